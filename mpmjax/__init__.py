@@ -1,0 +1,20 @@
+"""A differentiable Material Point Method in JAX, with explicit, semi-implicit and backward-Euler grid updates."""
+
+from mpmjax._boundary import AbstractBoundary, Conditions, Grip, SeparatingBox, SlipBox, StickyBox, SymmetryPlane
+from mpmjax._conjugate_residual import ConjugateResidual
+from mpmjax._grid import Grid
+from mpmjax._guess import Guess
+from mpmjax._hessian import AnalyticHessian, JvpHessian
+from mpmjax._kernel import BSpline, MLSGradient, SplineGradient
+from mpmjax._motion import Motion
+from mpmjax._particles import Particles
+from mpmjax._region import AbstractRegion, Ball, Box
+from mpmjax._run import Run, SimulationError
+from mpmjax._sample import fill
+from mpmjax._scene import Scene, TotalLagrangian, UpdatedLagrangian, prepare
+from mpmjax._simulate import rollout, simulate
+from mpmjax._step import BackwardEuler, Explicit, SemiImplicit, StepInfo, step
+from mpmjax._transfer import APIC, FLIP, PIC
+from mpmjax.material import AbstractMaterial, AbstractTangent, FixedCorotated, NeoHookean
+
+__version__ = "0.1.0"

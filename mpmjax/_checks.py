@@ -1,0 +1,61 @@
+"""Checks of what a user passes in: each raises a `ValueError` that says what must hold, what was got, what to do.
+
+A value that is being traced has no number yet and is passed; the same value is checked when it is first written down.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def is_traced(tree: Any) -> bool:
+    """Whether any leaf of the tree is a tracer, so that its value is not known yet."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def require(condition: Any, message: str) -> None:
+    """Raise `ValueError(message)` unless the condition holds everywhere, or is not known yet."""
+    if not is_traced(condition) and not np.all(condition):
+        raise ValueError(message)
+
+
+def require_finite(name: str, value: Any) -> None:
+    """Every number of `value` must be finite."""
+    if not is_traced(value):
+        require(np.isfinite(np.asarray(value, dtype=float)), f"{name} must be finite, got {value}.")
+
+
+def require_positive(name: str, value: Any) -> None:
+    """Every number of `value` must be finite and above zero."""
+    require_finite(name, value)
+    if not is_traced(value):
+        require(np.asarray(value) > 0, f"{name} must be greater than zero, got {value}.")
+
+
+def require_between(name: str, value: Any, lower: float, upper: float, *, open_ends: bool = False) -> None:
+    """Every number of `value` must lie in [lower, upper], or in (lower, upper) with `open_ends`."""
+    require_finite(name, value)
+    if not is_traced(value):
+        a = np.asarray(value)
+        inside = (a > lower) & (a < upper) if open_ends else (a >= lower) & (a <= upper)
+        words = f"strictly between {lower} and {upper}" if open_ends else f"from {lower} to {upper}"
+        require(inside, f"{name} must be {words}, got {value}.")
+
+
+def canonical(tree: Any, dtype: Any) -> Any:
+    """Make every number of the tree a strong array of one dtype.
+
+    A Python float is static under `eqx.filter_jit`, so a new value would compile anew, and `eqx.tree_at` puts one past
+    any converter; so this is applied at the entry of every public function that compiles.
+    """
+
+    def convert(leaf: Any) -> Any:
+        if isinstance(leaf, (bool, np.bool_)) or not isinstance(leaf, (int, float, np.number, np.ndarray, jax.Array)):
+            return leaf
+        if isinstance(leaf, jax.Array) and leaf.dtype == dtype and not leaf.weak_type:
+            return leaf
+        return jax.lax.convert_element_type(jnp.asarray(leaf), dtype)
+
+    return jax.tree.map(convert, tree)

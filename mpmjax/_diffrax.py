@@ -1,0 +1,173 @@
+"""The thin adapter by which diffrax drives the step: saving, events, progress and the checkpointed adjoint are its own."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._kernel import Stencil, in_window
+from mpmjax._particles import Particles, State, state_of, with_state
+from mpmjax._scene import Scene
+from mpmjax._step import Method, StepInfo, advance
+from mpmjax._types import Array, Bool, Float, Int, Scalar, components
+
+HEALTHY, NOT_FINITE, OUTSIDE, INADMISSIBLE = 0, 1, 2, 3
+"""What can be wrong with a state."""
+
+
+class Problem(eqx.Module):
+    """Everything of a rollout that does not evolve."""
+
+    scene: Scene
+    particles: Particles
+    stencil: Stencil | None
+    dt: Scalar
+    method: Method
+
+    def at(self, state: State) -> Particles:
+        """The particles in a state."""
+        return with_state(self.particles, state)
+
+
+class Tally(eqx.Module):
+    """Sums over the steps of a run."""
+
+    steps: Int[Array, "*f"]
+    """Steps taken."""
+    iterations: Int[Array, "*f"]
+    """Conjugate-residual iterations."""
+    most_iterations: Int[Array, "*f"]
+    """Most of them in one step."""
+    newton: Int[Array, "*f"]
+    """Newton steps."""
+    line_search: Int[Array, "*f"]
+    """Halvings by the line search."""
+    worst_residual: Float[Array, "*f"]
+    """Largest relative residual that a solve ended with."""
+    unconverged: Int[Array, "*f"]
+    """Steps whose solve met neither its tolerance nor the precision's limit."""
+    sweeps: Int[Array, "*f"]
+    """Solves that contact took beyond one a step."""
+    violations: Int[Array, "*f"]
+    """Contact conditions left violated, summed over steps."""
+    fault: Int[Array, "*f"]
+    """The first fault of a state: HEALTHY, NOT_FINITE, OUTSIDE or INADMISSIBLE."""
+    fault_step: Int[Array, "*f"]
+    """How many steps led to it."""
+
+    def plus(self, info: StepInfo, fault: Int[Array, ""]) -> "Tally":
+        """The tally after one more step."""
+        s, c = info.solve, info.contact
+        steps = self.steps + 1
+        first = (self.fault == HEALTHY) & (fault != HEALTHY)
+        return Tally(
+            steps=steps,
+            iterations=self.iterations + s.iterations,
+            most_iterations=jnp.maximum(self.most_iterations, s.iterations),
+            newton=self.newton + s.newton,
+            line_search=self.line_search + s.line_search,
+            worst_residual=jnp.maximum(self.worst_residual, jax.lax.stop_gradient(s.residual)),
+            unconverged=self.unconverged + jnp.where(s.converged, 0, 1).astype(jnp.int32),
+            sweeps=self.sweeps + c.sweeps,
+            violations=self.violations + c.violations,
+            fault=jnp.where(first, fault, self.fault),
+            fault_step=jnp.where(first, steps, self.fault_step),
+        )
+
+    def merged(self, later: "Tally") -> "Tally":
+        """This tally and that of the steps that followed."""
+        healthy = self.fault == HEALTHY
+        return Tally(
+            steps=self.steps + later.steps,
+            iterations=self.iterations + later.iterations,
+            most_iterations=jnp.maximum(self.most_iterations, later.most_iterations),
+            newton=self.newton + later.newton,
+            line_search=self.line_search + later.line_search,
+            worst_residual=jnp.maximum(self.worst_residual, later.worst_residual),
+            unconverged=self.unconverged + later.unconverged,
+            sweeps=self.sweeps + later.sweeps,
+            violations=self.violations + later.violations,
+            fault=jnp.where(healthy, later.fault, self.fault),
+            fault_step=jnp.where(healthy, self.steps + later.fault_step, self.fault_step),
+        )
+
+
+def no_steps(dtype: Any) -> Tally:
+    """The tally before the first step."""
+    zero = jnp.asarray(0, dtype=jnp.int32)
+    residual = jnp.asarray(0, dtype=dtype)
+    return Tally(zero, zero, zero, zero, zero, residual, zero, zero, zero, zero, zero)
+
+
+def faulty_particles(problem: Problem, state: State) -> tuple[Bool[Array, "p"], Bool[Array, "p"], Bool[Array, "p"]]:
+    """Which particles are not finite, have left the window, have an F that the law does not allow."""
+    scene, particles = problem.scene, problem.at(state)
+    finite = jnp.asarray(True)
+    for leaf in jax.tree.leaves(state):
+        finite = finite & jnp.isfinite(leaf).reshape(leaf.shape[0], -1).all(axis=1)
+    anchor = scene.anchor(particles)
+    outside = ~in_window(scene.kernel, scene.grid, scene.window(particles), anchor)
+    return ~finite, finite & outside, finite & ~scene.material.admits(components(state.F))
+
+
+def fault_of(problem: Problem, state: State) -> Int[Array, ""]:
+    """The gravest fault of a state."""
+    broken, outside, inadmissible = (a.any() for a in faulty_particles(problem, state))
+    fault = jnp.where(inadmissible, INADMISSIBLE, HEALTHY)
+    fault = jnp.where(outside, OUTSIDE, fault)
+    return jnp.where(broken, NOT_FINITE, fault).astype(jnp.int32)
+
+
+def step_number(t: Array) -> Array:
+    """diffrax's time as the number of a step: it divides an interval evenly, which is exact only up to rounding."""
+    return jnp.round(t)
+
+
+class StepSolver(diffrax.AbstractSolver):
+    """One step of the method a unit of diffrax's time, which counts steps: physical time is n·Δt, and every step has the
+    same Δt to the last bit. `args` is a `Problem`."""
+
+    term_structure: ClassVar = diffrax.ODETerm
+    interpolation_cls: ClassVar[Callable[..., diffrax.LocalLinearInterpolation]] = diffrax.LocalLinearInterpolation
+    keep_previous: bool = False
+    """Whether to carry the state before the last step, the last good one when an event stops the run."""
+
+    def order(self, terms: Any) -> int:
+        """First order in time."""
+        del terms
+        return 1
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: State, args: Problem) -> tuple[Tally, State | None]:
+        """An empty tally."""
+        del terms, t0, t1, args
+        return no_steps(y0.x.dtype), y0 if self.keep_previous else None
+
+    def step(self, terms: Any, t0: Any, t1: Any, y0: State, args: Problem, solver_state: Any, made_jump: Any) -> tuple:
+        """One step."""
+        del terms, t1, made_jump
+        tally, _ = solver_state
+        t = step_number(t0) * args.dt
+        particles, info = advance(args.scene, args.at(y0), t, args.dt, args.method, args.stencil)
+        y1 = state_of(particles)
+        tally = tally.plus(info, fault_of(*jax.lax.stop_gradient((args, y1))))
+        kept = y0 if self.keep_previous else None
+        return y1, None, {"y0": y0, "y1": y1}, (tally, kept), diffrax.RESULTS.successful
+
+    def func(self, terms: Any, t0: Any, y0: State, args: Problem) -> State:
+        """Not a vector field; diffrax only asks for its shape."""
+        return terms.vf(t0, y0, args)
+
+
+def no_vector_field(t: Any, y: State, args: Problem) -> State:
+    """What stands where diffrax expects an equation: the solver does not evaluate it."""
+    del t, args
+    return jax.tree.map(jnp.zeros_like, y)
+
+
+def is_faulty(t: Any, y: State, args: Problem, **kwargs: Any) -> Bool[Array, ""]:
+    """The event that stops a run."""
+    del t, kwargs
+    return fault_of(args, y) != HEALTHY

@@ -1,0 +1,31 @@
+"""Where an implicit solve starts."""
+
+import enum
+
+import jax.numpy as jnp
+
+from mpmjax._types import NodeVector
+
+
+class Guess(enum.Enum):
+    """The initial guess of an implicit update.
+
+    At some hundred times the explicit limit v* is far off, since it is what the explicit step would have done.
+    """
+
+    GRID_VELOCITY = "grid velocity"
+    """v^n, the nodes' velocity before the step: the default."""
+    EXPLICIT = "explicit"
+    """v*, the reference's choice."""
+    ZERO = "zero"
+    """Rest."""
+
+    def velocity(self, before: NodeVector, explicit: NodeVector) -> NodeVector:
+        """The guess [m/s], shape (n, d)."""
+        match self:
+            case Guess.GRID_VELOCITY:
+                return before
+            case Guess.EXPLICIT:
+                return explicit
+            case Guess.ZERO:
+                return jnp.zeros_like(before)

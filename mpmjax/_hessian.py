@@ -1,0 +1,145 @@
+"""The action of the elastic energy's Hessian, both ways, and the operator M + cH of the implicit solve."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+
+from mpmjax._potential import ElasticPotential
+from mpmjax._types import Array, Float, Mask, NodeScalar, NodeVector, Scalar
+from mpmjax.material import AbstractTangent
+
+
+class AbstractHessianAction(eqx.Module):
+    """The linear map δu ↦ H δu = ∂²Φ/∂u∂u : δu [N], of nodes' displacements."""
+
+    @abc.abstractmethod
+    def __call__(self, du: NodeVector) -> NodeVector:
+        """H δu."""
+
+
+class _AnalyticAction(AbstractHessianAction):
+    potential: ElasticPotential
+    tangent: AbstractTangent
+
+    def __call__(self, du: NodeVector) -> NodeVector:
+        """Σ_p V0_p A_p h_ip, with A_p = ∂²Ψ/∂F∂F : δF_p (reference, eqs. 7 and 8, the gradient in eq. 7 being node i's)."""
+        return _analytic_action(self.potential, self.tangent, du)
+
+
+@jax.jit
+def _analytic_action(potential: ElasticPotential, tangent: AbstractTangent, du: NodeVector) -> NodeVector:
+    return potential.divergence(tangent(potential.strain(du)), du)
+
+
+class _JvpAction(AbstractHessianAction):
+    potential: ElasticPotential
+    u: NodeVector
+
+    def __call__(self, du: NodeVector) -> NodeVector:
+        """The derivative of ∂Φ/∂u in the direction δu."""
+        return _jvp_action(self.potential, self.u, du)
+
+
+@jax.jit
+def _jvp_action(potential: ElasticPotential, u: NodeVector, du: NodeVector) -> NodeVector:
+    return jax.jvp(jax.grad(potential.energy), (u,), (du,))[1]
+
+
+class AnalyticHessian(eqx.Module):
+    """Hessian by the law's analytic stress differential (reference, eqs. 7 to 12). The faster of the two."""
+
+    def at(self, potential: ElasticPotential, u: NodeVector) -> AbstractHessianAction:
+        """The Hessian of the potential at a displacement u."""
+        return _AnalyticAction(potential, potential.material.tangent(potential.F + potential.strain(u)))
+
+    def at_rest(self, potential: ElasticPotential, like: NodeVector) -> AbstractHessianAction:
+        """The Hessian at u = 0, without the gather."""
+        del like
+        return _AnalyticAction(potential, potential.material.tangent(potential.F))
+
+
+class JvpHessian(eqx.Module):
+    """Hessian by `jax.jvp` of the energy's gradient: needs nothing of a law but its energy, and checks the other."""
+
+    def at(self, potential: ElasticPotential, u: NodeVector) -> AbstractHessianAction:
+        """The Hessian of the potential at a displacement u."""
+        return _JvpAction(potential, u)
+
+    def at_rest(self, potential: ElasticPotential, like: NodeVector) -> AbstractHessianAction:
+        """The Hessian at u = 0."""
+        return _JvpAction(potential, jnp.zeros_like(like))
+
+
+Hessian = AnalyticHessian | JvpHessian
+
+
+class ImplicitOperator(lx.AbstractLinearOperator):
+    """Q (M + c H) Q + I − Q, symmetric: c = βΔt² for the semi-implicit step (reference, eq. 6 times m_i), Δt² for Newton.
+
+    Q keeps the components that are free; rows of prescribed components and of empty nodes are the identity.
+    """
+
+    mass: NodeScalar
+    factor: Scalar
+    hessian: AbstractHessianAction
+    free: Mask
+
+    def unconstrained(self, v: NodeVector) -> NodeVector:
+        """(M + c H) v."""
+        return self.mass[:, None] * v + self.factor * self.hessian(v)
+
+    def mv(self, vector: NodeVector) -> NodeVector:
+        """The operator applied to a node vector."""
+        return jnp.where(self.free, self.unconstrained(jnp.where(self.free, vector, 0)), vector)
+
+    def metric(self) -> NodeVector:
+        """The mass as an inner product over all rows: m_i on free ones, 1 on identity rows."""
+        return jnp.where(self.free, self.mass[:, None], 1)
+
+    def as_matrix(self) -> Float[Array, "nd nd"]:
+        """The dense matrix, for tests and small problems."""
+        shape = self.free.shape
+        columns = jax.vmap(lambda e: self.mv(e.reshape(shape)).reshape(-1))
+        return columns(jnp.eye(self.free.size, dtype=self.mass.dtype)).T
+
+    def transpose(self) -> "ImplicitOperator":
+        """Itself."""
+        return self
+
+    def in_structure(self) -> jax.ShapeDtypeStruct:
+        """Of a node vector."""
+        return jax.ShapeDtypeStruct(self.free.shape, self.mass.dtype)
+
+    def out_structure(self) -> jax.ShapeDtypeStruct:
+        """Of a node vector."""
+        return self.in_structure()
+
+
+@lx.is_symmetric.register(ImplicitOperator)
+def _(operator: ImplicitOperator) -> bool:
+    return True
+
+
+for _property in (
+    lx.is_diagonal,
+    lx.is_tridiagonal,
+    lx.has_unit_diagonal,
+    lx.is_lower_triangular,
+    lx.is_upper_triangular,
+    lx.is_positive_semidefinite,  # H can be indefinite
+    lx.is_negative_semidefinite,
+):
+
+    @_property.register(ImplicitOperator)
+    def _(operator: ImplicitOperator) -> bool:
+        return False
+
+
+@lx.linearise.register(ImplicitOperator)
+@lx.conj.register(ImplicitOperator)
+def _(operator: ImplicitOperator) -> Any:
+    return operator

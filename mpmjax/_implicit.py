@@ -1,0 +1,276 @@
+"""The nodal problems of the implicit updates, how each is solved, and one derivative rule for both.
+
+A problem is an equation residual(v) = 0 for the nodes' new velocity v, with a symmetric Jacobian. Whatever iteration
+finds v, its derivative is that of the implicit function theorem, J δv = −δ(residual): one more solve with the same
+operator, forward or backward, so that no iteration is ever differentiated.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+
+from mpmjax._conjugate_residual import ConjugateResidual, default_rtol
+from mpmjax._hessian import Hessian, ImplicitOperator
+from mpmjax._potential import ElasticPotential
+from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
+
+
+class SolveInfo(eqx.Module):
+    """What the solution of one step's system cost, and how good it is."""
+
+    iterations: Int[Array, "*f"]
+    """Conjugate-residual iterations, over all Newton steps."""
+    newton: Int[Array, "*f"]
+    """Newton steps (backward Euler)."""
+    line_search: Int[Array, "*f"]
+    """Halvings of a Newton step by the line search."""
+    residual: Float[Array, "*f"]
+    """True relative residual at the end, in the norm of the inverse mass."""
+    converged: Bool[Array, "*f"]
+    """Whether the solver's tolerance, or the precision's own limit, was met."""
+
+
+def no_solve(dtype: Any) -> SolveInfo:
+    """The report of an update that solves nothing."""
+    zero = jnp.asarray(0, dtype=jnp.int32)
+    return SolveInfo(zero, zero, zero, jnp.asarray(0, dtype=dtype), jnp.asarray(True))
+
+
+class AbstractProblem(eqx.Module):
+    """An equation for the nodes' velocity. Components that are not `free` take the value of `prescribed`."""
+
+    free: eqx.AbstractVar[Mask]
+    prescribed: eqx.AbstractVar[NodeVector]
+
+    @abc.abstractmethod
+    def imbalance(self, v: NodeVector) -> NodeVector:
+        """The momentum [kg m/s] by which each node misses its equation; on held nodes, minus the wall's impulse."""
+
+    @abc.abstractmethod
+    def operator(self, v: NodeVector) -> ImplicitOperator:
+        """The derivative of the imbalance at v, constrained."""
+
+    def residual(self, v: NodeVector) -> NodeVector:
+        """The equation that is solved: the imbalance of free components, the error of prescribed ones."""
+        return jnp.where(self.free, self.imbalance(v), v - self.prescribed)
+
+    def admit(self, guess: NodeVector) -> NodeVector:
+        """The guess with prescribed components as prescribed."""
+        return jnp.where(self.free, guess, self.prescribed)
+
+
+class LinearProblem(AbstractProblem):
+    """(M + c H) v = b (reference, eq. 6 times m_i)."""
+
+    mass: NodeScalar
+    factor: Scalar
+    hessian: Any
+    rhs: NodeVector
+    free: Mask
+    prescribed: NodeVector
+
+    def operator(self, v: NodeVector) -> ImplicitOperator:
+        """Q (M + c H) Q + I − Q."""
+        del v
+        return ImplicitOperator(self.mass, self.factor, self.hessian, self.free)
+
+    def imbalance(self, v: NodeVector) -> NodeVector:
+        """(M + c H) v − b."""
+        return self.operator(v).unconstrained(v) - self.rhs
+
+
+class NewtonProblem(AbstractProblem):
+    """M (v − ṽ) − Δt f(Δt v) = 0, ṽ = v^n + Δt g: backward Euler (reference, eq. 2), f being the force after the step.
+
+    It is the gradient of the incremental potential E(v) = ½ ‖v − ṽ‖²_M + Φ(Δt v), of which a step that a wall or the
+    line search accepts is a descent.
+    """
+
+    mass: NodeScalar
+    inertial: NodeVector
+    dt: Scalar
+    potential: ElasticPotential
+    hessian: Hessian
+    free: Mask
+    prescribed: NodeVector
+
+    def operator(self, v: NodeVector) -> ImplicitOperator:
+        """M + Δt² H at the displacement Δt v, constrained."""
+        return ImplicitOperator(self.mass, self.dt**2, self.hessian.at(self.potential, self.dt * v), self.free)
+
+    def imbalance(self, v: NodeVector) -> NodeVector:
+        """M (v − ṽ) − Δt f(Δt v)."""
+        return self.mass[:, None] * (v - self.inertial) - self.dt * self.potential.force(self.dt * v)
+
+    def merit(self, v: NodeVector) -> Float[Array, ""]:
+        """E(v) [J]."""
+        return 0.5 * (self.mass[:, None] * (v - self.inertial) ** 2).sum() + self.potential.energy(self.dt * v)
+
+
+class SolveOnce(eqx.Module):
+    """Solve a linear problem with one linear solve."""
+
+    solver: ConjugateResidual
+
+    def __call__(self, problem: AbstractProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
+        """The solution, started from a guess."""
+        operator = problem.operator(guess)
+        lift = jnp.where(problem.free, 0, problem.prescribed)
+        rhs = jnp.where(problem.free, -problem.imbalance(lift), 0)
+        options = {"metric": operator.metric(), "y0": jnp.where(problem.free, guess, 0)}
+        v, result, stats = self.solver.compute(self.solver.init(operator, options), rhs, options)
+        info = SolveInfo(
+            iterations=stats["num_steps"],
+            newton=jnp.asarray(0, dtype=jnp.int32),
+            line_search=jnp.asarray(0, dtype=jnp.int32),
+            residual=stats["residual"],
+            converged=result == lx.RESULTS.successful,
+        )
+        return v + lift, info
+
+
+class Newton(eqx.Module):
+    """Newton's method with a backtracking line search on the incremental potential.
+
+    A direction along which the potential does not fall (the Hessian can be indefinite) is replaced by the steepest one
+    in the mass norm; a step is halved until the potential falls by a ten-thousandth of what its slope promises, which
+    also keeps out of deformations where the law has no energy. Stops when ‖residual‖ ≤ rtol ‖b‖, b the right-hand side
+    M ṽ + Δt f(0), both in the norm of the inverse mass, or at the rounding of the residual.
+
+    Args:
+        rtol: relative tolerance. Default: that of the precision, 1e-8 or 1e-5.
+        max_steps: most Newton steps.
+        solver: of the linear systems.
+    """
+
+    solver: ConjugateResidual
+    rtol: Scalar | None = None
+    max_steps: int = eqx.field(static=True, default=30)
+
+    def __call__(self, problem: NewtonProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
+        """The solution, started from a guess."""
+        free = problem.free
+        metric = jnp.where(free, problem.mass[:, None], 1)
+        dtype = guess.dtype
+        eps = jnp.finfo(dtype).eps
+        rtol = default_rtol(dtype) if self.rtol is None else self.rtol
+
+        def norm(r: NodeVector) -> Float[Array, ""]:
+            return jnp.sqrt((r**2 / metric).sum())
+
+        def residual(v: NodeVector) -> NodeVector:
+            return jnp.where(free, problem.imbalance(v), 0)
+
+        def tolerance(c: _NewtonState) -> Float[Array, ""]:
+            speed = jnp.sqrt((metric * jnp.where(free, c.v, 0) ** 2).sum())
+            return jnp.maximum(rtol * scale, 4 * eps * (c.radius * speed + scale))
+
+        def goes_on(c: _NewtonState) -> Array:
+            return (norm(c.r) > tolerance(c)) & (c.newton < self.max_steps) & ~c.stuck
+
+        def step(c: _NewtonState) -> _NewtonState:
+            operator = problem.operator(c.v)
+            options = {"metric": metric}
+            direction, _, stats = self.solver.compute(self.solver.init(operator, options), -c.r, options)
+            slope = (c.r * direction).sum()
+            steepest = -c.r / metric / jnp.maximum(stats["spectral_radius"], 1)
+            uphill = ~(slope < 0)
+            direction = jnp.where(uphill, steepest, direction)
+            slope = jnp.where(uphill, (c.r * steepest).sum(), slope)
+            energy = problem.merit(c.v)
+            slack = 10 * eps * jnp.abs(energy)  # near the solution the fall drowns in rounding
+
+            def too_high(trial: tuple[Array, Array]) -> Array:
+                length, count = trial
+                fallen = problem.merit(c.v + length * direction) <= energy + 1e-4 * length * slope + slack
+                return ~fallen & (count < _MOST_HALVINGS)
+
+            one, zero = jnp.ones((), dtype), jnp.asarray(0, dtype=jnp.int32)
+            length, halvings = jax.lax.while_loop(too_high, lambda a: (a[0] / 2, a[1] + 1), (one, zero))
+            v = c.v + length * direction
+            return _NewtonState(
+                v=v,
+                r=residual(v),
+                radius=jnp.maximum(c.radius, stats["spectral_radius"]),
+                iterations=c.iterations + stats["num_steps"],
+                newton=c.newton + 1,
+                halvings=c.halvings + halvings,
+                stuck=halvings >= _MOST_HALVINGS,
+            )
+
+        start = problem.admit(guess)
+        zero = jnp.asarray(0, dtype=jnp.int32)
+        lift = jnp.where(free, 0, problem.prescribed)
+        scale = norm(residual(lift))
+        state = _NewtonState(start, residual(start), jnp.ones((), dtype), zero, zero, zero, jnp.asarray(False))
+        c = jax.lax.while_loop(goes_on, step, state)
+        left = norm(c.r)
+        info = SolveInfo(
+            iterations=c.iterations,
+            newton=c.newton,
+            line_search=c.halvings,
+            residual=left / jnp.where(scale == 0, 1, scale),
+            converged=left <= tolerance(c),
+        )
+        return c.v, info
+
+
+_MOST_HALVINGS = 30
+
+
+class _NewtonState(eqx.Module):
+    v: NodeVector
+    r: NodeVector
+    radius: Array
+    iterations: Array
+    newton: Array
+    halvings: Array
+    stuck: Array
+
+
+def solve(
+    problem: AbstractProblem, guess: NodeVector, find: SolveOnce | Newton, adjoint: ConjugateResidual
+) -> tuple[NodeVector, SolveInfo]:
+    """The solution of a problem, differentiable with respect to it in forward and reverse mode, to any order.
+
+    Args:
+        problem: the problem.
+        guess: where the iteration starts; the result does not depend on it beyond the tolerance, nor its derivative.
+        find: the iteration.
+        adjoint: solver of the tangent and adjoint systems. One that does not converge gives NaN derivatives, so that a
+            wrong gradient cannot pass for a right one.
+    """
+    return _solve(problem, *jax.lax.stop_gradient((guess, find, adjoint)))
+
+
+@eqx.filter_custom_jvp
+def _solve(
+    problem: AbstractProblem, guess: NodeVector, find: Any, adjoint: ConjugateResidual
+) -> tuple[NodeVector, SolveInfo]:
+    del adjoint
+    return find(problem, guess)
+
+
+@_solve.def_jvp
+def _solve_jvp(primals: Any, tangents: Any) -> Any:
+    problem, guess, find, adjoint = primals
+    d_problem = tangents[0]
+    v, info = _solve(problem, guess, find, adjoint)
+    d_residual = eqx.filter_jvp(lambda q: q.residual(v), (problem,), (d_problem,))[1]
+    operator = problem.operator(v)
+    metric = jax.lax.stop_gradient(operator.metric())
+
+    def solve_symmetric(matvec: Any, b: NodeVector) -> NodeVector:
+        structure = jax.ShapeDtypeStruct(b.shape, b.dtype)
+        linear = lx.FunctionLinearOperator(matvec, structure, lx.symmetric_tag)
+        x, result, _ = adjoint.compute(adjoint.init(linear, {}), b, {"metric": metric})
+        return jnp.where(result == lx.RESULTS.successful, x, jnp.nan)
+
+    lift = jnp.where(problem.free, 0, -d_residual)
+    rhs = jnp.where(problem.free, -d_residual - operator.unconstrained(lift), 0)
+    dv = jax.lax.custom_linear_solve(operator.mv, rhs, solve_symmetric, symmetric=True)
+    return (v, info), (dv + lift, jax.tree.map(lambda _: None, info))

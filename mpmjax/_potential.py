@@ -1,0 +1,59 @@
+"""The elastic potential of the grid: energy, force and deformation as functions of nodal displacement."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax import _linalg as la
+from mpmjax._boundary import Mirror
+from mpmjax._kernel import Stencil
+from mpmjax._transfer import collect, spread
+from mpmjax._types import Array, Float, Matrix, NodeVector
+from mpmjax.material import AbstractMaterial
+
+
+class ElasticPotential(eqx.Module):
+    """Φ(u) = Σ_p V0_p Ψ(F_p + Σ_i u_i h_ipᵀ), for a displacement u of the nodes [m] from where they are now.
+
+    h_ip is the material gradient: F_pᵀ ∇_x w_ip in the updated description, ∇_X w_ip in the total one. Every use of it
+    goes through `strain` and its transpose `divergence`, so that force and Hessian are the derivatives of Φ.
+    """
+
+    material: AbstractMaterial
+    volume: Float[Array, "p"]
+    F: Matrix
+    pull: Matrix | None
+    """F_p in the updated description, None in the total one."""
+    stencil: Stencil
+    mirror: Mirror
+
+    def strain(self, u: NodeVector) -> Matrix:
+        """δF_p = Σ_i u_i h_ipᵀ, shape (d, d, p)."""
+        gradient = collect(self.stencil.index, self.stencil.gradient, self.mirror.unfold(u))
+        gradient = jnp.swapaxes(gradient, 0, 1)  # from derivative first to component first
+        return gradient if self.pull is None else la.matmul(gradient, self.pull)
+
+    def divergence(self, P: Matrix, like: NodeVector) -> NodeVector:
+        """Σ_p V0_p P_p h_ip [N], the transpose of `strain`; `like` is any node vector."""
+        P = self.volume * P
+        flux = P if self.pull is None else la.matmul(P, la.transpose(self.pull))
+        nodes = spread(self.stencil.index, self.stencil.gradient, jnp.swapaxes(flux, 0, 1), like.shape[0])
+        return self.mirror.fold(nodes)
+
+    def energy(self, u: NodeVector) -> Float[Array, ""]:
+        """Φ(u) [J]."""
+        return (self.volume * self.material.energy(self.F + self.strain(u))).sum()
+
+    def force(self, u: NodeVector) -> NodeVector:
+        """f = −∂Φ/∂u [N]: at u = 0 the reference's f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
+        return -self.divergence(_stress(self.material, self.F + self.strain(u)), u)
+
+    def rest_force(self, like: NodeVector) -> NodeVector:
+        """The force at u = 0, without the gather."""
+        return -self.divergence(_stress(self.material, self.F), like)
+
+
+@jax.jit
+def _stress(material: AbstractMaterial, F: Matrix) -> Matrix:
+    """The law's stress, compiled as one function wherever it is called, so that it is traced once."""
+    return material.stress(F)

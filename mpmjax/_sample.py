@@ -1,0 +1,72 @@
+"""Filling a region with particles."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._checks import require, require_positive
+from mpmjax._grid import Grid
+from mpmjax._particles import Particles
+from mpmjax._region import AbstractRegion, Box
+from mpmjax._types import Point, Scalar
+
+
+def fill(
+    region: AbstractRegion,
+    grid: Grid,
+    *,
+    particles_per_cell: int | tuple[int, ...] | list[int] = 4,
+    density: Scalar,
+    velocity: Point | None = None,
+    dtype: type | str | None = None,
+) -> Particles:
+    """Fill a region with a lattice of particles at cell centres of a subdivided grid.
+
+    In a box the lattice is fitted to the box (its counts are rounded, its spacing then is the box's side over the
+    count), so that the particles' total mass and volume are the box's exactly. Any other region keeps the lattice points
+    inside it, each with the volume of a lattice cell.
+
+    Args:
+        region: what to fill.
+        grid: sets the spacing.
+        particles_per_cell: a d-th power (4 in 2-D is 2 x 2), or a count for each direction.
+        density: mass density [kg/m^d].
+        velocity: initial velocity [m/s], (d,). Default: rest.
+        dtype: float32 or float64. Default: jax's own, float32 unless 64-bit mode is on.
+
+    Raises:
+        ValueError: a count that is no d-th power, a region of another dimension, or one that holds no particle.
+    """
+    d = grid.dim
+    require_positive("density [kg/m^d]", density)
+    if isinstance(particles_per_cell, int):
+        root = round(particles_per_cell ** (1 / d))
+        require(
+            root >= 1 and root**d == particles_per_cell,
+            f"particles_per_cell must be the {d}-th power of a whole number (or a tuple of {d} counts), got "
+            f"{particles_per_cell}.",
+        )
+        counts = np.full(d, root)
+    else:
+        counts = np.asarray(particles_per_cell)
+        require(
+            counts.shape == (d,) and (counts >= 1).all() and counts.dtype.kind == "i",
+            f"particles_per_cell must be one or {d} positive whole numbers, got {particles_per_cell}.",
+        )
+    lower, upper = region.bounds()
+    require(lower.shape == (d,), f"The region is {lower.size}-dimensional, the grid {d}-dimensional.")
+    require(
+        np.isfinite(lower) & np.isfinite(upper), "A region to fill must be finite; infinite corners are for grips only."
+    )
+    size = upper - lower
+    number = np.maximum(np.rint(size * counts / float(grid.spacing)).astype(int), 1)
+    cell = size / number
+    axes = [low + (np.arange(n) + 0.5) * c for low, n, c in zip(lower, number, cell, strict=True)]
+    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, d)
+    if not isinstance(region, Box):
+        lattice = lattice[np.asarray(region.contains(jnp.asarray(lattice)))]
+    require(len(lattice) > 0, f"{region} holds no particle at this spacing: refine the grid or enlarge the region.")
+    dtype = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
+    x = jnp.asarray(lattice, dtype=dtype)
+    v = jnp.broadcast_to(jnp.asarray((0.0,) * d if velocity is None else velocity, dtype=dtype), x.shape)
+    volume = jnp.full(len(lattice), np.prod(cell), dtype=dtype)
+    return Particles(x=x, v=v, mass=jnp.asarray(density, dtype) * volume, volume=volume)

@@ -1,0 +1,285 @@
+"""Rollouts: many steps, saved, watched and differentiated."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._checks import canonical, is_traced, require, require_finite, require_positive
+from mpmjax._diffrax import (
+    HEALTHY,
+    INADMISSIBLE,
+    NOT_FINITE,
+    OUTSIDE,
+    Problem,
+    StepSolver,
+    Tally,
+    faulty_particles,
+    is_faulty,
+    no_vector_field,
+    step_number,
+)
+from mpmjax._particles import Particles, State, state_of, with_state
+from mpmjax._run import Run, SimulationError
+from mpmjax._scene import Scene, prepare
+from mpmjax._step import Explicit, Method, advance
+from mpmjax._types import Array, Float, Scalar
+
+_CHECKPOINT_BYTES = 2**28
+
+
+def simulate(
+    scene: Scene,
+    particles: Particles,
+    *,
+    t1: float,
+    dt: float,
+    method: Method = Explicit(),  # noqa: B008
+    save_every: int | None = None,
+    observe: Callable[[Particles], Any] | None = None,
+    start: int = 0,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    checkpoint_bytes: int = _CHECKPOINT_BYTES,
+    progress: bool = False,
+    throw: bool = True,
+) -> Run:
+    """Simulate a scene from step `start` to time t1 in steps of dt.
+
+    The rollout is differentiable with respect to every float of the scene, the particles and the method: in reverse mode
+    by default, by recomputation from checkpoints; in forward mode (`jax.jvp`, `jax.jacfwd`) with
+    `adjoint=diffrax.ForwardMode()`. Only the number of steps, `save_every` and choices of code compile anew.
+
+    Args:
+        scene: the scene.
+        particles: the particles at step `start`.
+        t1: end time [s], a whole number of steps after time zero.
+        dt: step [s].
+        method: update of the grid velocity.
+        save_every: save the state at the start, every so many steps, and at the end. Default: only `final` is returned.
+        observe: instead of states, save what this function returns for the particles (a curve costs no more memory than
+            its points). `save_every` then defaults to 1. Pass the same function object again to reuse the compilation.
+        start: number of the first step, e.g. a former run's `final_step`; time there is start·dt.
+        adjoint: how diffrax differentiates. Default: recursive checkpointing.
+        checkpoint_bytes: memory for the checkpoints of the default adjoint [B]. Fewer of them cost recomputation.
+        progress: show diffrax's progress meter.
+        throw: raise on faults. With False the result says them in `tally`, and a batch member that fails leaves the
+            others alone.
+
+    Raises:
+        ValueError: of `prepare`; a t1 that is not a whole number of steps after the start.
+        SimulationError: a state that is not finite, a particle outside the window, an F that the law does not allow
+            (each with step, time and first bad particle; the last good state is in its `run.final`), a solve that did
+            not converge. Under an outer transformation (`jax.grad`, `jax.jit`, `jax.vmap`): the runtime error of
+            `equinox.error_if` instead.
+    """
+    count = number_of_steps(t1, dt, start, particles.x.dtype)
+    require(save_every is None or save_every >= 1, f"save_every must be at least 1, got {save_every}.")
+    traced = is_traced((scene, particles, dt, method))
+    if observe is not None and save_every is None:
+        save_every = 1
+    dtype = particles.x.dtype
+    scene, dt_, method = canonical((scene, dt, method), dtype)
+    particles = prepare(scene, particles)
+    if adjoint is None:
+        adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=_checkpoints(particles, count, checkpoint_bytes))
+    saved, final, tally, previous = integrate(
+        scene,
+        particles,
+        jnp.asarray(start, dtype),
+        jnp.asarray(count, dtype),
+        dt_,
+        method,
+        max_steps=count,
+        save_every=save_every,
+        observe=observe,
+        adjoint=adjoint,
+        progress=progress,
+        watch=not traced,
+    )
+    steps, values = (jnp.zeros((0,), dtype), None) if saved is None else saved
+    run = Run(
+        scene=scene,
+        method=method,
+        dt=dt_,
+        steps=steps,
+        frames=values if observe is None else None,
+        observed=None if observe is None else values,
+        final=with_state(particles, final),
+        final_step=jnp.asarray(start, dtype) + tally.steps.astype(dtype),
+        tally=tally,
+    )
+    if not throw:
+        return run
+    if traced:
+        bad = (tally.fault != HEALTHY) | (tally.unconverged > 0)
+        return eqx.error_if(run, bad, _TRACED_FAULT)
+    raise_faults(run, previous, start)
+    return run
+
+
+_TRACED_FAULT = (
+    "mpmjax: the rollout met a fault (a non-finite state, a particle outside the window, an inadmissible F, or a solve "
+    "that did not converge). Call simulate outside of jax transformations to have step, time and particle named, or with "
+    "throw=False to inspect run.tally."
+)
+
+
+def rollout(
+    scene: Scene,
+    particles: Particles,
+    *,
+    steps: int,
+    dt: Scalar,
+    method: Method = Explicit(),
+    start: int = 0,  # noqa: B008
+) -> Particles:
+    """The plain rollout: `jax.lax.scan` over steps, without saving, checks or checkpoints. `simulate` is held to it.
+
+    Args:
+        scene: the scene.
+        particles: the particles at step `start`.
+        steps: number of steps.
+        dt: step [s].
+        method: update of the grid velocity.
+        start: number of the first step.
+    """
+    scene, dt, method = canonical((scene, dt, method), particles.x.dtype)
+    return _rollout(scene, prepare(scene, particles), dt, method, steps, start)
+
+
+@eqx.filter_jit
+def _rollout(scene: Scene, particles: Particles, dt: Scalar, method: Method, steps: int, start: int) -> Particles:
+    stencil = scene.stencil(particles) if scene.total else None
+
+    def body(state: State, n: Array) -> tuple[State, None]:
+        new, _ = advance(scene, with_state(particles, state), n * dt, dt, method, stencil)
+        return state_of(new), None
+
+    number = jnp.arange(start, start + steps, dtype=particles.x.dtype)
+    return with_state(particles, jax.lax.scan(body, state_of(particles), number)[0])
+
+
+def number_of_steps(t1: float, dt: float, start: int, dtype: Any) -> int:
+    """How many steps of dt lead from step `start` to time t1.
+
+    Raises:
+        ValueError: not a whole number, none, or more than the precision can count.
+    """
+    if is_traced((t1, dt)):
+        raise ValueError("t1 and dt fix the number of steps and must be known numbers, not traced ones.")
+    require_positive("dt [s]", dt)
+    require_finite("t1 [s]", t1)
+    ratio = float(t1) / float(dt)
+    total = round(ratio)
+    require(
+        abs(ratio - total) <= 1e-6 * max(1.0, abs(ratio)),
+        f"t1 must be a whole number of steps: t1 / dt = {ratio:.9g} (t1 = {t1}, dt = {dt}); change dt to {t1} / {total or 1}.",
+    )
+    require(total > start, f"t1 must lie after the start: t1 / dt = {total} steps, start = {start}.")
+    most = 2 ** (jnp.finfo(dtype).nmant - 1)
+    require(total < most, f"{jnp.dtype(dtype)} counts steps exactly only below {most}, got {total}: use float64.")
+    return total - int(start)
+
+
+def _checkpoints(particles: Particles, count: int, budget: int) -> int:
+    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state_of(particles)))
+    return max(1, min(count, budget // size))
+
+
+@eqx.filter_jit
+def integrate(
+    scene: Scene,
+    particles: Particles,
+    start: Float[Array, ""],
+    count: Float[Array, ""],
+    dt: Scalar,
+    method: Method,
+    *,
+    max_steps: int,
+    save_every: int | None,
+    observe: Callable[[Particles], Any] | None,
+    adjoint: diffrax.AbstractAdjoint,
+    progress: bool,
+    watch: bool,
+) -> tuple[Any, State, Tally, State | None]:
+    """`count` ≤ `max_steps` steps from step `start`: (steps and values saved), final state, tally, and with `watch`,
+    which stops the run at a fault, the state before the last step."""
+    problem = Problem(scene, particles, scene.stencil(particles) if scene.total else None, dt, method)
+
+    def kept(t: Any, y: State, args: Problem) -> Any:
+        del t
+        return y if observe is None else observe(args.at(y))
+
+    subs = {"final": diffrax.SubSaveAt(t1=True)}
+    if save_every is not None:
+        subs["frames"] = diffrax.SubSaveAt(t0=True, t1=True, steps=save_every, fn=kept)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(no_vector_field),
+        StepSolver(keep_previous=watch),
+        t0=start,
+        t1=start + count,
+        dt0=jnp.ones_like(start),
+        y0=state_of(particles),
+        args=problem,
+        saveat=diffrax.SaveAt(subs=subs, solver_state=True),
+        adjoint=adjoint,
+        event=diffrax.Event(is_faulty) if watch else None,
+        max_steps=max_steps,
+        throw=False,
+        progress_meter=diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter(),
+    )
+    tally, previous = solution.solver_state
+    final = jax.tree.map(lambda a: a[-1], solution.ys["final"])
+    saved = None if save_every is None else (step_number(solution.ts["frames"]), solution.ys["frames"])
+    return saved, final, tally, previous
+
+
+def raise_faults(run: Run, previous: State | None, start: int) -> None:
+    """Raise what the tally of an untraced run tells.
+
+    Args:
+        run: the run, its final state possibly bad.
+        previous: the state before the last step.
+        start: number of the run's first step.
+    """
+    fault = int(run.tally.fault)
+    if fault != HEALTHY:
+        assert previous is not None
+        step = start + int(run.tally.fault_step)
+        problem = Problem(run.scene, run.final, None, run.dt, run.method)
+        bad = dict(
+            zip((NOT_FINITE, OUTSIDE, INADMISSIBLE), faulty_particles(problem, state_of(run.final)), strict=True)
+        )
+        first = int(np.argmax(np.asarray(bad[fault])))
+        what, advice = _FAULTS[fault]
+        good = eqx.tree_at(
+            lambda r: (r.final, r.final_step),
+            run,
+            (with_state(run.final, previous), jnp.asarray(step - 1, run.dt.dtype)),
+        )
+        raise SimulationError(
+            f"At step {step} (t = {step * float(run.dt):.6g} s) particle {first} {what}; the last good position was "
+            f"{np.asarray(previous.x[first])}. {advice}",
+            good,
+        )
+    if int(run.tally.unconverged) > 0:
+        raise SimulationError(
+            f"The solve of {int(run.tally.unconverged)} of {int(run.tally.steps)} steps did not converge (worst relative "
+            f"residual {float(run.tally.worst_residual):.2g}). Reduce dt, raise the solver's max_steps or loosen its rtol; "
+            "BackwardEuler holds where one linear solve does not.",
+            run,
+        )
+
+
+_FAULTS = {
+    NOT_FINITE: ("is no longer finite", "Reduce dt (explicit steps have a limit), or use an implicit method."),
+    OUTSIDE: ("left the grid's window", "Enlarge the grid's shape, or use follow=True."),
+    INADMISSIBLE: (
+        "has a deformation gradient that its law does not allow (det F ≤ 0)",
+        "Reduce dt, or use FixedCorotated, which allows inversion.",
+    ),
+}

@@ -1,0 +1,302 @@
+"""One step, and the three ways to update the grid's velocity in it."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax import _linalg as la
+from mpmjax._boundary import Conditions, combine, mirror
+from mpmjax._checks import canonical, require_between, require_positive
+from mpmjax._conjugate_residual import ConjugateResidual
+from mpmjax._contact import ContactInfo, count_violations, find_active_set, no_contact, with_friction
+from mpmjax._guess import Guess
+from mpmjax._hessian import AnalyticHessian, Hessian
+from mpmjax._implicit import LinearProblem, Newton, NewtonProblem, SolveInfo, SolveOnce, no_solve, solve
+from mpmjax._kernel import Stencil
+from mpmjax._particles import Particles
+from mpmjax._potential import ElasticPotential
+from mpmjax._scene import Scene, is_prepared, prepare
+from mpmjax._transfer import g2p, p2g
+from mpmjax._types import Array, Int, Mask, NodeScalar, NodeVector, Scalar, components, particle_first
+
+
+class Nodes(eqx.Module):
+    """What the velocity update of one step is given."""
+
+    mass: NodeScalar
+    """m_i [kg], shape (n,), folded at symmetry planes."""
+    velocity: NodeVector
+    """v_i^n [m/s], shape (n, d); zero on empty nodes."""
+    occupied: Mask
+    """Whether the node has mass beyond rounding, shape (n, 1)."""
+    gravity: Array
+    """Body acceleration g [m/s²], shape (d,)."""
+    dt: Scalar
+    """Δt [s]."""
+    potential: ElasticPotential
+    """Φ, of nodal displacements."""
+    conditions: Conditions
+    """What the boundaries prescribe."""
+
+    def explicit_velocity(self) -> NodeVector:
+        """v* = v^n + Δt f / m + Δt g (reference, eq. 4)."""
+        f = self.potential.rest_force(self.velocity)
+        mass = jnp.where(self.occupied, self.mass[:, None], 1)
+        return jnp.where(self.occupied, self.velocity + self.dt * (f / mass + self.gravity), 0)
+
+    def free(self, active: Mask | bool) -> Mask:
+        """The components that neither a boundary prescribes nor a wall holds, on nodes that have mass."""
+        return self.occupied & ~self.conditions.fixed & ~jnp.asarray(active)
+
+
+class StepInfo(eqx.Module):
+    """What one step reports."""
+
+    solve: SolveInfo
+    contact: ContactInfo
+    outside: Int[Array, "*f"]
+    """Particles whose stencil left the grid's window."""
+
+
+class Explicit(eqx.Module):
+    """Symplectic Euler: v^{n+1} = v* (reference, eq. 4); positions then move with v^{n+1}.
+
+    Second order in space with APIC and FLIP, first order in time. Conserves linear and, with APIC, angular momentum.
+
+    *When it breaks*: above Δt of about 0.4 to 1 times dx/c, depending on dimension, kernel and transfer
+    (c the pressure-wave speed of the *current* tangent, which stretching and compression raise).
+    """
+
+    def velocity(self, nodes: Nodes, predictor: NodeVector, guess: NodeVector, active: Mask | bool) -> tuple:
+        """v^{n+1}, the walls' impulse and the solve's report."""
+        del guess
+        v = jnp.where(nodes.free(active), predictor, nodes.conditions.velocity)
+        return v, nodes.mass[:, None] * (v - predictor), no_solve(v.dtype)
+
+    def start(self, nodes: Nodes, predictor: NodeVector) -> NodeVector:
+        """Nothing is iterated."""
+        del nodes
+        return predictor
+
+
+class SemiImplicit(eqx.Module):
+    """The semi-implicit update: (M + βΔt²H) v^{n+1} = M v*, force and H at the start of the step (reference, eqs. 3, 6).
+
+    First order in time. On a mode of frequency ω the amplification is (1 + βz)^(−½) with z = (ωΔt)² while
+    z < 4/(1−β)²: stable for every Δt if β ≥ ½, else for z ≤ 4/(1−2β). β = 0 is the explicit step; β = 1 one Newton step
+    of backward Euler. β = ½ is *not* the trapezoidal rule, positions moving with v^{n+1}: for β > 0 motion is damped, by
+    a quarter in one period of a standing wave at the explicit limit. A method for slow, driven and overdamped motion.
+
+    *When it breaks*: large strains within one step (the system is linearised once), and where compression makes H
+    indefinite and Δt brings M + βΔt²H near singular.
+    *Good values*: β = 1 with Δt up to some hundred times the explicit limit for quasi-static pulls.
+
+    Args:
+        beta: β, from 0 to 1.
+        hessian: how H acts. Default: by the analytic stress differential.
+        solver: conjugate residuals of the forward solve.
+        adjoint_solver: of the tangent and adjoint solves, whose tolerance bounds the gradient's. Default: default
+            tolerances.
+        guess: where the solve starts.
+    """
+
+    beta: Scalar = 1.0
+    hessian: Hessian = AnalyticHessian()
+    solver: ConjugateResidual = ConjugateResidual()
+    adjoint_solver: ConjugateResidual = ConjugateResidual()
+    guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
+
+    def __check_init__(self):
+        require_between("SemiImplicit's beta", self.beta, 0, 1)
+
+    def velocity(self, nodes: Nodes, predictor: NodeVector, guess: NodeVector, active: Mask | bool) -> tuple:
+        """v^{n+1}, the walls' impulse and the solve's report."""
+        problem = LinearProblem(
+            mass=nodes.mass,
+            factor=self.beta * nodes.dt**2,
+            hessian=self.hessian.at_rest(nodes.potential, predictor),
+            rhs=nodes.mass[:, None] * predictor,
+            free=nodes.free(active),
+            prescribed=nodes.conditions.velocity,
+        )
+        v, info = solve(problem, guess, SolveOnce(self.solver), self.adjoint_solver)
+        return v, problem.imbalance(v), info
+
+    def start(self, nodes: Nodes, predictor: NodeVector) -> NodeVector:
+        """The chosen guess."""
+        return self.guess.velocity(nodes.velocity, predictor)
+
+
+class BackwardEuler(eqx.Module):
+    """Backward Euler: M (v^{n+1} − v^n) = Δt f(x^n + Δt v^{n+1}) + Δt M g (reference, eq. 2), by Newton's method.
+
+    First order in time, strongly damping; no linearisation error, so it holds where one linear solve does not.
+
+    *When it breaks*: where the incremental potential has several minima, Newton finds one of them, not always the one a
+    smaller step would lead to.
+
+    Args:
+        rtol: Newton's relative tolerance. Default: 1e-8 in float64, 1e-5 in float32.
+        max_newton: most Newton steps.
+        hessian: how H acts. Default: by the analytic stress differential.
+        solver: conjugate residuals within a Newton step; a loose tolerance suffices.
+        adjoint_solver: of the tangent and adjoint solves. Default: default tolerances.
+        guess: where Newton starts.
+    """
+
+    rtol: Scalar | None = None
+    max_newton: int = eqx.field(static=True, default=30)
+    hessian: Hessian = AnalyticHessian()
+    solver: ConjugateResidual = ConjugateResidual(rtol=1e-3)
+    adjoint_solver: ConjugateResidual = ConjugateResidual()
+    guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
+
+    def __check_init__(self):
+        if self.rtol is not None:
+            require_positive("BackwardEuler's rtol", self.rtol)
+
+    def velocity(self, nodes: Nodes, predictor: NodeVector, guess: NodeVector, active: Mask | bool) -> tuple:
+        """v^{n+1}, the walls' impulse and the solve's report."""
+        problem = NewtonProblem(
+            mass=nodes.mass,
+            inertial=jnp.where(nodes.occupied, nodes.velocity + nodes.dt * nodes.gravity, 0),
+            dt=nodes.dt,
+            potential=nodes.potential,
+            hessian=self.hessian,
+            free=nodes.free(active),
+            prescribed=nodes.conditions.velocity,
+        )
+        newton = Newton(self.solver, self.rtol, self.max_newton)
+        v, info = solve(problem, guess, newton, self.adjoint_solver)
+        return v, problem.imbalance(v), info
+
+    def start(self, nodes: Nodes, predictor: NodeVector) -> NodeVector:
+        """The chosen guess."""
+        return self.guess.velocity(nodes.velocity, predictor)
+
+
+Method = Explicit | SemiImplicit | BackwardEuler
+
+
+def advance(
+    scene: Scene, particles: Particles, t: Scalar, dt: Scalar, method: Method, stencil: Stencil | None = None
+) -> tuple[Particles, StepInfo]:
+    """One step, without checks or compilation: `step` is its public form.
+
+    Args:
+        scene: the scene, its floats arrays of the particles' dtype.
+        particles: prepared particles.
+        t: time at the start of the step [s].
+        dt: step [s].
+        method: update of the grid velocity.
+        stencil: that of the reference positions, if the description is total and it was computed before.
+    """
+    grid, window = scene.grid, scene.window(particles)
+    stencil = scene.stencil(particles) if stencil is None else stencil
+
+    # particles to grid
+    x, v, F = components(particles.x), components(particles.v), components(particles.F)
+    C = None if particles.C is None else components(particles.C)
+    with jax.named_scope("p2g"):
+        mass, momentum = p2g(stencil, particles.mass, v, C, grid.size)
+
+    # the grid's problem
+    images = mirror(scene.boundary, grid, window)
+    mass, momentum = images.fold_scalar(mass), images.fold(momentum)
+    occupied = (mass > jnp.finfo(mass.dtype).eps * particles.mass.mean())[:, None]
+    nodes = Nodes(
+        mass=jnp.where(occupied[:, 0], mass, 0),
+        velocity=jnp.where(occupied, momentum / jnp.where(occupied, mass[:, None], 1), 0),
+        occupied=occupied,
+        gravity=jnp.asarray(scene.gravity),
+        dt=dt,
+        potential=ElasticPotential(scene.material, particles.volume, F, None if scene.total else F, stencil, images),
+        conditions=combine(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total),
+    )
+
+    # the grid's new velocity
+    with jax.named_scope("update"):
+        velocity, solve_info, contact_info = update(nodes, method)
+
+    # grid to particles
+    before, after = images.unfold(nodes.velocity), images.unfold(velocity)
+    with jax.named_scope("g2p"):
+        moved, v, C = g2p(scene.transfer, stencil, v, before, after)
+        F = F + dt * nodes.potential.strain(velocity)
+    x = x + dt * moved
+
+    new = Particles(
+        x=particle_first(x),
+        v=particle_first(v),
+        mass=particles.mass,
+        volume=particles.volume,
+        F=particle_first(F),
+        C=None if C is None else particle_first(C),
+        X=particles.X,
+    )
+    outside = (~stencil.inside).sum().astype(jnp.int32)
+    return new, StepInfo(solve_info, contact_info, outside)
+
+
+def update(nodes: Nodes, method: Method) -> tuple[NodeVector, SolveInfo, ContactInfo]:
+    """The nodes' new velocity, boundaries and contact included."""
+    predictor = nodes.explicit_velocity()
+    guess = method.start(nodes, predictor)
+    if nodes.conditions.side is None:
+        v, _, info = method.velocity(nodes, predictor, guess, False)
+        return v, info, no_contact()
+
+    frozen_nodes, frozen_predictor, frozen_method = jax.lax.stop_gradient((nodes, predictor, method))
+
+    def try_set(active: Mask, guess: NodeVector) -> tuple[NodeVector, NodeVector]:
+        v, impulse, _ = frozen_method.velocity(frozen_nodes, frozen_predictor, guess, active)
+        return v, impulse
+
+    active, guess, sweeps = find_active_set(frozen_nodes.conditions, frozen_predictor, frozen_nodes.mass, try_set)
+    v, impulse, info = method.velocity(nodes, predictor, guess, active)
+    violations = count_violations(nodes.conditions, active, v, impulse, nodes.mass)
+    return with_friction(nodes.conditions, active, v, impulse, nodes.mass), info, ContactInfo(sweeps, violations)
+
+
+def step(
+    scene: Scene,
+    particles: Particles,
+    t: Scalar,
+    dt: Scalar,
+    *,
+    method: Method = Explicit(),  # noqa: B008
+) -> tuple[Particles, StepInfo]:
+    """One step of the Material Point Method, from t to t + dt.
+
+    P2G, the grid velocity's update by `method`, G2P, x ← x + Δt Σ_i w_ip v_i, F ← F + Δt Σ_i v_i h_ipᵀ.
+
+    Args:
+        scene: the scene.
+        particles: particles; what the scene needs and they lack is added (see `prepare`).
+        t: time at the start of the step [s].
+        dt: step [s].
+        method: `Explicit()`, `SemiImplicit(...)` or `BackwardEuler(...)`.
+
+    Returns:
+        the particles after the step, and a `StepInfo`. Nothing is raised for what only the numbers show: `StepInfo` says
+        whether the solve converged and whether particles left the window, and `simulate` acts on it.
+
+    Raises:
+        ValueError: from `prepare`, or a dt that is not positive.
+    """
+    require_positive("dt [s]", dt)
+    scene, t, dt, method = canonical((scene, t, dt, method), particles.x.dtype)
+    particles = particles if is_prepared(scene, particles) else prepare(scene, particles)
+    return _step(scene, particles, t, dt, method)
+
+
+@eqx.filter_jit
+def _step(scene: Any, particles: Any, t: Any, dt: Any, method: Any) -> Any:
+    return advance(scene, particles, t, dt, method)
+
+
+def determinant(particles: Particles) -> Array:
+    """J = det F of each particle [-], shape (p,)."""
+    return la.determinant(components(particles.F))

@@ -1,0 +1,142 @@
+"""Transfers between particles and grid. `spread` is the only function that scatters, `collect` the only one that gathers.
+
+Both are sums over a particle's stencil against a *basis*: an array (k, b, p) of b functions of the node, e.g. the weight
+and its d gradients. They are each other's transpose, so everything built of them (force and deformation, Hessian, P2G and
+G2P) is symmetric where mathematics says so.
+"""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._checks import require_between
+from mpmjax._kernel import Stencil
+from mpmjax._types import Array, Float, Matrix, NodeScalar, NodeVector, Scalar
+
+
+def spread(index: Array, basis: Float[Array, "k b p"], a: Float[Array, "b c p"], size: int) -> Float[Array, "n c"]:
+    """Scatter: the node array Σ_p Σ_b basis_kbp a_bcp, node n = index_kp."""
+
+    def add(nodes: Array, stencil_node: tuple[Array, Array]) -> tuple[Array, None]:
+        i, phi = stencil_node
+        rows = sum((phi[b] * a[b] for b in range(1, a.shape[0])), phi[0] * a[0])
+        return nodes.at[i].add(rows.T), None
+
+    empty = jnp.zeros((size, a.shape[1]), dtype=a.dtype)
+    return jax.lax.scan(add, empty, (index, basis))[0]
+
+
+def collect(index: Array, basis: Float[Array, "k b p"], nodes: Float[Array, "n c"]) -> Float[Array, "b c p"]:
+    """Gather, the transpose of `spread` in a: Σ_k basis_kbp nodes_nc, node n = index_kp."""
+
+    def add(total: Array, stencil_node: tuple[Array, Array]) -> tuple[Array, None]:
+        i, phi = stencil_node
+        return total + phi[:, None] * nodes[i].T, None
+
+    zero = jnp.zeros((basis.shape[1], nodes.shape[1], basis.shape[2]), dtype=nodes.dtype)
+    return jax.lax.scan(add, zero, (index, basis))[0]
+
+
+class PIC(eqx.Module):
+    """Particle-in-cell: particles take the grid's velocity (F. H. Harlow, Methods Comput. Phys. 3 (1964) 319).
+
+    Conserves linear momentum; loses angular momentum and, every step, all velocity that the grid does not resolve.
+    First order in space.
+    """
+
+    affine: ClassVar[bool] = False
+
+
+class FLIP(eqx.Module):
+    """FLIP(α): particles take the change of the grid's velocity, blended with PIC (J. U. Brackbill, H. M. Ruppel,
+    J. Comput. Phys. 65 (1986) 314, doi 10.1016/0021-9991(86)90211-1).
+
+    v ← α (v + Σ_i w_ip (v_i^{n+1} − v_i^n)) + (1 − α) Σ_i w_ip v_i^{n+1}. With α = 1 nothing is dissipated, noise in the
+    null space of the transfer included.
+
+    Args:
+        alpha: share of FLIP, from 0 (PIC) to 1.
+    """
+
+    alpha: Scalar = 0.99
+    affine: ClassVar[bool] = False
+
+    def __check_init__(self):
+        require_between("FLIP's alpha", self.alpha, 0, 1)
+
+
+class APIC(eqx.Module):
+    """Affine particle-in-cell (C. Jiang, C. Schroeder, A. Selle, J. Teran, A. Stomakhin, ACM Trans. Graph. 34 (2015) 51,
+    doi 10.1145/2766996).
+
+    Particles carry an affine velocity C [1/s]; linear and angular momentum are conserved by the transfers. Second order
+    in space with quadratic and cubic kernels.
+    """
+
+    affine: ClassVar[bool] = True
+
+
+Transfer = PIC | FLIP | APIC
+
+
+def p2g(
+    stencil: Stencil, mass: Float[Array, "p"], v: Float[Array, "d p"], C: Matrix | None, size: int
+) -> tuple[NodeScalar, NodeVector]:
+    """Particles to grid: m_i = Σ_p w_ip m_p and m_i v_i = Σ_p w_ip m_p (v_p + C_p (x_i − x_p)).
+
+    Conserves mass and linear momentum, and with the affine term angular momentum, to rounding.
+
+    Args:
+        stencil: stencil of the particles.
+        mass: m_p [kg], shape (p,).
+        v: v_p [m/s], shape (d, p).
+        C: affine velocity [1/s], shape (d, d, p), or None.
+        size: number of nodes.
+    Returns:
+        mass m_i [kg], shape (n,), and momentum m_i v_i [kg m/s], shape (n, d).
+    """
+    rows = jnp.concatenate([mass[None], mass * v])[None]
+    if C is None:
+        basis = stencil.weight[:, None]
+    else:
+        # w (x_i − x_p) = D g, with g the moving-least-squares gradient
+        slope = mass * jnp.swapaxes(C, 0, 1) * stencil.moment[:, None]
+        rows = jnp.concatenate([rows, jnp.pad(slope, ((0, 0), (1, 0), (0, 0)))])
+        basis = _affine_basis(stencil)
+    nodes = spread(stencil.index, basis, rows, size)
+    return nodes[:, 0], nodes[:, 1:]
+
+
+def g2p(
+    transfer: Transfer, stencil: Stencil, v: Float[Array, "d p"], before: NodeVector, after: NodeVector
+) -> tuple[Float[Array, "d p"], Float[Array, "d p"], Matrix | None]:
+    """Grid to particles.
+
+    Args:
+        transfer: PIC, FLIP or APIC.
+        stencil: stencil of the particles.
+        v: the particles' velocity before the step [m/s], shape (d, p).
+        before: v_i^n [m/s], shape (n, d).
+        after: v_i^{n+1} [m/s], shape (n, d).
+    Returns:
+        the velocity that carries the particles, Σ_i w_ip v_i^{n+1}, their new velocity, and their new C (APIC).
+    """
+    index, weight = stencil.index, stencil.weight[:, None]
+    match transfer:
+        case APIC():
+            moved, *gradient = collect(index, _affine_basis(stencil), after)
+            return moved, moved, jnp.swapaxes(jnp.stack(gradient), 0, 1)
+        case FLIP(alpha=alpha):
+            moved, change = jnp.split(collect(index, weight, jnp.concatenate([after, after - before], axis=1))[0], 2)
+            return moved, alpha * (v + change) + (1 - alpha) * moved, None
+        case _:
+            moved = collect(index, weight, after)[0]
+            return moved, moved, None
+
+
+def _affine_basis(stencil: Stencil) -> Float[Array, "k b p"]:
+    """The weight and the moving-least-squares gradient."""
+    slopes = stencil.gradient if stencil.affine is None else stencil.affine
+    return jnp.concatenate([stencil.weight[:, None], slopes], axis=1)

@@ -1,0 +1,66 @@
+"""Array aliases, and the glossary of axis names that every annotation in the package uses.
+
+    p   particles
+    n   nodes of the grid window, flattened in C order
+    d   space dimension (1, 2 or 3)
+    k   nodes of one particle's stencil, (order + 1)^d of them
+    f   saved frames
+
+At the public face a particle array starts with p: positions (p, d), deformation gradients (p, d, d). Inside a step,
+small matrices are *component first*, (d, d, p): `F[0, 1]` is then one contiguous array over the particles, which is
+what a CPU vectorises best, and a law reads as on paper. `components` and `particle_first` go between the two.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+Scalar = float | int | Float[Array, ""] | Float[np.ndarray, ""] | np.floating
+"""A number, or an array without axes."""
+
+PerParticle = float | int | Float[Array, "*#p"] | Float[np.ndarray, "*#p"] | np.floating
+"""One value for all particles, or one for each."""
+
+Point = tuple[float | int | Array, ...] | list[float | int] | Float[Array, "d"] | Float[np.ndarray, "d"]
+"""A point or vector of d numbers."""
+
+Mask = Bool[Array, "n d"]
+NodeScalar = Float[Array, "n"]
+NodeVector = Float[Array, "n d"]
+ParticleScalar = Float[Array, "p"]
+ParticleVector = Float[Array, "p d"]
+ParticleMatrix = Float[Array, "p d d"]
+Matrix = Float[Array, "d d *p"]
+"""A d x d matrix per particle (or a single one), component first."""
+
+Indices = Int[Array, "k p"]
+
+__all__ = [
+    "Array",
+    "Bool",
+    "Float",
+    "Indices",
+    "Int",
+    "Mask",
+    "Matrix",
+    "NodeScalar",
+    "NodeVector",
+    "ParticleMatrix",
+    "ParticleScalar",
+    "ParticleVector",
+    "PerParticle",
+    "Point",
+    "Scalar",
+    "components",
+    "particle_first",
+]
+
+
+def components(a: Array) -> Array:
+    """Move the particle axis last: (p, ...) to (..., p)."""
+    return jnp.moveaxis(a, 0, -1)
+
+
+def particle_first(a: Array) -> Array:
+    """Move the particle axis first: (..., p) to (p, ...)."""
+    return jnp.moveaxis(a, -1, 0)

@@ -1,0 +1,52 @@
+"""What an elastic law is."""
+
+import abc
+
+import equinox as eqx
+
+from mpmjax._types import Array, Bool, Matrix, PerParticle
+
+
+class AbstractTangent(eqx.Module):
+    """The stress differential at one deformation: the linear map δF ↦ δP = ∂²Ψ/∂F∂F : δF (reference, eq. 8).
+
+    Holds what does not depend on δF, so that a solver which applies it many times computes that once.
+    """
+
+    @abc.abstractmethod
+    def __call__(self, dF: Matrix) -> Matrix:
+        """δP [Pa] for δF [-], both of shape (d, d, p)."""
+
+
+class AbstractMaterial(eqx.Module):
+    """A hyperelastic law: energy density, its gradient and its second differential.
+
+    Matrices are component first, (d, d, p). Parameters are one value for all particles or one for each, shape (p,);
+    each is a leaf that can be differentiated and batched. Two dimensions are plane strain; one is uniaxial strain.
+    """
+
+    @abc.abstractmethod
+    def energy(self, F: Matrix) -> Array:
+        """Ψ(F) [J/m³ of undeformed volume], shape (p,)."""
+
+    @abc.abstractmethod
+    def stress(self, F: Matrix) -> Matrix:
+        """The first Piola-Kirchhoff stress P = ∂Ψ/∂F [Pa], shape (d, d, p)."""
+
+    @abc.abstractmethod
+    def tangent(self, F: Matrix) -> AbstractTangent:
+        """The stress differential at F."""
+
+    @abc.abstractmethod
+    def admits(self, F: Matrix) -> Bool[Array, "p"]:
+        """Whether the law is defined at F."""
+
+
+def shear_modulus(youngs_modulus: PerParticle, poisson_ratio: PerParticle) -> PerParticle:
+    """μ = E / (2 (1 + ν)) [Pa]."""
+    return youngs_modulus / (2 * (1 + poisson_ratio))
+
+
+def lame_lambda(youngs_modulus: PerParticle, poisson_ratio: PerParticle) -> PerParticle:
+    """λ = E ν / ((1 + ν)(1 − 2ν)) [Pa]."""
+    return youngs_modulus * poisson_ratio / ((1 + poisson_ratio) * (1 - 2 * poisson_ratio))

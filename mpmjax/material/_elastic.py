@@ -1,0 +1,164 @@
+"""Elastic laws: fixed corotated and neo-Hookean."""
+
+import jax.numpy as jnp
+
+from mpmjax import _linalg as la
+from mpmjax._checks import require_between, require_positive
+from mpmjax._types import Array, Bool, Matrix, PerParticle
+from mpmjax.material._base import AbstractMaterial, AbstractTangent, lame_lambda, shear_modulus
+
+
+class FixedCorotated(AbstractMaterial):
+    """Fixed corotated elasticity (A. Stomakhin, R. Howes, C. Schroeder, J. Teran, SCA 2012, doi 10.2312/SCA/SCA12/025-032).
+
+    Ψ = μ ‖F − R‖² + λ/2 (J − 1)², P = 2μ (F − R) + λ (J − 1) J F⁻ᵀ, with F = R S and J = det F; the differential is
+    eq. 11 of the reference.
+
+    *When it breaks*: never by inversion: it is defined for every F, J ≤ 0 included. Its Hessian is indefinite under any
+    uniform compression, and the stress differential grows like 1/(s_i + s_j) where two signed principal stretches
+    nearly cancel.
+    *Good values*: jelly E = 1e4 to 1e6 Pa, ν = 0.3; ν above 0.45 stiffens the volume and asks for more iterations.
+
+    Args:
+        youngs_modulus: E [Pa], one value or one per particle (p,).
+        poisson_ratio: ν [-], strictly between −1 and 0.5.
+    """
+
+    youngs_modulus: PerParticle
+    poisson_ratio: PerParticle
+
+    def __check_init__(self):
+        _check_moduli(self)
+
+    @property
+    def shear_modulus(self) -> PerParticle:
+        """μ [Pa]."""
+        return shear_modulus(self.youngs_modulus, self.poisson_ratio)
+
+    @property
+    def lame_lambda(self) -> PerParticle:
+        """λ [Pa]."""
+        return lame_lambda(self.youngs_modulus, self.poisson_ratio)
+
+    def energy(self, F: Matrix) -> Array:
+        """Ψ = μ ‖F − R‖² + λ/2 (J − 1)²."""
+        stretch = F - la.rotation(F)
+        return (
+            self.shear_modulus * la.double_dot(stretch, stretch) + self.lame_lambda / 2 * (la.determinant(F) - 1) ** 2
+        )
+
+    def stress(self, F: Matrix) -> Matrix:
+        """P = 2μ (F − R) + λ (J − 1) J F⁻ᵀ."""
+        volumetric = self.lame_lambda * (la.determinant(F) - 1)
+        return 2 * self.shear_modulus * (F - la.rotation(F)) + volumetric * la.cofactor(F)
+
+    def tangent(self, F: Matrix) -> "FixedCorotatedTangent":
+        """Eq. 11 of the reference, with R, (tr S I − S)⁻¹ and the cofactor computed once."""
+        R, cof = la.rotation(F), la.cofactor(F)
+        compliance = la.spin_compliance(la.matmul(la.transpose(R), F))
+        volumetric = self.lame_lambda * (la.determinant(F) - 1)
+        return FixedCorotatedTangent(F, R, compliance, cof, volumetric, self.shear_modulus, self.lame_lambda)
+
+    def admits(self, F: Matrix) -> Bool[Array, "p"]:
+        """Every finite F."""
+        return jnp.isfinite(F).all(axis=(0, 1))
+
+
+class FixedCorotatedTangent(AbstractTangent):
+    """δP = 2μ (δF − δR) + λ (J F⁻ᵀ : δF) J F⁻ᵀ + λ (J − 1) δ(J F⁻ᵀ) (reference, eq. 11)."""
+
+    F: Matrix
+    R: Matrix
+    compliance: Matrix
+    cofactor: Matrix
+    volumetric: Array
+    shear_modulus: PerParticle
+    lame_lambda: PerParticle
+
+    def __call__(self, dF: Matrix) -> Matrix:
+        """δP for δF."""
+        dR = la.rotation_differential(self.R, self.compliance, dF)
+        dJ = la.double_dot(self.cofactor, dF)
+        return (
+            2 * self.shear_modulus * (dF - dR)
+            + self.lame_lambda * dJ * self.cofactor
+            + self.volumetric * la.cofactor_differential(self.F, dF)
+        )
+
+
+class NeoHookean(AbstractMaterial):
+    """Compressible neo-Hookean elasticity (J. Bonet, R. D. Wood, Nonlinear Continuum Mechanics for Finite Element
+    Analysis, 2nd ed., Cambridge 2008, eq. 6.27).
+
+    Ψ = μ/2 (F : F − d) − μ ln J + λ/2 (ln J)², P = μ (F − F⁻ᵀ) + λ ln J F⁻ᵀ.
+
+    *When it breaks*: it needs J > 0; a step that inverts a particle is reported. Its Hessian can be indefinite under
+    compression and under expansion beyond ln J = 1 + μ/λ.
+    *Good values*: rubber μ = 0.1 to 2 MPa with ν = 0.49 (nearly incompressible), gels as for fixed corotated.
+
+    Args:
+        youngs_modulus: E [Pa], one value or one per particle (p,).
+        poisson_ratio: ν [-], strictly between −1 and 0.5.
+    """
+
+    youngs_modulus: PerParticle
+    poisson_ratio: PerParticle
+
+    def __check_init__(self):
+        _check_moduli(self)
+
+    @property
+    def shear_modulus(self) -> PerParticle:
+        """μ [Pa]."""
+        return shear_modulus(self.youngs_modulus, self.poisson_ratio)
+
+    @property
+    def lame_lambda(self) -> PerParticle:
+        """λ [Pa]."""
+        return lame_lambda(self.youngs_modulus, self.poisson_ratio)
+
+    def energy(self, F: Matrix) -> Array:
+        """Ψ = μ/2 (F : F − d) − μ ln J + λ/2 (ln J)²."""
+        log_J = jnp.log(la.determinant(F))
+        mu, lam = self.shear_modulus, self.lame_lambda
+        return mu / 2 * (la.double_dot(F, F) - F.shape[0]) - mu * log_J + lam / 2 * log_J**2
+
+    def stress(self, F: Matrix) -> Matrix:
+        """P = μ (F − F⁻ᵀ) + λ ln J F⁻ᵀ."""
+        J = la.determinant(F)
+        pull = (self.lame_lambda * jnp.log(J) - self.shear_modulus) / J
+        return self.shear_modulus * F + pull * la.cofactor(F)
+
+    def tangent(self, F: Matrix) -> "NeoHookeanTangent":
+        """δP = μ δF + λ (F⁻ᵀ : δF) F⁻ᵀ + (λ ln J − μ) δF⁻ᵀ, in terms of the cofactor matrix."""
+        J, cof = la.determinant(F), la.cofactor(F)
+        pull = (self.lame_lambda * jnp.log(J) - self.shear_modulus) / J
+        bulk = self.lame_lambda / J**2 - pull / J
+        return NeoHookeanTangent(F, cof, pull, bulk, self.shear_modulus)
+
+    def admits(self, F: Matrix) -> Bool[Array, "p"]:
+        """J > 0."""
+        return la.determinant(F) > 0
+
+
+class NeoHookeanTangent(AbstractTangent):
+    """δP = μ δF + q δ(J F⁻ᵀ) + b (J F⁻ᵀ : δF) J F⁻ᵀ, with q = (λ ln J − μ)/J and b = λ/J² − q/J = dq/dJ."""
+
+    F: Matrix
+    cofactor: Matrix
+    pull: Array
+    bulk: Array
+    shear_modulus: PerParticle
+
+    def __call__(self, dF: Matrix) -> Matrix:
+        """δP for δF."""
+        dJ = la.double_dot(self.cofactor, dF)
+        return (
+            self.shear_modulus * dF + self.pull * la.cofactor_differential(self.F, dF) + self.bulk * dJ * self.cofactor
+        )
+
+
+def _check_moduli(law: FixedCorotated | NeoHookean) -> None:
+    name = type(law).__name__
+    require_positive(f"{name}'s youngs_modulus [Pa]", law.youngs_modulus)
+    require_between(f"{name}'s poisson_ratio", law.poisson_ratio, -1, 0.5, open_ends=True)
