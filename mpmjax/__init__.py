@@ -2,13 +2,17 @@
 
 from mpmjax._boundary import AbstractBoundary, Conditions, Grip, SeparatingBox, SlipBox, StickyBox, SymmetryPlane
 from mpmjax._conjugate_residual import ConjugateResidual
+from mpmjax._diagnostics import Energy, energy, momentum
 from mpmjax._grid import Grid
 from mpmjax._guess import Guess
 from mpmjax._hessian import AnalyticHessian, JvpHessian
+from mpmjax._io import load, save
 from mpmjax._kernel import BSpline, MLSGradient, SplineGradient
 from mpmjax._motion import Motion
 from mpmjax._particles import Particles
+from mpmjax._record import record
 from mpmjax._region import AbstractRegion, Ball, Box
+from mpmjax._render import render
 from mpmjax._run import Run, SimulationError
 from mpmjax._sample import fill
 from mpmjax._scene import Scene, TotalLagrangian, UpdatedLagrangian, prepare
@@ -18,3 +22,62 @@ from mpmjax._transfer import APIC, FLIP, PIC
 from mpmjax.material import AbstractMaterial, AbstractTangent, FixedCorotated, NeoHookean
 
 __version__ = "0.1.0"
+
+__all__ = [  # noqa: RUF022 (grouped)
+    # scene
+    "Grid",
+    "Scene",
+    "UpdatedLagrangian",
+    "TotalLagrangian",
+    # particles and regions
+    "Particles",
+    "fill",
+    "prepare",
+    "AbstractRegion",
+    "Ball",
+    "Box",
+    # laws
+    "AbstractMaterial",
+    "AbstractTangent",
+    "FixedCorotated",
+    "NeoHookean",
+    # discretisation
+    "BSpline",
+    "MLSGradient",
+    "SplineGradient",
+    "APIC",
+    "FLIP",
+    "PIC",
+    # boundaries
+    "AbstractBoundary",
+    "Conditions",
+    "Grip",
+    "Motion",
+    "SeparatingBox",
+    "SlipBox",
+    "StickyBox",
+    "SymmetryPlane",
+    # grid updates
+    "BackwardEuler",
+    "Explicit",
+    "SemiImplicit",
+    "AnalyticHessian",
+    "JvpHessian",
+    "ConjugateResidual",
+    "Guess",
+    # running
+    "Run",
+    "SimulationError",
+    "StepInfo",
+    "record",
+    "rollout",
+    "simulate",
+    "step",
+    # results
+    "Energy",
+    "energy",
+    "load",
+    "momentum",
+    "render",
+    "save",
+]

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._checks import is_traced, require, require_between, require_finite
+from mpmjax._checks import coordinates, is_traced, require, require_between, require_finite
 from mpmjax._grid import Grid
 from mpmjax._motion import Motion
 from mpmjax._region import AbstractRegion
@@ -36,6 +36,11 @@ class Conditions(eqx.Module):
 class AbstractBoundary(eqx.Module):
     """A boundary condition."""
 
+    @property
+    @abc.abstractmethod
+    def dim(self) -> int | None:
+        """The space dimension it is made for; None where it fits any."""
+
     @abc.abstractmethod
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """The conditions on nodes at the given positions for the step from t to t + dt.
@@ -54,7 +59,7 @@ def _walls(lower: Point, upper: Point, nodes: NodeVector, spacing: Scalar) -> No
 
 def _check_box(name: str, lower: Point, upper: Point) -> None:
     require(
-        np.shape(lower) == np.shape(upper) and len(np.shape(lower)) == 1,
+        coordinates(f"{name}'s lower corner", lower) == coordinates(f"{name}'s upper corner", upper),
         f"{name} needs two corners with as many coordinates, got {lower} and {upper}.",
     )
     if not is_traced((lower, upper)):
@@ -80,6 +85,11 @@ class StickyBox(AbstractBoundary):
     def __check_init__(self):
         _check_box("StickyBox", self.lower, self.upper)
 
+    @property
+    def dim(self) -> int:
+        """That of the corners."""
+        return len(self.lower)
+
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v = 0."""
         del t, dt, reference
@@ -103,6 +113,11 @@ class SlipBox(AbstractBoundary):
 
     def __check_init__(self):
         _check_box("SlipBox", self.lower, self.upper)
+
+    @property
+    def dim(self) -> int:
+        """That of the corners."""
+        return len(self.lower)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v·n = 0."""
@@ -131,12 +146,17 @@ class SeparatingBox(AbstractBoundary):
         _check_box("SeparatingBox", self.lower, self.upper)
         require_between("SeparatingBox's friction", self.friction, 0, 1e6)
 
+    @property
+    def dim(self) -> int:
+        """That of the corners."""
+        return len(self.lower)
+
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v·n ≥ 0 ⟂ reaction ≥ 0."""
         del t, dt, reference
         nothing = jnp.zeros(nodes.shape, dtype=bool)
         side = _walls(self.lower, self.upper, nodes, spacing)
-        return Conditions(nothing, jnp.zeros_like(nodes), side, self.friction * jnp.abs(side))
+        return Conditions(nothing, jnp.zeros_like(nodes), side, jnp.abs(side) * self.friction)
 
 
 class Grip(AbstractBoundary):
@@ -156,8 +176,13 @@ class Grip(AbstractBoundary):
         static=True, default=None, converter=lambda a: a if a is None else tuple(a)
     )
 
+    @property
+    def dim(self) -> int:
+        """That of the motion."""
+        return np.shape(self.motion.displacement)[1]
+
     def __check_init__(self):
-        d = np.shape(self.motion.displacement)[1]
+        d = self.dim
         require(
             len(self.region.bounds()[0] if not is_traced(self.region) else range(d)) == d,
             "A grip's region and motion must have the same dimension.",
@@ -193,6 +218,11 @@ class SymmetryPlane(AbstractBoundary):
     axis: int = eqx.field(static=True)
     position: Scalar
     keep: str = eqx.field(static=True, default="above")
+
+    @property
+    def dim(self) -> None:
+        """Any that has the axis."""
+        return None
 
     def __check_init__(self):
         require_finite("A symmetry plane's position", self.position)

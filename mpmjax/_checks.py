@@ -8,11 +8,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 
 def is_traced(tree: Any) -> bool:
     """Whether any leaf of the tree is a tracer, so that its value is not known yet."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def require(condition: Any, message: str) -> None:
@@ -34,7 +35,14 @@ def require_positive(name: str, value: Any) -> None:
         require(np.asarray(value) > 0, f"{name} must be greater than zero, got {value}.")
 
 
-def require_between(name: str, value: Any, lower: float, upper: float, *, open_ends: bool = False) -> None:
+def coordinates(name: str, point: Any) -> int:
+    """How many coordinates a point has; it must be a plain sequence of them."""
+    shape = np.shape(point)
+    require(len(shape) == 1, f"{name} must be a sequence of numbers, one a direction, got {point}.")
+    return shape[0]
+
+
+def require_between(name: str, value: Any, lower: float | int, upper: float | int, *, open_ends: bool = False) -> None:
     """Every number of `value` must lie in [lower, upper], or in (lower, upper) with `open_ends`."""
     require_finite(name, value)
     if not is_traced(value):

@@ -26,6 +26,7 @@ class Problem(eqx.Module):
     stencil: Stencil | None
     dt: Scalar
     method: Method
+    observe: Callable[[Scene, Particles], Any] | None = None
 
     def at(self, state: State) -> Particles:
         """The particles in a state."""

@@ -92,7 +92,7 @@ class NewtonProblem(AbstractProblem):
 
     mass: NodeScalar
     inertial: NodeVector
-    dt: Scalar
+    dt: Float[Array, ""]
     potential: ElasticPotential
     hessian: Hessian
     free: Mask

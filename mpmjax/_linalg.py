@@ -8,7 +8,7 @@ than batched LAPACK or tiny `dot_general`s, and its derivatives are as cheap.
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Matrix
+from mpmjax._types import Array, Compliance, Matrix
 
 _NEWTON_STEPS = 16  # on the quartic of the 3-D rotation: halves the error until near, then squares it
 _POLISH_STEPS = 2  # on the rotation itself
@@ -129,7 +129,7 @@ def _rotation_jvp(primals: tuple[Matrix], tangents: tuple[Matrix]) -> tuple[Matr
     return R, rotation_differential(R, spin_compliance(matmul(transpose(R), F)), dF)
 
 
-def spin_compliance(S: Matrix) -> Matrix:
+def spin_compliance(S: Matrix) -> Compliance:
     """(tr(S) I − S)⁻¹, which turns the vector of a skew matrix into a spin (eq. 12 of the reference, solved for U).
 
     Shape (3, 3, *batch) in 3-D; in 2-D the scalar 1 / tr S as (1, 1, *batch); in 1-D there is no spin and the result,
@@ -145,7 +145,7 @@ def spin_compliance(S: Matrix) -> Matrix:
             return transpose(cofactor(system)) / determinant(system)
 
 
-def rotation_differential(R: Matrix, compliance: Matrix, dF: Matrix) -> Matrix:
+def rotation_differential(R: Matrix, compliance: Compliance, dF: Matrix) -> Matrix:
     """δR = R [ω]ₓ with (tr(S) I − S) ω = vee(RᵀδF − δFᵀR) (eq. 12 of the reference).
 
     Args:

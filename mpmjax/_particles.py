@@ -4,7 +4,7 @@ import equinox as eqx
 from jaxtyping import Float
 
 from mpmjax._checks import require, require_positive
-from mpmjax._types import Array, ParticleMatrix, ParticleScalar, ParticleVector
+from mpmjax._types import Array, Matrix, ParticleMatrix, ParticleScalar, ParticleVector, components, particle_first
 
 
 class Particles(eqx.Module):
@@ -43,6 +43,16 @@ class Particles(eqx.Module):
         """Number of particles p."""
         return self.x.shape[0]
 
+    def deformation(self) -> Matrix:
+        """F component first, shape (d, d, p).
+
+        Raises:
+            ValueError: the particles are not prepared.
+        """
+        if self.F is None:
+            raise ValueError("The particles have no deformation gradient yet: call prepare(scene, particles) first.")
+        return components(self.F)
+
     @property
     def dim(self) -> int:
         """Space dimension d."""
@@ -60,9 +70,7 @@ class State(eqx.Module):
 
 def state_of(particles: Particles) -> State:
     """The evolving part of prepared particles."""
-    if particles.F is None:
-        raise ValueError("The particles are not prepared: call prepare(scene, particles) first.")
-    return State(particles.x, particles.v, particles.C, particles.F)
+    return State(particles.x, particles.v, particles.C, particle_first(particles.deformation()))
 
 
 def with_state(particles: Particles, state: State) -> Particles:

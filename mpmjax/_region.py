@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._checks import is_traced, require, require_finite, require_positive
+from mpmjax._checks import coordinates, is_traced, require, require_finite, require_positive
 from mpmjax._types import Array, Bool, Float, Point, Scalar
 
 
@@ -35,7 +35,7 @@ class Box(AbstractRegion):
 
     def __check_init__(self):
         require(
-            np.shape(self.lower) == np.shape(self.upper) and len(np.shape(self.lower)) == 1,
+            coordinates("A box's lower corner", self.lower) == coordinates("A box's upper corner", self.upper),
             f"A box needs two corners with as many coordinates, got {self.lower} and {self.upper}.",
         )
         if not is_traced((self.lower, self.upper)):

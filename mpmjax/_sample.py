@@ -65,8 +65,8 @@ def fill(
     if not isinstance(region, Box):
         lattice = lattice[np.asarray(region.contains(jnp.asarray(lattice)))]
     require(len(lattice) > 0, f"{region} holds no particle at this spacing: refine the grid or enlarge the region.")
-    dtype = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
-    x = jnp.asarray(lattice, dtype=dtype)
-    v = jnp.broadcast_to(jnp.asarray((0.0,) * d if velocity is None else velocity, dtype=dtype), x.shape)
-    volume = jnp.full(len(lattice), np.prod(cell), dtype=dtype)
-    return Particles(x=x, v=v, mass=jnp.asarray(density, dtype) * volume, volume=volume)
+    precision = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
+    x = jnp.asarray(lattice, dtype=precision)
+    v = jnp.broadcast_to(jnp.asarray((0.0,) * d if velocity is None else velocity, dtype=precision), x.shape)
+    volume = jnp.full(len(lattice), np.prod(cell), dtype=precision)
+    return Particles(x=x, v=v, mass=jnp.asarray(density, precision) * volume, volume=volume)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._boundary import AbstractBoundary, SeparatingBox, SymmetryPlane
-from mpmjax._checks import is_traced, require, require_finite
+from mpmjax._checks import coordinates, is_traced, require, require_finite
 from mpmjax._grid import Grid
 from mpmjax._kernel import BSpline, Gradient, MLSGradient, Stencil, in_window, make_stencil
 from mpmjax._particles import Particles
@@ -81,13 +81,12 @@ class Scene(eqx.Module):
 
     def __check_init__(self):
         d = self.grid.dim
-        require(np.shape(self.gravity) == (d,), f"gravity must have {d} components, got {self.gravity}.")
+        require(coordinates("gravity", self.gravity) == d, f"gravity must have {d} components, got {self.gravity}.")
         require_finite("gravity", self.gravity)
         for boundary in self.boundary:
-            corners = getattr(boundary, "lower", None)
             require(
-                corners is None or np.shape(corners) == (d,),
-                f"{type(boundary).__name__} must have {d} coordinates a corner, as the grid has, got {corners}.",
+                boundary.dim in (None, d),
+                f"{type(boundary).__name__} must have {d} coordinates, as the grid has, got {boundary.dim}.",
             )
             if isinstance(boundary, SymmetryPlane):
                 self._check_plane(boundary)

@@ -1,7 +1,7 @@
 """Rollouts: many steps, saved, watched and differentiated."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import diffrax
 import equinox as eqx
@@ -36,11 +36,11 @@ def simulate(
     scene: Scene,
     particles: Particles,
     *,
-    t1: float,
-    dt: float,
+    t1: float | int,
+    dt: float | int,
     method: Method = Explicit(),  # noqa: B008
     save_every: int | None = None,
-    observe: Callable[[Particles], Any] | None = None,
+    observe: Callable[[Scene, Particles], Any] | None = None,
     start: int = 0,
     adjoint: diffrax.AbstractAdjoint | None = None,
     checkpoint_bytes: int = _CHECKPOINT_BYTES,
@@ -60,8 +60,9 @@ def simulate(
         dt: step [s].
         method: update of the grid velocity.
         save_every: save the state at the start, every so many steps, and at the end. Default: only `final` is returned.
-        observe: instead of states, save what this function returns for the particles (a curve costs no more memory than
-            its points). `save_every` then defaults to 1. Pass the same function object again to reuse the compilation.
+        observe: instead of states, save what this function of (scene, particles) returns, so that a curve costs no more
+            memory than its points. `save_every` then defaults to 1. It may be an `equinox.Module` with arrays; a plain
+            function compiles anew unless it is the same object.
         start: number of the first step, e.g. a former run's `final_step`; time there is start·dt.
         adjoint: how diffrax differentiates. Default: recursive checkpointing.
         checkpoint_bytes: memory for the checkpoints of the default adjoint [B]. Fewer of them cost recomputation.
@@ -163,7 +164,7 @@ def _rollout(scene: Scene, particles: Particles, dt: Scalar, method: Method, ste
     return with_state(particles, jax.lax.scan(body, state_of(particles), number)[0])
 
 
-def number_of_steps(t1: float, dt: float, start: int, dtype: Any) -> int:
+def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
     """How many steps of dt lead from step `start` to time t1.
 
     Raises:
@@ -201,18 +202,18 @@ def integrate(
     *,
     max_steps: int,
     save_every: int | None,
-    observe: Callable[[Particles], Any] | None,
+    observe: Callable[[Scene, Particles], Any] | None,
     adjoint: diffrax.AbstractAdjoint,
     progress: bool,
     watch: bool,
 ) -> tuple[Any, State, Tally, State | None]:
     """`count` ≤ `max_steps` steps from step `start`: (steps and values saved), final state, tally, and with `watch`,
     which stops the run at a fault, the state before the last step."""
-    problem = Problem(scene, particles, scene.stencil(particles) if scene.total else None, dt, method)
+    problem = Problem(scene, particles, scene.stencil(particles) if scene.total else None, dt, method, observe)
 
     def kept(t: Any, y: State, args: Problem) -> Any:
         del t
-        return y if observe is None else observe(args.at(y))
+        return y if args.observe is None else args.observe(args.scene, args.at(y))
 
     subs = {"final": diffrax.SubSaveAt(t1=True)}
     if save_every is not None:
@@ -232,9 +233,9 @@ def integrate(
         throw=False,
         progress_meter=diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter(),
     )
-    tally, previous = solution.solver_state
-    final = jax.tree.map(lambda a: a[-1], solution.ys["final"])
-    saved = None if save_every is None else (step_number(solution.ts["frames"]), solution.ys["frames"])
+    times, values, (tally, previous) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
+    final = jax.tree.map(lambda a: a[-1], values["final"])
+    saved = None if save_every is None else (step_number(times["frames"]), values["frames"])
     return saved, final, tally, previous
 
 
@@ -259,7 +260,7 @@ def raise_faults(run: Run, previous: State | None, start: int) -> None:
         good = eqx.tree_at(
             lambda r: (r.final, r.final_step),
             run,
-            (with_state(run.final, previous), jnp.asarray(step - 1, run.dt.dtype)),
+            (with_state(run.final, previous), jnp.asarray(step - 1, run.final_step.dtype)),
         )
         raise SimulationError(
             f"At step {step} (t = {step * float(run.dt):.6g} s) particle {first} {what}; the last good position was "
@@ -275,7 +276,7 @@ def raise_faults(run: Run, previous: State | None, start: int) -> None:
         )
 
 
-_FAULTS = {
+_FAULTS: dict[int, tuple[str, str]] = {
     NOT_FINITE: ("is no longer finite", "Reduce dt (explicit steps have a limit), or use an implicit method."),
     OUTSIDE: ("left the grid's window", "Enlarge the grid's shape, or use follow=True."),
     INADMISSIBLE: (

@@ -19,7 +19,7 @@ from mpmjax._particles import Particles
 from mpmjax._potential import ElasticPotential
 from mpmjax._scene import Scene, is_prepared, prepare
 from mpmjax._transfer import g2p, p2g
-from mpmjax._types import Array, Int, Mask, NodeScalar, NodeVector, Scalar, components, particle_first
+from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar, components, particle_first
 
 
 class Nodes(eqx.Module):
@@ -29,11 +29,11 @@ class Nodes(eqx.Module):
     """m_i [kg], shape (n,), folded at symmetry planes."""
     velocity: NodeVector
     """v_i^n [m/s], shape (n, d); zero on empty nodes."""
-    occupied: Mask
+    occupied: Bool[Array, "n 1"]
     """Whether the node has mass beyond rounding, shape (n, 1)."""
     gravity: Array
     """Body acceleration g [m/s²], shape (d,)."""
-    dt: Scalar
+    dt: Float[Array, ""]
     """Δt [s]."""
     potential: ElasticPotential
     """Φ, of nodal displacements."""
@@ -197,7 +197,7 @@ def advance(
     stencil = scene.stencil(particles) if stencil is None else stencil
 
     # particles to grid
-    x, v, F = components(particles.x), components(particles.v), components(particles.F)
+    x, v, F = components(particles.x), components(particles.v), particles.deformation()
     C = None if particles.C is None else components(particles.C)
     with jax.named_scope("p2g"):
         mass, momentum = p2g(stencil, particles.mass, v, C, grid.size)
@@ -211,7 +211,7 @@ def advance(
         velocity=jnp.where(occupied, momentum / jnp.where(occupied, mass[:, None], 1), 0),
         occupied=occupied,
         gravity=jnp.asarray(scene.gravity),
-        dt=dt,
+        dt=jnp.asarray(dt),
         potential=ElasticPotential(scene.material, particles.volume, F, None if scene.total else F, stencil, images),
         conditions=combine(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total),
     )
@@ -299,4 +299,4 @@ def _step(scene: Any, particles: Any, t: Any, dt: Any, method: Any) -> Any:
 
 def determinant(particles: Particles) -> Array:
     """J = det F of each particle [-], shape (p,)."""
-    return la.determinant(components(particles.F))
+    return la.determinant(particles.deformation())

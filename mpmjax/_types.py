@@ -11,15 +11,21 @@ small matrices are *component first*, (d, d, p): `F[0, 1]` is then one contiguou
 what a CPU vectorises best, and a law reads as on paper. `components` and `particle_first` go between the two.
 """
 
+from typing import TYPE_CHECKING
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-Scalar = float | int | Float[Array, ""] | Float[np.ndarray, ""] | np.floating
-"""A number, or an array without axes."""
+if TYPE_CHECKING:  # a static checker need not follow NumPy arrays into JAX expressions, which take them
+    Scalar = float | Array
+    PerParticle = float | Array
+else:
+    Scalar = float | int | Float[Array, ""] | Float[np.ndarray, ""] | np.floating
+    """A number, or an array without axes."""
 
-PerParticle = float | int | Float[Array, "*#p"] | Float[np.ndarray, "*#p"] | np.floating
-"""One value for all particles, or one for each."""
+    PerParticle = float | int | Float[Array, "*#p"] | Float[np.ndarray, "*#p"] | np.floating
+    """One value for all particles, or one for each."""
 
 Point = tuple[float | int | Array, ...] | list[float | int] | Float[Array, "d"] | Float[np.ndarray, "d"]
 """A point or vector of d numbers."""
@@ -33,11 +39,15 @@ ParticleMatrix = Float[Array, "p d d"]
 Matrix = Float[Array, "d d *p"]
 """A d x d matrix per particle (or a single one), component first."""
 
+Compliance = Float[Array, "s s *p"]
+"""What turns the vector of a skew d x d matrix into a spin: s = 3 in 3-D, else 1."""
+
 Indices = Int[Array, "k p"]
 
 __all__ = [
     "Array",
     "Bool",
+    "Compliance",
     "Float",
     "Indices",
     "Int",

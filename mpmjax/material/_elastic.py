@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 from mpmjax import _linalg as la
 from mpmjax._checks import require_between, require_positive
-from mpmjax._types import Array, Bool, Matrix, PerParticle
+from mpmjax._types import Array, Bool, Compliance, Matrix, PerParticle
 from mpmjax.material._base import AbstractMaterial, AbstractTangent, lame_lambda, shear_modulus
 
 
@@ -69,7 +69,7 @@ class FixedCorotatedTangent(AbstractTangent):
 
     F: Matrix
     R: Matrix
-    compliance: Matrix
+    compliance: Compliance
     cofactor: Matrix
     volumetric: Array
     shear_modulus: PerParticle

@@ -1,0 +1,61 @@
+"""What a state weighs, moves and stores: mass, momentum and energy."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mpmjax._kernel import Stencil
+from mpmjax._particles import Particles
+from mpmjax._scene import Scene, prepare
+from mpmjax._transfer import p2g
+from mpmjax._types import Array, Float, components
+
+
+class Energy(eqx.Module):
+    """The energy of a state [J] (per metre of thickness in 2-D, per square metre of section in 1-D)."""
+
+    kinetic: Float[Array, "*f"]
+    """½ Σ m (‖v‖² + C D Cᵀ): the affine part of APIC's velocities included."""
+    elastic: Float[Array, "*f"]
+    """Σ V0 Ψ(F)."""
+    potential: Float[Array, "*f"]
+    """−Σ m g·x."""
+
+    @property
+    def total(self) -> Float[Array, "*f"]:
+        """Their sum."""
+        return self.kinetic + self.elastic + self.potential
+
+
+@eqx.filter_jit
+def energy(scene: Scene, particles: Particles) -> Energy:
+    """The energy of the particles.
+
+    Args:
+        scene: the scene.
+        particles: its particles.
+    """
+    particles = prepare(scene, particles)
+    speed2 = (particles.v**2).sum(axis=1)
+    if particles.C is not None:
+        moment = scene.stencil(particles).moment.T[:, None, :]
+        speed2 = speed2 + (particles.C**2 * moment).sum(axis=(1, 2))
+    gravity = jnp.asarray(scene.gravity, particles.x.dtype)
+    return Energy(
+        kinetic=(particles.mass * speed2).sum() / 2,
+        elastic=(particles.volume * scene.material.energy(particles.deformation())).sum(),
+        potential=-(particles.mass[:, None] * particles.x * gravity).sum(),
+    )
+
+
+def momentum(particles: Particles) -> Float[Array, "d"]:
+    """Linear momentum Σ m v [kg m/s], shape (d,)."""
+    return (particles.mass[:, None] * particles.v).sum(axis=0)
+
+
+@eqx.filter_jit
+def grid_mass(scene: Scene, particles: Particles) -> Float[Array, ""]:
+    """The mass that arrives on the grid [kg]: that of the particles to rounding, or some of it left the window."""
+    particles = prepare(scene, particles)
+    stencil: Stencil = scene.stencil(particles)
+    nodes, _ = p2g(stencil, particles.mass, components(particles.v), None, scene.grid.size)
+    return nodes.sum()

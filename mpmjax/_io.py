@@ -1,0 +1,362 @@
+"""Runs in files: HDF5 that ParaView opens as it is, and from which a run continues bit for bit.
+
+    /VTKHDF     the frames in VTK's layout (see `_vtkhdf`): Points, and as PointData velocity, deformation_gradient,
+                J = det F and, with APIC, affine_velocity
+    /mpmjax     format, version, d, dtype, units, dt, mass, volume, X, the scene and the method as JSON (see `_schema`)
+                with their arrays, and a table with one row a frame: its step and the run's `Tally` up to it
+
+Whatever is not in a dataset with checksums lies in headers that HDF5 checks itself, so a flipped bit is found. `NSteps`
+is raised last, and what lies beyond it, the remains of a writer that was killed, is neither read nor kept.
+"""
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._checks import canonical, is_traced, require
+from mpmjax._diffrax import Tally, no_steps
+from mpmjax._particles import Particles, State, state_of, with_state
+from mpmjax._run import Run
+from mpmjax._scene import Scene
+from mpmjax._schema import decode, encode
+from mpmjax._step import Method
+from mpmjax._vtkhdf import File, add_fixed, add_growing, add_topology, count_in, rows_of, set_count, states_in
+
+_FORMAT = 1
+_LIBVER = ("v110", "v110")  # what "latest" writes, VTK 9.7 cannot read
+_UNITS = "SI: m, s, kg, Pa; deformation_gradient and J are pure numbers, affine_velocity is in 1/s"
+_UNCHANGING = ("mass", "volume", "X")
+_REMEDY = "restore it from a copy, or run the simulation again"
+
+
+class FrameWriter:
+    """Writes a run a frame at a time. What is written has left the program when `append` returns.
+
+    A context manager: leaving it closes the file.
+    """
+
+    def __init__(self, file: File, path: Path):
+        """Use `create` or `resume`."""
+        self._file, self._path = file, path
+
+    @classmethod
+    def create(
+        cls,
+        path: str | os.PathLike,
+        scene: Scene,
+        particles: Particles,
+        method: Method,
+        dt: Any,
+        *,
+        overwrite: bool = False,
+    ) -> "FrameWriter":
+        """Begin a file without frames.
+
+        Args:
+            path: the file to be.
+            scene: the scene.
+            particles: prepared particles (see `prepare`); their state is not written.
+            method: the method.
+            dt: step [s].
+            overwrite: replace a file that is there.
+
+        Raises:
+            ValueError: a file that is there, a place that cannot be written, an object that files cannot hold.
+        """
+        path = Path(path)
+        described = _describe(scene, particles, method, dt)
+        rows = _rows(0, 0, described["dt"], state_of(particles), no_steps(particles.x.dtype))
+        require(
+            overwrite or not path.exists(), f"{path} exists: choose another name, remove it, or pass overwrite=True."
+        )
+        file = _opened(path, "w")
+        add_topology(file, particles.count)
+        file.create_group("mpmjax/arrays")
+        for name, data in rows.items():
+            add_growing(file, name, data)
+        _write_description(file["mpmjax"], described)
+        file.flush()
+        return cls(file, path)
+
+    @classmethod
+    def resume(
+        cls, path: str | os.PathLike, scene: Scene, particles: Particles, method: Method, dt: Any
+    ) -> "FrameWriter":
+        """Open a file to append frames to it, after checking that it is whole and of the same run.
+
+        Frames that a killed writer left incomplete are cut off.
+
+        Raises:
+            ValueError: see `load`; a scene, particles, method or dt that differ from the file's.
+        """
+        path = Path(path)
+        described = _describe(scene, particles, method, dt)
+        rows = _rows(0, 0, described["dt"], state_of(particles), no_steps(particles.x.dtype))
+        with _reading(path) as file:
+            _check_whole(file)
+            _check_same(path, described, _description(file["mpmjax"]))
+            require(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
+        file = _opened(path, "r+")
+        for name, data in rows.items():
+            file[name].resize(count_in(file) * len(data), axis=0)
+        return cls(file, path)
+
+    def append(self, step: int, state: State, tally: Tally) -> None:
+        """Write a frame; one of the last frame's step replaces it.
+
+        Args:
+            step: its step number.
+            state: its state.
+            tally: of the run up to it.
+
+        Raises:
+            OSError: the disk refused. The frames before are whole.
+        """
+        file, n = self._file, count_in(self._file)
+        if n and file["mpmjax/frames"][n - 1]["step"] == step:
+            n -= 1
+        try:
+            for name, rows in _rows(n, step, file["mpmjax"].attrs["dt"], state, tally).items():
+                file[name].resize((n + 1) * len(rows), axis=0)
+                file[name][n * len(rows) :] = rows
+            file.flush()
+            set_count(file, n + 1)
+            file.flush()
+        except (OSError, RuntimeError) as error:
+            raise OSError(
+                f"{self._path}: frame {n} could not be written ({_reason(error)}); the frames before it are kept."
+            ) from None
+
+    def last(self) -> tuple[int, State, Tally]:
+        """Step number, state and tally of the last frame."""
+        n = count_in(self._file)
+        steps, states, tallies = _frames(self._file, n - 1, n)
+        return int(steps[0]), *jax.tree.map(lambda a: a[0], (states, tallies))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> "FrameWriter":
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def save(path: str | os.PathLike, run: Run) -> None:
+    """Save a run's frames (without frames, its final state as the one frame) with all that a restart needs.
+
+    The file is written aside, synced and renamed: at every moment `path` is either what it was or the whole run.
+    Observations are not saved. Of the tally only the last frame's is known; the others are −1.
+
+    Raises:
+        ValueError: a run inside a jax transformation or a batch of them, a scene that files cannot hold, a place that
+            cannot be written.
+    """
+    path = Path(path)
+    require(not is_traced(run), "A run inside a jax transformation has no values yet: save it outside.")
+    require(run.final.x.ndim == 2, "Save a batch of runs one by one: jax.tree.map(lambda a: a[i], run).")
+    steps, final_step = np.asarray(run.steps), int(run.final_step)
+    unknown = jax.tree.map(lambda a: np.full_like(a, -1), run.tally)
+    aside = path.with_name(path.name + ".part")
+    try:
+        with FrameWriter.create(aside, run.scene, run.final, run.method, run.dt, overwrite=True) as writer:
+            for i in range(len(run)):
+                if steps[i] < final_step:  # a run that met a fault has frames beyond its last good state
+                    writer.append(int(steps[i]), jax.tree.map(lambda a, i=i: a[i], run.frames), unknown)
+            writer.append(final_step, state_of(run.final), run.tally)
+        with open(aside, "rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(aside, path)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def load(path: str | os.PathLike) -> Run:
+    """The run in a file, bit for bit: scene, method, dt, frames, tally; `final` is the last frame.
+
+    Raises:
+        ValueError: a file that is missing, cut short or damaged, not of this package or of another format, without
+            frames; or a float64 run while jax's 64-bit mode is off.
+    """
+    path = Path(path)
+    with _reading(path) as file:
+        described = _description(file["mpmjax"])
+        dtype, arrays = np.dtype(described["dtype"]), described["arrays"]
+        require(
+            dtype == jnp.zeros((), dtype).dtype,
+            f'{path} holds a {dtype} run: call jax.config.update("jax_enable_x64", True) first.',
+        )
+        require(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
+        steps, frames, tallies = _frames(file, 0, count_in(file))
+        scene = decode(described["scene"], Scene, "scene", arrays)
+        method = decode(described["method"], Method, "method", arrays)
+        scene, method = canonical((scene, method), dtype)
+    last = jax.tree.map(lambda a: a[-1], frames)
+    parts: dict[str, Any] = {k: a if a is None else jnp.asarray(a) for k, a in described["particles"].items()}
+    return Run(
+        scene=scene,
+        method=method,
+        dt=jnp.asarray(described["dt"], dtype),
+        steps=jnp.asarray(steps, dtype),
+        frames=frames,
+        observed=None,
+        final=with_state(Particles(x=last.x, v=last.v, **parts), last),
+        final_step=jnp.asarray(steps[-1], dtype),
+        tally=jax.tree.map(lambda a: a[-1], tallies),
+    )
+
+
+def _describe(scene: Scene, particles: Particles, method: Method, dt: Any) -> dict[str, Any]:
+    """What a file says of a run beside its frames."""
+    dtype = particles.x.dtype
+    scene, method, dt = canonical((scene, method, dt), dtype)
+    arrays: dict[str, np.ndarray] = {}
+    parts = {name: getattr(particles, name) for name in _UNCHANGING}
+    return {
+        "dtype": str(dtype),
+        "d": particles.dim,
+        "dt": np.asarray(dt)[()],
+        "scene": encode(scene, arrays),
+        "method": encode(method, arrays, "method"),
+        "arrays": arrays,
+        "particles": {name: None if a is None else np.asarray(a) for name, a in parts.items()},
+    }
+
+
+def _write_description(group: File, described: dict[str, Any]) -> None:
+    for name, text in {"version": version("mpmjax"), "units": _UNITS, "dtype": described["dtype"]}.items():
+        group.attrs.create(name, np.bytes_(text))  # of fixed length: others lie where HDF5 has no checksum
+    group.attrs["format"] = np.int64(_FORMAT)
+    group.attrs["d"] = np.int64(described["d"])
+    group.attrs["dt"] = described["dt"]
+    for name in ("scene", "method"):
+        add_fixed(group, name, np.frombuffer(json.dumps(described[name]).encode(), np.uint8))
+    for name, data in described["particles"].items():
+        if data is not None:
+            add_fixed(group, name, data)
+    for name, data in described["arrays"].items():
+        add_fixed(group, f"arrays/{name}", data)
+
+
+def _description(group: File) -> dict[str, Any]:
+    """What `_describe` said when the file was written."""
+    return {
+        "dtype": group.attrs["dtype"].decode(),
+        "d": int(group.attrs["d"]),
+        "dt": group.attrs["dt"],
+        **{name: json.loads(group[name][...].tobytes()) for name in ("scene", "method")},
+        "arrays": {name: dataset[...] for name, dataset in group["arrays"].items()},
+        "particles": {name: group[name][...] if name in group else None for name in _UNCHANGING},
+    }
+
+
+def _rows(frame: int, step: int, dt: Any, state: State, tally: Tally) -> dict[str, np.ndarray]:
+    """What a frame adds to each dataset."""
+    values = {"step": np.int64(step)} | {f.name: np.asarray(getattr(tally, f.name)) for f in fields(Tally)}
+    row = np.array([tuple(values.values())], [(name, a.dtype) for name, a in values.items()])
+    return rows_of(frame, step * float(dt), state) | {"mpmjax/frames": row}
+
+
+def _frames(file: File, start: int, stop: int) -> tuple[np.ndarray, State, Tally]:
+    """Step numbers, states and tallies of frames `start` to `stop`, each with a leading axis."""
+    table = file["mpmjax/frames"][start:stop]
+    require(len(table) == stop - start, "frames are missing")
+    tallies = Tally(**{f.name: jnp.asarray(table[f.name]) for f in fields(Tally)})
+    return table["step"], states_in(file, int(file["mpmjax"].attrs["d"]), start, stop), tallies
+
+
+def _opened(path: Path, mode: str) -> File:
+    try:
+        return h5py.File(path, mode, libver=_LIBVER, locking=False)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be written ({_reason(error)}): name a place that can be.") from None
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[File]:
+    """The file opened to be read; whatever HDF5 stumbles over becomes one line that says what to do."""
+    require(path.exists(), f"{path} does not exist: check its name.")
+    require(path.is_file(), f"{path} is not a file: name one that mpmjax wrote.")
+    try:
+        with open(path, "rb") as raw:
+            signature = raw.read(8)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read ({_reason(error)}): check its permissions.") from None
+    require(len(signature) == 8, f"{path} is cut short to {len(signature)} bytes: {_REMEDY}.")
+    require(signature == b"\x89HDF\r\n\x1a\n", f"{path} is not an HDF5 file: name one that mpmjax wrote.")
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            _check_format(path, file)
+            yield file
+    except ValueError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise ValueError(f"{path} is damaged ({_reason(error)}): {_REMEDY}.") from None
+    except (OSError, KeyError, RuntimeError, TypeError, AttributeError, IndexError, UnicodeError) as error:
+        what = "is cut short" if "truncated" in str(error) else "is damaged, or just being written"
+        raise ValueError(f"{path} {what} ({_reason(error)}): {_REMEDY}.") from None
+
+
+def _check_format(path: Path, file: File) -> None:
+    missing = [name for name in ("VTKHDF", "mpmjax") if name not in file]
+    require(not missing, f"{path} has no group /{' or /'.join(missing)}: it is not a run that mpmjax wrote.")
+    found = int(file["mpmjax"].attrs["format"])
+    require(
+        found == _FORMAT,
+        f"{path} has format {found}, this mpmjax reads format {_FORMAT}: use mpmjax "
+        f"{file['mpmjax'].attrs['version'].decode()}, which wrote it.",
+    )
+
+
+def _check_whole(file: File) -> None:
+    """Read every chunk, so that every checksum is compared."""
+
+    def read(_: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and item.size:
+            for chunk in item.iter_chunks():
+                item[chunk]
+
+    file.visititems(read)
+
+
+def _check_same(path: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> None:
+    """The run to be continued must be the one in the file."""
+    mine, other = dict(_flat(ours)), dict(_flat(theirs))
+    for name in (*other, *mine):
+        pair: Any = mine.get(name), other.get(name)
+        a, b = pair
+        show = "another array" if isinstance(b, np.ndarray) else "none" if b is None else repr(b)
+        got = "" if isinstance(a, np.ndarray) else f" instead of {a!r}"
+        require(
+            type(a) is type(b) and np.array_equal(a, b),
+            f"{path} holds another run: its {name} is {show}{got}. Resume the same run, or name a new file.",
+        )
+
+
+def _flat(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Every leaf under its dotted path."""
+    if isinstance(data, (dict, list)):
+        for key, value in data.items() if isinstance(data, dict) else enumerate(data):
+            yield from _flat(value, f"{path}.{key}".lstrip("."))
+    else:
+        yield path, data.item() if isinstance(data, np.generic) else data
+
+
+def _reason(error: BaseException) -> str:
+    """The first line of what a library said."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return (str(error).splitlines() or [type(error).__name__])[0].strip("'\"")

@@ -1,0 +1,115 @@
+"""Long runs, written to a file as they go."""
+
+import os
+import sys
+
+import diffrax
+import jax.numpy as jnp
+from tqdm import tqdm
+
+from mpmjax._checks import canonical, require
+from mpmjax._diffrax import HEALTHY, no_steps
+from mpmjax._io import FrameWriter
+from mpmjax._particles import Particles, state_of, with_state
+from mpmjax._run import Run, SimulationError
+from mpmjax._scene import Scene, prepare
+from mpmjax._simulate import integrate, number_of_steps, raise_faults
+from mpmjax._step import Explicit, Method
+
+
+def record(
+    path: str | os.PathLike,
+    scene: Scene,
+    particles: Particles,
+    *,
+    t1: float | int,
+    dt: float | int,
+    method: Method = Explicit(),  # noqa: B008 (frozen)
+    save_every: int,
+    start: int = 0,
+    overwrite: bool = False,
+    resume: bool = False,
+    progress: bool = False,
+) -> Run:
+    """Simulate as `simulate` does, writing each frame to a file when it is reached; memory holds one frame only.
+
+    The steps between two frames are one compiled program, called again and again, and give the same numbers as
+    `simulate`, bit for bit on a CPU. A run that is interrupted or meets a fault leaves a whole file.
+
+    Args:
+        path: the file to be (see `save`).
+        scene: the scene.
+        particles: the particles at step `start`; when resuming, those the recorded run began with.
+        t1: end time [s], a whole number of steps after time zero.
+        dt: step [s].
+        method: update of the grid velocity.
+        save_every: write a frame at the start, every so many steps, and at the end.
+        start: number of the first step. Not used when resuming.
+        overwrite: replace a file that is there.
+        resume: continue from the last frame in the file, up to a later t1.
+        progress: show a progress bar on standard error.
+
+    Returns:
+        the run without its frames, which are in the file.
+
+    Raises:
+        ValueError: those of `simulate` and `load`; a file that is there, or of another run.
+        SimulationError: those of `simulate`; the last good state is in the file.
+    """
+    require(save_every >= 1, f"save_every must be at least 1, got {save_every}.")
+    dtype = particles.x.dtype
+    number_of_steps(t1, dt, start, dtype)
+    particles = prepare(scene, particles)
+    if resume:
+        writer = FrameWriter.resume(path, scene, particles, method, dt)
+    else:
+        writer = FrameWriter.create(path, scene, particles, method, dt, overwrite=overwrite)
+        writer.append(start, state_of(particles), no_steps(dtype))
+    scene, dt_, method = canonical((scene, dt, method), dtype)
+    with writer:
+        step, state, tally = writer.last()
+        require(
+            int(tally.fault) == HEALTHY,
+            f"{path} ends with a fault after step {step} and would meet it again: start anew with another dt or scene.",
+        )
+        start = step - int(tally.steps)
+        end = step + number_of_steps(t1, dt, step, dtype)
+        with tqdm(initial=step, total=end, unit="step", file=sys.stderr, disable=not progress) as bar:
+            while True:
+                count = min(save_every - (step - start) % save_every, end - step)
+                _, state, new, previous = integrate(
+                    scene,
+                    with_state(particles, state),
+                    jnp.asarray(step, dtype),
+                    jnp.asarray(count, dtype),
+                    dt_,
+                    method,
+                    max_steps=save_every,
+                    save_every=None,
+                    observe=None,
+                    adjoint=diffrax.ForwardMode(),  # the plain loop
+                    progress=False,
+                    watch=True,
+                )
+                tally, step = tally.merged(new), step + int(new.steps)
+                run = Run(
+                    scene=scene,
+                    method=method,
+                    dt=dt_,
+                    steps=jnp.zeros((0,), dtype),
+                    frames=None,
+                    observed=None,
+                    final=with_state(particles, state),
+                    final_step=jnp.asarray(step, dtype),
+                    tally=tally,
+                )
+                try:
+                    if int(new.fault) != HEALTHY or step == end:
+                        raise_faults(run, previous, start)
+                except SimulationError as error:
+                    writer.append(int(error.run.final_step), state_of(error.run.final), tally)
+                    raise
+                writer.append(step, state, tally)
+                bar.update(count)
+                if step == end:
+                    return run

@@ -1,0 +1,177 @@
+"""The shell's commands: `mpmjax run`, `mpmjax fit`, `mpmjax render`."""
+
+import sys
+import time
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import numpy as np
+import typer
+
+from mpmjax._diagnostics import energy, grid_mass
+from mpmjax._fit import FitResult
+from mpmjax._io import load
+from mpmjax._job import CurveSettings, Job, fit_job, read_job
+from mpmjax._record import record
+from mpmjax._render import COLOURS, render
+from mpmjax._run import Run
+
+app = typer.Typer(
+    help="A differentiable Material Point Method.", no_args_is_help=True, add_completion=False, rich_markup_mode=None
+)
+
+
+def _reporting(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with its faults told in one line and exit code 2."""
+
+    @wraps(command)
+    def guarded(*args: Any, **kwargs: Any) -> None:
+        try:
+            with jax.enable_x64(True):
+                command(*args, **kwargs)
+        except (ValueError, RuntimeError, OSError) as error:
+            print(f"mpmjax: {' '.join(str(error).split())}", file=sys.stderr)
+            raise typer.Exit(2) from None
+        except KeyboardInterrupt:
+            print("mpmjax: interrupted; every finished frame is in the file", file=sys.stderr)
+            raise typer.Exit(130) from None
+
+    return guarded
+
+
+SceneFile = Annotated[Path, typer.Argument(help="A TOML scene file; docs/scene_files.md is its schema.")]
+
+
+@app.command("run")
+@_reporting
+def run_command(
+    scene: SceneFile,
+    output: Annotated[Path, typer.Option("--output", "-o", help="The HDF5 file to write; ParaView opens it.")],
+    overwrite: Annotated[bool, typer.Option(help="Replace the output file if it exists.")] = False,
+    resume: Annotated[bool, typer.Option(help="Continue the output file from its last frame.")] = False,
+    quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
+) -> None:
+    """Simulate a scene and write its frames."""
+    job = read_job(scene)
+    begun = time.perf_counter()
+    run = record(
+        output,
+        job.scene,
+        job.particles,
+        t1=job.run.t1,
+        dt=job.run.dt,
+        method=job.run.method,
+        save_every=job.run.save_every,
+        overwrite=overwrite,
+        resume=resume,
+        progress=not quiet,
+    )
+    print(_summary(job, run, time.perf_counter() - begun))
+    print(f"written            {output}")
+
+
+def _summary(job: Job, run: Run, seconds: float) -> str:
+    """What a run cost and how well it kept mass and energy."""
+    steps, p = int(run.tally.steps), run.final.count
+    before, after = energy(run.scene, job.particles), energy(run.scene, run.final)
+    mass = float(run.final.mass.sum())
+    lines = [
+        ("particles", f"{p}"),
+        ("steps", f"{steps} of {float(run.dt):.4g} s with {type(run.method).__name__}"),
+        ("wall time", f"{seconds:.3g} s (compilation included), {steps * p / seconds:.3g} particle-steps per second"),
+    ]
+    if int(run.tally.iterations) > 0:
+        lines.append(
+            (
+                "solver",
+                f"{int(run.tally.iterations) / steps:.3g} iterations a step, at most {int(run.tally.most_iterations)}, "
+                f"worst relative residual {float(run.tally.worst_residual):.2g}",
+            )
+        )
+    if int(run.tally.newton) > 0:
+        lines.append(("Newton", f"{int(run.tally.newton) / steps:.3g} a step, {int(run.tally.line_search)} halvings"))
+    if int(run.tally.violations) > 0:
+        lines.append(("contact", f"{int(run.tally.violations)} conditions left violated"))
+    for name in ("kinetic", "elastic", "potential", "total"):
+        lines.append((f"{name} energy", f"{float(getattr(before, name)):.6g} J to {float(getattr(after, name)):.6g} J"))
+    lost = (float(grid_mass(run.scene, run.final)) - mass) / mass
+    lines.append(("mass", f"{mass:.6g} kg; on the grid {lost:+.1e} of it"))
+    return "\n".join(f"{name:<18} {text}" for name, text in lines)
+
+
+@app.command("fit")
+@_reporting
+def fit_command(
+    scene: SceneFile,
+    plot: Annotated[Path | None, typer.Option(help="The plot to write. Default: SCENE_fit.png here.")] = None,
+) -> None:
+    """Fit a scene's parameter to the measured curve that its [fit] table names."""
+    begun = time.perf_counter()
+    job = read_job(scene)
+    result = fit_job(job)
+    assert job.fit is not None
+    print(_table(job.fit, result))
+    name = (job.fit.report or job.fit.parameter).rsplit(".", 1)[-1]
+    print(f"{job.fit.parameter} = {float(result.parameter):.5g}")
+    print(f"{name} = {float(result.value):.5g} ± {float(result.standard_error):.2g} (standard error)")
+    plot = Path(f"{scene.stem}_fit.png") if plot is None else plot
+    _plot(job.fit, result, name, plot)
+    print(f"{result.simulations} simulations with exact derivatives, {time.perf_counter() - begun:.3g} s in all")
+    print(f"written {plot}")
+
+
+def _table(fit: CurveSettings, result: FitResult) -> str:
+    """Misfit at each point."""
+    lines = [f"{'stretch':>10} {'measured [Pa]':>14} {'model [Pa]':>12} {'misfit':>8}"]
+    for x, y, model, used in zip(fit.stretch, fit.stress, np.asarray(result.predicted), fit.fitted, strict=True):
+        misfit = f"{model / y - 1:+8.1%}" if y else " " * 8
+        if np.isnan(model):
+            lines.append(f"{x:10.4f} {y:14.5g} {'-':>12} {'':>8} not reached by the run")
+        else:
+            lines.append(f"{x:10.4f} {y:14.5g} {model:12.5g} {misfit} {'fitted' if used else 'predicted'}")
+    return "\n".join(lines)
+
+
+def _plot(fit: CurveSettings, result: FitResult, name: str, path: Path) -> None:
+    from matplotlib import pyplot as plt  # here, since it takes a second that only pictures should pay
+
+    figure, axes = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
+    x, y = (np.asarray(a) for a in result.curve)
+    shown = x <= max(fit.stretch.max(), 1.02 * x[0])
+    axes.plot(x[shown], y[shown] / 1e6, color="tab:blue", label=f"{name} = {float(result.value):.4g}")
+    axes.plot(fit.stretch[fit.fitted], fit.stress[fit.fitted] / 1e6, "o", color="black", label="measured, fitted")
+    others = ~fit.fitted
+    axes.plot(
+        fit.stretch[others], fit.stress[others] / 1e6, "o", color="black", mfc="white", label="measured, predicted"
+    )
+    axes.set(xlabel="stretch of the gauge section [-]", ylabel="nominal stress [MPa]")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(path, dpi=140)
+    plt.close(figure)
+
+
+@app.command("render")
+@_reporting
+def render_command(
+    run: Annotated[Path, typer.Argument(help="An HDF5 file of a run.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="A picture: .png, .pdf, .svg, or .gif of all frames.")],
+    colour: Annotated[str, typer.Option(help=f"What colours the particles: {', '.join(COLOURS)}.")] = "speed",
+    frame: Annotated[int | None, typer.Option(help="The frame of a still; negative from the end.")] = None,
+    fps: Annotated[int, typer.Option(help="Frames a second of an animation.")] = 20,
+) -> None:
+    """Draw a run's particles."""
+    render(load(run), output, colour=colour, frame=frame, fps=fps)
+    print(f"written {output}")
+
+
+def main() -> None:
+    """Entry point of the `mpmjax` command."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

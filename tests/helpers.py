@@ -1,0 +1,67 @@
+"""Registries and small scenes that the tests share. A new kernel, law or method costs one line here."""
+
+import jax.numpy as jnp
+import numpy as np
+
+import mpmjax as mpm
+from mpmjax._types import Array
+
+DIMS = (1, 2, 3)
+KERNELS = {"linear": mpm.BSpline(1), "quadratic": mpm.BSpline(2), "cubic": mpm.BSpline(3)}
+GRADIENTS = {"spline": mpm.SplineGradient(), "mls": mpm.MLSGradient()}
+TRANSFERS = {"pic": mpm.PIC(), "flip": mpm.FLIP(0.95), "apic": mpm.APIC()}
+LAWS = {
+    "fixed_corotated": mpm.FixedCorotated(youngs_modulus=1e4, poisson_ratio=0.3),
+    "neo_hookean": mpm.NeoHookean(youngs_modulus=1e4, poisson_ratio=0.3),
+}
+DESCRIPTIONS = {"updated": mpm.UpdatedLagrangian(), "total": mpm.TotalLagrangian()}
+METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(), "backward_euler": mpm.BackwardEuler()}
+
+
+def ids(registry: dict) -> dict:
+    """The keyword arguments that parametrise a test over a registry."""
+    return {"argvalues": list(registry.values()), "ids": list(registry)}
+
+
+def rotation_matrix(d: int, rng: np.random.Generator) -> np.ndarray:
+    """A random rotation."""
+    q = np.linalg.qr(rng.normal(size=(d, d)))[0]
+    q[:, 0] *= np.sign(np.linalg.det(q))
+    return q
+
+
+def cloud(d: int, *, p: int = 20, seed: int = 0, cells: int = 6, dx: float = 0.1) -> tuple[mpm.Grid, mpm.Particles]:
+    """A grid and random particles well inside it, with random velocity, affine velocity and deformation."""
+    rng = np.random.default_rng(seed)
+    grid = mpm.Grid((cells + 5,) * d, dx, origin=(-2,) * d)
+    particles = mpm.Particles(
+        x=jnp.asarray(rng.uniform(0, cells * dx, (p, d))),
+        v=jnp.asarray(rng.normal(size=(p, d))),
+        mass=jnp.asarray(rng.uniform(0.5, 1.5, p)),
+        volume=jnp.asarray(rng.uniform(0.5, 1.5, p) * (dx / 2) ** d),
+        F=jnp.asarray(np.eye(d) + 0.1 * rng.normal(size=(p, d, d))),
+        C=jnp.asarray(rng.normal(size=(p, d, d))),
+    )
+    return grid, particles
+
+
+def block(d: int, *, side: int = 3, dx: float = 0.1, **scene: object) -> tuple[mpm.Scene, mpm.Particles]:
+    """A small elastic block at rest in a window with room around it."""
+    grid = mpm.Grid((side + 6,) * d, dx, origin=(-3,) * d)
+    particles = mpm.fill(mpm.Box((0.0,) * d, (side * dx,) * d), grid, particles_per_cell=2**d, density=1e3)
+    material = scene.pop("material", LAWS["fixed_corotated"])
+    return mpm.Scene(grid, material, **scene), particles
+
+
+def explicit_limit(scene: mpm.Scene) -> float:
+    """dx / c [s], c the pressure-wave speed at rest."""
+    law = scene.material
+    modulus = law.lame_lambda + 2 * law.shear_modulus
+    return float(scene.grid.spacing) / float(np.sqrt(modulus / 1e3))
+
+
+def assert_close(a: Array, b: Array, rtol: float = 1e-12, atol: float = 0.0) -> None:
+    """Relative to the largest entry, since rounding is."""
+    a, b = np.asarray(a), np.asarray(b)
+    scale = max(np.abs(a).max(initial=0), np.abs(b).max(initial=0))
+    np.testing.assert_allclose(a, b, rtol=0, atol=rtol * scale + atol)

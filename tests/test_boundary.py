@@ -1,0 +1,230 @@
+"""Boundaries: exact on the nodes they act on, also inside the implicit solves."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import DESCRIPTIONS, KERNELS, LAWS, assert_close, cloud, ids
+from numpy_oracle import grid_update
+
+import mpmjax as mpm
+from mpmjax._boundary import Mirror, combine, mirror
+
+TIGHT = mpm.ConjugateResidual(rtol=1e-13)
+METHODS = {
+    "explicit": mpm.Explicit(),
+    "semi_implicit": mpm.SemiImplicit(solver=TIGHT),
+    "backward_euler": mpm.BackwardEuler(rtol=1e-12, solver=TIGHT),
+}
+DX, DT = 0.1, 1e-2
+
+
+def scene_of(grid, *boundary, **options):
+    """A scene of the random cloud's grid, with gravity."""
+    options = {"gravity": (1.0, -9.81, 2.0)[: grid.dim]} | options
+    return mpm.Scene(grid, LAWS["fixed_corotated"], boundary=boundary, **options)
+
+
+@pytest.mark.parametrize("method", **ids(METHODS))
+def test_walls_and_grips_hold_exactly_on_their_nodes(method):
+    """Sticky: every component, slip: the normal one, grip: its own velocity on its axes; all others are free."""
+    grid, particles = cloud(2)
+    region, motion = mpm.Box((0.25, 0.15), (0.41, 0.31)), mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.7, -0.4)))
+    slip, sticky = mpm.SlipBox((0.1, -np.inf), (np.inf, 0.5)), mpm.StickyBox((-np.inf, 0.0), (0.6, np.inf))
+    grip = mpm.Grip(region, motion, axes=(False, True))
+    step = grid_update(scene_of(grid, sticky, slip, grip), particles, DT, method)
+    x, v, mass = np.asarray(step.position), np.asarray(step.velocity), np.asarray(step.nodes.mass)
+    stuck = (x[:, 1] < 1e-9) | (x[:, 0] > 0.6 - 1e-9)
+    slipping = np.stack([x[:, 0] < 0.1 + 1e-9, x[:, 1] > 0.5 - 1e-9], axis=1) & ~stuck[:, None]
+    gripped = (np.abs(x - [0.33, 0.23]) < 0.081).all(axis=1)
+    assert step.info.solve.converged
+    for held in (stuck, slipping[:, 0], slipping[:, 1], gripped):
+        assert (mass[held] > 0).any()
+    assert (v[stuck] == 0).all()
+    assert (v[slipping] == 0).all()
+    assert_close(v[gripped, 1], np.full(gripped.sum(), -0.4), 1e-15)
+    free = (mass > 0)[:, None] & ~(stuck[:, None] | slipping | (gripped[:, None] & [False, True]))
+    assert (np.abs(v[free]) > 1e-6).all()
+
+
+@pytest.mark.parametrize(("description", "reached"), [("updated", 0.3), ("total", 0.1)])
+def test_a_grip_moves_with_its_motion_or_stays_in_the_reference(description, reached):
+    """At t the updated description's grip holds the nodes where it is now, the total one's those where it began."""
+    grid, particles = cloud(2)
+    motion = mpm.Motion((0.0, 1.0, 2.0), ((0.0, 0.0), (0.2, 0.0), (0.1, 0.3)))
+    grip = mpm.Grip(mpm.Box((0.1, -np.inf), (0.2, np.inf)), motion)
+    scene = scene_of(grid, grip, description=DESCRIPTIONS[description])
+    step = grid_update(scene, particles, 0.5, mpm.Explicit(), t=1.0)
+    fixed = np.asarray(step.nodes.conditions.fixed)
+    x = np.asarray(step.position)[:, 0]
+    np.testing.assert_array_equal(fixed.all(axis=1), (x > reached - 1e-9) & (x < reached + 0.1 + 1e-9))
+    held = fixed.all(axis=1)
+    assert_close(step.velocity[held], np.broadcast_to([-0.1, 0.3], (held.sum(), 2)), 1e-14)
+
+
+def test_a_motion_is_piecewise_linear_and_rests_outside_its_times():
+    """Its velocity is the mean over the step, across corners too."""
+    motion = mpm.Motion((1.0, 2.0, 4.0), ((0.0, 0.0), (1.0, 0.0), (1.0, -4.0)))
+    for t, dt, velocity in [(0.0, 1.0, (0, 0)), (1.25, 0.5, (1, 0)), (1.5, 1.0, (0.5, -1)), (3.0, 0.5, (0, -2)), (4.0, 9.0, (0, 0))]:
+        assert_close(motion.velocity(t, dt), np.array(velocity, float), 1e-15)
+    assert_close(motion.at(3.0), np.array([1.0, -2.0]), 1e-15)
+
+
+def test_the_earlier_boundary_wins():
+    """Where two prescribe one component; components that only the later one prescribes are its own."""
+    grid = mpm.Grid((6, 6), DX)
+    nodes = grid.nodes(grid.window(jnp.zeros((1, 2))))
+    motion = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (2.0, 3.0)))
+    grip = mpm.Grip(mpm.Box((-np.inf, -np.inf), (0.15, np.inf)), motion)
+    slip = mpm.SlipBox((-np.inf, 0.0), (0.1, np.inf))
+    rule = [(grip, slip), (slip, grip)]
+    first, second = (np.asarray(combine(b, nodes, DX, 0.0, 0.1, reference=False).velocity) for b in rule)
+    x = np.asarray(nodes)
+    both = np.isclose(x[:, 0], 0.1)
+    assert_close(first[both], np.broadcast_to([2.0, 3.0], (6, 2)), 1e-14)
+    np.testing.assert_allclose(second[both & (x[:, 1] > 0.05)], np.broadcast_to([0.0, 3.0], (5, 2)), atol=1e-14)
+    np.testing.assert_allclose(second[both & (x[:, 1] < 0.05)], np.zeros((1, 2)), atol=1e-14)
+    np.testing.assert_allclose(first[x[:, 0] > 0.15][:, 0], 0)
+
+
+# Two planes, at a node and half-way between two, that keep opposite sides.
+PLANES = (mpm.SymmetryPlane(0, 0.3, keep="above"), mpm.SymmetryPlane(1, 0.55, keep="below"))
+
+
+@eqx.filter_jit
+def reflected(plane, a):
+    """A particle array with the mirror images appended."""
+    sign = jnp.ones(2).at[plane.axis].set(-1)
+    match a.ndim:
+        case 1:
+            image = a
+        case 2:
+            image = a * sign
+        case _:
+            image = a * sign[:, None] * sign
+    return jnp.concatenate([a, image])
+
+
+def with_images(planes, particles):
+    """The full model of a half one."""
+    for plane in planes:
+        shift = jnp.zeros(2).at[plane.axis].set(plane.position)
+        arrays = {k: getattr(particles, k) for k in ("x", "v", "mass", "volume", "F", "C")}
+        arrays["x"] = arrays["x"] - shift
+        arrays = {k: reflected(plane, a) for k, a in arrays.items()}
+        particles = mpm.Particles(**arrays | {"x": arrays["x"] + shift})
+    return particles
+
+
+MIRROR_CASES = [
+    *((k, m, "updated") for k in KERNELS for m in ("explicit", "semi_implicit")),
+    ("quadratic", "backward_euler", "updated"),
+    ("quadratic", "semi_implicit", "total"),
+]
+
+
+@pytest.mark.parametrize(("kernel", "method", "description"), MIRROR_CASES)
+def test_a_mirrored_half_equals_the_full_model(kernel, method, description):
+    """Planes at a node and half-way between nodes, above and below, to 1e-10 over three steps."""
+    _, particles = cloud(2)
+    move = jnp.array([0.31, -0.06])  # beyond the first plane, below the second
+    quarter = eqx.tree_at(lambda p: (p.x, p.v), particles, (particles.x + move, 0.2 * particles.v))
+    assert (np.abs(np.asarray(quarter.x) - [0.3, 0.55]).min(axis=0) < DX / 2).all()  # both planes are felt
+    grid = mpm.Grid((24, 24), DX, origin=(-9, -6))
+    options = {"kernel": KERNELS[kernel], "description": DESCRIPTIONS[description], "gravity": (0.0, 0.0)}
+    run = {"steps": 3, "dt": 5e-3, "method": METHODS[method]}
+    half = mpm.rollout(scene_of(grid, *PLANES, **options), quarter, **run)
+    full = mpm.rollout(scene_of(grid, **options), with_images(PLANES, quarter), **run)
+    for name in ("x", "v", "F", "C"):
+        assert_close(getattr(full, name)[: quarter.count], getattr(half, name), 1e-10)
+
+
+@pytest.mark.parametrize("d", [1, 2, 3])
+def test_fold_is_the_transpose_of_unfold(d):
+    """B and Bᵀ as dense matrices; a fold brings all mass to the true nodes."""
+    grid = mpm.Grid((7, 6, 5)[:d], DX)
+    images: Mirror = mirror((mpm.SymmetryPlane(0, 0.2),), grid, grid.window(jnp.zeros((1, d))))
+    size = grid.size * d
+    basis = jnp.eye(size).reshape(size, grid.size, d)
+    B, transpose = (np.asarray(jax.vmap(f)(basis)).reshape(size, size).T for f in (images.unfold, images.fold))
+    np.testing.assert_array_equal(B.T, transpose)
+    # nodes 0, 1 mirror 4, 3; node 2 lies on the plane
+    v = np.random.default_rng(0).normal(size=(*grid.shape, d))
+    out = np.asarray(images.unfold(jnp.asarray(v.reshape(-1, d)))).reshape(v.shape)
+    np.testing.assert_array_equal(out[2:, ..., 1:], v[2:, ..., 1:])
+    np.testing.assert_array_equal(out[3:, ..., 0], v[3:, ..., 0])
+    np.testing.assert_array_equal(out[:2, ..., 1:], v[[4, 3], ..., 1:])
+    np.testing.assert_array_equal(out[:3, ..., 0], -v[[4, 3, 2], ..., 0] * np.array([1, 1, 0]).reshape(-1, *[1] * (d - 1)))
+    mass = np.arange(1.0, grid.size + 1).reshape(grid.shape)
+    folded = np.asarray(images.fold_scalar(jnp.asarray(mass.reshape(-1)))).reshape(grid.shape)
+    np.testing.assert_array_equal(folded[:2], 0)
+    np.testing.assert_array_equal(folded[2:5], mass[2:5] + np.stack([0 * mass[0], mass[1], mass[0]]))
+
+
+@pytest.mark.parametrize("method", **ids(METHODS))
+def test_a_periodic_body_may_straddle_the_seam(method):
+    """Moved by whole spacings across it, or by a whole period, it moves as in the middle; momentum is conserved."""
+    _, particles = cloud(2)
+    grid = mpm.Grid((12, 12), DX, periodic=(True, True))
+    scene = scene_of(grid, gravity=(0.0, 0.0))
+    particles = eqx.tree_at(lambda p: p.x, particles, particles.x + 0.3)
+    run = {"steps": 5, "dt": 5e-3, "method": method}
+    here = mpm.rollout(scene, particles, **run)
+    for shift in ([0.5, -0.4], [1.2, -2.4]):
+        moved = eqx.tree_at(lambda p: p.x, particles, particles.x + jnp.array(shift))
+        there = mpm.rollout(scene, moved, **run)
+        assert_close(there.x - jnp.array(shift), here.x, 1e-12)
+        for name in ("v", "F", "C"):
+            assert_close(getattr(there, name), getattr(here, name), 1e-11)
+    assert np.abs(np.asarray(here.v - particles.v)).max() > 0.1
+    assert_close(here.mass @ here.v, particles.mass @ particles.v, 1e-12)
+
+
+def test_particles_feel_each_other_across_the_seam():
+    """Two particles in neighbouring cells on its two sides exchange momentum; without periodicity they cannot."""
+    x, v = jnp.array([[0.03], [1.17]]), jnp.array([[1.0], [-1.0]])
+    one = jnp.ones(2)
+    new, _ = mpm.step(scene_of(mpm.Grid((12,), DX, periodic=True)), mpm.Particles(x, v, one, 0.05 * one), 0.0, 1e-3)
+    assert np.abs(np.asarray(new.v[:, 0] - v[:, 0] - 1e-3)).min() > 0.05
+
+
+BAD = {
+    "off the half lattice": (lambda g: scene_of(g, mpm.SymmetryPlane(0, 0.13)), "half the grid's spacing"),
+    "axis beyond the grid": (lambda g: scene_of(g, mpm.SymmetryPlane(2, 0.1)), "axis must be below 2"),
+    "plane in a periodic direction": (
+        lambda g: scene_of(mpm.Grid((8, 8), DX, periodic=(True, False)), mpm.SymmetryPlane(0, 0.1)),
+        "periodic",
+    ),
+    "separation in the total description": (
+        lambda g: scene_of(g, mpm.SeparatingBox((0, 0), (1, 1)), description=mpm.TotalLagrangian()),
+        "no contact",
+    ),
+    "dimension of a wall": (lambda g: scene_of(g, mpm.StickyBox((0,), (1,))), "2 coordinates"),
+    "dimension of gravity": (lambda g: scene_of(g, gravity=(1.0,)), "gravity must have 2"),
+    "dimension of a grip": (lambda g: mpm.Grip(mpm.Box((0,), (1,)), mpm.Motion((0.0,), ((0.0, 0.0),))), "same dimension"),
+    "dimension of a grip in the scene": (
+        lambda g: scene_of(g, mpm.Grip(mpm.Box((0, 0, 0), (1, 1, 1)), mpm.Motion((0.0,), ((0.0,) * 3,)))),
+        "2",
+    ),
+    "no axis of a grip": (
+        lambda g: mpm.Grip(mpm.Box((0, 0), (1, 1)), mpm.Motion((0.0,), ((0.0, 0.0),)), axes=(False, False)),
+        "at least one",
+    ),
+    "times that fall": (lambda g: mpm.Motion((1.0, 0.0), ((0.0,), (1.0,))), "increase"),
+    "corners swapped": (lambda g: mpm.SlipBox((1, 0), (0, 1)), "below"),
+    "friction below zero": (lambda g: mpm.SeparatingBox((0, 0), (1, 1), friction=-0.1), "friction"),
+    "side of a plane": (lambda g: mpm.SymmetryPlane(0, 0.1, keep="left"), "above"),
+    "particles beyond the plane": (
+        lambda g: mpm.prepare(scene_of(g, mpm.SymmetryPlane(0, 0.3)), cloud(2)[1]),
+        "particle",
+    ),
+    "particles outside the window": (lambda g: mpm.prepare(scene_of(mpm.Grid((5, 5), DX)), cloud(2)[1]), "window"),
+}
+
+
+@pytest.mark.parametrize(("make", "message"), **ids(BAD))
+def test_bad_boundaries_are_refused(make, message):
+    """With a ValueError that says what must hold."""
+    with pytest.raises(ValueError, match=message):
+        make(cloud(2)[0])

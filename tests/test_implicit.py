@@ -1,0 +1,176 @@
+"""The implicit updates: what they solve, how they relate, and what they report."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import DESCRIPTIONS, LAWS, assert_close, block, explicit_limit, ids
+from numpy_oracle import grid_update, stress
+
+import mpmjax as mpm
+from mpmjax._hessian import AnalyticHessian
+from mpmjax._implicit import LinearProblem
+
+TIGHT = mpm.ConjugateResidual(rtol=1e-13)
+NEWTON = mpm.BackwardEuler(rtol=1e-12, solver=TIGHT)
+
+
+def jolted(speed=0.3, side=3, dtype="float64", **scene):
+    """A block with random velocities and some strain."""
+    scene, particles = block(2, side=side, **scene)
+    rng = np.random.default_rng(0)
+    shape = particles.x.shape
+    v, F = speed * rng.normal(size=shape), np.eye(2) + 0.05 * rng.normal(size=(*shape, 2))
+    arrays = (particles.x, v, particles.mass, particles.volume, F)
+    return scene, mpm.prepare(scene, mpm.Particles(*(jnp.asarray(a, dtype) for a in arrays)))
+
+
+def squeezed(rate):
+    """A neo-Hookean block whose two halves rush at each other, at a rate [1/s] of compression along x."""
+    scene, particles = block(2, material=LAWS["neo_hookean"])
+    v = -rate * (particles.x - particles.x.mean(axis=0)) * jnp.array([1.0, 0.0])
+    return scene, mpm.Particles(particles.x, v, particles.mass, particles.volume)
+
+
+@pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
+def test_beta_zero_from_the_explicit_velocity_is_the_explicit_step(description):
+    """To rounding, and without an iteration."""
+    scene, particles = jolted(description=description, gravity=(0.0, -9.81), boundary=mpm.SlipBox((0, 0), (1, 1)))
+    explicit, _ = mpm.step(scene, particles, 0.0, 5e-3)
+    method = mpm.SemiImplicit(beta=0.0, guess=mpm.Guess.EXPLICIT)
+    new, info = mpm.step(scene, particles, 0.0, 5e-3, method=method)
+    assert info.solve.iterations == 0
+    assert info.solve.converged
+    for name in ("x", "v", "F", "C"):
+        assert_close(getattr(new, name), getattr(explicit, name), 1e-15)
+
+
+def test_beta_one_is_one_newton_step_of_backward_euler():
+    """Newton from rest linearises where the semi-implicit step does."""
+    scene, particles = jolted(gravity=(0.0, -9.81), boundary=mpm.StickyBox((0, 0), (1, 1)))
+    once = mpm.BackwardEuler(max_newton=1, guess=mpm.Guess.ZERO, solver=TIGHT)
+    a, info = mpm.step(scene, particles, 0.0, 2e-2, method=once)
+    b, _ = mpm.step(scene, particles, 0.0, 2e-2, method=mpm.SemiImplicit(beta=1.0, solver=TIGHT))
+    assert info.solve.newton == 1
+    assert info.solve.line_search == 0
+    assert not info.solve.converged
+    for name in ("x", "v", "F", "C"):
+        assert_close(getattr(a, name), getattr(b, name), 1e-11)
+
+
+@pytest.mark.parametrize("law", **ids(LAWS))
+def test_backward_euler_satisfies_its_equation(law):
+    """M (v − v^n) = Δt f(F^{n+1}) + Δt M g on free nodes, the force in plain NumPy from the particles after the step."""
+    gravity = np.array([1.0, -9.81])
+    scene, particles = jolted(material=law, gravity=tuple(gravity), boundary=mpm.StickyBox((0, 0), (1, 1)))
+    dt = 2e-2
+    grid = grid_update(scene, particles, dt, NEWTON)
+    assert grid.info.solve.converged
+    assert 2 <= grid.info.solve.newton < 10
+    assert grid.info.solve.iterations > grid.info.solve.newton
+    nodes, stencil = grid.nodes, grid.nodes.potential.stencil
+    force = np.zeros(grid.velocity.shape)
+    mu, lam = float(law.shear_modulus), float(law.lame_lambda)
+    for p, F in enumerate(np.asarray(grid.particles.F)):
+        flux = float(particles.volume[p]) * stress(law, mu, lam, F) @ np.asarray(particles.F[p]).T
+        for k, i in enumerate(np.asarray(stencil.index[:, p])):
+            force[i] -= flux @ np.asarray(stencil.gradient[k, :, p])
+    mass, free = np.asarray(nodes.mass)[:, None], np.asarray(nodes.free(False))
+    inertia = mass * np.asarray(grid.velocity - nodes.velocity)
+    residual = inertia - dt * (force + mass * gravity)
+    assert free.any()
+    assert np.abs(residual[free]).max() < 1e-11 * np.abs(inertia[free]).max()
+
+
+def test_semi_implicit_and_backward_euler_agree_as_the_step_falls():
+    """The linearised force misses terms of second order in the displacement: Δt³ in the velocity of one step."""
+    scene, particles = jolted(speed=1.0)
+
+    def gap(dt):
+        linear, _ = mpm.step(scene, particles, 0.0, dt, method=mpm.SemiImplicit(solver=TIGHT))
+        full, info = mpm.step(scene, particles, 0.0, dt, method=NEWTON)
+        assert info.solve.converged
+        return float(jnp.abs(linear.v - full.v).max())
+
+    gaps = np.array([gap(2e-3 / 2**k) for k in range(3)])
+    orders = np.log2(gaps[:-1] / gaps[1:])
+    assert (np.abs(orders - 3) < 0.2).all(), orders
+
+
+@pytest.mark.parametrize("method", [mpm.SemiImplicit, mpm.BackwardEuler])
+def test_the_two_hessians_give_the_same_step(method):
+    """Analytic differential or jvp of the energy's gradient."""
+    scene, particles = jolted(material=LAWS["neo_hookean"])
+    options = {"solver": TIGHT} | ({"rtol": 1e-12} if method is mpm.BackwardEuler else {})
+    a, _ = mpm.step(scene, particles, 0.0, 2e-2, method=method(hessian=mpm.AnalyticHessian(), **options))
+    b, _ = mpm.step(scene, particles, 0.0, 2e-2, method=method(hessian=mpm.JvpHessian(), **options))
+    for name in ("x", "v", "F", "C"):
+        assert_close(getattr(a, name), getattr(b, name), 1e-11)
+
+
+@pytest.mark.parametrize("guess", mpm.Guess, ids=lambda g: g.name.lower())
+def test_backward_euler_withstands_a_guess_that_inverts_the_material(guess):
+    """A compression that would turn cells inside out within the step ends at an admissible minimum, whatever the guess."""
+    scene, particles = squeezed(rate=50.0)
+    new, info = mpm.step(scene, particles, 0.0, 0.05, method=mpm.BackwardEuler(guess=guess, max_newton=60))
+    assert info.solve.converged
+    assert np.isfinite(np.asarray(new.x)).all()
+    assert (np.linalg.det(np.asarray(new.F)) > 0).all()
+
+
+def test_line_search_backtracks_and_saves_what_one_newton_step_would_invert():
+    """From rest at a violent compression the full Newton step overshoots; the semi-implicit one inverts the material."""
+    scene, particles = squeezed(rate=200.0)
+    linear, _ = mpm.step(scene, particles, 0.0, 0.05, method=mpm.SemiImplicit())
+    method = mpm.BackwardEuler(guess=mpm.Guess.ZERO, max_newton=100)
+    new, info = mpm.step(scene, particles, 0.0, 0.05, method=method)
+    assert np.linalg.det(np.asarray(linear.F)).min() < 0
+    assert info.solve.line_search > 0
+    assert info.solve.converged
+    assert (np.linalg.det(np.asarray(new.F)) > 0).all()
+
+
+@pytest.mark.parametrize("times", [1, 20, 100])
+def test_single_precision_converges_and_says_how_far(times):
+    """The residual it states is the true one, evaluated in double precision; at the explicit limit it is the tolerance."""
+    scene, particles = jolted(speed=1.0, side=4, dtype="float32")
+    grid = grid_update(scene, particles, times * explicit_limit(scene), mpm.SemiImplicit())
+    assert grid.velocity.dtype == jnp.float32
+    assert grid.info.solve.converged
+    widen = lambda a: a.astype(jnp.float64) if a.dtype == jnp.float32 else a  # noqa: E731
+    nodes = jax.tree.map(widen, grid.nodes)
+    predictor = nodes.explicit_velocity()
+    problem = LinearProblem(
+        mass=nodes.mass,
+        factor=nodes.dt**2,
+        hessian=AnalyticHessian().at_rest(nodes.potential, predictor),
+        rhs=nodes.mass[:, None] * predictor,
+        free=nodes.free(False),
+        prescribed=nodes.conditions.velocity,
+    )
+
+    def norm(a):
+        return float(jnp.sqrt((a**2 / jnp.where(nodes.occupied, nodes.mass[:, None], 1)).sum()))
+
+    true = norm(problem.residual(widen(grid.velocity))) / norm(problem.rhs)
+    assert abs(float(grid.info.solve.residual) / true - 1) < 0.05
+    assert true < {1: 1e-5, 20: 5e-4, 100: 1e-2}[times]
+
+
+def test_an_unconverged_solve_is_reported():
+    """Too few iterations: converged is false and the residual says by how much."""
+    scene, particles = jolted()
+    method = mpm.SemiImplicit(solver=mpm.ConjugateResidual(max_steps=3))
+    _, info = mpm.step(scene, particles, 0.0, 0.1, method=method)
+    assert not info.solve.converged
+    assert info.solve.iterations == 3
+    assert info.solve.residual > 1e-8
+    _, info = mpm.step(scene, particles, 0.0, 0.1, method=mpm.BackwardEuler(max_newton=1))
+    assert not info.solve.converged
+
+
+@pytest.mark.parametrize("beta", [-0.1, 1.1, np.nan])
+def test_beta_must_lie_between_zero_and_one(beta):
+    """Anything else is refused."""
+    with pytest.raises(ValueError, match="beta"):
+        mpm.SemiImplicit(beta=beta)

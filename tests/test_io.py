@@ -1,0 +1,476 @@
+"""Files: a run comes back bit for bit, VTK's layout holds, nothing written is lost, and nothing damaged is believed."""
+
+import contextlib
+import dataclasses
+import json
+import shutil
+
+import equinox as eqx
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import DESCRIPTIONS, DIMS, TRANSFERS, block, cloud, ids
+
+import mpmjax as mpm
+import mpmjax._io
+from mpmjax._diffrax import Tally, no_steps
+from mpmjax._io import FrameWriter, load, save
+from mpmjax._particles import Particles, state_of
+from mpmjax._record import record
+from mpmjax._run import Run
+from mpmjax._scene import prepare
+from mpmjax._simulate import integrate
+
+DTYPES = {"float32": jnp.float32, "float64": jnp.float64}
+STEPPERS = {
+    "explicit": (mpm.Explicit(), 5e-3),
+    "semi_implicit": (mpm.SemiImplicit(solver=mpm.ConjugateResidual(1e-4)), 5e-2),
+}
+
+
+def made_up(d: int, dtype=jnp.float64, description=DESCRIPTIONS["updated"], transfer=TRANSFERS["apic"]) -> Run:
+    """A run of random numbers: three frames, none of them simulated."""
+    grid, particles = cloud(d, p=7)
+    particles = jax.tree.map(lambda a: a.astype(dtype), particles)
+    law = mpm.FixedCorotated(jnp.asarray(1 / 3, dtype), jnp.asarray(0.3, dtype))
+    scene = mpm.Scene(grid, law, gravity=(0.1,) * d, description=description, transfer=transfer)
+    scene = jax.tree.map(lambda a: jnp.asarray(a, dtype), scene)
+    rng = np.random.default_rng(1)
+    particles = prepare(scene, particles)
+    frames = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=(3, *a.shape)), dtype), state_of(particles))
+    final = mpm._particles.with_state(particles, jax.tree.map(lambda a: a[-1], frames))
+    counts = {f.name: jnp.asarray(i, jnp.int32) for i, f in enumerate(dataclasses.fields(Tally), 7)}
+    return Run(
+        scene=scene,
+        method=jax.tree.map(lambda a: jnp.asarray(a, dtype), mpm.SemiImplicit(beta=0.7)),
+        dt=jnp.asarray(1e-3, dtype),
+        steps=jnp.asarray([0, 5, 7], dtype),
+        frames=frames,
+        observed=None,
+        final=final,
+        final_step=jnp.asarray(7, dtype),
+        tally=Tally(**{**counts, "worst_residual": jnp.asarray(1 / 7, dtype)}),
+    )
+
+
+def jelly(dtype=jnp.float64, **scene: object) -> tuple[mpm.Scene, Particles]:
+    """A block thrown in the plane."""
+    scene, particles = block(2, gravity=(0.3, -1.0), **scene)
+    particles = eqx.tree_at(lambda q: q.v, particles, particles.x[:, ::-1] * jnp.asarray([1.0, -0.5]))
+    return scene, jax.tree.map(lambda a: a.astype(dtype), particles)
+
+
+def assert_same(a: object, b: object) -> None:
+    """The same tree with the same numbers to the last bit."""
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for one, other in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert one.dtype == other.dtype
+        assert np.array_equal(one, other)
+
+
+# A run in a file -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
+@pytest.mark.parametrize("dtype", **ids(DTYPES))
+@pytest.mark.parametrize("d", DIMS)
+def test_a_run_comes_back_bit_for_bit(d, dtype, description, tmp_path):
+    """load(save(run)) = run, every leaf of it."""
+    run = made_up(d, dtype, description)
+    save(tmp_path / "run.h5", run)
+    assert_same(load(tmp_path / "run.h5"), run)
+
+
+@pytest.mark.parametrize("transfer", **ids(TRANSFERS))
+def test_what_a_transfer_does_not_need_is_not_stored(transfer, tmp_path):
+    """The affine velocity is in the file with APIC only."""
+    run = made_up(2, transfer=transfer)
+    save(tmp_path / "run.h5", run)
+    assert_same(load(tmp_path / "run.h5"), run)
+    with h5py.File(tmp_path / "run.h5") as file:
+        assert ("affine_velocity" in file["VTKHDF/PointData"]) == transfer.affine
+
+
+def test_parameters_of_each_particle_come_back(tmp_path):
+    """Arrays of the scene that are too long for text lie beside it."""
+    run = made_up(2)
+    moduli = jnp.asarray(np.random.default_rng(0).uniform(1, 2, 100))
+    run = eqx.tree_at(lambda r: r.scene.material.youngs_modulus, run, moduli)
+    save(tmp_path / "run.h5", run)
+    assert_same(load(tmp_path / "run.h5"), run)
+
+
+def test_a_run_without_frames_is_saved_as_its_final_state(tmp_path):
+    """The final state becomes the only frame."""
+    run = made_up(2)
+    bare = eqx.tree_at(lambda r: (r.frames, r.steps), run, (None, jnp.zeros(0)), is_leaf=lambda x: x is None)
+    save(tmp_path / "run.h5", bare)
+    back = load(tmp_path / "run.h5")
+    assert np.array_equal(back.steps, [7])
+    assert_same(back.final, run.final)
+    assert_same(jax.tree.map(lambda a: a[0], back.frames), state_of(run.final))
+
+
+def test_saving_is_all_or_nothing(tmp_path, monkeypatch):
+    """A save that fails on the way leaves the file that was there, and no litter."""
+    path, run = tmp_path / "run.h5", made_up(2)
+    save(path, run)
+    monkeypatch.setattr(mpmjax._io, "set_count", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(OSError, match=r"frame 0 could not be written \(disk full\)"):
+        save(path, eqx.tree_at(lambda r: r.dt, run, jnp.asarray(2e-3)))
+    assert_same(load(path), run)
+    assert [p.name for p in tmp_path.iterdir()] == ["run.h5"]
+
+
+@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("dtype", **ids(DTYPES))
+def test_the_file_has_the_layout_that_vtk_reads(d, dtype, tmp_path):
+    """Temporal PolyData, field by field."""
+    run, n, p = made_up(d, dtype), 3, 7
+    save(tmp_path / "run.h5", run)
+    x, v, F, C = (np.asarray(a).reshape(n * p, *a.shape[2:]) for a in dataclasses.astuple(run.frames) if a is not None)
+    F, C = (C, F) if run.frames.C is F else (F, C)
+    F, C = np.asarray(run.frames.F).reshape(n * p, d, d), np.asarray(run.frames.C).reshape(n * p, d, d)
+    full = np.tile(np.eye(3), (n * p, 1, 1))
+    full[:, :d, :d] = F
+    affine = np.zeros((n * p, 3, 3))
+    affine[:, :d, :d] = C
+    with h5py.File(tmp_path / "run.h5") as file:
+        vtk = file["VTKHDF"]
+        assert vtk.attrs["Version"].tolist() == [2, 0]
+        kind = vtk.attrs.get_id("Type")
+        assert kind.get_type().get_class() == h5py.h5t.STRING
+        assert not kind.get_type().is_variable_str()
+        assert vtk.attrs["Type"] == b"PolyData"
+        wanted = {
+            "NumberOfPoints": [p],
+            "Points": np.pad(x, ((0, 0), (0, 3 - d))),
+            "PointData/velocity": np.pad(v, ((0, 0), (0, 3 - d))),
+            "PointData/deformation_gradient": full.reshape(-1, 9),
+            "PointData/affine_velocity": affine.reshape(-1, 9),
+            "PointData/J": np.linalg.det(F),
+            "Vertices/NumberOfCells": [p],
+            "Vertices/NumberOfConnectivityIds": [p],
+            "Vertices/Connectivity": np.arange(p),
+            "Vertices/Offsets": np.arange(p + 1),
+            "Steps/Values": np.asarray([0, 5, 7]) * float(run.dt),
+            "Steps/PartOffsets": [0, 0, 0],
+            "Steps/NumberOfParts": [1, 1, 1],
+            "Steps/PointOffsets": [0, p, 2 * p],
+            "Steps/CellOffsets": np.zeros((n, 4)),
+            "Steps/ConnectivityIdOffsets": np.zeros((n, 4)),
+        }
+        for name in ("velocity", "deformation_gradient", "affine_velocity", "J"):
+            wanted[f"Steps/PointDataOffsets/{name}"] = [0, p, 2 * p]
+        for name in ("Lines", "Polygons", "Strips"):
+            wanted |= {f"{name}/NumberOfCells": [0], f"{name}/NumberOfConnectivityIds": [0]}
+            wanted |= {f"{name}/Connectivity": [], f"{name}/Offsets": [0]}
+        found = {}
+        vtk.visititems(lambda name, item: found.update({name: item}) if isinstance(item, h5py.Dataset) else None)
+        assert set(found) == set(wanted)
+        for name, value in wanted.items():
+            assert np.array_equal(found[name][...], value), name
+            assert found[name].fletcher32, name
+            real = name == "Points" or name.startswith("PointData")
+            assert found[name].dtype == (dtype if real else np.float64 if name == "Steps/Values" else np.int64), name
+        assert vtk["Steps"].attrs["NSteps"] == n
+        assert vtk["Steps"].attrs["NSteps"].dtype == np.int64
+
+
+def test_the_file_says_what_it_holds(tmp_path):
+    """Units, dtype, dimension and the scene can be read without this package."""
+    run = made_up(2)
+    save(tmp_path / "run.h5", run)
+    with h5py.File(tmp_path / "run.h5") as file:
+        own = file["mpmjax"]
+        assert own.attrs["units"].startswith(b"SI")
+        assert (own.attrs["format"], own.attrs["d"], own.attrs["dtype"]) == (1, 2, b"float64")
+        scene = json.loads(own["scene"][...].tobytes())
+        assert scene["material"] == {"kind": "FixedCorotated", "youngs_modulus": 1 / 3, "poisson_ratio": 0.3}
+        assert own["frames"]["step"].tolist() == [0, 5, 7]
+        assert own["frames"]["iterations"].tolist() == [-1, -1, int(run.tally.iterations)]
+
+
+# A run recorded as it goes -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stepper", **ids(STEPPERS))
+@pytest.mark.parametrize("dtype", **ids(DTYPES))
+def test_recorded_resumed_and_simulated_runs_are_equal_bit_for_bit(dtype, stepper, tmp_path):
+    """Chunks, a restart between frames and one single solve give the same numbers, from one compilation."""
+    (method, dt), (scene, particles) = stepper, jelly(dtype)
+    kwargs = {"dt": dt, "method": method, "save_every": 4}
+    single = mpm.simulate(scene, particles, t1=14 * dt, **kwargs)
+    before = integrate._cached._cache_size()
+    whole = record(tmp_path / "whole.h5", scene, particles, t1=14 * dt, **kwargs)
+    record(tmp_path / "parts.h5", scene, particles, t1=5 * dt, **kwargs)
+    resumed = record(tmp_path / "parts.h5", scene, particles, t1=14 * dt, resume=True, **kwargs)
+    assert integrate._cached._cache_size() == before + 1
+    assert_same(load(tmp_path / "whole.h5"), single)
+    assert_same((whole.final, whole.tally), (single.final, single.tally))
+    assert_same((resumed.final, resumed.tally), (single.final, single.tally))
+    parts = load(tmp_path / "parts.h5")
+    assert parts.steps.tolist() == [0, 4, 5, 8, 12, 14]
+    kept = jnp.asarray([0, 1, 3, 4, 5])
+    assert_same(jax.tree.map(lambda a: a[kept], parts.frames), single.frames)
+    assert_same(parts.tally, single.tally)
+
+
+def test_a_saved_run_can_be_resumed(tmp_path):
+    """What `save` writes and what `record` writes is one kind of file, in the total description too."""
+    scene, particles = jelly(description=mpm.TotalLagrangian())
+    kwargs = {"dt": 5e-3, "save_every": 4}
+    save(tmp_path / "run.h5", mpm.simulate(scene, particles, t1=0.03, **kwargs))
+    resumed = record(tmp_path / "run.h5", scene, particles, t1=0.06, resume=True, **kwargs)
+    assert_same(resumed.final, mpm.simulate(scene, particles, t1=0.06, **kwargs).final)
+
+
+def test_a_file_being_written_can_be_read(tmp_path):
+    """Every frame appended is on its way to the disk: a copy of the open file, as a kill leaves it, holds them all."""
+    path, run = tmp_path / "run.h5", made_up(2)
+    frames = [jax.tree.map(lambda a, i=i: a[i], run.frames) for i in range(3)]
+    with FrameWriter.create(path, run.scene, run.final, run.method, run.dt) as writer:
+        for i, frame in enumerate(frames):
+            writer.append(i, frame, run.tally)
+            shutil.copy(path, tmp_path / "copy.h5")
+            for name in (path, tmp_path / "copy.h5"):
+                assert_same(load(name).frames, jax.tree.map(lambda a, i=i: a[: i + 1], run.frames))
+
+
+def test_an_interrupt_leaves_complete_frames_and_can_be_resumed(tmp_path, monkeypatch):
+    """A frame whose writing was interrupted is not read, and is cut off before the next is appended."""
+    path, (scene, particles) = tmp_path / "run.h5", jelly()
+    kwargs = {"dt": 5e-3, "save_every": 4}
+    single = mpm.simulate(scene, particles, t1=0.06, **kwargs)
+    set_count, calls = mpmjax._io.set_count, []
+
+    def interrupted(file, count):
+        calls.append(count)
+        if count == 3:
+            raise KeyboardInterrupt
+        set_count(file, count)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(mpmjax._io, "set_count", interrupted)
+        record(path, scene, particles, t1=0.06, **kwargs)
+    assert calls == [1, 2, 3]
+    with h5py.File(path, "r+") as file:  # and killed amid the next, before all of it was written
+        p = particles.count
+        assert file["VTKHDF/Points"].shape == (3 * p, 3)
+        file["VTKHDF/Points"].resize(3 * p + 5, axis=0)
+    assert_same(load(path).frames, jax.tree.map(lambda a: a[:2], single.frames))
+    FrameWriter.resume(path, scene, prepare(scene, particles), mpm.Explicit(), 5e-3).close()
+    with h5py.File(path) as file:
+        assert {len(d) for d in file["VTKHDF/PointData"].values()} | {len(file["VTKHDF/Points"])} == {2 * p}
+        assert len(file["mpmjax/frames"]) == len(file["VTKHDF/Steps/Values"]) == 2
+    record(path, scene, particles, t1=0.06, resume=True, **kwargs)
+    assert_same(load(path), single)
+
+
+def test_a_run_that_blows_up_keeps_its_good_frames(tmp_path):
+    """Step, time and particle are named; the last good state is the file's last frame; it is not resumed."""
+    path, (scene, particles) = tmp_path / "run.h5", jelly()
+    kwargs = {"dt": 0.1, "save_every": 4}
+    with pytest.raises(mpm.SimulationError, match=r"At step \d+ \(t = .* s\) particle \d+ ") as caught:
+        record(path, scene, particles, t1=10.0, **kwargs)
+    with pytest.raises(mpm.SimulationError) as single:
+        mpm.simulate(scene, particles, t1=10.0, dt=0.1)
+    assert str(caught.value) == str(single.value)
+    run = load(path)
+    assert_same((run.final, run.tally), (single.value.run.final, single.value.run.tally))
+    assert int(run.final_step) == int(run.tally.fault_step) - 1
+    assert all(np.isfinite(a).all() for a in jax.tree.leaves(run.frames))
+    with pytest.raises(ValueError, match=r"ends with a fault after step \d+ .*: start anew"):
+        record(path, scene, particles, t1=10.0, resume=True, **kwargs)
+
+
+def test_a_fault_in_the_first_step_after_a_frame_repeats_no_frame(tmp_path):
+    """The last good state is then there already; only what the tally says of it changes."""
+    path, (scene, particles) = tmp_path / "run.h5", jelly()
+    with pytest.raises(mpm.SimulationError, match="particle"):
+        record(path, scene, particles, t1=10.0, dt=0.1, save_every=1)
+    run = load(path)
+    assert run.steps.tolist() == list(range(int(run.tally.fault_step)))
+
+
+def test_a_faulty_run_is_saved_up_to_its_last_good_state(tmp_path):
+    """What `simulate` hands out with its error can be saved like any run."""
+    scene, particles = jelly()
+    with pytest.raises(mpm.SimulationError) as caught:
+        mpm.simulate(scene, particles, t1=10.0, dt=0.1, save_every=1)
+    save(tmp_path / "run.h5", caught.value.run)
+    run = load(tmp_path / "run.h5")
+    assert_same(run.final, caught.value.run.final)
+    assert run.steps.tolist() == list(range(int(run.tally.fault_step)))
+    assert all(np.isfinite(a).all() for a in jax.tree.leaves(run.frames))
+
+
+def test_progress_is_shown_on_standard_error(tmp_path, capsys):
+    """And nothing on standard output."""
+    scene, particles = jelly()
+    record(tmp_path / "run.h5", scene, particles, t1=0.06, dt=5e-3, save_every=4, progress=True)
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "12/12" in err
+
+
+# What is refused -----------------------------------------------------------------------------------------------------
+
+
+def test_a_file_that_is_there_is_not_overwritten(tmp_path):
+    """Unless asked for."""
+    path, (scene, particles) = tmp_path / "run.h5", jelly()
+    save(path, made_up(2))
+    before = path.read_bytes()
+    kwargs = {"dt": 5e-3, "save_every": 4, "t1": 0.06}
+    with pytest.raises(ValueError, match=r"run\.h5 exists: choose another name, remove it, or pass overwrite=True\.$"):
+        record(path, scene, particles, **kwargs)
+    with pytest.raises(ValueError, match="whole number of steps"):
+        record(path, scene, particles, **{**kwargs, "t1": 0.0611}, overwrite=True)
+    assert path.read_bytes() == before
+    record(path, scene, particles, **kwargs, overwrite=True)
+    assert load(path).steps.tolist() == [0, 4, 8, 12]
+
+
+def other_runs() -> dict:
+    """What differs, and what is said of it."""
+    run = made_up(2)
+    return {
+        "law": (
+            lambda r: r.scene.material.poisson_ratio,
+            0.31,
+            r"its scene\.material\.poisson_ratio is 0\.3 instead of 0\.31",
+        ),
+        "gravity": (lambda r: r.scene.gravity[1], 0.2, r"its scene\.gravity\.1 is 0\.1 instead of 0\.2"),
+        "transfer": (lambda r: r.scene.kernel, mpm.BSpline(3), r"its scene\.kernel\.order is 2 instead of 3"),
+        "method": (lambda r: r.method, mpm.Explicit(), r"its method\.kind is 'SemiImplicit' instead of 'Explicit'"),
+        "dt": (lambda r: r.dt, 2e-3, r"its dt is 0\.001 instead of 0\.002"),
+        "mass": (lambda r: r.final.mass, run.final.mass * 2, r"its particles\.mass is another array"),
+    }
+
+
+@pytest.mark.parametrize(("where", "value", "message"), **ids(other_runs()))
+def test_another_run_is_not_continued(where, value, message, tmp_path):
+    """Scene, method, dt and particles must be the file's; the first difference is named."""
+    run = made_up(2)
+    save(tmp_path / "run.h5", run)
+    before = (tmp_path / "run.h5").read_bytes()
+    other = eqx.tree_at(where, run, value)
+    with pytest.raises(ValueError, match=message):
+        FrameWriter.resume(tmp_path / "run.h5", other.scene, other.final, other.method, other.dt)
+    assert (tmp_path / "run.h5").read_bytes() == before
+
+
+def test_a_run_in_another_precision_is_not_continued(tmp_path):
+    """Nor one with the other dtype."""
+    save(tmp_path / "run.h5", made_up(2))
+    run = made_up(2, jnp.float32)
+    with pytest.raises(ValueError, match="its dtype is 'float64' instead of 'float32'"):
+        FrameWriter.resume(tmp_path / "run.h5", run.scene, run.final, run.method, run.dt)
+
+
+def test_a_law_of_ones_own_cannot_be_saved(tmp_path):
+    """The schema does not know it; no file is begun."""
+
+    class Wood(mpm.FixedCorotated):
+        """Not the package's own."""
+
+    run = eqx.tree_at(lambda r: r.scene.material, made_up(2), Wood(1e5, 0.3))
+    with pytest.raises(ValueError, match=r"^material is a Wood, which files cannot hold"):
+        save(tmp_path / "run.h5", run)
+    assert not list(tmp_path.iterdir())
+
+
+def test_batches_and_traced_runs_cannot_be_saved(tmp_path):
+    """A file holds one run, with values."""
+    run = made_up(2)
+    with pytest.raises(ValueError, match="one by one"):
+        save(tmp_path / "run.h5", jax.tree.map(lambda a: jnp.stack([a, a]), run))
+    with pytest.raises(ValueError, match="inside a jax transformation"):
+        jax.jit(lambda r: save(tmp_path / "run.h5", r))(run)
+
+
+def test_files_of_another_kind_are_named(tmp_path):
+    """Missing, a folder, not HDF5, HDF5 of another program, of another format, without frames: one line each."""
+    run = made_up(2)
+
+    def of(name: str, message: str) -> None:
+        with pytest.raises(ValueError, match=message) as caught:
+            load(tmp_path / name)
+        assert str(caught.value).startswith(str(tmp_path / name))
+        assert "\n" not in str(caught.value)
+
+    of("none.h5", r"does not exist: check its name\.$")
+    of("", r"is not a file: name one that mpmjax wrote\.$")
+    (tmp_path / "text.h5").write_text("x,y\n1,2\n3,4\n")
+    of("text.h5", r"is not an HDF5 file: name one that mpmjax wrote\.$")
+    (tmp_path / "empty.h5").write_bytes(b"")
+    of("empty.h5", r"is cut short to 0 bytes: restore it from a copy, or run the simulation again\.$")
+    h5py.File(tmp_path / "other.h5", "w").close()
+    of("other.h5", r"has no group /VTKHDF or /mpmjax: it is not a run that mpmjax wrote\.$")
+    save(tmp_path / "later.h5", run)
+    with h5py.File(tmp_path / "later.h5", "r+") as file:
+        file["mpmjax"].attrs["format"] = 2
+    of("later.h5", r"has format 2, this mpmjax reads format 1: use mpmjax [\d.]+, which wrote it\.$")
+    FrameWriter.create(tmp_path / "bare.h5", run.scene, run.final, run.method, run.dt).close()
+    of("bare.h5", r"holds no frame: run the simulation again\.$")
+    save(tmp_path / "lacking.h5", run)
+    with h5py.File(tmp_path / "lacking.h5", "r+") as file:
+        del file["mpmjax/mass"], file["VTKHDF/PointData/velocity"]
+    of("lacking.h5", r"is damaged, or just being written \(.*velocity.*\): restore it from a copy, or run")
+    with pytest.raises(
+        ValueError, match=r"cannot be written \(No such file or directory\): name a place that can be\.$"
+    ):
+        save(tmp_path / "folder" / "run.h5", run)
+
+
+def test_float64_runs_ask_for_64_bits(tmp_path):
+    """They are not rounded in silence."""
+    save(tmp_path / "run.h5", made_up(2))
+    with jax.enable_x64(False), pytest.raises(ValueError, match=r"holds a float64 run: call jax\.config\.update"):
+        load(tmp_path / "run.h5")
+
+
+def test_a_truncated_file_is_refused(tmp_path):
+    """At any length, in one line that says what to do."""
+    save(tmp_path / "run.h5", made_up(2))
+    whole, path = (tmp_path / "run.h5").read_bytes(), tmp_path / "cut.h5"
+    for length in (0, 7, 8, 50, 100, 1000, len(whole) // 2, 3 * len(whole) // 4, len(whole) - 100, len(whole) - 1):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=r"cut\.h5 is (cut short|damaged).*(restore|run the simulation)") as caught:
+            load(path)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_flipped_bit_is_caught_or_harmless(tmp_path):
+    """Never does a damaged file load as another run; nor is one continued that has a bad checksum anywhere."""
+    run, path = made_up(2), tmp_path / "flipped.h5"
+    save(tmp_path / "run.h5", run)
+    whole, rng, caught = (tmp_path / "run.h5").read_bytes(), np.random.default_rng(0), 0
+    for bit in rng.integers(0, 8 * len(whole), 200):
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << (bit % 8)
+        path.write_bytes(damaged)
+        try:
+            back = load(path)
+        except ValueError as error:
+            assert "\n" not in str(error)
+            caught += 1
+        else:
+            assert_same(back, run)
+        with contextlib.suppress(ValueError):
+            with FrameWriter.resume(path, run.scene, run.final, run.method, run.dt) as writer:
+                assert_same(writer.last(), (7, state_of(run.final), run.tally))
+    assert caught > 50
+
+
+def test_no_steps_is_the_row_of_a_start(tmp_path):
+    """A recorded run's first frame has the empty tally."""
+    run = made_up(2)
+    with FrameWriter.create(tmp_path / "run.h5", run.scene, run.final, run.method, run.dt) as writer:
+        writer.append(3, state_of(run.final), no_steps(jnp.float64))
+        step, state, tally = writer.last()
+    assert step == 3
+    assert_same((state, tally), (state_of(run.final), no_steps(jnp.float64)))

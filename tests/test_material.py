@@ -1,0 +1,211 @@
+"""Laws: stress and tangent derive from the energy, rest is rest, rotations cost nothing, and closed forms hold."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from deformations import STRETCHES, deformations
+from helpers import DIMS, LAWS, assert_close, ids, rotation_matrix
+
+import mpmjax as mpm
+
+EACH_LAW = pytest.mark.parametrize("law", **ids(LAWS))
+EACH_DIM = pytest.mark.parametrize("d", DIMS)
+
+
+@eqx.filter_jit
+def response(law, F, dF, dG):
+    """Energy, stress, ∂Ψ/∂F, the tangent in two directions, and the jvp of the stress in the first."""
+    tangent = law.tangent(F)
+    gradient = jax.grad(lambda F: law.energy(F).sum())(F)
+    return law.energy(F), law.stress(F), gradient, tangent(dF), tangent(dG), jax.jvp(law.stress, (F,), (dF,))[1]
+
+
+@eqx.filter_jit
+def forward(law, F, dF):
+    """Energy, stress and the tangent in one direction."""
+    return law.energy(F), law.stress(F), law.tangent(F)(dF)
+
+
+@eqx.filter_jit
+def hessian(law, F):
+    """∂²Ψ/∂F∂F of one deformation gradient, (d², d²)."""
+    return jax.hessian(lambda F: law.energy(F[..., None])[0])(F).reshape(F.size, F.size)
+
+
+def evaluate(f, law, *arrays):
+    """A compiled function of a law and arrays; numbers become arrays, so that another value is no compilation."""
+    return jax.tree.map(np.asarray, f(*jax.tree.map(jnp.asarray, (law, *arrays))))
+
+
+def directions(F):
+    """Two random δF."""
+    return np.random.default_rng(1).normal(size=(2, *F.shape))
+
+
+def with_lame(law, mu, lam):
+    """A law of the same kind with the given Lamé constants."""
+    ratio = lam / (2 * (lam + mu))
+    return type(law)(youngs_modulus=2 * mu * (1 + ratio), poisson_ratio=ratio)
+
+
+@EACH_LAW
+@EACH_DIM
+@pytest.mark.parametrize("family", STRETCHES)
+def test_stress_and_tangent_are_derivatives_of_the_energy(law, family, d):
+    """P = ∂Ψ/∂F by `jax.grad` and δP by `jax.jvp`, particle by particle, to 1e-12; the tangent is symmetric."""
+    F, _ = deformations(family, d)
+    if not np.asarray(law.admits(jnp.asarray(F))).all():
+        assert family == "inverted"
+        assert isinstance(law, mpm.NeoHookean)
+        return
+    dF, dG = directions(F)
+    _, P, gradient, A, B, derivative = evaluate(response, law, F, dF, dG)
+    # differences of terms as large as the moduli, whatever cancels near rest
+    moduli = float(law.shear_modulus + law.lame_lambda)
+    for p in range(F.shape[-1]):
+        assert_close(P[..., p], gradient[..., p], 1e-12, atol=1e-13 * moduli)
+        assert_close(A[..., p], derivative[..., p], 1e-12)
+    here, there = np.einsum("ijp,ijp->p", A, dG), np.einsum("ijp,ijp->p", B, dF)
+    size = np.linalg.norm(A, axis=(0, 1)) * np.linalg.norm(dG, axis=(0, 1))
+    np.testing.assert_allclose((here - there) / size, 0, atol=1e-13)
+
+
+@EACH_LAW
+@EACH_DIM
+def test_rest_and_rotations_carry_no_stress_and_no_energy(law, d):
+    """Ψ(R) = 0 and P(R) = 0; Ψ(QF) = Ψ(F) and P(QF) = Q P(F)."""
+    rng = np.random.default_rng(2)
+    moduli = float(law.shear_modulus + law.lame_lambda)
+    Q = np.stack([rotation_matrix(d, rng) for _ in range(20)], axis=-1)
+    Q[:, :, 0] = np.eye(d)
+    energy, P, _ = evaluate(forward, law, Q, Q)
+    np.testing.assert_allclose(energy / moduli, 0, atol=1e-14)
+    np.testing.assert_allclose(P / moduli, 0, atol=1e-14)
+    F, _ = deformations("random", d)
+    energy, P, _ = evaluate(forward, law, F, F)
+    turned_energy, turned_P, _ = evaluate(forward, law, np.einsum("ikp,kjp->ijp", Q, F), F)
+    assert_close(turned_energy, energy, 1e-13)
+    assert_close(turned_P, np.einsum("ikp,kjp->ijp", Q, P), 1e-13)
+    assert (energy >= 0).all()
+
+
+@EACH_LAW
+@EACH_DIM
+def test_small_strains_follow_lames_law(law, d):
+    """At F = I, δP = 2μ ε + λ tr(ε) I, with μ = E/(2(1+ν)) and λ = Eν/((1+ν)(1−2ν)); turning costs nothing."""
+    E, nu = float(law.youngs_modulus), float(law.poisson_ratio)
+    mu, lam = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
+    np.testing.assert_allclose([law.shear_modulus, law.lame_lambda], [mu, lam], rtol=1e-15)
+    F = np.broadcast_to(np.eye(d)[..., None], (d, d, 20))
+    dF, _ = directions(F)
+    _, _, A = evaluate(forward, law, F, dF)
+    strain = (dF + dF.swapaxes(0, 1)) / 2
+    expected = 2 * mu * strain + lam * np.einsum("iip->p", strain) * np.eye(d)[..., None]
+    assert_close(A, expected, 1e-14)
+
+
+@EACH_LAW
+@EACH_DIM
+def test_parameters_are_scalars_or_one_per_particle(law, d):
+    """Equal values per particle give the scalar's answer; different ones give each particle its own law's."""
+    F, _ = deformations("random", d)
+    p, rng, (dF, _) = F.shape[-1], np.random.default_rng(3), directions(F)
+    E, nu = rng.uniform(1e3, 1e5, p), rng.uniform(-0.2, 0.45, p)
+    same = type(law)(np.full(p, law.youngs_modulus), np.full(p, law.poisson_ratio))
+    for a, b in zip(evaluate(forward, same, F, dF), evaluate(forward, law, F, dF), strict=True):
+        assert_close(a, b, 1e-15)
+    varied = evaluate(forward, type(law)(E, nu), F, dF)
+    for q in (0, p - 1):
+        for a, b in zip(varied, evaluate(forward, type(law)(E[q], nu[q]), F, dF), strict=True):
+            assert_close(a[..., q], b[..., q], 1e-13)
+
+
+@EACH_DIM
+def test_fixed_corotated_is_linear_in_uniaxial_strain(d):
+    """P₁₁ = (λ + 2μ)(F₁₁ − 1) exactly for F₁₁ > 0, of any size (verification 1.1)."""
+    law = LAWS["fixed_corotated"]
+    F = np.broadcast_to(np.eye(d)[..., None], (d, d, 20)).copy()
+    F[0, 0] = np.linspace(0.05, 3, 20)
+    _, P, _ = evaluate(forward, law, F, F)
+    modulus = float(law.lame_lambda + 2 * law.shear_modulus)
+    assert_close(P[0, 0], modulus * (F[0, 0] - 1), 1e-14)
+
+
+@pytest.mark.parametrize("stretches", [(0.95, 0.95, 0.95), (0.7, 1.1, 1.4), (1.2, 1.2, 0.9), (1.3, 0.9, -0.4)])
+@pytest.mark.parametrize("d", [2, 3])
+def test_fixed_corotated_hessian_has_its_closed_form_eigenvalues(stretches, d):
+    """Twist, flip and scaling modes of ∂²Ψ/∂F∂F at F = U diag(s) Vᵀ, by `jax.hessian` and by the tangent."""
+    mu, lam = 1.0, 1.5
+    law = with_lame(LAWS["fixed_corotated"], mu, lam)
+    s, pairs = np.array(stretches[-d:]), [(i, j) for i in range(d) for j in range(i)]
+    J = s.prod()
+    third = {(i, j): J / (s[i] * s[j]) for i, j in pairs}
+    twist = [2 * mu * (1 - 2 / (s[i] + s[j])) + lam * (J - 1) * third[i, j] for i, j in pairs]
+    flip = [2 * mu - lam * (J - 1) * third[i, j] for i, j in pairs]
+    scaling = 2 * mu * np.eye(d) + lam * np.outer(J / s, J / s)
+    for i, j in pairs:
+        scaling[i, j] = scaling[j, i] = scaling[i, j] + lam * (J - 1) * third[i, j]
+    expected = np.sort([*twist, *flip, *np.linalg.eigvalsh(scaling)])
+    rng = np.random.default_rng(4)
+    F = rotation_matrix(d, rng) @ np.diag(s) @ rotation_matrix(d, rng).T
+    np.testing.assert_allclose(np.linalg.eigvalsh(evaluate(hessian, law, F)), expected, atol=1e-8)
+    basis = np.eye(d * d, 20).reshape(d, d, 20)
+    _, _, columns = evaluate(forward, law, np.repeat(F[..., None], 20, axis=-1), basis)
+    tangent = columns.reshape(d * d, 20)[:, : d * d]
+    np.testing.assert_allclose(np.linalg.eigvalsh(tangent), expected, atol=1e-12)
+    if stretches == (0.95,) * 3 and d == 3:
+        np.testing.assert_allclose(expected[0], -0.3085, atol=5e-5)
+
+
+@EACH_DIM
+def test_neo_hookean_matches_its_formula(d):
+    """P = μ (F − F⁻ᵀ) + λ ln J F⁻ᵀ by NumPy's inverse, and Ψ = μ/2 (F:F − d) − μ ln J + λ/2 (ln J)²."""
+    law = LAWS["neo_hookean"]
+    mu, lam = float(law.shear_modulus), float(law.lame_lambda)
+    F, _ = deformations("random", d)
+    energy, P, _ = evaluate(forward, law, F, F)
+    G = np.moveaxis(F, -1, 0)
+    log_J, pull = np.log(np.linalg.det(G)), np.linalg.inv(G).swapaxes(1, 2)
+    assert_close(np.moveaxis(P, -1, 0), mu * (G - pull) + lam * log_J[:, None, None] * pull, 1e-13)
+    squares = (G**2).sum(axis=(1, 2)) - d
+    assert_close(energy, mu / 2 * squares - mu * log_J + lam / 2 * log_J**2, 1e-13)
+
+
+@EACH_DIM
+def test_laws_say_what_they_admit(d):
+    """Fixed corotated takes every finite F, neo-Hookean those with det F > 0."""
+    F = np.repeat(np.eye(d)[..., None], 4, axis=-1)
+    F[0, 0] = [1.0, 0.0, -1.0, np.nan]
+    F = jnp.asarray(F)
+    np.testing.assert_array_equal(LAWS["fixed_corotated"].admits(F), [True, True, True, False])
+    np.testing.assert_array_equal(LAWS["neo_hookean"].admits(F), [True, False, False, False])
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_fixed_corotated_resists_collapse_and_inversion(d):
+    """At J = 0 and beyond, energy, stress and tangent are finite (no F⁻¹ is formed) and the stress pushes back."""
+    F = np.repeat(np.eye(d)[..., None], 20, axis=-1)
+    F[-1, -1] = np.linspace(0, -0.9, 20)
+    energy, P, A = evaluate(forward, LAWS["fixed_corotated"], F, directions(F)[0])
+    assert all(np.isfinite(a).all() for a in (energy, P, A))
+    assert (P[-1, -1] < 0).all()
+
+
+@EACH_LAW
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"youngs_modulus": 0.0, "poisson_ratio": 0.3}, r"youngs_modulus \[Pa\] must be greater than zero"),
+        ({"youngs_modulus": -1.0, "poisson_ratio": 0.3}, "must be greater than zero, got -1.0"),
+        ({"youngs_modulus": np.nan, "poisson_ratio": 0.3}, "youngs_modulus.* must be finite"),
+        ({"youngs_modulus": 1.0, "poisson_ratio": 0.5}, "poisson_ratio must be strictly between -1 and 0.5"),
+        ({"youngs_modulus": 1.0, "poisson_ratio": -1.0}, "poisson_ratio must be strictly between"),
+        ({"youngs_modulus": np.array([1.0, -1.0]), "poisson_ratio": 0.3}, "must be greater than zero"),
+    ],
+)
+def test_bad_parameters_are_refused(law, parameters, message):
+    """E must be positive and ν strictly between −1 and ½, per particle too."""
+    with pytest.raises(ValueError, match=message):
+        type(law)(**parameters)

@@ -1,0 +1,269 @@
+"""Objects as plain data, and what is said of data that describe none."""
+
+import json
+import tomllib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ids
+
+import mpmjax as mpm
+from mpmjax._guess import Guess
+from mpmjax._schema import CLASSES, arguments, decode, encode
+from mpmjax._step import Method
+
+GRID = mpm.Grid((8, 9), 0.1, origin=(-2, 3), periodic=(True, False))
+GRIP = mpm.Grip(mpm.Box((-np.inf, 0.0), (0.1, 1.0)), mpm.Motion((0.0, 0.3), ((0.0, 0.0), (0.1, 0.7))), (True, False))
+EXAMPLES = {
+    mpm.Scene: mpm.Scene(
+        GRID,
+        mpm.NeoHookean(1e5, 0.45),
+        gravity=(0.1, -9.81),
+        boundary=(mpm.SlipBox((0.0, -np.inf), (1.0, np.inf)), GRIP),
+        kernel=mpm.BSpline(3),
+        gradient=mpm.SplineGradient(),
+        transfer=mpm.FLIP(0.97),
+        description=mpm.TotalLagrangian(),
+    ),
+    mpm.Grid: GRID,
+    mpm.FixedCorotated: mpm.FixedCorotated(1 / 3, 0.3),
+    mpm.NeoHookean: mpm.NeoHookean(np.array([1.0, 2.0]), 0.3),
+    mpm.StickyBox: mpm.StickyBox((0.1,), (0.9,)),
+    mpm.SlipBox: mpm.SlipBox((0.1, -np.inf), (np.inf, 0.7)),
+    mpm.SeparatingBox: mpm.SeparatingBox((0.1,), (0.9,), friction=0.3),
+    mpm.Grip: GRIP,
+    mpm.SymmetryPlane: mpm.SymmetryPlane(1, 0.05, "below"),
+    mpm.Box: mpm.Box((0.0, 0.1, 0.2), (1.0, 1.1, 1.2)),
+    mpm.Ball: mpm.Ball((0.1, 0.2), 0.3),
+    mpm.Motion: GRIP.motion,
+    mpm.BSpline: mpm.BSpline(1),
+    mpm.SplineGradient: mpm.SplineGradient(),
+    mpm.MLSGradient: mpm.MLSGradient(),
+    mpm.PIC: mpm.PIC(),
+    mpm.FLIP: mpm.FLIP(0.9),
+    mpm.APIC: mpm.APIC(),
+    mpm.UpdatedLagrangian: mpm.UpdatedLagrangian(),
+    mpm.TotalLagrangian: mpm.TotalLagrangian(),
+    mpm.Explicit: mpm.Explicit(),
+    mpm.SemiImplicit: mpm.SemiImplicit(0.5, mpm.JvpHessian(), mpm.ConjugateResidual(1e-7), guess=Guess.EXPLICIT),
+    mpm.BackwardEuler: mpm.BackwardEuler(rtol=1e-6, max_newton=7, guess=Guess.ZERO),
+    mpm.AnalyticHessian: mpm.AnalyticHessian(),
+    mpm.JvpHessian: mpm.JvpHessian(),
+    mpm.ConjugateResidual: mpm.ConjugateResidual(1e-7, increment_rtol=1e-3, max_steps=17),
+}
+"""One of each class that files hold; the next test says so."""
+
+
+def assert_same(a: object, b: object) -> None:
+    """The same tree with the same numbers to the last bit."""
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for one, other in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert np.array_equal(one, other)
+        assert np.asarray(one).dtype == np.asarray(other).dtype
+
+
+def test_every_class_has_an_example():
+    """A class that is registered is a class that is tested."""
+    assert set(EXAMPLES) == set(CLASSES)
+
+
+@pytest.mark.parametrize("value", **ids({c.__name__: value for c, value in EXAMPLES.items()}))
+def test_objects_come_back_from_json(value):
+    """decode(encode(a)) = a, through JSON text, whether or not the class is known beforehand."""
+    data = json.loads(json.dumps(encode(value)))
+    assert_same(decode(data, type(value)), value)
+    assert_same(decode(data, type(value).__mro__[1]), value)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_numbers_keep_every_bit(dtype):
+    """Floats of all magnitudes survive text."""
+    bits = np.random.default_rng(0).integers(0, 2**62, 60).astype(np.uint64)
+    a = np.abs(bits.view(np.float64) if dtype == np.float64 else (bits % 2**31).astype(np.uint32).view(np.float32))
+    a = np.where(np.isfinite(a) & (a > 0), a, np.finfo(dtype).smallest_subnormal)
+    law = decode(json.loads(json.dumps(encode(mpm.FixedCorotated(jnp.asarray(a), 0.3)))), mpm.FixedCorotated)
+    assert np.array_equal(np.asarray(law.youngs_modulus).astype(dtype), a)
+
+
+def test_large_arrays_are_put_aside():
+    """More than 64 numbers go to the side, under their path, and come back with their dtype."""
+    moduli, times = np.linspace(1, 2, 65, dtype=np.float32), np.linspace(0, 1, 100)
+    motion = mpm.Motion(times, np.zeros((100, 2)))
+    scene = mpm.Scene(GRID, mpm.NeoHookean(moduli, 0.3), boundary=mpm.Grip(mpm.Ball((0.0, 0.0), 1.0), motion))
+    arrays: dict = {}
+    data = encode(scene, arrays)
+    assert set(arrays) == {"material.youngs_modulus", "boundary.0.motion.times", "boundary.0.motion.displacement"}
+    assert data["material"]["youngs_modulus"] == {"array": "material.youngs_modulus"}
+    assert_same(decode(json.loads(json.dumps(data)), mpm.Scene, "", arrays), scene)
+    assert_same(decode(encode(scene), mpm.Scene).boundary, scene.boundary)  # written out, an array is read as one
+    with pytest.raises(ValueError, match=r"\[material\] youngs_modulus refers to the array 'gone', which is not there"):
+        decode({**data, "material": {**data["material"], "youngs_modulus": {"array": "gone"}}}, mpm.Scene, "", arrays)
+
+
+def test_toml_may_leave_out_defaults_and_evident_kinds():
+    """A scene needs no more text than it has content; whole numbers stand for floats."""
+    text = """
+        gravity = [0, -10]
+        transfer = "PIC"
+        grid = {shape = [8, 8], spacing = 1}
+        [material]
+        kind = "NeoHookean"
+        youngs_modulus = 100000
+        poisson_ratio = 0.3
+        [[boundary]]
+        kind = "Grip"
+        region = {kind = "Box", lower = [-inf, 0], upper = [1, 1]}
+        motion = {times = [0, 1], displacement = [[0, 0], [1, 0.5]]}
+    """
+    grip = mpm.Grip(mpm.Box((-np.inf, 0.0), (1.0, 1.0)), mpm.Motion((0.0, 1.0), ((0.0, 0.0), (1.0, 0.5))))
+    scene = mpm.Scene(
+        mpm.Grid((8, 8), 1.0), mpm.NeoHookean(1e5, 0.3), gravity=(0.0, -10.0), boundary=grip, transfer=mpm.PIC()
+    )
+    assert_same(decode(tomllib.loads(text), mpm.Scene), scene)
+
+
+def test_a_function_takes_its_arguments_from_a_table():
+    """What `fill` is called with can be read like an object."""
+    table = {"region": {"kind": "Ball", "centre": [0, 0], "radius": 1}, "density": 1000, "particles_per_cell": [2, 3]}
+    given = arguments(mpm.fill, table, "[particles]", given=("grid",))
+    assert given["particles_per_cell"] == (2, 3)
+    assert isinstance(given["region"], mpm.Ball)
+    with pytest.raises(
+        ValueError, match=r"^\[particles\]: unknown key 'grid'\. Known here: region, particles_per_cell"
+    ):
+        arguments(mpm.fill, {**table, "grid": 1}, "[particles]", given=("grid",))
+    with pytest.raises(ValueError, match=r"^\[particles\] needs the key 'density'\.$"):
+        arguments(mpm.fill, {"region": table["region"]}, "[particles]", given=("grid",))
+
+
+def test_a_class_of_ones_own_is_refused():
+    """A law that the schema does not know cannot be written, and the error says which object it is."""
+
+    class Wood(mpm.FixedCorotated):
+        """Not the package's own, though it inherits from it."""
+
+    with pytest.raises(ValueError, match=r"^material is a Wood, which files cannot hold: .*own classes"):
+        encode(mpm.Scene(GRID, Wood(1e5, 0.3)))
+
+
+def edited(**changes: object) -> dict:
+    """A valid scene table with keys set at dotted paths (two underscores for a dot), or removed by None."""
+    scene = {
+        "grid": {"shape": [8, 8], "spacing": 0.1},
+        "material": {"kind": "FixedCorotated", "youngs_modulus": 1e5, "poisson_ratio": 0.3},
+        "boundary": [
+            {"kind": "SlipBox", "lower": [0, 0], "upper": [1, 1]},
+            {
+                "kind": "Grip",
+                "region": {"kind": "Box", "lower": [0, 0], "upper": [1, 1]},
+                "motion": {"times": [0, 1], "displacement": [[0, 0], [1, 0]]},
+            },
+        ],
+    }
+    for path, value in changes.items():
+        *parents, key = path.split("__")
+        table: dict = scene
+        for parent in parents:
+            table = table[int(parent) if parent.isdigit() else parent]  # type: ignore[index]
+        if value is None:
+            del table[key]
+        else:
+            table[key] = value
+    return scene
+
+
+ERRORS = [
+    (
+        {"gravty": [0, 0]},
+        "Unknown key 'gravty', did you mean 'gravity'? Known here: grid, material, gravity, boundary,",
+    ),
+    ({"grid": None}, "The file needs the key 'grid'."),
+    ({"grid": 3}, "grid must be a table with a kind, Grid, got 3."),
+    ({"grid__shape": [8.5, 8]}, "[grid] shape must be a list of whole numbers, got [8.5, 8]."),
+    ({"grid__shape": 8}, "[grid] shape must be a list of whole numbers, got 8."),
+    ({"grid__shape": [True, 8]}, "[grid] shape must be a list of whole numbers, got [True, 8]."),
+    ({"grid__spacing": [0.1]}, "[grid] spacing must be a number, got [0.1]."),
+    ({"grid__spacing": 10**400}, "[grid] spacing must be finite, got 1000"),
+    ({"grid__spacing": -1}, "[grid]: A grid's spacing must be greater than zero, got -1.0."),
+    ({"grid__follow": 1}, "[grid] follow must be true or false, got 1."),
+    ({"grid__kind": "Gird"}, "[grid]: unknown kind 'Gird', did you mean 'Grid'? It must be Grid."),
+    ({"material__kind": None}, "[material] needs a kind: one of FixedCorotated, NeoHookean."),
+    (
+        {"material__kind": "Neohookean"},
+        "[material]: unknown kind 'Neohookean', did you mean 'NeoHookean'? It must be one",
+    ),
+    ({"material__kind": 7}, "[material]: unknown kind 7. It must be one of FixedCorotated, NeoHookean."),
+    ({"material__kind": "Box"}, "[material]: unknown kind 'Box'. It must be one of FixedCorotated, NeoHookean."),
+    ({"material__youngs_modulu": 1}, "[material]: unknown key 'youngs_modulu', did you mean 'youngs_modulus'? Known"),
+    ({"material__poisson_ratio": None}, "[material] needs the key 'poisson_ratio'."),
+    (
+        {"material__poisson_ratio": 0.7},
+        "[material]: FixedCorotated's poisson_ratio must be strictly between -1 and 0.5",
+    ),
+    (
+        {"material__youngs_modulus": "soft"},
+        "[material] youngs_modulus must be a number or a list of numbers, got 'soft'.",
+    ),
+    ({"material__youngs_modulus": float("nan")}, "[material] youngs_modulus must be finite, got nan."),
+    ({"material__youngs_modulus": True}, "[material] youngs_modulus must be a number or a list of numbers, got True."),
+    (
+        {"material__youngs_modulus": {"array": "x"}},
+        "[material] youngs_modulus must be a number or a list of numbers, got",
+    ),
+    ({"gravity": [0, float("inf")]}, "gravity must be finite, got [0, inf]."),
+    ({"gravity": [0, 0, 0]}, "gravity must have 2 components, got (0.0, 0.0, 0.0)."),
+    ({"boundary": 3}, "boundary must be a table with a kind, one of StickyBox, SlipBox, SeparatingBox, Grip, Symm"),
+    ({"boundary": ["Sticky"]}, "[boundary] 1: unknown kind 'Sticky', did you mean 'StickyBox'? It must be one of"),
+    ({"boundary__0__lower": [float("nan"), 0]}, "[[boundary]] 1 lower must be finite, got [nan, 0]."),
+    ({"boundary__0__lower": [2, 0]}, "[[boundary]] 1: SlipBox's lower corner must lie below its upper one"),
+    ({"boundary__1__axes": [1, 0]}, "[[boundary]] 2 axes must be a list of true and false, got [1, 0]."),
+    (
+        {"boundary__1__region__lower": [[0, 0]]},
+        "[[boundary]] 2 [region] lower must be a list of numbers, got [[0, 0]].",
+    ),
+    ({"boundary__1__motion__times": [1, 0]}, "[[boundary]] 2 [motion]: A motion's times must increase"),
+    (
+        {"boundary__1__motion__displacement": [[0, 0], [1]]},
+        "[[boundary]] 2 [motion] displacement must be a list of lists of numbers, got [[0, 0], [1]].",
+    ),
+    ({"transfer": "PICK"}, "transfer: unknown kind 'PICK', did you mean 'PIC'? It must be one of PIC, FLIP, APIC."),
+    ({"kernel": {"order": 4}}, "[kernel]: A B-spline's order must be 1, 2 or 3, got 4."),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), ERRORS, ids=[message[:40] for _, message in ERRORS])
+def test_a_wrong_scene_gets_one_line_that_names_the_place(changes, message):
+    """Place, what must hold, what was got."""
+    assert isinstance(decode(edited(), mpm.Scene), mpm.Scene)
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 (the whole line is compared)
+        decode(edited(**changes), mpm.Scene)
+    assert str(caught.value).startswith(message)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        (
+            {"kind": "SemiImplicit", "guess": "v"},
+            "[method] guess must be one of 'grid velocity', 'explicit', 'zero', got 'v'.",
+        ),
+        ({"kind": "SemiImplicit", "beta": 2}, "[method]: SemiImplicit's beta must be from 0 to 1, got 2.0."),
+        (
+            {"kind": "SemiImplicit", "solver": {"max_steps": 1.5}},
+            "[method.solver] max_steps must be a whole number, got 1.5.",
+        ),
+        ({"kind": "SemiImplicit", "solver": {"rtol": -1}}, "[method.solver]: ConjugateResidual's rtol must be greater"),
+        (
+            "Implicit",
+            "[method]: unknown kind 'Implicit', did you mean 'SemiImplicit'? It must be one of Explicit, Semi",
+        ),
+    ],
+)
+def test_a_wrong_method_gets_one_line_that_names_the_place(table, message):
+    """Nested tables are named by their header."""
+    with pytest.raises(ValueError) as caught:  # noqa: PT011
+        decode(table, Method, "[method]")
+    assert str(caught.value).startswith(message)
