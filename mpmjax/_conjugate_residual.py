@@ -85,7 +85,7 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         rtol = default_rtol(b.dtype) if self.rtol is None else self.rtol
         unit = _ROUNDING * jnp.finfo(b.dtype).eps
 
-        def E(u: Array) -> Array:  # noqa: N802
+        def E(u: Array) -> Array:
             return ravel_pytree(state.mv(unravel(u)))[0] / w
 
         def dot(a: Array, c: Array) -> Float[Array, ""]:
@@ -113,10 +113,8 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
             qq = dot(q, q)
             alpha = jnp.where(breakdown, 0, gamma / jnp.where(breakdown, 1, qq))
             x = c.x + alpha * p
-            if self.increment_rtol is None:
-                settled = c.settled
-            else:
-                settled = norm(alpha * p) <= self.increment_rtol * norm(x)
+            small = self.increment_rtol
+            settled = c.settled if small is None else norm(alpha * p) <= small * norm(x)
             rayleigh = jnp.abs(gamma) / dot(c.r, c.r)
             radius = jnp.maximum(c.radius, rayleigh)
             fresh = jnp.asarray(False)

@@ -171,7 +171,7 @@ def _least_squares(misfit: Callable[[Array], tuple[Array, Array]], dtype: Any) -
             known[key] = (np.asarray(r), np.asarray(J)[:, None])
         return known[key]
 
-    jacobian: Any = lambda ratio: evaluate(ratio)[1]  # noqa: E731
+    jacobian: Any = lambda ratio: evaluate(ratio)[1]
     solution = scipy.optimize.least_squares(
         lambda ratio: evaluate(ratio)[0], np.ones(1), jac=jacobian, bounds=(0, np.inf), xtol=1e-6
     )

@@ -93,6 +93,7 @@ class NewtonProblem(AbstractProblem):
     mass: NodeScalar
     inertial: NodeVector
     dt: Float[Array, ""]
+    spacing: Float[Array, ""]
     potential: ElasticPotential
     hessian: Hessian
     free: Mask
@@ -105,6 +106,14 @@ class NewtonProblem(AbstractProblem):
     def imbalance(self, v: NodeVector) -> NodeVector:
         """M (v − ṽ) − Δt f(Δt v)."""
         return self.mass[:, None] * (v - self.inertial) - self.dt * self.potential.force(self.dt * v)
+
+    def unit_strain(self) -> Float[Array, ""]:
+        """The norm √(Σ m) dx/Δt [√J] of a velocity that would strain everything by one in the step.
+
+        Deformation gradients are of order one, and are rounded as such, however small the strains: so this, times the
+        operator's spectral radius and ε, is the rounding of the imbalance, and times itself that of the potential.
+        """
+        return jnp.sqrt(self.mass.sum()) * self.spacing / self.dt
 
     def merit(self, v: NodeVector) -> Float[Array, ""]:
         """E(v) [J]."""
@@ -167,7 +176,7 @@ class Newton(eqx.Module):
 
         def tolerance(c: _NewtonState) -> Float[Array, ""]:
             speed = jnp.sqrt((metric * jnp.where(free, c.v, 0) ** 2).sum())
-            return jnp.maximum(rtol * scale, 4 * eps * (c.radius * speed + scale))
+            return jnp.maximum(rtol * scale, 4 * eps * (c.radius * (speed + unit_strain) + scale))
 
         def goes_on(c: _NewtonState) -> Array:
             return (norm(c.r) > tolerance(c)) & (c.newton < self.max_steps) & ~c.stuck
@@ -182,7 +191,8 @@ class Newton(eqx.Module):
             direction = jnp.where(uphill, steepest, direction)
             slope = jnp.where(uphill, (c.r * steepest).sum(), slope)
             energy = problem.merit(c.v)
-            slack = 10 * eps * jnp.abs(energy)  # near the solution the fall drowns in rounding
+            radius = jnp.maximum(c.radius, stats["spectral_radius"])
+            slack = 4 * eps * radius * unit_strain**2  # near the solution the fall drowns in rounding
 
             def too_high(trial: tuple[Array, Array]) -> Array:
                 length, count = trial
@@ -195,7 +205,7 @@ class Newton(eqx.Module):
             return _NewtonState(
                 v=v,
                 r=residual(v),
-                radius=jnp.maximum(c.radius, stats["spectral_radius"]),
+                radius=radius,
                 iterations=c.iterations + stats["num_steps"],
                 newton=c.newton + 1,
                 halvings=c.halvings + halvings,
@@ -206,6 +216,7 @@ class Newton(eqx.Module):
         zero = jnp.asarray(0, dtype=jnp.int32)
         lift = jnp.where(free, 0, problem.prescribed)
         scale = norm(residual(lift))
+        unit_strain = problem.unit_strain()
         state = _NewtonState(start, residual(start), jnp.ones((), dtype), zero, zero, zero, jnp.asarray(False))
         c = jax.lax.while_loop(goes_on, step, state)
         left = norm(c.r)

@@ -11,6 +11,7 @@ is raised last, and what lies beyond it, the remains of a writer that was killed
 
 import json
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
@@ -35,6 +36,7 @@ from mpmjax._vtkhdf import File, add_fixed, add_growing, add_topology, count_in,
 
 _FORMAT = 1
 _LIBVER = ("v110", "v110")  # what "latest" writes, VTK 9.7 cannot read
+_LIBVER_HEAD = ("v108", "v108")
 _UNITS = "SI: m, s, kg, Pa; deformation_gradient and J are pure numbers, affine_velocity is in 1/s"
 _UNCHANGING = ("mass", "volume", "X")
 _REMEDY = "restore it from a copy, or run the simulation again"
@@ -196,7 +198,7 @@ def load(path: str | os.PathLike) -> Run:
         described = _description(file["mpmjax"])
         dtype, arrays = np.dtype(described["dtype"]), described["arrays"]
         require(
-            dtype == jnp.zeros((), dtype).dtype,
+            dtype.itemsize <= jnp.zeros(()).dtype.itemsize,
             f'{path} holds a {dtype} run: call jax.config.update("jax_enable_x64", True) first.',
         )
         require(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
@@ -279,8 +281,12 @@ def _frames(file: File, start: int, stop: int) -> tuple[np.ndarray, State, Tally
 
 
 def _opened(path: Path, mode: str) -> File:
+    """The file opened to be written. A new one gets the superblock of HDF5 1.8: a later one says whether a writer is at
+    work, and while it is, and for ever if it was killed, nobody could open the file."""
     try:
-        return h5py.File(path, mode, libver=_LIBVER, locking=False)
+        if mode == "w":
+            h5py.File(path, "w", libver=_LIBVER_HEAD, locking=False).close()
+        return h5py.File(path, "r+", libver=_LIBVER, locking=False)
     except OSError as error:
         raise ValueError(f"{path} cannot be written ({_reason(error)}): name a place that can be.") from None
 
@@ -356,7 +362,7 @@ def _flat(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _reason(error: BaseException) -> str:
-    """The first line of what a library said."""
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return (str(error).splitlines() or [type(error).__name__])[0].strip("'\"")
+    """What the system said, or the first line of what the library did."""
+    text = (isinstance(error, OSError) and error.strerror) or str(error) or type(error).__name__
+    said = re.search(r"error message = '(.*?)'", text)
+    return said[1] if said else text.splitlines()[0].strip("'\"")

@@ -159,7 +159,7 @@ def _run_settings(
     dt: Scalar,
     method: Method = Explicit(),
     save_every: int = 1,
-    precision: str = "float64",  # noqa: B008
+    precision: str = "float64",
 ) -> RunSettings:
     require_positive("[run] t1", t1)
     require_positive("[run] dt", dt)
@@ -189,7 +189,7 @@ def _curve_settings(table: Any, folder: Path) -> CurveSettings:
         stretch: str,
         nominal_stress: str,
         unit: Scalar = 1.0,
-        range: tuple[float, ...],  # noqa: A002 (the key in the file)
+        range: tuple[float, ...],
         parameter: str,
         report: str | None = None,
         gauge: AbstractRegion,

@@ -24,7 +24,7 @@ def record(
     *,
     t1: float | int,
     dt: float | int,
-    method: Method = Explicit(),  # noqa: B008 (frozen)
+    method: Method = Explicit(),
     save_every: int,
     start: int = 0,
     overwrite: bool = False,

@@ -65,10 +65,10 @@ class Scene(eqx.Module):
         *,
         gravity: Point | None = None,
         boundary: AbstractBoundary | tuple[AbstractBoundary, ...] | list[AbstractBoundary] = (),
-        kernel: BSpline = BSpline(),  # noqa: B008 (frozen)
-        gradient: Gradient = MLSGradient(),  # noqa: B008
-        transfer: Transfer = APIC(),  # noqa: B008
-        description: Description = UpdatedLagrangian(),  # noqa: B008
+        kernel: BSpline = BSpline(),
+        gradient: Gradient = MLSGradient(),
+        transfer: Transfer = APIC(),
+        description: Description = UpdatedLagrangian(),
     ):
         self.grid = grid
         self.material = material

@@ -38,7 +38,7 @@ def simulate(
     *,
     t1: float | int,
     dt: float | int,
-    method: Method = Explicit(),  # noqa: B008
+    method: Method = Explicit(),
     save_every: int | None = None,
     observe: Callable[[Scene, Particles], Any] | None = None,
     start: int = 0,
@@ -136,7 +136,7 @@ def rollout(
     steps: int,
     dt: Scalar,
     method: Method = Explicit(),
-    start: int = 0,  # noqa: B008
+    start: int = 0,
 ) -> Particles:
     """The plain rollout: `jax.lax.scan` over steps, without saving, checks or checkpoints. `simulate` is held to it.
 
@@ -252,9 +252,8 @@ def raise_faults(run: Run, previous: State | None, start: int) -> None:
         assert previous is not None
         step = start + int(run.tally.fault_step)
         problem = Problem(run.scene, run.final, None, run.dt, run.method)
-        bad = dict(
-            zip((NOT_FINITE, OUTSIDE, INADMISSIBLE), faulty_particles(problem, state_of(run.final)), strict=True)
-        )
+        broken, outside, inadmissible = faulty_particles(problem, state_of(run.final))
+        bad: dict[int, Array] = {NOT_FINITE: broken, OUTSIDE: outside, INADMISSIBLE: inadmissible}
         first = int(np.argmax(np.asarray(bad[fault])))
         what, advice = _FAULTS[fault]
         good = eqx.tree_at(

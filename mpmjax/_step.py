@@ -35,6 +35,8 @@ class Nodes(eqx.Module):
     """Body acceleration g [m/s²], shape (d,)."""
     dt: Float[Array, ""]
     """Δt [s]."""
+    spacing: Float[Array, ""]
+    """dx [m]."""
     potential: ElasticPotential
     """Φ, of nodal displacements."""
     conditions: Conditions
@@ -163,6 +165,7 @@ class BackwardEuler(eqx.Module):
             mass=nodes.mass,
             inertial=jnp.where(nodes.occupied, nodes.velocity + nodes.dt * nodes.gravity, 0),
             dt=nodes.dt,
+            spacing=nodes.spacing,
             potential=nodes.potential,
             hessian=self.hessian,
             free=nodes.free(active),
@@ -212,6 +215,7 @@ def advance(
         occupied=occupied,
         gravity=jnp.asarray(scene.gravity),
         dt=jnp.asarray(dt),
+        spacing=jnp.asarray(grid.spacing),
         potential=ElasticPotential(scene.material, particles.volume, F, None if scene.total else F, stencil, images),
         conditions=combine(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total),
     )
@@ -266,7 +270,7 @@ def step(
     t: Scalar,
     dt: Scalar,
     *,
-    method: Method = Explicit(),  # noqa: B008
+    method: Method = Explicit(),
 ) -> tuple[Particles, StepInfo]:
     """One step of the Material Point Method, from t to t + dt.
 

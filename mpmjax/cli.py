@@ -161,10 +161,11 @@ def render_command(
     output: Annotated[Path, typer.Option("--output", "-o", help="A picture: .png, .pdf, .svg, or .gif of all frames.")],
     colour: Annotated[str, typer.Option(help=f"What colours the particles: {', '.join(COLOURS)}.")] = "speed",
     frame: Annotated[int | None, typer.Option(help="The frame of a still; negative from the end.")] = None,
+    dpi: Annotated[float, typer.Option(help="Resolution.")] = 120.0,
     fps: Annotated[int, typer.Option(help="Frames a second of an animation.")] = 20,
 ) -> None:
     """Draw a run's particles."""
-    render(load(run), output, colour=colour, frame=frame, fps=fps)
+    render(load(run), output, colour=colour, frame=frame, fps=fps, dpi=dpi)
     print(f"written {output}")
 
 

@@ -66,7 +66,13 @@ def test_a_grip_moves_with_its_motion_or_stays_in_the_reference(description, rea
 def test_a_motion_is_piecewise_linear_and_rests_outside_its_times():
     """Its velocity is the mean over the step, across corners too."""
     motion = mpm.Motion((1.0, 2.0, 4.0), ((0.0, 0.0), (1.0, 0.0), (1.0, -4.0)))
-    for t, dt, velocity in [(0.0, 1.0, (0, 0)), (1.25, 0.5, (1, 0)), (1.5, 1.0, (0.5, -1)), (3.0, 0.5, (0, -2)), (4.0, 9.0, (0, 0))]:
+    for t, dt, velocity in [
+        (0.0, 1.0, (0, 0)),
+        (1.25, 0.5, (1, 0)),
+        (1.5, 1.0, (0.5, -1)),
+        (3.0, 0.5, (0, -2)),
+        (4.0, 9.0, (0, 0)),
+    ]:
         assert_close(motion.velocity(t, dt), np.array(velocity, float), 1e-15)
     assert_close(motion.at(3.0), np.array([1.0, -2.0]), 1e-15)
 
@@ -155,7 +161,9 @@ def test_fold_is_the_transpose_of_unfold(d):
     np.testing.assert_array_equal(out[2:, ..., 1:], v[2:, ..., 1:])
     np.testing.assert_array_equal(out[3:, ..., 0], v[3:, ..., 0])
     np.testing.assert_array_equal(out[:2, ..., 1:], v[[4, 3], ..., 1:])
-    np.testing.assert_array_equal(out[:3, ..., 0], -v[[4, 3, 2], ..., 0] * np.array([1, 1, 0]).reshape(-1, *[1] * (d - 1)))
+    np.testing.assert_array_equal(
+        out[:3, ..., 0], -v[[4, 3, 2], ..., 0] * np.array([1, 1, 0]).reshape(-1, *[1] * (d - 1))
+    )
     mass = np.arange(1.0, grid.size + 1).reshape(grid.shape)
     folded = np.asarray(images.fold_scalar(jnp.asarray(mass.reshape(-1)))).reshape(grid.shape)
     np.testing.assert_array_equal(folded[:2], 0)
@@ -202,7 +210,10 @@ BAD = {
     ),
     "dimension of a wall": (lambda g: scene_of(g, mpm.StickyBox((0,), (1,))), "2 coordinates"),
     "dimension of gravity": (lambda g: scene_of(g, gravity=(1.0,)), "gravity must have 2"),
-    "dimension of a grip": (lambda g: mpm.Grip(mpm.Box((0,), (1,)), mpm.Motion((0.0,), ((0.0, 0.0),))), "same dimension"),
+    "dimension of a grip": (
+        lambda g: mpm.Grip(mpm.Box((0,), (1,)), mpm.Motion((0.0,), ((0.0, 0.0),))),
+        "same dimension",
+    ),
     "dimension of a grip in the scene": (
         lambda g: scene_of(g, mpm.Grip(mpm.Box((0, 0, 0), (1, 1, 1)), mpm.Motion((0.0,), ((0.0,) * 3,)))),
         "2",

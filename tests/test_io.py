@@ -1,6 +1,5 @@
 """Files: a run comes back bit for bit, VTK's layout holds, nothing written is lost, and nothing damaged is believed."""
 
-import contextlib
 import dataclasses
 import json
 import shutil
@@ -26,7 +25,7 @@ from mpmjax._simulate import integrate
 DTYPES = {"float32": jnp.float32, "float64": jnp.float64}
 STEPPERS = {
     "explicit": (mpm.Explicit(), 5e-3),
-    "semi_implicit": (mpm.SemiImplicit(solver=mpm.ConjugateResidual(1e-4)), 5e-2),
+    "semi_implicit": (mpm.SemiImplicit(solver=mpm.ConjugateResidual(1e-4)), 3e-2),
 }
 
 
@@ -57,7 +56,7 @@ def made_up(d: int, dtype=jnp.float64, description=DESCRIPTIONS["updated"], tran
 
 def jelly(dtype=jnp.float64, **scene: object) -> tuple[mpm.Scene, Particles]:
     """A block thrown in the plane."""
-    scene, particles = block(2, gravity=(0.3, -1.0), **scene)
+    scene, particles = block(2, gravity=(0.03, -0.1), **scene)
     particles = eqx.tree_at(lambda q: q.v, particles, particles.x[:, ::-1] * jnp.asarray([1.0, -0.5]))
     return scene, jax.tree.map(lambda a: a.astype(dtype), particles)
 
@@ -130,9 +129,8 @@ def test_the_file_has_the_layout_that_vtk_reads(d, dtype, tmp_path):
     """Temporal PolyData, field by field."""
     run, n, p = made_up(d, dtype), 3, 7
     save(tmp_path / "run.h5", run)
-    x, v, F, C = (np.asarray(a).reshape(n * p, *a.shape[2:]) for a in dataclasses.astuple(run.frames) if a is not None)
-    F, C = (C, F) if run.frames.C is F else (F, C)
-    F, C = np.asarray(run.frames.F).reshape(n * p, d, d), np.asarray(run.frames.C).reshape(n * p, d, d)
+    x, v, F, C = (np.asarray(getattr(run.frames, name)).reshape(n * p, d, -1) for name in "xvFC")
+    x, v = x[..., 0], v[..., 0]
     full = np.tile(np.eye(3), (n * p, 1, 1))
     full[:, :d, :d] = F
     affine = np.zeros((n * p, 3, 3))
@@ -222,9 +220,10 @@ def test_a_saved_run_can_be_resumed(tmp_path):
     """What `save` writes and what `record` writes is one kind of file, in the total description too."""
     scene, particles = jelly(description=mpm.TotalLagrangian())
     kwargs = {"dt": 5e-3, "save_every": 4}
+    whole = record(tmp_path / "whole.h5", scene, particles, t1=0.06, **kwargs)
     save(tmp_path / "run.h5", mpm.simulate(scene, particles, t1=0.03, **kwargs))
     resumed = record(tmp_path / "run.h5", scene, particles, t1=0.06, resume=True, **kwargs)
-    assert_same(resumed.final, mpm.simulate(scene, particles, t1=0.06, **kwargs).final)
+    assert_same((resumed.final, resumed.tally), (whole.final, whole.tally))
 
 
 def test_a_file_being_written_can_be_read(tmp_path):
@@ -243,7 +242,7 @@ def test_an_interrupt_leaves_complete_frames_and_can_be_resumed(tmp_path, monkey
     """A frame whose writing was interrupted is not read, and is cut off before the next is appended."""
     path, (scene, particles) = tmp_path / "run.h5", jelly()
     kwargs = {"dt": 5e-3, "save_every": 4}
-    single = mpm.simulate(scene, particles, t1=0.06, **kwargs)
+    single = mpm.simulate(scene, particles, t1=0.07, **kwargs)
     set_count, calls = mpmjax._io.set_count, []
 
     def interrupted(file, count):
@@ -252,9 +251,10 @@ def test_an_interrupt_leaves_complete_frames_and_can_be_resumed(tmp_path, monkey
             raise KeyboardInterrupt
         set_count(file, count)
 
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch:
         patch.setattr(mpmjax._io, "set_count", interrupted)
-        record(path, scene, particles, t1=0.06, **kwargs)
+        with pytest.raises(KeyboardInterrupt):
+            record(path, scene, particles, t1=0.07, **kwargs)
     assert calls == [1, 2, 3]
     with h5py.File(path, "r+") as file:  # and killed amid the next, before all of it was written
         p = particles.count
@@ -265,55 +265,49 @@ def test_an_interrupt_leaves_complete_frames_and_can_be_resumed(tmp_path, monkey
     with h5py.File(path) as file:
         assert {len(d) for d in file["VTKHDF/PointData"].values()} | {len(file["VTKHDF/Points"])} == {2 * p}
         assert len(file["mpmjax/frames"]) == len(file["VTKHDF/Steps/Values"]) == 2
-    record(path, scene, particles, t1=0.06, resume=True, **kwargs)
+    record(path, scene, particles, t1=0.07, resume=True, **kwargs)
     assert_same(load(path), single)
 
 
 def test_a_run_that_blows_up_keeps_its_good_frames(tmp_path):
-    """Step, time and particle are named; the last good state is the file's last frame; it is not resumed."""
+    """Step, time and particle are named, as `simulate` does; the last good state is the file's last frame."""
     path, (scene, particles) = tmp_path / "run.h5", jelly()
     kwargs = {"dt": 0.1, "save_every": 4}
+    with pytest.raises(mpm.SimulationError) as single:
+        mpm.simulate(scene, particles, t1=10.0, **kwargs)
     with pytest.raises(mpm.SimulationError, match=r"At step \d+ \(t = .* s\) particle \d+ ") as caught:
         record(path, scene, particles, t1=10.0, **kwargs)
-    with pytest.raises(mpm.SimulationError) as single:
-        mpm.simulate(scene, particles, t1=10.0, dt=0.1)
     assert str(caught.value) == str(single.value)
-    run = load(path)
+    run, last = load(path), int(caught.value.run.final_step)
+    assert_same((run.final, run.tally), (caught.value.run.final, caught.value.run.tally))
     assert_same((run.final, run.tally), (single.value.run.final, single.value.run.tally))
-    assert int(run.final_step) == int(run.tally.fault_step) - 1
+    assert last == int(run.tally.fault_step) - 1
+    assert run.steps.tolist() == [*range(0, last, 4), last]
     assert all(np.isfinite(a).all() for a in jax.tree.leaves(run.frames))
+
+    # it is not resumed, since it would end there again
     with pytest.raises(ValueError, match=r"ends with a fault after step \d+ .*: start anew"):
         record(path, scene, particles, t1=10.0, resume=True, **kwargs)
 
+    # a fault in the first step after a frame repeats no frame
+    record(path, scene, particles, t1=0.1 * last, overwrite=True, **kwargs)
+    with pytest.raises(mpm.SimulationError) as resumed:
+        record(path, scene, particles, t1=10.0, resume=True, **kwargs)
+    assert str(resumed.value) == str(single.value)
+    assert_same(load(path), run)
 
-def test_a_fault_in_the_first_step_after_a_frame_repeats_no_frame(tmp_path):
-    """The last good state is then there already; only what the tally says of it changes."""
-    path, (scene, particles) = tmp_path / "run.h5", jelly()
-    with pytest.raises(mpm.SimulationError, match="particle"):
-        record(path, scene, particles, t1=10.0, dt=0.1, save_every=1)
-    run = load(path)
-    assert run.steps.tolist() == list(range(int(run.tally.fault_step)))
-
-
-def test_a_faulty_run_is_saved_up_to_its_last_good_state(tmp_path):
-    """What `simulate` hands out with its error can be saved like any run."""
-    scene, particles = jelly()
-    with pytest.raises(mpm.SimulationError) as caught:
-        mpm.simulate(scene, particles, t1=10.0, dt=0.1, save_every=1)
-    save(tmp_path / "run.h5", caught.value.run)
-    run = load(tmp_path / "run.h5")
-    assert_same(run.final, caught.value.run.final)
-    assert run.steps.tolist() == list(range(int(run.tally.fault_step)))
-    assert all(np.isfinite(a).all() for a in jax.tree.leaves(run.frames))
+    # the run that came with the error can be saved like any other, without what lies beyond its last good state
+    save(tmp_path / "single.h5", single.value.run)
+    assert_same(load(tmp_path / "single.h5"), run)
 
 
 def test_progress_is_shown_on_standard_error(tmp_path, capsys):
     """And nothing on standard output."""
     scene, particles = jelly()
-    record(tmp_path / "run.h5", scene, particles, t1=0.06, dt=5e-3, save_every=4, progress=True)
+    record(tmp_path / "run.h5", scene, particles, t1=0.07, dt=5e-3, save_every=4, progress=True)
     out, err = capsys.readouterr()
     assert out == ""
-    assert "12/12" in err
+    assert "14/14" in err
 
 
 # What is refused -----------------------------------------------------------------------------------------------------
@@ -448,22 +442,24 @@ def test_a_flipped_bit_is_caught_or_harmless(tmp_path):
     """Never does a damaged file load as another run; nor is one continued that has a bad checksum anywhere."""
     run, path = made_up(2), tmp_path / "flipped.h5"
     save(tmp_path / "run.h5", run)
-    whole, rng, caught = (tmp_path / "run.h5").read_bytes(), np.random.default_rng(0), 0
-    for bit in rng.integers(0, 8 * len(whole), 200):
+    whole, rng, caught = (tmp_path / "run.h5").read_bytes(), np.random.default_rng(0), []
+    first = 8 * whole.index(np.pad(np.asarray(run.frames.x[1]), ((0, 0), (0, 1))).tobytes())
+    positions = range(first + 3, first + 8 * 24 * 7, 8 * 24)  # in each particle's position
+    for bit in [*positions, *rng.integers(0, 8 * len(whole), 120)]:
         damaged = bytearray(whole)
         damaged[bit // 8] ^= 1 << (bit % 8)
         path.write_bytes(damaged)
         try:
-            back = load(path)
-        except ValueError as error:
-            assert "\n" not in str(error)
-            caught += 1
-        else:
-            assert_same(back, run)
-        with contextlib.suppress(ValueError):
+            assert_same(load(path), run)
+        except ValueError:
+            caught.append(bit)
+        try:
             with FrameWriter.resume(path, run.scene, run.final, run.method, run.dt) as writer:
                 assert_same(writer.last(), (7, state_of(run.final), run.tally))
-    assert caught > 50
+        except ValueError:
+            continue
+    assert set(positions) <= set(caught)
+    assert len(caught) > 40
 
 
 def test_no_steps_is_the_row_of_a_start(tmp_path):

@@ -1,0 +1,206 @@
+"""The Hessian action both ways, against each other and against finite differences, and the operator M + cH."""
+
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from deformations import STRETCHES, deformations
+from helpers import DESCRIPTIONS, DIMS, GRADIENTS, LAWS, cloud
+
+import mpmjax as mpm
+from mpmjax._boundary import combine, mirror
+from mpmjax._hessian import ImplicitOperator
+from mpmjax._kernel import make_stencil
+from mpmjax._potential import ElasticPotential
+from mpmjax._transfer import p2g
+from mpmjax._types import components
+
+DX = 0.1
+CASES = {
+    f"{law}-{d}d-{family}-{description}-{gradient}": (law, d, family, description, gradient)
+    for law in LAWS
+    for d in DIMS
+    for family in STRETCHES
+    for description in DESCRIPTIONS
+    for gradient in GRADIENTS
+    # neo-Hookean needs det F > 0
+    if (law, family) != ("neo_hookean", "inverted")
+}
+HESSIANS = {"analytic": mpm.AnalyticHessian(), "jvp": mpm.JvpHessian()}
+EACH_CASE = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+
+
+make = eqx.filter_jit(make_stencil)
+
+
+@eqx.filter_jit
+def linearised(potential, du, u, h):
+    """About u: −∂Φ/∂u, the force there and at u ∓ h δu, and H δu by both routes, through the operator without mass."""
+
+    def action(hessian):
+        H = hessian.at_rest(potential, du) if u is None else hessian.at(potential, u)
+        return ImplicitOperator(jnp.zeros(len(du)), jnp.asarray(1.0), H, jnp.ones(du.shape, bool)).mv(du)
+
+    place = jnp.zeros_like(du) if u is None else u
+    forces = jax.vmap(lambda step: potential.force(place + step * du))(jnp.stack([0 * h, -h, h]))
+    return -jax.grad(potential.energy)(place), forces, [action(hessian) for hessian in HESSIANS.values()]
+
+
+@cache
+def scene_of(law, d, family, description, gradient):
+    """The elastic potential of a random cloud, and a random nodal displacement of about a spacing."""
+    grid, particles = cloud(d, dx=DX)
+    window = grid.window(particles.x)
+    stencil = make(mpm.BSpline(), GRADIENTS[gradient], grid, window, particles.x, affine=False)
+    F = jnp.asarray(deformations(family, d, n=particles.count)[0])
+    pull = F if description == "updated" else None
+    images = mirror((), grid, window)
+    material = jax.tree.map(jnp.asarray, LAWS[law])
+    potential = ElasticPotential(material, particles.volume, F, pull, stencil, images)
+    du = jnp.asarray(DX * np.random.default_rng(1).normal(size=(grid.size, d)))
+    return potential, du
+
+
+def relative(a, b):
+    """The largest difference over the largest entry."""
+    return float(np.abs(np.asarray(a) - np.asarray(b)).max() / np.abs(np.asarray(b)).max())
+
+
+@cache
+def results_of(*case):
+    """`linearised` of a case at rest; its steps are small against the smallest stretch. With h."""
+    potential, du = scene_of(*case)
+    h = 1e-6 * jnp.abs(jnp.linalg.det(potential.F.transpose(2, 0, 1))).min() ** (1 / du.shape[1])
+    return *jax.tree.map(np.asarray, linearised(potential, du, None, h)), float(h)
+
+
+def route_difference(*case):
+    """How far `AnalyticHessian` and `JvpHessian` are apart, relative to the largest entry of H δu."""
+    return relative(*results_of(*case)[2])
+
+
+def worst_difference():
+    """The worst difference of the two routes over all cases, and the case."""
+    return max((route_difference(*case), name) for name, case in CASES.items())
+
+
+@EACH_CASE
+def test_both_routes_agree(case):
+    """The analytic action (eqs. 7 to 12) and the jvp of the energy's gradient are one to 1e-12."""
+    assert route_difference(*case) < 1e-12
+
+
+@EACH_CASE
+def test_hessian_agrees_with_central_differences_of_the_force(case):
+    """H δu = (f(u − hδu) − f(u + hδu))/2h."""
+    _, (_, back, there), actions, h = results_of(*case)
+    for H in actions:
+        assert relative((back - there) / (2 * h), H) < 1e-7
+
+
+@EACH_CASE
+def test_force_is_minus_the_gradient_of_the_energy(case):
+    """f = −∂Φ/∂u at u = 0, to rounding of the moduli."""
+    descent, (force, _, _), _, _ = results_of(*case)
+    law, volume = LAWS[case[0]], scene_of(*case)[0].volume
+    moduli = float((law.shear_modulus + law.lame_lambda) * volume.max() / DX)
+    np.testing.assert_allclose(force, descent, rtol=0, atol=1e-13 * max(np.abs(force).max(), moduli))
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("description", DESCRIPTIONS)
+def test_hessian_at_a_displacement_is_the_forces_derivative_there(law, description):
+    """Newton's later steps: both routes at u ≠ 0, against each other and central differences; force = −∂Φ/∂u there."""
+    case = (law, 2, "repeated", description, "mls")
+    potential, du = scene_of(*case)
+    u, h = 0.05 * jnp.roll(du, 7, axis=0), jnp.asarray(1e-6)
+    descent, (force, back, there), (one, other) = linearised(potential, du, u, h)
+    assert relative(force, descent) < 1e-12
+    assert relative(one, other) < 1e-12
+    assert relative((back - there) / (2 * h), one) < 1e-7
+    assert relative(one, results_of(*case)[2][0]) > 1e-2
+
+
+EACH_CONSTRAINED = pytest.mark.parametrize(
+    ("d", "description"), [(1, "updated"), (1, "total"), (2, "updated"), (2, "total"), (3, "updated")]
+)
+
+
+@eqx.filter_jit
+def apply(operator, u):
+    return operator.mv(u)
+
+
+@cache
+def constrained(d, description, law="fixed_corotated"):
+    """Operators of both routes with a symmetry plane, a sticky wall and empty nodes, their potential and free mask."""
+    grid, particles = cloud(d, dx=DX)
+    walls = (mpm.SymmetryPlane(0, 0.0), mpm.StickyBox((-np.inf,) * d, (5 * DX,) * d))
+    window = grid.window(particles.x)
+    stencil = make(mpm.BSpline(), mpm.MLSGradient(), grid, window, particles.x, affine=False)
+    F, images = components(particles.F), mirror(walls, grid, window)
+    pull = F if description == "updated" else None
+    potential = ElasticPotential(jax.tree.map(jnp.asarray, LAWS[law]), particles.volume, F, pull, stencil, images)
+    mass = images.fold_scalar(p2g(stencil, particles.mass, components(particles.v), None, grid.size)[0])
+    fixed = combine(walls, grid.nodes(window), DX, 0.0, 1.0, reference=False).fixed
+    free = (mass > 0)[:, None] & ~fixed
+    assert {"free", "fixed", "empty"} == {
+        kind
+        for kind, mask in {"free": free, "fixed": fixed & (mass > 0)[:, None], "empty": mass == 0}.items()
+        if mask.any()
+    }
+    # so that mass and stiffness are alike
+    factor = jnp.asarray(1e-3)
+    like = jnp.zeros((grid.size, d))
+    operators = [ImplicitOperator(mass, factor, h.at_rest(potential, like), free) for h in HESSIANS.values()]
+    return operators, potential, free
+
+
+@EACH_CONSTRAINED
+@pytest.mark.parametrize("route", [0, 1], ids=HESSIANS)
+def test_operator_is_symmetric(route, d, description):
+    """⟨a, A b⟩ = ⟨A a, b⟩ to 1e-13 with a symmetry plane, fixed components and empty nodes; densely below 3-D."""
+    operators, _, free = constrained(d, description)
+    operator = operators[route]
+    a, b = (jnp.asarray(np.random.default_rng(seed).normal(size=free.shape)) for seed in (5, 6))
+    Aa, Ab = np.asarray(apply(operator, a)), np.asarray(apply(operator, b))
+    size = np.linalg.norm(Ab) * np.linalg.norm(a)
+    np.testing.assert_allclose((np.vdot(a, Ab) - np.vdot(Aa, b)) / size, 0, atol=1e-13)
+    assert relative(apply(operators[1 - route], b), Ab) < 1e-12
+    if d < 3:
+        A = np.asarray(eqx.filter_jit(ImplicitOperator.as_matrix)(operator))
+        np.testing.assert_allclose(A, A.T, rtol=0, atol=1e-13 * np.abs(A).max())
+        np.testing.assert_allclose(
+            (A @ np.asarray(b).ravel()).reshape(b.shape), Ab, rtol=0, atol=1e-12 * np.abs(A).max()
+        )
+        held = ~np.asarray(free).ravel()
+        np.testing.assert_array_equal(A[held], np.eye(len(A))[held])
+        np.testing.assert_array_equal(A[:, held], np.eye(len(A))[:, held])
+
+
+@pytest.mark.parametrize("d", DIMS)
+def test_rows_of_fixed_components_and_empty_nodes_are_the_identity(d):
+    """Rows that are held return their entry and pass nothing on; the metric is the mass on free rows, one elsewhere."""
+    (operator, _), _, free = constrained(d, "updated")
+    u = jnp.asarray(np.random.default_rng(7).normal(size=free.shape))
+    got = np.asarray(apply(operator, u))
+    held = ~np.asarray(free)
+    np.testing.assert_array_equal(got[held], np.asarray(u)[held])
+    np.testing.assert_array_equal(apply(operator, jnp.where(free, 0, u)), jnp.where(free, 0, u))
+    np.testing.assert_array_equal(operator.metric(), jnp.where(free, operator.mass[:, None], 1))
+    assert (operator.metric() > 0).all()
+    without = eqx.tree_at(lambda o: o.factor, operator, jnp.asarray(0.0))
+    np.testing.assert_array_equal(apply(without, u), jnp.where(free, operator.mass[:, None] * u, u))
+
+
+@pytest.mark.parametrize("description", DESCRIPTIONS)
+@pytest.mark.parametrize("d", [1, 2])
+def test_mirrored_force_is_minus_the_gradient_of_the_mirrored_energy(d, description):
+    """With a symmetry plane the force is folded as the energy's gradient is."""
+    _, potential, free = constrained(d, description)
+    u = jnp.asarray(1e-3 * DX * np.random.default_rng(8).normal(size=free.shape))
+    force, descent = jax.jit(lambda p, u: (p.force(u), -jax.grad(p.energy)(u)))(potential, u)
+    assert relative(force, descent) < 1e-12

@@ -1,0 +1,17 @@
+"""The README says what happens."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_quick_start_runs_as_written_and_ends_in_a_gradient(tmp_path):
+    """The README's Python block, run as a fresh program, prints the gradient that the README states."""
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert abs(float(ran.stdout) + 6.18e-7) < 0.03e-7
+    assert (tmp_path / "jelly.h5").exists()

@@ -1,0 +1,262 @@
+"""Rollouts: the same as a plain scan, saved where they should be, compiled once, and stopped with a word."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import DESCRIPTIONS, LAWS, assert_close, block, explicit_limit, ids
+
+import mpmjax as mpm
+from mpmjax import _simulate
+from mpmjax._diffrax import NOT_FINITE
+
+DT = 5e-3
+METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(), "backward_euler": mpm.BackwardEuler()}
+GRIP = mpm.Grip(mpm.Box((-1.0, -1.0), (0.05, 1.0)), mpm.Motion((0.0, 1.0), ((0.0, 0.0), (-0.4, 0.1))))
+
+
+def pulled(**options):
+    """A block held at its left by a moving grip, under gravity, and stirred."""
+    scene, particles = block(2, side=2, gravity=(0.0, -9.81), boundary=GRIP, **options)
+    v = 0.1 * np.random.default_rng(0).normal(size=particles.x.shape)
+    return scene, eqx.tree_at(lambda p: p.v, particles, jnp.asarray(v))
+
+
+def height(scene, particles):
+    """What a run observes: the mean height and the scene's gravity."""
+    return particles.x[:, 1].mean(), jnp.asarray(scene.gravity)[1]
+
+
+def assert_equal(a, b):
+    """Bit for bit, leaf by leaf."""
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def state(particles):
+    """What evolves."""
+    return particles.x, particles.v, particles.F, particles.C
+
+
+@pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
+@pytest.mark.parametrize("method", **ids(METHODS))
+def test_simulate_equals_the_plain_rollout(method, description):
+    """diffrax's loop against lax.scan, bit for bit, at every saved frame."""
+    scene, particles = pulled(description=description)
+    run = mpm.simulate(scene, particles, t1=8 * DT, dt=DT, method=method, save_every=4)
+    for frame, steps in [(run.frame(1), 4), (run.final, 8)]:
+        assert_equal(state(frame), state(mpm.rollout(scene, particles, steps=steps, dt=DT, method=method)))
+    assert_equal(state(run.frame(2)), state(run.final))
+    assert int(run.tally.steps) == 8
+
+
+def test_frames_are_saved_at_the_start_every_so_many_steps_and_at_the_end():
+    """Also where save_every does not divide the number of steps; times are steps times dt."""
+    scene, particles = pulled()
+    run = mpm.simulate(scene, particles, t1=10 * DT, dt=DT, save_every=4)
+    np.testing.assert_array_equal(run.steps, [0, 4, 8, 10])
+    assert_close(run.times, np.array([0, 4, 8, 10]) * DT, 1e-15)
+    assert len(run) == 4
+    assert_equal(state(run.frame(0)), state(mpm.prepare(scene, particles)))
+    assert_equal(state(run.frame(2)), state(mpm.rollout(scene, particles, steps=8, dt=DT)))
+    assert_equal(state(run.frame(3)), state(run.final))
+    with pytest.raises(ValueError, match="save_every"):
+        mpm.simulate(scene, particles, t1=10 * DT, dt=DT).frame(0)
+
+
+def test_observations_are_curves():
+    """One value of the function a saved step, of scene and particles, and no frames."""
+    scene, particles = pulled()
+    run = mpm.simulate(scene, particles, t1=6 * DT, dt=DT, observe=height)
+    frames = mpm.simulate(scene, particles, t1=6 * DT, dt=DT, save_every=1).frames
+    assert run.frames is None
+    np.testing.assert_array_equal(run.steps, range(7))
+    assert_close(run.observed[0], np.asarray(frames.x)[:, :, 1].mean(axis=1), 1e-15)
+    np.testing.assert_array_equal(run.observed[1], np.full(7, -9.81))
+    coarse = mpm.simulate(scene, particles, t1=6 * DT, dt=DT, observe=height, save_every=4)
+    assert_equal(coarse.observed[0], run.observed[0][np.array([0, 4, 6])])
+
+
+def test_a_run_continues_from_its_end():
+    """With start = final_step a moving grip is where it should be: two halves equal the whole, bit for bit."""
+    scene, particles = pulled()
+    method = mpm.SemiImplicit()
+    first = mpm.simulate(scene, particles, t1=4 * DT, dt=DT, method=method)
+    second = mpm.simulate(scene, first.final, t1=8 * DT, dt=DT, method=method, start=int(first.final_step))
+    whole = mpm.simulate(scene, particles, t1=8 * DT, dt=DT, method=method)
+    assert float(second.final_step) == 8
+    assert_equal(state(second.final), state(whole.final))
+    assert_equal(state(mpm.rollout(scene, first.final, steps=4, dt=DT, method=method, start=4)), state(whole.final))
+
+
+def test_no_float_compiles_anew():
+    """Material, gravity, wall, grip, spacing, β, tolerances, dt, start: one compilation; another number of steps may."""
+    scene, particles = pulled()
+    wall = mpm.SlipBox((-5.0, -0.2), (5.0, 5.0))
+    scene = eqx.tree_at(lambda s: s.boundary, scene, (*scene.boundary, wall))
+    method = mpm.SemiImplicit(beta=1.0, solver=mpm.ConjugateResidual(rtol=1e-8))
+    count = []
+
+    def run(scene=scene, particles=particles, method=method, steps=3, dt=DT, start=0):
+        before = _simulate.integrate._cached._cache_size()
+        mpm.simulate(scene, particles, t1=(start + steps) * dt, dt=dt, method=method, start=start)
+        count.append(_simulate.integrate._cached._cache_size() - before)
+
+    run(steps=4)
+    count.clear()
+    change = {
+        "Young's modulus": (lambda s: s.material.youngs_modulus, 2e4),
+        "an integer": (lambda s: s.material.youngs_modulus, 20_000),
+        "NumPy": (lambda s: s.material.poisson_ratio, np.float64(0.25)),
+        "float32": (lambda s: s.material.poisson_ratio, jnp.float32(0.25)),
+        "gravity": (lambda s: s.gravity, (0.0, -1.62)),
+        "wall": (lambda s: s.boundary[1].lower, (-5.0, -0.1)),
+        "grip": (lambda s: s.boundary[0].motion.displacement, ((0.0, 0.0), (0.2, 0.1))),
+        "times": (lambda s: s.boundary[0].motion.times, (0.0, 2.0)),
+        "region": (lambda s: s.boundary[0].region.upper, (0.06, 1.0)),
+        "spacing": (lambda s: s.grid.spacing, 0.11),
+    }
+    for where, value in change.values():
+        run(eqx.tree_at(where, scene, value), steps=4)
+    run(method=mpm.SemiImplicit(beta=0.5, solver=mpm.ConjugateResidual(rtol=1e-6)), steps=4)
+    run(method=mpm.SemiImplicit(beta=1, solver=mpm.ConjugateResidual(rtol=1e-6)), steps=4)
+    run(dt=2e-3, steps=4)
+    run(start=7, steps=4)
+    run(particles=eqx.tree_at(lambda p: p.v, particles, 2 * particles.v), steps=4)
+    assert count == [0] * len(count)
+    run(steps=5)
+    assert count[-1] == 1
+
+
+def test_an_explicit_blow_up_is_stopped_and_named():
+    """Step, time and the first bad particle are told, and the last finite state is kept."""
+    scene, particles = pulled()
+    dt = 3 * explicit_limit(scene)
+    with pytest.raises(mpm.SimulationError, match=r"At step \d+ \(t = [\d.]+ s\) particle \d+") as caught:
+        mpm.simulate(scene, particles, t1=400 * dt, dt=dt)
+    run = caught.value.run
+    step = int(run.final_step)
+    assert f"At step {step + 1} " in str(caught.value)
+    assert f"t = {(step + 1) * dt:.6g} s" in str(caught.value)
+    assert all(np.isfinite(leaf).all() for leaf in state(run.final))
+    assert_equal(state(run.final), state(mpm.rollout(scene, particles, steps=step, dt=dt)))
+
+
+def test_a_particle_that_is_not_finite_is_named():
+    """One overflowing velocity: that particle, at the first step."""
+    scene, particles = pulled()
+    particles = eqx.tree_at(lambda p: p.v, particles, particles.v.at[5].set(1e308))
+    with pytest.raises(mpm.SimulationError, match=r"At step 1 .* particle \d+ is no longer finite") as caught:
+        mpm.simulate(scene, particles, t1=10 * DT, dt=DT)
+    assert int(caught.value.run.tally.fault) == NOT_FINITE
+    assert_equal(caught.value.run.final.x, particles.x)
+
+
+def test_a_particle_that_leaves_the_window_is_named():
+    """With the step after which its stencil is outside, and what to do."""
+    grid = mpm.Grid((12, 8), 0.1, origin=(-2, -2))
+    x = jnp.array([[0.2, 0.2], [0.5, 0.1]])
+    v = jnp.array([[0.1, 0.0], [0.99, 0.0]])
+    particles = mpm.Particles(x, v, jnp.ones(2), jnp.full(2, 1e-6))
+    scene = mpm.Scene(grid, LAWS["neo_hookean"])
+    # the last node is at 0.9: a quadratic stencil ends beyond 0.85, which the second particle passes at step 36
+    with pytest.raises(mpm.SimulationError, match=r"At step 36 .*particle 1 left the grid's window") as caught:
+        mpm.simulate(scene, particles, t1=0.5, dt=0.01)
+    assert "follow=True" in str(caught.value)
+    assert_close(caught.value.run.final.x[1, 0], 0.5 + 35 * 0.0099, 1e-12)
+
+
+def test_inversion_of_a_law_that_does_not_allow_it_is_named():
+    """neo-Hookean at det F ≤ 0 stops; fixed corotated goes on."""
+    scene, particles = block(2, side=2)
+    v = -300.0 * (particles.x - particles.x.mean(axis=0)) * jnp.array([1.0, 0.0])
+    particles = eqx.tree_at(lambda p: p.v, particles, v)
+    assert np.linalg.det(np.asarray(mpm.simulate(scene, particles, t1=0.01, dt=0.01).final.F)).min() < 0
+    scene = eqx.tree_at(lambda s: s.material, scene, LAWS["neo_hookean"])
+    with pytest.raises(mpm.SimulationError, match=r"At step 1 .*det F ≤ 0"):
+        mpm.simulate(scene, particles, t1=0.05, dt=0.01)
+
+
+def test_an_unconverged_solve_is_raised():
+    """With the number of steps concerned and the worst residual; throw=False leaves it to the tally."""
+    scene, particles = pulled()
+    method = mpm.SemiImplicit(solver=mpm.ConjugateResidual(max_steps=2))
+    with pytest.raises(mpm.SimulationError, match="of 4 of 4 steps did not converge"):
+        mpm.simulate(scene, particles, t1=4 * 0.1, dt=0.1, method=method)
+    run = mpm.simulate(scene, particles, t1=4 * 0.1, dt=0.1, method=method, throw=False)
+    assert int(run.tally.unconverged) == 4
+    assert float(run.tally.worst_residual) > 1e-8
+    assert int(run.tally.most_iterations) == 2
+
+
+@pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in ("explicit", "semi_implicit")}))
+def test_a_batch_member_that_fails_leaves_the_others_alone(method):
+    """One of three is driven to NaN: the other two are what they are without it, bit for bit, and the tally says which."""
+    scene, particles = pulled()
+
+    @eqx.filter_jit
+    def batch(speeds):
+        def member(speed):
+            moved = eqx.tree_at(lambda p: p.v, particles, speed * particles.v)
+            run = mpm.simulate(scene, moved, t1=6 * DT, dt=DT, method=method, throw=False)
+            return state(run.final), run.tally.fault
+
+        return jax.vmap(member)(speeds)
+
+    good, faults = batch(jnp.array([1.0, 1.0, 2.0]))
+    bad, faulty = batch(jnp.array([1.0, jnp.nan, 2.0]))
+    assert list(faults) == [0, 0, 0]
+    assert list(faulty) == [0, NOT_FINITE, 0]
+    for a, b in zip(good, bad, strict=True):
+        assert_equal(a[np.array([0, 2])], b[np.array([0, 2])])
+        assert np.isnan(b[1]).any()
+
+
+def test_a_fault_under_a_transformation_raises():
+    """Where a particle cannot be named, equinox's runtime error."""
+    scene, particles = pulled()
+    run = eqx.filter_jit(lambda v: mpm.simulate(scene, eqx.tree_at(lambda p: p.v, particles, v), t1=4 * DT, dt=DT).final.x)
+    assert np.isfinite(run(particles.v)).all()
+    with pytest.raises(Exception, match="the rollout met a fault"):
+        run(jnp.nan * particles.v)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"t1": 0.0123, "dt": 0.005}, "whole number of steps"),
+        ({"t1": 0.0, "dt": 0.005}, "after the start"),
+        ({"t1": 0.01, "dt": 0.005, "start": 2}, "after the start"),
+        ({"t1": 0.01, "dt": -0.005}, "dt"),
+        ({"t1": np.inf, "dt": 0.005}, "t1"),
+        ({"t1": 0.01, "dt": 0.005, "save_every": 0}, "save_every"),
+    ],
+)
+def test_bad_times_are_refused(options, message):
+    """With a ValueError that says what must hold."""
+    with pytest.raises(ValueError, match=message):
+        mpm.simulate(*pulled(), **options)
+
+
+def test_the_number_of_steps_is_robust_to_rounding():
+    """0.3 / 0.1 is three steps."""
+    scene, particles = pulled()
+    assert int(mpm.simulate(scene, particles, t1=0.3 / 100, dt=0.1 / 100).tally.steps) == 3
+
+
+def test_progress_changes_nothing(capsys):
+    """A meter is shown, and the result is the same bit for bit."""
+    scene, particles = pulled()
+    quiet = mpm.simulate(scene, particles, t1=8 * DT, dt=DT)
+    shown = mpm.simulate(scene, particles, t1=8 * DT, dt=DT, progress=True)
+    jax.effects_barrier()
+    assert "100" in capsys.readouterr().err
+    assert_equal(state(quiet.final), state(shown.final))
+
+
+def test_the_checkpoints_memory_changes_nothing_of_the_run():
+    """Nor does it need more than one."""
+    scene, particles = pulled()
+    a = mpm.simulate(scene, particles, t1=8 * DT, dt=DT)
+    b = mpm.simulate(scene, particles, t1=8 * DT, dt=DT, checkpoint_bytes=1)
+    assert_equal(state(a.final), state(b.final))
