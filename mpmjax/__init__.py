@@ -23,7 +23,7 @@ from mpmjax.material import AbstractMaterial, AbstractTangent, FixedCorotated, N
 
 __version__ = "0.1.0"
 
-__all__ = [
+__all__ = [  # noqa: RUF022 (grouped)
     # scene
     "Grid",
     "Scene",

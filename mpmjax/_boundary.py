@@ -66,7 +66,7 @@ def _check_box(name: str, lower: Point, upper: Point) -> None:
         a, b = np.asarray(lower, float), np.asarray(upper, float)
         require(
             (a < b) & ~np.isnan(a) & ~np.isnan(b),
-            f"{name}'s lower corner must lie below its upper one in each direction (an infinite coordinate is no wall), "
+            f"{name}'s lower corner must lie below its upper one in each direction (infinite means no wall), "
             f"got {lower} and {upper}.",
         )
 

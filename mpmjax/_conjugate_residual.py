@@ -26,8 +26,8 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
 
     It works on E = W⁻¹A in the inner product ⟨a, b⟩ = aᵀ W b of a positive diagonal *metric* W, in which E is
     self-adjoint; with W the mass this is the reference's algorithm, which in the plain inner product would not be
-    conjugate residuals at all, E = I + βΔt²M⁻¹H not being symmetric. The norm ‖r‖ of the residual r = W⁻¹(b − A x) never
-    grows.
+    conjugate residuals at all, E = I + βΔt²M⁻¹H not being symmetric. The norm ‖r‖ of the residual r = W⁻¹(b − A x)
+    never grows.
 
     Stops when ‖r‖ ≤ rtol ‖W⁻¹b‖ for the *true* residual, or when that residual is down to the rounding of its own
     evaluation, 4 ε (‖E‖‖x‖ + ‖W⁻¹b‖) with ‖E‖ estimated by the largest Rayleigh quotient met. A tolerance that the
@@ -85,7 +85,7 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         rtol = default_rtol(b.dtype) if self.rtol is None else self.rtol
         unit = _ROUNDING * jnp.finfo(b.dtype).eps
 
-        def E(u: Array) -> Array:
+        def E(u: Array) -> Array:  # noqa: N802
             return ravel_pytree(state.mv(unravel(u)))[0] / w
 
         def dot(a: Array, c: Array) -> Float[Array, ""]:

@@ -2,10 +2,10 @@
 
 On a separating wall the velocity v and the wall's impulse r along the inward normal obey v ≥ 0, r ≥ 0, v r = 0. The
 active set (the nodes the wall holds) is guessed as those the explicit velocity v* drives into the wall. Then, at most
-`SWEEPS` times: solve with the active nodes held; release those the wall would have to pull, hold those that would enter;
-stop when nothing changes. What still violates the conditions after that is counted in `StepInfo.violations`. The last
-solve, with the set settled and started from the last sweep's result, is the one that is differentiated; the derivative is
-that of the active set found, and does not exist where it changes.
+`SWEEPS` times: solve with the active nodes held; release those the wall would have to pull, hold those that would
+enter; stop when nothing changes. What still violates the conditions after that is counted in `ContactInfo.violations`.
+The last solve, with the set settled and started from the last sweep's result, is the one that is differentiated; the
+derivative is that of the active set found, and does not exist where it changes.
 
 Friction is an impulse at the held nodes after the solve, against the tangential velocity and at most μ times the normal
 impulse (Coulomb); it is not part of the implicit system, so it lags by the elastic response of one step.

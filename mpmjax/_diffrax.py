@@ -1,4 +1,5 @@
-"""The thin adapter by which diffrax drives the step: saving, events, progress and the checkpointed adjoint are its own."""
+"""The thin adapter by which diffrax drives the step: saving, events, progress and the checkpointed adjoint are its
+own."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -128,8 +129,8 @@ def step_number(t: Array) -> Array:
 
 
 class StepSolver(diffrax.AbstractSolver):
-    """One step of the method a unit of diffrax's time, which counts steps: physical time is n·Δt, and every step has the
-    same Δt to the last bit. `args` is a `Problem`."""
+    """One step of the method a unit of diffrax's time, which counts steps: physical time is n·Δt, and every step has
+    the same Δt to the last bit. `args` is a `Problem`."""
 
     term_structure: ClassVar = diffrax.ODETerm
     interpolation_cls: ClassVar[Callable[..., diffrax.LocalLinearInterpolation]] = diffrax.LocalLinearInterpolation

@@ -171,13 +171,16 @@ def _least_squares(misfit: Callable[[Array], tuple[Array, Array]], dtype: Any) -
             known[key] = (np.asarray(r), np.asarray(J)[:, None])
         return known[key]
 
-    jacobian: Any = lambda ratio: evaluate(ratio)[1]
+    def slope(ratio: np.ndarray) -> np.ndarray:
+        return evaluate(ratio)[1]
+
+    jacobian: Any = slope  # SciPy's annotation knows only strings
     solution = scipy.optimize.least_squares(
         lambda ratio: evaluate(ratio)[0], np.ones(1), jac=jacobian, bounds=(0, np.inf), xtol=1e-6
     )
     if not solution.success:
         raise RuntimeError(
-            f"The fit did not converge in {len(known)} simulations: start from a closer value of the parameter, or check "
+            f"The fit did not converge in {len(known)} simulations: start from a closer value, or check "
             "the data's units."
         )
     J2 = float((solution.jac**2).sum())
@@ -200,5 +203,5 @@ def _require_reached(curve: tuple[Array, Array], wanted: np.ndarray) -> None:
     require(
         (x[0] <= wanted) & (wanted <= x[-1]),
         f"The simulation covers {x[0]:.4g} to {x[-1]:.4g}, which leaves out measured points to be fitted "
-        f"({', '.join(f'{w:.4g}' for w in wanted if not x[0] <= w <= x[-1])}): move the grip further, or narrow the range.",
+        f"({', '.join(f'{w:.4g}' for w in wanted if not x[0] <= w <= x[-1])}): pull further, or narrow the range.",
     )

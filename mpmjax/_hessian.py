@@ -26,7 +26,8 @@ class _AnalyticAction(AbstractHessianAction):
     tangent: AbstractTangent
 
     def __call__(self, du: NodeVector) -> NodeVector:
-        """Σ_p V0_p A_p h_ip, with A_p = ∂²Ψ/∂F∂F : δF_p (reference, eqs. 7 and 8, the gradient in eq. 7 being node i's)."""
+        """Σ_p V0_p A_p h_ip, with A_p = ∂²Ψ/∂F∂F : δF_p (reference, eqs. 7 and 8, the gradient in eq. 7 being node
+        i's)."""
         return _analytic_action(self.potential, self.tangent, du)
 
 
@@ -78,7 +79,8 @@ Hessian = AnalyticHessian | JvpHessian
 
 
 class ImplicitOperator(lx.AbstractLinearOperator):
-    """Q (M + c H) Q + I − Q, symmetric: c = βΔt² for the semi-implicit step (reference, eq. 6 times m_i), Δt² for Newton.
+    """Q (M + c H) Q + I − Q, symmetric: c = βΔt² for the semi-implicit step (reference, eq. 6 times m_i), Δt² for
+    Newton.
 
     Q keeps the components that are free; rows of prescribed components and of empty nodes are the identity.
     """

@@ -1,4 +1,5 @@
-"""Scene files: TOML in, a scene with its particles and run settings out. `docs/scene_files.md` is the schema in words."""
+"""Scene files: TOML in, a scene with its particles and run settings out. `docs/scene_files.md` is the schema in
+words."""
 
 import csv
 import tomllib
@@ -189,7 +190,7 @@ def _curve_settings(table: Any, folder: Path) -> CurveSettings:
         stretch: str,
         nominal_stress: str,
         unit: Scalar = 1.0,
-        range: tuple[float, ...],
+        range: tuple[float, ...],  # noqa: A002 (the key in the file)
         parameter: str,
         report: str | None = None,
         gauge: AbstractRegion,

@@ -1,4 +1,5 @@
-"""Prescribed motions: data, never callables, so that they can be saved, differentiated and changed without compiling."""
+"""Prescribed motions: data, never callables, so that they can be saved, differentiated and changed without
+compiling."""
 
 import equinox as eqx
 import jax.numpy as jnp

@@ -22,8 +22,8 @@ def fill(
     """Fill a region with a lattice of particles at cell centres of a subdivided grid.
 
     In a box the lattice is fitted to the box (its counts are rounded, its spacing then is the box's side over the
-    count), so that the particles' total mass and volume are the box's exactly. Any other region keeps the lattice points
-    inside it, each with the volume of a lattice cell.
+    count), so that the particles' total mass and volume are the box's exactly. Any other region keeps the lattice
+    points inside it, each with the volume of a lattice cell.
 
     Args:
         region: what to fill.

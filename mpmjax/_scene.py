@@ -21,8 +21,8 @@ class UpdatedLagrangian(eqx.Module):
 class TotalLagrangian(eqx.Module):
     """Stencils at the reference positions, h_ip = ∇_X w_ip, computed once.
 
-    For a body that neither separates nor meets anything but what it was attached to from the start: no cell crossing, no
-    numerical fracture, second order at every amplitude. Boundaries act at reference nodes.
+    For a body that neither separates nor meets anything but what it was attached to from the start: no cell crossing,
+    no numerical fracture, second order at every amplitude. Boundaries act at reference nodes.
     """
 
 
@@ -174,7 +174,7 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
     if not inside.all():
         first = int(np.argmin(inside))
         raise ValueError(
-            f"Every particle's stencil must lie in the grid's window; particle {first} at {np.asarray(place[first])} and "
+            f"Each particle's stencil must lie in the grid's window; particle {first} at {np.asarray(place[first])} and "
             f"{int((~inside).sum()) - 1} others do not: enlarge the grid's shape, move its origin, or use follow=True."
         )
     for plane in scene.boundary:
@@ -190,6 +190,6 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
     allowed = np.asarray(scene.material.admits(jnp.asarray(F)))
     require(
         allowed,
-        f"{type(scene.material).__name__} does not allow the deformation gradient of particle {int(np.argmin(allowed))} "
+        f"{type(scene.material).__name__} does not allow the F of particle {int(np.argmin(allowed))} "
         "(neo-Hookean needs det F > 0): start from an admissible one.",
     )

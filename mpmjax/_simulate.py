@@ -49,8 +49,8 @@ def simulate(
 ) -> Run:
     """Simulate a scene from step `start` to time t1 in steps of dt.
 
-    The rollout is differentiable with respect to every float of the scene, the particles and the method: in reverse mode
-    by default, by recomputation from checkpoints; in forward mode (`jax.jvp`, `jax.jacfwd`) with
+    The rollout is differentiable with respect to every float of the scene, the particles and the method: in reverse
+    mode by default, by recomputation from checkpoints; in forward mode (`jax.jvp`, `jax.jacfwd`) with
     `adjoint=diffrax.ForwardMode()`. Only the number of steps, `save_every` and choices of code compile anew.
 
     Args:
@@ -124,8 +124,8 @@ def simulate(
 
 _TRACED_FAULT = (
     "mpmjax: the rollout met a fault (a non-finite state, a particle outside the window, an inadmissible F, or a solve "
-    "that did not converge). Call simulate outside of jax transformations to have step, time and particle named, or with "
-    "throw=False to inspect run.tally."
+    "that did not converge). Call simulate outside of jax transformations to have step, time and particle named, or "
+    "with throw=False to inspect run.tally."
 )
 
 
@@ -178,7 +178,7 @@ def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
     total = round(ratio)
     require(
         abs(ratio - total) <= 1e-6 * max(1.0, abs(ratio)),
-        f"t1 must be a whole number of steps: t1 / dt = {ratio:.9g} (t1 = {t1}, dt = {dt}); change dt to {t1} / {total or 1}.",
+        f"t1 must be a whole number of steps: t1 / dt = {ratio:.9g} (t1 = {t1}, dt = {dt}); take dt = {t1} / {total or 1}.",
     )
     require(total > start, f"t1 must lie after the start: t1 / dt = {total} steps, start = {start}.")
     most = 2 ** (jnp.finfo(dtype).nmant - 1)
@@ -268,9 +268,9 @@ def raise_faults(run: Run, previous: State | None, start: int) -> None:
         )
     if int(run.tally.unconverged) > 0:
         raise SimulationError(
-            f"The solve of {int(run.tally.unconverged)} of {int(run.tally.steps)} steps did not converge (worst relative "
-            f"residual {float(run.tally.worst_residual):.2g}). Reduce dt, raise the solver's max_steps or loosen its rtol; "
-            "BackwardEuler holds where one linear solve does not.",
+            f"The solve of {int(run.tally.unconverged)} of {int(run.tally.steps)} steps did not converge (worst "
+            f"relative residual {float(run.tally.worst_residual):.2g}). Reduce dt, raise the solver's max_steps or loosen its "
+            "rtol; BackwardEuler holds where one linear solve does not.",
             run,
         )
 

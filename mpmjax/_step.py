@@ -84,13 +84,14 @@ class Explicit(eqx.Module):
 
 
 class SemiImplicit(eqx.Module):
-    """The semi-implicit update: (M + βΔt²H) v^{n+1} = M v*, force and H at the start of the step (reference, eqs. 3, 6).
+    """The semi-implicit update: (M + βΔt²H) v^{n+1} = M v*, force and H at the start of the step (reference, eqs. 3,
+    6).
 
     First order in time. On a mode of frequency ω the amplification is (1 + βz)^(−½) with z = (ωΔt)² while
     z < 4/(1−β)²: stable for every Δt if β ≥ ½, else for z ≤ 4/(1−2β). β = 0 is the explicit step; β = 1 one Newton step
-    of backward Euler. β = ½ is *not* the trapezoidal rule, positions moving with v^{n+1}: for β > 0 motion is damped, by
-    a quarter in one period of a standing wave at the explicit limit. A method for slow, driven and overdamped motion.
-
+    of backward Euler. β = ½ is *not* the trapezoidal rule, positions moving with v^{n+1}: for β > 0 motion is damped,
+    by a quarter in one period of a standing wave at the explicit limit. A method for slow, driven and overdamped
+    motion.
     *When it breaks*: large strains within one step (the system is linearised once), and where compression makes H
     indefinite and Δt brings M + βΔt²H near singular.
     *Good values*: β = 1 with Δt up to some hundred times the explicit limit for quasi-static pulls.
@@ -284,8 +285,8 @@ def step(
         method: `Explicit()`, `SemiImplicit(...)` or `BackwardEuler(...)`.
 
     Returns:
-        the particles after the step, and a `StepInfo`. Nothing is raised for what only the numbers show: `StepInfo` says
-        whether the solve converged and whether particles left the window, and `simulate` acts on it.
+        the particles after the step, and a `StepInfo`. Nothing is raised for what only the numbers show: `StepInfo`
+        says whether the solve converged and whether particles left the window, and `simulate` acts on it.
 
     Raises:
         ValueError: from `prepare`, or a dt that is not positive.

@@ -1,8 +1,9 @@
-"""Transfers between particles and grid. `spread` is the only function that scatters, `collect` the only one that gathers.
+"""Transfers between particles and grid. `spread` is the only function that scatters, `collect` the only one that
+gathers.
 
-Both are sums over a particle's stencil against a *basis*: an array (k, b, p) of b functions of the node, e.g. the weight
-and its d gradients. They are each other's transpose, so everything built of them (force and deformation, Hessian, P2G and
-G2P) is symmetric where mathematics says so.
+Both are sums over a particle's stencil against a *basis*: an array (k, b, p) of b functions of the node, e.g. the
+weight and its d gradients. They are each other's transpose, so everything built of them (force and deformation, Hessian,
+P2G and G2P) is symmetric where mathematics says so.
 """
 
 from typing import ClassVar
@@ -53,8 +54,8 @@ class FLIP(eqx.Module):
     """FLIP(α): particles take the change of the grid's velocity, blended with PIC (J. U. Brackbill, H. M. Ruppel,
     J. Comput. Phys. 65 (1986) 314, doi 10.1016/0021-9991(86)90211-1).
 
-    v ← α (v + Σ_i w_ip (v_i^{n+1} − v_i^n)) + (1 − α) Σ_i w_ip v_i^{n+1}. With α = 1 nothing is dissipated, noise in the
-    null space of the transfer included.
+    v ← α (v + Σ_i w_ip (v_i^{n+1} − v_i^n)) + (1 − α) Σ_i w_ip v_i^{n+1}. With α = 1 nothing is dissipated, noise in
+    the null space of the transfer included.
 
     Args:
         alpha: share of FLIP, from 0 (PIC) to 1.
@@ -68,8 +69,8 @@ class FLIP(eqx.Module):
 
 
 class APIC(eqx.Module):
-    """Affine particle-in-cell (C. Jiang, C. Schroeder, A. Selle, J. Teran, A. Stomakhin, ACM Trans. Graph. 34 (2015) 51,
-    doi 10.1145/2766996).
+    """Affine particle-in-cell (C. Jiang, C. Schroeder, A. Selle, J. Teran, A. Stomakhin, ACM Trans. Graph. 34 (2015)
+    51, doi 10.1145/2766996).
 
     Particles carry an affine velocity C [1/s]; linear and angular momentum are conserved by the transfers. Second order
     in space with quadratic and cubic kernels.

@@ -173,6 +173,7 @@ def test_float32_ends_at_its_own_floor_and_says_so():
     assert true_residual(A, x, b) <= 2 * floor
     assert stats["num_steps"] < 1000
     # and what it gives is the solution to what the condition leaves of float32
+    x = np.asarray(x, float)
     error = np.linalg.norm(x - np.linalg.solve(A.astype(float), b)) / np.linalg.norm(x)
     assert error < 1e4 * floor
 
@@ -263,61 +264,57 @@ def test_bad_arguments_are_refused(arguments, message):
 
 
 def literal_conjugate_residual(E, b, guess, steps):
-    """Section 2.1 of the reference to the letter: plain dot products on E = I + βΔt²M⁻¹H. Residual norms, true ones."""
+    """Section 2.1 of the reference to the letter: plain dot products on E = I + βΔt²M⁻¹H. The iterates."""
     v, r = guess, b - E @ guess
     s = E @ r
     p, q, gamma = r, s, r @ s
-    history = []
     for _ in range(steps):
         alpha = gamma / (q @ q)
         v, r = v + alpha * p, r - alpha * q
+        yield v
         s = E @ r
         beta = (r @ s) / gamma
         gamma = beta * gamma
         p, q = r + beta * p, s + beta * q
-        history.append(np.linalg.norm(b - E @ v) / np.linalg.norm(b))
-    return np.array(history)
 
 
-def test_the_references_plain_inner_product_fails_on_a_nearly_empty_node():
-    """Kept to show why not: an elastic block and a stray particle whose farthest node has 1e-9 of a particle's mass.
-
-    At 20 times the explicit limit the mass-weighted recurrence converges in some dozen steps, by its own matrix-free
-    operator; the literal one, in which E is not self-adjoint, has not reached the same tolerance in ten times as many.
-    """
+def block_and_stray(multiple):
+    """The system of a block in random motion and a stray particle, at a multiple of the explicit limit, and M v."""
     dx = 0.1
     grid = mpm.Grid((14, 14), dx, origin=(-4, -4))
     block = mpm.fill(mpm.Box((0.0, 0.0), (3 * dx, 3 * dx)), grid, particles_per_cell=4, density=1e3)
-    stray = jnp.asarray([[4.5 * dx + 1e-5 * dx, 1.5 * dx]])
-    scene = mpm.Scene(grid, LAWS["fixed_corotated"], gradient=mpm.SplineGradient())
-    rng = np.random.default_rng(0)
-    x = jnp.concatenate([block.x, stray])
-    particles = mpm.Particles(
-        x=x,
-        v=jnp.asarray(rng.normal(size=x.shape)),
-        mass=jnp.full(len(x), block.mass[0]),
-        volume=jnp.full(len(x), block.volume[0]),
-    )
-    particles = mpm.prepare(scene, particles)
-    stencil = scene.stencil(particles)
-    mass, momentum = p2g(stencil, particles.mass, components(particles.v), components(particles.C), grid.size)
-    lightest = float(jnp.where(mass > 0, mass, jnp.inf).min() / particles.mass[0])
-    assert 0 < lightest < 1e-8
-    F = components(particles.F)
-    material = jax.tree.map(jnp.asarray, scene.material)
-    potential = ElasticPotential(material, particles.volume, F, F, stencil, mirror((), grid, scene.window(particles)))
-    dt = jnp.asarray(20 * explicit_limit(scene))
-    free = jnp.broadcast_to((mass > 0)[:, None], momentum.shape)
-    system = ImplicitOperator(mass, dt**2, mpm.AnalyticHessian().at_rest(potential, momentum), free)
+    x = jnp.concatenate([block.x, jnp.asarray([[4.50001 * dx, 1.7 * dx]])])
+    v = jnp.asarray(np.random.default_rng(0).normal(size=x.shape))
+    mass, volume = (jnp.full(len(x), a[0]) for a in (block.mass, block.volume))
+    scene = mpm.Scene(grid, jax.tree.map(jnp.asarray, LAWS["fixed_corotated"]))
+    particles = mpm.prepare(scene, mpm.Particles(x, v, mass, volume))
+    F, stencil = components(particles.F), scene.stencil(particles)
+    node_mass, momentum = p2g(stencil, mass, components(v), components(particles.C), grid.size)
+    occupied = node_mass > jnp.finfo(float).eps * mass[0]
+    assert 0 < jnp.where(occupied, node_mass, jnp.inf).min() < 1e-10 * mass[0]
+    potential = ElasticPotential(scene.material, volume, F, F, stencil, mirror((), grid, scene.window(particles)))
+    hessian = mpm.AnalyticHessian().at_rest(potential, momentum)
+    free = jnp.broadcast_to(occupied[:, None], momentum.shape)
+    factor = jnp.asarray((multiple * explicit_limit(scene)) ** 2)
+    return ImplicitOperator(node_mass, factor, hessian, free), jnp.where(free, momentum, 0)
+
+
+def test_the_references_plain_inner_product_fails_on_a_nearly_empty_node():
+    """Kept to show why not: an elastic block and a stray particle that leaves 1e-11 of its mass on some nodes.
+
+    At 5 times the explicit limit the mass-weighted recurrence is at 1e-8 in some fifty steps. The literal one, in whose
+    inner product E is not self-adjoint, does not come near in ten times as many, whichever norm one asks.
+    """
+    system, momentum = block_and_stray(5)
     options = {"metric": system.metric(), "y0": momentum / system.metric()}
-    _, result, stats = eqx.filter_jit(mpm.ConjugateResidual(rtol=1e-8).compute)(system, momentum, options)
+    v, result, stats = eqx.filter_jit(mpm.ConjugateResidual(rtol=1e-8).compute)(system, momentum, options)
     assert result == R.successful
     steps = int(stats["num_steps"])
     assert steps < 60
-    keep = np.asarray(free).ravel()
-    M = np.asarray(system.metric()).ravel()[keep]
-    E = np.asarray(eqx.filter_jit(ImplicitOperator.as_matrix)(system))[np.ix_(keep, keep)] / M[:, None]
-    b = np.asarray(momentum).ravel()[keep] / M
-    history = literal_conjugate_residual(E, b, b, 10 * steps)
-    print(steps, lightest, history[[steps, 2 * steps, 5 * steps, -1]], history.min())
-    assert history.min() > 1e-8
+    keep = np.asarray(system.free).ravel()
+    M, rhs, v = (np.asarray(a).ravel()[keep] for a in (system.metric(), momentum, v))
+    A = np.asarray(eqx.filter_jit(ImplicitOperator.as_matrix)(system))[np.ix_(keep, keep)]
+    assert true_residual(A, v, rhs, M) < 1e-8
+    iterates = list(literal_conjugate_residual(A / M[:, None], rhs / M, rhs / M, 10 * steps))
+    for norm in (M, M**2):  # of the inverse mass, and the recurrence's own
+        assert min(true_residual(A, v, rhs, norm) for v in iterates) > 1e-3

@@ -9,7 +9,8 @@ from mpmjax.material._base import AbstractMaterial, AbstractTangent, lame_lambda
 
 
 class FixedCorotated(AbstractMaterial):
-    """Fixed corotated elasticity (A. Stomakhin, R. Howes, C. Schroeder, J. Teran, SCA 2012, doi 10.2312/SCA/SCA12/025-032).
+    """Fixed corotated elasticity (A. Stomakhin, R. Howes, C. Schroeder, J. Teran, SCA 2012, doi
+    10.2312/SCA/SCA12/025-032).
 
     Ψ = μ ‖F − R‖² + λ/2 (J − 1)², P = 2μ (F − R) + λ (J − 1) J F⁻ᵀ, with F = R S and J = det F; the differential is
     eq. 11 of the reference.

@@ -1,0 +1,161 @@
+"""Each command of the shell, on good input and on bad: one clear line, exit code 2, no traceback, nothing lost."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import mpmjax as mpm
+from mpmjax.cli import app
+
+SCENE = """
+gravity = [0.0, -9.81]
+
+[grid]
+shape = [10, 14]
+spacing = 0.1
+origin = [-3, -3]
+
+[material]
+kind = "FixedCorotated"
+youngs_modulus = 1e5
+poisson_ratio = 0.3
+
+[[boundary]]
+kind = "SlipBox"
+lower = [-0.2, 0.0]
+upper = [0.6, inf]
+
+[[particles]]
+region = { kind = "Box", lower = [0.0, 0.1], upper = [0.3, 0.4] }
+density = 1e3
+
+[run]
+t1 = 0.06
+dt = 1e-2
+method = { kind = "SemiImplicit" }
+save_every = 2
+"""
+
+
+def shell(*words: object) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of a command."""
+    result = CliRunner().invoke(app, [str(w) for w in words])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result.exit_code, result.stdout, result.stderr
+
+
+def refused(*words: object) -> str:
+    """The one line that a refused command says."""
+    code, _, err = shell(*words)
+    lines = [line for line in err.splitlines() if line.startswith("mpmjax: ")]
+    assert code == 2
+    assert len(lines) == 1
+    assert "Traceback" not in err
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A folder with a scene file and the file of its run."""
+    folder = tmp_path_factory.mktemp("shell")
+    (folder / "scene.toml").write_text(SCENE)
+    code, out, err = shell("run", folder / "scene.toml", "-o", folder / "run.h5")
+    assert code == 0, err
+    (folder / "summary").write_text(out)
+    return folder
+
+
+def test_run_writes_the_frames_and_a_summary(folder):
+    run = mpm.load(folder / "run.h5")
+    np.testing.assert_array_equal(run.steps, [0, 2, 4, 6])
+    summary = (folder / "summary").read_text()
+    assert re.search(r"steps +6 of 0.01 s with SemiImplicit", summary)
+    for word in ("particle-steps per second", "iterations a step", "total energy", "mass"):
+        assert word in summary
+    lost = re.search(r"on the grid ([-+.e\d]+) of it", summary)
+    assert lost is not None
+    assert abs(float(lost[1])) < 1e-14
+
+
+def test_run_reports_what_simulate_returns(folder):
+    """The recorded run is the simulated one."""
+    from mpmjax._job import read_job
+
+    job = read_job(folder / "scene.toml")
+    run = mpm.simulate(job.scene, job.particles, t1=job.run.t1, dt=job.run.dt, method=job.run.method)
+    np.testing.assert_array_equal(mpm.load(folder / "run.h5").final.x, run.final.x)
+
+
+def test_run_does_not_replace_a_file_unasked_and_resumes_it(folder):
+    before = (folder / "run.h5").read_bytes()
+    assert "exists" in refused("run", folder / "scene.toml", "-o", folder / "run.h5")
+    assert (folder / "run.h5").read_bytes() == before
+    longer = folder / "longer.toml"
+    longer.write_text(SCENE.replace("t1 = 0.06", "t1 = 0.08"))
+    copy = folder / "copy.h5"
+    copy.write_bytes(before)
+    assert shell("run", longer, "-o", copy, "--resume", "--quiet")[0] == 0
+    np.testing.assert_array_equal(mpm.load(copy).steps, [0, 2, 4, 6, 8])
+
+
+@pytest.mark.parametrize("name", ["still.png", "moving.gif"])
+def test_render_draws_a_picture(folder, name):
+    code, _, err = shell("render", folder / "run.h5", "-o", folder / name, "--colour", "energy", "--dpi", 40)
+    assert code == 0, err
+    assert (folder / name).stat().st_size > 1000
+
+
+BAD_SCENES = {
+    "wrong key": ("spacing = 0.1", "spacng = 0.1", r"\[grid\].*spacng.*spacing"),
+    "wrong kind": ('"SlipBox"', '"SlideBox"', r"\[\[boundary\]\].*SlideBox"),
+    "bad number": ("youngs_modulus = 1e5", "youngs_modulus = -1e5", r"youngs_modulus.*greater than zero"),
+    "not a number": ("dt = 1e-2", 'dt = "small"', r"\[run\] dt"),
+    "not whole steps": ("dt = 1e-2", "dt = 0.7e-2", r"whole number of steps"),
+    "outside the window": ("lower = [0.0, 0.1]", "lower = [-0.5, 0.1]", r"window; particle 0 at"),
+    "no TOML": ("[grid]", "[grid", r"not a TOML file"),
+    "missing table": ("[run]", "[rum]", r"\[run\]"),
+    "counts": ("density = 1e3", "density = 1e3\nparticles_per_cell = 3", r"\[\[particles\]\] 1.*2-th power"),
+}
+
+
+@pytest.mark.parametrize(("old", "new", "says"), BAD_SCENES.values(), ids=BAD_SCENES)
+def test_a_bad_scene_gets_one_line(tmp_path, old, new, says):
+    assert old in SCENE
+    scene = tmp_path / "bad.toml"
+    scene.write_text(SCENE.replace(old, new, 1))
+    line = refused("run", scene, "-o", tmp_path / "run.h5")
+    assert re.search(says, line), line
+    assert not (tmp_path / "run.h5").exists()
+
+
+def test_a_missing_file_gets_one_line(tmp_path):
+    assert "none.toml" in refused("run", tmp_path / "none.toml", "-o", tmp_path / "run.h5")
+    assert "none.h5" in refused("render", tmp_path / "none.h5", "-o", tmp_path / "a.png")
+
+
+def test_a_corrupt_file_gets_one_line(folder, tmp_path):
+    whole = (folder / "run.h5").read_bytes()
+    (tmp_path / "cut.h5").write_bytes(whole[: len(whole) // 2])
+    refused("render", tmp_path / "cut.h5", "-o", tmp_path / "a.png")
+    (tmp_path / "text.h5").write_text("no HDF5")
+    refused("render", tmp_path / "text.h5", "-o", tmp_path / "a.png")
+    assert "png" in refused("render", folder / "run.h5", "-o", tmp_path / "a.xyz")
+
+
+def test_a_run_that_blows_up_keeps_what_was_written(tmp_path):
+    """An explicit run far beyond its limit names step, time and particle; its good frames stay."""
+    scene = tmp_path / "wild.toml"
+    wild = SCENE.replace('{ kind = "SemiImplicit" }', '"Explicit"').replace("t1 = 0.06", "t1 = 1.0")
+    scene.write_text(wild.replace("dt = 1e-2", "dt = 4e-2").replace("save_every = 2", "save_every = 1"))
+    line = refused("run", scene, "-o", tmp_path / "run.h5")
+    assert re.search(r"At step \d+ \(t = .* s\) particle \d+", line), line
+    run = mpm.load(tmp_path / "run.h5")
+    assert len(run) >= 2
+    assert np.isfinite(run.frames.x).all()
+
+
+def test_fit_needs_a_fit_table(folder):
+    assert "[fit]" in refused("fit", folder / "scene.toml")

@@ -1,0 +1,114 @@
+"""The main job: rubber's shear modulus from its measured curve."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mpmjax as mpm
+from mpmjax._fit import gauge
+from mpmjax._job import fit_job, read_columns, read_job
+from test_cli import refused, shell
+
+RUBBER = Path(__file__).parents[1] / "examples" / "rubber.toml"
+
+
+@pytest.fixture(scope="module")
+def job():
+    """The example's job."""
+    return read_job(RUBBER)
+
+
+@pytest.fixture(scope="module")
+def coarse(job):
+    """The same strip at twice the spacing, for what does not need the figure itself."""
+    grid = mpm.Grid((8, 14), 5e-3, origin=(-3, -3))
+    particles = mpm.fill(mpm.Box((0.0, 0.0), (0.01, 0.04)), grid, particles_per_cell=4, density=930.0, dtype="float64")
+    scene = mpm.Scene(grid, job.scene.material, boundary=job.scene.boundary, description=mpm.TotalLagrangian())
+    return job._replace(scene=scene, particles=particles, run=job.run._replace(dt=5e-3))
+
+
+def test_the_fit_finds_rubbers_modulus(tmp_path):
+    """`mpmjax fit` prints a modulus within 3 % of 0.339 MPa, the closed form's least-squares answer, and a plot."""
+    code, out, err = shell("fit", RUBBER, "--plot", tmp_path / "fit.png")
+    assert code == 0, err
+    match = re.search(r"shear_modulus = (\S+) ± (\S+)", out)
+    assert match is not None, out
+    modulus, error = float(match[1]), float(match[2])
+    assert abs(modulus / 0.339e6 - 1) < 0.03
+    assert 0 < error < 0.02e6
+    assert len(re.findall(r"% fitted", out)) == 3
+    assert len(re.findall(r"% predicted", out)) == 6
+    assert (tmp_path / "fit.png").stat().st_size > 10_000
+
+
+def test_the_step_is_far_beyond_the_explicit_limit(job):
+    """More than 100 times dx/c."""
+    law = job.scene.material
+    speed = np.sqrt((law.lame_lambda + 2 * law.shear_modulus) / 930)
+    assert job.run.dt / (job.scene.grid.spacing / speed) > 100
+
+
+def test_doubled_stresses_double_the_modulus(coarse):
+    """A quasi-static curve is proportional to the modulus."""
+    once = fit_job(coarse)
+    twice = fit_job(coarse._replace(fit=coarse.fit._replace(stress=2 * coarse.fit.stress)))
+    assert float(twice.value / once.value) == pytest.approx(2, rel=1e-4)
+    assert float(twice.standard_error / once.standard_error) == pytest.approx(2, rel=1e-3)
+
+
+def test_the_fit_is_the_least_squares_answer_of_its_own_curve(coarse):
+    """At the fit the residual is orthogonal to the curve, stress being proportional to the modulus."""
+    result = fit_job(coarse)
+    fit = coarse.fit
+    model = np.asarray(result.predicted)[fit.fitted]
+    assert abs((model * (model - fit.stress[fit.fitted])).sum()) < 1e-4 * (model**2).sum()
+
+
+def test_an_unreached_stretch_is_an_error_and_not_a_flat_curve(coarse):
+    with pytest.raises(ValueError, match="leaves out measured points"):
+        fit_job(coarse._replace(run=coarse.run._replace(t1=0.1)))
+
+
+def test_a_gauge_without_particles_is_refused(job):
+    with pytest.raises(ValueError, match="holds no particle"):
+        gauge(mpm.Box((1.0, 1.0), (2.0, 2.0)), job.particles, 1)
+
+
+def test_the_gauge_weighs_by_volume(job):
+    curve = gauge(mpm.Box((0.0, 0.0), (0.01, 0.01)), job.particles, 1)
+    stretched = dataclasses.replace(job.particles, F=2 * job.particles.F)
+    assert float(curve.weight.sum()) == pytest.approx(1)
+    stretch, stress = curve(job.scene, stretched)
+    assert float(stretch) == pytest.approx(2)
+    assert float(stress) == pytest.approx(float(job.scene.material.stress(2 * jnp.eye(2)[..., None])[1, 1, 0]))
+
+
+FIT_FAULTS = {
+    "no file": ('data = "data/treloar_1944_pure_shear.csv"', 'data = "none.csv"', r"none\.csv"),
+    "no column": ('stretch = "stretch"', 'stretch = "lambda"', r"no column 'lambda'"),
+    "no parameter": ('"material.youngs_modulus"', '"material.stiffness"', r"no 'stiffness'"),
+    "empty range": ("range = [1.1, 2.4]", "range = [1.1, 1.2]", r"holds 0 of"),
+    "kind": ('kind = "curve"', 'kind = "surface"', r"must be \"curve\""),
+}
+
+
+@pytest.mark.parametrize(("old", "new", "says"), FIT_FAULTS.values(), ids=FIT_FAULTS)
+def test_a_bad_fit_table_gets_one_line(tmp_path, old, new, says):
+    text = RUBBER.read_text()
+    assert old in text
+    data = RUBBER.parent / "data" / "treloar_1944_pure_shear.csv"
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / data.name).write_bytes(data.read_bytes())
+    (tmp_path / "bad.toml").write_text(text.replace(old, new, 1))
+    line = refused("fit", tmp_path / "bad.toml")
+    assert re.search(says, line), line
+
+
+def test_columns_name_the_row_that_is_no_number(tmp_path):
+    (tmp_path / "a.csv").write_text("# comment\nx,y\n1,2\n3,four\n")
+    with pytest.raises(ValueError, match="data row 2: y must be a number, got 'four'"):
+        read_columns(tmp_path / "a.csv", "x", "y")
