@@ -174,7 +174,7 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
     if not inside.all():
         first = int(np.argmin(inside))
         raise ValueError(
-            f"Each particle's stencil must lie in the grid's window; particle {first} at {np.asarray(place[first])} and "
+            f"Every particle's stencil must lie in the window; particle {first} at {np.asarray(place[first])} and "
             f"{int((~inside).sum()) - 1} others do not: enlarge the grid's shape, move its origin, or use follow=True."
         )
     for plane in scene.boundary:

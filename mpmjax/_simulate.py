@@ -178,7 +178,8 @@ def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
     total = round(ratio)
     require(
         abs(ratio - total) <= 1e-6 * max(1.0, abs(ratio)),
-        f"t1 must be a whole number of steps: t1 / dt = {ratio:.9g} (t1 = {t1}, dt = {dt}); take dt = {t1} / {total or 1}.",
+        f"t1 must be a whole number of steps: t1 / dt = {ratio:.9g} (t1 = {t1}, dt = {dt}); "
+        f"take dt = {t1} / {total or 1}.",
     )
     require(total > start, f"t1 must lie after the start: t1 / dt = {total} steps, start = {start}.")
     most = 2 ** (jnp.finfo(dtype).nmant - 1)
@@ -269,8 +270,8 @@ def raise_faults(run: Run, previous: State | None, start: int) -> None:
     if int(run.tally.unconverged) > 0:
         raise SimulationError(
             f"The solve of {int(run.tally.unconverged)} of {int(run.tally.steps)} steps did not converge (worst "
-            f"relative residual {float(run.tally.worst_residual):.2g}). Reduce dt, raise the solver's max_steps or loosen its "
-            "rtol; BackwardEuler holds where one linear solve does not.",
+            f"relative residual {float(run.tally.worst_residual):.2g}). Reduce dt, raise the solver's max_steps "
+            "or loosen its rtol; BackwardEuler holds where one linear solve does not.",
             run,
         )
 

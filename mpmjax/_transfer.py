@@ -2,8 +2,8 @@
 gathers.
 
 Both are sums over a particle's stencil against a *basis*: an array (k, b, p) of b functions of the node, e.g. the
-weight and its d gradients. They are each other's transpose, so everything built of them (force and deformation, Hessian,
-P2G and G2P) is symmetric where mathematics says so.
+weight and its d gradients. They are each other's transpose, so everything built of them (force and deformation,
+Hessian, P2G and G2P) is symmetric where mathematics says so.
 """
 
 from typing import ClassVar

@@ -96,7 +96,8 @@ def _summary(job: Job, run: Run, seconds: float) -> str:
     if int(run.tally.violations) > 0:
         lines.append(("contact", f"{int(run.tally.violations)} conditions left violated"))
     for name in ("kinetic", "elastic", "potential", "total"):
-        lines.append((f"{name} energy", f"{float(getattr(before, name)):.6g} J to {float(getattr(after, name)):.6g} J"))
+        a, b = float(getattr(before, name)), float(getattr(after, name))
+        lines.append((f"{name} energy", f"{a + 0.0:.6g} J to {b + 0.0:.6g} J, change {b - a:+.3g} J"))
     lost = (float(grid_mass(run.scene, run.final)) - mass) / mass
     lines.append(("mass", f"{mass:.6g} kg; on the grid {lost:+.1e} of it"))
     return "\n".join(f"{name:<18} {text}" for name, text in lines)

@@ -13,19 +13,20 @@ from mpmjax._diffrax import NOT_FINITE
 
 DT = 5e-3
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(), "backward_euler": mpm.BackwardEuler()}
-GRIP = mpm.Grip(mpm.Box((-1.0, -1.0), (0.05, 1.0)), mpm.Motion((0.0, 1.0), ((0.0, 0.0), (-0.4, 0.1))))
 
 
-def pulled(**options):
+def pulled(d=1, **options):
     """A block held at its left by a moving grip, under gravity, and stirred."""
-    scene, particles = block(2, side=2, gravity=(0.0, -9.81), boundary=GRIP, **options)
+    motion = mpm.Motion((0.0, 1.0), ((0.0,) * d, (-0.4, 0.1)[:d]))
+    grip = mpm.Grip(mpm.Box((-1.0,) * d, (0.05, 1.0)[:d]), motion)
+    scene, particles = block(d, side=3, gravity=(-9.81,) * d, boundary=grip, **options)
     v = 0.1 * np.random.default_rng(0).normal(size=particles.x.shape)
     return scene, eqx.tree_at(lambda p: p.v, particles, jnp.asarray(v))
 
 
 def height(scene, particles):
     """What a run observes: the mean height and the scene's gravity."""
-    return particles.x[:, 1].mean(), jnp.asarray(scene.gravity)[1]
+    return particles.x[:, 0].mean(), jnp.asarray(scene.gravity)[0]
 
 
 def assert_equal(a, b):
@@ -38,11 +39,14 @@ def state(particles):
     return particles.x, particles.v, particles.F, particles.C
 
 
-@pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
-@pytest.mark.parametrize("method", **ids(METHODS))
+EQUAL = {"explicit": "updated", "semi_implicit": "total", "backward_euler": "updated"}
+
+
+@pytest.mark.parametrize(("method", "description"), EQUAL.items())
 def test_simulate_equals_the_plain_rollout(method, description):
     """diffrax's loop against lax.scan, bit for bit, at every saved frame."""
-    scene, particles = pulled(description=description)
+    scene, particles = pulled(2, description=DESCRIPTIONS[description])
+    method = METHODS[method]
     run = mpm.simulate(scene, particles, t1=8 * DT, dt=DT, method=method, save_every=4)
     for frame, steps in [(run.frame(1), 4), (run.final, 8)]:
         assert_equal(state(frame), state(mpm.rollout(scene, particles, steps=steps, dt=DT, method=method)))
@@ -71,7 +75,7 @@ def test_observations_are_curves():
     frames = mpm.simulate(scene, particles, t1=6 * DT, dt=DT, save_every=1).frames
     assert run.frames is None
     np.testing.assert_array_equal(run.steps, range(7))
-    assert_close(run.observed[0], np.asarray(frames.x)[:, :, 1].mean(axis=1), 1e-15)
+    assert_close(run.observed[0], np.asarray(frames.x)[:, :, 0].mean(axis=1), 1e-15)
     np.testing.assert_array_equal(run.observed[1], np.full(7, -9.81))
     coarse = mpm.simulate(scene, particles, t1=6 * DT, dt=DT, observe=height, save_every=4)
     assert_equal(coarse.observed[0], run.observed[0][np.array([0, 4, 6])])
@@ -92,7 +96,7 @@ def test_a_run_continues_from_its_end():
 def test_no_float_compiles_anew():
     """Material, gravity, wall, grip, spacing, β, tolerances, dt, start: one compilation; another number of steps may."""
     scene, particles = pulled()
-    wall = mpm.SlipBox((-5.0, -0.2), (5.0, 5.0))
+    wall = mpm.SlipBox((-5.0,), (5.0,))
     scene = eqx.tree_at(lambda s: s.boundary, scene, (*scene.boundary, wall))
     method = mpm.SemiImplicit(beta=1.0, solver=mpm.ConjugateResidual(rtol=1e-8))
     count = []
@@ -109,11 +113,11 @@ def test_no_float_compiles_anew():
         "an integer": (lambda s: s.material.youngs_modulus, 20_000),
         "NumPy": (lambda s: s.material.poisson_ratio, np.float64(0.25)),
         "float32": (lambda s: s.material.poisson_ratio, jnp.float32(0.25)),
-        "gravity": (lambda s: s.gravity, (0.0, -1.62)),
-        "wall": (lambda s: s.boundary[1].lower, (-5.0, -0.1)),
-        "grip": (lambda s: s.boundary[0].motion.displacement, ((0.0, 0.0), (0.2, 0.1))),
+        "gravity": (lambda s: s.gravity, (-1.62,)),
+        "wall": (lambda s: s.boundary[1].lower, (-4.0,)),
+        "grip": (lambda s: s.boundary[0].motion.displacement, ((0.0,), (0.2,))),
         "times": (lambda s: s.boundary[0].motion.times, (0.0, 2.0)),
-        "region": (lambda s: s.boundary[0].region.upper, (0.06, 1.0)),
+        "region": (lambda s: s.boundary[0].region.upper, (0.06,)),
         "spacing": (lambda s: s.grid.spacing, 0.11),
     }
     for where, value in change.values():
@@ -154,9 +158,8 @@ def test_a_particle_that_is_not_finite_is_named():
 
 def test_a_particle_that_leaves_the_window_is_named():
     """With the step after which its stencil is outside, and what to do."""
-    grid = mpm.Grid((12, 8), 0.1, origin=(-2, -2))
-    x = jnp.array([[0.2, 0.2], [0.5, 0.1]])
-    v = jnp.array([[0.1, 0.0], [0.99, 0.0]])
+    grid = mpm.Grid((12,), 0.1, origin=(-2,))
+    x, v = jnp.array([[0.2], [0.5]]), jnp.array([[0.1], [0.99]])
     particles = mpm.Particles(x, v, jnp.ones(2), jnp.full(2, 1e-6))
     scene = mpm.Scene(grid, LAWS["neo_hookean"])
     # the last node is at 0.9: a quadratic stencil ends beyond 0.85, which the second particle passes at step 36
@@ -168,8 +171,8 @@ def test_a_particle_that_leaves_the_window_is_named():
 
 def test_inversion_of_a_law_that_does_not_allow_it_is_named():
     """neo-Hookean at det F ≤ 0 stops; fixed corotated goes on."""
-    scene, particles = block(2, side=2)
-    v = -300.0 * (particles.x - particles.x.mean(axis=0)) * jnp.array([1.0, 0.0])
+    scene, particles = block(1, side=2)
+    v = -300.0 * (particles.x - particles.x.mean(axis=0))
     particles = eqx.tree_at(lambda p: p.v, particles, v)
     assert np.linalg.det(np.asarray(mpm.simulate(scene, particles, t1=0.01, dt=0.01).final.F)).min() < 0
     scene = eqx.tree_at(lambda s: s.material, scene, LAWS["neo_hookean"])
@@ -215,7 +218,9 @@ def test_a_batch_member_that_fails_leaves_the_others_alone(method):
 def test_a_fault_under_a_transformation_raises():
     """Where a particle cannot be named, equinox's runtime error."""
     scene, particles = pulled()
-    run = eqx.filter_jit(lambda v: mpm.simulate(scene, eqx.tree_at(lambda p: p.v, particles, v), t1=4 * DT, dt=DT).final.x)
+    run = eqx.filter_jit(
+        lambda v: mpm.simulate(scene, eqx.tree_at(lambda p: p.v, particles, v), t1=4 * DT, dt=DT).final.x
+    )
     assert np.isfinite(run(particles.v)).all()
     with pytest.raises(Exception, match="the rollout met a fault"):
         run(jnp.nan * particles.v)
@@ -252,11 +257,3 @@ def test_progress_changes_nothing(capsys):
     jax.effects_barrier()
     assert "100" in capsys.readouterr().err
     assert_equal(state(quiet.final), state(shown.final))
-
-
-def test_the_checkpoints_memory_changes_nothing_of_the_run():
-    """Nor does it need more than one."""
-    scene, particles = pulled()
-    a = mpm.simulate(scene, particles, t1=8 * DT, dt=DT)
-    b = mpm.simulate(scene, particles, t1=8 * DT, dt=DT, checkpoint_bytes=1)
-    assert_equal(state(a.final), state(b.final))
