@@ -3,11 +3,12 @@
 import equinox as eqx
 import jax.numpy as jnp
 
+from mpmjax import _linalg as la
 from mpmjax._kernel import Stencil
 from mpmjax._particles import Particles
 from mpmjax._scene import Scene, prepare
 from mpmjax._transfer import p2g
-from mpmjax._types import Array, Float, components
+from mpmjax._types import Array, Float, ParticleScalar, components
 
 
 class Energy(eqx.Module):
@@ -50,6 +51,11 @@ def energy(scene: Scene, particles: Particles) -> Energy:
 def momentum(particles: Particles) -> Float[Array, "d"]:
     """Linear momentum Σ m v [kg m/s], shape (d,)."""
     return (particles.mass[:, None] * particles.v).sum(axis=0)
+
+
+def volume_ratio(particles: Particles) -> ParticleScalar:
+    """J = det F of each particle [-], shape (p,)."""
+    return la.determinant(particles.deformation())
 
 
 @eqx.filter_jit

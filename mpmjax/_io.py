@@ -347,7 +347,7 @@ def _check_same(path: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> Non
         show = "another array" if isinstance(b, np.ndarray) else "none" if b is None else repr(b)
         got = "" if isinstance(a, np.ndarray) else f" instead of {a!r}"
         require(
-            type(a) is type(b) and np.array_equal(a, b),
+            type(a) is type(b) and np.array_equal(*pair),
             f"{path} holds another run: its {name} is {show}{got}. Resume the same run, or name a new file.",
         )
 

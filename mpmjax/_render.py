@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from mpmjax._checks import require
+from mpmjax._diagnostics import volume_ratio
 from mpmjax._particles import Particles
 from mpmjax._run import Run
-from mpmjax._step import determinant
 
 COLOURS: dict[str, tuple[str, Callable[[Run, Particles], Any]]] = {
     "speed": ("speed [m/s]", lambda run, q: np.linalg.norm(q.v, axis=1)),
-    "volume": ("volume ratio J [-]", lambda run, q: determinant(q)),
+    "volume": ("volume ratio J [-]", lambda run, q: volume_ratio(q)),
     "energy": ("elastic energy density [J/m³]", lambda run, q: run.scene.material.energy(q.deformation())),
 }
 """What particles can be coloured by: a label and a value for each particle."""

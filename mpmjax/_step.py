@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax import _linalg as la
 from mpmjax._boundary import Conditions, combine, mirror
 from mpmjax._checks import canonical, require_between, require_positive
 from mpmjax._conjugate_residual import ConjugateResidual
@@ -300,8 +299,3 @@ def step(
 @eqx.filter_jit
 def _step(scene: Any, particles: Any, t: Any, dt: Any, method: Any) -> Any:
     return advance(scene, particles, t, dt, method)
-
-
-def determinant(particles: Particles) -> Array:
-    """J = det F of each particle [-], shape (p,)."""
-    return la.determinant(particles.deformation())
