@@ -93,7 +93,7 @@ class Tally(eqx.Module):
             sweeps=self.sweeps + later.sweeps,
             violations=self.violations + later.violations,
             fault=jnp.where(healthy, later.fault, self.fault),
-            fault_step=jnp.where(healthy, self.steps + later.fault_step, self.fault_step),
+            fault_step=jnp.where(healthy & (later.fault != HEALTHY), self.steps + later.fault_step, self.fault_step),
         )
 
 

@@ -80,7 +80,8 @@ class FrameWriter:
         described = _describe(scene, particles, method, dt)
         rows = _rows(0, 0, described["dt"], state_of(particles), no_steps(particles.x.dtype))
         require(
-            overwrite or not path.exists(), f"{path} exists: choose another name, remove it, or pass overwrite=True."
+            overwrite or not path.exists(),
+            f"{path} exists: choose another name, remove it, or ask to overwrite or to resume it.",
         )
         file = _opened(path, "w")
         add_topology(file, particles.count)

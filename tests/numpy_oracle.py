@@ -69,7 +69,7 @@ def stress_differential(law, mu: float, lam: float, F: np.ndarray, dF: np.ndarra
 
 
 def numpy_step(scene: mpm.Scene, particles: mpm.Particles, dt: float, beta: float | None = None) -> dict:
-    """One step from rest time, explicit without a beta, else semi-implicit; walls may be sticky or slip boxes."""
+    """One step at t = 0, explicit without a beta, else semi-implicit; boundaries: sticky and slip boxes, box grips."""
     d, dx, law, total = scene.grid.dim, float(scene.grid.spacing), scene.material, scene.total
     x, v, F = (np.asarray(a) for a in (particles.x, particles.v, particles.F))
     C = np.zeros_like(F) if particles.C is None else np.asarray(particles.C)
@@ -110,9 +110,14 @@ def numpy_step(scene: mpm.Scene, particles: mpm.Particles, dt: float, beta: floa
     before[occupied] = momentum[occupied] / mass[occupied, None]
 
     # the update
-    free = np.repeat(occupied[:, None], d, axis=1)
+    free, held = np.repeat(occupied[:, None], d, axis=1), np.zeros((n, d))
     for wall in scene.boundary:
         for i in range(n):
+            if isinstance(wall, mpm.Grip):
+                if (nodes[i] > np.array(wall.region.lower)).all() and (nodes[i] < np.array(wall.region.upper)).all():
+                    first, second = np.array(wall.motion.displacement)
+                    free[i], held[i] = False, (second - first) / (wall.motion.times[1] - wall.motion.times[0])
+                continue
             beyond = (nodes[i] <= np.array(wall.lower) + 1e-9) | (nodes[i] >= np.array(wall.upper) - 1e-9)
             free[i] &= ~(beyond.any() if isinstance(wall, mpm.StickyBox) else beyond)
     after[occupied] = before[occupied] + dt * (force[occupied] / mass[occupied, None] + np.array(scene.gravity))
@@ -125,10 +130,10 @@ def numpy_step(scene: mpm.Scene, particles: mpm.Particles, dt: float, beta: floa
         A = np.diag(np.repeat(mass, d)) + beta * dt**2 * H.reshape(n * d, n * d)
         keep = np.flatnonzero(free)
         b = (mass[:, None] * after).reshape(-1)
-        after = np.zeros(n * d)
-        after[keep] = np.linalg.solve(A[np.ix_(keep, keep)], b[keep])
+        after = held.reshape(-1).copy()
+        after[keep] = np.linalg.solve(A[np.ix_(keep, keep)], (b - A @ after)[keep])
         after = after.reshape(n, d)
-    after = np.where(free, after, 0)
+    after = np.where(free, after, held)
 
     # grid to particles
     moved = w @ after

@@ -160,6 +160,18 @@ def test_reported_residual_is_the_true_one(dtype, spectrum, max_steps):
         assert float(stats["residual"]) <= max({4: 1e-5, 8: 1e-8}[b.itemsize], 1.001 * floor)
 
 
+@EACH_DTYPE
+def test_reported_residual_is_the_true_one_after_a_far_guess(dtype):
+    """From y0 a million times too large the recurrence's own residual drifts; what is reported and obeyed does not."""
+    b, y0, _ = vectors()
+    A, b, y0 = (a.astype(dtype) for a in (symmetric("definite"), b, 1e6 * y0))
+    x, result, stats = solve(mpm.ConjugateResidual(), *map(jnp.asarray, (A, b)), None, jnp.asarray(y0))
+    rtol = {4: 1e-5, 8: 1e-8}[b.itemsize]
+    assert result == R.successful
+    assert true_residual(A, x, b) <= 1.1 * rtol
+    np.testing.assert_allclose(stats["residual"], true_residual(A, x, b), rtol=0.1)
+
+
 def test_float32_ends_at_its_own_floor_and_says_so():
     """Asked for 1e-12 at a condition of 1e4, float32 stops at its residual's rounding: converged, and says how far."""
     rng = np.random.default_rng(3)

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import LAWS, assert_close, explicit_limit, ids
+from helpers import assert_close, explicit_limit, ids
 from numpy_oracle import grid_update
 
 import mpmjax as mpm

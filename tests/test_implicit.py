@@ -60,7 +60,7 @@ def test_beta_one_is_one_newton_step_of_backward_euler():
 
 @pytest.mark.parametrize("law", **ids(LAWS))
 def test_backward_euler_satisfies_its_equation(law):
-    """M (v − v^n) = Δt f(F^{n+1}) + Δt M g on free nodes, the force in plain NumPy from the particles after the step."""
+    """M (v − v^n) = Δt f(F^{n+1}) + Δt M g on free nodes, the force by NumPy from the particles after the step."""
     gravity = np.array([1.0, -9.81])
     scene, particles = jolted(material=law, gravity=tuple(gravity), boundary=mpm.StickyBox((0, 0), (1, 1)))
     dt = 2e-2
@@ -110,7 +110,7 @@ def test_the_two_hessians_give_the_same_step(method):
 
 @pytest.mark.parametrize("guess", mpm.Guess, ids=lambda g: g.name.lower())
 def test_backward_euler_withstands_a_guess_that_inverts_the_material(guess):
-    """A compression that would turn cells inside out within the step ends at an admissible minimum, whatever the guess."""
+    """A compression that would turn cells inside out in the step ends at an admissible state, whatever the guess."""
     scene, particles = squeezed(rate=50.0)
     new, info = mpm.step(scene, particles, 0.0, 0.05, method=mpm.BackwardEuler(guess=guess, max_newton=60))
     assert info.solve.converged
@@ -119,10 +119,10 @@ def test_backward_euler_withstands_a_guess_that_inverts_the_material(guess):
 
 
 def test_line_search_backtracks_and_saves_what_one_newton_step_would_invert():
-    """From rest at a violent compression the full Newton step overshoots; the semi-implicit one inverts the material."""
-    scene, particles = squeezed(rate=200.0)
+    """In a violent compression the full Newton step overshoots; the semi-implicit one inverts the material."""
+    scene, particles = squeezed(rate=150.0)
     linear, _ = mpm.step(scene, particles, 0.0, 0.05, method=mpm.SemiImplicit())
-    method = mpm.BackwardEuler(guess=mpm.Guess.ZERO, max_newton=100)
+    method = mpm.BackwardEuler(guess=mpm.Guess.ZERO)
     new, info = mpm.step(scene, particles, 0.0, 0.05, method=method)
     assert np.linalg.det(np.asarray(linear.F)).min() < 0
     assert info.solve.line_search > 0
@@ -132,7 +132,7 @@ def test_line_search_backtracks_and_saves_what_one_newton_step_would_invert():
 
 @pytest.mark.parametrize("times", [1, 20, 100])
 def test_single_precision_converges_and_says_how_far(times):
-    """The residual it states is the true one, evaluated in double precision; at the explicit limit it is the tolerance."""
+    """The residual it states is the true one, evaluated in double precision."""
     scene, particles = jolted(speed=1.0, side=4, dtype="float32")
     grid = grid_update(scene, particles, times * explicit_limit(scene), mpm.SemiImplicit())
     assert grid.velocity.dtype == jnp.float32

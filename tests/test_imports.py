@@ -36,7 +36,7 @@ def noun(name: str) -> str:
 
 
 def imported(path: Path) -> set[str]:
-    """The modules that a file imports, also inside functions; `from mpmjax import _linalg` counts as `mpmjax._linalg`."""
+    """The modules that a file imports, also inside functions; `from mpmjax import _a` counts as `mpmjax._a`."""
     names = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):

@@ -47,6 +47,12 @@ def test_a_box_of_whole_cells_holds_the_count_asked_for(d):
             np.testing.assert_allclose(places, 0.2 + DX / n * (np.arange(3 * n) + 0.5), atol=1e-12)
 
 
+@pytest.mark.parametrize(("side", "count"), [(0.31, 6), (0.33, 7)])
+def test_counts_in_a_box_are_rounded_to_the_nearest(side, count):
+    """6.2 lattice cells become 6, 6.6 become 7."""
+    assert mpm.fill(mpm.Box((0.2,), (0.2 + side,)), grid_of(1), particles_per_cell=2, density=1.0).count == count
+
+
 def test_a_sliver_gets_one_particle_across():
     """A box thinner than a lattice cell is still filled, with its exact mass."""
     particles = mpm.fill(mpm.Box((0.2, 0.2), (0.5, 0.201)), grid_of(2), density=10.0)

@@ -39,13 +39,13 @@ def state(particles):
     return particles.x, particles.v, particles.F, particles.C
 
 
-EQUAL = {"explicit": "updated", "semi_implicit": "total", "backward_euler": "updated"}
+EQUAL = [("explicit", "updated", 2), ("semi_implicit", "total", 2), ("backward_euler", "updated", 1)]
 
 
-@pytest.mark.parametrize(("method", "description"), EQUAL.items())
-def test_simulate_equals_the_plain_rollout(method, description):
+@pytest.mark.parametrize(("method", "description", "d"), EQUAL)
+def test_simulate_equals_the_plain_rollout(method, description, d):
     """diffrax's loop against lax.scan, bit for bit, at every saved frame."""
-    scene, particles = pulled(2, description=DESCRIPTIONS[description])
+    scene, particles = pulled(d, description=DESCRIPTIONS[description])
     method = METHODS[method]
     run = mpm.simulate(scene, particles, t1=8 * DT, dt=DT, method=method, save_every=4)
     for frame, steps in [(run.frame(1), 4), (run.final, 8)]:
@@ -94,7 +94,7 @@ def test_a_run_continues_from_its_end():
 
 
 def test_no_float_compiles_anew():
-    """Material, gravity, wall, grip, spacing, β, tolerances, dt, start: one compilation; another number of steps may."""
+    """Material, gravity, wall, grip, spacing, β, tolerance, dt, start: one compilation; the number of steps may."""
     scene, particles = pulled()
     wall = mpm.SlipBox((-5.0,), (5.0,))
     scene = eqx.tree_at(lambda s: s.boundary, scene, (*scene.boundary, wall))
@@ -194,7 +194,7 @@ def test_an_unconverged_solve_is_raised():
 
 @pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in ("explicit", "semi_implicit")}))
 def test_a_batch_member_that_fails_leaves_the_others_alone(method):
-    """One of three is driven to NaN: the other two are what they are without it, bit for bit, and the tally says which."""
+    """One of three is driven to NaN: the other two are the same bit for bit as without, and the tally says which."""
     scene, particles = pulled()
 
     @eqx.filter_jit
