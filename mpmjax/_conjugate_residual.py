@@ -12,7 +12,9 @@ from mpmjax._checks import require, require_positive
 from mpmjax._types import Array, Float, Scalar
 
 _DEFAULT_RTOL = {4: 1e-5, 8: 1e-8}  # by bytes a number
-_ROUNDING = 4.0  # how many units of rounding of ‖E‖‖x‖ a residual can be asked to beat
+_ROUNDING = 4.0  # a residual of so many units of rounding of ‖E‖‖x‖ is as small as it gets
+_STALLED = 16.0  # and so many will do where the iteration makes no more progress, ‖E‖ being underestimated
+_MOST = 0.05  # of the right-hand side; a residual above it is never accepted, whatever the rounding
 
 
 def default_rtol(dtype: Any) -> float:
@@ -30,7 +32,8 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
     never grows.
 
     Stops when ‖r‖ ≤ rtol ‖W⁻¹b‖ for the *true* residual, or when that residual is down to the rounding of its own
-    evaluation, 4 ε (‖E‖‖x‖ + ‖W⁻¹b‖) with ‖E‖ estimated by the largest Rayleigh quotient met. A tolerance that the
+    evaluation: 4 ε (‖E‖‖x‖ + ‖W⁻¹b‖) with ‖E‖ estimated by the largest Rayleigh quotient met, or four times that when it
+    falls no further, but never more than a twentieth of ‖W⁻¹b‖. A tolerance that the
     precision cannot give is thus met as far as it can be, and the residual that is returned says how far.
 
     Options of `compute` (both optional):
@@ -83,7 +86,7 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         y0 = options.get("y0")
         x = jnp.zeros_like(b) if y0 is None else ravel_pytree(y0)[0]
         rtol = default_rtol(b.dtype) if self.rtol is None else self.rtol
-        unit = _ROUNDING * jnp.finfo(b.dtype).eps
+        eps = jnp.finfo(b.dtype).eps
 
         def E(u: Array) -> Array:  # noqa: N802
             return ravel_pytree(state.mv(unravel(u)))[0] / w
@@ -98,7 +101,9 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         b_norm = norm(b)
 
         def tolerance(c: _Recurrence) -> Float[Array, ""]:
-            return jnp.maximum(rtol * b_norm, unit * (c.radius * norm(c.x) + b_norm))
+            units = jnp.where(c.stalled, _STALLED, _ROUNDING).astype(b.dtype)
+            rounding = units * eps * (c.radius * norm(c.x) + b_norm)
+            return jnp.maximum(rtol * b_norm, jnp.minimum(rounding, _MOST * b_norm))
 
         def goes_on(c: _Recurrence) -> Array:
             return (norm(c.r) > tolerance(c)) & ~c.settled & ~c.breakdown & (c.k < self.max_steps)
@@ -106,7 +111,7 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         def step(c: _Recurrence) -> _Recurrence:
             s = E(c.r)
             gamma = dot(c.r, s)
-            breakdown = jnp.abs(gamma) <= jnp.finfo(b.dtype).eps * norm(c.r) * norm(s)
+            breakdown = jnp.abs(gamma) <= eps * norm(c.r) * norm(s)
             beta = jnp.where(c.fresh, 0, gamma / jnp.where(c.fresh, 1, c.gamma))
             p = c.r + beta * c.p
             q = s + beta * c.q
@@ -143,7 +148,7 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         )
         c = jax.lax.while_loop(lambda c: goes_on(c) & ~c.stalled, restart, start)
         residual = norm(c.r)
-        converged = (residual <= tolerance(c)) | c.settled
+        converged = ((residual <= tolerance(c)) | c.settled) & jnp.isfinite(residual)
         result = lx.RESULTS.where(c.k < self.max_steps, lx.RESULTS.stagnation, lx.RESULTS.max_steps_reached)
         result = lx.RESULTS.where(c.breakdown, lx.RESULTS.breakdown, result)
         result = lx.RESULTS.where(jnp.isfinite(residual), result, lx.RESULTS.nonfinite_input)

@@ -154,7 +154,8 @@ class StepSolver(diffrax.AbstractSolver):
         t = step_number(t0) * args.dt
         particles, info = advance(args.scene, args.at(y0), t, args.dt, args.method, args.stencil)
         y1 = state_of(particles)
-        tally = tally.plus(info, fault_of(*jax.lax.stop_gradient((args, y1))))
+        arrays, rest = eqx.partition((args, y1), eqx.is_array)
+        tally = tally.plus(info, fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest)))
         kept = y0 if self.keep_previous else None
         return y1, None, {"y0": y0, "y1": y1}, (tally, kept), diffrax.RESULTS.successful
 

@@ -148,7 +148,8 @@ class Newton(eqx.Module):
     A direction along which the potential does not fall (the Hessian can be indefinite) is replaced by the steepest one
     in the mass norm; a step is halved until the potential falls by a ten-thousandth of what its slope promises, which
     also keeps out of deformations where the law has no energy. Stops when ‖residual‖ ≤ rtol ‖b‖, b the right-hand side
-    M ṽ + Δt f(0), both in the norm of the inverse mass, or at the rounding of the residual.
+    M ṽ + Δt f(0), both in the norm of the inverse mass, or at the rounding of the residual. Starts from the guess, or
+    from rest where the potential is lower.
 
     Args:
         rtol: relative tolerance. Default: that of the precision, 1e-8 or 1e-5.
@@ -212,9 +213,10 @@ class Newton(eqx.Module):
                 stuck=halvings >= _MOST_HALVINGS,
             )
 
-        start = problem.admit(guess)
-        zero = jnp.asarray(0, dtype=jnp.int32)
         lift = jnp.where(free, 0, problem.prescribed)
+        start = problem.admit(guess)
+        start = jnp.where(problem.merit(start) <= problem.merit(lift), start, lift)  # the guess may invert a particle
+        zero = jnp.asarray(0, dtype=jnp.int32)
         scale = norm(residual(lift))
         unit_strain = problem.unit_strain()
         state = _NewtonState(start, residual(start), jnp.ones((), dtype), zero, zero, zero, jnp.asarray(False))

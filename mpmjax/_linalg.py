@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Compliance, Matrix
 
-_NEWTON_STEPS = 16  # on the quartic of the 3-D rotation: halves the error until near, then squares it
+_NEWTON_STEPS = 30  # on the quartic of the 3-D rotation: halves the error at a double root, else squares it
 _POLISH_STEPS = 2  # on the rotation itself
 
 
@@ -97,13 +97,14 @@ def rotation(F: Matrix) -> Matrix:
     principal stretch negative. In 1-D R = 1.
 
     2-D: the closed form. 3-D: λ = tr S is the largest root of (λ² − ‖F‖²)² − 8 det(F) λ − 4 ‖cof F‖², the
-    characteristic polynomial of a symmetric 4 x 4 matrix (N. J. Higham, V. Noferini, Numer. Algorithms 73 (2016) 349,
-    doi 10.1007/s11075-016-0098-7), found by Newton's method from above; then, with κ = (λ² − ‖F‖²)/2,
-    R = ((κ + ‖F‖²) F + λ cof F − F Fᵀ F) / (κλ − det F) (F. L. Markley, J. Astronaut. Sci. 41 (1993) 261), polished by
-    orthonormalisation and Newton steps of eq. 12 of the reference.
+    characteristic polynomial of a symmetric 4 x 4 matrix K linear in F, and the rotation's quaternion is its eigenvector
+    (N. J. Higham, V. Noferini, Numer. Algorithms 73 (2016) 349, doi 10.1007/s11075-016-0098-7). Newton's method finds
+    λ, a column of adj(K − λI) the quaternion, and Newton steps of eq. 12 of the reference polish it; it is normalised,
+    so the result is a rotation to rounding whatever F is.
 
-    *When it breaks*: where two signed principal stretches sum to zero R is not unique; its derivative grows like the
-    inverse of that sum and is not finite at zero.
+    *When it breaks*: where two signed principal stretches sum to zero R is not unique and one of the maximisers is
+    given; near there its error grows like rounding over that sum, its derivative like the sum's inverse, which is not
+    finite at zero.
 
     The derivative is the rule of `rotation_differential`, never that of the iterations, so it is finite at F = I and
     at repeated stretches, to every order.
@@ -156,16 +157,22 @@ def rotation_differential(R: Matrix, compliance: Compliance, dF: Matrix) -> Matr
     d = R.shape[0]
     if d == 1:
         return jnp.zeros_like(dF)
-    V = matmul(transpose(R), dF)
     if d == 2:
+        V = matmul(transpose(R), dF)
         omega = compliance[0, 0] * (V[1, 0] - V[0, 1])
         return omega * assemble([[R[0, 1], -R[0, 0]], [R[1, 1], -R[1, 0]]])
+    return matmul(R, _skew(_spin(R, compliance, dF)))
+
+
+def _spin(R: Matrix, compliance: Compliance, dF: Matrix) -> tuple[Array, Array, Array]:
+    """ω in 3-D."""
+    V = matmul(transpose(R), dF)
     v = (V[2, 1] - V[1, 2], V[0, 2] - V[2, 0], V[1, 0] - V[0, 1])
-    w = [sum((compliance[i, j] * v[j] for j in range(1, 3)), compliance[i, 0] * v[0]) for i in range(3)]
-    return matmul(R, _skew(w))
+    x, y, z = (sum((compliance[i, j] * v[j] for j in range(1, 3)), compliance[i, 0] * v[0]) for i in range(3))
+    return x, y, z
 
 
-def _skew(w: list[Array]) -> Matrix:
+def _skew(w: tuple[Array, Array, Array]) -> Matrix:
     """[w]ₓ, with [w]ₓ a = w × a."""
     zero = jnp.zeros_like(w[0])
     return assemble([[zero, -w[2], w[1]], [w[2], zero, -w[0]], [-w[1], w[0], zero]])
@@ -183,24 +190,70 @@ def _rotation_2d(F: Matrix) -> Matrix:
 def _rotation_3d(F: Matrix) -> Matrix:
     size = jnp.sqrt(double_dot(F, F))
     F = F / jnp.where(size == 0, 1, size)  # ‖F‖ = 1 from here on
+    q = _dominant_quaternion(F, _largest_root(F))
+    for _ in range(_POLISH_STEPS):
+        R = _rotation_of(q)
+        x, y, z = _spin(R, spin_compliance(matmul(transpose(R), F)), F)
+        near = x * x + y * y + z * z < 0.1  # not where R is hardly determined
+        q = _normalised([a + jnp.where(near, b / 2, 0) for a, b in zip(q, _times_spin(q, (x, y, z)), strict=True)])
+    return _rotation_of(q)
+
+
+def _largest_root(F: Matrix) -> Array:
+    """tr S for ‖F‖ = 1, by Newton's method from √3 ≥ tr S, where it is monotone until rounding stops it."""
     cof = cofactor(F)
     J, cof2 = determinant(F), double_dot(cof, cof)
-    root = jnp.full_like(J, jnp.sqrt(3.0).astype(F.dtype))  # tr S ≤ √3 ‖F‖: above the root, where Newton is monotone
+    root = jnp.full_like(J, jnp.sqrt(3.0).astype(F.dtype))
     for _ in range(_NEWTON_STEPS):
         square = root * root - 1
         slope = 4 * root * square - 8 * J
-        root = root - (square * square - 8 * J * root - 4 * cof2) / jnp.where(slope == 0, 1, slope)
-    kappa = (root * root - 1) / 2
-    zeta = kappa * root - J  # (s₁+s₂)(s₂+s₃)(s₃+s₁)
-    numerator = (kappa + 1) * F + root * cof - matmul(F, matmul(transpose(F), F))
-    R = numerator / jnp.where(zeta == 0, 1, zeta)
-    R = _orthonormalised(R)
-    for _ in range(_POLISH_STEPS):
-        compliance = spin_compliance(matmul(transpose(R), F))
-        R = _orthonormalised(R + rotation_differential(R, compliance, F))
-    return R
+        lower = root - (square * square - 8 * J * root - 4 * cof2) / jnp.where(slope == 0, 1, slope)
+        root = jnp.where(lower < root, lower, root)
+    return root
 
 
-def _orthonormalised(R: Matrix) -> Matrix:
-    """One Newton-Schulz step towards the nearest orthogonal matrix: the error is squared."""
-    return matmul(R, 1.5 * identity_like(R) - 0.5 * matmul(transpose(R), R))
+def _dominant_quaternion(F: Matrix, root: Array) -> list[Array]:
+    """The unit quaternion that maximises tr(RᵀF) = qᵀ K q: the largest column of adj(K − λI), λ the largest root."""
+    t = trace(F)
+    z = [F[2, 1] - F[1, 2], F[0, 2] - F[2, 0], F[1, 0] - F[0, 1]]
+    K = [[t, *z], *([z[i], *(F[i, j] + F[j, i] - (t if i == j else 0) for j in range(3))] for i in range(3))]
+    K = [[K[i][j] - (root if i == j else 0) for j in range(4)] for i in range(4)]
+
+    def signed_minor(i: int, j: int) -> Array:
+        rows, columns = ([k for k in range(4) if k != skip] for skip in (i, j))
+        return (-1) ** (i + j) * determinant(assemble([[K[r][c] for c in columns] for r in rows]))
+
+    upper = {(i, j): signed_minor(i, j) for i in range(4) for j in range(i, 4)}
+    columns = [[upper[min(i, j), max(i, j)] for i in range(4)] for j in range(4)]
+    best, size = columns[0], jnp.abs(columns[0][0])
+    for j in range(1, 4):
+        larger = jnp.abs(columns[j][j]) > size
+        best = [jnp.where(larger, a, b) for a, b in zip(columns[j], best, strict=True)]
+        size = jnp.where(larger, jnp.abs(columns[j][j]), size)
+    return _normalised(best)
+
+
+def _normalised(q: list[Array]) -> list[Array]:
+    """q / ‖q‖, and the identity for q = 0."""
+    size = jnp.sqrt(sum((a * a for a in q[1:]), q[0] * q[0]))
+    nothing = size == 0
+    w, *rest = (a / jnp.where(nothing, 1, size) for a in q)
+    return [jnp.where(nothing, 1, w), *rest]
+
+
+def _times_spin(q: list[Array], spin: tuple[Array, Array, Array]) -> list[Array]:
+    """The quaternion product of q with (0, spin)."""
+    (w, x, y, z), (a, b, c) = q, spin
+    return [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
+
+
+def _rotation_of(q: list[Array]) -> Matrix:
+    """The rotation of a unit quaternion."""
+    w, x, y, z = q
+    return assemble(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

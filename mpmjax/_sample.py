@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._checks import require, require_positive
+from mpmjax._checks import coordinates, require, require_positive
 from mpmjax._grid import Grid
 from mpmjax._particles import Particles
 from mpmjax._region import AbstractRegion, Box
@@ -52,6 +52,8 @@ def fill(
             counts.shape == (d,) and (counts >= 1).all() and counts.dtype.kind == "i",
             f"particles_per_cell must be one or {d} positive whole numbers, got {particles_per_cell}.",
         )
+    velocity = (0.0,) * d if velocity is None else velocity
+    require(coordinates("velocity", velocity) == d, f"velocity must have {d} components, got {velocity}.")
     lower, upper = region.bounds()
     require(lower.shape == (d,), f"The region is {lower.size}-dimensional, the grid {d}-dimensional.")
     require(
@@ -67,6 +69,6 @@ def fill(
     require(len(lattice) > 0, f"{region} holds no particle at this spacing: refine the grid or enlarge the region.")
     precision = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
     x = jnp.asarray(lattice, dtype=precision)
-    v = jnp.broadcast_to(jnp.asarray((0.0,) * d if velocity is None else velocity, dtype=precision), x.shape)
+    v = jnp.broadcast_to(jnp.asarray(velocity, dtype=precision), x.shape)
     volume = jnp.full(len(lattice), np.prod(cell), dtype=precision)
     return Particles(x=x, v=v, mass=jnp.asarray(density, precision) * volume, volume=volume)

@@ -136,8 +136,8 @@ class BackwardEuler(eqx.Module):
 
     First order in time, strongly damping; no linearisation error, so it holds where one linear solve does not.
 
-    *When it breaks*: where the incremental potential has several minima, Newton finds one of them, not always the one a
-    smaller step would lead to.
+    *When it breaks*: where the incremental potential has several stationary points (steps that compress material to a
+    fraction of itself make H indefinite), Newton finds one of them, not always the one a smaller step would lead to.
 
     Args:
         rtol: Newton's relative tolerance. Default: 1e-8 in float64, 1e-5 in float32.

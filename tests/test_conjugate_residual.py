@@ -236,6 +236,7 @@ def test_increment_rtol_stops_at_a_small_increment():
     k = int(stats["num_steps"])
     assert result == R.successful
     assert 1 < k < full["num_steps"]
+    assert k == solve(mpm.ConjugateResidual(rtol=1e-12, increment_rtol=1e-3), A, 2.0**-20 * b)[2]["num_steps"]
     np.testing.assert_allclose(stats["residual"], true_residual(A, x, b))
     iterates = [solve(mpm.ConjugateResidual(rtol=1e-14, max_steps=m), A, b)[0] for m in (k - 2, k - 1, k)]
     before, last = (float(jnp.linalg.norm(new - old) / jnp.linalg.norm(new)) for old, new in pairwise(iterates))
