@@ -32,9 +32,9 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
     never grows.
 
     Stops when ‖r‖ ≤ rtol ‖W⁻¹b‖ for the *true* residual, or when that residual is down to the rounding of its own
-    evaluation: 4 ε (‖E‖‖x‖ + ‖W⁻¹b‖) with ‖E‖ estimated by the largest Rayleigh quotient met, or four times that when it
-    falls no further, but never more than a twentieth of ‖W⁻¹b‖. A tolerance that the
-    precision cannot give is thus met as far as it can be, and the residual that is returned says how far.
+    evaluation: 4 ε (‖E‖‖x‖ + ‖W⁻¹b‖) with ‖E‖ estimated by the largest Rayleigh quotient met, or four times that when
+    it falls no further, but never more than a twentieth of ‖W⁻¹b‖. A tolerance that the precision cannot give is thus
+    met as far as it can be, and the residual that is returned says how far.
 
     Options of `compute` (both optional):
 

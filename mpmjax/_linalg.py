@@ -97,9 +97,9 @@ def rotation(F: Matrix) -> Matrix:
     principal stretch negative. In 1-D R = 1.
 
     2-D: the closed form. 3-D: λ = tr S is the largest root of (λ² − ‖F‖²)² − 8 det(F) λ − 4 ‖cof F‖², the
-    characteristic polynomial of a symmetric 4 x 4 matrix K linear in F, and the rotation's quaternion is its eigenvector
+    characteristic polynomial of a symmetric 4 x 4 matrix K linear in F, whose eigenvector is the rotation's quaternion
     (N. J. Higham, V. Noferini, Numer. Algorithms 73 (2016) 349, doi 10.1007/s11075-016-0098-7). Newton's method finds
-    λ, a column of adj(K − λI) the quaternion, and Newton steps of eq. 12 of the reference polish it; it is normalised,
+    λ, a column of adj(K − λI) the quaternion, and Newton steps of eq. 12 of the reference polish it. It is normalised,
     so the result is a rotation to rounding whatever F is.
 
     *When it breaks*: where two signed principal stretches sum to zero R is not unique and one of the maximisers is
@@ -203,13 +203,14 @@ def _largest_root(F: Matrix) -> Array:
     """tr S for ‖F‖ = 1, by Newton's method from √3 ≥ tr S, where it is monotone until rounding stops it."""
     cof = cofactor(F)
     J, cof2 = determinant(F), double_dot(cof, cof)
-    root = jnp.full_like(J, jnp.sqrt(3.0).astype(F.dtype))
-    for _ in range(_NEWTON_STEPS):
+
+    def step(_: int, root: Array) -> Array:
         square = root * root - 1
         slope = 4 * root * square - 8 * J
         lower = root - (square * square - 8 * J * root - 4 * cof2) / jnp.where(slope == 0, 1, slope)
-        root = jnp.where(lower < root, lower, root)
-    return root
+        return jnp.where(lower < root, lower, root)
+
+    return jax.lax.fori_loop(0, _NEWTON_STEPS, step, jnp.full_like(J, jnp.sqrt(3.0).astype(F.dtype)))
 
 
 def _dominant_quaternion(F: Matrix, root: Array) -> list[Array]:

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from shell import refused, shell
 
 import mpmjax as mpm
-from mpmjax.cli import app
 
 SCENE = """
 gravity = [0.0, -9.81]
@@ -38,23 +37,6 @@ dt = 1e-2
 method = { kind = "SemiImplicit" }
 save_every = 2
 """
-
-
-def shell(*words: object) -> tuple[int, str, str]:
-    """Exit code, standard output and standard error of a command."""
-    result = CliRunner().invoke(app, [str(w) for w in words])
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result.exit_code, result.stdout, result.stderr
-
-
-def refused(*words: object) -> str:
-    """The one line that a refused command says."""
-    code, _, err = shell(*words)
-    lines = [line for line in err.splitlines() if line.startswith("mpmjax: ")]
-    assert code == 2
-    assert len(lines) == 1
-    assert "Traceback" not in err
-    return lines[0]
 
 
 @pytest.fixture(scope="module")

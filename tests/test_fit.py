@@ -7,11 +7,11 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from shell import refused, shell
 
 import mpmjax as mpm
 from mpmjax._fit import gauge
 from mpmjax._job import fit_job, read_columns, read_job
-from test_cli import refused, shell
 
 RUBBER = Path(__file__).parents[1] / "examples" / "rubber.toml"
 

@@ -321,7 +321,7 @@ def test_a_file_that_is_there_is_not_overwritten(tmp_path):
     save(path, made_up(2))
     before = path.read_bytes()
     kwargs = {"dt": 5e-3, "save_every": 4, "t1": 0.06}
-    with pytest.raises(ValueError, match=r"run\.h5 exists: choose another name, remove it, or ask to overwrite or to resume it\.$"):
+    with pytest.raises(ValueError, match=r"run\.h5 exists: .* remove it, or ask to overwrite or to resume it\.$"):
         record(path, scene, particles, **kwargs)
     with pytest.raises(ValueError, match="whole number of steps"):
         record(path, scene, particles, **{**kwargs, "t1": 0.0611}, overwrite=True)
