@@ -204,7 +204,7 @@ def _largest_root(F: Matrix) -> Array:
     cof = cofactor(F)
     J, cof2 = determinant(F), double_dot(cof, cof)
 
-    def step(_: int, root: Array) -> Array:
+    def step(_: Array, root: Array) -> Array:
         square = root * root - 1
         slope = 4 * root * square - 8 * J
         lower = root - (square * square - 8 * J * root - 4 * cof2) / jnp.where(slope == 0, 1, slope)

@@ -1,9 +1,12 @@
 """The README says what happens."""
 
+import dataclasses
 import re
 import subprocess
 import sys
 from pathlib import Path
+
+from mpmjax._schema import CLASSES
 
 ROOT = Path(__file__).parents[1]
 
@@ -15,3 +18,13 @@ def test_quick_start_runs_as_written_and_ends_in_a_gradient(tmp_path):
     assert ran.returncode == 0, ran.stderr
     assert abs(float(ran.stdout) + 6.18e-7) < 0.03e-7
     assert (tmp_path / "jelly.h5").exists()
+
+
+def test_scene_files_documentation_names_every_class_and_key():
+    """What a scene file can say stands in its documentation."""
+    text = (ROOT / "docs" / "scene_files.md").read_text(encoding="utf-8")
+    words = set(re.findall(r"\w+", text))
+    by_key = {"Scene", "Grid", "Motion", "BSpline", "ConjugateResidual"}  # one class fits the key, so none is named
+    names = {c.__name__ for c in CLASSES} - by_key
+    keys = {f.name for c in CLASSES for f in dataclasses.fields(c)}
+    assert names | keys <= words, (names | keys) - words
