@@ -1,7 +1,8 @@
 """Boundary conditions: functions of node position that prescribe grid velocities, mirror them, or mark contact.
 
 Every condition acts on the grid alone; the transfers know nothing of it. A wall acts on the nodes at and beyond it; a
-node within a thousandth of a spacing of a wall counts as on it.
+node within a thousandth of a spacing of a wall counts as on it. Where walls, planes and regions lie only selects
+nodes, so derivatives with respect to it are zero.
 """
 
 import abc
@@ -162,7 +163,9 @@ class SeparatingBox(AbstractBoundary):
 class Grip(AbstractBoundary):
     """A region of nodes with a prescribed velocity, which moves as it prescribes.
 
-    In the total description the region is that of the reference configuration.
+    In the total description the region is that of the reference configuration. In a periodic direction the region does
+    not wrap: it must stay within the window's extent. The region only selects nodes, so its floats have no derivative;
+    those of the motion have.
 
     Args:
         region: region at zero displacement.
@@ -179,7 +182,7 @@ class Grip(AbstractBoundary):
     @property
     def dim(self) -> int:
         """That of the motion."""
-        return np.shape(self.motion.displacement)[1]
+        return jnp.shape(jnp.asarray(self.motion.displacement))[1]
 
     def __check_init__(self):
         d = self.dim

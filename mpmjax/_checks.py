@@ -37,9 +37,10 @@ def require_positive(name: str, value: Any) -> None:
 
 def coordinates(name: str, point: Any) -> int:
     """How many coordinates a point has; it must be a plain sequence of them."""
-    shape = np.shape(point)
-    require(len(shape) == 1, f"{name} must be a sequence of numbers, one a direction, got {point}.")
-    return shape[0]
+    if isinstance(point, (tuple, list)):
+        return len(point)
+    require(np.ndim(point) == 1, f"{name} must be a sequence of numbers, one a direction, got {point}.")
+    return len(point)
 
 
 def require_between(name: str, value: Any, lower: float | int, upper: float | int, *, open_ends: bool = False) -> None:

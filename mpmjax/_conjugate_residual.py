@@ -14,7 +14,8 @@ from mpmjax._types import Array, Float, Scalar
 _DEFAULT_RTOL = {4: 1e-5, 8: 1e-8}  # by bytes a number
 _ROUNDING = 4.0  # a residual of so many units of rounding of ‖E‖‖x‖ is as small as it gets
 _STALLED = 16.0  # and so many will do where the iteration makes no more progress, ‖E‖ being underestimated
-_MOST = 0.05  # of the right-hand side; a residual above it is never accepted, whatever the rounding
+LARGEST_RESIDUAL = 0.05
+"""Share of the right-hand side above which a residual is never accepted, whatever the rounding."""
 
 
 def default_rtol(dtype: Any) -> float:
@@ -103,7 +104,7 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         def tolerance(c: _Recurrence) -> Float[Array, ""]:
             units = jnp.where(c.stalled, _STALLED, _ROUNDING).astype(b.dtype)
             rounding = units * eps * (c.radius * norm(c.x) + b_norm)
-            return jnp.maximum(rtol * b_norm, jnp.minimum(rounding, _MOST * b_norm))
+            return jnp.maximum(rtol * b_norm, jnp.minimum(rounding, LARGEST_RESIDUAL * b_norm))
 
         def goes_on(c: _Recurrence) -> Array:
             return (norm(c.r) > tolerance(c)) & ~c.settled & ~c.breakdown & (c.k < self.max_steps)
@@ -119,7 +120,7 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
             alpha = jnp.where(breakdown, 0, gamma / jnp.where(breakdown, 1, qq))
             x = c.x + alpha * p
             small = self.increment_rtol
-            settled = c.settled if small is None else norm(alpha * p) <= small * norm(x)
+            settled = c.settled if small is None else ~breakdown & (norm(alpha * p) <= small * norm(x))
             rayleigh = jnp.abs(gamma) / dot(c.r, c.r)
             radius = jnp.maximum(c.radius, rayleigh)
             fresh = jnp.asarray(False)

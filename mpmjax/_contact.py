@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._boundary import Conditions
+from mpmjax._implicit import SolveInfo, no_solve
 from mpmjax._types import Array, Int, Mask, NodeScalar, NodeVector
 
 SWEEPS = 4
@@ -48,32 +49,40 @@ def _verdict(side: NodeVector, active: Mask, v: NodeVector, impulse: NodeVector,
 
 
 def find_active_set(
-    conditions: Conditions, predictor: NodeVector, mass: NodeScalar, try_set: Callable[[Mask, NodeVector], tuple]
-) -> tuple[Mask, NodeVector, Int[Array, ""]]:
-    """The components that separating walls hold, a velocity to start the last solve from, and the number of sweeps.
+    conditions: Conditions,
+    predictor: NodeVector,
+    guess: NodeVector,
+    mass: NodeScalar,
+    try_set: Callable[[Mask, NodeVector], tuple[NodeVector, NodeVector, SolveInfo]],
+) -> tuple[Mask, NodeVector, SolveInfo, Int[Array, ""]]:
+    """The components that separating walls hold, a velocity to start the last solve from, and what the sweeps cost.
 
     Args:
         conditions: of the step, with separating walls.
         predictor: explicit velocity v* [m/s].
+        guess: where the first solve starts [m/s].
         mass: nodal mass [kg].
-        try_set: (active, guess) to (velocity, wall impulse [kg m/s]). Must not be differentiated.
+        try_set: (active, guess) to (velocity, wall impulse [kg m/s], report). Must not be differentiated.
+
+    Returns:
+        active set, velocity, the sweeps' reports added up, number of sweeps.
     """
     side = conditions.side
     assert side is not None
 
     def sweep(state: tuple) -> tuple:
-        active, v, _, count = state
-        v, impulse = try_set(active, v)
+        active, v, cost, _, count = state
+        v, impulse, info = try_set(active, v)
         pulls, enters = _verdict(side, active, v, impulse, mass)
-        return (active & ~pulls) | enters, v, (pulls | enters).any(), count + 1
+        return (active & ~pulls) | enters, v, cost.plus(info), (pulls | enters).any(), count + 1
 
     def unsettled(state: tuple) -> Array:
-        return state[2] & (state[3] < SWEEPS)
+        return state[3] & (state[4] < SWEEPS)
 
     active = side * predictor < 0
-    start = (active, predictor, jnp.asarray(True), jnp.asarray(0, dtype=jnp.int32))
-    active, v, _, count = jax.lax.while_loop(unsettled, sweep, start)
-    return active, v, count
+    start = (active, guess, no_solve(guess.dtype), jnp.asarray(True), jnp.asarray(0, dtype=jnp.int32))
+    active, v, cost, _, count = jax.lax.while_loop(unsettled, sweep, start)
+    return active, v, cost, count
 
 
 def count_violations(

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import _linalg as la
-from mpmjax._kernel import Stencil
+from mpmjax._checks import canonical
 from mpmjax._particles import Particles
 from mpmjax._scene import Scene, prepare
 from mpmjax._transfer import p2g
@@ -15,7 +15,7 @@ class Energy(eqx.Module):
     """The energy of a state [J] (per metre of thickness in 2-D, per square metre of section in 1-D)."""
 
     kinetic: Float[Array, "*f"]
-    """½ Σ m (‖v‖² + C D Cᵀ): the affine part of APIC's velocities included."""
+    """½ Σ m (‖v‖² + tr(C D Cᵀ)): the affine part of APIC's velocities included."""
     elastic: Float[Array, "*f"]
     """Σ V0 Ψ(F)."""
     potential: Float[Array, "*f"]
@@ -27,7 +27,6 @@ class Energy(eqx.Module):
         return self.kinetic + self.elastic + self.potential
 
 
-@eqx.filter_jit
 def energy(scene: Scene, particles: Particles) -> Energy:
     """The energy of the particles.
 
@@ -35,7 +34,12 @@ def energy(scene: Scene, particles: Particles) -> Energy:
         scene: the scene.
         particles: its particles.
     """
-    particles = prepare(scene, particles)
+    scene = canonical(scene, particles.x.dtype)
+    return _energy(scene, prepare(scene, particles))
+
+
+@eqx.filter_jit
+def _energy(scene: Scene, particles: Particles) -> Energy:
     speed2 = (particles.v**2).sum(axis=1)
     if particles.C is not None:
         moment = scene.stencil(particles).moment.T[:, None, :]
@@ -58,10 +62,14 @@ def volume_ratio(particles: Particles) -> ParticleScalar:
     return la.determinant(particles.deformation())
 
 
-@eqx.filter_jit
 def grid_mass(scene: Scene, particles: Particles) -> Float[Array, ""]:
     """The mass that arrives on the grid [kg]: that of the particles to rounding, or some of it left the window."""
-    particles = prepare(scene, particles)
-    stencil: Stencil = scene.stencil(particles)
+    scene = canonical(scene, particles.x.dtype)
+    return _grid_mass(scene, prepare(scene, particles))
+
+
+@eqx.filter_jit
+def _grid_mass(scene: Scene, particles: Particles) -> Float[Array, ""]:
+    stencil = scene.stencil(particles)
     nodes, _ = p2g(stencil, particles.mass, components(particles.v), None, scene.grid.size)
     return nodes.sum()

@@ -60,6 +60,11 @@ class Tally(eqx.Module):
     fault_step: Int[Array, "*f"]
     """How many steps led to it."""
 
+    @property
+    def healthy(self) -> Bool[Array, "*f"]:
+        """Whether no state was at fault and every solve converged."""
+        return (self.fault == HEALTHY) & (self.unconverged == 0)
+
     def plus(self, info: StepInfo, fault: Int[Array, ""]) -> "Tally":
         """The tally after one more step."""
         s, c = info.solve, info.contact

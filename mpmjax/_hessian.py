@@ -141,6 +141,9 @@ for _property in (
         return False
 
 
+del _property
+
+
 @lx.linearise.register(ImplicitOperator)
 @lx.conj.register(ImplicitOperator)
 def _(operator: ImplicitOperator) -> Any:

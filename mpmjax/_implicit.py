@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 
-from mpmjax._conjugate_residual import ConjugateResidual, default_rtol
+from mpmjax._conjugate_residual import LARGEST_RESIDUAL, ConjugateResidual, default_rtol
 from mpmjax._hessian import Hessian, ImplicitOperator
 from mpmjax._potential import ElasticPotential
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
@@ -33,6 +33,16 @@ class SolveInfo(eqx.Module):
     converged: Bool[Array, "*f"]
     """Whether the solver's tolerance, or the precision's own limit, was met."""
 
+    def plus(self, later: "SolveInfo") -> "SolveInfo":
+        """The cost of both solves and the quality of the later one."""
+        return SolveInfo(
+            iterations=self.iterations + later.iterations,
+            newton=self.newton + later.newton,
+            line_search=self.line_search + later.line_search,
+            residual=later.residual,
+            converged=later.converged,
+        )
+
 
 def no_solve(dtype: Any) -> SolveInfo:
     """The report of an update that solves nothing."""
@@ -48,7 +58,7 @@ class AbstractProblem(eqx.Module):
 
     @abc.abstractmethod
     def imbalance(self, v: NodeVector) -> NodeVector:
-        """The momentum [kg m/s] by which each node misses its equation; on held nodes, minus the wall's impulse."""
+        """The momentum [kg m/s] by which each node misses its equation; on held nodes, the impulse that holds them."""
 
     @abc.abstractmethod
     def operator(self, v: NodeVector) -> ImplicitOperator:
@@ -148,8 +158,9 @@ class Newton(eqx.Module):
     A direction along which the potential does not fall (the Hessian can be indefinite) is replaced by the steepest one
     in the mass norm; a step is halved until the potential falls by a ten-thousandth of what its slope promises, which
     also keeps out of deformations where the law has no energy. Stops when ‖residual‖ ≤ rtol ‖b‖, b the right-hand side
-    M ṽ + Δt f(0), both in the norm of the inverse mass, or at the rounding of the residual. Starts from the guess, or
-    from rest where the potential is lower.
+    M ṽ + Δt f(0), less what prescribed velocities contribute to it, both in the norm of the inverse mass, or at the
+    rounding of the residual. Starts from the guess, or from rest where the potential is lower there or the guess is a
+    deformation for which the law has no energy.
 
     Args:
         rtol: relative tolerance. Default: that of the precision, 1e-8 or 1e-5.
@@ -177,7 +188,8 @@ class Newton(eqx.Module):
 
         def tolerance(c: _NewtonState) -> Float[Array, ""]:
             speed = jnp.sqrt((metric * jnp.where(free, c.v, 0) ** 2).sum())
-            return jnp.maximum(rtol * scale, 4 * eps * (c.radius * (speed + unit_strain) + scale))
+            rounding = 4 * eps * (c.radius * (speed + unit_strain) + scale)
+            return jnp.maximum(rtol * scale, jnp.minimum(rounding, LARGEST_RESIDUAL * scale))
 
         def goes_on(c: _NewtonState) -> Array:
             return (norm(c.r) > tolerance(c)) & (c.newton < self.max_steps) & ~c.stuck
@@ -215,9 +227,11 @@ class Newton(eqx.Module):
 
         lift = jnp.where(free, 0, problem.prescribed)
         start = problem.admit(guess)
-        start = jnp.where(problem.merit(start) <= problem.merit(lift), start, lift)  # the guess may invert a particle
+        energies = problem.merit(start), problem.merit(lift)
+        start = jnp.where(jnp.isfinite(energies[0]) & ~(energies[1] < energies[0]), start, lift)
         zero = jnp.asarray(0, dtype=jnp.int32)
-        scale = norm(residual(lift))
+        still = jnp.zeros_like(guess)
+        scale = norm(jnp.where(free, problem.imbalance(still) + problem.operator(still).unconstrained(lift), 0))
         unit_strain = problem.unit_strain()
         state = _NewtonState(start, residual(start), jnp.ones((), dtype), zero, zero, zero, jnp.asarray(False))
         c = jax.lax.while_loop(goes_on, step, state)

@@ -3,9 +3,11 @@ words."""
 
 import csv
 import tomllib
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -75,7 +77,7 @@ def read_job(path: Path) -> Job:
         number_of_steps(run.t1, run.dt, 0, particles.x.dtype)
         if fit is not None:
             gauge(fit.gauge, particles, fit.axis)
-            leaf_of(fit.parameter, scene)
+            _check_paths(fit, scene)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return Job(scene, particles, run, fit)
@@ -115,6 +117,27 @@ def leaf_of(path: str, scene: Scene) -> Any:
         except (AttributeError, IndexError, TypeError):
             raise ValueError(f"[fit] names {path!r}, but the scene has no {name!r} there.") from None
     return value
+
+
+def _check_paths(fit: CurveSettings, scene: Scene) -> None:
+    """The fitted parameter must be a positive number of the scene's own, and what is reported a number."""
+    value, (owner, _, name) = leaf_of(fit.parameter, scene), fit.parameter.rpartition(".")
+    parent = leaf_of(owner, scene) if owner else scene
+    known = [f.name for f in fields(parent)] if is_dataclass(parent) else []
+    require(
+        not known or name in known,
+        f"[fit] parameter {fit.parameter!r} follows from others and cannot be fitted; name one of {', '.join(known)}.",
+    )
+    require(
+        not isinstance(value, eqx.Module) and np.ndim(value) == 0 and np.all(np.asarray(value) > 0),
+        f"[fit] parameter {fit.parameter!r} must be one positive number, but is {value}.",
+    )
+    if fit.report is not None:
+        reported = leaf_of(fit.report, scene)
+        require(
+            not isinstance(reported, eqx.Module) and np.ndim(reported) == 0,
+            f"[fit] report {fit.report!r} must be one number, but is {reported}.",
+        )
 
 
 def read_columns(path: Path, *names: str) -> list[np.ndarray]:

@@ -97,8 +97,9 @@ class Stencil(eqx.Module):
 
 def in_window(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleVector) -> Bool[Array, "p"]:
     """Whether the whole stencil of a particle at x lies in the window, shape (p,)."""
-    first = _first_node(kernel, grid, window, components(x) / grid.spacing)
-    shape = jnp.asarray(grid.shape, dtype=jnp.int32)[:, None]
+    base = kernel.base(components(x) / grid.spacing)
+    first = base - window.astype(base.dtype)[:, None]  # in floats: what is far outside overflows an integer
+    shape = jnp.asarray(grid.shape, dtype=base.dtype)[:, None]
     return (jnp.asarray(grid.periodic)[:, None] | ((first >= 0) & (first + kernel.order < shape))).all(axis=0)
 
 

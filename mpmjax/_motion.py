@@ -5,7 +5,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._checks import is_traced, require
+from mpmjax._checks import is_traced, require, require_finite
 from mpmjax._types import Array, Float, Scalar
 
 
@@ -21,11 +21,13 @@ class Motion(eqx.Module):
     displacement: Float[Array, "j d"] | Float[np.ndarray, "j d"] | tuple | list
 
     def __check_init__(self):
-        times, displacement = np.shape(self.times), np.shape(self.displacement)
+        times, displacement = jnp.shape(jnp.asarray(self.times)), jnp.shape(jnp.asarray(self.displacement))
         require(
             len(times) == 1 and len(displacement) == 2 and times[0] == displacement[0],
             f"A motion needs one row of displacements a time, got shapes {times} and {displacement}.",
         )
+        require_finite("A motion's times", self.times)
+        require_finite("A motion's displacement", self.displacement)
         if not is_traced(self.times):
             require(np.diff(np.asarray(self.times)) > 0, f"A motion's times must increase, got {self.times}.")
 

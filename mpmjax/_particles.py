@@ -1,6 +1,7 @@
 """The particles: the state of a simulation."""
 
 import equinox as eqx
+import jax
 from jaxtyping import Float
 
 from mpmjax._checks import require, require_positive
@@ -35,6 +36,11 @@ class Particles(eqx.Module):
             "Particles need x and v of shape (p, d), mass and volume of shape (p,), got "
             f"{self.x.shape}, {self.v.shape}, {self.mass.shape}, {self.volume.shape}.",
         )
+        dtypes = {str(leaf.dtype) for leaf in jax.tree.leaves(self)}
+        require(
+            len(dtypes) == 1 and dtypes <= {"float32", "float64"},
+            f"Particles need arrays of one precision, float32 or float64, got {', '.join(sorted(dtypes))}.",
+        )
         require_positive("Particle masses [kg]", self.mass)
         require_positive("Particle volumes [m^d]", self.volume)
 
@@ -42,6 +48,11 @@ class Particles(eqx.Module):
     def count(self) -> int:
         """Number of particles p."""
         return self.x.shape[0]
+
+    @property
+    def dim(self) -> int:
+        """Space dimension d."""
+        return self.x.shape[1]
 
     def deformation(self) -> Matrix:
         """F component first, shape (d, d, p).
@@ -52,11 +63,6 @@ class Particles(eqx.Module):
         if self.F is None:
             raise ValueError("The particles have no deformation gradient yet: call prepare(scene, particles) first.")
         return components(self.F)
-
-    @property
-    def dim(self) -> int:
-        """Space dimension d."""
-        return self.x.shape[1]
 
 
 class State(eqx.Module):

@@ -104,7 +104,7 @@ def record(
                     tally=tally,
                 )
                 try:
-                    if int(new.fault) != HEALTHY or step == end:
+                    if int(new.fault) != HEALTHY or int(new.unconverged) > 0 or step == end:
                         raise_faults(run, previous, start)
                 except SimulationError as error:
                     writer.append(int(error.run.final_step), state_of(error.run.final), tally)

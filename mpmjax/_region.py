@@ -66,6 +66,7 @@ class Ball(AbstractRegion):
     radius: Scalar
 
     def __check_init__(self):
+        coordinates("A ball's centre", self.centre)
         require_finite("A ball's centre", self.centre)
         require_positive("A ball's radius", self.radius)
 

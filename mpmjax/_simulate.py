@@ -41,7 +41,7 @@ def simulate(
     method: Method = Explicit(),
     save_every: int | None = None,
     observe: Callable[[Scene, Particles], Any] | None = None,
-    start: int = 0,
+    start: Any = 0,
     adjoint: diffrax.AbstractAdjoint | None = None,
     checkpoint_bytes: int = _CHECKPOINT_BYTES,
     progress: bool = False,
@@ -77,14 +77,15 @@ def simulate(
             not converge. Under an outer transformation (`jax.grad`, `jax.jit`, `jax.vmap`): the runtime error of
             `equinox.error_if` instead.
     """
+    start = int(start)
     count = number_of_steps(t1, dt, start, particles.x.dtype)
     require(save_every is None or save_every >= 1, f"save_every must be at least 1, got {save_every}.")
-    traced = is_traced((scene, particles, dt, method))
     if observe is not None and save_every is None:
         save_every = 1
     dtype = particles.x.dtype
     scene, dt_, method = canonical((scene, dt, method), dtype)
     particles = prepare(scene, particles)
+    traced = is_traced((scene, particles, dt_, method))  # under jax.jit also if all that was passed is known
     if adjoint is None:
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=_checkpoints(particles, count, checkpoint_bytes))
     saved, final, tally, previous = integrate(
@@ -116,8 +117,7 @@ def simulate(
     if not throw:
         return run
     if traced:
-        bad = (tally.fault != HEALTHY) | (tally.unconverged > 0)
-        return eqx.error_if(run, bad, _TRACED_FAULT)
+        return eqx.error_if(run, ~tally.healthy, _TRACED_FAULT)
     raise_faults(run, previous, start)
     return run
 
@@ -257,10 +257,16 @@ def raise_faults(run: Run, previous: State | None, start: int) -> None:
         bad: dict[int, Array] = {NOT_FINITE: broken, OUTSIDE: outside, INADMISSIBLE: inadmissible}
         first = int(np.argmax(np.asarray(bad[fault])))
         what, advice = _FAULTS[fault]
+        reached = int((run.steps < step).sum())
         good = eqx.tree_at(
-            lambda r: (r.final, r.final_step),
+            lambda r: (r.final, r.final_step, r.steps, r.frames, r.observed),
             run,
-            (with_state(run.final, previous), jnp.asarray(step - 1, run.final_step.dtype)),
+            (
+                with_state(run.final, previous),
+                jnp.asarray(step - 1, run.final_step.dtype),
+                *jax.tree.map(lambda a: a[:reached], (run.steps, run.frames, run.observed)),
+            ),
+            is_leaf=lambda leaf: leaf is None,
         )
         raise SimulationError(
             f"At step {step} (t = {step * float(run.dt):.6g} s) particle {first} {what}; the last good position was "

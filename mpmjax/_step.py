@@ -254,14 +254,16 @@ def update(nodes: Nodes, method: Method) -> tuple[NodeVector, SolveInfo, Contact
 
     frozen_nodes, frozen_predictor, frozen_method = jax.lax.stop_gradient((nodes, predictor, method))
 
-    def try_set(active: Mask, guess: NodeVector) -> tuple[NodeVector, NodeVector]:
-        v, impulse, _ = frozen_method.velocity(frozen_nodes, frozen_predictor, guess, active)
-        return v, impulse
+    def try_set(active: Mask, guess: NodeVector) -> tuple[NodeVector, NodeVector, SolveInfo]:
+        return frozen_method.velocity(frozen_nodes, frozen_predictor, guess, active)
 
-    active, guess, sweeps = find_active_set(frozen_nodes.conditions, frozen_predictor, frozen_nodes.mass, try_set)
+    active, guess, cost, sweeps = find_active_set(
+        frozen_nodes.conditions, frozen_predictor, jax.lax.stop_gradient(guess), frozen_nodes.mass, try_set
+    )
     v, impulse, info = method.velocity(nodes, predictor, guess, active)
     violations = count_violations(nodes.conditions, active, v, impulse, nodes.mass)
-    return with_friction(nodes.conditions, active, v, impulse, nodes.mass), info, ContactInfo(sweeps, violations)
+    v = with_friction(nodes.conditions, active, v, impulse, nodes.mass)
+    return v, cost.plus(info), ContactInfo(sweeps, violations)
 
 
 def step(

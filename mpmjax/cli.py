@@ -36,7 +36,7 @@ def _reporting(command: Callable[..., None]) -> Callable[..., None]:
             print(f"mpmjax: {' '.join(str(error).split())}", file=sys.stderr)
             raise typer.Exit(2) from None
         except KeyboardInterrupt:
-            print("mpmjax: interrupted; every finished frame is in the file", file=sys.stderr)
+            print("mpmjax: interrupted; the finished frames of a run are in its file", file=sys.stderr)
             raise typer.Exit(130) from None
 
     return guarded
@@ -56,6 +56,7 @@ def run_command(
 ) -> None:
     """Simulate a scene and write its frames."""
     job = read_job(scene)
+    done = int(load(output).tally.steps) if resume else 0
     begun = time.perf_counter()
     run = record(
         output,
@@ -69,19 +70,19 @@ def run_command(
         resume=resume,
         progress=not quiet,
     )
-    print(_summary(job, run, time.perf_counter() - begun))
+    print(_summary(job, run, int(run.tally.steps) - done, time.perf_counter() - begun))
     print(f"written            {output}")
 
 
-def _summary(job: Job, run: Run, seconds: float) -> str:
-    """What a run cost and how well it kept mass and energy."""
+def _summary(job: Job, run: Run, taken: int, seconds: float) -> str:
+    """What a run cost, `taken` of its steps in these seconds, and how well it kept mass and energy."""
     steps, p = int(run.tally.steps), run.final.count
     before, after = energy(run.scene, job.particles), energy(run.scene, run.final)
     mass = float(run.final.mass.sum())
     lines = [
         ("particles", f"{p}"),
         ("steps", f"{steps} of {float(run.dt):.4g} s with {type(run.method).__name__}"),
-        ("wall time", f"{seconds:.3g} s (compilation included), {steps * p / seconds:.3g} particle-steps per second"),
+        ("wall time", f"{seconds:.3g} s (compilation included), {taken * p / seconds:.3g} particle-steps per second"),
     ]
     if int(run.tally.iterations) > 0:
         lines.append(

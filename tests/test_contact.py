@@ -49,8 +49,9 @@ def test_a_wall_pushes_never_pulls_and_is_not_entered(method):
     step = grid_update(scene, particles, dt, method)
     nodes, v = step.nodes, np.asarray(step.velocity)
     predictor = nodes.explicit_velocity()
-    active, guess, sweeps = find_active_set(
-        nodes.conditions, predictor, nodes.mass, lambda a, guess: method.velocity(nodes, predictor, guess, a)[:2]
+    start = method.start(nodes, predictor)
+    active, guess, _, sweeps = find_active_set(
+        nodes.conditions, predictor, start, nodes.mass, lambda a, guess: method.velocity(nodes, predictor, guess, a)
     )
     again, impulse, _ = method.velocity(nodes, predictor, guess, active)
     impulse = np.where(active, impulse, 0)

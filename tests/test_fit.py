@@ -91,6 +91,9 @@ FIT_FAULTS = {
     "no file": ('data = "data/treloar_1944_pure_shear.csv"', 'data = "none.csv"', r"none\.csv"),
     "no column": ('stretch = "stretch"', 'stretch = "lambda"', r"no column 'lambda'"),
     "no parameter": ('"material.youngs_modulus"', '"material.stiffness"', r"no 'stiffness'"),
+    "no number": ('"material.youngs_modulus"', '"material"', r"must be one positive number"),
+    "derived": ('"material.youngs_modulus"', '"material.lame_lambda"', r"follows from others"),
+    "no report": ('"material.shear_modulus"', '"material.bulk"', r"no 'bulk'"),
     "empty range": ("range = [1.1, 2.4]", "range = [1.1, 1.2]", r"holds 0 of"),
     "kind": ('kind = "curve"', 'kind = "surface"', r"must be \"curve\""),
 }

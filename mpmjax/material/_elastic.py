@@ -15,9 +15,9 @@ class FixedCorotated(AbstractMaterial):
     Ψ = μ ‖F − R‖² + λ/2 (J − 1)², P = 2μ (F − R) + λ (J − 1) J F⁻ᵀ, with F = R S and J = det F; the differential is
     eq. 11 of the reference.
 
-    *When it breaks*: never by inversion: it is defined for every F, J ≤ 0 included. Its Hessian is indefinite under any
-    uniform compression, and the stress differential grows like 1/(s_i + s_j) where two signed principal stretches
-    nearly cancel.
+    *When it breaks*: never by inversion: it is defined for every F, J ≤ 0 included. In 2-D and 3-D its Hessian is
+    indefinite under any uniform compression, and the stress differential grows like 1/(s_i + s_j) where two signed
+    principal stretches nearly cancel.
     *Good values*: jelly E = 1e4 to 1e6 Pa, ν = 0.3; ν above 0.45 stiffens the volume and asks for more iterations.
 
     Args:
