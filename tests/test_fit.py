@@ -4,6 +4,7 @@ import dataclasses
 import re
 from pathlib import Path
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -71,6 +72,20 @@ def test_the_fit_is_the_least_squares_answer_of_its_own_curve(coarse):
 def test_an_unreached_stretch_is_an_error_and_not_a_flat_curve(coarse):
     with pytest.raises(ValueError, match="leaves out measured points"):
         fit_job(coarse._replace(run=coarse.run._replace(t1=0.1)))
+
+
+def test_an_abscissa_that_turns_back_is_refused(coarse):
+    """Interpolation in it would not be defined."""
+    grip = next(b for b in coarse.scene.boundary if isinstance(b, mpm.Grip))
+    end = coarse.run.t1
+    back = mpm.Motion((0.0, end / 3, end / 2, end), ((0.0, 0.0), (0.0, 0.06), (0.0, 0.05), (0.0, 0.2)))
+    scene = eqx.tree_at(
+        lambda s: s.boundary,
+        coarse.scene,
+        (*(b for b in coarse.scene.boundary if b is not grip), mpm.Grip(grip.region, back, grip.axes)),
+    )
+    with pytest.raises(ValueError, match="must grow with every step"):
+        fit_job(coarse._replace(scene=scene))
 
 
 def test_a_gauge_without_particles_is_refused(job):
