@@ -1,5 +1,6 @@
 """A differentiable Material Point Method in JAX, with explicit, semi-implicit and backward-Euler grid updates."""
 
+from mpmjax._body_force import AbstractBodyForce
 from mpmjax._boundary import AbstractBoundary, Conditions, Grip, SeparatingBox, SlipBox, StickyBox, SymmetryPlane
 from mpmjax._conjugate_residual import ConjugateResidual
 from mpmjax._diagnostics import Energy, energy, momentum
@@ -57,6 +58,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "SlipBox",
     "StickyBox",
     "SymmetryPlane",
+    "AbstractBodyForce",
     # grid updates
     "BackwardEuler",
     "Explicit",

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from mpmjax._body_force import AbstractBodyForce
 from mpmjax._boundary import AbstractBoundary, SeparatingBox, SymmetryPlane
 from mpmjax._checks import coordinates, is_traced, require, require_finite
 from mpmjax._grid import Grid
@@ -43,6 +44,7 @@ class Scene(eqx.Module):
         gradient: gradient operator of force and deformation. Default: moving least squares.
         transfer: PIC, FLIP or APIC. Default: APIC.
         description: updated (default) or total Lagrangian.
+        body_force: a force per mass that varies in space or time, besides gravity. Default: none.
 
     Raises:
         ValueError: dimensions that differ, a symmetry plane off the half-spacing lattice, or what the total description
@@ -57,6 +59,7 @@ class Scene(eqx.Module):
     gradient: Gradient
     transfer: Transfer
     description: Description
+    body_force: AbstractBodyForce | None
 
     def __init__(
         self,
@@ -69,6 +72,7 @@ class Scene(eqx.Module):
         gradient: Gradient = MLSGradient(),
         transfer: Transfer = APIC(),
         description: Description = UpdatedLagrangian(),
+        body_force: AbstractBodyForce | None = None,
     ):
         self.grid = grid
         self.material = material
@@ -78,6 +82,7 @@ class Scene(eqx.Module):
         self.gradient = gradient
         self.transfer = transfer
         self.description = description
+        self.body_force = body_force
 
     def __check_init__(self):
         d = self.grid.dim

@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._boundary import Conditions, combine, mirror
 from mpmjax._checks import canonical, require_between, require_positive
 from mpmjax._conjugate_residual import ConjugateResidual
 from mpmjax._contact import ContactInfo, count_violations, find_active_set, no_contact, with_friction
@@ -14,42 +13,11 @@ from mpmjax._guess import Guess
 from mpmjax._hessian import AnalyticHessian, Hessian
 from mpmjax._implicit import LinearProblem, Newton, NewtonProblem, SolveInfo, SolveOnce, no_solve, solve
 from mpmjax._kernel import Stencil
+from mpmjax._nodes import Nodes, particles_to_grid
 from mpmjax._particles import Particles
-from mpmjax._potential import ElasticPotential
 from mpmjax._scene import Scene, is_prepared, prepare
-from mpmjax._transfer import g2p, p2g
-from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar, components, particle_first
-
-
-class Nodes(eqx.Module):
-    """What the velocity update of one step is given."""
-
-    mass: NodeScalar
-    """m_i [kg], shape (n,), folded at symmetry planes."""
-    velocity: NodeVector
-    """v_i^n [m/s], shape (n, d); zero on empty nodes."""
-    occupied: Bool[Array, "n 1"]
-    """Whether the node has mass beyond rounding, shape (n, 1)."""
-    gravity: Array
-    """Body acceleration g [m/s²], shape (d,)."""
-    dt: Float[Array, ""]
-    """Δt [s]."""
-    spacing: Float[Array, ""]
-    """dx [m]."""
-    potential: ElasticPotential
-    """Φ, of nodal displacements."""
-    conditions: Conditions
-    """What the boundaries prescribe."""
-
-    def explicit_velocity(self) -> NodeVector:
-        """v* = v^n + Δt f / m + Δt g (reference, eq. 4)."""
-        f = self.potential.rest_force(self.velocity)
-        mass = jnp.where(self.occupied, self.mass[:, None], 1)
-        return jnp.where(self.occupied, self.velocity + self.dt * (f / mass + self.gravity), 0)
-
-    def free(self, active: Mask | bool) -> Mask:
-        """The components that neither a boundary prescribes nor a wall holds, on nodes that have mass."""
-        return self.occupied & ~self.conditions.fixed & ~jnp.asarray(active)
+from mpmjax._transfer import g2p
+from mpmjax._types import Array, Int, Mask, NodeVector, Scalar, components, particle_first
 
 
 class StepInfo(eqx.Module):
@@ -163,7 +131,7 @@ class BackwardEuler(eqx.Module):
         """v^{n+1}, the walls' impulse and the solve's report."""
         problem = NewtonProblem(
             mass=nodes.mass,
-            inertial=jnp.where(nodes.occupied, nodes.velocity + nodes.dt * nodes.gravity, 0),
+            inertial=nodes.inertial_velocity(),
             dt=nodes.dt,
             spacing=nodes.spacing,
             potential=nodes.potential,
@@ -183,6 +151,19 @@ class BackwardEuler(eqx.Module):
 Method = Explicit | SemiImplicit | BackwardEuler
 
 
+class GridUpdate(eqx.Module):
+    """The nodes' new velocity and where it came from."""
+
+    velocity: NodeVector
+    """v_i^{n+1} [m/s], shape (n, d)."""
+    reaction: NodeVector
+    """The impulse of walls and grips [kg m/s], shape (n, d); on free components what the solve left."""
+    friction: NodeVector | None
+    """The impulse of friction [kg m/s], shape (n, d), where there are separating walls."""
+    solve: SolveInfo
+    contact: ContactInfo
+
+
 def advance(
     scene: Scene, particles: Particles, t: Scalar, dt: Scalar, method: Method, stencil: Stencil | None = None
 ) -> tuple[Particles, StepInfo]:
@@ -196,43 +177,46 @@ def advance(
         method: update of the grid velocity.
         stencil: that of the reference positions, if the description is total and it was computed before.
     """
-    grid, window = scene.grid, scene.window(particles)
     stencil = scene.stencil(particles) if stencil is None else stencil
+    nodes = particles_to_grid(scene, particles, t, dt, stencil)
+    new = update(nodes, method)
+    outside = (~stencil.inside).sum().astype(jnp.int32)
+    return grid_to_particles(scene, particles, nodes, new.velocity), StepInfo(new.solve, new.contact, outside)
 
-    # particles to grid
-    x, v, F = components(particles.x), components(particles.v), particles.deformation()
-    C = None if particles.C is None else components(particles.C)
-    with jax.named_scope("p2g"):
-        mass, momentum = p2g(stencil, particles.mass, v, C, grid.size)
 
-    # the grid's problem
-    images = mirror(scene.boundary, grid, window)
-    mass, momentum = images.fold_scalar(mass), images.fold(momentum)
-    occupied = (mass > jnp.finfo(mass.dtype).eps * particles.mass.mean())[:, None]
-    nodes = Nodes(
-        mass=jnp.where(occupied[:, 0], mass, 0),
-        velocity=jnp.where(occupied, momentum / jnp.where(occupied, mass[:, None], 1), 0),
-        occupied=occupied,
-        gravity=jnp.asarray(scene.gravity),
-        dt=jnp.asarray(dt),
-        spacing=jnp.asarray(grid.spacing),
-        potential=ElasticPotential(scene.material, particles.volume, F, None if scene.total else F, stencil, images),
-        conditions=combine(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total),
-    )
-
-    # the grid's new velocity
+def update(nodes: Nodes, method: Method) -> GridUpdate:
+    """The nodes' new velocity, boundaries and contact included."""
     with jax.named_scope("update"):
-        velocity, solve_info, contact_info = update(nodes, method)
+        predictor = nodes.explicit_velocity()
+        guess = method.start(nodes, predictor)
+        if nodes.conditions.side is None:
+            v, reaction, info = method.velocity(nodes, predictor, guess, False)
+            return GridUpdate(v, reaction, None, info, no_contact())
 
-    # grid to particles
-    before, after = images.unfold(nodes.velocity), images.unfold(velocity)
+        frozen_nodes, frozen_predictor, frozen_method = jax.lax.stop_gradient((nodes, predictor, method))
+
+        def try_set(active: Mask, guess: NodeVector) -> tuple[NodeVector, NodeVector, SolveInfo]:
+            return frozen_method.velocity(frozen_nodes, frozen_predictor, guess, active)
+
+        active, guess, cost, sweeps = find_active_set(
+            frozen_nodes.conditions, frozen_predictor, jax.lax.stop_gradient(guess), frozen_nodes.mass, try_set
+        )
+        v, reaction, info = method.velocity(nodes, predictor, guess, active)
+        violations = count_violations(nodes.conditions, active, v, reaction, nodes.mass)
+        slowed = with_friction(nodes.conditions, active, v, reaction, nodes.mass)
+        friction = nodes.mass[:, None] * (slowed - v)
+        return GridUpdate(slowed, reaction, friction, cost.plus(info), ContactInfo(sweeps, violations))
+
+
+def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, velocity: NodeVector) -> Particles:
+    """G2P: the particles moved and deformed by the nodes' new velocity, x ← x + Δt Σ w v_i, F ← F + Δt Σ v_i hᵀ."""
+    potential, dt = nodes.potential, nodes.dt
+    before, after = potential.mirror.unfold(nodes.velocity), potential.mirror.unfold(velocity)
     with jax.named_scope("g2p"):
-        moved, v, C = g2p(scene.transfer, stencil, v, before, after)
-        F = F + dt * nodes.potential.strain(velocity)
-    x = x + dt * moved
-
-    new = Particles(
-        x=particle_first(x),
+        moved, v, C = g2p(scene.transfer, potential.stencil, components(particles.v), before, after)
+        F = potential.F + dt * potential.strain(velocity)
+    return Particles(
+        x=particle_first(components(particles.x) + dt * moved),
         v=particle_first(v),
         mass=particles.mass,
         volume=particles.volume,
@@ -240,30 +224,6 @@ def advance(
         C=None if C is None else particle_first(C),
         X=particles.X,
     )
-    outside = (~stencil.inside).sum().astype(jnp.int32)
-    return new, StepInfo(solve_info, contact_info, outside)
-
-
-def update(nodes: Nodes, method: Method) -> tuple[NodeVector, SolveInfo, ContactInfo]:
-    """The nodes' new velocity, boundaries and contact included."""
-    predictor = nodes.explicit_velocity()
-    guess = method.start(nodes, predictor)
-    if nodes.conditions.side is None:
-        v, _, info = method.velocity(nodes, predictor, guess, False)
-        return v, info, no_contact()
-
-    frozen_nodes, frozen_predictor, frozen_method = jax.lax.stop_gradient((nodes, predictor, method))
-
-    def try_set(active: Mask, guess: NodeVector) -> tuple[NodeVector, NodeVector, SolveInfo]:
-        return frozen_method.velocity(frozen_nodes, frozen_predictor, guess, active)
-
-    active, guess, cost, sweeps = find_active_set(
-        frozen_nodes.conditions, frozen_predictor, jax.lax.stop_gradient(guess), frozen_nodes.mass, try_set
-    )
-    v, impulse, info = method.velocity(nodes, predictor, guess, active)
-    violations = count_violations(nodes.conditions, active, v, impulse, nodes.mass)
-    v = with_friction(nodes.conditions, active, v, impulse, nodes.mass)
-    return v, cost.plus(info), ContactInfo(sweeps, violations)
 
 
 def step(

@@ -18,11 +18,11 @@ LAYERS = (
     ("_transfer",),
     ("_linalg",),
     ("material",),
-    ("_boundary",),
+    ("_boundary", "_body_force"),
     ("_particles", "_scene"),
     ("_potential", "_hessian"),
     ("_conjugate_residual",),
-    ("_guess", "_implicit", "_contact"),
+    ("_nodes", "_guess", "_implicit", "_contact"),
     ("_step",),
     ("_diffrax", "_run", "_simulate"),
 )
