@@ -2,6 +2,7 @@
 
 from mpmjax._body_force import AbstractBodyForce
 from mpmjax._boundary import AbstractBoundary, Conditions, Grip, SeparatingBox, SlipBox, StickyBox, SymmetryPlane
+from mpmjax._budget import Budget, EnergyBudget, MomentumBudget, budget
 from mpmjax._conjugate_residual import ConjugateResidual
 from mpmjax._diagnostics import Energy, energy, momentum
 from mpmjax._grid import Grid
@@ -76,6 +77,10 @@ __all__ = [  # noqa: RUF022 (grouped)
     "simulate",
     "step",
     # results
+    "Budget",
+    "EnergyBudget",
+    "MomentumBudget",
+    "budget",
     "Energy",
     "energy",
     "load",

@@ -38,8 +38,8 @@ def energy(scene: Scene, particles: Particles) -> Energy:
     return _energy(scene, prepare(scene, particles))
 
 
-@eqx.filter_jit
-def _energy(scene: Scene, particles: Particles) -> Energy:
+def energy_of(scene: Scene, particles: Particles) -> Energy:
+    """The same of prepared particles, without compilation."""
     speed2 = (particles.v**2).sum(axis=1)
     if particles.C is not None:
         moment = scene.stencil(particles).moment.T[:, None, :]
@@ -50,6 +50,9 @@ def _energy(scene: Scene, particles: Particles) -> Energy:
         elastic=(particles.volume * scene.material.energy(particles.deformation())).sum(),
         potential=-(particles.mass[:, None] * particles.x * gravity).sum(),
     )
+
+
+_energy = eqx.filter_jit(energy_of)
 
 
 def momentum(particles: Particles) -> Float[Array, "d"]:

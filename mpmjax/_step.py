@@ -44,6 +44,10 @@ class Explicit(eqx.Module):
         v = jnp.where(nodes.free(active), predictor, nodes.conditions.velocity)
         return v, nodes.mass[:, None] * (v - predictor), no_solve(v.dtype)
 
+    def elastic_impulse(self, nodes: Nodes, v: NodeVector) -> NodeVector:
+        """Δt f(0) [kg m/s], on nodes that have mass."""
+        return jnp.where(nodes.occupied, nodes.dt * nodes.potential.rest_force(v), 0)
+
     def start(self, nodes: Nodes, predictor: NodeVector) -> NodeVector:
         """Nothing is iterated."""
         del nodes
@@ -94,6 +98,11 @@ class SemiImplicit(eqx.Module):
         v, info = solve(problem, guess, SolveOnce(self.solver), self.adjoint_solver)
         return v, problem.imbalance(v), info
 
+    def elastic_impulse(self, nodes: Nodes, v: NodeVector) -> NodeVector:
+        """Δt f(0) − βΔt² H v [kg m/s]."""
+        action = self.hessian.at_rest(nodes.potential, v)
+        return nodes.dt * nodes.potential.rest_force(v) - self.beta * nodes.dt**2 * action(v)
+
     def start(self, nodes: Nodes, predictor: NodeVector) -> NodeVector:
         """The chosen guess."""
         return self.guess.velocity(nodes.velocity, predictor)
@@ -143,6 +152,10 @@ class BackwardEuler(eqx.Module):
         v, info = solve(problem, guess, newton, self.adjoint_solver)
         return v, problem.imbalance(v), info
 
+    def elastic_impulse(self, nodes: Nodes, v: NodeVector) -> NodeVector:
+        """Δt f(Δt v) [kg m/s]."""
+        return nodes.dt * nodes.potential.force(nodes.dt * v)
+
     def start(self, nodes: Nodes, predictor: NodeVector) -> NodeVector:
         """The chosen guess."""
         return self.guess.velocity(nodes.velocity, predictor)
@@ -160,6 +173,8 @@ class GridUpdate(eqx.Module):
     """The impulse of walls and grips [kg m/s], shape (n, d); on free components what the solve left."""
     friction: NodeVector | None
     """The impulse of friction [kg m/s], shape (n, d), where there are separating walls."""
+    free: Mask
+    """The components that nothing held, shape (n, d)."""
     solve: SolveInfo
     contact: ContactInfo
 
@@ -191,7 +206,7 @@ def update(nodes: Nodes, method: Method) -> GridUpdate:
         guess = method.start(nodes, predictor)
         if nodes.conditions.side is None:
             v, reaction, info = method.velocity(nodes, predictor, guess, False)
-            return GridUpdate(v, reaction, None, info, no_contact())
+            return GridUpdate(v, reaction, None, nodes.free(False), info, no_contact())
 
         frozen_nodes, frozen_predictor, frozen_method = jax.lax.stop_gradient((nodes, predictor, method))
 
@@ -205,7 +220,8 @@ def update(nodes: Nodes, method: Method) -> GridUpdate:
         violations = count_violations(nodes.conditions, active, v, reaction, nodes.mass)
         slowed = with_friction(nodes.conditions, active, v, reaction, nodes.mass)
         friction = nodes.mass[:, None] * (slowed - v)
-        return GridUpdate(slowed, reaction, friction, cost.plus(info), ContactInfo(sweeps, violations))
+        free = nodes.free(active)
+        return GridUpdate(slowed, reaction, friction, free, cost.plus(info), ContactInfo(sweeps, violations))
 
 
 def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, velocity: NodeVector) -> Particles:

@@ -1,0 +1,24 @@
+"""Problems with a known answer, for tests, benchmarks and new laws; not imported by `mpmjax` itself."""
+
+from mpmjax.verification._aligned import AxisAligned
+from mpmjax.verification._bar import VibratingBar
+from mpmjax.verification._disks import TwoDisks
+from mpmjax.verification._problem import AbstractProblem, Ends, Manufactured, discretise, displacement_error
+from mpmjax.verification._refinement import errors, orders
+from mpmjax.verification._vortex import Vortex
+from mpmjax.verification._wave import StandingWave
+
+__all__ = [
+    "AbstractProblem",
+    "AxisAligned",
+    "Ends",
+    "Manufactured",
+    "StandingWave",
+    "TwoDisks",
+    "VibratingBar",
+    "Vortex",
+    "discretise",
+    "displacement_error",
+    "errors",
+    "orders",
+]

@@ -1,0 +1,53 @@
+"""Two elastic disks that collide."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._grid import Grid
+from mpmjax._particles import Particles
+from mpmjax._region import Ball
+from mpmjax._sample import fill
+from mpmjax._scene import Scene
+from mpmjax.material import AbstractMaterial, NeoHookean
+
+
+class TwoDisks(eqx.Module):
+    """Two disks on one diagonal fly into each other and part (the scene of D. Sulsky, Z. Chen, H. L. Schreyer, Comput.
+    Methods Appl. Mech. Eng. 118 (1994) 179, doi 10.1016/0045-7825(94)90112-0).
+
+    No exact motion is known; momentum is zero throughout, the disks touch at t = (‖Δcentre‖ − 2R)/‖Δv‖ and no energy
+    appears.
+
+    Args:
+        radius: R [m].
+        centre: the disks' centres are ±(centre, centre) [m].
+        speed: and their velocities ∓(speed, speed) [m/s].
+    """
+
+    radius: float = 0.2
+    centre: float = 0.3
+    speed: float = 0.1
+    density: float = 1e3
+    material: AbstractMaterial = NeoHookean(1e3, 0.3)
+
+    @property
+    def contact_time(self) -> float:
+        """When the circles touch [s]."""
+        return (2**0.5 * self.centre - self.radius) / (2**0.5 * self.speed)
+
+    def discretise(self, cells: int = 20, *, per_side: int = 2) -> tuple[Scene, Particles]:
+        """Scene and particles, with so many cells to the unit of length and room around the disks."""
+        half = round(0.75 * cells)
+        grid = Grid((2 * half + 1,) * 2, 1 / cells, origin=(-half,) * 2)
+        disks = [
+            fill(
+                Ball((side * self.centre,) * 2, self.radius),
+                grid,
+                particles_per_cell=per_side**2,
+                density=self.density,
+                velocity=(-side * self.speed,) * 2,
+            )
+            for side in (-1, 1)
+        ]
+        return Scene(grid, self.material), jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *disks)

@@ -1,0 +1,183 @@
+"""A problem with an exact motion, and how it is put on a grid and measured."""
+
+import abc
+import enum
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._body_force import AbstractBodyForce
+from mpmjax._boundary import AbstractBoundary, SlipBox, SymmetryPlane
+from mpmjax._checks import require
+from mpmjax._grid import Grid
+from mpmjax._particles import Particles
+from mpmjax._region import AbstractRegion
+from mpmjax._run import Run
+from mpmjax._sample import fill
+from mpmjax._scene import Scene, TotalLagrangian
+from mpmjax._types import Array, Float, ParticleVector, Scalar
+from mpmjax.material import AbstractMaterial
+
+_MARGIN = 4  # nodes beyond the domain, for the widest stencil and some motion
+
+
+class Ends(enum.Enum):
+    """What bounds a problem whose exact motion is odd at the faces of its box."""
+
+    PERIODIC = "periodic"
+    """Twice the box is a period: no wall at all."""
+    MIRRORED = "mirrored"
+    """Symmetry planes."""
+    PLAIN = "plain"
+    """Slip walls: the normal velocity of the nodes at and beyond them is zero."""
+
+
+class AbstractProblem(eqx.Module):
+    """An exact motion x(X, t) of a body with a law and a density, and the body force that makes it one.
+
+    A subclass gives the motion of one point; velocity, deformation gradient and the manufactured body force
+    b = ẍ − Div P / ρ0 follow by automatic differentiation.
+    """
+
+    material: eqx.AbstractVar[AbstractMaterial]
+    density: eqx.AbstractVar[float]
+    dim: eqx.AbstractVar[int]
+    forced: eqx.AbstractVar[bool]
+    """Whether the motion needs the body force."""
+
+    @abc.abstractmethod
+    def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
+        """x(X, t) [m] of one point X [m], shape (d,)."""
+
+    @property
+    @abc.abstractmethod
+    def duration(self) -> float:
+        """How long it is observed [s]."""
+
+    @abc.abstractmethod
+    def grid(self, cells: int) -> Grid:
+        """A grid with so many cells to the unit of length."""
+
+    @abc.abstractmethod
+    def body(self, cells: int) -> AbstractRegion:
+        """The body at rest, on such a grid."""
+
+    def boundary(self) -> tuple[AbstractBoundary, ...]:
+        """Its boundary conditions. Default: none."""
+        return ()
+
+    @property
+    def wave_speed(self) -> float:
+        """c = √((λ + 2μ) / ρ0) [m/s], of pressure waves at rest."""
+        law: Any = self.material
+        return math.sqrt(float(law.lame_lambda + 2 * law.shear_modulus) / self.density)
+
+    def velocity(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
+        """∂x/∂t [m/s]."""
+        t = jnp.asarray(t, X.dtype)
+        return jax.jvp(lambda s: self.position(X, s), (t,), (jnp.ones_like(t),))[1]
+
+    def deformation(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d d"]:
+        """F = ∂x/∂X [-]."""
+        return jax.jacfwd(lambda Y: self.position(Y, t))(X)
+
+    def body_force(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
+        """b = ẍ − Div P / ρ0 [m/s²], (Div P)_i = ∂P_ij/∂X_j."""
+        t = jnp.asarray(t, X.dtype)
+        inertia = jax.jvp(lambda s: self.velocity(X, s), (t,), (jnp.ones_like(t),))[1]
+        slope = jax.jacfwd(lambda Y: self.material.stress(self.deformation(Y, t)))(X)
+        return inertia - jnp.trace(slope, axis1=1, axis2=2) / self.density
+
+
+class Manufactured(AbstractBodyForce):
+    """The body force of a problem, on particles that know where they were."""
+
+    problem: AbstractProblem
+    X: ParticleVector
+
+    def acceleration(self, x: ParticleVector, t: Scalar) -> ParticleVector:
+        """b(X, t)."""
+        del x
+        return jax.vmap(lambda X: self.problem.body_force(X, t))(self.X)
+
+
+def box_grid(lower: tuple[float, ...], upper: tuple[float, ...], cells: int, ends: Ends) -> Grid:
+    """A grid for a box whose sides are whole numbers of cells: the period, or the box with room around it."""
+    counts = [round((b - a) * cells) for a, b in zip(lower, upper, strict=True)]
+    first = [round(a * cells) for a in lower]
+    if ends is Ends.PERIODIC:
+        return Grid(tuple(counts), 1 / cells, origin=tuple(first), periodic=True)
+    room = 2 * _MARGIN + 1
+    return Grid(tuple(n + room for n in counts), 1 / cells, origin=tuple(i - _MARGIN for i in first))
+
+
+def box_boundary(lower: tuple[float, ...], upper: tuple[float, ...], ends: Ends) -> tuple[AbstractBoundary, ...]:
+    """The boundary conditions of a box whose faces the motion leaves in place."""
+    if ends is Ends.MIRRORED:
+        sides = (
+            (a, place, keep) for a in range(len(lower)) for place, keep in ((lower[a], "above"), (upper[a], "below"))
+        )
+        return tuple(SymmetryPlane(axis, place, keep=keep) for axis, place, keep in sides)
+    return (SlipBox(lower, upper),) if ends is Ends.PLAIN else ()
+
+
+def discretise(
+    problem: AbstractProblem,
+    cells: int,
+    *,
+    per_side: int = 2,
+    velocity_time: float = 0.0,
+    **choices: Any,
+) -> tuple[Scene, Particles]:
+    """The problem's scene and particles in their exact initial state.
+
+    Args:
+        problem: the problem.
+        cells: grid cells to the unit of length.
+        per_side: particles to a cell's side.
+        velocity_time: the time at which initial velocities are taken [s]. Symplectic Euler is the leap-frog method
+            whose velocities stand half a step early: with −Δt/2 it is second order in time, with 0 first.
+        choices: of the scene: kernel, gradient, transfer, description.
+    """
+    grid = problem.grid(cells)
+    d = problem.dim
+    require(grid.dim == d, f"The problem is {d}-dimensional, its grid {grid.dim}-dimensional.")
+    rest = fill(problem.body(cells), grid, particles_per_cell=per_side**d, density=problem.density)
+    X = rest.x
+    x, F = jax.vmap(lambda Y: (problem.position(Y, 0.0), problem.deformation(Y, 0.0)))(X)
+    v, rate = jax.vmap(
+        lambda Y: (problem.velocity(Y, velocity_time), jax.jacfwd(lambda Z: problem.velocity(Z, velocity_time))(Y))
+    )(X)
+    total = isinstance(choices.get("description"), TotalLagrangian)
+    C = rate if total else rate @ jnp.linalg.inv(F)
+    scene = Scene(
+        grid,
+        problem.material,
+        boundary=problem.boundary(),
+        body_force=Manufactured(problem, X) if problem.forced else None,
+        **choices,
+    )
+    return scene, Particles(x, v, rest.mass, rest.volume, F=F, C=C, X=X)
+
+
+def displacement_error(problem: AbstractProblem, particles: Particles, run: Run) -> Float[Array, "f"]:
+    """√(Σ V0 ‖x − x(X, t)‖² / Σ V0) [m] at each saved frame, shape (f,).
+
+    Args:
+        problem: the problem.
+        particles: as `discretise` made them, with X.
+        run: the run, with frames.
+    """
+    if run.frames is None or particles.X is None:
+        raise ValueError("The error needs a run with frames (pass save_every to simulate) and particles with X.")
+    X, share = particles.X, particles.volume / particles.volume.sum()
+
+    def at(frame: tuple[Array, Array]) -> Array:
+        x, t = frame
+        exact = jax.vmap(lambda Y: problem.position(Y, t))(X)
+        return jnp.sqrt((share * ((x - exact) ** 2).sum(axis=1)).sum())
+
+    return jax.lax.map(at, (run.frames.x, run.times))

@@ -1,0 +1,64 @@
+"""Errors under refinement, and the orders they show."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mpmjax._simulate import simulate
+from mpmjax._step import Explicit, Method
+from mpmjax.verification._problem import AbstractProblem, discretise, displacement_error
+
+_SAMPLES = 10
+
+
+def errors(
+    problem: AbstractProblem,
+    cells: Sequence[int],
+    *,
+    courant: float | Sequence[float],
+    method: Method = Explicit(),
+    staggered: bool = True,
+    **discretisation: Any,
+) -> np.ndarray:
+    """The largest of ten displacement errors, evenly over the problem's duration, for each grid [m].
+
+    A run that fails has the error inf.
+
+    Args:
+        problem: the problem.
+        cells: grid cells to the unit of length, for each grid.
+        courant: Δt c/dx, c the pressure-wave speed at rest; one for all grids, or one for each. It is rounded down so
+            that ten whole numbers of steps fill the duration.
+        method: update of the grid velocity.
+        staggered: whether initial velocities are those of half a step before the start, see `discretise`.
+        discretisation: of `discretise`.
+    """
+    numbers = [courant] * len(cells) if isinstance(courant, (int, float)) else courant
+    return np.array(
+        [_error(problem, n, c, method, staggered, discretisation) for n, c in zip(cells, numbers, strict=True)]
+    )
+
+
+def orders(errors: np.ndarray, cells: Sequence[int]) -> np.ndarray:
+    """The observed order between successive grids, log(e₁/e₂) / log(n₂/n₁)."""
+    return np.log(errors[:-1] / errors[1:]) / np.log(np.divide(cells[1:], cells[:-1]))
+
+
+def _error(
+    problem: AbstractProblem,
+    cells: int,
+    courant: float,
+    method: Method,
+    staggered: bool,
+    discretisation: dict[str, Any],
+) -> float:
+    longest = courant / (cells * problem.wave_speed)
+    every = max(1, math.ceil(problem.duration / _SAMPLES / longest - 1e-9))
+    dt = problem.duration / (_SAMPLES * every)
+    start = -dt / 2 if staggered else 0.0
+    scene, particles = discretise(problem, cells, velocity_time=start, **discretisation)
+    run = simulate(scene, particles, t1=problem.duration, dt=dt, method=method, save_every=every, throw=False)
+    worst = float(displacement_error(problem, particles, run).max())
+    return worst if bool(run.tally.healthy) and math.isfinite(worst) else math.inf

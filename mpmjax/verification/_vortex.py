@@ -1,0 +1,86 @@
+"""The generalized vortex: a ring whose material turns, most in the middle of its width."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._boundary import AbstractBoundary, Conditions
+from mpmjax._grid import Grid
+from mpmjax._region import AbstractRegion
+from mpmjax._types import Array, Bool, Float, NodeVector, Scalar
+from mpmjax.material import AbstractMaterial, NeoHookean
+from mpmjax.verification._problem import AbstractProblem, Ends, box_grid
+
+_INNER, _OUTER, _ROOM = 0.75, 1.25, 1.5
+
+
+class Ring(AbstractRegion):
+    """0.75 < R < 1.25."""
+
+    def contains(self, x: Float[Array, "m d"], margin: Scalar = 0.0) -> Bool[Array, "m"]:
+        """Between the radii."""
+        R = jnp.sqrt((x**2).sum(axis=-1))
+        return (_INNER - margin < R) & (_OUTER + margin > R)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """The square around it."""
+        return np.full(2, -_OUTER), np.full(2, _OUTER)
+
+
+class RestOutside(AbstractBoundary):
+    """Nodes that are not in the ring are at rest, as the motion is at its edges."""
+
+    @property
+    def dim(self) -> int:
+        """Two."""
+        return 2
+
+    def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
+        """v = 0."""
+        del spacing, t, dt, reference
+        outside = ~Ring().contains(nodes)[:, None]
+        return Conditions(jnp.broadcast_to(outside, nodes.shape), jnp.zeros_like(nodes))
+
+
+class Vortex(AbstractProblem):
+    """x = Q(g h) X, a turn by α = g(t) h(R), g = A sin(πt), h = 1 − 32(R−1)² + 256(R−1)⁴ (K. Kamojjala, R. Brannon,
+    A. Sadeghirad, J. Guilkey, Eng. Comput. 31 (2015) 201, doi 10.1007/s00366-013-0342-x).
+
+    Without change of volume, at rest at the ring's edges.
+
+    Args:
+        amplitude: A [rad]: at 0.3 the ring's shear reaches about 1, at 1 about 3.
+        material: any law.
+        density: ρ0 [kg/m²].
+    """
+
+    amplitude: float = 0.1
+    material: AbstractMaterial = NeoHookean(1e3, 0.3)
+    density: float = 1e3
+    dim: int = eqx.field(static=True, default=2)
+    forced: bool = eqx.field(static=True, default=True)
+
+    @property
+    def duration(self) -> float:
+        """There and back [s]."""
+        return 1.0
+
+    def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
+        """x(X, t) [m]."""
+        s = (jnp.sqrt((X**2).sum()) - 1) ** 2
+        turn = self.amplitude * jnp.sin(jnp.pi * t) * (1 - 32 * s + 256 * s**2)
+        cos, sin = jnp.cos(turn), jnp.sin(turn)
+        return jnp.stack([cos * X[0] - sin * X[1], sin * X[0] + cos * X[1]])
+
+    def grid(self, cells: int) -> Grid:
+        """A square around the ring."""
+        return box_grid((-_ROOM,) * 2, (_ROOM,) * 2, cells, Ends.PLAIN)
+
+    def body(self, cells: int) -> Ring:
+        """The ring."""
+        del cells
+        return Ring()
+
+    def boundary(self) -> tuple[AbstractBoundary, ...]:
+        """Rest outside the ring."""
+        return (RestOutside(),)

@@ -1,0 +1,125 @@
+"""Where energy and momentum go: every term on its own, and their sum closes to rounding."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import DESCRIPTIONS, GRADIENTS, KERNELS, LAWS, METHODS, TRANSFERS, block, explicit_limit, ids
+from test_body_force import Wind
+
+import mpmjax as mpm
+
+STEPS = 4
+MOVED = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.3, 0.1)))
+BOUNDARIES = {
+    "free": (),
+    "walls": (mpm.SlipBox((-np.inf, 0.0), (np.inf, np.inf)), mpm.StickyBox((-np.inf, -np.inf), (0.3, np.inf))),
+    "contact": (mpm.SeparatingBox((-0.2, 0.0), (0.6, 0.6), friction=0.3),),
+    "planes": (mpm.SymmetryPlane(1, 0.0), mpm.SymmetryPlane(0, 0.0)),
+    "grip": (mpm.Grip(mpm.Box((-1.0, -1.0), (1.0, 0.0)), MOVED),),
+}
+
+
+def budget_of(*, number=0.3, method=METHODS["explicit"], steps=STEPS, speed=1.0, **scene):
+    """The budget of a shaken block, and the particles before and after."""
+    gravity = scene.pop("gravity", (1.0, -9.81))
+    scene, particles = block(2, gravity=gravity, **scene)
+    shaken = speed * jnp.asarray(np.random.default_rng(3).normal(size=particles.v.shape))
+    particles = mpm.prepare(scene, eqx.tree_at(lambda q: q.v, particles, shaken))
+    after, result = mpm.budget(scene, particles, steps=steps, dt=number * explicit_limit(scene), method=method)
+    return result, scene, particles, after
+
+
+def assert_closes(result):
+    """Energy and momentum: what is explained is the change, to rounding of the largest term."""
+    for part in (result.energy, result.momentum):
+        largest = max(float(jnp.abs(term).max()) for term in jax.tree.leaves(part))
+        assert float(jnp.abs(part.change - part.explained).max()) < 2e-13 * largest
+
+
+CASES = {
+    **{f"{t}-{d}": {"transfer": TRANSFERS[t], "description": DESCRIPTIONS[d]} for t in TRANSFERS for d in DESCRIPTIONS},
+    "linear": {"kernel": KERNELS["linear"]},
+    "cubic-spline": {"kernel": KERNELS["cubic"], "gradient": GRADIENTS["spline"]},
+    **{f"explicit-{b}": {"boundary": boundary} for b, boundary in BOUNDARIES.items() if b != "free"},
+    "semi_implicit-contact": {"method": METHODS["semi_implicit"], "boundary": BOUNDARIES["contact"]},
+    "semi_implicit-planes": {
+        "method": METHODS["semi_implicit"],
+        "boundary": BOUNDARIES["planes"],
+        "material": LAWS["neo_hookean"],
+    },
+    "backward_euler-grip": {"method": METHODS["backward_euler"], "boundary": BOUNDARIES["grip"]},
+    "body force": {"body_force": Wind(jnp.asarray([0.5, 2.0]), 0.1, 3.0), "boundary": BOUNDARIES["planes"]},
+}
+
+
+@pytest.mark.parametrize("case", **ids(CASES))
+def test_the_budget_closes(case):
+    """For every transfer, description, kernel, gradient operator, update and boundary."""
+    assert_closes(budget_of(**case)[0])
+
+
+def test_the_budget_is_of_the_run_itself():
+    """Its particles are those of `rollout`, and its sums the change of `energy` and `momentum` from end to end."""
+    result, scene, before, after = budget_of(method=METHODS["semi_implicit"], boundary=BOUNDARIES["walls"])
+    run = mpm.rollout(scene, before, steps=STEPS, dt=0.3 * explicit_limit(scene), method=METHODS["semi_implicit"])
+    np.testing.assert_allclose(after.x, run.x, rtol=1e-13)
+    np.testing.assert_allclose(after.v, run.v, rtol=0, atol=1e-12)
+    change = float(mpm.energy(scene, after).total - mpm.energy(scene, before).total)
+    assert float(result.energy.change.sum()) == pytest.approx(change, rel=1e-10)
+    np.testing.assert_allclose(
+        result.momentum.change.sum(axis=0), mpm.momentum(after) - mpm.momentum(before), atol=1e-10
+    )
+
+
+def test_what_the_transfers_lose_is_never_negative():
+    """Both are sums of squares with PIC and APIC."""
+    for transfer in (mpm.PIC(), mpm.APIC()):
+        energy = budget_of(transfer=transfer)[0].energy
+        assert (np.asarray(energy.p2g) > 0).all()
+        assert (np.asarray(energy.g2p) > 0).all()
+
+
+def test_flip_without_blending_loses_nothing_over_a_step():
+    """FLIP(1): what P2G leaves on the particles comes back: p2g + g2p is what the grid's change alone would lose."""
+    energy = budget_of(transfer=mpm.FLIP(1.0), number=1e-4)[0].energy
+    assert float(jnp.abs(energy.p2g + energy.g2p).max()) < 1e-3 * float(energy.p2g.max())
+    pic = budget_of(transfer=mpm.PIC(), number=1e-4)[0].energy
+    assert float((pic.p2g + pic.g2p)[0]) > 0.5 * float(pic.p2g[0])
+
+
+def test_each_boundary_appears_where_it_acts():
+    """A wall and friction only take energy; a grip that moves gives it; a plane does no work."""
+    contact = budget_of(boundary=BOUNDARIES["contact"])[0]
+    assert (np.asarray(contact.energy.friction) <= 0).all()
+    assert float(contact.energy.friction.sum()) < 0
+    assert float(contact.momentum.boundary[:, 1].sum()) > 0
+    grip = budget_of(boundary=BOUNDARIES["grip"], speed=0.0, gravity=(0.0, 0.0))[0]
+    assert float(grip.energy.boundary.sum()) > 0
+    planes = budget_of(boundary=BOUNDARIES["planes"])[0]
+    assert not np.asarray(planes.energy.friction).any()
+    assert float(jnp.abs(planes.momentum.transfer).max()) > 0
+    free = budget_of()[0].momentum
+    for name in ("transfer", "elastic", "boundary"):
+        assert float(jnp.abs(getattr(free, name)).max()) < 1e-12 * float(jnp.abs(free.gravity).max())
+
+
+def test_an_explicit_step_dissipates_nothing_implicitly_and_beta_does():
+    """β Δt² v̄·H v^{n+1}."""
+    energy = budget_of()[0].energy
+    assert float(jnp.abs(energy.implicit).max()) < 1e-14 * float(energy.p2g.max())
+    half, whole = (float(budget_of(method=mpm.SemiImplicit(beta=b))[0].energy.implicit[0]) for b in (0.5, 1.0))
+    assert 0 < half < whole
+
+
+@pytest.mark.parametrize("method", **ids(METHODS))
+def test_time_integration_is_of_first_order_over_a_given_time(method):
+    """With FLIP(1), whose motion converges as Δt → 0: halving Δt halves its sum, and the sum of its sizes."""
+    sums = []
+    for halvings in (2, 3, 4):  # the same number of steps in each, so that one compilation serves
+        settings = {"method": method, "transfer": mpm.FLIP(1.0), "speed": 0.05}
+        energy = budget_of(number=0.8 / 2**halvings, steps=64, **settings)[0].energy
+        sums.append(float(jnp.abs(energy.time_integration[: 4 * 2**halvings]).sum()))
+    slopes = np.log2(np.array(sums[:-1]) / sums[1:])
+    assert (np.abs(slopes - 1) < 0.15).all(), slopes
