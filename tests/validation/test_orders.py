@@ -1,0 +1,185 @@
+"""Orders of accuracy, in space and in time, of everything for which one is claimed, and where there is none.
+
+Space: at a fixed Courant number for the explicit update; the implicit ones are of first order in time, so there
+Δt ∝ dx². Time: at a fixed grid, from differences between successive Δt, with FLIP(1), which dissipates nothing itself.
+"""
+
+import itertools
+
+import numpy as np
+import pytest
+from helpers import DESCRIPTIONS, GRADIENTS, KERNELS, METHODS, ids
+
+import mpmjax as mpm
+from mpmjax.verification import AxisAligned, Ends, StandingWave, discretise, errors, orders
+
+CELLS = (8, 16, 32)
+TRANSFERS = {"pic": mpm.PIC(), "flip": mpm.FLIP(1.0), "apic": mpm.APIC()}
+COMBINATIONS = {
+    "-".join(names): names
+    for names in itertools.product(KERNELS, TRANSFERS, DESCRIPTIONS, GRADIENTS, METHODS)
+    # the linear kernel's two gradient operators are one; implicit updates see the operator through H alone
+    if not (names[0] == "linear" and names[3] == "mls")
+    and not (names[4] != "explicit" and names[3] == "spline" and names[0] != "linear")
+}
+QUICK = {"quadratic-apic-updated-mls-explicit", "quadratic-apic-total-mls-semi_implicit"}
+
+
+def wave_orders(kernel, transfer, description, gradient, method, dim=1):
+    """Observed orders on the standing wave between symmetry planes, and the errors relative to its amplitude."""
+    crossing = kernel == "linear" and description == "updated"
+    amplitude = 1e-4 if crossing else 0.03
+    courant = 0.3 if method == "explicit" else [0.4 * CELLS[0] / n for n in CELLS]
+    e = errors(
+        StandingWave(amplitude, dim),
+        CELLS,
+        courant=courant,
+        method=METHODS[method],
+        kernel=KERNELS[kernel],
+        transfer=TRANSFERS[transfer],
+        description=DESCRIPTIONS[description],
+        gradient=GRADIENTS[gradient],
+    )
+    return orders(e, CELLS), e / amplitude
+
+
+@pytest.mark.parametrize(
+    "names", [pytest.param(v, id=k, marks=() if k in QUICK else pytest.mark.slow) for k, v in COMBINATIONS.items()]
+)
+def test_order_in_space(names):
+    """Second with FLIP and APIC. PIC: first at a fixed Courant number; none with Δt ∝ dx², since it loses what the grid
+    does not resolve in every step. The linear kernel: at amplitudes at which nothing crosses a cell, or in the total
+    description.
+    """
+    observed, relative = wave_orders(*names)
+    transfer, method = names[1], names[4]
+    if transfer != "pic":
+        assert (observed > 1.8).all(), (observed, relative)
+        assert relative[-1] < 0.02, relative
+    elif method == "explicit":
+        assert 0.8 < observed[-1] < 1.2, (observed, relative)
+    else:
+        assert observed[-1] < 0.4, (observed, relative)
+
+
+def test_order_in_space_in_two_dimensions():
+    observed, relative = wave_orders("quadratic", "apic", "updated", "mls", "explicit", dim=2)
+    assert (observed > 1.8).all(), (observed, relative)
+
+
+ALIGNED = {  # measured independently with separate prototypes, relative agreement in the last digit
+    "quadratic APIC, MLS": ({}, (3.62e-3, 9.04e-4, 2.49e-4)),
+    "quadratic APIC, spline": ({"gradient": mpm.SplineGradient()}, (4.56e-3, 1.15e-3, 3.66e-4)),
+    "cubic APIC, spline": ({"kernel": mpm.BSpline(3), "gradient": mpm.SplineGradient()}, (6.13e-3, 1.43e-3, 3.61e-4)),
+    "quadratic FLIP, spline": (
+        {"transfer": mpm.FLIP(1.0), "gradient": mpm.SplineGradient()},
+        (9.97e-3, 2.45e-3, 6.96e-4),
+    ),
+    "quadratic PIC, MLS": ({"transfer": mpm.PIC()}, (2.79e-2, 1.60e-2, 8.60e-3)),
+    "linear FLIP": ({"kernel": mpm.BSpline(1), "transfer": mpm.FLIP(1.0)}, (1.27e-2, 1.34e-2, 2.36e-2)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("choices", "expected"), **ids(ALIGNED))
+def test_axis_aligned_displacement_has_the_errors_of_independent_codes(choices, expected):
+    """2-D, periodic, A = 0.05, 2 x 2 particles a cell, Δt = 0.3 dx/c, neo-Hookean: to one per cent."""
+    e = errors(AxisAligned(0.05), CELLS, courant=0.3, staggered=False, **choices)
+    np.testing.assert_allclose(e, expected, rtol=0.01)
+
+
+@pytest.mark.slow
+def test_three_dimensions_are_second_order_too():
+    """Axis-aligned displacement between symmetry planes, fixed corotated."""
+    problem = AxisAligned(0.05, 3, Ends.MIRRORED, mpm.FixedCorotated(1e7, 0.3))
+    e = errors(problem, (4, 8, 16), courant=0.3, staggered=False)
+    assert (orders(e, (4, 8, 16)) > 1.8).all(), e
+
+
+@pytest.mark.slow
+def test_small_amplitudes_are_second_order_with_the_linear_kernel_too():
+    """A = 1e-4: no particle crosses a cell face."""
+    for choices in ({"kernel": mpm.BSpline(1), "transfer": mpm.FLIP(1.0)}, {"transfer": mpm.FLIP(1.0)}, {}):
+        e = errors(AxisAligned(1e-4), CELLS, courant=0.3, staggered=False, **choices)
+        assert (orders(e, CELLS) > 1.9).all(), e
+
+
+@pytest.mark.slow
+def test_plain_walls_are_first_order_and_mirrored_ones_second():
+    """Errors of independent codes: plain 2.9e-2, 1.3e-2, 6.4e-3 (spline gradient); mirrored those without any wall."""
+    plain = errors(AxisAligned(0.05, 2, Ends.PLAIN), CELLS, courant=0.3, staggered=False, gradient=mpm.SplineGradient())
+    np.testing.assert_allclose(plain, (2.9e-2, 1.3e-2, 6.4e-3), rtol=0.02)
+    assert (np.abs(orders(plain, CELLS) - 1) < 0.2).all()
+    mirrored = errors(AxisAligned(0.05, 2, Ends.MIRRORED), CELLS, courant=0.3)
+    np.testing.assert_allclose(mirrored, errors(AxisAligned(0.05, 2), CELLS, courant=0.3), rtol=1e-6)
+
+
+RECORD = {  # errors at 8, 32, 128 cells: (amplitude, scene, errors, relative agreement)
+    "hat functions, small": (1e-4, {}, (8.917e-6, 5.720e-7, 3.584e-8), 0.21),
+    "hat functions": (0.05, {}, (0.00725, 0.01532, 0.0394), 0.16),
+    "hat functions, total": (0.05, {"description": mpm.TotalLagrangian()}, (4.471e-3, 2.842e-4, 1.779e-5), 0.21),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("amplitude", "scene", "expected", "agreement"), **ids(RECORD))
+def test_the_one_dimensional_record(amplitude, scene, expected, agreement):
+    """A public record of the axis-aligned problem in 1-D, ν = 0, Δt = 0.2 dx/c, linear kernel. Its velocity transfer is
+    not stated; with FLIP(1) the errors agree to a fifth at 8 cells and to 2 per cent at 128: the difference is of third
+    order. It has the same failure: updated Lagrangian hat functions at A = 0.05 diverge.
+    """
+    problem = AxisAligned(amplitude, 1, Ends.PLAIN, mpm.NeoHookean(1e7, 0.0))
+    choices = {"kernel": mpm.BSpline(1), "transfer": mpm.FLIP(1.0), **scene}
+    e = errors(problem, (8, 32, 128), courant=0.2, staggered=False, **choices)
+    np.testing.assert_allclose(e, expected, rtol=agreement)
+    np.testing.assert_allclose(e[-1], expected[-1], rtol=0.025)
+
+
+@pytest.mark.slow
+def test_quadratic_splines_on_the_one_dimensional_record():
+    """At 8 cells, A = 0.05: 1.19e-2 with plain walls, worse than hats; 3.70e-3 with mirrored ones, better than total
+    Lagrangian hats."""
+    law = mpm.NeoHookean(1e7, 0.0)
+    for ends, expected in ((Ends.PLAIN, 1.19e-2), (Ends.MIRRORED, 3.70e-3)):
+        e = errors(AxisAligned(0.05, 1, ends, law), (8,), courant=0.2, staggered=False)
+        np.testing.assert_allclose(e, expected, rtol=5e-3)
+
+
+@pytest.mark.slow
+def test_dissipation_of_the_transfers_grows_as_the_step_shrinks():
+    """At N = 16, from Δt c/dx = 0.4 to 0.025: PIC 1.3e-2 to 5.0e-2, APIC 8.9e-4 to 1.4e-3, FLIP(1) no more."""
+    growth = {}
+    for name, transfer in TRANSFERS.items():
+        coarse, fine = (
+            errors(AxisAligned(0.05), (16,), courant=c, staggered=False, transfer=transfer)[0] for c in (0.4, 0.025)
+        )
+        growth[name] = fine / coarse
+    assert 3.5 < growth["pic"] < 4.5
+    assert 1.4 < growth["apic"] < 1.8
+    assert growth["flip"] < 1.1
+
+
+TIME = {
+    "explicit, staggered start": (mpm.Explicit(), True, 2),
+    "explicit": (mpm.Explicit(), False, 1),
+    "semi-implicit, β = 1/2": (mpm.SemiImplicit(beta=0.5), False, 1),
+    "semi-implicit, β = 1": (mpm.SemiImplicit(beta=1.0), False, 1),
+    "backward Euler": (mpm.BackwardEuler(), False, 1),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
+@pytest.mark.parametrize(("method", "staggered", "expected"), **ids(TIME))
+def test_order_in_time(method, staggered, expected, description):
+    """‖x_Δt − x_Δt/2‖ over ‖x_Δt/2 − x_Δt/4‖, at 8 cells, Δt c/dx from 0.1 down."""
+    problem = StandingWave(0.03)
+    ends = []
+    for steps in (80, 160, 320):
+        dt = problem.duration / steps
+        scene, particles = discretise(
+            problem, 8, velocity_time=-dt / 2 if staggered else 0.0, transfer=mpm.FLIP(1.0), description=description
+        )
+        ends.append(np.asarray(mpm.rollout(scene, particles, steps=steps, dt=dt, method=method).x))
+    first, second = (np.linalg.norm(a - b) for a, b in itertools.pairwise(ends))
+    assert abs(np.log2(first / second) - expected) < 0.15, (first, second)
