@@ -92,7 +92,7 @@ class SemiImplicit(eqx.Module):
     by a quarter in one period of a standing wave at the explicit limit. A method for slow, driven and overdamped
     motion.
     *When it breaks*: large strains within one step (the system is linearised once), and where compression makes H
-    indefinite and Δt brings M + βΔt²H near singular.
+    indefinite and Δt brings M + βΔt²H near singular: `AnalyticHessian(projected=True)` holds there.
     *Good values*: β = 1 with Δt up to some hundred times the explicit limit for quasi-static pulls.
 
     Args:

@@ -20,7 +20,7 @@ class AbstractTangent(eqx.Module):
 
 class PrincipalTangent(eqx.Module):
     """The closed-form eigenstructure of ∂²Ψ/∂F∂F at F = U diag(s) Vᵀ (B. Smith, F. de Goes, T. Kim, ACM Trans. Graph.
-    38 (2019) 12, doi 10.1145/3241041).
+    38 (2019) 3, doi 10.1145/3241041).
 
     With e_ij the unit matrices, U (e_ij − e_ji) Vᵀ/√2 is an eigenvector of eigenvalue `twist`, U (e_ij + e_ji) Vᵀ/√2
     one of eigenvalue `flip`, and the d remaining eigenvectors are U diag(q) Vᵀ with q those of `scaling`.
