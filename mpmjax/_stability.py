@@ -64,7 +64,7 @@ def stable_dt(
 @eqx.filter_jit
 def _limit(scene: Scene, particles: Particles, method: Method) -> Float[Array, ""]:
     density = particles.mass / particles.volume
-    z = (_tangent_bound(scene, particles) * _gradient_bound(scene, particles) / density).max()  # per Δt²
+    z = (_tangent_spectrum(scene, particles).max(axis=0) * _gradient_bound(scene, particles) / density).max()  # per Δt²
     match method:
         case Explicit():
             pass
@@ -75,8 +75,9 @@ def _limit(scene: Scene, particles: Particles, method: Method) -> Float[Array, "
     return jnp.where(z > 0, 2 / jnp.sqrt(jnp.where(z > 0, z, 1)), jnp.inf)
 
 
-def _tangent_bound(scene: Scene, particles: Particles) -> Float[Array, "p"]:
-    """Λ [Pa] of each particle: in the principal frame the map is d x d on the diagonal and 2 x 2 for each pair."""
+def _tangent_spectrum(scene: Scene, particles: Particles) -> Float[Array, "m p"]:
+    """The d² eigenvalues of each particle's tangent [Pa], whose largest is Λ: in the principal frame the map is d x d
+    on the diagonal and 2 x 2 on (L_ij, L_ji) for each pair."""
     _, s, _ = la.principal_frame(particles.deformation())
     tangent = scene.material.principal_tangent(s)
     d = s.shape[0]
@@ -86,13 +87,13 @@ def _tangent_bound(scene: Scene, particles: Particles) -> Float[Array, "p"]:
         P = scene.material.stress(s * jnp.eye(d, dtype=s.dtype)[..., None])
         pull, tau = s, s * jnp.stack([P[i, i] for i in range(d)])
     scaling = tangent.scaling * pull[:, None] * pull + tau * jnp.eye(d, dtype=s.dtype)[..., None]
-    largest = [*la.symmetric_eigen(scaling)[0]]
+    values = [*la.symmetric_eigen(scaling)[0]]
     for (i, j), twist, flip in zip(la.pairs(d), tangent.twist, tangent.flip, strict=True):
-        # acts on (L_ij, L_ji)
         near, far = (flip + twist) / 2 * pull[j] ** 2, (flip + twist) / 2 * pull[i] ** 2
         across = (flip - twist) / 2 * pull[i] * pull[j] + (tau[i] + tau[j]) / 2
-        largest.append((near + far) / 2 + jnp.hypot((near - far) / 2, across))
-    return jnp.stack(largest).max(axis=0)
+        centre, radius = (near + far) / 2, jnp.hypot((near - far) / 2, across)
+        values += [centre - radius, centre + radius]
+    return jnp.stack(values)
 
 
 def _gradient_bound(scene: Scene, particles: Particles) -> Float[Array, "*p"]:

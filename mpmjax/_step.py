@@ -67,7 +67,7 @@ class Explicit(eqx.Module):
     Second order in space with APIC and FLIP, first order in time. Conserves linear and, with APIC, angular momentum.
 
     *When it breaks*: above Δt of about 0.4 to 1 times dx/c, depending on dimension, kernel and transfer
-    (c the pressure-wave speed of the *current* tangent, which stretching and compression raise).
+    (c the pressure-wave speed of the *current* tangent, which stretching and compression raise): see `stable_dt`.
     """
 
     def velocity(self, nodes: Nodes, predictor: NodeVector, guess: NodeVector, active: Mask | bool) -> tuple:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from deformations import deformations
-from helpers import DESCRIPTIONS, DIMS, GRADIENTS, LAWS, TRANSFERS, ids
+from helpers import DESCRIPTIONS, DIMS, GRADIENTS, LAWS, TRANSFERS, assert_close, ids
 from jax.flatten_util import ravel_pytree
 
 import mpmjax as mpm
@@ -35,10 +35,10 @@ def alone(d, stretch=1.0, place=WORST_PLACE, law=LAW, **scene):
     return mpm.Scene(grid, law, **scene), mpm.Particles(x, 0 * x, DENSITY * 1e-3 * one, 1e-3 * one, F=F)
 
 
-def lattice(d, per_cell, stretch=1.0, law=LAW, **scene):
+def lattice(d, per_cell, stretch=1.0, law=LAW, cells=4, **scene):
     """A periodic block of uniform stretch, at rest and in equilibrium whatever the stretch."""
-    grid = mpm.Grid((4,) * d, DX, periodic=True)
-    side = (np.arange(4 * per_cell) + 0.5) * DX / per_cell
+    grid = mpm.Grid((cells,) * d, DX, periodic=True)
+    side = (np.arange(cells * per_cell) + 0.5) * DX / per_cell
     x = jnp.asarray(np.stack(np.meshgrid(*[side] * d, indexing="ij"), axis=-1).reshape(-1, d))
     volume = jnp.full(len(x), (DX / per_cell / stretch) ** d)
     F = jnp.tile(stretch * jnp.eye(d), (len(x), 1, 1))
@@ -118,6 +118,29 @@ def test_spline_gradients_are_steepest_where_the_bound_takes_them():
         f = (order - 1) / 2 + jnp.linspace(1e-9, 1 - 1e-9, 100001)
         values = (kernel.slopes(f) ** 2 / kernel.weights(f)).sum(axis=0)
         np.testing.assert_allclose(values.max(), most, rtol=1e-7)
+
+
+@eqx.filter_jit
+def tangent_spectra(scene, particles):
+    """The closed form's eigenvalues, and the map itself, (p, d², d²)."""
+    d, law, F = particles.dim, scene.material, jnp.moveaxis(particles.F, 0, -1)
+    pull = jnp.broadcast_to(jnp.eye(d)[..., None], F.shape) if scene.total else F
+    tau = 0 * F if scene.total else jnp.einsum("ijp,kjp->ikp", law.stress(F), F)
+    L = jnp.eye(d * d).reshape(-1, d, d)
+    image = jax.vmap(law.tangent(F))(jnp.einsum("mij,jkp->mikp", L, pull))
+    image = jnp.einsum("mijp,kjp->mikp", image, pull) + jnp.einsum("ijp,mkj->mikp", tau, L)
+    return mpm._stability._tangent_spectrum(scene, particles), jnp.moveaxis(image.reshape(d * d, d * d, -1), -1, 0)
+
+
+@pytest.mark.parametrize("law", **ids(LAWS))
+@pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
+@pytest.mark.parametrize("d", DIMS)
+def test_tangent_spectrum_is_that_of_the_assembled_map(law, description, d):
+    """Of L ↦ ∂²Ψ/∂F∂F : (L F) Fᵀ + τ Lᵀ made symmetric, or of ∂²Ψ/∂F∂F in the total description, assembled densely."""
+    scene, particles = cloud(d, 0, "large", material=law, description=description)
+    found, dense = map(np.asarray, tangent_spectra(*canonical((scene, particles), jnp.float64)))
+    expected = np.linalg.eigvalsh((dense + dense.swapaxes(1, 2)) / 2)
+    assert_close(np.sort(found.T, axis=1), expected, 1e-12)
 
 
 def left(scene, particles, dt, steps=300):
@@ -309,23 +332,19 @@ def test_amplification_has_its_known_figures(beta, z, expected, digits):
 # Bulk material.
 
 BULK = {
-    "1-D, 1 per cell": (1, 1, mpm.MLSGradient(), 1.000),
-    "1-D, 2 per cell": (1, 2, mpm.MLSGradient(), 1.306),
-    "1-D, 2 per cell, spline": (1, 2, mpm.SplineGradient(), 1.588),
+    "1-D, 1 per cell": (1, 1, 4, mpm.MLSGradient(), 1.000),
+    "1-D, 2 per cell": (1, 2, 4, mpm.MLSGradient(), 1.306),
+    "1-D, 2 per cell, spline": (1, 2, 12, mpm.SplineGradient(), 1.648),
+    "2-D, 2 x 2 per cell": (2, 2, 4, mpm.MLSGradient(), 1.306),
+    "2-D, 2 x 2 per cell, spline": (2, 2, 4, mpm.SplineGradient(), 1.588),
 }
+EACH_BULK = [pytest.param(*row, marks=pytest.mark.slow if row[0] == 2 else (), id=name) for name, row in BULK.items()]
 
 
-@pytest.mark.parametrize(("d", "per_cell", "gradient", "limit"), **ids(BULK))
-def test_limit_of_bulk_material(d, per_cell, gradient, limit):
+@pytest.mark.parametrize(("d", "per_cell", "cells", "gradient", "limit"), EACH_BULK)
+def test_limit_of_bulk_material(d, per_cell, cells, gradient, limit):
     """Quadratic APIC, periodic, in dx/c, from both sides within 0.1 %; `stable_dt` is below."""
-    scene, particles = lattice(d, per_cell, gradient=gradient)
+    scene, particles = lattice(d, per_cell, cells=cells, gradient=gradient)
     assert not alternates(scene, particles, 0.999 * limit * UNIT)
     assert alternates(scene, particles, 1.001 * limit * UNIT)
     assert mpm.stable_dt(scene, particles, safety=1.0) <= limit * UNIT * (1 + 1e-12)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("gradient", "limit"), [(mpm.MLSGradient(), 1.306), (mpm.SplineGradient(), 1.588)])
-def test_limit_of_bulk_material_in_two_dimensions(gradient, limit):
-    """2 x 2 per cell."""
-    test_limit_of_bulk_material(2, 2, gradient, limit)
