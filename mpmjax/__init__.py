@@ -19,6 +19,7 @@ from mpmjax._run import Run, SimulationError
 from mpmjax._sample import fill
 from mpmjax._scene import Scene, TotalLagrangian, UpdatedLagrangian, prepare
 from mpmjax._simulate import rollout, simulate
+from mpmjax._stability import stable_dt
 from mpmjax._step import BackwardEuler, Explicit, SemiImplicit, StepInfo, step
 from mpmjax._transfer import APIC, FLIP, PIC
 from mpmjax.material import AbstractMaterial, AbstractTangent, FixedCorotated, NeoHookean
@@ -68,6 +69,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "JvpHessian",
     "ConjugateResidual",
     "Guess",
+    "stable_dt",
     # running
     "Run",
     "SimulationError",

@@ -43,7 +43,8 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
     - `y0`: the initial guess. Default: zeros.
 
     Statistics returned: `num_steps` (applications of E in the recurrence), `residual` (the true ‖r‖/‖W⁻¹b‖),
-    `spectral_radius` (the estimate of ‖E‖).
+    `spectral_radius` (the estimate of ‖E‖), `indefinite` (whether rᵀA r < 0 was met, beyond rounding: A then is not
+    positive definite; the converse does not hold).
 
     *When it breaks*: on an indefinite A the recurrence stops where rᵀA r = 0; the result is then
     `RESULTS.breakdown`, never silence.
@@ -112,7 +113,9 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         def step(c: _Recurrence) -> _Recurrence:
             s = E(c.r)
             gamma = dot(c.r, s)
-            breakdown = jnp.abs(gamma) <= eps * norm(c.r) * norm(s)
+            noise = eps * norm(c.r) * norm(s)
+            breakdown = jnp.abs(gamma) <= noise
+            indefinite = c.indefinite | (gamma < -noise)
             beta = jnp.where(c.fresh, 0, gamma / jnp.where(c.fresh, 1, c.gamma))
             p = c.r + beta * c.p
             q = s + beta * c.q
@@ -124,7 +127,8 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
             rayleigh = jnp.abs(gamma) / dot(c.r, c.r)
             radius = jnp.maximum(c.radius, rayleigh)
             fresh = jnp.asarray(False)
-            return _Recurrence(x, c.r - alpha * q, p, q, gamma, radius, c.k + 1, fresh, settled, breakdown, c.stalled)
+            r = c.r - alpha * q
+            return _Recurrence(x, r, p, q, gamma, radius, c.k + 1, fresh, settled, breakdown, c.stalled, indefinite)
 
         def restart(c: _Recurrence) -> _Recurrence:
             before = norm(c.r)
@@ -146,6 +150,7 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
             settled=no,
             breakdown=no,
             stalled=no,
+            indefinite=no,
         )
         c = jax.lax.while_loop(lambda c: goes_on(c) & ~c.stalled, restart, start)
         residual = norm(c.r)
@@ -159,6 +164,7 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
             "max_steps": self.max_steps,
             "residual": residual / jnp.where(b_norm == 0, 1, b_norm),
             "spectral_radius": c.radius,
+            "indefinite": c.indefinite,
         }
         return unravel(c.x), result, stats
 
@@ -189,3 +195,4 @@ class _Recurrence(eqx.Module):
     settled: Array
     breakdown: Array
     stalled: Array
+    indefinite: Array

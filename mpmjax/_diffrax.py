@@ -51,6 +51,9 @@ class Tally(eqx.Module):
     """Largest relative residual that a solve ended with."""
     unconverged: Int[Array, "*f"]
     """Steps whose solve met neither its tolerance nor the precision's limit."""
+    indefinite: Int[Array, "*f"]
+    """Steps whose solve met negative curvature: compression has made M + cH indefinite, and near a singular one the
+    motion is wrong however small the residual. `AnalyticHessian(projected=True)` or a smaller step avoids it."""
     sweeps: Int[Array, "*f"]
     """Solves that contact took beyond one a step."""
     violations: Int[Array, "*f"]
@@ -78,6 +81,7 @@ class Tally(eqx.Module):
             line_search=self.line_search + s.line_search,
             worst_residual=jnp.maximum(self.worst_residual, jax.lax.stop_gradient(s.residual)),
             unconverged=self.unconverged + jnp.where(s.converged, 0, 1).astype(jnp.int32),
+            indefinite=self.indefinite + s.indefinite.astype(jnp.int32),
             sweeps=self.sweeps + c.sweeps,
             violations=self.violations + c.violations,
             fault=jnp.where(first, fault, self.fault),
@@ -95,6 +99,7 @@ class Tally(eqx.Module):
             line_search=self.line_search + later.line_search,
             worst_residual=jnp.maximum(self.worst_residual, later.worst_residual),
             unconverged=self.unconverged + later.unconverged,
+            indefinite=self.indefinite + later.indefinite,
             sweeps=self.sweeps + later.sweeps,
             violations=self.violations + later.violations,
             fault=jnp.where(healthy, later.fault, self.fault),
@@ -106,7 +111,7 @@ def no_steps(dtype: Any) -> Tally:
     """The tally before the first step."""
     zero = jnp.asarray(0, dtype=jnp.int32)
     residual = jnp.asarray(0, dtype=dtype)
-    return Tally(zero, zero, zero, zero, zero, residual, zero, zero, zero, zero, zero)
+    return Tally(zero, zero, zero, zero, zero, residual, zero, zero, zero, zero, zero, zero)
 
 
 def faulty_particles(problem: Problem, state: State) -> tuple[Bool[Array, "p"], Bool[Array, "p"], Bool[Array, "p"]]:

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._potential import ElasticPotential
-from mpmjax._types import Array, Float, Mask, NodeScalar, NodeVector, Scalar
-from mpmjax.material import AbstractTangent
+from mpmjax._types import Array, Float, Mask, Matrix, NodeScalar, NodeVector, Scalar
+from mpmjax.material import AbstractTangent, projected_tangent
 
 
 class AbstractHessianAction(eqx.Module):
@@ -51,16 +51,35 @@ def _jvp_action(potential: ElasticPotential, u: NodeVector, du: NodeVector) -> N
 
 
 class AnalyticHessian(eqx.Module):
-    """Hessian by the law's analytic stress differential (reference, eqs. 7 to 12). The faster of the two."""
+    """Hessian by the law's analytic stress differential (reference, eqs. 7 to 12). The faster of the two.
+
+    With `projected`, each particle's stress differential is made positive semi-definite first (see
+    `projected_tangent`), so that M + cH is positive definite whatever the compression and the step. A particle whose
+    differential is so already is not changed by it. The semi-implicit step then solves another, more strongly damped
+    equation where it matters; backward Euler only takes another way to the same solution. First derivatives stay
+    exact; second ones are refused.
+
+    Args:
+        projected: whether to project.
+    """
+
+    projected: bool = eqx.field(static=True, default=False)
 
     def at(self, potential: ElasticPotential, u: NodeVector) -> AbstractHessianAction:
         """The Hessian of the potential at a displacement u."""
-        return _AnalyticAction(potential, potential.material.tangent(potential.F + potential.strain(u)))
+        return _AnalyticAction(potential, self._tangent(potential, potential.F + potential.strain(u)))
 
     def at_rest(self, potential: ElasticPotential, like: NodeVector) -> AbstractHessianAction:
         """The Hessian at u = 0, without the gather."""
         del like
-        return _AnalyticAction(potential, potential.material.tangent(potential.F))
+        return _AnalyticAction(potential, self._tangent(potential, potential.F))
+
+    def exact(self) -> "AnalyticHessian":
+        """The Hessian itself, of which this may be a projection."""
+        return AnalyticHessian()
+
+    def _tangent(self, potential: ElasticPotential, F: Matrix) -> AbstractTangent:
+        return projected_tangent(potential.material, F) if self.projected else potential.material.tangent(F)
 
 
 class JvpHessian(eqx.Module):
@@ -73,6 +92,10 @@ class JvpHessian(eqx.Module):
     def at_rest(self, potential: ElasticPotential, like: NodeVector) -> AbstractHessianAction:
         """The Hessian at u = 0."""
         return _JvpAction(potential, jnp.zeros_like(like))
+
+    def exact(self) -> "JvpHessian":
+        """Itself."""
+        return self
 
 
 Hessian = AnalyticHessian | JvpHessian

@@ -32,6 +32,9 @@ class SolveInfo(eqx.Module):
     """True relative residual at the end, in the norm of the inverse mass."""
     converged: Bool[Array, "*f"]
     """Whether the solver's tolerance, or the precision's own limit, was met."""
+    indefinite: Bool[Array, "*f"]
+    """Whether the solver met a direction of negative curvature: M + cH is indefinite, and the step may be near a
+    singular one."""
 
     def plus(self, later: "SolveInfo") -> "SolveInfo":
         """The cost of both solves and the quality of the later one."""
@@ -41,13 +44,14 @@ class SolveInfo(eqx.Module):
             line_search=self.line_search + later.line_search,
             residual=later.residual,
             converged=later.converged,
+            indefinite=self.indefinite | later.indefinite,
         )
 
 
 def no_solve(dtype: Any) -> SolveInfo:
     """The report of an update that solves nothing."""
     zero = jnp.asarray(0, dtype=jnp.int32)
-    return SolveInfo(zero, zero, zero, jnp.asarray(0, dtype=dtype), jnp.asarray(True))
+    return SolveInfo(zero, zero, zero, jnp.asarray(0, dtype=dtype), jnp.asarray(True), jnp.asarray(False))
 
 
 class AbstractProblem(eqx.Module):
@@ -110,8 +114,15 @@ class NewtonProblem(AbstractProblem):
     prescribed: NodeVector
 
     def operator(self, v: NodeVector) -> ImplicitOperator:
-        """M + Δt² H at the displacement Δt v, constrained."""
-        return ImplicitOperator(self.mass, self.dt**2, self.hessian.at(self.potential, self.dt * v), self.free)
+        """M + Δt² H at the displacement Δt v, constrained: the derivative of the imbalance, H never projected."""
+        return self._operator(self.hessian.exact(), v)
+
+    def model(self, v: NodeVector) -> ImplicitOperator:
+        """What a Newton step from v solves: the operator, or with a projected Hessian a positive definite stand-in."""
+        return self._operator(self.hessian, v)
+
+    def _operator(self, hessian: Hessian, v: NodeVector) -> ImplicitOperator:
+        return ImplicitOperator(self.mass, self.dt**2, hessian.at(self.potential, self.dt * v), self.free)
 
     def imbalance(self, v: NodeVector) -> NodeVector:
         """M (v − ṽ) − Δt f(Δt v)."""
@@ -148,6 +159,7 @@ class SolveOnce(eqx.Module):
             line_search=jnp.asarray(0, dtype=jnp.int32),
             residual=stats["residual"],
             converged=result == lx.RESULTS.successful,
+            indefinite=stats["indefinite"],
         )
         return v + lift, info
 
@@ -195,9 +207,9 @@ class Newton(eqx.Module):
             return (norm(c.r) > tolerance(c)) & (c.newton < self.max_steps) & ~c.stuck
 
         def step(c: _NewtonState) -> _NewtonState:
-            operator = problem.operator(c.v)
+            model = problem.model(c.v)
             options = {"metric": metric}
-            direction, _, stats = self.solver.compute(self.solver.init(operator, options), -c.r, options)
+            direction, _, stats = self.solver.compute(self.solver.init(model, options), -c.r, options)
             slope = (c.r * direction).sum()
             steepest = -c.r / metric / jnp.maximum(stats["spectral_radius"], 1)
             uphill = ~(slope < 0)
@@ -223,6 +235,7 @@ class Newton(eqx.Module):
                 newton=c.newton + 1,
                 halvings=c.halvings + halvings,
                 stuck=halvings >= _MOST_HALVINGS,
+                indefinite=c.indefinite | stats["indefinite"],
             )
 
         lift = jnp.where(free, 0, problem.prescribed)
@@ -233,7 +246,8 @@ class Newton(eqx.Module):
         still = jnp.zeros_like(guess)
         scale = norm(jnp.where(free, problem.imbalance(still) + problem.operator(still).unconstrained(lift), 0))
         unit_strain = problem.unit_strain()
-        state = _NewtonState(start, residual(start), jnp.ones((), dtype), zero, zero, zero, jnp.asarray(False))
+        no = jnp.asarray(False)
+        state = _NewtonState(start, residual(start), jnp.ones((), dtype), zero, zero, zero, no, no)
         c = jax.lax.while_loop(goes_on, step, state)
         left = norm(c.r)
         info = SolveInfo(
@@ -242,6 +256,7 @@ class Newton(eqx.Module):
             line_search=c.halvings,
             residual=left / jnp.where(scale == 0, 1, scale),
             converged=left <= tolerance(c),
+            indefinite=c.indefinite,
         )
         return c.v, info
 
@@ -257,6 +272,7 @@ class _NewtonState(eqx.Module):
     newton: Array
     halvings: Array
     stuck: Array
+    indefinite: Array
 
 
 def solve(

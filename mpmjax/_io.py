@@ -34,7 +34,7 @@ from mpmjax._schema import decode, encode
 from mpmjax._step import Method
 from mpmjax._vtkhdf import File, add_fixed, add_growing, add_topology, count_in, rows_of, set_count, states_in
 
-_FORMAT = 1
+_FORMAT = 2
 _LIBVER = ("v110", "v110")  # what "latest" writes, VTK 9.7 cannot read
 _LIBVER_HEAD = ("v108", "v108")
 _UNITS = "SI: m, s, kg, Pa; deformation_gradient and J are pure numbers, affine_velocity is in 1/s"

@@ -1,17 +1,21 @@
-"""Small-matrix algebra by components: products, determinant, cofactor and the rotation of the polar decomposition.
+"""Small-matrix algebra by components: products, determinant, cofactor, the rotation of the polar decomposition, and
+the principal frame.
 
 Every matrix has shape (d, d, *batch), d = 1, 2 or 3, with its two matrix axes first. The expressions are unrolled over
 the components, so that XLA sees plain elementwise arithmetic over the batch: on a CPU that is some twenty times faster
 than batched LAPACK or tiny `dot_general`s, and its derivatives are as cheap.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Compliance, Matrix
+from mpmjax._types import Array, Compliance, Float, Matrix
 
 _NEWTON_STEPS = 30  # on the quartic of the 3-D rotation: halves the error at a double root, else squares it
 _POLISH_STEPS = 2  # on the rotation itself
+_JACOBI_SWEEPS = {1: 0, 2: 1, 3: 6}  # by dimension: in 2-D one rotation is the closed form; 3-D converges quadratically
 
 
 def assemble(rows: list[list[Array]]) -> Matrix:
@@ -87,6 +91,93 @@ def _cross_cofactor(A: Matrix, B: Matrix) -> Matrix:
         return A[i1, j1] * B[i2, j2] - A[i1, j2] * B[i2, j1]
 
     return assemble([[minor(i, j) for j in range(3)] for i in range(3)])
+
+
+def symmetric_eigen(S: Matrix) -> tuple[Array, Matrix]:
+    """The eigenvalues w and a rotation V of eigenvectors of a symmetric matrix, S = V diag(w) Vᵀ, in no order.
+
+    Jacobi's cyclic method (G. H. Golub, C. F. Van Loan, Matrix Computations, 4th ed., 2013, section 8.5), in 2-D one
+    rotation and exact. Accurate to rounding of ‖S‖ whatever the eigenvalues, repeated ones included. Only the upper
+    triangle is read.
+
+    *When it breaks*: it must not be differentiated: V is not a differentiable function where eigenvalues coincide.
+
+    Args:
+        S: shape (d, d, *batch).
+    Returns:
+        w, shape (d, *batch), and V, shape (d, d, *batch), det V = +1.
+    """
+    d = S.shape[0]
+
+    def sweep(_: Array | int, state: tuple[Matrix, Matrix]) -> tuple[Matrix, Matrix]:
+        A, V = ([[M[i, j] for j in range(d)] for i in range(d)] for M in state)
+        for p, q in pairs(d):
+            gap, twice = A[q][q] - A[p][p], 2 * A[p][q]
+            scale = jnp.abs(gap) + jnp.hypot(gap, twice)
+            tan = jnp.where(gap < 0, -twice, twice) / jnp.where(scale == 0, 1, scale)
+            cos = 1 / jnp.sqrt(1 + tan * tan)
+            sin = tan * cos
+            A[p][p], A[q][q] = A[p][p] - tan * A[p][q], A[q][q] + tan * A[p][q]
+            A[p][q] = jnp.zeros_like(gap)
+            for r in set(range(d)) - {p, q}:
+                (a, b), (e, f) = sorted((r, p)), sorted((r, q))
+                A[a][b], A[e][f] = cos * A[a][b] - sin * A[e][f], sin * A[a][b] + cos * A[e][f]
+            for row in V:
+                row[p], row[q] = cos * row[p] - sin * row[q], sin * row[p] + cos * row[q]
+        return assemble(A), assemble(V)
+
+    A, V = jax.lax.fori_loop(0, _JACOBI_SWEEPS[d], sweep, (S, identity_like(S)))
+    return jnp.stack([A[i, i] for i in range(d)]), V
+
+
+def pairs(d: int) -> list[tuple[int, int]]:
+    """The d (d − 1)/2 pairs of directions i < j, in the order in which arrays over pairs hold them."""
+    return [(i, j) for i in range(d) for j in range(i + 1, d)]
+
+
+@jax.custom_jvp
+def principal_frame(F: Matrix) -> tuple[Matrix, Array, Matrix]:
+    """F = U diag(s) Vᵀ with rotations U and V: the singular value decomposition with signed stretches.
+
+    R = `rotation(F)` and the eigenvectors V of S = RᵀF, U = R V. Where det F < 0 one stretch is negative, the smallest
+    in magnitude, so that s_i + s_j ≥ 0 for i ≠ j. The stretches come in no order. In 1-D U = V = 1 and s = F.
+
+    *When it breaks*: it must not be differentiated, and says so: the frame is not a function of F where stretches
+    coincide, F = I among those. An isotropic function of F has a derivative there all the same; give that function its
+    rule, in terms of this frame.
+
+    Args:
+        F: shape (d, d, *batch).
+    Returns:
+        U, shape (d, d, *batch), s, shape (d, *batch), and V, shape (d, d, *batch).
+    """
+    R = rotation(F)
+    S = matmul(transpose(R), F)
+    s, V = symmetric_eigen((S + transpose(S)) / 2)
+    return matmul(R, V), s, V
+
+
+def principal_modes(U: Matrix, V: Matrix) -> Float[Array, "m d d *p"]:
+    """An orthonormal basis of the d x d matrices in the frame: scalings, twists, flips, shape (d², d, d, *batch).
+
+    With u_i, v_j the columns of U and V: u_i v_iᵀ for each direction, then (u_i v_jᵀ − u_j v_iᵀ)/√2 for each pair
+    i < j, then (u_i v_jᵀ + u_j v_iᵀ)/√2.
+    """
+    d = U.shape[0]
+    half = jnp.sqrt(0.5).astype(U.dtype)
+    outer = {(i, j): U[:, None, i] * V[None, :, j] for i in range(d) for j in range(d)}
+    twists = [half * (outer[i, j] - outer[j, i]) for i, j in pairs(d)]
+    flips = [half * (outer[i, j] + outer[j, i]) for i, j in pairs(d)]
+    return jnp.stack([*(outer[i, i] for i in range(d)), *twists, *flips])
+
+
+@principal_frame.defjvp
+def _principal_frame_jvp(primals: Any, tangents: Any) -> Any:
+    raise NotImplementedError(
+        "The principal frame U, s, V of F has no derivative where stretches coincide, and is not differentiated: what "
+        "is built on it has a rule for its first derivative, and no second one. With a projected Hessian take first "
+        "derivatives only, or use AnalyticHessian() without projection."
+    )
 
 
 @jax.custom_jvp

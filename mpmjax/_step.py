@@ -35,7 +35,7 @@ class Explicit(eqx.Module):
     Second order in space with APIC and FLIP, first order in time. Conserves linear and, with APIC, angular momentum.
 
     *When it breaks*: above Δt of about 0.4 to 1 times dx/c, depending on dimension, kernel and transfer
-    (c the pressure-wave speed of the *current* tangent, which stretching and compression raise).
+    (c the pressure-wave speed of the *current* tangent, which stretching and compression raise): see `stable_dt`.
     """
 
     def velocity(self, nodes: Nodes, predictor: NodeVector, guess: NodeVector, active: Mask | bool) -> tuple:
@@ -64,7 +64,7 @@ class SemiImplicit(eqx.Module):
     by a quarter in one period of a standing wave at the explicit limit. A method for slow, driven and overdamped
     motion.
     *When it breaks*: large strains within one step (the system is linearised once), and where compression makes H
-    indefinite and Δt brings M + βΔt²H near singular.
+    indefinite and Δt brings M + βΔt²H near singular: `AnalyticHessian(projected=True)` holds there.
     *Good values*: β = 1 with Δt up to some hundred times the explicit limit for quasi-static pulls.
 
     Args:

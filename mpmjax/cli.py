@@ -94,6 +94,14 @@ def _summary(job: Job, run: Run, taken: int, seconds: float) -> str:
         )
     if int(run.tally.newton) > 0:
         lines.append(("Newton", f"{int(run.tally.newton) / steps:.3g} a step, {int(run.tally.line_search)} halvings"))
+    if int(run.tally.indefinite) > 0:
+        lines.append(
+            (
+                "indefinite",
+                f"the system of {int(run.tally.indefinite)} of {steps} steps: compressed material; if the motion looks "
+                'wrong, reduce dt or take hessian = { kind = "AnalyticHessian", projected = true }',
+            )
+        )
     if int(run.tally.violations) > 0:
         lines.append(("contact", f"{int(run.tally.violations)} conditions left violated"))
     for name in ("kinetic", "elastic", "potential", "total"):

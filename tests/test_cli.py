@@ -3,11 +3,14 @@
 import re
 from pathlib import Path
 
+import equinox as eqx
 import numpy as np
 import pytest
 from shell import refused, shell
 
 import mpmjax as mpm
+from mpmjax._job import read_job
+from mpmjax.cli import _summary
 
 SCENE = """
 gravity = [0.0, -9.81]
@@ -48,6 +51,14 @@ def folder(tmp_path_factory) -> Path:
     assert code == 0, err
     (folder / "summary").write_text(out)
     return folder
+
+
+def test_summary_says_how_many_steps_were_indefinite(folder):
+    """And is silent where none was."""
+    job, run = read_job(folder / "scene.toml"), mpm.load(folder / "run.h5")
+    assert "indefinite" not in (folder / "summary").read_text()
+    run = eqx.tree_at(lambda r: r.tally.indefinite, run, run.tally.indefinite + 5)
+    assert re.search(r"\nindefinite +the system of 5 of 6 steps", _summary(job, run, 6, 1.0))
 
 
 def test_run_writes_the_frames_and_a_summary(folder):

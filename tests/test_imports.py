@@ -24,6 +24,7 @@ LAYERS = (
     ("_conjugate_residual",),
     ("_nodes", "_guess", "_implicit", "_contact"),
     ("_step",),
+    ("_stability",),
     ("_diffrax", "_run", "_simulate"),
 )
 LEAF = len(LAYERS)

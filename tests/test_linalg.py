@@ -14,6 +14,8 @@ EACH_FAMILY = pytest.mark.parametrize("family", STRETCHES)
 REPEATED = {"identity": (1.0, 1.0, 1.0), "uniform": (1.2, 1.2, 1.2), "pair": (1.2, 1.2, 0.9)}
 
 rotation = jax.jit(la.rotation)
+principal_frame = jax.jit(la.principal_frame)
+symmetric_eigen = jax.jit(la.symmetric_eigen)
 
 
 @jax.jit
@@ -118,6 +120,59 @@ def test_rotation_is_the_polar_decompositions(dtype, rtol, family, d):
     np.testing.assert_allclose(S, S.swapaxes(0, 1), atol=rtol * np.abs(F).max())
     if d > 1:
         assert_close(R, on_batch(svd_rotation, F), rtol)
+
+
+@EACH_DIM
+@EACH_FAMILY
+@pytest.mark.parametrize(("dtype", "rtol"), [(np.float64, 1e-14), (np.float32, 1e-5)], ids=["float64", "float32"])
+def test_principal_frame_is_the_singular_value_decomposition_with_signs(dtype, rtol, family, d):
+    """F = U diag(s) Vᵀ with rotations U and V; |s| the singular values, at most the smallest negative."""
+    F, _ = deformations(family, d)
+    U, s, V = map(np.asarray, principal_frame(jnp.asarray(F, dtype)))
+    assert U.dtype == s.dtype == V.dtype == dtype
+    rtol = rtol * d**3
+    for Q in (U, V):
+        assert_close(np.einsum("kin,kjn->ijn", Q, Q), np.broadcast_to(np.eye(d)[..., None], Q.shape), rtol)
+        assert_close(on_batch(np.linalg.det, Q), 1.0, rtol)
+    assert_close(np.einsum("ikn,kn,jkn->ijn", U, s, V), F, rtol)
+    singular = on_batch(lambda F: np.linalg.svd(F, compute_uv=False), F)
+    assert_close(np.sort(np.abs(s), axis=0), singular[::-1], rtol)
+    assert ((s < 0).sum(axis=0) == (on_batch(np.linalg.det, F) < 0)).all()
+    assert (np.abs(s).min(axis=0) == np.where(s.min(axis=0) < 0, -s.min(axis=0), np.abs(s).min(axis=0))).all()
+
+
+EIGENVALUES = {
+    "generic": (3.0, -1.0, 0.5),
+    "equal": (2.0, 2.0, 2.0),
+    "pair": (2.0, -1.0, -1.0),
+    "nearly equal": (1.0, 1.0 + 1e-13, 1.0 - 1e-13),
+    "far apart": (1e8, 1.0, 1e-8),
+    "zero": (0.0, 0.0, 0.0),
+}
+
+
+@EACH_DIM
+@pytest.mark.parametrize("eigenvalues", EIGENVALUES.values(), ids=EIGENVALUES)
+def test_symmetric_eigen_agrees_with_numpy(eigenvalues, d):
+    """S = V diag(w) Vᵀ to rounding of ‖S‖, V a rotation, for distinct, repeated and diagonal ones."""
+    rng = np.random.default_rng(0)
+    Q = np.stack([np.eye(d), *(rotation_matrix(d, rng) for _ in range(9))], axis=-1)
+    S = np.einsum("ikn,k,jkn->ijn", Q, np.array(eigenvalues[:d]), Q)
+    w, V = map(np.asarray, symmetric_eigen(jnp.asarray(S)))
+    size = np.abs(eigenvalues[:d]).max()
+    np.testing.assert_allclose(np.einsum("ikn,kn,jkn->ijn", V, w, V), S, rtol=0, atol=2e-15 * d * size)
+    np.testing.assert_allclose(np.sort(w, axis=0), np.sort(eigenvalues[:d])[:, None] + 0 * w, atol=4e-15 * size)
+    assert_close(np.einsum("kin,kjn->ijn", V, V), np.broadcast_to(np.eye(d)[..., None], V.shape), 4e-15)
+    assert_close(on_batch(np.linalg.det, V), 1.0, 4e-15)
+
+
+def test_the_principal_frame_refuses_to_be_differentiated():
+    """Where stretches coincide it is no function of F: an error, never NaN."""
+    F = jnp.eye(2)
+    with pytest.raises(NotImplementedError, match="no derivative where stretches coincide"):
+        jax.jvp(la.principal_frame, (F,), (F,))
+    with pytest.raises(NotImplementedError, match="no derivative where stretches coincide"):
+        jax.grad(lambda F: la.principal_frame(F)[1].sum())(F)
 
 
 @EACH_DIM

@@ -4,7 +4,7 @@ import abc
 
 import equinox as eqx
 
-from mpmjax._types import Array, Bool, Matrix, PerParticle
+from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 
 
 class AbstractTangent(eqx.Module):
@@ -16,6 +16,22 @@ class AbstractTangent(eqx.Module):
     @abc.abstractmethod
     def __call__(self, dF: Matrix) -> Matrix:
         """δP [Pa] for δF [-], both of shape (d, d, p)."""
+
+
+class PrincipalTangent(eqx.Module):
+    """The closed-form eigenstructure of ∂²Ψ/∂F∂F at F = U diag(s) Vᵀ (B. Smith, F. de Goes, T. Kim, ACM Trans. Graph.
+    38 (2019) 3, doi 10.1145/3241041).
+
+    With e_ij the unit matrices, U (e_ij − e_ji) Vᵀ/√2 is an eigenvector of eigenvalue `twist`, U (e_ij + e_ji) Vᵀ/√2
+    one of eigenvalue `flip`, and the d remaining eigenvectors are U diag(q) Vᵀ with q those of `scaling`.
+    """
+
+    twist: Float[Array, "c *p"]
+    """Of the pairs i < j [Pa], in the order (0, 1), (0, 2), (1, 2), shape (d (d − 1)/2, *p)."""
+    flip: Float[Array, "c *p"]
+    """Likewise."""
+    scaling: Matrix
+    """∂²Ψ/∂s_i∂s_j [Pa], shape (d, d, *p)."""
 
 
 class AbstractMaterial(eqx.Module):
@@ -36,6 +52,10 @@ class AbstractMaterial(eqx.Module):
     @abc.abstractmethod
     def tangent(self, F: Matrix) -> AbstractTangent:
         """The stress differential at F."""
+
+    @abc.abstractmethod
+    def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
+        """The eigenstructure of the stress differential at signed principal stretches s [-], shape (d, *p)."""
 
     @abc.abstractmethod
     def admits(self, F: Matrix) -> Bool[Array, "p"]:

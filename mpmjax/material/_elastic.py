@@ -4,8 +4,8 @@ import jax.numpy as jnp
 
 from mpmjax import _linalg as la
 from mpmjax._checks import require_between, require_positive
-from mpmjax._types import Array, Bool, Compliance, Matrix, PerParticle
-from mpmjax.material._base import AbstractMaterial, AbstractTangent, lame_lambda, shear_modulus
+from mpmjax._types import Array, Bool, Compliance, Float, Matrix, PerParticle
+from mpmjax.material._base import AbstractMaterial, AbstractTangent, PrincipalTangent, lame_lambda, shear_modulus
 
 
 class FixedCorotated(AbstractMaterial):
@@ -59,6 +59,13 @@ class FixedCorotated(AbstractMaterial):
         compliance = la.spin_compliance(la.matmul(la.transpose(R), F))
         volumetric = self.lame_lambda * (la.determinant(F) - 1)
         return FixedCorotatedTangent(F, R, compliance, cof, volumetric, self.shear_modulus, self.lame_lambda)
+
+    def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
+        """With v = λ (J − 1) J/(s_i s_j): twist 2μ (1 − 2/(s_i + s_j)) + v, flip 2μ − v, scaling
+        2μ δ_ij + λ (J/s_i)(J/s_j) + (1 − δ_ij) v."""
+        mu, lam = 2 * self.shear_modulus * jnp.ones_like(s[0]), self.lame_lambda * jnp.ones_like(s[0])
+        sums = [s[i] + s[j] for i, j in la.pairs(s.shape[0])]
+        return _with_volumetric(s, lam * (s.prod(axis=0) - 1), lam, [mu * (1 - 2 / total) for total in sums], mu)
 
     def admits(self, F: Matrix) -> Bool[Array, "p"]:
         """Every finite F."""
@@ -126,16 +133,25 @@ class NeoHookean(AbstractMaterial):
 
     def stress(self, F: Matrix) -> Matrix:
         """P = μ (F − F⁻ᵀ) + λ ln J F⁻ᵀ."""
-        J = la.determinant(F)
-        pull = (self.lame_lambda * jnp.log(J) - self.shear_modulus) / J
+        pull, _ = self._volumetric(la.determinant(F))
         return self.shear_modulus * F + pull * la.cofactor(F)
 
     def tangent(self, F: Matrix) -> "NeoHookeanTangent":
         """δP = μ δF + λ (F⁻ᵀ : δF) F⁻ᵀ + (λ ln J − μ) δF⁻ᵀ, in terms of the cofactor matrix."""
-        J, cof = la.determinant(F), la.cofactor(F)
+        pull, bulk = self._volumetric(la.determinant(F))
+        return NeoHookeanTangent(F, la.cofactor(F), pull, bulk, self.shear_modulus)
+
+    def _volumetric(self, J: Array) -> tuple[Array, Array]:
+        """q = (λ ln J − μ)/J, by which the cofactor matrix enters the stress, and b = dq/dJ."""
         pull = (self.lame_lambda * jnp.log(J) - self.shear_modulus) / J
-        bulk = self.lame_lambda / J**2 - pull / J
-        return NeoHookeanTangent(F, cof, pull, bulk, self.shear_modulus)
+        return pull, self.lame_lambda / J**2 - pull / J
+
+    def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
+        """With v = (μ − λ ln J)/(s_i s_j): twist μ − v, flip μ + v, scaling μ + (μ + λ (1 − ln J))/s_i² on the diagonal
+        and λ/(s_i s_j) off it."""
+        mu, J = self.shear_modulus * jnp.ones_like(s[0]), s.prod(axis=0)
+        pull, bulk = self._volumetric(J)
+        return _with_volumetric(s, pull, bulk, [mu for _ in la.pairs(s.shape[0])], mu)
 
     def admits(self, F: Matrix) -> Bool[Array, "p"]:
         """J > 0."""
@@ -157,6 +173,37 @@ class NeoHookeanTangent(AbstractTangent):
         return (
             self.shear_modulus * dF + self.pull * la.cofactor_differential(self.F, dF) + self.bulk * dJ * self.cofactor
         )
+
+
+def _with_volumetric(s: Array, pull: Array, bulk: Array, twist: list[Array], stiffness: Array) -> PrincipalTangent:
+    """The eigenstructure of a law with P = deviatoric part + q J F⁻ᵀ, q = `pull` and b = dq/dJ = `bulk`.
+
+    δ(q J F⁻ᵀ) = b (J F⁻ᵀ : δF) J F⁻ᵀ + q δ(J F⁻ᵀ) has twist q J/(s_i s_j), flip −q J/(s_i s_j) and scaling
+    b (J/s_i)(J/s_j) + (1 − δ_ij) q J/(s_i s_j), both quotients being products of the other stretches.
+
+    Args:
+        s: signed principal stretches, shape (d, *p).
+        pull: q, shape (*p).
+        bulk: b, shape (*p).
+        twist: the deviatoric part's for each pair; its flip and the diagonal of its scaling are `stiffness`.
+        stiffness: see `twist`.
+    """
+    d = s.shape[0]
+
+    def others(*without: int) -> Array:
+        return jnp.stack([jnp.ones_like(s[0]), *(s[k] for k in range(d) if k not in without)]).prod(axis=0)
+
+    def scaling(i: int, j: int) -> Array:
+        spherical = bulk * others(i) * others(j)
+        return spherical + (stiffness if i == j else pull * others(i, j))
+
+    shear = [pull * others(i, j) for i, j in la.pairs(d)]
+    none = jnp.zeros((0, *s.shape[1:]), s.dtype)
+    return PrincipalTangent(
+        twist=jnp.stack([t + v for t, v in zip(twist, shear, strict=True)]) if shear else none,
+        flip=jnp.stack([stiffness - v for v in shear]) if shear else none,
+        scaling=la.assemble([[scaling(i, j) for j in range(d)] for i in range(d)]),
+    )
 
 
 def _check_moduli(law: FixedCorotated | NeoHookean) -> None:

@@ -1,0 +1,85 @@
+"""The stress differential projected to positive semi-definite, with a derivative that holds at repeated stretches."""
+
+import jax
+import jax.numpy as jnp
+
+from mpmjax import _linalg as la
+from mpmjax._types import Array, Float, Matrix
+from mpmjax.material._base import AbstractMaterial, AbstractTangent
+
+
+class ProjectedTangent(AbstractTangent):
+    """δP = A⁺ : δF, A⁺ being A = ∂²Ψ/∂F∂F with its negative eigenvalues set to zero (J. Teran, E. Sifakis, G. Irving,
+    R. Fedkiw, SCA 2005, doi 10.1145/1073368.1073394): of the positive semi-definite maps, the nearest to A."""
+
+    matrix: Float[Array, "m m *p"]
+    """A⁺ on the d² components in C order, shape (d², d², *p)."""
+
+    def __call__(self, dF: Matrix) -> Matrix:
+        """δP for δF."""
+        return _product(self.matrix, dF.reshape(-1, 1, *dF.shape[2:])).reshape(dF.shape)
+
+
+def projected_tangent(material: AbstractMaterial, F: Matrix) -> ProjectedTangent:
+    """The stress differential at F, projected. In closed form: no eigenvalue problem larger than d x d is solved.
+
+    Its first derivative with respect to F and the law's parameters is exact, at repeated stretches too: with E the
+    eigenvectors of A and λ its eigenvalues, δA⁺ = E (K ∘ Eᵀ δA E) Eᵀ, K_kl = (λ_k⁺ − λ_l⁺)/(λ_k − λ_l) (J. L. Daleckii,
+    S. G. Krein; N. J. Higham, Functions of Matrices, SIAM 2008, theorem 3.11, doi 10.1137/1.9780898717778), the limit
+    of K being 1 where both are positive and 0 where both are negative.
+
+    *When it breaks*: second derivatives are refused. Where an eigenvalue is zero A⁺ has a kink; the derivative given is
+    the mean of the two sides, which is what a central difference tends to. At F = I that is so: all twists are zero.
+    """
+    return ProjectedTangent(_projected_matrix(material, F))
+
+
+@jax.custom_jvp
+def _projected_matrix(material: AbstractMaterial, F: Matrix) -> Float[Array, "m m *p"]:
+    values, modes = _spectrum(material, F)
+    return _in_modes(modes, jnp.maximum(values, 0) * _identity(values))
+
+
+@_projected_matrix.defjvp
+def _projected_matrix_jvp(
+    primals: tuple[AbstractMaterial, Matrix], tangents: tuple[AbstractMaterial, Matrix]
+) -> tuple[Array, Array]:
+    values, modes = _spectrum(*primals)
+
+    def in_frame(material: AbstractMaterial, F: Matrix) -> Array:
+        """Eᵀ A E, the frame held fixed."""
+        images = jax.vmap(material.tangent(F))(modes.reshape(-1, *F.shape)).reshape(modes.shape)
+        return _product(modes, jnp.swapaxes(images, 0, 1))
+
+    change = jax.jvp(in_frame, primals, tangents)[1]
+    positive, size = jnp.maximum(values, 0), jnp.abs(values)
+    total = size[:, None] + size
+    # for every pair of signs the quotient of differences is this one of sums, which cancels nowhere
+    K = jnp.where(total == 0, 0.5, (positive[:, None] + positive) / jnp.where(total == 0, 1, total))
+    return _in_modes(modes, positive * _identity(values)), _in_modes(modes, K * change)
+
+
+def _spectrum(material: AbstractMaterial, F: Matrix) -> tuple[Float[Array, "m *p"], Float[Array, "m m *p"]]:
+    """Eigenvalues λ_k of ∂²Ψ/∂F∂F and its eigenvectors E_ka, a over components in C order."""
+    U, s, V = la.principal_frame(F)
+    tangent = material.principal_tangent(s)
+    scalings, Q = la.symmetric_eigen(tangent.scaling)
+    d, modes = F.shape[0], la.principal_modes(U, V)
+    modes = modes.reshape(d * d, d * d, *F.shape[2:])
+    modes = jnp.concatenate([_product(la.transpose(Q), modes[:d]), modes[d:]])
+    return jnp.concatenate([scalings, tangent.twist, tangent.flip]), modes
+
+
+def _in_modes(modes: Float[Array, "m m *p"], core: Float[Array, "m m *p"]) -> Float[Array, "m m *p"]:
+    """Σ_kl E_ka core_kl E_lb."""
+    return _product(jnp.swapaxes(modes, 0, 1), _product(core, modes))
+
+
+def _identity(values: Float[Array, "m *p"]) -> Float[Array, "m m *p"]:
+    """The identity, to make a diagonal of eigenvalues of."""
+    return la.identity_like(jnp.broadcast_to(values, (values.shape[0], *values.shape)))
+
+
+def _product(A: Float[Array, "a k *p"], B: Float[Array, "k b *p"]) -> Float[Array, "a b *p"]:
+    """A B, by columns of A and rows of B."""
+    return sum((A[:, k, None] * B[k] for k in range(1, A.shape[1])), A[:, 0, None] * B[0])
