@@ -4,7 +4,7 @@ from mpmjax._body_force import AbstractBodyForce
 from mpmjax._boundary import AbstractBoundary, Conditions, Grip, SeparatingBox, SlipBox, StickyBox, SymmetryPlane
 from mpmjax._budget import Budget, EnergyBudget, MomentumBudget, budget
 from mpmjax._conjugate_residual import ConjugateResidual
-from mpmjax._diagnostics import Energy, energy, momentum
+from mpmjax._diagnostics import Energy, energy, momentum, pieces
 from mpmjax._grid import Grid
 from mpmjax._guess import Guess
 from mpmjax._hessian import AnalyticHessian, JvpHessian
@@ -87,6 +87,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "energy",
     "load",
     "momentum",
+    "pieces",
     "render",
     "save",
 ]

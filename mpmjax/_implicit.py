@@ -172,7 +172,9 @@ class Newton(eqx.Module):
     also keeps out of deformations where the law has no energy. Stops when ‖residual‖ ≤ rtol ‖b‖, b the right-hand side
     M ṽ + Δt f(0), less what prescribed velocities contribute to it, both in the norm of the inverse mass, or at the
     rounding of the residual. Starts from the guess, or from rest where the potential is lower there or the guess is a
-    deformation for which the law has no energy.
+    deformation for which the law has no energy; if that is so at rest too, for what is prescribed alone (a grip that
+    closes a gap of one cell in a step), the first step is that of the system linearised before anything moves, which
+    is the semi-implicit one.
 
     Args:
         rtol: relative tolerance. Default: that of the precision, 1e-8 or 1e-5.
@@ -207,7 +209,7 @@ class Newton(eqx.Module):
             return (norm(c.r) > tolerance(c)) & (c.newton < self.max_steps) & ~c.stuck
 
         def step(c: _NewtonState) -> _NewtonState:
-            model = problem.model(c.v)
+            model = problem.model(jnp.where((c.newton == 0) & ~startable, still, c.v))
             options = {"metric": metric}
             direction, _, stats = self.solver.compute(self.solver.init(model, options), -c.r, options)
             slope = (c.r * direction).sum()
@@ -216,6 +218,7 @@ class Newton(eqx.Module):
             direction = jnp.where(uphill, steepest, direction)
             slope = jnp.where(uphill, (c.r * steepest).sum(), slope)
             energy = problem.merit(c.v)
+            energy = jnp.where(jnp.isfinite(energy), energy, jnp.inf)
             radius = jnp.maximum(c.radius, stats["spectral_radius"])
             slack = 4 * eps * radius * unit_strain**2  # near the solution the fall drowns in rounding
 
@@ -242,12 +245,15 @@ class Newton(eqx.Module):
         start = problem.admit(guess)
         energies = problem.merit(start), problem.merit(lift)
         start = jnp.where(jnp.isfinite(energies[0]) & ~(energies[1] < energies[0]), start, lift)
+        startable = jnp.isfinite(energies[0]) | jnp.isfinite(energies[1])
         zero = jnp.asarray(0, dtype=jnp.int32)
         still = jnp.zeros_like(guess)
-        scale = norm(jnp.where(free, problem.imbalance(still) + problem.operator(still).unconstrained(lift), 0))
+        linearised = jnp.where(free, problem.imbalance(still) + problem.operator(still).unconstrained(lift), 0)
+        scale = norm(linearised)
         unit_strain = problem.unit_strain()
         no = jnp.asarray(False)
-        state = _NewtonState(start, residual(start), jnp.ones((), dtype), zero, zero, zero, no, no)
+        first = jnp.where(startable, residual(start), linearised)
+        state = _NewtonState(start, first, jnp.ones((), dtype), zero, zero, zero, no, no)
         c = jax.lax.while_loop(goes_on, step, state)
         left = norm(c.r)
         info = SolveInfo(

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import typer
 
-from mpmjax._diagnostics import energy, grid_mass
+from mpmjax._diagnostics import energy, grid_mass, pieces
 from mpmjax._fit import FitResult
 from mpmjax._io import load
 from mpmjax._job import CurveSettings, Job, fit_job, read_job
@@ -104,6 +104,10 @@ def _summary(job: Job, run: Run, taken: int, seconds: float) -> str:
         )
     if int(run.tally.violations) > 0:
         lines.append(("contact", f"{int(run.tally.violations)} conditions left violated"))
+    whole, parts = pieces(run.scene, job.particles), pieces(run.scene, run.final)
+    if parts > whole:
+        advice = "if nothing was to part, this is numerical fracture: more particles a cell, or TotalLagrangian"
+        lines.append(("pieces", f"{whole} at the start, {parts} at the end; {advice}"))
     for name in ("kinetic", "elastic", "potential", "total"):
         a, b = float(getattr(before, name)), float(getattr(after, name))
         lines.append((f"{name} energy", f"{a + 0.0:.6g} J to {b + 0.0:.6g} J, change {b - a:+.3g} J"))
