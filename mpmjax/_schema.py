@@ -24,11 +24,12 @@ import jax
 import numpy as np
 from jaxtyping import AbstractArray
 
-from mpmjax._boundary import Grip, SeparatingBox, SlipBox, StickyBox, SymmetryPlane
+from mpmjax._boundary import Grip, SeparatingBox, SlipBox, StickyBox
 from mpmjax._conjugate_residual import ConjugateResidual
 from mpmjax._grid import Grid
 from mpmjax._hessian import AnalyticHessian, JvpHessian
 from mpmjax._kernel import BSpline, MLSGradient, SplineGradient
+from mpmjax._mirror import ContactPlane, SymmetryPlane
 from mpmjax._motion import Motion
 from mpmjax._region import Ball, Box
 from mpmjax._scene import Scene, TotalLagrangian, UpdatedLagrangian
@@ -40,7 +41,7 @@ CLASSES: tuple[type, ...] = (
     Scene,
     Grid,
     *(FixedCorotated, NeoHookean),
-    *(StickyBox, SlipBox, SeparatingBox, Grip, SymmetryPlane),
+    *(StickyBox, SlipBox, SeparatingBox, Grip, SymmetryPlane, ContactPlane),
     *(Box, Ball, Motion),
     *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
     *(Explicit, SemiImplicit, BackwardEuler, AnalyticHessian, JvpHessian, ConjugateResidual),

@@ -8,7 +8,7 @@ from helpers import assert_close, explicit_limit, ids
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax._contact import SWEEPS, find_active_set
+from mpmjax._contact import SWEEPS
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(solver=TIGHT)}
@@ -47,17 +47,11 @@ def test_a_wall_pushes_never_pulls_and_is_not_entered(method):
     particles = eqx.tree_at(lambda p: p.v, particles, particles.v + spin)
     dt = 0.5 * explicit_limit(scene)
     step = grid_update(scene, particles, dt, method)
-    nodes, v = step.nodes, np.asarray(step.velocity)
-    predictor = nodes.explicit_velocity()
-    start = method.start(nodes, predictor)
-    active, guess, _, sweeps = find_active_set(
-        nodes.conditions, predictor, start, nodes.mass, lambda a, guess: method.velocity(nodes, predictor, guess, a)
-    )
-    again, impulse, _ = method.velocity(nodes, predictor, guess, active)
-    impulse = np.where(active, impulse, 0)
+    nodes, v, impulse = step.nodes, np.asarray(step.velocity), np.asarray(step.reaction)
     wall, occupied = np.asarray(nodes.conditions.side[:, 1]) == 1, np.asarray(nodes.mass) > 0
-    assert_close(v, again, 1e-11)  # frictionless: what the step returned
-    assert int(sweeps) == int(step.info.contact.sweeps) <= SWEEPS
+    held = wall & (v[:, 1] == 0) & occupied
+    impulse = np.where(held[:, None] & [False, True], impulse, 0)
+    assert int(step.info.contact.sweeps) <= SWEEPS
     assert int(step.info.contact.violations) == 0
     assert (v[wall & occupied, 1] == 0).any()
     assert (v[wall & occupied, 1] > 0.1).any()

@@ -35,6 +35,7 @@ EXAMPLES = {
     mpm.SeparatingBox: mpm.SeparatingBox((0.1,), (0.9,), friction=0.3),
     mpm.Grip: GRIP,
     mpm.SymmetryPlane: mpm.SymmetryPlane(1, 0.05, "below"),
+    mpm.ContactPlane: mpm.ContactPlane(1, 0.05, "below", friction=0.3),
     mpm.Box: mpm.Box((0.0, 0.1, 0.2), (1.0, 1.1, 1.2)),
     mpm.Ball: mpm.Ball((0.1, 0.2), 0.3),
     mpm.Motion: GRIP.motion,
