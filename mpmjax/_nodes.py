@@ -21,6 +21,8 @@ class Nodes(eqx.Module):
     """m_i [kg], shape (n,), folded at symmetry planes; zero on empty nodes, whose mass is but rounding."""
     velocity: NodeVector
     """v_i^n [m/s], shape (n, d); zero on empty nodes."""
+    occupied: Bool[Array, "n 1"]
+    """Whether the node has mass beyond rounding, shape (n, 1)."""
     acceleration: Array
     """Body acceleration g [m/s²], shape (d,), or (n, d) where it varies."""
     force: NodeVector
@@ -35,11 +37,6 @@ class Nodes(eqx.Module):
     """What the boundaries prescribe."""
     contacts: tuple[Contact, ...] = ()
     """The scene's contact planes, of which none holds anything here."""
-
-    @property
-    def occupied(self) -> Bool[Array, "n 1"]:
-        """Whether the node has mass, shape (n, 1)."""
-        return (self.mass > 0)[:, None]
 
     @property
     def free(self) -> Mask:
@@ -65,11 +62,12 @@ class Nodes(eqx.Module):
         """
         if not images.images:
             return self
+        mass = images.fold_scalar(self.mass)
         momentum, pull = self.mass[:, None] * self.velocity, self.mass[:, None] * self.acceleration
         nodes = eqx.tree_at(
-            lambda n: (n.mass, n.force, n.potential.mirror),
+            lambda n: (n.mass, n.occupied, n.force, n.potential.mirror),
             self,
-            (images.fold_scalar(self.mass), images.fold(self.force), images.then(self.potential.mirror)),
+            (mass, (mass > 0)[:, None], images.fold(self.force), images.then(self.potential.mirror)),
         )
         parts = nodes.per_mass(images.fold(momentum)), nodes.per_mass(images.fold(pull))
         return eqx.tree_at(lambda n: (n.velocity, n.acceleration), nodes, parts)
@@ -95,6 +93,7 @@ def particles_to_grid(scene: Scene, particles: Particles, t: Scalar, dt: Scalar,
         nodes = Nodes(
             mass=jnp.where(occupied[:, 0], mass, 0),
             velocity=jnp.where(occupied, momentum / full, 0),
+            occupied=occupied,
             acceleration=acceleration,
             force=potential.rest_force(momentum),
             dt=jnp.asarray(dt),
