@@ -9,7 +9,9 @@ from helpers import assert_close, explicit_limit, ids
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax._contact import SWEEPS
+from mpmjax._checks import canonical
+from mpmjax._contact import SWEEPS, find_active_set, held_images, holding
+from mpmjax._nodes import particles_to_grid
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(solver=TIGHT)}
@@ -218,6 +220,37 @@ def test_a_body_pressed_into_a_corner_feels_symmetry_planes(case, name):
     held, mirrored = (mpm.rollout(mpm.Scene(grid, law, boundary=b), body, **run) for b in (planes, symmetric))
     for field in ("x", "v", "F", "C"):
         assert_close(getattr(held, field), getattr(mirrored, field), 1e-11)
+
+
+def test_where_planes_meet_a_held_node_never_copies_a_node_that_is_held_itself():
+    """Random velocities hold random columns of two planes; mirroring what was mirrored changes nothing."""
+    planes = (mpm.ContactPlane(0, 0.0), mpm.ContactPlane(1, 0.05))
+    grid = mpm.Grid((10, 10), DX, origin=(-4, -4))
+    body = mpm.fill(mpm.Box((0.0, 0.05), (0.3, 0.35)), grid, density=1e3)
+    scene = canonical(mpm.Scene(grid, mpm.FixedCorotated(1e5, 0.3), boundary=planes), float)
+    method, rng = mpm.Explicit(), np.random.default_rng(0)
+
+    @eqx.filter_jit
+    def held_and_mirrored(v, field):
+        start = mpm.prepare(scene, eqx.tree_at(lambda b: b.v, body, v))
+        nodes = particles_to_grid(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start))
+
+        def try_set(active, guess):
+            v, info = method.velocity(holding(nodes, active), guess)
+            v = held_images(nodes, active).unfold(v)
+            return v, method.imbalance(nodes, v), info
+
+        active, *_ = find_active_set(nodes, nodes.velocity, try_set)
+        images = held_images(nodes, active)
+        once = images.unfold(field)
+        return active.columns, once, images.unfold(once)
+
+    for _ in range(20):
+        columns, once, twice = held_and_mirrored(
+            jnp.asarray(rng.normal(size=body.v.shape)), jnp.asarray(rng.normal(size=(grid.size, 2)))
+        )
+        assert all(0 < held.sum() < 100 for held in columns)
+        np.testing.assert_array_equal(once, twice)
 
 
 @pytest.mark.parametrize("name", METHODS)
