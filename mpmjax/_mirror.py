@@ -68,7 +68,8 @@ class ContactPlane(AbstractBoundary):
     the wall (the mirrored tangential velocity has no slope there), and in the moment of touching and leaving.
 
     *When it breaks*: as a `SymmetryPlane`. Contact is felt as soon as a particle's stencil reaches the plane, a half to
-    two spacings early, as in every contact on the grid.
+    two spacings early, as in every contact on the grid. PIC and FLIP carry no velocity gradient to the grid, so with
+    them a fast stretch of what touches the wall is taken for leaving it; APIC knows better.
 
     Args:
         axis: direction of the normal, 0 to d − 1.

@@ -31,9 +31,10 @@ def wave_run(
     stretch=1.0,
     amplitude=0.01,
     offset=0.0,
-    method=mpm.Explicit(),
     per_cell=2,
-    **run,
+    steps=None,
+    method=mpm.Explicit(),
+    transfer=mpm.APIC(),
 ):
     """x = sX + A sin(kX) cos(kct) in a strip of half a wavelength that fills the space between two walls.
 
@@ -125,7 +126,16 @@ TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 )
 def test_a_contact_plane_that_is_pressed_upon_is_a_symmetry_plane(kernel, method, transfer, offset):
     """To rounding, and nothing of the conditions is left violated."""
-    case = {"stretch": 0.9, "offset": offset, "method": method, "transfer": transfer, "steps": 32}
+    # without an affine velocity, P2G takes a fast stretch at the wall for leaving it
+    amplitude = 0.01 if transfer.affine else 1e-3
+    case = {
+        "stretch": 0.9,
+        "amplitude": amplitude,
+        "offset": offset,
+        "method": method,
+        "transfer": transfer,
+        "steps": 32,
+    }
     symmetry, contact = (wave_run(8, kind, kernel, **case)[0] for kind in ("symmetry", "contact"))
     for name in ("x", "v", "F", "C") if transfer.affine else ("x", "v", "F"):
         a, b = (np.asarray(getattr(run.frames, name)) for run in (symmetry, contact))
