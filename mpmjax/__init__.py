@@ -1,7 +1,7 @@
 """A differentiable Material Point Method in JAX, with explicit, semi-implicit and backward-Euler grid updates."""
 
 from mpmjax._body_force import AbstractBodyForce
-from mpmjax._boundary import AbstractBoundary, Conditions, Grip, SeparatingBox, SlipBox, StickyBox, SymmetryPlane
+from mpmjax._boundary import AbstractBoundary, Conditions, Grip, SeparatingBox, SlipBox, StickyBox
 from mpmjax._budget import Budget, EnergyBudget, MomentumBudget, budget
 from mpmjax._conjugate_residual import ConjugateResidual
 from mpmjax._diagnostics import Energy, energy, momentum, pieces
@@ -10,6 +10,7 @@ from mpmjax._guess import Guess
 from mpmjax._hessian import AnalyticHessian, JvpHessian
 from mpmjax._io import load, save
 from mpmjax._kernel import BSpline, MLSGradient, SplineGradient
+from mpmjax._mirror import ContactPlane, SymmetryPlane
 from mpmjax._motion import Motion
 from mpmjax._particles import Particles
 from mpmjax._record import record
@@ -54,6 +55,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     # boundaries
     "AbstractBoundary",
     "Conditions",
+    "ContactPlane",
     "Grip",
     "Motion",
     "SeparatingBox",

@@ -127,7 +127,7 @@ def _budget(
         stencil = scene.stencil(before)
         nodes = particles_to_grid(scene, before, (start + n) * dt, dt, stencil)
         new = update(nodes, method)
-        after = grid_to_particles(scene, before, nodes, new.velocity)
+        after = grid_to_particles(scene, before, nodes, new)
         return after, _step_budget(scene, before, after, nodes, new, method)
 
     numbers = jnp.arange(steps, dtype=particles.x.dtype)
@@ -146,7 +146,7 @@ def _step_budget(
 
     # impulses at the nodes
     elastic = method.elastic_impulse(nodes, v1 - nodes.per_mass(friction))
-    elastic_at_start = dt * potential.rest_force(v0)
+    elastic_at_start = dt * nodes.force
     raw = spread(stencil.index, stencil.weight[:, None], before.mass[None, None], scene.grid.size)
     weight = dt * images.fold(raw * jnp.asarray(scene.gravity))
     body = jnp.where(nodes.occupied, dt * nodes.mass[:, None] * nodes.acceleration - weight, 0)
@@ -154,7 +154,7 @@ def _step_budget(
 
     # particle and nodes beside each other
     v_old = components(before.v)
-    arrived = collect(stencil.index, stencil.weight[:, None], all0)[0]
+    arrived = collect(stencil.index, stencil.weight[:, None], images.unfold(new.before))[0]
     moved = collect(stencil.index, stencil.weight[:, None], all1)[0]
     C_old, C_new = (None if q.C is None else components(q.C) for q in (before, after))
     beside = scene.transfer.alpha * (v_old - arrived) if isinstance(scene.transfer, FLIP) else jnp.zeros_like(v_old)

@@ -1,14 +1,22 @@
-"""Separation and friction: which wall nodes hold, and what friction takes from them.
+"""Separation and friction: what the walls that push but do not pull hold, and what friction takes from it.
 
-On a separating wall the velocity v and the wall's impulse r along the inward normal obey v ≥ 0, r ≥ 0, v r = 0. The
-active set (the nodes the wall holds) is guessed as those the explicit velocity v* drives into the wall. Then, at most
-`SWEEPS` times: solve with the active nodes held; release those the wall would have to pull, hold those that would
-enter; stop when nothing changes. What still violates the conditions after that is counted in `ContactInfo.violations`.
-The last solve, with the set settled and started from the last sweep's result, is the one that is differentiated; the
-derivative is that of the active set found, and does not exist where it changes.
+On such a wall the velocity v and the wall's impulse r along the inward normal obey v ≥ 0, r ≥ 0, v r = 0: for each
+component of a node at and beyond a separating box, and for each column of nodes of a contact plane, where holding means
+that the column's nodes beyond the plane mirror those before it. A column's r is the normal impulse of its nodes on the
+plane and twice that of the images (a node and its image share equally). Its v is what r works on: the mean, with
+weights 2 m m'/(m + m'), of the v + v' of nodes and their images, and of the v of nodes on the plane (where the two are
+one). So an explicit step that holds the column has r = −Σ 2 m m'/(m + m') (v* + v*'), and the two conditions exclude
+each other. Columns that are each other's image in another plane are held together.
+
+The active set (what the walls hold) is guessed as what the explicit velocity v* drives into them. Then, at most
+`SWEEPS` times: solve with the active set held; release what the wall would have to pull, hold what would enter; stop
+when nothing changes. What still violates the conditions after that is counted in `ContactInfo.violations`. The last
+solve, with the set settled and started from the last sweep's result, is the one that is differentiated; the derivative
+is that of the active set found, and does not exist where it changes.
 
 Friction is an impulse at the held nodes after the solve, against the tangential velocity and at most μ times the normal
-impulse (Coulomb); it is not part of the implicit system, so it lags by the elastic response of one step.
+impulse (Coulomb); it is not part of the implicit system, so it lags by the elastic response of one step. That of a
+column acts on its node on the plane, or half a spacing before it.
 """
 
 from collections.abc import Callable
@@ -17,9 +25,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._boundary import Conditions
 from mpmjax._implicit import SolveInfo, no_solve
-from mpmjax._types import Array, Int, Mask, NodeScalar, NodeVector
+from mpmjax._mirror import Contact, Mirror
+from mpmjax._nodes import Nodes
+from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
 
 SWEEPS = 4
 """Most active sets that are tried in a step."""
@@ -31,83 +40,167 @@ class ContactInfo(eqx.Module):
     sweeps: Int[Array, "*f"]
     """Solves before the last one."""
     violations: Int[Array, "*f"]
-    """Wall components that pull or are entered all the same."""
+    """Wall components and columns that pull or are entered all the same."""
 
 
 def no_contact() -> ContactInfo:
-    """The report of a scene without separating walls."""
+    """The report of a scene without walls that may be left."""
     zero = jnp.asarray(0, dtype=jnp.int32)
     return ContactInfo(zero, zero)
 
 
-def _verdict(side: NodeVector, active: Mask, v: NodeVector, impulse: NodeVector, mass: NodeScalar) -> tuple[Mask, Mask]:
-    """Which active components pull, and which inactive ones enter, beyond rounding."""
-    noise = jnp.sqrt(jnp.finfo(v.dtype).eps) * jnp.abs(v).max()
-    pulls = active & (side * impulse < -noise * mass[:, None])
-    enters = ~active & (side * v < -noise)
-    return pulls, enters
+class ActiveSet(eqx.Module):
+    """What walls that may be left hold, or a part of it."""
+
+    components: Mask | None
+    """Of velocity, at separating boxes, shape (n, d); None without any."""
+    columns: tuple[Bool[Array, "n"], ...]
+    """For each contact plane its columns, each at all of its nodes."""
+
+
+def touches(nodes: Nodes) -> bool:
+    """Whether there are walls that may be left."""
+    return nodes.conditions.side is not None or bool(nodes.contacts)
+
+
+def held_images(nodes: Nodes, active: ActiveSet) -> Mirror:
+    """The mirrors in the columns that are held."""
+    return Mirror(tuple(c.image.within(held) for c, held in zip(nodes.contacts, active.columns, strict=True)))
+
+
+def holding(nodes: Nodes, active: ActiveSet) -> Nodes:
+    """The nodes with the active set held."""
+    fixed = nodes.conditions.fixed
+    if active.components is not None:
+        fixed = fixed | active.components
+    for contact, held in zip(nodes.contacts, active.columns, strict=True):
+        normal = jnp.arange(fixed.shape[1]) == contact.image.axis
+        fixed = fixed | ((held & contact.on_plane)[:, None] & normal)
+    return eqx.tree_at(lambda n: n.conditions.fixed, nodes.folded(held_images(nodes, active)), fixed)
+
+
+def untouched(nodes: Nodes, active: ActiveSet) -> Mask:
+    """The free components in which no held wall has a part."""
+    free = nodes.free
+    if active.components is not None:
+        free = free & ~active.components
+    for held in active.columns:
+        free = free & ~held[:, None]
+    return free
 
 
 def find_active_set(
-    conditions: Conditions,
-    predictor: NodeVector,
+    nodes: Nodes,
     guess: NodeVector,
-    mass: NodeScalar,
-    try_set: Callable[[Mask, NodeVector], tuple[NodeVector, NodeVector, SolveInfo]],
-) -> tuple[Mask, NodeVector, SolveInfo, Int[Array, ""]]:
-    """The components that separating walls hold, a velocity to start the last solve from, and what the sweeps cost.
+    try_set: Callable[[ActiveSet, NodeVector], tuple[NodeVector, NodeVector, SolveInfo]],
+) -> tuple[ActiveSet, NodeVector, SolveInfo, Int[Array, ""]]:
+    """What the walls hold, a velocity to start the last solve from, and what the sweeps cost.
 
     Args:
-        conditions: of the step, with separating walls.
-        predictor: explicit velocity v* [m/s].
+        nodes: nodes of which nothing is held yet.
         guess: where the first solve starts [m/s].
-        mass: nodal mass [kg].
-        try_set: (active, guess) to (velocity, wall impulse [kg m/s], report). Must not be differentiated.
+        try_set: (active, guess) to (velocity, imbalance [kg m/s] of all nodes, report). Must not be differentiated.
 
     Returns:
         active set, velocity, the sweeps' reports added up, number of sweeps.
     """
-    side = conditions.side
-    assert side is not None
 
     def sweep(state: tuple) -> tuple:
         active, v, cost, _, count = state
-        v, impulse, info = try_set(active, v)
-        pulls, enters = _verdict(side, active, v, impulse, mass)
-        return (active & ~pulls) | enters, v, cost.plus(info), (pulls | enters).any(), count + 1
+        v, imbalance, info = try_set(active, v)
+        pulls, enters = _verdict(nodes, active, v, imbalance)
+        active = jax.tree.map(lambda held, pulled, entered: (held & ~pulled) | entered, active, pulls, enters)
+        return active, v, cost.plus(info), _number(nodes, pulls) + _number(nodes, enters) > 0, count + 1
 
     def unsettled(state: tuple) -> Array:
         return state[3] & (state[4] < SWEEPS)
 
-    active = side * predictor < 0
+    predictor, side = nodes.explicit_velocity(), nodes.conditions.side
+    active = ActiveSet(
+        None if side is None else side * predictor < 0,
+        tuple(_approach(nodes, contact, predictor) < 0 for contact in nodes.contacts),
+    )
     start = (active, guess, no_solve(guess.dtype), jnp.asarray(True), jnp.asarray(0, dtype=jnp.int32))
     active, v, cost, _, count = jax.lax.while_loop(unsettled, sweep, start)
     return active, v, cost, count
 
 
-def count_violations(
-    conditions: Conditions, active: Mask, v: NodeVector, impulse: NodeVector, mass: NodeScalar
-) -> Int[Array, ""]:
-    """How many wall components pull or are entered all the same."""
-    assert conditions.side is not None
-    pulls, enters = _verdict(conditions.side, active, v, impulse, mass)
-    return (pulls | enters).sum().astype(jnp.int32)
+def count_violations(nodes: Nodes, active: ActiveSet, v: NodeVector, imbalance: NodeVector) -> Int[Array, ""]:
+    """How many wall components and columns pull or are entered all the same."""
+    pulls, enters = _verdict(nodes, active, v, imbalance)
+    return _number(nodes, pulls) + _number(nodes, enters)
 
 
-def with_friction(
-    conditions: Conditions, active: Mask, v: NodeVector, impulse: NodeVector, mass: NodeScalar
-) -> NodeVector:
-    """Velocity after Coulomb friction on the held nodes, one wall direction after the other."""
-    assert conditions.side is not None and conditions.friction is not None
+def with_friction(nodes: Nodes, active: ActiveSet, v: NodeVector, imbalance: NodeVector) -> NodeVector:
+    """Velocity after Coulomb friction on the held nodes, one wall direction after the other.
+
+    Args:
+        nodes: nodes of which nothing is held.
+        active: what is held.
+        v: velocity of all nodes after the solve [m/s].
+        imbalance: that of all nodes [kg m/s].
+    """
+    images = held_images(nodes, active)
+    mass = images.fold_scalar(nodes.mass)
+    limit = _friction_limit(nodes, active, imbalance, images)
     d = v.shape[1]
     for a in range(d):
         tangent = jnp.arange(d) != a
         slip = jnp.where(tangent, v, 0)
         speed2 = (slip**2).sum(axis=1)
         speed = jnp.sqrt(jnp.where(speed2 == 0, 1, speed2))
-        pressure = jnp.where(active[:, a], jnp.maximum(conditions.side[:, a] * impulse[:, a], 0), 0)
-        loss = conditions.friction[:, a] * pressure / jnp.where(mass == 0, 1, mass)
+        loss = limit[:, a] / jnp.where(mass == 0, 1, mass)
         share = jnp.minimum(loss / speed, 1)
-        free = tangent & ~conditions.fixed
+        free = tangent & ~nodes.conditions.fixed
         v = v - jnp.where(free & (speed2 > 0)[:, None], share[:, None] * slip, 0)
-    return v
+    return images.unfold(v)
+
+
+def _friction_limit(nodes: Nodes, active: ActiveSet, imbalance: NodeVector, images: Mirror) -> NodeVector:
+    """The largest impulse of friction at each node [kg m/s], by the wall's direction, shape (n, d)."""
+    limit = jnp.zeros_like(imbalance)
+    side, friction = nodes.conditions.side, nodes.conditions.friction
+    if active.components is not None and side is not None and friction is not None:
+        push = jnp.maximum(side * images.fold(imbalance), 0)
+        limit = friction * jnp.where(active.components, push, 0)
+    for contact, held in zip(nodes.contacts, active.columns, strict=True):
+        push = jnp.where(held & contact.at_key, contact.impulse(imbalance), 0)
+        push = contact.friction * jnp.maximum(images.fold_scalar(push), 0)
+        limit = limit.at[:, contact.image.axis].add(push)
+    return limit
+
+
+def _verdict(nodes: Nodes, active: ActiveSet, v: NodeVector, imbalance: NodeVector) -> tuple[ActiveSet, ActiveSet]:
+    """What of the active set pulls, and what of the rest enters, beyond rounding."""
+    noise = jnp.sqrt(jnp.finfo(v.dtype).eps) * jnp.abs(v).max()
+    pulls, enters = None, None
+    if active.components is not None and nodes.conditions.side is not None:
+        push = nodes.conditions.side * held_images(nodes, active).fold(imbalance)
+        pulls = active.components & (push < -noise * nodes.mass[:, None])
+        enters = ~active.components & (nodes.conditions.side * v < -noise)
+    pulling, entering = [], []
+    for contact, held in zip(nodes.contacts, active.columns, strict=True):
+        least = -noise * _tied(nodes, contact, contact.image.column(contact.weight(nodes.mass)))
+        pulling.append(held & (_tied(nodes, contact, contact.impulse(imbalance)) < least))
+        entering.append(~held & (_approach(nodes, contact, v) < least))
+    return ActiveSet(pulls, tuple(pulling)), ActiveSet(enters, tuple(entering))
+
+
+def _number(nodes: Nodes, part: ActiveSet) -> Int[Array, ""]:
+    """How many components and columns a part has."""
+    masks = [held & contact.at_key for contact, held in zip(nodes.contacts, part.columns, strict=True)]
+    masks = masks if part.components is None else [*masks, part.components]
+    return jnp.asarray(sum(mask.sum() for mask in masks), dtype=jnp.int32)
+
+
+def _approach(nodes: Nodes, contact: Contact, v: NodeVector) -> NodeScalar:
+    """The momentum [kg m/s] with which each column leaves the plane; below zero it enters."""
+    return _tied(nodes, contact, contact.departure(nodes.mass, v))
+
+
+def _tied(nodes: Nodes, contact: Contact, columns: NodeScalar) -> NodeScalar:
+    """A quantity of the columns of a plane, summed over columns that are each other's image in other planes."""
+    for image in (*(c.image for c in nodes.contacts), *nodes.potential.mirror.images):
+        if image.axis != contact.image.axis:
+            columns = image.scalar(Mirror((image,)).fold_scalar(columns))
+    return columns

@@ -4,8 +4,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._boundary import Conditions, combine, mirror
+from mpmjax._boundary import Conditions, combine
 from mpmjax._kernel import Stencil
+from mpmjax._mirror import Contact, Mirror, contacts, mirror
 from mpmjax._particles import Particles
 from mpmjax._potential import ElasticPotential
 from mpmjax._scene import Scene
@@ -17,13 +18,15 @@ class Nodes(eqx.Module):
     """What the velocity update of one step is given."""
 
     mass: NodeScalar
-    """m_i [kg], shape (n,), folded at symmetry planes."""
+    """m_i [kg], shape (n,), folded at symmetry planes; zero on empty nodes, whose mass is but rounding."""
     velocity: NodeVector
     """v_i^n [m/s], shape (n, d); zero on empty nodes."""
     occupied: Bool[Array, "n 1"]
     """Whether the node has mass beyond rounding, shape (n, 1)."""
     acceleration: Array
     """Body acceleration g [m/s²], shape (d,), or (n, d) where it varies."""
+    force: NodeVector
+    """f_i at the start of the step [N], shape (n, d)."""
     dt: Float[Array, ""]
     """Δt [s]."""
     spacing: Float[Array, ""]
@@ -32,11 +35,17 @@ class Nodes(eqx.Module):
     """Φ, of nodal displacements."""
     conditions: Conditions
     """What the boundaries prescribe."""
+    contacts: tuple[Contact, ...] = ()
+    """The scene's contact planes, of which none holds anything here."""
+
+    @property
+    def free(self) -> Mask:
+        """The components that nothing prescribes, on nodes that have mass."""
+        return self.occupied & ~self.conditions.fixed
 
     def explicit_velocity(self) -> NodeVector:
         """v* = v^n + Δt f / m + Δt g (reference, eq. 4)."""
-        f = self.potential.rest_force(self.velocity)
-        return jnp.where(self.occupied, self.inertial_velocity() + self.dt * self.per_mass(f), 0)
+        return jnp.where(self.occupied, self.inertial_velocity() + self.dt * self.per_mass(self.force), 0)
 
     def inertial_velocity(self) -> NodeVector:
         """ṽ = v^n + Δt g."""
@@ -46,9 +55,22 @@ class Nodes(eqx.Module):
         """An impulse or force over the nodes' mass; zero on empty nodes."""
         return jnp.where(self.occupied, impulse / jnp.where(self.occupied, self.mass[:, None], 1), 0)
 
-    def free(self, active: Mask | bool) -> Mask:
-        """The components that neither a boundary prescribes nor a wall holds, on nodes that have mass."""
-        return self.occupied & ~self.conditions.fixed & ~jnp.asarray(active)
+    def folded(self, images: Mirror) -> "Nodes":
+        """The true nodes of mirror planes, with what their images received. Nothing changes without a plane.
+
+        A force is folded like the momentum it makes: a plane's mirror image is pulled the other way.
+        """
+        if not images.images:
+            return self
+        mass = images.fold_scalar(self.mass)
+        momentum, pull = self.mass[:, None] * self.velocity, self.mass[:, None] * self.acceleration
+        nodes = eqx.tree_at(
+            lambda n: (n.mass, n.occupied, n.force, n.potential.mirror),
+            self,
+            (mass, (mass > 0)[:, None], images.fold(self.force), images.then(self.potential.mirror)),
+        )
+        parts = nodes.per_mass(images.fold(momentum)), nodes.per_mass(images.fold(pull))
+        return eqx.tree_at(lambda n: (n.velocity, n.acceleration), nodes, parts)
 
 
 def particles_to_grid(scene: Scene, particles: Particles, t: Scalar, dt: Scalar, stencil: Stencil) -> Nodes:
@@ -56,28 +78,28 @@ def particles_to_grid(scene: Scene, particles: Particles, t: Scalar, dt: Scalar,
     grid, window = scene.grid, scene.window(particles)
     v, F = components(particles.v), particles.deformation()
     C = None if particles.C is None else components(particles.C)
-    images = mirror(scene.boundary, grid, window)
-    gravity = jnp.asarray(scene.gravity)
+    acceleration = jnp.asarray(scene.gravity)
     with jax.named_scope("p2g"):
-        raw, momentum = p2g(stencil, particles.mass, v, C, grid.size)
-        mass, momentum = images.fold_scalar(raw), images.fold(momentum)
+        mass, momentum = p2g(stencil, particles.mass, v, C, grid.size)
         occupied = (mass > jnp.finfo(mass.dtype).eps * particles.mass.mean())[:, None]
         full = jnp.where(occupied, mass[:, None], 1)
-        if scene.body_force is None and not images.images:
-            acceleration = gravity
-        else:  # a force is folded like the momentum it makes: a plane's mirror image is pulled the other way
-            force = raw[:, None] * gravity
-            if scene.body_force is not None:
-                push = particles.mass * components(scene.body_force.acceleration(particles.x, t))
-                force = force + spread(stencil.index, stencil.weight[:, None], push[None], grid.size)
-            acceleration = jnp.where(occupied, images.fold(force) / full, 0)
-    return Nodes(
-        mass=jnp.where(occupied[:, 0], mass, 0),
-        velocity=jnp.where(occupied, momentum / full, 0),
-        occupied=occupied,
-        acceleration=acceleration,
-        dt=jnp.asarray(dt),
-        spacing=jnp.asarray(grid.spacing),
-        potential=ElasticPotential(scene.material, particles.volume, F, None if scene.total else F, stencil, images),
-        conditions=combine(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total),
-    )
+        if scene.body_force is not None:
+            push = particles.mass * components(scene.body_force.acceleration(particles.x, t))
+            force = spread(stencil.index, stencil.weight[:, None], push[None], grid.size)
+            acceleration = acceleration + jnp.where(occupied, force / full, 0)
+        potential = ElasticPotential(
+            scene.material, particles.volume, F, None if scene.total else F, stencil, Mirror(())
+        )
+        nodes = Nodes(
+            mass=jnp.where(occupied[:, 0], mass, 0),
+            velocity=jnp.where(occupied, momentum / full, 0),
+            occupied=occupied,
+            acceleration=acceleration,
+            force=potential.rest_force(momentum),
+            dt=jnp.asarray(dt),
+            spacing=jnp.asarray(grid.spacing),
+            potential=potential,
+            conditions=combine(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total),
+            contacts=contacts(scene.boundary, grid, window),
+        )
+        return nodes.folded(mirror(scene.boundary, grid, window))

@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax import _linalg as la
-from mpmjax._boundary import Mirror
 from mpmjax._kernel import Stencil
+from mpmjax._mirror import Mirror
 from mpmjax._transfer import collect, spread
 from mpmjax._types import Array, Float, Matrix, NodeVector
 from mpmjax.material import AbstractMaterial

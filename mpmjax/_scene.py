@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._body_force import AbstractBodyForce
-from mpmjax._boundary import AbstractBoundary, SeparatingBox, SymmetryPlane
+from mpmjax._boundary import AbstractBoundary, SeparatingBox
 from mpmjax._checks import coordinates, is_traced, require, require_finite
 from mpmjax._grid import Grid
 from mpmjax._kernel import BSpline, Gradient, MLSGradient, Stencil, in_window, make_stencil
+from mpmjax._mirror import ContactPlane, Plane, SymmetryPlane, fits
 from mpmjax._particles import Particles
 from mpmjax._transfer import APIC, Transfer
 from mpmjax._types import Array, Int, Point
@@ -47,7 +48,7 @@ class Scene(eqx.Module):
         body_force: a force per mass that varies in space or time, besides gravity. Default: none.
 
     Raises:
-        ValueError: dimensions that differ, a symmetry plane off the half-spacing lattice, or what the total description
+        ValueError: dimensions that differ, a mirrored plane off the half-spacing lattice, or what the total description
             cannot do (a window that follows, walls that separate).
     """
 
@@ -93,25 +94,27 @@ class Scene(eqx.Module):
                 boundary.dim in (None, d),
                 f"{type(boundary).__name__} must have {d} coordinates, as the grid has, got {boundary.dim}.",
             )
-            if isinstance(boundary, SymmetryPlane):
+            if isinstance(boundary, Plane):
                 self._check_plane(boundary)
         if self.total:
             require(not self.grid.follow, "In the total description the window cannot follow: drop follow=True.")
             require(
-                not any(isinstance(b, SeparatingBox) for b in self.boundary),
-                "In the total description there is no contact: use the updated one, or SlipBox for an attached wall.",
+                not any(isinstance(b, SeparatingBox | ContactPlane) for b in self.boundary),
+                "In the total description there is no contact: use the updated one, or SymmetryPlane or SlipBox "
+                "for a wall that is never left.",
             )
 
-    def _check_plane(self, plane: SymmetryPlane) -> None:
-        require(plane.axis < self.grid.dim, f"A symmetry plane's axis must be below {self.grid.dim}, got {plane.axis}.")
+    def _check_plane(self, plane: Plane) -> None:
+        name = type(plane).__name__
+        require(plane.axis < self.grid.dim, f"{name}'s axis must be below {self.grid.dim}, got {plane.axis}.")
         require(
             not self.grid.periodic[plane.axis],
-            f"Direction {plane.axis} is periodic and cannot have a symmetry plane: drop one of them.",
+            f"Direction {plane.axis} is periodic and cannot have a {name}: drop one of them.",
         )
         require(
-            plane.fits(self.grid),
-            f"A symmetry plane must lie at a multiple of half the grid's spacing ({self.grid.spacing}), got "
-            f"{plane.position}: move it, or use SlipBox.",
+            fits(plane, self.grid),
+            f"A {name} must lie at a multiple of half the grid's spacing ({self.grid.spacing}), got "
+            f"{plane.position}: move it, or use {'SlipBox' if isinstance(plane, SymmetryPlane) else 'SeparatingBox'}.",
         )
 
     @property
@@ -146,7 +149,7 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
 
     Raises:
         ValueError: the particles have another dimension than the grid, a particle lies outside the window or beyond a
-            symmetry plane, or a deformation gradient is one the law does not allow.
+            mirrored plane, or a deformation gradient is one the law does not allow.
     """
     p, d = particles.count, particles.dim
     require(d == scene.grid.dim, f"The particles are {d}-dimensional, the grid {scene.grid.dim}-dimensional.")
@@ -183,12 +186,13 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
             f"{int((~inside).sum()) - 1} others do not: enlarge the grid's shape, move its origin, or use follow=True."
         )
     for plane in scene.boundary:
-        if isinstance(plane, SymmetryPlane):
+        if isinstance(plane, Plane):
+            name = type(plane).__name__
             depth = np.asarray(place[:, plane.axis]) - float(plane.position)
             wrong = depth < 0 if plane.keep == "above" else depth > 0
             require(
                 ~wrong,
-                f"Particles must lie {plane.keep} the symmetry plane at {plane.position} on axis {plane.axis}, but "
+                f"Particles must lie {plane.keep} the {name} at {plane.position} on axis {plane.axis}, but "
                 f"particle {int(np.argmax(wrong))} does not: move it or change the plane's keep.",
             )
     F = np.moveaxis(np.asarray(particles.F), 0, -1)

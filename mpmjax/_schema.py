@@ -24,11 +24,12 @@ import jax
 import numpy as np
 from jaxtyping import AbstractArray
 
-from mpmjax._boundary import Grip, SeparatingBox, SlipBox, StickyBox, SymmetryPlane
+from mpmjax._boundary import Grip, SeparatingBox, SlipBox, StickyBox
 from mpmjax._conjugate_residual import ConjugateResidual
 from mpmjax._grid import Grid
 from mpmjax._hessian import AnalyticHessian, JvpHessian
 from mpmjax._kernel import BSpline, MLSGradient, SplineGradient
+from mpmjax._mirror import ContactPlane, SymmetryPlane
 from mpmjax._motion import Motion
 from mpmjax._region import Ball, Box
 from mpmjax._scene import Scene, TotalLagrangian, UpdatedLagrangian
@@ -40,7 +41,7 @@ CLASSES: tuple[type, ...] = (
     Scene,
     Grid,
     *(FixedCorotated, NeoHookean),
-    *(StickyBox, SlipBox, SeparatingBox, Grip, SymmetryPlane),
+    *(StickyBox, SlipBox, SeparatingBox, Grip, SymmetryPlane, ContactPlane),
     *(Box, Ball, Motion),
     *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
     *(Explicit, SemiImplicit, BackwardEuler, AnalyticHessian, JvpHessian, ConjugateResidual),
@@ -109,6 +110,8 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
         return tuple(decode(d, items[0], f"[{where}] {i}", arrays) for i, d in enumerate(data, 1))
     if classes:
         return _object(data, classes, where, arrays)
+    unfit = "takes an object of Python, which files cannot hold: leave it out"
+    _require(not any(_is_module(a) for a in alternatives), where, unfit)
     if enums := [a for a in alternatives if isinstance(a, type) and issubclass(a, enum.Enum)]:
         words = [member.value for member in enums[0]]
         _require(data in words, where, f"must be one of {_quoted(words)}, got {data!r}")

@@ -8,7 +8,18 @@ import jax.numpy as jnp
 
 from mpmjax._checks import canonical, require_between, require_positive
 from mpmjax._conjugate_residual import ConjugateResidual
-from mpmjax._contact import ContactInfo, count_violations, find_active_set, no_contact, with_friction
+from mpmjax._contact import (
+    ActiveSet,
+    ContactInfo,
+    count_violations,
+    find_active_set,
+    held_images,
+    holding,
+    no_contact,
+    touches,
+    untouched,
+    with_friction,
+)
 from mpmjax._guess import Guess
 from mpmjax._hessian import AnalyticHessian, Hessian
 from mpmjax._implicit import LinearProblem, Newton, NewtonProblem, SolveInfo, SolveOnce, no_solve, solve
@@ -38,20 +49,20 @@ class Explicit(eqx.Module):
     (c the pressure-wave speed of the *current* tangent, which stretching and compression raise): see `stable_dt`.
     """
 
-    def velocity(self, nodes: Nodes, predictor: NodeVector, guess: NodeVector, active: Mask | bool) -> tuple:
-        """v^{n+1}, the walls' impulse and the solve's report."""
+    def velocity(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
+        """v^{n+1} and the solve's report."""
         del guess
-        v = jnp.where(nodes.free(active), predictor, nodes.conditions.velocity)
-        return v, nodes.mass[:, None] * (v - predictor), no_solve(v.dtype)
+        v = jnp.where(nodes.free, nodes.explicit_velocity(), nodes.conditions.velocity)
+        return v, no_solve(v.dtype)
 
     def elastic_impulse(self, nodes: Nodes, v: NodeVector) -> NodeVector:
         """Δt f(0) [kg m/s], on nodes that have mass."""
-        return jnp.where(nodes.occupied, nodes.dt * nodes.potential.rest_force(v), 0)
+        del v
+        return jnp.where(nodes.occupied, nodes.dt * nodes.force, 0)
 
-    def start(self, nodes: Nodes, predictor: NodeVector) -> NodeVector:
+    def start(self, nodes: Nodes) -> NodeVector:
         """Nothing is iterated."""
-        del nodes
-        return predictor
+        return nodes.velocity
 
 
 class SemiImplicit(eqx.Module):
@@ -85,27 +96,29 @@ class SemiImplicit(eqx.Module):
     def __check_init__(self):
         require_between("SemiImplicit's beta", self.beta, 0, 1)
 
-    def velocity(self, nodes: Nodes, predictor: NodeVector, guess: NodeVector, active: Mask | bool) -> tuple:
-        """v^{n+1}, the walls' impulse and the solve's report."""
-        problem = LinearProblem(
+    def velocity(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
+        """v^{n+1} and the solve's report."""
+        return solve(self._problem(nodes), guess, SolveOnce(self.solver), self.adjoint_solver)
+
+    def _problem(self, nodes: Nodes) -> LinearProblem:
+        predictor = nodes.explicit_velocity()
+        return LinearProblem(
             mass=nodes.mass,
             factor=self.beta * nodes.dt**2,
             hessian=self.hessian.at_rest(nodes.potential, predictor),
             rhs=nodes.mass[:, None] * predictor,
-            free=nodes.free(active),
+            free=nodes.free,
             prescribed=nodes.conditions.velocity,
         )
-        v, info = solve(problem, guess, SolveOnce(self.solver), self.adjoint_solver)
-        return v, problem.imbalance(v), info
 
     def elastic_impulse(self, nodes: Nodes, v: NodeVector) -> NodeVector:
         """Δt f(0) − βΔt² H v [kg m/s]."""
         action = self.hessian.at_rest(nodes.potential, v)
-        return nodes.dt * nodes.potential.rest_force(v) - self.beta * nodes.dt**2 * action(v)
+        return nodes.dt * nodes.force - self.beta * nodes.dt**2 * action(v)
 
-    def start(self, nodes: Nodes, predictor: NodeVector) -> NodeVector:
+    def start(self, nodes: Nodes) -> NodeVector:
         """The chosen guess."""
-        return self.guess.velocity(nodes.velocity, predictor)
+        return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())
 
 
 class BackwardEuler(eqx.Module):
@@ -136,29 +149,30 @@ class BackwardEuler(eqx.Module):
         if self.rtol is not None:
             require_positive("BackwardEuler's rtol", self.rtol)
 
-    def velocity(self, nodes: Nodes, predictor: NodeVector, guess: NodeVector, active: Mask | bool) -> tuple:
-        """v^{n+1}, the walls' impulse and the solve's report."""
-        problem = NewtonProblem(
+    def velocity(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
+        """v^{n+1} and the solve's report."""
+        newton = Newton(self.solver, self.rtol, self.max_newton)
+        return solve(self._problem(nodes), guess, newton, self.adjoint_solver)
+
+    def _problem(self, nodes: Nodes) -> NewtonProblem:
+        return NewtonProblem(
             mass=nodes.mass,
             inertial=nodes.inertial_velocity(),
             dt=nodes.dt,
             spacing=nodes.spacing,
             potential=nodes.potential,
             hessian=self.hessian,
-            free=nodes.free(active),
+            free=nodes.free,
             prescribed=nodes.conditions.velocity,
         )
-        newton = Newton(self.solver, self.rtol, self.max_newton)
-        v, info = solve(problem, guess, newton, self.adjoint_solver)
-        return v, problem.imbalance(v), info
 
     def elastic_impulse(self, nodes: Nodes, v: NodeVector) -> NodeVector:
         """Δt f(Δt v) [kg m/s]."""
         return nodes.dt * nodes.potential.force(nodes.dt * v)
 
-    def start(self, nodes: Nodes, predictor: NodeVector) -> NodeVector:
+    def start(self, nodes: Nodes) -> NodeVector:
         """The chosen guess."""
-        return self.guess.velocity(nodes.velocity, predictor)
+        return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())
 
 
 Method = Explicit | SemiImplicit | BackwardEuler
@@ -167,14 +181,16 @@ Method = Explicit | SemiImplicit | BackwardEuler
 class GridUpdate(eqx.Module):
     """The nodes' new velocity and where it came from."""
 
+    before: NodeVector
+    """v_i^n [m/s], shape (n, d), mirrored where a contact plane holds."""
     velocity: NodeVector
-    """v_i^{n+1} [m/s], shape (n, d)."""
+    """v_i^{n+1} [m/s], shape (n, d), mirrored likewise."""
     reaction: NodeVector
     """The impulse of walls and grips [kg m/s], shape (n, d); on free components what the solve left."""
     friction: NodeVector | None
-    """The impulse of friction [kg m/s], shape (n, d), where there are separating walls."""
+    """The impulse of friction [kg m/s], shape (n, d), where there are walls that may be left."""
     free: Mask
-    """The components that nothing held, shape (n, d)."""
+    """The components in which no boundary had a part, shape (n, d)."""
     solve: SolveInfo
     contact: ContactInfo
 
@@ -196,41 +212,45 @@ def advance(
     nodes = particles_to_grid(scene, particles, t, dt, stencil)
     new = update(nodes, method)
     outside = (~stencil.inside).sum().astype(jnp.int32)
-    return grid_to_particles(scene, particles, nodes, new.velocity), StepInfo(new.solve, new.contact, outside)
+    return grid_to_particles(scene, particles, nodes, new), StepInfo(new.solve, new.contact, outside)
 
 
 def update(nodes: Nodes, method: Method) -> GridUpdate:
     """The nodes' new velocity, boundaries and contact included."""
     with jax.named_scope("update"):
-        predictor = nodes.explicit_velocity()
-        guess = method.start(nodes, predictor)
-        if nodes.conditions.side is None:
-            v, reaction, info = method.velocity(nodes, predictor, guess, False)
-            return GridUpdate(v, reaction, None, nodes.free(False), info, no_contact())
+        if not touches(nodes):
+            v, info = method.velocity(nodes, method.start(nodes))
+            return GridUpdate(nodes.velocity, v, imbalance(nodes, method, v), None, nodes.free, info, no_contact())
 
-        frozen_nodes, frozen_predictor, frozen_method = jax.lax.stop_gradient((nodes, predictor, method))
+        def with_held(nodes: Nodes, method: Method, active: ActiveSet, guess: NodeVector) -> tuple:
+            v, info = method.velocity(holding(nodes, active), guess)
+            v = held_images(nodes, active).unfold(v)
+            return v, imbalance(nodes, method, v), info
 
-        def try_set(active: Mask, guess: NodeVector) -> tuple[NodeVector, NodeVector, SolveInfo]:
-            return frozen_method.velocity(frozen_nodes, frozen_predictor, guess, active)
-
-        active, guess, cost, sweeps = find_active_set(
-            frozen_nodes.conditions, frozen_predictor, jax.lax.stop_gradient(guess), frozen_nodes.mass, try_set
-        )
-        v, reaction, info = method.velocity(nodes, predictor, guess, active)
-        violations = count_violations(nodes.conditions, active, v, reaction, nodes.mass)
-        slowed = with_friction(nodes.conditions, active, v, reaction, nodes.mass)
+        frozen = jax.lax.stop_gradient((nodes, method))
+        guess = frozen[1].start(frozen[0])
+        active, guess, cost, sweeps = find_active_set(frozen[0], guess, lambda a, v: with_held(*frozen, a, v))
+        v, reaction, info = with_held(nodes, method, active, guess)
+        violations = count_violations(nodes, active, v, reaction)
+        slowed = with_friction(nodes, active, v, reaction)
         friction = nodes.mass[:, None] * (slowed - v)
-        free = nodes.free(active)
-        return GridUpdate(slowed, reaction, friction, free, cost.plus(info), ContactInfo(sweeps, violations))
+        before = held_images(nodes, active).unfold(holding(nodes, active).velocity)
+        contact = ContactInfo(sweeps, violations)
+        return GridUpdate(before, slowed, reaction, friction, untouched(nodes, active), cost.plus(info), contact)
 
 
-def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, velocity: NodeVector) -> Particles:
+def imbalance(nodes: Nodes, method: Method, v: NodeVector) -> NodeVector:
+    """The impulse [kg m/s] that is missing for nodes to move at v: that of walls and grips."""
+    return nodes.mass[:, None] * (v - nodes.inertial_velocity()) - method.elastic_impulse(nodes, v)
+
+
+def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: GridUpdate) -> Particles:
     """G2P: the particles moved and deformed by the nodes' new velocity, x ← x + Δt Σ w v_i, F ← F + Δt Σ v_i hᵀ."""
     potential, dt = nodes.potential, nodes.dt
-    before, after = potential.mirror.unfold(nodes.velocity), potential.mirror.unfold(velocity)
+    before, after = potential.mirror.unfold(new.before), potential.mirror.unfold(new.velocity)
     with jax.named_scope("g2p"):
         moved, v, C = g2p(scene.transfer, potential.stencil, components(particles.v), before, after)
-        F = potential.F + dt * potential.strain(velocity)
+        F = potential.F + dt * potential.strain(new.velocity)
     return Particles(
         x=particle_first(components(particles.x) + dt * moved),
         v=particle_first(v),

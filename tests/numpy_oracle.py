@@ -150,6 +150,7 @@ class GridUpdate(eqx.Module):
 
     nodes: Nodes
     velocity: jax.Array
+    reaction: jax.Array
     info: StepInfo
     particles: mpm.Particles
     position: jax.Array
@@ -165,4 +166,5 @@ def grid_update(scene: mpm.Scene, particles: mpm.Particles, dt: float, method, t
 def _grid_update(scene, particles, t, dt, method) -> GridUpdate:
     nodes = particles_to_grid(scene, particles, t, dt, scene.stencil(particles))
     new, info = advance(scene, particles, t, dt, method)
-    return GridUpdate(nodes, update(nodes, method).velocity, info, new, scene.grid.nodes(scene.window(particles)))
+    grid = update(nodes, method)
+    return GridUpdate(nodes, grid.velocity, grid.reaction, info, new, scene.grid.nodes(scene.window(particles)))

@@ -9,7 +9,8 @@ from helpers import DESCRIPTIONS, KERNELS, LAWS, assert_close, cloud, ids
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax._boundary import Mirror, combine, mirror
+from mpmjax._boundary import combine
+from mpmjax._mirror import Mirror, contacts, mirror
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {
@@ -170,6 +171,26 @@ def test_fold_is_the_transpose_of_unfold(d):
     np.testing.assert_array_equal(folded[2:5], mass[2:5] + np.stack([0 * mass[0], mass[1], mass[0]]))
 
 
+def test_fold_is_the_transpose_of_unfold_where_some_columns_are_held():
+    """Two planes that meet, with random columns of either: every node is itself or a signed copy; no mass is lost."""
+    grid, rng = mpm.Grid((7, 6), DX), np.random.default_rng(0)
+    planes = (mpm.ContactPlane(0, 0.2), mpm.ContactPlane(1, 0.35, "below"))
+    columns = [np.broadcast_to(rng.random((1, 6)) < 0.5, (7, 6)), np.broadcast_to(rng.random((7, 1)) < 0.5, (7, 6))]
+    found = contacts(planes, grid, grid.window(jnp.zeros((1, 2))))
+    images = Mirror(tuple(c.image.within(jnp.asarray(h.ravel())) for c, h in zip(found, columns, strict=True)))
+    basis = jnp.eye(84).reshape(84, 42, 2)
+    B, transpose = (np.asarray(jax.vmap(f)(basis)).reshape(84, 84).T for f in (images.unfold, images.fold))
+    np.testing.assert_array_equal(B.T, transpose)
+    assert ((B != 0).sum(axis=1) <= 1).all()
+    assert set(np.unique(B)) == {-1, 0, 1}
+    free = ~columns[0] & ~columns[1]
+    np.testing.assert_array_equal(B[np.repeat(free.ravel(), 2)], np.eye(84)[np.repeat(free.ravel(), 2)])
+    mass = jnp.asarray(rng.random(42))
+    lost = float(mass.sum() - images.fold_scalar(mass).sum())
+    beyond = np.zeros((7, 6))  # nodes whose image lies outside the window: none below 0.2, above 0.35 rows of it
+    assert abs(lost - float((np.asarray(mass).reshape(7, 6) * beyond).sum())) < 1e-12
+
+
 @pytest.mark.parametrize("kernel", **ids(KERNELS))
 def test_a_column_hangs_in_its_own_weight_from_a_symmetry_plane(kernel):
     """u = ρg (X − X²/2)/(λ + 2μ): nothing moves but for the quadrature of the weights, half a per cent of g, since the
@@ -229,6 +250,21 @@ BAD = {
     "separation in the total description": (
         lambda g: scene_of(g, mpm.SeparatingBox((0, 0), (1, 1)), description=mpm.TotalLagrangian()),
         "no contact",
+    ),
+    "contact in the total description": (
+        lambda g: scene_of(g, mpm.ContactPlane(0, 0.1), description=mpm.TotalLagrangian()),
+        "no contact",
+    ),
+    "contact off the half lattice": (lambda g: scene_of(g, mpm.ContactPlane(0, 0.13)), "use SeparatingBox"),
+    "contact in a periodic direction": (
+        lambda g: scene_of(mpm.Grid((8, 8), DX, periodic=(True, False)), mpm.ContactPlane(0, 0.1)),
+        "periodic",
+    ),
+    "friction of a contact plane below zero": (lambda g: mpm.ContactPlane(0, 0.1, friction=-0.1), "friction"),
+    "side of a contact plane": (lambda g: mpm.ContactPlane(0, 0.1, keep="left"), "above"),
+    "particles beyond the contact plane": (
+        lambda g: mpm.prepare(scene_of(g, mpm.ContactPlane(0, 0.3)), cloud(2)[1]),
+        "above the ContactPlane",
     ),
     "dimension of a wall": (lambda g: scene_of(g, mpm.StickyBox((0,), (1,))), "2 coordinates"),
     "dimension of gravity": (lambda g: scene_of(g, gravity=(1.0,)), "gravity must have 2"),

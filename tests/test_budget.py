@@ -16,6 +16,7 @@ BOUNDARIES = {
     "free": (),
     "walls": (mpm.SlipBox((-np.inf, 0.0), (np.inf, np.inf)), mpm.StickyBox((-np.inf, -np.inf), (0.3, np.inf))),
     "contact": (mpm.SeparatingBox((-0.2, 0.0), (0.6, 0.6), friction=0.3),),
+    "contact planes": (mpm.ContactPlane(1, 0.0, friction=0.3), mpm.ContactPlane(0, 0.0)),
     "planes": (mpm.SymmetryPlane(1, 0.0), mpm.SymmetryPlane(0, 0.0)),
     "grip": (mpm.Grip(mpm.Box((-1.0, -1.0), (1.0, 0.0)), MOVED),),
 }
@@ -44,6 +45,11 @@ CASES = {
     "cubic-spline": {"kernel": KERNELS["cubic"], "gradient": GRADIENTS["spline"]},
     **{f"explicit-{b}": {"boundary": boundary} for b, boundary in BOUNDARIES.items() if b != "free"},
     "semi_implicit-contact": {"method": METHODS["semi_implicit"], "boundary": BOUNDARIES["contact"]},
+    "semi_implicit-contact planes": {
+        "method": METHODS["semi_implicit"],
+        "boundary": BOUNDARIES["contact planes"],
+        "transfer": TRANSFERS["flip"],
+    },
     "semi_implicit-planes": {
         "method": METHODS["semi_implicit"],
         "boundary": BOUNDARIES["planes"],

@@ -11,8 +11,8 @@ import pytest
 from helpers import LAWS, assert_close, explicit_limit
 
 import mpmjax as mpm
-from mpmjax._boundary import mirror
 from mpmjax._hessian import ImplicitOperator
+from mpmjax._mirror import mirror
 from mpmjax._potential import ElasticPotential
 from mpmjax._transfer import p2g
 from mpmjax._types import components

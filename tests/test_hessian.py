@@ -11,9 +11,10 @@ from deformations import STRETCHES, deformations
 from helpers import DESCRIPTIONS, DIMS, GRADIENTS, LAWS, cloud
 
 import mpmjax as mpm
-from mpmjax._boundary import combine, mirror
+from mpmjax._boundary import combine
 from mpmjax._hessian import ImplicitOperator
 from mpmjax._kernel import make_stencil
+from mpmjax._mirror import mirror
 from mpmjax._potential import ElasticPotential
 from mpmjax._transfer import p2g
 from mpmjax._types import components

@@ -75,7 +75,7 @@ def test_backward_euler_satisfies_its_equation(law):
         flux = float(particles.volume[p]) * stress(law, mu, lam, F) @ np.asarray(particles.F[p]).T
         for k, i in enumerate(np.asarray(stencil.index[:, p])):
             force[i] -= flux @ np.asarray(stencil.gradient[k, :, p])
-    mass, free = np.asarray(nodes.mass)[:, None], np.asarray(nodes.free(False))
+    mass, free = np.asarray(nodes.mass)[:, None], np.asarray(nodes.free)
     inertia = mass * np.asarray(grid.velocity - nodes.velocity)
     residual = inertia - dt * (force + mass * gravity)
     assert free.any()
@@ -145,7 +145,7 @@ def test_single_precision_converges_and_says_how_far(times):
         factor=nodes.dt**2,
         hessian=AnalyticHessian().at_rest(nodes.potential, predictor),
         rhs=nodes.mass[:, None] * predictor,
-        free=nodes.free(False),
+        free=nodes.free,
         prescribed=nodes.conditions.velocity,
     )
 

@@ -19,6 +19,7 @@ LAYERS = (
     ("_linalg",),
     ("material",),
     ("_boundary", "_body_force"),
+    ("_mirror",),
     ("_particles", "_scene"),
     ("_potential", "_hessian"),
     ("_conjugate_residual",),

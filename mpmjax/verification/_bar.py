@@ -5,8 +5,9 @@ import math
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._boundary import AbstractBoundary, SymmetryPlane
+from mpmjax._boundary import AbstractBoundary
 from mpmjax._grid import Grid
+from mpmjax._mirror import SymmetryPlane
 from mpmjax._region import Box
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.material import AbstractMaterial, FixedCorotated

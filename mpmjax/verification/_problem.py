@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._body_force import AbstractBodyForce
-from mpmjax._boundary import AbstractBoundary, SlipBox, SymmetryPlane
+from mpmjax._boundary import AbstractBoundary, SlipBox
 from mpmjax._checks import require
 from mpmjax._grid import Grid
+from mpmjax._mirror import SymmetryPlane
 from mpmjax._particles import Particles
 from mpmjax._region import AbstractRegion
 from mpmjax._run import Run

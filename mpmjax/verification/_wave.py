@@ -5,9 +5,10 @@ import math
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._boundary import AbstractBoundary, SlipBox, SymmetryPlane
+from mpmjax._boundary import AbstractBoundary, SlipBox
 from mpmjax._checks import require
 from mpmjax._grid import Grid
+from mpmjax._mirror import SymmetryPlane
 from mpmjax._region import Box
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.material import AbstractMaterial, FixedCorotated
