@@ -16,6 +16,7 @@ from mpmjax._render import render
 from mpmjax._run import Run, SimulationError
 from mpmjax._sample import fill
 from mpmjax._scene import Scene, TotalLagrangian, UpdatedLagrangian, prepare
+from mpmjax._sensitivity import Sensitivity, sensitivity
 from mpmjax._simulate import rollout, simulate
 from mpmjax._step import BackwardEuler, Explicit, SemiImplicit, StepInfo, step
 from mpmjax._transfer import APIC, FLIP, PIC
@@ -75,9 +76,11 @@ __all__ = [  # noqa: RUF022 (grouped)
     "step",
     # results
     "Energy",
+    "Sensitivity",
     "energy",
     "load",
     "momentum",
     "render",
     "save",
+    "sensitivity",
 ]

@@ -160,7 +160,7 @@ class Newton(eqx.Module):
     also keeps out of deformations where the law has no energy. Stops when ‖residual‖ ≤ rtol ‖b‖, b the right-hand side
     M ṽ + Δt f(0), less what prescribed velocities contribute to it, both in the norm of the inverse mass, or at the
     rounding of the residual. Starts from the guess, or from rest where the potential is lower there or the guess is a
-    deformation for which the law has no energy.
+    deformation for which the law has no energy. An equation that is not finite there gives NaN, never rest.
 
     Args:
         rtol: relative tolerance. Default: that of the precision, 1e-8 or 1e-5.
@@ -241,9 +241,9 @@ class Newton(eqx.Module):
             newton=c.newton,
             line_search=c.halvings,
             residual=left / jnp.where(scale == 0, 1, scale),
-            converged=left <= tolerance(c),
+            converged=jnp.isfinite(left) & (left <= tolerance(c)),
         )
-        return c.v, info
+        return jnp.where(free & ~jnp.isfinite(left), jnp.nan, c.v), info
 
 
 _MOST_HALVINGS = 30
