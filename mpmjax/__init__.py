@@ -19,6 +19,7 @@ from mpmjax._render import render
 from mpmjax._run import Run, SimulationError
 from mpmjax._sample import fill
 from mpmjax._scene import Scene, TotalLagrangian, UpdatedLagrangian, prepare
+from mpmjax._sensitivity import Sensitivity, sensitivity
 from mpmjax._simulate import rollout, simulate
 from mpmjax._stability import stable_dt
 from mpmjax._step import BackwardEuler, Explicit, SemiImplicit, StepInfo, step
@@ -86,10 +87,12 @@ __all__ = [  # noqa: RUF022 (grouped)
     "MomentumBudget",
     "budget",
     "Energy",
+    "Sensitivity",
     "energy",
     "load",
     "momentum",
     "pieces",
     "render",
     "save",
+    "sensitivity",
 ]

@@ -174,7 +174,8 @@ class Newton(eqx.Module):
     rounding of the residual. Starts from the guess, or from rest where the potential is lower there or the guess is a
     deformation for which the law has no energy; if that is so at rest too, for what is prescribed alone (a grip that
     closes a gap of one cell in a step), the first step is that of the system linearised before anything moves, which
-    is the semi-implicit one.
+    is the semi-implicit one. An equation that is not finite even
+    there gives NaN, never rest.
 
     Args:
         rtol: relative tolerance. Default: that of the precision, 1e-8 or 1e-5.
@@ -261,10 +262,10 @@ class Newton(eqx.Module):
             newton=c.newton,
             line_search=c.halvings,
             residual=left / jnp.where(scale == 0, 1, scale),
-            converged=left <= tolerance(c),
+            converged=jnp.isfinite(left) & (left <= tolerance(c)),
             indefinite=c.indefinite,
         )
-        return c.v, info
+        return jnp.where(free & ~jnp.isfinite(left), jnp.nan, c.v), info
 
 
 _MOST_HALVINGS = 30

@@ -169,6 +169,16 @@ def test_an_unconverged_solve_is_reported():
     assert not info.solve.converged
 
 
+@pytest.mark.parametrize("method", [mpm.SemiImplicit(), mpm.BackwardEuler()], ids=["semi_implicit", "backward_euler"])
+def test_an_overflow_is_not_a_solution(method):
+    """A velocity whose momentum overflows is seen in the state and in the report; it does not turn into rest."""
+    scene, particles = block(1)
+    wild = mpm.Particles(particles.x, particles.v.at[0].set(jnp.asarray(1e308)), 10 * particles.mass, particles.volume)
+    new, info = mpm.step(scene, wild, 0.0, 1e-2, method=method)
+    assert not np.isfinite(new.x).all()
+    assert not info.solve.converged
+
+
 @pytest.mark.parametrize("beta", [-0.1, 1.1, np.nan])
 def test_beta_must_lie_between_zero_and_one(beta):
     """Anything else is refused."""
