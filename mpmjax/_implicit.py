@@ -174,8 +174,7 @@ class Newton(eqx.Module):
     rounding of the residual. Starts from the guess, or from rest where the potential is lower there or the guess is a
     deformation for which the law has no energy; if that is so at rest too, for what is prescribed alone (a grip that
     closes a gap of one cell in a step), the first step is that of the system linearised before anything moves, which
-    is the semi-implicit one. An equation that is not finite even
-    there gives NaN, never rest.
+    is the semi-implicit one. An equation that is not finite even there gives NaN, never rest.
 
     Args:
         rtol: relative tolerance. Default: that of the precision, 1e-8 or 1e-5.
