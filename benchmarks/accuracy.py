@@ -1,0 +1,137 @@
+"""How accurate is which choice? Errors on problems with exact motions, under refinement in space and in time.
+
+    python benchmarks/accuracy.py [--quick]
+
+Prints each series with its observed orders, and writes docs/accuracy.csv and docs/accuracy.png. `--quick` leaves out
+the finest grids and writes nothing.
+"""
+
+import argparse
+import csv
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+
+import mpmjax as mpm
+from mpmjax.verification import AxisAligned, Ends, StandingWave, Vortex, errors
+
+DOCS = Path(__file__).parents[1] / "docs"
+FLIP, TOTAL, SPLINE = mpm.FLIP(1.0), mpm.TotalLagrangian(), mpm.SplineGradient()
+
+
+class Series(NamedTuple):
+    """One line of a panel."""
+
+    panel: str
+    name: str
+    x: np.ndarray
+    error: np.ndarray
+    seconds: float
+    """Of the finest run, compilation left out."""
+
+
+PANELS = {
+    "kernels and transfers": ("cells", "axis-aligned, A = 0.05, 2-D"),
+    "walls": ("cells", "the same between walls"),
+    "quadrature": ("cells", "vortex, A = 0.3"),
+    "dissipation": ("Δt c/dx", "axis-aligned, 16 cells"),
+    "time": ("Δt c/dx", "standing wave, 32 cells, FLIP(1)"),
+}
+
+
+def refined(panel, name, problem, cells, courant, **choices) -> Series:
+    """A series over grids."""
+    e = errors(problem, cells, courant=courant, staggered=False, **choices)
+    begun = time.perf_counter()
+    errors(problem, cells[-1:], courant=courant, staggered=False, **choices)
+    return Series(panel, name, np.array(cells), e, time.perf_counter() - begun)
+
+
+def over_steps(panel, name, problem, cells, numbers, **choices) -> Series:
+    """A series over Δt c/dx on one grid."""
+    e = np.array([errors(problem, (cells,), courant=c, **choices)[0] for c in numbers])
+    begun = time.perf_counter()
+    errors(problem, (cells,), courant=numbers[-1], **choices)
+    return Series(panel, name, np.array(numbers), e, time.perf_counter() - begun)
+
+
+def measure(quick: bool):
+    """All series, one after the other."""
+    cells, rings = ((8, 16), (10, 20)) if quick else ((8, 16, 32), (10, 20, 40))
+    numbers = (0.4, 0.1) if quick else (0.4, 0.2, 0.1, 0.05, 0.025)
+    for name, choices in {
+        "quadratic APIC": {},
+        "quadratic APIC, spline gradient": {"gradient": SPLINE},
+        "quadratic APIC, total": {"description": TOTAL},
+        "cubic APIC": {"kernel": mpm.BSpline(3)},
+        "quadratic FLIP(1)": {"transfer": FLIP},
+        "quadratic PIC": {"transfer": mpm.PIC()},
+        "linear FLIP(1)": {"kernel": mpm.BSpline(1), "transfer": FLIP},
+    }.items():
+        yield refined("kernels and transfers", name, AxisAligned(0.05), cells, 0.3, **choices)
+    for name, ends in {"none (periodic)": Ends.PERIODIC, "mirrored": Ends.MIRRORED, "plain": Ends.PLAIN}.items():
+        yield refined("walls", name, AxisAligned(0.05, ends=ends), cells, 0.3)
+    for name, choices in {
+        "updated, 2 x 2 a cell": {},
+        "updated, 4 x 4 a cell": {"per_side": 4},
+        "total, 2 x 2 a cell": {"description": TOTAL},
+    }.items():
+        yield refined("quadrature", name, Vortex(0.3), rings, 0.5, **choices)
+    for name, transfer in {"PIC": mpm.PIC(), "APIC": mpm.APIC(), "FLIP(1)": FLIP}.items():
+        yield over_steps("dissipation", name, AxisAligned(0.05), 16, numbers, transfer=transfer)
+    for name, method in {
+        "explicit": mpm.Explicit(),
+        "semi-implicit, β = 1/2": mpm.SemiImplicit(beta=0.5),
+        "semi-implicit, β = 1": mpm.SemiImplicit(),
+        "backward Euler": mpm.BackwardEuler(),
+    }.items():
+        longer = numbers if name == "explicit" else (1.6, *numbers)
+        yield over_steps("time", name, StandingWave(0.05), 32, longer, method=method, transfer=FLIP)
+
+
+def draw(series: list[Series]) -> None:
+    """One panel a question."""
+    figure, axes = plt.subplots(1, len(PANELS), figsize=(4 * len(PANELS), 4.2), constrained_layout=True)
+    for axis, (panel, (label, problem)) in zip(axes, PANELS.items(), strict=True):
+        for s in series:
+            if s.panel == panel:
+                name = f"{s.name} ({s.seconds:.2g} s)" if panel == "quadrature" else s.name
+                axis.loglog(s.x, s.error, "o-", label=name)
+        axis.set(title=f"{panel}\n{problem}", xlabel=label, ylabel="largest RMS displacement error [m]")
+        axis.legend(fontsize=7)
+        axis.grid(visible=True, which="both", alpha=0.2)
+    figure.savefig(DOCS / "accuracy.png", dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="leave out the finest grids, write nothing")
+    quick = parser.parse_args().quick
+    jax.config.update("jax_enable_x64", True)
+    series = []
+    for s in measure(quick):
+        slope = np.log(s.error[1:] / s.error[:-1]) / np.log(s.x[1:] / s.x[:-1])
+        order = slope if PANELS[s.panel][0] != "cells" else -slope
+        figures = " ".join(f"{e:.2e}" for e in s.error)
+        shown = " ".join(f"{o:5.2f}" for o in order)
+        print(f"{s.panel:>22}, {s.name:>32}: {figures}, order {shown}, {s.seconds:.2g} s", flush=True)
+        series.append(s)
+    if quick:
+        return
+    with (DOCS / "accuracy.csv").open("w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file)
+        rows.writerow(["panel", "series", "x", "error_m", "seconds_of_finest"])
+        rows.writerows(
+            [s.panel, s.name, x, f"{e:.6e}", f"{s.seconds:.3g}"]
+            for s in series
+            for x, e in zip(s.x, s.error, strict=True)
+        )
+    draw(series)
+
+
+if __name__ == "__main__":
+    main()
