@@ -71,6 +71,7 @@ def test_the_vortex_at_full_amplitude():
 # Cell crossing
 
 
+@pytest.mark.slow
 def test_the_linear_kernel_fails_where_particles_cross_cells():
     """A = 0.05: the error grows under refinement; the quadratic kernel and the total description cure it."""
     cells = (8, 16, 32)
@@ -182,7 +183,7 @@ def test_pieces_are_counted_by_shared_nodes():
 
 
 @pytest.mark.parametrize("method", [METHODS["semi_implicit"], METHODS["backward_euler"]], ids=["semi", "backward"])
-@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_an_inverted_particle_recovers(d, method):
     """F = diag(1, …, −0.2), fixed corotated: in the total description it returns to rest. In the updated one F changes
     by a factor, det F ← det(I + Δt C) det F, and keeps its sign while Δt‖C‖ < 1: it is squeezed flat, not turned back.
@@ -233,6 +234,7 @@ def squeezed(method, stretch, steps):
     return np.asarray(run.final.F[:12, 0, 0])
 
 
+@pytest.mark.slow
 def test_one_linear_solve_loses_accuracy_where_newton_does_not():
     """Squeezed to a fifth in one step: backward Euler gives what 16 steps give, the linear solve is off by 4 per cent,
     and by 0.3 in two steps."""

@@ -62,6 +62,7 @@ def test_order_in_space(names):
         assert observed[-1] < 0.4, (observed, relative)
 
 
+@pytest.mark.slow
 def test_order_in_space_in_two_dimensions():
     observed, relative = wave_orders("quadratic", "apic", "updated", "mls", "explicit", dim=2)
     assert (observed > 1.8).all(), (observed, relative)
