@@ -102,8 +102,7 @@ def best_of(f, *args, repeats=3) -> float:
 
 def costs(quick: bool) -> list[dict]:
     """Seconds of the quick start's scene, 0.1 s of it, forward and with the gradient, and the latter's temporary memory
-    by number of checkpoints: four (not with --quick), and one
-    for every step."""
+    by number of checkpoints: four (not with --quick), and one for every step."""
     rows = []
     for update, (method, dt) in COSTED.items():
         t1 = 0.1
