@@ -1,5 +1,7 @@
 """Settings of every test: 64-bit numbers, strict dtype promotion, array shapes and dtypes checked at every call."""
 
+from typing import Any
+
 import matplotlib
 
 matplotlib.use("Agg")
@@ -12,3 +14,10 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 with install_import_hook("mpmjax", "beartype.beartype"):
     import mpmjax  # noqa: F401
+
+
+def pytest_runtest_teardown(item: Any, nextitem: Any) -> None:
+    """Drop compiled programs that no later test shares. Each holds memory maps, of which a process may have 65530, and
+    XLA crashes when there are no more."""
+    if nextitem is None or nextitem.module is not item.module or item.get_closest_marker("slow"):
+        jax.clear_caches()

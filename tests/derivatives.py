@@ -121,9 +121,9 @@ def rolled(q: dict[str, Any], case: Case, steps: int = STEPS) -> tuple[jax.Array
     particles = mpm.prepare(scene, particles)
     seen = []
 
-    def spy(conditions: Any, active: Any, v: Any, impulse: Any, mass: Any) -> Any:
-        after = with_friction(conditions, active, v, impulse, mass)
-        seen.append((active, (v != 0) & (after == 0)))
+    def spy(nodes: Any, active: Any, v: Any, imbalance: Any) -> Any:
+        after = with_friction(nodes, active, v, imbalance)
+        seen.append((active.components, (v != 0) & (after == 0)))
         return after
 
     def body(state: Any, n: Any) -> Any:

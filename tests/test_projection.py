@@ -142,7 +142,7 @@ def compressed(stretch=(0.9, 0.9), spin=0.0, side=3, noise=0.0, law=LAWS["fixed_
 def stiffness(scene, particles, hessian):
     """H restricted to the free components, and their masses."""
     nodes = grid_update(scene, particles, 1e-3, mpm.Explicit()).nodes
-    free = nodes.free(False)
+    free = nodes.free
     action = hessian.at_rest(nodes.potential, nodes.velocity)
     operator = ImplicitOperator(jnp.zeros_like(nodes.mass), jnp.asarray(1.0), action, free)
     A, keep = np.asarray(eqx.filter_jit(ImplicitOperator.as_matrix)(operator)), np.asarray(free).ravel()
