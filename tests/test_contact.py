@@ -59,6 +59,7 @@ def tumbling(floor, method, steps=1):
 
 
 EACH_METHOD = pytest.mark.parametrize("method", **ids(METHODS | {"backward_euler": BACKWARD_EULER}))
+NAMES = pytest.mark.parametrize("name", ["explicit", pytest.param("semi_implicit", marks=pytest.mark.slow)])
 
 
 @EACH_METHOD
@@ -157,7 +158,7 @@ def test_a_block_rests_on_the_floor(name, floor):
 
 
 @EACH_FLOOR
-@pytest.mark.parametrize("name", METHODS)
+@NAMES
 def test_a_block_bounces(name, floor):
     """It comes back up, the slower the more the method damps, and nothing sticks."""
     run, _ = slid(name, 150, floor, velocity=(0.0, -1.0), height=0.1)
@@ -169,7 +170,7 @@ def test_a_block_bounces(name, floor):
 
 
 @EACH_FLOOR
-@pytest.mark.parametrize("name", METHODS)
+@NAMES
 def test_a_sliding_block_decelerates_at_mu_g(name, floor):
     """Δv_x = −μ (g t + Δv_y), exactly: while all of the foot slides, friction takes μ times the normal impulse."""
     mu, steps = 0.3, {"explicit": 100, "semi_implicit": 25}[name]
@@ -181,7 +182,7 @@ def test_a_sliding_block_decelerates_at_mu_g(name, floor):
 
 
 @EACH_FLOOR
-@pytest.mark.parametrize("name", METHODS)
+@NAMES
 @pytest.mark.parametrize(("slope", "sticks"), [(0.25, True), (0.8, False)])
 def test_a_block_sticks_below_the_angle_of_friction_and_slides_above(name, slope, sticks, floor):
     """tan θ against μ = 0.4: the mean velocity stays at rest, or grows as g sin θ t − μ (g cos θ t + v_y)."""
@@ -277,7 +278,7 @@ def test_whatever_columns_are_held_mirroring_twice_is_mirroring_once(number):
     assert partly > 10
 
 
-@pytest.mark.parametrize("name", METHODS)
+@NAMES
 def test_a_ceiling_is_a_floor_upside_down(name):
     """Off the lattice's symmetry and with friction: keep="below" mirrors keep="above"."""
     outcome = []
@@ -297,6 +298,7 @@ def test_a_ceiling_is_a_floor_upside_down(name):
     assert_close(*outcome, 1e-11)
 
 
+@pytest.mark.slow
 def test_explicit_and_semi_implicit_contact_agree_as_the_step_shrinks():
     """A block that lands and slides: their difference halves with the step."""
     differences = []
@@ -309,7 +311,7 @@ def test_explicit_and_semi_implicit_contact_agree_as_the_step_shrinks():
     assert differences[-1] < 0.02 * DX
 
 
-@pytest.mark.parametrize("name", METHODS)
+@NAMES
 def test_the_gradient_through_contact_is_that_of_the_active_set(name):
     """Against central differences, in stiffness, friction, pull and velocity, while the block slides in contact."""
     scene, particles = on_a_floor("mirrored", friction=0.3)

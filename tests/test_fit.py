@@ -53,6 +53,7 @@ def test_the_step_is_far_beyond_the_explicit_limit(job):
     assert job.run.dt / (job.scene.grid.spacing / speed) > 100
 
 
+@pytest.mark.slow
 def test_doubled_stresses_double_the_modulus(coarse):
     """A quasi-static curve is proportional to the modulus."""
     once = fit_job(coarse)

@@ -31,7 +31,17 @@ CASES = {
     if (law, family) != ("neo_hookean", "inverted")
 }
 HESSIANS = {"analytic": mpm.AnalyticHessian(), "jvp": mpm.JvpHessian()}
-EACH_CASE = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+IN_TURN = {"updated": "spline", "total": "mls"}  # in three dimensions by default; the others are slow
+
+
+def case_of(name):
+    """A case, slow if it is one of the dearest."""
+    _, d, _, description, gradient = CASES[name]
+    dear = d == 3 and IN_TURN[description] != gradient
+    return pytest.param(CASES[name], marks=pytest.mark.slow if dear else (), id=name)
+
+
+EACH_CASE = pytest.mark.parametrize("case", [case_of(name) for name in CASES])
 
 
 make = eqx.filter_jit(make_stencil)

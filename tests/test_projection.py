@@ -193,6 +193,7 @@ def test_gradient_through_projected_steps_is_that_of_central_differences(beta, s
     assert abs(float(exact / difference) - 1) < 1e-6
 
 
+@pytest.mark.slow
 def test_backward_euler_finds_the_same_with_projection_and_has_the_same_derivative():
     """Projection changes Newton's way, not the equation: solution and derivative are those of the true Hessian."""
     scene, particles = compressed((0.9, 0.85), noise=0.02, side=2)

@@ -84,7 +84,9 @@ def test_a_plain_wall_is_first_order(kernel):
     assert errors[-1] > 5 * wave_run(64, "symmetry", kernel)[1]
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize(
+    "kernel", ["quadratic", *(pytest.param(k, marks=pytest.mark.slow) for k in ("linear", "cubic"))]
+)
 def test_a_symmetry_plane_is_second_order(kernel):
     """The same wave, with all kernels."""
     errors, order = orders("symmetry", kernel, **(LINEAR if kernel == "linear" else {}))
@@ -116,11 +118,11 @@ TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 @pytest.mark.parametrize(
     ("kernel", "method", "transfer"),
     [
-        ("linear", mpm.Explicit(), mpm.APIC()),
+        pytest.param("linear", mpm.Explicit(), mpm.APIC(), marks=pytest.mark.slow),
         ("quadratic", mpm.Explicit(), mpm.FLIP()),
-        ("cubic", mpm.Explicit(), mpm.APIC()),
+        pytest.param("cubic", mpm.Explicit(), mpm.APIC(), marks=pytest.mark.slow),
         ("quadratic", mpm.SemiImplicit(solver=TIGHT), mpm.APIC()),
-        ("quadratic", mpm.BackwardEuler(rtol=1e-13, solver=TIGHT), mpm.APIC()),
+        pytest.param("quadratic", mpm.BackwardEuler(rtol=1e-13, solver=TIGHT), mpm.APIC(), marks=pytest.mark.slow),
     ],
     ids=lambda a: a if isinstance(a, str) else type(a).__name__,
 )
