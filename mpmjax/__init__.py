@@ -8,8 +8,10 @@ from mpmjax._diagnostics import Energy, energy, momentum, pieces
 from mpmjax._grid import Grid
 from mpmjax._guess import Guess
 from mpmjax._hessian import AnalyticHessian, JvpHessian
+from mpmjax._implicit import Linearised, Newton
 from mpmjax._io import load, save
 from mpmjax._kernel import BSpline, MLSGradient, SplineGradient
+from mpmjax._method import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
 from mpmjax._mirror import ContactPlane, SymmetryPlane
 from mpmjax._motion import Motion
 from mpmjax._particles import Particles
@@ -22,7 +24,7 @@ from mpmjax._scene import Scene, TotalLagrangian, UpdatedLagrangian, prepare
 from mpmjax._sensitivity import Sensitivity, sensitivity
 from mpmjax._simulate import rollout, simulate
 from mpmjax._stability import stable_dt
-from mpmjax._step import BackwardEuler, Explicit, SemiImplicit, StepInfo, step
+from mpmjax._step import StepInfo, step
 from mpmjax._transfer import APIC, FLIP, PIC
 from mpmjax.material import AbstractMaterial, AbstractTangent, FixedCorotated, NeoHookean
 
@@ -67,7 +69,11 @@ __all__ = [  # noqa: RUF022 (grouped)
     # grid updates
     "BackwardEuler",
     "Explicit",
+    "ImplicitMidpoint",
     "SemiImplicit",
+    "TRBDF2",
+    "Linearised",
+    "Newton",
     "AnalyticHessian",
     "JvpHessian",
     "ConjugateResidual",

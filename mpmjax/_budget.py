@@ -7,10 +7,11 @@ import jax.numpy as jnp
 from mpmjax._checks import canonical
 from mpmjax._diagnostics import energy_of
 from mpmjax._kernel import Stencil
+from mpmjax._method import Explicit, Method
 from mpmjax._nodes import Nodes, particles_to_grid
 from mpmjax._particles import Particles
 from mpmjax._scene import Scene, prepare
-from mpmjax._step import Explicit, GridUpdate, Method, grid_to_particles, update
+from mpmjax._step import GridUpdate, grid_to_particles, update
 from mpmjax._transfer import FLIP, collect, spread
 from mpmjax._types import Array, Float, Matrix, NodeVector, Scalar, components
 
@@ -38,7 +39,8 @@ class EnergyBudget(eqx.Module):
     grid's part of the velocity, and what the particles keep beside it counts as gained. The affine motion's energy is
     that at the new place, which differs with the linear kernel, whose moment D depends on it."""
     implicit: Float[Array, "*f"]
-    """Dissipated by treating the elastic force implicitly, (Δt f^n − its impulse)·v̄: β Δt² v̄·H v^{n+1}."""
+    """Dissipated by treating the elastic force implicitly, (Δt f^n − its impulse)·v̄: β Δt² v̄·H v^{n+1}. In methods of
+    second order `time_integration` gives it back but for terms of third order in Δt."""
     boundary: Float[Array, "*f"]
     """Work of walls and grips, impulse·v̄: that of a wall is what stops dead on it."""
     friction: Float[Array, "*f"]
@@ -125,28 +127,25 @@ def _budget(
 ) -> tuple[Particles, Budget]:
     def body(before: Particles, n: Array) -> tuple[Particles, Budget]:
         stencil = scene.stencil(before)
-        nodes = particles_to_grid(scene, before, (start + n) * dt, dt, stencil)
+        nodes = particles_to_grid(scene, before, (start + n) * dt, dt, stencil, centred=method.centred)
         new = update(nodes, method)
         after = grid_to_particles(scene, before, nodes, new)
-        return after, _step_budget(scene, before, after, nodes, new, method)
+        return after, _step_budget(scene, before, after, nodes, new)
 
     numbers = jnp.arange(steps, dtype=particles.x.dtype)
     return jax.lax.scan(body, particles, numbers)
 
 
-def _step_budget(
-    scene: Scene, before: Particles, after: Particles, nodes: Nodes, new: GridUpdate, method: Method
-) -> Budget:
+def _step_budget(scene: Scene, before: Particles, after: Particles, nodes: Nodes, new: GridUpdate) -> Budget:
     potential, dt = nodes.potential, nodes.dt
     stencil, images = potential.stencil, potential.mirror
-    v0, v1 = nodes.velocity, new.velocity
+    v0, v1 = nodes.velocity, new.motion.velocity
     all0, all1 = images.unfold(v0), images.unfold(v1)
     mean = (v0 + v1) / 2
     friction = jnp.zeros_like(v0) if new.friction is None else new.friction
 
     # impulses at the nodes
-    elastic = method.elastic_impulse(nodes, v1 - nodes.per_mass(friction))
-    elastic_at_start = dt * nodes.force
+    elastic, elastic_at_start = new.elastic, dt * nodes.force
     raw = spread(stencil.index, stencil.weight[:, None], before.mass[None, None], scene.grid.size)
     weight = dt * images.fold(raw * jnp.asarray(scene.gravity))
     body = jnp.where(nodes.occupied, dt * nodes.mass[:, None] * nodes.acceleration - weight, 0)

@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._kernel import Stencil, in_window
+from mpmjax._method import Method
 from mpmjax._particles import Particles, State, state_of, with_state
 from mpmjax._scene import Scene
-from mpmjax._step import Method, StepInfo, advance
+from mpmjax._step import StepInfo, advance
 from mpmjax._types import Array, Bool, Float, Int, Scalar, components
 
 HEALTHY, NOT_FINITE, OUTSIDE, INADMISSIBLE = 0, 1, 2, 3

@@ -11,11 +11,11 @@ import numpy as np
 import scipy.optimize
 
 from mpmjax._checks import canonical, require, require_finite
+from mpmjax._method import Method
 from mpmjax._particles import Particles
 from mpmjax._region import AbstractRegion
 from mpmjax._scene import Scene, prepare
 from mpmjax._simulate import simulate
-from mpmjax._step import Method
 from mpmjax._types import Array, Float, ParticleScalar, Scalar
 
 

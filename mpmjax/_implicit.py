@@ -25,7 +25,7 @@ class SolveInfo(eqx.Module):
     iterations: Int[Array, "*f"]
     """Conjugate-residual iterations, over all Newton steps."""
     newton: Int[Array, "*f"]
-    """Newton steps (backward Euler)."""
+    """Newton steps."""
     line_search: Int[Array, "*f"]
     """Halvings of a Newton step by the line search."""
     residual: Float[Array, "*f"]
@@ -46,6 +46,12 @@ class SolveInfo(eqx.Module):
             converged=later.converged,
             indefinite=self.indefinite | later.indefinite,
         )
+
+    def beside(self, other: "SolveInfo") -> "SolveInfo":
+        """The cost of both solves and the quality of the worse one."""
+        both = self.plus(other)
+        worst = jnp.maximum(self.residual, other.residual), self.converged & other.converged
+        return eqx.tree_at(lambda info: (info.residual, info.converged), both, worst)
 
 
 def no_solve(dtype: Any) -> SolveInfo:
@@ -98,23 +104,36 @@ class LinearProblem(AbstractProblem):
 
 
 class NewtonProblem(AbstractProblem):
-    """M (v − ṽ) − Δt f(Δt v) = 0, ṽ = v^n + Δt g: backward Euler (reference, eq. 2), f being the force after the step.
+    """M (v − ṽ) − c f(u + c v) = 0: a stage of length c that starts at the displacement u. Backward Euler (reference,
+    eq. 2) has c = Δt, u = 0, ṽ = v^n + Δt g.
 
-    It is the gradient of the incremental potential E(v) = ½ ‖v − ṽ‖²_M + Φ(Δt v), of which a step that a wall or the
-    line search accepts is a descent.
+    It is the gradient of the incremental potential E(v) = ½ ‖v − ṽ‖²_M + Φ(u + c v), of which a step that a wall or
+    the line search accepts is a descent.
     """
 
     mass: NodeScalar
     inertial: NodeVector
-    dt: Float[Array, ""]
+    """ṽ [m/s]."""
+    length: Float[Array, ""]
+    """c [s]."""
+    displaced: NodeVector | None
+    """u [m]; None for zero."""
     spacing: Float[Array, ""]
     potential: ElasticPotential
     hessian: Hessian
     free: Mask
     prescribed: NodeVector
 
+    def displacement(self, v: NodeVector) -> NodeVector:
+        """u + c v [m]."""
+        return self.length * v if self.displaced is None else self.displaced + self.length * v
+
+    def undisplaced(self) -> NodeVector:
+        """The velocity at which nothing is displaced, −u/c."""
+        return jnp.zeros_like(self.inertial) if self.displaced is None else -self.displaced / self.length
+
     def operator(self, v: NodeVector) -> ImplicitOperator:
-        """M + Δt² H at the displacement Δt v, constrained: the derivative of the imbalance, H never projected."""
+        """M + c² H at the displacement, constrained: the derivative of the imbalance, H never projected."""
         return self._operator(self.hessian.exact(), v)
 
     def model(self, v: NodeVector) -> ImplicitOperator:
@@ -122,29 +141,35 @@ class NewtonProblem(AbstractProblem):
         return self._operator(self.hessian, v)
 
     def _operator(self, hessian: Hessian, v: NodeVector) -> ImplicitOperator:
-        return ImplicitOperator(self.mass, self.dt**2, hessian.at(self.potential, self.dt * v), self.free)
+        action = hessian.at(self.potential, self.displacement(v))
+        return ImplicitOperator(self.mass, self.length**2, action, self.free)
 
     def imbalance(self, v: NodeVector) -> NodeVector:
-        """M (v − ṽ) − Δt f(Δt v)."""
-        return self.mass[:, None] * (v - self.inertial) - self.dt * self.potential.force(self.dt * v)
+        """M (v − ṽ) − c f(u + c v)."""
+        return self.mass[:, None] * (v - self.inertial) - self.length * self.potential.force(self.displacement(v))
 
     def unit_strain(self) -> Float[Array, ""]:
-        """The norm √(Σ m) dx/Δt [√J] of a velocity that would strain everything by one in the step.
+        """The norm √(Σ m) dx/c [√J] of a velocity that would strain everything by one in the stage.
 
         Deformation gradients are of order one, and are rounded as such, however small the strains: so this, times the
         operator's spectral radius and ε, is the rounding of the imbalance, and times itself that of the potential.
         """
-        return jnp.sqrt(self.mass.sum()) * self.spacing / self.dt
+        return jnp.sqrt(self.mass.sum()) * self.spacing / self.length
 
     def merit(self, v: NodeVector) -> Float[Array, ""]:
         """E(v) [J]."""
-        return 0.5 * (self.mass[:, None] * (v - self.inertial) ** 2).sum() + self.potential.energy(self.dt * v)
+        inertia = 0.5 * (self.mass[:, None] * (v - self.inertial) ** 2).sum()
+        return inertia + self.potential.energy(self.displacement(v))
 
 
-class SolveOnce(eqx.Module):
-    """Solve a linear problem with one linear solve."""
+class Linearised(eqx.Module):
+    """One linear solve: the force is f(0) − H u in the whole step.
 
-    solver: ConjugateResidual
+    Args:
+        solver: of the linear system. Default: default tolerances.
+    """
+
+    solver: ConjugateResidual = ConjugateResidual()
 
     def __call__(self, problem: AbstractProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         """The solution, started from a guess."""
@@ -170,19 +195,19 @@ class Newton(eqx.Module):
     A direction along which the potential does not fall (the Hessian can be indefinite) is replaced by the steepest one
     in the mass norm; a step is halved until the potential falls by a ten-thousandth of what its slope promises, which
     also keeps out of deformations where the law has no energy. Stops when ‖residual‖ ≤ rtol ‖b‖, b the right-hand side
-    M ṽ + Δt f(0), less what prescribed velocities contribute to it, both in the norm of the inverse mass, or at the
-    rounding of the residual. Starts from the guess, or from rest where the potential is lower there or the guess is a
-    deformation for which the law has no energy; if that is so at rest too, for what is prescribed alone (a grip that
-    closes a gap of one cell in a step), the first step is that of the system linearised before anything moves, which
-    is the semi-implicit one. An equation that is not finite even there gives NaN, never rest.
+    of the system linearised before anything moves, less what prescribed velocities contribute to it, both in the norm
+    of the inverse mass, or at the rounding of the residual. Starts from the guess, or from rest where the potential is
+    lower there or the guess is a deformation for which the law has no energy; if that is so at rest too, for what is
+    prescribed alone (a grip that closes a gap of one cell in a step), the first step is that of the linearised system.
+    An equation that is not finite even there gives NaN, never rest.
 
     Args:
+        solver: of the linear systems; a loose tolerance suffices.
         rtol: relative tolerance. Default: that of the precision, 1e-8 or 1e-5.
         max_steps: most Newton steps.
-        solver: of the linear systems.
     """
 
-    solver: ConjugateResidual
+    solver: ConjugateResidual = ConjugateResidual(rtol=1e-3)
     rtol: Scalar | None = None
     max_steps: int = eqx.field(static=True, default=30)
 
@@ -247,8 +272,9 @@ class Newton(eqx.Module):
         start = jnp.where(jnp.isfinite(energies[0]) & ~(energies[1] < energies[0]), start, lift)
         startable = jnp.isfinite(energies[0]) | jnp.isfinite(energies[1])
         zero = jnp.asarray(0, dtype=jnp.int32)
-        still = jnp.zeros_like(guess)
-        linearised = jnp.where(free, problem.imbalance(still) + problem.operator(still).unconstrained(lift), 0)
+        still = problem.undisplaced()
+        linearised = problem.imbalance(still) + problem.operator(still).unconstrained(lift - still)
+        linearised = jnp.where(free, linearised, 0)
         scale = norm(linearised)
         unit_strain = problem.unit_strain()
         no = jnp.asarray(False)
@@ -282,7 +308,7 @@ class _NewtonState(eqx.Module):
 
 
 def solve(
-    problem: AbstractProblem, guess: NodeVector, find: SolveOnce | Newton, adjoint: ConjugateResidual
+    problem: AbstractProblem, guess: NodeVector, find: Linearised | Newton, adjoint: ConjugateResidual
 ) -> tuple[NodeVector, SolveInfo]:
     """The solution of a problem, differentiable with respect to it in forward and reverse mode, to any order.
 

@@ -27,11 +27,11 @@ import numpy as np
 
 from mpmjax._checks import canonical, is_traced, require
 from mpmjax._diffrax import Tally, no_steps
+from mpmjax._method import Method
 from mpmjax._particles import Particles, State, state_of, with_state
 from mpmjax._run import Run
 from mpmjax._scene import Scene
 from mpmjax._schema import decode, encode
-from mpmjax._step import Method
 from mpmjax._vtkhdf import File, add_fixed, add_growing, add_topology, count_in, rows_of, set_count, states_in
 
 _FORMAT = 2

@@ -14,13 +14,13 @@ import numpy as np
 
 from mpmjax._checks import require, require_positive
 from mpmjax._fit import FitResult, fit_curve, gauge
+from mpmjax._method import Explicit, Method
 from mpmjax._particles import Particles
 from mpmjax._region import AbstractRegion
 from mpmjax._sample import fill
 from mpmjax._scene import Scene, prepare
 from mpmjax._schema import arguments, decode
 from mpmjax._simulate import number_of_steps
-from mpmjax._step import Explicit, Method
 from mpmjax._types import Scalar
 
 

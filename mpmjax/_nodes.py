@@ -51,6 +51,10 @@ class Nodes(eqx.Module):
         """ṽ = v^n + Δt g."""
         return jnp.where(self.occupied, self.velocity + self.dt * self.acceleration, 0)
 
+    def admitted_velocity(self) -> NodeVector:
+        """v^n with what is prescribed: what a wall will hold stops as the step begins."""
+        return jnp.where(self.free, self.velocity, self.conditions.velocity)
+
     def per_mass(self, impulse: NodeVector) -> NodeVector:
         """An impulse or force over the nodes' mass; zero on empty nodes."""
         return jnp.where(self.occupied, impulse / jnp.where(self.occupied, self.mass[:, None], 1), 0)
@@ -73,8 +77,13 @@ class Nodes(eqx.Module):
         return eqx.tree_at(lambda n: (n.velocity, n.acceleration), nodes, parts)
 
 
-def particles_to_grid(scene: Scene, particles: Particles, t: Scalar, dt: Scalar, stencil: Stencil) -> Nodes:
-    """P2G, folded at symmetry planes, with the elastic potential and the boundaries of the step from t to t + dt."""
+def particles_to_grid(
+    scene: Scene, particles: Particles, t: Scalar, dt: Scalar, stencil: Stencil, *, centred: bool
+) -> Nodes:
+    """P2G, folded at symmetry planes, with the elastic potential and the boundaries of the step from t to t + dt.
+
+    Body forces are those of the particles at t, or with `centred` at t + ½dt, half a step on by their velocity.
+    """
     grid, window = scene.grid, scene.window(particles)
     v, F = components(particles.v), particles.deformation()
     C = None if particles.C is None else components(particles.C)
@@ -84,7 +93,8 @@ def particles_to_grid(scene: Scene, particles: Particles, t: Scalar, dt: Scalar,
         occupied = (mass > jnp.finfo(mass.dtype).eps * particles.mass.mean())[:, None]
         full = jnp.where(occupied, mass[:, None], 1)
         if scene.body_force is not None:
-            push = particles.mass * components(scene.body_force.acceleration(particles.x, t))
+            x, at = (particles.x + dt / 2 * particles.v, t + dt / 2) if centred else (particles.x, t)
+            push = particles.mass * components(scene.body_force.acceleration(x, at))
             force = spread(stencil.index, stencil.weight[:, None], push[None], grid.size)
             acceleration = acceleration + jnp.where(occupied, force / full, 0)
         potential = ElasticPotential(

@@ -10,11 +10,11 @@ from tqdm import tqdm
 from mpmjax._checks import canonical, require
 from mpmjax._diffrax import HEALTHY, no_steps
 from mpmjax._io import FrameWriter
+from mpmjax._method import Explicit, Method
 from mpmjax._particles import Particles, state_of, with_state
 from mpmjax._run import Run, SimulationError
 from mpmjax._scene import Scene, prepare
 from mpmjax._simulate import integrate, number_of_steps, raise_faults
-from mpmjax._step import Explicit, Method
 
 
 def record(

@@ -7,9 +7,9 @@ import jax
 import numpy as np
 
 from mpmjax._diffrax import Tally
+from mpmjax._method import Method
 from mpmjax._particles import Particles, State, with_state
 from mpmjax._scene import Scene
-from mpmjax._step import Method
 from mpmjax._types import Array, Float, Scalar
 
 

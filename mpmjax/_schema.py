@@ -28,12 +28,13 @@ from mpmjax._boundary import Grip, SeparatingBox, SlipBox, StickyBox
 from mpmjax._conjugate_residual import ConjugateResidual
 from mpmjax._grid import Grid
 from mpmjax._hessian import AnalyticHessian, JvpHessian
+from mpmjax._implicit import Linearised, Newton
 from mpmjax._kernel import BSpline, MLSGradient, SplineGradient
+from mpmjax._method import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
 from mpmjax._mirror import ContactPlane, SymmetryPlane
 from mpmjax._motion import Motion
 from mpmjax._region import Ball, Box
 from mpmjax._scene import Scene, TotalLagrangian, UpdatedLagrangian
-from mpmjax._step import BackwardEuler, Explicit, SemiImplicit
 from mpmjax._transfer import APIC, FLIP, PIC
 from mpmjax.material import FixedCorotated, NeoHookean
 
@@ -44,7 +45,8 @@ CLASSES: tuple[type, ...] = (
     *(StickyBox, SlipBox, SeparatingBox, Grip, SymmetryPlane, ContactPlane),
     *(Box, Ball, Motion),
     *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
-    *(Explicit, SemiImplicit, BackwardEuler, AnalyticHessian, JvpHessian, ConjugateResidual),
+    *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),
+    *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual),
 )
 """What files can hold."""
 

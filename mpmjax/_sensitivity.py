@@ -10,10 +10,10 @@ import jax.numpy as jnp
 
 from mpmjax._checks import is_traced, require, require_positive
 from mpmjax._diffrax import HEALTHY, Tally
+from mpmjax._method import Explicit, Method
 from mpmjax._particles import Particles
 from mpmjax._scene import Scene, prepare
 from mpmjax._simulate import number_of_steps, simulate
-from mpmjax._step import Explicit, Method
 from mpmjax._types import Array, Float, ParticleVector
 
 _POINTS = 100

@@ -23,10 +23,11 @@ from mpmjax._diffrax import (
     no_vector_field,
     step_number,
 )
+from mpmjax._method import Explicit, Method
 from mpmjax._particles import Particles, State, state_of, with_state
 from mpmjax._run import Run, SimulationError
 from mpmjax._scene import Scene, prepare
-from mpmjax._step import Explicit, Method, advance
+from mpmjax._step import advance
 from mpmjax._types import Array, Float, Scalar
 
 _CHECKPOINT_BYTES = 2**28

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from mpmjax import _linalg as la
 from mpmjax._checks import canonical, require_positive
 from mpmjax._kernel import MLSGradient
+from mpmjax._method import Explicit, Method, SemiImplicit
 from mpmjax._particles import Particles
 from mpmjax._scene import Scene, is_prepared, prepare
-from mpmjax._step import Explicit, Method, SemiImplicit
 from mpmjax._types import Array, Float, Scalar
 
 _INVERSE_MOMENT = {2: 4.0, 3: 3.0}

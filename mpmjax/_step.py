@@ -1,4 +1,4 @@
-"""One step, and the three ways to update the grid's velocity in it."""
+"""One step: particles to grid, the grid's update by a method, grid to particles."""
 
 from typing import Any
 
@@ -6,8 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._checks import canonical, require_between, require_positive
-from mpmjax._conjugate_residual import ConjugateResidual
+from mpmjax._checks import canonical, require_positive
 from mpmjax._contact import (
     ActiveSet,
     ContactInfo,
@@ -20,10 +19,9 @@ from mpmjax._contact import (
     untouched,
     with_friction,
 )
-from mpmjax._guess import Guess
-from mpmjax._hessian import AnalyticHessian, Hessian
-from mpmjax._implicit import LinearProblem, Newton, NewtonProblem, SolveInfo, SolveOnce, no_solve, solve
+from mpmjax._implicit import SolveInfo
 from mpmjax._kernel import Stencil
+from mpmjax._method import Explicit, Method, NodeMotion
 from mpmjax._nodes import Nodes, particles_to_grid
 from mpmjax._particles import Particles
 from mpmjax._scene import Scene, is_prepared, prepare
@@ -40,151 +38,15 @@ class StepInfo(eqx.Module):
     """Particles whose stencil left the grid's window."""
 
 
-class Explicit(eqx.Module):
-    """Symplectic Euler: v^{n+1} = v* (reference, eq. 4); positions then move with v^{n+1}.
-
-    Second order in space with APIC and FLIP, first order in time. Conserves linear and, with APIC, angular momentum.
-
-    *When it breaks*: above Δt of about 0.4 to 1 times dx/c, depending on dimension, kernel and transfer
-    (c the pressure-wave speed of the *current* tangent, which stretching and compression raise): see `stable_dt`.
-    """
-
-    def velocity(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
-        """v^{n+1} and the solve's report."""
-        del guess
-        v = jnp.where(nodes.free, nodes.explicit_velocity(), nodes.conditions.velocity)
-        return v, no_solve(v.dtype)
-
-    def elastic_impulse(self, nodes: Nodes, v: NodeVector) -> NodeVector:
-        """Δt f(0) [kg m/s], on nodes that have mass."""
-        del v
-        return jnp.where(nodes.occupied, nodes.dt * nodes.force, 0)
-
-    def start(self, nodes: Nodes) -> NodeVector:
-        """Nothing is iterated."""
-        return nodes.velocity
-
-
-class SemiImplicit(eqx.Module):
-    """The semi-implicit update: (M + βΔt²H) v^{n+1} = M v*, force and H at the start of the step (reference, eqs. 3,
-    6).
-
-    First order in time. On a mode of frequency ω the amplification is (1 + βz)^(−½) with z = (ωΔt)² while
-    z < 4/(1−β)²: stable for every Δt if β ≥ ½, else for z ≤ 4/(1−2β). β = 0 is the explicit step; β = 1 one Newton step
-    of backward Euler. β = ½ is *not* the trapezoidal rule, positions moving with v^{n+1}: for β > 0 motion is damped,
-    by a quarter in one period of a standing wave at the explicit limit. A method for slow, driven and overdamped
-    motion.
-    *When it breaks*: large strains within one step (the system is linearised once), and where compression makes H
-    indefinite and Δt brings M + βΔt²H near singular: `AnalyticHessian(projected=True)` holds there.
-    *Good values*: β = 1 with Δt up to some hundred times the explicit limit for quasi-static pulls.
-
-    Args:
-        beta: β, from 0 to 1.
-        hessian: how H acts. Default: by the analytic stress differential.
-        solver: conjugate residuals of the forward solve.
-        adjoint_solver: of the tangent and adjoint solves, whose tolerance bounds the gradient's. Default: default
-            tolerances.
-        guess: where the solve starts.
-    """
-
-    beta: Scalar = 1.0
-    hessian: Hessian = AnalyticHessian()
-    solver: ConjugateResidual = ConjugateResidual()
-    adjoint_solver: ConjugateResidual = ConjugateResidual()
-    guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
-
-    def __check_init__(self):
-        require_between("SemiImplicit's beta", self.beta, 0, 1)
-
-    def velocity(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
-        """v^{n+1} and the solve's report."""
-        return solve(self._problem(nodes), guess, SolveOnce(self.solver), self.adjoint_solver)
-
-    def _problem(self, nodes: Nodes) -> LinearProblem:
-        predictor = nodes.explicit_velocity()
-        return LinearProblem(
-            mass=nodes.mass,
-            factor=self.beta * nodes.dt**2,
-            hessian=self.hessian.at_rest(nodes.potential, predictor),
-            rhs=nodes.mass[:, None] * predictor,
-            free=nodes.free,
-            prescribed=nodes.conditions.velocity,
-        )
-
-    def elastic_impulse(self, nodes: Nodes, v: NodeVector) -> NodeVector:
-        """Δt f(0) − βΔt² H v [kg m/s]."""
-        action = self.hessian.at_rest(nodes.potential, v)
-        return nodes.dt * nodes.force - self.beta * nodes.dt**2 * action(v)
-
-    def start(self, nodes: Nodes) -> NodeVector:
-        """The chosen guess."""
-        return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())
-
-
-class BackwardEuler(eqx.Module):
-    """Backward Euler: M (v^{n+1} − v^n) = Δt f(x^n + Δt v^{n+1}) + Δt M g (reference, eq. 2), by Newton's method.
-
-    First order in time, strongly damping; no linearisation error, so it holds where one linear solve does not.
-
-    *When it breaks*: where the incremental potential has several stationary points (steps that compress material to a
-    fraction of itself make H indefinite), Newton finds one of them, not always the one a smaller step would lead to.
-
-    Args:
-        rtol: Newton's relative tolerance. Default: 1e-8 in float64, 1e-5 in float32.
-        max_newton: most Newton steps.
-        hessian: how H acts. Default: by the analytic stress differential.
-        solver: conjugate residuals within a Newton step; a loose tolerance suffices.
-        adjoint_solver: of the tangent and adjoint solves. Default: default tolerances.
-        guess: where Newton starts.
-    """
-
-    rtol: Scalar | None = None
-    max_newton: int = eqx.field(static=True, default=30)
-    hessian: Hessian = AnalyticHessian()
-    solver: ConjugateResidual = ConjugateResidual(rtol=1e-3)
-    adjoint_solver: ConjugateResidual = ConjugateResidual()
-    guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
-
-    def __check_init__(self):
-        if self.rtol is not None:
-            require_positive("BackwardEuler's rtol", self.rtol)
-
-    def velocity(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
-        """v^{n+1} and the solve's report."""
-        newton = Newton(self.solver, self.rtol, self.max_newton)
-        return solve(self._problem(nodes), guess, newton, self.adjoint_solver)
-
-    def _problem(self, nodes: Nodes) -> NewtonProblem:
-        return NewtonProblem(
-            mass=nodes.mass,
-            inertial=nodes.inertial_velocity(),
-            dt=nodes.dt,
-            spacing=nodes.spacing,
-            potential=nodes.potential,
-            hessian=self.hessian,
-            free=nodes.free,
-            prescribed=nodes.conditions.velocity,
-        )
-
-    def elastic_impulse(self, nodes: Nodes, v: NodeVector) -> NodeVector:
-        """Δt f(Δt v) [kg m/s]."""
-        return nodes.dt * nodes.potential.force(nodes.dt * v)
-
-    def start(self, nodes: Nodes) -> NodeVector:
-        """The chosen guess."""
-        return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())
-
-
-Method = Explicit | SemiImplicit | BackwardEuler
-
-
 class GridUpdate(eqx.Module):
     """The nodes' new velocity and where it came from."""
 
     before: NodeVector
     """v_i^n [m/s], shape (n, d), mirrored where a contact plane holds."""
-    velocity: NodeVector
-    """v_i^{n+1} [m/s], shape (n, d), mirrored likewise."""
+    motion: NodeMotion
+    """How they move, mirrored likewise."""
+    elastic: NodeVector
+    """The impulse of the elastic force [kg m/s], shape (n, d)."""
     reaction: NodeVector
     """The impulse of walls and grips [kg m/s], shape (n, d); on free components what the solve left."""
     friction: NodeVector | None
@@ -209,48 +71,66 @@ def advance(
         stencil: that of the reference positions, if the description is total and it was computed before.
     """
     stencil = scene.stencil(particles) if stencil is None else stencil
-    nodes = particles_to_grid(scene, particles, t, dt, stencil)
+    nodes = particles_to_grid(scene, particles, t, dt, stencil, centred=method.centred)
     new = update(nodes, method)
     outside = (~stencil.inside).sum().astype(jnp.int32)
     return grid_to_particles(scene, particles, nodes, new), StepInfo(new.solve, new.contact, outside)
 
 
 def update(nodes: Nodes, method: Method) -> GridUpdate:
-    """The nodes' new velocity, boundaries and contact included."""
+    """The nodes' motion, boundaries and contact included."""
     with jax.named_scope("update"):
         if not touches(nodes):
-            v, info = method.velocity(nodes, method.start(nodes))
-            return GridUpdate(nodes.velocity, v, imbalance(nodes, method, v), None, nodes.free, info, no_contact())
-
-        def with_held(nodes: Nodes, method: Method, active: ActiveSet, guess: NodeVector) -> tuple:
-            v, info = method.velocity(holding(nodes, active), guess)
-            v = held_images(nodes, active).unfold(v)
-            return v, imbalance(nodes, method, v), info
+            motion, info = method.move(nodes, method.start(nodes))
+            elastic, reaction = impulses(nodes, method, motion)
+            return GridUpdate(nodes.velocity, motion, elastic, reaction, None, nodes.free, info, no_contact())
 
         frozen = jax.lax.stop_gradient((nodes, method))
+
+        def with_held(nodes: Nodes, method: Method, active: ActiveSet, guess: NodeVector) -> tuple:
+            motion, info = method.move(holding(nodes, active), guess)
+            return jax.tree.map(held_images(nodes, active).unfold, motion), info
+
+        def tried(active: ActiveSet, guess: NodeVector) -> tuple:
+            motion, info = with_held(*frozen, active, guess)
+            return motion.velocity, impulses(*frozen, motion)[1], info
+
         guess = frozen[1].start(frozen[0])
-        active, guess, cost, sweeps = find_active_set(frozen[0], guess, lambda a, v: with_held(*frozen, a, v))
-        v, reaction, info = with_held(nodes, method, active, guess)
-        violations = count_violations(nodes, active, v, reaction)
-        slowed = with_friction(nodes, active, v, reaction)
-        friction = nodes.mass[:, None] * (slowed - v)
+        active, guess, cost, sweeps = find_active_set(frozen[0], guess, tried)
+        motion, info = with_held(nodes, method, active, guess)
+        elastic, reaction = impulses(nodes, method, motion)
+        violations = count_violations(nodes, active, motion.velocity, reaction)
+        loss = with_friction(nodes, active, motion.velocity, reaction) - motion.velocity
         before = held_images(nodes, active).unfold(holding(nodes, active).velocity)
-        contact = ContactInfo(sweeps, violations)
-        return GridUpdate(before, slowed, reaction, friction, untouched(nodes, active), cost.plus(info), contact)
+        return GridUpdate(
+            before=before,
+            motion=motion.slowed(loss),
+            elastic=elastic,
+            reaction=reaction,
+            friction=nodes.mass[:, None] * loss,
+            free=untouched(nodes, active),
+            solve=cost.plus(info),
+            contact=ContactInfo(sweeps, violations),
+        )
 
 
-def imbalance(nodes: Nodes, method: Method, v: NodeVector) -> NodeVector:
-    """The impulse [kg m/s] that is missing for nodes to move at v: that of walls and grips."""
-    return nodes.mass[:, None] * (v - nodes.inertial_velocity()) - method.elastic_impulse(nodes, v)
+def impulses(nodes: Nodes, method: Method, motion: NodeMotion) -> tuple[NodeVector, NodeVector]:
+    """The impulse of the elastic force [kg m/s], and that which is missing for the nodes to move so: of walls and
+    grips."""
+    elastic = method.elastic_impulse(nodes, motion)
+    return elastic, nodes.mass[:, None] * (motion.velocity - nodes.inertial_velocity()) - elastic
 
 
 def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: GridUpdate) -> Particles:
-    """G2P: the particles moved and deformed by the nodes' new velocity, x ← x + Δt Σ w v_i, F ← F + Δt Σ v_i hᵀ."""
+    """G2P: the particles moved and deformed with the nodes, x ← x + Δt Σ w v̄_i, F ← F + Δt Σ v̄_i hᵀ."""
     potential, dt = nodes.potential, nodes.dt
-    before, after = potential.mirror.unfold(new.before), potential.mirror.unfold(new.velocity)
+    unfold = potential.mirror.unfold
+    before, motion = unfold(new.before), jax.tree.map(unfold, new.motion)
     with jax.named_scope("g2p"):
-        moved, v, C = g2p(scene.transfer, potential.stencil, components(particles.v), before, after)
-        F = potential.F + dt * potential.strain(new.velocity)
+        moved, v, C = g2p(
+            scene.transfer, potential.stencil, components(particles.v), before, motion.velocity, motion.mean
+        )
+        F = potential.F + dt * potential.strain(new.motion.carrier)
     return Particles(
         x=particle_first(components(particles.x) + dt * moved),
         v=particle_first(v),
@@ -272,14 +152,15 @@ def step(
 ) -> tuple[Particles, StepInfo]:
     """One step of the Material Point Method, from t to t + dt.
 
-    P2G, the grid velocity's update by `method`, G2P, x ← x + Δt Σ_i w_ip v_i, F ← F + Δt Σ_i v_i h_ipᵀ.
+    P2G, the grid velocity's update by `method`, G2P, x ← x + Δt Σ_i w_ip v̄_i, F ← F + Δt Σ_i v̄_i h_ipᵀ, v̄ being
+    v^{n+1} or, for methods of second order, the nodes' mean velocity over the step.
 
     Args:
         scene: the scene.
         particles: particles; what the scene needs and they lack is added (see `prepare`).
         t: time at the start of the step [s].
         dt: step [s].
-        method: `Explicit()`, `SemiImplicit(...)` or `BackwardEuler(...)`.
+        method: `Explicit()`, `SemiImplicit(...)`, `BackwardEuler(...)`, `ImplicitMidpoint(...)` or `TRBDF2(...)`.
 
     Returns:
         the particles after the step, and a `StepInfo`. Nothing is raised for what only the numbers show: `StepInfo`

@@ -111,7 +111,12 @@ def p2g(
 
 
 def g2p(
-    transfer: Transfer, stencil: Stencil, v: Float[Array, "d p"], before: NodeVector, after: NodeVector
+    transfer: Transfer,
+    stencil: Stencil,
+    v: Float[Array, "d p"],
+    before: NodeVector,
+    after: NodeVector,
+    mean: NodeVector | None = None,
 ) -> tuple[Float[Array, "d p"], Float[Array, "d p"], Matrix | None]:
     """Grid to particles.
 
@@ -121,20 +126,24 @@ def g2p(
         v: the particles' velocity before the step [m/s], shape (d, p).
         before: v_i^n [m/s], shape (n, d).
         after: v_i^{n+1} [m/s], shape (n, d).
+        mean: with what the nodes move over the step [m/s], shape (n, d), if not with v_i^{n+1}.
     Returns:
-        the velocity that carries the particles, Σ_i w_ip v_i^{n+1}, their new velocity, and their new C (APIC).
+        the velocity that carries the particles, Σ_i w_ip v̄_i, their new velocity, and their new C (APIC).
     """
     index, weight = stencil.index, stencil.weight[:, None]
+    C = None
     match transfer:
         case APIC():
-            moved, *gradient = collect(index, _affine_basis(stencil), after)
-            return moved, moved, jnp.swapaxes(jnp.stack(gradient), 0, 1)
+            arrived, *gradient = collect(index, _affine_basis(stencil), after)
+            new, C = arrived, jnp.swapaxes(jnp.stack(gradient), 0, 1)
         case FLIP(alpha=alpha):
-            moved, change = jnp.split(collect(index, weight, jnp.concatenate([after, after - before], axis=1))[0], 2)
-            return moved, alpha * (v + change) + (1 - alpha) * moved, None
+            arrived, change = jnp.split(collect(index, weight, jnp.concatenate([after, after - before], axis=1))[0], 2)
+            new = alpha * (v + change) + (1 - alpha) * arrived
         case _:
-            moved = collect(index, weight, after)[0]
-            return moved, moved, None
+            arrived = collect(index, weight, after)[0]
+            new = arrived
+    moved = arrived if mean is None else collect(index, weight, mean)[0]
+    return moved, new, C
 
 
 def _affine_basis(stencil: Stencil) -> Float[Array, "k b p"]:

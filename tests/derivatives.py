@@ -2,6 +2,7 @@
 measures of how far J and Jᵀ are from the truth. One compiled program a case serves all three."""
 
 import functools
+import operator
 from typing import Any, NamedTuple
 from unittest import mock
 
@@ -19,6 +20,8 @@ UPDATES = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(beta=0.8, solver=TIGHT, adjoint_solver=TIGHT),
     "backward_euler": mpm.BackwardEuler(rtol=1e-14, solver=TIGHT, adjoint_solver=TIGHT),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT), adjoint_solver=TIGHT),
+    "trbdf2": mpm.TRBDF2(0.2, mpm.Newton(TIGHT, rtol=1e-14), adjoint_solver=TIGHT),
 }
 DX, DT, STEPS = 0.1, 1e-2, 20
 
@@ -39,7 +42,7 @@ class Case(NamedTuple):
 
 def parameters(case: Case) -> dict[str, Any]:
     """All floats that a rollout of a small block, from rest in F, is differentiated in: the law's (the first of them
-    one value a particle), places, velocities, gravity, the motion of the grip or the friction of the floor, β."""
+    one value a particle), places, velocities, gravity, the motion of the grip or the friction of the floor, β or ρ∞."""
     d = case.d
     rng = np.random.default_rng(1)
     box, grid = mpm.Box((0.0,) * d, (0.2,) * d), mpm.Grid((8,) * d, DX)
@@ -59,10 +62,12 @@ def parameters(case: Case) -> dict[str, Any]:
         q["displacement"] = jnp.asarray([[0.0] * d, [0.4, 0.3, 0.2][:d]])
     if case.update == "semi_implicit":
         q["beta"] = jnp.asarray(0.8)
+    if case.update == "trbdf2":
+        q["rho"] = jnp.asarray(0.2)
     return q
 
 
-UNIT = {"x": 0.03, "v": 0.3, "gravity": 3.0, "displacement": 0.4, "friction": 0.2, "beta": 0.5}
+UNIT = {"x": 0.03, "v": 0.3, "gravity": 3.0, "displacement": 0.4, "friction": 0.2, "beta": 0.5, "rho": 0.2}
 
 
 def direction(q: dict[str, Any], seed: int = 5, only: str | None = None) -> dict[str, Any]:
@@ -101,8 +106,9 @@ def model(q: dict[str, Any], case: Case) -> tuple[mpm.Scene, mpm.Particles, Any]
     one = jnp.ones(len(q["x"]))
     particles = mpm.Particles(q["x"], q["v"], 1e3 * (DX / 2) ** d * one, (DX / 2) ** d * one)
     method = UPDATES[case.update]
-    if "beta" in q:
-        method = eqx.tree_at(lambda m: m.beta, method, q["beta"])
+    for name in ("beta", "rho"):
+        if name in q:
+            method = eqx.tree_at(operator.attrgetter(name), method, q[name])
     return scene, particles, method
 
 

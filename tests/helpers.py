@@ -16,6 +16,7 @@ LAWS = {
 }
 DESCRIPTIONS = {"updated": mpm.UpdatedLagrangian(), "total": mpm.TotalLagrangian()}
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(), "backward_euler": mpm.BackwardEuler()}
+SECOND_ORDER = {"implicit_midpoint": mpm.ImplicitMidpoint(), "trbdf2": mpm.TRBDF2()}
 
 
 def ids(registry: dict) -> dict:

@@ -164,7 +164,7 @@ def grid_update(scene: mpm.Scene, particles: mpm.Particles, dt: float, method, t
 
 @eqx.filter_jit
 def _grid_update(scene, particles, t, dt, method) -> GridUpdate:
-    nodes = particles_to_grid(scene, particles, t, dt, scene.stencil(particles))
+    nodes = particles_to_grid(scene, particles, t, dt, scene.stencil(particles), centred=method.centred)
     new, info = advance(scene, particles, t, dt, method)
     grid = update(nodes, method)
-    return GridUpdate(nodes, grid.velocity, grid.reaction, info, new, scene.grid.nodes(scene.window(particles)))
+    return GridUpdate(nodes, grid.motion.velocity, grid.reaction, info, new, scene.grid.nodes(scene.window(particles)))

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import METHODS, block, ids
+from helpers import METHODS, SECOND_ORDER, block, ids
 
 import mpmjax as mpm
 from mpmjax._types import Array, ParticleVector, Scalar
@@ -40,6 +40,17 @@ def test_a_body_force_is_that_of_the_start_of_the_step():
     scene = mpm.Scene(mpm.Grid((8,), 0.1), mpm.FixedCorotated(1.0, 0.3), body_force=Wind(jnp.ones(1), 3.0, 2.0))
     after, _ = mpm.step(scene, mpm.Particles(x, 0 * x, one, one), 0.5, 0.01)
     np.testing.assert_allclose(after.v, 0.01 * (1 + 3.0 * 0.5 + 2.0 * 0.33), rtol=1e-13)
+
+
+@pytest.mark.parametrize("method", **ids(SECOND_ORDER))
+def test_methods_of_second_order_take_it_half_a_step_on(method):
+    """A lone particle gains Δt b(x + ½Δt v, t + ½Δt), and moves with the mean of its velocities."""
+    x, one, dt = jnp.full((1, 1), 0.33), jnp.ones(1), 0.01
+    scene = mpm.Scene(mpm.Grid((8,), 0.1), mpm.FixedCorotated(1.0, 0.3), body_force=Wind(jnp.ones(1), 3.0, 2.0))
+    after, _ = mpm.step(scene, mpm.Particles(x, 2 + 0 * x, one, one), 0.5, dt, method=method)
+    gain = dt * (1 + 3.0 * 0.505 + 2.0 * (0.33 + 0.01))
+    np.testing.assert_allclose(after.v, 2 + gain, rtol=1e-8)
+    np.testing.assert_allclose(after.x, 0.33 + dt * (2 + gain / 2), rtol=1e-8)
 
 
 def test_a_scene_with_a_body_force_cannot_be_written(tmp_path):

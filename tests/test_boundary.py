@@ -17,6 +17,8 @@ METHODS = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(solver=TIGHT),
     "backward_euler": mpm.BackwardEuler(rtol=1e-12, solver=TIGHT),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
+    "trbdf2": mpm.TRBDF2(0.0, mpm.Linearised(TIGHT)),
 }
 DX, DT = 0.1, 1e-2
 
@@ -128,7 +130,7 @@ MIRROR_CASES = [
     *((k, "explicit", "updated") for k in KERNELS),
     ("quadratic", "semi_implicit", "updated"),
     *(pytest.param(k, "semi_implicit", "updated", marks=pytest.mark.slow) for k in ("linear", "cubic")),
-    pytest.param("quadratic", "backward_euler", "updated", marks=pytest.mark.slow),
+    *(pytest.param("quadratic", k, "updated", marks=pytest.mark.slow) for k in list(METHODS)[2:]),
     ("quadratic", "semi_implicit", "total"),
 ]
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DESCRIPTIONS, GRADIENTS, KERNELS, LAWS, METHODS, TRANSFERS, block, explicit_limit, ids
+from helpers import DESCRIPTIONS, GRADIENTS, KERNELS, LAWS, METHODS, SECOND_ORDER, TRANSFERS, block, explicit_limit
 from test_body_force import Wind
 
 import mpmjax as mpm
@@ -56,11 +56,25 @@ CASES = {
         "material": LAWS["neo_hookean"],
     },
     "backward_euler-grip": {"method": METHODS["backward_euler"], "boundary": BOUNDARIES["grip"]},
+    "implicit_midpoint-contact planes": {
+        "method": SECOND_ORDER["implicit_midpoint"],
+        "boundary": BOUNDARIES["contact planes"],
+    },
+    "trbdf2-grip": {"method": SECOND_ORDER["trbdf2"], "boundary": BOUNDARIES["grip"], "transfer": TRANSFERS["flip"]},
+    "trbdf2-contact": {"method": mpm.TRBDF2(0.5, mpm.Newton()), "boundary": BOUNDARIES["contact"]},
+    "body force, half a step on": {
+        "body_force": Wind(jnp.asarray([0.5, 2.0]), 0.1, 3.0),
+        "method": SECOND_ORDER["implicit_midpoint"],
+    },
     "body force": {"body_force": Wind(jnp.asarray([0.5, 2.0]), 0.1, 3.0), "boundary": BOUNDARIES["planes"]},
 }
 
 
-@pytest.mark.parametrize("case", **ids(CASES))
+SLOW = {"semi_implicit-contact", "semi_implicit-planes", "explicit-contact planes", "trbdf2-contact", "pic-total"}
+EACH_CASE = [pytest.param(case, id=k, marks=pytest.mark.slow if k in SLOW else ()) for k, case in CASES.items()]
+
+
+@pytest.mark.parametrize("case", EACH_CASE)
 def test_the_budget_closes(case):
     """For every transfer, description, kernel, gradient operator, update and boundary."""
     assert_closes(budget_of(**case)[0])
@@ -119,7 +133,22 @@ def test_an_explicit_step_dissipates_nothing_implicitly_and_beta_does():
     assert 0 < half < whole
 
 
-@pytest.mark.parametrize("method", **ids(METHODS))
+def test_methods_of_second_order_give_back_what_they_take_implicitly():
+    """time_integration − implicit is of second order over a given time, and less than a hundredth of either."""
+    sums = []
+    for halvings in (2, 3, 4):
+        settings = {"method": SECOND_ORDER["implicit_midpoint"], "transfer": mpm.FLIP(1.0), "speed": 0.05}
+        energy = budget_of(number=0.8 / 2**halvings, steps=64, **settings)[0].energy
+        each = np.abs([energy.time_integration - energy.implicit, energy.implicit])[:, : 4 * 2**halvings]
+        sums.append(each.sum(axis=1))
+    slopes = np.log2(np.array(sums[:-1]) / sums[1:])
+    assert (np.abs(slopes[-1] - [2, 1]) < 0.15).all(), slopes
+    assert (sums[-1][0] < 0.01 * sums[-1][1]).all()
+
+
+@pytest.mark.parametrize(
+    "method", [METHODS["explicit"], *(pytest.param(METHODS[m], marks=pytest.mark.slow) for m in list(METHODS)[1:])]
+)
 def test_time_integration_is_of_first_order_over_a_given_time(method):
     """With FLIP(1), whose motion converges as Δt → 0: halving Δt halves its sum, and the sum of its sizes."""
     sums = []

@@ -24,6 +24,7 @@ LAYERS = (
     ("_potential", "_hessian"),
     ("_conjugate_residual",),
     ("_nodes", "_guess", "_implicit", "_contact"),
+    ("_method",),
     ("_step",),
     ("_stability",),
     ("_diffrax", "_run", "_simulate"),

@@ -11,8 +11,8 @@ from helpers import ids
 
 import mpmjax as mpm
 from mpmjax._guess import Guess
+from mpmjax._method import Method
 from mpmjax._schema import CLASSES, arguments, decode, encode
-from mpmjax._step import Method
 
 GRID = mpm.Grid((8, 9), 0.1, origin=(-2, 3), periodic=(True, False))
 GRIP = mpm.Grip(mpm.Box((-np.inf, 0.0), (0.1, 1.0)), mpm.Motion((0.0, 0.3), ((0.0, 0.0), (0.1, 0.7))), (True, False))
@@ -50,6 +50,10 @@ EXAMPLES = {
     mpm.Explicit: mpm.Explicit(),
     mpm.SemiImplicit: mpm.SemiImplicit(0.5, mpm.JvpHessian(), mpm.ConjugateResidual(1e-7), guess=Guess.EXPLICIT),
     mpm.BackwardEuler: mpm.BackwardEuler(rtol=1e-6, max_newton=7, guess=Guess.ZERO),
+    mpm.ImplicitMidpoint: mpm.ImplicitMidpoint(mpm.Newton(mpm.ConjugateResidual(1e-2), 1e-6, 9), guess=Guess.ZERO),
+    mpm.TRBDF2: mpm.TRBDF2(0.3, mpm.Linearised(mpm.ConjugateResidual(1e-7))),
+    mpm.Linearised: mpm.Linearised(),
+    mpm.Newton: mpm.Newton(),
     mpm.AnalyticHessian: mpm.AnalyticHessian(),
     mpm.JvpHessian: mpm.JvpHessian(),
     mpm.ConjugateResidual: mpm.ConjugateResidual(1e-7, increment_rtol=1e-3, max_steps=17),

@@ -39,7 +39,11 @@ def state(particles):
     return particles.x, particles.v, particles.F, particles.C
 
 
-EQUAL = [("explicit", "updated", 2), ("semi_implicit", "total", 2), ("backward_euler", "updated", 1)]
+EQUAL = [
+    ("explicit", "updated", 2),
+    ("semi_implicit", "total", 2),
+    pytest.param("backward_euler", "updated", 1, marks=pytest.mark.slow),
+]
 
 
 @pytest.mark.parametrize(("method", "description", "d"), EQUAL)

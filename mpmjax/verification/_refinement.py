@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from mpmjax._method import Explicit, Method
 from mpmjax._simulate import simulate
-from mpmjax._step import Explicit, Method
 from mpmjax.verification._problem import AbstractProblem, discretise, displacement_error
 
 _SAMPLES = 10
@@ -19,7 +19,7 @@ def errors(
     *,
     courant: float | Sequence[float],
     method: Method = Explicit(),
-    staggered: bool = True,
+    staggered: bool | None = None,
     **discretisation: Any,
 ) -> np.ndarray:
     """The largest of ten displacement errors, evenly over the problem's duration, for each grid [m].
@@ -32,7 +32,8 @@ def errors(
         courant: Δt c/dx, c the pressure-wave speed at rest; one for all grids, or one for each. It is rounded down so
             that ten whole numbers of steps fill the duration.
         method: update of the grid velocity.
-        staggered: whether initial velocities are those of half a step before the start, see `discretise`.
+        staggered: whether initial velocities are those of half a step before the start, see `discretise`. Default: but
+            for methods of second order, whose velocities stand at the time of the positions.
         discretisation: of `discretise`.
     """
     numbers = [courant] * len(cells) if isinstance(courant, (int, float)) else courant
@@ -51,13 +52,13 @@ def _error(
     cells: int,
     courant: float,
     method: Method,
-    staggered: bool,
+    staggered: bool | None,
     discretisation: dict[str, Any],
 ) -> float:
     longest = courant / (cells * problem.wave_speed)
     every = max(1, math.ceil(problem.duration / _SAMPLES / longest - 1e-9))
     dt = problem.duration / (_SAMPLES * every)
-    start = -dt / 2 if staggered else 0.0
+    start = -dt / 2 if staggered or (staggered is None and not method.centred) else 0.0
     scene, particles = discretise(problem, cells, velocity_time=start, **discretisation)
     run = simulate(scene, particles, t1=problem.duration, dt=dt, method=method, save_every=every, throw=False)
     worst = float(displacement_error(problem, particles, run).max())

@@ -254,7 +254,11 @@ def test_bound_of_the_semi_implicit_step(beta):
         assert above < -1
 
 
-@pytest.mark.parametrize("method", [mpm.SemiImplicit(beta=0.5), mpm.SemiImplicit(), mpm.BackwardEuler()])
+@pytest.mark.parametrize(
+    "method",
+    [mpm.SemiImplicit(beta=0.5), mpm.SemiImplicit(), mpm.BackwardEuler(), mpm.ImplicitMidpoint(), mpm.TRBDF2()],
+    ids=lambda method: type(method).__name__,
+)
 def test_there_is_no_bound_from_a_half_on(method):
     """Infinite, also under jit, and never NaN."""
     scene, particles = alone(1)
@@ -272,7 +276,12 @@ def test_stable_dt_takes_the_worst_particle_and_its_own_law():
         mpm.stable_dt(scene, particles, safety=0.0)
 
 
-# The semi-implicit step on the same particle.
+# Implicit steps on the same particle.
+
+
+def semi_implicit(beta):
+    """Solved down to rounding."""
+    return mpm.SemiImplicit(beta=beta, solver=TIGHT, adjoint_solver=TIGHT)
 
 
 @eqx.filter_jit
@@ -288,11 +297,10 @@ def dilation_map(scene, particles, dt, method):
     return jax.jacfwd(after)(jnp.zeros(2))
 
 
-def moduli(d, beta, z):
+def moduli(d, method, z):
     """|λ| of the map, the larger first, at z = ω²Δt², ω² = a (2μ + dλ)/ρ0, a = 4/dx²."""
     scene, particles = alone(d, place=2.2637)
     dt = np.sqrt(z * DENSITY * DX**2 / (4 * (2 * MU + d * LAMBDA)))
-    method = mpm.SemiImplicit(beta=beta, solver=TIGHT, adjoint_solver=TIGHT)
     scene, dt, method = canonical((scene, dt, method), jnp.float64)
     return np.sort(np.abs(np.linalg.eigvals(dilation_map(scene, mpm.prepare(scene, particles), dt, method))))[::-1]
 
@@ -304,7 +312,7 @@ def test_amplification_of_the_semi_implicit_step(beta, d):
     two real ones; at most 1 for every z if β ≥ ½, else for z ≤ 4/(1 − 2β)."""
     edge = np.inf if beta >= 0.5 else 4 / (1 - 2 * beta)
     for z in (0.01, 0.5, 2.0, 3.9, 3.999, 4.001, 7.1, 7.2, 7.5, 7.999, 8.001, 15.9, 16.1, 100.0, 1e4):
-        found = moduli(d, beta, z)
+        found = moduli(d, semi_implicit(beta), z)
         exact = np.sort(np.abs(np.roots([1 + beta * z, z - 2 - beta * z, 1])))[::-1]
         np.testing.assert_allclose(found, exact, atol=1e-6)
         if beta < 1 and z > 4.1 / (1 - beta) ** 2:
@@ -326,7 +334,28 @@ def test_amplification_of_the_semi_implicit_step(beta, d):
 )
 def test_amplification_has_its_known_figures(beta, z, expected, digits):
     """Complex and real branches."""
-    assert abs(moduli(2, beta, z)[0] - expected) <= 0.5001 * 10.0**-digits
+    assert abs(moduli(2, semi_implicit(beta), z)[0] - expected) <= 0.5001 * 10.0**-digits
+
+
+@pytest.mark.parametrize("d", [1, 2])
+@pytest.mark.parametrize("rho", [None, 0.0, 0.4, 1.0])
+def test_amplification_of_the_methods_of_second_order(rho, d):
+    """|R(i√z)|, R the rational function of the method for y' = λy, to 1e-6: 1 for the midpoint rule (ρ∞ = None) at
+    every z; for TR-BDF2 at most 1, and ρ∞ as z → ∞."""
+    how = mpm.Linearised(TIGHT)
+    method = (
+        mpm.ImplicitMidpoint(how, adjoint_solver=TIGHT) if rho is None else mpm.TRBDF2(rho, how, adjoint_solver=TIGHT)
+    )
+    for z in (0.01, 0.5, 3.9, 4.1, 15.0, 100.0, 1e4, 1e8):
+        y = 1j * np.sqrt(z)
+        exact = 1.0
+        if rho is not None:
+            gamma, q0, q1, q2 = (float(a) for a in method.weights())
+            inner = (1 + gamma / 2 * y) / (1 - gamma / 2 * y)
+            exact = abs((1 + q0 * y + q1 * y * inner) / (1 - q2 * y))
+        np.testing.assert_allclose(moduli(d, method, z), exact, atol=1e-6)
+        assert exact <= 1 + 1e-12
+    assert rho is None or abs(exact - rho) < 1e-3
 
 
 # Bulk material.

@@ -1,0 +1,335 @@
+"""The ways to update the grid's velocity in a step.
+
+A method says how the nodes move (`move`) and what impulse the elastic force gives them meanwhile (`elastic_impulse`);
+walls, contact, friction, transfers, reports and derivatives are the same for all. The implicit ones are made of
+stages M (v − a) = c f(u + c v), f(u) the elastic force at the nodal displacement u: each is one linear solve, with
+f(u) = f(0) − H u, or Newton's method.
+"""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mpmjax._checks import require_between, require_positive
+from mpmjax._conjugate_residual import ConjugateResidual
+from mpmjax._guess import Guess
+from mpmjax._hessian import AnalyticHessian, Hessian
+from mpmjax._implicit import Linearised, LinearProblem, Newton, NewtonProblem, SolveInfo, no_solve, solve
+from mpmjax._nodes import Nodes
+from mpmjax._types import Array, Float, NodeVector, Scalar
+
+
+class NodeMotion(eqx.Module):
+    """How the nodes move in a step."""
+
+    velocity: NodeVector
+    """v^{n+1} [m/s], shape (n, d)."""
+    mean: NodeVector | None = None
+    """The velocity with which positions and deformation move over the step [m/s], shape (n, d); None where it is
+    v^{n+1}."""
+    inner: NodeVector | None = None
+    """The same up to an inner stage, the displacement there over Δt; None without one."""
+
+    @property
+    def carrier(self) -> NodeVector:
+        """The velocity with which positions and deformation move [m/s], shape (n, d)."""
+        return self.velocity if self.mean is None else self.mean
+
+    def slowed(self, loss: NodeVector) -> "NodeMotion":
+        """Changed by an impulse that acts evenly over the step: half of it counts for the mean."""
+        return NodeMotion(self.velocity + loss, None if self.mean is None else self.mean + loss / 2, self.inner)
+
+
+class Explicit(eqx.Module):
+    """Symplectic Euler: v^{n+1} = v* (reference, eq. 4); positions then move with v^{n+1}.
+
+    Second order in space with APIC and FLIP, first order in time. Conserves linear and, with APIC, angular momentum.
+
+    *When it breaks*: above Δt of about 0.4 to 1 times dx/c, depending on dimension, kernel and transfer
+    (c the pressure-wave speed of the *current* tangent, which stretching and compression raise): see `stable_dt`.
+    """
+
+    centred: ClassVar[bool] = False
+
+    def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+        """The nodes' motion and the solve's report."""
+        del guess
+        v = jnp.where(nodes.free, nodes.explicit_velocity(), nodes.conditions.velocity)
+        return NodeMotion(v), no_solve(v.dtype)
+
+    def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """Δt f(0) [kg m/s], on nodes that have mass."""
+        del motion
+        return jnp.where(nodes.occupied, nodes.dt * nodes.force, 0)
+
+    def start(self, nodes: Nodes) -> NodeVector:
+        """Nothing is iterated."""
+        return nodes.velocity
+
+
+class SemiImplicit(eqx.Module):
+    """The semi-implicit update: (M + βΔt²H) v^{n+1} = M v*, force and H at the start of the step (reference, eqs. 3,
+    6).
+
+    First order in time. On a mode of frequency ω the amplification is (1 + βz)^(−½) with z = (ωΔt)² while
+    z < 4/(1−β)²: stable for every Δt if β ≥ ½, else for z ≤ 4/(1−2β). β = 0 is the explicit step; β = 1 one Newton step
+    of backward Euler. β = ½ is *not* the trapezoidal rule, positions moving with v^{n+1}: for β > 0 motion is damped,
+    by a quarter in one period of a standing wave at the explicit limit. A method for slow, driven and overdamped
+    motion; `ImplicitMidpoint` costs as much and follows motion in time.
+    *When it breaks*: large strains within one step (the system is linearised once), and where compression makes H
+    indefinite and Δt brings M + βΔt²H near singular: `AnalyticHessian(projected=True)` holds there.
+    *Good values*: β = 1 with Δt up to some hundred times the explicit limit for quasi-static pulls.
+
+    Args:
+        beta: β, from 0 to 1.
+        hessian: how H acts. Default: by the analytic stress differential.
+        solver: conjugate residuals of the forward solve.
+        adjoint_solver: of the tangent and adjoint solves, whose tolerance bounds the gradient's. Default: default
+            tolerances.
+        guess: where the solve starts.
+    """
+
+    beta: Scalar = 1.0
+    hessian: Hessian = AnalyticHessian()
+    solver: ConjugateResidual = ConjugateResidual()
+    adjoint_solver: ConjugateResidual = ConjugateResidual()
+    guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
+    centred: ClassVar[bool] = False
+
+    def __check_init__(self):
+        require_between("SemiImplicit's beta", self.beta, 0, 1)
+
+    def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+        """The nodes' motion and the solve's report."""
+        predictor = nodes.explicit_velocity()
+        problem = LinearProblem(
+            mass=nodes.mass,
+            factor=self.beta * nodes.dt**2,
+            hessian=self.hessian.at_rest(nodes.potential, predictor),
+            rhs=nodes.mass[:, None] * predictor,
+            free=nodes.free,
+            prescribed=nodes.conditions.velocity,
+        )
+        v, info = solve(problem, guess, Linearised(self.solver), self.adjoint_solver)
+        return NodeMotion(v), info
+
+    def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """Δt f(0) − βΔt² H v [kg m/s]."""
+        action = self.hessian.at_rest(nodes.potential, motion.velocity)
+        return nodes.dt * nodes.force - self.beta * nodes.dt**2 * action(motion.velocity)
+
+    def start(self, nodes: Nodes) -> NodeVector:
+        """The chosen guess."""
+        return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())
+
+
+class BackwardEuler(eqx.Module):
+    """Backward Euler: M (v^{n+1} − v^n) = Δt f(Δt v^{n+1}) + Δt M g (reference, eq. 2), by Newton's method.
+
+    First order in time, strongly damping; no linearisation error, so it holds where one linear solve does not.
+
+    *When it breaks*: where the incremental potential has several stationary points (steps that compress material to a
+    fraction of itself make H indefinite), Newton finds one of them, not always the one a smaller step would lead to.
+
+    Args:
+        rtol: Newton's relative tolerance. Default: 1e-8 in float64, 1e-5 in float32.
+        max_newton: most Newton steps.
+        hessian: how H acts. Default: by the analytic stress differential.
+        solver: conjugate residuals within a Newton step; a loose tolerance suffices.
+        adjoint_solver: of the tangent and adjoint solves. Default: default tolerances.
+        guess: where Newton starts.
+    """
+
+    rtol: Scalar | None = None
+    max_newton: int = eqx.field(static=True, default=30)
+    hessian: Hessian = AnalyticHessian()
+    solver: ConjugateResidual = ConjugateResidual(rtol=1e-3)
+    adjoint_solver: ConjugateResidual = ConjugateResidual()
+    guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
+    centred: ClassVar[bool] = False
+
+    def __check_init__(self):
+        if self.rtol is not None:
+            require_positive("BackwardEuler's rtol", self.rtol)
+
+    def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+        """The nodes' motion and the solve's report."""
+        newton = Newton(self.solver, self.rtol, self.max_newton)
+        stage = _Stage(nodes.inertial_velocity(), nodes.dt)
+        v, info = stage.solve(nodes, guess, self.hessian, newton, self.adjoint_solver)
+        return NodeMotion(v), info
+
+    def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """Δt f(Δt v) [kg m/s]."""
+        return nodes.dt * nodes.potential.force(nodes.dt * motion.velocity)
+
+    def start(self, nodes: Nodes) -> NodeVector:
+        """The chosen guess."""
+        return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())
+
+
+class ImplicitMidpoint(eqx.Module):
+    """The implicit midpoint rule: M (v^{n+1} − v^n) = Δt f(½Δt v̄) + Δt M g with v̄ = ½(v^n + v^{n+1}), positions and
+    deformation moving with v̄.
+
+    By one linear solve, (M + ¼Δt²H) v̄ = M v^n + ½Δt (f + M g), at the cost of `SemiImplicit`; or by Newton's method.
+    Second order in time either way. On a mode of any frequency |λ| = 1 at every Δt: stable, and nothing is dissipated
+    but by the transfers; a mode that Δt does not resolve is slowed down, to a period of some πΔt, and not damped.
+    Walls stop what they hold at once. Body forces are taken at the middle of the step.
+    *When it breaks*: as the semi-implicit step (one solve: large strains in a step; compression: half as soon in Δt).
+    What rings unresolved (an impact, a start from rest under load at a large Δt) rings on: `TRBDF2` damps it.
+    *Good values*: Δt that resolves the motion of interest, tens of steps a period, whatever the explicit limit.
+    (E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration, 2nd ed. 2006, II.1.)
+
+    Args:
+        solution: `Linearised()`, one linear solve, or `Newton()`.
+        hessian: how H acts. Default: by the analytic stress differential.
+        adjoint_solver: of the tangent and adjoint solves. Default: default tolerances.
+        guess: where the solve starts.
+    """
+
+    solution: Linearised | Newton = Linearised()
+    hessian: Hessian = AnalyticHessian()
+    adjoint_solver: ConjugateResidual = ConjugateResidual()
+    guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
+    centred: ClassVar[bool] = True
+
+    def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+        """The nodes' motion and the solve's report."""
+        v0, half = nodes.admitted_velocity(), nodes.dt / 2
+        stage = _Stage(v0 + half * nodes.acceleration, half)
+        mean, info = stage.solve(nodes, guess, self.hessian, self.solution, self.adjoint_solver)
+        return NodeMotion(2 * mean - v0, mean), info
+
+    def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """Δt f(½Δt v̄) [kg m/s]."""
+        return nodes.dt * _force(nodes, nodes.dt / 2 * motion.carrier, self.hessian, self.solution)
+
+    def start(self, nodes: Nodes) -> NodeVector:
+        """The chosen guess."""
+        return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())
+
+
+class TRBDF2(eqx.Module):
+    """A trapezoidal stage to γΔt, then a step with what is known at 0, γΔt and Δt: for y' = F(y),
+
+        y_γ = y_0 + ½γΔt (F_0 + F_γ),    y_1 = y_0 + Δt (q_0 F_0 + q_1 F_γ + q_2 F_1).
+
+    Second order in time, stable at every Δt, and a mode that Δt does not resolve is multiplied by ρ∞ in each step:
+    with ρ∞ = 0, TR-BDF2, it is gone at once (L-stable); with 1 the method is two trapezoidal steps of Δt/2. γ and q are
+    fixed by the order, by ρ∞ and by both stages having the same matrix, M + (½γΔt)²H: two solves a step, each of them
+    easier than that of `ImplicitMidpoint`, ½γ being 0.29 (ρ∞ = 0) to 0.25.
+    (R. E. Bank et al., IEEE Trans. CAD 4 (1985) 436, doi 10.1109/TCAD.1985.1270142; with ρ∞: G. Noh, K.-J. Bathe,
+    Comput. Struct. 212 (2019) 299, doi 10.1016/j.compstruc.2018.11.001.)
+
+    For motion to be followed in time in which unresolved frequencies would ring: contact, stiff starts.
+    *When it breaks*: as `ImplicitMidpoint`.
+
+    Args:
+        rho: ρ∞, from 0 to 1.
+        solution: `Linearised()`, one linear solve a stage, or `Newton()`.
+        hessian: how H acts. Default: by the analytic stress differential.
+        adjoint_solver: of the tangent and adjoint solves. Default: default tolerances.
+        guess: where the first stage's solve starts; the second's does where the first ended.
+    """
+
+    rho: Scalar = 0.0
+    solution: Linearised | Newton = Linearised()
+    hessian: Hessian = AnalyticHessian()
+    adjoint_solver: ConjugateResidual = ConjugateResidual()
+    guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
+    centred: ClassVar[bool] = True
+
+    def __check_init__(self):
+        require_between("TRBDF2's rho", self.rho, 0, 1)
+
+    def weights(self) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+        """γ, q_0, q_1, q_2: γ solves (1 − ρ∞)γ² − 4γ + 2 = 0, q_2 = ½γ, q_1 = (½ − q_2)/γ, q_0 = 1 − q_1 − q_2."""
+        gamma = 2 / (2 + jnp.sqrt(2 + 2 * jnp.asarray(self.rho)))
+        q1 = (1 / gamma - 1) / 2
+        return gamma, 1 - q1 - gamma / 2, q1, gamma / 2
+
+    def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+        """The nodes' motion and the solves' report."""
+        _, q0, q1, q2 = self.weights()
+        dt, g, v0 = nodes.dt, nodes.acceleration, nodes.admitted_velocity()
+        how = self.hessian, self.solution, self.adjoint_solver
+        c = q2 * dt  # = ½γΔt
+        pull = nodes.per_mass(nodes.force)
+        trapezoidal = _Stage(v0 + c * (pull + 2 * g), c, c * v0)
+        middle, first = trapezoidal.solve(nodes, guess, *how)
+        later_pull = (middle - trapezoidal.inertial) / c  # f_γ/m, by the stage's own equation
+        last = _Stage(v0 + dt * (q0 * pull + q1 * later_pull + g), c, dt * (q0 * v0 + q1 * middle))
+        v, second = last.solve(nodes, middle, *how)
+        inner = q2 * (v0 + middle)
+        return NodeMotion(v, q0 * v0 + q1 * middle + q2 * v, inner), first.beside(second)
+
+    def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """Δt (q_0 f_0 + q_1 f_γ + q_2 f_1) [kg m/s]."""
+        _, q0, q1, q2 = self.weights()
+        inner = motion.carrier if motion.inner is None else motion.inner
+        at_inner, at_end = (_force(nodes, nodes.dt * u, self.hessian, self.solution) for u in (inner, motion.carrier))
+        return nodes.dt * (q0 * nodes.force + q1 * at_inner + q2 * at_end)
+
+    def start(self, nodes: Nodes) -> NodeVector:
+        """The chosen guess."""
+        return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())
+
+
+Method = Explicit | SemiImplicit | BackwardEuler | ImplicitMidpoint | TRBDF2
+
+
+class _Stage(eqx.Module):
+    """M (v − a) = c f(u + c v)."""
+
+    inertial: NodeVector
+    """a [m/s]."""
+    length: Float[Array, ""]
+    """c [s]."""
+    displaced: NodeVector | None = None
+    """u [m]; None for zero."""
+
+    def solve(
+        self,
+        nodes: Nodes,
+        guess: NodeVector,
+        hessian: Hessian,
+        solution: Linearised | Newton,
+        adjoint: ConjugateResidual,
+    ) -> tuple[NodeVector, SolveInfo]:
+        """The velocity and the solve's report."""
+        match solution:
+            case Linearised():
+                action = hessian.at_rest(nodes.potential, guess)
+                force = nodes.force if self.displaced is None else nodes.force - action(self.displaced)
+                problem = LinearProblem(
+                    mass=nodes.mass,
+                    factor=self.length**2,
+                    hessian=action,
+                    rhs=nodes.mass[:, None] * self.inertial + self.length * force,
+                    free=nodes.free,
+                    prescribed=nodes.conditions.velocity,
+                )
+            case Newton():
+                problem = NewtonProblem(
+                    mass=nodes.mass,
+                    inertial=self.inertial,
+                    length=self.length,
+                    displaced=self.displaced,
+                    spacing=nodes.spacing,
+                    potential=nodes.potential,
+                    hessian=hessian,
+                    free=nodes.free,
+                    prescribed=nodes.conditions.velocity,
+                )
+        return solve(problem, guess, solution, adjoint)
+
+
+def _force(nodes: Nodes, u: NodeVector, hessian: Hessian, solution: Linearised | Newton) -> NodeVector:
+    """The elastic force [N] at a nodal displacement u, as a stage takes it."""
+    match solution:
+        case Linearised():
+            return nodes.force - hessian.at_rest(nodes.potential, u)(u)
+        case Newton():
+            return nodes.potential.force(u)
