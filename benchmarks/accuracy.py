@@ -88,8 +88,10 @@ def measure(quick: bool):
         "semi-implicit, β = 1/2": mpm.SemiImplicit(beta=0.5),
         "semi-implicit, β = 1": mpm.SemiImplicit(),
         "backward Euler": mpm.BackwardEuler(),
+        "implicit midpoint": mpm.ImplicitMidpoint(),
+        "TR-BDF2": mpm.TRBDF2(),
     }.items():
-        longer = numbers if name == "explicit" else (1.6, *numbers)
+        longer = numbers if name == "explicit" else (6.4, 1.6, *numbers)
         yield over_steps("time", name, StandingWave(0.05), 32, longer, method=method, transfer=FLIP)
 
 

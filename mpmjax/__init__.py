@@ -1,4 +1,4 @@
-"""A differentiable Material Point Method in JAX, with explicit, semi-implicit and backward-Euler grid updates."""
+"""A differentiable Material Point Method in JAX, with explicit and implicit grid updates."""
 
 from mpmjax._body_force import AbstractBodyForce
 from mpmjax._boundary import AbstractBoundary, Conditions, Grip, SeparatingBox, SlipBox, StickyBox
