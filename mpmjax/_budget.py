@@ -51,8 +51,8 @@ class EnergyBudget(eqx.Module):
     """Work of the impulse by which the solve misses its equation."""
     time_integration: Float[Array, "*f"]
     """What Δt adds: the energies' change along the step less the work of their forces at its start,
-    [Φ(Δt v^{n+1}) − Φ(0) + Δt f^n·v̄] + Δt G·(v̄ − v^{n+1}), G the nodes' weight. Of second order in Δt in each step, of
-    first over a given time."""
+    [Φ(Δt v_c) − Φ(0) + Δt f^n·v̄] + Δt G·(v̄ − v_c), v_c the velocity with which the nodes move and
+    G their weight. Of second order in Δt in each step, of first over a given time."""
 
     @property
     def change(self) -> Float[Array, "*f"]:
@@ -165,15 +165,14 @@ def _step_budget(scene: Scene, before: Particles, after: Particles, nodes: Nodes
         kept = kept + (before.mass * (C_new**2 * turn).sum(axis=(0, 1))).sum() / 2
 
     old, new_energy = energy_of(scene, before), energy_of(scene, after)
-    elastic_change = new_energy.elastic - old.elastic
-    potential_change = new_energy.potential - old.potential
+    stored = potential.energy(dt * new.motion.carrier)
     share = jnp.where(nodes.occupied, images.fold(jnp.broadcast_to(raw, v0.shape)), 0)
     share = nodes.per_mass(share)  # of an impulse at a node in the particles' momentum: 1 but at symmetry planes
     return Budget(
         EnergyBudget(
             kinetic=new_energy.kinetic - old.kinetic,
-            elastic=elastic_change,
-            potential=potential_change,
+            elastic=new_energy.elastic - old.elastic,
+            potential=new_energy.potential - old.potential,
             p2g=lost_p2g,
             g2p=lost_g2p - kept,
             implicit=((elastic_at_start - elastic) * mean).sum(),
@@ -181,10 +180,10 @@ def _step_budget(scene: Scene, before: Particles, after: Particles, nodes: Nodes
             friction=(friction * mean).sum(),
             body_force=(body * mean).sum(),
             solver=(missed * mean).sum(),
-            time_integration=elastic_change
+            time_integration=stored
+            - potential.energy(jnp.zeros_like(v0))
             + (elastic_at_start * mean).sum()
-            + potential_change
-            + (weight * mean).sum(),
+            + (weight * (mean - new.motion.carrier)).sum(),
         ),
         MomentumBudget(
             change=(before.mass * components(after.v - before.v)).sum(axis=1),

@@ -92,25 +92,26 @@ def untouched(nodes: Nodes, active: ActiveSet) -> Mask:
 def find_active_set(
     nodes: Nodes,
     guess: NodeVector,
-    try_set: Callable[[ActiveSet, NodeVector], tuple[NodeVector, NodeVector, SolveInfo]],
+    try_set: Callable[[ActiveSet, NodeVector], tuple[NodeVector, NodeVector, NodeVector, SolveInfo]],
 ) -> tuple[ActiveSet, NodeVector, SolveInfo, Int[Array, ""]]:
     """What the walls hold, a velocity to start the last solve from, and what the sweeps cost.
 
     Args:
         nodes: nodes of which nothing is held yet.
         guess: where the first solve starts [m/s].
-        try_set: (active, guess) to (velocity, imbalance [kg m/s] of all nodes, report). Must not be differentiated.
+        try_set: (active, guess) to (velocity, imbalance [kg m/s] of all nodes, guess of the next solve, report). Must
+            not be differentiated.
 
     Returns:
         active set, velocity, the sweeps' reports added up, number of sweeps.
     """
 
     def sweep(state: tuple) -> tuple:
-        active, v, cost, _, count = state
-        v, imbalance, info = try_set(active, v)
+        active, guess, cost, _, count = state
+        v, imbalance, guess, info = try_set(active, guess)
         pulls, enters = _verdict(nodes, active, v, imbalance)
         active = jax.tree.map(lambda held, pulled, entered: (held & ~pulled) | entered, active, pulls, enters)
-        return active, v, cost.plus(info), _number(nodes, pulls) + _number(nodes, enters) > 0, count + 1
+        return active, guess, cost.plus(info), _number(nodes, pulls) + _number(nodes, enters) > 0, count + 1
 
     def unsettled(state: tuple) -> Array:
         return state[3] & (state[4] < SWEEPS)
@@ -121,8 +122,8 @@ def find_active_set(
         tuple(_approach(nodes, contact, predictor) < 0 for contact in nodes.contacts),
     )
     start = (active, guess, no_solve(guess.dtype), jnp.asarray(True), jnp.asarray(0, dtype=jnp.int32))
-    active, v, cost, _, count = jax.lax.while_loop(unsettled, sweep, start)
-    return active, v, cost, count
+    active, guess, cost, _, count = jax.lax.while_loop(unsettled, sweep, start)
+    return active, guess, cost, count
 
 
 def count_violations(nodes: Nodes, active: ActiveSet, v: NodeVector, imbalance: NodeVector) -> Int[Array, ""]:

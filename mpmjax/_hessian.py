@@ -55,8 +55,8 @@ class AnalyticHessian(eqx.Module):
 
     With `projected`, each particle's stress differential is made positive semi-definite first (see
     `projected_tangent`), so that M + cH is positive definite whatever the compression and the step. A particle whose
-    differential is so already is not changed by it. The semi-implicit step then solves another, more strongly damped
-    equation where it matters; backward Euler only takes another way to the same solution. First derivatives stay
+    differential is so already is not changed by it. One linear solve then solves another, more strongly damped
+    equation where it matters; Newton's method only takes another way to the same solution. First derivatives stay
     exact; second ones are refused.
 
     Args:
@@ -102,8 +102,8 @@ Hessian = AnalyticHessian | JvpHessian
 
 
 class ImplicitOperator(lx.AbstractLinearOperator):
-    """Q (M + c H) Q + I − Q, symmetric: c = βΔt² for the semi-implicit step (reference, eq. 6 times m_i), Δt² for
-    Newton.
+    """Q (M + c H) Q + I − Q, symmetric: c = βΔt² for the semi-implicit step (reference, eq. 6 times m_i), the square of
+    its length for a stage.
 
     Q keeps the components that are free; rows of prescribed components and of empty nodes are the identity.
     """

@@ -1,8 +1,8 @@
 """The nodal problems of the implicit updates, how each is solved, and one derivative rule for both.
 
-A problem is an equation residual(v) = 0 for the nodes' new velocity v, with a symmetric Jacobian. Whatever iteration
-finds v, its derivative is that of the implicit function theorem, J δv = −δ(residual): one more solve with the same
-operator, forward or backward, so that no iteration is ever differentiated.
+A problem is an equation residual(v) = 0 for a velocity v of the nodes, the new one or that of a stage, with a symmetric
+Jacobian. Whatever iteration finds v, its derivative is that of the implicit function theorem, J δv = −δ(residual): one
+more solve with the same operator, forward or backward, so that no iteration is ever differentiated.
 """
 
 import abc
@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 
+from mpmjax._checks import require, require_positive
 from mpmjax._conjugate_residual import LARGEST_RESIDUAL, ConjugateResidual, default_rtol
 from mpmjax._hessian import Hessian, ImplicitOperator
 from mpmjax._potential import ElasticPotential
@@ -157,8 +158,8 @@ class NewtonProblem(AbstractProblem):
         return jnp.sqrt(self.mass.sum()) * self.spacing / self.length
 
     def merit(self, v: NodeVector) -> Float[Array, ""]:
-        """E(v) [J]."""
-        inertia = 0.5 * (self.mass[:, None] * (v - self.inertial) ** 2).sum()
+        """E(v) [J], without the constant of what is held."""
+        inertia = 0.5 * jnp.where(self.free, self.mass[:, None] * (v - self.inertial) ** 2, 0).sum()
         return inertia + self.potential.energy(self.displacement(v))
 
 
@@ -210,6 +211,11 @@ class Newton(eqx.Module):
     solver: ConjugateResidual = ConjugateResidual(rtol=1e-3)
     rtol: Scalar | None = None
     max_steps: int = eqx.field(static=True, default=30)
+
+    def __check_init__(self):
+        if self.rtol is not None:
+            require_positive("Newton's rtol", self.rtol)
+        require(self.max_steps >= 1, f"Newton's max_steps must be at least 1, got {self.max_steps}.")
 
     def __call__(self, problem: NewtonProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         """The solution, started from a guess."""

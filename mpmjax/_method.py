@@ -1,9 +1,9 @@
 """The ways to update the grid's velocity in a step.
 
 A method says how the nodes move (`move`) and what impulse the elastic force gives them meanwhile (`elastic_impulse`);
-walls, contact, friction, transfers, reports and derivatives are the same for all. The implicit ones are made of
-stages M (v − a) = c f(u + c v), f(u) the elastic force at the nodal displacement u: each is one linear solve, with
-f(u) = f(0) − H u, or Newton's method.
+walls, contact, friction, transfers, reports and derivatives are the same for all. Backward Euler and the methods of
+second order are made of stages M (v − a) = c f(u + c v), f(u) the elastic force at the nodal displacement u: each is
+one linear solve, with f(u) = f(0) − H u, or Newton's method.
 """
 
 from typing import ClassVar
@@ -50,6 +50,7 @@ class Explicit(eqx.Module):
     (c the pressure-wave speed of the *current* tangent, which stretching and compression raise): see `stable_dt`.
     """
 
+    guess: ClassVar[Guess] = Guess.GRID_VELOCITY
     centred: ClassVar[bool] = False
 
     def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
@@ -62,10 +63,6 @@ class Explicit(eqx.Module):
         """Δt f(0) [kg m/s], on nodes that have mass."""
         del motion
         return jnp.where(nodes.occupied, nodes.dt * nodes.force, 0)
-
-    def start(self, nodes: Nodes) -> NodeVector:
-        """Nothing is iterated."""
-        return nodes.velocity
 
 
 class SemiImplicit(eqx.Module):
@@ -119,10 +116,6 @@ class SemiImplicit(eqx.Module):
         action = self.hessian.at_rest(nodes.potential, motion.velocity)
         return nodes.dt * nodes.force - self.beta * nodes.dt**2 * action(motion.velocity)
 
-    def start(self, nodes: Nodes) -> NodeVector:
-        """The chosen guess."""
-        return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())
-
 
 class BackwardEuler(eqx.Module):
     """Backward Euler: M (v^{n+1} − v^n) = Δt f(Δt v^{n+1}) + Δt M g (reference, eq. 2), by Newton's method.
@@ -164,21 +157,18 @@ class BackwardEuler(eqx.Module):
         """Δt f(Δt v) [kg m/s]."""
         return nodes.dt * nodes.potential.force(nodes.dt * motion.velocity)
 
-    def start(self, nodes: Nodes) -> NodeVector:
-        """The chosen guess."""
-        return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())
-
 
 class ImplicitMidpoint(eqx.Module):
     """The implicit midpoint rule: M (v^{n+1} − v^n) = Δt f(½Δt v̄) + Δt M g with v̄ = ½(v^n + v^{n+1}), positions and
     deformation moving with v̄.
 
     By one linear solve, (M + ¼Δt²H) v̄ = M v^n + ½Δt (f + M g), at the cost of `SemiImplicit`; or by Newton's method.
-    Second order in time either way. On a mode of any frequency |λ| = 1 at every Δt: stable, and nothing is dissipated
-    but by the transfers; a mode that Δt does not resolve is slowed down, to a period of some πΔt, and not damped.
-    Walls stop what they hold at once. Body forces are taken at the middle of the step.
-    *When it breaks*: as the semi-implicit step (one solve: large strains in a step; compression: half as soon in Δt).
-    What rings unresolved (an impact, a start from rest under load at a large Δt) rings on: `TRBDF2` damps it.
+    Second order in time either way, but for one solve with a projected Hessian, which is another equation. On a mode of
+    any frequency |λ| = 1 at every Δt: stable, and nothing is dissipated but by the transfers; a mode that Δt does not
+    resolve is slowed down, at most to a period of 2Δt, and not damped. Body forces are taken at the middle of the step.
+    *When it breaks*: as the semi-implicit step: one solve at large strains in a step; compression, at twice the Δt at
+    which β = 1 does. Newton's line search keeps the middle of the step admissible, not its end. What rings unresolved
+    (an impact, a start under load at a large Δt) rings on: `TRBDF2` damps it.
     *Good values*: Δt that resolves the motion of interest, tens of steps a period, whatever the explicit limit.
     (E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration, 2nd ed. 2006, II.1.)
 
@@ -205,10 +195,6 @@ class ImplicitMidpoint(eqx.Module):
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt f(½Δt v̄) [kg m/s]."""
         return nodes.dt * _force(nodes, nodes.dt / 2 * motion.carrier, self.hessian, self.solution)
-
-    def start(self, nodes: Nodes) -> NodeVector:
-        """The chosen guess."""
-        return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())
 
 
 class TRBDF2(eqx.Module):
@@ -271,10 +257,6 @@ class TRBDF2(eqx.Module):
         inner = motion.carrier if motion.inner is None else motion.inner
         at_inner, at_end = (_force(nodes, nodes.dt * u, self.hessian, self.solution) for u in (inner, motion.carrier))
         return nodes.dt * (q0 * nodes.force + q1 * at_inner + q2 * at_end)
-
-    def start(self, nodes: Nodes) -> NodeVector:
-        """The chosen guess."""
-        return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())
 
 
 Method = Explicit | SemiImplicit | BackwardEuler | ImplicitMidpoint | TRBDF2

@@ -34,7 +34,8 @@ def stable_dt(
     - a = 4/dx² (quadratic), 3/dx² (cubic); κ = 1 for APIC and 0 for PIC and FLIP, which forget the affine velocity.
 
     At F = I that is √(4ρ0/((2μ + dλ)(2Ξ − κa))). The semi-implicit step's is 1/√(1 − 2β) times it for β < ½; for
-    β ≥ ½, and for backward Euler, there is none: the result is infinite, and says nothing of accuracy.
+    β ≥ ½, for backward Euler and for the methods of second order there is none: the result is infinite, and says
+    nothing of accuracy.
 
     The default safety of 0.7 is for what is not linear. Vibrations of a few per cent grow below the linear limit where
     a mode's third or fourth harmonic resonates with the step, (ωΔt)² = 3 and 2, at 0.87 and 0.71 of the limit: a

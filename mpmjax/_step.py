@@ -80,8 +80,9 @@ def advance(
 def update(nodes: Nodes, method: Method) -> GridUpdate:
     """The nodes' motion, boundaries and contact included."""
     with jax.named_scope("update"):
+        guess = method.guess.velocity(nodes.velocity, nodes.explicit_velocity())
         if not touches(nodes):
-            motion, info = method.move(nodes, method.start(nodes))
+            motion, info = method.move(nodes, guess)
             elastic, reaction = impulses(nodes, method, motion)
             return GridUpdate(nodes.velocity, motion, elastic, reaction, None, nodes.free, info, no_contact())
 
@@ -93,9 +94,9 @@ def update(nodes: Nodes, method: Method) -> GridUpdate:
 
         def tried(active: ActiveSet, guess: NodeVector) -> tuple:
             motion, info = with_held(*frozen, active, guess)
-            return motion.velocity, impulses(*frozen, motion)[1], info
+            return motion.velocity, impulses(*frozen, motion)[1], motion.carrier, info
 
-        guess = frozen[1].start(frozen[0])
+        guess = jax.lax.stop_gradient(guess)
         active, guess, cost, sweeps = find_active_set(frozen[0], guess, tried)
         motion, info = with_held(nodes, method, active, guess)
         elastic, reaction = impulses(nodes, method, motion)

@@ -20,8 +20,9 @@ UPDATES = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(beta=0.8, solver=TIGHT, adjoint_solver=TIGHT),
     "backward_euler": mpm.BackwardEuler(rtol=1e-14, solver=TIGHT, adjoint_solver=TIGHT),
-    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT), adjoint_solver=TIGHT),
-    "trbdf2": mpm.TRBDF2(0.2, mpm.Newton(TIGHT, rtol=1e-14), adjoint_solver=TIGHT),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Newton(TIGHT, rtol=1e-14), adjoint_solver=TIGHT),
+    "trbdf2": mpm.TRBDF2(0.2, mpm.Linearised(TIGHT), adjoint_solver=TIGHT),
+    "trbdf2_newton": mpm.TRBDF2(0.2, mpm.Newton(TIGHT, rtol=1e-14), adjoint_solver=TIGHT),
 }
 DX, DT, STEPS = 0.1, 1e-2, 20
 
@@ -62,7 +63,7 @@ def parameters(case: Case) -> dict[str, Any]:
         q["displacement"] = jnp.asarray([[0.0] * d, [0.4, 0.3, 0.2][:d]])
     if case.update == "semi_implicit":
         q["beta"] = jnp.asarray(0.8)
-    if case.update == "trbdf2":
+    if case.update.startswith("trbdf2"):
         q["rho"] = jnp.asarray(0.2)
     return q
 
@@ -147,7 +148,7 @@ def quickly_compiled(f: Any) -> Any:
     return jax.jit(f, compiler_options={"xla_backend_optimization_level": 0})
 
 
-class Linearised(NamedTuple):
+class Derivatives(NamedTuple):
     """A rollout and its derivative at some parameters."""
 
     y: jax.Array
@@ -162,13 +163,13 @@ class Linearised(NamedTuple):
 
 @functools.cache
 def linearised(case: Case) -> Any:
-    """The compiled function (q, t, u) → `Linearised`."""
+    """The compiled function (q, t, u) → `Derivatives`."""
 
-    def evaluate(q: Any, t: Any, u: Any) -> Linearised:
+    def evaluate(q: Any, t: Any, u: Any) -> Derivatives:
         f = functools.partial(rolled, case=case)
         y, pushed, branches = jax.jvp(f, (q,), (t,), has_aux=True)
         pulled = jax.vjp(f, q, has_aux=True)[1](u)[0]
-        return Linearised(y, pushed, pulled, branches)
+        return Derivatives(y, pushed, pulled, branches)
 
     return quickly_compiled(evaluate)
 

@@ -133,7 +133,7 @@ def test_an_explicit_step_dissipates_nothing_implicitly_and_beta_does():
     assert 0 < half < whole
 
 
-def test_methods_of_second_order_give_back_what_they_take_implicitly():
+def test_the_midpoint_rule_gives_back_what_it_takes_implicitly():
     """time_integration − implicit is of second order over a given time, and less than a hundredth of either."""
     sums = []
     for halvings in (2, 3, 4):

@@ -186,6 +186,30 @@ def test_a_sliding_block_decelerates_at_mu_g(name, floor):
     assert_close(v[:, 0], 3.0 - mu * (G * t + v[:, 1]), 1e-9)
 
 
+@pytest.mark.slow
+@EACH_FLOOR
+@pytest.mark.parametrize("method", [OTHERS["implicit_midpoint"], OTHERS["trbdf2"]], ids=["midpoint", "trbdf2"])
+def test_methods_of_second_order_slide_with_the_mean_velocity(method, floor):
+    """Δv_x = −μ (g t + Δv_y), and the block's centre moves with the mean of the velocities before and after: exactly
+    by the midpoint rule, to third order in Δt by TR-BDF2."""
+    mu, steps = 0.3, 25
+    scene, particles = on_a_floor(floor, friction=mu, velocity=(3.0, 0.0))
+    dt = 2 * explicit_limit(scene)
+
+    def watch(scene, particles):
+        del scene
+        return jnp.concatenate([particles.v.mean(axis=0), particles.x.mean(axis=0)])
+
+    run = mpm.simulate(scene, particles, t1=steps * dt, dt=dt, method=method, observe=watch)
+    v, x = np.split(np.asarray(run.observed), 2, axis=1)
+    t = dt * np.arange(steps + 1)
+    assert v[-1, 0] < 3.0 - 0.8 * mu * G * t[-1]
+    assert_close(v[:, 0], 3.0 - mu * (G * t + v[:, 1]), 1e-9)
+    missed = np.diff(x[:, 0]) - dt * (v[1:, 0] + v[:-1, 0]) / 2
+    exact = isinstance(method, mpm.ImplicitMidpoint)
+    assert np.abs(missed).max() < (1e-9 if exact else 0.02) * dt * np.abs(np.diff(v[:, 0])).max()
+
+
 @EACH_FLOOR
 @NAMES
 @pytest.mark.parametrize(("slope", "sticks"), [(0.25, True), (0.8, False)])
@@ -262,7 +286,7 @@ def test_whatever_columns_are_held_mirroring_twice_is_mirroring_once(number):
         def try_set(active, guess):
             motion, info = method.move(holding(nodes, active), guess)
             motion = jax.tree.map(held_images(nodes, active).unfold, motion)
-            return motion.velocity, impulses(nodes, method, motion)[1], info
+            return motion.velocity, impulses(nodes, method, motion)[1], motion.carrier, info
 
         active, _, _, sweeps = find_active_set(nodes, nodes.velocity, try_set)
         held_on_plane = active.columns[0].reshape(grid.shape)[4]  # the first plane's node along its axis

@@ -27,7 +27,7 @@ GRIP = mpm.Grip(mpm.Box((-1.0, -1.0), (1.0, 0.05)), mpm.Motion((0.0, 1.0), ((0.0
 @eqx.filter_jit
 def move(method, nodes):
     """The nodes' motion and the solves' report."""
-    return method.move(nodes, method.start(nodes))
+    return method.move(nodes, nodes.velocity)
 
 
 def trapezoidal(A, y, h):
@@ -73,7 +73,7 @@ def test_a_step_is_that_of_the_first_order_system(method, description):
     assert_close(dt * np.asarray(motion.mean).ravel()[free], expected[:n], 1e-10)
     assert_close(np.asarray(motion.velocity).ravel()[free], expected[n : 2 * n], 1e-10)
     for v in (motion.velocity, motion.mean):
-        np.testing.assert_array_equal(np.asarray(v).ravel()[~free], held[~free])
+        np.testing.assert_allclose(np.asarray(v).ravel()[~free], held[~free], rtol=1e-14)
 
 
 @pytest.mark.parametrize("method", **ids(BY_NEWTON))
@@ -113,7 +113,8 @@ def test_rho_must_lie_between_zero_and_one(bad):
 
 def test_midpoint_by_newton_keeps_the_angular_momentum_of_the_nodes():
     """Σ m (x + Δt v̄) × v^{n+1} = Σ m x × v^n for a free body: the rule keeps quadratic invariants, and the potential
-    knows no rotation of the nodes. To 1e-12 at a step in which one linear solve loses a per cent."""
+    knows no rotation of the nodes. To 1e-12 of momentum times half the block's side at 2 dx/c, where one linear solve
+    misses it by more than 1e-3."""
     scene, particles = jolted(speed=2.0)
     dt = 2 * explicit_limit(scene)
     before = grid_update(scene, particles, dt, mpm.Explicit())

@@ -32,8 +32,8 @@ def errors(
         courant: Δt c/dx, c the pressure-wave speed at rest; one for all grids, or one for each. It is rounded down so
             that ten whole numbers of steps fill the duration.
         method: update of the grid velocity.
-        staggered: whether initial velocities are those of half a step before the start, see `discretise`. Default: but
-            for methods of second order, whose velocities stand at the time of the positions.
+        staggered: whether initial velocities are those of half a step before the start, see `discretise`. Default:
+            yes, but with methods of second order, whose velocities stand at the time of the positions.
         discretisation: of `discretise`.
     """
     numbers = [courant] * len(cells) if isinstance(courant, (int, float)) else courant

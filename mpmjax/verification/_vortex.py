@@ -49,7 +49,7 @@ class Vortex(AbstractProblem):
     Without change of volume, at rest at the ring's edges.
 
     Args:
-        amplitude: A [rad]: at 0.3 the ring's shear reaches about 1, at 1 about 3.
+        amplitude: A [rad]: the shear of F reaches 7 A in the ring.
         material: any law.
         density: ρ0 [kg/m²].
     """
