@@ -54,8 +54,7 @@ def held_cases():
 
 def contact_cases():
     """Sliding on a floor, in two dimensions; there is no contact in the total description."""
-    others = [("implicit_midpoint", "fixed_corotated"), ("trbdf2", "neo_hookean")]
-    for update, law in [*itertools.product(METHODS, LAWS), *others]:
+    for update, law in [*itertools.product(METHODS, LAWS), ("implicit_midpoint", "fixed_corotated")]:
         case = Case(update, law, "updated", 2, contact=True)
         now = case.update == "explicit" and case.law == "fixed_corotated"
         yield pytest.param(case, marks=() if now else pytest.mark.slow, id=str(case))
@@ -152,7 +151,7 @@ RUIN = {
 
 @pytest.mark.parametrize(
     "update",
-    ["explicit", *(pytest.param(u, marks=pytest.mark.slow) for u in ("semi_implicit", "backward_euler", "trbdf2"))],
+    ["explicit", *(pytest.param(u, marks=pytest.mark.slow) for u in ("semi_implicit", "backward_euler"))],
 )
 def test_a_batch_equals_a_loop_bit_for_bit_the_same_beside_a_member_that_turns_nan(update):
     """Value and gradient with respect to everything, by vmap of `simulate`: each of three is as alone, and when the
