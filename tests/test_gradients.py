@@ -38,8 +38,8 @@ import mpmjax as mpm
 def held_cases():
     """Every update × law × description × dimension, but of backward Euler in three dimensions one law for each
     description, and of the updates of second order, whose stages are of one form with those of the others, the same in
-    one and two. By default each update in one
-    dimension, with one law for each description, and the explicit one in two; the rest is slow."""
+    one and two. By default each update in one dimension, with one law for each description, and the explicit one in
+    two; the rest is slow."""
     for update, law, description in itertools.product(UPDATES, LAWS, DESCRIPTIONS):
         turn = (list(UPDATES).index(update) + list(LAWS).index(law) + list(DESCRIPTIONS).index(description)) % 2
         dims = (1, 2, 3) if turn or update != "backward_euler" else (1, 2)
