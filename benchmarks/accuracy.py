@@ -15,6 +15,7 @@ from typing import NamedTuple
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import NullLocator
 
 import mpmjax as mpm
 from mpmjax.verification import AxisAligned, Ends, StandingWave, Vortex, errors
@@ -97,14 +98,17 @@ def measure(quick: bool):
 
 def draw(series: list[Series]) -> None:
     """One panel a question."""
-    figure, axes = plt.subplots(1, len(PANELS), figsize=(4 * len(PANELS), 4.2), constrained_layout=True)
+    figure, axes = plt.subplots(1, len(PANELS), figsize=(4 * len(PANELS), 5.5), constrained_layout=True)
     for axis, (panel, (label, problem)) in zip(axes, PANELS.items(), strict=True):
         for s in series:
             if s.panel == panel:
                 name = f"{s.name} ({s.seconds:.2g} s)" if panel == "quadrature" else s.name
                 axis.loglog(s.x, s.error, "o-", label=name)
         axis.set(title=f"{panel}\n{problem}", xlabel=label, ylabel="largest RMS displacement error [m]")
-        axis.legend(fontsize=7)
+        axis.set_xticks(sorted({x for s in series if s.panel == panel for x in s.x}))
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set_minor_locator(NullLocator())
+        axis.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.15), frameon=False)
         axis.grid(visible=True, which="both", alpha=0.2)
     figure.savefig(DOCS / "accuracy.png", dpi=110)
 

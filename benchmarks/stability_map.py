@@ -2,21 +2,25 @@
 
     python benchmarks/stability_map.py [--quick]
 
-Three sweeps of the real step, in float64, fixed corotated, quadratic APIC, 2-D; Δt in units of `stable_dt(safety=1)`:
+Sweeps of the real step, in float64, fixed corotated, quadratic APIC, 2-D; Δt in units of `stable_dt(safety=1)`:
 
 - particle: one alone, at rest. |λ| of the Jacobian of a semi-implicit step over Δt and β; the edge is 1/√(1 − 2β).
 - spin: a free block of three cells a side, compressed, turning slowly. What one step makes of the spin; the plain
   semi-implicit step should multiply it by 1/(1 − (Δt/Δ̂t)²), Δ̂t from the lowest eigenvalue of the assembled Hessian.
 - block: the same block with random velocities, particles alternately soft and stiff, at rest size or compressed. The
   largest energy (kinetic and elastic) of a short run, over that at its start.
+- slack: the explicit limit of random clouds (those of `tests/validation/test_stability.py`, in 1-, 2- and 3-D), by
+  bisection on the eigenvalues of the step's Jacobian, over the bound.
 
-Writes docs/stability_map.csv and docs/stability_map.png and prints how the measured edges agree with the closed forms.
+Prints how the measured edges agree with the closed forms, and writes docs/stability_map.csv, docs/slack.csv and
+docs/stability_map.png. `--quick` sweeps more coarsely and writes nothing.
 """
 
 import argparse
 import csv
+import sys
 import time
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 import equinox as eqx
@@ -26,6 +30,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mpmjax as mpm
+from mpmjax._mirror import mirror
+from mpmjax._potential import ElasticPotential
+from mpmjax._transfer import p2g
+from mpmjax._types import components
+
+sys.path += [str(Path(__file__).parents[1] / "tests" / folder) for folder in ("", "validation")]
+jax.config.update("jax_enable_x64", True)
 
 DX, DENSITY, E, NU, SIDE = 0.1, 1e3, 1e4, 0.3, 3
 DOCS = Path(__file__).parents[1] / "docs"
@@ -36,7 +47,10 @@ METHODS = {
     "semi-implicit": lambda beta: mpm.SemiImplicit(beta, PLAIN, SOLVER, SOLVER),
     "projected": lambda beta: mpm.SemiImplicit(beta, PROJECTED, SOLVER, SOLVER),
     "backward Euler": lambda beta: mpm.BackwardEuler(hessian=PROJECTED, max_newton=15),
+    "implicit midpoint": lambda beta: mpm.ImplicitMidpoint(mpm.Linearised(SOLVER), PLAIN, SOLVER),
+    "TR-BDF2": lambda beta: mpm.TRBDF2(0.0, mpm.Linearised(SOLVER), PLAIN, SOLVER),
 }
+IMPLICIT = tuple(METHODS)[1:]
 FIELDS = ("sweep", "method", "beta", "contrast", "compression", "dt_over_bound", "growth")
 
 
@@ -87,11 +101,6 @@ def particle_sweep(count: int) -> list[dict]:
 
 def singular_step(compression: float) -> float:
     """The first Δ̂t [s] at which M + Δ̂t²H is singular, M and H assembled column by column."""
-    from mpmjax._boundary import mirror
-    from mpmjax._potential import ElasticPotential
-    from mpmjax._transfer import p2g
-    from mpmjax._types import components
-
     scene, block = scene_of()
     q = compressed(block, compression, jnp.zeros_like, jnp.zeros((2, 2)))
     stencil, F = scene.stencil(q), components(q.F)
@@ -117,7 +126,7 @@ def spin_sweep(count: int) -> tuple[list[dict], dict[float, float]]:
 
     rows, singular = [], {}
     times = np.geomspace(0.5, 12, count)
-    for name in ("semi-implicit", "projected", "backward Euler"):
+    for name in IMPLICIT:
 
         @jax.jit
         @jax.vmap
@@ -165,6 +174,28 @@ def block_sweep(count: int, steps: int) -> list[dict]:
     return rows
 
 
+def slack_sweep(seeds: int) -> list[dict]:
+    """The explicit limit of random clouds over the bound, by description, dimension and largest strain."""
+    from test_stability import slack
+
+    law = mpm.FixedCorotated(E, NU)
+    descriptions = {"updated": mpm.UpdatedLagrangian(), "total": mpm.TotalLagrangian()}
+    rows = []
+    for (name, description), d in product(descriptions.items(), (1, 2, 3)):
+        for strain, seed in product((0.0, 0.03, 0.1, 0.2, 0.3), range(seeds)):
+            found = slack(d, seed, strain, material=law, description=description)
+            rows.append(
+                {
+                    "description": name,
+                    "dimension": d,
+                    "strain": strain,
+                    "seed": seed,
+                    "limit_over_bound": round(found, 3),
+                }
+            )
+    return rows
+
+
 def row(*values) -> dict:
     return dict(zip(FIELDS, (v if isinstance(v, str) else round(float(v), 9) for v in values), strict=True))
 
@@ -178,8 +209,8 @@ def edge(rows: list[dict], limit: float) -> float:
     return np.inf
 
 
-def report(rows: list[dict], singular: dict[float, float]) -> None:
-    """Measured edges against the closed forms."""
+def report(rows: list[dict], singular: dict[float, float], slacks: list[dict]) -> None:
+    """Measured edges against the closed forms, and the bound's slack."""
     particle = [r for r in rows if r["sweep"] == "particle"]
     times = np.unique([r["dt_over_bound"] for r in particle])
     grid = np.sqrt(times[1] / times[0]) - 1
@@ -196,11 +227,11 @@ def report(rows: list[dict], singular: dict[float, float]) -> None:
     roots = [np.abs(np.roots([1 + b * q, q - 2 - b * q, 1])).max() for b, q in zip(beta, 4 * z**2, strict=True)]
     exact = np.maximum(roots, 1)  # the other modes neither grow nor decay
     print(f"particle: |lambda| against its closed form: {np.abs([r['growth'] for r in particle] - exact).max():.1e}")
-    for name in ("semi-implicit", "projected", "backward Euler"):
+    for name in IMPLICIT:
         for compression, dt in singular.items():
             here = [r for r in rows if (r["sweep"], r["method"], r["compression"]) == ("spin", name, compression)]
             gains = np.array([r["growth"] for r in here])
-            line = f"spin, {name:>14}, {compression:4.0%} compressed: gain {gains.min():8.3g} to {gains.max():8.3g}"
+            line = f"spin, {name:>17}, {compression:4.0%} compressed: gain {gains.min():8.3g} to {gains.max():8.3g}"
             if name == "semi-implicit":
                 t = np.array([r["dt_over_bound"] for r in here])
                 ratio = (gains - 1) / (1 / (1 - (t / dt) ** 2) - 1)
@@ -223,11 +254,14 @@ def report(rows: list[dict], singular: dict[float, float]) -> None:
         beta = max(r["beta"] for r in own)
         worst = {c: max(r["growth"] for r in own if (r["beta"], r["compression"]) == (beta, c)) for c in (0.0, 0.1)}
         print(f"block, {name}, beta = {beta:g}: largest energy {worst[0.0]:.3g}, compressed {worst[0.1]:.3g}")
+    for name, strain in sorted({(r["description"], r["strain"]) for r in slacks}):
+        found = [r["limit_over_bound"] for r in slacks if (r["description"], r["strain"]) == (name, strain)]
+        print(f"slack, {name:>7}, strains to {strain:g}: {min(found):.2f} to {max(found):.2f}")
 
 
-def draw(rows: list[dict], singular: dict[float, float], path: Path) -> None:
-    figure, axes = plt.subplots(2, 2, figsize=(12, 9), constrained_layout=True)
-    a, b, c, d = axes.flat
+def draw(rows: list[dict], singular: dict[float, float], slacks: list[dict], path: Path) -> None:
+    figure, axes = plt.subplot_mosaic("aabbee;cccddd", figsize=(15, 10), constrained_layout=True)
+    a, b, c, d, e = (axes[k] for k in "abcde")
     particle = [r for r in rows if r["sweep"] == "particle"]
     times, betas = (np.unique([r[k] for r in particle]) for k in ("dt_over_bound", "beta"))
     growth = np.array([r["growth"] for r in particle]).reshape(len(betas), len(times))
@@ -238,11 +272,11 @@ def draw(rows: list[dict], singular: dict[float, float], path: Path) -> None:
     a.axhline(0.5, color="k", ls=":")
     a.set(xscale="log", xlim=(times[0], times[-1]), ylabel="β", title="one particle, semi-implicit: measured |λ|")
     a.legend(loc="lower right")
-    styles = {"semi-implicit": "o", "projected": "s", "backward Euler": "^"}
+    styles = dict(zip(IMPLICIT, "os^vD", strict=True))
     here = [r for r in rows if r["sweep"] == "spin" and r["compression"] == 0.1]
     for name, mark in styles.items():
         own = [r for r in here if r["method"] == name]
-        b.plot([r["dt_over_bound"] for r in own], [abs(r["growth"]) for r in own], mark, ms=4, label=f"{name}, β = 1")
+        b.plot([r["dt_over_bound"] for r in own], [abs(r["growth"]) for r in own], mark, ms=4, label=name)
     t = np.geomspace(0.5, 12, 2000)
     b.plot(t, np.abs(1 / (1 - (t / singular[0.1]) ** 2)), "k", lw=0.8, label="1/|1 − (Δt/Δ̂t)²|")
     b.axvline(singular[0.1], color="k", ls=":")
@@ -267,33 +301,47 @@ def draw(rows: list[dict], singular: dict[float, float], path: Path) -> None:
         axis.set_yticks(np.arange(len(labels)), labels, fontsize=7)
         for k, label in enumerate(labels):
             beta = float(label.split("β = ")[1].split(",")[0]) if "β" in label else 0.0
-            if "Euler" not in label and beta < 0.5:
+            if beta < 0.5 and ("β" in label or "explicit" in label):
                 axis.plot([1 / np.sqrt(1 - 2 * beta)] * 2, [k - 0.5, k + 0.5], "k", lw=1.5)
         axis.set(xscale="log", title=f"block, {compression:.0%} compressed: largest energy over the first")
         figure.colorbar(colours, ax=axis, label="log10 growth")
-    for axis in axes.flat:
+    for axis in (a, b, c, d):
         axis.xaxis.set_minor_formatter("")
         axis.set_xlabel("Δt / stable_dt(safety=1)")
+    names = sorted({(r["dimension"], r["description"]) for r in slacks})
+    for k, (dimension, name) in enumerate(names):
+        own = [r for r in slacks if (r["dimension"], r["description"]) == (dimension, name)]
+        mark, colour = {"updated": "o", "total": "x"}[name], f"C{dimension - 1}"
+        x = [r["strain"] + 0.003 * (k - len(names) / 2) for r in own]
+        e.plot(x, [r["limit_over_bound"] for r in own], mark, color=colour, ms=4, label=f"{name}, {dimension}-D")
+    e.axhline(1, color="k", lw=0.8)
+    e.axhline(0.7, color="k", ls=":", label="default safety")
+    e.set(title="explicit limit of random clouds over the bound", xlabel="largest strain", ylabel="slack")
+    e.legend(fontsize=8)
     figure.savefig(path, dpi=110)
+
+
+def write(rows: list[dict], path: Path) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a coarser sweep")
+    parser.add_argument("--quick", action="store_true", help="a coarser sweep, write nothing")
     quick = parser.parse_args().quick
-    jax.config.update("jax_enable_x64", True)
     begun = time.perf_counter()
     rows = particle_sweep(40 if quick else 120)
-    print(f"{time.perf_counter() - begun:.0f} s", flush=True)
     spins, singular = spin_sweep(16 if quick else 60)
-    print(f"{time.perf_counter() - begun:.0f} s", flush=True)
     rows += spins + block_sweep(*(8, 30) if quick else (24, 60))
-    report(rows, singular)
-    with open(DOCS / "stability_map.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, FIELDS)
-        writer.writeheader()
-        writer.writerows(rows)
-    draw(rows, singular, DOCS / "stability_map.png")
+    slacks = slack_sweep(3 if quick else 8)
+    report(rows, singular, slacks)
+    if not quick:
+        write(rows, DOCS / "stability_map.csv")
+        write(slacks, DOCS / "slack.csv")
+        draw(rows, singular, slacks, DOCS / "stability_map.png")
     print(f"{time.perf_counter() - begun:.0f} s in all")
 
 
