@@ -260,17 +260,19 @@ def report(rows: list[dict], singular: dict[float, float], slacks: list[dict]) -
 
 
 def draw(rows: list[dict], singular: dict[float, float], slacks: list[dict], path: Path) -> None:
-    figure, axes = plt.subplot_mosaic("aabbee;cccddd", figsize=(15, 10), constrained_layout=True)
-    a, b, c, d, e = (axes[k] for k in "abcde")
+    figure = plt.figure(figsize=(16, 10), constrained_layout=True)
+    above, below = figure.subfigures(2, 1)
+    a, b, e = above.subplots(1, 3)
+    c, d = below.subplots(1, 2, sharey=True)
     particle = [r for r in rows if r["sweep"] == "particle"]
     times, betas = (np.unique([r[k] for r in particle]) for k in ("dt_over_bound", "beta"))
     growth = np.array([r["growth"] for r in particle]).reshape(len(betas), len(times))
     colours = a.pcolormesh(times, betas, np.log10(growth), vmin=-1, vmax=1, cmap="RdBu_r", shading="nearest")
-    figure.colorbar(colours, ax=a, label="log10 |λ|")
-    below = np.linspace(0, 0.492, 200)
-    a.plot(1 / np.sqrt(1 - 2 * below), below, "k", label="1/√(1 − 2β)")
+    above.colorbar(colours, ax=a, label="log10 |λ|")
+    conditional = np.linspace(0, 0.492, 200)
+    a.plot(1 / np.sqrt(1 - 2 * conditional), conditional, "k", label="1/√(1 − 2β)")
     a.axhline(0.5, color="k", ls=":")
-    a.set(xscale="log", xlim=(times[0], times[-1]), ylabel="β", title="one particle, semi-implicit: measured |λ|")
+    a.set(xscale="log", xlim=(times[0], times[-1]), ylabel="β", title="one particle, semi-implicit: |λ|")
     a.legend(loc="lower right")
     styles = dict(zip(IMPLICIT, "os^vD", strict=True))
     here = [r for r in rows if r["sweep"] == "spin" and r["compression"] == 0.1]
@@ -280,9 +282,7 @@ def draw(rows: list[dict], singular: dict[float, float], slacks: list[dict], pat
     t = np.geomspace(0.5, 12, 2000)
     b.plot(t, np.abs(1 / (1 - (t / singular[0.1]) ** 2)), "k", lw=0.8, label="1/|1 − (Δt/Δ̂t)²|")
     b.axvline(singular[0.1], color="k", ls=":")
-    b.set(
-        xscale="log", yscale="log", ylim=(1e-2, 1e3), title="block compressed by 10 %: spin after one step over before"
-    )
+    b.set(xscale="log", yscale="log", ylim=(1e-2, 1e3), title="10 % compressed: spin after one step over before")
     b.legend()
     for axis, compression in ((c, 0.0), (d, 0.1)):
         lines = [(m, beta, k) for k in (1.0, 100.0) for m in METHODS for beta in (0.0, 0.25, 0.5, 1.0)]
@@ -304,7 +304,7 @@ def draw(rows: list[dict], singular: dict[float, float], slacks: list[dict], pat
             if beta < 0.5 and ("β" in label or "explicit" in label):
                 axis.plot([1 / np.sqrt(1 - 2 * beta)] * 2, [k - 0.5, k + 0.5], "k", lw=1.5)
         axis.set(xscale="log", title=f"block, {compression:.0%} compressed: largest energy over the first")
-        figure.colorbar(colours, ax=axis, label="log10 growth")
+        below.colorbar(colours, ax=axis, label="log10 growth")
     for axis in (a, b, c, d):
         axis.xaxis.set_minor_formatter("")
         axis.set_xlabel("Δt / stable_dt(safety=1)")
@@ -316,8 +316,9 @@ def draw(rows: list[dict], singular: dict[float, float], slacks: list[dict], pat
         e.plot(x, [r["limit_over_bound"] for r in own], mark, color=colour, ms=4, label=f"{name}, {dimension}-D")
     e.axhline(1, color="k", lw=0.8)
     e.axhline(0.7, color="k", ls=":", label="default safety")
-    e.set(title="explicit limit of random clouds over the bound", xlabel="largest strain", ylabel="slack")
-    e.legend(fontsize=8)
+    e.set(title="random clouds: explicit limit over the bound", xlabel="largest strain", ylabel="slack")
+    e.set_ylim(top=2.6)
+    e.legend(fontsize=8, ncols=2, loc="upper right")
     figure.savefig(path, dpi=110)
 
 
