@@ -26,6 +26,7 @@ from mpmjax._simulate import rollout, simulate
 from mpmjax._stability import stable_dt
 from mpmjax._step import StepInfo, step
 from mpmjax._transfer import APIC, FLIP, PIC
+from mpmjax._work_precision import Trial, WorkPrecision, work_precision
 from mpmjax.material import AbstractMaterial, AbstractTangent, FixedCorotated, NeoHookean
 
 __version__ = "0.1.0"
@@ -87,6 +88,9 @@ __all__ = [  # noqa: RUF022 (grouped)
     "rollout",
     "simulate",
     "step",
+    "Trial",
+    "WorkPrecision",
+    "work_precision",
     # results
     "Budget",
     "EnergyBudget",

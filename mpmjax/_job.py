@@ -22,16 +22,31 @@ from mpmjax._scene import Scene, prepare
 from mpmjax._schema import arguments, decode
 from mpmjax._simulate import number_of_steps
 from mpmjax._types import Scalar
+from mpmjax._work_precision import METHODS, Build, work_precision
+
+_FRAMES = 50
+"""How many frames are saved where neither they nor the step are given."""
 
 
 class RunSettings(NamedTuple):
-    """The `[run]` table."""
+    """How a scene is run."""
 
     t1: float
     dt: float
     method: Method
     save_every: int
     dtype: str
+
+
+class RunTable(NamedTuple):
+    """The `[run]` table: as the settings, but that what is "auto" is None."""
+
+    t1: float
+    dt: float | None
+    method: Method | None
+    save_every: int | None
+    dtype: str
+    error: float
 
 
 class CurveSettings(NamedTuple):
@@ -46,16 +61,29 @@ class CurveSettings(NamedTuple):
     gauge: AbstractRegion
 
 
-class Job(NamedTuple):
+class Plan(NamedTuple):
     """Everything that a scene file says."""
+
+    scene: Scene
+    particles: Particles
+    run: RunTable
+    fit: CurveSettings | None
+    build: Build
+    """From n to the scene on n times as many cells a direction, and its particles."""
+
+
+class Job(NamedTuple):
+    """A plan, ready to be run."""
 
     scene: Scene
     particles: Particles
     run: RunSettings
     fit: CurveSettings | None
+    choice: str | None
+    """What stood for "auto", and why."""
 
 
-def read_job(path: Path) -> Job:
+def read_plan(path: Path) -> Plan:
     """Read a scene file.
 
     Raises:
@@ -67,20 +95,45 @@ def read_job(path: Path) -> Job:
         require(name in table, f"{path}: needs the table [{name}]. See docs/scene_files.md.")
     fit_table = table.pop("fit", None)
     groups, run_table = table.pop("particles"), table.pop("run")
+    groups = groups if isinstance(groups, list) else [groups]
     try:
-        run = _run_settings(**arguments(_run_settings, run_table, "[run]"))
-        scene = decode(table, Scene)
-        groups = groups if isinstance(groups, list) else [groups]
-        filled = [_fill(scene, group, i, run.dtype) for i, group in enumerate(groups, 1)]
+        run = _run_table(run_table)
+
+        def build(n: int) -> tuple[Scene, Particles]:
+            scene = decode(_refined(table, n), Scene)
+            filled = [_fill(scene, group, i, run.dtype) for i, group in enumerate(groups, 1)]
+            return scene, prepare(scene, _joined(filled))
+
+        scene, particles = build(1)
         fit = None if fit_table is None else _curve_settings(fit_table, path.parent)
-        particles = prepare(scene, _joined(filled))
-        number_of_steps(run.t1, run.dt, 0, particles.x.dtype)
+        if run.dt is not None:
+            number_of_steps(run.t1, run.dt, 0, particles.x.dtype)
         if fit is not None:
             gauge(fit.gauge, particles, fit.axis)
             _check_paths(fit, scene)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    return Job(scene, particles, run, fit)
+    return Plan(scene, particles, run, fit, build)
+
+
+def read_job(path: Path) -> Job:
+    """Read a scene file, and choose by pilot runs what it leaves to be chosen.
+
+    Raises:
+        ValueError: as `read_plan`, and as `work_precision`.
+    """
+    plan = read_plan(path)
+    t1, dt, method, save_every, dtype, error = plan.run
+    choice = None
+    if dt is None or method is None:
+        methods = METHODS if method is None else (method,)
+        found = work_precision(plan.build, t1=t1, error=error, methods=methods, refinements=(1,))
+        best, choice = found.cheapest(), found.verdict()
+        require(best is not None, f"{path}: {choice}")
+        assert best is not None
+        dt, method = best.dt, best.method
+        save_every = save_every or max(1, best.steps // _FRAMES)
+    return Job(plan.scene, plan.particles, RunSettings(t1, dt, method, save_every or 1, dtype), plan.fit, choice)
 
 
 def fit_job(job: Job) -> FitResult:
@@ -177,19 +230,45 @@ def _reason(error: Exception) -> str:
     return (getattr(error, "strerror", None) or str(error)).lower()
 
 
-def _run_settings(
-    *,
-    t1: Scalar,
-    dt: Scalar,
-    method: Method = Explicit(),
-    save_every: int = 1,
-    precision: str = "float64",
-) -> RunSettings:
-    require_positive("[run] t1", t1)
-    require_positive("[run] dt", dt)
-    require(save_every >= 1, f"[run] save_every must be at least 1, got {save_every}.")
-    require(precision in ("float32", "float64"), f'[run] precision must be "float32" or "float64", got {precision!r}.')
-    return RunSettings(float(t1), float(dt), method, save_every, precision)
+def _run_table(table: Any) -> RunTable:
+    def run(
+        *,
+        t1: Scalar,
+        dt: Scalar | None = None,
+        method: Method | None = None,
+        save_every: int | None = None,
+        precision: str = "float64",
+        error: Scalar = 1e-2,
+    ) -> RunTable:
+        require_positive("[run] t1", t1)
+        if dt is not None:
+            require_positive("[run] dt", dt)
+        require_positive("[run] error", error)
+        every = save_every is None or save_every >= 1
+        require(every, f"[run] save_every must be at least 1, got {save_every}.")
+        known = precision in ("float32", "float64")
+        require(known, f'[run] precision must be "float32" or "float64", got {precision!r}.')
+        return RunTable(float(t1), None if dt is None else float(dt), method, save_every, precision, float(error))
+
+    require(isinstance(table, dict), f"[run] must be a table, got {table!r}.")
+    left = {name for name in ("dt", "method") if table.get(name) == "auto"}
+    require("dt" in table, "[run] needs the key 'dt': a step in seconds, or \"auto\".")
+    require(left != {"method"}, '[run] method = "auto" goes with dt = "auto": the cheapest of both is chosen together.')
+    given = arguments(run, {key: value for key, value in table.items() if key not in left}, "[run]")
+    if "method" not in left:
+        given.setdefault("method", Explicit())
+    return run(**given)
+
+
+def _refined(table: dict[str, Any], n: int) -> dict[str, Any]:
+    """The table of a scene on n times as many cells a direction."""
+    grid = table.get("grid")
+    if n == 1 or not isinstance(grid, dict):
+        return table
+    lists = [key for key, value in table.get("material", {}).items() if isinstance(value, list)]
+    require(not lists, f"[material] {', '.join(lists)}: refinement needs one number for all particles.")
+    finer = {key: [n * k for k in grid[key]] for key in ("shape", "origin") if key in grid}
+    return table | {"grid": grid | finer | {"spacing": grid["spacing"] / n}}
 
 
 def _fill(scene: Scene, table: Any, number: int, dtype: str) -> Particles:

@@ -1,4 +1,4 @@
-"""The shell's commands: `mpmjax run`, `mpmjax fit`, `mpmjax render`."""
+"""The shell's commands: `mpmjax run`, `mpmjax fit`, `mpmjax chart`, `mpmjax render`."""
 
 import sys
 import time
@@ -11,13 +11,15 @@ import jax
 import numpy as np
 import typer
 
+from mpmjax._chart import draw_chart, write_trials
 from mpmjax._diagnostics import energy, grid_mass, pieces
 from mpmjax._fit import FitResult
 from mpmjax._io import load
-from mpmjax._job import CurveSettings, Job, fit_job, read_job
+from mpmjax._job import CurveSettings, Job, fit_job, read_job, read_plan
 from mpmjax._record import record
 from mpmjax._render import COLOURS, render
 from mpmjax._run import Run
+from mpmjax._work_precision import Trial, name_of, work_precision
 
 app = typer.Typer(
     help="A differentiable Material Point Method.", no_args_is_help=True, add_completion=False, rich_markup_mode=None
@@ -56,6 +58,7 @@ def run_command(
 ) -> None:
     """Simulate a scene and write its frames."""
     job = read_job(scene)
+    _say_choice(job)
     done = int(load(output).tally.steps) if resume else 0
     begun = time.perf_counter()
     run = record(
@@ -72,6 +75,11 @@ def run_command(
     )
     print(_summary(job, run, int(run.tally.steps) - done, time.perf_counter() - begun))
     print(f"written            {output}")
+
+
+def _say_choice(job: Job) -> None:
+    if job.choice is not None:
+        print(f"{'chosen':<18} {job.choice}")
 
 
 def _summary(job: Job, run: Run, taken: int, seconds: float) -> str:
@@ -125,6 +133,7 @@ def fit_command(
     """Fit a scene's parameter to the measured curve that its [fit] table names."""
     begun = time.perf_counter()
     job = read_job(scene)
+    _say_choice(job)
     result = fit_job(job)
     assert job.fit is not None
     print(_table(job.fit, result))
@@ -166,6 +175,37 @@ def _plot(fit: CurveSettings, result: FitResult, name: str, path: Path) -> None:
     axes.legend()
     figure.savefig(path, dpi=140)
     plt.close(figure)
+
+
+@app.command("chart")
+@_reporting
+def chart_command(
+    scene: SceneFile,
+    error: Annotated[float, typer.Option(help="The relative error of the motion that is asked for.")] = 1e-2,
+    most_seconds: Annotated[float, typer.Option(help="The longest run; what would take longer is foreseen.")] = 60.0,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="The chart to write, its numbers beside it as .csv.")
+    ] = None,
+) -> None:
+    """Chart a scene's error against seconds, and name the cheapest setting for an error."""
+    plan = read_plan(scene)
+    output = Path(f"{scene.stem}_chart.png") if output is None else output
+    print(f"{'method':>24} {'spacing':>10} {'dt [s]':>10} {'steps':>9} {'seconds':>9} {'error':>9}")
+    own = () if plan.run.dt is None or plan.run.method is None else ((plan.run.method, plan.run.dt),)
+    found = work_precision(
+        plan.build, t1=plan.run.t1, error=error, also=own, most_seconds=most_seconds, progress=_print_trial
+    )
+    print(found.verdict())
+    print(f"written {draw_chart(found, output)} and {write_trials(found, output.with_suffix('.csv'))}")
+
+
+def _print_trial(trial: Trial) -> None:
+    said = "failed" if np.isinf(trial.error) else "foreseen" if np.isnan(trial.error) else f"{trial.error:.2e}"
+    print(
+        f"{name_of(trial.method):>24} {f'1 / {trial.refinement}':>10} {trial.dt:10.3g} {trial.steps:9d} "
+        f"{trial.seconds:9.3g} {said:>9}",
+        flush=True,
+    )
 
 
 @app.command("render")

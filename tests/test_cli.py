@@ -9,7 +9,7 @@ import pytest
 from shell import refused, shell
 
 import mpmjax as mpm
-from mpmjax._job import read_job
+from mpmjax._job import read_job, read_plan
 from mpmjax.cli import _summary
 
 SCENE = """
@@ -110,6 +110,8 @@ BAD_SCENES = {
     "outside the window": ("lower = [0.0, 0.1]", "lower = [-0.5, 0.1]", r"window; particle 0 at"),
     "no TOML": ("[grid]", "[grid", r"not a TOML file"),
     "missing table": ("[run]", "[rum]", r"\[run\]"),
+    "automatic method, given step": ('method = { kind = "SemiImplicit" }', 'method = "auto"', r'goes with dt = "auto"'),
+    "no step": ("dt = 1e-2", "", r"\[run\] needs the key 'dt'"),
     "counts": ("density = 1e3", "density = 1e3\nparticles_per_cell = 3", r"\[\[particles\]\] 1.*2-th power"),
 }
 
@@ -152,3 +154,49 @@ def test_a_run_that_blows_up_keeps_what_was_written(tmp_path):
 
 def test_fit_needs_a_fit_table(folder):
     assert "[fit]" in refused("fit", folder / "scene.toml")
+
+
+@pytest.mark.slow
+def test_the_step_is_chosen_where_it_is_left_open(tmp_path):
+    """By pilot runs, for the method that is given; the run says what and why."""
+    scene = tmp_path / "auto.toml"
+    left = SCENE.replace("dt = 1e-2", 'dt = "auto"\nerror = 0.1').replace("save_every = 2", "")
+    scene.write_text(left.replace('{ kind = "SemiImplicit" }', '"Explicit"'))
+    code, out, err = shell("run", scene, "-o", tmp_path / "run.h5", "--quiet")
+    assert code == 0, err
+    chosen = re.search(r"chosen +Explicit\(\), dt = ([-.e\d]+) s \((\d+) steps\)", out)
+    assert chosen is not None, out
+    run = mpm.load(tmp_path / "run.h5")
+    assert int(run.tally.steps) == int(chosen[2])
+    job = read_plan(scene)
+    assert float(run.dt) <= 0.7 * float(mpm.stable_dt(job.scene, job.particles, safety=1.0))
+
+
+def test_a_plan_refines(tmp_path):
+    """The same body at the same place, on half the spacing."""
+    scene = tmp_path / "scene.toml"
+    scene.write_text(SCENE)
+    plan = read_plan(scene)
+    (coarse, few), (fine, many) = plan.build(1), plan.build(2)
+    assert few.count * 4 == many.count
+    np.testing.assert_allclose(few.mass.sum(), many.mass.sum(), rtol=1e-14)
+    np.testing.assert_allclose(few.x.mean(axis=0), many.x.mean(axis=0), rtol=1e-14)
+    assert (2 * float(fine.grid.spacing), *fine.grid.shape) == (float(coarse.grid.spacing), 20, 28)
+    scene.write_text(SCENE.replace("youngs_modulus = 1e5", f"youngs_modulus = {[1e5] * few.count}"))
+    with pytest.raises(ValueError, match="one number for all particles"):
+        read_plan(scene).build(2)
+
+
+@pytest.mark.slow
+def test_chart_draws_and_names_the_cheapest(folder, tmp_path):
+    code, out, err = shell(
+        "chart", folder / "scene.toml", "--error", 0.05, "--most-seconds", 20, "-o", tmp_path / "chart.png"
+    )
+    assert code == 0, err
+    assert (tmp_path / "chart.png").stat().st_size > 1000
+    table = (tmp_path / "chart.csv").read_text().splitlines()
+    assert {line.split("(")[0] for line in table[1:]} == {
+        *("Explicit", "SemiImplicit", "BackwardEuler", "ImplicitMidpoint", "TRBDF2")
+    }
+    assert table[-1].startswith("SemiImplicit(beta=1),1,0.0")  # the scene's own setting
+    assert re.search(r"\n\w+\(.*\), dt = .* s.* \(\d+ steps\): .* s, error", out)

@@ -1,0 +1,167 @@
+"""Error against seconds: the errors are those of `simulate`, the reference knows its own, the verdict names the
+cheapest."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close
+
+import mpmjax as mpm
+from mpmjax import Trial, WorkPrecision
+from mpmjax._chart import draw_chart, write_trials
+from mpmjax._work_precision import FRAMES
+from mpmjax.verification import StandingWave, discretise
+
+WAVE = StandingWave(0.05)
+
+
+def wave(n):
+    """A standing wave on 16 n cells."""
+    return discretise(WAVE, 16 * n, description=mpm.TotalLagrangian())
+
+
+def pulled(n):
+    """A stiff bar, pulled slowly: an explicit run of it takes some hundred million steps."""
+    grid = mpm.Grid((8 * n,), 0.1 / n, origin=(-2 * n,))
+    bar = mpm.fill(mpm.Box((0.0,), (0.4,)), grid, particles_per_cell=2, density=1e3)
+    motion = mpm.Motion((0.0, 10.0), ((0.0,), (0.1,)))
+    ends = (mpm.SymmetryPlane(0, 0.0), mpm.Grip(mpm.Box((0.39,), (1.0,)), motion))
+    law = mpm.NeoHookean(youngs_modulus=1e12, poisson_ratio=0.3)
+    return mpm.Scene(grid, law, boundary=ends, description=mpm.TotalLagrangian()), bar
+
+
+@pytest.fixture(scope="module")
+def waves():
+    """Of a quarter of a period."""
+    methods = (mpm.Explicit(), mpm.ImplicitMidpoint())
+    own = ((mpm.SemiImplicit(), WAVE.duration / 16),)
+    return mpm.work_precision(wave, t1=WAVE.duration / 2, error=1e-2, methods=methods, also=own)
+
+
+def displacements(trial):
+    """Initial places and the way from them, at the times of comparison, by `simulate`."""
+    scene, particles = wave(trial.refinement)
+    run = mpm.simulate(
+        scene, particles, t1=WAVE.duration / 2, dt=trial.dt, method=trial.method, save_every=trial.steps // FRAMES
+    )
+    return np.asarray(particles.X), np.asarray(particles.x), np.asarray(run.frames.x[1:])
+
+
+def rms(a):
+    return np.sqrt((a**2).sum(axis=2).mean(axis=1))
+
+
+@pytest.mark.slow
+def test_errors_are_those_of_simulate(waves):
+    """Of the best trial on each grid, against the mean of the reference's particles in its place, in plain NumPy."""
+    _, fine0, fine = displacements(waves.reference)
+    size = rms(fine - fine0).max()
+    for n in (1, 2):
+        best = min((t for t in waves.trials if t.refinement == n), key=lambda t: t.error)
+        _, x0, x = displacements(best)
+        near = np.abs(x0 - fine0.T).argsort(axis=1)[:, : len(fine0) // len(x0)]
+        mean = (fine - fine0)[:, near].mean(axis=2)
+        assert_close(best.error, rms(x - x0 - mean).max() / size, 1e-9)
+
+
+@pytest.mark.slow
+def test_the_reference_is_as_good_as_it_says(waves):
+    """Against the exact motion, and so are the trials."""
+    reference = waves.reference
+    X, x0, x = displacements(reference)
+    t = WAVE.duration / 2 * np.arange(1, FRAMES + 1) / FRAMES
+    exact = X + 0.05 * np.sin(np.pi * X) * np.cos(np.pi * WAVE.wave_speed * t)[:, None, None]
+    true = rms(x - exact).max() / rms(x - x0).max()
+    assert true < reference.error <= 1e-2 / 3
+    assert reference.refinement >= 2
+
+
+@pytest.mark.slow
+def test_trials_refine_until_they_are_good(waves):
+    """The midpoint rule's errors fall to the target and stop there; β = 1 is far from it at sixteen steps a half
+    period."""
+    for n in (1, 2):
+        own = [t for t in waves.trials if (type(t.method), t.refinement) == (mpm.ImplicitMidpoint, n)]
+        assert [t.steps for t in own] == [FRAMES * 2**k for k in range(len(own))]
+        assert own[0].error > own[-1].error <= 1e-2
+    assert 1e-2 < waves.trials[-1].error < 1
+
+
+def test_a_slow_pull_of_a_stiff_bar_is_not_run_explicitly():
+    """It is foreseen to take too long, and the verdict says so; an explicit step of an implicit one's length fails."""
+    tried = {"methods": (mpm.Explicit(), mpm.SemiImplicit()), "also": ((mpm.Explicit(), 1.25),)}
+    found = mpm.work_precision(pulled, t1=10.0, error=0.1, refinements=(1,), most_seconds=20.0, **tried)
+    explicit, *implicit, wild = found.trials
+    assert wild.error == math.inf
+    assert math.isnan(explicit.error)
+    assert explicit.seconds > 20
+    assert found.cheapest() == implicit[0]
+    assert implicit[0].error < 0.1
+    assert "SemiImplicit(beta=1), dt = 1.25 s (8 steps)" in found.verdict()
+    assert "Explicit()" in found.verdict()
+    assert "would need" in found.verdict()
+
+
+def trial(method, seconds, error, refinement=1):
+    return Trial(method, refinement, 0.1, 10, seconds, error)
+
+
+MIDPOINT, EXPLICIT = mpm.ImplicitMidpoint(), mpm.Explicit()
+REFERENCE = trial(mpm.TRBDF2(), 9.0, 1e-3, 4)
+
+
+def test_the_cheapest_is_the_fastest_that_is_good_enough():
+    trials = (
+        trial(EXPLICIT, 1.0, math.inf),
+        trial(EXPLICIT, 8.0, 2e-3),
+        trial(MIDPOINT, 2.0, 2e-2),
+        trial(MIDPOINT, 4.0, 9e-3, 2),
+        trial(MIDPOINT, 5.0, 1e-3),
+        trial(MIDPOINT, 0.1, math.nan),
+    )
+    found = WorkPrecision(trials, REFERENCE, 1e-2, 1.0)
+    assert found.cheapest() == trials[3]
+    assert found.cheapest(explicit=True) == trials[1]
+    assert found.verdict() == (
+        "ImplicitMidpoint(), dt = 0.1 s, spacing / 2 (10 steps): 4 s, error 0.009; Explicit(), dt = 0.1 s needs 8 s."
+    )
+
+
+def test_an_explicit_step_beyond_the_limit_is_never_the_cheapest():
+    """On any grid, however well it went in a short run."""
+    trials = (trial(EXPLICIT, 1.0, 1e-3), trial(EXPLICIT, 1.0, 1e-3, 2), trial(MIDPOINT, 2.0, 5e-3))
+    assert WorkPrecision(trials, REFERENCE, 1e-2, 0.2).cheapest() == trials[0]
+    assert WorkPrecision(trials[1:], REFERENCE, 1e-2, 0.19).cheapest() == trials[2]
+    assert WorkPrecision(trials, REFERENCE, 1e-2, 0.09).cheapest() == trials[2]
+
+
+def test_where_the_grid_allows_no_better_the_cheapest_is_as_good_as_it_allows():
+    trials = (trial(MIDPOINT, 1.0, 0.1), trial(MIDPOINT, 2.0, 0.049), trial(MIDPOINT, 4.0, 0.04))
+    found = WorkPrecision(trials, REFERENCE, 1e-2, 1.0)
+    assert found.cheapest() == trials[1]
+    assert "None reached 0.01" in found.verdict()
+    doubtful = WorkPrecision(trials, trial(mpm.TRBDF2(), 9.0, 2e-2, 2), 1e-2, 1.0)
+    assert "The reference is known to 0.02 only" in doubtful.verdict()
+    failed = WorkPrecision((trial(EXPLICIT, 1.0, math.inf),), REFERENCE, 1e-2, 1.0)
+    assert failed.cheapest() is None
+    assert "No run ended well" in failed.verdict()
+
+
+@pytest.mark.slow
+def test_the_chart_and_its_numbers_are_written(waves, tmp_path):
+    assert draw_chart(waves, tmp_path / "chart.png").stat().st_size > 1000
+    header, *rows = write_trials(waves, tmp_path / "chart.csv").read_text().splitlines()
+    assert header == "method,refinement,dt_s,steps,seconds,error"
+    assert len(rows) == len(waves.trials)
+    assert rows[-1].startswith("SemiImplicit(beta=1),1,")
+
+
+def test_a_scene_in_which_nothing_moves_is_refused():
+    def still(n):
+        scene, bar = pulled(n)
+        return mpm.Scene(scene.grid, scene.material, gravity=(jnp.zeros(()),)), bar
+
+    with pytest.raises(ValueError, match="Nothing moves"):
+        mpm.work_precision(still, t1=1.0)
