@@ -1,0 +1,173 @@
+"""How fast is a step? Explicit steps of a free elastic block, beside MLS-MPM in Taichi and in Warp.
+
+    python benchmarks/throughput.py            # this package alone
+    python benchmarks/throughput.py --peers    # needs: python -m pip install -e ".[peers]"
+    python benchmarks/throughput.py --json --quick
+
+Scenes: A, 3-D, 97 336 particles on 64³ nodes, 8 a cell; C, 2-D, 10 000 on 128² and 99 856 on 256², 4 a cell. All codes:
+neo-Hookean, quadratic kernel, APIC, moving least squares, the same initial particles, gravity, no walls reached. Before
+anything is timed, their centres of mass and their energies after some steps must agree to what the precision allows.
+The codes take turns, and medians are compared as ratios: seconds on a shared machine mean little.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import mpmjax as mpm
+
+sys.path.append(str(Path(__file__).parent))
+jax.config.update("jax_enable_x64", True)
+
+E_MODULUS, NU, DENSITY, GRAVITY = 1e5, 0.3, 1e3, 9.81
+SCENES = {"A 100k": (3, 100_000, 64, 8), "C 10k": (2, 10_000, 128, 4), "C 100k": (2, 100_000, 256, 4)}
+QUICK = {"A 5k": (3, 5_000, 32, 8), "C 2k": (2, 2_000, 64, 4)}
+Code = Callable[[], tuple[np.ndarray, np.ndarray, np.ndarray]]
+"""Goes on by the timed steps and returns x, v, F."""
+
+
+class Block(NamedTuple):
+    """A scene in terms that every code understands."""
+
+    x: np.ndarray
+    v: np.ndarray
+    mass: float
+    volume: float
+    nodes: int
+    spacing: float
+    dt: float
+    dtype: str
+
+
+def block(d: int, particles: int, nodes: int, per_cell: int, dtype: str) -> Block:
+    """A cube of particles in the middle of the unit box, slightly stirred so that it deforms."""
+    spacing = 1 / nodes
+    side = round(per_cell ** (1 / d))
+    along = round(particles ** (1 / d))
+    places = (np.arange(along) + 0.5) * spacing / side
+    x = np.stack(np.meshgrid(*[places] * d, indexing="ij"), axis=-1).reshape(-1, d)
+    x += (0.5 - along * spacing / side / 2) // spacing * spacing
+    v = 0.1 * np.sin(2 * np.pi * x[:, ::-1])
+    volume = (spacing / side) ** d
+    law = mpm.NeoHookean(E_MODULUS, NU)
+    speed = float(np.sqrt((law.lame_lambda + 2 * law.shear_modulus) / DENSITY))
+    return Block(x, v, DENSITY * volume, volume, nodes, spacing, 0.3 * spacing / speed, dtype)
+
+
+def ours(b: Block, description: Any, steps: int) -> Code:
+    """This package's `rollout`."""
+    d = b.x.shape[1]
+    grid = mpm.Grid((b.nodes,) * d, b.spacing)
+    one = jnp.ones(len(b.x), b.dtype)
+    particles = mpm.Particles(jnp.asarray(b.x, b.dtype), jnp.asarray(b.v, b.dtype), b.mass * one, b.volume * one)
+    gravity = (*[0.0] * (d - 1), -GRAVITY)
+    scene = mpm.Scene(grid, mpm.NeoHookean(E_MODULUS, NU), gravity=gravity, description=description)
+    state = [mpm.prepare(scene, particles)]
+
+    def go() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        state[0] = mpm.rollout(scene, state[0], steps=steps, dt=b.dt)
+        return tuple(np.asarray(a) for a in (state[0].x, state[0].v, state[0].F))
+
+    return go
+
+
+def peer(b: Block, make: Callable[..., Any], steps: int) -> Code:
+    """A peer's `run`."""
+    law, d = mpm.NeoHookean(E_MODULUS, NU), b.x.shape[1]
+    code = make(
+        b.x,
+        b.v,
+        mass=b.mass,
+        volume=b.volume,
+        shape=(b.nodes,) * d,
+        spacing=b.spacing,
+        shear_modulus=float(law.shear_modulus),
+        lame_lambda=float(law.lame_lambda),
+        gravity=(*[0.0] * (d - 1), -GRAVITY),
+        dtype=b.dtype,
+    )
+    return lambda: code.run(steps, b.dt)
+
+
+def energies(b: Block, x: np.ndarray, v: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre of mass, and kinetic (without the affine part), elastic and potential energy added up, in double."""
+    law = mpm.NeoHookean(E_MODULUS, NU)
+    stored = np.asarray(law.energy(jnp.moveaxis(jnp.asarray(F, "float64"), 0, -1)))
+    v, x = v.astype("float64"), x.astype("float64")
+    return x.mean(axis=0), float(
+        (b.mass * (v**2 / 2).sum(axis=1) + b.volume * stored + b.mass * GRAVITY * x[:, -1]).sum()
+    )
+
+
+def codes_of(b: Block, steps: int, peers: bool) -> dict[str, Code]:
+    """The codes that run this block."""
+    found = {
+        "mpmjax, updated": ours(b, mpm.UpdatedLagrangian(), steps),
+        "mpmjax, total": ours(b, mpm.TotalLagrangian(), steps),
+    }
+    if peers:
+        from peers.taichi_mpm import TaichiMPM
+        from peers.warp_mpm import WarpMPM
+
+        found["Taichi"] = peer(b, TaichiMPM, steps)
+        if b.x.shape[1] == 3 and b.dtype == "float32":
+            found["Warp"] = peer(b, WarpMPM, steps)
+    return found
+
+
+def compare(name: str, b: Block, *, steps: int, repeats: int, peers: bool) -> dict[str, Any]:
+    """Agreement first, then medians of interleaved runs."""
+    codes = codes_of(b, steps, peers)
+    outcomes = {code: energies(b, *go()) for code, go in codes.items()}
+    (centre, total), tolerance = outcomes["mpmjax, updated"], {"float32": 1e-5, "float64": 1e-9}[b.dtype]
+    for code, (other, energy) in outcomes.items():
+        allowed = tolerance if code != "mpmjax, total" else 1e-4  # another discretisation: X for x
+        if np.abs(other - centre).max() > allowed or abs(energy / total - 1) > allowed:
+            raise SystemExit(
+                f"{name}, {b.dtype}: {code} disagrees: centre {other} and {centre}, energy {energy}, {total}."
+            )
+    seconds: dict[str, list[float]] = {code: [] for code in codes}
+    for _ in range(repeats):
+        for code, go in codes.items():
+            begun = time.perf_counter()
+            go()
+            seconds[code].append((time.perf_counter() - begun) / steps)
+    medians = {code: float(np.median(s)) for code, s in seconds.items()}
+    return {
+        "scene": name,
+        "dtype": b.dtype,
+        "particles": len(b.x),
+        "milliseconds": {c: 1e3 * s for c, s in medians.items()},
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--peers", action="store_true", help="Taichi and Warp too")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--quick", action="store_true", help="small scenes")
+    options = parser.parse_args()
+    steps, repeats = (10, 3) if options.quick else (20, 7)
+    rows = []
+    for name, numbers in (QUICK if options.quick else SCENES).items():
+        for dtype in ("float32", "float64"):
+            rows.append(compare(name, block(*numbers, dtype), steps=steps, repeats=repeats, peers=options.peers))
+            if not options.json:
+                ms = rows[-1]["milliseconds"]
+                base = ms["mpmjax, updated"]
+                shown = ", ".join(f"{code} {t:.2f} ms ({t / base:.2f})" for code, t in ms.items())
+                print(f"{name}, {dtype}, {rows[-1]['particles']} particles: {shown}", flush=True)
+    if options.json:
+        print(json.dumps({"jax": jax.__version__, "device": str(jax.devices()[0]), "steps": steps, "rows": rows}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,128 @@
+"""A scene pays for what it uses: operations counted in the program of a step, for scenes that differ in one feature."""
+
+from collections import Counter
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import pytest
+from helpers import DESCRIPTIONS, GRADIENTS, KERNELS, METHODS, SECOND_ORDER, TRANSFERS, ids
+
+import mpmjax as mpm
+from mpmjax._checks import canonical
+from mpmjax._diffrax import Problem
+from mpmjax._step import advance
+
+LAW = mpm.NeoHookean(1e5, 0.3)
+COUNTED = ("scatter-add", "gather", "while", "floor", "exp", "log")
+
+
+def program(method=mpm.Explicit(), *, d=2, nodes=12, **scene):
+    """The step as a function of arrays, as a rollout has it, and the arrays."""
+    grid = mpm.Grid((nodes,) * d, 0.1, origin=(-3,) * d)
+    particles = mpm.fill(mpm.Box((0.0,) * d, (0.4,) * d), grid, particles_per_cell=2**d, density=1e3)
+    scene, dt, method = canonical((mpm.Scene(grid, LAW, **scene), 1e-3, method), jnp.float64)
+    particles = mpm.prepare(scene, particles)
+    problem = Problem(scene, particles, scene.stencil(particles) if scene.total else None, dt, method)
+    arrays, rest = eqx.partition(problem, eqx.is_array)
+
+    def step(arrays):
+        p = eqx.combine(arrays, rest)
+        return advance(p.scene, p.particles, 0 * p.dt, p.dt, p.method, p.stencil)[0]
+
+    return step, arrays
+
+
+def operations(jaxpr, times=1):
+    """How often each counted primitive runs: loops of known length all their turns, others one."""
+    total = Counter()
+    for equation in jaxpr.eqns:
+        if equation.primitive.name in COUNTED:
+            total[equation.primitive.name] += times
+        turns = times * equation.params["length"] if equation.primitive.name == "scan" else times
+        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda a: hasattr(a, "eqns")):
+            inner = getattr(inner, "jaxpr", inner)
+            if hasattr(inner, "eqns"):
+                total += operations(inner, turns)
+    return total
+
+
+def counted(method=mpm.Explicit(), **scene):
+    """Of one step."""
+    step, arrays = program(method, **scene)
+    return operations(jax.make_jaxpr(step)(arrays).jaxpr)
+
+
+def compiled(method=mpm.Explicit(), **scene):
+    """Floating-point operations, bytes moved and temporary bytes of the compiled step, and its state's arrays."""
+    step, arrays = program(method, **scene)
+    program_ = jax.jit(step).lower(arrays).compile()
+    costs = program_.cost_analysis()
+    state = len(jax.tree.leaves(jax.eval_shape(step, arrays)))
+    return costs["flops"], costs["bytes accessed"], program_.memory_analysis().temp_size_in_bytes, state
+
+
+@pytest.mark.parametrize("d", [1, 2, 3])
+@pytest.mark.parametrize("kernel", **ids(KERNELS))
+def test_an_explicit_step_crosses_to_the_grid_and_back_twice(kernel, d):
+    """Momentum and force, velocity and its gradient: two sums over the (order + 1)^d nodes each way, no iteration."""
+    found = counted(d=d, kernel=kernel)
+    nodes = (kernel.order + 1) ** d
+    assert (found["scatter-add"], found["gather"], found["while"]) == (2 * nodes, 2 * nodes, 0)
+
+
+@pytest.mark.parametrize("transfer", **ids(TRANSFERS))
+@pytest.mark.parametrize("gradient", **ids(GRADIENTS))
+@pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
+def test_no_transfer_gradient_or_description_adds_a_crossing(transfer, gradient, description):
+    found = counted(transfer=transfer, gradient=gradient, description=description)
+    assert (found["scatter-add"], found["gather"], found["while"]) == (18, 18, 0)
+
+
+HELD = {
+    "sticky": (mpm.StickyBox((-0.2, -0.2), (0.8, 0.8)), 0),
+    "slip": (mpm.SlipBox((-0.2, -0.2), (0.8, 0.8)), 0),
+    "grip": (mpm.Grip(mpm.Box((0.3, -1.0), (1.0, 1.0)), mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.1, 0.0)))), 0),
+    "mirrored": (mpm.SymmetryPlane(0, 0.0), 4),
+}
+
+
+@pytest.mark.parametrize(("boundary", "folds"), HELD.values(), ids=HELD)
+def test_walls_that_are_never_left_add_no_crossing_and_no_iteration(boundary, folds):
+    """A symmetry plane folds mass, momentum, gravity and force at the nodes; no other wall adds a sum."""
+    free, held = counted(), counted(boundary=boundary)
+    assert held["scatter-add"] == free["scatter-add"] + folds
+    assert held["while"] == 0
+
+
+@pytest.mark.parametrize("method", **ids({k: m for k, m in (METHODS | SECOND_ORDER).items() if k != "explicit"}))
+def test_only_implicit_steps_iterate(method):
+    """And only walls that may be left add a search for what they hold."""
+    assert counted()["while"] == 0
+    assert counted(method)["while"] > 0
+    wall = {"boundary": mpm.SeparatingBox((-0.2, 0.0), (0.8, 0.8))}
+    assert counted(**wall)["while"] == 1
+    assert counted(method, **wall)["while"] > counted(method)["while"] + 1
+
+
+def test_in_the_total_description_a_rollout_builds_no_stencil_in_its_steps():
+    """The first node is found by rounding down: in each step of the updated description, in none of the total one."""
+    assert counted()["floor"] > 0
+    assert counted(description=mpm.TotalLagrangian())["floor"] == 0
+
+
+def test_pic_carries_no_affine_velocity_and_two_dimensions_no_third():
+    """Leaves of the state, flops, bytes and temporaries of the compiled step all fall."""
+    apic, pic, solid = compiled(), compiled(transfer=mpm.PIC()), compiled(d=3)
+    assert pic[3] == apic[3] - 1
+    assert all(less < more for less, more in zip(pic[:3], apic[:3], strict=True))
+    assert all(less < more for less, more in zip(apic[:3], solid[:3], strict=True))
+
+
+def test_the_cost_of_an_empty_window_is_that_of_its_nodes():
+    """Twice the window each way: the same crossings, and at most 40 flops and 400 bytes for each node that is added."""
+    small, large = compiled(nodes=12), compiled(nodes=24)
+    added = 24**2 - 12**2
+    assert counted(nodes=24) == counted(nodes=12)
+    assert large[0] - small[0] < 40 * added
+    assert large[1] - small[1] < 400 * added
