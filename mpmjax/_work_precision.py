@@ -37,6 +37,7 @@ METHODS: tuple[Method, ...] = (Explicit(), SemiImplicit(), BackwardEuler(), Impl
 """What is tried by default."""
 _REFERENCE = TRBDF2()
 _RESOLVED = 0.25  # the error above which a larger one at a smaller step does not say that the best was reached
+_HOPELESS = 4  # how far below the explicit limit a run that still fails will not get better
 _MOST_STEPS = 2**30
 _PILOT = 20  # explicit steps from which the time of all of them is foreseen
 
@@ -183,6 +184,8 @@ def work_precision(
             resolved = trial.error < _RESOLVED or trial.dt < limit / bench.refinement
             idle = idle + 1 if resolved and trial.error > 0.8 * best else 0
             best = min(best, trial.error)
+            if trial.error == math.inf and trial.dt < limit / (_HOPELESS * bench.refinement):
+                return
             steps *= 2
             if 2 * trial.seconds > bench.most_seconds:
                 note(bench, method, steps, 2 * trial.seconds, math.nan)
@@ -242,7 +245,8 @@ class _Bench(NamedTuple):
     def limit(self, states: list[State]) -> float:
         """The least `stable_dt` at the start and in these states [s]."""
         on_the_way = [self.particles, *(with_state(self.particles, state) for state in states)]
-        return min(float(stable_dt(self.scene, particles)) for particles in on_the_way)
+        least = min(float(stable_dt(self.scene, particles)) for particles in on_the_way)
+        return max(least, self.t1 / _MOST_STEPS)  # with the linear kernel it may be zero
 
     def run(self, method: Method, steps: int) -> tuple[list[State] | None, float]:
         """The states at the times of comparison, None of a run that failed, and its seconds."""
@@ -254,8 +258,9 @@ class _Bench(NamedTuple):
 
     def foresee(self, method: Method, steps: int) -> float:
         """Seconds of so many steps, from a few of them."""
+        some = min(_PILOT, steps)
         self._go(method, steps, 1, 1)
-        return self._timed(method, steps, 1, _PILOT)[1] / _PILOT * steps
+        return self._timed(method, steps, 1, some)[1] / some * steps
 
     def _timed(self, method: Method, steps: int, frames: int, each: int) -> tuple[list[State] | None, float]:
         begun = time.perf_counter()
@@ -298,7 +303,7 @@ def _reference(build: Build, bench: _Bench, error: float) -> tuple[float, Trial,
     while change > error / 3 and (states is None or bench.t1 / steps > limit):
         steps *= 2
         states, seconds = bench.run(_REFERENCE, steps)
-        _require_time(seconds, bench, steps)
+        _require_prospects(bench, steps, seconds, limit)
         if states is not None:
             coarse, motion = motion, bench.motion(states)
             require(motion.size > 0, "Nothing moves in this scene, so there is no motion to be right or wrong.")
@@ -311,19 +316,21 @@ def _reference(build: Build, bench: _Bench, error: float) -> tuple[float, Trial,
         steps *= 2
         states, seconds = bench.run(_REFERENCE, steps)
         while states is None:
+            _require_prospects(bench, steps, seconds, limit / bench.refinement)
             steps *= 2
-            _require_time(seconds, bench, steps)
             states, seconds = bench.run(_REFERENCE, steps)
         motion = bench.motion(states)
         change = coarse.distance(motion)
     return limit, Trial(_REFERENCE, bench.refinement, bench.t1 / steps, steps, seconds, change), motion
 
 
-def _require_time(seconds: float, bench: _Bench, steps: int) -> None:
+def _require_prospects(bench: _Bench, steps: int, seconds: float, limit: float) -> None:
+    """Half the step must not take too long, and may succeed where this one fails."""
     require(
-        2 * seconds <= bench.most_seconds,
-        f"The reference, {name_of(_REFERENCE)} in {steps} steps, took {seconds:.2g} s and would have to be refined; "
-        f"allow more than {bench.most_seconds:g} s a run, or choose a shorter t1.",
+        2 * seconds <= bench.most_seconds and bench.t1 / steps > limit / _HOPELESS,
+        f"The reference, {name_of(_REFERENCE)} in {steps} steps ({seconds:.2g} s), does not settle or fails, and half "
+        f"the step will not do: allow more than {bench.most_seconds:g} s a run, choose a shorter t1, or see by "
+        "`mpmjax run` with that step what goes wrong.",
     )
 
 

@@ -3,6 +3,7 @@ cheapest."""
 
 import math
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -165,3 +166,15 @@ def test_a_scene_in_which_nothing_moves_is_refused():
 
     with pytest.raises(ValueError, match="Nothing moves"):
         mpm.work_precision(still, t1=1.0)
+
+
+def test_a_scene_that_fails_at_every_step_is_refused_and_not_tried_for_ever():
+    """The bar leaves the window."""
+
+    def leaving(n):
+        scene, bar = pulled(n)
+        bar = eqx.tree_at(lambda p: p.v, bar, bar.v + 1.0)
+        return mpm.Scene(scene.grid, mpm.NeoHookean(1e4, 0.3)), bar
+
+    with pytest.raises(ValueError, match="does not settle or fails"):
+        mpm.work_precision(leaving, t1=1.0)
