@@ -129,8 +129,8 @@ def read_job(path: Path) -> Job:
         methods = METHODS if method is None else (method,)
         found = work_precision(plan.build, t1=t1, error=error, methods=methods, refinements=(1,))
         best, choice = found.cheapest(), found.verdict()
-        require(best is not None, f"{path}: {choice}")
-        assert best is not None
+        if best is None:
+            raise ValueError(f"{path}: {choice}")
         dt, method = best.dt, best.method
         save_every = save_every or max(1, best.steps // _FRAMES)
     return Job(plan.scene, plan.particles, RunSettings(t1, dt, method, save_every or 1, dtype), plan.fit, choice)
