@@ -79,13 +79,22 @@ class WorkPrecision(NamedTuple):
         """The fastest trial that is good enough: of all, of the explicit ones or of the others; None if none is.
 
         Good enough is the target or, where no trial reaches it, a quarter above the least error of all, which then is
-        that of the grid. An explicit step beyond the limit is not, however well it went.
+        that of the grid. A trial is as good as the worse of itself and the next smaller step: where the error passes
+        through zero on its way from one sign to the other, that is luck. An explicit step beyond the limit is not
+        good, however well it went.
         """
         trials = [t for t in self.trials if not (isinstance(t.method, Explicit) and t.dt * t.refinement > self.limit)]
-        enough = max(self.target, 1.25 * min((t.error for t in trials if t.error >= 0), default=math.inf))
-        good = [t for t in trials if t.error <= enough < math.inf]
+        errors = [max(t.error, self._next(t).error) for t in trials]
+        enough = max(self.target, 1.25 * min((e for e in errors if e >= 0), default=math.inf))
+        good = [t for t, e in zip(trials, errors, strict=True) if e <= enough < math.inf]
         good = [t for t in good if explicit in (None, isinstance(t.method, Explicit))]
         return min(good, key=lambda trial: trial.seconds, default=None)
+
+    def _next(self, trial: Trial) -> Trial:
+        """The same with the next smaller step that was run, or itself."""
+        own = [t for t in self.trials if (t.refinement, name_of(t.method)) == (trial.refinement, name_of(trial.method))]
+        finer = [t for t in own if t.dt < trial.dt and not math.isnan(t.error)]
+        return max(finer, key=lambda t: t.dt, default=trial)
 
     def verdict(self) -> str:
         """In words: the cheapest setting, and what the other kind of method would have cost."""

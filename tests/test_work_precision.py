@@ -138,6 +138,14 @@ def test_an_explicit_step_beyond_the_limit_is_never_the_cheapest():
     assert WorkPrecision(trials, REFERENCE, 1e-2, 0.09).cheapest() == trials[2]
 
 
+def test_luck_does_not_count():
+    """A small error between two large ones is where the error changes its sign."""
+    steps = [(0.4, 1.0, 0.5), (0.2, 2.0, 0.005), (0.1, 4.0, 0.02), (0.05, 8.0, 0.009), (0.025, 16.0, 0.004)]
+    trials = tuple(Trial(MIDPOINT, 1, dt, 10, seconds, error) for dt, seconds, error in steps)
+    assert WorkPrecision(trials, REFERENCE, 1e-2, 1.0).cheapest() == trials[3]
+    assert WorkPrecision(trials[:3], REFERENCE, 1e-2, 1.0).cheapest() == trials[1]  # as good as what follows it
+
+
 def test_where_the_grid_allows_no_better_the_cheapest_is_as_good_as_it_allows():
     trials = (trial(MIDPOINT, 1.0, 0.1), trial(MIDPOINT, 2.0, 0.049), trial(MIDPOINT, 4.0, 0.04))
     found = WorkPrecision(trials, REFERENCE, 1e-2, 1.0)
