@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._checks import canonical
+from mpmjax._crossing import collect, spread
 from mpmjax._diagnostics import energy_of
 from mpmjax._kernel import Stencil
 from mpmjax._method import Explicit, Method
@@ -12,7 +13,7 @@ from mpmjax._nodes import Nodes, particles_to_grid
 from mpmjax._particles import Particles
 from mpmjax._scene import Scene, prepare
 from mpmjax._step import GridUpdate, grid_to_particles, update
-from mpmjax._transfer import FLIP, collect, spread
+from mpmjax._transfer import FLIP
 from mpmjax._types import Array, Float, Matrix, NodeVector, Scalar, components
 
 
@@ -146,15 +147,15 @@ def _step_budget(scene: Scene, before: Particles, after: Particles, nodes: Nodes
 
     # impulses at the nodes
     elastic, elastic_at_start = new.elastic, dt * nodes.force
-    raw = spread(stencil.index, stencil.weight[:, None], before.mass[None, None], scene.grid.size)
+    raw = spread(stencil, before.mass[None], None, scene.grid.size)
     weight = dt * images.fold(raw * jnp.asarray(scene.gravity))
     body = jnp.where(nodes.occupied, dt * nodes.mass[:, None] * nodes.acceleration - weight, 0)
     boundary, missed = jnp.where(new.free, 0, new.reaction), jnp.where(new.free, new.reaction, 0)
 
     # particle and nodes beside each other
     v_old = components(before.v)
-    arrived = collect(stencil.index, stencil.weight[:, None], images.unfold(new.before))[0]
-    moved = collect(stencil.index, stencil.weight[:, None], all1)[0]
+    arrived = collect(stencil, images.unfold(new.before))[0]
+    moved = collect(stencil, all1)[0]
     C_old, C_new = (None if q.C is None else components(q.C) for q in (before, after))
     beside = scene.transfer.alpha * (v_old - arrived) if isinstance(scene.transfer, FLIP) else jnp.zeros_like(v_old)
     lost_p2g, gained_p2g = _mismatch(stencil, before.mass, v_old, C_old, all0)
@@ -201,9 +202,10 @@ def _mismatch(
     stencil: Stencil, mass: Array, v: Float[Array, "d p"], C: Matrix | None, nodes: NodeVector
 ) -> tuple[Float[Array, ""], Float[Array, "d"]]:
     """½ Σ_ip w m ‖v_i − u_ip‖² and Σ_ip w m (v_i − u_ip), u_ip = v_p + C_p (x_i − x_p)."""
-    arm = stencil.gradient if stencil.affine is None else stencil.affine
-    safe = jnp.where(stencil.weight == 0, 1, stencil.weight)
-    arm = stencil.moment * arm / safe[:, None]  # x_i − x_p, (k, d, p); where the weight is zero it does not matter
+    weight = stencil.weight
+    arm = (
+        stencil.moment * stencil.least_squares.gradient / jnp.where(weight == 0, 1, weight)[:, None]
+    )  # x_i − x_p, (k, d, p); where the weight is zero it does not matter
 
     def add(total: tuple[Array, Array], stencil_node: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], None]:
         i, w, r = stencil_node
@@ -212,4 +214,4 @@ def _mismatch(
         return (total[0] + (w * mass * gap**2).sum() / 2, total[1] + (w * mass * gap).sum(axis=1)), None
 
     zero = jnp.zeros((), v.dtype), jnp.zeros(v.shape[0], v.dtype)
-    return jax.lax.scan(add, zero, (stencil.index, stencil.weight, arm))[0]
+    return jax.lax.scan(add, zero, (stencil.index, weight, arm))[0]

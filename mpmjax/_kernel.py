@@ -1,5 +1,8 @@
 """B-spline kernels and the stencil: for each particle its nodes, weights and weight gradients."""
 
+import math
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -31,30 +34,30 @@ class BSpline(eqx.Module):
         return jnp.floor(xi - (self.order - 1) / 2)
 
     def weights(self, f: Array) -> Array:
-        """Weights of the order + 1 nodes at a distance f from the first, in spacings. Shape (order + 1, *f.shape)."""
+        """Weights of the order + 1 nodes, (d, order + 1, p), at a distance f, (d, p), from the first, in spacings."""
         match self.order:
             case 1:
-                return jnp.stack([1 - f, f])
+                return jnp.stack([1 - f, f], axis=1)
             case 2:
-                return jnp.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2])
+                return jnp.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2], axis=1)
             case _:
                 t = f - 1
                 near = (3 * t**3 - 6 * t**2 + 4) / 6
                 far = (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6
-                return jnp.stack([(1 - t) ** 3 / 6, near, far, t**3 / 6])
+                return jnp.stack([(1 - t) ** 3 / 6, near, far, t**3 / 6], axis=1)
 
     def slopes(self, f: Array) -> Array:
         """Derivatives of the weights with respect to f [1 per spacing]."""
         match self.order:
             case 1:
-                return jnp.stack([-jnp.ones_like(f), jnp.ones_like(f)])
+                return jnp.stack([-jnp.ones_like(f), jnp.ones_like(f)], axis=1)
             case 2:
-                return jnp.stack([f - 1.5, -2 * (f - 1), f - 0.5])
+                return jnp.stack([f - 1.5, -2 * (f - 1), f - 0.5], axis=1)
             case _:
                 t = f - 1
                 near = (9 * t**2 - 12 * t) / 6
                 far = (-9 * t**2 + 6 * t + 3) / 6
-                return jnp.stack([-((1 - t) ** 2) / 2, near, far, t**2 / 2])
+                return jnp.stack([-((1 - t) ** 2) / 2, near, far, t**2 / 2], axis=1)
 
 
 class SplineGradient(eqx.Module):
@@ -75,24 +78,49 @@ Gradient = SplineGradient | MLSGradient
 
 
 class Stencil(eqx.Module):
-    """What ties particles to nodes: for each particle its k nodes, their weights and the weights' gradients.
+    """What ties particles to nodes: for each particle s = order + 1 nodes along each axis, and their weights.
 
-    Built at the positions x (updated Lagrangian) or once at the reference positions X (total Lagrangian); gradients are
-    with respect to those. Component first: the particle axis is last.
+    Weights and gradients of the s^d stencil nodes are products of one factor an axis, and only those are stored: w_ip
+    is the product of the weights, g_ip in direction a the same with the slope along a in the weight's place. Built at
+    the positions x (updated Lagrangian) or once at the reference positions X (total Lagrangian); gradients are with
+    respect to those. Component first: the particle axis is last.
     """
 
-    index: Indices
-    """Flat node index, shape (k, p); meaningless for a particle that is not `inside`."""
-    weight: Float[Array, "k p"]
-    """w_ip [-], shape (k, p)."""
-    gradient: Float[Array, "k d p"]
-    """g_ip [1/m], of the chosen operator, shape (k, d, p)."""
-    affine: Float[Array, "k d p"] | None
-    """The moving-least-squares gradient [1/m], where the transfer needs it and it is not `gradient` itself."""
+    shares: Int[Array, "d s p"]
+    """What each axis adds to the flat node index, shape (d, s, p); meaningless for a particle that is not `inside`."""
+    weights: Float[Array, "d s p"]
+    """Weights along each axis [-], shape (d, s, p)."""
+    slopes: Float[Array, "d s p"]
+    """Slopes [1/m] along each axis, of the chosen gradient operator, shape (d, s, p)."""
+    affine_slopes: Float[Array, "d s p"] | None
+    """Those of the moving-least-squares gradient, where the transfer needs it and it is not the chosen one."""
     moment: Float[Array, "d p"]
     """Diagonal of D_p [m²], shape (d, p)."""
     inside: Bool[Array, "p"]
     """Whether the whole stencil of the particle lies in the window."""
+
+    @property
+    def least_squares(self) -> "Stencil":
+        """The stencil whose gradient is that of moving least squares."""
+        if self.affine_slopes is None:
+            return self
+        return eqx.tree_at(lambda s: (s.slopes, s.affine_slopes), self, (self.affine_slopes, None))
+
+    @property
+    def index(self) -> Indices:
+        """Flat index of each stencil node, shape (s^d, p)."""
+        return _tensor(jnp.add, list(self.shares))
+
+    @property
+    def weight(self) -> Float[Array, "k p"]:
+        """w_ip [-], shape (s^d, p)."""
+        return _tensor(jnp.multiply, list(self.weights))
+
+    @property
+    def gradient(self) -> Float[Array, "k d p"]:
+        """g_ip [1/m], of the chosen operator, shape (s^d, d, p)."""
+        w, g = list(self.weights), list(self.slopes)
+        return jnp.stack([_tensor(jnp.multiply, [*w[:a], g[a], *w[a + 1 :]]) for a in range(len(w))], axis=1)
 
 
 def in_window(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleVector) -> Bool[Array, "p"]:
@@ -101,10 +129,6 @@ def in_window(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleV
     first = base - window.astype(base.dtype)[:, None]  # in floats: what is far outside overflows an integer
     shape = jnp.asarray(grid.shape, dtype=base.dtype)[:, None]
     return (jnp.asarray(grid.periodic)[:, None] | ((first >= 0) & (first + kernel.order < shape))).all(axis=0)
-
-
-def _first_node(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Array) -> Array:
-    return jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window[:, None]
 
 
 def make_stencil(
@@ -123,46 +147,40 @@ def make_stencil(
     dx = grid.spacing
     xi = components(x) / dx
     f = xi - jax.lax.stop_gradient(kernel.base(xi))
-    w, dw = kernel.weights(f), kernel.slopes(f) / dx  # (order + 1, d, p)
-    index = _first_node(kernel, grid, window, xi) + jnp.arange(kernel.order + 1, dtype=jnp.int32)[:, None, None]
-    shape = jnp.asarray(grid.shape, dtype=jnp.int32)[:, None]
-    index = jnp.where(jnp.asarray(grid.periodic)[:, None], index % shape, index)
-    factors = [w[:, a] for a in range(grid.dim)]
-    weight = _outer(factors)
-    spline = jnp.stack([_outer([*factors[:a], dw[:, a], *factors[a + 1 :]]) for a in range(grid.dim)], axis=1)
+    weights, spline = kernel.weights(f), kernel.slopes(f) / dx
     if kernel.order == 1:
         moment = f * (1 - f) * dx**2
         least_squares = spline
     else:
         variance = {2: 1 / 4, 3: 1 / 3}[kernel.order]
         moment = jnp.full_like(f, variance) * dx**2
-        offset = (jnp.arange(kernel.order + 1, dtype=f.dtype)[:, None, None] - f) * dx
-        ones = [jnp.ones_like(w[:, a]) for a in range(grid.dim)]
-        arms = [_outer([*ones[:a], offset[:, a], *ones[a + 1 :]]) for a in range(grid.dim)]
-        least_squares = weight[:, None] * jnp.stack(arms, axis=1) / moment
-    chosen = spline if isinstance(gradient, SplineGradient) else least_squares
+        offset = jnp.arange(kernel.order + 1, dtype=f.dtype)[:, None] - f[:, None]
+        least_squares = weights * offset / (variance * dx)
     same = isinstance(gradient, MLSGradient) or kernel.order == 1
     return Stencil(
-        index=_flat([index[:, a] for a in range(grid.dim)], grid.shape),
-        weight=weight,
-        gradient=chosen,
-        affine=least_squares if affine and not same else None,
+        shares=_shares(kernel, grid, window, xi),
+        weights=weights,
+        slopes=spline if isinstance(gradient, SplineGradient) else least_squares,
+        affine_slopes=least_squares if affine and not same else None,
         moment=moment,
         inside=in_window(kernel, grid, window, x),
     )
 
 
-def _outer(factors: list[Array]) -> Array:
-    """The tensor product over directions of (order + 1, p) factors, shape (k, p)."""
-    product = factors[0]
+def _shares(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Array) -> Int[Array, "d s p"]:
+    """What each axis adds to the C-order index of a particle's nodes."""
+    first = jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window[:, None]
+    along = first[:, None] + jnp.arange(kernel.order + 1, dtype=jnp.int32)[:, None]
+    periods, wraps, strides = (
+        jnp.asarray(numbers)[:, None, None]
+        for numbers in (grid.shape, grid.periodic, [math.prod(grid.shape[a + 1 :]) for a in range(grid.dim)])
+    )
+    return jnp.where(wraps, along % periods.astype(jnp.int32), along) * strides.astype(jnp.int32)
+
+
+def _tensor(combine: Callable[[Array, Array], Array], factors: list[Array]) -> Array:
+    """The (outer) tensor combination of one (s, p) factor a direction, in C order, shape (s^d, p)."""
+    combined = factors[0]
     for factor in factors[1:]:
-        product = (product[:, None] * factor).reshape(-1, factor.shape[-1])
-    return product
-
-
-def _flat(index: list[Array], shape: tuple[int, ...]) -> Array:
-    """C-order node index of the tensor product of (order + 1, p) indices, shape (k, p)."""
-    flat = index[0]
-    for i, length in zip(index[1:], shape[1:], strict=True):
-        flat = (flat[:, None] * length + i).reshape(-1, i.shape[-1])
-    return flat
+        combined = combine(combined[:, None], factor).reshape(-1, factor.shape[-1])
+    return combined

@@ -5,12 +5,13 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._boundary import Conditions, combine
+from mpmjax._crossing import spread
 from mpmjax._kernel import Stencil
 from mpmjax._mirror import Contact, Mirror, contacts, mirror
 from mpmjax._particles import Particles
 from mpmjax._potential import ElasticPotential
 from mpmjax._scene import Scene
-from mpmjax._transfer import p2g, spread
+from mpmjax._transfer import p2g
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
 
 
@@ -95,7 +96,7 @@ def particles_to_grid(
         if scene.body_force is not None:
             x, at = (particles.x + dt / 2 * particles.v, t + dt / 2) if centred else (particles.x, t)
             push = particles.mass * components(scene.body_force.acceleration(x, at))
-            force = spread(stencil.index, stencil.weight[:, None], push[None], grid.size)
+            force = spread(stencil, push, None, grid.size)
             acceleration = acceleration + jnp.where(occupied, force / full, 0)
         potential = ElasticPotential(
             scene.material, particles.volume, F, None if scene.total else F, stencil, Mirror(())

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax import _linalg as la
+from mpmjax._crossing import collect, spread
 from mpmjax._kernel import Stencil
 from mpmjax._mirror import Mirror
-from mpmjax._transfer import collect, spread
 from mpmjax._types import Array, Float, Matrix, NodeVector
 from mpmjax.material import AbstractMaterial
 
@@ -29,15 +29,14 @@ class ElasticPotential(eqx.Module):
 
     def strain(self, u: NodeVector) -> Matrix:
         """δF_p = Σ_i u_i h_ipᵀ, shape (d, d, p)."""
-        gradient = collect(self.stencil.index, self.stencil.gradient, self.mirror.unfold(u))
-        gradient = jnp.swapaxes(gradient, 0, 1)  # from derivative first to component first
+        gradient = jnp.swapaxes(collect(self.stencil, self.mirror.unfold(u))[1], 0, 1)
         return gradient if self.pull is None else la.matmul(gradient, self.pull)
 
     def divergence(self, P: Matrix, like: NodeVector) -> NodeVector:
         """Σ_p V0_p P_p h_ip [N], the transpose of `strain`; `like` is any node vector."""
         P = self.volume * P
         flux = P if self.pull is None else la.matmul(P, la.transpose(self.pull))
-        nodes = spread(self.stencil.index, self.stencil.gradient, jnp.swapaxes(flux, 0, 1), like.shape[0])
+        nodes = spread(self.stencil, None, jnp.swapaxes(flux, 0, 1), like.shape[0])
         return self.mirror.fold(nodes)
 
     def energy(self, u: NodeVector) -> Float[Array, ""]:

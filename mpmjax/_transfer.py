@@ -1,43 +1,14 @@
-"""Transfers between particles and grid. `spread` is the only function that scatters, `collect` the only one that
-gathers.
-
-Both are sums over a particle's stencil against a *basis*: an array (k, b, p) of b functions of the node, e.g. the
-weight and its d gradients. They are each other's transpose, so everything built of them (force and deformation,
-Hessian, P2G and G2P) is symmetric where mathematics says so.
-"""
+"""Transfers between particles and grid: PIC, FLIP and APIC."""
 
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from mpmjax._checks import require_between
+from mpmjax._crossing import collect, spread
 from mpmjax._kernel import Stencil
 from mpmjax._types import Array, Float, Matrix, NodeScalar, NodeVector, Scalar
-
-
-def spread(index: Array, basis: Float[Array, "k b p"], a: Float[Array, "b c p"], size: int) -> Float[Array, "n c"]:
-    """Scatter: the node array Σ_p Σ_b basis_kbp a_bcp, node n = index_kp."""
-
-    def add(nodes: Array, stencil_node: tuple[Array, Array]) -> tuple[Array, None]:
-        i, phi = stencil_node
-        rows = sum((phi[b] * a[b] for b in range(1, a.shape[0])), phi[0] * a[0])
-        return nodes.at[i].add(rows.T), None
-
-    empty = jnp.zeros((size, a.shape[1]), dtype=a.dtype)
-    return jax.lax.scan(add, empty, (index, basis))[0]
-
-
-def collect(index: Array, basis: Float[Array, "k b p"], nodes: Float[Array, "n c"]) -> Float[Array, "b c p"]:
-    """Gather, the transpose of `spread` in a: Σ_k basis_kbp nodes_nc, node n = index_kp."""
-
-    def add(total: Array, stencil_node: tuple[Array, Array]) -> tuple[Array, None]:
-        i, phi = stencil_node
-        return total + phi[:, None] * nodes[i].T, None
-
-    zero = jnp.zeros((basis.shape[1], nodes.shape[1], basis.shape[2]), dtype=nodes.dtype)
-    return jax.lax.scan(add, zero, (index, basis))[0]
 
 
 class PIC(eqx.Module):
@@ -98,15 +69,11 @@ def p2g(
     Returns:
         mass m_i [kg], shape (n,), and momentum m_i v_i [kg m/s], shape (n, d).
     """
-    rows = jnp.concatenate([mass[None], mass * v])[None]
-    if C is None:
-        basis = stencil.weight[:, None]
-    else:
-        # w (x_i − x_p) = D g, with g the moving-least-squares gradient
-        slope = mass * jnp.swapaxes(C, 0, 1) * stencil.moment[:, None]
-        rows = jnp.concatenate([rows, jnp.pad(slope, ((0, 0), (1, 0), (0, 0)))])
-        basis = _affine_basis(stencil)
-    nodes = spread(stencil.index, basis, rows, size)
+    rows, slopes = jnp.concatenate([mass[None], mass * v]), None
+    if C is not None:  # w (x_i − x_p) = D g, with g the moving-least-squares gradient
+        slopes = mass * jnp.swapaxes(C, 0, 1) * stencil.moment[:, None]
+        slopes = jnp.pad(slopes, ((0, 0), (1, 0), (0, 0)))
+    nodes = spread(stencil.least_squares, rows, slopes, size)
     return nodes[:, 0], nodes[:, 1:]
 
 
@@ -130,23 +97,16 @@ def g2p(
     Returns:
         the velocity that carries the particles, Σ_i w_ip v̄_i, their new velocity, and their new C (APIC).
     """
-    index, weight = stencil.index, stencil.weight[:, None]
     C = None
     match transfer:
         case APIC():
-            arrived, *gradient = collect(index, _affine_basis(stencil), after)
-            new, C = arrived, jnp.swapaxes(jnp.stack(gradient), 0, 1)
+            arrived, gradient = collect(stencil.least_squares, after)
+            new, C = arrived, jnp.swapaxes(gradient, 0, 1)
         case FLIP(alpha=alpha):
-            arrived, change = jnp.split(collect(index, weight, jnp.concatenate([after, after - before], axis=1))[0], 2)
+            arrived, change = jnp.split(collect(stencil, jnp.concatenate([after, after - before], axis=1))[0], 2)
             new = alpha * (v + change) + (1 - alpha) * arrived
         case _:
-            arrived = collect(index, weight, after)[0]
+            arrived, _ = collect(stencil, after)
             new = arrived
-    moved = arrived if mean is None else collect(index, weight, mean)[0]
+    moved = arrived if mean is None else collect(stencil, mean)[0]
     return moved, new, C
-
-
-def _affine_basis(stencil: Stencil) -> Float[Array, "k b p"]:
-    """The weight and the moving-least-squares gradient."""
-    slopes = stencil.gradient if stencil.affine is None else stencil.affine
-    return jnp.concatenate([stencil.weight[:, None], slopes], axis=1)
