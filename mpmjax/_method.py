@@ -1,9 +1,10 @@
 """The ways to update the grid's velocity in a step.
 
 A method says how the nodes move (`move`) and what impulse the elastic force gives them meanwhile (`elastic_impulse`);
-walls, contact, friction, transfers, reports and derivatives are the same for all. Backward Euler and the methods of
-second order are made of stages M (v − a) = c f(u + c v), f(u) the elastic force at the nodal displacement u: each is
-one linear solve, with f(u) = f(0) − H u, or Newton's method.
+walls, contact, friction, transfers, reports and derivatives are the same for all. Two constants say what it wants of
+P2G: body forces `centred` in the step, and whether it `needs_force` apart from the momentum that makes. Backward Euler
+and the methods of second order are made of stages M (v − a) = c f(u + c v), f(u) the elastic force at the nodal
+displacement u: each is one linear solve, with f(u) = f(0) − H u, or Newton's method.
 """
 
 from typing import ClassVar
@@ -52,6 +53,7 @@ class Explicit(eqx.Module):
 
     guess: ClassVar[Guess] = Guess.GRID_VELOCITY
     centred: ClassVar[bool] = False
+    needs_force: ClassVar[bool] = False
 
     def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         """The nodes' motion and the solve's report."""
@@ -93,6 +95,7 @@ class SemiImplicit(eqx.Module):
     adjoint_solver: ConjugateResidual = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = False
+    needs_force: ClassVar[bool] = True
 
     def __check_init__(self):
         require_between("SemiImplicit's beta", self.beta, 0, 1)
@@ -141,6 +144,7 @@ class BackwardEuler(eqx.Module):
     adjoint_solver: ConjugateResidual = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = False
+    needs_force: ClassVar[bool] = True
 
     def __check_init__(self):
         if self.rtol is not None:
@@ -184,6 +188,7 @@ class ImplicitMidpoint(eqx.Module):
     adjoint_solver: ConjugateResidual = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = True
+    needs_force: ClassVar[bool] = True
 
     def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         """The nodes' motion and the solve's report."""
@@ -226,6 +231,7 @@ class TRBDF2(eqx.Module):
     adjoint_solver: ConjugateResidual = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = True
+    needs_force: ClassVar[bool] = True
 
     def __check_init__(self):
         require_between("TRBDF2's rho", self.rho, 0, 1)

@@ -21,13 +21,13 @@ class Nodes(eqx.Module):
     mass: NodeScalar
     """m_i [kg], shape (n,), folded at symmetry planes; zero on empty nodes, whose mass is but rounding."""
     velocity: NodeVector
-    """v_i^n [m/s], shape (n, d); zero on empty nodes."""
+    """v_i^n [m/s], shape (n, d); zero on empty nodes. Plus Δt f_i/m_i where P2G has added the force's impulse."""
     occupied: Bool[Array, "n 1"]
     """Whether the node has mass beyond rounding, shape (n, 1)."""
     acceleration: Array
     """Body acceleration g [m/s²], shape (d,), or (n, d) where it varies."""
     force: NodeVector
-    """f_i at the start of the step [N], shape (n, d)."""
+    """f_i at the start of the step [N], shape (n, d); zero where P2G has added its impulse to the momentum."""
     dt: Float[Array, ""]
     """Δt [s]."""
     spacing: Float[Array, ""]
@@ -79,18 +79,25 @@ class Nodes(eqx.Module):
 
 
 def particles_to_grid(
-    scene: Scene, particles: Particles, t: Scalar, dt: Scalar, stencil: Stencil, *, centred: bool
+    scene: Scene, particles: Particles, t: Scalar, dt: Scalar, stencil: Stencil, *, centred: bool, kicked: bool = False
 ) -> Nodes:
     """P2G, folded at symmetry planes, with the elastic potential and the boundaries of the step from t to t + dt.
 
-    Body forces are those of the particles at t, or with `centred` at t + ½dt, half a step on by their velocity.
+    Body forces are those of the particles at t, or with `centred` at t + ½dt, half a step on by their velocity. With
+    `kicked` the elastic force is not wanted for itself: its impulse over the step goes to the nodes in one sum with the
+    momentum, where they have one gradient operator, and half of P2G's cost is saved.
     """
     grid, window = scene.grid, scene.window(particles)
     v, F = components(particles.v), particles.deformation()
     C = None if particles.C is None else components(particles.C)
     acceleration = jnp.asarray(scene.gravity)
     with jax.named_scope("p2g"):
-        mass, momentum = p2g(stencil, particles.mass, v, C, grid.size)
+        potential = ElasticPotential(
+            scene.material, particles.volume, F, None if scene.total else F, stencil, Mirror(())
+        )
+        kicked = kicked and stencil.affine_slopes is None
+        impulse = -dt * potential.rest_flux() if kicked else None
+        mass, momentum = p2g(stencil, particles.mass, v, C, grid.size, impulse)
         occupied = (mass > jnp.finfo(mass.dtype).eps * particles.mass.mean())[:, None]
         full = jnp.where(occupied, mass[:, None], 1)
         if scene.body_force is not None:
@@ -98,15 +105,12 @@ def particles_to_grid(
             push = particles.mass * components(scene.body_force.acceleration(x, at))
             force = spread(stencil, push, None, grid.size)
             acceleration = acceleration + jnp.where(occupied, force / full, 0)
-        potential = ElasticPotential(
-            scene.material, particles.volume, F, None if scene.total else F, stencil, Mirror(())
-        )
         nodes = Nodes(
             mass=jnp.where(occupied[:, 0], mass, 0),
             velocity=jnp.where(occupied, momentum / full, 0),
             occupied=occupied,
             acceleration=acceleration,
-            force=potential.rest_force(momentum),
+            force=jnp.zeros_like(momentum) if kicked else potential.rest_force(momentum),
             dt=jnp.asarray(dt),
             spacing=jnp.asarray(grid.spacing),
             potential=potential,

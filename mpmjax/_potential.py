@@ -29,14 +29,16 @@ class ElasticPotential(eqx.Module):
 
     def strain(self, u: NodeVector) -> Matrix:
         """δF_p = Σ_i u_i h_ipᵀ, shape (d, d, p)."""
-        gradient = jnp.swapaxes(collect(self.stencil, self.mirror.unfold(u))[1], 0, 1)
+        _, slopes = collect(self.stencil, self.mirror.unfold(u))
+        return self.deformed(jnp.swapaxes(slopes, 0, 1))
+
+    def deformed(self, gradient: Matrix) -> Matrix:
+        """δF_p from the gradient Σ_i u_i g_ipᵀ of the displacement."""
         return gradient if self.pull is None else la.matmul(gradient, self.pull)
 
     def divergence(self, P: Matrix, like: NodeVector) -> NodeVector:
         """Σ_p V0_p P_p h_ip [N], the transpose of `strain`; `like` is any node vector."""
-        P = self.volume * P
-        flux = P if self.pull is None else la.matmul(P, la.transpose(self.pull))
-        nodes = spread(self.stencil, None, jnp.swapaxes(flux, 0, 1), like.shape[0])
+        nodes = spread(self.stencil, None, jnp.swapaxes(self._flux(P), 0, 1), like.shape[0])
         return self.mirror.fold(nodes)
 
     def energy(self, u: NodeVector) -> Float[Array, ""]:
@@ -50,6 +52,14 @@ class ElasticPotential(eqx.Module):
     def rest_force(self, like: NodeVector) -> NodeVector:
         """The force at u = 0, without the gather."""
         return -self.divergence(_stress(self.material, self.F), like)
+
+    def rest_flux(self) -> Matrix:
+        """What the force at u = 0 is the sum of, f_i = −Σ_p (V0_p P_p F_pᵀ) g_ip: the bracket [J], shape (d, d, p)."""
+        return self._flux(_stress(self.material, self.F))
+
+    def _flux(self, P: Matrix) -> Matrix:
+        P = self.volume * P
+        return P if self.pull is None else la.matmul(P, la.transpose(self.pull))
 
 
 @jax.jit

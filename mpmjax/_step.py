@@ -71,7 +71,8 @@ def advance(
         stencil: that of the reference positions, if the description is total and it was computed before.
     """
     stencil = scene.stencil(particles) if stencil is None else stencil
-    nodes = particles_to_grid(scene, particles, t, dt, stencil, centred=method.centred)
+    kicked = not (method.needs_force or scene.transfer.needs_change)
+    nodes = particles_to_grid(scene, particles, t, dt, stencil, centred=method.centred, kicked=kicked)
     new = update(nodes, method)
     outside = (~stencil.inside).sum().astype(jnp.int32)
     return grid_to_particles(scene, particles, nodes, new), StepInfo(new.solve, new.contact, outside)
@@ -128,10 +129,10 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
     unfold = potential.mirror.unfold
     before, motion = unfold(new.before), jax.tree.map(unfold, new.motion)
     with jax.named_scope("g2p"):
-        moved, v, C = g2p(
+        moved, v, C, gradient = g2p(
             scene.transfer, potential.stencil, components(particles.v), before, motion.velocity, motion.mean
         )
-        F = potential.F + dt * potential.strain(new.motion.carrier)
+        F = potential.F + dt * potential.deformed(gradient)
     return Particles(
         x=particle_first(components(particles.x) + dt * moved),
         v=particle_first(v),

@@ -19,6 +19,7 @@ class PIC(eqx.Module):
     """
 
     affine: ClassVar[bool] = False
+    needs_change: ClassVar[bool] = False
 
 
 class FLIP(eqx.Module):
@@ -34,6 +35,7 @@ class FLIP(eqx.Module):
 
     alpha: Scalar = 0.99
     affine: ClassVar[bool] = False
+    needs_change: ClassVar[bool] = True
 
     def __check_init__(self):
         require_between("FLIP's alpha", self.alpha, 0, 1)
@@ -48,13 +50,19 @@ class APIC(eqx.Module):
     """
 
     affine: ClassVar[bool] = True
+    needs_change: ClassVar[bool] = False
 
 
 Transfer = PIC | FLIP | APIC
 
 
 def p2g(
-    stencil: Stencil, mass: Float[Array, "p"], v: Float[Array, "d p"], C: Matrix | None, size: int
+    stencil: Stencil,
+    mass: Float[Array, "p"],
+    v: Float[Array, "d p"],
+    C: Matrix | None,
+    size: int,
+    impulse: Matrix | None = None,
 ) -> tuple[NodeScalar, NodeVector]:
     """Particles to grid: m_i = Σ_p w_ip m_p and m_i v_i = Σ_p w_ip m_p (v_p + C_p (x_i − x_p)).
 
@@ -66,14 +74,19 @@ def p2g(
         v: v_p [m/s], shape (d, p).
         C: affine velocity [1/s], shape (d, d, p), or None.
         size: number of nodes.
+        impulse: what else the momentum receives in the same sum, Σ_p I_p g_ip [kg m²/s], shape (d, d, p), with g_ip the
+            moving-least-squares gradient if there is a C.
     Returns:
         mass m_i [kg], shape (n,), and momentum m_i v_i [kg m/s], shape (n, d).
     """
-    rows, slopes = jnp.concatenate([mass[None], mass * v]), None
-    if C is not None:  # w (x_i − x_p) = D g, with g the moving-least-squares gradient
-        slopes = mass * jnp.swapaxes(C, 0, 1) * stencil.moment[:, None]
-        slopes = jnp.pad(slopes, ((0, 0), (1, 0), (0, 0)))
-    nodes = spread(stencil.least_squares, rows, slopes, size)
+    arms = [] if impulse is None else [impulse]
+    if C is None:
+        along = stencil
+    else:  # w (x_i − x_p) = D g, with g the moving-least-squares gradient
+        along = stencil.least_squares
+        arms.append(mass * C * stencil.moment)
+    slopes = jnp.pad(jnp.swapaxes(sum(arms), 0, 1), ((0, 0), (1, 0), (0, 0))) if arms else None
+    nodes = spread(along, jnp.concatenate([mass[None], mass * v]), slopes, size)
     return nodes[:, 0], nodes[:, 1:]
 
 
@@ -84,29 +97,32 @@ def g2p(
     before: NodeVector,
     after: NodeVector,
     mean: NodeVector | None = None,
-) -> tuple[Float[Array, "d p"], Float[Array, "d p"], Matrix | None]:
+) -> tuple[Float[Array, "d p"], Float[Array, "d p"], Matrix | None, Matrix]:
     """Grid to particles.
 
     Args:
         transfer: PIC, FLIP or APIC.
         stencil: stencil of the particles.
         v: the particles' velocity before the step [m/s], shape (d, p).
-        before: v_i^n [m/s], shape (n, d).
+        before: v_i^n [m/s], shape (n, d); only FLIP looks at it.
         after: v_i^{n+1} [m/s], shape (n, d).
-        mean: with what the nodes move over the step [m/s], shape (n, d), if not with v_i^{n+1}.
+        mean: with what the nodes move over the step, v̄_i [m/s], shape (n, d), if not with v_i^{n+1}.
     Returns:
-        the velocity that carries the particles, Σ_i w_ip v̄_i, their new velocity, and their new C (APIC).
+        the velocity that carries the particles, Σ_i w_ip v̄_i; their new velocity; their new C (APIC); and the velocity
+        gradient that deforms them, Σ_i v̄_i g_ipᵀ [1/s], shape (d, d, p).
     """
-    C = None
+    fields = [after] if mean is None else [after, mean]
+    if isinstance(transfer, FLIP):
+        fields.append(after - before)
+    values, gradients = collect(stencil, jnp.concatenate(fields, axis=1))
+    arrived, *others = jnp.split(values, len(fields))
+    slope, *other_slopes = (jnp.swapaxes(g, 0, 1) for g in jnp.split(gradients, len(fields), axis=1))
+    new, C = arrived, None
     match transfer:
+        case APIC() if stencil.affine_slopes is None:
+            C = slope
         case APIC():
-            arrived, gradient = collect(stencil.least_squares, after)
-            new, C = arrived, jnp.swapaxes(gradient, 0, 1)
+            C = jnp.swapaxes(collect(stencil.least_squares, after)[1], 0, 1)
         case FLIP(alpha=alpha):
-            arrived, change = jnp.split(collect(stencil, jnp.concatenate([after, after - before], axis=1))[0], 2)
-            new = alpha * (v + change) + (1 - alpha) * arrived
-        case _:
-            arrived, _ = collect(stencil, after)
-            new = arrived
-    moved = arrived if mean is None else collect(stencil, mean)[0]
-    return moved, new, C
+            new = alpha * (v + others[-1]) + (1 - alpha) * arrived
+    return (arrived, new, C, slope) if mean is None else (others[0], new, C, other_slopes[0])

@@ -164,22 +164,22 @@ def work_precision(
     require_positive("t1 [s]", t1)
     require_positive("error", error)
     require_positive("most_seconds", most_seconds)
-    benches = {n: _Bench.of(build, n, t1, most_seconds) for n in {1, *refinements}}
-    limit, reference, truth = _reference(build, benches[1], error)
+    benches = {n: Bench.of(build, n, t1, most_seconds) for n in {1, *refinements}}
+    limit, reference, truth = settle(build, benches[1], error)
     progress(reference)
     trials: list[Trial] = []
 
-    def note(bench: _Bench, method: Method, steps: int, seconds: float, miss: float) -> Trial:
+    def note(bench: Bench, method: Method, steps: int, seconds: float, miss: float) -> Trial:
         trials.append(Trial(method, bench.refinement, bench.t1 / steps, steps, seconds, miss))
         progress(trials[-1])
         return trials[-1]
 
-    def tried(bench: _Bench, method: Method, steps: int) -> Trial:
+    def tried(bench: Bench, method: Method, steps: int) -> Trial:
         states, seconds = bench.run(method, steps)
         miss = math.inf if states is None else bench.motion(states).distance(truth)
         return note(bench, method, steps, seconds, miss)
 
-    def refine(bench: _Bench, method: Method) -> None:
+    def refine(bench: Bench, method: Method) -> None:
         steps, best, idle = FRAMES, math.inf, 0
         if isinstance(method, Explicit):
             steps = bench.whole(limit / bench.refinement)
@@ -207,7 +207,7 @@ def work_precision(
     return WorkPrecision(tuple(trials), reference, float(error), limit)
 
 
-class _Motion(NamedTuple):
+class Displacements(NamedTuple):
     """Where particles were, and how far they had come at the times of comparison."""
 
     X: np.ndarray
@@ -220,14 +220,14 @@ class _Motion(NamedTuple):
         """The largest RMS displacement [m]."""
         return float(_rms(self.u).max())
 
-    def distance(self, finer: "_Motion") -> float:
+    def distance(self, finer: "Displacements") -> float:
         """From a motion of as many or more particles, relative to its size."""
         share = max(1, round(len(finer.X) / len(self.X)))
         near = scipy.spatial.KDTree(finer.X).query(self.X, k=share)[1].reshape(len(self.X), share)
         return float(_rms(self.u - finer.u[:, near].mean(axis=2)).max() / finer.size)
 
 
-class _Bench(NamedTuple):
+class Bench(NamedTuple):
     """Runs and times a scene; each method is compiled once, whatever its step."""
 
     refinement: int
@@ -237,7 +237,7 @@ class _Bench(NamedTuple):
     most_seconds: float
 
     @classmethod
-    def of(cls, build: Build, refinement: int, t1: float, most_seconds: float) -> "_Bench":
+    def of(cls, build: Build, refinement: int, t1: float, most_seconds: float) -> "Bench":
         """The bench of a refined scene."""
         scene, particles = build(refinement)
         return cls(refinement, scene, prepare(scene, particles), float(t1), float(most_seconds))
@@ -246,10 +246,10 @@ class _Bench(NamedTuple):
         """The least number of steps, a multiple of the frames, whose step is not longer than dt [s]."""
         return FRAMES * math.ceil(self.t1 / (FRAMES * float(dt)) - 1e-9)
 
-    def motion(self, states: list[State]) -> _Motion:
+    def motion(self, states: list[State]) -> Displacements:
         """The motion through these states."""
         X = np.asarray(self.particles.x)
-        return _Motion(X, np.stack([np.asarray(state.x) for state in states]) - X)
+        return Displacements(X, np.stack([np.asarray(state.x) for state in states]) - X)
 
     def limit(self, states: list[State]) -> float:
         """The least `stable_dt` at the start and in these states [s]."""
@@ -260,18 +260,18 @@ class _Bench(NamedTuple):
     def run(self, method: Method, steps: int) -> tuple[list[State] | None, float]:
         """The states at the times of comparison, None of a run that failed, and its seconds."""
         self._go(method, steps, 1, 1)
-        states, seconds = self._timed(method, steps, FRAMES, steps // FRAMES)
+        states, seconds = self.timed(method, steps, FRAMES, steps // FRAMES)
         if states is not None and seconds < self.most_seconds / 10:
-            seconds = min(seconds, self._timed(method, steps, FRAMES, steps // FRAMES)[1])
+            seconds = min(seconds, self.timed(method, steps, FRAMES, steps // FRAMES)[1])
         return states, seconds
 
     def foresee(self, method: Method, steps: int) -> float:
         """Seconds of so many steps, from a few of them."""
         some = min(_PILOT, steps)
         self._go(method, steps, 1, 1)
-        return self._timed(method, steps, 1, some)[1] / some * steps
+        return self.timed(method, steps, 1, some)[1] / some * steps
 
-    def _timed(self, method: Method, steps: int, frames: int, each: int) -> tuple[list[State] | None, float]:
+    def timed(self, method: Method, steps: int, frames: int, each: int) -> tuple[list[State] | None, float]:
         begun = time.perf_counter()
         states = self._go(method, steps, frames, each)
         return states, time.perf_counter() - begun
@@ -302,7 +302,7 @@ class _Bench(NamedTuple):
         return states
 
 
-def _reference(build: Build, bench: _Bench, error: float) -> tuple[float, Trial, _Motion]:
+def settle(build: Build, bench: Bench, error: float) -> tuple[float, Trial, Displacements]:
     """The explicit limit over the motion on the scene's own grid [s], the reference, and its motion.
 
     Its first step is halved, on that grid, until that changes the motion by less than a third of the error, or it is
@@ -321,7 +321,7 @@ def _reference(build: Build, bench: _Bench, error: float) -> tuple[float, Trial,
     assert motion is not None
     change, seconds = math.inf, 0.0
     while change > error / 3 and (math.isinf(change) or seconds * 2 ** (bench.particles.dim + 1) <= bench.most_seconds):
-        bench, coarse = _Bench.of(build, 2 * bench.refinement, bench.t1, bench.most_seconds), motion
+        bench, coarse = Bench.of(build, 2 * bench.refinement, bench.t1, bench.most_seconds), motion
         steps *= 2
         states, seconds = bench.run(_REFERENCE, steps)
         while states is None:
@@ -333,7 +333,7 @@ def _reference(build: Build, bench: _Bench, error: float) -> tuple[float, Trial,
     return limit, Trial(_REFERENCE, bench.refinement, bench.t1 / steps, steps, seconds, change), motion
 
 
-def _require_prospects(bench: _Bench, steps: int, seconds: float, limit: float) -> None:
+def _require_prospects(bench: Bench, steps: int, seconds: float, limit: float) -> None:
     """Half the step must not take too long, and may succeed where this one fails."""
     require(
         2 * seconds <= bench.most_seconds and bench.t1 / steps > limit / _HOPELESS,

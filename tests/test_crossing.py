@@ -1,107 +1,156 @@
-"""`gather` and `scatter`: what they sum, and that each is the other's transpose to every order and in batches."""
+"""`collect` and `spread`: the sums they say, and that each is the other's transpose to every order and in batches."""
 
+from functools import cache
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close
+from helpers import DIMS, GRADIENTS, KERNELS, assert_close, ids
 
-from mpmjax._crossing import gather, scatter
+import mpmjax as mpm
+from mpmjax._crossing import collect, spread
+from mpmjax._kernel import Stencil, make_stencil
 
-S, P, SIZE = 3, 17, 40
-COLUMNS = pytest.mark.parametrize("c", [1, 2, 3, 4, 6])
-EACH_DIM = pytest.mark.parametrize("d", [1, 2])
-
-
-def shares(d, seed=0, batch=()):
-    """Of which some lead to the same node."""
-    return jnp.asarray(np.random.default_rng(seed).integers(0, SIZE // d, (*batch, S, d, P)), jnp.int32)
-
-
-def values(d, c, seed=1, batch=()):
-    """One array for each stencil node."""
-    return list(jnp.asarray(np.random.default_rng(seed).normal(size=(S**d, *batch, c, P))))
+P = 17
+EACH_KERNEL = pytest.mark.parametrize("kernel", **ids(KERNELS))
+EACH_DIM = pytest.mark.parametrize("d", DIMS)
+to_nodes, from_nodes = eqx.filter_jit(spread), eqx.filter_jit(collect)
+QUADRATIC, MLS = mpm.BSpline(), mpm.MLSGradient()
 
 
-def grid(c, seed=2, batch=()):
-    """Node values."""
-    return jnp.asarray(np.random.default_rng(seed).normal(size=(*batch, SIZE, c)))
+def place(x, kernel=QUADRATIC, gradient=MLS):
+    """The stencil at x in a periodic window of 5 nodes, of which the cubic kernel's stencil has 4."""
+    d = x.shape[1]
+    return make_stencil(
+        kernel, gradient, mpm.Grid((5,) * d, 1.0, periodic=True), jnp.zeros(d, jnp.int32), x, affine=True
+    )
 
 
-def node_of(index):
-    """Node numbers, stencil nodes in C order, (S^d, P)."""
-    index = np.asarray(index)
-    return np.stack([sum(index[i, a] for a, i in enumerate(at)) for at in np.ndindex((S,) * index.shape[1])])
+@cache
+def example(d, c=3, kernel=QUADRATIC, gradient=MLS, seed=0):
+    """Positions, their stencil, what particles give (d + 1, c, P), and node values."""
+    rng = np.random.default_rng(seed)
+    x = jnp.asarray(rng.uniform(0, 5, (P, d)))
+    given, nodes = (jnp.asarray(rng.normal(size=shape)) for shape in ((d + 1, c, P), (5**d, c)))
+    return x, eqx.filter_jit(place)(x, kernel, gradient), given, nodes
 
 
-@COLUMNS
+@EACH_KERNEL
 @EACH_DIM
-def test_they_read_and_add_at_the_nodes(d, c):
-    index = shares(d)
-    for read, at in zip(gather(index, grid(c)), node_of(index), strict=True):
-        np.testing.assert_array_equal(read.T, grid(c)[at])
-    expected = np.zeros((SIZE, c))
-    for value, at in zip(values(d, c), node_of(index), strict=True):
-        np.add.at(expected, at, value.T)
-    assert_close(jax.jit(scatter, static_argnums=2)(index, values(d, c), SIZE), expected, 1e-14)
+@pytest.mark.parametrize("gradient", **ids(GRADIENTS))
+@pytest.mark.parametrize("c", [1, 3, 6])
+def test_they_are_the_sums_that_weights_and_gradients_say(c, gradient, d, kernel):
+    """Σ_p (w a + Σ_b g_b a_b) and Σ_i w n, Σ_i g n, term by term in NumPy, whichever part of a is given."""
+    _, stencil, given, nodes = example(d, c, kernel, gradient)
+    basis = np.concatenate([stencil.weight[:, None], stencil.gradient], axis=1)
+    index = np.asarray(stencil.index)
+    for value, slopes in ((given[0], given[1:]), (given[0], None), (None, given[1:])):
+        a = np.concatenate(
+            [0 * given[:1] if value is None else value[None], 0 * given[1:] if slopes is None else slopes]
+        )
+        expected = np.zeros_like(nodes)
+        np.add.at(expected, index, np.einsum("kbp,bcp->kpc", basis, a))
+        assert_close(to_nodes(stencil, value, slopes, 5**d), expected, 1e-13)
+    value, slopes = from_nodes(stencil, nodes)
+    expected = np.einsum("kbp,kpc->bcp", basis, np.asarray(nodes)[index])
+    assert_close(jnp.concatenate([value[None], slopes]), expected, 1e-13)
 
 
 def test_what_goes_to_no_node_is_dropped():
-    """Beyond either end; the rest arrives."""
-    index = jnp.asarray([-1, 0, SIZE - 1, SIZE, 2**30], jnp.int32)[None, None]
-    given = scatter(index, [jnp.ones((3, 5))], SIZE)
-    np.testing.assert_array_equal(given, np.zeros((SIZE, 3)) + np.isin(np.arange(SIZE), [0, SIZE - 1])[:, None])
+    """Beyond either end; the rest arrives. Nothing else is touched."""
+    shares = jnp.asarray([-1, 0, 3, 4, 2**30], jnp.int32)[None, None]
+    one = jnp.ones((1, 1, 5))
+    stencil = Stencil(shares, one, one, None, one[0], one[0, 0] > 0)
+    np.testing.assert_array_equal(spread(stencil, jnp.ones((3, 5)), None, 4), np.tile([[1.0], [0], [0], [1]], 3))
 
 
-@COLUMNS
-@EACH_DIM
-def test_each_is_the_others_transpose(d, c):
-    """By `linear_transpose` and by reverse mode, in one call each and not one a stencil node."""
-    index = shares(d)
-    (back,) = jax.linear_transpose(lambda v: scatter(index, v, SIZE), values(d, c))(grid(c))
-    jax.tree.map(np.testing.assert_array_equal, back, gather(index, grid(c)))
-    pull = jax.vjp(lambda n: gather(index, n), grid(c))[1]
-    assert_close(pull(values(d, c))[0], scatter(index, values(d, c), SIZE), 1e-15)
-    assert str(jax.make_jaxpr(pull)(values(d, c))).count("stencil_scatter") == 1
+def sums(x, given, nodes):
+    """Both sums, as functions of everything."""
+    stencil = place(x)
+    value, slopes = collect(stencil, nodes)
+    return spread(stencil, given[0], given[1:], nodes.shape[0]), jnp.concatenate([value[None], slopes])
 
 
 @EACH_DIM
-def test_derivatives_of_every_order_and_mode(d):
-    """Of a cubic form: the Hessian forward over reverse, reverse over forward and reverse over reverse agree with the
-    one in closed form."""
-    index, n = shares(d), grid(2)[:, :1]
-
-    def form(n):
-        squared = [v * v * v for v in gather(index, n)]
-        return (scatter(index, squared, SIZE) * jnp.arange(float(SIZE))[:, None]).sum() / 6
-
-    expected = np.zeros(SIZE)
-    at = node_of(index)
-    for k in at:
-        np.add.at(expected, k, np.asarray(n)[k, 0] * k)
-    for outer in (jax.jacfwd, jax.jacrev):
-        for inner in (jax.jacfwd, jax.jacrev):
-            assert_close(outer(inner(form))(n).reshape(SIZE, SIZE), np.diag(expected), 1e-12)
+def test_each_is_the_others_transpose(d):
+    """By `linear_transpose` and in reverse mode, each by one call of the other and none of itself."""
+    _, stencil, given, nodes = example(d)
+    (back,) = jax.linear_transpose(lambda a: spread(stencil, a[0], a[1:], 5**d), given)(nodes)
+    value, slopes = collect(stencil, nodes)
+    np.testing.assert_array_equal(back, jnp.concatenate([value[None], slopes]))
+    pull = jax.vjp(lambda n: collect(stencil, n), nodes)[1]
+    assert_close(pull((given[0], given[1:]))[0], spread(stencil, given[0], given[1:], 5**d), 1e-15)
+    program = str(jax.make_jaxpr(pull)((given[0], given[1:])))
+    assert (program.count("stencil_spread"), program.count("stencil_collect")) == (1, 0)
 
 
-@pytest.mark.parametrize("mapped", [(0, 0), (None, 0), (0, None)])
 @EACH_DIM
-def test_a_batch_is_its_members(mapped, d):
-    """Whichever of index and values is batched, also nested, and differentiated outside of the batch."""
-    index = shares(d, batch=(4,) if mapped[0] == 0 else ())
-    n = grid(3, batch=(4,) if mapped[1] == 0 else ())
-    v = jnp.stack(values(d, 3, batch=(4,) if mapped[1] == 0 else ()), axis=1 if mapped[1] == 0 else 0)
-    member = [(index[i] if mapped[0] == 0 else index, n[i] if mapped[1] == 0 else n) for i in range(4)]
-    for i, read in enumerate(jnp.stack(jax.vmap(gather, mapped)(index, n), axis=1)):
-        np.testing.assert_array_equal(read, jnp.stack(gather(*member[i])))
-    added = jax.vmap(lambda i, v: scatter(i, list(v), SIZE), mapped)(index, v)
-    for i, nodes in enumerate(added):
-        assert_close(nodes, scatter(member[i][0], list(v[i] if mapped[1] == 0 else v), SIZE), 1e-14)
+def test_derivatives_by_everything_are_those_of_the_sums_written_out(d):
+    """First and second, by x as well: against the same sums as dense products, in forward and in reverse mode."""
+    x, _, given, nodes = example(d)
+    to = [jnp.asarray(np.random.default_rng(9).normal(size=a.shape)) for a in (nodes, given)]
 
-    def loss(n):
-        return sum((r**3).sum() for r in jax.vmap(gather, mapped)(index, n))
+    def loss(sums, x, given, nodes):
+        return sum((t * s**2).sum() for t, s in zip(to, sums(x, given, nodes), strict=True))
 
-    alone = [jax.grad(lambda n, i=i: sum((r**3).sum() for r in gather(i, n)))(n) for i, n in member]
-    assert_close(jax.grad(loss)(n), jnp.stack(alone) if mapped[1] == 0 else sum(alone), 1e-12)
-    nested = jax.vmap(jax.vmap(gather, mapped))(*(a[None] for a in (index, n)))
-    assert_close(jnp.stack(nested)[:, 0], jnp.stack(jax.vmap(gather, mapped)(index, n)), 1e-15)
+    def dense(x, given, nodes):
+        stencil = place(x)
+        basis = jnp.concatenate([stencil.weight[:, None], stencil.gradient], axis=1)
+        at = jax.nn.one_hot(stencil.index, nodes.shape[0], dtype=x.dtype)  # (k, p, n)
+        return jnp.einsum("kbp,bcp,kpn->nc", basis, given, at), jnp.einsum("kbp,kpn,nc->bcp", basis, at, nodes)
+
+    here, there = (jax.grad(lambda *a, f=f: loss(f, *a), (0, 1, 2)) for f in (sums, dense))
+    args = x, given, nodes
+    along = tuple(jnp.asarray(np.random.default_rng(i).normal(size=a.shape)) for i, a in enumerate(args))
+
+    @jax.jit
+    def derivatives(args, along):
+        found = []
+        for grad, f in ((here, sums), (there, dense)):
+            slope = jax.jvp(lambda *a, f=f: loss(f, *a), args, along)[1]
+            curved = jax.jvp(grad, args, along)[1]
+            twice = jax.grad(lambda a, grad=grad: sum((g * b).sum() for g, b in zip(grad(*a), along, strict=True)))(
+                args
+            )
+            found.append((grad(*args), slope, curved, twice))
+        return found
+
+    one, other = derivatives(args, along)
+    jax.tree.map(lambda a, b: assert_close(a, b, 1e-11), one, other)
+
+
+@pytest.mark.parametrize("of_nodes", [True, False], ids=["nodes", "stencil"])
+@pytest.mark.parametrize("d", [1, 2])
+def test_a_batch_is_its_members(d, of_nodes):
+    """Batched in what is summed or in the stencil, nested, and differentiated outside of the batch."""
+    x, _, given, nodes = example(d)
+    whole = (x, *(jnp.stack([a, 2 * a, a**2]) for a in (given, nodes)))
+    axes = (None, 0, 0)
+    if not of_nodes:
+        whole, axes = (jnp.stack([x, x + 0.3, x - 1.7]), given, nodes), (0, None, None)
+    members = [tuple(a if ax is None else a[i] for a, ax in zip(whole, axes, strict=True)) for i in range(3)]
+    batch, one = jax.vmap(sums, axes), jax.jit(sums)
+    together = jax.jit(batch)(*whole)
+    for i, member in enumerate(members):
+        jax.tree.map(lambda a, b, i=i: assert_close(a[i], b, 1e-14), together, one(*member))
+    nested = jax.jit(jax.vmap(batch))(*(a[None] for a in whole))
+    jax.tree.map(lambda a, b: assert_close(a[0], b, 1e-14), nested, together)
+
+    def slopes(f):
+        return jax.jit(jax.grad(lambda *args: sum((s**3).sum() for s in f(*args)), (0, 1, 2)))
+
+    of_one = slopes(sums)
+    alone = [of_one(*member) for member in members]
+    for found, each, axis in zip(slopes(batch)(*whole), zip(*alone, strict=True), axes, strict=True):
+        assert_close(found, sum(each) if axis is None else jnp.stack(each), 1e-12)
+
+
+def test_a_member_that_is_not_finite_leaves_the_others_as_they_are():
+    """NaN positions make node numbers of no meaning: they reach no other member's grid."""
+    x, _, given, nodes = example(2)
+    args = jnp.stack([x, x]), jnp.stack([given, given]), jnp.stack([nodes, nodes])
+    batch = jax.jit(jax.vmap(sums))
+    whole, broken = (batch(xs, *args[1:]) for xs in (args[0], args[0].at[0].set(jnp.nan)))
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[1], b[1]), whole, broken)

@@ -10,12 +10,13 @@ import pytest
 from helpers import DIMS, GRADIENTS, KERNELS, TRANSFERS, assert_close, cloud, ids
 
 import mpmjax as mpm
+from mpmjax._crossing import collect
 from mpmjax._kernel import make_stencil
-from mpmjax._transfer import collect, g2p, p2g, spread
+from mpmjax._transfer import g2p, p2g
 from mpmjax._types import components
 
 make, to_grid, to_particles = eqx.filter_jit(make_stencil), eqx.filter_jit(p2g), eqx.filter_jit(g2p)
-to_nodes, from_nodes = eqx.filter_jit(spread), eqx.filter_jit(collect)
+from_nodes = eqx.filter_jit(collect)
 
 EACH_KERNEL = pytest.mark.parametrize("kernel", **ids(KERNELS))
 EACH_DIM = pytest.mark.parametrize("d", DIMS)
@@ -87,7 +88,7 @@ def test_g2p_conserves_momentum(transfer, kernel, d):
     node_mass, momentum = on_nodes(stencil, mass, v, C if transfer.affine else None, grid.size)
     before = momentum / np.where(node_mass > 0, node_mass, 1)[:, None]
     after = before + noise(grid, d)
-    moved, new, affine = on_particles(transfer, stencil, v, before, after)
+    moved, new, affine, _ = on_particles(transfer, stencil, v, before, after)
     on_grid = node_mass[:, None] * after
     np.testing.assert_allclose((mass * moved).sum(axis=1), on_grid.sum(axis=0), atol=1e-13)
     np.testing.assert_allclose((mass * new).sum(axis=1), on_grid.sum(axis=0), atol=1e-13)
@@ -109,7 +110,7 @@ def test_apic_reproduces_affine_motion(kernel, gradient, d):
     node_mass, momentum = on_nodes(stencil, mass, v, C, grid.size)
     field = a + nodes @ B.T
     assert_close(momentum, node_mass[:, None] * field, 1e-14)
-    moved, new, affine = on_particles(mpm.APIC(), stencil, v, 0 * field, field)
+    moved, new, affine, _ = on_particles(mpm.APIC(), stencil, v, 0 * field, field)
     assert_close(moved, v, 1e-13)
     assert_close(new, v, 1e-13)
     assert_close(affine, C, 1e-13)
@@ -123,7 +124,7 @@ def test_a_constant_velocity_stays(transfer, kernel, d):
     grid, _, stencil, _, v, _, _ = scattered(kernel, GRADIENTS["mls"], d)
     constant = np.broadcast_to(np.arange(1.0, d + 1), (grid.size, d))
     expected = np.broadcast_to(constant[0][:, None], v.shape)
-    moved, new, affine = on_particles(transfer, stencil, expected, constant, constant)
+    moved, new, affine, _ = on_particles(transfer, stencil, expected, constant, constant)
     assert_close(moved, expected, 1e-14)
     assert_close(new, expected, 1e-14)
     assert (affine is not None) == transfer.affine
@@ -150,21 +151,22 @@ def test_flip_blends_the_change_with_pic(d):
 @EACH_KERNEL
 @EACH_DIM
 @EACH_GRADIENT
-def test_spread_and_collect_are_the_sums_that_weights_and_gradients_say(kernel, gradient, d):
-    """Σ_p (w a + Σ_b g_b a_b) and Σ_i w n, Σ_i g n, term by term; also where several nodes of a stencil are one, as in
-    a small periodic window."""
-    stencil = scattered(kernel, gradient, d)[2]
-    stencil = eqx.tree_at(lambda s: s.shares, stencil, stencil.shares % 7)
-    rng, size = np.random.default_rng(7), 6 * d + 1
-    value, *slopes = a = rng.normal(size=(d + 1, 3, stencil.inside.size))
-    nodes = rng.normal(size=(size, 3))
-    basis = np.concatenate([stencil.weight[:, None], stencil.gradient], axis=1)
-    expected = np.zeros_like(nodes)
-    np.add.at(expected, np.asarray(stencil.index), np.einsum("kbp,bcp->kpc", basis, a))
-    assert_close(to_nodes(stencil, jnp.asarray(value), [jnp.asarray(s) for s in slopes], size), expected, 1e-13)
-    found, gradients = from_nodes(stencil, jnp.asarray(nodes))
-    at_nodes = nodes[np.asarray(stencil.index)]
-    assert_close(jnp.stack([found, *gradients]), np.einsum("kbp,kpc->bcp", basis, at_nodes), 1e-13)
+@EACH_TRANSFER
+def test_what_deforms_is_the_gradient_of_what_carries(transfer, gradient, kernel, d):
+    """By the chosen operator, of the mean velocity if there is one; an impulse at the particles is its transpose."""
+    grid, _, stencil, _, v, C, mass = scattered(kernel, gradient, d)
+    if not transfer.affine:
+        C, stencil = None, eqx.tree_at(lambda s: s.affine_slopes, stencil, None, is_leaf=lambda a: a is None)
+    before, after, mean = (jnp.asarray(noise(grid, d, seed)) for seed in (3, 4, 5))
+    for mean_, carrier in ((None, after), (mean, mean)):
+        moved, _, _, slope = to_particles(transfer, stencil, jnp.asarray(v), before, after, mean_)
+        value, slopes = from_nodes(stencil, carrier)
+        assert_close(moved, value, 1e-14)
+        assert_close(slope, jnp.swapaxes(slopes, 0, 1), 1e-14)
+    if stencil.affine_slopes is None:
+        impulse = jnp.asarray(np.random.default_rng(6).normal(size=(d, d, v.shape[1])))
+        given = [to_grid(stencil, mass, jnp.asarray(v), C, grid.size, i)[1] for i in (impulse, None)]
+        assert float(((given[0] - given[1]) * mean).sum()) == pytest.approx(float((impulse * slope).sum()), rel=1e-10)
 
 
 def hat(order, r):
@@ -198,7 +200,7 @@ def test_p2g_and_g2p_agree_with_a_plain_double_loop(kernel, d):
     got_mass, got_momentum = on_nodes(stencil, m, v, C, grid.size)
     assert_close(got_mass, node_mass, 1e-13)
     assert_close(got_momentum, momentum, 1e-13)
-    moved, _, _ = on_particles(mpm.PIC(), stencil, v, field, field)
+    moved, _, _, _ = on_particles(mpm.PIC(), stencil, v, field, field)
     assert_close(moved[:, : len(some)], gathered, 1e-13)
 
 
