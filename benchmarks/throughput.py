@@ -3,11 +3,14 @@
     python benchmarks/throughput.py            # this package alone
     python benchmarks/throughput.py --peers    # needs: python -m pip install -e ".[peers]"
     python benchmarks/throughput.py --json --quick
+    python benchmarks/throughput.py --device gpu
 
 Scenes: A, 3-D, 97 336 particles on 64³ nodes, 8 a cell; C, 2-D, 10 000 on 128² and 99 856 on 256², 4 a cell. All codes:
 neo-Hookean, quadratic kernel, APIC, moving least squares, the same initial particles, gravity, no walls reached. Before
 anything is timed, their centres of mass and their energies after some steps must agree to what the precision allows.
-The codes take turns, and medians are compared as ratios: seconds on a shared machine mean little.
+The codes take turns, and medians are compared as ratios: seconds on a shared machine mean little. What an iteration of
+the implicit solve costs is told from semi-implicit steps of two lengths of the iteration; and from the bytes that any
+explicit step has to move, the fraction of the memory's bandwidth, which is that of a copy.
 """
 
 import argparse
@@ -30,6 +33,7 @@ jax.config.update("jax_enable_x64", True)
 E_MODULUS, NU, DENSITY, GRAVITY = 1e5, 0.3, 1e3, 9.81
 SCENES = {"A 100k": (3, 100_000, 64, 8), "C 10k": (2, 10_000, 128, 4), "C 100k": (2, 100_000, 256, 4)}
 QUICK = {"A 5k": (3, 5_000, 32, 8), "C 2k": (2, 2_000, 64, 4)}
+ITERATIONS = 4, 14
 Code = Callable[[], tuple[np.ndarray, np.ndarray, np.ndarray]]
 """Goes on by the timed steps and returns x, v, F."""
 
@@ -62,7 +66,7 @@ def block(d: int, particles: int, nodes: int, per_cell: int, dtype: str) -> Bloc
     return Block(x, v, DENSITY * volume, volume, nodes, spacing, 0.3 * spacing / speed, dtype)
 
 
-def ours(b: Block, description: Any, steps: int) -> Code:
+def ours(b: Block, description: Any, steps: int, method: Any = mpm.Explicit()) -> Code:
     """This package's `rollout`."""
     d = b.x.shape[1]
     grid = mpm.Grid((b.nodes,) * d, b.spacing)
@@ -73,7 +77,7 @@ def ours(b: Block, description: Any, steps: int) -> Code:
     state = [mpm.prepare(scene, particles)]
 
     def go() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        state[0] = mpm.rollout(scene, state[0], steps=steps, dt=b.dt)
+        state[0] = mpm.rollout(scene, state[0], steps=steps, dt=b.dt, method=method)
         return tuple(np.asarray(a) for a in (state[0].x, state[0].v, state[0].F))
 
     return go
@@ -123,9 +127,19 @@ def codes_of(b: Block, steps: int, peers: bool) -> dict[str, Code]:
     return found
 
 
-def compare(name: str, b: Block, *, steps: int, repeats: int, peers: bool) -> dict[str, Any]:
-    """Agreement first, then medians of interleaved runs."""
-    codes = codes_of(b, steps, peers)
+def medians(codes: dict[str, Code], repeats: int) -> dict[str, float]:
+    """Seconds of each, called in turn."""
+    seconds: dict[str, list[float]] = {code: [] for code in codes}
+    for _ in range(repeats):
+        for code, go in codes.items():
+            begun = time.perf_counter()
+            go()
+            seconds[code].append(time.perf_counter() - begun)
+    return {code: float(np.median(s)) for code, s in seconds.items()}
+
+
+def check(name: str, b: Block, codes: dict[str, Code]) -> None:
+    """That all codes compute the same motion."""
     outcomes = {code: energies(b, *go()) for code, go in codes.items()}
     (centre, total), tolerance = outcomes["mpmjax, updated"], {"float32": 1e-5, "float64": 1e-9}[b.dtype]
     for code, (other, energy) in outcomes.items():
@@ -134,18 +148,52 @@ def compare(name: str, b: Block, *, steps: int, repeats: int, peers: bool) -> di
             raise SystemExit(
                 f"{name}, {b.dtype}: {code} disagrees: centre {other} and {centre}, energy {energy}, {total}."
             )
-    seconds: dict[str, list[float]] = {code: [] for code in codes}
-    for _ in range(repeats):
-        for code, go in codes.items():
-            begun = time.perf_counter()
-            go()
-            seconds[code].append((time.perf_counter() - begun) / steps)
-    medians = {code: float(np.median(s)) for code, s in seconds.items()}
+
+
+def iterations(b: Block) -> dict[str, Code]:
+    """Semi-implicit steps of twenty times the block's own, cut off after few and after more iterations."""
+
+    def cut(most: int) -> Code:
+        solver = mpm.ConjugateResidual(rtol=1e-30, max_steps=most)
+        return ours(b._replace(dt=20 * b.dt), mpm.UpdatedLagrangian(), 1, mpm.SemiImplicit(solver=solver))
+
+    return {f"{most} iterations": cut(most) for most in ITERATIONS}
+
+
+def copied() -> float:
+    """Bytes a second that a copy reads and writes."""
+    field = jnp.zeros(2**26, "float32")
+    copies = jax.jit(lambda a: jax.lax.fori_loop(0, 10, lambda _, a: a + 1, a))
+    seconds = medians({"copy": lambda: jax.block_until_ready(copies(field))}, 4)["copy"]
+    return 10 * 2 * field.nbytes / seconds
+
+
+def least_bytes(b: Block) -> int:
+    """What an explicit step has to move: x, v, C and F of the particles read and written, their mass and volume read,
+    and the mass and velocity of as many nodes as their cells have, written and read."""
+    d, p = b.x.shape[1], len(b.x)
+    nodes = p * b.volume / b.spacing**d
+    return round(np.dtype(b.dtype).itemsize * (p * (2 * (2 * d + 2 * d * d) + 2) + 2 * nodes * (d + 1)))
+
+
+def compare(name: str, b: Block, *, steps: int, repeats: int, peers: bool) -> dict[str, Any]:
+    """Agreement first, then medians of interleaved runs."""
+    codes = codes_of(b, steps, peers)
+    check(name, b, codes)
+    solves = iterations(b)
+    for go in solves.values():
+        go()
+    seconds = medians(codes | solves, repeats)
+    few, more = (seconds.pop(solve) for solve in solves)
+    step = {code: s / steps for code, s in seconds.items()}
+    iteration = (more - few) / (ITERATIONS[1] - ITERATIONS[0])
     return {
         "scene": name,
         "dtype": b.dtype,
         "particles": len(b.x),
-        "milliseconds": {c: 1e3 * s for c, s in medians.items()},
+        "milliseconds": {code: 1e3 * s for code, s in step.items()},
+        "iteration_over_step": iteration / step["mpmjax, updated"],
+        "bandwidth_fraction": least_bytes(b) / step["mpmjax, updated"] / copied(),
     }
 
 
@@ -154,7 +202,10 @@ def main() -> None:
     parser.add_argument("--peers", action="store_true", help="Taichi and Warp too")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--quick", action="store_true", help="small scenes")
+    parser.add_argument("--device", choices=("cpu", "gpu"), help="where this package runs; peers run on the CPU")
     options = parser.parse_args()
+    if options.device:
+        jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[options.device])
     steps, repeats = (10, 3) if options.quick else (20, 7)
     rows = []
     for name, numbers in (QUICK if options.quick else SCENES).items():
@@ -165,6 +216,11 @@ def main() -> None:
                 base = ms["mpmjax, updated"]
                 shown = ", ".join(f"{code} {t:.2f} ms ({t / base:.2f})" for code, t in ms.items())
                 print(f"{name}, {dtype}, {rows[-1]['particles']} particles: {shown}", flush=True)
+                print(
+                    f"    an iteration of the solve takes {rows[-1]['iteration_over_step']:.2f} of an explicit step, "
+                    f"which moves its bytes at {rows[-1]['bandwidth_fraction']:.1%} of a copy's rate",
+                    flush=True,
+                )
     if options.json:
         print(json.dumps({"jax": jax.__version__, "device": str(jax.devices()[0]), "steps": steps, "rows": rows}))
 

@@ -1,0 +1,192 @@
+"""What does the gradient of a rollout cost, in seconds and in bytes?
+
+    python benchmarks/gradient_cost.py [--quick] [--peers] [--json]
+
+Of the mean of ‖x‖² after some steps, by a factor of the stiffness, in float32:
+
+- scene D: 100 explicit steps of a free 2-D block of 10 000 particles on 128² nodes, beside Taichi's tape (`--peers`),
+  whose value and derivative must agree with ours before anything is timed;
+- a semi-implicit rollout of the same block, 100 steps of twenty times the explicit limit, solver tolerance 1e-5;
+- memory and seconds against the number of steps and of checkpoints: docs/gradient_cost.png and .csv.
+
+Medians of interleaved calls, compilation left out; bytes are the compiled program's temporaries.
+"""
+
+import argparse
+import csv
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import mpmjax as mpm
+
+sys.path.append(str(Path(__file__).parent))
+from throughput import E_MODULUS, GRAVITY, NU, QUICK, SCENES, Block, block
+
+DOCS = Path(__file__).parents[1] / "docs"
+TIMES_EXPLICIT = 20
+LIMIT = 0.3
+"""The explicit step of `block` over dx/c."""
+
+
+def rollout(b: Block, method: mpm.Explicit | mpm.SemiImplicit, steps: int, dt: float) -> Callable[..., Any]:
+    """The mean of ‖x‖² as a function of a factor of the stiffness, and of the adjoint."""
+    one = jnp.ones(len(b.x), b.dtype)
+    particles = mpm.Particles(jnp.asarray(b.x, b.dtype), jnp.asarray(b.v, b.dtype), b.mass * one, b.volume * one)
+    grid = mpm.Grid((b.nodes,) * 2, b.spacing)
+
+    def size(factor: Any, adjoint: Any = None) -> Any:
+        scene = mpm.Scene(grid, mpm.NeoHookean(E_MODULUS * factor, NU), gravity=(0.0, -GRAVITY))
+        run = mpm.simulate(scene, particles, t1=steps * dt, dt=dt, method=method, adjoint=adjoint, throw=False)
+        return (run.final.x**2).sum(axis=1).mean()
+
+    return size
+
+
+def compiled(f: Callable[..., Any]) -> tuple[Callable[[], Any], int]:
+    """A call at the factor one, and the bytes of its temporaries."""
+    program = jax.jit(f).lower(jnp.float32(1)).compile()
+    return lambda: jax.block_until_ready(program(jnp.float32(1))), program.memory_analysis().temp_size_in_bytes
+
+
+def medians(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+    """Seconds of each, called in turn, after one call that is not timed."""
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    for n in range(repeats + 1):
+        for name, call in calls.items():
+            begun = time.perf_counter()
+            call()
+            if n:
+                seconds[name].append(time.perf_counter() - begun)
+    return {name: float(np.median(s)) for name, s in seconds.items()}
+
+
+def with_checkpoints(size: Callable[..., Any], checkpoints: int) -> Callable[..., Any]:
+    """Value and gradient with so many checkpoints."""
+    adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=checkpoints)
+    return jax.value_and_grad(lambda factor: size(factor, adjoint))
+
+
+def taichi(b: Block, steps: int) -> Any:
+    """The peer."""
+    from peers.taichi_gradient import TaichiGradient
+
+    law = mpm.NeoHookean(E_MODULUS, NU)
+    return TaichiGradient(
+        b.x,
+        b.v,
+        mass=b.mass,
+        volume=b.volume,
+        shape=(b.nodes,) * 2,
+        spacing=b.spacing,
+        shear_modulus=float(law.shear_modulus),
+        lame_lambda=float(law.lame_lambda),
+        gravity=(0.0, -GRAVITY),
+        steps=steps,
+        dt=b.dt,
+        dtype=b.dtype,
+    )
+
+
+def scene_d(b: Block, steps: int, repeats: int, peers: bool) -> dict[str, Any]:
+    """Explicit steps, with a checkpoint each and with a tenth as many."""
+    size = rollout(b, mpm.Explicit(), steps, b.dt)
+    names = {f"{n} checkpoints": n for n in (steps, steps // 10)}
+    programs = {"forward": compiled(size)} | {name: compiled(with_checkpoints(size, n)) for name, n in names.items()}
+    calls = {name: call for name, (call, _) in programs.items()}
+    megabytes = {name: size / 1e6 for name, (_, size) in programs.items()}
+    if peers:
+        tape = taichi(b, steps)
+        value, slope = (float(a) for a in calls[f"{steps} checkpoints"]())
+        other, other_slope = tape.gradient()
+        if abs(other / value - 1) > 1e-5 or abs(other_slope / slope - 1) > 1e-2:
+            raise SystemExit(f"Taichi disagrees: {other} and {value}, derivative {other_slope} and {slope}.")
+        calls |= {"Taichi, forward": tape.forward, "Taichi, tape": tape.gradient}
+        megabytes["Taichi, tape"] = tape.bytes() / 1e6
+    return {"steps": steps, "seconds": medians(calls, repeats), "megabytes": megabytes}
+
+
+def semi_implicit(b: Block, steps: int, repeats: int) -> dict[str, Any]:
+    """At twenty times the explicit limit."""
+    solver = mpm.ConjugateResidual(rtol=1e-5)
+    size = rollout(b, mpm.SemiImplicit(solver=solver, adjoint_solver=solver), steps, TIMES_EXPLICIT / LIMIT * b.dt)
+    programs = {"forward": compiled(size), "with gradient": compiled(with_checkpoints(size, steps))}
+    seconds = medians({name: call for name, (call, _) in programs.items()}, repeats)
+    ratio = seconds["with gradient"] / seconds["forward"]
+    megabytes = {name: size / 1e6 for name, (_, size) in programs.items()}
+    return {"steps": steps, "seconds": seconds, "ratio": ratio, "megabytes": megabytes}
+
+
+def budgets(b: Block, lengths: tuple[int, ...], repeats: int) -> list[dict[str, Any]]:
+    """Seconds and memory of value and gradient against steps and checkpoints."""
+    rows = []
+    for steps in lengths:
+        size = rollout(b, mpm.Explicit(), steps, b.dt)
+        forward = compiled(size)[0]
+        for checkpoints in (4, 16, 64, 256):
+            if checkpoints <= steps:
+                call, memory = compiled(with_checkpoints(size, checkpoints))
+                seconds = medians({"forward": forward, "gradient": call}, repeats)
+                ratio = seconds["gradient"] / seconds["forward"]
+                rows.append({"steps": steps, "checkpoints": checkpoints, "megabytes": memory / 1e6, "ratio": ratio})
+    return rows
+
+
+def draw(rows: list[dict[str, Any]]) -> None:
+    """The chart and its numbers."""
+    with (DOCS / "gradient_cost.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(row | {k: f"{row[k]:.4g}" for k in ("megabytes", "ratio")} for row in rows)
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
+    for checkpoints in sorted({row["checkpoints"] for row in rows}):
+        line = [row for row in rows if row["checkpoints"] == checkpoints]
+        for axis, key in zip(axes, ("megabytes", "ratio"), strict=True):
+            axis.plot([row["steps"] for row in line], [row[key] for row in line], "o-", ms=4, label=f"{checkpoints}")
+    for axis, label in zip(axes, ("temporaries [MB]", "seconds over those of the forward run"), strict=True):
+        axis.set(xscale="log", xlabel="steps", ylabel=label)
+    axes[0].set_yscale("log")
+    axes[0].legend(title="checkpoints", frameon=False)
+    figure.savefig(DOCS / "gradient_cost.png", dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="a small block, few steps, no chart")
+    parser.add_argument("--peers", action="store_true", help="Taichi's tape too")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args()
+    b = block(*(QUICK["C 2k"] if options.quick else SCENES["C 10k"]), "float32")
+    steps, repeats = (20, 3) if options.quick else (100, 5)
+    report = {
+        "jax": jax.__version__,
+        "device": str(jax.devices()[0]),
+        "particles": len(b.x),
+        "explicit": scene_d(b, steps, repeats, options.peers),
+        "semi_implicit": semi_implicit(b, steps, repeats),
+    }
+    if not options.quick:
+        report["budgets"] = budgets(block(*QUICK["C 2k"], "float32"), (16, 64, 256, 1024), 3)
+        draw(report["budgets"])
+    if options.json:
+        print(json.dumps(report))
+        return
+    for name in ("explicit", "semi_implicit"):
+        found = report[name]
+        for code, seconds in found["seconds"].items():
+            memory = f", {found['megabytes'][code]:.1f} MB" if code in found["megabytes"] else ""
+            print(f"{name}, {found['steps']} steps, {code}: {seconds:.4f} s{memory}")
+    print(f"semi_implicit: value and gradient over forward {report['semi_implicit']['ratio']:.2f}")
+
+
+if __name__ == "__main__":
+    main()
