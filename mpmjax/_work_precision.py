@@ -39,7 +39,8 @@ _REFERENCE = TRBDF2()
 _RESOLVED = 0.25  # the error above which a larger one at a smaller step does not say that the best was reached
 _HOPELESS = 4  # how far below the explicit limit a run that still fails will not get better
 _MOST_STEPS = 2**30
-_PILOT = 20  # explicit steps from which the time of all of them is foreseen
+_PILOT = 20  # explicit steps from which the time of all of them is foreseen, or fourfold as often as is needed
+_PILOT_SECONDS = 0.2  # to last so long: a call alone takes as long as a hundred steps of a small scene
 
 Build = Callable[[int], tuple[Scene, Particles]]
 """From a refinement n to the scene with 1/n of its spacing, and its particles."""
@@ -267,11 +268,16 @@ class Bench(NamedTuple):
 
     def foresee(self, method: Method, steps: int) -> float:
         """Seconds of so many steps, from a few of them."""
-        some = min(_PILOT, steps)
         self._go(method, steps, 1, 1)
-        return self.timed(method, steps, 1, some)[1] / some * steps
+        some = min(_PILOT, steps)
+        seconds = self.timed(method, steps, 1, some)[1]
+        while seconds < _PILOT_SECONDS and some < steps:
+            some = min(4 * some, steps)
+            seconds = self.timed(method, steps, 1, some)[1]
+        return seconds / some * steps
 
     def timed(self, method: Method, steps: int, frames: int, each: int) -> tuple[list[State] | None, float]:
+        """The states after each of some frames of so many steps, None if one is at fault, and the seconds."""
         begun = time.perf_counter()
         states = self._go(method, steps, frames, each)
         return states, time.perf_counter() - begun

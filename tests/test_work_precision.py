@@ -12,7 +12,7 @@ from helpers import assert_close
 import mpmjax as mpm
 from mpmjax import Trial, WorkPrecision
 from mpmjax._chart import draw_chart, write_trials
-from mpmjax._work_precision import FRAMES
+from mpmjax._work_precision import FRAMES, Bench
 from mpmjax.verification import StandingWave, discretise
 
 WAVE = StandingWave(0.05)
@@ -103,6 +103,13 @@ def test_a_slow_pull_of_a_stiff_bar_is_not_run_explicitly():
     assert "SemiImplicit(beta=1), dt = 1.25 s (8 steps)" in found.verdict()
     assert "Explicit()" in found.verdict()
     assert "would need" in found.verdict()
+
+
+def test_what_a_call_takes_is_not_foreseen_for_every_step(monkeypatch):
+    """With 5 ms a call and 50 µs a step, a million steps are foreseen to take 50 s to a few per cent."""
+    monkeypatch.setattr(Bench, "timed", lambda self, method, steps, frames, each: (None, 5e-3 + 50e-6 * each))
+    bench = Bench.of(pulled, 1, 10.0, 20.0)
+    assert_close(bench.foresee(mpm.Explicit(), 10**6), 50.0, 0.03)
 
 
 def trial(method, seconds, error, refinement=1):

@@ -11,7 +11,7 @@ import taichi as ti
 
 
 class TaichiMPM:
-    """A free body under gravity in a box whose walls it does not touch.
+    """A body under gravity in a box whose walls it does not touch, above a floor.
 
     Args:
         x, v: positions [m] and velocities [m/s], shape (p, d).
@@ -20,6 +20,8 @@ class TaichiMPM:
         shear_modulus, lame_lambda: of the neo-Hookean law ½μ(tr FᵀF − d − 2 ln J) + ½λ ln²J [Pa].
         gravity: [m/s²], shape (d,).
         dtype: "float32" or "float64".
+        C: affine velocities at the start [1/s], shape (p, d, d). Default: none.
+        floor: height of a floor without friction, which pushes and does not pull [m]. Default: none.
     """
 
     def __init__(
@@ -35,6 +37,8 @@ class TaichiMPM:
         lame_lambda: float,
         gravity: tuple[float, ...],
         dtype: str,
+        C: np.ndarray | None = None,
+        floor: float | None = None,
     ):
         real = getattr(ti, {"float32": "f32", "float64": "f64"}[dtype])
         ti.init(arch=ti.cpu, default_fp=real, log_level=ti.ERROR, fast_math=True)
@@ -43,9 +47,10 @@ class TaichiMPM:
         self._x, self._v = (ti.Vector.field(d, real, p) for _ in range(2))
         self._C, self._F = (ti.Matrix.field(d, d, real, p) for _ in range(2))
         self._momentum, self._mass = ti.Vector.field(d, real, shape), ti.field(real, shape)
-        self._x.from_numpy(x.astype(dtype))
-        self._v.from_numpy(v.astype(dtype))
-        self._F.from_numpy(np.broadcast_to(np.eye(d), (p, d, d)).astype(dtype))
+        start = x, v, np.zeros((p, d, d)) if C is None else C, np.broadcast_to(np.eye(d), (p, d, d))
+        self._start = [a.astype(dtype) for a in start]
+        self.restart()
+        lowest = -1 if floor is None else round(floor / spacing)
         dx, inv_dx, g = float(spacing), 1 / float(spacing), ti.Vector(list(gravity))
         m, volume0, mu, lam = float(mass), float(volume), float(shear_modulus), float(lame_lambda)
 
@@ -71,7 +76,10 @@ class TaichiMPM:
         def update(dt: real):
             for i in ti.grouped(self._mass):
                 if self._mass[i] > 0:
-                    self._momentum[i] = self._momentum[i] / self._mass[i] + dt * g
+                    velocity = self._momentum[i] / self._mass[i] + dt * g
+                    if i[d - 1] <= lowest:
+                        velocity[d - 1] = ti.max(velocity[d - 1], 0)
+                    self._momentum[i] = velocity
 
         @ti.kernel
         def collect(dt: real):
@@ -93,6 +101,11 @@ class TaichiMPM:
                 self._F[q] = (identity + dt * C) @ self._F[q]
 
         self._kernels = spread, update, collect
+
+    def restart(self) -> None:
+        """Back to the initial state."""
+        for field, values in zip((self._x, self._v, self._C, self._F), self._start, strict=True):
+            field.from_numpy(values)
 
     def run(self, steps: int, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Go on for some steps. Returns x, v and F."""
