@@ -76,13 +76,7 @@ def _widen(value: Array, slopes: list[Array], w: Array, g: Array) -> list[Array]
     return [w[:, None] * value, g[:, None] * value, *(w[:, None] * slope for slope in slopes)]
 
 
-def _along(
-    axis: int,
-    factors: tuple[Array, ...],
-    step: Callable[[Any, Any], tuple[Any, Any]],
-    start: Any,
-    unroll: bool,
-) -> Any:
+def _along(axis: int, factors: tuple[Array, ...], step: Callable[..., tuple], start: Any, unroll: bool) -> Any:
     """`lax.scan` over the nodes along an axis, unrolled along the last one, or with `unroll` along all.
 
     On a CPU a loop whose body is a few kernels over all particles is the fastest, on a GPU a single kernel.
@@ -159,9 +153,7 @@ def _pull(*args: Array, valued: bool) -> tuple[Array, Array]:
             return jax.tree.map(jnp.add, carry, (_widen(found[0], found[1:], w, g), inner)), here
 
         zeros = [jnp.zeros((p, nodes.shape[1]), nodes.dtype)] * (d - axis + 1)
-        inner = [
-            (jnp.zeros_like(w), jnp.zeros_like(g)) for _, w, g in zip(*(f[axis + 1 :] for f in factors), strict=True)
-        ]
+        inner = [(jnp.zeros_like(w), jnp.zeros_like(w)) for w in factors[1][axis + 1 :]]
         (totals, inner), here = _along(axis, factors, step, (zeros, inner), unroll=False)
         return totals, [here, *inner]
 
@@ -174,10 +166,9 @@ def _pull(*args: Array, valued: bool) -> tuple[Array, Array]:
 def _by_factors(function: Callable[..., list[Array]]) -> Callable[..., list[Array]]:
     """A sum's differential by its factors, of shares, weights, slopes, their differentials, and what else it takes."""
 
-    def differential(
-        shares: Array, w: Array, g: Array, dw: Array, dg: Array, *rest: Array, **params: Any
-    ) -> list[Array]:
-        return jax.jvp(lambda w, g: function(shares, w, g, *rest, **params), (w, g), (dw, dg))[1]
+    def differential(*args: Array, **params: Any) -> list[Array]:
+        shares, rest = args[0], args[5:]
+        return jax.jvp(lambda *factors: function(shares, *factors, *rest, **params), args[1:3], args[3:5])[1]
 
     return differential
 

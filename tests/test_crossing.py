@@ -10,6 +10,7 @@ import pytest
 from helpers import DIMS, GRADIENTS, KERNELS, assert_close, ids
 
 import mpmjax as mpm
+from mpmjax import _crossing
 from mpmjax._crossing import collect, spread
 from mpmjax._kernel import Stencil, make_stencil
 
@@ -154,3 +155,18 @@ def test_a_member_that_is_not_finite_leaves_the_others_as_they_are():
     batch = jax.jit(jax.vmap(sums))
     whole, broken = (batch(xs, *args[1:]) for xs in (args[0], args[0].at[0].set(jnp.nan)))
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[1], b[1]), whole, broken)
+
+
+@EACH_DIM
+def test_the_program_for_other_platforms_is_the_same_sum(d):
+    """Where it is not for a CPU nothing is left of the loops: the same numbers, in one kernel a sum."""
+    _, stencil, given, nodes = example(d)
+    factors = stencil.shares, stencil.weights, stencil.slopes
+    loops, kernel = (_crossing._collect(*factors, nodes, unroll=unroll) for unroll in (False, True))
+    assert_close(jnp.stack(loops), jnp.stack(kernel), 1e-15)
+    loops, kernel = (_crossing._spread(*factors, *given, valued=True, size=5**d, unroll=u) for u in (False, True))
+    assert_close(loops[0], kernel[0], 1e-14)
+    traced = jax.jit(lambda given, nodes: (spread(stencil, given[0], given[1:], 5**d), collect(stencil, nodes)))
+    programs = {p: traced.trace(given, nodes).lower(lowering_platforms=(p,)).as_text() for p in ("cpu", "cuda")}
+    assert ("while" in programs["cpu"]) == (d > 1)
+    assert "while" not in programs["cuda"]
