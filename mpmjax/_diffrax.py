@@ -163,7 +163,8 @@ class StepSolver(diffrax.AbstractSolver):
         del terms, t1, made_jump
         tally, _ = solver_state
         t = step_number(t0) * args.dt
-        particles, info = advance(args.scene, args.at(y0), t, args.dt, args.method, args.stencil)
+        step = eqx.filter_jit(advance)  # so that all of diffrax's traces of it are one
+        particles, info = step(args.scene, args.at(y0), t, args.dt, args.method, args.stencil)
         y1 = state_of(particles)
         arrays, rest = eqx.partition((args, y1), eqx.is_array)
         tally = tally.plus(info, fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest)))

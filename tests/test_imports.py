@@ -15,6 +15,7 @@ LAYERS = (
     ("_types", "_checks"),
     ("_grid", "_region", "_motion"),
     ("_kernel",),
+    ("_crossing",),
     ("_transfer",),
     ("_linalg",),
     ("material",),

@@ -29,8 +29,9 @@ def _make(kernel, gradient, grid, x):
 
 
 def make(kernel, gradient, grid, x):
-    """The stencil, with everything as NumPy arrays, window and node positions, and who is inside the window."""
-    return jax.tree.map(np.asarray, _make(kernel, gradient, grid, jnp.asarray(x)))
+    """The stencil, and as NumPy arrays window and node positions, and who is inside the window."""
+    stencil, *others = _make(kernel, gradient, grid, jnp.asarray(x))
+    return stencil, *map(np.asarray, others)
 
 
 def places(d, seed=0, p=40):
