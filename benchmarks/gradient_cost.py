@@ -16,8 +16,8 @@ import argparse
 import csv
 import json
 import sys
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +25,11 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
-import numpy as np
 
 import mpmjax as mpm
 
 sys.path.append(str(Path(__file__).parent))
-from throughput import E_MODULUS, GRAVITY, NU, QUICK, SCENES, Block, block
+from throughput import E_MODULUS, GRAVITY, NU, QUICK, SCENES, Block, block, medians, peer
 
 DOCS = Path(__file__).parents[1] / "docs"
 TIMES_EXPLICIT = 20
@@ -53,48 +52,20 @@ def rollout(b: Block, method: mpm.Explicit | mpm.SemiImplicit, steps: int, dt: f
 
 
 def compiled(f: Callable[..., Any]) -> tuple[Callable[[], Any], int]:
-    """A call at the factor one, and the bytes of its temporaries."""
+    """A call at the factor one, made once already, and the bytes of its temporaries."""
     program = jax.jit(f).lower(jnp.float32(1)).compile()
-    return lambda: jax.block_until_ready(program(jnp.float32(1))), program.memory_analysis().temp_size_in_bytes
 
+    def call() -> Any:
+        return jax.block_until_ready(program(jnp.float32(1)))
 
-def medians(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
-    """Seconds of each, called in turn, after one call that is not timed."""
-    seconds: dict[str, list[float]] = {name: [] for name in calls}
-    for n in range(repeats + 1):
-        for name, call in calls.items():
-            begun = time.perf_counter()
-            call()
-            if n:
-                seconds[name].append(time.perf_counter() - begun)
-    return {name: float(np.median(s)) for name, s in seconds.items()}
+    call()
+    return call, program.memory_analysis().temp_size_in_bytes
 
 
 def with_checkpoints(size: Callable[..., Any], checkpoints: int) -> Callable[..., Any]:
     """Value and gradient with so many checkpoints."""
     adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=checkpoints)
     return jax.value_and_grad(lambda factor: size(factor, adjoint))
-
-
-def taichi(b: Block, steps: int) -> Any:
-    """The peer."""
-    from peers.taichi_gradient import TaichiGradient
-
-    law = mpm.NeoHookean(E_MODULUS, NU)
-    return TaichiGradient(
-        b.x,
-        b.v,
-        mass=b.mass,
-        volume=b.volume,
-        shape=(b.nodes,) * 2,
-        spacing=b.spacing,
-        shear_modulus=float(law.shear_modulus),
-        lame_lambda=float(law.lame_lambda),
-        gravity=(0.0, -GRAVITY),
-        steps=steps,
-        dt=b.dt,
-        dtype=b.dtype,
-    )
 
 
 def scene_d(b: Block, steps: int, repeats: int, peers: bool) -> dict[str, Any]:
@@ -105,7 +76,9 @@ def scene_d(b: Block, steps: int, repeats: int, peers: bool) -> dict[str, Any]:
     calls = {name: call for name, (call, _) in programs.items()}
     megabytes = {name: size / 1e6 for name, (_, size) in programs.items()}
     if peers:
-        tape = taichi(b, steps)
+        from peers.taichi_gradient import TaichiGradient
+
+        tape = peer(b, partial(TaichiGradient, steps=steps, dt=b.dt))
         value, slope = (float(a) for a in calls[f"{steps} checkpoints"]())
         other, other_slope = tape.gradient()
         if abs(other / value - 1) > 1e-5 or abs(other_slope / slope - 1) > 1e-2:

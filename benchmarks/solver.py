@@ -17,7 +17,7 @@ Writes docs/solver.png and docs/solver_*.csv; `--quick` takes small squares and 
 
 import argparse
 import csv
-import time
+import sys
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -31,6 +31,9 @@ import numpy as np
 import mpmjax as mpm
 from mpmjax._hessian import ImplicitOperator
 from mpmjax._nodes import Nodes, particles_to_grid
+
+sys.path.append(str(Path(__file__).parent))
+from gradient import best_of
 
 jax.config.update("jax_enable_x64", True)
 
@@ -67,17 +70,6 @@ def square(n: int, *, contrast: float = 1.0, factor: Any = 1.0, coarser: int = 0
     return Square(scene, mpm.prepare(scene, particles), dx / SPEED / float(np.sqrt(contrast)))
 
 
-def seconds_of(call: Callable[[], Any], repeats: int = 3) -> float:
-    """The fastest of some calls, after one that is not timed."""
-    jax.block_until_ready(call())
-    found = []
-    for _ in range(repeats):
-        begun = time.perf_counter()
-        jax.block_until_ready(call())
-        found.append(time.perf_counter() - begun)
-    return min(found)
-
-
 def tolerances(n: int, multiple: float, steps: int, rtols: tuple[float, ...]) -> list[Row]:
     """Errors and seconds, and in the first row the errors of the step: its difference from a quarter of it."""
     _, particles, limit = square(n)
@@ -106,7 +98,7 @@ def tolerances(n: int, multiple: float, steps: int, rtols: tuple[float, ...]) ->
     for guess in GUESSES:
         motion, slope = functions(guess)
         for rtol in rtols:
-            rows.append(row(guess.value, rtol, motion(rtol), slope(rtol), seconds_of(partial(motion, rtol))))
+            rows.append(row(guess.value, rtol, motion(rtol), slope(rtol), best_of(motion, rtol)))
     return rows
 
 
@@ -231,7 +223,7 @@ def preconditioners(n: int, multiple: float, *, contrast: float = 1.0, rtol: flo
         solve = jax.jit(lambda b, precondition=precondition: conjugate_gradients(fine, precondition, b, rtol))
         for side, b in sides.items():
             counted = {"n": n, "multiple": multiple, "contrast": contrast, "preconditioner": kind, "side": side}
-            rows.append(counted | {"iterations": int(solve(b)[1]), "seconds": seconds_of(partial(solve, b))})
+            rows.append(counted | {"iterations": int(solve(b)[1]), "seconds": best_of(solve, b)})
     return rows
 
 
@@ -239,7 +231,7 @@ def preconditioners(n: int, multiple: float, *, contrast: float = 1.0, rtol: flo
 def explicit_seconds(n: int, contrast: float) -> float:
     """Of an explicit step."""
     scene, particles, limit = square(n, contrast=contrast)
-    return seconds_of(lambda: mpm.rollout(scene, particles, steps=40, dt=limit / 4).x) / 40
+    return best_of(lambda: mpm.rollout(scene, particles, steps=40, dt=limit / 4).x) / 40
 
 
 def break_even(n: int, contrast: float, rtol: float, multiples: tuple[float, ...]) -> Row:
@@ -249,7 +241,7 @@ def break_even(n: int, contrast: float, rtol: float, multiples: tuple[float, ...
     costs = []
     for multiple in multiples:
         run = partial(mpm.rollout, scene, particles, steps=4, dt=multiple * limit, method=method)
-        costs.append(seconds_of(lambda run=run: run().x) / 4 / explicit_seconds(n, contrast))
+        costs.append(best_of(lambda run=run: run().x) / 4 / explicit_seconds(n, contrast))
     gain = np.log(np.asarray(multiples) / costs)  # grows with the multiple, though not always steadily
     above = np.flatnonzero(gain > 0)
     found = float("inf")

@@ -18,6 +18,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -83,10 +84,10 @@ def ours(b: Block, description: Any, steps: int, method: Any = mpm.Explicit()) -
     return go
 
 
-def peer(b: Block, make: Callable[..., Any], steps: int) -> Code:
-    """A peer's `run`."""
+def peer(b: Block, make: Callable[..., Any]) -> Any:
+    """The block in a peer's code."""
     law, d = mpm.NeoHookean(E_MODULUS, NU), b.x.shape[1]
-    code = make(
+    return make(
         b.x,
         b.v,
         mass=b.mass,
@@ -98,7 +99,6 @@ def peer(b: Block, make: Callable[..., Any], steps: int) -> Code:
         gravity=(*[0.0] * (d - 1), -GRAVITY),
         dtype=b.dtype,
     )
-    return lambda: code.run(steps, b.dt)
 
 
 def energies(b: Block, x: np.ndarray, v: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, float]:
@@ -121,13 +121,13 @@ def codes_of(b: Block, steps: int, peers: bool) -> dict[str, Code]:
         from peers.taichi_mpm import TaichiMPM
         from peers.warp_mpm import WarpMPM
 
-        found["Taichi"] = peer(b, TaichiMPM, steps)
+        found["Taichi"] = partial(peer(b, TaichiMPM).run, steps, b.dt)
         if b.dtype == "float32":
-            found["Warp"] = peer(b, WarpMPM, steps)
+            found["Warp"] = partial(peer(b, WarpMPM).run, steps, b.dt)
     return found
 
 
-def medians(codes: dict[str, Code], repeats: int) -> dict[str, float]:
+def medians(codes: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
     """Seconds of each, called in turn."""
     seconds: dict[str, list[float]] = {code: [] for code in codes}
     for _ in range(repeats):

@@ -203,9 +203,8 @@ def _mismatch(
 ) -> tuple[Float[Array, ""], Float[Array, "d"]]:
     """½ Σ_ip w m ‖v_i − u_ip‖² and Σ_ip w m (v_i − u_ip), u_ip = v_p + C_p (x_i − x_p)."""
     weight = stencil.weight
-    arm = (
-        stencil.moment * stencil.least_squares.gradient / jnp.where(weight == 0, 1, weight)[:, None]
-    )  # x_i − x_p, (k, d, p); where the weight is zero it does not matter
+    safe = jnp.where(weight == 0, 1, weight)[:, None]  # where the weight is zero the arm does not matter
+    arm = stencil.moment * stencil.least_squares.gradient / safe  # x_i − x_p, (k, d, p)
 
     def add(total: tuple[Array, Array], stencil_node: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], None]:
         i, w, r = stencil_node

@@ -13,7 +13,7 @@ from mpmjax._kernel import Stencil, in_window
 from mpmjax._method import Method
 from mpmjax._particles import Particles, State, state_of, with_state
 from mpmjax._scene import Scene
-from mpmjax._step import StepInfo, advance
+from mpmjax._step import StepInfo, advance_compiled
 from mpmjax._types import Array, Bool, Float, Int, Scalar, components
 
 HEALTHY, NOT_FINITE, OUTSIDE, INADMISSIBLE = 0, 1, 2, 3
@@ -163,8 +163,7 @@ class StepSolver(diffrax.AbstractSolver):
         del terms, t1, made_jump
         tally, _ = solver_state
         t = step_number(t0) * args.dt
-        step = eqx.filter_jit(advance)  # so that all of diffrax's traces of it are one
-        particles, info = step(args.scene, args.at(y0), t, args.dt, args.method, args.stencil)
+        particles, info = advance_compiled(args.scene, args.at(y0), t, args.dt, args.method, args.stencil)
         y1 = state_of(particles)
         arrays, rest = eqx.partition((args, y1), eqx.is_array)
         tally = tally.plus(info, fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest)))

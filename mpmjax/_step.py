@@ -1,7 +1,5 @@
 """One step: particles to grid, the grid's update by a method, grid to particles."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -76,6 +74,10 @@ def advance(
     new = update(nodes, method)
     outside = (~stencil.inside).sum().astype(jnp.int32)
     return grid_to_particles(scene, particles, nodes, new), StepInfo(new.solve, new.contact, outside)
+
+
+advance_compiled = eqx.filter_jit(advance)
+"""The same as one program, which is traced once wherever it is called."""
 
 
 def update(nodes: Nodes, method: Method) -> GridUpdate:
@@ -174,9 +176,4 @@ def step(
     require_positive("dt [s]", dt)
     scene, t, dt, method = canonical((scene, t, dt, method), particles.x.dtype)
     particles = particles if is_prepared(scene, particles) else prepare(scene, particles)
-    return _step(scene, particles, t, dt, method)
-
-
-@eqx.filter_jit
-def _step(scene: Any, particles: Any, t: Any, dt: Any, method: Any) -> Any:
-    return advance(scene, particles, t, dt, method)
+    return advance_compiled(scene, particles, t, dt, method)
