@@ -46,7 +46,7 @@ METHODS = {
     "explicit": lambda beta: mpm.Explicit(),
     "semi-implicit": lambda beta: mpm.SemiImplicit(beta, PLAIN, SOLVER, SOLVER),
     "projected": lambda beta: mpm.SemiImplicit(beta, PROJECTED, SOLVER, SOLVER),
-    "backward Euler": lambda beta: mpm.BackwardEuler(hessian=PROJECTED, max_newton=15),
+    "backward Euler": lambda beta: mpm.BackwardEuler(mpm.Newton(max_steps=15), PROJECTED),
     "implicit midpoint": lambda beta: mpm.ImplicitMidpoint(mpm.Linearised(SOLVER), PLAIN, SOLVER),
     "TR-BDF2": lambda beta: mpm.TRBDF2(0.0, mpm.Linearised(SOLVER), PLAIN, SOLVER),
 }

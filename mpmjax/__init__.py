@@ -12,6 +12,7 @@ from mpmjax._implicit import Linearised, Newton
 from mpmjax._io import load, save
 from mpmjax._kernel import BSpline, MLSGradient, SplineGradient
 from mpmjax._method import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
+from mpmjax._metric import Metric
 from mpmjax._mirror import ContactPlane, SymmetryPlane
 from mpmjax._motion import Motion
 from mpmjax._particles import Particles
@@ -79,6 +80,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "JvpHessian",
     "ConjugateResidual",
     "Guess",
+    "Metric",
     "stable_dt",
     # running
     "Run",

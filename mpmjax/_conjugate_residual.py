@@ -1,5 +1,6 @@
 """The conjugate residual method."""
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -77,7 +78,9 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
     # The recurrence is the reference's, with the application of E moved to the head of the loop, which saves the last
     # one. Around it is a loop that this method's textbook form lacks: the recurrence's residual drifts from the true
     # one (by ε‖E‖‖x‖ a step), so when the recurrence is content the true residual is computed, and if that is not
-    # small enough the recurrence starts anew from it.
+    # small enough the recurrence starts anew from it. Three sums over the vector are all that an iteration takes:
+    # ‖s‖ follows from ‖q‖, the q being orthogonal, and of ‖x‖, which only the rounding is measured by, the last
+    # restart's will do.
     def compute(
         self, state: lx.AbstractLinearOperator, vector: Any, options: dict[str, Any]
     ) -> tuple[Any, lx.RESULTS, dict[str, Any]]:
@@ -96,64 +99,76 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         def dot(a: Array, c: Array) -> Float[Array, ""]:
             return (w * a * c).sum()
 
-        def norm(a: Array) -> Float[Array, ""]:
-            return jnp.sqrt(dot(a, a))
-
         b = b / w
-        b_norm = norm(b)
+        b_norm = jnp.sqrt(dot(b, b))
 
         def tolerance(c: _Recurrence) -> Float[Array, ""]:
             units = jnp.where(c.stalled, _STALLED, _ROUNDING).astype(b.dtype)
-            rounding = units * eps * (c.radius * norm(c.x) + b_norm)
+            rounding = units * eps * (c.radius * c.length + b_norm)
             return jnp.maximum(rtol * b_norm, jnp.minimum(rounding, LARGEST_RESIDUAL * b_norm))
 
         def goes_on(c: _Recurrence) -> Array:
-            return (norm(c.r) > tolerance(c)) & ~c.settled & ~c.breakdown & (c.k < self.max_steps)
+            return (jnp.sqrt(c.rr) > tolerance(c)) & ~c.settled & ~c.breakdown & (c.k < self.max_steps)
 
         def step(c: _Recurrence) -> _Recurrence:
             s = E(c.r)
             gamma = dot(c.r, s)
-            noise = eps * norm(c.r) * norm(s)
-            breakdown = jnp.abs(gamma) <= noise
-            indefinite = c.indefinite | (gamma < -noise)
-            beta = jnp.where(c.fresh, 0, gamma / jnp.where(c.fresh, 1, c.gamma))
+            beta = gamma / c.gamma
             p = c.r + beta * c.p
             q = s + beta * c.q
             qq = dot(q, q)
+            noise = eps * jnp.sqrt(c.rr * (qq + beta**2 * c.qq))  # of γ: ε‖r‖‖s‖
+            breakdown = jnp.abs(gamma) <= noise
             alpha = jnp.where(breakdown, 0, gamma / jnp.where(breakdown, 1, qq))
             x = c.x + alpha * p
-            small = self.increment_rtol
-            settled = c.settled if small is None else ~breakdown & (norm(alpha * p) <= small * norm(x))
-            rayleigh = jnp.abs(gamma) / dot(c.r, c.r)
-            radius = jnp.maximum(c.radius, rayleigh)
-            fresh = jnp.asarray(False)
             r = c.r - alpha * q
-            return _Recurrence(x, r, p, q, gamma, radius, c.k + 1, fresh, settled, breakdown, c.stalled, indefinite)
+            settled = c.settled
+            if self.increment_rtol is not None:
+                settled = ~breakdown & (alpha**2 * dot(p, p) <= self.increment_rtol**2 * dot(x, x))
+            return replace(
+                c,
+                x=x,
+                r=r,
+                p=p,
+                q=q,
+                rr=dot(r, r),
+                qq=qq,
+                gamma=gamma,
+                radius=jnp.maximum(c.radius, jnp.abs(gamma) / c.rr),
+                k=c.k + 1,
+                settled=settled,
+                breakdown=breakdown,
+                indefinite=c.indefinite | (gamma < -noise),
+            )
 
         def restart(c: _Recurrence) -> _Recurrence:
-            before = norm(c.r)
-            c = jax.lax.while_loop(goes_on, step, eqx.tree_at(lambda c: c.fresh, c, jnp.asarray(True)))
             r = b - E(c.x)
-            stalled = norm(r) > 0.5 * before
-            return eqx.tree_at(lambda c: (c.r, c.stalled), c, (r, stalled))
+            rr = dot(r, r)
+            c = replace(c, r=r, rr=rr, gamma=far, length=jnp.sqrt(dot(c.x, c.x)), true=rr, stalled=rr > c.true / 4)
+            c = replace(c, done=c.stalled | ~goes_on(c))
+            return jax.lax.while_loop(lambda c: goes_on(c) & ~c.done, step, c)
 
-        no = jnp.asarray(False)
+        no, none, far = jnp.asarray(False), jnp.zeros_like(b_norm), jnp.full_like(b_norm, jnp.inf)
         start = _Recurrence(
             x=x,
-            r=b - E(x),
+            r=b,
             p=jnp.zeros_like(b),
             q=jnp.zeros_like(b),
-            gamma=jnp.ones_like(b_norm),
-            radius=jnp.zeros_like(b_norm),
+            rr=far,
+            qq=none,
+            gamma=far,
+            length=none,
+            radius=none,
             k=jnp.asarray(0, dtype=jnp.int32),
-            fresh=~no,
+            true=far,
+            stalled=no,
+            done=no,
             settled=no,
             breakdown=no,
-            stalled=no,
             indefinite=no,
         )
-        c = jax.lax.while_loop(lambda c: goes_on(c) & ~c.stalled, restart, start)
-        residual = norm(c.r)
+        c = jax.lax.while_loop(lambda c: ~c.done, restart, start)
+        residual = jnp.sqrt(c.rr)
         converged = ((residual <= tolerance(c)) | c.settled) & jnp.isfinite(residual)
         result = lx.RESULTS.where(c.k < self.max_steps, lx.RESULTS.stagnation, lx.RESULTS.max_steps_reached)
         result = lx.RESULTS.where(c.breakdown, lx.RESULTS.breakdown, result)
@@ -188,11 +203,21 @@ class _Recurrence(eqx.Module):
     r: Array
     p: Array
     q: Array
+    rr: Array
+    """‖r‖²."""
+    qq: Array
+    """‖q‖²."""
     gamma: Array
+    """rᵀA r; infinite where the recurrence starts anew, which makes β zero."""
+    length: Array
+    """‖x‖ at the last restart."""
     radius: Array
     k: Array
-    fresh: Array
+    true: Array
+    """‖r‖² at the last restart, of the true residual."""
+    stalled: Array
+    """Whether the true residual has not halved since the restart before."""
+    done: Array
     settled: Array
     breakdown: Array
-    stalled: Array
     indefinite: Array

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 
+from mpmjax._metric import Metric
 from mpmjax._potential import ElasticPotential
 from mpmjax._types import Array, Float, Mask, Matrix, NodeScalar, NodeVector, Scalar
 from mpmjax.material import AbstractTangent, projected_tangent
@@ -20,6 +21,10 @@ class AbstractHessianAction(eqx.Module):
     def __call__(self, du: NodeVector) -> NodeVector:
         """H δu."""
 
+    @abc.abstractmethod
+    def diagonal(self, like: NodeVector) -> NodeVector:
+        """A positive stand-in for H's diagonal [N/m] (see `ElasticPotential.stiffness`); `like` is any node vector."""
+
 
 class _AnalyticAction(AbstractHessianAction):
     potential: ElasticPotential
@@ -29,6 +34,10 @@ class _AnalyticAction(AbstractHessianAction):
         """Σ_p V0_p A_p h_ip, with A_p = ∂²Ψ/∂F∂F : δF_p (reference, eqs. 7 and 8, the gradient in eq. 7 being node
         i's)."""
         return _analytic_action(self.potential, self.tangent, du)
+
+    def diagonal(self, like: NodeVector) -> NodeVector:
+        """From the stress differential."""
+        return self.potential.stiffness(self.tangent, like)
 
 
 @jax.jit
@@ -43,6 +52,12 @@ class _JvpAction(AbstractHessianAction):
     def __call__(self, du: NodeVector) -> NodeVector:
         """The derivative of ∂Φ/∂u in the direction δu."""
         return _jvp_action(self.potential, self.u, du)
+
+    def diagonal(self, like: NodeVector) -> NodeVector:
+        """From the derivative of the energy's gradient by F."""
+        stress = jax.grad(lambda F: self.potential.material.energy(F).sum())
+        F = self.potential.F + self.potential.strain(self.u)
+        return self.potential.stiffness(lambda dF: jax.jvp(stress, (F,), (dF,))[1], like)
 
 
 @jax.jit
@@ -112,6 +127,7 @@ class ImplicitOperator(lx.AbstractLinearOperator):
     factor: Scalar
     hessian: AbstractHessianAction
     free: Mask
+    inner: Metric = eqx.field(static=True, default=Metric.MASS)
 
     def unconstrained(self, v: NodeVector) -> NodeVector:
         """(M + c H) v."""
@@ -122,8 +138,11 @@ class ImplicitOperator(lx.AbstractLinearOperator):
         return jnp.where(self.free, self.unconstrained(jnp.where(self.free, vector, 0)), vector)
 
     def metric(self) -> NodeVector:
-        """The mass as an inner product over all rows: m_i on free ones, 1 on identity rows."""
-        return jnp.where(self.free, self.mass[:, None], 1)
+        """W, the inner product over all rows: on free ones m_i or m_i + c H_ii, on identity rows 1."""
+        weight = jnp.broadcast_to(self.mass[:, None], self.free.shape)
+        if self.inner is Metric.DIAGONAL:
+            weight = weight + self.factor * self.hessian.diagonal(weight)
+        return jnp.where(self.free, weight, 1)
 
     def as_matrix(self) -> Float[Array, "nd nd"]:
         """The dense matrix, for tests and small problems."""

@@ -16,6 +16,7 @@ import lineax as lx
 from mpmjax._checks import require, require_positive
 from mpmjax._conjugate_residual import LARGEST_RESIDUAL, ConjugateResidual, default_rtol
 from mpmjax._hessian import Hessian, ImplicitOperator
+from mpmjax._metric import Metric
 from mpmjax._potential import ElasticPotential
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
 
@@ -30,7 +31,8 @@ class SolveInfo(eqx.Module):
     line_search: Int[Array, "*f"]
     """Halvings of a Newton step by the line search."""
     residual: Float[Array, "*f"]
-    """True relative residual at the end, in the norm of the inverse mass."""
+    """True relative residual at the end: of one linear solve in the norm of the inverse metric, of Newton's method in
+    that of the inverse mass."""
     converged: Bool[Array, "*f"]
     """Whether the solver's tolerance, or the precision's own limit, was met."""
     indefinite: Bool[Array, "*f"]
@@ -93,11 +95,12 @@ class LinearProblem(AbstractProblem):
     rhs: NodeVector
     free: Mask
     prescribed: NodeVector
+    metric: Metric = eqx.field(static=True, default=Metric.MASS)
 
     def operator(self, v: NodeVector) -> ImplicitOperator:
         """Q (M + c H) Q + I − Q."""
         del v
-        return ImplicitOperator(self.mass, self.factor, self.hessian, self.free)
+        return ImplicitOperator(self.mass, self.factor, self.hessian, self.free, self.metric)
 
     def imbalance(self, v: NodeVector) -> NodeVector:
         """(M + c H) v − b."""
@@ -124,6 +127,7 @@ class NewtonProblem(AbstractProblem):
     hessian: Hessian
     free: Mask
     prescribed: NodeVector
+    metric: Metric = eqx.field(static=True, default=Metric.MASS)
 
     def displacement(self, v: NodeVector) -> NodeVector:
         """u + c v [m]."""
@@ -143,7 +147,7 @@ class NewtonProblem(AbstractProblem):
 
     def _operator(self, hessian: Hessian, v: NodeVector) -> ImplicitOperator:
         action = hessian.at(self.potential, self.displacement(v))
-        return ImplicitOperator(self.mass, self.length**2, action, self.free)
+        return ImplicitOperator(self.mass, self.length**2, action, self.free, self.metric)
 
     def imbalance(self, v: NodeVector) -> NodeVector:
         """M (v − ṽ) − c f(u + c v)."""
@@ -194,13 +198,13 @@ class Newton(eqx.Module):
     """Newton's method with a backtracking line search on the incremental potential.
 
     A direction along which the potential does not fall (the Hessian can be indefinite) is replaced by the steepest one
-    in the mass norm; a step is halved until the potential falls by a ten-thousandth of what its slope promises, which
-    also keeps out of deformations where the law has no energy. Stops when ‖residual‖ ≤ rtol ‖b‖, b the right-hand side
-    of the system linearised before anything moves, less what prescribed velocities contribute to it, both in the norm
-    of the inverse mass, or at the rounding of the residual. Starts from the guess, or from rest where the potential is
-    lower there or the guess is a deformation for which the law has no energy; if that is so at rest too, for what is
-    prescribed alone (a grip that closes a gap of one cell in a step), the first step is that of the linearised system.
-    An equation that is not finite even there gives NaN, never rest.
+    in the metric's norm; a step is halved until the potential falls by a ten-thousandth of what its slope promises,
+    which also keeps out of deformations where the law has no energy. Stops when ‖residual‖ ≤ rtol ‖b‖, b the right-hand
+    side of the system linearised before anything moves, less what prescribed velocities contribute to it, both in the
+    norm of the inverse mass, or at the rounding of the residual. Starts from the guess, or from rest where the
+    potential is lower there or the guess is a deformation for which the law has no energy; if that is so at rest too,
+    for what is prescribed alone (a grip that closes a gap of one cell in a step), the first step is that of the
+    linearised system. An equation that is not finite even there gives NaN, never rest.
 
     Args:
         solver: of the linear systems; a loose tolerance suffices.
@@ -241,16 +245,17 @@ class Newton(eqx.Module):
 
         def step(c: _NewtonState) -> _NewtonState:
             model = problem.model(jnp.where((c.newton == 0) & ~startable, still, c.v))
-            options = {"metric": metric}
+            inner = model.metric()
+            options = {"metric": inner}
             direction, _, stats = self.solver.compute(self.solver.init(model, options), -c.r, options)
             slope = (c.r * direction).sum()
-            steepest = -c.r / metric / jnp.maximum(stats["spectral_radius"], 1)
+            steepest = -c.r / inner / jnp.maximum(stats["spectral_radius"], 1)
             uphill = ~(slope < 0)
             direction = jnp.where(uphill, steepest, direction)
             slope = jnp.where(uphill, (c.r * steepest).sum(), slope)
             energy = problem.merit(c.v)
             energy = jnp.where(jnp.isfinite(energy), energy, jnp.inf)
-            radius = jnp.maximum(c.radius, stats["spectral_radius"])
+            radius = jnp.maximum(c.radius, stats["spectral_radius"] * (inner / metric).max())
             slack = 4 * eps * radius * unit_strain**2  # near the solution the fall drowns in rounding
 
             def too_high(trial: tuple[Array, Array]) -> Array:
@@ -343,7 +348,7 @@ def _solve_jvp(primals: Any, tangents: Any) -> Any:
     v, info = _solve(problem, guess, find, adjoint)
     d_residual = eqx.filter_jvp(lambda q: q.residual(v), (problem,), (d_problem,))[1]
     operator = problem.operator(v)
-    metric = jax.lax.stop_gradient(operator.metric())
+    metric = jax.lax.stop_gradient(operator).metric()
 
     def solve_symmetric(matvec: Any, b: NodeVector) -> NodeVector:
         structure = jax.ShapeDtypeStruct(b.shape, b.dtype)

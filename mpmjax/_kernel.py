@@ -107,6 +107,11 @@ class Stencil(eqx.Module):
         return eqx.tree_at(lambda s: (s.slopes, s.affine_slopes), self, (self.affine_slopes, None))
 
     @property
+    def squared(self) -> "Stencil":
+        """The stencil of w_ip² and of the squared components g_ip,a²."""
+        return eqx.tree_at(lambda s: (s.weights, s.slopes), self, (self.weights**2, self.slopes**2))
+
+    @property
     def index(self) -> Indices:
         """Flat index of each stencil node, shape (s^d, p)."""
         return _tensor(jnp.add, list(self.shares))

@@ -12,11 +12,12 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._checks import require_between, require_positive
+from mpmjax._checks import require_between
 from mpmjax._conjugate_residual import ConjugateResidual
 from mpmjax._guess import Guess
 from mpmjax._hessian import AnalyticHessian, Hessian
 from mpmjax._implicit import Linearised, LinearProblem, Newton, NewtonProblem, SolveInfo, no_solve, solve
+from mpmjax._metric import Metric
 from mpmjax._nodes import Nodes
 from mpmjax._types import Array, Float, NodeVector, Scalar
 
@@ -84,6 +85,7 @@ class SemiImplicit(eqx.Module):
         beta: β, from 0 to 1.
         hessian: how H acts. Default: by the analytic stress differential.
         solver: conjugate residuals of the forward solve.
+        metric: inner product of the solves, which is their preconditioner.
         adjoint_solver: of the tangent and adjoint solves, whose tolerance bounds the gradient's. Default: default
             tolerances.
         guess: where the solve starts.
@@ -92,6 +94,7 @@ class SemiImplicit(eqx.Module):
     beta: Scalar = 1.0
     hessian: Hessian = AnalyticHessian()
     solver: ConjugateResidual = ConjugateResidual()
+    metric: Metric = eqx.field(static=True, default=Metric.MASS)
     adjoint_solver: ConjugateResidual = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = False
@@ -110,6 +113,7 @@ class SemiImplicit(eqx.Module):
             rhs=nodes.mass[:, None] * predictor,
             free=nodes.free,
             prescribed=nodes.conditions.velocity,
+            metric=self.metric,
         )
         v, info = solve(problem, guess, Linearised(self.solver), self.adjoint_solver)
         return NodeMotion(v), info
@@ -129,32 +133,24 @@ class BackwardEuler(eqx.Module):
     fraction of itself make H indefinite), Newton finds one of them, not always the one a smaller step would lead to.
 
     Args:
-        rtol: Newton's relative tolerance. Default: 1e-8 in float64, 1e-5 in float32.
-        max_newton: most Newton steps.
+        solution: `Newton()`, with its tolerances.
         hessian: how H acts. Default: by the analytic stress differential.
-        solver: conjugate residuals within a Newton step; a loose tolerance suffices.
+        metric: inner product of the linear solves, which is their preconditioner.
         adjoint_solver: of the tangent and adjoint solves. Default: default tolerances.
         guess: where Newton starts.
     """
 
-    rtol: Scalar | None = None
-    max_newton: int = eqx.field(static=True, default=30)
+    solution: Newton = Newton()
     hessian: Hessian = AnalyticHessian()
-    solver: ConjugateResidual = ConjugateResidual(rtol=1e-3)
+    metric: Metric = eqx.field(static=True, default=Metric.MASS)
     adjoint_solver: ConjugateResidual = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = False
     needs_force: ClassVar[bool] = True
 
-    def __check_init__(self):
-        if self.rtol is not None:
-            require_positive("BackwardEuler's rtol", self.rtol)
-
     def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         """The nodes' motion and the solve's report."""
-        newton = Newton(self.solver, self.rtol, self.max_newton)
-        stage = _Stage(nodes.inertial_velocity(), nodes.dt)
-        v, info = stage.solve(nodes, guess, self.hessian, newton, self.adjoint_solver)
+        v, info = _Stage(nodes.inertial_velocity(), nodes.dt).solve(nodes, guess, self)
         return NodeMotion(v), info
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
@@ -179,12 +175,14 @@ class ImplicitMidpoint(eqx.Module):
     Args:
         solution: `Linearised()`, one linear solve, or `Newton()`.
         hessian: how H acts. Default: by the analytic stress differential.
+        metric: inner product of the linear solves, which is their preconditioner.
         adjoint_solver: of the tangent and adjoint solves. Default: default tolerances.
         guess: where the solve starts.
     """
 
     solution: Linearised | Newton = Linearised()
     hessian: Hessian = AnalyticHessian()
+    metric: Metric = eqx.field(static=True, default=Metric.MASS)
     adjoint_solver: ConjugateResidual = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = True
@@ -194,7 +192,7 @@ class ImplicitMidpoint(eqx.Module):
         """The nodes' motion and the solve's report."""
         v0, half = nodes.admitted_velocity(), nodes.dt / 2
         stage = _Stage(v0 + half * nodes.acceleration, half)
-        mean, info = stage.solve(nodes, guess, self.hessian, self.solution, self.adjoint_solver)
+        mean, info = stage.solve(nodes, guess, self)
         return NodeMotion(2 * mean - v0, mean), info
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
@@ -221,6 +219,7 @@ class TRBDF2(eqx.Module):
         rho: ρ∞, from 0 to 1.
         solution: `Linearised()`, one linear solve a stage, or `Newton()`.
         hessian: how H acts. Default: by the analytic stress differential.
+        metric: inner product of the linear solves, which is their preconditioner.
         adjoint_solver: of the tangent and adjoint solves. Default: default tolerances.
         guess: where the first stage's solve starts; the second's does where the first ended.
     """
@@ -228,6 +227,7 @@ class TRBDF2(eqx.Module):
     rho: Scalar = 0.0
     solution: Linearised | Newton = Linearised()
     hessian: Hessian = AnalyticHessian()
+    metric: Metric = eqx.field(static=True, default=Metric.MASS)
     adjoint_solver: ConjugateResidual = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = True
@@ -246,14 +246,13 @@ class TRBDF2(eqx.Module):
         """The nodes' motion and the solves' report."""
         _, q0, q1, q2 = self.weights()
         dt, g, v0 = nodes.dt, nodes.acceleration, nodes.admitted_velocity()
-        how = self.hessian, self.solution, self.adjoint_solver
         c = q2 * dt  # = ½γΔt
         pull = nodes.per_mass(nodes.force)
         trapezoidal = _Stage(v0 + c * (pull + 2 * g), c, c * v0)
-        middle, first = trapezoidal.solve(nodes, guess, *how)
+        middle, first = trapezoidal.solve(nodes, guess, self)
         later_pull = (middle - trapezoidal.inertial) / c  # f_γ/m, by the stage's own equation
         last = _Stage(v0 + dt * (q0 * pull + q1 * later_pull + g), c, dt * (q0 * v0 + q1 * middle))
-        v, second = last.solve(nodes, middle, *how)
+        v, second = last.solve(nodes, middle, self)
         inner = q2 * (v0 + middle)
         return NodeMotion(v, q0 * v0 + q1 * middle + q2 * v, inner), first.beside(second)
 
@@ -279,39 +278,36 @@ class _Stage(eqx.Module):
     """u [m]; None for zero."""
 
     def solve(
-        self,
-        nodes: Nodes,
-        guess: NodeVector,
-        hessian: Hessian,
-        solution: Linearised | Newton,
-        adjoint: ConjugateResidual,
+        self, nodes: Nodes, guess: NodeVector, method: BackwardEuler | ImplicitMidpoint | TRBDF2
     ) -> tuple[NodeVector, SolveInfo]:
         """The velocity and the solve's report."""
-        match solution:
+        system = {
+            "mass": nodes.mass,
+            "free": nodes.free,
+            "prescribed": nodes.conditions.velocity,
+            "metric": method.metric,
+        }
+        match method.solution:
             case Linearised():
-                action = hessian.at_rest(nodes.potential, guess)
+                action = method.hessian.at_rest(nodes.potential, guess)
                 force = nodes.force if self.displaced is None else nodes.force - action(self.displaced)
                 problem = LinearProblem(
-                    mass=nodes.mass,
                     factor=self.length**2,
                     hessian=action,
                     rhs=nodes.mass[:, None] * self.inertial + self.length * force,
-                    free=nodes.free,
-                    prescribed=nodes.conditions.velocity,
+                    **system,
                 )
             case Newton():
                 problem = NewtonProblem(
-                    mass=nodes.mass,
                     inertial=self.inertial,
                     length=self.length,
                     displaced=self.displaced,
                     spacing=nodes.spacing,
                     potential=nodes.potential,
-                    hessian=hessian,
-                    free=nodes.free,
-                    prescribed=nodes.conditions.velocity,
+                    hessian=method.hessian,
+                    **system,
                 )
-        return solve(problem, guess, solution, adjoint)
+        return solve(problem, guess, method.solution, method.adjoint_solver)
 
 
 def _force(nodes: Nodes, u: NodeVector, hessian: Hessian, solution: Linearised | Newton) -> NodeVector:

@@ -19,7 +19,7 @@ TIGHT = mpm.ConjugateResidual(rtol=1e-14)  # that is, down to rounding: central 
 UPDATES = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(beta=0.8, solver=TIGHT, adjoint_solver=TIGHT),
-    "backward_euler": mpm.BackwardEuler(rtol=1e-14, solver=TIGHT, adjoint_solver=TIGHT),
+    "backward_euler": mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-14), adjoint_solver=TIGHT),
     "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Newton(TIGHT, rtol=1e-14), adjoint_solver=TIGHT),
     "trbdf2": mpm.TRBDF2(0.2, mpm.Linearised(TIGHT), adjoint_solver=TIGHT),
     "trbdf2_newton": mpm.TRBDF2(0.2, mpm.Newton(TIGHT, rtol=1e-14), adjoint_solver=TIGHT),
@@ -258,7 +258,7 @@ def tolerance_sweep(update: str) -> dict[str, np.ndarray]:
             if update == "semi_implicit":
                 method = mpm.SemiImplicit(solver=solver, adjoint_solver=adjoint_solver)
             else:
-                method = mpm.BackwardEuler(rtol=forward, adjoint_solver=adjoint_solver)
+                method = mpm.BackwardEuler(mpm.Newton(rtol=forward), adjoint_solver=adjoint_solver)
             return (weights * mpm.rollout(softer, thrown, steps=5, dt=5e-2, method=method).x).sum()
 
         return jax.grad(value, argnums=(0, 1))(modulus, v)

@@ -16,7 +16,7 @@ TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(solver=TIGHT),
-    "backward_euler": mpm.BackwardEuler(rtol=1e-12, solver=TIGHT),
+    "backward_euler": mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12)),
     "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
     "trbdf2": mpm.TRBDF2(0.0, mpm.Linearised(TIGHT)),
 }

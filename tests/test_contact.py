@@ -16,7 +16,7 @@ from mpmjax._step import impulses
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(solver=TIGHT)}
-BACKWARD_EULER = mpm.BackwardEuler(rtol=1e-12, solver=TIGHT)
+BACKWARD_EULER = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12))
 OTHERS = {
     "backward_euler": BACKWARD_EULER,
     "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),

@@ -116,6 +116,15 @@ def test_an_iteration_of_an_implicit_step_crosses_once_each_way():
     assert operations(body) == {"stencil_spread": 1, "stencil_collect": 1}
 
 
+def test_the_diagonal_metric_adds_one_crossing_to_a_solve_and_nothing_to_an_iteration():
+    by_mass, by_diagonal = mpm.SemiImplicit(), mpm.SemiImplicit(metric=mpm.Metric.DIAGONAL)
+    (there, back), (more, as_many) = crossings(counted(by_mass)), crossings(counted(by_diagonal))
+    assert (more, as_many) == (there + 1, back)
+    step, arrays = program(by_diagonal)
+    (body,) = innermost_loops(jax.make_jaxpr(step)(arrays).jaxpr)
+    assert operations(body) == {"stencil_spread": 1, "stencil_collect": 1}
+
+
 HELD = {
     "sticky": mpm.StickyBox((-0.2, -0.2), (0.8, 0.8)),
     "slip": mpm.SlipBox((-0.2, -0.2), (0.8, 0.8)),

@@ -12,7 +12,7 @@ from mpmjax._hessian import AnalyticHessian
 from mpmjax._implicit import LinearProblem
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
-NEWTON = mpm.BackwardEuler(rtol=1e-12, solver=TIGHT)
+NEWTON = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12))
 
 
 def jolted(speed=0.3, side=3, dtype="float64", **scene):
@@ -48,7 +48,7 @@ def test_beta_zero_from_the_explicit_velocity_is_the_explicit_step(description):
 def test_beta_one_is_one_newton_step_of_backward_euler():
     """Newton from rest linearises where the semi-implicit step does."""
     scene, particles = jolted(gravity=(0.0, -9.81), boundary=mpm.StickyBox((0, 0), (1, 1)))
-    once = mpm.BackwardEuler(max_newton=1, guess=mpm.Guess.ZERO, solver=TIGHT)
+    once = mpm.BackwardEuler(mpm.Newton(TIGHT, max_steps=1), guess=mpm.Guess.ZERO)
     a, info = mpm.step(scene, particles, 0.0, 2e-2, method=once)
     b, _ = mpm.step(scene, particles, 0.0, 2e-2, method=mpm.SemiImplicit(beta=1.0, solver=TIGHT))
     assert info.solve.newton == 1
@@ -112,7 +112,7 @@ def test_the_two_hessians_give_the_same_step(method):
 def test_backward_euler_withstands_a_guess_that_inverts_the_material(guess):
     """A compression that would turn cells inside out in the step ends at an admissible state, whatever the guess."""
     scene, particles = squeezed(rate=50.0)
-    new, info = mpm.step(scene, particles, 0.0, 0.05, method=mpm.BackwardEuler(guess=guess, max_newton=60))
+    new, info = mpm.step(scene, particles, 0.0, 0.05, method=mpm.BackwardEuler(mpm.Newton(max_steps=60), guess=guess))
     assert info.solve.converged
     assert np.isfinite(np.asarray(new.x)).all()
     assert (np.linalg.det(np.asarray(new.F)) > 0).all()
@@ -165,7 +165,7 @@ def test_an_unconverged_solve_is_reported():
     assert not info.solve.converged
     assert info.solve.iterations == 3
     assert info.solve.residual > 1e-8
-    _, info = mpm.step(scene, particles, 0.0, 0.1, method=mpm.BackwardEuler(max_newton=1))
+    _, info = mpm.step(scene, particles, 0.0, 0.1, method=mpm.BackwardEuler(mpm.Newton(max_steps=1)))
     assert not info.solve.converged
 
 

@@ -22,7 +22,7 @@ LAYERS = (
     ("_boundary", "_body_force"),
     ("_mirror",),
     ("_particles", "_scene"),
-    ("_potential", "_hessian"),
+    ("_metric", "_potential", "_hessian"),
     ("_conjugate_residual",),
     ("_nodes", "_guess", "_implicit", "_contact"),
     ("_method",),

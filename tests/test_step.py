@@ -90,7 +90,7 @@ def test_semi_implicit_step_agrees_with_numpy_and_with_itself_uncompiled(choices
 METHODS = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(solver=TIGHT),
-    "backward_euler": mpm.BackwardEuler(rtol=1e-13, solver=TIGHT),
+    "backward_euler": mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-13)),
 }
 
 

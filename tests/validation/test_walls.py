@@ -122,7 +122,7 @@ TIGHT = mpm.ConjugateResidual(rtol=1e-13)
         ("quadratic", mpm.Explicit(), mpm.FLIP()),
         pytest.param("cubic", mpm.Explicit(), mpm.APIC(), marks=pytest.mark.slow),
         ("quadratic", mpm.SemiImplicit(solver=TIGHT), mpm.APIC()),
-        pytest.param("quadratic", mpm.BackwardEuler(rtol=1e-13, solver=TIGHT), mpm.APIC(), marks=pytest.mark.slow),
+        pytest.param("quadratic", mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-13)), mpm.APIC(), marks=pytest.mark.slow),
     ],
     ids=lambda a: a if isinstance(a, str) else type(a).__name__,
 )

@@ -1,0 +1,138 @@
+"""The diagonal inner product: what it is, what it saves where stiffness differs, and that nothing else changes."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import DESCRIPTIONS, GRADIENTS, LAWS, assert_close, block, cloud, explicit_limit, ids
+
+import mpmjax as mpm
+from mpmjax._hessian import ImplicitOperator
+from mpmjax._nodes import particles_to_grid
+
+TIGHT = mpm.ConjugateResidual(rtol=1e-11)
+IMPLICIT = {
+    "semi_implicit": mpm.SemiImplicit(solver=TIGHT, adjoint_solver=TIGHT),
+    "backward_euler": mpm.BackwardEuler(mpm.Newton(rtol=1e-11), adjoint_solver=TIGHT),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT), adjoint_solver=TIGHT),
+    "trbdf2": mpm.TRBDF2(solution=mpm.Newton(rtol=1e-11), adjoint_solver=TIGHT),
+}
+
+
+def diagonally(method):
+    return dataclasses.replace(method, metric=mpm.Metric.DIAGONAL)
+
+
+def operator_of(scene, particles, hessian, factor=1e-3):
+    """M + cH at the particles, c such that mass and stiffness are alike, in the diagonal metric."""
+    particles = mpm.prepare(scene, particles)
+    dt = jnp.asarray(1e-3)
+    nodes = particles_to_grid(scene, particles, 0.0, dt, scene.stencil(particles), centred=False)
+    action = hessian.at_rest(nodes.potential, nodes.velocity)
+    return ImplicitOperator(nodes.mass, jnp.asarray(factor), action, nodes.free, mpm.Metric.DIAGONAL)
+
+
+@eqx.filter_jit
+def metric_and_matrix(operator):
+    return operator.metric(), operator.as_matrix()
+
+
+@pytest.mark.parametrize("d", [1, 2, 3])
+@pytest.mark.parametrize("gradient", **ids(GRADIENTS))
+@pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
+def test_undeformed_it_is_the_operators_diagonal(description, gradient, d):
+    """An isotropic law at F = I has no products of slopes along different axes."""
+    grid, particles = cloud(d, p=6, cells=1 if d == 3 else 2)
+    still = mpm.Particles(particles.x, particles.v, particles.mass, particles.volume)
+    scene = mpm.Scene(grid, LAWS["neo_hookean"], gradient=gradient, description=description)
+    metric, matrix = metric_and_matrix(operator_of(scene, still, mpm.AnalyticHessian()))
+    assert_close(metric.ravel(), jnp.diag(matrix), 1e-13)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
+def test_deformed_it_scales_the_operator_whatever_the_law_and_the_walls(description, law):
+    """Positive, one on identity rows, the same from the energy alone, and near the diagonal: without products of
+    slopes, and at a symmetry plane without those of a node's with its image's."""
+    grid, particles = cloud(2)
+    walls = (mpm.SymmetryPlane(0, 0.0), mpm.StickyBox((-np.inf, 0.05), (5.0, 5.0)))
+    scene = mpm.Scene(grid, LAWS[law], boundary=walls, description=description)
+    both = [operator_of(scene, particles, hessian) for hessian in (mpm.AnalyticHessian(), mpm.JvpHessian())]
+    (metric, matrix), (other, _) = map(metric_and_matrix, both)
+    assert_close(metric, other, 1e-12)
+    free = np.asarray(both[0].free)
+    assert (metric[free] >= jnp.broadcast_to(both[0].mass[:, None], free.shape)[free]).all()
+    np.testing.assert_array_equal(metric[~free], 1)
+    exact = np.diag(matrix).reshape(free.shape)[free]
+    assert 0.5 < (exact / metric[free]).min() <= (exact / metric[free]).max() < 2
+
+
+def test_negative_stiffness_is_left_out():
+    """Of a fixed corotated body at a tenth of its volume, whose Hessian is indefinite."""
+    scene, particles = block(2)
+    F = jnp.broadcast_to(0.3 * jnp.eye(2), (len(particles.x), 2, 2))
+    squeezed = mpm.Particles(particles.x, particles.v, particles.mass, particles.volume, F)
+    operator = operator_of(scene, squeezed, mpm.AnalyticHessian(), factor=1.0)
+    metric, matrix = metric_and_matrix(operator)
+    assert np.linalg.eigvalsh(matrix).min() < 0
+    assert (metric >= jnp.where(operator.free, operator.mass[:, None], 1)).all()
+
+
+def layered(contrast, multiple, *, side=6, dtype=jnp.float64):
+    """A thrown block, its upper half stiffer by the contrast, and a step that is a multiple of that half's limit."""
+    scene, particles = block(2, side=side)
+    height = particles.x[:, 1]
+    E = jnp.where(height > height.mean(), contrast, 1.0) * scene.material.youngs_modulus
+    scene = dataclasses.replace(scene, material=mpm.NeoHookean(E.astype(dtype), 0.3))
+    v = jnp.stack([0 * height, jnp.sin(5 * height)], axis=1)
+    arrays = (a.astype(dtype) for a in (particles.x, v, particles.mass, particles.volume))
+    dt = multiple * explicit_limit(block(2)[0]) / np.sqrt(contrast)
+    return scene, mpm.prepare(scene, mpm.Particles(*arrays)), dt
+
+
+@pytest.mark.parametrize("method", **ids(IMPLICIT))
+def test_at_a_contrast_of_stiffness_it_takes_a_fraction_of_the_iterations(method):
+    """Less than half in a linear solve, less than three quarters over Newton's inexact ones; and every method arrives
+    where it does by the mass."""
+    scene, particles, dt = layered(1e3, 60.0)
+    by_mass, mass = mpm.step(scene, particles, 0.0, dt, method=method)
+    by_diagonal, diagonal = mpm.step(scene, particles, 0.0, dt, method=diagonally(method))
+    assert mass.solve.converged
+    assert diagonal.solve.converged
+    share = 0.75 if int(mass.solve.newton) else 0.5
+    assert int(diagonal.solve.iterations) < share * int(mass.solve.iterations)
+    for name in ("x", "v", "F", "C"):
+        assert_close(getattr(by_diagonal, name), getattr(by_mass, name), 1e-8)
+
+
+@pytest.mark.parametrize("second", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_gradients_do_not_depend_on_it(second):
+    """Through the tangent and the adjoint solve, which work in it too."""
+    scene, particles, dt = layered(100.0, 20.0, side=3)
+
+    def height(stiffer, method):
+        harder = dataclasses.replace(scene, material=mpm.NeoHookean(stiffer * scene.material.youngs_modulus, 0.3))
+        return mpm.rollout(harder, particles, steps=2, dt=dt, method=method).x[0, 1]
+
+    def curvature(q, method):
+        return jax.jvp(lambda q: jax.grad(height)(q, method), (q,), (q,))[1]
+
+    derivative = jax.jit(curvature if second else jax.grad(height), static_argnums=1)
+    method = IMPLICIT["semi_implicit"]
+    by_mass, by_diagonal = (derivative(jnp.asarray(1.0), m) for m in (method, diagonally(method)))
+    np.testing.assert_allclose(by_diagonal, by_mass, rtol=1e-6)
+
+
+def test_newton_in_single_precision_knows_its_rounding_in_either():
+    """Asked for more than float32 can give, it stops at the same floor, and says that it converged."""
+    scene, particles, dt = layered(1e3, 60.0, dtype=jnp.float32)
+    ends = {}
+    for metric in mpm.Metric:
+        method = mpm.BackwardEuler(mpm.Newton(rtol=1e-12), metric=metric)
+        ends[metric], info = mpm.step(scene, particles, 0.0, dt, method=method)
+        assert info.solve.converged
+        assert 1e-12 < info.solve.residual < 1e-3
+    assert_close(ends[mpm.Metric.MASS].v, ends[mpm.Metric.DIAGONAL].v, 1e-3)
