@@ -28,7 +28,7 @@ from mpmjax._stability import stable_dt
 from mpmjax._step import StepInfo, step
 from mpmjax._transfer import APIC, FLIP, PIC
 from mpmjax._work_precision import Trial, WorkPrecision, work_precision
-from mpmjax.material import AbstractMaterial, AbstractTangent, FixedCorotated, NeoHookean
+from mpmjax.material import AbstractMaterial, AbstractTangent, FixedCorotated, Hencky, NeoHookean
 
 __version__ = "0.1.0"
 
@@ -49,6 +49,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "AbstractMaterial",
     "AbstractTangent",
     "FixedCorotated",
+    "Hencky",
     "NeoHookean",
     # discretisation
     "BSpline",

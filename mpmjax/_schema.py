@@ -36,12 +36,12 @@ from mpmjax._motion import Motion
 from mpmjax._region import Ball, Box
 from mpmjax._scene import Scene, TotalLagrangian, UpdatedLagrangian
 from mpmjax._transfer import APIC, FLIP, PIC
-from mpmjax.material import FixedCorotated, NeoHookean
+from mpmjax.material import FixedCorotated, Hencky, NeoHookean
 
 CLASSES: tuple[type, ...] = (
     Scene,
     Grid,
-    *(FixedCorotated, NeoHookean),
+    *(FixedCorotated, NeoHookean, Hencky),
     *(StickyBox, SlipBox, SeparatingBox, Grip, SymmetryPlane, ContactPlane),
     *(Box, Ball, Motion),
     *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),

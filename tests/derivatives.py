@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from helpers import DESCRIPTIONS, LAWS, block
+from helpers import DESCRIPTIONS, ELASTIC, block
 
 import mpmjax as mpm
 from mpmjax import _simulate, _step
@@ -48,7 +48,7 @@ def parameters(case: Case) -> dict[str, Any]:
     rng = np.random.default_rng(1)
     box, grid = mpm.Box((0.0,) * d, (0.2,) * d), mpm.Grid((8,) * d, DX)
     x = mpm.fill(box, grid, particles_per_cell=2**d, density=1e3).x
-    first, *others = jax.tree.leaves(LAWS[case.law])
+    first, *others = jax.tree.leaves(ELASTIC[case.law])
     law = [first * rng.uniform(0.8, 1.2, len(x)), *others]
     q = {
         "law": [jnp.asarray(a) for a in law],
@@ -89,7 +89,7 @@ def model(q: dict[str, Any], case: Case) -> tuple[mpm.Scene, mpm.Particles, Any]
     that it may leave.
     """
     d = case.d
-    law = jax.tree.unflatten(jax.tree.structure(LAWS[case.law]), q["law"])
+    law = jax.tree.unflatten(jax.tree.structure(ELASTIC[case.law]), q["law"])
     if case.contact:
         lower = (-np.inf,) * (d - 1) + (0.0,)
         boundary = (mpm.SeparatingBox(lower, (np.inf,) * d, friction=q["friction"]),)

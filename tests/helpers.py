@@ -14,6 +14,8 @@ LAWS = {
     "fixed_corotated": mpm.FixedCorotated(youngs_modulus=1e4, poisson_ratio=0.3),
     "neo_hookean": mpm.NeoHookean(youngs_modulus=1e4, poisson_ratio=0.3),
 }
+ELASTIC = LAWS | {"hencky": mpm.Hencky(youngs_modulus=1e4, poisson_ratio=0.3)}
+"""All elastic laws, for what is cheap or a law's own; `LAWS` for what is multiplied by other choices."""
 DESCRIPTIONS = {"updated": mpm.UpdatedLagrangian(), "total": mpm.TotalLagrangian()}
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(), "backward_euler": mpm.BackwardEuler()}
 SECOND_ORDER = {"implicit_midpoint": mpm.ImplicitMidpoint(), "trbdf2": mpm.TRBDF2()}

@@ -40,7 +40,8 @@ def held_cases():
     each description and backward Euler has one case, and that the updates of second order, whose stages are of one form
     with those of the others, have one law for each description in one and two. By default each update in one
     dimension, with one law for each description (of second order, one law), and the explicit one in two; the rest is
-    slow."""
+    slow. Hencky's law, whose derivatives are of a kind of their own, has an explicit and a semi-implicit case, and one
+    in three dimensions."""
     for update, law, description in itertools.product(UPDATES, LAWS, DESCRIPTIONS):
         turn = (list(UPDATES).index(update) + list(LAWS).index(law) + list(DESCRIPTIONS).index(description)) % 2
         solid = {"explicit": True, "semi_implicit": turn, "backward_euler": turn and law == "neo_hookean"}
@@ -53,6 +54,9 @@ def held_cases():
             )
             case = Case(update, law, description, d)
             yield pytest.param(case, marks=() if now else pytest.mark.slow, id=str(case))
+    for update, description, d in (("explicit", "updated", 2), ("explicit", "total", 3), ("semi_implicit", "total", 2)):
+        case = Case(update, "hencky", description, d)
+        yield pytest.param(case, marks=() if d == 2 else pytest.mark.slow, id=str(case))
 
 
 def contact_cases():

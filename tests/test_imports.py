@@ -18,6 +18,7 @@ LAYERS = (
     ("_crossing",),
     ("_transfer",),
     ("_linalg",),
+    ("_isotropic",),
     ("material",),
     ("_boundary", "_body_force"),
     ("_mirror",),

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from deformations import STRETCHES, deformations
-from helpers import DIMS, LAWS, assert_close, block, explicit_limit, ids, rotation_matrix
+from helpers import DIMS, ELASTIC, LAWS, assert_close, block, explicit_limit, ids, rotation_matrix
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
@@ -14,7 +14,7 @@ from mpmjax._hessian import ImplicitOperator
 from mpmjax.material import projected_tangent
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
-EACH_LAW = pytest.mark.parametrize("law", **ids(LAWS))
+EACH_LAW = pytest.mark.parametrize("law", **ids(ELASTIC))
 EACH_DIM = pytest.mark.parametrize("d", DIMS)
 PROJECTED = mpm.AnalyticHessian(projected=True)
 
@@ -39,7 +39,8 @@ def test_projection_keeps_what_is_positive_and_drops_the_rest(law, family, d):
     positive semi-definite."""
     law, F = jax.tree.map(jnp.asarray, law), jnp.asarray(deformations(family, d)[0])
     if not np.asarray(law.admits(F)).all():
-        assert (type(law), family) == (mpm.NeoHookean, "inverted")
+        assert family == "inverted"
+        assert not isinstance(law, mpm.FixedCorotated)
         return
     plain, projected = map(np.asarray, both(law, F))
     positive = 0

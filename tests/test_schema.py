@@ -30,6 +30,7 @@ EXAMPLES = {
     mpm.Grid: GRID,
     mpm.FixedCorotated: mpm.FixedCorotated(1 / 3, 0.3),
     mpm.NeoHookean: mpm.NeoHookean(np.array([1.0, 2.0]), 0.3),
+    mpm.Hencky: mpm.Hencky(2e5, 0.2),
     mpm.StickyBox: mpm.StickyBox((0.1,), (0.9,)),
     mpm.SlipBox: mpm.SlipBox((0.1, -np.inf), (np.inf, 0.7)),
     mpm.SeparatingBox: mpm.SeparatingBox((0.1,), (0.9,), friction=0.3),

@@ -1,17 +1,24 @@
 """Elastic laws."""
 
-from mpmjax.material._base import AbstractMaterial, AbstractTangent, PrincipalTangent, lame_lambda, shear_modulus
+from mpmjax.material._base import (
+    AbstractIsotropic,
+    AbstractMaterial,
+    AbstractTangent,
+    MatrixTangent,
+    PrincipalTangent,
+)
 from mpmjax.material._elastic import FixedCorotated, NeoHookean
-from mpmjax.material._projection import ProjectedTangent, projected_tangent
+from mpmjax.material._hencky import Hencky
+from mpmjax.material._projection import projected_tangent
 
 __all__ = [
+    "AbstractIsotropic",
     "AbstractMaterial",
     "AbstractTangent",
     "FixedCorotated",
+    "Hencky",
+    "MatrixTangent",
     "NeoHookean",
     "PrincipalTangent",
-    "ProjectedTangent",
-    "lame_lambda",
     "projected_tangent",
-    "shear_modulus",
 ]

@@ -4,6 +4,7 @@ import abc
 
 import equinox as eqx
 
+from mpmjax._checks import require_between, require_positive
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 
 
@@ -16,6 +17,22 @@ class AbstractTangent(eqx.Module):
     @abc.abstractmethod
     def __call__(self, dF: Matrix) -> Matrix:
         """δP [Pa] for δF [-], both of shape (d, d, p)."""
+
+
+class MatrixTangent(AbstractTangent):
+    """The stress differential as a matrix."""
+
+    matrix: Float[Array, "m m *p"]
+    """A on the d² components in C order, shape (d², d², *p) [Pa]."""
+
+    def __call__(self, dF: Matrix) -> Matrix:
+        """δP for δF."""
+        return componentwise_product(self.matrix, dF.reshape(-1, 1, *dF.shape[2:])).reshape(dF.shape)
+
+
+def componentwise_product(A: Float[Array, "a k *p"], B: Float[Array, "k b *p"]) -> Float[Array, "a b *p"]:
+    """A B of matrices of any size, by columns of A and rows of B."""
+    return sum((A[:, k, None] * B[k] for k in range(1, A.shape[1])), A[:, 0, None] * B[0])
 
 
 class PrincipalTangent(eqx.Module):
@@ -62,11 +79,25 @@ class AbstractMaterial(eqx.Module):
         """Whether the law is defined at F."""
 
 
-def shear_modulus(youngs_modulus: PerParticle, poisson_ratio: PerParticle) -> PerParticle:
-    """μ = E / (2 (1 + ν)) [Pa]."""
-    return youngs_modulus / (2 * (1 + poisson_ratio))
+class AbstractIsotropic(AbstractMaterial):
+    """A law that small strains see as Lamé's: δP = 2μ ε + λ tr(ε) I at F = I."""
 
+    youngs_modulus: PerParticle
+    """E [Pa]."""
+    poisson_ratio: PerParticle
+    """ν [-]."""
 
-def lame_lambda(youngs_modulus: PerParticle, poisson_ratio: PerParticle) -> PerParticle:
-    """λ = E ν / ((1 + ν)(1 − 2ν)) [Pa]."""
-    return youngs_modulus * poisson_ratio / ((1 + poisson_ratio) * (1 - 2 * poisson_ratio))
+    def __check_init__(self):
+        name = type(self).__name__
+        require_positive(f"{name}'s youngs_modulus [Pa]", self.youngs_modulus)
+        require_between(f"{name}'s poisson_ratio", self.poisson_ratio, -1, 0.5, open_ends=True)
+
+    @property
+    def shear_modulus(self) -> PerParticle:
+        """μ = E / (2 (1 + ν)) [Pa]."""
+        return self.youngs_modulus / (2 * (1 + self.poisson_ratio))
+
+    @property
+    def lame_lambda(self) -> PerParticle:
+        """λ = E ν / ((1 + ν)(1 − 2ν)) [Pa]."""
+        return self.youngs_modulus * self.poisson_ratio / ((1 + self.poisson_ratio) * (1 - 2 * self.poisson_ratio))

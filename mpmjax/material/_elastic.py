@@ -3,12 +3,11 @@
 import jax.numpy as jnp
 
 from mpmjax import _linalg as la
-from mpmjax._checks import require_between, require_positive
 from mpmjax._types import Array, Bool, Compliance, Float, Matrix, PerParticle
-from mpmjax.material._base import AbstractMaterial, AbstractTangent, PrincipalTangent, lame_lambda, shear_modulus
+from mpmjax.material._base import AbstractIsotropic, AbstractTangent, PrincipalTangent
 
 
-class FixedCorotated(AbstractMaterial):
+class FixedCorotated(AbstractIsotropic):
     """Fixed corotated elasticity (A. Stomakhin, R. Howes, C. Schroeder, J. Teran, SCA 2012, doi
     10.2312/SCA/SCA12/025-032).
 
@@ -24,22 +23,6 @@ class FixedCorotated(AbstractMaterial):
         youngs_modulus: E [Pa], one value or one per particle (p,).
         poisson_ratio: ν [-], strictly between −1 and 0.5.
     """
-
-    youngs_modulus: PerParticle
-    poisson_ratio: PerParticle
-
-    def __check_init__(self):
-        _check_moduli(self)
-
-    @property
-    def shear_modulus(self) -> PerParticle:
-        """μ [Pa]."""
-        return shear_modulus(self.youngs_modulus, self.poisson_ratio)
-
-    @property
-    def lame_lambda(self) -> PerParticle:
-        """λ [Pa]."""
-        return lame_lambda(self.youngs_modulus, self.poisson_ratio)
 
     def energy(self, F: Matrix) -> Array:
         """Ψ = μ ‖F − R‖² + λ/2 (J − 1)²."""
@@ -94,7 +77,7 @@ class FixedCorotatedTangent(AbstractTangent):
         )
 
 
-class NeoHookean(AbstractMaterial):
+class NeoHookean(AbstractIsotropic):
     """Compressible neo-Hookean elasticity (J. Bonet, R. D. Wood, Nonlinear Continuum Mechanics for Finite Element
     Analysis, 2nd ed., Cambridge 2008, eq. 6.27).
 
@@ -108,22 +91,6 @@ class NeoHookean(AbstractMaterial):
         youngs_modulus: E [Pa], one value or one per particle (p,).
         poisson_ratio: ν [-], strictly between −1 and 0.5.
     """
-
-    youngs_modulus: PerParticle
-    poisson_ratio: PerParticle
-
-    def __check_init__(self):
-        _check_moduli(self)
-
-    @property
-    def shear_modulus(self) -> PerParticle:
-        """μ [Pa]."""
-        return shear_modulus(self.youngs_modulus, self.poisson_ratio)
-
-    @property
-    def lame_lambda(self) -> PerParticle:
-        """λ [Pa]."""
-        return lame_lambda(self.youngs_modulus, self.poisson_ratio)
 
     def energy(self, F: Matrix) -> Array:
         """Ψ = μ/2 (F : F − d) − μ ln J + λ/2 (ln J)²."""
@@ -204,9 +171,3 @@ def _with_volumetric(s: Array, pull: Array, bulk: Array, twist: list[Array], sti
         flip=jnp.stack([stiffness - v for v in shear]) if shear else none,
         scaling=la.assemble([[scaling(i, j) for j in range(d)] for i in range(d)]),
     )
-
-
-def _check_moduli(law: FixedCorotated | NeoHookean) -> None:
-    name = type(law).__name__
-    require_positive(f"{name}'s youngs_modulus [Pa]", law.youngs_modulus)
-    require_between(f"{name}'s poisson_ratio", law.poisson_ratio, -1, 0.5, open_ends=True)

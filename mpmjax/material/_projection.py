@@ -5,23 +5,13 @@ import jax.numpy as jnp
 
 from mpmjax import _linalg as la
 from mpmjax._types import Array, Float, Matrix
-from mpmjax.material._base import AbstractMaterial, AbstractTangent
+from mpmjax.material._base import AbstractMaterial, MatrixTangent, componentwise_product
 
 
-class ProjectedTangent(AbstractTangent):
+def projected_tangent(material: AbstractMaterial, F: Matrix) -> MatrixTangent:
     """δP = A⁺ : δF, A⁺ being A = ∂²Ψ/∂F∂F with its negative eigenvalues set to zero (J. Teran, E. Sifakis, G. Irving,
-    R. Fedkiw, SCA 2005, doi 10.1145/1073368.1073394): of the positive semi-definite maps, the nearest to A."""
-
-    matrix: Float[Array, "m m *p"]
-    """A⁺ on the d² components in C order, shape (d², d², *p)."""
-
-    def __call__(self, dF: Matrix) -> Matrix:
-        """δP for δF."""
-        return _product(self.matrix, dF.reshape(-1, 1, *dF.shape[2:])).reshape(dF.shape)
-
-
-def projected_tangent(material: AbstractMaterial, F: Matrix) -> ProjectedTangent:
-    """The stress differential at F, projected. In closed form: no eigenvalue problem larger than d x d is solved.
+    R. Fedkiw, SCA 2005, doi 10.1145/1073368.1073394): of the positive semi-definite maps, the nearest to A. In closed
+    form: no eigenvalue problem larger than d x d is solved.
 
     Its first derivative with respect to F and the law's parameters is exact, at repeated stretches too: with E the
     eigenvectors of A and λ its eigenvalues, δA⁺ = E (K ∘ Eᵀ δA E) Eᵀ, K_kl = (λ_k⁺ − λ_l⁺)/(λ_k − λ_l) (J. L. Daleckii,
@@ -31,7 +21,7 @@ def projected_tangent(material: AbstractMaterial, F: Matrix) -> ProjectedTangent
     *When it breaks*: second derivatives are refused. Where an eigenvalue is zero A⁺ has a kink; the derivative given is
     the mean of the two sides, which is what a central difference tends to. At F = I that is so: all twists are zero.
     """
-    return ProjectedTangent(_projected_matrix(material, F))
+    return MatrixTangent(_projected_matrix(material, F))
 
 
 @jax.custom_jvp
@@ -49,7 +39,7 @@ def _projected_matrix_jvp(
     def in_frame(material: AbstractMaterial, F: Matrix) -> Array:
         """Eᵀ A E, the frame held fixed."""
         images = jax.vmap(material.tangent(F))(modes.reshape(-1, *F.shape)).reshape(modes.shape)
-        return _product(modes, jnp.swapaxes(images, 0, 1))
+        return componentwise_product(modes, jnp.swapaxes(images, 0, 1))
 
     change = jax.jvp(in_frame, primals, tangents)[1]
     positive, size = jnp.maximum(values, 0), jnp.abs(values)
@@ -66,20 +56,15 @@ def _spectrum(material: AbstractMaterial, F: Matrix) -> tuple[Float[Array, "m *p
     scalings, Q = la.symmetric_eigen(tangent.scaling)
     d, modes = F.shape[0], la.principal_modes(U, V)
     modes = modes.reshape(d * d, d * d, *F.shape[2:])
-    modes = jnp.concatenate([_product(la.transpose(Q), modes[:d]), modes[d:]])
+    modes = jnp.concatenate([componentwise_product(la.transpose(Q), modes[:d]), modes[d:]])
     return jnp.concatenate([scalings, tangent.twist, tangent.flip]), modes
 
 
 def _in_modes(modes: Float[Array, "m m *p"], core: Float[Array, "m m *p"]) -> Float[Array, "m m *p"]:
     """Σ_kl E_ka core_kl E_lb."""
-    return _product(jnp.swapaxes(modes, 0, 1), _product(core, modes))
+    return componentwise_product(jnp.swapaxes(modes, 0, 1), componentwise_product(core, modes))
 
 
 def _identity(values: Float[Array, "m *p"]) -> Float[Array, "m m *p"]:
     """The identity, to make a diagonal of eigenvalues of."""
     return la.identity_like(jnp.broadcast_to(values, (values.shape[0], *values.shape)))
-
-
-def _product(A: Float[Array, "a k *p"], B: Float[Array, "k b *p"]) -> Float[Array, "a b *p"]:
-    """A B, by columns of A and rows of B."""
-    return sum((A[:, k, None] * B[k] for k in range(1, A.shape[1])), A[:, 0, None] * B[0])

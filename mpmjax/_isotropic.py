@@ -1,0 +1,144 @@
+"""Functions of symmetric matrices, f(S) = V diag(f(s)) Vᵀ for S = V diag(s) Vᵀ: the logarithm and the exponential.
+
+Their derivatives do not differentiate V, which has none where eigenvalues coincide (F = I, the first step of every
+scene). They are written in divided differences of f, which are finite there: with A and B in the frame V,
+
+    (Df[A])_ij = f[s_i, s_j] A_ij,
+    (D²f[A, B])_ij = Σ_k f[s_i, s_k, s_j] (A_ik B_kj + B_ik A_kj)
+
+(J. L. Daleckii, S. G. Krein; N. J. Higham, Functions of Matrices, SIAM 2008, theorem 3.11 and its proof,
+doi 10.1137/1.9780898717778). First and second derivatives hold at every S; third ones are refused.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax import _linalg as la
+from mpmjax._types import Array, Matrix
+
+_CLOSE = 1e-4
+"""Eigenvalues in such a share of each other have f''/2 at their mean for f[a, b, c], within its square; else the
+quotient of differences cancels to rounding over it."""
+
+
+class AbstractSpectral(eqx.Module):
+    """A function f of an eigenvalue, and of symmetric matrices by it."""
+
+    @abc.abstractmethod
+    def of(self, s: Array) -> Array:
+        """f(s)."""
+
+    @abc.abstractmethod
+    def slope(self, a: Array, b: Array) -> Array:
+        """The divided difference f[a, b] = (f(a) − f(b))/(a − b), f'(a) where they are equal, to rounding."""
+
+    @abc.abstractmethod
+    def curvature(self, s: Array) -> Array:
+        """f''(s)."""
+
+    def __call__(self, S: Matrix) -> Matrix:
+        """f(S). Only the upper triangle is read.
+
+        Args:
+            S: symmetric, shape (d, d, *batch).
+        """
+        return _function(self, S)
+
+
+class Logarithm(AbstractSpectral):
+    """log S, of positive definite S."""
+
+    def of(self, s: Array) -> Array:
+        """ln s."""
+        return jnp.log(s)
+
+    def slope(self, a: Array, b: Array) -> Array:
+        """ln(b/a)/(b − a)."""
+        gap = (b - a) / a
+        return jnp.where(gap == 0, 1, jnp.log1p(gap) / jnp.where(gap == 0, 1, gap)) / a
+
+    def curvature(self, s: Array) -> Array:
+        """−1/s²."""
+        return -1 / s**2
+
+
+class Exponential(AbstractSpectral):
+    """exp S."""
+
+    def of(self, s: Array) -> Array:
+        """eˢ."""
+        return jnp.exp(s)
+
+    def slope(self, a: Array, b: Array) -> Array:
+        """eᵃ (e^(b − a) − 1)/(b − a)."""
+        gap = b - a
+        return jnp.where(gap == 0, 1, jnp.expm1(gap) / jnp.where(gap == 0, 1, gap)) * jnp.exp(a)
+
+    def curvature(self, s: Array) -> Array:
+        """eˢ."""
+        return jnp.exp(s)
+
+
+@jax.custom_jvp
+def _function(f: AbstractSpectral, S: Matrix) -> Matrix:
+    s, V = la.symmetric_eigen(S)
+    return _from_frame(V, f.of(s) * la.identity_like(S))
+
+
+@_function.defjvp
+def _function_jvp(primals: Any, tangents: Any) -> Any:
+    (f, S), (_, dS) = primals, tangents
+    return _function(f, S), _differential(f, S, dS)
+
+
+@jax.custom_jvp
+def _differential(f: AbstractSpectral, S: Matrix, A: Matrix) -> Matrix:
+    """Df(S)[A]."""
+    s, V = la.symmetric_eigen(S)
+    return _from_frame(V, f.slope(s[:, None], s[None]) * _in_frame(V, A))
+
+
+@_differential.defjvp
+def _differential_jvp(primals: Any, tangents: Any) -> Any:
+    (f, S, A), (_, dS, dA) = primals, tangents
+    return _differential(f, S, A), _differential(f, S, dA) + _second_differential(f, S, A, dS)
+
+
+@jax.custom_jvp
+def _second_differential(f: AbstractSpectral, S: Matrix, A: Matrix, B: Matrix) -> Matrix:
+    """D²f(S)[A, B]."""
+    s, V = la.symmetric_eigen(S)
+    A, B = _in_frame(V, A), _in_frame(V, B)
+
+    def divided(*three: Array) -> Array:
+        low, middle, high = jnp.sort(jnp.stack(three), axis=0)
+        close = high - low <= _CLOSE * (jnp.abs(low) + jnp.abs(high))
+        apart = (f.slope(middle, high) - f.slope(low, middle)) / jnp.where(close, 1, high - low)
+        return jnp.where(close, f.curvature((low + middle + high) / 3) / 2, apart)
+
+    def entry(i: int, j: int) -> Array:
+        terms = [divided(s[i], s[k], s[j]) * (A[i, k] * B[k, j] + B[i, k] * A[k, j]) for k in directions]
+        return sum(terms[1:], terms[0])
+
+    directions = range(s.shape[0])
+    return _from_frame(V, la.assemble([[entry(i, j) for j in directions] for i in directions]))
+
+
+@_second_differential.defjvp
+def _second_differential_jvp(primals: Any, tangents: Any) -> Any:
+    raise NotImplementedError(
+        "Functions of a strain's principal values have first and second derivatives, no third one: with Hencky's law "
+        "take first derivatives through implicit steps, and second ones through explicit steps only."
+    )
+
+
+def _in_frame(V: Matrix, A: Matrix) -> Matrix:
+    return la.matmul(la.transpose(V), la.matmul(A, V))
+
+
+def _from_frame(V: Matrix, A: Matrix) -> Matrix:
+    return la.matmul(V, la.matmul(A, la.transpose(V)))

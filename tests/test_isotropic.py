@@ -1,0 +1,105 @@
+"""Functions of symmetric matrices: against LAPACK, and their derivatives against central differences, at repeated and
+nearly repeated eigenvalues too."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import DIMS, assert_close, ids, rotation_matrix
+
+from mpmjax._isotropic import Exponential, Logarithm
+
+FUNCTIONS = {"logarithm": Logarithm(), "exponential": Exponential()}
+NUMPY = {Logarithm: np.log, Exponential: np.exp}
+EIGENVALUES = {
+    "all one": (1.0, 1.0, 1.0),
+    "two equal": (1.3, 1.3, 0.4),
+    "three distinct": (0.3, 1.1, 2.7),
+    "two nearly equal": (1.0, 1.0 + 1e-9, 2.0),
+    "all close": (1.0, 1.0 + 3e-5, 1.0 - 2e-5),
+    "some decades": (1e-3, 1.0, 8.0),
+}
+EACH = [
+    pytest.mark.parametrize("f", **ids(FUNCTIONS)),
+    pytest.mark.parametrize("d", DIMS),
+    pytest.mark.parametrize("eigenvalues", **ids(EIGENVALUES)),
+]
+
+
+def each(test):
+    for mark in EACH:
+        test = mark(test)
+    return test
+
+
+def symmetric(A):
+    return (A + A.swapaxes(0, 1)) / 2
+
+
+def case(eigenvalues, d, seed=0):
+    """A matrix of these eigenvalues, three symmetric directions, all with a batch axis of one."""
+    rng = np.random.default_rng(seed)
+    Q = rotation_matrix(d, rng)
+    S = symmetric(Q * np.array(eigenvalues[:d]) @ Q.T)
+    return tuple(jnp.asarray(a[..., None]) for a in (S, *(symmetric(rng.normal(size=(d, d))) for _ in range(3))))
+
+
+@jax.jit
+def evaluated(f, S, A, B, W):
+    """f(S), Df[A], D²f[A, B], and the cotangent W pulled back through f and through Df[A]."""
+    once = lambda S: jax.jvp(f, (S,), (A,))[1]  # noqa: E731
+    value, first = jax.jvp(f, (S,), (A,))
+    second = jax.jvp(once, (S,), (B,))[1]
+    pulled = [jax.grad(lambda S, g=g: (W * g(S)).sum())(S) for g in (f, once)]
+    return value, first, second, *pulled
+
+
+@each
+def test_values_are_those_of_lapacks_eigenvectors(eigenvalues, d, f):
+    """To rounding, whatever the eigenvalues."""
+    S, *directions = case(eigenvalues, d)
+    value = evaluated(f, S, *directions)[0]
+    s, V = np.linalg.eigh(S[..., 0])
+    assert_close(value[..., 0], (V * NUMPY[type(f)](s)) @ V.T, 1e-13, atol=4e-15)
+
+
+@each
+def test_derivatives_are_central_differences(eigenvalues, d, f):
+    """The first of the values, the second of the first, at a step of 1e-5 of the smallest eigenvalue."""
+    S, A, B, W = case(eigenvalues, d)
+    _, first, second, *_ = evaluated(f, S, A, B, W)
+    h = 1e-4 * min(eigenvalues[:d])
+    ahead, behind = (evaluated(f, S + s * A, A, B, W)[0] for s in (h, -h))
+    assert_close(first, (ahead - behind) / (2 * h), 1e-7)
+    ahead, behind = (evaluated(f, S + s * B, A, B, W)[1] for s in (h, -h))
+    assert_close(second, (ahead - behind) / (2 * h), 1e-6)
+
+
+@each
+def test_reverse_mode_is_the_transpose(eigenvalues, d, f):
+    """⟨W, Df[A]⟩ = ⟨DfᵀW, A⟩ and ⟨W, D²f[A, B]⟩ likewise, to 1e-12."""
+    S, A, B, W = case(eigenvalues, d)
+    _, first, second, once, twice = evaluated(f, S, A, B, W)
+    for forward, backward, direction in ((first, once, A), (second, twice, B)):
+        size = float(jnp.abs(W * forward).sum())
+        np.testing.assert_allclose((backward * direction).sum(), (W * forward).sum(), rtol=0, atol=1e-12 * size)
+
+
+def test_the_exponential_undoes_the_logarithm():
+    """Batches of any shape."""
+    rng = np.random.default_rng(4)
+    A = jnp.asarray(rng.normal(size=(3, 3, 4, 5)))
+    S = jnp.einsum("ki...,kj...->ij...", A, A) + 0.1 * jnp.eye(3)[..., None, None]
+    assert_close(jax.jit(Exponential().__call__)(jax.jit(Logarithm().__call__)(S)), S, 1e-12)
+
+
+def test_third_derivatives_are_refused():
+    """And not wrong."""
+    S, A, *_ = case(EIGENVALUES["all one"], 2)
+
+    def nth(n, S):
+        return Logarithm()(S) if n == 0 else jax.jvp(lambda S: nth(n - 1, S), (S,), (A,))[1]
+
+    assert np.isfinite(nth(2, S)).all()
+    with pytest.raises(NotImplementedError, match="no third one"):
+        nth(3, S)
