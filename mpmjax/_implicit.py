@@ -178,7 +178,7 @@ class Linearised(eqx.Module):
 
     def __call__(self, problem: AbstractProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         """The solution, started from a guess."""
-        operator = problem.operator(guess)
+        operator = problem.operator(guess).assembled()
         lift = jnp.where(problem.free, 0, problem.prescribed)
         rhs = jnp.where(problem.free, -problem.imbalance(lift), 0)
         options = {"metric": operator.metric(), "y0": jnp.where(problem.free, guess, 0)}
@@ -244,7 +244,7 @@ class Newton(eqx.Module):
             return (norm(c.r) > tolerance(c)) & (c.newton < self.max_steps) & ~c.stuck
 
         def step(c: _NewtonState) -> _NewtonState:
-            model = problem.model(jnp.where((c.newton == 0) & ~startable, still, c.v))
+            model = problem.model(jnp.where((c.newton == 0) & ~startable, still, c.v)).assembled()
             inner = model.metric()
             options = {"metric": inner}
             direction, _, stats = self.solver.compute(self.solver.init(model, options), -c.r, options)
@@ -348,12 +348,12 @@ def _solve_jvp(primals: Any, tangents: Any) -> Any:
     v, info = _solve(problem, guess, find, adjoint)
     d_residual = eqx.filter_jvp(lambda q: q.residual(v), (problem,), (d_problem,))[1]
     operator = problem.operator(v)
-    metric = jax.lax.stop_gradient(operator).metric()
+    assembled = jax.lax.stop_gradient(operator).assembled()
+    options = {"metric": assembled.metric()}
 
     def solve_symmetric(matvec: Any, b: NodeVector) -> NodeVector:
-        structure = jax.ShapeDtypeStruct(b.shape, b.dtype)
-        linear = lx.FunctionLinearOperator(matvec, structure, lx.symmetric_tag)
-        x, result, _ = adjoint.compute(adjoint.init(linear, {}), b, {"metric": metric})
+        del matvec  # the same operator, slower
+        x, result, _ = adjoint.compute(adjoint.init(assembled, options), b, options)
         return jnp.where(result == lx.RESULTS.successful, x, jnp.nan)
 
     lift = jnp.where(problem.free, 0, -d_residual)

@@ -11,7 +11,7 @@ from mpmjax._crossing import collect, spread
 from mpmjax._kernel import Stencil
 from mpmjax._mirror import Mirror
 from mpmjax._types import Array, Float, Matrix, NodeVector
-from mpmjax.material import AbstractMaterial
+from mpmjax.material import AbstractMaterial, matrix_of
 
 
 class ElasticPotential(eqx.Module):
@@ -59,28 +59,15 @@ class ElasticPotential(eqx.Module):
         """What the force at u = 0 is the sum of, f_i = −Σ_p (V0_p P_p F_pᵀ) g_ip: the bracket [J], shape (d, d, p)."""
         return self._flux(_stress(self.material, self.F))
 
-    def stiffness(self, tangent: Callable[[Matrix], Matrix], like: NodeVector) -> NodeVector:
-        """Σ_p V0_p Σ_b g_ip,b² k_p,ab [N/m], never negative: the diagonal of the Hessian for a scaling, not to the last
-        digit.
+    def stiffness(self, tangent: Callable[[Matrix], Matrix]) -> Float[Array, "m m p"]:
+        """K_p [J], each particle's part of the Hessian Σ_p g_ip K_p g_jp: of the stress differential δF ↦ A : δF, the
+        symmetric map from the components of the displacement's gradient, direction of the slope first, to those of what
+        the force is the sum of. Shape (d², d², p)."""
 
-        k_ab = (e_a e_bᵀ F) : A : (e_a e_bᵀ F) is the stiffness [Pa] of a particle against one component of the
-        displacement's gradient, zero where it is negative. What the diagonal has besides are products of slopes along
-        different axes, which an isotropic law has none of at F = I, and at mirror planes of a node's with its image's.
+        def flux_of(slopes: Matrix) -> Matrix:
+            return la.transpose(self._flux(tangent(self.deformed(la.transpose(slopes)))))
 
-        Args:
-            tangent: the map δF ↦ A : δF.
-            like: any node vector.
-        """
-        d, zero, one = self.F.shape[0], jnp.zeros_like(self.volume), jnp.ones_like(self.volume)
-
-        def against(a: int, b: int) -> Array:
-            unit = [[one if (i, j) == (a, b) else zero for j in range(d)] for i in range(d)]
-            dF = self.deformed(la.assemble(unit))
-            return self.volume * jnp.maximum(la.double_dot(dF, tangent(dF)), 0)
-
-        k = la.assemble([[against(a, b) for a in range(d)] for b in range(d)])
-        nodes = spread(self.stencil.squared, None, k, like.shape[0])
-        return jnp.stack([self.mirror.fold_scalar(component) for component in nodes.T], axis=1)
+        return matrix_of(flux_of, self.F)
 
     def _flux(self, P: Matrix) -> Matrix:
         P = self.volume * P

@@ -6,6 +6,8 @@ from mpmjax.material._base import (
     AbstractTangent,
     MatrixTangent,
     PrincipalTangent,
+    componentwise_product,
+    matrix_of,
 )
 from mpmjax.material._elastic import FixedCorotated, NeoHookean
 from mpmjax.material._hencky import Hencky
@@ -20,5 +22,7 @@ __all__ = [
     "MatrixTangent",
     "NeoHookean",
     "PrincipalTangent",
+    "componentwise_product",
+    "matrix_of",
     "projected_tangent",
 ]

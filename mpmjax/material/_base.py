@@ -1,8 +1,11 @@
 """What an elastic law is."""
 
 import abc
+from collections.abc import Callable
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 
 from mpmjax._checks import require_between, require_positive
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
@@ -31,8 +34,16 @@ class MatrixTangent(AbstractTangent):
 
 
 def componentwise_product(A: Float[Array, "a k *p"], B: Float[Array, "k b *p"]) -> Float[Array, "a b *p"]:
-    """A B of matrices of any size, by columns of A and rows of B."""
+    """A B, for matrices of any size, by columns of A and rows of B."""
     return sum((A[:, k, None] * B[k] for k in range(1, A.shape[1])), A[:, 0, None] * B[0])
+
+
+def matrix_of(linear: Callable[[Matrix], Matrix], like: Matrix) -> Float[Array, "m m *p"]:
+    """The matrix, on the d² components in C order, of a linear map between d x d matrices, (d, d, *p), as `like` is."""
+    d, batch = like.shape[0], like.shape[2:]
+    units = jnp.eye(d * d, dtype=like.dtype).reshape(d * d, d, d, *[1] * len(batch))
+    columns = jax.vmap(lambda unit: linear(jnp.broadcast_to(unit, like.shape)))(units)
+    return jnp.swapaxes(columns.reshape(d * d, d * d, *batch), 0, 1)
 
 
 class PrincipalTangent(eqx.Module):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from mpmjax import _linalg as la
 from mpmjax._isotropic import Logarithm
 from mpmjax._types import Array, Bool, Float, Matrix
-from mpmjax.material._base import AbstractIsotropic, MatrixTangent, PrincipalTangent
+from mpmjax.material._base import AbstractIsotropic, MatrixTangent, PrincipalTangent, matrix_of
 
 _log = Logarithm()
 
@@ -44,10 +44,7 @@ class Hencky(AbstractIsotropic):
 
     def tangent(self, F: Matrix) -> MatrixTangent:
         """The stress's derivative in each of the d² directions."""
-        d = F.shape[0]
-        units = jnp.eye(d * d, dtype=F.dtype).reshape(d * d, d, d, *[1] * (F.ndim - 2))
-        along = jax.vmap(lambda dF: jax.jvp(self.stress, (F,), (jnp.broadcast_to(dF, F.shape),))[1])(units)
-        return MatrixTangent(jnp.swapaxes(along.reshape(d * d, d * d, *F.shape[2:]), 0, 1))
+        return MatrixTangent(matrix_of(lambda dF: jax.jvp(self.stress, (F,), (dF,))[1], F))
 
     def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
         """With τ_i = 2μ ln s_i + λ ln J: scaling (2μ δ_ij + λ)/(s_i s_j) − δ_ij τ_i/s_i², twist
