@@ -193,6 +193,18 @@ def test_operator_is_symmetric(route, d, description):
         np.testing.assert_array_equal(A[:, held], np.eye(len(A))[:, held])
 
 
+@EACH_CONSTRAINED
+@pytest.mark.parametrize("route", [0, 1], ids=HESSIANS)
+def test_assembled_it_is_the_same_operator(route, d, description):
+    """What the solvers iterate on, one symmetric matrix a particle, against the map through the law."""
+    operator = constrained(d, description)[0][route]
+    b = jnp.asarray(np.random.default_rng(9).normal(size=operator.free.shape))
+    assembled = eqx.filter_jit(ImplicitOperator.assembled)(operator)
+    assert relative(apply(assembled, b), apply(operator, b)) < 1e-13
+    K = np.asarray(assembled.hessian.matrix)
+    np.testing.assert_allclose(K, K.swapaxes(0, 1), rtol=0, atol=1e-13 * np.abs(K).max())
+
+
 @pytest.mark.parametrize("d", DIMS)
 def test_rows_of_fixed_components_and_empty_nodes_are_the_identity(d):
     """Rows that are held return their entry and pass nothing on; the metric is the mass on free rows, one elsewhere."""
