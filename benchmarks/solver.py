@@ -270,35 +270,35 @@ def write(name: str, rows: list[Row]) -> None:
 
 def draw(swept: list[Row], helped: list[Row], even: list[Row]) -> None:
     """docs/solver.png."""
-    figure, axes = plt.subplots(1, 3, figsize=(13, 3.9), layout="constrained")
+    figure, axes = plt.subplots(1, 3, figsize=(13, 5.2), layout="constrained")
     step, *swept = swept
-    for guess, marker in zip(GUESSES, "os^", strict=True):
+    for i, guess in enumerate(GUESSES):
         line = [row for row in swept if row["guess"] == guess.value]
         for key, style in (("motion", "-"), ("gradient", "--")):
             x, y = ([row[k] for row in line] for k in ("rtol", key))
-            axes[0].loglog(x, y, style, marker=marker, ms=4, lw=1, label=f"{key}, from {guess.value}")
+            axes[0].loglog(x, y, style, color=f"C{i}", marker="o", ms=4, lw=1, label=f"{key}, from {guess.value}")
     for key, style in (("motion", "-"), ("gradient", "--")):
         axes[0].axhline(step[key], color="0.6", ls=style, lw=1)
     axes[0].set(xlabel="solver's relative tolerance", ylabel="relative error", title="error (grey: the step's own)")
-    axes[0].legend(frameon=False, fontsize=7)
-    for kind, marker in zip(dict.fromkeys(row["preconditioner"] for row in helped), "ospv^", strict=True):
-        for n, style in zip(sorted({row["n"] for row in helped}), ("-", "--", ":"), strict=False):
-            chosen = {"preconditioner": kind, "n": n, "side": "step", "contrast": 1.0}
-            line = [row for row in helped if all(row[k] == v for k, v in chosen.items())]
+    for i, kind in enumerate(dict.fromkeys(row["preconditioner"] for row in helped)):
+        for contrast, style in ((1.0, "-"), (100.0, "--")):
+            chosen = {"preconditioner": kind, "n": max(row["n"] for row in helped), "side": "step"}
+            line = [row for row in helped if all(row[k] == v for k, v in (chosen | {"contrast": contrast}).items())]
             x, y = ([row[k] for row in line] for k in ("multiple", "seconds"))
-            axes[1].loglog(x, y, style, marker=marker, ms=4, lw=1, label=f"{kind}, {n}²")
-    axes[1].set(xlabel="Δt over the explicit limit", ylabel="seconds a solve", title="preconditioning")
-    axes[1].legend(frameon=False, fontsize=7)
-    lines = dict.fromkeys((row["contrast"], row["metric"], row["rtol"]) for row in even)
-    for contrast, metric, rtol in lines:
+            axes[1].loglog(x, y, style, color=f"C{i}", marker="o", ms=4, lw=1, label=f"{kind}, contrast {contrast:g}")
+    axes[1].set(xlabel="Δt over the explicit limit", ylabel="seconds a solve", title="preconditioning, 64²")
+    for contrast, metric, rtol in dict.fromkeys((row["contrast"], row["metric"], row["rtol"]) for row in even):
         line = [row for row in even if (row["contrast"], row["metric"], row["rtol"]) == (contrast, metric, rtol)]
         x, y = ([row[k] for row in line] for k in ("n", "break_even"))
-        marker, style = "o" if metric == "mass" else "s", "-" if contrast == 1 else "--"
-        label = f"contrast {contrast:g}, {metric}, rtol {rtol:g}"
-        axes[2].plot(x, y, style, marker=marker, ms=4, lw=1, label=label)
+        style, marker = "-" if contrast == 1 else "--", "o" if rtol == 1e-3 else "s"
+        label = f"{metric}, contrast {contrast:g}, rtol {rtol:g}"
+        axes[2].loglog(x, y, style, color=f"C{metric != 'mass':d}", marker=marker, ms=4, lw=1, label=label)
+    sizes = sorted({row["n"] for row in even})
     axes[2].set(xlabel="cells a side", ylabel="Δt over the explicit limit", title="break-even")
-    axes[2].loglog()
-    axes[2].legend(frameon=False, fontsize=7)
+    axes[2].set_xticks(sizes, [f"{n}" for n in sizes], minor=False)
+    axes[2].set_xticks([], minor=True)
+    for ax in axes:
+        ax.legend(frameon=False, fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
     figure.savefig(DOCS / "solver.png", dpi=110)
 
 

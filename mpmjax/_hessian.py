@@ -31,8 +31,7 @@ class AbstractHessianAction(eqx.Module):
 
 
 class Stiffness(AbstractHessianAction):
-    """H by one matrix a particle, made once: d⁴ numbers, and a quarter of the time that it takes to go through the law
-    at each application."""
+    """H by one matrix a particle, made once: d⁴ numbers each, and no way through the law at each application."""
 
     matrix: Float[Array, "m m p"]
     """K_p [J] (see `ElasticPotential.stiffness`), shape (d², d², p)."""
