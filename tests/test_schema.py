@@ -196,13 +196,13 @@ ERRORS = [
     ({"grid__spacing": -1}, "[grid]: A grid's spacing must be greater than zero, got -1.0."),
     ({"grid__follow": 1}, "[grid] follow must be true or false, got 1."),
     ({"grid__kind": "Gird"}, "[grid]: unknown kind 'Gird', did you mean 'Grid'? It must be Grid."),
-    ({"material__kind": None}, "[material] needs a kind: one of FixedCorotated, NeoHookean."),
+    ({"material__kind": None}, "[material] needs a kind: one of FixedCorotated, NeoHookean, Hencky."),
     (
         {"material__kind": "Neohookean"},
         "[material]: unknown kind 'Neohookean', did you mean 'NeoHookean'? It must be one",
     ),
-    ({"material__kind": 7}, "[material]: unknown kind 7. It must be one of FixedCorotated, NeoHookean."),
-    ({"material__kind": "Box"}, "[material]: unknown kind 'Box'. It must be one of FixedCorotated, NeoHookean."),
+    ({"material__kind": 7}, "[material]: unknown kind 7. It must be one of FixedCorotated, NeoHookean, Hencky."),
+    ({"material__kind": "Box"}, "[material]: unknown kind 'Box'. It must be one of FixedCorotated, NeoHookean, Hencky."),
     ({"material__youngs_modulu": 1}, "[material]: unknown key 'youngs_modulu', did you mean 'youngs_modulus'? Known"),
     ({"material__poisson_ratio": None}, "[material] needs the key 'poisson_ratio'."),
     (
