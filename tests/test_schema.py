@@ -202,7 +202,7 @@ ERRORS = [
         "[material]: unknown kind 'Neohookean', did you mean 'NeoHookean'? It must be one",
     ),
     ({"material__kind": 7}, "[material]: unknown kind 7. It must be one of FixedCorotated, NeoHookean, Hencky."),
-    ({"material__kind": "Box"}, "[material]: unknown kind 'Box'. It must be one of FixedCorotated, NeoHookean, Hencky."),
+    ({"material__kind": "Box"}, "[material]: unknown kind 'Box'. It must be one of FixedCorotated, NeoHookean, H"),
     ({"material__youngs_modulu": 1}, "[material]: unknown key 'youngs_modulu', did you mean 'youngs_modulus'? Known"),
     ({"material__poisson_ratio": None}, "[material] needs the key 'poisson_ratio'."),
     (
