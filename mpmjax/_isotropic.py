@@ -1,4 +1,4 @@
-"""Functions of symmetric matrices, f(S) = V diag(f(s)) Vᵀ for S = V diag(s) Vᵀ: the logarithm and the exponential.
+"""Functions of symmetric matrices, f(S) = V diag(f(s)) Vᵀ for S = V diag(s) Vᵀ: the logarithm.
 
 Their derivatives do not differentiate V, which has none where eigenvalues coincide (F = I, the first step of every
 scene). They are written in divided differences of f, which are finite there: with A and B in the frame V,
@@ -21,8 +21,8 @@ from mpmjax import _linalg as la
 from mpmjax._types import Array, Matrix
 
 _CLOSE = 1e-4
-"""Eigenvalues in such a share of each other have f''/2 at their mean for f[a, b, c], within its square; else the
-quotient of differences cancels to rounding over it."""
+"""Where three eigenvalues lie within this share of each other, f[a, b, c] is f''/2 at their mean, off by the share's
+square; elsewhere it is a quotient of differences, off by rounding over the share."""
 
 
 class AbstractSpectral(eqx.Module):
@@ -66,23 +66,6 @@ class Logarithm(AbstractSpectral):
         return -1 / s**2
 
 
-class Exponential(AbstractSpectral):
-    """exp S."""
-
-    def of(self, s: Array) -> Array:
-        """eˢ."""
-        return jnp.exp(s)
-
-    def slope(self, a: Array, b: Array) -> Array:
-        """eᵃ (e^(b − a) − 1)/(b − a)."""
-        gap = b - a
-        return jnp.where(gap == 0, 1, jnp.expm1(gap) / jnp.where(gap == 0, 1, gap)) * jnp.exp(a)
-
-    def curvature(self, s: Array) -> Array:
-        """eˢ."""
-        return jnp.exp(s)
-
-
 @jax.custom_jvp
 def _function(f: AbstractSpectral, S: Matrix) -> Matrix:
     s, V = la.symmetric_eigen(S)
@@ -113,6 +96,7 @@ def _second_differential(f: AbstractSpectral, S: Matrix, A: Matrix, B: Matrix) -
     """D²f(S)[A, B]."""
     s, V = la.symmetric_eigen(S)
     A, B = _in_frame(V, A), _in_frame(V, B)
+    directions = range(s.shape[0])
 
     def divided(*three: Array) -> Array:
         low, middle, high = jnp.sort(jnp.stack(three), axis=0)
@@ -124,7 +108,6 @@ def _second_differential(f: AbstractSpectral, S: Matrix, A: Matrix, B: Matrix) -
         terms = [divided(s[i], s[k], s[j]) * (A[i, k] * B[k, j] + B[i, k] * A[k, j]) for k in directions]
         return sum(terms[1:], terms[0])
 
-    directions = range(s.shape[0])
     return _from_frame(V, la.assemble([[entry(i, j) for j in directions] for i in directions]))
 
 
