@@ -280,13 +280,14 @@ def draw(swept: list[Row], helped: list[Row], even: list[Row]) -> None:
     for key, style in (("motion", "-"), ("gradient", "--")):
         axes[0].axhline(step[key], color="0.6", ls=style, lw=1)
     axes[0].set(xlabel="solver's relative tolerance", ylabel="relative error", title="error (grey: the step's own)")
+    finest = max(row["n"] for row in helped)
     for i, kind in enumerate(dict.fromkeys(row["preconditioner"] for row in helped)):
         for contrast, style in ((1.0, "-"), (100.0, "--")):
-            chosen = {"preconditioner": kind, "n": max(row["n"] for row in helped), "side": "step"}
+            chosen = {"preconditioner": kind, "n": finest, "side": "step"}
             line = [row for row in helped if all(row[k] == v for k, v in (chosen | {"contrast": contrast}).items())]
             x, y = ([row[k] for row in line] for k in ("multiple", "seconds"))
             axes[1].loglog(x, y, style, color=f"C{i}", marker="o", ms=4, lw=1, label=f"{kind}, contrast {contrast:g}")
-    axes[1].set(xlabel="Δt over the explicit limit", ylabel="seconds a solve", title="preconditioning, 64²")
+    axes[1].set(xlabel="Δt over the explicit limit", ylabel="seconds a solve", title=f"preconditioning, {finest}²")
     for contrast, metric, rtol in dict.fromkeys((row["contrast"], row["metric"], row["rtol"]) for row in even):
         line = [row for row in even if (row["contrast"], row["metric"], row["rtol"]) == (contrast, metric, rtol)]
         x, y = ([row[k] for row in line] for k in ("n", "break_even"))

@@ -9,13 +9,14 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 
+from mpmjax import _linalg as la
 from mpmjax._crossing import collect, spread
 from mpmjax._kernel import Stencil
 from mpmjax._metric import Metric
 from mpmjax._mirror import Mirror
 from mpmjax._potential import ElasticPotential
 from mpmjax._types import Array, Float, Mask, Matrix, NodeScalar, NodeVector, Scalar
-from mpmjax.material import AbstractTangent, componentwise_product, projected_tangent
+from mpmjax.material import AbstractTangent, projected_tangent
 
 
 class AbstractHessianAction(eqx.Module):
@@ -41,7 +42,7 @@ class Stiffness(AbstractHessianAction):
     def __call__(self, du: NodeVector) -> NodeVector:
         """Σ_p g_ip K_p Σ_j g_jp δu_j."""
         _, slopes = collect(self.stencil, self.mirror.unfold(du))
-        flux = componentwise_product(self.matrix, slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
+        flux = la.product(self.matrix, slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
         return self.mirror.fold(spread(self.stencil, None, flux, du.shape[0]))
 
     def assembled(self) -> "Stiffness":

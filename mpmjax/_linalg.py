@@ -6,6 +6,7 @@ the components, so that XLA sees plain elementwise arithmetic over the batch: on
 than batched LAPACK or tiny `dot_general`s, and its derivatives are as cheap.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -41,6 +42,19 @@ def matmul(A: Matrix, B: Matrix) -> Matrix:
     return assemble(
         [[sum((A[i, k] * B[k, j] for k in range(1, d)), A[i, 0] * B[0, j]) for j in range(d)] for i in range(d)]
     )
+
+
+def product(A: Float[Array, "a k *p"], B: Float[Array, "k b *p"]) -> Float[Array, "a b *p"]:
+    """A B for matrices of any size, by columns of A and rows of B."""
+    return sum((A[:, k, None] * B[k] for k in range(1, A.shape[1])), A[:, 0, None] * B[0])
+
+
+def matrix_of(linear: Callable[[Matrix], Matrix], like: Matrix) -> Float[Array, "m m *p"]:
+    """The matrix, on the d² components in C order, of a linear map between d x d matrices, (d, d, *p), as `like` is."""
+    d, batch = like.shape[0], like.shape[2:]
+    units = jnp.eye(d * d, dtype=like.dtype).reshape(d * d, d, d, *[1] * len(batch))
+    columns = jax.vmap(lambda unit: linear(jnp.broadcast_to(unit, like.shape)))(units)
+    return jnp.swapaxes(columns.reshape(d * d, d * d, *batch), 0, 1)
 
 
 def trace(A: Matrix) -> Array:

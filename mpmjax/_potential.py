@@ -11,7 +11,7 @@ from mpmjax._crossing import collect, spread
 from mpmjax._kernel import Stencil
 from mpmjax._mirror import Mirror
 from mpmjax._types import Array, Float, Matrix, NodeVector
-from mpmjax.material import AbstractMaterial, matrix_of
+from mpmjax.material import AbstractMaterial
 
 
 class ElasticPotential(eqx.Module):
@@ -67,7 +67,7 @@ class ElasticPotential(eqx.Module):
         def flux_of(slopes: Matrix) -> Matrix:
             return la.transpose(self._flux(tangent(self.deformed(la.transpose(slopes)))))
 
-        return matrix_of(flux_of, self.F)
+        return la.matrix_of(flux_of, self.F)
 
     def _flux(self, P: Matrix) -> Matrix:
         P = self.volume * P

@@ -18,7 +18,7 @@ with install_import_hook("mpmjax", "beartype.beartype"):
 
 
 def pytest_configure(config: Any) -> None:
-    """Most of the default tests' time is XLA's compiler's, which takes a third less where it does not optimise the
+    """Most of the default tests' time is XLA's compiler's, which takes three tenths less where it does not optimise the
     machine's code; the slow ones, which compute for longer, are compiled as for users."""
     if config.option.markexpr == "not slow":
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"

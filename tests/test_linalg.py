@@ -281,3 +281,11 @@ def test_rotation_where_stretches_cancel_is_one_of_the_rotations(d):
     R = np.moveaxis(np.asarray(rotation(jnp.asarray(F))), -1, 0)
     np.testing.assert_allclose(R @ R.swapaxes(1, 2), np.broadcast_to(np.eye(d), R.shape), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(R), 1, rtol=1e-12)
+
+
+@pytest.mark.parametrize("d", [1, 2, 3])
+def test_the_matrix_of_a_map_applies_it(d):
+    """M, of A ↦ B A with B not symmetric, times the components of A in C order."""
+    A, B = (jnp.asarray(a) for a in np.random.default_rng(5).normal(size=(2, d, d, 4)))
+    matrix = la.matrix_of(lambda A: la.matmul(B, A), A)
+    np.testing.assert_allclose(la.product(matrix, A.reshape(d * d, 1, 4)).reshape(A.shape), la.matmul(B, A), atol=1e-14)

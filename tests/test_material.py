@@ -176,33 +176,32 @@ def test_fixed_corotated_is_indefinite_under_compression():
     np.testing.assert_allclose(np.linalg.eigvalsh(dense[..., 0])[:3], expected, rtol=1e-12)
 
 
+def sampled(law, d):
+    """Lamé's constants, and F, energy and stress at random, the particle first."""
+    F, _ = deformations("random", d)
+    energy, P, _ = evaluate(forward, law, F, F)
+    return float(law.shear_modulus), float(law.lame_lambda), np.moveaxis(F, -1, 0), energy, np.moveaxis(P, -1, 0)
+
+
 @EACH_DIM
 def test_neo_hookean_matches_its_formula(d):
     """P = μ (F − F⁻ᵀ) + λ ln J F⁻ᵀ by NumPy's inverse, and Ψ = μ/2 (F:F − d) − μ ln J + λ/2 (ln J)²."""
-    law = LAWS["neo_hookean"]
-    mu, lam = float(law.shear_modulus), float(law.lame_lambda)
-    F, _ = deformations("random", d)
-    energy, P, _ = evaluate(forward, law, F, F)
-    G = np.moveaxis(F, -1, 0)
-    log_J, pull = np.log(np.linalg.det(G)), np.linalg.inv(G).swapaxes(1, 2)
-    assert_close(np.moveaxis(P, -1, 0), mu * (G - pull) + lam * log_J[:, None, None] * pull, 1e-13)
-    squares = (G**2).sum(axis=(1, 2)) - d
+    mu, lam, F, energy, P = sampled(ELASTIC["neo_hookean"], d)
+    log_J, pull = np.log(np.linalg.det(F)), np.linalg.inv(F).swapaxes(1, 2)
+    assert_close(P, mu * (F - pull) + lam * log_J[:, None, None] * pull, 1e-13)
+    squares = (F**2).sum(axis=(1, 2)) - d
     assert_close(energy, mu / 2 * squares - mu * log_J + lam / 2 * log_J**2, 1e-13)
 
 
 @EACH_DIM
 def test_hencky_matches_its_formula(d):
     """With ε = ½ log FᵀF by NumPy's eigenvectors: P = F⁻ᵀ (2μ ε + λ tr(ε) I) and Ψ = μ ε : ε + λ/2 (tr ε)²."""
-    law = ELASTIC["hencky"]
-    mu, lam = float(law.shear_modulus), float(law.lame_lambda)
-    F, _ = deformations("random", d)
-    energy, P, _ = evaluate(forward, law, F, F)
-    G = np.moveaxis(F, -1, 0)
-    stretches, V = np.linalg.eigh(G.swapaxes(1, 2) @ G)
-    strain = (V * np.log(stretches)[:, None] / 2) @ V.swapaxes(1, 2)
+    mu, lam, F, energy, P = sampled(ELASTIC["hencky"], d)
+    squares, V = np.linalg.eigh(F.swapaxes(1, 2) @ F)
+    strain = (V * np.log(squares)[:, None] / 2) @ V.swapaxes(1, 2)
     trace = np.trace(strain, axis1=1, axis2=2)
     kirchhoff = 2 * mu * strain + lam * trace[:, None, None] * np.eye(d)
-    assert_close(np.moveaxis(P, -1, 0), np.linalg.inv(G).swapaxes(1, 2) @ kirchhoff, 1e-13)
+    assert_close(P, np.linalg.inv(F).swapaxes(1, 2) @ kirchhoff, 1e-13)
     assert_close(energy, mu * (strain**2).sum(axis=(1, 2)) + lam / 2 * trace**2, 1e-13)
 
 

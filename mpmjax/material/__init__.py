@@ -6,8 +6,6 @@ from mpmjax.material._base import (
     AbstractTangent,
     MatrixTangent,
     PrincipalTangent,
-    componentwise_product,
-    matrix_of,
 )
 from mpmjax.material._elastic import FixedCorotated, NeoHookean
 from mpmjax.material._hencky import Hencky
@@ -22,7 +20,5 @@ __all__ = [
     "MatrixTangent",
     "NeoHookean",
     "PrincipalTangent",
-    "componentwise_product",
-    "matrix_of",
     "projected_tangent",
 ]

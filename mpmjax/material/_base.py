@@ -4,9 +4,9 @@ import abc
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
+from mpmjax import _linalg as la
 from mpmjax._checks import require_between, require_positive
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 
@@ -30,20 +30,7 @@ class MatrixTangent(AbstractTangent):
 
     def __call__(self, dF: Matrix) -> Matrix:
         """δP for δF."""
-        return componentwise_product(self.matrix, dF.reshape(-1, 1, *dF.shape[2:])).reshape(dF.shape)
-
-
-def componentwise_product(A: Float[Array, "a k *p"], B: Float[Array, "k b *p"]) -> Float[Array, "a b *p"]:
-    """A B, for matrices of any size, by columns of A and rows of B."""
-    return sum((A[:, k, None] * B[k] for k in range(1, A.shape[1])), A[:, 0, None] * B[0])
-
-
-def matrix_of(linear: Callable[[Matrix], Matrix], like: Matrix) -> Float[Array, "m m *p"]:
-    """The matrix, on the d² components in C order, of a linear map between d x d matrices, (d, d, *p), as `like` is."""
-    d, batch = like.shape[0], like.shape[2:]
-    units = jnp.eye(d * d, dtype=like.dtype).reshape(d * d, d, d, *[1] * len(batch))
-    columns = jax.vmap(lambda unit: linear(jnp.broadcast_to(unit, like.shape)))(units)
-    return jnp.swapaxes(columns.reshape(d * d, d * d, *batch), 0, 1)
+        return la.product(self.matrix, dF.reshape(-1, 1, *dF.shape[2:])).reshape(dF.shape)
 
 
 class PrincipalTangent(eqx.Module):
@@ -60,6 +47,23 @@ class PrincipalTangent(eqx.Module):
     """Likewise."""
     scaling: Matrix
     """∂²Ψ/∂s_i∂s_j [Pa], shape (d, d, *p)."""
+
+    @classmethod
+    def of(
+        cls,
+        s: Float[Array, "d *p"],
+        twist: Callable[[int, int], Array],
+        flip: Callable[[int, int], Array],
+        scaling: Callable[[int, int], Array],
+    ) -> "PrincipalTangent":
+        """From an expression a pair, and one an entry of the scaling, at stretches s."""
+        d, none = s.shape[0], jnp.zeros((0, *s.shape[1:]), s.dtype)
+
+        def over_pairs(entry: Callable[[int, int], Array]) -> Array:
+            return jnp.stack([entry(i, j) for i, j in la.pairs(d)]) if d > 1 else none
+
+        entries = [[scaling(i, j) for j in range(d)] for i in range(d)]
+        return cls(over_pairs(twist), over_pairs(flip), la.assemble(entries))
 
 
 class AbstractMaterial(eqx.Module):

@@ -1,5 +1,7 @@
 """Elastic laws: fixed corotated and neo-Hookean."""
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 
 from mpmjax import _linalg as la
@@ -47,8 +49,7 @@ class FixedCorotated(AbstractIsotropic):
         """With v = λ (J − 1) J/(s_i s_j): twist 2μ (1 − 2/(s_i + s_j)) + v, flip 2μ − v, scaling
         2μ δ_ij + λ (J/s_i)(J/s_j) + (1 − δ_ij) v."""
         mu, lam = 2 * self.shear_modulus * jnp.ones_like(s[0]), self.lame_lambda * jnp.ones_like(s[0])
-        sums = [s[i] + s[j] for i, j in la.pairs(s.shape[0])]
-        return _with_volumetric(s, lam * (s.prod(axis=0) - 1), lam, [mu * (1 - 2 / total) for total in sums], mu)
+        return _with_volumetric(s, lam * (s.prod(axis=0) - 1), lam, lambda i, j: mu * (1 - 2 / (s[i] + s[j])), mu)
 
     def admits(self, F: Matrix) -> Bool[Array, "p"]:
         """Every finite F."""
@@ -118,7 +119,7 @@ class NeoHookean(AbstractIsotropic):
         and λ/(s_i s_j) off it."""
         mu, J = self.shear_modulus * jnp.ones_like(s[0]), s.prod(axis=0)
         pull, bulk = self._volumetric(J)
-        return _with_volumetric(s, pull, bulk, [mu for _ in la.pairs(s.shape[0])], mu)
+        return _with_volumetric(s, pull, bulk, lambda i, j: mu, mu)
 
     def admits(self, F: Matrix) -> Bool[Array, "p"]:
         """J > 0."""
@@ -142,7 +143,9 @@ class NeoHookeanTangent(AbstractTangent):
         )
 
 
-def _with_volumetric(s: Array, pull: Array, bulk: Array, twist: list[Array], stiffness: Array) -> PrincipalTangent:
+def _with_volumetric(
+    s: Array, pull: Array, bulk: Array, twist: Callable[[int, int], Array], stiffness: Array
+) -> PrincipalTangent:
     """The eigenstructure of a law with P = deviatoric part + q J F⁻ᵀ, q = `pull` and b = dq/dJ = `bulk`.
 
     δ(q J F⁻ᵀ) = b (J F⁻ᵀ : δF) J F⁻ᵀ + q δ(J F⁻ᵀ) has twist q J/(s_i s_j), flip −q J/(s_i s_j) and scaling
@@ -164,10 +167,9 @@ def _with_volumetric(s: Array, pull: Array, bulk: Array, twist: list[Array], sti
         spherical = bulk * others(i) * others(j)
         return spherical + (stiffness if i == j else pull * others(i, j))
 
-    shear = [pull * others(i, j) for i, j in la.pairs(d)]
-    none = jnp.zeros((0, *s.shape[1:]), s.dtype)
-    return PrincipalTangent(
-        twist=jnp.stack([t + v for t, v in zip(twist, shear, strict=True)]) if shear else none,
-        flip=jnp.stack([stiffness - v for v in shear]) if shear else none,
-        scaling=la.assemble([[scaling(i, j) for j in range(d)] for i in range(d)]),
+    return PrincipalTangent.of(
+        s,
+        twist=lambda i, j: twist(i, j) + pull * others(i, j),
+        flip=lambda i, j: stiffness - pull * others(i, j),
+        scaling=scaling,
     )

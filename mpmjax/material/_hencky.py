@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from mpmjax import _linalg as la
 from mpmjax._isotropic import Logarithm
 from mpmjax._types import Array, Bool, Float, Matrix
-from mpmjax.material._base import AbstractIsotropic, MatrixTangent, PrincipalTangent, matrix_of
+from mpmjax.material._base import AbstractIsotropic, MatrixTangent, PrincipalTangent
 
 _log = Logarithm()
 
@@ -44,26 +44,25 @@ class Hencky(AbstractIsotropic):
 
     def tangent(self, F: Matrix) -> MatrixTangent:
         """The stress's derivative in each of the d² directions."""
-        return MatrixTangent(matrix_of(lambda dF: jax.jvp(self.stress, (F,), (dF,))[1], F))
+        return MatrixTangent(la.matrix_of(lambda dF: jax.jvp(self.stress, (F,), (dF,))[1], F))
 
     def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
         """With τ_i = 2μ ln s_i + λ ln J: scaling (2μ δ_ij + λ)/(s_i s_j) − δ_ij τ_i/s_i², twist
         (τ_i/s_i + τ_j/s_j)/(s_i + s_j), flip (2μ s_j ln(s_i/s_j)/(s_i − s_j) − τ_j)/(s_i s_j)."""
         mu, lam = self.shear_modulus, self.lame_lambda * jnp.ones_like(s[0])
-        log_s, d = jnp.log(s), s.shape[0]
+        log_s = jnp.log(s)
         tau = 2 * mu * log_s + lam * log_s.sum(axis=0)
 
         def scaling(i: int, j: int) -> Array:
             return ((2 * mu - tau[i] + lam) if i == j else lam) / (s[i] * s[j])
 
-        twist = [(tau[i] / s[i] + tau[j] / s[j]) / (s[i] + s[j]) for i, j in la.pairs(d)]
-        flip = [(2 * mu * s[j] * _log.slope(s[j], s[i]) - tau[j]) / (s[i] * s[j]) for i, j in la.pairs(d)]
-        none = jnp.zeros((0, *s.shape[1:]), s.dtype)
-        return PrincipalTangent(
-            twist=jnp.stack(twist) if twist else none,
-            flip=jnp.stack(flip) if flip else none,
-            scaling=la.assemble([[scaling(i, j) for j in range(d)] for i in range(d)]),
-        )
+        def twist(i: int, j: int) -> Array:
+            return (tau[i] / s[i] + tau[j] / s[j]) / (s[i] + s[j])
+
+        def flip(i: int, j: int) -> Array:
+            return (2 * mu * s[j] * _log.slope(s[j], s[i]) - tau[j]) / (s[i] * s[j])
+
+        return PrincipalTangent.of(s, twist, flip, scaling)
 
     def admits(self, F: Matrix) -> Bool[Array, "p"]:
         """J > 0."""

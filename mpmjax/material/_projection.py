@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from mpmjax import _linalg as la
 from mpmjax._types import Array, Float, Matrix
-from mpmjax.material._base import AbstractMaterial, MatrixTangent, componentwise_product
+from mpmjax.material._base import AbstractMaterial, MatrixTangent
 
 
 def projected_tangent(material: AbstractMaterial, F: Matrix) -> MatrixTangent:
@@ -39,7 +39,7 @@ def _projected_matrix_jvp(
     def in_frame(material: AbstractMaterial, F: Matrix) -> Array:
         """Eᵀ A E, the frame held fixed."""
         images = jax.vmap(material.tangent(F))(modes.reshape(-1, *F.shape)).reshape(modes.shape)
-        return componentwise_product(modes, jnp.swapaxes(images, 0, 1))
+        return la.product(modes, jnp.swapaxes(images, 0, 1))
 
     change = jax.jvp(in_frame, primals, tangents)[1]
     positive, size = jnp.maximum(values, 0), jnp.abs(values)
@@ -56,13 +56,13 @@ def _spectrum(material: AbstractMaterial, F: Matrix) -> tuple[Float[Array, "m *p
     scalings, Q = la.symmetric_eigen(tangent.scaling)
     d, modes = F.shape[0], la.principal_modes(U, V)
     modes = modes.reshape(d * d, d * d, *F.shape[2:])
-    modes = jnp.concatenate([componentwise_product(la.transpose(Q), modes[:d]), modes[d:]])
+    modes = jnp.concatenate([la.product(la.transpose(Q), modes[:d]), modes[d:]])
     return jnp.concatenate([scalings, tangent.twist, tangent.flip]), modes
 
 
 def _in_modes(modes: Float[Array, "m m *p"], core: Float[Array, "m m *p"]) -> Float[Array, "m m *p"]:
     """Σ_kl E_ka core_kl E_lb."""
-    return componentwise_product(jnp.swapaxes(modes, 0, 1), componentwise_product(core, modes))
+    return la.product(jnp.swapaxes(modes, 0, 1), la.product(core, modes))
 
 
 def _identity(values: Float[Array, "m *p"]) -> Float[Array, "m m *p"]:
