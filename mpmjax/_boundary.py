@@ -14,10 +14,58 @@ import numpy as np
 from mpmjax._checks import coordinates, is_traced, require, require_between
 from mpmjax._motion import Motion
 from mpmjax._region import AbstractRegion
-from mpmjax._types import Mask, NodeVector, Point, Scalar
+from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Point, Scalar
 
 ON_THE_WALL = 1e-3
 """Distance within which a node is on a wall, in spacings."""
+
+
+class Touch(eqx.Module):
+    """What k colliders ask of the nodes that lie in them."""
+
+    normal: NodeVector
+    """Unit normal out of the collider that holds or pushes the node along it, shape (n, d); zero where none does."""
+    velocity: NodeVector
+    """Velocity of that collider there [m/s], shape (n, d)."""
+    held: Bool[Array, "n"]
+    """Whether the normal component of the node's velocity is held, shape (n,)."""
+    owner: Int[Array, "n"]
+    """Number of that collider, −1 for none, shape (n,)."""
+    holder: Int[Array, "n d"]
+    """Number of the collider that prescribes each component, −1 for none, shape (n, d)."""
+    position: NodeVector
+    """The nodes' positions [m], shape (n, d)."""
+    pivots: Float[Array, "k d"]
+    """The points about which the colliders' torques are taken [m], shape (k, d)."""
+    leavable: Bool[Array, "n"] | None = None
+    """Whether the node may leave, shape (n,); None where there is no such collider."""
+    friction: NodeScalar | None = None
+    """Coulomb coefficient there [-], shape (n,)."""
+
+    def beside(self, later: "Touch") -> "Touch":
+        """Both; where normals of two meet, the earlier one's."""
+        number = len(self.pivots)
+
+        def numbered(n: Array) -> Array:
+            return jnp.where(n < 0, n, n + number)
+
+        def joined(a: Array | None, b: Array | None) -> Array | None:
+            if a is None or b is None:
+                return a if b is None else jnp.where(mine, jnp.zeros_like(b), b)
+            return jnp.where(mine, a, b)
+
+        mine = self.owner >= 0
+        return Touch(
+            normal=jnp.where(mine[:, None], self.normal, later.normal),
+            velocity=jnp.where(mine[:, None], self.velocity, later.velocity),
+            held=jnp.where(mine, self.held, later.held),
+            owner=jnp.where(mine, self.owner, numbered(later.owner)),
+            holder=jnp.where(self.holder >= 0, self.holder, numbered(later.holder)),
+            position=self.position,
+            pivots=jnp.concatenate([self.pivots, later.pivots]),
+            leavable=joined(self.leavable, later.leavable),
+            friction=joined(self.friction, later.friction),
+        )
 
 
 class Conditions(eqx.Module):
@@ -31,6 +79,8 @@ class Conditions(eqx.Module):
     """Inward normal (+1 or −1) of a separating wall in each direction, 0 where there is none; None without any."""
     friction: NodeVector | None = None
     """Coulomb coefficient of that wall [-]."""
+    touch: Touch | None = None
+    """What colliders ask; None without any."""
 
 
 class AbstractBoundary(eqx.Module):
@@ -190,8 +240,8 @@ class Grip(AbstractBoundary):
     def __check_init__(self):
         d = self.dim
         require(
-            len(self.region.bounds()[0] if not is_traced(self.region) else range(d)) == d,
-            "A grip's region and motion must have the same dimension.",
+            self.region.dim == d,
+            f"A grip's region and motion must have the same dimension, got {self.region.dim} and {d}.",
         )
         require(
             self.axes is None or (len(self.axes) == d and any(self.axes)),
@@ -218,7 +268,9 @@ def combine(
 ) -> Conditions:
     """All of a scene's conditions; where two prescribe one component, the earlier in the tuple holds.
 
-    Contact is left to nodes' components that nothing prescribes.
+    Contact is left to nodes' components that nothing prescribes. Of a node's components some may be prescribed and
+    besides them a collider's normal component: both hold (see `Nodes.grasp`), and where the normal is within a
+    hundredth of what is prescribed already it asks nothing. Of two colliders' normals the earlier holds.
     """
     total = Conditions(jnp.zeros(nodes.shape, dtype=bool), jnp.zeros_like(nodes))
     for boundary in boundaries:
@@ -231,7 +283,13 @@ def combine(
             else:
                 friction = jnp.where(side != 0, friction, new.friction)
                 side = jnp.where(side != 0, side, new.side)
-        total = Conditions(total.fixed | new.fixed, velocity, side, friction)
+        touch = total.touch
+        if new.touch is not None:
+            holder = jnp.where(total.fixed, -1, new.touch.holder)
+            mine = eqx.tree_at(lambda c: c.holder, new.touch, holder)
+            touch = mine if touch is None else touch.beside(mine)
+        total = Conditions(total.fixed | new.fixed, velocity, side, friction, touch)
     if total.side is None:
         return total
-    return Conditions(total.fixed, total.velocity, jnp.where(total.fixed, 0, total.side), total.friction)
+    side = jnp.where(total.fixed, 0, total.side)
+    return Conditions(total.fixed, total.velocity, side, total.friction, total.touch)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from mpmjax._checks import canonical
 from mpmjax._crossing import collect, spread
-from mpmjax._diagnostics import energy_of
+from mpmjax._diagnostics import energy_density, energy_of
 from mpmjax._kernel import Stencil
 from mpmjax._method import Explicit, Method
 from mpmjax._nodes import Nodes, particles_to_grid
@@ -21,7 +21,7 @@ class EnergyBudget(eqx.Module):
     """The energy of one step [J], f steps:
 
     Δkinetic + Δelastic + Δpotential = boundary + friction + body_force + solver + time_integration
-    − p2g − g2p − implicit.
+    − p2g − g2p − implicit − viscous − plastic.
 
     v̄ = (v^n + v^{n+1})/2 at the nodes, u_ip = v_p + C_p (x_i − x_p). Each term is computed from its own expression and
     none as what is left, so that the sum's closing to rounding says that all of them are right.
@@ -48,12 +48,19 @@ class EnergyBudget(eqx.Module):
     """Work of friction, ≤ 0."""
     body_force: Float[Array, "*f"]
     """Work of the scene's body force."""
+    viscous: Float[Array, "*f"]
+    """Dissipated by viscosity, Δt Σ V σ_v : D ≥ 0 of the velocity that it resists."""
+    plastic: Float[Array, "*f"]
+    """Dissipated by return maps, Σ V0 (Ψ of the trial deformation − Ψ of what it is brought back to): hardening, which
+    stiffens what is strained, included. Where a step strains by many times the strain of yielding, what it stores
+    before the return is in `time_integration`: the two are to be read together."""
     solver: Float[Array, "*f"]
     """Work of the impulse by which the solve misses its equation."""
     time_integration: Float[Array, "*f"]
     """What Δt adds: the energies' change along the step less the work of their forces at its start,
     [Φ(Δt v_c) − Φ(0) + Δt f^n·v̄] + Δt G·(v̄ − v_c), v_c the velocity with which the nodes move and
-    G their weight. Of second order in Δt in each step, of first over a given time."""
+    G their weight; and the work on v̄ of viscosity's impulse beyond what it dissipates. Of second order in Δt in each
+    step, of first over a given time."""
 
     @property
     def change(self) -> Float[Array, "*f"]:
@@ -64,12 +71,12 @@ class EnergyBudget(eqx.Module):
     def explained(self) -> Float[Array, "*f"]:
         """The sum of all that changes it."""
         gains = self.boundary + self.friction + self.body_force + self.solver + self.time_integration
-        return gains - self.p2g - self.g2p - self.implicit
+        return gains - self.p2g - self.g2p - self.implicit - self.viscous - self.plastic
 
 
 class MomentumBudget(eqx.Module):
     """The linear momentum of one step [kg m/s], f steps, (f, d): change = gravity + body_force + boundary + friction +
-    elastic + transfer.
+    elastic + viscous + transfer.
 
     A symmetry plane pushes through its mirror image: it is seen in `elastic` and `transfer`, which vanish without one.
     """
@@ -86,13 +93,16 @@ class MomentumBudget(eqx.Module):
     """Impulse of friction."""
     elastic: Float[Array, "*f d"]
     """Impulse of the elastic force."""
+    viscous: Float[Array, "*f d"]
+    """Impulse of viscosity."""
     transfer: Float[Array, "*f d"]
     """Lost in the transfers."""
 
     @property
     def explained(self) -> Float[Array, "*f d"]:
         """The sum of all that changes it."""
-        return self.gravity + self.body_force + self.boundary + self.friction + self.elastic + self.transfer
+        outer = self.gravity + self.body_force + self.boundary + self.friction
+        return outer + self.elastic + self.viscous + self.transfer
 
 
 class Budget(eqx.Module):
@@ -128,16 +138,28 @@ def _budget(
 ) -> tuple[Particles, Budget]:
     def body(before: Particles, n: Array) -> tuple[Particles, Budget]:
         stencil = scene.stencil(before)
-        nodes = particles_to_grid(scene, before, (start + n) * dt, dt, stencil, centred=method.centred)
+        nodes = particles_to_grid(
+            scene,
+            before,
+            (start + n) * dt,
+            dt,
+            stencil,
+            centred=method.centred,
+            lagged=method.lagged,
+            apart=True,
+        )
         new = update(nodes, method)
-        after = grid_to_particles(scene, before, nodes, new)
-        return after, _step_budget(scene, before, after, nodes, new)
+        trial = grid_to_particles(scene, before, nodes, new)
+        after = scene.return_map(trial)
+        return after, _step_budget(scene, before, trial, after, nodes, new)
 
     numbers = jnp.arange(steps, dtype=particles.x.dtype)
     return jax.lax.scan(body, particles, numbers)
 
 
-def _step_budget(scene: Scene, before: Particles, after: Particles, nodes: Nodes, new: GridUpdate) -> Budget:
+def _step_budget(
+    scene: Scene, before: Particles, trial: Particles, after: Particles, nodes: Nodes, new: GridUpdate
+) -> Budget:
     potential, dt = nodes.potential, nodes.dt
     stencil, images = potential.stencil, potential.mirror
     v0, v1 = nodes.velocity, new.motion.velocity
@@ -150,13 +172,20 @@ def _step_budget(scene: Scene, before: Particles, after: Particles, nodes: Nodes
     raw = spread(stencil, before.mass[None], None, scene.grid.size)
     weight = dt * images.fold(raw * jnp.asarray(scene.gravity))
     body = jnp.where(nodes.occupied, dt * nodes.mass[:, None] * nodes.acceleration - weight, 0)
-    boundary, missed = jnp.where(new.free, 0, new.reaction), jnp.where(new.free, new.reaction, 0)
+    boundary, missed = new.free.split(0, new.reaction), new.free.split(new.reaction, 0)
+
+    # viscosity: its impulse, and what it dissipates of the velocity that it resists
+    C, resisted = None if before.C is None else components(before.C), new.motion.resisted
+    viscous, dissipated = jnp.zeros_like(v0), jnp.zeros((), v0.dtype)
+    if new.viscous is not None and C is not None:
+        power = (potential.drag_flux(C) * C).sum() if resisted is None else potential.power(resisted)
+        viscous, dissipated = new.viscous, dt * power
 
     # particle and nodes beside each other
     v_old = components(before.v)
     arrived = collect(stencil, images.unfold(new.before))[0]
     moved = collect(stencil, all1)[0]
-    C_old, C_new = (None if q.C is None else components(q.C) for q in (before, after))
+    C_old, C_new = (components(q.C) if scene.transfer.affine and q.C is not None else None for q in (before, after))
     beside = scene.transfer.alpha * (v_old - arrived) if isinstance(scene.transfer, FLIP) else jnp.zeros_like(v_old)
     lost_p2g, gained_p2g = _mismatch(stencil, before.mass, v_old, C_old, all0)
     lost_g2p, _ = _mismatch(stencil, before.mass, moved, C_new, all1)
@@ -180,11 +209,15 @@ def _step_budget(scene: Scene, before: Particles, after: Particles, nodes: Nodes
             boundary=(boundary * mean).sum(),
             friction=(friction * mean).sum(),
             body_force=(body * mean).sum(),
+            viscous=dissipated,
+            plastic=(before.volume * (energy_density(scene, trial) - energy_density(scene, after))).sum(),
             solver=(missed * mean).sum(),
             time_integration=stored
             - potential.energy(jnp.zeros_like(v0))
             + (elastic_at_start * mean).sum()
-            + (weight * (mean - new.motion.carrier)).sum(),
+            + (weight * (mean - new.motion.carrier)).sum()
+            + (viscous * mean).sum()
+            + dissipated,
         ),
         MomentumBudget(
             change=(before.mass * components(after.v - before.v)).sum(axis=1),
@@ -193,6 +226,7 @@ def _step_budget(scene: Scene, before: Particles, after: Particles, nodes: Nodes
             boundary=(share * (boundary + missed)).sum(axis=0),
             friction=(share * friction).sum(axis=0),
             elastic=(share * elastic).sum(axis=0),
+            viscous=(share * viscous).sum(axis=0),
             transfer=gained_p2g + (before.mass * beside).sum(axis=1),
         ),
     )

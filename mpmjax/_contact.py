@@ -1,12 +1,13 @@
 """Separation and friction: what the walls that push but do not pull hold, and what friction takes from it.
 
 On such a wall the velocity v and the wall's impulse r along the inward normal obey v ≥ 0, r ≥ 0, v r = 0: for each
-component of a node at and beyond a separating box, and for each column of nodes of a contact plane, where holding means
-that the column's nodes beyond the plane mirror those before it. A column's r is the normal impulse of its nodes on the
-plane and twice that of the images (a node and its image share equally). Its v is what r works on: the mean, with
-weights 2 m m'/(m + m'), of the v + v' of nodes and their images, and of the v of nodes on the plane (where the two are
-one). So an explicit step that holds the column has r = −Σ 2 m m'/(m + m') (v* + v*'), and the two conditions exclude
-each other. Columns that are each other's image in another plane are held together.
+component of a node at and beyond a separating box, for each node in a separating collider, where v is relative to the
+collider's, and for each column of nodes of a contact plane, where holding means that the column's nodes beyond the
+plane mirror those before it. A column's r is the normal impulse of its nodes on the plane and twice that of the images
+(a node and its image share equally). Its v is what r works on: the mean, with weights 2 m m'/(m + m'), of the v + v' of
+nodes and their images, and of the v of nodes on the plane (where the two are one). So an explicit step that holds the
+column has r = −Σ 2 m m'/(m + m') (v* + v*'), and the two conditions exclude each other. Columns that are each other's
+image in another plane are held together.
 
 The active set (what the walls hold) is guessed as what the explicit velocity v* drives into them. Then, at most
 `SWEEPS` times: solve with the active set held; release what the wall would have to pull, hold what would enter; stop
@@ -14,9 +15,9 @@ when nothing changes. What still violates the conditions after that is counted i
 solve, with the set settled and started from the last sweep's result, is the one that is differentiated; the derivative
 is that of the active set found, and does not exist where it changes.
 
-Friction is an impulse at the held nodes after the solve, against the tangential velocity and at most μ times the normal
-impulse (Coulomb); it is not part of the implicit system, so it lags by the elastic response of one step. That of a
-column acts on its node on the plane, or half a spacing before it.
+Friction is an impulse at the held nodes after the solve, against the tangential velocity (at a collider, that relative
+to it) and at most μ times the normal impulse (Coulomb); it is not part of the implicit system, so it lags by the
+elastic response of one step. That of a column acts on its node on the plane, or half a spacing before it.
 """
 
 from collections.abc import Callable
@@ -25,6 +26,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from mpmjax._constraint import Constraint
 from mpmjax._implicit import SolveInfo, no_solve
 from mpmjax._mirror import Contact, Mirror
 from mpmjax._nodes import Nodes
@@ -56,11 +58,18 @@ class ActiveSet(eqx.Module):
     """Of velocity, at separating boxes, shape (n, d); None without any."""
     columns: tuple[Bool[Array, "n"], ...]
     """For each contact plane its columns, each at all of its nodes."""
+    normals: Bool[Array, "n"] | None = None
+    """Of nodes in separating colliders; None without any."""
+
+
+NOTHING = ActiveSet(None, ())
+"""What is held where no wall may be left."""
 
 
 def touches(nodes: Nodes) -> bool:
     """Whether there are walls that may be left."""
-    return nodes.conditions.side is not None or bool(nodes.contacts)
+    leavable = nodes.conditions.touch is not None and nodes.conditions.touch.leavable is not None
+    return nodes.conditions.side is not None or bool(nodes.contacts) or leavable
 
 
 def held_images(nodes: Nodes, active: ActiveSet) -> Mirror:
@@ -76,17 +85,48 @@ def holding(nodes: Nodes, active: ActiveSet) -> Nodes:
     for contact, held in zip(nodes.contacts, active.columns, strict=True):
         normal = jnp.arange(fixed.shape[1]) == contact.image.axis
         fixed = fixed | ((held & contact.on_plane)[:, None] & normal)
-    return eqx.tree_at(lambda n: n.conditions.fixed, nodes.folded(held_images(nodes, active)), fixed)
+    nodes = eqx.tree_at(lambda n: n.conditions.fixed, nodes.folded(held_images(nodes, active)), fixed)
+    if active.normals is None or nodes.conditions.touch is None:
+        return nodes
+    return eqx.tree_at(lambda n: n.conditions.touch.held, nodes, nodes.conditions.touch.held | active.normals)
 
 
-def untouched(nodes: Nodes, active: ActiveSet) -> Mask:
-    """The free components in which no held wall has a part."""
+def untouched(nodes: Nodes, active: ActiveSet) -> Constraint:
+    """The projection on that in which no boundary has a part."""
     free = nodes.free
     if active.components is not None:
         free = free & ~active.components
     for held in active.columns:
         free = free & ~held[:, None]
-    return free
+    normal = held_normals(nodes, active)
+    return Constraint(free, None if normal is None else jnp.where(free, normal, 0))
+
+
+def held_normals(nodes: Nodes, active: ActiveSet) -> NodeVector | None:
+    """The free parts of the normals that colliders hold, of length one; None without colliders."""
+    return None if nodes.conditions.touch is None else holding(nodes, active).constraint.normal
+
+
+def pushes(nodes: Nodes, active: ActiveSet, imbalance: NodeVector) -> NodeScalar | None:
+    """The impulse [kg m/s], shape (n,), by which colliders hold each node along their normals, outward positive; None
+    without any.
+
+    The imbalance is push·n and what holds the prescribed components; along the free part of n it is the push alone,
+    times the part's length.
+    """
+    if nodes.conditions.touch is None:
+        return None
+    held = holding(nodes, active)
+    grasp, normal = held.grasp, held.constraint.normal
+    if grasp is None or normal is None:
+        return None
+    return (normal * held_images(nodes, active).fold(imbalance)).sum(axis=1) / grasp.reach
+
+
+def _beside_colliders(nodes: Nodes, active: ActiveSet, imbalance: NodeVector) -> NodeVector:
+    """The imbalance less what colliders hold along their normals: what is left for walls."""
+    push, touch = pushes(nodes, active, imbalance), nodes.conditions.touch
+    return imbalance if push is None or touch is None else imbalance - push[:, None] * touch.normal
 
 
 def find_active_set(
@@ -117,9 +157,11 @@ def find_active_set(
         return state[3] & (state[4] < SWEEPS)
 
     predictor, side = nodes.explicit_velocity(), nodes.conditions.side
+    departure = _departure(nodes, predictor)
     active = ActiveSet(
         None if side is None else side * predictor < 0,
         tuple(_approach(nodes, contact, predictor) < 0 for contact in nodes.contacts),
+        None if departure is None else departure < 0,
     )
     start = (active, guess, no_solve(guess.dtype), jnp.asarray(True), jnp.asarray(0, dtype=jnp.int32))
     active, guess, cost, _, count = jax.lax.while_loop(unsettled, sweep, start)
@@ -133,7 +175,7 @@ def count_violations(nodes: Nodes, active: ActiveSet, v: NodeVector, imbalance: 
 
 
 def with_friction(nodes: Nodes, active: ActiveSet, v: NodeVector, imbalance: NodeVector) -> NodeVector:
-    """Velocity after Coulomb friction on the held nodes, one wall direction after the other.
+    """Velocity after Coulomb friction of walls on the held nodes, one wall direction after the other.
 
     Args:
         nodes: nodes of which nothing is held.
@@ -143,11 +185,13 @@ def with_friction(nodes: Nodes, active: ActiveSet, v: NodeVector, imbalance: Nod
     """
     images = held_images(nodes, active)
     mass = images.fold_scalar(nodes.mass)
-    limit = _friction_limit(nodes, active, imbalance, images)
+    limit = _friction_limit(nodes, active, _beside_colliders(nodes, active, imbalance), images)
     d = v.shape[1]
+    normal = held_normals(nodes, active)
     for a in range(d):
         tangent = jnp.arange(d) != a
         slip = jnp.where(tangent, v, 0)
+        slip = slip if normal is None else slip - normal * (normal * slip).sum(axis=1, keepdims=True)
         speed2 = (slip**2).sum(axis=1)
         speed = jnp.sqrt(jnp.where(speed2 == 0, 1, speed2))
         loss = limit[:, a] / jnp.where(mass == 0, 1, mass)
@@ -155,6 +199,32 @@ def with_friction(nodes: Nodes, active: ActiveSet, v: NodeVector, imbalance: Nod
         free = tangent & ~nodes.conditions.fixed
         v = v - jnp.where(free & (speed2 > 0)[:, None], share[:, None] * slip, 0)
     return images.unfold(v)
+
+
+def with_collider_friction(
+    nodes: Nodes, active: ActiveSet, v: NodeVector, push: NodeScalar | None
+) -> tuple[NodeVector, NodeVector | None]:
+    """Velocity after Coulomb friction of colliders on the held nodes, v − min(1, μ push / (m ‖s‖)) s with the slip
+    s = Q (v − v_c), and the impulse of it [kg m/s]; None without any.
+
+    Args:
+        nodes: nodes of which nothing is held.
+        active: what is held.
+        v: velocity of all nodes after the solve [m/s].
+        push: see `pushes`.
+    """
+    touch = nodes.conditions.touch
+    if push is None or touch is None or touch.friction is None or active.normals is None:
+        return v, None
+    images, held = held_images(nodes, active), holding(nodes, active)
+    slip = held.constraint.split(v - touch.velocity, 0)
+    square = (slip**2).sum(axis=1)
+    rubbed = active.normals & (square > 0) & (held.mass > 0)
+    limit = touch.friction * jnp.maximum(push, 0)
+    stopping = held.mass * jnp.sqrt(jnp.where(rubbed, square, 1))
+    share = jnp.where(rubbed, jnp.minimum(limit / jnp.where(rubbed, stopping, 1), 1), 0)
+    loss = images.unfold(-share[:, None] * slip)
+    return v + loss, nodes.mass[:, None] * loss
 
 
 def _friction_limit(nodes: Nodes, active: ActiveSet, imbalance: NodeVector, images: Mirror) -> NodeVector:
@@ -174,24 +244,52 @@ def _friction_limit(nodes: Nodes, active: ActiveSet, imbalance: NodeVector, imag
 def _verdict(nodes: Nodes, active: ActiveSet, v: NodeVector, imbalance: NodeVector) -> tuple[ActiveSet, ActiveSet]:
     """What of the active set pulls, and what of the rest enters, beyond rounding."""
     noise = jnp.sqrt(jnp.finfo(v.dtype).eps) * jnp.abs(v).max()
+    of_walls = _beside_colliders(nodes, active, imbalance)
     pulls, enters = None, None
     if active.components is not None and nodes.conditions.side is not None:
-        push = nodes.conditions.side * held_images(nodes, active).fold(imbalance)
+        push = nodes.conditions.side * held_images(nodes, active).fold(of_walls)
         pulls = active.components & (push < -noise * nodes.mass[:, None])
+        if nodes.conditions.touch is not None:
+            pulls = pulls | (active.components & _driven_off(nodes, active, v, noise))
         enters = ~active.components & (nodes.conditions.side * v < -noise)
     pulling, entering = [], []
     for contact, held in zip(nodes.contacts, active.columns, strict=True):
         least = -noise * _tied(nodes, contact, contact.image.column(contact.weight(nodes.mass)))
-        pulling.append(held & (_tied(nodes, contact, contact.impulse(imbalance)) < least))
+        pulling.append(held & (_tied(nodes, contact, contact.impulse(of_walls)) < least))
         entering.append(~held & (_approach(nodes, contact, v) < least))
-    return ActiveSet(pulls, tuple(pulling)), ActiveSet(enters, tuple(entering))
+    if active.normals is None:
+        return ActiveSet(pulls, tuple(pulling)), ActiveSet(enters, tuple(entering))
+    push, departure = pushes(nodes, active, imbalance), _departure(holding(nodes, active), v)
+    assert push is not None and departure is not None
+    pulled = active.normals & (push < -noise * held_images(nodes, active).fold_scalar(nodes.mass))
+    entered = ~active.normals & (departure < -noise)
+    return ActiveSet(pulls, tuple(pulling), pulled), ActiveSet(enters, tuple(entering), entered)
+
+
+def _driven_off(nodes: Nodes, active: ActiveSet, v: NodeVector, noise: Array) -> Mask:
+    """The components of walls from which a collider with the same normal drives the node away, but cannot while the
+    wall holds it."""
+    touch, grasp, side = nodes.conditions.touch, holding(nodes, active).grasp, nodes.conditions.side
+    assert touch is not None and grasp is not None and side is not None
+    blocked = (grasp.normal == 0).all(axis=1) & ((touch.normal * (v - touch.velocity)).sum(axis=1) < -noise)
+    return blocked[:, None] & (side * touch.normal > 0)
 
 
 def _number(nodes: Nodes, part: ActiveSet) -> Int[Array, ""]:
     """How many components and columns a part has."""
     masks = [held & contact.at_key for contact, held in zip(nodes.contacts, part.columns, strict=True)]
-    masks = masks if part.components is None else [*masks, part.components]
+    masks += [mask for mask in (part.components, part.normals) if mask is not None]
     return jnp.asarray(sum(mask.sum() for mask in masks), dtype=jnp.int32)
+
+
+def _departure(nodes: Nodes, v: NodeVector) -> NodeScalar | None:
+    """The velocity [m/s], shape (n,), with which nodes leave the separating collider that they lie in; zero where they
+    lie in none, or what is prescribed leaves it no part. None without any."""
+    touch, grasp = nodes.conditions.touch, nodes.grasp
+    if touch is None or touch.leavable is None or grasp is None:
+        return None
+    departure = (touch.normal * (v - touch.velocity)).sum(axis=1)
+    return jnp.where(touch.leavable & (grasp.normal != 0).any(axis=1), departure, 0)
 
 
 def _approach(nodes: Nodes, contact: Contact, v: NodeVector) -> NodeScalar:

@@ -1,6 +1,7 @@
 """What a state weighs, moves and stores: mass, momentum and energy."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse.csgraph
@@ -19,7 +20,7 @@ class Energy(eqx.Module):
     kinetic: Float[Array, "*f"]
     """½ Σ m (‖v‖² + tr(C D Cᵀ)): the affine part of APIC's velocities included."""
     elastic: Float[Array, "*f"]
-    """Σ V0 Ψ(F)."""
+    """Σ V0 Ψ(F), Ψ being the elastic law in force."""
     potential: Float[Array, "*f"]
     """−Σ m g·x."""
 
@@ -43,18 +44,23 @@ def energy(scene: Scene, particles: Particles) -> Energy:
 def energy_of(scene: Scene, particles: Particles) -> Energy:
     """The same of prepared particles, without compilation."""
     speed2 = (particles.v**2).sum(axis=1)
-    if particles.C is not None:
+    if scene.transfer.affine and particles.C is not None:
         moment = scene.stencil(particles).moment.T[:, None, :]
         speed2 = speed2 + (particles.C**2 * moment).sum(axis=(1, 2))
     gravity = jnp.asarray(scene.gravity, particles.x.dtype)
     return Energy(
         kinetic=(particles.mass * speed2).sum() / 2,
-        elastic=(particles.volume * scene.material.energy(particles.deformation())).sum(),
+        elastic=(particles.volume * energy_density(scene, particles)).sum(),
         potential=-(particles.mass[:, None] * particles.x * gravity).sum(),
     )
 
 
 _energy = eqx.filter_jit(energy_of)
+
+
+def energy_density(scene: Scene, particles: Particles) -> ParticleScalar:
+    """Ψ of each prepared particle [J/m^d of undeformed volume], shape (p,)."""
+    return jnp.concatenate([c.law.energy(c.F) for c in scene.constituents(particles)])
 
 
 def momentum(particles: Particles) -> Float[Array, "d"]:
@@ -63,8 +69,8 @@ def momentum(particles: Particles) -> Float[Array, "d"]:
 
 
 def volume_ratio(particles: Particles) -> ParticleScalar:
-    """J = det F of each particle [-], shape (p,)."""
-    return la.determinant(particles.deformation())
+    """J = det F of each prepared particle [-], of what yields det F_E, shape (p,)."""
+    return jnp.concatenate([la.determinant(components(F)) for F in jax.tree.leaves(particles.F)])
 
 
 def grid_mass(scene: Scene, particles: Particles) -> Float[Array, ""]:

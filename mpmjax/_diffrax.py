@@ -2,6 +2,7 @@
 own."""
 
 from collections.abc import Callable
+from functools import reduce
 from typing import Any, ClassVar
 
 import diffrax
@@ -14,7 +15,7 @@ from mpmjax._method import Method
 from mpmjax._particles import Particles, State, state_of, with_state
 from mpmjax._scene import Scene
 from mpmjax._step import StepInfo, advance_compiled
-from mpmjax._types import Array, Bool, Float, Int, Scalar, components
+from mpmjax._types import Array, Bool, Float, Int, Scalar
 
 HEALTHY, NOT_FINITE, OUTSIDE, INADMISSIBLE = 0, 1, 2, 3
 """What can be wrong with a state."""
@@ -118,12 +119,18 @@ def no_steps(dtype: Any) -> Tally:
 def faulty_particles(problem: Problem, state: State) -> tuple[Bool[Array, "p"], Bool[Array, "p"], Bool[Array, "p"]]:
     """Which particles are not finite, have left the window, have an F that the law does not allow."""
     scene, particles = problem.scene, problem.at(state)
-    finite = jnp.asarray(True)
-    for leaf in jax.tree.leaves(state):
-        finite = finite & jnp.isfinite(leaf).reshape(leaf.shape[0], -1).all(axis=1)
+    finite = _finite((particles.x, particles.v, particles.C))
+    finite = finite & jnp.concatenate([_finite((group.F, group.history)) for group in particles.groups])
     anchor = scene.anchor(particles)
     outside = ~in_window(scene.kernel, scene.grid, scene.window(particles), anchor)
-    return ~finite, finite & outside, finite & ~scene.material.admits(components(state.F))
+    admitted = jnp.concatenate([c.law.admits(c.F) for c in scene.constituents(particles)])
+    return ~finite, finite & outside, finite & ~admitted
+
+
+def _finite(fields: Any) -> Bool[Array, "p"]:
+    """Whether all numbers of a particle are, of fields whose first axis is the particles'."""
+    finite = [jnp.isfinite(a).reshape(a.shape[0], -1).all(axis=1) for a in jax.tree.leaves(fields)]
+    return reduce(jnp.logical_and, finite)
 
 
 def fault_of(problem: Problem, state: State) -> Int[Array, ""]:

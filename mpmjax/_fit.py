@@ -32,10 +32,10 @@ class StressStretch(eqx.Module):
 
     def __call__(self, scene: Scene, particles: Particles) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Stretch [-] and nominal stress [Pa]."""
-        F = particles.deformation()
-        P = scene.material.stress(F)
+        (body,) = scene.constituents(particles)
+        P = body.law.stress(body.F)
         a = self.axis
-        return (self.weight * F[a, a]).sum(), (self.weight * P[a, a]).sum()
+        return (self.weight * body.F[a, a]).sum(), (self.weight * P[a, a]).sum()
 
 
 def gauge(region: AbstractRegion, particles: Particles, axis: int) -> StressStretch:

@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax import _linalg as la
+from mpmjax._constraint import Constraint
 from mpmjax._crossing import collect, spread
 from mpmjax._kernel import Stencil
 from mpmjax._metric import Metric
 from mpmjax._mirror import Mirror
-from mpmjax._potential import ElasticPotential
-from mpmjax._types import Array, Float, Mask, Matrix, NodeScalar, NodeVector, Scalar
-from mpmjax.material import AbstractTangent, projected_tangent
+from mpmjax._potential import ElasticPotential, Matrices
+from mpmjax._types import Array, Float, Matrix, NodeScalar, NodeVector, Scalar
+from mpmjax.material import AbstractMaterial, AbstractTangent, projected_tangent
 
 
 class AbstractHessianAction(eqx.Module):
@@ -66,25 +67,26 @@ class Stiffness(AbstractHessianAction):
 
 class _AnalyticAction(AbstractHessianAction):
     potential: ElasticPotential
-    tangent: AbstractTangent
+    tangents: tuple[AbstractTangent, ...]
 
     def __call__(self, du: NodeVector) -> NodeVector:
         """Σ_p V0_p A_p h_ip, with A_p = ∂²Ψ/∂F∂F : δF_p (reference, eqs. 7 and 8, the gradient in eq. 7 being node
         i's)."""
-        return _analytic_action(self.potential, self.tangent, du)
+        return _analytic_action(self.potential, self.tangents, du)
 
     def assembled(self) -> Stiffness:
-        """From the stress differential."""
-        return _stiffness(self.potential, self.tangent)
+        """From the stress differentials."""
+        return _stiffness(self.potential, self.tangents)
 
 
-def _stiffness(potential: ElasticPotential, tangent: Callable[[Matrix], Matrix]) -> Stiffness:
-    return Stiffness(potential.stiffness(tangent), potential.stencil, potential.mirror)
+def _stiffness(potential: ElasticPotential, tangents: tuple[Callable[[Matrix], Matrix], ...]) -> Stiffness:
+    return Stiffness(potential.stiffness(tangents), potential.stencil, potential.mirror)
 
 
 @jax.jit
-def _analytic_action(potential: ElasticPotential, tangent: AbstractTangent, du: NodeVector) -> NodeVector:
-    return potential.divergence(tangent(potential.strain(du)), du)
+def _analytic_action(potential: ElasticPotential, tangents: tuple[AbstractTangent, ...], du: NodeVector) -> NodeVector:
+    changes = (tangent(dF) for tangent, dF in zip(tangents, potential.strain(du), strict=True))
+    return potential.divergence(tuple(changes), du)
 
 
 class _JvpAction(AbstractHessianAction):
@@ -96,15 +98,41 @@ class _JvpAction(AbstractHessianAction):
         return _jvp_action(self.potential, self.u, du)
 
     def assembled(self) -> Stiffness:
-        """From the derivative of the energy's gradient by F."""
-        stress = jax.grad(lambda F: self.potential.material.energy(F).sum())
-        F = self.potential.F + self.potential.strain(self.u)
-        return _stiffness(self.potential, lambda dF: jax.jvp(stress, (F,), (dF,))[1])
+        """From the derivative of the energies' gradients by F."""
+        laws = (c.law for c in self.potential.constituents)
+        places = zip(laws, self.potential.displaced(self.u), strict=True)
+        return _stiffness(self.potential, tuple(_derived_tangent(law, F) for law, F in places))
+
+
+def _derived_tangent(law: AbstractMaterial, F: Matrix) -> Callable[[Matrix], Matrix]:
+    stress = jax.grad(lambda F: law.energy(F).sum())
+    return lambda dF: jax.jvp(stress, (F,), (dF,))[1]
 
 
 @jax.jit
 def _jvp_action(potential: ElasticPotential, u: NodeVector, du: NodeVector) -> NodeVector:
     return jax.jvp(jax.grad(potential.energy), (u,), (du,))[1]
+
+
+class _DampedAction(AbstractHessianAction):
+    elastic: AbstractHessianAction
+    potential: ElasticPotential
+    rate: Scalar
+
+    def __call__(self, du: NodeVector) -> NodeVector:
+        """(H + r D) δu."""
+        return self.elastic(du) + self.rate * self.potential.drag(du)
+
+    def assembled(self) -> Stiffness:
+        """One matrix a particle for both."""
+        stiffness = self.elastic.assembled()
+        return eqx.tree_at(lambda s: s.matrix, stiffness, stiffness.matrix + self.rate * self.potential.damping())
+
+
+def damped(elastic: AbstractHessianAction, potential: ElasticPotential, rate: Scalar) -> AbstractHessianAction:
+    """H + r D, D the viscous force's by velocity [N s/m]: with r = 1/c a stage of length c has M + c D + c² H. Without
+    viscosity it is H."""
+    return _DampedAction(elastic, potential, rate) if potential.viscous else elastic
 
 
 class AnalyticHessian(eqx.Module):
@@ -124,19 +152,23 @@ class AnalyticHessian(eqx.Module):
 
     def at(self, potential: ElasticPotential, u: NodeVector) -> AbstractHessianAction:
         """The Hessian of the potential at a displacement u."""
-        return _AnalyticAction(potential, self._tangent(potential, potential.F + potential.strain(u)))
+        return self._action(potential, potential.displaced(u))
 
     def at_rest(self, potential: ElasticPotential, like: NodeVector) -> AbstractHessianAction:
         """The Hessian at u = 0, without the gather."""
         del like
-        return _AnalyticAction(potential, self._tangent(potential, potential.F))
+        return self._action(potential, potential.at_rest())
 
     def exact(self) -> "AnalyticHessian":
         """The Hessian itself, of which this may be a projection."""
         return AnalyticHessian()
 
-    def _tangent(self, potential: ElasticPotential, F: Matrix) -> AbstractTangent:
-        return projected_tangent(potential.material, F) if self.projected else potential.material.tangent(F)
+    def _action(self, potential: ElasticPotential, F: Matrices) -> _AnalyticAction:
+        def tangent(law: AbstractMaterial, F: Matrix) -> AbstractTangent:
+            return projected_tangent(law, F) if self.projected else law.tangent(F)
+
+        laws = (c.law for c in potential.constituents)
+        return _AnalyticAction(potential, tuple(tangent(law, own) for law, own in zip(laws, F, strict=True)))
 
 
 class JvpHessian(eqx.Module):
@@ -162,14 +194,19 @@ class ImplicitOperator(lx.AbstractLinearOperator):
     """Q (M + c H) Q + I − Q, symmetric: c = βΔt² for the semi-implicit step (reference, eq. 6 times m_i), the square of
     its length for a stage.
 
-    Q keeps the components that are free; rows of prescribed components and of empty nodes are the identity.
+    Q keeps what is not held (see `Constraint`); rows of prescribed components and of empty nodes are the identity, and
+    along the held normals of colliders stands the mass.
     """
 
     mass: NodeScalar
     factor: Scalar
     hessian: AbstractHessianAction
-    free: Mask
+    constraint: Constraint
     inner: Metric = eqx.field(static=True, default=Metric.MASS)
+
+    @property
+    def _shape(self) -> tuple[int, ...]:
+        return self.constraint.free.shape
 
     def unconstrained(self, v: NodeVector) -> NodeVector:
         """(M + c H) v."""
@@ -177,24 +214,26 @@ class ImplicitOperator(lx.AbstractLinearOperator):
 
     def mv(self, vector: NodeVector) -> NodeVector:
         """The operator applied to a node vector."""
-        return jnp.where(self.free, self.unconstrained(jnp.where(self.free, vector, 0)), vector)
+        split = self.constraint.split
+        return split(self.unconstrained(split(vector, 0)), self.constraint.identity(vector, self.mass))
 
     def assembled(self) -> "ImplicitOperator":
         """The same operator, for many applications."""
         return eqx.tree_at(lambda o: o.hessian, self, self.hessian.assembled())
 
     def metric(self) -> NodeVector:
-        """W, the inner product over all rows: on free ones m_i or m_i + c H_ii, on identity rows 1."""
-        weight = jnp.broadcast_to(self.mass[:, None], self.free.shape)
+        """W, the inner product over all rows: on free ones m_i or m_i + c H_ii (its mean over the directions where a
+        normal is held, so that it commutes with Q), on identity rows 1."""
+        weight = jnp.broadcast_to(self.mass[:, None], self._shape)
         if self.inner is Metric.DIAGONAL:
             weight = weight + self.factor * self.hessian.assembled().diagonal(weight)
-        return jnp.where(self.free, weight, 1)
+        return self.constraint.metric(weight)
 
     def as_matrix(self) -> Float[Array, "nd nd"]:
         """The dense matrix, for tests and small problems."""
-        shape = self.free.shape
+        shape = self._shape
         columns = jax.vmap(lambda e: self.mv(e.reshape(shape)).reshape(-1))
-        return columns(jnp.eye(self.free.size, dtype=self.mass.dtype)).T
+        return columns(jnp.eye(shape[0] * shape[1], dtype=self.mass.dtype)).T
 
     def transpose(self) -> "ImplicitOperator":
         """Itself."""
@@ -202,7 +241,7 @@ class ImplicitOperator(lx.AbstractLinearOperator):
 
     def in_structure(self) -> jax.ShapeDtypeStruct:
         """Of a node vector."""
-        return jax.ShapeDtypeStruct(self.free.shape, self.mass.dtype)
+        return jax.ShapeDtypeStruct(self._shape, self.mass.dtype)
 
     def out_structure(self) -> jax.ShapeDtypeStruct:
         """Of a node vector."""

@@ -15,10 +15,11 @@ import lineax as lx
 
 from mpmjax._checks import require, require_positive
 from mpmjax._conjugate_residual import LARGEST_RESIDUAL, ConjugateResidual, default_rtol
-from mpmjax._hessian import Hessian, ImplicitOperator
+from mpmjax._constraint import Constraint
+from mpmjax._hessian import Hessian, ImplicitOperator, damped
 from mpmjax._metric import Metric
 from mpmjax._potential import ElasticPotential
-from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector, Scalar
 
 
 class SolveInfo(eqx.Module):
@@ -64,9 +65,9 @@ def no_solve(dtype: Any) -> SolveInfo:
 
 
 class AbstractProblem(eqx.Module):
-    """An equation for the nodes' velocity. Components that are not `free` take the value of `prescribed`."""
+    """An equation for the nodes' velocity. What is held takes the value of `prescribed`."""
 
-    free: eqx.AbstractVar[Mask]
+    constraint: eqx.AbstractVar[Constraint]
     prescribed: eqx.AbstractVar[NodeVector]
 
     @abc.abstractmethod
@@ -78,12 +79,12 @@ class AbstractProblem(eqx.Module):
         """The derivative of the imbalance at v, constrained."""
 
     def residual(self, v: NodeVector) -> NodeVector:
-        """The equation that is solved: the imbalance of free components, the error of prescribed ones."""
-        return jnp.where(self.free, self.imbalance(v), v - self.prescribed)
+        """The equation that is solved: the imbalance of what is free, the error of what is prescribed."""
+        return self.constraint.split(self.imbalance(v), v - self.prescribed)
 
     def admit(self, guess: NodeVector) -> NodeVector:
-        """The guess with prescribed components as prescribed."""
-        return jnp.where(self.free, guess, self.prescribed)
+        """The guess with what is prescribed."""
+        return self.constraint.split(guess, self.prescribed)
 
 
 class LinearProblem(AbstractProblem):
@@ -93,14 +94,14 @@ class LinearProblem(AbstractProblem):
     factor: Scalar
     hessian: Any
     rhs: NodeVector
-    free: Mask
+    constraint: Constraint
     prescribed: NodeVector
     metric: Metric = eqx.field(static=True, default=Metric.MASS)
 
     def operator(self, v: NodeVector) -> ImplicitOperator:
         """Q (M + c H) Q + I − Q."""
         del v
-        return ImplicitOperator(self.mass, self.factor, self.hessian, self.free, self.metric)
+        return ImplicitOperator(self.mass, self.factor, self.hessian, self.constraint, self.metric)
 
     def imbalance(self, v: NodeVector) -> NodeVector:
         """(M + c H) v − b."""
@@ -112,7 +113,7 @@ class NewtonProblem(AbstractProblem):
     eq. 2) has c = Δt, u = 0, ṽ = v^n + Δt g.
 
     It is the gradient of the incremental potential E(v) = ½ ‖v − ṽ‖²_M + Φ(u + c v), of which a step that a wall or
-    the line search accepts is a descent.
+    the line search accepts is a descent. Viscosity adds c D v to the one and ½ c v·D v to the other.
     """
 
     mass: NodeScalar
@@ -125,7 +126,7 @@ class NewtonProblem(AbstractProblem):
     spacing: Float[Array, ""]
     potential: ElasticPotential
     hessian: Hessian
-    free: Mask
+    constraint: Constraint
     prescribed: NodeVector
     metric: Metric = eqx.field(static=True, default=Metric.MASS)
 
@@ -138,7 +139,7 @@ class NewtonProblem(AbstractProblem):
         return jnp.zeros_like(self.inertial) if self.displaced is None else -self.displaced / self.length
 
     def operator(self, v: NodeVector) -> ImplicitOperator:
-        """M + c² H at the displacement, constrained: the derivative of the imbalance, H never projected."""
+        """M + c D + c² H at the displacement, constrained: the derivative of the imbalance, H never projected."""
         return self._operator(self.hessian.exact(), v)
 
     def model(self, v: NodeVector) -> ImplicitOperator:
@@ -146,12 +147,15 @@ class NewtonProblem(AbstractProblem):
         return self._operator(self.hessian, v)
 
     def _operator(self, hessian: Hessian, v: NodeVector) -> ImplicitOperator:
-        action = hessian.at(self.potential, self.displacement(v))
-        return ImplicitOperator(self.mass, self.length**2, action, self.free, self.metric)
+        action = damped(hessian.at(self.potential, self.displacement(v)), self.potential, 1 / self.length)
+        return ImplicitOperator(self.mass, self.length**2, action, self.constraint, self.metric)
 
     def imbalance(self, v: NodeVector) -> NodeVector:
-        """M (v − ṽ) − c f(u + c v)."""
-        return self.mass[:, None] * (v - self.inertial) - self.length * self.potential.force(self.displacement(v))
+        """M (v − ṽ) − c (f(u + c v) − D v)."""
+        force = self.potential.force(self.displacement(v))
+        if self.potential.viscous:
+            force = force - self.potential.drag(v)
+        return self.mass[:, None] * (v - self.inertial) - self.length * force
 
     def unit_strain(self) -> Float[Array, ""]:
         """The norm √(Σ m) dx/c [√J] of a velocity that would strain everything by one in the stage.
@@ -163,7 +167,10 @@ class NewtonProblem(AbstractProblem):
 
     def merit(self, v: NodeVector) -> Float[Array, ""]:
         """E(v) [J], without the constant of what is held."""
-        inertia = 0.5 * jnp.where(self.free, self.mass[:, None] * (v - self.inertial) ** 2, 0).sum()
+        free = self.constraint.free
+        inertia = 0.5 * jnp.where(free, self.mass[:, None] * (v - self.inertial) ** 2, 0).sum()
+        if self.potential.viscous:
+            inertia = inertia + self.length / 2 * self.potential.power(v)
         return inertia + self.potential.energy(self.displacement(v))
 
 
@@ -179,9 +186,10 @@ class Linearised(eqx.Module):
     def __call__(self, problem: AbstractProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         """The solution, started from a guess."""
         operator = problem.operator(guess).assembled()
-        lift = jnp.where(problem.free, 0, problem.prescribed)
-        rhs = jnp.where(problem.free, -problem.imbalance(lift), 0)
-        options = {"metric": operator.metric(), "y0": jnp.where(problem.free, guess, 0)}
+        split = problem.constraint.split
+        lift = split(0, problem.prescribed)
+        rhs = split(-problem.imbalance(lift), 0)
+        options = {"metric": operator.metric(), "y0": split(guess, 0)}
         v, result, stats = self.solver.compute(self.solver.init(operator, options), rhs, options)
         info = SolveInfo(
             iterations=stats["num_steps"],
@@ -223,7 +231,7 @@ class Newton(eqx.Module):
 
     def __call__(self, problem: NewtonProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         """The solution, started from a guess."""
-        free = problem.free
+        split, free = problem.constraint.split, problem.constraint.free
         metric = jnp.where(free, problem.mass[:, None], 1)
         dtype = guess.dtype
         eps = jnp.finfo(dtype).eps
@@ -233,10 +241,10 @@ class Newton(eqx.Module):
             return jnp.sqrt((r**2 / metric).sum())
 
         def residual(v: NodeVector) -> NodeVector:
-            return jnp.where(free, problem.imbalance(v), 0)
+            return split(problem.imbalance(v), 0)
 
         def tolerance(c: _NewtonState) -> Float[Array, ""]:
-            speed = jnp.sqrt((metric * jnp.where(free, c.v, 0) ** 2).sum())
+            speed = jnp.sqrt((metric * split(c.v, 0) ** 2).sum())
             rounding = 4 * eps * (c.radius * (speed + unit_strain) + scale)
             return jnp.maximum(rtol * scale, jnp.minimum(rounding, LARGEST_RESIDUAL * scale))
 
@@ -277,7 +285,7 @@ class Newton(eqx.Module):
                 indefinite=c.indefinite | stats["indefinite"],
             )
 
-        lift = jnp.where(free, 0, problem.prescribed)
+        lift = split(0, problem.prescribed)
         start = problem.admit(guess)
         energies = problem.merit(start), problem.merit(lift)
         start = jnp.where(jnp.isfinite(energies[0]) & ~(energies[1] < energies[0]), start, lift)
@@ -285,7 +293,7 @@ class Newton(eqx.Module):
         zero = jnp.asarray(0, dtype=jnp.int32)
         still = problem.undisplaced()
         linearised = problem.imbalance(still) + problem.operator(still).unconstrained(lift - still)
-        linearised = jnp.where(free, linearised, 0)
+        linearised = split(linearised, 0)
         scale = norm(linearised)
         unit_strain = problem.unit_strain()
         no = jnp.asarray(False)
@@ -356,7 +364,8 @@ def _solve_jvp(primals: Any, tangents: Any) -> Any:
         x, result, _ = adjoint.compute(adjoint.init(assembled, options), b, options)
         return jnp.where(result == lx.RESULTS.successful, x, jnp.nan)
 
-    lift = jnp.where(problem.free, 0, -d_residual)
-    rhs = jnp.where(problem.free, -d_residual - operator.unconstrained(lift), 0)
+    split = problem.constraint.split
+    lift = split(0, -d_residual)
+    rhs = split(-d_residual - operator.unconstrained(lift), 0)
     dv = jax.lax.custom_linear_solve(operator.mv, rhs, solve_symmetric, symmetric=True)
     return (v, info), (dv + lift, jax.tree.map(lambda _: None, info))

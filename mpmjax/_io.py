@@ -1,9 +1,10 @@
 """Runs in files: HDF5 that ParaView opens as it is, and from which a run continues bit for bit.
 
     /VTKHDF     the frames in VTK's layout (see `_vtkhdf`): Points, and as PointData velocity, deformation_gradient,
-                J = det F and, with APIC, affine_velocity
-    /mpmjax     format, version, d, dtype, units, dt, mass, volume, X, the scene and the method as JSON (see `_schema`)
-                with their arrays, and a table with one row a frame: its step and the run's `Tally` up to it
+                J = det F, with APIC affine_velocity, and what laws that yield remember
+    /mpmjax     format, version, d, dtype, units, dt, counts, mass, volume, X, the scene and the method as JSON (see
+                `_schema`) with their arrays, and a table with one row a frame: its step and the run's `Tally` up to
+                it; with colliders `received`, what each had received by then: impulse, then angular impulse
 
 Whatever is not in a dataset with checksums lies in headers that HDF5 checks itself, so a flipped bit is found. `NSteps`
 is raised last, and what lies beyond it, the remains of a writer that was killed, is neither read nor kept.
@@ -14,7 +15,7 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -27,14 +28,15 @@ import numpy as np
 
 from mpmjax._checks import canonical, is_traced, require
 from mpmjax._diffrax import Tally, no_steps
+from mpmjax._exchange import Exchange
 from mpmjax._method import Method
 from mpmjax._particles import Particles, State, state_of, with_state
 from mpmjax._run import Run
-from mpmjax._scene import Scene
+from mpmjax._scene import Scene, prepare
 from mpmjax._schema import decode, encode
 from mpmjax._vtkhdf import File, add_fixed, add_growing, add_topology, count_in, rows_of, set_count, states_in
 
-_FORMAT = 2
+_FORMAT = 3
 _LIBVER = ("v110", "v110")  # what "latest" writes, VTK 9.7 cannot read
 _LIBVER_HEAD = ("v108", "v108")
 _UNITS = "SI: m, s, kg, Pa; deformation_gradient and J are pure numbers, affine_velocity is in 1/s"
@@ -48,9 +50,9 @@ class FrameWriter:
     A context manager: leaving it closes the file.
     """
 
-    def __init__(self, file: File, path: Path):
+    def __init__(self, file: File, path: Path, like: State):
         """Use `create` or `resume`."""
-        self._file, self._path = file, path
+        self._file, self._path, self._like = file, path, like
 
     @classmethod
     def create(
@@ -90,7 +92,7 @@ class FrameWriter:
             add_growing(file, name, data)
         _write_description(file["mpmjax"], described)
         file.flush()
-        return cls(file, path)
+        return cls(file, path, state_of(particles))
 
     @classmethod
     def resume(
@@ -113,7 +115,7 @@ class FrameWriter:
         file = _opened(path, "r+")
         for name, data in rows.items():
             file[name].resize(count_in(file) * len(data), axis=0)
-        return cls(file, path)
+        return cls(file, path, state_of(particles))
 
     def append(self, step: int, state: State, tally: Tally) -> None:
         """Write a frame; one of the last frame's step replaces it.
@@ -144,7 +146,7 @@ class FrameWriter:
     def last(self) -> tuple[int, State, Tally]:
         """Step number, state and tally of the last frame."""
         n = count_in(self._file)
-        steps, states, tallies = _frames(self._file, n - 1, n)
+        steps, states, tallies = _frames(self._file, self._like, n - 1, n)
         return int(steps[0]), *jax.tree.map(lambda a: a[0], (states, tallies))
 
     def close(self) -> None:
@@ -203,12 +205,18 @@ def load(path: str | os.PathLike) -> Run:
             f'{path} holds a {dtype} run: call jax.config.update("jax_enable_x64", True) first.',
         )
         require(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
-        steps, frames, tallies = _frames(file, 0, count_in(file))
         scene = decode(described["scene"], Scene, "scene", arrays)
         method = decode(described["method"], Method, "method", arrays)
         scene, method = canonical((scene, method), dtype)
+        parts = {k: a if a is None else jnp.asarray(a) for k, a in described["particles"].items()}
+        require(parts["mass"] is not None and parts["volume"] is not None, "mass or volume is missing")
+        known: dict[str, Any] = parts
+        blank = jnp.zeros((len(known["mass"]), described["d"]), dtype)
+        particles = Particles(blank, blank, **known, counts=described["counts"])
+        steps, frames, tallies = _frames(
+            file, jax.eval_shape(lambda: state_of(prepare(scene, particles))), 0, count_in(file)
+        )
     last = jax.tree.map(lambda a: a[-1], frames)
-    parts: dict[str, Any] = {k: a if a is None else jnp.asarray(a) for k, a in described["particles"].items()}
     return Run(
         scene=scene,
         method=method,
@@ -216,7 +224,7 @@ def load(path: str | os.PathLike) -> Run:
         steps=jnp.asarray(steps, dtype),
         frames=frames,
         observed=None,
-        final=with_state(Particles(x=last.x, v=last.v, **parts), last),
+        final=with_state(particles, last),
         final_step=jnp.asarray(steps[-1], dtype),
         tally=jax.tree.map(lambda a: a[-1], tallies),
     )
@@ -231,6 +239,7 @@ def _describe(scene: Scene, particles: Particles, method: Method, dt: Any) -> di
     return {
         "dtype": str(dtype),
         "d": particles.dim,
+        "counts": particles.counts,
         "dt": np.asarray(dt)[()],
         "scene": encode(scene, arrays),
         "method": encode(method, arrays, "method"),
@@ -244,6 +253,8 @@ def _write_description(group: File, described: dict[str, Any]) -> None:
         group.attrs.create(name, np.bytes_(text))  # of fixed length: others lie where HDF5 has no checksum
     group.attrs["format"] = np.int64(_FORMAT)
     group.attrs["d"] = np.int64(described["d"])
+    if described["counts"] is not None:
+        group.attrs["counts"] = np.asarray(described["counts"], np.int64)
     group.attrs["dt"] = described["dt"]
     for name in ("scene", "method"):
         add_fixed(group, name, np.frombuffer(json.dumps(described[name]).encode(), np.uint8))
@@ -259,6 +270,7 @@ def _description(group: File) -> dict[str, Any]:
     return {
         "dtype": group.attrs["dtype"].decode(),
         "d": int(group.attrs["d"]),
+        "counts": tuple(group.attrs["counts"].tolist()) if "counts" in group.attrs else None,
         "dt": group.attrs["dt"],
         **{name: json.loads(group[name][...].tobytes()) for name in ("scene", "method")},
         "arrays": {name: dataset[...] for name, dataset in group["arrays"].items()},
@@ -270,15 +282,23 @@ def _rows(frame: int, step: int, dt: Any, state: State, tally: Tally) -> dict[st
     """What a frame adds to each dataset."""
     values = {"step": np.int64(step)} | {f.name: np.asarray(getattr(tally, f.name)) for f in fields(Tally)}
     row = np.array([tuple(values.values())], [(name, a.dtype) for name, a in values.items()])
-    return rows_of(frame, step * float(dt), state) | {"mpmjax/frames": row}
+    rows = rows_of(frame, step * float(dt), state) | {"mpmjax/frames": row}
+    if state.received is not None:
+        both = state.received.impulse, state.received.angular
+        rows["mpmjax/received"] = np.concatenate([np.asarray(a) for a in both], axis=1)[None]
+    return rows
 
 
-def _frames(file: File, start: int, stop: int) -> tuple[np.ndarray, State, Tally]:
-    """Step numbers, states and tallies of frames `start` to `stop`, each with a leading axis."""
+def _frames(file: File, like: State, start: int, stop: int) -> tuple[np.ndarray, State, Tally]:
+    """Step numbers, states and tallies of frames `start` to `stop`, each with a leading axis. See `states_in`."""
     table = file["mpmjax/frames"][start:stop]
     require(len(table) == stop - start, "frames are missing")
     tallies = Tally(**{f.name: jnp.asarray(table[f.name]) for f in fields(Tally)})
-    return table["step"], states_in(file, int(file["mpmjax"].attrs["d"]), start, stop), tallies
+    states = states_in(file, like, start, stop)
+    if like.received is not None:
+        both = jnp.asarray(file["mpmjax/received"][start:stop])
+        states = replace(states, received=Exchange(*jnp.split(both, [like.x.shape[1]], axis=-1)))
+    return table["step"], states, tallies
 
 
 def _opened(path: Path, mode: str) -> File:

@@ -1,4 +1,4 @@
-"""Functions of symmetric matrices, f(S) = V diag(f(s)) Vᵀ for S = V diag(s) Vᵀ: the logarithm.
+"""Functions of symmetric matrices, f(S) = V diag(f(s)) Vᵀ for S = V diag(s) Vᵀ: the logarithm, powers.
 
 Their derivatives do not differentiate V, which has none where eigenvalues coincide (F = I, the first step of every
 scene). They are written in divided differences of f, which are finite there: with A and B in the frame V,
@@ -7,10 +7,14 @@ scene). They are written in divided differences of f, which are finite there: wi
     (D²f[A, B])_ij = Σ_k f[s_i, s_k, s_j] (A_ik B_kj + B_ik A_kj)
 
 (J. L. Daleckii, S. G. Krein; N. J. Higham, Functions of Matrices, SIAM 2008, theorem 3.11 and its proof,
-doi 10.1137/1.9780898717778). First and second derivatives hold at every S; third ones are refused.
+doi 10.1137/1.9780898717778). First and second derivatives hold at every S; third ones are refused. In the parameters
+of f, if it has any, Df and f are differentiated as they stand: the derivative is again a function of S in this frame.
+
+Each function finds the frame for itself; XLA merges equal ones, so that several functions of one S cost one frame.
 """
 
 import abc
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -66,6 +70,52 @@ class Logarithm(AbstractSpectral):
         return -1 / s**2
 
 
+class PowerLessOne(AbstractSpectral):
+    """eᶜ Sᵃ − I, of positive definite S: exactly zero for a = c = 0, and to rounding of itself near there."""
+
+    exponent: Array
+    """a [-], shape (*batch)."""
+    shift: Array
+    """c [-], shape (*batch)."""
+
+    def of(self, s: Array) -> Array:
+        """exp(a ln s + c) − 1."""
+        return jnp.expm1(self.exponent * jnp.log(s) + self.shift)
+
+    def slope(self, a: Array, b: Array) -> Array:
+        """eᶜ (bᵃ − aᵃ)/(b − a), the exponent upstairs."""
+        gap = (b - a) / a
+        ratio = jnp.expm1(self.exponent * jnp.log1p(gap)) / jnp.where(gap == 0, 1, gap)
+        return self._power(a) * jnp.where(gap == 0, self.exponent, ratio) / a
+
+    def curvature(self, s: Array) -> Array:
+        """a (a − 1) eᶜ sᵃ⁻²."""
+        return self.exponent * (self.exponent - 1) * self._power(s) / s**2
+
+    def _power(self, s: Array) -> Array:
+        return jnp.exp(self.exponent * jnp.log(s) + self.shift)
+
+
+class _Change(AbstractSpectral):
+    """The change of a function by its parameters, a function of the same eigenvalue."""
+
+    function: AbstractSpectral
+    change: AbstractSpectral
+    """Of the function's class, each parameter its rate."""
+
+    def of(self, s: Array) -> Array:
+        return self._along(lambda f: f.of(s))
+
+    def slope(self, a: Array, b: Array) -> Array:
+        return self._along(lambda f: f.slope(a, b))
+
+    def curvature(self, s: Array) -> Array:
+        return self._along(lambda f: f.curvature(s))
+
+    def _along(self, value: Callable[[Any], Array]) -> Array:
+        return jax.jvp(value, (self.function,), (self.change,))[1]
+
+
 @jax.custom_jvp
 def _function(f: AbstractSpectral, S: Matrix) -> Matrix:
     s, V = la.symmetric_eigen(S)
@@ -74,8 +124,11 @@ def _function(f: AbstractSpectral, S: Matrix) -> Matrix:
 
 @_function.defjvp
 def _function_jvp(primals: Any, tangents: Any) -> Any:
-    (f, S), (_, dS) = primals, tangents
-    return _function(f, S), _differential(f, S, dS)
+    (f, S), (df, dS) = primals, tangents
+    change = _differential(f, S, dS)
+    if jax.tree.leaves(f):
+        change = change + _function(_Change(f, df), S)
+    return _function(f, S), change
 
 
 @jax.custom_jvp
@@ -87,8 +140,11 @@ def _differential(f: AbstractSpectral, S: Matrix, A: Matrix) -> Matrix:
 
 @_differential.defjvp
 def _differential_jvp(primals: Any, tangents: Any) -> Any:
-    (f, S, A), (_, dS, dA) = primals, tangents
-    return _differential(f, S, A), _differential(f, S, dA) + _second_differential(f, S, A, dS)
+    (f, S, A), (df, dS, dA) = primals, tangents
+    change = _differential(f, S, dA) + _second_differential(f, S, A, dS)
+    if jax.tree.leaves(f):
+        change = change + _differential(_Change(f, df), S, A)
+    return _differential(f, S, A), change
 
 
 @jax.custom_jvp
@@ -115,7 +171,8 @@ def _second_differential(f: AbstractSpectral, S: Matrix, A: Matrix, B: Matrix) -
 def _second_differential_jvp(primals: Any, tangents: Any) -> Any:
     raise NotImplementedError(
         "Functions of a strain's principal values have first and second derivatives, no third one: with Hencky's law "
-        "take first derivatives through implicit steps, and second ones through explicit steps only."
+        "and those that yield take first derivatives through implicit steps, and second ones through explicit steps "
+        "only."
     )
 
 

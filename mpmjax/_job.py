@@ -3,19 +3,17 @@ words."""
 
 import csv
 import tomllib
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._checks import require, require_positive
 from mpmjax._fit import FitResult, fit_curve, gauge
 from mpmjax._method import Explicit, Method
-from mpmjax._particles import Particles
+from mpmjax._particles import Particles, join
 from mpmjax._region import AbstractRegion
 from mpmjax._sample import fill
 from mpmjax._scene import Scene, prepare
@@ -101,8 +99,7 @@ def read_plan(path: Path) -> Plan:
 
         def build(n: int) -> tuple[Scene, Particles]:
             scene = decode(_refined(table, n), Scene)
-            filled = [_fill(scene, group, i, run.dtype) for i, group in enumerate(groups, 1)]
-            return scene, prepare(scene, _joined(filled))
+            return scene, prepare(scene, _filled(scene, groups, run.dtype))
 
         scene, particles = build(1)
         fit = None if fit_table is None else _curve_settings(fit_table, path.parent)
@@ -265,23 +262,36 @@ def _refined(table: dict[str, Any], n: int) -> dict[str, Any]:
     grid = table.get("grid")
     if n == 1 or not isinstance(grid, dict):
         return table
-    lists = [key for key, value in table.get("material", {}).items() if isinstance(value, list)]
-    require(not lists, f"[material] {', '.join(lists)}: refinement needs one number for all particles.")
+    materials = table.get("material", {})
+    for material in materials if isinstance(materials, list) else [materials]:
+        lists = [key for key, value in material.items() if isinstance(value, list)]
+        require(not lists, f"[material] {', '.join(lists)}: refinement needs one number for all particles.")
     finer = {key: [n * k for k in grid[key]] for key in ("shape", "origin") if key in grid}
     return table | {"grid": grid | finer | {"spacing": grid["spacing"] / n}}
 
 
-def _fill(scene: Scene, table: Any, number: int, dtype: str) -> Particles:
-    where = f"[[particles]] {number}"
-    given = arguments(fill, table, where, given=("grid", "dtype"))
-    try:
-        return fill(grid=scene.grid, dtype=dtype, **given)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
-
-
-def _joined(groups: list[Particles]) -> Particles:
-    return jax.tree.map(lambda *a: jnp.concatenate(a), *groups)
+def _filled(scene: Scene, tables: list[Any], dtype: str) -> Particles:
+    """The particles of all tables, those of each material together, in the materials' order."""
+    filled: list[list[Particles]] = [[] for _ in scene.laws]
+    for number, table in enumerate(tables, 1):
+        where = f"[[particles]] {number}"
+        require(isinstance(table, dict), f"{where} must be a table, got {table!r}")
+        material, rest = table.get("material", 1), {key: value for key, value in table.items() if key != "material"}
+        known = range(1, len(scene.laws) + 1)
+        require(
+            type(material) is int and material in known,
+            f"{where} material must be the number of a [[material]], from 1 to {len(scene.laws)}, got {material!r}.",
+        )
+        given = arguments(fill, rest, where, given=("grid", "dtype"))
+        try:
+            filled[material - 1].append(fill(grid=scene.grid, dtype=dtype, **given))
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
+    for number, sets in enumerate(filled, 1):
+        require(
+            len(sets) > 0, f"[[material]] {number} has no particles: name it in a [[particles]] table, or leave it out."
+        )
+    return join(*(replace(join(*sets), counts=None) for sets in filled))
 
 
 def _curve_settings(table: Any, folder: Path) -> CurveSettings:

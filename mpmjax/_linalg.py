@@ -3,10 +3,12 @@ the principal frame.
 
 Every matrix has shape (d, d, *batch), d = 1, 2 or 3, with its two matrix axes first. The expressions are unrolled over
 the components, so that XLA sees plain elementwise arithmetic over the batch: on a CPU that is some twenty times faster
-than batched LAPACK or tiny `dot_general`s, and its derivatives are as cheap.
+than batched LAPACK or tiny `dot_general`s, and its derivatives are as cheap. A matrix is taken apart in one operation
+(`entries`) and put together in one (`assemble`), whose transposes are each other: a component that is indexed each time
+it is used would be added to a whole matrix of zeros each time in reverse mode.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -16,12 +18,20 @@ from mpmjax._types import Array, Compliance, Float, Matrix
 
 _NEWTON_STEPS = 30  # on the quartic of the 3-D rotation: halves the error at a double root, else squares it
 _POLISH_STEPS = 2  # on the rotation itself
-_JACOBI_SWEEPS = {1: 0, 2: 1, 3: 6}  # by dimension: in 2-D one rotation is the closed form; 3-D converges quadratically
+_JACOBI_SWEEPS = {1: 0, 2: 1, 3: 4}  # by dimension: in 2-D one rotation is the closed form; 3-D converges quadratically
 
 
 def assemble(rows: list[list[Array]]) -> Matrix:
     """A matrix from its components, `rows[i][j]` having the shape of the batch."""
-    return jnp.stack([jnp.stack(row) for row in rows])
+    flat = jnp.stack([entry for row in rows for entry in row])
+    return flat.reshape(len(rows), len(rows[0]), *flat.shape[1:])
+
+
+def entries(A: Float[Array, "a b *p"]) -> list[list[Array]]:
+    """The components of a matrix, `rows[i][j]` having the shape of the batch."""
+    a, b, *batch = A.shape
+    flat = jnp.unstack(A.reshape(a * b, *batch))
+    return [list(flat[i * b : (i + 1) * b]) for i in range(a)]
 
 
 def identity_like(A: Matrix) -> Matrix:
@@ -38,10 +48,13 @@ def transpose(A: Matrix) -> Matrix:
 
 def matmul(A: Matrix, B: Matrix) -> Matrix:
     """A B."""
-    d = A.shape[0]
-    return assemble(
-        [[sum((A[i, k] * B[k, j] for k in range(1, d)), A[i, 0] * B[0, j]) for j in range(d)] for i in range(d)]
-    )
+    columns = list(zip(*entries(B), strict=True))
+    return assemble([[_dot(row, column) for column in columns] for row in entries(A)])
+
+
+def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
+    first, *others = (x * y for x, y in zip(a, b, strict=True))
+    return sum(others, first)
 
 
 def product(A: Float[Array, "a k *p"], B: Float[Array, "k b *p"]) -> Float[Array, "a b *p"]:
@@ -59,31 +72,24 @@ def matrix_of(linear: Callable[[Matrix], Matrix], like: Matrix) -> Float[Array, 
 
 def trace(A: Matrix) -> Array:
     """tr A, shape (*batch)."""
-    return sum((A[i, i] for i in range(1, A.shape[0])), A[0, 0])
+    first, *others = (row[i] for i, row in enumerate(entries(A)))
+    return sum(others, first)
 
 
 def double_dot(A: Matrix, B: Matrix) -> Array:
     """The Frobenius inner product A : B, shape (*batch)."""
-    d = A.shape[0]
-    pairs = [A[i, j] * B[i, j] for i in range(d) for j in range(d)]
-    return sum(pairs[1:], pairs[0])
+    return _dot(*([entry for row in entries(M) for entry in row] for M in (A, B)))
 
 
 def determinant(A: Matrix) -> Array:
     """det A, shape (*batch)."""
-    C = cofactor(A)
-    return sum((A[0, j] * C[0, j] for j in range(1, A.shape[0])), A[0, 0] * C[0, 0])
+    a = entries(A)
+    return _dot(a[0], _cofactors(a)[0])
 
 
 def cofactor(A: Matrix) -> Matrix:
     """The cofactor matrix det(A) A⁻ᵀ = ∂ det A / ∂A, polynomial in A and so defined for singular A."""
-    match A.shape[0]:
-        case 1:
-            return jnp.ones_like(A)
-        case 2:
-            return assemble([[A[1, 1], -A[1, 0]], [-A[0, 1], A[0, 0]]])
-        case _:
-            return _cross_cofactor(A, A)
+    return assemble(_cofactors(entries(A)))
 
 
 def cofactor_differential(A: Matrix, dA: Matrix) -> Matrix:
@@ -94,17 +100,29 @@ def cofactor_differential(A: Matrix, dA: Matrix) -> Matrix:
         case 2:
             return cofactor(dA)
         case _:
-            return _cross_cofactor(A, dA) + _cross_cofactor(dA, A)
+            a, da = entries(A), entries(dA)
+            return assemble(_cross_cofactors(a, da)) + assemble(_cross_cofactors(da, a))
 
 
-def _cross_cofactor(A: Matrix, B: Matrix) -> Matrix:
+def _cofactors(a: list[list[Array]]) -> list[list[Array]]:
+    """The cofactor matrix by components."""
+    match len(a):
+        case 1:
+            return [[jnp.ones_like(a[0][0])]]
+        case 2:
+            return [[a[1][1], -a[1][0]], [-a[0][1], a[0][0]]]
+        case _:
+            return _cross_cofactors(a, a)
+
+
+def _cross_cofactors(a: list[list[Array]], b: list[list[Array]]) -> list[list[Array]]:
     """In 3-D, the bilinear form whose value at (A, A) is the cofactor matrix of A."""
 
     def minor(i: int, j: int) -> Array:
         i1, i2, j1, j2 = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
-        return A[i1, j1] * B[i2, j2] - A[i1, j2] * B[i2, j1]
+        return a[i1][j1] * b[i2][j2] - a[i1][j2] * b[i2][j1]
 
-    return assemble([[minor(i, j) for j in range(3)] for i in range(3)])
+    return [[minor(i, j) for j in range(3)] for i in range(3)]
 
 
 def symmetric_eigen(S: Matrix) -> tuple[Array, Matrix]:
@@ -124,7 +142,7 @@ def symmetric_eigen(S: Matrix) -> tuple[Array, Matrix]:
     d = S.shape[0]
 
     def sweep(_: Array | int, state: tuple[Matrix, Matrix]) -> tuple[Matrix, Matrix]:
-        A, V = ([[M[i, j] for j in range(d)] for i in range(d)] for M in state)
+        A, V = map(entries, state)
         for p, q in pairs(d):
             gap, twice = A[q][q] - A[p][p], 2 * A[p][q]
             scale = jnp.abs(gap) + jnp.hypot(gap, twice)
@@ -263,17 +281,17 @@ def rotation_differential(R: Matrix, compliance: Compliance, dF: Matrix) -> Matr
     if d == 1:
         return jnp.zeros_like(dF)
     if d == 2:
-        V = matmul(transpose(R), dF)
-        omega = compliance[0, 0] * (V[1, 0] - V[0, 1])
-        return omega * assemble([[R[0, 1], -R[0, 0]], [R[1, 1], -R[1, 0]]])
+        V, r = entries(matmul(transpose(R), dF)), entries(R)
+        omega = compliance[0, 0] * (V[1][0] - V[0][1])
+        return omega * assemble([[r[0][1], -r[0][0]], [r[1][1], -r[1][0]]])
     return matmul(R, _skew(_spin(R, compliance, dF)))
 
 
 def _spin(R: Matrix, compliance: Compliance, dF: Matrix) -> tuple[Array, Array, Array]:
     """ω in 3-D."""
-    V = matmul(transpose(R), dF)
-    v = (V[2, 1] - V[1, 2], V[0, 2] - V[2, 0], V[1, 0] - V[0, 1])
-    x, y, z = (sum((compliance[i, j] * v[j] for j in range(1, 3)), compliance[i, 0] * v[0]) for i in range(3))
+    V = entries(matmul(transpose(R), dF))
+    v = (V[2][1] - V[1][2], V[0][2] - V[2][0], V[1][0] - V[0][1])
+    x, y, z = (_dot(row, v) for row in entries(compliance))
     return x, y, z
 
 
@@ -284,7 +302,8 @@ def _skew(w: tuple[Array, Array, Array]) -> Matrix:
 
 
 def _rotation_2d(F: Matrix) -> Matrix:
-    cos, sin = F[0, 0] + F[1, 1], F[1, 0] - F[0, 1]
+    (a, b), (c, d) = entries(F)
+    cos, sin = a + d, c - b
     unit = jnp.hypot(cos, sin)
     singular = unit == 0
     cos = jnp.where(singular, 1, cos) / jnp.where(singular, 1, unit)
@@ -320,14 +339,15 @@ def _largest_root(F: Matrix) -> Array:
 
 def _dominant_quaternion(F: Matrix, root: Array) -> list[Array]:
     """The unit quaternion that maximises tr(RᵀF) = qᵀ K q: the largest column of adj(K − λI), λ the largest root."""
-    t = trace(F)
-    z = [F[2, 1] - F[1, 2], F[0, 2] - F[2, 0], F[1, 0] - F[0, 1]]
-    K = [[t, *z], *([z[i], *(F[i, j] + F[j, i] - (t if i == j else 0) for j in range(3))] for i in range(3))]
+    t, f = trace(F), entries(F)
+    z = [f[2][1] - f[1][2], f[0][2] - f[2][0], f[1][0] - f[0][1]]
+    K = [[t, *z], *([z[i], *(f[i][j] + f[j][i] - (t if i == j else 0) for j in range(3))] for i in range(3))]
     K = [[K[i][j] - (root if i == j else 0) for j in range(4)] for i in range(4)]
 
     def signed_minor(i: int, j: int) -> Array:
         rows, columns = ([k for k in range(4) if k != skip] for skip in (i, j))
-        return (-1) ** (i + j) * determinant(assemble([[K[r][c] for c in columns] for r in rows]))
+        minor = [[K[r][c] for c in columns] for r in rows]
+        return (-1) ** (i + j) * _dot(minor[0], _cofactors(minor)[0])
 
     upper = {(i, j): signed_minor(i, j) for i in range(4) for j in range(i, 4)}
     columns = [[upper[min(i, j), max(i, j)] for i in range(4)] for j in range(4)]

@@ -1,10 +1,11 @@
 """The ways to update the grid's velocity in a step.
 
 A method says how the nodes move (`move`) and what impulse the elastic force gives them meanwhile (`elastic_impulse`);
-walls, contact, friction, transfers, reports and derivatives are the same for all. Two constants say what it wants of
-P2G: body forces `centred` in the step, and whether it `needs_force` apart from the momentum that makes. Backward Euler
-and the methods of second order are made of stages M (v − a) = c f(u + c v), f(u) the elastic force at the nodal
-displacement u: each is one linear solve, with f(u) = f(0) − H u, or Newton's method.
+walls, contact, friction, transfers, reports and derivatives are the same for all. Three constants say what it wants of
+P2G: body forces `centred` in the step, whether it `needs_force` apart from the momentum that makes, and whether its
+viscosity is `lagged`, that of the particles' stored velocity gradients. Backward Euler and the methods of second order
+are made of stages M (v − a) = c (f(u + c v) − D v), f(u) the elastic force at the nodal displacement u and D v that of
+viscosity: each is one linear solve, with f(u) = f(0) − H u, or Newton's method.
 """
 
 from typing import ClassVar
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 from mpmjax._checks import require_between
 from mpmjax._conjugate_residual import ConjugateResidual
 from mpmjax._guess import Guess
-from mpmjax._hessian import AnalyticHessian, Hessian
+from mpmjax._hessian import AnalyticHessian, Hessian, damped
 from mpmjax._implicit import Linearised, LinearProblem, Newton, NewtonProblem, SolveInfo, no_solve, solve
 from mpmjax._metric import Metric
 from mpmjax._nodes import Nodes
@@ -32,6 +33,8 @@ class NodeMotion(eqx.Module):
     v^{n+1}."""
     inner: NodeVector | None = None
     """The same up to an inner stage, the displacement there over Δt; None without one."""
+    resisted: NodeVector | None = None
+    """The velocity that viscosity resists over the step [m/s], shape (n, d); None where the solve has no viscosity."""
 
     @property
     def carrier(self) -> NodeVector:
@@ -40,7 +43,9 @@ class NodeMotion(eqx.Module):
 
     def slowed(self, loss: NodeVector) -> "NodeMotion":
         """Changed by an impulse that acts evenly over the step: half of it counts for the mean."""
-        return NodeMotion(self.velocity + loss, None if self.mean is None else self.mean + loss / 2, self.inner)
+        return NodeMotion(
+            self.velocity + loss, None if self.mean is None else self.mean + loss / 2, self.inner, self.resisted
+        )
 
 
 class Explicit(eqx.Module):
@@ -55,11 +60,12 @@ class Explicit(eqx.Module):
     guess: ClassVar[Guess] = Guess.GRID_VELOCITY
     centred: ClassVar[bool] = False
     needs_force: ClassVar[bool] = False
+    lagged: ClassVar[bool] = True
 
     def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         """The nodes' motion and the solve's report."""
         del guess
-        v = jnp.where(nodes.free, nodes.explicit_velocity(), nodes.conditions.velocity)
+        v = nodes.constraint.split(nodes.explicit_velocity(), nodes.prescribed)
         return NodeMotion(v), no_solve(v.dtype)
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
@@ -70,7 +76,7 @@ class Explicit(eqx.Module):
 
 class SemiImplicit(eqx.Module):
     """The semi-implicit update: (M + βΔt²H) v^{n+1} = M v*, force and H at the start of the step (reference, eqs. 3,
-    6).
+    6); with viscosity (M + βΔt D + βΔt²H) v^{n+1} = M v* − (1 − β) Δt D v^n.
 
     First order in time. On a mode of frequency ω the amplification is (1 + βz)^(−½) with z = (ωΔt)² while
     z < 4/(1−β)²: stable for every Δt if β ≥ ½, else for z ≤ 4/(1−2β). β = 0 is the explicit step; β = 1 one Newton step
@@ -99,24 +105,27 @@ class SemiImplicit(eqx.Module):
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = False
     needs_force: ClassVar[bool] = True
+    lagged: ClassVar[bool] = False
 
     def __check_init__(self):
         require_between("SemiImplicit's beta", self.beta, 0, 1)
 
     def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         """The nodes' motion and the solve's report."""
-        predictor = nodes.explicit_velocity()
+        predictor, v0, beta = nodes.explicit_velocity(), nodes.admitted_velocity(), self.beta
+        viscous = nodes.potential.viscous
+        impulse = nodes.mass[:, None] * predictor
         problem = LinearProblem(
             mass=nodes.mass,
-            factor=self.beta * nodes.dt**2,
-            hessian=self.hessian.at_rest(nodes.potential, predictor),
-            rhs=nodes.mass[:, None] * predictor,
-            free=nodes.free,
-            prescribed=nodes.conditions.velocity,
+            factor=beta * nodes.dt**2,
+            hessian=damped(self.hessian.at_rest(nodes.potential, predictor), nodes.potential, 1 / nodes.dt),
+            rhs=impulse - (1 - beta) * nodes.dt * nodes.potential.drag(v0) if viscous else impulse,
+            constraint=nodes.constraint,
+            prescribed=nodes.prescribed,
             metric=self.metric,
         )
         v, info = solve(problem, guess, Linearised(self.solver), self.adjoint_solver)
-        return NodeMotion(v), info
+        return NodeMotion(v, resisted=(1 - beta) * v0 + beta * v if viscous else None), info
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt f(0) − βΔt² H v [kg m/s]."""
@@ -147,11 +156,12 @@ class BackwardEuler(eqx.Module):
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = False
     needs_force: ClassVar[bool] = True
+    lagged: ClassVar[bool] = False
 
     def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         """The nodes' motion and the solve's report."""
         v, info = _Stage(nodes.inertial_velocity(), nodes.dt).solve(nodes, guess, self)
-        return NodeMotion(v), info
+        return NodeMotion(v, resisted=v if nodes.potential.viscous else None), info
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt f(Δt v) [kg m/s]."""
@@ -187,13 +197,14 @@ class ImplicitMidpoint(eqx.Module):
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = True
     needs_force: ClassVar[bool] = True
+    lagged: ClassVar[bool] = False
 
     def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         """The nodes' motion and the solve's report."""
         v0, half = nodes.admitted_velocity(), nodes.dt / 2
         stage = _Stage(v0 + half * nodes.acceleration, half)
         mean, info = stage.solve(nodes, guess, self)
-        return NodeMotion(2 * mean - v0, mean), info
+        return NodeMotion(2 * mean - v0, mean, resisted=mean if nodes.potential.viscous else None), info
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt f(½Δt v̄) [kg m/s]."""
@@ -232,6 +243,7 @@ class TRBDF2(eqx.Module):
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = True
     needs_force: ClassVar[bool] = True
+    lagged: ClassVar[bool] = False
 
     def __check_init__(self):
         require_between("TRBDF2's rho", self.rho, 0, 1)
@@ -247,14 +259,15 @@ class TRBDF2(eqx.Module):
         _, q0, q1, q2 = self.weights()
         dt, g, v0 = nodes.dt, nodes.acceleration, nodes.admitted_velocity()
         c = q2 * dt  # = ½γΔt
-        pull = nodes.per_mass(nodes.force)
+        viscous = nodes.potential.viscous
+        pull = nodes.per_mass(nodes.force - nodes.potential.drag(v0) if viscous else nodes.force)
         trapezoidal = _Stage(v0 + c * (pull + 2 * g), c, c * v0)
         middle, first = trapezoidal.solve(nodes, guess, self)
-        later_pull = (middle - trapezoidal.inertial) / c  # f_γ/m, by the stage's own equation
+        later_pull = (middle - trapezoidal.inertial) / c  # f_γ/m, viscosity's with it, by the stage's own equation
         last = _Stage(v0 + dt * (q0 * pull + q1 * later_pull + g), c, dt * (q0 * v0 + q1 * middle))
         v, second = last.solve(nodes, middle, self)
-        inner = q2 * (v0 + middle)
-        return NodeMotion(v, q0 * v0 + q1 * middle + q2 * v, inner), first.beside(second)
+        inner, mean = q2 * (v0 + middle), q0 * v0 + q1 * middle + q2 * v
+        return NodeMotion(v, mean, inner, mean if viscous else None), first.beside(second)
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt (q_0 f_0 + q_1 f_γ + q_2 f_1) [kg m/s]."""
@@ -267,8 +280,16 @@ class TRBDF2(eqx.Module):
 Method = Explicit | SemiImplicit | BackwardEuler | ImplicitMidpoint | TRBDF2
 
 
+def viscous_impulse(nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
+    """−Δt D v [kg m/s] of the velocity that it resisted, or what P2G knew of it; None without viscosity, and where P2G
+    joined it to the elastic force."""
+    if motion.resisted is not None:
+        return -nodes.dt * nodes.potential.drag(motion.resisted)
+    return None if nodes.viscous is None else jnp.where(nodes.occupied, nodes.dt * nodes.viscous, 0)
+
+
 class _Stage(eqx.Module):
-    """M (v − a) = c f(u + c v)."""
+    """M (v − a) = c (f(u + c v) − D v)."""
 
     inertial: NodeVector
     """a [m/s]."""
@@ -283,8 +304,8 @@ class _Stage(eqx.Module):
         """The velocity and the solve's report."""
         system = {
             "mass": nodes.mass,
-            "free": nodes.free,
-            "prescribed": nodes.conditions.velocity,
+            "constraint": nodes.constraint,
+            "prescribed": nodes.prescribed,
             "metric": method.metric,
         }
         match method.solution:
@@ -293,7 +314,7 @@ class _Stage(eqx.Module):
                 force = nodes.force if self.displaced is None else nodes.force - action(self.displaced)
                 problem = LinearProblem(
                     factor=self.length**2,
-                    hessian=action,
+                    hessian=damped(action, nodes.potential, 1 / self.length),
                     rhs=nodes.mass[:, None] * self.inertial + self.length * force,
                     **system,
                 )

@@ -1,15 +1,45 @@
 """Prescribed motions: data, never callables, so that they can be saved, differentiated and changed without
 compiling."""
 
+import abc
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._checks import is_traced, require, require_finite
-from mpmjax._types import Array, Float, Scalar
+from mpmjax._checks import coordinates, is_traced, require, require_finite
+from mpmjax._types import Array, Float, Point, Scalar
+
+Times = Float[Array, "j"] | Float[np.ndarray, "j"] | tuple[float | int, ...] | list[float | int]
+Displacements = Float[Array, "j d"] | Float[np.ndarray, "j d"] | tuple | list
 
 
-class Motion(eqx.Module):
+class AbstractMotion(eqx.Module):
+    """The motion of a rigid body, given by that of each of its points X, their places before it."""
+
+    @property
+    @abc.abstractmethod
+    def dim(self) -> int:
+        """Space dimension d."""
+
+    @abc.abstractmethod
+    def origin(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """The points X that are at x at time t [m], each (m, d)."""
+
+    @abc.abstractmethod
+    def turned(self, a: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """Vectors that turn with the body, at time t, each (m, d)."""
+
+    @abc.abstractmethod
+    def velocity_of(self, X: Float[Array, "m d"], t: Scalar, dt: Scalar) -> Float[Array, "m d"]:
+        """(place at t + dt − place at t)/dt of the points X [m/s], shape (m, d)."""
+
+    @abc.abstractmethod
+    def pivot(self, middle: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
+        """The place at time t [m], (d,), of the point about which torques on a body with a given middle are taken."""
+
+
+class Motion(AbstractMotion):
     """A displacement that is piecewise linear in time, at rest before the first and after the last of its times.
 
     Args:
@@ -17,30 +47,143 @@ class Motion(eqx.Module):
         displacement: displacement at each of them [m], (j, d).
     """
 
-    times: Float[Array, "j"] | Float[np.ndarray, "j"] | tuple[float | int, ...] | list[float | int]
-    displacement: Float[Array, "j d"] | Float[np.ndarray, "j d"] | tuple | list
+    times: Times
+    displacement: Displacements
 
     def __check_init__(self):
-        times, displacement = jnp.shape(jnp.asarray(self.times)), jnp.shape(jnp.asarray(self.displacement))
-        require(
-            len(times) == 1 and len(displacement) == 2 and times[0] == displacement[0],
-            f"A motion needs one row of displacements a time, got shapes {times} and {displacement}.",
-        )
-        require_finite("A motion's times", self.times)
-        require_finite("A motion's displacement", self.displacement)
-        if not is_traced(self.times):
-            require(np.diff(np.asarray(self.times)) > 0, f"A motion's times must increase, got {self.times}.")
+        _check_rows("A motion", self.times, self.displacement)
+
+    @property
+    def dim(self) -> int:
+        """That of the displacement."""
+        return jnp.shape(jnp.asarray(self.displacement))[1]
 
     def at(self, t: Scalar) -> Float[Array, "d"]:
         """Displacement at time t [m], shape (d,)."""
-        times, displacement = jnp.asarray(self.times), jnp.asarray(self.displacement)
-        return jnp.stack([jnp.interp(t, times, displacement[:, a]) for a in range(displacement.shape[1])])
+        return _interpolated(t, jnp.asarray(self.times), jnp.asarray(self.displacement))
 
     def velocity(self, t: Scalar, dt: Scalar) -> Float[Array, "d"]:
         """Mean velocity from t to t + dt [m/s], shape (d,): what moves a node exactly along the displacement."""
         return (self.at(t + dt) - self.at(t)) / dt
 
+    def origin(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """x less the displacement."""
+        return x - self.at(t)
+
+    def turned(self, a: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """As they are."""
+        del t
+        return a
+
+    def velocity_of(self, X: Float[Array, "m d"], t: Scalar, dt: Scalar) -> Float[Array, "m d"]:
+        """The same for all."""
+        return jnp.broadcast_to(self.velocity(t, dt), X.shape)
+
+    def pivot(self, middle: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
+        """The middle."""
+        return middle + self.at(t)
+
+
+class RigidMotion(AbstractMotion):
+    """A displacement d and a rotation R about a centre, x = c + d(t) + R(t) (X − c): both are piecewise linear in time,
+    at rest before the first and after the last of its times.
+
+    The rotation is an angle in 2-D, in 3-D a rotation vector, the axis times the angle; so between two times the spin
+    is constant where the axis is. A step takes points along chords: they end where the rotation takes them, whatever
+    the step.
+
+    Args:
+        times: increasing times [s], (j,).
+        displacement: displacement of the centre at each of them [m], (j, d).
+        rotation: rotation at each of them [rad], (j,) in 2-D, (j, 3) in 3-D.
+        centre: the point about which it turns, and torques are taken, before the motion [m], (d,).
+    """
+
+    times: Times
+    displacement: Displacements
+    rotation: Times | Float[Array, "j r"] | Float[np.ndarray, "j r"] | tuple | list
+    centre: Point
+
+    def __check_init__(self):
+        _check_rows("A rigid motion", self.times, self.displacement)
+        d, shape = self.dim, jnp.shape(jnp.asarray(self.rotation))
+        require(d in (2, 3), f"A rigid motion is two- or three-dimensional, got {d} coordinates: take a Motion.")
+        expected = (len(self.times),) if d == 2 else (len(self.times), 3)
+        require(shape == expected, f"A rigid motion's rotation must have shape {expected} here, got {shape}.")
+        require_finite("A rigid motion's rotation", self.rotation)
+        require(
+            coordinates("A rigid motion's centre", self.centre) == d,
+            f"A rigid motion's centre must have {d} coordinates, as its displacement has, got {self.centre}.",
+        )
+        require_finite("A rigid motion's centre", self.centre)
+
+    @property
+    def dim(self) -> int:
+        """That of the displacement."""
+        return jnp.shape(jnp.asarray(self.displacement))[1]
+
+    def at(self, t: Scalar) -> Float[Array, "d"]:
+        """Displacement of the centre at time t [m], shape (d,)."""
+        return _interpolated(t, jnp.asarray(self.times), jnp.asarray(self.displacement))
+
+    def rotation_at(self, t: Scalar) -> Float[Array, "r"]:
+        """Angle or rotation vector at time t [rad], shape (1,) or (3,)."""
+        rotation = jnp.asarray(self.rotation)
+        return _interpolated(t, jnp.asarray(self.times), rotation.reshape(len(rotation), -1))
+
+    def origin(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """c + Rᵀ (x − c − d)."""
+        centre = jnp.asarray(self.centre, x.dtype)
+        return centre + _turn(x - centre - self.at(t), -self.rotation_at(t))
+
+    def turned(self, a: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """R a."""
+        return _turn(a, self.rotation_at(t))
+
+    def velocity_of(self, X: Float[Array, "m d"], t: Scalar, dt: Scalar) -> Float[Array, "m d"]:
+        """That of the centre, and the change of R (X − c)."""
+        arm = X - jnp.asarray(self.centre, X.dtype)
+        return ((self.at(t + dt) - self.at(t)) + (self.turned(arm, t + dt) - self.turned(arm, t))) / dt
+
+    def pivot(self, middle: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
+        """The centre."""
+        return jnp.asarray(self.centre, middle.dtype) + self.at(t)
+
 
 def still(dim: int) -> Motion:
     """No motion in `dim` dimensions."""
     return Motion((0.0,), ((0.0,) * dim,))
+
+
+def _check_rows(name: str, times: Times, displacement: Displacements) -> None:
+    j, rows = jnp.shape(jnp.asarray(times)), jnp.shape(jnp.asarray(displacement))
+    require(
+        len(j) == 1 and len(rows) == 2 and j[0] == rows[0],
+        f"{name} needs one row of displacements a time, got shapes {j} and {rows}.",
+    )
+    require_finite(f"{name}'s times", times)
+    require_finite(f"{name}'s displacement", displacement)
+    if not is_traced(times):
+        require(np.diff(np.asarray(times)) > 0, f"{name}'s times must increase, got {times}.")
+
+
+def _interpolated(t: Scalar, times: Float[Array, "j"], values: Float[Array, "j c"]) -> Float[Array, "c"]:
+    """Each column of the values, piecewise linear in time."""
+    return jnp.stack([jnp.interp(t, times, values[:, a]) for a in range(values.shape[1])])
+
+
+def _turn(a: Float[Array, "m d"], rotation: Float[Array, "r"]) -> Float[Array, "m d"]:
+    """Vectors turned by an angle, or by a rotation vector r (O. Rodrigues): a + (sin θ/θ) r × a + ((1 − cos θ)/θ²)
+    r × (r × a), θ = ‖r‖."""
+    if rotation.shape == (1,):
+        cos, sin = jnp.cos(rotation[0]), jnp.sin(rotation[0])
+        return jnp.stack([cos * a[:, 0] - sin * a[:, 1], sin * a[:, 0] + cos * a[:, 1]], axis=1)
+    square = (rotation**2).sum()
+    small = square < 1e-3  # where the quotients are their series, to the last digit and with all their derivatives
+    angle = jnp.sqrt(jnp.where(small, 1, square))
+    once = jnp.where(small, 1 - square / 6 + square**2 / 120 - square**3 / 5040, jnp.sin(angle) / angle)
+    twice = jnp.where(
+        small, 1 / 2 - square / 24 + square**2 / 720 - square**3 / 40320, 2 * (jnp.sin(angle / 2) / angle) ** 2
+    )
+    across = jnp.cross(rotation, a)
+    return a + once * across + twice * jnp.cross(rotation, across)

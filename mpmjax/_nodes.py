@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._boundary import Conditions, combine
+from mpmjax._constraint import Constraint
 from mpmjax._crossing import spread
 from mpmjax._kernel import Stencil
 from mpmjax._mirror import Contact, Mirror, contacts, mirror
@@ -13,6 +14,19 @@ from mpmjax._potential import ElasticPotential
 from mpmjax._scene import Scene
 from mpmjax._transfer import p2g
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
+
+_PARALLEL = 1e-2  # a normal whose part in free components is smaller is prescribed by the others
+
+
+class Grasp(eqx.Module):
+    """The colliders' normals in the components that nothing prescribes."""
+
+    normal: NodeVector
+    """The unit vector along the normal's free part, shape (n, d); zero where there is none."""
+    reach: NodeScalar
+    """The length of that part of the normal [-], shape (n,)."""
+    speed: NodeScalar
+    """The velocity along it [m/s] with which the whole normal component is the collider's, shape (n,)."""
 
 
 class Nodes(eqx.Module):
@@ -36,6 +50,8 @@ class Nodes(eqx.Module):
     """Φ, of nodal displacements."""
     conditions: Conditions
     """What the boundaries prescribe."""
+    viscous: NodeVector | None = None
+    """The part of viscosity in an explicit step's force [N], shape (n, d), where it was wanted apart."""
     contacts: tuple[Contact, ...] = ()
     """The scene's contact planes, of which none holds anything here."""
 
@@ -44,9 +60,46 @@ class Nodes(eqx.Module):
         """The components that nothing prescribes, on nodes that have mass."""
         return self.occupied & ~self.conditions.fixed
 
+    @property
+    def grasp(self) -> Grasp | None:
+        """The colliders' normals, held or not, as far as they ask for more than the prescribed components give.
+
+        With components a prescribed, n·v = n·v_c says Σ_free n v = n·v_c − Σ_a n_a v_a.
+        """
+        touch = self.conditions.touch
+        if touch is None:
+            return None
+        part = jnp.where(self.free, touch.normal, 0)
+        square = (part**2).sum(axis=1)
+        some = square > _PARALLEL**2
+        reach = jnp.sqrt(jnp.where(some, square, 1))
+        asked = touch.normal * (touch.velocity - jnp.where(self.free, 0, self.conditions.velocity))
+        return Grasp(
+            normal=jnp.where(some[:, None], part / reach[:, None], 0),
+            reach=reach,
+            speed=jnp.where(some, asked.sum(axis=1) / reach, 0),
+        )
+
+    @property
+    def constraint(self) -> Constraint:
+        """The projection on what nothing holds."""
+        touch, grasp = self.conditions.touch, self.grasp
+        if touch is None or grasp is None:
+            return Constraint(self.free)
+        return Constraint(self.free, jnp.where(touch.held[:, None], grasp.normal, 0))
+
+    @property
+    def prescribed(self) -> NodeVector:
+        """The velocity [m/s], shape (n, d), of what is held."""
+        grasp = self.grasp
+        if grasp is None:
+            return self.conditions.velocity
+        return jnp.where(self.free, grasp.normal * grasp.speed[:, None], self.conditions.velocity)
+
     def explicit_velocity(self) -> NodeVector:
         """v* = v^n + Δt f / m + Δt g (reference, eq. 4)."""
-        return jnp.where(self.occupied, self.inertial_velocity() + self.dt * self.per_mass(self.force), 0)
+        force = self.force if self.viscous is None else self.force + self.viscous
+        return jnp.where(self.occupied, self.inertial_velocity() + self.dt * self.per_mass(force), 0)
 
     def inertial_velocity(self) -> NodeVector:
         """ṽ = v^n + Δt g."""
@@ -54,7 +107,7 @@ class Nodes(eqx.Module):
 
     def admitted_velocity(self) -> NodeVector:
         """v^n with what is prescribed: what a wall will hold stops as the step begins."""
-        return jnp.where(self.free, self.velocity, self.conditions.velocity)
+        return self.constraint.split(self.velocity, self.prescribed)
 
     def per_mass(self, impulse: NodeVector) -> NodeVector:
         """An impulse or force over the nodes' mass; zero on empty nodes."""
@@ -75,29 +128,42 @@ class Nodes(eqx.Module):
             (mass, (mass > 0)[:, None], images.fold(self.force), images.then(self.potential.mirror)),
         )
         parts = nodes.per_mass(images.fold(momentum)), nodes.per_mass(images.fold(pull))
-        return eqx.tree_at(lambda n: (n.velocity, n.acceleration), nodes, parts)
+        nodes = eqx.tree_at(lambda n: (n.velocity, n.acceleration), nodes, parts)
+        return nodes if nodes.viscous is None else eqx.tree_at(lambda n: n.viscous, nodes, images.fold(nodes.viscous))
 
 
 def particles_to_grid(
-    scene: Scene, particles: Particles, t: Scalar, dt: Scalar, stencil: Stencil, *, centred: bool, kicked: bool = False
+    scene: Scene,
+    particles: Particles,
+    t: Scalar,
+    dt: Scalar,
+    stencil: Stencil,
+    *,
+    centred: bool,
+    lagged: bool = False,
+    kicked: bool = False,
+    apart: bool = False,
 ) -> Nodes:
     """P2G, folded at symmetry planes, with the elastic potential and the boundaries of the step from t to t + dt.
 
     Body forces are those of the particles at t, or with `centred` at t + ½dt, half a step on by their velocity. With
     `kicked` the elastic force is not wanted for itself: its impulse over the step goes to the nodes in one sum with the
-    momentum, where they have one gradient operator, and half of P2G's cost is saved.
+    momentum, where they have one gradient operator, and half of P2G's cost is saved. With `lagged` the viscous stress
+    of the particles' own velocity gradients is part of that force, or with `apart` beside it.
     """
     grid, window = scene.grid, scene.window(particles)
-    v, F = components(particles.v), particles.deformation()
+    v = components(particles.v)
     C = None if particles.C is None else components(particles.C)
+    affine = C if scene.transfer.affine else None
     acceleration = jnp.asarray(scene.gravity)
     with jax.named_scope("p2g"):
-        potential = ElasticPotential(
-            scene.material, particles.volume, F, None if scene.total else F, stencil, Mirror(())
-        )
+        potential = ElasticPotential(scene.constituents(particles), stencil, Mirror(()))
         kicked = kicked and stencil.affine_slopes is None
-        impulse = -dt * potential.rest_flux() if kicked else None
-        mass, momentum = p2g(stencil, particles.mass, v, C, grid.size, impulse)
+        resisted = C if lagged and potential.viscous else None
+        flux = potential.rest_flux()
+        if resisted is not None and not apart:
+            flux = flux + potential.drag_flux(resisted)
+        mass, momentum = p2g(stencil, particles.mass, v, affine, grid.size, -dt * flux if kicked else None)
         occupied = (mass > jnp.finfo(mass.dtype).eps * particles.mass.mean())[:, None]
         full = jnp.where(occupied, mass[:, None], 1)
         if scene.body_force is not None:
@@ -110,11 +176,14 @@ def particles_to_grid(
             velocity=jnp.where(occupied, momentum / full, 0),
             occupied=occupied,
             acceleration=acceleration,
-            force=jnp.zeros_like(momentum) if kicked else potential.rest_force(momentum),
+            force=jnp.zeros_like(momentum) if kicked else -potential.sum_of(flux, momentum),
             dt=jnp.asarray(dt),
             spacing=jnp.asarray(grid.spacing),
             potential=potential,
             conditions=combine(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total),
+            viscous=None
+            if resisted is None or not apart
+            else -potential.sum_of(potential.drag_flux(resisted), momentum),
             contacts=contacts(scene.boundary, grid, window),
         )
         return nodes.folded(mirror(scene.boundary, grid, window))

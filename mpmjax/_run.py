@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from mpmjax._diffrax import Tally
+from mpmjax._exchange import Exchange
 from mpmjax._method import Method
 from mpmjax._particles import Particles, State, with_state
 from mpmjax._scene import Scene
@@ -53,6 +54,25 @@ class Run(eqx.Module):
         if self.frames is None:
             raise ValueError("This run saved no frames: pass save_every to simulate.")
         return with_state(self.final, jax.tree.map(lambda a: a[i], self.frames))
+
+    def forces(self) -> tuple[Float[Array, "g"], Exchange]:
+        """The mean force [N] and torque [N m] on each collider between one saved frame and the next.
+
+        Returns:
+            the times half way between frames [s], shape (f − 1,), and an `Exchange` over time: force (f − 1, k, d) and
+            torque (f − 1, k, r).
+
+        Raises:
+            ValueError: no frames were saved, or the scene has no collider.
+        """
+        if self.frames is None or self.frames.received is None:
+            raise ValueError(
+                "Forces need saved frames and colliders: pass save_every to simulate, a collider to Scene."
+            )
+        times = self.times
+        between = times[1:] - times[:-1]
+        mean = jax.tree.map(lambda a: (a[1:] - a[:-1]) / between[:, None, None], self.frames.received)
+        return (times[1:] + times[:-1]) / 2, mean
 
     def __len__(self) -> int:
         return 0 if self.frames is None else int(np.shape(self.steps)[0])

@@ -1,5 +1,8 @@
 """The scene: what a step needs and does not change."""
 
+from dataclasses import replace
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -7,13 +10,16 @@ import numpy as np
 from mpmjax._body_force import AbstractBodyForce
 from mpmjax._boundary import AbstractBoundary, SeparatingBox
 from mpmjax._checks import coordinates, is_traced, require, require_finite
+from mpmjax._collider import AbstractCollider, SeparatingCollider, SlipCollider
+from mpmjax._constituent import Constituent, Laws, constituents, return_map, split
+from mpmjax._exchange import Exchange, nothing_received
 from mpmjax._grid import Grid
 from mpmjax._kernel import BSpline, Gradient, MLSGradient, Stencil, in_window, make_stencil
 from mpmjax._mirror import ContactPlane, Plane, SymmetryPlane, fits
-from mpmjax._particles import Particles
+from mpmjax._particles import Group, Particles
 from mpmjax._transfer import APIC, Transfer
-from mpmjax._types import Array, Int, Point
-from mpmjax.material import AbstractMaterial
+from mpmjax._types import Array, Int, Point, components
+from mpmjax.material import AbstractPlastic, AbstractVolumetric, Law, Viscous
 
 
 class UpdatedLagrangian(eqx.Module):
@@ -38,7 +44,7 @@ class Scene(eqx.Module):
 
     Args:
         grid: the background grid.
-        material: the elastic law.
+        material: the law; or several, each for a group of the particles (see `join`).
         gravity: body acceleration [m/s²], (d,). Default: none.
         boundary: one boundary condition or several; where two prescribe the same component, the earlier holds.
         kernel: B-spline. Default: quadratic.
@@ -49,11 +55,12 @@ class Scene(eqx.Module):
 
     Raises:
         ValueError: dimensions that differ, a mirrored plane off the half-spacing lattice, or what the total description
-            cannot do (a window that follows, walls that separate).
+            cannot do (a window that follows, walls that separate, colliders along which it would slide around, laws
+            that yield or flow).
     """
 
     grid: Grid
-    material: AbstractMaterial
+    material: Laws
     gravity: Point
     boundary: tuple[AbstractBoundary, ...]
     kernel: BSpline
@@ -65,7 +72,7 @@ class Scene(eqx.Module):
     def __init__(
         self,
         grid: Grid,
-        material: AbstractMaterial,
+        material: Laws | list[Law | Viscous],
         *,
         gravity: Point | None = None,
         boundary: AbstractBoundary | tuple[AbstractBoundary, ...] | list[AbstractBoundary] = (),
@@ -76,7 +83,7 @@ class Scene(eqx.Module):
         body_force: AbstractBodyForce | None = None,
     ):
         self.grid = grid
-        self.material = material
+        self.material = tuple(material) if isinstance(material, list) else material
         self.gravity = (0.0,) * grid.dim if gravity is None else gravity
         self.boundary = (boundary,) if isinstance(boundary, AbstractBoundary) else tuple(boundary)
         self.kernel = kernel
@@ -89,6 +96,7 @@ class Scene(eqx.Module):
         d = self.grid.dim
         require(coordinates("gravity", self.gravity) == d, f"gravity must have {d} components, got {self.gravity}.")
         require_finite("gravity", self.gravity)
+        require(len(self.laws) > 0, "A scene needs at least one law, got none.")
         for boundary in self.boundary:
             require(
                 boundary.dim in (None, d),
@@ -99,10 +107,22 @@ class Scene(eqx.Module):
         if self.total:
             require(not self.grid.follow, "In the total description the window cannot follow: drop follow=True.")
             require(
-                not any(isinstance(b, SeparatingBox | ContactPlane) for b in self.boundary),
+                not any(isinstance(b, SeparatingBox | ContactPlane | SeparatingCollider) for b in self.boundary),
                 "In the total description there is no contact: use the updated one, or SymmetryPlane or SlipBox "
                 "for a wall that is never left.",
             )
+            flowing = [law for law in self.laws if isinstance(law, AbstractPlastic | AbstractVolumetric)]
+            require(
+                not flowing,
+                "The total description keeps the deformation from the start, which what yields or flows does not know: "
+                f"use the updated one for {', '.join(type(law).__name__ for law in flowing)}.",
+            )
+            for boundary in self.boundary:
+                require(
+                    not isinstance(boundary, SlipCollider) or boundary.flat,
+                    "In the total description material can slide along a half-space that does not turn and nothing "
+                    "else, its nodes being those of the start: use the updated one, or StickyCollider.",
+                )
 
     def _check_plane(self, plane: Plane) -> None:
         name = type(plane).__name__
@@ -116,6 +136,33 @@ class Scene(eqx.Module):
             f"A {name} must lie at a multiple of half the grid's spacing ({self.grid.spacing}), got "
             f"{plane.position}: move it, or use {'SlipBox' if isinstance(plane, SymmetryPlane) else 'SeparatingBox'}.",
         )
+
+    @property
+    def laws(self) -> tuple[Law, ...]:
+        """The laws, one for each material, without viscosities."""
+        return tuple(split(law)[0] for law in self._materials)
+
+    @property
+    def keeps_gradient(self) -> bool:
+        """Whether particles keep the velocity gradient C: for the transfer, or for a viscosity."""
+        return self.transfer.affine or any(isinstance(law, Viscous) for law in self._materials)
+
+    @property
+    def _materials(self) -> tuple[Law | Viscous, ...]:
+        return self.material if isinstance(self.material, tuple) else (self.material,)
+
+    def constituents(self, particles: Particles) -> tuple[Constituent, ...]:
+        """The materials of prepared particles, with the elastic laws in force."""
+        return constituents(self.material, particles, total=self.total)
+
+    def return_map(self, particles: Particles) -> Particles:
+        """The particles with what yields brought back from a trial deformation to what its law admits."""
+        return return_map(self.material, particles)
+
+    @property
+    def colliders(self) -> int:
+        """How many colliders there are."""
+        return sum(isinstance(boundary, AbstractCollider) for boundary in self.boundary)
 
     @property
     def total(self) -> bool:
@@ -143,35 +190,75 @@ class Scene(eqx.Module):
 
 
 def prepare(scene: Scene, particles: Particles) -> Particles:
-    """Add to the particles what the scene's law, transfer and description need, where it is missing.
+    """Add to the particles what the scene's laws, transfer and description need, where it is missing.
 
-    F = I, C = 0 with APIC (and none without), X = x in the total description (and none in the updated one).
+    F = I (J = 1), the history of what never yielded, C = 0 with APIC or viscosity (and none without), X = x in the
+    total description (and none in the updated one), and nothing received by colliders.
 
     Raises:
-        ValueError: the particles have another dimension than the grid, a particle lies outside the window or beyond a
-            mirrored plane, or a deformation gradient is one the law does not allow.
+        ValueError: the particles have another dimension than the grid or another number of materials than the scene, a
+            particle lies outside the window or beyond a mirrored plane, or a deformation gradient is one the law does
+            not allow.
     """
     p, d = particles.count, particles.dim
     require(d == scene.grid.dim, f"The particles are {d}-dimensional, the grid {scene.grid.dim}-dimensional.")
     still = jnp.zeros((p, d, d), particles.x.dtype)
-    prepared = Particles(
-        x=particles.x,
-        v=particles.v,
-        mass=particles.mass,
-        volume=particles.volume,
-        F=jnp.broadcast_to(jnp.eye(d, dtype=still.dtype), still.shape) if particles.F is None else particles.F,
-        C=(still if particles.C is None else particles.C) if scene.transfer.affine else None,
+    several = isinstance(scene.material, tuple)
+    counts = particles.counts or (p,)
+    require(
+        not several or len(counts) == len(scene.laws),
+        f"The scene has {len(scene.laws)} laws, so the particles must be {len(scene.laws)} sets joined by mpmjax.join, "
+        f"in the laws' order, got {len(counts)}.",
+    )
+    particles = replace(particles, counts=counts if several else None)
+    own = [_prepared(law, group, particles) for law, group in zip(scene.laws, particles.groups, strict=True)]
+    prepared = replace(
+        particles,
+        F=tuple(F for F, _ in own) if several else own[0][0],
+        history=tuple(history for _, history in own) if several else own[0][1],
+        C=(still if particles.C is None else particles.C) if scene.keeps_gradient else None,
         X=(particles.x if particles.X is None else particles.X) if scene.total else None,
+        received=_received(scene, particles),
     )
     if not is_traced((scene, prepared)):
         _check_placement(scene, prepared)
     return prepared
 
 
+def _received(scene: Scene, particles: Particles) -> Exchange | None:
+    """What colliders have received: what the particles say, if it is of as many as the scene has."""
+    if scene.colliders == 0:
+        return None
+    nothing = nothing_received(scene.colliders, particles.dim, particles.x.dtype)
+    known = particles.received
+    return known if known is not None and known.impulse.shape == nothing.impulse.shape else nothing
+
+
+def _prepared(law: Law, group: Group, particles: Particles) -> tuple[Array, Any]:
+    """F and history of one material's particles."""
+    start, stop = group.rows or (0, particles.count)
+    e = 1 if isinstance(law, AbstractVolumetric) else particles.dim
+    shape = (stop - start, e, e)
+    F = jnp.broadcast_to(jnp.eye(e, dtype=particles.x.dtype), shape) if group.F is None else group.F
+    require(F.shape == shape, f"{type(law).__name__} needs F of shape {shape}, got {F.shape}.")
+    if not isinstance(law, AbstractPlastic):
+        return F, None
+    return F, law.virgin(components(F)) if group.history is None else group.history
+
+
 def is_prepared(scene: Scene, particles: Particles) -> bool:
     """Whether the particles have exactly what the scene needs."""
     has_affine, has_reference = particles.C is not None, particles.X is not None
-    return particles.F is not None and has_affine == scene.transfer.affine and has_reference == scene.total
+    if has_affine != scene.keeps_gradient or has_reference != scene.total:
+        return False
+    several = isinstance(scene.material, tuple)
+    if several != (particles.counts is not None) or (several and len(scene.laws) != len(particles.groups)):
+        return False
+    known = 0 if particles.received is None else len(particles.received.impulse)
+    return known == scene.colliders and all(
+        group.F is not None and (group.history is not None) == isinstance(law, AbstractPlastic)
+        for law, group in zip(scene.laws, particles.groups, strict=True)
+    )
 
 
 def _check_placement(scene: Scene, particles: Particles) -> None:
@@ -195,10 +282,11 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
                 f"Particles must lie {plane.keep} the {name} at {plane.position} on axis {plane.axis}, but "
                 f"particle {int(np.argmax(wrong))} does not: move it or change the plane's keep.",
             )
-    F = np.moveaxis(np.asarray(particles.F), 0, -1)
-    allowed = np.asarray(scene.material.admits(jnp.asarray(F)))
-    require(
-        allowed,
-        f"{type(scene.material).__name__} does not allow the F of particle {int(np.argmin(allowed))} "
-        "(neo-Hookean needs det F > 0): start from an admissible one.",
-    )
+    for part in scene.constituents(particles):
+        allowed = np.asarray(part.law.admits(part.F))
+        first = int(np.argmin(allowed)) + (part.rows[0] if part.rows else 0)
+        require(
+            allowed,
+            f"{type(part.law).__name__} does not allow the F of particle {first} (most laws need det F > 0): start "
+            "from an admissible one.",
+        )

@@ -14,10 +14,11 @@ import difflib
 import enum
 import inspect
 import math
+import typing
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields
 from types import UnionType
-from typing import Any, Union, get_args, get_origin
+from typing import Any, get_args, get_origin
 
 import equinox as eqx
 import jax
@@ -25,6 +26,7 @@ import numpy as np
 from jaxtyping import AbstractArray
 
 from mpmjax._boundary import Grip, SeparatingBox, SlipBox, StickyBox
+from mpmjax._collider import SeparatingCollider, SlipCollider, StickyCollider
 from mpmjax._conjugate_residual import ConjugateResidual
 from mpmjax._grid import Grid
 from mpmjax._hessian import AnalyticHessian, JvpHessian
@@ -32,18 +34,21 @@ from mpmjax._implicit import Linearised, Newton
 from mpmjax._kernel import BSpline, MLSGradient, SplineGradient
 from mpmjax._method import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
 from mpmjax._mirror import ContactPlane, SymmetryPlane
-from mpmjax._motion import Motion
-from mpmjax._region import Ball, Box
+from mpmjax._motion import Motion, RigidMotion
+from mpmjax._region import Ball, Box, Capsule, Cylinder, HalfSpace, Union
+from mpmjax._sampled import SampledDistance
 from mpmjax._scene import Scene, TotalLagrangian, UpdatedLagrangian
 from mpmjax._transfer import APIC, FLIP, PIC
-from mpmjax.material import FixedCorotated, Hencky, NeoHookean
+from mpmjax.material import CamClay, DruckerPrager, FixedCorotated, Fluid, Hencky, NeoHookean, Snow, Viscous, VonMises
 
 CLASSES: tuple[type, ...] = (
     Scene,
     Grid,
     *(FixedCorotated, NeoHookean, Hencky),
+    *(Snow, VonMises, DruckerPrager, CamClay, Fluid, Viscous),
     *(StickyBox, SlipBox, SeparatingBox, Grip, SymmetryPlane, ContactPlane),
-    *(Box, Ball, Motion),
+    *(StickyCollider, SlipCollider, SeparatingCollider),
+    *(Box, Ball, HalfSpace, Capsule, Cylinder, Union, SampledDistance, Motion, RigidMotion),
     *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
     *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),
     *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual),
@@ -109,7 +114,7 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
     classes = {c.__name__: c for c in CLASSES if any(_is_module(a) and issubclass(c, a) for a in alternatives)}
     items = [get_args(a)[0] for a in alternatives if get_origin(a) in (tuple, list)]
     if classes and isinstance(data, list) and items:
-        return tuple(decode(d, items[0], f"[{where}] {i}", arrays) for i, d in enumerate(data, 1))
+        return tuple(decode(d, items[0], _nth(where, i), arrays) for i, d in enumerate(data, 1))
     if classes:
         return _object(data, classes, where, arrays)
     unfit = "takes an object of Python, which files cannot hold: leave it out"
@@ -198,7 +203,7 @@ def _parameters(function: Callable) -> dict[str, tuple[Any, Any]]:
 
 def _alternatives(hint: Any) -> list[Any]:
     """The members of a union, or the one annotation."""
-    if get_origin(hint) in (Union, UnionType):
+    if get_origin(hint) in (typing.Union, UnionType):
         return [a for member in get_args(hint) for a in _alternatives(member)]
     return [hint]
 
@@ -277,6 +282,12 @@ def _inside(where: str, key: str, value: Any) -> str:
     if not where:
         return f"[{key}]"
     return f"{where[:-1]}.{key}]" if where.endswith("]") else f"{where} [{key}]"
+
+
+def _nth(where: str, i: int) -> str:
+    """The place of one of a list of tables: its header is that of the list with another pair of brackets."""
+    *outer, header = where.split(" ")
+    return " ".join([*outer, f"[{header}]", str(i)])
 
 
 def _named(where: str, what: str) -> str:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 
 from mpmjax import _linalg as la
 from mpmjax._checks import canonical, require_positive
+from mpmjax._constituent import Constituent
 from mpmjax._kernel import MLSGradient
 from mpmjax._method import Explicit, Method, SemiImplicit
 from mpmjax._particles import Particles
@@ -37,6 +38,11 @@ def stable_dt(
     β ≥ ½, for backward Euler and for the methods of second order there is none: the result is infinite, and says
     nothing of accuracy.
 
+    With viscosity it is Δt of Δt² Λ (2Ξ − κa)/ρ0 + Δt Λ_v b/ρ0 = 4, Λ_v the largest eigenvalue of L ↦ |J| σ_v, that is
+    |J| max(2η, 2η (1 − d/3) + dζ), and b = 2a for APIC, whose stored gradient a step multiplies by 1 − Δt a Λ_v/ρ0, or
+    4Ξ for PIC and FLIP, whose gradient of a step ago stands beside nothing that it changes; 8/(B + √(B² + 16A)) with
+    the factors A of Δt² and B of Δt. The semi-implicit step has (1 − 2β) times both.
+
     The default safety of 0.7 is for what is not linear. Vibrations of a few per cent grow below the linear limit where
     a mode's third or fourth harmonic resonates with the step, (ωΔt)² = 3 and 2, at 0.87 and 0.71 of the limit: a
     particle released at a stretch of 1.2 blows up at 0.75 of it, and does not at 0.7. It also covers what the argument
@@ -65,29 +71,48 @@ def stable_dt(
 @eqx.filter_jit
 def _limit(scene: Scene, particles: Particles, method: Method) -> Float[Array, ""]:
     density = particles.mass / particles.volume
-    z = (_tangent_spectrum(scene, particles).max(axis=0) * _gradient_bound(scene, particles) / density).max()  # per Δt²
+    bodies = scene.constituents(particles)
+    stiffest = jnp.concatenate([_tangent_spectrum(c, particles.dim).max(axis=0) for c in bodies])
+    z = stiffest * _gradient_bound(scene, particles) / density  # per Δt²
     match method:
         case Explicit():
-            pass
+            explicit = jnp.ones_like(z)
         case SemiImplicit(beta=beta):
-            z = z * (1 - 2 * jnp.asarray(beta))
+            explicit = (1 - 2 * jnp.asarray(beta)) * jnp.ones_like(z)
         case _:
-            z = 0 * z
-    return jnp.where(z > 0, 2 / jnp.sqrt(jnp.where(z > 0, z, 1)), jnp.inf)
+            explicit = jnp.zeros_like(z)
+    most = jnp.concatenate([_viscous_spectrum(c, particles.dim) for c in bodies])
+    y = most * _viscous_gradient_bound(scene, particles) / density  # per Δt
+    z, y = jnp.maximum(explicit * z, 0), jnp.maximum(explicit * y, 0)
+    square = y**2 + 16 * z
+    steepness = (y + jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)).max()
+    return jnp.where(steepness > 0, 8 / jnp.where(steepness > 0, steepness, 1), jnp.inf)
 
 
-def _tangent_spectrum(scene: Scene, particles: Particles) -> Float[Array, "m p"]:
-    """The d² eigenvalues of each particle's tangent [Pa], whose largest is Λ: in the principal frame the map is d x d
-    on the diagonal and 2 x 2 on (L_ij, L_ji) for each pair."""
-    _, s, _ = la.principal_frame(particles.deformation())
-    tangent = scene.material.principal_tangent(s)
+def _viscous_spectrum(body: Constituent, dim: int) -> Float[Array, "q"]:
+    """The largest eigenvalue of each particle's ∇v ↦ |J| σ_v [Pa s]; in the total description a bound of it."""
+    J = jnp.abs(la.determinant(body.F))
+    if body.viscosity is None:
+        return jnp.zeros_like(J)
+    most = J * body.viscosity.stiffest(dim)
+    return most / (la.principal_frame(body.F)[1] ** 2).min(axis=0) if body.total else most
+
+
+def _tangent_spectrum(body: Constituent, dim: int) -> Float[Array, "m q"]:
+    """The eigenvalues of each particle's tangent [Pa], whose largest is Λ: in the principal frame the map is d x d
+    on the diagonal and 2 x 2 on (L_ij, L_ji) for each pair. Where the law knows J alone it is d/dJ(JΨ') J tr(L) I, of
+    which one is not zero."""
+    _, s, _ = la.principal_frame(body.F)
+    tangent = body.law.principal_tangent(s)
     d = s.shape[0]
-    if scene.total:
+    if body.total:
         pull, tau = jnp.ones_like(s), jnp.zeros_like(s)
     else:
-        P = scene.material.stress(s * jnp.eye(d, dtype=s.dtype)[..., None])
+        P = body.law.stress(s * jnp.eye(d, dtype=s.dtype)[..., None])
         pull, tau = s, s * jnp.stack([P[i, i] for i in range(d)])
     scaling = tangent.scaling * pull[:, None] * pull + tau * jnp.eye(d, dtype=s.dtype)[..., None]
+    if d < dim:
+        return dim * scaling[0]
     values = [*la.symmetric_eigen(scaling)[0]]
     for (i, j), twist, flip in zip(la.pairs(d), tangent.twist, tangent.flip, strict=True):
         near, far = (flip + twist) / 2 * pull[j] ** 2, (flip + twist) / 2 * pull[i] ** 2
@@ -99,10 +124,22 @@ def _tangent_spectrum(scene: Scene, particles: Particles) -> Float[Array, "m p"]
 
 def _gradient_bound(scene: Scene, particles: Particles) -> Float[Array, "*p"]:
     """2Ξ − κa [1/m²]."""
-    kept = 1 if scene.transfer.affine else 0
+    a, steepest = _inverse_moments(scene, particles)
+    return 2 * steepest - a if scene.transfer.affine else 2 * steepest
+
+
+def _viscous_gradient_bound(scene: Scene, particles: Particles) -> Float[Array, "*p"]:
+    """2a with APIC, 4Ξ with PIC and FLIP [1/m²]."""
+    a, steepest = _inverse_moments(scene, particles)
+    return 2 * a if scene.transfer.affine else 4 * steepest
+
+
+def _inverse_moments(scene: Scene, particles: Particles) -> tuple[Array, Array]:
+    """a and Ξ [1/m²]."""
     order, dx = scene.kernel.order, jnp.asarray(scene.grid.spacing)
     if order == 1:  # both gradients are one, and Ξ = a
-        return (2 - kept) / scene.stencil(particles).moment.min(axis=0)
+        a = 1 / scene.stencil(particles).moment.min(axis=0)
+        return a, a
     a = _INVERSE_MOMENT[order]
     steepest = a if isinstance(scene.gradient, MLSGradient) else _STEEPEST[order]
-    return (2 * steepest - kept * a) / dx**2
+    return a / dx**2, steepest / dx**2

@@ -1,11 +1,15 @@
-"""One step: particles to grid, the grid's update by a method, grid to particles."""
+"""One step: particles to grid, the grid's update by a method, grid to particles, return maps of what yields."""
+
+from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from mpmjax._checks import canonical, require_positive
+from mpmjax._constraint import Constraint
 from mpmjax._contact import (
+    NOTHING,
     ActiveSet,
     ContactInfo,
     count_violations,
@@ -13,18 +17,21 @@ from mpmjax._contact import (
     held_images,
     holding,
     no_contact,
+    pushes,
     touches,
     untouched,
+    with_collider_friction,
     with_friction,
 )
+from mpmjax._exchange import Exchange, received
 from mpmjax._implicit import SolveInfo
 from mpmjax._kernel import Stencil
-from mpmjax._method import Explicit, Method, NodeMotion
+from mpmjax._method import Explicit, Method, NodeMotion, viscous_impulse
 from mpmjax._nodes import Nodes, particles_to_grid
 from mpmjax._particles import Particles
 from mpmjax._scene import Scene, is_prepared, prepare
 from mpmjax._transfer import g2p
-from mpmjax._types import Array, Int, Mask, NodeVector, Scalar, components, particle_first
+from mpmjax._types import Array, Int, NodeScalar, NodeVector, Scalar, components, particle_first
 
 
 class StepInfo(eqx.Module):
@@ -34,6 +41,8 @@ class StepInfo(eqx.Module):
     contact: ContactInfo
     outside: Int[Array, "*f"]
     """Particles whose stencil left the grid's window."""
+    colliders: Exchange | None = None
+    """What the scene's colliders received, in the order of its boundaries; None without any."""
 
 
 class GridUpdate(eqx.Module):
@@ -44,15 +53,21 @@ class GridUpdate(eqx.Module):
     motion: NodeMotion
     """How they move, mirrored likewise."""
     elastic: NodeVector
-    """The impulse of the elastic force [kg m/s], shape (n, d)."""
+    """The impulse of the elastic force [kg m/s], shape (n, d); with it that of viscosity where P2G joined them."""
+    viscous: NodeVector | None
+    """The impulse of viscosity [kg m/s], shape (n, d), where there is one."""
     reaction: NodeVector
     """The impulse of walls and grips [kg m/s], shape (n, d); on free components what the solve left."""
     friction: NodeVector | None
     """The impulse of friction [kg m/s], shape (n, d), where there are walls that may be left."""
-    free: Mask
-    """The components in which no boundary had a part, shape (n, d)."""
+    free: Constraint
+    """The projection on that in which no boundary had a part."""
     solve: SolveInfo
     contact: ContactInfo
+    push: NodeScalar | None = None
+    """The impulse of colliders along their normals [kg m/s], shape (n,), where there are colliders."""
+    rub: NodeVector | None = None
+    """Their part of the impulse of friction [kg m/s], shape (n, d)."""
 
 
 def advance(
@@ -70,10 +85,17 @@ def advance(
     """
     stencil = scene.stencil(particles) if stencil is None else stencil
     kicked = not (method.needs_force or scene.transfer.needs_change)
-    nodes = particles_to_grid(scene, particles, t, dt, stencil, centred=method.centred, kicked=kicked)
+    nodes = particles_to_grid(
+        scene, particles, t, dt, stencil, centred=method.centred, lagged=method.lagged, kicked=kicked
+    )
     new = update(nodes, method)
     outside = (~stencil.inside).sum().astype(jnp.int32)
-    return grid_to_particles(scene, particles, nodes, new), StepInfo(new.solve, new.contact, outside)
+    touch = nodes.conditions.touch
+    exchange = None if touch is None else received(touch, new.reaction, new.push, new.rub)
+    after = scene.return_map(grid_to_particles(scene, particles, nodes, new))
+    if exchange is not None and after.received is not None:
+        after = replace(after, received=after.received.plus(exchange))
+    return after, StepInfo(new.solve, new.contact, outside, exchange)
 
 
 advance_compiled = eqx.filter_jit(advance)
@@ -86,8 +108,10 @@ def update(nodes: Nodes, method: Method) -> GridUpdate:
         guess = method.guess.velocity(nodes.velocity, nodes.explicit_velocity())
         if not touches(nodes):
             motion, info = method.move(nodes, guess)
-            elastic, reaction = impulses(nodes, method, motion)
-            return GridUpdate(nodes.velocity, motion, elastic, reaction, None, nodes.free, info, no_contact())
+            elastic, reaction, viscous = impulses(nodes, method, motion)
+            push = pushes(nodes, NOTHING, reaction)
+            free, none = nodes.constraint, no_contact()
+            return GridUpdate(nodes.velocity, motion, elastic, viscous, reaction, None, free, info, none, push)
 
         frozen = jax.lax.stop_gradient((nodes, method))
 
@@ -102,47 +126,60 @@ def update(nodes: Nodes, method: Method) -> GridUpdate:
         guess = jax.lax.stop_gradient(guess)
         active, guess, cost, sweeps = find_active_set(frozen[0], guess, tried)
         motion, info = with_held(nodes, method, active, guess)
-        elastic, reaction = impulses(nodes, method, motion)
+        elastic, reaction, viscous = impulses(nodes, method, motion)
         violations = count_violations(nodes, active, motion.velocity, reaction)
-        loss = with_friction(nodes, active, motion.velocity, reaction) - motion.velocity
+        push = pushes(nodes, active, reaction)
+        slowed = with_friction(nodes, active, motion.velocity, reaction)
+        slowed, rub = with_collider_friction(nodes, active, slowed, push)
+        loss = slowed - motion.velocity
         before = held_images(nodes, active).unfold(holding(nodes, active).velocity)
         return GridUpdate(
             before=before,
             motion=motion.slowed(loss),
             elastic=elastic,
+            viscous=viscous,
             reaction=reaction,
             friction=nodes.mass[:, None] * loss,
             free=untouched(nodes, active),
             solve=cost.plus(info),
             contact=ContactInfo(sweeps, violations),
+            push=push,
+            rub=rub,
         )
 
 
-def impulses(nodes: Nodes, method: Method, motion: NodeMotion) -> tuple[NodeVector, NodeVector]:
-    """The impulse of the elastic force [kg m/s], and that which is missing for the nodes to move so: of walls and
-    grips."""
-    elastic = method.elastic_impulse(nodes, motion)
-    return elastic, nodes.mass[:, None] * (motion.velocity - nodes.inertial_velocity()) - elastic
+def impulses(nodes: Nodes, method: Method, motion: NodeMotion) -> tuple[NodeVector, NodeVector, NodeVector | None]:
+    """The impulse of the elastic force [kg m/s], that which is missing for the nodes to move so, of walls and grips,
+    and that of viscosity."""
+    elastic, viscous = method.elastic_impulse(nodes, motion), viscous_impulse(nodes, motion)
+    known = elastic if viscous is None else elastic + viscous
+    return elastic, nodes.mass[:, None] * (motion.velocity - nodes.inertial_velocity()) - known, viscous
 
 
 def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: GridUpdate) -> Particles:
-    """G2P: the particles moved and deformed with the nodes, x ← x + Δt Σ w v̄_i, F ← F + Δt Σ v̄_i hᵀ."""
+    """G2P: the particles moved and deformed with the nodes, x ← x + Δt Σ w v̄_i, F ← F + Δt Σ v̄_i hᵀ; of what yields
+    that is the trial F_E, which `Scene.return_map` brings back."""
     potential, dt = nodes.potential, nodes.dt
     unfold = potential.mirror.unfold
     before, motion = unfold(new.before), jax.tree.map(unfold, new.motion)
     with jax.named_scope("g2p"):
         moved, v, C, gradient = g2p(
-            scene.transfer, potential.stencil, components(particles.v), before, motion.velocity, motion.mean
+            scene.transfer,
+            potential.stencil,
+            components(particles.v),
+            before,
+            motion.velocity,
+            motion.mean,
+            kept=scene.keeps_gradient,
         )
-        F = potential.F + dt * potential.deformed(gradient)
-    return Particles(
+        changes = zip(potential.at_rest(), potential.deformed(gradient), strict=True)
+        F = tuple(particle_first(F + dt * rate) for F, rate in changes)
+    return replace(
+        particles,
         x=particle_first(components(particles.x) + dt * moved),
         v=particle_first(v),
-        mass=particles.mass,
-        volume=particles.volume,
-        F=particle_first(F),
+        F=F if isinstance(scene.material, tuple) else F[0],
         C=None if C is None else particle_first(C),
-        X=particles.X,
     )
 
 
@@ -157,7 +194,8 @@ def step(
     """One step of the Material Point Method, from t to t + dt.
 
     P2G, the grid velocity's update by `method`, G2P, x ← x + Δt Σ_i w_ip v̄_i, F ← F + Δt Σ_i v̄_i h_ipᵀ, v̄ being
-    v^{n+1} or, for methods of second order, the nodes' mean velocity over the step.
+    v^{n+1} or, for methods of second order, the nodes' mean velocity over the step; then the return map of laws that
+    yield.
 
     Args:
         scene: the scene.

@@ -97,6 +97,8 @@ def g2p(
     before: NodeVector,
     after: NodeVector,
     mean: NodeVector | None = None,
+    *,
+    kept: bool = False,
 ) -> tuple[Float[Array, "d p"], Float[Array, "d p"], Matrix | None, Matrix]:
     """Grid to particles.
 
@@ -107,8 +109,9 @@ def g2p(
         before: v_i^n [m/s], shape (n, d); only FLIP looks at it.
         after: v_i^{n+1} [m/s], shape (n, d).
         mean: with what the nodes move over the step, v̄_i [m/s], shape (n, d), if not with v_i^{n+1}.
+        kept: whether PIC and FLIP return a C too, Σ_i v_i^{n+1} g_ipᵀ.
     Returns:
-        the velocity that carries the particles, Σ_i w_ip v̄_i; their new velocity; their new C (APIC); and the velocity
+        the velocity that carries the particles, Σ_i w_ip v̄_i; their new velocity; their new C, if any; and the velocity
         gradient that deforms them, Σ_i v̄_i g_ipᵀ [1/s], shape (d, d, p).
     """
     fields = [after] if mean is None else [after, mean]
@@ -117,7 +120,7 @@ def g2p(
     values, gradients = collect(stencil, jnp.concatenate(fields, axis=1))
     arrived, *others = jnp.split(values, len(fields))
     slope, *other_slopes = (jnp.swapaxes(g, 0, 1) for g in jnp.split(gradients, len(fields), axis=1))
-    new, C = arrived, None
+    new, C = arrived, slope if kept else None
     match transfer:
         case APIC() if stencil.affine_slopes is None:
             C = slope

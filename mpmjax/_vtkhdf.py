@@ -2,21 +2,21 @@
 
 Frames lie end to end in Points and PointData, and `Steps` says where each begins; the topology, a vertex a particle, is
 there once for all of them. Numbers keep the run's dtype. In one and two dimensions vectors are padded with zeros and
-deformation gradients with the identity. Every dataset carries checksums, and a chunk holds one frame, so that writing a
-frame touches no other.
+deformation gradients with the identity; where a law knows J alone, J^(1/d) I stands for F. What laws remember is a
+dataset a name, NaN at the particles of other laws. Every dataset carries checksums, and a chunk holds one frame, so
+that writing a frame touches no other.
 """
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._particles import State
+from mpmjax._particles import State, by_material, histories
 
 File = Any
 """An `h5py.File`, whose own annotations do not say what a name leads to."""
-
-_TENSORS = {"deformation_gradient": ("F", 1.0), "affine_velocity": ("C", 0.0)}  # field, and what pads its diagonal
 
 
 def add_fixed(file: File, name: str, data: Any) -> None:
@@ -50,19 +50,25 @@ def add_topology(file: File, count: int) -> None:
 
 def rows_of(frame: int, time: float, state: State) -> dict[str, np.ndarray]:
     """What a state adds to each dataset as the frame of that number, at that time [s]."""
-    x, v, F = np.asarray(state.x), np.asarray(state.v), np.asarray(state.F)
-    missing = 3 - x.shape[1]
-    data = {"velocity": np.pad(v, ((0, 0), (0, missing))), "J": np.linalg.det(F)}
-    for name, (field, diagonal) in _TENSORS.items():
-        if (a := getattr(state, field)) is not None:
-            padded = np.pad(np.asarray(a), ((0, 0), (0, missing), (0, missing)))
-            padded[:, range(3 - missing, 3), range(3 - missing, 3)] = diagonal
-            data[name] = padded.reshape(-1, 9)
-    first = frame * len(x)
+    x, v = np.asarray(state.x), np.asarray(state.v)
+    p, d = x.shape
+    flat = ((0, 0), (0, 3 - d))
+    groups = [np.asarray(F) for F in jax.tree.leaves(state.F)]
+    full = [F if F.shape[1] == d else F ** (1 / d) * np.eye(d, dtype=F.dtype) for F in groups]
+    data = {
+        "velocity": np.pad(v, flat),
+        "J": np.concatenate([np.linalg.det(F) if F.shape[1] > 1 else F[:, 0, 0] for F in groups]),
+        "deformation_gradient": _padded(np.concatenate(full), 1.0),
+    }
+    if state.C is not None:
+        data["affine_velocity"] = _padded(np.asarray(state.C), 0.0)
+    for name, rows, leaf in histories(state):
+        data.setdefault(name, np.full(p, np.nan, x.dtype))[rows] = leaf
+    first = frame * p
     steps = {"PartOffsets": 0, "NumberOfParts": 1, "PointOffsets": first}  # the one part, read anew at each step
     steps |= {f"PointDataOffsets/{name}": first for name in data}
     return {
-        "VTKHDF/Points": np.pad(x, ((0, 0), (0, missing))),
+        "VTKHDF/Points": np.pad(x, flat),
         **{f"VTKHDF/PointData/{name}": a for name, a in data.items()},
         "VTKHDF/Steps/Values": np.array([time]),
         "VTKHDF/Steps/CellOffsets": np.zeros((1, 4), np.int64),
@@ -71,16 +77,41 @@ def rows_of(frame: int, time: float, state: State) -> dict[str, np.ndarray]:
     }
 
 
-def states_in(file: File, d: int, start: int, stop: int) -> State:
-    """The states of frames `start` to `stop`, with a leading axis."""
-    f, p, data = stop - start, int(file["VTKHDF/NumberOfPoints"][0]), file["VTKHDF/PointData"]
-    rows = slice(start * p, stop * p)
+def states_in(file: File, like: State, start: int, stop: int) -> State:
+    """The states of frames `start` to `stop`, with a leading axis, but for what colliders have received.
 
-    def tensors(name: str) -> Any:
-        return jnp.asarray(data[name][rows].reshape(f, p, 3, 3)[..., :d, :d]) if name in data else None
+    Args:
+        file: the file.
+        like: a state of the same run, whose shapes count and whose numbers do not.
+        start: first frame.
+        stop: the one after the last.
+    """
+    f, (p, d), data = stop - start, like.x.shape, file["VTKHDF/PointData"]
 
-    x, v = (jnp.asarray(a[rows, :d].reshape(f, p, d)) for a in (file["VTKHDF/Points"], data["velocity"]))
-    return State(x=x, v=v, F=tensors("deformation_gradient"), C=tensors("affine_velocity"))
+    def read(dataset: Any, *shape: int) -> np.ndarray:
+        return dataset[start * p : stop * p].reshape(f, p, *shape)
+
+    def tensors(name: str) -> np.ndarray:
+        return read(data[name], 3, 3)[..., :d, :d]
+
+    F, J = tensors("deformation_gradient"), read(data["J"])[..., None, None]
+    each = [(F if q.shape[1] == d else J)[:, rows] for rows, q, _ in by_material(like)]
+    history = [jnp.asarray(read(data[name])[:, rows]) for name, rows, _ in histories(like)]
+    return State(
+        x=jnp.asarray(read(file["VTKHDF/Points"], 3)[..., :d]),
+        v=jnp.asarray(read(data["velocity"], 3)[..., :d]),
+        F=jax.tree.unflatten(jax.tree.structure(like.F), [jnp.asarray(q) for q in each]),
+        C=None if like.C is None else jnp.asarray(tensors("affine_velocity")),
+        history=jax.tree.unflatten(jax.tree.structure(like.history), history),
+    )
+
+
+def _padded(a: np.ndarray, diagonal: float) -> np.ndarray:
+    """Matrices (p, d, d) as rows of nine, missing directions with this diagonal."""
+    d, missing = a.shape[1], 3 - a.shape[1]
+    padded = np.pad(a, ((0, 0), (0, missing), (0, missing)))
+    padded[:, range(d, 3), range(d, 3)] = diagonal
+    return padded.reshape(-1, 9)
 
 
 def count_in(file: File) -> int:

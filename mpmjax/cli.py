@@ -213,13 +213,18 @@ def _print_trial(trial: Trial) -> None:
 def render_command(
     run: Annotated[Path, typer.Argument(help="An HDF5 file of a run.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="A picture: .png, .pdf, .svg, or .gif of all frames.")],
-    colour: Annotated[str, typer.Option(help=f"What colours the particles: {', '.join(COLOURS)}.")] = "speed",
+    colour: Annotated[
+        str, typer.Option(help=f"What colours the particles: {', '.join(COLOURS)}, what a law remembers, none.")
+    ] = "speed",
     frame: Annotated[int | None, typer.Option(help="The frame of a still; negative from the end.")] = None,
+    view: Annotated[
+        tuple[float, float], typer.Option(help="Azimuth and elevation of the eye in degrees, of a run in 3-D.")
+    ] = (30.0, 20.0),
     dpi: Annotated[float, typer.Option(help="Resolution.")] = 120.0,
     fps: Annotated[int, typer.Option(help="Frames a second of an animation.")] = 20,
 ) -> None:
     """Draw a run's particles."""
-    render(load(run), output, colour=colour, frame=frame, fps=fps, dpi=dpi)
+    render(load(run), output, colour=colour, frame=frame, view=view, fps=fps, dpi=dpi)
     print(f"written {output}")
 
 

@@ -16,6 +16,20 @@ LAWS = {
 }
 ELASTIC = LAWS | {"hencky": mpm.Hencky(youngs_modulus=1e4, poisson_ratio=0.3)}
 """All elastic laws, for what is cheap or a law's own; `LAWS` for what is multiplied by other choices."""
+PLASTIC = {
+    "snow": mpm.Snow(1e4, 0.2, critical_compression=2.5e-2, critical_stretch=7.5e-3, hardening=10.0),
+    "von_mises": mpm.VonMises(1e4, 0.3, yield_stress=400.0, hardening_modulus=1e3),
+    "drucker_prager": mpm.DruckerPrager(1e4, 0.3, friction_angle=0.6),
+    "cam_clay": mpm.CamClay(1e4, 0.3, friction=1.0, preconsolidation=300.0, cohesion=0.5, hardening=3.0),
+}
+"""Laws that yield."""
+FLUIDS = {"fluid": mpm.Fluid(1e4), "fluid_in_tension": mpm.Fluid(1e4, tension=True)}
+"""Laws that know J alone, in the updated description."""
+VISCOUS = {
+    "viscous_solid": mpm.Viscous(LAWS["neo_hookean"], 20.0, 5.0),
+    "viscous_fluid": mpm.Viscous(FLUIDS["fluid_in_tension"], 20.0, 5.0),
+}
+"""Laws with viscosity beside them."""
 DESCRIPTIONS = {"updated": mpm.UpdatedLagrangian(), "total": mpm.TotalLagrangian()}
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(), "backward_euler": mpm.BackwardEuler()}
 SECOND_ORDER = {"implicit_midpoint": mpm.ImplicitMidpoint(), "trbdf2": mpm.TRBDF2()}
@@ -58,8 +72,10 @@ def block(d: int, *, side: int = 3, dx: float = 0.1, **scene: object) -> tuple[m
 
 def explicit_limit(scene: mpm.Scene) -> float:
     """dx / c [s], c the pressure-wave speed at rest."""
-    law = scene.material
-    modulus = law.lame_lambda + 2 * law.shear_modulus
+    (law,) = scene.laws
+    if isinstance(law, mpm.AbstractPlastic) and not isinstance(law, mpm.Fluid):
+        law = law.elastic(law.virgin(jnp.ones((1, 1))))
+    modulus = law.bulk_modulus if isinstance(law, mpm.Fluid) else law.lame_lambda + 2 * law.shear_modulus
     return float(scene.grid.spacing) / float(np.sqrt(modulus / 1e3))
 
 

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 import mpmjax as mpm
+from mpmjax import _step
 from mpmjax._checks import canonical
 from mpmjax._nodes import Nodes, particles_to_grid
 from mpmjax._step import StepInfo, advance, update
@@ -154,6 +155,7 @@ class GridUpdate(eqx.Module):
     info: StepInfo
     particles: mpm.Particles
     position: jax.Array
+    update: _step.GridUpdate
 
 
 def grid_update(scene: mpm.Scene, particles: mpm.Particles, dt: float, method, t: float = 0.0) -> GridUpdate:
@@ -167,4 +169,5 @@ def _grid_update(scene, particles, t, dt, method) -> GridUpdate:
     nodes = particles_to_grid(scene, particles, t, dt, scene.stencil(particles), centred=method.centred)
     new, info = advance(scene, particles, t, dt, method)
     grid = update(nodes, method)
-    return GridUpdate(nodes, grid.motion.velocity, grid.reaction, info, new, scene.grid.nodes(scene.window(particles)))
+    position = scene.grid.nodes(scene.window(particles))
+    return GridUpdate(nodes, grid.motion.velocity, grid.reaction, info, new, position, grid)

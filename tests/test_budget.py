@@ -5,7 +5,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DESCRIPTIONS, GRADIENTS, KERNELS, LAWS, METHODS, SECOND_ORDER, TRANSFERS, block, explicit_limit
+from helpers import (
+    DESCRIPTIONS,
+    FLUIDS,
+    GRADIENTS,
+    KERNELS,
+    LAWS,
+    METHODS,
+    PLASTIC,
+    SECOND_ORDER,
+    TRANSFERS,
+    VISCOUS,
+    block,
+    explicit_limit,
+    ids,
+)
 from test_body_force import Wind
 
 import mpmjax as mpm
@@ -19,6 +33,16 @@ BOUNDARIES = {
     "contact planes": (mpm.ContactPlane(1, 0.0, friction=0.3), mpm.ContactPlane(0, 0.0)),
     "planes": (mpm.SymmetryPlane(1, 0.0), mpm.SymmetryPlane(0, 0.0)),
     "grip": (mpm.Grip(mpm.Box((-1.0, -1.0), (1.0, 0.0)), MOVED),),
+    "colliders": (
+        mpm.SeparatingBox((-0.2, 0.0), (0.6, 0.6), friction=0.3),
+        mpm.SeparatingCollider(mpm.Ball((0.1, -0.1), 0.24), MOVED, friction=0.3),
+        mpm.SlipCollider(mpm.HalfSpace((0.25, 0.2), (-2.0, -1.0))),
+        mpm.StickyCollider(mpm.Capsule((0.0, 0.3), (0.1, 0.3), 0.06), MOVED),
+    ),
+    "collider and contact plane": (
+        mpm.ContactPlane(1, 0.0, friction=0.3),
+        mpm.SeparatingCollider(mpm.HalfSpace((0.05, 0.0), (2.0, 1.0)), friction=0.3),
+    ),
 }
 
 
@@ -45,6 +69,7 @@ CASES = {
     "cubic-spline": {"kernel": KERNELS["cubic"], "gradient": GRADIENTS["spline"]},
     **{f"explicit-{b}": {"boundary": boundary} for b, boundary in BOUNDARIES.items() if b != "free"},
     "semi_implicit-contact": {"method": METHODS["semi_implicit"], "boundary": BOUNDARIES["contact"]},
+    "semi_implicit-colliders": {"method": METHODS["semi_implicit"], "boundary": BOUNDARIES["colliders"]},
     "semi_implicit-contact planes": {
         "method": METHODS["semi_implicit"],
         "boundary": BOUNDARIES["contact planes"],
@@ -54,6 +79,23 @@ CASES = {
         "method": METHODS["semi_implicit"],
         "boundary": BOUNDARIES["planes"],
         "material": LAWS["neo_hookean"],
+    },
+    "fluid": {"material": FLUIDS["fluid"], "boundary": BOUNDARIES["walls"]},
+    "semi_implicit-fluid": {"material": FLUIDS["fluid"], "method": METHODS["semi_implicit"], "transfer": mpm.PIC()},
+    **{
+        f"{m}-viscous": {"material": VISCOUS["viscous_solid"], "method": method, "boundary": BOUNDARIES["walls"]}
+        for m, method in (METHODS | SECOND_ORDER).items()
+    },
+    "flip-total-viscous": {
+        "material": VISCOUS["viscous_solid"],
+        "transfer": TRANSFERS["flip"],
+        "description": DESCRIPTIONS["total"],
+    },
+    "viscous fluid-contact": {"material": VISCOUS["viscous_fluid"], "boundary": BOUNDARIES["contact planes"]},
+    "semi_implicit-viscous fluid-contact": {
+        "material": VISCOUS["viscous_fluid"],
+        "method": mpm.SemiImplicit(0.6),
+        "boundary": BOUNDARIES["contact"],
     },
     "backward_euler-grip": {"method": METHODS["backward_euler"], "boundary": BOUNDARIES["grip"]},
     "implicit_midpoint-contact planes": {
@@ -66,11 +108,24 @@ CASES = {
         "body_force": Wind(jnp.asarray([0.5, 2.0]), 0.1, 3.0),
         "method": SECOND_ORDER["implicit_midpoint"],
     },
+    **{law: {"material": PLASTIC[law]} for law in PLASTIC},
+    **{f"semi_implicit-{law}": {"method": METHODS["semi_implicit"], "material": PLASTIC[law]} for law in PLASTIC},
     "body force": {"body_force": Wind(jnp.asarray([0.5, 2.0]), 0.1, 3.0), "boundary": BOUNDARIES["planes"]},
 }
 
 
-SLOW = {"semi_implicit-contact", "semi_implicit-planes", "explicit-contact planes", "trbdf2-contact", "pic-total"}
+SLOW = {
+    *(f"semi_implicit-{law}" for law in PLASTIC),
+    "semi_implicit-fluid",
+    "semi_implicit-contact",
+    "semi_implicit-planes",
+    "explicit-contact planes",
+    "trbdf2-contact",
+    "pic-total",
+    "backward_euler-viscous",
+    "implicit_midpoint-viscous",
+    "semi_implicit-viscous fluid-contact",
+}
 EACH_CASE = [pytest.param(case, id=k, marks=pytest.mark.slow if k in SLOW else ()) for k, case in CASES.items()]
 
 
@@ -133,6 +188,15 @@ def test_an_explicit_step_dissipates_nothing_implicitly_and_beta_does():
     assert 0 < half < whole
 
 
+@pytest.mark.parametrize("law", **ids(PLASTIC))
+def test_yielding_only_takes_energy(law):
+    """And nothing else has a plastic part."""
+    yielding, elastic = (budget_of(material=m)[0].energy.plastic for m in (law, LAWS["neo_hookean"]))
+    assert (np.asarray(yielding) >= 0).all()
+    assert float(yielding.sum()) > 0
+    assert not np.asarray(elastic).any()
+
+
 def test_the_midpoint_rule_gives_back_what_it_takes_implicitly():
     """time_integration − implicit is of second order over a given time, and less than a hundredth of either."""
     sums = []
@@ -158,3 +222,14 @@ def test_time_integration_is_of_first_order_over_a_given_time(method):
         sums.append(float(jnp.abs(energy.time_integration[: 4 * 2**halvings]).sum()))
     slopes = np.log2(np.array(sums[:-1]) / sums[1:])
     assert (np.abs(slopes - 1) < 0.15).all(), slopes
+
+
+@pytest.mark.parametrize("method", [METHODS["explicit"], mpm.SemiImplicit(0.6), SECOND_ORDER["trbdf2"]])
+@pytest.mark.parametrize("law", ["viscous_solid", "viscous_fluid"])
+def test_viscosity_only_takes_energy_and_no_momentum(law, method):
+    """Its dissipation is not negative (zero in an explicit step from C = 0), and its impulses add up to nothing without
+    walls."""
+    result = budget_of(material=VISCOUS[law], method=method)[0]
+    assert (np.asarray(result.energy.viscous) >= 0).all()
+    assert float(result.energy.viscous.sum()) > 0
+    assert float(jnp.abs(result.momentum.viscous).max()) < 1e-12 * float(jnp.abs(result.momentum.gravity).max())

@@ -12,6 +12,7 @@ import mpmjax as mpm
 from mpmjax._job import read_job, read_plan
 from mpmjax.cli import _summary
 
+EXAMPLES = Path(__file__).parents[1] / "examples"
 SCENE = """
 gravity = [0.0, -9.81]
 
@@ -96,7 +97,8 @@ def test_run_does_not_replace_a_file_unasked_and_resumes_it(folder):
 
 @pytest.mark.parametrize("name", ["still.png", "moving.gif"])
 def test_render_draws_a_picture(folder, name):
-    code, _, err = shell("render", folder / "run.h5", "-o", folder / name, "--colour", "energy", "--dpi", 40)
+    options = ("--colour", "energy", "--dpi", 40, "--view", 40, 25)
+    code, _, err = shell("render", folder / "run.h5", "-o", folder / name, *options)
     assert code == 0, err
     assert (folder / name).stat().st_size > 1000
 
@@ -126,6 +128,89 @@ def test_a_bad_scene_gets_one_line(tmp_path, old, new, says):
     assert not (tmp_path / "run.h5").exists()
 
 
+TWO = SCENE.replace(
+    """[material]
+kind""",
+    """[[material]]
+kind = "VonMises"
+youngs_modulus = 2e5
+poisson_ratio = 0.25
+yield_stress = 1e2
+
+[[material]]
+kind""",
+).replace(
+    """density = 1e3
+""",
+    """density = 1e3
+material = 2
+
+[[particles]]
+region = { kind = "Box", lower = [0.0, 0.5], upper = [0.3, 0.6] }
+density = 2e3
+
+[[particles]]
+region = { kind = "Ball", centre = [0.4, 0.8], radius = 0.1 }
+density = 500.0
+material = 2
+""",
+)
+
+
+def test_a_file_may_name_several_materials(tmp_path):
+    """Particles stand by material, in the laws' order, whatever that of their tables; each obeys its own law."""
+    (tmp_path / "two.toml").write_text(TWO)
+    job = read_job(tmp_path / "two.toml")
+    metal, jelly = job.scene.laws
+    assert type(metal) is mpm.VonMises
+    assert type(jelly) is mpm.FixedCorotated
+    assert job.particles.counts is not None
+    first, second = job.particles.counts
+    assert first == 12
+    density = np.asarray(job.particles.mass / job.particles.volume)
+    np.testing.assert_allclose(density[:first], 2e3)
+    np.testing.assert_allclose(density[first:], [1e3] * 36 + [500.0] * (second - 36))
+    code, out, err = shell("run", tmp_path / "two.toml", "-o", tmp_path / "two.h5", "--quiet")
+    assert code == 0, err
+    assert re.search(rf"particles +{first + second}\n", out)
+    run = mpm.load(tmp_path / "two.h5")
+    np.testing.assert_array_equal(run.final.counts, job.particles.counts)
+    plain = mpm.simulate(job.scene, job.particles, t1=job.run.t1, dt=job.run.dt, method=job.run.method)
+    np.testing.assert_array_equal(run.final.x, plain.final.x)
+
+
+BAD_MATERIALS = {
+    "no such material": (TWO, "material = 2", "material = 3", r"\[\[particles\]\] 1 material .* from 1 to 2, got 3"),
+    "material zero": (TWO, "material = 2", "material = 0", r"\[\[particles\]\] 1 material .* from 1 to 2, got 0"),
+    "no number": (TWO, "material = 2", 'material = "jelly"', r"\[\[particles\]\] 1 material .*, got 'jelly'"),
+    "a switch": (TWO, "material = 2", "material = true", r"\[\[particles\]\] 1 material .*, got True"),
+    "second of one": (
+        SCENE,
+        "density = 1e3",
+        "density = 1e3\nmaterial = 2",
+        r"\[\[particles\]\] 1 material .* to 1, got 2",
+    ),
+    "left over": (TWO, "density = 2e3", "density = 2e3\nmaterial = 2", r"\[\[material\]\] 1 has no particles"),
+    "key of the second law": (
+        TWO,
+        "poisson_ratio = 0.3",
+        "poison_ratio = 0.3",
+        r"\[\[material\]\] 2: .*'poisson_ratio'",
+    ),
+    "number of the first law": (TWO, "yield_stress = 1e2", "yield_stress = -1", r"\[\[material\]\] 1: .*yield_stress"),
+    "key of a later table": (TWO, "density = 500.0", "denstiy = 500.0", r"\[\[particles\]\] 3: .*'density'"),
+}
+
+
+@pytest.mark.parametrize(("scene", "old", "new", "says"), BAD_MATERIALS.values(), ids=BAD_MATERIALS)
+def test_a_bad_material_gets_one_line(tmp_path, scene, old, new, says):
+    assert old in scene
+    (tmp_path / "bad.toml").write_text(scene.replace(old, new, 1))
+    with pytest.raises(ValueError, match=says) as caught:
+        read_plan(tmp_path / "bad.toml")
+    assert "\n" not in str(caught.value)
+
+
 def test_a_missing_file_gets_one_line(tmp_path):
     assert "none.toml" in refused("run", tmp_path / "none.toml", "-o", tmp_path / "run.h5")
     assert "none.h5" in refused("render", tmp_path / "none.h5", "-o", tmp_path / "a.png")
@@ -150,6 +235,14 @@ def test_a_run_that_blows_up_keeps_what_was_written(tmp_path):
     run = mpm.load(tmp_path / "run.h5")
     assert len(run) >= 2
     assert np.isfinite(run.frames.x).all()
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.stem)
+def test_the_examples_can_be_run(path):
+    """They are read, and name their own commands."""
+    plan = read_plan(path)
+    assert plan.particles.count > 50
+    assert re.search(rf"#   mpmjax (run|fit) examples/{path.name}", path.read_text(encoding="utf-8"))
 
 
 def test_fit_needs_a_fit_table(folder):

@@ -1,27 +1,33 @@
 """A scene pays for what it uses: operations counted in the program of a step, for scenes that differ in one feature."""
 
 from collections import Counter
+from unittest import mock
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
-from helpers import DESCRIPTIONS, KERNELS, METHODS, SECOND_ORDER, ids
+from helpers import DESCRIPTIONS, KERNELS, METHODS, SECOND_ORDER, block, ids
 
 import mpmjax as mpm
+from mpmjax import _contact, _step
 from mpmjax._checks import canonical
+from mpmjax._constraint import Constraint
 from mpmjax._diffrax import Problem
+from mpmjax._nodes import Nodes
 from mpmjax._step import advance
 
 LAW = mpm.NeoHookean(1e5, 0.3)
 COUNTED = ("stencil_spread", "stencil_collect", "while", "floor", "exp", "log")
 
 
-def program(method=mpm.Explicit(), *, d=2, nodes=12, **scene):
-    """The step as a function of arrays, as a rollout has it, and the arrays."""
+def program(method=mpm.Explicit(), *, d=2, nodes=12, material=LAW, **scene):
+    """The step as a function of arrays, as a rollout has it, and the arrays. Each of several materials has as many
+    particles as one has alone."""
     grid = mpm.Grid((nodes,) * d, 0.1, origin=(-3,) * d)
-    particles = mpm.fill(mpm.Box((0.0,) * d, (0.4,) * d), grid, particles_per_cell=2**d, density=1e3)
-    scene, dt, method = canonical((mpm.Scene(grid, LAW, **scene), 1e-3, method), jnp.float64)
+    block = mpm.fill(mpm.Box((0.0,) * d, (0.4,) * d), grid, particles_per_cell=2**d, density=1e3)
+    particles = mpm.join(*[block] * len(material)) if isinstance(material, tuple) else block
+    scene, dt, method = canonical((mpm.Scene(grid, material, **scene), 1e-3, method), jnp.float64)
     particles = mpm.prepare(scene, particles)
     problem = Problem(scene, particles, scene.stencil(particles) if scene.total else None, dt, method)
     arrays, rest = eqx.partition(problem, eqx.is_array)
@@ -130,6 +136,8 @@ HELD = {
     "slip": mpm.SlipBox((-0.2, -0.2), (0.8, 0.8)),
     "grip": mpm.Grip(mpm.Box((0.3, -1.0), (1.0, 1.0)), mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.1, 0.0)))),
     "mirrored": mpm.SymmetryPlane(0, 0.0),
+    "sticky collider": mpm.StickyCollider(mpm.Ball((0.4, 0.4), 0.15)),
+    "slip collider": mpm.SlipCollider(mpm.HalfSpace((0.0, 0.0), (1.0, 2.0))),
 }
 
 
@@ -148,12 +156,96 @@ def test_only_implicit_steps_iterate(method):
     wall = {"boundary": mpm.SeparatingBox((-0.2, 0.0), (0.8, 0.8))}
     assert counted(**wall)["while"] == 1
     assert counted(method, **wall)["while"] > counted(method)["while"] + 1
+    collider = {"boundary": mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (1.0, 2.0)), friction=0.1)}
+    assert counted(**collider)["while"] == 1
+    assert counted(method, **collider)["while"] == counted(method, **wall)["while"]
+
+
+def equations(jaxpr):
+    """Of a program and all within it."""
+    return len(jaxpr.eqns) + sum(equations(inner) for equation in jaxpr.eqns for inner in inner_programs(equation))
+
+
+@pytest.mark.parametrize("method", [METHODS["explicit"], METHODS["semi_implicit"]], ids=["explicit", "semi_implicit"])
+@pytest.mark.parametrize("boundary", [(), HELD["slip"], mpm.SeparatingBox((-0.2, 0.0), (0.8, 0.8))])
+def test_without_colliders_a_constraint_is_a_mask(method, boundary):
+    """No operation more: where each projection and what is prescribed are the mask's `where` itself, written out, the
+    program of a step has as many equations. No leaf more: nothing of colliders is there, nor reported."""
+
+    def masked(self, a, b):
+        return jnp.where(self.free, a, b)
+
+    step, arrays = program(method, boundary=boundary)
+    as_is = equations(jax.make_jaxpr(step)(arrays).jaxpr)
+    with (
+        mock.patch.object(Constraint, "split", masked),
+        mock.patch.object(Constraint, "identity", lambda self, vector, mass: vector),
+        mock.patch.object(Nodes, "constraint", property(lambda self: Constraint(self.free))),
+        mock.patch.object(Nodes, "prescribed", property(lambda self: self.conditions.velocity)),
+        mock.patch.object(_step, "pushes", return_value=None),
+        mock.patch.object(_step, "with_collider_friction", lambda nodes, active, v, push: (v, None)),
+        mock.patch.object(_contact, "_beside_colliders", lambda nodes, active, imbalance: imbalance),
+        mock.patch.object(_contact, "held_normals", return_value=None),
+    ):
+        step, arrays = program(method, boundary=boundary)
+        assert equations(jax.make_jaxpr(step)(arrays).jaxpr) == as_is
+    info = jax.eval_shape(lambda a: mpm.step(*a, 0.0, 1e-3, method=method)[1], block(2, boundary=boundary))
+    assert info.colliders is None
+
+
+@pytest.mark.parametrize("collider", [mpm.SlipCollider, mpm.StickyCollider, mpm.SeparatingCollider])
+def test_a_collider_scatters_nothing_and_adds_no_crossing_to_an_iteration(collider):
+    method, boundary = mpm.SemiImplicit(), collider(mpm.HalfSpace((0.0, 0.0), (1.0, 2.0)))
+    step, arrays = program(method, boundary=boundary)
+    jaxpr = jax.make_jaxpr(step)(arrays).jaxpr
+    for body in innermost_loops(jaxpr):
+        assert operations(body) == {"stencil_spread": 1, "stencil_collect": 1}
+    plain, arrays = program(method, boundary=HELD["slip"])
+    if collider is not mpm.SeparatingCollider:
+        assert operations(jaxpr) == operations(jax.make_jaxpr(plain)(arrays).jaxpr)
 
 
 def test_in_the_total_description_a_rollout_builds_no_stencil_in_its_steps():
     """The first node is found by rounding down: in each step of the updated description, in none of the total one."""
     assert counted()["floor"] > 0
     assert counted(description=mpm.TotalLagrangian())["floor"] == 0
+
+
+SNOW = mpm.Snow()
+
+
+@pytest.mark.parametrize("method", **ids(METHODS | SECOND_ORDER))
+def test_yielding_adds_no_crossing_and_one_number_a_particle(method):
+    """To an explicit step or an implicit one; what it computes is its own: an eigenvalue problem and an exponential."""
+    elastic, yielding = (counted(method, material=law) for law in (mpm.FixedCorotated(1e5, 0.2), SNOW))
+    assert crossings(yielding) == crossings(elastic)
+    assert yielding["while"] == elastic["while"]
+    if method == METHODS["explicit"]:
+        assert (yielding["exp"], elastic["exp"]) == (1, 0)
+        assert compiled(material=SNOW)[3] == compiled(material=mpm.FixedCorotated(1e5, 0.2))[3] + 1
+
+
+@pytest.mark.parametrize("method", **ids(METHODS))
+def test_a_second_material_adds_no_crossing_and_no_iteration(method):
+    """Both go to the grid and back in one sum."""
+    one, two = counted(method), counted(method, material=(LAW, SNOW))
+    assert crossings(two) == crossings(one)
+
+
+def logarithms(jaxpr):
+    """The shapes of what logarithms are taken of."""
+    shapes = {e.invars[0].aval.shape for e in jaxpr.eqns if e.primitive.name == "log"}
+    return shapes.union(*(logarithms(inner) for e in jaxpr.eqns for inner in inner_programs(e)))
+
+
+def test_no_law_is_evaluated_for_particles_of_another():
+    """Neo-Hookean's logarithm is taken of its own 64 particles of 128, and F and history are stored by material."""
+    step, arrays = program(material=(SNOW, LAW))
+    assert logarithms(jax.make_jaxpr(step)(arrays).jaxpr) == {(64,)}
+    alone = [compiled(material=(law,)) for law in (SNOW, LAW)]
+    both = compiled(material=(SNOW, LAW))
+    assert both[0] < sum(costs[0] for costs in alone)
+    assert both[3] == compiled(material=(LAW,))[3] + 2  # F and J_P of snow
 
 
 def test_pic_carries_no_affine_velocity_and_two_dimensions_no_third():
@@ -171,3 +263,29 @@ def test_the_cost_of_an_empty_window_is_that_of_its_nodes():
     assert counted(nodes=24) == counted(nodes=12)
     assert large[0] - small[0] < 40 * added
     assert large[1] - small[1] < 400 * added
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_fluid_stores_and_costs_less_than_a_solid(d):
+    """One number in the place of F's d²; in flops and bytes of the compiled step it is below the cheapest solid."""
+    fluid, solid = compiled(d=d, material=mpm.Fluid(1e5)), compiled(d=d)
+    assert fluid[0] < 0.9 * solid[0]
+    assert fluid[1] < 0.95 * solid[1]
+    assert crossings(counted(d=d, material=mpm.Fluid(1e5))) == (1, 1)
+    step, arrays = program(d=d, material=mpm.Fluid(1e5))
+    assert jax.eval_shape(step, arrays).F.shape[1:] == (1, 1)
+
+
+@pytest.mark.parametrize("transfer", [mpm.APIC(), mpm.PIC(), mpm.FLIP()])
+@pytest.mark.parametrize("law", [LAW, mpm.Fluid(1e5)])
+def test_viscosity_adds_no_crossing(law, transfer):
+    """To an explicit step, whatever the transfer; nor to an iteration. What it needs kept is the velocity gradient."""
+    viscous = mpm.Viscous(law, 1.0)
+    assert crossings(counted(material=viscous, transfer=transfer)) == crossings(
+        counted(material=law, transfer=transfer)
+    )
+    step, arrays = program(material=viscous, transfer=transfer)
+    assert jax.eval_shape(step, arrays).C is not None
+    step, arrays = program(mpm.SemiImplicit(), material=viscous, transfer=transfer)
+    (body,) = innermost_loops(jax.make_jaxpr(step)(arrays).jaxpr)
+    assert operations(body) == {"stencil_spread": 1, "stencil_collect": 1}

@@ -12,6 +12,8 @@ from helpers import DESCRIPTIONS, DIMS, ELASTIC, GRADIENTS, LAWS, cloud
 
 import mpmjax as mpm
 from mpmjax._boundary import combine
+from mpmjax._constituent import Constituent
+from mpmjax._constraint import Constraint
 from mpmjax._hessian import ImplicitOperator
 from mpmjax._kernel import make_stencil
 from mpmjax._mirror import mirror
@@ -57,7 +59,7 @@ def linearised(potential, du, u, h):
 
     def action(hessian):
         H = hessian.at_rest(potential, du) if u is None else hessian.at(potential, u)
-        return ImplicitOperator(jnp.zeros(len(du)), jnp.asarray(1.0), H, jnp.ones(du.shape, bool)).mv(du)
+        return ImplicitOperator(jnp.zeros(len(du)), jnp.asarray(1.0), H, Constraint(jnp.ones(du.shape, bool))).mv(du)
 
     place = jnp.zeros_like(du) if u is None else u
     forces = jax.vmap(lambda step: potential.force(place + step * du))(jnp.stack([0 * h, -h, h]))
@@ -71,10 +73,10 @@ def scene_of(law, d, family, description, gradient):
     window = grid.window(particles.x)
     stencil = make(mpm.BSpline(), GRADIENTS[gradient], grid, window, particles.x, affine=False)
     F = jnp.asarray(deformations(family, d, n=particles.count)[0])
-    pull = F if description == "updated" else None
+    total = description == "total"
     images = mirror((), grid, window)
     material = jax.tree.map(jnp.asarray, ELASTIC[law])
-    potential = ElasticPotential(material, particles.volume, F, pull, stencil, images)
+    potential = ElasticPotential((Constituent(material, particles.volume, F, total),), stencil, images)
     du = jnp.asarray(DX * np.random.default_rng(1).normal(size=(grid.size, d)))
     return potential, du
 
@@ -88,7 +90,7 @@ def relative(a, b):
 def results_of(*case):
     """`linearised` of a case at rest; its steps are small against the smallest stretch. With h."""
     potential, du = scene_of(*case)
-    h = 1e-6 * jnp.abs(jnp.linalg.det(potential.F.transpose(2, 0, 1))).min() ** (1 / du.shape[1])
+    h = 1e-6 * jnp.abs(jnp.linalg.det(potential.at_rest()[0].transpose(2, 0, 1))).min() ** (1 / du.shape[1])
     return *jax.tree.map(np.asarray, linearised(potential, du, None, h)), float(h)
 
 
@@ -120,7 +122,7 @@ def test_hessian_agrees_with_central_differences_of_the_force(case):
 def test_force_is_minus_the_gradient_of_the_energy(case):
     """f = −∂Φ/∂u at u = 0, to rounding of the moduli."""
     descent, (force, _, _), _, _ = results_of(*case)
-    law, volume = LAWS[case[0]], scene_of(*case)[0].volume
+    law, volume = LAWS[case[0]], scene_of(*case)[0].constituents[0].volume
     moduli = float((law.shear_modulus + law.lame_lambda) * volume.max() / DX)
     np.testing.assert_allclose(force, descent, rtol=0, atol=1e-13 * max(np.abs(force).max(), moduli))
 
@@ -157,8 +159,8 @@ def constrained(d, description, law="fixed_corotated"):
     window = grid.window(particles.x)
     stencil = make(mpm.BSpline(), mpm.MLSGradient(), grid, window, particles.x, affine=False)
     F, images = components(particles.F), mirror(walls, grid, window)
-    pull = F if description == "updated" else None
-    potential = ElasticPotential(jax.tree.map(jnp.asarray, LAWS[law]), particles.volume, F, pull, stencil, images)
+    body = Constituent(jax.tree.map(jnp.asarray, LAWS[law]), particles.volume, F, description == "total")
+    potential = ElasticPotential((body,), stencil, images)
     mass = images.fold_scalar(p2g(stencil, particles.mass, components(particles.v), None, grid.size)[0])
     fixed = combine(walls, grid.nodes(window), DX, 0.0, 1.0, reference=False).fixed
     free = (mass > 0)[:, None] & ~fixed
@@ -170,7 +172,9 @@ def constrained(d, description, law="fixed_corotated"):
     # so that mass and stiffness are alike
     factor = jnp.asarray(1e-3)
     like = jnp.zeros((grid.size, d))
-    operators = [ImplicitOperator(mass, factor, h.at_rest(potential, like), free) for h in HESSIANS.values()]
+    operators = [
+        ImplicitOperator(mass, factor, h.at_rest(potential, like), Constraint(free)) for h in HESSIANS.values()
+    ]
     return operators, potential, free
 
 
@@ -201,7 +205,7 @@ def test_operator_is_symmetric(route, d, description):
 def test_assembled_it_is_the_same_operator(route, d, description):
     """What the solvers iterate on, one symmetric matrix a particle, against the map through the law."""
     operator = constrained(d, description)[0][route]
-    b = jnp.asarray(np.random.default_rng(9).normal(size=operator.free.shape))
+    b = jnp.asarray(np.random.default_rng(9).normal(size=operator.constraint.free.shape))
     assembled = eqx.filter_jit(ImplicitOperator.assembled)(operator)
     assert relative(apply(assembled, b), apply(operator, b)) < 1e-13
     K = np.asarray(assembled.hessian.matrix)

@@ -145,8 +145,8 @@ def test_single_precision_converges_and_says_how_far(times):
         factor=nodes.dt**2,
         hessian=AnalyticHessian().at_rest(nodes.potential, predictor),
         rhs=nodes.mass[:, None] * predictor,
-        free=nodes.free,
-        prescribed=nodes.conditions.velocity,
+        constraint=nodes.constraint,
+        prescribed=nodes.prescribed,
     )
 
     def norm(a):

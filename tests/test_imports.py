@@ -12,17 +12,17 @@ FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.r
 
 # Each layer may import from itself and from those before it; what is not listed is a leaf, on top of them all.
 LAYERS = (
-    ("_types", "_checks"),
+    ("_types", "_checks", "_constraint"),
     ("_grid", "_region", "_motion"),
     ("_kernel",),
-    ("_crossing",),
+    ("_crossing", "_sampled"),
     ("_transfer",),
     ("_linalg",),
     ("_isotropic",),
     ("material",),
     ("_boundary", "_body_force"),
-    ("_mirror",),
-    ("_particles", "_scene"),
+    ("_mirror", "_collider", "_exchange"),
+    ("_particles", "_constituent", "_scene"),
     ("_metric", "_potential", "_hessian"),
     ("_conjugate_residual",),
     ("_nodes", "_guess", "_implicit", "_contact"),

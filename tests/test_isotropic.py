@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from helpers import DIMS, assert_close, ids, rotation_matrix
 
-from mpmjax._isotropic import Logarithm
+from mpmjax._isotropic import Logarithm, PowerLessOne
 
-FUNCTIONS = {"logarithm": Logarithm()}
-NUMPY = {Logarithm: np.log}
+FUNCTIONS = {"logarithm": Logarithm()} | {
+    f"power {a}": PowerLessOne(jnp.array([a]), jnp.array([c])) for a, c in ((-0.4, 0.3), (-1e-9, 1e-8), (1.7, -0.2))
+}
 EIGENVALUES = {
     "all one": (1.0, 1.0, 1.0),
     "two equal": (1.3, 1.3, 0.4),
@@ -60,7 +61,8 @@ def test_values_are_those_of_lapacks_eigenvectors(eigenvalues, d, f):
     S, *directions = case(eigenvalues, d)
     value = evaluated(f, S, *directions)[0]
     s, V = np.linalg.eigh(S[..., 0])
-    assert_close(value[..., 0], (V * NUMPY[type(f)](s)) @ V.T, 1e-13, atol=4e-15)
+    of = np.log(s) if isinstance(f, Logarithm) else np.expm1(f.exponent[0] * np.log(s) + f.shift[0])
+    assert_close(value[..., 0], (V * of) @ V.T, 1e-13, atol=4e-15 if isinstance(f, Logarithm) else 0)
 
 
 @each
@@ -83,6 +85,40 @@ def test_reverse_mode_is_the_transpose(eigenvalues, d, f):
     for forward, backward, direction in ((first, once, A), (second, twice, B)):
         size = float(jnp.abs(W * forward).sum())
         np.testing.assert_allclose((backward * direction).sum(), (W * forward).sum(), rtol=0, atol=1e-12 * size)
+
+
+@jax.jit
+def parametric(f, df, S, A):
+    """f(S), its change by the parameters of f, and Df[A]; and the changes of these three by them."""
+
+    def three(f):
+        value, change = jax.jvp(lambda f: f(S), (f,), (df,))
+        return value, change, jax.jvp(f, (S,), (A,))[1]
+
+    return jax.jvp(three, (f,), (df,))
+
+
+@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("eigenvalues", **ids(EIGENVALUES))
+def test_derivatives_in_the_parameters_are_central_differences(eigenvalues, d):
+    """Of values, once and twice, and of first derivatives; the adjoint is the transpose to 1e-12."""
+    S, A, _, W = case(eigenvalues, d)
+    f, df = FUNCTIONS["power -0.4"], PowerLessOne(jnp.array([0.7]), jnp.array([-0.3]))
+    _, changes = parametric(f, df, S, A)
+    h = 1e-5
+    ahead, behind = (parametric(jax.tree.map(lambda a, b, s=s: a + s * b, f, df), df, S, A)[0] for s in (h, -h))
+    for exact, a, b in zip(changes, ahead, behind, strict=True):
+        assert_close(exact, (a - b) / (2 * h), 1e-7)
+    pulled = jax.grad(lambda f: (W * f(S)).sum())(f)
+    found = sum((a * b).sum() for a, b in zip(jax.tree.leaves(pulled), jax.tree.leaves(df), strict=True))
+    size = float(jnp.abs(W * changes[0]).sum())
+    np.testing.assert_allclose(found, (W * changes[0]).sum(), rtol=0, atol=1e-12 * size)
+
+
+def test_a_power_of_nothing_is_nothing():
+    """e⁰ S⁰ − I = 0 to the last bit."""
+    S, *_ = case(EIGENVALUES["three distinct"], 3)
+    assert not np.any(PowerLessOne(jnp.zeros(1), jnp.zeros(1))(S))
 
 
 def test_batches_of_any_shape_are_taken():

@@ -13,6 +13,11 @@ from mpmjax import _linalg as la
 
 EACH_LAW = pytest.mark.parametrize("law", **ids(ELASTIC))
 EACH_DIM = pytest.mark.parametrize("d", DIMS)
+STRAINED = ELASTIC | {"hencky_transverse": mpm.Hencky(1e4, 0.3, transverse_strain=-0.2)}
+EACH_STATE = pytest.mark.parametrize(
+    ("name", "d"), [(name, d) for name in STRAINED for d in DIMS if (name, d) != ("hencky_transverse", 3)]
+)
+"""Every law in every dimension, and Hencky's with a strain out of the space, which in 3-D there is not."""
 
 
 @eqx.filter_jit
@@ -45,11 +50,11 @@ def with_lame(law, mu, lam):
     return type(law)(youngs_modulus=2 * mu * (1 + ratio), poisson_ratio=ratio)
 
 
-@EACH_LAW
-@EACH_DIM
+@EACH_STATE
 @pytest.mark.parametrize("family", STRETCHES)
-def test_stress_and_tangent_are_derivatives_of_the_energy(law, family, d):
+def test_stress_and_tangent_are_derivatives_of_the_energy(name, family, d):
     """P = ∂Ψ/∂F by `jax.grad` and δP by `jax.jvp`, particle by particle, to 1e-12; the tangent is symmetric."""
+    law = STRAINED[name]
     F, _ = deformations(family, d)
     if not np.asarray(law.admits(jnp.asarray(F))).all():
         assert family == "inverted"
@@ -146,12 +151,12 @@ def principal_forms(law, F):
     return dense, jnp.einsum("kap,klp,lbp->abp", modes, inner, modes), closed
 
 
-@EACH_LAW
-@EACH_DIM
+@EACH_STATE
 @pytest.mark.parametrize("family", STRETCHES)
-def test_principal_tangent_is_the_tangents_eigenstructure(law, family, d):
+def test_principal_tangent_is_the_tangents_eigenstructure(name, family, d):
     """The closed form in the principal frame is the assembled tangent to 1e-11 of its largest entry, and its
     eigenvalues are those of `numpy.linalg.eigvalsh`."""
+    law = STRAINED[name]
     F, _ = deformations(family, d)
     if not np.asarray(law.admits(jnp.asarray(F))).all():
         assert family == "inverted"
@@ -203,6 +208,28 @@ def test_hencky_matches_its_formula(d):
     kirchhoff = 2 * mu * strain + lam * trace[:, None, None] * np.eye(d)
     assert_close(P, np.linalg.inv(F).swapaxes(1, 2) @ kirchhoff, 1e-13)
     assert_close(energy, mu * (strain**2).sum(axis=(1, 2)) + lam / 2 * trace**2, 1e-13)
+
+
+@pytest.mark.parametrize("d", [1, 2])
+def test_hencky_with_a_transverse_strain_is_the_law_in_three_dimensions(d):
+    """Energy and stress are those of F with exp ε_t on the rest of the diagonal, whatever ε_t of each particle."""
+    F, _ = deformations("random", d)
+    strain = np.random.default_rng(5).normal(size=F.shape[-1]) / 5
+    whole = np.repeat(np.eye(3)[..., None], F.shape[-1], axis=-1) * np.exp(strain)
+    whole[:d, :d] = F
+    energy, P, A = evaluate(forward, mpm.Hencky(1e4, 0.3, transverse_strain=strain), F, np.ones_like(F))
+    dF = np.zeros_like(whole)
+    dF[:d, :d] = 1
+    expected = evaluate(forward, ELASTIC["hencky"], whole, dF)
+    for ours, theirs in zip((energy, P, A), (expected[0], expected[1][:d, :d], expected[2][:d, :d]), strict=True):
+        assert_close(ours, theirs, 1e-13)
+
+
+def test_no_strain_is_transverse_in_three_dimensions():
+    """A law that holds one says so."""
+    law = mpm.Hencky(1e4, 0.3, transverse_strain=0.1)
+    with pytest.raises(ValueError, match="In 3-D no direction is transverse"):
+        law.energy(jnp.ones((3, 3, 1)))
 
 
 @EACH_DIM

@@ -32,7 +32,7 @@ def operator_of(scene, particles, hessian, factor=1e-3):
     dt = jnp.asarray(1e-3)
     nodes = particles_to_grid(scene, particles, 0.0, dt, scene.stencil(particles), centred=False)
     action = hessian.at_rest(nodes.potential, nodes.velocity)
-    return ImplicitOperator(nodes.mass, jnp.asarray(factor), action, nodes.free, mpm.Metric.DIAGONAL)
+    return ImplicitOperator(nodes.mass, jnp.asarray(factor), action, nodes.constraint, mpm.Metric.DIAGONAL)
 
 
 @eqx.filter_jit
@@ -63,7 +63,7 @@ def test_deformed_it_scales_the_operator_whatever_the_law_and_the_walls(descript
     both = [operator_of(scene, particles, hessian) for hessian in (mpm.AnalyticHessian(), mpm.JvpHessian())]
     (metric, matrix), (other, _) = map(metric_and_matrix, both)
     assert_close(metric, other, 1e-12)
-    free = np.asarray(both[0].free)
+    free = np.asarray(both[0].constraint.free)
     assert (metric[free] >= jnp.broadcast_to(both[0].mass[:, None], free.shape)[free]).all()
     np.testing.assert_array_equal(metric[~free], 1)
     exact = np.diag(matrix).reshape(free.shape)[free]
@@ -78,7 +78,7 @@ def test_negative_stiffness_is_left_out():
     operator = operator_of(scene, squeezed, mpm.AnalyticHessian(), factor=1.0)
     metric, matrix = metric_and_matrix(operator)
     assert np.linalg.eigvalsh(matrix).min() < 0
-    assert (metric >= jnp.where(operator.free, operator.mass[:, None], 1)).all()
+    assert (metric >= jnp.where(operator.constraint.free, operator.mass[:, None], 1)).all()
 
 
 def layered(contrast, multiple, *, side=6, dtype=jnp.float64):

@@ -145,7 +145,7 @@ def stiffness(scene, particles, hessian):
     nodes = grid_update(scene, particles, 1e-3, mpm.Explicit()).nodes
     free = nodes.free
     action = hessian.at_rest(nodes.potential, nodes.velocity)
-    operator = ImplicitOperator(jnp.zeros_like(nodes.mass), jnp.asarray(1.0), action, free)
+    operator = ImplicitOperator(jnp.zeros_like(nodes.mass), jnp.asarray(1.0), action, nodes.constraint)
     A, keep = np.asarray(eqx.filter_jit(ImplicitOperator.as_matrix)(operator)), np.asarray(free).ravel()
     return A[np.ix_(keep, keep)], np.repeat(np.asarray(nodes.mass), 2)[keep]
 

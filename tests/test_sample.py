@@ -101,11 +101,16 @@ def test_density_can_be_differentiated():
 class Nowhere(mpm.AbstractRegion):
     """A region with bounds but no points."""
 
-    def contains(self, x, margin=0.0):
-        return jnp.zeros(len(x), bool)
+    dim = 2
+
+    def distance(self, x):
+        return jnp.ones(len(x))
 
     def bounds(self):
         return np.zeros(2), np.ones(2)
+
+    def middle(self):
+        return jnp.zeros(2)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,11 @@ import pytest
 from helpers import ids
 
 import mpmjax as mpm
+from mpmjax._collider import AbstractCollider
 from mpmjax._guess import Guess
 from mpmjax._method import Method
+from mpmjax._motion import AbstractMotion
+from mpmjax._region import AbstractRegion
 from mpmjax._schema import CLASSES, arguments, decode, encode
 
 GRID = mpm.Grid((8, 9), 0.1, origin=(-2, 3), periodic=(True, False))
@@ -31,6 +34,13 @@ EXAMPLES = {
     mpm.FixedCorotated: mpm.FixedCorotated(1 / 3, 0.3),
     mpm.NeoHookean: mpm.NeoHookean(np.array([1.0, 2.0]), 0.3),
     mpm.Hencky: mpm.Hencky(2e5, 0.2),
+    mpm.Snow: mpm.Snow(1.4e5, 0.2, hardening=7.0),
+    mpm.VonMises: mpm.VonMises(2e11, 0.3, yield_stress=2.5e8, hardening_modulus=1e9),
+    mpm.DruckerPrager: mpm.DruckerPrager(3.5e5, 0.3, friction_angle=0.6),
+    mpm.CamClay: mpm.CamClay(1e6, 0.3, friction=1.2, preconsolidation=3e4, cohesion=0.3, hardening=2.0),
+    mpm.Snow: mpm.Snow(1e5, hardening=7.0),
+    mpm.Viscous: mpm.Viscous(mpm.NeoHookean(1e5, 0.4), 3.0, 1.0),
+    mpm.Fluid: mpm.Fluid(2e5, 1.4, tension=True),
     mpm.StickyBox: mpm.StickyBox((0.1,), (0.9,)),
     mpm.SlipBox: mpm.SlipBox((0.1, -np.inf), (np.inf, 0.7)),
     mpm.SeparatingBox: mpm.SeparatingBox((0.1,), (0.9,), friction=0.3),
@@ -39,7 +49,16 @@ EXAMPLES = {
     mpm.ContactPlane: mpm.ContactPlane(1, 0.05, "below", friction=0.3),
     mpm.Box: mpm.Box((0.0, 0.1, 0.2), (1.0, 1.1, 1.2)),
     mpm.Ball: mpm.Ball((0.1, 0.2), 0.3),
+    mpm.HalfSpace: mpm.HalfSpace((0.1, 0.2), (3.0, 4.0)),
+    mpm.Capsule: mpm.Capsule((0.1, 0.2), (0.3, 0.4), 0.1),
+    mpm.Cylinder: mpm.Cylinder((0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 0.1),
+    mpm.Union: mpm.Union((mpm.Ball((0.1, 0.2), 0.3), mpm.Box((0.0, 0.1), (1.0, 1.1)))),
+    mpm.SampledDistance: mpm.SampledDistance((0.1, 0.2), 0.1, np.linspace(-1, 1, 20).reshape(4, 5)),
+    mpm.StickyCollider: mpm.StickyCollider(mpm.Ball((0.1, 0.2), 0.3), GRIP.motion),
+    mpm.SlipCollider: mpm.SlipCollider(mpm.HalfSpace((0.1, 0.2), (0.0, 1.0))),
+    mpm.SeparatingCollider: mpm.SeparatingCollider(mpm.Ball((0.1,), 0.3), friction=0.2),
     mpm.Motion: GRIP.motion,
+    mpm.RigidMotion: mpm.RigidMotion((0.0, 1.0), ((0.0, 0.0), (0.1, 0.2)), (0.0, 0.5), (0.3, 0.4)),
     mpm.BSpline: mpm.BSpline(1),
     mpm.SplineGradient: mpm.SplineGradient(),
     mpm.MLSGradient: mpm.MLSGradient(),
@@ -130,6 +149,88 @@ def test_toml_may_leave_out_defaults_and_evident_kinds():
     assert_same(decode(tomllib.loads(text), mpm.Scene), scene)
 
 
+DISK = mpm.Ball((0.3, 0.4), 0.2)
+NESTED = mpm.Union((DISK, mpm.Union((mpm.HalfSpace((0.0, 0.1), (0.0, 1.0)), mpm.Box((0.1, 0.1), (0.2, 0.3))))))
+SLIDE = mpm.Motion((0.0, 0.5), ((0.0, 0.0), (0.1, 0.0)))
+TURN = mpm.RigidMotion((0.0, 0.5), ((0.0, 0.0), (0.1, 0.0)), (0.0, 1.5), (0.3, 0.4))
+SPIN = mpm.RigidMotion((0.0, 0.5), ((0.0,) * 3, (0.1, 0.0, 0.0)), ((0.0,) * 3, (0.0, 1.5, 0.0)), (0.3, 0.4, 0.5))
+BODIES = {
+    "ball that slides": (
+        'kind = "StickyCollider"\nshape = { kind = "Ball", centre = [0.3, 0.4], radius = 0.2 }\n'
+        'motion = { kind = "Motion", times = [0, 0.5], displacement = [[0, 0], [0.1, 0]] }',
+        mpm.StickyCollider(DISK, SLIDE),
+    ),
+    "half-space": (
+        'kind = "SlipCollider"\nshape = { kind = "HalfSpace", point = [0.0, 0.1], normal = [0.0, 1.0] }',
+        mpm.SlipCollider(NESTED.regions[1].regions[0]),
+    ),
+    "nested union that turns": (
+        """kind = "SeparatingCollider"
+        friction = 0.3
+        motion = { kind = "RigidMotion", times = [0, 0.5], displacement = [[0, 0], [0.1, 0]], \
+            rotation = [0, 1.5], centre = [0.3, 0.4] }
+        [boundary.shape]
+        kind = "Union"
+        [[boundary.shape.regions]]
+        kind = "Ball"
+        centre = [0.3, 0.4]
+        radius = 0.2
+        [[boundary.shape.regions]]
+        kind = "Union"
+        regions = [
+            { kind = "HalfSpace", point = [0.0, 0.1], normal = [0.0, 1.0] },
+            { kind = "Box", lower = [0.1, 0.1], upper = [0.2, 0.3] },
+        ]""",
+        mpm.SeparatingCollider(NESTED, TURN, friction=0.3),
+    ),
+    "union of one": (
+        'kind = "SlipCollider"\n[boundary.shape]\nkind = "Union"\n'
+        'regions = { kind = "Ball", centre = [0.3, 0.4], radius = 0.2 }',
+        mpm.SlipCollider(mpm.Union(DISK)),
+    ),
+    "capsule": (
+        'kind = "SeparatingCollider"\nshape = { kind = "Capsule", start = [0, 0], end = [0.5, 0.5], radius = 0.1 }',
+        mpm.SeparatingCollider(mpm.Capsule((0.0, 0.0), (0.5, 0.5), 0.1)),
+    ),
+    "samples": (
+        'kind = "SlipCollider"\n'
+        'shape = { kind = "SampledDistance", lower = [0, 0], spacing = 0.5, values = [' + 4 * "[-1, 0, 1, 2]," + "] }",
+        mpm.SlipCollider(mpm.SampledDistance((0.0, 0.0), 0.5, np.array([[-1.0, 0.0, 1.0, 2.0]] * 4))),
+    ),
+    "cylinder that spins": (
+        """kind = "StickyCollider"
+        shape = { kind = "Cylinder", start = [0, 0, 0], end = [0, 0, 1], radius = 0.2 }
+        [boundary.motion]
+        kind = "RigidMotion"
+        times = [0, 0.5]
+        displacement = [[0, 0, 0], [0.1, 0, 0]]
+        rotation = [[0, 0, 0], [0, 1.5, 0]]
+        centre = [0.3, 0.4, 0.5]""",
+        mpm.StickyCollider(mpm.Cylinder((0.0,) * 3, (0.0, 0.0, 1.0), 0.2), SPIN),
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "expected"), **ids(BODIES))
+def test_toml_holds_every_collider_shape_and_motion(text, expected):
+    """As whole scenes, which say the same as the constructors do."""
+    head = f"""
+        grid = {{ shape = {[8] * expected.dim}, spacing = 0.1 }}
+        material = {{ kind = "NeoHookean", youngs_modulus = 1e5, poisson_ratio = 0.3 }}
+        [[boundary]]
+        """
+    scene = decode(tomllib.loads(head + text), mpm.Scene)
+    assert_same(scene.boundary[0], expected)
+    assert_same(decode(json.loads(json.dumps(encode(scene))), mpm.Scene), scene)
+
+
+def test_the_bodies_are_of_every_kind():
+    """Every collider, shape and motion stands in a file above."""
+    named = {word for text, _ in BODIES.values() for word in text.split('"')}
+    bodies = {c.__name__ for c in CLASSES if issubclass(c, (AbstractCollider, AbstractRegion, AbstractMotion))}
+    assert bodies - named == set()
+
+
 def test_a_function_takes_its_arguments_from_a_table():
     """What `fill` is called with can be read like an object."""
     table = {"region": {"kind": "Ball", "centre": [0, 0], "radius": 1}, "density": 1000, "particles_per_cell": [2, 3]}
@@ -180,6 +281,8 @@ def edited(**changes: object) -> dict:
     return scene
 
 
+DISC = {"kind": "Ball", "centre": [0, 0], "radius": 1}
+TURNS = {"kind": "RigidMotion", "times": [0, 1], "displacement": [[0, 0], [1, 0]], "centre": [0, 0]}
 ERRORS = [
     (
         {"gravty": [0, 0]},
@@ -196,12 +299,12 @@ ERRORS = [
     ({"grid__spacing": -1}, "[grid]: A grid's spacing must be greater than zero, got -1.0."),
     ({"grid__follow": 1}, "[grid] follow must be true or false, got 1."),
     ({"grid__kind": "Gird"}, "[grid]: unknown kind 'Gird', did you mean 'Grid'? It must be Grid."),
-    ({"material__kind": None}, "[material] needs a kind: one of FixedCorotated, NeoHookean, Hencky."),
+    ({"material__kind": None}, "[material] needs a kind: one of FixedCorotated, NeoHookean, Hencky, "),
     (
         {"material__kind": "Neohookean"},
         "[material]: unknown kind 'Neohookean', did you mean 'NeoHookean'? It must be one",
     ),
-    ({"material__kind": 7}, "[material]: unknown kind 7. It must be one of FixedCorotated, NeoHookean, Hencky."),
+    ({"material__kind": 7}, "[material]: unknown kind 7. It must be one of FixedCorotated, NeoHookean, Hencky, "),
     ({"material__kind": "Box"}, "[material]: unknown kind 'Box'. It must be one of FixedCorotated, NeoHookean, H"),
     ({"material__youngs_modulu": 1}, "[material]: unknown key 'youngs_modulu', did you mean 'youngs_modulus'? Known"),
     ({"material__poisson_ratio": None}, "[material] needs the key 'poisson_ratio'."),
@@ -234,6 +337,36 @@ ERRORS = [
     (
         {"boundary__1__motion__displacement": [[0, 0], [1]]},
         "[[boundary]] 2 [motion] displacement must be a list of lists of numbers, got [[0, 0], [1]].",
+    ),
+    (
+        {"boundary": [{"kind": "SlipCollider", "shape": {"kind": "Bal"}}]},
+        "[[boundary]] 1 [shape]: unknown kind 'Bal', did you mean 'Ball'? It must be one of Box, Ball, HalfSpace, Caps",
+    ),
+    (
+        {"boundary": [{"kind": "SlipCollider", "shape": {"kind": "Ball", "centre": [0, 0], "radius": -1}}]},
+        "[[boundary]] 1 [shape]: A ball's radius must be greater than zero, got -1.0.",
+    ),
+    (
+        {"boundary": [{"kind": "SlipCollider", "shape": {"kind": "Union", "regions": [DISC, {"kind": "Box"}]}}]},
+        "[[boundary]] 1 [[shape.regions]] 2 needs the key 'lower'.",
+    ),
+    (
+        {"boundary": [{"kind": "SlipCollider", "shape": DISC, "motion": {**TURNS, "rotation": [0]}}]},
+        "[[boundary]] 1 [motion]: A rigid motion's rotation must have shape (2,) here, got (1,).",
+    ),
+    (
+        {"boundary": [{"kind": "SlipCollider", "shape": DISC, "motion": {"times": [0], "displacement": [[0, 0]]}}]},
+        "[[boundary]] 1 [motion] needs a kind: one of Motion, RigidMotion.",
+    ),
+    (
+        {"boundary": [{"kind": "SlipCollider", "shape": {**DISC, "centre": [0, 0, 0]}}]},
+        "SlipCollider must have 2 coordinates, as the grid has, got 3.",
+    ),
+    ({"material": []}, "A scene needs at least one law, got none."),
+    ({"material": [{"kind": "NeoHookean"}]}, "[[material]] 1 needs the key 'youngs_modulus'."),
+    (
+        {"material": [{"kind": "NeoHookean", "youngs_modulus": 1, "poisson_ratio": 0.3}, {"kind": "Snoww"}]},
+        "[[material]] 2: unknown kind 'Snoww', did you mean 'Snow'? It must be one of FixedCorotated, NeoHookean,",
     ),
     ({"transfer": "PICK"}, "transfer: unknown kind 'PICK', did you mean 'PIC'? It must be one of PIC, FLIP, APIC."),
     ({"kernel": {"order": 4}}, "[kernel]: A B-spline's order must be 1, 2 or 3, got 4."),

@@ -9,6 +9,7 @@ from numpy_oracle import grid_update
 from test_implicit import jolted
 
 import mpmjax as mpm
+from mpmjax._constraint import Constraint
 from mpmjax._hessian import ImplicitOperator
 from mpmjax._method import NodeMotion
 from mpmjax._step import impulses
@@ -55,7 +56,7 @@ def test_a_step_is_that_of_the_first_order_system(method, description):
     motion, info = move(method, nodes)
     assert info.converged
     action = method.hessian.at_rest(nodes.potential, nodes.force)
-    everything = ImplicitOperator(0 * nodes.mass, jnp.asarray(1.0), action, jnp.ones_like(nodes.free))
+    everything = ImplicitOperator(0 * nodes.mass, jnp.asarray(1.0), action, Constraint(jnp.ones_like(nodes.free)))
     H = np.asarray(eqx.filter_jit(ImplicitOperator.as_matrix)(everything))
     free = np.asarray(nodes.free).ravel()
     m = np.repeat(np.asarray(nodes.mass), 2)[free]

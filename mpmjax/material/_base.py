@@ -1,7 +1,8 @@
-"""What an elastic law is."""
+"""What a law is."""
 
 import abc
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -92,6 +93,34 @@ class AbstractMaterial(eqx.Module):
     @abc.abstractmethod
     def admits(self, F: Matrix) -> Bool[Array, "p"]:
         """Whether the law is defined at F."""
+
+
+class AbstractPlastic(eqx.Module):
+    """An elastic law that yields: F is the elastic part F_E of the deformation, and what a step strains beyond the
+    yield condition is taken out of it after the step (return map). The implicit solve sees the elastic law alone.
+
+    What a particle remembers besides F_E is its history: a pytree, the law's own, of arrays of shape (p,).
+    """
+
+    @abc.abstractmethod
+    def virgin(self, F: Matrix) -> Any:
+        """The history of particles at elastic deformations F that have never yielded, leaves of shape (p,)."""
+
+    @abc.abstractmethod
+    def elastic(self, history: Any) -> AbstractMaterial:
+        """The elastic law in force."""
+
+    @abc.abstractmethod
+    def returned(self, F: Matrix, history: Any) -> tuple[Matrix, Any]:
+        """The return map: the admissible F_E next to a trial one, and the history after it."""
+
+
+Law = AbstractMaterial | AbstractPlastic
+
+
+class AbstractVolumetric(eqx.Module):
+    """Marks a law that knows of the deformation its determinant alone: what other laws see as F is J, (1, 1, p), and a
+    particle stores no more."""
 
 
 class AbstractIsotropic(AbstractMaterial):

@@ -1,11 +1,12 @@
-"""Hencky's elasticity: linear in the logarithmic strain."""
+"""Hencky's elasticity, linear in the logarithmic strain, and what the laws that yield on it share."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from mpmjax import _linalg as la
-from mpmjax._isotropic import Logarithm
-from mpmjax._types import Array, Bool, Float, Matrix
+from mpmjax._isotropic import Logarithm, PowerLessOne
+from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 from mpmjax.material._base import AbstractIsotropic, MatrixTangent, PrincipalTangent
 
 _log = Logarithm()
@@ -16,6 +17,10 @@ class Hencky(AbstractIsotropic):
     (1992) 61, doi 10.1016/0045-7825(92)90123-2).
 
     Ψ = μ ε : ε + λ/2 (tr ε)² with the logarithmic strain ε = ½ log FᵀF, P = F⁻ᵀ (2μ ε + λ tr(ε) I).
+
+    In fewer than three dimensions F says nothing of the 3 − d directions normal to it. The total strain there is zero,
+    but where a law has yielded its elastic part ε_t is not: then μ (3 − d) ε_t² joins the energy, and (3 − d) ε_t the
+    trace.
 
     The law of plasticity at large strains: a return map is as in small strains, and tr ε = ln J keeps changes of shape
     and of volume apart.
@@ -29,17 +34,25 @@ class Hencky(AbstractIsotropic):
     Args:
         youngs_modulus: E [Pa], one value or one per particle (p,).
         poisson_ratio: ν [-], strictly between −1 and 0.5.
+        transverse_strain: ε_t [-], the elastic logarithmic strain in each of the 3 − d directions normal to F; None,
+            and so in 3-D always, where they are as undeformed.
     """
 
+    transverse_strain: PerParticle | None = None
+
     def energy(self, F: Matrix) -> Array:
-        """Ψ = μ ε : ε + λ/2 (tr ε)²."""
+        """Ψ = μ (ε : ε + (3 − d) ε_t²) + λ/2 (tr ε + (3 − d) ε_t)²."""
         strain = logarithmic_strain(F)
-        return self.shear_modulus * la.double_dot(strain, strain) + self.lame_lambda / 2 * la.trace(strain) ** 2
+        squares = la.double_dot(strain, strain)
+        if self.transverse_strain is not None:
+            squares = squares + _missing(F) * self.transverse_strain**2
+        return self.shear_modulus * squares + self.lame_lambda / 2 * self._dilation(la.trace(strain), F) ** 2
 
     def stress(self, F: Matrix) -> Matrix:
-        """P = F⁻ᵀ (2μ ε + λ tr(ε) I)."""
+        """P = F⁻ᵀ (2μ ε + λ (tr ε + (3 − d) ε_t) I)."""
         strain = logarithmic_strain(F)
-        kirchhoff = 2 * self.shear_modulus * strain + self.lame_lambda * la.trace(strain) * la.identity_like(F)
+        dilation = self._dilation(la.trace(strain), F)
+        kirchhoff = 2 * self.shear_modulus * strain + self.lame_lambda * dilation * la.identity_like(F)
         return la.matmul(la.cofactor(F), kirchhoff) / la.determinant(F)
 
     def tangent(self, F: Matrix) -> MatrixTangent:
@@ -47,11 +60,11 @@ class Hencky(AbstractIsotropic):
         return MatrixTangent(la.matrix_of(lambda dF: jax.jvp(self.stress, (F,), (dF,))[1], F))
 
     def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
-        """With τ_i = 2μ ln s_i + λ ln J: scaling (2μ δ_ij + λ)/(s_i s_j) − δ_ij τ_i/s_i², twist
+        """With τ_i = 2μ ln s_i + λ (ln J + (3 − d) ε_t): scaling (2μ δ_ij + λ)/(s_i s_j) − δ_ij τ_i/s_i², twist
         (τ_i/s_i + τ_j/s_j)/(s_i + s_j), flip (2μ s_j ln(s_i/s_j)/(s_i − s_j) − τ_j)/(s_i s_j)."""
         mu, lam = self.shear_modulus, self.lame_lambda * jnp.ones_like(s[0])
         log_s = jnp.log(s)
-        tau = 2 * mu * log_s + lam * log_s.sum(axis=0)
+        tau = 2 * mu * log_s + lam * self._dilation(log_s.sum(axis=0), s)
 
         def scaling(i: int, j: int) -> Array:
             return ((2 * mu - tau[i] + lam) if i == j else lam) / (s[i] * s[j])
@@ -67,6 +80,60 @@ class Hencky(AbstractIsotropic):
     def admits(self, F: Matrix) -> Bool[Array, "p"]:
         """J > 0."""
         return la.determinant(F) > 0
+
+    def _dilation(self, trace: Array, like: Array) -> Array:
+        """tr ε + (3 − d) ε_t, from tr ε and an array whose first axis is the dimension."""
+        return trace if self.transverse_strain is None else trace + _missing(like) * self.transverse_strain
+
+
+class Split(eqx.Module):
+    """The elastic logarithmic strain in three dimensions whatever d is, as mean and deviator: ε = m I + e.
+
+    The laws that yield on Hencky's elasticity are isotropic: the return map turns no principal direction, scales the
+    deviator and sets the mean, ε ← k e + m′ I. With F = R exp ε that is F ← F exp((k − 1) ε + c I) = F eᶜ C^((k−1)/2),
+    with C = FᵀF and c = m′ − k m: a function of C, whose derivative needs no frame.
+    """
+
+    F: Matrix
+    transverse: Array | None
+    """ε_t [-], shape (p,); None in 3-D."""
+    mean: Array
+    """m = (tr ε + (3 − d) ε_t)/3 [-], shape (p,)."""
+    deviation: Array
+    """‖e‖ [-], shape (p,); its derivative where it is zero is zero."""
+
+    @classmethod
+    def of(cls, F: Matrix, transverse: Array | None) -> "Split":
+        """From the elastic part of the deformation, (d, d, p), and ε_t, (p,)."""
+        strain = logarithmic_strain(F)
+        trace = la.trace(strain)
+        mean = (trace if transverse is None else trace + _missing(F) * transverse) / 3
+        e = strain - mean * la.identity_like(F)
+        squares = la.double_dot(e, e)
+        if transverse is not None:
+            squares = squares + _missing(F) * (transverse - mean) ** 2
+        deviates = squares > 0
+        return cls(F, transverse, mean, jnp.where(deviates, jnp.sqrt(jnp.where(deviates, squares, 1)), 0))
+
+    def returned(self, ratio: Array, mean: Array) -> tuple[Matrix, Array | None]:
+        """F and ε_t with the deviator times k = `ratio` and m′ = `mean`, both (p,): to the last bit what they were
+        where k = 1 and m′ = m."""
+        shift = mean - ratio * self.mean
+        change = PowerLessOne((ratio - 1) / 2, shift)(la.matmul(la.transpose(self.F), self.F))
+        transverse = None if self.transverse is None else ratio * self.transverse + shift
+        return self.F + la.matmul(self.F, change), transverse
+
+
+def no_transverse_strain(F: Matrix) -> Array | None:
+    """ε_t of particles that have never yielded: zero, (p,), and None in 3-D."""
+    return None if F.shape[0] == 3 else jnp.zeros(F.shape[2:], F.dtype)
+
+
+def _missing(like: Array) -> int:
+    """3 − d, of directions for which there is a transverse strain."""
+    if like.shape[0] == 3:
+        raise ValueError("In 3-D no direction is transverse: Hencky's transverse_strain must be None.")
+    return 3 - like.shape[0]
 
 
 def logarithmic_strain(F: Matrix) -> Matrix:

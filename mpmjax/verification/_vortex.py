@@ -6,8 +6,8 @@ import numpy as np
 
 from mpmjax._boundary import AbstractBoundary, Conditions
 from mpmjax._grid import Grid
-from mpmjax._region import AbstractRegion
-from mpmjax._types import Array, Bool, Float, NodeVector, Scalar
+from mpmjax._region import AbstractRegion, length
+from mpmjax._types import Array, Float, NodeVector, Scalar
 from mpmjax.material import AbstractMaterial, NeoHookean
 from mpmjax.verification._problem import AbstractProblem, Ends, box_grid
 
@@ -15,16 +15,24 @@ _INNER, _OUTER, _ROOM = 0.75, 1.25, 1.5
 
 
 class Ring(AbstractRegion):
-    """0.75 < R < 1.25."""
+    """0.75 ≤ R ≤ 1.25."""
 
-    def contains(self, x: Float[Array, "m d"], margin: Scalar = 0.0) -> Bool[Array, "m"]:
-        """Between the radii."""
-        R = jnp.sqrt((x**2).sum(axis=-1))
-        return (_INNER - margin < R) & (_OUTER + margin > R)
+    @property
+    def dim(self) -> int:
+        """Two."""
+        return 2
+
+    def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
+        """From the nearer of the two circles."""
+        return jnp.abs(length(x) - (_INNER + _OUTER) / 2) - (_OUTER - _INNER) / 2
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """The square around it."""
         return np.full(2, -_OUTER), np.full(2, _OUTER)
+
+    def middle(self) -> Float[Array, "d"]:
+        """The origin."""
+        return jnp.zeros(2)
 
 
 class RestOutside(AbstractBoundary):
@@ -38,7 +46,7 @@ class RestOutside(AbstractBoundary):
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v = 0."""
         del spacing, t, dt, reference
-        outside = ~Ring().contains(nodes)[:, None]
+        outside = Ring().distance(nodes)[:, None] >= 0
         return Conditions(jnp.broadcast_to(outside, nodes.shape), jnp.zeros_like(nodes))
 
 

@@ -1,0 +1,111 @@
+"""Soil and wet snow that compact: a Cam clay on Hencky's elasticity."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._checks import require_between, require_positive
+from mpmjax._types import Array, Float, Matrix, PerParticle
+from mpmjax.material._base import AbstractPlastic
+from mpmjax.material._hencky import Hencky, Split, no_transverse_strain
+
+
+class CamClayHistory(eqx.Module):
+    """What a particle of Cam clay remembers."""
+
+    volume_strain: Float[Array, "*p"]
+    """α [-], the plastic logarithmic change of volume that sets the strength: negative where compacted."""
+    transverse_strain: Float[Array, "*p"] | None
+    """ε_t [-], see `Hencky`; None in 3-D."""
+
+
+class CamClay(AbstractPlastic):
+    """Soil or snow that shears, compacts and, if cohesive, tears: a non-associated Cam clay at large strains, with the
+    yield condition of J. Gaume, T. Gast, J. Teran, A. van Herwijnen, C. Jiang, Nat. Commun. 9 (2018) 3047, doi
+    10.1038/s41467-018-05181-w.
+
+    With the Kirchhoff stresses p = −K tr ε and q = √(3/2) ‖2μ e‖, m and e the mean and the deviator of the elastic
+    logarithmic strain in three dimensions whatever d is, it holds only the ellipse
+
+        q² (1 + 2β) + M² (p + β p₀)(p − p₀) ≤ 0,   p₀ = K sinh(ξ max(−α, 0)).
+
+    A return starts from the p₀ before the step, and
+    - for p > p₀ or p < −β p₀ goes to that tip of the ellipse, q = 0, and α changes by the volume given up,
+      tr ε − tr ε′;
+    - else, for q outside, shortens e at the same p. α then changes by what the volume would on the straight way to the
+      ellipse's centre, at p_c = (1 − β) p₀/2: −(p − p_×)/K with p_× the pressure where that way meets the ellipse.
+
+    So it hardens and compacts for p > p_c, softens and loosens for p < p_c, and shears on at p = p_c without change,
+    the critical state: q = M (1 + β)/((1 − β) √(1 + 2β)) p, which is M p without cohesion,
+    and is there for β < 1. Where α ≥ 0 nothing is held:
+    the particles are apart, and α is the gap that must close first. The paper's elasticity is neo-Hookean; here it is
+    Hencky's, in whose strains p and q are linear. Where nothing yields F comes back to the last bit; no return adds
+    elastic energy, which α does not enter.
+
+    *When it breaks*: as Hencky's law does in the elastic part: J > 0. The stress lags behind the ellipse by one step's
+    hardening, so an error in proportion to the step's strain. Softening gathers strain in bands as wide as a cell.
+    The sinh stiffens: ξ (−α) of a few is no longer soil. Derivatives jump where it starts to yield, and are
+    unbounded at the tips.
+    *Good values*: M = 0.5 to 1.5 (M = 6 sin φ/(3 − sin φ) at the friction angle φ of triaxial compression), β = 0 for
+    dry soil, 0.1 to 1 for cohesive snow, ξ = 1 to 10; snow E = 1e6 Pa, ν = 0.3, p₀ = 1e3 to 1e5 Pa.
+
+    Args:
+        youngs_modulus: E [Pa], one value or one per particle (p,).
+        poisson_ratio: ν [-], strictly between −1 and 0.5.
+        friction: M [-], greater than zero: slope of the critical state.
+        preconsolidation: p₀ at first [Pa], at least zero: the pressure at which a virgin particle yields.
+        cohesion: β [-], at least zero: the tension it holds, in shares of p₀.
+        hardening: ξ [-], greater than zero.
+    """
+
+    youngs_modulus: PerParticle
+    poisson_ratio: PerParticle
+    friction: PerParticle
+    preconsolidation: PerParticle
+    cohesion: PerParticle = 0.0
+    hardening: PerParticle = 1.0
+
+    def __check_init__(self):
+        require_positive("CamClay's youngs_modulus [Pa]", self.youngs_modulus)
+        require_between("CamClay's poisson_ratio", self.poisson_ratio, -1, 0.5, open_ends=True)
+        require_positive("CamClay's friction", self.friction)
+        require_between("CamClay's preconsolidation [Pa]", self.preconsolidation, 0, np.inf)
+        require_between("CamClay's cohesion", self.cohesion, 0, np.inf)
+        require_positive("CamClay's hardening", self.hardening)
+
+    def virgin(self, F: Matrix) -> CamClayHistory:
+        """α = −arsinh(p₀/K)/ξ, ε_t = 0."""
+        bulk = self.youngs_modulus / (3 * (1 - 2 * self.poisson_ratio))
+        alpha = -jnp.arcsinh(self.preconsolidation / bulk) / self.hardening
+        return CamClayHistory(alpha * jnp.ones(F.shape[2:], F.dtype), no_transverse_strain(F))
+
+    def elastic(self, history: Any) -> Hencky:
+        """Hencky's law with the history's ε_t."""
+        return Hencky(self.youngs_modulus, self.poisson_ratio, history.transverse_strain)
+
+    def returned(self, F: Matrix, history: Any) -> tuple[Matrix, CamClayHistory]:
+        """To a tip, or to the ellipse at the same pressure; all stresses in shares of K."""
+        split = Split.of(F, history.transverse_strain)
+        alpha, beta, M = history.volume_strain, self.cohesion, self.friction
+        nu = self.poisson_ratio
+        p0 = jnp.sinh(self.hardening * jnp.where(alpha < 0, -alpha, 0))
+        p, q = -3 * split.mean, 6**0.5 * 3 * (1 - 2 * nu) / (2 * (1 + nu)) * split.deviation
+        # to a tip
+        compacts, tears = p > p0, p < -beta * p0
+        tip = compacts | tears
+        held = jnp.where(compacts, p0, jnp.where(tears, -beta * p0, p))
+        # to the ellipse
+        square = jnp.where(tip, 0, (held + beta * p0) * (p0 - held))
+        proper = square > 0
+        allowed = jnp.where(proper, M * jnp.sqrt(jnp.where(proper, square, 1) / (1 + 2 * beta)), 0)
+        shears = q > allowed
+        ratio = jnp.where(shears, allowed / jnp.where(shears, q, 1), jnp.where(tip, 0, 1))
+        # straight to the centre, the share t of the way from there
+        centre, half = (1 - beta) / 2 * p0, (1 + beta) / 2 * p0
+        radius = (1 + 2 * beta) * q**2 + (M * (p - centre)) ** 2
+        t = M * half / jnp.sqrt(jnp.where(shears, radius, 1))
+        change = jnp.where(tip, p - held, jnp.where(shears, (1 - t) * (p - centre), 0))
+        F, transverse = split.returned(ratio, jnp.where(tip, -held / 3, split.mean))
+        return F, CamClayHistory(alpha - change, transverse)

@@ -1,0 +1,104 @@
+"""Snow."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mpmjax import _linalg as la
+from mpmjax._checks import require_between, require_positive
+from mpmjax._isotropic import AbstractSpectral
+from mpmjax._types import Array, Float, Matrix, PerParticle
+from mpmjax.material._base import AbstractPlastic
+from mpmjax.material._elastic import FixedCorotated
+
+
+class SnowHistory(eqx.Module):
+    """What snow remembers."""
+
+    plastic_volume: Float[Array, "*p"]
+    """J_P = det F_P [-]: below 1 packed and harder, above 1 torn and softer."""
+
+
+class Snow(AbstractPlastic):
+    """Snow (A. Stomakhin, C. Schroeder, L. Chai, J. Teran, A. Selle, ACM Trans. Graph. 32 (2013) 102,
+    doi 10.1145/2461912.2461948).
+
+    Fixed corotated elasticity of F_E whose moduli harden with plastic compression, E e^{ξ (1 − J_P)}. The principal
+    stretches of F_E stay within [1 − θ_c, 1 + θ_s]; what they exceed goes into F_P, of which J_P alone acts
+    (F = F_E F_P). In plane strain nothing yields normal to the plane, the stretch there being one.
+
+    *When it breaks*: where hardening outruns yielding a return map creates energy: keep ξ θ_c below 2/(3 d). The moduli
+    grow without bound under compression, by e at J_P = 1 − 1/ξ, and with them the explicit step shrinks: packed snow is
+    what the semi-implicit step is for. The return map's derivative jumps where yielding begins.
+    *Good values* (the reference's table): E = 1.4e5 Pa, ν = 0.2, θ_c = 2.5e-2, θ_s = 7.5e-3, ξ = 10, density 400 kg/m³.
+    A smaller θ_c or θ_s makes powder of chunks, a larger ξ and E ice.
+
+    Args:
+        youngs_modulus: E [Pa] of virgin snow, one value or one per particle (p,).
+        poisson_ratio: ν [-], strictly between −1 and 0.5.
+        critical_compression: θ_c [-], between 0 and 1.
+        critical_stretch: θ_s [-], positive.
+        hardening: ξ [-], at least 0.
+    """
+
+    youngs_modulus: PerParticle = 1.4e5
+    poisson_ratio: PerParticle = 0.2
+    critical_compression: PerParticle = 2.5e-2
+    critical_stretch: PerParticle = 7.5e-3
+    hardening: PerParticle = 10.0
+
+    def __check_init__(self):
+        FixedCorotated(self.youngs_modulus, self.poisson_ratio)
+        require_between("Snow's critical_compression", self.critical_compression, 0, 1, open_ends=True)
+        require_positive("Snow's critical_stretch", self.critical_stretch)
+        require_between("Snow's hardening", self.hardening, 0, 1e3)
+
+    def virgin(self, F: Matrix) -> SnowHistory:
+        """J_P = 1."""
+        return SnowHistory(jnp.ones(F.shape[2:], F.dtype))
+
+    def elastic(self, history: SnowHistory) -> FixedCorotated:
+        """Fixed corotated, with E e^{ξ (1 − J_P)}."""
+        harder = jnp.exp(self.hardening * (1 - history.plastic_volume))
+        return FixedCorotated(self.youngs_modulus * harder, self.poisson_ratio)
+
+    def returned(self, F: Matrix, history: SnowHistory) -> tuple[Matrix, SnowHistory]:
+        """F_E with its principal stretches clamped; J_P ← J_P det F_trial / det F_E."""
+        least, most = (jnp.asarray(a, F.dtype) for a in (1 - self.critical_compression, 1 + self.critical_stretch))
+        excess = _Clamp(least, most)(la.matmul(la.transpose(F), F))
+        clamped = F + la.matmul(F, excess)
+        yielded = la.determinant(F) / la.determinant(clamped)
+        return clamped, SnowHistory(history.plastic_volume * yielded)
+
+
+class _Clamp(AbstractSpectral):
+    """clamp(√c)/√c − 1 of c = s²: what F is changed by, as F (1 + ...), to clamp its stretches s; exactly zero where
+    they are within."""
+
+    least: Array
+    most: Array
+
+    def _limit(self, c: Array) -> tuple[Array, Array]:
+        """Whether c is clamped, and the stretch that it is clamped to."""
+        below, above = c < self.least**2, c > self.most**2
+        return below | above, jnp.where(below, self.least, self.most)
+
+    def of(self, s: Array) -> Array:
+        """(limit − √c)/√c where clamped."""
+        clamped, limit = self._limit(s)
+        root = jnp.sqrt(jnp.where(clamped, s, 1))
+        return jnp.where(clamped, (limit - root) / root, 0)
+
+    def slope(self, a: Array, b: Array) -> Array:
+        """−limit/(√a √b (√a + √b)) between two that are clamped alike, else the quotient of differences."""
+        (at_a, limit), (at_b, other) = self._limit(a), self._limit(b)
+        alike = at_a & at_b & (limit == other)
+        apart = (at_a | at_b) & ~alike
+        root_a, root_b = jnp.sqrt(jnp.where(alike, a, 1)), jnp.sqrt(jnp.where(alike, b, 1))
+        together = -limit / (root_a * root_b * (root_a + root_b))
+        quotient = (self.of(a) - self.of(b)) / jnp.where(apart, a - b, 1)
+        return jnp.where(alike, together, jnp.where(apart, quotient, 0))
+
+    def curvature(self, s: Array) -> Array:
+        """¾ limit c^(−5/2) where clamped."""
+        clamped, limit = self._limit(s)
+        return jnp.where(clamped, 0.75 * limit * jnp.where(clamped, s, 1) ** -2.5, 0)

@@ -1,0 +1,498 @@
+"""Colliders: exact on the nodes that lie in them, along oblique normals, in every update; what they receive is what
+the material loses."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import LAWS, assert_close, cloud, explicit_limit, ids
+from numpy_oracle import grid_update
+
+import mpmjax as mpm
+from mpmjax._boundary import combine
+from mpmjax._constraint import Constraint
+from mpmjax._hessian import ImplicitOperator
+
+TIGHT = mpm.ConjugateResidual(rtol=1e-13)
+METHODS = {
+    "explicit": mpm.Explicit(),
+    "semi_implicit": mpm.SemiImplicit(solver=TIGHT),
+    "diagonal": mpm.SemiImplicit(solver=TIGHT, metric=mpm.Metric.DIAGONAL),
+    "backward_euler": mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12)),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
+    "trbdf2": mpm.TRBDF2(0.0, mpm.Linearised(TIGHT)),
+}
+EACH_METHOD = pytest.mark.parametrize("method", **ids(METHODS))
+DX, DT, G = 0.1, 1e-2, np.array([1.0, -9.81, 2.0])
+LAW = LAWS["fixed_corotated"]
+BALL = mpm.Ball((0.31, 0.02), 0.22)
+ROLLING = mpm.RigidMotion((0.0, 1.0), ((0.0, 0.0), (0.4, 0.3)), (0.0, 3.0), (0.31, 0.02))
+ROLLING_3D = mpm.RigidMotion((0.0, 1.0), ((0.0,) * 3, (0.4, 0.3, 0.2)), ((0.0,) * 3, (1.0, 3.0, 2.0)), (0.3, 0.0, 0.3))
+
+
+def scene_of(grid, *boundary, **options):
+    return mpm.Scene(grid, LAW, gravity=tuple(G[: grid.dim]), boundary=boundary, **options)
+
+
+def normal_of(x, place=BALL.centre):
+    """Of a ball, at points x."""
+    arm = np.asarray(x) - np.asarray(place)
+    return arm / np.linalg.norm(arm, axis=1, keepdims=True)
+
+
+def turning(x, motion, dt, t=0.0):
+    """Velocity of points of a body in plane motion from t to t + dt, by complex numbers."""
+    (_, t1), (_, angle) = motion.times, motion.rotation
+    shift = np.asarray(motion.displacement[1])
+    now, then = (complex(*(np.asarray(motion.centre) + s * shift / t1)) for s in (t, t + dt))
+    arm = x[:, 0] + 1j * x[:, 1] - now
+    after = then + arm * np.exp(1j * angle * dt / t1)
+    return np.stack([after.real, after.imag], axis=1) / dt - x / dt
+
+
+@EACH_METHOD
+def test_what_colliders_hold_moves_with_them(method):
+    """Sticky: the whole velocity; slip: the normal component alone; beside a wall's component, both; to rounding,
+    also after a solve, with the body moving and turning."""
+    grid, particles = cloud(2, p=60)
+    sticky = mpm.StickyCollider(
+        mpm.HalfSpace((0.5, 0.5), (-3.0, -4.0)), mpm.Motion((0.0, 1.0), ((0.0,) * 2, (0.3, 0.1)))
+    )
+    lifted = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.0, 0.2)))
+    wall = mpm.Grip(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0)), lifted, axes=(False, True))
+    step = grid_update(scene_of(grid, wall, sticky, mpm.SlipCollider(BALL, ROLLING)), particles, DT, method)
+    x, v, mass = np.asarray(step.position), np.asarray(step.velocity), np.asarray(step.nodes.mass)
+    stuck = ((x - 0.5) @ [-3.0, -4.0] < 1e-9) & (x[:, 1] > 0.01)
+    touched = (np.linalg.norm(x - BALL.centre, axis=1) < 0.22) & (mass > 0)
+    floor = x[:, 1] < 1e-9
+    assert step.info.solve.converged
+    assert (stuck & (mass > 0)).sum() > 3
+    assert (touched & ~floor).sum() > 3
+    assert (touched & floor).sum() > 1
+    assert_close(v[stuck], np.broadcast_to([0.3, 0.1], v[stuck].shape), 1e-14)
+    assert_close(v[floor, 1], np.full(floor.sum(), 0.2), 1e-14)
+    n, asked = normal_of(x), turning(x, ROLLING, DT)
+    assert_close(((v - asked) * n).sum(axis=1)[touched], np.zeros(touched.sum()), 0, 1e-13)
+    along = v[:, 0] * n[:, 1] - v[:, 1] * n[:, 0]
+    assert (np.abs(along[touched & ~floor]) > 1e-3).all()
+    beside = np.asarray(step.reaction) - np.asarray(step.update.push)[:, None] * n  # the floor's part, where both hold
+    assert_close(beside[touched & floor, 0], np.zeros((touched & floor).sum()), 0, 1e-11 * np.abs(step.reaction).max())
+
+
+def test_a_body_stands_where_its_motion_takes_it():
+    """At t the nodes are those of the shape moved and turned, and the normals turn with it."""
+    grid = mpm.Grid((30, 30), DX, origin=(-10, -10))
+    nodes = grid.nodes(grid.window(jnp.zeros((1, 2))))
+    bar = mpm.Box((-0.6, -0.15), (0.6, 0.15))
+    motion = mpm.RigidMotion((0.0, 2.0), ((0.0, 0.0), (0.6, 0.4)), (0.0, 1.2), (0.0, 0.0))
+    touch = combine((mpm.SlipCollider(bar, motion),), nodes, DX, 1.0, 0.1, reference=False).touch
+    angle, shift = 0.6, np.array([0.3, 0.2])
+    R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    back = (np.asarray(nodes) - shift) @ R
+    inside = (np.abs(back) < [0.6, 0.15]).all(axis=1)
+    np.testing.assert_array_equal(np.asarray(touch.held), inside)
+    middle = inside & (np.abs(back[:, 0]) < 0.4) & (np.abs(back[:, 1]) > 1e-9)
+    assert_close(touch.normal[middle], (np.sign(back[middle, 1:]) * [0.0, 1.0]) @ R.T, 1e-13)
+    assert_close(touch.pivots, shift[None], 1e-14)
+
+
+def test_of_two_bodies_normals_the_earlier_holds_and_a_prescribed_component_is_allowed_for():
+    """And a normal that prescribed components hold already asks nothing."""
+    grid, particles = cloud(2, p=60)
+    one, two = mpm.HalfSpace((0.3, 0.3), (1.0, 1.0)), mpm.HalfSpace((0.3, 0.3), (1.0, -1.0))
+    still = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.2, 0.0)))
+    scene = scene_of(grid, mpm.SlipCollider(one, still), mpm.SlipCollider(two))
+    step = grid_update(scene, particles, DT, METHODS["explicit"])
+    x, v, mass = np.asarray(step.position), np.asarray(step.velocity), np.asarray(step.nodes.mass) > 0
+    first = (x.sum(axis=1) < 0.6 + 1e-9) & mass
+    second = (x[:, 0] - x[:, 1] < 1e-9) & mass & ~first
+    assert (first & (x[:, 0] < x[:, 1])).any()
+    assert second.any()
+    assert_close(v[first].sum(axis=1), np.full(first.sum(), 0.2), 1e-13)
+    assert_close(v[second] @ [1.0, -1.0], np.zeros(second.sum()), 0, 1e-13)
+    np.testing.assert_array_equal(np.asarray(step.nodes.conditions.touch.owner)[mass & ~first & ~second], -1)
+    box = mpm.SlipBox((-np.inf, 0.3), (np.inf, np.inf))
+    steep = mpm.SlipCollider(mpm.HalfSpace((0.0, 0.3), (1e-4, 1.0)), mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.0, 5.0))))
+    step = grid_update(scene_of(grid, box, steep), particles, DT, METHODS["explicit"])
+    below = np.asarray(step.position)[:, 1] < 0.3 + 1e-9
+    alone = grid_update(scene_of(grid, box), particles, DT, METHODS["explicit"])
+    assert_close(step.velocity[below], alone.velocity[below], 1e-14)
+
+
+@pytest.mark.parametrize("inner", mpm.Metric)
+def test_the_operator_is_symmetric_and_its_metric_commutes_with_the_projection(inner):
+    """Q (M + cH) Q and the identity, or the mass, on the rest; beside fixed components too."""
+    grid, particles = cloud(2, p=12, cells=3)
+    ball = mpm.Ball((0.16, 0.02), 0.22)
+    scene = scene_of(grid, mpm.SlipBox((-np.inf, 0.0), (np.inf, np.inf)), mpm.SlipCollider(ball))
+    step = grid_update(scene, particles, DT, METHODS["explicit"])
+    nodes = step.nodes
+    action = mpm.AnalyticHessian().at_rest(nodes.potential, nodes.velocity)
+    operator = ImplicitOperator(nodes.mass, jnp.asarray(1e-3), action, nodes.constraint, inner)
+    A, W = np.asarray(operator.as_matrix()), np.asarray(operator.metric()).ravel()
+    n = A.shape[0]
+    Q = np.asarray(jax.vmap(lambda e: nodes.constraint.split(e.reshape(-1, 2), 0).ravel())(jnp.eye(n))).T
+    free = ImplicitOperator(nodes.mass, jnp.asarray(1e-3), action, Constraint(jnp.ones_like(nodes.free)))
+    assert 0.1 < (np.abs(nodes.constraint.normal) > 1e-6).any(axis=1).mean() < 0.9
+    assert_close(A, A.T, 1e-14)
+    assert_close(Q @ Q, Q, 1e-14)
+    assert_close(Q, Q.T, 1e-14)
+    assert_close(W[:, None] * Q, Q * W, 1e-14)
+    assert_close(Q @ A @ Q, Q @ np.asarray(free.as_matrix()) @ Q, 1e-14)
+    rest = A - Q @ A @ Q
+    assert_close((np.eye(n) - Q) @ rest @ (np.eye(n) - Q), rest, 1e-14)
+    assert np.linalg.eigvalsh(rest + Q).min() > 0
+    share = rest / W[:, None]
+    assert np.linalg.norm(share, 2) < 1 + 1e-12
+
+
+def test_a_linear_solve_with_a_collider_is_the_dense_one():
+    """min over what Q leaves free, by dense algebra from Q and the unconstrained matrix."""
+    grid, particles = cloud(2, p=12, cells=3)
+    scene = scene_of(grid, mpm.SlipCollider(mpm.Ball((0.16, 0.12), 0.22), ROLLING))
+    step = grid_update(scene, particles, DT, METHODS["semi_implicit"])
+    nodes = step.nodes
+    action = mpm.AnalyticHessian().at_rest(nodes.potential, nodes.velocity)
+    whole = ImplicitOperator(nodes.mass, nodes.dt**2, action, Constraint(jnp.ones_like(nodes.free)))
+    A, n = np.asarray(whole.as_matrix()), nodes.velocity.size
+    Q = np.asarray(jax.vmap(lambda e: nodes.constraint.split(e.reshape(-1, 2), 0).ravel())(jnp.eye(n))).T
+    b = np.asarray(nodes.mass[:, None] * nodes.explicit_velocity()).ravel()
+    held = (np.eye(n) - Q) @ np.asarray(nodes.prescribed).ravel()
+    v = np.linalg.solve(Q @ A @ Q + np.eye(n) - Q, Q @ (b - A @ held) + held)
+    assert_close(step.velocity.ravel(), v, 1e-10)
+
+
+# --- contact ---------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def landing(d=2):
+    """A spinning block that meets a turning ball and a tilted half-space, one side of it lifting off."""
+    grid = mpm.Grid((12,) * d, DX, origin=(-4,) * d)
+    block = mpm.fill(mpm.Box((0.0,) * d, (0.4,) * d), grid, particles_per_cell=2**d, density=1e3)
+    spin = 8.0 * jnp.stack([0.2 - block.x[:, 1], block.x[:, 0] - 0.2], axis=1)
+    v = jnp.concatenate([spin, jnp.zeros((block.count, d - 2))], axis=1) + jnp.asarray([0.3, -0.5, 0.2][:d])
+    return grid, eqx.tree_at(lambda b: b.v, block, v)
+
+
+def obstacles(friction, d=2):
+    spin = (0.0, 3.0) if d == 2 else ((0.0,) * 3, (1.0, 2.0, 3.0))
+    motion = mpm.RigidMotion((0.0, 1.0), ((0.0,) * d, (0.4, 0.3, 0.2)[:d]), spin, (0.2, -0.2, 0.2)[:d])
+    ball = mpm.SeparatingCollider(mpm.Ball((0.2, -0.2, 0.2)[:d], 0.24), motion, friction)
+    slope = mpm.SeparatingCollider(mpm.HalfSpace((0.1,) * d, (4.0, 3.0, 1.0)[:d]), friction=friction)
+    return ball, slope
+
+
+@EACH_METHOD
+def test_a_separating_collider_pushes_never_pulls_and_is_not_entered(method):
+    """(v − v_c)·n ≥ 0, push ≥ 0, and their product zero at every node, with a wall beside."""
+    grid, particles = landing()
+    wall = mpm.SeparatingBox((-np.inf, 0.0), (np.inf, np.inf))
+    scene = scene_of(grid, *obstacles(0.0), wall)
+    step = grid_update(scene, particles, 0.5 * explicit_limit(scene), method)
+    touch, mass = step.nodes.conditions.touch, np.asarray(step.nodes.mass)
+    v, n = np.asarray(step.velocity), np.asarray(touch.normal)
+    inside = (np.asarray(touch.owner) >= 0) & (mass > 0)
+    departure = ((v - np.asarray(touch.velocity)) * n).sum(axis=1)
+    push = np.asarray(step.update.push)
+    scale = np.abs(v).max()
+    assert int(step.info.contact.violations) == 0
+    held = inside & (np.abs(departure) < 1e-12 * scale)
+    assert held.sum() > 3
+    assert (inside & ~held).sum() > 3
+    assert departure[inside].min() > -1e-12 * scale
+    assert push.min() > -1e-9 * push.max()
+    assert np.abs(push[~held]).max() <= 1e-9 * push.max()
+    assert (push[held] > 0).all()
+    side = np.asarray(step.nodes.conditions.side[:, 1]) == 1
+    assert (v[side, 1] >= 0).all()
+
+
+@pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.slow)])
+@EACH_METHOD
+def test_what_colliders_receive_is_what_the_material_loses(method, d):
+    """Change of momentum + impulse on all colliders = gravity's, with friction, sticking, sliding and separation."""
+    grid, particles = landing(d)
+    sticky = mpm.StickyCollider(mpm.Ball((0.4,) * d, 0.15), ROLLING if d == 2 else ROLLING_3D)
+    slip = mpm.SlipCollider(mpm.Capsule((0.0,) * d, (0.0, 0.2, 0.1)[:d], 0.11))
+    scene = scene_of(grid, *obstacles(0.3, d), sticky, slip)
+    dt = 0.5 * explicit_limit(scene)
+    after, info = mpm.step(scene, particles, 0.0, dt, method=method)
+    mass = np.asarray(particles.mass)
+    change = mass @ np.asarray(after.v - particles.v)
+    gravity = mass.sum() * dt * G[:d]
+    given = np.asarray(info.colliders.impulse)
+    assert given.shape == (4, d)
+    assert info.colliders.angular.shape == (4, 1 if d == 2 else 3)
+    assert (np.abs(given).max(axis=1) > 1e-3 * np.abs(given).max()).all()
+    assert_close(change + given.sum(axis=0), gravity, 1e-9)
+    assert info.contact.violations == 0
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_angular_momentum_goes_to_the_colliders_too(d):
+    """In an explicit step with APIC, exactly: change + Σ (angular impulse + pivot × impulse) = gravity's moment."""
+    grid, particles = landing(d)
+    sticky = mpm.StickyCollider(mpm.Ball((0.4,) * d, 0.15), ROLLING if d == 2 else ROLLING_3D)
+    scene = scene_of(grid, *obstacles(0.3, d), sticky)
+    dt = 0.3 * explicit_limit(scene)
+    before = mpm.prepare(scene, particles)
+    after, info = mpm.step(scene, before, 0.0, dt)
+
+    def moment(q):
+        x, v, m = (np.asarray(a) for a in (q.x, q.v, q.mass))
+        skew = DX**2 / 4 * np.asarray(q.C - q.C.transpose(0, 2, 1))  # Σ w (x_i − x_p) × C (x_i − x_p), D = DX²/4
+        spin = np.stack([skew[:, i, j] for i, j in ([(2, 1), (0, 2), (1, 0)] if d == 3 else [(1, 0)])], axis=1)
+        return (m[:, None] * (cross(x, v) + spin)).sum(axis=0)
+
+    def cross(a, b):
+        return np.cross(a, b) if d == 3 else (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])[..., None]
+
+    pivots = np.array([[0.2, -0.2, 0.2], [0.1] * 3, (0.31, 0.02, 0.0) if d == 2 else (0.3, 0.0, 0.3)])[:, :d]
+    given = np.asarray(info.colliders.angular) + cross(pivots, np.asarray(info.colliders.impulse))
+    mass = np.asarray(before.mass)[:, None]
+    gravity = (mass * dt * cross(np.asarray(before.x), np.broadcast_to(G[:d], before.x.shape))).sum(axis=0)
+    assert_close(moment(after) - moment(before) + given.sum(axis=0), gravity, 1e-11, 1e-11 * np.abs(given).max())
+    assert np.abs(info.colliders.angular).min() > 0
+
+
+def test_forces_on_colliders_against_time(tmp_path):
+    """Between frames the mean force is the impulses of the steps over the time; restarted from a file it goes on from
+    where it was; a block presses on the ground with its weight and what its momentum loses."""
+    grid = mpm.Grid((16, 16), DX, origin=(-3, -3))
+    block = mpm.fill(mpm.Box((0.3, 0.0), (0.6, 0.3)), grid, particles_per_cell=4, density=1e3)
+    ground = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0)), friction=0.5)
+    ball = mpm.StickyCollider(mpm.Ball((-0.1, 0.9), 0.15))
+    scene = mpm.Scene(grid, LAW, gravity=(0.0, -9.81), boundary=(ground, ball))
+    settings = {"dt": DT, "method": mpm.SemiImplicit(), "save_every": 5}
+    run = mpm.simulate(scene, block, t1=20 * DT, **settings)
+    particles, steps = mpm.prepare(scene, block), []
+    for n in range(20):
+        particles, info = mpm.step(scene, particles, n * DT, DT, method=mpm.SemiImplicit())
+        steps.append(info.colliders)
+    times, mean = run.forces()
+    np.testing.assert_allclose(times, DT * np.array([2.5, 7.5, 12.5, 17.5]))
+    for name in ("impulse", "angular"):
+        each = np.stack([getattr(info, name) for info in steps]).reshape(4, 5, 2, -1)
+        assert_close(getattr(mean, name), each.mean(axis=1) / DT, 1e-12)
+    assert not np.asarray(mean.impulse)[:, 1].any()
+    weight = float(block.mass.sum()) * 9.81
+    gained = np.diff([mpm.momentum(run.frame(i))[1] for i in range(5)]) / (5 * DT)
+    assert_close(-np.asarray(mean.impulse)[:, 0, 1], weight + gained, 1e-6)
+    path = tmp_path / "run.h5"
+    mpm.record(path, scene, block, t1=10 * DT, **settings)
+    mpm.record(path, scene, block, t1=20 * DT, resume=True, **settings)
+    assert np.array_equal(mpm.load(path).frames.received.impulse, run.frames.received.impulse)
+    assert np.array_equal(mpm.load(path).frames.received.angular, run.frames.received.angular)
+    with pytest.raises(ValueError, match="Forces need saved frames and colliders"):
+        mpm.simulate(eqx.tree_at(lambda s: s.boundary, scene, ()), block, t1=DT, dt=DT, save_every=1).forces()
+
+
+def test_the_force_on_a_collider_can_be_differentiated():
+    """By the stiffness of what it is pressed into, against a central difference."""
+    grid = mpm.Grid((14, 14), DX, origin=(-3, -3))
+    block = mpm.fill(mpm.Box((0.3, 0.0), (0.6, 0.3)), grid, particles_per_cell=4, density=1e3)
+    down = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.0, -0.3)))
+    press = mpm.SlipCollider(mpm.Box((0.0, 0.3), (1.0, 0.6)), down)
+    floor = mpm.SymmetryPlane(1, 0.0)
+
+    def force(modulus):
+        scene = mpm.Scene(grid, mpm.NeoHookean(modulus, 0.3), boundary=(press, floor))
+        return mpm.rollout(scene, block, steps=10, dt=2e-3).received.impulse[0, 1] / 2e-2
+
+    slope = jax.grad(force)(1e5)
+    assert float(force(1e5)) > 0
+    assert float(slope) == pytest.approx(float(force(1e5 + 10) - force(1e5 - 10)) / 20, rel=1e-6)
+
+
+@pytest.mark.parametrize("mu", [0.2, 1e5])
+@pytest.mark.parametrize("name", ["explicit", "semi_implicit", "implicit_midpoint"])
+def test_friction_opposes_slip_by_at_most_mu_times_the_push(name, mu):
+    """Relative to the collider: where it does not stop a node, exactly μ push, against the slip that is left."""
+    grid, particles = landing()
+    scene = scene_of(grid, *obstacles(mu))
+    step = grid_update(scene, particles, 0.5 * explicit_limit(scene), METHODS[name])
+    touch, rub, push = step.nodes.conditions.touch, np.asarray(step.update.rub), np.asarray(step.update.push)
+    slip = np.asarray(step.velocity - touch.velocity)
+    n = np.asarray(touch.normal)
+    slip = slip - n * (n * slip).sum(axis=1, keepdims=True)
+    held = push > 1e-9 * push.max()
+    size, left = np.linalg.norm(rub, axis=1), np.linalg.norm(slip, axis=1)
+    slides = held & (left > 1e-9)
+    assert_close((rub * n).sum(axis=1), np.zeros(len(n)), 0, 1e-12 * push.max())
+    assert (size <= mu * np.maximum(push, 0) * (1 + 1e-12)).all()
+    assert not rub[~held].any()
+    if mu < 1:
+        assert slides.sum() > 2
+        assert_close(rub[slides], -mu * push[slides, None] * slip[slides] / left[slides, None], 1e-10)
+    else:
+        assert held.any()
+        assert not slides.any()
+
+
+@pytest.mark.parametrize("name", ["explicit", "semi_implicit"])
+def test_a_collider_lets_go_freely(name):
+    """A block that a tilted floor does not hold leaves as if there were none."""
+    grid, block = landing()
+    block = eqx.tree_at(lambda b: b.v, block, jnp.broadcast_to(jnp.array([0.4, 0.3]), block.v.shape))
+    floor = mpm.SeparatingCollider(mpm.HalfSpace((0.1, 0.1), (4.0, 3.0)), friction=0.5)
+    scene = eqx.tree_at(lambda s: s.gravity, scene_of(grid, floor), (0.8, 0.6))
+    run = {"steps": 5, "dt": 0.2 * explicit_limit(scene), "method": METHODS[name]}
+    with_floor = mpm.rollout(scene, block, **run)
+    without = mpm.rollout(eqx.tree_at(lambda s: s.boundary, scene, ()), block, **run)
+    for field in ("x", "v", "F"):
+        assert_close(getattr(with_floor, field), getattr(without, field), 1e-11)
+
+
+def test_a_turning_body_drags_what_it_touches_and_is_braked():
+    """A cylinder under a block, turning anticlockwise: friction drives the block to the left; the torque on the body is
+    clockwise and that of μ times the load at arms between the surface and a spacing below it, where the nodes are."""
+    grid = mpm.Grid((14, 12), DX, origin=(-7, -6))
+    block = mpm.fill(mpm.Box((-0.4, 0.0), (0.4, 0.2)), grid, density=1e3)
+    wheel = mpm.Ball((0.0, -0.45), 0.46)
+    motion = mpm.RigidMotion((0.0, 1.0), ((0.0, 0.0),) * 2, (0.0, 20.0), wheel.centre)
+    scene = mpm.Scene(grid, LAW, gravity=(0.0, -9.81), boundary=mpm.SeparatingCollider(wheel, motion, 0.3))
+    dt, total = 0.3 * explicit_limit(scene), np.zeros(3)
+    step = jax.jit(lambda p, n: mpm.step(scene, p, n * dt, dt))
+    particles = mpm.prepare(scene, block)
+    for n in range(40):
+        particles, info = step(particles, float(n))
+        total += [*info.colliders.impulse[0], info.colliders.angular[0, 0]]
+    drag, load, torque = total
+    assert float(particles.v[:, 0].mean()) < -0.01
+    assert drag > 0
+    assert load < 0
+    assert torque < 0
+    assert 0.36 < -torque / (0.3 * -load) < 0.46
+
+
+def test_a_ball_pushed_through_a_block_meets_resistance():
+    """In 3-D, with a ball by samples of its distance as well: both are pushed back, by nearly the same."""
+    grid = mpm.Grid((12,) * 3, DX, origin=(-3,) * 3)
+    block = mpm.fill(mpm.Box((0.0,) * 3, (0.5,) * 3), grid, particles_per_cell=8, density=1e3)
+    ball = mpm.Ball((0.25, 0.25, 0.7), 0.2)
+    down = mpm.Motion((0.0, 1.0), ((0.0,) * 3, (0.0, 0.0, -4.0)))
+    floor = mpm.SlipBox((-np.inf, -np.inf, 0.0), (np.inf,) * 3)
+    impulses = []
+    for shape in (ball, mpm.sample_distance(ball, 0.05)):
+        scene = mpm.Scene(grid, LAW, boundary=(floor, mpm.SeparatingCollider(shape, down, 0.1)))
+        dt = 0.3 * explicit_limit(scene)
+        step = jax.jit(lambda p, n, scene=scene, dt=dt: mpm.step(scene, p, n * dt, dt))
+        particles, total = mpm.prepare(scene, block), np.zeros(3)
+        for n in range(20):
+            particles, info = step(particles, float(n))
+            total += np.asarray(info.colliders.impulse[0])
+        assert np.isfinite(np.asarray(particles.x)).all()
+        impulses.append(total)
+    assert impulses[0][2] > 1.0
+    assert np.abs(impulses[0][:2]).max() < 1e-6 * impulses[0][2]
+    assert_close(impulses[0], impulses[1], 0.1)
+
+
+# --- the total description, refusals, derivatives --------------------------------------------------------------------
+
+
+def test_in_the_total_description_a_sticky_collider_is_a_grip_that_turns():
+    """It holds the reference nodes where it began; a whole body in it turns rigidly, exactly, F = R."""
+    grid, block = landing()
+    block = eqx.tree_at(lambda b: b.v, block, 0 * block.v)
+    motion = mpm.RigidMotion((0.0, 1.0), ((0.0, 0.0), (0.3, 0.2)), (0.0, 1.5), (0.1, 0.0))
+    sticky = mpm.StickyCollider(mpm.Box((-1.0, -1.0), (1.0, 1.0)), motion)
+    scene = mpm.Scene(grid, LAW, boundary=sticky, description=mpm.TotalLagrangian())
+    after = mpm.rollout(scene, block, steps=10, dt=0.05)
+    cos, sin = np.cos(0.75), np.sin(0.75)
+    R = np.array([[cos, -sin], [sin, cos]])
+    assert_close(after.F, np.broadcast_to(R, after.F.shape), 1e-13)
+    assert_close(after.x, [0.25, 0.1] + (np.asarray(block.x) - [0.1, 0.0]) @ R.T, 1e-13)
+
+
+@pytest.mark.parametrize(
+    ("boundary", "options", "message"),
+    [
+        (mpm.SeparatingCollider(BALL), {"description": mpm.TotalLagrangian()}, "there is no contact"),
+        (mpm.SlipCollider(BALL), {"description": mpm.TotalLagrangian()}, "slide along a half-space that does not turn"),
+        (
+            mpm.SlipCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0)), ROLLING),
+            {"description": mpm.TotalLagrangian()},
+            "turn",
+        ),
+        (mpm.StickyCollider(mpm.Ball((0.0,) * 3, 1.0)), {}, "must have 2 coordinates"),
+    ],
+)
+def test_what_cannot_work_is_refused(boundary, options, message):
+    with pytest.raises(ValueError, match=message):
+        scene_of(mpm.Grid((8, 8), DX), boundary, **options)
+    with pytest.raises(ValueError, match="same dimension"):
+        mpm.StickyCollider(mpm.Ball((0.0,) * 3, 1.0), ROLLING)
+    with pytest.raises(ValueError, match="friction must be from 0"):
+        mpm.SeparatingCollider(BALL, friction=-1.0)
+
+
+def test_a_slip_half_space_in_the_total_description_is_a_slip_box():
+    """Axis-aligned, to the last bit but those of a normal's length."""
+    grid, block = landing()
+    runs = []
+    for floor in (
+        mpm.SlipBox((-np.inf, 0.0), (np.inf, np.inf)),
+        mpm.SlipCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 2.0))),
+    ):
+        scene = scene_of(grid, floor, description=mpm.TotalLagrangian())
+        runs.append(mpm.rollout(scene, block, steps=5, dt=0.3 * explicit_limit(scene), method=METHODS["semi_implicit"]))
+    assert_close(runs[0].x, runs[1].x, 1e-11)
+
+
+def test_single_precision_stays_single():
+    """Under strict promotion, in the updates and in what is reported."""
+    grid, block = landing()
+    block = jax.tree.map(lambda a: a.astype(jnp.float32), block)
+    sticky = mpm.StickyCollider(mpm.Union((mpm.Capsule((0.4, 0.4), (0.4, 0.3), 0.15), mpm.Box((0.0, 0.3), (0.1, 0.4)))))
+    scene = scene_of(grid, *obstacles(0.3), sticky)
+    for method in (mpm.Explicit(), mpm.SemiImplicit()):
+        after, info = mpm.step(scene, block, 0.0, 1e-3, method=method)
+        floats = [a for a in jax.tree.leaves((after, info)) if jnp.issubdtype(a.dtype, jnp.floating)]
+        assert {a.dtype for a in floats} == {jnp.dtype(jnp.float32)}
+
+
+TIGHTEST = mpm.ConjugateResidual(rtol=1e-14)
+UPDATES = {
+    "explicit": mpm.Explicit(),
+    "semi_implicit": mpm.SemiImplicit(solver=TIGHTEST, adjoint_solver=TIGHTEST),
+}
+
+
+@pytest.mark.parametrize("kind", ["separating", "slip", "sticky"])
+@pytest.mark.parametrize("name", UPDATES)
+def test_derivatives_by_a_colliders_motion_shape_and_friction(name, kind):
+    """After 20 steps, in forward and reverse mode, against central differences, one parameter after the other:
+    displacement, rotation, centre, radius, friction. A ball whose centre lies on a node, too."""
+    grid, block = landing()
+    block = eqx.tree_at(lambda b: b.v, block, block.v / 4)
+    dt = 0.25 * DX / np.sqrt(1.35e4 / 1e3)
+
+    def outcome(q):
+        motion = mpm.RigidMotion((0.0, 1.0), jnp.stack([jnp.zeros(2), q[:2]]), jnp.stack([0 * q[2], q[2]]), (0.2, -0.2))
+        ball = mpm.Ball((0.2 + q[5], -0.2), 0.2437 + q[3])
+        match kind:
+            case "separating":
+                collider = mpm.SeparatingCollider(ball, motion, q[4])
+            case "slip":
+                collider = mpm.SlipCollider(ball, motion)
+            case _:
+                collider = mpm.StickyCollider(ball, motion)
+        scene = scene_of(grid, collider)
+        final = mpm.rollout(scene, block, steps=20, dt=dt, method=UPDATES[name])
+        weights = jnp.asarray(np.random.default_rng(0).normal(size=final.x.shape))
+        return (weights * final.x).sum() + 0.1 * (weights * final.v).sum()
+
+    at = jnp.array([0.31, 0.23, 2.0, 0.0, 0.2, 0.0])
+    value = jax.jit(outcome)
+    reverse = np.asarray(jax.jit(jax.grad(outcome))(at))
+    h = 1e-6
+    difference = np.array([float(value(at + h * e) - value(at - h * e)) / (2 * h) for e in jnp.eye(6)])
+    assert np.isfinite(reverse).all()
+    acts = {"separating": [0, 1, 2, 4, 5], "slip": [0, 1, 2, 5], "sticky": [0, 1, 2]}[kind]
+    assert (np.abs(difference[acts]) > 1e-8).all(), difference
+    np.testing.assert_allclose(reverse, difference, rtol=1e-5, atol=1e-7 * np.abs(difference).max())

@@ -1,0 +1,226 @@
+"""Regions: exact distances, unit gradients, and none of them NaN."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, ids
+
+import mpmjax as mpm
+
+REGIONS = {
+    "ball-1d": mpm.Ball((0.1,), 0.4),
+    "ball-2d": mpm.Ball((0.1, 0.2), 0.4),
+    "ball-3d": mpm.Ball((0.1, 0.2, -0.1), 0.4),
+    "box-1d": mpm.Box((-0.3,), (0.4,)),
+    "box-2d": mpm.Box((-0.3, -0.2), (0.4, 0.3)),
+    "box-3d": mpm.Box((-0.3, -0.2, -0.1), (0.4, 0.3, 0.3)),
+    "capsule-2d": mpm.Capsule((-0.3, -0.1), (0.3, 0.2), 0.2),
+    "capsule-3d": mpm.Capsule((-0.3, -0.1, 0.1), (0.3, 0.2, -0.1), 0.2),
+    "cylinder-2d": mpm.Cylinder((-0.3, -0.1), (0.3, 0.2), 0.2),
+    "cylinder-3d": mpm.Cylinder((-0.3, -0.1, 0.1), (0.3, 0.2, -0.1), 0.25),
+    "half_space-2d": mpm.HalfSpace((0.1, 0.1), (3.0, 4.0)),
+    "half_space-3d": mpm.HalfSpace((0.1, 0.1, 0.0), (3.0, 4.0, -1.0)),
+    "union-2d": mpm.Union((mpm.Ball((-0.4, 0.0), 0.2), mpm.Box((0.1, -0.3), (0.5, 0.3)))),
+}
+SAMPLED = {f"sampled-{d}d": mpm.sample_distance(mpm.Ball((0.1,) * d, 0.35), 0.05) for d in (1, 2, 3)}
+EACH = pytest.mark.parametrize("region", **ids(REGIONS))
+ANY = pytest.mark.parametrize("region", **ids(REGIONS | SAMPLED))
+
+
+def points(region, count=200):
+    return jnp.asarray(np.random.default_rng(1).uniform(-0.8, 0.8, (count, region.dim)))
+
+
+@functools.cache
+def surface_of(region_name):
+    """Points of the surface and whether a point is inside, each from the set's own definition."""
+    n, rng = 200_000, np.random.default_rng(2)
+    region = REGIONS[region_name]
+    d = region.dim
+    sphere = rng.normal(size=(n, d))
+    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
+    match region:
+        case mpm.Ball():
+            return np.asarray(region.centre) + region.radius * sphere
+        case mpm.Box():
+            lower, upper = (np.asarray(a) for a in region.bounds())
+            x = rng.uniform(lower, upper, (n, d))
+            axis = rng.integers(0, d, n)
+            x[np.arange(n), axis] = np.where(rng.random(n) < 0.5, lower[axis], upper[axis])
+            return x
+        case mpm.Capsule() | mpm.Cylinder():
+            a, b = np.asarray(region.start), np.asarray(region.end)
+            axis = (b - a) / np.linalg.norm(b - a)
+            across = sphere - (sphere @ axis)[:, None] * axis
+            across /= np.linalg.norm(across, axis=1, keepdims=True)
+            side = a + rng.random((n, 1)) * (b - a) + region.radius * across
+            if isinstance(region, mpm.Cylinder):
+                cap = np.where(rng.random((n, 1)) < 0.5, a, b) + region.radius * np.sqrt(rng.random((n, 1))) * across
+            else:
+                cap = np.where((sphere @ axis < 0)[:, None], a, b) + region.radius * sphere
+            return np.concatenate([side, cap])
+        case mpm.HalfSpace():
+            x, unit = rng.uniform(-2, 2, (n, d)), np.asarray(region.normal) / np.linalg.norm(region.normal)
+            return x - ((x - np.asarray(region.point)) @ unit)[:, None] * unit
+    raise AssertionError
+
+
+@pytest.mark.parametrize("name", [name for name in REGIONS if not name.startswith("union")])
+def test_the_distance_is_that_of_the_nearest_point_of_the_surface(name):
+    """In size, by brute force over points of the surface: never more than theirs, and less by their spacing at most."""
+    region = REGIONS[name]
+    surface = surface_of(name)
+    x = points(region, 40)
+    nearest = np.array([np.linalg.norm(surface - p, axis=1).min() for p in np.asarray(x)])
+    distance = np.abs(np.asarray(region.distance(x)))
+    assert (distance <= nearest + 1e-12).all()
+    resolution = {1: 1e-12, 2: 3e-4, 3: 1e-2}[region.dim]
+    assert (nearest - distance < resolution).all(), (nearest - distance).max()
+
+
+def inside(region, x):
+    """From the set's definition."""
+    match region:
+        case mpm.Ball():
+            return ((x - np.asarray(region.centre)) ** 2).sum(axis=1) < region.radius**2
+        case mpm.Box():
+            return ((x > np.asarray(region.lower)) & (x < np.asarray(region.upper))).all(axis=1)
+        case mpm.HalfSpace():
+            return (x - np.asarray(region.point)) @ np.asarray(region.normal) < 0
+        case mpm.Union():
+            return np.any([inside(r, x) for r in region.regions], axis=0)
+    a, axis = np.asarray(region.start), np.asarray(region.end) - np.asarray(region.start)
+    s = (x - a) @ axis / (axis @ axis)
+    near = s.clip(0, 1) if isinstance(region, mpm.Capsule) else s
+    beside = np.linalg.norm(x - a - near[:, None] * axis, axis=1) < region.radius
+    return beside & ((s > 0) & (s < 1) if isinstance(region, mpm.Cylinder) else True)
+
+
+@EACH
+def test_it_is_negative_inside_and_the_bounds_hold_all_of_it(region):
+    x = points(region, 2000)
+    within = inside(region, np.asarray(x))
+    np.testing.assert_array_equal(np.asarray(region.distance(x)) < 0, within)
+    np.testing.assert_array_equal(np.asarray(region.contains(x)), within)
+    np.testing.assert_array_equal(np.asarray(region.contains(x, 0.1)), np.asarray(region.distance(x)) <= 0.1)
+    lower, upper = region.bounds()
+    held = np.asarray(x)[within]
+    assert within.any()
+    assert (held >= lower).all()
+    assert (held <= upper).all()
+    if not isinstance(region, mpm.HalfSpace):  # and they are tight
+        assert (held.min(axis=0) - lower < 0.15).all()
+        assert (upper - held.max(axis=0) < 0.15).all()
+        assert (np.abs(region.middle() - (lower + upper) / 2) < 0.1).all()
+
+
+@EACH
+def test_its_gradient_has_length_one(region):
+    """Almost everywhere, and it is that of central differences."""
+    x = points(region)
+    gradient = np.asarray(jax.grad(lambda x: region.distance(x).sum())(x))
+    assert_close(np.linalg.norm(gradient, axis=1), np.ones(len(x)), 1e-12)
+    h = 1e-6
+    difference = [(region.distance(x + h * e) - region.distance(x - h * e)) / (2 * h) for e in np.eye(region.dim)]
+    wrong = np.abs(np.stack(difference, axis=1) - gradient).max(axis=1) > 1e-6
+    assert wrong.sum() <= 1  # a point on an edge of the distance itself
+
+
+@ANY
+def test_no_derivative_is_nan_anywhere(region):
+    """First and second, at centres, edges, corners and on the surface, in the place and in every number of it."""
+    lower, upper = (np.nan_to_num(np.asarray(b), neginf=-1.0, posinf=1.0) for b in region.bounds())
+    middle = np.asarray(region.middle())
+    ends = [np.asarray(getattr(region, name)) for name in ("start", "end", "centre") if hasattr(region, name)]
+    special = jnp.asarray(np.stack([middle, lower, upper, (middle + lower) / 2, *ends, np.where(upper > 0, upper, 0)]))
+
+    def slope(region, x):
+        return jax.grad(lambda x: region.distance(x).sum())(x)
+
+    parameters, rest = jax.tree.flatten(jax.tree.map(lambda a: jnp.asarray(a, float), region))
+    there = jax.jacfwd(lambda leaves, x: slope(rest.unflatten(leaves), x), argnums=(0, 1))(parameters, special)
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves((slope(region, special), there)))
+
+
+def test_samples_converge_to_the_distance_at_second_order():
+    """Near the surface: a ball's distance and its normal; quadratic splines move it inward by (d − 1) h²/8R."""
+    ball, rng = mpm.Ball((0.1, 0.2, 0.0), 0.4), np.random.default_rng(3)
+    direction = rng.normal(size=(100, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    x = jnp.asarray(np.array([0.1, 0.2, 0.0]) + 0.4 * direction)
+    errors, slopes = [], []
+    for h in (0.1, 0.05, 0.025):
+        sampled = mpm.sample_distance(ball, h)
+        errors.append(np.abs(sampled.distance(x)).mean())
+        normal = jax.grad(lambda x, region=sampled: region.distance(x).sum())(x)
+        slopes.append(np.abs(np.asarray(normal) - direction).mean())
+    assert (np.log2(np.divide(errors[:-1], errors[1:])) > 1.8).all()
+    assert (np.log2(np.divide(slopes[:-1], slopes[1:])) > 1.8).all()
+    np.testing.assert_allclose(errors[-1], 2 * 0.025**2 / 8 / 0.4, rtol=0.1)
+
+
+def test_beyond_its_lattice_a_sampled_distance_goes_on():
+    """Positive, growing, and never more than the way there."""
+    ball = mpm.Ball((0.0, 0.0), 0.3)
+    sampled = mpm.sample_distance(ball, 0.1)
+    x = jnp.stack([jnp.linspace(0.3, 3.0, 28), jnp.linspace(0.0, 2.0, 28)], axis=1)
+    far = np.asarray(sampled.distance(x))
+    assert (np.diff(far) > 0).all()
+    assert (np.abs(far - ball.distance(x)) < 0.6).all()
+
+
+def test_a_mesh_is_sampled():
+    """A cube of twelve triangles has the distance of the box, to the samples' order, and a hole is refused."""
+    pytest.importorskip("trimesh")
+    pytest.importorskip("rtree")
+    corners = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) * 0.5
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    mesh, box = mpm.sample_mesh((corners, faces), 0.05), mpm.Box((0.0,) * 3, (0.5,) * 3)
+    exact = mpm.sample_distance(box, 0.05)
+    np.testing.assert_allclose(mesh.lower, exact.lower)
+    np.testing.assert_allclose(mesh.values, exact.values, atol=1e-12)
+    with pytest.raises(ValueError, match="must be a closed surface"):
+        mpm.sample_mesh((corners, faces[:-1]), 0.05)
+
+
+def test_without_trimesh_it_is_said_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "trimesh", None)
+    monkeypatch.setitem(__import__("sys").modules, "rtree", None)
+    with pytest.raises(ImportError, match=r"mpmjax\[mesh\]"):
+        mpm.sample_mesh("part.stl", 0.1)
+
+
+@pytest.mark.parametrize("region", [REGIONS["cylinder-3d"], REGIONS["capsule-2d"], REGIONS["union-2d"]])
+def test_any_bounded_region_can_be_filled(region):
+    """The particles' volume tends to the region's."""
+    grid = mpm.Grid((40,) * region.dim, 0.05, origin=(-20,) * region.dim)
+    particles = mpm.fill(region, grid, density=1.0, particles_per_cell=4**region.dim)
+    axis = 0.0 if isinstance(region, mpm.Union) else float(np.linalg.norm(np.subtract(region.end, region.start)))
+    volume = {2: 0.4 * axis + np.pi * 0.2**2, 3: np.pi * 0.25**2 * axis}[region.dim]
+    volume = np.pi * 0.2**2 + 0.24 if isinstance(region, mpm.Union) else volume
+    np.testing.assert_allclose(particles.volume.sum(), volume, rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: mpm.HalfSpace((0.0, 0.0), (0.0, 0.0)), "normal must not be zero"),
+        (lambda: mpm.HalfSpace((0.0, 0.0), (0.0, 0.0, 1.0)), "as many coordinates"),
+        (lambda: mpm.Capsule((0.0, 0.0), (0.0, 0.0), 1.0), "ends must differ"),
+        (lambda: mpm.Cylinder((0.0,), (1.0,), 1.0), "take a Box"),
+        (lambda: mpm.Cylinder((0.0, 0.0), (1.0, 0.0), -1.0), "radius must be greater than zero"),
+        (lambda: mpm.Union(()), "at least one region"),
+        (lambda: mpm.Union((mpm.Ball((0.0,), 1.0), mpm.Ball((0.0, 0.0), 1.0))), "the same dimension"),
+        (lambda: mpm.SampledDistance((0.0,), 0.1, np.ones((5, 5))), "as many coordinates as its values have axes"),
+        (lambda: mpm.SampledDistance((0.0,), 0.1, -np.ones(3)), "at least 4 samples"),
+        (lambda: mpm.SampledDistance((0.0,), 0.1, np.ones(5)), "must be negative somewhere"),
+        (lambda: mpm.sample_distance(REGIONS["half_space-2d"], 0.1), "Only a region with bounds"),
+    ],
+)
+def test_bad_regions_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -1,0 +1,161 @@
+"""Snow: its return map against the singular values, closed forms of element tests, and its derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import DIMS, assert_close, rotation_matrix
+
+import mpmjax as mpm
+from mpmjax.material import SnowHistory
+
+SNOW = mpm.Snow(1.4e5, 0.2, critical_compression=2.5e-2, critical_stretch=7.5e-3, hardening=10.0)
+
+
+def trials(d, n=200, size=0.05, seed=0):
+    """Trial deformations with stretches around the yield limits, shape (d, d, n), and a random history."""
+    rng = np.random.default_rng(seed)
+    stretches = 1 + size * rng.normal(size=(n, d))
+    F = np.stack([rotation_matrix(d, rng) * s @ rotation_matrix(d, rng) for s in stretches], axis=-1)
+    return jnp.asarray(F), SnowHistory(jnp.asarray(rng.uniform(0.8, 1.1, n)))
+
+
+@pytest.mark.parametrize("d", DIMS)
+def test_the_return_map_clamps_the_singular_values(d):
+    """U clip(s) Vᵀ by LAPACK, to rounding; J_E J_P does not change."""
+    F, history = trials(d)
+    U, s, Vt = np.linalg.svd(np.moveaxis(np.asarray(F), -1, 0))
+    expected = U * np.clip(s, 1 - 2.5e-2, 1 + 7.5e-3)[:, None] @ Vt
+    clamped, after = jax.jit(SNOW.returned)(F, history)
+    assert_close(np.moveaxis(np.asarray(clamped), -1, 0), expected, 1e-14)
+    volume = np.linalg.det(np.moveaxis(np.asarray(F), -1, 0)) * history.plastic_volume
+    assert_close(np.linalg.det(expected) * after.plastic_volume, volume, 1e-13)
+
+
+@pytest.mark.parametrize("d", DIMS)
+def test_what_does_not_yield_comes_back_bit_for_bit(d):
+    """And its history too."""
+    F, history = trials(d, size=2e-3)
+    clamped, after = jax.jit(SNOW.returned)(F, history)
+    assert np.array_equal(clamped, F)
+    assert np.array_equal(after.plastic_volume, history.plastic_volume)
+
+
+def squeezed(d, rates, steps):
+    """F_E, history and total stretches of one particle strained along its axes by F ← (1 + rate) F, step by step."""
+    F, total = jnp.eye(d)[..., None], np.ones(d)
+    history = SNOW.virgin(F)
+    returned = jax.jit(SNOW.returned)
+    for _ in range(steps):
+        F = F * (1 + jnp.asarray(rates))[:, None, None]
+        total = total * (1 + np.asarray(rates))
+        F, history = returned(F, history)
+    return F, history, total
+
+
+@pytest.mark.parametrize("d", DIMS)
+def test_uniaxial_compression_hardens_as_its_closed_form(d):
+    """The stretch along the axis is 1 − θ_c, the others 1; J_P = total/(1 − θ_c); the stress is that of fixed corotated
+    there, times e^{ξ (1 − J_P)}."""
+    F, history, total = squeezed(d, [-1e-3] + [0.0] * (d - 1), 150)
+    assert_close(jnp.diagonal(F[..., 0]), jnp.asarray([1 - 2.5e-2] + [1.0] * (d - 1)), 1e-13)
+    packed = total[0] / (1 - 2.5e-2)
+    assert float(history.plastic_volume[0]) == pytest.approx(packed, rel=1e-12)
+    modulus = 1.4e5 * np.exp(10 * (1 - packed))
+    mu, lam = modulus / 2.4, modulus * 0.2 / (1.2 * 0.6)
+    stress = SNOW.elastic(history).stress(F)[0, 0, 0]
+    assert float(stress) == pytest.approx(-(2 * mu + lam) * 2.5e-2, rel=1e-10)
+
+
+def test_isotropic_extension_tears():
+    """Beyond 1 + θ_s the stretch stays and the moduli fall like e^{ξ (1 − J_P)}."""
+    F, history, total = squeezed(3, [2e-3] * 3, 40)
+    assert_close(jnp.diagonal(F[..., 0]), jnp.full(3, 1 + 7.5e-3), 1e-13)
+    torn = total.prod() / (1 + 7.5e-3) ** 3
+    assert float(history.plastic_volume[0]) == pytest.approx(torn, rel=1e-11)
+    assert float(SNOW.elastic(history).youngs_modulus[0]) == pytest.approx(1.4e5 * np.exp(10 * (1 - torn)), rel=1e-9)
+
+
+def test_simple_shear_turns_and_yields():
+    """The principal stretches of a sheared particle reach both limits, and J_P = 1/((1 − θ_c)(1 + θ_s)) from then on:
+    shear keeps the volume, J_E J_P = 1."""
+    returned = jax.jit(SNOW.returned)
+    F, history = jnp.eye(2)[..., None], SNOW.virgin(jnp.eye(2)[..., None])
+    step = jnp.asarray([[0.0, 1e-3], [0.0, 0.0]])
+    for _ in range(200):
+        F, history = returned(F + jnp.einsum("ij,jkp->ikp", step, F), history)
+    s = np.linalg.svd(np.asarray(F[..., 0]))[1]
+    assert_close(s, np.array([1 + 7.5e-3, 1 - 2.5e-2]), 1e-12)
+    assert float(history.plastic_volume[0]) == pytest.approx(1 / ((1 - 2.5e-2) * (1 + 7.5e-3)), rel=1e-12)
+
+
+def test_plane_strain_is_three_dimensional_strain_with_a_stretch_of_one():
+    F, history = trials(2)
+    solid = jnp.zeros((3, 3, F.shape[-1])).at[:2, :2].set(F).at[2, 2].set(1.0)
+    flat, thick = jax.jit(SNOW.returned)(F, history), jax.jit(SNOW.returned)(solid, history)
+    assert_close(thick[0][:2, :2], flat[0], 1e-14)
+    assert_close(thick[1].plastic_volume, flat[1].plastic_volume, 1e-14)
+    stress = [SNOW.elastic(after).stress(E) for E, after in (flat, thick)]
+    assert_close(stress[1][:2, :2], stress[0], 1e-11)
+
+
+@pytest.mark.parametrize("d", DIMS)
+def test_the_return_map_creates_no_energy(d):
+    """Ψ after it, hardened, is at most Ψ before it, while ξ θ_c < 2/(3 d); with a hundred times the hardening it is
+    not."""
+
+    def gain(snow):
+        F, history = trials(d, n=2000, size=0.02)
+        after, later = jax.jit(snow.returned)(F, history)
+        before = snow.elastic(history).energy(F)
+        return float((snow.elastic(later).energy(after) / before - 1).max())
+
+    assert gain(SNOW) <= 1e-12
+    assert gain(mpm.Snow(hardening=1e3)) > 0.1
+
+
+def outcome(snow, F, history):
+    after, later = snow.returned(F, history)
+    return jnp.concatenate([after.reshape(-1), later.plastic_volume])
+
+
+EXACTLY = {"stretched alike": (1.02, 1.02, 1.02), "pressed alike": (0.95, 0.95, 0.95), "at rest": (1.0, 1.0, 1.0)}
+
+
+@pytest.mark.parametrize("stretches", [*EXACTLY.values(), (0.94, 1.0, 1.03), (0.93, 0.95, 0.99)])
+@pytest.mark.parametrize("d", DIMS)
+def test_derivatives_of_the_return_map_are_central_differences(d, stretches):
+    """By F, history and all parameters, at repeated stretches too; the transpose is the transpose, and second
+    derivatives are differences of first ones."""
+    rng = np.random.default_rng(4)
+    F = jnp.asarray(rotation_matrix(d, rng) * np.array(stretches[:d]) @ rotation_matrix(d, rng))[..., None]
+    place = (SNOW, F, SnowHistory(jnp.asarray([0.9])))
+    place = jax.tree.map(lambda a: jnp.asarray(a, float), place)
+    t = jax.tree.map(lambda a: jnp.asarray(a * rng.normal(size=a.shape) * 0.3), place)
+    t = (t[0], jnp.asarray(0.1 * rng.normal(size=F.shape)), t[2])
+
+    def moved(h):
+        return jax.tree.map(lambda a, b: a + h * b, place, t)
+
+    push = jax.jit(lambda q: jax.jvp(lambda q: outcome(*q), (q,), (t,)))
+    value, pushed = push(place)
+    h = 1e-6
+    difference = (push(moved(h))[0] - push(moved(-h))[0]) / (2 * h)
+    assert_close(pushed, difference, 1e-8)
+    u = jnp.asarray(rng.normal(size=value.shape))
+    pulled = jax.grad(lambda q: (u * outcome(*q)).sum())(place)
+    dot = sum(float((a * b).sum()) for a, b in zip(jax.tree.leaves(pulled), jax.tree.leaves(t), strict=True))
+    assert dot == pytest.approx(float((u * pushed).sum()), rel=1e-11)
+    twice = jax.jvp(lambda q: push(q)[1], (place,), (t,))[1]
+    assert_close(twice, (push(moved(h))[1] - push(moved(-h))[1]) / (2 * h), 1e-6, atol=1e-8)
+
+
+def test_snow_refuses_what_makes_no_sense():
+    for given, what in (
+        ({"critical_compression": 1.0}, "critical_compression"),
+        ({"critical_stretch": 0.0}, "critical_stretch"),
+        ({"hardening": -1.0}, "hardening"),
+        ({"youngs_modulus": -1.0}, "youngs_modulus"),
+    ):
+        with pytest.raises(ValueError, match=what):
+            mpm.Snow(**given)
