@@ -103,10 +103,10 @@ def singular_step(compression: float) -> float:
     """The first Δ̂t [s] at which M + Δ̂t²H is singular, M and H assembled column by column."""
     scene, block = scene_of()
     q = compressed(block, compression, jnp.zeros_like, jnp.zeros((2, 2)))
-    stencil, F = scene.stencil(q), components(q.F)
+    stencil = scene.stencil(q)
     mass = p2g(stencil, q.mass, components(q.v), None, scene.grid.size)[0]
     images = mirror((), scene.grid, scene.window(q))
-    potential = ElasticPotential(scene.material, q.volume, F, F, stencil, images)
+    potential = ElasticPotential(scene.constituents(q), stencil, images)
     at_rest = jnp.zeros((scene.grid.size, 2))
     hessian = jax.jacfwd(lambda u: -potential.force(u))(at_rest).reshape(2 * len(mass), -1)
     keep = np.repeat(np.asarray(mass) > 1e-12 * float(mass.max()), 2)

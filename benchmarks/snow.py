@@ -1,0 +1,229 @@
+"""Snow by explicit and by semi-implicit steps: do they agree, and from which hardening on is the explicit one dearer?
+
+    python benchmarks/snow.py            # writes docs/snow.png and docs/snow.csv
+    python benchmarks/snow.py --quick    # coarse, writes nothing
+
+Four scenes as in the reference of `mpmjax.Snow`, in two dimensions: a snowball dropped on the ground, thrown at a wall,
+two snowballs that collide, and a wedge driven through a block. Each is run with semi-implicit steps of 5e-4 s, and its
+energy is accounted for: what the walls, friction, the return map and each approximation took.
+
+Agreement: the first hundredth of a second after touching, before fragments go their ways, with steps of both kinds that
+are halved; the distance to the finest explicit motion falls with the step.
+
+Hardening: with ξ the packed snow stiffens by e^{ξ (1 − J_P)}, and the explicit step is that of its stiffest particle at
+any time of the run (0.7 of `stable_dt` then), where the semi-implicit one stays.
+"""
+
+import argparse
+import csv
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import mpmjax as mpm
+
+jax.config.update("jax_enable_x64", True)
+
+DOCS = Path(__file__).parents[1] / "docs"
+DENSITY = 400.0
+RADIUS = 0.15
+SEMI_IMPLICIT = mpm.SemiImplicit(solver=mpm.ConjugateResidual(rtol=1e-3))
+DT = 5e-4
+HARDENINGS = (0.0, 5.0, 10.0, 15.0, 20.0, 30.0)
+
+Case = tuple[mpm.Scene, mpm.Particles, float]
+"""Scene, particles, and the time to run for [s]."""
+
+
+def ball(grid: mpm.Grid, centre: tuple[float, float], velocity: tuple[float, float]) -> mpm.Particles:
+    """A snowball."""
+    region = mpm.Ball(centre, RADIUS)
+    return mpm.fill(region, grid, particles_per_cell=4, density=DENSITY, velocity=velocity)
+
+
+def drop(n: int, snow: mpm.Snow) -> Case:
+    """Onto the ground, at the speed of a fall from 1.3 m."""
+    grid = mpm.Grid((n, 3 * n // 4), 1 / n)
+    ground = mpm.SeparatingBox((-np.inf, 0.1), (np.inf, np.inf), friction=0.3)
+    scene = mpm.Scene(grid, snow, gravity=(0.0, -9.81), boundary=ground)
+    return scene, ball(grid, (0.5, 0.1 + RADIUS + 2 / n), (0.0, -5.0)), 0.1
+
+
+def against_a_wall(n: int, snow: mpm.Snow) -> Case:
+    """Thrown at 10 m/s."""
+    grid = mpm.Grid((n, n), 1 / n)
+    wall = mpm.SeparatingBox((-np.inf, 0.1), (0.8, np.inf), friction=0.3)
+    scene = mpm.Scene(grid, snow, gravity=(0.0, -9.81), boundary=wall)
+    return scene, ball(grid, (0.8 - RADIUS - 2 / n, 0.5), (10.0, 0.0)), 0.1
+
+
+def collision(n: int, snow: mpm.Snow) -> Case:
+    """Two at 6 m/s each, half a radius off centre."""
+    grid = mpm.Grid((3 * n // 2, n), 1 / n)
+    apart = RADIUS + 2 / n
+    left = ball(grid, (0.75 - apart, 0.5 + RADIUS / 4), (6.0, 0.0))
+    right = ball(grid, (0.75 + apart, 0.5 - RADIUS / 4), (-6.0, 0.0))
+    return mpm.Scene(grid, snow, gravity=(0.0, -9.81)), mpm.join(left, right), 0.1
+
+
+def wedge(n: int, snow: mpm.Snow) -> Case:
+    """A block between two walls on the ground, and a blunt wedge that comes down through it at 2 m/s."""
+    grid = mpm.Grid((n, n), 1 / n)
+    block = mpm.fill(mpm.Box((0.3, 0.1), (0.7, 0.4)), grid, particles_per_cell=4, density=DENSITY)
+    walls = mpm.SeparatingBox((0.1, 0.1), (0.9, np.inf), friction=0.5)
+    blade = mpm.Capsule((0.5, 0.45 + 0.03), (0.5, 0.75), 0.03)
+    down = mpm.Motion((0.0, 0.15), ((0.0, 0.0), (0.0, -0.3)))
+    tool = mpm.SeparatingCollider(blade, down, friction=0.1)
+    return mpm.Scene(grid, snow, gravity=(0.0, -9.81), boundary=(walls, tool)), block, 0.15
+
+
+SCENES: dict[str, Callable[[int, mpm.Snow], Case]] = {
+    "drop": drop,
+    "wall": against_a_wall,
+    "collision": collision,
+    "wedge": wedge,
+}
+
+
+def account(name: str, n: int) -> dict[str, Any]:
+    """A scene by semi-implicit steps of the reference's size, and where its energy went."""
+    scene, particles, t1 = SCENES[name](n, mpm.Snow())
+    steps = round(t1 / DT)
+    after, budget = mpm.budget(scene, particles, steps=steps, dt=DT, method=SEMI_IMPLICIT)
+    run = mpm.simulate(scene, particles, t1=t1, dt=DT, method=SEMI_IMPLICIT, throw=False)
+    energy = budget.energy
+    before = float(mpm.energy(scene, particles).kinetic)
+    terms = {
+        "change": energy.change,
+        **{f"by {k}": getattr(energy, k) for k in ("boundary", "friction", "solver", "time_integration")},
+        **{f"lost to {k}": -getattr(energy, k) for k in ("plastic", "p2g", "g2p", "implicit")},
+    }
+    sums = {k: float(a.sum()) for k, a in terms.items()}
+    packed = np.asarray(after.history.plastic_volume)
+    limit = float(mpm.stable_dt(scene, after, safety=1.0))
+    tally = run.tally
+    print(
+        f"{name}: {particles.count} particles, {steps} steps of {DT / limit:.1f} times the explicit limit at the end, "
+        f"{float(tally.iterations) / steps:.1f} iterations a step, {int(tally.unconverged)} unconverged, fault "
+        f"{int(tally.fault)}; J_P from {packed.min():.3f} to {packed.max():.3f}, in {mpm.pieces(scene, after)} pieces; "
+        f"kinetic energy at the start {before:.4g} J"
+    )
+    print("   " + ", ".join(f"{k} {v:.3g}" for k, v in sums.items()) + " J")
+    closing = float(jnp.abs(energy.change - energy.explained).max() / jnp.abs(energy.kinetic).max())
+    return {"scene": name, "kinetic at start": before, **sums, "closing": closing}
+
+
+def agreement(n: int, halvings: int) -> list[dict[str, Any]]:
+    """The distance of both kinds of steps from the finest explicit motion, as the step is halved."""
+    scene, particles, _ = drop(n, mpm.Snow())
+    t1, first = 0.016, 2e-4
+    finest = first / 2 ** (halvings + 1)
+    reference = mpm.simulate(scene, particles, t1=t1, dt=finest).final.x
+    moved = jnp.sqrt(((reference - particles.x) ** 2).sum(axis=1).mean())
+    rows = []
+    for kind, method in {"explicit": mpm.Explicit(), "semi-implicit": mpm.SemiImplicit()}.items():
+        for k in range(halvings + 1):
+            dt = first / 2**k
+            run = mpm.simulate(scene, particles, t1=t1, dt=dt, method=method, throw=False)
+            gap = jnp.sqrt(((run.final.x - reference) ** 2).sum(axis=1).mean()) / moved
+            failed = not bool(run.tally.healthy) or not np.isfinite(float(gap)) or float(gap) > 1
+            rows.append({"kind": kind, "dt_s": dt, "distance": np.nan if failed else float(gap)})
+            print(f"{kind}, dt = {dt:.3g} s: {'failed' if failed else f'{float(gap):.2e} of the motion'}")
+    return rows
+
+
+def seconds_of(scene: mpm.Scene, particles: mpm.Particles, t1: float, dt: float, method: Any, repeats: int) -> float:
+    """Wall time of a run, compilation left out: the least of some."""
+
+    def go() -> None:
+        run = mpm.simulate(scene, particles, t1=t1, dt=dt, method=method, throw=False)
+        assert bool(jax.block_until_ready(run.tally.healthy)), "the run failed"
+
+    go()
+    times = []
+    for _ in range(repeats):
+        begun = time.perf_counter()
+        go()
+        times.append(time.perf_counter() - begun)
+    return min(times)
+
+
+def hardening(n: int, repeats: int, hardenings: tuple[float, ...]) -> list[dict[str, Any]]:
+    """Seconds of a drop by both kinds of steps, by ξ."""
+    rows = []
+    for xi in hardenings:
+        scene, particles, t1 = drop(n, mpm.Snow(hardening=xi))
+
+        def limit(scene: mpm.Scene, now: mpm.Particles) -> Any:
+            return mpm.stable_dt(scene, now)
+
+        pilot = mpm.simulate(scene, particles, t1=t1, dt=DT, method=SEMI_IMPLICIT, observe=limit)
+        steps = int(np.ceil(t1 / float(pilot.observed.min())))
+        while True:  # at its own steps snow may pack further than the pilot's
+            own = mpm.simulate(scene, particles, t1=t1, dt=t1 / steps, observe=limit, save_every=max(1, steps // 50))
+            least = float(own.observed.min())
+            if t1 / steps <= 1.05 * least:
+                break
+            steps = int(np.ceil(t1 / least))
+        row = {
+            "hardening": xi,
+            "explicit_dt_s": t1 / steps,
+            "packed": float(own.final.history.plastic_volume.min()),
+            "explicit_s": seconds_of(scene, particles, t1, t1 / steps, mpm.Explicit(), repeats),
+            "semi_implicit_s": seconds_of(scene, particles, t1, DT, SEMI_IMPLICIT, repeats),
+            "iterations": float(pilot.tally.iterations) / float(pilot.tally.steps),
+        }
+        rows.append(row)
+        print(
+            f"ξ = {xi:g}: explicit {row['explicit_s']:.3g} s in {steps} steps, semi-implicit "
+            f"{row['semi_implicit_s']:.3g} s in {round(t1 / DT)} steps of {row['iterations']:.1f} iterations; "
+            f"J_P down to {row['packed']:.3f}"
+        )
+    return rows
+
+
+def draw(path: Path, agreed: list[dict[str, Any]], costs: list[dict[str, Any]]) -> None:
+    """Both as a chart."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
+    for kind, colour in {"explicit": "tab:blue", "semi-implicit": "tab:red"}.items():
+        own = [r for r in agreed if r["kind"] == kind]
+        left.loglog([r["dt_s"] for r in own], [r["distance"] for r in own], "o-", color=colour, label=kind)
+        key = kind.replace("-", "_") + "_s"
+        right.semilogy([r["hardening"] for r in costs], [r[key] for r in costs], "o-", color=colour, label=kind)
+    left.set(xlabel="Δt [s]", ylabel="distance to the finest, over the motion [-]", title="16 ms of a drop")
+    right.set(xlabel="hardening ξ [-]", ylabel="seconds", title="0.1 s of a drop")
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+        axes.legend()
+    figure.savefig(path, dpi=140)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Run all three, print, and write what they found."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="coarse, write nothing")
+    options = parser.parse_args()
+    n, halvings, repeats = (32, 2, 1) if options.quick else (64, 5, 3)
+    for name in SCENES:
+        account(name, n)
+    agreed = agreement(n, halvings)
+    costs = hardening(n, repeats, HARDENINGS[1:4:2] if options.quick else HARDENINGS)
+    if options.quick:
+        return
+    draw(DOCS / "snow.png", agreed, costs)
+    with open(DOCS / "snow.csv", "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, ["kind", "dt_s", "distance", *costs[0]])
+        writer.writeheader()
+        writer.writerows([*agreed, *costs])
+    print(f"written {DOCS / 'snow.png'}, {DOCS / 'snow.csv'}")
+
+
+if __name__ == "__main__":
+    main()
