@@ -141,7 +141,7 @@ def rolled(q: dict[str, Any], case: Case, steps: int = STEPS) -> tuple[jax.Array
         # what a return map changes is seen in the history, beyond the rounding of what a grip carries on its yield
         # condition, or where there is none in J = 1
         grown = jax.tree.map(lambda a, b: jnp.abs(a - b) > 1e-12, new.history, state.history)
-        yielded = grown if case.law in PLASTIC else new.F == 1
+        yielded = grown if case.law in PLASTIC else [new.F == 1] * (case.law in KINKED)
         return _simulate.state_of(new), jax.tree.leaves((seen.pop() if seen else (), yielded))
 
     with_friction = _step.with_friction

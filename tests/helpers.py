@@ -1,7 +1,10 @@
 """Registries and small scenes that the tests share. A new kernel, law or method costs one line here."""
 
+from collections.abc import Collection
+
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import mpmjax as mpm
 from mpmjax._types import Array
@@ -30,14 +33,18 @@ VISCOUS = {
     "viscous_fluid": mpm.Viscous(FLUIDS["fluid_in_tension"], 20.0, 5.0),
 }
 """Laws with viscosity beside them."""
+QUICK = ("explicit", "semi_implicit")
+"""The updates that run by default where every update is tested at length."""
 DESCRIPTIONS = {"updated": mpm.UpdatedLagrangian(), "total": mpm.TotalLagrangian()}
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(), "backward_euler": mpm.BackwardEuler()}
 SECOND_ORDER = {"implicit_midpoint": mpm.ImplicitMidpoint(), "trbdf2": mpm.TRBDF2()}
 
 
-def ids(registry: dict) -> dict:
-    """The keyword arguments that parametrise a test over a registry."""
-    return {"argvalues": list(registry.values()), "ids": list(registry)}
+def ids(registry: dict, default: Collection[str] | None = None) -> dict:
+    """The keyword arguments that parametrise a test over a registry; what is not among the `default` names is slow."""
+    slow = set(registry) - set(registry if default is None else default)
+    values = [pytest.param(value, marks=[pytest.mark.slow] * (name in slow)) for name, value in registry.items()]
+    return {"argvalues": values, "ids": list(registry)}
 
 
 def rotation_matrix(d: int, rng: np.random.Generator) -> np.ndarray:

@@ -115,6 +115,17 @@ CASES = {
 
 
 SLOW = {
+    "semi_implicit-contact planes",
+    "explicit-collider and contact plane",
+    "explicit-colliders",
+    "flip-updated",
+    "pic-updated",
+    "explicit-grip",
+    "trbdf2-viscous",
+    "viscous fluid-contact",
+    "backward_euler-grip",
+    "body force",
+    *(law for law in PLASTIC if law != "snow"),
     *(f"semi_implicit-{law}" for law in PLASTIC),
     "semi_implicit-fluid",
     "semi_implicit-contact",

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import LAWS, assert_close, cloud, explicit_limit, ids
+from helpers import LAWS, QUICK, assert_close, cloud, explicit_limit, ids
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
@@ -25,7 +25,7 @@ METHODS = {
     "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
     "trbdf2": mpm.TRBDF2(0.0, mpm.Linearised(TIGHT)),
 }
-EACH_METHOD = pytest.mark.parametrize("method", **ids(METHODS))
+EACH_METHOD = pytest.mark.parametrize("method", **ids(METHODS, QUICK))
 DX, DT, G = 0.1, 1e-2, np.array([1.0, -9.81, 2.0])
 LAW = LAWS["fixed_corotated"]
 BALL = mpm.Ball((0.31, 0.02), 0.22)
@@ -463,7 +463,7 @@ UPDATES = {
 }
 
 
-@pytest.mark.parametrize("kind", ["separating", "slip", "sticky"])
+@pytest.mark.parametrize("kind", ["separating", *(pytest.param(k, marks=pytest.mark.slow) for k in ("slip", "sticky"))])
 @pytest.mark.parametrize("name", UPDATES)
 def test_derivatives_by_a_colliders_motion_shape_and_friction(name, kind):
     """After 20 steps, in forward and reverse mode, against central differences, one parameter after the other:

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, explicit_limit, ids
+from helpers import QUICK, assert_close, explicit_limit, ids
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
@@ -63,7 +63,7 @@ def tumbling(floor, method, steps=1):
     return scene, particles, grid_update(scene, particles, 0.5 * explicit_limit(scene), method)
 
 
-EACH_METHOD = pytest.mark.parametrize("method", **ids(METHODS | OTHERS))
+EACH_METHOD = pytest.mark.parametrize("method", **ids(METHODS | OTHERS, QUICK))
 NAMES = pytest.mark.parametrize("name", ["explicit", pytest.param("semi_implicit", marks=pytest.mark.slow)])
 
 

@@ -119,6 +119,17 @@ def outcome(snow, F, history):
     return jnp.concatenate([after.reshape(-1), later.plastic_volume])
 
 
+@jax.jit
+def derivatives(place, t, u):
+    """The outcome, its first and second derivatives along t, and its first one in reverse mode."""
+
+    def push(q):
+        return jax.jvp(lambda q: outcome(*q), (q,), (t,))
+
+    (value, pushed), (_, twice) = jax.jvp(push, (place,), (t,))
+    return value, pushed, twice, jax.grad(lambda q: (u * outcome(*q)).sum())(place)
+
+
 EXACTLY = {"stretched alike": (1.02, 1.02, 1.02), "pressed alike": (0.95, 0.95, 0.95), "at rest": (1.0, 1.0, 1.0)}
 
 
@@ -137,17 +148,15 @@ def test_derivatives_of_the_return_map_are_central_differences(d, stretches):
     def moved(h):
         return jax.tree.map(lambda a, b: a + h * b, place, t)
 
-    push = jax.jit(lambda q: jax.jvp(lambda q: outcome(*q), (q,), (t,)))
-    value, pushed = push(place)
+    u = jnp.asarray(rng.normal(size=F.size + 1))
     h = 1e-6
-    difference = (push(moved(h))[0] - push(moved(-h))[0]) / (2 * h)
-    assert_close(pushed, difference, 1e-8)
-    u = jnp.asarray(rng.normal(size=value.shape))
-    pulled = jax.grad(lambda q: (u * outcome(*q)).sum())(place)
+    (before, pushed_before, _, _), (_, pushed, twice, pulled), (after, pushed_after, _, _) = (
+        derivatives(moved(s), t, u) for s in (-h, 0.0, h)
+    )
+    assert_close(pushed, (after - before) / (2 * h), 1e-8)
     dot = sum(float((a * b).sum()) for a, b in zip(jax.tree.leaves(pulled), jax.tree.leaves(t), strict=True))
     assert dot == pytest.approx(float((u * pushed).sum()), rel=1e-11)
-    twice = jax.jvp(lambda q: push(q)[1], (place,), (t,))[1]
-    assert_close(twice, (push(moved(h))[1] - push(moved(-h))[1]) / (2 * h), 1e-6, atol=1e-8)
+    assert_close(twice, (pushed_after - pushed_before) / (2 * h), 1e-6, atol=1e-8)
 
 
 def test_snow_refuses_what_makes_no_sense():

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import ids
 
 import mpmjax as mpm
 
@@ -103,17 +104,14 @@ def test_sound_has_its_speed(d):
 
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-11)
-EACH_METHOD = pytest.mark.parametrize(
-    "method",
-    [
-        mpm.Explicit(),
-        mpm.SemiImplicit(solver=TIGHT),
-        mpm.BackwardEuler(),
-        mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
-        mpm.TRBDF2(0.0, mpm.Linearised(TIGHT)),
-    ],
-    ids=lambda method: type(method).__name__,
-)
+METHODS = {
+    "explicit": mpm.Explicit(),
+    "semi_implicit": mpm.SemiImplicit(solver=TIGHT),
+    "backward_euler": mpm.BackwardEuler(),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
+    "trbdf2": mpm.TRBDF2(0.0, mpm.Linearised(TIGHT)),
+}
+EACH_METHOD = pytest.mark.parametrize("method", **ids(METHODS, ("explicit", "implicit_midpoint")))
 
 
 def started(rest, v, C, **fields):

@@ -192,7 +192,7 @@ VISCOSITIES = {"shear": (1.0, 0.0), "bulk": (0.1, 4.0), "both": (2.0, 0.7)}
 
 @pytest.mark.parametrize(("shear", "bulk"), **ids(VISCOSITIES))
 @pytest.mark.parametrize("transfer", **ids({k: t for k, t in TRANSFERS.items() if k != "flip"}))
-@pytest.mark.parametrize("d", [1, 2])
+@pytest.mark.parametrize("d", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_bound_of_a_viscous_particle_from_both_sides(d, transfer, shear, bulk):
     """Of diffusion and sound together, exact where the stiffest mode of both is one: the spherical one of a fluid; of a
     solid it may be short by no more than that they are not. Also of the semi-implicit step with β = ¼."""
@@ -402,7 +402,7 @@ def test_amplification_has_its_known_figures(beta, z, expected, digits):
     assert abs(moduli(2, semi_implicit(beta), z)[0] - expected) <= 0.5001 * 10.0**-digits
 
 
-@pytest.mark.parametrize("d", [1, 2])
+@pytest.mark.parametrize("d", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("rho", [None, 0.0, 0.4, 1.0])
 def test_amplification_of_the_methods_of_second_order(rho, d):
     """|R(i√z)|, R the rational function of the method for y' = λy, to 1e-6: 1 for the midpoint rule (ρ∞ = None) at
