@@ -3,8 +3,8 @@
     python benchmarks/dam_break.py [--quick]
 
 A column a wide and 2a high (a = 1.125 in) is let go on a dry plane, in two dimensions, float64, quadratic APIC,
-explicit steps at half of `stable_dt`, K = 200 ρ g a. Z is the place of the foremost particle, with half its width, over
-a, and T = t √(2g/a).
+explicit steps at half of the stability limit (`stable_dt(safety=0.5)`), K = 200 ρ g a. Z is the place of the foremost
+particle, with half its width, over a, and T = t √(2g/a).
 
 - resolution: 10, 20, 40 and 80 cells to a, inviscid, on a mirrored plane.
 - stiffness: K ten times as large, without tension and with, at 20 cells.

@@ -3,10 +3,10 @@
     python benchmarks/laws.py
     python benchmarks/laws.py --quick
 
-Scene A of `throughput.py` (3-D, 97 336 particles on 64³ nodes, 8 a cell, float32), strained by a hundredth so that what
-yields does: the laws take turns, and medians are compared. What snow adds is against fixed corotated elasticity, what
-metal, sand and soil add against Hencky's, their own elastic parts. The gradient is that of ten steps of a block of
-8 000 particles by the law's first parameter, a checkpoint a step.
+Scene A of `throughput.py` (3-D, 97 336 particles on 64³ nodes, 8 a cell, float32), strained by a hundredth or two so
+that what yields does: the laws take turns, and medians are compared. What snow adds is against fixed corotated
+elasticity, what metal, sand and soil add against Hencky's, their own elastic parts. The gradient is that of ten steps
+of a block of 8 000 particles by the law's first parameter, a checkpoint a step.
 """
 
 import argparse
@@ -38,7 +38,7 @@ LAWS: dict[str, Any] = {
 
 
 def made(b: Block, law: Any) -> tuple[mpm.Scene, mpm.Particles]:
-    """The block of a law, squeezed by a hundredth along one axis and stretched by as much along another."""
+    """The block of a law, squeezed by two hundredths along one axis and stretched by one along another."""
     one = jnp.ones(len(b.x), b.dtype)
     particles = mpm.Particles(jnp.asarray(b.x, b.dtype), jnp.asarray(b.v, b.dtype), b.mass * one, b.volume * one)
     scene = mpm.Scene(mpm.Grid((b.nodes,) * 3, b.spacing), law, gravity=(0.0, 0.0, -9.81))

@@ -12,7 +12,7 @@ are halved; how far the two motions are apart falls with the step. Each of them 
 alike in both: a transfer smooths what the grid does not resolve once a step, and yields are where that is felt.
 
 Hardening: with ξ the packed snow stiffens by e^{ξ (1 − J_P)}, and the explicit step is that of its stiffest particle at
-any time of the run (0.7 of `stable_dt` then), where the semi-implicit one stays.
+any time of the run (`stable_dt` then), where the semi-implicit one stays.
 """
 
 import argparse

@@ -1,8 +1,8 @@
 """Boundary conditions: functions of node position that prescribe grid velocities or mark contact.
 
 Every condition acts on the grid alone; the transfers know nothing of it. A wall acts on the nodes at and beyond it; a
-node within a thousandth of a spacing of a wall counts as on it. Where walls, planes and regions lie only selects
-nodes, so derivatives with respect to it are zero.
+node within a thousandth of a spacing of a wall counts as on it. Where walls, planes and grips lie only selects nodes,
+so derivatives with respect to it are zero.
 """
 
 import abc
@@ -238,6 +238,10 @@ class Grip(AbstractBoundary):
         return jnp.shape(jnp.asarray(self.motion.displacement))[1]
 
     def __check_init__(self):
+        require(
+            isinstance(self.motion, Motion),
+            f"A grip does not turn: take a StickyCollider, got the motion {self.motion}.",
+        )
         d = self.dim
         require(
             self.region.dim == d,

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._checks import canonical
+from mpmjax._checks import canonical, require_positive
 from mpmjax._crossing import collect, spread
 from mpmjax._diagnostics import energy_density, energy_of
 from mpmjax._kernel import Stencil
@@ -127,7 +127,11 @@ def budget(
 
     Returns:
         the particles after the last step, and the budget, each of its terms with a leading axis f.
+
+    Raises:
+        ValueError: from `prepare`, or a step that is not positive.
     """
+    require_positive("dt [s]", dt)
     scene, dt, method = canonical((scene, dt, method), particles.x.dtype)
     return _budget(scene, prepare(scene, particles), jnp.asarray(start, particles.x.dtype), dt, method, steps)
 

@@ -168,7 +168,7 @@ class _Body(eqx.Module):
         return self.shape.contains(self.place, ON_THE_WALL * spacing)
 
     def touch(self, spacing: Scalar) -> Touch:
-        """Normals held wherever there is one: a ball's centre has none."""
+        """Normals held wherever there is one; samples may be level somewhere."""
         slope = jax.grad(lambda x: self.shape.distance(x).sum())(self.place)
         steepness = length(slope)
         held = self.holds(spacing) & (steepness > 0)

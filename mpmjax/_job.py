@@ -264,10 +264,16 @@ def _refined(table: dict[str, Any], n: int) -> dict[str, Any]:
         return table
     materials = table.get("material", {})
     for material in materials if isinstance(materials, list) else [materials]:
-        lists = [key for key, value in material.items() if isinstance(value, list)]
+        lists = _lists(material)
         require(not lists, f"[material] {', '.join(lists)}: refinement needs one number for all particles.")
     finer = {key: [n * k for k in grid[key]] for key in ("shape", "origin") if key in grid}
     return table | {"grid": grid | finer | {"spacing": grid["spacing"] / n}}
+
+
+def _lists(material: Any) -> list[str]:
+    """The keys of a law, and of a law within it, that have one value for each particle."""
+    items = material.items() if isinstance(material, dict) else ()
+    return [key for key, value in items if isinstance(value, list)] + [k for _, v in items for k in _lists(v)]
 
 
 def _filled(scene: Scene, tables: list[Any], dtype: str) -> Particles:

@@ -80,7 +80,8 @@ class Particles(eqx.Module):
     def groups(self) -> tuple["Group", ...]:
         """The particles of each material."""
         if self.counts is None:
-            assert not isinstance(self.F, tuple)
+            if isinstance(self.F, tuple):
+                raise ValueError("F is that of several materials: give their counts, or drop F and history.")
             return (Group(None, self.F, self.history),)
         ends = pairwise(accumulate(self.counts, initial=0))
         F, history = ((None,) * len(self.counts) if a is None else a for a in (self.F, self.history))

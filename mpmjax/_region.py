@@ -1,7 +1,8 @@
 """Regions of space: what `fill` fills, a grip holds and a collider is.
 
 A region is its signed distance: negative inside, Euclidean, with a gradient of length one. Where several points of the
-surface are nearest (a ball's centre, a box's diagonal) the gradient is their mean or zero, never NaN.
+surface are nearest (a ball's centre, a box's diagonal) the gradient is the direction of one of them or their mean:
+never NaN, and not zero either, so that a collider holds what is on its middle too.
 """
 
 import abc
@@ -44,6 +45,12 @@ def length(a: Float[Array, "*m d"]) -> Float[Array, "*m"]:
     square = (a**2).sum(axis=-1)
     zero = square == 0
     return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, square)))
+
+
+def _from_axis(a: Float[Array, "m d"]) -> Float[Array, "m"]:
+    """The norm of each row, with the derivative of some direction at zero."""
+    some = jnp.asarray([0.8, 0.5, 0.3][: a.shape[-1]], a.dtype)
+    return jnp.where((a == 0).all(axis=-1), (a * some).sum(axis=-1), length(a))
 
 
 def _common(slabs: Float[Array, "m j"]) -> Float[Array, "m"]:
@@ -92,7 +99,8 @@ class Box(AbstractRegion):
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         """max(q) inside, ‖max(q, 0)‖ outside, q = max(lower − x, x − upper)."""
-        return _common(jnp.maximum(jnp.asarray(self.lower, x.dtype) - x, x - jnp.asarray(self.upper, x.dtype)))
+        below, above = jnp.asarray(self.lower, x.dtype) - x, x - jnp.asarray(self.upper, x.dtype)
+        return _common(jnp.where(below > above, below, above))
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """The corners."""
@@ -128,7 +136,7 @@ class Ball(AbstractRegion):
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         """‖x − centre‖ − radius."""
-        return length(x - jnp.asarray(self.centre, x.dtype)) - self.radius
+        return _from_axis(x - jnp.asarray(self.centre, x.dtype)) - self.radius
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Centre minus and plus the radius."""
@@ -207,7 +215,7 @@ class Capsule(AbstractRegion):
         start, end = jnp.asarray(self.start, x.dtype), jnp.asarray(self.end, x.dtype)
         axis, arm = end - start, x - start
         along = jnp.clip((arm * axis).sum(axis=-1) / (axis**2).sum(), 0, 1)
-        return length(arm - along[:, None] * axis) - self.radius
+        return _from_axis(arm - along[:, None] * axis) - self.radius
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Those of the balls about both ends."""
@@ -248,8 +256,9 @@ class Cylinder(AbstractRegion):
         height = length(end - start)
         axis, arm = (end - start) / height, x - (start + end) / 2
         along = (arm * axis).sum(axis=-1)
-        beside = length(arm - along[:, None] * axis)
-        return _common(jnp.stack([jnp.abs(along) - height / 2, beside - self.radius], axis=-1))
+        beside = _from_axis(arm - along[:, None] * axis)
+        beyond = jnp.where(along < 0, -along, along) - height / 2
+        return _common(jnp.stack([beyond, beside - self.radius], axis=-1))
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Those of both end disks."""

@@ -75,6 +75,7 @@ def render(
     require(
         frame is None or -len(run) <= frame < len(run), f"The run has {len(run)} frames, there is no frame {frame}."
     )
+    require(frame is None or path.suffix != ".gif", "frame is for a still; a .gif shows all frames.")
     require_between("view's azimuth [degrees]", view[0], -360, 360)
     require_between("view's elevation [degrees]", view[1], 0.1, 90)
     still = path.suffix != ".gif"

@@ -1,13 +1,12 @@
 """What a simulation returns."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
 
 from mpmjax._diffrax import Tally
-from mpmjax._exchange import Exchange
 from mpmjax._method import Method
 from mpmjax._particles import Particles, State, with_state
 from mpmjax._scene import Scene
@@ -20,6 +19,18 @@ class SimulationError(RuntimeError):
     def __init__(self, message: str, run: "Run"):
         super().__init__(message)
         self.run = run
+
+
+class Forces(NamedTuple):
+    """Mean forces and torques on k colliders between one saved frame and the next, of f frames."""
+
+    times: Float[Array, "g"]
+    """Half way between frames [s], shape (f − 1,)."""
+    force: Float[Array, "g k d"]
+    """Friction included [N], shape (f − 1, k, d)."""
+    torque: Float[Array, "g k r"]
+    """About the centre of the collider's rotation, or where it has none about its shape's middle, as it moves [N m],
+    shape (f − 1, k, r): r = 1 in 2-D, 3 in 3-D, 0 in 1-D."""
 
 
 class Run(eqx.Module):
@@ -50,17 +61,20 @@ class Run(eqx.Module):
         return self.steps * self.dt
 
     def frame(self, i: int) -> Particles:
-        """The particles at the i-th saved frame."""
+        """The particles at the i-th saved frame, negative from the end.
+
+        Raises:
+            ValueError: no frames were saved.
+            IndexError: there is no such frame.
+        """
         if self.frames is None:
             raise ValueError("This run saved no frames: pass save_every to simulate.")
+        if not -len(self) <= i < len(self):
+            raise IndexError(f"The run has {len(self)} frames, there is no frame {i}.")
         return with_state(self.final, jax.tree.map(lambda a: a[i], self.frames))
 
-    def forces(self) -> tuple[Float[Array, "g"], Exchange]:
-        """The mean force [N] and torque [N m] on each collider between one saved frame and the next.
-
-        Returns:
-            the times half way between frames [s], shape (f − 1,), and an `Exchange` over time: force (f − 1, k, d) and
-            torque (f − 1, k, r).
+    def forces(self) -> Forces:
+        """The mean force and torque on each collider between one saved frame and the next.
 
         Raises:
             ValueError: no frames were saved, or the scene has no collider.
@@ -70,9 +84,9 @@ class Run(eqx.Module):
                 "Forces need saved frames and colliders: pass save_every to simulate, a collider to Scene."
             )
         times = self.times
-        between = times[1:] - times[:-1]
-        mean = jax.tree.map(lambda a: (a[1:] - a[:-1]) / between[:, None, None], self.frames.received)
-        return (times[1:] + times[:-1]) / 2, mean
+        between = (times[1:] - times[:-1])[:, None, None]
+        mean = jax.tree.map(lambda a: (a[1:] - a[:-1]) / between, self.frames.received)
+        return Forces((times[1:] + times[:-1]) / 2, mean.impulse, mean.angular)
 
     def __len__(self) -> int:
         return 0 if self.frames is None else int(np.shape(self.steps)[0])

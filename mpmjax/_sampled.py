@@ -105,7 +105,7 @@ def sample_mesh(mesh: str | Path | tuple[Any, Any], spacing: float) -> SampledDi
 
     Raises:
         ImportError: trimesh or rtree is not there.
-        ValueError: a surface that is not closed.
+        ValueError: a surface that is not closed, or whose faces do not all point outwards.
     """
     try:
         import rtree  # noqa: F401 # pyright: ignore[reportMissingImports]  # without it trimesh fails, later
@@ -113,7 +113,10 @@ def sample_mesh(mesh: str | Path | tuple[Any, Any], spacing: float) -> SampledDi
     except ImportError as error:
         raise ImportError('A mesh needs trimesh and rtree: pip install "mpmjax[mesh]".') from error
     surface = trimesh.Trimesh(*mesh) if isinstance(mesh, tuple) else trimesh.load(str(mesh), force="mesh")
-    require(surface.is_watertight, "A mesh must be a closed surface, got one with holes: repair it.")
+    require(
+        surface.is_volume,  # pyright: ignore[reportAttributeAccessIssue]
+        "A mesh must be a closed surface whose faces all point outwards, got holes or faces that do not: repair it.",
+    )
     lower, points = _lattice(surface.bounds[0], surface.bounds[1], spacing)
     values = -trimesh.proximity.signed_distance(surface, points.reshape(-1, 3))  # trimesh's is positive inside
     return SampledDistance(tuple(lower.tolist()), spacing, values.reshape(points.shape[:-1]))

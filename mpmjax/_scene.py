@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -19,7 +20,7 @@ from mpmjax._mirror import ContactPlane, Plane, SymmetryPlane, fits
 from mpmjax._particles import Group, Particles
 from mpmjax._transfer import APIC, Transfer
 from mpmjax._types import Array, Int, Point, components
-from mpmjax.material import AbstractPlastic, AbstractVolumetric, Law, Viscous
+from mpmjax.material import AbstractMaterial, AbstractPlastic, AbstractVolumetric, Law, Viscous
 
 
 class UpdatedLagrangian(eqx.Module):
@@ -97,6 +98,11 @@ class Scene(eqx.Module):
         require(coordinates("gravity", self.gravity) == d, f"gravity must have {d} components, got {self.gravity}.")
         require_finite("gravity", self.gravity)
         require(len(self.laws) > 0, "A scene needs at least one law, got none.")
+        for law in self._materials:
+            require(
+                isinstance(law, AbstractMaterial | AbstractPlastic | Viscous),
+                f"A scene's material must be a law, such as NeoHookean(1e6, 0.3), or several, got {law!r}.",
+            )
         for boundary in self.boundary:
             require(
                 boundary.dim in (None, d),
@@ -211,6 +217,10 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
         f"in the laws' order, got {len(counts)}.",
     )
     particles = replace(particles, counts=counts if several else None)
+    require(
+        not scene.total or particles.X is not None or all(group.F is None for group in particles.groups),
+        "In the total description particles with an F need the X from which it is measured: give X, or drop F.",
+    )
     own = [_prepared(law, group, particles) for law, group in zip(scene.laws, particles.groups, strict=True)]
     prepared = replace(
         particles,
@@ -243,7 +253,19 @@ def _prepared(law: Law, group: Group, particles: Particles) -> tuple[Array, Any]
     require(F.shape == shape, f"{type(law).__name__} needs F of shape {shape}, got {F.shape}.")
     if not isinstance(law, AbstractPlastic):
         return F, None
+    require(
+        group.history is None or _remembers(law, F, group.history),
+        f"{type(law).__name__} needs a history of its own, got {type(group.history).__name__}: drop it to start anew.",
+    )
     return F, law.virgin(components(F)) if group.history is None else group.history
+
+
+def _remembers(law: AbstractPlastic, F: Array, history: Any) -> bool:
+    """Whether that is a history of the law's, of particles with this F."""
+    own = jax.eval_shape(law.virgin, components(F))
+    if jax.tree.structure(own) != jax.tree.structure(history):
+        return False
+    return all(a.shape == b.shape for a, b in zip(jax.tree.leaves(own), jax.tree.leaves(history), strict=True))
 
 
 def is_prepared(scene: Scene, particles: Particles) -> bool:
@@ -256,7 +278,9 @@ def is_prepared(scene: Scene, particles: Particles) -> bool:
         return False
     known = 0 if particles.received is None else len(particles.received.impulse)
     return known == scene.colliders and all(
-        group.F is not None and (group.history is not None) == isinstance(law, AbstractPlastic)
+        group.F is not None
+        and (group.F.shape[-1] == 1 if isinstance(law, AbstractVolumetric) else group.F.shape[-1] == particles.dim)
+        and (_remembers(law, group.F, group.history) if isinstance(law, AbstractPlastic) else group.history is None)
         for law, group in zip(scene.laws, particles.groups, strict=True)
     )
 
@@ -282,6 +306,14 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
                 f"Particles must lie {plane.keep} the {name} at {plane.position} on axis {plane.axis}, but "
                 f"particle {int(np.argmax(wrong))} does not: move it or change the plane's keep.",
             )
+    for law, group in zip(scene.laws, particles.groups, strict=True):
+        rows = particles.count if group.rows is None else group.rows[1] - group.rows[0]
+        sizes = {jnp.size(leaf) for leaf in jax.tree.leaves(law)}
+        require(
+            sizes <= {1, rows},
+            f"{type(law).__name__}'s parameters must be one number or one for each of its {rows} particles, got "
+            f"{sorted(sizes - {1, rows})} of them.",
+        )
     for part in scene.constituents(particles):
         allowed = np.asarray(part.law.admits(part.F))
         first = int(np.argmin(allowed)) + (part.rows[0] if part.rows else 0)

@@ -2,9 +2,10 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax import _linalg as la
-from mpmjax._checks import canonical, require_positive
+from mpmjax._checks import canonical, is_traced, require, require_positive
 from mpmjax._constituent import Constituent
 from mpmjax._kernel import MLSGradient
 from mpmjax._method import Explicit, Method, SemiImplicit
@@ -65,7 +66,10 @@ def stable_dt(
     require_positive("safety", safety)
     scene, method, safety = canonical((scene, method, safety), particles.x.dtype)
     particles = particles if is_prepared(scene, particles) else prepare(scene, particles)
-    return safety * _limit(scene, particles, method)
+    limit = safety * _limit(scene, particles, method)
+    if not is_traced(limit):
+        require(not np.isnan(limit), "stable_dt needs particles whose F is finite and one that their law allows.")
+    return limit
 
 
 @eqx.filter_jit
@@ -81,15 +85,16 @@ def _limit(scene: Scene, particles: Particles, method: Method) -> Float[Array, "
             explicit = (1 - 2 * jnp.asarray(beta)) * jnp.ones_like(z)
         case _:
             explicit = jnp.zeros_like(z)
-    most = jnp.concatenate([_viscous_spectrum(c, particles.dim) for c in bodies])
+    most = jnp.concatenate([_stiffest_viscosity(c, particles.dim) for c in bodies])
     y = most * _viscous_gradient_bound(scene, particles) / density  # per Δt
     z, y = jnp.maximum(explicit * z, 0), jnp.maximum(explicit * y, 0)
     square = y**2 + 16 * z
-    steepness = (y + jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)).max()
-    return jnp.where(steepness > 0, 8 / jnp.where(steepness > 0, steepness, 1), jnp.inf)
+    none = square == 0  # and not what is NaN, which the least must keep
+    steepness = (y + jnp.where(none, 0, jnp.sqrt(jnp.where(none, 1, square)))).max()
+    return jnp.where(steepness == 0, jnp.inf, 8 / jnp.where(steepness == 0, 1, steepness))
 
 
-def _viscous_spectrum(body: Constituent, dim: int) -> Float[Array, "q"]:
+def _stiffest_viscosity(body: Constituent, dim: int) -> Float[Array, "q"]:
     """The largest eigenvalue of each particle's ∇v ↦ |J| σ_v [Pa s]; in the total description a bound of it."""
     J = jnp.abs(la.determinant(body.F))
     if body.viscosity is None:

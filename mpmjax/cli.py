@@ -12,6 +12,7 @@ import numpy as np
 import typer
 
 from mpmjax._chart import draw_chart, write_trials
+from mpmjax._checks import require
 from mpmjax._diagnostics import energy, grid_mass, pieces
 from mpmjax._fit import FitResult
 from mpmjax._io import load
@@ -59,6 +60,7 @@ def run_command(
     """Simulate a scene and write its frames."""
     job = read_job(scene)
     _say_choice(job)
+    require(not (overwrite and resume), "--overwrite starts a file anew and --resume continues it: give one of them.")
     done = int(load(output).tally.steps) if resume else 0
     begun = time.perf_counter()
     run = record(
@@ -208,6 +210,14 @@ def _print_trial(trial: Trial) -> None:
     )
 
 
+def _angles(text: str) -> tuple[float, float]:
+    try:
+        azimuth, elevation = (float(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not AZIMUTH,ELEVATION in degrees, such as -135,30.") from None
+    return azimuth, elevation
+
+
 @app.command("render")
 @_reporting
 def render_command(
@@ -218,8 +228,11 @@ def render_command(
     ] = "speed",
     frame: Annotated[int | None, typer.Option(help="The frame of a still; negative from the end.")] = None,
     view: Annotated[
-        tuple[float, float], typer.Option(help="Azimuth and elevation of the eye in degrees, of a run in 3-D.")
-    ] = (30.0, 20.0),
+        tuple,
+        typer.Option(
+            parser=_angles, metavar="AZIMUTH,ELEVATION", help="Of the eye, in degrees: where a run in 3-D is seen from."
+        ),
+    ] = "30,20",  # pyright: ignore[reportArgumentType]  # parsed as if it had been given
     dpi: Annotated[float, typer.Option(help="Resolution.")] = 120.0,
     fps: Annotated[int, typer.Option(help="Frames a second of an animation.")] = 20,
 ) -> None:

@@ -42,8 +42,11 @@ SECOND_ORDER = {"implicit_midpoint": mpm.ImplicitMidpoint(), "trbdf2": mpm.TRBDF
 
 def ids(registry: dict, default: Collection[str] | None = None) -> dict:
     """The keyword arguments that parametrise a test over a registry; what is not among the `default` names is slow."""
-    slow = set(registry) - set(registry if default is None else default)
-    values = [pytest.param(value, marks=[pytest.mark.slow] * (name in slow)) for name, value in registry.items()]
+    values = list(registry.values())
+    if default is not None:
+        values = [
+            pytest.param(value, marks=[pytest.mark.slow] * (name not in default)) for name, value in registry.items()
+        ]
     return {"argvalues": values, "ids": list(registry)}
 
 
@@ -58,13 +61,15 @@ def cloud(d: int, *, p: int = 20, seed: int = 0, cells: int = 6, dx: float = 0.1
     """A grid and random particles well inside it, with random velocity, affine velocity and deformation."""
     rng = np.random.default_rng(seed)
     grid = mpm.Grid((cells + 5,) * d, dx, origin=(-2,) * d)
+    x = jnp.asarray(rng.uniform(0, cells * dx, (p, d)))
     particles = mpm.Particles(
-        x=jnp.asarray(rng.uniform(0, cells * dx, (p, d))),
+        x=x,
         v=jnp.asarray(rng.normal(size=(p, d))),
         mass=jnp.asarray(rng.uniform(0.5, 1.5, p)),
         volume=jnp.asarray(rng.uniform(0.5, 1.5, p) * (dx / 2) ** d),
         F=jnp.asarray(np.eye(d) + 0.1 * rng.normal(size=(p, d, d))),
         C=jnp.asarray(rng.normal(size=(p, d, d))),
+        X=x,
     )
     return grid, particles
 

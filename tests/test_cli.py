@@ -91,16 +91,24 @@ def test_run_does_not_replace_a_file_unasked_and_resumes_it(folder):
     longer.write_text(SCENE.replace("t1 = 0.06", "t1 = 0.08"))
     copy = folder / "copy.h5"
     copy.write_bytes(before)
+    assert "give one of them" in refused("run", longer, "-o", copy, "--resume", "--overwrite")
     assert shell("run", longer, "-o", copy, "--resume", "--quiet")[0] == 0
     np.testing.assert_array_equal(mpm.load(copy).steps, [0, 2, 4, 6, 8])
 
 
 @pytest.mark.parametrize("name", ["still.png", "moving.gif"])
 def test_render_draws_a_picture(folder, name):
-    options = ("--colour", "energy", "--dpi", 40, "--view", 40, 25)
+    options = ("--colour", "energy", "--dpi", 40, "--view=-140,25")
     code, _, err = shell("render", folder / "run.h5", "-o", folder / name, *options)
     assert code == 0, err
     assert (folder / name).stat().st_size > 1000
+
+
+@pytest.mark.parametrize("view", ["30", "30,high", "1,2,3"])
+def test_an_angle_that_is_none_gets_a_hint(folder, view):
+    code, _, err = shell("render", folder / "run.h5", "-o", folder / "a.png", "--view", view)
+    assert code == 2
+    assert "is not AZIMUTH,ELEVATION" in err
 
 
 BAD_SCENES = {
@@ -275,9 +283,15 @@ def test_a_plan_refines(tmp_path):
     np.testing.assert_allclose(few.mass.sum(), many.mass.sum(), rtol=1e-14)
     np.testing.assert_allclose(few.x.mean(axis=0), many.x.mean(axis=0), rtol=1e-14)
     assert (2 * float(fine.grid.spacing), *fine.grid.shape) == (float(coarse.grid.spacing), 20, 28)
-    scene.write_text(SCENE.replace("youngs_modulus = 1e5", f"youngs_modulus = {[1e5] * few.count}"))
-    with pytest.raises(ValueError, match="one number for all particles"):
-        read_plan(scene).build(2)
+    law = '[material]\nkind = "FixedCorotated"\nyoungs_modulus = 1e5\npoisson_ratio = 0.3\n'
+    scene.write_text('material = "Snow"\n' + SCENE.replace(law, ""))
+    assert read_plan(scene).build(2)[1].count == many.count
+    each = f"youngs_modulus = {[1e5] * few.count}, poisson_ratio = 0.3"
+    viscous = f'kind = "Viscous"\nshear_viscosity = 1.0\nlaw = {{ kind = "NeoHookean", {each} }}'
+    for varied in (f'kind = "NeoHookean"\n{each.replace(", p", chr(10) + "p")}', viscous):
+        scene.write_text(SCENE.replace(law, f"[material]\n{varied}\n"))
+        with pytest.raises(ValueError, match="one number for all particles"):
+            read_plan(scene).build(2)
 
 
 @pytest.mark.slow

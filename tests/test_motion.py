@@ -8,6 +8,7 @@ from helpers import assert_close
 from scipy.spatial.transform import Rotation
 
 import mpmjax as mpm
+from mpmjax._checks import canonical
 
 TIMES = (0.0, 1.0, 3.0)
 MOTIONS = {
@@ -89,3 +90,14 @@ def test_bad_motions_are_refused(change, message):
     data = {"times": TIMES, "displacement": np.zeros((3, 2)), "rotation": np.zeros(3), "centre": (0.0, 0.0)}
     with pytest.raises(ValueError, match=message):
         mpm.RigidMotion(**data | change)
+
+
+@EACH
+def test_in_single_precision_small_steps_have_the_speed_of_large_ones(motion):
+    """Where the difference of two places would keep three digits of it, or none."""
+    X = jnp.asarray(np.random.default_rng(0).normal(size=(7, motion.dim)))
+    for t in (0.3, 2.1):
+        exact = motion.velocity_of(X, t, 1e-7)
+        for dt in (1e-4, 1e-6):
+            found = canonical(motion, jnp.float32).velocity_of(X.astype(jnp.float32), np.float32(t), np.float32(dt))
+            assert_close(found, exact, 1e-6 + 5 * dt)

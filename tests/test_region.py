@@ -150,6 +150,20 @@ def test_no_derivative_is_nan_anywhere(region):
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(derivatives(parameters, special)))
 
 
+def test_the_middle_has_a_direction_too():
+    """Nodes on a plate's mid-plane, an axis or a centre: a collider needs a normal of length one there."""
+    middles = {
+        mpm.Box((0.0, 0.0), (1.0, 2.0)): [[0.5, 1.0], [0.5, 0.7]],
+        mpm.Ball((0.2, 0.1)[:2], 0.3): [[0.2, 0.1]],
+        mpm.Capsule((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.2): [[0.5, 0.0, 0.0]],
+        mpm.Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 2.0): [[0.3, 0.0, 0.5], [0.0, 0.0, 0.5]],
+        mpm.Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 4.0), 0.5): [[0.0, 0.0, 2.0]],
+    }
+    for region, points in middles.items():
+        gradient = jax.grad(lambda x, region=region: region.distance(x).sum())(jnp.asarray(points))
+        assert (np.linalg.norm(np.asarray(gradient), axis=1) > 0.5).all(), region
+
+
 def test_samples_converge_to_the_distance_at_second_order():
     """Near the surface: a ball's distance and its normal; quadratic splines move it inward by (d − 1) h²/8R."""
     ball, rng = mpm.Ball((0.1, 0.2, 0.0), 0.4), np.random.default_rng(3)

@@ -1,5 +1,7 @@
 """Faults that reviews found, each seen to fail before it was mended."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -113,3 +115,59 @@ def test_the_run_of_an_error_holds_only_frames_that_were_reached():
     assert 0 < len(run) < 400
     assert float(run.steps[-1]) == float(run.final_step)
     assert np.isfinite(run.frames.x).all()
+
+
+def test_a_frame_that_is_not_there_is_an_error():
+    """Where an array's index would be clamped."""
+    run = mpm.simulate(*block(2), t1=2e-3, dt=1e-3, save_every=1)
+    assert np.array_equal(run.frame(-1).x, run.frame(2).x)
+    for i in (3, -4):
+        with pytest.raises(IndexError, match="3 frames"):
+            run.frame(i)
+
+
+def test_the_stable_step_does_not_leave_broken_particles_out():
+    """NaN is no stiffness of zero."""
+    scene, particles = block(2, material=mpm.NeoHookean(1e4, 0.3))
+    particles = mpm.prepare(scene, particles)
+    for bad in (jnp.nan, -1.0):
+        broken = eqx.tree_at(lambda q: q.F, particles, particles.F.at[0, 0, 0].set(bad))
+        with pytest.raises(ValueError, match="their law allows"):
+            mpm.stable_dt(scene, broken)
+
+
+def test_a_deformation_needs_the_places_that_it_is_measured_from():
+    """In the total description."""
+    scene, particles = block(2, description=mpm.TotalLagrangian())
+    strained = eqx.tree_at(
+        lambda q: q.F, particles, jnp.tile(1.1 * jnp.eye(2), (particles.count, 1, 1)), is_leaf=lambda leaf: leaf is None
+    )
+    with pytest.raises(ValueError, match="give X, or drop F"):
+        mpm.prepare(scene, strained)
+
+
+def test_particles_of_another_law_are_refused():
+    """By what they remember, and by the shape of their F."""
+    sand, metal = mpm.DruckerPrager(1e4, 0.3, friction_angle=0.6), mpm.VonMises(1e4, 0.3, yield_stress=1e2)
+    scene, particles = block(2, material=sand)
+    prepared = mpm.prepare(scene, particles)
+    for other, says in ((metal, "history of its own"), (mpm.Fluid(1e4), "F of shape"), ((sand, metal), "2 laws")):
+        scene = block(2, material=other)[0]
+        for refusing in (mpm.prepare, mpm.stable_dt):
+            with pytest.raises(ValueError, match=says):
+                refusing(scene, prepared)
+    several = mpm.join(particles, particles)
+    both = mpm.prepare(block(2, material=(sand, metal))[0], several)
+    with pytest.raises(ValueError, match="several materials"):
+        mpm.prepare(block(2, material=sand)[0], replace(both, counts=None))
+
+
+def test_a_wrong_number_of_moduli_is_refused():
+    scene, particles = block(2, material=mpm.NeoHookean(jnp.full(3, 1e4), 0.3))
+    with pytest.raises(ValueError, match=r"one for each of its 36 particles, got \[3\]"):
+        mpm.prepare(scene, particles)
+
+
+def test_a_budget_needs_a_step():
+    with pytest.raises(ValueError, match="dt"):
+        mpm.budget(*block(2), steps=1, dt=-1e-3)

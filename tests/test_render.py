@@ -368,6 +368,8 @@ def test_what_cannot_be_drawn_is_refused(tmp_path):
             mpm.render(run, path, **bad)
     with pytest.raises(ValueError, match="must end in"):
         mpm.render(run, tmp_path / "a.xyz")
+    with pytest.raises(ValueError, match="frame is for a still"):
+        mpm.render(run, tmp_path / "a.gif", frame=0)
     with pytest.raises(ValueError, match="no frames"):
         mpm.render(eqx.tree_at(lambda r: r.frames, run, None), path)
     assert not path.exists()

@@ -1,10 +1,11 @@
 """Snow: its return map against the singular values, closed forms of element tests, and its derivatives."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DIMS, assert_close, rotation_matrix
+from helpers import DIMS, assert_close, block, rotation_matrix
 
 import mpmjax as mpm
 from mpmjax.material import SnowHistory
@@ -101,8 +102,8 @@ def test_plane_strain_is_three_dimensional_strain_with_a_stretch_of_one():
 
 @pytest.mark.parametrize("d", DIMS)
 def test_the_return_map_creates_no_energy(d):
-    """Ψ after it, hardened, is at most Ψ before it, while ξ θ_c < 2/(3 d); with a hundred times the hardening it is
-    not."""
+    """Ψ after it, hardened, is at most Ψ before it, where snow is packed; with a hundred times the hardening it is not.
+    Torn snow gains little, since it has little."""
 
     def gain(snow):
         F, history = trials(d, n=2000, size=0.02)
@@ -112,6 +113,22 @@ def test_the_return_map_creates_no_energy(d):
 
     assert gain(SNOW) <= 1e-12
     assert gain(mpm.Snow(hardening=1e3)) > 0.1
+    F, _ = trials(d, n=2000, size=0.02)
+    for torn in (1.5, 2.0, 3.0):
+        history = SnowHistory(jnp.full(F.shape[2:], torn))
+        after, later = jax.jit(SNOW.returned)(F, history)
+        more = SNOW.elastic(later).energy(after) - SNOW.elastic(history).energy(F)
+        first = 1 - SNOW.critical_compression
+        yielding = SNOW.elastic(SNOW.virgin(F)).energy(first * jnp.eye(d)[..., None])
+        assert float(more.max()) < 1e-2 * float(yielding[0])
+
+
+def test_inverted_snow_is_a_fault():
+    """The clamp would keep it inverted."""
+    scene, particles = block(2, material=SNOW)
+    F = jnp.broadcast_to(jnp.eye(2), (particles.count, 2, 2)).at[3, 0, 0].set(-0.5)
+    with pytest.raises(ValueError, match="does not allow the F of particle 3"):
+        mpm.prepare(scene, eqx.tree_at(lambda q: q.F, particles, F, is_leaf=lambda leaf: leaf is None))
 
 
 def outcome(snow, F, history):

@@ -10,15 +10,15 @@ from mpmjax.material._base import (
     MatrixTangent,
     PrincipalTangent,
 )
-from mpmjax.material._cam_clay import CamClay
-from mpmjax.material._drucker_prager import DruckerPrager
+from mpmjax.material._cam_clay import CamClay, CamClayHistory
+from mpmjax.material._drucker_prager import DruckerPrager, DruckerPragerHistory
 from mpmjax.material._elastic import FixedCorotated, NeoHookean
 from mpmjax.material._fluid import Fluid, NoHistory, Tait
 from mpmjax.material._hencky import Hencky
 from mpmjax.material._projection import projected_tangent
-from mpmjax.material._snow import Snow, SnowHistory
+from mpmjax.material._snow import Snow, SnowElasticity, SnowHistory
 from mpmjax.material._viscous import Viscosity, Viscous
-from mpmjax.material._von_mises import VonMises
+from mpmjax.material._von_mises import VonMises, VonMisesHistory
 
 __all__ = [
     "AbstractIsotropic",
@@ -27,7 +27,9 @@ __all__ = [
     "AbstractTangent",
     "AbstractVolumetric",
     "CamClay",
+    "CamClayHistory",
     "DruckerPrager",
+    "DruckerPragerHistory",
     "FixedCorotated",
     "Fluid",
     "Hencky",
@@ -37,10 +39,12 @@ __all__ = [
     "NoHistory",
     "PrincipalTangent",
     "Snow",
+    "SnowElasticity",
     "SnowHistory",
     "Tait",
     "Viscosity",
     "Viscous",
     "VonMises",
+    "VonMisesHistory",
     "projected_tangent",
 ]

@@ -1,7 +1,5 @@
 """Soil and wet snow that compact: a Cam clay on Hencky's elasticity."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -81,11 +79,11 @@ class CamClay(AbstractPlastic):
         alpha = -jnp.arcsinh(self.preconsolidation / bulk) / self.hardening
         return CamClayHistory(alpha * jnp.ones(F.shape[2:], F.dtype), no_transverse_strain(F))
 
-    def elastic(self, history: Any) -> Hencky:
+    def elastic(self, history: CamClayHistory) -> Hencky:
         """Hencky's law with the history's ε_t."""
         return Hencky(self.youngs_modulus, self.poisson_ratio, history.transverse_strain)
 
-    def returned(self, F: Matrix, history: Any) -> tuple[Matrix, CamClayHistory]:
+    def returned(self, F: Matrix, history: CamClayHistory) -> tuple[Matrix, CamClayHistory]:
         """To a tip, or to the ellipse at the same pressure; all stresses in shares of K."""
         split = Split.of(F, history.transverse_strain)
         alpha, beta, M = history.volume_strain, self.cohesion, self.friction

@@ -1,7 +1,5 @@
 """Dry sand: the yield condition of Drucker and Prager on Hencky's elasticity."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -71,11 +69,11 @@ class DruckerPrager(AbstractPlastic):
         """v_c = 0, ε_t = 0."""
         return DruckerPragerHistory(jnp.zeros(F.shape[2:], F.dtype), no_transverse_strain(F))
 
-    def elastic(self, history: Any) -> Hencky:
+    def elastic(self, history: DruckerPragerHistory) -> Hencky:
         """Hencky's law with the history's ε_t."""
         return Hencky(self.youngs_modulus, self.poisson_ratio, history.transverse_strain)
 
-    def returned(self, F: Matrix, history: Any) -> tuple[Matrix, DruckerPragerHistory]:
+    def returned(self, F: Matrix, history: DruckerPragerHistory) -> tuple[Matrix, DruckerPragerHistory]:
         """To the cone at the same volume, or to its tip."""
         split = Split.of(F, history.transverse_strain)
         mean = split.mean + history.gap / 3

@@ -85,7 +85,8 @@ class NeoHookean(AbstractIsotropic):
     Ψ = μ/2 (F : F − d) − μ ln J + λ/2 (ln J)², P = μ (F − F⁻ᵀ) + λ ln J F⁻ᵀ.
 
     *When it breaks*: it needs J > 0; a step that inverts a particle is reported. Its Hessian can be indefinite under
-    compression and under expansion beyond ln J = 1 + μ/λ.
+    compression, and under even expansion once λ ln J > μ (1 + J^{2/d}): in 2-D never at ν = 0.3, and from J = 1.04 on
+    at ν = 0.49.
     *Good values*: rubber μ = 0.1 to 2 MPa with ν = 0.49 (nearly incompressible), gels as for fixed corotated.
 
     Args:

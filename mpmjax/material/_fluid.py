@@ -71,7 +71,8 @@ class Tait(AbstractMaterial, AbstractVolumetric):
     Args:
         bulk_modulus: K [Pa] at rest, one value or one per particle (p,).
         exponent: γ [-], positive.
-        tension: whether the pressure may be below zero.
+        tension: whether the pressure may be below zero. Unlike `Fluid`, which forgets what expands, it may by default:
+            an elastic law remembers.
     """
 
     bulk_modulus: PerParticle
@@ -120,10 +121,10 @@ _TERMS = 6
 def _raised(J: Array, a: Scalar) -> Array:
     """−(J^a − 1)/a, by its series in a ln J where a is small, whose derivatives hold at a = 0."""
     small = jnp.abs(a) < _NEARLY_ZERO
-    log = jnp.log(J)
+    log = jnp.log1p(J - 1)  # exact near J = 1, where a fluid works
     x = jnp.where(small, a * log, 0)
     series = jnp.ones_like(x)
     for n in range(_TERMS, 1, -1):
         series = 1 + x / n * series
     power = jnp.where(small, 1, a)
-    return -jnp.where(small, log * series, (J**power - 1) / power)
+    return -jnp.where(small, log * series, jnp.expm1(power * log) / power)

@@ -26,9 +26,9 @@ class Hencky(AbstractIsotropic):
     and of volume apart.
 
     *When it breaks*: it needs J > 0. The force in a stretched fibre falls beyond a stretch of e: not a law for rubber.
-    Each particle needs an eigenvalue problem, and an implicit step the matrix of its stress differential: dearer than
-    the other laws. The strain has two derivatives: first derivatives pass through implicit steps, second ones through
-    explicit steps only, and more are refused.
+    Each particle needs an eigenvalue problem, and an implicit step the matrix of its stress differential. The strain
+    has two derivatives: first derivatives pass through implicit steps, second ones through explicit steps only, and
+    more are refused.
     *Good values*: as for fixed corotated.
 
     Args:

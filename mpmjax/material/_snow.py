@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from mpmjax import _linalg as la
 from mpmjax._checks import require_between, require_positive
 from mpmjax._isotropic import AbstractSpectral
-from mpmjax._types import Array, Float, Matrix, PerParticle
+from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 from mpmjax.material._base import AbstractPlastic
 from mpmjax.material._elastic import FixedCorotated
 
@@ -26,9 +26,11 @@ class Snow(AbstractPlastic):
     stretches of F_E stay within [1 − θ_c, 1 + θ_s]; what they exceed goes into F_P, of which J_P alone acts
     (F = F_E F_P). In plane strain nothing yields normal to the plane, the stretch there being one.
 
-    *When it breaks*: where hardening outruns yielding a return map creates energy: keep ξ θ_c below 2/(3 d). The moduli
-    grow without bound under compression, by e at J_P = 1 − 1/ξ, and with them the explicit step shrinks: packed snow is
-    what the semi-implicit step is for. The return map's derivative jumps where yielding begins.
+    *When it breaks*: it needs J > 0. Where hardening outruns yielding a return map creates energy: keep ξ J_P θ_c well
+    below 2/d. The table's 0.25 does for packed snow; torn snow that is pressed again gains a little, of which there is
+    little: it is soft. The moduli grow without bound under compression, by e at J_P = 1 − 1/ξ, and with them the
+    explicit step shrinks: packed snow is what the semi-implicit step is for. The return map's derivative jumps where
+    yielding begins.
     *Good values* (the reference's table): E = 1.4e5 Pa, ν = 0.2, θ_c = 2.5e-2, θ_s = 7.5e-3, ξ = 10, density 400 kg/m³.
     A smaller θ_c or θ_s makes powder of chunks, a larger ξ and E ice.
 
@@ -56,10 +58,10 @@ class Snow(AbstractPlastic):
         """J_P = 1."""
         return SnowHistory(jnp.ones(F.shape[2:], F.dtype))
 
-    def elastic(self, history: SnowHistory) -> FixedCorotated:
+    def elastic(self, history: SnowHistory) -> "SnowElasticity":
         """Fixed corotated, with E e^{ξ (1 − J_P)}."""
         harder = jnp.exp(self.hardening * (1 - history.plastic_volume))
-        return FixedCorotated(self.youngs_modulus * harder, self.poisson_ratio)
+        return SnowElasticity(self.youngs_modulus * harder, self.poisson_ratio)
 
     def returned(self, F: Matrix, history: SnowHistory) -> tuple[Matrix, SnowHistory]:
         """F_E with its principal stretches clamped; J_P ← J_P det F_trial / det F_E."""
@@ -68,6 +70,14 @@ class Snow(AbstractPlastic):
         clamped = F + la.matmul(F, excess)
         yielded = la.determinant(F) / la.determinant(clamped)
         return clamped, SnowHistory(history.plastic_volume * yielded)
+
+
+class SnowElasticity(FixedCorotated):
+    """Fixed corotated elasticity of what has J > 0: the clamp would keep what is inverted inverted."""
+
+    def admits(self, F: Matrix) -> Bool[Array, "p"]:
+        """J > 0."""
+        return la.determinant(F) > 0
 
 
 class _Clamp(AbstractSpectral):

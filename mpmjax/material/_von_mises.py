@@ -1,7 +1,5 @@
 """Metals: von Mises' yield condition on Hencky's elasticity."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -65,11 +63,11 @@ class VonMises(AbstractPlastic):
         """α = 0, ε_t = 0."""
         return VonMisesHistory(jnp.zeros(F.shape[2:], F.dtype), no_transverse_strain(F))
 
-    def elastic(self, history: Any) -> Hencky:
+    def elastic(self, history: VonMisesHistory) -> Hencky:
         """Hencky's law with the history's ε_t."""
         return Hencky(self.youngs_modulus, self.poisson_ratio, history.transverse_strain)
 
-    def returned(self, F: Matrix, history: Any) -> tuple[Matrix, VonMisesHistory]:
+    def returned(self, F: Matrix, history: VonMisesHistory) -> tuple[Matrix, VonMisesHistory]:
         """The radial return."""
         split = Split.of(F, history.transverse_strain)
         stiffness = 2 * self.elastic(history).shear_modulus
