@@ -53,6 +53,12 @@ def require_between(name: str, value: Any, lower: float | int, upper: float | in
         require(inside, f"{name} must be {words}, got {value}.")
 
 
+def require_moduli(name: str, youngs_modulus: Any, poisson_ratio: Any) -> None:
+    """E must be greater than zero and ν strictly between −1 and 0.5."""
+    require_positive(f"{name}'s youngs_modulus [Pa]", youngs_modulus)
+    require_between(f"{name}'s poisson_ratio", poisson_ratio, -1, 0.5, open_ends=True)
+
+
 def canonical(tree: Any, dtype: Any) -> Any:
     """Make every number of the tree a strong array of one dtype.
 

@@ -119,7 +119,7 @@ class _Change(AbstractSpectral):
 @jax.custom_jvp
 def _function(f: AbstractSpectral, S: Matrix) -> Matrix:
     s, V = la.symmetric_eigen(S)
-    return _from_frame(V, f.of(s) * la.identity_like(S))
+    return _from_frame(V, la.diagonal(f.of(s)))
 
 
 @_function.defjvp

@@ -41,6 +41,11 @@ def identity_like(A: Matrix) -> Matrix:
     return jnp.broadcast_to(eye, A.shape)
 
 
+def diagonal(s: Float[Array, "m *p"]) -> Float[Array, "m m *p"]:
+    """diag(s)."""
+    return s * jnp.eye(len(s), dtype=s.dtype).reshape((len(s), len(s)) + (1,) * (s.ndim - 1))
+
+
 def transpose(A: Matrix) -> Matrix:
     """Aᵀ."""
     return jnp.swapaxes(A, 0, 1)

@@ -113,9 +113,9 @@ def _tangent_spectrum(body: Constituent, dim: int) -> Float[Array, "m q"]:
     if body.total:
         pull, tau = jnp.ones_like(s), jnp.zeros_like(s)
     else:
-        P = body.law.stress(s * jnp.eye(d, dtype=s.dtype)[..., None])
+        P = body.law.stress(la.diagonal(s))
         pull, tau = s, s * jnp.stack([P[i, i] for i in range(d)])
-    scaling = tangent.scaling * pull[:, None] * pull + tau * jnp.eye(d, dtype=s.dtype)[..., None]
+    scaling = tangent.scaling * pull[:, None] * pull + la.diagonal(tau)
     if d < dim:
         return dim * scaling[0]
     values = [*la.symmetric_eigen(scaling)[0]]

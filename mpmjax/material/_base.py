@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import _linalg as la
-from mpmjax._checks import require_between, require_positive
+from mpmjax._checks import require_moduli
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 
 
@@ -132,9 +132,7 @@ class AbstractIsotropic(AbstractMaterial):
     """ν [-]."""
 
     def __check_init__(self):
-        name = type(self).__name__
-        require_positive(f"{name}'s youngs_modulus [Pa]", self.youngs_modulus)
-        require_between(f"{name}'s poisson_ratio", self.poisson_ratio, -1, 0.5, open_ends=True)
+        require_moduli(type(self).__name__, self.youngs_modulus, self.poisson_ratio)
 
     @property
     def shear_modulus(self) -> PerParticle:
@@ -145,3 +143,8 @@ class AbstractIsotropic(AbstractMaterial):
     def lame_lambda(self) -> PerParticle:
         """λ = E ν / ((1 + ν)(1 − 2ν)) [Pa]."""
         return self.youngs_modulus * self.poisson_ratio / ((1 + self.poisson_ratio) * (1 - 2 * self.poisson_ratio))
+
+    @property
+    def bulk_modulus(self) -> PerParticle:
+        """K = E / (3 (1 − 2ν)) [Pa], of three dimensions."""
+        return self.youngs_modulus / (3 * (1 - 2 * self.poisson_ratio))

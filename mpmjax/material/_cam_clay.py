@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._checks import require_between, require_positive
+from mpmjax._checks import require_between, require_moduli, require_positive
 from mpmjax._types import Array, Float, Matrix, PerParticle
 from mpmjax.material._base import AbstractPlastic
 from mpmjax.material._hencky import Hencky, Split, no_transverse_strain
@@ -66,8 +66,7 @@ class CamClay(AbstractPlastic):
     hardening: PerParticle = 1.0
 
     def __check_init__(self):
-        require_positive("CamClay's youngs_modulus [Pa]", self.youngs_modulus)
-        require_between("CamClay's poisson_ratio", self.poisson_ratio, -1, 0.5, open_ends=True)
+        require_moduli("CamClay", self.youngs_modulus, self.poisson_ratio)
         require_positive("CamClay's friction", self.friction)
         require_between("CamClay's preconsolidation [Pa]", self.preconsolidation, 0, np.inf)
         require_between("CamClay's cohesion", self.cohesion, 0, np.inf)
@@ -75,8 +74,8 @@ class CamClay(AbstractPlastic):
 
     def virgin(self, F: Matrix) -> CamClayHistory:
         """α = −arsinh(p₀/K)/ξ, ε_t = 0."""
-        bulk = self.youngs_modulus / (3 * (1 - 2 * self.poisson_ratio))
-        alpha = -jnp.arcsinh(self.preconsolidation / bulk) / self.hardening
+        bulk_modulus = Hencky(self.youngs_modulus, self.poisson_ratio).bulk_modulus
+        alpha = -jnp.arcsinh(self.preconsolidation / bulk_modulus) / self.hardening
         return CamClayHistory(alpha * jnp.ones(F.shape[2:], F.dtype), no_transverse_strain(F))
 
     def elastic(self, history: CamClayHistory) -> Hencky:

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._checks import require_between, require_positive
+from mpmjax._checks import require_between, require_moduli
 from mpmjax._types import Array, Float, Matrix, PerParticle
 from mpmjax.material._base import AbstractPlastic
 from mpmjax.material._hencky import Hencky, Split, no_transverse_strain
@@ -61,8 +61,7 @@ class DruckerPrager(AbstractPlastic):
     friction_angle: PerParticle
 
     def __check_init__(self):
-        require_positive("DruckerPrager's youngs_modulus [Pa]", self.youngs_modulus)
-        require_between("DruckerPrager's poisson_ratio", self.poisson_ratio, -1, 0.5, open_ends=True)
+        require_moduli("DruckerPrager", self.youngs_modulus, self.poisson_ratio)
         require_between("DruckerPrager's friction_angle [rad]", self.friction_angle, 0, np.pi / 2, open_ends=True)
 
     def virgin(self, F: Matrix) -> DruckerPragerHistory:

@@ -27,7 +27,7 @@ def projected_tangent(material: AbstractMaterial, F: Matrix) -> MatrixTangent:
 @jax.custom_jvp
 def _projected_matrix(material: AbstractMaterial, F: Matrix) -> Float[Array, "m m *p"]:
     values, modes = _spectrum(material, F)
-    return _in_modes(modes, jnp.maximum(values, 0) * _identity(values))
+    return _in_modes(modes, la.diagonal(jnp.maximum(values, 0)))
 
 
 @_projected_matrix.defjvp
@@ -46,7 +46,7 @@ def _projected_matrix_jvp(
     total = size[:, None] + size
     # for every pair of signs the quotient of differences is this one of sums, which cancels nowhere
     K = jnp.where(total == 0, 0.5, (positive[:, None] + positive) / jnp.where(total == 0, 1, total))
-    return _in_modes(modes, positive * _identity(values)), _in_modes(modes, K * change)
+    return _in_modes(modes, la.diagonal(positive)), _in_modes(modes, K * change)
 
 
 def _spectrum(material: AbstractMaterial, F: Matrix) -> tuple[Float[Array, "m *p"], Float[Array, "m m *p"]]:
@@ -63,8 +63,3 @@ def _spectrum(material: AbstractMaterial, F: Matrix) -> tuple[Float[Array, "m *p
 def _in_modes(modes: Float[Array, "m m *p"], core: Float[Array, "m m *p"]) -> Float[Array, "m m *p"]:
     """Σ_kl E_ka core_kl E_lb."""
     return la.product(jnp.swapaxes(modes, 0, 1), la.product(core, modes))
-
-
-def _identity(values: Float[Array, "m *p"]) -> Float[Array, "m m *p"]:
-    """The identity, to make a diagonal of eigenvalues of."""
-    return la.identity_like(jnp.broadcast_to(values, (values.shape[0], *values.shape)))

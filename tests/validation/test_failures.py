@@ -192,7 +192,8 @@ def test_an_inverted_particle_recovers(d, method):
     F = np.eye(d)
     F[-1, -1] = -0.2
     grid, one = mpm.Grid((8,) * d, 0.1), 1e-3 * jnp.ones(1)
-    particle = mpm.Particles(jnp.full((1, d), 0.4), jnp.zeros((1, d)), 1e3 * one, one, F=jnp.asarray(F)[None])
+    x = jnp.full((1, d), 0.4)
+    particle = mpm.Particles(x, jnp.zeros((1, d)), 1e3 * one, one, F=jnp.asarray(F)[None], X=x)
     end = {}
     for description in (TOTAL, mpm.UpdatedLagrangian()):
         scene = mpm.Scene(grid, LAW, description=description)

@@ -34,7 +34,7 @@ def alone(d, stretch=1.0, place=WORST_PLACE, law=LAW, **scene):
     grid = mpm.Grid((6,) * d, DX)
     x, one = jnp.full((1, d), place * DX), jnp.ones(1)
     F = jnp.asarray(stretch * np.eye(d)[None])
-    return mpm.Scene(grid, law, **scene), mpm.Particles(x, 0 * x, DENSITY * 1e-3 * one, 1e-3 * one, F=F)
+    return mpm.Scene(grid, law, **scene), mpm.Particles(x, 0 * x, DENSITY * 1e-3 * one, 1e-3 * one, F=F, X=x)
 
 
 def lattice(d, per_cell, stretch=1.0, law=LAW, cells=4, **scene):
@@ -44,7 +44,7 @@ def lattice(d, per_cell, stretch=1.0, law=LAW, cells=4, **scene):
     x = jnp.asarray(np.stack(np.meshgrid(*[side] * d, indexing="ij"), axis=-1).reshape(-1, d))
     volume = jnp.full(len(x), (DX / per_cell / stretch) ** d)
     F = jnp.tile(stretch * jnp.eye(d), (len(x), 1, 1))
-    return mpm.Scene(grid, law, **scene), mpm.Particles(x, 0 * x, DENSITY * volume, volume, F=F)
+    return mpm.Scene(grid, law, **scene), mpm.Particles(x, 0 * x, DENSITY * volume, volume, F=F, X=x)
 
 
 def cloud(d, seed, strain, count=5, **scene):
@@ -59,7 +59,7 @@ def cloud(d, seed, strain, count=5, **scene):
     x = jnp.asarray(rng.uniform(0, 2 * DX, (count, d)))
     mass, volume = jnp.asarray(rng.uniform(0.5, 1.5, (2, count)) * np.array([[1.0], [1e-3]]))
     F = jnp.asarray(np.moveaxis(F, -1, 0))
-    return mpm.Scene(grid, **scene), mpm.Particles(x, 0 * x, mass, volume, F=F)
+    return mpm.Scene(grid, **scene), mpm.Particles(x, 0 * x, mass, volume, F=F, X=x)
 
 
 @eqx.filter_jit
