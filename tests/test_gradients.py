@@ -113,9 +113,12 @@ def test_derivatives_across_contact_are_right_while_the_active_set_stays(case):
     assert compared["slope"] >= 1
 
 
-CLOSE, LONGER = (1e-7, (1e-4, 3e-5, 1e-5, 3e-6)), (1e-5, (1e-3, 3e-4, 1e-4, 3e-5))
-"""Between the kinks of yielding, the step of a central difference and those of a Taylor test. A fluid that is free to
-expand answers little to its moduli, which asks for longer ones."""
+DIFFERENCES = (1e-5, 1e-6, 1e-7)
+"""The steps of a central difference, of which the first is taken that meets no kink of yielding: the shorter, the more
+rounding."""
+TAYLORS = (1e-3, 3e-4, 1e-4, 3e-5), (1e-4, 3e-5, 1e-5, 3e-6)
+"""Those of a Taylor test: of the longer ones the third order may show, of the shorter ones rounding. Of a wrong
+derivative the slope is 1 for both."""
 
 
 def plastic_cases():
@@ -130,7 +133,7 @@ def plastic_cases():
 @pytest.mark.parametrize("case", list(plastic_cases()))
 def test_derivatives_of_what_yields_are_right_while_the_same_particles_yield(case):
     """As above, of a block that is torn and pressed beyond yielding; its history is part of the outcome."""
-    q, (h, hs) = parameters(case), LONGER if case.law == "fluid" else CLOSE
+    q = parameters(case)
     here = linearised(case)(q, direction(q), cotangent(case)).branches
     for changing in here:  # particles begin or cease to yield within the rollout
         assert len({np.asarray(step).tobytes() for step in changing}) >= 2
@@ -138,12 +141,14 @@ def test_derivatives_of_what_yields_are_right_while_the_same_particles_yield(cas
     for only, seed in itertools.product((None, *q), range(2)):
         t = direction(q, seed, only)
         assert transpose_error(case, q, t) < 1e-10, only
-        if same_branches(case, q, t, (h, -h)):
+        smooth = [h for h in DIFFERENCES if same_branches(case, q, t, (h, -h))]
+        if smooth:
             compared["difference"] += 1
-            assert difference_error(case, q, t, h) < 1e-6, only
-        if same_branches(case, q, t, hs):
+            assert difference_error(case, q, t, smooth[0]) < 1e-6, only
+        smooth = [hs for hs in TAYLORS if same_branches(case, q, t, hs)]
+        if smooth:
             compared["slope"] += 1
-            assert abs(taylor_slope(case, q, t, hs) - 2) < 0.1, only
+            assert min(abs(taylor_slope(case, q, t, hs) - 2) for hs in smooth) < 0.1, only
     assert compared["difference"] >= 6
     assert compared["slope"] >= 2
 
