@@ -185,3 +185,10 @@ def test_snow_refuses_what_makes_no_sense():
     ):
         with pytest.raises(ValueError, match=what):
             mpm.Snow(**given)
+
+
+def test_dust_has_a_modulus():
+    """Of snow torn to many times its volume, in single precision."""
+    particles = SnowHistory(jnp.full(2, 30.0, jnp.float32))
+    law = mpm.Snow(*(jnp.float32(a) for a in (1.4e5, 0.2, 2.5e-2, 7.5e-3, 10.0))).elastic(particles)
+    assert (np.asarray(law.youngs_modulus) > 0).all()

@@ -59,8 +59,8 @@ class Snow(AbstractPlastic):
         return SnowHistory(jnp.ones(F.shape[2:], F.dtype))
 
     def elastic(self, history: SnowHistory) -> "SnowElasticity":
-        """Fixed corotated, with E e^{ξ (1 − J_P)}."""
-        harder = jnp.exp(self.hardening * (1 - history.plastic_volume))
+        """Fixed corotated, with E e^{ξ (1 − J_P)}; of dust it stays a number in single precision."""
+        harder = jnp.exp(jnp.maximum(self.hardening * (1 - history.plastic_volume), _DUST))
         return SnowElasticity(self.youngs_modulus * harder, self.poisson_ratio)
 
     def returned(self, F: Matrix, history: SnowHistory) -> tuple[Matrix, SnowHistory]:
@@ -70,6 +70,10 @@ class Snow(AbstractPlastic):
         clamped = F + la.matmul(F, excess)
         yielded = la.determinant(F) / la.determinant(clamped)
         return clamped, SnowHistory(history.plastic_volume * yielded)
+
+
+_DUST = -60.0
+"""The least exponent of hardening: a modulus of 1e-26 E."""
 
 
 class SnowElasticity(FixedCorotated):
