@@ -146,10 +146,12 @@ class RigidMotion(AbstractMotion):
         return _turn(a, self.rotation_at(t))
 
     def velocity_of(self, X: Float[Array, "m d"], t: Scalar, dt: Scalar) -> Float[Array, "m d"]:
-        """That of the centre, and the change of R (X − c)."""
+        """That of the centre, and the change of R times X − c: R's, once, and not each point's."""
         times, arm = jnp.asarray(self.times), X - jnp.asarray(self.centre, X.dtype)
         shift = _change(t, dt, times, jnp.asarray(self.displacement))
-        return (shift + _turn_further(arm, self.rotation_at(t), _change(t, dt, times, self._rotations()))) / dt
+        by = _change(t, dt, times, self._rotations())
+        columns = _turn_further(jnp.eye(self.dim, dtype=X.dtype), self.rotation_at(t), by)
+        return (shift + sum(arm[:, a, None] * columns[a] for a in range(self.dim))) / dt
 
     def pivot(self, middle: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
         """The centre."""
