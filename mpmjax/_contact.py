@@ -72,75 +72,177 @@ def touches(nodes: Nodes) -> bool:
     return nodes.conditions.side is not None or bool(nodes.contacts) or leavable
 
 
-def held_images(nodes: Nodes, active: ActiveSet) -> Mirror:
+class Held(eqx.Module):
+    """The nodes while an active set is held; see `hold`."""
+
+    unheld: Nodes
+    """The nodes of which nothing is held."""
+    active: ActiveSet
+    """What is held."""
+    images: Mirror
     """The mirrors in the columns that are held."""
-    return Mirror(tuple(c.image.within(held) for c, held in zip(nodes.contacts, active.columns, strict=True)))
-
-
-def holding(nodes: Nodes, active: ActiveSet) -> Nodes:
+    nodes: Nodes
     """The nodes with the active set held."""
+
+    @property
+    def normal(self) -> NodeVector | None:
+        """The free parts of the normals that colliders hold, of length one; None without any."""
+        return self.nodes.constraint.normal
+
+    @property
+    def untouched(self) -> Constraint:
+        """The projection on that in which no boundary has a part."""
+        free, normal = self.unheld.free, self.normal
+        if self.active.components is not None:
+            free = free & ~self.active.components
+        for held in self.active.columns:
+            free = free & ~held[:, None]
+        return Constraint(free, None if normal is None else jnp.where(free, normal, 0))
+
+    def pushes(self, imbalance: NodeVector) -> NodeScalar | None:
+        """The impulse [kg m/s], shape (n,), by which colliders hold each node along their normals, outward positive;
+        None without any.
+
+        The imbalance is push·n and what holds the prescribed components; along the free part of n it is the push alone,
+        times the part's length.
+        """
+        grasp, normal = self.nodes.grasp, self.normal
+        if grasp is None or normal is None:
+            return None
+        return (normal * self.images.fold(imbalance)).sum(axis=1) / grasp.reach
+
+    def count_violations(self, v: NodeVector, imbalance: NodeVector) -> Int[Array, ""]:
+        """How many wall components and columns pull or are entered all the same."""
+        pulls, enters = self.verdict(v, imbalance)
+        return _number(self.unheld, pulls) + _number(self.unheld, enters)
+
+    def verdict(self, v: NodeVector, imbalance: NodeVector) -> tuple[ActiveSet, ActiveSet]:
+        """What of the active set pulls, and what of the rest enters, beyond rounding.
+
+        Args:
+            v: velocity of all nodes after the solve [m/s].
+            imbalance: that of all nodes [kg m/s].
+        """
+        nodes, active = self.unheld, self.active
+        noise = jnp.sqrt(jnp.finfo(v.dtype).eps) * jnp.abs(v).max()
+        of_walls = self._beside_colliders(imbalance)
+        pulls, enters = None, None
+        if active.components is not None and nodes.conditions.side is not None:
+            push = nodes.conditions.side * self.images.fold(of_walls)
+            pulls = active.components & (push < -noise * nodes.mass[:, None])
+            if nodes.conditions.touch is not None:
+                pulls = pulls | (active.components & self._driven_off(v, noise))
+            enters = ~active.components & (nodes.conditions.side * v < -noise)
+        pulling, entering = [], []
+        for contact, held in zip(nodes.contacts, active.columns, strict=True):
+            least = -noise * _tied(nodes, contact, contact.image.column(contact.weight(nodes.mass)))
+            pulling.append(held & (_tied(nodes, contact, contact.impulse(of_walls)) < least))
+            entering.append(~held & (_approach(nodes, contact, v) < least))
+        if active.normals is None:
+            return ActiveSet(pulls, tuple(pulling)), ActiveSet(enters, tuple(entering))
+        push, departure = self.pushes(imbalance), _departure(self.nodes, v)
+        assert push is not None and departure is not None
+        pulled = active.normals & (push < -noise * self.images.fold_scalar(nodes.mass))
+        entered = ~active.normals & (departure < -noise)
+        return ActiveSet(pulls, tuple(pulling), pulled), ActiveSet(enters, tuple(entering), entered)
+
+    def wall_friction(self, v: NodeVector, imbalance: NodeVector) -> NodeVector:
+        """Velocity after Coulomb friction of walls on the held nodes, one wall direction after the other.
+
+        Args:
+            v: velocity of all nodes after the solve [m/s].
+            imbalance: that of all nodes [kg m/s].
+        """
+        mass = self.images.fold_scalar(self.unheld.mass)
+        limit = self._friction_limit(self._beside_colliders(imbalance))
+        normal, d = self.normal, v.shape[1]
+        for a in range(d):
+            tangent = jnp.arange(d) != a
+            slip = jnp.where(tangent, v, 0)
+            slip = slip if normal is None else slip - normal * (normal * slip).sum(axis=1, keepdims=True)
+            speed2 = (slip**2).sum(axis=1)
+            speed = jnp.sqrt(jnp.where(speed2 == 0, 1, speed2))
+            loss = limit[:, a] / jnp.where(mass == 0, 1, mass)
+            share = jnp.minimum(loss / speed, 1)
+            free = tangent & ~self.unheld.conditions.fixed
+            v = v - jnp.where(free & (speed2 > 0)[:, None], share[:, None] * slip, 0)
+        return self.images.unfold(v)
+
+    def collider_friction(self, v: NodeVector, push: NodeScalar | None) -> tuple[NodeVector, NodeVector | None]:
+        """Velocity after Coulomb friction of colliders on the held nodes, v − min(1, μ push / (m ‖s‖)) s with the slip
+        s = Q (v − v_c), and the impulse of it [kg m/s]; None without any.
+
+        Args:
+            v: velocity of all nodes after the solve [m/s].
+            push: see `pushes`.
+        """
+        touch, mass = self.unheld.conditions.touch, self.nodes.mass
+        if push is None or touch is None or touch.friction is None or self.active.normals is None:
+            return v, None
+        slip = self.nodes.constraint.split(v - touch.velocity, 0)
+        square = (slip**2).sum(axis=1)
+        rubbed = self.active.normals & (square > 0) & (mass > 0)
+        limit = touch.friction * jnp.maximum(push, 0)
+        stopping = mass * jnp.sqrt(jnp.where(rubbed, square, 1))
+        share = jnp.where(rubbed, jnp.minimum(limit / jnp.where(rubbed, stopping, 1), 1), 0)
+        loss = self.images.unfold(-share[:, None] * slip)
+        return v + loss, self.unheld.mass[:, None] * loss
+
+    def _beside_colliders(self, imbalance: NodeVector) -> NodeVector:
+        """The imbalance less what colliders hold along their normals: what is left for walls."""
+        push, touch = self.pushes(imbalance), self.unheld.conditions.touch
+        return imbalance if push is None or touch is None else imbalance - push[:, None] * touch.normal
+
+    def _friction_limit(self, imbalance: NodeVector) -> NodeVector:
+        """The largest impulse of friction at each node [kg m/s], by the wall's direction, shape (n, d)."""
+        limit, components = jnp.zeros_like(imbalance), self.active.components
+        side, friction = self.unheld.conditions.side, self.unheld.conditions.friction
+        if components is not None and side is not None and friction is not None:
+            push = jnp.maximum(side * self.images.fold(imbalance), 0)
+            limit = friction * jnp.where(components, push, 0)
+        for contact, held in zip(self.unheld.contacts, self.active.columns, strict=True):
+            push = jnp.where(held & contact.at_key, contact.impulse(imbalance), 0)
+            push = contact.friction * jnp.maximum(self.images.fold_scalar(push), 0)
+            limit = limit.at[:, contact.image.axis].add(push)
+        return limit
+
+    def _driven_off(self, v: NodeVector, noise: Array) -> Mask:
+        """The components of walls from which a collider with the same normal drives the node away, but cannot while
+        the wall holds it."""
+        touch, grasp, side = self.unheld.conditions.touch, self.nodes.grasp, self.unheld.conditions.side
+        assert touch is not None and grasp is not None and side is not None
+        blocked = (grasp.normal == 0).all(axis=1) & ((touch.normal * (v - touch.velocity)).sum(axis=1) < -noise)
+        return blocked[:, None] & (side * touch.normal > 0)
+
+
+def hold(nodes: Nodes, active: ActiveSet) -> Held:
+    """Nodes of which nothing is held yet, with an active set held."""
+    images = Mirror(tuple(c.image.within(held) for c, held in zip(nodes.contacts, active.columns, strict=True)))
     fixed = nodes.conditions.fixed
     if active.components is not None:
         fixed = fixed | active.components
-    for contact, held in zip(nodes.contacts, active.columns, strict=True):
+    for contact, columns in zip(nodes.contacts, active.columns, strict=True):
         normal = jnp.arange(fixed.shape[1]) == contact.image.axis
-        fixed = fixed | ((held & contact.on_plane)[:, None] & normal)
-    nodes = eqx.tree_at(lambda n: n.conditions.fixed, nodes.folded(held_images(nodes, active)), fixed)
-    if active.normals is None or nodes.conditions.touch is None:
-        return nodes
-    return eqx.tree_at(lambda n: n.conditions.touch.held, nodes, nodes.conditions.touch.held | active.normals)
-
-
-def untouched(nodes: Nodes, active: ActiveSet) -> Constraint:
-    """The projection on that in which no boundary has a part."""
-    free = nodes.free
-    if active.components is not None:
-        free = free & ~active.components
-    for held in active.columns:
-        free = free & ~held[:, None]
-    normal = held_normals(nodes, active)
-    return Constraint(free, None if normal is None else jnp.where(free, normal, 0))
-
-
-def held_normals(nodes: Nodes, active: ActiveSet) -> NodeVector | None:
-    """The free parts of the normals that colliders hold, of length one; None without colliders."""
-    return None if nodes.conditions.touch is None else holding(nodes, active).constraint.normal
-
-
-def pushes(nodes: Nodes, active: ActiveSet, imbalance: NodeVector) -> NodeScalar | None:
-    """The impulse [kg m/s], shape (n,), by which colliders hold each node along their normals, outward positive; None
-    without any.
-
-    The imbalance is push·n and what holds the prescribed components; along the free part of n it is the push alone,
-    times the part's length.
-    """
-    if nodes.conditions.touch is None:
-        return None
-    held = holding(nodes, active)
-    grasp, normal = held.grasp, held.constraint.normal
-    if grasp is None or normal is None:
-        return None
-    return (normal * held_images(nodes, active).fold(imbalance)).sum(axis=1) / grasp.reach
-
-
-def _beside_colliders(nodes: Nodes, active: ActiveSet, imbalance: NodeVector) -> NodeVector:
-    """The imbalance less what colliders hold along their normals: what is left for walls."""
-    push, touch = pushes(nodes, active, imbalance), nodes.conditions.touch
-    return imbalance if push is None or touch is None else imbalance - push[:, None] * touch.normal
+        fixed = fixed | ((columns & contact.on_plane)[:, None] & normal)
+    held = eqx.tree_at(lambda n: n.conditions.fixed, nodes.folded(images), fixed)
+    if active.normals is not None and nodes.conditions.touch is not None:
+        gripped = nodes.conditions.touch.held | active.normals
+        held = eqx.tree_at(lambda n: n.conditions.touch.held, held, gripped)
+    return Held(nodes, active, images, held)
 
 
 def find_active_set(
     nodes: Nodes,
     guess: NodeVector,
-    try_set: Callable[[ActiveSet, NodeVector], tuple[NodeVector, NodeVector, NodeVector, SolveInfo]],
+    attempt: Callable[[Held, NodeVector], tuple[NodeVector, NodeVector, NodeVector, SolveInfo]],
 ) -> tuple[ActiveSet, NodeVector, SolveInfo, Int[Array, ""]]:
     """What the walls hold, a velocity to start the last solve from, and what the sweeps cost.
 
     Args:
         nodes: nodes of which nothing is held yet.
         guess: where the first solve starts [m/s].
-        try_set: (active, guess) to (velocity, imbalance [kg m/s] of all nodes, guess of the next solve, report). Must
-            not be differentiated.
+        attempt: (held nodes, guess) to (velocity, imbalance [kg m/s] of all nodes, guess of the next solve, report).
+            Must not be differentiated.
 
     Returns:
         active set, velocity, the sweeps' reports added up, number of sweeps.
@@ -148,8 +250,9 @@ def find_active_set(
 
     def sweep(state: tuple) -> tuple:
         active, guess, cost, _, count = state
-        v, imbalance, guess, info = try_set(active, guess)
-        pulls, enters = _verdict(nodes, active, v, imbalance)
+        held = hold(nodes, active)
+        v, imbalance, guess, info = attempt(held, guess)
+        pulls, enters = held.verdict(v, imbalance)
         active = jax.tree.map(lambda held, pulled, entered: (held & ~pulled) | entered, active, pulls, enters)
         return active, guess, cost.plus(info), _number(nodes, pulls) + _number(nodes, enters) > 0, count + 1
 
@@ -166,113 +269,6 @@ def find_active_set(
     start = (active, guess, no_solve(guess.dtype), jnp.asarray(True), jnp.asarray(0, dtype=jnp.int32))
     active, guess, cost, _, count = jax.lax.while_loop(unsettled, sweep, start)
     return active, guess, cost, count
-
-
-def count_violations(nodes: Nodes, active: ActiveSet, v: NodeVector, imbalance: NodeVector) -> Int[Array, ""]:
-    """How many wall components and columns pull or are entered all the same."""
-    pulls, enters = _verdict(nodes, active, v, imbalance)
-    return _number(nodes, pulls) + _number(nodes, enters)
-
-
-def with_friction(nodes: Nodes, active: ActiveSet, v: NodeVector, imbalance: NodeVector) -> NodeVector:
-    """Velocity after Coulomb friction of walls on the held nodes, one wall direction after the other.
-
-    Args:
-        nodes: nodes of which nothing is held.
-        active: what is held.
-        v: velocity of all nodes after the solve [m/s].
-        imbalance: that of all nodes [kg m/s].
-    """
-    images = held_images(nodes, active)
-    mass = images.fold_scalar(nodes.mass)
-    limit = _friction_limit(nodes, active, _beside_colliders(nodes, active, imbalance), images)
-    d = v.shape[1]
-    normal = held_normals(nodes, active)
-    for a in range(d):
-        tangent = jnp.arange(d) != a
-        slip = jnp.where(tangent, v, 0)
-        slip = slip if normal is None else slip - normal * (normal * slip).sum(axis=1, keepdims=True)
-        speed2 = (slip**2).sum(axis=1)
-        speed = jnp.sqrt(jnp.where(speed2 == 0, 1, speed2))
-        loss = limit[:, a] / jnp.where(mass == 0, 1, mass)
-        share = jnp.minimum(loss / speed, 1)
-        free = tangent & ~nodes.conditions.fixed
-        v = v - jnp.where(free & (speed2 > 0)[:, None], share[:, None] * slip, 0)
-    return images.unfold(v)
-
-
-def with_collider_friction(
-    nodes: Nodes, active: ActiveSet, v: NodeVector, push: NodeScalar | None
-) -> tuple[NodeVector, NodeVector | None]:
-    """Velocity after Coulomb friction of colliders on the held nodes, v − min(1, μ push / (m ‖s‖)) s with the slip
-    s = Q (v − v_c), and the impulse of it [kg m/s]; None without any.
-
-    Args:
-        nodes: nodes of which nothing is held.
-        active: what is held.
-        v: velocity of all nodes after the solve [m/s].
-        push: see `pushes`.
-    """
-    touch = nodes.conditions.touch
-    if push is None or touch is None or touch.friction is None or active.normals is None:
-        return v, None
-    images, held = held_images(nodes, active), holding(nodes, active)
-    slip = held.constraint.split(v - touch.velocity, 0)
-    square = (slip**2).sum(axis=1)
-    rubbed = active.normals & (square > 0) & (held.mass > 0)
-    limit = touch.friction * jnp.maximum(push, 0)
-    stopping = held.mass * jnp.sqrt(jnp.where(rubbed, square, 1))
-    share = jnp.where(rubbed, jnp.minimum(limit / jnp.where(rubbed, stopping, 1), 1), 0)
-    loss = images.unfold(-share[:, None] * slip)
-    return v + loss, nodes.mass[:, None] * loss
-
-
-def _friction_limit(nodes: Nodes, active: ActiveSet, imbalance: NodeVector, images: Mirror) -> NodeVector:
-    """The largest impulse of friction at each node [kg m/s], by the wall's direction, shape (n, d)."""
-    limit = jnp.zeros_like(imbalance)
-    side, friction = nodes.conditions.side, nodes.conditions.friction
-    if active.components is not None and side is not None and friction is not None:
-        push = jnp.maximum(side * images.fold(imbalance), 0)
-        limit = friction * jnp.where(active.components, push, 0)
-    for contact, held in zip(nodes.contacts, active.columns, strict=True):
-        push = jnp.where(held & contact.at_key, contact.impulse(imbalance), 0)
-        push = contact.friction * jnp.maximum(images.fold_scalar(push), 0)
-        limit = limit.at[:, contact.image.axis].add(push)
-    return limit
-
-
-def _verdict(nodes: Nodes, active: ActiveSet, v: NodeVector, imbalance: NodeVector) -> tuple[ActiveSet, ActiveSet]:
-    """What of the active set pulls, and what of the rest enters, beyond rounding."""
-    noise = jnp.sqrt(jnp.finfo(v.dtype).eps) * jnp.abs(v).max()
-    of_walls = _beside_colliders(nodes, active, imbalance)
-    pulls, enters = None, None
-    if active.components is not None and nodes.conditions.side is not None:
-        push = nodes.conditions.side * held_images(nodes, active).fold(of_walls)
-        pulls = active.components & (push < -noise * nodes.mass[:, None])
-        if nodes.conditions.touch is not None:
-            pulls = pulls | (active.components & _driven_off(nodes, active, v, noise))
-        enters = ~active.components & (nodes.conditions.side * v < -noise)
-    pulling, entering = [], []
-    for contact, held in zip(nodes.contacts, active.columns, strict=True):
-        least = -noise * _tied(nodes, contact, contact.image.column(contact.weight(nodes.mass)))
-        pulling.append(held & (_tied(nodes, contact, contact.impulse(of_walls)) < least))
-        entering.append(~held & (_approach(nodes, contact, v) < least))
-    if active.normals is None:
-        return ActiveSet(pulls, tuple(pulling)), ActiveSet(enters, tuple(entering))
-    push, departure = pushes(nodes, active, imbalance), _departure(holding(nodes, active), v)
-    assert push is not None and departure is not None
-    pulled = active.normals & (push < -noise * held_images(nodes, active).fold_scalar(nodes.mass))
-    entered = ~active.normals & (departure < -noise)
-    return ActiveSet(pulls, tuple(pulling), pulled), ActiveSet(enters, tuple(entering), entered)
-
-
-def _driven_off(nodes: Nodes, active: ActiveSet, v: NodeVector, noise: Array) -> Mask:
-    """The components of walls from which a collider with the same normal drives the node away, but cannot while the
-    wall holds it."""
-    touch, grasp, side = nodes.conditions.touch, holding(nodes, active).grasp, nodes.conditions.side
-    assert touch is not None and grasp is not None and side is not None
-    blocked = (grasp.normal == 0).all(axis=1) & ((touch.normal * (v - touch.velocity)).sum(axis=1) < -noise)
-    return blocked[:, None] & (side * touch.normal > 0)
 
 
 def _number(nodes: Nodes, part: ActiveSet) -> Int[Array, ""]:

@@ -8,21 +8,7 @@ import jax.numpy as jnp
 
 from mpmjax._checks import canonical, require_positive
 from mpmjax._constraint import Constraint
-from mpmjax._contact import (
-    NOTHING,
-    ActiveSet,
-    ContactInfo,
-    count_violations,
-    find_active_set,
-    held_images,
-    holding,
-    no_contact,
-    pushes,
-    touches,
-    untouched,
-    with_collider_friction,
-    with_friction,
-)
+from mpmjax._contact import NOTHING, ContactInfo, Held, find_active_set, hold, no_contact, touches
 from mpmjax._exchange import Exchange, received
 from mpmjax._implicit import SolveInfo
 from mpmjax._kernel import Stencil
@@ -109,40 +95,37 @@ def update(nodes: Nodes, method: Method) -> GridUpdate:
         if not touches(nodes):
             motion, info = method.move(nodes, guess)
             elastic, reaction, viscous = impulses(nodes, method, motion)
-            push = pushes(nodes, NOTHING, reaction)
+            push = hold(nodes, NOTHING).pushes(reaction)
             free, none = nodes.constraint, no_contact()
             return GridUpdate(nodes.velocity, motion, elastic, viscous, reaction, None, free, info, none, push)
 
-        frozen = jax.lax.stop_gradient((nodes, method))
+        def moved(held: Held, method: Method, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+            motion, info = method.move(held.nodes, guess)
+            return jax.tree.map(held.images.unfold, motion), info
 
-        def with_held(nodes: Nodes, method: Method, active: ActiveSet, guess: NodeVector) -> tuple:
-            motion, info = method.move(holding(nodes, active), guess)
-            return jax.tree.map(held_images(nodes, active).unfold, motion), info
+        frozen, frozen_method, guess = jax.lax.stop_gradient((nodes, method, guess))
 
-        def tried(active: ActiveSet, guess: NodeVector) -> tuple:
-            motion, info = with_held(*frozen, active, guess)
-            return motion.velocity, impulses(*frozen, motion)[1], motion.carrier, info
+        def attempt(held: Held, guess: NodeVector) -> tuple:
+            motion, info = moved(held, frozen_method, guess)
+            return motion.velocity, impulses(frozen, frozen_method, motion)[1], motion.carrier, info
 
-        guess = jax.lax.stop_gradient(guess)
-        active, guess, cost, sweeps = find_active_set(frozen[0], guess, tried)
-        motion, info = with_held(nodes, method, active, guess)
+        active, guess, cost, sweeps = find_active_set(frozen, guess, attempt)
+        held = hold(nodes, active)
+        motion, info = moved(held, method, guess)
         elastic, reaction, viscous = impulses(nodes, method, motion)
-        violations = count_violations(nodes, active, motion.velocity, reaction)
-        push = pushes(nodes, active, reaction)
-        slowed = with_friction(nodes, active, motion.velocity, reaction)
-        slowed, rub = with_collider_friction(nodes, active, slowed, push)
+        push = held.pushes(reaction)
+        slowed, rub = held.collider_friction(held.wall_friction(motion.velocity, reaction), push)
         loss = slowed - motion.velocity
-        before = held_images(nodes, active).unfold(holding(nodes, active).velocity)
         return GridUpdate(
-            before=before,
+            before=held.images.unfold(held.nodes.velocity),
             motion=motion.slowed(loss),
             elastic=elastic,
             viscous=viscous,
             reaction=reaction,
             friction=nodes.mass[:, None] * loss,
-            free=untouched(nodes, active),
+            free=held.untouched,
             solve=cost.plus(info),
-            contact=ContactInfo(sweeps, violations),
+            contact=ContactInfo(sweeps, held.count_violations(motion.velocity, reaction)),
             push=push,
             rub=rub,
         )

@@ -10,7 +10,7 @@ from numpy_oracle import grid_update
 
 import mpmjax as mpm
 from mpmjax._checks import canonical
-from mpmjax._contact import SWEEPS, find_active_set, held_images, holding
+from mpmjax._contact import SWEEPS, find_active_set, hold
 from mpmjax._nodes import particles_to_grid
 from mpmjax._step import impulses
 
@@ -284,15 +284,16 @@ def test_whatever_columns_are_held_mirroring_twice_is_mirroring_once(number):
         start = mpm.prepare(scene, eqx.tree_at(lambda b: (b.x, b.v), body, (x, v)))
         nodes = particles_to_grid(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start), centred=False)
 
-        def try_set(active, guess):
-            motion, info = method.move(holding(nodes, active), guess)
-            motion = jax.tree.map(held_images(nodes, active).unfold, motion)
+        def attempt(held, guess):
+            motion, info = method.move(held.nodes, guess)
+            motion = jax.tree.map(held.images.unfold, motion)
             return motion.velocity, impulses(nodes, method, motion)[1], motion.carrier, info
 
-        active, _, _, sweeps = find_active_set(nodes, nodes.velocity, try_set)
+        active, _, _, sweeps = find_active_set(nodes, nodes.velocity, attempt)
         held_on_plane = active.columns[0].reshape(grid.shape)[4]  # the first plane's node along its axis
-        loose = (holding(nodes, active).free[:, 0].reshape(grid.shape)[4] & held_on_plane).any()
-        images = held_images(nodes, active)
+        held = hold(nodes, active)
+        loose = (held.nodes.free[:, 0].reshape(grid.shape)[4] & held_on_plane).any()
+        images = held.images
         once = images.unfold(field)
         return active.columns, sweeps, loose, once, images.unfold(once)
 
