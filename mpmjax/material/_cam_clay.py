@@ -21,8 +21,8 @@ class CamClayHistory(eqx.Module):
 
 class CamClay(AbstractPlastic):
     """Soil or snow that shears, compacts and, if cohesive, tears: a non-associated Cam clay at large strains, with the
-    yield condition of J. Gaume, T. Gast, J. Teran, A. van Herwijnen, C. Jiang, Nat. Commun. 9 (2018) 3047, doi
-    10.1038/s41467-018-05181-w.
+    yield condition (eq. 3) and the hardening (eq. 4) of J. Gaume, T. Gast, J. Teran, A. van Herwijnen, C. Jiang, Nat.
+    Commun. 9 (2018) 3047, doi 10.1038/s41467-018-05181-w.
 
     With the Kirchhoff stresses p = −K tr ε and q = √(3/2) ‖2μ e‖, m and e the mean and the deviator of the elastic
     logarithmic strain in three dimensions whatever d is, it holds only the ellipse
@@ -36,11 +36,10 @@ class CamClay(AbstractPlastic):
       ellipse's centre, at p_c = (1 − β) p₀/2: −(p − p_×)/K with p_× the pressure where that way meets the ellipse.
 
     So it hardens and compacts for p > p_c, softens and loosens for p < p_c, and shears on at p = p_c without change,
-    the critical state: q = M (1 + β)/((1 − β) √(1 + 2β)) p, which is M p without cohesion,
-    and is there for β < 1. Where α ≥ 0 nothing is held:
-    the particles are apart, and α is the gap that must close first. The paper's elasticity is neo-Hookean; here it is
-    Hencky's, in whose strains p and q are linear. Where nothing yields F comes back to the last bit; no return adds
-    elastic energy, which α does not enter.
+    the critical state: q = M (1 + β)/((1 − β) √(1 + 2β)) p, which is M p without cohesion, and is there for β < 1.
+    Where α ≥ 0 nothing is held: the particles are apart, and α is the gap that must close first. The paper's flow is
+    associated (its eqs. 12, 13) and its elasticity neo-Hookean; here it is Hencky's, in whose strains p and q are
+    linear. Where nothing yields F comes back to the last bit; no return adds elastic energy, which α does not enter.
 
     *When it breaks*: as Hencky's law does in the elastic part: J > 0. The stress lags behind the ellipse by one step's
     hardening, so an error in proportion to the step's strain. Softening gathers strain in bands as wide as a cell.

@@ -22,9 +22,9 @@ class Snow(AbstractPlastic):
     """Snow (A. Stomakhin, C. Schroeder, L. Chai, J. Teran, A. Selle, ACM Trans. Graph. 32 (2013) 102,
     doi 10.1145/2461912.2461948).
 
-    Fixed corotated elasticity of F_E whose moduli harden with plastic compression, E e^{ξ (1 − J_P)}. The principal
-    stretches of F_E stay within [1 − θ_c, 1 + θ_s]; what they exceed goes into F_P, of which J_P alone acts
-    (F = F_E F_P). In plane strain nothing yields normal to the plane, the stretch there being one.
+    Fixed corotated elasticity of F_E (eq. 1) whose moduli harden with plastic compression, E e^{ξ (1 − J_P)} (eq. 2).
+    The principal stretches of F_E stay within [1 − θ_c, 1 + θ_s]; what they exceed goes into F_P (section 7), of which
+    J_P alone acts (F = F_E F_P). In plane strain nothing yields normal to the plane, the stretch there being one.
 
     *When it breaks*: it needs J > 0. Where hardening outruns yielding a return map creates energy: keep ξ J_P θ_c well
     below 2/d. The table's 0.25 does for packed snow; torn snow that is pressed again gains a little, of which there is
