@@ -285,7 +285,8 @@ def test_rotation_where_stretches_cancel_is_one_of_the_rotations(d):
 
 @pytest.mark.parametrize("d", [1, 2, 3])
 def test_the_matrix_of_a_map_applies_it(d):
-    """M, of A ↦ B A with B not symmetric, times the components of A in C order."""
-    A, B = (jnp.asarray(a) for a in np.random.default_rng(5).normal(size=(2, d, d, 4)))
-    matrix = la.matrix_of(lambda A: la.matmul(B, A), A)
-    np.testing.assert_allclose(la.product(matrix, A.reshape(d * d, 1, 4)).reshape(A.shape), la.matmul(B, A), atol=1e-14)
+    """M, of A ↦ S A T with S and T symmetric, times the components of A in C order."""
+    A, S, T = (jnp.asarray(a) for a in np.random.default_rng(5).normal(size=(3, d, d, 4)))
+    S, T = S + la.transpose(S), T + la.transpose(T)
+    matrix, image = la.matrix_of(lambda A: la.matmul(la.matmul(S, A), T), A), la.matmul(la.matmul(S, A), T)
+    np.testing.assert_allclose(la.product(matrix, A.reshape(d * d, 1, 4)).reshape(A.shape), image, atol=1e-13)
