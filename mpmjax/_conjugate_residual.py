@@ -15,6 +15,7 @@ from mpmjax._types import Array, Float, Scalar
 _DEFAULT_RTOL = {4: 1e-5, 8: 1e-8}  # by bytes a number
 _ROUNDING = 4.0  # a residual of so many units of rounding of ‖E‖‖x‖ is as small as it gets
 _STALLED = 16.0  # and so many will do where the iteration makes no more progress, ‖E‖ being underestimated
+_REACH = 64.0  # the recurrence's own residual means nothing below so many units of rounding of the one it started from
 LARGEST_RESIDUAL = 0.05
 """Share of the right-hand side above which a residual is never accepted, whatever the rounding."""
 
@@ -77,8 +78,8 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
 
     # The recurrence is the reference's, with the application of E moved to the head of the loop, which saves the last
     # one. Around it is a loop that this method's textbook form lacks: the recurrence's residual drifts from the true
-    # one (by ε‖E‖‖x‖ a step), so when the recurrence is content the true residual is computed, and if that is not
-    # small enough the recurrence starts anew from it. Three sums over the vector are all that an iteration takes:
+    # one (by ε‖E‖‖x‖ a step), so when the recurrence is content, or at the end of its reach, the true residual is
+    # computed, and if that is not small enough the recurrence starts anew from it. Three sums over the vector are all that an iteration takes:
     # ‖s‖ follows from ‖q‖, the q being orthogonal, and of ‖x‖, which only the rounding is measured by, the last
     # restart's will do.
     def compute(
@@ -146,7 +147,7 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
             rr = dot(r, r)
             c = replace(c, r=r, rr=rr, gamma=far, length=jnp.sqrt(dot(c.x, c.x)), true=rr, stalled=rr > c.true / 4)
             c = replace(c, done=c.stalled | ~goes_on(c))
-            return jax.lax.while_loop(lambda c: goes_on(c) & ~c.done, step, c)
+            return jax.lax.while_loop(lambda c: goes_on(c) & ~c.done & (c.rr > (_REACH * eps) ** 2 * c.true), step, c)
 
         no, none, far = jnp.asarray(False), jnp.zeros_like(b_norm), jnp.full_like(b_norm, jnp.inf)
         start = _Recurrence(

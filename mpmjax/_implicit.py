@@ -183,12 +183,12 @@ class Linearised(eqx.Module):
 
     solver: ConjugateResidual = ConjugateResidual()
 
-    def __call__(self, problem: AbstractProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
+    def __call__(self, problem: LinearProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         """The solution, started from a guess."""
         operator = problem.operator(guess).assembled()
         split = problem.constraint.split
         lift = split(0, problem.prescribed)
-        rhs = split(-problem.imbalance(lift), 0)
+        rhs = split(problem.rhs - operator.unconstrained(lift), 0)
         options = {"metric": operator.metric(), "y0": split(guess, 0)}
         v, result, stats = self.solver.compute(self.solver.init(operator, options), rhs, options)
         info = SolveInfo(

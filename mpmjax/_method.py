@@ -8,6 +8,7 @@ are made of stages M (v − a) = c (f(u + c v) − D v), f(u) the elastic force 
 viscosity: each is one linear solve, with f(u) = f(0) − H u, or Newton's method.
 """
 
+from functools import reduce
 from typing import ClassVar
 
 import equinox as eqx
@@ -208,7 +209,7 @@ class ImplicitMidpoint(eqx.Module):
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt f(½Δt v̄) [kg m/s]."""
-        return nodes.dt * _force(nodes, nodes.dt / 2 * motion.carrier, self.hessian, self.solution)
+        return nodes.dt * _force(nodes, self, (1, nodes.dt / 2 * motion.carrier))
 
 
 class TRBDF2(eqx.Module):
@@ -273,8 +274,8 @@ class TRBDF2(eqx.Module):
         """Δt (q_0 f_0 + q_1 f_γ + q_2 f_1) [kg m/s]."""
         _, q0, q1, q2 = self.weights()
         inner = motion.carrier if motion.inner is None else motion.inner
-        at_inner, at_end = (_force(nodes, nodes.dt * u, self.hessian, self.solution) for u in (inner, motion.carrier))
-        return nodes.dt * (q0 * nodes.force + q1 * at_inner + q2 * at_end)
+        stages = (q1, nodes.dt * inner), (q2, nodes.dt * motion.carrier)
+        return nodes.dt * (q0 * nodes.force + _force(nodes, self, *stages))
 
 
 Method = Explicit | SemiImplicit | BackwardEuler | ImplicitMidpoint | TRBDF2
@@ -331,10 +332,11 @@ class _Stage(eqx.Module):
         return solve(problem, guess, method.solution, method.adjoint_solver)
 
 
-def _force(nodes: Nodes, u: NodeVector, hessian: Hessian, solution: Linearised | Newton) -> NodeVector:
-    """The elastic force [N] at a nodal displacement u, as a stage takes it."""
-    match solution:
+def _force(nodes: Nodes, method: ImplicitMidpoint | TRBDF2, *stages: tuple[Scalar, NodeVector]) -> NodeVector:
+    """Σ q f(u) [N], the elastic forces at nodal displacements u with their weights q, as the stages take them."""
+    match method.solution:
         case Linearised():
-            return nodes.force - hessian.at_rest(nodes.potential, u)(u)
+            u = reduce(jnp.add, (q * u for q, u in stages))
+            return sum(q for q, _ in stages) * nodes.force - method.hessian.at_rest(nodes.potential, u)(u)
         case Newton():
-            return nodes.potential.force(u)
+            return reduce(jnp.add, (q * nodes.potential.force(u) for q, u in stages))

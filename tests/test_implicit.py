@@ -133,11 +133,13 @@ def test_line_search_backtracks_and_saves_what_one_newton_step_would_invert():
 
 @pytest.mark.parametrize("times", [1, 20, 100])
 def test_single_precision_converges_and_says_how_far(times):
-    """The residual it states is the true one, evaluated in double precision."""
+    """The residual it states is the true one, evaluated in double precision; and the iteration does not wander: at 100
+    times the limit it starts from 288 times the right-hand side, of which its own residual keeps a rounding."""
     scene, particles = jolted(speed=1.0, side=4, dtype="float32")
     grid = grid_update(scene, particles, times * explicit_limit(scene), mpm.SemiImplicit())
     assert grid.velocity.dtype == jnp.float32
     assert grid.info.solve.converged
+    assert grid.info.solve.iterations < 300
     widen = lambda a: a.astype(jnp.float64) if a.dtype == jnp.float32 else a  # noqa: E731
     nodes = jax.tree.map(widen, grid.nodes)
     predictor = nodes.explicit_velocity()
