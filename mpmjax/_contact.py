@@ -87,7 +87,7 @@ class Held(eqx.Module):
     @property
     def normal(self) -> NodeVector | None:
         """The free parts of the normals that colliders hold, of length one; None without any."""
-        return self.nodes.constraint.normal
+        return None if self.unheld.conditions.touch is None else self.nodes.constraint.normal
 
     @property
     def untouched(self) -> Constraint:

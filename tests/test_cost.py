@@ -10,9 +10,9 @@ import pytest
 from helpers import DESCRIPTIONS, KERNELS, METHODS, SECOND_ORDER, block, ids
 
 import mpmjax as mpm
-from mpmjax import _contact, _step
 from mpmjax._checks import canonical
 from mpmjax._constraint import Constraint
+from mpmjax._contact import Held
 from mpmjax._diffrax import Problem
 from mpmjax._nodes import Nodes
 from mpmjax._step import advance
@@ -182,10 +182,10 @@ def test_without_colliders_a_constraint_is_a_mask(method, boundary):
         mock.patch.object(Constraint, "identity", lambda self, vector, mass: vector),
         mock.patch.object(Nodes, "constraint", property(lambda self: Constraint(self.free))),
         mock.patch.object(Nodes, "prescribed", property(lambda self: self.conditions.velocity)),
-        mock.patch.object(_step, "pushes", return_value=None),
-        mock.patch.object(_step, "with_collider_friction", lambda nodes, active, v, push: (v, None)),
-        mock.patch.object(_contact, "_beside_colliders", lambda nodes, active, imbalance: imbalance),
-        mock.patch.object(_contact, "held_normals", return_value=None),
+        mock.patch.object(Held, "pushes", return_value=None),
+        mock.patch.object(Held, "collider_friction", lambda self, v, push: (v, None)),
+        mock.patch.object(Held, "_beside_colliders", lambda self, imbalance: imbalance),
+        mock.patch.object(Held, "normal", None),
     ):
         step, arrays = program(method, boundary=boundary)
         assert equations(jax.make_jaxpr(step)(arrays).jaxpr) == as_is
