@@ -79,9 +79,9 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
     # The recurrence is the reference's, with the application of E moved to the head of the loop, which saves the last
     # one. Around it is a loop that this method's textbook form lacks: the recurrence's residual drifts from the true
     # one (by ε‖E‖‖x‖ a step), so when the recurrence is content, or at the end of its reach, the true residual is
-    # computed, and if that is not small enough the recurrence starts anew from it. Three sums over the vector are all that an iteration takes:
-    # ‖s‖ follows from ‖q‖, the q being orthogonal, and of ‖x‖, which only the rounding is measured by, the last
-    # restart's will do.
+    # computed, and if that is not small enough the recurrence starts anew from it. Three sums over the vector are all
+    # that an iteration takes: ‖s‖ follows from ‖q‖, the q being orthogonal, and of ‖x‖, which only the rounding is
+    # measured by, the last restart's will do.
     def compute(
         self, state: lx.AbstractLinearOperator, vector: Any, options: dict[str, Any]
     ) -> tuple[Any, lx.RESULTS, dict[str, Any]]:

@@ -14,6 +14,7 @@ from helpers import DESCRIPTIONS, ELASTIC, FLUIDS, PLASTIC, VISCOUS, block
 
 import mpmjax as mpm
 from mpmjax import _simulate, _step
+from mpmjax._contact import Held
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-14)  # that is, down to rounding: central differences see every digit
 UPDATES = {
@@ -131,9 +132,9 @@ def rolled(q: dict[str, Any], case: Case, steps: int = STEPS) -> tuple[jax.Array
     particles = mpm.prepare(scene, particles)
     seen = []
 
-    def spy(nodes: Any, active: Any, v: Any, imbalance: Any) -> Any:
-        after = with_friction(nodes, active, v, imbalance)
-        seen.append((active.components, (v != 0) & (after == 0)))
+    def spy(held: Any, v: Any, imbalance: Any) -> Any:
+        after = wall_friction(held, v, imbalance)
+        seen.append((held.active.components, (v != 0) & (after == 0)))
         return after
 
     def body(state: Any, n: Any) -> Any:
@@ -144,8 +145,8 @@ def rolled(q: dict[str, Any], case: Case, steps: int = STEPS) -> tuple[jax.Array
         yielded = grown if case.law in PLASTIC else [new.F == 1] * (case.law in KINKED)
         return _simulate.state_of(new), jax.tree.leaves((seen.pop() if seen else (), yielded))
 
-    with_friction = _step.with_friction
-    with mock.patch.object(_step, "with_friction", spy):
+    wall_friction = Held.wall_friction
+    with mock.patch.object(Held, "wall_friction", spy):
         final, branches = jax.lax.scan(body, _simulate.state_of(particles), jnp.arange(float(steps)))
     return outcome(_simulate.with_state(particles, final)), branches
 

@@ -370,6 +370,7 @@ def test_a_turning_body_drags_what_it_touches_and_is_braked():
     assert 0.36 < -torque / (0.3 * -load) < 0.46
 
 
+@pytest.mark.slow
 def test_a_ball_pushed_through_a_block_meets_resistance():
     """In 3-D, with a ball by samples of its distance as well: both are pushed back, by nearly the same."""
     grid = mpm.Grid((12,) * 3, DX, origin=(-3,) * 3)

@@ -32,6 +32,7 @@ def coarse(job):
     return job._replace(scene=scene, particles=particles, run=job.run._replace(dt=5e-3))
 
 
+@pytest.mark.slow
 def test_the_fit_finds_rubbers_modulus(tmp_path):
     """`mpmjax fit` prints a modulus within 3 % of 0.339 MPa, the closed form's least-squares answer, and a plot."""
     code, out, err = shell("fit", RUBBER, "--plot", tmp_path / "fit.png")

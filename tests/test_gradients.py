@@ -71,9 +71,11 @@ def held_cases():
 
 
 def contact_cases():
-    """Sliding on a floor, in two dimensions; there is no contact in the total description."""
+    """Sliding on a floor, in two dimensions; there is no contact in the total description. Of the fluid an explicit and
+    a semi-implicit case."""
     second_order = itertools.product(SECOND_ORDER, ["fixed_corotated"])
-    for update, law in [*itertools.product(METHODS, LAWS), *second_order]:
+    fluid = itertools.product(("explicit", "semi_implicit"), ["fluid_in_tension"])
+    for update, law in [*itertools.product(METHODS, LAWS), *second_order, *fluid]:
         case = Case(update, law, "updated", 2, contact=True)
         now = case.update == "explicit" and case.law == "fixed_corotated"
         yield pytest.param(case, marks=() if now else pytest.mark.slow, id=str(case))
@@ -248,6 +250,7 @@ def test_gradient_error_is_proportional_to_the_solvers_tolerances(update):
         assert (errors[measured] < 5 * tolerance).all(), (which, errors)
 
 
+@pytest.mark.slow
 def test_second_derivative_passes_through_the_implicit_solve():
     """In all the moduli's scale, forward over reverse, against differences of the first."""
     case, h = Case("semi_implicit", "fixed_corotated", "updated", 2), 1e-5

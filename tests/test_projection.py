@@ -246,6 +246,7 @@ def test_projection_holds_where_the_plain_step_is_near_singular(times):
     np.testing.assert_allclose(run.final.x.std() / particles.x.std(), 1 / 0.9, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_negative_curvature_is_counted_by_steps():
     """In the solver's statistics, a step's report and a run's tally; not where the material is stretched."""
     scene, particles = compressed(noise=0.1)
