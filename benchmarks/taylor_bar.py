@@ -9,13 +9,13 @@ E = 117 GPa, ν = 0.35, σ_y = 400 MPa, H = 100 MPa. After 80 µs it has come to
 dimensions, between two symmetry planes, onto a `ContactPlane`.
 
 What is known of the numbers. Length, radius, speed and the wall without friction stand in Ansys' demonstration of a
-metal bar's impact (ch. 17.2); its table of results was not at hand. The benchmark page of a finite-element code (a fork
-of OpenSees, its finite-strain bricks under a leap-frog rule) states the same copper, quotes 21.4 and 7 mm as
-Kamoulakos's length and radius, and finds 21.7 and 6.9 mm itself. The ranges of what codes find, a final length of 21.42
-to 21.5 mm and a mushroom's radius of 6.97 to 7.24 mm, are quoted from memory, from A. Kamoulakos, Bench Mark (1990),
-Y. Y. Zhu, S. Cescotto, Comput. Struct. 54 (1995), and G. T. Camacho, M. Ortiz, Comput. Methods Appl. Mech. Eng. 142
-(1997), doi 10.1016/S0045-7825(96)01134-2. (Abaqus' benchmark of the same bar has other constants, 110 GPa, 0.3 and 314
-MPa without hardening, and is no reference here.)
+metal bar's impact (ch. 17.2); its table of results was not at hand. A finite-element code's own benchmark
+(LadrunoBrick, finite strains, in a fork of OpenSees: its page *P4, explicit dynamics*) states the same copper, quotes
+21.4 and 7 mm as Kamoulakos's length and radius, and finds 21.7 and 6.9 mm itself. The ranges of what codes find, a
+final length of 21.42 to 21.5 mm and a mushroom's radius of 6.97 to 7.24 mm, are quoted from memory and to be checked
+before they are cited, from A. Kamoulakos, Bench Mark (1990), Y. Y. Zhu, S. Cescotto, Comput. Struct. 54 (1995), and G.
+T. Camacho, M. Ortiz, Comput. Methods Appl. Mech. Eng. 142 (1997), doi 10.1016/S0045-7825(96)01134-2. (Abaqus' benchmark
+of the same bar has other constants, 110 GPa, 0.3 and 314 MPa without hardening, and is no reference here.)
 
 On one of the grids the run is repeated with half the step, in single precision and onto a symmetry plane, which the bar
 cannot leave: whether the wall pulls shows in the difference. The energy's account is that grid's too. A step's trial

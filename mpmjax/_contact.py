@@ -42,7 +42,7 @@ class ContactInfo(eqx.Module):
     sweeps: Int[Array, "*f"]
     """Solves before the last one."""
     violations: Int[Array, "*f"]
-    """Wall components and columns that pull or are entered all the same."""
+    """Wall components, columns and colliders' nodes that pull or are entered all the same."""
 
 
 def no_contact() -> ContactInfo:
@@ -112,7 +112,7 @@ class Held(eqx.Module):
         return (normal * self.images.fold(imbalance)).sum(axis=1) / grasp.reach
 
     def count_violations(self, v: NodeVector, imbalance: NodeVector) -> Int[Array, ""]:
-        """How many wall components and columns pull or are entered all the same."""
+        """How many wall components, columns and colliders' nodes pull or are entered all the same."""
         pulls, enters = self.verdict(v, imbalance)
         return _number(self.unheld, pulls) + _number(self.unheld, enters)
 
@@ -224,11 +224,11 @@ def hold(nodes: Nodes, active: ActiveSet) -> Held:
     for contact, columns in zip(nodes.contacts, active.columns, strict=True):
         normal = jnp.arange(fixed.shape[1]) == contact.image.axis
         fixed = fixed | ((columns & contact.on_plane)[:, None] & normal)
-    held = eqx.tree_at(lambda n: n.conditions.fixed, nodes.folded(images), fixed)
+    constrained = eqx.tree_at(lambda n: n.conditions.fixed, nodes.folded(images), fixed)
     if active.normals is not None and nodes.conditions.touch is not None:
         gripped = nodes.conditions.touch.held | active.normals
-        held = eqx.tree_at(lambda n: n.conditions.touch.held, held, gripped)
-    return Held(nodes, active, images, held)
+        constrained = eqx.tree_at(lambda n: n.conditions.touch.held, constrained, gripped)
+    return Held(unheld=nodes, active=active, images=images, nodes=constrained)
 
 
 def find_active_set(
@@ -253,7 +253,7 @@ def find_active_set(
         held = hold(nodes, active)
         v, imbalance, guess, info = attempt(held, guess)
         pulls, enters = held.verdict(v, imbalance)
-        active = jax.tree.map(lambda held, pulled, entered: (held & ~pulled) | entered, active, pulls, enters)
+        active = jax.tree.map(lambda was, pulled, entered: (was & ~pulled) | entered, active, pulls, enters)
         return active, guess, cost.plus(info), _number(nodes, pulls) + _number(nodes, enters) > 0, count + 1
 
     def unsettled(state: tuple) -> Array:

@@ -69,7 +69,7 @@ def product(A: Float[Array, "a k *p"], B: Float[Array, "k b *p"]) -> Float[Array
 
 def matrix_of(linear: Callable[[Matrix], Matrix], like: Matrix) -> Float[Array, "m m *p"]:
     """The matrix, on the d² components in C order, of a symmetric linear map between d x d matrices, (d, d, *p), as
-    `like` is: its columns, one after the other, as its rows."""
+    `like` is: row m is the image of the m-th unit matrix, and so is column m."""
     d, batch = like.shape[0], like.shape[2:]
     units = jnp.eye(d * d, dtype=like.dtype).reshape(d * d, d, d, *[1] * len(batch))
     return jax.lax.map(lambda unit: linear(jnp.broadcast_to(unit, like.shape)).reshape(d * d, *batch), units)

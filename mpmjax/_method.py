@@ -336,7 +336,7 @@ def _force(nodes: Nodes, method: ImplicitMidpoint | TRBDF2, *stages: tuple[Scala
     """Σ q f(u) [N], the elastic forces at nodal displacements u with their weights q, as the stages take them."""
     match method.solution:
         case Linearised():
-            u = reduce(jnp.add, (q * u for q, u in stages))
-            return sum(q for q, _ in stages) * nodes.force - method.hessian.at_rest(nodes.potential, u)(u)
+            mean = reduce(jnp.add, (q * u for q, u in stages))
+            return sum(q for q, _ in stages) * nodes.force - method.hessian.at_rest(nodes.potential, mean)(mean)
         case Newton():
             return reduce(jnp.add, (q * nodes.potential.force(u) for q, u in stages))

@@ -1,7 +1,6 @@
 """Settings of every test: 64-bit numbers, strict dtype promotion, array shapes and dtypes checked at every call."""
 
 import os
-from collections import Counter
 from typing import Any
 from zlib import crc32
 
@@ -29,18 +28,18 @@ def pytest_configure(config: Any) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: Any, items: list[Any]) -> None:
-    """Where no file is named, leave to `-m rest` what is neither slow nor the first case of its test, but for one in
-    four, drawn by its name: what breaks seldom breaks a single case."""
-    if config.args_source is not config.ArgsSource.TESTPATHS:
+    """Where neither files nor cases are asked for, leave to `-m rest` what is neither slow nor the last case of its
+    test, the hardest as a rule, but for one in six, drawn by its name: what breaks seldom breaks a single case."""
+    if config.args_source is not config.ArgsSource.TESTPATHS or config.option.keyword:
         return
-    cases: Counter[str] = Counter()
+    tests: dict[str, list[Any]] = {}
     for item in items:
-        if item.get_closest_marker("slow"):
-            continue
-        test = item.nodeid.split("[")[0]
-        if cases[test] and crc32(item.nodeid.encode()) % 4:
-            item.add_marker("rest")
-        cases[test] += 1
+        if not item.get_closest_marker("slow"):
+            tests.setdefault(item.nodeid.split("[")[0], []).append(item)
+    for cases in tests.values():
+        for item in cases[:-1]:
+            if crc32(item.nodeid.encode()) % 6:
+                item.add_marker("rest")
 
 
 def pytest_runtest_teardown(item: Any, nextitem: Any) -> None:

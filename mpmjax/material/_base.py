@@ -84,7 +84,7 @@ class AbstractMaterial(eqx.Module):
 
     @abc.abstractmethod
     def tangent(self, F: Matrix) -> AbstractTangent:
-        """The stress differential at F."""
+        """The stress differential at F, ∂²Ψ/∂F∂F: a symmetric map."""
 
     @abc.abstractmethod
     def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
