@@ -72,7 +72,7 @@ def matrix_of(linear: Callable[[Matrix], Matrix], like: Matrix) -> Float[Array, 
     `like` is: row m is the image of the m-th unit matrix, and so is column m."""
     d, batch = like.shape[0], like.shape[2:]
     units = jnp.eye(d * d, dtype=like.dtype).reshape(d * d, d, d, *[1] * len(batch))
-    return jax.lax.map(lambda unit: linear(jnp.broadcast_to(unit, like.shape)).reshape(d * d, *batch), units)
+    return jax.vmap(lambda unit: linear(jnp.broadcast_to(unit, like.shape)))(units).reshape(d * d, d * d, *batch)
 
 
 def trace(A: Matrix) -> Array:

@@ -57,7 +57,8 @@ class Hencky(AbstractIsotropic):
 
     def tangent(self, F: Matrix) -> MatrixTangent:
         """The stress's derivative in each of the d² directions."""
-        return MatrixTangent(la.matrix_of(jax.linearize(self.stress, F)[1], F))
+        # by jvp, whose derivative is the rule's: jax.linearize's is that of its code, wrong where stretches coincide
+        return MatrixTangent(la.matrix_of(lambda dF: jax.jvp(self.stress, (F,), (dF,))[1], F))
 
     def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
         """With τ_i = 2μ ln s_i + λ (ln J + (3 − d) ε_t): scaling (2μ δ_ij + λ)/(s_i s_j) − δ_ij τ_i/s_i², twist
