@@ -24,15 +24,15 @@ def require(condition: Any, message: str) -> None:
 
 def require_finite(name: str, value: Any) -> None:
     """Every number of `value` must be finite."""
-    if not is_traced(value):
-        require(np.isfinite(np.asarray(value, dtype=float)), f"{name} must be finite, got {value}.")
+    if not is_traced(value) and not np.isfinite(np.asarray(value, dtype=float)).all():
+        raise ValueError(f"{name} must be finite, got {value}.")  # written only here: writing an array takes ms
 
 
 def require_positive(name: str, value: Any) -> None:
     """Every number of `value` must be finite and above zero."""
     require_finite(name, value)
-    if not is_traced(value):
-        require(np.asarray(value) > 0, f"{name} must be greater than zero, got {value}.")
+    if not is_traced(value) and not (np.asarray(value) > 0).all():
+        raise ValueError(f"{name} must be greater than zero, got {value}.")
 
 
 def coordinates(name: str, point: Any) -> int:
@@ -71,6 +71,8 @@ def canonical(tree: Any, dtype: Any) -> Any:
             return leaf
         if isinstance(leaf, jax.Array) and leaf.dtype == dtype and not leaf.weak_type:
             return leaf
-        return jax.lax.convert_element_type(jnp.asarray(leaf), dtype)
+        if isinstance(leaf, jax.Array):
+            return jax.lax.convert_element_type(leaf, dtype)
+        return jnp.asarray(np.asarray(leaf, dtype))  # of a NumPy array: of a Python number XLA compiles a program
 
     return jax.tree.map(convert, tree)

@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax._checks import require, require_positive
 from mpmjax._types import Array, Int, NodeVector, ParticleVector, Scalar
@@ -85,7 +86,7 @@ class Grid(eqx.Module):
     def window(self, x: ParticleVector) -> Int[Array, "d"]:
         """The lattice index of the window's first node, for particles at x."""
         if not self.follow:
-            return jnp.asarray(self.origin, dtype=jnp.int32)
+            return jnp.asarray(np.asarray(self.origin, dtype=np.int32))
         middle = (x.min(axis=0) + x.max(axis=0)) / 2
         first = jnp.floor(jax.lax.stop_gradient(middle / self.spacing)).astype(jnp.int32)
         return first - jnp.asarray([length // 2 for length in self.shape], dtype=jnp.int32)

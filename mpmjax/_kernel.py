@@ -128,6 +128,7 @@ class Stencil(eqx.Module):
         return jnp.stack([_tensor(jnp.multiply, [*w[:a], g[a], *w[a + 1 :]]) for a in range(len(w))], axis=1)
 
 
+@eqx.filter_jit
 def in_window(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleVector) -> Bool[Array, "p"]:
     """Whether the whole stencil of a particle at x lies in the window, shape (p,)."""
     base = kernel.base(components(x) / grid.spacing)

@@ -67,8 +67,8 @@ def fill(
     if not isinstance(region, Box):
         lattice = lattice[np.asarray(region.contains(jnp.asarray(lattice)))]
     require(len(lattice) > 0, f"{region} holds no particle at this spacing: refine the grid or enlarge the region.")
-    precision = jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
+    precision = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
     x = jnp.asarray(lattice, dtype=precision)
     v = jnp.broadcast_to(jnp.asarray(velocity, dtype=precision), x.shape)
-    volume = jnp.full(len(lattice), np.prod(cell), dtype=precision)
+    volume = jnp.asarray(np.full(len(lattice), np.prod(cell)), dtype=precision)
     return Particles(x=x, v=v, mass=jnp.asarray(density, precision) * volume, volume=volume)

@@ -249,7 +249,8 @@ def _prepared(law: Law, group: Group, particles: Particles) -> tuple[Array, Any]
     start, stop = group.rows or (0, particles.count)
     e = 1 if isinstance(law, AbstractVolumetric) else particles.dim
     shape = (stop - start, e, e)
-    F = jnp.broadcast_to(jnp.eye(e, dtype=particles.x.dtype), shape) if group.F is None else group.F
+    undeformed = jnp.asarray(np.eye(e, dtype=particles.x.dtype))
+    F = jnp.broadcast_to(undeformed, shape) if group.F is None else group.F
     require(F.shape == shape, f"{type(law).__name__} needs F of shape {shape}, got {F.shape}.")
     if not isinstance(law, AbstractPlastic):
         return F, None
@@ -315,7 +316,7 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
             f"{sorted(sizes - {1, rows})} of them.",
         )
     for part in scene.constituents(particles):
-        allowed = np.asarray(part.law.admits(part.F))
+        allowed = np.asarray(eqx.filter_jit(part.law.admits)(part.F))
         first = int(np.argmin(allowed)) + (part.rows[0] if part.rows else 0)
         require(
             allowed,
