@@ -34,7 +34,7 @@ jax.config.update("jax_enable_x64", True)
 E_MODULUS, NU, DENSITY, GRAVITY = 1e5, 0.3, 1e3, 9.81
 SCENES = {"A 100k": (3, 100_000, 64, 8), "C 10k": (2, 10_000, 128, 4), "C 100k": (2, 100_000, 256, 4)}
 QUICK = {"A 5k": (3, 5_000, 32, 8), "C 2k": (2, 2_000, 64, 4)}
-ITERATIONS = 4, 24
+ITERATIONS = 4, 44
 Code = Callable[[], tuple[np.ndarray, np.ndarray, np.ndarray]]
 """Goes on by the timed steps and returns x, v, F."""
 

@@ -43,7 +43,7 @@ class Stiffness(AbstractHessianAction):
     def __call__(self, du: NodeVector) -> NodeVector:
         """Σ_p g_ip K_p Σ_j g_jp δu_j."""
         _, slopes = collect(self.stencil, self.mirror.unfold(du))
-        flux = la.product(self.matrix, slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
+        flux = la.matmul(self.matrix, slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
         return self.mirror.fold(spread(self.stencil, None, flux, du.shape[0]))
 
     def assembled(self) -> "Stiffness":

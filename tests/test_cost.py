@@ -270,7 +270,7 @@ def test_a_fluid_stores_and_costs_less_than_a_solid(d):
     """One number in the place of F's d²; in flops and bytes of the compiled step it is below the cheapest solid."""
     fluid, solid = compiled(d=d, material=mpm.Fluid(1e5)), compiled(d=d)
     assert fluid[0] < 0.9 * solid[0]
-    assert fluid[1] < 0.95 * solid[1]
+    assert fluid[1] < 0.98 * solid[1]
     assert crossings(counted(d=d, material=mpm.Fluid(1e5))) == (1, 1)
     step, arrays = program(d=d, material=mpm.Fluid(1e5))
     assert jax.eval_shape(step, arrays).F.shape[1:] == (1, 1)

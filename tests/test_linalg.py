@@ -289,4 +289,4 @@ def test_the_matrix_of_a_map_applies_it(d):
     A, S, T = (jnp.asarray(a) for a in np.random.default_rng(5).normal(size=(3, d, d, 4)))
     S, T = S + la.transpose(S), T + la.transpose(T)
     matrix, image = la.matrix_of(lambda A: la.matmul(la.matmul(S, A), T), A), la.matmul(la.matmul(S, A), T)
-    np.testing.assert_allclose(la.product(matrix, A.reshape(d * d, 1, 4)).reshape(A.shape), image, atol=1e-13)
+    np.testing.assert_allclose(la.matmul(matrix, A.reshape(d * d, 1, 4)).reshape(A.shape), image, atol=1e-13)

@@ -31,7 +31,7 @@ class MatrixTangent(AbstractTangent):
 
     def __call__(self, dF: Matrix) -> Matrix:
         """δP for δF."""
-        return la.product(self.matrix, dF.reshape(-1, 1, *dF.shape[2:])).reshape(dF.shape)
+        return la.matmul(self.matrix, dF.reshape(-1, 1, *dF.shape[2:])).reshape(dF.shape)
 
 
 class PrincipalTangent(eqx.Module):

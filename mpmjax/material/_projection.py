@@ -39,7 +39,7 @@ def _projected_matrix_jvp(
     def in_frame(material: AbstractMaterial, F: Matrix) -> Array:
         """Eᵀ A E, the frame held fixed."""
         images = jax.vmap(material.tangent(F))(modes.reshape(-1, *F.shape)).reshape(modes.shape)
-        return la.product(modes, jnp.swapaxes(images, 0, 1))
+        return la.matmul(modes, jnp.swapaxes(images, 0, 1))
 
     change = jax.jvp(in_frame, primals, tangents)[1]
     positive, size = jnp.maximum(values, 0), jnp.abs(values)
@@ -56,10 +56,10 @@ def _spectrum(material: AbstractMaterial, F: Matrix) -> tuple[Float[Array, "m *p
     scalings, Q = la.symmetric_eigen(tangent.scaling)
     d, modes = F.shape[0], la.principal_modes(U, V)
     modes = modes.reshape(d * d, d * d, *F.shape[2:])
-    modes = jnp.concatenate([la.product(la.transpose(Q), modes[:d]), modes[d:]])
+    modes = jnp.concatenate([la.matmul(la.transpose(Q), modes[:d]), modes[d:]])
     return jnp.concatenate([scalings, tangent.twist, tangent.flip]), modes
 
 
 def _in_modes(modes: Float[Array, "m m *p"], core: Float[Array, "m m *p"]) -> Float[Array, "m m *p"]:
     """Σ_kl E_ka core_kl E_lb."""
-    return la.product(jnp.swapaxes(modes, 0, 1), la.product(core, modes))
+    return la.matmul(jnp.swapaxes(modes, 0, 1), la.matmul(core, modes))
