@@ -39,7 +39,7 @@ import mpmjax as mpm
 def held_cases():
     """Every update × law × description × dimension, but that in three dimensions semi-implicit steps have one law for
     each description and backward Euler has one case, and that the updates of second order, whose stages are of one form
-    with those of the others, have one law for each description in one and two. Hencky's law, whose derivatives are of
+    with those of the others, have one law for each description in one and two, and one case in three. Hencky's law, whose derivatives are of
     a kind of their own, has an explicit and a semi-implicit case, and one in three dimensions; so has the fluid,
     updated, and one of backward Euler. Viscosity, which each update takes in its own way, has one case for each, of a
     fluid and of a solid. By default each update in one dimension, in one description, the explicit one in two, and one
@@ -56,6 +56,9 @@ def held_cases():
             )
             case = Case(update, law, description, d)
             yield pytest.param(case, marks=() if now else pytest.mark.slow, id=str(case))
+    for update in SECOND_ORDER:
+        case = Case(update, "neo_hookean", "total", 3)
+        yield pytest.param(case, marks=pytest.mark.slow, id=str(case))
     for update, description, d in (("explicit", "updated", 2), ("explicit", "total", 3), ("semi_implicit", "total", 2)):
         case = Case(update, "hencky", description, d)
         yield pytest.param(case, marks=pytest.mark.slow, id=str(case))
