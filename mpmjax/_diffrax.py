@@ -1,4 +1,4 @@
-"""The thin adapter by which diffrax drives the step: saving, events, progress and the checkpointed adjoint are its
+"""The thin adapter by which diffrax drives the step: saving, stopping, progress and the checkpointed adjoint are its
 own."""
 
 from collections.abc import Callable
@@ -30,6 +30,8 @@ class Problem(eqx.Module):
     dt: Scalar
     method: Method
     observe: Callable[[Scene, Particles], Any] | None = None
+    start: Scalar = 0.0
+    """Number of the first step."""
 
     def at(self, state: State) -> Particles:
         """The particles in a state."""
@@ -147,13 +149,13 @@ def step_number(t: Array) -> Array:
 
 
 class StepSolver(diffrax.AbstractSolver):
-    """One step of the method a unit of diffrax's time, which counts steps: physical time is n·Δt, and every step has
-    the same Δt to the last bit. `args` is a `Problem`."""
+    """One step of the method a unit of diffrax's time, which counts steps from the run's first: physical time is n·Δt,
+    n counting from the problem's start, and every step has the same Δt to the last bit. `args` is a `Problem`."""
 
     term_structure: ClassVar = diffrax.ODETerm
     interpolation_cls: ClassVar[Callable[..., diffrax.LocalLinearInterpolation]] = diffrax.LocalLinearInterpolation
-    keep_previous: bool = False
-    """Whether to carry the state before the last step, the last good one when an event stops the run."""
+    watch: bool = False
+    """Whether a fault stops the run, and the state before the last step, then the last good one, is carried."""
 
     def order(self, terms: Any) -> int:
         """At least first order in time; nothing depends on it, Δt being constant."""
@@ -163,19 +165,22 @@ class StepSolver(diffrax.AbstractSolver):
     def init(self, terms: Any, t0: Any, t1: Any, y0: State, args: Problem) -> tuple[Tally, State | None]:
         """An empty tally."""
         del terms, t0, t1, args
-        return no_steps(y0.x.dtype), y0 if self.keep_previous else None
+        return no_steps(y0.x.dtype), y0 if self.watch else None
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: State, args: Problem, solver_state: Any, made_jump: Any) -> tuple:
-        """One step."""
+        """One step. A fault is reported as the solver's failure: as an event diffrax would ask for it once more."""
         del terms, t1, made_jump
         tally, _ = solver_state
-        t = step_number(t0) * args.dt
+        t = (args.start + step_number(t0)) * args.dt
         particles, info = advance_compiled(args.scene, args.at(y0), t, args.dt, args.method, args.stencil)
         y1 = state_of(particles)
         arrays, rest = eqx.partition((args, y1), eqx.is_array)
         tally = tally.plus(info, fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest)))
-        kept = y0 if self.keep_previous else None
-        return y1, None, {"y0": y0, "y1": y1}, (tally, kept), diffrax.RESULTS.successful
+        dense = {"y0": y0, "y1": y1}
+        good, bad = diffrax.RESULTS.successful, diffrax.RESULTS.nonlinear_divergence
+        if not self.watch:
+            return y1, None, dense, (tally, None), good
+        return y1, None, dense, (tally, y0), diffrax.RESULTS.where(tally.fault == HEALTHY, good, bad)
 
     def func(self, terms: Any, t0: Any, y0: State, args: Problem) -> State:
         """Not a vector field; diffrax only asks for its shape."""
@@ -187,8 +192,3 @@ def no_vector_field(t: Any, y: State, args: Problem) -> State:
     del t, args
     return jax.tree.map(jnp.zeros_like, y)
 
-
-def is_faulty(t: Any, y: State, args: Problem, **kwargs: Any) -> Bool[Array, ""]:
-    """The event that stops a run."""
-    del t, kwargs
-    return fault_of(args, y) != HEALTHY

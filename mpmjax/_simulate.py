@@ -19,7 +19,6 @@ from mpmjax._diffrax import (
     StepSolver,
     Tally,
     faulty_particles,
-    is_faulty,
     no_vector_field,
     step_number,
 )
@@ -93,7 +92,7 @@ def simulate(
         scene,
         particles,
         jnp.asarray(start, dtype),
-        jnp.asarray(count, dtype),
+        None,
         dt_,
         method,
         max_steps=count,
@@ -198,7 +197,7 @@ def integrate(
     scene: Scene,
     particles: Particles,
     start: Float[Array, ""],
-    count: Float[Array, ""],
+    count: Float[Array, ""] | None,
     dt: Scalar,
     method: Method,
     *,
@@ -210,8 +209,14 @@ def integrate(
     watch: bool,
 ) -> tuple[Any, State, Tally, State | None]:
     """`count` ≤ `max_steps` steps from step `start`: (steps and values saved), final state, tally, and with `watch`,
-    which stops the run at a fault, the state before the last step."""
-    problem = Problem(scene, particles, scene.stencil(particles) if scene.total else None, dt, method, observe)
+    which stops the run at a fault, the state before the last step.
+
+    Without a count, all of them: what diffrax derives of its last time is then a constant, which XLA computes as it
+    compiles, and not a program of two thousand operations.
+    """
+    stencil = scene.stencil(particles) if scene.total else None
+    problem = Problem(scene, particles, stencil, dt, method, observe, start)
+    none, one, all_steps = (np.asarray(n, start.dtype) for n in (0, 1, max_steps))
 
     def kept(t: Any, y: State, args: Problem) -> Any:
         del t
@@ -222,22 +227,21 @@ def integrate(
         subs["frames"] = diffrax.SubSaveAt(t0=True, t1=True, steps=save_every, fn=kept)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(no_vector_field),
-        StepSolver(keep_previous=watch),
-        t0=start,
-        t1=start + count,
-        dt0=jnp.ones_like(start),
+        StepSolver(watch),
+        t0=none,
+        t1=all_steps if count is None else count,
+        dt0=one,
         y0=state_of(particles),
         args=problem,
         saveat=diffrax.SaveAt(subs=subs, solver_state=True),
         adjoint=adjoint,
-        event=diffrax.Event(is_faulty) if watch else None,
         max_steps=max_steps,
         throw=False,
         progress_meter=diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter(),
     )
     times, values, (tally, previous) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
     final = jax.tree.map(lambda a: a[-1], values["final"])
-    saved = None if save_every is None else (step_number(times["frames"]), values["frames"])
+    saved = None if save_every is None else (start + step_number(times["frames"]), values["frames"])
     return saved, final, tally, previous
 
 
