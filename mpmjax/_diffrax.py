@@ -191,4 +191,3 @@ def no_vector_field(t: Any, y: State, args: Problem) -> State:
     """What stands where diffrax expects an equation: the solver does not evaluate it."""
     del t, args
     return jax.tree.map(jnp.zeros_like, y)
-

@@ -39,11 +39,11 @@ import mpmjax as mpm
 def held_cases():
     """Every update × law × description × dimension, but that in three dimensions semi-implicit steps have one law for
     each description and backward Euler has one case, and that the updates of second order, whose stages are of one form
-    with those of the others, have one law for each description in one and two, and one case in three. Hencky's law, whose derivatives are of
-    a kind of their own, has an explicit and a semi-implicit case, and one in three dimensions; so has the fluid,
-    updated, and one of backward Euler. Viscosity, which each update takes in its own way, has one case for each, of a
-    fluid and of a solid. By default each update in one dimension, in one description, the explicit one in two, and one
-    case of fluid and viscosity; the rest is slow."""
+    with those of the others, have one law for each description in one and two, and one case in three. Hencky's law,
+    whose derivatives are of a kind of their own, has an explicit and a semi-implicit case, and one in three dimensions;
+    so has the fluid, updated, and one of backward Euler. Viscosity, which each update takes in its own way, has one
+    case for each, of a fluid and of a solid. By default each update in one dimension, in one description, the explicit
+    one in two, and one case of fluid and viscosity; the rest is slow."""
     for update, law, description in itertools.product(UPDATES, LAWS, DESCRIPTIONS):
         turn = (list(UPDATES).index(update) + list(LAWS).index(law) + list(DESCRIPTIONS).index(description)) % 2
         solid = {"explicit": True, "semi_implicit": turn, "backward_euler": turn and law == "neo_hookean"}
