@@ -177,10 +177,11 @@ class StepSolver(diffrax.AbstractSolver):
         arrays, rest = eqx.partition((args, y1), eqx.is_array)
         tally = tally.plus(info, fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest)))
         dense = {"y0": y0, "y1": y1}
-        good, bad = diffrax.RESULTS.successful, diffrax.RESULTS.nonlinear_divergence
         if not self.watch:
-            return y1, None, dense, (tally, None), good
-        return y1, None, dense, (tally, y0), diffrax.RESULTS.where(tally.fault == HEALTHY, good, bad)
+            return y1, None, dense, (tally, None), diffrax.RESULTS.successful
+        results: Any = diffrax.RESULTS  # whose members the type checker takes for another type
+        result = results.where(tally.fault == HEALTHY, results.successful, results.nonlinear_divergence)
+        return y1, None, dense, (tally, y0), result
 
     def func(self, terms: Any, t0: Any, y0: State, args: Problem) -> State:
         """Not a vector field; diffrax only asks for its shape."""
