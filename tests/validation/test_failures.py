@@ -262,15 +262,15 @@ def thrown(method, speed, number):
 @pytest.mark.slow
 def test_one_linear_solve_inverts_where_newton_holds():
     """Impact at twice the speed of sound: the linear solve holds at Δt = 0.1 dx/c and inverts particles from 0.5 on;
-    backward Euler holds up to 8, with a handful of halvings by the line search. At four to eight times c and 8 dx/c it
-    is a matter of chance whether it converges, and where it does not it says so."""
+    backward Euler holds up to 8, with a handful of halvings by the line search. From four times c and 8 dx/c on it is a
+    matter of chance whether thirty Newton steps suffice, and where they do not it says so."""
     assert bool(thrown(mpm.SemiImplicit(), 2.0, 0.1).healthy)
     for number in (0.5, 2.0, 8.0):
         assert int(thrown(mpm.SemiImplicit(), 2.0, number).fault) == INADMISSIBLE
         held = thrown(mpm.BackwardEuler(), 2.0, number)
         assert bool(held.healthy)
         assert 1 <= int(held.line_search) <= 10
-    faster = [thrown(mpm.BackwardEuler(), speed, 8.0) for speed in (4.0, 5.0, 6.0, 8.0)]
+    faster = [thrown(mpm.BackwardEuler(), speed, 8.0) for speed in (4.0, 8.0, 12.0, 16.0, 24.0)]
     assert not all(bool(tally.healthy) for tally in faster)
     assert all(bool(tally.healthy) or int(tally.unconverged) for tally in faster)
     midpoint = thrown(mpm.ImplicitMidpoint(mpm.Newton()), 2.0, 2.0)  # admissible at the middle of the step only
