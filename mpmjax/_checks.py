@@ -49,8 +49,9 @@ def require_between(name: str, value: Any, lower: float | int, upper: float | in
     if not is_traced(value):
         a = np.asarray(value)
         inside = (a > lower) & (a < upper) if open_ends else (a >= lower) & (a <= upper)
-        words = f"strictly between {lower} and {upper}" if open_ends else f"from {lower} to {upper}"
-        require(inside, f"{name} must be {words}, got {value}.")
+        if not inside.all():
+            words = f"strictly between {lower} and {upper}" if open_ends else f"from {lower} to {upper}"
+            raise ValueError(f"{name} must be {words}, got {value}.")
 
 
 def require_moduli(name: str, youngs_modulus: Any, poisson_ratio: Any) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mpmjax._body_force import AbstractBodyForce
 from mpmjax._boundary import AbstractBoundary, SeparatingBox
-from mpmjax._checks import coordinates, is_traced, require, require_finite
+from mpmjax._checks import canonical, coordinates, is_traced, require, require_finite
 from mpmjax._collider import AbstractCollider, SeparatingCollider, SlipCollider
 from mpmjax._constituent import Constituent, Laws, constituents, return_map, split
 from mpmjax._exchange import Exchange, nothing_received
@@ -231,7 +231,7 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
         received=_received(scene, particles),
     )
     if not is_traced((scene, prepared)):
-        _check_placement(scene, prepared)
+        _check_placement(canonical(scene, particles.x.dtype), prepared)
     return prepared
 
 

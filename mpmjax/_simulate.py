@@ -216,7 +216,7 @@ def integrate(
     """
     stencil = scene.stencil(particles) if scene.total else None
     problem = Problem(scene, particles, stencil, dt, method, observe, start)
-    none, one, all_steps = (np.asarray(n, start.dtype) for n in (0, 1, max_steps))
+    zero, one, all_steps = (np.asarray(n, start.dtype) for n in (0, 1, max_steps))
 
     def kept(t: Any, y: State, args: Problem) -> Any:
         del t
@@ -228,7 +228,7 @@ def integrate(
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(no_vector_field),
         StepSolver(watch),
-        t0=none,
+        t0=zero,
         t1=all_steps if count is None else count,
         dt0=one,
         y0=state_of(particles),

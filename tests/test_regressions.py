@@ -171,3 +171,14 @@ def test_a_wrong_number_of_moduli_is_refused():
 def test_a_budget_needs_a_step():
     with pytest.raises(ValueError, match="dt"):
         mpm.budget(*block(2), steps=1, dt=-1e-3)
+
+
+def test_prepare_compiles_once_for_all_moduli_and_spacings():
+    scene, particles = block(2)
+    mpm.prepare(scene, particles)
+    before = in_window._cached._cache_size()
+    for change in (1.0, 1.001, 1.002):
+        numbers = (change * float(scene.material.youngs_modulus), change * float(scene.grid.spacing))
+        changed = eqx.tree_at(lambda s: (s.material.youngs_modulus, s.grid.spacing), scene, numbers)
+        mpm.prepare(changed, particles)
+    assert in_window._cached._cache_size() == before

@@ -90,7 +90,10 @@ def test_a_run_continues_from_its_end():
     scene, particles = pulled()
     method = mpm.SemiImplicit()
     first = mpm.simulate(scene, particles, t1=4 * DT, dt=DT, method=method)
-    second = mpm.simulate(scene, first.final, t1=8 * DT, dt=DT, method=method, start=int(first.final_step))
+    second = mpm.simulate(
+        scene, first.final, t1=8 * DT, dt=DT, method=method, start=int(first.final_step), save_every=2
+    )
+    np.testing.assert_array_equal(second.steps, [4, 6, 8])
     whole = mpm.simulate(scene, particles, t1=8 * DT, dt=DT, method=method)
     assert float(second.final_step) == 8
     assert_equal(state(second.final), state(whole.final))
