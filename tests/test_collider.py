@@ -334,6 +334,36 @@ def test_friction_opposes_slip_by_at_most_mu_times_the_push(name, mu):
         assert not slides.any()
 
 
+@pytest.mark.parametrize("floor", ["box", "plane"])
+def test_friction_of_a_wall_leaves_alone_what_others_hold(floor):
+    """At a node that a moving body holds along an oblique normal, or a grip in one direction, the wall's friction acts
+    in the directions that are left; elsewhere it takes energy."""
+    grid, block = landing(3)
+    block = eqx.tree_at(lambda b: b.v, block, block.v + jnp.array([1.0, 0.5, -1.5]))
+    pushed = mpm.Motion((0.0, 1.0), ((0.0,) * 3, (0.4, 0.2, 0.1)))
+    side = mpm.SlipCollider(mpm.HalfSpace((0.12,) * 3, (2.0, 1.0, 0.5)), pushed)
+    drag = mpm.Grip(mpm.HalfSpace((0.0, 0.32, 0.0), (0.0, -1.0, 0.0)), pushed, axes=(True, False, False))
+    mu = 0.3
+    wall = {
+        "box": mpm.SeparatingBox((-np.inf, -np.inf, 0.0), (np.inf,) * 3, friction=mu),
+        "plane": mpm.ContactPlane(2, 0.0, friction=mu),
+    }[floor]
+    scene = scene_of(grid, drag, side, wall)
+    step = grid_update(scene, block, 0.3 * explicit_limit(scene), mpm.Explicit())
+    x, v, mass = np.asarray(step.position), np.asarray(step.velocity), np.asarray(step.nodes.mass) > 0
+    n = np.array([2.0, 1.0, 0.5]) / np.sqrt(5.25)
+    mass &= x[:, 2] > -1e-9  # what lies beyond a plane is its mirror image
+    held, gripped = (x - 0.12) @ n < 1e-9, x[:, 1] > 0.32
+    rubbed = np.abs(step.update.friction).max(axis=1) > 1e-9 * np.abs(step.update.friction).max()
+    assert (rubbed & held & ~gripped).sum() > 3
+    assert (rubbed & gripped & ~held).sum() > 3
+    assert (rubbed & ~held & ~gripped).sum() > 3
+    assert_close(v[held & mass] @ n, np.full((held & mass).sum(), n @ [0.4, 0.2, 0.1]), 1e-13)
+    assert_close(v[gripped & mass, 0], np.full((gripped & mass).sum(), 0.4), 1e-14)
+    friction = np.asarray(step.update.friction)
+    assert ((friction * v).sum(axis=1)[rubbed & ~held & ~gripped] < 0).all()
+
+
 @pytest.mark.parametrize("name", ["explicit", "semi_implicit"])
 def test_a_collider_lets_go_freely(name):
     """A block that a tilted floor does not hold leaves as if there were none."""

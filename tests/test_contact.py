@@ -10,7 +10,7 @@ from numpy_oracle import grid_update
 
 import mpmjax as mpm
 from mpmjax._checks import canonical
-from mpmjax._contact import SWEEPS, find_active_set, hold
+from mpmjax._contact import SWEEPS, ActiveSet, find_active_set, hold
 from mpmjax._nodes import particles_to_grid
 from mpmjax._step import impulses
 
@@ -307,6 +307,52 @@ def test_whatever_columns_are_held_mirroring_twice_is_mirroring_once(number):
         assert not loose
         assert sweeps == 1 or number == 2
     assert partly > 10
+
+
+@pytest.mark.parametrize("wall", ["box", "plane", "collider"])
+def test_a_verdict_is_given_beyond_rounding_only(wall):
+    """Of what is held, what pulls by more than 1.5e-8 of its mass times the largest velocity, the root of the machine
+    precision; of what is not, what enters by more than 1.5e-8 of it. What the solver leaves does not count."""
+    boundary = {
+        "box": FLOORS["plain"](0.0),
+        "plane": FLOORS["mirrored"](0.0),
+        "collider": mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (3.0, 4.0))),
+    }[wall]
+    grid = mpm.Grid((10, 9), DX, origin=(-4, -3))
+    block = mpm.fill(mpm.Box((-0.1, 0.0), (0.3, 0.2)), grid, density=1e3)
+    scene = canonical(mpm.Scene(grid, LAW, boundary=boundary), float)
+    start = mpm.prepare(scene, block)
+    nodes = particles_to_grid(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start), centred=False)
+    mass, touch, up = np.asarray(nodes.mass), nodes.conditions.touch, np.array([0.0, 1.0])
+    inward, weight = up, mass
+    match wall:
+        case "box":
+            met = nodes.conditions.side[:, 1] == 1
+        case "plane":  # its columns are seen at their nodes on it
+            (contact,) = nodes.contacts
+            met, weight = contact.on_plane, np.asarray(contact.image.column(contact.weight(nodes.mass)))
+        case _:
+            met, inward = touch.leavable, np.asarray(touch.normal)
+    met = np.asarray(met) & (mass > 0)
+
+    def found(held, share):
+        """How many pull where all are held, or enter where none is, by a share of the largest velocity, 3 m/s."""
+        along = np.where(met[:, None], 3 * share * inward, 0)
+        fast = np.zeros_like(along)
+        fast[-1, 0] = 3.0
+        active = ActiveSet(
+            jnp.asarray(held & met[:, None] & (up == 1)) if wall == "box" else None,
+            (jnp.full(grid.size, held),) if wall == "plane" else (),
+            jnp.asarray(held & met) if wall == "collider" else None,
+        )
+        v = fast if held else fast + along * (weight / np.where(met, mass, 1))[:, None]
+        imbalance = weight[:, None] * along if held else np.zeros_like(along)
+        return int(hold(nodes, active).count_violations(jnp.asarray(v), jnp.asarray(imbalance)))
+
+    assert met.sum() > 3
+    for held in (True, False):
+        assert found(held, 1.0) == found(held, -1.4e-8) == 0
+        assert found(held, -1.6e-8) == met.sum()
 
 
 @NAMES

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DESCRIPTIONS, assert_close, explicit_limit, ids
+from helpers import DESCRIPTIONS, VISCOUS, assert_close, explicit_limit, ids
 from numpy_oracle import grid_update
 from test_implicit import jolted
 
@@ -94,6 +94,56 @@ def test_newton_solves_the_stages_themselves(method):
     linearised = eqx.tree_at(lambda m: m.solution, method, mpm.Linearised(SOLVER))
     once, _ = move(linearised, nodes)
     assert np.abs(np.asarray(impulses(nodes, method, once)[1]))[free].max() > 1e-3 * np.abs(momentum).max()
+
+
+def test_an_unconverged_first_stage_is_reported():
+    """By its own residual, from the stages' equations, though the second stage, which starts nearer, has converged."""
+    scene, particles = jolted(speed=1.0, gravity=(1.0, -9.81))
+    nodes = grid_update(scene, particles, 20 * explicit_limit(scene), mpm.Explicit()).nodes
+    guess = 1e3 * nodes.explicit_velocity()
+
+    @eqx.filter_jit
+    def stages(rtol):
+        """The report, and the relative residual of either stage."""
+        method = mpm.TRBDF2(0.0, mpm.Linearised(mpm.ConjugateResidual(rtol=rtol, max_steps=25)))
+        motion, info = method.move(nodes, guess)
+        _, q0, q1, q2 = method.weights()
+        dt, v0, v, g = nodes.dt, nodes.velocity, motion.velocity, nodes.acceleration
+        middle, c, pull = motion.inner / q2 - v0, q2 * dt, nodes.per_mass(nodes.force)
+        action = method.hessian.at_rest(nodes.potential, v0)
+        a = v0 + c * (pull + 2 * g)
+        b = v0 + dt * (q0 * pull + q1 * (middle - a) / c + g)
+
+        def missed(v, inertial, u):
+            known = nodes.mass[:, None] * inertial + c * (nodes.force - action(u))
+            left = nodes.mass[:, None] * v + c**2 * action(v) - known
+            norms = [jnp.sqrt((nodes.per_mass(r) * r).sum()) for r in (left, known)]
+            return norms[0] / norms[1]
+
+        return info, missed(middle, a, c * v0), missed(v, b, dt * (q0 * v0 + q1 * middle))
+
+    info, first, second = stages(jnp.asarray(1e-14))
+    assert first > 100 * second
+    np.testing.assert_allclose(info.residual, first, rtol=1e-6)
+    rtol = 10 * second
+    info, first, second = stages(rtol)
+    assert second <= 1.001 * rtol < first / 10
+    np.testing.assert_allclose(info.residual, first, rtol=1e-6)
+    assert not info.converged
+
+
+def test_free_nodes_feel_nothing_but_force_gravity_and_viscosity():
+    """M (v^{n+1} − v^n) = the elastic impulse + that of viscosity + Δt M g on them, so that what walls and grips give
+    is nothing: viscosity resists the velocity with which each method says it does."""
+    scene, particles = jolted(speed=3.0, material=VISCOUS["viscous_solid"], gravity=(1.0, -9.81), boundary=GRIP)
+    nodes = grid_update(scene, particles, explicit_limit(jolted()[0]), mpm.SemiImplicit()).nodes
+    free = np.asarray(nodes.free)
+    for method in (mpm.SemiImplicit(0.6, solver=SOLVER), mpm.BackwardEuler(NEWTON), *METHODS.values()):
+        motion, info = move(method, nodes)
+        elastic, missed, viscous = (np.asarray(a)[free] for a in impulses(nodes, method, motion))
+        assert info.converged
+        assert np.abs(viscous).max() > 0.05 * np.abs(elastic).max()
+        assert np.abs(missed).max() < 1e-10 * np.abs(viscous).max()
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.3, 1.0])

@@ -169,6 +169,22 @@ def test_what_deforms_is_the_gradient_of_what_carries(transfer, gradient, kernel
         assert float(((given[0] - given[1]) * mean).sum()) == pytest.approx(float((impulse * slope).sum()), rel=1e-10)
 
 
+def test_what_is_kept_is_the_least_squares_gradient_of_the_new_velocity():
+    """C, which belongs to the velocity that the particles take on, not to the one that moved them, and whatever the
+    gradient operator: that of viscosity with PIC and FLIP, by the chosen operator, too."""
+    for name, gradient in GRADIENTS.items():
+        grid, _, stencil, _, v, _, _ = scattered(KERNELS["quadratic"], gradient, 2)
+        before, after, mean = (jnp.asarray(noise(grid, 2, seed)) for seed in (3, 4, 5))
+        for transfer in TRANSFERS.values():
+            operator = stencil.least_squares if transfer.affine else stencil
+            expected = jnp.swapaxes(from_nodes(operator, after)[1], 0, 1)
+            for mean_ in (None, mean):
+                C = to_particles(transfer, stencil, jnp.asarray(v), before, after, mean_, kept=True)[2]
+                assert_close(C, expected, 1e-14)
+        if name == "spline":
+            assert np.abs(from_nodes(stencil, after)[1] - from_nodes(stencil.least_squares, after)[1]).max() > 1
+
+
 def hat(order, r):
     """The B-spline at a distance of r spacings, in closed form."""
     r = abs(r)

@@ -62,12 +62,13 @@ def applied(potential, u, hessian):
 
 
 @pytest.mark.parametrize(("law", "description"), CASES)
-@pytest.mark.parametrize("hessian", [mpm.AnalyticHessian(), mpm.JvpHessian()], ids=["analytic", "jvp"])
-@pytest.mark.parametrize("d", [1, 2, 3])
+@pytest.mark.parametrize(
+    ("hessian", "d"),
+    [(mpm.JvpHessian(), 1), (mpm.JvpHessian(), 2), *((mpm.AnalyticHessian(), d) for d in DIMS)],
+    ids=["jvp-1", "jvp-2", "analytic-1", "analytic-2", "analytic-3"],
+)
 def test_the_operator_is_symmetric_and_dissipates(law, description, hessian, d):
     """⟨a, D b⟩ = ⟨D a, b⟩, a·D a = the power ≥ 0; H + rD is one matrix a particle, as through the law."""
-    if d == 3 and isinstance(hessian, mpm.JvpHessian):
-        return
     potential, u = potential_of(VISCOUS[law], d, description)
     drags, powers, elastic, action, assembled = map(np.asarray, applied(potential, u, hessian))
     work = np.einsum("anc,bnc->ab", u, drags)
