@@ -166,12 +166,12 @@ class NewtonProblem(AbstractProblem):
         return jnp.sqrt(self.mass.sum()) * self.spacing / self.length
 
     def merit(self, v: NodeVector) -> Float[Array, ""]:
-        """E(v) [J], without the constant of what is held."""
+        """E(v) [J], without the constant of what is held; NaN where a law is not defined."""
         free = self.constraint.free
         inertia = 0.5 * jnp.where(free, self.mass[:, None] * (v - self.inertial) ** 2, 0).sum()
         if self.potential.viscous:
             inertia = inertia + self.length / 2 * self.potential.power(v)
-        return inertia + self.potential.energy(self.displacement(v))
+        return inertia + self.potential.admitted_energy(self.displacement(v))
 
 
 class Linearised(eqx.Module):

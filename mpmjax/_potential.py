@@ -55,6 +55,14 @@ class ElasticPotential(eqx.Module):
         parts = [(c.volume * c.law.energy(F)).sum() for c, F in zip(self.constituents, self.displaced(u), strict=True)]
         return sum(parts[1:], parts[0])
 
+    def admitted_energy(self, u: NodeVector) -> Float[Array, ""]:
+        """Φ(u) [J], NaN where a law is not defined, whatever its formula gives there: not to be differentiated."""
+        parts = [
+            jnp.where(c.law.admits(F), c.volume * c.law.energy(F), jnp.nan).sum()
+            for c, F in zip(self.constituents, self.displaced(u), strict=True)
+        ]
+        return sum(parts[1:], parts[0])
+
     def force(self, u: NodeVector) -> NodeVector:
         """f = −∂Φ/∂u [N]: at u = 0 the reference's f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
         return -self.divergence(self._stress(self.displaced(u)), u)

@@ -80,6 +80,30 @@ def test_a_motion_is_piecewise_linear_and_rests_outside_its_times():
     assert_close(motion.at(3.0), np.array([1.0, -2.0]), 1e-15)
 
 
+def test_a_node_within_a_thousandth_of_a_spacing_of_a_wall_is_on_it():
+    """Of boxes, grips and colliders, from either side; a plane may lie off the half lattice by half as much."""
+    grid = mpm.Grid((8,), DX)
+    nodes, rest = grid.nodes(grid.window(jnp.zeros((1, 1)))), mpm.Motion((0.0,), ((0.0,),))
+    boxes = mpm.StickyBox, mpm.SlipBox, mpm.SeparatingBox
+    for share, met in ((0.9e-3, 2), (1.1e-3, 1)):
+        lower, upper = (2 - share) * DX, (5 + share) * DX  # nodes 2 and 5 are just within; 0, 1, 6 and 7 beyond
+        for box in boxes:
+            found = combine((box((lower,), (upper,)),), nodes, DX, 0.0, 0.1, reference=False)
+            held = found.fixed if found.side is None else found.side != 0
+            np.testing.assert_array_equal(
+                held[:, 0], np.isin(np.arange(8), [0, 1, 6, 7, *([2, 5] if met == 2 else [])])
+            )
+        between = mpm.Box(((2 + share) * DX,), ((5 - share) * DX,))
+        for holds in (mpm.Grip(between, rest), mpm.StickyCollider(between), mpm.SlipCollider(between)):
+            found = combine((holds,), nodes, DX, 0.0, 0.1, reference=False)
+            held = found.fixed[:, 0] if isinstance(holds, (mpm.Grip, mpm.StickyCollider)) else found.touch.held
+            np.testing.assert_array_equal(held, np.isin(np.arange(8), [3, 4, *([2, 5] if met == 2 else [])]))
+    for plane in (mpm.SymmetryPlane, mpm.ContactPlane):
+        scene_of(grid, plane(0, (2.5 + 0.45e-3) * DX))
+        with pytest.raises(ValueError, match="half the grid's spacing"):
+            scene_of(grid, plane(0, (2.5 + 0.55e-3) * DX))
+
+
 def test_the_earlier_boundary_wins():
     """Where two prescribe one component; components that only the later one prescribes are its own."""
     grid = mpm.Grid((6, 6), DX)
@@ -95,6 +119,19 @@ def test_the_earlier_boundary_wins():
     np.testing.assert_allclose(second[both & (x[:, 1] > 0.05)], np.broadcast_to([0.0, 3.0], (5, 2)), atol=1e-14)
     np.testing.assert_allclose(second[both & (x[:, 1] < 0.05)], np.zeros((1, 2)), atol=1e-14)
     np.testing.assert_allclose(first[x[:, 0] > 0.15][:, 0], 0)
+    walls = (((-np.inf, 0.1), 0.2), ((-np.inf, 0.0), 0.3), ((0.1, -np.inf), 0.4))
+    boxes = [mpm.SeparatingBox(lower, (0.4, np.inf), friction=mu) for lower, mu in walls]
+    found = combine((grip, *boxes), nodes, DX, 0.0, 0.1, reference=False)
+    open_ = x[:, 0] > 0.15  # what a grip holds, no wall does
+    np.testing.assert_array_equal(np.asarray(found.side)[~open_], 0)
+    np.testing.assert_array_equal(np.asarray(found.side)[open_, 1], x[open_, 1] < 0.15)
+    np.testing.assert_array_equal(np.asarray(found.side)[open_, 0], np.where(x[open_, 0] > 0.35, -1, 0))
+    np.testing.assert_allclose(np.asarray(found.friction)[open_ & (x[:, 1] < 0.15), 1], 0.2)
+    np.testing.assert_allclose(np.asarray(found.friction)[x[:, 0] > 0.35, 0], 0.2)
+    found = combine(tuple(boxes[2:] + boxes[:2]), nodes, DX, 0.0, 0.1, reference=False)
+    np.testing.assert_array_equal(np.asarray(found.side)[x[:, 0] < 0.15, 0], 1)
+    np.testing.assert_allclose(np.asarray(found.friction)[x[:, 1] < 0.15, 1], 0.2)
+    np.testing.assert_allclose(np.asarray(found.friction)[x[:, 0] < 0.15, 0], 0.4)
 
 
 # Two planes, at a node and half-way between two, that keep opposite sides.
@@ -175,6 +212,20 @@ def test_fold_is_the_transpose_of_unfold(d):
     folded = np.asarray(images.fold_scalar(jnp.asarray(mass.reshape(-1)))).reshape(grid.shape)
     np.testing.assert_array_equal(folded[:2], 0)
     np.testing.assert_array_equal(folded[2:5], mass[2:5] + np.stack([0 * mass[0], mass[1], mass[0]]))
+
+
+@pytest.mark.parametrize("keep", ["above", "below"])
+def test_what_has_no_image_in_the_window_is_still(keep):
+    """Nodes beyond a plane so near the window's end that theirs lie outside of it: no velocity, and no mass."""
+    grid = mpm.Grid((7,), DX)
+    position, ghosts, known = {"above": (0.55, [0, 1, 2, 3, 4, 5], [5]), "below": (0.05, [1, 2, 3, 4, 5, 6], [1])}[keep]
+    images = mirror((mpm.SymmetryPlane(0, position, keep),), grid, grid.window(jnp.zeros((1, 1))))
+    v, true = np.arange(1.0, 8.0), {"above": 6, "below": 0}[keep]
+    expected = np.zeros(7)
+    expected[true], expected[known] = v[true], -v[true]
+    np.testing.assert_array_equal(images.unfold(jnp.asarray(v[:, None]))[:, 0], expected)
+    np.testing.assert_array_equal(images.unfold_scalar(jnp.asarray(v)), np.abs(expected))
+    assert set(np.flatnonzero(expected)) <= {true, *ghosts}
 
 
 def test_fold_is_the_transpose_of_unfold_where_some_columns_are_held():

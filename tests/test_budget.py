@@ -83,7 +83,11 @@ CASES = {
     "fluid": {"material": FLUIDS["fluid"], "boundary": BOUNDARIES["walls"]},
     "semi_implicit-fluid": {"material": FLUIDS["fluid"], "method": METHODS["semi_implicit"], "transfer": mpm.PIC()},
     **{
-        f"{m}-viscous": {"material": VISCOUS["viscous_solid"], "method": method, "boundary": BOUNDARIES["walls"]}
+        f"{m}-viscous": {
+            "material": VISCOUS["viscous_solid"],
+            "method": method,
+            "boundary": BOUNDARIES["planes" if m == "explicit" else "walls"],
+        }
         for m, method in (METHODS | SECOND_ORDER).items()
     },
     "flip-total-viscous": {

@@ -115,11 +115,14 @@ def test_of_two_bodies_normals_the_earlier_holds_and_a_prescribed_component_is_a
     assert_close(v[second] @ [1.0, -1.0], np.zeros(second.sum()), 0, 1e-13)
     np.testing.assert_array_equal(np.asarray(step.nodes.conditions.touch.owner)[mass & ~first & ~second], -1)
     box = mpm.SlipBox((-np.inf, 0.3), (np.inf, np.inf))
-    steep = mpm.SlipCollider(mpm.HalfSpace((0.0, 0.3), (1e-4, 1.0)), mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.0, 5.0))))
-    step = grid_update(scene_of(grid, box, steep), particles, DT, METHODS["explicit"])
-    below = np.asarray(step.position)[:, 1] < 0.3 + 1e-9
     alone = grid_update(scene_of(grid, box), particles, DT, METHODS["explicit"])
-    assert_close(step.velocity[below], alone.velocity[below], 1e-14)
+    rising = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.0, 5.0)))
+    for tilt in (9e-3, 11e-3):  # a hundredth is what counts as parallel
+        steep = mpm.SlipCollider(mpm.HalfSpace((0.0, 0.3), (tilt, 1.0)), rising)
+        step = grid_update(scene_of(grid, box, steep), particles, DT, METHODS["explicit"])
+        below = (np.asarray(step.position)[:, 1] < 0.25) & mass
+        expected = alone.velocity[below] if tilt < 1e-2 else np.broadcast_to([5 / tilt, 0.0], (below.sum(), 2))
+        assert_close(step.velocity[below], expected, 1e-12)
 
 
 @pytest.mark.parametrize("inner", mpm.Metric)

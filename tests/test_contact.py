@@ -11,8 +11,10 @@ from numpy_oracle import grid_update
 import mpmjax as mpm
 from mpmjax._checks import canonical
 from mpmjax._contact import SWEEPS, ActiveSet, find_active_set, hold
+from mpmjax._implicit import no_solve
+from mpmjax._method import NodeMotion
 from mpmjax._nodes import particles_to_grid
-from mpmjax._step import impulses
+from mpmjax._step import impulses, update
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(solver=TIGHT)}
@@ -309,50 +311,81 @@ def test_whatever_columns_are_held_mirroring_twice_is_mirroring_once(number):
     assert partly > 10
 
 
-@pytest.mark.parametrize("wall", ["box", "plane", "collider"])
-def test_a_verdict_is_given_beyond_rounding_only(wall):
-    """Of what is held, what pulls by more than 1.5e-8 of its mass times the largest velocity, the root of the machine
-    precision; of what is not, what enters by more than 1.5e-8 of it. What the solver leaves does not count."""
-    boundary = {
-        "box": FLOORS["plain"](0.0),
-        "plane": FLOORS["mirrored"](0.0),
-        "collider": mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (3.0, 4.0))),
-    }[wall]
+def in_touch(boundary):
+    """The nodes of a block on a boundary, of which nothing is held yet."""
     grid = mpm.Grid((10, 9), DX, origin=(-4, -3))
     block = mpm.fill(mpm.Box((-0.1, 0.0), (0.3, 0.2)), grid, density=1e3)
     scene = canonical(mpm.Scene(grid, LAW, boundary=boundary), float)
     start = mpm.prepare(scene, block)
-    nodes = particles_to_grid(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start), centred=False)
-    mass, touch, up = np.asarray(nodes.mass), nodes.conditions.touch, np.array([0.0, 1.0])
-    inward, weight = up, mass
-    match wall:
-        case "box":
-            met = nodes.conditions.side[:, 1] == 1
-        case "plane":  # its columns are seen at their nodes on it
+    return particles_to_grid(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start), centred=False)
+
+
+def test_a_verdict_is_given_beyond_rounding_only():
+    """Of what is held, what pulls by more than 1.5e-8 of its mass times the largest velocity, the root of the machine
+    precision; of what is not, what enters by more than 1.5e-8 of it. What a solver leaves does not count."""
+    slope = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (3.0, 4.0)))
+    for boundary in (FLOORS["plain"](0.0), FLOORS["mirrored"](0.0), slope):
+        nodes = in_touch(boundary)
+        touch, side, mass = nodes.conditions.touch, nodes.conditions.side, np.asarray(nodes.mass)
+        inward, weight, up = np.array([0.0, 1.0]), mass, np.array([False, True])
+        if touch is not None:
+            met, inward = touch.leavable, np.asarray(touch.normal)
+        elif side is not None:
+            met = side[:, 1] == 1
+        else:  # columns are seen at their nodes on the plane
             (contact,) = nodes.contacts
             met, weight = contact.on_plane, np.asarray(contact.image.column(contact.weight(nodes.mass)))
-        case _:
-            met, inward = touch.leavable, np.asarray(touch.normal)
-    met = np.asarray(met) & (mass > 0)
+        met = np.asarray(met) & (mass > 0)
 
-    def found(held, share):
-        """How many pull where all are held, or enter where none is, by a share of the largest velocity, 3 m/s."""
-        along = np.where(met[:, None], 3 * share * inward, 0)
-        fast = np.zeros_like(along)
-        fast[-1, 0] = 3.0
-        active = ActiveSet(
-            jnp.asarray(held & met[:, None] & (up == 1)) if wall == "box" else None,
-            (jnp.full(grid.size, held),) if wall == "plane" else (),
-            jnp.asarray(held & met) if wall == "collider" else None,
-        )
-        v = fast if held else fast + along * (weight / np.where(met, mass, 1))[:, None]
-        imbalance = weight[:, None] * along if held else np.zeros_like(along)
-        return int(hold(nodes, active).count_violations(jnp.asarray(v), jnp.asarray(imbalance)))
+        def found(held, share):
+            """How many pull where all are held, or enter where none is, by a share of the largest velocity, 3 m/s."""
+            along = np.where(met[:, None], 3 * share * inward, 0)  # noqa: B023
+            fast = np.zeros_like(along)
+            fast[-1, 0] = 3.0
+            active = ActiveSet(
+                None if side is None else jnp.asarray(held & met[:, None] & up),  # noqa: B023
+                tuple(jnp.full(len(met), held) for _ in nodes.contacts),  # noqa: B023
+                None if touch is None else jnp.asarray(held & met),  # noqa: B023
+            )
+            v = fast if held else fast + along * (weight / np.where(met, mass, 1))[:, None]  # noqa: B023
+            imbalance = weight[:, None] * along if held else 0 * along  # noqa: B023
+            return int(hold(nodes, active).count_violations(jnp.asarray(v), jnp.asarray(imbalance)))  # noqa: B023
 
-    assert met.sum() > 3
-    for held in (True, False):
-        assert found(held, 1.0) == found(held, -1.4e-8) == 0
-        assert found(held, -1.6e-8) == met.sum()
+        assert met.sum() > 3
+        for held in (True, False):
+            assert found(held, 1.0) == found(held, -1.4e-8) == 0
+            assert found(held, -1.6e-8) == met.sum()
+
+
+class Stubborn(mpm.Explicit):
+    """Nodes that a wall would have to pull where it holds them, and that enter it where it does not."""
+
+    def move(self, nodes, guess):
+        del guess
+        return NodeMotion(-nodes.conditions.side), no_solve(float)
+
+
+def test_an_active_set_that_does_not_settle_is_given_up_after_four_sweeps():
+    """And what is still wrong is reported."""
+    nodes = in_touch(FLOORS["plain"](0.0))
+    pulled = eqx.tree_at(lambda n: n.velocity, nodes, jnp.ones_like(nodes.velocity))
+    new = update(pulled, Stubborn())
+    assert new.contact.sweeps == SWEEPS == 4
+    assert int(new.contact.violations) == int(((nodes.conditions.side[:, 1] == 1) & (nodes.mass > 0)).sum())
+
+
+def test_flip_at_a_contact_plane_that_holds_is_flip_at_a_symmetry_plane():
+    """It takes the change of the nodes' velocity from what it was as mirrored."""
+    scene, particles = on_a_floor("mirrored", velocity=(0.3, -1.0))
+    shaken = 0.2 * jnp.asarray(np.random.default_rng(0).normal(size=particles.v.shape))
+    particles = eqx.tree_at(lambda q: q.v, particles, particles.v + shaken)
+    planes = scene.boundary[0], mpm.SymmetryPlane(1, 0.0)
+    ends = [
+        mpm.step(mpm.Scene(scene.grid, LAW, boundary=plane, transfer=mpm.FLIP(1.0)), particles, 0.0, 1e-3)[0]
+        for plane in planes
+    ]
+    for field in ("x", "v", "F"):
+        assert_close(getattr(ends[0], field), getattr(ends[1], field), 1e-12)
 
 
 @NAMES

@@ -1,15 +1,16 @@
 """The implicit updates: what they solve, how they relate, and what they report."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DESCRIPTIONS, LAWS, assert_close, block, explicit_limit, ids
+from helpers import DESCRIPTIONS, ELASTIC, LAWS, assert_close, block, explicit_limit, ids
 from numpy_oracle import grid_update, stress
 
 import mpmjax as mpm
 from mpmjax._hessian import AnalyticHessian
-from mpmjax._implicit import LinearProblem
+from mpmjax._implicit import LinearProblem, SolveInfo
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 NEWTON = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12))
@@ -129,6 +130,56 @@ def test_line_search_backtracks_and_saves_what_one_newton_step_would_invert():
     assert info.solve.line_search > 0
     assert info.solve.converged
     assert (np.linalg.det(np.asarray(new.F)) > 0).all()
+
+
+RUBBER = mpm.NeoHookean(1e4, 0.49)  # whose stress falls from a stretch of about 4 to one of 7
+
+
+@pytest.mark.parametrize("law", [RUBBER, ELASTIC["hencky"]], ids=["neo_hookean", "hencky"])
+def test_newton_goes_downhill_from_where_the_energy_is_concave(law):
+    """A bar let go at a stretch at which its law softens, at ten times the explicit limit: Newton's direction leads
+    uphill there, and a step along the slope comes to rest undeformed, not beyond an inversion, where Hencky's formula
+    has a value and the law has none."""
+    scene, particles = block(1, material=law)
+    stretched = eqx.tree_at(lambda q: q.F, mpm.prepare(scene, particles), jnp.full((particles.count, 1, 1), 5.0))
+    new, info = mpm.step(scene, stretched, 0.0, 10 * explicit_limit(block(1)[0]), method=mpm.BackwardEuler())
+    assert info.solve.indefinite
+    assert info.solve.converged
+    np.testing.assert_allclose(new.F, 1, atol=0.01)
+
+
+def test_newton_starts_from_the_linearised_system_where_nothing_else_is_admissible():
+    """A grip that closes more than the gap to its neighbours in a step inverts them by itself, and so does rest."""
+    grip = mpm.Grip(mpm.Box((0.25,), (2.0,)), mpm.Motion((0.0, 1.0), ((0.0,), (-0.5,))))
+    scene, particles = block(1, material=LAWS["neo_hookean"], boundary=grip)
+    for guess in (mpm.Guess.GRID_VELOCITY, mpm.Guess.ZERO):
+        new, info = mpm.step(scene, particles, 0.0, 0.5, method=mpm.BackwardEuler(NEWTON.solution, guess=guess))
+        assert info.solve.converged
+        assert 0.97 < np.asarray(new.F).min() <= np.asarray(new.F).max() < 1
+        np.testing.assert_allclose(new.v, -0.5, atol=0.02)
+
+
+def test_newton_gives_up_after_thirty_halvings():
+    """Where no velocity is admissible: two grips that pass through each other."""
+    ends = ((-2.0, 0.05, 1.0), (0.25, 2.0, -1.0))
+    grips = [mpm.Grip(mpm.Box((a,), (b,)), mpm.Motion((0.0, 1.0), ((0.0,), (v,)))) for a, b, v in ends]
+    scene, particles = block(1, material=LAWS["neo_hookean"], boundary=tuple(grips))
+    _, info = mpm.step(scene, particles, 0.0, 0.5, method=mpm.BackwardEuler())
+    assert not info.solve.converged
+    assert info.solve.newton == 1
+    assert info.solve.line_search == 30
+
+
+def test_reports_of_two_solves_are_added_up():
+    """Costs are summed and negative curvature is remembered; the quality is that of the later, or of the worse one."""
+    one = SolveInfo(*map(jnp.asarray, (5, 2, 1, 0.3, False, True)))
+    two = SolveInfo(*map(jnp.asarray, (7, 3, 4, 0.1, True, False)))
+    for first, second in ((one, two), (two, one)):
+        after, beside = first.plus(second), first.beside(second)
+        for total in (after, beside):
+            assert (total.iterations, total.newton, total.line_search, total.indefinite) == (12, 5, 5, True)
+        assert (after.residual, after.converged) == (second.residual, second.converged)
+        assert (beside.residual, beside.converged) == (0.3, False)
 
 
 @pytest.mark.parametrize("times", [1, 20, 100])

@@ -44,11 +44,11 @@ def assert_same(new, expected, rtol):
 
 ORACLE_CASES = [
     (2, "updated", "mls", "apic", "fixed_corotated", STICKY),
-    (2, "updated", "spline", "flip", "neo_hookean", SLIP),
     (2, "total", "spline", "apic", "neo_hookean", SLIP),
     (2, "total", "mls", "pic", "fixed_corotated", GRIP),
     (3, "updated", "spline", "apic", "fixed_corotated", SLIP),
     (1, "updated", "mls", "apic", "neo_hookean", STICKY),
+    (2, "updated", "spline", "flip", "neo_hookean", SLIP),
 ]
 
 
@@ -66,8 +66,8 @@ def test_explicit_step_agrees_with_numpy_and_with_itself_uncompiled(choices):
 
 SEMI_IMPLICIT_CASES = [
     (2, "updated", "mls", "apic", "fixed_corotated", STICKY, 1.0),
-    (2, "total", "spline", "flip", "neo_hookean", GRIP, 0.5),
     (1, "updated", "spline", "pic", "neo_hookean", STICKY, 0.75),
+    (2, "total", "spline", "flip", "neo_hookean", GRIP, 0.5),
 ]
 
 

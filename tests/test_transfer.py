@@ -169,18 +169,21 @@ def test_what_deforms_is_the_gradient_of_what_carries(transfer, gradient, kernel
         assert float(((given[0] - given[1]) * mean).sum()) == pytest.approx(float((impulse * slope).sum()), rel=1e-10)
 
 
-def test_what_is_kept_is_the_least_squares_gradient_of_the_new_velocity():
-    """C, which belongs to the velocity that the particles take on, not to the one that moved them, and whatever the
-    gradient operator: that of viscosity with PIC and FLIP, by the chosen operator, too."""
+def test_velocity_and_its_gradient_are_those_of_the_new_velocity():
+    """Not of the one that moves the particles: v, and C by moving least squares with APIC, whatever the gradient
+    operator, and by the chosen one where PIC and FLIP keep it for viscosity."""
     for name, gradient in GRADIENTS.items():
         grid, _, stencil, _, v, _, _ = scattered(KERNELS["quadratic"], gradient, 2)
         before, after, mean = (jnp.asarray(noise(grid, 2, seed)) for seed in (3, 4, 5))
         for transfer in TRANSFERS.values():
             operator = stencil.least_squares if transfer.affine else stencil
             expected = jnp.swapaxes(from_nodes(operator, after)[1], 0, 1)
+            alpha = transfer.alpha if isinstance(transfer, mpm.FLIP) else 0.0
+            ends = [from_nodes(stencil, a)[0] for a in (after, after - before)]
             for mean_ in (None, mean):
-                C = to_particles(transfer, stencil, jnp.asarray(v), before, after, mean_, kept=True)[2]
+                _, new, C, _ = to_particles(transfer, stencil, jnp.asarray(v), before, after, mean_, kept=True)
                 assert_close(C, expected, 1e-14)
+                assert_close(new, (1 - alpha) * ends[0] + alpha * (v + ends[1]), 1e-14)
         if name == "spline":
             assert np.abs(from_nodes(stencil, after)[1] - from_nodes(stencil.least_squares, after)[1]).max() > 1
 
