@@ -92,7 +92,8 @@ def explicit_limit(scene: mpm.Scene) -> float:
 
 
 def assert_close(a: Array, b: Array, rtol: float = 1e-12, atol: float = 0.0) -> None:
-    """Relative to the largest entry, since rounding is."""
+    """Relative to the largest entry, since rounding is. Nothing is close to NaN, and there must be something."""
     a, b = np.asarray(a), np.asarray(b)
+    assert a.size > 0, "nothing to compare"
     scale = max(np.abs(a).max(initial=0), np.abs(b).max(initial=0))
-    np.testing.assert_allclose(a, b, rtol=0, atol=rtol * scale + atol)
+    np.testing.assert_allclose(a, b, rtol=0, atol=rtol * scale + atol, equal_nan=False)

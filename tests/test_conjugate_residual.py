@@ -201,6 +201,56 @@ def test_breakdown_is_reported(A):
     np.testing.assert_allclose(stats["residual"], true_residual(A, x, b))
 
 
+def test_breakdown_is_known_from_rounding():
+    """What of rᵀA r = 0 the rounding of its sum leaves, some tenths of ε‖r‖‖A r‖, is a breakdown and no negative
+    curvature; four thousand times that is what it looks like."""
+    solver = mpm.ConjugateResidual(max_steps=5)
+
+    @jax.jit
+    def report(diagonal, b):
+        like = jax.ShapeDtypeStruct(b.shape, b.dtype)
+        plain = lx.FunctionLinearOperator(lambda u: diagonal * u, like, lx.symmetric_tag)
+        _, result, stats = solver.compute(plain, b, {})
+        return result == R.breakdown, stats["indefinite"], stats["num_steps"]
+
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        c, u, order = rng.uniform(1, 10, 12), rng.normal(size=12), rng.permutation(N)
+        b = jnp.asarray(np.r_[u, u][order])
+        assert report(jnp.asarray(np.r_[c, -c][order]), b) == (True, False, 1)
+        assert report(jnp.asarray(np.r_[c, -c * (1 + 2e-12)][order]), b) == (False, True, 5)
+
+
+@pytest.mark.parametrize("share", [0.4, 0.6])
+def test_it_goes_on_while_the_true_residual_halves(share):
+    """An operator that is off on small vectors, so that each pass of the recurrence leaves a share of the residual that
+    it believes to be gone: with less than half of it the solution is found, with more the iteration has stagnated, says
+    so, and does not go on for the thousand steps that it has."""
+    b = vectors()[0] / np.linalg.norm(vectors()[0])
+
+    def off(u):
+        return u * jnp.where(jnp.linalg.norm(u) < 0.5, 1 / (1 - share), 1.0)
+
+    plain = lx.FunctionLinearOperator(off, jax.ShapeDtypeStruct(b.shape, b.dtype), lx.symmetric_tag)
+    x, result, stats = mpm.ConjugateResidual().compute(plain, jnp.asarray(b), {"y0": jnp.asarray(0.6 * b)})
+    if share < 0.5:
+        assert result == R.successful
+        assert_close(x, b, 1e-8)
+        assert 10 < stats["num_steps"] < 30
+    else:
+        assert result == R.stagnation
+        assert stats["num_steps"] < 5
+
+
+def test_a_residual_above_a_twentieth_is_never_accepted():
+    """However large the rounding of its own evaluation: 400 times the right-hand side here, in float32."""
+    A = jnp.diag(jnp.asarray([1.0, 2.0, 1e-8], jnp.float32))
+    b, y0 = (jnp.asarray(a, jnp.float32) for a in ((1.3, 1.3, 10.0), (0.0, 0.0, 1e9)))
+    _, result, stats = solve(mpm.ConjugateResidual(max_steps=1), A, b, None, y0)
+    np.testing.assert_allclose(stats["residual"], 0.0572, atol=1e-4)
+    assert result == R.max_steps_reached
+
+
 def test_running_out_of_steps_is_reported():
     """`max_steps` steps, no more; raised by `lineax.linear_solve`."""
     A, (b, _, _) = symmetric("definite"), vectors()

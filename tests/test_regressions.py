@@ -11,7 +11,6 @@ import pytest
 from helpers import block
 
 import mpmjax as mpm
-from mpmjax._conjugate_residual import LARGEST_RESIDUAL
 from mpmjax._diagnostics import _energy
 from mpmjax._kernel import in_window
 
@@ -22,7 +21,7 @@ def bar(**options):
 
 
 def test_newton_never_accepts_a_residual_of_order_one():
-    """In float32, far beyond the explicit limit, where rounding exceeds the right-hand side."""
+    """None above a twentieth: in float32, far beyond the explicit limit, where rounding exceeds the right-hand side."""
     grid = mpm.Grid((10, 12), 0.1, origin=(-3, -3))
     jelly = mpm.fill(mpm.Box((0.0, 0.0), (0.3, 0.3)), grid, particles_per_cell=4, density=1e3, dtype="float32")
     walls = mpm.SlipBox((-0.2, 0.0), (0.6, np.inf))
@@ -30,7 +29,7 @@ def test_newton_never_accepts_a_residual_of_order_one():
     particles = jelly
     for n in range(4):
         particles, info = mpm.step(scene, particles, n * 5e-3, 5e-3, method=mpm.BackwardEuler())
-        assert bool(info.solve.converged) <= (float(info.solve.residual) <= LARGEST_RESIDUAL)
+        assert bool(info.solve.converged) <= (float(info.solve.residual) <= 0.05)
 
 
 def test_newton_keeps_a_good_guess_where_the_grip_alone_would_invert():

@@ -208,6 +208,17 @@ def test_bound_of_a_viscous_particle_from_both_sides(d, transfer, shear, bulk):
             assert eigenvalues(scene, one, 1.001 * bound, method).real.min() < -1
 
 
+@pytest.mark.parametrize("stretch", [0.6, 1.5])
+def test_bound_of_viscosity_in_the_total_description_from_both_sides(stretch):
+    """Whose gradients are of the reference: a stretched particle's flow is 1/F times as steep, and so is its force."""
+    for transfer in (mpm.APIC(), mpm.PIC()):
+        options = {"transfer": transfer, "place": 2.2637, "description": mpm.TotalLagrangian()}
+        scene, one = alone(1, stretch, law=mpm.Viscous(LAW, 200.0, 70.0), **options)
+        bound = float(mpm.stable_dt(scene, one, safety=1.0))
+        assert eigenvalues(scene, one, 0.999 * bound).real.min() > -1 - 1e-9
+        assert eigenvalues(scene, one, 1.001 * bound).real.min() < -1
+
+
 def left(scene, particles, dt, steps=300):
     """|F − I| after so many steps, relative to what it was."""
     final = mpm.rollout(scene, particles, steps=steps, dt=dt)
