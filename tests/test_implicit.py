@@ -159,6 +159,41 @@ def test_newton_starts_from_the_linearised_system_where_nothing_else_is_admissib
         np.testing.assert_allclose(new.v, -0.5, atol=0.02)
 
 
+def test_newton_starts_from_rest_where_the_potential_is_lower_there():
+    """As from the explicit velocity at 20 times the limit: the same path as from rest, to the last bit. From the grid's
+    velocity, where it is not, another one."""
+    scene, particles = block(1, material=LAWS["neo_hookean"])
+    F = 1 + 0.05 * np.random.default_rng(0).normal(size=(particles.count, 1, 1))
+    moving = jnp.ones_like(particles.v)
+    particles = eqx.tree_at(lambda q: (q.v, q.F), mpm.prepare(scene, particles), (moving, jnp.asarray(F)))
+    nodes = grid_update(scene, particles, 20 * explicit_limit(scene), mpm.Explicit()).nodes
+    move = eqx.filter_jit(lambda guess: NEWTON.move(nodes, guess))
+    rest, far, near = map(move, (0 * nodes.velocity, nodes.explicit_velocity(), nodes.velocity))
+    jax.tree.map(np.testing.assert_array_equal, rest, far)
+    for motion, info in (rest, near):
+        assert info.converged
+        assert_close(motion.velocity, rest[0].velocity, 1e-9)
+    assert near[1].residual != rest[1].residual
+
+
+def test_the_derivative_of_a_newton_step_with_a_projected_hessian_is_the_equations():
+    """That of the true Hessian, where it is not positive: a projection changes Newton's way alone."""
+    scene, particles = block(1, material=RUBBER)
+    stretched = eqx.tree_at(lambda q: q.F, mpm.prepare(scene, particles), jnp.full((particles.count, 1, 1), 5.0))
+    dt = 2 * explicit_limit(block(1)[0])
+
+    def end(gravity, hessian):
+        pulled = eqx.tree_at(lambda s: s.gravity, scene, gravity[None])
+        return mpm.step(pulled, stretched, 0.0, dt, method=mpm.BackwardEuler(NEWTON.solution, hessian))[0].x[-1, 0]
+
+    exact, projected = (
+        jax.jvp(lambda g, h=h: end(g, h), (jnp.asarray(1.0),), (jnp.asarray(1.0),))
+        for h in (mpm.AnalyticHessian(), mpm.AnalyticHessian(projected=True))
+    )
+    assert_close(projected[0], exact[0], 1e-11)
+    assert_close(projected[1], exact[1], 1e-7)
+
+
 def test_newton_gives_up_after_thirty_halvings():
     """Where no velocity is admissible: two grips that pass through each other."""
     ends = ((-2.0, 0.05, 1.0), (0.25, 2.0, -1.0))
