@@ -37,7 +37,7 @@ class Nodes(eqx.Module):
     velocity: NodeVector
     """v_i^n [m/s], shape (n, d); zero on empty nodes. Plus Δt f_i/m_i where P2G has added the force's impulse."""
     occupied: Bool[Array, "n 1"]
-    """Whether the node has mass beyond rounding, shape (n, 1)."""
+    """Whether the node has mass beyond rounding, that of the lightest particle, shape (n, 1)."""
     acceleration: Array
     """Body acceleration g [m/s²], shape (d,), or (n, d) where it varies."""
     force: NodeVector
@@ -164,7 +164,8 @@ def particles_to_grid(
         if resisted is not None and not apart:
             flux = flux + potential.drag_flux(resisted)
         mass, momentum = p2g(stencil, particles.mass, v, affine, grid.size, -dt * flux if kicked else None)
-        occupied = (mass > jnp.finfo(mass.dtype).eps * particles.mass.mean())[:, None]
+        lightest = particles.mass.min()  # a mean would empty the nodes of a body much lighter than the others
+        occupied = (mass > jnp.finfo(mass.dtype).eps * lightest)[:, None]
         full = jnp.where(occupied, mass[:, None], 1)
         if scene.body_force is not None:
             x, at = (particles.x + dt / 2 * particles.v, t + dt / 2) if centred else (particles.x, t)

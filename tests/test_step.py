@@ -175,6 +175,32 @@ def test_explicit_step_conserves_linear_momentum(transfer, description):
     assert_close(final.mass @ final.v, particles.mass @ particles.v, 1e-12)
 
 
+@pytest.mark.parametrize("contrast", [1e6, 1e12])
+@pytest.mark.parametrize("gradient", **ids(GRADIENTS))
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_a_light_body_flies_as_freely_as_a_heavy_one(dtype, gradient, contrast):
+    """Its velocity, and what it owes to its first, after 100 steps beside a body heavier by the contrast."""
+    grid = mpm.Grid((20, 10), 0.1, origin=(-2, -2))
+    boxes = mpm.Box((0.03, 0.04), (0.33, 0.34)), mpm.Box((1.03, 0.04), (1.33, 0.34))
+    pair = [
+        mpm.fill(place, grid, particles_per_cell=4, density=rho)
+        for place, rho in zip(boxes, (1e3, 1e3 / contrast), strict=True)
+    ]
+    particles = jax.tree.map(lambda a: a.astype(dtype), mpm.join(*pair))
+    laws = [mpm.NeoHookean(stiffness, 0.3) for stiffness in (1e4, 1e4 / contrast)]
+    scene, light, speed = mpm.Scene(grid, laws, gradient=gradient), pair[0].count, jnp.asarray([-0.1, 0.2], dtype)
+
+    def final(speed):
+        moving = eqx.tree_at(lambda q: q.v, particles, particles.v.at[light:].set(speed))
+        v = mpm.rollout(scene, moving, steps=100, dt=2e-3).v[light:]
+        return v.mean(axis=0), v
+
+    slope, v = jax.jacfwd(final, has_aux=True)(speed)
+    rounding = 100 * float(jnp.finfo(dtype).eps)
+    assert_close(v, np.broadcast_to(speed, v.shape), rounding)
+    assert_close(slope, np.eye(2), rounding)
+
+
 @pytest.mark.parametrize("dt", [0.0, -1e-3, np.nan])
 def test_a_step_must_be_positive(dt):
     """dt is refused with its value."""
