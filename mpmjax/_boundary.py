@@ -34,9 +34,11 @@ class Touch(eqx.Module):
     holder: Int[Array, "n d"]
     """Number of the collider that prescribes each component, −1 for none, shape (n, d)."""
     position: NodeVector
-    """The nodes' positions [m], shape (n, d)."""
+    """Where the nodes are [m], shape (n, d): in the total description those that are held have moved with the body."""
     pivots: Float[Array, "k d"]
     """The points about which the colliders' torques are taken [m], shape (k, d)."""
+    pivot_velocity: Float[Array, "k d"]
+    """Their velocity [m/s], shape (k, d)."""
     leavable: Bool[Array, "n"] | None = None
     """Whether the node may leave, shape (n,); None where there is no such collider."""
     friction: NodeScalar | None = None
@@ -55,17 +57,24 @@ class Touch(eqx.Module):
             return jnp.where(mine, a, b)
 
         mine = self.owner >= 0
+        touched = mine | (self.holder >= 0).any(axis=1)
         return Touch(
             normal=jnp.where(mine[:, None], self.normal, later.normal),
             velocity=jnp.where(mine[:, None], self.velocity, later.velocity),
             held=jnp.where(mine, self.held, later.held),
             owner=jnp.where(mine, self.owner, numbered(later.owner)),
             holder=jnp.where(self.holder >= 0, self.holder, numbered(later.holder)),
-            position=self.position,
+            position=jnp.where(touched[:, None], self.position, later.position),
             pivots=jnp.concatenate([self.pivots, later.pivots]),
+            pivot_velocity=jnp.concatenate([self.pivot_velocity, later.pivot_velocity]),
             leavable=joined(self.leavable, later.leavable),
             friction=joined(self.friction, later.friction),
         )
+
+    def after(self, time: Scalar, velocity: NodeVector) -> "Touch":
+        """The same with nodes and pivots where they are some time [s] later, the nodes moving with a velocity [m/s]."""
+        moved = self.position + time * velocity, self.pivots + time * self.pivot_velocity
+        return eqx.tree_at(lambda c: (c.position, c.pivots), self, moved)
 
 
 class Conditions(eqx.Module):

@@ -61,8 +61,9 @@ class StickyCollider(AbstractCollider):
             held=jnp.zeros(len(nodes), bool),
             owner=jnp.full(len(nodes), -1, jnp.int32),
             holder=jnp.where(fixed, 0, -1).astype(jnp.int32),
-            position=nodes,
+            position=body.position,
             pivots=body.pivot[None],
+            pivot_velocity=body.pivot_velocity[None],
         )
         return Conditions(fixed, jnp.where(fixed, body.velocity, 0), touch=touch)
 
@@ -154,14 +155,20 @@ class _Body(eqx.Module):
     """The nodes in the shape's own frame [m], shape (n, d)."""
     velocity: NodeVector
     """That of the body at the nodes [m/s], shape (n, d)."""
+    position: NodeVector
+    """Where the nodes are that move with it [m], shape (n, d)."""
     pivot: Float[Array, "d"]
+    pivot_velocity: Float[Array, "d"]
 
     def __init__(self, collider: AbstractCollider, nodes: NodeVector, t: Scalar, dt: Scalar, reference: bool):
         motion = canonical(still(collider.dim), nodes.dtype) if collider.motion is None else collider.motion
         self.nodes, self.shape, self.motion, self.t = nodes, collider.shape, motion, t
         self.place = nodes if reference else motion.origin(nodes, t)
         self.velocity = motion.velocity_of(self.place, t, dt)
-        self.pivot = motion.pivot(jnp.asarray(collider.shape.middle(), nodes.dtype), t)
+        self.position = nodes + motion.place(nodes, t) - motion.place(nodes, 0.0) if reference else nodes
+        middle = jnp.asarray(collider.shape.middle(), nodes.dtype)
+        self.pivot = motion.pivot(middle, t)
+        self.pivot_velocity = (motion.pivot(middle, t + dt) - self.pivot) / dt
 
     def holds(self, spacing: Scalar) -> Bool[Array, "n"]:
         """The nodes that lie in it."""
@@ -179,6 +186,7 @@ class _Body(eqx.Module):
             held=held,
             owner=jnp.where(held, 0, -1).astype(jnp.int32),
             holder=jnp.full(self.nodes.shape, -1, jnp.int32),
-            position=self.nodes,
+            position=self.position,
             pivots=self.pivot[None],
+            pivot_velocity=self.pivot_velocity[None],
         )

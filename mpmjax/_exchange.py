@@ -21,7 +21,10 @@ class Exchange(eqx.Module):
     """Impulse [kg m/s], friction included."""
     angular: Float[Array, "*f k r"]
     """Angular impulse [kg m²/s] about the centre of the collider's rotation, or where it has none about its shape's
-    middle, as it moves: of r = 1 component in 2-D, 3 in 3-D, none in 1-D."""
+    middle, as it moves: of r = 1 component in 2-D, 3 in 3-D, none in 1-D. Nodes and centre are taken where they are as
+    the step begins, with methods of second order half-way through it: about these places the moments of all impulses
+    are the change of angular momentum, Σ x^n × m Δv = Δ Σ x × m v where x moves with v^{n+1}, and
+    Σ ½(x^n + x^{n+1}) × m Δv where it moves with the mean."""
 
     def plus(self, later: "Exchange") -> "Exchange":
         """Both together."""

@@ -29,6 +29,10 @@ class AbstractMotion(eqx.Module):
         """The points X that are at x at time t [m], each (m, d)."""
 
     @abc.abstractmethod
+    def place(self, X: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """The places x of the points X at time t [m], each (m, d)."""
+
+    @abc.abstractmethod
     def turned(self, a: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
         """Vectors that turn with the body, at time t, each (m, d)."""
 
@@ -71,6 +75,10 @@ class Motion(AbstractMotion):
     def origin(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
         """x less the displacement."""
         return x - self.at(t)
+
+    def place(self, X: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """X and the displacement."""
+        return X + self.at(t)
 
     def turned(self, a: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
         """As they are."""
@@ -140,6 +148,11 @@ class RigidMotion(AbstractMotion):
         """c + Rᵀ (x − c − d)."""
         centre = jnp.asarray(self.centre, x.dtype)
         return centre + _turn(x - centre - self.at(t), -self.rotation_at(t))
+
+    def place(self, X: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """c + d + R (X − c)."""
+        centre = jnp.asarray(self.centre, X.dtype)
+        return centre + self.at(t) + _turn(X - centre, self.rotation_at(t))
 
     def turned(self, a: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
         """R a."""

@@ -172,6 +172,11 @@ def particles_to_grid(
             push = particles.mass * components(scene.body_force.acceleration(x, at))
             force = spread(stencil, push, None, grid.size)
             acceleration = acceleration + jnp.where(occupied, force / full, 0)
+        conditions = combine(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total)
+        if scene.total and conditions.touch is not None and scene.slides:
+            slid = (conditions.touch.owner >= 0)[:, None] & occupied
+            place = jnp.where(slid, _place(particles, stencil, grid.size) / full, conditions.touch.position)
+            conditions = eqx.tree_at(lambda c: c.touch.position, conditions, place)
         nodes = Nodes(
             mass=jnp.where(occupied[:, 0], mass, 0),
             velocity=jnp.where(occupied, momentum / full, 0),
@@ -181,10 +186,16 @@ def particles_to_grid(
             dt=jnp.asarray(dt),
             spacing=jnp.asarray(grid.spacing),
             potential=potential,
-            conditions=combine(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total),
+            conditions=conditions,
             viscous=None
             if resisted is None or not apart
             else -potential.sum_of(potential.drag_flux(resisted), momentum),
             contacts=contacts(scene.boundary, grid, window),
         )
         return nodes.folded(mirror(scene.boundary, grid, window))
+
+
+def _place(particles: Particles, stencil: Stencil, size: int) -> NodeVector:
+    """The places of reference nodes times their mass, Σ_p w_ip m_p (x_p + F_p (X_i − X_p)) [kg m], shape (n, d)."""
+    F = jnp.concatenate([components(group) for group in jax.tree.leaves(particles.F)], axis=-1)
+    return p2g(stencil, particles.mass, components(particles.x), F, size)[1]

@@ -171,6 +171,11 @@ class Scene(eqx.Module):
         return sum(isinstance(boundary, AbstractCollider) for boundary in self.boundary)
 
     @property
+    def slides(self) -> bool:
+        """Whether there is a collider along which material slides and which it does not leave."""
+        return any(isinstance(boundary, SlipCollider) for boundary in self.boundary)
+
+    @property
     def total(self) -> bool:
         """Whether the description is total Lagrangian."""
         return isinstance(self.description, TotalLagrangian)

@@ -77,6 +77,8 @@ def advance(
     new = update(nodes, method)
     outside = (~stencil.inside).sum().astype(jnp.int32)
     touch = nodes.conditions.touch
+    if touch is not None and new.motion.mean is not None:
+        touch = touch.after(dt / 2, new.motion.mean)
     exchange = None if touch is None else received(touch, new.reaction, new.push, new.rub)
     after = scene.return_map(grid_to_particles(scene, particles, nodes, new))
     if exchange is not None and after.received is not None:

@@ -235,33 +235,6 @@ def test_what_colliders_receive_is_what_the_material_loses(method, d):
     assert info.contact.violations == 0
 
 
-@pytest.mark.parametrize("d", [2, 3])
-def test_angular_momentum_goes_to_the_colliders_too(d):
-    """In an explicit step with APIC, exactly: change + Σ (angular impulse + pivot × impulse) = gravity's moment."""
-    grid, particles = landing(d)
-    sticky = mpm.StickyCollider(mpm.Ball((0.4,) * d, 0.15), ROLLING if d == 2 else ROLLING_3D)
-    scene = scene_of(grid, *obstacles(0.3, d), sticky)
-    dt = 0.3 * explicit_limit(scene)
-    before = mpm.prepare(scene, particles)
-    after, info = mpm.step(scene, before, 0.0, dt)
-
-    def moment(q):
-        x, v, m = (np.asarray(a) for a in (q.x, q.v, q.mass))
-        skew = DX**2 / 4 * np.asarray(q.C - q.C.transpose(0, 2, 1))  # Σ w (x_i − x_p) × C (x_i − x_p), D = DX²/4
-        spin = np.stack([skew[:, i, j] for i, j in ([(2, 1), (0, 2), (1, 0)] if d == 3 else [(1, 0)])], axis=1)
-        return (m[:, None] * (cross(x, v) + spin)).sum(axis=0)
-
-    def cross(a, b):
-        return np.cross(a, b) if d == 3 else (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])[..., None]
-
-    pivots = np.array([[0.2, -0.2, 0.2], [0.1] * 3, (0.31, 0.02, 0.0) if d == 2 else (0.3, 0.0, 0.3)])[:, :d]
-    given = np.asarray(info.colliders.angular) + cross(pivots, np.asarray(info.colliders.impulse))
-    mass = np.asarray(before.mass)[:, None]
-    gravity = (mass * dt * cross(np.asarray(before.x), np.broadcast_to(G[:d], before.x.shape))).sum(axis=0)
-    assert_close(moment(after) - moment(before) + given.sum(axis=0), gravity, 1e-11, 1e-11 * np.abs(given).max())
-    assert np.abs(info.colliders.angular).min() > 0
-
-
 def test_forces_on_colliders_against_time(tmp_path):
     """Between frames the mean force is the impulses of the steps over the time; restarted from a file it goes on from
     where it was; a block presses on the ground with its weight and what its momentum loses."""
