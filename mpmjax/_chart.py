@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mpmjax._aside import replacing, save_figure
 from mpmjax._work_precision import WorkPrecision, name_of
 
 
@@ -36,14 +37,14 @@ def draw_chart(found: WorkPrecision, path: Path) -> Path:
     axes.set_title("x failed, > foreseen; grey: less than the reference's own uncertainty", fontsize=9)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7)
-    figure.savefig(path, dpi=140)
+    save_figure(figure, path, 140)
     plt.close(figure)
     return path
 
 
 def write_trials(found: WorkPrecision, path: Path) -> Path:
     """The trials as CSV; an error of inf is a run that failed, of nan one that was foreseen to take too long."""
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with replacing(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file, lineterminator="\n")
         rows.writerow(["method", "refinement", "dt_s", "steps", "seconds", "error"])
         rows.writerows([name_of(t.method), *t[1:]] for t in found.trials)

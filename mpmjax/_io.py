@@ -7,14 +7,16 @@
                 it; with colliders `received`, what each had received by then: impulse, then angular impulse
 
 Whatever is not in a dataset with checksums lies in headers that HDF5 checks itself, so a flipped bit is found. `NSteps`
-is raised last, and what lies beyond it, the remains of a writer that was killed, is neither read nor kept.
+is raised last, and what lies beyond it, the remains of a writer that was killed, is neither read nor kept. A frame that
+the disk does not take leaves the file as it was (see `_staged`).
+
+A file is read only if it holds all of its data itself: HDF5 follows links to other files, and would write into them.
 """
 
 import json
 import os
-import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from dataclasses import fields, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -26,22 +28,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mpmjax._aside import reason, replacing
 from mpmjax._checks import canonical, is_traced, require
 from mpmjax._diffrax import Tally, no_steps
 from mpmjax._exchange import Exchange
+from mpmjax._hdf5 import (
+    FORMAT,
+    LIBVER_HEAD,
+    check_hdf5,
+    check_no_writer,
+    check_place,
+    check_whole,
+    opened,
+    reading,
+    staged_file,
+)
 from mpmjax._method import Method
 from mpmjax._particles import Particles, State, state_of, with_state
 from mpmjax._run import Run
 from mpmjax._scene import Scene, prepare
 from mpmjax._schema import decode, encode
+from mpmjax._staged import StagedFile
 from mpmjax._vtkhdf import File, add_fixed, add_growing, add_topology, count_in, rows_of, set_count, states_in
 
-_FORMAT = 3
-_LIBVER = ("v110", "v110")  # what "latest" writes, VTK 9.7 cannot read
-_LIBVER_HEAD = ("v108", "v108")
 _UNITS = "SI: m, s, kg, Pa; deformation_gradient and J are pure numbers, affine_velocity is in 1/s"
 _UNCHANGING = ("mass", "volume", "X")
-_REMEDY = "restore it from a copy, or run the simulation again"
 
 
 class FrameWriter:
@@ -50,9 +61,10 @@ class FrameWriter:
     A context manager: leaving it closes the file.
     """
 
-    def __init__(self, file: File, path: Path, like: State):
+    def __init__(self, file: File, staged: StagedFile, path: Path, like: State):
         """Use `create` or `resume`."""
-        self._file, self._path, self._like = file, path, like
+        self._file, self._staged, self._path, self._like = file, staged, path, like
+        self._kept = self._standing()
 
     @classmethod
     def create(
@@ -73,26 +85,37 @@ class FrameWriter:
             particles: prepared particles (see `prepare`); their state is not written.
             method: the method.
             dt: step [s].
-            overwrite: replace a file that is there.
+            overwrite: replace a run's file that is there.
 
         Raises:
-            ValueError: a file that is there, a place that cannot be written, an object that files cannot hold.
+            ValueError: a file that is there, and with `overwrite` one that is no run or is being written; a place that
+                cannot be written; an object that files cannot hold.
+            OSError: the disk has no room for it; no file is left.
         """
         path = Path(path)
         described = _describe(scene, particles, method, dt)
+        _check_readable(path, described)
         rows = _rows(0, 0, described["dt"], state_of(particles), no_steps(particles.x.dtype))
-        require(
-            overwrite or not path.exists(),
-            f"{path} exists: choose another name, remove it, or ask to overwrite or to resume it.",
-        )
-        file = _opened(path, "w")
-        add_topology(file, particles.count)
-        file.create_group("mpmjax/arrays")
-        for name, data in rows.items():
-            add_growing(file, name, data)
-        _write_description(file["mpmjax"], described)
-        file.flush()
-        return cls(file, path, state_of(particles))
+        check_place(path, overwrite=overwrite)
+        staged = staged_file(path, new=True)
+        try:
+            staged.clear()
+            h5py.File(staged, "w", libver=LIBVER_HEAD).close()
+            file = opened(staged, path)
+            add_topology(file, particles.count)
+            file.create_group("mpmjax/arrays")
+            for name, data in rows.items():
+                add_growing(file, name, data)
+            _write_description(file["mpmjax"], described)
+            file.flush()
+            staged.commit()
+        except BaseException as error:
+            staged.close()
+            path.unlink(missing_ok=True)
+            if isinstance(error, OSError):
+                raise OSError(f"{path} was not begun: {reason(error)}. Make room, or name another place.") from None
+            raise
+        return cls(file, staged, path, state_of(particles))
 
     @classmethod
     def resume(
@@ -103,19 +126,32 @@ class FrameWriter:
         Frames that a killed writer left incomplete are cut off.
 
         Raises:
-            ValueError: see `load`; a scene, particles, method or dt that differ from the file's.
+            ValueError: see `load`; a file that is being written; a scene, particles, method or dt that differ from the
+                file's.
         """
         path = Path(path)
         described = _describe(scene, particles, method, dt)
         rows = _rows(0, 0, described["dt"], state_of(particles), no_steps(particles.x.dtype))
-        with _reading(path) as file:
-            _check_whole(file)
-            _check_same(path, described, _description(file["mpmjax"]))
-            require(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
-        file = _opened(path, "r+")
-        for name, data in rows.items():
-            file[name].resize(count_in(file) * len(data), axis=0)
-        return cls(file, path, state_of(particles))
+        check_hdf5(path)
+        staged = staged_file(path)
+        try:
+            with reading(path) as file:
+                check_whole(file)
+                _check_same(path, described, _description(file["mpmjax"]))
+                require(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
+            file = opened(staged, path)
+            count = count_in(file)
+            if any(len(file[name]) != count * len(data) for name, data in rows.items()):
+                for name, data in rows.items():
+                    file[name].resize(count * len(data), axis=0)
+                file.flush()
+                staged.commit()
+        except BaseException as error:
+            staged.close()
+            if isinstance(error, OSError):
+                raise OSError(f"{path} could not be written ({reason(error)}); it is as it was.") from None
+            raise
+        return cls(file, staged, path, state_of(particles))
 
     def append(self, step: int, state: State, tally: Tally) -> None:
         """Write a frame; one of the last frame's step replaces it.
@@ -126,7 +162,7 @@ class FrameWriter:
             tally: of the run up to it.
 
         Raises:
-            OSError: the disk refused. The frames before are whole.
+            OSError: the disk refused. The file is what it was before, and this writer can only be closed.
         """
         file, n = self._file, count_in(self._file)
         if n and file["mpmjax/frames"][n - 1]["step"] == step:
@@ -136,12 +172,13 @@ class FrameWriter:
                 file[name].resize((n + 1) * len(rows), axis=0)
                 file[name][n * len(rows) :] = rows
             file.flush()
+            self._staged.commit()
             set_count(file, n + 1)
             file.flush()
+            self._staged.commit()
         except (OSError, RuntimeError) as error:
-            raise OSError(
-                f"{self._path}: frame {n} could not be written ({_reason(error)}); the frames before it are kept."
-            ) from None
+            raise OSError(f"frame {n} could not be written ({reason(error)})") from None
+        self._kept = self._standing()
 
     def last(self) -> tuple[int, State, Tally]:
         """Step number, state and tally of the last frame."""
@@ -149,9 +186,33 @@ class FrameWriter:
         steps, states, tallies = _frames(self._file, self._like, n - 1, n)
         return int(steps[0]), *jax.tree.map(lambda a: a[0], (states, tallies))
 
+    def standing(self) -> str:
+        """What the file holds, as a sentence. It asks nobody, so that any thread may ask it at any time."""
+        frames, step, time = self._kept
+        if frames == 0:
+            return f"{self._path} holds no frame yet."
+        return f"{self._path} holds {frames} frame{'s' * (frames > 1)}, the last of step {step} (t = {time:.6g} s)."
+
+    def _standing(self) -> tuple[int, int, float]:
+        """The number of frames, and the last one's step and time [s]."""
+        n = count_in(self._file)
+        step = int(self._file["mpmjax/frames"][n - 1]["step"]) if n else 0
+        return n, step, step * float(self._file["mpmjax"].attrs["dt"])
+
     def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Close the file.
+
+        Raises:
+            OSError: what was written cannot be brought to the disk.
+        """
+        with suppress(OSError, RuntimeError):  # of a writer that failed; what it has not committed is dropped
+            self._file.close()
+        try:
+            self._staged.sync()
+        except OSError as error:
+            raise OSError(f"{self._path} may not be whole on the disk ({reason(error)}): check it.") from None
+        finally:
+            self._staged.close()
 
     def __enter__(self) -> "FrameWriter":
         return self
@@ -168,25 +229,35 @@ def save(path: str | os.PathLike, run: Run) -> None:
 
     Raises:
         ValueError: a run inside a jax transformation or a batch of them, a scene that files cannot hold, a place that
-            cannot be written.
+            cannot be written, a file there that is no run or is being written.
+        OSError: the disk refused.
     """
     path = Path(path)
+    check_place(path, overwrite=True)
     require(not is_traced(run), "A run inside a jax transformation has no values yet: save it outside.")
     require(run.final.x.ndim == 2, "Save a batch of runs one by one: jax.tree.map(lambda a: a[i], run).")
     steps, final_step = np.asarray(run.steps), int(run.final_step)
     unknown = jax.tree.map(lambda a: np.full_like(a, -1), run.tally)
-    aside = path.with_name(path.name + ".part")
-    try:
-        with FrameWriter.create(aside, run.scene, run.final, run.method, run.dt, overwrite=True) as writer:
-            for i in range(len(run)):
-                if steps[i] < final_step:  # a run that met a fault has frames beyond its last good state
-                    writer.append(int(steps[i]), jax.tree.map(lambda a, i=i: a[i], run.frames), unknown)
-            writer.append(final_step, state_of(run.final), run.tally)
-        with open(aside, "rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(aside, path)
-    finally:
-        aside.unlink(missing_ok=True)
+    with (
+        replacing(path) as aside,
+        FrameWriter.create(aside, run.scene, run.final, run.method, run.dt, overwrite=True) as writer,
+    ):
+        for i in range(len(run)):
+            if steps[i] < final_step:  # a run that met a fault has frames beyond its last good state
+                writer.append(int(steps[i]), jax.tree.map(lambda a, i=i: a[i], run.frames), unknown)
+        writer.append(final_step, state_of(run.final), run.tally)
+
+
+def steps_in(path: str | os.PathLike) -> int:
+    """How many steps led to the last frame of a file, −1 if that is not known.
+
+    Raises:
+        ValueError: see `load`; a file that is being written.
+    """
+    check_no_writer(Path(path))
+    with reading(Path(path)) as file:
+        require(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
+        return int(file["mpmjax/frames"][count_in(file) - 1]["steps"])
 
 
 def load(path: str | os.PathLike) -> Run:
@@ -197,7 +268,7 @@ def load(path: str | os.PathLike) -> Run:
             frames; or a float64 run while jax's 64-bit mode is off.
     """
     path = Path(path)
-    with _reading(path) as file:
+    with reading(path) as file:
         described = _description(file["mpmjax"])
         dtype, arrays = np.dtype(described["dtype"]), described["arrays"]
         require(
@@ -248,10 +319,20 @@ def _describe(scene: Scene, particles: Particles, method: Method, dt: Any) -> di
     }
 
 
+def _check_readable(path: Path, described: dict[str, Any]) -> None:
+    """What is written must be what `load` takes. A number that the run's dtype rounds to zero or to a bound may not."""
+    dtype, arrays = np.dtype(described["dtype"]), described["arrays"]
+    try:
+        decode(described["scene"], Scene, "", arrays)
+        decode(described["method"], Method, "method", arrays)
+    except ValueError as error:
+        raise ValueError(f"{path} could not be loaded again, as {dtype} rounds it: {error}") from None
+
+
 def _write_description(group: File, described: dict[str, Any]) -> None:
     for name, text in {"version": version("mpmjax"), "units": _UNITS, "dtype": described["dtype"]}.items():
         group.attrs.create(name, np.bytes_(text))  # of fixed length: others lie where HDF5 has no checksum
-    group.attrs["format"] = np.int64(_FORMAT)
+    group.attrs["format"] = np.int64(FORMAT)
     group.attrs["d"] = np.int64(described["d"])
     if described["counts"] is not None:
         group.attrs["counts"] = np.asarray(described["counts"], np.int64)
@@ -301,64 +382,6 @@ def _frames(file: File, like: State, start: int, stop: int) -> tuple[np.ndarray,
     return table["step"], states, tallies
 
 
-def _opened(path: Path, mode: str) -> File:
-    """The file opened to be written. A new one gets the superblock of HDF5 1.8: a later one says whether a writer is at
-    work, and while it is, and for ever if it was killed, nobody could open the file."""
-    try:
-        if mode == "w":
-            h5py.File(path, "w", libver=_LIBVER_HEAD, locking=False).close()
-        return h5py.File(path, "r+", libver=_LIBVER, locking=False)
-    except OSError as error:
-        raise ValueError(f"{path} cannot be written ({_reason(error)}): name a place that can be.") from None
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[File]:
-    """The file opened to be read; whatever HDF5 stumbles over becomes one line that says what to do."""
-    require(path.exists(), f"{path} does not exist: check its name.")
-    require(path.is_file(), f"{path} is not a file: name one that mpmjax wrote.")
-    try:
-        with open(path, "rb") as raw:
-            signature = raw.read(8)
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read ({_reason(error)}): check its permissions.") from None
-    require(len(signature) == 8, f"{path} is cut short to {len(signature)} bytes: {_REMEDY}.")
-    require(signature == b"\x89HDF\r\n\x1a\n", f"{path} is not an HDF5 file: name one that mpmjax wrote.")
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            _check_format(path, file)
-            yield file
-    except ValueError as error:
-        if str(error).startswith(str(path)):
-            raise
-        raise ValueError(f"{path} is damaged ({_reason(error)}): {_REMEDY}.") from None
-    except (OSError, KeyError, RuntimeError, TypeError, AttributeError, IndexError, UnicodeError) as error:
-        what = "is cut short" if "truncated" in str(error) else "is damaged, or just being written"
-        raise ValueError(f"{path} {what} ({_reason(error)}): {_REMEDY}.") from None
-
-
-def _check_format(path: Path, file: File) -> None:
-    missing = [name for name in ("VTKHDF", "mpmjax") if name not in file]
-    require(not missing, f"{path} has no group /{' or /'.join(missing)}: it is not a run that mpmjax wrote.")
-    found = int(file["mpmjax"].attrs["format"])
-    require(
-        found == _FORMAT,
-        f"{path} has format {found}, this mpmjax reads format {_FORMAT}: use mpmjax "
-        f"{file['mpmjax'].attrs['version'].decode()}, which wrote it.",
-    )
-
-
-def _check_whole(file: File) -> None:
-    """Read every chunk, so that every checksum is compared."""
-
-    def read(_: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and item.size:
-            for chunk in item.iter_chunks():
-                item[chunk]
-
-    file.visititems(read)
-
-
 def _check_same(path: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> None:
     """The run to be continued must be the one in the file."""
     mine, other = dict(_flat(ours)), dict(_flat(theirs))
@@ -380,10 +403,3 @@ def _flat(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
             yield from _flat(value, f"{path}.{key}".lstrip("."))
     else:
         yield path, data.item() if isinstance(data, np.generic) else data
-
-
-def _reason(error: BaseException) -> str:
-    """What the system said, or the first line of what the library did."""
-    text = (isinstance(error, OSError) and error.strerror) or str(error) or type(error).__name__
-    said = re.search(r"error message = '(.*?)'", text)
-    return said[1] if said else text.splitlines()[0].strip("'\"")

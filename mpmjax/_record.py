@@ -2,16 +2,19 @@
 
 import os
 import sys
+from pathlib import Path
+from typing import Any
 
 import diffrax
 import jax.numpy as jnp
 from tqdm import tqdm
 
 from mpmjax._checks import canonical, require
-from mpmjax._diffrax import HEALTHY, no_steps
+from mpmjax._diffrax import HEALTHY, Tally, no_steps
+from mpmjax._interrupt import reporting, undisturbed
 from mpmjax._io import FrameWriter
 from mpmjax._method import Explicit, Method
-from mpmjax._particles import Particles, state_of, with_state
+from mpmjax._particles import Particles, State, state_of, with_state
 from mpmjax._run import Run, SimulationError
 from mpmjax._scene import Scene, prepare
 from mpmjax._simulate import integrate, number_of_steps, raise_faults
@@ -46,36 +49,43 @@ def record(
         save_every: write a frame at the start, every so many steps, and at the end.
         start: number of the first step. Not used when resuming.
         overwrite: replace a file that is there.
-        resume: continue from the last frame in the file, up to a later t1.
+        resume: continue from the last frame in the file up to t1. Where that is reached already, nothing is done.
         progress: show a progress bar on standard error.
 
     Returns:
         the run without its frames, which are in the file.
 
     Raises:
-        ValueError: those of `simulate` and `load`; a file that is there, or of another run.
+        ValueError: those of `simulate` and `load`; a file that is there, of another run, or being written.
         SimulationError: those of `simulate`; the last good state is in the file.
+        OSError: the disk refused a frame, as when it is full. The file holds all frames before it and can be resumed.
     """
     require(save_every >= 1, f"save_every must be at least 1, got {save_every}.")
     dtype = particles.x.dtype
-    number_of_steps(t1, dt, start, dtype)
+    start = 0 if resume else int(start)
+    end = start + number_of_steps(t1, dt, start, dtype)
     particles = prepare(scene, particles)
     if resume:
         writer = FrameWriter.resume(path, scene, particles, method, dt)
     else:
-        writer = FrameWriter.create(path, scene, particles, method, dt, overwrite=overwrite)
-        writer.append(start, state_of(particles), no_steps(dtype))
+        writer = _begun(path, scene, particles, method, dt, start, overwrite)
     scene, dt_, method = canonical((scene, dt, method), dtype)
     with writer:
         step, state, tally = writer.last()
+        previous, start = None, step - int(tally.steps)
         require(
             int(tally.fault) == HEALTHY,
             f"{path} ends with a fault after step {step} and would meet it again: start anew with another dt or scene.",
         )
-        start = step - int(tally.steps)
-        end = step + number_of_steps(t1, dt, step, dtype)
-        with tqdm(initial=step, total=end, unit="step", file=sys.stderr, disable=not progress) as bar:
-            while True:
+        bar = tqdm(initial=step, total=max(step, end), unit="step", file=sys.stderr, disable=not progress)
+
+        def stopped() -> str:
+            bar.close()
+            return f"{writer.standing()} Resume it to continue."
+
+        with bar, reporting(stopped):
+            healthy = True
+            while healthy and step < end:
                 count = min(save_every - (step - start) % save_every, end - step)
                 _, state, new, previous = integrate(
                     scene,
@@ -92,24 +102,61 @@ def record(
                     watch=True,
                 )
                 tally, step = tally.merged(new), step + int(new.steps)
-                run = Run(
-                    scene=scene,
-                    method=method,
-                    dt=dt_,
-                    steps=jnp.zeros((0,), dtype),
-                    frames=None,
-                    observed=None,
-                    final=with_state(particles, state),
-                    final_step=jnp.asarray(step, dtype),
-                    tally=tally,
-                )
-                try:
-                    if int(new.fault) != HEALTHY or int(new.unconverged) > 0 or step == end:
-                        raise_faults(run, previous, start)
-                except SimulationError as error:
-                    writer.append(int(error.run.final_step), state_of(error.run.final), tally)
-                    raise
-                writer.append(step, state, tally)
-                bar.update(count)
-                if step == end:
-                    return run
+                healthy = int(new.fault) == HEALTHY and int(new.unconverged) == 0
+                if healthy:
+                    _append(writer, step, state, tally)
+                    bar.update(count)
+        run = Run(
+            scene=scene,
+            method=method,
+            dt=dt_,
+            steps=jnp.zeros((0,), dtype),
+            frames=None,
+            observed=None,
+            final=with_state(particles, state),
+            final_step=jnp.asarray(step, dtype),
+            tally=tally,
+        )
+        try:
+            raise_faults(run, previous, start)
+        except SimulationError as error:
+            try:
+                _append(writer, int(error.run.final_step), state_of(error.run.final), tally)
+                again = "Resumed it would end there again: begin anew."
+                then = "It can be resumed as it is." if int(tally.fault) == HEALTHY else again
+                said = f"{writer.standing()} {then}"
+            except OSError as refused:
+                said = str(refused)
+            raise SimulationError(f"{error} {said}", error.run) from None
+        return run
+
+
+def _begun(
+    path: str | os.PathLike,
+    scene: Scene,
+    particles: Particles,
+    method: Method,
+    dt: Any,
+    start: int,
+    overwrite: bool,
+) -> FrameWriter:
+    """The writer of a new file with its first frame, or no file: one without frames cannot be resumed."""
+    with undisturbed():
+        writer = FrameWriter.create(path, scene, particles, method, dt, overwrite=overwrite)
+        try:
+            writer.append(start, state_of(particles), no_steps(particles.x.dtype))
+        except BaseException as error:
+            writer.close()
+            Path(path).unlink()
+            if isinstance(error, OSError):
+                raise OSError(f"{path} was not begun: {error}. Make room, or name another place.") from None
+            raise
+    return writer
+
+
+def _append(writer: FrameWriter, step: int, state: State, tally: Tally) -> None:
+    """Write a frame; an error says what the file holds."""
+    try:
+        writer.append(step, state, tally)
+    except OSError as error:
+        raise OSError(f"{error}. {writer.standing()} Make room, then resume it.") from None

@@ -8,6 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from mpmjax._aside import replacing, save_figure
 from mpmjax._boundary import SeparatingBox, SlipBox, StickyBox
 from mpmjax._checks import canonical, require, require_between
 from mpmjax._collider import AbstractCollider
@@ -96,10 +97,11 @@ def render(
     try:
         if still:
             show(0)
-            figure.savefig(path, dpi=dpi)
+            save_figure(figure, path, dpi)
         else:
             movie = animation.FuncAnimation(figure, lambda k: show(k) or [], frames=len(values), init_func=lambda: [])
-            movie.save(path, writer=animation.PillowWriter(fps=fps), dpi=dpi)
+            with replacing(path) as aside:
+                movie.save(aside, writer=animation.PillowWriter(fps=fps), dpi=dpi)
     finally:
         plt.close(figure)
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from disk import full_beyond
 from helpers import DESCRIPTIONS, DIMS, TRANSFERS, block, cloud, ids
 
 import mpmjax as mpm
@@ -303,7 +305,10 @@ def test_a_run_that_blows_up_keeps_its_good_frames(tmp_path):
         mpm.simulate(scene, particles, t1=10.0, **kwargs)
     with pytest.raises(mpm.SimulationError, match=r"At step \d+ \(t = .* s\) particle \d+ ") as caught:
         record(path, scene, particles, t1=10.0, **kwargs)
-    assert str(caught.value) == str(single.value)
+    held = (
+        rf" {path} holds \d+ frames, the last of step \d+ \(t = .* s\)\. Resumed it would end there again: begin anew\."
+    )
+    assert re.fullmatch(re.escape(str(single.value)) + held, str(caught.value))
     run, last = load(path), int(caught.value.run.final_step)
     assert_same((run.final, run.tally), (caught.value.run.final, caught.value.run.tally))
     assert_same((run.final, run.tally), (single.value.run.final, single.value.run.tally))
@@ -319,12 +324,67 @@ def test_a_run_that_blows_up_keeps_its_good_frames(tmp_path):
     record(path, scene, particles, t1=0.1 * last, overwrite=True, **kwargs)
     with pytest.raises(mpm.SimulationError) as resumed:
         record(path, scene, particles, t1=10.0, resume=True, **kwargs)
-    assert str(resumed.value) == str(single.value)
+    assert str(resumed.value) == str(caught.value)
     assert_same(load(path), run)
 
     # the run that came with the error can be saved like any other, without what lies beyond its last good state
     save(tmp_path / "single.h5", single.value.run)
     assert_same(load(tmp_path / "single.h5"), run)
+
+
+def test_a_full_disk_stops_a_run_at_the_frame_that_does_not_fit(tmp_path):
+    """At whatever byte that is. The frames before are right, and with room again the run continues as if nothing had
+    been; where not even the first frame fits, no file is left."""
+    (scene, particles), frames = jelly(), 16
+    kwargs = {"t1": frames * 5e-3, "dt": 5e-3, "save_every": 1}
+    record(tmp_path / "whole.h5", scene, particles, **kwargs)
+    whole, size = load(tmp_path / "whole.h5"), (tmp_path / "whole.h5").stat().st_size
+    kept = []
+    for number, limit in enumerate([*np.linspace(0.7 * size, size - 1, 4).astype(int), 1000]):
+        path = tmp_path / f"{number}.h5"
+        with full_beyond(int(limit)), pytest.raises(OSError, match="File too large") as caught:
+            record(path, scene, particles, **kwargs)
+        assert "\n" not in str(caught.value)
+        if not path.exists():
+            assert str(caught.value).endswith("Make room, or name another place.")
+            continue
+        n, last = map(int, re.search(r"holds (\d+) frames?, the last of step (\d+) ", str(caught.value)).groups())
+        assert str(caught.value).endswith("Make room, then resume it.")
+        part = load(path)
+        assert (len(part), part.steps[-1], last) == (n, n - 1, n - 1)
+        assert_same(part.frames, jax.tree.map(lambda a, n=n: a[:n], whole.frames))
+        kept.append(n)
+        record(path, scene, particles, resume=True, **kwargs)
+        assert_same(load(path), whole)
+    assert kept == sorted(kept)
+    assert len(set(kept)) == 4
+    assert len(list(tmp_path.iterdir())) == 1 + len(kept)
+
+
+def test_a_full_disk_leaves_the_run_that_was_to_be_replaced(tmp_path):
+    """`save` replaces a file by a whole one or not at all."""
+    path, run = tmp_path / "run.h5", made_up(2)
+    save(path, run)
+    before = path.read_bytes()
+    with (
+        full_beyond(len(before) // 2),
+        pytest.raises(OSError, match=rf"^{path} could not be written: .*File too large"),
+    ):
+        save(path, run)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_complete_run_can_be_resumed(tmp_path):
+    """To its end, or to an earlier time, which it has reached: nothing is done, and its end is returned."""
+    path, (scene, particles) = tmp_path / "run.h5", jelly()
+    kwargs = {"dt": 5e-3, "save_every": 4}
+    whole = record(path, scene, particles, t1=0.07, **kwargs)
+    before = path.read_bytes()
+    for t1 in (0.07, 0.03):
+        again = record(path, scene, particles, t1=t1, resume=True, **kwargs)
+        assert_same(again, whole)
+    assert path.read_bytes() == before
 
 
 def test_progress_is_shown_on_standard_error(tmp_path, capsys):
@@ -352,6 +412,36 @@ def test_a_file_that_is_there_is_not_overwritten(tmp_path):
     assert path.read_bytes() == before
     record(path, scene, particles, **kwargs, overwrite=True)
     assert load(path).steps.tolist() == [0, 4, 8, 12]
+
+
+def test_what_is_no_run_is_not_replaced(tmp_path):
+    """Whoever asks; nor is a run that is being written. An empty file has nothing to lose."""
+    run, path = made_up(2), tmp_path / "other"
+    scene, particles = jelly()
+    with h5py.File(tmp_path / "elsewhere.h5", "w") as file:
+        file["VTKHDF"] = h5py.ExternalLink("run.h5", "/VTKHDF")
+        file["mpmjax"] = h5py.SoftLink("/VTKHDF")
+    h5py.File(tmp_path / "bare.h5", "w").close()
+    for content in (b"[grid]\n", *(path.read_bytes() for path in tmp_path.glob("*.h5"))):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"other is not a run that mpmjax wrote, and is not replaced: "):
+            save(path, run)
+        with pytest.raises(ValueError, match=r"other is not a run that mpmjax wrote"):
+            record(path, scene, particles, t1=0.01, dt=5e-3, save_every=1, overwrite=True)
+        assert path.read_bytes() == content
+    path.write_bytes(b"")
+    save(path, run)
+    before = path.read_bytes()
+    with FrameWriter.resume(path, run.scene, run.final, run.method, run.dt):
+        for attempt in (
+            lambda: save(path, run),
+            lambda: FrameWriter.create(path, run.scene, run.final, run.method, run.dt, overwrite=True),
+            lambda: FrameWriter.resume(path, run.scene, run.final, run.method, run.dt),
+        ):
+            with pytest.raises(ValueError, match=r"other is being written by another run: wait until that ends"):
+                attempt()
+        assert_same(load(path), run)
+    assert path.read_bytes() == before
 
 
 def other_runs() -> dict:
@@ -444,10 +534,92 @@ def test_files_of_another_kind_are_named(tmp_path):
         del file["mpmjax/mass"]
     of("weightless.h5", r"is damaged \(mass or volume is missing\): restore it from a copy, or run")
     of("lacking.h5", r"is damaged, or just being written \(.*velocity.*\): restore it from a copy, or run")
-    with pytest.raises(
-        ValueError, match=r"cannot be written \(No such file or directory\): name a place that can be\.$"
-    ):
+    with pytest.raises(ValueError, match=r"run\.h5 cannot be written \(no folder .*\): name a place that can be\.$"):
         save(tmp_path / "folder" / "run.h5", run)
+
+
+def replaced(file: h5py.File, name: str, link: object) -> None:
+    del file[name]
+    file[name] = link
+
+
+def outside(file: h5py.File, **storage: object) -> None:
+    """Put a dataset's numbers elsewhere."""
+    numbers = file["VTKHDF/Points"][...]
+    del file["VTKHDF/Points"]
+    file.create_dataset("VTKHDF/Points", data=numbers, **storage)
+
+
+LEADING_AWAY = {
+    "external link": lambda file, other: replaced(file, "VTKHDF/Points", h5py.ExternalLink(other, "/VTKHDF/Points")),
+    "external group": lambda file, other: replaced(file, "VTKHDF", h5py.ExternalLink(other, "/VTKHDF")),
+    "soft link": lambda file, _: replaced(file, "VTKHDF/Points", h5py.SoftLink("/VTKHDF/PointData/velocity")),
+    "dangling link": lambda file, _: file.update(extra=h5py.SoftLink("/nowhere")),
+    "second name": lambda file, _: replaced(file, "VTKHDF/Points", file["VTKHDF/PointData/velocity"]),
+    "a group in itself": lambda file, _: file["VTKHDF"].update(VTKHDF=file["VTKHDF"]),
+    "external storage": lambda file, other: outside(file, external=[(f"{other}.raw", 0, h5py.h5f.UNLIMITED)]),
+    "virtual": lambda file, other: virtual(file, other),
+}
+
+
+def virtual(file: h5py.File, other: str) -> None:
+    layout = h5py.VirtualLayout(file["VTKHDF/Points"].shape, file["VTKHDF/Points"].dtype)
+    layout[...] = h5py.VirtualSource(other, "VTKHDF/Points", layout.shape)
+    del file["VTKHDF/Points"]
+    file.create_virtual_dataset("VTKHDF/Points", layout)
+
+
+@pytest.mark.parametrize("lead_away", **ids(LEADING_AWAY))
+def test_a_file_that_leads_elsewhere_is_refused(lead_away, tmp_path):
+    """HDF5 would follow, and write there."""
+    run, path = made_up(2), tmp_path / "run.h5"
+    save(path, run)
+    save(tmp_path / "other.h5", run)
+    with h5py.File(path, "r+") as file:
+        lead_away(file, str(tmp_path / "other.h5"))
+    before = {p: p.read_bytes() for p in tmp_path.iterdir()}
+    for read in (load, lambda path: FrameWriter.resume(path, run.scene, run.final, run.method, run.dt)):
+        with pytest.raises(ValueError, match=r"run\.h5: /.*, which no run of mpmjax has: restore it from a copy"):
+            read(path)
+    assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+def test_a_frame_that_was_never_written_is_no_frame(tmp_path):
+    """What reads as zeros without a checksum, as after a write that failed, is damage in whatever dataset it is."""
+    run, whole = made_up(2), tmp_path / "run.h5"
+    save(whole, run)
+    with h5py.File(whole) as file:
+        names = []
+        file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) and item.size else None)
+    assert len(names) > 20
+    for name in names:
+        path = tmp_path / "lost.h5"
+        shutil.copy(whole, path)
+        with h5py.File(path, "r+", libver=("v110", "v110")) as file:
+            length = len(file[name])
+            file[name].resize(length - 1, axis=0)
+            file[name].resize(length - file[name].chunks[0], axis=0)  # which drops the chunk
+            file[name].resize(length, axis=0)
+            assert not any(file[name][-1:].tobytes())
+        for read in (load, lambda path: FrameWriter.resume(path, run.scene, run.final, run.method, run.dt)):
+            with pytest.raises(ValueError, match=rf"is damaged \(frame \d of {name} was never written\)"):
+                read(path)
+
+
+def test_what_could_not_be_loaded_is_not_begun(tmp_path):
+    """A number that the run's precision rounds to one that the law refuses is named before the run, not after it."""
+    scene, particles = jelly(jnp.float32, material=mpm.FixedCorotated(1e4, 0.3))
+    for law, says in (
+        (
+            mpm.FixedCorotated(1e-46, 0.3),
+            r"\[material\].*youngs_modulus \[Pa\] must be greater .* got 0\.0",
+        ),
+        (mpm.FixedCorotated(1e4, 0.5 - 1e-10), r"\[material\].*poisson_ratio must be .* got 0\.5"),
+    ):
+        bad = dataclasses.replace(scene, material=law)
+        with pytest.raises(ValueError, match=rf"run\.h5 could not be loaded again, as float32 rounds it: {says}"):
+            record(tmp_path / "run.h5", bad, particles, t1=0.01, dt=5e-3, save_every=1)
+    assert not list(tmp_path.iterdir())
 
 
 def test_float64_runs_ask_for_64_bits(tmp_path):
