@@ -11,11 +11,14 @@ import jax
 import numpy as np
 import typer
 
+from mpmjax._aside import save_figure
 from mpmjax._chart import draw_chart, write_trials
 from mpmjax._checks import require
 from mpmjax._diagnostics import energy, grid_mass, pieces
 from mpmjax._fit import FitResult
-from mpmjax._io import load
+from mpmjax._hdf5 import check_place
+from mpmjax._interrupt import end_on_signals, reporting
+from mpmjax._io import load, steps_in
 from mpmjax._job import CurveSettings, Job, fit_job, read_job, read_plan
 from mpmjax._record import record
 from mpmjax._render import COLOURS, render
@@ -38,9 +41,6 @@ def _reporting(command: Callable[..., None]) -> Callable[..., None]:
         except (ValueError, RuntimeError, OSError) as error:
             print(f"mpmjax: {' '.join(str(error).split())}", file=sys.stderr)
             raise typer.Exit(2) from None
-        except KeyboardInterrupt:
-            print("mpmjax: interrupted; the finished frames of a run are in its file", file=sys.stderr)
-            raise typer.Exit(130) from None
 
     return guarded
 
@@ -58,10 +58,12 @@ def run_command(
     quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
 ) -> None:
     """Simulate a scene and write its frames."""
+    require(not (overwrite and resume), "--overwrite starts a file anew and --resume continues it: give one of them.")
+    done = steps_in(output) if resume else 0
+    if not resume:
+        check_place(output, overwrite=overwrite)
     job = read_job(scene)
     _say_choice(job)
-    require(not (overwrite and resume), "--overwrite starts a file anew and --resume continues it: give one of them.")
-    done = int(load(output).tally.steps) if resume else 0
     begun = time.perf_counter()
     run = record(
         output,
@@ -75,8 +77,11 @@ def run_command(
         resume=resume,
         progress=not quiet,
     )
-    print(_summary(job, run, int(run.tally.steps) - done, time.perf_counter() - begun))
-    print(f"written            {output}")
+    taken, seconds = int(run.tally.steps) - done, time.perf_counter() - begun
+    with reporting(lambda: f"{output} is complete."):
+        print(_summary(job, run, taken, seconds))
+    reached = f"complete already: it reaches t = {float(run.final_step * run.dt):.6g} s" if resume and not taken else ""
+    print(f"written            {output} {reached}".rstrip())
 
 
 def _say_choice(job: Job) -> None:
@@ -175,7 +180,7 @@ def _plot(fit: CurveSettings, result: FitResult, name: str, path: Path) -> None:
     axes.set(xlabel="stretch of the gauge section [-]", ylabel="nominal stress [MPa]")
     axes.grid(alpha=0.3)
     axes.legend()
-    figure.savefig(path, dpi=140)
+    save_figure(figure, path, 140)
     plt.close(figure)
 
 
@@ -243,6 +248,7 @@ def render_command(
 
 def main() -> None:
     """Entry point of the `mpmjax` command."""
+    end_on_signals()
     app()
 
 

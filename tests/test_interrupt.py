@@ -1,0 +1,140 @@
+"""Ctrl-C and SIGTERM end a command at any moment with their own code and one line; a live run has one writer."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import equinox as eqx
+import pytest
+from shell import refused, shell
+
+import mpmjax as mpm
+
+SCENE = """
+gravity = [-0.1]
+
+[grid]
+shape = [12]
+spacing = 0.1
+origin = [-3]
+
+[material]
+kind = "FixedCorotated"
+youngs_modulus = 1e4
+poisson_ratio = 0.3
+
+[[boundary]]
+kind = "SlipBox"
+lower = [0.0]
+upper = [inf]
+
+[[particles]]
+region = { kind = "Box", lower = [0.1], upper = [0.4] }
+density = 1e3
+
+[run]
+t1 = 1e4
+dt = 1e-3
+save_every = 10
+"""
+SIGNALS = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "told to end")}
+
+
+def wait_for(condition: Callable[[], bool], process: subprocess.Popen) -> None:
+    """Until the condition holds, as long as the process runs."""
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+
+
+def frames_in(path: Path) -> int:
+    try:
+        return len(mpm.load(path))
+    except ValueError:  # not there, or just being written
+        return 0
+
+
+def begun(folder: Path, *words: object, scene: str = SCENE) -> subprocess.Popen:
+    """A command of the shell in a process of its own."""
+    (folder / "scene.toml").write_text(scene)
+    command = [sys.executable, "-u", "-c", "from mpmjax_command import main; main()", *map(str, words)]
+    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def ended(process: subprocess.Popen, number: signal.Signals) -> str:
+    """The line that the process ends with when it gets the signal."""
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    code, what = SIGNALS[number]
+    assert process.returncode == code, err
+    lines = [line for line in err.splitlines() if line and not re.search(r"\d+/\d+ \[", line)]  # but for the bar
+    assert len(lines) == 1, err
+    assert lines[0].startswith(f"mpmjax: {what}. ")
+    return lines[0]
+
+
+def test_a_signal_ends_a_run_wherever_it_is(tmp_path):
+    """While its steps are compiled, and amid writing frames as fast as it can; meanwhile nobody else writes there."""
+    path = tmp_path / "run.h5"
+    compiling = begun(tmp_path, "run", "scene.toml", "-o", "run.h5", "--quiet")
+    wait_for(lambda: frames_in(path) > 0, compiling)
+    line = ended(compiling, signal.SIGINT)
+    assert re.search(r"run\.h5 holds \d+ frames?, the last of step \d+ \(t = \S+ s\)\. Resume it to continue\.$", line)
+
+    stepping = begun(tmp_path, "run", "scene.toml", "-o", "run.h5", "--resume")
+    wait_for(lambda: frames_in(path) > 5, stepping)
+    for choice in ("--resume", "--overwrite"):
+        assert "is being written by another run" in refused("run", tmp_path / "scene.toml", "-o", path, choice)
+    line = ended(stepping, signal.SIGTERM)
+    run = mpm.load(path)
+    assert f"run.h5 holds {len(run)} frames, the last of step {int(run.final_step)} (t = " in line
+    assert run.steps.tolist() == list(range(0, 10 * len(run), 10))
+
+
+@pytest.mark.slow
+def test_a_signal_ends_a_run_at_any_moment(tmp_path):
+    """From the first import to the summary, whole files every time."""
+    path, scene = tmp_path / "run.h5", SCENE.replace("1e4\ndt", "0.2\ndt")
+    begin = time.perf_counter()
+    assert begun(tmp_path, "run", "scene.toml", "-o", "run.h5", scene=scene).wait() == 0
+    whole, seconds = mpm.load(path), time.perf_counter() - begin
+    for i in range(10):
+        path.unlink(missing_ok=True)
+        process = begun(tmp_path, "run", "scene.toml", "-o", "run.h5", scene=scene)
+        time.sleep(seconds * (i + 0.5) / 10)
+        number = (signal.SIGINT, signal.SIGTERM)[i % 2]
+        process.send_signal(number)
+        _, err = process.communicate(timeout=60)
+        assert process.returncode in (0, 128 + number, -number), err  # minus: by the system, amid imports
+        assert err.count("mpmjax: ") == (process.returncode > 0), err
+        assert "Traceback" not in err
+        if path.exists():
+            assert shell("run", tmp_path / "scene.toml", "-o", path, "--resume", "--quiet")[0] == 0
+            assert eqx.tree_equal(mpm.load(path), whole)
+
+
+def test_a_signal_ends_what_writes_no_file(tmp_path):
+    process = begun(tmp_path, "chart", "scene.toml", scene=SCENE.replace("1e4\ndt", "1.0\ndt"))
+    assert process.stdout is not None
+    assert "method" in process.stdout.readline()
+    assert ended(process, signal.SIGTERM).endswith("No file was being written.")
+    assert os.listdir(tmp_path) == ["scene.toml"]
+
+
+def test_a_signal_that_is_ignored_stays_ignored(tmp_path):
+    """As for a command in the background of a script, or under nohup."""
+    program = """
+import os, signal
+from mpmjax._interrupt import end_on_signals
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+end_on_signals()
+os.kill(os.getpid(), signal.SIGINT)
+print("alive")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (0, "alive\n")
