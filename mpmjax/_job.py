@@ -2,6 +2,7 @@
 words."""
 
 import csv
+import difflib
 import tomllib
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -24,6 +25,8 @@ from mpmjax._work_precision import METHODS, Build, work_precision
 
 _FRAMES = 50
 """How many frames are saved where neither they nor the step are given."""
+_SHOWN = 20
+"""How many characters of a cell that is no number are shown."""
 
 
 class RunSettings(NamedTuple):
@@ -200,18 +203,31 @@ def read_columns(path: Path, *names: str) -> list[np.ndarray]:
         lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line and not line.startswith("#")]
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"Cannot read the data file {path}: {_reason(error)}.") from None
-    reader = csv.DictReader(lines)
-    known = reader.fieldnames or []
-    for name in names:
-        require(name in known, f"{path} has no column {name!r}, it has {', '.join(known)}.")
     columns: list[list[float]] = [[] for _ in names]
-    for row, record in enumerate(reader, 1):
-        for column, name in zip(columns, names, strict=True):
-            try:
-                column.append(float(record[name]))
-            except (TypeError, ValueError):
-                raise ValueError(f"{path}, data row {row}: {name} must be a number, got {record[name]!r}.") from None
+    try:
+        reader = csv.DictReader(lines)
+        known = reader.fieldnames or []
+        for name in names:  # of what else is in the file nothing is said: it may be another file than was meant
+            close = difflib.get_close_matches(name, known, 1)
+            hint = f", did you mean {close[0]!r}?" if close else f" among its {len(known)}."
+            require(name in known, f"{path} has no column {name!r}{hint}")
+        for row, record in enumerate(reader, 1):
+            for column, name in zip(columns, names, strict=True):
+                cell = record[name]
+                where = f"{path}, data row {row}: {name} must be a finite number, got"
+                require(cell is not None, f"{where} a row that ends before it.")
+                try:
+                    column.append(float(cell))
+                except ValueError:
+                    raise ValueError(f"{where} {_shortened(cell)!r}.") from None
+                require(np.isfinite(column[-1]), f"{where} {_shortened(cell)!r}.")
+    except csv.Error as error:
+        raise ValueError(f"{path} is not a CSV file: {error}.") from None
     return [np.asarray(column) for column in columns]
+
+
+def _shortened(cell: str) -> str:
+    return cell if len(cell) <= _SHOWN else cell[:_SHOWN] + "..."
 
 
 def _toml(path: Path) -> dict[str, Any]:

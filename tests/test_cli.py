@@ -6,10 +6,11 @@ from pathlib import Path
 import equinox as eqx
 import numpy as np
 import pytest
+from disk import full_beyond
 from shell import refused, shell
 
 import mpmjax as mpm
-from mpmjax._job import read_job, read_plan
+from mpmjax._job import read_columns, read_job, read_plan
 from mpmjax.cli import _summary
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -94,6 +95,64 @@ def test_run_does_not_replace_a_file_unasked_and_resumes_it(folder):
     assert "give one of them" in refused("run", longer, "-o", copy, "--resume", "--overwrite")
     assert shell("run", longer, "-o", copy, "--resume", "--quiet")[0] == 0
     np.testing.assert_array_equal(mpm.load(copy).steps, [0, 2, 4, 6, 8])
+
+
+def test_a_complete_run_is_resumed_with_success(folder, tmp_path):
+    """Nothing is left to do, and the file stays as it is."""
+    before = (folder / "run.h5").read_bytes()
+    code, out, err = shell("run", folder / "scene.toml", "-o", folder / "run.h5", "--resume", "--quiet")
+    assert code == 0, err
+    assert out.splitlines()[-1].endswith("run.h5 complete already: it reaches t = 0.06 s")
+    assert (folder / "run.h5").read_bytes() == before
+
+
+@pytest.mark.parametrize("choice", ["--overwrite", "--resume"])
+def test_what_is_no_run_is_neither_replaced_nor_continued(folder, choice):
+    """Such as the scene itself; it is said before anything is run."""
+    scene = folder / "scene.toml"
+    assert re.search(r"scene\.toml is not a(n HDF5 file| run)", refused("run", scene, "-o", scene, choice))
+    assert scene.read_text() == SCENE
+
+
+def test_a_full_disk_leaves_no_half_picture(folder, tmp_path):
+    """The picture that was there stays."""
+    (tmp_path / "run.h5").write_bytes((folder / "run.h5").read_bytes())
+    for name in ("a.png", "a.pdf", "a.svg", "a.gif"):
+        (tmp_path / name).write_text("there before")
+        with full_beyond(500):
+            line = refused("render", tmp_path / "run.h5", "-o", tmp_path / name, "--dpi", 40)
+        assert re.search(rf"{name} could not be written: .*", line), line
+        assert (tmp_path / name).read_text() == "there before"
+    assert len(list(tmp_path.iterdir())) == 5
+
+
+SECRET = "root:x:0:0:administrator:/secret:/bin/sh"
+
+
+UNFIT_DATA = {
+    "no table": (f"{SECRET}\nbin:{SECRET}\n", r"has no column 'stretch' among its 1\.$"),
+    "a typing error": (f"strech,stress,{SECRET}\n1,1,1\n", r"has no column 'stretch', did you mean 'strech'\?$"),
+    "a long cell": (
+        f"stretch,stress\n1,'{SECRET * 9}\n",
+        r"row 1: stress must be a finite number, got \"'root.*\.\.\.\"\.$",
+    ),
+    "an open quote": (f'stretch,stress\n1,"{SECRET}\n{SECRET}\n', r"row 1: stress .*, got 'root.*\.\.\.'\.$"),
+    "a short row": (f"{SECRET},stretch,stress\n{SECRET},1\n", r"row 1: stress .*, got a row that ends before it\.$"),
+    "not finite": ("stretch,stress\n1,nan\n", r"row 1: stress must be a finite number, got 'nan'\.$"),
+    "a cell beyond csv's limit": ("stretch,stress\n1," + "1" * 200_000, r"is not a CSV file: field larger than"),
+    "empty": ("", r"has no column 'stretch' among its 0\.$"),
+}
+
+
+@pytest.mark.parametrize(("content", "says"), UNFIT_DATA.values(), ids=UNFIT_DATA)
+def test_of_a_data_file_no_more_is_shown_than_a_cell(content, says, tmp_path):
+    """Another file may have been named than was meant."""
+    path = tmp_path / "data.csv"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=says) as caught:
+        read_columns(path, "stretch", "stress")
+    assert "secret" not in str(caught.value)
+    assert len(str(caught.value).replace(str(path), "")) < 150
 
 
 @pytest.mark.parametrize("name", ["still.png", "moving.gif"])
@@ -240,6 +299,7 @@ def test_a_run_that_blows_up_keeps_what_was_written(tmp_path):
     scene.write_text(wild.replace("dt = 1e-2", "dt = 4e-2").replace("save_every = 2", "save_every = 1"))
     line = refused("run", scene, "-o", tmp_path / "run.h5")
     assert re.search(r"At step \d+ \(t = .* s\) particle \d+", line), line
+    assert re.search(r"run\.h5 holds \d+ frames, the last of step \d+ \(t = .* s\)\. .* begin anew\.$", line), line
     run = mpm.load(tmp_path / "run.h5")
     assert len(run) >= 2
     assert np.isfinite(run.frames.x).all()
