@@ -123,6 +123,27 @@ def test_of_two_bodies_normals_the_earlier_holds_and_a_prescribed_component_is_a
         below = (np.asarray(step.position)[:, 1] < 0.25) & mass
         expected = alone.velocity[below] if tilt < 1e-2 else np.broadcast_to([5 / tilt, 0.0], (below.sum(), 2))
         assert_close(step.velocity[below], expected, 1e-12)
+    level = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.3), (0.0, 1.0)), rising)
+    step = grid_update(scene_of(grid, box, level), particles, DT, METHODS["explicit"])
+    assert_close(step.velocity[below], alone.velocity[below], 1e-14)
+    assert step.info.contact.violations == 0  # what a wall holds already cannot get out of its way
+
+
+def test_what_the_earlier_holds_the_later_neither_lets_go_nor_rubs_nor_receives():
+    """Of a body that holds and one that may be left, and of a grip and a body that sticks."""
+    grid = mpm.Grid((6, 6), DX)
+    nodes = grid.nodes(grid.window(jnp.zeros((1, 2))))
+    x = np.asarray(nodes)
+    left, floor = mpm.HalfSpace((0.25, 0.0), (1.0, 0.0)), mpm.HalfSpace((0.0, 0.25), (0.0, 1.0))
+    pair = mpm.SlipCollider(left), mpm.SeparatingCollider(floor, friction=0.5)
+    touch = combine(pair, nodes, DX, 0.0, 0.1, reference=False).touch
+    later = (x[:, 0] > 0.25) & (x[:, 1] < 0.25)
+    np.testing.assert_array_equal(touch.leavable, later)
+    np.testing.assert_array_equal(touch.friction, 0.5 * later)
+    grip = mpm.Grip(left, mpm.Motion((0.0,), ((0.0, 0.0),)), axes=(True, False))
+    touch = combine((grip, mpm.StickyCollider(floor)), nodes, DX, 0.0, 0.1, reference=False).touch
+    np.testing.assert_array_equal(touch.holder[:, 1], np.where(x[:, 1] < 0.25, 0, -1))
+    np.testing.assert_array_equal(touch.holder[:, 0], np.where(later, 0, -1))
 
 
 @pytest.mark.parametrize("inner", mpm.Metric)
@@ -338,6 +359,11 @@ def test_friction_of_a_wall_leaves_alone_what_others_hold(floor):
     assert_close(v[gripped & mass, 0], np.full((gripped & mass).sum(), 0.4), 1e-14)
     friction = np.asarray(step.update.friction)
     assert ((friction * v).sum(axis=1)[rubbed & ~held & ~gripped] < 0).all()
+    if floor == "box":  # what the body pushes is not the wall's
+        push = (np.asarray(step.reaction) - np.asarray(step.update.push)[:, None] * np.where(held[:, None], n, 0))[:, 2]
+        size = np.linalg.norm(friction, axis=1)
+        assert (size <= mu * push * (1 + 1e-9))[rubbed].all()
+        assert np.isclose(size, mu * push, rtol=1e-9)[rubbed & held].sum() > 3
 
 
 @pytest.mark.parametrize("name", ["explicit", "semi_implicit"])

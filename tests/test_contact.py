@@ -357,6 +357,28 @@ def test_a_verdict_is_given_beyond_rounding_only():
             assert found(held, -1.6e-8) == met.sum()
 
 
+def test_there_is_no_friction_where_a_wall_would_have_to_pull():
+    """In a set that did not settle: friction takes speed, and never gives it."""
+    slope = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0)), friction=0.3)
+    for boundary in (FLOORS["plain"](0.3), FLOORS["mirrored"](0.3), slope):
+        nodes = in_touch(boundary)
+        side, touch = nodes.conditions.side, nodes.conditions.touch
+        held = hold(
+            nodes,
+            ActiveSet(
+                None if side is None else side != 0,
+                tuple(jnp.ones_like(nodes.mass, bool) for _ in nodes.contacts),
+                None if touch is None else touch.leavable,
+            ),
+        )
+        v = jnp.zeros_like(nodes.velocity).at[:, 0].set(1.0)
+        for up in (-1.0, 1.0):
+            imbalance = up * nodes.mass[:, None] * jnp.asarray([0.0, 1.0])
+            slowed = held.collider_friction(held.wall_friction(v, imbalance), held.pushes(imbalance))[0][:, 0]
+            assert slowed.max() == 1
+            assert (slowed.min() == 1) == (up < 0)
+
+
 class Stubborn(mpm.Explicit):
     """Nodes that a wall would have to pull where it holds them, and that enter it where it does not."""
 

@@ -162,7 +162,7 @@ def test_newton_starts_from_the_linearised_system_where_nothing_else_is_admissib
 def test_newton_starts_from_rest_where_the_potential_is_lower_there():
     """As from the explicit velocity at 20 times the limit: the same path as from rest, to the last bit. From the grid's
     velocity, where it is not, another one."""
-    scene, particles = block(1, material=LAWS["neo_hookean"])
+    scene, particles = block(1)  # fixed corotated, whose energy is finite everywhere
     F = 1 + 0.05 * np.random.default_rng(0).normal(size=(particles.count, 1, 1))
     moving = jnp.ones_like(particles.v)
     particles = eqx.tree_at(lambda q: (q.v, q.F), mpm.prepare(scene, particles), (moving, jnp.asarray(F)))
@@ -180,7 +180,7 @@ def test_the_derivative_of_a_newton_step_with_a_projected_hessian_is_the_equatio
     """That of the true Hessian, where it is not positive: a projection changes Newton's way alone."""
     scene, particles = block(1, material=RUBBER)
     stretched = eqx.tree_at(lambda q: q.F, mpm.prepare(scene, particles), jnp.full((particles.count, 1, 1), 5.0))
-    dt = 2 * explicit_limit(block(1)[0])
+    dt = 0.3 * explicit_limit(block(1)[0])
 
     def end(gravity, hessian):
         pulled = eqx.tree_at(lambda s: s.gravity, scene, gravity[None])
