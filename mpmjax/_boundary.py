@@ -14,7 +14,7 @@ import numpy as np
 from mpmjax._checks import coordinates, is_traced, require, require_between
 from mpmjax._motion import Motion
 from mpmjax._region import AbstractRegion
-from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Point, Scalar
+from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, ParticleVector, Point, Scalar
 
 ON_THE_WALL = 1e-3
 """Distance within which a node is on a wall, in spacings."""
@@ -107,6 +107,48 @@ class AbstractBoundary(eqx.Module):
         With `reference`, the nodes are those of the reference configuration and a region that moves stays where it was.
         """
 
+    def passed(
+        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
+    ) -> Bool[Array, "p"] | None:
+        """Which particles got beyond it in the step from t to t + dt; None where it keeps nothing out.
+
+        What moves less than a spacing a step stops before a wall or little beyond it, where a node of its stencil is
+        free still. A particle has passed when it is deeper, or when it came more than a spacing nearer in the step and
+        ended beyond. One that began beyond has not.
+
+        Args:
+            start: positions at t [m], shape (p, d).
+            end: positions at t + dt [m], shape (p, d).
+            spacing: dx [m].
+            t: time [s].
+            dt: step [s].
+            reach: half the kernel's width in spacings.
+        """
+        del start, end, spacing, t, dt, reach
+        return None
+
+
+def crossed(
+    start: Array, end: Array, wall: Array | Scalar, deepest: Array | Scalar, spacing: Scalar
+) -> Bool[Array, "..."]:
+    """Whether what moved from `start` to `end` passed a wall that keeps material above it: by more than a spacing, or
+    to a place below `deepest`."""
+    fast = (start >= wall) & (end < wall) & (start - end > spacing)
+    return fast | ((start >= deepest) & (end < deepest))
+
+
+def _through_box(
+    lower: Point, upper: Point, start: ParticleVector, end: ParticleVector, spacing: Scalar, reach: float
+) -> Bool[Array, "p"]:
+    """Which particles passed a wall of a box: the deepest place is where a stencil has free nodes no more."""
+
+    def through(wall: Array, start: Array, end: Array) -> Array:
+        first_free = jnp.floor(wall / spacing + ON_THE_WALL) + 1
+        return crossed(start, end, wall, (first_free - reach - ON_THE_WALL) * spacing, spacing).any(axis=1)
+
+    below, above = jnp.asarray(lower, end.dtype), jnp.asarray(upper, end.dtype)
+    return through(below, start, end) | through(-above, -start, -end)
+
 
 def _walls(lower: Point, upper: Point, nodes: NodeVector, spacing: Scalar) -> NodeVector:
     """The inward normal's component in each direction: +1 at and below `lower`, −1 at and above `upper`, else 0."""
@@ -155,6 +197,12 @@ class StickyBox(AbstractBoundary):
         held = (_walls(self.lower, self.upper, nodes, spacing) != 0).any(axis=1, keepdims=True)
         return Conditions(jnp.broadcast_to(held, nodes.shape), jnp.zeros_like(nodes))
 
+    def passed(
+        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
+    ) -> Bool[Array, "p"]:
+        del t, dt
+        return _through_box(self.lower, self.upper, start, end, spacing, reach)
+
 
 class SlipBox(AbstractBoundary):
     """Walls along which the material slides freely and from which it cannot part: the normal velocity is zero at and
@@ -183,6 +231,12 @@ class SlipBox(AbstractBoundary):
         """v·n = 0."""
         del t, dt, reference
         return Conditions(_walls(self.lower, self.upper, nodes, spacing) != 0, jnp.zeros_like(nodes))
+
+    def passed(
+        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
+    ) -> Bool[Array, "p"]:
+        del t, dt
+        return _through_box(self.lower, self.upper, start, end, spacing, reach)
 
 
 class SeparatingBox(AbstractBoundary):
@@ -220,6 +274,12 @@ class SeparatingBox(AbstractBoundary):
         nothing = jnp.zeros(nodes.shape, dtype=bool)
         side = _walls(self.lower, self.upper, nodes, spacing)
         return Conditions(nothing, jnp.zeros_like(nodes), side, jnp.abs(side) * self.friction)
+
+    def passed(
+        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
+    ) -> Bool[Array, "p"]:
+        del t, dt
+        return _through_box(self.lower, self.upper, start, end, spacing, reach)
 
 
 class Grip(AbstractBoundary):

@@ -14,7 +14,9 @@ from mpmjax._boundary import ON_THE_WALL, AbstractBoundary, Conditions, Touch
 from mpmjax._checks import canonical, require, require_between
 from mpmjax._motion import AbstractMotion, Motion, still
 from mpmjax._region import AbstractRegion, HalfSpace, length
-from mpmjax._types import Array, Bool, Float, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, NodeVector, ParticleVector, Scalar
+
+_LOOKS = 4  # places of a particle's way in which a collider is looked for
 
 
 class AbstractCollider(AbstractBoundary):
@@ -31,6 +33,27 @@ class AbstractCollider(AbstractBoundary):
     def distance(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m"]:
         """The signed distance [m] of each of the points x [m], shape (m, d), from the body as it is at time t."""
         return self.shape.distance(x if self.motion is None else self.motion.origin(x, t))
+
+    def passed(
+        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
+    ) -> Bool[Array, "p"]:
+        """Which particles came from outside more than a spacing nearer, relative to the body, and were in it after some
+        quarters of the way. Nobody is asked for distances while none moves as fast."""
+        del reach
+        if self.motion is not None:
+            start, end = self.motion.origin(start, t), self.motion.origin(end, t + dt)
+        way = end - start
+
+        def look() -> Array:
+            first = self.shape.distance(start)
+            later = jax.lax.map(
+                lambda part: self.shape.distance(start + part * way),
+                jnp.arange(1, _LOOKS + 1, dtype=end.dtype) / _LOOKS,
+            )
+            return (first >= 0) & ((later < 0) & (first - later > spacing)).any(axis=0)
+
+        fast = ((way**2).sum(axis=1) > spacing**2).any()
+        return jax.lax.cond(fast, look, lambda: jnp.zeros(len(end), bool))
 
 
 class StickyCollider(AbstractCollider):

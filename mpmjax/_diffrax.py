@@ -17,7 +17,7 @@ from mpmjax._scene import Scene
 from mpmjax._step import StepInfo, advance_compiled
 from mpmjax._types import Array, Bool, Float, Int, Scalar
 
-HEALTHY, NOT_FINITE, OUTSIDE, INADMISSIBLE = 0, 1, 2, 3
+HEALTHY, NOT_FINITE, OUTSIDE, INADMISSIBLE, BEYOND = 0, 1, 2, 3, 4
 """What can be wrong with a state."""
 
 
@@ -63,7 +63,7 @@ class Tally(eqx.Module):
     violations: Int[Array, "*f"]
     """Contact conditions left violated, summed over steps."""
     fault: Int[Array, "*f"]
-    """The first fault of a state: HEALTHY, NOT_FINITE, OUTSIDE or INADMISSIBLE."""
+    """The first fault of a state: HEALTHY, NOT_FINITE, OUTSIDE, INADMISSIBLE or BEYOND."""
     fault_step: Int[Array, "*f"]
     """How many steps led to it."""
 
@@ -135,11 +135,23 @@ def _finite(fields: Any) -> Bool[Array, "p"]:
     return reduce(jnp.logical_and, finite)
 
 
-def fault_of(problem: Problem, state: State) -> Int[Array, ""]:
-    """The gravest fault of a state."""
-    broken, outside, inadmissible = (a.any() for a in faulty_particles(problem, state))
+def passed_particles(problem: Problem, before: State, after: State, t: Scalar) -> list[tuple[int, Bool[Array, "p"]]]:
+    """The numbers of the boundaries that keep something out, and which particles passed each in the step from t [s]."""
+    scene = problem.scene
+    start = scene.grid.wrapped(before.x, scene.window(problem.at(before)))
+    end = start + (after.x - before.x)
+    reach = (scene.kernel.order + 1) / 2
+    found = [b.passed(start, end, scene.grid.spacing, t, problem.dt, reach) for b in scene.boundary]
+    return [(number, passed) for number, passed in enumerate(found) if passed is not None]
+
+
+def fault_of(problem: Problem, before: State, after: State, t: Scalar) -> Int[Array, ""]:
+    """The gravest fault of a state and of the step from t [s] that led to it."""
+    broken, outside, inadmissible = (a.any() for a in faulty_particles(problem, after))
     fault = jnp.where(inadmissible, INADMISSIBLE, HEALTHY)
     fault = jnp.where(outside, OUTSIDE, fault)
+    for _, passed in passed_particles(problem, before, after, t):
+        fault = jnp.where(passed.any(), BEYOND, fault)
     return jnp.where(broken, NOT_FINITE, fault).astype(jnp.int32)
 
 
@@ -174,7 +186,7 @@ class StepSolver(diffrax.AbstractSolver):
         t = (args.start + step_number(t0)) * args.dt
         particles, info = advance_compiled(args.scene, args.at(y0), t, args.dt, args.method, args.stencil)
         y1 = state_of(particles)
-        arrays, rest = eqx.partition((args, y1), eqx.is_array)
+        arrays, rest = eqx.partition((args, y0, y1, t), eqx.is_array)
         tally = tally.plus(info, fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest)))
         dense = {"y0": y0, "y1": y1}
         if not self.watch:

@@ -91,6 +91,14 @@ class Grid(eqx.Module):
         first = jnp.floor(jax.lax.stop_gradient(middle / self.spacing)).astype(jnp.int32)
         return first - jnp.asarray([length // 2 for length in self.shape], dtype=jnp.int32)
 
+    def wrapped(self, x: ParticleVector, window: Int[Array, "d"]) -> ParticleVector:
+        """Positions [m], shape (p, d), moved by whole periods into the window."""
+        if not any(self.periodic):
+            return x
+        period = jnp.asarray(self.shape, x.dtype) * self.spacing
+        turns = jnp.floor((x - window.astype(x.dtype) * self.spacing) / period)
+        return jnp.where(jnp.asarray(self.periodic), x - turns * period, x)
+
     def nodes(self, window: Int[Array, "d"]) -> NodeVector:
         """Positions of the window's nodes [m], shape (n, d)."""
         axes = [jnp.arange(length, dtype=jnp.int32) for length in self.shape]

@@ -10,16 +10,23 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._boundary import ON_THE_WALL, AbstractBoundary, Conditions
+from mpmjax._boundary import ON_THE_WALL, AbstractBoundary, Conditions, crossed
 from mpmjax._checks import is_traced, require, require_between, require_finite
 from mpmjax._grid import Grid
-from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector, ParticleVector, Scalar
 
 
 def _check_plane(name: str, axis: int, position: Scalar, keep: str) -> None:
     require_finite(f"{name}'s position", position)
     require(axis in (0, 1, 2), f"{name}'s axis must be 0, 1 or 2, got {axis}.")
     require(keep in ("above", "below"), f'{name} keeps "above" or "below", got {keep!r}.')
+
+
+def _through_plane(plane: "Plane", start: ParticleVector, end: ParticleVector, spacing: Scalar) -> Bool[Array, "p"]:
+    """Which particles passed a plane: half a spacing is the deepest that they may be."""
+    inward = 1 if plane.keep == "above" else -1
+    place = inward * jnp.asarray(plane.position, end.dtype)
+    return crossed(inward * start[:, plane.axis], inward * end[:, plane.axis], place, place - spacing / 2, spacing)
 
 
 class SymmetryPlane(AbstractBoundary):
@@ -53,6 +60,12 @@ class SymmetryPlane(AbstractBoundary):
         del t, dt, reference
         on = jnp.abs(nodes[:, self.axis] - self.position) <= ON_THE_WALL * spacing
         return Conditions(jnp.zeros(nodes.shape, dtype=bool).at[:, self.axis].set(on), jnp.zeros_like(nodes))
+
+    def passed(
+        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
+    ) -> Bool[Array, "p"]:
+        del t, dt, reach
+        return _through_plane(self, start, end, spacing)
 
 
 class ContactPlane(AbstractBoundary):
@@ -96,6 +109,12 @@ class ContactPlane(AbstractBoundary):
         """None that holds always."""
         del spacing, t, dt, reference
         return Conditions(jnp.zeros(nodes.shape, dtype=bool), jnp.zeros_like(nodes))
+
+    def passed(
+        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
+    ) -> Bool[Array, "p"]:
+        del t, dt, reach
+        return _through_plane(self, start, end, spacing)
 
 
 Plane = SymmetryPlane | ContactPlane

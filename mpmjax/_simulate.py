@@ -11,6 +11,7 @@ import numpy as np
 
 from mpmjax._checks import canonical, is_traced, require, require_finite, require_positive
 from mpmjax._diffrax import (
+    BEYOND,
     HEALTHY,
     INADMISSIBLE,
     NOT_FINITE,
@@ -20,6 +21,7 @@ from mpmjax._diffrax import (
     Tally,
     faulty_particles,
     no_vector_field,
+    passed_particles,
     step_number,
 )
 from mpmjax._method import Explicit, Method
@@ -73,9 +75,9 @@ def simulate(
     Raises:
         ValueError: of `prepare`; a t1 that is not a whole number of steps after the start.
         SimulationError: a state that is not finite, a particle outside the window, an F that the law does not allow
-            (each with step, time and first bad particle; the last good state is in its `run.final`), a solve that did
-            not converge. Under an outer transformation (`jax.grad`, `jax.jit`, `jax.vmap`): the runtime error of
-            `equinox.error_if` instead.
+            or one that passed a boundary (each with step, time and first bad particle; the last good state is in its
+            `run.final`), a solve that did not converge. Under an outer transformation (`jax.grad`, `jax.jit`,
+            `jax.vmap`): the runtime error of `equinox.error_if` instead.
     """
     start = int(start)
     count = number_of_steps(t1, dt, start, particles.x.dtype)
@@ -123,9 +125,9 @@ def simulate(
 
 
 _TRACED_FAULT = (
-    "mpmjax: the rollout met a fault (a non-finite state, a particle outside the window, an inadmissible F, or a solve "
-    "that did not converge). Call simulate outside of jax transformations to have step, time and particle named, or "
-    "with throw=False to inspect run.tally."
+    "mpmjax: the rollout met a fault (a non-finite state, a particle outside the window or beyond a boundary, an "
+    "inadmissible F, or a solve that did not converge). Call simulate outside of jax transformations to have step, time "
+    "and particle named, or with throw=False to inspect run.tally."
 )
 
 
@@ -260,8 +262,13 @@ def raise_faults(run: Run, previous: State | None, start: int) -> None:
         problem = Problem(run.scene, run.final, None, run.dt, run.method)
         broken, outside, inadmissible = faulty_particles(problem, state_of(run.final))
         bad: dict[int, Array] = {NOT_FINITE: broken, OUTSIDE: outside, INADMISSIBLE: inadmissible}
-        first = int(np.argmax(np.asarray(bad[fault])))
         what, advice = _FAULTS[fault]
+        if fault == BEYOND:
+            t = jnp.asarray(step - 1, run.final.x.dtype) * run.dt
+            passed = passed_particles(problem, previous, state_of(run.final), t)
+            number, bad[BEYOND] = next((i, mask) for i, mask in passed if mask.any())
+            what = f"{what} boundary {number}, {type(run.scene.boundary[number]).__name__}"
+        first = int(np.argmax(np.asarray(bad[fault])))
         reached = int((run.steps < step).sum())
         good = eqx.tree_at(
             lambda r: (r.final, r.final_step, r.steps, r.frames, r.observed),
@@ -290,6 +297,11 @@ def raise_faults(run: Run, previous: State | None, start: int) -> None:
 _FAULTS: dict[int, tuple[str, str]] = {
     NOT_FINITE: ("is no longer finite", "Reduce dt (explicit steps have a limit), or use an implicit method."),
     OUTSIDE: ("left the grid's window", "Enlarge the grid's shape, or use follow=True."),
+    BEYOND: (
+        "passed",
+        "Reduce dt: a boundary keeps out what comes less than a cell nearer in a step. In the total description it "
+        "holds only what touched it from the start: use the updated one.",
+    ),
     INADMISSIBLE: (
         "has a deformation gradient that its law does not allow (det F ≤ 0)",
         "Reduce dt, or use FixedCorotated, which allows inversion.",
