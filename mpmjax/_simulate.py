@@ -126,8 +126,8 @@ def simulate(
 
 _TRACED_FAULT = (
     "mpmjax: the rollout met a fault (a non-finite state, a particle outside the window or beyond a boundary, an "
-    "inadmissible F, or a solve that did not converge). Call simulate outside of jax transformations to have step, time "
-    "and particle named, or with throw=False to inspect run.tally."
+    "inadmissible F, or a solve that did not converge). Call simulate outside of jax transformations to have step, "
+    "time and particle named, or with throw=False to inspect run.tally."
 )
 
 
