@@ -19,6 +19,7 @@ from mpmjax._constraint import Constraint
 from mpmjax._hessian import Hessian, ImplicitOperator, damped
 from mpmjax._metric import Metric
 from mpmjax._potential import ElasticPotential
+from mpmjax._rule import ruled
 from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector, Scalar
 
 
@@ -341,7 +342,7 @@ def solve(
     return _solve(problem, *jax.lax.stop_gradient((guess, find, adjoint)))
 
 
-@eqx.filter_custom_jvp
+@ruled
 def _solve(
     problem: AbstractProblem, guess: NodeVector, find: Any, adjoint: ConjugateResidual
 ) -> tuple[NodeVector, SolveInfo]:
@@ -349,7 +350,7 @@ def _solve(
     return find(problem, guess)
 
 
-@_solve.def_jvp
+@_solve.defjvp
 def _solve_jvp(primals: Any, tangents: Any) -> Any:
     problem, guess, find, adjoint = primals
     d_problem = tangents[0]

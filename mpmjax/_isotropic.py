@@ -4,29 +4,39 @@ Their derivatives do not differentiate V, which has none where eigenvalues coinc
 scene). They are written in divided differences of f, which are finite there: with A and B in the frame V,
 
     (Df[A])_ij = f[s_i, s_j] A_ij,
-    (D²f[A, B])_ij = Σ_k f[s_i, s_k, s_j] (A_ik B_kj + B_ik A_kj)
+    (D²f[A, B])_ij = Σ_k f[s_i, s_k, s_j] (A_ik B_kj + B_ik A_kj),
 
-(J. L. Daleckii, S. G. Krein; N. J. Higham, Functions of Matrices, SIAM 2008, theorem 3.11 and its proof,
-doi 10.1137/1.9780898717778). First and second derivatives hold at every S; third ones are refused. In the parameters
-of f, if it has any, Df and f are differentiated as they stand: the derivative is again a function of S in this frame.
+and so on: Dⁿf is the sum over all orders of its n directions (J. L. Daleckii, S. G. Krein; N. J. Higham, Functions of
+Matrices, SIAM 2008, theorem 3.11 and its proof, doi 10.1137/1.9780898717778). The derivative of each is the next, and
+the adjoint of each is itself, so derivatives of any order and mode hold at every S. The derivative in a parameter of f
+is again a function of S in this frame.
 
 Each function finds the frame for itself; XLA merges equal ones, so that several functions of one S cost one frame.
 """
 
 import abc
+import itertools
 from collections.abc import Callable
+from functools import partial, reduce
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax import _linalg as la
-from mpmjax._types import Array, Matrix
+from mpmjax._rule import ruled
+from mpmjax._types import Array, Bool, Float, Matrix
 
-_CLOSE = 1e-4
-"""Where three eigenvalues lie within this share of each other, f[a, b, c] is f''/2 at their mean, off by the share's
-square; elsewhere it is a quotient of differences, off by rounding over the share."""
+Frame = tuple[Array, Matrix]
+"""Eigenvalues and eigenvectors, (d, *batch) and (d, d, *batch)."""
+
+_CLOSE = 0.01
+"""Three eigenvalues or more that lie within this share of each other, in the sum of the outer two, have their divided
+difference by a series; elsewhere it is a quotient of differences, off by rounding over the share."""
+_TERMS = 6
+"""Of the series, after the first: what is left out is of the order 1e-12."""
 
 
 class AbstractSpectral(eqx.Module):
@@ -41,8 +51,12 @@ class AbstractSpectral(eqx.Module):
         """The divided difference f[a, b] = (f(a) − f(b))/(a − b), f'(a) where they are equal, to rounding."""
 
     @abc.abstractmethod
-    def curvature(self, s: Array) -> Array:
-        """f''(s)."""
+    def coefficient(self, s: Array, order: int) -> Array:
+        """f⁽ⁿ⁾(s)/n! for n = `order` ≥ 2."""
+
+    def alike(self, low: Array, high: Array) -> Bool[Array, "..."]:
+        """Whether f is smooth between two eigenvalues."""
+        return jnp.full(jnp.broadcast_shapes(low.shape, high.shape), True)
 
     def __call__(self, S: Matrix) -> Matrix:
         """f(S). Only the upper triangle is read.
@@ -50,7 +64,7 @@ class AbstractSpectral(eqx.Module):
         Args:
             S: symmetric, shape (d, d, *batch).
         """
-        return _function(self, S)
+        return _differential(self, S, la.symmetric_eigen(jax.lax.stop_gradient(S)), ())
 
 
 class Logarithm(AbstractSpectral):
@@ -65,9 +79,9 @@ class Logarithm(AbstractSpectral):
         gap = (b - a) / a
         return jnp.where(gap == 0, 1, jnp.log1p(gap) / jnp.where(gap == 0, 1, gap)) / a
 
-    def curvature(self, s: Array) -> Array:
-        """−1/s²."""
-        return -1 / s**2
+    def coefficient(self, s: Array, order: int) -> Array:
+        """−(−1/s)ⁿ/n."""
+        return -((-1 / s) ** order) / order
 
 
 class PowerLessOne(AbstractSpectral):
@@ -88,92 +102,118 @@ class PowerLessOne(AbstractSpectral):
         ratio = jnp.expm1(self.exponent * jnp.log1p(gap)) / jnp.where(gap == 0, 1, gap)
         return self._power(a) * jnp.where(gap == 0, self.exponent, ratio) / a
 
-    def curvature(self, s: Array) -> Array:
-        """a (a − 1) eᶜ sᵃ⁻²."""
-        return self.exponent * (self.exponent - 1) * self._power(s) / s**2
+    def coefficient(self, s: Array, order: int) -> Array:
+        """eᶜ sᵃ Π (a − k)/((k + 1) s) over k < n."""
+        return reduce(jnp.multiply, ((self.exponent - k) / ((k + 1) * s) for k in range(order)), self._power(s))
 
     def _power(self, s: Array) -> Array:
         return jnp.exp(self.exponent * jnp.log(s) + self.shift)
 
 
-class _Change(AbstractSpectral):
-    """The change of a function by its parameters, a function of the same eigenvalue."""
+class _Partial(AbstractSpectral):
+    """∂f/∂a by one of the parameters of f, a function of the same eigenvalue."""
 
     function: AbstractSpectral
-    change: AbstractSpectral
-    """Of the function's class, each parameter its rate."""
+    parameter: int = eqx.field(static=True)
+    """Its place among the leaves."""
 
     def of(self, s: Array) -> Array:
-        return self._along(lambda f: f.of(s))
+        return self._rate(lambda f: f.of(s))
 
     def slope(self, a: Array, b: Array) -> Array:
-        return self._along(lambda f: f.slope(a, b))
+        return self._rate(lambda f: f.slope(a, b))
 
-    def curvature(self, s: Array) -> Array:
-        return self._along(lambda f: f.curvature(s))
+    def coefficient(self, s: Array, order: int) -> Array:
+        return self._rate(lambda f: f.coefficient(s, order))
 
-    def _along(self, value: Callable[[Any], Array]) -> Array:
-        return jax.jvp(value, (self.function,), (self.change,))[1]
+    def alike(self, low: Array, high: Array) -> Bool[Array, "..."]:
+        return self.function.alike(low, high)
 
-
-@jax.custom_jvp
-def _function(f: AbstractSpectral, S: Matrix) -> Matrix:
-    s, V = la.symmetric_eigen(S)
-    return _from_frame(V, la.diagonal(f.of(s)))
-
-
-@_function.defjvp
-def _function_jvp(primals: Any, tangents: Any) -> Any:
-    (f, S), (df, dS) = primals, tangents
-    change = _differential(f, S, dS)
-    if jax.tree.leaves(f):
-        change = change + _function(_Change(f, df), S)
-    return _function(f, S), change
+    def _rate(self, value: Callable[[Any], Array]) -> Array:
+        leaves, tree = jax.tree.flatten(self.function)
+        ones = [jnp.ones_like(a) if k == self.parameter else jnp.zeros_like(a) for k, a in enumerate(leaves)]
+        return jax.jvp(value, (self.function,), (jax.tree.unflatten(tree, ones),))[1]
 
 
-@jax.custom_jvp
-def _differential(f: AbstractSpectral, S: Matrix, A: Matrix) -> Matrix:
-    """Df(S)[A]."""
-    s, V = la.symmetric_eigen(S)
-    return _from_frame(V, f.slope(s[:, None], s[None]) * _in_frame(V, A))
+@ruled
+def _differential(f: AbstractSpectral, S: Matrix, frame: Frame, directions: tuple[Matrix, ...]) -> Matrix:
+    """Dⁿf(S)[A, B, ...] in n directions. The value is of the frame alone, the derivative by S alone."""
+    del S
+    s, V = frame
+    order = len(directions)
+    if order < 2:
+        core = la.diagonal(f.of(s)) if order == 0 else f.slope(s[:, None], s[None]) * _in_frame(V, directions[0])
+        return _from_frame(V, core)
+    s, V = _ascending(s, V)
+    divided, total = _divided_differences(f, s, order), None
+    for arranged in itertools.permutations([_in_frame(V, A) for A in directions]):
+        term = divided
+        for k, A in enumerate(arranged):
+            term = term * jnp.expand_dims(A, [*range(k), *range(k + 2, order + 1)])
+        total = term if total is None else total + term
+    return _from_frame(V, total.sum(axis=tuple(range(1, order))))
 
 
 @_differential.defjvp
 def _differential_jvp(primals: Any, tangents: Any) -> Any:
-    (f, S, A), (df, dS, dA) = primals, tangents
-    change = _differential(f, S, dA) + _second_differential(f, S, A, dS)
-    if jax.tree.leaves(f):
-        change = change + _differential(_Change(f, df), S, A)
-    return _differential(f, S, A), change
+    (f, S, frame, A), (df, dS, _, dA) = primals, tangents
+    parts = [] if dS is None else [_differential(f, S, frame, (*A, dS))]
+    for k, change in enumerate(dA):
+        if change is not None:
+            parts.append(_differential(f, S, frame, (*A[:k], change, *A[k + 1 :])))
+    for k, rate in enumerate(jax.tree.structure(f).flatten_up_to(df)):
+        if rate is not None:
+            parts.append(rate * _differential(_Partial(f, k), S, frame, A))
+    return _differential(f, S, frame, A), reduce(jnp.add, parts)
 
 
-@jax.custom_jvp
-def _second_differential(f: AbstractSpectral, S: Matrix, A: Matrix, B: Matrix) -> Matrix:
-    """D²f(S)[A, B]."""
-    s, V = la.symmetric_eigen(S)
-    A, B = _in_frame(V, A), _in_frame(V, B)
-    directions = range(s.shape[0])
-
-    def divided(*three: Array) -> Array:
-        low, middle, high = jnp.sort(jnp.stack(three), axis=0)
-        close = high - low <= _CLOSE * (jnp.abs(low) + jnp.abs(high))
-        apart = (f.slope(middle, high) - f.slope(low, middle)) / jnp.where(close, 1, high - low)
-        return jnp.where(close, f.curvature((low + middle + high) / 3) / 2, apart)
-
-    def entry(i: int, j: int) -> Array:
-        terms = [divided(s[i], s[k], s[j]) * (A[i, k] * B[k, j] + B[i, k] * A[k, j]) for k in directions]
-        return sum(terms[1:], terms[0])
-
-    return _from_frame(V, la.assemble([[entry(i, j) for j in directions] for i in directions]))
+@_differential.deftranspose
+def _differential_transpose(cotangent: Matrix, args: Any) -> Any:
+    f, S, frame, A = args
+    wanted = [direction is None for direction in A]
+    others = [cotangent if want else la.transpose(direction) for want, direction in zip(wanted, A, strict=True)]
+    pulled = _differential(f, S, frame, tuple(others))
+    nothing = jax.tree.map(lambda _: None, (f, S, frame))
+    return *nothing, tuple(pulled if want else None for want in wanted)
 
 
-@_second_differential.defjvp
-def _second_differential_jvp(primals: Any, tangents: Any) -> Any:
-    raise NotImplementedError(
-        "Functions of a strain's principal values have first and second derivatives, no third one: with Hencky's law "
-        "and those that yield take first derivatives through implicit steps, and second ones through explicit steps "
-        "only."
-    )
+def _ascending(s: Array, V: Matrix) -> Frame:
+    """The frame with its eigenvalues in ascending order."""
+    values, columns = list(jnp.unstack(s)), list(jnp.unstack(V, axis=1))
+    for i in [i for last in range(len(values) - 1, 0, -1) for i in range(last)]:
+        swap = values[i] > values[i + 1]
+        for a in (values, columns):
+            a[i], a[i + 1] = jnp.where(swap, a[i + 1], a[i]), jnp.where(swap, a[i], a[i + 1])
+    return jnp.stack(values), jnp.stack(columns, axis=1)
+
+
+def _divided_differences(f: AbstractSpectral, s: Array, order: int) -> Array:
+    """f[s_i, s_j, ...] for all tuples of n + 1 of the d ascending values s, n = `order`, shape (d, ..., d, *batch)."""
+    choices = partial(itertools.combinations_with_replacement, range(len(s)))
+    known = {(i, j): f.slope(s[i], s[j]) for i, j in choices(2)}
+    values = jnp.stack(list(known.values()))
+    for size in range(3, order + 2):
+        tuples = list(choices(size))
+        x = s[np.array(tuples).T]
+        low, high = x[0], x[-1]
+        close = f.alike(low, high) & (high - low <= _CLOSE * (jnp.abs(low) + jnp.abs(high)))
+        above, below = (jnp.stack([known[t[part]] for t in tuples]) for part in (slice(1, None), slice(-1)))
+        values = jnp.where(close, _series(f, x), (above - below) / jnp.where(close, 1, high - low))
+        known = dict(zip(tuples, jnp.unstack(values), strict=True))
+    number = {t: k for k, t in enumerate(known)}
+    everywhere = itertools.product(range(len(s)), repeat=order + 1)
+    return values[np.reshape([number[tuple(sorted(t))] for t in everywhere], [len(s)] * (order + 1))]
+
+
+def _series(f: AbstractSpectral, x: Float[Array, "k ..."]) -> Array:
+    """f[x_0, ..., x_n] by Taylor's series of f about the mean m: Σ_k f⁽ⁿ⁺ᵏ⁾(m)/(n+k)! h_k(x − m), with h_k the sum of
+    all products of k of the deviations, repeated ones too (C. de Boor, Surv. Approx. Theory 1 (2005) 46, section 9)."""
+    mean = x.mean(axis=0)
+    products = [jnp.ones_like(mean), *[jnp.zeros_like(mean)] * _TERMS]
+    for deviation in x - mean:
+        for k in range(1, _TERMS + 1):
+            products[k] = products[k] + deviation * products[k - 1]
+    return reduce(jnp.add, (f.coefficient(mean, len(x) - 1 + k) * h for k, h in enumerate(products)))
 
 
 def _in_frame(V: Matrix, A: Matrix) -> Matrix:

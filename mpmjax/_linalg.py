@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mpmjax._rule import ruled
 from mpmjax._types import Array, Compliance, Float, Matrix
 
 _NEWTON_STEPS = 30  # on the quartic of the 3-D rotation: halves the error at a double root, else squares it
@@ -168,7 +169,7 @@ def pairs(d: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(d) for j in range(i + 1, d)]
 
 
-@jax.custom_jvp
+@ruled
 def principal_frame(F: Matrix) -> tuple[Matrix, Array, Matrix]:
     """F = U diag(s) Vᵀ with rotations U and V: the singular value decomposition with signed stretches.
 
@@ -213,7 +214,7 @@ def _principal_frame_jvp(primals: Any, tangents: Any) -> Any:
     )
 
 
-@jax.custom_jvp
+@ruled
 def rotation(F: Matrix) -> Matrix:
     """The rotation R of the polar decomposition F = R S, with det R = +1.
 

@@ -1,9 +1,11 @@
 """The stress differential projected to positive semi-definite, with a derivative that holds at repeated stretches."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from mpmjax import _linalg as la
+from mpmjax._rule import ruled
 from mpmjax._types import Array, Float, Matrix
 from mpmjax.material._base import AbstractMaterial, MatrixTangent
 
@@ -24,7 +26,7 @@ def projected_tangent(material: AbstractMaterial, F: Matrix) -> MatrixTangent:
     return MatrixTangent(_projected_matrix(material, F))
 
 
-@jax.custom_jvp
+@ruled
 def _projected_matrix(material: AbstractMaterial, F: Matrix) -> Float[Array, "m m *p"]:
     values, modes = _spectrum(material, F)
     return _in_modes(modes, la.diagonal(jnp.maximum(values, 0)))
@@ -41,7 +43,7 @@ def _projected_matrix_jvp(
         images = jax.vmap(material.tangent(F))(modes.reshape(-1, *F.shape)).reshape(modes.shape)
         return la.matmul(modes, jnp.swapaxes(images, 0, 1))
 
-    change = jax.jvp(in_frame, primals, tangents)[1]
+    change = eqx.filter_jvp(in_frame, primals, tangents)[1]
     positive, size = jnp.maximum(values, 0), jnp.abs(values)
     total = size[:, None] + size
     # for every pair of signs the quotient of differences is this one of sums, which cancels nowhere

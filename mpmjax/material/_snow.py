@@ -1,5 +1,7 @@
 """Snow."""
 
+from functools import reduce
+
 import equinox as eqx
 import jax.numpy as jnp
 
@@ -112,7 +114,14 @@ class _Clamp(AbstractSpectral):
         quotient = (self.of(a) - self.of(b)) / jnp.where(apart, a - b, 1)
         return jnp.where(alike, together, jnp.where(apart, quotient, 0))
 
-    def curvature(self, s: Array) -> Array:
-        """¾ limit c^(−5/2) where clamped."""
+    def coefficient(self, s: Array, order: int) -> Array:
+        """limit c^(−1/2) Π (−½ − k)/((k + 1) c) over k < n where clamped."""
         clamped, limit = self._limit(s)
-        return jnp.where(clamped, 0.75 * limit * jnp.where(clamped, s, 1) ** -2.5, 0)
+        s = jnp.where(clamped, s, 1)
+        scaled = reduce(jnp.multiply, ((-0.5 - k) / ((k + 1) * s) for k in range(order)), limit / jnp.sqrt(s))
+        return jnp.where(clamped, scaled, 0)
+
+    def alike(self, low: Array, high: Array) -> Bool[Array, "..."]:
+        """Whether both are clamped to the same limit, or neither is."""
+        (at_low, limit), (at_high, other) = self._limit(low), self._limit(high)
+        return jnp.where(at_low & at_high, limit == other, at_low == at_high)

@@ -1,0 +1,182 @@
+"""Derivative rules that hold however transformations are nested.
+
+A function with a rule of `jax.custom_jvp` loses it where JAX takes a program apart into what is known and what is
+linear, as reverse mode does, in `lax.scan` above all: what is left is the function's code, and a second derivative is
+that of the code, an iteration's or an eigenvector's. A primitive is never taken apart. `ruled` makes one of a function:
+
+    @ruled
+    def f(x, y): ...
+
+    @f.defjvp
+    def _(primals, tangents):   # returns f(*primals) and its change
+        ...
+
+As with `jax.custom_jvp`, arguments and results are pytrees of arrays, of whose other leaves a call is a choice of code,
+and the change is linear in the tangents. Tangents that are zero are None, in arguments and in results. A change is
+differentiated in turn, and transposed for reverse mode: it is written in operations that JAX can transpose, or in
+functions that have a rule for that too:
+
+    @f.deftranspose
+    def _(cotangent, args):   # of one result: the pytree of args with the cotangents of those that are None in it
+        ...
+"""
+
+from collections.abc import Callable, Hashable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
+from jax.dtypes import float0
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from mpmjax._types import Array
+
+
+class ruled:  # noqa: N801, a decorator
+    """A function with a rule for its derivative."""
+
+    def __init__(self, function: Callable[..., Any]):
+        self.function = function
+        self.jvp: Callable[..., Any] | None = None
+        self.transpose: Callable[..., Any] | None = None
+        self.__doc__, self.__name__, self.__module__ = function.__doc__, function.__name__, function.__module__
+
+    def __repr__(self) -> str:
+        return self.__name__
+
+    def defjvp(self, rule: Callable[..., Any]) -> Callable[..., Any]:
+        """The rule of the derivative."""
+        self.jvp = rule
+        return rule
+
+    def deftranspose(self, rule: Callable[..., Any]) -> Callable[..., Any]:
+        """The transpose, by arguments in which the function is linear."""
+        self.transpose = rule
+        return rule
+
+    def __call__(self, *args: Any) -> Any:
+        leaves, tree = jax.tree.flatten(args)
+        fixed = tuple(_ARRAY if isinstance(leaf, (jax.Array, np.ndarray)) else leaf for leaf in leaves)
+        arrays = [jnp.asarray(leaf) for leaf, f in zip(leaves, fixed, strict=True) if f is _ARRAY]
+        call = _Call(self, tree, fixed)
+        shapes = jax.eval_shape(partial(_evaluated, call), *arrays)
+        return jax.tree.unflatten(jax.tree.structure(shapes), _ruled_p.bind(*arrays, call=call))
+
+
+_ARRAY = type("_Array", (), {"__repr__": lambda _: "array"})()
+
+
+class _Call(NamedTuple):
+    """What of a call is fixed in a program: everything but the arrays."""
+
+    rule: ruled
+    tree: Any
+    fixed: tuple[Hashable, ...]
+    """The leaves of the arguments, `_ARRAY` in the place of each array."""
+    mapped: tuple[tuple[int | None, ...], ...] = ()
+    """For each `jax.vmap` around the call, the inner first, the arrays' axes. Results have theirs in front."""
+
+    def args(self, arrays: Sequence[Any]) -> tuple[Any, ...]:
+        """The arguments, of the arrays."""
+        found = iter(arrays)
+        return jax.tree.unflatten(self.tree, [next(found) if f is _ARRAY else f for f in self.fixed])
+
+    def tangents(self, arrays: Sequence[Any]) -> tuple[Any, ...]:
+        """The arguments' tangents, of the arrays'."""
+        found = iter(arrays)
+        return jax.tree.unflatten(self.tree, [next(found) if f is _ARRAY else None for f in self.fixed])
+
+    def arrays(self, args: Any) -> list[Any]:
+        """What stands in the arrays' places."""
+        leaves = self.tree.flatten_up_to(args)
+        return [leaf for leaf, f in zip(leaves, self.fixed, strict=True) if f is _ARRAY]
+
+
+def _evaluate(call: _Call, *arrays: Array) -> Any:
+    def value(arrays: tuple[Array, ...]) -> Any:
+        return call.rule.function(*call.args(arrays))
+
+    for axes in call.mapped:
+        value = jax.vmap(value, in_axes=(axes,))
+    return value(arrays)
+
+
+_evaluated = jax.jit(_evaluate, static_argnums=0)  # traced once for all its uses on arrays of the same shapes
+
+
+def _values(*arrays: Array, call: _Call) -> list[Array]:
+    return jax.tree.leaves(_evaluated(call, *arrays))
+
+
+def _shapes(*arrays: ShapedArray, call: _Call) -> list[ShapedArray]:
+    found = jax.tree.leaves(jax.eval_shape(partial(_evaluated, call), *arrays))
+    return [ShapedArray(a.shape, a.dtype) for a in found]
+
+
+def _batch(arrays: Sequence[Array], axes: Sequence[Any], *, call: _Call) -> tuple[list[Array], list[int]]:
+    mapped = tuple(None if axis is batching.not_mapped else axis for axis in axes)
+    out = _ruled_p.bind(*arrays, call=call._replace(mapped=(*call.mapped, mapped)))
+    return out, [0] * len(out)
+
+
+def _jvp(primals: Sequence[Any], tangents: Sequence[Any], *, call: _Call) -> tuple[list[Any], list[Any]]:
+    moving = [type(t) is not ad.Zero and t.dtype != float0 for t in tangents]
+    rule = call.rule.jvp
+    if rule is None:
+        raise NotImplementedError(f"{call.rule.__name__} has no derivative.")
+
+    def changed(primals: Sequence[Any], tangents: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+        found = iter(tangents)
+        out, change = rule(call.args(primals), call.tangents([next(found) if m else None for m in moving]))
+        leaves, tree = jax.tree.flatten(out)
+        return leaves, tree.flatten_up_to(change)
+
+    for axes in call.mapped:
+        changed = jax.vmap(changed, in_axes=(list(axes), [axis for axis, m in zip(axes, moving, strict=True) if m]))
+    out, change = changed(list(primals), [t for t, m in zip(tangents, moving, strict=True) if m])
+    zeros = [ad.Zero(jax.typeof(a).to_tangent_aval()) for a in out]
+    return out, [zero if c is None else c for c, zero in zip(change, zeros, strict=True)]
+
+
+def _transpose(cotangents: Sequence[Any], *arrays: Any, call: _Call) -> list[Any]:
+    linear = [ad.is_undefined_primal(a) for a in arrays]
+    rule = call.rule.transpose
+    if rule is None:
+        raise NotImplementedError(f"{call.rule.__name__} has no transpose.")
+
+    def pulled(cotangent: Array, arrays: Sequence[Any]) -> list[Any]:
+        found = iter(arrays)
+        args = call.args([None if one else next(found) for one in linear])
+        pulled = call.arrays(rule(cotangent, args))
+        return [a for a, one in zip(pulled, linear, strict=True) if one]
+
+    def over_axis(pulled: Callable[..., list[Any]], axes: Sequence[int | None]) -> Callable[..., list[Any]]:
+        known = [axis for axis, one in zip(axes, linear, strict=True) if not one]
+        wanted = [axis for axis, one in zip(axes, linear, strict=True) if one]
+        mapped = jax.vmap(pulled, in_axes=(0, known), out_axes=[axis or 0 for axis in wanted])
+
+        def summed(cotangent: Array, arrays: Sequence[Any]) -> list[Any]:
+            """Over the members of the batch that share an array."""
+            parts = zip(mapped(cotangent, arrays), wanted, strict=True)
+            return [a.sum(axis=0) if axis is None else a for a, axis in parts]
+
+        return summed
+
+    for axes in call.mapped:
+        pulled = over_axis(pulled, axes)
+    found = iter(pulled(ad.instantiate_zeros(cotangents[0]), [a for a, one in zip(arrays, linear, strict=True) if not one]))
+    return [next(found) if one else None for one in linear]
+
+
+_ruled_p = Primitive("ruled")
+_ruled_p.multiple_results = True
+_ruled_p.def_impl(_values)
+_ruled_p.def_abstract_eval(_shapes)
+ad.primitive_jvps[_ruled_p] = _jvp
+ad.primitive_transposes[_ruled_p] = _transpose
+batching.primitive_batchers[_ruled_p] = _batch
+mlir.register_lowering(_ruled_p, mlir.lower_fun(_values, multiple_results=True))
