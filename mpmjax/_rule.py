@@ -1,8 +1,9 @@
-"""Derivative rules that hold however transformations are nested.
+"""Derivative rules that hold in every nest of transformations.
 
-A function with a rule of `jax.custom_jvp` loses it where JAX takes a program apart into what is known and what is
-linear, as reverse mode does, in `lax.scan` above all: what is left is the function's code, and a second derivative is
-that of the code, an iteration's or an eigenvector's. A primitive is never taken apart. `ruled` makes one of a function:
+Reverse mode splits a program into a known and a linear part, and there JAX replaces a function with a rule of
+`jax.custom_jvp` by its code. The next derivative is then that of the code: of a solver's iteration, of an eigenvector
+that has no derivative. A primitive is never replaced. `ruled` makes one of a
+function:
 
     @ruled
     def f(x, y): ...
@@ -11,10 +12,10 @@ that of the code, an iteration's or an eigenvector's. A primitive is never taken
     def _(primals, tangents):   # returns f(*primals) and its change
         ...
 
-As with `jax.custom_jvp`, arguments and results are pytrees of arrays, of whose other leaves a call is a choice of code,
-and the change is linear in the tangents. Tangents that are zero are None, in arguments and in results. A change is
-differentiated in turn, and transposed for reverse mode: it is written in operations that JAX can transpose, or in
-functions that have a rule for that too:
+Arguments and results are pytrees. Their arrays are differentiated and batched; other leaves are fixed in the program.
+Tangents that are zero are None, in the arguments and in the change. The change is differentiated again for the next
+order, and transposed for reverse mode: it consists of operations that JAX transposes, or of functions that have a rule
+for that too:
 
     @f.deftranspose
     def _(cotangent, args):   # of one result: the pytree of args with the cotangents of those that are None in it
@@ -62,7 +63,7 @@ class ruled:  # noqa: N801, a decorator
         leaves, tree = jax.tree.flatten(args)
         fixed = tuple(_ARRAY if isinstance(leaf, (jax.Array, np.ndarray)) else leaf for leaf in leaves)
         arrays = [jnp.asarray(leaf) for leaf, f in zip(leaves, fixed, strict=True) if f is _ARRAY]
-        call = _Call(self, tree, fixed)
+        call = _Call(self, tree, fixed, tuple(map(type, fixed)))
         shapes = jax.eval_shape(partial(_evaluated, call), *arrays)
         return jax.tree.unflatten(jax.tree.structure(shapes), _ruled_p.bind(*arrays, call=call))
 
@@ -77,6 +78,8 @@ class _Call(NamedTuple):
     tree: Any
     fixed: tuple[Hashable, ...]
     """The leaves of the arguments, `_ARRAY` in the place of each array."""
+    types: tuple[type, ...]
+    """Theirs: 1 and 1.0 are equal and are not the same program."""
     mapped: tuple[tuple[int | None, ...], ...] = ()
     """For each `jax.vmap` around the call, the inner first, the arrays' axes. Results have theirs in front."""
 
@@ -168,7 +171,8 @@ def _transpose(cotangents: Sequence[Any], *arrays: Any, call: _Call) -> list[Any
 
     for axes in call.mapped:
         pulled = over_axis(pulled, axes)
-    found = iter(pulled(ad.instantiate_zeros(cotangents[0]), [a for a, one in zip(arrays, linear, strict=True) if not one]))
+    known = [a for a, one in zip(arrays, linear, strict=True) if not one]
+    found = iter(pulled(ad.instantiate_zeros(cotangents[0]), known))
     return [next(found) if one else None for one in linear]
 
 

@@ -40,5 +40,7 @@ def deformations(family: str, d: int, *, n: int = 20, seed: int = 0) -> tuple[np
     """n deformation gradients F = U diag(s) Vᵀ of a family and their rotations R = U Vᵀ, both (d, d, n)."""
     rng = np.random.default_rng(seed)
     U, V = (np.stack([rotation_matrix(d, rng) for _ in range(n)], axis=-1) for _ in range(2))
+    if family == "repeated":  # rotations split stretches by rounding: every other F is turned by none
+        U[..., ::2] = V[..., ::2] = np.eye(d)[..., None]
     s = np.stack([STRETCHES[family](d, rng) for _ in range(n)], axis=-1)
     return np.einsum("ikn,kn,jkn->ijn", U, s, V), np.einsum("ikn,jkn->ijn", U, V)

@@ -18,7 +18,7 @@ ALONG = jnp.array([0.3, -1.0, 0.8])
 
 
 def value(z, case, method, run):
-    """A sum over the state after two steps of a block that gravity and a grip pull, from rest but for an even stretch."""
+    """A sum over the state after two steps of a block that gravity and a grip pull, evenly stretched at first."""
     q = parameters(case)
     modulus, *others = q["law"]
     q |= {"law": [z[2] * modulus, *others], "v": 0 * q["v"]}

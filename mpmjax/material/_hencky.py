@@ -26,9 +26,7 @@ class Hencky(AbstractIsotropic):
     and of volume apart.
 
     *When it breaks*: it needs J > 0. The force in a stretched fibre falls beyond a stretch of e: not a law for rubber.
-    Each particle needs an eigenvalue problem, and an implicit step the matrix of its stress differential. The strain
-    has two derivatives: first derivatives pass through implicit steps, second ones through explicit steps only, and
-    more are refused.
+    Each particle needs an eigenvalue problem, and an implicit step the matrix of its stress differential.
     *Good values*: as for fixed corotated.
 
     Args:
@@ -57,7 +55,6 @@ class Hencky(AbstractIsotropic):
 
     def tangent(self, F: Matrix) -> MatrixTangent:
         """The stress's derivative in each of the d² directions."""
-        # by jvp, whose derivative is the rule's: jax.linearize's is that of its code, wrong where stretches coincide
         return MatrixTangent(la.matrix_of(lambda dF: jax.jvp(self.stress, (F,), (dF,))[1], F))
 
     def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
