@@ -145,13 +145,12 @@ def _differential(f: AbstractSpectral, S: Matrix, frame: Frame, directions: tupl
         core = la.diagonal(f.of(s)) if order == 0 else f.slope(s[:, None], s[None]) * _in_frame(V, directions[0])
         return _from_frame(V, core)
     s, V = _ascending(s, V)
-    divided, total = _divided_differences(f, s, order), None
+    products = []
     for arranged in itertools.permutations([_in_frame(V, A) for A in directions]):
-        term = divided
-        for k, A in enumerate(arranged):
-            term = term * jnp.expand_dims(A, [*range(k), *range(k + 2, order + 1)])
-        total = term if total is None else total + term
-    return _from_frame(V, total.sum(axis=tuple(range(1, order))))
+        factors = (jnp.expand_dims(A, [*range(k), *range(k + 2, order + 1)]) for k, A in enumerate(arranged))
+        products.append(reduce(jnp.multiply, factors))
+    terms = _divided_differences(f, s, order) * reduce(jnp.add, products)
+    return _from_frame(V, terms.sum(axis=tuple(range(1, order))))
 
 
 @_differential.defjvp
@@ -190,7 +189,7 @@ def _ascending(s: Array, V: Matrix) -> Frame:
 def _divided_differences(f: AbstractSpectral, s: Array, order: int) -> Array:
     """f[s_i, s_j, ...] for all tuples of n + 1 of the d ascending values s, n = `order`, shape (d, ..., d, *batch)."""
     choices = partial(itertools.combinations_with_replacement, range(len(s)))
-    known = {(i, j): f.slope(s[i], s[j]) for i, j in choices(2)}
+    known: dict[tuple[int, ...], Array] = {(i, j): f.slope(s[i], s[j]) for i, j in choices(2)}
     values = jnp.stack(list(known.values()))
     for size in range(3, order + 2):
         tuples = list(choices(size))

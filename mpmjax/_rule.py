@@ -61,14 +61,16 @@ class ruled:  # noqa: N801, a decorator
 
     def __call__(self, *args: Any) -> Any:
         leaves, tree = jax.tree.flatten(args)
-        fixed = tuple(_ARRAY if isinstance(leaf, (jax.Array, np.ndarray)) else leaf for leaf in leaves)
+        fixed: tuple[Hashable, ...] = tuple(
+            _ARRAY if isinstance(leaf, (jax.Array, np.ndarray)) else leaf for leaf in leaves
+        )
         arrays = [jnp.asarray(leaf) for leaf, f in zip(leaves, fixed, strict=True) if f is _ARRAY]
         call = _Call(self, tree, fixed, tuple(map(type, fixed)))
         shapes = jax.eval_shape(partial(_evaluated, call), *arrays)
         return jax.tree.unflatten(jax.tree.structure(shapes), _ruled_p.bind(*arrays, call=call))
 
 
-_ARRAY = type("_Array", (), {"__repr__": lambda _: "array"})()
+_ARRAY: Hashable = object()
 
 
 class _Call(NamedTuple):

@@ -116,16 +116,22 @@ def test_derivative_at_rest_is_the_mean_of_the_two_sides():
     assert_close(A, both(law, F)[0], 1e-14)
 
 
-def test_second_derivatives_are_refused():
-    """With an error that says so; the first ones are there."""
+@pytest.mark.parametrize("looped", [False, True], ids=["plain", "in a loop"])
+@pytest.mark.parametrize("outer", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("inner", [jax.jacfwd, jax.jacrev])
+def test_second_derivatives_are_refused(inner, outer, looped):
+    """With an error that says so, in every nest; the first ones are there."""
     law, F = LAWS["fixed_corotated"], jnp.eye(2)[..., None] * 0.95
 
-    def entry(F):
+    def once(F):
         return projected_tangent(law, F).matrix[0, 1, 0]
 
-    assert np.isfinite(np.asarray(jax.grad(entry)(F))).all()
+    def entry(F):
+        return jax.lax.scan(lambda _, one: (None, once(one)), None, F[None])[1][0] if looped else once(F)
+
+    assert np.isfinite(np.asarray(inner(entry)(F))).all()
     with pytest.raises(NotImplementedError, match="first derivatives only"):
-        jax.hessian(entry)(F)
+        outer(inner(entry))(F)
 
 
 def compressed(stretch=(0.9, 0.9), spin=0.0, side=3, noise=0.0, law=LAWS["fixed_corotated"]):
