@@ -6,6 +6,7 @@ so derivatives with respect to it are zero.
 """
 
 import abc
+from functools import reduce
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -144,10 +145,11 @@ def _through_box(
 
     def through(wall: Array, start: Array, end: Array) -> Array:
         first_free = jnp.floor(wall / spacing + ON_THE_WALL) + 1
-        return crossed(start, end, wall, (first_free - reach - ON_THE_WALL) * spacing, spacing).any(axis=1)
+        return crossed(start, end, wall, (first_free - reach - ON_THE_WALL) * spacing, spacing)
 
     below, above = jnp.asarray(lower, end.dtype), jnp.asarray(upper, end.dtype)
-    return through(below, start, end) | through(-above, -start, -end)
+    by_axis = zip(below, above, start.T, end.T, strict=True)
+    return reduce(jnp.logical_or, [through(lo, a, b) | through(-hi, -a, -b) for lo, hi, a, b in by_axis])
 
 
 def _walls(lower: Point, upper: Point, nodes: NodeVector, spacing: Scalar) -> NodeVector:
