@@ -52,7 +52,7 @@ class AbstractCollider(AbstractBoundary):
             )
             return (first >= 0) & ((later < 0) & (first - later > spacing)).any(axis=0)
 
-        fast = (sum(way[:, a] ** 2 for a in range(self.dim)) > spacing**2).any()
+        fast = jnp.any(sum(way[:, a] ** 2 for a in range(self.dim)) > spacing**2)
         return jax.lax.cond(fast, look, lambda: jnp.zeros(len(end), bool))
 
 
