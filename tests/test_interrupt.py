@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import equinox as eqx
@@ -59,11 +59,23 @@ def frames_in(path: Path) -> int:
         return 0
 
 
-def begun(folder: Path, *words: object, scene: str = SCENE) -> subprocess.Popen:
-    """A command of the shell in a process of its own."""
-    (folder / "scene.toml").write_text(scene)
-    command = [sys.executable, "-u", "-c", "from mpmjax_command import main; main()", *map(str, words)]
-    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+@pytest.fixture
+def begun(tmp_path) -> Iterator[Callable[..., subprocess.Popen]]:
+    """Begins a command of the shell in a process of its own; what still runs at the end is killed."""
+    processes = []
+
+    def begin(*words: str, scene: str = SCENE) -> subprocess.Popen:
+        (tmp_path / "scene.toml").write_text(scene)
+        command = [sys.executable, "-u", "-c", "from mpmjax_command import main; main()", *words]
+        processes.append(
+            subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        )
+        return processes[-1]
+
+    yield begin
+    for process in processes:
+        process.kill()
+        process.communicate()
 
 
 def ended(process: subprocess.Popen, number: signal.Signals) -> str:
@@ -78,15 +90,15 @@ def ended(process: subprocess.Popen, number: signal.Signals) -> str:
     return lines[0]
 
 
-def test_a_signal_ends_a_run_wherever_it_is(tmp_path):
+def test_a_signal_ends_a_run_wherever_it_is(begun, tmp_path):
     """While its steps are compiled, and amid writing frames as fast as it can; meanwhile nobody else writes there."""
     path = tmp_path / "run.h5"
-    compiling = begun(tmp_path, "run", "scene.toml", "-o", "run.h5", "--quiet")
+    compiling = begun("run", "scene.toml", "-o", "run.h5", "--quiet")
     wait_for(lambda: frames_in(path) > 0, compiling)
     line = ended(compiling, signal.SIGINT)
     assert re.search(r"run\.h5 holds \d+ frames?, the last of step \d+ \(t = \S+ s\)\. Resume it to continue\.$", line)
 
-    stepping = begun(tmp_path, "run", "scene.toml", "-o", "run.h5", "--resume")
+    stepping = begun("run", "scene.toml", "-o", "run.h5", "--resume")
     wait_for(lambda: frames_in(path) > 5, stepping)
     for choice in ("--resume", "--overwrite"):
         assert "is being written by another run" in refused("run", tmp_path / "scene.toml", "-o", path, choice)
@@ -97,15 +109,15 @@ def test_a_signal_ends_a_run_wherever_it_is(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_signal_ends_a_run_at_any_moment(tmp_path):
+def test_a_signal_ends_a_run_at_any_moment(begun, tmp_path):
     """From the first import to the summary, whole files every time."""
     path, scene = tmp_path / "run.h5", SCENE.replace("1e4\ndt", "0.2\ndt")
     begin = time.perf_counter()
-    assert begun(tmp_path, "run", "scene.toml", "-o", "run.h5", scene=scene).wait() == 0
+    assert begun("run", "scene.toml", "-o", "run.h5", scene=scene).wait() == 0
     whole, seconds = mpm.load(path), time.perf_counter() - begin
     for i in range(10):
         path.unlink(missing_ok=True)
-        process = begun(tmp_path, "run", "scene.toml", "-o", "run.h5", scene=scene)
+        process = begun("run", "scene.toml", "-o", "run.h5", scene=scene)
         time.sleep(seconds * (i + 0.5) / 10)
         number = (signal.SIGINT, signal.SIGTERM)[i % 2]
         process.send_signal(number)
@@ -118,8 +130,8 @@ def test_a_signal_ends_a_run_at_any_moment(tmp_path):
             assert eqx.tree_equal(mpm.load(path), whole)
 
 
-def test_a_signal_ends_what_writes_no_file(tmp_path):
-    process = begun(tmp_path, "chart", "scene.toml", scene=SCENE.replace("1e4\ndt", "1.0\ndt"))
+def test_a_signal_ends_what_writes_no_file(begun, tmp_path):
+    process = begun("chart", "scene.toml", scene=SCENE.replace("1e4\ndt", "1.0\ndt"))
     assert process.stdout is not None
     assert "method" in process.stdout.readline()
     assert ended(process, signal.SIGTERM).endswith("No file was being written.")
