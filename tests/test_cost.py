@@ -1,6 +1,7 @@
 """A scene pays for what it uses: operations counted in the program of a step, for scenes that differ in one feature."""
 
 from collections import Counter
+from functools import partial
 from unittest import mock
 
 import equinox as eqx
@@ -15,6 +16,7 @@ from mpmjax._constraint import Constraint
 from mpmjax._contact import Held
 from mpmjax._diffrax import Problem
 from mpmjax._nodes import Nodes
+from mpmjax._rule import _values
 from mpmjax._step import advance
 
 LAW = mpm.NeoHookean(1e5, 0.3)
@@ -52,7 +54,10 @@ def operations(jaxpr, times=1):
 
 
 def inner_programs(equation):
-    """The programs in an equation's parameters."""
+    """The programs in an equation's parameters, or of a function with a derivative rule."""
+    if equation.primitive.name == "ruled":
+        yield jax.make_jaxpr(partial(_values, **equation.params))(*(a.aval for a in equation.invars)).jaxpr
+        return
     for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda a: hasattr(a, "eqns")):
         inner = getattr(inner, "jaxpr", inner)
         if hasattr(inner, "eqns"):
