@@ -54,7 +54,9 @@ class Tally(eqx.Module):
     worst_residual: Float[Array, "*f"]
     """Largest relative residual that a solve ended with."""
     unconverged: Int[Array, "*f"]
-    """Steps whose solve met neither its tolerance nor the precision's limit."""
+    """Steps whose solve met neither ten times its tolerance nor the precision's limit: the run is not a solution."""
+    short: Int[Array, "*f"]
+    """Steps whose solve missed its tolerance, by less than ten times: the run is less accurate than was asked for."""
     indefinite: Int[Array, "*f"]
     """Steps whose solve met negative curvature: compression has made M + cH indefinite, and near a singular one the
     motion is wrong however small the residual. `AnalyticHessian(projected=True)` or a smaller step avoids it."""
@@ -69,7 +71,7 @@ class Tally(eqx.Module):
 
     @property
     def healthy(self) -> Bool[Array, "*f"]:
-        """Whether no state was at fault and every solve converged."""
+        """Whether no state was at fault and no solve ended far from its tolerance."""
         return (self.fault == HEALTHY) & (self.unconverged == 0)
 
     def plus(self, info: StepInfo, fault: Int[Array, ""]) -> "Tally":
@@ -84,7 +86,8 @@ class Tally(eqx.Module):
             newton=self.newton + s.newton,
             line_search=self.line_search + s.line_search,
             worst_residual=jnp.maximum(self.worst_residual, jax.lax.stop_gradient(s.residual)),
-            unconverged=self.unconverged + jnp.where(s.converged, 0, 1).astype(jnp.int32),
+            unconverged=self.unconverged + jnp.where(s.converged | s.short, 0, 1).astype(jnp.int32),
+            short=self.short + s.short.astype(jnp.int32),
             indefinite=self.indefinite + s.indefinite.astype(jnp.int32),
             sweeps=self.sweeps + c.sweeps,
             violations=self.violations + c.violations,
@@ -103,6 +106,7 @@ class Tally(eqx.Module):
             line_search=self.line_search + later.line_search,
             worst_residual=jnp.maximum(self.worst_residual, later.worst_residual),
             unconverged=self.unconverged + later.unconverged,
+            short=self.short + later.short,
             indefinite=self.indefinite + later.indefinite,
             sweeps=self.sweeps + later.sweeps,
             violations=self.violations + later.violations,
@@ -115,7 +119,7 @@ def no_steps(dtype: Any) -> Tally:
     """The tally before the first step."""
     zero = jnp.asarray(0, dtype=jnp.int32)
     residual = jnp.asarray(0, dtype=dtype)
-    return Tally(zero, zero, zero, zero, zero, residual, zero, zero, zero, zero, zero, zero)
+    return Tally(zero, zero, zero, zero, zero, residual, zero, zero, zero, zero, zero, zero, zero)
 
 
 def faulty_particles(problem: Problem, state: State) -> tuple[Bool[Array, "p"], Bool[Array, "p"], Bool[Array, "p"]]:

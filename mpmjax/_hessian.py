@@ -224,10 +224,13 @@ class ImplicitOperator(lx.AbstractLinearOperator):
     def metric(self) -> NodeVector:
         """W, the inner product over all rows: on free ones m_i or m_i + c H_ii (its mean over the directions where a
         normal is held, so that it commutes with Q), on identity rows 1."""
-        weight = jnp.broadcast_to(self.mass[:, None], self._shape)
-        if self.inner is Metric.DIAGONAL:
-            weight = weight + self.factor * self.hessian.assembled().diagonal(weight)
-        return self.constraint.metric(weight)
+        mass = jnp.broadcast_to(self.mass[:, None], self._shape)
+        return self.constraint.metric(self.diagonal() if self.inner is Metric.DIAGONAL else mass)
+
+    def diagonal(self) -> NodeVector:
+        """m_i + c H_ii, of H's diagonal what is positive (see `Stiffness.diagonal`)."""
+        mass = jnp.broadcast_to(self.mass[:, None], self._shape)
+        return mass + self.factor * self.hessian.assembled().diagonal(mass)
 
     def as_matrix(self) -> Float[Array, "nd nd"]:
         """The dense matrix, for tests and small problems."""

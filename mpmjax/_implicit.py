@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._checks import require, require_positive
-from mpmjax._conjugate_residual import LARGEST_RESIDUAL, ConjugateResidual, default_rtol
+from mpmjax._conjugate_residual import SETTLED, SHORT, ConjugateResidual, default_rtol
 from mpmjax._constraint import Constraint
 from mpmjax._hessian import Hessian, ImplicitOperator, damped
 from mpmjax._metric import Metric
@@ -34,9 +34,11 @@ class SolveInfo(eqx.Module):
     """Halvings of a Newton step by the line search."""
     residual: Float[Array, "*f"]
     """True relative residual at the end: of one linear solve in the norm of the inverse metric, of Newton's method in
-    that of the inverse mass."""
+    that of the inverse mass, and there relative to the momentum that the forces balance where their sum vanishes."""
     converged: Bool[Array, "*f"]
     """Whether the solver's tolerance, or the precision's own limit, was met."""
+    short: Bool[Array, "*f"]
+    """Whether neither was, but ten times the tolerance."""
     indefinite: Bool[Array, "*f"]
     """Whether the solver met a direction of negative curvature: M + cH is indefinite, and the step may be near a
     singular one."""
@@ -49,20 +51,24 @@ class SolveInfo(eqx.Module):
             line_search=self.line_search + later.line_search,
             residual=later.residual,
             converged=later.converged,
+            short=later.short,
             indefinite=self.indefinite | later.indefinite,
         )
 
     def beside(self, other: "SolveInfo") -> "SolveInfo":
         """The cost of both solves and the quality of the worse one."""
         both = self.plus(other)
-        worst = jnp.maximum(self.residual, other.residual), self.converged & other.converged
-        return eqx.tree_at(lambda info: (info.residual, info.converged), both, worst)
+        converged = self.converged & other.converged
+        short = (self.converged | self.short) & (other.converged | other.short) & ~converged
+        worst = jnp.maximum(self.residual, other.residual), converged, short
+        return eqx.tree_at(lambda info: (info.residual, info.converged, info.short), both, worst)
 
 
 def no_solve(dtype: Any) -> SolveInfo:
     """The report of an update that solves nothing."""
     zero = jnp.asarray(0, dtype=jnp.int32)
-    return SolveInfo(zero, zero, zero, jnp.asarray(0, dtype=dtype), jnp.asarray(True), jnp.asarray(False))
+    no = jnp.asarray(False)
+    return SolveInfo(zero, zero, zero, jnp.asarray(0, dtype=dtype), converged=~no, short=no, indefinite=no)
 
 
 class AbstractProblem(eqx.Module):
@@ -159,12 +165,12 @@ class NewtonProblem(AbstractProblem):
         return self.mass[:, None] * (v - self.inertial) - self.length * force
 
     def unit_strain(self) -> Float[Array, ""]:
-        """The norm √(Σ m) dx/c [√J] of a velocity that would strain everything by one in the stage.
+        """The velocity dx/c [m/s] that strains a cell by one in the stage.
 
-        Deformation gradients are of order one, and are rounded as such, however small the strains: so this, times the
-        operator's spectral radius and ε, is the rounding of the imbalance, and times itself that of the potential.
+        Deformation gradients are of order one, and are rounded as such, however small the strains: so ε times this,
+        times the operator's diagonal, is the rounding of the imbalance, and times itself that of the potential.
         """
-        return jnp.sqrt(self.mass.sum()) * self.spacing / self.length
+        return self.spacing / self.length
 
     def merit(self, v: NodeVector) -> Float[Array, ""]:
         """E(v) [J], without the constant of what is held; NaN where a law is not defined."""
@@ -192,12 +198,15 @@ class Linearised(eqx.Module):
         rhs = split(problem.rhs - operator.unconstrained(lift), 0)
         options = {"metric": operator.metric(), "y0": split(guess, 0)}
         v, result, stats = self.solver.compute(self.solver.init(operator, options), rhs, options)
+        converged = result == lx.RESULTS.successful
+        rtol = default_rtol(rhs.dtype) if self.solver.rtol is None else self.solver.rtol
         info = SolveInfo(
             iterations=stats["num_steps"],
             newton=jnp.asarray(0, dtype=jnp.int32),
             line_search=jnp.asarray(0, dtype=jnp.int32),
             residual=stats["residual"],
-            converged=result == lx.RESULTS.successful,
+            converged=converged,
+            short=~converged & (stats["residual"] <= SHORT * rtol),
             indefinite=stats["indefinite"],
         )
         return v + lift, info
@@ -210,7 +219,17 @@ class Newton(eqx.Module):
     in the metric's norm; a step is halved until the potential falls by a ten-thousandth of what its slope promises,
     which also keeps out of deformations where the law has no energy. Stops when ‖residual‖ ≤ rtol ‖b‖, b the right-hand
     side of the system linearised before anything moves, less what prescribed velocities contribute to it, both in the
-    norm of the inverse mass, or at the rounding of the residual. Starts from the guess, or from rest where the
+    norm of the inverse mass.
+
+    b vanishes where forces balance, and in single precision it can be smaller than the rounding of the residual, which
+    is 4 ε (‖W (|v| + dx/c)‖ + ‖M ṽ‖), W the diagonal of the operator: that of the terms that were added, F's being of
+    order one. A residual below that ends the iteration too, if the solution is known to be good in another way: the
+    last Newton step, taken whole, changed v by no more than a thousandth or strained by no more than √ε, the energy of
+    which is the potential's own rounding; or, M + cH being no less than M, the error ‖v − v*‖ ≤ ‖residual‖ is no more
+    than a thousandth of ‖v‖, in the norms of the mass and of its inverse. No guess is accepted because of rounding
+    alone.
+
+    Starts from the guess, or from rest where the
     potential is lower there or the guess is a deformation for which the law has no energy; if that is so at rest too,
     for what is prescribed alone (a grip that closes a gap of one cell in a step), the first step is that of the
     linearised system. An equation that is not finite even there gives NaN, never rest.
@@ -234,6 +253,7 @@ class Newton(eqx.Module):
         """The solution, started from a guess."""
         split, free = problem.constraint.split, problem.constraint.free
         metric = jnp.where(free, problem.mass[:, None], 1)
+        unit_strain = problem.unit_strain()
         dtype = guess.dtype
         eps = jnp.finfo(dtype).eps
         rtol = default_rtol(dtype) if self.rtol is None else self.rtol
@@ -244,28 +264,32 @@ class Newton(eqx.Module):
         def residual(v: NodeVector) -> NodeVector:
             return split(problem.imbalance(v), 0)
 
-        def tolerance(c: _NewtonState) -> Float[Array, ""]:
-            speed = jnp.sqrt((metric * split(c.v, 0) ** 2).sum())
-            rounding = 4 * eps * (c.radius * (speed + unit_strain) + scale)
-            return jnp.maximum(rtol * scale, jnp.minimum(rounding, LARGEST_RESIDUAL * scale))
+        def converged(c: _NewtonState) -> Bool[Array, ""]:
+            left, speed = norm(c.r), jnp.sqrt((metric * split(c.v, 0) ** 2).sum())
+            bounded = ~c.indefinite & (left <= SETTLED * speed)
+            return (left <= rtol * scale) | ((left <= c.rounding) & (c.settled | bounded))
 
         def goes_on(c: _NewtonState) -> Array:
-            return (norm(c.r) > tolerance(c)) & (c.newton < self.max_steps) & ~c.stuck
+            return ~converged(c) & (c.newton < self.max_steps) & ~c.stuck
 
         def step(c: _NewtonState) -> _NewtonState:
             model = problem.model(jnp.where((c.newton == 0) & ~startable, still, c.v)).assembled()
             inner = model.metric()
             options = {"metric": inner}
-            direction, _, stats = self.solver.compute(self.solver.init(model, options), -c.r, options)
+            direction, result, stats = self.solver.compute(self.solver.init(model, options), -c.r, options)
             slope = (c.r * direction).sum()
             steepest = -c.r / inner / jnp.maximum(stats["spectral_radius"], 1)
             uphill = ~(slope < 0)
+            whole = ~uphill & (result == lx.RESULTS.successful)
             direction = jnp.where(uphill, steepest, direction)
             slope = jnp.where(uphill, (c.r * steepest).sum(), slope)
             energy = problem.merit(c.v)
             energy = jnp.where(jnp.isfinite(energy), energy, jnp.inf)
-            radius = jnp.maximum(c.radius, stats["spectral_radius"] * (inner / metric).max())
-            slack = 4 * eps * radius * unit_strain**2  # near the solution the fall drowns in rounding
+            weight = jnp.where(free, model.diagonal(), 0)
+            slack = _ROUNDING * eps * ((weight * unit_strain**2).sum() + jnp.abs(energy))  # in it the fall drowns
+            unseen = jnp.where(free, jnp.sqrt(eps) * unit_strain, 0)
+            steps = direction, split(c.v + direction, 0), unseen
+            moved, speed, least = (jnp.sqrt((inner * a**2).sum()) for a in steps)
 
             def too_high(trial: tuple[Array, Array]) -> Array:
                 length, count = trial
@@ -278,7 +302,8 @@ class Newton(eqx.Module):
             return _NewtonState(
                 v=v,
                 r=residual(v),
-                radius=radius,
+                rounding=_ROUNDING * eps * (norm(weight * (jnp.abs(v) + unit_strain)) + inertia),
+                settled=whole & (halvings == 0) & (moved <= jnp.maximum(SETTLED * speed, least)),
                 iterations=c.iterations + stats["num_steps"],
                 newton=c.newton + 1,
                 halvings=c.halvings + halvings,
@@ -295,31 +320,36 @@ class Newton(eqx.Module):
         still = problem.undisplaced()
         linearised = problem.imbalance(still) + problem.operator(still).unconstrained(lift - still)
         linearised = split(linearised, 0)
-        scale = norm(linearised)
-        unit_strain = problem.unit_strain()
+        scale, inertia = norm(linearised), norm(split(problem.mass[:, None] * problem.inertial, 0))
         no = jnp.asarray(False)
         first = jnp.where(startable, residual(start), linearised)
-        state = _NewtonState(start, first, jnp.ones((), dtype), zero, zero, zero, no, no)
+        state = _NewtonState(start, first, jnp.zeros((), dtype), no, zero, zero, zero, no, no)
         c = jax.lax.while_loop(goes_on, step, state)
-        left = norm(c.r)
+        left, size = norm(c.r), jnp.maximum(jnp.maximum(scale, inertia), c.rounding)
+        done = jnp.isfinite(left) & converged(c)
         info = SolveInfo(
             iterations=c.iterations,
             newton=c.newton,
             line_search=c.halvings,
-            residual=left / jnp.where(scale == 0, 1, scale),
-            converged=jnp.isfinite(left) & (left <= tolerance(c)),
+            residual=left / jnp.where(size == 0, 1, size),
+            converged=done,
+            short=~done & (left <= SHORT * rtol * scale),
             indefinite=c.indefinite,
         )
         return jnp.where(free & ~jnp.isfinite(left), jnp.nan, c.v), info
 
 
 _MOST_HALVINGS = 30
+_ROUNDING = 4.0  # units of it
 
 
 class _NewtonState(eqx.Module):
     v: NodeVector
     r: NodeVector
-    radius: Array
+    rounding: Array
+    """Of ‖r‖."""
+    settled: Array
+    """Whether the last Newton step was whole, and too small to matter."""
     iterations: Array
     newton: Array
     halvings: Array

@@ -92,7 +92,7 @@ class SemiImplicit(eqx.Module):
         beta: β, from 0 to 1.
         hessian: how H acts. Default: by the analytic stress differential.
         solver: conjugate residuals of the forward solve.
-        metric: inner product of the solves, which is their preconditioner.
+        metric: inner product of the solves, which is their preconditioner. Default: by the diagonal of M + cH.
         adjoint_solver: of the tangent and adjoint solves, whose tolerance bounds the gradient's. Default: default
             tolerances.
         guess: where the solve starts.
@@ -101,7 +101,7 @@ class SemiImplicit(eqx.Module):
     beta: Scalar = 1.0
     hessian: Hessian = AnalyticHessian()
     solver: ConjugateResidual = ConjugateResidual()
-    metric: Metric = eqx.field(static=True, default=Metric.MASS)
+    metric: Metric = eqx.field(static=True, default=Metric.DIAGONAL)
     adjoint_solver: ConjugateResidual = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = False
@@ -145,14 +145,14 @@ class BackwardEuler(eqx.Module):
     Args:
         solution: `Newton()`, with its tolerances.
         hessian: how H acts. Default: by the analytic stress differential.
-        metric: inner product of the linear solves, which is their preconditioner.
+        metric: inner product of the linear solves, which is their preconditioner. Default: by the diagonal of M + cH.
         adjoint_solver: of the tangent and adjoint solves. Default: default tolerances.
         guess: where Newton starts.
     """
 
     solution: Newton = Newton()
     hessian: Hessian = AnalyticHessian()
-    metric: Metric = eqx.field(static=True, default=Metric.MASS)
+    metric: Metric = eqx.field(static=True, default=Metric.DIAGONAL)
     adjoint_solver: ConjugateResidual = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = False
@@ -186,14 +186,14 @@ class ImplicitMidpoint(eqx.Module):
     Args:
         solution: `Linearised()`, one linear solve, or `Newton()`.
         hessian: how H acts. Default: by the analytic stress differential.
-        metric: inner product of the linear solves, which is their preconditioner.
+        metric: inner product of the linear solves, which is their preconditioner. Default: by the diagonal of M + cH.
         adjoint_solver: of the tangent and adjoint solves. Default: default tolerances.
         guess: where the solve starts.
     """
 
     solution: Linearised | Newton = Linearised()
     hessian: Hessian = AnalyticHessian()
-    metric: Metric = eqx.field(static=True, default=Metric.MASS)
+    metric: Metric = eqx.field(static=True, default=Metric.DIAGONAL)
     adjoint_solver: ConjugateResidual = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = True
@@ -231,7 +231,7 @@ class TRBDF2(eqx.Module):
         rho: ρ∞, from 0 to 1.
         solution: `Linearised()`, one linear solve a stage, or `Newton()`.
         hessian: how H acts. Default: by the analytic stress differential.
-        metric: inner product of the linear solves, which is their preconditioner.
+        metric: inner product of the linear solves, which is their preconditioner. Default: by the diagonal of M + cH.
         adjoint_solver: of the tangent and adjoint solves. Default: default tolerances.
         guess: where the first stage's solve starts; the second's does where the first ended.
     """
@@ -239,7 +239,7 @@ class TRBDF2(eqx.Module):
     rho: Scalar = 0.0
     solution: Linearised | Newton = Linearised()
     hessian: Hessian = AnalyticHessian()
-    metric: Metric = eqx.field(static=True, default=Metric.MASS)
+    metric: Metric = eqx.field(static=True, default=Metric.DIAGONAL)
     adjoint_solver: ConjugateResidual = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = True

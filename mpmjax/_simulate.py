@@ -1,5 +1,6 @@
 """Rollouts: many steps, saved, watched and differentiated."""
 
+import warnings
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -24,7 +25,8 @@ from mpmjax._diffrax import (
     passed_particles,
     step_number,
 )
-from mpmjax._method import Explicit, Method
+from mpmjax._method import BackwardEuler, Explicit, Method
+from mpmjax._metric import Metric
 from mpmjax._particles import Particles, State, state_of, with_state
 from mpmjax._run import Run, SimulationError
 from mpmjax._scene import Scene, prepare
@@ -76,8 +78,9 @@ def simulate(
         ValueError: of `prepare`; a t1 that is not a whole number of steps after the start.
         SimulationError: a state that is not finite, a particle outside the window, an F that the law does not allow
             or one that passed a boundary (each with step, time and first bad particle; the last good state is in its
-            `run.final`), a solve that did not converge. Under an outer transformation (`jax.grad`, `jax.jit`,
-            `jax.vmap`): the runtime error of `equinox.error_if` instead.
+            `run.final`), a solve that ended beyond ten times its tolerance; one that ended nearer is a Python warning.
+            Under an outer transformation (`jax.grad`, `jax.jit`, `jax.vmap`): the runtime error of `equinox.error_if`
+            instead.
     """
     start = int(start)
     count = number_of_steps(t1, dt, start, particles.x.dtype)
@@ -121,6 +124,7 @@ def simulate(
     if traced:
         return eqx.error_if(run, ~tally.healthy, _TRACED_FAULT)
     raise_faults(run, previous, start)
+    warn_of_short_solves(run.tally)
     return run
 
 
@@ -138,7 +142,7 @@ def rollout(
     steps: int,
     dt: Scalar,
     method: Method = Explicit(),
-    start: int = 0,
+    start: Any = 0,
 ) -> Particles:
     """The plain rollout: `jax.lax.scan` over steps, without saving, checks or checkpoints. `simulate` is held to it.
 
@@ -151,18 +155,20 @@ def rollout(
         start: number of the first step.
     """
     scene, dt, method = canonical((scene, dt, method), particles.x.dtype)
-    return _rollout(scene, prepare(scene, particles), dt, method, steps, start)
+    return _rollout(scene, prepare(scene, particles), dt, method, steps, jnp.asarray(start, particles.x.dtype))
 
 
 @eqx.filter_jit
-def _rollout(scene: Scene, particles: Particles, dt: Scalar, method: Method, steps: int, start: int) -> Particles:
+def _rollout(
+    scene: Scene, particles: Particles, dt: Scalar, method: Method, steps: int, start: Float[Array, ""]
+) -> Particles:
     stencil = scene.stencil(particles) if scene.total else None
 
     def body(state: State, n: Array) -> tuple[State, None]:
         new, _ = advance(scene, with_state(particles, state), n * dt, dt, method, stencil)
         return state_of(new), None
 
-    number = jnp.arange(start, start + steps, dtype=particles.x.dtype)
+    number = start + jnp.arange(steps, dtype=particles.x.dtype)
     return with_state(particles, jax.lax.scan(body, state_of(particles), number)[0])
 
 
@@ -288,9 +294,32 @@ def raise_faults(run: Run, previous: State | None, start: int) -> None:
     if int(run.tally.unconverged) > 0:
         raise SimulationError(
             f"The solve of {int(run.tally.unconverged)} of {int(run.tally.steps)} steps did not converge (worst "
-            f"relative residual {float(run.tally.worst_residual):.2g}). Reduce dt, raise the solver's max_steps "
-            "or loosen its rtol; BackwardEuler holds where one linear solve does not.",
+            f"relative residual {float(run.tally.worst_residual):.2g}). {unconverged_advice(run.method, run.dt.dtype)}",
             run,
+        )
+
+
+def unconverged_advice(method: Method, dtype: Any) -> str:
+    """What helps a solve that does not converge."""
+    advice = ["reduce dt", "raise the solver's max_steps or loosen its rtol"]
+    if not isinstance(method, Explicit) and method.metric is Metric.MASS:
+        advice.insert(0, "take metric=Metric.DIAGONAL, which needs fewer iterations")
+    if jnp.dtype(dtype) == jnp.float32:
+        advice.append("take float64 particles, of which rounding leaves more digits")
+    if not isinstance(method, BackwardEuler):
+        advice.append("BackwardEuler holds where one linear solve does not")
+    text = "; ".join(advice)
+    return f"{text[0].upper()}{text[1:]}."
+
+
+def warn_of_short_solves(tally: Tally) -> None:
+    """A Python warning where solves of an untraced run missed their tolerance by less than ten times."""
+    if int(tally.short) > 0:
+        warnings.warn(
+            f"The solve of {int(tally.short)} of {int(tally.steps)} steps missed its tolerance by less than ten times "
+            f"(worst relative residual {float(tally.worst_residual):.2g}): the run is that much less accurate than was "
+            "asked for. Raise the solver's max_steps, or ask for what it can reach by its rtol.",
+            stacklevel=3,
         )
 
 

@@ -385,3 +385,30 @@ def test_the_references_plain_inner_product_fails_on_a_nearly_empty_node():
     iterates = list(literal_conjugate_residual(A / M[:, None], rhs / M, rhs / M, 10 * steps))
     for norm in (M, M**2):  # of the inverse mass, and the recurrence's own
         assert min(true_residual(A, v, rhs, norm) for v in iterates) > 1e-3
+
+
+@pytest.mark.parametrize("condition", [1e4, 1e8])
+def test_converged_below_the_tolerance_of_float32_means_a_small_error(condition):
+    """Asked for what rounding forbids, the solver calls a solution what is one. At a condition beyond float32's digits
+    a residual as small as its own rounding leaves errors of a tenth and more, and is none."""
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        Q = np.linalg.qr(rng.normal(size=(N, N)))[0]
+        A = (Q @ np.diag(np.logspace(-np.log10(condition), 0, N)) @ Q.T).astype(np.float32)
+        A = (A + A.T) / 2
+        for b in (A @ rng.normal(size=N), rng.normal(size=N)):
+            b = b.astype(np.float32)
+            x, result, _ = solve(mpm.ConjugateResidual(rtol=1e-12, max_steps=4000), jnp.asarray(A), jnp.asarray(b))
+            exact = np.linalg.solve(A.astype(float), b.astype(float))
+            error = np.linalg.norm(np.asarray(x) - exact) / np.linalg.norm(exact)
+            assert bool(result == R.successful) == (condition < 1e5)
+            assert error < 1e-3 if condition < 1e5 else error > 0.02
+
+
+def test_a_residual_that_cannot_be_corrected_is_no_solution():
+    """The least-squares solution of a singular system: no correction changes it, since there is none."""
+    A, b, best = np.diag([1.0, 2.0, 0.0]), np.array([1.0, 1.0, 0.1]), np.array([1.0, 0.5, 0.0])
+    for y0 in (None, jnp.asarray(best)):
+        _, result, stats = solve(mpm.ConjugateResidual(), jnp.asarray(A), jnp.asarray(b), None, y0)
+        assert result == R.breakdown
+        np.testing.assert_allclose(stats["residual"], 0.1 / np.linalg.norm(b))

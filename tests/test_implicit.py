@@ -273,3 +273,61 @@ def test_beta_must_lie_between_zero_and_one(beta):
     """Anything else is refused."""
     with pytest.raises(ValueError, match="beta"):
         mpm.SemiImplicit(beta=beta)
+
+
+def column(d, dtype, gravity):
+    """A neo-Hookean column of two cells a side on the floor that holds it, at rest and undeformed."""
+    scene, particles = block(
+        d,
+        side=2,
+        material=mpm.NeoHookean(1e6, 0.3),
+        gravity=jnp.asarray((0.0,) * (d - 1) + (gravity,), dtype),
+        boundary=mpm.StickyBox((-np.inf,) * (d - 1) + (0.05,), (np.inf,) * d),
+    )
+    arrays = (particles.x, particles.v, particles.mass, particles.volume)
+    return scene, mpm.prepare(scene, mpm.Particles(*(a.astype(dtype) for a in arrays)))
+
+
+AT_REST = [
+    ("backward_euler", 1, "float64"),
+    ("backward_euler", 2, "float32"),
+    ("trbdf2", 1, "float32"),
+    pytest.param("trbdf2", 2, "float64", marks=pytest.mark.slow),
+    pytest.param("backward_euler", 3, "float32", marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("method", "d", "dtype"), AT_REST)
+def test_newton_knows_a_body_at_rest(method, d, dtype):
+    """A column that has come to rest under its weight, or without any: forces cancel, and what is left is rounding.
+    Every step converges, from the third of them to rest in no more than three Newton steps a solve."""
+    newton = {"backward_euler": mpm.BackwardEuler(), "trbdf2": mpm.TRBDF2(solution=mpm.Newton())}[method]
+    most = {"backward_euler": 3, "trbdf2": 6}[method]
+    for gravity in (-9.81, 0.0):
+        for dt in (1e-2, 1.0, 10.0, 1e4):
+            scene, particles = column(d, dtype, gravity)
+            for n in range(12):
+                particles, info = mpm.step(scene, particles, n * dt, dt, method=newton)
+                assert info.solve.converged, (gravity, dt, n)
+                if dt >= 1 and n >= 6:
+                    assert info.solve.newton <= most
+                    assert info.solve.residual < 1e-2
+            if gravity and dt >= 1:
+                assert np.abs(np.asarray(particles.F) - np.eye(d)).max() > 1e-4
+
+
+@pytest.mark.parametrize("metric", mpm.Metric, ids=lambda m: m.value)
+def test_rounding_alone_accepts_no_guess(metric):
+    """Free fall in single precision, of a body so stiff that a step's weight is below the rounding of its forces."""
+    scene, particles = block(
+        2, side=2, material=mpm.NeoHookean(1e9, 0.3), gravity=jnp.asarray((0.0, -0.5), jnp.float32)
+    )
+    arrays = (particles.x, particles.v, particles.mass, particles.volume)
+    fallen = mpm.prepare(scene, mpm.Particles(*(a.astype(jnp.float32) for a in arrays)))
+    dt, method = 1e-2, mpm.BackwardEuler(metric=metric)
+    for n in range(4):
+        fallen, info = mpm.step(scene, fallen, n * dt, dt, method=method)
+        assert info.solve.converged
+        np.testing.assert_allclose(
+            fallen.mass @ fallen.v / fallen.mass.sum(), [0, -0.5 * (n + 1) * dt], rtol=0.01, atol=1e-4
+        )

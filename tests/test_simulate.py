@@ -1,5 +1,7 @@
 """Rollouts: the same as a plain scan, saved where they should be, compiled once, and stopped with a word."""
 
+from contextlib import nullcontext
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -197,6 +199,40 @@ def test_an_unconverged_solve_is_raised():
     assert int(run.tally.unconverged) == 4
     assert float(run.tally.worst_residual) > 1e-8
     assert int(run.tally.most_iterations) == 2
+
+
+@pytest.mark.parametrize("metric", mpm.Metric, ids=lambda m: m.value)
+def test_a_solve_that_misses_its_tolerance_by_little_is_a_warning(metric):
+    """Within ten times of it the run goes on, counted and told at its end; beyond, it is a fault. The advice names the
+    metric that needs fewer iterations where it is not the one in use."""
+    scene, particles = pulled()
+
+    def simulated(rtol, **options):
+        method = mpm.SemiImplicit(solver=mpm.ConjugateResidual(rtol, max_steps=3), metric=metric)
+        return mpm.simulate(scene, particles, t1=0.1, dt=0.1, method=method, **options)
+
+    reached = float(simulated(1e-12, throw=False).tally.worst_residual)
+    for share, short in ((8.0, 1), (1.01, 1), (0.99, 0)):
+        with pytest.warns(UserWarning, match="1 of 1 steps missed its tolerance") if short else nullcontext():
+            tally = simulated(reached / share).tally
+        assert (int(tally.short), int(tally.unconverged), bool(tally.healthy)) == (short, 0, True)
+    with pytest.raises(mpm.SimulationError, match="of 1 of 1 steps did not converge") as caught:
+        simulated(reached / 12)
+    assert ("Metric.DIAGONAL" in str(caught.value)) == (metric is mpm.Metric.MASS)
+    assert int(caught.value.run.tally.short) == 0
+
+
+def test_a_rollout_from_another_step_compiles_nothing():
+    """The number of the first step is an argument like any other."""
+    scene, particles = pulled()
+    assert_equal(
+        state(mpm.rollout(scene, mpm.rollout(scene, particles, steps=2, dt=DT), steps=2, dt=DT, start=2)),
+        state(mpm.rollout(scene, particles, steps=4, dt=DT)),
+    )
+    before = _simulate._rollout._cached._cache_size()
+    for start in (3, np.int64(5), 7.0):
+        mpm.rollout(scene, particles, steps=2, dt=DT, start=start)
+    assert _simulate._rollout._cached._cache_size() == before
 
 
 @pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in ("explicit", "semi_implicit")}))
