@@ -12,7 +12,7 @@ from mpmjax._checks import require
 from mpmjax._staged import StagedFile, require_no_writer
 from mpmjax._vtkhdf import File, count_in
 
-FORMAT = 3
+FORMAT = 4
 LIBVER_HEAD = ("v108", "v108")
 _LIBVER = ("v110", "v110")  # what "latest" writes, VTK 9.7 cannot read
 _GROWING = ("VTKHDF/Points", "VTKHDF/PointData/", "VTKHDF/Steps/", "mpmjax/frames", "mpmjax/received")

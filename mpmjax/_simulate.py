@@ -294,7 +294,8 @@ def raise_faults(run: Run, previous: State | None, start: int) -> None:
     if int(run.tally.unconverged) > 0:
         raise SimulationError(
             f"The solve of {int(run.tally.unconverged)} of {int(run.tally.steps)} steps did not converge (worst "
-            f"relative residual {float(run.tally.worst_residual):.2g}). {unconverged_advice(run.method, run.dt.dtype)}",
+            f"relative residual {float(run.tally.worst_residual):.2g}). "
+            + unconverged_advice(run.method, run.final.x.dtype),
             run,
         )
 
