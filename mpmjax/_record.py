@@ -118,7 +118,7 @@ def record(
             tally=tally,
         )
         try:
-            raise_faults(run, previous, start)
+            raise_faults(run, particles, previous, start)
         except SimulationError as error:
             try:
                 _append(writer, int(error.run.final_step), state_of(error.run.final), tally)

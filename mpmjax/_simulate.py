@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mpmjax._advice import advise, disallowed
 from mpmjax._checks import canonical, is_traced, require, require_finite, require_positive
 from mpmjax._diffrax import (
     BEYOND,
@@ -32,6 +33,7 @@ from mpmjax._run import Run, SimulationError
 from mpmjax._scene import Scene, prepare
 from mpmjax._step import advance
 from mpmjax._types import Array, Float, Scalar
+from mpmjax.material import Law
 
 _CHECKPOINT_BYTES = 2**28
 
@@ -123,7 +125,7 @@ def simulate(
         return run
     if traced:
         return eqx.error_if(run, ~tally.healthy, _TRACED_FAULT)
-    raise_faults(run, previous, start)
+    raise_faults(run, particles, previous, start)
     warn_of_short_solves(run.tally)
     return run
 
@@ -253,11 +255,12 @@ def integrate(
     return saved, final, tally, previous
 
 
-def raise_faults(run: Run, previous: State | None, start: int) -> None:
+def raise_faults(run: Run, began: Particles, previous: State | None, start: int) -> None:
     """Raise what the tally of an untraced run tells.
 
     Args:
         run: the run, its final state possibly bad.
+        began: the particles at the start.
         previous: the state before the last step.
         start: number of the run's first step.
     """
@@ -268,19 +271,22 @@ def raise_faults(run: Run, previous: State | None, start: int) -> None:
         problem = Problem(run.scene, run.final, None, run.dt, run.method)
         broken, outside, inadmissible = faulty_particles(problem, state_of(run.final))
         bad: dict[int, Array] = {NOT_FINITE: broken, OUTSIDE: outside, INADMISSIBLE: inadmissible}
-        what, advice = _FAULTS[fault]
+        what, advice = _FAULTS.get(fault, ("", ""))
         if fault == BEYOND:
             t = jnp.asarray(step - 1, run.final.x.dtype) * run.dt
             passed = passed_particles(problem, previous, state_of(run.final), t)
             number, bad[BEYOND] = next((i, mask) for i, mask in passed if mask.any())
             what = f"{what} boundary {number}, {type(run.scene.boundary[number]).__name__}"
         first = int(np.argmax(np.asarray(bad[fault])))
+        if fault == INADMISSIBLE:
+            what, advice = disallowed(_law(run, first), run.method)
+        last = with_state(run.final, previous)
         reached = int((run.steps < step).sum())
         good = eqx.tree_at(
             lambda r: (r.final, r.final_step, r.steps, r.frames, r.observed),
             run,
             (
-                with_state(run.final, previous),
+                last,
                 jnp.asarray(step - 1, run.final_step.dtype),
                 *jax.tree.map(lambda a: a[:reached], (run.steps, run.frames, run.observed)),
             ),
@@ -288,7 +294,7 @@ def raise_faults(run: Run, previous: State | None, start: int) -> None:
         )
         raise SimulationError(
             f"At step {step} (t = {step * float(run.dt):.6g} s) particle {first} {what}; the last good position was "
-            f"{np.asarray(previous.x[first])}. {advice}",
+            f"{np.asarray(previous.x[first])}. {advise(run.scene, run.method, run.dt, began, last, advice)}",
             good,
         )
     if int(run.tally.unconverged) > 0:
@@ -324,16 +330,21 @@ def warn_of_short_solves(tally: Tally) -> None:
         )
 
 
+def _law(run: Run, particle: int) -> Law:
+    """The law of a particle, by its number."""
+    last = np.cumsum(run.final.counts or (run.final.count,))
+    return run.scene.laws[int(np.searchsorted(last, particle, side="right"))]
+
+
 _FAULTS: dict[int, tuple[str, str]] = {
-    NOT_FINITE: ("is no longer finite", "Reduce dt (explicit steps have a limit), or use an implicit method."),
+    NOT_FINITE: (
+        "is no longer finite",
+        "Look in the frames before (save_every) for what grows out of scale: a force, a prescribed motion, a velocity.",
+    ),
     OUTSIDE: ("left the grid's window", "Enlarge the grid's shape, or use follow=True."),
     BEYOND: (
         "passed",
         "Reduce dt: a boundary keeps out what comes less than a cell nearer in a step. In the total description it "
         "holds only what touched it from the start: use the updated one.",
-    ),
-    INADMISSIBLE: (
-        "has a deformation gradient that its law does not allow (det F ≤ 0)",
-        "Reduce dt, or use FixedCorotated, which allows inversion.",
     ),
 }

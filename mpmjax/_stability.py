@@ -19,8 +19,12 @@ _STEEPEST = {2: 6.0, 3: 3.1368191}
 """The largest value over a cell of dx² Σ_i (∂w_ip)²/w_ip, for the quadratic and the cubic kernel."""
 
 
+SAFETY = 0.7
+"""The default safety."""
+
+
 def stable_dt(
-    scene: Scene, particles: Particles, *, method: Method = Explicit(), safety: Scalar = 0.7
+    scene: Scene, particles: Particles, *, method: Method = Explicit(), safety: Scalar = SAFETY
 ) -> Float[Array, ""]:
     """The longest step Δt [s] for which the motion about the particles' present state does not grow.
 
@@ -31,8 +35,9 @@ def stable_dt(
 
     - Λ the largest eigenvalue of the present tangent L ↦ ∂²Ψ/∂F∂F : (L F) Fᵀ + τ Lᵀ, L = ∇v, τ = P Fᵀ, made symmetric,
       from `principal_tangent` (in the total description that of ∂²Ψ/∂F∂F): stretching and compression raise it;
-    - Ξ a bound of Σ_i g_ip g_ipᵀ/w_ip: a for the moving-least-squares gradient; for the spline's its value at the worst
-      place in a cell, 6/dx² (quadratic) and 3.137/dx² (cubic), since particles move;
+    - Ξ a bound of Σ_i g_ip g_ipᵀ/w_ip: a for the moving-least-squares gradient; for the spline's its value where the
+      particle is in the total description, and in the updated one, since particles move, at the worst place in a cell,
+      6/dx² (quadratic) and 3.137/dx² (cubic);
     - a = 4/dx² (quadratic), 3/dx² (cubic); κ = 1 for APIC and 0 for PIC and FLIP, which forget the affine velocity.
 
     At F = I that is √(4ρ0/((2μ + dλ)(2Ξ − κa))). The semi-implicit step's is 1/√(1 − 2β) times it for β < ½; for
@@ -64,12 +69,16 @@ def stable_dt(
         ValueError: from `prepare`, or a safety that is not positive.
     """
     require_positive("safety", safety)
-    scene, method, safety = canonical((scene, method, safety), particles.x.dtype)
-    particles = particles if is_prepared(scene, particles) else prepare(scene, particles)
-    limit = safety * _limit(scene, particles, method)
+    limit = canonical(safety, particles.x.dtype) * longest_step(scene, particles, method)
     if not is_traced(limit):
         require(not np.isnan(limit), "stable_dt needs particles whose F is finite and one that their law allows.")
     return limit
+
+
+def longest_step(scene: Scene, particles: Particles, method: Method) -> Float[Array, ""]:
+    """`stable_dt` with a safety of one [s]; NaN where F is not finite, or too large."""
+    scene, method = canonical((scene, method), particles.x.dtype)
+    return _limit(scene, particles if is_prepared(scene, particles) else prepare(scene, particles), method)
 
 
 @eqx.filter_jit
@@ -145,6 +154,12 @@ def _inverse_moments(scene: Scene, particles: Particles) -> tuple[Array, Array]:
     if order == 1:  # both gradients are one, and Ξ = a
         a = 1 / scene.stencil(particles).moment.min(axis=0)
         return a, a
-    a = _INVERSE_MOMENT[order]
-    steepest = a if isinstance(scene.gradient, MLSGradient) else _STEEPEST[order]
-    return a / dx**2, steepest / dx**2
+    a = _INVERSE_MOMENT[order] / dx**2
+    if isinstance(scene.gradient, MLSGradient):
+        return a, a
+    if not scene.total:
+        return a, _STEEPEST[order] / dx**2
+    stencil = scene.stencil(particles)
+    touched = stencil.weights > 0
+    steepness = jnp.where(touched, stencil.slopes**2 / jnp.where(touched, stencil.weights, 1), 0)
+    return a, steepness.sum(axis=1).max(axis=0)

@@ -29,7 +29,7 @@ LAYERS = (
     ("_method",),
     ("_step",),
     ("_stability",),
-    ("_diffrax", "_run", "_simulate"),
+    ("_advice", "_diffrax", "_run", "_simulate"),
 )
 LEAF = len(LAYERS)
 CORE_MAY_NOT_KNOW = {"diffrax", "h5py", "matplotlib", "optax", "optimistix", "time", "datetime", "tqdm", "typer"}

@@ -1,16 +1,18 @@
 """Rollouts: the same as a plain scan, saved where they should be, compiled once, and stopped with a word."""
 
 from contextlib import nullcontext
+from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DESCRIPTIONS, LAWS, assert_close, block, explicit_limit, ids
+from helpers import DESCRIPTIONS, ELASTIC, FLUIDS, LAWS, PLASTIC, assert_close, block, explicit_limit, ids
 
 import mpmjax as mpm
 from mpmjax import _simulate
+from mpmjax._advice import advise, disallowed
 from mpmjax._diffrax import NOT_FINITE
 
 DT = 5e-3
@@ -174,8 +176,97 @@ def test_a_particle_that_leaves_the_window_is_named():
     # the last node is at 0.9: a quadratic stencil ends beyond 0.85, which the second particle passes at step 36
     with pytest.raises(mpm.SimulationError, match=r"At step 36 .*particle 1 left the grid's window") as caught:
         mpm.simulate(scene, particles, t1=0.5, dt=0.01)
-    assert "follow=True" in str(caught.value)
+    assert "Enlarge the grid's shape, or use follow=True." in str(caught.value)
+    assert "limit" not in str(caught.value)  # dt is far below it
     assert_close(caught.value.run.final.x[1, 0], 0.5 + 35 * 0.0099, 1e-12)
+
+
+def breathing(law, d=2, **choices):
+    """One particle whose affine velocity sets off a vibration, in a window with room for it."""
+    grid = mpm.Grid((8,) * d, 0.1, origin=(-3,) * d)
+    x, C = jnp.full((1, d), 0.13), jnp.zeros((1, d, d)).at[0, :2, :2].set([[0.5, 0.1], [-0.2, -0.3]])
+    one = mpm.Particles(x, 0 * x, jnp.full(1, 1e3 * 0.05**d), jnp.full(1, 0.05**d), C=C)
+    return mpm.Scene(grid, law, **choices), one
+
+
+BLOWN_UP = {
+    "jelly": LAWS["fixed_corotated"],
+    "fluid": FLUIDS["fluid_in_tension"],
+    "neo_hookean": LAWS["neo_hookean"],
+    "von_mises": PLASTIC["von_mises"],
+}
+
+
+@pytest.mark.parametrize("law", **ids(BLOWN_UP))
+def test_a_blow_up_names_the_limit_and_by_how_much_the_step_is_above_it(law):
+    """Whatever fault it ends in; and a law that is no elastic solid is not told to be one."""
+    scene, particles = breathing(law)
+    limit = float(mpm.stable_dt(scene, particles, safety=1.0))
+    for times in (1.05, 1.5, 3.8):
+        with pytest.raises(mpm.SimulationError) as caught:
+            mpm.simulate(scene, particles, t1=200 * times * limit, dt=times * limit)
+        said = str(caught.value)
+        assert f"is {times:.3g} times the explicit limit at the start ({limit:.4g} s)" in said
+        assert f"Take a dt of at most {0.7 * limit:.4g} s (stable_dt, safety 0.7)" in said
+        assert said.index("Take a dt") < said.index("If the fault stays, ")
+        assert "FixedCorotated," not in said or law is LAWS["neo_hookean"]
+    run = mpm.simulate(scene, particles, t1=200 * 0.7 * limit, dt=0.7 * limit)
+    assert bool(run.tally.healthy)
+
+
+def test_advice_weighs_the_step_against_the_limit_of_the_method_there_and_then():
+    """Above it at the start, above it only where the body has stiffened, near it, below it, and without one."""
+    scene, rest = breathing(LAWS["neo_hookean"], d=3)
+    rest = mpm.prepare(scene, rest)
+    stretched = eqx.tree_at(lambda p: p.F, rest, 3 * rest.F)
+    limit, short = (float(mpm.stable_dt(scene, p, safety=1.0)) for p in (rest, stretched))
+
+    def advice(dt, last=rest, method=mpm.Explicit(), scene=scene):
+        return advise(scene, method, dt, rest, last, "Look there.")
+
+    assert advice(0.69 * limit) == "Look there."
+    assert advice(9 * limit, method=mpm.SemiImplicit()) == "Look there."
+    near = advice(0.8 * limit)
+    assert "0.8 times the explicit limit at the start" in near
+    assert "from 0.7 times on, large vibrations can grow" in near
+    assert near.endswith("If the fault stays, look there.")
+    stiffened = advice(0.6 * limit, stretched)
+    assert (
+        f"{0.6 * limit / short:.3g} times that of the last good state ({short:.4g} s). Take a dt of less" in stiffened
+    )
+    assert "2 times the limit of SemiImplicit with beta < 1/2 at the start" in advice(
+        4 * limit, method=mpm.SemiImplicit(beta=0.375)
+    )
+    torn = eqx.tree_at(lambda p: p.F, rest, 1e200 * rest.F)  # its limit overflows
+    assert advice(0.6 * limit, torn) == "Look there."
+    assert "2 times" in advice(2 * limit, torn)
+
+
+@pytest.mark.parametrize(
+    ("law", "method", "says"),
+    [
+        (FLUIDS["fluid"], mpm.Explicit(), "Reduce dt: a step must keep Δt |div v| below 1."),
+        (FLUIDS["fluid"], mpm.SemiImplicit(), "below 1, or take BackwardEuler()"),
+        (PLASTIC["von_mises"], mpm.BackwardEuler(), "Reduce dt: a step must keep Δt |∇v| below 1."),
+        (ELASTIC["hencky"], mpm.Explicit(), "Reduce dt, or use FixedCorotated, which allows inversion."),
+    ],
+)
+def test_a_deformation_that_a_law_does_not_allow_has_advice_that_fits_the_law(law, method, says):
+    what, advice = disallowed(law, method)
+    assert type(law).__name__ in what
+    assert says in advice
+
+
+def test_the_law_that_is_named_is_the_particles_own():
+    """Of two bodies the fluid one is driven to J < 0 in one step."""
+    scene, particles = block(1, side=2, material=[LAWS["neo_hookean"], FLUIDS["fluid"]])
+    scene = eqx.tree_at(lambda s: s.grid, scene, mpm.Grid((20,), 0.1, origin=(-3,)))
+    still = replace(particles, x=particles.x + 1.0)
+    both = mpm.join(still, replace(particles, v=-300.0 * (particles.x - particles.x.mean(axis=0))))
+    says = r"particle [4-7] has a volume that Fluid does not allow \(J ≤ 0\)"
+    with pytest.raises(mpm.SimulationError, match=says) as caught:
+        mpm.simulate(scene, both, t1=0.05, dt=0.01)
+    assert "Reduce dt: a step must keep Δt |div v| below 1." in str(caught.value)
 
 
 def test_inversion_of_a_law_that_does_not_allow_it_is_named():
