@@ -41,7 +41,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mpmjax as mpm
-from mpmjax._work_precision import FRAMES, Bench, Displacements, name_of, settle
+from mpmjax._bench import FRAMES, Bench, Displacements, name_of
+from mpmjax._reference import settle
 from mpmjax.verification import AbstractProblem, StandingWave, discretise
 
 sys.path.append(str(Path(__file__).parent))
@@ -58,7 +59,7 @@ UPDATES = {
     "TR-BDF2": mpm.TRBDF2(),
 }
 CHOICES = {
-    "total": {"description": mpm.TotalLagrangian()},
+    "total": {"description": mpm.TotalLagrangian(), "gradient": mpm.MLSGradient()},
     "updated": {"description": mpm.UpdatedLagrangian()},
     "FLIP": {"transfer": mpm.FLIP(1.0)},
     "PIC": {"transfer": mpm.PIC()},
@@ -67,7 +68,7 @@ CHOICES = {
     "plain wall": {"wall": "plain"},
     "float32": {"dtype": "float32"},
 }
-"""Besides the defaults: quadratic kernel, APIC, float64."""
+"""Besides quadratic kernel, APIC, the moving-least-squares gradient, float64."""
 COLOURS = dict(zip([*UPDATES, "Taichi", "Warp"], ["C0", "C1", "C3", "C4", "C2", "C9", "C5", "C7"], strict=True))
 MARKERS = {"FLIP": "^", "PIC": "v", "linear": "D", "cubic": "P", "plain wall": "s"}
 DASHES = {"total": "-", "updated": "--"}
@@ -89,14 +90,14 @@ class Limits(NamedTuple):
     """How many of a problem; None for all."""
     grids: int
     reference_seconds: float
-    """The longest run for a reference."""
+    """What a reference may take."""
     run_seconds: float
     """The longest run of a line."""
     rounds: int
     """How often a short run is timed."""
 
 
-FULL, QUICK = Limits(None, 3, 30.0, 15.0, 3), Limits(2, 1, 1.0, 2.0, 2)
+FULL, QUICK = Limits(None, 3, 120.0, 15.0, 3), Limits(2, 1, 10.0, 2.0, 2)
 
 
 class Problem(NamedTuple):
@@ -324,7 +325,7 @@ PROBLEMS = {
 }
 
 
-def bench_of(problem: Problem, line: str, n: int, run_seconds: float, **start: Any) -> Bench:
+def bench_of(problem: Problem, line: str, n: int, **start: Any) -> Bench:
     """A line's scene on the grid refined n times."""
     choices = start
     for word in line.split(", ")[1:]:
@@ -335,15 +336,17 @@ def bench_of(problem: Problem, line: str, n: int, run_seconds: float, **start: A
         scene, particles = problem.build(refinement, **choices)
         return scene, jax.tree.map(lambda a: a.astype(dtype), particles)
 
-    return Bench.of(build, n, problem.t1, run_seconds)
+    return Bench.of(build, n, problem.t1)
 
 
 def reference_of(problem: Problem, limits: Limits) -> Reference:
     """The exact motion, or a refined run of the first line's scene."""
     choices = CHOICES[problem.lines[0].split(", ")[1]]
-    coarse = Bench.of(lambda n: problem.build(n, **choices), 1, problem.t1, limits.reference_seconds)
+    coarse = Bench.of(lambda n: problem.build(n, **choices), 1, problem.t1)
     if problem.exact is None:
-        limit, trial, motion = settle(lambda n: problem.build(n, **choices), coarse, problem.target / 3)
+        limit, trial, motion = settle(
+            lambda n: problem.build(n, **choices), coarse, problem.target / 3, limits.reference_seconds
+        )
         print(f"  reference: {name_of(trial.method)} in {trial.steps} steps, spacing / {trial.refinement}", end="")
         print(f", {trial.seconds:.2g} s, known to {trial.error:.1e}", flush=True)
         return Reference(limit, trial.error, lambda n: motion)
@@ -370,13 +373,13 @@ class Runner:
 
     def line(self, line: str, n: int) -> None:
         """Steps of a line on one grid."""
-        bench, method = bench_of(self.problem, line, n, self.limits.run_seconds), UPDATES[line.split(", ")[0]]
+        bench, method = bench_of(self.problem, line, n), UPDATES[line.split(", ")[0]]
         truth, limit = self.reference.truth(n), self.reference.limit / n
         if isinstance(method, mpm.Explicit):
             for factor in EXPLICIT_STEPS:
                 steps = bench.whole(factor * limit)
                 seconds = bench.foresee(method, steps)
-                if seconds < bench.most_seconds:
+                if seconds < self.limits.run_seconds:
                     self._run(bench, line, steps, truth)
                 elif factor == 1:
                     self._note(bench, line, steps, seconds, math.nan)
@@ -387,7 +390,7 @@ class Runner:
             point = self._run(bench, line, steps, truth)
             idle = idle + 1 if 0.8 * best < point.error < 1 or point.error < self.problem.target / 20 else 0
             best = min(best, point.error)
-            if 2 * point.seconds > bench.most_seconds:
+            if 2 * point.seconds > self.limits.run_seconds:
                 return
             steps *= 2
 
@@ -396,11 +399,11 @@ class Runner:
         method = UPDATES[line.split(", ")[0]]
         if self.problem.exact is not None and not method.centred:
             early = -bench.t1 / steps / 2
-            start = bench_of(self.problem, line, bench.refinement, bench.most_seconds, velocity_time=early)
+            start = bench_of(self.problem, line, bench.refinement, velocity_time=early)
             bench = bench._replace(particles=start.particles)
         states, seconds = bench.timed(method, steps, FRAMES, steps // FRAMES)
         error = math.inf if states is None else bench.motion(states).distance(truth)
-        if states is not None and seconds < bench.most_seconds / 10:
+        if states is not None and seconds < self.limits.run_seconds / 10:
             self._again[len(self.points)] = lambda: bench.timed(method, steps, 1, steps)[1]
         return self._note(bench, line, steps, seconds, error)
 
@@ -415,7 +418,7 @@ class Runner:
         """
         line, truth = self.problem.peers, self.reference.truth(n)
         assert line is not None
-        own = bench_of(self.problem, line, n, math.inf)
+        own = bench_of(self.problem, line, n)
         x0, peer = np.asarray(own.particles.x), peer_of(own, make, dtype)
         peer.run(1, self.reference.limit / n)
         well = [p.steps for p in self.points if (p.line, p.refinement) == (line, n) and math.isfinite(p.error)]

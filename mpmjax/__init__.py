@@ -1,5 +1,6 @@
 """A differentiable Material Point Method in JAX, with explicit and implicit grid updates."""
 
+from mpmjax._bench import Trial
 from mpmjax._body_force import AbstractBodyForce
 from mpmjax._boundary import AbstractBoundary, Conditions, Grip, SeparatingBox, SlipBox, StickyBox
 from mpmjax._budget import Budget, EnergyBudget, MomentumBudget, budget
@@ -30,7 +31,7 @@ from mpmjax._simulate import rollout, simulate
 from mpmjax._stability import stable_dt
 from mpmjax._step import StepInfo, step
 from mpmjax._transfer import APIC, FLIP, PIC
-from mpmjax._work_precision import Trial, WorkPrecision, work_precision
+from mpmjax._work_precision import WorkPrecision, work_precision
 from mpmjax.material import (
     AbstractMaterial,
     AbstractPlastic,

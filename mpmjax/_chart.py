@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from mpmjax._aside import replacing, save_figure
-from mpmjax._work_precision import WorkPrecision, name_of
+from mpmjax._bench import name_of
+from mpmjax._work_precision import WorkPrecision
 
 
 def draw_chart(found: WorkPrecision, path: Path) -> Path:

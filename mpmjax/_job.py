@@ -4,6 +4,7 @@ words."""
 import csv
 import difflib
 import tomllib
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 
+from mpmjax._bench import Build, Trial
 from mpmjax._checks import require, require_positive
 from mpmjax._fit import FitResult, fit_curve, gauge
 from mpmjax._method import Explicit, Method
@@ -21,7 +23,7 @@ from mpmjax._scene import Scene, prepare
 from mpmjax._schema import arguments, decode
 from mpmjax._simulate import number_of_steps
 from mpmjax._types import Scalar
-from mpmjax._work_precision import METHODS, Build, work_precision
+from mpmjax._work_precision import METHODS, work_precision
 
 _FRAMES = 50
 """How many frames are saved where neither they nor the step are given."""
@@ -48,6 +50,7 @@ class RunTable(NamedTuple):
     save_every: int | None
     dtype: str
     error: float
+    most_seconds: float
 
 
 class CurveSettings(NamedTuple):
@@ -116,18 +119,43 @@ def read_plan(path: Path) -> Plan:
     return Plan(scene, particles, run, fit, build)
 
 
-def read_job(path: Path) -> Job:
+def read_job(
+    path: Path,
+    *,
+    most_seconds: float | None = None,
+    progress: Callable[[Trial], None] = lambda trial: None,
+    say: Callable[[str], None] = lambda line: None,
+) -> Job:
     """Read a scene file, and choose by pilot runs what it leaves to be chosen.
+
+    Args:
+        path: the file.
+        most_seconds: what the pilot runs may take [s]. Default: what the file says.
+        progress: called with each pilot run, see `work_precision`.
+        say: called with each run of their reference.
 
     Raises:
         ValueError: as `read_plan`, and as `work_precision`.
     """
     plan = read_plan(path)
-    t1, dt, method, save_every, dtype, error = plan.run
+    t1, dt, method, save_every, dtype, error, seconds = plan.run
     choice = None
+    require(
+        most_seconds is None or dt is None or method is None,
+        "--most-seconds is for pilot runs, and there are none: the file gives dt and method.",
+    )
     if dt is None or method is None:
         methods = METHODS if method is None else (method,)
-        found = work_precision(plan.build, t1=t1, error=error, methods=methods, refinements=(1,))
+        found = work_precision(
+            plan.build,
+            t1=t1,
+            error=error,
+            methods=methods,
+            refinements=(1,),
+            most_seconds=seconds if most_seconds is None else most_seconds,
+            progress=progress,
+            say=say,
+        )
         best, choice = found.cheapest(), found.verdict()
         if best is None:
             raise ValueError(f"{path}: {choice}")
@@ -252,16 +280,19 @@ def _run_table(table: Any) -> RunTable:
         save_every: int | None = None,
         precision: str = "float64",
         error: Scalar = 1e-2,
+        most_seconds: Scalar = 60.0,
     ) -> RunTable:
         require_positive("[run] t1", t1)
         if dt is not None:
             require_positive("[run] dt", dt)
         require_positive("[run] error", error)
+        require_positive("[run] most_seconds", most_seconds)
         every = save_every is None or save_every >= 1
         require(every, f"[run] save_every must be at least 1, got {save_every}.")
         known = precision in ("float32", "float64")
         require(known, f'[run] precision must be "float32" or "float64", got {precision!r}.')
-        return RunTable(float(t1), None if dt is None else float(dt), method, save_every, precision, float(error))
+        step = None if dt is None else float(dt)
+        return RunTable(float(t1), step, method, save_every, precision, float(error), float(most_seconds))
 
     require(isinstance(table, dict), f"[run] must be a table, got {table!r}.")
     left = {name for name in ("dt", "method") if table.get(name) == "auto"}

@@ -12,6 +12,7 @@ import numpy as np
 import typer
 
 from mpmjax._aside import save_figure
+from mpmjax._bench import Trial, name_of
 from mpmjax._chart import draw_chart, write_trials
 from mpmjax._checks import require
 from mpmjax._diagnostics import energy, grid_mass, pieces
@@ -23,7 +24,7 @@ from mpmjax._job import CurveSettings, Job, fit_job, read_job, read_plan
 from mpmjax._record import record
 from mpmjax._render import COLOURS, render
 from mpmjax._run import Run
-from mpmjax._work_precision import Trial, name_of, work_precision
+from mpmjax._work_precision import work_precision
 
 app = typer.Typer(
     help="A differentiable Material Point Method.", no_args_is_help=True, add_completion=False, rich_markup_mode=None
@@ -45,6 +46,10 @@ def _reporting(command: Callable[..., None]) -> Callable[..., None]:
     return guarded
 
 
+MostSeconds = Annotated[
+    float | None,
+    typer.Option(help="What pilot runs may take, compilation included. Default: the file's most_seconds, or 60."),
+]
 SceneFile = Annotated[Path, typer.Argument(help="A TOML scene file; docs/scene_files.md is its schema.")]
 
 
@@ -56,14 +61,14 @@ def run_command(
     overwrite: Annotated[bool, typer.Option(help="Replace the output file if it exists.")] = False,
     resume: Annotated[bool, typer.Option(help="Continue the output file from its last frame.")] = False,
     quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
+    most_seconds: MostSeconds = None,
 ) -> None:
     """Simulate a scene and write its frames."""
     require(not (overwrite and resume), "--overwrite starts a file anew and --resume continues it: give one of them.")
     done = steps_in(output) if resume else 0
     if not resume:
         check_place(output, overwrite=overwrite)
-    job = read_job(scene)
-    _say_choice(job)
+    job = _chosen(scene, most_seconds, quiet=quiet)
     begun = time.perf_counter()
     run = record(
         output,
@@ -84,9 +89,17 @@ def run_command(
     print(f"written            {output} {reached}".rstrip())
 
 
-def _say_choice(job: Job) -> None:
+def _chosen(scene: Path, most_seconds: float | None, *, quiet: bool = False) -> Job:
+    """The scene file's job; pilot runs are told on standard error, and what they chose on standard output."""
+    told = {} if quiet else {"progress": lambda trial: _print_error(_line(trial)), "say": _print_error}
+    job = read_job(scene, most_seconds=most_seconds, **told)
     if job.choice is not None:
         print(f"{'chosen':<18} {job.choice}")
+    return job
+
+
+def _print_error(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
 def _summary(job: Job, run: Run, taken: int, seconds: float) -> str:
@@ -139,11 +152,11 @@ def _summary(job: Job, run: Run, taken: int, seconds: float) -> str:
 def fit_command(
     scene: SceneFile,
     plot: Annotated[Path | None, typer.Option(help="The plot to write. Default: SCENE_fit.png here.")] = None,
+    most_seconds: MostSeconds = None,
 ) -> None:
     """Fit a scene's parameter to the measured curve that its [fit] table names."""
     begun = time.perf_counter()
-    job = read_job(scene)
-    _say_choice(job)
+    job = _chosen(scene, most_seconds)
     result = fit_job(job)
     assert job.fit is not None
     print(_table(job.fit, result))
@@ -192,7 +205,7 @@ def _plot(fit: CurveSettings, result: FitResult, name: str, path: Path) -> None:
 def chart_command(
     scene: SceneFile,
     error: Annotated[float, typer.Option(help="The relative error of the motion that is asked for.")] = 1e-2,
-    most_seconds: Annotated[float, typer.Option(help="The longest run; what would take longer is foreseen.")] = 60.0,
+    most_seconds: MostSeconds = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="The chart to write, its numbers beside it as .csv.")
     ] = None,
@@ -200,21 +213,26 @@ def chart_command(
     """Chart a scene's error against seconds, and name the cheapest setting for an error."""
     plan = read_plan(scene)
     output = Path(f"{scene.stem}_chart.png") if output is None else output
-    print(f"{'method':>24} {'spacing':>10} {'dt [s]':>10} {'steps':>9} {'seconds':>9} {'error':>9}")
+    print(f"{'method':>24} {'spacing':>10} {'dt [s]':>10} {'steps':>9} {'seconds':>9} {'error':>9}", flush=True)
     own = () if plan.run.dt is None or plan.run.method is None else ((plan.run.method, plan.run.dt),)
     found = work_precision(
-        plan.build, t1=plan.run.t1, error=error, also=own, most_seconds=most_seconds, progress=_print_trial
+        plan.build,
+        t1=plan.run.t1,
+        error=error,
+        also=own,
+        most_seconds=plan.run.most_seconds if most_seconds is None else most_seconds,
+        progress=lambda trial: print(_line(trial), flush=True),
+        say=_print_error,
     )
     print(found.verdict())
     print(f"written {draw_chart(found, output)} and {write_trials(found, output.with_suffix('.csv'))}")
 
 
-def _print_trial(trial: Trial) -> None:
+def _line(trial: Trial) -> str:
     said = "failed" if np.isinf(trial.error) else "foreseen" if np.isnan(trial.error) else f"{trial.error:.2e}"
-    print(
+    return (
         f"{name_of(trial.method):>24} {f'1 / {trial.refinement}':>10} {trial.dt:10.3g} {trial.steps:9d} "
-        f"{trial.seconds:9.3g} {said:>9}",
-        flush=True,
+        f"{trial.seconds:9.3g} {said:>9}"
     )
 
 

@@ -180,6 +180,7 @@ BAD_SCENES = {
     "no TOML": ("[grid]", "[grid", r"not a TOML file"),
     "missing table": ("[run]", "[rum]", r"\[run\]"),
     "automatic method, given step": ('method = { kind = "SemiImplicit" }', 'method = "auto"', r'goes with dt = "auto"'),
+    "no time for pilot runs": ("dt = 1e-2", 'dt = "auto"\nmost_seconds = 0', r"\[run\] most_seconds"),
     "no step": ("dt = 1e-2", "", r"\[run\] needs the key 'dt'"),
     "counts": ("density = 1e3", "density = 1e3\nparticles_per_cell = 3", r"\[\[particles\]\] 1.*2-th power"),
 }
@@ -323,14 +324,26 @@ def test_the_step_is_chosen_where_it_is_left_open(tmp_path):
     scene = tmp_path / "auto.toml"
     left = SCENE.replace("dt = 1e-2", 'dt = "auto"\nerror = 0.1').replace("save_every = 2", "")
     scene.write_text(left.replace('{ kind = "SemiImplicit" }', '"Explicit"'))
-    code, out, err = shell("run", scene, "-o", tmp_path / "run.h5", "--quiet")
+    code, out, err = shell("run", scene, "-o", tmp_path / "run.h5", "--most-seconds", 120)
     assert code == 0, err
+    assert "reference: " in err
+    assert re.search(r"Explicit\(\) +1 / 1 .*\d\n", err), err  # a trial, as it is done
     chosen = re.search(r"chosen +Explicit\(\), dt = ([-.e\d]+) s \((\d+) steps\)", out)
     assert chosen is not None, out
     run = mpm.load(tmp_path / "run.h5")
     assert int(run.tally.steps) == int(chosen[2])
     job = read_plan(scene)
     assert float(run.dt) <= 0.7 * float(mpm.stable_dt(job.scene, job.particles, safety=1.0))
+
+
+def test_pilot_runs_are_bounded_from_file_and_shell(tmp_path):
+    """By `most_seconds` in the file, and by the option, which has no use where nothing is left open."""
+    scene = tmp_path / "scene.toml"
+    scene.write_text(SCENE)
+    assert read_plan(scene).run.most_seconds == 60
+    assert "--most-seconds is for pilot runs" in refused("run", scene, "-o", tmp_path / "a.h5", "--most-seconds", 5)
+    scene.write_text(SCENE.replace("dt = 1e-2", 'dt = "auto"\nmost_seconds = 1e-9').replace('"SlipBox"', '"StickyBox"'))
+    assert read_plan(scene).run.most_seconds == 1e-9
 
 
 def test_a_plan_refines(tmp_path):
