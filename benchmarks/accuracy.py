@@ -1,13 +1,15 @@
 """How accurate is which choice? Errors on problems with exact motions, under refinement in space and in time.
 
     python benchmarks/accuracy.py [--quick]
+    python benchmarks/accuracy.py --column
 
 Prints each series with its observed orders, and writes docs/accuracy.csv and docs/accuracy.png. `--quick` leaves out
-the finest grids and writes nothing.
+the finest grids and writes nothing. `--column` prints the table of a column under its own weight, by gradient operator.
 """
 
 import argparse
 import csv
+import itertools
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -18,10 +20,11 @@ import numpy as np
 from matplotlib.ticker import NullLocator
 
 import mpmjax as mpm
-from mpmjax.verification import AxisAligned, Ends, StandingWave, Vortex, errors
+from mpmjax.verification import AxisAligned, Column, Ends, StandingWave, Vortex, errors, orders
 
 DOCS = Path(__file__).parents[1] / "docs"
-FLIP, TOTAL, SPLINE = mpm.FLIP(1.0), mpm.TotalLagrangian(), mpm.SplineGradient()
+FLIP, SPLINE = mpm.FLIP(1.0), mpm.SplineGradient()
+TOTAL, MLS = mpm.TotalLagrangian(), mpm.MLSGradient()
 
 
 class Series(NamedTuple):
@@ -67,7 +70,7 @@ def measure(quick: bool):
     for name, choices in {
         "quadratic APIC": {},
         "quadratic APIC, spline gradient": {"gradient": SPLINE},
-        "quadratic APIC, total": {"description": TOTAL},
+        "quadratic APIC, total": {"description": TOTAL, "gradient": MLS},
         "cubic APIC": {"kernel": mpm.BSpline(3)},
         "quadratic FLIP(1)": {"transfer": FLIP},
         "quadratic PIC": {"transfer": mpm.PIC()},
@@ -79,7 +82,7 @@ def measure(quick: bool):
     for name, choices in {
         "updated, 2 x 2 a cell": {},
         "updated, 4 x 4 a cell": {"per_side": 4},
-        "total, 2 x 2 a cell": {"description": TOTAL},
+        "total, 2 x 2 a cell": {"description": TOTAL, "gradient": MLS},
     }.items():
         yield refined("quadrature", name, Vortex(0.3), rings, 0.5, **choices)
     for name, transfer in {"PIC": mpm.PIC(), "APIC": mpm.APIC(), "FLIP(1)": FLIP}.items():
@@ -94,6 +97,22 @@ def measure(quick: bool):
     }.items():
         longer = numbers if name == "explicit" else (6.4, 1.6, *numbers)
         yield over_steps("time", name, StandingWave(0.05), 32, longer, method=method, transfer=FLIP)
+
+
+def column(quick: bool) -> None:
+    """Print errors and orders of displacement and stress, as rows of docs/accuracy.md."""
+    cells = (8, 16) if quick else (16, 32, 64)
+    for load, order, description, gradient, shift in itertools.product(
+        (0.04,) if quick else (0.04, 0.49), (2, 3), (TOTAL, mpm.UpdatedLagrangian()), (SPLINE, MLS), (0.0, 0.3)
+    ):
+        choices = {"kernel": mpm.BSpline(order), "description": description, "gradient": gradient}
+        e = np.array([Column(load, shift).errors(n, **choices) for n in cells])
+        shown = [
+            f"{', '.join(f'{x:.1e}' for x in field)} | {', '.join(f'{o:.1f}' for o in orders(field, cells))}"
+            for field in e.T
+        ]
+        name = f"{type(description).__name__}, {type(gradient).__name__}, order {order}, load {load}, shift {shift}"
+        print(f"| {name} | {' | '.join(shown)} |", flush=True)
 
 
 def draw(series: list[Series]) -> None:
@@ -116,8 +135,13 @@ def draw(series: list[Series]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="leave out the finest grids, write nothing")
-    quick = parser.parse_args().quick
+    parser.add_argument("--column", action="store_true", help="the table of a column under its own weight alone")
+    given = parser.parse_args()
+    quick = given.quick
     jax.config.update("jax_enable_x64", True)
+    if given.column:
+        column(quick)
+        return
     series = []
     for s in measure(quick):
         slope = np.log(s.error[1:] / s.error[:-1]) / np.log(s.x[1:] / s.x[:-1])

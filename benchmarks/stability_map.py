@@ -183,7 +183,7 @@ def slack_sweep(seeds: int) -> list[dict]:
     rows = []
     for (name, description), d in product(descriptions.items(), (1, 2, 3)):
         for strain, seed in product((0.0, 0.03, 0.1, 0.2, 0.3), range(seeds)):
-            found = slack(d, seed, strain, material=law, description=description)
+            found = slack(d, seed, strain, material=law, description=description, gradient=mpm.MLSGradient())
             rows.append(
                 {
                     "description": name,

@@ -74,7 +74,8 @@ def ours(b: Block, description: Any, steps: int, method: Any = mpm.Explicit()) -
     one = jnp.ones(len(b.x), b.dtype)
     particles = mpm.Particles(jnp.asarray(b.x, b.dtype), jnp.asarray(b.v, b.dtype), b.mass * one, b.volume * one)
     gravity = (*[0.0] * (d - 1), -GRAVITY)
-    scene = mpm.Scene(grid, mpm.NeoHookean(E_MODULUS, NU), gravity=gravity, description=description)
+    choices = {"gravity": gravity, "description": description, "gradient": mpm.MLSGradient()}
+    scene = mpm.Scene(grid, mpm.NeoHookean(E_MODULUS, NU), **choices)
     state = [mpm.prepare(scene, particles)]
 
     def go() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ from mpmjax._collider import AbstractCollider, SeparatingCollider, SlipCollider
 from mpmjax._constituent import Constituent, Laws, constituents, return_map, split
 from mpmjax._exchange import Exchange, nothing_received
 from mpmjax._grid import Grid
-from mpmjax._kernel import BSpline, Gradient, MLSGradient, Stencil, in_window, make_stencil
+from mpmjax._kernel import BSpline, Gradient, MLSGradient, SplineGradient, Stencil, in_window, make_stencil
 from mpmjax._mirror import ContactPlane, Plane, SymmetryPlane, fits
 from mpmjax._particles import Group, Particles
 from mpmjax._transfer import APIC, Transfer
@@ -49,7 +49,9 @@ class Scene(eqx.Module):
         gravity: body acceleration [m/s²], (d,). Default: none.
         boundary: one boundary condition or several; where two prescribe the same component, the earlier holds.
         kernel: B-spline. Default: quadratic.
-        gradient: gradient operator of force and deformation. Default: moving least squares.
+        gradient: gradient operator of force and deformation. Default: the spline's in the total description with the
+            quadratic kernel, where stresses are of second order with it and of first with the other; else moving least
+            squares.
         transfer: PIC, FLIP or APIC. Default: APIC.
         description: updated (default) or total Lagrangian.
         body_force: a force per mass that varies in space or time, besides gravity. Default: none.
@@ -78,7 +80,7 @@ class Scene(eqx.Module):
         gravity: Point | None = None,
         boundary: AbstractBoundary | tuple[AbstractBoundary, ...] | list[AbstractBoundary] = (),
         kernel: BSpline = BSpline(),
-        gradient: Gradient = MLSGradient(),
+        gradient: Gradient | None = None,
         transfer: Transfer = APIC(),
         description: Description = UpdatedLagrangian(),
         body_force: AbstractBodyForce | None = None,
@@ -88,7 +90,8 @@ class Scene(eqx.Module):
         self.gravity = (0.0,) * grid.dim if gravity is None else gravity
         self.boundary = (boundary,) if isinstance(boundary, AbstractBoundary) else tuple(boundary)
         self.kernel = kernel
-        self.gradient = gradient
+        rough = isinstance(description, TotalLagrangian) and kernel == BSpline(2)  # where moving least squares is
+        self.gradient = gradient or (SplineGradient() if rough else MLSGradient())
         self.transfer = transfer
         self.description = description
         self.body_force = body_force

@@ -99,8 +99,8 @@ def crossings(found):
 @pytest.mark.parametrize("kernel", **ids(KERNELS))
 @pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
 def test_an_explicit_step_crosses_to_the_grid_and_back_once(description, kernel, d):
-    """Momentum with the force's impulse, velocity with its gradient; no iteration."""
-    found = counted(d=d, kernel=kernel, description=description)
+    """Momentum with the force's impulse, velocity with its gradient, of moving least squares; no iteration."""
+    found = counted(d=d, kernel=kernel, description=description, gradient=mpm.MLSGradient())
     assert crossings(found) == (1, 1)
     assert found["while"] == 0
 

@@ -68,6 +68,21 @@ def test_weights_and_gradients_reproduce_affine_functions(kernel, gradient, d):
         np.testing.assert_allclose(slope, np.broadcast_to(np.eye(d)[..., None], slope.shape), atol=1e-13)
 
 
+@pytest.mark.parametrize("kernel", **ids({k: KERNELS[k] for k in ("quadratic", "cubic")}))
+def test_gradients_of_quadratic_functions(kernel):
+    """Exact with the spline gradient, and with that of moving least squares and the cubic kernel. With the quadratic
+    one it is off by 4 (s/4 − s³) dx, s spacings beyond the nearest node: of first order, opposite on its two sides.
+    """
+    x = places(1)
+    s = x[:, 0] / DX - np.round(x[:, 0] / DX)
+    s[np.isclose(abs(s), 0.5)] = 0.5
+    for gradient, expected in ((mpm.SplineGradient(), 0 * s), (mpm.MLSGradient(), 4 * (s / 4 - s**3) * DX)):
+        stencil, _, nodes, _ = make(kernel, gradient, mpm.Grid((8,), DX), x)
+        slope = (stencil.gradient[:, 0] * nodes[stencil.index][..., 0] ** 2).sum(axis=0)
+        miss = expected if kernel.order == 2 else 0 * s
+        np.testing.assert_allclose(slope - 2 * x[:, 0], miss, atol=1e-13)
+
+
 @pytest.mark.parametrize("kernel", **ids(KERNELS))
 @pytest.mark.parametrize("d", DIMS)
 def test_spline_gradient_is_the_derivative_of_the_weights(kernel, d):

@@ -2,8 +2,16 @@
 
 from mpmjax.verification._aligned import AxisAligned
 from mpmjax.verification._bar import VibratingBar
+from mpmjax.verification._column import Column
 from mpmjax.verification._disks import TwoDisks
-from mpmjax.verification._problem import AbstractProblem, Ends, Manufactured, discretise, displacement_error
+from mpmjax.verification._problem import (
+    AbstractProblem,
+    Ends,
+    Manufactured,
+    discretise,
+    displacement_error,
+    stress_error,
+)
 from mpmjax.verification._refinement import errors, orders
 from mpmjax.verification._vortex import Vortex
 from mpmjax.verification._wave import StandingWave
@@ -11,6 +19,7 @@ from mpmjax.verification._wave import StandingWave
 __all__ = [
     "AbstractProblem",
     "AxisAligned",
+    "Column",
     "Ends",
     "Manufactured",
     "StandingWave",
@@ -21,4 +30,5 @@ __all__ = [
     "displacement_error",
     "errors",
     "orders",
+    "stress_error",
 ]

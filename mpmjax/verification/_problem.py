@@ -131,6 +131,7 @@ def discretise(
     *,
     per_side: int = 2,
     velocity_time: float = 0.0,
+    rest: Particles | None = None,
     **choices: Any,
 ) -> tuple[Scene, Particles]:
     """The problem's scene and particles in their exact initial state.
@@ -141,12 +142,14 @@ def discretise(
         per_side: particles to a cell's side.
         velocity_time: the time at which initial velocities are taken [s]. Symplectic Euler is the leap-frog method
             whose velocities stand half a step early: with −Δt/2 it is second order in time, with 0 first.
+        rest: the particles at rest, with their mass and volume. Default: the grid's cells, filled evenly.
         choices: of the scene: kernel, gradient, transfer, description.
     """
     grid = problem.grid(cells)
     d = problem.dim
     require(grid.dim == d, f"The problem is {d}-dimensional, its grid {grid.dim}-dimensional.")
-    rest = fill(problem.body(cells), grid, particles_per_cell=per_side**d, density=problem.density)
+    if rest is None:
+        rest = fill(problem.body(cells), grid, particles_per_cell=per_side**d, density=problem.density)
     X = rest.x
     x, F = jax.vmap(lambda Y: (problem.position(Y, 0.0), problem.deformation(Y, 0.0)))(X)
     v, rate = jax.vmap(
@@ -182,3 +185,24 @@ def displacement_error(problem: AbstractProblem, particles: Particles, run: Run)
         return jnp.sqrt((share * ((x - exact) ** 2).sum(axis=1)).sum())
 
     return jax.lax.map(at, (run.frames.x, run.times))
+
+
+def stress_error(problem: AbstractProblem, particles: Particles, run: Run) -> Float[Array, "f"]:
+    """Σ V0 ‖P − P(X, t)‖ / Σ V0 [Pa] at each saved frame, P the first Piola-Kirchhoff stress, shape (f,).
+
+    Args:
+        problem: the problem.
+        particles: as `discretise` made them, with X.
+        run: the run, with frames.
+    """
+    if run.frames is None or particles.X is None:
+        raise ValueError("The error needs a run with frames (pass save_every to simulate) and particles with X.")
+    X, share = particles.X, particles.volume / particles.volume.sum()
+
+    def at(frame: tuple[Array, Array]) -> Array:
+        F, t = frame
+        exact = jax.vmap(lambda Y: problem.deformation(Y, t))(X)
+        miss = jax.vmap(problem.material.stress)(F) - jax.vmap(problem.material.stress)(exact)
+        return (share * jnp.sqrt((miss**2).sum(axis=(1, 2)))).sum()
+
+    return jax.lax.map(at, (run.frames.F, run.times))

@@ -1,0 +1,90 @@
+"""A column under its own weight: an exact static state."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._boundary import AbstractBoundary
+from mpmjax._grid import Grid
+from mpmjax._method import SemiImplicit
+from mpmjax._mirror import SymmetryPlane
+from mpmjax._particles import Particles
+from mpmjax._region import Box
+from mpmjax._simulate import simulate
+from mpmjax._types import Array, Float, Scalar
+from mpmjax.material import AbstractMaterial, FixedCorotated
+from mpmjax.verification._problem import (
+    AbstractProblem,
+    discretise,
+    displacement_error,
+    stress_error,
+)
+
+_LOADING, _HOLDING = 20, 8  # steps, of which each is a Newton step towards equilibrium
+
+
+class Column(AbstractProblem):
+    """A column 0 ≤ X ≤ 1 m that stands on a symmetry plane, its weight put on slowly: P = −a E (1 − X) at full load,
+    x = X − a (X − X²/2).
+
+    Exact at any load below E in one dimension with ν = 0, P = E (F − 1) being linear. The free end needs no condition.
+
+    Args:
+        load: a, weight over stiffness.
+        shift: by which fraction of a cell the free end lies beyond a node. Particles are spaced to fill the column
+            exactly, so that with a shift they stand elsewhere in each cell.
+    """
+
+    load: float = 0.04
+    shift: float = 0.0
+    material: AbstractMaterial = FixedCorotated(1.0, 0.0)
+    density: float = 1.0
+    dim: int = eqx.field(static=True, default=1)
+    forced: bool = eqx.field(static=True, default=True)
+
+    @property
+    def duration(self) -> float:
+        """So long that inertia does not show [s]."""
+        return 1e5 * (_LOADING + _HOLDING)
+
+    def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
+        """x(X, t) [m]."""
+        share = jnp.minimum(t / (1e5 * (_LOADING - 1)), 1)
+        return X - self.load * share * (X - X**2 / 2)
+
+    def grid(self, cells: int) -> Grid:
+        """With room at both ends."""
+        return Grid((cells + 8,), 1 / (cells + self.shift), origin=(-3,))
+
+    def body(self, cells: int) -> Box:
+        """The column."""
+        del cells
+        return Box((0.0,), (1.0,))
+
+    def rest(self, cells: int, per_side: int) -> Particles:
+        """Particles that fill the column exactly."""
+        n = cells * per_side
+        X, volume = jnp.asarray((np.arange(n) + 0.5)[:, None] / n), jnp.full(n, 1 / n)
+        return Particles(X, jnp.zeros_like(X), self.density * volume, volume)
+
+    def boundary(self) -> tuple[AbstractBoundary, ...]:
+        """What it stands on."""
+        return (SymmetryPlane(0, 0.0),)
+
+    def errors(self, cells: int, *, per_side: int = 2, **choices: object) -> tuple[float, float]:
+        """The errors of the state under full load: of the displacement over that of the top, a/2, and of the stress
+        over that at the bottom, a E.
+
+        Args:
+            cells: grid cells to the column's height.
+            per_side: particles to a cell.
+            choices: of the scene: kernel, gradient, transfer, description.
+        """
+        scene, particles = discretise(self, cells, rest=self.rest(cells, per_side), **choices)
+        steps = _LOADING + _HOLDING
+        run = simulate(
+            scene, particles, t1=self.duration, dt=self.duration / steps, method=SemiImplicit(), save_every=steps
+        )
+        stiffness = float(self.material.youngs_modulus)  # pyright: ignore[reportAttributeAccessIssue]
+        u, P = displacement_error(self, particles, run)[-1], stress_error(self, particles, run)[-1]
+        return float(u) / (self.load / 2), float(P) / (self.load * stiffness)
