@@ -158,7 +158,7 @@ class Bench(NamedTuple):
         scene, dt, method = canonical((self.scene, self.t1 / steps, method), dtype)
         state, states = state_of(self.particles), []
         for k in range(frames):
-            _, state, tally, previous = integrate(
+            _, state, tally, previous, _ = integrate(
                 scene,
                 with_state(self.particles, state),
                 jnp.asarray(k * each, dtype),

@@ -10,9 +10,8 @@ from functools import reduce
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 
-from mpmjax._checks import coordinates, is_traced, require, require_between
+from mpmjax._checks import coordinates, require, require_between, require_that
 from mpmjax._motion import Motion
 from mpmjax._region import AbstractRegion
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, ParticleVector, Point, Scalar
@@ -165,13 +164,12 @@ def _check_box(name: str, lower: Point, upper: Point) -> None:
         coordinates(f"{name}'s lower corner", lower) == coordinates(f"{name}'s upper corner", upper),
         f"{name} needs two corners with as many coordinates, got {lower} and {upper}.",
     )
-    if not is_traced((lower, upper)):
-        a, b = np.asarray(lower, float), np.asarray(upper, float)
-        require(
-            (a < b) & ~np.isnan(a) & ~np.isnan(b),
-            f"{name}'s lower corner must lie below its upper one in each direction (infinite means no wall), "
-            f"got {lower} and {upper}.",
-        )
+    require_that(
+        f"{name}'s lower corner must lie below its upper one in each direction (infinite means no wall)",
+        lambda a, b: a < b,  # false of what is not a number
+        lower,
+        upper,
+    )
 
 
 class StickyBox(AbstractBoundary):

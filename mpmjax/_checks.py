@@ -1,9 +1,14 @@
 """Checks of what a user passes in: each raises a `ValueError` that says what must hold, what was got, what to do.
 
-A value that is being traced has no number yet and is passed; the same value is checked when it is first written down.
+A value that is being traced has no number yet, and its check is put off. A module states what must hold of its values
+once, in its `__check_init__`. A constructor checks there what is known; `requirements` runs the same statements again
+and returns those that were put off, for a compiled program to evaluate.
 """
 
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from dataclasses import fields, is_dataclass
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,23 +21,94 @@ def is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
+class Requirement(NamedTuple):
+    """What must hold of values that are being traced."""
+
+    message: str
+    met: Callable[[], Any]
+    """Computes whether it does: bools, all of them true."""
+
+
+_put_off: ContextVar[list[Requirement] | None] = ContextVar("_put_off", default=None)
+"""Where `requirements` gathers; None outside of it, where what is not known is passed."""
+
+
+def requirements(tree: Any) -> list[Requirement]:
+    """What the modules in a tree require of their traced values, in a fixed order.
+
+    Raises:
+        ValueError: a value that is known is not as its module requires, as `equinox.tree_at` can make it.
+    """
+    gathered: list[Requirement] = []
+    token = _put_off.set(gathered)
+    try:
+        for module in _modules(tree):
+            for kind in type(module).__mro__:
+                if "__check_init__" in vars(kind):
+                    vars(kind)["__check_init__"](module)
+    finally:
+        _put_off.reset(token)
+    return gathered
+
+
+def first_unmet(required: list[Requirement]) -> jax.Array:
+    """The number, from one, of the first requirement that is not met; zero if all are."""
+    met = jnp.stack([jnp.all(requirement.met()) for requirement in required])
+    return jnp.where(met.all(), 0, 1 + jnp.argmin(met)).astype(jnp.int32)
+
+
+def _modules(tree: Any) -> Iterator[Any]:
+    """The dataclass instances in a tree, each after those in it."""
+    if isinstance(tree, (tuple, list)):
+        for entry in tree:
+            yield from _modules(entry)
+    elif is_dataclass(tree) and not isinstance(tree, type):
+        for field in fields(tree):
+            yield from _modules(getattr(tree, field.name))
+        yield tree
+
+
+def _put_off_check(message: str, met: Callable[[], Any]) -> None:
+    gathered = _put_off.get()
+    if gathered is not None:
+        gathered.append(Requirement(message, met))
+
+
 def require(condition: Any, message: str) -> None:
-    """Raise `ValueError(message)` unless the condition holds everywhere, or is not known yet."""
-    if not is_traced(condition) and not np.all(condition):
+    """Raise `ValueError(message)` unless the condition holds everywhere; of what is traced see `requirements`."""
+    if is_traced(condition):
+        _put_off_check(message, lambda: condition)
+    elif not np.all(condition):
         raise ValueError(message)
+
+
+def require_that(what: str, holds: Callable[..., Any], *values: Any) -> None:
+    """Raise `ValueError` unless a condition on the arrays of some values holds everywhere.
+
+    Args:
+        what: what must hold, in words.
+        holds: the condition, by operators and methods that NumPy's and JAX's arrays have both.
+        values: its arguments.
+    """
+    if is_traced(values):
+        _put_off_check(f"{what}.", lambda: holds(*map(jnp.asarray, values)))
+    elif not np.all(holds(*map(np.asarray, values))):  # written only here: writing an array takes ms
+        raise ValueError(f"{what}, got {' and '.join(map(str, values))}.")
 
 
 def require_finite(name: str, value: Any) -> None:
     """Every number of `value` must be finite."""
-    if not is_traced(value) and not np.isfinite(np.asarray(value, dtype=float)).all():
-        raise ValueError(f"{name} must be finite, got {value}.")  # written only here: writing an array takes ms
+    require_that(f"{name} must be finite", _finite, value)
+
+
+def _finite(a: Any) -> Any:
+    return abs(a.astype(float)) < np.inf
 
 
 def require_positive(name: str, value: Any) -> None:
     """Every number of `value` must be finite and above zero."""
     require_finite(name, value)
-    if not is_traced(value) and not (np.asarray(value) > 0).all():
-        raise ValueError(f"{name} must be greater than zero, got {value}.")
+    require_that(f"{name} must be greater than zero", lambda a: a > 0, value)
 
 
 def coordinates(name: str, point: Any) -> int:
@@ -46,12 +122,12 @@ def coordinates(name: str, point: Any) -> int:
 def require_between(name: str, value: Any, lower: float | int, upper: float | int, *, open_ends: bool = False) -> None:
     """Every number of `value` must lie in [lower, upper], or in (lower, upper) with `open_ends`."""
     require_finite(name, value)
-    if not is_traced(value):
-        a = np.asarray(value)
-        inside = (a > lower) & (a < upper) if open_ends else (a >= lower) & (a <= upper)
-        if not inside.all():
-            words = f"strictly between {lower} and {upper}" if open_ends else f"from {lower} to {upper}"
-            raise ValueError(f"{name} must be {words}, got {value}.")
+    words = f"strictly between {lower} and {upper}" if open_ends else f"from {lower} to {upper}"
+
+    def inside(a: Any) -> Any:
+        return (a > lower) & (a < upper) if open_ends else (a >= lower) & (a <= upper)
+
+    require_that(f"{name} must be {words}", inside, value)
 
 
 def require_moduli(name: str, youngs_modulus: Any, poisson_ratio: Any) -> None:

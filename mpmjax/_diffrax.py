@@ -10,8 +10,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from mpmjax._checks import first_unmet, requirements
 from mpmjax._kernel import Stencil, in_window
-from mpmjax._method import Method
+from mpmjax._method import Method, reporting
 from mpmjax._particles import Particles, State, state_of, with_state
 from mpmjax._scene import Scene
 from mpmjax._step import StepInfo, advance_compiled
@@ -19,6 +20,9 @@ from mpmjax._types import Array, Bool, Float, Int, Scalar
 
 HEALTHY, NOT_FINITE, OUTSIDE, INADMISSIBLE, BEYOND = 0, 1, 2, 3, 4
 """What can be wrong with a state."""
+BAD_PARAMETERS = 100
+"""From here on: a value of scene, particles or method that its module does not allow, by its number among their
+`requirements`."""
 
 
 class Problem(eqx.Module):
@@ -32,6 +36,10 @@ class Problem(eqx.Module):
     observe: Callable[[Scene, Particles], Any] | None = None
     start: Scalar = 0.0
     """Number of the first step."""
+    slot: Scalar = 0.0
+    """Through which adjoint solves report (see `Reporting`)."""
+    fault: Int[Array, ""] | None = None
+    """What was wrong before the first step; None where that is known to be nothing."""
 
     def at(self, state: State) -> Particles:
         """The particles in a state."""
@@ -65,7 +73,8 @@ class Tally(eqx.Module):
     violations: Int[Array, "*f"]
     """Contact conditions left violated, summed over steps."""
     fault: Int[Array, "*f"]
-    """The first fault of a state: HEALTHY, NOT_FINITE, OUTSIDE, INADMISSIBLE or BEYOND."""
+    """The first fault of a state: HEALTHY, NOT_FINITE, OUTSIDE, INADMISSIBLE or BEYOND; or BAD_PARAMETERS and what
+    follows."""
     fault_step: Int[Array, "*f"]
     """How many steps led to it."""
 
@@ -149,14 +158,32 @@ def passed_particles(problem: Problem, before: State, after: State, t: Scalar) -
     return [(number, passed) for number, passed in enumerate(found) if passed is not None]
 
 
-def fault_of(problem: Problem, before: State, after: State, t: Scalar) -> Int[Array, ""]:
-    """The gravest fault of a state and of the step from t [s] that led to it."""
-    broken, outside, inadmissible = (a.any() for a in faulty_particles(problem, after))
+def state_fault(problem: Problem, state: State) -> Int[Array, ""]:
+    """The gravest fault of a state."""
+    broken, outside, inadmissible = (a.any() for a in faulty_particles(problem, state))
     fault = jnp.where(inadmissible, INADMISSIBLE, HEALTHY)
     fault = jnp.where(outside, OUTSIDE, fault)
-    for _, passed in passed_particles(problem, before, after, t):
-        fault = jnp.where(passed.any(), BEYOND, fault)
     return jnp.where(broken, NOT_FINITE, fault).astype(jnp.int32)
+
+
+def fault_of(problem: Problem, before: State, after: State, t: Scalar) -> Int[Array, ""]:
+    """The gravest fault of a state and of the step from t [s] that led to it."""
+    fault = state_fault(problem, after)
+    for _, passed in passed_particles(problem, before, after, t):
+        fault = jnp.where(passed.any() & (fault != NOT_FINITE), BEYOND, fault)
+    return fault
+
+
+def examined(problem: Problem, state: State) -> tuple[Problem, State]:
+    """The problem with the fault that it starts with, of values that were not known when they were written down, and
+    the state, which is NaN where a parameter is bad: what follows would look like numbers."""
+    arrays, rest = eqx.partition((problem, state), eqx.is_array)
+    known, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
+    unmet = first_unmet(requirements((known.scene, known.particles, known.method)))
+    fault = jnp.where(unmet > 0, BAD_PARAMETERS + unmet - 1, state_fault(known, begin))
+    valid = jnp.where(unmet > 0, jnp.nan, 1)
+    state = jax.tree.map(lambda a: a * valid.astype(a.dtype), state)
+    return eqx.tree_at(lambda p: p.fault, problem, fault, is_leaf=lambda a: a is None), state
 
 
 def step_number(t: Array) -> Array:
@@ -171,33 +198,39 @@ class StepSolver(diffrax.AbstractSolver):
     term_structure: ClassVar = diffrax.ODETerm
     interpolation_cls: ClassVar[Callable[..., diffrax.LocalLinearInterpolation]] = diffrax.LocalLinearInterpolation
     watch: bool = False
-    """Whether a fault stops the run, and the state before the last step, then the last good one, is carried."""
+    """Whether a fault stops the run, and the state before the last step, then the last good one, is carried. All values
+    are then known and were checked; else that is done here."""
 
     def order(self, terms: Any) -> int:
         """At least first order in time; nothing depends on it, Δt being constant."""
         del terms
         return 1
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: State, args: Problem) -> tuple[Tally, State | None]:
-        """An empty tally."""
-        del terms, t0, t1, args
-        return no_steps(y0.x.dtype), y0 if self.watch else None
+    def init(self, terms: Any, t0: Any, t1: Any, y0: State, args: Problem) -> tuple[Tally, State | None, Array]:
+        """An empty tally, and a silent report."""
+        del terms, t0, t1
+        tally, silent = no_steps(y0.x.dtype), jnp.zeros((), y0.x.dtype)
+        if args.fault is not None:
+            tally = eqx.tree_at(lambda tally: tally.fault, tally, args.fault)
+        return tally, y0 if self.watch else None, silent
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: State, args: Problem, solver_state: Any, made_jump: Any) -> tuple:
         """One step. A fault is reported as the solver's failure: as an event diffrax would ask for it once more."""
         del terms, t1, made_jump
-        tally, _ = solver_state
+        tally, _, report = solver_state
         t = (args.start + step_number(t0)) * args.dt
-        particles, info = advance_compiled(args.scene, args.at(y0), t, args.dt, args.method, args.stencil)
+        method = reporting(args.method, args.slot)
+        particles, info = advance_compiled(args.scene, args.at(y0), t, args.dt, method, args.stencil)
+        report = report + info.solve.report
         y1 = state_of(particles)
         arrays, rest = eqx.partition((args, y0, y1, t), eqx.is_array)
         tally = tally.plus(info, fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest)))
         dense = {"y0": y0, "y1": y1}
         if not self.watch:
-            return y1, None, dense, (tally, None), diffrax.RESULTS.successful
+            return y1, None, dense, (tally, None, report), diffrax.RESULTS.successful
         results: Any = diffrax.RESULTS  # whose members the type checker takes for another type
         result = results.where(tally.fault == HEALTHY, results.successful, results.nonlinear_divergence)
-        return y1, None, dense, (tally, y0), result
+        return y1, None, dense, (tally, y0, report), result
 
     def func(self, terms: Any, t0: Any, y0: State, args: Problem) -> State:
         """Not a vector field; diffrax only asks for its shape."""

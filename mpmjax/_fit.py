@@ -1,7 +1,7 @@
 """Fitting a material parameter to a measured curve, by exact differentiation through the rollout."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -102,7 +102,7 @@ def fit_curve(
     Raises:
         ValueError: fewer than two points, data that are not finite, or an abscissa that the simulation does not reach.
         SimulationError: the rollout at the fit met a fault.
-        RuntimeError: the least-squares iteration did not converge.
+        RuntimeError: the least-squares iteration did not converge, or a tangent solve of the rollout did not.
     """
     fitted = np.asarray(fitted, bool)
     require(fitted.sum() >= 2, f"A fit with a standard error needs two points at least, got {int(fitted.sum())}.")
@@ -122,24 +122,36 @@ def fit_curve(
     def at(ratio: Scalar) -> Scene:
         return eqx.tree_at(parameter, scene, ratio * guess)
 
-    def simulated(candidate: Scene, until: float | int, **options: Any) -> tuple[Array, Array]:
-        return simulate(candidate, particles, t1=until, dt=dt, method=method, observe=curve, **options).observed
+    def simulated(candidate: Scene) -> tuple[Array, Array]:
+        return simulate(candidate, particles, t1=t1, dt=dt, method=method, observe=curve).observed
 
-    first = simulated(scene, t1)
+    first = simulated(scene)
     _require_reached(first, measured_x[fitted])
     until = _time_to_reach(np.asarray(first[0]), float(x.max()), float(dt))
 
-    def model(ratio: Scalar) -> Array:
-        options = {"adjoint": diffrax.ForwardMode(), "throw": False}
-        return jnp.interp(x, *simulated(at(ratio), until, **options))
+    def model(ratio: Scalar) -> tuple[Array, Array]:
+        run = simulate(
+            at(ratio),
+            particles,
+            t1=until,
+            dt=dt,
+            method=method,
+            observe=curve,
+            adjoint=diffrax.ForwardMode(),
+            throw=False,
+        )
+        misfit = (jnp.interp(x, *run.observed) - y) / scale
+        assert run.report is not None
+        return jnp.where(run.tally.healthy, misfit, jnp.nan), run.report
 
     @jax.jit
-    def misfit(ratio: Scalar) -> tuple[Array, Array]:
-        return jax.jvp(lambda r: (model(r) - y) / scale, (ratio,), (jnp.ones_like(ratio),))
+    def misfit(ratio: Scalar) -> _Misfit:
+        (r, _), (J, unsolved) = jax.jvp(model, (ratio,), (jnp.ones_like(ratio),))
+        return _Misfit(r, J, unsolved)
 
     ratio, variance, simulations = _least_squares(misfit, dtype)
     best = at(ratio)
-    curve_x, curve_y = simulated(best, t1)
+    curve_x, curve_y = simulated(best)
     _require_reached((curve_x[: round(until / float(dt)) + 1], curve_y), measured_x[fitted])
     value, slope = jax.jvp(lambda r: report(at(r)), (ratio,), (jnp.ones_like(ratio),))
     inside = (measured_x >= float(curve_x[0])) & (measured_x <= float(curve_x.max()))
@@ -154,29 +166,50 @@ def fit_curve(
     )
 
 
-def _least_squares(misfit: Callable[[Array], tuple[Array, Array]], dtype: Any) -> tuple[Array, float, int]:
+class _Misfit(NamedTuple):
+    """r, NaN where the run met a fault; its derivative J by the parameter; and the relative residual of the first
+    tangent solve that did not converge, zero if all did."""
+
+    r: Float[Array, "n"]
+    J: Float[Array, "n"]
+    unsolved: Float[Array, ""]
+
+
+def _least_squares(misfit: Callable[[Array], _Misfit], dtype: Any) -> tuple[Array, float, int]:
     """The positive number that minimises Σ r², from 1, its variance s² / (JᵀJ), and the number of evaluations.
 
+    Where a run meets a fault the search tries a smaller change of the parameter.
+
     Args:
-        misfit: r and its derivative J, each (n,). One compiled function gives both, and what SciPy asks for twice is
-            computed once.
+        misfit: One compiled function gives r and J, and what SciPy asks for twice is computed once.
         dtype: of the number.
     """
-    known: dict[float, tuple[np.ndarray, np.ndarray]] = {}
+    known: dict[float, _Misfit] = {}
 
-    def evaluate(ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def evaluate(ratio: np.ndarray) -> _Misfit:
         key = float(ratio[0])
         if key not in known:
-            r, J = misfit(jnp.asarray(key, dtype))
-            known[key] = (np.asarray(r), np.asarray(J)[:, None])
+            known[key] = misfit(jnp.asarray(key, dtype))
         return known[key]
 
     def slope(ratio: np.ndarray) -> np.ndarray:
-        return evaluate(ratio)[1]
+        _, J, unsolved = evaluate(ratio)
+        if float(unsolved) > 0:
+            raise RuntimeError(
+                f"The fit has no derivative at {float(ratio[0]):.4g} times the first guess: the tangent solve of a "
+                f"step did not converge (relative residual {float(unsolved):.2g}). Use metric=Metric.DIAGONAL, or "
+                "raise the max_steps of the method's adjoint_solver."
+            )
+        if not np.isfinite(J).all():
+            raise RuntimeError(
+                f"The fit has no derivative at {float(ratio[0]):.4g} times the first guess: that of the simulated "
+                "curve is not finite. Look for a law or a curve that cannot be differentiated where the run takes it."
+            )
+        return np.asarray(J)[:, None]
 
     jacobian: Any = slope  # SciPy's annotation knows only strings
     solution = scipy.optimize.least_squares(
-        lambda ratio: evaluate(ratio)[0], np.ones(1), jac=jacobian, bounds=(0, np.inf), xtol=1e-6
+        lambda ratio: np.asarray(evaluate(ratio).r), np.ones(1), jac=jacobian, bounds=(0, np.inf), xtol=1e-6
     )
     if not solution.success:
         raise RuntimeError(

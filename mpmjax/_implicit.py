@@ -42,6 +42,8 @@ class SolveInfo(eqx.Module):
     indefinite: Bool[Array, "*f"]
     """Whether the solver met a direction of negative curvature: M + cH is indefinite, and the step may be near a
     singular one."""
+    report: Float[Array, "*f"]
+    """Zero. Its tangent is the relative residual of the tangent solves that did not converge (see `Reporting`)."""
 
     def plus(self, later: "SolveInfo") -> "SolveInfo":
         """The cost of both solves and the quality of the later one."""
@@ -53,6 +55,7 @@ class SolveInfo(eqx.Module):
             converged=later.converged,
             short=later.short,
             indefinite=self.indefinite | later.indefinite,
+            report=self.report + later.report,
         )
 
     def beside(self, other: "SolveInfo") -> "SolveInfo":
@@ -68,7 +71,8 @@ def no_solve(dtype: Any) -> SolveInfo:
     """The report of an update that solves nothing."""
     zero = jnp.asarray(0, dtype=jnp.int32)
     no = jnp.asarray(False)
-    return SolveInfo(zero, zero, zero, jnp.asarray(0, dtype=dtype), converged=~no, short=no, indefinite=no)
+    none = jnp.asarray(0, dtype=dtype)
+    return SolveInfo(zero, zero, zero, none, converged=~no, short=no, indefinite=no, report=none)
 
 
 class AbstractProblem(eqx.Module):
@@ -208,6 +212,7 @@ class Linearised(eqx.Module):
             converged=converged,
             short=~converged & (stats["residual"] <= SHORT * rtol),
             indefinite=stats["indefinite"],
+            report=jnp.zeros_like(stats["residual"]),
         )
         return v + lift, info
 
@@ -335,6 +340,7 @@ class Newton(eqx.Module):
             converged=done,
             short=~done & (left <= SHORT * rtol * scale),
             indefinite=c.indefinite,
+            report=jnp.zeros_like(left),
         )
         return jnp.where(free & ~jnp.isfinite(left), jnp.nan, c.v), info
 
@@ -357,8 +363,22 @@ class _NewtonState(eqx.Module):
     indefinite: Array
 
 
+class Reporting(eqx.Module):
+    """The solver of tangent and adjoint systems, with a way to hear of those that did not converge.
+
+    Their residuals cannot be returned: they are computed where only derivatives are. So they are themselves given out
+    as derivatives, of zeros: the tangent of `SolveInfo.report` in forward mode, the cotangent of `slot` in reverse mode
+    is the sum of the relative residuals of the solves that did not converge, infinite where one is not finite. As such
+    a solve gives NaN, and what is solved after it is not counted, that is the residual of the first.
+    """
+
+    solver: ConjugateResidual
+    slot: Scalar
+    """Zero."""
+
+
 def solve(
-    problem: AbstractProblem, guess: NodeVector, find: Linearised | Newton, adjoint: ConjugateResidual
+    problem: AbstractProblem, guess: NodeVector, find: Linearised | Newton, adjoint: ConjugateResidual | Reporting
 ) -> tuple[NodeVector, SolveInfo]:
     """The solution of a problem, differentiable with respect to it in forward and reverse mode, to any order.
 
@@ -369,34 +389,42 @@ def solve(
         adjoint: solver of the tangent and adjoint systems. One that does not converge gives NaN derivatives, so that a
             wrong gradient cannot pass for a right one.
     """
-    return _solve(problem, *jax.lax.stop_gradient((guess, find, adjoint)))
+    if not isinstance(adjoint, Reporting):
+        adjoint = Reporting(adjoint, jnp.zeros((), guess.dtype))
+    return _solve(problem, adjoint.slot, *jax.lax.stop_gradient((guess, find, adjoint.solver)))
 
 
 @ruled
 def _solve(
-    problem: AbstractProblem, guess: NodeVector, find: Any, adjoint: ConjugateResidual
+    problem: AbstractProblem, slot: Array, guess: NodeVector, find: Any, adjoint: ConjugateResidual
 ) -> tuple[NodeVector, SolveInfo]:
-    del adjoint
+    del slot, adjoint
     return find(problem, guess)
 
 
 @_solve.defjvp
 def _solve_jvp(primals: Any, tangents: Any) -> Any:
-    problem, guess, find, adjoint = primals
-    d_problem = tangents[0]
-    v, info = _solve(problem, guess, find, adjoint)
+    problem, slot, guess, find, adjoint = primals
+    d_problem, d_slot = tangents[:2]
+    v, info = _solve(problem, slot, guess, find, adjoint)
     d_residual = eqx.filter_jvp(lambda q: q.residual(v), (problem,), (d_problem,))[1]
     operator = problem.operator(v)
     assembled = jax.lax.stop_gradient(operator).assembled()
     options = {"metric": assembled.metric()}
 
-    def solve_symmetric(matvec: Any, b: NodeVector) -> NodeVector:
+    def solve_symmetric(matvec: Any, b: tuple[NodeVector, Array]) -> tuple[NodeVector, Array]:
         del matvec  # the same operator, slower
-        x, result, _ = adjoint.compute(adjoint.init(assembled, options), b, options)
-        return jnp.where(result == lx.RESULTS.successful, x, jnp.nan)
+        x, result, stats = adjoint.compute(adjoint.init(assembled, options), b[0], options)
+        solved, known = result == lx.RESULTS.successful, jnp.isfinite(b[0]).all()
+        residual = jnp.where(jnp.isfinite(stats["residual"]), stats["residual"], jnp.inf)
+        return jnp.where(solved, x, jnp.nan), jnp.where(known & ~solved, residual, 0)
 
     split = problem.constraint.split
     lift = split(0, -d_residual)
     rhs = split(-d_residual - operator.unconstrained(lift), 0)
-    dv = jax.lax.custom_linear_solve(operator.mv, rhs, solve_symmetric, symmetric=True)
-    return (v, info), (dv + lift, jax.tree.map(lambda _: None, info))
+    d_slot = rhs[:0].sum() + (0 if d_slot is None else d_slot)  # linear in tangents also where nobody listens
+    dv, d_report = jax.lax.custom_linear_solve(
+        lambda x: (operator.mv(x[0]), x[1]), (rhs, d_slot), solve_symmetric, symmetric=True
+    )
+    d_info = eqx.tree_at(lambda i: i.report, jax.tree.map(lambda _: None, info), d_report, is_leaf=lambda a: a is None)
+    return (v, info), (dv + lift, d_info)

@@ -18,7 +18,7 @@ from mpmjax._checks import require_between
 from mpmjax._conjugate_residual import ConjugateResidual
 from mpmjax._guess import Guess
 from mpmjax._hessian import AnalyticHessian, Hessian, damped
-from mpmjax._implicit import Linearised, LinearProblem, Newton, NewtonProblem, SolveInfo, no_solve, solve
+from mpmjax._implicit import Linearised, LinearProblem, Newton, NewtonProblem, Reporting, SolveInfo, no_solve, solve
 from mpmjax._metric import Metric
 from mpmjax._nodes import Nodes
 from mpmjax._types import Array, Float, NodeVector, Scalar
@@ -279,6 +279,13 @@ class TRBDF2(eqx.Module):
 
 
 Method = Explicit | SemiImplicit | BackwardEuler | ImplicitMidpoint | TRBDF2
+
+
+def reporting(method: Method, slot: Scalar) -> Method:
+    """The method with tangent and adjoint solves that report through a slot."""
+    if isinstance(method, Explicit):
+        return method
+    return eqx.tree_at(lambda m: m.adjoint_solver, method, Reporting(method.adjoint_solver, slot))
 
 
 def viscous_impulse(nodes: Nodes, motion: NodeMotion) -> NodeVector | None:

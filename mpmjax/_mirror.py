@@ -6,12 +6,14 @@ implicit one is Bᵀ(M + βΔt²H)B. The transfers know nothing of it. At a `Sym
 a `ContactPlane` only in the *columns* (lines of nodes along the normal) that it holds.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from mpmjax._boundary import ON_THE_WALL, AbstractBoundary, Conditions, crossed
-from mpmjax._checks import is_traced, require, require_between, require_finite
+from mpmjax._checks import require, require_between, require_finite
 from mpmjax._grid import Grid
 from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector, ParticleVector, Scalar
 
@@ -120,12 +122,10 @@ class ContactPlane(AbstractBoundary):
 Plane = SymmetryPlane | ContactPlane
 
 
-def fits(plane: Plane, grid: Grid) -> bool:
-    """Whether the plane lies at a multiple of half a spacing (true while either is not known)."""
-    if is_traced((plane.position, grid.spacing)):
-        return True
-    halves = 2 * float(plane.position) / float(grid.spacing)
-    return abs(halves - round(halves)) < ON_THE_WALL
+def fits(position: Any, spacing: Any) -> Any:
+    """Whether a plane lies at a multiple of half a spacing."""
+    halves = 2 * position / spacing
+    return abs(halves - halves.round()) < ON_THE_WALL
 
 
 class Image(eqx.Module):

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._checks import coordinates, is_traced, require, require_finite
+from mpmjax._checks import coordinates, require, require_finite, require_that
 from mpmjax._types import Array, Float, Point, Scalar
 
-Times = Float[Array, "j"] | Float[np.ndarray, "j"] | tuple[float | int, ...] | list[float | int]
+Times = Float[Array, "j"] | Float[np.ndarray, "j"] | tuple[float | int | Array, ...] | list[float | int | Array]
 Displacements = Float[Array, "j d"] | Float[np.ndarray, "j d"] | tuple | list
 
 
@@ -184,8 +184,7 @@ def _check_rows(name: str, times: Times, displacement: Displacements) -> None:
     )
     require_finite(f"{name}'s times", times)
     require_finite(f"{name}'s displacement", displacement)
-    if not is_traced(times):
-        require(np.diff(np.asarray(times)) > 0, f"{name}'s times must increase, got {times}.")
+    require_that(f"{name}'s times must increase", lambda t: t[1:] > t[:-1], times)
 
 
 def _interpolated(t: Scalar, times: Float[Array, "j"], values: Float[Array, "j c"]) -> Float[Array, "c"]:

@@ -9,7 +9,7 @@ import diffrax
 import jax.numpy as jnp
 from tqdm import tqdm
 
-from mpmjax._checks import canonical, require
+from mpmjax._checks import canonical, require, requirements
 from mpmjax._diffrax import HEALTHY, Tally, no_steps
 from mpmjax._interrupt import reporting, undisturbed
 from mpmjax._io import FrameWriter
@@ -64,6 +64,7 @@ def record(
     dtype = particles.x.dtype
     start = 0 if resume else int(start)
     end = start + number_of_steps(t1, dt, start, dtype)
+    requirements(method)
     particles = prepare(scene, particles)
     if resume:
         writer = FrameWriter.resume(path, scene, particles, method, dt)
@@ -87,7 +88,7 @@ def record(
             healthy = True
             while healthy and step < end:
                 count = min(save_every - (step - start) % save_every, end - step)
-                _, state, new, previous = integrate(
+                _, state, new, previous, _ = integrate(
                     scene,
                     with_state(particles, state),
                     jnp.asarray(step, dtype),

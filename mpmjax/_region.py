@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._checks import coordinates, is_traced, require, require_finite, require_positive
+from mpmjax._checks import coordinates, require, require_finite, require_positive, require_that
 from mpmjax._types import Array, Bool, Float, Point, Scalar
 
 
@@ -66,8 +66,7 @@ def _check_segment(name: str, start: Point, end: Point) -> None:
     )
     require_finite(f"{name}'s start", start)
     require_finite(f"{name}'s end", end)
-    if not is_traced((start, end)):
-        require(np.any(np.asarray(start) != np.asarray(end)), f"{name}'s ends must differ, got {start} twice.")
+    require_that(f"{name}'s ends must differ", lambda a, b: (a != b).any(), start, end)
 
 
 class Box(AbstractRegion):
@@ -86,11 +85,12 @@ class Box(AbstractRegion):
             coordinates("A box's lower corner", self.lower) == coordinates("A box's upper corner", self.upper),
             f"A box needs two corners with as many coordinates, got {self.lower} and {self.upper}.",
         )
-        if not is_traced((self.lower, self.upper)):
-            require(
-                np.asarray(self.lower) < np.asarray(self.upper),
-                f"A box's lower corner must lie below its upper one in each direction, got {self.lower}, {self.upper}.",
-            )
+        require_that(
+            "A box's lower corner must lie below its upper one in each direction",
+            lambda a, b: a < b,
+            self.lower,
+            self.upper,
+        )
 
     @property
     def dim(self) -> int:
@@ -166,8 +166,7 @@ class HalfSpace(AbstractRegion):
         )
         require_finite("A half-space's point", self.point)
         require_finite("A half-space's normal", self.normal)
-        if not is_traced(self.normal):
-            require(np.any(np.asarray(self.normal) != 0), f"A half-space's normal must not be zero, got {self.normal}.")
+        require_that("A half-space's normal must not be zero", lambda a: (a != 0).any(), self.normal)
 
     @property
     def dim(self) -> int:

@@ -54,6 +54,9 @@ class Run(eqx.Module):
     """Step number at the end."""
     tally: Tally
     """Solver and contact statistics, and the first fault."""
+    report: Float[Array, "..."] | None = None
+    """Zero. Its tangent in forward mode is the relative residual of the first tangent solve that did not converge, zero
+    if all did. None of a run from a file."""
 
     @property
     def times(self) -> Float[Array, "*f"]:

@@ -45,8 +45,8 @@ class SampledDistance(AbstractRegion):
         require_finite("SampledDistance's lower corner", self.lower)
         require_finite("SampledDistance's values", self.values)
         require_positive("SampledDistance's spacing", self.spacing)
-        if not is_traced(self.values):
-            require(np.any(np.asarray(self.values) < 0), "SampledDistance's values must be negative somewhere: inside.")
+        inside = (jnp if is_traced(self.values) else np).asarray(self.values) < 0
+        require(inside.any(), "SampledDistance's values must be negative somewhere: inside.")
 
     @property
     def dim(self) -> int:

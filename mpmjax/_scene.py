@@ -10,7 +10,7 @@ import numpy as np
 
 from mpmjax._body_force import AbstractBodyForce
 from mpmjax._boundary import AbstractBoundary, SeparatingBox
-from mpmjax._checks import canonical, coordinates, is_traced, require, require_finite
+from mpmjax._checks import canonical, coordinates, is_traced, require, require_finite, require_that, requirements
 from mpmjax._collider import AbstractCollider, SeparatingCollider, SlipCollider
 from mpmjax._constituent import Constituent, Laws, constituents, return_map, split
 from mpmjax._exchange import Exchange, nothing_received
@@ -140,10 +140,12 @@ class Scene(eqx.Module):
             not self.grid.periodic[plane.axis],
             f"Direction {plane.axis} is periodic and cannot have a {name}: drop one of them.",
         )
-        require(
-            fits(plane, self.grid),
-            f"A {name} must lie at a multiple of half the grid's spacing ({self.grid.spacing}), got "
-            f"{plane.position}: move it, or use {'SlipBox' if isinstance(plane, SymmetryPlane) else 'SeparatingBox'}.",
+        box = "SlipBox" if isinstance(plane, SymmetryPlane) else "SeparatingBox"
+        require_that(
+            f"A {name} must lie at a multiple of half the grid's spacing (elsewhere use {box})",
+            fits,
+            plane.position,
+            self.grid.spacing,
         )
 
     @property
@@ -210,12 +212,13 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
     total description (and none in the updated one), and nothing received by colliders.
 
     Raises:
-        ValueError: the particles have another dimension than the grid or another number of materials than the scene, a
-            particle lies outside the window or beyond a mirrored plane, or a deformation gradient is one the law does
-            not allow.
+        ValueError: a value is not as its module requires (`equinox.tree_at` can make it so), the particles have
+            another dimension than the grid or another number of materials than the scene, a particle lies outside the
+            window or beyond a mirrored plane, or a deformation gradient is one the law does not allow.
     """
     p, d = particles.count, particles.dim
     require(d == scene.grid.dim, f"The particles are {d}-dimensional, the grid {scene.grid.dim}-dimensional.")
+    requirements((scene, particles))
     still = jnp.zeros((p, d, d), particles.x.dtype)
     several = isinstance(scene.material, tuple)
     counts = particles.counts or (p,)

@@ -28,7 +28,7 @@ class Sensitivity(eqx.Module):
     """Steps since the start, shape (f,)."""
     growth: Float[Array, "f"]
     """‖δx‖ / (t ‖δv0‖) [-], shape (f,): how much more positions depend on initial velocities than in free flight. NaN
-    from a fault of the run on, and throughout if a solve of it did not converge."""
+    from a fault of the run on, and throughout if a solve of it, or of its derivative, did not converge."""
     rate: Float[Array, ""]
     """Exponential rate of the growth [1/s]: the slope of a straight line fitted to its logarithm, as far as it is
     finite (a finite-time Lyapunov exponent). Zero for free flight, negative where motion is damped or oscillates."""
@@ -99,7 +99,7 @@ def sensitivity(
     require(change.shape == shape, f"velocity must have the particles' shape {shape}, got {change.shape}.")
     require((change != 0).any(), "velocity must not be zero everywhere: there is nothing to follow.")
 
-    def flown(v: ParticleVector) -> tuple[Array, tuple[Array, Tally]]:
+    def flown(v: ParticleVector) -> tuple[tuple[Array, Any], tuple[Array, Tally]]:
         thrown = eqx.tree_at(lambda p: p.v, particles, v)
         run = simulate(
             scene,
@@ -113,12 +113,12 @@ def sensitivity(
             adjoint=diffrax.ForwardMode(),
             throw=False,
         )
-        return run.observed, (run.steps, run.tally)
+        return (run.observed, run.report), (run.steps, run.tally)
 
-    _, moved, (steps, tally) = jax.jvp(flown, (particles.v,), (change,), has_aux=True)
-    report = _measure(moved[1:], steps[1:] - steps[0], tally, particles.mass, change, jnp.asarray(dt, dtype))
+    _, (moved, unsolved), (steps, tally) = jax.jvp(flown, (particles.v,), (change,), has_aux=True)
+    report = _measure(moved[1:], steps[1:] - steps[0], tally, unsolved, particles.mass, change, jnp.asarray(dt, dtype))
     if not is_traced(report) and not report.worst <= warn_at:
-        warnings.warn(_complaint(report, tally, warn_at), stacklevel=2)
+        warnings.warn(_complaint(report, tally, float(unsolved), warn_at), stacklevel=2)
     return report
 
 
@@ -128,12 +128,15 @@ def _positions(scene: Scene, particles: Particles) -> ParticleVector:
 
 
 @jax.jit
-def _measure(moved: Array, steps: Array, tally: Tally, mass: Array, change: Array, dt: Array) -> Sensitivity:
+def _measure(
+    moved: Array, steps: Array, tally: Tally, unsolved: Array, mass: Array, change: Array, dt: Array
+) -> Sensitivity:
     def norm(a: Array) -> Array:
         return jnp.sqrt((mass[:, None] * a**2).sum(axis=(-2, -1)))
 
     times = steps * dt
-    lost = ((tally.fault != HEALTHY) & (steps >= tally.fault_step.astype(steps.dtype))) | (tally.unconverged > 0)
+    faulty = (tally.fault != HEALTHY) & (steps >= tally.fault_step.astype(steps.dtype))
+    lost = faulty | (tally.unconverged > 0) | (unsolved > 0)
     growth = jnp.where(lost, jnp.nan, norm(moved) / (times * norm(change)))
     usable = jnp.isfinite(growth) & (growth > 0)
     weight = usable.astype(growth.dtype)
@@ -145,12 +148,18 @@ def _measure(moved: Array, steps: Array, tally: Tally, mass: Array, change: Arra
     return Sensitivity(times=times, steps=steps, growth=growth, rate=rate)
 
 
-def _complaint(report: Sensitivity, tally: Tally, warn_at: float | int) -> str:
+def _complaint(report: Sensitivity, tally: Tally, unsolved: float, warn_at: float | int) -> str:
     steps, times, over = report.steps, report.times, ~(report.growth <= warn_at)
     told = f"Over {int(steps[-1])} steps (t = {float(times[-1]):.4g} s) "
     if not tally.healthy:
         what = f"meets a fault at step {int(tally.fault_step)}" if int(tally.fault) else "does not solve its equations"
         return told + f"the run {what} and has no derivative from there on: see what simulate says of it."
+    if unsolved > 0:
+        return told + (
+            f"the run has a derivative that is not known: the tangent solve of a step did not converge (relative "
+            f"residual {unsolved:.2g}). Use metric=Metric.DIAGONAL, or raise the max_steps of the method's "
+            "adjoint_solver."
+        )
     first = int(jnp.argmax(over))
     return told + (
         f"the derivative of the positions by the initial velocities grows to {float(report.worst):.2g} times that of "

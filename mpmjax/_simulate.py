@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._advice import advise, disallowed
-from mpmjax._checks import canonical, is_traced, require, require_finite, require_positive
+from mpmjax._checks import canonical, is_traced, require, require_finite, require_positive, requirements
 from mpmjax._diffrax import (
+    BAD_PARAMETERS,
     BEYOND,
     HEALTHY,
     INADMISSIBLE,
@@ -21,11 +22,13 @@ from mpmjax._diffrax import (
     Problem,
     StepSolver,
     Tally,
+    examined,
     faulty_particles,
     no_vector_field,
     passed_particles,
     step_number,
 )
+from mpmjax._guard import guard
 from mpmjax._method import BackwardEuler, Explicit, Method
 from mpmjax._metric import Metric
 from mpmjax._particles import Particles, State, state_of, with_state
@@ -77,31 +80,41 @@ def simulate(
             others alone.
 
     Raises:
-        ValueError: of `prepare`; a t1 that is not a whole number of steps after the start.
+        ValueError: of `prepare`; a value of the method that it does not allow; a t1 that is not a whole number of steps
+            after the start.
         SimulationError: a state that is not finite, a particle outside the window, an F that the law does not allow
             or one that passed a boundary (each with step, time and first bad particle; the last good state is in its
             `run.final`), a solve that ended beyond ten times its tolerance; one that ended nearer is a Python warning.
-            Under an outer transformation (`jax.grad`, `jax.jit`, `jax.vmap`): the runtime error of `equinox.error_if`
-            instead.
+        RuntimeError: the same, and values that scene, particles or method do not allow, under an outer transformation
+            (`jax.jit`, `jax.grad`, `jax.vmap` and what is made of them, where only the derivative is asked for too);
+            and a tangent or adjoint solve that did not converge. In compiled programs it is that of
+            `equinox.error_if`. With `throw=False` such values make the state NaN and such a solve the derivative.
     """
     start = int(start)
     count = number_of_steps(t1, dt, start, particles.x.dtype)
     require(save_every is None or save_every >= 1, f"save_every must be at least 1, got {save_every}.")
     if observe is not None and save_every is None:
         save_every = 1
+    requirements((scene, particles, method))
     dtype = particles.x.dtype
     scene, dt_, method = canonical((scene, dt, method), dtype)
     particles = prepare(scene, particles)
-    traced = is_traced((scene, particles, dt_, method))  # under jax.jit also if all that was passed is known
+    requirements(method)  # in this precision
+    traced = is_traced((scene, particles, dt_, method, observe))  # under jax.jit also if all that was passed is known
+    slot = jnp.zeros((), dtype)
+    if traced and throw:
+        healthy, unsolved = jnp.asarray(HEALTHY, jnp.int32), _UNSOLVED.format("the adjoint")
+        (scene, particles, method), slot = guard((scene, particles, method), slot, healthy, (), unsolved)
     if adjoint is None:
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=_checkpoints(particles, count, checkpoint_bytes))
-    saved, final, tally, previous = integrate(
+    saved, final, tally, previous, report = integrate(
         scene,
         particles,
         jnp.asarray(start, dtype),
         None,
         dt_,
         method,
+        slot,
         max_steps=count,
         save_every=save_every,
         observe=observe,
@@ -120,21 +133,46 @@ def simulate(
         final=with_state(particles, final),
         final_step=jnp.asarray(start, dtype) + tally.steps.astype(dtype),
         tally=tally,
+        report=report,
     )
     if not throw:
         return run
     if traced:
-        return eqx.error_if(run, ~tally.healthy, _TRACED_FAULT)
+        return _guarded(run, report)
     raise_faults(run, particles, previous, start)
     warn_of_short_solves(run.tally)
     return run
 
 
-_TRACED_FAULT = (
-    "mpmjax: the rollout met a fault (a non-finite state, a particle outside the window or beyond a boundary, an "
-    "inadmissible F, or a solve that did not converge). Call simulate outside of jax transformations to have step, "
-    "time and particle named, or with throw=False to inspect run.tally."
+_STATE_FAULTS = (
+    "a state that is not finite",
+    "a particle outside the grid's window",
+    "a deformation gradient that its law does not allow",
+    "a particle that passed a boundary",
 )
+"""What is said of NOT_FINITE and the codes after it where no particle can be named."""
+_ADVICE = (
+    "Call simulate outside of jax transformations to have step, time and particle named, or with throw=False to "
+    "inspect run.tally."
+)
+_UNSOLVED = (
+    "mpmjax: {} solve of a step did not converge, so that there is no derivative. Use metric=Metric.DIAGONAL, or raise "
+    "the max_steps of the method's adjoint_solver."
+)
+
+
+def _guarded(run: Run, report: Array) -> Run:
+    """The run, of which neither a number nor a derivative can be had where it met a fault."""
+    inputs, rest = eqx.partition((run.scene, run.final, run.method), eqx.is_array)
+    names: list[str] = []
+    jax.eval_shape(lambda a: names.extend(r.message for r in requirements(eqx.combine(a, rest))), inputs)
+    met = [f"the rollout met a fault: {what}. {_ADVICE}" for what in (*_STATE_FAULTS, "a solve that did not converge")]
+    bad = [f"the rollout met a fault: {name}" for name in names]
+    tally, unsolved = run.tally, len(met)
+    state = jnp.where((tally.fault == HEALTHY) & (tally.unconverged > 0), unsolved, tally.fault)
+    number = jnp.where(tally.fault >= BAD_PARAMETERS, unsolved + 1 + tally.fault - BAD_PARAMETERS, state)
+    faults = [f"mpmjax: {message}" for message in (*met, *bad)]
+    return guard(run, report, number, faults, _UNSOLVED.format("the tangent"))[0]
 
 
 def rollout(
@@ -157,6 +195,7 @@ def rollout(
         start: number of the first step.
     """
     scene, dt, method = canonical((scene, dt, method), particles.x.dtype)
+    requirements(method)
     return _rollout(scene, prepare(scene, particles), dt, method, steps, jnp.asarray(start, particles.x.dtype))
 
 
@@ -210,6 +249,7 @@ def integrate(
     count: Float[Array, ""] | None,
     dt: Scalar,
     method: Method,
+    slot: Scalar = 0.0,
     *,
     max_steps: int,
     save_every: int | None,
@@ -217,15 +257,19 @@ def integrate(
     adjoint: diffrax.AbstractAdjoint,
     progress: bool,
     watch: bool,
-) -> tuple[Any, State, Tally, State | None]:
-    """`count` ≤ `max_steps` steps from step `start`: (steps and values saved), final state, tally, and with `watch`,
-    which stops the run at a fault, the state before the last step.
+) -> tuple[Any, State, Tally, State | None, Array]:
+    """`count` ≤ `max_steps` steps from step `start`: (steps and values saved), final state, tally, with `watch`, which
+    stops the run at a fault, the state before the last step, and what tangent solves report. Adjoint solves do through
+    the `slot` (see `Reporting`).
 
     Without a count, all of them: what diffrax derives of its last time is then a constant, which XLA computes as it
     compiles, and not a program of two thousand operations.
     """
     stencil = scene.stencil(particles) if scene.total else None
-    problem = Problem(scene, particles, stencil, dt, method, observe, start)
+    problem = Problem(scene, particles, stencil, dt, method, observe, start, slot)
+    state = state_of(particles)
+    if not watch:
+        problem, state = examined(problem, state)
     zero, one, all_steps = (np.asarray(n, start.dtype) for n in (0, 1, max_steps))
 
     def kept(t: Any, y: State, args: Problem) -> Any:
@@ -241,7 +285,7 @@ def integrate(
         t0=zero,
         t1=all_steps if count is None else count,
         dt0=one,
-        y0=state_of(particles),
+        y0=state,
         args=problem,
         saveat=diffrax.SaveAt(subs=subs, solver_state=True),
         adjoint=adjoint,
@@ -249,10 +293,10 @@ def integrate(
         throw=False,
         progress_meter=diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter(),
     )
-    times, values, (tally, previous) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
+    times, values, (tally, previous, report) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
     final = jax.tree.map(lambda a: a[-1], values["final"])
     saved = None if save_every is None else (start + step_number(times["frames"]), values["frames"])
-    return saved, final, tally, previous
+    return saved, final, tally, previous, report
 
 
 def raise_faults(run: Run, began: Particles, previous: State | None, start: int) -> None:

@@ -1,7 +1,8 @@
 """Registries and small scenes that the tests share. A new kernel, law or method costs one line here."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -38,6 +39,43 @@ QUICK = ("explicit", "semi_implicit")
 DESCRIPTIONS = {"updated": mpm.UpdatedLagrangian(), "total": mpm.TotalLagrangian()}
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(), "backward_euler": mpm.BackwardEuler()}
 SECOND_ORDER = {"implicit_midpoint": mpm.ImplicitMidpoint(), "trbdf2": mpm.TRBDF2()}
+
+
+def beside_a_half(batched: Callable) -> Callable:
+    """Asks a batched function for its value at x beside that at 0.5."""
+    return lambda x: batched(jnp.stack([x, 0.5 + 0 * x]))
+
+
+REVERSE = {
+    "vmap": lambda f: beside_a_half(jax.vmap(f)),
+    "jit": jax.jit,
+    "grad": jax.grad,
+    "value_and_grad": jax.value_and_grad,
+    "jit_grad": lambda f: jax.jit(jax.grad(f)),
+    "grad_jit": lambda f: jax.grad(jax.jit(f)),
+    "vmap_jit_grad": lambda f: beside_a_half(jax.vmap(jax.jit(jax.grad(f)))),
+    "jit_grad_vmap": lambda f: jax.jit(jax.grad(lambda x: beside_a_half(jax.vmap(f))(x).sum())),
+    "jit_vjp": lambda f: jax.jit(lambda x: jax.vjp(f, x)[1](jnp.ones_like(f(x)))[0]),
+    "jit_jacrev": lambda f: jax.jit(jax.jacrev(f)),
+    "jit_grad_remat": lambda f: jax.jit(jax.grad(jax.checkpoint(f))),
+    "jit_grad_scan": lambda f: jax.jit(
+        jax.grad(lambda x: jax.lax.scan(lambda c, _: (c + f(x), None), jnp.zeros_like(x), None, length=2)[0])
+    ),
+}
+"""Ways to ask a function of one number for numbers or for derivatives in reverse mode."""
+FORWARD = {
+    "jvp": lambda f: lambda x: jax.jvp(f, (x,), (jnp.ones_like(x),)),
+    "jit_jvp": lambda f: jax.jit(lambda x: jax.jvp(f, (x,), (jnp.ones_like(x),))[1]),
+    "jit_jacfwd": lambda f: jax.jit(jax.jacfwd(f)),
+    "jit_linearize": lambda f: jax.jit(lambda x: jax.linearize(f, x)[1](jnp.ones_like(x))),
+}
+"""In forward mode."""
+SECOND = {
+    "jit_hessian": lambda f: jax.jit(jax.hessian(f)),
+    "jit_grad_grad": lambda f: jax.jit(jax.grad(jax.grad(f))),
+    "jit_jacfwd_jacfwd": lambda f: jax.jit(jax.jacfwd(jax.jacfwd(f))),
+}
+"""Second derivatives."""
 
 
 def ids(registry: dict, default: Collection[str] | None = None) -> dict:

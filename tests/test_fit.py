@@ -11,7 +11,7 @@ import pytest
 from shell import refused, shell
 
 import mpmjax as mpm
-from mpmjax._fit import gauge
+from mpmjax._fit import fit_curve, gauge
 from mpmjax._job import fit_job, read_columns, read_job
 
 RUBBER = Path(__file__).parents[1] / "examples" / "rubber.toml"
@@ -88,6 +88,41 @@ def test_an_abscissa_that_turns_back_is_refused(coarse):
     )
     with pytest.raises(ValueError, match="must grow with every step"):
         fit_job(coarse._replace(scene=scene))
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"adjoint_solver": mpm.ConjugateResidual(max_steps=1)}, "tangent solve of a step did not converge"),
+        ({"beta": 1.0}, "derivative .* that of the simulated curve is not finite"),
+    ],
+)
+def test_a_fit_without_a_derivative_says_why(options, says):
+    """A solve that does not converge, or a curve with a vertical tangent."""
+    grid = mpm.Grid((9,), 0.1, origin=(-3,))
+    particles = mpm.fill(mpm.Box((0.0,), (0.3,)), grid, particles_per_cell=2, density=1e3, dtype="float64")
+    pull = mpm.Grip(mpm.Box((0.25,), (1.0,)), mpm.Motion((0.0, 1.0), ((0.0,), (0.1,))))
+    walls = mpm.SymmetryPlane(0, 0.0), pull
+    scene = mpm.Scene(grid, mpm.NeoHookean(1e4, 0.3), boundary=walls, description=mpm.TotalLagrangian())
+    curve = gauge(mpm.Box((0.05,), (0.2,)), particles, 0)
+
+    def steep(scene, particles):
+        stretch, stress = curve(scene, particles)
+        return stretch, jnp.sqrt(0 * stress)
+
+    with pytest.raises(RuntimeError, match=says):
+        fit_curve(
+            scene,
+            particles,
+            t1=0.5,
+            dt=0.1,
+            method=mpm.SemiImplicit(**options),
+            curve=curve if "beta" not in options else steep,
+            measured_x=np.array([1.01, 1.02, 1.03]),
+            measured_y=np.array([100.0, 200.0, 300.0]),
+            fitted=np.ones(3, bool),
+            parameter=lambda s: s.material.youngs_modulus,
+        )
 
 
 def test_a_gauge_without_particles_is_refused(job):

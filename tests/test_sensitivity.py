@@ -136,6 +136,16 @@ def test_a_run_that_is_not_solved_has_no_growth():
     assert np.isnan(report.growth).all()
 
 
+def test_a_tangent_that_is_not_solved_has_no_growth_and_is_named():
+    """The run itself is; one iteration does not do for its derivative."""
+    scene, particles, _ = bar()
+    stretched = mpm.Particles(particles.x, 0.1 * particles.x, particles.mass, particles.volume)
+    method = mpm.SemiImplicit(adjoint_solver=mpm.ConjugateResidual(max_steps=1))
+    with pytest.warns(UserWarning, match=r"tangent solve of a step did not converge \(relative residual"):
+        report = mpm.sensitivity(scene, stretched, t1=0.2, dt=0.1, method=method)
+    assert np.isnan(report.growth).all()
+
+
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 def test_growth_is_that_of_the_reverse_mode_gradient(factor):
     """Over 100, 200 and 400 steps, stable and not: gradients of functions of the final positions grow as the tangent

@@ -79,6 +79,10 @@ class Tait(AbstractMaterial, AbstractVolumetric):
     exponent: PerParticle = 7.0
     tension: bool = eqx.field(static=True, default=True)
 
+    def __check_init__(self):
+        require_positive("Tait's bulk_modulus [Pa]", self.bulk_modulus)
+        require_positive("Tait's exponent", self.exponent)
+
     def energy(self, F: Matrix) -> Array:
         """Ψ = K/γ (J − 1 + (J^{1−γ} − 1)/(γ − 1))."""
         J = self._acting(F)[0, 0]

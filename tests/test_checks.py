@@ -1,0 +1,118 @@
+"""What modules require of their values: of what is known a ValueError, of what is traced a named fault."""
+
+import dataclasses
+import re
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import ELASTIC, FLUIDS, METHODS, PLASTIC, SECOND_ORDER, VISCOUS, block, ids
+
+import mpmjax as mpm
+from mpmjax._checks import canonical, first_unmet, requirements
+from mpmjax.material import Tait
+
+MOTION = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.1, 0.1)))
+TURN = mpm.RigidMotion((0.0, 1.0), ((0.0, 0.0), (0.1, 0.1)), (0.0, 1.0), (0.2, 0.2))
+BALL = mpm.Ball((0.2, 0.2), 0.1)
+MODULES = {
+    **(ELASTIC | PLASTIC | FLUIDS | VISCOUS),
+    **(METHODS | SECOND_ORDER),
+    "tait": Tait(1e4),
+    "tolerances": mpm.BackwardEuler(mpm.Newton(mpm.ConjugateResidual(1e-3, 1e-6), 1e-8)),
+    "flip": mpm.FLIP(0.9),
+    "grid": mpm.Grid((8, 8), 0.1),
+    "symmetry plane": mpm.SymmetryPlane(0, 0.1),
+    "contact plane": mpm.ContactPlane(0, 0.1, friction=0.3),
+    "sticky box": mpm.StickyBox((0.0, 0.0), (1.0, 1.0)),
+    "slip box": mpm.SlipBox((0.0, 0.0), (1.0, 1.0)),
+    "separating box": mpm.SeparatingBox((0.0, 0.0), (1.0, 1.0), 0.3),
+    "grip": mpm.Grip(mpm.Box((0.0, 0.0), (1.0, 1.0)), MOTION),
+    "sticky collider": mpm.StickyCollider(mpm.Capsule((0.0, 0.0), (1.0, 0.0), 0.1), TURN),
+    "slip collider": mpm.SlipCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0))),
+    "separating collider": mpm.SeparatingCollider(BALL, TURN, 0.3),
+    "particles": block(2, side=2)[1],
+}
+"""One of each module with numbers that it asks something of."""
+
+
+def spoiled(module):
+    """The module with one of its numbers, each in turn, not a number; and the place."""
+    leaves, structure = jax.tree.flatten(canonical(module, jnp.float64))
+    for i, (path, _) in enumerate(jax.tree_util.tree_leaves_with_path(module)):
+        wrong = [jnp.full_like(leaf, jnp.nan) if i == k else leaf for k, leaf in enumerate(leaves)]
+        yield jax.tree_util.keystr(path), jax.tree.unflatten(structure, wrong)
+
+
+@pytest.mark.parametrize("module", **ids(MODULES))
+def test_every_number_is_checked_whether_it_is_known_or_traced(module):
+    """What is not a number is refused where it is known, and found by the same statement where it is traced."""
+    assert requirements(module) == []
+    arrays, static = eqx.partition(canonical(module, jnp.float64), eqx.is_array)
+    names: list[str] = []
+
+    def unmet(arrays):
+        required = requirements(eqx.combine(arrays, static))
+        names[:] = [requirement.message for requirement in required]
+        return first_unmet(required)
+
+    found = jax.jit(unmet)
+    if not jax.tree.leaves(arrays):
+        assert requirements(static) == []
+        return
+    assert int(found(arrays)) == 0
+    for place, wrong in spoiled(module):
+        if isinstance(module, mpm.Particles) and place not in (".mass", ".volume"):
+            continue  # the state, which a run's own faults are about
+        with pytest.raises(ValueError, match="must") as caught:
+            requirements(wrong)
+        told = names[int(found(eqx.filter(wrong, eqx.is_array))) - 1]
+        assert told.removesuffix(".") in str(caught.value), place
+
+
+LIMITS = [
+    (mpm.NeoHookean(1e4, 0.3), lambda m: m.poisson_ratio, 0.5, "poisson_ratio must be strictly between -1 and 0.5"),
+    (mpm.NeoHookean(1e4, 0.3), lambda m: m.youngs_modulus, -1.0, "youngs_modulus .* must be greater than zero"),
+    (mpm.TRBDF2(), lambda m: m.rho, 1.1, "rho must be from 0 to 1"),
+    (mpm.SemiImplicit(), lambda m: m.beta, -0.1, "beta must be from 0 to 1"),
+    (mpm.ContactPlane(0, 0.0, friction=0.1), lambda m: m.friction, -0.1, "friction must be from 0"),
+    (MODULES["particles"], lambda m: m.mass, jnp.array([1.0, -1.0, 1.0, 1.0] * 4), "masses .* must be greater"),
+    (MOTION, lambda m: m.times, (1.0, 0.0), "times must increase"),
+    (MODULES["slip box"], lambda m: m.lower, (2.0, 0.0), "lower corner must lie below"),
+]
+
+
+@pytest.mark.parametrize(("module", "where", "value", "words"), LIMITS)
+def test_a_value_past_its_limit_is_found_known_or_traced(module, where, value, words):
+    """Put there by `equinox.tree_at`, which no constructor sees."""
+    wrong = canonical(eqx.tree_at(where, module, value), jnp.float64)
+    with pytest.raises(ValueError, match=words):
+        requirements(wrong)
+    with pytest.raises(ValueError, match=words):  # the constructor's words are the same
+        dataclasses.replace(wrong)
+    arrays, static = eqx.partition(wrong, eqx.is_array)
+    required = []
+
+    def unmet(arrays):
+        required[:] = requirements(eqx.combine(arrays, static))
+        return first_unmet(required)
+
+    assert re.search(words, required[int(jax.jit(unmet)(arrays)) - 1].message)
+
+
+def test_what_tree_at_spoils_is_refused_by_every_entry():
+    """Before anything is compiled."""
+    scene, particles = block(1, side=2)
+    soft = eqx.tree_at(lambda s: s.material.poisson_ratio, scene, 0.6)
+    massless = eqx.tree_at(lambda p: p.mass, particles, 0 * particles.mass)
+    for options in ((soft, particles), (scene, massless)):
+        with pytest.raises(ValueError, match="must be"):
+            mpm.simulate(*options, t1=0.1, dt=0.1)
+        with pytest.raises(ValueError, match="must be"):
+            mpm.rollout(*options, steps=1, dt=0.1)
+    method = eqx.tree_at(lambda m: m.beta, mpm.SemiImplicit(), np.nan)
+    for run in (mpm.simulate, lambda *inputs, t1, **rest: mpm.rollout(*inputs, steps=1, **rest)):
+        with pytest.raises(ValueError, match="beta must be"):
+            run(scene, particles, t1=0.1, dt=0.1, method=method)

@@ -1,0 +1,117 @@
+"""Faults of a rollout and of its derivatives: by every transformation a named error, and alone in a batch."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import FORWARD, LAWS, REVERSE, block
+
+import mpmjax as mpm
+from mpmjax._diffrax import BAD_PARAMETERS, HEALTHY, INADMISSIBLE, NOT_FINITE, OUTSIDE
+
+DT = 0.01
+METHOD = mpm.SemiImplicit(
+    solver=mpm.ConjugateResidual(rtol=1e-3, max_steps=4), adjoint_solver=mpm.ConjugateResidual(rtol=1e-12, max_steps=4)
+)
+"""Four iterations solve what is soft, and of what is stiffer the motion but not its derivative."""
+WELL, UNDERIVED = 1.0, 7.0
+FAULTS = {
+    2.0: "a state that is not finite",
+    3.0: "a particle outside the grid's window",
+    4.0: "a deformation gradient that its law does not allow",
+    5.0: "a solve that did not converge",
+    6.0: r"NeoHookean's youngs_modulus \[Pa\] must be greater than zero",
+}
+STIFFNESS = np.array([10.0, 10.0, 10.0, 10.0, 10.0, 1e6, -1.0, 1e4])
+STRETCHING = np.array([0.0, 0.0, np.nan, 1e3, -101.0, 0.0, 0.0, 0.0])
+
+
+def outcome(x, adjoint=None, **options):
+    """A number of a run, and the run. The whole part of x chooses what goes wrong; the rest stretches and hardens."""
+    scene, particles = block(1, side=3, material=LAWS["neo_hookean"], gravity=(-9.81,))
+    kind = jnp.floor(jnp.asarray(x)).astype(jnp.int32)
+    part = x - kind.astype(float)
+    stiffness, stretching = jnp.asarray(STIFFNESS)[kind], jnp.asarray(STRETCHING)[kind]
+    scene = eqx.tree_at(lambda s: s.material.youngs_modulus, scene, stiffness * (1 + part))
+    places = particles.x - particles.x.mean()
+    stirred = 0.1 * np.random.default_rng(0).normal(size=places.shape) + (stretching + part) * places
+    particles = eqx.tree_at(lambda p: p.v, particles, stirred)
+    run = mpm.simulate(scene, particles, t1=2 * DT, dt=DT, method=METHOD, adjoint=adjoint, **options)
+    return run.final.x[0, 0] + (run.final.v**2).sum(), run
+
+
+CASES = [
+    *((f, None, name in ("vmap", "jit"), name, name in ("jit_grad", "vmap_jit_grad")) for name, f in REVERSE.items()),
+    *((f, diffrax.ForwardMode(), False, name, name == "jit_jvp") for name, f in FORWARD.items()),
+]
+
+
+@pytest.mark.parametrize(
+    ("transform", "adjoint", "primal"),
+    [pytest.param(*case, id=name, marks=[pytest.mark.slow] * (not now)) for *case, name, now in CASES],
+)
+def test_every_transformation_raises_every_fault(transform, adjoint, primal):
+    """By its name; so does a tangent or adjoint solve that does not converge, of which numbers alone know nothing."""
+    run = transform(lambda x: outcome(x, adjoint)[0])
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(run(WELL)))
+    for x, words in FAULTS.items():
+        with pytest.raises(Exception, match=words):
+            jax.block_until_ready(run(x))
+    if primal:
+        assert np.isfinite(run(UNDERIVED)).all()
+        return
+    with pytest.raises(Exception, match=f"the {'adjoint' if adjoint is None else 'tangent'} solve of a step did not"):
+        jax.block_until_ready(run(UNDERIVED))
+
+
+@pytest.mark.parametrize("reverse", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_a_member_without_a_derivative_leaves_the_others_alone(reverse):
+    """With throw=False: NaN where a tangent or adjoint solve did not converge or a parameter is bad, and the others'
+    numbers and derivatives are the same bit for bit; tally and report say which."""
+
+    def member(x):
+        value, run = outcome(x, None if reverse else diffrax.ForwardMode(), throw=False)
+        return value, (run.tally.fault, run.tally.unconverged, run.report)
+
+    def both(x):
+        if reverse:
+            (value, (*told, _)), slope = jax.value_and_grad(member, has_aux=True)(x)
+            return value, slope, *told
+        (value, told), (slope, (_, _, report)) = jax.jvp(member, (x,), (jnp.ones_like(x),))
+        return value, slope, *told[:2], report
+
+    batch = jax.jit(jax.vmap(both))
+    good = batch(jnp.array([1.0, 1.125, 1.0, 1.0, 1.0, 1.0, 1.25]))
+    value, slope, fault, unconverged, *report = bad = batch(jnp.array([1.0, UNDERIVED, 6.0, 3.0, 4.0, 2.0, 1.25]))
+    for a, b in zip(good, bad, strict=True):
+        np.testing.assert_array_equal(a[np.array([0, 6])], b[np.array([0, 6])])
+    assert list(fault) == [HEALTHY, HEALTHY, fault[2], OUTSIDE, INADMISSIBLE, NOT_FINITE, HEALTHY]
+    assert fault[2] >= BAD_PARAMETERS
+    assert list(np.isnan(value)) == [False, False, True, False, False, True, False]
+    assert list(np.isnan(slope[:3])) == [False, True, True]
+    assert np.isfinite(good[1]).all()
+    assert int(unconverged[1]) == 0
+    if not reverse:
+        assert report[0][1] > 1e-12
+        assert report[0][0] == report[0][6] == 0
+
+
+def test_outside_of_jit_neither_a_run_nor_its_gradient_calls_the_host(monkeypatch):
+    """A callback would keep their programs out of the cache of compiled ones."""
+
+    def refuse(*args, **options):
+        raise AssertionError("a program holds a callback")
+
+    monkeypatch.setattr(jax, "pure_callback", refuse)
+    scene, particles = block(1, side=2)
+
+    def height(stiffness):
+        softer = eqx.tree_at(lambda s: s.material.youngs_modulus, scene, stiffness)
+        return mpm.simulate(softer, particles, t1=2 * DT, dt=DT, method=METHOD).final.x.sum()
+
+    assert np.isfinite(height(10.0))
+    assert np.isfinite(jax.grad(height)(10.0))
+    with pytest.raises(AssertionError, match="callback"):
+        jax.jit(height)(10.0)
