@@ -266,7 +266,7 @@ def integrate(
     compiles, and not a program of two thousand operations.
     """
     stencil = scene.stencil(particles) if scene.total else None
-    problem = Problem(scene, particles, stencil, dt, method, observe, start, slot)
+    problem = Problem(scene, particles, stencil, dt, method, observe, start, jnp.asarray(slot, start.dtype))
     state = state_of(particles)
     if not watch:
         problem, state = examined(problem, state)
