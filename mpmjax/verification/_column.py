@@ -1,5 +1,7 @@
 """A column under its own weight: an exact static state."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -71,7 +73,7 @@ class Column(AbstractProblem):
         """What it stands on."""
         return (SymmetryPlane(0, 0.0),)
 
-    def errors(self, cells: int, *, per_side: int = 2, **choices: object) -> tuple[float, float]:
+    def errors(self, cells: int, *, per_side: int = 2, **choices: Any) -> tuple[float, float]:
         """The errors of the state under full load: of the displacement over that of the top, a/2, and of the stress
         over that at the bottom, a E.
 
