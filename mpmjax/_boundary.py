@@ -12,7 +12,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._checks import coordinates, require, require_between, require_that
-from mpmjax._motion import Motion
+from mpmjax._kinds import require_fields
+from mpmjax._motion import AbstractMotion, Motion
 from mpmjax._region import AbstractRegion
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, ParticleVector, Point, Scalar
 
@@ -184,6 +185,7 @@ class StickyBox(AbstractBoundary):
     upper: Point
 
     def __check_init__(self):
+        require_fields(self)
         _check_box("StickyBox", self.lower, self.upper)
 
     @property
@@ -220,6 +222,7 @@ class SlipBox(AbstractBoundary):
     upper: Point
 
     def __check_init__(self):
+        require_fields(self)
         _check_box("SlipBox", self.lower, self.upper)
 
     @property
@@ -260,6 +263,7 @@ class SeparatingBox(AbstractBoundary):
     friction: Scalar = 0.0
 
     def __check_init__(self):
+        require_fields(self)
         _check_box("SeparatingBox", self.lower, self.upper)
         require_between("SeparatingBox's friction", self.friction, 0, 1e6)
 
@@ -298,7 +302,7 @@ class Grip(AbstractBoundary):
     region: AbstractRegion
     motion: Motion
     axes: tuple[bool, ...] | None = eqx.field(
-        static=True, default=None, converter=lambda a: a if a is None else tuple(a)
+        static=True, default=None, converter=lambda a: tuple(a) if isinstance(a, list) else a
     )
 
     @property
@@ -308,9 +312,10 @@ class Grip(AbstractBoundary):
 
     def __check_init__(self):
         require(
-            isinstance(self.motion, Motion),
+            isinstance(self.motion, Motion) or not isinstance(self.motion, AbstractMotion),
             f"A grip does not turn: take a StickyCollider, got the motion {self.motion}.",
         )
+        require_fields(self)
         d = self.dim
         require(
             self.region.dim == d,

@@ -8,6 +8,7 @@ from mpmjax._checks import canonical, require_positive
 from mpmjax._crossing import collect, spread
 from mpmjax._diagnostics import energy_density, energy_of
 from mpmjax._kernel import Stencil
+from mpmjax._kinds import checked
 from mpmjax._method import Explicit, Method
 from mpmjax._nodes import Nodes, particles_to_grid
 from mpmjax._particles import Particles
@@ -112,6 +113,7 @@ class Budget(eqx.Module):
     momentum: MomentumBudget
 
 
+@checked
 def budget(
     scene: Scene, particles: Particles, *, steps: int, dt: Scalar, method: Method = Explicit(), start: int = 0
 ) -> tuple[Particles, Budget]:

@@ -82,6 +82,12 @@ def require(condition: Any, message: str) -> None:
         raise ValueError(message)
 
 
+def shortened(text: str, most: int = 80) -> str:
+    """In one line of at most so many characters."""
+    text = " ".join(text[: 10 * most].split())
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
 def require_that(what: str, holds: Callable[..., Any], *values: Any) -> None:
     """Raise `ValueError` unless a condition on the arrays of some values holds everywhere.
 
@@ -93,7 +99,7 @@ def require_that(what: str, holds: Callable[..., Any], *values: Any) -> None:
     if is_traced(values):
         _put_off_check(f"{what}.", lambda: holds(*map(jnp.asarray, values)))
     elif not np.all(holds(*map(np.asarray, values))):  # written only here: writing an array takes ms
-        raise ValueError(f"{what}, got {' and '.join(map(str, values))}.")
+        raise ValueError(f"{what}, got {' and '.join(shortened(str(value)) for value in values)}.")
 
 
 def require_finite(name: str, value: Any) -> None:
@@ -111,11 +117,23 @@ def require_positive(name: str, value: Any) -> None:
     require_that(f"{name} must be greater than zero", lambda a: a > 0, value)
 
 
+def require_whole(name: str, value: Any, least: int) -> int:
+    """A number must be whole, known and at least so large; it may be an array's."""
+    if is_traced(value):
+        raise ValueError(f"{name} must be a known number, not a traced one.")
+    a = np.asarray(value, dtype=float)
+    if not (a.ndim == 0 and np.isfinite(a) and a == np.rint(a) and a >= least):
+        raise ValueError(f"{name} must be a whole number of at least {least}, got {shortened(str(value))}.")
+    return int(value)
+
+
 def coordinates(name: str, point: Any) -> int:
-    """How many coordinates a point has; it must be a plain sequence of them."""
-    if isinstance(point, (tuple, list)):
-        return len(point)
-    require(np.ndim(point) == 1, f"{name} must be a sequence of numbers, one a direction, got {point}.")
+    """How many coordinates a point has, one to three; it must be a plain sequence of them."""
+    plain = isinstance(point, (tuple, list)) or np.ndim(point) == 1
+    if not (plain and 1 <= len(point) <= 3):
+        raise ValueError(
+            f"{name} must be a sequence of one to three numbers, one a direction, got {shortened(str(point))}."
+        )
     return len(point)
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from mpmjax._boundary import ON_THE_WALL, AbstractBoundary, Conditions, Touch
 from mpmjax._checks import canonical, require, require_between
+from mpmjax._kinds import require_fields
 from mpmjax._motion import AbstractMotion, Motion, still
 from mpmjax._region import AbstractRegion, HalfSpace, length
 from mpmjax._types import Array, Bool, Float, NodeVector, ParticleVector, Scalar
@@ -70,6 +71,7 @@ class StickyCollider(AbstractCollider):
     motion: AbstractMotion | None = None
 
     def __check_init__(self):
+        require_fields(self)
         _check(self)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
@@ -107,6 +109,7 @@ class SlipCollider(AbstractCollider):
     motion: AbstractMotion | None = None
 
     def __check_init__(self):
+        require_fields(self)
         _check(self)
 
     @property
@@ -144,6 +147,7 @@ class SeparatingCollider(AbstractCollider):
     friction: Scalar = 0.0
 
     def __check_init__(self):
+        require_fields(self)
         _check(self)
         require_between("SeparatingCollider's friction", self.friction, 0, 1e6)
 

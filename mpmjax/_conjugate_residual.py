@@ -10,6 +10,7 @@ import lineax as lx
 from jax.flatten_util import ravel_pytree
 
 from mpmjax._checks import require, require_positive
+from mpmjax._kinds import require_fields
 from mpmjax._types import Array, Float, Scalar
 
 _DEFAULT_RTOL = {4: 1e-5, 8: 1e-8}  # by bytes a number
@@ -65,6 +66,7 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
     max_steps: int = eqx.field(static=True, default=1000)
 
     def __check_init__(self):
+        require_fields(self)
         if self.rtol is not None:
             require_positive("ConjugateResidual's rtol", self.rtol)
         if self.increment_rtol is not None:

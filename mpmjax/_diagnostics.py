@@ -8,6 +8,7 @@ import scipy.sparse.csgraph
 
 from mpmjax import _linalg as la
 from mpmjax._checks import canonical
+from mpmjax._kinds import checked
 from mpmjax._particles import Particles
 from mpmjax._scene import Scene, prepare
 from mpmjax._transfer import p2g
@@ -30,6 +31,7 @@ class Energy(eqx.Module):
         return self.kinetic + self.elastic + self.potential
 
 
+@checked
 def energy(scene: Scene, particles: Particles) -> Energy:
     """The energy of the particles.
 
@@ -63,6 +65,7 @@ def energy_density(scene: Scene, particles: Particles) -> ParticleScalar:
     return jnp.concatenate([c.law.energy(c.F) for c in scene.constituents(particles)])
 
 
+@checked
 def momentum(particles: Particles) -> Float[Array, "d"]:
     """Linear momentum Σ m v [kg m/s], shape (d,)."""
     return (particles.mass[:, None] * particles.v).sum(axis=0)
@@ -86,6 +89,7 @@ def _grid_mass(scene: Scene, particles: Particles) -> Float[Array, ""]:
     return nodes.sum()
 
 
+@checked
 def pieces(scene: Scene, particles: Particles) -> int:
     """How many pieces the material is in: particles that share a node with weight belong together.
 

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.optimize
 
 from mpmjax._checks import canonical, require, require_finite
+from mpmjax._kinds import checked, shape_of
 from mpmjax._method import Method
 from mpmjax._particles import Particles
 from mpmjax._region import AbstractRegion
@@ -68,6 +69,7 @@ class FitResult(eqx.Module):
     """How many values of the parameter were tried, each with its exact derivative."""
 
 
+@checked
 def fit_curve(
     scene: Scene,
     particles: Particles,
@@ -114,7 +116,7 @@ def fit_curve(
     particles = prepare(scene, particles)
     guess = parameter(scene)
     require(
-        np.shape(guess) == () and np.all(guess > 0), f"The fitted parameter must be one positive number, got {guess}."
+        shape_of(guess) == () and np.all(guess > 0), f"The fitted parameter must be one positive number, got {guess}."
     )
     x, y = jnp.asarray(measured_x[fitted], dtype), jnp.asarray(measured_y[fitted], dtype)
     scale = jnp.abs(y).max()

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._checks import require, require_positive
+from mpmjax._kinds import checked
 from mpmjax._types import Array, Int, NodeVector, ParticleVector, Scalar
 
 
@@ -37,6 +38,7 @@ class Grid(eqx.Module):
     periodic: tuple[bool, ...] = eqx.field(static=True)
     follow: bool = eqx.field(static=True)
 
+    @checked
     def __init__(
         self,
         shape: tuple[int, ...] | list[int],
@@ -46,25 +48,22 @@ class Grid(eqx.Module):
         periodic: bool | tuple[bool, ...] | list[bool] = False,
         follow: bool = False,
     ):
-        self.shape = tuple(shape)
+        self.shape = tuple(int(n) for n in shape)
         self.spacing = spacing
-        self.origin = (0,) * len(self.shape) if origin is None else tuple(origin)
-        self.periodic = (periodic,) * len(self.shape) if isinstance(periodic, bool) else tuple(periodic)
+        self.origin = (0,) * len(self.shape) if origin is None else tuple(int(i) for i in origin)
+        every = (periodic,) * len(self.shape) if isinstance(periodic, bool) else periodic
+        self.periodic = tuple(bool(p) for p in every)
         self.follow = follow
 
     def __check_init__(self):
         d = len(self.shape)
         require(
-            d in (1, 2, 3) and all(isinstance(n, int) and n >= 4 for n in self.shape),
+            d in (1, 2, 3) and all(n >= 4 for n in self.shape),
             f"A grid's shape must be one, two or three integers of at least 4, got {self.shape}.",
         )
         require_positive("A grid's spacing", self.spacing)
         for name, value in (("origin", self.origin), ("periodic", self.periodic)):
             require(len(value) == d, f"A grid's {name} must have {d} entries, one a direction, got {value}.")
-        require(
-            all(isinstance(i, int) for i in self.origin),
-            f"A grid's origin must be integers (it counts nodes), got {self.origin}.",
-        )
         require(
             not (self.follow and any(self.periodic)),
             "A periodic grid cannot follow the material: its window is its period. Drop follow=True or periodic.",

@@ -13,6 +13,7 @@ from mpmjax import _linalg as la
 from mpmjax._constraint import Constraint
 from mpmjax._crossing import collect, spread
 from mpmjax._kernel import Stencil
+from mpmjax._kinds import require_fields
 from mpmjax._metric import Metric
 from mpmjax._mirror import Mirror
 from mpmjax._potential import ElasticPotential, Matrices
@@ -149,6 +150,9 @@ class AnalyticHessian(eqx.Module):
     """
 
     projected: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        require_fields(self)
 
     def at(self, potential: ElasticPotential, u: NodeVector) -> AbstractHessianAction:
         """The Hessian of the potential at a displacement u."""

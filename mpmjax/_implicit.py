@@ -17,6 +17,7 @@ from mpmjax._checks import require, require_positive
 from mpmjax._conjugate_residual import SETTLED, SHORT, ConjugateResidual, default_rtol
 from mpmjax._constraint import Constraint
 from mpmjax._hessian import Hessian, ImplicitOperator, damped
+from mpmjax._kinds import require_fields
 from mpmjax._metric import Metric
 from mpmjax._potential import ElasticPotential
 from mpmjax._rule import ruled
@@ -194,6 +195,9 @@ class Linearised(eqx.Module):
 
     solver: ConjugateResidual = ConjugateResidual()
 
+    def __check_init__(self):
+        require_fields(self)
+
     def __call__(self, problem: LinearProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         """The solution, started from a guess."""
         operator = problem.operator(guess).assembled()
@@ -250,6 +254,7 @@ class Newton(eqx.Module):
     max_steps: int = eqx.field(static=True, default=30)
 
     def __check_init__(self):
+        require_fields(self)
         if self.rtol is not None:
             require_positive("Newton's rtol", self.rtol)
         require(self.max_steps >= 1, f"Newton's max_steps must be at least 1, got {self.max_steps}.")

@@ -43,6 +43,7 @@ from mpmjax._hdf5 import (
     reading,
     staged_file,
 )
+from mpmjax._kinds import checked
 from mpmjax._method import Method
 from mpmjax._particles import Particles, State, state_of, with_state
 from mpmjax._run import Run
@@ -221,6 +222,7 @@ class FrameWriter:
         self.close()
 
 
+@checked
 def save(path: str | os.PathLike, run: Run) -> None:
     """Save a run's frames (without frames, its final state as the one frame) with all that a restart needs.
 
@@ -260,6 +262,7 @@ def steps_in(path: str | os.PathLike) -> int:
         return int(file["mpmjax/frames"][count_in(file) - 1]["steps"])
 
 
+@checked
 def load(path: str | os.PathLike) -> Run:
     """The run in a file, bit for bit: scene, method, dt, frames, tally; `final` is the last frame.
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from mpmjax._checks import require
 from mpmjax._grid import Grid
+from mpmjax._kinds import require_fields
 from mpmjax._types import Array, Bool, Float, Indices, Int, ParticleVector, components
 
 
@@ -27,6 +28,7 @@ class BSpline(eqx.Module):
     order: int = eqx.field(static=True, default=2)
 
     def __check_init__(self):
+        require_fields(self)
         require(self.order in (1, 2, 3), f"A B-spline's order must be 1, 2 or 3, got {self.order}.")
 
     def base(self, xi: Array) -> Array:
@@ -162,11 +164,17 @@ def make_stencil(
         moment = jnp.full_like(f, variance) * dx**2
         offset = jnp.arange(kernel.order + 1, dtype=f.dtype)[:, None] - f[:, None]
         least_squares = weights * offset / (variance * dx)
-    same = isinstance(gradient, MLSGradient) or kernel.order == 1
+    match gradient:
+        case MLSGradient():
+            slopes, same = least_squares, True
+        case SplineGradient():
+            slopes, same = spline, kernel.order == 1
+        case _:
+            raise ValueError(f"A gradient must be SplineGradient or MLSGradient, got {gradient!r}.")
     return Stencil(
         shares=_shares(kernel, grid, window, xi),
         weights=weights,
-        slopes=spline if isinstance(gradient, SplineGradient) else least_squares,
+        slopes=slopes,
         affine_slopes=least_squares if affine and not same else None,
         moment=moment,
         inside=in_window(kernel, grid, window, x),

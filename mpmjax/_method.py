@@ -19,6 +19,7 @@ from mpmjax._conjugate_residual import ConjugateResidual
 from mpmjax._guess import Guess
 from mpmjax._hessian import AnalyticHessian, Hessian, damped
 from mpmjax._implicit import Linearised, LinearProblem, Newton, NewtonProblem, Reporting, SolveInfo, no_solve, solve
+from mpmjax._kinds import require_fields
 from mpmjax._metric import Metric
 from mpmjax._nodes import Nodes
 from mpmjax._types import Array, Float, NodeVector, Scalar
@@ -109,6 +110,7 @@ class SemiImplicit(eqx.Module):
     lagged: ClassVar[bool] = False
 
     def __check_init__(self):
+        require_fields(self)
         require_between("SemiImplicit's beta", self.beta, 0, 1)
 
     def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
@@ -159,6 +161,9 @@ class BackwardEuler(eqx.Module):
     needs_force: ClassVar[bool] = True
     lagged: ClassVar[bool] = False
 
+    def __check_init__(self):
+        require_fields(self)
+
     def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         """The nodes' motion and the solve's report."""
         v, info = _Stage(nodes.inertial_velocity(), nodes.dt).solve(nodes, guess, self)
@@ -199,6 +204,9 @@ class ImplicitMidpoint(eqx.Module):
     centred: ClassVar[bool] = True
     needs_force: ClassVar[bool] = True
     lagged: ClassVar[bool] = False
+
+    def __check_init__(self):
+        require_fields(self)
 
     def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         """The nodes' motion and the solve's report."""
@@ -247,6 +255,7 @@ class TRBDF2(eqx.Module):
     lagged: ClassVar[bool] = False
 
     def __check_init__(self):
+        require_fields(self)
         require_between("TRBDF2's rho", self.rho, 0, 1)
 
     def weights(self) -> tuple[Scalar, Scalar, Scalar, Scalar]:

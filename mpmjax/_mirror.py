@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from mpmjax._boundary import ON_THE_WALL, AbstractBoundary, Conditions, crossed
 from mpmjax._checks import require, require_between, require_finite
 from mpmjax._grid import Grid
+from mpmjax._kinds import require_fields
 from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector, ParticleVector, Scalar
 
 
@@ -55,6 +56,7 @@ class SymmetryPlane(AbstractBoundary):
         return None
 
     def __check_init__(self):
+        require_fields(self)
         _check_plane("SymmetryPlane", self.axis, self.position, self.keep)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
@@ -104,6 +106,7 @@ class ContactPlane(AbstractBoundary):
         return None
 
     def __check_init__(self):
+        require_fields(self)
         _check_plane("ContactPlane", self.axis, self.position, self.keep)
         require_between("ContactPlane's friction", self.friction, 0, 1e6)
 

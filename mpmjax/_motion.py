@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._checks import coordinates, require, require_finite, require_that
+from mpmjax._kinds import require_fields
 from mpmjax._types import Array, Float, Point, Scalar
 
 Times = Float[Array, "j"] | Float[np.ndarray, "j"] | tuple[float | int | Array, ...] | list[float | int | Array]
@@ -57,6 +58,7 @@ class Motion(AbstractMotion):
     displacement: Displacements
 
     def __check_init__(self):
+        require_fields(self)
         _check_rows("A motion", self.times, self.displacement)
 
     @property
@@ -115,6 +117,7 @@ class RigidMotion(AbstractMotion):
     centre: Point
 
     def __check_init__(self):
+        require_fields(self)
         _check_rows("A rigid motion", self.times, self.displacement)
         d, shape = self.dim, jnp.shape(jnp.asarray(self.rotation))
         require(d in (2, 3), f"A rigid motion is two- or three-dimensional, got {d} coordinates: take a Motion.")

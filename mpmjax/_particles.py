@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from mpmjax._checks import require, require_positive
 from mpmjax._exchange import Exchange
+from mpmjax._kinds import checked, require_fields
 from mpmjax._types import Array, Matrix, ParticleMatrix, ParticleScalar, ParticleVector, components
 
 Deformations = Float[Array, "*f _ _ _"] | tuple[Float[Array, "*f _ _ _"], ...]
@@ -48,17 +49,21 @@ class Particles(eqx.Module):
     """How many particles each of several materials has; None where there is one."""
 
     def __check_init__(self):
+        require_fields(self)
         p = self.x.shape[0]
         require(
             self.x.ndim == 2 and self.v.shape == self.x.shape and self.mass.shape == self.volume.shape == (p,),
             "Particles need x and v of shape (p, d), mass and volume of shape (p,), got "
             f"{self.x.shape}, {self.v.shape}, {self.mass.shape}, {self.volume.shape}.",
         )
-        dtypes = {str(leaf.dtype) for leaf in jax.tree.leaves(self)}
+        require(p > 0, "There must be a particle at least, got none.")
+        dtypes = {str(getattr(leaf, "dtype", type(leaf).__name__)) for leaf in jax.tree.leaves(self)}
         require(
             len(dtypes) == 1 and dtypes <= {"float32", "float64"},
             f"Particles need arrays of one precision, float32 or float64, got {', '.join(sorted(dtypes))}.",
         )
+        some = not isinstance(self.F, tuple) or len(self.F) > 0
+        require(some, "F of several materials must be a sequence of arrays, one a material, got none.")
         require(
             self.counts is None or (sum(self.counts) == p and min(self.counts) > 0),
             f"The counts of the materials' particles must be positive and add up to {p}, got {self.counts}.",
@@ -119,6 +124,7 @@ class Group(eqx.Module):
         return components(self.F)
 
 
+@checked
 def join(*sets: Particles) -> Particles:
     """Several sets as one. With as many laws in the scene each is of the material in its place; with one law all are.
 

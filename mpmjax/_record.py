@@ -13,6 +13,7 @@ from mpmjax._checks import canonical, require, requirements
 from mpmjax._diffrax import HEALTHY, Tally, no_steps
 from mpmjax._interrupt import reporting, undisturbed
 from mpmjax._io import FrameWriter
+from mpmjax._kinds import checked
 from mpmjax._method import Explicit, Method
 from mpmjax._particles import Particles, State, state_of, with_state
 from mpmjax._run import Run, SimulationError
@@ -20,6 +21,7 @@ from mpmjax._scene import Scene, prepare
 from mpmjax._simulate import integrate, number_of_steps, raise_faults
 
 
+@checked
 def record(
     path: str | os.PathLike,
     scene: Scene,

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._checks import coordinates, require, require_finite, require_positive, require_that
+from mpmjax._kinds import checked, require_fields
 from mpmjax._types import Array, Bool, Float, Point, Scalar
 
 
@@ -81,6 +82,7 @@ class Box(AbstractRegion):
     upper: Point
 
     def __check_init__(self):
+        require_fields(self)
         require(
             coordinates("A box's lower corner", self.lower) == coordinates("A box's upper corner", self.upper),
             f"A box needs two corners with as many coordinates, got {self.lower} and {self.upper}.",
@@ -125,6 +127,7 @@ class Ball(AbstractRegion):
     radius: Scalar
 
     def __check_init__(self):
+        require_fields(self)
         coordinates("A ball's centre", self.centre)
         require_finite("A ball's centre", self.centre)
         require_positive("A ball's radius", self.radius)
@@ -160,6 +163,7 @@ class HalfSpace(AbstractRegion):
     normal: Point
 
     def __check_init__(self):
+        require_fields(self)
         require(
             coordinates("A half-space's point", self.point) == coordinates("A half-space's normal", self.normal),
             f"A half-space needs a point and a normal with as many coordinates, got {self.point} and {self.normal}.",
@@ -201,6 +205,7 @@ class Capsule(AbstractRegion):
     radius: Scalar
 
     def __check_init__(self):
+        require_fields(self)
         _check_segment("A capsule", self.start, self.end)
         require_positive("A capsule's radius", self.radius)
 
@@ -240,6 +245,7 @@ class Cylinder(AbstractRegion):
     radius: Scalar
 
     def __check_init__(self):
+        require_fields(self)
         _check_segment("A cylinder", self.start, self.end)
         require(len(self.start) > 1, f"A cylinder has two or three coordinates, got {self.start}: take a Box.")
         require_positive("A cylinder's radius", self.radius)
@@ -280,6 +286,7 @@ class Union(AbstractRegion):
 
     regions: tuple[AbstractRegion, ...]
 
+    @checked
     def __init__(self, regions: AbstractRegion | tuple[AbstractRegion, ...] | list[AbstractRegion]):
         self.regions = (regions,) if isinstance(regions, AbstractRegion) else tuple(regions)
 

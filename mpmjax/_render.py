@@ -13,6 +13,7 @@ from mpmjax._boundary import SeparatingBox, SlipBox, StickyBox
 from mpmjax._checks import canonical, require, require_between
 from mpmjax._collider import AbstractCollider
 from mpmjax._diagnostics import energy_density, volume_ratio
+from mpmjax._kinds import checked
 from mpmjax._mirror import Plane
 from mpmjax._particles import Particles, by_material, histories
 from mpmjax._run import Run
@@ -33,6 +34,7 @@ STONE = (0.55, 0.54, 0.52)
 Draw = Callable[[Particles, np.ndarray, float], None]
 
 
+@checked
 def render(
     run: Run,
     path: str | Path,

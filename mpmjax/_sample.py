@@ -3,13 +3,15 @@
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._checks import coordinates, require, require_positive
+from mpmjax._checks import coordinates, require, require_positive, shortened
 from mpmjax._grid import Grid
+from mpmjax._kinds import checked
 from mpmjax._particles import Particles
 from mpmjax._region import AbstractRegion, Box
 from mpmjax._types import Point, Scalar
 
 
+@checked
 def fill(
     region: AbstractRegion,
     grid: Grid,
@@ -37,6 +39,11 @@ def fill(
         ValueError: a count that is no d-th power, a region of another dimension, or one that holds no particle.
     """
     d = grid.dim
+    try:
+        precision = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
+    except TypeError:
+        precision = None
+    require(precision in (jnp.float32, jnp.float64), f"dtype must be float32 or float64, got {shortened(repr(dtype))}.")
     require_positive("density [kg/m^d]", density)
     if isinstance(particles_per_cell, int):
         root = round(particles_per_cell ** (1 / d))
@@ -67,7 +74,6 @@ def fill(
     if not isinstance(region, Box):
         lattice = lattice[np.asarray(region.contains(jnp.asarray(lattice)))]
     require(len(lattice) > 0, f"{region} holds no particle at this spacing: refine the grid or enlarge the region.")
-    precision = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
     x = jnp.asarray(lattice, dtype=precision)
     v = jnp.broadcast_to(jnp.asarray(velocity, dtype=precision), x.shape)
     volume = jnp.asarray(np.full(len(lattice), np.prod(cell)), dtype=precision)

@@ -10,6 +10,7 @@ import numpy as np
 
 from mpmjax._checks import coordinates, is_traced, require, require_finite, require_positive
 from mpmjax._kernel import BSpline
+from mpmjax._kinds import checked, require_fields, shape_of
 from mpmjax._region import AbstractRegion, length
 from mpmjax._types import Array, Float, Point, Scalar
 
@@ -36,6 +37,7 @@ class SampledDistance(AbstractRegion):
     values: Float[Array, "a"] | Float[Array, "a b"] | Float[Array, "a b c"] | Float[np.ndarray, "..."] | list
 
     def __check_init__(self):
+        require_fields(self)
         shape = jnp.shape(jnp.asarray(self.values))
         require(
             coordinates("SampledDistance's lower corner", self.lower) == len(shape) and len(shape) in (1, 2, 3),
@@ -81,6 +83,7 @@ class SampledDistance(AbstractRegion):
         return lower + (counts - 1).astype(lower.dtype) * self.spacing / 2
 
 
+@checked
 def sample_distance(region: AbstractRegion, spacing: float) -> SampledDistance:
     """The samples of a bounded region's own distance.
 
@@ -96,6 +99,7 @@ def sample_distance(region: AbstractRegion, spacing: float) -> SampledDistance:
     return SampledDistance(tuple(lower.tolist()), spacing, values.reshape(points.shape[:-1]))
 
 
+@checked
 def sample_mesh(mesh: str | Path | tuple[Any, Any], spacing: float) -> SampledDistance:
     """The samples of the signed distance from a closed surface of triangles. Needs the extra `mesh` (trimesh, rtree).
 
@@ -112,6 +116,10 @@ def sample_mesh(mesh: str | Path | tuple[Any, Any], spacing: float) -> SampledDi
         import trimesh  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError('A mesh needs trimesh and rtree: pip install "mpmjax[mesh]".') from error
+    if isinstance(mesh, tuple):
+        shapes = [shape_of(part) for part in mesh]
+        triangles = all(shape is not None and len(shape) == 2 and shape[1] == 3 for shape in shapes)
+        require(triangles, f"A mesh must be vertices of shape (j, 3) and faces of shape (k, 3), got shapes {shapes}.")
     surface = trimesh.Trimesh(*mesh) if isinstance(mesh, tuple) else trimesh.load(str(mesh), force="mesh")
     require(
         surface.is_volume,  # pyright: ignore[reportAttributeAccessIssue]

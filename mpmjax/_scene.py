@@ -16,11 +16,12 @@ from mpmjax._constituent import Constituent, Laws, constituents, return_map, spl
 from mpmjax._exchange import Exchange, nothing_received
 from mpmjax._grid import Grid
 from mpmjax._kernel import BSpline, Gradient, MLSGradient, SplineGradient, Stencil, in_window, make_stencil
+from mpmjax._kinds import checked, require_fields
 from mpmjax._mirror import ContactPlane, Plane, SymmetryPlane, fits
 from mpmjax._particles import Group, Particles
 from mpmjax._transfer import APIC, Transfer
 from mpmjax._types import Array, Int, Point, components
-from mpmjax.material import AbstractMaterial, AbstractPlastic, AbstractVolumetric, Law, Viscous
+from mpmjax.material import AbstractPlastic, AbstractVolumetric, Law, Viscous
 
 
 class UpdatedLagrangian(eqx.Module):
@@ -72,6 +73,7 @@ class Scene(eqx.Module):
     description: Description
     body_force: AbstractBodyForce | None
 
+    @checked
     def __init__(
         self,
         grid: Grid,
@@ -101,11 +103,6 @@ class Scene(eqx.Module):
         require(coordinates("gravity", self.gravity) == d, f"gravity must have {d} components, got {self.gravity}.")
         require_finite("gravity", self.gravity)
         require(len(self.laws) > 0, "A scene needs at least one law, got none.")
-        for law in self._materials:
-            require(
-                isinstance(law, AbstractMaterial | AbstractPlastic | Viscous),
-                f"A scene's material must be a law, such as NeoHookean(1e6, 0.3), or several, got {law!r}.",
-            )
         for boundary in self.boundary:
             require(
                 boundary.dim in (None, d),
@@ -205,6 +202,7 @@ class Scene(eqx.Module):
         )
 
 
+@checked
 def prepare(scene: Scene, particles: Particles) -> Particles:
     """Add to the particles what the scene's laws, transfer and description need, where it is missing.
 
@@ -216,6 +214,7 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
             another dimension than the grid or another number of materials than the scene, a particle lies outside the
             window or beyond a mirrored plane, or a deformation gradient is one the law does not allow.
     """
+    require_fields(scene)  # what eqx.tree_at may have put past its constructor
     p, d = particles.count, particles.dim
     require(d == scene.grid.dim, f"The particles are {d}-dimensional, the grid {scene.grid.dim}-dimensional.")
     requirements((scene, particles))

@@ -1,20 +1,20 @@
 """How a rollout's derivatives grow with its horizon."""
 
 import warnings
-from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._checks import is_traced, require, require_positive
+from mpmjax._checks import is_traced, require, require_positive, require_whole
 from mpmjax._diffrax import HEALTHY, Tally
+from mpmjax._kinds import checked
 from mpmjax._method import Explicit, Method
 from mpmjax._particles import Particles
 from mpmjax._scene import Scene, prepare
 from mpmjax._simulate import number_of_steps, simulate
-from mpmjax._types import Array, Float, ParticleVector
+from mpmjax._types import Array, Float, ParticleVector, Scalar
 
 _POINTS = 100
 
@@ -39,6 +39,7 @@ class Sensitivity(eqx.Module):
         return self.growth.max()
 
 
+@checked
 def sensitivity(
     scene: Scene,
     particles: Particles,
@@ -49,7 +50,7 @@ def sensitivity(
     velocity: ParticleVector | None = None,
     seed: int = 0,
     save_every: int | None = None,
-    start: Any = 0,
+    start: Scalar = 0,
     warn_at: float | int = 1e3,
 ) -> Sensitivity:
     """Ask whether gradients over this horizon are of any use: how a small change of the initial velocities grows.
@@ -88,7 +89,8 @@ def sensitivity(
         ValueError: as `simulate`; a change of the wrong shape, or zero.
     """
     require_positive("warn_at", warn_at)
-    count = number_of_steps(t1, dt, int(start), particles.x.dtype)
+    start = require_whole("start", start, 0)
+    count = number_of_steps(t1, dt, start, particles.x.dtype)
     every = max(1, count // _POINTS) if save_every is None else save_every
     particles = prepare(scene, particles)
     shape, dtype = particles.v.shape, particles.v.dtype

@@ -11,7 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._advice import advise, disallowed
-from mpmjax._checks import canonical, is_traced, require, require_finite, require_positive, requirements
+from mpmjax._checks import (
+    canonical,
+    is_traced,
+    require,
+    require_finite,
+    require_positive,
+    require_whole,
+    requirements,
+)
 from mpmjax._diffrax import (
     BAD_PARAMETERS,
     BEYOND,
@@ -29,6 +37,7 @@ from mpmjax._diffrax import (
     step_number,
 )
 from mpmjax._guard import guard
+from mpmjax._kinds import checked
 from mpmjax._method import BackwardEuler, Explicit, Method
 from mpmjax._metric import Metric
 from mpmjax._particles import Particles, State, state_of, with_state
@@ -41,6 +50,7 @@ from mpmjax.material import Law
 _CHECKPOINT_BYTES = 2**28
 
 
+@checked
 def simulate(
     scene: Scene,
     particles: Particles,
@@ -50,7 +60,7 @@ def simulate(
     method: Method = Explicit(),
     save_every: int | None = None,
     observe: Callable[[Scene, Particles], Any] | None = None,
-    start: Any = 0,
+    start: Scalar = 0,
     adjoint: diffrax.AbstractAdjoint | None = None,
     checkpoint_bytes: int = _CHECKPOINT_BYTES,
     progress: bool = False,
@@ -90,9 +100,10 @@ def simulate(
             and a tangent or adjoint solve that did not converge. In compiled programs it is that of
             `equinox.error_if`. With `throw=False` such values make the state NaN and such a solve the derivative.
     """
-    start = int(start)
+    start = require_whole("start", start, 0)
     count = number_of_steps(t1, dt, start, particles.x.dtype)
-    require(save_every is None or save_every >= 1, f"save_every must be at least 1, got {save_every}.")
+    if save_every is not None:
+        save_every = min(require_whole("save_every", save_every, 1), count)
     if observe is not None and save_every is None:
         save_every = 1
     requirements((scene, particles, method))
@@ -175,6 +186,7 @@ def _guarded(run: Run, report: Array) -> Run:
     return guard(run, report, number, faults, _UNSOLVED.format("the tangent"))[0]
 
 
+@checked
 def rollout(
     scene: Scene,
     particles: Particles,

@@ -8,7 +8,8 @@ from mpmjax import _linalg as la
 from mpmjax._checks import canonical, is_traced, require, require_positive
 from mpmjax._constituent import Constituent
 from mpmjax._kernel import MLSGradient
-from mpmjax._method import Explicit, Method, SemiImplicit
+from mpmjax._kinds import checked
+from mpmjax._method import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, Method, SemiImplicit
 from mpmjax._particles import Particles
 from mpmjax._scene import Scene, is_prepared, prepare
 from mpmjax._types import Array, Float, Scalar
@@ -23,6 +24,7 @@ SAFETY = 0.7
 """The default safety."""
 
 
+@checked
 def stable_dt(
     scene: Scene, particles: Particles, *, method: Method = Explicit(), safety: Scalar = SAFETY
 ) -> Float[Array, ""]:
@@ -92,8 +94,10 @@ def _limit(scene: Scene, particles: Particles, method: Method) -> Float[Array, "
             explicit = jnp.ones_like(z)
         case SemiImplicit(beta=beta):
             explicit = (1 - 2 * jnp.asarray(beta)) * jnp.ones_like(z)
-        case _:
+        case BackwardEuler() | ImplicitMidpoint() | TRBDF2():
             explicit = jnp.zeros_like(z)
+        case _:
+            raise ValueError(f"stable_dt does not know how {type(method).__name__} limits the step: give dt yourself.")
     most = jnp.concatenate([_stiffest_viscosity(c, particles.dim) for c in bodies])
     y = most * _viscous_gradient_bound(scene, particles) / density  # per Δt
     z, y = jnp.maximum(explicit * z, 0), jnp.maximum(explicit * y, 0)

@@ -12,6 +12,7 @@ from mpmjax._contact import NOTHING, ContactInfo, Held, find_active_set, hold, n
 from mpmjax._exchange import Exchange, received
 from mpmjax._implicit import SolveInfo
 from mpmjax._kernel import Stencil
+from mpmjax._kinds import checked
 from mpmjax._method import Explicit, Method, NodeMotion, viscous_impulse
 from mpmjax._nodes import Nodes, particles_to_grid
 from mpmjax._particles import Particles
@@ -168,6 +169,7 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
     )
 
 
+@checked
 def step(
     scene: Scene,
     particles: Particles,

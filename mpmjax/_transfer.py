@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from mpmjax._checks import require_between
 from mpmjax._crossing import collect, spread
 from mpmjax._kernel import Stencil
+from mpmjax._kinds import require_fields
 from mpmjax._types import Array, Float, Matrix, NodeScalar, NodeVector, Scalar
 
 
@@ -38,6 +39,7 @@ class FLIP(eqx.Module):
     needs_change: ClassVar[bool] = True
 
     def __check_init__(self):
+        require_fields(self)
         require_between("FLIP's alpha", self.alpha, 0, 1)
 
 
@@ -128,4 +130,8 @@ def g2p(
             C = jnp.swapaxes(collect(stencil.least_squares, after)[1], 0, 1)
         case FLIP(alpha=alpha):
             new = alpha * (v + others[-1]) + (1 - alpha) * arrived
+        case PIC():
+            pass
+        case _:
+            raise ValueError(f"A transfer must be PIC, FLIP or APIC, got {transfer!r}.")
     return (arrived, new, C, slope) if mean is None else (others[0], new, C, other_slopes[0])

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from mpmjax._bench import FRAMES, Bench, Build, Clock, Trial, name_of
 from mpmjax._checks import require_positive
+from mpmjax._kinds import checked
 from mpmjax._method import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, Method, SemiImplicit
 from mpmjax._reference import HOPELESS, settle
 
@@ -84,6 +85,7 @@ class WorkPrecision(NamedTuple):
         return said
 
 
+@checked
 def work_precision(
     build: Build,
     *,

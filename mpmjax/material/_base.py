@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from mpmjax import _linalg as la
 from mpmjax._checks import require_moduli
+from mpmjax._kinds import require_fields
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 
 
@@ -132,6 +133,7 @@ class AbstractIsotropic(AbstractMaterial):
     """ν [-]."""
 
     def __check_init__(self):
+        require_fields(self)
         require_moduli(type(self).__name__, self.youngs_modulus, self.poisson_ratio)
 
     @property

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._checks import require_between, require_moduli, require_positive
+from mpmjax._kinds import require_fields
 from mpmjax._types import Array, Float, Matrix, PerParticle
 from mpmjax.material._base import AbstractPlastic
 from mpmjax.material._hencky import Hencky, Split, no_transverse_strain
@@ -65,6 +66,7 @@ class CamClay(AbstractPlastic):
     hardening: PerParticle = 1.0
 
     def __check_init__(self):
+        require_fields(self)
         require_moduli("CamClay", self.youngs_modulus, self.poisson_ratio)
         require_positive("CamClay's friction", self.friction)
         require_between("CamClay's preconsolidation [Pa]", self.preconsolidation, 0, np.inf)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._checks import require_between, require_moduli
+from mpmjax._kinds import require_fields
 from mpmjax._types import Array, Float, Matrix, PerParticle
 from mpmjax.material._base import AbstractPlastic
 from mpmjax.material._hencky import Hencky, Split, no_transverse_strain
@@ -61,6 +62,7 @@ class DruckerPrager(AbstractPlastic):
     friction_angle: PerParticle
 
     def __check_init__(self):
+        require_fields(self)
         require_moduli("DruckerPrager", self.youngs_modulus, self.poisson_ratio)
         require_between("DruckerPrager's friction_angle [rad]", self.friction_angle, 0, np.pi / 2, open_ends=True)
 

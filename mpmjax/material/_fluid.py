@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._checks import require_positive
+from mpmjax._kinds import require_fields
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
 from mpmjax.material._base import AbstractMaterial, AbstractPlastic, AbstractVolumetric, MatrixTangent, PrincipalTangent
 
@@ -36,6 +37,7 @@ class Fluid(AbstractPlastic, AbstractVolumetric):
     tension: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
+        require_fields(self)
         require_positive("Fluid's bulk_modulus [Pa]", self.bulk_modulus)
         require_positive("Fluid's exponent", self.exponent)
 

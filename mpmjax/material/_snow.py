@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from mpmjax import _linalg as la
 from mpmjax._checks import require_between, require_moduli, require_positive
 from mpmjax._isotropic import AbstractSpectral
+from mpmjax._kinds import require_fields
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 from mpmjax.material._base import AbstractPlastic
 from mpmjax.material._elastic import FixedCorotated
@@ -51,6 +52,7 @@ class Snow(AbstractPlastic):
     hardening: PerParticle = 10.0
 
     def __check_init__(self):
+        require_fields(self)
         require_moduli("Snow", self.youngs_modulus, self.poisson_ratio)
         require_between("Snow's critical_compression", self.critical_compression, 0, 1, open_ends=True)
         require_positive("Snow's critical_stretch", self.critical_stretch)

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 
 from mpmjax import _linalg as la
 from mpmjax._checks import require, require_between
+from mpmjax._kinds import require_fields
 from mpmjax._types import Array, Matrix, PerParticle
-from mpmjax.material._base import AbstractMaterial, AbstractPlastic, Law
+from mpmjax.material._base import Law
 
 
 class Viscosity(eqx.Module):
@@ -56,11 +57,8 @@ class Viscous(eqx.Module):
     bulk_viscosity: PerParticle = 0.0
 
     def __check_init__(self):
-        require(
-            isinstance(self.law, AbstractMaterial | AbstractPlastic | Viscous),
-            f"Viscous takes a law, such as Fluid(2e6), and its viscosities, got the law {self.law!r}.",
-        )
         require(not isinstance(self.law, Viscous), "Viscous takes a law that is not viscous yet: add the viscosities.")
+        require_fields(self)
         require_between("Viscous's shear_viscosity [Pa s]", self.shear_viscosity, 0, float("inf"))
         require_between("Viscous's bulk_viscosity [Pa s]", self.bulk_viscosity, 0, float("inf"))
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._checks import require_between, require_moduli, require_positive
+from mpmjax._kinds import require_fields
 from mpmjax._types import Array, Float, Matrix, PerParticle
 from mpmjax.material._base import AbstractPlastic
 from mpmjax.material._hencky import Hencky, Split, no_transverse_strain
@@ -54,6 +55,7 @@ class VonMises(AbstractPlastic):
     hardening_modulus: PerParticle = 0.0
 
     def __check_init__(self):
+        require_fields(self)
         require_moduli("VonMises", self.youngs_modulus, self.poisson_ratio)
         require_positive("VonMises's yield_stress [Pa]", self.yield_stress)
         require_between("VonMises's hardening_modulus [Pa]", self.hardening_modulus, 0, np.inf)

@@ -1,0 +1,78 @@
+"""Public constructors and functions given what they do not take: a ValueError that says what they do."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jaxtyping
+import pytest
+from calls import PARTICLES, RUN, SCENE
+
+import mpmjax as mpm
+
+
+def test_bad_arguments_end_in_value_errors():
+    """Of one line, whichever argument it is; and what is of no kind is not taken."""
+    script = Path(__file__).parent / "calls.py"
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+
+
+@pytest.fixture
+def as_for_users():
+    """Without the type checks of the tests."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+CHOICES = {
+    "a name": (
+        lambda: mpm.Scene(SCENE.grid, SCENE.material, description="TotalLagrangian"),
+        r"Scene's description must be one of UpdatedLagrangian, TotalLagrangian, got 'TotalLagrangian', "
+        r"did you mean TotalLagrangian\(\)\?",
+    ),
+    "a class": (
+        lambda: mpm.Scene(SCENE.grid, SCENE.material, transfer=mpm.FLIP),
+        r"transfer must be one of PIC, FLIP, APIC, got the class FLIP, did you mean FLIP\(\)\?",
+    ),
+    "a class with arguments": (
+        lambda: mpm.StickyCollider(mpm.Ball),
+        r"shape must be one of Box, Ball, .*, got the class Ball, did you mean Ball\(\.\.\.\)\?",
+    ),
+    "part of a name": (lambda: mpm.SemiImplicit(hessian="jvp"), r"did you mean JvpHessian\(\)\?"),
+    "of an enumeration": (lambda: mpm.SemiImplicit(metric="diagonal"), r"did you mean Metric\.DIAGONAL\?"),
+    "a method": (
+        lambda: mpm.simulate(**RUN, method="explicit"),
+        r"simulate's method must be one of Explicit, SemiImplicit, .*, got 'explicit', did you mean Explicit\(\)\?",
+    ),
+    "of stable_dt": (lambda: mpm.stable_dt(SCENE, PARTICLES, method="fast"), r"stable_dt's method must be one of"),
+    "past the constructor": (
+        lambda: mpm.prepare(eqx.tree_at(lambda s: s.gradient, SCENE, "mls"), PARTICLES),
+        r"Scene's gradient must be one of SplineGradient, MLSGradient, got 'mls', did you mean MLSGradient\(\)\?",
+    ),
+    "one of several": (lambda: mpm.join(PARTICLES, "more"), r"join's sets must be Particles, got 'more'"),
+    "a list for each particle": (lambda: mpm.NeoHookean([1e5, 2e5], 0.3), r"must be a number or an array of numbers"),
+    "a switch": (lambda: mpm.BSpline(True), r"BSpline's order must be a whole number, got True"),
+}
+
+
+@pytest.mark.usefixtures("as_for_users")
+@pytest.mark.parametrize(("make", "message"), CHOICES.values(), ids=CHOICES)
+def test_a_wrong_choice_is_told_what_there_is(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_choices_of_ones_own_are_taken():
+    """Whatever is derived from a class of the package's."""
+
+    class Wood(mpm.NeoHookean):
+        grain: float = 0.1
+
+    class Hurried(mpm.Explicit):
+        pass
+
+    scene = mpm.Scene(SCENE.grid, Wood(1e4, 0.3))
+    assert 0 < mpm.stable_dt(scene, PARTICLES, method=Hurried()) < 1
