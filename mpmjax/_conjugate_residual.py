@@ -201,6 +201,20 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
         return True
 
 
+class Reporting(eqx.Module):
+    """The solver of tangent and adjoint systems, with a way to hear of those that did not converge.
+
+    Their residuals cannot be returned: they are computed where only derivatives are. So they are themselves given out
+    as derivatives, of zeros: the tangent of a solve's `report` in forward mode, the cotangent of `slot` in reverse mode
+    is the sum of the relative residuals of the solves that did not converge, infinite where one is not finite. As such
+    a solve gives NaN, and what is solved after it is not counted, that is the residual of the first.
+    """
+
+    solver: ConjugateResidual
+    slot: Scalar
+    """Zero."""
+
+
 class _Recurrence(eqx.Module):
     """The state of the iteration, in the letters of the reference."""
 

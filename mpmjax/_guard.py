@@ -54,7 +54,7 @@ def _say(faults: tuple[str, ...], failure: str, fault: Any, signal: Any) -> None
 
 
 @_guard_p.def_impl
-def _evaluate(*operands: Array, faults: tuple[str, ...], failure: str, derivative: bool) -> list[Array]:
+def _evaluate(*operands: Any, faults: tuple[str, ...], failure: str, derivative: bool) -> list[Any]:
     *leaves, signal, fault = operands
     _say(faults, failure, fault, signal if derivative else np.zeros(()))
     return [*leaves, signal]
@@ -65,7 +65,7 @@ def _abstract(*operands: Any, **_: Any) -> list[Any]:
     return list(operands[:-1])
 
 
-def _compiled(*operands: Array, faults: tuple[str, ...], failure: str, derivative: bool) -> list[Array]:
+def _compiled(*operands: Any, faults: tuple[str, ...], failure: str, derivative: bool) -> list[Any]:
     """The check is made once, of one number, which each leaf then depends on."""
     *leaves, signal, fault = operands
     if not faults and not derivative:
@@ -92,7 +92,7 @@ def _differentiated(primals: Any, tangents: Any, *, derivative: bool, **paramete
     return out, _guarded(tangents[:-1], primals[-1], derivative=True, **parameters)
 
 
-def _guarded(changes: Any, fault: Array, **parameters: Any) -> list[Any]:
+def _guarded(changes: Any, fault: Any, **parameters: Any) -> list[Any]:
     """Tangents or cotangents of leaves and signal, guarded."""
     *leaves, signal = changes
     places = [i for i, change in enumerate(leaves) if type(change) is not ad.Zero]

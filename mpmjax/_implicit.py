@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._checks import require, require_positive
-from mpmjax._conjugate_residual import SETTLED, SHORT, ConjugateResidual, default_rtol
+from mpmjax._conjugate_residual import SETTLED, SHORT, ConjugateResidual, Reporting, default_rtol
 from mpmjax._constraint import Constraint
 from mpmjax._hessian import Hessian, ImplicitOperator, damped
 from mpmjax._kinds import require_fields
@@ -71,8 +71,7 @@ class SolveInfo(eqx.Module):
 def no_solve(dtype: Any) -> SolveInfo:
     """The report of an update that solves nothing."""
     zero = jnp.asarray(0, dtype=jnp.int32)
-    no = jnp.asarray(False)
-    none = jnp.asarray(0, dtype=dtype)
+    no, none = jnp.asarray(False), jnp.asarray(0, dtype=dtype)
     return SolveInfo(zero, zero, zero, none, converged=~no, short=no, indefinite=no, report=none)
 
 
@@ -366,20 +365,6 @@ class _NewtonState(eqx.Module):
     halvings: Array
     stuck: Array
     indefinite: Array
-
-
-class Reporting(eqx.Module):
-    """The solver of tangent and adjoint systems, with a way to hear of those that did not converge.
-
-    Their residuals cannot be returned: they are computed where only derivatives are. So they are themselves given out
-    as derivatives, of zeros: the tangent of `SolveInfo.report` in forward mode, the cotangent of `slot` in reverse mode
-    is the sum of the relative residuals of the solves that did not converge, infinite where one is not finite. As such
-    a solve gives NaN, and what is solved after it is not counted, that is the residual of the first.
-    """
-
-    solver: ConjugateResidual
-    slot: Scalar
-    """Zero."""
 
 
 def solve(

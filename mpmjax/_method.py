@@ -15,10 +15,10 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._checks import require_between
-from mpmjax._conjugate_residual import ConjugateResidual
+from mpmjax._conjugate_residual import ConjugateResidual, Reporting
 from mpmjax._guess import Guess
 from mpmjax._hessian import AnalyticHessian, Hessian, damped
-from mpmjax._implicit import Linearised, LinearProblem, Newton, NewtonProblem, Reporting, SolveInfo, no_solve, solve
+from mpmjax._implicit import Linearised, LinearProblem, Newton, NewtonProblem, SolveInfo, no_solve, solve
 from mpmjax._kinds import require_fields
 from mpmjax._metric import Metric
 from mpmjax._nodes import Nodes

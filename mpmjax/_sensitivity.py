@@ -159,8 +159,8 @@ def _complaint(report: Sensitivity, tally: Tally, unsolved: float, warn_at: floa
     if unsolved > 0:
         return told + (
             f"the run has a derivative that is not known: the tangent solve of a step did not converge (relative "
-            f"residual {unsolved:.2g}). Use metric=Metric.DIAGONAL, or raise the max_steps of the method's "
-            "adjoint_solver."
+            f"residual {unsolved:.2g}). Raise the max_steps of the method's adjoint_solver, or leave "
+            "its metric at Metric.DIAGONAL."
         )
     first = int(jnp.argmax(over))
     return told + (

@@ -167,8 +167,8 @@ _ADVICE = (
     "inspect run.tally."
 )
 _UNSOLVED = (
-    "mpmjax: {} solve of a step did not converge, so that there is no derivative. Use metric=Metric.DIAGONAL, or raise "
-    "the max_steps of the method's adjoint_solver."
+    "mpmjax: {} solve of a step did not converge, so that there is no derivative. Raise the "
+    "max_steps of the method's adjoint_solver, or leave its metric at Metric.DIAGONAL."
 )
 
 
