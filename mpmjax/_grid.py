@@ -9,6 +9,8 @@ from mpmjax._checks import require, require_positive
 from mpmjax._kinds import checked
 from mpmjax._types import Array, Int, NodeVector, ParticleVector, Scalar
 
+_MOST_NODES = 2**31  # what an index of 32 bits counts
+
 
 class Grid(eqx.Module):
     """A uniform Cartesian grid of nodes at (origin + index) * spacing.
@@ -62,8 +64,17 @@ class Grid(eqx.Module):
             f"A grid's shape must be one, two or three integers of at least 4, got {self.shape}.",
         )
         require_positive("A grid's spacing", self.spacing)
+        require(
+            self.size < _MOST_NODES,
+            f"A grid's window must have fewer than 2^31 nodes, got {self.size} by the shape {self.shape}: take a "
+            "larger spacing, or a window that follows.",
+        )
         for name, value in (("origin", self.origin), ("periodic", self.periodic)):
             require(len(value) == d, f"A grid's {name} must have {d} entries, one a direction, got {value}.")
+        require(
+            all(abs(i) + n < _MOST_NODES for i, n in zip(self.origin, self.shape, strict=True)),
+            f"A grid's origin must be of fewer than 2^31 nodes in size, got {self.origin}.",
+        )
         require(
             not (self.follow and any(self.periodic)),
             "A periodic grid cannot follow the material: its window is its period. Drop follow=True or periodic.",

@@ -7,14 +7,15 @@ import tomllib
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from mpmjax._bench import Build, Trial
-from mpmjax._checks import require, require_positive
+from mpmjax._checks import require, require_positive, shortened
 from mpmjax._fit import FitResult, fit_curve, gauge
+from mpmjax._grid import Grid
 from mpmjax._method import Explicit, Method
 from mpmjax._particles import Particles, join
 from mpmjax._region import AbstractRegion
@@ -22,6 +23,7 @@ from mpmjax._sample import fill
 from mpmjax._scene import Scene, prepare
 from mpmjax._schema import arguments, decode
 from mpmjax._simulate import number_of_steps
+from mpmjax._stability import stable_dt
 from mpmjax._types import Scalar
 from mpmjax._work_precision import METHODS, work_precision
 
@@ -45,7 +47,7 @@ class RunTable(NamedTuple):
     """The `[run]` table: as the settings, but that what is "auto" is None."""
 
     t1: float
-    dt: float | None
+    dt: float | Literal["stable"] | None
     method: Method | None
     save_every: int | None
     dtype: str
@@ -84,7 +86,7 @@ class Job(NamedTuple):
     run: RunSettings
     fit: CurveSettings | None
     choice: str | None
-    """What stood for "auto", and why."""
+    """What stood for "auto" or "stable", and why."""
 
 
 def read_plan(path: Path) -> Plan:
@@ -109,13 +111,15 @@ def read_plan(path: Path) -> Plan:
 
         scene, particles = build(1)
         fit = None if fit_table is None else _curve_settings(fit_table, path.parent)
-        if run.dt is not None:
+        if isinstance(run.dt, float):
             number_of_steps(run.t1, run.dt, 0, particles.x.dtype)
         if fit is not None:
             gauge(fit.gauge, particles, fit.axis)
             _check_paths(fit, scene)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+    except RecursionError:
+        raise ValueError(f"{path}: tables are nested too deeply to be read.") from None
     return Plan(scene, particles, run, fit, build)
 
 
@@ -126,7 +130,7 @@ def read_job(
     progress: Callable[[Trial], None] = lambda trial: None,
     say: Callable[[str], None] = lambda line: None,
 ) -> Job:
-    """Read a scene file, and choose by pilot runs what it leaves to be chosen.
+    """Read a scene file, and choose what it leaves to be chosen: the stable step, or what pilot runs find.
 
     Args:
         path: the file.
@@ -135,7 +139,7 @@ def read_job(
         say: called with each run of their reference.
 
     Raises:
-        ValueError: as `read_plan`, and as `work_precision`.
+        ValueError: as `read_plan`, and as `stable_dt` and `work_precision`.
     """
     plan = read_plan(path)
     t1, dt, method, save_every, dtype, error, seconds = plan.run
@@ -144,6 +148,11 @@ def read_job(
         most_seconds is None or dt is None or method is None,
         "--most-seconds is for pilot runs, and there are none: the file gives dt and method.",
     )
+    if dt == "stable":
+        dt = stable_step(path, plan)
+        steps = round(t1 / dt)
+        choice = f"dt = {dt:.6g} s ({steps} steps), the longest that is stable as the particles start"
+        save_every = save_every or max(1, steps // _FRAMES)
     if dt is None or method is None:
         methods = METHODS if method is None else (method,)
         found = work_precision(
@@ -162,6 +171,19 @@ def read_job(
         dt, method = best.dt, best.method
         save_every = save_every or max(1, best.steps // _FRAMES)
     return Job(plan.scene, plan.particles, RunSettings(t1, dt, method, save_every or 1, dtype), plan.fit, choice)
+
+
+def stable_step(path: Path, plan: Plan) -> float:
+    """What dt = "stable" stands for in a scene file [s].
+
+    Raises:
+        ValueError: as `stable_dt`.
+    """
+    assert plan.run.method is not None
+    try:
+        return float(stable_dt(plan.scene, plan.particles, method=plan.run.method, t1=plan.run.t1))
+    except ValueError as error:
+        raise ValueError(f'{path}: [run] dt = "stable": {error}') from None
 
 
 def fit_job(job: Job) -> FitResult:
@@ -263,8 +285,10 @@ def _toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ValueError(f"Cannot read the scene file {path}: {_reason(error)}.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not a TOML file: {error}.") from None
+    except RecursionError:
+        raise ValueError(f"{path} is not a scene file: it is nested too deeply to be read.") from None
+    except ValueError as error:  # TOML's and UTF-8's among them
+        raise ValueError(f"{path} is not a TOML file: {shortened(str(error))}.") from None
 
 
 def _reason(error: Exception) -> str:
@@ -275,7 +299,7 @@ def _run_table(table: Any) -> RunTable:
     def run(
         *,
         t1: Scalar,
-        dt: Scalar | None = None,
+        dt: Scalar | Literal["stable"] | None = None,
         method: Method | None = None,
         save_every: int | None = None,
         precision: str = "float64",
@@ -283,20 +307,22 @@ def _run_table(table: Any) -> RunTable:
         most_seconds: Scalar = 60.0,
     ) -> RunTable:
         require_positive("[run] t1", t1)
-        if dt is not None:
+        if isinstance(dt, str):
+            require(dt == "stable", f'[run] dt must be a step in seconds, "stable" or "auto", got {dt!r}.')
+        elif dt is not None:
             require_positive("[run] dt", dt)
+            dt = float(dt)
         require_positive("[run] error", error)
         require_positive("[run] most_seconds", most_seconds)
         every = save_every is None or save_every >= 1
         require(every, f"[run] save_every must be at least 1, got {save_every}.")
         known = precision in ("float32", "float64")
         require(known, f'[run] precision must be "float32" or "float64", got {precision!r}.')
-        step = None if dt is None else float(dt)
-        return RunTable(float(t1), step, method, save_every, precision, float(error), float(most_seconds))
+        return RunTable(float(t1), dt, method, save_every, precision, float(error), float(most_seconds))
 
-    require(isinstance(table, dict), f"[run] must be a table, got {table!r}.")
+    require(isinstance(table, dict), f"[run] must be a table, got {shortened(repr(table))}.")
     left = {name for name in ("dt", "method") if table.get(name) == "auto"}
-    require("dt" in table, "[run] needs the key 'dt': a step in seconds, or \"auto\".")
+    require("dt" in table, '[run] needs the key \'dt\': a step in seconds, "stable" or "auto".')
     require(left != {"method"}, '[run] method = "auto" goes with dt = "auto": the cheapest of both is chosen together.')
     given = arguments(run, {key: value for key, value in table.items() if key not in left}, "[run]")
     if "method" not in left:
@@ -328,15 +354,17 @@ def _filled(scene: Scene, tables: list[Any], dtype: str) -> Particles:
     filled: list[list[Particles]] = [[] for _ in scene.laws]
     for number, table in enumerate(tables, 1):
         where = f"[[particles]] {number}"
-        require(isinstance(table, dict), f"{where} must be a table, got {table!r}")
+        require(isinstance(table, dict), f"{where} must be a table, got {shortened(repr(table))}.")
         material, rest = table.get("material", 1), {key: value for key, value in table.items() if key != "material"}
         known = range(1, len(scene.laws) + 1)
         require(
             type(material) is int and material in known,
-            f"{where} material must be the number of a [[material]], from 1 to {len(scene.laws)}, got {material!r}.",
+            f"{where} material must be the number of a [[material]], from 1 to {len(scene.laws)}, got "
+            f"{shortened(repr(material))}.",
         )
         given = arguments(fill, rest, where, given=("grid", "dtype"))
         try:
+            _check_place(given["region"], scene.grid)
             filled[material - 1].append(fill(grid=scene.grid, dtype=dtype, **given))
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
@@ -345,6 +373,24 @@ def _filled(scene: Scene, tables: list[Any], dtype: str) -> Particles:
             len(sets) > 0, f"[[material]] {number} has no particles: name it in a [[particles]] table, or leave it out."
         )
     return join(*(replace(join(*sets), counts=None) for sets in filled))
+
+
+def _check_place(region: AbstractRegion, grid: Grid) -> None:
+    """A region larger than the window, or beside it, is not worth filling to find that its particles are outside."""
+    lower, upper = region.bounds()
+    if len(lower) != grid.dim:
+        return  # as `fill` says
+    dx, window = float(grid.spacing), np.asarray(grid.shape) - 1
+    first = np.asarray(grid.origin) * dx
+    held = ~np.asarray(grid.periodic)
+    too_large = (upper - lower > (window + 2) * dx) & held
+    beside = ((upper < first) | (lower > first + window * dx)) & held & (not grid.follow)
+    require(
+        ~(too_large | beside),
+        f"the region from {lower} to {upper} m does not fit into the grid's window, of {window * dx} m"
+        + ("" if grid.follow else f" from {first} m")
+        + ": all lengths are in metres; enlarge the shape, move the origin, or use follow = true.",
+    )
 
 
 def _curve_settings(table: Any, folder: Path) -> CurveSettings:

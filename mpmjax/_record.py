@@ -3,13 +3,13 @@
 import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import diffrax
 import jax.numpy as jnp
 from tqdm import tqdm
 
-from mpmjax._checks import canonical, require, requirements
+from mpmjax._checks import canonical, require, require_whole, requirements
 from mpmjax._diffrax import HEALTHY, Tally, no_steps
 from mpmjax._interrupt import reporting, undisturbed
 from mpmjax._io import FrameWriter
@@ -19,6 +19,8 @@ from mpmjax._particles import Particles, State, state_of, with_state
 from mpmjax._run import Run, SimulationError
 from mpmjax._scene import Scene, prepare
 from mpmjax._simulate import integrate, number_of_steps, raise_faults
+from mpmjax._stability import step_for
+from mpmjax._types import Scalar
 
 
 @checked
@@ -27,8 +29,8 @@ def record(
     scene: Scene,
     particles: Particles,
     *,
-    t1: float | int,
-    dt: float | int,
+    t1: Scalar,
+    dt: Scalar | Literal["stable"],
     method: Method = Explicit(),
     save_every: int,
     start: int = 0,
@@ -46,7 +48,7 @@ def record(
         scene: the scene.
         particles: the particles at step `start`; when resuming, those the recorded run began with.
         t1: end time [s], a whole number of steps after time zero.
-        dt: step [s].
+        dt: step [s], or "stable", as in `simulate`.
         method: update of the grid velocity.
         save_every: write a frame at the start, every so many steps, and at the end.
         start: number of the first step. Not used when resuming.
@@ -62,12 +64,13 @@ def record(
         SimulationError: those of `simulate`; the last good state is in the file.
         OSError: the disk refused a frame, as when it is full. The file holds all frames before it and can be resumed.
     """
-    require(save_every >= 1, f"save_every must be at least 1, got {save_every}.")
     dtype = particles.x.dtype
-    start = 0 if resume else int(start)
-    end = start + number_of_steps(t1, dt, start, dtype)
+    start = 0 if resume else require_whole("start", start, 0)
     requirements(method)
     particles = prepare(scene, particles)
+    dt = step_for(scene, particles, t1, dt, method, start)
+    end = start + number_of_steps(t1, dt, start, dtype)
+    save_every = min(require_whole("save_every", save_every, 1), end - start)
     if resume:
         writer = FrameWriter.resume(path, scene, particles, method, dt)
     else:

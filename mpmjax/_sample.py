@@ -6,6 +6,7 @@ import numpy as np
 from mpmjax._checks import coordinates, require, require_positive, shortened
 from mpmjax._grid import Grid
 from mpmjax._kinds import checked
+from mpmjax._memory import require_memory
 from mpmjax._particles import Particles
 from mpmjax._region import AbstractRegion, Box
 from mpmjax._types import Point, Scalar
@@ -16,7 +17,7 @@ def fill(
     region: AbstractRegion,
     grid: Grid,
     *,
-    particles_per_cell: int | tuple[int, ...] | list[int] = 4,
+    particles_per_cell: int | tuple[int, ...] | list[int] | None = None,
     density: Scalar,
     velocity: Point | None = None,
     dtype: type | str | None = None,
@@ -30,7 +31,7 @@ def fill(
     Args:
         region: what to fill.
         grid: sets the spacing.
-        particles_per_cell: a d-th power (4 in 2-D is 2 x 2), or a count for each direction.
+        particles_per_cell: a d-th power (4 in 2-D is 2 x 2), or a count for each direction. Default: two in each, 2^d.
         density: mass density [kg/m^d].
         velocity: initial velocity [m/s], (d,). Default: rest.
         dtype: float32 or float64. Default: jax's own, float32 unless 64-bit mode is on.
@@ -45,8 +46,10 @@ def fill(
         precision = None
     require(precision in (jnp.float32, jnp.float64), f"dtype must be float32 or float64, got {shortened(repr(dtype))}.")
     require_positive("density [kg/m^d]", density)
-    if isinstance(particles_per_cell, int):
-        root = round(particles_per_cell ** (1 / d))
+    if particles_per_cell is None:
+        counts = np.full(d, 2)
+    elif isinstance(particles_per_cell, (int, np.integer)):
+        root = round(max(0, particles_per_cell) ** (1 / d))
         require(
             root >= 1 and root**d == particles_per_cell,
             f"particles_per_cell must be the {d}-th power of a whole number (or a tuple of {d} counts), got "
@@ -67,7 +70,16 @@ def fill(
         np.isfinite(lower) & np.isfinite(upper), "A region to fill must be finite; infinite corners are for grips only."
     )
     size = upper - lower
-    number = np.maximum(np.rint(size * counts / float(grid.spacing)).astype(int), 1)
+    with np.errstate(over="ignore"):
+        number = np.maximum(np.rint(size * counts / float(grid.spacing)), 1)
+        total = number.prod()
+    require_memory(
+        f"A lattice of {total:.3g} particles",
+        total * d * 2 * 8,  # the coordinates and the points made of them
+        f"take a smaller region (it reaches from {lower} to {upper} m), a larger spacing (it is {grid.spacing} m) or "
+        "fewer particles_per_cell.",
+    )
+    number = number.astype(int)
     cell = size / number
     axes = [low + (np.arange(n) + 0.5) * c for low, n, c in zip(lower, number, cell, strict=True)]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, d)

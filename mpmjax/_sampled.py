@@ -11,6 +11,7 @@ import numpy as np
 from mpmjax._checks import coordinates, is_traced, require, require_finite, require_positive
 from mpmjax._kernel import BSpline
 from mpmjax._kinds import checked, require_fields, shape_of
+from mpmjax._memory import require_memory
 from mpmjax._region import AbstractRegion, length
 from mpmjax._types import Array, Float, Point, Scalar
 
@@ -137,6 +138,14 @@ def _lattice(lower: np.ndarray, upper: np.ndarray, spacing: float) -> tuple[np.n
         np.isfinite(lower) & np.isfinite(upper), f"Only a region with bounds can be sampled, got {lower} to {upper}."
     )
     first = lower - _PADDING * spacing
-    counts = np.ceil((upper - lower) / spacing).astype(int) + 2 * _PADDING + 1
+    with np.errstate(over="ignore"):
+        numbers = np.ceil((upper - lower) / spacing) + 2 * _PADDING + 1
+        total = numbers.prod()
+    require_memory(
+        f"A lattice of {total:.3g} samples",
+        total * (2 * len(lower) + 1) * 8,  # the coordinates, the points made of them, the distances
+        f"take a larger spacing than {spacing} m for a shape from {lower} to {upper} m.",
+    )
+    counts = numbers.astype(int)
     axes = [a + spacing * np.arange(n) for a, n in zip(first, counts, strict=True)]
     return first, np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)

@@ -17,6 +17,7 @@ from mpmjax._exchange import Exchange, nothing_received
 from mpmjax._grid import Grid
 from mpmjax._kernel import BSpline, Gradient, MLSGradient, SplineGradient, Stencil, in_window, make_stencil
 from mpmjax._kinds import checked, require_fields
+from mpmjax._memory import require_memory
 from mpmjax._mirror import ContactPlane, Plane, SymmetryPlane, fits
 from mpmjax._particles import Group, Particles
 from mpmjax._transfer import APIC, Transfer
@@ -240,9 +241,24 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
         X=(particles.x if particles.X is None else particles.X) if scene.total else None,
         received=_received(scene, particles),
     )
+    _check_size(scene, prepared)
     if not is_traced((scene, prepared)):
         _check_placement(canonical(scene, particles.x.dtype), prepared)
     return prepared
+
+
+def _check_size(scene: Scene, particles: Particles) -> None:
+    """A step's arrays must fit into memory: of the nodes mass, momentum, velocity and force, of the particles their
+    state before and after and their stencil."""
+    n, p, d, bytes_each = scene.grid.size, particles.count, particles.dim, particles.x.dtype.itemsize
+    state = sum(leaf.size for leaf in jax.tree.leaves(particles))
+    stencil = p * 3 * d * (scene.kernel.order + 1)
+    require_memory(
+        f"A step of {p} particles on a grid of {n} nodes",
+        (n * (1 + 3 * d) + 2 * state + stencil) * bytes_each,
+        f"take a smaller shape than {scene.grid.shape}, or fewer particles_per_cell.",
+        device=True,
+    )
 
 
 def _received(scene: Scene, particles: Particles) -> Exchange | None:

@@ -18,7 +18,7 @@ import typing
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields
 from types import UnionType
-from typing import Any, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 import equinox as eqx
 import jax
@@ -121,7 +121,7 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
     _require(not any(_is_module(a) for a in alternatives), where, unfit)
     if enums := [a for a in alternatives if isinstance(a, type) and issubclass(a, enum.Enum)]:
         words = [member.value for member in enums[0]]
-        _require(data in words, where, f"must be one of {_quoted(words)}, got {data!r}")
+        _require(isinstance(data, str) and data in words, where, f"must be one of {_quoted(words)}, got {_short(data)}")
         return enums[0](data)
     return _numbers(data, expected, where, arrays)
 
@@ -134,13 +134,15 @@ def arguments(
     Raises:
         ValueError: see `decode`.
     """
-    _require(isinstance(table, dict), where, f"must be a table, got {table!r}")
+    _require(isinstance(table, dict), where, f"must be a table, got {_short(table)}")
     known = {name: p for name, p in _parameters(function).items() if name not in given}
     for key in table:
         if key not in known:
-            close = difflib.get_close_matches(key, known, 1)
+            close = difflib.get_close_matches(key[:60], known, 1)
             hint = f", did you mean {close[0]!r}?" if close else "."
-            raise ValueError(f"{_named(where, 'unknown key')} {key!r}{hint} Known here: {', '.join(known) or 'none'}.")
+            raise ValueError(
+                f"{_named(where, 'unknown key')} {_short(key)}{hint} Known here: {', '.join(known) or 'none'}."
+            )
     for name, (_, default) in known.items():
         _require(name in table or default is not inspect.Parameter.empty, where, f"needs the key {name!r}")
     return {key: decode(value, known[key][0], _inside(where, key, value), arrays) for key, value in table.items()}
@@ -150,13 +152,13 @@ def _object(data: Any, classes: dict[str, type], where: str, arrays: dict[str, n
     """The table of an object that may be of one of several classes."""
     table = {"kind": data} if isinstance(data, str) else data
     choice = f"one of {', '.join(classes)}" if len(classes) > 1 else next(iter(classes))
-    _require(isinstance(table, dict), where, f"must be a table with a kind, {choice}, got {data!r}")
+    _require(isinstance(table, dict), where, f"must be a table with a kind, {choice}, got {_short(data)}")
     _require("kind" in table or len(classes) == 1, where, f"needs a kind: {choice}")
     kind = table.get("kind", next(iter(classes)))
     if not (isinstance(kind, str) and kind in classes):
-        close = difflib.get_close_matches(str(kind), classes, 1)
+        close = difflib.get_close_matches(_short(kind), classes, 1)
         hint = f", did you mean {close[0]!r}?" if close else "."
-        raise ValueError(f"{_named(where, 'unknown kind')} {kind!r}{hint} It must be {choice}.")
+        raise ValueError(f"{_named(where, 'unknown kind')} {_short(kind)}{hint} It must be {choice}.")
     given = arguments(classes[kind], {k: v for k, v in table.items() if k != "kind"}, where, arrays)
     try:
         return classes[kind](**given)
@@ -178,7 +180,8 @@ def _numbers(data: Any, expected: Any, where: str, arrays: dict[str, np.ndarray]
         _require(kinds, where, f"must be {_words(forms)}, got {_short(data)}")
     if float in kinds:
         bad = np.isnan if where.rsplit(" ", 1)[-1] in _MAY_BE_INFINITE else lambda x: ~np.isfinite(x)
-        _require(not any(bad(_float(x)) for x in leaves), where, f"must be finite, got {_short(data)}")
+        beyond = any(isinstance(x, int) and math.isinf(_float(x)) for x in leaves)
+        _require(not (beyond or any(bad(_float(x)) for x in leaves)), where, f"must be finite, got {_short(data)}")
         data = _floats(data) if a is data else a
     takes_tuples = any(tuple in (a, get_origin(a)) for a in _alternatives(expected))
     if not isinstance(data, list) or (takes_tuples and len(leaves) <= _SMALL):
@@ -218,6 +221,8 @@ def _forms(hint: Any) -> set[tuple[type, int]]:
     for a in _alternatives(hint):
         if a in _ONE:
             forms.add((a, 0))
+        elif get_origin(a) is Literal:
+            forms.add((str, 0))
         elif get_origin(a) in (tuple, list):
             forms |= {(kind, depth + 1) for kind, depth in _forms(get_args(a)[0])}
         elif isinstance(a, type) and issubclass(a, AbstractArray):
@@ -240,7 +245,7 @@ def _words(forms: set[tuple[type, int]]) -> str:
 def _fits(leaf: Any, kind: type) -> bool:
     if isinstance(leaf, bool) or kind in (bool, str):
         return type(leaf) is kind
-    return isinstance(leaf, (int, float) if kind is float else int)
+    return isinstance(leaf, (int, float)) if kind is float else isinstance(leaf, int) and abs(leaf) < 2**63
 
 
 def _depth(data: Any) -> int:
@@ -299,7 +304,7 @@ def _quoted(words: Iterable[Any]) -> str:
 
 
 def _short(data: Any, most: int = 60) -> str:
-    text = repr(data)
+    text = repr(data[: most + 1] if isinstance(data, str) else data)
     return text if len(text) <= most else text[: most - 3] + "..."
 
 

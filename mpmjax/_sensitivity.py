@@ -1,6 +1,7 @@
 """How a rollout's derivatives grow with its horizon."""
 
 import warnings
+from typing import Literal
 
 import diffrax
 import equinox as eqx
@@ -14,6 +15,7 @@ from mpmjax._method import Explicit, Method
 from mpmjax._particles import Particles
 from mpmjax._scene import Scene, prepare
 from mpmjax._simulate import number_of_steps, simulate
+from mpmjax._stability import step_for
 from mpmjax._types import Array, Float, ParticleVector, Scalar
 
 _POINTS = 100
@@ -44,8 +46,8 @@ def sensitivity(
     scene: Scene,
     particles: Particles,
     *,
-    t1: float | int,
-    dt: float | int,
+    t1: Scalar,
+    dt: Scalar | Literal["stable"],
     method: Method = Explicit(),
     velocity: ParticleVector | None = None,
     seed: int = 0,
@@ -76,7 +78,7 @@ def sensitivity(
         scene: the scene.
         particles: the particles at step `start`.
         t1: end time [s], a whole number of steps after time zero.
-        dt: step [s].
+        dt: step [s], or "stable", as in `simulate`.
         method: update of the grid velocity.
         velocity: the change δv0 of the initial velocities, of any size, shape (p, d). Default: normally distributed,
             of variance 1/m_p.
@@ -90,9 +92,10 @@ def sensitivity(
     """
     require_positive("warn_at", warn_at)
     start = require_whole("start", start, 0)
+    particles = prepare(scene, particles)
+    dt = step_for(scene, particles, t1, dt, method, start)
     count = number_of_steps(t1, dt, start, particles.x.dtype)
     every = max(1, count // _POINTS) if save_every is None else save_every
-    particles = prepare(scene, particles)
     shape, dtype = particles.v.shape, particles.v.dtype
     if velocity is None:
         change = jax.random.normal(jax.random.key(seed), shape, dtype) / jnp.sqrt(particles.mass)[:, None]

@@ -1,8 +1,9 @@
 """Rollouts: many steps, saved, watched and differentiated."""
 
+import math
 import warnings
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import diffrax
 import equinox as eqx
@@ -38,11 +39,13 @@ from mpmjax._diffrax import (
 )
 from mpmjax._guard import guard
 from mpmjax._kinds import checked
+from mpmjax._memory import require_memory
 from mpmjax._method import BackwardEuler, Explicit, Method
 from mpmjax._metric import Metric
 from mpmjax._particles import Particles, State, state_of, with_state
 from mpmjax._run import Run, SimulationError
 from mpmjax._scene import Scene, prepare
+from mpmjax._stability import MOST_STEPS, step_for
 from mpmjax._step import advance
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.material import Law
@@ -55,8 +58,8 @@ def simulate(
     scene: Scene,
     particles: Particles,
     *,
-    t1: float | int,
-    dt: float | int,
+    t1: Scalar,
+    dt: Scalar | Literal["stable"],
     method: Method = Explicit(),
     save_every: int | None = None,
     observe: Callable[[Scene, Particles], Any] | None = None,
@@ -76,7 +79,8 @@ def simulate(
         scene: the scene.
         particles: the particles at step `start`.
         t1: end time [s], a whole number of steps after time zero.
-        dt: step [s].
+        dt: step [s]; or "stable", the longest that `stable_dt` allows of the particles as they start and of which t1 is
+            a whole number (`run.dt` says it). What stretches or stiffens on the way may need a shorter one.
         method: update of the grid velocity.
         save_every: save the state at the start, every so many steps, and at the end. Default: only `final` is returned.
         observe: instead of states, save what this function of (scene, particles) returns, so that a curve costs no more
@@ -101,17 +105,25 @@ def simulate(
             `equinox.error_if`. With `throw=False` such values make the state NaN and such a solve the derivative.
     """
     start = require_whole("start", start, 0)
+    particles = prepare(scene, particles)
+    dt = step_for(scene, particles, t1, dt, method, start)
     count = number_of_steps(t1, dt, start, particles.x.dtype)
     if save_every is not None:
         save_every = min(require_whole("save_every", save_every, 1), count)
     if observe is not None and save_every is None:
         save_every = 1
-    requirements((scene, particles, method))
     dtype = particles.x.dtype
     scene, dt_, method = canonical((scene, dt, method), dtype)
-    particles = prepare(scene, particles)
-    requirements(method)  # in this precision
+    requirements((scene, method))  # in this precision
     traced = is_traced((scene, particles, dt_, method, observe))  # under jax.jit also if all that was passed is known
+    if save_every is not None and observe is None:
+        frames = count // save_every + 2
+        require_memory(
+            f"{frames} frames of {particles.count} particles",
+            float(frames) * _bytes(particles),
+            f"save less often than every {save_every} steps, observe what is needed of them, or use record.",
+            device=True,
+        )
     slot = jnp.zeros((), dtype)
     if traced and throw:
         healthy, unsolved = jnp.asarray(HEALTHY, jnp.int32), _UNSOLVED.format("the adjoint")
@@ -235,22 +247,29 @@ def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
         raise ValueError("t1 and dt fix the number of steps and must be known numbers, not traced ones.")
     require_positive("dt [s]", dt)
     require_finite("t1 [s]", t1)
-    ratio = float(t1) / float(dt)
+    ratio, exact = float(t1) / float(dt), 2 ** (jnp.finfo(dtype).nmant - 1)
+    require(ratio <= MOST_STEPS, f"A run has at most {MOST_STEPS} steps, got t1 / dt = {ratio:.9g}: shorten t1.")
+    require(
+        ratio < exact,
+        f"{jnp.dtype(dtype)} counts steps exactly only below {exact}, got t1 / dt = {ratio:.9g}: use float64.",
+    )
     total = round(ratio)
     require(
         abs(ratio - total) <= 1e-6 * max(1.0, abs(ratio)),
         f"t1 must be a whole number of steps: t1 / dt = {ratio:.9g} (t1 = {t1}, dt = {dt}); "
-        f"take dt = {t1} / {total or 1}.",
+        f"take dt = {t1} / {max(1, math.ceil(ratio))}.",
     )
     require(total > start, f"t1 must lie after the start: t1 / dt = {total} steps, start = {start}.")
-    most = 2 ** (jnp.finfo(dtype).nmant - 1)
-    require(total < most, f"{jnp.dtype(dtype)} counts steps exactly only below {most}, got {total}: use float64.")
     return total - int(start)
 
 
 def _checkpoints(particles: Particles, count: int, budget: int) -> int:
-    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state_of(particles)))
-    return max(1, min(count, budget // size))
+    return max(1, min(count, budget // _bytes(particles)))
+
+
+def _bytes(particles: Particles) -> int:
+    """Of what evolves of them."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state_of(particles)))
 
 
 @eqx.filter_jit

@@ -1,5 +1,8 @@
 """The longest stable step, known before it is taken."""
 
+import math
+from typing import Literal
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +17,8 @@ from mpmjax._particles import Particles
 from mpmjax._scene import Scene, is_prepared, prepare
 from mpmjax._types import Array, Float, Scalar
 
+MOST_STEPS = 2**31 - 1
+"""What a run counts its steps up to."""
 _INVERSE_MOMENT = {2: 4.0, 3: 3.0}
 """dx² a of the quadratic and the cubic kernel, a the inverse of D_p = Σ_i w_ip (x_i − x_p)²."""
 _STEEPEST = {2: 6.0, 3: 3.1368191}
@@ -26,7 +31,12 @@ SAFETY = 0.7
 
 @checked
 def stable_dt(
-    scene: Scene, particles: Particles, *, method: Method = Explicit(), safety: Scalar = SAFETY
+    scene: Scene,
+    particles: Particles,
+    *,
+    method: Method = Explicit(),
+    safety: Scalar = SAFETY,
+    t1: Scalar | None = None,
 ) -> Float[Array, ""]:
     """The longest step Δt [s] for which the motion about the particles' present state does not grow.
 
@@ -66,15 +76,54 @@ def stable_dt(
         particles: the particles; what the scene needs and they lack is added.
         method: update of the grid velocity.
         safety: factor of the bound.
+        t1: end time [s]: the result is then the longest step at or below the bound of which t1 is a whole number.
 
     Raises:
-        ValueError: from `prepare`, or a safety that is not positive.
+        ValueError: from `prepare`; a safety that is not positive; with t1, a bound that is zero or that there is none.
     """
     require_positive("safety", safety)
     limit = canonical(safety, particles.x.dtype) * longest_step(scene, particles, method)
     if not is_traced(limit):
         require(not np.isnan(limit), "stable_dt needs particles whose F is finite and one that their law allows.")
-    return limit
+    return limit if t1 is None else _whole(limit, t1, type(method).__name__)
+
+
+def step_for(
+    scene: Scene, particles: Particles, t1: Scalar, dt: Scalar | Literal["stable"], method: Method, start: int
+) -> Scalar:
+    """The step that is asked for: a number, or what `stable_dt` says of the particles as they start.
+
+    Raises:
+        ValueError: of `stable_dt`; "stable" for a run that does not start at step 0.
+    """
+    if not isinstance(dt, str):
+        return dt
+    require(start == 0, 'A run that goes on has the step that it began with: give dt, which run.dt is, not "stable".')
+    return stable_dt(scene, particles, method=method, t1=t1)
+
+
+def _whole(limit: Array, t1: Scalar, method: str) -> Float[Array, ""]:
+    """t1 by the least whole number for which that is at or below a limit [s]."""
+    if is_traced((limit, t1)):
+        raise ValueError(
+            "The number of steps must be known, and the limit that fixes it is traced here: ask for "
+            "stable_dt(scene, particles, t1=t1) outside of the jax transformation, and pass the number."
+        )
+    require_positive("t1 [s]", t1)
+    bound, end = float(limit), float(t1)
+    require(
+        bound < np.inf,
+        f"{method} has no longest stable step here, so accuracy alone decides: give dt as a number of seconds.",
+    )
+    require(
+        end <= bound * MOST_STEPS,
+        f"The longest stable step is {bound:.3g} s, of which t1 = {t1} s takes more than {MOST_STEPS}: choose an "
+        "implicit method, a coarser grid or, if the step is zero, another kernel than the linear one.",
+    )
+    count = max(1, math.ceil(end / bound))
+    while end / count > bound:  # by the rounding of the quotient
+        count += 1
+    return jnp.asarray(end / count, limit.dtype)
 
 
 def longest_step(scene: Scene, particles: Particles, method: Method) -> Float[Array, ""]:

@@ -20,7 +20,7 @@ from mpmjax._fit import FitResult
 from mpmjax._hdf5 import check_place
 from mpmjax._interrupt import end_on_signals, reporting
 from mpmjax._io import load, steps_in
-from mpmjax._job import CurveSettings, Job, fit_job, read_job, read_plan
+from mpmjax._job import CurveSettings, Job, fit_job, read_job, read_plan, stable_step
 from mpmjax._record import record
 from mpmjax._render import COLOURS, render
 from mpmjax._run import Run
@@ -39,8 +39,9 @@ def _reporting(command: Callable[..., None]) -> Callable[..., None]:
         try:
             with jax.enable_x64(True):
                 command(*args, **kwargs)
-        except (ValueError, RuntimeError, OSError) as error:
-            print(f"mpmjax: {' '.join(str(error).split())}", file=sys.stderr)
+        except (ValueError, RuntimeError, OSError, MemoryError) as error:
+            told = " ".join(str(error).split()) or "there is not enough memory for this"
+            print(f"mpmjax: {told}", file=sys.stderr)
             raise typer.Exit(2) from None
 
     return guarded
@@ -214,7 +215,8 @@ def chart_command(
     plan = read_plan(scene)
     output = Path(f"{scene.stem}_chart.png") if output is None else output
     print(f"{'method':>24} {'spacing':>10} {'dt [s]':>10} {'steps':>9} {'seconds':>9} {'error':>9}", flush=True)
-    own = () if plan.run.dt is None or plan.run.method is None else ((plan.run.method, plan.run.dt),)
+    dt = stable_step(scene, plan) if plan.run.dt == "stable" else plan.run.dt
+    own = () if dt is None or plan.run.method is None else ((plan.run.method, dt),)
     found = work_precision(
         plan.build,
         t1=plan.run.t1,

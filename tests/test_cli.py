@@ -174,7 +174,6 @@ BAD_SCENES = {
     "wrong key": ("spacing = 0.1", "spacng = 0.1", r"\[grid\].*spacng.*spacing"),
     "wrong kind": ('"SlipBox"', '"SlideBox"', r"\[\[boundary\]\].*SlideBox"),
     "bad number": ("youngs_modulus = 1e5", "youngs_modulus = -1e5", r"youngs_modulus.*greater than zero"),
-    "not a number": ("dt = 1e-2", 'dt = "small"', r"\[run\] dt"),
     "not whole steps": ("dt = 1e-2", "dt = 0.7e-2", r"whole number of steps"),
     "outside the window": ("lower = [0.0, 0.1]", "lower = [-0.5, 0.1]", r"window; particle 0 at"),
     "no TOML": ("[grid]", "[grid", r"not a TOML file"),
@@ -182,6 +181,7 @@ BAD_SCENES = {
     "automatic method, given step": ('method = { kind = "SemiImplicit" }', 'method = "auto"', r'goes with dt = "auto"'),
     "no time for pilot runs": ("dt = 1e-2", 'dt = "auto"\nmost_seconds = 0', r"\[run\] most_seconds"),
     "no step": ("dt = 1e-2", "", r"\[run\] needs the key 'dt'"),
+    "a step in words": ("dt = 1e-2", 'dt = "small"', r'"stable" or "auto", got \'small\''),
     "counts": ("density = 1e3", "density = 1e3\nparticles_per_cell = 3", r"\[\[particles\]\] 1.*2-th power"),
 }
 
@@ -316,6 +316,23 @@ def test_the_examples_can_be_run(path):
 
 def test_fit_needs_a_fit_table(folder):
     assert "[fit]" in refused("fit", folder / "scene.toml")
+
+
+def test_a_stable_step_is_taken_and_told(tmp_path):
+    """The longest that divides t1; frames are then a fiftieth of the run apart."""
+    scene = tmp_path / "stable.toml"
+    left = SCENE.replace("dt = 1e-2", 'dt = "stable"').replace("save_every = 2", "")
+    scene.write_text(left.replace('{ kind = "SemiImplicit" }', '"Explicit"'))
+    code, out, err = shell("run", scene, "-o", tmp_path / "run.h5", "--quiet")
+    assert code == 0, err
+    chosen = re.search(r"chosen +dt = ([-.e\d]+) s \((\d+) steps\), the longest that is stable", out)
+    assert chosen is not None, out
+    run, job = mpm.load(tmp_path / "run.h5"), read_plan(scene)
+    assert int(run.tally.steps) == int(chosen[2])
+    np.testing.assert_allclose(float(run.dt) * int(chosen[2]), 0.06)
+    assert float(run.dt) <= float(mpm.stable_dt(job.scene, job.particles)) < 0.06 / (int(chosen[2]) - 1)
+    scene.write_text(left)
+    assert 'dt = "stable": SemiImplicit has no longest stable step' in refused("run", scene, "-o", tmp_path / "a.h5")
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.r
 
 # Each layer may import from itself and from those before it; what is not listed is a leaf, on top of them all.
 LAYERS = (
-    ("_types", "_checks", "_constraint", "_rule", "_guard", "_kinds"),
+    ("_types", "_checks", "_constraint", "_rule", "_guard", "_kinds", "_memory"),
     ("_grid", "_region", "_motion"),
     ("_kernel",),
     ("_crossing", "_sampled"),

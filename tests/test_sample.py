@@ -47,6 +47,12 @@ def test_a_box_of_whole_cells_holds_the_count_asked_for(d):
             np.testing.assert_allclose(places, 0.2 + DX / n * (np.arange(3 * n) + 0.5), atol=1e-12)
 
 
+@pytest.mark.parametrize("d", DIMS)
+def test_two_in_each_direction_are_the_default(d):
+    particles = mpm.fill(mpm.Box((0.2,) * d, (0.5,) * d), grid_of(d), density=1.0)
+    assert particles.count == 6**d
+
+
 @pytest.mark.parametrize(("side", "count"), [(0.31, 6), (0.33, 7)])
 def test_counts_in_a_box_are_rounded_to_the_nearest(side, count):
     """6.2 lattice cells become 6, 6.6 become 7."""
@@ -118,6 +124,7 @@ class Nowhere(mpm.AbstractRegion):
     [
         ({"particles_per_cell": 3}, "2-th power of a whole number"),
         ({"particles_per_cell": 0}, "2-th power of a whole number"),
+        ({"particles_per_cell": -4}, "2-th power of a whole number"),
         ({"particles_per_cell": (2, 2, 2)}, "one or 2 positive whole numbers"),
         ({"particles_per_cell": (2, 0)}, "one or 2 positive whole numbers"),
         ({"density": 0.0}, "density .* must be greater than zero"),

@@ -369,6 +369,13 @@ def test_a_fault_under_a_transformation_raises():
         ({"t1": 0.01, "dt": -0.005}, "dt"),
         ({"t1": np.inf, "dt": 0.005}, "t1"),
         ({"t1": 0.01, "dt": 0.005, "save_every": 0}, "save_every"),
+        ({"t1": 1e308, "dt": 0.005}, r"at most 2147483647 steps, got t1 / dt = 2e\+310|got t1 / dt = inf"),
+        ({"t1": 0.1, "dt": 0.1 / 62.4}, r"take dt = 0\.1 / 63\."),
+        ({"t1": 0.01, "dt": 0.015}, r"take dt = 0\.01 / 1\."),
+        ({"t1": 0.01, "dt": "stable", "start": 1}, "give dt, which run.dt is"),
+        ({"t1": 0.01, "dt": "stable", "method": mpm.SemiImplicit()}, "SemiImplicit has no longest stable step"),
+        ({"t1": 0.0, "dt": "stable"}, "t1 .* greater than zero"),
+        ({"t1": 0.01, "dt": 0.005, "start": 0.5}, "start must be a whole number of at least 0, got 0.5"),
     ],
 )
 def test_bad_times_are_refused(options, message):
@@ -381,6 +388,37 @@ def test_the_number_of_steps_is_robust_to_rounding():
     """0.3 / 0.1 is three steps."""
     scene, particles = pulled()
     assert int(mpm.simulate(scene, particles, t1=0.3 / 100, dt=0.1 / 100).tally.steps) == 3
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_the_stable_step_is_the_longest_of_whole_steps(dtype):
+    """At or below the bound, one step fewer being above it; the run says it, and is that of the number."""
+    scene, particles = pulled()
+    particles = jax.tree.map(lambda a: a.astype(dtype), particles)
+    bound = float(mpm.stable_dt(scene, particles))
+    for t1 in (10.4 * bound, 3 * bound, 0.1 * bound):
+        whole = mpm.stable_dt(scene, particles, t1=t1)
+        steps = round(t1 / float(whole))
+        assert float(whole) <= bound
+        assert steps == 1 or t1 / (steps - 1) > bound
+    t1 = 10.4 * bound
+    run = mpm.simulate(scene, particles, t1=t1, dt="stable", save_every=10**18)
+    assert int(run.tally.steps) == 11
+    assert len(run) == 2
+    np.testing.assert_allclose(run.dt, t1 / 11, rtol=1e-6)
+    assert_equal(state(run.final), state(mpm.simulate(scene, particles, t1=t1, dt=run.dt).final))
+
+
+def test_the_stable_step_is_asked_for_outside_of_transformations():
+    """Where it depends on what is differentiated, which without a law's numbers it does not."""
+    scene, particles = pulled()
+
+    def moved(modulus):
+        softer = eqx.tree_at(lambda s: s.material.youngs_modulus, scene, modulus)
+        return mpm.simulate(softer, particles, t1=0.01, dt="stable").final.x.sum()
+
+    with pytest.raises(ValueError, match="outside of the jax transformation"):
+        jax.grad(moved)(1e4)
 
 
 def test_progress_changes_nothing(capsys):

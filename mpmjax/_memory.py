@@ -1,0 +1,66 @@
+"""Memory: what there is, and that what will be allocated fits into it, asked before it is."""
+
+import math
+import os
+from pathlib import Path
+
+import jax
+
+_UNKNOWN = 2**34
+"""What is taken for available where the system does not say [B]."""
+
+
+def require_memory(what: str, needed: float, advice: str, *, device: bool = False) -> None:
+    """What will be allocated must fit into what there is.
+
+    Args:
+        what: what it is, as the subject of "takes at least so many GB".
+        needed: how many bytes it takes at least.
+        advice: which number to change.
+        device: whether it lies on jax's device.
+
+    Raises:
+        ValueError: it does not.
+    """
+    if needed < 2**26:  # asking takes longer
+        return
+    there = available_memory(device=device)
+    if not needed <= there:
+        raise ValueError(
+            f"{what} takes at least {_gigabytes(needed)} of memory, and {_gigabytes(there)} are available: {advice}"
+        )
+
+
+def available_memory(*, device: bool = False) -> float:
+    """Bytes that can be allocated: of the host, within its control group's limit; with `device` of jax's device."""
+    stats = jax.local_devices()[0].memory_stats() if device else None  # None of a CPU, whose memory is the host's
+    if stats and "bytes_limit" in stats:
+        return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
+    return min(_free(), _within_limit())
+
+
+def _free() -> int:
+    try:
+        known = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        return 1024 * int(known["MemAvailable"].split()[0])
+    except (OSError, KeyError, ValueError):
+        pass
+    try:
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return _UNKNOWN
+
+
+def _within_limit() -> float:
+    """What the control group that the process is in may still take; what it keeps of files gives way."""
+    group = Path("/sys/fs/cgroup")
+    try:
+        limit, used = int((group / "memory.max").read_text()), int((group / "memory.current").read_text())
+        stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        return limit - used + int(stat.get("file", 0))
+    except (OSError, ValueError):  # no such group, or no limit: "max"
+        return math.inf
+
+
+def _gigabytes(count: float) -> str:
+    return f"{count / 1e9:.3g} GB"
