@@ -5,6 +5,8 @@ once, in its `__check_init__`. A constructor checks there what is known; `requir
 and returns those that were put off, for a compiled program to evaluate.
 """
 
+import sys
+import warnings
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from dataclasses import fields, is_dataclass
@@ -100,6 +102,21 @@ def require_that(what: str, holds: Callable[..., Any], *values: Any) -> None:
         _put_off_check(f"{what}.", lambda: holds(*map(jnp.asarray, values)))
     elif not np.all(holds(*map(np.asarray, values))):  # written only here: writing an array takes ms
         raise ValueError(f"{what}, got {' and '.join(shortened(str(value)) for value in values)}.")
+
+
+def warn(message: str) -> None:
+    """Give a Python warning, as of the line from which the package was called."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in ("mpmjax", "equinox", "jaxtyping"):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, stacklevel=level)
+
+
+def require_tolerance(name: str, value: Any) -> None:
+    """A relative tolerance must be positive; a warning is given of one that any guess meets."""
+    require_positive(name, value)
+    if not is_traced(value) and np.any(np.asarray(value) >= 1):
+        warn(f"{name} is {shortened(str(value))}: at 1 or more nothing is solved, zero meets it. Take 1e-2 or less.")
 
 
 def require_finite(name: str, value: Any) -> None:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jax.flatten_util import ravel_pytree
 
-from mpmjax._checks import require, require_positive
+from mpmjax._checks import require, require_positive, require_tolerance
 from mpmjax._kinds import require_fields
 from mpmjax._types import Array, Float, Scalar
 
@@ -68,7 +68,7 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
     def __check_init__(self):
         require_fields(self)
         if self.rtol is not None:
-            require_positive("ConjugateResidual's rtol", self.rtol)
+            require_tolerance("ConjugateResidual's rtol", self.rtol)
         if self.increment_rtol is not None:
             require_positive("ConjugateResidual's increment_rtol", self.increment_rtol)
         require(self.max_steps >= 1, f"ConjugateResidual's max_steps must be at least 1, got {self.max_steps}.")

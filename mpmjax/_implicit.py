@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 
-from mpmjax._checks import require, require_positive
+from mpmjax._checks import require, require_tolerance
 from mpmjax._conjugate_residual import SETTLED, SHORT, ConjugateResidual, Reporting, default_rtol
 from mpmjax._constraint import Constraint
 from mpmjax._hessian import Hessian, ImplicitOperator, damped
@@ -255,7 +255,7 @@ class Newton(eqx.Module):
     def __check_init__(self):
         require_fields(self)
         if self.rtol is not None:
-            require_positive("Newton's rtol", self.rtol)
+            require_tolerance("Newton's rtol", self.rtol)
         require(self.max_steps >= 1, f"Newton's max_steps must be at least 1, got {self.max_steps}.")
 
     def __call__(self, problem: NewtonProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:

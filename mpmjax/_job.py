@@ -3,6 +3,7 @@ words."""
 
 import csv
 import difflib
+import itertools
 import tomllib
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
@@ -10,10 +11,11 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._bench import Build, Trial
-from mpmjax._checks import require, require_positive, shortened
+from mpmjax._checks import require, require_positive, shortened, warn
 from mpmjax._fit import FitResult, fit_curve, gauge
 from mpmjax._grid import Grid
 from mpmjax._method import Explicit, Method
@@ -352,6 +354,8 @@ def _lists(material: Any) -> list[str]:
 def _filled(scene: Scene, tables: list[Any], dtype: str) -> Particles:
     """The particles of all tables, those of each material together, in the materials' order."""
     filled: list[list[Particles]] = [[] for _ in scene.laws]
+    regions: list[AbstractRegion] = []
+    placed: list[np.ndarray] = []
     for number, table in enumerate(tables, 1):
         where = f"[[particles]] {number}"
         require(isinstance(table, dict), f"{where} must be a table, got {shortened(repr(table))}.")
@@ -366,13 +370,28 @@ def _filled(scene: Scene, tables: list[Any], dtype: str) -> Particles:
         try:
             _check_place(given["region"], scene.grid)
             filled[material - 1].append(fill(grid=scene.grid, dtype=dtype, **given))
+            regions, placed = [*regions, given["region"]], [*placed, np.asarray(filled[material - 1][-1].x)]
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
+    _warn_of_overlaps(regions, placed, float(scene.grid.spacing))
     for number, sets in enumerate(filled, 1):
         require(
             len(sets) > 0, f"[[material]] {number} has no particles: name it in a [[particles]] table, or leave it out."
         )
     return join(*(replace(join(*sets), counts=None) for sets in filled))
+
+
+def _warn_of_overlaps(regions: list[AbstractRegion], placed: list[np.ndarray], spacing: float) -> None:
+    """Warn where particles of a table lie in the region of an earlier one, deeper than rounding has it."""
+    for (i, region), (j, x) in itertools.product(enumerate(regions, 1), enumerate(placed, 1)):
+        lower, upper = region.bounds()
+        if i < j and ((x.min(axis=0) < upper) & (x.max(axis=0) > lower)).all():
+            inside = int(np.asarray(region.contains(jnp.asarray(x), -1e-3 * spacing)).sum())
+            if inside:
+                warn(
+                    f"{inside} particles of [[particles]] {j} lie in the region of [[particles]] {i}: where two fill "
+                    "the same place there is twice the mass."
+                )
 
 
 def _check_place(region: AbstractRegion, grid: Grid) -> None:

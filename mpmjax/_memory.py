@@ -10,7 +10,7 @@ _UNKNOWN = 2**34
 """What is taken for available where the system does not say [B]."""
 
 
-def require_memory(what: str, needed: float, advice: str, *, device: bool = False) -> None:
+def require_memory(what: str, needed: float | int, advice: str, *, device: bool = False) -> None:
     """What will be allocated must fit into what there is.
 
     Args:
@@ -31,7 +31,7 @@ def require_memory(what: str, needed: float, advice: str, *, device: bool = Fals
         )
 
 
-def available_memory(*, device: bool = False) -> float:
+def available_memory(*, device: bool = False) -> float | int:
     """Bytes that can be allocated: of the host, within its control group's limit; with `device` of jax's device."""
     stats = jax.local_devices()[0].memory_stats() if device else None  # None of a CPU, whose memory is the host's
     if stats and "bytes_limit" in stats:
@@ -51,7 +51,7 @@ def _free() -> int:
         return _UNKNOWN
 
 
-def _within_limit() -> float:
+def _within_limit() -> float | int:
     """What the control group that the process is in may still take; what it keeps of files gives way."""
     group = Path("/sys/fs/cgroup")
     try:
@@ -62,5 +62,5 @@ def _within_limit() -> float:
         return math.inf
 
 
-def _gigabytes(count: float) -> str:
+def _gigabytes(count: float | int) -> str:
     return f"{count / 1e9:.3g} GB"

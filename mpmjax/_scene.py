@@ -19,6 +19,7 @@ from mpmjax._kernel import BSpline, Gradient, MLSGradient, SplineGradient, Stenc
 from mpmjax._kinds import checked, require_fields
 from mpmjax._memory import require_memory
 from mpmjax._mirror import ContactPlane, Plane, SymmetryPlane, fits
+from mpmjax._oversights import warn_of_oversights
 from mpmjax._particles import Group, Particles
 from mpmjax._transfer import APIC, Transfer
 from mpmjax._types import Array, Int, Point, components
@@ -208,7 +209,9 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
     """Add to the particles what the scene's laws, transfer and description need, where it is missing.
 
     F = I (J = 1), the history of what never yielded, C = 0 with APIC or viscosity (and none without), X = x in the
-    total description (and none in the updated one), and nothing received by colliders.
+    total description (and none in the updated one), and nothing received by colliders. Of particles that meet a scene
+    for the first time it warns where walls or colliders lie over them, grips or colliders touch nothing, and a body is
+    thinner than two cells.
 
     Raises:
         ValueError: a value is not as its module requires (`equinox.tree_at` can make it so), the particles have
@@ -243,7 +246,10 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
     )
     _check_size(scene, prepared)
     if not is_traced((scene, prepared)):
-        _check_placement(canonical(scene, particles.x.dtype), prepared)
+        known = canonical(scene, particles.x.dtype)
+        _check_placement(known, prepared)
+        if particles.F is None:
+            warn_of_oversights(known.grid, known.kernel, known.boundary, prepared, total=scene.total)
     return prepared
 
 

@@ -2,6 +2,7 @@
 
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -37,7 +38,9 @@ def _reporting(command: Callable[..., None]) -> Callable[..., None]:
     @wraps(command)
     def guarded(*args: Any, **kwargs: Any) -> None:
         try:
-            with jax.enable_x64(True):
+            with jax.enable_x64(True), warnings.catch_warnings():
+                warnings.simplefilter("default", UserWarning)
+                warnings.showwarning = _print_warning
                 command(*args, **kwargs)
         except (ValueError, RuntimeError, OSError, MemoryError) as error:
             told = " ".join(str(error).split()) or "there is not enough memory for this"
@@ -45,6 +48,12 @@ def _reporting(command: Callable[..., None]) -> Callable[..., None]:
             raise typer.Exit(2) from None
 
     return guarded
+
+
+def _print_warning(message: Warning | str, *where: Any) -> None:
+    """In one line, without the place in the code."""
+    del where
+    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 MostSeconds = Annotated[

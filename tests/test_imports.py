@@ -22,7 +22,7 @@ LAYERS = (
     ("material",),
     ("_boundary", "_body_force"),
     ("_mirror", "_collider", "_exchange"),
-    ("_particles", "_constituent", "_scene"),
+    ("_particles", "_constituent", "_oversights", "_scene"),
     ("_metric", "_potential", "_hessian"),
     ("_conjugate_residual",),
     ("_nodes", "_guess", "_implicit", "_contact"),

@@ -193,8 +193,6 @@ def test_beyond_its_lattice_a_sampled_distance_goes_on():
 
 def test_a_mesh_is_sampled():
     """A cube of twelve triangles has the distance of the box, to the samples' order, and a hole is refused."""
-    pytest.importorskip("trimesh")
-    pytest.importorskip("rtree")
     corners = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) * 0.5
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])

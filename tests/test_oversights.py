@@ -1,0 +1,123 @@
+"""Warnings of what is no error and most likely not meant, and none of what is well."""
+
+import re
+import warnings
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import LAWS, block
+from shell import refused, shell
+from test_cli import SCENE
+
+import mpmjax as mpm
+from mpmjax._job import read_plan
+
+TOTAL = {"description": mpm.TotalLagrangian()}
+FAR, HALF, NEAR = mpm.Ball((0.9, 0.9), 0.05), mpm.Ball((0.15, 0.3), 0.12), mpm.Box((-1.0, -1.0), (1.0, 0.0))
+BETWEEN = mpm.Ball((0.65, 0.15), 0.04)
+STAY, GO = mpm.Motion((0.0,), ((0.0, 0.0),)), mpm.Motion((0.0, 1.0), ((0.0, 0.0), (-1.0, 0.0)))
+TURN = mpm.RigidMotion((0.0, 1.0), ((0.0, 0.0),) * 2, (0.0, 1.0), (0.0, 0.0))
+EDGE = mpm.Box((-0.25, -0.25), (-0.2, -0.2))
+"""In the window's first cell, beyond what the block's stencils reach."""
+DOUBTFUL = {
+    "a wall over the body": ({"boundary": mpm.SlipBox((0.1, -np.inf), (np.inf, np.inf))}, "12 of 36 .* SlipBox"),
+    "one of a second box": (
+        {"boundary": (mpm.StickyBox((-1.0, 0.0), (1.0, 1.0)), mpm.SeparatingBox((-1.0, -1.0), (1.0, 0.25)))},
+        r"6 of 36 .* SeparatingBox \(boundary 2\)",
+    ),
+    "a sticky collider over the body": ({"boundary": mpm.StickyCollider(HALF)}, "of 36 particles .* StickyCollider"),
+    "a floor that is too high": (
+        {"boundary": mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.1), (0.0, 1.0)))},
+        "12 of 36 .* SeparatingCollider",
+    ),
+    "a grip beside the body": ({"boundary": mpm.Grip(FAR, STAY)}, "Grip .* touches nothing: .* a particle reaches"),
+    "a moving one in the total description": ({"boundary": mpm.Grip(EDGE, GO)} | TOTAL, "Grip .* touches nothing"),
+    "a collider there": ({"boundary": mpm.StickyCollider(FAR, TURN)} | TOTAL, "StickyCollider .* touches nothing"),
+    "a collider between nodes": ({"boundary": mpm.SlipCollider(BETWEEN)}, "no node of the window lies in it"),
+}
+WELL = {
+    "walls around": {"boundary": mpm.StickyBox((0.0, 0.0), (1.0, 1.0))},
+    "a grip at the end": {"boundary": mpm.Grip(NEAR, GO)},
+    "a grip that comes": {"boundary": mpm.Grip(FAR, GO)},
+    "a collider that waits": {"boundary": mpm.StickyCollider(mpm.Box((-1.0, -1.0), (1.0, -0.1)))},
+    "one between nodes that comes": {"boundary": mpm.SlipCollider(BETWEEN, GO)},
+    "one that turns": {"boundary": mpm.SlipCollider(BETWEEN, TURN)},
+    "one that holds in the total description": {"boundary": mpm.StickyCollider(HALF, TURN)} | TOTAL,
+}
+
+
+def meet(**scene: object) -> list[str]:
+    """What is said when a block of 3 x 3 cells meets a scene."""
+    made, particles = block(2, **scene)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        prepared = mpm.prepare(made, particles)
+        mpm.prepare(made, prepared)  # it is said once
+    assert all(Path(w.filename) == Path(__file__) for w in said)
+    return [str(w.message) for w in said]
+
+
+@pytest.mark.parametrize(("scene", "says"), DOUBTFUL.values(), ids=DOUBTFUL)
+def test_an_oversight_is_told(scene, says):
+    (said,) = meet(**scene)
+    assert re.search(says, said), said
+
+
+@pytest.mark.parametrize("scene", WELL.values(), ids=WELL)
+def test_of_what_is_well_nothing_is_told(scene):
+    assert meet(**scene) == []
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_body_thinner_than_two_cells_is_told_of(d):
+    """But not one that fills what lies between walls or planes, or the period."""
+    thin = [1.9 * 0.1, *[0.3] * (d - 1)]
+    walls = mpm.SlipBox((0.0,) + (-np.inf,) * (d - 1), (0.19,) + (np.inf,) * (d - 1))
+    for options, told in (
+        ({}, True),
+        ({"boundary": walls}, False),
+        ({"boundary": mpm.SymmetryPlane(0, 0.0)}, False),
+        ({"boundary": mpm.SymmetryPlane(1, 0.0)}, True),
+        ({"boundary": mpm.SlipBox((-np.inf,) * d, (0.9,) * d)}, True),
+    ):
+        grid = mpm.Grid((9,) * d, 0.1, origin=(-3,) * d)
+        body = mpm.fill(mpm.Box((0.0,) * d, thin), grid, density=1e3)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            mpm.prepare(mpm.Scene(grid, LAWS["neo_hookean"], **options), body)
+        assert [bool(re.search("The body is 1.9 cells thick in direction 0", str(w.message))) for w in said] == [
+            True
+        ] * told
+
+
+def test_a_tolerance_that_anything_meets_is_told_of():
+    for make in (mpm.ConjugateResidual, lambda rtol: mpm.Newton(rtol=rtol)):
+        with pytest.warns(UserWarning, match=r"rtol is 10\.0: at 1 or more nothing is solved"):
+            make(10.0)
+
+
+def test_nothing_is_told_under_transformations():
+    """Where nothing is known yet; and the check of placement is not compiled anew for other numbers."""
+    scene, particles = block(2, boundary=mpm.SlipBox((0.1, -np.inf), (np.inf, np.inf)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jax.eval_shape(lambda x: mpm.prepare(scene, eqx.tree_at(lambda p: p.x, particles, x)).x, jnp.zeros((36, 2)))
+
+
+def test_the_shell_prints_a_warning_in_a_line(tmp_path):
+    """Of overlapping tables too; what is refused afterwards still has one line of its own."""
+    twice = SCENE[SCENE.index("[[particles]]") : SCENE.index("[run]")]
+    scene = tmp_path / "scene.toml"
+    scene.write_text(SCENE.replace("[run]", f"{twice}[run]").replace("[-0.2, 0.0]", "[-0.2, 0.25]"))
+    with pytest.warns(
+        UserWarning, match=r"36 particles of \[\[particles\]\] 2 lie in the region of \[\[particles\]\] 1"
+    ):
+        read_plan(scene)
+    (tmp_path / "run.h5").write_text("")
+    assert "exists" in refused("run", scene, "-o", tmp_path / "run.h5")
+    told = [line for line in shell("run", scene, "-o", tmp_path / "run.h5")[2].splitlines() if "warning" in line]
+    assert [line.split(" particles")[0] for line in told] == ["warning: 36", "warning: 36 of 72"]
