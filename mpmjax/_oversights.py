@@ -17,9 +17,9 @@ from mpmjax._collider import AbstractCollider
 from mpmjax._grid import Grid
 from mpmjax._kernel import BSpline
 from mpmjax._mirror import Plane
-from mpmjax._motion import AbstractMotion, Motion, RigidMotion
+from mpmjax._motion import Motion, RigidMotion
 from mpmjax._particles import Particles
-from mpmjax._types import Array, Bool, Float, NodeVector, ParticleVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, NodeVector, ParticleVector, Scalar
 
 _THIN = 2.0
 """Cells below which a body's thickness is not resolved."""
@@ -36,26 +36,53 @@ def warn_of_oversights(grid: Grid, kernel: BSpline, boundary: Boundaries, partic
         particles: the particles, as they start.
         total: whether the description is total Lagrangian: colliders that lie over the body then hold it.
     """
+    bodies = [] if total else [c for c in boundary if isinstance(c, AbstractCollider)]
+    fixed = [c for c in boundary if isinstance(c, Grip | AbstractCollider) and (total or _rests(c, grid))]
+    covers, holds = {}, {}
+    if bodies or fixed:
+        margin = jnp.asarray(ON_THE_WALL * grid.spacing, particles.x.dtype)
+        nodes = grid.nodes(grid.window(particles.x)).astype(particles.x.dtype)
+        inside, held = _probed(tuple(bodies), tuple(fixed), particles.x, nodes, margin, total)
+        covers = {id(c): int(count) for c, count in zip(bodies, inside, strict=True)}
+        holds = {id(c): np.asarray(mask) for c, mask in zip(fixed, held, strict=True)}
     for number, condition in enumerate(boundary, 1):
         name = f"{type(condition).__name__} (boundary {number})"
-        covered = 0
+        covered = covers.get(id(condition), 0)
         if isinstance(condition, StickyBox | SlipBox | SeparatingBox):
             covered = _beyond(condition, grid, particles.x)
-        elif isinstance(condition, AbstractCollider) and not total:
-            covered = int((np.asarray(_depth(condition, particles.x)) < -ON_THE_WALL * float(grid.spacing)).sum())
         if covered:
             warn(
                 f"{covered} of {particles.count} particles lie in or beyond the {name} at the start: nodes there do "
                 "not move freely. Move one of them; to hold a body on purpose take a Grip."
             )
-        if isinstance(condition, Grip | AbstractCollider) and _is_idle(condition, grid, kernel, particles.x, total):
-            warn(
-                f"The {name} touches nothing: no node "
-                + ("of the window lies in it" if _needs_all_nodes(condition, total) else "that a particle reaches does")
-                + ", and so it has no effect. Move it, or enlarge it to a spacing or more."
-            )
+        if id(condition) in holds:
+            may_meet = not total and not isinstance(condition, Grip)  # the body comes to it: any node will do
+            mask = holds[id(condition)]
+            if not (mask if may_meet else mask[_reached(grid, kernel, particles.x)]).any():
+                where = "of the window lies in it" if may_meet else "that a particle reaches lies in it"
+                warn(f"The {name} touches nothing, since no node {where}: move it, or enlarge it to a spacing or more.")
     for text in _thin(grid, boundary, particles):
         warn(text)
+
+
+@eqx.filter_jit
+def _probed(
+    bodies: tuple[AbstractCollider, ...],
+    fixed: tuple[Grip | AbstractCollider, ...],
+    x: ParticleVector,
+    nodes: NodeVector,
+    margin: Scalar,
+    total: bool,
+) -> tuple[list[Int[Array, ""]], list[Bool[Array, "n"]]]:
+    """How many particles lie in each of some bodies, and which nodes in each of some others, at the start."""
+    start = jnp.zeros((), x.dtype)
+
+    def depth(condition: Grip | AbstractCollider) -> Float[Array, "n"]:
+        if isinstance(condition, Grip):
+            return condition.region.distance(nodes if total else nodes - condition.motion.at(start))
+        return condition.shape.distance(nodes) if total else condition.distance(nodes, start)
+
+    return [(body.distance(x, start) < -margin).sum() for body in bodies], [depth(c) <= margin for c in fixed]
 
 
 def _beyond(box: StickyBox | SlipBox | SeparatingBox, grid: Grid, x: ParticleVector) -> int:
@@ -65,42 +92,13 @@ def _beyond(box: StickyBox | SlipBox | SeparatingBox, grid: Grid, x: ParticleVec
     return int(outside.any(axis=1).sum())
 
 
-@eqx.filter_jit
-def _depth(collider: AbstractCollider, x: ParticleVector) -> Float[Array, "p"]:
-    return collider.distance(x, jnp.zeros((), x.dtype))
-
-
-def _needs_all_nodes(condition: Grip | AbstractCollider, total: bool) -> bool:
-    """Whether the body may come to the boundary: then it is idle only if it holds no node at all."""
-    return not total and not isinstance(condition, Grip)
-
-
-def _is_idle(condition: Grip | AbstractCollider, grid: Grid, kernel: BSpline, x: ParticleVector, total: bool) -> bool:
-    """Whether it is certain never to act. In the total description, if no node that a particle reaches lies in it; in
-    the updated one, if it does not move and that is so of a grip, or of a collider and all nodes of a window at rest.
-    """
-    if not total and (not _rests(condition.motion) or grid.follow):
-        return False
-    nodes = grid.nodes(grid.window(x)).astype(x.dtype)
-    held = np.asarray(_held(condition, nodes, jnp.asarray(grid.spacing, x.dtype), total))
-    return not (held.any() if _needs_all_nodes(condition, total) else held[_reached(grid, kernel, x)].any())
-
-
-def _rests(motion: AbstractMotion | None) -> bool:
-    """Whether a motion is none, and known to be."""
-    if not isinstance(motion, Motion | RigidMotion):
-        return motion is None
+def _rests(condition: Grip | AbstractCollider, grid: Grid) -> bool:
+    """Whether a boundary condition is known not to move, nor the window."""
+    motion = condition.motion
+    if grid.follow or not isinstance(motion, Motion | RigidMotion):
+        return motion is None and not grid.follow
     rows = [motion.displacement] + ([motion.rotation] if isinstance(motion, RigidMotion) else [])
     return all((np.ptp(np.asarray(values), axis=0) == 0).all() for values in rows)
-
-
-@eqx.filter_jit
-def _held(condition: AbstractBoundary, nodes: NodeVector, spacing: Scalar, total: bool) -> Bool[Array, "n"]:
-    """Which nodes a boundary condition acts on at the start."""
-    zero = jnp.zeros((), nodes.dtype)
-    asked = condition.conditions(nodes, spacing, zero, zero + 1, reference=total)
-    held = asked.fixed.any(axis=1)
-    return held if asked.touch is None else held | (asked.touch.owner >= 0)
 
 
 def _reached(grid: Grid, kernel: BSpline, x: ParticleVector) -> np.ndarray:

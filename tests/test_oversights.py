@@ -34,7 +34,10 @@ DOUBTFUL = {
         {"boundary": mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.1), (0.0, 1.0)))},
         "12 of 36 .* SeparatingCollider",
     ),
-    "a grip beside the body": ({"boundary": mpm.Grip(FAR, STAY)}, "Grip .* touches nothing: .* a particle reaches"),
+    "a grip beside the body": (
+        {"boundary": mpm.Grip(FAR, STAY)},
+        "Grip .* touches nothing, since no node that a particle reaches",
+    ),
     "a moving one in the total description": ({"boundary": mpm.Grip(EDGE, GO)} | TOTAL, "Grip .* touches nothing"),
     "a collider there": ({"boundary": mpm.StickyCollider(FAR, TURN)} | TOTAL, "StickyCollider .* touches nothing"),
     "a collider between nodes": ({"boundary": mpm.SlipCollider(BETWEEN)}, "no node of the window lies in it"),
