@@ -120,7 +120,6 @@ def test_the_shell_prints_a_warning_in_a_line(tmp_path):
         UserWarning, match=r"36 particles of \[\[particles\]\] 2 lie in the region of \[\[particles\]\] 1"
     ):
         read_plan(scene)
-    (tmp_path / "run.h5").write_text("")
-    assert "exists" in refused("run", scene, "-o", tmp_path / "run.h5")
-    told = [line for line in shell("run", scene, "-o", tmp_path / "run.h5")[2].splitlines() if "warning" in line]
+    assert "no [fit] table" in refused("fit", scene)
+    told = [line for line in shell("fit", scene)[2].splitlines() if "warning" in line]
     assert [line.split(" particles")[0] for line in told] == ["warning: 36", "warning: 36 of 72"]
