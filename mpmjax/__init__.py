@@ -11,13 +11,14 @@ from mpmjax._exchange import Exchange
 from mpmjax._grid import Grid
 from mpmjax._guess import Guess
 from mpmjax._hessian import AnalyticHessian, JvpHessian
-from mpmjax._implicit import Linearised, Newton
+from mpmjax._implicit import Linearised
 from mpmjax._io import load, save
 from mpmjax._kernel import BSpline, MLSGradient, SplineGradient
 from mpmjax._method import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
 from mpmjax._metric import Metric
 from mpmjax._mirror import ContactPlane, SymmetryPlane
 from mpmjax._motion import AbstractMotion, Motion, RigidMotion
+from mpmjax._newton import Newton
 from mpmjax._particles import Particles, join
 from mpmjax._record import record
 from mpmjax._region import AbstractRegion, Ball, Box, Capsule, Cylinder, HalfSpace, Union

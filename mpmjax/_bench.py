@@ -13,11 +13,12 @@ import numpy as np
 import scipy.spatial
 
 from mpmjax._checks import canonical
+from mpmjax._faults import raise_faults
 from mpmjax._method import Method
 from mpmjax._particles import Particles, State, state_of, with_state
 from mpmjax._run import Run, SimulationError
 from mpmjax._scene import Scene, prepare
-from mpmjax._simulate import integrate, raise_faults
+from mpmjax._simulate import integrate
 from mpmjax._stability import stable_dt
 
 FRAMES = 8

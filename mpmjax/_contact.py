@@ -27,9 +27,9 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._constraint import Constraint
-from mpmjax._implicit import SolveInfo, no_solve
 from mpmjax._mirror import Contact, Mirror
 from mpmjax._nodes import Nodes
+from mpmjax._problems import SolveInfo, no_solve
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
 
 SWEEPS = 4

@@ -1,8 +1,6 @@
 """Scene files: TOML in, a scene with its particles and run settings out. `docs/scene_files.md` is the schema in
 words."""
 
-import csv
-import difflib
 import itertools
 import tomllib
 from collections.abc import Callable
@@ -16,6 +14,7 @@ import numpy as np
 
 from mpmjax._bench import Build, Trial
 from mpmjax._checks import require, require_positive, shortened, warn
+from mpmjax._columns import read_columns, reason_of
 from mpmjax._fit import FitResult, fit_curve, gauge
 from mpmjax._grid import Grid
 from mpmjax._method import Explicit, Method
@@ -31,8 +30,6 @@ from mpmjax._work_precision import METHODS, work_precision
 
 _FRAMES = 50
 """How many frames are saved where neither they nor the step are given."""
-_SHOWN = 20
-"""How many characters of a cell that is no number are shown."""
 
 
 class RunSettings(NamedTuple):
@@ -245,56 +242,15 @@ def _check_paths(fit: CurveSettings, scene: Scene) -> None:
         )
 
 
-def read_columns(path: Path, *names: str) -> list[np.ndarray]:
-    """Columns of a CSV file with a header; lines that start with # are comments.
-
-    Raises:
-        ValueError: no such file or column, or an entry that is no number.
-    """
-    try:
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line and not line.startswith("#")]
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"Cannot read the data file {path}: {_reason(error)}.") from None
-    columns: list[list[float]] = [[] for _ in names]
-    try:
-        reader = csv.DictReader(lines)
-        known = reader.fieldnames or []
-        for name in names:  # of what else is in the file nothing is said: it may be another file than was meant
-            close = difflib.get_close_matches(name, known, 1)
-            hint = f", did you mean {close[0]!r}?" if close else f" among its {len(known)}."
-            require(name in known, f"{path} has no column {name!r}{hint}")
-        for row, record in enumerate(reader, 1):
-            for column, name in zip(columns, names, strict=True):
-                cell = record[name]
-                where = f"{path}, data row {row}: {name} must be a finite number, got"
-                require(cell is not None, f"{where} a row that ends before it.")
-                try:
-                    column.append(float(cell))
-                except ValueError:
-                    raise ValueError(f"{where} {_shortened(cell)!r}.") from None
-                require(np.isfinite(column[-1]), f"{where} {_shortened(cell)!r}.")
-    except csv.Error as error:
-        raise ValueError(f"{path} is not a CSV file: {error}.") from None
-    return [np.asarray(column) for column in columns]
-
-
-def _shortened(cell: str) -> str:
-    return cell if len(cell) <= _SHOWN else cell[:_SHOWN] + "..."
-
-
 def _toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ValueError(f"Cannot read the scene file {path}: {_reason(error)}.") from None
+        raise ValueError(f"Cannot read the scene file {path}: {reason_of(error)}.") from None
     except RecursionError:
         raise ValueError(f"{path} is not a scene file: it is nested too deeply to be read.") from None
     except ValueError as error:  # TOML's and UTF-8's among them
         raise ValueError(f"{path} is not a TOML file: {shortened(str(error))}.") from None
-
-
-def _reason(error: Exception) -> str:
-    return (getattr(error, "strerror", None) or str(error)).lower()
 
 
 def _run_table(table: Any) -> RunTable:

@@ -18,10 +18,12 @@ from mpmjax._checks import require_between
 from mpmjax._conjugate_residual import ConjugateResidual, Reporting
 from mpmjax._guess import Guess
 from mpmjax._hessian import AnalyticHessian, Hessian, damped
-from mpmjax._implicit import Linearised, LinearProblem, Newton, NewtonProblem, SolveInfo, no_solve, solve
+from mpmjax._implicit import Linearised, solve
 from mpmjax._kinds import require_fields
 from mpmjax._metric import Metric
+from mpmjax._newton import Newton
 from mpmjax._nodes import Nodes
+from mpmjax._problems import LinearProblem, NewtonProblem, SolveInfo, no_solve
 from mpmjax._types import Array, Float, NodeVector, Scalar
 
 

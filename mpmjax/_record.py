@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from mpmjax._checks import canonical, require, require_whole, requirements
 from mpmjax._diffrax import HEALTHY, Tally, no_steps
+from mpmjax._faults import raise_faults
 from mpmjax._interrupt import reporting, undisturbed
 from mpmjax._io import FrameWriter
 from mpmjax._kinds import checked
@@ -18,7 +19,7 @@ from mpmjax._method import Explicit, Method
 from mpmjax._particles import Particles, State, state_of, with_state
 from mpmjax._run import Run, SimulationError
 from mpmjax._scene import Scene, prepare
-from mpmjax._simulate import integrate, number_of_steps, raise_faults
+from mpmjax._simulate import integrate, number_of_steps
 from mpmjax._stability import step_for
 from mpmjax._types import Scalar
 
@@ -134,6 +135,7 @@ def record(
             except OSError as refused:
                 said = str(refused)
             raise SimulationError(f"{error} {said}", error.run) from None
+        warn_of_short_solves(run.tally)
         return run
 
 

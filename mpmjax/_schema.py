@@ -30,11 +30,12 @@ from mpmjax._collider import SeparatingCollider, SlipCollider, StickyCollider
 from mpmjax._conjugate_residual import ConjugateResidual
 from mpmjax._grid import Grid
 from mpmjax._hessian import AnalyticHessian, JvpHessian
-from mpmjax._implicit import Linearised, Newton
+from mpmjax._implicit import Linearised
 from mpmjax._kernel import BSpline, MLSGradient, SplineGradient
 from mpmjax._method import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
 from mpmjax._mirror import ContactPlane, SymmetryPlane
 from mpmjax._motion import Motion, RigidMotion
+from mpmjax._newton import Newton
 from mpmjax._region import Ball, Box, Capsule, Cylinder, HalfSpace, Union
 from mpmjax._sampled import SampledDistance
 from mpmjax._scene import Scene, TotalLagrangian, UpdatedLagrangian

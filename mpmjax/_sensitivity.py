@@ -1,7 +1,7 @@
 """How a rollout's derivatives grow with its horizon."""
 
 import warnings
-from typing import Literal
+from typing import Any, Literal
 
 import diffrax
 import equinox as eqx

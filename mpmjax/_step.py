@@ -10,12 +10,12 @@ from mpmjax._checks import canonical, require_positive
 from mpmjax._constraint import Constraint
 from mpmjax._contact import NOTHING, ContactInfo, Held, find_active_set, hold, no_contact, touches
 from mpmjax._exchange import Exchange, received
-from mpmjax._implicit import SolveInfo
 from mpmjax._kernel import Stencil
 from mpmjax._kinds import checked
 from mpmjax._method import Explicit, Method, NodeMotion, viscous_impulse
 from mpmjax._nodes import Nodes, particles_to_grid
 from mpmjax._particles import Particles
+from mpmjax._problems import SolveInfo
 from mpmjax._scene import Scene, is_prepared, prepare
 from mpmjax._transfer import g2p
 from mpmjax._types import Array, Int, NodeScalar, NodeVector, Scalar, components, particle_first

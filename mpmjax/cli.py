@@ -130,9 +130,6 @@ def _summary(job: Job, run: Run, taken: int, seconds: float) -> str:
                 f"worst relative residual {float(run.tally.worst_residual):.2g}",
             )
         )
-    if int(run.tally.short) > 0:
-        missed = f"by less than ten times in {int(run.tally.short)} of {steps} steps: raise max_steps or rtol"
-        lines.append(("tolerance missed", missed))
     if int(run.tally.newton) > 0:
         lines.append(("Newton", f"{int(run.tally.newton) / steps:.3g} a step, {int(run.tally.line_search)} halvings"))
     if int(run.tally.indefinite) > 0:

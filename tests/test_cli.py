@@ -10,7 +10,8 @@ from disk import full_beyond
 from shell import refused, shell
 
 import mpmjax as mpm
-from mpmjax._job import read_columns, read_job, read_plan
+from mpmjax._columns import read_columns
+from mpmjax._job import read_job, read_plan
 from mpmjax.cli import _summary
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

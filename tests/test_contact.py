@@ -11,9 +11,9 @@ from numpy_oracle import grid_update
 import mpmjax as mpm
 from mpmjax._checks import canonical
 from mpmjax._contact import SWEEPS, ActiveSet, find_active_set, hold
-from mpmjax._implicit import no_solve
 from mpmjax._method import NodeMotion
 from mpmjax._nodes import particles_to_grid
+from mpmjax._problems import no_solve
 from mpmjax._step import impulses, update
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)

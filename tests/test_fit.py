@@ -11,8 +11,9 @@ import pytest
 from shell import refused, shell
 
 import mpmjax as mpm
+from mpmjax._columns import read_columns
 from mpmjax._fit import fit_curve, gauge
-from mpmjax._job import fit_job, read_columns, read_job
+from mpmjax._job import fit_job, read_job
 
 RUBBER = Path(__file__).parents[1] / "examples" / "rubber.toml"
 

@@ -10,7 +10,7 @@ from numpy_oracle import grid_update, stress
 
 import mpmjax as mpm
 from mpmjax._hessian import AnalyticHessian
-from mpmjax._implicit import LinearProblem, SolveInfo
+from mpmjax._problems import LinearProblem, SolveInfo
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 NEWTON = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12))

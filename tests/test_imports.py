@@ -25,11 +25,11 @@ LAYERS = (
     ("_particles", "_constituent", "_oversights", "_scene"),
     ("_metric", "_potential", "_hessian"),
     ("_conjugate_residual",),
-    ("_nodes", "_guess", "_implicit", "_contact"),
+    ("_nodes", "_guess", "_problems", "_newton", "_implicit", "_contact"),
     ("_method",),
     ("_step",),
     ("_stability",),
-    ("_advice", "_diffrax", "_run", "_simulate"),
+    ("_advice", "_diffrax", "_run", "_faults", "_simulate"),
 )
 LEAF = len(LAYERS)
 CORE_MAY_NOT_KNOW = {"diffrax", "h5py", "matplotlib", "optax", "optimistix", "time", "datetime", "tqdm", "typer"}
