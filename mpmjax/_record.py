@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from mpmjax._checks import canonical, require, require_whole, requirements
 from mpmjax._diffrax import HEALTHY, Tally, no_steps
-from mpmjax._faults import raise_faults
+from mpmjax._faults import raise_faults, warn_of_short_solves
 from mpmjax._interrupt import reporting, undisturbed
 from mpmjax._io import FrameWriter
 from mpmjax._kinds import checked
