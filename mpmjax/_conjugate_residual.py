@@ -49,7 +49,8 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
 
     Statistics returned: `num_steps` (applications of E in the recurrence), `residual` (the true ‖r‖/‖W⁻¹b‖),
     `spectral_radius` (the estimate of ‖E‖), `indefinite` (whether rᵀA r < 0 was met, beyond rounding: A then is not
-    positive definite; the converse does not hold).
+    positive definite; the converse does not hold), `short` (whether it did not converge, but came within ten times
+    `rtol`).
 
     *When it breaks*: on an indefinite A the recurrence stops where rᵀA r = 0; the result is then
     `RESULTS.breakdown`, never silence.
@@ -185,6 +186,7 @@ class ConjugateResidual(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
             "residual": residual / jnp.where(b_norm == 0, 1, b_norm),
             "spectral_radius": c.radius,
             "indefinite": c.indefinite,
+            "short": ~converged & (residual <= SHORT * rtol * b_norm),
         }
         return unravel(c.x), result, stats
 

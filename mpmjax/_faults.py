@@ -52,6 +52,8 @@ def raise_faults(run: Run, began: Particles, previous: State | None, start: int)
             passed = passed_particles(problem, previous, state_of(run.final), t)
             number, bad[BEYOND] = next((i, mask) for i, mask in passed if mask.any())
             what = f"{what} boundary {number}, {type(run.scene.boundary[number]).__name__}"
+            if run.scene.total:
+                advice = "In the total description it holds only what touched it from the start: use the updated one."
         first = int(np.argmax(np.asarray(bad[fault])))
         if fault == INADMISSIBLE:
             what, advice = disallowed(_law(run, first), run.method)
@@ -118,8 +120,7 @@ _FAULTS: dict[int, tuple[str, str]] = {
     OUTSIDE: ("left the grid's window", "Enlarge the grid's shape, or use follow=True."),
     BEYOND: (
         "passed",
-        "Reduce dt: a boundary keeps out what comes less than a cell nearer in a step. In the total description it "
-        "holds only what touched it from the start: use the updated one.",
+        "Reduce dt: a boundary keeps out what comes less than a cell nearer in a step.",
     ),
 }
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 
-from mpmjax._conjugate_residual import SHORT, ConjugateResidual, Reporting, default_rtol
+from mpmjax._conjugate_residual import ConjugateResidual, Reporting
 from mpmjax._kinds import require_fields
 from mpmjax._newton import Newton
 from mpmjax._problems import AbstractProblem, LinearProblem, SolveInfo
@@ -40,15 +40,13 @@ class Linearised(eqx.Module):
         rhs = split(problem.rhs - operator.unconstrained(lift), 0)
         options = {"metric": operator.metric(), "y0": split(guess, 0)}
         v, result, stats = self.solver.compute(self.solver.init(operator, options), rhs, options)
-        converged = result == lx.RESULTS.successful
-        rtol = default_rtol(rhs.dtype) if self.solver.rtol is None else self.solver.rtol
         info = SolveInfo(
             iterations=stats["num_steps"],
             newton=jnp.asarray(0, dtype=jnp.int32),
             line_search=jnp.asarray(0, dtype=jnp.int32),
             residual=stats["residual"],
-            converged=converged,
-            short=~converged & (stats["residual"] <= SHORT * rtol),
+            converged=result == lx.RESULTS.successful,
+            short=stats["short"],
             indefinite=stats["indefinite"],
             report=jnp.zeros_like(stats["residual"]),
         )
@@ -64,8 +62,8 @@ def solve(
         problem: the problem.
         guess: where the iteration starts; the result does not depend on it beyond the tolerance, nor its derivative.
         find: the iteration.
-        adjoint: solver of the tangent and adjoint systems. One that does not converge gives NaN derivatives, so that a
-            wrong gradient cannot pass for a right one.
+        adjoint: solver of the tangent and adjoint systems. What ends beyond ten times its tolerance gives NaN
+            derivatives, so that a wrong gradient cannot pass for a right one.
     """
     if not isinstance(adjoint, Reporting):
         adjoint = Reporting(adjoint, jnp.zeros((), guess.dtype))
@@ -93,7 +91,7 @@ def _solve_jvp(primals: Any, tangents: Any) -> Any:
     def solve_symmetric(matvec: Any, b: tuple[NodeVector, Array]) -> tuple[NodeVector, Array]:
         del matvec  # the same operator, slower
         x, result, stats = adjoint.compute(adjoint.init(assembled, options), b[0], options)
-        solved, known = result == lx.RESULTS.successful, jnp.isfinite(b[0]).all()
+        solved, known = (result == lx.RESULTS.successful) | stats["short"], jnp.isfinite(b[0]).all()
         residual = jnp.where(jnp.isfinite(stats["residual"]), stats["residual"], jnp.inf)
         return jnp.where(solved, x, jnp.nan), jnp.where(known & ~solved, residual, 0)
 

@@ -146,7 +146,7 @@ def simulate(
         final=with_state(particles, final),
         final_step=jnp.asarray(start, dtype) + tally.steps.astype(dtype),
         tally=tally,
-        report=report,
+        report=report if traced else None,
     )
     if not throw:
         return run
@@ -165,7 +165,7 @@ def rollout(
     steps: int,
     dt: Scalar,
     method: Method = Explicit(),
-    start: Any = 0,
+    start: Scalar = 0,
 ) -> Particles:
     """The plain rollout: `jax.lax.scan` over steps, without saving, checks or checkpoints. `simulate` is held to it.
 

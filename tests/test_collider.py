@@ -20,7 +20,7 @@ TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(solver=TIGHT),
-    "diagonal": mpm.SemiImplicit(solver=TIGHT, metric=mpm.Metric.DIAGONAL),
+    "mass": mpm.SemiImplicit(solver=TIGHT, metric=mpm.Metric.MASS),
     "backward_euler": mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12)),
     "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
     "trbdf2": mpm.TRBDF2(0.0, mpm.Linearised(TIGHT)),

@@ -116,3 +116,33 @@ def test_outside_of_jit_neither_a_run_nor_its_gradient_calls_the_host(monkeypatc
     assert np.isfinite(jax.grad(height)(10.0))
     with pytest.raises(AssertionError, match="callback"):
         jax.jit(height)(10.0)
+
+
+def test_a_derivative_that_misses_its_tolerance_by_little_is_taken():
+    """A tangent solve within ten times its tolerance has a solution, as the solve of a step has; beyond, it is NaN."""
+    scene, particles = block(1, side=3, material=LAWS["neo_hookean"], gravity=(-9.81,))
+
+    @jax.jit
+    def tangent(rtol):
+        adjoint = mpm.ConjugateResidual(rtol, max_steps=2)
+
+        def place(stiffness):
+            harder = eqx.tree_at(lambda s: s.material.youngs_modulus, scene, stiffness)
+            run = mpm.simulate(
+                harder,
+                particles,
+                t1=DT,
+                dt=DT,
+                method=mpm.SemiImplicit(adjoint_solver=adjoint),
+                adjoint=diffrax.ForwardMode(),
+                throw=False,
+            )
+            return run.final.x[0, 0], run.report
+
+        return jax.jvp(place, (1e6,), (1.0,))[1]
+
+    slope, residual = tangent(1e-12)
+    assert np.isnan(slope)
+    assert residual > 1e-9
+    assert [bool(np.isnan(tangent(residual / share)[0])) for share in (8.0, 12.0)] == [False, True]
+    assert tangent(residual / 8.0)[1] == 0

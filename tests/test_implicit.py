@@ -207,14 +207,16 @@ def test_newton_gives_up_after_thirty_halvings():
 
 def test_reports_of_two_solves_are_added_up():
     """Costs are summed and negative curvature is remembered; the quality is that of the later, or of the worse one."""
-    one = SolveInfo(*map(jnp.asarray, (5, 2, 1, 0.3, False, True)))
-    two = SolveInfo(*map(jnp.asarray, (7, 3, 4, 0.1, True, False)))
+    one = SolveInfo(*map(jnp.asarray, (5, 2, 1, 0.3, False, True, True, 0.0)))
+    two = SolveInfo(*map(jnp.asarray, (7, 3, 4, 0.1, True, False, False, 0.0)))
     for first, second in ((one, two), (two, one)):
         after, beside = first.plus(second), first.beside(second)
         for total in (after, beside):
             assert (total.iterations, total.newton, total.line_search, total.indefinite) == (12, 5, 5, True)
-        assert (after.residual, after.converged) == (second.residual, second.converged)
-        assert (beside.residual, beside.converged) == (0.3, False)
+        assert (after.residual, after.converged, after.short) == (second.residual, second.converged, second.short)
+        assert (beside.residual, beside.converged, beside.short) == (0.3, False, True)
+    beyond = eqx.tree_at(lambda info: info.short, one, jnp.asarray(False))
+    assert not beyond.beside(one).short
 
 
 @pytest.mark.parametrize("times", [1, 20, 100])

@@ -18,9 +18,10 @@ from mpmjax._step import advance
 
 
 def quiet(scene, particles, **options):
-    """The report, which must not warn."""
+    """The report, which must not warn but of what is thin."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message="The body is .* cells thick")
         return mpm.sensitivity(scene, particles, **options)
 
 

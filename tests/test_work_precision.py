@@ -25,12 +25,12 @@ def wave(n):
 
 
 def pulled(n):
-    """A stiff bar, pulled slowly: an explicit run of it takes some ten million steps."""
+    """A stiff bar, pulled slowly: an explicit run of it takes some hundred million steps."""
     grid = mpm.Grid((8 * n,), 0.1 / n, origin=(-2 * n,))
     bar = mpm.fill(mpm.Box((0.0,), (0.4,)), grid, particles_per_cell=2, density=1e3)
     motion = mpm.Motion((0.0, 10.0), ((0.0,), (0.1,)))
     ends = (mpm.SymmetryPlane(0, 0.0), mpm.Grip(mpm.Box((0.39,), (1.0,)), motion))
-    law = mpm.NeoHookean(youngs_modulus=1e13, poisson_ratio=0.3)
+    law = mpm.NeoHookean(youngs_modulus=1e15, poisson_ratio=0.3)
     return mpm.Scene(grid, law, boundary=ends, description=mpm.TotalLagrangian()), bar
 
 
@@ -94,11 +94,11 @@ def test_trials_refine_until_they_are_good(waves):
 def test_a_slow_pull_of_a_stiff_bar_is_not_run_explicitly():
     """It is foreseen to take too long, and the verdict says so; an explicit step of an implicit one's length fails."""
     tried = {"methods": (mpm.Explicit(), mpm.SemiImplicit()), "also": ((mpm.Explicit(), 1.25),)}
-    found = mpm.work_precision(pulled, t1=10.0, error=0.1, refinements=(1,), most_seconds=300.0, **tried)
+    found = mpm.work_precision(pulled, t1=10.0, error=0.1, refinements=(1,), **tried)
     explicit, *implicit, wild = found.trials
     assert wild.error == math.inf
     assert math.isnan(explicit.error)
-    assert explicit.seconds > 100
+    assert explicit.seconds > 30
     assert found.cheapest() == implicit[0]
     assert implicit[0].error < 0.1
     assert "SemiImplicit(beta=1), dt = 1.25 s (8 steps)" in found.verdict()
