@@ -102,7 +102,11 @@ MAY = {
     (mpm.render, "colour"),
     (mpm.sample_mesh, "mesh"),
     (mpm.fill, "dtype"),
-    *((call, name) for call in CALLS for name in ("observe", "build", "curve", "parameter", "report", "progress", "say")),
+    *(
+        (call, name)
+        for call in CALLS
+        for name in ("observe", "build", "curve", "parameter", "report", "progress", "say")
+    ),
 }
 """Arguments that take words, or any function."""
 
