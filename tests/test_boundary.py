@@ -264,6 +264,7 @@ def test_a_column_hangs_in_its_own_weight_from_a_symmetry_plane(kernel):
         gravity=(g,),
         boundary=mpm.SymmetryPlane(0, 0.0),
         kernel=kernel,
+        gradient=mpm.MLSGradient(),
         description=mpm.TotalLagrangian(),
     )
     after, _ = mpm.step(scene, particles, 0.0, 1e-6)

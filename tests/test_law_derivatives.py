@@ -183,7 +183,7 @@ def test_every_route_to_a_return_maps_derivative_is_right(name, d):
 
     changed = np.abs(returned(F)[: d * d] - F.reshape(d * d, -1)).max(axis=0)
     inside = states[0][0].shape[-1]
-    assert (changed[:inside] == 0).all()
+    assert (changed[:inside] < 5e-4).all()  # sand takes back the volume that its history remembers
     assert (changed[inside:] > 1e-3).all()
     exact = differences(returned, F, G, (1, 2), 0.01)
     W = jnp.asarray(np.random.default_rng(4).normal(size=exact[0].shape))
