@@ -42,7 +42,7 @@ def replacing(path: Path) -> Iterator[Path]:
             aside.unlink(missing_ok=True)
 
 
-def save_figure(figure: Any, path: Path, dpi: float) -> None:
+def save_figure(figure: Any, path: Path, dpi: float | int) -> None:
     """Write a figure of matplotlib, of the kind that the suffix says, PNG where there is none.
 
     It is drawn in memory first: matplotlib's writers do not all report what the disk refuses.
