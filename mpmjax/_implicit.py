@@ -99,8 +99,11 @@ def _solve_jvp(primals: Any, tangents: Any) -> Any:
     lift = split(0, -d_residual)
     rhs = split(-d_residual - operator.unconstrained(lift), 0)
     d_slot = rhs[:0].sum() + (0 if d_slot is None else d_slot)  # linear in tangents also where nobody listens
-    dv, d_report = jax.lax.custom_linear_solve(
-        lambda x: (operator.mv(x[0]), x[1]), (rhs, d_slot), solve_symmetric, symmetric=True
-    )
+
+    def matvec(x: tuple[NodeVector, Array]) -> tuple[NodeVector, Array]:
+        y = operator.mv(x[0])
+        return y, x[1] + y[:0].sum()  # as above, of the next order's tangents
+
+    dv, d_report = jax.lax.custom_linear_solve(matvec, (rhs, d_slot), solve_symmetric, symmetric=True)
     d_info = eqx.tree_at(lambda i: i.report, jax.tree.map(lambda _: None, info), d_report, is_leaf=lambda a: a is None)
     return (v, info), (dv + lift, d_info)
