@@ -12,10 +12,10 @@ from calls import PARTICLES, RUN, SCENE
 import mpmjax as mpm
 
 
-def test_bad_arguments_end_in_value_errors():
+def test_bad_arguments_end_in_value_errors(tmp_path):
     """Of one line, whichever argument it is; and what is of no kind is not taken."""
     script = Path(__file__).parent / "calls.py"
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
 
 
