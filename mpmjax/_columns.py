@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mpmjax._aside import reason
 from mpmjax._checks import require, shortened
 
 
@@ -18,7 +19,7 @@ def read_columns(path: Path, *names: str) -> list[np.ndarray]:
     try:
         lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line and not line.startswith("#")]
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"Cannot read the data file {path}: {reason_of(error)}.") from None
+        raise ValueError(f"Cannot read the data file {path}: {reason(error).lower()}.") from None
     columns: list[list[float]] = [[] for _ in names]
     try:
         reader = csv.DictReader(lines)
@@ -40,8 +41,3 @@ def read_columns(path: Path, *names: str) -> list[np.ndarray]:
     except csv.Error as error:
         raise ValueError(f"{path} is not a CSV file: {error}.") from None
     return [np.asarray(column) for column in columns]
-
-
-def reason_of(error: Exception) -> str:
-    """Why a file could not be read, in a few words."""
-    return (getattr(error, "strerror", None) or str(error)).lower()

@@ -12,9 +12,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from mpmjax._aside import reason
 from mpmjax._bench import Build, Trial
 from mpmjax._checks import require, require_positive, shortened, warn
-from mpmjax._columns import read_columns, reason_of
+from mpmjax._columns import read_columns
 from mpmjax._fit import FitResult, fit_curve, gauge
 from mpmjax._grid import Grid
 from mpmjax._method import Explicit, Method
@@ -246,7 +247,7 @@ def _toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ValueError(f"Cannot read the scene file {path}: {reason_of(error)}.") from None
+        raise ValueError(f"Cannot read the scene file {path}: {reason(error).lower()}.") from None
     except RecursionError:
         raise ValueError(f"{path} is not a scene file: it is nested too deeply to be read.") from None
     except ValueError as error:  # TOML's and UTF-8's among them
