@@ -21,10 +21,10 @@ if TYPE_CHECKING:  # a static checker need not follow NumPy arrays into JAX expr
     Scalar = float | Array
     PerParticle = float | Array
 else:
-    Scalar = float | int | Float[Array, ""] | Float[np.ndarray, ""] | np.floating
+    Scalar = float | int | Float[Array, ""] | Float[np.ndarray, ""] | np.floating | np.integer
     """A number, or an array without axes."""
 
-    PerParticle = float | int | Float[Array, "*#p"] | Float[np.ndarray, "*#p"] | np.floating
+    PerParticle = float | int | Float[Array, "*#p"] | Float[np.ndarray, "*#p"] | np.floating | np.integer
     """One value for all particles, or one for each."""
 
 Point = tuple[float | int | Array, ...] | list[float | int] | Float[Array, "d"] | Float[np.ndarray, "d"]

@@ -99,9 +99,10 @@ def test_a_slow_pull_of_a_stiff_bar_is_not_run_explicitly():
     assert wild.error == math.inf
     assert math.isnan(explicit.error)
     assert explicit.seconds > 30
-    assert found.cheapest() == implicit[0]
-    assert implicit[0].error < 0.1
-    assert "SemiImplicit(beta=1), dt = 1.25 s (8 steps)" in found.verdict()
+    good = [trial for trial in implicit if trial.error < 0.1]
+    cheapest = found.cheapest()
+    assert cheapest == min(good, key=lambda trial: trial.seconds)
+    assert f"SemiImplicit(beta=1), dt = {cheapest.dt:g} s ({cheapest.steps} steps)" in found.verdict()
     assert "Explicit()" in found.verdict()
     assert "would need" in found.verdict()
 
