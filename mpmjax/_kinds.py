@@ -30,6 +30,7 @@ _LARGEST = 2**63  # arrays hold no whole number beyond
 _WORDS: dict[Any, str] = {
     float: "a number",
     np.floating: "a number",
+    np.integer: "a number",
     jax.Array: "a number",
     int: "a whole number",
     bool: "True or False",
