@@ -31,8 +31,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mpmjax as mpm
-from mpmjax._hessian import ImplicitOperator
-from mpmjax._nodes import Nodes, particles_to_grid
+from mpmjax.implicit._hessian import ImplicitOperator
+from mpmjax.stepping._nodes import Nodes, particles_to_grid
 
 sys.path.append(str(Path(__file__).parent))
 from gradient import best_of

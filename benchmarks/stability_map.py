@@ -30,10 +30,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mpmjax as mpm
-from mpmjax._mirror import mirror
-from mpmjax._potential import ElasticPotential
-from mpmjax._transfer import p2g
 from mpmjax._types import components
+from mpmjax.boundary._mirror import mirror
+from mpmjax.discretisation._transfer import p2g
+from mpmjax.implicit._potential import ElasticPotential
 
 sys.path += [str(Path(__file__).parents[1] / "tests" / folder) for folder in ("", "validation")]
 jax.config.update("jax_enable_x64", True)

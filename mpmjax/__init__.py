@@ -1,38 +1,53 @@
 """A differentiable Material Point Method in JAX, with explicit and implicit grid updates."""
 
-from mpmjax._bench import Trial
-from mpmjax._body_force import AbstractBodyForce
-from mpmjax._boundary import AbstractBoundary, Conditions, Grip, SeparatingBox, SlipBox, StickyBox
-from mpmjax._budget import Budget, EnergyBudget, MomentumBudget, budget
-from mpmjax._collider import AbstractCollider, SeparatingCollider, SlipCollider, StickyCollider
-from mpmjax._conjugate_residual import ConjugateResidual
-from mpmjax._diagnostics import Energy, energy, momentum, pieces
-from mpmjax._exchange import Exchange
-from mpmjax._grid import Grid
-from mpmjax._guess import Guess
-from mpmjax._hessian import AnalyticHessian, JvpHessian
-from mpmjax._implicit import Linearised
-from mpmjax._io import load, save
-from mpmjax._kernel import BSpline, MLSGradient, SplineGradient
-from mpmjax._method import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
-from mpmjax._metric import Metric
-from mpmjax._mirror import ContactPlane, SymmetryPlane
-from mpmjax._motion import AbstractMotion, Motion, RigidMotion
-from mpmjax._newton import Newton
-from mpmjax._particles import Particles, join
-from mpmjax._record import record
-from mpmjax._region import AbstractRegion, Ball, Box, Capsule, Cylinder, HalfSpace, Union
-from mpmjax._render import render
-from mpmjax._run import Run, SimulationError
-from mpmjax._sample import fill
-from mpmjax._sampled import SampledDistance, sample_distance, sample_mesh
-from mpmjax._scene import Scene, TotalLagrangian, UpdatedLagrangian, prepare
-from mpmjax._sensitivity import Sensitivity, sensitivity
-from mpmjax._simulate import rollout, simulate
-from mpmjax._stability import stable_dt
-from mpmjax._step import StepInfo, step
-from mpmjax._transfer import APIC, FLIP, PIC
-from mpmjax._work_precision import WorkPrecision, work_precision
+from mpmjax.analysis import (
+    Budget,
+    Energy,
+    EnergyBudget,
+    MomentumBudget,
+    Sensitivity,
+    Trial,
+    WorkPrecision,
+    budget,
+    energy,
+    momentum,
+    pieces,
+    sensitivity,
+    work_precision,
+)
+from mpmjax.boundary import (
+    AbstractBoundary,
+    AbstractCollider,
+    Conditions,
+    ContactPlane,
+    Exchange,
+    Grip,
+    SeparatingBox,
+    SeparatingCollider,
+    SlipBox,
+    SlipCollider,
+    StickyBox,
+    StickyCollider,
+    SymmetryPlane,
+)
+from mpmjax.discretisation import APIC, FLIP, PIC, BSpline, Grid, MLSGradient, SplineGradient
+from mpmjax.geometry import (
+    AbstractMotion,
+    AbstractRegion,
+    Ball,
+    Box,
+    Capsule,
+    Cylinder,
+    HalfSpace,
+    Motion,
+    RigidMotion,
+    SampledDistance,
+    Union,
+    sample_distance,
+    sample_mesh,
+)
+from mpmjax.implicit import AnalyticHessian, ConjugateResidual, Guess, JvpHessian, Linearised, Metric, Newton
+from mpmjax.io import load, record, save
 from mpmjax.material import (
     AbstractMaterial,
     AbstractPlastic,
@@ -47,6 +62,10 @@ from mpmjax.material import (
     Viscous,
     VonMises,
 )
+from mpmjax.simulation import Run, SimulationError, rollout, simulate
+from mpmjax.state import AbstractBodyForce, Particles, Scene, TotalLagrangian, UpdatedLagrangian, fill, join, prepare
+from mpmjax.stepping import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit, StepInfo, stable_dt, step
+from mpmjax.viz import render
 
 __version__ = "0.1.0"
 

@@ -15,7 +15,7 @@ from helpers import block
 from test_schema import EXAMPLES
 
 import mpmjax as mpm
-from mpmjax._fit import fit_curve
+from mpmjax.fitting._fit import fit_curve
 
 SCENE, PARTICLES = block(2)
 

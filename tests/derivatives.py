@@ -13,8 +13,9 @@ import numpy as np
 from helpers import DESCRIPTIONS, ELASTIC, FLUIDS, PLASTIC, VISCOUS, block
 
 import mpmjax as mpm
-from mpmjax import _simulate, _step
-from mpmjax._contact import Held
+from mpmjax.simulation import _simulate
+from mpmjax.stepping import _step
+from mpmjax.stepping._contact import Held
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-14)  # that is, down to rounding: central differences see every digit
 UPDATES = {

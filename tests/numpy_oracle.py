@@ -11,10 +11,10 @@ import jax
 import numpy as np
 
 import mpmjax as mpm
-from mpmjax import _step
-from mpmjax._checks import canonical
-from mpmjax._nodes import Nodes, particles_to_grid
-from mpmjax._step import StepInfo, advance, update
+from mpmjax.checks._values import canonical
+from mpmjax.stepping import _step
+from mpmjax.stepping._nodes import Nodes, particles_to_grid
+from mpmjax.stepping._step import StepInfo, advance, update
 
 
 def kernel(order: int, u: float) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 from typer.testing import CliRunner
 
-from mpmjax.cli import app
+from mpmjax.cli._commands import app
 
 
 def shell(*words: object) -> tuple[int, str, str]:

@@ -7,8 +7,8 @@ import pytest
 from helpers import METHODS, SECOND_ORDER, block, ids
 
 import mpmjax as mpm
-from mpmjax._step import advance_compiled
 from mpmjax._types import Array, ParticleVector, Scalar
+from mpmjax.stepping._step import advance_compiled
 
 
 class Wind(mpm.AbstractBodyForce):

@@ -11,7 +11,7 @@ import pytest
 from helpers import ELASTIC, FLUIDS, METHODS, PLASTIC, SECOND_ORDER, VISCOUS, block, ids
 
 import mpmjax as mpm
-from mpmjax._checks import canonical, first_unmet, requirements
+from mpmjax.checks._values import canonical, first_unmet, requirements
 from mpmjax.material import Tait
 
 MOTION = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.1, 0.1)))

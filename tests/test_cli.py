@@ -10,9 +10,9 @@ from disk import full_beyond
 from shell import refused, shell
 
 import mpmjax as mpm
-from mpmjax._columns import read_columns
-from mpmjax._job import read_job, read_plan
-from mpmjax.cli import _summary
+from mpmjax.cli._commands import _summary
+from mpmjax.cli._scene_file import read_job, read_plan
+from mpmjax.fitting._columns import read_columns
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SCENE = """
@@ -78,7 +78,7 @@ def test_run_writes_the_frames_and_a_summary(folder):
 
 def test_run_reports_what_simulate_returns(folder):
     """The recorded run is the simulated one."""
-    from mpmjax._job import read_job
+    from mpmjax.cli._scene_file import read_job
 
     job = read_job(folder / "scene.toml")
     run = mpm.simulate(job.scene, job.particles, t1=job.run.t1, dt=job.run.dt, method=job.run.method)

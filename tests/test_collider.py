@@ -12,9 +12,9 @@ from helpers import LAWS, QUICK, assert_close, cloud, explicit_limit, ids
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax._boundary import combine
-from mpmjax._constraint import Constraint
-from mpmjax._hessian import ImplicitOperator
+from mpmjax.boundary._walls import combine
+from mpmjax.implicit._constraint import Constraint
+from mpmjax.implicit._hessian import ImplicitOperator
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {

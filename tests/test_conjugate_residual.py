@@ -11,12 +11,12 @@ import pytest
 from helpers import LAWS, assert_close, explicit_limit
 
 import mpmjax as mpm
-from mpmjax._constraint import Constraint
-from mpmjax._hessian import ImplicitOperator
-from mpmjax._mirror import mirror
-from mpmjax._potential import ElasticPotential
-from mpmjax._transfer import p2g
 from mpmjax._types import components
+from mpmjax.boundary._mirror import mirror
+from mpmjax.discretisation._transfer import p2g
+from mpmjax.implicit._constraint import Constraint
+from mpmjax.implicit._hessian import ImplicitOperator
+from mpmjax.implicit._potential import ElasticPotential
 
 N = 24
 DTYPES = {"float64": jnp.float64, "float32": jnp.float32}

@@ -9,12 +9,12 @@ from helpers import QUICK, assert_close, explicit_limit, ids
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax._checks import canonical
-from mpmjax._contact import SWEEPS, ActiveSet, find_active_set, hold
-from mpmjax._method import NodeMotion
-from mpmjax._nodes import particles_to_grid
-from mpmjax._problems import no_solve
-from mpmjax._step import impulses, update
+from mpmjax.checks._values import canonical
+from mpmjax.implicit._problems import no_solve
+from mpmjax.stepping._contact import SWEEPS, ActiveSet, find_active_set, hold
+from mpmjax.stepping._method import NodeMotion
+from mpmjax.stepping._nodes import particles_to_grid
+from mpmjax.stepping._step import impulses, update
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(solver=TIGHT)}

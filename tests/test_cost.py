@@ -11,13 +11,13 @@ import pytest
 from helpers import DESCRIPTIONS, KERNELS, METHODS, SECOND_ORDER, block, ids
 
 import mpmjax as mpm
-from mpmjax._checks import canonical
-from mpmjax._constraint import Constraint
-from mpmjax._contact import Held
-from mpmjax._diffrax import Problem
-from mpmjax._nodes import Nodes
-from mpmjax._rule import _values
-from mpmjax._step import advance
+from mpmjax.autodiff._rule import _values
+from mpmjax.checks._values import canonical
+from mpmjax.implicit._constraint import Constraint
+from mpmjax.simulation._diffrax import Problem
+from mpmjax.stepping._contact import Held
+from mpmjax.stepping._nodes import Nodes
+from mpmjax.stepping._step import advance
 
 LAW = mpm.NeoHookean(1e5, 0.3)
 COUNTED = ("stencil_spread", "stencil_collect", "while", "floor", "exp", "log")

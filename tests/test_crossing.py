@@ -10,9 +10,9 @@ import pytest
 from helpers import DIMS, GRADIENTS, KERNELS, assert_close, ids
 
 import mpmjax as mpm
-from mpmjax import _crossing
-from mpmjax._crossing import collect, spread
-from mpmjax._kernel import Stencil, make_stencil
+from mpmjax.discretisation import _transfer_sums as _crossing
+from mpmjax.discretisation._kernel import Stencil, make_stencil
+from mpmjax.discretisation._transfer_sums import collect, spread
 
 P = 17
 EACH_KERNEL = pytest.mark.parametrize("kernel", **ids(KERNELS))

@@ -11,9 +11,9 @@ import pytest
 from shell import refused, shell
 
 import mpmjax as mpm
-from mpmjax._columns import read_columns
-from mpmjax._fit import fit_curve, gauge
-from mpmjax._job import fit_job, read_job
+from mpmjax.cli._scene_file import fit_job, read_job
+from mpmjax.fitting._columns import read_columns
+from mpmjax.fitting._fit import fit_curve, gauge
 
 RUBBER = Path(__file__).parents[1] / "examples" / "rubber.toml"
 

@@ -11,8 +11,8 @@ from shell import refused
 from test_cli import SCENE
 
 import mpmjax as mpm
-from mpmjax import _memory
-from mpmjax._job import read_plan
+from mpmjax.checks import _memory
+from mpmjax.cli._scene_file import read_plan
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SPOILT = {"jelly": range(40), "rubber": range(200, 220)}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers import FORWARD, REVERSE, SECOND, ids
 
-from mpmjax._guard import guard
+from mpmjax.autodiff._guard import guard
 
 
 def guarded(x):

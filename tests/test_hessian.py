@@ -11,15 +11,15 @@ from deformations import STRETCHES, deformations
 from helpers import DESCRIPTIONS, DIMS, ELASTIC, GRADIENTS, LAWS, cloud
 
 import mpmjax as mpm
-from mpmjax._boundary import combine
-from mpmjax._constituent import Constituent
-from mpmjax._constraint import Constraint
-from mpmjax._hessian import ImplicitOperator
-from mpmjax._kernel import make_stencil
-from mpmjax._mirror import mirror
-from mpmjax._potential import ElasticPotential
-from mpmjax._transfer import p2g
 from mpmjax._types import components
+from mpmjax.boundary._mirror import mirror
+from mpmjax.boundary._walls import combine
+from mpmjax.discretisation._kernel import make_stencil
+from mpmjax.discretisation._transfer import p2g
+from mpmjax.implicit._constraint import Constraint
+from mpmjax.implicit._hessian import ImplicitOperator
+from mpmjax.implicit._potential import ElasticPotential
+from mpmjax.state._constituent import Constituent
 
 DX = 0.1
 CASES = {

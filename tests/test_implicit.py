@@ -9,8 +9,8 @@ from helpers import DESCRIPTIONS, ELASTIC, LAWS, assert_close, block, explicit_l
 from numpy_oracle import grid_update, stress
 
 import mpmjax as mpm
-from mpmjax._hessian import AnalyticHessian
-from mpmjax._problems import LinearProblem, SolveInfo
+from mpmjax.implicit._hessian import AnalyticHessian
+from mpmjax.implicit._problems import LinearProblem, SolveInfo
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 NEWTON = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12))

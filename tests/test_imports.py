@@ -1,47 +1,46 @@
 """Imports run one way, files stay small, and importing the package does nothing else."""
 
 import ast
+import re
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "mpmjax"
+MAP = PACKAGE.parent / "CONTRIBUTING.md"
 FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.rglob("*.py"))}
 
-# Each layer may import from itself and from those before it; what is not listed is a leaf, on top of them all.
-LAYERS = (
-    ("_types", "_checks", "_constraint", "_rule", "_guard", "_kinds", "_memory"),
-    ("_grid", "_region", "_motion"),
-    ("_kernel",),
-    ("_crossing", "_sampled"),
-    ("_transfer",),
-    ("_linalg",),
-    ("_isotropic",),
-    ("material",),
-    ("_boundary", "_body_force"),
-    ("_mirror", "_collider", "_exchange"),
-    ("_particles", "_constituent", "_oversights", "_scene"),
-    ("_metric", "_potential", "_hessian"),
-    ("_conjugate_residual",),
-    ("_nodes", "_guess", "_problems", "_newton", "_implicit", "_contact"),
-    ("_method",),
-    ("_step",),
-    ("_stability",),
-    ("_advice", "_diffrax", "_run", "_faults", "_simulate"),
+# Each room may import from those before it.
+ROOMS = (
+    "checks",
+    "autodiff",
+    "linalg",
+    "material",
+    "discretisation",
+    "geometry",
+    "boundary",
+    "state",
+    "implicit",
+    "stepping",
+    "simulation",
+    "analysis",
+    "io",
+    "fitting",
+    "viz",
+    "cli",
+    "verification",
 )
-LEAF = len(LAYERS)
-CORE_MAY_NOT_KNOW = {"diffrax", "h5py", "matplotlib", "optax", "optimistix", "time", "datetime", "tqdm", "typer"}
-
-
-def noun(name: str) -> str:
-    """The noun of a file or of a dotted module name below `mpmjax`: its first part."""
-    return name.replace("/", ".").removesuffix(".py").split(".")[0]
+STEP = ROOMS[: ROOMS.index("stepping") + 1]
+STEP_MAY_NOT_KNOW = {"diffrax", "h5py", "matplotlib", "optax", "optimistix", "time", "datetime", "tqdm", "typer"}
+MODULES = {f"mpmjax.{name.removesuffix('.py').replace('/', '.')}" for name in FILES}
+INSIDE = [name for name in FILES if "/" in name]
 
 
 def imported(path: Path) -> set[str]:
-    """The modules that a file imports, also inside functions; `from mpmjax import _a` counts as `mpmjax._a`."""
+    """The modules that a file imports, also inside functions; `from mpmjax import linalg` counts as `mpmjax.linalg`."""
     names = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -53,59 +52,43 @@ def imported(path: Path) -> set[str]:
     return names
 
 
-def own(path: Path) -> set[str]:
-    """The nouns of this package that a file imports."""
-    return {noun(name.removeprefix("mpmjax.")) for name in imported(path) if name.split(".")[0] == "mpmjax"}
+def test_the_rooms_are_the_folders():
+    """Every folder is a room of the table, and every room a folder."""
+    assert {name.split("/")[0] for name in INSIDE} == set(ROOMS)
+    assert set(FILES) - set(INSIDE) == {"__init__.py", "_types.py"}
 
 
-GRAPH = {name: own(path) for name, path in FILES.items() if name != "__init__.py"}
-BY_NOUN: dict[str, set[str]] = {}
-for _name, _targets in GRAPH.items():
-    BY_NOUN.setdefault(noun(_name), set()).update(_targets - {noun(_name)})
-
-
-def rank(name: str) -> int:
-    return next((i for i, layer in enumerate(LAYERS) if name in layer), LEAF)
-
-
-def reachable(name: str) -> set[str]:
-    """A noun and all it imports, directly or not."""
-    seen, todo = set(), [name]
-    while todo:
-        current = todo.pop()
-        if current not in seen:
-            seen.add(current)
-            todo += BY_NOUN[current]
-    return seen
-
-
-def test_the_layers_are_files():
-    """Every noun of the table exists, and every import within the package is of one that does."""
-    assert {name for layer in LAYERS for name in layer} <= BY_NOUN.keys()
-    assert set().union(*BY_NOUN.values()) <= BY_NOUN.keys()
-
-
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", INSIDE)
 def test_imports_run_one_way(name):
-    """No file imports from a later layer; leaves are imported by leaves alone."""
-    later = {target for target in GRAPH.get(name, set()) if rank(target) > rank(noun(name))}
-    assert not later, f"{name} imports {later}, which stand above it"
+    """A file imports from its own room's files, and from the face (`__init__.py`) of the rooms before it."""
+    room = name.split("/")[0]
+    known = {"mpmjax._types", *(f"mpmjax.{earlier}" for earlier in ROOMS[: ROOMS.index(room)])}
+    own = {module for module in imported(FILES[name]) if module.split(".")[0] == "mpmjax"}
+    beyond = {module for module in own - known if not module.startswith(f"mpmjax.{room}.")}
+    assert not beyond
 
 
-@pytest.mark.parametrize("name", sorted(BY_NOUN))
-def test_no_noun_imports_itself_through_others(name):
-    """There is no cycle."""
-    assert all(name not in reachable(target) for target in BY_NOUN[name])
+def test_no_file_imports_itself_through_others():
+    """There is no cycle within a room; between rooms there is an order."""
+    graph = {
+        f"mpmjax.{name.removesuffix('.py').replace('/', '.')}": imported(path) & MODULES for name, path in FILES.items()
+    }
+    TopologicalSorter(graph).prepare()
 
 
-def test_the_step_knows_no_driver_no_file_no_clock_no_screen():
-    """`_step.py` and all it imports know neither diffrax nor optax, h5py, tqdm, matplotlib, time."""
-    core = reachable("_step")
-    assert {"_kernel", "_transfer", "_hessian", "material"} <= core
-    for name, path in FILES.items():
-        if noun(name) in core:
-            known = {module.split(".")[0] for module in imported(path)} & CORE_MAY_NOT_KNOW
-            assert not known, f"{name} imports {known}"
+@pytest.mark.parametrize("name", [name for name in INSIDE if name.split("/")[0] in STEP])
+def test_the_step_knows_no_driver_no_file_no_clock_no_screen(name):
+    """`stepping` and the rooms below it know neither diffrax nor h5py, matplotlib, tqdm, time."""
+    assert not {module.split(".")[0] for module in imported(FILES[name])} & STEP_MAY_NOT_KNOW
+
+
+def test_the_map_is_the_tree():
+    """The table of CONTRIBUTING.md names every room, in the order of their imports, and every file of each."""
+    rows = re.findall(r"^\| `(\w+)/` \| (.*?) \|$", MAP.read_text(), flags=re.MULTILINE)
+    assert [room for room, _ in rows] == list(ROOMS)
+    for room, words in rows:
+        own = {name.split("/")[1] for name in INSIDE if name.startswith(f"{room}/")} - {"__init__.py", "__main__.py"}
+        assert set(re.findall(r"`(\w+\.py)`", words)) == own, room
 
 
 @pytest.mark.parametrize("name", FILES)

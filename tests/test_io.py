@@ -15,14 +15,14 @@ from disk import full_beyond
 from helpers import DESCRIPTIONS, DIMS, TRANSFERS, block, cloud, ids
 
 import mpmjax as mpm
-import mpmjax._io
-from mpmjax._diffrax import Tally, no_steps
-from mpmjax._io import FrameWriter, load, save
-from mpmjax._particles import Particles, state_of
-from mpmjax._record import record
-from mpmjax._run import Run
-from mpmjax._scene import prepare
-from mpmjax._simulate import integrate
+import mpmjax.io._runs
+from mpmjax.io._record import record
+from mpmjax.io._runs import FrameWriter, load, save
+from mpmjax.simulation._diffrax import Tally, no_steps
+from mpmjax.simulation._run import Run
+from mpmjax.simulation._simulate import integrate
+from mpmjax.state._particles import Particles, state_of
+from mpmjax.state._scene import prepare
 
 DTYPES = {"float32": jnp.float32, "float64": jnp.float64}
 STEPPERS = {
@@ -143,7 +143,7 @@ def test_saving_is_all_or_nothing(tmp_path, monkeypatch):
     """A save that fails on the way leaves the file that was there, and no litter."""
     path, run = tmp_path / "run.h5", made_up(2)
     save(path, run)
-    monkeypatch.setattr(mpmjax._io, "set_count", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    monkeypatch.setattr(mpmjax.io._runs, "set_count", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match=r"frame 0 could not be written \(disk full\)"):
         save(path, eqx.tree_at(lambda r: r.dt, run, jnp.asarray(2e-3)))
     assert_same(load(path), run)
@@ -271,7 +271,7 @@ def test_an_interrupt_leaves_complete_frames_and_can_be_resumed(tmp_path, monkey
     path, (scene, particles) = tmp_path / "run.h5", jelly()
     kwargs = {"dt": 5e-3, "save_every": 4}
     single = mpm.simulate(scene, particles, t1=0.07, **kwargs)
-    set_count, calls = mpmjax._io.set_count, []
+    set_count, calls = mpmjax.io._runs.set_count, []
 
     def interrupted(file, count):
         calls.append(count)
@@ -280,7 +280,7 @@ def test_an_interrupt_leaves_complete_frames_and_can_be_resumed(tmp_path, monkey
         set_count(file, count)
 
     with monkeypatch.context() as patch:
-        patch.setattr(mpmjax._io, "set_count", interrupted)
+        patch.setattr(mpmjax.io._runs, "set_count", interrupted)
         with pytest.raises(KeyboardInterrupt):
             record(path, scene, particles, t1=0.07, **kwargs)
     assert calls == [1, 2, 3]

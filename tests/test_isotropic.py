@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers import DIMS, assert_close, ids, rotation_matrix
 
-from mpmjax._isotropic import Logarithm, PowerLessOne
+from mpmjax.linalg._spectral import Logarithm, PowerLessOne
 
 FUNCTIONS = {"logarithm": Logarithm()} | {
     f"power {a}": PowerLessOne(jnp.array([a]), jnp.array([c])) for a, c in ((-0.4, 0.3), (-1e-9, 1e-8), (1.7, -0.2))

@@ -7,7 +7,7 @@ import pytest
 from deformations import STRETCHES, deformations
 from helpers import DIMS, assert_close, rotation_matrix
 
-from mpmjax import _linalg as la
+from mpmjax import linalg as la
 
 EACH_DIM = pytest.mark.parametrize("d", DIMS)
 EACH_FAMILY = pytest.mark.parametrize("family", STRETCHES)

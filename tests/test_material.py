@@ -9,7 +9,7 @@ from deformations import STRETCHES, deformations
 from helpers import DIMS, ELASTIC, LAWS, assert_close, ids, rotation_matrix
 
 import mpmjax as mpm
-from mpmjax import _linalg as la
+from mpmjax import linalg as la
 
 EACH_LAW = pytest.mark.parametrize("law", **ids(ELASTIC))
 EACH_DIM = pytest.mark.parametrize("d", DIMS)

@@ -10,8 +10,8 @@ import pytest
 from helpers import DESCRIPTIONS, GRADIENTS, LAWS, QUICK, assert_close, block, cloud, explicit_limit, ids
 
 import mpmjax as mpm
-from mpmjax._hessian import ImplicitOperator
-from mpmjax._nodes import particles_to_grid
+from mpmjax.implicit._hessian import ImplicitOperator
+from mpmjax.stepping._nodes import particles_to_grid
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-11)
 IMPLICIT = {

@@ -8,7 +8,7 @@ from helpers import assert_close
 from scipy.spatial.transform import Rotation
 
 import mpmjax as mpm
-from mpmjax._checks import canonical
+from mpmjax.checks._values import canonical
 
 TIMES = (0.0, 1.0, 3.0)
 MOTIONS = {

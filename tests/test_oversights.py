@@ -14,7 +14,7 @@ from shell import refused, shell
 from test_cli import SCENE
 
 import mpmjax as mpm
-from mpmjax._job import read_plan
+from mpmjax.cli._scene_file import read_plan
 
 TOTAL = {"description": mpm.TotalLagrangian()}
 FAR, HALF, NEAR = mpm.Ball((0.9, 0.9), 0.05), mpm.Ball((0.15, 0.3), 0.12), mpm.Box((-1.0, -1.0), (1.0, 0.0))

@@ -14,8 +14,8 @@ import scipy.optimize
 from helpers import DIMS, assert_close, rotation_matrix
 
 import mpmjax as mpm
-from mpmjax import _linalg as la
-from mpmjax._checks import canonical
+from mpmjax import linalg as la
+from mpmjax.checks._values import canonical
 
 E, NU = 1e4, 0.3
 MU, K = E / (2 * (1 + NU)), E / (3 * (1 - 2 * NU))

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from mpmjax._schema import CLASSES
+from mpmjax.io._schema import CLASSES
 
 ROOT = Path(__file__).parents[1]
 

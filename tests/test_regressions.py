@@ -11,8 +11,8 @@ import pytest
 from helpers import block
 
 import mpmjax as mpm
-from mpmjax._diagnostics import _energy
-from mpmjax._kernel import in_window
+from mpmjax.analysis._diagnostics import _energy
+from mpmjax.discretisation._kernel import in_window
 
 
 def bar(**options):

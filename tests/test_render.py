@@ -8,9 +8,9 @@ import pytest
 from helpers import LAWS
 
 import mpmjax as mpm
-from mpmjax._diffrax import no_steps
-from mpmjax._particles import State
-from mpmjax._render import (
+from mpmjax.simulation._diffrax import no_steps
+from mpmjax.state._particles import State
+from mpmjax.viz._render import (
     _bearing,
     _flat_canvas,
     _measure,
@@ -22,7 +22,7 @@ from mpmjax._render import (
     _walls,
     skin,
 )
-from mpmjax._splat import SAMPLES, Balls, Camera, look, paint, picture, surroundings
+from mpmjax.viz._splat import SAMPLES, Balls, Camera, look, paint, picture, surroundings
 
 SIZE = (161, 121)
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpmjax._rule import ruled
+from mpmjax.autodiff._rule import ruled
 
 
 @ruled

@@ -10,12 +10,12 @@ import pytest
 from helpers import ids
 
 import mpmjax as mpm
-from mpmjax._collider import AbstractCollider
-from mpmjax._guess import Guess
-from mpmjax._method import Method
-from mpmjax._motion import AbstractMotion
-from mpmjax._region import AbstractRegion
-from mpmjax._schema import CLASSES, arguments, decode, encode
+from mpmjax.boundary._collider import AbstractCollider
+from mpmjax.geometry._motion import AbstractMotion
+from mpmjax.geometry._region import AbstractRegion
+from mpmjax.implicit._guess import Guess
+from mpmjax.io._schema import CLASSES, arguments, decode, encode
+from mpmjax.stepping._method import Method
 
 GRID = mpm.Grid((8, 9), 0.1, origin=(-2, 3), periodic=(True, False))
 GRIP = mpm.Grip(mpm.Box((-np.inf, 0.0), (0.1, 1.0)), mpm.Motion((0.0, 0.3), ((0.0, 0.0), (0.1, 0.7))), (True, False))

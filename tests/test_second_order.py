@@ -9,10 +9,10 @@ from numpy_oracle import grid_update
 from test_implicit import jolted
 
 import mpmjax as mpm
-from mpmjax._constraint import Constraint
-from mpmjax._hessian import ImplicitOperator
-from mpmjax._method import NodeMotion
-from mpmjax._step import impulses
+from mpmjax.implicit._constraint import Constraint
+from mpmjax.implicit._hessian import ImplicitOperator
+from mpmjax.stepping._method import NodeMotion
+from mpmjax.stepping._step import impulses
 
 SOLVER = mpm.ConjugateResidual(rtol=1e-14)
 NEWTON = mpm.Newton(SOLVER, rtol=1e-13)

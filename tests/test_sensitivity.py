@@ -13,8 +13,8 @@ import pytest
 from helpers import assert_close, block, explicit_limit
 
 import mpmjax as mpm
-from mpmjax._particles import state_of, with_state
-from mpmjax._step import advance
+from mpmjax.state._particles import state_of, with_state
+from mpmjax.stepping._step import advance
 
 
 def quiet(scene, particles, **options):

@@ -11,9 +11,9 @@ import pytest
 from helpers import DESCRIPTIONS, ELASTIC, FLUIDS, LAWS, PLASTIC, assert_close, block, explicit_limit, ids
 
 import mpmjax as mpm
-from mpmjax import _simulate
-from mpmjax._advice import advise, disallowed
-from mpmjax._diffrax import NOT_FINITE
+from mpmjax.simulation import _simulate
+from mpmjax.simulation._advice import advise, disallowed
+from mpmjax.simulation._diffrax import NOT_FINITE
 
 DT = 5e-3
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(), "backward_euler": mpm.BackwardEuler()}

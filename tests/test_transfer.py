@@ -10,10 +10,10 @@ import pytest
 from helpers import DIMS, GRADIENTS, KERNELS, TRANSFERS, assert_close, cloud, ids
 
 import mpmjax as mpm
-from mpmjax._crossing import collect
-from mpmjax._kernel import make_stencil
-from mpmjax._transfer import g2p, p2g
 from mpmjax._types import components
+from mpmjax.discretisation._kernel import make_stencil
+from mpmjax.discretisation._transfer import g2p, p2g
+from mpmjax.discretisation._transfer_sums import collect
 
 make, to_grid, to_particles = eqx.filter_jit(make_stencil), eqx.filter_jit(p2g), eqx.filter_jit(g2p)
 from_nodes = eqx.filter_jit(collect)

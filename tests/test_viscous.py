@@ -8,9 +8,9 @@ import pytest
 from helpers import DESCRIPTIONS, DIMS, FLUIDS, LAWS, VISCOUS, assert_close, block, cloud, rotation_matrix
 
 import mpmjax as mpm
-from mpmjax._hessian import damped
-from mpmjax._mirror import mirror
-from mpmjax._potential import ElasticPotential
+from mpmjax.boundary._mirror import mirror
+from mpmjax.implicit._hessian import damped
+from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.material import Viscosity
 
 

@@ -11,10 +11,10 @@ from helpers import assert_close
 
 import mpmjax as mpm
 from mpmjax import Trial, WorkPrecision
-from mpmjax._bench import FRAMES, Bench
-from mpmjax._chart import draw_chart, write_trials
-from mpmjax._reference import settle
+from mpmjax.analysis._bench import FRAMES, Bench
+from mpmjax.analysis._reference_run import settle
 from mpmjax.verification import StandingWave, discretise
+from mpmjax.viz._chart import draw_chart, write_trials
 
 WAVE = StandingWave(0.05)
 

@@ -7,10 +7,9 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax import _linalg as la
-from mpmjax._checks import require_moduli
-from mpmjax._kinds import require_fields
+from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
+from mpmjax.checks import require_fields, require_moduli
 
 
 class AbstractTangent(eqx.Module):

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 
-from mpmjax import _linalg as la
+from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Compliance, Float, Matrix, PerParticle
 from mpmjax.material._base import AbstractIsotropic, AbstractTangent, PrincipalTangent
 

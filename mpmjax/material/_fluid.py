@@ -3,9 +3,8 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._checks import require_positive
-from mpmjax._kinds import require_fields
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
+from mpmjax.checks import require_fields, require_positive
 from mpmjax.material._base import AbstractMaterial, AbstractPlastic, AbstractVolumetric, MatrixTangent, PrincipalTangent
 
 

@@ -4,9 +4,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax import _linalg as la
-from mpmjax._isotropic import Logarithm, PowerLessOne
+from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
+from mpmjax.linalg import Logarithm, PowerLessOne
 from mpmjax.material._base import AbstractIsotropic, MatrixTangent, PrincipalTangent
 
 _log = Logarithm()

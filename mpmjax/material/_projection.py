@@ -4,9 +4,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax import _linalg as la
-from mpmjax._rule import ruled
+from mpmjax import linalg as la
 from mpmjax._types import Array, Float, Matrix
+from mpmjax.autodiff import ruled
 from mpmjax.material._base import AbstractMaterial, MatrixTangent
 
 

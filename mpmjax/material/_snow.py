@@ -5,11 +5,10 @@ from functools import reduce
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax import _linalg as la
-from mpmjax._checks import require_between, require_moduli, require_positive
-from mpmjax._isotropic import AbstractSpectral
-from mpmjax._kinds import require_fields
+from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
+from mpmjax.checks import require_between, require_fields, require_moduli, require_positive
+from mpmjax.linalg import AbstractSpectral
 from mpmjax.material._base import AbstractPlastic
 from mpmjax.material._elastic import FixedCorotated
 

@@ -3,10 +3,9 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax import _linalg as la
-from mpmjax._checks import require, require_between
-from mpmjax._kinds import require_fields
+from mpmjax import linalg as la
 from mpmjax._types import Array, Matrix, PerParticle
+from mpmjax.checks import require, require_between, require_fields
 from mpmjax.material._base import Law
 
 

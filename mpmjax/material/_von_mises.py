@@ -4,9 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._checks import require_between, require_moduli, require_positive
-from mpmjax._kinds import require_fields
 from mpmjax._types import Array, Float, Matrix, PerParticle
+from mpmjax.checks import require_between, require_fields, require_moduli, require_positive
 from mpmjax.material._base import AbstractPlastic
 from mpmjax.material._hencky import Hencky, Split, no_transverse_strain
 

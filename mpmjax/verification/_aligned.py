@@ -5,10 +5,10 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._boundary import AbstractBoundary
-from mpmjax._grid import Grid
-from mpmjax._region import Box
 from mpmjax._types import Array, Float, Scalar
+from mpmjax.boundary import AbstractBoundary
+from mpmjax.discretisation import Grid
+from mpmjax.geometry import Box
 from mpmjax.material import AbstractMaterial, NeoHookean
 from mpmjax.verification._problem import AbstractProblem, Ends, box_boundary, box_grid
 

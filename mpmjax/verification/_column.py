@@ -6,15 +6,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._boundary import AbstractBoundary
-from mpmjax._grid import Grid
-from mpmjax._method import SemiImplicit
-from mpmjax._mirror import SymmetryPlane
-from mpmjax._particles import Particles
-from mpmjax._region import Box
-from mpmjax._simulate import simulate
 from mpmjax._types import Array, Float, Scalar
+from mpmjax.boundary import AbstractBoundary, SymmetryPlane
+from mpmjax.discretisation import Grid
+from mpmjax.geometry import Box
 from mpmjax.material import AbstractMaterial, FixedCorotated
+from mpmjax.simulation import simulate
+from mpmjax.state import Particles
+from mpmjax.stepping import SemiImplicit
 from mpmjax.verification._problem import (
     AbstractProblem,
     discretise,

@@ -4,12 +4,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._grid import Grid
-from mpmjax._particles import Particles
-from mpmjax._region import Ball
-from mpmjax._sample import fill
-from mpmjax._scene import Scene
+from mpmjax.discretisation import Grid
+from mpmjax.geometry import Ball
 from mpmjax.material import AbstractMaterial, NeoHookean
+from mpmjax.state import Particles, Scene, fill
 
 
 class TwoDisks(eqx.Module):

@@ -9,18 +9,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._body_force import AbstractBodyForce
-from mpmjax._boundary import AbstractBoundary, SlipBox
-from mpmjax._checks import require
-from mpmjax._grid import Grid
-from mpmjax._mirror import SymmetryPlane
-from mpmjax._particles import Particles
-from mpmjax._region import AbstractRegion
-from mpmjax._run import Run
-from mpmjax._sample import fill
-from mpmjax._scene import Scene, TotalLagrangian
 from mpmjax._types import Array, Float, ParticleVector, Scalar
+from mpmjax.boundary import AbstractBoundary, SlipBox, SymmetryPlane
+from mpmjax.checks import require
+from mpmjax.discretisation import Grid
+from mpmjax.geometry import AbstractRegion
 from mpmjax.material import AbstractMaterial
+from mpmjax.simulation import Run
+from mpmjax.state import AbstractBodyForce, Particles, Scene, TotalLagrangian, fill
 
 _MARGIN = 4  # nodes beyond the domain, for the widest stencil and some motion
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from mpmjax._method import Explicit, Method
-from mpmjax._simulate import simulate
+from mpmjax.simulation import simulate
+from mpmjax.stepping import Explicit, Method
 from mpmjax.verification._problem import AbstractProblem, discretise, displacement_error
 
 _SAMPLES = 10

@@ -4,10 +4,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._boundary import AbstractBoundary, Conditions
-from mpmjax._grid import Grid
-from mpmjax._region import AbstractRegion, length
 from mpmjax._types import Array, Float, NodeVector, Scalar
+from mpmjax.boundary import AbstractBoundary, Conditions
+from mpmjax.discretisation import Grid
+from mpmjax.geometry import AbstractRegion, length
 from mpmjax.material import AbstractMaterial, NeoHookean
 from mpmjax.verification._problem import AbstractProblem, Ends, box_grid
 

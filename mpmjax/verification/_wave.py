@@ -5,12 +5,11 @@ import math
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._boundary import AbstractBoundary, SlipBox
-from mpmjax._checks import require
-from mpmjax._grid import Grid
-from mpmjax._mirror import SymmetryPlane
-from mpmjax._region import Box
 from mpmjax._types import Array, Float, Scalar
+from mpmjax.boundary import AbstractBoundary, SlipBox, SymmetryPlane
+from mpmjax.checks import require
+from mpmjax.discretisation import Grid
+from mpmjax.geometry import Box
 from mpmjax.material import AbstractMaterial, FixedCorotated
 from mpmjax.verification._problem import AbstractProblem, Ends, box_grid
 

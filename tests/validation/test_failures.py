@@ -9,8 +9,8 @@ from helpers import LAWS, METHODS, block, explicit_limit, ids
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax._diagnostics import volume_ratio
-from mpmjax._diffrax import INADMISSIBLE
+from mpmjax.analysis._diagnostics import volume_ratio
+from mpmjax.simulation._diffrax import INADMISSIBLE
 from mpmjax.verification import AxisAligned, TwoDisks, VibratingBar, Vortex, discretise, errors, orders
 
 LAW = LAWS["fixed_corotated"]

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import mpmjax as mpm
-from mpmjax import _linalg as la
-from mpmjax._checks import canonical
-from mpmjax._transfer import p2g
+from mpmjax import linalg as la
 from mpmjax._types import components
+from mpmjax.checks._values import canonical
+from mpmjax.discretisation._transfer import p2g
 
 NU = 0.3
 CELLS = 8

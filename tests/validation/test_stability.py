@@ -17,9 +17,9 @@ from helpers import DESCRIPTIONS, DIMS, ELASTIC, FLUIDS, GRADIENTS, LAWS, TRANSF
 from jax.flatten_util import ravel_pytree
 
 import mpmjax as mpm
-from mpmjax._checks import canonical
-from mpmjax._particles import state_of, with_state
-from mpmjax._step import advance
+from mpmjax.checks._values import canonical
+from mpmjax.state._particles import state_of, with_state
+from mpmjax.stepping._step import advance
 
 DX, DENSITY = 0.1, 1e3
 LAW = mpm.FixedCorotated(1e4, 0.3)

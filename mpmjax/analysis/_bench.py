@@ -1,0 +1,184 @@
+"""Pilot runs: a scene's motion by a method at a step, and what it costs."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.spatial
+
+from mpmjax.checks import canonical
+from mpmjax.simulation import Run, SimulationError, integrate, raise_faults
+from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
+from mpmjax.stepping import Method, stable_dt
+
+FRAMES = 8
+"""Times at which motions are compared."""
+_MOST_STEPS = 2**30
+_PILOT_SECONDS = 0.2  # for which so many steps are run as the time of all is foreseen from: a call alone takes time too
+_BRIEF = 0.3  # seconds of a run below which it is timed again
+
+Build = Callable[[int], tuple[Scene, Particles]]
+"""From a refinement n to the scene with 1/n of its spacing, and its particles."""
+
+
+class Trial(NamedTuple):
+    """A setting, what it cost and how good it was."""
+
+    method: Method
+    refinement: int
+    """By how much the spacing is finer than the scene's own."""
+    dt: float
+    """Δt [s]."""
+    steps: int
+    seconds: float
+    """Wall time, compilation left out: the better of two runs where one is brief, or foreseen from fewer steps."""
+    error: float
+    """Relative error of the motion; infinite where the run failed, NaN where it was foreseen to take too long."""
+
+    def __str__(self) -> str:
+        spacing = f", spacing / {self.refinement}" if self.refinement > 1 else ""
+        return f"{name_of(self.method)}, dt = {self.dt:.3g} s{spacing}"
+
+
+def name_of(method: Method) -> str:
+    """A method's name with its one number, such as "SemiImplicit(beta=1)"."""
+    numbers = [f.name for f in fields(method) if f.name in ("beta", "rho")]
+    shown = ", ".join(f"{name}={float(getattr(method, name)):g}" for name in numbers)
+    return f"{type(method).__name__}({shown})"
+
+
+class Displacements(NamedTuple):
+    """Where particles were, and how far they had come at the times of comparison."""
+
+    X: np.ndarray
+    """(p, d) [m]."""
+    u: np.ndarray
+    """(frames, p, d) [m]."""
+
+    @property
+    def size(self) -> float:
+        """The largest RMS displacement [m]."""
+        return float(_rms(self.u).max())
+
+    def distance(self, finer: "Displacements") -> float:
+        """From a motion of as many or more particles, relative to its size."""
+        share = max(1, round(len(finer.X) / len(self.X)))
+        near = scipy.spatial.KDTree(finer.X).query(self.X, k=share)[1].reshape(len(self.X), share)
+        return float(_rms(self.u - finer.u[:, near].mean(axis=2)).max() / finer.size)
+
+
+class Clock:
+    """An allowance of seconds, compilation and all counted."""
+
+    def __init__(self, seconds: float):
+        self.seconds, self._end = seconds, time.perf_counter() + seconds
+
+    @property
+    def left(self) -> float:
+        """Seconds left, below zero once they are overrun."""
+        return self._end - time.perf_counter()
+
+    def allows(self, seconds: float) -> bool:
+        """Whether there is time for a run of what is compiled; always for a twentieth of it all."""
+        return seconds <= max(self.left, self.seconds / 20)
+
+
+class Bench(NamedTuple):
+    """Runs and times a scene; each method is compiled once, whatever its step."""
+
+    refinement: int
+    scene: Scene
+    particles: Particles
+    t1: float
+
+    @classmethod
+    def of(cls, build: Build, refinement: int, t1: float) -> "Bench":
+        """The bench of a refined scene."""
+        scene, particles = build(refinement)
+        return cls(refinement, scene, prepare(scene, particles), float(t1))
+
+    def whole(self, dt: float) -> int:
+        """The least number of steps, a multiple of the frames, whose step is not longer than dt [s]."""
+        return FRAMES * math.ceil(self.t1 / (FRAMES * float(dt)) - 1e-9)
+
+    def motion(self, states: list[State]) -> Displacements:
+        """The motion through these states."""
+        X = np.asarray(self.particles.x)
+        return Displacements(X, np.stack([np.asarray(state.x) for state in states]) - X)
+
+    def limit(self, states: list[State]) -> float:
+        """The least `stable_dt` at the start and in these states [s]."""
+        on_the_way = [self.particles, *(with_state(self.particles, state) for state in states)]
+        least = min(float(stable_dt(self.scene, particles)) for particles in on_the_way)
+        return max(least, self.t1 / _MOST_STEPS)  # with the linear kernel it may be zero
+
+    def run(self, method: Method, steps: int) -> tuple[list[State] | None, float]:
+        """The states at the times of comparison, None of a run that failed, and its seconds."""
+        self._go(method, steps, 1, 1)
+        states, seconds = self.timed(method, steps, FRAMES, steps // FRAMES)
+        if states is not None and seconds < _BRIEF:
+            seconds = min(seconds, self.timed(method, steps, FRAMES, steps // FRAMES)[1])
+        return states, seconds
+
+    def foresee(self, method: Method, steps: int) -> float:
+        """Seconds of so many steps, from a few of them."""
+        self._go(method, steps, 1, 1)
+        some, seconds = 1, self.timed(method, steps, 1, 1)[1]
+        while seconds < _PILOT_SECONDS and some < steps:
+            some = min(4 * some, steps)
+            seconds = self.timed(method, steps, 1, some)[1]
+        return seconds / some * steps
+
+    def timed(self, method: Method, steps: int, frames: int, each: int) -> tuple[list[State] | None, float]:
+        """The states after each of some frames of so many steps, None if one is at fault, and the seconds."""
+        begun = time.perf_counter()
+        states = self._go(method, steps, frames, each)
+        return states, time.perf_counter() - begun
+
+    def why(self, method: Method, steps: int) -> str:
+        """What goes wrong in a run that fails."""
+        try:
+            self._go(method, steps, FRAMES, steps // FRAMES, throw=True)
+        except SimulationError as error:
+            return str(error)
+        return "It ended well."
+
+    def _go(self, method: Method, steps: int, frames: int, each: int, *, throw: bool = False) -> list[State] | None:
+        """The states after each of some frames of so many steps; None if one is at fault, or that is raised."""
+        dtype = self.particles.x.dtype
+        scene, dt, method = canonical((self.scene, self.t1 / steps, method), dtype)
+        state, states = state_of(self.particles), []
+        for k in range(frames):
+            _, state, tally, previous, _ = integrate(
+                scene,
+                with_state(self.particles, state),
+                jnp.asarray(k * each, dtype),
+                jnp.asarray(each, dtype),
+                dt,
+                method,
+                max_steps=_MOST_STEPS,
+                save_every=None,
+                observe=None,
+                adjoint=diffrax.ForwardMode(),  # the plain loop
+                progress=False,
+                watch=True,
+            )
+            if not bool(jax.block_until_ready(tally.healthy)):
+                if throw:
+                    final, number = with_state(self.particles, state), k * each + tally.steps.astype(dtype)
+                    run = Run(scene, method, dt, jnp.zeros((0,), dtype), None, None, final, number, tally)
+                    raise_faults(run, self.particles, previous, k * each)
+                return None
+            states.append(state)
+        return states
+
+
+def _rms(distance: np.ndarray) -> Any:
+    """Over particles, of distances (frames, p, d)."""
+    return np.sqrt((distance**2).sum(axis=-1).mean(axis=-1))

@@ -1,0 +1,250 @@
+"""Where energy and momentum go in each step: every transfer, force and approximation by an expression of its own."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Float, Matrix, NodeVector, Scalar, components
+from mpmjax.analysis._diagnostics import energy_density, energy_of
+from mpmjax.checks import canonical, checked, require_positive
+from mpmjax.discretisation import FLIP, Stencil, collect, spread
+from mpmjax.state import Particles, Scene, prepare
+from mpmjax.stepping import Explicit, GridUpdate, Method, Nodes, grid_to_particles, particles_to_grid, update
+
+
+class EnergyBudget(eqx.Module):
+    """The energy of one step [J], f steps:
+
+    Δkinetic + Δelastic + Δpotential = boundary + friction + body_force + solver + time_integration
+    − p2g − g2p − implicit − viscous − plastic.
+
+    v̄ = (v^n + v^{n+1})/2 at the nodes, u_ip = v_p + C_p (x_i − x_p). Each term is computed from its own expression and
+    none as what is left, so that the sum's closing to rounding says that all of them are right.
+    """
+
+    kinetic: Float[Array, "*f"]
+    """Change of the particles' kinetic energy, their affine motion included."""
+    elastic: Float[Array, "*f"]
+    """Change of Σ V0 Ψ(F)."""
+    potential: Float[Array, "*f"]
+    """Change of −Σ m g·x: less the work of gravity."""
+    p2g: Float[Array, "*f"]
+    """Lost from particles to grid, ½ Σ_ip w m ‖u_ip − v_i^n‖² ≥ 0."""
+    g2p: Float[Array, "*f"]
+    """Lost from grid to particles, ½ Σ_ip w m ‖v_i^{n+1} − u_ip^{n+1}‖² ≥ 0 with PIC and APIC; with FLIP u is the
+    grid's part of the velocity, and what the particles keep beside it counts as gained. The affine motion's energy is
+    that at the new place, which differs with the linear kernel, whose moment D depends on it."""
+    implicit: Float[Array, "*f"]
+    """Dissipated by treating the elastic force implicitly, (Δt f^n − its impulse)·v̄: β Δt² v̄·H v^{n+1}. In methods of
+    second order `time_integration` gives it back but for terms of third order in Δt."""
+    boundary: Float[Array, "*f"]
+    """Work of walls and grips, impulse·v̄: that of a wall is what stops dead on it."""
+    friction: Float[Array, "*f"]
+    """Work of friction, ≤ 0."""
+    body_force: Float[Array, "*f"]
+    """Work of the scene's body force."""
+    viscous: Float[Array, "*f"]
+    """Dissipated by viscosity, Δt Σ V σ_v : D ≥ 0 of the velocity that it resists."""
+    plastic: Float[Array, "*f"]
+    """Dissipated by return maps, Σ V0 (Ψ of the trial deformation − Ψ of what it is brought back to): hardening, which
+    stiffens what is strained, included. Where a step strains by many times the strain of yielding, what it stores
+    before the return is in `time_integration`: the two are to be read together."""
+    solver: Float[Array, "*f"]
+    """Work of the impulse by which the solve misses its equation."""
+    time_integration: Float[Array, "*f"]
+    """What Δt adds: the energies' change along the step less the work of their forces at its start,
+    [Φ(Δt v_c) − Φ(0) + Δt f^n·v̄] + Δt G·(v̄ − v_c), v_c the velocity with which the nodes move and
+    G their weight; and the work on v̄ of viscosity's impulse beyond what it dissipates. Of second order in Δt in each
+    step, of first over a given time."""
+
+    @property
+    def change(self) -> Float[Array, "*f"]:
+        """Change of the total energy."""
+        return self.kinetic + self.elastic + self.potential
+
+    @property
+    def explained(self) -> Float[Array, "*f"]:
+        """The sum of all that changes it."""
+        gains = self.boundary + self.friction + self.body_force + self.solver + self.time_integration
+        return gains - self.p2g - self.g2p - self.implicit - self.viscous - self.plastic
+
+
+class MomentumBudget(eqx.Module):
+    """The linear momentum of one step [kg m/s], f steps, (f, d): change = gravity + body_force + boundary + friction +
+    elastic + viscous + transfer.
+
+    A symmetry plane pushes through its mirror image: it is seen in `elastic` and `transfer`, which vanish without one.
+    """
+
+    change: Float[Array, "*f d"]
+    """Change of Σ m v."""
+    gravity: Float[Array, "*f d"]
+    """Impulse of gravity."""
+    body_force: Float[Array, "*f d"]
+    """Impulse of the scene's body force."""
+    boundary: Float[Array, "*f d"]
+    """Impulse of walls and grips, and that by which the solve misses its equation."""
+    friction: Float[Array, "*f d"]
+    """Impulse of friction."""
+    elastic: Float[Array, "*f d"]
+    """Impulse of the elastic force."""
+    viscous: Float[Array, "*f d"]
+    """Impulse of viscosity."""
+    transfer: Float[Array, "*f d"]
+    """Lost in the transfers."""
+
+    @property
+    def explained(self) -> Float[Array, "*f d"]:
+        """The sum of all that changes it."""
+        outer = self.gravity + self.body_force + self.boundary + self.friction
+        return outer + self.elastic + self.viscous + self.transfer
+
+
+class Budget(eqx.Module):
+    """Energy and momentum of a run's steps."""
+
+    energy: EnergyBudget
+    momentum: MomentumBudget
+
+
+@checked
+def budget(
+    scene: Scene, particles: Particles, *, steps: int, dt: Scalar, method: Method = Explicit(), start: int = 0
+) -> tuple[Particles, Budget]:
+    """Run a scene for some steps and say where its energy and momentum went in each.
+
+    Args:
+        scene: the scene.
+        particles: the particles at step `start`.
+        steps: number of steps f.
+        dt: step [s].
+        method: update of the grid velocity.
+        start: number of the first step.
+
+    Returns:
+        the particles after the last step, and the budget, each of its terms with a leading axis f.
+
+    Raises:
+        ValueError: from `prepare`, or a step that is not positive.
+    """
+    require_positive("dt [s]", dt)
+    scene, dt, method = canonical((scene, dt, method), particles.x.dtype)
+    return _budget(scene, prepare(scene, particles), jnp.asarray(start, particles.x.dtype), dt, method, steps)
+
+
+@eqx.filter_jit
+def _budget(
+    scene: Scene, particles: Particles, start: Array, dt: Scalar, method: Method, steps: int
+) -> tuple[Particles, Budget]:
+    def body(before: Particles, n: Array) -> tuple[Particles, Budget]:
+        stencil = scene.stencil(before)
+        nodes = particles_to_grid(
+            scene,
+            before,
+            (start + n) * dt,
+            dt,
+            stencil,
+            centred=method.centred,
+            lagged=method.lagged,
+            apart=True,
+        )
+        new = update(nodes, method)
+        trial = grid_to_particles(scene, before, nodes, new)
+        after = scene.return_map(trial)
+        return after, _step_budget(scene, before, trial, after, nodes, new)
+
+    numbers = jnp.arange(steps, dtype=particles.x.dtype)
+    return jax.lax.scan(body, particles, numbers)
+
+
+def _step_budget(
+    scene: Scene, before: Particles, trial: Particles, after: Particles, nodes: Nodes, new: GridUpdate
+) -> Budget:
+    potential, dt = nodes.potential, nodes.dt
+    stencil, images = potential.stencil, potential.mirror
+    v0, v1 = nodes.velocity, new.motion.velocity
+    all0, all1 = images.unfold(v0), images.unfold(v1)
+    mean = (v0 + v1) / 2
+    friction = jnp.zeros_like(v0) if new.friction is None else new.friction
+
+    # impulses at the nodes
+    elastic, elastic_at_start = new.elastic, dt * nodes.force
+    raw = spread(stencil, before.mass[None], None, scene.grid.size)
+    weight = dt * images.fold(raw * jnp.asarray(scene.gravity))
+    body = jnp.where(nodes.occupied, dt * nodes.mass[:, None] * nodes.acceleration - weight, 0)
+    boundary, missed = new.free.split(0, new.reaction), new.free.split(new.reaction, 0)
+
+    # viscosity: its impulse, and what it dissipates of the velocity that it resists
+    C, resisted = None if before.C is None else components(before.C), new.motion.resisted
+    viscous, dissipated = jnp.zeros_like(v0), jnp.zeros((), v0.dtype)
+    if new.viscous is not None and C is not None:
+        power = (potential.drag_flux(C) * C).sum() if resisted is None else potential.power(resisted)
+        viscous, dissipated = new.viscous, dt * power
+
+    # particle and nodes beside each other
+    v_old = components(before.v)
+    arrived = collect(stencil, images.unfold(new.before))[0]
+    moved = collect(stencil, all1)[0]
+    C_old, C_new = (components(q.C) if scene.transfer.affine and q.C is not None else None for q in (before, after))
+    beside = scene.transfer.alpha * (v_old - arrived) if isinstance(scene.transfer, FLIP) else jnp.zeros_like(v_old)
+    lost_p2g, gained_p2g = _mismatch(stencil, before.mass, v_old, C_old, all0)
+    lost_g2p, _ = _mismatch(stencil, before.mass, moved, C_new, all1)
+    kept = (before.mass * beside * (moved + beside / 2)).sum()
+    if C_new is not None and scene.kernel.order == 1:  # its moment D changes with the particle's place
+        turn = scene.stencil(after).moment - stencil.moment
+        kept = kept + (before.mass * (C_new**2 * turn).sum(axis=(0, 1))).sum() / 2
+
+    old, new_energy = energy_of(scene, before), energy_of(scene, after)
+    stored = potential.energy(dt * new.motion.carrier)
+    share = jnp.where(nodes.occupied, images.fold(jnp.broadcast_to(raw, v0.shape)), 0)
+    share = nodes.per_mass(share)  # of an impulse at a node in the particles' momentum: 1 but at symmetry planes
+    return Budget(
+        EnergyBudget(
+            kinetic=new_energy.kinetic - old.kinetic,
+            elastic=new_energy.elastic - old.elastic,
+            potential=new_energy.potential - old.potential,
+            p2g=lost_p2g,
+            g2p=lost_g2p - kept,
+            implicit=((elastic_at_start - elastic) * mean).sum(),
+            boundary=(boundary * mean).sum(),
+            friction=(friction * mean).sum(),
+            body_force=(body * mean).sum(),
+            viscous=dissipated,
+            plastic=(before.volume * (energy_density(scene, trial) - energy_density(scene, after))).sum(),
+            solver=(missed * mean).sum(),
+            time_integration=stored
+            - potential.energy(jnp.zeros_like(v0))
+            + (elastic_at_start * mean).sum()
+            + (weight * (mean - new.motion.carrier)).sum()
+            + (viscous * mean).sum()
+            + dissipated,
+        ),
+        MomentumBudget(
+            change=(before.mass * components(after.v - before.v)).sum(axis=1),
+            gravity=(share * weight).sum(axis=0),
+            body_force=(share * body).sum(axis=0),
+            boundary=(share * (boundary + missed)).sum(axis=0),
+            friction=(share * friction).sum(axis=0),
+            elastic=(share * elastic).sum(axis=0),
+            viscous=(share * viscous).sum(axis=0),
+            transfer=gained_p2g + (before.mass * beside).sum(axis=1),
+        ),
+    )
+
+
+def _mismatch(
+    stencil: Stencil, mass: Array, v: Float[Array, "d p"], C: Matrix | None, nodes: NodeVector
+) -> tuple[Float[Array, ""], Float[Array, "d"]]:
+    """½ Σ_ip w m ‖v_i − u_ip‖² and Σ_ip w m (v_i − u_ip), u_ip = v_p + C_p (x_i − x_p)."""
+    weight = stencil.weight
+    safe = jnp.where(weight == 0, 1, weight)[:, None]  # where the weight is zero the arm does not matter
+    arm = stencil.moment * stencil.least_squares.gradient / safe  # x_i − x_p, (k, d, p)
+
+    def add(total: tuple[Array, Array], stencil_node: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], None]:
+        i, w, r = stencil_node
+        u = v if C is None else v + (C * r).sum(axis=1)
+        gap = nodes[i].T - u
+        return (total[0] + (w * mass * gap**2).sum() / 2, total[1] + (w * mass * gap).sum(axis=1)), None
+
+    zero = jnp.zeros((), v.dtype), jnp.zeros(v.shape[0], v.dtype)
+    return jax.lax.scan(add, zero, (stencil.index, weight, arm))[0]

@@ -1,0 +1,132 @@
+"""The motion that is held for the truth: a run refined until it changes little, or until its time is up.
+
+Where explicit steps are cheap it is made of them, at the `stable_dt` of the whole motion: they resolve all that the
+grid does. Else it is TR-BDF2, whose step is halved until that changes the motion by less than a third of the error that
+is asked for, or is below the explicit limit. Then spacing and step are halved together: transfers act once a step, and
+on a given grid a smaller step alone need not bring the motion nearer to the truth. The last change is the estimate of
+the reference's own error, which is safe from first order on.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+from mpmjax.analysis._bench import FRAMES, Bench, Build, Clock, Displacements, Trial, name_of
+from mpmjax.checks import require
+from mpmjax.state import State
+from mpmjax.stepping import TRBDF2, Explicit, Method
+
+HOPELESS = 4
+"""How far below the explicit limit a run that still fails will not get better."""
+_FEW = 1000  # explicit steps that no implicit run which follows the motion is cheaper than
+
+Say = Callable[[str], None]
+
+
+class Reference(NamedTuple):
+    """What trials are compared with."""
+
+    limit: float
+    """The longest explicit step on the scene's own grid that is offered, `stable_dt` of the whole motion [s]."""
+    trial: Trial
+    """Its error is the estimate of its own."""
+    motion: Displacements
+
+
+class _Look(NamedTuple):
+    """A run, and by how much it changed the motion of the one before."""
+
+    bench: Bench
+    steps: int
+    seconds: float
+    states: list[State] | None
+    motion: Displacements | None
+    """None where it failed."""
+    change: float
+
+    @property
+    def dt(self) -> float:
+        """Δt [s]."""
+        return self.bench.t1 / self.steps
+
+
+def settle(build: Build, bench: Bench, error: float, seconds: float, say: Say = lambda line: None) -> Reference:
+    """The reference that a number of seconds allows.
+
+    Args:
+        build: from a refinement to the scene.
+        bench: of the scene's own grid.
+        error: the error that trials are to be told by.
+        seconds: what it may take, compilation and all.
+        say: called with a line on each run.
+
+    Raises:
+        ValueError: nothing moves, or no run ended well in that time; with what went wrong.
+    """
+    clock, growth = Clock(seconds), 2 ** (bench.particles.dim + 1)
+    limit = bench.limit([])
+    steps, method = bench.whole(limit), Explicit()
+    say(f"reference: {bench.particles.count} particles, {steps} explicit steps of {bench.t1 / steps:.3g} s; compiling")
+    foreseen = bench.foresee(method, steps)
+    if (1 + growth) * foreseen > clock.left and steps > _FEW:
+        steps, method = 2 * FRAMES, TRBDF2()
+    elif not clock.allows(2 * foreseen):
+        raise ValueError(f"{steps} explicit steps take {foreseen:.2g} s and two runs are needed: {_more(seconds)}")
+    limit, good = _resolved_in_time(bench, method, steps, limit, error, clock, say)
+    while growth * good.seconds < clock.left and (good.bench is bench or good.change > error / 3):
+        finer = _look(Bench.of(build, 2 * good.bench.refinement, bench.t1), method, 2 * good.steps, good, say)
+        if finer.motion is None:
+            break
+        good = finer
+    alone = good.bench is bench  # there was no time for a finer grid
+    while alone and good.change > error / 3 and (math.isinf(good.change) or clock.allows(2 * good.seconds)):
+        again = _look(bench, method, 2 * good.steps, good, say)
+        if again.motion is None:
+            break
+        good = again
+    assert good.motion is not None
+    require(math.isfinite(good.change), f"The motion of one run only is known: {_more(seconds)}")
+    return Reference(
+        limit, Trial(method, good.bench.refinement, good.dt, good.steps, good.seconds, good.change), good.motion
+    )
+
+
+def _resolved_in_time(
+    bench: Bench, method: Method, steps: int, limit: float, error: float, clock: Clock, say: Say
+) -> tuple[float, _Look]:
+    """The explicit limit over the motion on the scene's own grid [s], and the run whose step resolves the motion, or
+    the last that time allows."""
+    good = None
+    while True:
+        new = _look(bench, method, steps, good, say)
+        if new.states is not None and new.motion is not None:
+            require(new.motion.size > 0, "Nothing moves in this scene, so there is no motion to be right or wrong.")
+            limit, good = min(limit, bench.limit(new.states)), new
+        hopeless = good is None and new.dt < limit / HOPELESS
+        enough = good is not None and (new.change <= error / 3 or new.dt <= limit * (1 + 1e-9))
+        if good is not None and (enough or not clock.allows(2 * new.seconds)):
+            return limit, good
+        if hopeless or not clock.allows(2 * new.seconds):
+            raise ValueError(
+                f"The reference, {name_of(method)} in {steps} steps ({new.seconds:.2g} s), fails, and half the step "
+                f"will not do or takes too long. {bench.why(method, steps)}"
+            )
+        steps = max(2 * steps, bench.whole(limit) if isinstance(method, Explicit) else 0)
+
+
+def _look(bench: Bench, method: Method, steps: int, before: _Look | None, say: Say) -> _Look:
+    states, seconds = bench.run(method, steps)
+    motion = None if states is None else bench.motion(states)
+    coarse = None if before is None else before.motion
+    change = math.inf if motion is None or coarse is None else coarse.distance(motion)
+    spacing = f", spacing / {bench.refinement}" if bench.refinement > 1 else ""
+    outcome = "failed" if motion is None else "" if math.isinf(change) else f"changes the motion by {change:.2g}"
+    say(f"reference: {name_of(method)}, {steps} steps{spacing}: {seconds:.2g} s {outcome}".rstrip())
+    return _Look(bench, steps, seconds, states, motion, change)
+
+
+def _more(seconds: float) -> str:
+    return (
+        f"more than the {seconds:.3g} s that a reference is given. Allow more (most_seconds in [run], --most-seconds), "
+        "choose a shorter t1, or give dt and method."
+    )

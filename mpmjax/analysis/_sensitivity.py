@@ -1,0 +1,170 @@
+"""How a rollout's derivatives grow with its horizon."""
+
+import warnings
+from typing import Any, Literal
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Float, ParticleVector, Scalar
+from mpmjax.checks import checked, is_traced, require, require_positive, require_whole
+from mpmjax.simulation import HEALTHY, Tally, number_of_steps, simulate
+from mpmjax.state import Particles, Scene, prepare
+from mpmjax.stepping import Explicit, Method, step_for
+
+_POINTS = 100
+
+
+class Sensitivity(eqx.Module):
+    """The growth of a rollout's derivative with respect to the initial velocities, over its horizon."""
+
+    times: Float[Array, "f"]
+    """Time since the start [s], shape (f,)."""
+    steps: Float[Array, "f"]
+    """Steps since the start, shape (f,)."""
+    growth: Float[Array, "f"]
+    """‖δx‖ / (t ‖δv0‖) [-], shape (f,): how much more positions depend on initial velocities than in free flight. NaN
+    from a fault of the run on, and throughout if a solve of it, or of its derivative, did not converge."""
+    rate: Float[Array, ""]
+    """Exponential rate of the growth [1/s]: the slope of a straight line fitted to its logarithm, as far as it is
+    finite (a finite-time Lyapunov exponent). Zero for free flight, negative where motion is damped or oscillates."""
+
+    @property
+    def worst(self) -> Float[Array, ""]:
+        """The largest growth; NaN where there is none to the end."""
+        return self.growth.max()
+
+
+@checked
+def sensitivity(
+    scene: Scene,
+    particles: Particles,
+    *,
+    t1: Scalar,
+    dt: Scalar | Literal["stable"],
+    method: Method = Explicit(),
+    velocity: ParticleVector | None = None,
+    seed: int = 0,
+    save_every: int | None = None,
+    start: Scalar = 0,
+    warn_at: float | int = 1e3,
+) -> Sensitivity:
+    """Ask whether gradients over this horizon are of any use: how a small change of the initial velocities grows.
+
+    The change δv0 is carried along by the derivative of the steps in forward mode, δx being what it does to the
+    positions, and measured against free flight,
+
+        growth(t) = ‖δx(t)‖ / (t ‖δv0‖),  ‖a‖² = Σ_p m_p a_p².
+
+    Free flight has exactly 1; oscillation and damping less. The default change is normally distributed and independent
+    for each particle, so that its growth estimates the root mean square over all directions (of p particles that stay
+    together, only about a √p-th is common flight), and that is also what the gradient of a random function of the final
+    positions grows by: ∂x/∂v0 and its transpose have the same singular values. The derivative with respect to anything
+    else that acts through the motion (stiffness, gravity, places) grows at the same rate.
+
+    *When it warns*: growth beyond `warn_at`, or a fault of the run. Beyond `warn_at` the motion is chaotic (many
+    contacts, crumpling) or the step unstable, and an exact gradient holds only for changes of the order of 1/growth: an
+    optimiser cannot use it. Shorten the horizon, observe averages, or, if it is the step, reduce dt.
+
+    The cost is that of a forward run and its tangent, two to three runs, and the memory that of the saved positions.
+
+    Args:
+        scene: the scene.
+        particles: the particles at step `start`.
+        t1: end time [s], a whole number of steps after time zero.
+        dt: step [s], or "stable", as in `simulate`.
+        method: update of the grid velocity.
+        velocity: the change δv0 of the initial velocities, of any size, shape (p, d). Default: normally distributed,
+            of variance 1/m_p.
+        seed: of the default change.
+        save_every: measure every so many steps, and at the end. Default: about a hundred times.
+        start: number of the first step.
+        warn_at: growth [-] from which a Python warning is given (under `jax.jit` and the like none is).
+
+    Raises:
+        ValueError: as `simulate`; a change of the wrong shape, or zero.
+    """
+    require_positive("warn_at", warn_at)
+    start = require_whole("start", start, 0)
+    particles = prepare(scene, particles)
+    dt = step_for(scene, particles, t1, dt, method, start)
+    count = number_of_steps(t1, dt, start, particles.x.dtype)
+    every = max(1, count // _POINTS) if save_every is None else save_every
+    shape, dtype = particles.v.shape, particles.v.dtype
+    if velocity is None:
+        change = jax.random.normal(jax.random.key(seed), shape, dtype) / jnp.sqrt(particles.mass)[:, None]
+    else:
+        change = jnp.asarray(velocity, dtype)
+    require(change.shape == shape, f"velocity must have the particles' shape {shape}, got {change.shape}.")
+    require((change != 0).any(), "velocity must not be zero everywhere: there is nothing to follow.")
+
+    def flown(v: ParticleVector) -> tuple[tuple[Array, Any], tuple[Array, Tally]]:
+        thrown = eqx.tree_at(lambda p: p.v, particles, v)
+        run = simulate(
+            scene,
+            thrown,
+            t1=t1,
+            dt=dt,
+            method=method,
+            save_every=every,
+            observe=_positions,
+            start=start,
+            adjoint=diffrax.ForwardMode(),
+            throw=False,
+        )
+        return (run.observed, run.report), (run.steps, run.tally)
+
+    _, (moved, unsolved), (steps, tally) = jax.jvp(flown, (particles.v,), (change,), has_aux=True)
+    report = _measure(moved[1:], steps[1:] - steps[0], tally, unsolved, particles.mass, change, jnp.asarray(dt, dtype))
+    if not is_traced(report) and not report.worst <= warn_at:
+        warnings.warn(_complaint(report, tally, float(unsolved), warn_at), stacklevel=2)
+    return report
+
+
+def _positions(scene: Scene, particles: Particles) -> ParticleVector:
+    del scene
+    return particles.x
+
+
+@jax.jit
+def _measure(
+    moved: Array, steps: Array, tally: Tally, unsolved: Array, mass: Array, change: Array, dt: Array
+) -> Sensitivity:
+    def norm(a: Array) -> Array:
+        return jnp.sqrt((mass[:, None] * a**2).sum(axis=(-2, -1)))
+
+    times = steps * dt
+    faulty = (tally.fault != HEALTHY) & (steps >= tally.fault_step.astype(steps.dtype))
+    lost = faulty | (tally.unconverged > 0) | (unsolved > 0)
+    growth = jnp.where(lost, jnp.nan, norm(moved) / (times * norm(change)))
+    usable = jnp.isfinite(growth) & (growth > 0)
+    weight = usable.astype(growth.dtype)
+    weight = weight / jnp.maximum(weight.sum(), 1)
+    logarithm = jnp.log(jnp.where(usable, growth, 1))
+    centred = times - (weight * times).sum()
+    spread = (weight * centred**2).sum()
+    rate = (weight * centred * logarithm).sum() / jnp.where(spread == 0, 1, spread)
+    return Sensitivity(times=times, steps=steps, growth=growth, rate=rate)
+
+
+def _complaint(report: Sensitivity, tally: Tally, unsolved: float, warn_at: float | int) -> str:
+    steps, times, over = report.steps, report.times, ~(report.growth <= warn_at)
+    told = f"Over {int(steps[-1])} steps (t = {float(times[-1]):.4g} s) "
+    if not tally.healthy:
+        what = f"meets a fault at step {int(tally.fault_step)}" if int(tally.fault) else "does not solve its equations"
+        return told + f"the run {what} and has no derivative from there on: see what simulate says of it."
+    if unsolved > 0:
+        return told + (
+            f"the run has a derivative that is not known: the tangent solve of a step did not converge (relative "
+            f"residual {unsolved:.2g}). Raise the max_steps of the method's adjoint_solver, or leave "
+            "its metric at Metric.DIAGONAL."
+        )
+    first = int(jnp.argmax(over))
+    return told + (
+        f"the derivative of the positions by the initial velocities grows to {float(report.worst):.2g} times that of "
+        f"free flight, at a rate of {float(report.rate):.3g} /s; it passes {warn_at:.4g} by step {int(steps[first])} "
+        f"(t = {float(times[first]):.4g} s). Gradients over this horizon say little: shorten it, or reduce dt if the "
+        "step is unstable."
+    )

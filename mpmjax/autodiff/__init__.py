@@ -1,0 +1,6 @@
+"""Derivative rules and guards that hold in every nest of JAX transformations."""
+
+from mpmjax.autodiff._guard import guard
+from mpmjax.autodiff._rule import ruled
+
+__all__ = ["guard", "ruled"]

@@ -1,0 +1,217 @@
+"""Colliders: rigid bodies of any shape that move as prescribed, and hold or push the nodes that lie in them.
+
+A node lies in a collider up to a thousandth of a spacing off its surface; its normal there is the gradient of the
+shape's distance, and its velocity that of the collider's own point, the chord over the step. Which nodes lie in it has
+no derivative; normals and velocities have, with respect to the motion and the shape. Two bodies whose nodes meet
+follow the rules of `combine`.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Bool, Float, NodeVector, ParticleVector, Scalar
+from mpmjax.boundary._walls import ON_THE_WALL, AbstractBoundary, Conditions, Touch
+from mpmjax.checks import canonical, require, require_between, require_fields
+from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, Motion, length, still
+
+_LOOKS = 4  # places of a particle's way in which a collider is looked for
+
+
+class AbstractCollider(AbstractBoundary):
+    """A rigid body in the way of the material."""
+
+    shape: eqx.AbstractVar[AbstractRegion]
+    motion: eqx.AbstractVar[AbstractMotion | None]
+
+    @property
+    def dim(self) -> int:
+        """That of the shape."""
+        return self.shape.dim
+
+    def distance(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m"]:
+        """The signed distance [m] of each of the points x [m], shape (m, d), from the body as it is at time t."""
+        return self.shape.distance(x if self.motion is None else self.motion.origin(x, t))
+
+    def passed(
+        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
+    ) -> Bool[Array, "p"]:
+        """Which particles came from outside more than a spacing nearer, relative to the body, and were in it after some
+        quarters of the way. Nobody is asked for distances while none moves as fast."""
+        del reach
+        if self.motion is not None:
+            start, end = self.motion.origin(start, t), self.motion.origin(end, t + dt)
+        way = end - start
+
+        def look() -> Array:
+            first = self.shape.distance(start)
+            later = jax.lax.map(
+                lambda part: self.shape.distance(start + part * way),
+                jnp.arange(1, _LOOKS + 1, dtype=end.dtype) / _LOOKS,
+            )
+            return (first >= 0) & ((later < 0) & (first - later > spacing)).any(axis=0)
+
+        fast = jnp.any(sum(way[:, a] ** 2 for a in range(self.dim)) > spacing**2)
+        return jax.lax.cond(fast, look, lambda: jnp.zeros(len(end), bool))
+
+
+class StickyCollider(AbstractCollider):
+    """A body to which the material sticks: nodes in it have its velocity, exactly, also after a solve.
+
+    In the total description it holds the reference nodes that lie in it before its motion: a grip that can turn.
+
+    Args:
+        shape: the body before its motion.
+        motion: how it moves. Default: not at all.
+    """
+
+    shape: AbstractRegion
+    motion: AbstractMotion | None = None
+
+    def __check_init__(self):
+        require_fields(self)
+        _check(self)
+
+    def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
+        """v = v_c."""
+        body = _Body(self, nodes, t, dt, reference)
+        inside = body.holds(spacing)[:, None]
+        fixed = jnp.broadcast_to(inside, nodes.shape)
+        nothing = jnp.zeros_like(nodes)
+        touch = Touch(
+            normal=nothing,
+            velocity=nothing,
+            held=jnp.zeros(len(nodes), bool),
+            owner=jnp.full(len(nodes), -1, jnp.int32),
+            holder=jnp.where(fixed, 0, -1).astype(jnp.int32),
+            position=body.position,
+            pivots=body.pivot[None],
+            pivot_velocity=body.pivot_velocity[None],
+        )
+        return Conditions(fixed, jnp.where(fixed, body.velocity, 0), touch=touch)
+
+
+class SlipCollider(AbstractCollider):
+    """A body along which the material slides freely and from which it cannot part: nodes in it have its velocity along
+    the normal, exactly, also after a solve.
+
+    In the total description only a half-space without rotation: elsewhere the normal of a reference node changes as it
+    slides.
+
+    Args:
+        shape: the body before its motion.
+        motion: how it moves. Default: not at all.
+    """
+
+    shape: AbstractRegion
+    motion: AbstractMotion | None = None
+
+    def __check_init__(self):
+        require_fields(self)
+        _check(self)
+
+    @property
+    def flat(self) -> bool:
+        """Whether the normal is the same everywhere and always."""
+        return isinstance(self.shape, HalfSpace) and (self.motion is None or isinstance(self.motion, Motion))
+
+    def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
+        """v·n = v_c·n."""
+        touch = _Body(self, nodes, t, dt, reference).touch(spacing)
+        return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), touch=touch)
+
+
+class SeparatingCollider(AbstractCollider):
+    """A body that the material may leave, and along which it slides with Coulomb friction.
+
+    At a node in it either the normal velocity is the body's and the body pushes, or the node moves outward and the body
+    does nothing (the rule is in `_contact.py`). Friction is an impulse applied after the solve, opposed to the
+    tangential velocity relative to the body and at most `friction` times the normal impulse: it lags the solve by one
+    step's elastic response.
+
+    Accurate to first order in the spacing: contact is felt at the nodes, one layer of which is up to a spacing deep in
+    the body.
+    *When it breaks*: a body or part of it that is thinner than two spacings holds too few nodes to keep material out,
+    and one that moves through more than a spacing in a step leaves some behind. Not in the total description.
+
+    Args:
+        shape: the body before its motion.
+        motion: how it moves. Default: not at all.
+        friction: Coulomb coefficient [-], at least 0.
+    """
+
+    shape: AbstractRegion
+    motion: AbstractMotion | None = None
+    friction: Scalar = 0.0
+
+    def __check_init__(self):
+        require_fields(self)
+        _check(self)
+        require_between("SeparatingCollider's friction", self.friction, 0, 1e6)
+
+    def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
+        """(v − v_c)·n ≥ 0 ⟂ reaction ≥ 0."""
+        touch = _Body(self, nodes, t, dt, reference).touch(spacing)
+        touch = eqx.tree_at(
+            lambda c: (c.held, c.leavable, c.friction),
+            touch,
+            (jnp.zeros_like(touch.held), touch.held, jnp.where(touch.held, self.friction, 0).astype(nodes.dtype)),
+            is_leaf=lambda leaf: leaf is None,
+        )
+        return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), touch=touch)
+
+
+def _check(collider: AbstractCollider) -> None:
+    motion, d = collider.motion, collider.dim
+    require(
+        motion is None or motion.dim == d,
+        f"A collider's shape and motion must have the same dimension, got {d} and {motion and motion.dim}.",
+    )
+
+
+class _Body(eqx.Module):
+    """A collider as the nodes see it in one step."""
+
+    shape: AbstractRegion
+    motion: AbstractMotion
+    t: Scalar
+    nodes: NodeVector
+    place: NodeVector
+    """The nodes in the shape's own frame [m], shape (n, d)."""
+    velocity: NodeVector
+    """That of the body at the nodes [m/s], shape (n, d)."""
+    position: NodeVector
+    """Where the nodes are that move with it [m], shape (n, d)."""
+    pivot: Float[Array, "d"]
+    pivot_velocity: Float[Array, "d"]
+
+    def __init__(self, collider: AbstractCollider, nodes: NodeVector, t: Scalar, dt: Scalar, reference: bool):
+        motion = canonical(still(collider.dim), nodes.dtype) if collider.motion is None else collider.motion
+        self.nodes, self.shape, self.motion, self.t = nodes, collider.shape, motion, t
+        self.place = nodes if reference else motion.origin(nodes, t)
+        self.velocity = motion.velocity_of(self.place, t, dt)
+        self.position = nodes + motion.place(nodes, t) - motion.place(nodes, 0.0) if reference else nodes
+        middle = jnp.asarray(collider.shape.middle(), nodes.dtype)
+        self.pivot = motion.pivot(middle, t)
+        self.pivot_velocity = (motion.pivot(middle, t + dt) - self.pivot) / dt
+
+    def holds(self, spacing: Scalar) -> Bool[Array, "n"]:
+        """The nodes that lie in it."""
+        return self.shape.contains(self.place, ON_THE_WALL * spacing)
+
+    def touch(self, spacing: Scalar) -> Touch:
+        """Normals held wherever there is one; samples may be level somewhere."""
+        slope = jax.grad(lambda x: self.shape.distance(x).sum())(self.place)
+        steepness = length(slope)
+        held = self.holds(spacing) & (steepness > 0)
+        normal = self.motion.turned(slope / jnp.where(held, steepness, 1)[:, None], self.t)
+        return Touch(
+            normal=jnp.where(held[:, None], normal, 0),
+            velocity=jnp.where(held[:, None], self.velocity, 0),
+            held=held,
+            owner=jnp.where(held, 0, -1).astype(jnp.int32),
+            holder=jnp.full(self.nodes.shape, -1, jnp.int32),
+            position=self.position,
+            pivots=self.pivot[None],
+            pivot_velocity=self.pivot_velocity[None],
+        )

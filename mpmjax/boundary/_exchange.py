@@ -1,0 +1,66 @@
+"""What colliders receive from the material in a step: the other side of what they give it."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Float, NodeScalar, NodeVector
+from mpmjax.boundary._walls import Touch
+from mpmjax.linalg import pairs
+
+
+class Exchange(eqx.Module):
+    """Linear and angular impulse on each of k colliders; over the step they are its mean force and torque.
+
+    What the nodes before a symmetry plane take is counted, not what their images take.
+    """
+
+    impulse: Float[Array, "*f k d"]
+    """Impulse [kg m/s], friction included."""
+    angular: Float[Array, "*f k r"]
+    """Angular impulse [kg m²/s] about the centre of the collider's rotation, or where it has none about its shape's
+    middle, as it moves: of r = 1 component in 2-D, 3 in 3-D, none in 1-D. Nodes and centre are taken where they are as
+    the step begins, with methods of second order half-way through it: about these places the moments of all impulses
+    are the change of angular momentum, Σ x^n × m Δv = Δ Σ x × m v where x moves with v^{n+1}, and
+    Σ ½(x^n + x^{n+1}) × m Δv where it moves with the mean."""
+
+    def plus(self, later: "Exchange") -> "Exchange":
+        """Both together."""
+        return jax.tree.map(jnp.add, self, later)
+
+
+def nothing_received(colliders: int, dim: int, dtype: Any) -> Exchange:
+    """Of so many colliders, at the start."""
+    return Exchange(jnp.zeros((colliders, dim), dtype), jnp.zeros((colliders, len(pairs(dim))), dtype))
+
+
+def received(
+    touch: Touch, reaction: NodeVector, push: NodeScalar | None = None, rub: NodeVector | None = None
+) -> Exchange:
+    """Minus what each collider gives the nodes: prescribed components, the push along normals, friction.
+
+    Args:
+        touch: which node and component is whose.
+        reaction: the impulse of all walls and bodies on the nodes, but for friction [kg m/s].
+        push: the part of it by colliders, along their normals [kg m/s].
+        rub: the impulse of their friction [kg m/s].
+    """
+    along = jnp.zeros_like(reaction) if push is None else push[:, None] * touch.normal
+    along = along if rub is None else along + rub
+    impulse, angular = [], []
+    for number, pivot in enumerate(touch.pivots):
+        given = jnp.where((touch.owner == number)[:, None], along, 0) + jnp.where(touch.holder == number, reaction, 0)
+        impulse.append(-given.sum(axis=0))
+        angular.append(-_moment(touch.position - pivot, given).sum(axis=0))
+    return Exchange(jnp.stack(impulse), jnp.stack(angular))
+
+
+def _moment(arm: NodeVector, force: NodeVector) -> Float[Array, "n r"]:
+    """arm × force: (r_y f_z − r_z f_y, r_z f_x − r_x f_z, r_x f_y − r_y f_x), in 2-D the last alone."""
+    d = arm.shape[1]
+    if d == 3:
+        return jnp.cross(arm, force)
+    moments = [arm[:, i] * force[:, j] - arm[:, j] * force[:, i] for i, j in pairs(d)]
+    return jnp.stack(moments, axis=1) if moments else jnp.zeros((len(arm), 0), arm.dtype)

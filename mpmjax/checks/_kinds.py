@@ -1,0 +1,221 @@
+"""Of what kind a value must be: a number, a sequence of so many axes, an object of a class. Its annotation says it.
+
+`require_fields` checks a module's fields, `checked` a function's arguments, so that what is wrong is said where it is
+given, with what is known there. Numbers may be Python's, NumPy's or JAX's, traced ones too.
+"""
+
+import difflib
+import enum
+import inspect
+import os
+import sys
+import typing
+from collections.abc import Callable
+from dataclasses import fields
+from functools import cache, wraps
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, cast, get_args, get_origin
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import AbstractArray
+
+from mpmjax.checks._values import shortened
+
+Function = TypeVar("Function", bound=Callable)
+
+_LARGEST = 2**63  # arrays hold no whole number beyond
+_WORDS: dict[Any, str] = {
+    float: "a number",
+    np.floating: "a number",
+    np.integer: "a number",
+    jax.Array: "a number",
+    int: "a whole number",
+    bool: "True or False",
+    str: "a string",
+    os.PathLike: "a path",
+    None: "None",
+    NoneType: "None",
+    tuple: "rows of numbers",
+    list: "rows of numbers",
+}
+
+
+def checked(function: Function) -> Function:
+    """A function that first requires its arguments to be of the kinds that their annotations name.
+
+    Raises:
+        ValueError: one is not.
+    """
+    signature = inspect.signature(function)
+    hints = {p.name: p.annotation for p in signature.parameters.values() if p.annotation is not p.empty}
+    owner = function.__qualname__.removesuffix(".__init__")
+
+    @wraps(function)
+    def guarded(*args: Any, **kwargs: Any) -> Any:
+        for name, given in signature.bind(*args, **kwargs).arguments.items():
+            several = signature.parameters[name].kind is inspect.Parameter.VAR_POSITIONAL
+            for value in given if several else (given,) if name in hints else ():
+                require_kind(f"{owner}'s {name}", value, hints[name])
+        return function(*args, **kwargs)
+
+    return cast(Function, guarded)
+
+
+def require_fields(module: eqx.Module) -> None:
+    """Every field of a module must be of the kind that its annotation names.
+
+    Raises:
+        ValueError: one is not.
+    """
+    for name, hint in _hints(type(module)):
+        require_kind(f"{type(module).__name__}'s {name}", getattr(module, name), hint)
+
+
+@cache
+def _hints(module: type) -> tuple[tuple[str, Any], ...]:
+    return tuple((f.name, f.type) for f in fields(module))
+
+
+def require_kind(name: str, value: Any, hint: Any) -> None:
+    """A value must be of a kind that an annotation names.
+
+    Raises:
+        ValueError: it is not; with the kinds that are known, and which of them may have been meant.
+    """
+    if not _takes(hint, value):
+        shown = f"the class {value.__name__}" if isinstance(value, type) else shortened(repr(value))
+        raise ValueError(f"{name} must be {_in_words(hint)}, got {shown}{_meant(hint, value)}")
+
+
+def alternatives(hint: Any) -> list[Any]:
+    """The members of a union, or the one annotation."""
+    if get_origin(hint) in (typing.Union, UnionType):
+        return [a for member in get_args(hint) for a in alternatives(member)]
+    return [hint]
+
+
+def is_module(hint: Any) -> bool:
+    """Whether an annotation is a class of modules."""
+    return isinstance(hint, type) and issubclass(hint, eqx.Module)
+
+
+def is_enum(hint: Any) -> bool:
+    """Whether an annotation is an enumeration."""
+    return isinstance(hint, type) and issubclass(hint, enum.Enum)
+
+
+def shape_of(value: Any) -> tuple[int, ...] | None:
+    """The shape of a number, of an array or of nested sequences of such; None of what is none, or ragged."""
+    if isinstance(value, (np.ndarray, np.generic, jax.Array)):
+        real = jnp.issubdtype(value.dtype, jnp.integer) or jnp.issubdtype(value.dtype, jnp.floating)
+        return np.shape(value) if real else None
+    if isinstance(value, (tuple, list)):
+        shapes = {shape_of(v) for v in value}
+        inner = shapes.pop() if shapes else ()
+        return None if shapes or inner is None else (len(value), *inner)
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return () if number and (isinstance(value, float) or abs(value) < _LARGEST) else None
+
+
+def _takes(hint: Any, value: Any) -> bool:
+    """Whether a value is of a kind that an annotation names. Where that is more than it can tell, it says yes."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin in (typing.Union, UnionType):
+        return any(_takes(a, value) for a in args)
+    if origin in (tuple, list):
+        sequence = isinstance(value, (tuple, list)) or (isinstance(value, np.ndarray) and value.ndim == 1)
+        wanted = args[:1] * len(value) if sequence and (origin is list or Ellipsis in args) else args
+        return sequence and len(value) == len(wanted) and all(_takes(a, v) for a, v in zip(wanted, value, strict=True))
+    if origin is Literal:
+        return isinstance(value, str) and value in args
+    if origin is Callable:
+        return callable(value)
+    if not isinstance(hint, type) or hint in (Any, type, object):
+        return hint is not None or value is None
+    if issubclass(hint, AbstractArray):
+        shape, (least, more) = None if isinstance(value, (tuple, list)) else shape_of(value), _axes(hint)
+        return shape is not None and (len(shape) == least or (more and len(shape) > least))
+    if hint in (tuple, list):  # of numbers, however nested
+        return isinstance(value, (tuple, list)) and shape_of(value) is not None
+    if hint in (float, jax.Array):
+        return shape_of(value) == ()
+    if hint is bool:
+        return isinstance(value, (bool, np.bool_))
+    if hint is int:
+        return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and abs(int(value)) < _LARGEST
+    return isinstance(value, hint)
+
+
+def _axes(hint: type[AbstractArray]) -> tuple[int, bool]:
+    """How many axes an array of jaxtyping's has, and whether it may have more."""
+    named = [axis for axis in hint.dim_str.split() if axis != "..." and not axis.startswith("*")]
+    return len(named), len(named) < len(hint.dim_str.split())
+
+
+def _known(hint: Any) -> dict[str, Any]:
+    """The classes of objects that an annotation takes, and the members of its enumerations, by their names: of a base
+    class, those below it."""
+
+    def below(kind: type) -> dict[str, Any]:
+        if inspect.isabstract(kind) or kind.__name__.startswith("Abstract"):
+            return {name: c for sub in kind.__subclasses__() for name, c in below(sub).items()}
+        own = kind.__module__.partition(".")[0] == "mpmjax"
+        return {kind.__name__: kind} if not own or hasattr(sys.modules["mpmjax"], kind.__name__) else {}
+
+    names: dict[str, Any] = {}
+    for a in alternatives(hint):
+        if get_origin(a) in (tuple, list):
+            names |= {name: c for item in get_args(a) for name, c in _known(item).items()}
+        elif is_enum(a):
+            names |= {str(member): member for member in a}
+        elif is_module(a):
+            names |= below(a)
+    return names
+
+
+def _in_words(hint: Any) -> str:
+    """What an annotation takes: objects by their names, then numbers and the rest."""
+    names = list(_known(hint))
+    words = [f"one of {', '.join(names)}" if len(names) > 1 else names[0]] if names else []
+    for a in alternatives(hint):
+        if get_origin(a) in (tuple, list) and _known(a):
+            words.append("several of them")
+        elif not _known(a):
+            words.append(_plain(a))
+    *most, last = [w for w in dict.fromkeys(words) if not (w == _WORDS[int] and _WORDS[float] in words)]
+    return f"{', '.join(most)} or {last}" if most else last
+
+
+def _plain(hint: Any) -> str:
+    """What an annotation of numbers, words and the like takes."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return " or ".join(repr(word) for word in args)
+    if origin in (tuple, list):
+        inner = [a for item in args for a in alternatives(item)]
+        return f"a sequence of {'whole numbers' if inner[0] is int else 'bools' if inner[0] is bool else 'numbers'}"
+    if origin is Callable:
+        return "a function"
+    if isinstance(hint, type) and issubclass(hint, AbstractArray):
+        axes, more = _axes(hint)
+        return "an array of numbers" if more else ("a number", "a sequence of numbers", "rows of numbers")[min(axes, 2)]
+    return _WORDS.get(hint, f"of a class derived from {getattr(hint, '__name__', hint)}")
+
+
+def _meant(hint: Any, value: Any) -> str:
+    """The end of a message: the object for which its class or name may stand."""
+    word = value.__name__ if isinstance(value, type) else value[:60] if isinstance(value, str) else ""
+    known = {name.rsplit(".", 1)[-1].lower(): (name, kind) for name, kind in _known(hint).items()}
+    key = word.replace(" ", "").replace("_", "").lower()
+    inside = [k for k in known if len(key) > 2 and (key in k or k in key)]
+    close = inside if len(inside) == 1 else difflib.get_close_matches(key, known, 1)
+    if not close:
+        return "."
+    name, kind = known[close[0]]
+    if not isinstance(kind, type):
+        return f", did you mean {name}?"
+    parameters = list(inspect.signature(kind.__init__).parameters.values())[1:]
+    return f", did you mean {name}({'...' if any(p.default is p.empty for p in parameters) else ''})?"

@@ -1,0 +1,274 @@
+"""The shell's commands: `mpmjax run`, `mpmjax fit`, `mpmjax chart`, `mpmjax render`."""
+
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import numpy as np
+import typer
+
+from mpmjax.analysis import Trial, energy, grid_mass, name_of, pieces, work_precision
+from mpmjax.checks import require
+from mpmjax.cli._scene_file import CurveSettings, Job, fit_job, read_job, read_plan, stable_step
+from mpmjax.fitting import FitResult
+from mpmjax.io import check_place, end_on_signals, load, record, reporting, save_figure, steps_in
+from mpmjax.simulation import Run
+from mpmjax.viz import COLOURS, draw_chart, render, write_trials
+
+app = typer.Typer(
+    help="A differentiable Material Point Method.", no_args_is_help=True, add_completion=False, rich_markup_mode=None
+)
+
+
+def _reporting(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with its faults told in one line and exit code 2."""
+
+    @wraps(command)
+    def guarded(*args: Any, **kwargs: Any) -> None:
+        try:
+            with jax.enable_x64(True), warnings.catch_warnings():
+                warnings.simplefilter("default", UserWarning)
+                warnings.showwarning = _print_warning
+                command(*args, **kwargs)
+        except (ValueError, RuntimeError, OSError, MemoryError) as error:
+            told = " ".join(str(error).split()) or "there is not enough memory for this"
+            print(f"mpmjax: {told}", file=sys.stderr)
+            raise typer.Exit(2) from None
+
+    return guarded
+
+
+def _print_warning(message: Warning | str, *where: Any) -> None:
+    """In one line, without the place in the code."""
+    del where
+    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
+MostSeconds = Annotated[
+    float | None,
+    typer.Option(help="What pilot runs may take, compilation included. Default: the file's most_seconds, or 60."),
+]
+SceneFile = Annotated[Path, typer.Argument(help="A TOML scene file; docs/scene_files.md is its schema.")]
+
+
+@app.command("run")
+@_reporting
+def run_command(
+    scene: SceneFile,
+    output: Annotated[Path, typer.Option("--output", "-o", help="The HDF5 file to write; ParaView opens it.")],
+    overwrite: Annotated[bool, typer.Option(help="Replace the output file if it exists.")] = False,
+    resume: Annotated[bool, typer.Option(help="Continue the output file from its last frame.")] = False,
+    quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
+    most_seconds: MostSeconds = None,
+) -> None:
+    """Simulate a scene and write its frames."""
+    require(not (overwrite and resume), "--overwrite starts a file anew and --resume continues it: give one of them.")
+    done = steps_in(output) if resume else 0
+    if not resume:
+        check_place(output, overwrite=overwrite)
+    job = _chosen(scene, most_seconds, quiet=quiet)
+    begun = time.perf_counter()
+    run = record(
+        output,
+        job.scene,
+        job.particles,
+        t1=job.run.t1,
+        dt=job.run.dt,
+        method=job.run.method,
+        save_every=job.run.save_every,
+        overwrite=overwrite,
+        resume=resume,
+        progress=not quiet,
+    )
+    taken, seconds = int(run.tally.steps) - done, time.perf_counter() - begun
+    with reporting(lambda: f"{output} is complete."):
+        print(_summary(job, run, taken, seconds))
+    reached = f"complete already: it reaches t = {float(run.final_step * run.dt):.6g} s" if resume and not taken else ""
+    print(f"written            {output} {reached}".rstrip())
+
+
+def _chosen(scene: Path, most_seconds: float | None, *, quiet: bool = False) -> Job:
+    """The scene file's job; pilot runs are told on standard error, and what they chose on standard output."""
+    told = {} if quiet else {"progress": lambda trial: _print_error(_line(trial)), "say": _print_error}
+    job = read_job(scene, most_seconds=most_seconds, **told)
+    if job.choice is not None:
+        print(f"{'chosen':<18} {job.choice}")
+    return job
+
+
+def _print_error(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+def _summary(job: Job, run: Run, taken: int, seconds: float) -> str:
+    """What a run cost, `taken` of its steps in these seconds, and how well it kept mass and energy."""
+    steps, p = int(run.tally.steps), run.final.count
+    before, after = energy(run.scene, job.particles), energy(run.scene, run.final)
+    mass = float(run.final.mass.sum())
+    lines = [
+        ("particles", f"{p}"),
+        ("steps", f"{steps} of {float(run.dt):.4g} s with {type(run.method).__name__}"),
+        ("wall time", f"{seconds:.3g} s (compilation included), {taken * p / seconds:.3g} particle-steps per second"),
+    ]
+    if int(run.tally.iterations) > 0:
+        lines.append(
+            (
+                "solver",
+                f"{int(run.tally.iterations) / steps:.3g} iterations a step, at most {int(run.tally.most_iterations)}, "
+                f"worst relative residual {float(run.tally.worst_residual):.2g}",
+            )
+        )
+    if int(run.tally.newton) > 0:
+        lines.append(("Newton", f"{int(run.tally.newton) / steps:.3g} a step, {int(run.tally.line_search)} halvings"))
+    if int(run.tally.indefinite) > 0:
+        lines.append(
+            (
+                "indefinite",
+                f"the system of {int(run.tally.indefinite)} of {steps} steps: compressed material; if the motion looks "
+                'wrong, reduce dt or take hessian = { kind = "AnalyticHessian", projected = true }',
+            )
+        )
+    if int(run.tally.violations) > 0:
+        lines.append(("contact", f"{int(run.tally.violations)} conditions left violated"))
+    whole, parts = pieces(run.scene, job.particles), pieces(run.scene, run.final)
+    if parts > whole:
+        advice = "if nothing was to part, this is numerical fracture: more particles a cell, or TotalLagrangian"
+        lines.append(("pieces", f"{whole} at the start, {parts} at the end; {advice}"))
+    for name in ("kinetic", "elastic", "potential", "total"):
+        a, b = float(getattr(before, name)), float(getattr(after, name))
+        lines.append((f"{name} energy", f"{a + 0.0:.6g} J to {b + 0.0:.6g} J, change {b - a:+.3g} J"))
+    lost = (float(grid_mass(run.scene, run.final)) - mass) / mass
+    lines.append(("mass", f"{mass:.6g} kg; on the grid {lost:+.1e} of it"))
+    return "\n".join(f"{name:<18} {text}" for name, text in lines)
+
+
+@app.command("fit")
+@_reporting
+def fit_command(
+    scene: SceneFile,
+    plot: Annotated[Path | None, typer.Option(help="The plot to write. Default: SCENE_fit.png here.")] = None,
+    most_seconds: MostSeconds = None,
+) -> None:
+    """Fit a scene's parameter to the measured curve that its [fit] table names."""
+    begun = time.perf_counter()
+    job = _chosen(scene, most_seconds)
+    result = fit_job(job)
+    assert job.fit is not None
+    print(_table(job.fit, result))
+    name = (job.fit.report or job.fit.parameter).rsplit(".", 1)[-1]
+    print(f"{job.fit.parameter} = {float(result.parameter):.5g}")
+    print(f"{name} = {float(result.value):.5g} ± {float(result.standard_error):.2g} (standard error)")
+    plot = Path(f"{scene.stem}_fit.png") if plot is None else plot
+    _plot(job.fit, result, name, plot)
+    print(f"{result.simulations} simulations with exact derivatives, {time.perf_counter() - begun:.3g} s in all")
+    print(f"written {plot}")
+
+
+def _table(fit: CurveSettings, result: FitResult) -> str:
+    """Misfit at each point."""
+    lines = [f"{'stretch':>10} {'measured [Pa]':>14} {'model [Pa]':>12} {'misfit':>8}"]
+    for x, y, model, used in zip(fit.stretch, fit.stress, np.asarray(result.predicted), fit.fitted, strict=True):
+        misfit = f"{model / y - 1:+8.1%}" if y else " " * 8
+        if np.isnan(model):
+            lines.append(f"{x:10.4f} {y:14.5g} {'-':>12} {'':>8} not reached by the run")
+        else:
+            lines.append(f"{x:10.4f} {y:14.5g} {model:12.5g} {misfit} {'fitted' if used else 'predicted'}")
+    return "\n".join(lines)
+
+
+def _plot(fit: CurveSettings, result: FitResult, name: str, path: Path) -> None:
+    from matplotlib import pyplot as plt  # here, since it takes a second that only pictures should pay
+
+    figure, axes = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
+    x, y = (np.asarray(a) for a in result.curve)
+    shown = x <= max(fit.stretch.max(), 1.02 * x[0])
+    axes.plot(x[shown], y[shown] / 1e6, color="tab:blue", label=f"{name} = {float(result.value):.4g}")
+    axes.plot(fit.stretch[fit.fitted], fit.stress[fit.fitted] / 1e6, "o", color="black", label="measured, fitted")
+    others = ~fit.fitted
+    axes.plot(
+        fit.stretch[others], fit.stress[others] / 1e6, "o", color="black", mfc="white", label="measured, predicted"
+    )
+    axes.set(xlabel="stretch of the gauge section [-]", ylabel="nominal stress [MPa]")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    save_figure(figure, path, 140)
+    plt.close(figure)
+
+
+@app.command("chart")
+@_reporting
+def chart_command(
+    scene: SceneFile,
+    error: Annotated[float, typer.Option(help="The relative error of the motion that is asked for.")] = 1e-2,
+    most_seconds: MostSeconds = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="The chart to write, its numbers beside it as .csv.")
+    ] = None,
+) -> None:
+    """Chart a scene's error against seconds, and name the cheapest setting for an error."""
+    plan = read_plan(scene)
+    output = Path(f"{scene.stem}_chart.png") if output is None else output
+    print(f"{'method':>24} {'spacing':>10} {'dt [s]':>10} {'steps':>9} {'seconds':>9} {'error':>9}", flush=True)
+    dt = stable_step(scene, plan) if plan.run.dt == "stable" else plan.run.dt
+    own = () if dt is None or plan.run.method is None else ((plan.run.method, dt),)
+    found = work_precision(
+        plan.build,
+        t1=plan.run.t1,
+        error=error,
+        also=own,
+        most_seconds=plan.run.most_seconds if most_seconds is None else most_seconds,
+        progress=lambda trial: print(_line(trial), flush=True),
+        say=_print_error,
+    )
+    print(found.verdict())
+    print(f"written {draw_chart(found, output)} and {write_trials(found, output.with_suffix('.csv'))}")
+
+
+def _line(trial: Trial) -> str:
+    said = "failed" if np.isinf(trial.error) else "foreseen" if np.isnan(trial.error) else f"{trial.error:.2e}"
+    return (
+        f"{name_of(trial.method):>24} {f'1 / {trial.refinement}':>10} {trial.dt:10.3g} {trial.steps:9d} "
+        f"{trial.seconds:9.3g} {said:>9}"
+    )
+
+
+def _angles(text: str) -> tuple[float, float]:
+    try:
+        azimuth, elevation = (float(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not AZIMUTH,ELEVATION in degrees, such as -135,30.") from None
+    return azimuth, elevation
+
+
+@app.command("render")
+@_reporting
+def render_command(
+    run: Annotated[Path, typer.Argument(help="An HDF5 file of a run.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="A picture: .png, .pdf, .svg, or .gif of all frames.")],
+    colour: Annotated[
+        str, typer.Option(help=f"What colours the particles: {', '.join(COLOURS)}, what a law remembers, none.")
+    ] = "speed",
+    frame: Annotated[int | None, typer.Option(help="The frame of a still; negative from the end.")] = None,
+    view: Annotated[
+        tuple,
+        typer.Option(
+            parser=_angles, metavar="AZIMUTH,ELEVATION", help="Of the eye, in degrees: where a run in 3-D is seen from."
+        ),
+    ] = "30,20",  # pyright: ignore[reportArgumentType]  # parsed as if it had been given
+    dpi: Annotated[float, typer.Option(help="Resolution.")] = 120.0,
+    fps: Annotated[int, typer.Option(help="Frames a second of an animation.")] = 20,
+) -> None:
+    """Draw a run's particles."""
+    render(load(run), output, colour=colour, frame=frame, view=view, fps=fps, dpi=dpi)
+    print(f"written {output}")
+
+
+def main() -> None:
+    """Entry point of the `mpmjax` command."""
+    end_on_signals()
+    app()

@@ -1,0 +1,388 @@
+"""Scene files: TOML in, a scene with its particles and run settings out. `docs/scene_files.md` is the schema in
+words."""
+
+import itertools
+import tomllib
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Scalar
+from mpmjax.analysis import METHODS, Build, Trial, work_precision
+from mpmjax.checks import require, require_positive, shortened, warn
+from mpmjax.discretisation import Grid
+from mpmjax.fitting import FitResult, fit_curve, gauge, read_columns
+from mpmjax.geometry import AbstractRegion
+from mpmjax.io import arguments, decode, reason
+from mpmjax.simulation import number_of_steps
+from mpmjax.state import Particles, Scene, fill, join, prepare
+from mpmjax.stepping import Explicit, Method, stable_dt
+
+_FRAMES = 50
+"""How many frames are saved where neither they nor the step are given."""
+
+
+class RunSettings(NamedTuple):
+    """How a scene is run."""
+
+    t1: float
+    dt: float
+    method: Method
+    save_every: int
+    dtype: str
+
+
+class RunTable(NamedTuple):
+    """The `[run]` table: as the settings, but that what is "auto" is None."""
+
+    t1: float
+    dt: float | Literal["stable"] | None
+    method: Method | None
+    save_every: int | None
+    dtype: str
+    error: float
+    most_seconds: float
+
+
+class CurveSettings(NamedTuple):
+    """The `[fit]` table of kind "curve", its data read."""
+
+    stretch: np.ndarray
+    stress: np.ndarray
+    fitted: np.ndarray
+    parameter: str
+    report: str | None
+    axis: int
+    gauge: AbstractRegion
+
+
+class Plan(NamedTuple):
+    """Everything that a scene file says."""
+
+    scene: Scene
+    particles: Particles
+    run: RunTable
+    fit: CurveSettings | None
+    build: Build
+    """From n to the scene on n times as many cells a direction, and its particles."""
+
+
+class Job(NamedTuple):
+    """A plan, ready to be run."""
+
+    scene: Scene
+    particles: Particles
+    run: RunSettings
+    fit: CurveSettings | None
+    choice: str | None
+    """What stood for "auto" or "stable", and why."""
+
+
+def read_plan(path: Path) -> Plan:
+    """Read a scene file.
+
+    Raises:
+        ValueError: no such file, no TOML, a key that is unknown, missing or unfit, particles outside of the window: one
+            line that names the place.
+    """
+    table = _toml(path)
+    for name in ("particles", "run"):
+        require(name in table, f"{path}: needs the table [{name}]. See docs/scene_files.md.")
+    fit_table = table.pop("fit", None)
+    groups, run_table = table.pop("particles"), table.pop("run")
+    groups = groups if isinstance(groups, list) else [groups]
+    try:
+        run = _run_table(run_table)
+
+        def build(n: int) -> tuple[Scene, Particles]:
+            scene = decode(_refined(table, n), Scene)
+            return scene, prepare(scene, _filled(scene, groups, run.dtype))
+
+        scene, particles = build(1)
+        fit = None if fit_table is None else _curve_settings(fit_table, path.parent)
+        if isinstance(run.dt, float):
+            number_of_steps(run.t1, run.dt, 0, particles.x.dtype)
+        if fit is not None:
+            gauge(fit.gauge, particles, fit.axis)
+            _check_paths(fit, scene)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    except RecursionError:
+        raise ValueError(f"{path}: tables are nested too deeply to be read.") from None
+    return Plan(scene, particles, run, fit, build)
+
+
+def read_job(
+    path: Path,
+    *,
+    most_seconds: float | None = None,
+    progress: Callable[[Trial], None] = lambda trial: None,
+    say: Callable[[str], None] = lambda line: None,
+) -> Job:
+    """Read a scene file, and choose what it leaves to be chosen: the stable step, or what pilot runs find.
+
+    Args:
+        path: the file.
+        most_seconds: what the pilot runs may take [s]. Default: what the file says.
+        progress: called with each pilot run, see `work_precision`.
+        say: called with each run of their reference.
+
+    Raises:
+        ValueError: as `read_plan`, and as `stable_dt` and `work_precision`.
+    """
+    plan = read_plan(path)
+    t1, dt, method, save_every, dtype, error, seconds = plan.run
+    choice = None
+    require(
+        most_seconds is None or dt is None or method is None,
+        "--most-seconds is for pilot runs, and there are none: the file gives dt and method.",
+    )
+    if dt == "stable":
+        dt = stable_step(path, plan)
+        steps = round(t1 / dt)
+        choice = f"dt = {dt:.6g} s ({steps} steps), the longest that is stable as the particles start"
+        save_every = save_every or max(1, steps // _FRAMES)
+    if dt is None or method is None:
+        methods = METHODS if method is None else (method,)
+        found = work_precision(
+            plan.build,
+            t1=t1,
+            error=error,
+            methods=methods,
+            refinements=(1,),
+            most_seconds=seconds if most_seconds is None else most_seconds,
+            progress=progress,
+            say=say,
+        )
+        best, choice = found.cheapest(), found.verdict()
+        if best is None:
+            raise ValueError(f"{path}: {choice}")
+        dt, method = best.dt, best.method
+        save_every = save_every or max(1, best.steps // _FRAMES)
+    return Job(plan.scene, plan.particles, RunSettings(t1, dt, method, save_every or 1, dtype), plan.fit, choice)
+
+
+def stable_step(path: Path, plan: Plan) -> float:
+    """What dt = "stable" stands for in a scene file [s].
+
+    Raises:
+        ValueError: as `stable_dt`.
+    """
+    assert plan.run.method is not None
+    try:
+        return float(stable_dt(plan.scene, plan.particles, method=plan.run.method, t1=plan.run.t1))
+    except ValueError as error:
+        raise ValueError(f'{path}: [run] dt = "stable": {error}') from None
+
+
+def fit_job(job: Job) -> FitResult:
+    """Carry out the fit that a scene file asks for.
+
+    Raises:
+        ValueError: it asks for none, or see `fit_curve`.
+    """
+    fit, run = job.fit, job.run
+    if fit is None:
+        raise ValueError("The scene file has no [fit] table, so there is nothing to fit. See docs/scene_files.md.")
+    report = fit.report
+    return fit_curve(
+        job.scene,
+        job.particles,
+        t1=run.t1,
+        dt=run.dt,
+        method=run.method,
+        curve=gauge(fit.gauge, job.particles, fit.axis),
+        measured_x=fit.stretch,
+        measured_y=fit.stress,
+        fitted=fit.fitted,
+        parameter=lambda scene: leaf_of(fit.parameter, scene),
+        report=None if report is None else lambda scene: leaf_of(report, scene),
+    )
+
+
+def leaf_of(path: str, scene: Scene) -> Any:
+    """The value at a dotted path such as "material.youngs_modulus" or "boundary.0.friction"."""
+    value: Any = scene
+    for name in path.split("."):
+        try:
+            value = value[int(name)] if name.isdecimal() else getattr(value, name)
+        except (AttributeError, IndexError, TypeError):
+            raise ValueError(f"[fit] names {path!r}, but the scene has no {name!r} there.") from None
+    return value
+
+
+def _check_paths(fit: CurveSettings, scene: Scene) -> None:
+    """The fitted parameter must be a positive number of the scene's own, and what is reported a number."""
+    value, (owner, _, name) = leaf_of(fit.parameter, scene), fit.parameter.rpartition(".")
+    parent = leaf_of(owner, scene) if owner else scene
+    known = [f.name for f in fields(parent)] if is_dataclass(parent) else []
+    require(
+        not known or name in known,
+        f"[fit] parameter {fit.parameter!r} follows from others and cannot be fitted; name one of {', '.join(known)}.",
+    )
+    require(
+        not isinstance(value, eqx.Module) and np.ndim(value) == 0 and np.all(np.asarray(value) > 0),
+        f"[fit] parameter {fit.parameter!r} must be one positive number, but is {value}.",
+    )
+    if fit.report is not None:
+        reported = leaf_of(fit.report, scene)
+        require(
+            not isinstance(reported, eqx.Module) and np.ndim(reported) == 0,
+            f"[fit] report {fit.report!r} must be one number, but is {reported}.",
+        )
+
+
+def _toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"Cannot read the scene file {path}: {reason(error).lower()}.") from None
+    except RecursionError:
+        raise ValueError(f"{path} is not a scene file: it is nested too deeply to be read.") from None
+    except ValueError as error:  # TOML's and UTF-8's among them
+        raise ValueError(f"{path} is not a TOML file: {shortened(str(error))}.") from None
+
+
+def _run_table(table: Any) -> RunTable:
+    def run(
+        *,
+        t1: Scalar,
+        dt: Scalar | Literal["stable"] | None = None,
+        method: Method | None = None,
+        save_every: int | None = None,
+        precision: str = "float64",
+        error: Scalar = 1e-2,
+        most_seconds: Scalar = 60.0,
+    ) -> RunTable:
+        require_positive("[run] t1", t1)
+        if isinstance(dt, str):
+            require(dt == "stable", f'[run] dt must be a step in seconds, "stable" or "auto", got {dt!r}.')
+        elif dt is not None:
+            require_positive("[run] dt", dt)
+            dt = float(dt)
+        require_positive("[run] error", error)
+        require_positive("[run] most_seconds", most_seconds)
+        every = save_every is None or save_every >= 1
+        require(every, f"[run] save_every must be at least 1, got {save_every}.")
+        known = precision in ("float32", "float64")
+        require(known, f'[run] precision must be "float32" or "float64", got {precision!r}.')
+        return RunTable(float(t1), dt, method, save_every, precision, float(error), float(most_seconds))
+
+    require(isinstance(table, dict), f"[run] must be a table, got {shortened(repr(table))}.")
+    left = {name for name in ("dt", "method") if table.get(name) == "auto"}
+    require("dt" in table, '[run] needs the key \'dt\': a step in seconds, "stable" or "auto".')
+    require(left != {"method"}, '[run] method = "auto" goes with dt = "auto": the cheapest of both is chosen together.')
+    given = arguments(run, {key: value for key, value in table.items() if key not in left}, "[run]")
+    if "method" not in left:
+        given.setdefault("method", Explicit())
+    return run(**given)
+
+
+def _refined(table: dict[str, Any], n: int) -> dict[str, Any]:
+    """The table of a scene on n times as many cells a direction."""
+    grid = table.get("grid")
+    if n == 1 or not isinstance(grid, dict):
+        return table
+    materials = table.get("material", {})
+    for material in materials if isinstance(materials, list) else [materials]:
+        lists = _lists(material)
+        require(not lists, f"[material] {', '.join(lists)}: refinement needs one number for all particles.")
+    finer = {key: [n * k for k in grid[key]] for key in ("shape", "origin") if key in grid}
+    return table | {"grid": grid | finer | {"spacing": grid["spacing"] / n}}
+
+
+def _lists(material: Any) -> list[str]:
+    """The keys of a law, and of a law within it, that have one value for each particle."""
+    items = material.items() if isinstance(material, dict) else ()
+    return [key for key, value in items if isinstance(value, list)] + [k for _, v in items for k in _lists(v)]
+
+
+def _filled(scene: Scene, tables: list[Any], dtype: str) -> Particles:
+    """The particles of all tables, those of each material together, in the materials' order."""
+    filled: list[list[Particles]] = [[] for _ in scene.laws]
+    regions: list[AbstractRegion] = []
+    placed: list[np.ndarray] = []
+    for number, table in enumerate(tables, 1):
+        where = f"[[particles]] {number}"
+        require(isinstance(table, dict), f"{where} must be a table, got {shortened(repr(table))}.")
+        material, rest = table.get("material", 1), {key: value for key, value in table.items() if key != "material"}
+        known = range(1, len(scene.laws) + 1)
+        require(
+            type(material) is int and material in known,
+            f"{where} material must be the number of a [[material]], from 1 to {len(scene.laws)}, got "
+            f"{shortened(repr(material))}.",
+        )
+        given = arguments(fill, rest, where, given=("grid", "dtype"))
+        try:
+            _check_place(given["region"], scene.grid)
+            filled[material - 1].append(fill(grid=scene.grid, dtype=dtype, **given))
+            regions, placed = [*regions, given["region"]], [*placed, np.asarray(filled[material - 1][-1].x)]
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
+    _warn_of_overlaps(regions, placed, float(scene.grid.spacing))
+    for number, sets in enumerate(filled, 1):
+        require(
+            len(sets) > 0, f"[[material]] {number} has no particles: name it in a [[particles]] table, or leave it out."
+        )
+    return join(*(replace(join(*sets), counts=None) for sets in filled))
+
+
+def _warn_of_overlaps(regions: list[AbstractRegion], placed: list[np.ndarray], spacing: float) -> None:
+    """Warn where particles of a table lie in the region of an earlier one, deeper than rounding has it."""
+    for (i, region), (j, x) in itertools.product(enumerate(regions, 1), enumerate(placed, 1)):
+        lower, upper = region.bounds()
+        if i < j and ((x.min(axis=0) < upper) & (x.max(axis=0) > lower)).all():
+            inside = int(np.asarray(region.contains(jnp.asarray(x), -1e-3 * spacing)).sum())
+            if inside:
+                warn(
+                    f"{inside} particles of [[particles]] {j} lie in the region of [[particles]] {i}: where two fill "
+                    "the same place there is twice the mass."
+                )
+
+
+def _check_place(region: AbstractRegion, grid: Grid) -> None:
+    """A region larger than the window, or beside it, is not worth filling to find that its particles are outside."""
+    lower, upper = region.bounds()
+    if len(lower) != grid.dim:
+        return  # as `fill` says
+    dx, window = float(grid.spacing), np.asarray(grid.shape) - 1
+    first = np.asarray(grid.origin) * dx
+    held = ~np.asarray(grid.periodic)
+    too_large = (upper - lower > (window + 2) * dx) & held
+    beside = ((upper < first) | (lower > first + window * dx)) & held & (not grid.follow)
+    require(
+        ~(too_large | beside),
+        f"the region from {lower} to {upper} m does not fit into the grid's window, of {window * dx} m"
+        + ("" if grid.follow else f" from {first} m")
+        + ": all lengths are in metres; enlarge the shape, move the origin, or use follow = true.",
+    )
+
+
+def _curve_settings(table: Any, folder: Path) -> CurveSettings:
+    def curve(
+        *,
+        kind: str,
+        data: str,
+        stretch: str,
+        nominal_stress: str,
+        unit: Scalar = 1.0,
+        range: tuple[float, ...],  # noqa: A002 (the key in the file)
+        parameter: str,
+        report: str | None = None,
+        gauge: AbstractRegion,
+        axis: int,
+    ) -> CurveSettings:
+        require(kind == "curve", f'[fit] kind must be "curve", got {kind!r}.')
+        require(len(range) == 2 and range[0] < range[1], f"[fit] range must be two growing stretches, got {range}.")
+        require_positive("[fit] unit [Pa]", unit)
+        x, y = read_columns(folder / data, stretch, nominal_stress)
+        fitted = (x >= range[0]) & (x <= range[1])
+        require(fitted.sum() >= 2, f"[fit] range {range} holds {int(fitted.sum())} of {len(x)} points; two are needed.")
+        return CurveSettings(x, y * float(unit), fitted, parameter, report, axis, gauge)
+
+    return curve(**arguments(curve, table, "[fit]"))

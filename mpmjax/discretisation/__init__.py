@@ -1,0 +1,33 @@
+"""Grid, B-spline kernels, stencils, and the transfers between particles and grid."""
+
+from mpmjax.discretisation._grid import Grid
+from mpmjax.discretisation._kernel import (
+    BSpline,
+    Gradient,
+    MLSGradient,
+    SplineGradient,
+    Stencil,
+    in_window,
+    make_stencil,
+)
+from mpmjax.discretisation._transfer import APIC, FLIP, PIC, Transfer, g2p, p2g
+from mpmjax.discretisation._transfer_sums import collect, spread
+
+__all__ = [
+    "APIC",
+    "FLIP",
+    "PIC",
+    "BSpline",
+    "Gradient",
+    "Grid",
+    "MLSGradient",
+    "SplineGradient",
+    "Stencil",
+    "Transfer",
+    "collect",
+    "g2p",
+    "in_window",
+    "make_stencil",
+    "p2g",
+    "spread",
+]

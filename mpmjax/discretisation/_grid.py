@@ -1,0 +1,115 @@
+"""The background grid: a window of static shape whose integer origin says where it lies."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Array, Int, NodeVector, ParticleVector, Scalar
+from mpmjax.checks import checked, require, require_positive
+
+_MOST_NODES = 2**31  # what an index of 32 bits counts
+
+
+class Grid(eqx.Module):
+    """A uniform Cartesian grid of nodes at (origin + index) * spacing.
+
+    The grid is scratch: nothing on it outlives a step. It is a window on an unbounded lattice, and every node quantity
+    is an array over the window's nodes, flattened in C order: (n,) or (n, d).
+
+    A direction is *periodic* with the window's extent, shape * spacing, as its period; positions stay unwrapped, only
+    node indices wrap.
+
+    Args:
+        shape: nodes in each direction, d = 1, 2 or 3 of them.
+        spacing: distance dx between nodes [m].
+        origin: lattice index of the window's first node in each direction. Default: zeros.
+        periodic: whether each direction is periodic; one bool stands for all.
+        follow: move the window by whole spacings so that it stays centred on the particles' bounding box. `origin` is
+            then ignored. Results do not depend on where the window lies, only on whether it holds the particles.
+
+    Raises:
+        ValueError: a shape that is not one to three integers of at least 4, a spacing that is not positive, an origin
+            or `periodic` of another length, or a window that both follows and is periodic.
+    """
+
+    shape: tuple[int, ...] = eqx.field(static=True, converter=tuple)
+    spacing: Scalar
+    origin: tuple[int, ...] = eqx.field(static=True)
+    periodic: tuple[bool, ...] = eqx.field(static=True)
+    follow: bool = eqx.field(static=True)
+
+    @checked
+    def __init__(
+        self,
+        shape: tuple[int, ...] | list[int],
+        spacing: Scalar,
+        *,
+        origin: tuple[int, ...] | list[int] | None = None,
+        periodic: bool | tuple[bool, ...] | list[bool] = False,
+        follow: bool = False,
+    ):
+        self.shape = tuple(int(n) for n in shape)
+        self.spacing = spacing
+        self.origin = (0,) * len(self.shape) if origin is None else tuple(int(i) for i in origin)
+        every = (periodic,) * len(self.shape) if isinstance(periodic, bool) else periodic
+        self.periodic = tuple(bool(p) for p in every)
+        self.follow = follow
+
+    def __check_init__(self):
+        d = len(self.shape)
+        require(
+            d in (1, 2, 3) and all(n >= 4 for n in self.shape),
+            f"A grid's shape must be one, two or three integers of at least 4, got {self.shape}.",
+        )
+        require_positive("A grid's spacing", self.spacing)
+        require(
+            self.size < _MOST_NODES,
+            f"A grid's window must have fewer than 2^31 nodes, got {self.size} by the shape {self.shape}: take a "
+            "larger spacing, or a window that follows.",
+        )
+        for name, value in (("origin", self.origin), ("periodic", self.periodic)):
+            require(len(value) == d, f"A grid's {name} must have {d} entries, one a direction, got {value}.")
+        require(
+            all(abs(i) + n < _MOST_NODES for i, n in zip(self.origin, self.shape, strict=True)),
+            f"A grid's origin must be of fewer than 2^31 nodes in size, got {self.origin}.",
+        )
+        require(
+            not (self.follow and any(self.periodic)),
+            "A periodic grid cannot follow the material: its window is its period. Drop follow=True or periodic.",
+        )
+
+    @property
+    def dim(self) -> int:
+        """Space dimension d."""
+        return len(self.shape)
+
+    @property
+    def size(self) -> int:
+        """Number of nodes n."""
+        size = 1
+        for length in self.shape:
+            size *= length
+        return size
+
+    def window(self, x: ParticleVector) -> Int[Array, "d"]:
+        """The lattice index of the window's first node, for particles at x."""
+        if not self.follow:
+            return jnp.asarray(np.asarray(self.origin, dtype=np.int32))
+        middle = (x.min(axis=0) + x.max(axis=0)) / 2
+        first = jnp.floor(jax.lax.stop_gradient(middle / self.spacing)).astype(jnp.int32)
+        return first - jnp.asarray([length // 2 for length in self.shape], dtype=jnp.int32)
+
+    def wrapped(self, x: ParticleVector, window: Int[Array, "d"]) -> ParticleVector:
+        """Positions [m], shape (p, d), moved by whole periods into the window."""
+        if not any(self.periodic):
+            return x
+        period = jnp.asarray(self.shape, x.dtype) * self.spacing
+        turns = jnp.floor((x - window.astype(x.dtype) * self.spacing) / period)
+        return jnp.where(jnp.asarray(self.periodic), x - turns * period, x)
+
+    def nodes(self, window: Int[Array, "d"]) -> NodeVector:
+        """Positions of the window's nodes [m], shape (n, d)."""
+        axes = [jnp.arange(length, dtype=jnp.int32) for length in self.shape]
+        index = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1).reshape(self.size, self.dim)
+        return (index + window).astype(jnp.result_type(self.spacing)) * self.spacing

@@ -1,0 +1,304 @@
+"""The two sums that cross between particles and grid: `collect` and `spread`, each other's transpose.
+
+Weights and gradients of a stencil are products of one factor an axis, so both sums are factorised: what is summed along
+the last axis, with its weights and with its slopes, meets one factor for each axis before it, and a gradient costs
+hardly more than a value.
+
+Both are partial derivatives of one form, linear in each of its arguments,
+
+    B(factors; a, f) = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b),    spread = ∂B/∂f,  collect = ∂B/∂a,
+
+and `_pull` is the third, by the factors. They are JAX primitives for the sake of their derivatives, which are each
+other, where JAX itself would transpose each read of a node to an addition of whole grids. Another back end replaces
+them here, and nothing else.
+"""
+
+from collections.abc import Callable
+from functools import partial, reduce
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from mpmjax._types import Array, Float
+from mpmjax.discretisation._kernel import Stencil
+
+_ROW = 4
+"""Most columns of the rows that are added to nodes. A CPU adds one, two or four numbers as one vector; three take it
+three times as long as four, being added one by one."""
+
+
+def collect(stencil: Stencil, nodes: Float[Array, "n c"]) -> tuple[Float[Array, "c p"], Float[Array, "d c p"]]:
+    """The sums over each particle's nodes Σ_i w_ip f_i, and Σ_i g_ip f_i for each direction of the gradient.
+
+    Args:
+        stencil: stencil of the particles.
+        nodes: f_i, shape (n, c).
+    """
+    value, *slopes = _collect_p.bind(*_factors(stencil), nodes, batched=0)
+    return value, jnp.stack(slopes)
+
+
+def spread(
+    stencil: Stencil, value: Float[Array, "c p"] | None, slopes: Float[Array, "d c p"] | None, size: int
+) -> Float[Array, "n c"]:
+    """The sums at the nodes Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b): `collect`'s transpose.
+
+    What goes to a node that does not exist is dropped.
+
+    Args:
+        stencil: stencil of the particles.
+        value: a_p, shape (c, p), or None for zero.
+        slopes: a_p,b for each direction b, shape (d, c, p), or None for zero.
+        size: number of nodes n.
+    """
+    given = [*([] if value is None else [value]), *([] if slopes is None else slopes)]
+    return _spread_p.bind(*_factors(stencil), *given, valued=value is not None, size=size, batched=0)[0]
+
+
+def _factors(stencil: Stencil) -> tuple[Array, ...]:
+    return stencil.shares, stencil.weights, stencil.slopes
+
+
+# The sums themselves, of rows (p, c): `_narrow` takes what a particle gives one axis further in, to one node along it;
+# `_widen` what it is given one axis further out.
+
+
+def _narrow(value: Array | None, slopes: list[Array], w: Array, g: Array) -> tuple[Array, list[Array]]:
+    parts = [*([] if value is None else [w[:, None] * value]), *(g[:, None] * slope for slope in slopes[:1])]
+    return reduce(jnp.add, parts), [w[:, None] * slope for slope in slopes[1:]]
+
+
+def _widen(value: Array, slopes: list[Array], w: Array, g: Array) -> list[Array]:
+    return [w[:, None] * value, g[:, None] * value, *(w[:, None] * slope for slope in slopes)]
+
+
+def _along(axis: int, factors: tuple[Array, ...], step: Callable[..., tuple], start: Any, unroll: bool) -> Any:
+    """`lax.scan` over the nodes along an axis, unrolled along the last one, or with `unroll` along all.
+
+    On a CPU a loop whose body is a few kernels over all particles is the fastest, on a GPU a single kernel.
+    """
+    each = tuple(factor[axis] for factor in factors)
+    return jax.lax.scan(step, start, each, unroll=each[0].shape[0] if unroll or axis == len(factors[0]) - 1 else 1)
+
+
+def _collect(*args: Array, unroll: bool) -> list[Array]:
+    """∂B/∂a: value and slopes, each (c, p)."""
+    *factors, nodes = args
+    d, _, p = factors[0].shape
+
+    def summed(axis: int, first: Array) -> list[Array]:
+        """Over this axis and those after it, from a first node: the value, then a slope an axis."""
+        if axis == d:
+            return [nodes.at[first].get(mode="clip", wrap_negative_indices=False)]
+
+        def add(totals: list[Array], factor: tuple[Array, ...]) -> tuple[list[Array], None]:
+            share, w, g = factor
+            value, *slopes = summed(axis + 1, first + share)
+            return [t + a for t, a in zip(totals, _widen(value, slopes, w, g), strict=True)], None
+
+        zeros = [jnp.zeros((p, nodes.shape[1]), nodes.dtype)] * (d - axis + 1)
+        return _along(axis, tuple(factors), add, zeros, unroll)[0]
+
+    return [rows.T for rows in summed(0, jnp.zeros((p,), factors[0].dtype))]
+
+
+def _spread(*args: Array, valued: bool, size: int, unroll: bool) -> list[Array]:
+    """∂B/∂f: the nodes' sums, (n, c)."""
+    factors, given = args[:3], args[3:]
+    d, _, p = factors[0].shape
+
+    def add(axis: int, first: Array, value: Array | None, slopes: list[Array], nodes: Array) -> Array:
+        """What the nodes along this axis and those after it receive, from a first node."""
+        if axis == d:
+            return nodes.at[first].add(value, mode="drop", wrap_negative_indices=False)
+
+        def step(nodes: Array, factor: tuple[Array, ...]) -> tuple[Array, None]:
+            share, w, g = factor
+            return add(axis + 1, first + share, *_narrow(value, slopes, w, g), nodes), None
+
+        return _along(axis, factors, step, nodes, unroll)[0]
+
+    blocks = []
+    for start in range(0, given[0].shape[0], _ROW):
+        block = [a[start : start + _ROW] for a in given]
+        width = block[0].shape[0]
+        spare = (1 << (width - 1).bit_length()) - width
+        rows = [jnp.pad(a, ((0, spare), (0, 0))).T for a in block]
+        value, slopes = (rows[0], rows[1:]) if valued else (None, rows)
+        nodes = jnp.zeros((size, width + spare), given[0].dtype)
+        blocks.append(add(0, jnp.zeros((p,), factors[0].dtype), value, slopes, nodes)[:, :width])
+    return [jnp.concatenate(blocks, axis=1)]
+
+
+def _pull(*args: Array, valued: bool) -> tuple[Array, Array]:
+    """∂B/∂factors at f and a: by the weights and by the slopes, each (d, s, p)."""
+    factors, nodes, given = args[:3], args[3], [a.T for a in args[4:]]
+    d, _, p = factors[0].shape
+
+    def pulled(axis: int, first: Array, value: Array | None, slopes: list[Array]) -> tuple[list[Array], list]:
+        """What is collected over this axis and those after it, and the derivatives by their factors."""
+        if axis == d:
+            return [nodes.at[first].get(mode="clip", wrap_negative_indices=False)], []
+
+        def step(carry: tuple[list[Array], list], factor: tuple[Array, ...]) -> tuple[Any, Any]:
+            share, w, g = factor
+            found, inner = pulled(axis + 1, first + share, *_narrow(value, slopes, w, g))
+            by_weight = [a * f for a, f in zip([value, *slopes[1:]], found, strict=False) if a is not None]
+            by_slope = [a * found[0] for a in slopes[:1]]
+            here = tuple(reduce(jnp.add, by, jnp.zeros_like(found[0])).sum(axis=1) for by in (by_weight, by_slope))
+            return jax.tree.map(jnp.add, carry, (_widen(found[0], found[1:], w, g), inner)), here
+
+        zeros = [jnp.zeros((p, nodes.shape[1]), nodes.dtype)] * (d - axis + 1)
+        inner = [(jnp.zeros_like(w), jnp.zeros_like(w)) for w in factors[1][axis + 1 :]]
+        (totals, inner), here = _along(axis, factors, step, (zeros, inner), unroll=False)
+        return totals, [here, *inner]
+
+    value, slopes = (given[0], given[1:]) if valued else (None, given)
+    by_axis = pulled(0, jnp.zeros((p,), factors[0].dtype), value, slopes)[1]
+    weights, slopes = zip(*by_axis, strict=True)
+    return jnp.stack(weights), jnp.stack(slopes)
+
+
+def _by_factors(function: Callable[..., list[Array]]) -> Callable[..., list[Array]]:
+    """A sum's differential by its factors, of shares, weights, slopes, their differentials, and what else it takes."""
+
+    def differential(*args: Array, **params: Any) -> list[Array]:
+        shares, rest = args[0], args[5:]
+        return jax.jvp(lambda *factors: function(shares, *factors, *rest, **params), args[1:3], args[3:5])[1]
+
+    return differential
+
+
+# What makes them primitives: arguments are shares, weights, slopes and what the sum is linear in, each with as many
+# leading axes as the batch has.
+
+
+def _members(function: Callable[..., Any], batched: int) -> Callable[..., Any]:
+    """The function for all members of a batch with so many axes."""
+    for _ in range(batched):
+        function = jax.vmap(function)
+    return function
+
+
+def _primitive(name: str, function: Callable[..., list[Array]], shapes: Callable[..., list[tuple]]) -> Primitive:
+    """A primitive that does what the function does, on batches too.
+
+    Args:
+        name: of the primitive.
+        function: of arrays.
+        shapes: the shapes of its results, of its arguments.
+    """
+
+    def run(*args: Array, batched: int, unroll: bool = False, **params: Any) -> list[Array]:
+        return _members(partial(function, unroll=unroll, **params), batched)(*args)
+
+    def results(*args: ShapedArray, batched: int, **params: Any) -> list[ShapedArray]:
+        batch = args[0].shape[:batched]
+        return [ShapedArray((*batch, *shape), args[1].dtype) for shape in shapes(*args, **params)]
+
+    def batch(args: tuple, axes: tuple, *, batched: int, **params: Any) -> tuple[list[Array], list[int]]:
+        size = next(a.shape[x] for a, x in zip(args, axes, strict=True) if x is not batching.not_mapped)
+        args = tuple(batching.bdim_at_front(a, x, size) for a, x in zip(args, axes, strict=True))
+        out = primitive.bind(*args, batched=batched + 1, **params)
+        return out, [0] * len(out)
+
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    once = jax.jit(run, static_argnames=("batched", "unroll", "valued", "size"))  # traced once for all its uses
+    primitive.def_impl(once)
+    primitive.def_abstract_eval(results)
+    batching.primitive_batchers[primitive] = batch
+    mlir.register_lowering(primitive, mlir.lower_fun(partial(once, unroll=True), multiple_results=True))
+    mlir.register_lowering(primitive, mlir.lower_fun(once, multiple_results=True), platform="cpu")
+    return primitive
+
+
+def _particle_rows(shares: ShapedArray, *others: ShapedArray) -> list[tuple]:
+    d, _, p = shares.shape[-3:]
+    return [(others[-1].shape[-1], p)] * (d + 1)
+
+
+def _node_rows(*args: ShapedArray, valued: bool, size: int) -> list[tuple]:
+    del valued
+    return [(size, args[-1].shape[-2])]
+
+
+_collect_p = _primitive("stencil_collect", _collect, _particle_rows)
+_spread_p = _primitive("stencil_spread", _spread, _node_rows)
+_collect_by_factors_p = _primitive("stencil_collect_by_factors", _by_factors(_collect), _particle_rows)
+_spread_by_factors_p = _primitive("stencil_spread_by_factors", _by_factors(_spread), _node_rows)
+
+
+def _differentiate(primitive: Primitive, by_factors: Primitive, function: Callable[..., list[Array]]) -> None:
+    """Their forward rules. The differential by the factors is a primitive for its transpose; its own differential,
+    which only second derivatives want, is that of the sum as written."""
+
+    def jvp(primals: tuple, tangents: tuple, **params: Any) -> tuple[list[Array], list[Any]]:
+        factors, rest = primals[:3], primals[3:]
+        out = primitive.bind(*primals, **params)
+        parts = [[ad.Zero(jax.typeof(o)) for o in out]]
+        if any(type(t) is not ad.Zero for t in tangents[3:]):
+            parts.append(primitive.bind(*factors, *map(ad.instantiate_zeros, tangents[3:]), **params))
+        if any(type(t) is not ad.Zero for t in tangents[1:3]):
+            parts.append(by_factors.bind(*factors, *map(ad.instantiate_zeros, tangents[1:3]), *rest, **params))
+        return out, [reduce(ad.add_tangents, part) for part in zip(*parts, strict=True)]
+
+    def jvp_by_factors(primals: tuple, tangents: tuple, *, batched: int, **params: Any) -> tuple:
+        written = _members(partial(_by_factors(function), unroll=False, **params), batched)
+        rest = tuple(map(ad.instantiate_zeros, tangents[1:]))
+        return jax.jvp(lambda *floats: written(primals[0], *floats), primals[1:], rest)
+
+    ad.primitive_jvps[primitive] = jvp
+    ad.primitive_jvps[by_factors] = jvp_by_factors
+
+
+_differentiate(_collect_p, _collect_by_factors_p, _collect)
+_differentiate(_spread_p, _spread_by_factors_p, _spread)
+
+
+def _given(cotangents: list) -> tuple[list[Array], bool]:
+    """The cotangents of what is collected, as what is spread: value and slopes, or one of them where the other is zero,
+    and whether there is a value."""
+    valued, sloped = (any(type(t) is not ad.Zero for t in part) for part in (cotangents[:1], cotangents[1:]))
+    parts = cotangents if valued and sloped else cotangents[:1] if valued else cotangents[1:]
+    return list(map(ad.instantiate_zeros, parts)), valued
+
+
+def _of_undefined(found: Any, args: Any) -> list:
+    return [f if ad.is_undefined_primal(a) else None for f, a in zip(found, args, strict=True)]
+
+
+def _transpose_collect(cotangents: list, *args: Any, batched: int) -> list:
+    given, valued = _given(cotangents)
+    size = args[3].aval.shape[-2]
+    return [None, None, None, *_spread_p.bind(*args[:3], *given, valued=valued, size=size, batched=batched)]
+
+
+def _transpose_spread(cotangents: list, *args: Any, valued: bool, size: int, batched: int) -> list:
+    del size
+    found = _collect_p.bind(*args[:3], ad.instantiate_zeros(cotangents[0]), batched=batched)
+    found = found[: len(args) - 3] if valued else found[1:]
+    return [None, None, None, *_of_undefined(found, args[3:])]
+
+
+def _transpose_collect_by_factors(cotangents: list, *args: Any, batched: int) -> list:
+    given, valued = _given(cotangents)
+    found = _members(partial(_pull, valued=valued), batched)(*args[:3], args[5], *given)
+    return [None, None, None, *_of_undefined(found, args[3:5]), None]
+
+
+def _transpose_spread_by_factors(cotangents: list, *args: Any, valued: bool, size: int, batched: int) -> list:
+    del size
+    nodes = ad.instantiate_zeros(cotangents[0])
+    found = _members(partial(_pull, valued=valued), batched)(*args[:3], nodes, *args[5:])
+    return [None, None, None, *_of_undefined(found, args[3:5]), *(None for _ in args[5:])]
+
+
+ad.primitive_transposes[_collect_p] = _transpose_collect
+ad.primitive_transposes[_spread_p] = _transpose_spread
+ad.primitive_transposes[_collect_by_factors_p] = _transpose_collect_by_factors
+ad.primitive_transposes[_spread_by_factors_p] = _transpose_spread_by_factors

@@ -1,0 +1,231 @@
+"""Prescribed motions: data, never callables, so that they can be saved, differentiated and changed without
+compiling."""
+
+import abc
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Array, Float, Point, Scalar
+from mpmjax.checks import coordinates, require, require_fields, require_finite, require_that
+
+Times = Float[Array, "j"] | Float[np.ndarray, "j"] | tuple[float | int | Array, ...] | list[float | int | Array]
+Displacements = Float[Array, "j d"] | Float[np.ndarray, "j d"] | tuple | list
+
+
+class AbstractMotion(eqx.Module):
+    """The motion of a rigid body, given by that of each of its points X, their places before it."""
+
+    @property
+    @abc.abstractmethod
+    def dim(self) -> int:
+        """Space dimension d."""
+
+    @abc.abstractmethod
+    def origin(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """The points X that are at x at time t [m], each (m, d)."""
+
+    @abc.abstractmethod
+    def place(self, X: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """The places x of the points X at time t [m], each (m, d)."""
+
+    @abc.abstractmethod
+    def turned(self, a: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """Vectors that turn with the body, at time t, each (m, d)."""
+
+    @abc.abstractmethod
+    def velocity_of(self, X: Float[Array, "m d"], t: Scalar, dt: Scalar) -> Float[Array, "m d"]:
+        """(place at t + dt − place at t)/dt of the points X [m/s], shape (m, d)."""
+
+    @abc.abstractmethod
+    def pivot(self, middle: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
+        """The place at time t [m], (d,), of the point about which torques on a body with a given middle are taken."""
+
+
+class Motion(AbstractMotion):
+    """A displacement that is piecewise linear in time, at rest before the first and after the last of its times.
+
+    Args:
+        times: increasing times [s], (j,).
+        displacement: displacement at each of them [m], (j, d).
+    """
+
+    times: Times
+    displacement: Displacements
+
+    def __check_init__(self):
+        require_fields(self)
+        _check_rows("A motion", self.times, self.displacement)
+
+    @property
+    def dim(self) -> int:
+        """That of the displacement."""
+        return jnp.shape(jnp.asarray(self.displacement))[1]
+
+    def at(self, t: Scalar) -> Float[Array, "d"]:
+        """Displacement at time t [m], shape (d,)."""
+        return _interpolated(t, jnp.asarray(self.times), jnp.asarray(self.displacement))
+
+    def velocity(self, t: Scalar, dt: Scalar) -> Float[Array, "d"]:
+        """Mean velocity from t to t + dt [m/s], shape (d,): what moves a node exactly along the displacement."""
+        return _change(t, dt, jnp.asarray(self.times), jnp.asarray(self.displacement)) / dt
+
+    def origin(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """x less the displacement."""
+        return x - self.at(t)
+
+    def place(self, X: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """X and the displacement."""
+        return X + self.at(t)
+
+    def turned(self, a: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """As they are."""
+        del t
+        return a
+
+    def velocity_of(self, X: Float[Array, "m d"], t: Scalar, dt: Scalar) -> Float[Array, "m d"]:
+        """The same for all."""
+        return jnp.broadcast_to(self.velocity(t, dt), X.shape)
+
+    def pivot(self, middle: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
+        """The middle."""
+        return middle + self.at(t)
+
+
+class RigidMotion(AbstractMotion):
+    """A displacement d and a rotation R about a centre, x = c + d(t) + R(t) (X − c): both are piecewise linear in time,
+    at rest before the first and after the last of its times.
+
+    The rotation is an angle in 2-D, in 3-D a rotation vector, the axis times the angle; so between two times the spin
+    is constant where the axis is. A step takes points along chords: they end where the rotation takes them, whatever
+    the step.
+
+    Args:
+        times: increasing times [s], (j,).
+        displacement: displacement of the centre at each of them [m], (j, d).
+        rotation: rotation at each of them [rad], (j,) in 2-D, (j, 3) in 3-D.
+        centre: the point about which it turns, and torques are taken, before the motion [m], (d,).
+    """
+
+    times: Times
+    displacement: Displacements
+    rotation: Times | Float[Array, "j r"] | Float[np.ndarray, "j r"] | tuple | list
+    centre: Point
+
+    def __check_init__(self):
+        require_fields(self)
+        _check_rows("A rigid motion", self.times, self.displacement)
+        d, shape = self.dim, jnp.shape(jnp.asarray(self.rotation))
+        require(d in (2, 3), f"A rigid motion is two- or three-dimensional, got {d} coordinates: take a Motion.")
+        expected = (len(self.times),) if d == 2 else (len(self.times), 3)
+        require(shape == expected, f"A rigid motion's rotation must have shape {expected} here, got {shape}.")
+        require_finite("A rigid motion's rotation", self.rotation)
+        require(
+            coordinates("A rigid motion's centre", self.centre) == d,
+            f"A rigid motion's centre must have {d} coordinates, as its displacement has, got {self.centre}.",
+        )
+        require_finite("A rigid motion's centre", self.centre)
+
+    @property
+    def dim(self) -> int:
+        """That of the displacement."""
+        return jnp.shape(jnp.asarray(self.displacement))[1]
+
+    def at(self, t: Scalar) -> Float[Array, "d"]:
+        """Displacement of the centre at time t [m], shape (d,)."""
+        return _interpolated(t, jnp.asarray(self.times), jnp.asarray(self.displacement))
+
+    def rotation_at(self, t: Scalar) -> Float[Array, "r"]:
+        """Angle or rotation vector at time t [rad], shape (1,) or (3,)."""
+        return _interpolated(t, jnp.asarray(self.times), self._rotations())
+
+    def _rotations(self) -> Float[Array, "j r"]:
+        rotation = jnp.asarray(self.rotation)
+        return rotation.reshape(len(rotation), -1)
+
+    def origin(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """c + Rᵀ (x − c − d)."""
+        centre = jnp.asarray(self.centre, x.dtype)
+        return centre + _turn(x - centre - self.at(t), -self.rotation_at(t))
+
+    def place(self, X: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """c + d + R (X − c)."""
+        centre = jnp.asarray(self.centre, X.dtype)
+        return centre + self.at(t) + _turn(X - centre, self.rotation_at(t))
+
+    def turned(self, a: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
+        """R a."""
+        return _turn(a, self.rotation_at(t))
+
+    def velocity_of(self, X: Float[Array, "m d"], t: Scalar, dt: Scalar) -> Float[Array, "m d"]:
+        """That of the centre, and the change of R times X − c: R's, once, and not each point's."""
+        times, arm = jnp.asarray(self.times), X - jnp.asarray(self.centre, X.dtype)
+        shift = _change(t, dt, times, jnp.asarray(self.displacement))
+        by = _change(t, dt, times, self._rotations())
+        columns = _turn_further(jnp.eye(self.dim, dtype=X.dtype), self.rotation_at(t), by)
+        return (shift + sum(arm[:, a, None] * columns[a] for a in range(self.dim))) / dt
+
+    def pivot(self, middle: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
+        """The centre."""
+        return jnp.asarray(self.centre, middle.dtype) + self.at(t)
+
+
+def still(dim: int) -> Motion:
+    """No motion in `dim` dimensions."""
+    return Motion((0.0,), ((0.0,) * dim,))
+
+
+def _check_rows(name: str, times: Times, displacement: Displacements) -> None:
+    j, rows = jnp.shape(jnp.asarray(times)), jnp.shape(jnp.asarray(displacement))
+    require(
+        len(j) == 1 and len(rows) == 2 and j[0] == rows[0],
+        f"{name} needs one row of displacements a time, got shapes {j} and {rows}.",
+    )
+    require_finite(f"{name}'s times", times)
+    require_finite(f"{name}'s displacement", displacement)
+    require_that(f"{name}'s times must increase", lambda t: t[1:] > t[:-1], times)
+
+
+def _interpolated(t: Scalar, times: Float[Array, "j"], values: Float[Array, "j c"]) -> Float[Array, "c"]:
+    """Each column of the values, piecewise linear in time."""
+    return jnp.stack([jnp.interp(t, times, values[:, a]) for a in range(values.shape[1])])
+
+
+def _change(t: Scalar, dt: Scalar, times: Float[Array, "j"], values: Float[Array, "j c"]) -> Float[Array, "c"]:
+    """What each column grows by from t to t + dt. The difference of two values would have their rounding, divided by
+    dt: at 1e-5 s in single precision, a thousandth of the velocity."""
+    slopes = jnp.diff(values, axis=0) / jnp.diff(times)[:, None]
+    within = jnp.diff(jnp.clip(times - t, 0, dt))  # the part of the step that lies between two times
+    return (within[:, None] * slopes).sum(axis=0)
+
+
+def _turn_further(a: Float[Array, "m d"], rotation: Float[Array, "r"], by: Float[Array, "r"]) -> Float[Array, "m d"]:
+    """R(rotation + by) a − R(rotation) a: where the difference would cancel, Gauss' rule of four points for the
+    integral of its derivative along the way, which is off by 6e-10 ‖by‖⁸ of itself."""
+    turn = partial(_turn, a)
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    along = [
+        weight / 2 * jax.jvp(turn, (rotation + (1 + node) / 2 * by,), (by,))[1]
+        for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True)
+    ]
+    return jnp.where((by**2).sum() < 0.1, sum(along), turn(rotation + by) - turn(rotation))
+
+
+def _turn(a: Float[Array, "m d"], rotation: Float[Array, "r"]) -> Float[Array, "m d"]:
+    """Vectors turned by an angle, or by a rotation vector r (O. Rodrigues): a + (sin θ/θ) r × a + ((1 − cos θ)/θ²)
+    r × (r × a), θ = ‖r‖."""
+    if rotation.shape == (1,):
+        cos, sin = jnp.cos(rotation[0]), jnp.sin(rotation[0])
+        return jnp.stack([cos * a[:, 0] - sin * a[:, 1], sin * a[:, 0] + cos * a[:, 1]], axis=1)
+    square = (rotation**2).sum()
+    small = square < 1e-3  # where the quotients are their series, to the last digit and with all their derivatives
+    angle = jnp.sqrt(jnp.where(small, 1, square))
+    once = jnp.where(small, 1 - square / 6 + square**2 / 120 - square**3 / 5040, jnp.sin(angle) / angle)
+    twice = jnp.where(
+        small, 1 / 2 - square / 24 + square**2 / 720 - square**3 / 40320, 2 * (jnp.sin(angle / 2) / angle) ** 2
+    )
+    across = jnp.cross(rotation, a)
+    return a + once * across + twice * jnp.cross(rotation, across)

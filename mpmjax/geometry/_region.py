@@ -1,0 +1,313 @@
+"""Regions of space: what `fill` fills, a grip holds and a collider is.
+
+A region is its signed distance: negative inside, Euclidean, with a gradient of length one. Where several points of the
+surface are nearest (a ball's centre, a box's diagonal) the gradient is the direction of one of them or their mean:
+never NaN, and not zero either, so that a collider holds what is on its middle too.
+"""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Array, Bool, Float, Point, Scalar
+from mpmjax.checks import checked, coordinates, require, require_fields, require_finite, require_positive, require_that
+
+
+class AbstractRegion(eqx.Module):
+    """A closed set of points."""
+
+    @property
+    @abc.abstractmethod
+    def dim(self) -> int:
+        """Space dimension d."""
+
+    @abc.abstractmethod
+    def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
+        """The signed distance [m] of each of the points x [m], shape (m, d), from the surface: negative inside."""
+
+    @abc.abstractmethod
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the bounding box [m], each (d,)."""
+
+    @abc.abstractmethod
+    def middle(self) -> Float[Array, "d"]:
+        """A point that goes with the region [m], (d,): its centre where it has one."""
+
+    def contains(self, x: Float[Array, "m d"], margin: Scalar = 0.0) -> Bool[Array, "m"]:
+        """Whether each of the points x [m], shape (m, d), lies in the region or within `margin` [m] of it."""
+        return self.distance(x) <= margin
+
+
+def length(a: Float[Array, "*m d"]) -> Float[Array, "*m"]:
+    """The norm of each row, with the derivative zero at zero."""
+    square = (a**2).sum(axis=-1)
+    zero = square == 0
+    return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, square)))
+
+
+def _from_axis(a: Float[Array, "m d"]) -> Float[Array, "m"]:
+    """The norm of each row, with the derivative of some direction at zero."""
+    some = jnp.asarray([0.8, 0.5, 0.3][: a.shape[-1]], a.dtype)
+    return jnp.where((a == 0).all(axis=-1), (a * some).sum(axis=-1), length(a))
+
+
+def _common(slabs: Float[Array, "m j"]) -> Float[Array, "m"]:
+    """The signed distance of what several sets at right angles to each other have in common, by those of the sets."""
+    nearest = slabs.max(axis=-1)
+    return jnp.where(nearest > 0, length(jnp.maximum(slabs, 0)), nearest)
+
+
+def _check_segment(name: str, start: Point, end: Point) -> None:
+    require(
+        coordinates(f"{name}'s start", start) == coordinates(f"{name}'s end", end),
+        f"{name} needs two ends with as many coordinates, got {start} and {end}.",
+    )
+    require_finite(f"{name}'s start", start)
+    require_finite(f"{name}'s end", end)
+    require_that(f"{name}'s ends must differ", lambda a, b: (a != b).any(), start, end)
+
+
+class Box(AbstractRegion):
+    """The axis-aligned box between two corners.
+
+    Args:
+        lower: smallest coordinate in each direction [m], (d,). −inf is allowed where a grip is meant to reach so far.
+        upper: largest coordinate in each direction [m], (d,), above `lower`.
+    """
+
+    lower: Point
+    upper: Point
+
+    def __check_init__(self):
+        require_fields(self)
+        require(
+            coordinates("A box's lower corner", self.lower) == coordinates("A box's upper corner", self.upper),
+            f"A box needs two corners with as many coordinates, got {self.lower} and {self.upper}.",
+        )
+        require_that(
+            "A box's lower corner must lie below its upper one in each direction",
+            lambda a, b: a < b,
+            self.lower,
+            self.upper,
+        )
+
+    @property
+    def dim(self) -> int:
+        """That of the corners."""
+        return len(self.lower)
+
+    def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
+        """max(q) inside, ‖max(q, 0)‖ outside, q = max(lower − x, x − upper)."""
+        below, above = jnp.asarray(self.lower, x.dtype) - x, x - jnp.asarray(self.upper, x.dtype)
+        return _common(jnp.where(below > above, below, above))
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """The corners."""
+        return np.asarray(self.lower, float), np.asarray(self.upper, float)
+
+    def middle(self) -> Float[Array, "d"]:
+        """Half-way between the corners; with one of them at infinity the other, with both zero."""
+        corners = jnp.stack([jnp.asarray(self.lower), jnp.asarray(self.upper)])
+        finite = jnp.isfinite(corners)
+        return jnp.where(finite, corners, 0).sum(axis=0) / jnp.maximum(finite.sum(axis=0), 1).astype(corners.dtype)
+
+
+class Ball(AbstractRegion):
+    """A ball (a disk in 2-D, an interval in 1-D).
+
+    Args:
+        centre: centre [m], (d,).
+        radius: radius [m].
+    """
+
+    centre: Point
+    radius: Scalar
+
+    def __check_init__(self):
+        require_fields(self)
+        coordinates("A ball's centre", self.centre)
+        require_finite("A ball's centre", self.centre)
+        require_positive("A ball's radius", self.radius)
+
+    @property
+    def dim(self) -> int:
+        """That of the centre."""
+        return len(self.centre)
+
+    def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
+        """‖x − centre‖ − radius."""
+        return _from_axis(x - jnp.asarray(self.centre, x.dtype)) - self.radius
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centre minus and plus the radius."""
+        centre, radius = np.asarray(self.centre, float), float(self.radius)
+        return centre - radius, centre + radius
+
+    def middle(self) -> Float[Array, "d"]:
+        """The centre."""
+        return jnp.asarray(self.centre)
+
+
+class HalfSpace(AbstractRegion):
+    """All that lies behind a plane (a line in 2-D, a point in 1-D).
+
+    Args:
+        point: a point of the plane [m], (d,).
+        normal: the direction out of the region, (d,), of any length.
+    """
+
+    point: Point
+    normal: Point
+
+    def __check_init__(self):
+        require_fields(self)
+        require(
+            coordinates("A half-space's point", self.point) == coordinates("A half-space's normal", self.normal),
+            f"A half-space needs a point and a normal with as many coordinates, got {self.point} and {self.normal}.",
+        )
+        require_finite("A half-space's point", self.point)
+        require_finite("A half-space's normal", self.normal)
+        require_that("A half-space's normal must not be zero", lambda a: (a != 0).any(), self.normal)
+
+    @property
+    def dim(self) -> int:
+        """That of the point."""
+        return len(self.point)
+
+    def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
+        """(x − point)·normal/‖normal‖."""
+        normal = jnp.asarray(self.normal, x.dtype)
+        return ((x - jnp.asarray(self.point, x.dtype)) * (normal / length(normal))).sum(axis=-1)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Infinite."""
+        return np.full(self.dim, -np.inf), np.full(self.dim, np.inf)
+
+    def middle(self) -> Float[Array, "d"]:
+        """The point of the plane."""
+        return jnp.asarray(self.point)
+
+
+class Capsule(AbstractRegion):
+    """All that lies within a radius of a segment.
+
+    Args:
+        start: one end of the segment [m], (d,).
+        end: the other [m], (d,).
+        radius: radius [m].
+    """
+
+    start: Point
+    end: Point
+    radius: Scalar
+
+    def __check_init__(self):
+        require_fields(self)
+        _check_segment("A capsule", self.start, self.end)
+        require_positive("A capsule's radius", self.radius)
+
+    @property
+    def dim(self) -> int:
+        """That of the ends."""
+        return len(self.start)
+
+    def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
+        """‖x − nearest point of the segment‖ − radius."""
+        start, end = jnp.asarray(self.start, x.dtype), jnp.asarray(self.end, x.dtype)
+        axis, arm = end - start, x - start
+        along = jnp.clip((arm * axis).sum(axis=-1) / (axis**2).sum(), 0, 1)
+        return _from_axis(arm - along[:, None] * axis) - self.radius
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Those of the balls about both ends."""
+        ends, radius = np.stack([np.asarray(self.start, float), np.asarray(self.end, float)]), float(self.radius)
+        return ends.min(axis=0) - radius, ends.max(axis=0) + radius
+
+    def middle(self) -> Float[Array, "d"]:
+        """That of the segment."""
+        return (jnp.asarray(self.start) + jnp.asarray(self.end)) / 2
+
+
+class Cylinder(AbstractRegion):
+    """A round cylinder with flat ends (in 2-D a rectangle, with an axis in any direction).
+
+    Args:
+        start: centre of one end [m], (d,).
+        end: centre of the other [m], (d,).
+        radius: radius [m].
+    """
+
+    start: Point
+    end: Point
+    radius: Scalar
+
+    def __check_init__(self):
+        require_fields(self)
+        _check_segment("A cylinder", self.start, self.end)
+        require(len(self.start) > 1, f"A cylinder has two or three coordinates, got {self.start}: take a Box.")
+        require_positive("A cylinder's radius", self.radius)
+
+    @property
+    def dim(self) -> int:
+        """That of the ends."""
+        return len(self.start)
+
+    def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
+        """As of a box, from the distances beyond the ends and beyond the radius."""
+        start, end = jnp.asarray(self.start, x.dtype), jnp.asarray(self.end, x.dtype)
+        height = length(end - start)
+        axis, arm = (end - start) / height, x - (start + end) / 2
+        along = (arm * axis).sum(axis=-1)
+        beside = _from_axis(arm - along[:, None] * axis)
+        beyond = jnp.where(along < 0, -along, along) - height / 2
+        return _common(jnp.stack([beyond, beside - self.radius], axis=-1))
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Those of both end disks."""
+        ends = np.stack([np.asarray(self.start, float), np.asarray(self.end, float)])
+        axis = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+        reach = float(self.radius) * np.sqrt(np.maximum(1 - axis**2, 0))
+        return ends.min(axis=0) - reach, ends.max(axis=0) + reach
+
+    def middle(self) -> Float[Array, "d"]:
+        """That of the axis."""
+        return (jnp.asarray(self.start) + jnp.asarray(self.end)) / 2
+
+
+class Union(AbstractRegion):
+    """Several regions as one. Its distance is exact outside; inside, where they overlap, it may be too small in size.
+
+    Args:
+        regions: the regions.
+    """
+
+    regions: tuple[AbstractRegion, ...]
+
+    @checked
+    def __init__(self, regions: AbstractRegion | tuple[AbstractRegion, ...] | list[AbstractRegion]):
+        self.regions = (regions,) if isinstance(regions, AbstractRegion) else tuple(regions)
+
+    def __check_init__(self):
+        require(len(self.regions) > 0, "A union needs at least one region, got none.")
+        dims = [region.dim for region in self.regions]
+        require(len(set(dims)) == 1, f"A union's regions must have the same dimension, got {dims}.")
+
+    @property
+    def dim(self) -> int:
+        """That of the regions."""
+        return self.regions[0].dim
+
+    def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
+        """The least of theirs."""
+        return jnp.stack([region.distance(x) for region in self.regions]).min(axis=0)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Around all of theirs."""
+        lower, upper = zip(*(region.bounds() for region in self.regions), strict=True)
+        return np.min(lower, axis=0), np.max(upper, axis=0)
+
+    def middle(self) -> Float[Array, "d"]:
+        """The mean of theirs."""
+        return jnp.stack([region.middle() for region in self.regions]).mean(axis=0)

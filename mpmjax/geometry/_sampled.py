@@ -1,0 +1,159 @@
+"""A region by samples of its signed distance: any shape, that of a triangle mesh among them."""
+
+import itertools
+import math
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Array, Float, Point, Scalar
+from mpmjax.checks import (
+    checked,
+    coordinates,
+    is_traced,
+    require,
+    require_fields,
+    require_finite,
+    require_memory,
+    require_positive,
+    shape_of,
+)
+from mpmjax.discretisation import BSpline
+from mpmjax.geometry._region import AbstractRegion, length
+
+_SPLINE = BSpline(2)
+_PADDING = 3  # samples beyond the bounding box on each side: one and a half are the spline's
+
+
+class SampledDistance(AbstractRegion):
+    """A region by the signed distances of a lattice of points, joined by quadratic B-splines, so that the normal is
+    continuous.
+
+    Second order in the lattice's spacing h: a surface of mean curvature κ in d dimensions is moved inward by
+    (d − 1)κh²/8, and edges are rounded over a spacing or two. Beyond the lattice the distance to it is added.
+
+    Args:
+        lower: place of the lattice's first point [m], (d,).
+        spacing: distance between its points [m].
+        values: signed distance of each of its points [m], negative inside; an array of d axes, at least 4 points each,
+            which reaches two spacings beyond the surface.
+    """
+
+    lower: Point
+    spacing: Scalar
+    values: Float[Array, "a"] | Float[Array, "a b"] | Float[Array, "a b c"] | Float[np.ndarray, "..."] | list
+
+    def __check_init__(self):
+        require_fields(self)
+        shape = jnp.shape(jnp.asarray(self.values))
+        require(
+            coordinates("SampledDistance's lower corner", self.lower) == len(shape) and len(shape) in (1, 2, 3),
+            f"SampledDistance needs as many coordinates as its values have axes, got {self.lower} and shape {shape}.",
+        )
+        require(min(shape) >= 4, f"SampledDistance needs at least 4 samples in each direction, got {shape}.")
+        require_finite("SampledDistance's lower corner", self.lower)
+        require_finite("SampledDistance's values", self.values)
+        require_positive("SampledDistance's spacing", self.spacing)
+        inside = (jnp if is_traced(self.values) else np).asarray(self.values) < 0
+        require(inside.any(), "SampledDistance's values must be negative somewhere: inside.")
+
+    @property
+    def dim(self) -> int:
+        """That of the lattice."""
+        return len(self.lower)
+
+    def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
+        """Σ_i N(x/h − i) values_i."""
+        values = jnp.asarray(self.values, x.dtype)
+        most = jnp.asarray(values.shape, x.dtype) - 1.5
+        xi = (x - jnp.asarray(self.lower, x.dtype)) / self.spacing
+        near = jnp.clip(xi, 0.5, most)
+        base = jnp.clip(_SPLINE.base(near), 0, most - 1.5)
+        weights = _SPLINE.weights((near - base).T)  # (d, 3, m)
+        first = base.astype(jnp.int32)
+        total = length(xi - near) * self.spacing
+        for offset in itertools.product(range(3), repeat=self.dim):
+            share = math.prod(weights[a, i] for a, i in enumerate(offset))
+            total = total + share * values[tuple(first[:, a] + i for a, i in enumerate(offset))]
+        return total
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Those of the points inside, and a spacing more."""
+        inside = np.argwhere(np.asarray(self.values) < 0)
+        lower, h = np.asarray(self.lower, float), float(self.spacing)
+        return lower + h * (inside.min(axis=0) - 1), lower + h * (inside.max(axis=0) + 1)
+
+    def middle(self) -> Float[Array, "d"]:
+        """That of the lattice."""
+        counts = jnp.asarray(jnp.shape(jnp.asarray(self.values)))
+        lower = jnp.asarray(self.lower)
+        return lower + (counts - 1).astype(lower.dtype) * self.spacing / 2
+
+
+@checked
+def sample_distance(region: AbstractRegion, spacing: float) -> SampledDistance:
+    """The samples of a bounded region's own distance.
+
+    Args:
+        region: the region.
+        spacing: distance between samples [m].
+
+    Raises:
+        ValueError: a region without bounds.
+    """
+    lower, points = _lattice(*region.bounds(), spacing)
+    values = np.asarray(region.distance(jnp.asarray(points.reshape(-1, region.dim))))
+    return SampledDistance(tuple(lower.tolist()), spacing, values.reshape(points.shape[:-1]))
+
+
+@checked
+def sample_mesh(mesh: str | Path | tuple[Any, Any], spacing: float) -> SampledDistance:
+    """The samples of the signed distance from a closed surface of triangles. Needs the extra `mesh` (trimesh, rtree).
+
+    Args:
+        mesh: a file that trimesh reads (STL, OBJ, PLY, ...), in metres, or vertices [m], (j, 3), and faces, (k, 3).
+        spacing: distance between samples [m].
+
+    Raises:
+        ImportError: trimesh or rtree is not there.
+        ValueError: a surface that is not closed, or whose faces do not all point outwards.
+    """
+    try:
+        import rtree  # noqa: F401 # pyright: ignore[reportMissingImports]  # without it trimesh fails, later
+        import trimesh  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ImportError('A mesh needs trimesh and rtree: pip install "mpmjax[mesh]".') from error
+    if isinstance(mesh, tuple):
+        shapes = [shape_of(part) for part in mesh]
+        triangles = all(shape is not None and len(shape) == 2 and shape[1] == 3 for shape in shapes)
+        require(triangles, f"A mesh must be vertices of shape (j, 3) and faces of shape (k, 3), got shapes {shapes}.")
+    surface = trimesh.Trimesh(*mesh) if isinstance(mesh, tuple) else trimesh.load(str(mesh), force="mesh")
+    require(
+        surface.is_volume,  # pyright: ignore[reportAttributeAccessIssue]
+        "A mesh must be a closed surface whose faces all point outwards, got holes or faces that do not: repair it.",
+    )
+    lower, points = _lattice(surface.bounds[0], surface.bounds[1], spacing)
+    values = -trimesh.proximity.signed_distance(surface, points.reshape(-1, 3))  # trimesh's is positive inside
+    return SampledDistance(tuple(lower.tolist()), spacing, values.reshape(points.shape[:-1]))
+
+
+def _lattice(lower: np.ndarray, upper: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """The first point of a lattice around a bounding box, and all of them, (..., d)."""
+    require_positive("The samples' spacing [m]", spacing)
+    require(
+        np.isfinite(lower) & np.isfinite(upper), f"Only a region with bounds can be sampled, got {lower} to {upper}."
+    )
+    first = lower - _PADDING * spacing
+    with np.errstate(over="ignore"):
+        numbers = np.ceil((upper - lower) / spacing) + 2 * _PADDING + 1
+        total = numbers.prod()
+    require_memory(
+        f"A lattice of {total:.3g} samples",
+        total * (2 * len(lower) + 1) * 8,  # the coordinates, the points made of them, the distances
+        f"take a larger spacing than {spacing} m for a shape from {lower} to {upper} m.",
+    )
+    counts = numbers.astype(int)
+    axes = [a + spacing * np.arange(n) for a, n in zip(first, counts, strict=True)]
+    return first, np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)

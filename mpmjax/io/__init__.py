@@ -1,0 +1,23 @@
+"""Runs, scenes and tables in files."""
+
+from mpmjax.io._aside import reason, replacing, save_figure
+from mpmjax.io._hdf5 import check_place
+from mpmjax.io._interrupt import end_on_signals, reporting
+from mpmjax.io._record import record
+from mpmjax.io._runs import load, save, steps_in
+from mpmjax.io._schema import arguments, decode
+
+__all__ = [
+    "arguments",
+    "check_place",
+    "decode",
+    "end_on_signals",
+    "load",
+    "reason",
+    "record",
+    "replacing",
+    "reporting",
+    "save",
+    "save_figure",
+    "steps_in",
+]

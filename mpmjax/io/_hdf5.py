@@ -1,0 +1,162 @@
+"""A run's HDF5 file, opened to be read or written: whether it is one, holds all of its data itself, and is whole."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+
+from mpmjax.checks import require
+from mpmjax.io._aside import reason
+from mpmjax.io._staged import StagedFile, require_no_writer
+from mpmjax.io._vtkhdf import File, count_in
+
+FORMAT = 4
+LIBVER_HEAD = ("v108", "v108")
+_LIBVER = ("v110", "v110")  # what "latest" writes, VTK 9.7 cannot read
+_GROWING = ("VTKHDF/Points", "VTKHDF/PointData/", "VTKHDF/Steps/", "mpmjax/frames", "mpmjax/received")
+_GROUPS = ("VTKHDF", "mpmjax")
+_REMEDY = "restore it from a copy, or run the simulation again"
+_BUSY = "{} is being written by another run: wait until that ends or stop it, or choose another name."
+
+
+def staged_file(path: Path, *, new: bool = False) -> StagedFile:
+    """The file, locked and ready to be changed; with `new` it is made if it is not there."""
+    try:
+        if new:
+            path.touch()
+        return StagedFile(path)
+    except BlockingIOError:
+        raise ValueError(_BUSY.format(path)) from None
+    except OSError as error:
+        raise ValueError(f"{path} cannot be written ({reason(error)}): name a place that can be.") from None
+
+
+def opened(staged: StagedFile, path: Path) -> File:
+    """The staged file as HDF5. Its head has been written with the superblock of HDF5 1.8: a later one says whether a
+    writer is at work, and while it is, and for ever if it was killed, nobody could open the file."""
+    try:
+        return h5py.File(staged, "r+", libver=_LIBVER)
+    except OSError as error:
+        raise ValueError(f"{path} is damaged ({reason(error)}): {_REMEDY}.") from None
+
+
+def check_place(path: Path, *, overwrite: bool) -> None:
+    """Raise `ValueError` if a new file cannot be there: no folder, a file that is there, and with `overwrite` one that
+    is no run or is being written."""
+    if not path.exists():
+        require(path.parent.is_dir(), f"{path} cannot be written (no folder {path.parent}): name a place that can be.")
+        return
+    require(overwrite, f"{path} exists: choose another name, remove it, or ask to overwrite or to resume it.")
+    require(path.is_file(), f"{path} is not a file: choose another name.")
+    if path.stat().st_size > 0:
+        try:
+            with h5py.File(path, "r", locking=False) as file:
+                run = all(_is_own(file, name) for name in _GROUPS)
+        except OSError:
+            run = False
+        require(run, f"{path} is not a run that mpmjax wrote, and is not replaced: choose another name, or remove it.")
+    check_no_writer(path)
+
+
+def check_no_writer(path: Path) -> None:
+    """Raise `ValueError` if somebody is writing the file."""
+    try:
+        require_no_writer(path)
+    except BlockingIOError:
+        raise ValueError(_BUSY.format(path)) from None
+    except OSError:
+        return  # whoever opens it next says why it cannot
+
+
+def check_hdf5(path: Path) -> None:
+    """Raise `ValueError` unless a file is there that can be read and begins as HDF5 does."""
+    require(path.exists(), f"{path} does not exist: check its name.")
+    require(path.is_file(), f"{path} is not a file: name one that mpmjax wrote.")
+    try:
+        with open(path, "rb") as raw:
+            signature = raw.read(8)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read ({reason(error)}): check its permissions.") from None
+    require(len(signature) == 8, f"{path} is cut short to {len(signature)} bytes: {_REMEDY}.")
+    require(signature == b"\x89HDF\r\n\x1a\n", f"{path} is not an HDF5 file: name one that mpmjax wrote.")
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[File]:
+    """The file opened to be read; whatever HDF5 stumbles over becomes one line that says what to do."""
+    check_hdf5(path)
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            _check_format(path, file)
+            _check_written(file)
+            yield file
+    except ValueError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise ValueError(f"{path} is damaged ({reason(error)}): {_REMEDY}.") from None
+    except (OSError, KeyError, RuntimeError, TypeError, AttributeError, IndexError, UnicodeError) as error:
+        what = "is cut short" if "truncated" in str(error) else "is damaged, or just being written"
+        raise ValueError(f"{path} {what} ({reason(error)}): {_REMEDY}.") from None
+
+
+def _check_format(path: Path, file: File) -> None:
+    missing = [name for name in _GROUPS if file.get(name, getlink=True) is None]
+    require(not missing, f"{path} has no group /{' or /'.join(missing)}: it is not a run that mpmjax wrote.")
+    _check_contained(path, file)
+    found = int(file["mpmjax"].attrs["format"])
+    require(
+        found == FORMAT,
+        f"{path} has format {found}, this mpmjax reads format {FORMAT}: use mpmjax "
+        f"{file['mpmjax'].attrs['version'].decode()}, which wrote it.",
+    )
+
+
+def _is_own(group: File, name: str) -> bool:
+    """Whether a name stands for an object and not for a link to one by its name, here or in another file."""
+    return isinstance(group.get(name, getlink=True), h5py.HardLink)
+
+
+def _check_contained(path: Path, file: File) -> None:
+    """All data must be in this file, and each dataset there once: what HDF5 is led to by links it would write to."""
+    seen, todo = {file["/"]}, [file["/"]]
+    while todo:
+        group = todo.pop()
+        for name in group:
+            where = f"{path}: {group.name.rstrip('/')}/{name}"
+            require(_is_own(group, name), f"{where} is a link, which no run of mpmjax has: {_REMEDY}.")
+            item = group[name]
+            require(item not in seen, f"{where} is a second name of an object, which no run of mpmjax has: {_REMEDY}.")
+            seen.add(item)
+            if isinstance(item, h5py.Group):
+                todo.append(item)
+            elif isinstance(item, h5py.Dataset):
+                elsewhere = item.is_virtual or item.external
+                require(not elsewhere, f"{where} has its data in other files, which no run of mpmjax has: {_REMEDY}.")
+
+
+def _check_written(file: File) -> None:
+    """Every frame that is counted must be there: what was never written reads as zeros, and has no checksum."""
+    count = count_in(file)
+
+    def check(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and item.size:
+            rows, frames = (item.chunks or item.shape)[0], count if name.startswith(_GROWING) else 1
+            chunks = set()
+            item.id.chunk_iter(lambda chunk: chunks.add(chunk.chunk_offset[0]))
+            lost = next((n for n in range(frames) if n * rows not in chunks), None)
+            require(lost is None, f"frame {lost} of {name} was never written")
+
+    file.visititems(check)
+
+
+def check_whole(file: File) -> None:
+    """Read every chunk, so that every checksum is compared."""
+
+    def read(_: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and item.size:
+            for chunk in item.iter_chunks():
+                item[chunk]
+
+    file.visititems(read)

@@ -1,0 +1,174 @@
+"""Long runs, written to a file as they go."""
+
+import os
+import sys
+from pathlib import Path
+from typing import Any, Literal
+
+import diffrax
+import jax.numpy as jnp
+from tqdm import tqdm
+
+from mpmjax._types import Scalar
+from mpmjax.checks import canonical, checked, require, require_whole, requirements
+from mpmjax.io._interrupt import reporting, undisturbed
+from mpmjax.io._runs import FrameWriter
+from mpmjax.simulation import (
+    HEALTHY,
+    Run,
+    SimulationError,
+    Tally,
+    integrate,
+    no_steps,
+    number_of_steps,
+    raise_faults,
+    warn_of_short_solves,
+)
+from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
+from mpmjax.stepping import Explicit, Method, step_for
+
+
+@checked
+def record(
+    path: str | os.PathLike,
+    scene: Scene,
+    particles: Particles,
+    *,
+    t1: Scalar,
+    dt: Scalar | Literal["stable"],
+    method: Method = Explicit(),
+    save_every: int,
+    start: int = 0,
+    overwrite: bool = False,
+    resume: bool = False,
+    progress: bool = False,
+) -> Run:
+    """Simulate as `simulate` does, writing each frame to a file when it is reached; memory holds one frame only.
+
+    The steps between two frames are one compiled program, called again and again, and give the same numbers as
+    `simulate`, bit for bit on a CPU. A run that is interrupted or meets a fault leaves a whole file.
+
+    Args:
+        path: the file to be (see `save`).
+        scene: the scene.
+        particles: the particles at step `start`; when resuming, those the recorded run began with.
+        t1: end time [s], a whole number of steps after time zero.
+        dt: step [s], or "stable", as in `simulate`.
+        method: update of the grid velocity.
+        save_every: write a frame at the start, every so many steps, and at the end.
+        start: number of the first step. Not used when resuming.
+        overwrite: replace a file that is there.
+        resume: continue from the last frame in the file up to t1. Where that is reached already, nothing is done.
+        progress: show a progress bar on standard error.
+
+    Returns:
+        the run without its frames, which are in the file.
+
+    Raises:
+        ValueError: those of `simulate` and `load`; a file that is there, of another run, or being written.
+        SimulationError: those of `simulate`; the last good state is in the file.
+        OSError: the disk refused a frame, as when it is full. The file holds all frames before it and can be resumed.
+    """
+    dtype = particles.x.dtype
+    start = 0 if resume else require_whole("start", start, 0)
+    requirements(method)
+    particles = prepare(scene, particles)
+    dt = step_for(scene, particles, t1, dt, method, start)
+    end = start + number_of_steps(t1, dt, start, dtype)
+    save_every = min(require_whole("save_every", save_every, 1), end - start)
+    if resume:
+        writer = FrameWriter.resume(path, scene, particles, method, dt)
+    else:
+        writer = _begun(path, scene, particles, method, dt, start, overwrite)
+    scene, dt_, method = canonical((scene, dt, method), dtype)
+    with writer:
+        step, state, tally = writer.last()
+        previous, start = None, step - int(tally.steps)
+        require(
+            int(tally.fault) == HEALTHY,
+            f"{path} ends with a fault after step {step} and would meet it again: start anew with another dt or scene.",
+        )
+        bar = tqdm(initial=step, total=max(step, end), unit="step", file=sys.stderr, disable=not progress)
+
+        def stopped() -> str:
+            bar.close()
+            return f"{writer.standing()} Resume it to continue."
+
+        with bar, reporting(stopped):
+            healthy = True
+            while healthy and step < end:
+                count = min(save_every - (step - start) % save_every, end - step)
+                _, state, new, previous, _ = integrate(
+                    scene,
+                    with_state(particles, state),
+                    jnp.asarray(step, dtype),
+                    jnp.asarray(count, dtype),
+                    dt_,
+                    method,
+                    max_steps=save_every,
+                    save_every=None,
+                    observe=None,
+                    adjoint=diffrax.ForwardMode(),  # the plain loop
+                    progress=False,
+                    watch=True,
+                )
+                tally, step = tally.merged(new), step + int(new.steps)
+                healthy = int(new.fault) == HEALTHY and int(new.unconverged) == 0
+                if healthy:
+                    _append(writer, step, state, tally)
+                    bar.update(count)
+        run = Run(
+            scene=scene,
+            method=method,
+            dt=dt_,
+            steps=jnp.zeros((0,), dtype),
+            frames=None,
+            observed=None,
+            final=with_state(particles, state),
+            final_step=jnp.asarray(step, dtype),
+            tally=tally,
+        )
+        try:
+            raise_faults(run, particles, previous, start)
+        except SimulationError as error:
+            try:
+                _append(writer, int(error.run.final_step), state_of(error.run.final), tally)
+                again = "Resumed it would end there again: begin anew."
+                then = "It can be resumed as it is." if int(tally.fault) == HEALTHY else again
+                said = f"{writer.standing()} {then}"
+            except OSError as refused:
+                said = str(refused)
+            raise SimulationError(f"{error} {said}", error.run) from None
+        warn_of_short_solves(run.tally)
+        return run
+
+
+def _begun(
+    path: str | os.PathLike,
+    scene: Scene,
+    particles: Particles,
+    method: Method,
+    dt: Any,
+    start: int,
+    overwrite: bool,
+) -> FrameWriter:
+    """The writer of a new file with its first frame, or no file: one without frames cannot be resumed."""
+    with undisturbed():
+        writer = FrameWriter.create(path, scene, particles, method, dt, overwrite=overwrite)
+        try:
+            writer.append(start, state_of(particles), no_steps(particles.x.dtype))
+        except BaseException as error:
+            writer.close()
+            Path(path).unlink()
+            if isinstance(error, OSError):
+                raise OSError(f"{path} was not begun: {error}. Make room, or name another place.") from None
+            raise
+    return writer
+
+
+def _append(writer: FrameWriter, step: int, state: State, tally: Tally) -> None:
+    """Write a frame; an error says what the file holds."""
+    try:
+        writer.append(step, state, tally)
+    except OSError as error:
+        raise OSError(f"{error}. {writer.standing()} Make room, then resume it.") from None

@@ -1,0 +1,405 @@
+"""Runs in files: HDF5 that ParaView opens as it is, and from which a run continues bit for bit.
+
+    /VTKHDF     the frames in VTK's layout (see `_vtkhdf`): Points, and as PointData velocity, deformation_gradient,
+                J = det F, with APIC affine_velocity, and what laws that yield remember
+    /mpmjax     format, version, d, dtype, units, dt, counts, mass, volume, X, the scene and the method as JSON (see
+                `_schema`) with their arrays, and a table with one row a frame: its step and the run's `Tally` up to
+                it; with colliders `received`, what each had received by then: impulse, then angular impulse
+
+Whatever is not in a dataset with checksums lies in headers that HDF5 checks itself, so a flipped bit is found. `NSteps`
+is raised last, and what lies beyond it, the remains of a writer that was killed, is neither read nor kept. A frame that
+the disk does not take leaves the file as it was (see `_staged`).
+
+A file is read only if it holds all of its data itself: HDF5 follows links to other files, and would write into them.
+"""
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import fields, replace
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax.boundary import Exchange
+from mpmjax.checks import canonical, checked, is_traced, require
+from mpmjax.io._aside import reason, replacing
+from mpmjax.io._hdf5 import (
+    FORMAT,
+    LIBVER_HEAD,
+    check_hdf5,
+    check_no_writer,
+    check_place,
+    check_whole,
+    opened,
+    reading,
+    staged_file,
+)
+from mpmjax.io._schema import decode, encode
+from mpmjax.io._staged import StagedFile
+from mpmjax.io._vtkhdf import File, add_fixed, add_growing, add_topology, count_in, rows_of, set_count, states_in
+from mpmjax.simulation import Run, Tally, no_steps
+from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
+from mpmjax.stepping import Method
+
+_UNITS = "SI: m, s, kg, Pa; deformation_gradient and J are pure numbers, affine_velocity is in 1/s"
+_UNCHANGING = ("mass", "volume", "X")
+
+
+class FrameWriter:
+    """Writes a run a frame at a time. What is written has left the program when `append` returns.
+
+    A context manager: leaving it closes the file.
+    """
+
+    def __init__(self, file: File, staged: StagedFile, path: Path, like: State):
+        """Use `create` or `resume`."""
+        self._file, self._staged, self._path, self._like = file, staged, path, like
+        self._kept = self._standing()
+
+    @classmethod
+    def create(
+        cls,
+        path: str | os.PathLike,
+        scene: Scene,
+        particles: Particles,
+        method: Method,
+        dt: Any,
+        *,
+        overwrite: bool = False,
+    ) -> "FrameWriter":
+        """Begin a file without frames.
+
+        Args:
+            path: the file to be.
+            scene: the scene.
+            particles: prepared particles (see `prepare`); their state is not written.
+            method: the method.
+            dt: step [s].
+            overwrite: replace a run's file that is there.
+
+        Raises:
+            ValueError: a file that is there, and with `overwrite` one that is no run or is being written; a place that
+                cannot be written; an object that files cannot hold.
+            OSError: the disk has no room for it; no file is left.
+        """
+        path = Path(path)
+        described = _describe(scene, particles, method, dt)
+        _check_readable(path, described)
+        rows = _rows(0, 0, described["dt"], state_of(particles), no_steps(particles.x.dtype))
+        check_place(path, overwrite=overwrite)
+        staged = staged_file(path, new=True)
+        try:
+            staged.clear()
+            h5py.File(staged, "w", libver=LIBVER_HEAD).close()
+            file = opened(staged, path)
+            add_topology(file, particles.count)
+            file.create_group("mpmjax/arrays")
+            for name, data in rows.items():
+                add_growing(file, name, data)
+            _write_description(file["mpmjax"], described)
+            file.flush()
+            staged.commit()
+        except BaseException as error:
+            staged.close()
+            path.unlink(missing_ok=True)
+            if isinstance(error, OSError):
+                raise OSError(f"{path} was not begun: {reason(error)}. Make room, or name another place.") from None
+            raise
+        return cls(file, staged, path, state_of(particles))
+
+    @classmethod
+    def resume(
+        cls, path: str | os.PathLike, scene: Scene, particles: Particles, method: Method, dt: Any
+    ) -> "FrameWriter":
+        """Open a file to append frames to it, after checking that it is whole and of the same run.
+
+        Frames that a killed writer left incomplete are cut off.
+
+        Raises:
+            ValueError: see `load`; a file that is being written; a scene, particles, method or dt that differ from the
+                file's.
+        """
+        path = Path(path)
+        described = _describe(scene, particles, method, dt)
+        rows = _rows(0, 0, described["dt"], state_of(particles), no_steps(particles.x.dtype))
+        check_hdf5(path)
+        staged = staged_file(path)
+        try:
+            with reading(path) as file:
+                check_whole(file)
+                _check_same(path, described, _description(file["mpmjax"]))
+                require(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
+            file = opened(staged, path)
+            count = count_in(file)
+            if any(len(file[name]) != count * len(data) for name, data in rows.items()):
+                for name, data in rows.items():
+                    file[name].resize(count * len(data), axis=0)
+                file.flush()
+                staged.commit()
+        except BaseException as error:
+            staged.close()
+            if isinstance(error, OSError):
+                raise OSError(f"{path} could not be written ({reason(error)}); it is as it was.") from None
+            raise
+        return cls(file, staged, path, state_of(particles))
+
+    def append(self, step: int, state: State, tally: Tally) -> None:
+        """Write a frame; one of the last frame's step replaces it.
+
+        Args:
+            step: its step number.
+            state: its state.
+            tally: of the run up to it.
+
+        Raises:
+            OSError: the disk refused. The file is what it was before, and this writer can only be closed.
+        """
+        file, n = self._file, count_in(self._file)
+        if n and file["mpmjax/frames"][n - 1]["step"] == step:
+            n -= 1
+        try:
+            for name, rows in _rows(n, step, file["mpmjax"].attrs["dt"], state, tally).items():
+                file[name].resize((n + 1) * len(rows), axis=0)
+                file[name][n * len(rows) :] = rows
+            file.flush()
+            self._staged.commit()
+            set_count(file, n + 1)
+            file.flush()
+            self._staged.commit()
+        except (OSError, RuntimeError) as error:
+            raise OSError(f"frame {n} could not be written ({reason(error)})") from None
+        self._kept = self._standing()
+
+    def last(self) -> tuple[int, State, Tally]:
+        """Step number, state and tally of the last frame."""
+        n = count_in(self._file)
+        steps, states, tallies = _frames(self._file, self._like, n - 1, n)
+        return int(steps[0]), *jax.tree.map(lambda a: a[0], (states, tallies))
+
+    def standing(self) -> str:
+        """What the file holds, as a sentence. It asks nobody, so that any thread may ask it at any time."""
+        frames, step, time = self._kept
+        if frames == 0:
+            return f"{self._path} holds no frame yet."
+        return f"{self._path} holds {frames} frame{'s' * (frames > 1)}, the last of step {step} (t = {time:.6g} s)."
+
+    def _standing(self) -> tuple[int, int, float]:
+        """The number of frames, and the last one's step and time [s]."""
+        n = count_in(self._file)
+        step = int(self._file["mpmjax/frames"][n - 1]["step"]) if n else 0
+        return n, step, step * float(self._file["mpmjax"].attrs["dt"])
+
+    def close(self) -> None:
+        """Close the file.
+
+        Raises:
+            OSError: what was written cannot be brought to the disk.
+        """
+        with suppress(OSError, RuntimeError):  # of a writer that failed; what it has not committed is dropped
+            self._file.close()
+        try:
+            self._staged.sync()
+        except OSError as error:
+            raise OSError(f"{self._path} may not be whole on the disk ({reason(error)}): check it.") from None
+        finally:
+            self._staged.close()
+
+    def __enter__(self) -> "FrameWriter":
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+@checked
+def save(path: str | os.PathLike, run: Run) -> None:
+    """Save a run's frames (without frames, its final state as the one frame) with all that a restart needs.
+
+    The file is written aside, synced and renamed: at every moment `path` is either what it was or the whole run.
+    Observations are not saved. Of the tally only the last frame's is known; the others are −1.
+
+    Raises:
+        ValueError: a run inside a jax transformation or a batch of them, a scene that files cannot hold, a place that
+            cannot be written, a file there that is no run or is being written.
+        OSError: the disk refused.
+    """
+    path = Path(path)
+    check_place(path, overwrite=True)
+    require(not is_traced(run), "A run inside a jax transformation has no values yet: save it outside.")
+    require(run.final.x.ndim == 2, "Save a batch of runs one by one: jax.tree.map(lambda a: a[i], run).")
+    steps, final_step = np.asarray(run.steps), int(run.final_step)
+    unknown = jax.tree.map(lambda a: np.full_like(a, -1), run.tally)
+    with (
+        replacing(path) as aside,
+        FrameWriter.create(aside, run.scene, run.final, run.method, run.dt, overwrite=True) as writer,
+    ):
+        for i in range(len(run)):
+            if steps[i] < final_step:  # a run that met a fault has frames beyond its last good state
+                writer.append(int(steps[i]), jax.tree.map(lambda a, i=i: a[i], run.frames), unknown)
+        writer.append(final_step, state_of(run.final), run.tally)
+
+
+def steps_in(path: str | os.PathLike) -> int:
+    """How many steps led to the last frame of a file, −1 if that is not known.
+
+    Raises:
+        ValueError: see `load`; a file that is being written.
+    """
+    check_no_writer(Path(path))
+    with reading(Path(path)) as file:
+        require(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
+        return int(file["mpmjax/frames"][count_in(file) - 1]["steps"])
+
+
+@checked
+def load(path: str | os.PathLike) -> Run:
+    """The run in a file, bit for bit: scene, method, dt, frames, tally; `final` is the last frame.
+
+    Raises:
+        ValueError: a file that is missing, cut short or damaged, not of this package or of another format, without
+            frames; or a float64 run while jax's 64-bit mode is off.
+    """
+    path = Path(path)
+    with reading(path) as file:
+        described = _description(file["mpmjax"])
+        dtype, arrays = np.dtype(described["dtype"]), described["arrays"]
+        require(
+            dtype.itemsize <= jnp.zeros(()).dtype.itemsize,
+            f'{path} holds a {dtype} run: call jax.config.update("jax_enable_x64", True) first.',
+        )
+        require(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
+        scene = decode(described["scene"], Scene, "scene", arrays)
+        method = decode(described["method"], Method, "method", arrays)
+        scene, method = canonical((scene, method), dtype)
+        parts = {k: a if a is None else jnp.asarray(a) for k, a in described["particles"].items()}
+        require(parts["mass"] is not None and parts["volume"] is not None, "mass or volume is missing")
+        known: dict[str, Any] = parts
+        blank = jnp.zeros((len(known["mass"]), described["d"]), dtype)
+        particles = Particles(blank, blank, **known, counts=described["counts"])
+        steps, frames, tallies = _frames(
+            file, jax.eval_shape(lambda: state_of(prepare(scene, particles))), 0, count_in(file)
+        )
+    last = jax.tree.map(lambda a: a[-1], frames)
+    return Run(
+        scene=scene,
+        method=method,
+        dt=jnp.asarray(described["dt"], dtype),
+        steps=jnp.asarray(steps, dtype),
+        frames=frames,
+        observed=None,
+        final=with_state(particles, last),
+        final_step=jnp.asarray(steps[-1], dtype),
+        tally=jax.tree.map(lambda a: a[-1], tallies),
+    )
+
+
+def _describe(scene: Scene, particles: Particles, method: Method, dt: Any) -> dict[str, Any]:
+    """What a file says of a run beside its frames."""
+    dtype = particles.x.dtype
+    scene, method, dt = canonical((scene, method, dt), dtype)
+    arrays: dict[str, np.ndarray] = {}
+    parts = {name: getattr(particles, name) for name in _UNCHANGING}
+    return {
+        "dtype": str(dtype),
+        "d": particles.dim,
+        "counts": particles.counts,
+        "dt": np.asarray(dt)[()],
+        "scene": encode(scene, arrays),
+        "method": encode(method, arrays, "method"),
+        "arrays": arrays,
+        "particles": {name: None if a is None else np.asarray(a) for name, a in parts.items()},
+    }
+
+
+def _check_readable(path: Path, described: dict[str, Any]) -> None:
+    """What is written must be what `load` takes. A number that the run's dtype rounds to zero or to a bound may not."""
+    dtype, arrays = np.dtype(described["dtype"]), described["arrays"]
+    try:
+        decode(described["scene"], Scene, "", arrays)
+        decode(described["method"], Method, "method", arrays)
+    except ValueError as error:
+        raise ValueError(f"{path} could not be loaded again, as {dtype} rounds it: {error}") from None
+
+
+def _write_description(group: File, described: dict[str, Any]) -> None:
+    for name, text in {"version": version("mpmjax"), "units": _UNITS, "dtype": described["dtype"]}.items():
+        group.attrs.create(name, np.bytes_(text))  # of fixed length: others lie where HDF5 has no checksum
+    group.attrs["format"] = np.int64(FORMAT)
+    group.attrs["d"] = np.int64(described["d"])
+    if described["counts"] is not None:
+        group.attrs["counts"] = np.asarray(described["counts"], np.int64)
+    group.attrs["dt"] = described["dt"]
+    for name in ("scene", "method"):
+        add_fixed(group, name, np.frombuffer(json.dumps(described[name]).encode(), np.uint8))
+    for name, data in described["particles"].items():
+        if data is not None:
+            add_fixed(group, name, data)
+    for name, data in described["arrays"].items():
+        add_fixed(group, f"arrays/{name}", data)
+
+
+def _description(group: File) -> dict[str, Any]:
+    """What `_describe` said when the file was written."""
+    return {
+        "dtype": group.attrs["dtype"].decode(),
+        "d": int(group.attrs["d"]),
+        "counts": tuple(group.attrs["counts"].tolist()) if "counts" in group.attrs else None,
+        "dt": group.attrs["dt"],
+        **{name: json.loads(group[name][...].tobytes()) for name in ("scene", "method")},
+        "arrays": {name: dataset[...] for name, dataset in group["arrays"].items()},
+        "particles": {name: group[name][...] if name in group else None for name in _UNCHANGING},
+    }
+
+
+def _rows(frame: int, step: int, dt: Any, state: State, tally: Tally) -> dict[str, np.ndarray]:
+    """What a frame adds to each dataset."""
+    values = {"step": np.int64(step)} | {f.name: np.asarray(getattr(tally, f.name)) for f in fields(Tally)}
+    row = np.array([tuple(values.values())], [(name, a.dtype) for name, a in values.items()])
+    rows = rows_of(frame, step * float(dt), state) | {"mpmjax/frames": row}
+    if state.received is not None:
+        both = state.received.impulse, state.received.angular
+        rows["mpmjax/received"] = np.concatenate([np.asarray(a) for a in both], axis=1)[None]
+    return rows
+
+
+def _frames(file: File, like: State, start: int, stop: int) -> tuple[np.ndarray, State, Tally]:
+    """Step numbers, states and tallies of frames `start` to `stop`, each with a leading axis. See `states_in`."""
+    table = file["mpmjax/frames"][start:stop]
+    require(len(table) == stop - start, "frames are missing")
+    tallies = Tally(**{f.name: jnp.asarray(table[f.name]) for f in fields(Tally)})
+    states = states_in(file, like, start, stop)
+    if like.received is not None:
+        both = jnp.asarray(file["mpmjax/received"][start:stop])
+        states = replace(states, received=Exchange(*jnp.split(both, [like.x.shape[1]], axis=-1)))
+    return table["step"], states, tallies
+
+
+def _check_same(path: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> None:
+    """The run to be continued must be the one in the file."""
+    mine, other = dict(_flat(ours)), dict(_flat(theirs))
+    for name in (*other, *mine):
+        pair: Any = mine.get(name), other.get(name)
+        a, b = pair
+        show = "another array" if isinstance(b, np.ndarray) else "none" if b is None else repr(b)
+        got = "" if isinstance(a, np.ndarray) else f" instead of {a!r}"
+        require(
+            type(a) is type(b) and np.array_equal(*pair),
+            f"{path} holds another run: its {name} is {show}{got}. Resume the same run, or name a new file.",
+        )
+
+
+def _flat(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Every leaf under its dotted path."""
+    if isinstance(data, (dict, list)):
+        for key, value in data.items() if isinstance(data, dict) else enumerate(data):
+            yield from _flat(value, f"{path}.{key}".lstrip("."))
+    else:
+        yield path, data.item() if isinstance(data, np.generic) else data

@@ -1,0 +1,315 @@
+"""The schema of scenes and methods in files: the package's objects as plain data, both ways.
+
+An object is a table whose `kind` names its class and whose other keys are its constructor's arguments:
+
+    {"kind": "FixedCorotated", "youngs_modulus": 1e5, "poisson_ratio": 0.3}
+
+A key with a default may be left out, and so may `kind` where only one class is possible; an object without other keys
+may be written as its kind alone (transfer = "PIC"). What a key takes follows from the constructor's annotation, so a
+new class costs one entry in `CLASSES`. Numbers come back bit for bit. A TOML scene is such data, and so is
+the JSON in a run's file.
+"""
+
+import difflib
+import enum
+import inspect
+import math
+import typing
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import fields
+from types import UnionType
+from typing import Any, Literal, get_args, get_origin
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import AbstractArray
+
+from mpmjax.boundary import (
+    ContactPlane,
+    Grip,
+    SeparatingBox,
+    SeparatingCollider,
+    SlipBox,
+    SlipCollider,
+    StickyBox,
+    StickyCollider,
+    SymmetryPlane,
+)
+from mpmjax.discretisation import APIC, FLIP, PIC, BSpline, Grid, MLSGradient, SplineGradient
+from mpmjax.geometry import Ball, Box, Capsule, Cylinder, HalfSpace, Motion, RigidMotion, SampledDistance, Union
+from mpmjax.implicit import AnalyticHessian, ConjugateResidual, JvpHessian, Linearised, Newton
+from mpmjax.material import CamClay, DruckerPrager, FixedCorotated, Fluid, Hencky, NeoHookean, Snow, Viscous, VonMises
+from mpmjax.state import Scene, TotalLagrangian, UpdatedLagrangian
+from mpmjax.stepping import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
+
+CLASSES: tuple[type, ...] = (
+    Scene,
+    Grid,
+    *(FixedCorotated, NeoHookean, Hencky),
+    *(Snow, VonMises, DruckerPrager, CamClay, Fluid, Viscous),
+    *(StickyBox, SlipBox, SeparatingBox, Grip, SymmetryPlane, ContactPlane),
+    *(StickyCollider, SlipCollider, SeparatingCollider),
+    *(Box, Ball, HalfSpace, Capsule, Cylinder, Union, SampledDistance, Motion, RigidMotion),
+    *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
+    *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),
+    *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual),
+)
+"""What files can hold."""
+
+_SMALL = 64  # most numbers that are written out, and that are read as a tuple where both are taken
+_MAY_BE_INFINITE = ("lower", "upper")  # a corner at infinity is no wall
+_ONE = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
+_MANY = {float: "numbers", int: "whole numbers", bool: "true and false", str: "strings"}
+
+
+def encode(value: Any, arrays: dict[str, np.ndarray] | None = None, path: str = "") -> Any:
+    """An object as plain data: dict, list, float, int, bool and str.
+
+    Args:
+        value: an object of the package, a number, an array, or a tuple of such.
+        arrays: takes arrays of more than 64 numbers, each under its dotted path; {"array": path} stands in their place.
+            Without it they are written out like any other.
+        path: dotted path of the value.
+
+    Raises:
+        ValueError: an object whose class is not the package's own.
+    """
+    match value:
+        case _ if type(value) in CLASSES:
+            parts = {name: getattr(value, name) for name in _parameters(type(value))}
+            keys = {k: encode(v, arrays, f"{path}.{k}".lstrip(".")) for k, v in parts.items() if v is not None}
+            return {"kind": type(value).__name__, **keys}
+        case enum.Enum():
+            return value.value
+        case bool() | int() | float() | str() if not isinstance(value, np.generic):
+            return value
+        case tuple() | list():
+            return [encode(v, arrays, f"{path}.{i}") for i, v in enumerate(value)]
+        case np.ndarray() | np.generic() | jax.Array():
+            a = np.asarray(value)
+            if arrays is None or a.size <= _SMALL:
+                return a.tolist()
+            arrays[path] = a
+            return {"array": path}
+        case _:
+            raise ValueError(
+                f"{path or 'The object'} is a {type(value).__name__}, which files cannot hold: they know the package's "
+                "own classes only. Use one of those, or keep the run in memory."
+            )
+
+
+def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarray] | None = None) -> Any:
+    """The object that plain data describe.
+
+    Args:
+        data: what `encode` returns, or a table of a TOML file.
+        expected: the class, abstract class or union that it must be of; also any annotation of numbers.
+        where: the place in the file that errors name, e.g. "[material]"; empty for the whole file.
+        arrays: the arrays that `encode` put aside.
+
+    Raises:
+        ValueError: an unknown, missing or unfit key, an unknown kind, or what the constructor refuses: one line that
+            names the place.
+    """
+    alternatives = _alternatives(expected)
+    classes = {c.__name__: c for c in CLASSES if any(_is_module(a) and issubclass(c, a) for a in alternatives)}
+    items = [get_args(a)[0] for a in alternatives if get_origin(a) in (tuple, list)]
+    if classes and isinstance(data, list) and items:
+        return tuple(decode(d, items[0], _nth(where, i), arrays) for i, d in enumerate(data, 1))
+    if classes:
+        return _object(data, classes, where, arrays)
+    unfit = "takes an object of Python, which files cannot hold: leave it out"
+    _require(not any(_is_module(a) for a in alternatives), where, unfit)
+    if enums := [a for a in alternatives if isinstance(a, type) and issubclass(a, enum.Enum)]:
+        words = [member.value for member in enums[0]]
+        _require(isinstance(data, str) and data in words, where, f"must be one of {_quoted(words)}, got {_short(data)}")
+        return enums[0](data)
+    return _numbers(data, expected, where, arrays)
+
+
+def arguments(
+    function: Callable, table: Any, where: str, arrays: dict[str, np.ndarray] | None = None, given: Iterable[str] = ()
+) -> dict[str, Any]:
+    """The keyword arguments of a function (or class) that a table describes, without those `given` otherwise.
+
+    Raises:
+        ValueError: see `decode`.
+    """
+    _require(isinstance(table, dict), where, f"must be a table, got {_short(table)}")
+    known = {name: p for name, p in _parameters(function).items() if name not in given}
+    for key in table:
+        if key not in known:
+            close = difflib.get_close_matches(key[:60], known, 1)
+            hint = f", did you mean {close[0]!r}?" if close else "."
+            raise ValueError(
+                f"{_named(where, 'unknown key')} {_short(key)}{hint} Known here: {', '.join(known) or 'none'}."
+            )
+    for name, (_, default) in known.items():
+        _require(name in table or default is not inspect.Parameter.empty, where, f"needs the key {name!r}")
+    return {key: decode(value, known[key][0], _inside(where, key, value), arrays) for key, value in table.items()}
+
+
+def _object(data: Any, classes: dict[str, type], where: str, arrays: dict[str, np.ndarray] | None) -> Any:
+    """The table of an object that may be of one of several classes."""
+    table = {"kind": data} if isinstance(data, str) else data
+    choice = f"one of {', '.join(classes)}" if len(classes) > 1 else next(iter(classes))
+    _require(isinstance(table, dict), where, f"must be a table with a kind, {choice}, got {_short(data)}")
+    _require("kind" in table or len(classes) == 1, where, f"needs a kind: {choice}")
+    kind = table.get("kind", next(iter(classes)))
+    if not (isinstance(kind, str) and kind in classes):
+        close = difflib.get_close_matches(_short(kind), classes, 1)
+        hint = f", did you mean {close[0]!r}?" if close else "."
+        raise ValueError(f"{_named(where, 'unknown kind')} {_short(kind)}{hint} It must be {choice}.")
+    given = arguments(classes[kind], {k: v for k, v in table.items() if k != "kind"}, where, arrays)
+    try:
+        return classes[kind](**given)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}" if where else str(error)) from None
+
+
+def _numbers(data: Any, expected: Any, where: str, arrays: dict[str, np.ndarray] | None) -> Any:
+    """Numbers, words and switches, single or in (nested) lists."""
+    forms = _forms(expected)
+    if isinstance(data, dict) and set(data) == {"array"} and arrays is not None:
+        _require(data["array"] in arrays, where, f"refers to the array {data['array']!r}, which is not there")
+        a = arrays[data["array"]]
+        _require((float, a.ndim) in forms, where, f"must be {_words(forms)}, got an array of shape {a.shape}")
+        leaves, kinds = a.ravel(), {float}
+    else:
+        a, leaves, depth = data, list(_leaves(data)), _depth(data)
+        kinds = {kind for kind, d in forms if d == depth and all(_fits(leaf, kind) for leaf in leaves)}
+        _require(kinds, where, f"must be {_words(forms)}, got {_short(data)}")
+    if float in kinds:
+        bad = np.isnan if where.rsplit(" ", 1)[-1] in _MAY_BE_INFINITE else lambda x: ~np.isfinite(x)
+        beyond = any(isinstance(x, int) and math.isinf(_float(x)) for x in leaves)
+        _require(not (beyond or any(bad(_float(x)) for x in leaves)), where, f"must be finite, got {_short(data)}")
+        data = _floats(data) if a is data else a
+    takes_tuples = any(tuple in (a, get_origin(a)) for a in _alternatives(expected))
+    if not isinstance(data, list) or (takes_tuples and len(leaves) <= _SMALL):
+        return _tuples(data)
+    return np.asarray(data)
+
+
+def _parameters(function: Callable) -> dict[str, tuple[Any, Any]]:
+    """Annotation and default of each argument of a function or constructor.
+
+    Where a field has a converter, equinox says `Any` of the argument, and the field itself says more.
+    """
+    of_class = isinstance(function, type)
+    signature = inspect.signature(function.__init__ if of_class else function)
+    types = {f.name: f.type for f in fields(function)} if of_class else {}
+    return {
+        p.name: (types.get(p.name, Any) if p.annotation is Any else p.annotation, p.default)
+        for p in signature.parameters.values()
+        if p.name != "self"
+    }
+
+
+def _alternatives(hint: Any) -> list[Any]:
+    """The members of a union, or the one annotation."""
+    if get_origin(hint) in (typing.Union, UnionType):
+        return [a for member in get_args(hint) for a in _alternatives(member)]
+    return [hint]
+
+
+def _is_module(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, eqx.Module)
+
+
+def _forms(hint: Any) -> set[tuple[type, int]]:
+    """Kind of number and depth of lists that an annotation takes."""
+    forms: set[tuple[type, int]] = set()
+    for a in _alternatives(hint):
+        if a in _ONE:
+            forms.add((a, 0))
+        elif get_origin(a) is Literal:
+            forms.add((str, 0))
+        elif get_origin(a) in (tuple, list):
+            forms |= {(kind, depth + 1) for kind, depth in _forms(get_args(a)[0])}
+        elif isinstance(a, type) and issubclass(a, AbstractArray):
+            axes = a.dim_str.split()
+            forms |= {(float, len(axes)), (float, len([axis for axis in axes if not axis.startswith("*")]))}
+    return forms
+
+
+def _words(forms: set[tuple[type, int]]) -> str:
+    """What the forms are, in words."""
+
+    def words(kind: type, depth: int) -> str:
+        lists = " ".join(["a list of", *["lists of"] * (depth - 1)])
+        return _ONE[kind] if depth == 0 else f"{lists} {_MANY[kind]}"
+
+    whole = {(int, depth) for kind, depth in forms if kind is float}  # a number may be whole anyway
+    return " or ".join(words(kind, depth) for kind, depth in sorted(forms - whole, key=lambda form: form[1]))
+
+
+def _fits(leaf: Any, kind: type) -> bool:
+    if isinstance(leaf, bool) or kind in (bool, str):
+        return type(leaf) is kind
+    return isinstance(leaf, (int, float)) if kind is float else isinstance(leaf, int) and abs(leaf) < 2**63
+
+
+def _depth(data: Any) -> int:
+    """How deep lists are nested; −1 where they are ragged."""
+    if not isinstance(data, list):
+        return 0
+    depths, lengths = {_depth(d) for d in data}, {len(d) for d in data if isinstance(d, list)}
+    return -1 if len(depths) > 1 or len(lengths) > 1 or -1 in depths else 1 + max(depths, default=0)
+
+
+def _leaves(data: Any) -> Iterator[Any]:
+    if isinstance(data, list):
+        for d in data:
+            yield from _leaves(d)
+    else:
+        yield data
+
+
+def _float(x: Any) -> float:
+    try:
+        return float(x)
+    except OverflowError:
+        return math.inf
+
+
+def _floats(data: Any) -> Any:
+    return [_floats(d) for d in data] if isinstance(data, list) else float(data)
+
+
+def _tuples(data: Any) -> Any:
+    return tuple(_tuples(d) for d in data) if isinstance(data, list) else data
+
+
+def _inside(where: str, key: str, value: Any) -> str:
+    """The place of a key: a table has a header of its own, anything else is named after the table it stands in."""
+    tables = value if isinstance(value, list) and value else [value]
+    if not all(isinstance(v, dict) and set(v) != {"array"} for v in tables):
+        return f"{where} {key}".strip()
+    if not where:
+        return f"[{key}]"
+    return f"{where[:-1]}.{key}]" if where.endswith("]") else f"{where} [{key}]"
+
+
+def _nth(where: str, i: int) -> str:
+    """The place of one of a list of tables: its header is that of the list with another pair of brackets."""
+    *outer, header = where.split(" ")
+    return " ".join([*outer, f"[{header}]", str(i)])
+
+
+def _named(where: str, what: str) -> str:
+    return f"{where}: {what}" if where else what.capitalize()
+
+
+def _quoted(words: Iterable[Any]) -> str:
+    return ", ".join(repr(w) for w in words)
+
+
+def _short(data: Any, most: int = 60) -> str:
+    text = repr(data[: most + 1] if isinstance(data, str) else data)
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def _require(condition: Any, where: str, message: str) -> None:
+    if not condition:
+        raise ValueError(f"{where or 'The file'} {message}.")

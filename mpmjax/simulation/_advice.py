@@ -1,0 +1,60 @@
+"""What to do about a fault of a run: whether its step was too long, and what fits the law."""
+
+import math
+from typing import Any
+
+from mpmjax.material import AbstractPlastic, AbstractVolumetric, Law
+from mpmjax.state import Particles, Scene
+from mpmjax.stepping import SAFETY, BackwardEuler, Explicit, Method, longest_step
+
+
+def advise(scene: Scene, method: Method, dt: Any, began: Particles, last: Particles, otherwise: str) -> str:
+    """What to do about a fault: of a step that was too long, to shorten it; else what the fault itself suggests.
+
+    A step above the limit explains any fault. Not every run with such a step fails by it, so both are said then.
+
+    Args:
+        scene: the scene.
+        method: update of the grid velocity.
+        dt: Δt [s].
+        began: the particles at the start.
+        last: the last good ones.
+        otherwise: what the fault suggests where the step is within the limit.
+    """
+    first, then = (float(longest_step(scene, particles, method)) for particles in (began, last))
+    if scene.kernel.order == 1 and not scene.total:
+        then = first  # it changes with every move of the particles, and is zero at each cell's face
+    if math.isnan(then):
+        then = first  # too deformed to tell
+    known = math.isfinite(first) and first > 0 and then > 0
+    if not known or float(dt) <= SAFETY * min(first, then):
+        return otherwise
+    name = "explicit limit" if isinstance(method, Explicit) else f"limit of {type(method).__name__} with beta < 1/2"
+    said = f"dt = {float(dt):.4g} s is {float(dt) / first:.3g} times the {name} at the start ({first:.4g} s)"
+    if not math.isclose(first, then, rel_tol=1e-2):
+        said += f" and {float(dt) / then:.3g} times that of the last good state ({then:.4g} s)"
+    if float(dt) <= min(first, then):
+        said += f"; from {SAFETY:g} times on, large vibrations can grow"
+    shortly = otherwise[0].lower() + otherwise[1:]
+    shorter = f"at most {SAFETY * first:.4g} s (stable_dt, safety {SAFETY:g})" if float(dt) > SAFETY * first else "less"
+    return f"{said}. Take a dt of {shorter}, or an implicit method that has no limit. If the fault stays, {shortly}"
+
+
+def disallowed(law: Law, method: Method) -> tuple[str, str]:
+    """What is wrong with an F that the law does not allow, and what to do."""
+    newton = (
+        ""
+        if isinstance(method, Explicit | BackwardEuler)
+        else ", or take BackwardEuler(), whose line search forbids it"
+    )
+    match law:
+        case AbstractVolumetric():
+            what = f"has a volume that {type(law).__name__} does not allow (J ≤ 0)"
+            advice = f"Reduce dt: a step must keep Δt |div v| below 1{newton}."
+        case AbstractPlastic():
+            what = f"has a deformation gradient that {type(law).__name__} does not allow (det F ≤ 0)"
+            advice = f"Reduce dt: a step must keep Δt |∇v| below 1{newton}."
+        case _:
+            what = f"has a deformation gradient that {type(law).__name__} does not allow (det F ≤ 0)"
+            advice = f"Reduce dt{newton}, or use FixedCorotated, which allows inversion."
+    return what, advice

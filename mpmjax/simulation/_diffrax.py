@@ -1,0 +1,241 @@
+"""The thin adapter by which diffrax drives the step: saving, stopping, progress and the checkpointed adjoint are its
+own."""
+
+from collections.abc import Callable
+from functools import reduce
+from typing import Any, ClassVar
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Bool, Float, Int, Scalar
+from mpmjax.checks import first_unmet, requirements
+from mpmjax.discretisation import Stencil, in_window
+from mpmjax.state import Particles, Scene, State, state_of, with_state
+from mpmjax.stepping import Method, StepInfo, advance_compiled, reporting
+
+HEALTHY, NOT_FINITE, OUTSIDE, INADMISSIBLE, BEYOND = 0, 1, 2, 3, 4
+"""What can be wrong with a state."""
+BAD_PARAMETERS = 100
+"""From here on: a value of scene, particles or method that its module does not allow, by its number among their
+`requirements`."""
+
+
+class Problem(eqx.Module):
+    """Everything of a rollout that does not evolve."""
+
+    scene: Scene
+    particles: Particles
+    stencil: Stencil | None
+    dt: Scalar
+    method: Method
+    observe: Callable[[Scene, Particles], Any] | None = None
+    start: Scalar = 0.0
+    """Number of the first step."""
+    slot: Scalar = 0.0
+    """Through which adjoint solves report (see `Reporting`)."""
+    fault: Int[Array, ""] | None = None
+    """What was wrong before the first step; None where that is known to be nothing."""
+
+    def at(self, state: State) -> Particles:
+        """The particles in a state."""
+        return with_state(self.particles, state)
+
+
+class Tally(eqx.Module):
+    """Sums over the steps of a run."""
+
+    steps: Int[Array, "*f"]
+    """Steps taken."""
+    iterations: Int[Array, "*f"]
+    """Conjugate-residual iterations."""
+    most_iterations: Int[Array, "*f"]
+    """Most of them in one step."""
+    newton: Int[Array, "*f"]
+    """Newton steps."""
+    line_search: Int[Array, "*f"]
+    """Halvings by the line search."""
+    worst_residual: Float[Array, "*f"]
+    """Largest relative residual that a solve ended with."""
+    unconverged: Int[Array, "*f"]
+    """Steps whose solve met neither ten times its tolerance nor the precision's limit: the run is not a solution."""
+    short: Int[Array, "*f"]
+    """Steps whose solve missed its tolerance, by less than ten times: the run is less accurate than was asked for."""
+    indefinite: Int[Array, "*f"]
+    """Steps whose solve met negative curvature: compression has made M + cH indefinite, and near a singular one the
+    motion is wrong however small the residual. `AnalyticHessian(projected=True)` or a smaller step avoids it."""
+    sweeps: Int[Array, "*f"]
+    """Solves that contact took beyond one a step."""
+    violations: Int[Array, "*f"]
+    """Contact conditions left violated, summed over steps."""
+    fault: Int[Array, "*f"]
+    """The first fault of a state: HEALTHY, NOT_FINITE, OUTSIDE, INADMISSIBLE or BEYOND; or BAD_PARAMETERS and what
+    follows."""
+    fault_step: Int[Array, "*f"]
+    """How many steps led to it."""
+
+    @property
+    def healthy(self) -> Bool[Array, "*f"]:
+        """Whether no state was at fault and no solve ended far from its tolerance."""
+        return (self.fault == HEALTHY) & (self.unconverged == 0)
+
+    def plus(self, info: StepInfo, fault: Int[Array, ""]) -> "Tally":
+        """The tally after one more step."""
+        s, c = info.solve, info.contact
+        steps = self.steps + 1
+        first = (self.fault == HEALTHY) & (fault != HEALTHY)
+        return Tally(
+            steps=steps,
+            iterations=self.iterations + s.iterations,
+            most_iterations=jnp.maximum(self.most_iterations, s.iterations),
+            newton=self.newton + s.newton,
+            line_search=self.line_search + s.line_search,
+            worst_residual=jnp.maximum(self.worst_residual, jax.lax.stop_gradient(s.residual)),
+            unconverged=self.unconverged + jnp.where(s.converged | s.short, 0, 1).astype(jnp.int32),
+            short=self.short + s.short.astype(jnp.int32),
+            indefinite=self.indefinite + s.indefinite.astype(jnp.int32),
+            sweeps=self.sweeps + c.sweeps,
+            violations=self.violations + c.violations,
+            fault=jnp.where(first, fault, self.fault),
+            fault_step=jnp.where(first, steps, self.fault_step),
+        )
+
+    def merged(self, later: "Tally") -> "Tally":
+        """This tally and that of the steps that followed."""
+        healthy = self.fault == HEALTHY
+        return Tally(
+            steps=self.steps + later.steps,
+            iterations=self.iterations + later.iterations,
+            most_iterations=jnp.maximum(self.most_iterations, later.most_iterations),
+            newton=self.newton + later.newton,
+            line_search=self.line_search + later.line_search,
+            worst_residual=jnp.maximum(self.worst_residual, later.worst_residual),
+            unconverged=self.unconverged + later.unconverged,
+            short=self.short + later.short,
+            indefinite=self.indefinite + later.indefinite,
+            sweeps=self.sweeps + later.sweeps,
+            violations=self.violations + later.violations,
+            fault=jnp.where(healthy, later.fault, self.fault),
+            fault_step=jnp.where(healthy & (later.fault != HEALTHY), self.steps + later.fault_step, self.fault_step),
+        )
+
+
+def no_steps(dtype: Any) -> Tally:
+    """The tally before the first step."""
+    zero = jnp.asarray(0, dtype=jnp.int32)
+    residual = jnp.asarray(0, dtype=dtype)
+    return Tally(zero, zero, zero, zero, zero, residual, zero, zero, zero, zero, zero, zero, zero)
+
+
+def faulty_particles(problem: Problem, state: State) -> tuple[Bool[Array, "p"], Bool[Array, "p"], Bool[Array, "p"]]:
+    """Which particles are not finite, have left the window, have an F that the law does not allow."""
+    scene, particles = problem.scene, problem.at(state)
+    finite = _finite((particles.x, particles.v, particles.C))
+    finite = finite & jnp.concatenate([_finite((group.F, group.history)) for group in particles.groups])
+    anchor = scene.anchor(particles)
+    outside = ~in_window(scene.kernel, scene.grid, scene.window(particles), anchor)
+    admitted = jnp.concatenate([c.law.admits(c.F) for c in scene.constituents(particles)])
+    return ~finite, finite & outside, finite & ~admitted
+
+
+def _finite(fields: Any) -> Bool[Array, "p"]:
+    """Whether all numbers of a particle are, of fields whose first axis is the particles'."""
+    finite = [jnp.isfinite(a).reshape(a.shape[0], -1).all(axis=1) for a in jax.tree.leaves(fields)]
+    return reduce(jnp.logical_and, finite)
+
+
+def passed_particles(problem: Problem, before: State, after: State, t: Scalar) -> list[tuple[int, Bool[Array, "p"]]]:
+    """The numbers of the boundaries that keep something out, and which particles passed each in the step from t [s]."""
+    scene = problem.scene
+    start = scene.grid.wrapped(before.x, scene.window(problem.at(before)))
+    end = start + (after.x - before.x)
+    reach = (scene.kernel.order + 1) / 2
+    found = [b.passed(start, end, scene.grid.spacing, t, problem.dt, reach) for b in scene.boundary]
+    return [(number, passed) for number, passed in enumerate(found) if passed is not None]
+
+
+def state_fault(problem: Problem, state: State) -> Int[Array, ""]:
+    """The gravest fault of a state."""
+    broken, outside, inadmissible = (a.any() for a in faulty_particles(problem, state))
+    fault = jnp.where(inadmissible, INADMISSIBLE, HEALTHY)
+    fault = jnp.where(outside, OUTSIDE, fault)
+    return jnp.where(broken, NOT_FINITE, fault).astype(jnp.int32)
+
+
+def fault_of(problem: Problem, before: State, after: State, t: Scalar) -> Int[Array, ""]:
+    """The gravest fault of a state and of the step from t [s] that led to it."""
+    fault = state_fault(problem, after)
+    for _, passed in passed_particles(problem, before, after, t):
+        fault = jnp.where(passed.any() & (fault != NOT_FINITE), BEYOND, fault)
+    return fault
+
+
+def examined(problem: Problem, state: State) -> tuple[Problem, State]:
+    """The problem with the fault that it starts with, of values that were not known when they were written down, and
+    the state, which is NaN where a parameter is bad: what follows would look like numbers."""
+    arrays, rest = eqx.partition((problem, state), eqx.is_array)
+    known, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
+    unmet = first_unmet(requirements((known.scene, known.particles, known.method)))
+    fault = jnp.where(unmet > 0, BAD_PARAMETERS + unmet - 1, state_fault(known, begin))
+    valid = jnp.where(unmet > 0, jnp.nan, 1)
+    state = jax.tree.map(lambda a: a * valid.astype(a.dtype), state)
+    return eqx.tree_at(lambda p: p.fault, problem, fault, is_leaf=lambda a: a is None), state
+
+
+def step_number(t: Array) -> Array:
+    """diffrax's time as the number of a step: it divides an interval evenly, which is exact only up to rounding."""
+    return jnp.round(t)
+
+
+class StepSolver(diffrax.AbstractSolver):
+    """One step of the method a unit of diffrax's time, which counts steps from the run's first: physical time is n·Δt,
+    n counting from the problem's start, and every step has the same Δt to the last bit. `args` is a `Problem`."""
+
+    term_structure: ClassVar = diffrax.ODETerm
+    interpolation_cls: ClassVar[Callable[..., diffrax.LocalLinearInterpolation]] = diffrax.LocalLinearInterpolation
+    watch: bool = False
+    """Whether a fault stops the run, and the state before the last step, then the last good one, is carried. All values
+    are then known and were checked; else that is done here."""
+
+    def order(self, terms: Any) -> int:
+        """At least first order in time; nothing depends on it, Δt being constant."""
+        del terms
+        return 1
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: State, args: Problem) -> tuple[Tally, State | None, Array]:
+        """An empty tally, and a silent report."""
+        del terms, t0, t1
+        tally, silent = no_steps(y0.x.dtype), jnp.zeros((), y0.x.dtype)
+        if args.fault is not None:
+            tally = eqx.tree_at(lambda tally: tally.fault, tally, args.fault)
+        return tally, y0 if self.watch else None, silent
+
+    def step(self, terms: Any, t0: Any, t1: Any, y0: State, args: Problem, solver_state: Any, made_jump: Any) -> tuple:
+        """One step. A fault is reported as the solver's failure: as an event diffrax would ask for it once more."""
+        del terms, t1, made_jump
+        tally, _, report = solver_state
+        t = (args.start + step_number(t0)) * args.dt
+        method = reporting(args.method, args.slot)
+        particles, info = advance_compiled(args.scene, args.at(y0), t, args.dt, method, args.stencil)
+        report = report + info.solve.report
+        y1 = state_of(particles)
+        arrays, rest = eqx.partition((args, y0, y1, t), eqx.is_array)
+        tally = tally.plus(info, fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest)))
+        dense = {"y0": y0, "y1": y1}
+        if not self.watch:
+            return y1, None, dense, (tally, None, report), diffrax.RESULTS.successful
+        results: Any = diffrax.RESULTS  # whose members the type checker takes for another type
+        result = results.where(tally.fault == HEALTHY, results.successful, results.nonlinear_divergence)
+        return y1, None, dense, (tally, y0, report), result
+
+    def func(self, terms: Any, t0: Any, y0: State, args: Problem) -> State:
+        """Not a vector field; diffrax only asks for its shape."""
+        return terms.vf(t0, y0, args)
+
+
+def no_vector_field(t: Any, y: State, args: Problem) -> State:
+    """What stands where diffrax expects an equation: the solver does not evaluate it."""
+    del t, args
+    return jax.tree.map(jnp.zeros_like, y)

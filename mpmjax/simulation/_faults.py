@@ -1,0 +1,156 @@
+"""What is wrong with a run, in words: errors, and warnings."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Array
+from mpmjax.autodiff import guard
+from mpmjax.checks import requirements, warn
+from mpmjax.implicit import Metric
+from mpmjax.material import Law
+from mpmjax.simulation._advice import advise, disallowed
+from mpmjax.simulation._diffrax import (
+    BAD_PARAMETERS,
+    BEYOND,
+    HEALTHY,
+    INADMISSIBLE,
+    NOT_FINITE,
+    OUTSIDE,
+    Problem,
+    Tally,
+    faulty_particles,
+    passed_particles,
+)
+from mpmjax.simulation._run import Run, SimulationError
+from mpmjax.state import Particles, State, state_of, with_state
+from mpmjax.stepping import BackwardEuler, Explicit, Method
+
+
+def raise_faults(run: Run, began: Particles, previous: State | None, start: int) -> None:
+    """Raise what the tally of an untraced run tells.
+
+    Args:
+        run: the run, its final state possibly bad.
+        began: the particles at the start.
+        previous: the state before the last step.
+        start: number of the run's first step.
+    """
+    fault = int(run.tally.fault)
+    if fault != HEALTHY:
+        assert previous is not None
+        step = start + int(run.tally.fault_step)
+        problem = Problem(run.scene, run.final, None, run.dt, run.method)
+        broken, outside, inadmissible = faulty_particles(problem, state_of(run.final))
+        bad: dict[int, Array] = {NOT_FINITE: broken, OUTSIDE: outside, INADMISSIBLE: inadmissible}
+        what, advice = _FAULTS.get(fault, ("", ""))
+        if fault == BEYOND:
+            t = jnp.asarray(step - 1, run.final.x.dtype) * run.dt
+            passed = passed_particles(problem, previous, state_of(run.final), t)
+            number, bad[BEYOND] = next((i, mask) for i, mask in passed if mask.any())
+            what = f"{what} boundary {number}, {type(run.scene.boundary[number]).__name__}"
+            if run.scene.total:
+                advice = "In the total description it holds only what touched it from the start: use the updated one."
+        first = int(np.argmax(np.asarray(bad[fault])))
+        if fault == INADMISSIBLE:
+            what, advice = disallowed(_law(run, first), run.method)
+        last = with_state(run.final, previous)
+        reached = int((run.steps < step).sum())
+        good = eqx.tree_at(
+            lambda r: (r.final, r.final_step, r.steps, r.frames, r.observed),
+            run,
+            (
+                last,
+                jnp.asarray(step - 1, run.final_step.dtype),
+                *jax.tree.map(lambda a: a[:reached], (run.steps, run.frames, run.observed)),
+            ),
+            is_leaf=lambda leaf: leaf is None,
+        )
+        raise SimulationError(
+            f"At step {step} (t = {step * float(run.dt):.6g} s) particle {first} {what}; the last good position was "
+            f"{np.asarray(previous.x[first])}. {advise(run.scene, run.method, run.dt, began, last, advice)}",
+            good,
+        )
+    if int(run.tally.unconverged) > 0:
+        raise SimulationError(
+            f"The solve of {int(run.tally.unconverged)} of {int(run.tally.steps)} steps did not converge (worst "
+            f"relative residual {float(run.tally.worst_residual):.2g}). "
+            + unconverged_advice(run.method, run.final.x.dtype),
+            run,
+        )
+
+
+def unconverged_advice(method: Method, dtype: Any) -> str:
+    """What helps a solve that does not converge."""
+    advice = ["reduce dt", "raise the solver's max_steps or loosen its rtol"]
+    if not isinstance(method, Explicit) and method.metric is Metric.MASS:
+        advice.insert(0, "take metric=Metric.DIAGONAL, which needs fewer iterations")
+    if jnp.dtype(dtype) == jnp.float32:
+        advice.append("take float64 particles, of which rounding leaves more digits")
+    if not isinstance(method, BackwardEuler):
+        advice.append("BackwardEuler holds where one linear solve does not")
+    text = "; ".join(advice)
+    return f"{text[0].upper()}{text[1:]}."
+
+
+def warn_of_short_solves(tally: Tally) -> None:
+    """A Python warning where solves of an untraced run missed their tolerance by less than ten times."""
+    if int(tally.short) > 0:
+        warn(
+            f"The solve of {int(tally.short)} of {int(tally.steps)} steps missed its tolerance by less than ten times "
+            f"(worst relative residual {float(tally.worst_residual):.2g}): the run is that much less accurate than was "
+            "asked for. Raise the solver's max_steps, or ask for what it can reach by its rtol."
+        )
+
+
+def _law(run: Run, particle: int) -> Law:
+    """The law of a particle, by its number."""
+    last = np.cumsum(run.final.counts or (run.final.count,))
+    return run.scene.laws[int(np.searchsorted(last, particle, side="right"))]
+
+
+_FAULTS: dict[int, tuple[str, str]] = {
+    NOT_FINITE: (
+        "is no longer finite",
+        "Look in the frames before (save_every) for what grows out of scale: a force, a prescribed motion, a velocity.",
+    ),
+    OUTSIDE: ("left the grid's window", "Enlarge the grid's shape, or use follow=True."),
+    BEYOND: (
+        "passed",
+        "Reduce dt: a boundary keeps out what comes less than a cell nearer in a step.",
+    ),
+}
+
+
+_STATE_FAULTS = (
+    "a state that is not finite",
+    "a particle outside the grid's window",
+    "a deformation gradient that its law does not allow",
+    "a particle that passed a boundary",
+)
+"""What is said of NOT_FINITE and the codes after it where no particle can be named."""
+_ADVICE = (
+    "Call simulate outside of jax transformations to have step, time and particle named, or with throw=False to "
+    "inspect run.tally."
+)
+UNSOLVED = (
+    "mpmjax: {} solve of a step did not converge, so that there is no derivative. Raise the "
+    "max_steps of the method's adjoint_solver, or leave its metric at Metric.DIAGONAL."
+)
+
+
+def guarded(run: Run, report: Array) -> Run:
+    """The run, of which neither a number nor a derivative can be had where it met a fault."""
+    inputs, rest = eqx.partition((run.scene, run.final, run.method), eqx.is_array)
+    names: list[str] = []
+    jax.eval_shape(lambda a: names.extend(r.message for r in requirements(eqx.combine(a, rest))), inputs)
+    met = [f"the rollout met a fault: {what}. {_ADVICE}" for what in (*_STATE_FAULTS, "a solve that did not converge")]
+    bad = [f"the rollout met a fault: {name}" for name in names]
+    tally, unsolved = run.tally, len(met)
+    state = jnp.where((tally.fault == HEALTHY) & (tally.unconverged > 0), unsolved, tally.fault)
+    number = jnp.where(tally.fault >= BAD_PARAMETERS, unsolved + 1 + tally.fault - BAD_PARAMETERS, state)
+    faults = [f"mpmjax: {message}" for message in (*met, *bad)]
+    return guard(run, report, number, faults, UNSOLVED.format("the tangent"))[0]

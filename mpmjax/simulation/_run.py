@@ -1,0 +1,94 @@
+"""What a simulation returns."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from mpmjax._types import Array, Float, Scalar
+from mpmjax.simulation._diffrax import Tally
+from mpmjax.state import Particles, Scene, State, with_state
+from mpmjax.stepping import Method
+
+
+class SimulationError(RuntimeError):
+    """A run that went wrong on the way. `run` holds what was reached, its `final` the last good state."""
+
+    def __init__(self, message: str, run: "Run"):
+        super().__init__(message)
+        self.run = run
+
+
+class Forces(NamedTuple):
+    """Mean forces and torques on k colliders between one saved frame and the next, of f frames."""
+
+    times: Float[Array, "g"]
+    """Half way between frames [s], shape (f − 1,)."""
+    force: Float[Array, "g k d"]
+    """Friction included [N], shape (f − 1, k, d)."""
+    torque: Float[Array, "g k r"]
+    """About the centre of the collider's rotation, or where it has none about its shape's middle, as it moves [N m],
+    shape (f − 1, k, r): r = 1 in 2-D, 3 in 3-D, 0 in 1-D."""
+
+
+class Run(eqx.Module):
+    """A simulation's outcome. A pytree: it can be returned from `jax.jit`, `jax.vmap` and differentiated."""
+
+    scene: Scene
+    """As it was simulated."""
+    method: Method
+    """As it was used."""
+    dt: Scalar
+    """Δt [s]."""
+    steps: Float[Array, "*f"]
+    """Step number of each saved frame, shape (f,)."""
+    frames: State | None
+    """The saved states, with a leading axis f; None where nothing or only observations were saved."""
+    observed: Any
+    """What `observe` returned for each frame, with a leading axis f."""
+    final: Particles
+    """The particles at the end."""
+    final_step: Float[Array, ""]
+    """Step number at the end."""
+    tally: Tally
+    """Solver and contact statistics, and the first fault."""
+    report: Float[Array, "..."] | None = None
+    """Zero. Its tangent in forward mode is the relative residual of the first tangent solve that did not converge, zero
+    if all did. None of a run from a file."""
+
+    @property
+    def times(self) -> Float[Array, "*f"]:
+        """Time of each saved frame [s], shape (f,)."""
+        return self.steps * self.dt
+
+    def frame(self, i: int) -> Particles:
+        """The particles at the i-th saved frame, negative from the end.
+
+        Raises:
+            ValueError: no frames were saved.
+            IndexError: there is no such frame.
+        """
+        if self.frames is None:
+            raise ValueError("This run saved no frames: pass save_every to simulate.")
+        if not -len(self) <= i < len(self):
+            raise IndexError(f"The run has {len(self)} frames, there is no frame {i}.")
+        return with_state(self.final, jax.tree.map(lambda a: a[i], self.frames))
+
+    def forces(self) -> Forces:
+        """The mean force and torque on each collider between one saved frame and the next.
+
+        Raises:
+            ValueError: no frames were saved, or the scene has no collider.
+        """
+        if self.frames is None or self.frames.received is None:
+            raise ValueError(
+                "Forces need saved frames and colliders: pass save_every to simulate, a collider to Scene."
+            )
+        times = self.times
+        between = (times[1:] - times[:-1])[:, None, None]
+        mean = jax.tree.map(lambda a: (a[1:] - a[:-1]) / between, self.frames.received)
+        return Forces((times[1:] + times[:-1]) / 2, mean.impulse, mean.angular)
+
+    def __len__(self) -> int:
+        return 0 if self.frames is None else int(np.shape(self.steps)[0])

@@ -1,0 +1,289 @@
+"""Rollouts: many steps, saved, watched and differentiated."""
+
+import math
+from collections.abc import Callable
+from typing import Any, Literal, cast
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Array, Float, Scalar
+from mpmjax.autodiff import guard
+from mpmjax.checks import (
+    canonical,
+    checked,
+    is_traced,
+    require,
+    require_finite,
+    require_memory,
+    require_positive,
+    require_whole,
+    requirements,
+)
+from mpmjax.simulation._diffrax import (
+    HEALTHY,
+    Problem,
+    StepSolver,
+    Tally,
+    examined,
+    no_vector_field,
+    step_number,
+)
+from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_short_solves
+from mpmjax.simulation._run import Run
+from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
+from mpmjax.stepping import MOST_STEPS, Explicit, Method, advance, step_for
+
+_CHECKPOINT_BYTES = 2**28
+
+
+@checked
+def simulate(
+    scene: Scene,
+    particles: Particles,
+    *,
+    t1: Scalar,
+    dt: Scalar | Literal["stable"],
+    method: Method = Explicit(),
+    save_every: int | None = None,
+    observe: Callable[[Scene, Particles], Any] | None = None,
+    start: Scalar = 0,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    checkpoint_bytes: int = _CHECKPOINT_BYTES,
+    progress: bool = False,
+    throw: bool = True,
+) -> Run:
+    """Simulate a scene from step `start` to time t1 in steps of dt.
+
+    The rollout is differentiable with respect to every float of the scene, the particles and the method: in reverse
+    mode by default, by recomputation from checkpoints; in forward mode (`jax.jvp`, `jax.jacfwd`) with
+    `adjoint=diffrax.ForwardMode()`. Only the number of steps, `save_every` and choices of code compile anew.
+
+    Args:
+        scene: the scene.
+        particles: the particles at step `start`.
+        t1: end time [s], a whole number of steps after time zero.
+        dt: step [s]; or "stable", the longest that `stable_dt` allows of the particles as they start and of which t1 is
+            a whole number (`run.dt` says it). What stretches or stiffens on the way may need a shorter one.
+        method: update of the grid velocity.
+        save_every: save the state at the start, every so many steps, and at the end. Default: only `final` is returned.
+        observe: instead of states, save what this function of (scene, particles) returns, so that a curve costs no more
+            memory than its points. `save_every` then defaults to 1. It may be an `equinox.Module` with arrays; a plain
+            function compiles anew unless it is the same object.
+        start: number of the first step, e.g. a former run's `final_step`; time there is start·dt.
+        adjoint: how diffrax differentiates. Default: recursive checkpointing.
+        checkpoint_bytes: memory for the checkpoints of the default adjoint [B]. Fewer of them cost recomputation.
+        progress: show diffrax's progress meter.
+        throw: raise on faults. With False the result says them in `tally`, and a batch member that fails leaves the
+            others alone.
+
+    Raises:
+        ValueError: of `prepare`; a value of the method that it does not allow; a t1 that is not a whole number of steps
+            after the start.
+        SimulationError: a state that is not finite, a particle outside the window, an F that the law does not allow
+            or one that passed a boundary (each with step, time and first bad particle; the last good state is in its
+            `run.final`), a solve that ended beyond ten times its tolerance; one that ended nearer is a Python warning.
+        RuntimeError: the same, and values that scene, particles or method do not allow, under an outer transformation
+            (`jax.jit`, `jax.grad`, `jax.vmap` and what is made of them, where only the derivative is asked for too);
+            and a tangent or adjoint solve that did not converge. In compiled programs it is that of
+            `equinox.error_if`. With `throw=False` such values make the state NaN and such a solve the derivative.
+    """
+    start = require_whole("start", start, 0)
+    particles = prepare(scene, particles)
+    dt = step_for(scene, particles, t1, dt, method, start)
+    count = number_of_steps(t1, dt, start, particles.x.dtype)
+    if save_every is not None:
+        save_every = min(require_whole("save_every", save_every, 1), count)
+    if observe is not None and save_every is None:
+        save_every = 1
+    dtype = particles.x.dtype
+    scene, dt_, method = canonical((scene, dt, method), dtype)
+    requirements((scene, method))  # in this precision
+    traced = is_traced((scene, particles, dt_, method, observe))  # under jax.jit also if all that was passed is known
+    if save_every is not None and observe is None:
+        frames = count // save_every + 2
+        require_memory(
+            f"{frames} frames of {particles.count} particles",
+            float(frames) * _bytes(particles),
+            f"save less often than every {save_every} steps, observe what is needed of them, or use record.",
+            device=True,
+        )
+    slot = jnp.zeros((), dtype)
+    if traced and throw:
+        healthy, unsolved = jnp.asarray(HEALTHY, jnp.int32), UNSOLVED.format("the adjoint")
+        (scene, particles, method), slot = guard((scene, particles, method), slot, healthy, (), unsolved)
+    if adjoint is None:
+        adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=_checkpoints(particles, count, checkpoint_bytes))
+    saved, final, tally, previous, report = integrate(
+        scene,
+        particles,
+        jnp.asarray(start, dtype),
+        None,
+        dt_,
+        method,
+        slot,
+        max_steps=count,
+        save_every=save_every,
+        observe=observe,
+        adjoint=adjoint,
+        progress=progress,
+        watch=not traced,
+    )
+    steps, values = (jnp.zeros((0,), dtype), None) if saved is None else saved
+    run = Run(
+        scene=scene,
+        method=method,
+        dt=dt_,
+        steps=steps,
+        frames=values if observe is None else None,
+        observed=None if observe is None else values,
+        final=with_state(particles, final),
+        final_step=jnp.asarray(start, dtype) + tally.steps.astype(dtype),
+        tally=tally,
+        report=report if traced else None,
+    )
+    if not throw:
+        return run
+    if traced:
+        return guarded(run, report)
+    raise_faults(run, particles, previous, start)
+    warn_of_short_solves(run.tally)
+    return run
+
+
+@checked
+def rollout(
+    scene: Scene,
+    particles: Particles,
+    *,
+    steps: int,
+    dt: Scalar,
+    method: Method = Explicit(),
+    start: Scalar = 0,
+) -> Particles:
+    """The plain rollout: `jax.lax.scan` over steps, without saving, checks or checkpoints. `simulate` is held to it.
+
+    Args:
+        scene: the scene.
+        particles: the particles at step `start`.
+        steps: number of steps.
+        dt: step [s].
+        method: update of the grid velocity.
+        start: number of the first step.
+    """
+    scene, dt, method = canonical((scene, dt, method), particles.x.dtype)
+    requirements(method)
+    return _rollout(scene, prepare(scene, particles), dt, method, steps, jnp.asarray(start, particles.x.dtype))
+
+
+@eqx.filter_jit
+def _rollout(
+    scene: Scene, particles: Particles, dt: Scalar, method: Method, steps: int, start: Float[Array, ""]
+) -> Particles:
+    stencil = scene.stencil(particles) if scene.total else None
+
+    def body(state: State, n: Array) -> tuple[State, None]:
+        new, _ = advance(scene, with_state(particles, state), n * dt, dt, method, stencil)
+        return state_of(new), None
+
+    number = start + jnp.arange(steps, dtype=particles.x.dtype)
+    return with_state(particles, jax.lax.scan(body, state_of(particles), number)[0])
+
+
+def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
+    """How many steps of dt lead from step `start` to time t1.
+
+    Raises:
+        ValueError: not a whole number, none, or more than the precision can count.
+    """
+    if is_traced((t1, dt)):
+        raise ValueError("t1 and dt fix the number of steps and must be known numbers, not traced ones.")
+    require_positive("dt [s]", dt)
+    require_finite("t1 [s]", t1)
+    ratio, exact = float(t1) / float(dt), 2 ** (jnp.finfo(dtype).nmant - 1)
+    require(
+        ratio <= MOST_STEPS,
+        f"A run has at most {MOST_STEPS} steps, got t1 / dt = {ratio:.9g}: choose a shorter t1 or a longer dt.",
+    )
+    require(
+        ratio < exact,
+        f"{jnp.dtype(dtype)} counts steps exactly only below {exact}, got t1 / dt = {ratio:.9g}: use float64.",
+    )
+    total = round(ratio)
+    require(
+        abs(ratio - total) <= 1e-6 * max(1.0, abs(ratio)),
+        f"t1 must be a whole number of steps: t1 / dt = {ratio:.9g} (t1 = {t1}, dt = {dt}); "
+        f"take dt = {t1} / {max(1, math.ceil(ratio))}.",
+    )
+    require(total > start, f"t1 must lie after the start: t1 / dt = {total} steps, start = {start}.")
+    return total - int(start)
+
+
+def _checkpoints(particles: Particles, count: int, budget: int) -> int:
+    return max(1, min(count, budget // _bytes(particles)))
+
+
+def _bytes(particles: Particles) -> int:
+    """Of what evolves of them."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state_of(particles)))
+
+
+@eqx.filter_jit
+def integrate(
+    scene: Scene,
+    particles: Particles,
+    start: Float[Array, ""],
+    count: Float[Array, ""] | None,
+    dt: Scalar,
+    method: Method,
+    slot: Scalar = 0.0,
+    *,
+    max_steps: int,
+    save_every: int | None,
+    observe: Callable[[Scene, Particles], Any] | None,
+    adjoint: diffrax.AbstractAdjoint,
+    progress: bool,
+    watch: bool,
+) -> tuple[Any, State, Tally, State | None, Array]:
+    """`count` ≤ `max_steps` steps from step `start`: (steps and values saved), final state, tally, with `watch`, which
+    stops the run at a fault, the state before the last step, and what tangent solves report. Adjoint solves do through
+    the `slot` (see `Reporting`).
+
+    Without a count, all of them: what diffrax derives of its last time is then a constant, which XLA computes as it
+    compiles, and not a program of two thousand operations.
+    """
+    stencil = scene.stencil(particles) if scene.total else None
+    problem = Problem(scene, particles, stencil, dt, method, observe, start, jnp.asarray(slot, start.dtype))
+    state = state_of(particles)
+    if not watch:
+        problem, state = examined(problem, state)
+    zero, one, all_steps = (np.asarray(n, start.dtype) for n in (0, 1, max_steps))
+
+    def kept(t: Any, y: State, args: Problem) -> Any:
+        del t
+        return y if args.observe is None else args.observe(args.scene, args.at(y))
+
+    subs = {"final": diffrax.SubSaveAt(t1=True)}
+    if save_every is not None:
+        subs["frames"] = diffrax.SubSaveAt(t0=True, t1=True, steps=save_every, fn=kept)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(no_vector_field),
+        StepSolver(watch),
+        t0=zero,
+        t1=all_steps if count is None else count,
+        dt0=one,
+        y0=state,
+        args=problem,
+        saveat=diffrax.SaveAt(subs=subs, solver_state=True),
+        adjoint=adjoint,
+        max_steps=max_steps,
+        throw=False,
+        progress_meter=diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter(),
+    )
+    times, values, (tally, previous, report) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
+    final = jax.tree.map(lambda a: a[-1], values["final"])
+    saved = None if save_every is None else (start + step_number(times["frames"]), values["frames"])
+    return saved, final, tally, previous, report

@@ -1,0 +1,25 @@
+"""Particles, scene and what a step needs of them."""
+
+from mpmjax.state._body_force import AbstractBodyForce
+from mpmjax.state._constituent import Constituent
+from mpmjax.state._fill import fill
+from mpmjax.state._particles import Particles, State, by_material, histories, join, state_of, with_state
+from mpmjax.state._scene import Scene, TotalLagrangian, UpdatedLagrangian, is_prepared, prepare
+
+__all__ = [
+    "AbstractBodyForce",
+    "Constituent",
+    "Particles",
+    "Scene",
+    "State",
+    "TotalLagrangian",
+    "UpdatedLagrangian",
+    "by_material",
+    "fill",
+    "histories",
+    "is_prepared",
+    "join",
+    "prepare",
+    "state_of",
+    "with_state",
+]

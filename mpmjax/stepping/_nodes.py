@@ -1,0 +1,196 @@
+"""The grid's side of a step: what the particles bring to the nodes, and what the nodes' new velocity is made from."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
+from mpmjax.boundary import Conditions, Contact, Mirror, combine, contacts, mirror
+from mpmjax.discretisation import Stencil, p2g, spread
+from mpmjax.implicit import Constraint, ElasticPotential
+from mpmjax.state import Particles, Scene
+
+_PARALLEL = 1e-2  # a normal whose part in free components is smaller is prescribed by the others
+
+
+class Grasp(eqx.Module):
+    """The colliders' normals in the components that nothing prescribes."""
+
+    normal: NodeVector
+    """The unit vector along the normal's free part, shape (n, d); zero where there is none."""
+    reach: NodeScalar
+    """The length of that part of the normal [-], shape (n,)."""
+    speed: NodeScalar
+    """The velocity along it [m/s] with which the whole normal component is the collider's, shape (n,)."""
+
+
+class Nodes(eqx.Module):
+    """What the velocity update of one step is given."""
+
+    mass: NodeScalar
+    """m_i [kg], shape (n,), folded at symmetry planes; zero on empty nodes, whose mass is but rounding."""
+    velocity: NodeVector
+    """v_i^n [m/s], shape (n, d); zero on empty nodes. Plus Δt f_i/m_i where P2G has added the force's impulse."""
+    occupied: Bool[Array, "n 1"]
+    """Whether the node has mass beyond rounding, that of the lightest particle, shape (n, 1)."""
+    acceleration: Array
+    """Body acceleration g [m/s²], shape (d,), or (n, d) where it varies."""
+    force: NodeVector
+    """f_i at the start of the step [N], shape (n, d); zero where P2G has added its impulse to the momentum."""
+    dt: Float[Array, ""]
+    """Δt [s]."""
+    spacing: Float[Array, ""]
+    """dx [m]."""
+    potential: ElasticPotential
+    """Φ, of nodal displacements."""
+    conditions: Conditions
+    """What the boundaries prescribe."""
+    viscous: NodeVector | None = None
+    """The part of viscosity in an explicit step's force [N], shape (n, d), where it was wanted apart."""
+    contacts: tuple[Contact, ...] = ()
+    """The scene's contact planes, of which none holds anything here."""
+
+    @property
+    def free(self) -> Mask:
+        """The components that nothing prescribes, on nodes that have mass."""
+        return self.occupied & ~self.conditions.fixed
+
+    @property
+    def grasp(self) -> Grasp | None:
+        """The colliders' normals, held or not, as far as they ask for more than the prescribed components give.
+
+        With components a prescribed, n·v = n·v_c says Σ_free n v = n·v_c − Σ_a n_a v_a.
+        """
+        touch = self.conditions.touch
+        if touch is None:
+            return None
+        part = jnp.where(self.free, touch.normal, 0)
+        square = (part**2).sum(axis=1)
+        some = square > _PARALLEL**2
+        reach = jnp.sqrt(jnp.where(some, square, 1))
+        asked = touch.normal * (touch.velocity - jnp.where(self.free, 0, self.conditions.velocity))
+        return Grasp(
+            normal=jnp.where(some[:, None], part / reach[:, None], 0),
+            reach=reach,
+            speed=jnp.where(some, asked.sum(axis=1) / reach, 0),
+        )
+
+    @property
+    def constraint(self) -> Constraint:
+        """The projection on what nothing holds."""
+        touch, grasp = self.conditions.touch, self.grasp
+        if touch is None or grasp is None:
+            return Constraint(self.free)
+        return Constraint(self.free, jnp.where(touch.held[:, None], grasp.normal, 0))
+
+    @property
+    def prescribed(self) -> NodeVector:
+        """The velocity [m/s], shape (n, d), of what is held."""
+        grasp = self.grasp
+        if grasp is None:
+            return self.conditions.velocity
+        return jnp.where(self.free, grasp.normal * grasp.speed[:, None], self.conditions.velocity)
+
+    def explicit_velocity(self) -> NodeVector:
+        """v* = v^n + Δt f / m + Δt g (reference, eq. 4)."""
+        force = self.force if self.viscous is None else self.force + self.viscous
+        return jnp.where(self.occupied, self.inertial_velocity() + self.dt * self.per_mass(force), 0)
+
+    def inertial_velocity(self) -> NodeVector:
+        """ṽ = v^n + Δt g."""
+        return jnp.where(self.occupied, self.velocity + self.dt * self.acceleration, 0)
+
+    def admitted_velocity(self) -> NodeVector:
+        """v^n with what is prescribed: what a wall will hold stops as the step begins."""
+        return self.constraint.split(self.velocity, self.prescribed)
+
+    def per_mass(self, impulse: NodeVector) -> NodeVector:
+        """An impulse or force over the nodes' mass; zero on empty nodes."""
+        return jnp.where(self.occupied, impulse / jnp.where(self.occupied, self.mass[:, None], 1), 0)
+
+    def folded(self, images: Mirror) -> "Nodes":
+        """The true nodes of mirror planes, with what their images received. Nothing changes without a plane.
+
+        A force is folded like the momentum it makes: a plane's mirror image is pulled the other way.
+        """
+        if not images.images:
+            return self
+        mass = images.fold_scalar(self.mass)
+        momentum, pull = self.mass[:, None] * self.velocity, self.mass[:, None] * self.acceleration
+        nodes = eqx.tree_at(
+            lambda n: (n.mass, n.occupied, n.force, n.potential.mirror),
+            self,
+            (mass, (mass > 0)[:, None], images.fold(self.force), images.then(self.potential.mirror)),
+        )
+        parts = nodes.per_mass(images.fold(momentum)), nodes.per_mass(images.fold(pull))
+        nodes = eqx.tree_at(lambda n: (n.velocity, n.acceleration), nodes, parts)
+        return nodes if nodes.viscous is None else eqx.tree_at(lambda n: n.viscous, nodes, images.fold(nodes.viscous))
+
+
+def particles_to_grid(
+    scene: Scene,
+    particles: Particles,
+    t: Scalar,
+    dt: Scalar,
+    stencil: Stencil,
+    *,
+    centred: bool,
+    lagged: bool = False,
+    kicked: bool = False,
+    apart: bool = False,
+) -> Nodes:
+    """P2G, folded at symmetry planes, with the elastic potential and the boundaries of the step from t to t + dt.
+
+    Body forces are those of the particles at t, or with `centred` at t + ½dt, half a step on by their velocity. With
+    `kicked` the elastic force is not wanted for itself: its impulse over the step goes to the nodes in one sum with the
+    momentum, where they have one gradient operator, and half of P2G's cost is saved. With `lagged` the viscous stress
+    of the particles' own velocity gradients is part of that force, or with `apart` beside it.
+    """
+    grid, window = scene.grid, scene.window(particles)
+    v = components(particles.v)
+    C = None if particles.C is None else components(particles.C)
+    affine = C if scene.transfer.affine else None
+    acceleration = jnp.asarray(scene.gravity)
+    with jax.named_scope("p2g"):
+        potential = ElasticPotential(scene.constituents(particles), stencil, Mirror(()))
+        kicked = kicked and stencil.affine_slopes is None
+        resisted = C if lagged and potential.viscous else None
+        flux = potential.rest_flux()
+        if resisted is not None and not apart:
+            flux = flux + potential.drag_flux(resisted)
+        mass, momentum = p2g(stencil, particles.mass, v, affine, grid.size, -dt * flux if kicked else None)
+        lightest = particles.mass.min()  # a mean would empty the nodes of a body much lighter than the others
+        occupied = (mass > jnp.finfo(mass.dtype).eps * lightest)[:, None]
+        full = jnp.where(occupied, mass[:, None], 1)
+        if scene.body_force is not None:
+            x, at = (particles.x + dt / 2 * particles.v, t + dt / 2) if centred else (particles.x, t)
+            push = particles.mass * components(scene.body_force.acceleration(x, at))
+            force = spread(stencil, push, None, grid.size)
+            acceleration = acceleration + jnp.where(occupied, force / full, 0)
+        conditions = combine(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total)
+        if scene.total and conditions.touch is not None and scene.slides:
+            slid = (conditions.touch.owner >= 0)[:, None] & occupied
+            place = jnp.where(slid, _place(particles, stencil, grid.size) / full, conditions.touch.position)
+            conditions = eqx.tree_at(lambda c: c.touch.position, conditions, place)
+        nodes = Nodes(
+            mass=jnp.where(occupied[:, 0], mass, 0),
+            velocity=jnp.where(occupied, momentum / full, 0),
+            occupied=occupied,
+            acceleration=acceleration,
+            force=jnp.zeros_like(momentum) if kicked else -potential.sum_of(flux, momentum),
+            dt=jnp.asarray(dt),
+            spacing=jnp.asarray(grid.spacing),
+            potential=potential,
+            conditions=conditions,
+            viscous=None
+            if resisted is None or not apart
+            else -potential.sum_of(potential.drag_flux(resisted), momentum),
+            contacts=contacts(scene.boundary, grid, window),
+        )
+        return nodes.folded(mirror(scene.boundary, grid, window))
+
+
+def _place(particles: Particles, stencil: Stencil, size: int) -> NodeVector:
+    """The places of reference nodes times their mass, Σ_p w_ip m_p (x_p + F_p (X_i − X_p)) [kg m], shape (n, d)."""
+    F = jnp.concatenate([components(group) for group in jax.tree.leaves(particles.F)], axis=-1)
+    return p2g(stencil, particles.mass, components(particles.x), F, size)[1]

@@ -1,0 +1,215 @@
+"""The longest stable step, known before it is taken."""
+
+import math
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax import linalg as la
+from mpmjax._types import Array, Float, Scalar
+from mpmjax.checks import canonical, checked, is_traced, require, require_positive
+from mpmjax.discretisation import MLSGradient
+from mpmjax.state import Constituent, Particles, Scene, is_prepared, prepare
+from mpmjax.stepping._method import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, Method, SemiImplicit
+
+MOST_STEPS = 2**31 - 1
+"""What a run counts its steps up to."""
+_INVERSE_MOMENT = {2: 4.0, 3: 3.0}
+"""dx² a of the quadratic and the cubic kernel, a the inverse of D_p = Σ_i w_ip (x_i − x_p)²."""
+_STEEPEST = {2: 6.0, 3: 3.1368191}
+"""The largest value over a cell of dx² Σ_i (∂w_ip)²/w_ip, for the quadratic and the cubic kernel."""
+
+
+SAFETY = 0.7
+"""The default safety."""
+
+
+@checked
+def stable_dt(
+    scene: Scene,
+    particles: Particles,
+    *,
+    method: Method = Explicit(),
+    safety: Scalar = SAFETY,
+    t1: Scalar | None = None,
+) -> Float[Array, ""]:
+    """The longest step Δt [s] for which the motion about the particles' present state does not grow.
+
+    For each particle alone on the grid the step's limit is known exactly, and no assembly of particles has a lower one
+    than the lowest of its members (B. M. Irons, G. Treharne, Proc. 3rd Conf. on Matrix Methods in Structural Mechanics,
+    1971, for frequencies; for the step of APIC and PIC the same argument holds with the velocity that the transfer
+    keeps): Δt² = 4 ρ0 / (Λ (2Ξ − κa)), the least over particles, with
+
+    - Λ the largest eigenvalue of the present tangent L ↦ ∂²Ψ/∂F∂F : (L F) Fᵀ + τ Lᵀ, L = ∇v, τ = P Fᵀ, made symmetric,
+      from `principal_tangent` (in the total description that of ∂²Ψ/∂F∂F): stretching and compression raise it;
+    - Ξ a bound of Σ_i g_ip g_ipᵀ/w_ip: a for the moving-least-squares gradient; for the spline's its value where the
+      particle is in the total description, and in the updated one, since particles move, at the worst place in a cell,
+      6/dx² (quadratic) and 3.137/dx² (cubic);
+    - a = 4/dx² (quadratic), 3/dx² (cubic); κ = 1 for APIC and 0 for PIC and FLIP, which forget the affine velocity.
+
+    At F = I that is √(4ρ0/((2μ + dλ)(2Ξ − κa))). The semi-implicit step's is 1/√(1 − 2β) times it for β < ½; for
+    β ≥ ½, for backward Euler and for the methods of second order there is none: the result is infinite, and says
+    nothing of accuracy.
+
+    With viscosity it is Δt of Δt² Λ (2Ξ − κa)/ρ0 + Δt Λ_v b/ρ0 = 4, Λ_v the largest eigenvalue of L ↦ |J| σ_v, that is
+    |J| max(2η, 2η (1 − d/3) + dζ), and b = 2a for APIC, whose stored gradient a step multiplies by 1 − Δt a Λ_v/ρ0, or
+    4Ξ for PIC and FLIP, whose gradient of a step ago stands beside nothing that it changes; 8/(B + √(B² + 16A)) with
+    the factors A of Δt² and B of Δt. The semi-implicit step has (1 − 2β) times both.
+
+    The default safety of 0.7 is for what is not linear. Vibrations of a few per cent grow below the linear limit where
+    a mode's third or fourth harmonic resonates with the step, (ωΔt)² = 3 and 2, at 0.87 and 0.71 of the limit: a
+    particle released at a stretch of 1.2 blows up at 0.75 of it, and does not at 0.7. It also covers what the argument
+    leaves out in the updated description, the motion of stencils under stress: among random clouds in which stretches
+    of 0.6 and 1.6 are neighbours the linearised step fails down to 0.94 of the bound.
+
+    *When it breaks*: Δt must be constant in a rollout, so ask for it at the state of the largest stretch expected. With
+    the linear kernel a = 1/(s(1 − s) dx²), s the particle's place in the cell, so that the bound holds only where the
+    particles are now and is zero at a cell's face. No step makes a physical instability (buckling) go away.
+
+    Args:
+        scene: the scene.
+        particles: the particles; what the scene needs and they lack is added.
+        method: update of the grid velocity.
+        safety: factor of the bound.
+        t1: end time [s]: the result is then the longest step at or below the bound of which t1 is a whole number.
+
+    Raises:
+        ValueError: from `prepare`; a safety that is not positive; with t1, a bound that is zero or that there is none.
+    """
+    require_positive("safety", safety)
+    limit = canonical(safety, particles.x.dtype) * longest_step(scene, particles, method)
+    if not is_traced(limit):
+        require(not np.isnan(limit), "stable_dt needs particles whose F is finite and one that their law allows.")
+    return limit if t1 is None else _whole(limit, t1, type(method).__name__)
+
+
+def step_for(
+    scene: Scene, particles: Particles, t1: Scalar, dt: Scalar | Literal["stable"], method: Method, start: int
+) -> Scalar:
+    """The step that is asked for: a number, or what `stable_dt` says of the particles as they start.
+
+    Raises:
+        ValueError: of `stable_dt`; "stable" for a run that does not start at step 0.
+    """
+    if not isinstance(dt, str):
+        return dt
+    require(start == 0, 'A run that goes on has the step that it began with: give dt, which run.dt is, not "stable".')
+    return stable_dt(scene, particles, method=method, t1=t1)
+
+
+def _whole(limit: Array, t1: Scalar, method: str) -> Float[Array, ""]:
+    """t1 by the least whole number for which that is at or below a limit [s]."""
+    if is_traced((limit, t1)):
+        raise ValueError(
+            "The number of steps must be known, and the limit that fixes it is traced here: ask for "
+            "stable_dt(scene, particles, t1=t1) outside of the jax transformation, and pass the number."
+        )
+    require_positive("t1 [s]", t1)
+    bound, end = float(limit), float(t1)
+    require(
+        bound < np.inf,
+        f"{method} has no longest stable step here, so accuracy alone decides: give dt as a number of seconds.",
+    )
+    require(
+        end <= bound * MOST_STEPS,
+        f"The longest stable step is {bound:.3g} s, of which t1 = {t1} s takes more than {MOST_STEPS}: choose an "
+        "implicit method, a coarser grid or, if the step is zero, another kernel than the linear one.",
+    )
+    count = max(1, math.ceil(end / bound))
+    while end / count > bound:  # by the rounding of the quotient
+        count += 1
+    return jnp.asarray(end / count, limit.dtype)
+
+
+def longest_step(scene: Scene, particles: Particles, method: Method) -> Float[Array, ""]:
+    """`stable_dt` with a safety of one [s]; NaN where F is not finite, or too large."""
+    scene, method = canonical((scene, method), particles.x.dtype)
+    return _limit(scene, particles if is_prepared(scene, particles) else prepare(scene, particles), method)
+
+
+@eqx.filter_jit
+def _limit(scene: Scene, particles: Particles, method: Method) -> Float[Array, ""]:
+    density = particles.mass / particles.volume
+    bodies = scene.constituents(particles)
+    stiffest = jnp.concatenate([_tangent_spectrum(c, particles.dim).max(axis=0) for c in bodies])
+    z = stiffest * _gradient_bound(scene, particles) / density  # per Δt²
+    match method:
+        case Explicit():
+            explicit = jnp.ones_like(z)
+        case SemiImplicit(beta=beta):
+            explicit = (1 - 2 * jnp.asarray(beta)) * jnp.ones_like(z)
+        case BackwardEuler() | ImplicitMidpoint() | TRBDF2():
+            explicit = jnp.zeros_like(z)
+        case _:
+            raise ValueError(f"stable_dt does not know how {type(method).__name__} limits the step: give dt yourself.")
+    most = jnp.concatenate([_stiffest_viscosity(c, particles.dim) for c in bodies])
+    y = most * _viscous_gradient_bound(scene, particles) / density  # per Δt
+    z, y = jnp.maximum(explicit * z, 0), jnp.maximum(explicit * y, 0)
+    square = y**2 + 16 * z
+    none = square == 0  # and not what is NaN, which the least must keep
+    steepness = (y + jnp.where(none, 0, jnp.sqrt(jnp.where(none, 1, square)))).max()
+    return jnp.where(steepness == 0, jnp.inf, 8 / jnp.where(steepness == 0, 1, steepness))
+
+
+def _stiffest_viscosity(body: Constituent, dim: int) -> Float[Array, "q"]:
+    """The largest eigenvalue of each particle's ∇v ↦ |J| σ_v [Pa s]; in the total description a bound of it."""
+    J = jnp.abs(la.determinant(body.F))
+    if body.viscosity is None:
+        return jnp.zeros_like(J)
+    most = J * body.viscosity.stiffest(dim)
+    return most / (la.principal_frame(body.F)[1] ** 2).min(axis=0) if body.total else most
+
+
+def _tangent_spectrum(body: Constituent, dim: int) -> Float[Array, "m q"]:
+    """The eigenvalues of each particle's tangent [Pa], whose largest is Λ: in the principal frame the map is d x d
+    on the diagonal and 2 x 2 on (L_ij, L_ji) for each pair. Where the law knows J alone it is d/dJ(JΨ') J tr(L) I, of
+    which one is not zero."""
+    _, s, _ = la.principal_frame(body.F)
+    tangent = body.law.principal_tangent(s)
+    d = s.shape[0]
+    if body.total:
+        pull, tau = jnp.ones_like(s), jnp.zeros_like(s)
+    else:
+        P = body.law.stress(la.diagonal(s))
+        pull, tau = s, s * jnp.stack([P[i, i] for i in range(d)])
+    scaling = tangent.scaling * pull[:, None] * pull + la.diagonal(tau)
+    if d < dim:
+        return dim * scaling[0]
+    values = [*la.symmetric_eigen(scaling)[0]]
+    for (i, j), twist, flip in zip(la.pairs(d), tangent.twist, tangent.flip, strict=True):
+        near, far = (flip + twist) / 2 * pull[j] ** 2, (flip + twist) / 2 * pull[i] ** 2
+        across = (flip - twist) / 2 * pull[i] * pull[j] + (tau[i] + tau[j]) / 2
+        centre, radius = (near + far) / 2, jnp.hypot((near - far) / 2, across)
+        values += [centre - radius, centre + radius]
+    return jnp.stack(values)
+
+
+def _gradient_bound(scene: Scene, particles: Particles) -> Float[Array, "*p"]:
+    """2Ξ − κa [1/m²]."""
+    a, steepest = _inverse_moments(scene, particles)
+    return 2 * steepest - a if scene.transfer.affine else 2 * steepest
+
+
+def _viscous_gradient_bound(scene: Scene, particles: Particles) -> Float[Array, "*p"]:
+    """2a with APIC, 4Ξ with PIC and FLIP [1/m²]."""
+    a, steepest = _inverse_moments(scene, particles)
+    return 2 * a if scene.transfer.affine else 4 * steepest
+
+
+def _inverse_moments(scene: Scene, particles: Particles) -> tuple[Array, Array]:
+    """a and Ξ [1/m²]."""
+    order, dx = scene.kernel.order, jnp.asarray(scene.grid.spacing)
+    if order == 1:  # both gradients are one, and Ξ = a
+        a = 1 / scene.stencil(particles).moment.min(axis=0)
+        return a, a
+    a = _INVERSE_MOMENT[order] / dx**2
+    if isinstance(scene.gradient, MLSGradient):
+        return a, a
+    if not scene.total:
+        return a, _STEEPEST[order] / dx**2
+    stencil = scene.stencil(particles)
+    touched = stencil.weights > 0
+    steepness = jnp.where(touched, stencil.slopes**2 / jnp.where(touched, stencil.weights, 1), 0)
+    return a, steepness.sum(axis=1).max(axis=0)

@@ -1,0 +1,200 @@
+"""One step: particles to grid, the grid's update by a method, grid to particles, return maps of what yields."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Int, NodeScalar, NodeVector, Scalar, components, particle_first
+from mpmjax.boundary import Exchange, received
+from mpmjax.checks import canonical, checked, require_positive
+from mpmjax.discretisation import Stencil, g2p
+from mpmjax.implicit import Constraint, SolveInfo
+from mpmjax.state import Particles, Scene, is_prepared, prepare
+from mpmjax.stepping._contact import NOTHING, ContactInfo, Held, find_active_set, hold, no_contact, touches
+from mpmjax.stepping._method import Explicit, Method, NodeMotion, viscous_impulse
+from mpmjax.stepping._nodes import Nodes, particles_to_grid
+
+
+class StepInfo(eqx.Module):
+    """What one step reports."""
+
+    solve: SolveInfo
+    contact: ContactInfo
+    outside: Int[Array, "*f"]
+    """Particles whose stencil left the grid's window."""
+    colliders: Exchange | None = None
+    """What the scene's colliders received, in the order of its boundaries; None without any."""
+
+
+class GridUpdate(eqx.Module):
+    """The nodes' new velocity and where it came from."""
+
+    before: NodeVector
+    """v_i^n [m/s], shape (n, d), mirrored where a contact plane holds."""
+    motion: NodeMotion
+    """How they move, mirrored likewise."""
+    elastic: NodeVector
+    """The impulse of the elastic force [kg m/s], shape (n, d); with it that of viscosity where P2G joined them."""
+    viscous: NodeVector | None
+    """The impulse of viscosity [kg m/s], shape (n, d), where there is one."""
+    reaction: NodeVector
+    """The impulse of walls and grips [kg m/s], shape (n, d); on free components what the solve left."""
+    friction: NodeVector | None
+    """The impulse of friction [kg m/s], shape (n, d), where there are walls that may be left."""
+    free: Constraint
+    """The projection on that in which no boundary had a part."""
+    solve: SolveInfo
+    contact: ContactInfo
+    push: NodeScalar | None = None
+    """The impulse of colliders along their normals [kg m/s], shape (n,), where there are colliders."""
+    rub: NodeVector | None = None
+    """Their part of the impulse of friction [kg m/s], shape (n, d)."""
+
+
+def advance(
+    scene: Scene, particles: Particles, t: Scalar, dt: Scalar, method: Method, stencil: Stencil | None = None
+) -> tuple[Particles, StepInfo]:
+    """One step, without checks or compilation: `step` is its public form.
+
+    Args:
+        scene: the scene, its floats arrays of the particles' dtype.
+        particles: prepared particles.
+        t: time at the start of the step [s].
+        dt: step [s].
+        method: update of the grid velocity.
+        stencil: that of the reference positions, if the description is total and it was computed before.
+    """
+    stencil = scene.stencil(particles) if stencil is None else stencil
+    kicked = not (method.needs_force or scene.transfer.needs_change)
+    nodes = particles_to_grid(
+        scene, particles, t, dt, stencil, centred=method.centred, lagged=method.lagged, kicked=kicked
+    )
+    new = update(nodes, method)
+    outside = (~stencil.inside).sum().astype(jnp.int32)
+    touch = nodes.conditions.touch
+    if touch is not None and new.motion.mean is not None:
+        touch = touch.after(dt / 2, new.motion.mean)
+    exchange = None if touch is None else received(touch, new.reaction, new.push, new.rub)
+    after = scene.return_map(grid_to_particles(scene, particles, nodes, new))
+    if exchange is not None and after.received is not None:
+        after = replace(after, received=after.received.plus(exchange))
+    return after, StepInfo(new.solve, new.contact, outside, exchange)
+
+
+advance_compiled = eqx.filter_jit(advance)
+"""The same as one program, which is traced once wherever it is called."""
+
+
+def update(nodes: Nodes, method: Method) -> GridUpdate:
+    """The nodes' motion, boundaries and contact included."""
+    with jax.named_scope("update"):
+        guess = method.guess.velocity(nodes.velocity, nodes.explicit_velocity())
+        if not touches(nodes):
+            motion, info = method.move(nodes, guess)
+            elastic, reaction, viscous = impulses(nodes, method, motion)
+            push = hold(nodes, NOTHING).pushes(reaction)
+            free, none = nodes.constraint, no_contact()
+            return GridUpdate(nodes.velocity, motion, elastic, viscous, reaction, None, free, info, none, push)
+
+        def moved(held: Held, method: Method, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+            motion, info = method.move(held.nodes, guess)
+            return jax.tree.map(held.images.unfold, motion), info
+
+        frozen, frozen_method, guess = jax.lax.stop_gradient((nodes, method, guess))
+
+        def attempt(held: Held, guess: NodeVector) -> tuple:
+            motion, info = moved(held, frozen_method, guess)
+            return motion.velocity, impulses(frozen, frozen_method, motion)[1], motion.carrier, info
+
+        active, guess, cost, sweeps = find_active_set(frozen, guess, attempt)
+        held = hold(nodes, active)
+        motion, info = moved(held, method, guess)
+        elastic, reaction, viscous = impulses(nodes, method, motion)
+        push = held.pushes(reaction)
+        slowed, rub = held.collider_friction(held.wall_friction(motion.velocity, reaction), push)
+        loss = slowed - motion.velocity
+        return GridUpdate(
+            before=held.images.unfold(held.nodes.velocity),
+            motion=motion.slowed(loss),
+            elastic=elastic,
+            viscous=viscous,
+            reaction=reaction,
+            friction=nodes.mass[:, None] * loss,
+            free=held.untouched,
+            solve=cost.plus(info),
+            contact=ContactInfo(sweeps, held.count_violations(motion.velocity, reaction)),
+            push=push,
+            rub=rub,
+        )
+
+
+def impulses(nodes: Nodes, method: Method, motion: NodeMotion) -> tuple[NodeVector, NodeVector, NodeVector | None]:
+    """The impulse of the elastic force [kg m/s], that which is missing for the nodes to move so, of walls and grips,
+    and that of viscosity."""
+    elastic, viscous = method.elastic_impulse(nodes, motion), viscous_impulse(nodes, motion)
+    known = elastic if viscous is None else elastic + viscous
+    return elastic, nodes.mass[:, None] * (motion.velocity - nodes.inertial_velocity()) - known, viscous
+
+
+def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: GridUpdate) -> Particles:
+    """G2P: the particles moved and deformed with the nodes, x ← x + Δt Σ w v̄_i, F ← F + Δt Σ v̄_i hᵀ; of what yields
+    that is the trial F_E, which `Scene.return_map` brings back."""
+    potential, dt = nodes.potential, nodes.dt
+    unfold = potential.mirror.unfold
+    before, motion = unfold(new.before), jax.tree.map(unfold, new.motion)
+    with jax.named_scope("g2p"):
+        moved, v, C, gradient = g2p(
+            scene.transfer,
+            potential.stencil,
+            components(particles.v),
+            before,
+            motion.velocity,
+            motion.mean,
+            kept=scene.keeps_gradient,
+        )
+        changes = zip(potential.at_rest(), potential.deformed(gradient), strict=True)
+        F = tuple(particle_first(F + dt * rate) for F, rate in changes)
+    return replace(
+        particles,
+        x=particle_first(components(particles.x) + dt * moved),
+        v=particle_first(v),
+        F=F if isinstance(scene.material, tuple) else F[0],
+        C=None if C is None else particle_first(C),
+    )
+
+
+@checked
+def step(
+    scene: Scene,
+    particles: Particles,
+    t: Scalar,
+    dt: Scalar,
+    *,
+    method: Method = Explicit(),
+) -> tuple[Particles, StepInfo]:
+    """One step of the Material Point Method, from t to t + dt.
+
+    P2G, the grid velocity's update by `method`, G2P, x ← x + Δt Σ_i w_ip v̄_i, F ← F + Δt Σ_i v̄_i h_ipᵀ, v̄ being
+    v^{n+1} or, for methods of second order, the nodes' mean velocity over the step; then the return map of laws that
+    yield.
+
+    Args:
+        scene: the scene.
+        particles: particles; what the scene needs and they lack is added (see `prepare`).
+        t: time at the start of the step [s].
+        dt: step [s].
+        method: `Explicit()`, `SemiImplicit(...)`, `BackwardEuler(...)`, `ImplicitMidpoint(...)` or `TRBDF2(...)`.
+
+    Returns:
+        the particles after the step, and a `StepInfo`. Nothing is raised for what only the numbers show: `StepInfo`
+        says whether the solve converged and whether particles left the window, and `simulate` acts on it.
+
+    Raises:
+        ValueError: from `prepare`, or a dt that is not positive.
+    """
+    require_positive("dt [s]", dt)
+    scene, t, dt, method = canonical((scene, t, dt, method), particles.x.dtype)
+    particles = particles if is_prepared(scene, particles) else prepare(scene, particles)
+    return advance_compiled(scene, particles, t, dt, method)
