@@ -9,8 +9,8 @@ from helpers import DESCRIPTIONS, KERNELS, LAWS, assert_close, cloud, ids
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
+from mpmjax.boundary._conditions import combine
 from mpmjax.boundary._mirror import Mirror, contacts, mirror
-from mpmjax.boundary._walls import combine
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {

@@ -12,7 +12,7 @@ from helpers import LAWS, QUICK, assert_close, cloud, explicit_limit, ids
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.boundary._walls import combine
+from mpmjax.boundary._conditions import combine
 from mpmjax.implicit._constraint import Constraint
 from mpmjax.implicit._hessian import ImplicitOperator
 

@@ -11,7 +11,7 @@ from helpers import DIMS, GRADIENTS, KERNELS, assert_close, ids
 
 import mpmjax as mpm
 from mpmjax.discretisation import _transfer_sums as _crossing
-from mpmjax.discretisation._kernel import Stencil, make_stencil
+from mpmjax.discretisation._stencil import Stencil, make_stencil
 from mpmjax.discretisation._transfer_sums import collect, spread
 
 P = 17

@@ -9,7 +9,7 @@ import pytest
 from helpers import FORWARD, LAWS, REVERSE, block
 
 import mpmjax as mpm
-from mpmjax.simulation._diffrax import BAD_PARAMETERS, HEALTHY, INADMISSIBLE, NOT_FINITE, OUTSIDE
+from mpmjax.simulation._statistics import BAD_PARAMETERS, HEALTHY, INADMISSIBLE, NOT_FINITE, OUTSIDE
 
 DT = 0.01
 METHOD = mpm.SemiImplicit(

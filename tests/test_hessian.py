@@ -12,9 +12,9 @@ from helpers import DESCRIPTIONS, DIMS, ELASTIC, GRADIENTS, LAWS, cloud
 
 import mpmjax as mpm
 from mpmjax._types import components
+from mpmjax.boundary._conditions import combine
 from mpmjax.boundary._mirror import mirror
-from mpmjax.boundary._walls import combine
-from mpmjax.discretisation._kernel import make_stencil
+from mpmjax.discretisation._stencil import make_stencil
 from mpmjax.discretisation._transfer import p2g
 from mpmjax.implicit._constraint import Constraint
 from mpmjax.implicit._hessian import ImplicitOperator

@@ -18,11 +18,11 @@ import mpmjax as mpm
 import mpmjax.io._runs
 from mpmjax.io._record import record
 from mpmjax.io._runs import FrameWriter, load, save
-from mpmjax.simulation._diffrax import Tally, no_steps
 from mpmjax.simulation._run import Run
 from mpmjax.simulation._simulate import integrate
+from mpmjax.simulation._statistics import Tally, no_steps
 from mpmjax.state._particles import Particles, state_of
-from mpmjax.state._scene import prepare
+from mpmjax.state._preparation import prepare
 
 DTYPES = {"float32": jnp.float32, "float64": jnp.float64}
 STEPPERS = {

@@ -10,7 +10,7 @@ import pytest
 from helpers import DIMS, GRADIENTS, KERNELS, assert_close, ids
 
 import mpmjax as mpm
-from mpmjax.discretisation._kernel import in_window, make_stencil
+from mpmjax.discretisation._stencil import in_window, make_stencil
 
 DX = 0.125  # a power of two, so that lattice positions and edges are exact
 COMBINATIONS = [

@@ -12,7 +12,7 @@ from helpers import block
 
 import mpmjax as mpm
 from mpmjax.analysis._diagnostics import _energy
-from mpmjax.discretisation._kernel import in_window
+from mpmjax.discretisation._stencil import in_window
 
 
 def bar(**options):

@@ -13,7 +13,7 @@ from helpers import DESCRIPTIONS, ELASTIC, FLUIDS, LAWS, PLASTIC, assert_close, 
 import mpmjax as mpm
 from mpmjax.simulation import _simulate
 from mpmjax.simulation._advice import advise, disallowed
-from mpmjax.simulation._diffrax import NOT_FINITE
+from mpmjax.simulation._statistics import NOT_FINITE
 
 DT = 5e-3
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(), "backward_euler": mpm.BackwardEuler()}

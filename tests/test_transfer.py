@@ -11,7 +11,7 @@ from helpers import DIMS, GRADIENTS, KERNELS, TRANSFERS, assert_close, cloud, id
 
 import mpmjax as mpm
 from mpmjax._types import components
-from mpmjax.discretisation._kernel import make_stencil
+from mpmjax.discretisation._stencil import make_stencil
 from mpmjax.discretisation._transfer import g2p, p2g
 from mpmjax.discretisation._transfer_sums import collect
 

@@ -1,18 +1,12 @@
 """Walls, grips, mirrored planes and colliders, and what colliders receive."""
 
 from mpmjax.boundary._collider import AbstractCollider, SeparatingCollider, SlipCollider, StickyCollider
+from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, Conditions, combine
 from mpmjax.boundary._exchange import Exchange, nothing_received, received
-from mpmjax.boundary._mirror import Contact, ContactPlane, Mirror, Plane, SymmetryPlane, contacts, fits, mirror
-from mpmjax.boundary._walls import (
-    ON_THE_WALL,
-    AbstractBoundary,
-    Conditions,
-    Grip,
-    SeparatingBox,
-    SlipBox,
-    StickyBox,
-    combine,
-)
+from mpmjax.boundary._grip import Grip
+from mpmjax.boundary._mirror import Contact, Mirror, contacts, mirror
+from mpmjax.boundary._planes import ContactPlane, Plane, SymmetryPlane, fits
+from mpmjax.boundary._walls import SeparatingBox, SlipBox, StickyBox
 
 __all__ = [
     "ON_THE_WALL",

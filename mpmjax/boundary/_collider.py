@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, NodeVector, ParticleVector, Scalar
-from mpmjax.boundary._walls import ON_THE_WALL, AbstractBoundary, Conditions, Touch
+from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, Conditions, Touch
 from mpmjax.checks import canonical, require, require_between, require_fields
 from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, Motion, length, still
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, NodeScalar, NodeVector
-from mpmjax.boundary._walls import Touch
+from mpmjax.boundary._conditions import Touch
 from mpmjax.linalg import pairs
 
 

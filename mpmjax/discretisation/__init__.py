@@ -1,15 +1,9 @@
 """Grid, B-spline kernels, stencils, and the transfers between particles and grid."""
 
+from mpmjax.discretisation._gradient import Gradient, MLSGradient, SplineGradient
 from mpmjax.discretisation._grid import Grid
-from mpmjax.discretisation._kernel import (
-    BSpline,
-    Gradient,
-    MLSGradient,
-    SplineGradient,
-    Stencil,
-    in_window,
-    make_stencil,
-)
+from mpmjax.discretisation._kernel import BSpline
+from mpmjax.discretisation._stencil import Stencil, in_window, make_stencil
 from mpmjax.discretisation._transfer import APIC, FLIP, PIC, Transfer, g2p, p2g
 from mpmjax.discretisation._transfer_sums import collect, spread
 

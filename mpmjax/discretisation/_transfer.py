@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, Matrix, NodeScalar, NodeVector, Scalar
 from mpmjax.checks import require_between, require_fields
-from mpmjax.discretisation._kernel import Stencil
+from mpmjax.discretisation._stencil import Stencil
 from mpmjax.discretisation._transfer_sums import collect, spread
 
 

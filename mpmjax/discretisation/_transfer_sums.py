@@ -24,7 +24,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from mpmjax._types import Array, Float
-from mpmjax.discretisation._kernel import Stencil
+from mpmjax.discretisation._stencil import Stencil
 
 _ROW = 4
 """Most columns of the rows that are added to nodes. A CPU adds one, two or four numbers as one vector; three take it

@@ -13,19 +13,9 @@ from mpmjax.checks import requirements, warn
 from mpmjax.implicit import Metric
 from mpmjax.material import Law
 from mpmjax.simulation._advice import advise, disallowed
-from mpmjax.simulation._diffrax import (
-    BAD_PARAMETERS,
-    BEYOND,
-    HEALTHY,
-    INADMISSIBLE,
-    NOT_FINITE,
-    OUTSIDE,
-    Problem,
-    Tally,
-    faulty_particles,
-    passed_particles,
-)
+from mpmjax.simulation._diffrax import Problem, faulty_particles, passed_particles
 from mpmjax.simulation._run import Run, SimulationError
+from mpmjax.simulation._statistics import BAD_PARAMETERS, BEYOND, HEALTHY, INADMISSIBLE, NOT_FINITE, OUTSIDE, Tally
 from mpmjax.state import Particles, State, state_of, with_state
 from mpmjax.stepping import BackwardEuler, Explicit, Method
 

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.simulation._diffrax import Tally
+from mpmjax.simulation._statistics import Tally
 from mpmjax.state import Particles, Scene, State, with_state
 from mpmjax.stepping import Method
 

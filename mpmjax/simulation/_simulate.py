@@ -23,17 +23,10 @@ from mpmjax.checks import (
     require_whole,
     requirements,
 )
-from mpmjax.simulation._diffrax import (
-    HEALTHY,
-    Problem,
-    StepSolver,
-    Tally,
-    examined,
-    no_vector_field,
-    step_number,
-)
+from mpmjax.simulation._diffrax import Problem, StepSolver, examined, no_vector_field, step_number
 from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_short_solves
 from mpmjax.simulation._run import Run
+from mpmjax.simulation._statistics import HEALTHY, Tally
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
 from mpmjax.stepping import MOST_STEPS, Explicit, Method, advance, step_for
 

@@ -1,38 +1,25 @@
 """The scene: what a step needs and does not change."""
 
-from dataclasses import replace
-from typing import Any
-
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-import numpy as np
 
-from mpmjax._types import Array, Int, Point, components
+from mpmjax._types import Array, Int, Point
 from mpmjax.boundary import (
     AbstractBoundary,
     AbstractCollider,
     ContactPlane,
-    Exchange,
     Plane,
     SeparatingBox,
     SeparatingCollider,
     SlipCollider,
     SymmetryPlane,
     fits,
-    nothing_received,
 )
 from mpmjax.checks import (
-    canonical,
     checked,
     coordinates,
-    is_traced,
     require,
-    require_fields,
     require_finite,
-    require_memory,
     require_that,
-    requirements,
 )
 from mpmjax.discretisation import (
     APIC,
@@ -43,29 +30,13 @@ from mpmjax.discretisation import (
     SplineGradient,
     Stencil,
     Transfer,
-    in_window,
     make_stencil,
 )
 from mpmjax.material import AbstractPlastic, AbstractVolumetric, Law, Viscous
 from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._constituent import Constituent, Laws, constituents, return_map, split
-from mpmjax.state._oversights import warn_of_oversights
-from mpmjax.state._particles import Group, Particles
-
-
-class UpdatedLagrangian(eqx.Module):
-    """Stencils at the current positions, h_ip = F_pᵀ ∇_x w_ip: for anything that moves, meets or separates."""
-
-
-class TotalLagrangian(eqx.Module):
-    """Stencils at the reference positions, h_ip = ∇_X w_ip, computed once.
-
-    For a body that neither separates nor meets anything but what it was attached to from the start: no cell crossing,
-    no numerical fracture, second order at every amplitude. Boundaries act at reference nodes.
-    """
-
-
-Description = UpdatedLagrangian | TotalLagrangian
+from mpmjax.state._description import Description, TotalLagrangian, UpdatedLagrangian
+from mpmjax.state._particles import Particles
 
 
 class Scene(eqx.Module):
@@ -228,157 +199,4 @@ class Scene(eqx.Module):
             self.window(particles),
             self.anchor(particles),
             affine=self.transfer.affine,
-        )
-
-
-@checked
-def prepare(scene: Scene, particles: Particles) -> Particles:
-    """Add to the particles what the scene's laws, transfer and description need, where it is missing.
-
-    F = I (J = 1), the history of what never yielded, C = 0 with APIC or viscosity (and none without), X = x in the
-    total description (and none in the updated one), and nothing received by colliders. Of particles that meet a scene
-    for the first time it warns where walls or colliders lie over them, grips or colliders touch nothing, and a body is
-    thinner than two cells.
-
-    Raises:
-        ValueError: a value is not as its module requires (`equinox.tree_at` can make it so), the particles have
-            another dimension than the grid or another number of materials than the scene, a particle lies outside the
-            window or beyond a mirrored plane, or a deformation gradient is one the law does not allow.
-    """
-    require_fields(scene)  # what eqx.tree_at may have put past its constructor
-    p, d = particles.count, particles.dim
-    require(d == scene.grid.dim, f"The particles are {d}-dimensional, the grid {scene.grid.dim}-dimensional.")
-    requirements((scene, particles))
-    still = jnp.zeros((p, d, d), particles.x.dtype)
-    several = isinstance(scene.material, tuple)
-    counts = particles.counts or (p,)
-    require(
-        not several or len(counts) == len(scene.laws),
-        f"The scene has {len(scene.laws)} laws, so the particles must be {len(scene.laws)} sets joined by mpmjax.join, "
-        f"in the laws' order, got {len(counts)}.",
-    )
-    particles = replace(particles, counts=counts if several else None)
-    require(
-        not scene.total or particles.X is not None or all(group.F is None for group in particles.groups),
-        "In the total description particles with an F need the X from which it is measured: give X, or drop F.",
-    )
-    own = [_prepared(law, group, particles) for law, group in zip(scene.laws, particles.groups, strict=True)]
-    prepared = replace(
-        particles,
-        F=tuple(F for F, _ in own) if several else own[0][0],
-        history=tuple(history for _, history in own) if several else own[0][1],
-        C=(still if particles.C is None else particles.C) if scene.keeps_gradient else None,
-        X=(particles.x if particles.X is None else particles.X) if scene.total else None,
-        received=_received(scene, particles),
-    )
-    _check_size(scene, prepared)
-    if not is_traced((scene, prepared)):
-        known = canonical(scene, particles.x.dtype)
-        _check_placement(known, prepared)
-        if particles.F is None:
-            warn_of_oversights(known.grid, known.kernel, known.boundary, prepared, total=scene.total)
-    return prepared
-
-
-def _check_size(scene: Scene, particles: Particles) -> None:
-    """A step's arrays must fit into memory: of the nodes mass, momentum, velocity and force, of the particles their
-    state before and after and their stencil."""
-    n, p, d, bytes_each = scene.grid.size, particles.count, particles.dim, particles.x.dtype.itemsize
-    state = sum(leaf.size for leaf in jax.tree.leaves(particles))
-    stencil = p * 3 * d * (scene.kernel.order + 1)
-    require_memory(
-        f"A step of {p} particles on a grid of {n} nodes",
-        (n * (1 + 3 * d) + 2 * state + stencil) * bytes_each,
-        f"take a smaller shape than {scene.grid.shape}, or fewer particles_per_cell.",
-        device=True,
-    )
-
-
-def _received(scene: Scene, particles: Particles) -> Exchange | None:
-    """What colliders have received: what the particles say, if it is of as many as the scene has."""
-    if scene.colliders == 0:
-        return None
-    nothing = nothing_received(scene.colliders, particles.dim, particles.x.dtype)
-    known = particles.received
-    return known if known is not None and known.impulse.shape == nothing.impulse.shape else nothing
-
-
-def _prepared(law: Law, group: Group, particles: Particles) -> tuple[Array, Any]:
-    """F and history of one material's particles."""
-    start, stop = group.rows or (0, particles.count)
-    e = 1 if isinstance(law, AbstractVolumetric) else particles.dim
-    shape = (stop - start, e, e)
-    undeformed = jnp.asarray(np.eye(e, dtype=particles.x.dtype))
-    F = jnp.broadcast_to(undeformed, shape) if group.F is None else group.F
-    require(F.shape == shape, f"{type(law).__name__} needs F of shape {shape}, got {F.shape}.")
-    if not isinstance(law, AbstractPlastic):
-        return F, None
-    require(
-        group.history is None or _remembers(law, F, group.history),
-        f"{type(law).__name__} needs a history of its own, got {type(group.history).__name__}: drop it to start anew.",
-    )
-    return F, law.virgin(components(F)) if group.history is None else group.history
-
-
-def _remembers(law: AbstractPlastic, F: Array, history: Any) -> bool:
-    """Whether that is a history of the law's, of particles with this F."""
-    own = jax.eval_shape(law.virgin, components(F))
-    if jax.tree.structure(own) != jax.tree.structure(history):
-        return False
-    return all(a.shape == b.shape for a, b in zip(jax.tree.leaves(own), jax.tree.leaves(history), strict=True))
-
-
-def is_prepared(scene: Scene, particles: Particles) -> bool:
-    """Whether the particles have exactly what the scene needs."""
-    has_affine, has_reference = particles.C is not None, particles.X is not None
-    if has_affine != scene.keeps_gradient or has_reference != scene.total:
-        return False
-    several = isinstance(scene.material, tuple)
-    if several != (particles.counts is not None) or (several and len(scene.laws) != len(particles.groups)):
-        return False
-    known = 0 if particles.received is None else len(particles.received.impulse)
-    return known == scene.colliders and all(
-        group.F is not None
-        and (group.F.shape[-1] == 1 if isinstance(law, AbstractVolumetric) else group.F.shape[-1] == particles.dim)
-        and (_remembers(law, group.F, group.history) if isinstance(law, AbstractPlastic) else group.history is None)
-        for law, group in zip(scene.laws, particles.groups, strict=True)
-    )
-
-
-def _check_placement(scene: Scene, particles: Particles) -> None:
-    place = scene.anchor(particles)
-    require_finite("Particle positions", particles.x)
-    require_finite("Particle velocities", particles.v)
-    inside = np.asarray(in_window(scene.kernel, scene.grid, scene.window(particles), place))
-    if not inside.all():
-        first = int(np.argmin(inside))
-        raise ValueError(
-            f"Every particle's stencil must lie in the window; particle {first} at {np.asarray(place[first])} and "
-            f"{int((~inside).sum()) - 1} others do not: enlarge the grid's shape, move its origin, or use follow=True."
-        )
-    for plane in scene.boundary:
-        if isinstance(plane, Plane):
-            name = type(plane).__name__
-            depth = np.asarray(place[:, plane.axis]) - float(plane.position)
-            wrong = depth < 0 if plane.keep == "above" else depth > 0
-            require(
-                ~wrong,
-                f"Particles must lie {plane.keep} the {name} at {plane.position} on axis {plane.axis}, but "
-                f"particle {int(np.argmax(wrong))} does not: move it or change the plane's keep.",
-            )
-    for law, group in zip(scene.laws, particles.groups, strict=True):
-        rows = particles.count if group.rows is None else group.rows[1] - group.rows[0]
-        sizes = {jnp.size(leaf) for leaf in jax.tree.leaves(law)}
-        require(
-            sizes <= {1, rows},
-            f"{type(law).__name__}'s parameters must be one number or one for each of its {rows} particles, got "
-            f"{sorted(sizes - {1, rows})} of them.",
-        )
-    for part in scene.constituents(particles):
-        allowed = np.asarray(eqx.filter_jit(part.law.admits)(part.F))
-        first = int(np.argmin(allowed)) + (part.rows[0] if part.rows else 0)
-        require(
-            allowed,
-            f"{type(part.law).__name__} does not allow the F of particle {first} (most laws need det F > 0): start "
-            "from an admissible one.",
         )

@@ -10,7 +10,7 @@ from numpy_oracle import grid_update
 
 import mpmjax as mpm
 from mpmjax.analysis._diagnostics import volume_ratio
-from mpmjax.simulation._diffrax import INADMISSIBLE
+from mpmjax.simulation._statistics import INADMISSIBLE
 from mpmjax.verification import AxisAligned, TwoDisks, VibratingBar, Vortex, discretise, errors, orders
 
 LAW = LAWS["fixed_corotated"]

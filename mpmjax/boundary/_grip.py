@@ -1,0 +1,58 @@
+"""Grips: regions of nodes with a prescribed velocity."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mpmjax._types import NodeVector, Scalar
+from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, Conditions
+from mpmjax.checks import require, require_fields
+from mpmjax.geometry import AbstractMotion, AbstractRegion, Motion
+
+
+class Grip(AbstractBoundary):
+    """A region of nodes with a prescribed velocity, which moves as it prescribes.
+
+    In the total description the region is that of the reference configuration. In a periodic direction the region does
+    not wrap: it must stay within the window's extent. The region only selects nodes, so its floats have no derivative;
+    those of the motion have.
+
+    Args:
+        region: region at zero displacement.
+        motion: displacement of the grip in time.
+        axes: the directions in which it holds, one bool each. Default: all of them.
+    """
+
+    region: AbstractRegion
+    motion: Motion
+    axes: tuple[bool, ...] | None = eqx.field(
+        static=True, default=None, converter=lambda a: tuple(a) if isinstance(a, list) else a
+    )
+
+    @property
+    def dim(self) -> int:
+        """That of the motion."""
+        return jnp.shape(jnp.asarray(self.motion.displacement))[1]
+
+    def __check_init__(self):
+        require(
+            isinstance(self.motion, Motion) or not isinstance(self.motion, AbstractMotion),
+            f"A grip does not turn: take a StickyCollider, got the motion {self.motion}.",
+        )
+        require_fields(self)
+        d = self.dim
+        require(
+            self.region.dim == d,
+            f"A grip's region and motion must have the same dimension, got {self.region.dim} and {d}.",
+        )
+        require(
+            self.axes is None or (len(self.axes) == d and any(self.axes)),
+            f"A grip's axes must be {d} bools, at least one of them true, got {self.axes}.",
+        )
+
+    def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
+        """v = that of the motion."""
+        place = nodes if reference else nodes - self.motion.at(t)
+        held = self.region.contains(place, ON_THE_WALL * spacing)[:, None]
+        axes = jnp.ones(nodes.shape[1], dtype=bool) if self.axes is None else jnp.asarray(self.axes)
+        fixed = held & axes
+        return Conditions(fixed, jnp.where(fixed, self.motion.velocity(t, dt), 0))

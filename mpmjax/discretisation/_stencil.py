@@ -1,0 +1,134 @@
+"""The stencil: for each particle its nodes, weights and weight gradients."""
+
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Bool, Float, Indices, Int, ParticleVector, components
+from mpmjax.discretisation._gradient import Gradient, MLSGradient, SplineGradient
+from mpmjax.discretisation._grid import Grid
+from mpmjax.discretisation._kernel import BSpline
+
+
+class Stencil(eqx.Module):
+    """What ties particles to nodes: for each particle s = order + 1 nodes along each axis, and their weights.
+
+    Weights and gradients of the s^d stencil nodes are products of one factor an axis, and only those are stored: w_ip
+    is the product of the weights, g_ip in direction a the same with the slope along a in the weight's place. Built at
+    the positions x (updated Lagrangian) or once at the reference positions X (total Lagrangian); gradients are with
+    respect to those. Component first: the particle axis is last.
+    """
+
+    shares: Int[Array, "d s p"]
+    """What each axis adds to the flat node index, shape (d, s, p); meaningless for a particle that is not `inside`."""
+    weights: Float[Array, "d s p"]
+    """Weights along each axis [-], shape (d, s, p)."""
+    slopes: Float[Array, "d s p"]
+    """Slopes [1/m] along each axis, of the chosen gradient operator, shape (d, s, p)."""
+    affine_slopes: Float[Array, "d s p"] | None
+    """Those of the moving-least-squares gradient, where the transfer needs it and it is not the chosen one."""
+    moment: Float[Array, "d p"]
+    """Diagonal of D_p [m²], shape (d, p)."""
+    inside: Bool[Array, "p"]
+    """Whether the whole stencil of the particle lies in the window."""
+
+    @property
+    def least_squares(self) -> "Stencil":
+        """The stencil whose gradient is that of moving least squares."""
+        if self.affine_slopes is None:
+            return self
+        return eqx.tree_at(lambda s: (s.slopes, s.affine_slopes), self, (self.affine_slopes, None))
+
+    @property
+    def squared(self) -> "Stencil":
+        """The stencil of w_ip² and of the squared components g_ip,a²."""
+        return eqx.tree_at(lambda s: (s.weights, s.slopes), self, (self.weights**2, self.slopes**2))
+
+    @property
+    def index(self) -> Indices:
+        """Flat index of each stencil node, shape (s^d, p)."""
+        return _tensor(jnp.add, list(self.shares))
+
+    @property
+    def weight(self) -> Float[Array, "k p"]:
+        """w_ip [-], shape (s^d, p)."""
+        return _tensor(jnp.multiply, list(self.weights))
+
+    @property
+    def gradient(self) -> Float[Array, "k d p"]:
+        """g_ip [1/m], of the chosen operator, shape (s^d, d, p)."""
+        w, g = list(self.weights), list(self.slopes)
+        return jnp.stack([_tensor(jnp.multiply, [*w[:a], g[a], *w[a + 1 :]]) for a in range(len(w))], axis=1)
+
+
+@eqx.filter_jit
+def in_window(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleVector) -> Bool[Array, "p"]:
+    """Whether the whole stencil of a particle at x lies in the window, shape (p,)."""
+    base = kernel.base(components(x) / grid.spacing)
+    first = base - window.astype(base.dtype)[:, None]  # in floats: what is far outside overflows an integer
+    shape = jnp.asarray(grid.shape, dtype=base.dtype)[:, None]
+    return (jnp.asarray(grid.periodic)[:, None] | ((first >= 0) & (first + kernel.order < shape))).all(axis=0)
+
+
+def make_stencil(
+    kernel: BSpline, gradient: Gradient, grid: Grid, window: Int[Array, "d"], x: ParticleVector, *, affine: bool
+) -> Stencil:
+    """The stencil of particles at x.
+
+    Args:
+        kernel: B-spline.
+        gradient: the gradient operator of the force and of the deformation gradient's update.
+        grid: grid.
+        window: lattice index of the window's first node.
+        x: positions [m], shape (p, d).
+        affine: whether the transfer needs the moving-least-squares gradient.
+    """
+    dx = grid.spacing
+    xi = components(x) / dx
+    f = xi - jax.lax.stop_gradient(kernel.base(xi))
+    weights, spline = kernel.weights(f), kernel.slopes(f) / dx
+    if kernel.order == 1:
+        moment = f * (1 - f) * dx**2
+        least_squares = spline
+    else:
+        variance = {2: 1 / 4, 3: 1 / 3}[kernel.order]
+        moment = jnp.full_like(f, variance) * dx**2
+        offset = jnp.arange(kernel.order + 1, dtype=f.dtype)[:, None] - f[:, None]
+        least_squares = weights * offset / (variance * dx)
+    match gradient:
+        case MLSGradient():
+            slopes, same = least_squares, True
+        case SplineGradient():
+            slopes, same = spline, kernel.order == 1
+        case _:
+            raise ValueError(f"A gradient must be SplineGradient or MLSGradient, got {gradient!r}.")
+    return Stencil(
+        shares=_shares(kernel, grid, window, xi),
+        weights=weights,
+        slopes=slopes,
+        affine_slopes=least_squares if affine and not same else None,
+        moment=moment,
+        inside=in_window(kernel, grid, window, x),
+    )
+
+
+def _shares(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Array) -> Int[Array, "d s p"]:
+    """What each axis adds to the C-order index of a particle's nodes."""
+    first = jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window[:, None]
+    along = first[:, None] + jnp.arange(kernel.order + 1, dtype=jnp.int32)[:, None]
+    periods, wraps, strides = (
+        jnp.asarray(numbers)[:, None, None]
+        for numbers in (grid.shape, grid.periodic, [math.prod(grid.shape[a + 1 :]) for a in range(grid.dim)])
+    )
+    return jnp.where(wraps, along % periods.astype(jnp.int32), along) * strides.astype(jnp.int32)
+
+
+def _tensor(combine: Callable[[Array, Array], Array], factors: list[Array]) -> Array:
+    """The (outer) tensor combination of one (s, p) factor a direction, in C order, shape (s^d, p)."""
+    combined = factors[0]
+    for factor in factors[1:]:
+        combined = combine(combined[:, None], factor).reshape(-1, factor.shape[-1])
+    return combined
