@@ -174,11 +174,11 @@ def account(a: float, n: int) -> None:
     energy = budget.energy
     fall = -float(energy.potential.sum())
     names = ("friction", "boundary", "time_integration", "plastic", "p2g", "g2p", "elastic", "kinetic")
-    shares = {name: float(getattr(energy, name).sum()) / fall for name in names}
+    index_factors = {name: float(getattr(energy, name).sum()) / fall for name in names}
     closing = float(abs(energy.change - energy.explained).max()) / fall
     print(
         f"energy at a = {a:g}, {n} cells: {fall:.4f} ρ g L0³ of potential energy lost; in shares of it "
-        + ", ".join(f"{name} {share:.3f}" for name, share in shares.items())
+        + ", ".join(f"{name} {share:.3f}" for name, share in index_factors.items())
         + f"; each step closes to {closing:.0e}"
     )
 

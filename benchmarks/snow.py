@@ -109,12 +109,12 @@ def account(name: str, n: int) -> dict[str, Any]:
     sums = {k: float(a.sum()) for k, a in terms.items()}
     packed = np.asarray(after.history.plastic_volume)
     limit = float(mpm.stable_dt(scene, after, safety=1.0))
-    tally = run.tally
+    statistics = run.statistics
     print(
         f"{name}: {particles.count} particles, {steps} steps of {DT / limit:.1f} times the explicit limit at the end, "
-        f"{float(tally.iterations) / steps:.1f} iterations a step, {int(tally.unconverged)} unconverged, fault "
-        f"{int(tally.fault)}; J_P from {packed.min():.3f} to {packed.max():.3f}, in {mpm.pieces(scene, after)} pieces; "
-        f"kinetic energy at the start {before:.4g} J"
+        f"{float(statistics.iterations) / steps:.1f} iterations a step, {int(statistics.unconverged)} unconverged, "
+        f"fault {int(statistics.fault)}; J_P from {packed.min():.3f} to {packed.max():.3f}, in "
+        f"{mpm.pieces(scene, after)} pieces; kinetic energy at the start {before:.4g} J"
     )
     print("   " + ", ".join(f"{k} {v:.3g}" for k, v in sums.items()) + " J")
     closing = float(jnp.abs(energy.change - energy.explained).max() / jnp.abs(energy.kinetic).max())
@@ -156,7 +156,7 @@ def seconds_of(runs: dict[str, Callable[[], mpm.Run]], repeats: int) -> dict[str
 
     def timed(go: Callable[[], mpm.Run]) -> float:
         begun = time.perf_counter()
-        assert bool(jax.block_until_ready(go().tally.healthy)), "the run failed"
+        assert bool(jax.block_until_ready(go().statistics.healthy)), "the run failed"
         return time.perf_counter() - begun
 
     rounds = [{name: timed(go) for name, go in runs.items()} for _ in range(repeats + 1)][1:]
@@ -193,7 +193,7 @@ def hardening(n: int, repeats: int, hardenings: tuple[float, ...]) -> list[dict[
             "explicit_dt_s": t1 / steps,
             "packed": float(own.final.history.plastic_volume.min()),
             **seconds,
-            "iterations": float(pilot.tally.iterations) / float(pilot.tally.steps),
+            "iterations": float(pilot.statistics.iterations) / float(pilot.statistics.steps),
         }
         rows.append(row)
         print(

@@ -117,8 +117,8 @@ def level(n: int, dt: float, coarser: int, contrast: float) -> tuple[Level, Node
     """Of one semi-implicit step with β = 1."""
     scene, particles, _ = square(n, coarser=coarser, contrast=contrast)
     nodes = particles_to_grid(scene, particles, 0.0, jnp.asarray(dt), scene.stencil(particles), centred=False)
-    action = mpm.AnalyticHessian().at_rest(nodes.potential, nodes.velocity)
-    operator = ImplicitOperator(nodes.mass, jnp.asarray(dt) ** 2, action, nodes.constraint)
+    action = mpm.AnalyticHessian().at_current(nodes.potential, nodes.velocity)
+    operator = ImplicitOperator(nodes.mass, jnp.asarray(dt) ** 2, action, nodes.projection)
     metric = operator.metric()
 
     def power(_: int, v: Any) -> Any:
@@ -173,10 +173,10 @@ def v_cycle(levels: list[Level], b: Any) -> Any:
     smooth = partial(chebyshev, here, degree=3, least=1 / 10)
     P = prolongation(here.shape[0], coarser[0].shape[0])
     x = smooth(b)
-    r = jnp.where(here.operator.constraint.free, b - here.operator.mv(x), 0).reshape(*here.shape, 2)
+    r = jnp.where(here.operator.projection.free, b - here.operator.mv(x), 0).reshape(*here.shape, 2)
     restricted = jnp.einsum("iI,jJ,ijc->IJc", P, P, r).reshape(-1, 2)
-    e = v_cycle(coarser, jnp.where(coarser[0].operator.constraint.free, restricted, 0)).reshape(*coarser[0].shape, 2)
-    x = x + jnp.where(here.operator.constraint.free, jnp.einsum("iI,jJ,IJc->ijc", P, P, e).reshape(-1, 2), 0)
+    e = v_cycle(coarser, jnp.where(coarser[0].operator.projection.free, restricted, 0)).reshape(*coarser[0].shape, 2)
+    x = x + jnp.where(here.operator.projection.free, jnp.einsum("iI,jJ,IJc->ijc", P, P, e).reshape(-1, 2), 0)
     return x + smooth(b - here.operator.mv(x))
 
 
@@ -213,8 +213,8 @@ def preconditioners(n: int, multiple: float, *, contrast: float = 1.0, rtol: flo
     inverse = jnp.linalg.inv(blocks(fine))
     noise = jax.random.normal(jax.random.key(1), fine.metric.shape)
     sides = {
-        "step": jnp.where(fine.operator.constraint.free, nodes.mass[:, None] * nodes.explicit_velocity(), 0),
-        "random": jnp.where(fine.operator.constraint.free, fine.metric * noise, 0),
+        "step": jnp.where(fine.operator.projection.free, nodes.mass[:, None] * nodes.explicit_velocity(), 0),
+        "random": jnp.where(fine.operator.projection.free, fine.metric * noise, 0),
     }
     kinds = {
         "mass": lambda r: r / fine.metric,

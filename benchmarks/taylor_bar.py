@@ -84,9 +84,9 @@ def account(bar: Any, steps: int) -> None:
     energy = mpm.budget(bar.scene, bar.particles, steps=steps, dt=TIME / steps)[1].energy
     before = float(mpm.energy(bar.scene, bar.particles).kinetic)
     terms = ("kinetic", "elastic", "plastic", "time_integration", "p2g", "g2p", "boundary")
-    shares = ", ".join(f"{k} {float(getattr(energy, k).sum()) / before:.4f}" for k in terms)
+    index_factors = ", ".join(f"{k} {float(getattr(energy, k).sum()) / before:.4f}" for k in terms)
     closing = float(np.abs(energy.change - energy.explained).max()) / before
-    print(f"of the kinetic energy at the start: {shares}; closes to {closing:.1e}", flush=True)
+    print(f"of the kinetic energy at the start: {index_factors}; closes to {closing:.1e}", flush=True)
 
 
 def draw(path: Path, runs: list[dict[str, Any]]) -> None:

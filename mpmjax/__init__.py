@@ -18,9 +18,9 @@ from mpmjax.analysis import (
 from mpmjax.boundary import (
     AbstractBoundary,
     AbstractCollider,
+    ColliderImpulse,
     Conditions,
     ContactPlane,
-    Exchange,
     Grip,
     SeparatingBox,
     SeparatingCollider,
@@ -49,8 +49,8 @@ from mpmjax.geometry import (
 from mpmjax.implicit import AnalyticHessian, ConjugateResidual, Guess, JvpHessian, Linearised, Metric, Newton
 from mpmjax.io import load, record, save
 from mpmjax.material import (
+    AbstractInelastic,
     AbstractMaterial,
-    AbstractPlastic,
     AbstractTangent,
     CamClay,
     DruckerPrager,
@@ -92,7 +92,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "sample_mesh",
     # laws
     "AbstractMaterial",
-    "AbstractPlastic",
+    "AbstractInelastic",
     "AbstractTangent",
     "FixedCorotated",
     "Hencky",
@@ -158,7 +158,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "MomentumBudget",
     "budget",
     "Energy",
-    "Exchange",
+    "ColliderImpulse",
     "Sensitivity",
     "energy",
     "load",

@@ -133,8 +133,8 @@ def rolled(q: dict[str, Any], case: Case, steps: int = STEPS) -> tuple[jax.Array
     particles = mpm.prepare(scene, particles)
     seen = []
 
-    def spy(held: Any, v: Any, imbalance: Any) -> Any:
-        after = wall_friction(held, v, imbalance)
+    def spy(held: Any, v: Any, momentum_residual: Any) -> Any:
+        after = wall_friction(held, v, momentum_residual)
         seen.append((held.active.components, (v != 0) & (after == 0)))
         return after
 

@@ -404,7 +404,7 @@ def test_what_passes_a_boundary_is_named(d, name, method):
 
     for cells in (0.4, 0.9):
         run = thrown(cells)
-        assert bool(run.tally.healthy)
+        assert bool(run.statistics.healthy)
         assert float(run.final.x[:, -1].min()) > -1.5 * DX
     for cells in (2.5, 5.0):
         with pytest.raises(mpm.SimulationError, match=rf"At step \d+ .* passed boundary 0, {type(floor).__name__}"):

@@ -60,7 +60,7 @@ def test_summary_says_how_many_steps_were_indefinite(folder):
     """And is silent where none was."""
     job, run = read_job(folder / "scene.toml"), mpm.load(folder / "run.h5")
     assert "indefinite" not in (folder / "summary").read_text()
-    run = eqx.tree_at(lambda r: r.tally.indefinite, run, run.tally.indefinite + 5)
+    run = eqx.tree_at(lambda r: r.statistics.indefinite, run, run.statistics.indefinite + 5)
     assert re.search(r"\nindefinite +the system of 5 of 6 steps", _summary(job, run, 6, 1.0))
 
 
@@ -329,7 +329,7 @@ def test_a_stable_step_is_taken_and_told(tmp_path):
     chosen = re.search(r"chosen +dt = ([-.e\d]+) s \((\d+) steps\), the longest that is stable", out)
     assert chosen is not None, out
     run, job = mpm.load(tmp_path / "run.h5"), read_plan(scene)
-    assert int(run.tally.steps) == int(chosen[2])
+    assert int(run.statistics.steps) == int(chosen[2])
     np.testing.assert_allclose(float(run.dt) * int(chosen[2]), 0.06)
     assert float(run.dt) <= float(mpm.stable_dt(job.scene, job.particles)) < 0.06 / (int(chosen[2]) - 1)
     scene.write_text(left)
@@ -349,7 +349,7 @@ def test_the_step_is_chosen_where_it_is_left_open(tmp_path):
     chosen = re.search(r"chosen +Explicit\(\), dt = ([-.e\d]+) s \((\d+) steps\)", out)
     assert chosen is not None, out
     run = mpm.load(tmp_path / "run.h5")
-    assert int(run.tally.steps) == int(chosen[2])
+    assert int(run.statistics.steps) == int(chosen[2])
     job = read_plan(scene)
     assert float(run.dt) <= 0.7 * float(mpm.stable_dt(job.scene, job.particles, safety=1.0))
 

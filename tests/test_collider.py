@@ -13,8 +13,8 @@ from numpy_oracle import grid_update
 
 import mpmjax as mpm
 from mpmjax.boundary._conditions import combine
-from mpmjax.implicit._constraint import Constraint
 from mpmjax.implicit._hessian import ImplicitOperator
+from mpmjax.implicit._projection import Projection
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {
@@ -154,13 +154,13 @@ def test_the_operator_is_symmetric_and_its_metric_commutes_with_the_projection(i
     scene = scene_of(grid, mpm.SlipBox((-np.inf, 0.0), (np.inf, np.inf)), mpm.SlipCollider(ball))
     step = grid_update(scene, particles, DT, METHODS["explicit"])
     nodes = step.nodes
-    action = mpm.AnalyticHessian().at_rest(nodes.potential, nodes.velocity)
-    operator = ImplicitOperator(nodes.mass, jnp.asarray(1e-3), action, nodes.constraint, inner)
+    action = mpm.AnalyticHessian().at_current(nodes.potential, nodes.velocity)
+    operator = ImplicitOperator(nodes.mass, jnp.asarray(1e-3), action, nodes.projection, inner)
     A, W = np.asarray(operator.as_matrix()), np.asarray(operator.metric()).ravel()
     n = A.shape[0]
-    Q = np.asarray(jax.vmap(lambda e: nodes.constraint.split(e.reshape(-1, 2), 0).ravel())(jnp.eye(n))).T
-    free = ImplicitOperator(nodes.mass, jnp.asarray(1e-3), action, Constraint(jnp.ones_like(nodes.free)))
-    assert 0.1 < (np.abs(nodes.constraint.normal) > 1e-6).any(axis=1).mean() < 0.9
+    Q = np.asarray(jax.vmap(lambda e: nodes.projection.combine(e.reshape(-1, 2), 0).ravel())(jnp.eye(n))).T
+    free = ImplicitOperator(nodes.mass, jnp.asarray(1e-3), action, Projection(jnp.ones_like(nodes.free)))
+    assert 0.1 < (np.abs(nodes.projection.normal) > 1e-6).any(axis=1).mean() < 0.9
     assert_close(A, A.T, 1e-14)
     assert_close(Q @ Q, Q, 1e-14)
     assert_close(Q, Q.T, 1e-14)
@@ -179,10 +179,10 @@ def test_a_linear_solve_with_a_collider_is_the_dense_one():
     scene = scene_of(grid, mpm.SlipCollider(mpm.Ball((0.16, 0.12), 0.22), ROLLING))
     step = grid_update(scene, particles, DT, METHODS["semi_implicit"])
     nodes = step.nodes
-    action = mpm.AnalyticHessian().at_rest(nodes.potential, nodes.velocity)
-    whole = ImplicitOperator(nodes.mass, nodes.dt**2, action, Constraint(jnp.ones_like(nodes.free)))
+    action = mpm.AnalyticHessian().at_current(nodes.potential, nodes.velocity)
+    whole = ImplicitOperator(nodes.mass, nodes.dt**2, action, Projection(jnp.ones_like(nodes.free)))
     A, n = np.asarray(whole.as_matrix()), nodes.velocity.size
-    Q = np.asarray(jax.vmap(lambda e: nodes.constraint.split(e.reshape(-1, 2), 0).ravel())(jnp.eye(n))).T
+    Q = np.asarray(jax.vmap(lambda e: nodes.projection.combine(e.reshape(-1, 2), 0).ravel())(jnp.eye(n))).T
     b = np.asarray(nodes.mass[:, None] * nodes.explicit_velocity()).ravel()
     held = (np.eye(n) - Q) @ np.asarray(nodes.prescribed).ravel()
     v = np.linalg.solve(Q @ A @ Q + np.eye(n) - Q, Q @ (b - A @ held) + held)

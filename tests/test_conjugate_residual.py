@@ -14,9 +14,9 @@ import mpmjax as mpm
 from mpmjax._types import components
 from mpmjax.boundary._mirror import mirror
 from mpmjax.discretisation._transfer import p2g
-from mpmjax.implicit._constraint import Constraint
 from mpmjax.implicit._hessian import ImplicitOperator
 from mpmjax.implicit._potential import ElasticPotential
+from mpmjax.implicit._projection import Projection
 
 N = 24
 DTYPES = {"float64": jnp.float64, "float32": jnp.float32}
@@ -359,11 +359,11 @@ def block_and_stray(multiple):
     node_mass, momentum = p2g(stencil, mass, components(v), components(particles.C), grid.size)
     occupied = node_mass > jnp.finfo(float).eps * mass[0]
     assert 0 < jnp.where(occupied, node_mass, jnp.inf).min() < 1e-10 * mass[0]
-    potential = ElasticPotential(scene.constituents(particles), stencil, mirror((), grid, scene.window(particles)))
-    hessian = mpm.AnalyticHessian().at_rest(potential, momentum)
+    potential = ElasticPotential(scene.material_points(particles), stencil, mirror((), grid, scene.window(particles)))
+    hessian = mpm.AnalyticHessian().at_current(potential, momentum)
     free = jnp.broadcast_to(occupied[:, None], momentum.shape)
     factor = jnp.asarray((multiple * explicit_limit(scene)) ** 2)
-    return ImplicitOperator(node_mass, factor, hessian, Constraint(free)), jnp.where(free, momentum, 0)
+    return ImplicitOperator(node_mass, factor, hessian, Projection(free)), jnp.where(free, momentum, 0)
 
 
 def test_the_references_plain_inner_product_fails_on_a_nearly_empty_node():
@@ -378,7 +378,7 @@ def test_the_references_plain_inner_product_fails_on_a_nearly_empty_node():
     assert result == R.successful
     steps = int(stats["num_steps"])
     assert steps < 60
-    keep = np.asarray(system.constraint.free).ravel()
+    keep = np.asarray(system.projection.free).ravel()
     M, rhs, v = (np.asarray(a).ravel()[keep] for a in (system.metric(), momentum, v))
     A = np.asarray(eqx.filter_jit(ImplicitOperator.as_matrix)(system))[np.ix_(keep, keep)]
     assert true_residual(A, v, rhs, M) < 1e-8

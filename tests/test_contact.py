@@ -157,8 +157,8 @@ def test_a_wall_lets_go_freely(name, floor):
 def test_a_block_rests_on_the_floor(name, floor):
     """It carries its weight, does not sink and no condition is left violated."""
     run, dt = slid(name, 200, floor)
-    assert int(run.tally.violations) == 0
-    assert int(run.tally.sweeps) <= SWEEPS * int(run.tally.steps)
+    assert int(run.statistics.violations) == 0
+    assert int(run.statistics.sweeps) <= SWEEPS * int(run.statistics.steps)
     static = 1e3 * G * 0.2**2 / 2 / 1.35e5  # settling of the top under its own weight, uniaxial
     assert float(run.observed[:, 3].min()) > DX / 4 - 3 * static
     assert float(jnp.abs(run.observed[-1, 1])) < 0.02 * G * 200 * dt
@@ -173,7 +173,7 @@ def test_a_block_bounces(name, floor):
     assert up.min() < -1.0
     assert up.max() > {"explicit": 0.5, "semi_implicit": 0.05}[name]
     assert float(run.observed[:, 3].min()) > 0
-    assert int(run.tally.violations) == 0
+    assert int(run.statistics.violations) == 0
 
 
 @EACH_FLOOR
@@ -348,8 +348,8 @@ def test_a_verdict_is_given_beyond_rounding_only():
                 None if touch is None else jnp.asarray(held & met),  # noqa: B023
             )
             v = fast if held else fast + along * (weight / np.where(met, mass, 1))[:, None]  # noqa: B023
-            imbalance = weight[:, None] * along if held else 0 * along  # noqa: B023
-            return int(hold(nodes, active).count_violations(jnp.asarray(v), jnp.asarray(imbalance)))  # noqa: B023
+            momentum_residual = weight[:, None] * along if held else 0 * along  # noqa: B023
+            return int(hold(nodes, active).count_violations(jnp.asarray(v), jnp.asarray(momentum_residual)))  # noqa: B023
 
         assert met.sum() > 3
         for held in (True, False):
@@ -373,8 +373,10 @@ def test_there_is_no_friction_where_a_wall_would_have_to_pull():
         )
         v = jnp.zeros_like(nodes.velocity).at[:, 0].set(1.0)
         for up in (-1.0, 1.0):
-            imbalance = up * nodes.mass[:, None] * jnp.asarray([0.0, 1.0])
-            slowed = held.collider_friction(held.wall_friction(v, imbalance), held.pushes(imbalance))[0][:, 0]
+            momentum_residual = up * nodes.mass[:, None] * jnp.asarray([0.0, 1.0])
+            slowed = held.collider_friction(held.wall_friction(v, momentum_residual), held.pushes(momentum_residual))[
+                0
+            ][:, 0]
             assert slowed.max() == 1
             assert (slowed.min() == 1) == (up < 0)
 

@@ -13,14 +13,14 @@ from helpers import DESCRIPTIONS, KERNELS, METHODS, SECOND_ORDER, block, ids
 import mpmjax as mpm
 from mpmjax.autodiff._rule import _values
 from mpmjax.checks._values import canonical
-from mpmjax.implicit._constraint import Constraint
+from mpmjax.implicit._projection import Projection
 from mpmjax.simulation._diffrax import Problem
 from mpmjax.stepping._contact import Held
 from mpmjax.stepping._nodes import Nodes
 from mpmjax.stepping._step import advance
 
 LAW = mpm.NeoHookean(1e5, 0.3)
-COUNTED = ("stencil_spread", "stencil_collect", "while", "floor", "exp", "log")
+COUNTED = ("stencil_scatter", "stencil_gather", "while", "floor", "exp", "log")
 
 
 def program(method=mpm.Explicit(), *, d=2, nodes=12, material=LAW, **scene):
@@ -92,7 +92,7 @@ def compiled(method=mpm.Explicit(), **scene):
 
 def crossings(found):
     """Sums to the nodes, and from them."""
-    return found["stencil_spread"], found["stencil_collect"]
+    return found["stencil_scatter"], found["stencil_gather"]
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])
@@ -124,7 +124,7 @@ def test_an_iteration_of_an_implicit_step_crosses_once_each_way():
     """Whatever stencil, rotations and factors it needs is made before the loop."""
     step, arrays = program(mpm.SemiImplicit())
     (body,) = innermost_loops(jax.make_jaxpr(step)(arrays).jaxpr)
-    assert operations(body) == {"stencil_spread": 1, "stencil_collect": 1}
+    assert operations(body) == {"stencil_scatter": 1, "stencil_gather": 1}
 
 
 def test_the_diagonal_metric_adds_one_crossing_to_a_solve_and_nothing_to_an_iteration():
@@ -133,7 +133,7 @@ def test_the_diagonal_metric_adds_one_crossing_to_a_solve_and_nothing_to_an_iter
     assert (more, as_many) == (there + 1, back)
     step, arrays = program(by_diagonal)
     (body,) = innermost_loops(jax.make_jaxpr(step)(arrays).jaxpr)
-    assert operations(body) == {"stencil_spread": 1, "stencil_collect": 1}
+    assert operations(body) == {"stencil_scatter": 1, "stencil_gather": 1}
 
 
 HELD = {
@@ -183,13 +183,13 @@ def test_without_colliders_a_constraint_is_a_mask(method, boundary):
     step, arrays = program(method, boundary=boundary)
     as_is = equations(jax.make_jaxpr(step)(arrays).jaxpr)
     with (
-        mock.patch.object(Constraint, "split", masked),
-        mock.patch.object(Constraint, "identity", lambda self, vector, mass: vector),
-        mock.patch.object(Nodes, "constraint", property(lambda self: Constraint(self.free))),
+        mock.patch.object(Projection, "split", masked),
+        mock.patch.object(Projection, "identity", lambda self, vector, mass: vector),
+        mock.patch.object(Nodes, "projection", property(lambda self: Projection(self.free))),
         mock.patch.object(Nodes, "prescribed", property(lambda self: self.conditions.velocity)),
         mock.patch.object(Held, "pushes", return_value=None),
         mock.patch.object(Held, "collider_friction", lambda self, v, push: (v, None)),
-        mock.patch.object(Held, "_beside_colliders", lambda self, imbalance: imbalance),
+        mock.patch.object(Held, "_beside_colliders", lambda self, momentum_residual: momentum_residual),
         mock.patch.object(Held, "normal", None),
     ):
         step, arrays = program(method, boundary=boundary)
@@ -204,7 +204,7 @@ def test_a_collider_scatters_nothing_and_adds_no_crossing_to_an_iteration(collid
     step, arrays = program(method, boundary=boundary)
     jaxpr = jax.make_jaxpr(step)(arrays).jaxpr
     for body in innermost_loops(jaxpr):
-        assert operations(body) == {"stencil_spread": 1, "stencil_collect": 1}
+        assert operations(body) == {"stencil_scatter": 1, "stencil_gather": 1}
     plain, arrays = program(method, boundary=HELD["slip"])
     if collider is not mpm.SeparatingCollider:
         assert operations(jaxpr) == operations(jax.make_jaxpr(plain)(arrays).jaxpr)
@@ -293,4 +293,4 @@ def test_viscosity_adds_no_crossing(law, transfer):
     assert jax.eval_shape(step, arrays).C is not None
     step, arrays = program(mpm.SemiImplicit(), material=viscous, transfer=transfer)
     (body,) = innermost_loops(jax.make_jaxpr(step)(arrays).jaxpr)
-    assert operations(body) == {"stencil_spread": 1, "stencil_collect": 1}
+    assert operations(body) == {"stencil_scatter": 1, "stencil_gather": 1}

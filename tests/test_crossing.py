@@ -1,4 +1,4 @@
-"""`collect` and `spread`: the sums they say, and that each is the other's transpose to every order and in batches."""
+"""`gather` and `scatter`: the sums they say, and that each is the other's transpose to every order and in batches."""
 
 from functools import cache
 
@@ -10,14 +10,14 @@ import pytest
 from helpers import DIMS, GRADIENTS, KERNELS, assert_close, ids
 
 import mpmjax as mpm
-from mpmjax.discretisation import _transfer_sums as _crossing
+from mpmjax.discretisation import _transfer_sums as _transfer_sums
 from mpmjax.discretisation._stencil import Stencil, make_stencil
-from mpmjax.discretisation._transfer_sums import collect, spread
+from mpmjax.discretisation._transfer_sums import gather, scatter
 
 P = 17
 EACH_KERNEL = pytest.mark.parametrize("kernel", **ids(KERNELS))
 EACH_DIM = pytest.mark.parametrize("d", DIMS)
-to_nodes, from_nodes = eqx.filter_jit(spread), eqx.filter_jit(collect)
+to_nodes, from_nodes = eqx.filter_jit(scatter), eqx.filter_jit(gather)
 QUADRATIC, MLS = mpm.BSpline(), mpm.MLSGradient()
 
 
@@ -61,30 +61,30 @@ def test_they_are_the_sums_that_weights_and_gradients_say(c, gradient, d, kernel
 
 def test_what_goes_to_no_node_is_dropped():
     """Beyond either end; the rest arrives. Nothing else is touched."""
-    shares = jnp.asarray([-1, 0, 3, 4, 2**30], jnp.int32)[None, None]
+    index_factors = jnp.asarray([-1, 0, 3, 4, 2**30], jnp.int32)[None, None]
     one = jnp.ones((1, 1, 5))
-    stencil = Stencil(shares, one, one, None, one[0], one[0, 0] > 0)
-    np.testing.assert_array_equal(spread(stencil, jnp.ones((3, 5)), None, 4), np.tile([[1.0], [0], [0], [1]], 3))
+    stencil = Stencil(index_factors, one, one, None, one[0], one[0, 0] > 0)
+    np.testing.assert_array_equal(scatter(stencil, jnp.ones((3, 5)), None, 4), np.tile([[1.0], [0], [0], [1]], 3))
 
 
 def sums(x, given, nodes):
     """Both sums, as functions of everything."""
     stencil = place(x)
-    value, slopes = collect(stencil, nodes)
-    return spread(stencil, given[0], given[1:], nodes.shape[0]), jnp.concatenate([value[None], slopes])
+    value, slopes = gather(stencil, nodes)
+    return scatter(stencil, given[0], given[1:], nodes.shape[0]), jnp.concatenate([value[None], slopes])
 
 
 @EACH_DIM
 def test_each_is_the_others_transpose(d):
     """By `linear_transpose` and in reverse mode, each by one call of the other and none of itself."""
     _, stencil, given, nodes = example(d)
-    (back,) = jax.linear_transpose(lambda a: spread(stencil, a[0], a[1:], 5**d), given)(nodes)
-    value, slopes = collect(stencil, nodes)
+    (back,) = jax.linear_transpose(lambda a: scatter(stencil, a[0], a[1:], 5**d), given)(nodes)
+    value, slopes = gather(stencil, nodes)
     np.testing.assert_array_equal(back, jnp.concatenate([value[None], slopes]))
-    pull = jax.vjp(lambda n: collect(stencil, n), nodes)[1]
-    assert_close(pull((given[0], given[1:]))[0], spread(stencil, given[0], given[1:], 5**d), 1e-15)
+    pull = jax.vjp(lambda n: gather(stencil, n), nodes)[1]
+    assert_close(pull((given[0], given[1:]))[0], scatter(stencil, given[0], given[1:], 5**d), 1e-15)
     program = str(jax.make_jaxpr(pull)((given[0], given[1:])))
-    assert (program.count("stencil_spread"), program.count("stencil_collect")) == (1, 0)
+    assert (program.count("stencil_scatter"), program.count("stencil_gather")) == (1, 0)
 
 
 @EACH_DIM
@@ -161,12 +161,12 @@ def test_a_member_that_is_not_finite_leaves_the_others_as_they_are():
 def test_the_program_for_other_platforms_is_the_same_sum(d):
     """Where it is not for a CPU nothing is left of the loops: the same numbers, in one kernel a sum."""
     _, stencil, given, nodes = example(d)
-    factors = stencil.shares, stencil.weights, stencil.slopes
-    loops, kernel = (_crossing._collect(*factors, nodes, unroll=unroll) for unroll in (False, True))
+    factors = stencil.index_factors, stencil.weights, stencil.slopes
+    loops, kernel = (_transfer_sums._gather(*factors, nodes, unroll=unroll) for unroll in (False, True))
     assert_close(jnp.stack(loops), jnp.stack(kernel), 1e-15)
-    loops, kernel = (_crossing._spread(*factors, *given, valued=True, size=5**d, unroll=u) for u in (False, True))
+    loops, kernel = (_transfer_sums._scatter(*factors, *given, valued=True, size=5**d, unroll=u) for u in (False, True))
     assert_close(loops[0], kernel[0], 1e-14)
-    traced = jax.jit(lambda given, nodes: (spread(stencil, given[0], given[1:], 5**d), collect(stencil, nodes)))
+    traced = jax.jit(lambda given, nodes: (scatter(stencil, given[0], given[1:], 5**d), gather(stencil, nodes)))
     programs = {p: traced.trace(given, nodes).lower(lowering_platforms=(p,)).as_text() for p in ("cpu", "cuda")}
     assert ("while" in programs["cpu"]) == (d > 1)
     assert "while" not in programs["cuda"]

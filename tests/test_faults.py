@@ -70,11 +70,11 @@ def test_every_transformation_raises_every_fault(transform, adjoint, primal):
 @pytest.mark.parametrize("reverse", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_member_without_a_derivative_leaves_the_others_alone(reverse):
     """With throw=False: NaN where a tangent or adjoint solve did not converge or a parameter is bad, and the others'
-    numbers and derivatives are the same bit for bit; tally and report say which."""
+    numbers and derivatives are the same bit for bit; statistics and report say which."""
 
     def member(x):
         value, run = outcome(x, None if reverse else diffrax.ForwardMode(), throw=False)
-        return value, (run.tally.fault, run.tally.unconverged, run.report)
+        return value, (run.statistics.fault, run.statistics.unconverged, run.report)
 
     def both(x):
         if reverse:

@@ -16,10 +16,10 @@ from mpmjax.boundary._conditions import combine
 from mpmjax.boundary._mirror import mirror
 from mpmjax.discretisation._stencil import make_stencil
 from mpmjax.discretisation._transfer import p2g
-from mpmjax.implicit._constraint import Constraint
 from mpmjax.implicit._hessian import ImplicitOperator
 from mpmjax.implicit._potential import ElasticPotential
-from mpmjax.state._constituent import Constituent
+from mpmjax.implicit._projection import Projection
+from mpmjax.state._material_points import MaterialPoints
 
 DX = 0.1
 CASES = {
@@ -59,8 +59,8 @@ def linearised(potential, du, u, h):
     """About u: −∂Φ/∂u, the force there and at u ∓ h δu, and H δu by both routes, through the operator without mass."""
 
     def action(hessian):
-        H = hessian.at_rest(potential, du) if u is None else hessian.at(potential, u)
-        return ImplicitOperator(jnp.zeros(len(du)), jnp.asarray(1.0), H, Constraint(jnp.ones(du.shape, bool))).mv(du)
+        H = hessian.at_current(potential, du) if u is None else hessian.at(potential, u)
+        return ImplicitOperator(jnp.zeros(len(du)), jnp.asarray(1.0), H, Projection(jnp.ones(du.shape, bool))).mv(du)
 
     place = jnp.zeros_like(du) if u is None else u
     forces = jax.vmap(lambda step: potential.force(place + step * du))(jnp.stack([0 * h, -h, h]))
@@ -77,7 +77,7 @@ def scene_of(law, d, family, description, gradient):
     total = description == "total"
     images = mirror((), grid, window)
     material = jax.tree.map(jnp.asarray, ELASTIC[law])
-    potential = ElasticPotential((Constituent(material, particles.volume, F, total),), stencil, images)
+    potential = ElasticPotential((MaterialPoints(material, particles.volume, F, total),), stencil, images)
     du = jnp.asarray(DX * np.random.default_rng(1).normal(size=(grid.size, d)))
     return potential, du
 
@@ -91,7 +91,7 @@ def relative(a, b):
 def results_of(*case):
     """`linearised` of a case at rest; its steps are small against the smallest stretch. With h."""
     potential, du = scene_of(*case)
-    h = 1e-6 * jnp.abs(jnp.linalg.det(potential.at_rest()[0].transpose(2, 0, 1))).min() ** (1 / du.shape[1])
+    h = 1e-6 * jnp.abs(jnp.linalg.det(potential.current_deformation()[0].transpose(2, 0, 1))).min() ** (1 / du.shape[1])
     return *jax.tree.map(np.asarray, linearised(potential, du, None, h)), float(h)
 
 
@@ -123,7 +123,7 @@ def test_hessian_agrees_with_central_differences_of_the_force(case):
 def test_force_is_minus_the_gradient_of_the_energy(case):
     """f = −∂Φ/∂u at u = 0, to rounding of the moduli."""
     descent, (force, _, _), _, _ = results_of(*case)
-    law, volume = ELASTIC[case[0]], scene_of(*case)[0].constituents[0].volume
+    law, volume = ELASTIC[case[0]], scene_of(*case)[0].material_points[0].volume
     moduli = float((law.shear_modulus + law.lame_lambda) * volume.max() / DX)
     np.testing.assert_allclose(force, descent, rtol=0, atol=1e-13 * max(np.abs(force).max(), moduli))
 
@@ -160,7 +160,7 @@ def constrained(d, description, law="fixed_corotated"):
     window = grid.window(particles.x)
     stencil = make(mpm.BSpline(), mpm.MLSGradient(), grid, window, particles.x, affine=False)
     F, images = components(particles.F), mirror(walls, grid, window)
-    body = Constituent(jax.tree.map(jnp.asarray, LAWS[law]), particles.volume, F, description == "total")
+    body = MaterialPoints(jax.tree.map(jnp.asarray, LAWS[law]), particles.volume, F, description == "total")
     potential = ElasticPotential((body,), stencil, images)
     mass = images.fold_scalar(p2g(stencil, particles.mass, components(particles.v), None, grid.size)[0])
     fixed = combine(walls, grid.nodes(window), DX, 0.0, 1.0, reference=False).fixed
@@ -174,7 +174,7 @@ def constrained(d, description, law="fixed_corotated"):
     factor = jnp.asarray(1e-3)
     like = jnp.zeros((grid.size, d))
     operators = [
-        ImplicitOperator(mass, factor, h.at_rest(potential, like), Constraint(free)) for h in HESSIANS.values()
+        ImplicitOperator(mass, factor, h.at_current(potential, like), Projection(free)) for h in HESSIANS.values()
     ]
     return operators, potential, free
 
@@ -206,7 +206,7 @@ def test_operator_is_symmetric(route, d, description):
 def test_assembled_it_is_the_same_operator(route, d, description):
     """What the solvers iterate on, one symmetric matrix a particle, against the map through the law."""
     operator = constrained(d, description)[0][route]
-    b = jnp.asarray(np.random.default_rng(9).normal(size=operator.constraint.free.shape))
+    b = jnp.asarray(np.random.default_rng(9).normal(size=operator.projection.free.shape))
     assembled = eqx.filter_jit(ImplicitOperator.assembled)(operator)
     assert relative(apply(assembled, b), apply(operator, b)) < 1e-13
     K = np.asarray(assembled.hessian.matrix)

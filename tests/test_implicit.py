@@ -235,9 +235,9 @@ def test_single_precision_converges_and_says_how_far(times):
     problem = LinearProblem(
         mass=nodes.mass,
         factor=nodes.dt**2,
-        hessian=AnalyticHessian().at_rest(nodes.potential, predictor),
+        hessian=AnalyticHessian().at_current(nodes.potential, predictor),
         rhs=nodes.mass[:, None] * predictor,
-        constraint=nodes.constraint,
+        projection=nodes.projection,
         prescribed=nodes.prescribed,
     )
 

@@ -20,7 +20,7 @@ from mpmjax.io._record import record
 from mpmjax.io._runs import FrameWriter, load, save
 from mpmjax.simulation._run import Run
 from mpmjax.simulation._simulate import integrate
-from mpmjax.simulation._statistics import Tally, no_steps
+from mpmjax.simulation._statistics import RunStatistics, no_steps
 from mpmjax.state._particles import Particles, state_of
 from mpmjax.state._preparation import prepare
 
@@ -42,7 +42,7 @@ def made_up(d: int, dtype=jnp.float64, description=DESCRIPTIONS["updated"], tran
     particles = prepare(scene, particles)
     frames = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=(3, *a.shape)), dtype), state_of(particles))
     final = mpm._particles.with_state(particles, jax.tree.map(lambda a: a[-1], frames))
-    counts = {f.name: jnp.asarray(i, jnp.int32) for i, f in enumerate(dataclasses.fields(Tally), 7)}
+    counts = {f.name: jnp.asarray(i, jnp.int32) for i, f in enumerate(dataclasses.fields(RunStatistics), 7)}
     return Run(
         scene=scene,
         method=jax.tree.map(lambda a: jnp.asarray(a, dtype), mpm.SemiImplicit(beta=0.7)),
@@ -52,7 +52,7 @@ def made_up(d: int, dtype=jnp.float64, description=DESCRIPTIONS["updated"], tran
         observed=None,
         final=final,
         final_step=jnp.asarray(7, dtype),
-        tally=Tally(**{**counts, "worst_residual": jnp.asarray(1 / 7, dtype)}),
+        statistics=RunStatistics(**{**counts, "worst_residual": jnp.asarray(1 / 7, dtype)}),
     )
 
 
@@ -215,7 +215,7 @@ def test_the_file_says_what_it_holds(tmp_path):
         scene = json.loads(own["scene"][...].tobytes())
         assert scene["material"] == {"kind": "FixedCorotated", "youngs_modulus": 1 / 3, "poisson_ratio": 0.3}
         assert own["frames"]["step"].tolist() == [0, 5, 7]
-        assert own["frames"]["iterations"].tolist() == [-1, -1, int(run.tally.iterations)]
+        assert own["frames"]["iterations"].tolist() == [-1, -1, int(run.statistics.iterations)]
 
 
 # A run recorded as it goes -------------------------------------------------------------------------------------------
@@ -235,13 +235,13 @@ def test_recorded_resumed_and_simulated_runs_are_equal_bit_for_bit(law, dtype, s
     resumed = record(tmp_path / "parts.h5", scene, particles, t1=14 * dt, resume=True, **kwargs)
     assert integrate._cached._cache_size() == before + 1
     assert_same(load(tmp_path / "whole.h5"), single)
-    assert_same((whole.final, whole.tally), (single.final, single.tally))
-    assert_same((resumed.final, resumed.tally), (single.final, single.tally))
+    assert_same((whole.final, whole.statistics), (single.final, single.statistics))
+    assert_same((resumed.final, resumed.statistics), (single.final, single.statistics))
     parts = load(tmp_path / "parts.h5")
     assert parts.steps.tolist() == [0, 4, 5, 8, 12, 14]
     kept = jnp.asarray([0, 1, 3, 4, 5])
     assert_same(jax.tree.map(lambda a: a[kept], parts.frames), single.frames)
-    assert_same(parts.tally, single.tally)
+    assert_same(parts.statistics, single.statistics)
 
 
 def test_a_saved_run_can_be_resumed(tmp_path):
@@ -251,7 +251,7 @@ def test_a_saved_run_can_be_resumed(tmp_path):
     whole = record(tmp_path / "whole.h5", scene, particles, t1=0.06, **kwargs)
     save(tmp_path / "run.h5", mpm.simulate(scene, particles, t1=0.03, **kwargs))
     resumed = record(tmp_path / "run.h5", scene, particles, t1=0.06, resume=True, **kwargs)
-    assert_same((resumed.final, resumed.tally), (whole.final, whole.tally))
+    assert_same((resumed.final, resumed.statistics), (whole.final, whole.statistics))
 
 
 def test_a_file_being_written_can_be_read(tmp_path):
@@ -260,7 +260,7 @@ def test_a_file_being_written_can_be_read(tmp_path):
     frames = [jax.tree.map(lambda a, i=i: a[i], run.frames) for i in range(3)]
     with FrameWriter.create(path, run.scene, run.final, run.method, run.dt) as writer:
         for i, frame in enumerate(frames):
-            writer.append(i, frame, run.tally)
+            writer.append(i, frame, run.statistics)
             shutil.copy(path, tmp_path / "copy.h5")
             for name in (path, tmp_path / "copy.h5"):
                 assert_same(load(name).frames, jax.tree.map(lambda a, i=i: a[: i + 1], run.frames))
@@ -310,9 +310,9 @@ def test_a_run_that_blows_up_keeps_its_good_frames(tmp_path):
     )
     assert re.fullmatch(re.escape(str(single.value)) + held, str(caught.value))
     run, last = load(path), int(caught.value.run.final_step)
-    assert_same((run.final, run.tally), (caught.value.run.final, caught.value.run.tally))
-    assert_same((run.final, run.tally), (single.value.run.final, single.value.run.tally))
-    assert last == int(run.tally.fault_step) - 1
+    assert_same((run.final, run.statistics), (caught.value.run.final, caught.value.run.statistics))
+    assert_same((run.final, run.statistics), (single.value.run.final, single.value.run.statistics))
+    assert last == int(run.statistics.fault_step) - 1
     assert run.steps.tolist() == [*range(0, last, 4), last]
     assert all(np.isfinite(a).all() for a in jax.tree.leaves(run.frames))
 
@@ -657,7 +657,7 @@ def test_a_flipped_bit_is_caught_or_harmless(tmp_path):
             caught.append(bit)
         try:
             with FrameWriter.resume(path, run.scene, run.final, run.method, run.dt) as writer:
-                assert_same(writer.last(), (7, state_of(run.final), run.tally))
+                assert_same(writer.last(), (7, state_of(run.final), run.statistics))
         except ValueError:
             continue
     assert set(positions) <= set(caught)
@@ -665,10 +665,10 @@ def test_a_flipped_bit_is_caught_or_harmless(tmp_path):
 
 
 def test_no_steps_is_the_row_of_a_start(tmp_path):
-    """A recorded run's first frame has the empty tally."""
+    """A recorded run's first frame has the empty statistics."""
     run = made_up(2)
     with FrameWriter.create(tmp_path / "run.h5", run.scene, run.final, run.method, run.dt) as writer:
         writer.append(3, state_of(run.final), no_steps(jnp.float64))
-        step, state, tally = writer.last()
+        step, state, statistics = writer.last()
     assert step == 3
-    assert_same((state, tally), (state_of(run.final), no_steps(jnp.float64)))
+    assert_same((state, statistics), (state_of(run.final), no_steps(jnp.float64)))

@@ -176,9 +176,9 @@ def test_every_route_to_a_return_maps_derivative_is_right(name, d):
     states = [moved_apart(stretches, d, size) for stretches in (within, beyond)]
     F, G = (jnp.concatenate(parts, axis=-1) for parts in zip(*states, strict=True))
 
-    def returned(F):
-        history = jax.tree.map(lambda a: a + 1e-3 * F[0, 0], law.virgin(F))
-        F, history = law.returned(F, history)
+    def return_map(F):
+        history = jax.tree.map(lambda a: a + 1e-3 * F[0, 0], law.initial_history(F))
+        F, history = law.return_map(F, history)
         return jnp.concatenate([F.reshape(-1, F.shape[-1]), *(a[None] for a in jax.tree.leaves(history))])
 
     changed = np.abs(returned(F)[: d * d] - F.reshape(d * d, -1)).max(axis=0)

@@ -31,8 +31,8 @@ def operator_of(scene, particles, hessian, factor=1e-3):
     particles = mpm.prepare(scene, particles)
     dt = jnp.asarray(1e-3)
     nodes = particles_to_grid(scene, particles, 0.0, dt, scene.stencil(particles), centred=False)
-    action = hessian.at_rest(nodes.potential, nodes.velocity)
-    return ImplicitOperator(nodes.mass, jnp.asarray(factor), action, nodes.constraint, mpm.Metric.DIAGONAL)
+    action = hessian.at_current(nodes.potential, nodes.velocity)
+    return ImplicitOperator(nodes.mass, jnp.asarray(factor), action, nodes.projection, mpm.Metric.DIAGONAL)
 
 
 @eqx.filter_jit
@@ -63,7 +63,7 @@ def test_deformed_it_scales_the_operator_whatever_the_law_and_the_walls(descript
     both = [operator_of(scene, particles, hessian) for hessian in (mpm.AnalyticHessian(), mpm.JvpHessian())]
     (metric, matrix), (other, _) = map(metric_and_matrix, both)
     assert_close(metric, other, 1e-12)
-    free = np.asarray(both[0].constraint.free)
+    free = np.asarray(both[0].projection.free)
     assert (metric[free] >= jnp.broadcast_to(both[0].mass[:, None], free.shape)[free]).all()
     np.testing.assert_array_equal(metric[~free], 1)
     exact = np.diag(matrix).reshape(free.shape)[free]
@@ -78,7 +78,7 @@ def test_negative_stiffness_is_left_out():
     operator = operator_of(scene, squeezed, mpm.AnalyticHessian(), factor=1.0)
     metric, matrix = metric_and_matrix(operator)
     assert np.linalg.eigvalsh(matrix).min() < 0
-    stiffness, free = operator.hessian.assembled(), np.asarray(operator.constraint.free)
+    stiffness, free = operator.hessian.assembled(), np.asarray(operator.projection.free)
     K = np.stack([np.asarray(stiffness.matrix)[m, m] for m in range(4)]).reshape(2, 2, -1)  # by slope, then component
     assert (K < 0).any()
     left = np.zeros(free.shape)

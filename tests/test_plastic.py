@@ -34,9 +34,9 @@ def law_of(name):
 
 
 @eqx.filter_jit
-def returned(law, F, history):
+def return_map(law, F, history):
     """The return map, and energy density before and after."""
-    after, new = law.returned(F, history)
+    after, new = law.return_map(F, history)
     return after, new, law.elastic(history).energy(F), law.elastic(new).energy(after)
 
 
@@ -45,16 +45,16 @@ def driven(law, F, history, L):
     """The states after each F ← (I + L_n) F and its return: F, the history and the Kirchhoff stress, steps first."""
 
     def body(state, L):
-        F, history = law.returned(state[0] + la.matmul(L, state[0]), state[1])
+        F, history = law.return_map(state[0] + la.matmul(L, state[0]), state[1])
         return (F, history), (F, history, la.matmul(law.elastic(history).stress(F), la.transpose(F)))
 
     return jax.lax.scan(body, (F, history), L)[1]
 
 
-def at_rest(law, d, p=1):
+def at_current(law, d, p=1):
     """F = I and the history of it."""
     F = jnp.repeat(jnp.eye(d)[..., None], p, axis=-1)
-    return F, law.virgin(F)
+    return F, law.initial_history(F)
 
 
 def strained(d, mean, deviation, rng, *, rotated=True):
@@ -137,7 +137,7 @@ def cases(name, d, seed=0):
     names = list(itertools.islice(itertools.cycle(table), 10))
     mean, deviation, value = np.array([table[case] for case in names]).T
     F, transverse = strained(d, mean, deviation, rng)
-    return names, F, with_history(law_of(name).virgin(F), transverse, **{scalar: value})
+    return names, F, with_history(law_of(name).initial_history(F), transverse, **{scalar: value})
 
 
 def random_states(name, d, p=300, seed=3):
@@ -147,7 +147,7 @@ def random_states(name, d, p=300, seed=3):
     scalar = CASES[name][0]
     value = 0.1 * rng.normal(size=p)
     value = value if name == "cam_clay" else np.abs(value) * (rng.uniform(size=p) > 0.5)
-    return F, with_history(law_of(name).virgin(F), transverse, **{scalar: value})
+    return F, with_history(law_of(name).initial_history(F), transverse, **{scalar: value})
 
 
 def yield_excess(name, mean, deviation, before, after):
@@ -206,7 +206,7 @@ def test_plane_and_uniaxial_strain_are_three_dimensional(name, d):
 
 def flat(law, F, history):
     """All that a return gives, as a vector; F in its place, the rest in strains."""
-    after, new = law.returned(F, history)
+    after, new = law.return_map(F, history)
     return jnp.concatenate([a.reshape(-1, F.shape[-1]) for a in jax.tree.leaves((after, new))])
 
 
@@ -276,7 +276,7 @@ def test_derivatives_are_finite_where_stretches_coincide(name, d, twice):
     law, rng = law_of(name), np.random.default_rng(2)
     diagonals = np.repeat([(1, 1, 1), (0.9, 0.9, 0.9), (1.1, 1.1, 1.1), (1.2, 1.2, 0.8), (0.7, 0.7, 0.8)], 2, axis=0)
     F = jnp.asarray(np.einsum("pi,ij->ijp", diagonals[:, :d], np.eye(d)))
-    history = law.virgin(F)
+    history = law.initial_history(F)
     scalar = CASES[name][0]
     yielded = np.where(np.arange(len(diagonals)) % 2 == 0, getattr(history, scalar), 0.04)
     transverse = None if d == 3 else jnp.log(diagonals[:, 2])
@@ -292,11 +292,13 @@ def test_what_has_come_apart_feels_no_strain(name, d):
     strain after the return, in the space or out of it, and its volume goes to the gap."""
     law = law_of(name)
     F = 1.05 * at_rest(law, d)[0]
-    history = with_history(law.virgin(F), None if d == 3 else jnp.log(jnp.array([1.05])), **{CASES[name][0]: [0.02]})
+    history = with_history(
+        law.initial_history(F), None if d == 3 else jnp.log(jnp.array([1.05])), **{CASES[name][0]: [0.02]}
+    )
     dF = jnp.asarray(np.random.default_rng(0).normal(size=F.shape))
 
     def after(F):
-        F, new = law.returned(F, history)
+        F, new = law.return_map(F, history)
         return la.matmul(la.transpose(F), F), new
 
     (squared, new), (change, rates) = jax.jvp(after, (F,), (dF,))
@@ -318,7 +320,7 @@ def test_single_precision_stays_single(name, d):
     for a, b in zip(jax.tree.leaves(single), jax.tree.leaves(exact), strict=True):
         assert a.dtype == jnp.float32
         np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-6)
-    assert all(a.dtype == jnp.float32 for a in jax.tree.leaves(law.virgin(F.astype(jnp.float32))))
+    assert all(a.dtype == jnp.float32 for a in jax.tree.leaves(law.initial_history(F.astype(jnp.float32))))
 
 
 def with_parameters(name, **values):
@@ -343,7 +345,7 @@ def triaxial(law, F, history, axial, confinement):
     lateral increments."""
 
     def strained(state, a, x):
-        F, history = law.returned(jnp.exp(jnp.stack([a, x, x]))[:, None, None] * state[0], state[1])
+        F, history = law.return_map(jnp.exp(jnp.stack([a, x, x]))[:, None, None] * state[0], state[1])
         return F, history, la.matmul(law.elastic(history).stress(F), la.transpose(F))
 
     def body(state, a):
@@ -501,7 +503,7 @@ def test_sand_in_simple_shear():
     (F, history), p = isotropic(law, 300.0), 300.0
     _, _, stress = sheared(law, F, history, 0.8, 200)
     np.testing.assert_allclose(np.ravel(pressure_and_shear(stress[None])), [p, SLOPE * p], rtol=1e-12)
-    plane = with_history(law.virgin(F[:2, :2]), jnp.log(F[2, 2]))
+    plane = with_history(law.initial_history(F[:2, :2]), jnp.log(F[2, 2]))
     _, _, flat = sheared(law, F[:2, :2], plane, 0.8, 200)
     np.testing.assert_allclose(flat, stress[:2, :2], rtol=1e-11)
 
@@ -512,7 +514,7 @@ def test_sand_that_flows_in_plane_strain():
     phi = np.arcsin(3 * np.sqrt(3) * 0.5 / (6 + np.sqrt(3) * 0.5))  # ψ = 30 degrees
     law = canonical(mpm.DruckerPrager(E, NU, phi), jnp.float64)
     F = jnp.repeat(0.99 * jnp.eye(2)[..., None], 1, axis=-1)
-    start = with_history(law.virgin(F), jnp.log(jnp.asarray([0.99])))
+    start = with_history(law.initial_history(F), jnp.log(jnp.asarray([0.99])))
     squeezed = jnp.diag(jnp.expm1(jnp.array([1e-2, -1e-2])))[..., None]
     stress = driven(law, F, start, jnp.repeat(squeezed[None], 200, axis=0))[2]
     tau = np.diagonal(np.asarray(stress)[-1, :, :, 0])
@@ -523,7 +525,7 @@ def test_clay_compacts():
     """In isotropic compression, exactly: where it yields p is the p₀ before the step, and tr ε + α what the total is.
     So −tr ε = sinh(−ξ α) with that sum, to the first order in the step, and to 1e-6 once extrapolated."""
     law = with_parameters("cam_clay", hardening=0.5)
-    start = float(law.virgin(jnp.eye(3)[..., None]).volume_strain[0])
+    start = float(law.initial_history(jnp.eye(3)[..., None]).volume_strain[0])
     np.testing.assert_allclose(K * np.sinh(-0.5 * start), 300, rtol=1e-14)
     total, found = -0.6, []
     for steps in (1000, 2000):
@@ -564,7 +566,7 @@ def test_clay_tears_and_closes():
     _, history, stress = stretched(law, np.outer(steps, np.ones(3)))
     p, _ = pressure_and_shear(stress)
     alpha = np.asarray(history.volume_strain[:, 0])
-    total, start = 3 * np.cumsum(steps), float(law.virgin(jnp.eye(3)[..., None]).volume_strain[0])
+    total, start = 3 * np.cumsum(steps), float(law.initial_history(jnp.eye(3)[..., None]).volume_strain[0])
     np.testing.assert_allclose(p.min(), -0.3 * 300, rtol=1e-12)
     np.testing.assert_allclose(total, -p / K + alpha - start, atol=1e-12)
     held = np.where(np.r_[start, alpha[:-1]] >= 0, p, 0)

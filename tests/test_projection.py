@@ -38,7 +38,7 @@ def test_projection_keeps_what_is_positive_and_drops_the_rest(law, family, d):
     """A⁺ is that of `numpy.linalg.eigh` with negative eigenvalues set to zero, symmetric, and A itself where A is
     positive semi-definite."""
     law, F = jax.tree.map(jnp.asarray, law), jnp.asarray(deformations(family, d)[0])
-    if not np.asarray(law.admits(F)).all():
+    if not np.asarray(law.is_admissible(F)).all():
         assert family == "inverted"
         assert not isinstance(law, mpm.FixedCorotated)
         return
@@ -150,8 +150,8 @@ def stiffness(scene, particles, hessian):
     """H restricted to the free components, and their masses."""
     nodes = grid_update(scene, particles, 1e-3, mpm.Explicit()).nodes
     free = nodes.free
-    action = hessian.at_rest(nodes.potential, nodes.velocity)
-    operator = ImplicitOperator(jnp.zeros_like(nodes.mass), jnp.asarray(1.0), action, nodes.constraint)
+    action = hessian.at_current(nodes.potential, nodes.velocity)
+    operator = ImplicitOperator(jnp.zeros_like(nodes.mass), jnp.asarray(1.0), action, nodes.projection)
     A, keep = np.asarray(eqx.filter_jit(ImplicitOperator.as_matrix)(operator)), np.asarray(free).ravel()
     return A[np.ix_(keep, keep)], np.repeat(np.asarray(nodes.mass), 2)[keep]
 
@@ -209,11 +209,11 @@ def test_backward_euler_finds_the_same_with_projection_and_has_the_same_derivati
     def outcome(hessian):
         method = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-13), hessian, adjoint_solver=TIGHT)
 
-        def spread(E):
+        def scatter(E):
             moved = eqx.tree_at(lambda s: s.material.youngs_modulus, scene, E)
             return (mpm.rollout(moved, particles, steps=2, dt=dt, method=method).x ** 2).sum()
 
-        return jax.jvp(spread, (jnp.asarray(1e4),), (jnp.asarray(1.0),))
+        return jax.jvp(scatter, (jnp.asarray(1e4),), (jnp.asarray(1.0),))
 
     (a, da), (b, db) = outcome(mpm.AnalyticHessian()), outcome(PROJECTED)
     assert_close(a, b, 1e-12)
@@ -247,23 +247,23 @@ def test_projection_holds_where_the_plain_step_is_near_singular(times):
     once, _ = mpm.step(scene, particles, 0.0, dt, method=method)
     assert abs(spin_of(once) / spin_of(particles) - 1) < 0.01
     run = mpm.simulate(scene, particles, t1=20 * dt, dt=dt, method=method)
-    assert int(run.tally.indefinite) == 0
+    assert int(run.statistics.indefinite) == 0
     np.testing.assert_allclose(np.linalg.det(np.asarray(run.final.F)), 1, atol=2e-3)
     np.testing.assert_allclose(run.final.x.std() / particles.x.std(), 1 / 0.9, atol=2e-3)
 
 
 @pytest.mark.slow
 def test_negative_curvature_is_counted_by_steps():
-    """In the solver's statistics, a step's report and a run's tally; not where the material is stretched."""
+    """In the solver's statistics, a step's report and a run's statistics; not where the material is stretched."""
     scene, particles = compressed(noise=0.1)
     dt = 8 * explicit_limit(scene)
-    tally = mpm.simulate(scene, particles, t1=3 * dt, dt=dt, method=mpm.SemiImplicit(), throw=False).tally
+    statistics = mpm.simulate(scene, particles, t1=3 * dt, dt=dt, method=mpm.SemiImplicit(), throw=False).statistics
     state, count = particles, 0
     for _ in range(3):
         state, info = mpm.step(scene, state, 0.0, dt, method=mpm.SemiImplicit())
         count += int(info.solve.indefinite)
-    assert 1 <= int(tally.indefinite) == count
-    assert int(tally.merged(tally).indefinite) == 2 * count
+    assert 1 <= int(statistics.indefinite) == count
+    assert int(statistics.merged(statistics).indefinite) == 2 * count
     for hessian in (mpm.AnalyticHessian(), PROJECTED):  # Newton's directions are those of the projected one
         _, info = mpm.step(scene, particles, 0.0, dt, method=mpm.BackwardEuler(hessian=hessian))
         assert bool(info.solve.indefinite) == (hessian != PROJECTED)

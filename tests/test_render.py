@@ -10,6 +10,7 @@ from helpers import LAWS
 import mpmjax as mpm
 from mpmjax.simulation._statistics import no_steps
 from mpmjax.state._particles import State
+from mpmjax.viz._ray_casting import SAMPLES, Balls, Camera, look, paint, picture, surroundings
 from mpmjax.viz._render import (
     _bearing,
     _flat_canvas,
@@ -22,7 +23,6 @@ from mpmjax.viz._render import (
     _walls,
     skin,
 )
-from mpmjax.viz._splat import SAMPLES, Balls, Camera, look, paint, picture, surroundings
 
 SIZE = (161, 121)
 

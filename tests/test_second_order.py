@@ -9,8 +9,8 @@ from numpy_oracle import grid_update
 from test_implicit import jolted
 
 import mpmjax as mpm
-from mpmjax.implicit._constraint import Constraint
 from mpmjax.implicit._hessian import ImplicitOperator
+from mpmjax.implicit._projection import Projection
 from mpmjax.stepping._method import NodeMotion
 from mpmjax.stepping._step import impulses
 
@@ -55,8 +55,8 @@ def test_a_step_is_that_of_the_first_order_system(method, description):
     nodes = grid_update(scene, particles, dt, mpm.Explicit()).nodes
     motion, info = move(method, nodes)
     assert info.converged
-    action = method.hessian.at_rest(nodes.potential, nodes.force)
-    everything = ImplicitOperator(0 * nodes.mass, jnp.asarray(1.0), action, Constraint(jnp.ones_like(nodes.free)))
+    action = method.hessian.at_current(nodes.potential, nodes.force)
+    everything = ImplicitOperator(0 * nodes.mass, jnp.asarray(1.0), action, Projection(jnp.ones_like(nodes.free)))
     H = np.asarray(eqx.filter_jit(ImplicitOperator.as_matrix)(everything))
     free = np.asarray(nodes.free).ravel()
     m = np.repeat(np.asarray(nodes.mass), 2)[free]
@@ -111,7 +111,7 @@ def test_an_unconverged_first_stage_is_reported():
         _, q0, q1, q2 = method.weights()
         dt, v0, v, g = nodes.dt, nodes.velocity, motion.velocity, nodes.acceleration
         middle, c, pull = motion.inner / q2 - v0, q2 * dt, nodes.per_mass(nodes.force)
-        action = method.hessian.at_rest(nodes.potential, v0)
+        action = method.hessian.at_current(nodes.potential, v0)
         a = v0 + c * (pull + 2 * g)
         b = v0 + dt * (q0 * pull + q1 * (middle - a) / c + g)
 

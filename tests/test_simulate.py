@@ -59,7 +59,7 @@ def test_simulate_equals_the_plain_rollout(method, description, d):
     for frame, steps in [(run.frame(1), 4), (run.final, 8)]:
         assert_equal(state(frame), state(mpm.rollout(scene, particles, steps=steps, dt=DT, method=method)))
     assert_equal(state(run.frame(2)), state(run.final))
-    assert int(run.tally.steps) == 8
+    assert int(run.statistics.steps) == 8
 
 
 def test_frames_are_saved_at_the_start_every_so_many_steps_and_at_the_end():
@@ -163,7 +163,7 @@ def test_a_particle_that_is_not_finite_is_named():
     particles = eqx.tree_at(lambda p: p.v, particles, particles.v.at[5].set(1e308))
     with pytest.raises(mpm.SimulationError, match=r"At step 1 .* particle \d+ is no longer finite") as caught:
         mpm.simulate(scene, particles, t1=10 * DT, dt=DT)
-    assert int(caught.value.run.tally.fault) == NOT_FINITE
+    assert int(caught.value.run.statistics.fault) == NOT_FINITE
     assert_equal(caught.value.run.final.x, particles.x)
 
 
@@ -211,7 +211,7 @@ def test_a_blow_up_names_the_limit_and_by_how_much_the_step_is_above_it(law):
         assert said.index("Take a dt") < said.index("If the fault stays, ")
         assert "FixedCorotated," not in said or law is LAWS["neo_hookean"]
     run = mpm.simulate(scene, particles, t1=200 * 0.7 * limit, dt=0.7 * limit)
-    assert bool(run.tally.healthy)
+    assert bool(run.statistics.healthy)
 
 
 def test_advice_weighs_the_step_against_the_limit_of_the_method_there_and_then():
@@ -281,15 +281,15 @@ def test_inversion_of_a_law_that_does_not_allow_it_is_named():
 
 
 def test_an_unconverged_solve_is_raised():
-    """With the number of steps concerned and the worst residual; throw=False leaves it to the tally."""
+    """With the number of steps concerned and the worst residual; throw=False leaves it to the statistics."""
     scene, particles = pulled()
     method = mpm.SemiImplicit(solver=mpm.ConjugateResidual(max_steps=2))
     with pytest.raises(mpm.SimulationError, match="of 4 of 4 steps did not converge"):
         mpm.simulate(scene, particles, t1=4 * 0.1, dt=0.1, method=method)
     run = mpm.simulate(scene, particles, t1=4 * 0.1, dt=0.1, method=method, throw=False)
-    assert int(run.tally.unconverged) == 4
-    assert float(run.tally.worst_residual) > 1e-8
-    assert int(run.tally.most_iterations) == 2
+    assert int(run.statistics.unconverged) == 4
+    assert float(run.statistics.worst_residual) > 1e-8
+    assert int(run.statistics.most_iterations) == 2
 
 
 @pytest.mark.parametrize("metric", mpm.Metric, ids=lambda m: m.value)
@@ -302,15 +302,15 @@ def test_a_solve_that_misses_its_tolerance_by_little_is_a_warning(metric):
         method = mpm.SemiImplicit(solver=mpm.ConjugateResidual(rtol, max_steps=3), metric=metric)
         return mpm.simulate(scene, particles, t1=0.1, dt=0.1, method=method, **options)
 
-    reached = float(simulated(1e-12, throw=False).tally.worst_residual)
+    reached = float(simulated(1e-12, throw=False).statistics.worst_residual)
     for share, short in ((8.0, 1), (1.01, 1), (0.99, 0)):
         with pytest.warns(UserWarning, match="1 of 1 steps missed its tolerance") if short else nullcontext():
-            tally = simulated(reached / share).tally
-        assert (int(tally.short), int(tally.unconverged), bool(tally.healthy)) == (short, 0, True)
+            statistics = simulated(reached / share).statistics
+        assert (int(statistics.short), int(statistics.unconverged), bool(statistics.healthy)) == (short, 0, True)
     with pytest.raises(mpm.SimulationError, match="of 1 of 1 steps did not converge") as caught:
         simulated(reached / 12)
     assert ("Metric.DIAGONAL" in str(caught.value)) == (metric is mpm.Metric.MASS)
-    assert int(caught.value.run.tally.short) == 0
+    assert int(caught.value.run.statistics.short) == 0
 
 
 def test_a_rollout_from_another_step_compiles_nothing():
@@ -328,7 +328,7 @@ def test_a_rollout_from_another_step_compiles_nothing():
 
 @pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in ("explicit", "semi_implicit")}))
 def test_a_batch_member_that_fails_leaves_the_others_alone(method):
-    """One of three is driven to NaN: the other two are the same bit for bit as without, and the tally says which."""
+    """One of three is driven to NaN: the other two are the same bit for bit as without, and the statistics says which."""
     scene, particles = pulled()
 
     @eqx.filter_jit
@@ -336,7 +336,7 @@ def test_a_batch_member_that_fails_leaves_the_others_alone(method):
         def member(speed):
             moved = eqx.tree_at(lambda p: p.v, particles, speed * particles.v)
             run = mpm.simulate(scene, moved, t1=6 * DT, dt=DT, method=method, throw=False)
-            return state(run.final), run.tally.fault
+            return state(run.final), run.statistics.fault
 
         return jax.vmap(member)(speeds)
 
@@ -387,7 +387,7 @@ def test_bad_times_are_refused(options, message):
 def test_the_number_of_steps_is_robust_to_rounding():
     """0.3 / 0.1 is three steps."""
     scene, particles = pulled()
-    assert int(mpm.simulate(scene, particles, t1=0.3 / 100, dt=0.1 / 100).tally.steps) == 3
+    assert int(mpm.simulate(scene, particles, t1=0.3 / 100, dt=0.1 / 100).statistics.steps) == 3
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
@@ -403,7 +403,7 @@ def test_the_stable_step_is_the_longest_of_whole_steps(dtype):
         assert steps == 1 or t1 / (steps - 1) > bound
     t1 = 10.4 * bound
     run = mpm.simulate(scene, particles, t1=t1, dt="stable", save_every=10**18)
-    assert int(run.tally.steps) == 11
+    assert int(run.statistics.steps) == 11
     assert len(run) == 2
     np.testing.assert_allclose(run.dt, t1 / 11, rtol=1e-6)
     assert_equal(state(run.final), state(mpm.simulate(scene, particles, t1=t1, dt=run.dt).final))

@@ -27,7 +27,7 @@ def test_the_return_map_clamps_the_singular_values(d):
     F, history = trials(d)
     U, s, Vt = np.linalg.svd(np.moveaxis(np.asarray(F), -1, 0))
     expected = U * np.clip(s, 1 - 2.5e-2, 1 + 7.5e-3)[:, None] @ Vt
-    clamped, after = jax.jit(SNOW.returned)(F, history)
+    clamped, after = jax.jit(SNOW.return_map)(F, history)
     assert_close(np.moveaxis(np.asarray(clamped), -1, 0), expected, 1e-14)
     volume = np.linalg.det(np.moveaxis(np.asarray(F), -1, 0)) * history.plastic_volume
     assert_close(np.linalg.det(expected) * after.plastic_volume, volume, 1e-13)
@@ -37,7 +37,7 @@ def test_the_return_map_clamps_the_singular_values(d):
 def test_what_does_not_yield_comes_back_bit_for_bit(d):
     """And its history too."""
     F, history = trials(d, size=2e-3)
-    clamped, after = jax.jit(SNOW.returned)(F, history)
+    clamped, after = jax.jit(SNOW.return_map)(F, history)
     assert np.array_equal(clamped, F)
     assert np.array_equal(after.plastic_volume, history.plastic_volume)
 
@@ -45,8 +45,8 @@ def test_what_does_not_yield_comes_back_bit_for_bit(d):
 def squeezed(d, rates, steps):
     """F_E, history and total stretches of one particle strained along its axes by F ← (1 + rate) F, step by step."""
     F, total = jnp.eye(d)[..., None], np.ones(d)
-    history = SNOW.virgin(F)
-    returned = jax.jit(SNOW.returned)
+    history = SNOW.initial_history(F)
+    returned = jax.jit(SNOW.return_map)
     for _ in range(steps):
         F = F * (1 + jnp.asarray(rates))[:, None, None]
         total = total * (1 + np.asarray(rates))
@@ -80,8 +80,8 @@ def test_isotropic_extension_tears():
 def test_simple_shear_turns_and_yields():
     """The principal stretches of a sheared particle reach both limits, and J_P = 1/((1 − θ_c)(1 + θ_s)) from then on:
     shear keeps the volume, J_E J_P = 1."""
-    returned = jax.jit(SNOW.returned)
-    F, history = jnp.eye(2)[..., None], SNOW.virgin(jnp.eye(2)[..., None])
+    returned = jax.jit(SNOW.return_map)
+    F, history = jnp.eye(2)[..., None], SNOW.initial_history(jnp.eye(2)[..., None])
     step = jnp.asarray([[0.0, 1e-3], [0.0, 0.0]])
     for _ in range(200):
         F, history = returned(F + jnp.einsum("ij,jkp->ikp", step, F), history)
@@ -93,7 +93,7 @@ def test_simple_shear_turns_and_yields():
 def test_plane_strain_is_three_dimensional_strain_with_a_stretch_of_one():
     F, history = trials(2)
     solid = jnp.zeros((3, 3, F.shape[-1])).at[:2, :2].set(F).at[2, 2].set(1.0)
-    flat, thick = jax.jit(SNOW.returned)(F, history), jax.jit(SNOW.returned)(solid, history)
+    flat, thick = jax.jit(SNOW.return_map)(F, history), jax.jit(SNOW.return_map)(solid, history)
     assert_close(thick[0][:2, :2], flat[0], 1e-14)
     assert_close(thick[1].plastic_volume, flat[1].plastic_volume, 1e-14)
     stress = [SNOW.elastic(after).stress(E) for E, after in (flat, thick)]
@@ -107,7 +107,7 @@ def test_the_return_map_creates_no_energy(d):
 
     def gain(snow):
         F, history = trials(d, n=2000, size=0.02)
-        after, later = jax.jit(snow.returned)(F, history)
+        after, later = jax.jit(snow.return_map)(F, history)
         before = snow.elastic(history).energy(F)
         return float((snow.elastic(later).energy(after) / before - 1).max())
 
@@ -116,10 +116,10 @@ def test_the_return_map_creates_no_energy(d):
     F, _ = trials(d, n=2000, size=0.02)
     for torn in (1.5, 2.0, 3.0):
         history = SnowHistory(jnp.full(F.shape[2:], torn))
-        after, later = jax.jit(SNOW.returned)(F, history)
+        after, later = jax.jit(SNOW.return_map)(F, history)
         more = SNOW.elastic(later).energy(after) - SNOW.elastic(history).energy(F)
         first = 1 - SNOW.critical_compression
-        yielding = SNOW.elastic(SNOW.virgin(F)).energy(first * jnp.eye(d)[..., None])
+        yielding = SNOW.elastic(SNOW.initial_history(F)).energy(first * jnp.eye(d)[..., None])
         assert float(more.max()) < 1e-2 * float(yielding[0])
 
 
@@ -132,7 +132,7 @@ def test_inverted_snow_is_a_fault():
 
 
 def outcome(snow, F, history):
-    after, later = snow.returned(F, history)
+    after, later = snow.return_map(F, history)
     return jnp.concatenate([after.reshape(-1), later.plastic_volume])
 
 

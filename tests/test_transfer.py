@@ -13,10 +13,10 @@ import mpmjax as mpm
 from mpmjax._types import components
 from mpmjax.discretisation._stencil import make_stencil
 from mpmjax.discretisation._transfer import g2p, p2g
-from mpmjax.discretisation._transfer_sums import collect
+from mpmjax.discretisation._transfer_sums import gather
 
 make, to_grid, to_particles = eqx.filter_jit(make_stencil), eqx.filter_jit(p2g), eqx.filter_jit(g2p)
-from_nodes = eqx.filter_jit(collect)
+from_nodes = eqx.filter_jit(gather)
 
 EACH_KERNEL = pytest.mark.parametrize("kernel", **ids(KERNELS))
 EACH_DIM = pytest.mark.parametrize("d", DIMS)

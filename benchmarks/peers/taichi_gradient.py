@@ -58,7 +58,7 @@ class TaichiGradient:
                 self._C[0, q], self._F[0, q] = ti.Matrix.zero(real, d, d), ti.Matrix.identity(real, d)
 
         @ti.kernel
-        def spread(n: int):
+        def scatter(n: int):
             for q in range(p):
                 base = (self._x[n, q] * inv_dx - 0.5).cast(int)
                 f = self._x[n, q] * inv_dx - base.cast(real)
@@ -83,7 +83,7 @@ class TaichiGradient:
                     self._velocity[n, i, j] = self._momentum[n, i, j] / self._mass[n, i, j] + dt * ti.Vector(g)
 
         @ti.kernel
-        def collect(n: int):
+        def gather(n: int):
             for q in range(p):
                 base = (self._x[n, q] * inv_dx - 0.5).cast(int)
                 f = self._x[n, q] * inv_dx - base.cast(real)
@@ -104,7 +104,7 @@ class TaichiGradient:
             for q in range(p):
                 self._loss[None] += self._x[steps, q].norm_sqr() / p
 
-        self._kernels = start, spread, update, collect, size
+        self._kernels = start, scatter, update, gather, size
 
     def forward(self) -> float:
         """The mean of ‖x‖² [m²]."""
@@ -124,12 +124,12 @@ class TaichiGradient:
             field.fill(0)
 
     def _run(self) -> None:
-        start, spread, update, collect, size = self._kernels
+        start, scatter, update, gather, size = self._kernels
         start()
         for n in range(self._steps):
-            spread(n)
+            scatter(n)
             update(n)
-            collect(n)
+            gather(n)
         size()
 
     def bytes(self) -> int:

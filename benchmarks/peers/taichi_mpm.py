@@ -55,7 +55,7 @@ class TaichiMPM:
         m, volume0, mu, lam = float(mass), float(volume), float(shear_modulus), float(lame_lambda)
 
         @ti.kernel
-        def spread(dt: real):
+        def scatter(dt: real):
             for q in self._x:
                 base = (self._x[q] * inv_dx - 0.5).cast(int)
                 f = self._x[q] * inv_dx - base.cast(real)
@@ -82,7 +82,7 @@ class TaichiMPM:
                     self._momentum[i] = velocity
 
         @ti.kernel
-        def collect(dt: real):
+        def gather(dt: real):
             for q in self._x:
                 base = (self._x[q] * inv_dx - 0.5).cast(int)
                 f = self._x[q] * inv_dx - base.cast(real)
@@ -100,7 +100,7 @@ class TaichiMPM:
                 self._x[q] += dt * v
                 self._F[q] = (identity + dt * C) @ self._F[q]
 
-        self._kernels = spread, update, collect
+        self._kernels = scatter, update, gather
 
     def restart(self) -> None:
         """Back to the initial state."""
@@ -109,13 +109,13 @@ class TaichiMPM:
 
     def run(self, steps: int, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Go on for some steps. Returns x, v and F."""
-        spread, update, collect = self._kernels
+        scatter, update, gather = self._kernels
         for _ in range(steps):
             self._momentum.fill(0)
             self._mass.fill(0)
-            spread(dt)
+            scatter(dt)
             update(dt)
-            collect(dt)
+            gather(dt)
         ti.sync()
         state: tuple[Any, ...] = tuple(a.to_numpy() for a in (self._x, self._v, self._F))
         return state

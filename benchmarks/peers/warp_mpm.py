@@ -107,7 +107,7 @@ def kernels(d: int) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
                 momentum[i, j, k] = v
 
     @wp.kernel
-    def spread(
+    def scatter(
         x: wp.array(dtype=vec),
         v: wp.array(dtype=vec),
         C: wp.array(dtype=mat),
@@ -131,7 +131,7 @@ def kernels(d: int) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
         scatter(mass, momentum, base, x[q] * inv_dx - base, m, m * v[q], affine, dx)
 
     @wp.kernel
-    def collect(
+    def gather(
         x: wp.array(dtype=vec),
         v: wp.array(dtype=vec),
         C: wp.array(dtype=mat),
@@ -151,7 +151,7 @@ def kernels(d: int) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
         x[q] = x[q] + dt * new
         F[q] = F[q] + dt * gradient * F[q]
 
-    return spread, update, collect
+    return scatter, update, gather
 
 
 class WarpMPM:
@@ -194,13 +194,13 @@ class WarpMPM:
 
     def run(self, steps: int, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Go on for some steps. Returns x, v and F."""
-        spread, update, collect = self._kernels
+        scatter, update, gather = self._kernels
         particles, (mass, momentum), spacing = self._particles, self._grid, self._constants[-1]
         for _ in range(steps):
             mass.zero_()
             momentum.zero_()
-            wp.launch(spread, particles[0].shape, [*particles, *self._grid, *self._constants, dt], device="cpu")
+            wp.launch(scatter, particles[0].shape, [*particles, *self._grid, *self._constants, dt], device="cpu")
             wp.launch(update, mass.shape, [*self._grid, self._gravity, dt, self._floor], device="cpu")
-            wp.launch(collect, particles[0].shape, [*particles, momentum, spacing, dt], device="cpu")
+            wp.launch(gather, particles[0].shape, [*particles, momentum, spacing, dt], device="cpu")
         x, v, _, F = (a.numpy().copy() for a in particles)
         return x, v, F

@@ -155,7 +155,7 @@ class Bench(NamedTuple):
         scene, dt, method = canonical((self.scene, self.t1 / steps, method), dtype)
         state, states = state_of(self.particles), []
         for k in range(frames):
-            _, state, tally, previous, _ = integrate(
+            _, state, statistics, previous, _ = integrate(
                 scene,
                 with_state(self.particles, state),
                 jnp.asarray(k * each, dtype),
@@ -169,10 +169,10 @@ class Bench(NamedTuple):
                 progress=False,
                 watch=True,
             )
-            if not bool(jax.block_until_ready(tally.healthy)):
+            if not bool(jax.block_until_ready(statistics.healthy)):
                 if throw:
-                    final, number = with_state(self.particles, state), k * each + tally.steps.astype(dtype)
-                    run = Run(scene, method, dt, jnp.zeros((0,), dtype), None, None, final, number, tally)
+                    final, number = with_state(self.particles, state), k * each + statistics.steps.astype(dtype)
+                    run = Run(scene, method, dt, jnp.zeros((0,), dtype), None, None, final, number, statistics)
                     raise_faults(run, self.particles, previous, k * each)
                 return None
             states.append(state)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Float, Matrix, NodeVector, Scalar, components
 from mpmjax.analysis._diagnostics import energy_density, energy_of
 from mpmjax.checks import canonical, checked, require_positive
-from mpmjax.discretisation import FLIP, Stencil, collect, spread
+from mpmjax.discretisation import FLIP, Stencil, gather, scatter
 from mpmjax.state import Particles, Scene, prepare
 from mpmjax.stepping import Explicit, GridUpdate, Method, Nodes, grid_to_particles, particles_to_grid, update
 
@@ -169,22 +169,22 @@ def _step_budget(
 
     # impulses at the nodes
     elastic, elastic_at_start = new.elastic, dt * nodes.force
-    raw = spread(stencil, before.mass[None], None, scene.grid.size)
+    raw = scatter(stencil, before.mass[None], None, scene.grid.size)
     weight = dt * images.fold(raw * jnp.asarray(scene.gravity))
     body = jnp.where(nodes.occupied, dt * nodes.mass[:, None] * nodes.acceleration - weight, 0)
-    boundary, missed = new.free.split(0, new.reaction), new.free.split(new.reaction, 0)
+    boundary, missed = new.free.combine(0, new.reaction), new.free.combine(new.reaction, 0)
 
     # viscosity: its impulse, and what it dissipates of the velocity that it resists
     C, resisted = None if before.C is None else components(before.C), new.motion.resisted
     viscous, dissipated = jnp.zeros_like(v0), jnp.zeros((), v0.dtype)
     if new.viscous is not None and C is not None:
-        power = (potential.drag_flux(C) * C).sum() if resisted is None else potential.power(resisted)
+        power = (potential.viscous_flux(C) * C).sum() if resisted is None else potential.power(resisted)
         viscous, dissipated = new.viscous, dt * power
 
     # particle and nodes beside each other
     v_old = components(before.v)
-    arrived = collect(stencil, images.unfold(new.before))[0]
-    moved = collect(stencil, all1)[0]
+    arrived = gather(stencil, images.unfold(new.before))[0]
+    moved = gather(stencil, all1)[0]
     C_old, C_new = (components(q.C) if scene.transfer.affine and q.C is not None else None for q in (before, after))
     beside = scene.transfer.alpha * (v_old - arrived) if isinstance(scene.transfer, FLIP) else jnp.zeros_like(v_old)
     lost_p2g, gained_p2g = _mismatch(stencil, before.mass, v_old, C_old, all0)

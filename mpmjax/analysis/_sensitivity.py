@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, ParticleVector, Scalar
 from mpmjax.checks import checked, is_traced, require, require_positive, require_whole
-from mpmjax.simulation import HEALTHY, Tally, number_of_steps, simulate
+from mpmjax.simulation import HEALTHY, RunStatistics, number_of_steps, simulate
 from mpmjax.state import Particles, Scene, prepare
 from mpmjax.stepping import Explicit, Method, step_for
 
@@ -100,7 +100,7 @@ def sensitivity(
     require(change.shape == shape, f"velocity must have the particles' shape {shape}, got {change.shape}.")
     require((change != 0).any(), "velocity must not be zero everywhere: there is nothing to follow.")
 
-    def flown(v: ParticleVector) -> tuple[tuple[Array, Any], tuple[Array, Tally]]:
+    def flown(v: ParticleVector) -> tuple[tuple[Array, Any], tuple[Array, RunStatistics]]:
         thrown = eqx.tree_at(lambda p: p.v, particles, v)
         run = simulate(
             scene,
@@ -114,12 +114,14 @@ def sensitivity(
             adjoint=diffrax.ForwardMode(),
             throw=False,
         )
-        return (run.observed, run.report), (run.steps, run.tally)
+        return (run.observed, run.report), (run.steps, run.statistics)
 
-    _, (moved, unsolved), (steps, tally) = jax.jvp(flown, (particles.v,), (change,), has_aux=True)
-    report = _measure(moved[1:], steps[1:] - steps[0], tally, unsolved, particles.mass, change, jnp.asarray(dt, dtype))
+    _, (moved, unsolved), (steps, statistics) = jax.jvp(flown, (particles.v,), (change,), has_aux=True)
+    report = _measure(
+        moved[1:], steps[1:] - steps[0], statistics, unsolved, particles.mass, change, jnp.asarray(dt, dtype)
+    )
     if not is_traced(report) and not report.worst <= warn_at:
-        warnings.warn(_complaint(report, tally, float(unsolved), warn_at), stacklevel=2)
+        warnings.warn(_complaint(report, statistics, float(unsolved), warn_at), stacklevel=2)
     return report
 
 
@@ -130,30 +132,34 @@ def _positions(scene: Scene, particles: Particles) -> ParticleVector:
 
 @jax.jit
 def _measure(
-    moved: Array, steps: Array, tally: Tally, unsolved: Array, mass: Array, change: Array, dt: Array
+    moved: Array, steps: Array, statistics: RunStatistics, unsolved: Array, mass: Array, change: Array, dt: Array
 ) -> Sensitivity:
     def norm(a: Array) -> Array:
         return jnp.sqrt((mass[:, None] * a**2).sum(axis=(-2, -1)))
 
     times = steps * dt
-    faulty = (tally.fault != HEALTHY) & (steps >= tally.fault_step.astype(steps.dtype))
-    lost = faulty | (tally.unconverged > 0) | (unsolved > 0)
+    faulty = (statistics.fault != HEALTHY) & (steps >= statistics.fault_step.astype(steps.dtype))
+    lost = faulty | (statistics.unconverged > 0) | (unsolved > 0)
     growth = jnp.where(lost, jnp.nan, norm(moved) / (times * norm(change)))
     usable = jnp.isfinite(growth) & (growth > 0)
     weight = usable.astype(growth.dtype)
     weight = weight / jnp.maximum(weight.sum(), 1)
     logarithm = jnp.log(jnp.where(usable, growth, 1))
     centred = times - (weight * times).sum()
-    spread = (weight * centred**2).sum()
-    rate = (weight * centred * logarithm).sum() / jnp.where(spread == 0, 1, spread)
+    scatter = (weight * centred**2).sum()
+    rate = (weight * centred * logarithm).sum() / jnp.where(scatter == 0, 1, scatter)
     return Sensitivity(times=times, steps=steps, growth=growth, rate=rate)
 
 
-def _complaint(report: Sensitivity, tally: Tally, unsolved: float, warn_at: float | int) -> str:
+def _complaint(report: Sensitivity, statistics: RunStatistics, unsolved: float, warn_at: float | int) -> str:
     steps, times, over = report.steps, report.times, ~(report.growth <= warn_at)
     told = f"Over {int(steps[-1])} steps (t = {float(times[-1]):.4g} s) "
-    if not tally.healthy:
-        what = f"meets a fault at step {int(tally.fault_step)}" if int(tally.fault) else "does not solve its equations"
+    if not statistics.healthy:
+        what = (
+            f"meets a fault at step {int(statistics.fault_step)}"
+            if int(statistics.fault)
+            else "does not solve its equations"
+        )
         return told + f"the run {what} and has no derivative from there on: see what simulate says of it."
     if unsolved > 0:
         return told + (

@@ -2,7 +2,7 @@
 
 from mpmjax.boundary._collider import AbstractCollider, SeparatingCollider, SlipCollider, StickyCollider
 from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, Conditions, combine
-from mpmjax.boundary._exchange import Exchange, nothing_received, received
+from mpmjax.boundary._exchange import ColliderImpulse, nothing_received, received
 from mpmjax.boundary._grip import Grip
 from mpmjax.boundary._mirror import Contact, Mirror, contacts, mirror
 from mpmjax.boundary._planes import ContactPlane, Plane, SymmetryPlane, fits
@@ -12,10 +12,10 @@ __all__ = [
     "ON_THE_WALL",
     "AbstractBoundary",
     "AbstractCollider",
+    "ColliderImpulse",
     "Conditions",
     "Contact",
     "ContactPlane",
-    "Exchange",
     "Grip",
     "Mirror",
     "Plane",

@@ -11,7 +11,7 @@ from mpmjax.boundary._conditions import Touch
 from mpmjax.linalg import pairs
 
 
-class Exchange(eqx.Module):
+class ColliderImpulse(eqx.Module):
     """Linear and angular impulse on each of k colliders; over the step they are its mean force and torque.
 
     What the nodes before a symmetry plane take is counted, not what their images take.
@@ -26,19 +26,19 @@ class Exchange(eqx.Module):
     are the change of angular momentum, Σ x^n × m Δv = Δ Σ x × m v where x moves with v^{n+1}, and
     Σ ½(x^n + x^{n+1}) × m Δv where it moves with the mean."""
 
-    def plus(self, later: "Exchange") -> "Exchange":
+    def plus(self, later: "ColliderImpulse") -> "ColliderImpulse":
         """Both together."""
         return jax.tree.map(jnp.add, self, later)
 
 
-def nothing_received(colliders: int, dim: int, dtype: Any) -> Exchange:
+def nothing_received(colliders: int, dim: int, dtype: Any) -> ColliderImpulse:
     """Of so many colliders, at the start."""
-    return Exchange(jnp.zeros((colliders, dim), dtype), jnp.zeros((colliders, len(pairs(dim))), dtype))
+    return ColliderImpulse(jnp.zeros((colliders, dim), dtype), jnp.zeros((colliders, len(pairs(dim))), dtype))
 
 
 def received(
     touch: Touch, reaction: NodeVector, push: NodeScalar | None = None, rub: NodeVector | None = None
-) -> Exchange:
+) -> ColliderImpulse:
     """Minus what each collider gives the nodes: prescribed components, the push along normals, friction.
 
     Args:
@@ -54,7 +54,7 @@ def received(
         given = jnp.where((touch.owner == number)[:, None], along, 0) + jnp.where(touch.holder == number, reaction, 0)
         impulse.append(-given.sum(axis=0))
         angular.append(-_moment(touch.position - pivot, given).sum(axis=0))
-    return Exchange(jnp.stack(impulse), jnp.stack(angular))
+    return ColliderImpulse(jnp.stack(impulse), jnp.stack(angular))
 
 
 def _moment(arm: NodeVector, force: NodeVector) -> Float[Array, "n r"]:

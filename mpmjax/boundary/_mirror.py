@@ -122,10 +122,12 @@ class Contact(eqx.Module):
         lacking = (v - self.image.vector(v))[:, self.image.axis]
         return self.inward * self.image.column(self.weight(mass) * lacking)
 
-    def impulse(self, imbalance: NodeVector) -> NodeScalar:
+    def impulse(self, momentum_residual: NodeVector) -> NodeScalar:
         """The normal impulse [kg m/s] that holds the column, inward positive."""
         share = self.image.along(jnp.where(self.before < 0, 2, jnp.where(self.before == 0, 1, 0)))
-        return self.inward * self.image.column(share.astype(imbalance.dtype) * imbalance[:, self.image.axis])
+        return self.inward * self.image.column(
+            share.astype(momentum_residual.dtype) * momentum_residual[:, self.image.axis]
+        )
 
 
 def _image(plane: Plane, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, Array]:

@@ -85,7 +85,7 @@ def run_command(
         resume=resume,
         progress=not quiet,
     )
-    taken, seconds = int(run.tally.steps) - done, time.perf_counter() - begun
+    taken, seconds = int(run.statistics.steps) - done, time.perf_counter() - begun
     with reporting(lambda: f"{output} is complete."):
         print(_summary(job, run, taken, seconds))
     reached = f"complete already: it reaches t = {float(run.final_step * run.dt):.6g} s" if resume and not taken else ""
@@ -107,7 +107,7 @@ def _print_error(line: str) -> None:
 
 def _summary(job: Job, run: Run, taken: int, seconds: float) -> str:
     """What a run cost, `taken` of its steps in these seconds, and how well it kept mass and energy."""
-    steps, p = int(run.tally.steps), run.final.count
+    steps, p = int(run.statistics.steps), run.final.count
     before, after = energy(run.scene, job.particles), energy(run.scene, run.final)
     mass = float(run.final.mass.sum())
     lines = [
@@ -115,26 +115,29 @@ def _summary(job: Job, run: Run, taken: int, seconds: float) -> str:
         ("steps", f"{steps} of {float(run.dt):.4g} s with {type(run.method).__name__}"),
         ("wall time", f"{seconds:.3g} s (compilation included), {taken * p / seconds:.3g} particle-steps per second"),
     ]
-    if int(run.tally.iterations) > 0:
+    if int(run.statistics.iterations) > 0:
         lines.append(
             (
                 "solver",
-                f"{int(run.tally.iterations) / steps:.3g} iterations a step, at most {int(run.tally.most_iterations)}, "
-                f"worst relative residual {float(run.tally.worst_residual):.2g}",
+                f"{int(run.statistics.iterations) / steps:.3g} iterations a step, at most "
+                f"{int(run.statistics.most_iterations)}, worst relative residual "
+                f"{float(run.statistics.worst_residual):.2g}",
             )
         )
-    if int(run.tally.newton) > 0:
-        lines.append(("Newton", f"{int(run.tally.newton) / steps:.3g} a step, {int(run.tally.line_search)} halvings"))
-    if int(run.tally.indefinite) > 0:
+    if int(run.statistics.newton) > 0:
+        lines.append(
+            ("Newton", f"{int(run.statistics.newton) / steps:.3g} a step, {int(run.statistics.line_search)} halvings")
+        )
+    if int(run.statistics.indefinite) > 0:
         lines.append(
             (
                 "indefinite",
-                f"the system of {int(run.tally.indefinite)} of {steps} steps: compressed material; if the motion looks "
-                'wrong, reduce dt or take hessian = { kind = "AnalyticHessian", projected = true }',
+                f"the system of {int(run.statistics.indefinite)} of {steps} steps: compressed material; if the "
+                'motion looks wrong, reduce dt or take hessian = { kind = "AnalyticHessian", projected = true }',
             )
         )
-    if int(run.tally.violations) > 0:
-        lines.append(("contact", f"{int(run.tally.violations)} conditions left violated"))
+    if int(run.statistics.violations) > 0:
+        lines.append(("contact", f"{int(run.statistics.violations)} conditions left violated"))
     whole, parts = pieces(run.scene, job.particles), pieces(run.scene, run.final)
     if parts > whole:
         advice = "if nothing was to part, this is numerical fracture: more particles a cell, or TotalLagrangian"

@@ -5,7 +5,7 @@ from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._kernel import BSpline
 from mpmjax.discretisation._stencil import Stencil, in_window, make_stencil
 from mpmjax.discretisation._transfer import APIC, FLIP, PIC, Transfer, g2p, p2g
-from mpmjax.discretisation._transfer_sums import collect, spread
+from mpmjax.discretisation._transfer_sums import gather, scatter
 
 __all__ = [
     "APIC",
@@ -18,10 +18,10 @@ __all__ = [
     "SplineGradient",
     "Stencil",
     "Transfer",
-    "collect",
     "g2p",
+    "gather",
     "in_window",
     "make_stencil",
     "p2g",
-    "spread",
+    "scatter",
 ]

@@ -22,7 +22,7 @@ class Stencil(eqx.Module):
     respect to those. Component first: the particle axis is last.
     """
 
-    shares: Int[Array, "d s p"]
+    index_factors: Int[Array, "d s p"]
     """What each axis adds to the flat node index, shape (d, s, p); meaningless for a particle that is not `inside`."""
     weights: Float[Array, "d s p"]
     """Weights along each axis [-], shape (d, s, p)."""
@@ -50,7 +50,7 @@ class Stencil(eqx.Module):
     @property
     def index(self) -> Indices:
         """Flat index of each stencil node, shape (s^d, p)."""
-        return _tensor(jnp.add, list(self.shares))
+        return _tensor(jnp.add, list(self.index_factors))
 
     @property
     def weight(self) -> Float[Array, "k p"]:
@@ -106,7 +106,7 @@ def make_stencil(
         case _:
             raise ValueError(f"A gradient must be SplineGradient or MLSGradient, got {gradient!r}.")
     return Stencil(
-        shares=_shares(kernel, grid, window, xi),
+        index_factors=_index_factors(kernel, grid, window, xi),
         weights=weights,
         slopes=slopes,
         affine_slopes=least_squares if affine and not same else None,
@@ -115,7 +115,7 @@ def make_stencil(
     )
 
 
-def _shares(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Array) -> Int[Array, "d s p"]:
+def _index_factors(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Array) -> Int[Array, "d s p"]:
     """What each axis adds to the C-order index of a particle's nodes."""
     first = jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window[:, None]
     along = first[:, None] + jnp.arange(kernel.order + 1, dtype=jnp.int32)[:, None]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Float, Matrix, NodeScalar, NodeVector, Scalar
 from mpmjax.checks import require_between, require_fields
 from mpmjax.discretisation._stencil import Stencil
-from mpmjax.discretisation._transfer_sums import collect, spread
+from mpmjax.discretisation._transfer_sums import gather, scatter
 
 
 class PIC(eqx.Module):
@@ -87,7 +87,7 @@ def p2g(
         along = stencil.least_squares
         arms.append(mass * C * stencil.moment)
     slopes = jnp.pad(jnp.swapaxes(sum(arms), 0, 1), ((0, 0), (1, 0), (0, 0))) if arms else None
-    nodes = spread(along, jnp.concatenate([mass[None], mass * v]), slopes, size)
+    nodes = scatter(along, jnp.concatenate([mass[None], mass * v]), slopes, size)
     return nodes[:, 0], nodes[:, 1:]
 
 
@@ -118,7 +118,7 @@ def g2p(
     fields = [after] if mean is None else [after, mean]
     if isinstance(transfer, FLIP):
         fields.append(after - before)
-    values, gradients = collect(stencil, jnp.concatenate(fields, axis=1))
+    values, gradients = gather(stencil, jnp.concatenate(fields, axis=1))
     arrived, *others = jnp.split(values, len(fields))
     slope, *other_slopes = (jnp.swapaxes(g, 0, 1) for g in jnp.split(gradients, len(fields), axis=1))
     new, C = arrived, slope if kept else None
@@ -126,7 +126,7 @@ def g2p(
         case APIC() if stencil.affine_slopes is None:
             C = slope
         case APIC():
-            C = jnp.swapaxes(collect(stencil.least_squares, after)[1], 0, 1)
+            C = jnp.swapaxes(gather(stencil.least_squares, after)[1], 0, 1)
         case FLIP(alpha=alpha):
             new = alpha * (v + others[-1]) + (1 - alpha) * arrived
         case PIC():

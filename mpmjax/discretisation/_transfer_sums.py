@@ -1,4 +1,4 @@
-"""The two sums that cross between particles and grid: `collect` and `spread`, each other's transpose.
+"""The two sums that cross between particles and grid: `gather` and `scatter`, each other's transpose.
 
 Weights and gradients of a stencil are products of one factor an axis, so both sums are factorised: what is summed along
 the last axis, with its weights and with its slopes, meets one factor for each axis before it, and a gradient costs
@@ -31,21 +31,21 @@ _ROW = 4
 three times as long as four, being added one by one."""
 
 
-def collect(stencil: Stencil, nodes: Float[Array, "n c"]) -> tuple[Float[Array, "c p"], Float[Array, "d c p"]]:
+def gather(stencil: Stencil, nodes: Float[Array, "n c"]) -> tuple[Float[Array, "c p"], Float[Array, "d c p"]]:
     """The sums over each particle's nodes Σ_i w_ip f_i, and Σ_i g_ip f_i for each direction of the gradient.
 
     Args:
         stencil: stencil of the particles.
         nodes: f_i, shape (n, c).
     """
-    value, *slopes = _collect_p.bind(*_factors(stencil), nodes, batched=0)
+    value, *slopes = _gather_p.bind(*_factors(stencil), nodes, batched=0)
     return value, jnp.stack(slopes)
 
 
-def spread(
+def scatter(
     stencil: Stencil, value: Float[Array, "c p"] | None, slopes: Float[Array, "d c p"] | None, size: int
 ) -> Float[Array, "n c"]:
-    """The sums at the nodes Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b): `collect`'s transpose.
+    """The sums at the nodes Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b): `gather`'s transpose.
 
     What goes to a node that does not exist is dropped.
 
@@ -56,11 +56,11 @@ def spread(
         size: number of nodes n.
     """
     given = [*([] if value is None else [value]), *([] if slopes is None else slopes)]
-    return _spread_p.bind(*_factors(stencil), *given, valued=value is not None, size=size, batched=0)[0]
+    return _scatter_p.bind(*_factors(stencil), *given, valued=value is not None, size=size, batched=0)[0]
 
 
 def _factors(stencil: Stencil) -> tuple[Array, ...]:
-    return stencil.shares, stencil.weights, stencil.slopes
+    return stencil.index_factors, stencil.weights, stencil.slopes
 
 
 # The sums themselves, of rows (p, c): `_narrow` takes what a particle gives one axis further in, to one node along it;
@@ -85,7 +85,7 @@ def _along(axis: int, factors: tuple[Array, ...], step: Callable[..., tuple], st
     return jax.lax.scan(step, start, each, unroll=each[0].shape[0] if unroll or axis == len(factors[0]) - 1 else 1)
 
 
-def _collect(*args: Array, unroll: bool) -> list[Array]:
+def _gather(*args: Array, unroll: bool) -> list[Array]:
     """∂B/∂a: value and slopes, each (c, p)."""
     *factors, nodes = args
     d, _, p = factors[0].shape
@@ -106,7 +106,7 @@ def _collect(*args: Array, unroll: bool) -> list[Array]:
     return [rows.T for rows in summed(0, jnp.zeros((p,), factors[0].dtype))]
 
 
-def _spread(*args: Array, valued: bool, size: int, unroll: bool) -> list[Array]:
+def _scatter(*args: Array, valued: bool, size: int, unroll: bool) -> list[Array]:
     """∂B/∂f: the nodes' sums, (n, c)."""
     factors, given = args[:3], args[3:]
     d, _, p = factors[0].shape
@@ -167,8 +167,8 @@ def _by_factors(function: Callable[..., list[Array]]) -> Callable[..., list[Arra
     """A sum's differential by its factors, of shares, weights, slopes, their differentials, and what else it takes."""
 
     def differential(*args: Array, **params: Any) -> list[Array]:
-        shares, rest = args[0], args[5:]
-        return jax.jvp(lambda *factors: function(shares, *factors, *rest, **params), args[1:3], args[3:5])[1]
+        index_factors, rest = args[0], args[5:]
+        return jax.jvp(lambda *factors: function(index_factors, *factors, *rest, **params), args[1:3], args[3:5])[1]
 
     return differential
 
@@ -217,8 +217,8 @@ def _primitive(name: str, function: Callable[..., list[Array]], shapes: Callable
     return primitive
 
 
-def _particle_rows(shares: ShapedArray, *others: ShapedArray) -> list[tuple]:
-    d, _, p = shares.shape[-3:]
+def _particle_rows(index_factors: ShapedArray, *others: ShapedArray) -> list[tuple]:
+    d, _, p = index_factors.shape[-3:]
     return [(others[-1].shape[-1], p)] * (d + 1)
 
 
@@ -227,10 +227,10 @@ def _node_rows(*args: ShapedArray, valued: bool, size: int) -> list[tuple]:
     return [(size, args[-1].shape[-2])]
 
 
-_collect_p = _primitive("stencil_collect", _collect, _particle_rows)
-_spread_p = _primitive("stencil_spread", _spread, _node_rows)
-_collect_by_factors_p = _primitive("stencil_collect_by_factors", _by_factors(_collect), _particle_rows)
-_spread_by_factors_p = _primitive("stencil_spread_by_factors", _by_factors(_spread), _node_rows)
+_gather_p = _primitive("stencil_gather", _gather, _particle_rows)
+_scatter_p = _primitive("stencil_scatter", _scatter, _node_rows)
+_gather_by_factors_p = _primitive("stencil_gather_by_factors", _by_factors(_gather), _particle_rows)
+_scatter_by_factors_p = _primitive("stencil_scatter_by_factors", _by_factors(_scatter), _node_rows)
 
 
 def _differentiate(primitive: Primitive, by_factors: Primitive, function: Callable[..., list[Array]]) -> None:
@@ -256,8 +256,8 @@ def _differentiate(primitive: Primitive, by_factors: Primitive, function: Callab
     ad.primitive_jvps[by_factors] = jvp_by_factors
 
 
-_differentiate(_collect_p, _collect_by_factors_p, _collect)
-_differentiate(_spread_p, _spread_by_factors_p, _spread)
+_differentiate(_gather_p, _gather_by_factors_p, _gather)
+_differentiate(_scatter_p, _scatter_by_factors_p, _scatter)
 
 
 def _given(cotangents: list) -> tuple[list[Array], bool]:
@@ -272,33 +272,33 @@ def _of_undefined(found: Any, args: Any) -> list:
     return [f if ad.is_undefined_primal(a) else None for f, a in zip(found, args, strict=True)]
 
 
-def _transpose_collect(cotangents: list, *args: Any, batched: int) -> list:
+def _transpose_gather(cotangents: list, *args: Any, batched: int) -> list:
     given, valued = _given(cotangents)
     size = args[3].aval.shape[-2]
-    return [None, None, None, *_spread_p.bind(*args[:3], *given, valued=valued, size=size, batched=batched)]
+    return [None, None, None, *_scatter_p.bind(*args[:3], *given, valued=valued, size=size, batched=batched)]
 
 
-def _transpose_spread(cotangents: list, *args: Any, valued: bool, size: int, batched: int) -> list:
+def _transpose_scatter(cotangents: list, *args: Any, valued: bool, size: int, batched: int) -> list:
     del size
-    found = _collect_p.bind(*args[:3], ad.instantiate_zeros(cotangents[0]), batched=batched)
+    found = _gather_p.bind(*args[:3], ad.instantiate_zeros(cotangents[0]), batched=batched)
     found = found[: len(args) - 3] if valued else found[1:]
     return [None, None, None, *_of_undefined(found, args[3:])]
 
 
-def _transpose_collect_by_factors(cotangents: list, *args: Any, batched: int) -> list:
+def _transpose_gather_by_factors(cotangents: list, *args: Any, batched: int) -> list:
     given, valued = _given(cotangents)
     found = _members(partial(_pull, valued=valued), batched)(*args[:3], args[5], *given)
     return [None, None, None, *_of_undefined(found, args[3:5]), None]
 
 
-def _transpose_spread_by_factors(cotangents: list, *args: Any, valued: bool, size: int, batched: int) -> list:
+def _transpose_scatter_by_factors(cotangents: list, *args: Any, valued: bool, size: int, batched: int) -> list:
     del size
     nodes = ad.instantiate_zeros(cotangents[0])
     found = _members(partial(_pull, valued=valued), batched)(*args[:3], nodes, *args[5:])
     return [None, None, None, *_of_undefined(found, args[3:5]), *(None for _ in args[5:])]
 
 
-ad.primitive_transposes[_collect_p] = _transpose_collect
-ad.primitive_transposes[_spread_p] = _transpose_spread
-ad.primitive_transposes[_collect_by_factors_p] = _transpose_collect_by_factors
-ad.primitive_transposes[_spread_by_factors_p] = _transpose_spread_by_factors
+ad.primitive_transposes[_gather_p] = _transpose_gather
+ad.primitive_transposes[_scatter_p] = _transpose_scatter
+ad.primitive_transposes[_gather_by_factors_p] = _transpose_gather_by_factors
+ad.primitive_transposes[_scatter_by_factors_p] = _transpose_scatter_by_factors

@@ -31,7 +31,7 @@ class StressStretch(eqx.Module):
 
     def __call__(self, scene: Scene, particles: Particles) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Stretch [-] and nominal stress [Pa]."""
-        (body,) = scene.constituents(particles)
+        (body,) = scene.material_points(particles)
         P = body.law.stress(body.F)
         a = self.axis
         return (self.weight * body.F[a, a]).sum(), (self.weight * P[a, a]).sum()
@@ -142,7 +142,7 @@ def fit_curve(
         )
         misfit = (jnp.interp(x, *run.observed) - y) / scale
         assert run.report is not None
-        return jnp.where(run.tally.healthy, misfit, jnp.nan), run.report
+        return jnp.where(run.statistics.healthy, misfit, jnp.nan), run.report
 
     @jax.jit
     def misfit(ratio: Scalar) -> _Misfit:

@@ -1,7 +1,6 @@
 """The elastic potential, its Hessian, and the nodal problems of the implicit updates and their solution."""
 
 from mpmjax.implicit._conjugate_residual import ConjugateResidual, Reporting
-from mpmjax.implicit._constraint import Constraint
 from mpmjax.implicit._guess import Guess
 from mpmjax.implicit._hessian import AnalyticHessian, Hessian, JvpHessian, damped
 from mpmjax.implicit._implicit import Linearised, solve
@@ -9,11 +8,11 @@ from mpmjax.implicit._metric import Metric
 from mpmjax.implicit._newton import Newton
 from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.implicit._problems import LinearProblem, NewtonProblem, SolveInfo, no_solve
+from mpmjax.implicit._projection import Projection
 
 __all__ = [
     "AnalyticHessian",
     "ConjugateResidual",
-    "Constraint",
     "ElasticPotential",
     "Guess",
     "Hessian",
@@ -23,6 +22,7 @@ __all__ = [
     "Metric",
     "Newton",
     "NewtonProblem",
+    "Projection",
     "Reporting",
     "SolveInfo",
     "damped",

@@ -13,10 +13,10 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Float, Matrix, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary import Mirror
 from mpmjax.checks import require_fields
-from mpmjax.discretisation import Stencil, collect, spread
-from mpmjax.implicit._constraint import Constraint
+from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.implicit._metric import Metric
 from mpmjax.implicit._potential import ElasticPotential, Matrices
+from mpmjax.implicit._projection import Projection
 from mpmjax.material import AbstractMaterial, AbstractTangent, projected_tangent
 
 
@@ -42,9 +42,9 @@ class Stiffness(AbstractHessianAction):
 
     def __call__(self, du: NodeVector) -> NodeVector:
         """Σ_p g_ip K_p Σ_j g_jp δu_j."""
-        _, slopes = collect(self.stencil, self.mirror.unfold(du))
+        _, slopes = gather(self.stencil, self.mirror.unfold(du))
         flux = la.matmul(self.matrix, slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
-        return self.mirror.fold(spread(self.stencil, None, flux, du.shape[0]))
+        return self.mirror.fold(scatter(self.stencil, None, flux, du.shape[0]))
 
     def assembled(self) -> "Stiffness":
         """Itself."""
@@ -61,7 +61,7 @@ class Stiffness(AbstractHessianAction):
         """
         d = like.shape[1]
         stiff = jnp.stack([jnp.maximum(self.matrix[m, m], 0) for m in range(d * d)])
-        nodes = spread(self.stencil.squared, None, stiff.reshape(d, d, -1), like.shape[0])
+        nodes = scatter(self.stencil.squared, None, stiff.reshape(d, d, -1), like.shape[0])
         return jnp.stack([self.mirror.fold_scalar(component) for component in nodes.T], axis=1)
 
 
@@ -99,7 +99,7 @@ class _JvpAction(AbstractHessianAction):
 
     def assembled(self) -> Stiffness:
         """From the derivative of the energies' gradients by F."""
-        laws = (c.law for c in self.potential.constituents)
+        laws = (c.law for c in self.potential.material_points)
         places = zip(laws, self.potential.displaced(self.u), strict=True)
         return _stiffness(self.potential, tuple(_derived_tangent(law, F) for law, F in places))
 
@@ -121,12 +121,14 @@ class _DampedAction(AbstractHessianAction):
 
     def __call__(self, du: NodeVector) -> NodeVector:
         """(H + r D) δu."""
-        return self.elastic(du) + self.rate * self.potential.drag(du)
+        return self.elastic(du) + self.rate * self.potential.damping_force(du)
 
     def assembled(self) -> Stiffness:
         """One matrix a particle for both."""
         stiffness = self.elastic.assembled()
-        return eqx.tree_at(lambda s: s.matrix, stiffness, stiffness.matrix + self.rate * self.potential.damping())
+        return eqx.tree_at(
+            lambda s: s.matrix, stiffness, stiffness.matrix + self.rate * self.potential.damping_matrices()
+        )
 
 
 def damped(elastic: AbstractHessianAction, potential: ElasticPotential, rate: Scalar) -> AbstractHessianAction:
@@ -157,10 +159,10 @@ class AnalyticHessian(eqx.Module):
         """The Hessian of the potential at a displacement u."""
         return self._action(potential, potential.displaced(u))
 
-    def at_rest(self, potential: ElasticPotential, like: NodeVector) -> AbstractHessianAction:
+    def at_current(self, potential: ElasticPotential, like: NodeVector) -> AbstractHessianAction:
         """The Hessian at u = 0, without the gather."""
         del like
-        return self._action(potential, potential.at_rest())
+        return self._action(potential, potential.current_deformation())
 
     def exact(self) -> "AnalyticHessian":
         """The Hessian itself, of which this may be a projection."""
@@ -170,7 +172,7 @@ class AnalyticHessian(eqx.Module):
         def tangent(law: AbstractMaterial, F: Matrix) -> AbstractTangent:
             return projected_tangent(law, F) if self.projected else law.tangent(F)
 
-        laws = (c.law for c in potential.constituents)
+        laws = (c.law for c in potential.material_points)
         return _AnalyticAction(potential, tuple(tangent(law, own) for law, own in zip(laws, F, strict=True)))
 
 
@@ -181,7 +183,7 @@ class JvpHessian(eqx.Module):
         """The Hessian of the potential at a displacement u."""
         return _JvpAction(potential, u)
 
-    def at_rest(self, potential: ElasticPotential, like: NodeVector) -> AbstractHessianAction:
+    def at_current(self, potential: ElasticPotential, like: NodeVector) -> AbstractHessianAction:
         """The Hessian at u = 0."""
         return _JvpAction(potential, jnp.zeros_like(like))
 
@@ -197,19 +199,19 @@ class ImplicitOperator(lx.AbstractLinearOperator):
     """Q (M + c H) Q + I − Q, symmetric: c = βΔt² for the semi-implicit step (reference, eq. 6 times m_i), the square of
     its length for a stage.
 
-    Q keeps what is not held (see `Constraint`); rows of prescribed components and of empty nodes are the identity, and
+    Q keeps what is not held (see `Projection`); rows of prescribed components and of empty nodes are the identity, and
     along the held normals of colliders stands the mass.
     """
 
     mass: NodeScalar
     factor: Scalar
     hessian: AbstractHessianAction
-    constraint: Constraint
+    projection: Projection
     inner: Metric = eqx.field(static=True, default=Metric.MASS)
 
     @property
     def _shape(self) -> tuple[int, ...]:
-        return self.constraint.free.shape
+        return self.projection.free.shape
 
     def unconstrained(self, v: NodeVector) -> NodeVector:
         """(M + c H) v."""
@@ -217,8 +219,8 @@ class ImplicitOperator(lx.AbstractLinearOperator):
 
     def mv(self, vector: NodeVector) -> NodeVector:
         """The operator applied to a node vector."""
-        split = self.constraint.split
-        return split(self.unconstrained(split(vector, 0)), self.constraint.identity(vector, self.mass))
+        split = self.projection.combine
+        return split(self.unconstrained(split(vector, 0)), self.projection.identity(vector, self.mass))
 
     def assembled(self) -> "ImplicitOperator":
         """The same operator, for many applications."""
@@ -228,7 +230,7 @@ class ImplicitOperator(lx.AbstractLinearOperator):
         """W, the inner product over all rows: on free ones m_i or m_i + c H_ii (its mean over the directions where a
         normal is held, so that it commutes with Q), on identity rows 1."""
         mass = jnp.broadcast_to(self.mass[:, None], self._shape)
-        return self.constraint.metric(self.diagonal() if self.inner is Metric.DIAGONAL else mass)
+        return self.projection.metric(self.diagonal() if self.inner is Metric.DIAGONAL else mass)
 
     def diagonal(self) -> NodeVector:
         """m_i + c H_ii, of H's diagonal what is positive (see `Stiffness.diagonal`)."""

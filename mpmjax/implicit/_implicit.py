@@ -35,7 +35,7 @@ class Linearised(eqx.Module):
     def __call__(self, problem: LinearProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         """The solution, started from a guess."""
         operator = problem.operator(guess).assembled()
-        split = problem.constraint.split
+        split = problem.projection.combine
         lift = split(0, problem.prescribed)
         rhs = split(problem.rhs - operator.unconstrained(lift), 0)
         options = {"metric": operator.metric(), "y0": split(guess, 0)}
@@ -95,7 +95,7 @@ def _solve_jvp(primals: Any, tangents: Any) -> Any:
         residual = jnp.where(jnp.isfinite(stats["residual"]), stats["residual"], jnp.inf)
         return jnp.where(solved, x, jnp.nan), jnp.where(known & ~solved, residual, 0)
 
-    split = problem.constraint.split
+    split = problem.projection.combine
     lift = split(0, -d_residual)
     rhs = split(-d_residual - operator.unconstrained(lift), 0)
     d_slot = rhs[:0].sum() + (0 if d_slot is None else d_slot)  # linear in tangents also where nobody listens

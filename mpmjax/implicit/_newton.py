@@ -51,7 +51,7 @@ class Newton(eqx.Module):
 
     def __call__(self, problem: NewtonProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         """The solution, started from a guess."""
-        split, free = problem.constraint.split, problem.constraint.free
+        split, free = problem.projection.combine, problem.projection.free
         metric = jnp.where(free, problem.mass[:, None], 1)
         unit_strain = problem.unit_strain()
         dtype = guess.dtype
@@ -62,7 +62,7 @@ class Newton(eqx.Module):
             return jnp.sqrt((r**2 / metric).sum())
 
         def residual(v: NodeVector) -> NodeVector:
-            return split(problem.imbalance(v), 0)
+            return split(problem.momentum_residual(v), 0)
 
         def converged(c: _NewtonState) -> Bool[Array, ""]:
             left, speed = norm(c.r), jnp.sqrt((metric * split(c.v, 0) ** 2).sum())
@@ -112,13 +112,13 @@ class Newton(eqx.Module):
             )
 
         lift = split(0, problem.prescribed)
-        start = problem.admit(guess)
+        start = problem.apply_dirichlet(guess)
         energies = problem.merit(start), problem.merit(lift)
         start = jnp.where(jnp.isfinite(energies[0]) & ~(energies[1] < energies[0]), start, lift)
         startable = jnp.isfinite(energies[0]) | jnp.isfinite(energies[1])
         zero = jnp.asarray(0, dtype=jnp.int32)
         still = problem.undisplaced()
-        linearised = problem.imbalance(still) + problem.operator(still).unconstrained(lift - still)
+        linearised = problem.momentum_residual(still) + problem.operator(still).unconstrained(lift - still)
         linearised = split(linearised, 0)
         scale, inertia = norm(linearised), norm(split(problem.mass[:, None] * problem.inertial, 0))
         no = jnp.asarray(False)

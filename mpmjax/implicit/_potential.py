@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, Matrix, NodeVector
 from mpmjax.boundary import Mirror
-from mpmjax.discretisation import Stencil, collect, spread
+from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.material import AbstractMaterial
-from mpmjax.state import Constituent
+from mpmjax.state import MaterialPoints
 
 Matrices = tuple[Float[Array, "_ _ ..."], ...]
 """One entry for each material, shape (d, d, q), or (1, 1, q) where its law knows J alone."""
@@ -25,7 +25,7 @@ class ElasticPotential(eqx.Module):
     goes through `strain` and its transpose `divergence`, so that force and Hessian are the derivatives of Φ.
     """
 
-    constituents: tuple[Constituent, ...]
+    material_points: tuple[MaterialPoints, ...]
     stencil: Stencil
     mirror: Mirror
 
@@ -35,15 +35,15 @@ class ElasticPotential(eqx.Module):
 
     def deformed(self, gradient: Matrix) -> Matrices:
         """δF_p from the gradient Σ_i u_i g_ipᵀ of the displacement."""
-        return tuple(c.deformed(c.own(gradient)) for c in self.constituents)
+        return tuple(c.deformed(c.own(gradient)) for c in self.material_points)
 
-    def at_rest(self) -> Matrices:
+    def current_deformation(self) -> Matrices:
         """F_p."""
-        return tuple(c.F for c in self.constituents)
+        return tuple(c.F for c in self.material_points)
 
     def displaced(self, u: NodeVector) -> Matrices:
         """F_p + δF_p."""
-        return tuple(F + dF for F, dF in zip(self.at_rest(), self.strain(u), strict=True))
+        return tuple(F + dF for F, dF in zip(self.current_deformation(), self.strain(u), strict=True))
 
     def divergence(self, P: Matrices, like: NodeVector) -> NodeVector:
         """Σ_p V0_p P_p h_ip [N], the transpose of `strain`; `like` is any node vector."""
@@ -51,14 +51,16 @@ class ElasticPotential(eqx.Module):
 
     def energy(self, u: NodeVector) -> Float[Array, ""]:
         """Φ(u) [J]."""
-        parts = [(c.volume * c.law.energy(F)).sum() for c, F in zip(self.constituents, self.displaced(u), strict=True)]
+        parts = [
+            (c.volume * c.law.energy(F)).sum() for c, F in zip(self.material_points, self.displaced(u), strict=True)
+        ]
         return sum(parts[1:], parts[0])
 
-    def admitted_energy(self, u: NodeVector) -> Float[Array, ""]:
+    def admissible_energy(self, u: NodeVector) -> Float[Array, ""]:
         """Φ(u) [J], NaN where a law is not defined, whatever its formula gives there: not to be differentiated."""
         parts = [
-            jnp.where(c.law.admits(F), c.volume * c.law.energy(F), jnp.nan).sum()
-            for c, F in zip(self.constituents, self.displaced(u), strict=True)
+            jnp.where(c.law.is_admissible(F), c.volume * c.law.energy(F), jnp.nan).sum()
+            for c, F in zip(self.material_points, self.displaced(u), strict=True)
         ]
         return sum(parts[1:], parts[0])
 
@@ -66,60 +68,60 @@ class ElasticPotential(eqx.Module):
         """f = −∂Φ/∂u [N]: at u = 0 the reference's f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
         return -self.divergence(self._stress(self.displaced(u)), u)
 
-    def rest_force(self, like: NodeVector) -> NodeVector:
+    def current_force(self, like: NodeVector) -> NodeVector:
         """The force at u = 0, without the gather."""
-        return -self.divergence(self._stress(self.at_rest()), like)
+        return -self.divergence(self._stress(self.current_deformation()), like)
 
-    def rest_flux(self) -> Matrix:
+    def current_flux(self) -> Matrix:
         """What the force at u = 0 is the sum of, f_i = −Σ_p (V0_p P_p F_pᵀ) g_ip: the bracket [J], shape (d, d, p)."""
-        return self._flux(self._stress(self.at_rest()))
+        return self._flux(self._stress(self.current_deformation()))
 
     @property
     def viscous(self) -> bool:
         """Whether anything is."""
-        return any(c.viscosity is not None for c in self.constituents)
+        return any(c.viscosity is not None for c in self.material_points)
 
-    def drag_flux(self, gradient: Matrix) -> Matrix:
-        """What the viscous force is the sum of at a velocity gradient of the particles [1/s]: like `rest_flux`."""
-        return _joined([c.drag(c.own(gradient)) for c in self.constituents])
+    def viscous_flux(self, gradient: Matrix) -> Matrix:
+        """What the viscous force is the sum of at a velocity gradient of the particles [1/s]: like `current_flux`."""
+        return _joined([c.damping_force(c.own(gradient)) for c in self.material_points])
 
-    def drag(self, v: NodeVector) -> NodeVector:
+    def damping_force(self, v: NodeVector) -> NodeVector:
         """D v [N], minus the viscous force at a velocity of the nodes: symmetric, positive semi-definite."""
-        return self.sum_of(self.drag_flux(self._gradient(v)), v)
+        return self.sum_of(self.viscous_flux(self._gradient(v)), v)
 
     def power(self, v: NodeVector) -> Float[Array, ""]:
         """v·D v [W], what viscosity dissipates."""
         gradient = self._gradient(v)
-        return (self.drag_flux(gradient) * gradient).sum()
+        return (self.viscous_flux(gradient) * gradient).sum()
 
     def sum_of(self, flux: Matrix, like: NodeVector) -> NodeVector:
         """Σ_p flux_p g_ip; `like` is any node vector."""
-        return self.mirror.fold(spread(self.stencil, None, jnp.swapaxes(flux, 0, 1), like.shape[0]))
+        return self.mirror.fold(scatter(self.stencil, None, jnp.swapaxes(flux, 0, 1), like.shape[0]))
 
-    def damping(self) -> Float[Array, "m m p"]:
+    def damping_matrices(self) -> Float[Array, "m m p"]:
         """Each particle's part of D [J s], as `stiffness` has that of H."""
 
-        def matrix(c: Constituent) -> Array:
+        def matrix(c: MaterialPoints) -> Array:
             like = jnp.zeros((self._dim, self._dim, *c.volume.shape), c.volume.dtype)
-            return la.matrix_of(lambda slopes: la.transpose(c.drag(la.transpose(slopes))), like)
+            return la.matrix_of(lambda slopes: la.transpose(c.damping_force(la.transpose(slopes))), like)
 
-        return _joined([matrix(c) for c in self.constituents])
+        return _joined([matrix(c) for c in self.material_points])
 
     def stiffness(self, tangents: tuple[Callable[[Matrix], Matrix], ...]) -> Float[Array, "m m p"]:
         """K_p [J], each particle's part of the Hessian Σ_p g_ip K_p g_jp: of the stress differentials δF ↦ A : δF, one
         for each material, the symmetric maps from the components of the displacement's gradient, direction of the slope
         first, to those of what the force is the sum of. Shape (d², d², p)."""
 
-        def matrix(c: Constituent, tangent: Callable[[Matrix], Matrix]) -> Array:
+        def matrix(c: MaterialPoints, tangent: Callable[[Matrix], Matrix]) -> Array:
             def flux_of(slopes: Matrix) -> Matrix:
                 return la.transpose(c.flux(tangent(c.deformed(la.transpose(slopes))), self._dim))
 
             return la.matrix_of(flux_of, jnp.zeros((self._dim, self._dim, *c.volume.shape), c.volume.dtype))
 
-        return _joined([matrix(c, tangent) for c, tangent in zip(self.constituents, tangents, strict=True)])
+        return _joined([matrix(c, tangent) for c, tangent in zip(self.material_points, tangents, strict=True)])
 
     def _gradient(self, field: NodeVector) -> Matrix:
-        _, slopes = collect(self.stencil, self.mirror.unfold(field))
+        _, slopes = gather(self.stencil, self.mirror.unfold(field))
         return jnp.swapaxes(slopes, 0, 1)
 
     @property
@@ -127,10 +129,10 @@ class ElasticPotential(eqx.Module):
         return len(self.stencil.weights)
 
     def _stress(self, F: Matrices) -> Matrices:
-        return tuple(_stress(c.law, own) for c, own in zip(self.constituents, F, strict=True))
+        return tuple(_stress(c.law, own) for c, own in zip(self.material_points, F, strict=True))
 
     def _flux(self, P: Matrices) -> Matrix:
-        return _joined([c.flux(own, self._dim) for c, own in zip(self.constituents, P, strict=True)])
+        return _joined([c.flux(own, self._dim) for c, own in zip(self.material_points, P, strict=True)])
 
 
 def _joined(parts: list[Array]) -> Array:

@@ -11,10 +11,10 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector, Scalar
-from mpmjax.implicit._constraint import Constraint
 from mpmjax.implicit._hessian import Hessian, ImplicitOperator, damped
 from mpmjax.implicit._metric import Metric
 from mpmjax.implicit._potential import ElasticPotential
+from mpmjax.implicit._projection import Projection
 
 
 class SolveInfo(eqx.Module):
@@ -71,24 +71,24 @@ def no_solve(dtype: Any) -> SolveInfo:
 class AbstractProblem(eqx.Module):
     """An equation for the nodes' velocity. What is held takes the value of `prescribed`."""
 
-    constraint: eqx.AbstractVar[Constraint]
+    projection: eqx.AbstractVar[Projection]
     prescribed: eqx.AbstractVar[NodeVector]
 
     @abc.abstractmethod
-    def imbalance(self, v: NodeVector) -> NodeVector:
+    def momentum_residual(self, v: NodeVector) -> NodeVector:
         """The momentum [kg m/s] by which each node misses its equation; on held nodes, the impulse that holds them."""
 
     @abc.abstractmethod
     def operator(self, v: NodeVector) -> ImplicitOperator:
-        """The derivative of the imbalance at v, constrained."""
+        """The derivative of the momentum residual at v, constrained."""
 
     def residual(self, v: NodeVector) -> NodeVector:
-        """The equation that is solved: the imbalance of what is free, the error of what is prescribed."""
-        return self.constraint.split(self.imbalance(v), v - self.prescribed)
+        """The equation that is solved: the momentum residual of what is free, the error of what is prescribed."""
+        return self.projection.combine(self.momentum_residual(v), v - self.prescribed)
 
-    def admit(self, guess: NodeVector) -> NodeVector:
+    def apply_dirichlet(self, guess: NodeVector) -> NodeVector:
         """The guess with what is prescribed."""
-        return self.constraint.split(guess, self.prescribed)
+        return self.projection.combine(guess, self.prescribed)
 
 
 class LinearProblem(AbstractProblem):
@@ -98,16 +98,16 @@ class LinearProblem(AbstractProblem):
     factor: Scalar
     hessian: Any
     rhs: NodeVector
-    constraint: Constraint
+    projection: Projection
     prescribed: NodeVector
     metric: Metric = eqx.field(static=True, default=Metric.MASS)
 
     def operator(self, v: NodeVector) -> ImplicitOperator:
         """Q (M + c H) Q + I − Q."""
         del v
-        return ImplicitOperator(self.mass, self.factor, self.hessian, self.constraint, self.metric)
+        return ImplicitOperator(self.mass, self.factor, self.hessian, self.projection, self.metric)
 
-    def imbalance(self, v: NodeVector) -> NodeVector:
+    def momentum_residual(self, v: NodeVector) -> NodeVector:
         """(M + c H) v − b."""
         return self.operator(v).unconstrained(v) - self.rhs
 
@@ -130,7 +130,7 @@ class NewtonProblem(AbstractProblem):
     spacing: Float[Array, ""]
     potential: ElasticPotential
     hessian: Hessian
-    constraint: Constraint
+    projection: Projection
     prescribed: NodeVector
     metric: Metric = eqx.field(static=True, default=Metric.MASS)
 
@@ -143,7 +143,7 @@ class NewtonProblem(AbstractProblem):
         return jnp.zeros_like(self.inertial) if self.displaced is None else -self.displaced / self.length
 
     def operator(self, v: NodeVector) -> ImplicitOperator:
-        """M + c D + c² H at the displacement, constrained: the derivative of the imbalance, H never projected."""
+        """M + c D + c² H at the displacement, constrained: the derivative of the momentum residual, H never projected."""
         return self._operator(self.hessian.exact(), v)
 
     def model(self, v: NodeVector) -> ImplicitOperator:
@@ -152,27 +152,27 @@ class NewtonProblem(AbstractProblem):
 
     def _operator(self, hessian: Hessian, v: NodeVector) -> ImplicitOperator:
         action = damped(hessian.at(self.potential, self.displacement(v)), self.potential, 1 / self.length)
-        return ImplicitOperator(self.mass, self.length**2, action, self.constraint, self.metric)
+        return ImplicitOperator(self.mass, self.length**2, action, self.projection, self.metric)
 
-    def imbalance(self, v: NodeVector) -> NodeVector:
+    def momentum_residual(self, v: NodeVector) -> NodeVector:
         """M (v − ṽ) − c (f(u + c v) − D v)."""
         force = self.potential.force(self.displacement(v))
         if self.potential.viscous:
-            force = force - self.potential.drag(v)
+            force = force - self.potential.damping_force(v)
         return self.mass[:, None] * (v - self.inertial) - self.length * force
 
     def unit_strain(self) -> Float[Array, ""]:
         """The velocity dx/c [m/s] that strains a cell by one in the stage.
 
         Deformation gradients are of order one, and are rounded as such, however small the strains: so ε times this,
-        times the operator's diagonal, is the rounding of the imbalance, and times itself that of the potential.
+        times the operator's diagonal, is the rounding of the momentum residual, and times itself that of the potential.
         """
         return self.spacing / self.length
 
     def merit(self, v: NodeVector) -> Float[Array, ""]:
         """E(v) [J], without the constant of what is held; NaN where a law is not defined."""
-        free = self.constraint.free
+        free = self.projection.free
         inertia = 0.5 * jnp.where(free, self.mass[:, None] * (v - self.inertial) ** 2, 0).sum()
         if self.potential.viscous:
             inertia = inertia + self.length / 2 * self.potential.power(v)
-        return inertia + self.potential.admitted_energy(self.displacement(v))
+        return inertia + self.potential.admissible_energy(self.displacement(v))

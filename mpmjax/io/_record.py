@@ -16,8 +16,8 @@ from mpmjax.io._runs import FrameWriter
 from mpmjax.simulation import (
     HEALTHY,
     Run,
+    RunStatistics,
     SimulationError,
-    Tally,
     integrate,
     no_steps,
     number_of_steps,
@@ -82,10 +82,10 @@ def record(
         writer = _begun(path, scene, particles, method, dt, start, overwrite)
     scene, dt_, method = canonical((scene, dt, method), dtype)
     with writer:
-        step, state, tally = writer.last()
-        previous, start = None, step - int(tally.steps)
+        step, state, statistics = writer.last()
+        previous, start = None, step - int(statistics.steps)
         require(
-            int(tally.fault) == HEALTHY,
+            int(statistics.fault) == HEALTHY,
             f"{path} ends with a fault after step {step} and would meet it again: start anew with another dt or scene.",
         )
         bar = tqdm(initial=step, total=max(step, end), unit="step", file=sys.stderr, disable=not progress)
@@ -112,10 +112,10 @@ def record(
                     progress=False,
                     watch=True,
                 )
-                tally, step = tally.merged(new), step + int(new.steps)
+                statistics, step = statistics.merged(new), step + int(new.steps)
                 healthy = int(new.fault) == HEALTHY and int(new.unconverged) == 0
                 if healthy:
-                    _append(writer, step, state, tally)
+                    _append(writer, step, state, statistics)
                     bar.update(count)
         run = Run(
             scene=scene,
@@ -126,20 +126,20 @@ def record(
             observed=None,
             final=with_state(particles, state),
             final_step=jnp.asarray(step, dtype),
-            tally=tally,
+            statistics=statistics,
         )
         try:
             raise_faults(run, particles, previous, start)
         except SimulationError as error:
             try:
-                _append(writer, int(error.run.final_step), state_of(error.run.final), tally)
+                _append(writer, int(error.run.final_step), state_of(error.run.final), statistics)
                 again = "Resumed it would end there again: begin anew."
-                then = "It can be resumed as it is." if int(tally.fault) == HEALTHY else again
+                then = "It can be resumed as it is." if int(statistics.fault) == HEALTHY else again
                 said = f"{writer.standing()} {then}"
             except OSError as refused:
                 said = str(refused)
             raise SimulationError(f"{error} {said}", error.run) from None
-        warn_of_short_solves(run.tally)
+        warn_of_short_solves(run.statistics)
         return run
 
 
@@ -166,9 +166,9 @@ def _begun(
     return writer
 
 
-def _append(writer: FrameWriter, step: int, state: State, tally: Tally) -> None:
+def _append(writer: FrameWriter, step: int, state: State, statistics: RunStatistics) -> None:
     """Write a frame; an error says what the file holds."""
     try:
-        writer.append(step, state, tally)
+        writer.append(step, state, statistics)
     except OSError as error:
         raise OSError(f"{error}. {writer.standing()} Make room, then resume it.") from None

@@ -3,8 +3,8 @@
     /VTKHDF     the frames in VTK's layout (see `_vtkhdf`): Points, and as PointData velocity, deformation_gradient,
                 J = det F, with APIC affine_velocity, and what laws that yield remember
     /mpmjax     format, version, d, dtype, units, dt, counts, mass, volume, X, the scene and the method as JSON (see
-                `_schema`) with their arrays, and a table with one row a frame: its step and the run's `Tally` up to
-                it; with colliders `received`, what each had received by then: impulse, then angular impulse
+                `_schema`) with their arrays, and a table with one row a frame: its step and the run's `RunStatistics`
+                up to it; with colliders `received`, what each had received by then: impulse, then angular impulse
 
 Whatever is not in a dataset with checksums lies in headers that HDF5 checks itself, so a flipped bit is found. `NSteps`
 is raised last, and what lies beyond it, the remains of a writer that was killed, is neither read nor kept. A frame that
@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax.boundary import Exchange
+from mpmjax.boundary import ColliderImpulse
 from mpmjax.checks import canonical, checked, is_traced, require
 from mpmjax.io._aside import reason, replacing
 from mpmjax.io._hdf5 import (
@@ -45,7 +45,7 @@ from mpmjax.io._hdf5 import (
 from mpmjax.io._schema import decode, encode
 from mpmjax.io._staged import StagedFile
 from mpmjax.io._vtkhdf import File, add_fixed, add_growing, add_topology, count_in, rows_of, set_count, states_in
-from mpmjax.simulation import Run, Tally, no_steps
+from mpmjax.simulation import Run, RunStatistics, no_steps
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
 from mpmjax.stepping import Method
 
@@ -151,13 +151,13 @@ class FrameWriter:
             raise
         return cls(file, staged, path, state_of(particles))
 
-    def append(self, step: int, state: State, tally: Tally) -> None:
+    def append(self, step: int, state: State, statistics: RunStatistics) -> None:
         """Write a frame; one of the last frame's step replaces it.
 
         Args:
             step: its step number.
             state: its state.
-            tally: of the run up to it.
+            statistics: of the run up to it.
 
         Raises:
             OSError: the disk refused. The file is what it was before, and this writer can only be closed.
@@ -166,7 +166,7 @@ class FrameWriter:
         if n and file["mpmjax/frames"][n - 1]["step"] == step:
             n -= 1
         try:
-            for name, rows in _rows(n, step, file["mpmjax"].attrs["dt"], state, tally).items():
+            for name, rows in _rows(n, step, file["mpmjax"].attrs["dt"], state, statistics).items():
                 file[name].resize((n + 1) * len(rows), axis=0)
                 file[name][n * len(rows) :] = rows
             file.flush()
@@ -178,8 +178,8 @@ class FrameWriter:
             raise OSError(f"frame {n} could not be written ({reason(error)})") from None
         self._kept = self._standing()
 
-    def last(self) -> tuple[int, State, Tally]:
-        """Step number, state and tally of the last frame."""
+    def last(self) -> tuple[int, State, RunStatistics]:
+        """Step number, state and statistics of the last frame."""
         n = count_in(self._file)
         steps, states, tallies = _frames(self._file, self._like, n - 1, n)
         return int(steps[0]), *jax.tree.map(lambda a: a[0], (states, tallies))
@@ -224,7 +224,7 @@ def save(path: str | os.PathLike, run: Run) -> None:
     """Save a run's frames (without frames, its final state as the one frame) with all that a restart needs.
 
     The file is written aside, synced and renamed: at every moment `path` is either what it was or the whole run.
-    Observations are not saved. Of the tally only the last frame's is known; the others are −1.
+    Observations are not saved. Of the statistics only the last frame's is known; the others are −1.
 
     Raises:
         ValueError: a run inside a jax transformation or a batch of them, a scene that files cannot hold, a place that
@@ -236,7 +236,7 @@ def save(path: str | os.PathLike, run: Run) -> None:
     require(not is_traced(run), "A run inside a jax transformation has no values yet: save it outside.")
     require(run.final.x.ndim == 2, "Save a batch of runs one by one: jax.tree.map(lambda a: a[i], run).")
     steps, final_step = np.asarray(run.steps), int(run.final_step)
-    unknown = jax.tree.map(lambda a: np.full_like(a, -1), run.tally)
+    unknown = jax.tree.map(lambda a: np.full_like(a, -1), run.statistics)
     with (
         replacing(path) as aside,
         FrameWriter.create(aside, run.scene, run.final, run.method, run.dt, overwrite=True) as writer,
@@ -244,7 +244,7 @@ def save(path: str | os.PathLike, run: Run) -> None:
         for i in range(len(run)):
             if steps[i] < final_step:  # a run that met a fault has frames beyond its last good state
                 writer.append(int(steps[i]), jax.tree.map(lambda a, i=i: a[i], run.frames), unknown)
-        writer.append(final_step, state_of(run.final), run.tally)
+        writer.append(final_step, state_of(run.final), run.statistics)
 
 
 def steps_in(path: str | os.PathLike) -> int:
@@ -261,7 +261,7 @@ def steps_in(path: str | os.PathLike) -> int:
 
 @checked
 def load(path: str | os.PathLike) -> Run:
-    """The run in a file, bit for bit: scene, method, dt, frames, tally; `final` is the last frame.
+    """The run in a file, bit for bit: scene, method, dt, frames, statistics; `final` is the last frame.
 
     Raises:
         ValueError: a file that is missing, cut short or damaged, not of this package or of another format, without
@@ -297,7 +297,7 @@ def load(path: str | os.PathLike) -> Run:
         observed=None,
         final=with_state(particles, last),
         final_step=jnp.asarray(steps[-1], dtype),
-        tally=jax.tree.map(lambda a: a[-1], tallies),
+        statistics=jax.tree.map(lambda a: a[-1], tallies),
     )
 
 
@@ -359,9 +359,9 @@ def _description(group: File) -> dict[str, Any]:
     }
 
 
-def _rows(frame: int, step: int, dt: Any, state: State, tally: Tally) -> dict[str, np.ndarray]:
+def _rows(frame: int, step: int, dt: Any, state: State, statistics: RunStatistics) -> dict[str, np.ndarray]:
     """What a frame adds to each dataset."""
-    values = {"step": np.int64(step)} | {f.name: np.asarray(getattr(tally, f.name)) for f in fields(Tally)}
+    values = {"step": np.int64(step)} | {f.name: np.asarray(getattr(statistics, f.name)) for f in fields(RunStatistics)}
     row = np.array([tuple(values.values())], [(name, a.dtype) for name, a in values.items()])
     rows = rows_of(frame, step * float(dt), state) | {"mpmjax/frames": row}
     if state.received is not None:
@@ -370,15 +370,15 @@ def _rows(frame: int, step: int, dt: Any, state: State, tally: Tally) -> dict[st
     return rows
 
 
-def _frames(file: File, like: State, start: int, stop: int) -> tuple[np.ndarray, State, Tally]:
+def _frames(file: File, like: State, start: int, stop: int) -> tuple[np.ndarray, State, RunStatistics]:
     """Step numbers, states and tallies of frames `start` to `stop`, each with a leading axis. See `states_in`."""
     table = file["mpmjax/frames"][start:stop]
     require(len(table) == stop - start, "frames are missing")
-    tallies = Tally(**{f.name: jnp.asarray(table[f.name]) for f in fields(Tally)})
+    tallies = RunStatistics(**{f.name: jnp.asarray(table[f.name]) for f in fields(RunStatistics)})
     states = states_in(file, like, start, stop)
     if like.received is not None:
         both = jnp.asarray(file["mpmjax/received"][start:stop])
-        states = replace(states, received=Exchange(*jnp.split(both, [like.x.shape[1]], axis=-1)))
+        states = replace(states, received=ColliderImpulse(*jnp.split(both, [like.x.shape[1]], axis=-1)))
     return table["step"], states, tallies
 
 

@@ -1,9 +1,9 @@
 """Laws."""
 
 from mpmjax.material._base import (
+    AbstractInelastic,
     AbstractIsotropic,
     AbstractMaterial,
-    AbstractPlastic,
     AbstractTangent,
     AbstractVolumetric,
     Law,
@@ -21,9 +21,9 @@ from mpmjax.material._viscous import Viscosity, Viscous
 from mpmjax.material._von_mises import VonMises, VonMisesHistory
 
 __all__ = [
+    "AbstractInelastic",
     "AbstractIsotropic",
     "AbstractMaterial",
-    "AbstractPlastic",
     "AbstractTangent",
     "AbstractVolumetric",
     "CamClay",

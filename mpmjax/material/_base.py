@@ -91,11 +91,11 @@ class AbstractMaterial(eqx.Module):
         """The eigenstructure of the stress differential at signed principal stretches s [-], shape (d, *p)."""
 
     @abc.abstractmethod
-    def admits(self, F: Matrix) -> Bool[Array, "p"]:
+    def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         """Whether the law is defined at F."""
 
 
-class AbstractPlastic(eqx.Module):
+class AbstractInelastic(eqx.Module):
     """An elastic law that yields: F is the elastic part F_E of the deformation, and what a step strains beyond the
     yield condition is taken out of it after the step (return map). The implicit solve sees the elastic law alone.
 
@@ -103,7 +103,7 @@ class AbstractPlastic(eqx.Module):
     """
 
     @abc.abstractmethod
-    def virgin(self, F: Matrix) -> Any:
+    def initial_history(self, F: Matrix) -> Any:
         """The history of particles at elastic deformations F that have never yielded, leaves of shape (p,)."""
 
     @abc.abstractmethod
@@ -111,11 +111,11 @@ class AbstractPlastic(eqx.Module):
         """The elastic law in force."""
 
     @abc.abstractmethod
-    def returned(self, F: Matrix, history: Any) -> tuple[Matrix, Any]:
+    def return_map(self, F: Matrix, history: Any) -> tuple[Matrix, Any]:
         """The return map: the admissible F_E next to a trial one, and the history after it."""
 
 
-Law = AbstractMaterial | AbstractPlastic
+Law = AbstractMaterial | AbstractInelastic
 
 
 class AbstractVolumetric(eqx.Module):

@@ -6,7 +6,7 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Matrix, PerParticle
 from mpmjax.checks import require_between, require_fields, require_moduli, require_positive
-from mpmjax.material._base import AbstractPlastic
+from mpmjax.material._base import AbstractInelastic
 from mpmjax.material._hencky import Hencky, Split, no_transverse_strain
 
 
@@ -19,7 +19,7 @@ class CamClayHistory(eqx.Module):
     """ε_t [-], see `Hencky`; None in 3-D."""
 
 
-class CamClay(AbstractPlastic):
+class CamClay(AbstractInelastic):
     """Soil or snow that shears, compacts and, if cohesive, tears: a non-associated Cam clay at large strains, with the
     yield condition (eq. 3) and the hardening (eq. 4) of J. Gaume, T. Gast, J. Teran, A. van Herwijnen, C. Jiang, Nat.
     Commun. 9 (2018) 3047, doi 10.1038/s41467-018-05181-w.
@@ -72,7 +72,7 @@ class CamClay(AbstractPlastic):
         require_between("CamClay's cohesion", self.cohesion, 0, np.inf)
         require_positive("CamClay's hardening", self.hardening)
 
-    def virgin(self, F: Matrix) -> CamClayHistory:
+    def initial_history(self, F: Matrix) -> CamClayHistory:
         """α = −arsinh(p₀/K)/ξ, ε_t = 0."""
         bulk_modulus = Hencky(self.youngs_modulus, self.poisson_ratio).bulk_modulus
         alpha = -jnp.arcsinh(self.preconsolidation / bulk_modulus) / self.hardening
@@ -82,7 +82,7 @@ class CamClay(AbstractPlastic):
         """Hencky's law with the history's ε_t."""
         return Hencky(self.youngs_modulus, self.poisson_ratio, history.transverse_strain)
 
-    def returned(self, F: Matrix, history: CamClayHistory) -> tuple[Matrix, CamClayHistory]:
+    def return_map(self, F: Matrix, history: CamClayHistory) -> tuple[Matrix, CamClayHistory]:
         """To a tip, or to the ellipse at the same pressure; all stresses in shares of K."""
         split = Split.of(F, history.transverse_strain)
         alpha, beta, M = history.volume_strain, self.cohesion, self.friction
@@ -104,5 +104,5 @@ class CamClay(AbstractPlastic):
         radius = (1 + 2 * beta) * q**2 + (M * (p - centre)) ** 2
         t = M * half / jnp.sqrt(jnp.where(shears, radius, 1))
         change = jnp.where(tip, p - held, jnp.where(shears, (1 - t) * (p - centre), 0))
-        F, transverse = split.returned(ratio, jnp.where(tip, -held / 3, split.mean))
+        F, transverse = split.return_map(ratio, jnp.where(tip, -held / 3, split.mean))
         return F, CamClayHistory(alpha - change, transverse)

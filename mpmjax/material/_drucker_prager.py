@@ -6,7 +6,7 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Matrix, PerParticle
 from mpmjax.checks import require_between, require_fields, require_moduli
-from mpmjax.material._base import AbstractPlastic
+from mpmjax.material._base import AbstractInelastic
 from mpmjax.material._hencky import Hencky, Split, no_transverse_strain
 
 
@@ -19,7 +19,7 @@ class DruckerPragerHistory(eqx.Module):
     """ε_t [-], see `Hencky`; None in 3-D."""
 
 
-class DruckerPrager(AbstractPlastic):
+class DruckerPrager(AbstractInelastic):
     """Dry sand without cohesion: the law of Drucker and Prager at large strains (G. Klár, T. Gast, A. Pradhana, C. Fu,
     C. Schroeder, C. Jiang, J. Teran, ACM Trans. Graph. 35 (2016) 103, doi 10.1145/2897824.2925906).
 
@@ -65,7 +65,7 @@ class DruckerPrager(AbstractPlastic):
         require_moduli("DruckerPrager", self.youngs_modulus, self.poisson_ratio)
         require_between("DruckerPrager's friction_angle [rad]", self.friction_angle, 0, np.pi / 2, open_ends=True)
 
-    def virgin(self, F: Matrix) -> DruckerPragerHistory:
+    def initial_history(self, F: Matrix) -> DruckerPragerHistory:
         """v_c = 0, ε_t = 0."""
         return DruckerPragerHistory(jnp.zeros(F.shape[2:], F.dtype), no_transverse_strain(F))
 
@@ -73,7 +73,7 @@ class DruckerPrager(AbstractPlastic):
         """Hencky's law with the history's ε_t."""
         return Hencky(self.youngs_modulus, self.poisson_ratio, history.transverse_strain)
 
-    def returned(self, F: Matrix, history: DruckerPragerHistory) -> tuple[Matrix, DruckerPragerHistory]:
+    def return_map(self, F: Matrix, history: DruckerPragerHistory) -> tuple[Matrix, DruckerPragerHistory]:
         """To the cone at the same volume, or to its tip."""
         split = Split.of(F, history.transverse_strain)
         mean = split.mean + history.gap / 3
@@ -83,5 +83,5 @@ class DruckerPrager(AbstractPlastic):
         allowed = jnp.where(apart, 0, -3 * slope * mean)
         slides = split.deviation > allowed
         ratio = jnp.where(slides, allowed / jnp.where(slides, split.deviation, 1), jnp.where(apart, 0, 1))
-        F, transverse = split.returned(ratio, jnp.where(apart, 0, mean))
+        F, transverse = split.return_map(ratio, jnp.where(apart, 0, mean))
         return F, DruckerPragerHistory(jnp.where(apart, 3 * mean, 0), transverse)

@@ -51,7 +51,7 @@ class FixedCorotated(AbstractIsotropic):
         mu, lam = 2 * self.shear_modulus * jnp.ones_like(s[0]), self.lame_lambda * jnp.ones_like(s[0])
         return _with_volumetric(s, lam * (s.prod(axis=0) - 1), lam, lambda i, j: mu * (1 - 2 / (s[i] + s[j])), mu)
 
-    def admits(self, F: Matrix) -> Bool[Array, "p"]:
+    def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         """Every finite F."""
         return jnp.isfinite(F).all(axis=(0, 1))
 
@@ -122,7 +122,7 @@ class NeoHookean(AbstractIsotropic):
         pull, bulk = self._volumetric(J)
         return _with_volumetric(s, pull, bulk, lambda i, j: mu, mu)
 
-    def admits(self, F: Matrix) -> Bool[Array, "p"]:
+    def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         """J > 0."""
         return la.determinant(F) > 0
 

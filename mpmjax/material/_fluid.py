@@ -5,10 +5,16 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
 from mpmjax.checks import require_fields, require_positive
-from mpmjax.material._base import AbstractMaterial, AbstractPlastic, AbstractVolumetric, MatrixTangent, PrincipalTangent
+from mpmjax.material._base import (
+    AbstractInelastic,
+    AbstractMaterial,
+    AbstractVolumetric,
+    MatrixTangent,
+    PrincipalTangent,
+)
 
 
-class Fluid(AbstractPlastic, AbstractVolumetric):
+class Fluid(AbstractInelastic, AbstractVolumetric):
     """A weakly compressible, inviscid fluid (J. J. Monaghan, J. Comput. Phys. 110 (1994) 399, eq. 2.3,
     doi 10.1006/jcph.1994.1034; in the Material Point Method by J alone: A. P. Tampubolon et al., ACM Trans. Graph. 36
     (2017) 105, doi 10.1145/3072959.3073651).
@@ -40,7 +46,7 @@ class Fluid(AbstractPlastic, AbstractVolumetric):
         require_positive("Fluid's bulk_modulus [Pa]", self.bulk_modulus)
         require_positive("Fluid's exponent", self.exponent)
 
-    def virgin(self, F: Matrix) -> "NoHistory":
+    def initial_history(self, F: Matrix) -> "NoHistory":
         """Nothing."""
         del F
         return NoHistory()
@@ -50,7 +56,7 @@ class Fluid(AbstractPlastic, AbstractVolumetric):
         del history
         return Tait(self.bulk_modulus, self.exponent, self.tension)
 
-    def returned(self, F: Matrix, history: "NoHistory") -> tuple[Matrix, "NoHistory"]:
+    def return_map(self, F: Matrix, history: "NoHistory") -> tuple[Matrix, "NoHistory"]:
         """min(J, 1), or with tension J."""
         return F if self.tension else _pressed(F), history
 
@@ -102,7 +108,7 @@ class Tait(AbstractMaterial, AbstractVolumetric):
         none = jnp.zeros((0, *s.shape[1:]), s.dtype)
         return PrincipalTangent(none, none, self._stiffness(s[None]))
 
-    def admits(self, F: Matrix) -> Bool[Array, "p"]:
+    def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         """J > 0."""
         return F[0, 0] > 0
 

@@ -75,7 +75,7 @@ class Hencky(AbstractIsotropic):
 
         return PrincipalTangent.of(s, twist, flip, scaling)
 
-    def admits(self, F: Matrix) -> Bool[Array, "p"]:
+    def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         """J > 0."""
         return la.determinant(F) > 0
 
@@ -113,7 +113,7 @@ class Split(eqx.Module):
         deviates = squares > 0
         return cls(F, transverse, mean, jnp.where(deviates, jnp.sqrt(jnp.where(deviates, squares, 1)), 0))
 
-    def returned(self, ratio: Array, mean: Array) -> tuple[Matrix, Array | None]:
+    def return_map(self, ratio: Array, mean: Array) -> tuple[Matrix, Array | None]:
         """F and ε_t with the deviator times k = `ratio` and m′ = `mean`, both (p,): to the last bit what they were
         where k = 1 and m′ = m."""
         shift = mean - ratio * self.mean

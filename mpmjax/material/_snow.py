@@ -9,7 +9,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 from mpmjax.checks import require_between, require_fields, require_moduli, require_positive
 from mpmjax.linalg import AbstractSpectral
-from mpmjax.material._base import AbstractPlastic
+from mpmjax.material._base import AbstractInelastic
 from mpmjax.material._elastic import FixedCorotated
 
 
@@ -20,7 +20,7 @@ class SnowHistory(eqx.Module):
     """J_P = det F_P [-]: below 1 packed and harder, above 1 torn and softer."""
 
 
-class Snow(AbstractPlastic):
+class Snow(AbstractInelastic):
     """Snow (A. Stomakhin, C. Schroeder, L. Chai, J. Teran, A. Selle, ACM Trans. Graph. 32 (2013) 102,
     doi 10.1145/2461912.2461948).
 
@@ -57,7 +57,7 @@ class Snow(AbstractPlastic):
         require_positive("Snow's critical_stretch", self.critical_stretch)
         require_between("Snow's hardening", self.hardening, 0, 1e3)
 
-    def virgin(self, F: Matrix) -> SnowHistory:
+    def initial_history(self, F: Matrix) -> SnowHistory:
         """J_P = 1."""
         return SnowHistory(jnp.ones(F.shape[2:], F.dtype))
 
@@ -66,7 +66,7 @@ class Snow(AbstractPlastic):
         harder = jnp.exp(jnp.maximum(self.hardening * (1 - history.plastic_volume), _DUST))
         return SnowElasticity(self.youngs_modulus * harder, self.poisson_ratio)
 
-    def returned(self, F: Matrix, history: SnowHistory) -> tuple[Matrix, SnowHistory]:
+    def return_map(self, F: Matrix, history: SnowHistory) -> tuple[Matrix, SnowHistory]:
         """F_E with its principal stretches clamped; J_P ← J_P det F_trial / det F_E."""
         least, most = (jnp.asarray(a, F.dtype) for a in (1 - self.critical_compression, 1 + self.critical_stretch))
         excess = _Clamp(least, most)(la.matmul(la.transpose(F), F))
@@ -82,7 +82,7 @@ _DUST = -60.0
 class SnowElasticity(FixedCorotated):
     """Fixed corotated elasticity of what has J > 0: the clamp would keep what is inverted inverted."""
 
-    def admits(self, F: Matrix) -> Bool[Array, "p"]:
+    def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         """J > 0."""
         return la.determinant(F) > 0
 

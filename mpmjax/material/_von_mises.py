@@ -6,7 +6,7 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Matrix, PerParticle
 from mpmjax.checks import require_between, require_fields, require_moduli, require_positive
-from mpmjax.material._base import AbstractPlastic
+from mpmjax.material._base import AbstractInelastic
 from mpmjax.material._hencky import Hencky, Split, no_transverse_strain
 
 
@@ -19,7 +19,7 @@ class VonMisesHistory(eqx.Module):
     """ε_t [-], see `Hencky`; None in 3-D."""
 
 
-class VonMises(AbstractPlastic):
+class VonMises(AbstractInelastic):
     """Von Mises' plasticity with linear isotropic hardening, at large strains (J. C. Simo, Comput. Methods Appl. Mech.
     Eng. 99 (1992) 61, doi 10.1016/0045-7825(92)90123-2).
 
@@ -59,7 +59,7 @@ class VonMises(AbstractPlastic):
         require_positive("VonMises's yield_stress [Pa]", self.yield_stress)
         require_between("VonMises's hardening_modulus [Pa]", self.hardening_modulus, 0, np.inf)
 
-    def virgin(self, F: Matrix) -> VonMisesHistory:
+    def initial_history(self, F: Matrix) -> VonMisesHistory:
         """α = 0, ε_t = 0."""
         return VonMisesHistory(jnp.zeros(F.shape[2:], F.dtype), no_transverse_strain(F))
 
@@ -67,7 +67,7 @@ class VonMises(AbstractPlastic):
         """Hencky's law with the history's ε_t."""
         return Hencky(self.youngs_modulus, self.poisson_ratio, history.transverse_strain)
 
-    def returned(self, F: Matrix, history: VonMisesHistory) -> tuple[Matrix, VonMisesHistory]:
+    def return_map(self, F: Matrix, history: VonMisesHistory) -> tuple[Matrix, VonMisesHistory]:
         """The radial return."""
         split = Split.of(F, history.transverse_strain)
         stiffness = 2 * self.elastic(history).shear_modulus
@@ -76,5 +76,5 @@ class VonMises(AbstractPlastic):
         yields = excess > 0
         flow = jnp.where(yields, excess / (stiffness + 2 / 3 * self.hardening_modulus), 0)
         ratio = 1 - flow / jnp.where(yields, split.deviation, 1)
-        F, transverse = split.returned(ratio, split.mean)
+        F, transverse = split.return_map(ratio, split.mean)
         return F, VonMisesHistory(history.plastic_strain + (2 / 3) ** 0.5 * flow, transverse)

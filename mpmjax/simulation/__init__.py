@@ -3,13 +3,13 @@
 from mpmjax.simulation._faults import raise_faults, warn_of_short_solves
 from mpmjax.simulation._run import Run, SimulationError
 from mpmjax.simulation._simulate import integrate, number_of_steps, rollout, simulate
-from mpmjax.simulation._statistics import HEALTHY, Tally, no_steps
+from mpmjax.simulation._statistics import HEALTHY, RunStatistics, no_steps
 
 __all__ = [
     "HEALTHY",
     "Run",
+    "RunStatistics",
     "SimulationError",
-    "Tally",
     "integrate",
     "no_steps",
     "number_of_steps",

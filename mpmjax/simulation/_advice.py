@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from mpmjax.material import AbstractPlastic, AbstractVolumetric, Law
+from mpmjax.material import AbstractInelastic, AbstractVolumetric, Law
 from mpmjax.state import Particles, Scene
 from mpmjax.stepping import SAFETY, BackwardEuler, Explicit, Method, longest_step
 
@@ -51,7 +51,7 @@ def disallowed(law: Law, method: Method) -> tuple[str, str]:
         case AbstractVolumetric():
             what = f"has a volume that {type(law).__name__} does not allow (J ≤ 0)"
             advice = f"Reduce dt: a step must keep Δt |div v| below 1{newton}."
-        case AbstractPlastic():
+        case AbstractInelastic():
             what = f"has a deformation gradient that {type(law).__name__} does not allow (det F ≤ 0)"
             advice = f"Reduce dt: a step must keep Δt |∇v| below 1{newton}."
         case _:

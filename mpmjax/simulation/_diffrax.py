@@ -20,7 +20,7 @@ from mpmjax.simulation._statistics import (
     INADMISSIBLE,
     NOT_FINITE,
     OUTSIDE,
-    Tally,
+    RunStatistics,
     no_steps,
 )
 from mpmjax.state import Particles, Scene, State, state_of, with_state
@@ -55,7 +55,7 @@ def faulty_particles(problem: Problem, state: State) -> tuple[Bool[Array, "p"], 
     finite = finite & jnp.concatenate([_finite((group.F, group.history)) for group in particles.groups])
     anchor = scene.anchor(particles)
     outside = ~in_window(scene.kernel, scene.grid, scene.window(particles), anchor)
-    admitted = jnp.concatenate([c.law.admits(c.F) for c in scene.constituents(particles)])
+    admitted = jnp.concatenate([c.law.is_admissible(c.F) for c in scene.material_points(particles)])
     return ~finite, finite & outside, finite & ~admitted
 
 
@@ -123,31 +123,31 @@ class StepSolver(diffrax.AbstractSolver):
         del terms
         return 1
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: State, args: Problem) -> tuple[Tally, State | None, Array]:
-        """An empty tally, and a silent report."""
+    def init(self, terms: Any, t0: Any, t1: Any, y0: State, args: Problem) -> tuple[RunStatistics, State | None, Array]:
+        """An empty statistics, and a silent report."""
         del terms, t0, t1
-        tally, silent = no_steps(y0.x.dtype), jnp.zeros((), y0.x.dtype)
+        statistics, silent = no_steps(y0.x.dtype), jnp.zeros((), y0.x.dtype)
         if args.fault is not None:
-            tally = eqx.tree_at(lambda tally: tally.fault, tally, args.fault)
-        return tally, y0 if self.watch else None, silent
+            statistics = eqx.tree_at(lambda statistics: statistics.fault, statistics, args.fault)
+        return statistics, y0 if self.watch else None, silent
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: State, args: Problem, solver_state: Any, made_jump: Any) -> tuple:
         """One step. A fault is reported as the solver's failure: as an event diffrax would ask for it once more."""
         del terms, t1, made_jump
-        tally, _, report = solver_state
+        statistics, _, report = solver_state
         t = (args.start + step_number(t0)) * args.dt
         method = reporting(args.method, args.slot)
         particles, info = advance_compiled(args.scene, args.at(y0), t, args.dt, method, args.stencil)
         report = report + info.solve.report
         y1 = state_of(particles)
         arrays, rest = eqx.partition((args, y0, y1, t), eqx.is_array)
-        tally = tally.plus(info, fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest)))
+        statistics = statistics.plus(info, fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest)))
         dense = {"y0": y0, "y1": y1}
         if not self.watch:
-            return y1, None, dense, (tally, None, report), diffrax.RESULTS.successful
+            return y1, None, dense, (statistics, None, report), diffrax.RESULTS.successful
         results: Any = diffrax.RESULTS  # whose members the type checker takes for another type
-        result = results.where(tally.fault == HEALTHY, results.successful, results.nonlinear_divergence)
-        return y1, None, dense, (tally, y0, report), result
+        result = results.where(statistics.fault == HEALTHY, results.successful, results.nonlinear_divergence)
+        return y1, None, dense, (statistics, y0, report), result
 
     def func(self, terms: Any, t0: Any, y0: State, args: Problem) -> State:
         """Not a vector field; diffrax only asks for its shape."""

@@ -15,13 +15,21 @@ from mpmjax.material import Law
 from mpmjax.simulation._advice import advise, disallowed
 from mpmjax.simulation._diffrax import Problem, faulty_particles, passed_particles
 from mpmjax.simulation._run import Run, SimulationError
-from mpmjax.simulation._statistics import BAD_PARAMETERS, BEYOND, HEALTHY, INADMISSIBLE, NOT_FINITE, OUTSIDE, Tally
+from mpmjax.simulation._statistics import (
+    BAD_PARAMETERS,
+    BEYOND,
+    HEALTHY,
+    INADMISSIBLE,
+    NOT_FINITE,
+    OUTSIDE,
+    RunStatistics,
+)
 from mpmjax.state import Particles, State, state_of, with_state
 from mpmjax.stepping import BackwardEuler, Explicit, Method
 
 
 def raise_faults(run: Run, began: Particles, previous: State | None, start: int) -> None:
-    """Raise what the tally of an untraced run tells.
+    """Raise what the statistics of an untraced run tells.
 
     Args:
         run: the run, its final state possibly bad.
@@ -29,10 +37,10 @@ def raise_faults(run: Run, began: Particles, previous: State | None, start: int)
         previous: the state before the last step.
         start: number of the run's first step.
     """
-    fault = int(run.tally.fault)
+    fault = int(run.statistics.fault)
     if fault != HEALTHY:
         assert previous is not None
-        step = start + int(run.tally.fault_step)
+        step = start + int(run.statistics.fault_step)
         problem = Problem(run.scene, run.final, None, run.dt, run.method)
         broken, outside, inadmissible = faulty_particles(problem, state_of(run.final))
         bad: dict[int, Array] = {NOT_FINITE: broken, OUTSIDE: outside, INADMISSIBLE: inadmissible}
@@ -64,10 +72,10 @@ def raise_faults(run: Run, began: Particles, previous: State | None, start: int)
             f"{np.asarray(previous.x[first])}. {advise(run.scene, run.method, run.dt, began, last, advice)}",
             good,
         )
-    if int(run.tally.unconverged) > 0:
+    if int(run.statistics.unconverged) > 0:
         raise SimulationError(
-            f"The solve of {int(run.tally.unconverged)} of {int(run.tally.steps)} steps did not converge (worst "
-            f"relative residual {float(run.tally.worst_residual):.2g}). "
+            f"The solve of {int(run.statistics.unconverged)} of {int(run.statistics.steps)} steps did not converge "
+            f"(worst relative residual {float(run.statistics.worst_residual):.2g}). "
             + unconverged_advice(run.method, run.final.x.dtype),
             run,
         )
@@ -86,13 +94,13 @@ def unconverged_advice(method: Method, dtype: Any) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def warn_of_short_solves(tally: Tally) -> None:
+def warn_of_short_solves(statistics: RunStatistics) -> None:
     """A Python warning where solves of an untraced run missed their tolerance by less than ten times."""
-    if int(tally.short) > 0:
+    if int(statistics.short) > 0:
         warn(
-            f"The solve of {int(tally.short)} of {int(tally.steps)} steps missed its tolerance by less than ten times "
-            f"(worst relative residual {float(tally.worst_residual):.2g}): the run is that much less accurate than was "
-            "asked for. Raise the solver's max_steps, or ask for what it can reach by its rtol."
+            f"The solve of {int(statistics.short)} of {int(statistics.steps)} steps missed its tolerance by less "
+            f"than ten times (worst relative residual {float(statistics.worst_residual):.2g}): the run is that much "
+            "less accurate than was asked for. Raise the solver's max_steps, or ask for what it can reach by its rtol."
         )
 
 
@@ -124,7 +132,7 @@ _STATE_FAULTS = (
 """What is said of NOT_FINITE and the codes after it where no particle can be named."""
 _ADVICE = (
     "Call simulate outside of jax transformations to have step, time and particle named, or with throw=False to "
-    "inspect run.tally."
+    "inspect run.statistics."
 )
 UNSOLVED = (
     "mpmjax: {} solve of a step did not converge, so that there is no derivative. Raise the "
@@ -139,8 +147,8 @@ def guarded(run: Run, report: Array) -> Run:
     jax.eval_shape(lambda a: names.extend(r.message for r in requirements(eqx.combine(a, rest))), inputs)
     met = [f"the rollout met a fault: {what}. {_ADVICE}" for what in (*_STATE_FAULTS, "a solve that did not converge")]
     bad = [f"the rollout met a fault: {name}" for name in names]
-    tally, unsolved = run.tally, len(met)
-    state = jnp.where((tally.fault == HEALTHY) & (tally.unconverged > 0), unsolved, tally.fault)
-    number = jnp.where(tally.fault >= BAD_PARAMETERS, unsolved + 1 + tally.fault - BAD_PARAMETERS, state)
+    statistics, unsolved = run.statistics, len(met)
+    state = jnp.where((statistics.fault == HEALTHY) & (statistics.unconverged > 0), unsolved, statistics.fault)
+    number = jnp.where(statistics.fault >= BAD_PARAMETERS, unsolved + 1 + statistics.fault - BAD_PARAMETERS, state)
     faults = [f"mpmjax: {message}" for message in (*met, *bad)]
     return guard(run, report, number, faults, UNSOLVED.format("the tangent"))[0]

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.simulation._statistics import Tally
+from mpmjax.simulation._statistics import RunStatistics
 from mpmjax.state import Particles, Scene, State, with_state
 from mpmjax.stepping import Method
 
@@ -51,7 +51,7 @@ class Run(eqx.Module):
     """The particles at the end."""
     final_step: Float[Array, ""]
     """Step number at the end."""
-    tally: Tally
+    statistics: RunStatistics
     """Solver and contact statistics, and the first fault."""
     report: Float[Array, "..."] | None = None
     """Zero. Its tangent in forward mode is the relative residual of the first tangent solve that did not converge, zero

@@ -26,7 +26,7 @@ from mpmjax.checks import (
 from mpmjax.simulation._diffrax import Problem, StepSolver, examined, no_vector_field, step_number
 from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_short_solves
 from mpmjax.simulation._run import Run
-from mpmjax.simulation._statistics import HEALTHY, Tally
+from mpmjax.simulation._statistics import HEALTHY, RunStatistics
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
 from mpmjax.stepping import MOST_STEPS, Explicit, Method, advance, step_for
 
@@ -70,8 +70,8 @@ def simulate(
         adjoint: how diffrax differentiates. Default: recursive checkpointing.
         checkpoint_bytes: memory for the checkpoints of the default adjoint [B]. Fewer of them cost recomputation.
         progress: show diffrax's progress meter.
-        throw: raise on faults. With False the result says them in `tally`, and a batch member that fails leaves the
-            others alone.
+        throw: raise on faults. With False the result says them in `statistics`, and a batch member that fails leaves
+            the others alone.
 
     Raises:
         ValueError: of `prepare`; a value of the method that it does not allow; a t1 that is not a whole number of steps
@@ -110,7 +110,7 @@ def simulate(
         (scene, particles, method), slot = guard((scene, particles, method), slot, healthy, (), unsolved)
     if adjoint is None:
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=_checkpoints(particles, count, checkpoint_bytes))
-    saved, final, tally, previous, report = integrate(
+    saved, final, statistics, previous, report = integrate(
         scene,
         particles,
         jnp.asarray(start, dtype),
@@ -134,8 +134,8 @@ def simulate(
         frames=values if observe is None else None,
         observed=None if observe is None else values,
         final=with_state(particles, final),
-        final_step=jnp.asarray(start, dtype) + tally.steps.astype(dtype),
-        tally=tally,
+        final_step=jnp.asarray(start, dtype) + statistics.steps.astype(dtype),
+        statistics=statistics,
         report=report if traced else None,
     )
     if not throw:
@@ -143,7 +143,7 @@ def simulate(
     if traced:
         return guarded(run, report)
     raise_faults(run, particles, previous, start)
-    warn_of_short_solves(run.tally)
+    warn_of_short_solves(run.statistics)
     return run
 
 
@@ -240,8 +240,8 @@ def integrate(
     adjoint: diffrax.AbstractAdjoint,
     progress: bool,
     watch: bool,
-) -> tuple[Any, State, Tally, State | None, Array]:
-    """`count` ≤ `max_steps` steps from step `start`: (steps and values saved), final state, tally, with `watch`, which
+) -> tuple[Any, State, RunStatistics, State | None, Array]:
+    """`count` ≤ `max_steps` steps from step `start`: (steps and values saved), final state, statistics, with `watch`, which
     stops the run at a fault, the state before the last step, and what tangent solves report. Adjoint solves do through
     the `slot` (see `Reporting`).
 
@@ -276,7 +276,7 @@ def integrate(
         throw=False,
         progress_meter=diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter(),
     )
-    times, values, (tally, previous, report) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
+    times, values, (statistics, previous, report) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
     final = jax.tree.map(lambda a: a[-1], values["final"])
     saved = None if save_every is None else (start + step_number(times["frames"]), values["frames"])
-    return saved, final, tally, previous, report
+    return saved, final, statistics, previous, report

@@ -18,7 +18,7 @@ BAD_PARAMETERS = 100
 `requirements`."""
 
 
-class Tally(eqx.Module):
+class RunStatistics(eqx.Module):
     """Sums over the steps of a run."""
 
     steps: Int[Array, "*f"]
@@ -55,12 +55,12 @@ class Tally(eqx.Module):
         """Whether no state was at fault and no solve ended far from its tolerance."""
         return (self.fault == HEALTHY) & (self.unconverged == 0)
 
-    def plus(self, info: StepInfo, fault: Int[Array, ""]) -> "Tally":
-        """The tally after one more step."""
+    def plus(self, info: StepInfo, fault: Int[Array, ""]) -> "RunStatistics":
+        """The statistics after one more step."""
         s, c = info.solve, info.contact
         steps = self.steps + 1
         first = (self.fault == HEALTHY) & (fault != HEALTHY)
-        return Tally(
+        return RunStatistics(
             steps=steps,
             iterations=self.iterations + s.iterations,
             most_iterations=jnp.maximum(self.most_iterations, s.iterations),
@@ -76,10 +76,10 @@ class Tally(eqx.Module):
             fault_step=jnp.where(first, steps, self.fault_step),
         )
 
-    def merged(self, later: "Tally") -> "Tally":
-        """This tally and that of the steps that followed."""
+    def merged(self, later: "RunStatistics") -> "RunStatistics":
+        """This statistics and that of the steps that followed."""
         healthy = self.fault == HEALTHY
-        return Tally(
+        return RunStatistics(
             steps=self.steps + later.steps,
             iterations=self.iterations + later.iterations,
             most_iterations=jnp.maximum(self.most_iterations, later.most_iterations),
@@ -96,8 +96,8 @@ class Tally(eqx.Module):
         )
 
 
-def no_steps(dtype: Any) -> Tally:
-    """The tally before the first step."""
+def no_steps(dtype: Any) -> RunStatistics:
+    """The statistics before the first step."""
     zero = jnp.asarray(0, dtype=jnp.int32)
     residual = jnp.asarray(0, dtype=dtype)
-    return Tally(zero, zero, zero, zero, zero, residual, zero, zero, zero, zero, zero, zero, zero)
+    return RunStatistics(zero, zero, zero, zero, zero, residual, zero, zero, zero, zero, zero, zero, zero)

@@ -1,16 +1,16 @@
 """Particles, scene and what a step needs of them."""
 
 from mpmjax.state._body_force import AbstractBodyForce
-from mpmjax.state._constituent import Constituent
 from mpmjax.state._description import TotalLagrangian, UpdatedLagrangian
 from mpmjax.state._fill import fill
+from mpmjax.state._material_points import MaterialPoints
 from mpmjax.state._particles import Particles, State, by_material, histories, join, state_of, with_state
 from mpmjax.state._preparation import is_prepared, prepare
 from mpmjax.state._scene import Scene
 
 __all__ = [
     "AbstractBodyForce",
-    "Constituent",
+    "MaterialPoints",
     "Particles",
     "Scene",
     "State",

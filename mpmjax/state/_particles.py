@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from mpmjax._types import Array, Matrix, ParticleMatrix, ParticleScalar, ParticleVector, components
-from mpmjax.boundary import Exchange
+from mpmjax.boundary import ColliderImpulse
 from mpmjax.checks import checked, require, require_fields, require_positive
 
 Deformations = Float[Array, "*f _ _ _"] | tuple[Float[Array, "*f _ _ _"], ...]
@@ -41,7 +41,7 @@ class Particles(eqx.Module):
     """Reference positions [m], shape (p, d), in the total description."""
     history: Any = None
     """What laws that yield remember, a pytree of arrays of shape (p,) each; see the law."""
-    received: Exchange | None = None
+    received: ColliderImpulse | None = None
     """Linear and angular impulse that the scene's colliders have received since they were prepared; None without any.
     The difference between two times is the mean force and torque times the time between."""
     counts: tuple[int, ...] | None = eqx.field(static=True, default=None)
@@ -153,7 +153,7 @@ class State(eqx.Module):
     C: Float[Array, "*f p d d"] | None
     F: Deformations
     history: Any = None
-    received: Exchange | None = None
+    received: ColliderImpulse | None = None
 
 
 def by_material(held: Particles | State) -> list[tuple[slice, Any, Any]]:

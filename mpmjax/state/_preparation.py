@@ -10,7 +10,7 @@ import numpy as np
 
 from mpmjax._types import Array, components
 from mpmjax.boundary import (
-    Exchange,
+    ColliderImpulse,
     Plane,
     nothing_received,
 )
@@ -27,7 +27,7 @@ from mpmjax.checks import (
 from mpmjax.discretisation import (
     in_window,
 )
-from mpmjax.material import AbstractPlastic, AbstractVolumetric, Law
+from mpmjax.material import AbstractInelastic, AbstractVolumetric, Law
 from mpmjax.state._oversights import warn_of_oversights
 from mpmjax.state._particles import Group, Particles
 from mpmjax.state._scene import Scene
@@ -96,7 +96,7 @@ def _check_size(scene: Scene, particles: Particles) -> None:
     )
 
 
-def _received(scene: Scene, particles: Particles) -> Exchange | None:
+def _received(scene: Scene, particles: Particles) -> ColliderImpulse | None:
     """What colliders have received: what the particles say, if it is of as many as the scene has."""
     if scene.colliders == 0:
         return None
@@ -113,18 +113,18 @@ def _prepared(law: Law, group: Group, particles: Particles) -> tuple[Array, Any]
     undeformed = jnp.asarray(np.eye(e, dtype=particles.x.dtype))
     F = jnp.broadcast_to(undeformed, shape) if group.F is None else group.F
     require(F.shape == shape, f"{type(law).__name__} needs F of shape {shape}, got {F.shape}.")
-    if not isinstance(law, AbstractPlastic):
+    if not isinstance(law, AbstractInelastic):
         return F, None
     require(
         group.history is None or _remembers(law, F, group.history),
         f"{type(law).__name__} needs a history of its own, got {type(group.history).__name__}: drop it to start anew.",
     )
-    return F, law.virgin(components(F)) if group.history is None else group.history
+    return F, law.initial_history(components(F)) if group.history is None else group.history
 
 
-def _remembers(law: AbstractPlastic, F: Array, history: Any) -> bool:
+def _remembers(law: AbstractInelastic, F: Array, history: Any) -> bool:
     """Whether that is a history of the law's, of particles with this F."""
-    own = jax.eval_shape(law.virgin, components(F))
+    own = jax.eval_shape(law.initial_history, components(F))
     if jax.tree.structure(own) != jax.tree.structure(history):
         return False
     return all(a.shape == b.shape for a, b in zip(jax.tree.leaves(own), jax.tree.leaves(history), strict=True))
@@ -142,7 +142,7 @@ def is_prepared(scene: Scene, particles: Particles) -> bool:
     return known == scene.colliders and all(
         group.F is not None
         and (group.F.shape[-1] == 1 if isinstance(law, AbstractVolumetric) else group.F.shape[-1] == particles.dim)
-        and (_remembers(law, group.F, group.history) if isinstance(law, AbstractPlastic) else group.history is None)
+        and (_remembers(law, group.F, group.history) if isinstance(law, AbstractInelastic) else group.history is None)
         for law, group in zip(scene.laws, particles.groups, strict=True)
     )
 
@@ -176,8 +176,8 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
             f"{type(law).__name__}'s parameters must be one number or one for each of its {rows} particles, got "
             f"{sorted(sizes - {1, rows})} of them.",
         )
-    for part in scene.constituents(particles):
-        allowed = np.asarray(eqx.filter_jit(part.law.admits)(part.F))
+    for part in scene.material_points(particles):
+        allowed = np.asarray(eqx.filter_jit(part.law.is_admissible)(part.F))
         first = int(np.argmin(allowed)) + (part.rows[0] if part.rows else 0)
         require(
             allowed,

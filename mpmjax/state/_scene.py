@@ -32,10 +32,10 @@ from mpmjax.discretisation import (
     Transfer,
     make_stencil,
 )
-from mpmjax.material import AbstractPlastic, AbstractVolumetric, Law, Viscous
+from mpmjax.material import AbstractInelastic, AbstractVolumetric, Law, Viscous
 from mpmjax.state._body_force import AbstractBodyForce
-from mpmjax.state._constituent import Constituent, Laws, constituents, return_map, split
 from mpmjax.state._description import Description, TotalLagrangian, UpdatedLagrangian
+from mpmjax.state._material_points import Laws, MaterialPoints, material_points, return_map, split
 from mpmjax.state._particles import Particles
 
 
@@ -117,7 +117,7 @@ class Scene(eqx.Module):
                 "In the total description there is no contact: use the updated one, or SymmetryPlane or SlipBox "
                 "for a wall that is never left.",
             )
-            flowing = [law for law in self.laws if isinstance(law, AbstractPlastic | AbstractVolumetric)]
+            flowing = [law for law in self.laws if isinstance(law, AbstractInelastic | AbstractVolumetric)]
             require(
                 not flowing,
                 "The total description keeps the deformation from the start, which what yields or flows does not know: "
@@ -159,9 +159,9 @@ class Scene(eqx.Module):
     def _materials(self) -> tuple[Law | Viscous, ...]:
         return self.material if isinstance(self.material, tuple) else (self.material,)
 
-    def constituents(self, particles: Particles) -> tuple[Constituent, ...]:
+    def material_points(self, particles: Particles) -> tuple[MaterialPoints, ...]:
         """The materials of prepared particles, with the elastic laws in force."""
-        return constituents(self.material, particles, total=self.total)
+        return material_points(self.material, particles, total=self.total)
 
     def return_map(self, particles: Particles) -> Particles:
         """The particles with what yields brought back from a trial deformation to what its law admits."""

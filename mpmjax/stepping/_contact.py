@@ -28,7 +28,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
 from mpmjax.boundary import Contact, Mirror
-from mpmjax.implicit import Constraint, SolveInfo, no_solve
+from mpmjax.implicit import Projection, SolveInfo, no_solve
 from mpmjax.stepping._nodes import Nodes
 
 SWEEPS = 4
@@ -86,45 +86,45 @@ class Held(eqx.Module):
     @property
     def normal(self) -> NodeVector | None:
         """The free parts of the normals that colliders hold, of length one; None without any."""
-        return None if self.unheld.conditions.touch is None else self.nodes.constraint.normal
+        return None if self.unheld.conditions.touch is None else self.nodes.projection.normal
 
     @property
-    def untouched(self) -> Constraint:
+    def untouched(self) -> Projection:
         """The projection on that in which no boundary has a part."""
         free, normal = self.unheld.free, self.normal
         if self.active.components is not None:
             free = free & ~self.active.components
         for held in self.active.columns:
             free = free & ~held[:, None]
-        return Constraint(free, None if normal is None else jnp.where(free, normal, 0))
+        return Projection(free, None if normal is None else jnp.where(free, normal, 0))
 
-    def pushes(self, imbalance: NodeVector) -> NodeScalar | None:
+    def pushes(self, momentum_residual: NodeVector) -> NodeScalar | None:
         """The impulse [kg m/s], shape (n,), by which colliders hold each node along their normals, outward positive;
         None without any.
 
-        The imbalance is push·n and what holds the prescribed components; along the free part of n it is the push alone,
+        The momentum residual is push·n and what holds the prescribed components; along the free part of n it is the push alone,
         times the part's length.
         """
         grasp, normal = self.nodes.grasp, self.normal
         if grasp is None or normal is None:
             return None
-        return (normal * self.images.fold(imbalance)).sum(axis=1) / grasp.reach
+        return (normal * self.images.fold(momentum_residual)).sum(axis=1) / grasp.reach
 
-    def count_violations(self, v: NodeVector, imbalance: NodeVector) -> Int[Array, ""]:
+    def count_violations(self, v: NodeVector, momentum_residual: NodeVector) -> Int[Array, ""]:
         """How many wall components, columns and colliders' nodes pull or are entered all the same."""
-        pulls, enters = self.verdict(v, imbalance)
+        pulls, enters = self.verdict(v, momentum_residual)
         return _number(self.unheld, pulls) + _number(self.unheld, enters)
 
-    def verdict(self, v: NodeVector, imbalance: NodeVector) -> tuple[ActiveSet, ActiveSet]:
+    def verdict(self, v: NodeVector, momentum_residual: NodeVector) -> tuple[ActiveSet, ActiveSet]:
         """What of the active set pulls, and what of the rest enters, beyond rounding.
 
         Args:
             v: velocity of all nodes after the solve [m/s].
-            imbalance: that of all nodes [kg m/s].
+            momentum_residual: that of all nodes [kg m/s].
         """
         nodes, active = self.unheld, self.active
         noise = jnp.sqrt(jnp.finfo(v.dtype).eps) * jnp.abs(v).max()
-        of_walls = self._beside_colliders(imbalance)
+        of_walls = self._beside_colliders(momentum_residual)
         pulls, enters = None, None
         if active.components is not None and nodes.conditions.side is not None:
             push = nodes.conditions.side * self.images.fold(of_walls)
@@ -139,21 +139,21 @@ class Held(eqx.Module):
             entering.append(~held & (_approach(nodes, contact, v) < least))
         if active.normals is None:
             return ActiveSet(pulls, tuple(pulling)), ActiveSet(enters, tuple(entering))
-        push, departure = self.pushes(imbalance), _departure(self.nodes, v)
+        push, departure = self.pushes(momentum_residual), _departure(self.nodes, v)
         assert push is not None and departure is not None
         pulled = active.normals & (push < -noise * self.images.fold_scalar(nodes.mass))
         entered = ~active.normals & (departure < -noise)
         return ActiveSet(pulls, tuple(pulling), pulled), ActiveSet(enters, tuple(entering), entered)
 
-    def wall_friction(self, v: NodeVector, imbalance: NodeVector) -> NodeVector:
+    def wall_friction(self, v: NodeVector, momentum_residual: NodeVector) -> NodeVector:
         """Velocity after Coulomb friction of walls on the held nodes, one wall direction after the other.
 
         Args:
             v: velocity of all nodes after the solve [m/s].
-            imbalance: that of all nodes [kg m/s].
+            momentum_residual: that of all nodes [kg m/s].
         """
         mass = self.images.fold_scalar(self.unheld.mass)
-        limit = self._friction_limit(self._beside_colliders(imbalance))
+        limit = self._friction_limit(self._beside_colliders(momentum_residual))
         normal, d = self.normal, v.shape[1]
         for a in range(d):
             tangent = jnp.arange(d) != a
@@ -178,7 +178,7 @@ class Held(eqx.Module):
         touch, mass = self.unheld.conditions.touch, self.nodes.mass
         if push is None or touch is None or touch.friction is None or self.active.normals is None:
             return v, None
-        slip = self.nodes.constraint.split(v - touch.velocity, 0)
+        slip = self.nodes.projection.combine(v - touch.velocity, 0)
         square = (slip**2).sum(axis=1)
         rubbed = self.active.normals & (square > 0) & (mass > 0)
         limit = touch.friction * jnp.maximum(push, 0)
@@ -187,20 +187,20 @@ class Held(eqx.Module):
         loss = self.images.unfold(-share[:, None] * slip)
         return v + loss, self.unheld.mass[:, None] * loss
 
-    def _beside_colliders(self, imbalance: NodeVector) -> NodeVector:
-        """The imbalance less what colliders hold along their normals: what is left for walls."""
-        push, touch = self.pushes(imbalance), self.unheld.conditions.touch
-        return imbalance if push is None or touch is None else imbalance - push[:, None] * touch.normal
+    def _beside_colliders(self, momentum_residual: NodeVector) -> NodeVector:
+        """The momentum residual less what colliders hold along their normals: what is left for walls."""
+        push, touch = self.pushes(momentum_residual), self.unheld.conditions.touch
+        return momentum_residual if push is None or touch is None else momentum_residual - push[:, None] * touch.normal
 
-    def _friction_limit(self, imbalance: NodeVector) -> NodeVector:
+    def _friction_limit(self, momentum_residual: NodeVector) -> NodeVector:
         """The largest impulse of friction at each node [kg m/s], by the wall's direction, shape (n, d)."""
-        limit, components = jnp.zeros_like(imbalance), self.active.components
+        limit, components = jnp.zeros_like(momentum_residual), self.active.components
         side, friction = self.unheld.conditions.side, self.unheld.conditions.friction
         if components is not None and side is not None and friction is not None:
-            push = jnp.maximum(side * self.images.fold(imbalance), 0)
+            push = jnp.maximum(side * self.images.fold(momentum_residual), 0)
             limit = friction * jnp.where(components, push, 0)
         for contact, held in zip(self.unheld.contacts, self.active.columns, strict=True):
-            push = jnp.where(held & contact.at_key, contact.impulse(imbalance), 0)
+            push = jnp.where(held & contact.at_key, contact.impulse(momentum_residual), 0)
             push = contact.friction * jnp.maximum(self.images.fold_scalar(push), 0)
             limit = limit.at[:, contact.image.axis].add(push)
         return limit
@@ -240,7 +240,7 @@ def find_active_set(
     Args:
         nodes: nodes of which nothing is held yet.
         guess: where the first solve starts [m/s].
-        attempt: (held nodes, guess) to (velocity, imbalance [kg m/s] of all nodes, guess of the next solve, report).
+        attempt: (held nodes, guess) to (velocity, momentum residual [kg m/s] of all nodes, guess of the next solve, report).
             Must not be differentiated.
 
     Returns:
@@ -250,8 +250,8 @@ def find_active_set(
     def sweep(state: tuple) -> tuple:
         active, guess, cost, _, count = state
         held = hold(nodes, active)
-        v, imbalance, guess, info = attempt(held, guess)
-        pulls, enters = held.verdict(v, imbalance)
+        v, momentum_residual, guess, info = attempt(held, guess)
+        pulls, enters = held.verdict(v, momentum_residual)
         active = jax.tree.map(lambda was, pulled, entered: (was & ~pulled) | entered, active, pulls, enters)
         return active, guess, cost.plus(info), _number(nodes, pulls) + _number(nodes, enters) > 0, count + 1
 

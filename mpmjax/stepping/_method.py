@@ -77,7 +77,7 @@ class Explicit(eqx.Module):
     def move(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         """The nodes' motion and the solve's report."""
         del guess
-        v = nodes.constraint.split(nodes.explicit_velocity(), nodes.prescribed)
+        v = nodes.projection.combine(nodes.explicit_velocity(), nodes.prescribed)
         return NodeMotion(v), no_solve(v.dtype)
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
@@ -131,9 +131,9 @@ class SemiImplicit(eqx.Module):
         problem = LinearProblem(
             mass=nodes.mass,
             factor=beta * nodes.dt**2,
-            hessian=damped(self.hessian.at_rest(nodes.potential, predictor), nodes.potential, 1 / nodes.dt),
-            rhs=impulse - (1 - beta) * nodes.dt * nodes.potential.drag(v0) if viscous else impulse,
-            constraint=nodes.constraint,
+            hessian=damped(self.hessian.at_current(nodes.potential, predictor), nodes.potential, 1 / nodes.dt),
+            rhs=impulse - (1 - beta) * nodes.dt * nodes.potential.damping_force(v0) if viscous else impulse,
+            projection=nodes.projection,
             prescribed=nodes.prescribed,
             metric=self.metric,
         )
@@ -142,7 +142,7 @@ class SemiImplicit(eqx.Module):
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt f(0) − βΔt² H v [kg m/s]."""
-        action = self.hessian.at_rest(nodes.potential, motion.velocity)
+        action = self.hessian.at_current(nodes.potential, motion.velocity)
         return nodes.dt * nodes.force - self.beta * nodes.dt**2 * action(motion.velocity)
 
 
@@ -280,7 +280,7 @@ class TRBDF2(eqx.Module):
         dt, g, v0 = nodes.dt, nodes.acceleration, nodes.admitted_velocity()
         c = q2 * dt  # = ½γΔt
         viscous = nodes.potential.viscous
-        pull = nodes.per_mass(nodes.force - nodes.potential.drag(v0) if viscous else nodes.force)
+        pull = nodes.per_mass(nodes.force - nodes.potential.damping_force(v0) if viscous else nodes.force)
         trapezoidal = _Stage(v0 + c * (pull + 2 * g), c, c * v0)
         middle, first = trapezoidal.solve(nodes, guess, self)
         later_pull = (middle - trapezoidal.inertial) / c  # f_γ/m, viscosity's with it, by the stage's own equation
@@ -311,7 +311,7 @@ def viscous_impulse(nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
     """−Δt D v [kg m/s] of the velocity that it resisted, or what P2G knew of it; None without viscosity, and where P2G
     joined it to the elastic force."""
     if motion.resisted is not None:
-        return -nodes.dt * nodes.potential.drag(motion.resisted)
+        return -nodes.dt * nodes.potential.damping_force(motion.resisted)
     return None if nodes.viscous is None else jnp.where(nodes.occupied, nodes.dt * nodes.viscous, 0)
 
 
@@ -331,13 +331,13 @@ class _Stage(eqx.Module):
         """The velocity and the solve's report."""
         system = {
             "mass": nodes.mass,
-            "constraint": nodes.constraint,
+            "projection": nodes.projection,
             "prescribed": nodes.prescribed,
             "metric": method.metric,
         }
         match method.solution:
             case Linearised():
-                action = method.hessian.at_rest(nodes.potential, guess)
+                action = method.hessian.at_current(nodes.potential, guess)
                 force = nodes.force if self.displaced is None else nodes.force - action(self.displaced)
                 problem = LinearProblem(
                     factor=self.length**2,
@@ -363,6 +363,6 @@ def _force(nodes: Nodes, method: ImplicitMidpoint | TRBDF2, *stages: tuple[Scala
     match method.solution:
         case Linearised():
             mean = reduce(jnp.add, (q * u for q, u in stages))
-            return sum(q for q, _ in stages) * nodes.force - method.hessian.at_rest(nodes.potential, mean)(mean)
+            return sum(q for q, _ in stages) * nodes.force - method.hessian.at_current(nodes.potential, mean)(mean)
         case Newton():
             return reduce(jnp.add, (q * nodes.potential.force(u) for q, u in stages))

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
 from mpmjax.boundary import Conditions, Contact, Mirror, combine, contacts, mirror
-from mpmjax.discretisation import Stencil, p2g, spread
-from mpmjax.implicit import Constraint, ElasticPotential
+from mpmjax.discretisation import Stencil, p2g, scatter
+from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.state import Particles, Scene
 
 _PARALLEL = 1e-2  # a normal whose part in free components is smaller is prescribed by the others
@@ -76,12 +76,12 @@ class Nodes(eqx.Module):
         )
 
     @property
-    def constraint(self) -> Constraint:
+    def projection(self) -> Projection:
         """The projection on what nothing holds."""
         touch, grasp = self.conditions.touch, self.grasp
         if touch is None or grasp is None:
-            return Constraint(self.free)
-        return Constraint(self.free, jnp.where(touch.held[:, None], grasp.normal, 0))
+            return Projection(self.free)
+        return Projection(self.free, jnp.where(touch.held[:, None], grasp.normal, 0))
 
     @property
     def prescribed(self) -> NodeVector:
@@ -102,7 +102,7 @@ class Nodes(eqx.Module):
 
     def admitted_velocity(self) -> NodeVector:
         """v^n with what is prescribed: what a wall will hold stops as the step begins."""
-        return self.constraint.split(self.velocity, self.prescribed)
+        return self.projection.combine(self.velocity, self.prescribed)
 
     def per_mass(self, impulse: NodeVector) -> NodeVector:
         """An impulse or force over the nodes' mass; zero on empty nodes."""
@@ -152,12 +152,12 @@ def particles_to_grid(
     affine = C if scene.transfer.affine else None
     acceleration = jnp.asarray(scene.gravity)
     with jax.named_scope("p2g"):
-        potential = ElasticPotential(scene.constituents(particles), stencil, Mirror(()))
+        potential = ElasticPotential(scene.material_points(particles), stencil, Mirror(()))
         kicked = kicked and stencil.affine_slopes is None
         resisted = C if lagged and potential.viscous else None
-        flux = potential.rest_flux()
+        flux = potential.current_flux()
         if resisted is not None and not apart:
-            flux = flux + potential.drag_flux(resisted)
+            flux = flux + potential.viscous_flux(resisted)
         mass, momentum = p2g(stencil, particles.mass, v, affine, grid.size, -dt * flux if kicked else None)
         lightest = particles.mass.min()  # a mean would empty the nodes of a body much lighter than the others
         occupied = (mass > jnp.finfo(mass.dtype).eps * lightest)[:, None]
@@ -165,7 +165,7 @@ def particles_to_grid(
         if scene.body_force is not None:
             x, at = (particles.x + dt / 2 * particles.v, t + dt / 2) if centred else (particles.x, t)
             push = particles.mass * components(scene.body_force.acceleration(x, at))
-            force = spread(stencil, push, None, grid.size)
+            force = scatter(stencil, push, None, grid.size)
             acceleration = acceleration + jnp.where(occupied, force / full, 0)
         conditions = combine(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total)
         if scene.total and conditions.touch is not None and scene.slides:
@@ -184,7 +184,7 @@ def particles_to_grid(
             conditions=conditions,
             viscous=None
             if resisted is None or not apart
-            else -potential.sum_of(potential.drag_flux(resisted), momentum),
+            else -potential.sum_of(potential.viscous_flux(resisted), momentum),
             contacts=contacts(scene.boundary, grid, window),
         )
         return nodes.folded(mirror(scene.boundary, grid, window))

@@ -11,7 +11,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import canonical, checked, is_traced, require, require_positive
 from mpmjax.discretisation import MLSGradient
-from mpmjax.state import Constituent, Particles, Scene, is_prepared, prepare
+from mpmjax.state import MaterialPoints, Particles, Scene, is_prepared, prepare
 from mpmjax.stepping._method import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, Method, SemiImplicit
 
 MOST_STEPS = 2**31 - 1
@@ -132,7 +132,7 @@ def longest_step(scene: Scene, particles: Particles, method: Method) -> Float[Ar
 @eqx.filter_jit
 def _limit(scene: Scene, particles: Particles, method: Method) -> Float[Array, ""]:
     density = particles.mass / particles.volume
-    bodies = scene.constituents(particles)
+    bodies = scene.material_points(particles)
     stiffest = jnp.concatenate([_tangent_spectrum(c, particles.dim).max(axis=0) for c in bodies])
     z = stiffest * _gradient_bound(scene, particles) / density  # per Δt²
     match method:
@@ -153,7 +153,7 @@ def _limit(scene: Scene, particles: Particles, method: Method) -> Float[Array, "
     return jnp.where(steepness == 0, jnp.inf, 8 / jnp.where(steepness == 0, 1, steepness))
 
 
-def _stiffest_viscosity(body: Constituent, dim: int) -> Float[Array, "q"]:
+def _stiffest_viscosity(body: MaterialPoints, dim: int) -> Float[Array, "q"]:
     """The largest eigenvalue of each particle's ∇v ↦ |J| σ_v [Pa s]; in the total description a bound of it."""
     J = jnp.abs(la.determinant(body.F))
     if body.viscosity is None:
@@ -162,7 +162,7 @@ def _stiffest_viscosity(body: Constituent, dim: int) -> Float[Array, "q"]:
     return most / (la.principal_frame(body.F)[1] ** 2).min(axis=0) if body.total else most
 
 
-def _tangent_spectrum(body: Constituent, dim: int) -> Float[Array, "m q"]:
+def _tangent_spectrum(body: MaterialPoints, dim: int) -> Float[Array, "m q"]:
     """The eigenvalues of each particle's tangent [Pa], whose largest is Λ: in the principal frame the map is d x d
     on the diagonal and 2 x 2 on (L_ij, L_ji) for each pair. Where the law knows J alone it is d/dJ(JΨ') J tr(L) I, of
     which one is not zero."""

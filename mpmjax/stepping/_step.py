@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Int, NodeScalar, NodeVector, Scalar, components, particle_first
-from mpmjax.boundary import Exchange, received
+from mpmjax.boundary import ColliderImpulse, received
 from mpmjax.checks import canonical, checked, require_positive
 from mpmjax.discretisation import Stencil, g2p
-from mpmjax.implicit import Constraint, SolveInfo
+from mpmjax.implicit import Projection, SolveInfo
 from mpmjax.state import Particles, Scene, is_prepared, prepare
 from mpmjax.stepping._contact import NOTHING, ContactInfo, Held, find_active_set, hold, no_contact, touches
 from mpmjax.stepping._method import Explicit, Method, NodeMotion, viscous_impulse
@@ -24,7 +24,7 @@ class StepInfo(eqx.Module):
     contact: ContactInfo
     outside: Int[Array, "*f"]
     """Particles whose stencil left the grid's window."""
-    colliders: Exchange | None = None
+    colliders: ColliderImpulse | None = None
     """What the scene's colliders received, in the order of its boundaries; None without any."""
 
 
@@ -43,7 +43,7 @@ class GridUpdate(eqx.Module):
     """The impulse of walls and grips [kg m/s], shape (n, d); on free components what the solve left."""
     friction: NodeVector | None
     """The impulse of friction [kg m/s], shape (n, d), where there are walls that may be left."""
-    free: Constraint
+    free: Projection
     """The projection on that in which no boundary had a part."""
     solve: SolveInfo
     contact: ContactInfo
@@ -95,7 +95,7 @@ def update(nodes: Nodes, method: Method) -> GridUpdate:
             motion, info = method.move(nodes, guess)
             elastic, reaction, viscous = impulses(nodes, method, motion)
             push = hold(nodes, NOTHING).pushes(reaction)
-            free, none = nodes.constraint, no_contact()
+            free, none = nodes.projection, no_contact()
             return GridUpdate(nodes.velocity, motion, elastic, viscous, reaction, None, free, info, none, push)
 
         def moved(held: Held, method: Method, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
@@ -154,7 +154,7 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
             motion.mean,
             kept=scene.keeps_gradient,
         )
-        changes = zip(potential.at_rest(), potential.deformed(gradient), strict=True)
+        changes = zip(potential.current_deformation(), potential.deformed(gradient), strict=True)
         F = tuple(particle_first(F + dt * rate) for F, rate in changes)
     return replace(
         particles,

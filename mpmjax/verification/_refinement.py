@@ -62,4 +62,4 @@ def _error(
     scene, particles = discretise(problem, cells, velocity_time=start, **discretisation)
     run = simulate(scene, particles, t1=problem.duration, dt=dt, method=method, save_every=every, throw=False)
     worst = float(displacement_error(problem, particles, run).max())
-    return worst if bool(run.tally.healthy) and math.isfinite(worst) else math.inf
+    return worst if bool(run.statistics.healthy) and math.isfinite(worst) else math.inf

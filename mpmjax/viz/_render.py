@@ -1,4 +1,4 @@
-"""Pictures of runs: matplotlib in one and two dimensions, balls in the light of `_splat` in three."""
+"""Pictures of runs: matplotlib in one and two dimensions, balls in the light of `_ray_casting` in three."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -14,7 +14,7 @@ from mpmjax.checks import canonical, checked, require, require_between
 from mpmjax.io import replacing, save_figure
 from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene, by_material, histories
-from mpmjax.viz._splat import Balls, Camera, look, picture, surroundings
+from mpmjax.viz._ray_casting import Balls, Camera, look, picture, surroundings
 
 COLOURS: dict[str, tuple[str, Callable[[Run, Particles], Any]]] = {
     "speed": ("speed [m/s]", lambda run, q: np.linalg.norm(q.v, axis=1)),

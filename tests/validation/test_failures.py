@@ -256,7 +256,7 @@ def thrown(method, speed, number):
     scene = mpm.Scene(grid, law, boundary=(mpm.SymmetryPlane(0, 0.0), mpm.SymmetryPlane(1, 0.0)), description=TOTAL)
     dt = number * explicit_limit(scene)
     fast = eqx.tree_at(lambda q: q.v, box, jnp.zeros_like(box.v).at[:, 1].set(-speed * dx / explicit_limit(scene)))
-    return mpm.simulate(scene, fast, t1=round(8 / number) * dt, dt=dt, method=method, throw=False).tally
+    return mpm.simulate(scene, fast, t1=round(8 / number) * dt, dt=dt, method=method, throw=False).statistics
 
 
 @pytest.mark.slow
@@ -271,8 +271,8 @@ def test_one_linear_solve_inverts_where_newton_holds():
         assert bool(held.healthy)
         assert 1 <= int(held.line_search) <= 10
     faster = [thrown(mpm.BackwardEuler(), speed, 8.0) for speed in (4.0, 8.0, 12.0, 16.0, 24.0)]
-    assert not all(bool(tally.healthy) for tally in faster)
-    assert all(bool(tally.healthy) or int(tally.unconverged) for tally in faster)
+    assert not all(bool(statistics.healthy) for statistics in faster)
+    assert all(bool(statistics.healthy) or int(statistics.unconverged) for statistics in faster)
     midpoint = thrown(mpm.ImplicitMidpoint(mpm.Newton()), 2.0, 2.0)  # admissible at the middle of the step only
     assert int(midpoint.fault) == INADMISSIBLE
 
@@ -292,7 +292,7 @@ def drawn(method=PATIENT, *, per_cell=4, nu=0.49, **choices):
     walls = mpm.SymmetryPlane(0, 0.0), mpm.SymmetryPlane(1, 0.0), clamp
     scene = mpm.Scene(grid, mpm.NeoHookean(1.6e6, nu), boundary=walls, **choices)
     run = mpm.simulate(scene, strip, t1=1.0, dt=1 / steps, method=method, throw=False)
-    return bool(run.tally.healthy), float(run.final.F[strip.x[:, 1] < 0.02, 1, 1].mean())
+    return bool(run.statistics.healthy), float(run.final.F[strip.x[:, 1] < 0.02, 1, 1].mean())
 
 
 @pytest.mark.slow
@@ -437,7 +437,7 @@ def test_the_stiffness_of_a_block_is_the_laws(law):
         moving = mpm.Particles(rest.x, rest.x @ C[0].T, rest.mass, rest.volume, C=C)
         strained, _ = mpm.step(scene, moving, 0.0, 1e-6)
         grid = grid_update(scene, strained, 1e-6, mpm.Explicit())
-        force = np.asarray(grid.nodes.potential.rest_force(grid.nodes.velocity))
+        force = np.asarray(grid.nodes.potential.current_force(grid.nodes.velocity))
         stress = -force.T @ np.asarray(grid.position) / float(rest.volume.sum())
         for entry, modulus in moduli.items():
             assert stress[entry] / h == pytest.approx(float(modulus), rel=1e-4)

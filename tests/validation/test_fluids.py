@@ -24,7 +24,7 @@ def misfit(scene, column, height):
     mean. With γ = 7 and compression (1 + 7p/K)^(6/7) = 1 + 6 ρ0 g (h − y)/K."""
     depth = height - column.x[:, 1]
     exact = K / 7 * ((1 + 6 * DENSITY * G * depth / K) ** (7 / 6) - 1)
-    (body,) = scene.constituents(column)
+    (body,) = scene.material_points(column)
     error = (-body.law.stress(body.F)[0, 0] - exact) / (DENSITY * G)
     return jnp.abs(jnp.where(depth > 2 * scene.grid.spacing, error, 0)).max(), jnp.abs(error.mean())
 

@@ -30,22 +30,22 @@ def in_plane_strain(phi):
     return np.arcsin(3 * np.sqrt(3) * sine / (6 + np.sqrt(3) * sine))
 
 
-class Forgetful(mpm.AbstractPlastic):
+class Forgetful(mpm.AbstractInelastic):
     """Sand that does not remember how far it came apart."""
 
     sand: mpm.DruckerPrager
 
-    def virgin(self, F):
+    def initial_history(self, F):
         """That of sand."""
-        return self.sand.virgin(F)
+        return self.sand.initial_history(F)
 
     def elastic(self, history):
         """That of sand."""
         return self.sand.elastic(history)
 
-    def returned(self, F, history):
+    def return_map(self, F, history):
         """That of sand, without a gap."""
-        F, history = self.sand.returned(F, history)
+        F, history = self.sand.return_map(F, history)
         return F, eqx.tree_at(lambda h: h.gap, history, jnp.zeros_like(history.gap))
 
 
@@ -160,7 +160,7 @@ def test_thrown_sand_falls_back_to_its_volume(rule):
     assert abs(top[-1] - 1) < 0.04 if rule else top[-1] > 1.3  # its topmost layer stays loose
 
 
-def at_rest(law, K0, layers):
+def at_current(law, K0, layers):
     """Layers of sand at rest under their weight, from the bottom up: the elastic strains in x, y and z, (layers, 3),
     and the height that each has to itself, for a height of one in all without weight.
 

@@ -48,7 +48,7 @@ def slid(name, friction, *, number, time, stiffness, speed=0.0):
 def test_without_friction_a_block_slides_as_a_point_does(name):
     """The floor's push has no part along it: the solver's tolerance, or rounding."""
     error, run = slid(name, 0.0, number={"explicit": 0.3, "semi_implicit": 3.0}[name], time=0.2, stiffness=1e6)
-    assert int(run.tally.violations) == 0
+    assert int(run.statistics.violations) == 0
     assert error < {"explicit": 1e-12, "semi_implicit": 1e-7}[name]
 
 
@@ -59,7 +59,7 @@ def test_a_block_slides_down_a_slope_as_coulomb_says(name, number):
     """From rest, over eight spacings, within 1e-3. The block is elastic: until its shear has grown to what friction
     takes, the foot sticks, for a time of its height over its wave speed, and what is missing then stays missing."""
     error, run = slid(name, np.tan(PHI), number=number, time=1.0, stiffness=1e8)
-    assert int(run.tally.violations) == 0
+    assert int(run.statistics.violations) == 0
     assert error < 1e-3
 
 
@@ -73,5 +73,5 @@ def test_the_foot_sticks_for_as_long_as_a_wave_takes():
 def test_a_semi_implicit_block_that_slides_already_follows_coulomb_at_larger_steps():
     """At three times the explicit limit; friction lags the solve by a step, which costs a block at rest some steps."""
     error, run = slid("semi_implicit", np.tan(PHI), number=3.0, time=0.5, stiffness=1e8, speed=1.0)
-    assert int(run.tally.violations) == 0
+    assert int(run.statistics.violations) == 0
     assert error < 1e-3

@@ -132,7 +132,7 @@ def tangent_spectra(scene, particles):
     L = jnp.eye(d * d).reshape(-1, d, d)
     image = jax.vmap(law.tangent(F))(jnp.einsum("mij,jkp->mikp", L, pull))
     image = jnp.einsum("mijp,kjp->mikp", image, pull) + jnp.einsum("ijp,mkj->mikp", tau, L)
-    (body,) = scene.constituents(particles)
+    (body,) = scene.material_points(particles)
     return mpm._stability._tangent_spectrum(body, d), jnp.moveaxis(image.reshape(d * d, d * d, -1), -1, 0)
 
 
@@ -150,7 +150,7 @@ def test_tangent_spectrum_is_that_of_the_assembled_map(law, description, d):
 @eqx.filter_jit
 def fluid_spectra(scene, particles):
     """The closed form's only eigenvalue, and the map L ↦ ∂τ/∂J J tr(L), τ = JΨ' I, assembled, (p, d², d²)."""
-    d, (body,) = particles.dim, scene.constituents(particles)
+    d, (body,) = particles.dim, scene.material_points(particles)
     kirchhoff = lambda J: (J * body.law.stress(J[None, None])[0, 0]).sum()  # noqa: E731
     eye = jnp.eye(d).reshape(-1)
     J = body.F[0, 0]

@@ -142,8 +142,8 @@ def test_a_contact_plane_that_is_pressed_upon_is_a_symmetry_plane(kernel, method
     for name in ("x", "v", "F", "C") if transfer.affine else ("x", "v", "F"):
         a, b = (np.asarray(getattr(run.frames, name)) for run in (symmetry, contact))
         assert_close(a, b, 1e-11)
-    assert int(contact.tally.violations) == 0
-    assert int(contact.tally.sweeps) == int(contact.tally.steps)
+    assert int(contact.statistics.violations) == 0
+    assert int(contact.statistics.sweeps) == int(contact.statistics.steps)
 
 
 SPEED, LENGTH = 0.05, 1.0
@@ -170,7 +170,7 @@ def bounce(cells, kernel="quadratic", *, keep="above", offset=0.0):
     steps = 8 * cells
     t1 = 2.5 * LENGTH / c
     run = mpm.simulate(scene, bar, t1=t1, dt=t1 / steps, observe=lambda scene, bar: bar.v.mean())
-    assert int(run.tally.violations) == 0
+    assert int(run.statistics.violations) == 0
     return np.asarray(run.times) * c / LENGTH, sign * np.asarray(run.observed) / SPEED
 
 

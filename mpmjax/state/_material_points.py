@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, Matrix, particle_first
-from mpmjax.material import AbstractMaterial, AbstractPlastic, Law, Viscosity, Viscous
+from mpmjax.material import AbstractInelastic, AbstractMaterial, Law, Viscosity, Viscous
 from mpmjax.state._particles import Group, Particles
 
 Laws = Law | Viscous | tuple[Law | Viscous, ...]
@@ -18,7 +18,7 @@ Deformation = Float[Array, "e e q"]
 """What a law sees of a deformation: e = d, or 1 where that is J."""
 
 
-class Constituent(eqx.Module):
+class MaterialPoints(eqx.Module):
     """The particles of one material. Each pays for its own law alone."""
 
     law: AbstractMaterial
@@ -57,7 +57,7 @@ class Constituent(eqx.Module):
             return P * self.F * jnp.eye(dim, dtype=P.dtype)[..., None]
         return la.matmul(P, la.transpose(self.F))
 
-    def drag(self, gradient: Matrix) -> Matrix:
+    def damping_force(self, gradient: Matrix) -> Matrix:
         """Likewise of the viscous stress, |J| V0 σ_v [J], by the velocity gradient ∇v [1/s], shape (d, d, q): in the
         total description L = ∇v F⁻¹, and the flux |J| V0 σ_v F⁻ᵀ. A symmetric map, and positive semi-definite."""
         if self.viscosity is None:
@@ -70,28 +70,28 @@ class Constituent(eqx.Module):
         return self.volume * jnp.abs(J) * la.matmul(stress, la.transpose(inverse))
 
 
-def constituents(laws: Laws, particles: Particles, *, total: bool) -> tuple[Constituent, ...]:
+def material_points(laws: Laws, particles: Particles, *, total: bool) -> tuple[MaterialPoints, ...]:
     """The materials of prepared particles."""
 
-    def one(law: Law | Viscous, group: Group) -> Constituent:
+    def one(law: Law | Viscous, group: Group) -> MaterialPoints:
         law, viscosity = split(law)
-        elastic = law.elastic(group.history) if isinstance(law, AbstractPlastic) else law
+        elastic = law.elastic(group.history) if isinstance(law, AbstractInelastic) else law
         volume = particles.volume if group.rows is None else particles.volume[slice(*group.rows)]
-        return Constituent(elastic, volume, group.deformation(), total, group.rows, viscosity)
+        return MaterialPoints(elastic, volume, group.deformation(), total, group.rows, viscosity)
 
     return tuple(one(law, group) for law, group in _paired(laws, particles))
 
 
 def return_map(laws: Laws, particles: Particles) -> Particles:
     """The particles with what yields brought back from a trial deformation to what its law admits."""
-    if not any(isinstance(split(law)[0], AbstractPlastic) for law, _ in _paired(laws, particles)):
+    if not any(isinstance(split(law)[0], AbstractInelastic) for law, _ in _paired(laws, particles)):
         return particles
 
     def one(law: Law | Viscous, group: Group) -> tuple[Array | None, Any]:
         law, _ = split(law)
-        if not isinstance(law, AbstractPlastic):
+        if not isinstance(law, AbstractInelastic):
             return group.F, group.history
-        F, history = law.returned(group.deformation(), group.history)
+        F, history = law.return_map(group.deformation(), group.history)
         return particle_first(F), history
 
     found = [one(law, group) for law, group in _paired(laws, particles)]

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Mask, NodeScalar, NodeVector, Scalar
 
 
-class Constraint(eqx.Module):
+class Projection(eqx.Module):
     """The projection Q of node vectors on what is not held: the components that are free and, at a node with a held
     normal n, of these what is at right angles to it, I − n nᵀ.
 
@@ -18,7 +18,7 @@ class Constraint(eqx.Module):
     normal: NodeVector | None = None
     """Held normals of length one, zero in components that are not free and where none is held, shape (n, d)."""
 
-    def split(self, a: NodeVector | Scalar, b: NodeVector | Scalar) -> NodeVector:
+    def combine(self, a: NodeVector | Scalar, b: NodeVector | Scalar) -> NodeVector:
         """Q a + (I − Q) b."""
         if self.normal is None:
             return jnp.where(self.free, a, b)
