@@ -328,7 +328,7 @@ def test_a_rollout_from_another_step_compiles_nothing():
 
 @pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in ("explicit", "semi_implicit")}))
 def test_a_batch_member_that_fails_leaves_the_others_alone(method):
-    """One of three is driven to NaN: the other two are the same bit for bit as without, and the statistics says which."""
+    """One of three is driven to NaN: the other two are the same bit for bit as without it; the statistics say which."""
     scene, particles = pulled()
 
     @eqx.filter_jit

@@ -143,7 +143,7 @@ class NewtonProblem(AbstractProblem):
         return jnp.zeros_like(self.inertial) if self.displaced is None else -self.displaced / self.length
 
     def operator(self, v: NodeVector) -> ImplicitOperator:
-        """M + c D + c² H at the displacement, constrained: the derivative of the momentum residual, H never projected."""
+        """M + c D + c² H at the displacement, projected: the momentum residual's derivative, with the true H."""
         return self._operator(self.hessian.exact(), v)
 
     def model(self, v: NodeVector) -> ImplicitOperator:

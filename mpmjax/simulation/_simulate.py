@@ -241,9 +241,11 @@ def integrate(
     progress: bool,
     watch: bool,
 ) -> tuple[Any, State, RunStatistics, State | None, Array]:
-    """`count` ≤ `max_steps` steps from step `start`: (steps and values saved), final state, statistics, with `watch`, which
-    stops the run at a fault, the state before the last step, and what tangent solves report. Adjoint solves do through
-    the `slot` (see `Reporting`).
+    """Integrate `count` ≤ `max_steps` steps from step `start`.
+
+    Returns the steps and values saved, the final state, the statistics, with `watch`, which stops the run at a fault, the
+    state before the last step, and what tangent solves report. Adjoint solves report through the `slot` (see
+    `Reporting`).
 
     Without a count, all of them: what diffrax derives of its last time is then a constant, which XLA computes as it
     compiles, and not a program of two thousand operations.

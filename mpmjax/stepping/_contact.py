@@ -102,8 +102,8 @@ class Held(eqx.Module):
         """The impulse [kg m/s], shape (n,), by which colliders hold each node along their normals, outward positive;
         None without any.
 
-        The momentum residual is push·n and what holds the prescribed components; along the free part of n it is the push alone,
-        times the part's length.
+        The momentum residual is push·n and what holds the prescribed components; along the free part of n it is the
+        push alone, times the part's length.
         """
         grasp, normal = self.nodes.grasp, self.normal
         if grasp is None or normal is None:
@@ -240,8 +240,8 @@ def find_active_set(
     Args:
         nodes: nodes of which nothing is held yet.
         guess: where the first solve starts [m/s].
-        attempt: (held nodes, guess) to (velocity, momentum residual [kg m/s] of all nodes, guess of the next solve, report).
-            Must not be differentiated.
+        attempt: (held nodes, guess) to (velocity, momentum residual [kg m/s] of all nodes, guess of the next
+            solve, report). Must not be differentiated.
 
     Returns:
         active set, velocity, the sweeps' reports added up, number of sweeps.
