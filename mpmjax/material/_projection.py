@@ -21,8 +21,9 @@ def projected_tangent(material: AbstractMaterial, F: Matrix) -> MatrixTangent:
     of K being 1 where both are positive and 0 where both are negative.
 
     *When it breaks*: the law must be isotropic; where it has no `principal_tangent` of its own and is not, a
-    `RuntimeError` says so. Second derivatives are refused. Where an eigenvalue is zero A⁺ has a kink; the derivative given is
-    the mean of the two sides, which is what a central difference tends to. At F = I that is so: all twists are zero.
+    `RuntimeError` says so. Second derivatives are refused. Where an eigenvalue is zero A⁺ has a kink; the
+    derivative given is the mean of the two sides, which is what a central difference tends to. At F = I that is so: all
+    twists are zero.
     """
     if type(material).principal_tangent is AbstractMaterial.principal_tangent:
         name = type(material).__name__
