@@ -130,7 +130,7 @@ class AbstractMaterial(eqx.Module):
                 jnp.shape(energy) == F.shape[2:],
                 f"{type(self).__name__}'s energy must be one number a particle, shape {F.shape[2:]} for F of shape "
                 f"{F.shape}, got shape {jnp.shape(energy)}: F is component first, which the functions of "
-                "mpmjax.linalg expect and those of jax.numpy.linalg do not",
+                "mpmjax.linalg expect and those of jax.numpy.linalg do not.",
             )
             return energy.sum()
 

@@ -54,20 +54,20 @@ def check_law(law: Law | Viscous, *, dim: int = 3, F: Any = None, rtol: float = 
         found = jnp.asarray(_deformations(size) if F is None else np.asarray(F, float))
         require(
             found.ndim == 3 and found.shape[1:] == (size, size),
-            f"check_law's F must have shape (p, {size}, {size}), got {found.shape}",
+            f"check_law's F must have shape (p, {size}, {size}), got {found.shape}.",
         )
         place = jnp.moveaxis(found, 0, -1)
         own: Law = canonical(law, place.dtype)
         elastic = own.elastic(own.initial_history(place)) if isinstance(own, AbstractInelastic) else own
         faults = eqx.filter_jit(_faults)(elastic, place)
     admitted, told = np.asarray(faults[0]), type(elastic).__name__
-    require(admitted.any(), f"{told} admits none of check_law's {len(admitted)} deformations: give some by F")
+    require(admitted.any(), f"{told} admits none of check_law's {len(admitted)} deformations: give some by F.")
     for what, wrong in zip(_CHECKED, faults[1], strict=False):
         wrong = np.where(admitted, np.asarray(wrong), 0)
         worst = int(np.argmax(np.where(np.isnan(wrong), np.inf, wrong)))
         where = f"at F = {np.array2string(np.asarray(found[worst]), precision=6, separator=', ')}".replace("\n", "")
-        require(not np.isnan(wrong[worst]), f"{told}: {what} is not finite {where}")
-        require(wrong[worst] <= rtol, f"{told}: {what} is off by {wrong[worst]:.2g} of its size {where}")
+        require(not np.isnan(wrong[worst]), f"{told}: {what} is not finite {where}.")
+        require(wrong[worst] <= rtol, f"{told}: {what} is off by {wrong[worst]:.2g} of its size {where}.")
 
 
 def _faults(law: AbstractMaterial, F: Matrix) -> tuple[Bool[Array, "p"], tuple[Float[Array, "p"], ...]]:
