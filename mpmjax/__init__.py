@@ -1,5 +1,6 @@
 """A differentiable Material Point Method in JAX, with explicit and implicit grid updates."""
 
+from mpmjax import linalg
 from mpmjax.analysis import (
     Budget,
     Energy,
@@ -47,7 +48,7 @@ from mpmjax.geometry import (
     sample_mesh,
 )
 from mpmjax.implicit import AnalyticHessian, ConjugateResidual, Guess, JvpHessian, Linearised, Metric, Newton
-from mpmjax.io import load, record, save
+from mpmjax.io import load, record, register, save
 from mpmjax.material import (
     AbstractInelastic,
     AbstractMaterial,
@@ -94,6 +95,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "AbstractMaterial",
     "AbstractInelastic",
     "AbstractTangent",
+    "linalg",
     "FixedCorotated",
     "Hencky",
     "NeoHookean",
@@ -164,6 +166,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "load",
     "momentum",
     "pieces",
+    "register",
     "render",
     "save",
     "sensitivity",

@@ -289,7 +289,11 @@ ERRORS = [
         "Unknown key 'gravty', did you mean 'gravity'? Known here: grid, material, gravity, boundary,",
     ),
     ({"grid": None}, "The file needs the key 'grid'."),
-    ({"body_force": {"kind": "Wind"}}, "[body_force] takes an object of Python, which files cannot hold: leave it out"),
+    (
+        {"body_force": {"kind": "Wind"}},
+        "[body_force]: unknown kind 'Wind'. It must be a class of your own. A class of your own is known when the "
+        "module is imported that calls mpm.register.",
+    ),
     ({"grid": 3}, "grid must be a table with a kind, Grid, got 3."),
     ({"grid__shape": [8.5, 8]}, "[grid] shape must be a list of whole numbers, got [8.5, 8]."),
     ({"grid__shape": 8}, "[grid] shape must be a list of whole numbers, got 8."),

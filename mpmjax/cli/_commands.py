@@ -1,5 +1,7 @@
 """The shell's commands: `mpmjax run`, `mpmjax fit`, `mpmjax chart`, `mpmjax render`."""
 
+import importlib
+import importlib.util
 import sys
 import time
 import warnings
@@ -53,6 +55,37 @@ MostSeconds = Annotated[
     float | None,
     typer.Option(help="What pilot runs may take, compilation included. Default: the file's most_seconds, or 60."),
 ]
+
+
+def _import(modules: list[str] | None) -> None:
+    """Import modules, each by its name or by the path of its .py file: files know what they register from then on.
+
+    Raises:
+        ValueError: there is no such module or file.
+    """
+    for name in modules or []:
+        path = Path(name)
+        if path.suffix != ".py":
+            known = importlib.util.find_spec(name.partition(".")[0])
+            require(known, f"--import: Python finds no module {name!r}; name its .py file instead.")
+            importlib.import_module(name)
+            continue
+        require(path.is_file(), f"--import: there is no file {name}.")
+        spec = importlib.util.spec_from_file_location(path.stem, path)
+        assert spec is not None
+        assert spec.loader is not None
+        sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+
+
+Imports = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--import",
+        metavar="MODULE",
+        help="A module, or its .py file, that registers classes of your own (mpm.register); its code is executed.",
+    ),
+]
 SceneFile = Annotated[Path, typer.Argument(help="A TOML scene file; docs/scene_files.md is its schema.")]
 
 
@@ -65,8 +98,10 @@ def run_command(
     resume: Annotated[bool, typer.Option(help="Continue the output file from its last frame.")] = False,
     quiet: Annotated[bool, typer.Option(help="No progress bar.")] = False,
     most_seconds: MostSeconds = None,
+    imports: Imports = None,
 ) -> None:
     """Simulate a scene and write its frames."""
+    _import(imports)
     require(not (overwrite and resume), "--overwrite starts a file anew and --resume continues it: give one of them.")
     done = steps_in(output) if resume else 0
     if not resume:
@@ -156,8 +191,10 @@ def fit_command(
     scene: SceneFile,
     plot: Annotated[Path | None, typer.Option(help="The plot to write. Default: SCENE_fit.png here.")] = None,
     most_seconds: MostSeconds = None,
+    imports: Imports = None,
 ) -> None:
     """Fit a scene's parameter to the measured curve that its [fit] table names."""
+    _import(imports)
     begun = time.perf_counter()
     job = _chosen(scene, most_seconds)
     result = fit_job(job)
@@ -212,8 +249,10 @@ def chart_command(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="The chart to write, its numbers beside it as .csv.")
     ] = None,
+    imports: Imports = None,
 ) -> None:
     """Chart a scene's error against seconds, and name the cheapest setting for an error."""
+    _import(imports)
     plan = read_plan(scene)
     output = Path(f"{scene.stem}_chart.png") if output is None else output
     print(f"{'method':>24} {'spacing':>10} {'dt [s]':>10} {'steps':>9} {'seconds':>9} {'error':>9}", flush=True)
@@ -265,8 +304,10 @@ def render_command(
     ] = "30,20",  # pyright: ignore[reportArgumentType]  # parsed as if it had been given
     dpi: Annotated[float, typer.Option(help="Resolution.")] = 120.0,
     fps: Annotated[int, typer.Option(help="Frames a second of an animation.")] = 20,
+    imports: Imports = None,
 ) -> None:
     """Draw a run's particles."""
+    _import(imports)
     render(load(run), output, colour=colour, frame=frame, view=view, fps=fps, dpi=dpi)
     print(f"written {output}")
 

@@ -5,7 +5,7 @@ from mpmjax.io._hdf5 import check_place
 from mpmjax.io._interrupt import end_on_signals, reporting
 from mpmjax.io._record import record
 from mpmjax.io._runs import load, save, steps_in
-from mpmjax.io._schema import arguments, decode
+from mpmjax.io._schema import arguments, decode, register
 
 __all__ = [
     "arguments",
@@ -15,6 +15,7 @@ __all__ = [
     "load",
     "reason",
     "record",
+    "register",
     "replacing",
     "reporting",
     "save",

@@ -4,10 +4,11 @@ An object is a table whose `kind` names its class and whose other keys are its c
 
     {"kind": "FixedCorotated", "youngs_modulus": 1e5, "poisson_ratio": 0.3}
 
-A key with a default may be left out, and so may `kind` where only one class is possible; an object without other keys
-may be written as its kind alone (transfer = "PIC"). What a key takes follows from the constructor's annotation, so a
-new class costs one entry in `CLASSES`. Numbers come back bit for bit. A TOML scene is such data, and so is
-the JSON in a run's file.
+A key with a default may be left out, and so may `kind` where the package has one class that fits; an object without
+other keys may be written as its kind alone (transfer = "PIC"). What a key takes follows from the constructor's
+annotation, so a new class of the package costs one entry in `CLASSES`, and one of a user's own a call of `register`.
+Numbers come back bit for bit. A TOML scene is such data, and so is the JSON in a run's file. Reading it calls
+constructors of known classes and executes nothing else.
 """
 
 import difflib
@@ -18,7 +19,7 @@ import typing
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields
 from types import UnionType
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import equinox as eqx
 import jax
@@ -36,6 +37,7 @@ from mpmjax.boundary import (
     StickyCollider,
     SymmetryPlane,
 )
+from mpmjax.checks import require
 from mpmjax.discretisation import APIC, FLIP, PIC, BSpline, Grid, MLSGradient, SplineGradient
 from mpmjax.geometry import Ball, Box, Capsule, Cylinder, HalfSpace, Motion, RigidMotion, SampledDistance, Union
 from mpmjax.implicit import AnalyticHessian, ConjugateResidual, JvpHessian, Linearised, Newton
@@ -55,9 +57,77 @@ CLASSES: tuple[type, ...] = (
     *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),
     *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual),
 )
-"""What files can hold."""
+"""What files can hold of the package's own."""
+
+_registered: dict[str, type] = {}
+"""What they can hold besides, by name."""
+
+Registered = TypeVar("Registered", bound=type[eqx.Module])
+
+
+def register(cls: Registered) -> Registered:
+    """Let objects of a class of one's own stand in scene files and be saved and loaded.
+
+        @mpm.register
+        class Gent(mpm.AbstractMaterial):
+            modulus: float | jax.Array
+            limit: float | jax.Array
+            ...
+
+    In a file such an object is a table whose `kind` is the class's name and whose other keys are its constructor's
+    arguments. So each argument must be a field of the same name, annotated with what files can hold: float, int, bool,
+    str, an array, an enumeration, an equinox module whose class is the package's or registered, or tuples of such.
+
+    A file names classes and never executes code: import the module that registers a class before reading a file with
+    one, in the shell by `mpmjax run SCENE.toml --import MODULE`. A class that is defined anew, as in a notebook, takes
+    the place of the one before.
+
+    Args:
+        cls: an `equinox.Module`, such as a law, a boundary, a body force or a region.
+
+    Returns:
+        The class.
+
+    Raises:
+        ValueError: no such class, a name that another class has, or an argument that files cannot hold.
+    """
+    require(_is_module(cls), f"register takes a class, an equinox.Module, got {_short(cls)}.")
+    name = cls.__name__
+    other = next((c for c in _known() if c.__name__ == name), cls)
+    require(
+        _place(other) == _place(cls),
+        f"register: the name {name!r} is taken by {other.__module__}.{other.__qualname__}; choose another.",
+    )
+    names = {f.name for f in fields(cls)}
+    for key, (hint, _) in _parameters(cls).items():
+        what = f"register: {name}'s argument {key!r}"
+        require(key in names, f"{what} is not a field of {name}, from which a file would take its value: make it one.")
+        require(_can_be_held(hint), f"{what} is annotated as {hint!r}, which files cannot hold (see its docstring).")
+    _registered[name] = cls
+    return cls
+
+
+def _place(cls: type) -> tuple[str, str]:
+    """Module and name, which a class defined anew keeps."""
+    return cls.__module__, cls.__qualname__
+
+
+def _known() -> tuple[type, ...]:
+    return (*CLASSES, *_registered.values())
+
+
+def _can_be_held(hint: Any) -> bool:
+    """Whether some value of an annotation can stand in a file."""
+
+    def can(a: Any) -> bool:
+        items = get_args(a) if get_origin(a) in (tuple, list) else ()
+        return _is_module(a) or _is_enum(a) or any(_can_be_held(item) for item in items if item is not Ellipsis)
+
+    return bool(_forms(hint)) or any(can(a) for a in _alternatives(hint))
+
 
 _SMALL = 64  # most numbers that are written out, and that are read as a tuple where both are taken
+_MOST_AXES = 3  # of what is annotated as an array and nothing more
 _MAY_BE_INFINITE = ("lower", "upper")  # a corner at infinity is no wall
 _ONE = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
 _MANY = {float: "numbers", int: "whole numbers", bool: "true and false", str: "strings"}
@@ -73,10 +143,10 @@ def encode(value: Any, arrays: dict[str, np.ndarray] | None = None, path: str = 
         path: dotted path of the value.
 
     Raises:
-        ValueError: an object whose class is not the package's own.
+        ValueError: an object whose class is neither the package's own nor registered.
     """
     match value:
-        case _ if type(value) in CLASSES:
+        case _ if type(value) in _known():
             parts = {name: getattr(value, name) for name in _parameters(type(value))}
             keys = {k: encode(v, arrays, f"{path}.{k}".lstrip(".")) for k, v in parts.items() if v is not None}
             return {"kind": type(value).__name__, **keys}
@@ -95,7 +165,7 @@ def encode(value: Any, arrays: dict[str, np.ndarray] | None = None, path: str = 
         case _:
             raise ValueError(
                 f"{path or 'The object'} is a {type(value).__name__}, which files cannot hold: they know the package's "
-                "own classes only. Use one of those, or keep the run in memory."
+                "own classes and those that are registered. Put @mpm.register before the class."
             )
 
 
@@ -113,15 +183,13 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
             names the place.
     """
     alternatives = _alternatives(expected)
-    classes = {c.__name__: c for c in CLASSES if any(_is_module(a) and issubclass(c, a) for a in alternatives)}
+    classes = {c.__name__: c for c in _known() if any(_is_module(a) and issubclass(c, a) for a in alternatives)}
     items = [get_args(a)[0] for a in alternatives if get_origin(a) in (tuple, list)]
     if classes and isinstance(data, list) and items:
         return tuple(decode(d, items[0], _nth(where, i), arrays) for i, d in enumerate(data, 1))
-    if classes:
-        return _object(data, classes, where, arrays)
-    unfit = "takes an object of Python, which files cannot hold: leave it out"
-    _require(not any(_is_module(a) for a in alternatives), where, unfit)
-    if enums := [a for a in alternatives if isinstance(a, type) and issubclass(a, enum.Enum)]:
+    if any(_is_module(a) for a in alternatives):
+        return _object(data, classes, any(inspect.isabstract(a) for a in alternatives), where, arrays)
+    if enums := [a for a in alternatives if _is_enum(a)]:
         words = [member.value for member in enums[0]]
         _require(isinstance(data, str) and data in words, where, f"must be one of {_quoted(words)}, got {_short(data)}")
         return enums[0](data)
@@ -150,17 +218,20 @@ def arguments(
     return {key: decode(value, known[key][0], _inside(where, key, value), arrays) for key, value in table.items()}
 
 
-def _object(data: Any, classes: dict[str, type], where: str, arrays: dict[str, np.ndarray] | None) -> Any:
-    """The table of an object that may be of one of several classes."""
+def _object(data: Any, classes: dict[str, type], opened: bool, where: str, arrays: dict[str, np.ndarray] | None) -> Any:
+    """The table of an object that may be of one of several classes; where `opened` also of one that is registered."""
     table = {"kind": data} if isinstance(data, str) else data
-    choice = f"one of {', '.join(classes)}" if len(classes) > 1 else next(iter(classes))
+    _require(classes or opened, where, "takes an object of Python, which files cannot hold: leave it out")
+    choice = f"one of {', '.join(classes)}" if len(classes) > 1 else next(iter(classes), "a class of your own")
+    evident = [name for name, c in classes.items() if c in CLASSES]
     _require(isinstance(table, dict), where, f"must be a table with a kind, {choice}, got {_short(data)}")
-    _require("kind" in table or len(classes) == 1, where, f"needs a kind: {choice}")
-    kind = table.get("kind", next(iter(classes)))
+    _require("kind" in table or len(evident) == 1, where, f"needs a kind: {choice}")
+    kind = table.get("kind", *evident) if len(evident) == 1 else table["kind"]
     if not (isinstance(kind, str) and kind in classes):
         close = difflib.get_close_matches(_short(kind), classes, 1)
         hint = f", did you mean {close[0]!r}?" if close else "."
-        raise ValueError(f"{_named(where, 'unknown kind')} {_short(kind)}{hint} It must be {choice}.")
+        own = " A class of your own is known when the module is imported that calls mpm.register." if opened else ""
+        raise ValueError(f"{_named(where, 'unknown kind')} {_short(kind)}{hint} It must be {choice}.{own}")
     given = arguments(classes[kind], {k: v for k, v in table.items() if k != "kind"}, where, arrays)
     try:
         return classes[kind](**given)
@@ -198,12 +269,21 @@ def _parameters(function: Callable) -> dict[str, tuple[Any, Any]]:
     """
     of_class = isinstance(function, type)
     signature = inspect.signature(function.__init__ if of_class else function)
-    types = {f.name: f.type for f in fields(function)} if of_class else {}
+    types = _field_types(function) if of_class else {}
     return {
-        p.name: (types.get(p.name, Any) if p.annotation is Any else p.annotation, p.default)
+        p.name: (
+            types.get(p.name, Any) if p.annotation is Any or isinstance(p.annotation, str) else p.annotation,
+            p.default,
+        )
         for p in signature.parameters.values()
         if p.name != "self"
     }
+
+
+def _field_types(cls: type) -> dict[str, Any]:
+    """The annotation of each field; where a module postpones them, they are read now."""
+    types = {f.name: f.type for f in fields(cls)}
+    return typing.get_type_hints(cls) if any(isinstance(t, str) for t in types.values()) else types
 
 
 def _alternatives(hint: Any) -> list[Any]:
@@ -217,16 +297,22 @@ def _is_module(hint: Any) -> bool:
     return isinstance(hint, type) and issubclass(hint, eqx.Module)
 
 
-def _forms(hint: Any) -> set[tuple[type, int]]:
-    """Kind of number and depth of lists that an annotation takes."""
+def _is_enum(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, enum.Enum)
+
+
+def _forms(hint: Any, *, within: bool = False) -> set[tuple[type, int]]:
+    """Kind of number and depth of lists that an annotation takes, `within` that of a sequence."""
     forms: set[tuple[type, int]] = set()
+    if not within and any(a in (jax.Array, np.ndarray) for a in _alternatives(hint)):
+        forms |= {(float, depth) for depth in range(_MOST_AXES + 1)}
     for a in _alternatives(hint):
         if a in _ONE:
             forms.add((a, 0))
         elif get_origin(a) is Literal:
             forms.add((str, 0))
         elif get_origin(a) in (tuple, list):
-            forms |= {(kind, depth + 1) for kind, depth in _forms(get_args(a)[0])}
+            forms |= {(kind, depth + 1) for kind, depth in _forms(get_args(a)[0], within=True)}
         elif isinstance(a, type) and issubclass(a, AbstractArray):
             axes = a.dim_str.split()
             forms |= {(float, len(axes)), (float, len([axis for axis in axes if not axis.startswith("*")]))}

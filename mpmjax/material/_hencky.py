@@ -1,13 +1,12 @@
 """Hencky's elasticity, linear in the logarithmic strain, and what the laws that yield on it share."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 from mpmjax.linalg import Logarithm, PowerLessOne
-from mpmjax.material._base import AbstractIsotropic, MatrixTangent, PrincipalTangent
+from mpmjax.material._base import AbstractIsotropic, PrincipalTangent
 
 _log = Logarithm()
 
@@ -52,10 +51,6 @@ class Hencky(AbstractIsotropic):
         dilation = self._dilation(la.trace(strain), F)
         kirchhoff = 2 * self.shear_modulus * strain + self.lame_lambda * dilation * la.identity_like(F)
         return la.matmul(la.cofactor(F), kirchhoff) / la.determinant(F)
-
-    def tangent(self, F: Matrix) -> MatrixTangent:
-        """The stress's derivative in each of the d² directions."""
-        return MatrixTangent(la.matrix_of(lambda dF: jax.jvp(self.stress, (F,), (dF,))[1], F))
 
     def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
         """With τ_i = 2μ ln s_i + λ (ln J + (3 − d) ε_t): scaling (2μ δ_ij + λ)/(s_i s_j) − δ_ij τ_i/s_i², twist

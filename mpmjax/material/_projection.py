@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, Matrix
 from mpmjax.autodiff import ruled
-from mpmjax.material._base import AbstractMaterial, MatrixTangent
+from mpmjax.material._base import AbstractMaterial, MatrixTangent, is_isotropic
 
 
 def projected_tangent(material: AbstractMaterial, F: Matrix) -> MatrixTangent:
@@ -20,9 +20,19 @@ def projected_tangent(material: AbstractMaterial, F: Matrix) -> MatrixTangent:
     S. G. Krein; N. J. Higham, Functions of Matrices, SIAM 2008, theorem 3.11, doi 10.1137/1.9780898717778), the limit
     of K being 1 where both are positive and 0 where both are negative.
 
-    *When it breaks*: second derivatives are refused. Where an eigenvalue is zero A⁺ has a kink; the derivative given is
-    the mean of the two sides, which is what a central difference tends to. At F = I that is so: all twists are zero.
+    *When it breaks*: the law must be isotropic; where it has no `principal_tangent` of its own and is not, a
+    `RuntimeError` says so. Second derivatives are refused. Where an eigenvalue is zero A⁺ has a kink; the
+    derivative given is the mean of the two sides, which is what a central difference tends to. At F = I that is so: all
+    twists are zero.
     """
+    if type(material).principal_tangent is AbstractMaterial.principal_tangent:
+        name = type(material).__name__
+        F = eqx.error_if(
+            F,
+            ~is_isotropic(material, F),
+            f"{name} is not isotropic, and the projected Hessian needs a law that is: take AnalyticHessian() without "
+            f"projection or JvpHessian(), or write {name}'s energy in invariants of FᵀF.",
+        )
     return MatrixTangent(_projected_matrix(material, F))
 
 

@@ -1,9 +1,11 @@
-"""Problems with a known answer, for tests, benchmarks and new laws; not imported by `mpmjax` itself."""
+"""Problems with a known answer and a check of laws, for tests, benchmarks and new laws; not imported by `mpmjax`
+itself."""
 
 from mpmjax.verification._aligned import AxisAligned
 from mpmjax.verification._bar import VibratingBar
 from mpmjax.verification._column import Column
 from mpmjax.verification._disks import TwoDisks
+from mpmjax.verification._law import check_law
 from mpmjax.verification._problem import (
     AbstractProblem,
     Ends,
@@ -26,6 +28,7 @@ __all__ = [
     "TwoDisks",
     "VibratingBar",
     "Vortex",
+    "check_law",
     "discretise",
     "displacement_error",
     "errors",

@@ -1,0 +1,134 @@
+"""A law's closed forms against derivatives of its energy."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax import linalg as la
+from mpmjax._types import Array, Bool, Float, Matrix
+from mpmjax.checks import canonical, require
+from mpmjax.material import AbstractInelastic, AbstractMaterial, AbstractVolumetric, Law, Viscous
+
+_CHECKED = (
+    "the energy",
+    "the energy's gradient",
+    "the derivative of the energy's gradient",
+    "the energy after a rotation of space",
+    "stress",
+    "tangent",
+    "the derivative of tangent by F and the law's parameters",
+    "principal_tangent",
+)
+"""What is checked, in this order; the last where a law overrides it."""
+
+
+def check_law(law: Law | Viscous, *, dim: int = 3, F: Any = None, rtol: float = 1e-9) -> None:
+    """Check that a law's methods are derivatives of its energy, and finite where steps and gradients need them.
+
+    At each deformation that the law admits, in float64:
+    - the energy is finite, and a rotation of space does not change it;
+    - `stress` is the energy's gradient, `tangent` the derivative of that and `principal_tangent` its eigenstructure, as
+      `AbstractMaterial`'s defaults have them. Differences are relative to the size of the stress differential;
+    - the derivatives of the stress differential, by F and by the law's parameters, are finite.
+
+    Of a law with a history the elastic law of its initial history is checked, of a viscous one the law beside the
+    viscosity; return maps are not.
+
+    Args:
+        law: the law.
+        dim: 1, 2 or 3.
+        F: deformation gradients, shape (p, dim, dim), of a law of J alone (p, 1, 1). Default: F = I, repeated and
+            nearly repeated stretches, turned and not, and stretches from 0.6 to 1.6.
+        rtol: the largest relative difference that is allowed.
+
+    Raises:
+        ValueError: a difference or a derivative that is not finite: the law's method, F and the relative difference.
+            None of the deformations is admitted.
+    """
+    law = law.law if isinstance(law, Viscous) else law
+    size = 1 if isinstance(law, AbstractVolumetric) else dim
+    with jax.enable_x64(True):
+        found = jnp.asarray(_deformations(size) if F is None else np.asarray(F, float))
+        require(
+            found.ndim == 3 and found.shape[1:] == (size, size),
+            f"check_law's F must have shape (p, {size}, {size}), got {found.shape}.",
+        )
+        place = jnp.moveaxis(found, 0, -1)
+        own: Law = canonical(law, place.dtype)
+        elastic = own.elastic(own.initial_history(place)) if isinstance(own, AbstractInelastic) else own
+        faults = eqx.filter_jit(_faults)(elastic, place)
+    admitted, told = np.asarray(faults[0]), type(elastic).__name__
+    require(admitted.any(), f"{told} admits none of check_law's {len(admitted)} deformations: give some by F.")
+    for what, wrong in zip(_CHECKED, faults[1], strict=False):
+        wrong = np.where(admitted, np.asarray(wrong), 0)
+        worst = int(np.argmax(np.where(np.isnan(wrong), np.inf, wrong)))
+        where = f"at F = {np.array2string(np.asarray(found[worst]), precision=6, separator=', ')}".replace("\n", "")
+        require(not np.isnan(wrong[worst]), f"{told}: {what} is not finite {where}.")
+        require(wrong[worst] <= rtol, f"{told}: {what} is off by {wrong[worst]:.2g} of its size {where}.")
+
+
+def _faults(law: AbstractMaterial, F: Matrix) -> tuple[Bool[Array, "p"], tuple[Float[Array, "p"], ...]]:
+    """Which F the law admits, and the relative difference of each of `_CHECKED`, NaN where something is not finite."""
+    base, d = AbstractMaterial, len(F)
+    Q = jnp.broadcast_to(jnp.asarray(_rotation(np.random.default_rng(1), d))[..., None], F.shape)
+    energy, turned = law.energy(F), law.energy(la.matmul(Q, F))
+    stress = base.stress(law, F)
+    A = la.matrix_of(lambda dF: jax.jvp(lambda F: base.stress(law, F), (F,), (dF,))[1], F)
+    stiffness = jnp.sqrt((A**2).sum(axis=(0, 1)))
+    U, s, V = la.principal_frame(F)
+
+    def differential(law: AbstractMaterial, F: Matrix) -> Array:
+        return la.matrix_of(law.tangent(F), F)
+
+    numbers, rest = eqx.partition(law, eqx.is_inexact_array)
+    ones = jax.tree.map(jnp.ones_like, numbers)
+    third = jax.jvp(lambda n, F: differential(eqx.combine(n, rest), F), (numbers, F), (ones, Q))[1]
+
+    def compared(ours: Array, expected: Array) -> Array:
+        scale = _size(expected) + stiffness
+        return _size(ours - expected) / jnp.where(scale == 0, 1, scale)
+
+    faults = (
+        0 * energy,
+        0 * _size(stress),
+        0 * stiffness,
+        compared(turned[None, None], energy[None, None]),
+        compared(law.stress(F), stress),
+        compared(differential(law, F), A),
+        0 * _size(third),
+    )
+    if type(law).principal_tangent is not base.principal_tangent:
+        faults += (compared(_assembled(law, U, s, V), A),)
+    return law.is_admissible(F), faults
+
+
+def _assembled(law: AbstractMaterial, U: Matrix, s: Float[Array, "d p"], V: Matrix) -> Float[Array, "m m p"]:
+    """The stress differential at F = U diag(s) Vᵀ that `principal_tangent` stands for."""
+    d, tangent = len(s), law.principal_tangent(s)
+    modes = la.principal_modes(U, V).reshape(d * d, d * d, -1)
+    core = la.diagonal(jnp.concatenate([jnp.zeros_like(s), tangent.twist, tangent.flip]))
+    core = core.at[:d, :d].set(tangent.scaling)
+    return la.matmul(la.transpose(modes), la.matmul(core, modes))
+
+
+def _size(A: Float[Array, "a b p"]) -> Float[Array, "p"]:
+    return jnp.sqrt((A**2).sum(axis=(0, 1)))
+
+
+def _rotation(rng: np.random.Generator, d: int) -> np.ndarray:
+    Q = np.linalg.qr(rng.normal(size=(d, d)))[0]
+    Q[:, 0] *= np.sign(np.linalg.det(Q))
+    return Q
+
+
+def _deformations(d: int) -> Float[np.ndarray, "p d d"]:
+    """See `check_law`."""
+    rng = np.random.default_rng(0)
+    stretches = [np.ones(3), np.full(3, 1.2), np.array([1.2, 0.9, 0.9]), np.array([0.8, 0.8, 1.3])]
+    stretches += [s + gap * np.array([0.4, -1.0, 0.7]) for s in stretches for gap in (1e-14, 1e-7, 1e-3)]
+    stretches += list(rng.uniform(0.6, 1.6, (8, 3)))
+    plain = [np.diag(s[:d]) for s in stretches]
+    return np.stack(plain + [_rotation(rng, d) @ F @ _rotation(rng, d).T for F in plain])
