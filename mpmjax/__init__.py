@@ -46,7 +46,18 @@ from mpmjax.geometry import (
     sample_distance,
     sample_mesh,
 )
-from mpmjax.implicit import AnalyticHessian, ConjugateResidual, Guess, JvpHessian, Linearised, Metric, Newton
+from mpmjax.implicit import (
+    AbstractHessian,
+    AbstractPreconditioner,
+    AnalyticHessian,
+    ConjugateResidual,
+    DiagonalPreconditioner,
+    Guess,
+    JvpHessian,
+    Linearised,
+    MassPreconditioner,
+    Newton,
+)
 from mpmjax.io import load, record, save
 from mpmjax.material import (
     AbstractInelastic,
@@ -135,11 +146,14 @@ __all__ = [  # noqa: RUF022 (grouped)
     "TRBDF2",
     "Linearised",
     "Newton",
+    "AbstractHessian",
     "AnalyticHessian",
     "JvpHessian",
     "ConjugateResidual",
+    "AbstractPreconditioner",
+    "DiagonalPreconditioner",
+    "MassPreconditioner",
     "Guess",
-    "Metric",
     "stable_dt",
     # running
     "Run",

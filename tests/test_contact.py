@@ -10,7 +10,7 @@ from numpy_oracle import grid_update
 
 import mpmjax as mpm
 from mpmjax.checks._values import canonical
-from mpmjax.implicit._problems import no_solve
+from mpmjax.implicit._solve_info import no_solve
 from mpmjax.stepping._contact import SWEEPS, ActiveSet, find_active_set, hold
 from mpmjax.stepping._method import NodeMotion
 from mpmjax.stepping._nodes import particles_to_grid

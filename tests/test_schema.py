@@ -69,7 +69,9 @@ EXAMPLES = {
     mpm.TotalLagrangian: mpm.TotalLagrangian(),
     mpm.Explicit: mpm.Explicit(),
     mpm.SemiImplicit: mpm.SemiImplicit(0.5, mpm.JvpHessian(), mpm.ConjugateResidual(1e-7), guess=Guess.EXPLICIT),
-    mpm.BackwardEuler: mpm.BackwardEuler(mpm.Newton(rtol=1e-6, max_steps=7), metric=mpm.Metric.DIAGONAL),
+    mpm.BackwardEuler: mpm.BackwardEuler(
+        mpm.Newton(rtol=1e-6, max_steps=7), preconditioner=mpm.DiagonalPreconditioner()
+    ),
     mpm.ImplicitMidpoint: mpm.ImplicitMidpoint(mpm.Newton(mpm.ConjugateResidual(1e-2), 1e-6, 9), guess=Guess.ZERO),
     mpm.TRBDF2: mpm.TRBDF2(0.3, mpm.Linearised(mpm.ConjugateResidual(1e-7))),
     mpm.Linearised: mpm.Linearised(),

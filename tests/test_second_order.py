@@ -9,7 +9,7 @@ from numpy_oracle import grid_update
 from test_implicit import jolted
 
 import mpmjax as mpm
-from mpmjax.implicit._hessian import ImplicitOperator
+from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._projection import Projection
 from mpmjax.stepping._method import NodeMotion
 from mpmjax.stepping._step import impulses
@@ -106,7 +106,7 @@ def test_an_unconverged_first_stage_is_reported():
     def stages(rtol):
         """The report, and the relative residual of either stage."""
         solution = mpm.Linearised(mpm.ConjugateResidual(rtol=rtol, max_steps=25))
-        method = mpm.TRBDF2(0.0, solution, metric=mpm.Metric.MASS)  # whose norm is taken below
+        method = mpm.TRBDF2(0.0, solution, preconditioner=mpm.MassPreconditioner())  # whose norm is taken below
         motion, info = method.move(nodes, guess)
         _, q0, q1, q2 = method.weights()
         dt, v0, v, g = nodes.dt, nodes.velocity, motion.velocity, nodes.acceleration

@@ -165,7 +165,7 @@ def _complaint(report: Sensitivity, statistics: RunStatistics, unsolved: float, 
         return told + (
             f"the run has a derivative that is not known: the tangent solve of a step did not converge (relative "
             f"residual {unsolved:.2g}). Raise the max_steps of the method's adjoint_solver, or leave "
-            "its metric at Metric.DIAGONAL."
+            "its preconditioner at DiagonalPreconditioner()."
         )
     first = int(jnp.argmax(over))
     return told + (

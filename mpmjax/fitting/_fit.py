@@ -198,7 +198,7 @@ def _least_squares(misfit: Callable[[Array], _Misfit], dtype: Any) -> tuple[Arra
             raise RuntimeError(
                 f"The fit has no derivative at {float(ratio[0]):.4g} times the first guess: the tangent solve of a "
                 f"step did not converge (relative residual {float(unsolved):.2g}). Raise the "
-                "max_steps of the method's adjoint_solver, or leave its metric at Metric.DIAGONAL."
+                "max_steps of the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner()."
             )
         if not np.isfinite(J).all():
             raise RuntimeError(

@@ -22,7 +22,7 @@ from mpmjax.simulation import (
     no_steps,
     number_of_steps,
     raise_faults,
-    warn_of_short_solves,
+    warn_of_inaccurate_solves,
 )
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
 from mpmjax.stepping import Explicit, Method, step_for
@@ -139,7 +139,7 @@ def record(
             except OSError as refused:
                 said = str(refused)
             raise SimulationError(f"{error} {said}", error.run) from None
-        warn_of_short_solves(run.statistics)
+        warn_of_inaccurate_solves(run.statistics)
         return run
 
 

@@ -24,7 +24,7 @@ from mpmjax.checks import (
     requirements,
 )
 from mpmjax.simulation._diffrax import Problem, StepSolver, examined, no_vector_field, step_number
-from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_short_solves
+from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccurate_solves
 from mpmjax.simulation._run import Run
 from mpmjax.simulation._statistics import HEALTHY, RunStatistics
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
@@ -143,7 +143,7 @@ def simulate(
     if traced:
         return guarded(run, report)
     raise_faults(run, particles, previous, start)
-    warn_of_short_solves(run.statistics)
+    warn_of_inaccurate_solves(run.statistics)
     return run
 
 

@@ -13,17 +13,19 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import lineax as lx
 
 from mpmjax._types import Array, Float, NodeVector, Scalar
 from mpmjax.checks import require_between, require_fields
 from mpmjax.implicit import (
+    AbstractHessian,
+    AbstractPreconditioner,
     AnalyticHessian,
     ConjugateResidual,
+    DiagonalPreconditioner,
     Guess,
-    Hessian,
     Linearised,
     LinearProblem,
-    Metric,
     Newton,
     NewtonProblem,
     Reporting,
@@ -103,17 +105,17 @@ class SemiImplicit(eqx.Module):
         beta: β, from 0 to 1.
         hessian: how H acts. Default: by the analytic stress differential.
         solver: conjugate residuals of the forward solve.
-        metric: inner product of the solves, which is their preconditioner. Default: by the diagonal of M + cH.
+        preconditioner: of the solves. Default: the diagonal of M + cH.
         adjoint_solver: of the tangent and adjoint solves, whose tolerance bounds the gradient's. Default: default
             tolerances.
         guess: where the solve starts.
     """
 
     beta: Scalar = 1.0
-    hessian: Hessian = AnalyticHessian()
-    solver: ConjugateResidual = ConjugateResidual()
-    metric: Metric = eqx.field(static=True, default=Metric.DIAGONAL)
-    adjoint_solver: ConjugateResidual = ConjugateResidual()
+    hessian: AbstractHessian = AnalyticHessian()
+    solver: lx.AbstractLinearSolver = ConjugateResidual()
+    preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
+    adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = False
     needs_force: ClassVar[bool] = True
@@ -135,7 +137,7 @@ class SemiImplicit(eqx.Module):
             rhs=impulse - (1 - beta) * nodes.dt * nodes.potential.damping_force(v0) if viscous else impulse,
             projection=nodes.projection,
             prescribed=nodes.prescribed,
-            metric=self.metric,
+            preconditioner=self.preconditioner,
         )
         v, info = solve(problem, guess, Linearised(self.solver), self.adjoint_solver)
         return NodeMotion(v, resisted=(1 - beta) * v0 + beta * v if viscous else None), info
@@ -157,15 +159,15 @@ class BackwardEuler(eqx.Module):
     Args:
         solution: `Newton()`, with its tolerances.
         hessian: how H acts. Default: by the analytic stress differential.
-        metric: inner product of the linear solves, which is their preconditioner. Default: by the diagonal of M + cH.
+        preconditioner: of the linear solves. Default: the diagonal of M + cH.
         adjoint_solver: of the tangent and adjoint solves. Default: default tolerances.
         guess: where Newton starts.
     """
 
     solution: Newton = Newton()
-    hessian: Hessian = AnalyticHessian()
-    metric: Metric = eqx.field(static=True, default=Metric.DIAGONAL)
-    adjoint_solver: ConjugateResidual = ConjugateResidual()
+    hessian: AbstractHessian = AnalyticHessian()
+    preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
+    adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = False
     needs_force: ClassVar[bool] = True
@@ -201,15 +203,15 @@ class ImplicitMidpoint(eqx.Module):
     Args:
         solution: `Linearised()`, one linear solve, or `Newton()`.
         hessian: how H acts. Default: by the analytic stress differential.
-        metric: inner product of the linear solves, which is their preconditioner. Default: by the diagonal of M + cH.
+        preconditioner: of the linear solves. Default: the diagonal of M + cH.
         adjoint_solver: of the tangent and adjoint solves. Default: default tolerances.
         guess: where the solve starts.
     """
 
     solution: Linearised | Newton = Linearised()
-    hessian: Hessian = AnalyticHessian()
-    metric: Metric = eqx.field(static=True, default=Metric.DIAGONAL)
-    adjoint_solver: ConjugateResidual = ConjugateResidual()
+    hessian: AbstractHessian = AnalyticHessian()
+    preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
+    adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = True
     needs_force: ClassVar[bool] = True
@@ -249,16 +251,16 @@ class TRBDF2(eqx.Module):
         rho: ρ∞, from 0 to 1.
         solution: `Linearised()`, one linear solve a stage, or `Newton()`.
         hessian: how H acts. Default: by the analytic stress differential.
-        metric: inner product of the linear solves, which is their preconditioner. Default: by the diagonal of M + cH.
+        preconditioner: of the linear solves. Default: the diagonal of M + cH.
         adjoint_solver: of the tangent and adjoint solves. Default: default tolerances.
         guess: where the first stage's solve starts; the second's does where the first ended.
     """
 
     rho: Scalar = 0.0
     solution: Linearised | Newton = Linearised()
-    hessian: Hessian = AnalyticHessian()
-    metric: Metric = eqx.field(static=True, default=Metric.DIAGONAL)
-    adjoint_solver: ConjugateResidual = ConjugateResidual()
+    hessian: AbstractHessian = AnalyticHessian()
+    preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
+    adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     centred: ClassVar[bool] = True
     needs_force: ClassVar[bool] = True
@@ -287,7 +289,7 @@ class TRBDF2(eqx.Module):
         last = _Stage(v0 + dt * (q0 * pull + q1 * later_pull + g), c, dt * (q0 * v0 + q1 * middle))
         v, second = last.solve(nodes, middle, self)
         inner, mean = q2 * (v0 + middle), q0 * v0 + q1 * middle + q2 * v
-        return NodeMotion(v, mean, inner, mean if viscous else None), first.beside(second)
+        return NodeMotion(v, mean, inner, mean if viscous else None), first.together_with(second)
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt (q_0 f_0 + q_1 f_γ + q_2 f_1) [kg m/s]."""
@@ -320,9 +322,9 @@ class _Stage(eqx.Module):
 
     inertial: NodeVector
     """a [m/s]."""
-    length: Float[Array, ""]
+    stage_dt: Float[Array, ""]
     """c [s]."""
-    displaced: NodeVector | None = None
+    initial_displacement: NodeVector | None = None
     """u [m]; None for zero."""
 
     def solve(
@@ -333,23 +335,27 @@ class _Stage(eqx.Module):
             "mass": nodes.mass,
             "projection": nodes.projection,
             "prescribed": nodes.prescribed,
-            "metric": method.metric,
+            "preconditioner": method.preconditioner,
         }
         match method.solution:
             case Linearised():
                 action = method.hessian.at_current(nodes.potential, guess)
-                force = nodes.force if self.displaced is None else nodes.force - action(self.displaced)
+                force = (
+                    nodes.force
+                    if self.initial_displacement is None
+                    else nodes.force - action(self.initial_displacement)
+                )
                 problem = LinearProblem(
-                    factor=self.length**2,
-                    hessian=damped(action, nodes.potential, 1 / self.length),
-                    rhs=nodes.mass[:, None] * self.inertial + self.length * force,
+                    factor=self.stage_dt**2,
+                    hessian=damped(action, nodes.potential, 1 / self.stage_dt),
+                    rhs=nodes.mass[:, None] * self.inertial + self.stage_dt * force,
                     **system,
                 )
             case Newton():
                 problem = NewtonProblem(
                     inertial=self.inertial,
-                    length=self.length,
-                    displaced=self.displaced,
+                    stage_dt=self.stage_dt,
+                    initial_displacement=self.initial_displacement,
                     spacing=nodes.spacing,
                     potential=nodes.potential,
                     hessian=method.hessian,

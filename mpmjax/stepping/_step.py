@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Int, NodeScalar, NodeVector, Scalar, components, particle_first
+from mpmjax.autodiff import without_derivative
 from mpmjax.boundary import ColliderImpulse, received
 from mpmjax.checks import canonical, checked, require_positive
 from mpmjax.discretisation import Stencil, g2p
@@ -102,7 +103,7 @@ def update(nodes: Nodes, method: Method) -> GridUpdate:
             motion, info = method.move(held.nodes, guess)
             return jax.tree.map(held.images.unfold, motion), info
 
-        frozen, frozen_method, guess = jax.lax.stop_gradient((nodes, method, guess))
+        frozen, frozen_method, guess = without_derivative((nodes, method, guess))
 
         def attempt(held: Held, guess: NodeVector) -> tuple:
             motion, info = moved(held, frozen_method, guess)
@@ -123,7 +124,7 @@ def update(nodes: Nodes, method: Method) -> GridUpdate:
             reaction=reaction,
             friction=nodes.mass[:, None] * loss,
             free=held.untouched,
-            solve=cost.plus(info),
+            solve=cost.followed_by(info),
             contact=ContactInfo(sweeps, held.count_violations(motion.velocity, reaction)),
             push=push,
             rub=rub,
