@@ -75,7 +75,17 @@ from mpmjax.material import (
 )
 from mpmjax.simulation import Run, SimulationError, rollout, simulate
 from mpmjax.state import AbstractBodyForce, Particles, Scene, TotalLagrangian, UpdatedLagrangian, fill, join, prepare
-from mpmjax.stepping import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit, StepInfo, stable_dt, step
+from mpmjax.stepping import (
+    TRBDF2,
+    AbstractIntegrator,
+    BackwardEuler,
+    Explicit,
+    ImplicitMidpoint,
+    SemiImplicit,
+    StepInfo,
+    stable_dt,
+    step,
+)
 from mpmjax.viz import render
 
 __version__ = "0.1.0"
@@ -139,6 +149,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "StickyCollider",
     "AbstractBodyForce",
     # grid updates
+    "AbstractIntegrator",
     "BackwardEuler",
     "Explicit",
     "ImplicitMidpoint",

@@ -168,7 +168,7 @@ def test_newton_starts_from_rest_where_the_potential_is_lower_there():
     moving = jnp.ones_like(particles.v)
     particles = eqx.tree_at(lambda q: (q.v, q.F), mpm.prepare(scene, particles), (moving, jnp.asarray(F)))
     nodes = grid_update(scene, particles, 20 * explicit_limit(scene), mpm.Explicit()).nodes
-    move = eqx.filter_jit(lambda guess: NEWTON.move(nodes, guess))
+    move = eqx.filter_jit(lambda guess: NEWTON.advance(nodes, guess))
     rest, far, near = map(move, (0 * nodes.velocity, nodes.explicit_velocity(), nodes.velocity))
     jax.tree.map(np.testing.assert_array_equal, rest, far)
     for motion, info in (rest, near):

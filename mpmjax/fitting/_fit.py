@@ -15,7 +15,7 @@ from mpmjax.checks import canonical, checked, require, require_finite, shape_of
 from mpmjax.geometry import AbstractRegion
 from mpmjax.simulation import simulate
 from mpmjax.state import Particles, Scene, prepare
-from mpmjax.stepping import Method
+from mpmjax.stepping import AbstractIntegrator
 
 
 class StressStretch(eqx.Module):
@@ -74,7 +74,7 @@ def fit_curve(
     *,
     t1: Scalar,
     dt: Scalar,
-    method: Method,
+    method: AbstractIntegrator,
     curve: Callable[[Scene, Particles], tuple[Array, Array]],
     measured_x: np.ndarray,
     measured_y: np.ndarray,

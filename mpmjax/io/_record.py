@@ -25,7 +25,7 @@ from mpmjax.simulation import (
     warn_of_inaccurate_solves,
 )
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
-from mpmjax.stepping import Explicit, Method, step_for
+from mpmjax.stepping import AbstractIntegrator, Explicit, step_for
 
 
 @checked
@@ -36,7 +36,7 @@ def record(
     *,
     t1: Scalar,
     dt: Scalar | Literal["stable"],
-    method: Method = Explicit(),
+    method: AbstractIntegrator = Explicit(),
     save_every: int,
     start: int = 0,
     overwrite: bool = False,
@@ -147,7 +147,7 @@ def _begun(
     path: str | os.PathLike,
     scene: Scene,
     particles: Particles,
-    method: Method,
+    method: AbstractIntegrator,
     dt: Any,
     start: int,
     overwrite: bool,

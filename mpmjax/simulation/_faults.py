@@ -24,7 +24,7 @@ from mpmjax.simulation._statistics import (
     RunStatistics,
 )
 from mpmjax.state import Particles, State, state_of, with_state
-from mpmjax.stepping import BackwardEuler, Explicit, Method
+from mpmjax.stepping import AbstractIntegrator, BackwardEuler
 
 
 def raise_faults(run: Run, began: Particles, previous: State | None, start: int) -> None:
@@ -80,11 +80,9 @@ def raise_faults(run: Run, began: Particles, previous: State | None, start: int)
         )
 
 
-def unconverged_advice(method: Method, dtype: Any) -> str:
+def unconverged_advice(method: AbstractIntegrator, dtype: Any) -> str:
     """What helps a solve that does not converge."""
-    advice = ["reduce dt", "raise the solver's max_steps or loosen its rtol"]
-    if not isinstance(method, Explicit) and method.preconditioner.advice is not None:
-        advice.insert(0, method.preconditioner.advice)
+    advice = [*method.unconverged_advice(), "reduce dt", "raise the solver's max_steps or loosen its rtol"]
     if jnp.dtype(dtype) == jnp.float32:
         advice.append("take float64 particles, of which rounding leaves more digits")
     if not isinstance(method, BackwardEuler):
