@@ -123,11 +123,11 @@ class _System(eqx.Module):
 
     def apply(self, u: Array) -> Array:
         """E u."""
-        return ravel_pytree(self.inner.solve(self.operator.mv(self.unravel(u))))[0]
+        return self.inner.solve(ravel_pytree(self.operator.mv(self.unravel(u)))[0])
 
     def dot(self, a: Array, c: Array) -> Float[Array, ""]:
         """aᵀ W c."""
-        return (ravel_pytree(self.inner.apply(self.unravel(a)))[0] * c).sum()
+        return (self.inner.apply(a) * c).sum()
 
     def norm(self, a: Array) -> Float[Array, ""]:
         """‖a‖ in the norm of W."""
@@ -177,9 +177,8 @@ def _system(
     solver: ConjugateResidual, operator: lx.AbstractLinearOperator, vector: Any, inner: AbstractInnerProduct | None
 ) -> _System:
     flat, unravel = ravel_pytree(vector)
-    if inner is None:
-        inner = DiagonalInnerProduct(jax.tree.map(jnp.ones_like, vector))
-    b = ravel_pytree(inner.solve(vector))[0]
+    inner = DiagonalInnerProduct(jnp.ones_like(flat)) if inner is None else inner.flattened(unravel)
+    b = inner.solve(flat)
     rtol = default_rtol(flat.dtype) if solver.rtol is None else solver.rtol
     system = _System(operator, inner, unravel, b, b[0], rtol, solver.increment_rtol, solver.max_steps)
     return replace(system, b_norm=system.norm(b))

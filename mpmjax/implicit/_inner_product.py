@@ -1,12 +1,16 @@
 """The inner product in which a linear system is solved."""
 
 import abc
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from typing_extensions import override
+
+from mpmjax._types import Array
 
 
 class AbstractInnerProduct(eqx.Module):
@@ -36,6 +40,10 @@ class AbstractInnerProduct(eqx.Module):
         """W⁻¹ r."""
         return self.solve_factor_transpose(self.solve_factor(r))
 
+    def flattened(self, unravel: Callable[[Array], Any]) -> "AbstractInnerProduct":
+        """The same inner product, of vectors that `jax.flatten_util.ravel_pytree` has flattened."""
+        return _FlatInnerProduct(self, unravel)
+
 
 class DiagonalInnerProduct(AbstractInnerProduct):
     """That of a diagonal W.
@@ -61,3 +69,24 @@ class DiagonalInnerProduct(AbstractInnerProduct):
     @override
     def solve(self, r: Any) -> Any:
         return jax.tree.map(jnp.divide, r, self.weight)
+
+    @override
+    def flattened(self, unravel: Callable[[Array], Any]) -> "DiagonalInnerProduct":
+        return DiagonalInnerProduct(ravel_pytree(self.weight)[0])
+
+
+class _FlatInnerProduct(AbstractInnerProduct):
+    inner: AbstractInnerProduct
+    unravel: Callable[[Array], Any] = eqx.field(static=True)
+
+    @override
+    def apply(self, v: Array) -> Array:
+        return ravel_pytree(self.inner.apply(self.unravel(v)))[0]
+
+    @override
+    def solve_factor(self, r: Array) -> Array:
+        return ravel_pytree(self.inner.solve_factor(self.unravel(r)))[0]
+
+    @override
+    def solve_factor_transpose(self, v: Array) -> Array:
+        return ravel_pytree(self.inner.solve_factor_transpose(self.unravel(v)))[0]
