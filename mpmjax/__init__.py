@@ -47,7 +47,18 @@ from mpmjax.geometry import (
     sample_distance,
     sample_mesh,
 )
-from mpmjax.implicit import AnalyticHessian, ConjugateResidual, Guess, JvpHessian, Linearised, Metric, Newton
+from mpmjax.implicit import (
+    AbstractHessian,
+    AbstractPreconditioner,
+    AnalyticHessian,
+    ConjugateResidual,
+    DiagonalPreconditioner,
+    Guess,
+    JvpHessian,
+    Linearised,
+    MassPreconditioner,
+    Newton,
+)
 from mpmjax.io import load, record, register, save
 from mpmjax.material import (
     AbstractInelastic,
@@ -65,7 +76,17 @@ from mpmjax.material import (
 )
 from mpmjax.simulation import Run, SimulationError, rollout, simulate
 from mpmjax.state import AbstractBodyForce, Particles, Scene, TotalLagrangian, UpdatedLagrangian, fill, join, prepare
-from mpmjax.stepping import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit, StepInfo, stable_dt, step
+from mpmjax.stepping import (
+    TRBDF2,
+    AbstractIntegrator,
+    BackwardEuler,
+    Explicit,
+    ImplicitMidpoint,
+    SemiImplicit,
+    StepInfo,
+    stable_dt,
+    step,
+)
 from mpmjax.viz import render
 
 __version__ = "0.1.0"
@@ -130,6 +151,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "StickyCollider",
     "AbstractBodyForce",
     # grid updates
+    "AbstractIntegrator",
     "BackwardEuler",
     "Explicit",
     "ImplicitMidpoint",
@@ -137,11 +159,14 @@ __all__ = [  # noqa: RUF022 (grouped)
     "TRBDF2",
     "Linearised",
     "Newton",
+    "AbstractHessian",
     "AnalyticHessian",
     "JvpHessian",
     "ConjugateResidual",
+    "AbstractPreconditioner",
+    "DiagonalPreconditioner",
+    "MassPreconditioner",
     "Guess",
-    "Metric",
     "stable_dt",
     # running
     "Run",

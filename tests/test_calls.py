@@ -42,7 +42,11 @@ CHOICES = {
         r"shape must be one of Box, Ball, .*, got the class Ball, did you mean Ball\(\.\.\.\)\?",
     ),
     "part of a name": (lambda: mpm.SemiImplicit(hessian="jvp"), r"did you mean JvpHessian\(\)\?"),
-    "of an enumeration": (lambda: mpm.SemiImplicit(metric="diagonal"), r"did you mean Metric\.DIAGONAL\?"),
+    "of an enumeration": (lambda: mpm.SemiImplicit(guess="explicit"), r"did you mean Guess\.EXPLICIT\?"),
+    "of a preconditioner": (
+        lambda: mpm.SemiImplicit(preconditioner="diagonal"),
+        r"did you mean DiagonalPreconditioner\(\)\?",
+    ),
     "a method": (
         lambda: mpm.simulate(**RUN, method="explicit"),
         r"simulate's method must be one of Explicit, SemiImplicit, .*, got 'explicit', did you mean Explicit\(\)\?",

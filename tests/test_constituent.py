@@ -40,10 +40,13 @@ def test_two_materials_are_one_with_a_modulus_for_each_particle(method, descript
 
 
 @pytest.mark.parametrize("hessian", [mpm.AnalyticHessian(True), mpm.JvpHessian()], ids=["projected", "jvp"])
-@pytest.mark.parametrize("metric", [mpm.Metric.DIAGONAL, pytest.param(mpm.Metric.MASS, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "preconditioner",
+    [mpm.DiagonalPreconditioner(), pytest.param(mpm.MassPreconditioner(), marks=pytest.mark.slow)],
+)
 def test_hessians_and_metrics_of_two_materials_are_those_of_one(metric, hessian):
     one, two, particles = halves()
-    method = mpm.SemiImplicit(hessian=hessian, metric=metric)
+    method = mpm.SemiImplicit(hessian=hessian, preconditioner=preconditioner)
     ends = [mpm.rollout(scene, particles, steps=2, dt=2e-2, method=method) for scene in (one, two)]
     assert_close(ends[0].x, ends[1].x, 1e-9)
 
@@ -88,7 +91,7 @@ def test_a_bar_of_two_stiffnesses_carries_one_stress(method, contrast):
         run = mpm.simulate(scene, particles, t1=4.0, dt=dt)
     else:
         solver = mpm.ConjugateResidual(1e-10)
-        update = mpm.SemiImplicit(metric=mpm.Metric.DIAGONAL, solver=solver)
+        update = mpm.SemiImplicit(preconditioner=mpm.DiagonalPreconditioner(), solver=solver)
         run = mpm.simulate(scene, particles, t1=40.0, dt=0.5, method=update)
     middle = slice(32, 48)
     soft, hard = (

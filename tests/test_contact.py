@@ -10,9 +10,9 @@ from numpy_oracle import grid_update
 
 import mpmjax as mpm
 from mpmjax.checks._values import canonical
-from mpmjax.implicit._problems import no_solve
+from mpmjax.implicit._solve_info import no_solve
+from mpmjax.stepping import NodeMotion
 from mpmjax.stepping._contact import SWEEPS, ActiveSet, find_active_set, hold
-from mpmjax.stepping._method import NodeMotion
 from mpmjax.stepping._nodes import particles_to_grid
 from mpmjax.stepping._step import impulses, update
 
@@ -287,7 +287,7 @@ def test_whatever_columns_are_held_mirroring_twice_is_mirroring_once(number):
         nodes = particles_to_grid(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start), centred=False)
 
         def attempt(held, guess):
-            motion, info = method.move(held.nodes, guess)
+            motion, info = method.advance(held.nodes, guess)
             motion = jax.tree.map(held.images.unfold, motion)
             return motion.velocity, impulses(nodes, method, motion)[1], motion.carrier, info
 

@@ -10,7 +10,7 @@ from helpers import DIMS, ELASTIC, LAWS, assert_close, block, explicit_limit, id
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.implicit._hessian import ImplicitOperator
+from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.material import projected_tangent
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)

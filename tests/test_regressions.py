@@ -49,7 +49,9 @@ def test_contact_starts_from_the_chosen_guess_and_counts_its_sweeps():
     shaken = jnp.asarray(np.random.default_rng(0).normal(size=particles.v.shape))
     particles, iterations = eqx.tree_at(lambda q: q.v, particles, shaken), []
     for guess in mpm.Guess:
-        method = mpm.SemiImplicit(guess=guess, metric=mpm.Metric.MASS)  # which tells guesses apart in so small a bar
+        method = mpm.SemiImplicit(
+            guess=guess, preconditioner=mpm.MassPreconditioner()
+        )  # which tells guesses apart in so small a bar
         _, info = mpm.step(scene, particles, 0.0, 0.05, method=method)
         assert int(info.contact.sweeps) >= 1
         iterations.append(int(info.solve.iterations))

@@ -15,7 +15,7 @@ from mpmjax.geometry._motion import AbstractMotion
 from mpmjax.geometry._region import AbstractRegion
 from mpmjax.implicit._guess import Guess
 from mpmjax.io._schema import CLASSES, arguments, decode, encode
-from mpmjax.stepping._method import Method
+from mpmjax.stepping import AbstractIntegrator
 
 GRID = mpm.Grid((8, 9), 0.1, origin=(-2, 3), periodic=(True, False))
 GRIP = mpm.Grip(mpm.Box((-np.inf, 0.0), (0.1, 1.0)), mpm.Motion((0.0, 0.3), ((0.0, 0.0), (0.1, 0.7))), (True, False))
@@ -69,7 +69,9 @@ EXAMPLES = {
     mpm.TotalLagrangian: mpm.TotalLagrangian(),
     mpm.Explicit: mpm.Explicit(),
     mpm.SemiImplicit: mpm.SemiImplicit(0.5, mpm.JvpHessian(), mpm.ConjugateResidual(1e-7), guess=Guess.EXPLICIT),
-    mpm.BackwardEuler: mpm.BackwardEuler(mpm.Newton(rtol=1e-6, max_steps=7), metric=mpm.Metric.DIAGONAL),
+    mpm.BackwardEuler: mpm.BackwardEuler(
+        mpm.Newton(rtol=1e-6, max_steps=7), preconditioner=mpm.DiagonalPreconditioner()
+    ),
     mpm.ImplicitMidpoint: mpm.ImplicitMidpoint(mpm.Newton(mpm.ConjugateResidual(1e-2), 1e-6, 9), guess=Guess.ZERO),
     mpm.TRBDF2: mpm.TRBDF2(0.3, mpm.Linearised(mpm.ConjugateResidual(1e-7))),
     mpm.Linearised: mpm.Linearised(),
@@ -409,5 +411,5 @@ def test_a_wrong_scene_gets_one_line_that_names_the_place(changes, message):
 def test_a_wrong_method_gets_one_line_that_names_the_place(table, message):
     """Nested tables are named by their header."""
     with pytest.raises(ValueError) as caught:  # noqa: PT011
-        decode(table, Method, "[method]")
+        decode(table, AbstractIntegrator, "[method]")
     assert str(caught.value).startswith(message)

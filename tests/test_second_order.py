@@ -9,9 +9,9 @@ from numpy_oracle import grid_update
 from test_implicit import jolted
 
 import mpmjax as mpm
-from mpmjax.implicit._hessian import ImplicitOperator
+from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._projection import Projection
-from mpmjax.stepping._method import NodeMotion
+from mpmjax.stepping import NodeMotion
 from mpmjax.stepping._step import impulses
 
 SOLVER = mpm.ConjugateResidual(rtol=1e-14)
@@ -28,7 +28,7 @@ GRIP = mpm.Grip(mpm.Box((-1.0, -1.0), (1.0, 0.05)), mpm.Motion((0.0, 1.0), ((0.0
 @eqx.filter_jit
 def move(method, nodes):
     """The nodes' motion and the solves' report."""
-    return method.move(nodes, nodes.velocity)
+    return method.advance(nodes, nodes.velocity)
 
 
 def trapezoidal(A, y, h):
@@ -106,8 +106,8 @@ def test_an_unconverged_first_stage_is_reported():
     def stages(rtol):
         """The report, and the relative residual of either stage."""
         solution = mpm.Linearised(mpm.ConjugateResidual(rtol=rtol, max_steps=25))
-        method = mpm.TRBDF2(0.0, solution, metric=mpm.Metric.MASS)  # whose norm is taken below
-        motion, info = method.move(nodes, guess)
+        method = mpm.TRBDF2(0.0, solution, preconditioner=mpm.MassPreconditioner())  # whose norm is taken below
+        motion, info = method.advance(nodes, guess)
         _, q0, q1, q2 = method.weights()
         dt, v0, v, g = nodes.dt, nodes.velocity, motion.velocity, nodes.acceleration
         middle, c, pull = motion.inner / q2 - v0, q2 * dt, nodes.per_mass(nodes.force)

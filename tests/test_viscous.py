@@ -9,7 +9,7 @@ from helpers import DESCRIPTIONS, DIMS, FLUIDS, LAWS, VISCOUS, assert_close, blo
 
 import mpmjax as mpm
 from mpmjax.boundary._mirror import mirror
-from mpmjax.implicit._hessian import damped
+from mpmjax.implicit._hessian_action import damped
 from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.material import Viscosity
 
@@ -58,7 +58,7 @@ def applied(potential, u, hessian):
     action = damped(hessian.at_current(potential, u[0]), potential, jnp.asarray(3.0))
     elastic = hessian.at_current(potential, u[0])(u[0])
     drags, powers = jax.vmap(potential.damping_force)(u), jax.vmap(potential.power)(u)
-    return drags, powers, elastic, action(u[0]), action.assembled()(u[0])
+    return drags, powers, elastic, action(u[0]), action.precomputed()(u[0])
 
 
 @pytest.mark.parametrize(("law", "description"), CASES)

@@ -15,7 +15,7 @@ import scipy.spatial
 from mpmjax.checks import canonical
 from mpmjax.simulation import Run, SimulationError, integrate, raise_faults
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
-from mpmjax.stepping import Method, stable_dt
+from mpmjax.stepping import AbstractIntegrator, stable_dt
 
 FRAMES = 8
 """Times at which motions are compared."""
@@ -30,7 +30,7 @@ Build = Callable[[int], tuple[Scene, Particles]]
 class Trial(NamedTuple):
     """A setting, what it cost and how good it was."""
 
-    method: Method
+    method: AbstractIntegrator
     refinement: int
     """By how much the spacing is finer than the scene's own."""
     dt: float
@@ -46,7 +46,7 @@ class Trial(NamedTuple):
         return f"{name_of(self.method)}, dt = {self.dt:.3g} s{spacing}"
 
 
-def name_of(method: Method) -> str:
+def name_of(method: AbstractIntegrator) -> str:
     """A method's name with its one number, such as "SemiImplicit(beta=1)"."""
     numbers = [f.name for f in fields(method) if f.name in ("beta", "rho")]
     shown = ", ".join(f"{name}={float(getattr(method, name)):g}" for name in numbers)
@@ -118,7 +118,7 @@ class Bench(NamedTuple):
         least = min(float(stable_dt(self.scene, particles)) for particles in on_the_way)
         return max(least, self.t1 / _MOST_STEPS)  # with the linear kernel it may be zero
 
-    def run(self, method: Method, steps: int) -> tuple[list[State] | None, float]:
+    def run(self, method: AbstractIntegrator, steps: int) -> tuple[list[State] | None, float]:
         """The states at the times of comparison, None of a run that failed, and its seconds."""
         self._go(method, steps, 1, 1)
         states, seconds = self.timed(method, steps, FRAMES, steps // FRAMES)
@@ -126,7 +126,7 @@ class Bench(NamedTuple):
             seconds = min(seconds, self.timed(method, steps, FRAMES, steps // FRAMES)[1])
         return states, seconds
 
-    def foresee(self, method: Method, steps: int) -> float:
+    def foresee(self, method: AbstractIntegrator, steps: int) -> float:
         """Seconds of so many steps, from a few of them."""
         self._go(method, steps, 1, 1)
         some, seconds = 1, self.timed(method, steps, 1, 1)[1]
@@ -135,13 +135,13 @@ class Bench(NamedTuple):
             seconds = self.timed(method, steps, 1, some)[1]
         return seconds / some * steps
 
-    def timed(self, method: Method, steps: int, frames: int, each: int) -> tuple[list[State] | None, float]:
+    def timed(self, method: AbstractIntegrator, steps: int, frames: int, each: int) -> tuple[list[State] | None, float]:
         """The states after each of some frames of so many steps, None if one is at fault, and the seconds."""
         begun = time.perf_counter()
         states = self._go(method, steps, frames, each)
         return states, time.perf_counter() - begun
 
-    def why(self, method: Method, steps: int) -> str:
+    def why(self, method: AbstractIntegrator, steps: int) -> str:
         """What goes wrong in a run that fails."""
         try:
             self._go(method, steps, FRAMES, steps // FRAMES, throw=True)
@@ -149,7 +149,9 @@ class Bench(NamedTuple):
             return str(error)
         return "It ended well."
 
-    def _go(self, method: Method, steps: int, frames: int, each: int, *, throw: bool = False) -> list[State] | None:
+    def _go(
+        self, method: AbstractIntegrator, steps: int, frames: int, each: int, *, throw: bool = False
+    ) -> list[State] | None:
         """The states after each of some frames of so many steps; None if one is at fault, or that is raised."""
         dtype = self.particles.x.dtype
         scene, dt, method = canonical((self.scene, self.t1 / steps, method), dtype)

@@ -9,7 +9,15 @@ from mpmjax.analysis._diagnostics import energy_density, energy_of
 from mpmjax.checks import canonical, checked, require_positive
 from mpmjax.discretisation import FLIP, Stencil, gather, scatter
 from mpmjax.state import Particles, Scene, prepare
-from mpmjax.stepping import Explicit, GridUpdate, Method, Nodes, grid_to_particles, particles_to_grid, update
+from mpmjax.stepping import (
+    AbstractIntegrator,
+    Explicit,
+    GridUpdate,
+    Nodes,
+    grid_to_particles,
+    particles_to_grid,
+    update,
+)
 
 
 class EnergyBudget(eqx.Module):
@@ -109,7 +117,13 @@ class Budget(eqx.Module):
 
 @checked
 def budget(
-    scene: Scene, particles: Particles, *, steps: int, dt: Scalar, method: Method = Explicit(), start: int = 0
+    scene: Scene,
+    particles: Particles,
+    *,
+    steps: int,
+    dt: Scalar,
+    method: AbstractIntegrator = Explicit(),
+    start: int = 0,
 ) -> tuple[Particles, Budget]:
     """Run a scene for some steps and say where its energy and momentum went in each.
 
@@ -134,7 +148,7 @@ def budget(
 
 @eqx.filter_jit
 def _budget(
-    scene: Scene, particles: Particles, start: Array, dt: Scalar, method: Method, steps: int
+    scene: Scene, particles: Particles, start: Array, dt: Scalar, method: AbstractIntegrator, steps: int
 ) -> tuple[Particles, Budget]:
     def body(before: Particles, n: Array) -> tuple[Particles, Budget]:
         stencil = scene.stencil(before)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from mpmjax.analysis._bench import FRAMES, Bench, Build, Clock, Displacements, Trial, name_of
 from mpmjax.checks import require
 from mpmjax.state import State
-from mpmjax.stepping import TRBDF2, Explicit, Method
+from mpmjax.stepping import TRBDF2, AbstractIntegrator, Explicit
 
 HOPELESS = 4
 """How far below the explicit limit a run that still fails will not get better."""
@@ -92,7 +92,7 @@ def settle(build: Build, bench: Bench, error: float, seconds: float, say: Say = 
 
 
 def _resolved_in_time(
-    bench: Bench, method: Method, steps: int, limit: float, error: float, clock: Clock, say: Say
+    bench: Bench, method: AbstractIntegrator, steps: int, limit: float, error: float, clock: Clock, say: Say
 ) -> tuple[float, _Look]:
     """The explicit limit over the motion on the scene's own grid [s], and the run whose step resolves the motion, or
     the last that time allows."""
@@ -114,7 +114,7 @@ def _resolved_in_time(
         steps = max(2 * steps, bench.whole(limit) if isinstance(method, Explicit) else 0)
 
 
-def _look(bench: Bench, method: Method, steps: int, before: _Look | None, say: Say) -> _Look:
+def _look(bench: Bench, method: AbstractIntegrator, steps: int, before: _Look | None, say: Say) -> _Look:
     states, seconds = bench.run(method, steps)
     motion = None if states is None else bench.motion(states)
     coarse = None if before is None else before.motion

@@ -12,7 +12,7 @@ from mpmjax._types import Array, Float, ParticleVector, Scalar
 from mpmjax.checks import checked, is_traced, require, require_positive, require_whole
 from mpmjax.simulation import HEALTHY, RunStatistics, number_of_steps, simulate
 from mpmjax.state import Particles, Scene, prepare
-from mpmjax.stepping import Explicit, Method, step_for
+from mpmjax.stepping import AbstractIntegrator, Explicit, step_for
 
 _POINTS = 100
 
@@ -44,7 +44,7 @@ def sensitivity(
     *,
     t1: Scalar,
     dt: Scalar | Literal["stable"],
-    method: Method = Explicit(),
+    method: AbstractIntegrator = Explicit(),
     velocity: ParticleVector | None = None,
     seed: int = 0,
     save_every: int | None = None,
@@ -165,7 +165,7 @@ def _complaint(report: Sensitivity, statistics: RunStatistics, unsolved: float, 
         return told + (
             f"the run has a derivative that is not known: the tangent solve of a step did not converge (relative "
             f"residual {unsolved:.2g}). Raise the max_steps of the method's adjoint_solver, or leave "
-            "its metric at Metric.DIAGONAL."
+            "its preconditioner at DiagonalPreconditioner()."
         )
     first = int(jnp.argmax(over))
     return told + (

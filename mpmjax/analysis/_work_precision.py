@@ -14,9 +14,9 @@ from typing import NamedTuple
 from mpmjax.analysis._bench import FRAMES, Bench, Build, Clock, Trial, name_of
 from mpmjax.analysis._reference_run import HOPELESS, settle
 from mpmjax.checks import checked, require_positive
-from mpmjax.stepping import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, Method, SemiImplicit
+from mpmjax.stepping import TRBDF2, AbstractIntegrator, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
 
-METHODS: tuple[Method, ...] = (Explicit(), SemiImplicit(), ImplicitMidpoint(), TRBDF2(), BackwardEuler())
+METHODS: tuple[AbstractIntegrator, ...] = (Explicit(), SemiImplicit(), ImplicitMidpoint(), TRBDF2(), BackwardEuler())
 """What is tried by default."""
 _RESOLVED = 0.25  # the error above which a larger one at a smaller step does not say that the best was reached
 _REFERENCE_SHARE = 0.4  # of all seconds
@@ -90,9 +90,9 @@ def work_precision(
     *,
     t1: float,
     error: float = 1e-2,
-    methods: tuple[Method, ...] = METHODS,
+    methods: tuple[AbstractIntegrator, ...] = METHODS,
     refinements: tuple[int, ...] = (1, 2),
-    also: tuple[tuple[Method, float], ...] = (),
+    also: tuple[tuple[AbstractIntegrator, float], ...] = (),
     most_seconds: float = 60.0,
     progress: Callable[[Trial], None] = lambda trial: None,
     say: Callable[[str], None] = lambda line: None,
@@ -134,24 +134,24 @@ def work_precision(
     trials: list[Trial] = []
     skipped: list[str] = []
 
-    def note(bench: Bench, method: Method, steps: int, seconds: float, miss: float) -> Trial:
+    def note(bench: Bench, method: AbstractIntegrator, steps: int, seconds: float, miss: float) -> Trial:
         trials.append(Trial(method, bench.refinement, bench.t1 / steps, steps, seconds, miss))
         progress(trials[-1])
         return trials[-1]
 
-    def tried(bench: Bench, method: Method, steps: int) -> Trial:
+    def tried(bench: Bench, method: AbstractIntegrator, steps: int) -> Trial:
         states, seconds = bench.run(method, steps)
         miss = math.inf if states is None else bench.motion(states).distance(truth)
         return note(bench, method, steps, seconds, miss)
 
-    def rival(method: Method) -> float:
+    def rival(method: AbstractIntegrator) -> float:
         """Seconds of the cheapest run so far that is as good as asked for, explicit or implicit as the method is."""
         best = WorkPrecision(tuple(trials), reference, float(error), limit).cheapest(
             explicit=isinstance(method, Explicit)
         )
         return math.inf if best is None or best.error > error else best.seconds
 
-    def refine(bench: Bench, method: Method, part: float) -> None:
+    def refine(bench: Bench, method: AbstractIntegrator, part: float) -> None:
         steps, best, idle = FRAMES, math.inf, 0
         if isinstance(method, Explicit):
             steps = bench.whole(limit / bench.refinement)
@@ -176,7 +176,7 @@ def work_precision(
                 note(bench, method, steps, 2 * trial.seconds, math.nan)
                 return
 
-    def bettered(method: Method) -> bool:
+    def bettered(method: AbstractIntegrator) -> bool:
         """Whether others do as well as this implicit method on the scene's own grid for no more seconds."""
         first = [
             t for t in trials if t.refinement == 1 and isinstance(t.method, Explicit) == isinstance(method, Explicit)

@@ -1,6 +1,6 @@
 """Derivative rules and guards that hold in every nest of JAX transformations."""
 
 from mpmjax.autodiff._guard import guard
-from mpmjax.autodiff._rule import ruled
+from mpmjax.autodiff._rule import ruled, without_derivative
 
-__all__ = ["guard", "ruled"]
+__all__ = ["guard", "ruled", "without_derivative"]

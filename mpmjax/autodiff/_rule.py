@@ -26,6 +26,7 @@ from collections.abc import Callable, Hashable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -68,6 +69,11 @@ class ruled:  # noqa: N801, a decorator
         call = _Call(self, tree, fixed, tuple(map(type, fixed)))
         shapes = jax.eval_shape(partial(_evaluated, call), *arrays)
         return jax.tree.unflatten(jax.tree.structure(shapes), _ruled_p.bind(*arrays, call=call))
+
+
+def without_derivative(tree: Any) -> Any:
+    """The tree, with arrays and numbers that are constants to derivatives; other leaves, as functions, as they are."""
+    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array_like(leaf) else leaf, tree)
 
 
 _ARRAY: Hashable = object()

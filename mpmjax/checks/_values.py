@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 from jax.core import Tracer
 
@@ -175,10 +176,13 @@ def canonical(tree: Any, dtype: Any) -> Any:
     """Make every number of the tree a strong array of one dtype.
 
     A Python float is static under `eqx.filter_jit`, so a new value would compile anew, and `eqx.tree_at` puts one past
-    any converter; so this is applied at the entry of every public function that compiles.
+    any converter; so this is applied at the entry of every public function that compiles. The whole numbers of a linear
+    solver are counts, which fix its program, and stay.
     """
 
     def convert(leaf: Any) -> Any:
+        if isinstance(leaf, lx.AbstractLinearSolver):
+            return jax.tree.map(lambda a: a if isinstance(a, int) else convert(a), leaf)
         if isinstance(leaf, (bool, np.bool_)) or not isinstance(leaf, (int, float, np.number, np.ndarray, jax.Array)):
             return leaf
         if isinstance(leaf, jax.Array) and leaf.dtype == dtype and not leaf.weak_type:
@@ -187,4 +191,4 @@ def canonical(tree: Any, dtype: Any) -> Any:
             return jax.lax.convert_element_type(leaf, dtype)
         return jnp.asarray(np.asarray(leaf, dtype))  # of a NumPy array: of a Python number XLA compiles a program
 
-    return jax.tree.map(convert, tree)
+    return jax.tree.map(convert, tree, is_leaf=lambda node: isinstance(node, lx.AbstractLinearSolver))

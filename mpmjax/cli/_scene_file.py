@@ -21,7 +21,7 @@ from mpmjax.geometry import AbstractRegion
 from mpmjax.io import arguments, decode, reason
 from mpmjax.simulation import number_of_steps
 from mpmjax.state import Particles, Scene, fill, join, prepare
-from mpmjax.stepping import Explicit, Method, stable_dt
+from mpmjax.stepping import AbstractIntegrator, Explicit, stable_dt
 
 _FRAMES = 50
 """How many frames are saved where neither they nor the step are given."""
@@ -32,7 +32,7 @@ class RunSettings(NamedTuple):
 
     t1: float
     dt: float
-    method: Method
+    method: AbstractIntegrator
     save_every: int
     dtype: str
 
@@ -42,7 +42,7 @@ class RunTable(NamedTuple):
 
     t1: float
     dt: float | Literal["stable"] | None
-    method: Method | None
+    method: AbstractIntegrator | None
     save_every: int | None
     dtype: str
     error: float
@@ -253,7 +253,7 @@ def _run_table(table: Any) -> RunTable:
         *,
         t1: Scalar,
         dt: Scalar | Literal["stable"] | None = None,
-        method: Method | None = None,
+        method: AbstractIntegrator | None = None,
         save_every: int | None = None,
         precision: str = "float64",
         error: Scalar = 1e-2,

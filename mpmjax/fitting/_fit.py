@@ -15,7 +15,7 @@ from mpmjax.checks import canonical, checked, require, require_finite, shape_of
 from mpmjax.geometry import AbstractRegion
 from mpmjax.simulation import simulate
 from mpmjax.state import Particles, Scene, prepare
-from mpmjax.stepping import Method
+from mpmjax.stepping import AbstractIntegrator
 
 
 class StressStretch(eqx.Module):
@@ -74,7 +74,7 @@ def fit_curve(
     *,
     t1: Scalar,
     dt: Scalar,
-    method: Method,
+    method: AbstractIntegrator,
     curve: Callable[[Scene, Particles], tuple[Array, Array]],
     measured_x: np.ndarray,
     measured_y: np.ndarray,
@@ -198,7 +198,7 @@ def _least_squares(misfit: Callable[[Array], _Misfit], dtype: Any) -> tuple[Arra
             raise RuntimeError(
                 f"The fit has no derivative at {float(ratio[0]):.4g} times the first guess: the tangent solve of a "
                 f"step did not converge (relative residual {float(unsolved):.2g}). Raise the "
-                "max_steps of the method's adjoint_solver, or leave its metric at Metric.DIAGONAL."
+                "max_steps of the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner()."
             )
         if not np.isfinite(J).all():
             raise RuntimeError(

@@ -1,30 +1,45 @@
 """The elastic potential, its Hessian, and the nodal problems of the implicit updates and their solution."""
 
-from mpmjax.implicit._conjugate_residual import ConjugateResidual, Reporting
+from mpmjax.implicit._conjugate_residual import ConjugateResidual
 from mpmjax.implicit._guess import Guess
-from mpmjax.implicit._hessian import AnalyticHessian, Hessian, JvpHessian, damped
-from mpmjax.implicit._implicit import Linearised, solve
-from mpmjax.implicit._metric import Metric
+from mpmjax.implicit._hessian import AbstractHessian, AnalyticHessian, JvpHessian
+from mpmjax.implicit._hessian_action import AbstractHessianAction, ParticleStiffness, TangentAction, damped
+from mpmjax.implicit._inner_product import AbstractInnerProduct, DiagonalInnerProduct
+from mpmjax.implicit._linear_solve import AbstractInnerProductSolver
+from mpmjax.implicit._linearised import Linearised
 from mpmjax.implicit._newton import Newton
+from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._potential import ElasticPotential
-from mpmjax.implicit._problems import LinearProblem, NewtonProblem, SolveInfo, no_solve
+from mpmjax.implicit._preconditioner import AbstractPreconditioner, DiagonalPreconditioner, MassPreconditioner
+from mpmjax.implicit._problems import LinearProblem, NewtonProblem
 from mpmjax.implicit._projection import Projection
+from mpmjax.implicit._solve import Reporting, solve
+from mpmjax.implicit._solve_info import SolveInfo, no_solve
 
 __all__ = [
+    "AbstractHessian",
+    "AbstractHessianAction",
+    "AbstractInnerProduct",
+    "AbstractInnerProductSolver",
+    "AbstractPreconditioner",
     "AnalyticHessian",
     "ConjugateResidual",
+    "DiagonalInnerProduct",
+    "DiagonalPreconditioner",
     "ElasticPotential",
     "Guess",
-    "Hessian",
+    "ImplicitOperator",
     "JvpHessian",
     "LinearProblem",
     "Linearised",
-    "Metric",
+    "MassPreconditioner",
     "Newton",
     "NewtonProblem",
+    "ParticleStiffness",
     "Projection",
     "Reporting",
     "SolveInfo",
+    "TangentAction",
     "damped",
     "no_solve",
     "solve",

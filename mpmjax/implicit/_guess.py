@@ -14,14 +14,14 @@ class Guess(enum.Enum):
     """
 
     GRID_VELOCITY = "grid velocity"
-    """v^n, the nodes' velocity before the step: the default."""
+    """v^n, the velocity of the nodes before the step: the default."""
     EXPLICIT = "explicit"
-    """v*, the reference's choice."""
+    """v*, the choice of the derivation."""
     ZERO = "zero"
     """Rest."""
 
     def velocity(self, before: NodeVector, explicit: NodeVector) -> NodeVector:
-        """The guess [m/s], shape (n, d)."""
+        """The guess [m/s], shape (n, d), from v^n and v*."""
         match self:
             case Guess.GRID_VELOCITY:
                 return before

@@ -1,24 +1,33 @@
 """Newton's method for the nodal problems."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
 
-from mpmjax._types import Array, Bool, Float, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, NodeVector, Scalar
 from mpmjax.checks import require, require_fields, require_tolerance
-from mpmjax.implicit._conjugate_residual import SETTLED, SHORT, ConjugateResidual, default_rtol
-from mpmjax.implicit._problems import NewtonProblem, SolveInfo
+from mpmjax.implicit._conjugate_residual import NEGLIGIBLE_CHANGE, ConjugateResidual
+from mpmjax.implicit._inner_product import AbstractInnerProduct
+from mpmjax.implicit._line_search import MOST_HALVINGS, backtrack
+from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, default_rtol, solve_linear
+from mpmjax.implicit._operator import ImplicitOperator
+from mpmjax.implicit._problems import NewtonProblem
+from mpmjax.implicit._solve_info import SolveInfo
+
+_ROUNDING = 4.0  # units of rounding that a sum over the particles and nodes is taken to have
 
 
 class Newton(eqx.Module):
     """Newton's method with a backtracking line search on the incremental potential.
 
     A direction along which the potential does not fall (the Hessian can be indefinite) is replaced by the steepest one
-    in the metric's norm; a step is halved until the potential falls by a ten-thousandth of what its slope promises,
-    which also keeps out of deformations where the law has no energy. Stops when ‖residual‖ ≤ rtol ‖b‖, b the right-hand
-    side of the system linearised before anything moves, less what prescribed velocities contribute to it, both in the
-    norm of the inverse mass.
+    in the preconditioner's norm; a step is halved until the potential falls by a ten-thousandth of what its slope
+    promises, which also keeps out of deformations where the law has no energy. Stops when ‖residual‖ ≤ rtol ‖b‖, b the
+    right-hand side of the system linearised before anything moves, less what prescribed velocities contribute to it,
+    both in the norm of the inverse mass.
 
     b vanishes where forces balance, and in single precision it can be smaller than the rounding of the residual, which
     is 4 ε (‖W (|v| + dx/c)‖ + ‖M ṽ‖), W the diagonal of the operator: that of the terms that were added, F's being of
@@ -28,18 +37,18 @@ class Newton(eqx.Module):
     than a thousandth of ‖v‖, in the norms of the mass and of its inverse. No guess is accepted because of rounding
     alone.
 
-    Starts from the guess, or from rest where the
-    potential is lower there or the guess is a deformation for which the law has no energy; if that is so at rest too,
-    for what is prescribed alone (a grip that closes a gap of one cell in a step), the first step is that of the
-    linearised system. An equation that is not finite even there gives NaN, never rest.
+    Starts from the guess, or from rest where the potential is lower there or the guess is a deformation for which the
+    law has no energy; if that is so at rest too, for what is prescribed alone (a grip that closes a gap of one cell in
+    a step), the first step is that of the linearised system. An equation that is not finite even there gives NaN, never
+    rest.
 
     Args:
-        solver: of the linear systems; a loose tolerance suffices.
+        solver: of the linear systems, any symmetric one of lineax; a loose tolerance suffices.
         rtol: relative tolerance. Default: that of the precision, 1e-8 or 1e-5.
         max_steps: most Newton steps.
     """
 
-    solver: ConjugateResidual = ConjugateResidual(rtol=1e-3)
+    solver: lx.AbstractLinearSolver = ConjugateResidual(rtol=1e-3)
     rtol: Scalar | None = None
     max_steps: int = eqx.field(static=True, default=30)
 
@@ -50,109 +59,174 @@ class Newton(eqx.Module):
         require(self.max_steps >= 1, f"Newton's max_steps must be at least 1, got {self.max_steps}.")
 
     def __call__(self, problem: NewtonProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
-        """The solution, started from a guess."""
-        split, free = problem.projection.combine, problem.projection.free
-        metric = jnp.where(free, problem.mass[:, None], 1)
-        unit_strain = problem.unit_strain()
-        dtype = guess.dtype
-        eps = jnp.finfo(dtype).eps
-        rtol = default_rtol(dtype) if self.rtol is None else self.rtol
+        """The solution, started from a guess [m/s], shape (n, d)."""
+        rtol = default_rtol(guess.dtype) if self.rtol is None else self.rtol
+        setting, start = _setting(problem, guess, rtol)
 
-        def norm(r: NodeVector) -> Float[Array, ""]:
-            return jnp.sqrt((r**2 / metric).sum())
+        def goes_on(c: _NewtonState) -> Bool[Array, ""]:
+            return ~_converged(setting, c) & (c.newton < self.max_steps) & ~c.stuck
 
-        def residual(v: NodeVector) -> NodeVector:
-            return split(problem.momentum_residual(v), 0)
-
-        def converged(c: _NewtonState) -> Bool[Array, ""]:
-            left, speed = norm(c.r), jnp.sqrt((metric * split(c.v, 0) ** 2).sum())
-            bounded = ~c.indefinite & (left <= SETTLED * speed)
-            return (left <= rtol * scale) | ((left <= c.rounding) & (c.settled | bounded))
-
-        def goes_on(c: _NewtonState) -> Array:
-            return ~converged(c) & (c.newton < self.max_steps) & ~c.stuck
-
-        def step(c: _NewtonState) -> _NewtonState:
-            model = problem.model(jnp.where((c.newton == 0) & ~startable, still, c.v)).assembled()
-            inner = model.metric()
-            options = {"metric": inner}
-            direction, result, stats = self.solver.compute(self.solver.init(model, options), -c.r, options)
-            slope = (c.r * direction).sum()
-            steepest = -c.r / inner / jnp.maximum(stats["spectral_radius"], 1)
-            uphill = ~(slope < 0)
-            whole = ~uphill & (result == lx.RESULTS.successful)
-            direction = jnp.where(uphill, steepest, direction)
-            slope = jnp.where(uphill, (c.r * steepest).sum(), slope)
-            energy = problem.merit(c.v)
-            energy = jnp.where(jnp.isfinite(energy), energy, jnp.inf)
-            weight = jnp.where(free, model.diagonal(), 0)
-            slack = _ROUNDING * eps * ((weight * unit_strain**2).sum() + jnp.abs(energy))  # in it the fall drowns
-            unseen = jnp.where(free, jnp.sqrt(eps) * unit_strain, 0)
-            steps = direction, split(c.v + direction, 0), unseen
-            moved, speed, least = (jnp.sqrt((inner * a**2).sum()) for a in steps)
-
-            def too_high(trial: tuple[Array, Array]) -> Array:
-                length, count = trial
-                fallen = problem.merit(c.v + length * direction) <= energy + 1e-4 * length * slope + slack
-                return ~fallen & (count < _MOST_HALVINGS)
-
-            one, zero = jnp.ones((), dtype), jnp.asarray(0, dtype=jnp.int32)
-            length, halvings = jax.lax.while_loop(too_high, lambda a: (a[0] / 2, a[1] + 1), (one, zero))
-            v = c.v + length * direction
-            return _NewtonState(
-                v=v,
-                r=residual(v),
-                rounding=_ROUNDING * eps * (norm(weight * (jnp.abs(v) + unit_strain)) + inertia),
-                settled=whole & (halvings == 0) & (moved <= jnp.maximum(SETTLED * speed, least)),
-                iterations=c.iterations + stats["num_steps"],
-                newton=c.newton + 1,
-                halvings=c.halvings + halvings,
-                stuck=halvings >= _MOST_HALVINGS,
-                indefinite=c.indefinite | stats["indefinite"],
-            )
-
-        lift = split(0, problem.prescribed)
-        start = problem.apply_dirichlet(guess)
-        energies = problem.merit(start), problem.merit(lift)
-        start = jnp.where(jnp.isfinite(energies[0]) & ~(energies[1] < energies[0]), start, lift)
-        startable = jnp.isfinite(energies[0]) | jnp.isfinite(energies[1])
-        zero = jnp.asarray(0, dtype=jnp.int32)
-        still = problem.undisplaced()
-        linearised = problem.momentum_residual(still) + problem.operator(still).unconstrained(lift - still)
-        linearised = split(linearised, 0)
-        scale, inertia = norm(linearised), norm(split(problem.mass[:, None] * problem.inertial, 0))
-        no = jnp.asarray(False)
-        first = jnp.where(startable, residual(start), linearised)
-        state = _NewtonState(start, first, jnp.zeros((), dtype), no, zero, zero, zero, no, no)
-        c = jax.lax.while_loop(goes_on, step, state)
-        left, size = norm(c.r), jnp.maximum(jnp.maximum(scale, inertia), c.rounding)
-        done = jnp.isfinite(left) & converged(c)
-        info = SolveInfo(
-            iterations=c.iterations,
-            newton=c.newton,
-            line_search=c.halvings,
-            residual=left / jnp.where(size == 0, 1, size),
-            converged=done,
-            short=~done & (left <= SHORT * rtol * scale),
-            indefinite=c.indefinite,
-            report=jnp.zeros_like(left),
-        )
-        return jnp.where(free & ~jnp.isfinite(left), jnp.nan, c.v), info
+        c = jax.lax.while_loop(goes_on, partial(_step, self.solver, setting), start)
+        return _outcome(setting, c)
 
 
-_MOST_HALVINGS = 30
-_ROUNDING = 4.0  # units of it
+class _Setting(eqx.Module):
+    """What an iteration does not change."""
+
+    problem: NewtonProblem
+    rtol: Scalar
+    mass: NodeVector
+    """Nodal masses, 1 in components that are not free: the weight of the norms of the stopping rule."""
+    scale: Float[Array, ""]
+    """‖b‖, b the right-hand side of the system linearised where nothing is displaced."""
+    inertia: Float[Array, ""]
+    """‖M ṽ‖."""
+    undisplaced: NodeVector
+    """The velocity at which nothing is displaced [m/s]."""
+    startable: Bool[Array, ""]
+    """Whether the guess or rest has an energy."""
+
+    def residual(self, v: NodeVector) -> NodeVector:
+        """The momentum residual of what is free."""
+        return self.problem.projection.combine(self.problem.momentum_residual(v), 0)
+
+    def norm(self, r: NodeVector) -> Float[Array, ""]:
+        """‖r‖ in the norm of the inverse mass."""
+        return _norm(r, self.mass)
 
 
 class _NewtonState(eqx.Module):
     v: NodeVector
     r: NodeVector
-    rounding: Array
+    """The residual at v."""
+    rounding: Float[Array, ""]
     """Of ‖r‖."""
-    settled: Array
+    settled: Bool[Array, ""]
     """Whether the last Newton step was whole, and too small to matter."""
-    iterations: Array
-    newton: Array
-    halvings: Array
-    stuck: Array
-    indefinite: Array
+    iterations: Int[Array, ""]
+    newton: Int[Array, ""]
+    halvings: Int[Array, ""]
+    stuck: Bool[Array, ""]
+    """Whether the last line search failed."""
+    indefinite: Bool[Array, ""]
+
+
+class _Direction(eqx.Module):
+    """Along which a Newton step goes, and what its solve was like."""
+
+    value: NodeVector
+    slope: Float[Array, ""]
+    """Of the potential along it."""
+    whole: Bool[Array, ""]
+    """Whether it is Newton's, from a solve that converged."""
+    iterations: Int[Array, ""]
+    indefinite: Bool[Array, ""]
+
+
+def _setting(problem: NewtonProblem, guess: NodeVector, rtol: Scalar) -> tuple[_Setting, _NewtonState]:
+    """What the iteration does not change, and where it starts."""
+    split, free = problem.projection.combine, problem.projection.free
+    rest = split(0, problem.prescribed)
+    start = problem.apply_dirichlet(guess)
+    energies = problem.incremental_potential(start), problem.incremental_potential(rest)
+    start = jnp.where(jnp.isfinite(energies[0]) & ~(energies[1] < energies[0]), start, rest)
+    undisplaced = problem.undisplaced_velocity()
+    linearised = problem.momentum_residual(undisplaced)
+    linearised = split(linearised + problem.operator(undisplaced).unconstrained(rest - undisplaced), 0)
+    mass = jnp.where(free, problem.mass[:, None], 1)
+    setting = _Setting(
+        problem=problem,
+        rtol=rtol,
+        mass=mass,
+        scale=_norm(linearised, mass),
+        inertia=_norm(split(problem.mass[:, None] * problem.inertial, 0), mass),
+        undisplaced=undisplaced,
+        startable=jnp.isfinite(energies[0]) | jnp.isfinite(energies[1]),
+    )
+    first = jnp.where(setting.startable, setting.residual(start), linearised)
+    zero, none, no = jnp.zeros((), guess.dtype), jnp.asarray(0, dtype=jnp.int32), jnp.asarray(False)
+    return setting, _NewtonState(start, first, zero, no, none, none, none, no, no)
+
+
+def _norm(r: NodeVector, mass: NodeVector) -> Float[Array, ""]:
+    return jnp.sqrt((r**2 / mass).sum())
+
+
+def _converged(setting: _Setting, c: _NewtonState) -> Bool[Array, ""]:
+    left = setting.norm(c.r)
+    speed = jnp.sqrt((setting.mass * setting.problem.projection.combine(c.v, 0) ** 2).sum())
+    bounded = ~c.indefinite & (left <= NEGLIGIBLE_CHANGE * speed)
+    return (left <= setting.rtol * setting.scale) | ((left <= c.rounding) & (c.settled | bounded))
+
+
+def _step(solver: lx.AbstractLinearSolver, setting: _Setting, c: _NewtonState) -> _NewtonState:
+    """One Newton step: direction, line search, residual."""
+    problem = setting.problem
+    unstarted = (c.newton == 0) & ~setting.startable
+    operator = problem.newton_operator(jnp.where(unstarted, setting.undisplaced, c.v)).precomputed()
+    inner = problem.preconditioner.inner_product(operator)
+    direction = _direction(solver, operator, inner, c.r)
+    energy = problem.incremental_potential(c.v)
+    energy = jnp.where(jnp.isfinite(energy), energy, jnp.inf)
+    weight = jnp.where(problem.projection.free, operator.diagonal(), 0)
+    unit, eps = problem.unit_strain_velocity(), jnp.finfo(c.v.dtype).eps
+    slack = _ROUNDING * eps * ((weight * unit**2).sum() + jnp.abs(energy))
+    size, halvings = backtrack(
+        lambda size: problem.incremental_potential(c.v + size * direction.value), energy, direction.slope, slack
+    )
+    v = c.v + size * direction.value
+    return _NewtonState(
+        v=v,
+        r=setting.residual(v),
+        rounding=_ROUNDING * eps * (setting.norm(weight * (jnp.abs(v) + unit)) + setting.inertia),
+        settled=direction.whole & (halvings == 0) & _negligible(problem, inner, c.v, direction.value),
+        iterations=c.iterations + direction.iterations,
+        newton=c.newton + 1,
+        halvings=c.halvings + halvings,
+        stuck=halvings >= MOST_HALVINGS,
+        indefinite=c.indefinite | direction.indefinite,
+    )
+
+
+def _direction(
+    solver: lx.AbstractLinearSolver, operator: ImplicitOperator, inner: AbstractInnerProduct, r: NodeVector
+) -> _Direction:
+    """Newton's direction, or the steepest one where the potential does not fall along Newton's."""
+    solution = solve_linear(solver, operator, -r, inner)
+    slope = (r * solution.value).sum()
+    steepest = inner.solve(-r) / jnp.maximum(solution.spectral_radius, 1)
+    uphill = ~(slope < 0)
+    return _Direction(
+        value=jnp.where(uphill, steepest, solution.value),
+        slope=jnp.where(uphill, (r * steepest).sum(), slope),
+        whole=~uphill & solution.converged,
+        iterations=solution.iterations,
+        indefinite=solution.indefinite,
+    )
+
+
+def _negligible(
+    problem: NewtonProblem, inner: AbstractInnerProduct, v: NodeVector, step: NodeVector
+) -> Bool[Array, ""]:
+    """Whether a step changes the velocity by no more than a thousandth, or strains by no more than √ε."""
+    unseen = jnp.sqrt(jnp.finfo(v.dtype).eps) * problem.unit_strain_velocity()
+    vectors = step, problem.projection.combine(v + step, 0), jnp.where(problem.projection.free, unseen, 0)
+    moved, speed, least = (jnp.sqrt((inner.apply(a) * a).sum()) for a in vectors)
+    return moved <= jnp.maximum(NEGLIGIBLE_CHANGE * speed, least)
+
+
+def _outcome(setting: _Setting, c: _NewtonState) -> tuple[NodeVector, SolveInfo]:
+    left = setting.norm(c.r)
+    size = jnp.maximum(jnp.maximum(setting.scale, setting.inertia), c.rounding)
+    done = jnp.isfinite(left) & _converged(setting, c)
+    info = SolveInfo(
+        iterations=c.iterations,
+        newton=c.newton,
+        line_search=c.halvings,
+        residual=left / jnp.where(size == 0, 1, size),
+        converged=done,
+        nearly_converged=~done & (left <= NEARLY_CONVERGED * setting.rtol * setting.scale),
+        indefinite=c.indefinite,
+        report=jnp.zeros_like(left),
+    )
+    return jnp.where(setting.problem.projection.free & ~jnp.isfinite(left), jnp.nan, c.v), info

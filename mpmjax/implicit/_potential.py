@@ -41,7 +41,7 @@ class ElasticPotential(eqx.Module):
         """F_p."""
         return tuple(c.F for c in self.material_points)
 
-    def displaced(self, u: NodeVector) -> Matrices:
+    def deformation(self, u: NodeVector) -> Matrices:
         """F_p + δF_p."""
         return tuple(F + dF for F, dF in zip(self.current_deformation(), self.strain(u), strict=True))
 
@@ -52,7 +52,7 @@ class ElasticPotential(eqx.Module):
     def energy(self, u: NodeVector) -> Float[Array, ""]:
         """Φ(u) [J]."""
         parts = [
-            (c.volume * c.law.energy(F)).sum() for c, F in zip(self.material_points, self.displaced(u), strict=True)
+            (c.volume * c.law.energy(F)).sum() for c, F in zip(self.material_points, self.deformation(u), strict=True)
         ]
         return sum(parts[1:], parts[0])
 
@@ -60,13 +60,13 @@ class ElasticPotential(eqx.Module):
         """Φ(u) [J], NaN where a law is not defined, whatever its formula gives there: not to be differentiated."""
         parts = [
             jnp.where(c.law.is_admissible(F), c.volume * c.law.energy(F), jnp.nan).sum()
-            for c, F in zip(self.material_points, self.displaced(u), strict=True)
+            for c, F in zip(self.material_points, self.deformation(u), strict=True)
         ]
         return sum(parts[1:], parts[0])
 
     def force(self, u: NodeVector) -> NodeVector:
-        """f = −∂Φ/∂u [N]: at u = 0 the reference's f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
-        return -self.divergence(self._stress(self.displaced(u)), u)
+        """f = −∂Φ/∂u [N]: at u = 0 f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
+        return -self.divergence(self._stress(self.deformation(u)), u)
 
     def current_force(self, like: NodeVector) -> NodeVector:
         """The force at u = 0, without the gather."""

@@ -7,8 +7,8 @@ from mpmjax._types import Array, Mask, NodeScalar, NodeVector, Scalar
 
 
 class Projection(eqx.Module):
-    """The projection Q of node vectors on what is not held: the components that are free and, at a node with a held
-    normal n, of these what is at right angles to it, I − n nᵀ.
+    """The projection Q of node vectors on the components that nothing holds; at a node with a held normal n, on those
+    of them at right angles to it, I − n nᵀ.
 
     Without normals it is a mask, and nothing else is compiled.
     """
@@ -25,15 +25,15 @@ class Projection(eqx.Module):
         gap = (self.normal * jnp.where(self.free, b - a, 0)).sum(axis=1, keepdims=True)
         return jnp.where(self.free, a + self.normal * gap, b)
 
-    def metric(self, weight: NodeVector) -> NodeVector:
-        """A positive diagonal weight as an inner product that commutes with Q: 1 on components that are not free, and
-        at a node with a held normal its mean."""
+    def commuting_weight(self, weight: NodeVector) -> NodeVector:
+        """A positive diagonal weight, changed so that it commutes with Q: 1 on components that are not free, and at a
+        node with a held normal the mean over its components."""
         if self.normal is not None:
             oblique = (self.normal != 0).any(axis=1, keepdims=True)
             weight = jnp.where(oblique, weight.mean(axis=1, keepdims=True), weight)
         return jnp.where(self.free, weight, 1)
 
-    def identity(self, vector: NodeVector, mass: NodeScalar) -> Array:
-        """What stands for the vector in (I − Q)'s rows: itself, but along a normal times the node's mass, so that in an
-        inner product of the mass or more it is not enlarged, however little a node has."""
+    def identity_rows(self, vector: NodeVector, mass: NodeScalar) -> Array:
+        """What an operator has in the rows of I − Q: the vector, and along a held normal the vector times the node's
+        mass, so that in an inner product of the mass or more it is not enlarged, however little a node has."""
         return vector if self.normal is None else jnp.where(self.free, mass[:, None], 1) * vector

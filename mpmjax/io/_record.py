@@ -22,10 +22,10 @@ from mpmjax.simulation import (
     no_steps,
     number_of_steps,
     raise_faults,
-    warn_of_short_solves,
+    warn_of_inaccurate_solves,
 )
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
-from mpmjax.stepping import Explicit, Method, step_for
+from mpmjax.stepping import AbstractIntegrator, Explicit, step_for
 
 
 @checked
@@ -36,7 +36,7 @@ def record(
     *,
     t1: Scalar,
     dt: Scalar | Literal["stable"],
-    method: Method = Explicit(),
+    method: AbstractIntegrator = Explicit(),
     save_every: int,
     start: int = 0,
     overwrite: bool = False,
@@ -139,7 +139,7 @@ def record(
             except OSError as refused:
                 said = str(refused)
             raise SimulationError(f"{error} {said}", error.run) from None
-        warn_of_short_solves(run.statistics)
+        warn_of_inaccurate_solves(run.statistics)
         return run
 
 
@@ -147,7 +147,7 @@ def _begun(
     path: str | os.PathLike,
     scene: Scene,
     particles: Particles,
-    method: Method,
+    method: AbstractIntegrator,
     dt: Any,
     start: int,
     overwrite: bool,

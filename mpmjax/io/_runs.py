@@ -47,7 +47,7 @@ from mpmjax.io._staged import StagedFile
 from mpmjax.io._vtkhdf import File, add_fixed, add_growing, add_topology, count_in, rows_of, set_count, states_in
 from mpmjax.simulation import Run, RunStatistics, no_steps
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
-from mpmjax.stepping import Method
+from mpmjax.stepping import AbstractIntegrator
 
 _UNITS = "SI: m, s, kg, Pa; deformation_gradient and J are pure numbers, affine_velocity is in 1/s"
 _UNCHANGING = ("mass", "volume", "X")
@@ -70,7 +70,7 @@ class FrameWriter:
         path: str | os.PathLike,
         scene: Scene,
         particles: Particles,
-        method: Method,
+        method: AbstractIntegrator,
         dt: Any,
         *,
         overwrite: bool = False,
@@ -117,7 +117,7 @@ class FrameWriter:
 
     @classmethod
     def resume(
-        cls, path: str | os.PathLike, scene: Scene, particles: Particles, method: Method, dt: Any
+        cls, path: str | os.PathLike, scene: Scene, particles: Particles, method: AbstractIntegrator, dt: Any
     ) -> "FrameWriter":
         """Open a file to append frames to it, after checking that it is whole and of the same run.
 
@@ -277,7 +277,7 @@ def load(path: str | os.PathLike) -> Run:
         )
         require(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
         scene = decode(described["scene"], Scene, "scene", arrays)
-        method = decode(described["method"], Method, "method", arrays)
+        method = decode(described["method"], AbstractIntegrator, "method", arrays)
         scene, method = canonical((scene, method), dtype)
         parts = {k: a if a is None else jnp.asarray(a) for k, a in described["particles"].items()}
         require(parts["mass"] is not None and parts["volume"] is not None, "mass or volume is missing")
@@ -301,7 +301,7 @@ def load(path: str | os.PathLike) -> Run:
     )
 
 
-def _describe(scene: Scene, particles: Particles, method: Method, dt: Any) -> dict[str, Any]:
+def _describe(scene: Scene, particles: Particles, method: AbstractIntegrator, dt: Any) -> dict[str, Any]:
     """What a file says of a run beside its frames."""
     dtype = particles.x.dtype
     scene, method, dt = canonical((scene, method, dt), dtype)
@@ -324,7 +324,7 @@ def _check_readable(path: Path, described: dict[str, Any]) -> None:
     dtype, arrays = np.dtype(described["dtype"]), described["arrays"]
     try:
         decode(described["scene"], Scene, "", arrays)
-        decode(described["method"], Method, "method", arrays)
+        decode(described["method"], AbstractIntegrator, "method", arrays)
     except ValueError as error:
         raise ValueError(f"{path} could not be loaded again, as {dtype} rounds it: {error}") from None
 

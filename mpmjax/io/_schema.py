@@ -40,7 +40,15 @@ from mpmjax.boundary import (
 from mpmjax.checks import require
 from mpmjax.discretisation import APIC, FLIP, PIC, BSpline, Grid, MLSGradient, SplineGradient
 from mpmjax.geometry import Ball, Box, Capsule, Cylinder, HalfSpace, Motion, RigidMotion, SampledDistance, Union
-from mpmjax.implicit import AnalyticHessian, ConjugateResidual, JvpHessian, Linearised, Newton
+from mpmjax.implicit import (
+    AnalyticHessian,
+    ConjugateResidual,
+    DiagonalPreconditioner,
+    JvpHessian,
+    Linearised,
+    MassPreconditioner,
+    Newton,
+)
 from mpmjax.material import CamClay, DruckerPrager, FixedCorotated, Fluid, Hencky, NeoHookean, Snow, Viscous, VonMises
 from mpmjax.state import Scene, TotalLagrangian, UpdatedLagrangian
 from mpmjax.stepping import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
@@ -55,7 +63,7 @@ CLASSES: tuple[type, ...] = (
     *(Box, Ball, HalfSpace, Capsule, Cylinder, Union, SampledDistance, Motion, RigidMotion),
     *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
     *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),
-    *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual),
+    *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual, DiagonalPreconditioner, MassPreconditioner),
 )
 """What files can hold of the package's own."""
 

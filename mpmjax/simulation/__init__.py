@@ -1,6 +1,6 @@
 """Rollouts: many steps, driven by diffrax, and their faults in words."""
 
-from mpmjax.simulation._faults import raise_faults, warn_of_short_solves
+from mpmjax.simulation._faults import raise_faults, warn_of_inaccurate_solves
 from mpmjax.simulation._run import Run, SimulationError
 from mpmjax.simulation._simulate import integrate, number_of_steps, rollout, simulate
 from mpmjax.simulation._statistics import HEALTHY, RunStatistics, no_steps
@@ -16,5 +16,5 @@ __all__ = [
     "raise_faults",
     "rollout",
     "simulate",
-    "warn_of_short_solves",
+    "warn_of_inaccurate_solves",
 ]

@@ -5,10 +5,10 @@ from typing import Any
 
 from mpmjax.material import AbstractInelastic, AbstractVolumetric, Law
 from mpmjax.state import Particles, Scene
-from mpmjax.stepping import SAFETY, BackwardEuler, Explicit, Method, longest_step
+from mpmjax.stepping import SAFETY, AbstractIntegrator, BackwardEuler, Explicit, longest_step
 
 
-def advise(scene: Scene, method: Method, dt: Any, began: Particles, last: Particles, otherwise: str) -> str:
+def advise(scene: Scene, method: AbstractIntegrator, dt: Any, began: Particles, last: Particles, otherwise: str) -> str:
     """What to do about a fault: of a step that was too long, to shorten it; else what the fault itself suggests.
 
     A step above the limit explains any fault. Not every run with such a step fails by it, so both are said then.
@@ -40,7 +40,7 @@ def advise(scene: Scene, method: Method, dt: Any, began: Particles, last: Partic
     return f"{said}. Take a dt of {shorter}, or an implicit method that has no limit. If the fault stays, {shortly}"
 
 
-def disallowed(law: Law, method: Method) -> tuple[str, str]:
+def disallowed(law: Law, method: AbstractIntegrator) -> tuple[str, str]:
     """What is wrong with an F that the law does not allow, and what to do."""
     newton = (
         ""

@@ -24,7 +24,7 @@ from mpmjax.simulation._statistics import (
     no_steps,
 )
 from mpmjax.state import Particles, Scene, State, state_of, with_state
-from mpmjax.stepping import Method, advance_compiled, reporting
+from mpmjax.stepping import AbstractIntegrator, advance_compiled
 
 
 class Problem(eqx.Module):
@@ -34,7 +34,7 @@ class Problem(eqx.Module):
     particles: Particles
     stencil: Stencil | None
     dt: Scalar
-    method: Method
+    method: AbstractIntegrator
     observe: Callable[[Scene, Particles], Any] | None = None
     start: Scalar = 0.0
     """Number of the first step."""
@@ -136,7 +136,7 @@ class StepSolver(diffrax.AbstractSolver):
         del terms, t1, made_jump
         statistics, _, report = solver_state
         t = (args.start + step_number(t0)) * args.dt
-        method = reporting(args.method, args.slot)
+        method = args.method.reporting(args.slot)
         particles, info = advance_compiled(args.scene, args.at(y0), t, args.dt, method, args.stencil)
         report = report + info.solve.report
         y1 = state_of(particles)

@@ -10,7 +10,6 @@ import numpy as np
 from mpmjax._types import Array
 from mpmjax.autodiff import guard
 from mpmjax.checks import requirements, warn
-from mpmjax.implicit import Metric
 from mpmjax.material import Law
 from mpmjax.simulation._advice import advise, disallowed
 from mpmjax.simulation._diffrax import Problem, faulty_particles, passed_particles
@@ -25,7 +24,7 @@ from mpmjax.simulation._statistics import (
     RunStatistics,
 )
 from mpmjax.state import Particles, State, state_of, with_state
-from mpmjax.stepping import BackwardEuler, Explicit, Method
+from mpmjax.stepping import AbstractIntegrator, BackwardEuler
 
 
 def raise_faults(run: Run, began: Particles, previous: State | None, start: int) -> None:
@@ -81,11 +80,9 @@ def raise_faults(run: Run, began: Particles, previous: State | None, start: int)
         )
 
 
-def unconverged_advice(method: Method, dtype: Any) -> str:
+def unconverged_advice(method: AbstractIntegrator, dtype: Any) -> str:
     """What helps a solve that does not converge."""
-    advice = ["reduce dt", "raise the solver's max_steps or loosen its rtol"]
-    if not isinstance(method, Explicit) and method.metric is Metric.MASS:
-        advice.insert(0, "take metric=Metric.DIAGONAL, which needs fewer iterations")
+    advice = [*method.unconverged_advice(), "reduce dt", "raise the solver's max_steps or loosen its rtol"]
     if jnp.dtype(dtype) == jnp.float32:
         advice.append("take float64 particles, of which rounding leaves more digits")
     if not isinstance(method, BackwardEuler):
@@ -94,13 +91,14 @@ def unconverged_advice(method: Method, dtype: Any) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def warn_of_short_solves(statistics: RunStatistics) -> None:
+def warn_of_inaccurate_solves(statistics: RunStatistics) -> None:
     """A Python warning where solves of an untraced run missed their tolerance by less than ten times."""
-    if int(statistics.short) > 0:
+    if int(statistics.nearly_converged) > 0:
         warn(
-            f"The solve of {int(statistics.short)} of {int(statistics.steps)} steps missed its tolerance by less "
-            f"than ten times (worst relative residual {float(statistics.worst_residual):.2g}): the run is that much "
-            "less accurate than was asked for. Raise the solver's max_steps, or ask for what it can reach by its rtol."
+            f"The solve of {int(statistics.nearly_converged)} of {int(statistics.steps)} steps missed its tolerance by "
+            f"less than ten times (worst relative residual {float(statistics.worst_residual):.2g}): the run is that "
+            "much less accurate than was asked for. Raise the solver's max_steps, or ask for what it can reach by its "
+            "rtol."
         )
 
 
@@ -136,7 +134,7 @@ _ADVICE = (
 )
 UNSOLVED = (
     "mpmjax: {} solve of a step did not converge, so that there is no derivative. Raise the "
-    "max_steps of the method's adjoint_solver, or leave its metric at Metric.DIAGONAL."
+    "max_steps of the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner()."
 )
 
 

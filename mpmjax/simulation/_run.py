@@ -9,7 +9,7 @@ import numpy as np
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.simulation._statistics import RunStatistics
 from mpmjax.state import Particles, Scene, State, with_state
-from mpmjax.stepping import Method
+from mpmjax.stepping import AbstractIntegrator
 
 
 class SimulationError(RuntimeError):
@@ -37,7 +37,7 @@ class Run(eqx.Module):
 
     scene: Scene
     """As it was simulated."""
-    method: Method
+    method: AbstractIntegrator
     """As it was used."""
     dt: Scalar
     """Δt [s]."""

@@ -24,11 +24,11 @@ from mpmjax.checks import (
     requirements,
 )
 from mpmjax.simulation._diffrax import Problem, StepSolver, examined, no_vector_field, step_number
-from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_short_solves
+from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccurate_solves
 from mpmjax.simulation._run import Run
 from mpmjax.simulation._statistics import HEALTHY, RunStatistics
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
-from mpmjax.stepping import MOST_STEPS, Explicit, Method, advance, step_for
+from mpmjax.stepping import MOST_STEPS, AbstractIntegrator, Explicit, advance, step_for
 
 _CHECKPOINT_BYTES = 2**28
 
@@ -40,7 +40,7 @@ def simulate(
     *,
     t1: Scalar,
     dt: Scalar | Literal["stable"],
-    method: Method = Explicit(),
+    method: AbstractIntegrator = Explicit(),
     save_every: int | None = None,
     observe: Callable[[Scene, Particles], Any] | None = None,
     start: Scalar = 0,
@@ -143,7 +143,7 @@ def simulate(
     if traced:
         return guarded(run, report)
     raise_faults(run, particles, previous, start)
-    warn_of_short_solves(run.statistics)
+    warn_of_inaccurate_solves(run.statistics)
     return run
 
 
@@ -154,7 +154,7 @@ def rollout(
     *,
     steps: int,
     dt: Scalar,
-    method: Method = Explicit(),
+    method: AbstractIntegrator = Explicit(),
     start: Scalar = 0,
 ) -> Particles:
     """The plain rollout: `jax.lax.scan` over steps, without saving, checks or checkpoints. `simulate` is held to it.
@@ -174,7 +174,7 @@ def rollout(
 
 @eqx.filter_jit
 def _rollout(
-    scene: Scene, particles: Particles, dt: Scalar, method: Method, steps: int, start: Float[Array, ""]
+    scene: Scene, particles: Particles, dt: Scalar, method: AbstractIntegrator, steps: int, start: Float[Array, ""]
 ) -> Particles:
     stencil = scene.stencil(particles) if scene.total else None
 
@@ -231,7 +231,7 @@ def integrate(
     start: Float[Array, ""],
     count: Float[Array, ""] | None,
     dt: Scalar,
-    method: Method,
+    method: AbstractIntegrator,
     slot: Scalar = 0.0,
     *,
     max_steps: int,
@@ -243,8 +243,8 @@ def integrate(
 ) -> tuple[Any, State, RunStatistics, State | None, Array]:
     """Integrate `count` ≤ `max_steps` steps from step `start`.
 
-    Returns the steps and values saved, the final state, the statistics, with `watch`, which stops the run at a fault, the
-    state before the last step, and what tangent solves report. Adjoint solves report through the `slot` (see
+    Returns the steps and values saved, the final state, the statistics, with `watch`, which stops the run at a fault,
+    the state before the last step, and what tangent solves report. Adjoint solves report through the `slot` (see
     `Reporting`).
 
     Without a count, all of them: what diffrax derives of its last time is then a constant, which XLA computes as it

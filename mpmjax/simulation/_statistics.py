@@ -35,7 +35,7 @@ class RunStatistics(eqx.Module):
     """Largest relative residual that a solve ended with."""
     unconverged: Int[Array, "*f"]
     """Steps whose solve met neither ten times its tolerance nor the precision's limit: the run is not a solution."""
-    short: Int[Array, "*f"]
+    nearly_converged: Int[Array, "*f"]
     """Steps whose solve missed its tolerance, by less than ten times: the run is less accurate than was asked for."""
     indefinite: Int[Array, "*f"]
     """Steps whose solve met negative curvature: compression has made M + cH indefinite, and near a singular one the
@@ -67,8 +67,8 @@ class RunStatistics(eqx.Module):
             newton=self.newton + s.newton,
             line_search=self.line_search + s.line_search,
             worst_residual=jnp.maximum(self.worst_residual, jax.lax.stop_gradient(s.residual)),
-            unconverged=self.unconverged + jnp.where(s.converged | s.short, 0, 1).astype(jnp.int32),
-            short=self.short + s.short.astype(jnp.int32),
+            unconverged=self.unconverged + jnp.where(s.converged | s.nearly_converged, 0, 1).astype(jnp.int32),
+            nearly_converged=self.nearly_converged + s.nearly_converged.astype(jnp.int32),
             indefinite=self.indefinite + s.indefinite.astype(jnp.int32),
             sweeps=self.sweeps + c.sweeps,
             violations=self.violations + c.violations,
@@ -87,7 +87,7 @@ class RunStatistics(eqx.Module):
             line_search=self.line_search + later.line_search,
             worst_residual=jnp.maximum(self.worst_residual, later.worst_residual),
             unconverged=self.unconverged + later.unconverged,
-            short=self.short + later.short,
+            nearly_converged=self.nearly_converged + later.nearly_converged,
             indefinite=self.indefinite + later.indefinite,
             sweeps=self.sweeps + later.sweeps,
             violations=self.violations + later.violations,

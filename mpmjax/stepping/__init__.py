@@ -1,19 +1,25 @@
 """One step: what particles bring to the nodes, the grid's updates, contact, and the longest stable step."""
 
-from mpmjax.stepping._method import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, Method, SemiImplicit, reporting
+from mpmjax.stepping._backward_euler import BackwardEuler
+from mpmjax.stepping._explicit import Explicit
+from mpmjax.stepping._implicit_midpoint import ImplicitMidpoint
+from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes, particles_to_grid
+from mpmjax.stepping._semi_implicit import SemiImplicit
 from mpmjax.stepping._stability import MOST_STEPS, SAFETY, longest_step, stable_dt, step_for
 from mpmjax.stepping._step import GridUpdate, StepInfo, advance, advance_compiled, grid_to_particles, step, update
+from mpmjax.stepping._trbdf2 import TRBDF2
 
 __all__ = [
     "MOST_STEPS",
     "SAFETY",
     "TRBDF2",
+    "AbstractIntegrator",
     "BackwardEuler",
     "Explicit",
     "GridUpdate",
     "ImplicitMidpoint",
-    "Method",
+    "NodeMotion",
     "Nodes",
     "SemiImplicit",
     "StepInfo",
@@ -22,7 +28,6 @@ __all__ = [
     "grid_to_particles",
     "longest_step",
     "particles_to_grid",
-    "reporting",
     "stable_dt",
     "step",
     "step_for",

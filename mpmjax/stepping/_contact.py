@@ -253,7 +253,7 @@ def find_active_set(
         v, momentum_residual, guess, info = attempt(held, guess)
         pulls, enters = held.verdict(v, momentum_residual)
         active = jax.tree.map(lambda was, pulled, entered: (was & ~pulled) | entered, active, pulls, enters)
-        return active, guess, cost.plus(info), _number(nodes, pulls) + _number(nodes, enters) > 0, count + 1
+        return active, guess, cost.followed_by(info), _number(nodes, pulls) + _number(nodes, enters) > 0, count + 1
 
     def unsettled(state: tuple) -> Array:
         return state[3] & (state[4] < SWEEPS)

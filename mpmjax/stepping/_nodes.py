@@ -92,7 +92,7 @@ class Nodes(eqx.Module):
         return jnp.where(self.free, grasp.normal * grasp.speed[:, None], self.conditions.velocity)
 
     def explicit_velocity(self) -> NodeVector:
-        """v* = v^n + Δt f / m + Δt g (reference, eq. 4)."""
+        """v* = v^n + Δt f / m + Δt g (derivation, eq. 4)."""
         force = self.force if self.viscous is None else self.force + self.viscous
         return jnp.where(self.occupied, self.inertial_velocity() + self.dt * self.per_mass(force), 0)
 

@@ -12,7 +12,12 @@ from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import canonical, checked, is_traced, require, require_positive
 from mpmjax.discretisation import MLSGradient
 from mpmjax.state import MaterialPoints, Particles, Scene, is_prepared, prepare
-from mpmjax.stepping._method import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, Method, SemiImplicit
+from mpmjax.stepping._backward_euler import BackwardEuler
+from mpmjax.stepping._explicit import Explicit
+from mpmjax.stepping._implicit_midpoint import ImplicitMidpoint
+from mpmjax.stepping._integrator import AbstractIntegrator
+from mpmjax.stepping._semi_implicit import SemiImplicit
+from mpmjax.stepping._trbdf2 import TRBDF2
 
 MOST_STEPS = 2**31 - 1
 """What a run counts its steps up to."""
@@ -31,7 +36,7 @@ def stable_dt(
     scene: Scene,
     particles: Particles,
     *,
-    method: Method = Explicit(),
+    method: AbstractIntegrator = Explicit(),
     safety: Scalar = SAFETY,
     t1: Scalar | None = None,
 ) -> Float[Array, ""]:
@@ -86,7 +91,12 @@ def stable_dt(
 
 
 def step_for(
-    scene: Scene, particles: Particles, t1: Scalar, dt: Scalar | Literal["stable"], method: Method, start: int
+    scene: Scene,
+    particles: Particles,
+    t1: Scalar,
+    dt: Scalar | Literal["stable"],
+    method: AbstractIntegrator,
+    start: int,
 ) -> Scalar:
     """The step that is asked for: a number, or what `stable_dt` says of the particles as they start.
 
@@ -123,14 +133,14 @@ def _whole(limit: Array, t1: Scalar, method: str) -> Float[Array, ""]:
     return jnp.asarray(end / count, limit.dtype)
 
 
-def longest_step(scene: Scene, particles: Particles, method: Method) -> Float[Array, ""]:
+def longest_step(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Float[Array, ""]:
     """`stable_dt` with a safety of one [s]; NaN where F is not finite, or too large."""
     scene, method = canonical((scene, method), particles.x.dtype)
     return _limit(scene, particles if is_prepared(scene, particles) else prepare(scene, particles), method)
 
 
 @eqx.filter_jit
-def _limit(scene: Scene, particles: Particles, method: Method) -> Float[Array, ""]:
+def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Float[Array, ""]:
     density = particles.mass / particles.volume
     bodies = scene.material_points(particles)
     stiffest = jnp.concatenate([_tangent_spectrum(c, particles.dim).max(axis=0) for c in bodies])

@@ -7,13 +7,15 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Int, NodeScalar, NodeVector, Scalar, components, particle_first
+from mpmjax.autodiff import without_derivative
 from mpmjax.boundary import ColliderImpulse, received
 from mpmjax.checks import canonical, checked, require_positive
 from mpmjax.discretisation import Stencil, g2p
 from mpmjax.implicit import Projection, SolveInfo
 from mpmjax.state import Particles, Scene, is_prepared, prepare
 from mpmjax.stepping._contact import NOTHING, ContactInfo, Held, find_active_set, hold, no_contact, touches
-from mpmjax.stepping._method import Explicit, Method, NodeMotion, viscous_impulse
+from mpmjax.stepping._explicit import Explicit
+from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion, viscous_impulse
 from mpmjax.stepping._nodes import Nodes, particles_to_grid
 
 
@@ -54,7 +56,12 @@ class GridUpdate(eqx.Module):
 
 
 def advance(
-    scene: Scene, particles: Particles, t: Scalar, dt: Scalar, method: Method, stencil: Stencil | None = None
+    scene: Scene,
+    particles: Particles,
+    t: Scalar,
+    dt: Scalar,
+    method: AbstractIntegrator,
+    stencil: Stencil | None = None,
 ) -> tuple[Particles, StepInfo]:
     """One step, without checks or compilation: `step` is its public form.
 
@@ -87,22 +94,22 @@ advance_compiled = eqx.filter_jit(advance)
 """The same as one program, which is traced once wherever it is called."""
 
 
-def update(nodes: Nodes, method: Method) -> GridUpdate:
+def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     """The nodes' motion, boundaries and contact included."""
     with jax.named_scope("update"):
-        guess = method.guess.velocity(nodes.velocity, nodes.explicit_velocity())
+        guess = method.initial_guess(nodes)
         if not touches(nodes):
-            motion, info = method.move(nodes, guess)
+            motion, info = method.advance(nodes, guess)
             elastic, reaction, viscous = impulses(nodes, method, motion)
             push = hold(nodes, NOTHING).pushes(reaction)
             free, none = nodes.projection, no_contact()
             return GridUpdate(nodes.velocity, motion, elastic, viscous, reaction, None, free, info, none, push)
 
-        def moved(held: Held, method: Method, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
-            motion, info = method.move(held.nodes, guess)
+        def moved(held: Held, method: AbstractIntegrator, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+            motion, info = method.advance(held.nodes, guess)
             return jax.tree.map(held.images.unfold, motion), info
 
-        frozen, frozen_method, guess = jax.lax.stop_gradient((nodes, method, guess))
+        frozen, frozen_method, guess = without_derivative((nodes, method, guess))
 
         def attempt(held: Held, guess: NodeVector) -> tuple:
             motion, info = moved(held, frozen_method, guess)
@@ -123,14 +130,16 @@ def update(nodes: Nodes, method: Method) -> GridUpdate:
             reaction=reaction,
             friction=nodes.mass[:, None] * loss,
             free=held.untouched,
-            solve=cost.plus(info),
+            solve=cost.followed_by(info),
             contact=ContactInfo(sweeps, held.count_violations(motion.velocity, reaction)),
             push=push,
             rub=rub,
         )
 
 
-def impulses(nodes: Nodes, method: Method, motion: NodeMotion) -> tuple[NodeVector, NodeVector, NodeVector | None]:
+def impulses(
+    nodes: Nodes, method: AbstractIntegrator, motion: NodeMotion
+) -> tuple[NodeVector, NodeVector, NodeVector | None]:
     """The impulse of the elastic force [kg m/s], that which is missing for the nodes to move so, of walls and grips,
     and that of viscosity."""
     elastic, viscous = method.elastic_impulse(nodes, motion), viscous_impulse(nodes, motion)
@@ -172,7 +181,7 @@ def step(
     t: Scalar,
     dt: Scalar,
     *,
-    method: Method = Explicit(),
+    method: AbstractIntegrator = Explicit(),
 ) -> tuple[Particles, StepInfo]:
     """One step of the Material Point Method, from t to t + dt.
 

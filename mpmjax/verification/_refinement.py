@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mpmjax.simulation import simulate
-from mpmjax.stepping import Explicit, Method
+from mpmjax.stepping import AbstractIntegrator, Explicit
 from mpmjax.verification._problem import AbstractProblem, discretise, displacement_error
 
 _SAMPLES = 10
@@ -18,7 +18,7 @@ def errors(
     cells: Sequence[int],
     *,
     courant: float | Sequence[float],
-    method: Method = Explicit(),
+    method: AbstractIntegrator = Explicit(),
     staggered: bool | None = None,
     **discretisation: Any,
 ) -> np.ndarray:
@@ -51,7 +51,7 @@ def _error(
     problem: AbstractProblem,
     cells: int,
     courant: float,
-    method: Method,
+    method: AbstractIntegrator,
     staggered: bool | None,
     discretisation: dict[str, Any],
 ) -> float:

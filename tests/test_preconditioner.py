@@ -10,7 +10,7 @@ import pytest
 from helpers import DESCRIPTIONS, GRADIENTS, LAWS, QUICK, assert_close, block, cloud, explicit_limit, ids
 
 import mpmjax as mpm
-from mpmjax.implicit._hessian import ImplicitOperator
+from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.stepping._nodes import particles_to_grid
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-11)
@@ -23,21 +23,21 @@ IMPLICIT = {
 
 
 def by_the_mass(method):
-    return dataclasses.replace(method, metric=mpm.Metric.MASS)
+    return dataclasses.replace(method, preconditioner=mpm.MassPreconditioner())
 
 
 def operator_of(scene, particles, hessian, factor=1e-3):
-    """M + cH at the particles, c such that mass and stiffness are alike, in the diagonal metric."""
+    """M + cH at the particles, c such that mass and stiffness are alike, ."""
     particles = mpm.prepare(scene, particles)
     dt = jnp.asarray(1e-3)
     nodes = particles_to_grid(scene, particles, 0.0, dt, scene.stencil(particles), centred=False)
     action = hessian.at_current(nodes.potential, nodes.velocity)
-    return ImplicitOperator(nodes.mass, jnp.asarray(factor), action, nodes.projection, mpm.Metric.DIAGONAL)
+    return ImplicitOperator(nodes.mass, jnp.asarray(factor), action, nodes.projection)
 
 
 @eqx.filter_jit
-def metric_and_matrix(operator):
-    return operator.metric(), operator.as_matrix()
+def weight_and_matrix(operator):
+    return mpm.DiagonalPreconditioner().inner_product(operator).weight, operator.as_matrix()
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])
@@ -48,8 +48,8 @@ def test_undeformed_it_is_the_operators_diagonal(description, gradient, d):
     grid, particles = cloud(d, p=6, cells=1 if d == 3 else 2)
     still = mpm.Particles(particles.x, particles.v, particles.mass, particles.volume)
     scene = mpm.Scene(grid, LAWS["neo_hookean"], gradient=gradient, description=description)
-    metric, matrix = metric_and_matrix(operator_of(scene, still, mpm.AnalyticHessian()))
-    assert_close(metric.ravel(), jnp.diag(matrix), 1e-13)
+    weight, matrix = weight_and_matrix(operator_of(scene, still, mpm.AnalyticHessian()))
+    assert_close(weight.ravel(), jnp.diag(matrix), 1e-13)
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -61,13 +61,13 @@ def test_deformed_it_scales_the_operator_whatever_the_law_and_the_walls(descript
     walls = (mpm.SymmetryPlane(0, 0.0), mpm.StickyBox((-np.inf, 0.05), (5.0, 5.0)))
     scene = mpm.Scene(grid, LAWS[law], boundary=walls, description=description)
     both = [operator_of(scene, particles, hessian) for hessian in (mpm.AnalyticHessian(), mpm.JvpHessian())]
-    (metric, matrix), (other, _) = map(metric_and_matrix, both)
-    assert_close(metric, other, 1e-12)
+    (weight, matrix), (other, _) = map(weight_and_matrix, both)
+    assert_close(weight, other, 1e-12)
     free = np.asarray(both[0].projection.free)
-    assert (metric[free] >= jnp.broadcast_to(both[0].mass[:, None], free.shape)[free]).all()
-    np.testing.assert_array_equal(metric[~free], 1)
+    assert (weight[free] >= jnp.broadcast_to(both[0].mass[:, None], free.shape)[free]).all()
+    np.testing.assert_array_equal(weight[~free], 1)
     exact = np.diag(matrix).reshape(free.shape)[free]
-    assert 0.5 < (exact / metric[free]).min() <= (exact / metric[free]).max() < 2
+    assert 0.5 < (exact / weight[free]).min() <= (exact / weight[free]).max() < 2
 
 
 def test_negative_stiffness_is_left_out():
@@ -76,15 +76,15 @@ def test_negative_stiffness_is_left_out():
     F = jnp.broadcast_to(0.3 * jnp.eye(2), (len(particles.x), 2, 2))
     squeezed = mpm.Particles(particles.x, particles.v, particles.mass, particles.volume, F)
     operator = operator_of(scene, squeezed, mpm.AnalyticHessian(), factor=1.0)
-    metric, matrix = metric_and_matrix(operator)
+    weight, matrix = weight_and_matrix(operator)
     assert np.linalg.eigvalsh(matrix).min() < 0
-    stiffness, free = operator.hessian.assembled(), np.asarray(operator.projection.free)
+    stiffness, free = operator.hessian.precomputed(), np.asarray(operator.projection.free)
     K = np.stack([np.asarray(stiffness.matrix)[m, m] for m in range(4)]).reshape(2, 2, -1)  # by slope, then component
     assert (K < 0).any()
     left = np.zeros(free.shape)
     square = np.asarray(stiffness.stencil.gradient) ** 2
     np.add.at(left, np.asarray(stiffness.stencil.index), np.einsum("kbp,bap->kpa", square, np.where(K > 0, K, 0)))
-    assert_close(metric[free], (np.asarray(operator.mass)[:, None] + left)[free], 1e-13)
+    assert_close(weight[free], (np.asarray(operator.mass)[:, None] + left)[free], 1e-13)
 
 
 def layered(contrast, multiple, *, side=6, dtype=jnp.float64):
@@ -136,9 +136,9 @@ def test_newton_in_single_precision_knows_its_rounding_in_either():
     """Asked for more than float32 can give, it stops at the same floor, and says that it converged."""
     scene, particles, dt = layered(1e3, 60.0, dtype=jnp.float32)
     ends = {}
-    for metric in mpm.Metric:
-        method = mpm.BackwardEuler(mpm.Newton(rtol=1e-12), metric=metric)
-        ends[metric], info = mpm.step(scene, particles, 0.0, dt, method=method)
+    for preconditioner in (mpm.DiagonalPreconditioner(), mpm.MassPreconditioner()):
+        method = mpm.BackwardEuler(mpm.Newton(rtol=1e-12), preconditioner=preconditioner)
+        ends[preconditioner], info = mpm.step(scene, particles, 0.0, dt, method=method)
         assert info.solve.converged
         assert 1e-12 < info.solve.residual < 1e-3
-    assert_close(ends[mpm.Metric.MASS].v, ends[mpm.Metric.DIAGONAL].v, 1e-3)
+    assert_close(ends[mpm.MassPreconditioner()].v, ends[mpm.DiagonalPreconditioner()].v, 1e-3)

@@ -1,0 +1,138 @@
+"""The elastic energy's Hessian as a linear map of nodal displacements."""
+
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from typing_extensions import override
+
+from mpmjax import linalg as la
+from mpmjax._types import Array, Float, Matrix, NodeVector, Scalar
+from mpmjax.boundary import Mirror
+from mpmjax.discretisation import Stencil, gather, scatter
+from mpmjax.implicit._potential import ElasticPotential
+
+
+class AbstractHessianAction(eqx.Module):
+    """The symmetric linear map δu ↦ H δu [N] with H = ∂²Φ/∂u∂u [N/m], of nodal displacements δu [m], shape (n, d)."""
+
+    @abc.abstractmethod
+    def is_positive_semidefinite(self) -> bool:
+        """Whether H is known to be positive semi-definite."""
+
+    @abc.abstractmethod
+    def __call__(self, du: NodeVector) -> NodeVector:
+        """H δu."""
+
+    @abc.abstractmethod
+    def precomputed(self) -> "ParticleStiffness":
+        """The same map by one matrix a particle, made once for many applications."""
+
+
+class ParticleStiffness(AbstractHessianAction):
+    """H by one matrix a particle: d⁴ numbers each, and no evaluation of the law at each application."""
+
+    matrix: Float[Array, "m m p"]
+    """K_p [J] (see `ElasticPotential.stiffness`), shape (d², d², p)."""
+    stencil: Stencil
+    mirror: Mirror
+    positive_semidefinite: bool = eqx.field(static=True, default=False)
+
+    @override
+    def is_positive_semidefinite(self) -> bool:
+        return self.positive_semidefinite
+
+    def __call__(self, du: NodeVector) -> NodeVector:
+        """Σ_p g_ip K_p Σ_j g_jp δu_j."""
+        _, slopes = gather(self.stencil, self.mirror.unfold(du))
+        flux = la.matmul(self.matrix, slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
+        return self.mirror.fold(scatter(self.stencil, None, flux, du.shape[0]))
+
+    @override
+    def precomputed(self) -> "ParticleStiffness":
+        return self
+
+    def diagonal(self, like: NodeVector) -> NodeVector:
+        """Σ_p Σ_b g_ip,b² K_p,ba,ba [N/m], shape (n, d): an approximation of H's diagonal that is never negative.
+
+        Negative entries of K count as zero. Left out are the products of slopes along different axes, which an
+        isotropic law has none of at F = I, and at mirror planes those of a node's slopes with its image's.
+
+        Args:
+            like: any node vector.
+        """
+        d = like.shape[1]
+        stiff = jnp.stack([jnp.maximum(self.matrix[m, m], 0) for m in range(d * d)])
+        nodes = scatter(self.stencil.squared, None, stiff.reshape(d, d, -1), like.shape[0])
+        return jnp.stack([self.mirror.fold_scalar(component) for component in nodes.T], axis=1)
+
+
+class TangentAction(AbstractHessianAction):
+    """H by stress differentials.
+
+    Args:
+        potential: the elastic potential.
+        tangents: for each material the symmetric linear map δF ↦ δP [Pa] of its particles, of the shapes of F.
+        positive_semidefinite: whether all of these maps are known to be positive semi-definite.
+    """
+
+    potential: ElasticPotential
+    tangents: tuple[Callable[[Matrix], Matrix], ...]
+    positive_semidefinite: bool = eqx.field(static=True, default=False)
+
+    @override
+    def is_positive_semidefinite(self) -> bool:
+        return self.positive_semidefinite
+
+    def __call__(self, du: NodeVector) -> NodeVector:
+        """Σ_p V0_p A_p h_ip, with A_p = ∂²Ψ/∂F∂F : δF_p (derivation, eqs. 7 and 8)."""
+        return _tangent_action(self.potential, self.tangents, du)
+
+    @override
+    def precomputed(self) -> ParticleStiffness:
+        return particle_stiffness(self.potential, self.tangents, positive_semidefinite=self.positive_semidefinite)
+
+
+def particle_stiffness(
+    potential: ElasticPotential, tangents: tuple[Callable[[Matrix], Matrix], ...], *, positive_semidefinite: bool
+) -> ParticleStiffness:
+    """H by one matrix a particle, from the materials' stress differentials."""
+    matrix = potential.stiffness(tangents)
+    return ParticleStiffness(matrix, potential.stencil, potential.mirror, positive_semidefinite)
+
+
+@jax.jit
+def _tangent_action(
+    potential: ElasticPotential, tangents: tuple[Callable[[Matrix], Matrix], ...], du: NodeVector
+) -> NodeVector:
+    changes = (tangent(dF) for tangent, dF in zip(tangents, potential.strain(du), strict=True))
+    return potential.divergence(tuple(changes), du)
+
+
+class _DampedAction(AbstractHessianAction):
+    elastic: AbstractHessianAction
+    potential: ElasticPotential
+    rate: Scalar
+
+    @override
+    def is_positive_semidefinite(self) -> bool:
+        return self.elastic.is_positive_semidefinite()
+
+    def __call__(self, du: NodeVector) -> NodeVector:
+        """(H + r D) δu."""
+        return self.elastic(du) + self.rate * self.potential.damping_force(du)
+
+    @override
+    def precomputed(self) -> ParticleStiffness:
+        stiffness = self.elastic.precomputed()
+        return eqx.tree_at(
+            lambda s: s.matrix, stiffness, stiffness.matrix + self.rate * self.potential.damping_matrices()
+        )
+
+
+def damped(elastic: AbstractHessianAction, potential: ElasticPotential, rate: Scalar) -> AbstractHessianAction:
+    """H + r D, with D [N s/m] the matrix of the viscous force, positive semi-definite: for r = 1/c a stage of duration
+    c has M + c D + c² H. Without viscosity it is H."""
+    return _DampedAction(elastic, potential, rate) if potential.viscous else elastic

@@ -1,0 +1,92 @@
+"""The inner product in which a linear system is solved."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from typing_extensions import override
+
+from mpmjax._types import Array
+
+
+class AbstractInnerProduct(eqx.Module):
+    """⟨a, b⟩ = aᵀ W b with a symmetric positive definite W = L Lᵀ.
+
+    For a symmetric A the map W⁻¹A is self-adjoint in it, so W is a preconditioner of A: iterations grow with the spread
+    of the eigenvalues of W⁻¹A. `ConjugateResidual` works on W⁻¹A; any other solver is given L⁻¹A L⁻ᵀ, which has the
+    same eigenvalues and is symmetric in the plain inner product.
+
+    The W of an `ImplicitOperator` must commute with its projection Q, so that residuals and steps keep out of what is
+    held: W = Q W Q + (I − Q) W (I − Q).
+    """
+
+    @abc.abstractmethod
+    def apply(self, v: Any) -> Any:
+        """W v."""
+
+    @abc.abstractmethod
+    def solve_factor(self, r: Any) -> Any:
+        """L⁻¹ r."""
+
+    @abc.abstractmethod
+    def solve_factor_transpose(self, v: Any) -> Any:
+        """L⁻ᵀ v."""
+
+    def solve(self, r: Any) -> Any:
+        """W⁻¹ r."""
+        return self.solve_factor_transpose(self.solve_factor(r))
+
+    def flattened(self, unravel: Callable[[Array], Any]) -> "AbstractInnerProduct":
+        """The same inner product, of vectors that `jax.flatten_util.ravel_pytree` has flattened."""
+        return _FlatInnerProduct(self, unravel)
+
+
+class DiagonalInnerProduct(AbstractInnerProduct):
+    """That of a diagonal W.
+
+    Args:
+        weight: the diagonal, positive, of the vector's structure.
+    """
+
+    weight: Any
+
+    @override
+    def apply(self, v: Any) -> Any:
+        return jax.tree.map(jnp.multiply, self.weight, v)
+
+    @override
+    def solve_factor(self, r: Any) -> Any:
+        return jax.tree.map(lambda r, w: r / jnp.sqrt(w), r, self.weight)
+
+    @override
+    def solve_factor_transpose(self, v: Any) -> Any:
+        return self.solve_factor(v)
+
+    @override
+    def solve(self, r: Any) -> Any:
+        return jax.tree.map(jnp.divide, r, self.weight)
+
+    @override
+    def flattened(self, unravel: Callable[[Array], Any]) -> "DiagonalInnerProduct":
+        return DiagonalInnerProduct(ravel_pytree(self.weight)[0])
+
+
+class _FlatInnerProduct(AbstractInnerProduct):
+    inner: AbstractInnerProduct
+    unravel: Callable[[Array], Any] = eqx.field(static=True)
+
+    @override
+    def apply(self, v: Array) -> Array:
+        return ravel_pytree(self.inner.apply(self.unravel(v)))[0]
+
+    @override
+    def solve_factor(self, r: Array) -> Array:
+        return ravel_pytree(self.inner.solve_factor(self.unravel(r)))[0]
+
+    @override
+    def solve_factor_transpose(self, v: Array) -> Array:
+        return ravel_pytree(self.inner.solve_factor_transpose(self.unravel(v)))[0]

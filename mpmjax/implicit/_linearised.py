@@ -1,0 +1,46 @@
+"""One linear solve a stage."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import lineax as lx
+
+from mpmjax._types import NodeVector
+from mpmjax.checks import require_fields
+from mpmjax.implicit._conjugate_residual import ConjugateResidual
+from mpmjax.implicit._linear_solve import solve_linear
+from mpmjax.implicit._problems import LinearProblem
+from mpmjax.implicit._solve_info import SolveInfo
+
+
+class Linearised(eqx.Module):
+    """One linear solve: the force is f(0) − H u in the whole step.
+
+    Args:
+        solver: of the linear system, any symmetric one of lineax. Default: `ConjugateResidual`, default tolerances.
+    """
+
+    solver: lx.AbstractLinearSolver = ConjugateResidual()
+
+    def __check_init__(self):
+        require_fields(self)
+
+    def __call__(self, problem: LinearProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
+        """The solution, started from a guess [m/s], shape (n, d)."""
+        operator = problem.operator(guess).precomputed()
+        split = problem.projection.combine
+        lift = split(0, problem.prescribed)
+        rhs = split(problem.rhs - operator.unconstrained(lift), 0)
+        inner = problem.preconditioner.inner_product(operator)
+        solution = solve_linear(self.solver, operator, rhs, inner, split(guess, 0))
+        none = jnp.asarray(0, dtype=jnp.int32)
+        info = SolveInfo(
+            iterations=solution.iterations,
+            newton=none,
+            line_search=none,
+            residual=solution.residual,
+            converged=solution.converged,
+            nearly_converged=solution.nearly_converged,
+            indefinite=solution.indefinite,
+            report=jnp.zeros_like(solution.residual),
+        )
+        return solution.value + lift, info

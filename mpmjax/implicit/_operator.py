@@ -1,0 +1,125 @@
+"""The matrix of the implicit solves, M + cH on what is free, as a lineax operator."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from typing_extensions import override
+
+from mpmjax._types import Array, Float, NodeScalar, NodeVector, Scalar
+from mpmjax.implicit._hessian_action import AbstractHessianAction
+from mpmjax.implicit._projection import Projection
+
+
+class AbstractSymmetricOperator(lx.AbstractLinearOperator):
+    """A symmetric operator on arrays of one shape, given by its products with them."""
+
+    @abc.abstractmethod
+    def is_positive_semidefinite(self) -> bool:
+        """Whether it is known to be positive semi-definite, which solvers such as `lineax.CG` require."""
+
+    @abc.abstractmethod
+    def mv(self, vector: Array) -> Array:
+        """The product with a vector."""
+
+    @abc.abstractmethod
+    def in_structure(self) -> jax.ShapeDtypeStruct:
+        """Shape and dtype of a vector."""
+
+    @override
+    def out_structure(self) -> jax.ShapeDtypeStruct:
+        return self.in_structure()
+
+    @override
+    def as_matrix(self) -> Float[Array, "nd nd"]:
+        vector = self.in_structure()
+        columns = jax.vmap(lambda e: self.mv(e.reshape(vector.shape)).reshape(-1))
+        return columns(jnp.eye(vector.size, dtype=vector.dtype)).T
+
+    @override
+    def transpose(self) -> "AbstractSymmetricOperator":
+        return self
+
+
+class ImplicitOperator(AbstractSymmetricOperator):
+    """Q (M + c H) Q + I − Q [kg], with c = βΔt² for the semi-implicit step (derivation, eq. 6 times m_i) and the square
+    of its duration for a stage.
+
+    Q keeps what is free (see `Projection`). Rows of prescribed components and of empty nodes are those of the identity;
+    along a held normal stands the mass.
+    """
+
+    mass: NodeScalar
+    """Nodal masses m_i [kg], shape (n,)."""
+    factor: Scalar
+    """c [s²]."""
+    hessian: AbstractHessianAction
+    """H [N/m]."""
+    projection: Projection
+
+    @override
+    def is_positive_semidefinite(self) -> bool:
+        return self.hessian.is_positive_semidefinite()
+
+    def unconstrained(self, v: NodeVector) -> NodeVector:
+        """(M + c H) v."""
+        return self.mass[:, None] * v + self.factor * self.hessian(v)
+
+    @override
+    def mv(self, vector: NodeVector) -> NodeVector:
+        split = self.projection.combine
+        return split(self.unconstrained(split(vector, 0)), self.projection.identity_rows(vector, self.mass))
+
+    def precomputed(self) -> "ImplicitOperator":
+        """The same operator, with one matrix a particle made once for many applications."""
+        return eqx.tree_at(lambda o: o.hessian, self, self.hessian.precomputed())
+
+    def nodal_mass(self) -> NodeVector:
+        """m_i [kg] for each component, shape (n, d)."""
+        return jnp.broadcast_to(self.mass[:, None], self.projection.free.shape)
+
+    def diagonal(self) -> NodeVector:
+        """m_i + c H_ii [kg], shape (n, d), negative parts of H left out (see `AssembledHessian.diagonal`)."""
+        mass = self.nodal_mass()
+        return mass + self.factor * self.hessian.precomputed().diagonal(mass)
+
+    @override
+    def in_structure(self) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(self.projection.free.shape, self.mass.dtype)
+
+
+@lx.is_symmetric.register(AbstractSymmetricOperator)
+def _(operator: AbstractSymmetricOperator) -> bool:
+    return True
+
+
+@lx.is_positive_semidefinite.register(AbstractSymmetricOperator)
+def _(operator: AbstractSymmetricOperator) -> bool:
+    return operator.is_positive_semidefinite()
+
+
+for _property in (
+    lx.is_diagonal,
+    lx.is_tridiagonal,
+    lx.has_unit_diagonal,
+    lx.is_lower_triangular,
+    lx.is_upper_triangular,
+    lx.is_negative_semidefinite,
+):
+
+    @_property.register(AbstractSymmetricOperator)
+    def _(operator: AbstractSymmetricOperator) -> bool:
+        return False
+
+
+del _property
+
+
+@lx.linearise.register(AbstractSymmetricOperator)
+@lx.materialise.register(AbstractSymmetricOperator)
+@lx.conj.register(AbstractSymmetricOperator)
+def _(operator: AbstractSymmetricOperator) -> Any:
+    return operator

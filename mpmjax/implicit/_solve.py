@@ -1,0 +1,96 @@
+"""Solutions of nodal problems, with one derivative rule for all of them.
+
+Whatever iteration finds the solution v of residual(v) = 0, its derivative is that of the implicit function theorem,
+J δv = −δ(residual): one more solve with the same operator, forward or backward, so that no iteration is ever
+differentiated.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+
+from mpmjax._types import Array, NodeVector, Scalar
+from mpmjax.autodiff import ruled, without_derivative
+from mpmjax.implicit._linear_solve import solve_linear
+from mpmjax.implicit._linearised import Linearised
+from mpmjax.implicit._newton import Newton
+from mpmjax.implicit._problems import AbstractProblem
+from mpmjax.implicit._solve_info import SolveInfo
+
+
+class Reporting(eqx.Module):
+    """The solver of tangent and adjoint systems, with a way to hear of those that did not converge.
+
+    Their residuals cannot be returned: they are computed where only derivatives are. So they are themselves given out
+    as derivatives, of zeros: the tangent of a solve's `report` in forward mode, the cotangent of `slot` in reverse mode
+    is the sum of the relative residuals of the solves that did not converge, infinite where one is not finite. As such
+    a solve gives NaN, and what is solved after it is not counted, that is the residual of the first.
+    """
+
+    solver: lx.AbstractLinearSolver
+    slot: Scalar
+    """Zero."""
+
+
+def solve(
+    problem: AbstractProblem,
+    guess: NodeVector,
+    find: Linearised | Newton,
+    adjoint: lx.AbstractLinearSolver | Reporting,
+) -> tuple[NodeVector, SolveInfo]:
+    """The solution of a problem, differentiable with respect to it in forward and reverse mode, to any order.
+
+    Args:
+        problem: the problem.
+        guess: where the iteration starts [m/s], shape (n, d); the result does not depend on it beyond the tolerance,
+            nor its derivative.
+        find: the iteration.
+        adjoint: solver of the tangent and adjoint systems. What ends beyond ten times its tolerance gives NaN
+            derivatives, so that a wrong gradient cannot pass for a right one.
+    """
+    if not isinstance(adjoint, Reporting):
+        adjoint = Reporting(adjoint, jnp.zeros((), guess.dtype))
+    return _solve(problem, adjoint.slot, *without_derivative((guess, find, adjoint.solver)))
+
+
+@ruled
+def _solve(
+    problem: AbstractProblem, slot: Array, guess: NodeVector, find: Any, adjoint: lx.AbstractLinearSolver
+) -> tuple[NodeVector, SolveInfo]:
+    del slot, adjoint
+    return find(problem, guess)
+
+
+@_solve.defjvp
+def _solve_jvp(primals: Any, tangents: Any) -> Any:
+    problem, slot, guess, find, adjoint = primals
+    d_problem, d_slot = tangents[:2]
+    v, info = _solve(problem, slot, guess, find, adjoint)
+    d_residual = eqx.filter_jvp(lambda q: q.residual(v), (problem,), (d_problem,))[1]
+    operator = problem.operator(v)
+    known, preconditioner = without_derivative((operator, problem.preconditioner))
+    known = known.precomputed()
+    inner = preconditioner.inner_product(known)
+
+    def solve_symmetric(matvec: Any, b: tuple[NodeVector, Array]) -> tuple[NodeVector, Array]:
+        del matvec  # the same operator, slower
+        solution = solve_linear(adjoint, known, b[0], inner)
+        solved, finite = solution.converged | solution.nearly_converged, jnp.isfinite(b[0]).all()
+        residual = jnp.where(jnp.isfinite(solution.residual), solution.residual, jnp.inf)
+        return jnp.where(solved, solution.value, jnp.nan), jnp.where(finite & ~solved, residual, 0)
+
+    split = problem.projection.combine
+    lift = split(0, -d_residual)
+    rhs = split(-d_residual - operator.unconstrained(lift), 0)
+    d_slot = rhs[:0].sum() + (0 if d_slot is None else d_slot)  # linear in tangents also where nobody listens
+
+    def matvec(x: tuple[NodeVector, Array]) -> tuple[NodeVector, Array]:
+        y = operator.mv(x[0])
+        return y, x[1] + y[:0].sum()  # as above, of the next order's tangents
+
+    dv, d_report = jax.lax.custom_linear_solve(matvec, (rhs, d_slot), solve_symmetric, symmetric=True)
+    d_info = eqx.tree_at(lambda i: i.report, jax.tree.map(lambda _: None, info), d_report, is_leaf=lambda a: a is None)
+    return (v, info), (dv + lift, d_info)

@@ -1,0 +1,60 @@
+"""What the solution of a step's equations cost, and how good it is."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Bool, Float, Int
+
+
+class SolveInfo(eqx.Module):
+    """What the solution of one step's equations cost, and how good it is."""
+
+    iterations: Int[Array, "*f"]
+    """Iterations of the linear solver, over all Newton steps; 0 of a solver that states none."""
+    newton: Int[Array, "*f"]
+    """Newton steps."""
+    line_search: Int[Array, "*f"]
+    """Halvings of a Newton step by the line search."""
+    residual: Float[Array, "*f"]
+    """True relative residual at the end: of one linear solve in the norm of the inverse preconditioner, of Newton's
+    method in that of the inverse mass, and there relative to the momentum that the forces balance where their sum
+    vanishes."""
+    converged: Bool[Array, "*f"]
+    """Whether the solver's tolerance, or the precision's own limit, was met."""
+    nearly_converged: Bool[Array, "*f"]
+    """Whether neither was, but ten times the tolerance."""
+    indefinite: Bool[Array, "*f"]
+    """Whether the solver met a direction of negative curvature: M + cH is indefinite, and the step may be near a
+    singular one."""
+    report: Float[Array, "*f"]
+    """Zero. Its tangent is the relative residual of the tangent solves that did not converge (see `Reporting`)."""
+
+    def followed_by(self, later: "SolveInfo") -> "SolveInfo":
+        """The cost of two solves of one equation, and the quality of the later one."""
+        return SolveInfo(
+            iterations=self.iterations + later.iterations,
+            newton=self.newton + later.newton,
+            line_search=self.line_search + later.line_search,
+            residual=later.residual,
+            converged=later.converged,
+            nearly_converged=later.nearly_converged,
+            indefinite=self.indefinite | later.indefinite,
+            report=self.report + later.report,
+        )
+
+    def together_with(self, other: "SolveInfo") -> "SolveInfo":
+        """The cost of two solves, both of which are needed, and the quality of the worse one."""
+        both = self.followed_by(other)
+        converged = self.converged & other.converged
+        usable = (self.converged | self.nearly_converged) & (other.converged | other.nearly_converged)
+        worst = jnp.maximum(self.residual, other.residual), converged, usable & ~converged
+        return eqx.tree_at(lambda info: (info.residual, info.converged, info.nearly_converged), both, worst)
+
+
+def no_solve(dtype: Any) -> SolveInfo:
+    """Of an update that solves nothing."""
+    zero = jnp.asarray(0, dtype=jnp.int32)
+    no, none = jnp.asarray(False), jnp.asarray(0, dtype=dtype)
+    return SolveInfo(zero, zero, zero, none, converged=~no, nearly_converged=no, indefinite=no, report=none)

@@ -1,0 +1,83 @@
+"""The semi-implicit step."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import lineax as lx
+
+from mpmjax._types import NodeVector, Scalar
+from mpmjax.checks import require_between, require_fields
+from mpmjax.implicit import (
+    AbstractHessian,
+    AbstractPreconditioner,
+    AnalyticHessian,
+    ConjugateResidual,
+    DiagonalPreconditioner,
+    Guess,
+    Linearised,
+    LinearProblem,
+    SolveInfo,
+    damped,
+    solve,
+)
+from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
+from mpmjax.stepping._nodes import Nodes
+
+
+class SemiImplicit(AbstractImplicitIntegrator):
+    """The semi-implicit update: (M + βΔt²H) v^{n+1} = M v*, force and H at the start of the step (derivation, eqs. 3,
+    6); with viscosity (M + βΔt D + βΔt²H) v^{n+1} = M v* − (1 − β) Δt D v^n.
+
+    First order in time. On a mode of frequency ω the amplification is (1 + βz)^(−½) with z = (ωΔt)² while
+    z < 4/(1−β)²: stable for every Δt if β ≥ ½, else for z ≤ 4/(1−2β). β = 0 is the explicit step; β = 1 one Newton step
+    of backward Euler. β = ½ is *not* the trapezoidal rule, positions moving with v^{n+1}: for β > 0 motion is damped,
+    by a quarter in one period of a standing wave at the explicit limit. A method for slow, driven and overdamped
+    motion; `ImplicitMidpoint` costs as much and follows motion in time.
+    *When it breaks*: large strains within one step (the system is linearised once), and where compression makes H
+    indefinite and Δt brings M + βΔt²H near singular: `AnalyticHessian(projected=True)` holds there.
+    *Good values*: β = 1 with Δt up to some hundred times the explicit limit for quasi-static pulls.
+
+    Args:
+        beta: β, from 0 to 1.
+        hessian: how H acts. Default: by the analytic stress differential.
+        solver: of the forward solve, any symmetric one of lineax. Default: `ConjugateResidual`.
+        preconditioner: of the solves. Default: the diagonal of M + cH.
+        adjoint_solver: of the tangent and adjoint solves, whose tolerance bounds the gradient's. Default: default
+            tolerances.
+        guess: where the solve starts.
+    """
+
+    beta: Scalar = 1.0
+    hessian: AbstractHessian = AnalyticHessian()
+    solver: lx.AbstractLinearSolver = ConjugateResidual()
+    preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
+    adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
+    guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
+    centred: ClassVar[bool] = False
+    needs_force: ClassVar[bool] = True
+    lagged: ClassVar[bool] = False
+
+    def __check_init__(self):
+        require_fields(self)
+        require_between("SemiImplicit's beta", self.beta, 0, 1)
+
+    def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+        predictor, v0, beta = nodes.explicit_velocity(), nodes.admitted_velocity(), self.beta
+        viscous = nodes.potential.viscous
+        impulse = nodes.mass[:, None] * predictor
+        problem = LinearProblem(
+            mass=nodes.mass,
+            factor=beta * nodes.dt**2,
+            hessian=damped(self.hessian.at_current(nodes.potential, predictor), nodes.potential, 1 / nodes.dt),
+            rhs=impulse - (1 - beta) * nodes.dt * nodes.potential.damping_force(v0) if viscous else impulse,
+            projection=nodes.projection,
+            prescribed=nodes.prescribed,
+            preconditioner=self.preconditioner,
+        )
+        v, info = solve(problem, guess, Linearised(self.solver), self.adjoint_solver)
+        return NodeMotion(v, resisted=(1 - beta) * v0 + beta * v if viscous else None), info
+
+    def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """Δt f(0) − βΔt² H v [kg m/s]."""
+        action = self.hessian.at_current(nodes.potential, motion.velocity)
+        return nodes.dt * nodes.force - self.beta * nodes.dt**2 * action(motion.velocity)

@@ -1,0 +1,90 @@
+"""TR-BDF2 and its relatives."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import lineax as lx
+
+from mpmjax._types import NodeVector, Scalar
+from mpmjax.checks import require_between, require_fields
+from mpmjax.implicit import (
+    AbstractHessian,
+    AbstractPreconditioner,
+    AnalyticHessian,
+    ConjugateResidual,
+    DiagonalPreconditioner,
+    Guess,
+    Linearised,
+    Newton,
+    SolveInfo,
+)
+from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
+from mpmjax.stepping._nodes import Nodes
+from mpmjax.stepping._stage import Stage, stage_force
+
+
+class TRBDF2(AbstractImplicitIntegrator):
+    """A trapezoidal stage to γΔt, then a step with what is known at 0, γΔt and Δt: for y' = F(y),
+
+        y_γ = y_0 + ½γΔt (F_0 + F_γ),    y_1 = y_0 + Δt (q_0 F_0 + q_1 F_γ + q_2 F_1).
+
+    Second order in time, stable at every Δt, and a mode that Δt does not resolve is multiplied by ρ∞ in each step:
+    with ρ∞ = 0, TR-BDF2, it is gone at once (L-stable); with 1 the method is two trapezoidal steps of Δt/2. γ and q are
+    fixed by the order, by ρ∞ and by both stages having the same matrix, M + (½γΔt)²H: two solves a step, each of them
+    easier than that of `ImplicitMidpoint`, ½γ being 0.29 (ρ∞ = 0) to 0.25.
+    (R. E. Bank et al., IEEE Trans. CAD 4 (1985) 436, doi 10.1109/TCAD.1985.1270142; with ρ∞: G. Noh, K.-J. Bathe,
+    Comput. Struct. 212 (2019) 299, doi 10.1016/j.compstruc.2018.11.001.)
+
+    For motion to be followed in time in which unresolved frequencies would ring: contact, stiff starts.
+    *When it breaks*: as `ImplicitMidpoint`.
+
+    Args:
+        rho: ρ∞, from 0 to 1.
+        solution: `Linearised()`, one linear solve a stage, or `Newton()`.
+        hessian: how H acts. Default: by the analytic stress differential.
+        preconditioner: of the linear solves. Default: the diagonal of M + cH.
+        adjoint_solver: of the tangent and adjoint solves, any symmetric one. Default: `ConjugateResidual`.
+        guess: where the first stage's solve starts; the second's does where the first ended.
+    """
+
+    rho: Scalar = 0.0
+    solution: Linearised | Newton = Linearised()
+    hessian: AbstractHessian = AnalyticHessian()
+    preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
+    adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
+    guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
+    centred: ClassVar[bool] = True
+    needs_force: ClassVar[bool] = True
+    lagged: ClassVar[bool] = False
+
+    def __check_init__(self):
+        require_fields(self)
+        require_between("TRBDF2's rho", self.rho, 0, 1)
+
+    def weights(self) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+        """γ, q_0, q_1, q_2: γ solves (1 − ρ∞)γ² − 4γ + 2 = 0, q_2 = ½γ, q_1 = (½ − q_2)/γ, q_0 = 1 − q_1 − q_2."""
+        gamma = 2 / (2 + jnp.sqrt(2 + 2 * jnp.asarray(self.rho)))
+        q1 = (1 / gamma - 1) / 2
+        return gamma, 1 - q1 - gamma / 2, q1, gamma / 2
+
+    def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+        _, q0, q1, q2 = self.weights()
+        dt, g, v0 = nodes.dt, nodes.acceleration, nodes.admitted_velocity()
+        c = q2 * dt  # = ½γΔt
+        viscous = nodes.potential.viscous
+        pull = nodes.per_mass(nodes.force - nodes.potential.damping_force(v0) if viscous else nodes.force)
+        trapezoidal = Stage(v0 + c * (pull + 2 * g), c, c * v0)
+        middle, first = trapezoidal.solve(nodes, guess, self, self.solution)
+        later_pull = (middle - trapezoidal.inertial) / c  # f_γ/m, viscosity's with it, by the stage's own equation
+        last = Stage(v0 + dt * (q0 * pull + q1 * later_pull + g), c, dt * (q0 * v0 + q1 * middle))
+        v, second = last.solve(nodes, middle, self, self.solution)
+        inner, mean = q2 * (v0 + middle), q0 * v0 + q1 * middle + q2 * v
+        return NodeMotion(v, mean, inner, mean if viscous else None), first.together_with(second)
+
+    def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """Δt (q_0 f_0 + q_1 f_γ + q_2 f_1) [kg m/s]."""
+        _, q0, q1, q2 = self.weights()
+        inner = motion.carrier if motion.inner is None else motion.inner
+        stages = (q1, nodes.dt * inner), (q2, nodes.dt * motion.carrier)
+        return nodes.dt * (q0 * nodes.force + stage_force(nodes, self, self.solution, *stages))
