@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, NodeVector, ParticleVector, Scalar
-from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, Conditions, Touch
+from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, ColliderConditions, Conditions
 from mpmjax.checks import canonical, require, require_between, require_fields
 from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, Motion, length, still
 
@@ -78,7 +78,7 @@ class StickyCollider(AbstractCollider):
         inside = body.holds(spacing)[:, None]
         fixed = jnp.broadcast_to(inside, nodes.shape)
         nothing = jnp.zeros_like(nodes)
-        touch = Touch(
+        touch = ColliderConditions(
             normal=nothing,
             velocity=nothing,
             held=jnp.zeros(len(nodes), bool),
@@ -88,7 +88,7 @@ class StickyCollider(AbstractCollider):
             pivots=body.pivot[None],
             pivot_velocity=body.pivot_velocity[None],
         )
-        return Conditions(fixed, jnp.where(fixed, body.velocity, 0), touch=touch)
+        return Conditions(fixed, jnp.where(fixed, body.velocity, 0), colliders=touch)
 
 
 class SlipCollider(AbstractCollider):
@@ -118,7 +118,7 @@ class SlipCollider(AbstractCollider):
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v·n = v_c·n."""
         touch = _Body(self, nodes, t, dt, reference).touch(spacing)
-        return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), touch=touch)
+        return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), colliders=touch)
 
 
 class SeparatingCollider(AbstractCollider):
@@ -158,7 +158,7 @@ class SeparatingCollider(AbstractCollider):
             (jnp.zeros_like(touch.held), touch.held, jnp.where(touch.held, self.friction, 0).astype(nodes.dtype)),
             is_leaf=lambda leaf: leaf is None,
         )
-        return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), touch=touch)
+        return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), colliders=touch)
 
 
 def _check(collider: AbstractCollider) -> None:
@@ -199,13 +199,13 @@ class _Body(eqx.Module):
         """The nodes that lie in it."""
         return self.shape.contains(self.place, ON_THE_WALL * spacing)
 
-    def touch(self, spacing: Scalar) -> Touch:
+    def touch(self, spacing: Scalar) -> ColliderConditions:
         """Normals held wherever there is one; samples may be level somewhere."""
         slope = jax.grad(lambda x: self.shape.distance(x).sum())(self.place)
         steepness = length(slope)
         held = self.holds(spacing) & (steepness > 0)
         normal = self.motion.turned(slope / jnp.where(held, steepness, 1)[:, None], self.t)
-        return Touch(
+        return ColliderConditions(
             normal=jnp.where(held[:, None], normal, 0),
             velocity=jnp.where(held[:, None], self.velocity, 0),
             held=held,

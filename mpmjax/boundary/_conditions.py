@@ -16,7 +16,7 @@ ON_THE_WALL = 1e-3
 """Distance within which a node is on a wall, in spacings."""
 
 
-class Touch(eqx.Module):
+class ColliderConditions(eqx.Module):
     """What k colliders ask of the nodes that lie in them."""
 
     normal: NodeVector
@@ -40,7 +40,7 @@ class Touch(eqx.Module):
     friction: NodeScalar | None = None
     """Coulomb coefficient there [-], shape (n,)."""
 
-    def beside(self, later: "Touch") -> "Touch":
+    def beside(self, later: "ColliderConditions") -> "ColliderConditions":
         """Both; where normals of two meet, the earlier one's."""
         number = len(self.pivots)
 
@@ -54,7 +54,7 @@ class Touch(eqx.Module):
 
         mine = self.owner >= 0
         touched = mine | (self.holder >= 0).any(axis=1)
-        return Touch(
+        return ColliderConditions(
             normal=jnp.where(mine[:, None], self.normal, later.normal),
             velocity=jnp.where(mine[:, None], self.velocity, later.velocity),
             held=jnp.where(mine, self.held, later.held),
@@ -67,7 +67,7 @@ class Touch(eqx.Module):
             friction=joined(self.friction, later.friction),
         )
 
-    def after(self, time: Scalar, velocity: NodeVector) -> "Touch":
+    def after(self, time: Scalar, velocity: NodeVector) -> "ColliderConditions":
         """The same with nodes and pivots where they are some time [s] later, the nodes moving with a velocity [m/s]."""
         moved = self.position + time * velocity, self.pivots + time * self.pivot_velocity
         return eqx.tree_at(lambda c: (c.position, c.pivots), self, moved)
@@ -84,7 +84,7 @@ class Conditions(eqx.Module):
     """Inward normal (+1 or −1) of a separating wall in each direction, 0 where there is none; None without any."""
     friction: NodeVector | None = None
     """Coulomb coefficient of that wall [-]."""
-    touch: Touch | None = None
+    colliders: ColliderConditions | None = None
     """What colliders ask; None without any."""
 
 
@@ -145,7 +145,7 @@ def combine(
     """All of a scene's conditions; where two prescribe one component, the earlier in the tuple holds.
 
     Contact is left to nodes' components that nothing prescribes. Of a node's components some may be prescribed and
-    besides them a collider's normal component: both hold (see `Nodes.grasp`), and where the normal is within a
+    besides them a collider's normal component: both hold (see `Nodes.free_normal`), and where the normal is within a
     hundredth of what is prescribed already it asks nothing. Of two colliders' normals the earlier holds.
     """
     total = Conditions(jnp.zeros(nodes.shape, dtype=bool), jnp.zeros_like(nodes))
@@ -159,13 +159,13 @@ def combine(
             else:
                 friction = jnp.where(side != 0, friction, new.friction)
                 side = jnp.where(side != 0, side, new.side)
-        touch = total.touch
-        if new.touch is not None:
-            holder = jnp.where(total.fixed, -1, new.touch.holder)
-            mine = eqx.tree_at(lambda c: c.holder, new.touch, holder)
-            touch = mine if touch is None else touch.beside(mine)
-        total = Conditions(total.fixed | new.fixed, velocity, side, friction, touch)
+        colliders = total.colliders
+        if new.colliders is not None:
+            holder = jnp.where(total.fixed, -1, new.colliders.holder)
+            mine = eqx.tree_at(lambda c: c.holder, new.colliders, holder)
+            colliders = mine if colliders is None else colliders.beside(mine)
+        total = Conditions(total.fixed | new.fixed, velocity, side, friction, colliders)
     if total.side is None:
         return total
     side = jnp.where(total.fixed, 0, total.side)
-    return Conditions(total.fixed, total.velocity, side, total.friction, total.touch)
+    return Conditions(total.fixed, total.velocity, side, total.friction, total.colliders)

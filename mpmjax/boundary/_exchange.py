@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, NodeScalar, NodeVector
-from mpmjax.boundary._conditions import Touch
+from mpmjax.boundary._conditions import ColliderConditions
 from mpmjax.linalg import pairs
 
 
@@ -37,7 +37,7 @@ def nothing_received(colliders: int, dim: int, dtype: Any) -> ColliderImpulse:
 
 
 def received(
-    touch: Touch, reaction: NodeVector, push: NodeScalar | None = None, rub: NodeVector | None = None
+    touch: ColliderConditions, reaction: NodeVector, push: NodeScalar | None = None, rub: NodeVector | None = None
 ) -> ColliderImpulse:
     """Minus what each collider gives the nodes: prescribed components, the push along normals, friction.
 

@@ -243,8 +243,8 @@ def integrate(
 ) -> tuple[Any, State, RunStatistics, State | None, Array]:
     """Integrate `count` ≤ `max_steps` steps from step `start`.
 
-    Returns the steps and values saved, the final state, the statistics, with `watch`, which stops the run at a fault, the
-    state before the last step, and what tangent solves report. Adjoint solves report through the `slot` (see
+    Returns the steps and values saved, the final state, the statistics, with `watch`, which stops the run at a fault,
+    the state before the last step, and what tangent solves report. Adjoint solves report through the `slot` (see
     `Reporting`).
 
     Without a count, all of them: what diffrax derives of its last time is then a constant, which XLA computes as it
