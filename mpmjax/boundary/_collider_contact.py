@@ -58,7 +58,6 @@ class ColliderContact(AbstractContact):
         return jnp.zeros(shape, bool)
 
     def normals(self, active: Array) -> Bool[Array, "n"]:
-        """The nodes held."""
         return active
 
 

@@ -17,7 +17,7 @@ ON_THE_WALL = 1e-3
 
 
 class ColliderConditions(eqx.Module):
-    """What k colliders ask of the nodes that lie in them."""
+    """The conditions of k colliders on the nodes that lie in them."""
 
     normal: NodeVector
     """Unit normal out of the collider that holds or pushes the node along it, shape (n, d); zero where none does."""
@@ -41,7 +41,7 @@ class ColliderConditions(eqx.Module):
     """Coulomb coefficient there [-], shape (n,)."""
 
     def beside(self, later: "ColliderConditions") -> "ColliderConditions":
-        """Both; where normals of two meet, the earlier one's."""
+        """Both conditions; where two normals meet at a node, that of the earlier collider."""
         number = len(self.pivots)
 
         def numbered(n: Array) -> Array:
@@ -68,13 +68,14 @@ class ColliderConditions(eqx.Module):
         )
 
     def after(self, time: Scalar, velocity: NodeVector) -> "ColliderConditions":
-        """The same with nodes and pivots where they are some time [s] later, the nodes moving with a velocity [m/s]."""
+        """The same conditions with nodes and pivots moved on by a time [s], the nodes at a velocity [m/s], shape (n,
+        d)."""
         moved = self.position + time * velocity, self.pivots + time * self.pivot_velocity
         return eqx.tree_at(lambda c: (c.position, c.pivots), self, moved)
 
 
 class Conditions(eqx.Module):
-    """What boundaries ask of the window's nodes."""
+    """The conditions of boundaries on the window's nodes."""
 
     fixed: Mask
     """Components of velocity that are prescribed, shape (n, d)."""
@@ -85,7 +86,7 @@ class Conditions(eqx.Module):
     friction: NodeVector | None = None
     """Coulomb coefficient of that wall [-]."""
     colliders: ColliderConditions | None = None
-    """What colliders ask; None without any."""
+    """Conditions of colliders; None without any."""
 
 
 class AbstractBoundary(eqx.Module):
@@ -94,7 +95,7 @@ class AbstractBoundary(eqx.Module):
     @property
     @abc.abstractmethod
     def dim(self) -> int | None:
-        """The space dimension it is made for; None where it fits any."""
+        """Space dimension d of the condition; None if it fits any."""
 
     @abc.abstractmethod
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
@@ -106,11 +107,11 @@ class AbstractBoundary(eqx.Module):
     def passed(
         self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
     ) -> Bool[Array, "p"] | None:
-        """Which particles got beyond it in the step from t to t + dt; None where it keeps nothing out.
+        """Which particles passed the boundary in the step from t to t + dt; None if it keeps nothing out.
 
-        What moves less than a spacing a step stops before a wall or little beyond it, where a node of its stencil is
-        free still. A particle has passed when it is deeper, or when it came more than a spacing nearer in the step and
-        ended beyond. One that began beyond has not.
+        A particle that moves less than a spacing in a step stops before a wall, or so little beyond it that a node of
+        its stencil is still free. A particle has passed if it is deeper than that, or if it moved more than a spacing
+        towards the wall in the step and ended beyond it. One that began beyond has not passed.
 
         Args:
             start: positions at t [m], shape (p, d).
@@ -127,8 +128,8 @@ class AbstractBoundary(eqx.Module):
 def crossed(
     start: Array, end: Array, wall: Array | Scalar, deepest: Array | Scalar, spacing: Scalar
 ) -> Bool[Array, "..."]:
-    """Whether what moved from `start` to `end` passed a wall that keeps material above it: by more than a spacing, or
-    to a place below `deepest`."""
+    """Whether a coordinate that moved from `start` to `end` passed a wall that keeps material above it: it moved by
+    more than a spacing and ended below the wall, or it ended below `deepest`."""
     fast = (start >= wall) & (end < wall) & (start - end > spacing)
     return fast | ((start >= deepest) & (end < deepest))
 
@@ -142,11 +143,11 @@ def combine(
     *,
     reference: bool,
 ) -> Conditions:
-    """All of a scene's conditions; where two prescribe one component, the earlier in the tuple holds.
+    """The conditions of all boundaries of a scene. Where two prescribe the same component, the earlier one holds.
 
-    Contact is left to nodes' components that nothing prescribes. Of a node's components some may be prescribed and
-    besides them a collider's normal component: both hold (see `Nodes.free_normal`), and where the normal is within a
-    hundredth of what is prescribed already it asks nothing. Of two colliders' normals the earlier holds.
+    Contact acts on components that nothing prescribes. A node may have components that are prescribed and, besides
+    them, a collider's normal component: both hold (see `Nodes.free_normal`). A normal that lies within a hundredth of
+    the prescribed components asks for nothing more. Of two colliders' normals the earlier one holds.
     """
     total = Conditions(jnp.zeros(nodes.shape, dtype=bool), jnp.zeros_like(nodes))
     for boundary in boundaries:

@@ -37,7 +37,7 @@ class Image(eqx.Module):
         return self._copy(field, jnp.where(normal, self.odd[:, None], self.even[:, None]))
 
     def within(self, held: Bool[Array, "n"]) -> "Image":
-        """The mirror in some columns alone."""
+        """The mirror in some columns only."""
         return Image(self.shape, self.axis, self.source, self.even, self.odd, held)
 
     def along(self, values: Array) -> Array:
@@ -62,7 +62,7 @@ class Image(eqx.Module):
 
 
 class Mirror(eqx.Module):
-    """Several planes together: `unfold` is B, from true nodes to all; `fold` its transpose Bᵀ."""
+    """The mirrors of several planes: `unfold` applies B, from true nodes to all nodes; `fold` applies Bᵀ."""
 
     images: tuple[Image, ...]
 
@@ -73,7 +73,7 @@ class Mirror(eqx.Module):
         return field
 
     def fold(self, field: NodeVector) -> NodeVector:
-        """Bᵀ f: bring to the true nodes what the mirror images received."""
+        """Bᵀ f: add to the true nodes what their mirror images received."""
         return jax.linear_transpose(self.unfold, field)(field)[0] if self.images else field
 
     def unfold_scalar(self, field: Float[Array, "n"]) -> Float[Array, "n"]:
@@ -87,7 +87,7 @@ class Mirror(eqx.Module):
         return jax.linear_transpose(self.unfold_scalar, field)(field)[0] if self.images else field
 
     def then(self, other: "Mirror") -> "Mirror":
-        """The mirror that unfolds by this one first."""
+        """The mirror that unfolds by this one first, then by the other."""
         return Mirror(self.images + other.images)
 
 

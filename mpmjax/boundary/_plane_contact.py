@@ -34,7 +34,6 @@ class PlaneContact(AbstractContact):
 
     @property
     def mirror_image(self) -> Image:
-        """The plane's."""
         return self.image
 
     @property
@@ -58,7 +57,6 @@ class PlaneContact(AbstractContact):
         return least, least
 
     def friction(self, held: ConstrainedNodes, active: Array, v: NodeVector, residual: NodeVector) -> NodeVector:
-        """Against the velocity along the plane."""
         impulse = jnp.where(active & self.representative(), self._column_impulse(held, residual), 0)
         limit = self.coefficient * jnp.maximum(held.images.fold_scalar(impulse), 0)
         return friction_across(held, self.image.axis, limit, v)

@@ -32,7 +32,6 @@ class WallContact(AbstractContact):
         return noise, noise * held.free.mass
 
     def friction(self, held: ConstrainedNodes, active: Array, v: NodeVector, residual: NodeVector) -> NodeVector:
-        """Against the velocity along the wall."""
         impulse = jnp.maximum(self.normal_impulse(held, residual), 0)
         return friction_across(held, self.axis, self.coefficient * jnp.where(active, impulse, 0), v)
 
