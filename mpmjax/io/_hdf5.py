@@ -21,14 +21,14 @@ _REMEDY = "restore it from a copy, or run the simulation again"
 _BUSY = "{} is being written by another run: wait until that ends or stop it, or choose another name."
 
 
-class RefusedFile(ValueError):
+class FileRefusedError(ValueError):
     """A file cannot be used. The message says which, why, and what to do."""
 
 
 def require_of_file(condition: Any, message: str) -> None:
-    """Raise `RefusedFile(message)` unless the condition holds."""
+    """Raise `FileRefusedError(message)` unless the condition holds."""
     if not condition:
-        raise RefusedFile(message)
+        raise FileRefusedError(message)
 
 
 def staged_file(path: Path, *, new: bool = False) -> StagedFile:
@@ -102,7 +102,7 @@ def reading(path: Path) -> Iterator[File]:
             _check_format(path, file)
             _check_written(file)
             yield file
-    except RefusedFile:
+    except FileRefusedError:
         raise
     except ValueError as error:
         raise ValueError(f"{path} is damaged ({reason(error)}): {_REMEDY}.") from None

@@ -34,7 +34,7 @@ from mpmjax.io._aside import reason, replacing
 from mpmjax.io._hdf5 import (
     FORMAT,
     LIBVER_HEAD,
-    RefusedFile,
+    FileRefusedError,
     check_hdf5,
     check_no_writer,
     check_place,
@@ -328,7 +328,7 @@ def _check_readable(path: Path, described: dict[str, Any]) -> None:
         decode(described["scene"], Scene, "", arrays)
         decode(described["method"], Method, "method", arrays)
     except ValueError as error:
-        raise RefusedFile(f"{path} could not be loaded again, as {dtype} rounds it: {error}") from None
+        raise FileRefusedError(f"{path} could not be loaded again, as {dtype} rounds it: {error}") from None
 
 
 def _write_description(group: File, described: dict[str, Any]) -> None:
