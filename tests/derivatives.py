@@ -13,9 +13,9 @@ import numpy as np
 from helpers import DESCRIPTIONS, ELASTIC, FLUIDS, PLASTIC, VISCOUS, block
 
 import mpmjax as mpm
+from mpmjax.boundary._contact import ConstrainedNodes
 from mpmjax.simulation import _simulate
 from mpmjax.stepping import _step
-from mpmjax.stepping._contact import Held
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-14)  # that is, down to rounding: central differences see every digit
 UPDATES = {
@@ -134,8 +134,8 @@ def rolled(q: dict[str, Any], case: Case, steps: int = STEPS) -> tuple[jax.Array
     seen = []
 
     def spy(held: Any, v: Any, momentum_residual: Any) -> Any:
-        after = wall_friction(held, v, momentum_residual)
-        seen.append((held.active.components, (v != 0) & (after == 0)))
+        after = friction(held, v, momentum_residual)
+        seen.append((held.active, (v != 0) & (after[0] == 0)))
         return after
 
     def body(state: Any, n: Any) -> Any:
@@ -146,8 +146,8 @@ def rolled(q: dict[str, Any], case: Case, steps: int = STEPS) -> tuple[jax.Array
         yielded = grown if case.law in PLASTIC else [new.F == 1] * (case.law in KINKED)
         return _simulate.state_of(new), jax.tree.leaves((seen.pop() if seen else (), yielded))
 
-    wall_friction = Held.wall_friction
-    with mock.patch.object(Held, "wall_friction", spy):
+    friction = ConstrainedNodes.friction
+    with mock.patch.object(ConstrainedNodes, "friction", spy):
         final, branches = jax.lax.scan(body, _simulate.state_of(particles), jnp.arange(float(steps)))
     return outcome(_simulate.with_state(particles, final)), branches
 

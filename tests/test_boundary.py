@@ -10,7 +10,8 @@ from numpy_oracle import grid_update
 
 import mpmjax as mpm
 from mpmjax.boundary._conditions import combine
-from mpmjax.boundary._mirror import Mirror, contacts, mirror
+from mpmjax.boundary._mirror import Mirror, mirror
+from mpmjax.boundary._plane_contact import plane_contacts
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {
@@ -96,7 +97,7 @@ def test_a_node_within_a_thousandth_of_a_spacing_of_a_wall_is_on_it():
         between = mpm.Box(((2 + share) * DX,), ((5 - share) * DX,))
         for holds in (mpm.Grip(between, rest), mpm.StickyCollider(between), mpm.SlipCollider(between)):
             found = combine((holds,), nodes, DX, 0.0, 0.1, reference=False)
-            held = found.fixed[:, 0] if isinstance(holds, (mpm.Grip, mpm.StickyCollider)) else found.touch.held
+            held = found.fixed[:, 0] if isinstance(holds, (mpm.Grip, mpm.StickyCollider)) else found.colliders.held
             np.testing.assert_array_equal(held, np.isin(np.arange(8), [3, 4, *([2, 5] if met == 2 else [])]))
     for plane in (mpm.SymmetryPlane, mpm.ContactPlane):
         scene_of(grid, plane(0, (2.5 + 0.45e-3) * DX))
@@ -233,7 +234,7 @@ def test_fold_is_the_transpose_of_unfold_where_some_columns_are_held():
     grid, rng = mpm.Grid((7, 6), DX), np.random.default_rng(0)
     planes = (mpm.ContactPlane(0, 0.2), mpm.ContactPlane(1, 0.35, "below"))
     columns = [np.broadcast_to(rng.random((1, 6)) < 0.5, (7, 6)), np.broadcast_to(rng.random((7, 1)) < 0.5, (7, 6))]
-    found = contacts(planes, grid, grid.window(jnp.zeros((1, 2))))
+    found = plane_contacts(planes, grid, grid.window(jnp.zeros((1, 2))))
     images = Mirror(tuple(c.image.within(jnp.asarray(h.ravel())) for c, h in zip(found, columns, strict=True)))
     basis = jnp.eye(84).reshape(84, 42, 2)
     B, transpose = (np.asarray(jax.vmap(f)(basis)).reshape(84, 84).T for f in (images.unfold, images.fold))

@@ -88,7 +88,7 @@ def test_a_body_stands_where_its_motion_takes_it():
     nodes = grid.nodes(grid.window(jnp.zeros((1, 2))))
     bar = mpm.Box((-0.6, -0.15), (0.6, 0.15))
     motion = mpm.RigidMotion((0.0, 2.0), ((0.0, 0.0), (0.6, 0.4)), (0.0, 1.2), (0.0, 0.0))
-    touch = combine((mpm.SlipCollider(bar, motion),), nodes, DX, 1.0, 0.1, reference=False).touch
+    touch = combine((mpm.SlipCollider(bar, motion),), nodes, DX, 1.0, 0.1, reference=False).colliders
     angle, shift = 0.6, np.array([0.3, 0.2])
     R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     back = (np.asarray(nodes) - shift) @ R
@@ -113,7 +113,7 @@ def test_of_two_bodies_normals_the_earlier_holds_and_a_prescribed_component_is_a
     assert second.any()
     assert_close(v[first].sum(axis=1), np.full(first.sum(), 0.2), 1e-13)
     assert_close(v[second] @ [1.0, -1.0], np.zeros(second.sum()), 0, 1e-13)
-    np.testing.assert_array_equal(np.asarray(step.nodes.conditions.touch.owner)[mass & ~first & ~second], -1)
+    np.testing.assert_array_equal(np.asarray(step.nodes.conditions.colliders.owner)[mass & ~first & ~second], -1)
     box = mpm.SlipBox((-np.inf, 0.3), (np.inf, np.inf))
     alone = grid_update(scene_of(grid, box), particles, DT, METHODS["explicit"])
     rising = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.0, 5.0)))
@@ -136,12 +136,12 @@ def test_what_the_earlier_holds_the_later_neither_lets_go_nor_rubs_nor_receives(
     x = np.asarray(nodes)
     left, floor = mpm.HalfSpace((0.25, 0.0), (1.0, 0.0)), mpm.HalfSpace((0.0, 0.25), (0.0, 1.0))
     pair = mpm.SlipCollider(left), mpm.SeparatingCollider(floor, friction=0.5)
-    touch = combine(pair, nodes, DX, 0.0, 0.1, reference=False).touch
+    touch = combine(pair, nodes, DX, 0.0, 0.1, reference=False).colliders
     later = (x[:, 0] > 0.25) & (x[:, 1] < 0.25)
     np.testing.assert_array_equal(touch.leavable, later)
     np.testing.assert_array_equal(touch.friction, 0.5 * later)
     grip = mpm.Grip(left, mpm.Motion((0.0,), ((0.0, 0.0),)), axes=(True, False))
-    touch = combine((grip, mpm.StickyCollider(floor)), nodes, DX, 0.0, 0.1, reference=False).touch
+    touch = combine((grip, mpm.StickyCollider(floor)), nodes, DX, 0.0, 0.1, reference=False).colliders
     np.testing.assert_array_equal(touch.holder[:, 1], np.where(x[:, 1] < 0.25, 0, -1))
     np.testing.assert_array_equal(touch.holder[:, 0], np.where(later, 0, -1))
 
@@ -217,7 +217,7 @@ def test_a_separating_collider_pushes_never_pulls_and_is_not_entered(method):
     wall = mpm.SeparatingBox((-np.inf, 0.0), (np.inf, np.inf))
     scene = scene_of(grid, *obstacles(0.0), wall)
     step = grid_update(scene, particles, 0.5 * explicit_limit(scene), method)
-    touch, mass = step.nodes.conditions.touch, np.asarray(step.nodes.mass)
+    touch, mass = step.nodes.conditions.colliders, np.asarray(step.nodes.mass)
     v, n = np.asarray(step.velocity), np.asarray(touch.normal)
     inside = (np.asarray(touch.owner) >= 0) & (mass > 0)
     departure = ((v - np.asarray(touch.velocity)) * n).sum(axis=1)
@@ -313,7 +313,7 @@ def test_friction_opposes_slip_by_at_most_mu_times_the_push(name, mu):
     grid, particles = landing()
     scene = scene_of(grid, *obstacles(mu))
     step = grid_update(scene, particles, 0.5 * explicit_limit(scene), METHODS[name])
-    touch, rub, push = step.nodes.conditions.touch, np.asarray(step.update.rub), np.asarray(step.update.push)
+    touch, rub, push = step.nodes.conditions.colliders, np.asarray(step.update.rub), np.asarray(step.update.push)
     slip = np.asarray(step.velocity - touch.velocity)
     n = np.asarray(touch.normal)
     slip = slip - n * (n * slip).sum(axis=1, keepdims=True)

@@ -9,10 +9,13 @@ from helpers import QUICK, assert_close, explicit_limit, ids
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
+from mpmjax.boundary._collider_contact import ColliderContact
+from mpmjax.boundary._contact import SWEEPS, constrain, find_active_set
+from mpmjax.boundary._plane_contact import PlaneContact
+from mpmjax.boundary._wall_contact import WallContact
 from mpmjax.checks._values import canonical
 from mpmjax.implicit._solve_info import no_solve
 from mpmjax.stepping import NodeMotion
-from mpmjax.stepping._contact import SWEEPS, ActiveSet, find_active_set, hold
 from mpmjax.stepping._nodes import particles_to_grid
 from mpmjax.stepping._step import impulses, update
 
@@ -291,13 +294,13 @@ def test_whatever_columns_are_held_mirroring_twice_is_mirroring_once(number):
             motion = jax.tree.map(held.images.unfold, motion)
             return motion.velocity, impulses(nodes, method, motion)[1], motion.carrier, info
 
-        active, _, _, sweeps = find_active_set(nodes, nodes.velocity, attempt)
-        held_on_plane = active.columns[0].reshape(grid.shape)[4]  # the first plane's node along its axis
-        held = hold(nodes, active)
+        active, _, _, sweeps = find_active_set(nodes, nodes.velocity, attempt, no_solve(nodes.velocity.dtype))
+        held_on_plane = active[0].reshape(grid.shape)[4]  # the first plane's node along its axis
+        held = constrain(nodes, active)
         loose = (held.nodes.free[:, 0].reshape(grid.shape)[4] & held_on_plane).any()
         images = held.images
         once = images.unfold(field)
-        return active.columns, sweeps, loose, once, images.unfold(once)
+        return active, sweeps, loose, once, images.unfold(once)
 
     partly = 0
     for _ in range(40):
@@ -320,21 +323,33 @@ def in_touch(boundary):
     return particles_to_grid(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start), centred=False)
 
 
+def places(contact):
+    """Where a contact can hold, shape (n,): at its walls, in its colliders, in all columns of its plane."""
+    match contact:
+        case WallContact():
+            return contact.side != 0
+        case ColliderContact():
+            return contact.leavable
+        case PlaneContact():
+            return jnp.ones_like(contact.image.along(contact.before), bool)
+
+
 def test_a_verdict_is_given_beyond_rounding_only():
     """Of what is held, what pulls by more than 1.5e-8 of its mass times the largest velocity, the root of the machine
     precision; of what is not, what enters by more than 1.5e-8 of it. What a solver leaves does not count."""
     slope = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (3.0, 4.0)))
     for boundary in (FLOORS["plain"](0.0), FLOORS["mirrored"](0.0), slope):
         nodes = in_touch(boundary)
-        touch, side, mass = nodes.conditions.touch, nodes.conditions.side, np.asarray(nodes.mass)
-        inward, weight, up = np.array([0.0, 1.0]), mass, np.array([False, True])
+        touch, side, mass = nodes.conditions.colliders, nodes.conditions.side, np.asarray(nodes.mass)
+        inward, weight = np.array([0.0, 1.0]), mass
         if touch is not None:
             met, inward = touch.leavable, np.asarray(touch.normal)
         elif side is not None:
             met = side[:, 1] == 1
         else:  # columns are seen at their nodes on the plane
             (contact,) = nodes.contacts
-            met, weight = contact.on_plane, np.asarray(contact.image.column(contact.weight(nodes.mass)))
+            met = contact.image.along(contact.before == 0)
+            weight = np.asarray(contact.image.column(contact._weight(nodes.mass)))
         met = np.asarray(met) & (mass > 0)
 
         def found(held, share):
@@ -342,14 +357,10 @@ def test_a_verdict_is_given_beyond_rounding_only():
             along = np.where(met[:, None], 3 * share * inward, 0)  # noqa: B023
             fast = np.zeros_like(along)
             fast[-1, 0] = 3.0
-            active = ActiveSet(
-                None if side is None else jnp.asarray(held & met[:, None] & up),  # noqa: B023
-                tuple(jnp.full(len(met), held) for _ in nodes.contacts),  # noqa: B023
-                None if touch is None else jnp.asarray(held & met),  # noqa: B023
-            )
+            active = tuple(held & places(contact) for contact in nodes.contacts)  # noqa: B023
             v = fast if held else fast + along * (weight / np.where(met, mass, 1))[:, None]  # noqa: B023
             momentum_residual = weight[:, None] * along if held else 0 * along  # noqa: B023
-            return int(hold(nodes, active).count_violations(jnp.asarray(v), jnp.asarray(momentum_residual)))  # noqa: B023
+            return int(constrain(nodes, active).count_violations(jnp.asarray(v), jnp.asarray(momentum_residual)))  # noqa: B023
 
         assert met.sum() > 3
         for held in (True, False):
@@ -362,21 +373,11 @@ def test_there_is_no_friction_where_a_wall_would_have_to_pull():
     slope = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0)), friction=0.3)
     for boundary in (FLOORS["plain"](0.3), FLOORS["mirrored"](0.3), slope):
         nodes = in_touch(boundary)
-        side, touch = nodes.conditions.side, nodes.conditions.touch
-        held = hold(
-            nodes,
-            ActiveSet(
-                None if side is None else side != 0,
-                tuple(jnp.ones_like(nodes.mass, bool) for _ in nodes.contacts),
-                None if touch is None else touch.leavable,
-            ),
-        )
+        held = constrain(nodes, tuple(places(contact) for contact in nodes.contacts))
         v = jnp.zeros_like(nodes.velocity).at[:, 0].set(1.0)
         for up in (-1.0, 1.0):
             momentum_residual = up * nodes.mass[:, None] * jnp.asarray([0.0, 1.0])
-            slowed = held.collider_friction(held.wall_friction(v, momentum_residual), held.pushes(momentum_residual))[
-                0
-            ][:, 0]
+            slowed = held.friction(v, momentum_residual)[0][:, 0]
             assert slowed.max() == 1
             assert (slowed.min() == 1) == (up < 0)
 

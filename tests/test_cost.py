@@ -12,10 +12,10 @@ from helpers import DESCRIPTIONS, KERNELS, METHODS, SECOND_ORDER, block, ids
 
 import mpmjax as mpm
 from mpmjax.autodiff._rule import _values
+from mpmjax.boundary._contact import ConstrainedNodes
 from mpmjax.checks._values import canonical
 from mpmjax.implicit._projection import Projection
 from mpmjax.simulation._diffrax import Problem
-from mpmjax.stepping._contact import Held
 from mpmjax.stepping._nodes import Nodes
 from mpmjax.stepping._step import advance
 
@@ -183,14 +183,13 @@ def test_without_colliders_a_constraint_is_a_mask(method, boundary):
     step, arrays = program(method, boundary=boundary)
     as_is = equations(jax.make_jaxpr(step)(arrays).jaxpr)
     with (
-        mock.patch.object(Projection, "split", masked),
+        mock.patch.object(Projection, "combine", masked),
         mock.patch.object(Projection, "identity", lambda self, vector, mass: vector),
         mock.patch.object(Nodes, "projection", property(lambda self: Projection(self.free))),
         mock.patch.object(Nodes, "prescribed", property(lambda self: self.conditions.velocity)),
-        mock.patch.object(Held, "pushes", return_value=None),
-        mock.patch.object(Held, "collider_friction", lambda self, v, push: (v, None)),
-        mock.patch.object(Held, "_beside_colliders", lambda self, momentum_residual: momentum_residual),
-        mock.patch.object(Held, "normal", None),
+        mock.patch.object(ConstrainedNodes, "collider_impulse", return_value=None),
+        mock.patch.object(ConstrainedNodes, "beside_colliders", lambda self, residual: residual),
+        mock.patch.object(ConstrainedNodes, "normal", None),
     ):
         step, arrays = program(method, boundary=boundary)
         assert equations(jax.make_jaxpr(step)(arrays).jaxpr) == as_is

@@ -103,8 +103,12 @@ def test_moments_of_all_boundaries_are_the_change_of_angular_momentum(descriptio
         pivots = np.stack([np.asarray(m.centre) + np.asarray(m.at((n + late) * dt)) for m in motions])
         rub = 0 if new.rub is None else np.asarray(new.rub)
         friction = 0 if new.friction is None else np.asarray(new.friction)
-        push = 0 if new.push is None else np.asarray(new.push)[:, None] * np.asarray(step.nodes.conditions.touch.normal)
-        holder = np.asarray(step.nodes.conditions.touch.holder)
+        push = (
+            0
+            if new.push is None
+            else np.asarray(new.push)[:, None] * np.asarray(step.nodes.conditions.colliders.normal)
+        )
+        holder = np.asarray(step.nodes.conditions.colliders.holder)
         of_colliders = np.where(holder >= 0, np.asarray(new.reaction), 0) + push + rub
         of_walls = np.where(walled, np.asarray(new.reaction) + friction - of_colliders, 0)
         received = step.info.colliders

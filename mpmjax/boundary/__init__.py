@@ -2,9 +2,19 @@
 
 from mpmjax.boundary._collider import AbstractCollider, SeparatingCollider, SlipCollider, StickyCollider
 from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, Conditions, combine
+from mpmjax.boundary._contact import (
+    AbstractContact,
+    AbstractNodes,
+    ConstrainedNodes,
+    ContactInfo,
+    constrain,
+    find_active_set,
+    no_contact,
+)
+from mpmjax.boundary._contacts import contacts_of
 from mpmjax.boundary._exchange import ColliderImpulse, nothing_received, received
 from mpmjax.boundary._grip import Grip
-from mpmjax.boundary._mirror import Contact, Mirror, contacts, mirror
+from mpmjax.boundary._mirror import Mirror, mirror
 from mpmjax.boundary._planes import ContactPlane, Plane, SymmetryPlane, fits
 from mpmjax.boundary._walls import SeparatingBox, SlipBox, StickyBox
 
@@ -12,9 +22,12 @@ __all__ = [
     "ON_THE_WALL",
     "AbstractBoundary",
     "AbstractCollider",
+    "AbstractContact",
+    "AbstractNodes",
     "ColliderImpulse",
     "Conditions",
-    "Contact",
+    "ConstrainedNodes",
+    "ContactInfo",
     "ContactPlane",
     "Grip",
     "Mirror",
@@ -27,9 +40,12 @@ __all__ = [
     "StickyCollider",
     "SymmetryPlane",
     "combine",
-    "contacts",
+    "constrain",
+    "contacts_of",
+    "find_active_set",
     "fits",
     "mirror",
+    "no_contact",
     "nothing_received",
     "received",
 ]

@@ -2,8 +2,8 @@
 
 A node lies in a collider up to a thousandth of a spacing off its surface; its normal there is the gradient of the
 shape's distance, and its velocity that of the collider's own point, the chord over the step. Which nodes lie in it has
-no derivative; normals and velocities have, with respect to the motion and the shape. Two bodies whose nodes meet
-follow the rules of `combine`.
+no derivative; normals and velocities have, with respect to the motion and the shape. Where two bodies share a node, the
+rules of `combine` apply.
 """
 
 import equinox as eqx
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, NodeVector, ParticleVector, Scalar
-from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, Conditions, Touch
+from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, ColliderConditions, Conditions
 from mpmjax.checks import canonical, require, require_between, require_fields
 from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, Motion, length, still
 
@@ -26,7 +26,6 @@ class AbstractCollider(AbstractBoundary):
 
     @property
     def dim(self) -> int:
-        """That of the shape."""
         return self.shape.dim
 
     def distance(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m"]:
@@ -36,8 +35,9 @@ class AbstractCollider(AbstractBoundary):
     def passed(
         self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
     ) -> Bool[Array, "p"]:
-        """Which particles came from outside more than a spacing nearer, relative to the body, and were in it after some
-        quarters of the way. Nobody is asked for distances while none moves as fast."""
+        """Which particles entered the body: they started outside, moved more than a spacing towards it in the step,
+        relative to it, and were inside at one of four points of their way. Distances are computed only if a particle
+        moves that fast."""
         del reach
         if self.motion is not None:
             start, end = self.motion.origin(start, t), self.motion.origin(end, t + dt)
@@ -78,7 +78,7 @@ class StickyCollider(AbstractCollider):
         inside = body.holds(spacing)[:, None]
         fixed = jnp.broadcast_to(inside, nodes.shape)
         nothing = jnp.zeros_like(nodes)
-        touch = Touch(
+        asked = ColliderConditions(
             normal=nothing,
             velocity=nothing,
             held=jnp.zeros(len(nodes), bool),
@@ -88,7 +88,7 @@ class StickyCollider(AbstractCollider):
             pivots=body.pivot[None],
             pivot_velocity=body.pivot_velocity[None],
         )
-        return Conditions(fixed, jnp.where(fixed, body.velocity, 0), touch=touch)
+        return Conditions(fixed, jnp.where(fixed, body.velocity, 0), colliders=asked)
 
 
 class SlipCollider(AbstractCollider):
@@ -117,8 +117,8 @@ class SlipCollider(AbstractCollider):
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v·n = v_c·n."""
-        touch = _Body(self, nodes, t, dt, reference).touch(spacing)
-        return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), touch=touch)
+        asked = _Body(self, nodes, t, dt, reference).conditions(spacing)
+        return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), colliders=asked)
 
 
 class SeparatingCollider(AbstractCollider):
@@ -151,14 +151,14 @@ class SeparatingCollider(AbstractCollider):
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """(v − v_c)·n ≥ 0 ⟂ reaction ≥ 0."""
-        touch = _Body(self, nodes, t, dt, reference).touch(spacing)
-        touch = eqx.tree_at(
+        asked = _Body(self, nodes, t, dt, reference).conditions(spacing)
+        asked = eqx.tree_at(
             lambda c: (c.held, c.leavable, c.friction),
-            touch,
-            (jnp.zeros_like(touch.held), touch.held, jnp.where(touch.held, self.friction, 0).astype(nodes.dtype)),
+            asked,
+            (jnp.zeros_like(asked.held), asked.held, jnp.where(asked.held, self.friction, 0).astype(nodes.dtype)),
             is_leaf=lambda leaf: leaf is None,
         )
-        return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), touch=touch)
+        return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), colliders=asked)
 
 
 def _check(collider: AbstractCollider) -> None:
@@ -179,9 +179,9 @@ class _Body(eqx.Module):
     place: NodeVector
     """The nodes in the shape's own frame [m], shape (n, d)."""
     velocity: NodeVector
-    """That of the body at the nodes [m/s], shape (n, d)."""
+    """Velocity of the body at the nodes [m/s], shape (n, d)."""
     position: NodeVector
-    """Where the nodes are that move with it [m], shape (n, d)."""
+    """Positions of the nodes [m], shape (n, d); in the total description moved with the body."""
     pivot: Float[Array, "d"]
     pivot_velocity: Float[Array, "d"]
 
@@ -196,16 +196,17 @@ class _Body(eqx.Module):
         self.pivot_velocity = (motion.pivot(middle, t + dt) - self.pivot) / dt
 
     def holds(self, spacing: Scalar) -> Bool[Array, "n"]:
-        """The nodes that lie in it."""
+        """Which nodes lie in the body, shape (n,)."""
         return self.shape.contains(self.place, ON_THE_WALL * spacing)
 
-    def touch(self, spacing: Scalar) -> Touch:
-        """Normals held wherever there is one; samples may be level somewhere."""
+    def conditions(self, spacing: Scalar) -> ColliderConditions:
+        """The conditions of a body that holds the normal velocity of every node in it, but for nodes where the distance
+        has no slope, as a sampled one may have none."""
         slope = jax.grad(lambda x: self.shape.distance(x).sum())(self.place)
         steepness = length(slope)
         held = self.holds(spacing) & (steepness > 0)
         normal = self.motion.turned(slope / jnp.where(held, steepness, 1)[:, None], self.t)
-        return Touch(
+        return ColliderConditions(
             normal=jnp.where(held[:, None], normal, 0),
             velocity=jnp.where(held[:, None], self.velocity, 0),
             held=held,

@@ -16,8 +16,8 @@ ON_THE_WALL = 1e-3
 """Distance within which a node is on a wall, in spacings."""
 
 
-class Touch(eqx.Module):
-    """What k colliders ask of the nodes that lie in them."""
+class ColliderConditions(eqx.Module):
+    """The conditions of k colliders on the nodes that lie in them."""
 
     normal: NodeVector
     """Unit normal out of the collider that holds or pushes the node along it, shape (n, d); zero where none does."""
@@ -40,8 +40,8 @@ class Touch(eqx.Module):
     friction: NodeScalar | None = None
     """Coulomb coefficient there [-], shape (n,)."""
 
-    def beside(self, later: "Touch") -> "Touch":
-        """Both; where normals of two meet, the earlier one's."""
+    def beside(self, later: "ColliderConditions") -> "ColliderConditions":
+        """Both conditions; where two normals meet at a node, that of the earlier collider."""
         number = len(self.pivots)
 
         def numbered(n: Array) -> Array:
@@ -54,7 +54,7 @@ class Touch(eqx.Module):
 
         mine = self.owner >= 0
         touched = mine | (self.holder >= 0).any(axis=1)
-        return Touch(
+        return ColliderConditions(
             normal=jnp.where(mine[:, None], self.normal, later.normal),
             velocity=jnp.where(mine[:, None], self.velocity, later.velocity),
             held=jnp.where(mine, self.held, later.held),
@@ -67,14 +67,15 @@ class Touch(eqx.Module):
             friction=joined(self.friction, later.friction),
         )
 
-    def after(self, time: Scalar, velocity: NodeVector) -> "Touch":
-        """The same with nodes and pivots where they are some time [s] later, the nodes moving with a velocity [m/s]."""
+    def after(self, time: Scalar, velocity: NodeVector) -> "ColliderConditions":
+        """The same conditions with nodes and pivots moved on by a time [s], the nodes at a velocity [m/s], shape (n,
+        d)."""
         moved = self.position + time * velocity, self.pivots + time * self.pivot_velocity
         return eqx.tree_at(lambda c: (c.position, c.pivots), self, moved)
 
 
 class Conditions(eqx.Module):
-    """What boundaries ask of the window's nodes."""
+    """The conditions of boundaries on the window's nodes."""
 
     fixed: Mask
     """Components of velocity that are prescribed, shape (n, d)."""
@@ -84,8 +85,8 @@ class Conditions(eqx.Module):
     """Inward normal (+1 or −1) of a separating wall in each direction, 0 where there is none; None without any."""
     friction: NodeVector | None = None
     """Coulomb coefficient of that wall [-]."""
-    touch: Touch | None = None
-    """What colliders ask; None without any."""
+    colliders: ColliderConditions | None = None
+    """Conditions of colliders; None without any."""
 
 
 class AbstractBoundary(eqx.Module):
@@ -94,7 +95,7 @@ class AbstractBoundary(eqx.Module):
     @property
     @abc.abstractmethod
     def dim(self) -> int | None:
-        """The space dimension it is made for; None where it fits any."""
+        """Space dimension d of the condition; None if it fits any."""
 
     @abc.abstractmethod
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
@@ -106,11 +107,11 @@ class AbstractBoundary(eqx.Module):
     def passed(
         self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
     ) -> Bool[Array, "p"] | None:
-        """Which particles got beyond it in the step from t to t + dt; None where it keeps nothing out.
+        """Which particles passed the boundary in the step from t to t + dt; None if it keeps nothing out.
 
-        What moves less than a spacing a step stops before a wall or little beyond it, where a node of its stencil is
-        free still. A particle has passed when it is deeper, or when it came more than a spacing nearer in the step and
-        ended beyond. One that began beyond has not.
+        A particle that moves less than a spacing in a step stops before a wall, or so little beyond it that a node of
+        its stencil is still free. A particle has passed if it is deeper than that, or if it moved more than a spacing
+        towards the wall in the step and ended beyond it. One that began beyond has not passed.
 
         Args:
             start: positions at t [m], shape (p, d).
@@ -127,8 +128,8 @@ class AbstractBoundary(eqx.Module):
 def crossed(
     start: Array, end: Array, wall: Array | Scalar, deepest: Array | Scalar, spacing: Scalar
 ) -> Bool[Array, "..."]:
-    """Whether what moved from `start` to `end` passed a wall that keeps material above it: by more than a spacing, or
-    to a place below `deepest`."""
+    """Whether a coordinate that moved from `start` to `end` passed a wall that keeps material above it: it moved by
+    more than a spacing and ended below the wall, or it ended below `deepest`."""
     fast = (start >= wall) & (end < wall) & (start - end > spacing)
     return fast | ((start >= deepest) & (end < deepest))
 
@@ -142,11 +143,11 @@ def combine(
     *,
     reference: bool,
 ) -> Conditions:
-    """All of a scene's conditions; where two prescribe one component, the earlier in the tuple holds.
+    """The conditions of all boundaries of a scene. Where two prescribe the same component, the earlier one holds.
 
-    Contact is left to nodes' components that nothing prescribes. Of a node's components some may be prescribed and
-    besides them a collider's normal component: both hold (see `Nodes.grasp`), and where the normal is within a
-    hundredth of what is prescribed already it asks nothing. Of two colliders' normals the earlier holds.
+    Contact acts on components that nothing prescribes. A node may have components that are prescribed and, besides
+    them, a collider's normal component: both hold (see `Nodes.free_normal`). A normal that lies within a hundredth of
+    the prescribed components asks for nothing more. Of two colliders' normals the earlier one holds.
     """
     total = Conditions(jnp.zeros(nodes.shape, dtype=bool), jnp.zeros_like(nodes))
     for boundary in boundaries:
@@ -159,13 +160,13 @@ def combine(
             else:
                 friction = jnp.where(side != 0, friction, new.friction)
                 side = jnp.where(side != 0, side, new.side)
-        touch = total.touch
-        if new.touch is not None:
-            holder = jnp.where(total.fixed, -1, new.touch.holder)
-            mine = eqx.tree_at(lambda c: c.holder, new.touch, holder)
-            touch = mine if touch is None else touch.beside(mine)
-        total = Conditions(total.fixed | new.fixed, velocity, side, friction, touch)
+        colliders = total.colliders
+        if new.colliders is not None:
+            holder = jnp.where(total.fixed, -1, new.colliders.holder)
+            mine = eqx.tree_at(lambda c: c.holder, new.colliders, holder)
+            colliders = mine if colliders is None else colliders.beside(mine)
+        total = Conditions(total.fixed | new.fixed, velocity, side, friction, colliders)
     if total.side is None:
         return total
     side = jnp.where(total.fixed, 0, total.side)
-    return Conditions(total.fixed, total.velocity, side, total.friction, total.touch)
+    return Conditions(total.fixed, total.velocity, side, total.friction, total.colliders)

@@ -1,4 +1,4 @@
-"""What colliders receive from the material in a step: the other side of what they give it."""
+"""The impulse that colliders receive from the material in a step."""
 
 from typing import Any
 
@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, NodeScalar, NodeVector
-from mpmjax.boundary._conditions import Touch
+from mpmjax.boundary._conditions import ColliderConditions
 from mpmjax.linalg import pairs
 
 
 class ColliderImpulse(eqx.Module):
-    """Linear and angular impulse on each of k colliders; over the step they are its mean force and torque.
+    """Linear and angular impulse on each of k colliders. Divided by the step they are its mean force and torque.
 
-    What the nodes before a symmetry plane take is counted, not what their images take.
+    At a symmetry plane only the true nodes count, not their images.
     """
 
     impulse: Float[Array, "*f k d"]
@@ -27,19 +27,19 @@ class ColliderImpulse(eqx.Module):
     Σ ½(x^n + x^{n+1}) × m Δv where it moves with the mean."""
 
     def plus(self, later: "ColliderImpulse") -> "ColliderImpulse":
-        """Both together."""
+        """The sum of both."""
         return jax.tree.map(jnp.add, self, later)
 
 
 def nothing_received(colliders: int, dim: int, dtype: Any) -> ColliderImpulse:
-    """Of so many colliders, at the start."""
+    """No impulse yet on a number of colliders."""
     return ColliderImpulse(jnp.zeros((colliders, dim), dtype), jnp.zeros((colliders, len(pairs(dim))), dtype))
 
 
 def received(
-    touch: Touch, reaction: NodeVector, push: NodeScalar | None = None, rub: NodeVector | None = None
+    touch: ColliderConditions, reaction: NodeVector, push: NodeScalar | None = None, rub: NodeVector | None = None
 ) -> ColliderImpulse:
-    """Minus what each collider gives the nodes: prescribed components, the push along normals, friction.
+    """The impulse on each collider: minus what it gives the nodes by prescribed components, along normals, by friction.
 
     Args:
         touch: which node and component is whose.

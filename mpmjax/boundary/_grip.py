@@ -10,11 +10,11 @@ from mpmjax.geometry import AbstractMotion, AbstractRegion, Motion
 
 
 class Grip(AbstractBoundary):
-    """A region of nodes with a prescribed velocity, which moves as it prescribes.
+    """A region of nodes with a prescribed velocity. The region moves with that velocity.
 
     In the total description the region is that of the reference configuration. In a periodic direction the region does
-    not wrap: it must stay within the window's extent. The region only selects nodes, so its floats have no derivative;
-    those of the motion have.
+    not wrap: it must stay within the window's extent. The region only selects nodes, so derivatives by
+    its floats are zero; those by the floats of the motion are not.
 
     Args:
         region: region at zero displacement.
@@ -30,7 +30,6 @@ class Grip(AbstractBoundary):
 
     @property
     def dim(self) -> int:
-        """That of the motion."""
         return jnp.shape(jnp.asarray(self.motion.displacement))[1]
 
     def __check_init__(self):
@@ -50,7 +49,7 @@ class Grip(AbstractBoundary):
         )
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        """v = that of the motion."""
+        """v is the velocity of the motion."""
         place = nodes if reference else nodes - self.motion.at(t)
         held = self.region.contains(place, ON_THE_WALL * spacing)[:, None]
         axes = jnp.ones(nodes.shape[1], dtype=bool) if self.axes is None else jnp.asarray(self.axes)

@@ -10,9 +10,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector
 from mpmjax.boundary._conditions import AbstractBoundary
-from mpmjax.boundary._planes import ContactPlane, Plane, SymmetryPlane
+from mpmjax.boundary._planes import Plane, SymmetryPlane
 from mpmjax.discretisation import Grid
 
 
@@ -37,7 +37,7 @@ class Image(eqx.Module):
         return self._copy(field, jnp.where(normal, self.odd[:, None], self.even[:, None]))
 
     def within(self, held: Bool[Array, "n"]) -> "Image":
-        """The mirror in some columns alone."""
+        """The mirror in some columns only."""
         return Image(self.shape, self.axis, self.source, self.even, self.odd, held)
 
     def along(self, values: Array) -> Array:
@@ -62,7 +62,7 @@ class Image(eqx.Module):
 
 
 class Mirror(eqx.Module):
-    """Several planes together: `unfold` is B, from true nodes to all; `fold` its transpose Bᵀ."""
+    """The mirrors of several planes: `unfold` applies B, from true nodes to all nodes; `fold` applies Bᵀ."""
 
     images: tuple[Image, ...]
 
@@ -73,7 +73,7 @@ class Mirror(eqx.Module):
         return field
 
     def fold(self, field: NodeVector) -> NodeVector:
-        """Bᵀ f: bring to the true nodes what the mirror images received."""
+        """Bᵀ f: add to the true nodes what their mirror images received."""
         return jax.linear_transpose(self.unfold, field)(field)[0] if self.images else field
 
     def unfold_scalar(self, field: Float[Array, "n"]) -> Float[Array, "n"]:
@@ -87,50 +87,11 @@ class Mirror(eqx.Module):
         return jax.linear_transpose(self.unfold_scalar, field)(field)[0] if self.images else field
 
     def then(self, other: "Mirror") -> "Mirror":
-        """The mirror that unfolds by this one first."""
+        """The mirror that unfolds by this one first, then by the other."""
         return Mirror(self.images + other.images)
 
 
-class Contact(eqx.Module):
-    """A contact plane in the window, seen by columns: what is said of a column is said at all of its nodes."""
-
-    image: Image
-    inward: int = eqx.field(static=True)
-    """The inward normal's component: +1 or −1."""
-    before: Int[Array, "m"]
-    """How many half spacings each node along the axis lies before the plane."""
-    friction: Scalar
-
-    @property
-    def on_plane(self) -> Bool[Array, "n"]:
-        """The nodes on the plane, if it lies on nodes."""
-        return self.image.along(self.before == 0)
-
-    @property
-    def at_key(self) -> Bool[Array, "n"]:
-        """One node a column: that on the plane or, where there is none, half a spacing before it."""
-        return self.image.along((self.before == 0) | (self.before == 1))
-
-    def weight(self, mass: NodeScalar) -> NodeScalar:
-        """2 m m' / (m + m') [kg] at nodes beyond the plane, m on it, zero before it."""
-        both = mass + self.image.scalar(mass)
-        harmonic = 2 * mass * self.image.scalar(mass) / jnp.where(both == 0, 1, both)
-        return jnp.where(self.image.along(self.before <= 0), harmonic, 0)
-
-    def departure(self, mass: NodeScalar, v: NodeVector) -> NodeScalar:
-        """The column's weights times what its velocity lacks of the mirror's [kg m/s], inward positive."""
-        lacking = (v - self.image.vector(v))[:, self.image.axis]
-        return self.inward * self.image.column(self.weight(mass) * lacking)
-
-    def impulse(self, momentum_residual: NodeVector) -> NodeScalar:
-        """The normal impulse [kg m/s] that holds the column, inward positive."""
-        share = self.image.along(jnp.where(self.before < 0, 2, jnp.where(self.before == 0, 1, 0)))
-        return self.inward * self.image.column(
-            share.astype(momentum_residual.dtype) * momentum_residual[:, self.image.axis]
-        )
-
-
-def _image(plane: Plane, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, Array]:
+def image_of(plane: Plane, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, Array]:
     """The plane's map from true nodes to all nodes of the window, and how many half spacings each node along the axis
     lies before the plane."""
     length = grid.shape[plane.axis]
@@ -147,14 +108,4 @@ def _image(plane: Plane, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, Ar
 
 def mirror(boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"]) -> Mirror:
     """The mirror images of a scene's symmetry planes."""
-    return Mirror(tuple(_image(b, grid, window)[0] for b in boundaries if isinstance(b, SymmetryPlane)))
-
-
-def contacts(boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"]) -> tuple[Contact, ...]:
-    """A scene's contact planes."""
-    found = []
-    for plane in boundaries:
-        if isinstance(plane, ContactPlane):
-            image, before = _image(plane, grid, window)
-            found.append(Contact(image, 1 if plane.keep == "above" else -1, before, plane.friction))
-    return tuple(found)
+    return Mirror(tuple(image_of(b, grid, window)[0] for b in boundaries if isinstance(b, SymmetryPlane)))

@@ -17,14 +17,15 @@ def _check_plane(name: str, axis: int, position: Scalar, keep: str) -> None:
 
 
 def _through_plane(plane: "Plane", start: ParticleVector, end: ParticleVector, spacing: Scalar) -> Bool[Array, "p"]:
-    """Which particles passed a plane: half a spacing is the deepest that they may be."""
+    """Which particles passed a plane: those that end more than half a spacing beyond it, among others (`crossed`)."""
     inward = 1 if plane.keep == "above" else -1
     place = inward * jnp.asarray(plane.position, end.dtype)
     return crossed(inward * start[:, plane.axis], inward * end[:, plane.axis], place, place - spacing / 2, spacing)
 
 
 class SymmetryPlane(AbstractBoundary):
-    """A plane of mirror symmetry: nodes beyond it are mirror images. It is also a frictionless wall that holds.
+    """A plane of mirror symmetry: nodes beyond it are mirror images. It is also a frictionless wall that
+    material cannot leave.
 
     Exact inside the implicit solve, and second order in the spacing, where a wall that fixes the velocity of its nodes
     is first.
@@ -43,7 +44,6 @@ class SymmetryPlane(AbstractBoundary):
 
     @property
     def dim(self) -> None:
-        """Any that has the axis."""
         return None
 
     def __check_init__(self):
@@ -93,7 +93,6 @@ class ContactPlane(AbstractBoundary):
 
     @property
     def dim(self) -> None:
-        """Any that has the axis."""
         return None
 
     def __check_init__(self):
@@ -102,7 +101,6 @@ class ContactPlane(AbstractBoundary):
         require_between("ContactPlane's friction", self.friction, 0, 1e6)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        """None that holds always."""
         del spacing, t, dt, reference
         return Conditions(jnp.zeros(nodes.shape, dtype=bool), jnp.zeros_like(nodes))
 

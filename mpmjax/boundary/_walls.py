@@ -61,7 +61,6 @@ class StickyBox(AbstractBoundary):
 
     @property
     def dim(self) -> int:
-        """That of the corners."""
         return len(self.lower)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
@@ -98,7 +97,6 @@ class SlipBox(AbstractBoundary):
 
     @property
     def dim(self) -> int:
-        """That of the corners."""
         return len(self.lower)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
@@ -140,7 +138,6 @@ class SeparatingBox(AbstractBoundary):
 
     @property
     def dim(self) -> int:
-        """That of the corners."""
         return len(self.lower)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:

@@ -17,7 +17,7 @@ Displacements = Float[Array, "j d"] | Float[np.ndarray, "j d"] | tuple | list
 
 
 class AbstractMotion(eqx.Module):
-    """The motion of a rigid body, given by that of each of its points X, their places before it."""
+    """The motion of a rigid body. X are the positions of its points before the motion, x those at time t."""
 
     @property
     @abc.abstractmethod
@@ -38,11 +38,11 @@ class AbstractMotion(eqx.Module):
 
     @abc.abstractmethod
     def velocity_of(self, X: Float[Array, "m d"], t: Scalar, dt: Scalar) -> Float[Array, "m d"]:
-        """(place at t + dt − place at t)/dt of the points X [m/s], shape (m, d)."""
+        """Mean velocity of the points X from t to t + dt [m/s], shape (m, d): (place(t + dt) − place(t))/dt."""
 
     @abc.abstractmethod
     def pivot(self, middle: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
-        """The place at time t [m], (d,), of the point about which torques on a body with a given middle are taken."""
+        """The point about which torques are taken, at time t [m], shape (d,), for a body with a given middle."""
 
 
 class Motion(AbstractMotion):
@@ -62,7 +62,6 @@ class Motion(AbstractMotion):
 
     @property
     def dim(self) -> int:
-        """That of the displacement."""
         return jnp.shape(jnp.asarray(self.displacement))[1]
 
     def at(self, t: Scalar) -> Float[Array, "d"]:
@@ -74,24 +73,21 @@ class Motion(AbstractMotion):
         return _change(t, dt, jnp.asarray(self.times), jnp.asarray(self.displacement)) / dt
 
     def origin(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
-        """x less the displacement."""
+        """x − d(t)."""
         return x - self.at(t)
 
     def place(self, X: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
-        """X and the displacement."""
+        """X + d(t)."""
         return X + self.at(t)
 
     def turned(self, a: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
-        """As they are."""
         del t
         return a
 
     def velocity_of(self, X: Float[Array, "m d"], t: Scalar, dt: Scalar) -> Float[Array, "m d"]:
-        """The same for all."""
         return jnp.broadcast_to(self.velocity(t, dt), X.shape)
 
     def pivot(self, middle: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
-        """The middle."""
         return middle + self.at(t)
 
 
@@ -131,7 +127,6 @@ class RigidMotion(AbstractMotion):
 
     @property
     def dim(self) -> int:
-        """That of the displacement."""
         return jnp.shape(jnp.asarray(self.displacement))[1]
 
     def at(self, t: Scalar) -> Float[Array, "d"]:
@@ -161,7 +156,7 @@ class RigidMotion(AbstractMotion):
         return _turn(a, self.rotation_at(t))
 
     def velocity_of(self, X: Float[Array, "m d"], t: Scalar, dt: Scalar) -> Float[Array, "m d"]:
-        """That of the centre, and the change of R times X − c: R's, once, and not each point's."""
+        """The mean velocity of the centre plus the change of R over the step times (X − c)/dt."""
         times, arm = jnp.asarray(self.times), X - jnp.asarray(self.centre, X.dtype)
         shift = _change(t, dt, times, jnp.asarray(self.displacement))
         by = _change(t, dt, times, self._rotations())
@@ -169,12 +164,11 @@ class RigidMotion(AbstractMotion):
         return (shift + sum(arm[:, a, None] * columns[a] for a in range(self.dim))) / dt
 
     def pivot(self, middle: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
-        """The centre."""
         return jnp.asarray(self.centre, middle.dtype) + self.at(t)
 
 
 def still(dim: int) -> Motion:
-    """No motion in `dim` dimensions."""
+    """A motion that leaves everything in place, in `dim` dimensions."""
     return Motion((0.0,), ((0.0,) * dim,))
 
 
@@ -190,7 +184,7 @@ def _check_rows(name: str, times: Times, displacement: Displacements) -> None:
 
 
 def _interpolated(t: Scalar, times: Float[Array, "j"], values: Float[Array, "j c"]) -> Float[Array, "c"]:
-    """Each column of the values, piecewise linear in time."""
+    """The piecewise linear interpolation of each column of `values` at time t."""
     return jnp.stack([jnp.interp(t, times, values[:, a]) for a in range(values.shape[1])])
 
 

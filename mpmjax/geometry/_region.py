@@ -33,7 +33,7 @@ class AbstractRegion(eqx.Module):
 
     @abc.abstractmethod
     def middle(self) -> Float[Array, "d"]:
-        """A point that goes with the region [m], (d,): its centre where it has one."""
+        """A point that moves with the region [m], shape (d,): its centre if it has one."""
 
     def contains(self, x: Float[Array, "m d"], margin: Scalar = 0.0) -> Bool[Array, "m"]:
         """Whether each of the points x [m], shape (m, d), lies in the region or within `margin` [m] of it."""
@@ -41,20 +41,20 @@ class AbstractRegion(eqx.Module):
 
 
 def length(a: Float[Array, "*m d"]) -> Float[Array, "*m"]:
-    """The norm of each row, with the derivative zero at zero."""
+    """The norm of each row; its derivative at zero is zero."""
     square = (a**2).sum(axis=-1)
     zero = square == 0
     return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, square)))
 
 
 def _from_axis(a: Float[Array, "m d"]) -> Float[Array, "m"]:
-    """The norm of each row, with the derivative of some direction at zero."""
+    """The norm of each row; its derivative at zero is that along a fixed direction."""
     some = jnp.asarray([0.8, 0.5, 0.3][: a.shape[-1]], a.dtype)
     return jnp.where((a == 0).all(axis=-1), (a * some).sum(axis=-1), length(a))
 
 
 def _common(slabs: Float[Array, "m j"]) -> Float[Array, "m"]:
-    """The signed distance of what several sets at right angles to each other have in common, by those of the sets."""
+    """The signed distance of the intersection of sets at right angles to each other, from the distances of the sets."""
     nearest = slabs.max(axis=-1)
     return jnp.where(nearest > 0, length(jnp.maximum(slabs, 0)), nearest)
 
@@ -95,7 +95,6 @@ class Box(AbstractRegion):
 
     @property
     def dim(self) -> int:
-        """That of the corners."""
         return len(self.lower)
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
@@ -104,7 +103,6 @@ class Box(AbstractRegion):
         return _common(jnp.where(below > above, below, above))
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """The corners."""
         return np.asarray(self.lower, float), np.asarray(self.upper, float)
 
     def middle(self) -> Float[Array, "d"]:
@@ -133,7 +131,6 @@ class Ball(AbstractRegion):
 
     @property
     def dim(self) -> int:
-        """That of the centre."""
         return len(self.centre)
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
@@ -146,7 +143,6 @@ class Ball(AbstractRegion):
         return centre - radius, centre + radius
 
     def middle(self) -> Float[Array, "d"]:
-        """The centre."""
         return jnp.asarray(self.centre)
 
 
@@ -173,7 +169,6 @@ class HalfSpace(AbstractRegion):
 
     @property
     def dim(self) -> int:
-        """That of the point."""
         return len(self.point)
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
@@ -182,11 +177,9 @@ class HalfSpace(AbstractRegion):
         return ((x - jnp.asarray(self.point, x.dtype)) * (normal / length(normal))).sum(axis=-1)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Infinite."""
         return np.full(self.dim, -np.inf), np.full(self.dim, np.inf)
 
     def middle(self) -> Float[Array, "d"]:
-        """The point of the plane."""
         return jnp.asarray(self.point)
 
 
@@ -210,7 +203,6 @@ class Capsule(AbstractRegion):
 
     @property
     def dim(self) -> int:
-        """That of the ends."""
         return len(self.start)
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
@@ -221,12 +213,10 @@ class Capsule(AbstractRegion):
         return _from_axis(arm - along[:, None] * axis) - self.radius
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Those of the balls about both ends."""
         ends, radius = np.stack([np.asarray(self.start, float), np.asarray(self.end, float)]), float(self.radius)
         return ends.min(axis=0) - radius, ends.max(axis=0) + radius
 
     def middle(self) -> Float[Array, "d"]:
-        """That of the segment."""
         return (jnp.asarray(self.start) + jnp.asarray(self.end)) / 2
 
 
@@ -251,11 +241,10 @@ class Cylinder(AbstractRegion):
 
     @property
     def dim(self) -> int:
-        """That of the ends."""
         return len(self.start)
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
-        """As of a box, from the distances beyond the ends and beyond the radius."""
+        """As for a box, with the distances beyond the ends and beyond the radius."""
         start, end = jnp.asarray(self.start, x.dtype), jnp.asarray(self.end, x.dtype)
         height = length(end - start)
         axis, arm = (end - start) / height, x - (start + end) / 2
@@ -265,19 +254,18 @@ class Cylinder(AbstractRegion):
         return _common(jnp.stack([beyond, beside - self.radius], axis=-1))
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Those of both end disks."""
         ends = np.stack([np.asarray(self.start, float), np.asarray(self.end, float)])
         axis = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
         reach = float(self.radius) * np.sqrt(np.maximum(1 - axis**2, 0))
         return ends.min(axis=0) - reach, ends.max(axis=0) + reach
 
     def middle(self) -> Float[Array, "d"]:
-        """That of the axis."""
         return (jnp.asarray(self.start) + jnp.asarray(self.end)) / 2
 
 
 class Union(AbstractRegion):
-    """Several regions as one. Its distance is exact outside; inside, where they overlap, it may be too small in size.
+    """The union of several regions. Its distance is exact outside; inside, where they overlap, it may be too small in
+    size.
 
     Args:
         regions: the regions.
@@ -296,18 +284,14 @@ class Union(AbstractRegion):
 
     @property
     def dim(self) -> int:
-        """That of the regions."""
         return self.regions[0].dim
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
-        """The least of theirs."""
         return jnp.stack([region.distance(x) for region in self.regions]).min(axis=0)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Around all of theirs."""
         lower, upper = zip(*(region.bounds() for region in self.regions), strict=True)
         return np.min(lower, axis=0), np.max(upper, axis=0)
 
     def middle(self) -> Float[Array, "d"]:
-        """The mean of theirs."""
         return jnp.stack([region.middle() for region in self.regions]).mean(axis=0)

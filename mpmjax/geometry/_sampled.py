@@ -61,7 +61,6 @@ class SampledDistance(AbstractRegion):
 
     @property
     def dim(self) -> int:
-        """That of the lattice."""
         return len(self.lower)
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
@@ -80,13 +79,12 @@ class SampledDistance(AbstractRegion):
         return total
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Those of the points inside, and a spacing more."""
+        """The box around the sample points inside, enlarged by a spacing."""
         inside = np.argwhere(np.asarray(self.values) < 0)
         lower, h = np.asarray(self.lower, float), float(self.spacing)
         return lower + h * (inside.min(axis=0) - 1), lower + h * (inside.max(axis=0) + 1)
 
     def middle(self) -> Float[Array, "d"]:
-        """That of the lattice."""
         counts = jnp.asarray(jnp.shape(jnp.asarray(self.values)))
         lower = jnp.asarray(self.lower)
         return lower + (counts - 1).astype(lower.dtype) * self.spacing / 2

@@ -21,6 +21,16 @@ _REMEDY = "restore it from a copy, or run the simulation again"
 _BUSY = "{} is being written by another run: wait until that ends or stop it, or choose another name."
 
 
+class FileRefusedError(ValueError):
+    """A file cannot be used. The message says which, why, and what to do."""
+
+
+def require_of_file(condition: Any, message: str) -> None:
+    """Raise `FileRefusedError(message)` unless the condition holds."""
+    if not condition:
+        raise FileRefusedError(message)
+
+
 def staged_file(path: Path, *, new: bool = False) -> StagedFile:
     """The file, locked and ready to be changed; with `new` it is made if it is not there."""
     try:
@@ -92,9 +102,9 @@ def reading(path: Path) -> Iterator[File]:
             _check_format(path, file)
             _check_written(file)
             yield file
+    except FileRefusedError:
+        raise
     except ValueError as error:
-        if str(error).startswith(str(path)):
-            raise
         raise ValueError(f"{path} is damaged ({reason(error)}): {_REMEDY}.") from None
     except (OSError, KeyError, RuntimeError, TypeError, AttributeError, IndexError, UnicodeError) as error:
         what = "is cut short" if "truncated" in str(error) else "is damaged, or just being written"
@@ -103,10 +113,10 @@ def reading(path: Path) -> Iterator[File]:
 
 def _check_format(path: Path, file: File) -> None:
     missing = [name for name in _GROUPS if file.get(name, getlink=True) is None]
-    require(not missing, f"{path} has no group /{' or /'.join(missing)}: it is not a run that mpmjax wrote.")
+    require_of_file(not missing, f"{path} has no group /{' or /'.join(missing)}: it is not a run that mpmjax wrote.")
     _check_contained(path, file)
     found = int(file["mpmjax"].attrs["format"])
-    require(
+    require_of_file(
         found == FORMAT,
         f"{path} has format {found}, this mpmjax reads format {FORMAT}: use mpmjax "
         f"{file['mpmjax'].attrs['version'].decode()}, which wrote it.",
@@ -125,15 +135,19 @@ def _check_contained(path: Path, file: File) -> None:
         group = todo.pop()
         for name in group:
             where = f"{path}: {group.name.rstrip('/')}/{name}"
-            require(_is_own(group, name), f"{where} is a link, which no run of mpmjax has: {_REMEDY}.")
+            require_of_file(_is_own(group, name), f"{where} is a link, which no run of mpmjax has: {_REMEDY}.")
             item = group[name]
-            require(item not in seen, f"{where} is a second name of an object, which no run of mpmjax has: {_REMEDY}.")
+            require_of_file(
+                item not in seen, f"{where} is a second name of an object, which no run of mpmjax has: {_REMEDY}."
+            )
             seen.add(item)
             if isinstance(item, h5py.Group):
                 todo.append(item)
             elif isinstance(item, h5py.Dataset):
                 elsewhere = item.is_virtual or item.external
-                require(not elsewhere, f"{where} has its data in other files, which no run of mpmjax has: {_REMEDY}.")
+                require_of_file(
+                    not elsewhere, f"{where} has its data in other files, which no run of mpmjax has: {_REMEDY}."
+                )
 
 
 def _check_written(file: File) -> None:

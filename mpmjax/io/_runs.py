@@ -34,12 +34,14 @@ from mpmjax.io._aside import reason, replacing
 from mpmjax.io._hdf5 import (
     FORMAT,
     LIBVER_HEAD,
+    FileRefusedError,
     check_hdf5,
     check_no_writer,
     check_place,
     check_whole,
     opened,
     reading,
+    require_of_file,
     staged_file,
 )
 from mpmjax.io._schema import decode, encode
@@ -136,7 +138,7 @@ class FrameWriter:
             with reading(path) as file:
                 check_whole(file)
                 _check_same(path, described, _description(file["mpmjax"]))
-                require(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
+                require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
             file = opened(staged, path)
             count = count_in(file)
             if any(len(file[name]) != count * len(data) for name, data in rows.items()):
@@ -255,7 +257,7 @@ def steps_in(path: str | os.PathLike) -> int:
     """
     check_no_writer(Path(path))
     with reading(Path(path)) as file:
-        require(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
+        require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
         return int(file["mpmjax/frames"][count_in(file) - 1]["steps"])
 
 
@@ -271,11 +273,11 @@ def load(path: str | os.PathLike) -> Run:
     with reading(path) as file:
         described = _description(file["mpmjax"])
         dtype, arrays = np.dtype(described["dtype"]), described["arrays"]
-        require(
+        require_of_file(
             dtype.itemsize <= jnp.zeros(()).dtype.itemsize,
             f'{path} holds a {dtype} run: call jax.config.update("jax_enable_x64", True) first.',
         )
-        require(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
+        require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
         scene = decode(described["scene"], Scene, "scene", arrays)
         method = decode(described["method"], AbstractIntegrator, "method", arrays)
         scene, method = canonical((scene, method), dtype)
@@ -326,7 +328,7 @@ def _check_readable(path: Path, described: dict[str, Any]) -> None:
         decode(described["scene"], Scene, "", arrays)
         decode(described["method"], AbstractIntegrator, "method", arrays)
     except ValueError as error:
-        raise ValueError(f"{path} could not be loaded again, as {dtype} rounds it: {error}") from None
+        raise FileRefusedError(f"{path} could not be loaded again, as {dtype} rounds it: {error}") from None
 
 
 def _write_description(group: File, described: dict[str, Any]) -> None:
@@ -390,7 +392,7 @@ def _check_same(path: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> Non
         a, b = pair
         show = "another array" if isinstance(b, np.ndarray) else "none" if b is None else repr(b)
         got = "" if isinstance(a, np.ndarray) else f" instead of {a!r}"
-        require(
+        require_of_file(
             type(a) is type(b) and np.array_equal(*pair),
             f"{path} holds another run: its {name} is {show}{got}. Resume the same run, or name a new file.",
         )

@@ -1,5 +1,4 @@
-"""The particles of one material in a step: their law in force, their deformation, and how the grid's motion changes
-it."""
+"""The particles of one material in a step: their law, their deformation, and how the grid's motion changes it."""
 
 from dataclasses import replace
 from typing import Any
@@ -15,27 +14,27 @@ from mpmjax.state._particles import Group, Particles
 Laws = Law | Viscous | tuple[Law | Viscous, ...]
 """One law for all particles, or one for each of their groups."""
 Deformation = Float[Array, "e e q"]
-"""What a law sees of a deformation: e = d, or 1 where that is J."""
+"""The deformation as a law sees it: F with e = d, or J with e = 1."""
 
 
 class MaterialPoints(eqx.Module):
-    """The particles of one material. Each pays for its own law alone."""
+    """The particles of one material, which pay for their own law only."""
 
     law: AbstractMaterial
     """The elastic law in force, frozen in the step."""
     volume: Float[Array, "q"]
     """V0 [m^d], shape (q,)."""
     F: Deformation
-    """F or its elastic part [-], shape (d, d, q); where the law knows J alone, that, shape (1, 1, q)."""
+    """F or its elastic part [-], shape (d, d, q); for a law that depends on J only, J, shape (1, 1, q)."""
     total: bool = eqx.field(static=True, default=False)
-    """Whether gradients are those by reference positions."""
+    """Whether gradients are with respect to the reference positions."""
     rows: tuple[int, int] | None = eqx.field(static=True, default=None)
     """First particle and the one after the last; None for all of them."""
     viscosity: Viscosity | None = None
-    """What resists the velocity gradient beside the law."""
+    """The viscosity beside the law; None without."""
 
     def own(self, field: Array) -> Array:
-        """This material's part of what all particles have, the particle axis last."""
+        """The part of an array over all particles (particle axis last) that belongs to this material."""
         return field if self.rows is None else field[..., slice(*self.rows)]
 
     def deformed(self, gradient: Matrix) -> Deformation:
@@ -83,7 +82,7 @@ def material_points(laws: Laws, particles: Particles, *, total: bool) -> tuple[M
 
 
 def return_map(laws: Laws, particles: Particles) -> Particles:
-    """The particles with what yields brought back from a trial deformation to what its law admits."""
+    """The particles after the return maps of laws that yield: from the trial deformation to one that the law admits."""
     if not any(isinstance(split(law)[0], AbstractInelastic) for law, _ in _paired(laws, particles)):
         return particles
 
@@ -100,7 +99,7 @@ def return_map(laws: Laws, particles: Particles) -> Particles:
 
 
 def split(law: Law | Viscous) -> tuple[Law, Viscosity | None]:
-    """A law without its viscosity, and that."""
+    """A law without its viscosity, and the viscosity; None without."""
     return (law.law, law.viscosity) if isinstance(law, Viscous) else (law, None)
 
 

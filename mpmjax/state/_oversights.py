@@ -1,7 +1,7 @@
-"""What is no error, and most likely not what was meant: said in a warning where scene and particles first meet.
+"""Warnings of what is no error but most likely not meant, given when particles are first prepared for a scene.
 
-Only what is certain is said. A collider that is met later is none of it; a grip or collider that can never touch a node
-that carries mass is.
+Only certain cases are warned of: not a collider that the body may meet later, but a grip or collider that can never
+touch a node with mass.
 """
 
 import itertools
@@ -28,7 +28,7 @@ from mpmjax.geometry import Motion, RigidMotion
 from mpmjax.state._particles import Particles
 
 _THIN = 2.0
-"""Cells below which a body's thickness is not resolved."""
+"""A body thinner than so many cells is not resolved."""
 Boundaries = tuple[AbstractBoundary, ...]
 
 
@@ -80,7 +80,7 @@ def _probed(
     margin: Scalar,
     total: bool,
 ) -> tuple[list[Int[Array, ""]], list[Bool[Array, "n"]]]:
-    """How many particles lie in each of some bodies, and which nodes in each of some others, at the start."""
+    """How many particles lie in each of `bodies` at the start, and which nodes lie in each of `fixed`."""
     start = jnp.zeros((), x.dtype)
 
     def depth(condition: Grip | AbstractCollider) -> Float[Array, "n"]:
@@ -99,7 +99,7 @@ def _beyond(box: StickyBox | SlipBox | SeparatingBox, grid: Grid, x: ParticleVec
 
 
 def _rests(condition: Grip | AbstractCollider, grid: Grid) -> bool:
-    """Whether a boundary condition is known not to move, nor the window."""
+    """Whether neither the boundary condition nor the window moves."""
     motion = condition.motion
     if grid.follow or not isinstance(motion, Motion | RigidMotion):
         return motion is None and not grid.follow
@@ -118,7 +118,7 @@ def _reached(grid: Grid, kernel: BSpline, x: ParticleVector) -> np.ndarray:
 
 
 def _thin(grid: Grid, boundary: Boundaries, particles: Particles) -> Iterator[str]:
-    """What is said of materials that fill less than two cells in a direction, no wall or plane being beside them."""
+    """Warnings of materials less than two cells thick in a direction in which no wall or plane lies beside them."""
     dx, places = float(grid.spacing), np.asarray(particles.x)
     side = np.asarray(particles.volume) ** (1 / grid.dim)
     ends = np.cumsum([0, *(particles.counts or (particles.count,))])

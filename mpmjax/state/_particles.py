@@ -17,9 +17,9 @@ Deformations = Float[Array, "*f _ _ _"] | tuple[Float[Array, "*f _ _ _"], ...]
 
 
 class Particles(eqx.Module):
-    """A set of particles. `fill` makes x, v, mass and volume; `prepare` adds what the scene's choices need.
+    """A set of particles. `fill` makes x, v, mass and volume; `prepare` adds what the scene needs.
 
-    Of these only x, v, C, F, history and received change in time. Every leaf is a float array of one dtype. Particles
+    Only x, v, C, F, history and received change with time. Every leaf is a float array of one dtype. Particles
     of several materials lie group after group (see `join`), and F and history have one entry a group.
     """
 
@@ -32,20 +32,20 @@ class Particles(eqx.Module):
     volume: ParticleScalar
     """Undeformed volumes V0 [m^d], shape (p,)."""
     F: Deformations | None = None
-    """Deformation gradients [-], of what yields their elastic part, shape (p, d, d); J = det F alone, shape (p, 1, 1),
-    where the law knows no more."""
+    """Deformation gradients [-], for laws that yield their elastic part, shape (p, d, d); J = det F, shape (p, 1, 1),
+    for laws that depend on J only."""
     C: ParticleMatrix | None = None
     """Velocity gradients ∇_x v [1/s], in the total description ∇_X v, shape (p, d, d): the affine velocities of APIC,
     and what viscosity resists."""
     X: ParticleVector | None = None
     """Reference positions [m], shape (p, d), in the total description."""
     history: Any = None
-    """What laws that yield remember, a pytree of arrays of shape (p,) each; see the law."""
+    """The history of laws that yield, a pytree of arrays of shape (p,) each; see the law."""
     received: ColliderImpulse | None = None
-    """Linear and angular impulse that the scene's colliders have received since they were prepared; None without any.
-    The difference between two times is the mean force and torque times the time between."""
+    """Linear and angular impulse on the scene's colliders since the particles were prepared; None without colliders.
+    The difference between two times, over the time between them, is the mean force and torque."""
     counts: tuple[int, ...] | None = eqx.field(static=True, default=None)
-    """How many particles each of several materials has; None where there is one."""
+    """Number of particles of each of several materials; None if there is one."""
 
     def __check_init__(self):
         require_fields(self)
@@ -103,10 +103,10 @@ class Particles(eqx.Module):
 
 
 class Group(eqx.Module):
-    """What particles of one material have of their own."""
+    """The particles of one material."""
 
     rows: tuple[int, int] | None = eqx.field(static=True)
-    """First particle and the one after the last; None for all of them."""
+    """First particle, and the one after the last; None for all particles."""
     F: Float[Array, "*f q e e"] | None
     """Shape (q, e, e)."""
     history: Any
@@ -125,7 +125,8 @@ class Group(eqx.Module):
 
 @checked
 def join(*sets: Particles) -> Particles:
-    """Several sets as one. With as many laws in the scene each is of the material in its place; with one law all are.
+    """Join several sets of particles. In a scene with as many laws, each set has the law in its place; with one law,
+    all sets have that one.
 
     Args:
         sets: particles of one dimension and precision, as `fill` makes them: F, C, X and history are not joined.
@@ -157,7 +158,7 @@ class State(eqx.Module):
 
 
 def by_material(held: Particles | State) -> list[tuple[slice, Any, Any]]:
-    """The particles, F and history of each material, of prepared particles or a state of them."""
+    """Rows, F and history of each material, of prepared particles or of a state of them."""
     groups, several = jax.tree.leaves(held.F), isinstance(held.F, tuple)
     ends = pairwise(accumulate((len(F) for F in groups), initial=0))
     return [
@@ -167,7 +168,7 @@ def by_material(held: Particles | State) -> list[tuple[slice, Any, Any]]:
 
 
 def histories(held: Particles | State) -> list[tuple[str, slice, Any]]:
-    """Name, particles and numbers of everything that laws remember, in the order of the leaves of `history`."""
+    """Name, rows and values of each array of the laws' histories, in the order of the leaves of `history`."""
     return [
         (path[-1].name, rows, leaf)
         for rows, _, history in by_material(held)

@@ -1,4 +1,4 @@
-"""Preparing particles for a scene: what its laws, transfer and description need is added, and all is checked."""
+"""Preparation: particles are given what a scene's laws, transfer and description need, and both are checked."""
 
 from dataclasses import replace
 from typing import Any
@@ -83,8 +83,8 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
 
 
 def _check_size(scene: Scene, particles: Particles) -> None:
-    """A step's arrays must fit into memory: of the nodes mass, momentum, velocity and force, of the particles their
-    state before and after and their stencil."""
+    """Check that the arrays of a step fit into memory: mass, momentum, velocity and force of the nodes; the state
+    before and after the step and the stencil of the particles."""
     n, p, d, bytes_each = scene.grid.size, particles.count, particles.dim, particles.x.dtype.itemsize
     state = sum(leaf.size for leaf in jax.tree.leaves(particles))
     stencil = p * 3 * d * (scene.kernel.order + 1)
@@ -97,7 +97,7 @@ def _check_size(scene: Scene, particles: Particles) -> None:
 
 
 def _received(scene: Scene, particles: Particles) -> ColliderImpulse | None:
-    """What colliders have received: what the particles say, if it is of as many as the scene has."""
+    """The impulse that colliders have received: the particles' own if it fits the number of colliders, else zero."""
     if scene.colliders == 0:
         return None
     nothing = nothing_received(scene.colliders, particles.dim, particles.x.dtype)
@@ -123,7 +123,7 @@ def _prepared(law: Law, group: Group, particles: Particles) -> tuple[Array, Any]
 
 
 def _remembers(law: AbstractInelastic, F: Array, history: Any) -> bool:
-    """Whether that is a history of the law's, of particles with this F."""
+    """Whether a history is one of the law's, for particles with this F."""
     own = jax.eval_shape(law.initial_history, components(F))
     if jax.tree.structure(own) != jax.tree.structure(history):
         return False

@@ -1,4 +1,4 @@
-"""The scene: what a step needs and does not change."""
+"""The scene: everything that a step needs and does not change."""
 
 import equinox as eqx
 
@@ -164,17 +164,17 @@ class Scene(eqx.Module):
         return material_points(self.material, particles, total=self.total)
 
     def return_map(self, particles: Particles) -> Particles:
-        """The particles with what yields brought back from a trial deformation to what its law admits."""
+        """The particles after the return maps of laws that yield (see `return_map`)."""
         return return_map(self.material, particles)
 
     @property
     def colliders(self) -> int:
-        """How many colliders there are."""
+        """Number of colliders."""
         return sum(isinstance(boundary, AbstractCollider) for boundary in self.boundary)
 
     @property
     def slides(self) -> bool:
-        """Whether there is a collider along which material slides and which it does not leave."""
+        """Whether there is a collider along which material slides without leaving it."""
         return any(isinstance(boundary, SlipCollider) for boundary in self.boundary)
 
     @property
@@ -187,7 +187,7 @@ class Scene(eqx.Module):
         return self.grid.window(self.anchor(particles))
 
     def anchor(self, particles: Particles) -> Array:
-        """The positions at which stencils stand: x, or X in the total description. Shape (p, d)."""
+        """The positions of the stencils [m], shape (p, d): x, or X in the total description."""
         return particles.X if self.total and particles.X is not None else particles.x
 
     def stencil(self, particles: Particles) -> Stencil:

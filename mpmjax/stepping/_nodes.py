@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
-from mpmjax.boundary import Conditions, Contact, Mirror, combine, contacts, mirror
+from mpmjax.boundary import AbstractContact, AbstractNodes, Conditions, Mirror, combine, contacts_of, mirror
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.state import Particles, Scene
@@ -13,18 +13,18 @@ from mpmjax.state import Particles, Scene
 _PARALLEL = 1e-2  # a normal whose part in free components is smaller is prescribed by the others
 
 
-class Grasp(eqx.Module):
-    """The colliders' normals in the components that nothing prescribes."""
+class FreeNormal(eqx.Module):
+    """The part of the colliders' normals in the components that nothing prescribes."""
 
-    normal: NodeVector
-    """The unit vector along the normal's free part, shape (n, d); zero where there is none."""
-    reach: NodeScalar
-    """The length of that part of the normal [-], shape (n,)."""
+    direction: NodeVector
+    """The unit vector along it, shape (n, d); zero where there is none."""
+    length: NodeScalar
+    """Its length [-], shape (n,); 1 where there is none."""
     speed: NodeScalar
     """The velocity along it [m/s] with which the whole normal component is the collider's, shape (n,)."""
 
 
-class Nodes(eqx.Module):
+class Nodes(AbstractNodes):
     """What the velocity update of one step is given."""
 
     mass: NodeScalar
@@ -47,8 +47,8 @@ class Nodes(eqx.Module):
     """What the boundaries prescribe."""
     viscous: NodeVector | None = None
     """The part of viscosity in an explicit step's force [N], shape (n, d), where it was wanted apart."""
-    contacts: tuple[Contact, ...] = ()
-    """The scene's contact planes, of which none holds anything here."""
+    contacts: tuple[AbstractContact, ...] = ()
+    """The boundaries that may be left, of which none holds anything here."""
 
     @property
     def free(self) -> Mask:
@@ -56,40 +56,46 @@ class Nodes(eqx.Module):
         return self.occupied & ~self.conditions.fixed
 
     @property
-    def grasp(self) -> Grasp | None:
-        """The colliders' normals, held or not, as far as they ask for more than the prescribed components give.
+    def mirror(self) -> Mirror:
+        """The mirror images of symmetry planes, and of the columns of contact planes that are held."""
+        return self.potential.mirror
+
+    @property
+    def free_normal(self) -> FreeNormal | None:
+        """The colliders' normals, held or not, as far as they ask for more than the prescribed components give; None
+        without colliders.
 
         With components a prescribed, n·v = n·v_c says Σ_free n v = n·v_c − Σ_a n_a v_a.
         """
-        touch = self.conditions.touch
-        if touch is None:
+        colliders = self.conditions.colliders
+        if colliders is None:
             return None
-        part = jnp.where(self.free, touch.normal, 0)
+        part = jnp.where(self.free, colliders.normal, 0)
         square = (part**2).sum(axis=1)
         some = square > _PARALLEL**2
-        reach = jnp.sqrt(jnp.where(some, square, 1))
-        asked = touch.normal * (touch.velocity - jnp.where(self.free, 0, self.conditions.velocity))
-        return Grasp(
-            normal=jnp.where(some[:, None], part / reach[:, None], 0),
-            reach=reach,
-            speed=jnp.where(some, asked.sum(axis=1) / reach, 0),
+        length = jnp.sqrt(jnp.where(some, square, 1))
+        asked = colliders.normal * (colliders.velocity - jnp.where(self.free, 0, self.conditions.velocity))
+        return FreeNormal(
+            direction=jnp.where(some[:, None], part / length[:, None], 0),
+            length=length,
+            speed=jnp.where(some, asked.sum(axis=1) / length, 0),
         )
 
     @property
     def projection(self) -> Projection:
         """The projection on what nothing holds."""
-        touch, grasp = self.conditions.touch, self.grasp
-        if touch is None or grasp is None:
+        colliders, part = self.conditions.colliders, self.free_normal
+        if colliders is None or part is None:
             return Projection(self.free)
-        return Projection(self.free, jnp.where(touch.held[:, None], grasp.normal, 0))
+        return Projection(self.free, jnp.where(colliders.held[:, None], part.direction, 0))
 
     @property
     def prescribed(self) -> NodeVector:
         """The velocity [m/s], shape (n, d), of what is held."""
-        grasp = self.grasp
-        if grasp is None:
+        part = self.free_normal
+        if part is None:
             return self.conditions.velocity
-        return jnp.where(self.free, grasp.normal * grasp.speed[:, None], self.conditions.velocity)
+        return jnp.where(self.free, part.direction * part.speed[:, None], self.conditions.velocity)
 
     def explicit_velocity(self) -> NodeVector:
         """v* = v^n + Δt f / m + Δt g (derivation, eq. 4)."""
@@ -125,6 +131,16 @@ class Nodes(eqx.Module):
         parts = nodes.per_mass(images.fold(momentum)), nodes.per_mass(images.fold(pull))
         nodes = eqx.tree_at(lambda n: (n.velocity, n.acceleration), nodes, parts)
         return nodes if nodes.viscous is None else eqx.tree_at(lambda n: n.viscous, nodes, images.fold(nodes.viscous))
+
+    def constrained(self, images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None) -> "Nodes":
+        """These nodes folded on the mirrors, with the components `fixed` and the `normals` held too."""
+        nodes, colliders = (
+            eqx.tree_at(lambda n: n.conditions.fixed, self.folded(images), fixed),
+            self.conditions.colliders,
+        )
+        if normals is None or colliders is None:
+            return nodes
+        return eqx.tree_at(lambda n: n.conditions.colliders.held, nodes, colliders.held | normals)
 
 
 def particles_to_grid(
@@ -168,10 +184,10 @@ def particles_to_grid(
             force = scatter(stencil, push, None, grid.size)
             acceleration = acceleration + jnp.where(occupied, force / full, 0)
         conditions = combine(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total)
-        if scene.total and conditions.touch is not None and scene.slides:
-            slid = (conditions.touch.owner >= 0)[:, None] & occupied
-            place = jnp.where(slid, _place(particles, stencil, grid.size) / full, conditions.touch.position)
-            conditions = eqx.tree_at(lambda c: c.touch.position, conditions, place)
+        if scene.total and conditions.colliders is not None and scene.slides:
+            slid = (conditions.colliders.owner >= 0)[:, None] & occupied
+            place = jnp.where(slid, _place(particles, stencil, grid.size) / full, conditions.colliders.position)
+            conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
         nodes = Nodes(
             mass=jnp.where(occupied[:, 0], mass, 0),
             velocity=jnp.where(occupied, momentum / full, 0),
@@ -185,7 +201,7 @@ def particles_to_grid(
             viscous=None
             if resisted is None or not apart
             else -potential.sum_of(potential.viscous_flux(resisted), momentum),
-            contacts=contacts(scene.boundary, grid, window),
+            contacts=contacts_of(scene.boundary, conditions, grid, window),
         )
         return nodes.folded(mirror(scene.boundary, grid, window))
 

@@ -8,12 +8,19 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Int, NodeScalar, NodeVector, Scalar, components, particle_first
 from mpmjax.autodiff import without_derivative
-from mpmjax.boundary import ColliderImpulse, received
+from mpmjax.boundary import (
+    ColliderImpulse,
+    ConstrainedNodes,
+    ContactInfo,
+    constrain,
+    find_active_set,
+    no_contact,
+    received,
+)
 from mpmjax.checks import canonical, checked, require_positive
 from mpmjax.discretisation import Stencil, g2p
-from mpmjax.implicit import Projection, SolveInfo
+from mpmjax.implicit import Projection, SolveInfo, no_solve
 from mpmjax.state import Particles, Scene, is_prepared, prepare
-from mpmjax.stepping._contact import NOTHING, ContactInfo, Held, find_active_set, hold, no_contact, touches
 from mpmjax.stepping._explicit import Explicit
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion, viscous_impulse
 from mpmjax.stepping._nodes import Nodes, particles_to_grid
@@ -80,7 +87,7 @@ def advance(
     )
     new = update(nodes, method)
     outside = (~stencil.inside).sum().astype(jnp.int32)
-    touch = nodes.conditions.touch
+    touch = nodes.conditions.colliders
     if touch is not None and new.motion.mean is not None:
         touch = touch.after(dt / 2, new.motion.mean)
     exchange = None if touch is None else received(touch, new.reaction, new.push, new.rub)
@@ -98,29 +105,31 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     """The nodes' motion, boundaries and contact included."""
     with jax.named_scope("update"):
         guess = method.initial_guess(nodes)
-        if not touches(nodes):
+        if not nodes.contacts:
             motion, info = method.advance(nodes, guess)
             elastic, reaction, viscous = impulses(nodes, method, motion)
-            push = hold(nodes, NOTHING).pushes(reaction)
+            push = constrain(nodes, ()).collider_impulse(reaction)
             free, none = nodes.projection, no_contact()
             return GridUpdate(nodes.velocity, motion, elastic, viscous, reaction, None, free, info, none, push)
 
-        def moved(held: Held, method: AbstractIntegrator, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+        def moved(
+            held: ConstrainedNodes, method: AbstractIntegrator, guess: NodeVector
+        ) -> tuple[NodeMotion, SolveInfo]:
             motion, info = method.advance(held.nodes, guess)
             return jax.tree.map(held.images.unfold, motion), info
 
         frozen, frozen_method, guess = without_derivative((nodes, method, guess))
 
-        def attempt(held: Held, guess: NodeVector) -> tuple:
+        def attempt(held: ConstrainedNodes, guess: NodeVector) -> tuple:
             motion, info = moved(held, frozen_method, guess)
             return motion.velocity, impulses(frozen, frozen_method, motion)[1], motion.carrier, info
 
-        active, guess, cost, sweeps = find_active_set(frozen, guess, attempt)
-        held = hold(nodes, active)
+        active, guess, cost, sweeps = find_active_set(frozen, guess, attempt, no_solve(guess.dtype))
+        held = constrain(nodes, active)
         motion, info = moved(held, method, guess)
         elastic, reaction, viscous = impulses(nodes, method, motion)
-        push = held.pushes(reaction)
-        slowed, rub = held.collider_friction(held.wall_friction(motion.velocity, reaction), push)
+        push = held.collider_impulse(reaction)
+        slowed, rub = held.friction(motion.velocity, reaction)
         loss = slowed - motion.velocity
         return GridUpdate(
             before=held.images.unfold(held.nodes.velocity),
@@ -129,7 +138,7 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
             viscous=viscous,
             reaction=reaction,
             friction=nodes.mass[:, None] * loss,
-            free=held.untouched,
+            free=Projection(*held.beyond_boundaries()),
             solve=cost.followed_by(info),
             contact=ContactInfo(sweeps, held.count_violations(motion.velocity, reaction)),
             push=push,

@@ -1,0 +1,319 @@
+"""Contact: boundaries that push but do not pull.
+
+At each place of such a boundary the velocity v with which the gap opens and the normal impulse r obey v ≥ 0, r ≥ 0,
+v r = 0. A place is a node, or for a contact plane a column of nodes, described at all of its nodes; masks of places
+have shape (n,). The *active set* is the mask of the places that are held shut, one for each contact.
+
+The active set is guessed as the places into which the explicit velocity v* drives the material. Then, at most `SWEEPS`
+times: solve with the active set held; release the places that would have to pull, hold those that are entered; stop
+when nothing changes. The conditions that are violated after that are counted in `ContactInfo.violations`. The last
+solve, with the set settled and started from the last sweep's result, is the one that is differentiated: its derivative
+is that of the active set found, and does not exist where the set changes.
+
+Friction is an impulse at the places held, applied after the solve against the tangential velocity (at a collider, that
+relative to it) and at most μ times the normal impulse (Coulomb). It is not part of the implicit system, so it lags by
+the elastic response of one step.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
+from mpmjax.boundary._conditions import Conditions
+from mpmjax.boundary._mirror import Image, Mirror
+
+SWEEPS = 4
+"""Most active sets that are tried in a step."""
+
+ActiveSet = tuple[Bool[Array, "n"], ...]
+"""The places that are held, one mask for each contact."""
+
+
+class AbstractNodes(eqx.Module):
+    """What contact needs to know of a step's nodes."""
+
+    mass: eqx.AbstractVar[NodeScalar]
+    """m_i [kg], shape (n,)."""
+    conditions: eqx.AbstractVar[Conditions]
+    """What boundaries prescribe."""
+    contacts: eqx.AbstractVar[tuple["AbstractContact", ...]]
+    """The boundaries that may be left."""
+
+    @property
+    @abc.abstractmethod
+    def free(self) -> Mask:
+        """The components of velocity that nothing prescribes, on nodes that have mass, shape (n, d)."""
+
+    @property
+    @abc.abstractmethod
+    def free_normal(self) -> Any:
+        """The free part of the colliders' normals; None without colliders."""
+
+    @property
+    @abc.abstractmethod
+    def projection(self) -> Any:
+        """The projection on what nothing holds."""
+
+    @property
+    @abc.abstractmethod
+    def mirror(self) -> Mirror:
+        """The mirror images of symmetry planes, and of the columns that are held."""
+
+    @abc.abstractmethod
+    def constrained(self, images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None) -> Any:
+        """These nodes with more of them held.
+
+        Args:
+            images: mirrors on which the nodes are folded.
+            fixed: components of velocity that are prescribed, shape (n, d).
+            normals: nodes whose component along a collider's normal is held too, shape (n,).
+        """
+
+    @abc.abstractmethod
+    def explicit_velocity(self) -> NodeVector:
+        """v* [m/s], shape (n, d)."""
+
+
+class AbstractContact(eqx.Module):
+    """A boundary that pushes but does not pull."""
+
+    of_collider: ClassVar[bool] = False
+    """Whether colliders receive its friction."""
+
+    @property
+    def mirror_image(self) -> Image | None:
+        """The mirror that stands in the places held; None without one."""
+        return None
+
+    @abc.abstractmethod
+    def gap_velocity(self, held: "ConstrainedNodes", v: NodeVector) -> NodeScalar:
+        """The rate at which the gap opens, shape (n,): below zero where it closes, zero where there is no contact. Any
+        positive multiple of a velocity will do, such as the momentum of a column.
+
+        Args:
+            held: the nodes with an active set held.
+            v: velocity of all nodes [m/s], shape (n, d).
+        """
+
+    @abc.abstractmethod
+    def normal_impulse(self, held: "ConstrainedNodes", residual: NodeVector) -> NodeScalar:
+        """The impulse by which the boundary holds each place [kg m/s], shape (n,): below zero where it pulls.
+
+        Args:
+            held: the nodes with an active set held.
+            residual: the impulse that is missing at each node [kg m/s], shape (n, d).
+        """
+
+    @abc.abstractmethod
+    def rounding(self, held: "ConstrainedNodes", noise: Array) -> tuple[Array, Array]:
+        """How far the gap velocity and the normal impulse may lie below zero by rounding, each (n,) or a number.
+
+        Args:
+            held: the nodes with an active set held.
+            noise: the rounding of a velocity [m/s].
+        """
+
+    @abc.abstractmethod
+    def friction(self, held: "ConstrainedNodes", active: Array, v: NodeVector, residual: NodeVector) -> NodeVector:
+        """The change of velocity by Coulomb friction [m/s], shape (n, d), on true nodes.
+
+        Args:
+            held: the nodes with the active set held.
+            active: the places of this contact that are held, shape (n,).
+            v: velocity of all nodes [m/s], shape (n, d).
+            residual: the impulse that is missing at each node [kg m/s], shape (n, d).
+        """
+
+    @abc.abstractmethod
+    def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
+        """The components of velocity on which the held places act, shape (n, d)."""
+
+    def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
+        """The components of velocity that are zero at the places held, shape (n, d)."""
+        del active
+        return jnp.zeros(shape, bool)
+
+    def normals(self, active: Array) -> Bool[Array, "n"] | None:
+        """The nodes whose component along a collider's normal is held, shape (n,); None without any."""
+        del active
+        return None
+
+    def blocked(self, held: "ConstrainedNodes", v: NodeVector, noise: Array) -> Bool[Array, "n"] | None:
+        """The places that must be released because another boundary drives their nodes away; None without any."""
+        del held, v, noise
+        return None
+
+    def representative(self) -> Bool[Array, "n"] | None:
+        """One node of each place, shape (n,), by which places are counted; None where each node is a place."""
+        return None
+
+
+class ContactInfo(eqx.Module):
+    """How the active set was found."""
+
+    sweeps: Int[Array, "*f"]
+    """Solves before the last one."""
+    violations: Int[Array, "*f"]
+    """Places that pull or are entered all the same."""
+
+
+def no_contact() -> ContactInfo:
+    """The report of a scene without contact."""
+    zero = jnp.asarray(0, dtype=jnp.int32)
+    return ContactInfo(zero, zero)
+
+
+class ConstrainedNodes(eqx.Module):
+    """The nodes while an active set is held; see `constrain`."""
+
+    free: Any
+    """The nodes of which no contact holds anything."""
+    active: ActiveSet
+    """What is held."""
+    images: Mirror
+    """The mirrors in the columns that are held."""
+    nodes: Any
+    """The nodes with the active set held."""
+
+    @property
+    def normal(self) -> NodeVector | None:
+        """The free parts of the normals that colliders hold, of length one, shape (n, d); None without colliders."""
+        return None if self.free.conditions.colliders is None else self.nodes.projection.normal
+
+    @property
+    def mass(self) -> NodeScalar:
+        """The nodes' mass, folded on the mirrors [kg], shape (n,)."""
+        return self.images.fold_scalar(self.free.mass)
+
+    def beyond_boundaries(self) -> tuple[Mask, NodeVector | None]:
+        """The components of velocity on which no boundary acts, shape (n, d), and the normals that colliders hold."""
+        free, normal = self.free.free, self.normal
+        for contact, active in zip(self.free.contacts, self.active, strict=True):
+            free = free & ~contact.reached(active, free.shape)
+        return free, None if normal is None else jnp.where(free, normal, 0)
+
+    def collider_impulse(self, residual: NodeVector) -> NodeScalar | None:
+        """The impulse by which colliders hold each node along their normals [kg m/s], shape (n,), outward positive;
+        None without colliders.
+
+        Args:
+            residual: the impulse that is missing at each node [kg m/s], shape (n, d). It is the collider's impulse
+                times n, plus what holds the prescribed components: along the free part of n it is the impulse alone,
+                times the part's length.
+        """
+        part, normal = self.nodes.free_normal, self.normal
+        if part is None or normal is None:
+            return None
+        return (normal * self.images.fold(residual)).sum(axis=1) / part.length
+
+    def beside_colliders(self, residual: NodeVector) -> NodeVector:
+        """The residual without what colliders hold along their normals: what walls and planes hold."""
+        impulse, colliders = self.collider_impulse(residual), self.free.conditions.colliders
+        return residual if impulse is None else residual - impulse[:, None] * colliders.normal
+
+    def violations(self, v: NodeVector, residual: NodeVector) -> tuple[ActiveSet, ActiveSet]:
+        """The held places that pull, and the others that are entered, beyond rounding.
+
+        Args:
+            v: velocity of all nodes after the solve [m/s], shape (n, d).
+            residual: the impulse that is missing at each node [kg m/s], shape (n, d).
+        """
+        noise = jnp.sqrt(jnp.finfo(v.dtype).eps) * jnp.abs(v).max()
+        pulling, entering = [], []
+        for contact, active in zip(self.free.contacts, self.active, strict=True):
+            gap, impulse = contact.rounding(self, noise)
+            pulls = contact.normal_impulse(self, residual) < -impulse
+            blocked = contact.blocked(self, v, noise)
+            pulling.append(active & (pulls if blocked is None else pulls | blocked))
+            entering.append(~active & (contact.gap_velocity(self, v) < -gap))
+        return tuple(pulling), tuple(entering)
+
+    def count_violations(self, v: NodeVector, residual: NodeVector) -> Int[Array, ""]:
+        """How many places pull or are entered."""
+        return _count(self.free, *self.violations(v, residual))
+
+    def friction(self, v: NodeVector, residual: NodeVector) -> tuple[NodeVector, NodeVector | None]:
+        """The velocity after Coulomb friction, one contact after the other, and the impulse of colliders' friction
+        [kg m/s]; None without any.
+
+        Args:
+            v: velocity of all nodes after the solve [m/s], shape (n, d).
+            residual: the impulse that is missing at each node [kg m/s], shape (n, d).
+        """
+        impulse = None
+        for contact, active in zip(self.free.contacts, self.active, strict=True):
+            change = contact.friction(self, active, v, residual)
+            v = v + change
+            if contact.of_collider:
+                impulse = self.free.mass[:, None] * self.images.unfold(change)
+        return self.images.unfold(v), impulse
+
+
+def constrain(nodes: AbstractNodes, active: ActiveSet) -> ConstrainedNodes:
+    """The nodes with an active set held.
+
+    Args:
+        nodes: nodes of which no contact holds anything yet.
+        active: what is held.
+    """
+    pairs = list(zip(nodes.contacts, active, strict=True))
+    images = Mirror(tuple(image.within(mask) for contact, mask in pairs if (image := contact.mirror_image) is not None))
+    fixed, normals = nodes.conditions.fixed, None
+    for contact, mask in pairs:
+        fixed = fixed | contact.fixed(mask, fixed.shape)
+        along = contact.normals(mask)
+        normals = along if normals is None else normals
+    return ConstrainedNodes(nodes, active, images, nodes.constrained(images, fixed, normals))
+
+
+def find_active_set(
+    nodes: AbstractNodes,
+    guess: NodeVector,
+    attempt: Callable[[ConstrainedNodes, NodeVector], tuple[NodeVector, NodeVector, NodeVector, Any]],
+    cost: Any,
+) -> tuple[ActiveSet, NodeVector, Any, Int[Array, ""]]:
+    """The active set, a velocity to start the last solve from, and what the sweeps cost.
+
+    Args:
+        nodes: nodes of which no contact holds anything yet.
+        guess: where the first solve starts [m/s], shape (n, d).
+        attempt: (constrained nodes, guess) to (velocity, missing impulse [kg m/s] of all nodes, guess of the next
+            solve, report). It is not differentiated.
+        cost: the report of no solve.
+
+    Returns:
+        active set, velocity, the sweeps' reports added up, number of sweeps.
+    """
+
+    def sweep(state: tuple) -> tuple:
+        active, guess, cost, _, count = state
+        held = constrain(nodes, active)
+        v, residual, guess, info = attempt(held, guess)
+        pulls, enters = held.violations(v, residual)
+        active = jax.tree.map(lambda was, pulled, entered: (was & ~pulled) | entered, active, pulls, enters)
+        return active, guess, cost.followed_by(info), _count(nodes, pulls, enters) > 0, count + 1
+
+    def unsettled(state: tuple) -> Array:
+        return state[3] & (state[4] < SWEEPS)
+
+    predictor = nodes.explicit_velocity()
+    nothing_held = ConstrainedNodes(nodes, (), Mirror(()), nodes)
+    active = tuple(contact.gap_velocity(nothing_held, predictor) < 0 for contact in nodes.contacts)
+    start = (active, guess, cost, jnp.asarray(True), jnp.asarray(0, dtype=jnp.int32))
+    active, guess, cost, _, count = jax.lax.while_loop(unsettled, sweep, start)
+    return active, guess, cost, count
+
+
+def _count(nodes: AbstractNodes, *sets: ActiveSet) -> Int[Array, ""]:
+    """How many places some sets have."""
+    total = jnp.asarray(0, dtype=jnp.int32)
+    for part in sets:
+        for contact, mask in zip(nodes.contacts, part, strict=True):
+            one = contact.representative()
+            total = total + (mask if one is None else mask & one).sum().astype(jnp.int32)
+    return total

@@ -1,0 +1,108 @@
+"""Contact with mirrored planes."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, Scalar
+from mpmjax.boundary._conditions import AbstractBoundary
+from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
+from mpmjax.boundary._mirror import Image, Mirror, image_of
+from mpmjax.boundary._planes import ContactPlane
+from mpmjax.boundary._wall_contact import friction_across
+from mpmjax.discretisation import Grid
+
+
+class PlaneContact(AbstractContact):
+    """A contact plane in the window. Each column of nodes along its normal is a place, described at all of its nodes.
+
+    Holding a column means that its nodes beyond the plane mirror those before it. The normal impulse r is that of the
+    column's nodes on the plane and twice that of the images (a node and its image share equally). The gap velocity is
+    what r works on: the mean, with weights 2 m m'/(m + m'), of the v + v' of nodes and their images, and of the v of
+    nodes on the plane (where the two are one). So an explicit step that holds the column has
+    r = −Σ 2 m m'/(m + m') (v* + v*'), and the two conditions exclude each other. Columns that are each other's image in
+    another plane are held together. Friction acts on the column's node on the plane, or half a spacing before it.
+    """
+
+    image: Image
+    """The mirror."""
+    inward: int = eqx.field(static=True)
+    """The inward normal's component: +1 or −1."""
+    before: Int[Array, "m"]
+    """How many half spacings each node along the axis lies before the plane, shape (m,)."""
+    coefficient: Scalar
+    """Coulomb coefficient [-]."""
+
+    @property
+    def mirror_image(self) -> Image:
+        return self.image
+
+    @property
+    def axis(self) -> int:
+        """The direction of its normal."""
+        return self.image.axis
+
+    def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> NodeScalar:
+        """The momentum with which each column leaves the plane [kg m/s]: its weights times what its velocity lacks of
+        the mirror's."""
+        lacking = (v - self.image.vector(v))[:, self.image.axis]
+        return self._tied(held, self.inward * self.image.column(self._weight(held.free.mass) * lacking))
+
+    def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> NodeScalar:
+        """The normal impulse of each column [kg m/s]."""
+        return self._tied(held, self._column_impulse(held, residual))
+
+    def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
+        """That of a column's momentum, for both."""
+        least = noise * self._tied(held, self.image.column(self._weight(held.free.mass)))
+        return least, least
+
+    def friction(self, held: ConstrainedNodes, active: Array, v: NodeVector, residual: NodeVector) -> NodeVector:
+        impulse = jnp.where(active & self.representative(), self._column_impulse(held, residual), 0)
+        limit = self.coefficient * jnp.maximum(held.images.fold_scalar(impulse), 0)
+        return friction_across(held, self.image.axis, limit, v)
+
+    def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
+        """The normal component of the nodes on the plane."""
+        on_plane = self.image.along(self.before == 0)
+        return (active & on_plane)[:, None] & (jnp.arange(shape[1]) == self.image.axis)
+
+    def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
+        """All components of the columns held."""
+        return jnp.broadcast_to(active[:, None], shape)
+
+    def representative(self) -> Bool[Array, "n"]:
+        """The node on the plane or, where there is none, half a spacing before it."""
+        return self.image.along((self.before == 0) | (self.before == 1))
+
+    def _weight(self, mass: NodeScalar) -> NodeScalar:
+        """2 m m'/(m + m') [kg] at nodes beyond the plane, m on it, zero before it, shape (n,)."""
+        mirrored = self.image.scalar(mass)
+        both = mass + mirrored
+        harmonic = 2 * mass * mirrored / jnp.where(both == 0, 1, both)
+        return jnp.where(self.image.along(self.before <= 0), harmonic, 0)
+
+    def _column_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> NodeScalar:
+        """The normal impulse that holds each column by itself [kg m/s], shape (n,)."""
+        impulse = held.beside_colliders(residual)
+        share = self.image.along(jnp.where(self.before < 0, 2, jnp.where(self.before == 0, 1, 0)))
+        return self.inward * self.image.column(share.astype(impulse.dtype) * impulse[:, self.image.axis])
+
+    def _tied(self, held: ConstrainedNodes, columns: NodeScalar) -> NodeScalar:
+        """A quantity of the columns, summed over columns that are each other's image in other planes, shape (n,)."""
+        contacts = (image for c in held.free.contacts if (image := c.mirror_image) is not None)
+        for image in (*contacts, *held.free.mirror.images):
+            if image.axis != self.image.axis:
+                columns = image.scalar(Mirror((image,)).fold_scalar(columns))
+        return columns
+
+
+def plane_contacts(
+    boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"]
+) -> tuple[PlaneContact, ...]:
+    """A scene's contact planes."""
+    found = []
+    for plane in boundaries:
+        if isinstance(plane, ContactPlane):
+            image, before = image_of(plane, grid, window)
+            found.append(PlaneContact(image, 1 if plane.keep == "above" else -1, before, plane.friction))
+    return tuple(found)
