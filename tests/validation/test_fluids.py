@@ -111,7 +111,7 @@ METHODS = {
     "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
     "trbdf2": mpm.TRBDF2(0.0, mpm.Linearised(TIGHT)),
 }
-EACH_METHOD = pytest.mark.parametrize("method", **ids(METHODS, ("explicit", "implicit_midpoint")))
+EACH_METHOD = pytest.mark.parametrize("method", **ids(METHODS, "explicit", ("implicit_midpoint",)))
 
 
 def started(rest, v, C, **fields):
