@@ -92,7 +92,7 @@ def ids(registry: dict, default: str | Collection[str] | None = None, thorough: 
 
 
 def thorough(*cases: object) -> list:
-    """Cases of a parametrised test that the default run leaves out; of several arguments each is a tuple."""
+    """Cases of a parametrised test that the default run leaves out. A tuple holds the values of several arguments."""
     return [pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.thorough) for case in cases]
 
 

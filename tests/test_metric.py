@@ -52,8 +52,9 @@ def test_undeformed_it_is_the_operators_diagonal(description, gradient, d):
     assert_close(metric.ravel(), jnp.diag(matrix), 1e-13)
 
 
-@pytest.mark.parametrize("law", [*thorough("fixed_corotated"), "neo_hookean"])
-@pytest.mark.parametrize("description", **ids(DESCRIPTIONS, "updated"))
+@pytest.mark.thorough
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
 def test_deformed_it_scales_the_operator_whatever_the_law_and_the_walls(description, law):
     """Positive, one on identity rows, the same from the energy alone, and near the diagonal: without products of
     slopes, and at a symmetry plane without those of a node's with its image's."""
@@ -70,6 +71,7 @@ def test_deformed_it_scales_the_operator_whatever_the_law_and_the_walls(descript
     assert 0.5 < (exact / metric[free]).min() <= (exact / metric[free]).max() < 2
 
 
+@pytest.mark.thorough
 def test_negative_stiffness_is_left_out():
     """Of a fixed corotated body at a tenth of its volume, whose Hessian is indefinite."""
     scene, particles = block(2)
@@ -114,6 +116,7 @@ def test_at_a_contrast_of_stiffness_it_takes_a_fraction_of_the_iterations(method
         assert_close(getattr(by_diagonal, name), getattr(by_mass, name), 1e-8)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("second", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_gradients_do_not_depend_on_it(second):
     """Through the tangent and the adjoint solve, which work in it too."""
@@ -132,6 +135,7 @@ def test_gradients_do_not_depend_on_it(second):
     np.testing.assert_allclose(by_diagonal, by_mass, rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_newton_in_single_precision_knows_its_rounding_in_either():
     """Asked for more than float32 can give, it stops at the same floor, and says that it converged."""
     scene, particles, dt = layered(1e3, 60.0, dtype=jnp.float32)

@@ -147,6 +147,7 @@ def test_a_tangent_that_is_not_solved_has_no_growth_and_is_named():
     assert np.isnan(report.growth).all()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 def test_growth_is_that_of_the_reverse_mode_gradient(factor):
     """Over 100, 200 and 400 steps, stable and not: gradients of functions of the final positions grow as the tangent
