@@ -297,6 +297,7 @@ def test_a_corrupt_file_gets_one_line(folder, tmp_path):
     assert "png" in refused("render", folder / "run.h5", "-o", tmp_path / "a.xyz")
 
 
+@pytest.mark.thorough
 def test_a_run_that_blows_up_keeps_what_was_written(tmp_path):
     """An explicit run far beyond its limit names step, time and particle; its good frames stay."""
     scene = tmp_path / "wild.toml"

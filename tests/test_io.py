@@ -221,9 +221,9 @@ def test_the_file_says_what_it_holds(tmp_path):
 # A run recorded as it goes -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stepper", **ids(STEPPERS))
+@pytest.mark.parametrize("stepper", **ids(STEPPERS, "explicit"))
 @pytest.mark.parametrize("dtype", **ids(DTYPES, "float64", ()))
-@pytest.mark.parametrize("law", [None, mpm.Snow(1e4, critical_stretch=1e-4)], ids=["elastic", "snow"])
+@pytest.mark.parametrize("law", [None, *thorough(mpm.Snow(1e4, critical_stretch=1e-4))], ids=["elastic", "snow"])
 def test_recorded_resumed_and_simulated_runs_are_equal_bit_for_bit(law, dtype, stepper, tmp_path):
     """Chunks, a restart between frames and one single solve give the same numbers, from one compilation."""
     (method, dt), (scene, particles) = stepper, jelly(dtype, **({} if law is None else {"material": law}))

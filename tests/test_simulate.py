@@ -390,7 +390,7 @@ def test_the_number_of_steps_is_robust_to_rounding():
     assert int(mpm.simulate(scene, particles, t1=0.3 / 100, dt=0.1 / 100).tally.steps) == 3
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("dtype", [*thorough(jnp.float32), jnp.float64])
 def test_the_stable_step_is_the_longest_of_whole_steps(dtype):
     """At or below the bound, one step fewer being above it; the run says it, and is that of the number."""
     scene, particles = pulled()
@@ -421,6 +421,7 @@ def test_the_stable_step_is_asked_for_outside_of_transformations():
         jax.grad(moved)(1e4)
 
 
+@pytest.mark.thorough
 def test_progress_changes_nothing(capsys):
     """A meter is shown, and the result is the same bit for bit."""
     scene, particles = pulled()
