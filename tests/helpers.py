@@ -35,7 +35,7 @@ VISCOUS = {
 }
 """Laws with viscosity beside them."""
 QUICK = ("explicit", "semi_implicit")
-"""The updates that run by default where every update is tested at length."""
+"""The updates of the default and the thorough tests where every update is tested at length."""
 DESCRIPTIONS = {"updated": mpm.UpdatedLagrangian(), "total": mpm.TotalLagrangian()}
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(), "backward_euler": mpm.BackwardEuler()}
 SECOND_ORDER = {"implicit_midpoint": mpm.ImplicitMidpoint(), "trbdf2": mpm.TRBDF2()}
@@ -78,14 +78,22 @@ SECOND = {
 """Second derivatives."""
 
 
-def ids(registry: dict, default: Collection[str] | None = None) -> dict:
-    """The keyword arguments that parametrise a test over a registry; what is not among the `default` names is slow."""
-    values = list(registry.values())
-    if default is not None:
-        values = [
-            pytest.param(value, marks=[pytest.mark.slow] * (name not in default)) for name, value in registry.items()
-        ]
+def ids(registry: dict, default: str | Collection[str] | None = None, thorough: Collection[str] | None = None) -> dict:
+    """The keyword arguments that parametrise a test over a registry. The names in `default` belong to the default run;
+    without it all do. The other names are marked thorough, or where `thorough` is given, those in it thorough and what
+    is in neither slow."""
+    default = {default} if isinstance(default, str) else set(registry if default is None else default)
+    thorough = set(registry) if thorough is None else set(thorough)
+    values = []
+    for name, value in registry.items():
+        further = pytest.mark.thorough if name in thorough else pytest.mark.slow
+        values.append(value if name in default else pytest.param(value, marks=further))
     return {"argvalues": values, "ids": list(registry)}
+
+
+def thorough(*cases: object) -> list:
+    """Cases of a parametrised test that the default run leaves out. A tuple holds the values of several arguments."""
+    return [pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.thorough) for case in cases]
 
 
 def rotation_matrix(d: int, rng: np.random.Generator) -> np.ndarray:

@@ -22,7 +22,7 @@ class Wind(mpm.AbstractBodyForce):
         return (1 + self.rate * t) * self.strength + self.slope * x
 
 
-@pytest.mark.parametrize("method", **ids(METHODS))
+@pytest.mark.parametrize("method", **ids(METHODS, "explicit"))
 def test_a_uniform_body_force_is_gravity(method):
     """Also at a symmetry plane, whose normal pull it must not exert."""
     g = jnp.asarray([0.7, -2.0])
@@ -43,7 +43,7 @@ def test_a_body_force_is_that_of_the_start_of_the_step():
     np.testing.assert_allclose(after.v, 0.01 * (1 + 3.0 * 0.5 + 2.0 * 0.33), rtol=1e-13)
 
 
-@pytest.mark.parametrize("method", **ids(SECOND_ORDER))
+@pytest.mark.parametrize("method", **ids(SECOND_ORDER, "trbdf2"))
 def test_methods_of_second_order_take_it_half_a_step_on(method):
     """A lone particle gains Δt b(x + ½Δt v, t + ½Δt), and moves with the mean of its velocities."""
     x, one, dt = jnp.full((1, 1), 0.33), jnp.ones(1), 0.01

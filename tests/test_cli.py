@@ -56,6 +56,7 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.thorough
 def test_summary_says_how_many_steps_were_indefinite(folder):
     """And is silent where none was."""
     job, run = read_job(folder / "scene.toml"), mpm.load(folder / "run.h5")
@@ -115,6 +116,7 @@ def test_what_is_no_run_is_neither_replaced_nor_continued(folder, choice):
     assert scene.read_text() == SCENE
 
 
+@pytest.mark.thorough
 def test_a_full_disk_leaves_no_half_picture(folder, tmp_path):
     """The picture that was there stays."""
     (tmp_path / "run.h5").write_bytes((folder / "run.h5").read_bytes())
@@ -226,6 +228,7 @@ material = 2
 )
 
 
+@pytest.mark.thorough
 def test_a_file_may_name_several_materials(tmp_path):
     """Particles stand by material, in the laws' order, whatever that of their tables; each obeys its own law."""
     (tmp_path / "two.toml").write_text(TWO)
@@ -294,6 +297,7 @@ def test_a_corrupt_file_gets_one_line(folder, tmp_path):
     assert "png" in refused("render", folder / "run.h5", "-o", tmp_path / "a.xyz")
 
 
+@pytest.mark.thorough
 def test_a_run_that_blows_up_keeps_what_was_written(tmp_path):
     """An explicit run far beyond its limit names step, time and particle; its good frames stay."""
     scene = tmp_path / "wild.toml"

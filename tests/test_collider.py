@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import LAWS, QUICK, assert_close, cloud, explicit_limit, ids
+from helpers import LAWS, QUICK, assert_close, cloud, explicit_limit, ids, thorough
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
@@ -25,7 +25,7 @@ METHODS = {
     "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
     "trbdf2": mpm.TRBDF2(0.0, mpm.Linearised(TIGHT)),
 }
-EACH_METHOD = pytest.mark.parametrize("method", **ids(METHODS, QUICK))
+EACH_METHOD = pytest.mark.parametrize("method", **ids(METHODS, "semi_implicit", QUICK))
 DX, DT, G = 0.1, 1e-2, np.array([1.0, -9.81, 2.0])
 LAW = LAWS["fixed_corotated"]
 BALL = mpm.Ball((0.31, 0.02), 0.22)
@@ -82,6 +82,7 @@ def test_what_colliders_hold_moves_with_them(method):
     assert_close(beside[touched & floor, 0], np.zeros((touched & floor).sum()), 0, 1e-11 * np.abs(step.reaction).max())
 
 
+@pytest.mark.thorough
 def test_a_body_stands_where_its_motion_takes_it():
     """At t the nodes are those of the shape moved and turned, and the normals turn with it."""
     grid = mpm.Grid((30, 30), DX, origin=(-10, -10))
@@ -99,6 +100,7 @@ def test_a_body_stands_where_its_motion_takes_it():
     assert_close(touch.pivots, shift[None], 1e-14)
 
 
+@pytest.mark.thorough
 def test_of_two_bodies_normals_the_earlier_holds_and_a_prescribed_component_is_allowed_for():
     """And a normal that prescribed components hold already asks nothing."""
     grid, particles = cloud(2, p=60)
@@ -146,6 +148,7 @@ def test_what_the_earlier_holds_the_later_neither_lets_go_nor_rubs_nor_receives(
     np.testing.assert_array_equal(touch.holder[:, 0], np.where(later, 0, -1))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("preconditioner", [mpm.DiagonalPreconditioner(), mpm.MassPreconditioner()])
 def test_the_operator_is_symmetric_and_its_inner_product_commutes_with_the_projection(preconditioner):
     """Q (M + cH) Q and the identity, or the mass, on the rest; beside fixed components too."""
@@ -173,6 +176,7 @@ def test_the_operator_is_symmetric_and_its_inner_product_commutes_with_the_proje
     assert np.linalg.norm(share, 2) < 1 + 1e-12
 
 
+@pytest.mark.thorough
 def test_a_linear_solve_with_a_collider_is_the_dense_one():
     """min over what Q leaves free, by dense algebra from Q and the unconstrained matrix."""
     grid, particles = cloud(2, p=12, cells=3)
@@ -210,7 +214,7 @@ def obstacles(friction, d=2):
     return ball, slope
 
 
-@EACH_METHOD
+@pytest.mark.parametrize("method", **ids(METHODS, "explicit", QUICK))
 def test_a_separating_collider_pushes_never_pulls_and_is_not_entered(method):
     """(v − v_c)·n ≥ 0, push ≥ 0, and their product zero at every node, with a wall beside."""
     grid, particles = landing()
@@ -236,7 +240,7 @@ def test_a_separating_collider_pushes_never_pulls_and_is_not_entered(method):
 
 
 @pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.slow)])
-@EACH_METHOD
+@pytest.mark.parametrize("method", **ids(METHODS, "explicit", QUICK))
 def test_what_colliders_receive_is_what_the_material_loses(method, d):
     """Change of momentum + impulse on all colliders = gravity's, with friction, sticking, sliding and separation."""
     grid, particles = landing(d)
@@ -256,6 +260,7 @@ def test_what_colliders_receive_is_what_the_material_loses(method, d):
     assert info.contact.violations == 0
 
 
+@pytest.mark.thorough
 def test_forces_on_colliders_against_time(tmp_path):
     """Between frames the mean force is the impulses of the steps over the time; restarted from a file it goes on from
     where it was; a block presses on the ground with its weight and what its momentum loses."""
@@ -306,8 +311,8 @@ def test_the_force_on_a_collider_can_be_differentiated():
     assert float(slope) == pytest.approx(float(force(1e5 + 10) - force(1e5 - 10)) / 20, rel=1e-6)
 
 
-@pytest.mark.parametrize("mu", [0.2, 1e5])
-@pytest.mark.parametrize("name", ["explicit", "semi_implicit", "implicit_midpoint"])
+@pytest.mark.parametrize("mu", [0.2, *thorough(1e5)])
+@pytest.mark.parametrize("name", ["explicit", *thorough("semi_implicit", "implicit_midpoint")])
 def test_friction_opposes_slip_by_at_most_mu_times_the_push(name, mu):
     """Relative to the collider: where it does not stop a node, exactly μ push, against the slip that is left."""
     grid, particles = landing()
@@ -331,6 +336,7 @@ def test_friction_opposes_slip_by_at_most_mu_times_the_push(name, mu):
         assert not slides.any()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("floor", ["box", "plane"])
 def test_friction_of_a_wall_leaves_alone_what_others_hold(floor):
     """At a node that a moving body holds along an oblique normal, or a grip in one direction, the wall's friction acts
@@ -366,7 +372,7 @@ def test_friction_of_a_wall_leaves_alone_what_others_hold(floor):
         assert np.isclose(size, mu * push, rtol=1e-9)[rubbed & held].sum() > 3
 
 
-@pytest.mark.parametrize("name", ["explicit", "semi_implicit"])
+@pytest.mark.parametrize("name", ["explicit", *thorough("semi_implicit")])
 def test_a_collider_lets_go_freely(name):
     """A block that a tilted floor does not hold leaves as if there were none."""
     grid, block = landing()
@@ -465,6 +471,7 @@ def test_what_cannot_work_is_refused(boundary, options, message):
         mpm.SeparatingCollider(BALL, friction=-1.0)
 
 
+@pytest.mark.thorough
 def test_a_slip_half_space_in_the_total_description_is_a_slip_box():
     """Axis-aligned, to the last bit but those of a normal's length."""
     grid, block = landing()
@@ -478,6 +485,7 @@ def test_a_slip_half_space_in_the_total_description_is_a_slip_box():
     assert_close(runs[0].x, runs[1].x, 1e-11)
 
 
+@pytest.mark.thorough
 def test_single_precision_stays_single():
     """Under strict promotion, in the updates and in what is reported."""
     grid, block = landing()
@@ -497,6 +505,7 @@ UPDATES = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["separating", *(pytest.param(k, marks=pytest.mark.slow) for k in ("slip", "sticky"))])
 @pytest.mark.parametrize("name", UPDATES)
 def test_derivatives_by_a_colliders_motion_shape_and_friction(name, kind):

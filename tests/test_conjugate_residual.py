@@ -368,6 +368,7 @@ def block_and_stray(multiple):
     return ImplicitOperator(node_mass, factor, hessian, Projection(free)), jnp.where(free, momentum, 0)
 
 
+@pytest.mark.thorough
 def test_the_references_plain_inner_product_fails_on_a_nearly_empty_node():
     """Kept to show why not: an elastic block and a stray particle that leaves 1e-11 of its mass on some nodes.
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import METHODS, QUICK, SECOND_ORDER, assert_close, block, ids
+from helpers import METHODS, QUICK, SECOND_ORDER, assert_close, block, ids, thorough
 
 import mpmjax as mpm
 
@@ -27,8 +27,10 @@ def halves(d=2, **scene):
     return one, mpm.Scene(grid, (HARD, SOFT), **scene), particles
 
 
-@pytest.mark.parametrize("description", [mpm.UpdatedLagrangian(), mpm.TotalLagrangian()], ids=["updated", "total"])
-@pytest.mark.parametrize("method", **ids(METHODS | SECOND_ORDER, QUICK))
+@pytest.mark.parametrize(
+    "description", [mpm.UpdatedLagrangian(), *thorough(mpm.TotalLagrangian())], ids=["updated", "total"]
+)
+@pytest.mark.parametrize("method", **ids(METHODS | SECOND_ORDER, "semi_implicit", QUICK))
 def test_two_materials_are_one_with_a_modulus_for_each_particle(method, description):
     """The same motion to the solver's tolerance, by every update."""
     one, two, particles = halves(gravity=(0.0, -5.0), description=description)
@@ -39,6 +41,7 @@ def test_two_materials_are_one_with_a_modulus_for_each_particle(method, descript
     assert float(mpm.stable_dt(one, ends[0])) == pytest.approx(float(mpm.stable_dt(two, ends[1])), rel=1e-6)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("hessian", [mpm.AnalyticHessian(True), mpm.JvpHessian()], ids=["projected", "jvp"])
 @pytest.mark.parametrize(
     "preconditioner",
@@ -51,7 +54,7 @@ def test_hessians_and_metrics_of_two_materials_are_those_of_one(metric, hessian)
     assert_close(ends[0].x, ends[1].x, 1e-9)
 
 
-@pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in QUICK}, ("explicit",)))
+@pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in QUICK}, "explicit", ()))
 def test_gradients_pass_to_each_material(method):
     """By the two moduli: the sums of one law's over the particles of each."""
     one, two, particles = halves()
@@ -67,6 +70,7 @@ def test_gradients_pass_to_each_material(method):
     assert_close(jnp.stack([law.youngs_modulus for law in by_material]), sums, 1e-5)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("contrast", [1e2, 1e4])
 @pytest.mark.parametrize("method", ["explicit", "semi_implicit"])
 def test_a_bar_of_two_stiffnesses_carries_one_stress(method, contrast):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DIMS, GRADIENTS, KERNELS, assert_close, ids
+from helpers import DIMS, GRADIENTS, KERNELS, assert_close, ids, thorough
 
 import mpmjax as mpm
 from mpmjax.discretisation import _transfer_sums as _transfer_sums
@@ -38,10 +38,10 @@ def example(d, c=3, kernel=QUADRATIC, gradient=MLS, seed=0):
     return x, eqx.filter_jit(place)(x, kernel, gradient), given, nodes
 
 
-@EACH_KERNEL
+@pytest.mark.parametrize("kernel", **ids(KERNELS, "quadratic"))
 @EACH_DIM
-@pytest.mark.parametrize("gradient", **ids(GRADIENTS))
-@pytest.mark.parametrize("c", [1, 3, 6])
+@pytest.mark.parametrize("gradient", **ids(GRADIENTS, "mls"))
+@pytest.mark.parametrize("c", [3, *thorough(1, 6)])
 def test_they_are_the_sums_that_weights_and_gradients_say(c, gradient, d, kernel):
     """Σ_p (w a + Σ_b g_b a_b) and Σ_i w n, Σ_i g n, term by term in NumPy, whichever part of a is given."""
     _, stencil, given, nodes = example(d, c, kernel, gradient)
@@ -74,7 +74,7 @@ def sums(x, given, nodes):
     return scatter(stencil, given[0], given[1:], nodes.shape[0]), jnp.concatenate([value[None], slopes])
 
 
-@EACH_DIM
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_each_is_the_others_transpose(d):
     """By `linear_transpose` and in reverse mode, each by one call of the other and none of itself."""
     _, stencil, given, nodes = example(d)
@@ -87,7 +87,7 @@ def test_each_is_the_others_transpose(d):
     assert (program.count("stencil_scatter"), program.count("stencil_gather")) == (1, 0)
 
 
-@EACH_DIM
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_derivatives_by_everything_are_those_of_the_sums_written_out(d):
     """First and second, by x as well: against the same sums as dense products, in forward and in reverse mode."""
     x, _, given, nodes = example(d)
@@ -123,7 +123,7 @@ def test_derivatives_by_everything_are_those_of_the_sums_written_out(d):
 
 
 @pytest.mark.parametrize("of_nodes", [True, False], ids=["nodes", "stencil"])
-@pytest.mark.parametrize("d", [1, 2])
+@pytest.mark.parametrize("d", [1, *thorough(2)])
 def test_a_batch_is_its_members(d, of_nodes):
     """Batched in what is summed or in the stencil, nested, and differentiated outside of the batch."""
     x, _, given, nodes = example(d)
@@ -157,7 +157,7 @@ def test_a_member_that_is_not_finite_leaves_the_others_as_they_are():
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[1], b[1]), whole, broken)
 
 
-@EACH_DIM
+@pytest.mark.parametrize("d", [1, *thorough(2, 3)])
 def test_the_program_for_other_platforms_is_the_same_sum(d):
     """Where it is not for a CPU nothing is left of the loops: the same numbers, in one kernel a sum."""
     _, stencil, given, nodes = example(d)

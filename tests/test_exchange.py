@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import GRADIENTS, LAWS, assert_close, explicit_limit
+from helpers import GRADIENTS, LAWS, assert_close, explicit_limit, thorough
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
@@ -69,11 +69,13 @@ def boundaries(description, d):
     ("description", "name", "d"),
     [
         ("updated", "explicit", 2),
-        ("updated", "semi_implicit", 2),
-        ("updated", "explicit", 3),
-        ("total", "explicit", 2),
-        ("total", "midpoint", 2),
-        ("total", "explicit", 3),
+        *thorough(
+            ("updated", "semi_implicit", 2),
+            ("updated", "explicit", 3),
+            ("total", "explicit", 2),
+            ("total", "midpoint", 2),
+            ("total", "explicit", 3),
+        ),
     ],
 )
 def test_moments_of_all_boundaries_are_the_change_of_angular_momentum(description, name, d):
@@ -132,6 +134,7 @@ def test_moments_of_all_boundaries_are_the_change_of_angular_momentum(descriptio
     assert description == "updated" or wrong_if_at_reference > 1e-2
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("d", [pytest.param(3, marks=pytest.mark.slow), 2])
 def test_moments_at_the_two_ends_of_a_column_balance(d):
     """One end is held, the other turned by 2 rad (in 3-D about the axis) and shifted; then it comes to rest."""
@@ -157,6 +160,7 @@ def test_moments_at_the_two_ends_of_a_column_balance(d):
     assert np.abs(moments[:, -1]).min() > 1.0
 
 
+@pytest.mark.thorough
 def test_in_the_total_description_the_torque_on_a_slip_half_space_moves_with_the_material():
     """A block that a sticky plate drags along the half-space: at rest the moments on both balance, but for what the
     places of nodes that slide, known by the particles alone, are off."""

@@ -44,14 +44,16 @@ def outcome(x, adjoint=None, **options):
 
 
 CASES = [
-    *((f, None, name in ("vmap", "jit"), name, name in ("jit_grad", "vmap_jit_grad")) for name, f in REVERSE.items()),
-    *((f, diffrax.ForwardMode(), False, name, name == "jit_jvp") for name, f in FORWARD.items()),
+    *((f, None, name in ("vmap", "jit"), name) for name, f in REVERSE.items()),
+    *((f, diffrax.ForwardMode(), False, name) for name, f in FORWARD.items()),
 ]
+MARKS = {"jit_grad": (), "vmap_jit_grad": pytest.mark.thorough, "jit_jvp": pytest.mark.thorough}
+"""Of the others each is slow."""
 
 
 @pytest.mark.parametrize(
     ("transform", "adjoint", "primal"),
-    [pytest.param(*case, id=name, marks=[pytest.mark.slow] * (not now)) for *case, name, now in CASES],
+    [pytest.param(*case, id=name, marks=MARKS.get(name, pytest.mark.slow)) for *case, name in CASES],
 )
 def test_every_transformation_raises_every_fault(transform, adjoint, primal):
     """By its name; so does a tangent or adjoint solve that does not converge, of which numbers alone know nothing."""
@@ -67,6 +69,7 @@ def test_every_transformation_raises_every_fault(transform, adjoint, primal):
         jax.block_until_ready(run(UNDERIVED))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("reverse", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_member_without_a_derivative_leaves_the_others_alone(reverse):
     """With throw=False: NaN where a tangent or adjoint solve did not converge or a parameter is bad, and the others'
@@ -99,6 +102,7 @@ def test_a_member_without_a_derivative_leaves_the_others_alone(reverse):
         assert report[0][0] == report[0][6] == 0
 
 
+@pytest.mark.thorough
 def test_outside_of_jit_neither_a_run_nor_its_gradient_calls_the_host(monkeypatch):
     """A callback would keep their programs out of the cache of compiled ones."""
 
@@ -118,6 +122,7 @@ def test_outside_of_jit_neither_a_run_nor_its_gradient_calls_the_host(monkeypatc
         jax.jit(height)(10.0)
 
 
+@pytest.mark.thorough
 def test_a_derivative_that_misses_its_tolerance_by_little_is_taken():
     """A tangent solve within ten times its tolerance has a solution, as the solve of a step has; beyond, it is NaN."""
     scene, particles = block(1, side=3, material=LAWS["neo_hookean"], gravity=(-9.81,))

@@ -77,6 +77,7 @@ def test_an_unreached_stretch_is_an_error_and_not_a_flat_curve(coarse):
         fit_job(coarse._replace(run=coarse.run._replace(t1=0.1)))
 
 
+@pytest.mark.thorough
 def test_an_abscissa_that_turns_back_is_refused(coarse):
     """Interpolation in it would not be defined."""
     grip = next(b for b in coarse.scene.boundary if isinstance(b, mpm.Grip))
@@ -91,6 +92,7 @@ def test_an_abscissa_that_turns_back_is_refused(coarse):
         fit_job(coarse._replace(scene=scene))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("options", "says"),
     [

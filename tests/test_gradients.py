@@ -35,6 +35,24 @@ from helpers import DESCRIPTIONS, LAWS, METHODS, SECOND_ORDER, assert_close
 
 import mpmjax as mpm
 
+DEFAULT = {"semi_implicit-fixed_corotated-updated-1d", "explicit-fixed_corotated-updated-2d-contact"}
+THOROUGH = {
+    "explicit-fixed_corotated-total-1d",
+    "explicit-fixed_corotated-updated-2d",
+    "backward_euler-fixed_corotated-total-1d",
+    "implicit_midpoint-fixed_corotated-updated-1d",
+    "trbdf2-fixed_corotated-total-1d",
+    "explicit-fluid_in_tension-updated-2d",
+    "explicit-viscous_solid-updated-2d",
+    "explicit-snow-updated-2d",
+}
+
+
+def marked(case):
+    """A case as a parameter: slow, unless its name is in `DEFAULT` or `THOROUGH`."""
+    further = pytest.mark.thorough if str(case) in THOROUGH else pytest.mark.slow
+    return pytest.param(case, marks=() if str(case) in DEFAULT else further, id=str(case))
+
 
 def held_cases():
     """Every update × law × description × dimension, but that in three dimensions semi-implicit steps have one law for
@@ -42,35 +60,23 @@ def held_cases():
     with those of the others, have one law for each description in one and two, and one case in three. Hencky's law,
     whose derivatives are of a kind of their own, has an explicit and a semi-implicit case, and one in three dimensions;
     so has the fluid, updated, and one of backward Euler. Viscosity, which each update takes in its own way, has one
-    case for each, of a fluid and of a solid. By default each update in one dimension, in one description, the explicit
-    one in two, and one case of fluid and viscosity; the rest is slow."""
+    case for each, of a fluid and of a solid."""
     for update, law, description in itertools.product(UPDATES, LAWS, DESCRIPTIONS):
         turn = (list(UPDATES).index(update) + list(LAWS).index(law) + list(DESCRIPTIONS).index(description)) % 2
         solid = {"explicit": True, "semi_implicit": turn, "backward_euler": turn and law == "neo_hookean"}
         dims = (1, 2) if update in METHODS or turn else ()
         for d in (*dims, 3) if solid.get(update) else dims:
-            now = (
-                (law == "fixed_corotated" and (update in METHODS or update in SECOND_ORDER))
-                and turn == d % 2
-                and (d == 1 or (d == 2 and (update, description) == ("explicit", "updated")))
-            )
-            case = Case(update, law, description, d)
-            yield pytest.param(case, marks=() if now else pytest.mark.slow, id=str(case))
+            yield marked(Case(update, law, description, d))
     for update in SECOND_ORDER:
-        case = Case(update, "neo_hookean", "total", 3)
-        yield pytest.param(case, marks=pytest.mark.slow, id=str(case))
+        yield marked(Case(update, "neo_hookean", "total", 3))
     for update, description, d in (("explicit", "updated", 2), ("explicit", "total", 3), ("semi_implicit", "total", 2)):
-        case = Case(update, "hencky", description, d)
-        yield pytest.param(case, marks=pytest.mark.slow, id=str(case))
+        yield marked(Case(update, "hencky", description, d))
     for update, d in (("explicit", 2), ("semi_implicit", 2), ("backward_euler", 2), ("explicit", 3)):
-        case = Case(update, "fluid_in_tension", "updated", d)
-        yield pytest.param(case, marks=() if (update, d) == ("explicit", 2) else pytest.mark.slow, id=str(case))
+        yield marked(Case(update, "fluid_in_tension", "updated", d))
     for update, (law, description) in itertools.product(
         UPDATES, (("viscous_fluid", "updated"), ("viscous_solid", "updated"), ("viscous_solid", "total"))
     ):
-        case = Case(update, law, description, 2)
-        now = (update, law, description) == ("explicit", "viscous_solid", "updated")
-        yield pytest.param(case, marks=() if now else pytest.mark.slow, id=str(case))
+        yield marked(Case(update, law, description, 2))
 
 
 def contact_cases():
@@ -79,9 +85,7 @@ def contact_cases():
     second_order = itertools.product(SECOND_ORDER, ["fixed_corotated"])
     fluid = itertools.product(("explicit", "semi_implicit"), ["fluid_in_tension"])
     for update, law in [*itertools.product(METHODS, LAWS), *second_order, *fluid]:
-        case = Case(update, law, "updated", 2, contact=True)
-        now = case.update == "explicit" and case.law == "fixed_corotated"
-        yield pytest.param(case, marks=() if now else pytest.mark.slow, id=str(case))
+        yield marked(Case(update, law, "updated", 2, contact=True))
 
 
 @pytest.mark.parametrize("case", list(held_cases()))
@@ -127,12 +131,9 @@ derivative the slope is 1 for both."""
 
 
 def plastic_cases():
-    """Each law that yields, in two dimensions by explicit and semi-implicit steps and in three by explicit ones; by
-    default snow."""
+    """Each law that yields, in two dimensions by explicit and semi-implicit steps and in three by explicit ones."""
     for law, (update, d) in itertools.product(KINKED, (("explicit", 2), ("semi_implicit", 2), ("explicit", 3))):
-        case = Case(update, law, "updated", d)
-        now = (law, update, d) == ("snow", "explicit", 2)
-        yield pytest.param(case, marks=() if now else pytest.mark.slow, id=str(case))
+        yield marked(Case(update, law, "updated", d))
 
 
 @pytest.mark.parametrize("case", list(plastic_cases()))
@@ -185,6 +186,7 @@ SIMULATED = [
 ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("case", SIMULATED, ids=str)
 def test_simulate_has_the_derivatives_of_the_plain_scan(case):
     """Value, J t by ForwardMode and Jᵀ u by three checkpoints for twenty steps, to 1e-12."""
@@ -213,6 +215,7 @@ RUIN = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "update",
     ["explicit", *(pytest.param(u, marks=pytest.mark.slow) for u in ("semi_implicit", "backward_euler", "trbdf2"))],
@@ -241,6 +244,7 @@ def test_a_batch_equals_a_loop_bit_for_bit_the_same_beside_a_member_that_turns_n
                 assert np.array_equal(a[::2], b[::2]), ruin
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("update", ["semi_implicit", pytest.param("backward_euler", marks=pytest.mark.slow)])
 def test_gradient_error_is_proportional_to_the_solvers_tolerances(update):
     """From 1e-3 to 1e-10, to both, to the forward one alone and to the adjoint one alone: the error's logarithm falls
@@ -266,6 +270,7 @@ def test_second_derivative_passes_through_the_implicit_solve():
     assert abs(float(both(one)[1] / difference) - 1) < 1e-6
 
 
+@pytest.mark.thorough
 def test_an_adjoint_that_does_not_converge_gives_nan():
     """Never a wrong number."""
     case = Case("semi_implicit", "fixed_corotated", "updated", 1)

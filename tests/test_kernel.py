@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DIMS, GRADIENTS, KERNELS, assert_close, ids
+from helpers import DIMS, GRADIENTS, KERNELS, assert_close, ids, thorough
 
 import mpmjax as mpm
 from mpmjax.discretisation._stencil import in_window, make_stencil
 
 DX = 0.125  # a power of two, so that lattice positions and edges are exact
 COMBINATIONS = [
-    pytest.param(kernel, gradient, d, id=f"{k}-{g}-{d}d")
+    pytest.param(kernel, gradient, d, id=f"{k}-{g}-{d}d", marks=() if d == 2 else pytest.mark.thorough)
     for k, kernel in KERNELS.items()
     for g, gradient in GRADIENTS.items()
     for d in DIMS
@@ -84,7 +84,7 @@ def test_gradients_of_quadratic_functions(kernel):
 
 
 @pytest.mark.parametrize("kernel", **ids(KERNELS))
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_spline_gradient_is_the_derivative_of_the_weights(kernel, d):
     """∇w is the forward derivative of the weights with respect to the particle's position."""
     grid = mpm.Grid((8,) * d, DX)
@@ -102,7 +102,7 @@ def test_spline_gradient_is_the_derivative_of_the_weights(kernel, d):
         assert_close(gradient[:, axis], derivative, 1e-13)
 
 
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_linear_kernel_has_one_gradient(d):
     """With hat functions the least-squares gradient is the spline's, at nodes too, where D is singular."""
     one, other = (stencil_of(KERNELS["linear"], gradient, d)[0] for gradient in GRADIENTS.values())
@@ -111,7 +111,7 @@ def test_linear_kernel_has_one_gradient(d):
 
 
 @pytest.mark.parametrize("kernel", **ids(KERNELS))
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_moment_is_the_second_moment_of_the_weights(kernel, d):
     """D_p = Σ w (x_i − x)(x_i − x)ᵀ is diagonal, and `moment` is its diagonal; MLS gradients are D⁻¹ w (x_i − x)."""
     stencil, arms = stencil_of(kernel, GRADIENTS["mls"], d)
@@ -121,7 +121,7 @@ def test_moment_is_the_second_moment_of_the_weights(kernel, d):
 
 
 @pytest.mark.parametrize("kernel", **ids(KERNELS))
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_nodes_are_those_within_the_support(kernel, d):
     """The stencil lists, once each, all nodes with a weight, and every weight is the kernel at its node's distance."""
     stencil, arms = stencil_of(kernel, GRADIENTS["spline"], d)
@@ -137,7 +137,7 @@ def test_nodes_are_those_within_the_support(kernel, d):
 
 
 @pytest.mark.parametrize("kernel", **ids(KERNELS))
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_periodic_indices_wrap(kernel, d):
     """A shift by any number of periods changes no index or weight, and no particle is outside."""
     grid = mpm.Grid((8,) * d, DX, periodic=True)
@@ -157,7 +157,7 @@ def test_periodic_indices_wrap(kernel, d):
 
 
 @pytest.mark.parametrize("kernel", **ids(KERNELS))
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 @pytest.mark.parametrize("origin", [0, -3])
 def test_particles_outside_are_flagged_also_at_the_edges(kernel, d, origin):
     """Inside is from (order − 1)/2 spacings off the first node, included, to as far from the last, excluded."""
@@ -177,7 +177,7 @@ def test_particles_outside_are_flagged_also_at_the_edges(kernel, d, origin):
         np.testing.assert_allclose(reproduced, x[expected], atol=1e-14)
 
 
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_only_the_open_direction_of_a_half_periodic_window_has_an_outside(d):
     """Direction 0 wraps, the others do not."""
     grid = mpm.Grid((8,) * d, DX, periodic=(True,) + (False,) * (d - 1))
@@ -187,7 +187,7 @@ def test_only_the_open_direction_of_a_half_periodic_window_has_an_outside(d):
 
 
 @pytest.mark.parametrize("kernel", **ids(KERNELS))
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_stencil_does_not_depend_on_where_the_window_lies(kernel, d):
     """A shift of particles and origin by k dx gives the same indices, and weights and gradients to 1e-13."""
     shift = np.arange(3, 3 + d)
@@ -198,7 +198,7 @@ def test_stencil_does_not_depend_on_where_the_window_lies(kernel, d):
     assert_close(here.gradient, there.gradient, 1e-13)
 
 
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_following_window_keeps_the_material_in_its_middle(d):
     """Wherever the particles go they are inside, their window moves by whole spacings, their stencil stays."""
     grid = mpm.Grid((10,) * d, DX, follow=True)

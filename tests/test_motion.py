@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close
+from helpers import assert_close, thorough
 from scipy.spatial.transform import Rotation
 
 import mpmjax as mpm
@@ -20,7 +20,7 @@ MOTIONS = {
         (0.1,) * 3,
     ),
 }
-EACH = pytest.mark.parametrize("motion", MOTIONS.values(), ids=["2d", "3d"])
+EACH = pytest.mark.parametrize("motion", [MOTIONS[2], *thorough(MOTIONS[3])], ids=["2d", "3d"])
 
 
 def place(motion, X, t):
@@ -56,7 +56,7 @@ def test_without_rotation_it_is_the_plain_motion():
 
 
 @EACH
-@pytest.mark.parametrize("scale", [0.0, 1e-8, 0.02, 0.0316, 0.0317, 1.0])
+@pytest.mark.parametrize("scale", [0.0, *thorough(1e-8, 0.02, 0.0316, 0.0317), 1.0])
 def test_its_derivatives_are_right_at_no_rotation_too(motion, scale):
     """First and second, against central differences of places and of first derivatives."""
     X = jnp.asarray(np.random.default_rng(1).normal(size=(4, motion.dim)))
@@ -92,6 +92,7 @@ def test_bad_motions_are_refused(change, message):
         mpm.RigidMotion(**data | change)
 
 
+@pytest.mark.thorough
 @EACH
 def test_in_single_precision_small_steps_have_the_speed_of_large_ones(motion):
     """Where the difference of two places would keep three digits of it, or none."""

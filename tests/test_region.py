@@ -27,7 +27,7 @@ REGIONS = {
 }
 SAMPLED = {f"sampled-{d}d": mpm.sample_distance(mpm.Ball((0.1,) * d, 0.35), 0.05) for d in (1, 2, 3)}
 EACH = pytest.mark.parametrize("region", **ids(REGIONS))
-ANY = pytest.mark.parametrize("region", **ids(REGIONS | SAMPLED))
+ANY = pytest.mark.parametrize("region", **ids(REGIONS | SAMPLED, ("capsule-2d", "sampled-1d")))
 
 
 def points(region, count=200):
@@ -150,6 +150,7 @@ def test_no_derivative_is_nan_anywhere(region):
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(derivatives(parameters, special)))
 
 
+@pytest.mark.thorough
 def test_the_middle_has_a_direction_too():
     """Nodes on a plate's mid-plane, an axis or a centre: a collider needs a normal of length one there."""
     middles = {
@@ -164,6 +165,7 @@ def test_the_middle_has_a_direction_too():
         assert (np.linalg.norm(np.asarray(gradient), axis=1) > 0.5).all(), region
 
 
+@pytest.mark.thorough
 def test_samples_converge_to_the_distance_at_second_order():
     """Near the surface: a ball's distance and its normal; quadratic splines move it inward by (d − 1) h²/8R."""
     ball, rng = mpm.Ball((0.1, 0.2, 0.0), 0.4), np.random.default_rng(3)

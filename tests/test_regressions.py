@@ -20,6 +20,7 @@ def bar(**options):
     return block(1, material=mpm.NeoHookean(1e4, 0.3), **options)
 
 
+@pytest.mark.thorough
 def test_newton_never_accepts_a_residual_of_order_one():
     """None above a twentieth: in float32, far beyond the explicit limit, where rounding exceeds the right-hand side."""
     grid = mpm.Grid((10, 12), 0.1, origin=(-3, -3))
@@ -32,6 +33,7 @@ def test_newton_never_accepts_a_residual_of_order_one():
         assert bool(info.solve.converged) <= (float(info.solve.residual) <= 0.05)
 
 
+@pytest.mark.thorough
 def test_newton_keeps_a_good_guess_where_the_grip_alone_would_invert():
     """A bar that moves rigidly with its grip: v^n is the answer, and rest is inadmissible."""
     grip = mpm.Grip(mpm.Box((-1.0,), (0.05,)), mpm.Motion((0.0, 1.0), ((0.0,), (1.0,))))
@@ -42,6 +44,7 @@ def test_newton_keeps_a_good_guess_where_the_grip_alone_would_invert():
     np.testing.assert_allclose(after.v, 1, rtol=1e-10)
 
 
+@pytest.mark.thorough
 def test_contact_starts_from_the_chosen_guess_and_counts_its_sweeps():
     """Guesses differ in their iterations, and every sweep's are in the report."""
     wall = mpm.SeparatingBox((-1.0,), (1.0,))
@@ -74,6 +77,7 @@ def test_what_is_very_far_outside_is_outside(x):
     assert not in_window(mpm.BSpline(), grid, grid.window(jnp.zeros((1, 1))), jnp.asarray([[x]])).any()
 
 
+@pytest.mark.thorough
 def test_points_may_hold_traced_numbers():
     """Gravity and a grip's displacement given as tuples inside a gradient."""
     material = mpm.FixedCorotated(1e4, 0.3)
@@ -87,6 +91,7 @@ def test_points_may_hold_traced_numbers():
     assert float(jax.grad(place)(1.0)) > 0
 
 
+@pytest.mark.thorough
 def test_simulate_works_inside_jit_on_what_is_known():
     """Nothing passed is traced, yet all that is computed is."""
     scene, particles = bar(gravity=(1.0,))
@@ -108,6 +113,7 @@ def test_particles_of_mixed_precision_are_refused():
         mpm.Particles(jnp.ones((2, 1), jnp.float32), jnp.ones((2, 1)), one, one)
 
 
+@pytest.mark.thorough
 def test_the_run_of_an_error_holds_only_frames_that_were_reached():
     """An explicit run that blows up; what diffrax would have filled is cut off."""
     scene, particles = block(2, gravity=(0.0, -9.81), boundary=mpm.SlipBox((-0.2, 0.0), (0.5, 0.5)))
@@ -119,6 +125,7 @@ def test_the_run_of_an_error_holds_only_frames_that_were_reached():
     assert np.isfinite(run.frames.x).all()
 
 
+@pytest.mark.thorough
 def test_a_frame_that_is_not_there_is_an_error():
     """Where an array's index would be clamped."""
     run = mpm.simulate(*block(2), t1=2e-3, dt=1e-3, save_every=1)

@@ -65,6 +65,7 @@ def test_free_flight_has_growth_one():
     assert_close(quiet(scene, one, t1=400 * 5e-3, dt=5e-3, seed=3).growth, np.ones(100), 1e-12)
 
 
+@pytest.mark.thorough
 def test_growth_is_that_of_a_finite_change():
     """δx against the central difference of the positions, at every saved step of a bounce off a wall."""
     wall = mpm.SeparatingBox((0.0,), (np.inf,))
@@ -127,6 +128,7 @@ def test_a_fault_of_the_run_ends_the_report_and_warns():
     assert np.isfinite(report.rate)
 
 
+@pytest.mark.thorough
 def test_a_run_that_is_not_solved_has_no_growth():
     """One step of conjugate residuals does not do."""
     scene, particles, _ = bar()
@@ -137,6 +139,7 @@ def test_a_run_that_is_not_solved_has_no_growth():
     assert np.isnan(report.growth).all()
 
 
+@pytest.mark.thorough
 def test_a_tangent_that_is_not_solved_has_no_growth_and_is_named():
     """The run itself is; one iteration does not do for its derivative."""
     scene, particles, _ = bar()
@@ -147,6 +150,7 @@ def test_a_tangent_that_is_not_solved_has_no_growth_and_is_named():
     assert np.isnan(report.growth).all()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 def test_growth_is_that_of_the_reverse_mode_gradient(factor):
     """Over 100, 200 and 400 steps, stable and not: gradients of functions of the final positions grow as the tangent

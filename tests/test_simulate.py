@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DESCRIPTIONS, ELASTIC, FLUIDS, LAWS, PLASTIC, assert_close, block, explicit_limit, ids
+from helpers import DESCRIPTIONS, ELASTIC, FLUIDS, LAWS, PLASTIC, assert_close, block, explicit_limit, ids, thorough
 
 import mpmjax as mpm
 from mpmjax.simulation import _simulate
@@ -45,7 +45,7 @@ def state(particles):
 
 EQUAL = [
     ("explicit", "updated", 2),
-    ("semi_implicit", "total", 2),
+    *thorough(("semi_implicit", "total", 2)),
     pytest.param("backward_euler", "updated", 1, marks=pytest.mark.slow),
 ]
 
@@ -197,7 +197,7 @@ BLOWN_UP = {
 }
 
 
-@pytest.mark.parametrize("law", **ids(BLOWN_UP))
+@pytest.mark.parametrize("law", **ids(BLOWN_UP, "jelly"))
 def test_a_blow_up_names_the_limit_and_by_how_much_the_step_is_above_it(law):
     """Whatever fault it ends in; and a law that is no elastic solid is not told to be one."""
     scene, particles = breathing(law)
@@ -292,7 +292,7 @@ def test_an_unconverged_solve_is_raised():
     assert int(run.statistics.most_iterations) == 2
 
 
-@pytest.mark.parametrize("preconditioner", [mpm.DiagonalPreconditioner(), mpm.MassPreconditioner()])
+@pytest.mark.parametrize("preconditioner", [mpm.DiagonalPreconditioner(), *thorough(mpm.MassPreconditioner())])
 def test_a_solve_that_misses_its_tolerance_by_little_is_a_warning(metric):
     """Within ten times of it the run goes on, counted and told at its end; beyond, it is a fault. The advice names the
     metric that needs fewer iterations where it is not the one in use."""
@@ -327,7 +327,7 @@ def test_a_rollout_from_another_step_compiles_nothing():
     assert _simulate._rollout._cached._cache_size() == before
 
 
-@pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in ("explicit", "semi_implicit")}))
+@pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in ("explicit", "semi_implicit")}, "explicit"))
 def test_a_batch_member_that_fails_leaves_the_others_alone(method):
     """One of three is driven to NaN: the other two are the same bit for bit as without it; the statistics say which."""
     scene, particles = pulled()
@@ -391,7 +391,7 @@ def test_the_number_of_steps_is_robust_to_rounding():
     assert int(mpm.simulate(scene, particles, t1=0.3 / 100, dt=0.1 / 100).statistics.steps) == 3
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("dtype", [*thorough(jnp.float32), jnp.float64])
 def test_the_stable_step_is_the_longest_of_whole_steps(dtype):
     """At or below the bound, one step fewer being above it; the run says it, and is that of the number."""
     scene, particles = pulled()
@@ -422,6 +422,7 @@ def test_the_stable_step_is_asked_for_outside_of_transformations():
         jax.grad(moved)(1e4)
 
 
+@pytest.mark.thorough
 def test_progress_changes_nothing(capsys):
     """A meter is shown, and the result is the same bit for bit."""
     scene, particles = pulled()

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DIMS, assert_close, block, rotation_matrix
+from helpers import assert_close, block, rotation_matrix, thorough
 
 import mpmjax as mpm
 from mpmjax.material import SnowHistory
@@ -21,7 +21,7 @@ def trials(d, n=200, size=0.05, seed=0):
     return jnp.asarray(F), SnowHistory(jnp.asarray(rng.uniform(0.8, 1.1, n)))
 
 
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_the_return_map_clamps_the_singular_values(d):
     """U clip(s) Vᵀ by LAPACK, to rounding; J_E J_P does not change."""
     F, history = trials(d)
@@ -33,7 +33,7 @@ def test_the_return_map_clamps_the_singular_values(d):
     assert_close(np.linalg.det(expected) * after.plastic_volume, volume, 1e-13)
 
 
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_what_does_not_yield_comes_back_bit_for_bit(d):
     """And its history too."""
     F, history = trials(d, size=2e-3)
@@ -54,7 +54,7 @@ def squeezed(d, rates, steps):
     return F, history, total
 
 
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_uniaxial_compression_hardens_as_its_closed_form(d):
     """The stretch along the axis is 1 − θ_c, the others 1; J_P = total/(1 − θ_c); the stress is that of fixed corotated
     there, times e^{ξ (1 − J_P)}."""
@@ -100,7 +100,7 @@ def test_plane_strain_is_three_dimensional_strain_with_a_stretch_of_one():
     assert_close(stress[1][:2, :2], stress[0], 1e-11)
 
 
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_the_return_map_creates_no_energy(d):
     """Ψ after it, hardened, is at most Ψ before it, where snow is packed; with a hundred times the hardening it is not.
     Torn snow gains little, since it has little."""
@@ -151,7 +151,7 @@ EXACTLY = {"stretched alike": (1.02, 1.02, 1.02), "pressed alike": (0.95, 0.95, 
 
 
 @pytest.mark.parametrize("stretches", [*EXACTLY.values(), (0.94, 1.0, 1.03), (0.93, 0.95, 0.99)])
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_derivatives_of_the_return_map_are_central_differences(d, stretches):
     """By F, history and all parameters, at repeated stretches too; the transpose is the transpose, and second
     derivatives are differences of first ones."""

@@ -25,7 +25,7 @@ COMBINATIONS = {
     if not (names[0] == "linear" and names[3] == "mls")
     and not (names[4] != "explicit" and names[3] == "spline" and names[0] != "linear")
 }
-QUICK = {"quadratic-apic-updated-mls-explicit", "quadratic-apic-total-mls-implicit_midpoint"}
+DEFAULT, THOROUGH = "quadratic-apic-updated-mls-explicit", "quadratic-apic-total-mls-implicit_midpoint"
 
 
 def wave_orders(kernel, transfer, description, gradient, method, dim=1):
@@ -46,9 +46,7 @@ def wave_orders(kernel, transfer, description, gradient, method, dim=1):
     return orders(e, CELLS), e / amplitude
 
 
-@pytest.mark.parametrize(
-    "names", [pytest.param(v, id=k, marks=() if k in QUICK else pytest.mark.slow) for k, v in COMBINATIONS.items()]
-)
+@pytest.mark.parametrize("names", **ids(COMBINATIONS, DEFAULT, (THOROUGH,)))
 def test_order_in_space(names):
     """Second with FLIP and APIC. PIC: first at a fixed Courant number; none with Δt ∝ dx², since it loses what the grid
     does not resolve in every step. The linear kernel: at amplitudes at which nothing crosses a cell, or in the total
@@ -89,7 +87,7 @@ AT_REST = {  # gradient, kernel, shift: orders of displacement and stress, total
 
 @pytest.mark.parametrize(
     "case",
-    **ids(AT_REST, default=("spline, quadratic", "spline, quadratic, shifted", "mls, quadratic, shifted")),
+    **ids(AT_REST, "spline, quadratic", ("spline, quadratic, shifted", "mls, quadratic, shifted")),
 )
 def test_order_of_a_column_under_its_own_weight(case):
     """Total description, free end on a node or 0.3 of a cell beyond: second, but with the quadratic kernel's
@@ -101,6 +99,7 @@ def test_order_of_a_column_under_its_own_weight(case):
     np.testing.assert_allclose(observed[-1], expected, atol=0.2 if kernel == "quadratic" else 0.6)
 
 
+@pytest.mark.thorough
 def test_the_default_gradient_is_the_better_one():
     """The spline's where the other is of first order, on the column; else that of moving least squares; or as asked."""
 

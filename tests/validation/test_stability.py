@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from deformations import deformations
-from helpers import DESCRIPTIONS, DIMS, ELASTIC, FLUIDS, GRADIENTS, LAWS, TRANSFERS, assert_close, ids
+from helpers import DESCRIPTIONS, ELASTIC, FLUIDS, GRADIENTS, LAWS, TRANSFERS, assert_close, ids, thorough
 from jax.flatten_util import ravel_pytree
 
 import mpmjax as mpm
@@ -95,7 +95,7 @@ ROWS = {
 }
 
 
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 @pytest.mark.parametrize(("transfer", "gradient", "order", "limits"), **ids(ROWS))
 def test_bound_at_rest_is_the_closed_form(transfer, gradient, order, limits, d):
     """√(4ρ0/((2μ + dλ)(2Ξ − κa))), to the digits of the table."""
@@ -137,8 +137,8 @@ def tangent_spectra(scene, particles):
 
 
 @pytest.mark.parametrize("law", **ids(ELASTIC))
-@pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("description", **ids(DESCRIPTIONS, "updated"))
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_tangent_spectrum_is_that_of_the_assembled_map(law, description, d):
     """Of L ↦ ∂²Ψ/∂F∂F : (L F) Fᵀ + τ Lᵀ made symmetric, or of ∂²Ψ/∂F∂F in the total description, assembled densely."""
     scene, particles = cloud(d, 0, None, material=law, description=description)
@@ -157,7 +157,7 @@ def fluid_spectra(scene, particles):
     return mpm._stability._tangent_spectrum(body, d), (jax.grad(kirchhoff)(J) * J)[:, None, None] * jnp.outer(eye, eye)
 
 
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_tangent_spectrum_of_a_fluid_is_that_of_the_assembled_map(d):
     """d (J²Ψ'' + JΨ'), pressure and expansion included."""
     scene, particles = cloud(d, 0, None, material=FLUIDS["fluid_in_tension"])
@@ -167,6 +167,7 @@ def test_tangent_spectrum_of_a_fluid_is_that_of_the_assembled_map(d):
     assert_close(found.max(axis=0), np.trace(dense, axis1=1, axis2=2), 1e-12)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("d", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
 def test_bound_of_a_fluid_from_both_sides(d):
     """One particle in equilibrium at J = 1, and under a pressure, a full lattice of one particle a cell: the linearised
@@ -190,6 +191,7 @@ def test_bound_of_a_fluid_from_both_sides(d):
 VISCOSITIES = {"shear": (1.0, 0.0), "bulk": (0.1, 4.0), "both": (2.0, 0.7)}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("shear", "bulk"), **ids(VISCOSITIES))
 @pytest.mark.parametrize("transfer", **ids({k: t for k, t in TRANSFERS.items() if k != "flip"}))
 @pytest.mark.parametrize("d", [1, pytest.param(2, marks=pytest.mark.slow)])
@@ -208,6 +210,7 @@ def test_bound_of_a_viscous_particle_from_both_sides(d, transfer, shear, bulk):
             assert eigenvalues(scene, one, 1.001 * bound, method).real.min() < -1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("stretch", [0.6, 1.5])
 def test_bound_of_viscosity_in_the_total_description_from_both_sides(stretch):
     """Whose gradients are of the reference: a stretched particle's flow is 1/F times as steep, and so is its force."""
@@ -226,7 +229,7 @@ def left(scene, particles, dt, steps=300):
     return size[0] / size[1]
 
 
-@pytest.mark.parametrize("d", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("d", [1, *thorough(2), pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("transfer", "gradient", "order", "limits"), **ids(ROWS))
 def test_one_particle_is_bounded_below_its_bound_and_grows_above(transfer, gradient, order, limits, d):
     """A real run of 300 steps from a strain of 1e-9: at 0.98 and 1.02 of it."""
@@ -237,8 +240,8 @@ def test_one_particle_is_bounded_below_its_bound_and_grows_above(transfer, gradi
     assert not left(scene, particles, 1.02 * bound) < 1e4
 
 
-@pytest.mark.parametrize("law", **ids(LAWS))
-@pytest.mark.parametrize("stretch", [0.9, 1.0, 1.05, 1.2])
+@pytest.mark.parametrize("law", **ids(LAWS, "neo_hookean"))
+@pytest.mark.parametrize("stretch", [*thorough(0.9, 1.0, 1.05), 1.2])
 def test_bound_is_exact_in_a_stretched_bar(law, stretch):
     """One particle a cell, held in equilibrium at a stretch: the linearised step fails between 0.999 and 1.001 of the
     bound, initial stress included. At a stretch of 1.2 the bound of F = I is 1.1 to 1.3 times too long."""
@@ -250,6 +253,7 @@ def test_bound_is_exact_in_a_stretched_bar(law, stretch):
         assert 1.1 < at_rest / bound < 1.3
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("law", **ids(LAWS))
 @pytest.mark.parametrize("stretch", [1.05, 1.2])
 @pytest.mark.parametrize("d", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
@@ -283,6 +287,7 @@ def slack(d, seed, strain, **scene):
     return low
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("law", **ids(LAWS))
 @pytest.mark.parametrize("d", [1, 2])
 @pytest.mark.parametrize(
@@ -316,7 +321,7 @@ def test_slack_of_the_bound(transfer, gradient, description):
     assert min(slacks) < 3
 
 
-@pytest.mark.parametrize("beta", [0.0, 0.25, 0.49])
+@pytest.mark.parametrize("beta", [*thorough(0.0), 0.25, *thorough(0.49)])
 def test_bound_of_the_semi_implicit_step(beta):
     """1/√(1 − 2β) times the explicit one below ½, for each transfer: bounded at 0.999 of it, not at 1.001."""
     for transfer in TRANSFERS.values():
@@ -381,8 +386,8 @@ def moduli(d, method, z):
     return np.sort(np.abs(np.linalg.eigvals(dilation_map(scene, mpm.prepare(scene, particles), dt, method))))[::-1]
 
 
-@pytest.mark.parametrize("d", [1, 2])
-@pytest.mark.parametrize("beta", [0.0, 0.25, 0.5, 0.75, 1.0])
+@pytest.mark.parametrize("d", [1, *thorough(2)])
+@pytest.mark.parametrize("beta", [*thorough(0.0, 0.25), 0.5, *thorough(0.75, 1.0)])
 def test_amplification_of_the_semi_implicit_step(beta, d):
     """The roots of (1 + βz) λ² − (2 + βz − z) λ + 1, to 1e-6: |λ| = 1/√(1 + βz) while complex, z < 4/(1 − β)², then
     two real ones; at most 1 for every z if β ≥ ½, else for z ≤ 4/(1 − 2β)."""
@@ -398,6 +403,7 @@ def test_amplification_of_the_semi_implicit_step(beta, d):
         assert (found[0] <= 1 + 1e-6) == (z <= edge), z
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("beta", "z", "expected", "digits"),
     [
@@ -413,6 +419,7 @@ def test_amplification_has_its_known_figures(beta, z, expected, digits):
     assert abs(moduli(2, semi_implicit(beta), z)[0] - expected) <= 0.5001 * 10.0**-digits
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("d", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("rho", [None, 0.0, 0.4, 1.0])
 def test_amplification_of_the_methods_of_second_order(rho, d):
@@ -446,6 +453,7 @@ BULK = {
 EACH_BULK = [pytest.param(*row, marks=pytest.mark.slow if row[0] == 2 else (), id=name) for name, row in BULK.items()]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("d", "per_cell", "cells", "gradient", "limit"), EACH_BULK)
 def test_limit_of_bulk_material(d, per_cell, cells, gradient, limit):
     """Quadratic APIC, periodic, in dx/c, from both sides within 0.1 %; `stable_dt` is below."""

@@ -76,6 +76,7 @@ LINEAR = {"amplitude": 1e-4}  # that kernel stands no crossing of cells
 PRESSED = {"stretch": 0.9, "per_cell": 4}  # with 2 a cell the quadrature of the mean stress is first order
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kernel", ["quadratic", pytest.param("cubic", marks=pytest.mark.slow)])
 def test_a_plain_wall_is_first_order(kernel):
     """A slip box at a fixed Courant number. (With the linear kernel no node beyond the wall is in reach.)"""
@@ -103,6 +104,7 @@ EACH_PLANE = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.thorough
 @EACH_PLANE
 def test_a_contact_plane_that_is_pressed_upon_is_second_order(kernel, offset):
     """Planes on nodes and between them, which might be left and are not."""
@@ -114,6 +116,7 @@ def test_a_contact_plane_that_is_pressed_upon_is_second_order(kernel, offset):
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("offset", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
 @pytest.mark.parametrize(
     ("kernel", "method", "transfer"),
