@@ -47,7 +47,7 @@ def test_two_materials_are_one_with_a_modulus_for_each_particle(method, descript
     "preconditioner",
     [mpm.DiagonalPreconditioner(), pytest.param(mpm.MassPreconditioner(), marks=pytest.mark.slow)],
 )
-def test_hessians_and_metrics_of_two_materials_are_those_of_one(metric, hessian):
+def test_hessians_and_preconditioners_of_two_materials_are_those_of_one(preconditioner, hessian):
     one, two, particles = halves()
     method = mpm.SemiImplicit(hessian=hessian, preconditioner=preconditioner)
     ends = [mpm.rollout(scene, particles, steps=2, dt=2e-2, method=method) for scene in (one, two)]

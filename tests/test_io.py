@@ -21,7 +21,7 @@ from mpmjax.io._runs import FrameWriter, load, save
 from mpmjax.simulation._run import Run
 from mpmjax.simulation._simulate import integrate
 from mpmjax.simulation._statistics import RunStatistics, no_steps
-from mpmjax.state._particles import Particles, state_of
+from mpmjax.state._particles import Particles, state_of, with_state
 from mpmjax.state._preparation import prepare
 
 DTYPES = {"float32": jnp.float32, "float64": jnp.float64}
@@ -41,7 +41,7 @@ def made_up(d: int, dtype=jnp.float64, description=DESCRIPTIONS["updated"], tran
     rng = np.random.default_rng(1)
     particles = prepare(scene, particles)
     frames = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=(3, *a.shape)), dtype), state_of(particles))
-    final = mpm._particles.with_state(particles, jax.tree.map(lambda a: a[-1], frames))
+    final = with_state(particles, jax.tree.map(lambda a: a[-1], frames))
     counts = {f.name: jnp.asarray(i, jnp.int32) for i, f in enumerate(dataclasses.fields(RunStatistics), 7)}
     return Run(
         scene=scene,
@@ -109,7 +109,7 @@ def test_what_laws_remember_comes_back(laws, tmp_path):
     particles = prepare(scene, mpm.join(*bare))
     rng = np.random.default_rng(1)
     frames = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=(3, *a.shape))), state_of(particles))
-    final = mpm._particles.with_state(particles, jax.tree.map(lambda a: a[-1], frames))
+    final = with_state(particles, jax.tree.map(lambda a: a[-1], frames))
     run = dataclasses.replace(made_up(2), scene=scene, frames=frames, final=final)
     save(tmp_path / "run.h5", run)
     assert_same(load(tmp_path / "run.h5"), run)

@@ -293,9 +293,9 @@ def test_an_unconverged_solve_is_raised():
 
 
 @pytest.mark.parametrize("preconditioner", [mpm.DiagonalPreconditioner(), *thorough(mpm.MassPreconditioner())])
-def test_a_solve_that_misses_its_tolerance_by_little_is_a_warning(metric):
+def test_a_solve_that_misses_its_tolerance_by_little_is_a_warning(preconditioner):
     """Within ten times of it the run goes on, counted and told at its end; beyond, it is a fault. The advice names the
-    metric that needs fewer iterations where it is not the one in use."""
+    preconditioner that needs fewer iterations if it is not the one in use."""
     scene, particles = pulled()
 
     def simulated(rtol, **options):

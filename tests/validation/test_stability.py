@@ -19,6 +19,7 @@ from jax.flatten_util import ravel_pytree
 import mpmjax as mpm
 from mpmjax.checks._values import canonical
 from mpmjax.state._particles import state_of, with_state
+from mpmjax.stepping import _stability
 from mpmjax.stepping._step import advance
 
 DX, DENSITY = 0.1, 1e3
@@ -116,7 +117,7 @@ def test_bound_of_the_linear_kernel_falls_to_zero_at_a_face(place):
 
 def test_spline_gradients_are_steepest_where_the_bound_takes_them():
     """dx² Σ (∂w)²/w over a cell: at most 6 (quadratic) and 3.137 (cubic), and reached."""
-    for order, most in mpm._stability._STEEPEST.items():
+    for order, most in _stability._STEEPEST.items():
         kernel = mpm.BSpline(order)
         f = (order - 1) / 2 + jnp.linspace(1e-9, 1 - 1e-9, 100001)[None]
         values = (kernel.slopes(f) ** 2 / kernel.weights(f)).sum(axis=1)
@@ -133,7 +134,7 @@ def tangent_spectra(scene, particles):
     image = jax.vmap(law.tangent(F))(jnp.einsum("mij,jkp->mikp", L, pull))
     image = jnp.einsum("mijp,kjp->mikp", image, pull) + jnp.einsum("ijp,mkj->mikp", tau, L)
     (body,) = scene.material_points(particles)
-    return mpm._stability._tangent_spectrum(body, d), jnp.moveaxis(image.reshape(d * d, d * d, -1), -1, 0)
+    return _stability._tangent_spectrum(body, d), jnp.moveaxis(image.reshape(d * d, d * d, -1), -1, 0)
 
 
 @pytest.mark.parametrize("law", **ids(ELASTIC))
@@ -154,7 +155,7 @@ def fluid_spectra(scene, particles):
     kirchhoff = lambda J: (J * body.law.stress(J[None, None])[0, 0]).sum()  # noqa: E731
     eye = jnp.eye(d).reshape(-1)
     J = body.F[0, 0]
-    return mpm._stability._tangent_spectrum(body, d), (jax.grad(kirchhoff)(J) * J)[:, None, None] * jnp.outer(eye, eye)
+    return _stability._tangent_spectrum(body, d), (jax.grad(kirchhoff)(J) * J)[:, None, None] * jnp.outer(eye, eye)
 
 
 @pytest.mark.parametrize("d", [2, *thorough(1, 3)])
