@@ -72,6 +72,7 @@ def test_the_fit_is_the_least_squares_answer_of_its_own_curve(coarse):
     assert abs((model * (model - fit.stress[fit.fitted])).sum()) < 1e-4 * (model**2).sum()
 
 
+@pytest.mark.thorough
 def test_an_unreached_stretch_is_an_error_and_not_a_flat_curve(coarse):
     with pytest.raises(ValueError, match="leaves out measured points"):
         fit_job(coarse._replace(run=coarse.run._replace(t1=0.1)))

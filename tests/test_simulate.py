@@ -167,6 +167,7 @@ def test_a_particle_that_is_not_finite_is_named():
     assert_equal(caught.value.run.final.x, particles.x)
 
 
+@pytest.mark.thorough
 def test_a_particle_that_leaves_the_window_is_named():
     """With the step after which its stencil is outside, and what to do."""
     grid = mpm.Grid((12,), 0.1, origin=(-2,))
@@ -197,7 +198,8 @@ BLOWN_UP = {
 }
 
 
-@pytest.mark.parametrize("law", **ids(BLOWN_UP, "jelly"))
+@pytest.mark.thorough
+@pytest.mark.parametrize("law", **ids(BLOWN_UP))
 def test_a_blow_up_names_the_limit_and_by_how_much_the_step_is_above_it(law):
     """Whatever fault it ends in; and a law that is no elastic solid is not told to be one."""
     scene, particles = breathing(law)
@@ -214,6 +216,7 @@ def test_a_blow_up_names_the_limit_and_by_how_much_the_step_is_above_it(law):
     assert bool(run.statistics.healthy)
 
 
+@pytest.mark.thorough
 def test_advice_weighs_the_step_against_the_limit_of_the_method_there_and_then():
     """Above it at the start, above it only where the body has stiffened, near it, below it, and without one."""
     scene, rest = breathing(LAWS["neo_hookean"], d=3)
@@ -257,6 +260,7 @@ def test_a_deformation_that_a_law_does_not_allow_has_advice_that_fits_the_law(la
     assert says in advice
 
 
+@pytest.mark.thorough
 def test_the_law_that_is_named_is_the_particles_own():
     """Of two bodies the fluid one is driven to J < 0 in one step."""
     scene, particles = block(1, side=2, material=[LAWS["neo_hookean"], FLUIDS["fluid"]])
@@ -269,6 +273,7 @@ def test_the_law_that_is_named_is_the_particles_own():
     assert "Reduce dt: a step must keep Δt |div v| below 1." in str(caught.value)
 
 
+@pytest.mark.thorough
 def test_inversion_of_a_law_that_does_not_allow_it_is_named():
     """neo-Hookean at det F ≤ 0 stops; fixed corotated goes on."""
     scene, particles = block(1, side=2)

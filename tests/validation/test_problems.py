@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DIMS, ids
+from helpers import ids, thorough
 
 import mpmjax as mpm
 from mpmjax.verification import AxisAligned, Ends, StandingWave, TwoDisks, VibratingBar, Vortex, discretise
@@ -29,7 +29,7 @@ def aligned_force(law: str, u, stretch, J):
 @pytest.mark.parametrize(
     "law", [mpm.NeoHookean(E, NU), mpm.FixedCorotated(E, NU)], ids=["neo_hookean", "fixed_corotated"]
 )
-@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_the_axis_aligned_force_is_the_closed_form(d, law):
     problem = AxisAligned(0.05, d, material=law)
     name = "neo_hookean" if isinstance(law, mpm.NeoHookean) else "fixed_corotated"
