@@ -14,6 +14,7 @@ from mpmjax.boundary._collider import AbstractCollider
 from mpmjax.geometry._motion import AbstractMotion
 from mpmjax.geometry._region import AbstractRegion
 from mpmjax.implicit._guess import Guess
+from mpmjax.io import _schema
 from mpmjax.io._schema import CLASSES, arguments, decode, encode
 from mpmjax.stepping import AbstractIntegrator
 
@@ -81,6 +82,12 @@ EXAMPLES = {
     mpm.ConjugateResidual: mpm.ConjugateResidual(1e-7, increment_rtol=1e-3, max_steps=17),
 }
 """One of each class that files hold; the next test says so."""
+
+
+@pytest.fixture(autouse=True)
+def _no_class_of_ones_own(monkeypatch):
+    """Other tests register some."""
+    monkeypatch.setattr(_schema, "_registered", {})
 
 
 def assert_same(a: object, b: object) -> None:

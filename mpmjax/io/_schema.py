@@ -70,7 +70,7 @@ CLASSES: tuple[type, ...] = (
 _registered: dict[str, type] = {}
 """What they can hold besides, by name."""
 
-Registered = TypeVar("Registered", bound=type[eqx.Module])
+Registered = TypeVar("Registered", bound=type)
 
 
 def register(cls: Registered) -> Registered:

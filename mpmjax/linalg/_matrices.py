@@ -78,8 +78,8 @@ def trace(A: Matrix) -> Array:
     return sum(others, first)
 
 
-def double_dot(A: Matrix, B: Matrix) -> Array:
-    """The Frobenius inner product A : B, shape (*batch)."""
+def double_dot(A: Float[Array, "a b *p"], B: Float[Array, "a b *p"]) -> Array:
+    """The Frobenius inner product A : B = Σ_ij A_ij B_ij of matrices of any one size, shape (*batch)."""
     return _dot(*([entry for row in entries(M) for entry in row] for M in (A, B)))
 
 

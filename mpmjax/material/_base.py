@@ -123,18 +123,7 @@ class AbstractMaterial(eqx.Module):
 
     def stress(self, F: Matrix) -> Matrix:
         """The first Piola-Kirchhoff stress P = ∂Ψ/∂F [Pa], shape (d, d, p). Default: the energy's gradient."""
-
-        def total(F: Matrix) -> Array:
-            energy = self.energy(F)
-            require(
-                jnp.shape(energy) == F.shape[2:],
-                f"{type(self).__name__}'s energy must be one number a particle, shape {F.shape[2:]} for F of shape "
-                f"{F.shape}, got shape {jnp.shape(energy)}: F is component first, which the functions of "
-                "mpmjax.linalg expect and those of jax.numpy.linalg do not.",
-            )
-            return energy.sum()
-
-        return jax.grad(total)(F)
+        return jax.grad(lambda F: _density(self, F).sum())(F)
 
     def tangent(self, F: Matrix) -> AbstractTangent:
         """The stress differential ∂²Ψ/∂F∂F at F, a symmetric map. Default: its matrix, by the derivative of the stress
@@ -172,7 +161,19 @@ class AbstractMaterial(eqx.Module):
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         """Whether the law is defined at F, shape (p,). Default: where its energy is finite."""
-        return jnp.isfinite(self.energy(F))
+        return jnp.isfinite(_density(self, F))
+
+
+def _density(law: AbstractMaterial, F: Matrix) -> Array:
+    """A law's energy, which must have the shape of one number a particle."""
+    energy = law.energy(F)
+    require(
+        jnp.shape(energy) == F.shape[2:],
+        f"{type(law).__name__}'s energy must be one number a particle, shape {F.shape[2:]} for F of shape {F.shape}, "
+        f"got shape {jnp.shape(energy)}: F is component first, as the functions of mpmjax.linalg expect it and those "
+        "of jax.numpy.linalg do not.",
+    )
+    return energy
 
 
 def is_isotropic(law: AbstractMaterial, like: Matrix) -> Bool[Array, "*p"]:

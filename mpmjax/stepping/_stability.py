@@ -86,7 +86,10 @@ def stable_dt(
     require_positive("safety", safety)
     limit = canonical(safety, particles.x.dtype) * longest_step(scene, particles, method)
     if not is_traced(limit):
-        require(not np.isnan(limit), "stable_dt needs particles whose F is finite and one that their law allows.")
+        require(
+            not np.isnan(limit),
+            "stable_dt needs particles whose F is finite and one that their law allows, and an isotropic law.",
+        )
     return limit if t1 is None else _whole(limit, t1, type(method).__name__)
 
 
