@@ -26,7 +26,6 @@ from collections.abc import Callable, Hashable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,8 +71,9 @@ class ruled:  # noqa: N801, a decorator
 
 
 def without_derivative(tree: Any) -> Any:
-    """The tree, with arrays and numbers that are constants to derivatives; other leaves, as functions, as they are."""
-    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array_like(leaf) else leaf, tree)
+    """The tree, its arrays and floats constants to derivatives; other leaves, as counts and functions, as they are."""
+    kinds = (jax.Array, np.ndarray, np.floating, float)
+    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, kinds) else leaf, tree)
 
 
 _ARRAY: Hashable = object()

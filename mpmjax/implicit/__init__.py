@@ -5,7 +5,7 @@ from mpmjax.implicit._guess import Guess
 from mpmjax.implicit._hessian import AbstractHessian, AnalyticHessian, JvpHessian
 from mpmjax.implicit._hessian_action import AbstractHessianAction, ParticleStiffness, TangentAction, damped
 from mpmjax.implicit._inner_product import AbstractInnerProduct, DiagonalInnerProduct
-from mpmjax.implicit._linear_solve import AbstractInnerProductSolver
+from mpmjax.implicit._linear_solve import AbstractInnerProductSolver, require_solver
 from mpmjax.implicit._linearised import Linearised
 from mpmjax.implicit._newton import Newton
 from mpmjax.implicit._operator import ImplicitOperator
@@ -42,5 +42,6 @@ __all__ = [
     "TangentAction",
     "damped",
     "no_solve",
+    "require_solver",
     "solve",
 ]

@@ -11,6 +11,7 @@ import lineax as lx
 from typing_extensions import override
 
 from mpmjax._types import Array, Bool, Float, Int, NodeVector
+from mpmjax.checks import require_that
 from mpmjax.implicit._inner_product import AbstractInnerProduct
 from mpmjax.implicit._operator import AbstractSymmetricOperator
 
@@ -151,18 +152,33 @@ def _initialised(solver: lx.AbstractLinearSolver, operator: ScaledOperator, opti
     try:
         return solver.init(operator, options)
     except ValueError as error:
-        known = (
-            "is symmetric and positive definite, with nothing else known of it. Take a solver of such matrices, as "
-            "lineax.CG(rtol=1e-8, atol=1e-8)"
-            if operator.is_positive_semidefinite()
-            else "is symmetric, and positive definite for certain only with a projected Hessian. Take "
-            "AnalyticHessian(projected=True), but for the adjoint_solver of Newton's method, whose derivatives are "
-            "those of the true Hessian; or take a solver of symmetric matrices that may be indefinite, as "
-            "ConjugateResidual() or lineax.GMRES(rtol=1e-8, atol=1e-8)"
-        )
+        if operator.is_positive_semidefinite():
+            known = "positive definite, without other structure. Take a solver of such matrices, as ConjugateResidual()"
+        else:
+            known = (
+                "may be indefinite. Take a solver of such matrices, as ConjugateResidual(); or make it positive "
+                "definite with AnalyticHessian(projected=True), which for the adjoint_solver of Newton's method is no "
+                "way out, as its derivatives are those of the true Hessian"
+            )
         raise ValueError(
-            f"{_name(solver)} refuses the matrix M + cH of the implicit solves (it says: {error}), which {known}."
+            f"{_name(solver)} refuses the matrix M + cH of an implicit step: {str(error).rstrip('.')}. The matrix is "
+            f"symmetric and {known}."
         ) from error
+
+
+def require_solver(name: str, solver: lx.AbstractLinearSolver) -> None:
+    """An absolute tolerance must be above zero.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if (atol := getattr(solver, "atol", None)) is not None:
+        require_that(
+            f"{name} must have an atol above zero, as it compares residuals component by component and those of empty "
+            "nodes are zero (right-hand sides are scaled to norm one, so that it may be as large as rtol)",
+            lambda a: a > 0,
+            atol,
+        )
 
 
 def _tolerance(solver: lx.AbstractLinearSolver, b: Array) -> Any:

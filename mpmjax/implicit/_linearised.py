@@ -7,7 +7,7 @@ import lineax as lx
 from mpmjax._types import NodeVector
 from mpmjax.checks import require_fields
 from mpmjax.implicit._conjugate_residual import ConjugateResidual
-from mpmjax.implicit._linear_solve import solve_linear
+from mpmjax.implicit._linear_solve import require_solver, solve_linear
 from mpmjax.implicit._problems import LinearProblem
 from mpmjax.implicit._solve_info import SolveInfo
 
@@ -23,6 +23,7 @@ class Linearised(eqx.Module):
 
     def __check_init__(self):
         require_fields(self)
+        require_solver("Linearised's solver", self.solver)
 
     def __call__(self, problem: LinearProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         """The solution, started from a guess [m/s], shape (n, d)."""

@@ -12,7 +12,7 @@ from mpmjax.checks import require, require_fields, require_tolerance
 from mpmjax.implicit._conjugate_residual import NEGLIGIBLE_CHANGE, ConjugateResidual
 from mpmjax.implicit._inner_product import AbstractInnerProduct
 from mpmjax.implicit._line_search import MOST_HALVINGS, backtrack
-from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, default_rtol, solve_linear
+from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, default_rtol, require_solver, solve_linear
 from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._problems import NewtonProblem
 from mpmjax.implicit._solve_info import SolveInfo
@@ -54,6 +54,7 @@ class Newton(eqx.Module):
 
     def __check_init__(self):
         require_fields(self)
+        require_solver("Newton's solver", self.solver)
         if self.rtol is not None:
             require_tolerance("Newton's rtol", self.rtol)
         require(self.max_steps >= 1, f"Newton's max_steps must be at least 1, got {self.max_steps}.")

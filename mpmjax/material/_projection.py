@@ -44,7 +44,7 @@ def _projected_matrix(material: AbstractMaterial, F: Matrix) -> Float[Array, "m 
 
 @_projected_matrix.defjvp
 def _projected_matrix_jvp(
-    primals: tuple[AbstractMaterial, Matrix], tangents: tuple[AbstractMaterial, Matrix]
+    primals: tuple[AbstractMaterial, Matrix], tangents: tuple[AbstractMaterial | None, Matrix | None]
 ) -> tuple[Array, Array]:
     values, modes = _spectrum(*primals)
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._types import NodeVector, Scalar
-from mpmjax.implicit import AbstractHessian, AbstractPreconditioner, Guess, Reporting, SolveInfo
+from mpmjax.implicit import AbstractHessian, AbstractPreconditioner, Guess, Reporting, SolveInfo, require_solver
 from mpmjax.stepping._nodes import Nodes
 
 
@@ -89,6 +89,9 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
     """That of the tangent and adjoint solves."""
     guess: eqx.AbstractVar[Guess]
     """Where the solve starts."""
+
+    def __check_init__(self):
+        require_solver(f"{type(self).__name__}'s adjoint_solver", self.adjoint_solver)
 
     def initial_guess(self, nodes: Nodes) -> NodeVector:
         return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())

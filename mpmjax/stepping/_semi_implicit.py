@@ -18,6 +18,7 @@ from mpmjax.implicit import (
     LinearProblem,
     SolveInfo,
     damped,
+    require_solver,
     solve,
 )
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
@@ -59,6 +60,7 @@ class SemiImplicit(AbstractImplicitIntegrator):
 
     def __check_init__(self):
         require_fields(self)
+        require_solver("SemiImplicit's solver", self.solver)
         require_between("SemiImplicit's beta", self.beta, 0, 1)
 
     def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
