@@ -30,7 +30,18 @@ from mpmjax.boundary import (
     StickyCollider,
     SymmetryPlane,
 )
-from mpmjax.discretisation import APIC, FLIP, PIC, BSpline, Grid, MLSGradient, SplineGradient
+from mpmjax.discretisation import (
+    APIC,
+    FLIP,
+    PIC,
+    AbstractGradient,
+    AbstractTransfer,
+    BSpline,
+    Gathered,
+    Grid,
+    MLSGradient,
+    SplineGradient,
+)
 from mpmjax.geometry import (
     AbstractMotion,
     AbstractRegion,
@@ -46,7 +57,17 @@ from mpmjax.geometry import (
     sample_distance,
     sample_mesh,
 )
-from mpmjax.implicit import AnalyticHessian, ConjugateResidual, Guess, JvpHessian, Linearised, Metric, Newton
+from mpmjax.implicit import (
+    AnalyticHessian,
+    ConjugateResidual,
+    Guess,
+    JvpHessian,
+    Linearised,
+    Metric,
+    Newton,
+    SolveInfo,
+    no_solve,
+)
 from mpmjax.io import load, record, save
 from mpmjax.material import (
     AbstractInelastic,
@@ -70,6 +91,8 @@ from mpmjax.stepping import (
     BackwardEuler,
     Explicit,
     ImplicitMidpoint,
+    NodeMotion,
+    Nodes,
     SemiImplicit,
     StepInfo,
     stable_dt,
@@ -115,8 +138,11 @@ __all__ = [  # noqa: RUF022 (grouped)
     "Viscous",
     # discretisation
     "BSpline",
+    "AbstractGradient",
     "MLSGradient",
     "SplineGradient",
+    "AbstractTransfer",
+    "Gathered",
     "APIC",
     "FLIP",
     "PIC",
@@ -139,6 +165,10 @@ __all__ = [  # noqa: RUF022 (grouped)
     "AbstractBodyForce",
     # grid updates
     "AbstractIntegrator",
+    "Nodes",
+    "NodeMotion",
+    "SolveInfo",
+    "no_solve",
     "BackwardEuler",
     "Explicit",
     "ImplicitMidpoint",

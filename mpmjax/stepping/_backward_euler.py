@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import equinox as eqx
 
-from mpmjax._types import NodeVector
+from mpmjax._types import NodeVector, Scalar
 from mpmjax.checks import require_fields
 from mpmjax.implicit import AnalyticHessian, ConjugateResidual, Guess, Hessian, Metric, Newton, SolveInfo
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
@@ -13,7 +13,7 @@ from mpmjax.stepping._stage import Stage
 
 
 class BackwardEuler(AbstractImplicitIntegrator):
-    """Backward Euler: M (v^{n+1} − v^n) = Δt f(Δt v^{n+1}) + Δt M g (reference, eq. 2), by Newton's method.
+    """Backward Euler: M (v^{n+1} − v^n) = Δt f(Δt v^{n+1}) + Δt M g (derivation, eq. 2), by Newton's method.
 
     First order in time, strongly damping; no linearisation error, so it holds where one linear solve does not.
 
@@ -33,9 +33,7 @@ class BackwardEuler(AbstractImplicitIntegrator):
     metric: Metric = eqx.field(static=True, default=Metric.DIAGONAL)
     adjoint_solver: ConjugateResidual = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
-    centred: ClassVar[bool] = False
-    needs_force: ClassVar[bool] = True
-    lagged: ClassVar[bool] = False
+    keeps_admissible: ClassVar[bool] = True
 
     def __check_init__(self):
         require_fields(self)
@@ -47,3 +45,6 @@ class BackwardEuler(AbstractImplicitIntegrator):
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt f(Δt v) [kg m/s]."""
         return nodes.dt * nodes.potential.force(nodes.dt * motion.velocity)
+
+    def stability_factor(self) -> Scalar:
+        return 0.0

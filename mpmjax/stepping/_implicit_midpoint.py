@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import equinox as eqx
 
-from mpmjax._types import NodeVector
+from mpmjax._types import NodeVector, Scalar
 from mpmjax.checks import require_fields
 from mpmjax.implicit import (
     AnalyticHessian,
@@ -48,9 +48,7 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
     metric: Metric = eqx.field(static=True, default=Metric.DIAGONAL)
     adjoint_solver: ConjugateResidual = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
-    centred: ClassVar[bool] = True
-    needs_force: ClassVar[bool] = True
-    lagged: ClassVar[bool] = False
+    body_force_at: ClassVar[float] = 0.5
 
     def __check_init__(self):
         require_fields(self)
@@ -64,3 +62,6 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt f(½Δt v̄) [kg m/s]."""
         return nodes.dt * stage_force(nodes, self, self.solution, (1, nodes.dt / 2 * motion.carrier))
+
+    def stability_factor(self) -> Scalar:
+        return 0.0

@@ -1,8 +1,7 @@
 """The semi-implicit step."""
 
-from typing import ClassVar
-
 import equinox as eqx
+import jax.numpy as jnp
 
 from mpmjax._types import NodeVector, Scalar
 from mpmjax.checks import require_between, require_fields
@@ -23,7 +22,7 @@ from mpmjax.stepping._nodes import Nodes
 
 
 class SemiImplicit(AbstractImplicitIntegrator):
-    """The semi-implicit update: (M + βΔt²H) v^{n+1} = M v*, force and H at the start of the step (reference, eqs. 3,
+    """The semi-implicit update: (M + βΔt²H) v^{n+1} = M v*, force and H at the start of the step (derivation, eqs. 3,
     6); with viscosity (M + βΔt D + βΔt²H) v^{n+1} = M v* − (1 − β) Δt D v^n.
 
     First order in time. On a mode of frequency ω the amplification is (1 + βz)^(−½) with z = (ωΔt)² while
@@ -51,9 +50,6 @@ class SemiImplicit(AbstractImplicitIntegrator):
     metric: Metric = eqx.field(static=True, default=Metric.DIAGONAL)
     adjoint_solver: ConjugateResidual = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
-    centred: ClassVar[bool] = False
-    needs_force: ClassVar[bool] = True
-    lagged: ClassVar[bool] = False
 
     def __check_init__(self):
         require_fields(self)
@@ -79,3 +75,9 @@ class SemiImplicit(AbstractImplicitIntegrator):
         """Δt f(0) − βΔt² H v [kg m/s]."""
         action = self.hessian.at_current(nodes.potential, motion.velocity)
         return nodes.dt * nodes.force - self.beta * nodes.dt**2 * action(motion.velocity)
+
+    def stability_factor(self) -> Scalar:
+        return 1 - 2 * jnp.asarray(self.beta)
+
+    def limit_name(self) -> str:
+        return "limit of SemiImplicit with beta < 1/2"

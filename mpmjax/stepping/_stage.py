@@ -28,7 +28,7 @@ class Stage(eqx.Module):
 
     inertial: NodeVector
     """a [m/s]."""
-    length: Float[Array, ""]
+    stage_dt: Float[Array, ""]
     """c [s]."""
     displaced: NodeVector | None = None
     """u [m]; None for zero."""
@@ -48,15 +48,15 @@ class Stage(eqx.Module):
                 action = method.hessian.at_current(nodes.potential, guess)
                 force = nodes.force if self.displaced is None else nodes.force - action(self.displaced)
                 problem = LinearProblem(
-                    factor=self.length**2,
-                    hessian=damped(action, nodes.potential, 1 / self.length),
-                    rhs=nodes.mass[:, None] * self.inertial + self.length * force,
+                    factor=self.stage_dt**2,
+                    hessian=damped(action, nodes.potential, 1 / self.stage_dt),
+                    rhs=nodes.mass[:, None] * self.inertial + self.stage_dt * force,
                     **system,
                 )
             case Newton():
                 problem = NewtonProblem(
                     inertial=self.inertial,
-                    length=self.length,
+                    length=self.stage_dt,
                     displaced=self.displaced,
                     spacing=nodes.spacing,
                     potential=nodes.potential,
