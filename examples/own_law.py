@@ -13,8 +13,8 @@ from mpmjax.verification import check_law
 
 @mpm.register  # so that files can hold it
 class Gent(mpm.AbstractMaterial):
-    """Ψ = −μ J_m/2 ln(1 − (F : F − 3)/J_m) − μ ln J + K/2 (J − 1)², in plane strain (A. N. Gent, Rubber Chem. Technol. 69
-    (1996) 59, doi 10.5254/1.3538357)."""
+    """Ψ = −μ J_m/2 ln(1 − (F : F − 3)/J_m) − μ ln J + K/2 (J − 1)², in plane strain (A. N. Gent, Rubber Chem. Technol.
+    69 (1996) 59, doi 10.5254/1.3538357)."""
 
     shear_modulus: float | jax.Array
     bulk_modulus: float | jax.Array

@@ -31,7 +31,18 @@ from mpmjax.boundary import (
     StickyCollider,
     SymmetryPlane,
 )
-from mpmjax.discretisation import APIC, FLIP, PIC, BSpline, Grid, MLSGradient, SplineGradient
+from mpmjax.discretisation import (
+    APIC,
+    FLIP,
+    PIC,
+    AbstractGradient,
+    AbstractTransfer,
+    BSpline,
+    Gathered,
+    Grid,
+    MLSGradient,
+    SplineGradient,
+)
 from mpmjax.geometry import (
     AbstractMotion,
     AbstractRegion,
@@ -58,6 +69,8 @@ from mpmjax.implicit import (
     Linearised,
     MassPreconditioner,
     Newton,
+    SolveInfo,
+    no_solve,
 )
 from mpmjax.io import load, record, register, save
 from mpmjax.material import (
@@ -82,6 +95,8 @@ from mpmjax.stepping import (
     BackwardEuler,
     Explicit,
     ImplicitMidpoint,
+    NodeMotion,
+    Nodes,
     SemiImplicit,
     StepInfo,
     stable_dt,
@@ -128,8 +143,11 @@ __all__ = [  # noqa: RUF022 (grouped)
     "Viscous",
     # discretisation
     "BSpline",
+    "AbstractGradient",
     "MLSGradient",
     "SplineGradient",
+    "AbstractTransfer",
+    "Gathered",
     "APIC",
     "FLIP",
     "PIC",
@@ -152,6 +170,10 @@ __all__ = [  # noqa: RUF022 (grouped)
     "AbstractBodyForce",
     # grid updates
     "AbstractIntegrator",
+    "Nodes",
+    "NodeMotion",
+    "SolveInfo",
+    "no_solve",
     "BackwardEuler",
     "Explicit",
     "ImplicitMidpoint",
