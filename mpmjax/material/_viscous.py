@@ -39,7 +39,7 @@ class Viscous(eqx.Module):
     det F_E of a law with a history), and only dissipates energy.
 
     Explicit steps take the velocity gradient C that particles stored a step ago. Implicit ones solve for it in the
-    configuration of the step's start: methods of second order are of first order in what the step turns or strains it.
+    configuration of the step's start: methods of second order are of first order in what a step turns and strains.
     *When it breaks*: explicit steps are limited by diffusion besides sound, dx²/ν (see `stable_dt`). APIC, PIC and FLIP
     have a numerical viscosity on the scale of the grid, in which a small η disappears: see their orders.
     *Good values*: η of water 1e-3, of oil 0.1, of honey 10 Pa s; for a solid some thousandths of E times the period
