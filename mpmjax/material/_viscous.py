@@ -35,11 +35,11 @@ class Viscous(eqx.Module):
         σ_v = 2η dev D + ζ tr(D) I,    D = sym ∇_x v,    dev D = D − ⅓ tr(D) I (plane strain in two dimensions).
 
     With a fluid this gives the compressible Navier-Stokes equations, with a solid the Kelvin-Voigt model, a spring and
-    a dashpot in parallel. It conserves linear and angular momentum, takes |J| V0 as the particle's volume (J = det F, or
-    det F_E of a law with a history), and only dissipates energy.
+    a dashpot in parallel. It conserves linear and angular momentum, takes |J| V0 as the particle's volume (J = det F,
+    or det F_E of a law with a history), and only dissipates energy.
 
     Explicit steps take the velocity gradient C that particles stored a step ago. Implicit ones solve for it in the
-    configuration of the step's start: methods of second order are of first order in what a step turns and strains.
+    configuration of the step's start: methods of second order are of first order in what a step turns or strains.
     *When it breaks*: explicit steps are limited by diffusion besides sound, dx²/ν (see `stable_dt`). APIC, PIC and FLIP
     have a numerical viscosity on the scale of the grid, in which a small η disappears: see their orders.
     *Good values*: η of water 1e-3, of oil 0.1, of honey 10 Pa s; for a solid some thousandths of E times the period
