@@ -13,14 +13,14 @@ from mpmjax.verification import check_law
 
 @mpm.register  # so that files can hold it
 class Gent(mpm.AbstractMaterial):
-    """Ψ = −μ J_m/2 ln(1 − (F : F − 3)/J_m) − μ ln J + K/2 (J − 1)², in plane strain (A. N. Gent, Rubber Chem. Technol.
-    69 (1996) 59, doi 10.5254/1.3538357)."""
+    """Gent's rubber in plane strain (Rubber Chem. Technol. 69 (1996) 59, doi 10.5254/1.3538357)."""
 
     shear_modulus: float | jax.Array
     bulk_modulus: float | jax.Array
     limit: float | jax.Array
 
     def energy(self, F):
+        """Ψ = −μ J_m/2 ln(1 − (F : F − d)/J_m) − μ ln J + K/2 (J − 1)²."""
         J, stretch = mpm.linalg.determinant(F), mpm.linalg.double_dot(F, F) - F.shape[0]
         chains = -self.limit / 2 * jnp.log(1 - stretch / self.limit) - jnp.log(J)
         return self.shear_modulus * chains + self.bulk_modulus / 2 * (J - 1) ** 2

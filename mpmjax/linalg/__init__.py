@@ -1,4 +1,8 @@
-"""Small matrices by components, component first: algebra, decompositions, functions of symmetric matrices."""
+"""Algebra of small matrices, component first, (d, d, p): what laws are written with.
+
+Products, determinants, decompositions and functions of symmetric matrices. All but `symmetric_eigen` and
+`principal_frame` can be differentiated to every order, at repeated stretches and eigenvalues too.
+"""
 
 from mpmjax.linalg._matrices import (
     assemble,

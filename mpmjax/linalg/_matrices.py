@@ -4,11 +4,10 @@ the principal frame.
 Every matrix has shape (d, d, *batch), d = 1, 2 or 3, with its two matrix axes first, so that XLA sees plain
 elementwise arithmetic over the batch: on a CPU that is some twenty times faster than batched LAPACK or tiny
 `dot_general`s, and its derivatives are as cheap. A product is one multiplication and one sum over an axis, which XLA
-turns into vector instructions; put together from components it would not, and an explicit step would take a tenth to a
-third longer. Other expressions are unrolled over the components. A matrix is taken apart in one operation (`entries`):
-a component that is indexed each time it is used would be added to a whole matrix of zeros each time in reverse mode.
-It is put together row by row (`assemble`): one stack of nine components is not fused with what makes them, and doubles
-the time of a Hessian's action.
+turns into vector instructions; assembled from components it would not be, and an explicit step would take a tenth to a
+third longer. Other expressions are unrolled over the components. `entries` splits a matrix in one operation: in reverse
+mode each indexed component would be added to a whole matrix of zeros. `assemble` stacks row by row: XLA does not fuse
+one stack of nine components with what computes them, which doubles the time of a Hessian's action.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,14 +37,14 @@ def entries(A: Float[Array, "a b *p"]) -> list[list[Array]]:
 
 
 def identity_like(A: Matrix) -> Matrix:
-    """The identity in the shape and dtype of `A`."""
+    """The identity matrix, in the shape and dtype of `A`."""
     d = A.shape[0]
     eye = jnp.eye(d, dtype=A.dtype).reshape((d, d) + (1,) * (A.ndim - 2))
     return jnp.broadcast_to(eye, A.shape)
 
 
 def diagonal(s: Float[Array, "m *p"]) -> Float[Array, "m m *p"]:
-    """diag(s)."""
+    """The diagonal matrix of s, shape (m, m, *batch) from (m, *batch)."""
     return s * jnp.eye(len(s), dtype=s.dtype).reshape((len(s), len(s)) + (1,) * (s.ndim - 1))
 
 
@@ -55,7 +54,7 @@ def transpose(A: Matrix) -> Matrix:
 
 
 def matmul(A: Float[Array, "a k *p"], B: Float[Array, "k b *p"]) -> Float[Array, "a b *p"]:
-    """A B, of any sizes."""
+    """The product A B of matrices of any sizes."""
     return (A[:, :, None] * B[None]).sum(axis=1)
 
 
@@ -65,8 +64,16 @@ def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
 
 
 def matrix_of(linear: Callable[[Matrix], Matrix], like: Matrix) -> Float[Array, "m m *p"]:
-    """The matrix, on the d² components in C order, of a symmetric linear map between d x d matrices, (d, d, *p), as
-    `like` is: row m is the image of the m-th unit matrix, and so is column m."""
+    """The matrix of a symmetric linear map between d x d matrices, on their d² components in C order.
+
+    Row m, and so column m, is the image of the m-th unit matrix.
+
+    Args:
+        linear: the map, from (d, d, *p) to (d, d, *p).
+        like: any matrices of that shape.
+    Returns:
+        shape (d², d², *p).
+    """
     d, batch = like.shape[0], like.shape[2:]
     units = jnp.eye(d * d, dtype=like.dtype).reshape(d * d, d, d, *[1] * len(batch))
     return jax.vmap(lambda unit: linear(jnp.broadcast_to(unit, like.shape)))(units).reshape(d * d, d * d, *batch)
@@ -95,7 +102,7 @@ def cofactor(A: Matrix) -> Matrix:
 
 
 def cofactor_differential(A: Matrix, dA: Matrix) -> Matrix:
-    """δ(J A⁻ᵀ), the differential of the cofactor matrix at A in the direction dA (reference, after eq. 11)."""
+    """δ(J A⁻ᵀ), the differential of the cofactor matrix at A in the direction dA (derivation, after eq. 11)."""
     match A.shape[0]:
         case 1:
             return jnp.zeros_like(dA)
@@ -128,10 +135,10 @@ def _cross_cofactors(a: list[list[Array]], b: list[list[Array]]) -> list[list[Ar
 
 
 def symmetric_eigen(S: Matrix) -> tuple[Array, Matrix]:
-    """The eigenvalues w and a rotation V of eigenvectors of a symmetric matrix, S = V diag(w) Vᵀ, in no order.
+    """The eigenvalues w of a symmetric matrix, in no order, and a rotation V of eigenvectors: S = V diag(w) Vᵀ.
 
     Jacobi's cyclic method (G. H. Golub, C. F. Van Loan, Matrix Computations, 4th ed., 2013, section 8.5), in 2-D one
-    rotation and exact. Accurate to rounding of ‖S‖ whatever the eigenvalues, repeated ones included. Only the upper
+    rotation and exact. Accurate to rounding of ‖S‖ for all eigenvalues, repeated ones included. Only the upper
     triangle is read.
 
     *When it breaks*: it must not be differentiated: V is not a differentiable function where eigenvalues coincide.
@@ -165,7 +172,7 @@ def symmetric_eigen(S: Matrix) -> tuple[Array, Matrix]:
 
 
 def pairs(d: int) -> list[tuple[int, int]]:
-    """The d (d − 1)/2 pairs of directions i < j, in the order in which arrays over pairs hold them."""
+    """The d (d − 1)/2 pairs of directions i < j, in the order of arrays over pairs: (0, 1), (0, 2), (1, 2)."""
     return [(i, j) for i in range(d) for j in range(i + 1, d)]
 
 
@@ -177,8 +184,8 @@ def principal_frame(F: Matrix) -> tuple[Matrix, Array, Matrix]:
     in magnitude, so that s_i + s_j ≥ 0 for i ≠ j. The stretches come in no order. In 1-D U = V = 1 and s = F.
 
     *When it breaks*: it must not be differentiated, and says so: the frame is not a function of F where stretches
-    coincide, F = I among those. An isotropic function of F has a derivative there all the same; give that function its
-    rule, in terms of this frame.
+    coincide, F = I for one. An isotropic function of F still has a derivative there: give that function a rule of its
+    own, in terms of this frame.
 
     Args:
         F: shape (d, d, *batch).
@@ -224,15 +231,14 @@ def rotation(F: Matrix) -> Matrix:
     2-D: the closed form. 3-D: λ = tr S is the largest root of (λ² − ‖F‖²)² − 8 det(F) λ − 4 ‖cof F‖², the
     characteristic polynomial of a symmetric 4 x 4 matrix K linear in F, whose eigenvector is the rotation's quaternion
     (N. J. Higham, V. Noferini, Numer. Algorithms 73 (2016) 349, doi 10.1007/s11075-016-0098-7). Newton's method finds
-    λ, a column of adj(K − λI) the quaternion, and Newton steps of eq. 12 of the reference polish it. It is normalised,
-    so the result is a rotation to rounding whatever F is.
+    λ, a column of adj(K − λI) the quaternion, and Newton steps of the derivation's eq. 12 refine it. It is
+    normalised, so the result is a rotation to rounding whatever F is.
 
-    *When it breaks*: where two signed principal stretches sum to zero R is not unique and one of the maximisers is
-    given; near there its error grows like rounding over that sum, its derivative like the sum's inverse, which is not
-    finite at zero.
+    The derivative is that of `rotation_differential`, not of the iterations, and so finite at F = I and at repeated
+    stretches, to every order.
 
-    The derivative is the rule of `rotation_differential`, never that of the iterations, so it is finite at F = I and
-    at repeated stretches, to every order.
+    *When it breaks*: where two signed principal stretches sum to zero R is not unique, and one of the maximisers is
+    returned. Near there its error grows like rounding over that sum, its derivative like the sum's inverse.
 
     Args:
         F: shape (d, d, *batch).
@@ -256,10 +262,14 @@ def _rotation_jvp(primals: tuple[Matrix], tangents: tuple[Matrix]) -> tuple[Matr
 
 
 def spin_compliance(S: Matrix) -> Compliance:
-    """(tr(S) I − S)⁻¹, which turns the vector of a skew matrix into a spin (eq. 12 of the reference, solved for U).
+    """(tr(S) I − S)⁻¹, which maps the vector of RᵀδF − δFᵀR to the spin ω of `rotation_differential` (derivation,
+    eq. 12).
 
-    Shape (3, 3, *batch) in 3-D; in 2-D the scalar 1 / tr S as (1, 1, *batch); in 1-D there is no spin and the result,
-    (1, 1, *batch), is zero.
+    Args:
+        S: the stretch RᵀF, shape (d, d, *batch).
+    Returns:
+        in 3-D shape (3, 3, *batch); in 2-D 1/tr S, shape (1, 1, *batch); in 1-D, where nothing turns, zero, shape
+        (1, 1, *batch).
     """
     match S.shape[0]:
         case 1:
@@ -272,7 +282,7 @@ def spin_compliance(S: Matrix) -> Compliance:
 
 
 def rotation_differential(R: Matrix, compliance: Compliance, dF: Matrix) -> Matrix:
-    """δR = R [ω]ₓ with (tr(S) I − S) ω = vee(RᵀδF − δFᵀR) (eq. 12 of the reference).
+    """δR = R [ω]ₓ with (tr(S) I − S) ω = vee(RᵀδF − δFᵀR) (derivation, eq. 12).
 
     Args:
         R: rotation of F, shape (d, d, *batch).

@@ -1,7 +1,7 @@
 """Functions of symmetric matrices, f(S) = V diag(f(s)) Vᵀ for S = V diag(s) Vᵀ: the logarithm, powers.
 
-Their derivatives do not differentiate V, which has none where eigenvalues coincide (F = I, the first step of every
-scene). They are written in divided differences of f, which are finite there: with A and B in the frame V,
+The eigenvectors V have no derivative where eigenvalues coincide (F = I, the first step of every scene), so the
+derivatives of f(S) are written in divided differences of f, which are finite there: with A and B in the frame V,
 
     (Df[A])_ij = f[s_i, s_j] A_ij,
     (D²f[A, B])_ij = Σ_k f[s_i, s_k, s_j] (A_ik B_kj + B_ik A_kj),
@@ -11,7 +11,7 @@ Matrices, SIAM 2008, theorem 3.11 and its proof, doi 10.1137/1.9780898717778). T
 the adjoint of each is itself, so derivatives of any order and mode hold at every S. The derivative in a parameter of f
 is again a function of S in this frame.
 
-Each function finds the frame for itself; XLA merges equal ones, so that several functions of one S cost one frame.
+Each function computes the frame; XLA merges equal computations, so that several functions of one S cost one frame.
 """
 
 import abc
@@ -33,14 +33,14 @@ Frame = tuple[Array, Matrix]
 """Eigenvalues and eigenvectors, (d, *batch) and (d, d, *batch)."""
 
 _CLOSE = 0.01
-"""Three eigenvalues or more that lie within this share of each other, in the sum of the outer two, have their divided
-difference by a series; elsewhere it is a quotient of differences, off by rounding over the share."""
+"""Relative to the sum of the outer two: three or more eigenvalues closer than this have their divided difference by a
+series. Elsewhere it is a quotient of differences, with an error of rounding over this."""
 _TERMS = 6
-"""Of the series, after the first: what is left out is of the order 1e-12."""
+"""Terms of the series after the first; the remainder is of the order 1e-12."""
 
 
 class AbstractSpectral(eqx.Module):
-    """A function f of an eigenvalue, and of symmetric matrices by it."""
+    """A scalar function f of an eigenvalue, applied to symmetric matrices: f(S) = V diag(f(s)) Vᵀ."""
 
     @abc.abstractmethod
     def of(self, s: Array) -> Array:
@@ -68,7 +68,7 @@ class AbstractSpectral(eqx.Module):
 
 
 class Logarithm(AbstractSpectral):
-    """log S, of positive definite S."""
+    """The logarithm log S of positive definite S."""
 
     def of(self, s: Array) -> Array:
         """ln s."""
@@ -85,7 +85,7 @@ class Logarithm(AbstractSpectral):
 
 
 class PowerLessOne(AbstractSpectral):
-    """eᶜ Sᵃ − I, of positive definite S: exactly zero for a = c = 0, and to rounding of itself near there."""
+    """eᶜ Sᵃ − I of positive definite S: exactly zero for a = c = 0, and of full relative precision near there."""
 
     exponent: Array
     """a [-], shape (*batch)."""
@@ -97,7 +97,7 @@ class PowerLessOne(AbstractSpectral):
         return jnp.expm1(self.exponent * jnp.log(s) + self.shift)
 
     def slope(self, a: Array, b: Array) -> Array:
-        """eᶜ (bᵃ − aᵃ)/(b − a), the exponent upstairs."""
+        """eᶜ (b^n − a^n)/(b − a), n the exponent."""
         gap = (b - a) / a
         ratio = jnp.expm1(self.exponent * jnp.log1p(gap)) / jnp.where(gap == 0, 1, gap)
         return self._power(a) * jnp.where(gap == 0, self.exponent, ratio) / a
@@ -111,11 +111,11 @@ class PowerLessOne(AbstractSpectral):
 
 
 class _Partial(AbstractSpectral):
-    """∂f/∂a by one of the parameters of f, a function of the same eigenvalue."""
+    """The derivative of f by one of its parameters, a function of the same eigenvalue."""
 
     function: AbstractSpectral
     parameter: int = eqx.field(static=True)
-    """Its place among the leaves."""
+    """The index of the parameter among the leaves of f."""
 
     def of(self, s: Array) -> Array:
         return self._rate(lambda f: f.of(s))
@@ -137,7 +137,7 @@ class _Partial(AbstractSpectral):
 
 @ruled
 def _differential(f: AbstractSpectral, S: Matrix, frame: Frame, directions: tuple[Matrix, ...]) -> Matrix:
-    """Dⁿf(S)[A, B, ...] in n directions. The value is of the frame alone, the derivative by S alone."""
+    """Dⁿf(S)[A, B, ...] in n directions. The value is computed from the frame, and differentiated by S."""
     del S
     s, V = frame
     order = len(directions)

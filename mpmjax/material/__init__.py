@@ -1,4 +1,4 @@
-"""Laws."""
+"""Laws: elastic, plastic, fluid, viscous."""
 
 from mpmjax.material._base import (
     AbstractInelastic,

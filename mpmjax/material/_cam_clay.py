@@ -7,16 +7,16 @@ import numpy as np
 from mpmjax._types import Array, Float, Matrix, PerParticle
 from mpmjax.checks import require_between, require_fields, require_moduli, require_positive
 from mpmjax.material._base import AbstractInelastic
-from mpmjax.material._hencky import Hencky, Split, no_transverse_strain
+from mpmjax.material._hencky import ElasticStrain, Hencky, no_transverse_strain
 
 
 class CamClayHistory(eqx.Module):
-    """What a particle of Cam clay remembers."""
+    """The history of a particle of Cam clay."""
 
     volume_strain: Float[Array, "*p"]
-    """α [-], the plastic logarithmic change of volume that sets the strength: negative where compacted."""
+    """α [-], the plastic logarithmic change of volume, shape (p,). It sets the strength: negative where compacted."""
     transverse_strain: Float[Array, "*p"] | None
-    """ε_t [-], see `Hencky`; None in 3-D."""
+    """ε_t [-] (see `Hencky`), shape (p,); None in 3-D."""
 
 
 class CamClay(AbstractInelastic):
@@ -25,11 +25,11 @@ class CamClay(AbstractInelastic):
     Commun. 9 (2018) 3047, doi 10.1038/s41467-018-05181-w.
 
     With the Kirchhoff stresses p = −K tr ε and q = √(3/2) ‖2μ e‖, m and e the mean and the deviator of the elastic
-    logarithmic strain in three dimensions whatever d is, it holds only the ellipse
+    logarithmic strain in three dimensions whatever d is, the yield condition is the ellipse
 
         q² (1 + 2β) + M² (p + β p₀)(p − p₀) ≤ 0,   p₀ = K sinh(ξ max(−α, 0)).
 
-    A return starts from the p₀ before the step, and
+    The return map takes p₀ before the step, and
     - for p > p₀ or p < −β p₀ goes to that tip of the ellipse, q = 0, and α changes by the volume given up,
       tr ε − tr ε′;
     - else, for q outside, shortens e at the same p. α then changes by what the volume would on the straight way to the
@@ -37,12 +37,13 @@ class CamClay(AbstractInelastic):
 
     So it hardens and compacts for p > p_c, softens and loosens for p < p_c, and shears on at p = p_c without change,
     the critical state: q = M (1 + β)/((1 − β) √(1 + 2β)) p, which is M p without cohesion, and is there for β < 1.
-    Where α ≥ 0 nothing is held: the particles are apart, and α is the gap that must close first. The paper's flow is
-    associated (its eqs. 12, 13) and its elasticity neo-Hookean; here it is Hencky's, in whose strains p and q are
-    linear. Where nothing yields F comes back to the last bit; no return adds elastic energy, which α does not enter.
+    Where α ≥ 0 the material bears no stress: the particles are apart, and α is the gap that must close first. The
+    paper's flow is associated (its eqs. 12, 13) and its elasticity neo-Hookean; here it is Hencky's, in whose strains p
+    and q are linear. Where nothing yields F is unchanged to the last bit. No return map adds elastic energy, which does
+    not depend on α.
 
-    *When it breaks*: as Hencky's law does in the elastic part: J > 0. The stress lags behind the ellipse by one step's
-    hardening, so an error in proportion to the step's strain. Softening gathers strain in bands as wide as a cell.
+    *When it breaks*: it needs J > 0, as Hencky's law does. The stress lags behind the ellipse by one step's
+    hardening, an error in proportion to the step's strain. Softening localises strain in bands as wide as a cell.
     The sinh stiffens: ξ (−α) of a few is no longer soil. Derivatives jump where it starts to yield, and are
     unbounded at the tips.
     *Good values*: M = 0.5 to 1.5 (M = 6 sin φ/(3 − sin φ) at the friction angle φ of triaxial compression), β = 0 for
@@ -52,8 +53,8 @@ class CamClay(AbstractInelastic):
         youngs_modulus: E [Pa], one value or one per particle (p,).
         poisson_ratio: ν [-], strictly between −1 and 0.5.
         friction: M [-], greater than zero: slope of the critical state.
-        preconsolidation: p₀ at first [Pa], at least zero: the pressure at which a virgin particle yields.
-        cohesion: β [-], at least zero: the tension it holds, in shares of p₀.
+        preconsolidation: initial p₀ [Pa], at least zero: the pressure at which a particle first yields.
+        cohesion: β [-], at least zero: the tension it bears, as a fraction of p₀.
         hardening: ξ [-], greater than zero.
     """
 
@@ -83,12 +84,12 @@ class CamClay(AbstractInelastic):
         return Hencky(self.youngs_modulus, self.poisson_ratio, history.transverse_strain)
 
     def return_map(self, F: Matrix, history: CamClayHistory) -> tuple[Matrix, CamClayHistory]:
-        """To a tip, or to the ellipse at the same pressure; all stresses in shares of K."""
-        split = Split.of(F, history.transverse_strain)
+        """To a tip, or to the ellipse at the same pressure; all stresses are divided by K."""
+        strain = ElasticStrain.of(F, history.transverse_strain)
         alpha, beta, M = history.volume_strain, self.cohesion, self.friction
         nu = self.poisson_ratio
         p0 = jnp.sinh(self.hardening * jnp.where(alpha < 0, -alpha, 0))
-        p, q = -3 * split.mean, 6**0.5 * 3 * (1 - 2 * nu) / (2 * (1 + nu)) * split.deviation
+        p, q = -3 * strain.mean, 6**0.5 * 3 * (1 - 2 * nu) / (2 * (1 + nu)) * strain.deviation
         # to a tip
         compacts, tears = p > p0, p < -beta * p0
         tip = compacts | tears
@@ -104,5 +105,5 @@ class CamClay(AbstractInelastic):
         radius = (1 + 2 * beta) * q**2 + (M * (p - centre)) ** 2
         t = M * half / jnp.sqrt(jnp.where(shears, radius, 1))
         change = jnp.where(tip, p - held, jnp.where(shears, (1 - t) * (p - centre), 0))
-        F, transverse = split.return_map(ratio, jnp.where(tip, -held / 3, split.mean))
+        F, transverse = strain.returned(ratio, jnp.where(tip, -held / 3, strain.mean))
         return F, CamClayHistory(alpha - change, transverse)

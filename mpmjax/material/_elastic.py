@@ -13,10 +13,10 @@ class FixedCorotated(AbstractIsotropic):
     """Fixed corotated elasticity (A. Stomakhin, R. Howes, C. Schroeder, J. Teran, SCA 2012, doi
     10.2312/SCA/SCA12/025-032).
 
-    Ψ = μ ‖F − R‖² + λ/2 (J − 1)², P = 2μ (F − R) + λ (J − 1) J F⁻ᵀ, with F = R S and J = det F; the differential is
-    eq. 11 of the reference.
+    Ψ = μ ‖F − R‖² + λ/2 (J − 1)², P = 2μ (F − R) + λ (J − 1) J F⁻ᵀ, with F = R S and J = det F; its differential
+    is eq. 11 of the derivation.
 
-    *When it breaks*: never by inversion: it is defined for every F, J ≤ 0 included. In 2-D and 3-D its Hessian is
+    *When it breaks*: not by inversion, since it is defined for every F, J ≤ 0 included. In 2-D and 3-D its Hessian is
     indefinite under any uniform compression, and the stress differential grows like 1/(s_i + s_j) where two signed
     principal stretches nearly cancel.
     *Good values*: jelly E = 1e4 to 1e6 Pa, ν = 0.3; ν above 0.45 stiffens the volume and asks for more iterations.
@@ -39,7 +39,7 @@ class FixedCorotated(AbstractIsotropic):
         return 2 * self.shear_modulus * (F - la.rotation(F)) + volumetric * la.cofactor(F)
 
     def tangent(self, F: Matrix) -> "FixedCorotatedTangent":
-        """Eq. 11 of the reference, with R, (tr S I − S)⁻¹ and the cofactor computed once."""
+        """Derivation, eq. 11, with R, (tr S I − S)⁻¹ and the cofactor matrix computed once."""
         R, cof = la.rotation(F), la.cofactor(F)
         compliance = la.spin_compliance(la.matmul(la.transpose(R), F))
         volumetric = self.lame_lambda * (la.determinant(F) - 1)
@@ -57,7 +57,7 @@ class FixedCorotated(AbstractIsotropic):
 
 
 class FixedCorotatedTangent(AbstractTangent):
-    """δP = 2μ (δF − δR) + λ (J F⁻ᵀ : δF) J F⁻ᵀ + λ (J − 1) δ(J F⁻ᵀ) (reference, eq. 11)."""
+    """δP = 2μ (δF − δR) + λ (J F⁻ᵀ : δF) J F⁻ᵀ + λ (J − 1) δ(J F⁻ᵀ) (derivation, eq. 11)."""
 
     F: Matrix
     R: Matrix
@@ -68,7 +68,6 @@ class FixedCorotatedTangent(AbstractTangent):
     lame_lambda: PerParticle
 
     def __call__(self, dF: Matrix) -> Matrix:
-        """δP for δF."""
         dR = la.rotation_differential(self.R, self.compliance, dF)
         dJ = la.double_dot(self.cofactor, dF)
         return (
@@ -137,7 +136,6 @@ class NeoHookeanTangent(AbstractTangent):
     shear_modulus: PerParticle
 
     def __call__(self, dF: Matrix) -> Matrix:
-        """δP for δF."""
         dJ = la.double_dot(self.cofactor, dF)
         return (
             self.shear_modulus * dF + self.pull * la.cofactor_differential(self.F, dF) + self.bulk * dJ * self.cofactor
@@ -156,8 +154,8 @@ def _with_volumetric(
         s: signed principal stretches, shape (d, *p).
         pull: q, shape (*p).
         bulk: b, shape (*p).
-        twist: the deviatoric part's for each pair; its flip and the diagonal of its scaling are `stiffness`.
-        stiffness: see `twist`.
+        twist: of the deviatoric part, for each pair.
+        stiffness: of the deviatoric part, its flip and the diagonal of its scaling.
     """
     d = s.shape[0]
 

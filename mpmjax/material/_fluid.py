@@ -19,15 +19,15 @@ class Fluid(AbstractInelastic, AbstractVolumetric):
     doi 10.1006/jcph.1994.1034; in the Material Point Method by J alone: A. P. Tampubolon et al., ACM Trans. Graph. 36
     (2017) 105, doi 10.1145/3072959.3073651).
 
-    p = K/γ (J^−γ − 1) with J = ρ0/ρ (see `Tait`), sound at √(K/ρ0) at rest. Particles store J in the place of F. Unless
-    `tension`, a surface separates freely: what expands beyond J = 1 has no pressure, and forgets the expansion when the
-    step is over, so that it resists as soon as it is compressed again.
+    p = K/γ (J^−γ − 1) with J = ρ0/ρ (see `Tait`), sound at √(K/ρ0) at rest. Particles store J in the place of F.
+    Without `tension` a surface separates freely: beyond J = 1 the pressure is zero, and J returns to 1 at the end of
+    the step, so that the fluid resists as soon as it is compressed again.
 
     *When it breaks*: J is the product of the steps' changes and not the particles' real spacing, from which it drifts
-    in long mixing flows. With tension, what is torn hangs together until its particles lie further apart than the
-    kernel reaches, and clusters; without, a sound wave whose troughs lie below zero pressure is not one, and one linear
-    solve, whose tangent at J = 1 is that of compression, resists within a step what expands: Newton's method does not.
-    Explicit steps shrink with 1/√K.
+    in long mixing flows. With tension, fluid that is torn stays connected until its particles lie further apart than
+    the kernel reaches, and clusters. Without it, sound waves with troughs below zero pressure are cut off; and a single
+    linear solve, whose tangent at J = 1 is that of compression, resists expansion within the step, which Newton's
+    method does not. Explicit steps shrink with 1/√K.
     *Good values*: water has γ = 7 and K = 2.2e9 Pa, but its speed of sound is rarely of interest: K of 100 to 1000
     times ρ g H, H the depth, or 100 ρ v², keeps changes of density under 1 %. γ = 1 makes p linear in the density.
 
@@ -47,7 +47,7 @@ class Fluid(AbstractInelastic, AbstractVolumetric):
         require_positive("Fluid's exponent", self.exponent)
 
     def initial_history(self, F: Matrix) -> "NoHistory":
-        """Nothing."""
+        """No history."""
         del F
         return NoHistory()
 
@@ -57,12 +57,12 @@ class Fluid(AbstractInelastic, AbstractVolumetric):
         return Tait(self.bulk_modulus, self.exponent, self.tension)
 
     def return_map(self, F: Matrix, history: "NoHistory") -> tuple[Matrix, "NoHistory"]:
-        """min(J, 1), or with tension J."""
+        """min(J, 1); with tension J."""
         return F if self.tension else _pressed(F), history
 
 
 class NoHistory(eqx.Module):
-    """What a fluid remembers besides J."""
+    """The empty history of a fluid."""
 
 
 class Tait(AbstractMaterial, AbstractVolumetric):
@@ -72,14 +72,14 @@ class Tait(AbstractMaterial, AbstractVolumetric):
     Ψ = K/γ (J − 1 + (J^{1−γ} − 1)/(γ − 1)), for γ = 1 K (J − 1 − ln J): zero at rest, and convex for every J > 0.
     Without `tension` Ψ is zero beyond J = 1; derivatives at J = 1 are those of compression.
 
-    *When it breaks*: it needs J > 0; a step that takes all of a particle's volume is reported.
+    *When it breaks*: it needs J > 0; a step that makes a particle's volume negative is reported.
     *Good values*: see `Fluid`.
 
     Args:
         bulk_modulus: K [Pa] at rest, one value or one per particle (p,).
         exponent: γ [-], positive.
-        tension: whether the pressure may be below zero. Unlike `Fluid`, which forgets what expands, it may by default:
-            an elastic law remembers.
+        tension: whether the pressure may be below zero. It may by default, unlike that of `Fluid`, whose return map
+            undoes expansion.
     """
 
     bulk_modulus: PerParticle
@@ -104,7 +104,7 @@ class Tait(AbstractMaterial, AbstractVolumetric):
         return MatrixTangent(self._stiffness(F))
 
     def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
-        """There is one stretch, J, and no pair."""
+        """One stretch, J, and no pair."""
         none = jnp.zeros((0, *s.shape[1:]), s.dtype)
         return PrincipalTangent(none, none, self._stiffness(s[None]))
 

@@ -1,4 +1,4 @@
-"""Hencky's elasticity, linear in the logarithmic strain, and what the laws that yield on it share."""
+"""Hencky's elasticity, linear in the logarithmic strain, and the strain of the laws that yield on it."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,12 +17,11 @@ class Hencky(AbstractIsotropic):
 
     Ψ = μ ε : ε + λ/2 (tr ε)² with the logarithmic strain ε = ½ log FᵀF, P = F⁻ᵀ (2μ ε + λ tr(ε) I).
 
-    In fewer than three dimensions F says nothing of the 3 − d directions normal to it. The total strain there is zero,
-    but where a law has yielded its elastic part ε_t is not: then μ (3 − d) ε_t² joins the energy, and (3 − d) ε_t the
-    trace.
+    In fewer than three dimensions the total strain in the 3 − d directions normal to F is zero. Its elastic part ε_t is
+    not zero once a law has yielded: then μ (3 − d) ε_t² is added to the energy, and (3 − d) ε_t to the trace.
 
-    The law of plasticity at large strains: a return map is as in small strains, and tr ε = ln J keeps changes of shape
-    and of volume apart.
+    Laws that yield at large strains are built on it: their return maps have the form of small strains, and tr ε = ln J
+    separates changes of volume from changes of shape.
 
     *When it breaks*: it needs J > 0. The force in a stretched fibre falls beyond a stretch of e: not a law for rubber.
     Each particle needs an eigenvalue problem, and an implicit step the matrix of its stress differential.
@@ -31,8 +30,8 @@ class Hencky(AbstractIsotropic):
     Args:
         youngs_modulus: E [Pa], one value or one per particle (p,).
         poisson_ratio: ν [-], strictly between −1 and 0.5.
-        transverse_strain: ε_t [-], the elastic logarithmic strain in each of the 3 − d directions normal to F; None,
-            and so in 3-D always, where they are as undeformed.
+        transverse_strain: ε_t [-], the elastic logarithmic strain in each of the 3 − d directions normal to F. None
+            (default, and always in 3-D): zero.
     """
 
     transverse_strain: PerParticle | None = None
@@ -75,29 +74,35 @@ class Hencky(AbstractIsotropic):
         return la.determinant(F) > 0
 
     def _dilation(self, trace: Array, like: Array) -> Array:
-        """tr ε + (3 − d) ε_t, from tr ε and an array whose first axis is the dimension."""
+        """tr ε + (3 − d) ε_t [-]; the first axis of `like` is d."""
         return trace if self.transverse_strain is None else trace + _missing(like) * self.transverse_strain
 
 
-class Split(eqx.Module):
-    """The elastic logarithmic strain in three dimensions whatever d is, as mean and deviator: ε = m I + e.
+class ElasticStrain(eqx.Module):
+    """The elastic logarithmic strain in three dimensions, whatever d is, as mean and deviator: ε = m I + e.
 
-    The laws that yield on Hencky's elasticity are isotropic: the return map turns no principal direction, scales the
-    deviator and sets the mean, ε ← k e + m′ I. With F = R exp ε that is F ← F exp((k − 1) ε + c I) = F eᶜ C^((k−1)/2),
-    with C = FᵀF and c = m′ − k m: a function of C, whose derivative needs no frame.
+    The laws that yield on Hencky's elasticity are isotropic: their return maps turn no principal direction, scale the
+    deviator and set the mean, ε ← k e + m′ I. With F = R exp ε that is F ← F exp((k − 1) ε + c I) = F eᶜ C^((k−1)/2),
+    where C = FᵀF and c = m′ − k m: a function of C, whose derivative needs no eigenvectors.
     """
 
     F: Matrix
+    """F_E [-], shape (d, d, p)."""
     transverse: Array | None
     """ε_t [-], shape (p,); None in 3-D."""
     mean: Array
     """m = (tr ε + (3 − d) ε_t)/3 [-], shape (p,)."""
     deviation: Array
-    """‖e‖ [-], shape (p,); its derivative where it is zero is zero."""
+    """‖e‖ [-], shape (p,). Where it is zero its derivative is zero."""
 
     @classmethod
-    def of(cls, F: Matrix, transverse: Array | None) -> "Split":
-        """From the elastic part of the deformation, (d, d, p), and ε_t, (p,)."""
+    def of(cls, F: Matrix, transverse: Array | None) -> "ElasticStrain":
+        """The strain of an elastic deformation.
+
+        Args:
+            F: F_E [-], shape (d, d, p).
+            transverse: ε_t [-], shape (p,); None in 3-D.
+        """
         strain = logarithmic_strain(F)
         trace = la.trace(strain)
         mean = (trace if transverse is None else trace + _missing(F) * transverse) / 3
@@ -108,9 +113,13 @@ class Split(eqx.Module):
         deviates = squares > 0
         return cls(F, transverse, mean, jnp.where(deviates, jnp.sqrt(jnp.where(deviates, squares, 1)), 0))
 
-    def return_map(self, ratio: Array, mean: Array) -> tuple[Matrix, Array | None]:
-        """F and ε_t with the deviator times k = `ratio` and m′ = `mean`, both (p,): to the last bit what they were
-        where k = 1 and m′ = m."""
+    def returned(self, ratio: Array, mean: Array) -> tuple[Matrix, Array | None]:
+        """F_E and ε_t at the strain k e + m′ I. Where k = 1 and m′ = m they are unchanged to the last bit.
+
+        Args:
+            ratio: k [-], shape (p,).
+            mean: m′ [-], shape (p,).
+        """
         shift = mean - ratio * self.mean
         change = PowerLessOne((ratio - 1) / 2, shift)(la.matmul(la.transpose(self.F), self.F))
         transverse = None if self.transverse is None else ratio * self.transverse + shift
@@ -118,12 +127,12 @@ class Split(eqx.Module):
 
 
 def no_transverse_strain(F: Matrix) -> Array | None:
-    """ε_t of particles that have never yielded: zero, (p,), and None in 3-D."""
+    """ε_t [-] of particles that have never yielded: zero, shape (p,), or None in 3-D."""
     return None if F.shape[0] == 3 else jnp.zeros(F.shape[2:], F.dtype)
 
 
 def _missing(like: Array) -> int:
-    """3 − d, of directions for which there is a transverse strain."""
+    """3 − d, the number of directions that have a transverse strain; an array's first axis is d."""
     if like.shape[0] == 3:
         raise ValueError("In 3-D no direction is transverse: Hencky's transverse_strain must be None.")
     return 3 - like.shape[0]

@@ -14,10 +14,10 @@ from mpmjax.material._elastic import FixedCorotated
 
 
 class SnowHistory(eqx.Module):
-    """What snow remembers."""
+    """The history of a particle of snow."""
 
     plastic_volume: Float[Array, "*p"]
-    """J_P = det F_P [-]: below 1 packed and harder, above 1 torn and softer."""
+    """J_P = det F_P [-], shape (p,): below 1 packed and harder, above 1 torn and softer."""
 
 
 class Snow(AbstractInelastic):
@@ -25,19 +25,19 @@ class Snow(AbstractInelastic):
     doi 10.1145/2461912.2461948).
 
     Fixed corotated elasticity of F_E (eq. 1) whose moduli harden with plastic compression, E e^{ξ (1 − J_P)} (eq. 2).
-    The principal stretches of F_E stay within [1 − θ_c, 1 + θ_s]; what they exceed goes into F_P (section 7), of which
-    J_P alone acts (F = F_E F_P). In plane strain nothing yields normal to the plane, the stretch there being one.
+    The principal stretches of F_E stay within [1 − θ_c, 1 + θ_s]; what exceeds them goes into F_P (section 7), of which
+    only J_P has an effect (F = F_E F_P). In plane strain nothing yields normal to the plane, where the stretch is one.
 
     *When it breaks*: it needs J > 0. Where hardening outruns yielding a return map creates energy: keep ξ J_P θ_c well
-    below 2/d. The table's 0.25 does for packed snow; torn snow that is pressed again gains a little, of which there is
-    little: it is soft. The moduli grow without bound under compression, by e at J_P = 1 − 1/ξ, and with them the
-    explicit step shrinks: packed snow is what the semi-implicit step is for. The return map's derivative jumps where
+    below 2/d. The table's 0.25 is enough for packed snow; torn snow that is pressed again gains a little energy, but it
+    is soft and holds little. The moduli grow without bound under compression, by a factor e at J_P = 1 − 1/ξ, and the
+    explicit step shrinks with them: take semi-implicit steps for packed snow. The return map's derivative jumps where
     yielding begins.
-    *Good values* (the reference's table): E = 1.4e5 Pa, ν = 0.2, θ_c = 2.5e-2, θ_s = 7.5e-3, ξ = 10, density 400 kg/m³.
+    *Good values* (the paper's table): E = 1.4e5 Pa, ν = 0.2, θ_c = 2.5e-2, θ_s = 7.5e-3, ξ = 10, density 400 kg/m³.
     A smaller θ_c or θ_s makes powder of chunks, a larger ξ and E ice.
 
     Args:
-        youngs_modulus: E [Pa] of virgin snow, one value or one per particle (p,).
+        youngs_modulus: E [Pa] of undisturbed snow, one value or one per particle (p,).
         poisson_ratio: ν [-], strictly between −1 and 0.5.
         critical_compression: θ_c [-], between 0 and 1.
         critical_stretch: θ_s [-], positive.
@@ -62,12 +62,12 @@ class Snow(AbstractInelastic):
         return SnowHistory(jnp.ones(F.shape[2:], F.dtype))
 
     def elastic(self, history: SnowHistory) -> "SnowElasticity":
-        """Fixed corotated, with E e^{ξ (1 − J_P)}; of dust it stays a number in single precision."""
+        """Fixed corotated with E e^{ξ (1 − J_P)}, the exponent bounded below so that E stays positive in float32."""
         harder = jnp.exp(jnp.maximum(self.hardening * (1 - history.plastic_volume), _DUST))
         return SnowElasticity(self.youngs_modulus * harder, self.poisson_ratio)
 
     def return_map(self, F: Matrix, history: SnowHistory) -> tuple[Matrix, SnowHistory]:
-        """F_E with its principal stretches clamped; J_P ← J_P det F_trial / det F_E."""
+        """Clamp the principal stretches of F_E; J_P ← J_P det F_trial / det F_E."""
         least, most = (jnp.asarray(a, F.dtype) for a in (1 - self.critical_compression, 1 + self.critical_stretch))
         excess = _Clamp(least, most)(la.matmul(la.transpose(F), F))
         clamped = F + la.matmul(F, excess)
@@ -76,11 +76,11 @@ class Snow(AbstractInelastic):
 
 
 _DUST = -60.0
-"""The least exponent of hardening: a modulus of 1e-26 E."""
+"""The smallest exponent of hardening, which gives a modulus of 1e-26 E."""
 
 
 class SnowElasticity(FixedCorotated):
-    """Fixed corotated elasticity of what has J > 0: the clamp would keep what is inverted inverted."""
+    """Fixed corotated elasticity restricted to J > 0: the clamp would keep an inverted particle inverted."""
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         """J > 0."""
@@ -88,14 +88,14 @@ class SnowElasticity(FixedCorotated):
 
 
 class _Clamp(AbstractSpectral):
-    """clamp(√c)/√c − 1 of c = s²: what F is changed by, as F (1 + ...), to clamp its stretches s; exactly zero where
-    they are within."""
+    """clamp(√c)/√c − 1 of c = s², so that F (I + f(FᵀF)) has the stretches of F, clamped. Exactly zero within the
+    limits."""
 
     least: Array
     most: Array
 
     def _limit(self, c: Array) -> tuple[Array, Array]:
-        """Whether c is clamped, and the stretch that it is clamped to."""
+        """Whether c is clamped, and the stretch it is clamped to."""
         below, above = c < self.least**2, c > self.most**2
         return below | above, jnp.where(below, self.least, self.most)
 
@@ -106,7 +106,7 @@ class _Clamp(AbstractSpectral):
         return jnp.where(clamped, (limit - root) / root, 0)
 
     def slope(self, a: Array, b: Array) -> Array:
-        """−limit/(√a √b (√a + √b)) between two that are clamped alike, else the quotient of differences."""
+        """−limit/(√a √b (√a + √b)) where both are clamped to one limit, else the quotient of differences."""
         (at_a, limit), (at_b, other) = self._limit(a), self._limit(b)
         alike = at_a & at_b & (limit == other)
         apart = (at_a | at_b) & ~alike

@@ -1,4 +1,4 @@
-"""Viscosity, beside any law."""
+"""Viscosity, added to any law."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from mpmjax.material._base import Law
 
 
 class Viscosity(eqx.Module):
-    """The viscous part of a Cauchy stress, linear in the velocity gradient L = ∇_x v."""
+    """A Newtonian viscous stress, linear in the velocity gradient L = ∇_x v."""
 
     shear: PerParticle
     """η [Pa s]."""
@@ -24,25 +24,25 @@ class Viscosity(eqx.Module):
         return self.shear * twice + spherical * la.identity_like(L)
 
     def stiffest(self, dim: int) -> Array:
-        """The largest eigenvalue [Pa s] of L ↦ σ_v: 2η of what shears, 2η (1 − d/3) + dζ of what expands evenly."""
+        """The largest eigenvalue [Pa s] of L ↦ σ_v: 2η for shear, 2η (1 − d/3) + dζ for even expansion."""
         even = 2 * (1 - dim / 3) * self.shear + dim * self.bulk
         return jnp.asarray(even) if dim == 1 else jnp.maximum(2 * self.shear, even)
 
 
 class Viscous(eqx.Module):
-    """A law with viscosity beside it: the stress of the law, and of the velocity gradient the Newtonian one,
+    """A law with a Newtonian viscosity: to the law's stress is added
 
         σ_v = 2η dev D + ζ tr(D) I,    D = sym ∇_x v,    dev D = D − ⅓ tr(D) I (plane strain in two dimensions).
 
-    With a fluid it makes the compressible Navier-Stokes equations, with a solid Kelvin's and Voigt's, a spring and a
-    dashpot side by side. It conserves linear and angular momentum, takes |J| V0 as the particle's volume (J = det F, of
-    what yields det F_E), and never gives energy.
+    With a fluid this gives the compressible Navier-Stokes equations, with a solid the Kelvin-Voigt model, a spring and
+    a dashpot in parallel. It conserves linear and angular momentum, takes |J| V0 as the particle's volume (J = det F,
+    or det F_E of a law with a history), and only dissipates energy.
 
-    Explicit steps take the velocity gradient that particles stored a step ago, C; implicit ones solve for it, at the
-    configuration of the step's start, so that methods of second order lose it to what Δt ∇v turns and strains.
-    *When it breaks*: explicit steps have a limit of diffusion besides that of sound, dx²/ν (see `stable_dt`). APIC, PIC
-    and FLIP have a viscosity of their own on the scale of the grid, which a small η disappears in: see their orders.
-    *Good values*: η of water 1e-3, of oil 0.1, of honey 10 Pa s; a solid's η of some thousandths of E times the period
+    Explicit steps take the velocity gradient C that particles stored a step ago. Implicit ones solve for it in the
+    configuration of the step's start: methods of second order are of first order in what a step turns or strains.
+    *When it breaks*: explicit steps are limited by diffusion besides sound, dx²/ν (see `stable_dt`). APIC, PIC and FLIP
+    have a numerical viscosity on the scale of the grid, in which a small η disappears: see their orders.
+    *Good values*: η of water 1e-3, of oil 0.1, of honey 10 Pa s; for a solid some thousandths of E times the period
     that is to be damped: a pressure wave's amplitude falls as e^{−ω²t (4η/3 + ζ)/(2 (λ + 2μ))}.
 
     Args:
@@ -63,5 +63,5 @@ class Viscous(eqx.Module):
 
     @property
     def viscosity(self) -> Viscosity:
-        """Without the law."""
+        """The viscosity without the law."""
         return Viscosity(self.shear_viscosity, self.bulk_viscosity)

@@ -7,16 +7,16 @@ import numpy as np
 from mpmjax._types import Array, Float, Matrix, PerParticle
 from mpmjax.checks import require_between, require_fields, require_moduli, require_positive
 from mpmjax.material._base import AbstractInelastic
-from mpmjax.material._hencky import Hencky, Split, no_transverse_strain
+from mpmjax.material._hencky import ElasticStrain, Hencky, no_transverse_strain
 
 
 class VonMisesHistory(eqx.Module):
-    """What a particle of von Mises' law remembers."""
+    """The history of a particle of von Mises' law."""
 
     plastic_strain: Float[Array, "*p"]
-    """α [-], the equivalent plastic strain accumulated, ∫ √(2/3) ‖d_p‖ dt."""
+    """α [-], the accumulated equivalent plastic strain ∫ √(2/3) ‖d_p‖ dt, shape (p,)."""
     transverse_strain: Float[Array, "*p"] | None
-    """ε_t [-], see `Hencky`; None in 3-D."""
+    """ε_t [-] (see `Hencky`), shape (p,); None in 3-D."""
 
 
 class VonMises(AbstractInelastic):
@@ -28,16 +28,16 @@ class VonMises(AbstractInelastic):
 
         ‖s‖ = √(2/3) (σ_y + H α),
 
-    in tension at the stress σ_y. Flow is associated and keeps the volume: the return map shortens e by
+    which is the stress σ_y in uniaxial tension. Flow is associated and keeps the volume: the return map shortens e by
 
         Δγ = (‖s‖ − √(2/3) (σ_y + H α)) / (2μ + 2H/3),   α ← α + √(2/3) Δγ,
 
-    in closed form, along e itself. In 1-D and 2-D the deviator is that of three dimensions: plane strain yields out
-    of the plane too. Where nothing yields F comes back to the last bit.
+    along e, in closed form. In 1-D and 2-D the deviator is that of three dimensions: plane strain yields out of the
+    plane too. Where nothing yields F is unchanged to the last bit.
 
-    *When it breaks*: as Hencky's law does in the elastic part: J > 0. Stress lags a step behind the yield condition,
-    since the return follows the step. Without hardening, strain gathers in bands as wide as a cell. In float32 a strain
-    is known to 1e-7, of a metal's yield strain 1e-4.
+    *When it breaks*: it needs J > 0, as Hencky's law does. The stress lags a step behind the yield condition, since the
+    return map follows the step. Without hardening, strain localises in bands as wide as a cell. In float32 strains have
+    an error of 1e-7, a thousandth of a metal's yield strain of 1e-4.
     *Good values*: steel E = 2.1e11 Pa, ν = 0.3, σ_y = 2.5e8 Pa, H = 1e9 Pa; annealed copper 1.2e11 Pa, 0.34, 7e7 Pa,
     5e8 Pa; lead 1.6e10 Pa, 0.44, 1e7 Pa, 5e7 Pa.
 
@@ -68,13 +68,13 @@ class VonMises(AbstractInelastic):
         return Hencky(self.youngs_modulus, self.poisson_ratio, history.transverse_strain)
 
     def return_map(self, F: Matrix, history: VonMisesHistory) -> tuple[Matrix, VonMisesHistory]:
-        """The radial return."""
-        split = Split.of(F, history.transverse_strain)
+        """Radial return of the deviator."""
+        strain = ElasticStrain.of(F, history.transverse_strain)
         stiffness = 2 * self.elastic(history).shear_modulus
         allowed = (2 / 3) ** 0.5 * (self.yield_stress + self.hardening_modulus * history.plastic_strain)
-        excess = stiffness * split.deviation - allowed
+        excess = stiffness * strain.deviation - allowed
         yields = excess > 0
         flow = jnp.where(yields, excess / (stiffness + 2 / 3 * self.hardening_modulus), 0)
-        ratio = 1 - flow / jnp.where(yields, split.deviation, 1)
-        F, transverse = split.return_map(ratio, split.mean)
+        ratio = 1 - flow / jnp.where(yields, strain.deviation, 1)
+        F, transverse = strain.returned(ratio, strain.mean)
         return F, VonMisesHistory(history.plastic_strain + (2 / 3) ** 0.5 * flow, transverse)
