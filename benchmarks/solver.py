@@ -116,7 +116,7 @@ class Level(NamedTuple):
 def level(n: int, dt: float, coarser: int, contrast: float) -> tuple[Level, Nodes]:
     """Of one semi-implicit step with β = 1."""
     scene, particles, _ = square(n, coarser=coarser, contrast=contrast)
-    nodes = particles_to_grid(scene, particles, 0.0, jnp.asarray(dt), scene.stencil(particles), centred=False)
+    nodes = particles_to_grid(scene, particles, 0.0, jnp.asarray(dt), scene.stencil(particles))
     action = mpm.AnalyticHessian().at_current(nodes.potential, nodes.velocity)
     operator = ImplicitOperator(nodes.mass, jnp.asarray(dt) ** 2, action, nodes.projection)
     weight = mpm.MassPreconditioner().inner_product(operator).weight

@@ -397,7 +397,7 @@ class Runner:
     def _run(self, bench: Bench, line: str, steps: int, truth: Displacements) -> Point:
         """Once, with eight calls; if it is short, it is timed again with a single one."""
         method = UPDATES[line.split(", ")[0]]
-        if self.problem.exact is not None and not method.centred:
+        if self.problem.exact is not None and method.body_force_at == 0:
             early = -bench.t1 / steps / 2
             start = bench_of(self.problem, line, bench.refinement, velocity_time=early)
             bench = bench._replace(particles=start.particles)

@@ -30,7 +30,18 @@ from mpmjax.boundary import (
     StickyCollider,
     SymmetryPlane,
 )
-from mpmjax.discretisation import APIC, FLIP, PIC, BSpline, Grid, MLSGradient, SplineGradient
+from mpmjax.discretisation import (
+    APIC,
+    FLIP,
+    PIC,
+    AbstractGradient,
+    AbstractTransfer,
+    BSpline,
+    Gathered,
+    Grid,
+    MLSGradient,
+    SplineGradient,
+)
 from mpmjax.geometry import (
     AbstractMotion,
     AbstractRegion,
@@ -57,6 +68,8 @@ from mpmjax.implicit import (
     Linearised,
     MassPreconditioner,
     Newton,
+    SolveInfo,
+    no_solve,
 )
 from mpmjax.io import load, record, save
 from mpmjax.material import (
@@ -81,6 +94,8 @@ from mpmjax.stepping import (
     BackwardEuler,
     Explicit,
     ImplicitMidpoint,
+    NodeMotion,
+    Nodes,
     SemiImplicit,
     StepInfo,
     stable_dt,
@@ -126,8 +141,11 @@ __all__ = [  # noqa: RUF022 (grouped)
     "Viscous",
     # discretisation
     "BSpline",
+    "AbstractGradient",
     "MLSGradient",
     "SplineGradient",
+    "AbstractTransfer",
+    "Gathered",
     "APIC",
     "FLIP",
     "PIC",
@@ -150,6 +168,10 @@ __all__ = [  # noqa: RUF022 (grouped)
     "AbstractBodyForce",
     # grid updates
     "AbstractIntegrator",
+    "Nodes",
+    "NodeMotion",
+    "SolveInfo",
+    "no_solve",
     "BackwardEuler",
     "Explicit",
     "ImplicitMidpoint",

@@ -166,7 +166,7 @@ def grid_update(scene: mpm.Scene, particles: mpm.Particles, dt: float, method, t
 
 @eqx.filter_jit
 def _grid_update(scene, particles, t, dt, method) -> GridUpdate:
-    nodes = particles_to_grid(scene, particles, t, dt, scene.stencil(particles), centred=method.centred)
+    nodes = particles_to_grid(scene, particles, t, dt, scene.stencil(particles), body_force_at=method.body_force_at)
     new, info = advance(scene, particles, t, dt, method)
     grid = update(nodes, method)
     position = scene.grid.nodes(scene.window(particles))

@@ -284,7 +284,7 @@ def test_whatever_columns_are_held_mirroring_twice_is_mirroring_once(number):
     @eqx.filter_jit
     def try_out(x, v, field):
         start = mpm.prepare(scene, eqx.tree_at(lambda b: (b.x, b.v), body, (x, v)))
-        nodes = particles_to_grid(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start), centred=False)
+        nodes = particles_to_grid(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start))
 
         def attempt(held, guess):
             motion, info = method.advance(held.nodes, guess)
@@ -317,7 +317,7 @@ def in_touch(boundary):
     block = mpm.fill(mpm.Box((-0.1, 0.0), (0.3, 0.2)), grid, density=1e3)
     scene = canonical(mpm.Scene(grid, LAW, boundary=boundary), float)
     start = mpm.prepare(scene, block)
-    return particles_to_grid(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start), centred=False)
+    return particles_to_grid(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start))
 
 
 def test_a_verdict_is_given_beyond_rounding_only():

@@ -161,7 +161,7 @@ def test_a_member_that_is_not_finite_leaves_the_others_as_they_are():
 def test_the_program_for_other_platforms_is_the_same_sum(d):
     """Where it is not for a CPU nothing is left of the loops: the same numbers, in one kernel a sum."""
     _, stencil, given, nodes = example(d)
-    factors = stencil.index_factors, stencil.weights, stencil.slopes
+    factors = stencil.index_factors, stencil.weights, stencil.weight_derivatives
     loops, kernel = (_transfer_sums._gather(*factors, nodes, unroll=unroll) for unroll in (False, True))
     assert_close(jnp.stack(loops), jnp.stack(kernel), 1e-15)
     loops, kernel = (_transfer_sums._scatter(*factors, *given, valued=True, size=5**d, unroll=u) for u in (False, True))

@@ -30,7 +30,7 @@ def operator_of(scene, particles, hessian, factor=1e-3):
     """M + cH at the particles, c such that mass and stiffness are alike, ."""
     particles = mpm.prepare(scene, particles)
     dt = jnp.asarray(1e-3)
-    nodes = particles_to_grid(scene, particles, 0.0, dt, scene.stencil(particles), centred=False)
+    nodes = particles_to_grid(scene, particles, 0.0, dt, scene.stencil(particles))
     action = hessian.at_current(nodes.potential, nodes.velocity)
     return ImplicitOperator(nodes.mass, jnp.asarray(factor), action, nodes.projection)
 

@@ -156,14 +156,14 @@ def test_what_deforms_is_the_gradient_of_what_carries(transfer, gradient, kernel
     """By the chosen operator, of the mean velocity if there is one; an impulse at the particles is its transpose."""
     grid, _, stencil, _, v, C, mass = scattered(kernel, gradient, d)
     if not transfer.affine:
-        C, stencil = None, eqx.tree_at(lambda s: s.affine_slopes, stencil, None, is_leaf=lambda a: a is None)
+        C, stencil = None, eqx.tree_at(lambda s: s.mls_weight_derivatives, stencil, None, is_leaf=lambda a: a is None)
     before, after, mean = (jnp.asarray(noise(grid, d, seed)) for seed in (3, 4, 5))
     for mean_, carrier in ((None, after), (mean, mean)):
         moved, _, _, slope = to_particles(transfer, stencil, jnp.asarray(v), before, after, mean_)
         value, slopes = from_nodes(stencil, carrier)
         assert_close(moved, value, 1e-14)
         assert_close(slope, jnp.swapaxes(slopes, 0, 1), 1e-14)
-    if stencil.affine_slopes is None:
+    if stencil.mls_weight_derivatives is None:
         impulse = jnp.asarray(np.random.default_rng(6).normal(size=(d, d, v.shape[1])))
         given = [to_grid(stencil, mass, jnp.asarray(v), C, grid.size, i)[1] for i in (impulse, None)]
         assert float(((given[0] - given[1]) * mean).sum()) == pytest.approx(float((impulse * slope).sum()), rel=1e-10)

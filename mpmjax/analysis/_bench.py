@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.spatial
 
-from mpmjax.checks import canonical
+from mpmjax.checks import canonical, shape_of
 from mpmjax.simulation import Run, SimulationError, integrate, raise_faults
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator, stable_dt
@@ -47,8 +47,8 @@ class Trial(NamedTuple):
 
 
 def name_of(method: AbstractIntegrator) -> str:
-    """A method's name with its one number, such as "SemiImplicit(beta=1)"."""
-    numbers = [f.name for f in fields(method) if f.name in ("beta", "rho")]
+    """An integrator's name with its numbers, such as "SemiImplicit(beta=1)"."""
+    numbers = [f.name for f in fields(method) if shape_of(getattr(method, f.name)) == ()]
     shown = ", ".join(f"{name}={float(getattr(method, name)):g}" for name in numbers)
     return f"{type(method).__name__}({shown})"
 

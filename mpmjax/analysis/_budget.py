@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Float, Matrix, NodeVector, Scalar, components
 from mpmjax.analysis._diagnostics import energy_density, energy_of
 from mpmjax.checks import canonical, checked, require_positive
-from mpmjax.discretisation import FLIP, Stencil, gather, scatter
+from mpmjax.discretisation import Gathered, Stencil, gather, scatter
 from mpmjax.state import Particles, Scene, prepare
 from mpmjax.stepping import (
     AbstractIntegrator,
@@ -39,9 +39,9 @@ class EnergyBudget(eqx.Module):
     p2g: Float[Array, "*f"]
     """Lost from particles to grid, ½ Σ_ip w m ‖u_ip − v_i^n‖² ≥ 0."""
     g2p: Float[Array, "*f"]
-    """Lost from grid to particles, ½ Σ_ip w m ‖v_i^{n+1} − u_ip^{n+1}‖² ≥ 0 with PIC and APIC; with FLIP u is the
-    grid's part of the velocity, and what the particles keep beside it counts as gained. The affine motion's energy is
-    that at the new place, which differs with the linear kernel, whose moment D depends on it."""
+    """Lost from grid to particles, ½ Σ_ip w m ‖v_i^{n+1} − u_ip^{n+1}‖² ≥ 0 with PIC and APIC; with others u is
+    the grid's part of the velocity, and what the particles keep beside it counts as gained. The affine motion's energy
+    is that at the new place, which differs with the linear kernel, whose moment D depends on it."""
     implicit: Float[Array, "*f"]
     """Dissipated by treating the elastic force implicitly, (Δt f^n − its impulse)·v̄: β Δt² v̄·H v^{n+1}. In methods of
     second order `time_integration` gives it back but for terms of third order in Δt."""
@@ -158,9 +158,9 @@ def _budget(
             (start + n) * dt,
             dt,
             stencil,
-            centred=method.centred,
-            lagged=method.lagged,
-            apart=True,
+            body_force_at=method.body_force_at,
+            explicit_viscosity=method.explicit_viscosity,
+            viscosity_apart=True,
         )
         new = update(nodes, method)
         trial = grid_to_particles(scene, before, nodes, new)
@@ -182,7 +182,8 @@ def _step_budget(
     friction = jnp.zeros_like(v0) if new.friction is None else new.friction
 
     # impulses at the nodes
-    elastic, elastic_at_start = new.elastic, dt * nodes.force
+    at_start = nodes.force if nodes.viscous_force is None else nodes.force - nodes.viscous_force
+    elastic_at_start = dt * at_start
     raw = scatter(stencil, before.mass[None], None, scene.grid.size)
     weight = dt * images.fold(raw * jnp.asarray(scene.gravity))
     body = jnp.where(nodes.occupied, dt * nodes.mass[:, None] * nodes.acceleration - weight, 0)
@@ -194,19 +195,24 @@ def _step_budget(
     if new.viscous is not None and C is not None:
         power = (potential.viscous_flux(C) * C).sum() if resisted is None else potential.power(resisted)
         viscous, dissipated = new.viscous, dt * power
+    assert new.internal is not None and new.before is not None  # P2G was asked for momentum and force apart
+    elastic = new.internal if new.viscous is None else new.internal - new.viscous
 
     # particle and nodes beside each other
     v_old = components(before.v)
-    arrived = gather(stencil, images.unfold(new.before))[0]
-    moved = gather(stencil, all1)[0]
+    arrived = _gathered(scene, stencil, all1)
+    change = _gathered(scene, stencil, all1 - images.unfold(new.before)) if scene.transfer.needs_change else None
+    moved = arrived.value
     C_old, C_new = (components(q.C) if scene.transfer.affine and q.C is not None else None for q in (before, after))
-    beside = scene.transfer.alpha * (v_old - arrived) if isinstance(scene.transfer, FLIP) else jnp.zeros_like(v_old)
+    beside = scene.transfer.velocity(v_old, arrived, change) - moved
     lost_p2g, gained_p2g = _mismatch(stencil, before.mass, v_old, C_old, all0)
-    lost_g2p, _ = _mismatch(stencil, before.mass, moved, C_new, all1)
+    lost_g2p, _ = _mismatch(stencil, before.mass, moved, arrived.affine, all1)
     kept = (before.mass * beside * (moved + beside / 2)).sum()
-    if C_new is not None and scene.kernel.order == 1:  # its moment D changes with the particle's place
-        turn = scene.stencil(after).moment - stencil.moment
-        kept = kept + (before.mass * (C_new**2 * turn).sum(axis=(0, 1))).sum() / 2
+    if C_new is not None and arrived.affine is not None:
+        kept = kept + (before.mass * ((C_new**2 - arrived.affine**2) * stencil.moment).sum(axis=(0, 1))).sum() / 2
+        if scene.kernel.order == 1:  # its moment D changes with the particle's place
+            turn = scene.stencil(after).moment - stencil.moment
+            kept = kept + (before.mass * (C_new**2 * turn).sum(axis=(0, 1))).sum() / 2
 
     old, new_energy = energy_of(scene, before), energy_of(scene, after)
     stored = potential.energy(dt * new.motion.carrier)
@@ -244,6 +250,13 @@ def _step_budget(
             transfer=gained_p2g + (before.mass * beside).sum(axis=1),
         ),
     )
+
+
+def _gathered(scene: Scene, stencil: Stencil, nodes: NodeVector) -> Gathered:
+    """A velocity field of the nodes [m/s], shape (n, d), as the scene's transfer is given it."""
+    value, gradient = gather(stencil, nodes)
+    affine = jnp.swapaxes(gather(stencil.least_squares, nodes)[1], 0, 1) if scene.transfer.affine else None
+    return Gathered(value, jnp.swapaxes(gradient, 0, 1), affine)
 
 
 def _mismatch(

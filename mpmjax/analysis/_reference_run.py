@@ -111,7 +111,7 @@ def _resolved_in_time(
                 f"The reference, {name_of(method)} in {steps} steps ({new.seconds:.2g} s), fails, and half the step "
                 f"will not do or takes too long. {bench.why(method, steps)}"
             )
-        steps = max(2 * steps, bench.whole(limit) if isinstance(method, Explicit) else 0)
+        steps = max(2 * steps, bench.whole(limit) if method.is_explicit else 0)
 
 
 def _look(bench: Bench, method: AbstractIntegrator, steps: int, before: _Look | None, say: Say) -> _Look:

@@ -44,11 +44,11 @@ class WorkPrecision(NamedTuple):
         through zero on its way from one sign to the other, that is luck) and the reference, whose own error it cannot
         be told from. An explicit step beyond the limit is not good, however well it went.
         """
-        trials = [t for t in self.trials if not (isinstance(t.method, Explicit) and t.dt * t.refinement > self.limit)]
+        trials = [t for t in self.trials if not (t.method.is_explicit and t.dt * t.refinement > self.limit)]
         errors = [max(t.error, self._next(t).error, self.reference.error) for t in trials]
         enough = max(self.target, 1.25 * min((e for e in errors if e >= 0), default=math.inf))
         good = [t for t, e in zip(trials, errors, strict=True) if e <= enough < math.inf]
-        good = [t for t in good if explicit in (None, isinstance(t.method, Explicit))]
+        good = [t for t in good if explicit in (None, t.method.is_explicit)]
         return min(good, key=lambda trial: trial.seconds, default=None)
 
     def _next(self, trial: Trial) -> Trial:
@@ -62,9 +62,9 @@ class WorkPrecision(NamedTuple):
         best = self.cheapest()
         if best is None:
             return "No run ended well: allow more seconds or choose a shorter t1."
-        is_explicit = isinstance(best.method, Explicit)
+        is_explicit = best.method.is_explicit
         rival = self.cheapest(explicit=not is_explicit)
-        foreseen = [t for t in self.trials if math.isnan(t.error) and isinstance(t.method, Explicit) != is_explicit]
+        foreseen = [t for t in self.trials if math.isnan(t.error) and t.method.is_explicit != is_explicit]
         if rival is not None:
             other = f"{rival} needs {rival.seconds:.2g} s"
         elif foreseen:
@@ -146,21 +146,19 @@ def work_precision(
 
     def rival(method: AbstractIntegrator) -> float:
         """Seconds of the cheapest run so far that is as good as asked for, explicit or implicit as the method is."""
-        best = WorkPrecision(tuple(trials), reference, float(error), limit).cheapest(
-            explicit=isinstance(method, Explicit)
-        )
+        best = WorkPrecision(tuple(trials), reference, float(error), limit).cheapest(explicit=method.is_explicit)
         return math.inf if best is None or best.error > error else best.seconds
 
     def refine(bench: Bench, method: AbstractIntegrator, part: float) -> None:
         steps, best, idle = FRAMES, math.inf, 0
-        if isinstance(method, Explicit):
+        if method.is_explicit:
             steps = bench.whole(limit / bench.refinement)
         foreseen = bench.foresee(method, steps)
         share = Clock(part * clock.left)  # once it is compiled
         if not share.allows(foreseen):
             note(bench, method, steps, foreseen, math.nan)
             return
-        if isinstance(method, Explicit):
+        if method.is_explicit:
             tried(bench, method, bench.whole(2 * limit / bench.refinement))
         while best > max(error / 3, reference.error / 2) and idle < 2:
             trial = tried(bench, method, steps)
@@ -178,9 +176,7 @@ def work_precision(
 
     def bettered(method: AbstractIntegrator) -> bool:
         """Whether others do as well as this implicit method on the scene's own grid for no more seconds."""
-        first = [
-            t for t in trials if t.refinement == 1 and isinstance(t.method, Explicit) == isinstance(method, Explicit)
-        ]
+        first = [t for t in trials if t.refinement == 1 and t.method.is_explicit == method.is_explicit]
         own = [t for t in first if t.method is method and math.isfinite(t.error)]
         others = [t for t in first if t.method is not method]
         return all(any(o.error <= _AS_GOOD * t.error and o.seconds <= t.seconds for o in others) for t in own)
@@ -188,7 +184,7 @@ def work_precision(
     benches = {1: own}
     plan = [(n, method) for n, method in itertools.product(refinements, methods) if n <= reference.refinement or n == 1]
     for k, (n, method) in enumerate(plan):
-        if n > 1 and 1 in refinements and not isinstance(method, Explicit) and bettered(method):
+        if n > 1 and 1 in refinements and not method.is_explicit and bettered(method):
             continue
         if clock.left <= 0:
             skipped.append(name_of(method) + (f" at spacing / {n}" if n > 1 else ""))

@@ -1,23 +1,24 @@
 """Grid, B-spline kernels, stencils, and the transfers between particles and grid."""
 
-from mpmjax.discretisation._gradient import Gradient, MLSGradient, SplineGradient
+from mpmjax.discretisation._gradient import AbstractGradient, MLSGradient, SplineGradient
 from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._kernel import BSpline
 from mpmjax.discretisation._stencil import Stencil, in_window, make_stencil
-from mpmjax.discretisation._transfer import APIC, FLIP, PIC, Transfer, g2p, p2g
+from mpmjax.discretisation._transfer import APIC, FLIP, PIC, AbstractTransfer, Gathered, g2p, p2g
 from mpmjax.discretisation._transfer_sums import gather, scatter
 
 __all__ = [
     "APIC",
     "FLIP",
     "PIC",
+    "AbstractGradient",
+    "AbstractTransfer",
     "BSpline",
-    "Gradient",
+    "Gathered",
     "Grid",
     "MLSGradient",
     "SplineGradient",
     "Stencil",
-    "Transfer",
     "g2p",
     "gather",
     "in_window",

@@ -1,13 +1,54 @@
-"""The gradient operators: of the spline, and of moving least squares."""
+"""Gradient operators: of the spline, and of moving least squares."""
+
+from abc import abstractmethod
 
 import equinox as eqx
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Float, Scalar
+from mpmjax.discretisation._kernel import BSpline
+
+_STEEPEST = {2: 6.0, 3: 3.1368191}
+"""The largest value over a cell of dx² Σ_i (∂w_ip)²/w_ip, for the quadratic and the cubic kernel."""
 
 
-class SplineGradient(eqx.Module):
-    """The gradient of the kernel itself, g_ip = ∇w_ip: the reference's choice."""
+class AbstractGradient(eqx.Module):
+    """The gradient operator g_ip [1/m] of the internal force and of the deformation gradient's update."""
+
+    @abstractmethod
+    def derivatives(self, spline: Float[Array, "d s p"], least_squares: Float[Array, "d s p"]) -> Float[Array, "d s p"]:
+        """The factor of g_ip along each axis that stands in the place of the weight [1/m], shape (d, s, p).
+
+        Args:
+            spline: the derivative of the weight along each axis [1/m], shape (d, s, p).
+            least_squares: the same factor of the moving-least-squares gradient [1/m], shape (d, s, p).
+        """
+
+    def steepness(self, kernel: BSpline, spacing: Scalar, inverse_moment: Float[Array, "*p"]) -> Array | None:
+        """Ξ [1/m²], a bound of the eigenvalues of Σ_i g_ip g_ipᵀ/w_ip at any place in a cell, for `stable_dt`. Default:
+        None, no bound is known, and then `stable_dt` can be asked for in the total description only.
+
+        Args:
+            kernel: B-spline.
+            spacing: distance dx between nodes [m].
+            inverse_moment: the largest eigenvalue of D_p⁻¹, D_p = Σ_i w_ip (x_i − x_p)(x_i − x_p)ᵀ [1/m²].
+        """
+        del kernel, spacing, inverse_moment
+        return None
 
 
-class MLSGradient(eqx.Module):
+class SplineGradient(AbstractGradient):
+    """The gradient of the kernel itself, g_ip = ∇w_ip."""
+
+    def derivatives(self, spline: Float[Array, "d s p"], least_squares: Float[Array, "d s p"]) -> Float[Array, "d s p"]:
+        del least_squares
+        return spline
+
+    def steepness(self, kernel: BSpline, spacing: Scalar, inverse_moment: Float[Array, "*p"]) -> Array | None:
+        return inverse_moment if kernel.order == 1 else _STEEPEST[kernel.order] / jnp.asarray(spacing) ** 2
+
+
+class MLSGradient(AbstractGradient):
     """The moving-least-squares gradient, g_ip = w_ip D_p⁻¹ (x_i − x_p), D_p = Σ_i w_ip (x_i − x_p)(x_i − x_p)ᵀ.
 
     D_p = dx²/4 I for the quadratic and dx²/3 I for the cubic kernel; for the linear one the product is the gradient of
@@ -16,5 +57,10 @@ class MLSGradient(eqx.Module):
     doi 10.1145/3197517.3201293). The velocity gradient then is APIC's affine matrix.
     """
 
+    def derivatives(self, spline: Float[Array, "d s p"], least_squares: Float[Array, "d s p"]) -> Float[Array, "d s p"]:
+        del spline
+        return least_squares
 
-Gradient = SplineGradient | MLSGradient
+    def steepness(self, kernel: BSpline, spacing: Scalar, inverse_moment: Float[Array, "*p"]) -> Array | None:
+        del kernel, spacing
+        return inverse_moment

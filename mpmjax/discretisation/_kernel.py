@@ -25,6 +25,12 @@ class BSpline(eqx.Module):
         require_fields(self)
         require(self.order in (1, 2, 3), f"A B-spline's order must be 1, 2 or 3, got {self.order}.")
 
+    @property
+    def variance(self) -> float:
+        """Σ_i w_ip (x_i − x_p)²/dx² along an axis, which does not depend on the place for the quadratic and the cubic
+        kernel."""
+        return {2: 1 / 4, 3: 1 / 3}[self.order]
+
     def base(self, xi: Array) -> Array:
         """First node of the stencil for a position xi in spacings."""
         return jnp.floor(xi - (self.order - 1) / 2)
@@ -42,7 +48,7 @@ class BSpline(eqx.Module):
                 far = (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6
                 return jnp.stack([(1 - t) ** 3 / 6, near, far, t**3 / 6], axis=1)
 
-    def slopes(self, f: Array) -> Array:
+    def derivatives(self, f: Array) -> Array:
         """Derivatives of the weights with respect to f [1 per spacing]."""
         match self.order:
             case 1:

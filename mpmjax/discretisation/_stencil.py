@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Indices, Int, ParticleVector, components
-from mpmjax.discretisation._gradient import Gradient, MLSGradient, SplineGradient
+from mpmjax.discretisation._gradient import AbstractGradient
 from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._kernel import BSpline
 
@@ -17,19 +17,20 @@ class Stencil(eqx.Module):
     """What ties particles to nodes: for each particle s = order + 1 nodes along each axis, and their weights.
 
     Weights and gradients of the s^d stencil nodes are products of one factor an axis, and only those are stored: w_ip
-    is the product of the weights, g_ip in direction a the same with the slope along a in the weight's place. Built at
-    the positions x (updated Lagrangian) or once at the reference positions X (total Lagrangian); gradients are with
-    respect to those. Component first: the particle axis is last.
+    is the product of the weights, g_ip in direction a the same with the derivative along a in the weight's place.
+    Built at the positions x (updated Lagrangian) or once at the reference positions X (total Lagrangian); gradients are
+    with respect to those. Component first: the particle axis is last.
     """
 
     index_factors: Int[Array, "d s p"]
     """What each axis adds to the flat node index, shape (d, s, p); meaningless for a particle that is not `inside`."""
     weights: Float[Array, "d s p"]
     """Weights along each axis [-], shape (d, s, p)."""
-    slopes: Float[Array, "d s p"]
-    """Slopes [1/m] along each axis, of the chosen gradient operator, shape (d, s, p)."""
-    affine_slopes: Float[Array, "d s p"] | None
-    """Those of the moving-least-squares gradient, where the transfer needs it and it is not the chosen one."""
+    weight_derivatives: Float[Array, "d s p"]
+    """Derivatives of the weights along each axis [1/m], by the scene's gradient operator, shape (d, s, p)."""
+    mls_weight_derivatives: Float[Array, "d s p"] | None
+    """The same by moving least squares, shape (d, s, p), if the transfer keeps an affine velocity and the scene's
+    gradient operator is another; else None."""
     moment: Float[Array, "d p"]
     """Diagonal of D_p [m²], shape (d, p)."""
     inside: Bool[Array, "p"]
@@ -38,14 +39,18 @@ class Stencil(eqx.Module):
     @property
     def least_squares(self) -> "Stencil":
         """The stencil whose gradient is that of moving least squares."""
-        if self.affine_slopes is None:
+        if self.mls_weight_derivatives is None:
             return self
-        return eqx.tree_at(lambda s: (s.slopes, s.affine_slopes), self, (self.affine_slopes, None))
+        return eqx.tree_at(
+            lambda s: (s.weight_derivatives, s.mls_weight_derivatives), self, (self.mls_weight_derivatives, None)
+        )
 
     @property
     def squared(self) -> "Stencil":
         """The stencil of w_ip² and of the squared components g_ip,a²."""
-        return eqx.tree_at(lambda s: (s.weights, s.slopes), self, (self.weights**2, self.slopes**2))
+        return eqx.tree_at(
+            lambda s: (s.weights, s.weight_derivatives), self, (self.weights**2, self.weight_derivatives**2)
+        )
 
     @property
     def index(self) -> Indices:
@@ -60,7 +65,7 @@ class Stencil(eqx.Module):
     @property
     def gradient(self) -> Float[Array, "k d p"]:
         """g_ip [1/m], of the chosen operator, shape (s^d, d, p)."""
-        w, g = list(self.weights), list(self.slopes)
+        w, g = list(self.weights), list(self.weight_derivatives)
         return jnp.stack([_tensor(jnp.multiply, [*w[:a], g[a], *w[a + 1 :]]) for a in range(len(w))], axis=1)
 
 
@@ -74,7 +79,7 @@ def in_window(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleV
 
 
 def make_stencil(
-    kernel: BSpline, gradient: Gradient, grid: Grid, window: Int[Array, "d"], x: ParticleVector, *, affine: bool
+    kernel: BSpline, gradient: AbstractGradient, grid: Grid, window: Int[Array, "d"], x: ParticleVector, *, affine: bool
 ) -> Stencil:
     """The stencil of particles at x.
 
@@ -84,32 +89,26 @@ def make_stencil(
         grid: grid.
         window: lattice index of the window's first node.
         x: positions [m], shape (p, d).
-        affine: whether the transfer needs the moving-least-squares gradient.
+        affine: whether the transfer keeps an affine velocity, which needs the moving-least-squares gradient.
     """
     dx = grid.spacing
     xi = components(x) / dx
     f = xi - jax.lax.stop_gradient(kernel.base(xi))
-    weights, spline = kernel.weights(f), kernel.slopes(f) / dx
+    weights, spline = kernel.weights(f), kernel.derivatives(f) / dx
     if kernel.order == 1:
         moment = f * (1 - f) * dx**2
         least_squares = spline
     else:
-        variance = {2: 1 / 4, 3: 1 / 3}[kernel.order]
+        variance = kernel.variance
         moment = jnp.full_like(f, variance) * dx**2
         offset = jnp.arange(kernel.order + 1, dtype=f.dtype)[:, None] - f[:, None]
         least_squares = weights * offset / (variance * dx)
-    match gradient:
-        case MLSGradient():
-            slopes, same = least_squares, True
-        case SplineGradient():
-            slopes, same = spline, kernel.order == 1
-        case _:
-            raise ValueError(f"A gradient must be SplineGradient or MLSGradient, got {gradient!r}.")
+    derivatives = gradient.derivatives(spline, least_squares)
     return Stencil(
         index_factors=_index_factors(kernel, grid, window, xi),
         weights=weights,
-        slopes=slopes,
-        affine_slopes=least_squares if affine and not same else None,
+        weight_derivatives=derivatives,
+        mls_weight_derivatives=least_squares if affine and derivatives is not least_squares else None,
         moment=moment,
         inside=in_window(kernel, grid, window, x),
     )

@@ -1,5 +1,6 @@
 """Transfers between particles and grid: PIC, FLIP and APIC."""
 
+from abc import abstractmethod
 from typing import ClassVar
 
 import equinox as eqx
@@ -11,18 +12,78 @@ from mpmjax.discretisation._stencil import Stencil
 from mpmjax.discretisation._transfer_sums import gather, scatter
 
 
-class PIC(eqx.Module):
+class Gathered(eqx.Module):
+    """A velocity field of the nodes as each particle sees it."""
+
+    value: Float[Array, "d p"]
+    """Σ_i w_ip v_i [m/s], shape (d, p)."""
+    gradient: Matrix
+    """Σ_i v_i g_ipᵀ [1/s], shape (d, d, p), by the scene's gradient operator."""
+    affine: Matrix | None
+    """Σ_i v_i g_ipᵀ [1/s], shape (d, d, p), by moving least squares; None unless the transfer is `affine`."""
+
+
+class AbstractTransfer(eqx.Module):
+    """What particles take over from the grid's velocity, and what they keep of their own."""
+
+    affine: ClassVar[bool] = False
+    """Whether particles keep an affine velocity C [1/s]: P2G then gives Σ_p w_ip m_p (v_p + C_p (x_i − x_p))."""
+    needs_change: ClassVar[bool] = False
+    """Whether `velocity` or `affine_velocity` uses the change of the nodes' velocity over the step. P2G then computes
+    v^n apart from the explicit force's impulse, which an explicit step pays for."""
+
+    @abstractmethod
+    def velocity(self, v: Float[Array, "d p"], new: Gathered, change: Gathered | None) -> Float[Array, "d p"]:
+        """The particles' velocity after the step [m/s], shape (d, p).
+
+        Args:
+            v: the particles' velocity before the step [m/s], shape (d, p).
+            new: the nodes' velocity after the step, v_i^{n+1}.
+            change: its change over the step, v_i^{n+1} − v_i^n; None unless `needs_change`.
+        """
+
+    def affine_velocity(self, C: Matrix | None, new: Gathered, change: Gathered | None) -> Matrix | None:
+        """The particles' affine velocity after the step [1/s], shape (d, d, p). Default: the moving-least-squares
+        gradient of the new velocity, or None unless the transfer is `affine`.
+
+        Args:
+            C: the affine velocity before the step [1/s], shape (d, d, p).
+            new: as in `velocity`.
+            change: as in `velocity`.
+        """
+        del C, change
+        return new.affine
+
+    def steepness(self, inverse_moment: Array, gradient_bound: Array) -> tuple[Array, Array] | None:
+        """The two numbers [1/m²] with which `stable_dt` bounds Δt² Λ A/ρ0 + Δt Λ_v B/ρ0 ≤ 4: A of elasticity and B of
+        viscosity. Default: None, no bound is known.
+
+        Args:
+            inverse_moment: a, the largest eigenvalue of D_p⁻¹ [1/m²].
+            gradient_bound: Ξ, a bound of Σ_i g_ip g_ipᵀ/w_ip [1/m²].
+        """
+        del inverse_moment, gradient_bound
+        return None
+
+
+class PIC(AbstractTransfer):
     """Particle-in-cell: particles take the grid's velocity (F. H. Harlow, Methods Comput. Phys. 3 (1964) 319).
 
     Conserves linear momentum; loses angular momentum and, every step, all velocity that the grid does not resolve.
     First order in space.
     """
 
-    affine: ClassVar[bool] = False
-    needs_change: ClassVar[bool] = False
+    def velocity(self, v: Float[Array, "d p"], new: Gathered, change: Gathered | None) -> Float[Array, "d p"]:
+        del v, change
+        return new.value
+
+    def steepness(self, inverse_moment: Array, gradient_bound: Array) -> tuple[Array, Array] | None:
+        """2Ξ and 4Ξ: the affine velocity is forgotten."""
+        del inverse_moment
+        return 2 * gradient_bound, 4 * gradient_bound
 
 
-class FLIP(eqx.Module):
+class FLIP(AbstractTransfer):
     """FLIP(α): particles take the change of the grid's velocity, blended with PIC (J. U. Brackbill, H. M. Ruppel,
     J. Comput. Phys. 65 (1986) 314, doi 10.1016/0021-9991(86)90211-1).
 
@@ -34,15 +95,23 @@ class FLIP(eqx.Module):
     """
 
     alpha: Scalar = 0.99
-    affine: ClassVar[bool] = False
     needs_change: ClassVar[bool] = True
 
     def __check_init__(self):
         require_fields(self)
         require_between("FLIP's alpha", self.alpha, 0, 1)
 
+    def velocity(self, v: Float[Array, "d p"], new: Gathered, change: Gathered | None) -> Float[Array, "d p"]:
+        assert change is not None
+        return self.alpha * (v + change.value) + (1 - self.alpha) * new.value
 
-class APIC(eqx.Module):
+    def steepness(self, inverse_moment: Array, gradient_bound: Array) -> tuple[Array, Array] | None:
+        """2Ξ and 4Ξ: the affine velocity is forgotten."""
+        del inverse_moment
+        return 2 * gradient_bound, 4 * gradient_bound
+
+
+class APIC(AbstractTransfer):
     """Affine particle-in-cell (C. Jiang, C. Schroeder, A. Selle, J. Teran, A. Stomakhin, ACM Trans. Graph. 34 (2015)
     51, doi 10.1145/2766996).
 
@@ -51,10 +120,14 @@ class APIC(eqx.Module):
     """
 
     affine: ClassVar[bool] = True
-    needs_change: ClassVar[bool] = False
 
+    def velocity(self, v: Float[Array, "d p"], new: Gathered, change: Gathered | None) -> Float[Array, "d p"]:
+        del v, change
+        return new.value
 
-Transfer = PIC | FLIP | APIC
+    def steepness(self, inverse_moment: Array, gradient_bound: Array) -> tuple[Array, Array] | None:
+        """2Ξ − a and 2a."""
+        return 2 * gradient_bound - inverse_moment, 2 * inverse_moment
 
 
 def p2g(
@@ -86,51 +159,63 @@ def p2g(
     else:  # w (x_i − x_p) = D g, with g the moving-least-squares gradient
         along = stencil.least_squares
         arms.append(mass * C * stencil.moment)
-    slopes = jnp.pad(jnp.swapaxes(sum(arms), 0, 1), ((0, 0), (1, 0), (0, 0))) if arms else None
-    nodes = scatter(along, jnp.concatenate([mass[None], mass * v]), slopes, size)
+    gradients = jnp.pad(jnp.swapaxes(sum(arms), 0, 1), ((0, 0), (1, 0), (0, 0))) if arms else None
+    nodes = scatter(along, jnp.concatenate([mass[None], mass * v]), gradients, size)
     return nodes[:, 0], nodes[:, 1:]
 
 
 def g2p(
-    transfer: Transfer,
+    transfer: AbstractTransfer,
     stencil: Stencil,
     v: Float[Array, "d p"],
-    before: NodeVector,
+    before: NodeVector | None,
     after: NodeVector,
     mean: NodeVector | None = None,
     *,
+    C: Matrix | None = None,
     kept: bool = False,
 ) -> tuple[Float[Array, "d p"], Float[Array, "d p"], Matrix | None, Matrix]:
     """Grid to particles.
 
     Args:
-        transfer: PIC, FLIP or APIC.
+        transfer: the transfer.
         stencil: stencil of the particles.
         v: the particles' velocity before the step [m/s], shape (d, p).
-        before: v_i^n [m/s], shape (n, d); only FLIP looks at it.
+        before: v_i^n [m/s], shape (n, d); needed by transfers with `needs_change` only.
         after: v_i^{n+1} [m/s], shape (n, d).
-        mean: with what the nodes move over the step, v̄_i [m/s], shape (n, d), if not with v_i^{n+1}.
-        kept: whether PIC and FLIP return a C too, Σ_i v_i^{n+1} g_ipᵀ.
+        mean: the velocity v̄_i with which positions and deformation move over the step [m/s], shape (n, d), if it is not
+            v_i^{n+1}.
+        C: the particles' affine velocity before the step [1/s], shape (d, d, p), if they have one.
+        kept: whether transfers that are not affine return a C too, Σ_i v_i^{n+1} g_ipᵀ.
     Returns:
-        the velocity that carries the particles, Σ_i w_ip v̄_i; their new velocity; their new C, if any; and the velocity
+        the velocity with which particles move, Σ_i w_ip v̄_i; their new velocity; their new C, if any; and the velocity
         gradient that deforms them, Σ_i v̄_i g_ipᵀ [1/s], shape (d, d, p).
     """
-    fields = [after] if mean is None else [after, mean]
-    if isinstance(transfer, FLIP):
-        fields.append(after - before)
+    change = None
+    if transfer.needs_change:
+        if before is None:
+            raise ValueError(f"{type(transfer).__name__} needs the change of the nodes' velocity: give before.")
+        change = after - before
+    fields = [field for field in (after, mean, change) if field is not None]
     values, gradients = gather(stencil, jnp.concatenate(fields, axis=1))
-    arrived, *others = jnp.split(values, len(fields))
-    slope, *other_slopes = (jnp.swapaxes(g, 0, 1) for g in jnp.split(gradients, len(fields), axis=1))
-    new, C = arrived, slope if kept else None
-    match transfer:
-        case APIC() if stencil.affine_slopes is None:
-            C = slope
-        case APIC():
-            C = jnp.swapaxes(gather(stencil.least_squares, after)[1], 0, 1)
-        case FLIP(alpha=alpha):
-            new = alpha * (v + others[-1]) + (1 - alpha) * arrived
-        case PIC():
-            pass
-        case _:
-            raise ValueError(f"A transfer must be PIC, FLIP or APIC, got {transfer!r}.")
-    return (arrived, new, C, slope) if mean is None else (others[0], new, C, other_slopes[0])
+    values, gradients = jnp.split(values, len(fields)), _split_gradients(gradients, len(fields))
+    affine: list[Matrix | None] = [None] * len(fields)
+    if transfer.affine and stencil.mls_weight_derivatives is None:
+        affine = [*gradients]
+    elif transfer.affine:
+        kept_fields = [field for field in (after, change) if field is not None]
+        found = _split_gradients(
+            gather(stencil.least_squares, jnp.concatenate(kept_fields, axis=1))[1], len(kept_fields)
+        )
+        affine[0] = found[0]
+        if change is not None:
+            affine[-1] = found[-1]
+    seen = [Gathered(*parts) for parts in zip(values, gradients, affine, strict=True)]
+    new, carrier, changed = seen[0], seen[0 if mean is None else 1], None if change is None else seen[-1]
+    C = transfer.affine_velocity(C, new, changed) if transfer.affine else new.gradient if kept else None
+    return carrier.value, transfer.velocity(v, new, changed), C, carrier.gradient
+
+
+def _split_gradients(gradients: Float[Array, "d c p"], fields: int) -> list[Matrix]:
+    """The velocity gradient of each field, shape (d, d, p), of the gradients of all of them."""
+    return [jnp.swapaxes(g, 0, 1) for g in jnp.split(gradients, fields, axis=1)]

@@ -1,12 +1,12 @@
 """The two sums that cross between particles and grid: `gather` and `scatter`, each other's transpose.
 
 Weights and gradients of a stencil are products of one factor an axis, so both sums are factorised: what is summed along
-the last axis, with its weights and with its slopes, meets one factor for each axis before it, and a gradient costs
+the last axis, with its weights and with its gradients, meets one factor for each axis before it, and a gradient costs
 hardly more than a value.
 
 Both are partial derivatives of one form, linear in each of its arguments,
 
-    B(factors; a, f) = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b),    spread = ∂B/∂f,  collect = ∂B/∂a,
+    B(factors; a, f) = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b),    scatter = ∂B/∂f,  gather = ∂B/∂a,
 
 and `_pull` is the third, by the factors. They are JAX primitives for the sake of their derivatives, which are each
 other, where JAX itself would transpose each read of a node to an addition of whole grids. Another back end replaces
@@ -38,12 +38,12 @@ def gather(stencil: Stencil, nodes: Float[Array, "n c"]) -> tuple[Float[Array, "
         stencil: stencil of the particles.
         nodes: f_i, shape (n, c).
     """
-    value, *slopes = _gather_p.bind(*_factors(stencil), nodes, batched=0)
-    return value, jnp.stack(slopes)
+    value, *gradients = _gather_p.bind(*_factors(stencil), nodes, batched=0)
+    return value, jnp.stack(gradients)
 
 
 def scatter(
-    stencil: Stencil, value: Float[Array, "c p"] | None, slopes: Float[Array, "d c p"] | None, size: int
+    stencil: Stencil, value: Float[Array, "c p"] | None, gradients: Float[Array, "d c p"] | None, size: int
 ) -> Float[Array, "n c"]:
     """The sums at the nodes Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b): `gather`'s transpose.
 
@@ -52,28 +52,28 @@ def scatter(
     Args:
         stencil: stencil of the particles.
         value: a_p, shape (c, p), or None for zero.
-        slopes: a_p,b for each direction b, shape (d, c, p), or None for zero.
+        gradients: a_p,b for each direction b, shape (d, c, p), or None for zero.
         size: number of nodes n.
     """
-    given = [*([] if value is None else [value]), *([] if slopes is None else slopes)]
+    given = [*([] if value is None else [value]), *([] if gradients is None else gradients)]
     return _scatter_p.bind(*_factors(stencil), *given, valued=value is not None, size=size, batched=0)[0]
 
 
 def _factors(stencil: Stencil) -> tuple[Array, ...]:
-    return stencil.index_factors, stencil.weights, stencil.slopes
+    return stencil.index_factors, stencil.weights, stencil.weight_derivatives
 
 
 # The sums themselves, of rows (p, c): `_narrow` takes what a particle gives one axis further in, to one node along it;
 # `_widen` what it is given one axis further out.
 
 
-def _narrow(value: Array | None, slopes: list[Array], w: Array, g: Array) -> tuple[Array, list[Array]]:
-    parts = [*([] if value is None else [w[:, None] * value]), *(g[:, None] * slope for slope in slopes[:1])]
-    return reduce(jnp.add, parts), [w[:, None] * slope for slope in slopes[1:]]
+def _narrow(value: Array | None, gradients: list[Array], w: Array, g: Array) -> tuple[Array, list[Array]]:
+    parts = [*([] if value is None else [w[:, None] * value]), *(g[:, None] * gradient for gradient in gradients[:1])]
+    return reduce(jnp.add, parts), [w[:, None] * gradient for gradient in gradients[1:]]
 
 
-def _widen(value: Array, slopes: list[Array], w: Array, g: Array) -> list[Array]:
-    return [w[:, None] * value, g[:, None] * value, *(w[:, None] * slope for slope in slopes)]
+def _widen(value: Array, gradients: list[Array], w: Array, g: Array) -> list[Array]:
+    return [w[:, None] * value, g[:, None] * value, *(w[:, None] * gradient for gradient in gradients)]
 
 
 def _along(axis: int, factors: tuple[Array, ...], step: Callable[..., tuple], start: Any, unroll: bool) -> Any:
@@ -86,19 +86,19 @@ def _along(axis: int, factors: tuple[Array, ...], step: Callable[..., tuple], st
 
 
 def _gather(*args: Array, unroll: bool) -> list[Array]:
-    """∂B/∂a: value and slopes, each (c, p)."""
+    """∂B/∂a: value and gradients, each (c, p)."""
     *factors, nodes = args
     d, _, p = factors[0].shape
 
     def summed(axis: int, first: Array) -> list[Array]:
-        """Over this axis and those after it, from a first node: the value, then a slope an axis."""
+        """Over this axis and those after it, from a first node: the value, then a gradient an axis."""
         if axis == d:
             return [nodes.at[first].get(mode="clip", wrap_negative_indices=False)]
 
         def add(totals: list[Array], factor: tuple[Array, ...]) -> tuple[list[Array], None]:
             share, w, g = factor
-            value, *slopes = summed(axis + 1, first + share)
-            return [t + a for t, a in zip(totals, _widen(value, slopes, w, g), strict=True)], None
+            value, *gradients = summed(axis + 1, first + share)
+            return [t + a for t, a in zip(totals, _widen(value, gradients, w, g), strict=True)], None
 
         zeros = [jnp.zeros((p, nodes.shape[1]), nodes.dtype)] * (d - axis + 1)
         return _along(axis, tuple(factors), add, zeros, unroll)[0]
@@ -111,14 +111,14 @@ def _scatter(*args: Array, valued: bool, size: int, unroll: bool) -> list[Array]
     factors, given = args[:3], args[3:]
     d, _, p = factors[0].shape
 
-    def add(axis: int, first: Array, value: Array | None, slopes: list[Array], nodes: Array) -> Array:
+    def add(axis: int, first: Array, value: Array | None, gradients: list[Array], nodes: Array) -> Array:
         """What the nodes along this axis and those after it receive, from a first node."""
         if axis == d:
             return nodes.at[first].add(value, mode="drop", wrap_negative_indices=False)
 
         def step(nodes: Array, factor: tuple[Array, ...]) -> tuple[Array, None]:
             share, w, g = factor
-            return add(axis + 1, first + share, *_narrow(value, slopes, w, g), nodes), None
+            return add(axis + 1, first + share, *_narrow(value, gradients, w, g), nodes), None
 
         return _along(axis, factors, step, nodes, unroll)[0]
 
@@ -128,28 +128,28 @@ def _scatter(*args: Array, valued: bool, size: int, unroll: bool) -> list[Array]
         width = block[0].shape[0]
         spare = (1 << (width - 1).bit_length()) - width
         rows = [jnp.pad(a, ((0, spare), (0, 0))).T for a in block]
-        value, slopes = (rows[0], rows[1:]) if valued else (None, rows)
+        value, gradients = (rows[0], rows[1:]) if valued else (None, rows)
         nodes = jnp.zeros((size, width + spare), given[0].dtype)
-        blocks.append(add(0, jnp.zeros((p,), factors[0].dtype), value, slopes, nodes)[:, :width])
+        blocks.append(add(0, jnp.zeros((p,), factors[0].dtype), value, gradients, nodes)[:, :width])
     return [jnp.concatenate(blocks, axis=1)]
 
 
 def _pull(*args: Array, valued: bool) -> tuple[Array, Array]:
-    """∂B/∂factors at f and a: by the weights and by the slopes, each (d, s, p)."""
+    """∂B/∂factors at f and a: by the weights and by their derivatives, each (d, s, p)."""
     factors, nodes, given = args[:3], args[3], [a.T for a in args[4:]]
     d, _, p = factors[0].shape
 
-    def pulled(axis: int, first: Array, value: Array | None, slopes: list[Array]) -> tuple[list[Array], list]:
+    def pulled(axis: int, first: Array, value: Array | None, gradients: list[Array]) -> tuple[list[Array], list]:
         """What is collected over this axis and those after it, and the derivatives by their factors."""
         if axis == d:
             return [nodes.at[first].get(mode="clip", wrap_negative_indices=False)], []
 
         def step(carry: tuple[list[Array], list], factor: tuple[Array, ...]) -> tuple[Any, Any]:
             share, w, g = factor
-            found, inner = pulled(axis + 1, first + share, *_narrow(value, slopes, w, g))
-            by_weight = [a * f for a, f in zip([value, *slopes[1:]], found, strict=False) if a is not None]
-            by_slope = [a * found[0] for a in slopes[:1]]
-            here = tuple(reduce(jnp.add, by, jnp.zeros_like(found[0])).sum(axis=1) for by in (by_weight, by_slope))
+            found, inner = pulled(axis + 1, first + share, *_narrow(value, gradients, w, g))
+            by_weight = [a * f for a, f in zip([value, *gradients[1:]], found, strict=False) if a is not None]
+            by_gradient = [a * found[0] for a in gradients[:1]]
+            here = tuple(reduce(jnp.add, by, jnp.zeros_like(found[0])).sum(axis=1) for by in (by_weight, by_gradient))
             return jax.tree.map(jnp.add, carry, (_widen(found[0], found[1:], w, g), inner)), here
 
         zeros = [jnp.zeros((p, nodes.shape[1]), nodes.dtype)] * (d - axis + 1)
@@ -157,14 +157,15 @@ def _pull(*args: Array, valued: bool) -> tuple[Array, Array]:
         (totals, inner), here = _along(axis, factors, step, (zeros, inner), unroll=False)
         return totals, [here, *inner]
 
-    value, slopes = (given[0], given[1:]) if valued else (None, given)
-    by_axis = pulled(0, jnp.zeros((p,), factors[0].dtype), value, slopes)[1]
-    weights, slopes = zip(*by_axis, strict=True)
-    return jnp.stack(weights), jnp.stack(slopes)
+    value, gradients = (given[0], given[1:]) if valued else (None, given)
+    by_axis = pulled(0, jnp.zeros((p,), factors[0].dtype), value, gradients)[1]
+    weights, derivatives = zip(*by_axis, strict=True)
+    return jnp.stack(weights), jnp.stack(derivatives)
 
 
 def _by_factors(function: Callable[..., list[Array]]) -> Callable[..., list[Array]]:
-    """A sum's differential by its factors, of shares, weights, slopes, their differentials, and what else it takes."""
+    """A sum's differential by its factors, of shares, weights, their derivatives, the differentials of both, and what
+    else it takes."""
 
     def differential(*args: Array, **params: Any) -> list[Array]:
         index_factors, rest = args[0], args[5:]
@@ -173,8 +174,8 @@ def _by_factors(function: Callable[..., list[Array]]) -> Callable[..., list[Arra
     return differential
 
 
-# What makes them primitives: arguments are shares, weights, slopes and what the sum is linear in, each with as many
-# leading axes as the batch has.
+# What makes them primitives: arguments are shares, weights, their derivatives and what the sum is linear in, each with
+# as many leading axes as the batch has.
 
 
 def _members(function: Callable[..., Any], batched: int) -> Callable[..., Any]:
@@ -261,10 +262,10 @@ _differentiate(_scatter_p, _scatter_by_factors_p, _scatter)
 
 
 def _given(cotangents: list) -> tuple[list[Array], bool]:
-    """The cotangents of what is collected, as what is spread: value and slopes, or one of them where the other is zero,
-    and whether there is a value."""
-    valued, sloped = (any(type(t) is not ad.Zero for t in part) for part in (cotangents[:1], cotangents[1:]))
-    parts = cotangents if valued and sloped else cotangents[:1] if valued else cotangents[1:]
+    """The cotangents of what was gathered, as what is scattered: value and gradients, or one of them where the other is
+    zero, and whether there is a value."""
+    valued, graded = (any(type(t) is not ad.Zero for t in part) for part in (cotangents[:1], cotangents[1:]))
+    parts = cotangents if valued and graded else cotangents[:1] if valued else cotangents[1:]
     return list(map(ad.instantiate_zeros, parts)), valued
 
 

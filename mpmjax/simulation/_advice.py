@@ -5,7 +5,7 @@ from typing import Any
 
 from mpmjax.material import AbstractInelastic, AbstractVolumetric, Law
 from mpmjax.state import Particles, Scene
-from mpmjax.stepping import SAFETY, AbstractIntegrator, BackwardEuler, Explicit, longest_step
+from mpmjax.stepping import SAFETY, AbstractIntegrator, UnknownBoundError, longest_step
 
 
 def advise(scene: Scene, method: AbstractIntegrator, dt: Any, began: Particles, last: Particles, otherwise: str) -> str:
@@ -21,7 +21,10 @@ def advise(scene: Scene, method: AbstractIntegrator, dt: Any, began: Particles, 
         last: the last good ones.
         otherwise: what the fault suggests where the step is within the limit.
     """
-    first, then = (float(longest_step(scene, particles, method)) for particles in (began, last))
+    try:
+        first, then = (float(longest_step(scene, particles, method)) for particles in (began, last))
+    except UnknownBoundError:
+        return otherwise
     if scene.kernel.order == 1 and not scene.total:
         then = first  # it changes with every move of the particles, and is zero at each cell's face
     if math.isnan(then):
@@ -29,8 +32,8 @@ def advise(scene: Scene, method: AbstractIntegrator, dt: Any, began: Particles, 
     known = math.isfinite(first) and first > 0 and then > 0
     if not known or float(dt) <= SAFETY * min(first, then):
         return otherwise
-    name = "explicit limit" if isinstance(method, Explicit) else f"limit of {type(method).__name__} with beta < 1/2"
-    said = f"dt = {float(dt):.4g} s is {float(dt) / first:.3g} times the {name} at the start ({first:.4g} s)"
+    times = float(dt) / first
+    said = f"dt = {float(dt):.4g} s is {times:.3g} times the {method.limit_name()} at the start ({first:.4g} s)"
     if not math.isclose(first, then, rel_tol=1e-2):
         said += f" and {float(dt) / then:.3g} times that of the last good state ({then:.4g} s)"
     if float(dt) <= min(first, then):
@@ -44,7 +47,7 @@ def disallowed(law: Law, method: AbstractIntegrator) -> tuple[str, str]:
     """What is wrong with an F that the law does not allow, and what to do."""
     newton = (
         ""
-        if isinstance(method, Explicit | BackwardEuler)
+        if method.is_explicit or method.keeps_admissible
         else ", or take BackwardEuler(), whose line search forbids it"
     )
     match law:

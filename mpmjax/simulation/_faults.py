@@ -24,7 +24,7 @@ from mpmjax.simulation._statistics import (
     RunStatistics,
 )
 from mpmjax.state import Particles, State, state_of, with_state
-from mpmjax.stepping import AbstractIntegrator, BackwardEuler
+from mpmjax.stepping import AbstractIntegrator
 
 
 def raise_faults(run: Run, began: Particles, previous: State | None, start: int) -> None:
@@ -85,7 +85,7 @@ def unconverged_advice(method: AbstractIntegrator, dtype: Any) -> str:
     advice = [*method.unconverged_advice(), "reduce dt", "raise the solver's max_steps or loosen its rtol"]
     if jnp.dtype(dtype) == jnp.float32:
         advice.append("take float64 particles, of which rounding leaves more digits")
-    if not isinstance(method, BackwardEuler):
+    if not method.keeps_admissible:
         advice.append("BackwardEuler holds where one linear solve does not")
     text = "; ".join(advice)
     return f"{text[0].upper()}{text[1:]}."

@@ -1,7 +1,7 @@
 """Particles, scene and what a step needs of them."""
 
 from mpmjax.state._body_force import AbstractBodyForce
-from mpmjax.state._description import TotalLagrangian, UpdatedLagrangian
+from mpmjax.state._description import AbstractDescription, TotalLagrangian, UpdatedLagrangian
 from mpmjax.state._fill import fill
 from mpmjax.state._material_points import MaterialPoints
 from mpmjax.state._particles import Particles, State, by_material, histories, join, state_of, with_state
@@ -10,6 +10,7 @@ from mpmjax.state._scene import Scene
 
 __all__ = [
     "AbstractBodyForce",
+    "AbstractDescription",
     "MaterialPoints",
     "Particles",
     "Scene",

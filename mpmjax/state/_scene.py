@@ -23,18 +23,18 @@ from mpmjax.checks import (
 )
 from mpmjax.discretisation import (
     APIC,
+    AbstractGradient,
+    AbstractTransfer,
     BSpline,
-    Gradient,
     Grid,
     MLSGradient,
     SplineGradient,
     Stencil,
-    Transfer,
     make_stencil,
 )
 from mpmjax.material import AbstractInelastic, AbstractVolumetric, Law, Viscous
 from mpmjax.state._body_force import AbstractBodyForce
-from mpmjax.state._description import Description, TotalLagrangian, UpdatedLagrangian
+from mpmjax.state._description import AbstractDescription, UpdatedLagrangian
 from mpmjax.state._material_points import Laws, MaterialPoints, material_points, return_map, split
 from mpmjax.state._particles import Particles
 
@@ -68,9 +68,9 @@ class Scene(eqx.Module):
     gravity: Point
     boundary: tuple[AbstractBoundary, ...]
     kernel: BSpline
-    gradient: Gradient
-    transfer: Transfer
-    description: Description
+    gradient: AbstractGradient
+    transfer: AbstractTransfer
+    description: AbstractDescription
     body_force: AbstractBodyForce | None
 
     @checked
@@ -82,9 +82,9 @@ class Scene(eqx.Module):
         gravity: Point | None = None,
         boundary: AbstractBoundary | tuple[AbstractBoundary, ...] | list[AbstractBoundary] = (),
         kernel: BSpline = BSpline(),
-        gradient: Gradient | None = None,
-        transfer: Transfer = APIC(),
-        description: Description = UpdatedLagrangian(),
+        gradient: AbstractGradient | None = None,
+        transfer: AbstractTransfer = APIC(),
+        description: AbstractDescription = UpdatedLagrangian(),
         body_force: AbstractBodyForce | None = None,
     ):
         self.grid = grid
@@ -92,7 +92,7 @@ class Scene(eqx.Module):
         self.gravity = (0.0,) * grid.dim if gravity is None else gravity
         self.boundary = (boundary,) if isinstance(boundary, AbstractBoundary) else tuple(boundary)
         self.kernel = kernel
-        rough = isinstance(description, TotalLagrangian) and kernel == BSpline(2)  # where moving least squares is
+        rough = description.total and kernel == BSpline(2)  # where moving least squares is
         self.gradient = gradient or (SplineGradient() if rough else MLSGradient())
         self.transfer = transfer
         self.description = description
@@ -180,15 +180,15 @@ class Scene(eqx.Module):
     @property
     def total(self) -> bool:
         """Whether the description is total Lagrangian."""
-        return isinstance(self.description, TotalLagrangian)
+        return self.description.total
 
     def window(self, particles: Particles) -> Int[Array, "d"]:
         """Lattice index of the grid window's first node."""
         return self.grid.window(self.anchor(particles))
 
     def anchor(self, particles: Particles) -> Array:
-        """The positions at which stencils stand: x, or X in the total description. Shape (p, d)."""
-        return particles.X if self.total and particles.X is not None else particles.x
+        """The positions at which stencils stand [m], shape (p, d): x, or X in the total description."""
+        return self.description.anchor(particles)
 
     def stencil(self, particles: Particles) -> Stencil:
         """The particles' stencil, with the moving-least-squares gradient where the transfer needs it."""

@@ -6,7 +6,7 @@ from mpmjax.stepping._implicit_midpoint import ImplicitMidpoint
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes, particles_to_grid
 from mpmjax.stepping._semi_implicit import SemiImplicit
-from mpmjax.stepping._stability import MOST_STEPS, SAFETY, longest_step, stable_dt, step_for
+from mpmjax.stepping._stability import MOST_STEPS, SAFETY, UnknownBoundError, longest_step, stable_dt, step_for
 from mpmjax.stepping._step import GridUpdate, StepInfo, advance, advance_compiled, grid_to_particles, step, update
 from mpmjax.stepping._trbdf2 import TRBDF2
 
@@ -23,6 +23,7 @@ __all__ = [
     "Nodes",
     "SemiImplicit",
     "StepInfo",
+    "UnknownBoundError",
     "advance",
     "advance_compiled",
     "grid_to_particles",

@@ -5,7 +5,7 @@ from typing import ClassVar
 import equinox as eqx
 import lineax as lx
 
-from mpmjax._types import NodeVector
+from mpmjax._types import NodeVector, Scalar
 from mpmjax.checks import require_fields
 from mpmjax.implicit import (
     AbstractHessian,
@@ -43,9 +43,7 @@ class BackwardEuler(AbstractImplicitIntegrator):
     preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
     adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
-    centred: ClassVar[bool] = False
-    needs_force: ClassVar[bool] = True
-    lagged: ClassVar[bool] = False
+    keeps_admissible: ClassVar[bool] = True
 
     def __check_init__(self):
         require_fields(self)
@@ -57,3 +55,6 @@ class BackwardEuler(AbstractImplicitIntegrator):
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt f(Δt v) [kg m/s]."""
         return nodes.dt * nodes.potential.force(nodes.dt * motion.velocity)
+
+    def stability_factor(self) -> Scalar:
+        return 0.0

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from mpmjax._types import NodeVector
+from mpmjax._types import NodeVector, Scalar
 from mpmjax.implicit import SolveInfo, no_solve
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
@@ -19,9 +19,8 @@ class Explicit(AbstractIntegrator):
     (c the pressure-wave speed of the *current* tangent, which stretching and compression raise): see `stable_dt`.
     """
 
-    centred: ClassVar[bool] = False
-    needs_force: ClassVar[bool] = False
-    lagged: ClassVar[bool] = True
+    is_explicit: ClassVar[bool] = True
+    needs_separate_force: ClassVar[bool] = False
 
     def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         del guess
@@ -32,3 +31,9 @@ class Explicit(AbstractIntegrator):
         """Δt f(0) [kg m/s], on nodes that have mass."""
         del motion
         return jnp.where(nodes.occupied, nodes.dt * nodes.force, 0)
+
+    def stability_factor(self) -> Scalar:
+        return 1.0
+
+    def limit_name(self) -> str:
+        return "explicit limit"

@@ -5,7 +5,7 @@ from typing import ClassVar
 import equinox as eqx
 import lineax as lx
 
-from mpmjax._types import NodeVector
+from mpmjax._types import NodeVector, Scalar
 from mpmjax.checks import require_fields
 from mpmjax.implicit import (
     AbstractHessian,
@@ -50,9 +50,7 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
     preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
     adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
-    centred: ClassVar[bool] = True
-    needs_force: ClassVar[bool] = True
-    lagged: ClassVar[bool] = False
+    body_force_at: ClassVar[float] = 0.5
 
     def __check_init__(self):
         require_fields(self)
@@ -66,3 +64,6 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt f(½Δt v̄) [kg m/s]."""
         return nodes.dt * stage_force(nodes, self, self.solution, (1, nodes.dt / 2 * motion.carrier))
+
+    def stability_factor(self) -> Scalar:
+        return 0.0

@@ -4,7 +4,6 @@ from abc import abstractmethod
 from typing import ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._types import NodeVector, Scalar
@@ -21,9 +20,10 @@ class NodeMotion(eqx.Module):
     """The velocity with which positions and deformation move over the step [m/s], shape (n, d); None where it is
     v^{n+1}."""
     inner: NodeVector | None = None
-    """The same up to an inner stage, the displacement there over Δt; None without one."""
+    """The displacement at an inner stage over Δt [m/s], shape (n, d); None without one."""
     resisted: NodeVector | None = None
-    """The velocity that viscosity resists over the step [m/s], shape (n, d); None where the solve has no viscosity."""
+    """The velocity that viscosity resists over the step [m/s], shape (n, d); None without viscosity, or if it is
+    explicit."""
 
     @property
     def carrier(self) -> NodeVector:
@@ -31,7 +31,7 @@ class NodeMotion(eqx.Module):
         return self.velocity if self.mean is None else self.mean
 
     def slowed(self, loss: NodeVector) -> "NodeMotion":
-        """Changed by an impulse that acts evenly over the step: half of it counts for the mean."""
+        """With the velocity changed by an impulse that acts evenly over the step, and the mean by half of that."""
         return NodeMotion(
             self.velocity + loss, None if self.mean is None else self.mean + loss / 2, self.inner, self.resisted
         )
@@ -40,35 +40,57 @@ class NodeMotion(eqx.Module):
 class AbstractIntegrator(eqx.Module):
     """How the velocity of the nodes is updated in a step.
 
+    An integrator of one's own needs `advance` and `elastic_impulse`; the rest has defaults that are right for any.
     Boundaries, contact, friction, transfers, reports and derivatives are the same for all integrators.
     """
 
-    centred: ClassVar[bool] = False
-    """Whether body forces are those at the middle of the step."""
-    needs_force: ClassVar[bool] = True
-    """Whether the force is wanted apart from the momentum that it makes."""
-    lagged: ClassVar[bool] = False
-    """Whether viscosity is explicit, that of the particles' stored velocity gradients."""
+    is_explicit: ClassVar[bool] = False
+    """Whether there is nothing to solve. Advice on faults and `work_precision` use it."""
+    needs_separate_force: ClassVar[bool] = True
+    """Whether v^n and the force are needed apart. An integrator whose v^{n+1} is `nodes.explicit_velocity()` wherever
+    nothing is prescribed may set it to False: P2G then sums momentum and force in one where it can, at half the cost,
+    `nodes.velocity` and `nodes.force` raise, and `elastic_impulse` is not asked for."""
+    explicit_viscosity: ClassVar[bool] = True
+    """Whether `nodes.force` holds the viscous stress of the particles' stored velocity gradients. With False `advance`
+    must treat viscosity, and return the velocity that it resists in `NodeMotion.resisted`."""
+    body_force_at: ClassVar[float] = 0.0
+    """When body forces are taken, as a fraction of the step: 0 is its start, ½ its middle."""
+    keeps_admissible: ClassVar[bool] = False
+    """Whether the solve ends at a deformation that the law allows, as Newton's line search makes sure of."""
 
     @abstractmethod
     def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
-        """The nodes' motion and the solve's report.
+        """The motion of the nodes over the step, and the report of the solve (`no_solve` if there is none).
+
+        Components outside of `nodes.projection` must move with `nodes.prescribed`.
 
         Args:
-            nodes: what P2G brought, with what the boundaries hold.
+            nodes: the nodes at the start of the step, with the boundaries.
             guess: where an implicit solve starts [m/s], shape (n, d).
         """
 
     @abstractmethod
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
-        """The impulse of the elastic force over the step [kg m/s], shape (n, d)."""
+        """The impulse over the step [kg m/s], shape (n, d), of the elastic force and of what else the integrator adds,
+        equal to m (v^{n+1} − v^n − Δt g) where nothing is prescribed. Explicit viscosity is a part of it, being one of
+        `nodes.force`; implicit viscosity, which resists `NodeMotion.resisted`, is added elsewhere."""
+
+    def stability_factor(self) -> Scalar | None:
+        """c, such that a step is stable where c (Δt² Λ A/ρ0 + Δt Λ_v B/ρ0) ≤ 4 (see `stable_dt`): 1 for the explicit
+        step, 0 or less for no bound on the step at all. Default: None, no bound is known, and `stable_dt` raises."""
+        return None
+
+    def limit_name(self) -> str:
+        """What messages call the bound on the step."""
+        return f"limit of {type(self).__name__}"
 
     def initial_guess(self, nodes: Nodes) -> NodeVector:
-        """Where an implicit solve starts [m/s], shape (n, d). Default: v^n."""
-        return nodes.velocity
+        """Where an implicit solve starts [m/s], shape (n, d). Default: v^n, or v* where v^n is not known."""
+        return nodes.velocity if nodes.separate else nodes.explicit_velocity()
 
     def reporting(self, slot: Scalar) -> "AbstractIntegrator":
-        """The same integrator, its tangent and adjoint solves reporting through a slot. Default: there are none."""
+        """This integrator with tangent and adjoint solves that report through a slot. Default: itself, for there are
+        none."""
         del slot
         return self
 
@@ -79,7 +101,9 @@ class AbstractIntegrator(eqx.Module):
 
 
 class AbstractImplicitIntegrator(AbstractIntegrator):
-    """An integrator that solves with the elastic Hessian."""
+    """An integrator that solves with the elastic Hessian, and treats viscosity implicitly."""
+
+    explicit_viscosity: ClassVar[bool] = False
 
     hessian: eqx.AbstractVar[AbstractHessian]
     """How H acts."""
@@ -102,11 +126,3 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
     def unconverged_advice(self) -> tuple[str, ...]:
         advice = self.preconditioner.advice
         return () if advice is None else (advice,)
-
-
-def viscous_impulse(nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
-    """−Δt D v [kg m/s] of the velocity that it resisted, or what P2G knew of it; None without viscosity, and where P2G
-    joined it to the elastic force."""
-    if motion.resisted is not None:
-        return -nodes.dt * nodes.potential.damping_force(motion.resisted)
-    return None if nodes.viscous is None else jnp.where(nodes.occupied, nodes.dt * nodes.viscous, 0)

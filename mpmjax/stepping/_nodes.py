@@ -1,5 +1,7 @@
 """The grid's side of a step: what the particles bring to the nodes, and what the nodes' new velocity is made from."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,9 @@ from mpmjax.boundary import Conditions, Contact, Mirror, combine, contacts, mirr
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.state import Particles, Scene
+
+Fold = Callable[[NodeVector], NodeVector]
+"""The sum of a nodal vector with its images at mirrors."""
 
 _PARALLEL = 1e-2  # a normal whose part in free components is smaller is prescribed by the others
 
@@ -24,19 +29,54 @@ class Grasp(eqx.Module):
     """The velocity along it [m/s] with which the whole normal component is the collider's, shape (n,)."""
 
 
+class SeparateSums(eqx.Module):
+    """What P2G gives when it sums momentum and force apart."""
+
+    velocity: NodeVector
+    """v_i^n [m/s], shape (n, d); zero on empty nodes."""
+    force: NodeVector
+    """The internal force at the start of the step [N], shape (n, d): of elasticity, and of viscosity for integrators in
+    which that is explicit."""
+    viscous_force: NodeVector | None
+    """The part of `force` that is viscous [N], shape (n, d), where it was asked for."""
+
+    def explicit_velocity(self, nodes: "Nodes") -> NodeVector:
+        """v^n + Δt g + Δt f/m [m/s], shape (n, d)."""
+        return nodes.inertial_velocity() + nodes.dt * nodes.per_mass(self.force)
+
+    def folded(self, velocity: Fold, force: Fold) -> "SeparateSums":
+        """With velocities and forces folded at mirrors."""
+        viscous = None if self.viscous_force is None else force(self.viscous_force)
+        return SeparateSums(velocity(self.velocity), force(self.force), viscous)
+
+
+class JoinedSum(eqx.Module):
+    """What P2G gives when it adds the impulse of the force to the momentum in one sum, at half the cost."""
+
+    velocity_with_force: NodeVector
+    """v^n + Δt f/m [m/s], shape (n, d); zero on empty nodes."""
+
+    def explicit_velocity(self, nodes: "Nodes") -> NodeVector:
+        """v^n + Δt f/m + Δt g [m/s], shape (n, d)."""
+        return self.velocity_with_force + nodes.dt * nodes.acceleration
+
+    def folded(self, velocity: Fold, force: Fold) -> "JoinedSum":
+        """With velocities and forces folded at mirrors."""
+        del force
+        return JoinedSum(velocity(self.velocity_with_force))
+
+
 class Nodes(eqx.Module):
-    """What the velocity update of one step is given."""
+    """What an integrator is given: the nodes at the start of a step, with the step and the boundaries."""
 
     mass: NodeScalar
     """m_i [kg], shape (n,), folded at symmetry planes; zero on empty nodes, whose mass is but rounding."""
-    velocity: NodeVector
-    """v_i^n [m/s], shape (n, d); zero on empty nodes. Plus Δt f_i/m_i where P2G has added the force's impulse."""
+    sums: SeparateSums | JoinedSum
+    """What P2G summed besides the mass."""
     occupied: Bool[Array, "n 1"]
     """Whether the node has mass beyond rounding, that of the lightest particle, shape (n, 1)."""
     acceleration: Array
     """Body acceleration g [m/s²], shape (d,), or (n, d) where it varies."""
-    force: NodeVector
-    """f_i at the start of the step [N], shape (n, d); zero where P2G has added its impulse to the momentum."""
     dt: Float[Array, ""]
     """Δt [s]."""
     spacing: Float[Array, ""]
@@ -45,10 +85,45 @@ class Nodes(eqx.Module):
     """Φ, of nodal displacements."""
     conditions: Conditions
     """What the boundaries prescribe."""
-    viscous: NodeVector | None = None
-    """The part of viscosity in an explicit step's force [N], shape (n, d), where it was wanted apart."""
     contacts: tuple[Contact, ...] = ()
     """The scene's contact planes, of which none holds anything here."""
+
+    @property
+    def velocity(self) -> NodeVector:
+        """v_i^n [m/s], shape (n, d); zero on empty nodes.
+
+        Raises:
+            ValueError: P2G summed momentum and force in one.
+        """
+        return self._separate.velocity
+
+    @property
+    def force(self) -> NodeVector:
+        """The internal force at the start of the step [N], shape (n, d).
+
+        Raises:
+            ValueError: P2G summed momentum and force in one.
+        """
+        return self._separate.force
+
+    @property
+    def viscous_force(self) -> NodeVector | None:
+        """The part of `force` that is viscous [N], shape (n, d); None where it was not asked for."""
+        return None if isinstance(self.sums, JoinedSum) else self.sums.viscous_force
+
+    @property
+    def separate(self) -> bool:
+        """Whether v^n and the force are known apart."""
+        return not isinstance(self.sums, JoinedSum)
+
+    @property
+    def _separate(self) -> SeparateSums:
+        if isinstance(self.sums, JoinedSum):
+            raise ValueError(
+                "P2G summed momentum and force in one, so v^n and the force are not known apart: only "
+                "nodes.explicit_velocity() is. An integrator that uses them must have needs_separate_force = True."
+            )
+        return self.sums
 
     @property
     def free(self) -> Mask:
@@ -92,20 +167,19 @@ class Nodes(eqx.Module):
         return jnp.where(self.free, grasp.normal * grasp.speed[:, None], self.conditions.velocity)
 
     def explicit_velocity(self) -> NodeVector:
-        """v* = v^n + Δt f / m + Δt g (derivation, eq. 4)."""
-        force = self.force if self.viscous is None else self.force + self.viscous
-        return jnp.where(self.occupied, self.inertial_velocity() + self.dt * self.per_mass(force), 0)
+        """v* = v^n + Δt f/m + Δt g [m/s], shape (n, d) (derivation, eq. 4)."""
+        return jnp.where(self.occupied, self.sums.explicit_velocity(self), 0)
 
     def inertial_velocity(self) -> NodeVector:
-        """ṽ = v^n + Δt g."""
+        """ṽ = v^n + Δt g [m/s], shape (n, d)."""
         return jnp.where(self.occupied, self.velocity + self.dt * self.acceleration, 0)
 
     def admitted_velocity(self) -> NodeVector:
-        """v^n with what is prescribed: what a wall will hold stops as the step begins."""
+        """v^n with the prescribed components [m/s], shape (n, d): what a wall will hold stops as the step begins."""
         return self.projection.combine(self.velocity, self.prescribed)
 
     def per_mass(self, impulse: NodeVector) -> NodeVector:
-        """An impulse or force over the nodes' mass; zero on empty nodes."""
+        """An impulse or force divided by the nodes' mass; zero on empty nodes."""
         return jnp.where(self.occupied, impulse / jnp.where(self.occupied, self.mass[:, None], 1), 0)
 
     def folded(self, images: Mirror) -> "Nodes":
@@ -116,15 +190,17 @@ class Nodes(eqx.Module):
         if not images.images:
             return self
         mass = images.fold_scalar(self.mass)
-        momentum, pull = self.mass[:, None] * self.velocity, self.mass[:, None] * self.acceleration
         nodes = eqx.tree_at(
-            lambda n: (n.mass, n.occupied, n.force, n.potential.mirror),
+            lambda n: (n.mass, n.occupied, n.potential.mirror),
             self,
-            (mass, (mass > 0)[:, None], images.fold(self.force), images.then(self.potential.mirror)),
+            (mass, (mass > 0)[:, None], images.then(self.potential.mirror)),
         )
-        parts = nodes.per_mass(images.fold(momentum)), nodes.per_mass(images.fold(pull))
-        nodes = eqx.tree_at(lambda n: (n.velocity, n.acceleration), nodes, parts)
-        return nodes if nodes.viscous is None else eqx.tree_at(lambda n: n.viscous, nodes, images.fold(nodes.viscous))
+
+        def fold_per_mass(v: Array) -> NodeVector:
+            return nodes.per_mass(images.fold(self.mass[:, None] * v))
+
+        parts = self.sums.folded(fold_per_mass, images.fold), fold_per_mass(self.acceleration)
+        return eqx.tree_at(lambda n: (n.sums, n.acceleration), nodes, parts)
 
 
 def particles_to_grid(
@@ -134,17 +210,25 @@ def particles_to_grid(
     dt: Scalar,
     stencil: Stencil,
     *,
-    centred: bool,
-    lagged: bool = False,
-    kicked: bool = False,
-    apart: bool = False,
+    body_force_at: float = 0.0,
+    explicit_viscosity: bool = False,
+    joined: bool = False,
+    viscosity_apart: bool = False,
 ) -> Nodes:
     """P2G, folded at symmetry planes, with the elastic potential and the boundaries of the step from t to t + dt.
 
-    Body forces are those of the particles at t, or with `centred` at t + ½dt, half a step on by their velocity. With
-    `kicked` the elastic force is not wanted for itself: its impulse over the step goes to the nodes in one sum with the
-    momentum, where they have one gradient operator, and half of P2G's cost is saved. With `lagged` the viscous stress
-    of the particles' own velocity gradients is part of that force, or with `apart` beside it.
+    Args:
+        scene: the scene.
+        particles: prepared particles.
+        t: time at the start of the step [s].
+        dt: step [s].
+        stencil: that of the particles.
+        body_force_at: when body forces are taken, as a fraction of the step from its start, at positions moved on with
+            the particles' velocity until then.
+        explicit_viscosity: whether the viscous stress of the particles' stored velocity gradients is part of the force.
+        joined: whether momentum and force may be summed in one, which is done where both have the same gradient
+            operator.
+        viscosity_apart: whether the viscous part of the force is also wanted for itself.
     """
     grid, window = scene.grid, scene.window(particles)
     v = components(particles.v)
@@ -153,17 +237,19 @@ def particles_to_grid(
     acceleration = jnp.asarray(scene.gravity)
     with jax.named_scope("p2g"):
         potential = ElasticPotential(scene.material_points(particles), stencil, Mirror(()))
-        kicked = kicked and stencil.affine_slopes is None
-        resisted = C if lagged and potential.viscous else None
-        flux = potential.current_flux()
-        if resisted is not None and not apart:
-            flux = flux + potential.viscous_flux(resisted)
-        mass, momentum = p2g(stencil, particles.mass, v, affine, grid.size, -dt * flux if kicked else None)
+        joined = joined and stencil.mls_weight_derivatives is None
+        flux, viscous_flux = potential.current_flux(), None
+        if explicit_viscosity and potential.viscous and C is not None:
+            viscous_flux = potential.viscous_flux(C)
+            flux = flux + viscous_flux
+        mass, momentum = p2g(stencil, particles.mass, v, affine, grid.size, -dt * flux if joined else None)
         lightest = particles.mass.min()  # a mean would empty the nodes of a body much lighter than the others
         occupied = (mass > jnp.finfo(mass.dtype).eps * lightest)[:, None]
         full = jnp.where(occupied, mass[:, None], 1)
         if scene.body_force is not None:
-            x, at = (particles.x + dt / 2 * particles.v, t + dt / 2) if centred else (particles.x, t)
+            x, at = particles.x, t
+            if body_force_at > 0:
+                x, at = x + body_force_at * dt * particles.v, t + body_force_at * dt
             push = particles.mass * components(scene.body_force.acceleration(x, at))
             force = scatter(stencil, push, None, grid.size)
             acceleration = acceleration + jnp.where(occupied, force / full, 0)
@@ -172,19 +258,23 @@ def particles_to_grid(
             slid = (conditions.touch.owner >= 0)[:, None] & occupied
             place = jnp.where(slid, _place(particles, stencil, grid.size) / full, conditions.touch.position)
             conditions = eqx.tree_at(lambda c: c.touch.position, conditions, place)
+        velocity = jnp.where(occupied, momentum / full, 0)
+        if joined:
+            sums = JoinedSum(velocity)
+        else:
+            viscous_force = None
+            if viscosity_apart and viscous_flux is not None:
+                viscous_force = -potential.sum_of(viscous_flux, momentum)
+            sums = SeparateSums(velocity, -potential.sum_of(flux, momentum), viscous_force)
         nodes = Nodes(
             mass=jnp.where(occupied[:, 0], mass, 0),
-            velocity=jnp.where(occupied, momentum / full, 0),
+            sums=sums,
             occupied=occupied,
             acceleration=acceleration,
-            force=jnp.zeros_like(momentum) if kicked else -potential.sum_of(flux, momentum),
             dt=jnp.asarray(dt),
             spacing=jnp.asarray(grid.spacing),
             potential=potential,
             conditions=conditions,
-            viscous=None
-            if resisted is None or not apart
-            else -potential.sum_of(potential.viscous_flux(resisted), momentum),
             contacts=contacts(scene.boundary, grid, window),
         )
         return nodes.folded(mirror(scene.boundary, grid, window))

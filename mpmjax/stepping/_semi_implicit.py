@@ -1,8 +1,7 @@
 """The semi-implicit step."""
 
-from typing import ClassVar
-
 import equinox as eqx
+import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._types import NodeVector, Scalar
@@ -54,9 +53,6 @@ class SemiImplicit(AbstractImplicitIntegrator):
     preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
     adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
-    centred: ClassVar[bool] = False
-    needs_force: ClassVar[bool] = True
-    lagged: ClassVar[bool] = False
 
     def __check_init__(self):
         require_fields(self)
@@ -83,3 +79,9 @@ class SemiImplicit(AbstractImplicitIntegrator):
         """Δt f(0) − βΔt² H v [kg m/s]."""
         action = self.hessian.at_current(nodes.potential, motion.velocity)
         return nodes.dt * nodes.force - self.beta * nodes.dt**2 * action(motion.velocity)
+
+    def stability_factor(self) -> Scalar:
+        return 1 - 2 * jnp.asarray(self.beta)
+
+    def limit_name(self) -> str:
+        return "limit of SemiImplicit with beta < 1/2"

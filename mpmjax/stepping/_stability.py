@@ -10,25 +10,19 @@ import numpy as np
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import canonical, checked, is_traced, require, require_positive
-from mpmjax.discretisation import MLSGradient
+from mpmjax.discretisation import Stencil
 from mpmjax.state import MaterialPoints, Particles, Scene, is_prepared, prepare
-from mpmjax.stepping._backward_euler import BackwardEuler
 from mpmjax.stepping._explicit import Explicit
-from mpmjax.stepping._implicit_midpoint import ImplicitMidpoint
 from mpmjax.stepping._integrator import AbstractIntegrator
-from mpmjax.stepping._semi_implicit import SemiImplicit
-from mpmjax.stepping._trbdf2 import TRBDF2
 
 MOST_STEPS = 2**31 - 1
 """What a run counts its steps up to."""
-_INVERSE_MOMENT = {2: 4.0, 3: 3.0}
-"""dx² a of the quadratic and the cubic kernel, a the inverse of D_p = Σ_i w_ip (x_i − x_p)²."""
-_STEEPEST = {2: 6.0, 3: 3.1368191}
-"""The largest value over a cell of dx² Σ_i (∂w_ip)²/w_ip, for the quadratic and the cubic kernel."""
-
-
 SAFETY = 0.7
 """The default safety."""
+
+
+class UnknownBoundError(ValueError):
+    """An integrator, transfer or gradient operator gives no bound on the step."""
 
 
 @checked
@@ -81,7 +75,8 @@ def stable_dt(
         t1: end time [s]: the result is then the longest step at or below the bound of which t1 is a whole number.
 
     Raises:
-        ValueError: from `prepare`; a safety that is not positive; with t1, a bound that is zero or that there is none.
+        ValueError: from `prepare`; a safety that is not positive; an integrator, transfer or gradient operator that
+            gives no bound; with t1, a bound that is zero or infinite.
     """
     require_positive("safety", safety)
     limit = canonical(safety, particles.x.dtype) * longest_step(scene, particles, method)
@@ -134,7 +129,11 @@ def _whole(limit: Array, t1: Scalar, method: str) -> Float[Array, ""]:
 
 
 def longest_step(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Float[Array, ""]:
-    """`stable_dt` with a safety of one [s]; NaN where F is not finite, or too large."""
+    """`stable_dt` with a safety of one [s]; NaN where F is not finite, or too large.
+
+    Raises:
+        UnknownBoundError: an integrator, transfer or gradient operator gives no bound.
+    """
     scene, method = canonical((scene, method), particles.x.dtype)
     return _limit(scene, particles if is_prepared(scene, particles) else prepare(scene, particles), method)
 
@@ -142,21 +141,16 @@ def longest_step(scene: Scene, particles: Particles, method: AbstractIntegrator)
 @eqx.filter_jit
 def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Float[Array, ""]:
     density = particles.mass / particles.volume
+    elastic_steepness, viscous_steepness = _steepness(scene, particles)
     bodies = scene.material_points(particles)
     stiffest = jnp.concatenate([_tangent_spectrum(c, particles.dim).max(axis=0) for c in bodies])
-    z = stiffest * _gradient_bound(scene, particles) / density  # per Δt²
-    match method:
-        case Explicit():
-            explicit = jnp.ones_like(z)
-        case SemiImplicit(beta=beta):
-            explicit = (1 - 2 * jnp.asarray(beta)) * jnp.ones_like(z)
-        case BackwardEuler() | ImplicitMidpoint() | TRBDF2():
-            explicit = jnp.zeros_like(z)
-        case _:
-            raise ValueError(f"stable_dt does not know how {type(method).__name__} limits the step: give dt yourself.")
+    z = stiffest * elastic_steepness / density  # per Δt²
+    factor = method.stability_factor()
+    if factor is None:
+        raise UnknownBoundError(f"{type(method).__name__} gives no bound on its step: give dt.")
     most = jnp.concatenate([_stiffest_viscosity(c, particles.dim) for c in bodies])
-    y = most * _viscous_gradient_bound(scene, particles) / density  # per Δt
-    z, y = jnp.maximum(explicit * z, 0), jnp.maximum(explicit * y, 0)
+    y = most * viscous_steepness / density  # per Δt
+    z, y = jnp.maximum(factor * z, 0), jnp.maximum(factor * y, 0)
     square = y**2 + 16 * z
     none = square == 0  # and not what is NaN, which the least must keep
     steepness = (y + jnp.where(none, 0, jnp.sqrt(jnp.where(none, 1, square)))).max()
@@ -196,30 +190,25 @@ def _tangent_spectrum(body: MaterialPoints, dim: int) -> Float[Array, "m q"]:
     return jnp.stack(values)
 
 
-def _gradient_bound(scene: Scene, particles: Particles) -> Float[Array, "*p"]:
-    """2Ξ − κa [1/m²]."""
-    a, steepest = _inverse_moments(scene, particles)
-    return 2 * steepest - a if scene.transfer.affine else 2 * steepest
+def _steepness(scene: Scene, particles: Particles) -> tuple[Array, Array]:
+    """A and B [1/m²] of Δt² Λ A/ρ0 + Δt Λ_v B/ρ0 ≤ 4, by the scene's gradient operator and transfer."""
+    spacing = jnp.asarray(scene.grid.spacing)
+    if scene.kernel.order == 1:
+        inverse_moment = 1 / scene.stencil(particles).moment.min(axis=0)
+    else:
+        inverse_moment = 1 / scene.kernel.variance / spacing**2
+    bound = scene.gradient.steepness(scene.kernel, spacing, inverse_moment)
+    if scene.total and (bound is None or scene.kernel.order > 1):
+        bound = _steepness_here(scene.stencil(particles))
+    bounds = None if bound is None else scene.transfer.steepness(inverse_moment, bound)
+    if bound is None or bounds is None:
+        culprit = scene.gradient if bound is None else scene.transfer
+        raise UnknownBoundError(f"{type(culprit).__name__} gives no bound on the step: give dt.")
+    return bounds
 
 
-def _viscous_gradient_bound(scene: Scene, particles: Particles) -> Float[Array, "*p"]:
-    """2a with APIC, 4Ξ with PIC and FLIP [1/m²]."""
-    a, steepest = _inverse_moments(scene, particles)
-    return 2 * a if scene.transfer.affine else 4 * steepest
-
-
-def _inverse_moments(scene: Scene, particles: Particles) -> tuple[Array, Array]:
-    """a and Ξ [1/m²]."""
-    order, dx = scene.kernel.order, jnp.asarray(scene.grid.spacing)
-    if order == 1:  # both gradients are one, and Ξ = a
-        a = 1 / scene.stencil(particles).moment.min(axis=0)
-        return a, a
-    a = _INVERSE_MOMENT[order] / dx**2
-    if isinstance(scene.gradient, MLSGradient):
-        return a, a
-    if not scene.total:
-        return a, _STEEPEST[order] / dx**2
-    stencil = scene.stencil(particles)
+def _steepness_here(stencil: Stencil) -> Float[Array, "p"]:
+    """Ξ [1/m²] where each particle is, shape (p,): Σ_i g_ip g_ipᵀ/w_ip is diagonal."""
     touched = stencil.weights > 0
-    steepness = jnp.where(touched, stencil.slopes**2 / jnp.where(touched, stencil.weights, 1), 0)
-    return a, steepness.sum(axis=1).max(axis=0)
+    parts = jnp.where(touched, stencil.weight_derivatives**2 / jnp.where(touched, stencil.weights, 1), 0)
+    return parts.sum(axis=1).max(axis=0)

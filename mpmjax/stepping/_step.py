@@ -1,4 +1,4 @@
-"""One step: particles to grid, the grid's update by a method, grid to particles, return maps of what yields."""
+"""One step: particles to grid, the nodes' update by an integrator, grid to particles, return maps of what yields."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from mpmjax.implicit import Projection, SolveInfo
 from mpmjax.state import Particles, Scene, is_prepared, prepare
 from mpmjax.stepping._contact import NOTHING, ContactInfo, Held, find_active_set, hold, no_contact, touches
 from mpmjax.stepping._explicit import Explicit
-from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion, viscous_impulse
+from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes, particles_to_grid
 
 
@@ -33,16 +33,18 @@ class StepInfo(eqx.Module):
 class GridUpdate(eqx.Module):
     """The nodes' new velocity and where it came from."""
 
-    before: NodeVector
-    """v_i^n [m/s], shape (n, d), mirrored where a contact plane holds."""
+    before: NodeVector | None
+    """v_i^n [m/s], shape (n, d), mirrored where a contact plane holds; None where P2G summed momentum and force in
+    one."""
     motion: NodeMotion
-    """How they move, mirrored likewise."""
-    elastic: NodeVector
-    """The impulse of the elastic force [kg m/s], shape (n, d); with it that of viscosity where P2G joined them."""
+    """How they move over the step, mirrored likewise."""
+    internal: NodeVector | None
+    """The impulse of internal forces [kg m/s], shape (n, d), elastic and viscous; None where P2G summed momentum and
+    force in one."""
     viscous: NodeVector | None
-    """The impulse of viscosity [kg m/s], shape (n, d), where there is one."""
+    """The viscous part of `internal` [kg m/s], shape (n, d); None without viscosity, or where it was not asked for."""
     reaction: NodeVector
-    """The impulse of walls and grips [kg m/s], shape (n, d); on free components what the solve left."""
+    """The impulse of walls and grips [kg m/s], shape (n, d); on free components the residual of the solve."""
     friction: NodeVector | None
     """The impulse of friction [kg m/s], shape (n, d), where there are walls that may be left."""
     free: Projection
@@ -74,9 +76,15 @@ def advance(
         stencil: that of the reference positions, if the description is total and it was computed before.
     """
     stencil = scene.stencil(particles) if stencil is None else stencil
-    kicked = not (method.needs_force or scene.transfer.needs_change)
     nodes = particles_to_grid(
-        scene, particles, t, dt, stencil, centred=method.centred, lagged=method.lagged, kicked=kicked
+        scene,
+        particles,
+        t,
+        dt,
+        stencil,
+        body_force_at=method.body_force_at,
+        explicit_viscosity=method.explicit_viscosity,
+        joined=not (method.needs_separate_force or scene.transfer.needs_change),
     )
     new = update(nodes, method)
     outside = (~stencil.inside).sum().astype(jnp.int32)
@@ -100,10 +108,10 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
         guess = method.initial_guess(nodes)
         if not touches(nodes):
             motion, info = method.advance(nodes, guess)
-            elastic, reaction, viscous = impulses(nodes, method, motion)
+            internal, viscous, reaction = impulses(nodes, method, motion)
             push = hold(nodes, NOTHING).pushes(reaction)
-            free, none = nodes.projection, no_contact()
-            return GridUpdate(nodes.velocity, motion, elastic, viscous, reaction, None, free, info, none, push)
+            before, free = nodes.velocity if nodes.separate else None, nodes.projection
+            return GridUpdate(before, motion, internal, viscous, reaction, None, free, info, no_contact(), push)
 
         def moved(held: Held, method: AbstractIntegrator, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
             motion, info = method.advance(held.nodes, guess)
@@ -113,19 +121,19 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
 
         def attempt(held: Held, guess: NodeVector) -> tuple:
             motion, info = moved(held, frozen_method, guess)
-            return motion.velocity, impulses(frozen, frozen_method, motion)[1], motion.carrier, info
+            return motion.velocity, impulses(frozen, frozen_method, motion)[2], motion.carrier, info
 
         active, guess, cost, sweeps = find_active_set(frozen, guess, attempt)
         held = hold(nodes, active)
         motion, info = moved(held, method, guess)
-        elastic, reaction, viscous = impulses(nodes, method, motion)
+        internal, viscous, reaction = impulses(nodes, method, motion)
         push = held.pushes(reaction)
         slowed, rub = held.collider_friction(held.wall_friction(motion.velocity, reaction), push)
         loss = slowed - motion.velocity
         return GridUpdate(
-            before=held.images.unfold(held.nodes.velocity),
+            before=held.images.unfold(held.nodes.velocity) if nodes.separate else None,
             motion=motion.slowed(loss),
-            elastic=elastic,
+            internal=internal,
             viscous=viscous,
             reaction=reaction,
             friction=nodes.mass[:, None] * loss,
@@ -139,12 +147,23 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
 
 def impulses(
     nodes: Nodes, method: AbstractIntegrator, motion: NodeMotion
-) -> tuple[NodeVector, NodeVector, NodeVector | None]:
-    """The impulse of the elastic force [kg m/s], that which is missing for the nodes to move so, of walls and grips,
-    and that of viscosity."""
-    elastic, viscous = method.elastic_impulse(nodes, motion), viscous_impulse(nodes, motion)
-    known = elastic if viscous is None else elastic + viscous
-    return elastic, nodes.mass[:, None] * (motion.velocity - nodes.inertial_velocity()) - known, viscous
+) -> tuple[NodeVector | None, NodeVector | None, NodeVector]:
+    """The impulses over the step [kg m/s], each of shape (n, d): of internal forces and its viscous part, as in
+    `GridUpdate`, and what walls and grips must give for the nodes to move so."""
+    if nodes.potential.viscous and not method.explicit_viscosity and motion.resisted is None:
+        raise ValueError(
+            f"{type(method).__name__} has explicit_viscosity = False, so its advance must return the velocity that "
+            "viscosity resists, NodeMotion.resisted. It returned None."
+        )
+    if not nodes.separate:
+        return None, None, nodes.mass[:, None] * (motion.velocity - nodes.explicit_velocity())
+    internal, viscous = method.elastic_impulse(nodes, motion), None
+    if motion.resisted is not None:
+        viscous = -nodes.dt * nodes.potential.damping_force(motion.resisted)
+        internal = internal + viscous
+    elif nodes.viscous_force is not None:
+        viscous = jnp.where(nodes.occupied, nodes.dt * nodes.viscous_force, 0)
+    return internal, viscous, nodes.mass[:, None] * (motion.velocity - nodes.inertial_velocity()) - internal
 
 
 def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: GridUpdate) -> Particles:
@@ -152,7 +171,7 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
     that is the trial F_E, which `Scene.return_map` brings back."""
     potential, dt = nodes.potential, nodes.dt
     unfold = potential.mirror.unfold
-    before, motion = unfold(new.before), jax.tree.map(unfold, new.motion)
+    before, motion = jax.tree.map(unfold, (new.before, new.motion))
     with jax.named_scope("g2p"):
         moved, v, C, gradient = g2p(
             scene.transfer,
@@ -161,6 +180,7 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
             before,
             motion.velocity,
             motion.mean,
+            C=None if particles.C is None else components(particles.C),
             kept=scene.keeps_gradient,
         )
         changes = zip(potential.current_deformation(), potential.deformed(gradient), strict=True)
@@ -194,7 +214,8 @@ def step(
         particles: particles; what the scene needs and they lack is added (see `prepare`).
         t: time at the start of the step [s].
         dt: step [s].
-        method: `Explicit()`, `SemiImplicit(...)`, `BackwardEuler(...)`, `ImplicitMidpoint(...)` or `TRBDF2(...)`.
+        method: the integrator: `Explicit()`, `SemiImplicit(...)`, `BackwardEuler(...)`, `ImplicitMidpoint(...)`,
+            `TRBDF2(...)` or one of your own.
 
     Returns:
         the particles after the step, and a `StepInfo`. Nothing is raised for what only the numbers show: `StepInfo`

@@ -54,9 +54,7 @@ class TRBDF2(AbstractImplicitIntegrator):
     preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
     adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
-    centred: ClassVar[bool] = True
-    needs_force: ClassVar[bool] = True
-    lagged: ClassVar[bool] = False
+    body_force_at: ClassVar[float] = 0.5
 
     def __check_init__(self):
         require_fields(self)
@@ -88,3 +86,6 @@ class TRBDF2(AbstractImplicitIntegrator):
         inner = motion.carrier if motion.inner is None else motion.inner
         stages = (q1, nodes.dt * inner), (q2, nodes.dt * motion.carrier)
         return nodes.dt * (q0 * nodes.force + stage_force(nodes, self, self.solution, *stages))
+
+    def stability_factor(self) -> Scalar:
+        return 0.0

@@ -16,7 +16,7 @@ from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractRegion
 from mpmjax.material import AbstractMaterial
 from mpmjax.simulation import Run
-from mpmjax.state import AbstractBodyForce, Particles, Scene, TotalLagrangian, fill
+from mpmjax.state import AbstractBodyForce, Particles, Scene, UpdatedLagrangian, fill
 
 _MARGIN = 4  # nodes beyond the domain, for the widest stencil and some motion
 
@@ -151,7 +151,7 @@ def discretise(
     v, rate = jax.vmap(
         lambda Y: (problem.velocity(Y, velocity_time), jax.jacfwd(lambda Z: problem.velocity(Z, velocity_time))(Y))
     )(X)
-    total = isinstance(choices.get("description"), TotalLagrangian)
+    total = choices.get("description", UpdatedLagrangian()).total
     C = rate if total else rate @ jnp.linalg.inv(F)
     scene = Scene(
         grid,

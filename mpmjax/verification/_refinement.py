@@ -58,7 +58,7 @@ def _error(
     longest = courant / (cells * problem.wave_speed)
     every = max(1, math.ceil(problem.duration / _SAMPLES / longest - 1e-9))
     dt = problem.duration / (_SAMPLES * every)
-    start = -dt / 2 if staggered or (staggered is None and not method.centred) else 0.0
+    start = -dt / 2 if staggered or (staggered is None and method.body_force_at == 0) else 0.0
     scene, particles = discretise(problem, cells, velocity_time=start, **discretisation)
     run = simulate(scene, particles, t1=problem.duration, dt=dt, method=method, save_every=every, throw=False)
     worst = float(displacement_error(problem, particles, run).max())

@@ -119,7 +119,7 @@ def test_spline_gradients_are_steepest_where_the_bound_takes_them():
     for order, most in mpm._stability._STEEPEST.items():
         kernel = mpm.BSpline(order)
         f = (order - 1) / 2 + jnp.linspace(1e-9, 1 - 1e-9, 100001)[None]
-        values = (kernel.slopes(f) ** 2 / kernel.weights(f)).sum(axis=1)
+        values = (kernel.derivatives(f) ** 2 / kernel.weights(f)).sum(axis=1)
         np.testing.assert_allclose(values.max(), most, rtol=1e-7)
 
 
