@@ -153,7 +153,12 @@ NEWTON = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-11), PROJECTED, adjoint_solver=T
 
 @pytest.mark.parametrize(
     "solver",
-    [*(pytest.param(dense, marks=pytest.mark.slow) for dense in (lx.LU(), lx.Cholesky())), MinimalResidual(), CG],
+    [
+        pytest.param(lx.LU(), marks=pytest.mark.slow),
+        pytest.param(lx.Cholesky(), marks=pytest.mark.slow),
+        MinimalResidual(),
+        CG,
+    ],
     ids=lambda solver: type(solver).__name__,
 )
 def test_a_semi_implicit_run_and_its_gradient_by_any_symmetric_solver(solver):

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 from jax.flatten_util import ravel_pytree
-from typing_extensions import override
 
 from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.checks import require, require_fields, require_positive, require_tolerance
@@ -68,7 +67,6 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
             require_positive("ConjugateResidual's increment_rtol", self.increment_rtol)
         require(self.max_steps >= 1, f"ConjugateResidual's max_steps must be at least 1, got {self.max_steps}.")
 
-    @override
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> lx.AbstractLinearOperator:
         if not lx.is_symmetric(operator):
             raise ValueError("ConjugateResidual needs a symmetric operator; tag it lineax.symmetric_tag if it is one.")
@@ -84,7 +82,6 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
     # one (by ε‖E‖‖x‖ a step), so when the recurrence is content, or at the end of its reach, the true residual is
     # computed, and if that is not small enough the recurrence starts anew from it. Three sums over the vector are all
     # that an iteration takes: ‖s‖ follows from ‖q‖, the q being orthogonal.
-    @override
     def compute(
         self, state: lx.AbstractLinearOperator, vector: Any, options: dict[str, Any]
     ) -> tuple[Any, lx.RESULTS, dict[str, Any]]:
@@ -95,15 +92,12 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
         result, stats = _outcome(system, c)
         return system.unravel(c.x), result, stats
 
-    @override
     def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         return state, options
 
-    @override
     def conj(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         return state, options
 
-    @override
     def assume_full_rank(self) -> bool:
         return True
 

@@ -6,7 +6,6 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from typing_extensions import override
 
 from mpmjax._types import Matrix, NodeVector
 from mpmjax.checks import require_fields
@@ -54,16 +53,13 @@ class AnalyticHessian(AbstractHessian):
     def __check_init__(self):
         require_fields(self)
 
-    @override
     def at(self, potential: ElasticPotential, u: NodeVector) -> AbstractHessianAction:
         return self._action(potential, potential.deformation(u))
 
-    @override
     def at_current(self, potential: ElasticPotential, like: NodeVector) -> AbstractHessianAction:
         del like
         return self._action(potential, potential.current_deformation())  # without the gather
 
-    @override
     def exact(self) -> "AnalyticHessian":
         return AnalyticHessian()
 
@@ -80,11 +76,9 @@ class JvpHessian(AbstractHessian):
     """Hessian by `jax.jvp` of the energy's gradient. It needs nothing of a law but its energy, and the tests hold
     `AnalyticHessian` to it."""
 
-    @override
     def at(self, potential: ElasticPotential, u: NodeVector) -> AbstractHessianAction:
         return _JvpAction(potential, u)
 
-    @override
     def exact(self) -> "JvpHessian":
         return self
 
@@ -93,7 +87,6 @@ class _JvpAction(AbstractHessianAction):
     potential: ElasticPotential
     u: NodeVector
 
-    @override
     def is_positive_semidefinite(self) -> bool:
         return False
 
@@ -101,7 +94,6 @@ class _JvpAction(AbstractHessianAction):
         """The derivative of ∂Φ/∂u in the direction δu."""
         return _jvp_action(self.potential, self.u, du)
 
-    @override
     def precomputed(self) -> ParticleStiffness:
         laws = (c.law for c in self.potential.material_points)
         F = self.potential.deformation(self.u)

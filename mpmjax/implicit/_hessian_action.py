@@ -6,7 +6,6 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from typing_extensions import override
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, Matrix, NodeVector, Scalar
@@ -40,7 +39,6 @@ class ParticleStiffness(AbstractHessianAction):
     mirror: Mirror
     positive_semidefinite: bool = eqx.field(static=True, default=False)
 
-    @override
     def is_positive_semidefinite(self) -> bool:
         return self.positive_semidefinite
 
@@ -50,7 +48,6 @@ class ParticleStiffness(AbstractHessianAction):
         flux = la.matmul(self.matrix, slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
         return self.mirror.fold(scatter(self.stencil, None, flux, du.shape[0]))
 
-    @override
     def precomputed(self) -> "ParticleStiffness":
         return self
 
@@ -82,7 +79,6 @@ class TangentAction(AbstractHessianAction):
     tangents: tuple[Callable[[Matrix], Matrix], ...]
     positive_semidefinite: bool = eqx.field(static=True, default=False)
 
-    @override
     def is_positive_semidefinite(self) -> bool:
         return self.positive_semidefinite
 
@@ -90,7 +86,6 @@ class TangentAction(AbstractHessianAction):
         """Σ_p V0_p A_p h_ip, with A_p = ∂²Ψ/∂F∂F : δF_p (derivation, eqs. 7 and 8)."""
         return _tangent_action(self.potential, self.tangents, du)
 
-    @override
     def precomputed(self) -> ParticleStiffness:
         return particle_stiffness(self.potential, self.tangents, positive_semidefinite=self.positive_semidefinite)
 
@@ -116,7 +111,6 @@ class _DampedAction(AbstractHessianAction):
     potential: ElasticPotential
     rate: Scalar
 
-    @override
     def is_positive_semidefinite(self) -> bool:
         return self.elastic.is_positive_semidefinite()
 
@@ -124,7 +118,6 @@ class _DampedAction(AbstractHessianAction):
         """(H + r D) δu."""
         return self.elastic(du) + self.rate * self.potential.damping_force(du)
 
-    @override
     def precomputed(self) -> ParticleStiffness:
         stiffness = self.elastic.precomputed()
         return eqx.tree_at(

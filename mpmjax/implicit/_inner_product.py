@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from typing_extensions import override
 
 from mpmjax._types import Array
 
@@ -54,23 +53,18 @@ class DiagonalInnerProduct(AbstractInnerProduct):
 
     weight: Any
 
-    @override
     def apply(self, v: Any) -> Any:
         return jax.tree.map(jnp.multiply, self.weight, v)
 
-    @override
     def solve_factor(self, r: Any) -> Any:
         return jax.tree.map(lambda r, w: r / jnp.sqrt(w), r, self.weight)
 
-    @override
     def solve_factor_transpose(self, v: Any) -> Any:
         return self.solve_factor(v)
 
-    @override
     def solve(self, r: Any) -> Any:
         return jax.tree.map(jnp.divide, r, self.weight)
 
-    @override
     def flattened(self, unravel: Callable[[Array], Any]) -> "DiagonalInnerProduct":
         return DiagonalInnerProduct(ravel_pytree(self.weight)[0])
 
@@ -79,14 +73,11 @@ class _FlatInnerProduct(AbstractInnerProduct):
     inner: AbstractInnerProduct
     unravel: Callable[[Array], Any] = eqx.field(static=True)
 
-    @override
     def apply(self, v: Array) -> Array:
         return ravel_pytree(self.inner.apply(self.unravel(v)))[0]
 
-    @override
     def solve_factor(self, r: Array) -> Array:
         return ravel_pytree(self.inner.solve_factor(self.unravel(r)))[0]
 
-    @override
     def solve_factor_transpose(self, v: Array) -> Array:
         return ravel_pytree(self.inner.solve_factor_transpose(self.unravel(v)))[0]

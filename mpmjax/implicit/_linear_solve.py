@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from typing_extensions import override
 
 from mpmjax._types import Array, Bool, Float, Int, NodeVector
 from mpmjax.checks import require_that
@@ -135,15 +134,12 @@ class ScaledOperator(AbstractSymmetricOperator):
     operator: AbstractSymmetricOperator
     inner: AbstractInnerProduct
 
-    @override
     def is_positive_semidefinite(self) -> bool:
         return self.operator.is_positive_semidefinite()
 
-    @override
     def mv(self, vector: Array) -> Array:
         return self.inner.solve_factor(self.operator.mv(self.inner.solve_factor_transpose(vector)))
 
-    @override
     def in_structure(self) -> jax.ShapeDtypeStruct:
         return self.operator.in_structure()
 

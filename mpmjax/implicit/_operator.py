@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from typing_extensions import override
 
 from mpmjax._types import Array, Float, NodeScalar, NodeVector, Scalar
 from mpmjax.implicit._hessian_action import AbstractHessianAction
@@ -29,17 +28,14 @@ class AbstractSymmetricOperator(lx.AbstractLinearOperator):
     def in_structure(self) -> jax.ShapeDtypeStruct:
         """Shape and dtype of a vector."""
 
-    @override
     def out_structure(self) -> jax.ShapeDtypeStruct:
         return self.in_structure()
 
-    @override
     def as_matrix(self) -> Float[Array, "nd nd"]:
         vector = self.in_structure()
         columns = jax.vmap(lambda e: self.mv(e.reshape(vector.shape)).reshape(-1))
         return columns(jnp.eye(vector.size, dtype=vector.dtype)).T
 
-    @override
     def transpose(self) -> "AbstractSymmetricOperator":
         return self
 
@@ -60,7 +56,6 @@ class ImplicitOperator(AbstractSymmetricOperator):
     """H [N/m]."""
     projection: Projection
 
-    @override
     def is_positive_semidefinite(self) -> bool:
         return self.hessian.is_positive_semidefinite()
 
@@ -68,7 +63,6 @@ class ImplicitOperator(AbstractSymmetricOperator):
         """(M + c H) v."""
         return self.mass[:, None] * v + self.factor * self.hessian(v)
 
-    @override
     def mv(self, vector: NodeVector) -> NodeVector:
         split = self.projection.combine
         return split(self.unconstrained(split(vector, 0)), self.projection.identity_rows(vector, self.mass))
@@ -86,7 +80,6 @@ class ImplicitOperator(AbstractSymmetricOperator):
         mass = self.nodal_mass()
         return mass + self.factor * self.hessian.precomputed().diagonal(mass)
 
-    @override
     def in_structure(self) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct(self.projection.free.shape, self.mass.dtype)
 

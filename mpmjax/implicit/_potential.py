@@ -30,7 +30,7 @@ class ElasticPotential(eqx.Module):
     mirror: Mirror
 
     def strain(self, u: NodeVector) -> Matrices:
-        """δF_p = Σ_i u_i h_ipᵀ."""
+        """δF_p = Σ_i u_i h_ipᵀ, one array a material."""
         return self.deformed(self._gradient(u))
 
     def deformed(self, gradient: Matrix) -> Matrices:
@@ -38,11 +38,11 @@ class ElasticPotential(eqx.Module):
         return tuple(c.deformed(c.own(gradient)) for c in self.material_points)
 
     def current_deformation(self) -> Matrices:
-        """F_p."""
+        """F_p at u = 0, one array a material."""
         return tuple(c.F for c in self.material_points)
 
     def deformation(self, u: NodeVector) -> Matrices:
-        """F_p + δF_p."""
+        """F_p + δF_p at a nodal displacement u [m], shape (n, d), one array a material."""
         return tuple(F + dF for F, dF in zip(self.current_deformation(), self.strain(u), strict=True))
 
     def divergence(self, P: Matrices, like: NodeVector) -> NodeVector:
@@ -73,24 +73,24 @@ class ElasticPotential(eqx.Module):
         return -self.divergence(self._stress(self.current_deformation()), like)
 
     def current_flux(self) -> Matrix:
-        """What the force at u = 0 is the sum of, f_i = −Σ_p (V0_p P_p F_pᵀ) g_ip: the bracket [J], shape (d, d, p)."""
+        """V0_p P_p F_pᵀ at u = 0 [J], shape (d, d, p): the force there is f_i = −Σ_p (V0_p P_p F_pᵀ) g_ip."""
         return self._flux(self._stress(self.current_deformation()))
 
     @property
     def viscous(self) -> bool:
-        """Whether anything is."""
+        """Whether any of the materials has viscosity."""
         return any(c.viscosity is not None for c in self.material_points)
 
     def viscous_flux(self, gradient: Matrix) -> Matrix:
-        """What the viscous force is the sum of at a velocity gradient of the particles [1/s]: like `current_flux`."""
+        """The viscous counterpart of `current_flux` [J], at a velocity gradient of the particles [1/s], (d, d, p)."""
         return _joined([c.damping_force(c.own(gradient)) for c in self.material_points])
 
     def damping_force(self, v: NodeVector) -> NodeVector:
-        """D v [N], minus the viscous force at a velocity of the nodes: symmetric, positive semi-definite."""
+        """D v [N], minus the viscous force at a velocity of the nodes; D is symmetric and positive semi-definite."""
         return self.sum_of(self.viscous_flux(self._gradient(v)), v)
 
     def power(self, v: NodeVector) -> Float[Array, ""]:
-        """v·D v [W], what viscosity dissipates."""
+        """v·D v [W], the power that viscosity dissipates at a velocity of the nodes."""
         gradient = self._gradient(v)
         return (self.viscous_flux(gradient) * gradient).sum()
 

@@ -4,7 +4,6 @@ import abc
 from typing import ClassVar
 
 import equinox as eqx
-from typing_extensions import override
 
 from mpmjax.implicit._inner_product import AbstractInnerProduct, DiagonalInnerProduct
 from mpmjax.implicit._operator import ImplicitOperator
@@ -35,7 +34,6 @@ class DiagonalPreconditioner(AbstractPreconditioner):
     and a third to all of them at twenty times. In homogeneous bodies it took from a third of them to a fifth more.
     """
 
-    @override
     def inner_product(self, operator: ImplicitOperator) -> AbstractInnerProduct:
         return DiagonalInnerProduct(operator.projection.commuting_weight(operator.diagonal()))
 
@@ -45,6 +43,5 @@ class MassPreconditioner(AbstractPreconditioner):
 
     advice: ClassVar[str | None] = "take preconditioner=DiagonalPreconditioner(), which needs fewer iterations"
 
-    @override
     def inner_product(self, operator: ImplicitOperator) -> AbstractInnerProduct:
         return DiagonalInnerProduct(operator.projection.commuting_weight(operator.nodal_mass()))

@@ -4,7 +4,6 @@ import abc
 
 import equinox as eqx
 import jax.numpy as jnp
-from typing_extensions import override
 
 from mpmjax._types import Array, Float, NodeScalar, NodeVector, Scalar
 from mpmjax.implicit._hessian import AbstractHessian
@@ -55,12 +54,10 @@ class LinearProblem(AbstractProblem):
     prescribed: NodeVector
     preconditioner: AbstractPreconditioner = MassPreconditioner()
 
-    @override
     def operator(self, v: NodeVector) -> ImplicitOperator:
         del v
         return ImplicitOperator(self.mass, self.factor, self.hessian, self.projection)
 
-    @override
     def momentum_residual(self, v: NodeVector) -> NodeVector:
         return self.operator(v).unconstrained(v) - self.rhs
 
@@ -100,7 +97,6 @@ class NewtonProblem(AbstractProblem):
             return jnp.zeros_like(self.inertial)
         return -self.initial_displacement / self.stage_dt
 
-    @override
     def operator(self, v: NodeVector) -> ImplicitOperator:
         return self._operator(self.hessian.exact(), v)
 
@@ -113,7 +109,6 @@ class NewtonProblem(AbstractProblem):
         action = damped(hessian.at(self.potential, self.displacement(v)), self.potential, 1 / self.stage_dt)
         return ImplicitOperator(self.mass, self.stage_dt**2, action, self.projection)
 
-    @override
     def momentum_residual(self, v: NodeVector) -> NodeVector:
         force = self.potential.force(self.displacement(v))
         if self.potential.viscous:
