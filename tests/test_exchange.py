@@ -110,7 +110,7 @@ def test_moments_of_all_boundaries_are_the_change_of_angular_momentum(descriptio
         received = step.info.colliders
         given = -np.asarray(received.angular) - cross(pivots, np.asarray(received.impulse))
         outer = moment(of_walls) + given.sum(axis=0) + moment(mass * dt * G[:d])
-        change, elastic = moment(mass * (v1 - v0)), moment(new.elastic)
+        change, elastic = moment(mass * (v1 - v0)), moment(new.internal)
         scale = np.abs(given).sum() + np.abs(moment(of_walls)).sum()
         if name != "semi_implicit":  # its linearised force has a moment
             assert np.abs(elastic).max() < 1e-9 * scale

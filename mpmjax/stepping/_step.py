@@ -107,7 +107,7 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
         guess = method.initial_guess(nodes)
         if not touches(nodes):
             motion, info = method.advance(nodes, guess)
-            internal, viscous, reaction = impulses(nodes, method, motion)
+            internal, reaction, viscous = impulses(nodes, method, motion)
             push = hold(nodes, NOTHING).pushes(reaction)
             before, free = nodes.velocity if nodes.separate else None, nodes.projection
             return GridUpdate(before, motion, internal, viscous, reaction, None, free, info, no_contact(), push)
@@ -120,12 +120,12 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
 
         def attempt(held: Held, guess: NodeVector) -> tuple:
             motion, info = moved(held, frozen_method, guess)
-            return motion.velocity, impulses(frozen, frozen_method, motion)[2], motion.carrier, info
+            return motion.velocity, impulses(frozen, frozen_method, motion)[1], motion.carrier, info
 
         active, guess, cost, sweeps = find_active_set(frozen, guess, attempt)
         held = hold(nodes, active)
         motion, info = moved(held, method, guess)
-        internal, viscous, reaction = impulses(nodes, method, motion)
+        internal, reaction, viscous = impulses(nodes, method, motion)
         push = held.pushes(reaction)
         slowed, rub = held.collider_friction(held.wall_friction(motion.velocity, reaction), push)
         loss = slowed - motion.velocity
@@ -146,23 +146,23 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
 
 def impulses(
     nodes: Nodes, method: AbstractIntegrator, motion: NodeMotion
-) -> tuple[NodeVector | None, NodeVector | None, NodeVector]:
-    """The impulses over the step [kg m/s], each of shape (n, d): of internal forces and its viscous part, as in
-    `GridUpdate`, and what walls and grips must give for the nodes to move so."""
+) -> tuple[NodeVector | None, NodeVector, NodeVector | None]:
+    """The impulses over the step [kg m/s], each of shape (n, d): of internal forces, as in `GridUpdate`; what walls and
+    grips must give for the nodes to move so; and the viscous part of the first."""
     if nodes.potential.viscous and not method.explicit_viscosity and motion.resisted is None:
         raise ValueError(
             f"{type(method).__name__} has explicit_viscosity = False, so its advance must return the velocity that "
             "viscosity resists, NodeMotion.resisted. It returned None."
         )
     if not nodes.separate:
-        return None, None, nodes.mass[:, None] * (motion.velocity - nodes.explicit_velocity())
+        return None, nodes.mass[:, None] * (motion.velocity - nodes.explicit_velocity()), None
     internal, viscous = method.elastic_impulse(nodes, motion), None
     if motion.resisted is not None:
         viscous = -nodes.dt * nodes.potential.damping_force(motion.resisted)
         internal = internal + viscous
     elif nodes.viscous_force is not None:
         viscous = jnp.where(nodes.occupied, nodes.dt * nodes.viscous_force, 0)
-    return internal, viscous, nodes.mass[:, None] * (motion.velocity - nodes.inertial_velocity()) - internal
+    return internal, nodes.mass[:, None] * (motion.velocity - nodes.inertial_velocity()) - internal, viscous
 
 
 def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: GridUpdate) -> Particles:
