@@ -78,7 +78,9 @@ def test_what_colliders_hold_moves_with_them(method):
     assert_close(((v - asked) * n).sum(axis=1)[touched], np.zeros(touched.sum()), 0, 1e-13)
     along = v[:, 0] * n[:, 1] - v[:, 1] * n[:, 0]
     assert (np.abs(along[touched & ~floor]) > 1e-3).all()
-    beside = np.asarray(step.reaction) - np.asarray(step.update.push)[:, None] * n  # the floor's part, where both hold
+    beside = (
+        np.asarray(step.reaction) - np.asarray(step.update.normal_impulse)[:, None] * n
+    )  # the floor's part, where both hold
     assert_close(beside[touched & floor, 0], np.zeros((touched & floor).sum()), 0, 1e-11 * np.abs(step.reaction).max())
 
 
@@ -225,7 +227,7 @@ def test_a_separating_collider_pushes_never_pulls_and_is_not_entered(method):
     v, n = np.asarray(step.velocity), np.asarray(touch.normal)
     inside = (np.asarray(touch.owner) >= 0) & (mass > 0)
     departure = ((v - np.asarray(touch.velocity)) * n).sum(axis=1)
-    push = np.asarray(step.update.push)
+    push = np.asarray(step.update.normal_impulse)
     scale = np.abs(v).max()
     assert int(step.info.contact.violations) == 0
     held = inside & (np.abs(departure) < 1e-12 * scale)
@@ -318,7 +320,11 @@ def test_friction_opposes_slip_by_at_most_mu_times_the_push(name, mu):
     grid, particles = landing()
     scene = scene_of(grid, *obstacles(mu))
     step = grid_update(scene, particles, 0.5 * explicit_limit(scene), METHODS[name])
-    touch, rub, push = step.nodes.conditions.colliders, np.asarray(step.update.rub), np.asarray(step.update.push)
+    touch, rub, push = (
+        step.nodes.conditions.colliders,
+        np.asarray(step.update.collider_friction),
+        np.asarray(step.update.normal_impulse),
+    )
     slip = np.asarray(step.velocity - touch.velocity)
     n = np.asarray(touch.normal)
     slip = slip - n * (n * slip).sum(axis=1, keepdims=True)
@@ -366,7 +372,9 @@ def test_friction_of_a_wall_leaves_alone_what_others_hold(floor):
     friction = np.asarray(step.update.friction)
     assert ((friction * v).sum(axis=1)[rubbed & ~held & ~gripped] < 0).all()
     if floor == "box":  # what the body pushes is not the wall's
-        push = (np.asarray(step.reaction) - np.asarray(step.update.push)[:, None] * np.where(held[:, None], n, 0))[:, 2]
+        push = (
+            np.asarray(step.reaction) - np.asarray(step.update.normal_impulse)[:, None] * np.where(held[:, None], n, 0)
+        )[:, 2]
         size = np.linalg.norm(friction, axis=1)
         assert (size <= mu * push * (1 + 1e-9))[rubbed].all()
         assert np.isclose(size, mu * push, rtol=1e-9)[rubbed & held].sum() > 3

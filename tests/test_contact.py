@@ -403,7 +403,7 @@ class Stubborn(mpm.Explicit):
 def test_an_active_set_that_does_not_settle_is_given_up_after_four_sweeps():
     """And what is still wrong is reported."""
     nodes = in_touch(FLOORS["plain"](0.0))
-    pulled = eqx.tree_at(lambda n: n.velocity, nodes, jnp.ones_like(nodes.velocity))
+    pulled = eqx.tree_at(lambda n: n.sums.velocity, nodes, jnp.ones_like(nodes.velocity))
     new = update(pulled, Stubborn())
     assert new.contact.sweeps == SWEEPS == 4
     assert int(new.contact.violations) == int(((nodes.conditions.side[:, 1] == 1) & (nodes.mass > 0)).sum())

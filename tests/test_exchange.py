@@ -103,12 +103,12 @@ def test_moments_of_all_boundaries_are_the_change_of_angular_momentum(descriptio
             return cross(place, np.asarray(impulse)).sum(axis=0)
 
         pivots = np.stack([np.asarray(m.centre) + np.asarray(m.at((n + late) * dt)) for m in motions])
-        rub = 0 if new.rub is None else np.asarray(new.rub)
+        rub = 0 if new.collider_friction is None else np.asarray(new.collider_friction)
         friction = 0 if new.friction is None else np.asarray(new.friction)
         push = (
             0
-            if new.push is None
-            else np.asarray(new.push)[:, None] * np.asarray(step.nodes.conditions.colliders.normal)
+            if new.normal_impulse is None
+            else np.asarray(new.normal_impulse)[:, None] * np.asarray(step.nodes.conditions.colliders.normal)
         )
         holder = np.asarray(step.nodes.conditions.colliders.holder)
         of_colliders = np.where(holder >= 0, np.asarray(new.reaction), 0) + push + rub
@@ -116,7 +116,7 @@ def test_moments_of_all_boundaries_are_the_change_of_angular_momentum(descriptio
         received = step.info.colliders
         given = -np.asarray(received.angular) - cross(pivots, np.asarray(received.impulse))
         outer = moment(of_walls) + given.sum(axis=0) + moment(mass * dt * G[:d])
-        change, elastic = moment(mass * (v1 - v0)), moment(new.elastic)
+        change, elastic = moment(mass * (v1 - v0)), moment(new.internal)
         scale = np.abs(given).sum() + np.abs(moment(of_walls)).sum()
         if name != "semi_implicit":  # its linearised force has a moment
             assert np.abs(elastic).max() < 1e-9 * scale

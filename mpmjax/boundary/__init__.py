@@ -1,6 +1,7 @@
 """Walls, grips, mirrored planes and colliders, and what colliders receive."""
 
 from mpmjax.boundary._collider import AbstractCollider, SeparatingCollider, SlipCollider, StickyCollider
+from mpmjax.boundary._collider_impulse import ColliderImpulse, nothing_received, received
 from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, Conditions, combine
 from mpmjax.boundary._contact import (
     AbstractContact,
@@ -12,7 +13,6 @@ from mpmjax.boundary._contact import (
     no_contact,
 )
 from mpmjax.boundary._contacts import contacts_of
-from mpmjax.boundary._exchange import ColliderImpulse, nothing_received, received
 from mpmjax.boundary._grip import Grip
 from mpmjax.boundary._mirror import Mirror, mirror
 from mpmjax.boundary._planes import ContactPlane, Plane, SymmetryPlane, fits

@@ -58,9 +58,9 @@ class GridUpdate(eqx.Module):
     """The projection on that in which no boundary had a part."""
     solve: SolveInfo
     contact: ContactInfo
-    push: NodeScalar | None = None
+    normal_impulse: NodeScalar | None = None
     """The impulse of colliders along their normals [kg m/s], shape (n,), where there are colliders."""
-    rub: NodeVector | None = None
+    collider_friction: NodeVector | None = None
     """Their part of the impulse of friction [kg m/s], shape (n, d)."""
 
 
@@ -98,7 +98,7 @@ def advance(
     touch = nodes.conditions.colliders
     if touch is not None and new.motion.mean is not None:
         touch = touch.after(dt / 2, new.motion.mean)
-    exchange = None if touch is None else received(touch, new.reaction, new.push, new.rub)
+    exchange = None if touch is None else received(touch, new.reaction, new.normal_impulse, new.collider_friction)
     after = scene.return_map(grid_to_particles(scene, particles, nodes, new))
     if exchange is not None and after.received is not None:
         after = replace(after, received=after.received.plus(exchange))
@@ -115,10 +115,10 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
         guess = method.initial_guess(nodes)
         if not nodes.contacts:
             motion, info = method.advance(nodes, guess)
-            internal, viscous, reaction = impulses(nodes, method, motion)
-            push = constrain(nodes, ()).collider_impulse(reaction)
+            internal, reaction, viscous = impulses(nodes, method, motion)
+            normal = constrain(nodes, ()).collider_impulse(reaction)
             before, free = nodes.velocity if nodes.separate else None, nodes.projection
-            return GridUpdate(before, motion, internal, viscous, reaction, None, free, info, no_contact(), push)
+            return GridUpdate(before, motion, internal, viscous, reaction, None, free, info, no_contact(), normal)
 
         def moved(
             held: ConstrainedNodes, method: AbstractIntegrator, guess: NodeVector
@@ -130,14 +130,14 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
 
         def attempt(held: ConstrainedNodes, guess: NodeVector) -> tuple:
             motion, info = moved(held, frozen_method, guess)
-            return motion.velocity, impulses(frozen, frozen_method, motion)[2], motion.carrier, info
+            return motion.velocity, impulses(frozen, frozen_method, motion)[1], motion.carrier, info
 
         active, guess, cost, sweeps = find_active_set(frozen, guess, attempt, no_solve(guess.dtype))
         held = constrain(nodes, active)
         motion, info = moved(held, method, guess)
-        internal, viscous, reaction = impulses(nodes, method, motion)
-        push = held.collider_impulse(reaction)
-        slowed, rub = held.friction(motion.velocity, reaction)
+        internal, reaction, viscous = impulses(nodes, method, motion)
+        normal = held.collider_impulse(reaction)
+        slowed, friction = held.friction(motion.velocity, reaction)
         loss = slowed - motion.velocity
         return GridUpdate(
             before=held.images.unfold(held.nodes.velocity) if nodes.separate else None,
@@ -149,30 +149,30 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
             free=Projection(*held.beyond_boundaries()),
             solve=cost.followed_by(info),
             contact=ContactInfo(sweeps, held.count_violations(motion.velocity, reaction)),
-            push=push,
-            rub=rub,
+            normal_impulse=normal,
+            collider_friction=friction,
         )
 
 
 def impulses(
     nodes: Nodes, method: AbstractIntegrator, motion: NodeMotion
-) -> tuple[NodeVector | None, NodeVector | None, NodeVector]:
-    """The impulses over the step [kg m/s], each of shape (n, d): of internal forces and its viscous part, as in
-    `GridUpdate`, and what walls and grips must give for the nodes to move so."""
+) -> tuple[NodeVector | None, NodeVector, NodeVector | None]:
+    """The impulses over the step [kg m/s], each of shape (n, d): of internal forces, as in `GridUpdate`; what walls and
+    grips must give for the nodes to move so; and the viscous part of the first."""
     if nodes.potential.viscous and not method.explicit_viscosity and motion.resisted is None:
         raise ValueError(
             f"{type(method).__name__} has explicit_viscosity = False, so its advance must return the velocity that "
             "viscosity resists, NodeMotion.resisted. It returned None."
         )
     if not nodes.separate:
-        return None, None, nodes.mass[:, None] * (motion.velocity - nodes.explicit_velocity())
+        return None, nodes.mass[:, None] * (motion.velocity - nodes.explicit_velocity()), None
     internal, viscous = method.elastic_impulse(nodes, motion), None
     if motion.resisted is not None:
         viscous = -nodes.dt * nodes.potential.damping_force(motion.resisted)
         internal = internal + viscous
     elif nodes.viscous_force is not None:
         viscous = jnp.where(nodes.occupied, nodes.dt * nodes.viscous_force, 0)
-    return internal, viscous, nodes.mass[:, None] * (motion.velocity - nodes.inertial_velocity()) - internal
+    return internal, nodes.mass[:, None] * (motion.velocity - nodes.inertial_velocity()) - internal, viscous
 
 
 def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: GridUpdate) -> Particles:

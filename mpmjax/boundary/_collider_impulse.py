@@ -37,23 +37,26 @@ def nothing_received(colliders: int, dim: int, dtype: Any) -> ColliderImpulse:
 
 
 def received(
-    touch: ColliderConditions, reaction: NodeVector, push: NodeScalar | None = None, rub: NodeVector | None = None
+    asked: ColliderConditions,
+    reaction: NodeVector,
+    normal_impulse: NodeScalar | None = None,
+    friction: NodeVector | None = None,
 ) -> ColliderImpulse:
     """The impulse on each collider: minus what it gives the nodes by prescribed components, along normals, by friction.
 
     Args:
-        touch: which node and component is whose.
-        reaction: the impulse of all walls and bodies on the nodes, but for friction [kg m/s].
-        push: the part of it by colliders, along their normals [kg m/s].
-        rub: the impulse of their friction [kg m/s].
+        asked: the conditions of the colliders, with which node and component is whose.
+        reaction: the impulse of all walls and bodies on the nodes, without friction [kg m/s], shape (n, d).
+        normal_impulse: the part of it by colliders, along their normals [kg m/s], shape (n,).
+        friction: the impulse of the colliders' friction on the nodes [kg m/s], shape (n, d).
     """
-    along = jnp.zeros_like(reaction) if push is None else push[:, None] * touch.normal
-    along = along if rub is None else along + rub
+    along = jnp.zeros_like(reaction) if normal_impulse is None else normal_impulse[:, None] * asked.normal
+    along = along if friction is None else along + friction
     impulse, angular = [], []
-    for number, pivot in enumerate(touch.pivots):
-        given = jnp.where((touch.owner == number)[:, None], along, 0) + jnp.where(touch.holder == number, reaction, 0)
+    for number, pivot in enumerate(asked.pivots):
+        given = jnp.where((asked.owner == number)[:, None], along, 0) + jnp.where(asked.holder == number, reaction, 0)
         impulse.append(-given.sum(axis=0))
-        angular.append(-_moment(touch.position - pivot, given).sum(axis=0))
+        angular.append(-_moment(asked.position - pivot, given).sum(axis=0))
     return ColliderImpulse(jnp.stack(impulse), jnp.stack(angular))
 
 
