@@ -182,14 +182,14 @@ def test_every_route_to_a_return_maps_derivative_is_right(name, d):
         F, history = law.return_map(F, history)
         return jnp.concatenate([F.reshape(-1, F.shape[-1]), *(a[None] for a in jax.tree.leaves(history))])
 
-    changed = np.abs(returned(F)[: d * d] - F.reshape(d * d, -1)).max(axis=0)
+    changed = np.abs(return_map(F)[: d * d] - F.reshape(d * d, -1)).max(axis=0)
     inside = states[0][0].shape[-1]
     assert (changed[:inside] < 5e-4).all()  # sand takes back the volume that its history remembers
     assert (changed[inside:] > 1e-3).all()
-    exact = differences(returned, F, G, (1, 2), 0.01)
+    exact = differences(return_map, F, G, (1, 2), 0.01)
     W = jnp.asarray(np.random.default_rng(4).normal(size=exact[0].shape))
-    pulled, pushed = reverse(returned, W), forward(returned, G)
-    looped = in_scan(reverse(in_scan(returned), W))
+    pulled, pushed = reverse(return_map, W), forward(return_map, G)
+    looped = in_scan(reverse(in_scan(return_map), W))
     # by route the order, and whether it is the transpose
     along = {
         "forward": (1, False, pushed),

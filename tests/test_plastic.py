@@ -51,7 +51,7 @@ def driven(law, F, history, L):
     return jax.lax.scan(body, (F, history), L)[1]
 
 
-def at_current(law, d, p=1):
+def undeformed(law, d, p=1):
     """F = I and the history of it."""
     F = jnp.repeat(jnp.eye(d)[..., None], p, axis=-1)
     return F, law.initial_history(F)
@@ -170,7 +170,7 @@ def test_a_return_meets_the_yield_condition_and_lowers_the_energy(name, d):
     and history are to the last bit as before where the condition held."""
     law = law_of(name)
     F, history = random_states(name, d)
-    after, new, energy_before, energy = returned(law, F, history)
+    after, new, energy_before, energy = return_map(law, F, history)
     before, then = scalar_of(history), scalar_of(new)
     mean, deviation = invariants(after, new.transverse_strain)
     assert (yield_excess(name, mean, deviation, before, then) < 1e-14).all()
@@ -194,8 +194,8 @@ def test_plane_and_uniaxial_strain_are_three_dimensional(name, d):
     L = 0.02 * rng.normal(size=(steps, d, d, p))
     whole = np.zeros((steps, 3, 3, p))
     whole[:, :d, :d] = L
-    F, history, stress = driven(law, *at_rest(law, d, p), jnp.asarray(L))
-    F3, history3, stress3 = driven(law, *at_rest(law, 3, p), jnp.asarray(whole))
+    F, history, stress = driven(law, *undeformed(law, d, p), jnp.asarray(L))
+    F3, history3, stress3 = driven(law, *undeformed(law, 3, p), jnp.asarray(whole))
     assert_close(F, F3[:, :d, :d], 1e-12)
     np.testing.assert_allclose(stress / E, stress3[:, :d, :d] / E, rtol=0, atol=1e-12)
     np.testing.assert_allclose(scalar_of(history), scalar_of(history3), rtol=0, atol=1e-12)
@@ -296,7 +296,7 @@ def test_what_has_come_apart_feels_no_strain(name, d):
     """F = 1.05 I, its deviator exactly zero, is at the tip with all its neighbours: no change of it changes the elastic
     strain after the return, in the space or out of it, and its volume goes to the gap."""
     law = law_of(name)
-    F = 1.05 * at_rest(law, d)[0]
+    F = 1.05 * undeformed(law, d)[0]
     history = with_history(
         law.initial_history(F), None if d == 3 else jnp.log(jnp.array([1.05])), **{CASES[name][0]: [0.02]}
     )
@@ -321,8 +321,8 @@ def test_single_precision_stays_single(name, d):
     """F, history and stress in float32, and near those of double precision."""
     law = canonical(PLASTIC[name], jnp.float32)
     _, F, history = cases(name, d)
-    exact = returned(law_of(name), F, history)
-    single = returned(law, *jax.tree.map(lambda a: a.astype(jnp.float32), (F, history)))
+    exact = return_map(law_of(name), F, history)
+    single = return_map(law, *jax.tree.map(lambda a: a.astype(jnp.float32), (F, history)))
     for a, b in zip(jax.tree.leaves(single), jax.tree.leaves(exact), strict=True):
         assert a.dtype == jnp.float32
         np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-6)
@@ -341,7 +341,7 @@ def stretched(law, strains):
     """The states of one particle that is strained by these principal logarithmic increments, (steps, d), from rest."""
     d = strains.shape[1]
     L = np.einsum("ni,ij->nij", np.expm1(strains), np.eye(d))[..., None]
-    return driven(law, *at_rest(law, d), jnp.asarray(L))
+    return driven(law, *undeformed(law, d), jnp.asarray(L))
 
 
 @eqx.filter_jit
@@ -378,7 +378,7 @@ def pressure_and_shear(stress):
 
 def isotropic(law, p):
     """One particle in three dimensions under a pressure, by its elastic law: F and the history."""
-    F, history = at_rest(law, 3)
+    F, history = undeformed(law, 3)
     return jnp.exp(-p / (3 * K)) * F, history
 
 
@@ -386,7 +386,7 @@ def test_von_mises_in_tension():
     """τ = E ε to σ_y; beyond, dε = dτ/E + dα and dτ = H dα give the slope E H/(E + H), α = (τ − σ_y)/H, and a lateral
     strain −ν τ/E − α/2; to 1e-12."""
     law, axial = law_of("von_mises"), np.full(60, 1e-3)
-    _, history, stress, lateral = triaxial(law, *at_rest(law, 3), jnp.asarray(axial), 0.0)
+    _, history, stress, lateral = triaxial(law, *undeformed(law, 3), jnp.asarray(axial), 0.0)
     strain = np.cumsum(axial)
     tau = np.minimum(E * strain, 100 + E * 500 / (E + 500) * (strain - 100 / E))
     alpha = np.maximum(tau - 100, 0) / 500
@@ -463,7 +463,7 @@ def test_von_mises_in_simple_shear():
     deviator, alpha = shear_by_integration(0.6)
     found = []
     for steps in (500, 1000, 2000):
-        _, history, stress = sheared(law, *at_rest(law, 3), 0.6, steps)
+        _, history, stress = sheared(law, *undeformed(law, 3), 0.6, steps)
         found.append(np.r_[np.asarray(stress).ravel(), 100 * history.plastic_strain])
     expected = np.r_[deviator.ravel(), 100 * alpha]
     errors = [np.linalg.norm(a - expected) / np.linalg.norm(expected) for a in found]
