@@ -84,6 +84,8 @@ def ids(registry: dict, default: str | Collection[str] | None = None, thorough: 
     is in neither slow."""
     default = {default} if isinstance(default, str) else set(registry if default is None else default)
     thorough = set(registry) if thorough is None else set(thorough)
+    if unknown := (default | thorough) - set(registry):
+        raise ValueError(f"The registry has no {sorted(unknown)}; its names are {list(registry)}.")
     values = []
     for name, value in registry.items():
         further = pytest.mark.thorough if name in thorough else pytest.mark.slow
