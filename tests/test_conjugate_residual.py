@@ -1,4 +1,4 @@
-"""The solver against dense solves, what it reports, and the reference's literal form, which fails."""
+"""The solver against dense solves, what it reports, and the literal form of the recurrence, which fails."""
 
 from itertools import pairwise
 
@@ -333,7 +333,7 @@ def test_bad_arguments_are_refused(arguments, message):
 
 
 def literal_conjugate_residual(E, b, guess, steps):
-    """Section 2.1 of the reference to the letter: plain dot products on E = I + βΔt²M⁻¹H. The iterates."""
+    """The recurrence (derivation, eq. 19) to the letter, without the inner product: plain dot products on E = I + βΔt²M⁻¹H. The iterates."""
     v, r = guess, b - E @ guess
     s = E @ r
     p, q, gamma = r, s, r @ s

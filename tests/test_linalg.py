@@ -178,7 +178,7 @@ def test_the_principal_frame_refuses_to_be_differentiated():
 @EACH_DIM
 @EACH_FAMILY
 def test_rotation_differential_agrees_with_the_svds(family, d):
-    """The jvp rule and eq. 12 of the reference against δR by an SVD; δR in the tangent space of the rotations."""
+    """The jvp rule and derivation, eq. 12, against δR by an SVD; δR in the tangent space of the rotations."""
     F, _ = deformations(family, d)
     dF = matrices(d, seed=3)
     dR = first(jnp.asarray(F), jnp.asarray(dF))
@@ -239,7 +239,7 @@ def test_reverse_mode_and_batches_agree_with_forward_mode(d):
 
 
 def test_reference_system_of_eq_12_gives_the_same_differential():
-    """The 3 x 3 system printed below eq. 12 of the reference, for U₀₁, U₀₂, U₁₂ of U = RᵀδR, written out."""
+    """The 3 x 3 system below eq. 12 of the derivation, for U₀₁, U₀₂, U₁₂ of U = RᵀδR, written out."""
     F, R = deformations("random", 3)
     dF = matrices(3, seed=3)
     S, V = np.einsum("kin,kjn->ijn", R, F), np.einsum("kin,kjn->ijn", R, dF)

@@ -4,7 +4,7 @@ Where explicit steps are cheap it is made of them, at the `stable_dt` of the who
 grid does. Else it is TR-BDF2, whose step is halved until that changes the motion by less than a third of the error that
 is asked for, or is below the explicit limit. Then spacing and step are halved together: transfers act once a step, and
 on a given grid a smaller step alone need not bring the motion nearer to the truth. The last change is the estimate of
-the reference's own error, which is safe from first order on.
+the reference run's own error, which is safe from first order on.
 """
 
 import math
@@ -108,8 +108,8 @@ def _resolved_in_time(
             return limit, good
         if hopeless or not clock.allows(2 * new.seconds):
             raise ValueError(
-                f"The reference, {name_of(method)} in {steps} steps ({new.seconds:.2g} s), fails, and half the step "
-                f"will not do or takes too long. {bench.why(method, steps)}"
+                f"The reference run, {name_of(method)} in {steps} steps ({new.seconds:.2g} s), fails, and half the step
+                " f"will not do or takes too long. {bench.why(method, steps)}"
             )
         steps = max(2 * steps, bench.whole(limit) if method.is_explicit else 0)
 

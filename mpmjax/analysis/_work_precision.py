@@ -2,7 +2,7 @@
 good enough.
 
 The error is that of the motion: the largest over eight evenly spaced times of the RMS over particles of the distance
-between a particle's displacement and the reference's, over the largest RMS displacement of the reference. Where the
+between a particle's displacement and the reference run's, over the largest RMS displacement of the latter. Where the
 reference has k particles for one, the mean of the k nearest at time zero stands for it.
 """
 
@@ -103,10 +103,10 @@ def work_precision(
     Implicit methods start with eight steps in all; explicit ones at the default safety of `stable_dt`, at the greatest
     stretch of the reference run on the scene's own grid, and once at twice that, which should fail. A method that
     another one betters on the scene's own grid, with no larger error in no more seconds whatever its step, is not tried
-    on finer ones, and no grid is tried that is finer than the reference's.
+    on finer ones, and no grid is tried that is finer than the reference run's.
 
     The seconds are this machine's, so the result is not a function of the arguments alone. They are shared out: two
-    fifths for the reference, of what is left as much for one method as for another. What would take longer is foreseen
+    fifths for the reference run, of what is left as much for one method as for another. What would take longer is foreseen
     from fewer steps, and what cannot be tried at all is named.
 
     *When it breaks*: where refinement does not settle the motion (chaotic contact, PIC at long times), the reference
@@ -121,10 +121,10 @@ def work_precision(
         also: methods with one step [s] each, tried besides on the scene's own grid.
         most_seconds: what all of it may take, compilation included [s]. A run that has begun is ended.
         progress: called with each trial as it is done.
-        say: called with a line on each run of the reference.
+        say: called with a line on each reference run.
 
     Raises:
-        ValueError: from `prepare`; nothing moves, or no run of the reference ended well.
+        ValueError: from `prepare`; nothing moves, or no reference run ended well.
     """
     require_positive("t1 [s]", t1)
     require_positive("error", error)

@@ -125,7 +125,7 @@ class SeparatingCollider(AbstractCollider):
     """A body that the material may leave, and along which it slides with Coulomb friction.
 
     At a node in it either the normal velocity is the body's and the body pushes, or the node moves outward and the body
-    does nothing (the rule is in `_contact.py`). Friction is an impulse applied after the solve, opposed to the
+    does nothing (see `AbstractContact`). Friction is an impulse applied after the solve, opposed to the
     tangential velocity relative to the body and at most `friction` times the normal impulse: it lags the solve by one
     step's elastic response.
 

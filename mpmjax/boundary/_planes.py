@@ -68,7 +68,7 @@ class ContactPlane(AbstractBoundary):
 
     Where it touches, nodes beyond the plane are mirror images, as at a `SymmetryPlane`; where it does not, they are
     nodes like any other. Which it is, is decided for each column of nodes along the normal: either the wall holds the
-    column and pushes, or the column moves inward and the wall does nothing (the rule is in `_contact.py`). Friction is
+    column and pushes, or the column moves inward and the wall does nothing (see `AbstractContact`). Friction is
     an impulse applied after the solve, opposed to the tangential velocity and at most `friction` times the column's
     normal impulse: it lags the solve by one step's elastic response.
 

@@ -115,7 +115,7 @@ class SeparatingBox(AbstractBoundary):
     """Walls that the material may leave, and along which it slides with Coulomb friction.
 
     At a wall node either the normal velocity is zero and the wall pushes, or the node moves inward and the wall does
-    nothing (the rule is in `_contact.py`). Friction is an impulse applied after the solve, opposed to the tangential
+    nothing (see `AbstractContact`). Friction is an impulse applied after the solve, opposed to the tangential
     velocity and at most `friction` times the normal impulse: it lags the solve by one step's elastic response.
 
     Accurate to first order in the spacing. A wall at a multiple of half a spacing is better written as a

@@ -13,7 +13,7 @@ def draw_chart(found: WorkPrecision, path: Path) -> Path:
     """Error over seconds, a line for each method and grid.
 
     Runs that failed and runs that were only foreseen stand at the upper edge; the error that was asked for is a line,
-    and below the reference's own error nothing is certain.
+    and below the reference run's own error nothing is certain.
     """
     from matplotlib import pyplot as plt  # here, since it takes a second that only pictures should pay
 
