@@ -333,7 +333,8 @@ def test_bad_arguments_are_refused(arguments, message):
 
 
 def literal_conjugate_residual(E, b, guess, steps):
-    """The recurrence (derivation, eq. 19) to the letter, without the inner product: plain dot products on E = I + βΔt²M⁻¹H. The iterates."""
+    """The recurrence (derivation, eq. 19) without the inner product, plain dot products on E = I + βΔt²M⁻¹H. The
+    iterates."""
     v, r = guess, b - E @ guess
     s = E @ r
     p, q, gamma = r, s, r @ s

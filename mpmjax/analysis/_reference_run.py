@@ -108,8 +108,8 @@ def _resolved_in_time(
             return limit, good
         if hopeless or not clock.allows(2 * new.seconds):
             raise ValueError(
-                f"The reference run, {name_of(method)} in {steps} steps ({new.seconds:.2g} s), fails, and half the step
-                " f"will not do or takes too long. {bench.why(method, steps)}"
+                f"The reference run, {name_of(method)} in {steps} steps ({new.seconds:.2g} s), fails, and half "
+                f"the step will not do or takes too long. {bench.why(method, steps)}"
             )
         steps = max(2 * steps, bench.whole(limit) if method.is_explicit else 0)
 

@@ -106,8 +106,8 @@ def work_precision(
     on finer ones, and no grid is tried that is finer than the reference run's.
 
     The seconds are this machine's, so the result is not a function of the arguments alone. They are shared out: two
-    fifths for the reference run, of what is left as much for one method as for another. What would take longer is foreseen
-    from fewer steps, and what cannot be tried at all is named.
+    fifths for the reference run, of what is left as much for one method as for another. What would take longer is
+    foreseen from fewer steps, and what cannot be tried at all is named.
 
     *When it breaks*: where refinement does not settle the motion (chaotic contact, PIC at long times), the reference
     is uncertain, and says so in its `error`.
