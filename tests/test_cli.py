@@ -77,6 +77,7 @@ def test_run_writes_the_frames_and_a_summary(folder):
     assert abs(float(lost[1])) < 1e-14
 
 
+@pytest.mark.thorough
 def test_run_reports_what_simulate_returns(folder):
     """The recorded run is the simulated one."""
     from mpmjax.cli._scene_file import read_job

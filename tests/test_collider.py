@@ -133,6 +133,7 @@ def test_of_two_bodies_normals_the_earlier_holds_and_a_prescribed_component_is_a
     assert step.info.contact.violations == 0  # what a wall holds already cannot get out of its way
 
 
+@pytest.mark.thorough
 def test_what_the_earlier_holds_the_later_neither_lets_go_nor_rubs_nor_receives():
     """Of a body that holds and one that may be left, and of a grip and a body that sticks."""
     grid = mpm.Grid((6, 6), DX)
@@ -296,6 +297,7 @@ def test_forces_on_colliders_against_time(tmp_path):
         mpm.simulate(eqx.tree_at(lambda s: s.boundary, scene, ()), block, t1=DT, dt=DT, save_every=1).forces()
 
 
+@pytest.mark.thorough
 def test_the_force_on_a_collider_can_be_differentiated():
     """By the stiffness of what it is pressed into, against a central difference."""
     grid = mpm.Grid((14, 14), DX, origin=(-3, -3))
@@ -380,7 +382,8 @@ def test_friction_of_a_wall_leaves_alone_what_others_hold(floor):
         assert np.isclose(size, mu * push, rtol=1e-9)[rubbed & held].sum() > 3
 
 
-@pytest.mark.parametrize("name", ["explicit", *thorough("semi_implicit")])
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", ["explicit", "semi_implicit"])
 def test_a_collider_lets_go_freely(name):
     """A block that a tilted floor does not hold leaves as if there were none."""
     grid, block = landing()
@@ -394,6 +397,7 @@ def test_a_collider_lets_go_freely(name):
         assert_close(getattr(with_floor, field), getattr(without, field), 1e-11)
 
 
+@pytest.mark.thorough
 def test_a_turning_body_drags_what_it_touches_and_is_braked():
     """A cylinder under a block, turning anticlockwise: friction drives the block to the left; the torque on the body is
     clockwise and that of μ times the load at arms between the surface and a spacing below it, where the nodes are."""
@@ -443,6 +447,7 @@ def test_a_ball_pushed_through_a_block_meets_resistance():
 # --- the total description, refusals, derivatives --------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_in_the_total_description_a_sticky_collider_is_a_grip_that_turns():
     """It holds the reference nodes where it began; a whole body in it turns rigidly, exactly, F = R."""
     grid, block = landing()

@@ -377,6 +377,7 @@ def test_a_verdict_is_given_beyond_rounding_only():
             assert found(held, -1.6e-8) == met.sum()
 
 
+@pytest.mark.thorough
 def test_there_is_no_friction_where_a_wall_would_have_to_pull():
     """In a set that did not settle: friction takes speed, and never gives it."""
     slope = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0)), friction=0.3)

@@ -87,7 +87,8 @@ def test_each_is_the_others_transpose(d):
     assert (program.count("stencil_scatter"), program.count("stencil_gather")) == (1, 0)
 
 
-@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
+@pytest.mark.thorough
+@EACH_DIM
 def test_derivatives_by_everything_are_those_of_the_sums_written_out(d):
     """First and second, by x as well: against the same sums as dense products, in forward and in reverse mode."""
     x, _, given, nodes = example(d)

@@ -90,6 +90,7 @@ def ended(process: subprocess.Popen, number: signal.Signals) -> str:
     return lines[0]
 
 
+@pytest.mark.thorough
 def test_a_signal_ends_a_run_wherever_it_is(begun, tmp_path):
     """While its steps are compiled, and amid writing frames as fast as it can; meanwhile nobody else writes there."""
     path = tmp_path / "run.h5"

@@ -298,6 +298,7 @@ def test_an_interrupt_leaves_complete_frames_and_can_be_resumed(tmp_path, monkey
     assert_same(load(path), single)
 
 
+@pytest.mark.thorough
 def test_a_run_that_blows_up_keeps_its_good_frames(tmp_path):
     """Step, time and particle are named, as `simulate` does; the last good state is the file's last frame."""
     path, (scene, particles) = tmp_path / "run.h5", jelly()

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DESCRIPTIONS, ELASTIC, FLUIDS, LAWS, PLASTIC, assert_close, block, explicit_limit, ids, thorough
+from helpers import DESCRIPTIONS, ELASTIC, FLUIDS, LAWS, PLASTIC, assert_close, block, explicit_limit, ids
 
 import mpmjax as mpm
 from mpmjax.simulation import _simulate
@@ -45,11 +45,12 @@ def state(particles):
 
 EQUAL = [
     ("explicit", "updated", 2),
-    *thorough(("semi_implicit", "total", 2)),
+    ("semi_implicit", "total", 2),
     pytest.param("backward_euler", "updated", 1, marks=pytest.mark.slow),
 ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("method", "description", "d"), EQUAL)
 def test_simulate_equals_the_plain_rollout(method, description, d):
     """diffrax's loop against lax.scan, bit for bit, at every saved frame."""
@@ -89,6 +90,7 @@ def test_observations_are_curves():
     assert_equal(coarse.observed[0], run.observed[0][np.array([0, 4, 6])])
 
 
+@pytest.mark.thorough
 def test_a_run_continues_from_its_end():
     """With start = final_step a moving grip is where it should be: two halves equal the whole, bit for bit."""
     scene, particles = pulled()
@@ -297,7 +299,8 @@ def test_an_unconverged_solve_is_raised():
     assert int(run.statistics.most_iterations) == 2
 
 
-@pytest.mark.parametrize("preconditioner", [mpm.DiagonalPreconditioner(), *thorough(mpm.MassPreconditioner())])
+@pytest.mark.thorough
+@pytest.mark.parametrize("preconditioner", [mpm.DiagonalPreconditioner(), mpm.MassPreconditioner()])
 def test_a_solve_that_misses_its_tolerance_by_little_is_a_warning(preconditioner):
     """Within ten times of it the run goes on, counted and told at its end; beyond, it is a fault. The advice names the
     preconditioner that needs fewer iterations if it is not the one in use."""
@@ -396,7 +399,8 @@ def test_the_number_of_steps_is_robust_to_rounding():
     assert int(mpm.simulate(scene, particles, t1=0.3 / 100, dt=0.1 / 100).statistics.steps) == 3
 
 
-@pytest.mark.parametrize("dtype", [*thorough(jnp.float32), jnp.float64])
+@pytest.mark.thorough
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_the_stable_step_is_the_longest_of_whole_steps(dtype):
     """At or below the bound, one step fewer being above it; the run says it, and is that of the number."""
     scene, particles = pulled()

@@ -100,6 +100,7 @@ def test_plane_strain_is_three_dimensional_strain_with_a_stretch_of_one():
     assert_close(stress[1][:2, :2], stress[0], 1e-11)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_the_return_map_creates_no_energy(d):
     """Ψ after it, hardened, is at most Ψ before it, where snow is packed; with a hundred times the hardening it is not.

@@ -55,10 +55,10 @@ def assert_same(new, expected, rtol):
 
 
 ORACLE_CASES = [
-    (2, "total", "mls", "pic", "fixed_corotated", GRIP),
     (3, "updated", "spline", "apic", "fixed_corotated", SLIP),
     (1, "updated", "mls", "apic", "neo_hookean", STICKY),
     *thorough(
+        ((2, "total", "mls", "pic", "fixed_corotated", GRIP),),
         ((2, "updated", "mls", "apic", "fixed_corotated", STICKY),),
         ((2, "total", "spline", "apic", "neo_hookean", SLIP),),
         ((2, "updated", "spline", "flip", "neo_hookean", SLIP),),
@@ -79,9 +79,9 @@ def test_explicit_step_agrees_with_numpy_and_with_itself_uncompiled(choices):
 
 
 SEMI_IMPLICIT_CASES = [
-    (2, "updated", "mls", "apic", "fixed_corotated", STICKY, 1.0),
+    (1, "updated", "spline", "pic", "neo_hookean", STICKY, 0.75),
     *thorough(
-        ((1, "updated", "spline", "pic", "neo_hookean", STICKY, 0.75),),
+        ((2, "updated", "mls", "apic", "fixed_corotated", STICKY, 1.0),),
         ((2, "total", "spline", "flip", "neo_hookean", GRIP, 0.5),),
     ),
 ]
@@ -191,9 +191,10 @@ def test_explicit_step_conserves_linear_momentum(transfer, description):
     assert_close(final.mass @ final.v, particles.mass @ particles.v, 1e-12)
 
 
-@pytest.mark.parametrize("contrast", [*thorough(1e6), 1e12])
-@pytest.mark.parametrize("gradient", **ids(GRADIENTS, "mls"))
-@pytest.mark.parametrize("dtype", [jnp.float32, *thorough(jnp.float64)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("contrast", [1e6, 1e12])
+@pytest.mark.parametrize("gradient", **ids(GRADIENTS))
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_a_light_body_flies_as_freely_as_a_heavy_one(dtype, gradient, contrast):
     """Its velocity, and what it owes to its first, after 100 steps beside a body heavier by the contrast."""
     grid = mpm.Grid((20, 10), 0.1, origin=(-2, -2))

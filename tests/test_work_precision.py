@@ -200,6 +200,7 @@ def test_the_chart_and_its_numbers_are_written(waves, tmp_path):
     assert rows[-1].startswith("SemiImplicit(beta=1),1,")
 
 
+@pytest.mark.thorough
 def test_a_scene_in_which_nothing_moves_is_refused():
     def still(n):
         scene, bar = pulled(n)

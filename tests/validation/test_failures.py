@@ -121,6 +121,7 @@ def ringing(transfer, periods=10, per=8):
     return sizes[0], sizes[-1]
 
 
+@pytest.mark.thorough
 def test_flip_rings_and_apic_does_not():
     """The vibrating bar, 8 particles a cell, 10 periods: FLIP's in-cell noise doubles, APIC's stays."""
     first, last = ringing(mpm.FLIP(1.0))
@@ -329,6 +330,7 @@ def spun(method, number):
     return angular(after) / angular(square) - 1
 
 
+@pytest.mark.thorough
 def test_explicit_apic_keeps_angular_momentum_and_the_linearised_force_does_not():
     """Over one turn: rounding against a loss that grows with Δt, 2 per cent at 0.3 dx/c and 9 at 1."""
     assert abs(spun(mpm.Explicit(), 0.3)) < 1e-12

@@ -27,7 +27,7 @@ def aligned_force(law: str, u, stretch, J):
 
 
 @pytest.mark.parametrize(
-    "law", [mpm.NeoHookean(E, NU), mpm.FixedCorotated(E, NU)], ids=["neo_hookean", "fixed_corotated"]
+    "law", [mpm.NeoHookean(E, NU), *thorough(mpm.FixedCorotated(E, NU))], ids=["neo_hookean", "fixed_corotated"]
 )
 @pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_the_axis_aligned_force_is_the_closed_form(d, law):
@@ -41,6 +41,7 @@ def test_the_axis_aligned_force_is_the_closed_form(d, law):
             np.testing.assert_allclose(problem.body_force(jnp.asarray(X), t), expected, rtol=1e-9, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_the_vortex_force_is_the_closed_form():
     """b_r = (μ/ρ) R (g h′)² − R (g′ h)², b_t = R g″ h − (μ/ρ)(3 g h′ + R g h″), turned by Θ + g h."""
     amplitude, mu, rho = 0.3, 1e3 / 2.6, 1e3
@@ -93,7 +94,7 @@ PROBLEMS = {
 }
 
 
-@pytest.mark.parametrize("problem", **ids(PROBLEMS))
+@pytest.mark.parametrize("problem", **ids(PROBLEMS, "wave"))
 def test_a_problem_starts_in_its_exact_state(problem):
     """Position, velocity, F and the velocity gradient in both descriptions, against finite differences in time."""
     for description in (mpm.UpdatedLagrangian(), mpm.TotalLagrangian()):
@@ -118,6 +119,7 @@ def test_a_wave_of_another_law_or_beyond_folding_is_refused():
         StandingWave(0.5)
 
 
+@pytest.mark.thorough
 def test_the_disks_touch_when_they_should():
     disks = TwoDisks()
     assert disks.contact_time == pytest.approx(1.5858, abs=1e-4)

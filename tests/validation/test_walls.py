@@ -85,6 +85,7 @@ def test_a_plain_wall_is_first_order(kernel):
     assert errors[-1] > 5 * wave_run(64, "symmetry", kernel)[1]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "kernel", ["quadratic", *(pytest.param(k, marks=pytest.mark.slow) for k in ("linear", "cubic"))]
 )
