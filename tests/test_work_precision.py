@@ -102,7 +102,7 @@ def test_a_slow_pull_of_a_stiff_bar_is_not_run_explicitly():
     good = [trial for trial in implicit if trial.error < 0.1]
     cheapest = found.cheapest()
     assert cheapest == min(good, key=lambda trial: trial.seconds)
-    assert f"SemiImplicit(beta=1), dt = {cheapest.dt:g} s ({cheapest.steps} steps)" in found.verdict()
+    assert f"SemiImplicit(beta=1), dt = {cheapest.dt:.3g} s ({cheapest.steps} steps)" in found.verdict()
     assert "Explicit()" in found.verdict()
     assert "would need" in found.verdict()
 

@@ -157,7 +157,7 @@ def _axes(hint: type[AbstractArray]) -> tuple[int, bool]:
 
 def _known(hint: Any) -> dict[str, Any]:
     """The classes of objects that an annotation takes, and the members of its enumerations, by their names: of a base
-    class, those below it."""
+    class, those below it, in the order of the package's own list."""
 
     def below(kind: type) -> dict[str, Any]:
         if inspect.isabstract(kind) or kind.__name__.startswith("Abstract"):
@@ -172,7 +172,9 @@ def _known(hint: Any) -> dict[str, Any]:
         elif is_enum(a):
             names |= {str(member): member for member in a}
         elif is_module(a):
-            names |= below(a)
+            listed = getattr(sys.modules["mpmjax"], "__all__", [])
+            found = below(a)
+            names |= {name: found[name] for name in sorted(found, key=lambda n: listed.index(n) if n in listed else -1)}
     return names
 
 

@@ -18,6 +18,7 @@ from jax.flatten_util import ravel_pytree
 
 import mpmjax as mpm
 from mpmjax.checks._values import canonical
+from mpmjax.discretisation._gradient import _STEEPEST
 from mpmjax.state._particles import state_of, with_state
 from mpmjax.stepping import _stability
 from mpmjax.stepping._step import advance
@@ -118,7 +119,7 @@ def test_bound_of_the_linear_kernel_falls_to_zero_at_a_face(place):
 
 def test_spline_gradients_are_steepest_where_the_bound_takes_them():
     """dx² Σ (∂w)²/w over a cell: at most 6 (quadratic) and 3.137 (cubic), and reached."""
-    for order, most in _stability._STEEPEST.items():
+    for order, most in _STEEPEST.items():
         kernel = mpm.BSpline(order)
         f = (order - 1) / 2 + jnp.linspace(1e-9, 1 - 1e-9, 100001)[None]
         values = (kernel.derivatives(f) ** 2 / kernel.weights(f)).sum(axis=1)
