@@ -174,7 +174,10 @@ def _known(hint: Any) -> dict[str, Any]:
         elif is_module(a):
             listed = getattr(sys.modules["mpmjax"], "__all__", [])
             found = below(a)
-            names |= {name: found[name] for name in sorted(found, key=lambda n: listed.index(n) if n in listed else -1)}
+            names |= {
+                name: found[name]
+                for name in sorted(found, key=lambda n: listed.index(n) if n in listed else len(listed))
+            }
     return names
 
 
