@@ -154,8 +154,8 @@ NEWTON = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-11), PROJECTED, adjoint_solver=T
 @pytest.mark.parametrize(
     "solver",
     [
-        pytest.param(lx.LU(), marks=pytest.mark.slow),
-        pytest.param(lx.Cholesky(), marks=pytest.mark.slow),
+        pytest.param(lx.LU(), marks=pytest.mark.thorough),
+        pytest.param(lx.Cholesky(), marks=pytest.mark.thorough),
         MinimalResidual(),
         CG,
     ],
@@ -169,6 +169,7 @@ def test_a_semi_implicit_run_and_its_gradient_by_any_symmetric_solver(solver):
     assert float(statistics.worst_residual) < 1e-10
 
 
+@pytest.mark.thorough
 def test_newtons_method_by_conjugate_gradients():
     """In backward Euler, of a projected Hessian; the adjoint is that of the true one, for which it takes a solver of
     matrices that may be indefinite."""
@@ -235,8 +236,8 @@ def test_a_solver_that_does_not_solve_is_found_out():
 @pytest.mark.parametrize(
     ("preconditioner", "method"),
     [
-        pytest.param(ScaledMass(), OURS, id="diagonal_linear", marks=pytest.mark.slow),
-        pytest.param(BlockJacobi(), NEWTON, id="blocks_newton", marks=pytest.mark.slow),
+        pytest.param(ScaledMass(), OURS, id="diagonal_linear", marks=pytest.mark.thorough),
+        pytest.param(BlockJacobi(), NEWTON, id="blocks_newton", marks=pytest.mark.thorough),
         pytest.param(ScaledMass(), NEWTON, id="diagonal_newton"),
         pytest.param(BlockJacobi(), OURS, id="blocks_linear"),
     ],
