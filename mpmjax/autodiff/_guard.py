@@ -1,4 +1,4 @@
-"""The guard: an identity that raises where a number says that something is at fault.
+"""The guard: an identity that raises if a number says that there is a fault.
 
 A check on the outcome of a program is removed with the outcome if only a derivative of it is used. This one is an
 operation of its own, linear in what it guards: its tangent guards the tangents and its transpose the cotangents, by the
@@ -46,7 +46,7 @@ _guard_p.multiple_results = True
 
 
 def _say(faults: tuple[str, ...], failure: str, fault: Any, signal: Any) -> None:
-    """Raise what is wrong, of known numbers."""
+    """Raise the error of a fault or a signal whose numbers are known."""
     if (worst := np.max(fault)) > 0:
         raise RuntimeError(faults[int(worst) - 1])
     if not np.all(np.asarray(signal) == 0):
@@ -66,7 +66,7 @@ def _abstract(*operands: Any, **_: Any) -> list[Any]:
 
 
 def _compiled(*operands: Any, faults: tuple[str, ...], failure: str, derivative: bool) -> list[Any]:
-    """The check is made once, of one number, which each leaf then depends on."""
+    """Check once, by one number on which each leaf then depends."""
     *leaves, signal, fault = operands
     if not faults and not derivative:
         return [*leaves, signal]
@@ -87,7 +87,8 @@ mlir.register_lowering(_guard_p, mlir.lower_fun(_compiled, multiple_results=True
 
 
 def _differentiated(primals: Any, tangents: Any, *, derivative: bool, **parameters: Any) -> Any:
-    """Tangents that are zero need no guard. The signal's is made a number: a cotangent needs a way through it."""
+    """Guard the tangents that are not zero. The signal's tangent is always made an array, so that a cotangent can
+    pass."""
     out = _guard_p.bind(*primals, derivative=derivative, **parameters)
     return out, _guarded(tangents[:-1], primals[-1], derivative=True, **parameters)
 
@@ -115,7 +116,7 @@ ad.primitive_transposes[_guard_p] = _transposed
 
 
 def _batched(operands: Any, axes: Any, **parameters: Any) -> tuple[list[Any], list[Any]]:
-    """What is wrong in one member is raised for all: it looks at every number of a signal and a fault anyway."""
+    """Raise for the whole batch if one member has a fault: all numbers of signal and fault are looked at anyway."""
     return _guard_p.bind(*operands, **parameters), list(axes[:-1])
 
 

@@ -80,29 +80,30 @@ _ARRAY: Hashable = object()
 
 
 class _Call(NamedTuple):
-    """What of a call is fixed in a program: everything but the arrays."""
+    """The part of a call that is fixed in a program: everything but the arrays."""
 
     rule: ruled
     tree: Any
     fixed: tuple[Hashable, ...]
     """The leaves of the arguments, `_ARRAY` in the place of each array."""
     types: tuple[type, ...]
-    """Theirs: 1 and 1.0 are equal and are not the same program."""
+    """The types of these leaves: 1 and 1.0 are equal, but not the same program."""
     mapped: tuple[tuple[int | None, ...], ...] = ()
-    """For each `jax.vmap` around the call, the inner first, the arrays' axes. Results have theirs in front."""
+    """The mapped axes of the arrays for each `jax.vmap` around the call, the inner one first. Results are mapped along
+    axis 0."""
 
     def args(self, arrays: Sequence[Any]) -> tuple[Any, ...]:
-        """The arguments, of the arrays."""
+        """The arguments with these arrays in their places."""
         found = iter(arrays)
         return jax.tree.unflatten(self.tree, [next(found) if f is _ARRAY else f for f in self.fixed])
 
     def tangents(self, arrays: Sequence[Any]) -> tuple[Any, ...]:
-        """The arguments' tangents, of the arrays'."""
+        """The tangents of the arguments, from those of the arrays."""
         found = iter(arrays)
         return jax.tree.unflatten(self.tree, [next(found) if f is _ARRAY else None for f in self.fixed])
 
     def arrays(self, args: Any) -> list[Any]:
-        """What stands in the arrays' places."""
+        """What stands in the places of the arrays."""
         leaves = self.tree.flatten_up_to(args)
         return [leaf for leaf, f in zip(leaves, self.fixed, strict=True) if f is _ARRAY]
 
@@ -171,7 +172,7 @@ def _transpose(cotangents: Sequence[Any], *arrays: Any, call: _Call) -> list[Any
         mapped = jax.vmap(pulled, in_axes=(0, known), out_axes=[axis or 0 for axis in wanted])
 
         def summed(cotangent: Array, arrays: Sequence[Any]) -> list[Any]:
-            """Over the members of the batch that share an array."""
+            """Sum over the members of the batch that share an array."""
             parts = zip(mapped(cotangent, arrays), wanted, strict=True)
             return [a.sum(axis=0) if axis is None else a for a, axis in parts]
 

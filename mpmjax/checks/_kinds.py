@@ -1,4 +1,4 @@
-"""Of what kind a value must be: a number, a sequence of so many axes, an object of a class. Its annotation says it.
+"""The kind that a value must be of, by its annotation: a number, an array with so many axes, an object of a class.
 
 `require_fields` checks a module's fields, `checked` a function's arguments, so that what is wrong is said where it is
 given, with what is known there. Numbers may be Python's, NumPy's or JAX's, traced ones too.
@@ -44,7 +44,7 @@ _WORDS: dict[Any, str] = {
 
 
 def checked(function: Function) -> Function:
-    """A function that first requires its arguments to be of the kinds that their annotations name.
+    """Decorate a function to check that its arguments are of the kinds that their annotations name.
 
     Raises:
         ValueError: one is not.
@@ -65,7 +65,7 @@ def checked(function: Function) -> Function:
 
 
 def require_fields(module: eqx.Module) -> None:
-    """Every field of a module must be of the kind that its annotation names.
+    """Check that every field of a module is of the kind that its annotation names.
 
     Raises:
         ValueError: one is not.
@@ -80,7 +80,7 @@ def _hints(module: type) -> tuple[tuple[str, Any], ...]:
 
 
 def require_kind(name: str, value: Any, hint: Any) -> None:
-    """A value must be of a kind that an annotation names.
+    """Check that a value is of a kind that an annotation names.
 
     Raises:
         ValueError: it is not; with the kinds that are known, and which of them may have been meant.
@@ -91,7 +91,7 @@ def require_kind(name: str, value: Any, hint: Any) -> None:
 
 
 def alternatives(hint: Any) -> list[Any]:
-    """The members of a union, or the one annotation."""
+    """The members of a union; of any other annotation, the annotation alone."""
     if get_origin(hint) in (typing.Union, UnionType):
         return [a for member in get_args(hint) for a in alternatives(member)]
     return [hint]
@@ -108,7 +108,7 @@ def is_enum(hint: Any) -> bool:
 
 
 def shape_of(value: Any) -> tuple[int, ...] | None:
-    """The shape of a number, of an array or of nested sequences of such; None of what is none, or ragged."""
+    """The shape of a number, an array or nested sequences of numbers; None if it is none of these, or ragged."""
     if isinstance(value, (np.ndarray, np.generic, jax.Array)):
         real = jnp.issubdtype(value.dtype, jnp.integer) or jnp.issubdtype(value.dtype, jnp.floating)
         return np.shape(value) if real else None
@@ -121,7 +121,7 @@ def shape_of(value: Any) -> tuple[int, ...] | None:
 
 
 def _takes(hint: Any, value: Any) -> bool:
-    """Whether a value is of a kind that an annotation names. Where that is more than it can tell, it says yes."""
+    """Whether a value is of a kind that an annotation names; True if that cannot be told."""
     origin, args = get_origin(hint), get_args(hint)
     if origin in (typing.Union, UnionType):
         return any(_takes(a, value) for a in args)
@@ -182,7 +182,7 @@ def _known(hint: Any) -> dict[str, Any]:
 
 
 def _in_words(hint: Any) -> str:
-    """What an annotation takes: objects by their names, then numbers and the rest."""
+    """The kinds that an annotation takes, in words: classes by their names, then numbers and the rest."""
     names = list(_known(hint))
     words = [f"one of {', '.join(names)}" if len(names) > 1 else names[0]] if names else []
     for a in alternatives(hint):
@@ -195,7 +195,7 @@ def _in_words(hint: Any) -> str:
 
 
 def _plain(hint: Any) -> str:
-    """What an annotation of numbers, words and the like takes."""
+    """The kind that an annotation of numbers, strings or other plain values takes, in words."""
     origin, args = get_origin(hint), get_args(hint)
     if origin is Literal:
         return " or ".join(repr(word) for word in args)
@@ -211,7 +211,7 @@ def _plain(hint: Any) -> str:
 
 
 def _meant(hint: Any, value: Any) -> str:
-    """The end of a message: the object for which its class or name may stand."""
+    """The end of a message that names the object which was probably meant."""
     word = value.__name__ if isinstance(value, type) else value[:60] if isinstance(value, str) else ""
     known = {name.rsplit(".", 1)[-1].lower(): (name, kind) for name, kind in _known(hint).items()}
     key = word.replace(" ", "").replace("_", "").lower()

@@ -1,4 +1,4 @@
-"""Memory: what there is, and that what will be allocated fits into it, asked before it is."""
+"""Memory: a check, before it is allocated, that it is available."""
 
 import math
 import os
@@ -7,11 +7,11 @@ from pathlib import Path
 import jax
 
 _UNKNOWN = 2**34
-"""What is taken for available where the system does not say [B]."""
+"""Memory assumed to be available if the system does not say [B]."""
 
 
 def require_memory(what: str, needed: float | int, advice: str, *, device: bool = False) -> None:
-    """What will be allocated must fit into what there is.
+    """Check that what will be allocated fits into the available memory.
 
     Args:
         what: what it is, as the subject of "takes at least so many GB".
@@ -32,7 +32,8 @@ def require_memory(what: str, needed: float | int, advice: str, *, device: bool 
 
 
 def available_memory(*, device: bool = False) -> float | int:
-    """Bytes that can be allocated: of the host, within its control group's limit; with `device` of jax's device."""
+    """Memory that can be allocated [B]: of the host, within its control group's limit, or with `device` of jax's
+    device."""
     stats = jax.local_devices()[0].memory_stats() if device else None  # None of a CPU, whose memory is the host's
     if stats and "bytes_limit" in stats:
         return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
@@ -52,7 +53,7 @@ def _free() -> int:
 
 
 def _within_limit() -> float | int:
-    """What the control group that the process is in may still take; what it keeps of files gives way."""
+    """Memory that the process's control group may still take [B]; the file cache counts as free."""
     group = Path("/sys/fs/cgroup")
     try:
         limit, used = int((group / "memory.max").read_text()), int((group / "memory.current").read_text())

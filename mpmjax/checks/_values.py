@@ -25,15 +25,15 @@ def is_traced(tree: Any) -> bool:
 
 
 class Requirement(NamedTuple):
-    """What must hold of values that are being traced."""
+    """A requirement on values that are being traced."""
 
     message: str
     met: Callable[[], Any]
-    """Computes whether it does: bools, all of them true."""
+    """Computes bools that are all true if it is met."""
 
 
 _put_off: ContextVar[list[Requirement] | None] = ContextVar("_put_off", default=None)
-"""Where `requirements` gathers; None outside of it, where what is not known is passed."""
+"""The list in which `requirements` collects; None outside of it, where checks of unknown values are skipped."""
 
 
 def requirements(tree: Any) -> list[Requirement]:
@@ -78,7 +78,8 @@ def _put_off_check(message: str, met: Callable[[], Any]) -> None:
 
 
 def require(condition: Any, message: str) -> None:
-    """Raise `ValueError(message)` unless the condition holds everywhere; of what is traced see `requirements`."""
+    """Raise `ValueError(message)` unless the condition holds everywhere. Traced conditions are put off
+    (`requirements`)."""
     if is_traced(condition):
         _put_off_check(message, lambda: condition)
     elif not np.all(condition):
@@ -86,7 +87,7 @@ def require(condition: Any, message: str) -> None:
 
 
 def shortened(text: str, most: int = 80) -> str:
-    """In one line of at most so many characters."""
+    """The text in one line of at most `most` characters."""
     text = " ".join(text[: 10 * most].split())
     return text if len(text) <= most else text[: most - 3] + "..."
 
@@ -106,7 +107,7 @@ def require_that(what: str, holds: Callable[..., Any], *values: Any) -> None:
 
 
 def warn(message: str) -> None:
-    """Give a Python warning, as of the line from which the package was called."""
+    """Give a Python warning, at the line from which the package was called."""
     level, frame = 1, sys._getframe()
     while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in ("mpmjax", "equinox", "jaxtyping"):
         level, frame = level + 1, frame.f_back
@@ -114,7 +115,7 @@ def warn(message: str) -> None:
 
 
 def require_tolerance(name: str, value: Any) -> None:
-    """A relative tolerance must be positive; a warning is given of one that any guess meets."""
+    """Check that a relative tolerance is positive; warn of one that any guess meets."""
     require_positive(name, value)
     if not is_traced(value) and np.any(np.asarray(value) >= 1):
         warn(f"{name} is {shortened(str(value))}: at 1 or more nothing is solved, zero meets it. Take 1e-2 or less.")

@@ -1,4 +1,4 @@
-"""The background grid: a window of static shape whose integer origin says where it lies."""
+"""The background grid: a window of static shape on an unbounded lattice, placed by its integer origin."""
 
 import equinox as eqx
 import jax

@@ -14,7 +14,7 @@ from mpmjax.discretisation._kernel import BSpline
 
 
 class Stencil(eqx.Module):
-    """What ties particles to nodes: for each particle s = order + 1 nodes along each axis, and their weights.
+    """The nodes of each particle, s = order + 1 along each axis, with their weights and weight derivatives.
 
     Weights and gradients of the s^d stencil nodes are products of one factor an axis, and only those are stored: w_ip
     is the product of the weights, g_ip in direction a the same with the derivative along a in the weight's place.
@@ -23,7 +23,7 @@ class Stencil(eqx.Module):
     """
 
     index_factors: Int[Array, "d s p"]
-    """What each axis adds to the flat node index, shape (d, s, p); meaningless for a particle that is not `inside`."""
+    """The part of the flat node index that each axis adds, shape (d, s, p); meaningless for a particle not `inside`."""
     weights: Float[Array, "d s p"]
     """Weights along each axis [-], shape (d, s, p)."""
     weight_derivatives: Float[Array, "d s p"]
@@ -115,7 +115,7 @@ def make_stencil(
 
 
 def _index_factors(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Array) -> Int[Array, "d s p"]:
-    """What each axis adds to the C-order index of a particle's nodes."""
+    """The part of the C-order node index that each axis adds, shape (d, s, p)."""
     first = jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window[:, None]
     along = first[:, None] + jnp.arange(kernel.order + 1, dtype=jnp.int32)[:, None]
     periods, wraps, strides = (

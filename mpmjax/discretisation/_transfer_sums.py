@@ -27,8 +27,8 @@ from mpmjax._types import Array, Float
 from mpmjax.discretisation._stencil import Stencil
 
 _ROW = 4
-"""Most columns of the rows that are added to nodes. A CPU adds one, two or four numbers as one vector; three take it
-three times as long as four, being added one by one."""
+"""Largest number of columns that are added to the nodes at once. A CPU adds one, two or four numbers as one vector;
+three take it three times as long as four, being added one by one."""
 
 
 def gather(stencil: Stencil, nodes: Float[Array, "n c"]) -> tuple[Float[Array, "c p"], Float[Array, "d c p"]]:

@@ -1,4 +1,4 @@
-"""What to do about a fault of a run: whether its step was too long, and what fits the law."""
+"""Advice on a fault of a run: whether its step was too long, and what helps with the law."""
 
 import math
 from typing import Any
@@ -9,9 +9,9 @@ from mpmjax.stepping import SAFETY, AbstractIntegrator, UnknownBoundError, longe
 
 
 def advise(scene: Scene, method: AbstractIntegrator, dt: Any, began: Particles, last: Particles, otherwise: str) -> str:
-    """What to do about a fault: of a step that was too long, to shorten it; else what the fault itself suggests.
+    """Advice on a fault: to shorten the step if it was too long, else what the fault itself suggests.
 
-    A step above the limit explains any fault. Not every run with such a step fails by it, so both are said then.
+    A step above the limit explains any fault, but not every run with such a step fails by it. So both are said then.
 
     Args:
         scene: the scene.
@@ -44,7 +44,7 @@ def advise(scene: Scene, method: AbstractIntegrator, dt: Any, began: Particles, 
 
 
 def disallowed(law: Law, method: AbstractIntegrator) -> tuple[str, str]:
-    """What is wrong with an F that the law does not allow, and what to do."""
+    """What is wrong with an F that the law does not allow, and what helps."""
     newton = (
         ""
         if method.is_explicit or method.keeps_admissible

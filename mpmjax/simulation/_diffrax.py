@@ -28,7 +28,7 @@ from mpmjax.stepping import AbstractIntegrator, advance_compiled
 
 
 class Problem(eqx.Module):
-    """Everything of a rollout that does not evolve."""
+    """The part of a rollout that does not evolve."""
 
     scene: Scene
     particles: Particles
@@ -39,17 +39,17 @@ class Problem(eqx.Module):
     start: Scalar = 0.0
     """Number of the first step."""
     slot: Scalar = 0.0
-    """Through which adjoint solves report (see `Reporting`)."""
+    """Zero; adjoint solves report through its cotangent (see `Reporting`)."""
     fault: Int[Array, ""] | None = None
-    """What was wrong before the first step; None where that is known to be nothing."""
+    """Fault of the state before the first step; None if it is known that there is none."""
 
     def at(self, state: State) -> Particles:
-        """The particles in a state."""
+        """The particles with a state put in."""
         return with_state(self.particles, state)
 
 
 def faulty_particles(problem: Problem, state: State) -> tuple[Bool[Array, "p"], Bool[Array, "p"], Bool[Array, "p"]]:
-    """Which particles are not finite, have left the window, have an F that the law does not allow."""
+    """Which particles are not finite, which have left the window, and which have an F that the law does not allow."""
     scene, particles = problem.scene, problem.at(state)
     finite = _finite((particles.x, particles.v, particles.C))
     finite = finite & jnp.concatenate([_finite((group.F, group.history)) for group in particles.groups])
@@ -60,7 +60,7 @@ def faulty_particles(problem: Problem, state: State) -> tuple[Bool[Array, "p"], 
 
 
 def _finite(fields: Any) -> Bool[Array, "p"]:
-    """Whether all numbers of a particle are, of fields whose first axis is the particles'."""
+    """Whether all numbers of each particle are finite, of fields whose first axis is the particles'."""
     finite = [jnp.isfinite(a).reshape(a.shape[0], -1).all(axis=1) for a in jax.tree.leaves(fields)]
     return reduce(jnp.logical_and, finite)
 
@@ -84,7 +84,7 @@ def state_fault(problem: Problem, state: State) -> Int[Array, ""]:
 
 
 def fault_of(problem: Problem, before: State, after: State, t: Scalar) -> Int[Array, ""]:
-    """The gravest fault of a state and of the step from t [s] that led to it."""
+    """The gravest fault of a state, or of the step from t [s] that led to it."""
     fault = state_fault(problem, after)
     for _, passed in passed_particles(problem, before, after, t):
         fault = jnp.where(passed.any() & (fault != NOT_FINITE), BEYOND, fault)
@@ -92,8 +92,8 @@ def fault_of(problem: Problem, before: State, after: State, t: Scalar) -> Int[Ar
 
 
 def examined(problem: Problem, state: State) -> tuple[Problem, State]:
-    """The problem with the fault that it starts with, of values that were not known when they were written down, and
-    the state, which is NaN where a parameter is bad: what follows would look like numbers."""
+    """The problem with the fault of its start, found from values that were not known when they were given, and the
+    state, made NaN if a parameter is bad, since what follows would look like numbers."""
     arrays, rest = eqx.partition((problem, state), eqx.is_array)
     known, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
     unmet = first_unmet(requirements((known.scene, known.particles, known.method)))
@@ -119,12 +119,12 @@ class StepSolver(diffrax.AbstractSolver):
     are then known and were checked; else that is done here."""
 
     def order(self, terms: Any) -> int:
-        """At least first order in time; nothing depends on it, Δt being constant."""
+        """Order in time; nothing depends on it, since Δt is constant."""
         del terms
         return 1
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: State, args: Problem) -> tuple[RunStatistics, State | None, Array]:
-        """An empty statistics, and a silent report."""
+        """Empty statistics, no previous state, and a report of zero."""
         del terms, t0, t1
         statistics, silent = no_steps(y0.x.dtype), jnp.zeros((), y0.x.dtype)
         if args.fault is not None:
@@ -155,6 +155,6 @@ class StepSolver(diffrax.AbstractSolver):
 
 
 def no_vector_field(t: Any, y: State, args: Problem) -> State:
-    """What stands where diffrax expects an equation: the solver does not evaluate it."""
+    """A stand-in for the equation that diffrax expects; the solver does not evaluate it."""
     del t, args
     return jax.tree.map(jnp.zeros_like, y)

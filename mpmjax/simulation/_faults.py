@@ -1,4 +1,4 @@
-"""What is wrong with a run, in words: errors, and warnings."""
+"""The errors and warnings of a run."""
 
 from typing import Any
 
@@ -28,7 +28,7 @@ from mpmjax.stepping import AbstractIntegrator
 
 
 def raise_faults(run: Run, began: Particles, previous: State | None, start: int) -> None:
-    """Raise what the statistics of an untraced run tells.
+    """Raise the faults in the statistics of an untraced run.
 
     Args:
         run: the run, its final state possibly bad.
@@ -81,7 +81,7 @@ def raise_faults(run: Run, began: Particles, previous: State | None, start: int)
 
 
 def unconverged_advice(method: AbstractIntegrator, dtype: Any) -> str:
-    """What helps a solve that does not converge."""
+    """Advice on a solve that does not converge."""
     advice = [*method.unconverged_advice(), "reduce dt", "raise the solver's max_steps or loosen its rtol"]
     if jnp.dtype(dtype) == jnp.float32:
         advice.append("take float64 particles, of which rounding leaves more digits")
@@ -127,7 +127,7 @@ _STATE_FAULTS = (
     "a deformation gradient that its law does not allow",
     "a particle that passed a boundary",
 )
-"""What is said of NOT_FINITE and the codes after it where no particle can be named."""
+"""The texts of NOT_FINITE and the following codes if no particle can be named."""
 _ADVICE = (
     "Call simulate outside of jax transformations to have step, time and particle named, or with throw=False to "
     "inspect run.statistics."
@@ -139,7 +139,7 @@ UNSOLVED = (
 
 
 def guarded(run: Run, report: Array) -> Run:
-    """The run, of which neither a number nor a derivative can be had where it met a fault."""
+    """The run, guarded: neither its numbers nor their derivatives can be used if it met a fault."""
     inputs, rest = eqx.partition((run.scene, run.final, run.method), eqx.is_array)
     names: list[str] = []
     jax.eval_shape(lambda a: names.extend(r.message for r in requirements(eqx.combine(a, rest))), inputs)

@@ -1,4 +1,4 @@
-"""What a simulation returns."""
+"""The outcome of a simulation."""
 
 from typing import Any, NamedTuple
 
@@ -36,9 +36,9 @@ class Run(eqx.Module):
     """A simulation's outcome. A pytree: it can be returned from `jax.jit`, `jax.vmap` and differentiated."""
 
     scene: Scene
-    """As it was simulated."""
+    """The scene, with numbers as arrays of the particles' precision."""
     method: AbstractIntegrator
-    """As it was used."""
+    """The integrator, likewise."""
     dt: Scalar
     """Δt [s]."""
     steps: Float[Array, "*f"]

@@ -1,4 +1,4 @@
-"""Rollouts: many steps, saved, watched and differentiated."""
+"""Rollouts: many steps, with saving, faults and derivatives."""
 
 import math
 from collections.abc import Callable
@@ -157,7 +157,8 @@ def rollout(
     method: AbstractIntegrator = Explicit(),
     start: Scalar = 0,
 ) -> Particles:
-    """The plain rollout: `jax.lax.scan` over steps, without saving, checks or checkpoints. `simulate` is held to it.
+    """The plain rollout: `jax.lax.scan` over steps, without saving, checks or checkpoints. Tests compare `simulate`
+    with it.
 
     Args:
         scene: the scene.
@@ -220,7 +221,7 @@ def _checkpoints(particles: Particles, count: int, budget: int) -> int:
 
 
 def _bytes(particles: Particles) -> int:
-    """Of what evolves of them."""
+    """Size of the evolving part of the particles [B]."""
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state_of(particles)))
 
 

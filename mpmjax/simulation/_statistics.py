@@ -10,7 +10,7 @@ from mpmjax._types import Array, Bool, Float, Int
 from mpmjax.stepping import StepInfo
 
 HEALTHY, NOT_FINITE, OUTSIDE, INADMISSIBLE, BEYOND = 0, 1, 2, 3, 4
-"""What can be wrong with a state."""
+"""The faults of a state."""
 
 
 BAD_PARAMETERS = 100
@@ -26,13 +26,13 @@ class RunStatistics(eqx.Module):
     iterations: Int[Array, "*f"]
     """Conjugate-residual iterations."""
     most_iterations: Int[Array, "*f"]
-    """Most of them in one step."""
+    """Largest number of iterations in one step."""
     newton: Int[Array, "*f"]
     """Newton steps."""
     line_search: Int[Array, "*f"]
     """Halvings by the line search."""
     worst_residual: Float[Array, "*f"]
-    """Largest relative residual that a solve ended with."""
+    """Largest relative residual at the end of a solve."""
     unconverged: Int[Array, "*f"]
     """Steps whose solve met neither ten times its tolerance nor the precision's limit: the run is not a solution."""
     nearly_converged: Int[Array, "*f"]
@@ -41,14 +41,14 @@ class RunStatistics(eqx.Module):
     """Steps whose solve met negative curvature: compression has made M + cH indefinite, and near a singular one the
     motion is wrong however small the residual. `AnalyticHessian(projected=True)` or a smaller step avoids it."""
     sweeps: Int[Array, "*f"]
-    """Solves that contact took beyond one a step."""
+    """Solves for contact beyond one a step."""
     violations: Int[Array, "*f"]
     """Contact conditions left violated, summed over steps."""
     fault: Int[Array, "*f"]
     """The first fault of a state: HEALTHY, NOT_FINITE, OUTSIDE, INADMISSIBLE or BEYOND; or BAD_PARAMETERS and what
     follows."""
     fault_step: Int[Array, "*f"]
-    """How many steps led to it."""
+    """Number of steps that led to it."""
 
     @property
     def healthy(self) -> Bool[Array, "*f"]:
@@ -77,7 +77,7 @@ class RunStatistics(eqx.Module):
         )
 
     def merged(self, later: "RunStatistics") -> "RunStatistics":
-        """This statistics and that of the steps that followed."""
+        """These statistics and those of the steps that followed."""
         healthy = self.fault == HEALTHY
         return RunStatistics(
             steps=self.steps + later.steps,

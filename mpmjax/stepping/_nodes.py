@@ -166,7 +166,7 @@ class Nodes(AbstractNodes):
 
     @property
     def prescribed(self) -> NodeVector:
-        """The velocity [m/s], shape (n, d), of what is held."""
+        """The velocity of the components that are held [m/s], shape (n, d)."""
         part = self.free_normal
         if part is None:
             return self.conditions.velocity
@@ -297,6 +297,7 @@ def particles_to_grid(
 
 
 def _place(particles: Particles, stencil: Stencil, size: int) -> NodeVector:
-    """The places of reference nodes times their mass, Σ_p w_ip m_p (x_p + F_p (X_i − X_p)) [kg m], shape (n, d)."""
+    """The current positions of reference nodes times their mass, Σ_p w_ip m_p (x_p + F_p (X_i − X_p)) [kg m], shape (n,
+    d)."""
     F = jnp.concatenate([components(group) for group in jax.tree.leaves(particles.F)], axis=-1)
     return p2g(stencil, particles.mass, components(particles.x), F, size)[1]

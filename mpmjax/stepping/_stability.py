@@ -1,4 +1,4 @@
-"""The longest stable step, known before it is taken."""
+"""The longest stable step."""
 
 import math
 from typing import Literal
@@ -16,7 +16,7 @@ from mpmjax.stepping._explicit import Explicit
 from mpmjax.stepping._integrator import AbstractIntegrator
 
 MOST_STEPS = 2**31 - 1
-"""What a run counts its steps up to."""
+"""The largest number of steps of a run."""
 SAFETY = 0.7
 """The default safety."""
 
@@ -96,7 +96,7 @@ def step_for(
     method: AbstractIntegrator,
     start: int,
 ) -> Scalar:
-    """The step that is asked for: a number, or what `stable_dt` says of the particles as they start.
+    """The step that is asked for [s]: a number, or `stable_dt` of the particles as they start.
 
     Raises:
         ValueError: of `stable_dt`; "stable" for a run that does not start at step 0.
@@ -108,7 +108,7 @@ def step_for(
 
 
 def _whole(limit: Array, t1: Scalar, method: str) -> Float[Array, ""]:
-    """t1 by the least whole number for which that is at or below a limit [s]."""
+    """The longest step at or below a limit of which t1 is a whole number [s]."""
     if is_traced((limit, t1)):
         raise ValueError(
             "The number of steps must be known, and the limit that fixes it is traced here: ask for "

@@ -1,4 +1,5 @@
-"""One step: particles to grid, the nodes' update by an integrator, grid to particles, return maps of what yields."""
+"""One step: particles to grid, the nodes' update by an integrator, grid to particles, return maps of laws that
+yield."""
 
 from dataclasses import replace
 
@@ -34,7 +35,7 @@ class StepInfo(eqx.Module):
     outside: Int[Array, "*f"]
     """Particles whose stencil left the grid's window."""
     colliders: ColliderImpulse | None = None
-    """What the scene's colliders received, in the order of its boundaries; None without any."""
+    """Impulse on the scene's colliders, in the order of its boundaries; None without colliders."""
 
 
 class GridUpdate(eqx.Module):
@@ -55,7 +56,7 @@ class GridUpdate(eqx.Module):
     friction: NodeVector | None
     """The impulse of friction [kg m/s], shape (n, d), where there are walls that may be left."""
     free: Projection
-    """The projection on that in which no boundary had a part."""
+    """The projection on the components of velocity on which no boundary acts."""
     solve: SolveInfo
     contact: ContactInfo
     normal_impulse: NodeScalar | None = None
@@ -106,11 +107,11 @@ def advance(
 
 
 advance_compiled = eqx.filter_jit(advance)
-"""The same as one program, which is traced once wherever it is called."""
+"""`advance`, compiled as one program that is traced once wherever it is called."""
 
 
 def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
-    """The nodes' motion, boundaries and contact included."""
+    """The motion of the nodes, with boundaries and contact."""
     with jax.named_scope("update"):
         guess = method.initial_guess(nodes)
         if not nodes.contacts:
@@ -176,8 +177,8 @@ def impulses(
 
 
 def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: GridUpdate) -> Particles:
-    """G2P: the particles moved and deformed with the nodes, x ← x + Δt Σ w v̄_i, F ← F + Δt Σ v̄_i hᵀ; of what yields
-    that is the trial F_E, which `Scene.return_map` brings back."""
+    """G2P: the particles moved and deformed with the nodes, x ← x + Δt Σ w v̄_i, F ← F + Δt Σ v̄_i hᵀ; for laws that
+    yield that is the trial F_E, which `Scene.return_map` brings back."""
     potential, dt = nodes.potential, nodes.dt
     unfold = potential.mirror.unfold
     before, motion = jax.tree.map(unfold, (new.before, new.motion))
