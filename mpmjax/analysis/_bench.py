@@ -1,4 +1,4 @@
-"""Pilot runs: a scene's motion by a method at a step, and what it costs."""
+"""Timed runs: the motion of a scene by a method at a step, and the seconds that it takes."""
 
 import math
 import time
@@ -18,7 +18,7 @@ from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator, stable_dt
 
 FRAMES = 8
-"""Times at which motions are compared."""
+"""Number of times at which motions are compared."""
 _MOST_STEPS = 2**30
 _PILOT_SECONDS = 0.2  # for which so many steps are run as the time of all is foreseen from: a call alone takes time too
 _BRIEF = 0.3  # seconds of a run below which it is timed again
@@ -28,11 +28,11 @@ Build = Callable[[int], tuple[Scene, Particles]]
 
 
 class Trial(NamedTuple):
-    """A setting, what it cost and how good it was."""
+    """A method, step and spacing, with the seconds that it took and its error."""
 
     method: AbstractIntegrator
     refinement: int
-    """By how much the spacing is finer than the scene's own."""
+    """The scene's own spacing over the trial's."""
     dt: float
     """Δt [s]."""
     steps: int
@@ -54,12 +54,12 @@ def name_of(method: AbstractIntegrator) -> str:
 
 
 class Displacements(NamedTuple):
-    """Where particles were, and how far they had come at the times of comparison."""
+    """Initial positions of particles, and their displacements at the times of comparison."""
 
     X: np.ndarray
-    """(p, d) [m]."""
+    """Initial positions [m], shape (p, d)."""
     u: np.ndarray
-    """(frames, p, d) [m]."""
+    """Displacements [m], shape (frames, p, d)."""
 
     @property
     def size(self) -> float:
@@ -67,14 +67,14 @@ class Displacements(NamedTuple):
         return float(_rms(self.u).max())
 
     def distance(self, finer: "Displacements") -> float:
-        """From a motion of as many or more particles, relative to its size."""
+        """The relative error against the motion of as many or more particles."""
         share = max(1, round(len(finer.X) / len(self.X)))
         near = scipy.spatial.KDTree(finer.X).query(self.X, k=share)[1].reshape(len(self.X), share)
         return float(_rms(self.u - finer.u[:, near].mean(axis=2)).max() / finer.size)
 
 
 class Clock:
-    """An allowance of seconds, compilation and all counted."""
+    """An allowance of seconds, compilation included."""
 
     def __init__(self, seconds: float):
         self.seconds, self._end = seconds, time.perf_counter() + seconds
@@ -127,7 +127,7 @@ class Bench(NamedTuple):
         return states, seconds
 
     def foresee(self, method: AbstractIntegrator, steps: int) -> float:
-        """Seconds of so many steps, from a few of them."""
+        """The seconds that a number of steps will take, estimated from a few of them."""
         self._go(method, steps, 1, 1)
         some, seconds = 1, self.timed(method, steps, 1, 1)[1]
         while seconds < _PILOT_SECONDS and some < steps:
@@ -142,7 +142,7 @@ class Bench(NamedTuple):
         return states, time.perf_counter() - begun
 
     def why(self, method: AbstractIntegrator, steps: int) -> str:
-        """What goes wrong in a run that fails."""
+        """The error message of a run that fails."""
         try:
             self._go(method, steps, FRAMES, steps // FRAMES, throw=True)
         except SimulationError as error:
@@ -182,5 +182,5 @@ class Bench(NamedTuple):
 
 
 def _rms(distance: np.ndarray) -> Any:
-    """Over particles, of distances (frames, p, d)."""
+    """The root mean square over particles of distances, shape (frames, p, d)."""
     return np.sqrt((distance**2).sum(axis=-1).mean(axis=-1))

@@ -1,4 +1,4 @@
-"""Where energy and momentum go in each step: every transfer, force and approximation by an expression of its own."""
+"""Budgets of energy and momentum in each step, with an expression for every transfer, force and approximation."""
 
 import equinox as eqx
 import jax
@@ -46,7 +46,7 @@ class EnergyBudget(eqx.Module):
     """Dissipated by treating the elastic force implicitly, (Δt f^n − its impulse)·v̄: β Δt² v̄·H v^{n+1}. In methods of
     second order `time_integration` gives it back but for terms of third order in Δt."""
     boundary: Float[Array, "*f"]
-    """Work of walls and grips, impulse·v̄: that of a wall is what stops dead on it."""
+    """Work of walls and grips, impulse·v̄: at a wall the kinetic energy of what stops on it."""
     friction: Float[Array, "*f"]
     """Work of friction, ≤ 0."""
     body_force: Float[Array, "*f"]

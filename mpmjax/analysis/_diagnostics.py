@@ -1,4 +1,4 @@
-"""What a state weighs, moves and stores: mass, momentum and energy."""
+"""Mass, momentum and energy of a state."""
 
 import equinox as eqx
 import jax
@@ -25,7 +25,7 @@ class Energy(eqx.Module):
 
     @property
     def total(self) -> Float[Array, "*f"]:
-        """Their sum."""
+        """The sum of all three."""
         return self.kinetic + self.elastic + self.potential
 
 
@@ -42,7 +42,7 @@ def energy(scene: Scene, particles: Particles) -> Energy:
 
 
 def energy_of(scene: Scene, particles: Particles) -> Energy:
-    """The same of prepared particles, without compilation."""
+    """The energy of prepared particles, without compilation."""
     speed2 = (particles.v**2).sum(axis=1)
     if scene.transfer.affine and particles.C is not None:
         moment = scene.stencil(particles).moment.T[:, None, :]
@@ -70,12 +70,12 @@ def momentum(particles: Particles) -> Float[Array, "d"]:
 
 
 def volume_ratio(particles: Particles) -> ParticleScalar:
-    """J = det F of each prepared particle [-], of what yields det F_E, shape (p,)."""
+    """J = det F of each prepared particle [-], for laws that yield det F_E, shape (p,)."""
     return jnp.concatenate([la.determinant(components(F)) for F in jax.tree.leaves(particles.F)])
 
 
 def grid_mass(scene: Scene, particles: Particles) -> Float[Array, ""]:
-    """The mass that arrives on the grid [kg]: that of the particles to rounding, or some of it left the window."""
+    """The mass on the grid [kg]: that of the particles to rounding, unless some left the window."""
     scene = canonical(scene, particles.x.dtype)
     return _grid_mass(scene, prepare(scene, particles))
 

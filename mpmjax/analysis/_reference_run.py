@@ -17,19 +17,19 @@ from mpmjax.state import State
 from mpmjax.stepping import TRBDF2, AbstractIntegrator, Explicit
 
 HOPELESS = 4
-"""How far below the explicit limit a run that still fails will not get better."""
+"""A run that fails at a step so many times below the explicit limit will fail at any."""
 _FEW = 1000  # explicit steps that no implicit run which follows the motion is cheaper than
 
 Say = Callable[[str], None]
 
 
 class Reference(NamedTuple):
-    """What trials are compared with."""
+    """The reference run."""
 
     limit: float
     """The longest explicit step on the scene's own grid that is offered, `stable_dt` of the whole motion [s]."""
     trial: Trial
-    """Its error is the estimate of its own."""
+    """The run; its error is an estimate."""
     motion: Displacements
 
 

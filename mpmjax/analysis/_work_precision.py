@@ -17,18 +17,18 @@ from mpmjax.checks import checked, require_positive
 from mpmjax.stepping import TRBDF2, AbstractIntegrator, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
 
 METHODS: tuple[AbstractIntegrator, ...] = (Explicit(), SemiImplicit(), ImplicitMidpoint(), TRBDF2(), BackwardEuler())
-"""What is tried by default."""
+"""The methods that are tried by default."""
 _RESOLVED = 0.25  # the error above which a larger one at a smaller step does not say that the best was reached
 _REFERENCE_SHARE = 0.4  # of all seconds
 _AS_GOOD = 1.1  # how much larger an error still counts as the same
 
 
 class WorkPrecision(NamedTuple):
-    """Error against seconds."""
+    """Errors against seconds, and the cheapest setting."""
 
     trials: tuple[Trial, ...]
     reference: Trial
-    """Its error is the estimate of its own."""
+    """The reference run; its error is an estimate."""
     target: float
     """The error that was asked for."""
     limit: float
@@ -52,13 +52,13 @@ class WorkPrecision(NamedTuple):
         return min(good, key=lambda trial: trial.seconds, default=None)
 
     def _next(self, trial: Trial) -> Trial:
-        """The same with the next smaller step that was run, or itself."""
+        """The trial with the next smaller step, or the trial itself."""
         own = [t for t in self.trials if (t.refinement, name_of(t.method)) == (trial.refinement, name_of(trial.method))]
         finer = [t for t in own if t.dt < trial.dt and not math.isnan(t.error)]
         return max(finer, key=lambda t: t.dt, default=trial)
 
     def verdict(self) -> str:
-        """In words: the cheapest setting, and what the other kind of method would have cost."""
+        """The cheapest setting in words, and what the other kind of method would have cost."""
         best = self.cheapest()
         if best is None:
             return "No run ended well: allow more seconds or choose a shorter t1."

@@ -28,7 +28,7 @@ app = typer.Typer(
 
 
 def _reporting(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with its faults told in one line and exit code 2."""
+    """Decorate a command to tell its errors in one line and exit with code 2."""
 
     @wraps(command)
     def guarded(*args: Any, **kwargs: Any) -> None:
@@ -46,7 +46,7 @@ def _reporting(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _print_warning(message: Warning | str, *where: Any) -> None:
-    """In one line, without the place in the code."""
+    """Print a warning in one line, without the place in the code."""
     del where
     print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
 
@@ -128,7 +128,7 @@ def run_command(
 
 
 def _chosen(scene: Path, most_seconds: float | None, *, quiet: bool = False) -> Job:
-    """The scene file's job; pilot runs are told on standard error, and what they chose on standard output."""
+    """The job of a scene file; pilot runs are reported on standard error, their choice on standard output."""
     told = {} if quiet else {"progress": lambda trial: _print_error(_line(trial)), "say": _print_error}
     job = read_job(scene, most_seconds=most_seconds, **told)
     if job.choice is not None:
@@ -141,7 +141,7 @@ def _print_error(line: str) -> None:
 
 
 def _summary(job: Job, run: Run, taken: int, seconds: float) -> str:
-    """What a run cost, `taken` of its steps in these seconds, and how well it kept mass and energy."""
+    """The cost of a run, with `taken` of its steps done in these seconds, and how well it kept mass and energy."""
     steps, p = int(run.statistics.steps), run.final.count
     before, after = energy(run.scene, job.particles), energy(run.scene, run.final)
     mass = float(run.final.mass.sum())

@@ -24,11 +24,11 @@ from mpmjax.state import Particles, Scene, fill, join, prepare
 from mpmjax.stepping import AbstractIntegrator, Explicit, stable_dt
 
 _FRAMES = 50
-"""How many frames are saved where neither they nor the step are given."""
+"""Number of frames that are saved if neither it nor the step is given."""
 
 
 class RunSettings(NamedTuple):
-    """How a scene is run."""
+    """The settings of a run."""
 
     t1: float
     dt: float
@@ -38,7 +38,7 @@ class RunSettings(NamedTuple):
 
 
 class RunTable(NamedTuple):
-    """The `[run]` table: as the settings, but that what is "auto" is None."""
+    """The `[run]` table: the settings, with None for "auto"."""
 
     t1: float
     dt: float | Literal["stable"] | None
@@ -62,7 +62,7 @@ class CurveSettings(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """Everything that a scene file says."""
+    """The contents of a scene file."""
 
     scene: Scene
     particles: Particles
@@ -80,7 +80,7 @@ class Job(NamedTuple):
     run: RunSettings
     fit: CurveSettings | None
     choice: str | None
-    """What stood for "auto" or "stable", and why."""
+    """What was chosen for "auto" or "stable", and why."""
 
 
 def read_plan(path: Path) -> Plan:
@@ -168,7 +168,7 @@ def read_job(
 
 
 def stable_step(path: Path, plan: Plan) -> float:
-    """What dt = "stable" stands for in a scene file [s].
+    """The step of dt = "stable" in a scene file [s].
 
     Raises:
         ValueError: as `stable_dt`.

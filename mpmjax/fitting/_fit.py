@@ -58,7 +58,8 @@ class FitResult(eqx.Module):
     value: Float[Array, ""]
     """The property reported, e.g. μ = E / (2 (1 + ν)) [Pa]."""
     standard_error: Float[Array, ""]
-    """Of `value`: √(s² / (JᵀJ)) with s² = Σ r² / (n − 1) and J the derivative of the n fitted points by `value`."""
+    """Standard error of `value`: √(s² / (JᵀJ)) with s² = Σ r² / (n − 1) and J the derivative of the n fitted points by
+    `value`."""
     curve: tuple[Float[Array, "f"], Float[Array, "f"]]
     """The simulated curve at the fit."""
     predicted: Float[Array, "m"]

@@ -1,4 +1,4 @@
-"""A run's HDF5 file, opened to be read or written: whether it is one, holds all of its data itself, and is whole."""
+"""Opening a run's HDF5 file, with checks that it is one, holds all of its data itself, and is whole."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -95,7 +95,7 @@ def check_hdf5(path: Path) -> None:
 
 @contextmanager
 def reading(path: Path) -> Iterator[File]:
-    """The file opened to be read; whatever HDF5 stumbles over becomes one line that says what to do."""
+    """Open a file to be read; every error of HDF5 becomes one line that says what to do."""
     check_hdf5(path)
     try:
         with h5py.File(path, "r", locking=False) as file:
@@ -124,12 +124,12 @@ def _check_format(path: Path, file: File) -> None:
 
 
 def _is_own(group: File, name: str) -> bool:
-    """Whether a name stands for an object and not for a link to one by its name, here or in another file."""
+    """Whether a name stands for an object itself, not for a link to an object in this or another file."""
     return isinstance(group.get(name, getlink=True), h5py.HardLink)
 
 
 def _check_contained(path: Path, file: File) -> None:
-    """All data must be in this file, and each dataset there once: what HDF5 is led to by links it would write to."""
+    """Check that all data are in this file, each dataset once: HDF5 would follow links and write to where they lead."""
     seen, todo = {file["/"]}, [file["/"]]
     while todo:
         group = todo.pop()
@@ -151,7 +151,7 @@ def _check_contained(path: Path, file: File) -> None:
 
 
 def _check_written(file: File) -> None:
-    """Every frame that is counted must be there: what was never written reads as zeros, and has no checksum."""
+    """Check that every counted frame was written: one that was not reads as zeros and has no checksum."""
     count = count_in(file)
 
     def check(name: str, item: Any) -> None:

@@ -1,4 +1,4 @@
-"""Long runs, written to a file as they go."""
+"""Long runs, written to a file while they run."""
 
 import os
 import sys
@@ -152,7 +152,7 @@ def _begun(
     start: int,
     overwrite: bool,
 ) -> FrameWriter:
-    """The writer of a new file with its first frame, or no file: one without frames cannot be resumed."""
+    """A writer of a new file with its first frame. If that fails the file is removed, since it could not be resumed."""
     with undisturbed():
         writer = FrameWriter.create(path, scene, particles, method, dt, overwrite=overwrite)
         try:

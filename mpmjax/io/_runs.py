@@ -187,7 +187,7 @@ class FrameWriter:
         return int(steps[0]), *jax.tree.map(lambda a: a[0], (states, tallies))
 
     def standing(self) -> str:
-        """What the file holds, as a sentence. It asks nobody, so that any thread may ask it at any time."""
+        """What the file holds, as a sentence. It reads nothing, so that any thread may call it at any time."""
         frames, step, time = self._kept
         if frames == 0:
             return f"{self._path} holds no frame yet."
@@ -304,7 +304,7 @@ def load(path: str | os.PathLike) -> Run:
 
 
 def _describe(scene: Scene, particles: Particles, method: AbstractIntegrator, dt: Any) -> dict[str, Any]:
-    """What a file says of a run beside its frames."""
+    """The description of a run in its file, without the frames."""
     dtype = particles.x.dtype
     scene, method, dt = canonical((scene, method, dt), dtype)
     arrays: dict[str, np.ndarray] = {}
@@ -322,7 +322,8 @@ def _describe(scene: Scene, particles: Particles, method: AbstractIntegrator, dt
 
 
 def _check_readable(path: Path, described: dict[str, Any]) -> None:
-    """What is written must be what `load` takes. A number that the run's dtype rounds to zero or to a bound may not."""
+    """Check that `load` will take what is written: a number may be rounded by the run's dtype to one that is not
+    allowed."""
     dtype, arrays = np.dtype(described["dtype"]), described["arrays"]
     try:
         decode(described["scene"], Scene, "", arrays)
@@ -349,7 +350,7 @@ def _write_description(group: File, described: dict[str, Any]) -> None:
 
 
 def _description(group: File) -> dict[str, Any]:
-    """What `_describe` said when the file was written."""
+    """The description of the run in a file (see `_describe`)."""
     return {
         "dtype": group.attrs["dtype"].decode(),
         "d": int(group.attrs["d"]),
@@ -362,7 +363,7 @@ def _description(group: File) -> dict[str, Any]:
 
 
 def _rows(frame: int, step: int, dt: Any, state: State, statistics: RunStatistics) -> dict[str, np.ndarray]:
-    """What a frame adds to each dataset."""
+    """The rows that a frame adds to each dataset."""
     values = {"step": np.int64(step)} | {f.name: np.asarray(getattr(statistics, f.name)) for f in fields(RunStatistics)}
     row = np.array([tuple(values.values())], [(name, a.dtype) for name, a in values.items()])
     rows = rows_of(frame, step * float(dt), state) | {"mpmjax/frames": row}
@@ -373,7 +374,7 @@ def _rows(frame: int, step: int, dt: Any, state: State, statistics: RunStatistic
 
 
 def _frames(file: File, like: State, start: int, stop: int) -> tuple[np.ndarray, State, RunStatistics]:
-    """Step numbers, states and tallies of frames `start` to `stop`, each with a leading axis. See `states_in`."""
+    """Step numbers, states and statistics of frames `start` to `stop`, each with a leading axis. See `states_in`."""
     table = file["mpmjax/frames"][start:stop]
     require(len(table) == stop - start, "frames are missing")
     tallies = RunStatistics(**{f.name: jnp.asarray(table[f.name]) for f in fields(RunStatistics)})
@@ -385,7 +386,7 @@ def _frames(file: File, like: State, start: int, stop: int) -> tuple[np.ndarray,
 
 
 def _check_same(path: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> None:
-    """The run to be continued must be the one in the file."""
+    """Check that the run to be continued is the one in the file."""
     mine, other = dict(_flat(ours)), dict(_flat(theirs))
     for name in (*other, *mine):
         pair: Any = mine.get(name), other.get(name)

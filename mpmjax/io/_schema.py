@@ -65,10 +65,10 @@ CLASSES: tuple[type, ...] = (
     *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),
     *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual, DiagonalPreconditioner, MassPreconditioner),
 )
-"""What files can hold of the package's own."""
+"""The package's own classes that files can hold."""
 
 _registered: dict[str, type] = {}
-"""What they can hold besides, by name."""
+"""The registered classes that files can hold, by name."""
 
 Registered = TypeVar("Registered", bound=type)
 

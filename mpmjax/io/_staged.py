@@ -22,7 +22,7 @@ _PAGE = 4096
 
 
 class StagedFile:
-    """What h5py asks of a file object, on top of a file that is there.
+    """A file object for h5py that stages all changes in memory, on top of an existing file.
 
     A context manager: leaving it drops what was not committed.
     """
@@ -63,13 +63,13 @@ class StagedFile:
         return self._at
 
     def read(self, size: int) -> bytes:
-        """So many bytes; what lies beyond the end is zero."""
+        """Read a number of bytes; those beyond the end are zero."""
         into = bytearray(size)
         self.readinto(into)
         return bytes(into)
 
     def readinto(self, into: Any) -> int:
-        """Fill a buffer; what lies beyond the end is zero."""
+        """Read into a buffer; bytes beyond the end are zero."""
         view, begin = memoryview(into).cast("B"), self._at
         end = self._at = begin + len(view)
         inside = max(0, min(end, self._base) - begin)
@@ -114,7 +114,7 @@ class StagedFile:
         return size
 
     def flush(self) -> None:
-        """Nothing: only `commit` writes."""
+        """Do nothing: only `commit` writes."""
 
     # What its owner calls
 
@@ -166,7 +166,7 @@ class StagedFile:
         self.close()
 
     def _stored(self, at: int, size: int) -> bytes:
-        """What the file on the disk has there, as far as it goes."""
+        """The bytes of the file on the disk at a position, as far as it has them."""
         self._raw.seek(at)
         parts, left = [], size
         while left > 0 and (part := self._raw.read(left)):

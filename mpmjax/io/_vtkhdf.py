@@ -49,7 +49,7 @@ def add_topology(file: File, count: int) -> None:
 
 
 def rows_of(frame: int, time: float, state: State) -> dict[str, np.ndarray]:
-    """What a state adds to each dataset as the frame of that number, at that time [s]."""
+    """The rows that a state adds to each dataset, as a frame with this number and time [s]."""
     x, v = np.asarray(state.x), np.asarray(state.v)
     p, d = x.shape
     flat = ((0, 0), (0, 3 - d))
@@ -120,5 +120,5 @@ def count_in(file: File) -> int:
 
 
 def set_count(file: File, count: int) -> None:
-    """Declare so many frames complete."""
+    """Set the number of complete frames."""
     file["VTKHDF/Steps"].attrs.modify("NSteps", np.int64(count))

@@ -42,21 +42,17 @@ class AxisAligned(AbstractProblem):
         return 2 / float(self._speed)
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
-        """x(X, t) [m]."""
         phase = jnp.pi * jnp.asarray(_PHASES[self.dim], X.dtype)
         return X + self.amplitude * jnp.sin(jnp.pi * X) * jnp.sin(jnp.pi * self._speed * t + phase)
 
     def grid(self, cells: int) -> Grid:
-        """Of the box."""
         return box_grid(*self._corners(), cells, self.ends)
 
     def body(self, cells: int) -> Box:
-        """The box."""
         del cells
         return Box(*self._corners())
 
     def boundary(self) -> tuple[AbstractBoundary, ...]:
-        """At its faces."""
         return box_boundary(*self._corners(), self.ends)
 
     @property

@@ -48,16 +48,13 @@ class VibratingBar(AbstractProblem):
         return 2 * math.pi / self.frequency
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
-        """x(X, t) [m]."""
         omega = self.frequency
         return X + self.speed / omega * jnp.sin(omega * t) * jnp.sin(self.wave_number * X)
 
     def grid(self, cells: int) -> Grid:
-        """With room beyond both ends."""
         return box_grid((0.0,), (self.length,), cells, Ends.MIRRORED)
 
     def body(self, cells: int) -> Box:
-        """The bar."""
         del cells
         return Box((0.0,), (self.length,))
 

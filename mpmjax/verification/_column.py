@@ -49,27 +49,22 @@ class Column(AbstractProblem):
         return 1e5 * (_LOADING + _HOLDING)
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
-        """x(X, t) [m]."""
         share = jnp.minimum(t / (1e5 * (_LOADING - 1)), 1)
         return X - self.load * share * (X - X**2 / 2)
 
     def grid(self, cells: int) -> Grid:
-        """With room at both ends."""
         return Grid((cells + 8,), 1 / (cells + self.shift), origin=(-3,))
 
     def body(self, cells: int) -> Box:
-        """The column."""
         del cells
         return Box((0.0,), (1.0,))
 
     def rest(self, cells: int, per_side: int) -> Particles:
-        """Particles that fill the column exactly."""
         n = cells * per_side
         X, volume = jnp.asarray((np.arange(n) + 0.5)[:, None] / n), jnp.full(n, 1 / n)
         return Particles(X, jnp.zeros_like(X), self.density * volume, volume)
 
     def boundary(self) -> tuple[AbstractBoundary, ...]:
-        """What it stands on."""
         return (SymmetryPlane(0, 0.0),)
 
     def errors(self, cells: int, *, per_side: int = 2, **choices: Any) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""A problem with an exact motion, and how it is put on a grid and measured."""
+"""Problems with an exact motion: how they are discretised, and how errors are measured."""
 
 import abc
 import enum
@@ -22,7 +22,7 @@ _MARGIN = 4  # nodes beyond the domain, for the widest stencil and some motion
 
 
 class Ends(enum.Enum):
-    """What bounds a problem whose exact motion is odd at the faces of its box."""
+    """The boundary of a problem whose exact motion is odd at the faces of its box."""
 
     PERIODIC = "periodic"
     """Twice the box is a period: no wall at all."""
@@ -52,7 +52,7 @@ class AbstractProblem(eqx.Module):
     @property
     @abc.abstractmethod
     def duration(self) -> float:
-        """How long it is observed [s]."""
+        """Duration of the run [s]."""
 
     @abc.abstractmethod
     def grid(self, cells: int) -> Grid:
@@ -96,7 +96,6 @@ class Manufactured(AbstractBodyForce):
     X: ParticleVector
 
     def acceleration(self, x: ParticleVector, t: Scalar) -> ParticleVector:
-        """b(X, t)."""
         del x
         return jax.vmap(lambda X: self.problem.body_force(X, t))(self.X)
 

@@ -19,19 +19,15 @@ class Ring(AbstractRegion):
 
     @property
     def dim(self) -> int:
-        """Two."""
         return 2
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
-        """From the nearer of the two circles."""
         return jnp.abs(length(x) - (_INNER + _OUTER) / 2) - (_OUTER - _INNER) / 2
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """The square around it."""
         return np.full(2, -_OUTER), np.full(2, _OUTER)
 
     def middle(self) -> Float[Array, "d"]:
-        """The origin."""
         return jnp.zeros(2)
 
 
@@ -40,11 +36,9 @@ class RestOutside(AbstractBoundary):
 
     @property
     def dim(self) -> int:
-        """Two."""
         return 2
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        """v = 0."""
         del spacing, t, dt, reference
         outside = Ring().distance(nodes)[:, None] >= 0
         return Conditions(jnp.broadcast_to(outside, nodes.shape), jnp.zeros_like(nodes))
@@ -74,21 +68,17 @@ class Vortex(AbstractProblem):
         return 1.0
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
-        """x(X, t) [m]."""
         s = (jnp.sqrt((X**2).sum()) - 1) ** 2
         turn = self.amplitude * jnp.sin(jnp.pi * t) * (1 - 32 * s + 256 * s**2)
         cos, sin = jnp.cos(turn), jnp.sin(turn)
         return jnp.stack([cos * X[0] - sin * X[1], sin * X[0] + cos * X[1]])
 
     def grid(self, cells: int) -> Grid:
-        """A square around the ring."""
         return box_grid((-_ROOM,) * 2, (_ROOM,) * 2, cells, Ends.PLAIN)
 
     def body(self, cells: int) -> Ring:
-        """The ring."""
         del cells
         return Ring()
 
     def boundary(self) -> tuple[AbstractBoundary, ...]:
-        """Rest outside the ring."""
         return (RestOutside(),)

@@ -45,14 +45,12 @@ class StandingWave(AbstractProblem):
         return 1 / self.wave_speed
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
-        """x(X, t) [m]."""
         law = self.material
         assert isinstance(law, FixedCorotated)
         c = jnp.sqrt(jnp.asarray(law.lame_lambda + 2 * law.shear_modulus) / self.density)
         return X.at[0].add(self.amplitude * jnp.sin(jnp.pi * X[0]) * jnp.cos(jnp.pi * c * t))
 
     def grid(self, cells: int) -> Grid:
-        """Periodic across."""
         along = box_grid(self._ends()[:1], self._ends()[1:], cells, self.ends)
         across = self.dim - 1
         return Grid(
@@ -63,12 +61,10 @@ class StandingWave(AbstractProblem):
         )
 
     def body(self, cells: int) -> Box:
-        """Its box."""
         (low, high), across = self._ends(), self.dim - 1
         return Box((low, *(0.0,) * across), (high, *(_ACROSS / cells,) * across))
 
     def boundary(self) -> tuple[AbstractBoundary, ...]:
-        """At X₁ = 0 and 1."""
         match self.ends:
             case Ends.MIRRORED:
                 return (SymmetryPlane(0, 0.0), SymmetryPlane(0, 1.0, keep="below"))

@@ -21,11 +21,11 @@ COLOURS: dict[str, tuple[str, Callable[[Run, Particles], Any]]] = {
     "volume": ("volume ratio J [-]", lambda run, q: volume_ratio(q)),
     "energy": ("elastic energy density [J/m³]", lambda run, q: energy_density(run.scene, q)),
 }
-"""What particles can be coloured by: a label and a value for each particle."""
+"""The quantities that can colour particles: a label, and a value for each particle."""
 
 SNOW, OCHRE, STEEL, MOSS = (0.91, 0.93, 0.96), (0.82, 0.55, 0.33), (0.36, 0.5, 0.66), (0.45, 0.62, 0.42)
 STONE = (0.55, 0.54, 0.52)
-"""The colour of what stands in the particles' way."""
+"""The colour of walls and colliders."""
 
 Draw = Callable[[Particles, np.ndarray, float], None]
 
@@ -105,7 +105,7 @@ def render(
 
 
 def _remembered(name: str, run: Any, particles: Particles) -> np.ndarray:
-    """What laws remember by that name, NaN at the particles of others."""
+    """The history variable of that name; NaN at particles whose law has none."""
     del run
     values = np.full(particles.count, np.nan)
     for known, rows, leaf in histories(particles):
