@@ -60,6 +60,7 @@ class Column(AbstractProblem):
         return Box((0.0,), (1.0,))
 
     def rest(self, cells: int, per_side: int) -> Particles:
+        """Particles at rest that fill the column exactly, `per_side` a cell."""
         n = cells * per_side
         X, volume = jnp.asarray((np.arange(n) + 0.5)[:, None] / n), jnp.full(n, 1 / n)
         return Particles(X, jnp.zeros_like(X), self.density * volume, volume)
