@@ -187,7 +187,7 @@ def test_without_colliders_a_constraint_is_a_mask(method, boundary):
     as_is = equations(jax.make_jaxpr(step)(arrays).jaxpr)
     with (
         mock.patch.object(Projection, "combine", masked),
-        mock.patch.object(Projection, "identity", lambda self, vector, mass: vector),
+        mock.patch.object(Projection, "identity_rows", lambda self, vector, mass: vector),
         mock.patch.object(Nodes, "projection", property(lambda self: Projection(self.free))),
         mock.patch.object(Nodes, "prescribed", property(lambda self: self.conditions.velocity)),
         mock.patch.object(ConstrainedNodes, "collider_impulse", return_value=None),
