@@ -395,7 +395,7 @@ def test_there_is_no_friction_where_a_wall_would_have_to_pull():
 class Stubborn(mpm.Explicit):
     """Nodes that a wall would have to pull where it holds them, and that enter it where it does not."""
 
-    def move(self, nodes, guess):
+    def advance(self, nodes, guess):
         del guess
         return NodeMotion(-nodes.conditions.side), no_solve(float)
 

@@ -165,7 +165,7 @@ def test_thrown_sand_falls_back_to_its_volume(rule):
     assert abs(top[-1] - 1) < 0.04 if rule else top[-1] > 1.3  # its topmost layer stays loose
 
 
-def at_current(law, K0, layers):
+def at_rest(law, K0, layers):
     """Layers of sand at rest under their weight, from the bottom up: the elastic strains in x, y and z, (layers, 3),
     and the height that each has to itself, for a height of one in all without weight.
 
