@@ -135,7 +135,7 @@ def rolled(q: dict[str, Any], case: Case, steps: int = STEPS) -> tuple[jax.Array
 
     def spy(held: Any, v: Any, momentum_residual: Any) -> Any:
         after = friction(held, v, momentum_residual)
-        seen.append((held.active, (v != 0) & (after[0] == 0)))
+        seen.append((jnp.stack(held.active, axis=1), (v != 0) & (after[0] == 0)))
         return after
 
     def body(state: Any, n: Any) -> Any:

@@ -35,7 +35,7 @@ CHOICES = {
     ),
     "a class": (
         lambda: mpm.Scene(SCENE.grid, SCENE.material, transfer=mpm.FLIP),
-        r"transfer must be one of PIC, FLIP, APIC, got the class FLIP, did you mean FLIP\(\)\?",
+        r"transfer must be one of PIC, FLIP, APIC.*, got the class FLIP, did you mean FLIP\(\)\?",
     ),
     "a class with arguments": (
         lambda: mpm.StickyCollider(mpm.Ball),
@@ -54,7 +54,7 @@ CHOICES = {
     "of stable_dt": (lambda: mpm.stable_dt(SCENE, PARTICLES, method="fast"), r"stable_dt's method must be one of"),
     "past the constructor": (
         lambda: mpm.prepare(eqx.tree_at(lambda s: s.gradient, SCENE, "mls"), PARTICLES),
-        r"Scene's gradient must be one of SplineGradient, MLSGradient, got 'mls', did you mean MLSGradient\(\)\?",
+        r"Scene's gradient must be one of SplineGradient, MLSGradient.*, got 'mls', did you mean MLSGradient\(\)\?",
     ),
     "one of several": (lambda: mpm.join(PARTICLES, "more"), r"join's sets must be Particles, got 'more'"),
     "a list for each particle": (lambda: mpm.NeoHookean([1e5, 2e5], 0.3), r"must be a number or an array of numbers"),
