@@ -35,7 +35,7 @@ class ColliderContact(AbstractContact):
         return impulse
 
     def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
-        """That of a velocity, and of a node's momentum."""
+        """The rounding of a velocity [m/s], and of a node's momentum [kg m/s], shape (n,)."""
         return noise, noise * held.mass
 
     def friction(self, held: ConstrainedNodes, active: Array, v: NodeVector, residual: NodeVector) -> NodeVector:

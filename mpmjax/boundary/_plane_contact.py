@@ -52,7 +52,7 @@ class PlaneContact(AbstractContact):
         return self._tied(held, self._column_impulse(held, residual))
 
     def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
-        """That of a column's momentum, for both."""
+        """The rounding of a column's momentum [kg m/s], shape (n,), for both."""
         least = noise * self._tied(held, self.image.column(self._weight(held.free.mass)))
         return least, least
 

@@ -28,7 +28,7 @@ class WallContact(AbstractContact):
         return self.side * held.images.fold(held.beside_colliders(residual))[:, self.axis]
 
     def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
-        """That of a velocity, and of a node's momentum."""
+        """The rounding of a velocity [m/s], and of a node's momentum [kg m/s], shape (n,)."""
         return noise, noise * held.free.mass
 
     def friction(self, held: ConstrainedNodes, active: Array, v: NodeVector, residual: NodeVector) -> NodeVector:

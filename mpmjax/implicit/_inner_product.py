@@ -45,7 +45,7 @@ class AbstractInnerProduct(eqx.Module):
 
 
 class DiagonalInnerProduct(AbstractInnerProduct):
-    """That of a diagonal W.
+    """The inner product of a diagonal W.
 
     Args:
         weight: the diagonal, positive, of the vector's structure.

@@ -108,9 +108,9 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
     hessian: eqx.AbstractVar[AbstractHessian]
     """How H acts."""
     preconditioner: eqx.AbstractVar[AbstractPreconditioner]
-    """That of the solves."""
+    """Preconditioner of the linear solves."""
     adjoint_solver: eqx.AbstractVar[lx.AbstractLinearSolver]
-    """That of the tangent and adjoint solves."""
+    """Linear solver of the tangent and adjoint systems."""
     guess: eqx.AbstractVar[Guess]
     """Where the solve starts."""
 

@@ -96,14 +96,14 @@ def advance(
     )
     new = update(nodes, method)
     outside = (~stencil.inside).sum().astype(jnp.int32)
-    touch = nodes.conditions.colliders
-    if touch is not None and new.motion.mean is not None:
-        touch = touch.after(dt / 2, new.motion.mean)
-    exchange = None if touch is None else received(touch, new.reaction, new.normal_impulse, new.collider_friction)
+    asked = nodes.conditions.colliders
+    if asked is not None and new.motion.mean is not None:
+        asked = asked.after(dt / 2, new.motion.mean)
+    impulse = None if asked is None else received(asked, new.reaction, new.normal_impulse, new.collider_friction)
     after = scene.return_map(grid_to_particles(scene, particles, nodes, new))
-    if exchange is not None and after.received is not None:
-        after = replace(after, received=after.received.plus(exchange))
-    return after, StepInfo(new.solve, new.contact, outside, exchange)
+    if impulse is not None and after.received is not None:
+        after = replace(after, received=after.received.plus(impulse))
+    return after, StepInfo(new.solve, new.contact, outside, impulse)
 
 
 advance_compiled = eqx.filter_jit(advance)
