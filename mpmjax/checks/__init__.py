@@ -1,6 +1,6 @@
 """What a user passes in: its values, its kind, the memory that it asks for."""
 
-from mpmjax.checks._kinds import checked, require_fields, shape_of
+from mpmjax.checks._kinds import alternatives, checked, is_enum, is_module, require_fields, shape_of
 from mpmjax.checks._memory import require_memory
 from mpmjax.checks._values import (
     canonical,
@@ -21,10 +21,13 @@ from mpmjax.checks._values import (
 )
 
 __all__ = [
+    "alternatives",
     "canonical",
     "checked",
     "coordinates",
     "first_unmet",
+    "is_enum",
+    "is_module",
     "is_traced",
     "require",
     "require_between",

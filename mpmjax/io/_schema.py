@@ -18,10 +18,8 @@ import math
 import typing
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields
-from types import UnionType
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import AbstractArray
@@ -37,7 +35,7 @@ from mpmjax.boundary import (
     StickyCollider,
     SymmetryPlane,
 )
-from mpmjax.checks import require
+from mpmjax.checks import alternatives, is_enum, is_module, require
 from mpmjax.discretisation import APIC, FLIP, PIC, BSpline, Grid, MLSGradient, SplineGradient
 from mpmjax.geometry import Ball, Box, Capsule, Cylinder, HalfSpace, Motion, RigidMotion, SampledDistance, Union
 from mpmjax.implicit import (
@@ -99,7 +97,7 @@ def register(cls: Registered) -> Registered:
     Raises:
         ValueError: no such class, a name that another class has, or an argument that files cannot hold.
     """
-    require(_is_module(cls), f"register takes a class, an equinox.Module, got {_short(cls)}.")
+    require(is_module(cls), f"register takes a class, an equinox.Module, got {_short(cls)}.")
     name = cls.__name__
     other = next((c for c in _known() if c.__name__ == name), cls)
     require(
@@ -129,9 +127,9 @@ def _can_be_held(hint: Any) -> bool:
 
     def can(a: Any) -> bool:
         items = get_args(a) if get_origin(a) in (tuple, list) else ()
-        return _is_module(a) or _is_enum(a) or any(_can_be_held(item) for item in items if item is not Ellipsis)
+        return is_module(a) or is_enum(a) or any(_can_be_held(item) for item in items if item is not Ellipsis)
 
-    return bool(_forms(hint)) or any(can(a) for a in _alternatives(hint))
+    return bool(_forms(hint)) or any(can(a) for a in alternatives(hint))
 
 
 _SMALL = 64  # most numbers that are written out, and that are read as a tuple where both are taken
@@ -190,14 +188,14 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
         ValueError: an unknown, missing or unfit key, an unknown kind, or what the constructor refuses: one line that
             names the place.
     """
-    alternatives = _alternatives(expected)
-    classes = {c.__name__: c for c in _known() if any(_is_module(a) and issubclass(c, a) for a in alternatives)}
-    items = [get_args(a)[0] for a in alternatives if get_origin(a) in (tuple, list)]
+    choices = alternatives(expected)
+    classes = {c.__name__: c for c in _known() if any(is_module(a) and issubclass(c, a) for a in choices)}
+    items = [get_args(a)[0] for a in choices if get_origin(a) in (tuple, list)]
     if classes and isinstance(data, list) and items:
         return tuple(decode(d, items[0], _nth(where, i), arrays) for i, d in enumerate(data, 1))
-    if any(_is_module(a) for a in alternatives):
-        return _object(data, classes, any(inspect.isabstract(a) for a in alternatives), where, arrays)
-    if enums := [a for a in alternatives if _is_enum(a)]:
+    if any(is_module(a) for a in choices):
+        return _object(data, classes, any(inspect.isabstract(a) for a in choices), where, arrays)
+    if enums := [a for a in choices if is_enum(a)]:
         words = [member.value for member in enums[0]]
         _require(isinstance(data, str) and data in words, where, f"must be one of {_quoted(words)}, got {_short(data)}")
         return enums[0](data)
@@ -264,7 +262,7 @@ def _numbers(data: Any, expected: Any, where: str, arrays: dict[str, np.ndarray]
         beyond = any(isinstance(x, int) and math.isinf(_float(x)) for x in leaves)
         _require(not (beyond or any(bad(_float(x)) for x in leaves)), where, f"must be finite, got {_short(data)}")
         data = _floats(data) if a is data else a
-    takes_tuples = any(tuple in (a, get_origin(a)) for a in _alternatives(expected))
+    takes_tuples = any(tuple in (a, get_origin(a)) for a in alternatives(expected))
     if not isinstance(data, list) or (takes_tuples and len(leaves) <= _SMALL):
         return _tuples(data)
     return np.asarray(data)
@@ -294,27 +292,12 @@ def _field_types(cls: type) -> dict[str, Any]:
     return typing.get_type_hints(cls) if any(isinstance(t, str) for t in types.values()) else types
 
 
-def _alternatives(hint: Any) -> list[Any]:
-    """The members of a union, or the one annotation."""
-    if get_origin(hint) in (typing.Union, UnionType):
-        return [a for member in get_args(hint) for a in _alternatives(member)]
-    return [hint]
-
-
-def _is_module(hint: Any) -> bool:
-    return isinstance(hint, type) and issubclass(hint, eqx.Module)
-
-
-def _is_enum(hint: Any) -> bool:
-    return isinstance(hint, type) and issubclass(hint, enum.Enum)
-
-
 def _forms(hint: Any, *, within: bool = False) -> set[tuple[type, int]]:
     """Kind of number and depth of lists that an annotation takes, `within` that of a sequence."""
     forms: set[tuple[type, int]] = set()
-    if not within and any(a in (jax.Array, np.ndarray) for a in _alternatives(hint)):
+    if not within and any(a in (jax.Array, np.ndarray) for a in alternatives(hint)):
         forms |= {(float, depth) for depth in range(_MOST_AXES + 1)}
-    for a in _alternatives(hint):
+    for a in alternatives(hint):
         if a in _ONE:
             forms.add((a, 0))
         elif get_origin(a) is Literal:
