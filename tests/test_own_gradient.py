@@ -42,7 +42,7 @@ EXPLICIT, IMPLICIT, SPLINE, MLS = mpm.Explicit(), mpm.SemiImplicit(), mpm.Spline
 
 @pytest.mark.parametrize(
     ("method", "share", "package"),
-    [(IMPLICIT, 1.0, SPLINE), *thorough((EXPLICIT, 1.0, SPLINE), (EXPLICIT, 0.0, MLS), (IMPLICIT, 0.0, MLS))],
+    [(EXPLICIT, 1.0, SPLINE), *thorough((IMPLICIT, 1.0, SPLINE), (EXPLICIT, 0.0, MLS), (IMPLICIT, 0.0, MLS))],
 )
 def test_at_its_ends_it_is_the_packages(method, share, package):
     own, expected = (

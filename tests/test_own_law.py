@@ -132,7 +132,7 @@ def test_the_stable_step_and_the_projection_are_those_of_the_closed_form(d):
 LAWS = [(law, d) for law in ELASTIC.values() for d in DIMS]
 LAWS += [(law, 2) for law in (*PLASTIC.values(), *VISCOUS.values(), *FLUIDS.values())]
 CASES = [
-    pytest.param(law, d, id=f"{type(law).__name__}-{d}", marks=pytest.mark.thorough if d == 3 else ())
+    pytest.param(law, d, id=f"{type(law).__name__}-{d}", marks=pytest.mark.thorough if d == 1 else ())
     for law, d in LAWS
 ]
 

@@ -160,7 +160,7 @@ NEWTON = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-11), PROJECTED, adjoint_solver=T
         pytest.param(lx.LU(), marks=pytest.mark.thorough),
         pytest.param(lx.Cholesky(), marks=pytest.mark.thorough),
         MinimalResidual(),
-        CG,
+        pytest.param(CG, marks=pytest.mark.thorough),
     ],
     ids=lambda solver: type(solver).__name__,
 )
