@@ -1,6 +1,8 @@
 """Registries and small scenes that the tests share. A new kernel, law or method costs one line here."""
 
 from collections.abc import Callable, Collection
+from pathlib import Path
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,7 @@ import pytest
 
 import mpmjax as mpm
 from mpmjax._types import Array
+from mpmjax.io import _schema
 
 DIMS = (1, 2, 3)
 KERNELS = {"linear": mpm.BSpline(1), "quadratic": mpm.BSpline(2), "cubic": mpm.BSpline(3)}
@@ -145,3 +148,21 @@ def assert_close(a: Array, b: Array, rtol: float = 1e-12, atol: float = 0.0) -> 
     assert a.size > 0, "nothing to compare"
     scale = max(np.abs(a).max(initial=0), np.abs(b).max(initial=0))
     np.testing.assert_allclose(a, b, rtol=0, atol=rtol * scale + atol, equal_nan=False)
+
+
+def assert_files_hold(path: Path, run: mpm.Run, *own: type) -> None:
+    """A run comes back from its file as it was saved: classes, numbers and final state, bit for bit. Where one of the
+    classes is not registered, loading says so."""
+    mpm.save(path, run)
+    again = mpm.load(path)
+    for part in ("scene", "method", "final"):
+        found, saved = (jax.tree.flatten(getattr(r, part)) for r in (again, run))
+        assert found[1] == saved[1], part
+        for a, b in zip(found[0], saved[0], strict=True):
+            np.testing.assert_array_equal(a, b)
+    for cls in own:
+        unknown = rf"unknown kind '{cls.__name__}'.* is known when the module is imported that calls mpm\.register"
+        with mock.patch.dict(_schema._registered):
+            del _schema._registered[cls.__name__]
+            with pytest.raises(ValueError, match=unknown):
+                mpm.load(path)

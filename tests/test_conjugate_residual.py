@@ -203,6 +203,7 @@ def test_breakdown_is_reported(A):
     np.testing.assert_allclose(stats["residual"], true_residual(A, x, b))
 
 
+@pytest.mark.thorough
 def test_breakdown_is_known_from_rounding():
     """What of rᵀA r = 0 the rounding of its sum leaves, some tenths of ε‖r‖‖A r‖, is a breakdown and no negative
     curvature; four thousand times that is what it looks like."""
@@ -223,6 +224,7 @@ def test_breakdown_is_known_from_rounding():
         assert report(jnp.asarray(np.r_[c, -c * (1 + 2e-12)][order]), b) == (False, True, 5)
 
 
+@pytest.mark.thorough
 def test_it_goes_on_while_the_true_residual_halves():
     """An operator that is off on small vectors, so that each pass of the recurrence leaves a share of the residual that
     it believes to be gone: with 0.4 of it the solution is found; with 0.6 the iteration has stagnated, says so, and
@@ -247,6 +249,7 @@ def test_it_goes_on_while_the_true_residual_halves():
     assert steps < 5
 
 
+@pytest.mark.thorough
 def test_a_residual_above_a_twentieth_is_never_accepted():
     """However large the rounding of its own evaluation: 400 times the right-hand side here, in float32."""
     A = jnp.diag(jnp.asarray([1.0, 2.0, 1e-8], jnp.float32))
@@ -283,6 +286,7 @@ def test_a_non_symmetric_operator_is_refused():
         lx.linear_solve(plain, jnp.ones(N), mpm.ConjugateResidual())
 
 
+@pytest.mark.thorough
 def test_increment_rtol_stops_at_a_small_increment():
     """The reference's test ‖αp‖² ≤ tol²‖x‖²: stops sooner than the residual's would, converged by itself."""
     A, (b, _, _) = symmetric("definite"), vectors()

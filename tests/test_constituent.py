@@ -30,7 +30,7 @@ def halves(d=2, **scene):
 @pytest.mark.parametrize(
     "description", [mpm.UpdatedLagrangian(), *thorough(mpm.TotalLagrangian())], ids=["updated", "total"]
 )
-@pytest.mark.parametrize("method", **ids(METHODS | SECOND_ORDER, "semi_implicit", QUICK))
+@pytest.mark.parametrize("method", **ids(METHODS | SECOND_ORDER, "explicit", QUICK))
 def test_two_materials_are_one_with_a_modulus_for_each_particle(method, description):
     """The same motion to the solver's tolerance, by every update."""
     one, two, particles = halves(gravity=(0.0, -5.0), description=description)

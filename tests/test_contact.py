@@ -72,7 +72,7 @@ EACH_METHOD = pytest.mark.parametrize("method", **ids(METHODS | OTHERS, "semi_im
 NAMES = pytest.mark.parametrize("name", ["explicit", pytest.param("semi_implicit", marks=pytest.mark.slow)])
 
 
-@EACH_METHOD
+@pytest.mark.parametrize("method", **ids(METHODS | OTHERS, "explicit", QUICK))
 def test_a_plain_wall_pushes_never_pulls_and_is_not_entered(method):
     """v·n ≥ 0, reaction ≥ 0, and their product is zero, at every node."""
     _, _, step = tumbling("plain", method)
@@ -171,7 +171,8 @@ def test_a_block_rests_on_the_floor(name, floor):
     assert float(jnp.abs(run.observed[-1, 1])) < 0.02 * G * 200 * dt
 
 
-@pytest.mark.parametrize("floor", ["plain", *thorough("mirrored")])
+@pytest.mark.thorough
+@pytest.mark.parametrize("floor", ["plain", "mirrored"])
 @NAMES
 def test_a_block_bounces(name, floor):
     """It comes back up, the slower the more the method damps, and nothing sticks."""

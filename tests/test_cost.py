@@ -276,7 +276,7 @@ def test_the_cost_of_an_empty_window_is_that_of_its_nodes():
     assert large[1] - small[1] < 400 * added
 
 
-@pytest.mark.parametrize("d", [2, *thorough(3)])
+@pytest.mark.parametrize("d", thorough(2, 3))
 def test_a_fluid_stores_and_costs_less_than_a_solid(d):
     """One number in the place of F's d²; in flops and bytes of the compiled step it is below the cheapest solid."""
     fluid, solid = compiled(d=d, material=mpm.Fluid(1e5)), compiled(d=d)

@@ -39,7 +39,7 @@ def example(d, c=3, kernel=QUADRATIC, gradient=MLS, seed=0):
 
 
 @pytest.mark.parametrize("kernel", **ids(KERNELS, "quadratic"))
-@EACH_DIM
+@pytest.mark.parametrize("d", [*thorough(1, 2), 3])
 @pytest.mark.parametrize("gradient", **ids(GRADIENTS, "mls"))
 @pytest.mark.parametrize("c", [3, *thorough(1, 6)])
 def test_they_are_the_sums_that_weights_and_gradients_say(c, gradient, d, kernel):
@@ -123,7 +123,7 @@ def test_derivatives_by_everything_are_those_of_the_sums_written_out(d):
     jax.tree.map(lambda a, b: assert_close(a, b, 1e-11), one, other)
 
 
-@pytest.mark.parametrize("of_nodes", [True, False], ids=["nodes", "stencil"])
+@pytest.mark.parametrize("of_nodes", **ids({"nodes": True, "stencil": False}, "nodes"))
 @pytest.mark.parametrize("d", [1, *thorough(2)])
 def test_a_batch_is_its_members(d, of_nodes):
     """Batched in what is summed or in the stencil, nested, and differentiated outside of the batch."""

@@ -96,7 +96,9 @@ def test_what_a_transfer_does_not_need_is_not_stored(transfer, tmp_path):
         assert ("affine_velocity" in file["VTKHDF/PointData"]) == transfer.affine
 
 
-@pytest.mark.parametrize("laws", [mpm.Snow(), (mpm.NeoHookean(1e4, 0.3), mpm.Snow()), (mpm.Snow(), mpm.Snow(1e5))])
+@pytest.mark.parametrize(
+    "laws", [*thorough(mpm.Snow()), (mpm.NeoHookean(1e4, 0.3), mpm.Snow()), *thorough(((mpm.Snow(), mpm.Snow(1e5)),))]
+)
 def test_what_laws_remember_comes_back(laws, tmp_path):
     """One law or several: F and history of each of them, bit for bit; in ParaView a dataset has NaN where nothing is
     remembered."""
@@ -244,6 +246,7 @@ def test_recorded_resumed_and_simulated_runs_are_equal_bit_for_bit(law, dtype, s
     assert_same(parts.statistics, single.statistics)
 
 
+@pytest.mark.thorough
 def test_a_saved_run_can_be_resumed(tmp_path):
     """What `save` writes and what `record` writes is one kind of file, in the total description too."""
     scene, particles = jelly(description=mpm.TotalLagrangian())
@@ -588,6 +591,7 @@ def test_a_file_that_leads_elsewhere_is_refused(lead_away, tmp_path):
     assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before
 
 
+@pytest.mark.thorough
 def test_a_frame_that_was_never_written_is_no_frame(tmp_path):
     """What reads as zeros without a checksum, as after a write that failed, is damage in whatever dataset it is."""
     run, whole = made_up(2), tmp_path / "run.h5"

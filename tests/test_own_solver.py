@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import pytest
-from helpers import LAWS, assert_close
+from helpers import LAWS, assert_close, assert_files_hold, block
 from test_implicit import jolted
 
 import mpmjax as mpm
@@ -23,6 +23,7 @@ TIGHT = mpm.ConjugateResidual(rtol=1e-12)
 WALL = mpm.SlipBox((0.0, 0.0), (1.0, 1.0))
 
 
+@mpm.register
 class MinimalResidual(lx.AbstractLinearSolver):
     """C. C. Paige, M. A. Saunders, SIAM J. Numer. Anal. 12 (1975) 617, in its plainest form: a user's own solver of
     symmetric systems, which takes neither an inner product nor a guess."""
@@ -88,15 +89,17 @@ class Blocks(AbstractInnerProduct):
         return jax.vmap(lambda L, v: jax.scipy.linalg.solve_triangular(L.T, v))(self.factor, v)
 
 
+@mpm.register
 class ScaledMass(mpm.AbstractPreconditioner):
     """A multiple of M that is a parameter: of no use, but for tests."""
 
-    scale: Any = 3.0
+    scale: float | jax.Array = 3.0
 
     def inner_product(self, operator):
         return DiagonalInnerProduct(operator.projection.commuting_weight(self.scale * operator.nodal_mass()))
 
 
+@mpm.register
 class UndeformedHessian(mpm.AbstractHessian):
     """That of the undeformed state, whatever the deformation: linear elasticity, with which Newton's method converges
     linearly, and whose matrix is positive definite."""
@@ -157,7 +160,7 @@ NEWTON = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-11), PROJECTED, adjoint_solver=T
         pytest.param(lx.LU(), marks=pytest.mark.thorough),
         pytest.param(lx.Cholesky(), marks=pytest.mark.thorough),
         MinimalResidual(),
-        CG,
+        pytest.param(CG, marks=pytest.mark.thorough),
     ],
     ids=lambda solver: type(solver).__name__,
 )
@@ -178,6 +181,7 @@ def test_newtons_method_by_conjugate_gradients():
     assert statistics.newton == reference.newton
 
 
+@pytest.mark.thorough
 def test_the_preconditioner_is_that_of_any_solver():
     """A solver that knows of none is given the scaled system: it takes as many iterations as ours, as many fewer with
     the better preconditioner, and ends with the residual that it states."""
@@ -219,6 +223,7 @@ def test_what_cannot_solve_is_refused_with_what_can():
         mpm.ConjugateResidual().init(identity, {"preconditioner": identity})
 
 
+@pytest.mark.thorough
 def test_a_solver_that_does_not_solve_is_found_out():
     """One that returns its right-hand side and calls it a solution: the residual is computed, and the run raises."""
 
@@ -238,7 +243,7 @@ def test_a_solver_that_does_not_solve_is_found_out():
     [
         pytest.param(ScaledMass(), OURS, id="diagonal_linear", marks=pytest.mark.thorough),
         pytest.param(BlockJacobi(), NEWTON, id="blocks_newton", marks=pytest.mark.thorough),
-        pytest.param(ScaledMass(), NEWTON, id="diagonal_newton"),
+        pytest.param(ScaledMass(), NEWTON, id="diagonal_newton", marks=pytest.mark.thorough),
         pytest.param(BlockJacobi(), OURS, id="blocks_linear"),
     ],
 )
@@ -247,6 +252,7 @@ def test_a_preconditioner_of_ones_own(preconditioner, method):
     assert_same(dataclasses.replace(method, preconditioner=preconditioner), method, 1e-9)
 
 
+@pytest.mark.thorough
 def test_a_hessian_of_ones_own():
     """Newton's method converges with it to the same solution, more slowly, and the gradient is that of the true
     Hessian; lineax's conjugate gradients take its word that it is positive definite."""
@@ -255,3 +261,10 @@ def test_a_hessian_of_ones_own():
     assert statistics.newton > reference.newton
     method = dataclasses.replace(OURS, hessian=UndeformedHessian())
     assert_same(dataclasses.replace(method, solver=CG, adjoint_solver=CG), method, 1e-9)
+
+
+def test_a_run_by_a_solver_preconditioner_and_hessian_of_ones_own_is_saved_and_loaded(tmp_path):
+    """In one method, each with its parameters."""
+    method = mpm.SemiImplicit(0.9, UndeformedHessian(), MinimalResidual(1e-9), ScaledMass(2.0), MinimalResidual(1e-8))
+    run = mpm.simulate(*block(1, gravity=(-9.81,)), t1=DT, dt=DT, method=method)
+    assert_files_hold(tmp_path / "run.h5", run, UndeformedHessian, MinimalResidual, ScaledMass)

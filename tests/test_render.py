@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import matplotlib.image
 import numpy as np
 import pytest
-from helpers import LAWS
+from helpers import LAWS, thorough
 
 import mpmjax as mpm
 from mpmjax.simulation._statistics import no_steps
@@ -262,6 +262,7 @@ def test_obstacles_move(t, at):
     np.testing.assert_allclose(distance(np.array([[at, 0, 0.5], [at, 0, 0]])), [0, -0.5], atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_obstacles_turn():
     """A bar along the first axis that is turned by a right angle about its end, and moved: in the plane and in space,
     where a turn about the second axis takes the first into minus the third."""
@@ -277,7 +278,7 @@ def test_obstacles_turn():
     np.testing.assert_allclose(obstacle(rod, solid, 0.0)(x[3:] - [10.0, 0.0, 0.0]), [0.0], atol=1e-12)
 
 
-@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("d", [*thorough(2), 3])
 def test_obstacles_are_drawn(tmp_path, d):
     """There are more pixels of stone with one than without."""
     a = np.linspace(0, 1, 6)

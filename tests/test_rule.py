@@ -102,3 +102,20 @@ def test_what_has_no_rule_says_so():
 
     with pytest.raises(NotImplementedError, match="bare has no derivative"):
         jax.grad(bare)(1.0 * jnp.ones(()))
+
+
+def test_what_has_no_transpose_says_so():
+    """A function with a derivative that reverse mode must transpose: forward mode works."""
+
+    @ruled
+    def doubled(x):
+        return 2 * x
+
+    @doubled.defjvp
+    def _(primals, tangents):
+        return doubled(*primals), doubled(*tangents)
+
+    x = jnp.asarray(X)
+    np.testing.assert_array_equal(jax.jvp(doubled, (x,), (x,)), [2 * X, 2 * X])
+    with pytest.raises(NotImplementedError, match=r"^doubled has no transpose\."):
+        jax.grad(doubled)(x)

@@ -90,6 +90,7 @@ def test_simple_shear_turns_and_yields():
     assert float(history.plastic_volume[0]) == pytest.approx(1 / ((1 - 2.5e-2) * (1 + 7.5e-3)), rel=1e-12)
 
 
+@pytest.mark.thorough
 def test_plane_strain_is_three_dimensional_strain_with_a_stretch_of_one():
     F, history = trials(2)
     solid = jnp.zeros((3, 3, F.shape[-1])).at[:2, :2].set(F).at[2, 2].set(1.0)

@@ -110,7 +110,7 @@ METHODS = {
 }
 
 
-@pytest.mark.parametrize("method", **ids(METHODS, "semi_implicit"))
+@pytest.mark.parametrize("method", **ids(METHODS, "explicit"))
 def test_free_fall_is_exact(method):
     """y_n = y0 + n v0 dt + n(n+1)/2 g dt², over many windows' heights."""
     n, dt, g = 100, 1e-2, -9.81
@@ -122,7 +122,7 @@ def test_free_fall_is_exact(method):
     assert_close(final.v, np.broadcast_to([0.5, 1.0 + n * g * dt], final.v.shape), 1e-12)
 
 
-@pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in ("explicit", "semi_implicit")}, "explicit"))
+@pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in ("explicit", "semi_implicit")}, ()))
 def test_a_shift_by_whole_spacings_changes_nothing(method):
     """The frame's place on the lattice does not matter, whether the window is moved by hand or follows."""
     shift, dx = np.array([5, -3]), 0.125

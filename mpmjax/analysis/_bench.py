@@ -1,4 +1,4 @@
-"""Timed runs: the motion of a scene by a method at a step, and the seconds that it takes."""
+"""Timed runs of a scene: its motion by a method at a step, and the seconds it takes."""
 
 import math
 import time
@@ -24,22 +24,22 @@ _PILOT_SECONDS = 0.2  # for which so many steps are run as the time of all is fo
 _BRIEF = 0.3  # seconds of a run below which it is timed again
 
 Build = Callable[[int], tuple[Scene, Particles]]
-"""From a refinement n to the scene with 1/n of its spacing, and its particles."""
+"""A function of a refinement n, which returns the scene at 1/n of its spacing, and its particles."""
 
 
 class Trial(NamedTuple):
-    """A method, step and spacing, with the seconds that it took and its error."""
+    """A run by a method at a step and spacing, with its seconds and error."""
 
     method: AbstractIntegrator
     refinement: int
-    """The scene's own spacing over the trial's."""
+    """The spacing of the scene over that of the run."""
     dt: float
     """Δt [s]."""
     steps: int
     seconds: float
-    """Wall time, compilation left out: the better of two runs where one is brief, or foreseen from fewer steps."""
+    """Wall time without compilation [s]: of one run, the faster of two brief ones, or foreseen from fewer steps."""
     error: float
-    """Relative error of the motion; infinite where the run failed, NaN where it was foreseen to take too long."""
+    """Relative error of the motion; infinite if the run failed, NaN if it was foreseen to take too long."""
 
     def __str__(self) -> str:
         spacing = f", spacing / {self.refinement}" if self.refinement > 1 else ""
@@ -47,7 +47,7 @@ class Trial(NamedTuple):
 
 
 def name_of(method: AbstractIntegrator) -> str:
-    """An integrator's name with its numbers, such as "SemiImplicit(beta=1)"."""
+    """The name of an integrator with its numbers, such as "SemiImplicit(beta=1)"."""
     numbers = [f.name for f in fields(method) if shape_of(getattr(method, f.name)) == ()]
     shown = ", ".join(f"{name}={float(getattr(method, name)):g}" for name in numbers)
     return f"{type(method).__name__}({shown})"
@@ -67,7 +67,7 @@ class Displacements(NamedTuple):
         return float(_rms(self.u).max())
 
     def distance(self, finer: "Displacements") -> float:
-        """The relative error against the motion of as many or more particles."""
+        """The relative error against the motion of as many or more particles, see `_work_precision`."""
         share = max(1, round(len(finer.X) / len(self.X)))
         near = scipy.spatial.KDTree(finer.X).query(self.X, k=share)[1].reshape(len(self.X), share)
         return float(_rms(self.u - finer.u[:, near].mean(axis=2)).max() / finer.size)
@@ -81,16 +81,17 @@ class Clock:
 
     @property
     def left(self) -> float:
-        """Seconds left, below zero once they are overrun."""
+        """Seconds left; negative once they are overrun."""
         return self._end - time.perf_counter()
 
     def allows(self, seconds: float) -> bool:
-        """Whether there is time for a run of what is compiled; always for a twentieth of it all."""
+        """Whether a run of compiled code that takes these seconds is allowed: it fits into the seconds left, or into a
+        twentieth of all."""
         return seconds <= max(self.left, self.seconds / 20)
 
 
 class Bench(NamedTuple):
-    """Runs and times a scene; each method is compiled once, whatever its step."""
+    """Runs and times a scene. Each method is compiled once for all steps."""
 
     refinement: int
     scene: Scene
@@ -99,27 +100,27 @@ class Bench(NamedTuple):
 
     @classmethod
     def of(cls, build: Build, refinement: int, t1: float) -> "Bench":
-        """The bench of a refined scene."""
+        """The bench of a scene at a refinement."""
         scene, particles = build(refinement)
         return cls(refinement, scene, prepare(scene, particles), float(t1))
 
     def whole(self, dt: float) -> int:
-        """The least number of steps, a multiple of the frames, whose step is not longer than dt [s]."""
+        """The smallest number of steps, a multiple of `FRAMES`, with a step of at most dt [s]."""
         return FRAMES * math.ceil(self.t1 / (FRAMES * float(dt)) - 1e-9)
 
     def motion(self, states: list[State]) -> Displacements:
-        """The motion through these states."""
+        """The displacements at these states."""
         X = np.asarray(self.particles.x)
         return Displacements(X, np.stack([np.asarray(state.x) for state in states]) - X)
 
     def limit(self, states: list[State]) -> float:
-        """The least `stable_dt` at the start and in these states [s]."""
+        """The smallest `stable_dt` of the start and of these states [s]."""
         on_the_way = [self.particles, *(with_state(self.particles, state) for state in states)]
         least = min(float(stable_dt(self.scene, particles)) for particles in on_the_way)
         return max(least, self.t1 / _MOST_STEPS)  # with the linear kernel it may be zero
 
     def run(self, method: AbstractIntegrator, steps: int) -> tuple[list[State] | None, float]:
-        """The states at the times of comparison, None of a run that failed, and its seconds."""
+        """The states at the times of comparison, None for a run that failed, and its seconds."""
         self._go(method, steps, 1, 1)
         states, seconds = self.timed(method, steps, FRAMES, steps // FRAMES)
         if states is not None and seconds < _BRIEF:
@@ -127,7 +128,7 @@ class Bench(NamedTuple):
         return states, seconds
 
     def foresee(self, method: AbstractIntegrator, steps: int) -> float:
-        """The seconds that a number of steps will take, estimated from a few of them."""
+        """The seconds of a number of steps, estimated from fewer of them."""
         self._go(method, steps, 1, 1)
         some, seconds = 1, self.timed(method, steps, 1, 1)[1]
         while seconds < _PILOT_SECONDS and some < steps:
@@ -136,7 +137,7 @@ class Bench(NamedTuple):
         return seconds / some * steps
 
     def timed(self, method: AbstractIntegrator, steps: int, frames: int, each: int) -> tuple[list[State] | None, float]:
-        """The states after each of some frames of so many steps, None if one is at fault, and the seconds."""
+        """As `_go`, with the seconds that it took."""
         begun = time.perf_counter()
         states = self._go(method, steps, frames, each)
         return states, time.perf_counter() - begun
@@ -152,7 +153,8 @@ class Bench(NamedTuple):
     def _go(
         self, method: AbstractIntegrator, steps: int, frames: int, each: int, *, throw: bool = False
     ) -> list[State] | None:
-        """The states after each of some frames of so many steps; None if one is at fault, or that is raised."""
+        """The states after each of `frames` times `each` steps of t1 / `steps`. A faulty run returns None, or raises
+        with `throw`."""
         dtype = self.particles.x.dtype
         scene, dt, method = canonical((self.scene, self.t1 / steps, method), dtype)
         state, states = state_of(self.particles), []

@@ -1,4 +1,4 @@
-"""Budgets of energy and momentum in each step, with an expression for every transfer, force and approximation."""
+"""Budgets of energy and momentum for each step, with a term for every transfer, force and approximation."""
 
 import equinox as eqx
 import jax
@@ -21,49 +21,49 @@ from mpmjax.stepping import (
 
 
 class EnergyBudget(eqx.Module):
-    """The energy of one step [J], f steps:
+    """The budget of energy for each of f steps [J]:
 
     Δkinetic + Δelastic + Δpotential = boundary + friction + body_force + solver + time_integration
     − p2g − g2p − implicit − viscous − plastic.
 
-    v̄ = (v^n + v^{n+1})/2 at the nodes, u_ip = v_p + C_p (x_i − x_p). Each term is computed from its own expression and
-    none as what is left, so that the sum's closing to rounding says that all of them are right.
+    Below, v̄ = (v^n + v^{n+1})/2 at the nodes and u_ip = v_p + C_p (x_i − x_p). Each term has its own expression, and
+    none is the remainder of the others. So if the budget closes to rounding, all of them are right.
     """
 
     kinetic: Float[Array, "*f"]
-    """Change of the particles' kinetic energy, their affine motion included."""
+    """Change of the particles' kinetic energy, with that of their affine motion."""
     elastic: Float[Array, "*f"]
     """Change of Σ V0 Ψ(F)."""
     potential: Float[Array, "*f"]
-    """Change of −Σ m g·x: less the work of gravity."""
+    """Change of −Σ m g·x, minus the work of gravity."""
     p2g: Float[Array, "*f"]
-    """Lost from particles to grid, ½ Σ_ip w m ‖u_ip − v_i^n‖² ≥ 0."""
+    """Loss from particles to grid, ½ Σ_ip w m ‖u_ip − v_i^n‖² ≥ 0."""
     g2p: Float[Array, "*f"]
-    """Lost from grid to particles, ½ Σ_ip w m ‖v_i^{n+1} − u_ip^{n+1}‖² ≥ 0 with PIC and APIC; with others u is
-    the grid's part of the velocity, and what the particles keep beside it counts as gained. The affine motion's energy
-    is that at the new place, which differs with the linear kernel, whose moment D depends on it."""
+    """Loss from grid to particles, ½ Σ_ip w m ‖v_i^{n+1} − u_ip^{n+1}‖² ≥ 0 with PIC and APIC. With other transfers u
+    is the velocity from the grid, and the energy of the velocity that particles keep is subtracted. The energy of the
+    affine motion is that at the new position, on which the moment D of the linear kernel depends."""
     implicit: Float[Array, "*f"]
-    """Dissipated by treating the elastic force implicitly, (Δt f^n − its impulse)·v̄: β Δt² v̄·H v^{n+1}. In methods of
-    second order `time_integration` gives it back but for terms of third order in Δt."""
+    """Dissipation by the implicit elastic force, (Δt f^n − its impulse)·v̄, which is β Δt² v̄·H v^{n+1} for the
+    semi-implicit step. In methods of second order `time_integration` cancels it up to third order in Δt."""
     boundary: Float[Array, "*f"]
-    """Work of walls and grips, impulse·v̄: at a wall the kinetic energy of what stops on it."""
+    """Work of walls and grips, impulse·v̄. At a wall it is the kinetic energy of what stops there."""
     friction: Float[Array, "*f"]
     """Work of friction, ≤ 0."""
     body_force: Float[Array, "*f"]
     """Work of the scene's body force."""
     viscous: Float[Array, "*f"]
-    """Dissipated by viscosity, Δt Σ V σ_v : D ≥ 0 of the velocity that it resists."""
+    """Dissipation by viscosity, Δt Σ V σ_v : D ≥ 0, at the velocity in the viscous force."""
     plastic: Float[Array, "*f"]
-    """Dissipated by return maps, Σ V0 (Ψ of the trial deformation − Ψ of what it is brought back to): hardening, which
-    stiffens what is strained, included. Where a step strains by many times the strain of yielding, what it stores
-    before the return is in `time_integration`: the two are to be read together."""
+    """Dissipation by return maps, Σ V0 (Ψ(trial deformation) − Ψ(returned deformation)), with the change of Ψ by
+    hardening. If a step strains by many times the yield strain, the energy that it stores before the return is in
+    `time_integration`: read the two together."""
     solver: Float[Array, "*f"]
-    """Work of the impulse by which the solve misses its equation."""
+    """Work of the residual of the solve."""
     time_integration: Float[Array, "*f"]
-    """What Δt adds: the energies' change along the step less the work of their forces at its start,
-    [Φ(Δt v_c) − Φ(0) + Δt f^n·v̄] + Δt G·(v̄ − v_c), v_c the velocity with which the nodes move and
-    G their weight; and the work on v̄ of viscosity's impulse beyond what it dissipates. Of second order in Δt in each
-    step, of first over a given time."""
+    """Error of the time step: the change of the energies minus the work of their forces at the start,
+    [Φ(Δt v_c) − Φ(0) + Δt f^n·v̄] + Δt G·(v̄ − v_c), with v_c the velocity at which the nodes move and G their weight,
+    plus the work of the viscous impulse on v̄ beyond its dissipation. It is of second order in Δt for each step, and of
+    first order over a given time."""
 
     @property
     def change(self) -> Float[Array, "*f"]:
@@ -72,16 +72,18 @@ class EnergyBudget(eqx.Module):
 
     @property
     def explained(self) -> Float[Array, "*f"]:
-        """The sum of all that changes it."""
+        """The sum of all terms on the right, equal to `change`."""
         gains = self.boundary + self.friction + self.body_force + self.solver + self.time_integration
         return gains - self.p2g - self.g2p - self.implicit - self.viscous - self.plastic
 
 
 class MomentumBudget(eqx.Module):
-    """The linear momentum of one step [kg m/s], f steps, (f, d): change = gravity + body_force + boundary + friction +
-    elastic + viscous + transfer.
+    """The budget of linear momentum for each of f steps [kg m/s], shape (f, d):
 
-    A symmetry plane pushes through its mirror image: it is seen in `elastic` and `transfer`, which vanish without one.
+    change = gravity + body_force + boundary + friction + elastic + viscous + transfer.
+
+    The impulse of a symmetry plane is that of its mirror image, in `elastic` and `transfer`. Without such planes both
+    vanish.
     """
 
     change: Float[Array, "*f d"]
@@ -91,7 +93,7 @@ class MomentumBudget(eqx.Module):
     body_force: Float[Array, "*f d"]
     """Impulse of the scene's body force."""
     boundary: Float[Array, "*f d"]
-    """Impulse of walls and grips, and that by which the solve misses its equation."""
+    """Impulse of walls and grips, and the residual of the solve."""
     friction: Float[Array, "*f d"]
     """Impulse of friction."""
     elastic: Float[Array, "*f d"]
@@ -99,17 +101,17 @@ class MomentumBudget(eqx.Module):
     viscous: Float[Array, "*f d"]
     """Impulse of viscosity."""
     transfer: Float[Array, "*f d"]
-    """Lost in the transfers."""
+    """Change by the transfers."""
 
     @property
     def explained(self) -> Float[Array, "*f d"]:
-        """The sum of all that changes it."""
+        """The sum of all terms on the right, equal to `change`."""
         outer = self.gravity + self.body_force + self.boundary + self.friction
         return outer + self.elastic + self.viscous + self.transfer
 
 
 class Budget(eqx.Module):
-    """Energy and momentum of a run's steps."""
+    """Budgets of energy and momentum for the steps of a run."""
 
     energy: EnergyBudget
     momentum: MomentumBudget
@@ -125,14 +127,14 @@ def budget(
     method: AbstractIntegrator = Explicit(),
     start: int = 0,
 ) -> tuple[Particles, Budget]:
-    """Run a scene for some steps and say where its energy and momentum went in each.
+    """Run a scene for some steps, with the budgets of energy and momentum for each.
 
     Args:
         scene: the scene.
         particles: the particles at step `start`.
         steps: number of steps f.
         dt: step [s].
-        method: update of the grid velocity.
+        method: the integrator.
         start: number of the first step.
 
     Returns:
@@ -253,7 +255,7 @@ def _step_budget(
 
 
 def _gathered(scene: Scene, stencil: Stencil, nodes: NodeVector) -> Gathered:
-    """A velocity field of the nodes [m/s], shape (n, d), as the scene's transfer is given it."""
+    """A velocity field of the nodes [m/s], shape (n, d), gathered for the scene's transfer."""
     value, gradient = gather(stencil, nodes)
     affine = jnp.swapaxes(gather(stencil.least_squares, nodes)[1], 0, 1) if scene.transfer.affine else None
     return Gathered(value, jnp.swapaxes(gradient, 0, 1), affine)

@@ -17,9 +17,9 @@ class Energy(eqx.Module):
     """The energy of a state [J] (per metre of thickness in 2-D, per square metre of section in 1-D)."""
 
     kinetic: Float[Array, "*f"]
-    """½ Σ m (‖v‖² + tr(C D Cᵀ)): the affine part of APIC's velocities included."""
+    """½ Σ m (‖v‖² + tr(C D Cᵀ)), with the affine part for APIC."""
     elastic: Float[Array, "*f"]
-    """Σ V0 Ψ(F), Ψ being the elastic law in force."""
+    """Σ V0 Ψ(F), with the elastic law for the present history."""
     potential: Float[Array, "*f"]
     """−Σ m g·x."""
 
@@ -70,12 +70,12 @@ def momentum(particles: Particles) -> Float[Array, "d"]:
 
 
 def volume_ratio(particles: Particles) -> ParticleScalar:
-    """J = det F of each prepared particle [-], for laws that yield det F_E, shape (p,)."""
+    """J = det F of each prepared particle [-], shape (p,); det F_E for laws that yield."""
     return jnp.concatenate([la.determinant(components(F)) for F in jax.tree.leaves(particles.F)])
 
 
 def grid_mass(scene: Scene, particles: Particles) -> Float[Array, ""]:
-    """The mass on the grid [kg]: that of the particles to rounding, unless some left the window."""
+    """The mass on the grid [kg]. It is that of the particles to rounding, unless some left the window."""
     scene = canonical(scene, particles.x.dtype)
     return _grid_mass(scene, prepare(scene, particles))
 
@@ -89,12 +89,12 @@ def _grid_mass(scene: Scene, particles: Particles) -> Float[Array, ""]:
 
 @checked
 def pieces(scene: Scene, particles: Particles) -> int:
-    """How many pieces the material is in: particles that share a node with weight belong together.
+    """The number of pieces of the material. Particles with a common node of non-zero weight are of one piece.
 
-    Different pieces exchange neither momentum nor stress. In the updated description a body that is stretched until its
-    particles lie further apart than the kernel reaches falls apart, whatever its law says: *numerical fracture*. More
-    pieces at the end of a run than at its start are a warning of it, unless the material was to part; `TotalLagrangian`
-    and more particles a cell are its remedies.
+    Pieces exchange neither momentum nor stress. In the updated description a body falls apart, whatever its law, when
+    it is stretched until its particles lie further apart than the kernel reaches: *numerical fracture*. More pieces at
+    the end of a run than at its start are a sign of it, unless the material was meant to part. `TotalLagrangian` and
+    more particles a cell prevent it.
     """
     scene = canonical(scene, particles.x.dtype)
     stencil = scene.stencil(prepare(scene, particles))

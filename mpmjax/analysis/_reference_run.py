@@ -1,10 +1,10 @@
-"""The motion that is held for the truth: a run refined until it changes little, or until its time is up.
+"""The reference motion of `work_precision`: a run refined until it changes little, or until its time is up.
 
-Where explicit steps are cheap it is made of them, at the `stable_dt` of the whole motion: they resolve all that the
-grid does. Else it is TR-BDF2, whose step is halved until that changes the motion by less than a third of the error that
-is asked for, or is below the explicit limit. Then spacing and step are halved together: transfers act once a step, and
-on a given grid a smaller step alone need not bring the motion nearer to the truth. The last change is the estimate of
-the reference run's own error, which is safe from first order on.
+If explicit steps are cheap it uses them, at the `stable_dt` of the whole motion, which resolves all that the grid does.
+Otherwise it uses TR-BDF2, and halves the step until that changes the motion by less than a third of the target error,
+or until the step is below the explicit limit. Then spacing and step are halved together: transfers act once a step, so
+on a given grid a smaller step alone need not improve the motion. The last change estimates the error of the reference
+run; the estimate is safe for convergence of first order or more.
 """
 
 import math
@@ -17,7 +17,7 @@ from mpmjax.state import State
 from mpmjax.stepping import TRBDF2, AbstractIntegrator, Explicit
 
 HOPELESS = 4
-"""A run that fails at a step so many times below the explicit limit will fail at any."""
+"""A run that fails at a step this many times below the explicit limit is taken to fail at any step."""
 _FEW = 1000  # explicit steps that no implicit run which follows the motion is cheaper than
 
 Say = Callable[[str], None]
@@ -34,14 +34,14 @@ class Reference(NamedTuple):
 
 
 class _Look(NamedTuple):
-    """A run, and by how much it changed the motion of the one before."""
+    """A run, and its relative change of the motion of the run before."""
 
     bench: Bench
     steps: int
     seconds: float
     states: list[State] | None
     motion: Displacements | None
-    """None where it failed."""
+    """None if the run failed."""
     change: float
 
     @property
@@ -51,17 +51,17 @@ class _Look(NamedTuple):
 
 
 def settle(build: Build, bench: Bench, error: float, seconds: float, say: Say = lambda line: None) -> Reference:
-    """The reference that a number of seconds allows.
+    """The best reference run within an allowance of time.
 
     Args:
-        build: from a refinement to the scene.
-        bench: of the scene's own grid.
-        error: the error that trials are to be told by.
-        seconds: what it may take, compilation and all.
+        build: makes the scene at a refinement.
+        bench: the bench of the scene's own grid.
+        error: the target error of the trials.
+        seconds: the allowance, compilation included [s].
         say: called with a line on each run.
 
     Raises:
-        ValueError: nothing moves, or no run ended well in that time; with what went wrong.
+        ValueError: nothing moves, or no run ended well in that time; the message says what went wrong.
     """
     clock, growth = Clock(seconds), 2 ** (bench.particles.dim + 1)
     limit = bench.limit([])
@@ -95,7 +95,7 @@ def _resolved_in_time(
     bench: Bench, method: AbstractIntegrator, steps: int, limit: float, error: float, clock: Clock, say: Say
 ) -> tuple[float, _Look]:
     """The explicit limit over the motion on the scene's own grid [s], and the run whose step resolves the motion, or
-    the last that time allows."""
+    the last one within the time."""
     good = None
     while True:
         new = _look(bench, method, steps, good, say)

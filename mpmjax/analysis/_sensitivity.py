@@ -1,4 +1,4 @@
-"""How a rollout's derivatives grow with its horizon."""
+"""The growth of a rollout's derivatives over its horizon."""
 
 import warnings
 from typing import Any, Literal
@@ -25,15 +25,15 @@ class Sensitivity(eqx.Module):
     steps: Float[Array, "f"]
     """Steps since the start, shape (f,)."""
     growth: Float[Array, "f"]
-    """‖δx‖ / (t ‖δv0‖) [-], shape (f,): how much more positions depend on initial velocities than in free flight. NaN
-    from a fault of the run on, and throughout if a solve of it, or of its derivative, did not converge."""
+    """‖δx‖ / (t ‖δv0‖) [-], shape (f,): the dependence of positions on initial velocities, relative to free flight. NaN
+    after a fault of the run, and everywhere if a solve of the run or of its derivative did not converge."""
     rate: Float[Array, ""]
-    """Exponential rate of the growth [1/s]: the slope of a straight line fitted to its logarithm, as far as it is
-    finite (a finite-time Lyapunov exponent). Zero for free flight, negative where motion is damped or oscillates."""
+    """Exponential rate of the growth [1/s], a finite-time Lyapunov exponent: the slope of a line fitted to the
+    logarithm of its finite values. Zero for free flight, negative if motion is damped or oscillates."""
 
     @property
     def worst(self) -> Float[Array, ""]:
-        """The largest growth; NaN where there is none to the end."""
+        """The largest growth; NaN if a value is NaN."""
         return self.growth.max()
 
 
@@ -51,31 +51,32 @@ def sensitivity(
     start: Scalar = 0,
     warn_at: float | int = 1e3,
 ) -> Sensitivity:
-    """Ask whether gradients over this horizon are of any use: how a small change of the initial velocities grows.
+    """The growth of a small change of the initial velocities, which shows whether gradients over this horizon are
+    useful.
 
-    The change δv0 is carried along by the derivative of the steps in forward mode, δx being what it does to the
-    positions, and measured against free flight,
+    The change δv0 is propagated to a change δx of the positions by forward-mode differentiation of the steps, and
+    measured against free flight:
 
         growth(t) = ‖δx(t)‖ / (t ‖δv0‖),  ‖a‖² = Σ_p m_p a_p².
 
-    Free flight has exactly 1; oscillation and damping less. The default change is normally distributed and independent
-    for each particle, so that its growth estimates the root mean square over all directions (of p particles that stay
-    together, only about a √p-th is common flight), and that is also what the gradient of a random function of the final
-    positions grows by: ∂x/∂v0 and its transpose have the same singular values. The derivative with respect to anything
-    else that acts through the motion (stiffness, gravity, places) grows at the same rate.
+    It is 1 in free flight, and less with oscillation and damping. The default change is normally distributed and
+    independent for each particle, so its growth estimates the root mean square over all directions. (Of p particles
+    that stay together, only about a √p-th of it is common flight.) The gradient of a random function of the final
+    positions grows likewise, since ∂x/∂v0 and its transpose have the same singular values. Derivatives with respect to
+    other quantities that act through the motion (stiffness, gravity, positions) grow at the same rate.
 
-    *When it warns*: growth beyond `warn_at`, or a fault of the run. Beyond `warn_at` the motion is chaotic (many
-    contacts, crumpling) or the step unstable, and an exact gradient holds only for changes of the order of 1/growth: an
-    optimiser cannot use it. Shorten the horizon, observe averages, or, if it is the step, reduce dt.
+    *When it warns*: at a growth beyond `warn_at`, or a fault of the run. Beyond `warn_at` the motion is chaotic (many
+    contacts, crumpling) or the step unstable. An exact gradient then holds only for changes of the order of 1/growth,
+    and is of no use to an optimiser. Shorten the horizon, observe averages, or reduce dt if the step is unstable.
 
-    The cost is that of a forward run and its tangent, two to three runs, and the memory that of the saved positions.
+    The cost is two to three runs, for a forward run and its tangent. The memory is that of the saved positions.
 
     Args:
         scene: the scene.
         particles: the particles at step `start`.
-        t1: end time [s], a whole number of steps after time zero.
+        t1: end time [s], a multiple of the step.
         dt: step [s], or "stable", as in `simulate`.
-        method: update of the grid velocity.
+        method: the integrator.
         velocity: the change δv0 of the initial velocities, of any size, shape (p, d). Default: normally distributed,
             of variance 1/m_p.
         seed: of the default change.

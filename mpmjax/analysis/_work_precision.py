@@ -1,9 +1,9 @@
-"""What accuracy costs: a scene's error against seconds, by method, step and spacing, and the cheapest setting that is
-good enough.
+"""The error of a scene against seconds, by method, step and spacing, and the cheapest setting that is good enough.
 
-The error is that of the motion: the largest over eight evenly spaced times of the RMS over particles of the distance
-between a particle's displacement and the reference run's, over the largest RMS displacement of the latter. Where the
-reference has k particles for one, the mean of the k nearest at time zero stands for it.
+The error is that of the motion relative to a reference run. At eight evenly spaced times, take the RMS over particles
+of the difference between a particle's displacement and that in the reference run. The error is the largest of these,
+over the largest RMS displacement of the reference run. If that has k particles for one, the mean of the k nearest ones
+at time zero is used.
 """
 
 import itertools
@@ -17,7 +17,7 @@ from mpmjax.checks import checked, require_positive
 from mpmjax.stepping import TRBDF2, AbstractIntegrator, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
 
 METHODS: tuple[AbstractIntegrator, ...] = (Explicit(), SemiImplicit(), ImplicitMidpoint(), TRBDF2(), BackwardEuler())
-"""The methods that are tried by default."""
+"""The default methods."""
 _RESOLVED = 0.25  # the error above which a larger one at a smaller step does not say that the best was reached
 _REFERENCE_SHARE = 0.4  # of all seconds
 _AS_GOOD = 1.1  # how much larger an error still counts as the same
@@ -30,19 +30,19 @@ class WorkPrecision(NamedTuple):
     reference: Trial
     """The reference run; its error is an estimate."""
     target: float
-    """The error that was asked for."""
+    """The target error."""
     limit: float
-    """The longest explicit step on the scene's own grid that is offered, `stable_dt` of the whole motion [s]."""
+    """The longest explicit step allowed on the scene's own grid [s], the `stable_dt` of the whole motion."""
     skipped: tuple[str, ...] = ()
-    """Methods for which there was no time."""
+    """Names of the methods for which there was no time."""
 
     def cheapest(self, *, explicit: bool | None = None) -> Trial | None:
         """The fastest trial that is good enough: of all, of the explicit ones or of the others; None if none is.
 
-        Good enough is the target or, where no trial reaches it, a quarter above the least error of all, which then is
-        that of the grid. A trial is as good as the worst of itself, the next smaller step (where the error passes
-        through zero on its way from one sign to the other, that is luck) and the reference, whose own error it cannot
-        be told from. An explicit step beyond the limit is not good, however well it went.
+        A trial is good enough if its error is within the target, or, where no trial reaches the target, within 1.25
+        times the least error, which is then that of the grid. The error that counts is the largest of three: the
+        trial's own, that at the next smaller step (an error that changes sign can be small by luck), and that of the
+        reference. An explicit step beyond the limit is never good enough.
         """
         trials = [t for t in self.trials if not (t.method.is_explicit and t.dt * t.refinement > self.limit)]
         errors = [max(t.error, self._next(t).error, self.reference.error) for t in trials]
@@ -58,7 +58,7 @@ class WorkPrecision(NamedTuple):
         return max(finer, key=lambda t: t.dt, default=trial)
 
     def verdict(self) -> str:
-        """The cheapest setting in words, and what the other kind of method would have cost."""
+        """The cheapest setting in words, with the cost of the other kind of method, explicit or implicit."""
         best = self.cheapest()
         if best is None:
             return "No run ended well: allow more seconds or choose a shorter t1."
@@ -97,30 +97,30 @@ def work_precision(
     progress: Callable[[Trial], None] = lambda trial: None,
     say: Callable[[str], None] = lambda line: None,
 ) -> WorkPrecision:
-    """Run a scene by several methods, on several grids, with ever smaller steps, until each is as good as asked for,
-    gets no better, or costs more than another that is.
+    """Run a scene by several methods on several grids, at smaller and smaller steps. A method and grid is done when it
+    reaches the target error, gets no better, or costs more than another that reached it.
 
-    Implicit methods start with eight steps in all; explicit ones at the default safety of `stable_dt`, at the greatest
-    stretch of the reference run on the scene's own grid, and once at twice that, which should fail. A method that
-    another one betters on the scene's own grid, with no larger error in no more seconds whatever its step, is not tried
-    on finer ones, and no grid is tried that is finer than the reference run's.
+    Implicit methods start with eight steps in all. Explicit ones start at the default safety of `stable_dt`, at the
+    largest stretch of the reference run on the scene's own grid, and once at twice that step, which should fail. A
+    method is not tried on finer grids if others on the scene's own grid have no larger error in no more seconds at all
+    of its steps. No grid is finer than that of the reference run.
 
-    The seconds are this machine's, so the result is not a function of the arguments alone. They are shared out: two
-    fifths for the reference run, of what is left as much for one method as for another. What would take longer is
-    foreseen from fewer steps, and what cannot be tried at all is named.
+    The seconds are those of this machine, so the result depends on more than the arguments. Two fifths of them are for
+    the reference run, and the rest is shared equally among methods. Runs that would take longer are foreseen from fewer
+    steps; methods that cannot be tried are named.
 
-    *When it breaks*: where refinement does not settle the motion (chaotic contact, PIC at long times), the reference
-    is uncertain, and says so in its `error`.
+    *When it breaks*: if refinement does not settle the motion (chaotic contact, PIC at long times), the reference is
+    uncertain. Its `error` shows it.
 
     Args:
-        build: from a refinement n = 1, 2, 4, ... to the scene with 1/n of its spacing and as many particles a cell.
+        build: makes the scene at 1/n of its spacing, with as many particles a cell, for n = 1, 2, 4, ...
         t1: end time [s].
-        error: the relative error that is asked for.
-        methods: what is tried.
-        refinements: on which grids.
-        also: methods with one step [s] each, tried besides on the scene's own grid.
-        most_seconds: what all of it may take, compilation included [s]. A run that has begun is ended.
-        progress: called with each trial as it is done.
+        error: the target error, relative.
+        methods: the methods to try.
+        refinements: the grids to try, as values of n.
+        also: pairs of a method and a step [s] to try too, on the scene's own grid.
+        most_seconds: largest time of all runs, compilation included [s]. A run that has begun is finished.
+        progress: called with each trial when it is done.
         say: called with a line on each reference run.
 
     Raises:
@@ -145,7 +145,7 @@ def work_precision(
         return note(bench, method, steps, seconds, miss)
 
     def rival(method: AbstractIntegrator) -> float:
-        """Seconds of the cheapest run so far that is as good as asked for, explicit or implicit as the method is."""
+        """Seconds of the cheapest run so far that reached the target, among explicit or implicit ones as the method."""
         best = WorkPrecision(tuple(trials), reference, float(error), limit).cheapest(explicit=method.is_explicit)
         return math.inf if best is None or best.error > error else best.seconds
 
@@ -175,7 +175,7 @@ def work_precision(
                 return
 
     def bettered(method: AbstractIntegrator) -> bool:
-        """Whether others do as well as this implicit method on the scene's own grid for no more seconds."""
+        """Whether others reach the errors of this implicit method on the scene's own grid in no more seconds."""
         first = [t for t in trials if t.refinement == 1 and t.method.is_explicit == method.is_explicit]
         own = [t for t in first if t.method is method and math.isfinite(t.error)]
         others = [t for t in first if t.method is not method]

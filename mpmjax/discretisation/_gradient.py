@@ -1,4 +1,4 @@
-"""Gradient operators: of the spline, and of moving least squares."""
+"""Gradient operators: those of the spline and of moving least squares."""
 
 from abc import abstractmethod
 
@@ -17,16 +17,16 @@ class AbstractGradient(eqx.Module):
 
     @abstractmethod
     def derivatives(self, spline: Float[Array, "d s p"], least_squares: Float[Array, "d s p"]) -> Float[Array, "d s p"]:
-        """The factor of g_ip along each axis that stands in the place of the weight [1/m], shape (d, s, p).
+        """The factor along each axis that replaces the weight in g_ip [1/m], shape (d, s, p).
 
         Args:
-            spline: the derivative of the weight along each axis [1/m], shape (d, s, p).
-            least_squares: the same factor of the moving-least-squares gradient [1/m], shape (d, s, p).
+            spline: this factor for the gradient of the spline, the derivative of the weight [1/m], shape (d, s, p).
+            least_squares: this factor for the moving-least-squares gradient [1/m], shape (d, s, p).
         """
 
     def steepness(self, kernel: BSpline, spacing: Scalar, inverse_moment: Float[Array, "*p"]) -> Array | None:
         """Ξ [1/m²], a bound of the eigenvalues of Σ_i g_ip g_ipᵀ/w_ip at any place in a cell, for `stable_dt`. Default:
-        None, no bound is known, and then `stable_dt` can be asked for in the total description only.
+        None, with which `stable_dt` raises in the updated description; in the total one it needs no bound.
 
         Args:
             kernel: B-spline.
@@ -38,7 +38,7 @@ class AbstractGradient(eqx.Module):
 
 
 class SplineGradient(AbstractGradient):
-    """The gradient of the kernel itself, g_ip = ∇w_ip."""
+    """The gradient of the kernel, g_ip = ∇w_ip."""
 
     def derivatives(self, spline: Float[Array, "d s p"], least_squares: Float[Array, "d s p"]) -> Float[Array, "d s p"]:
         del least_squares
@@ -51,10 +51,10 @@ class SplineGradient(AbstractGradient):
 class MLSGradient(AbstractGradient):
     """The moving-least-squares gradient, g_ip = w_ip D_p⁻¹ (x_i − x_p), D_p = Σ_i w_ip (x_i − x_p)(x_i − x_p)ᵀ.
 
-    D_p = dx²/4 I for the quadratic and dx²/3 I for the cubic kernel; for the linear one the product is the gradient of
-    the kernel, without the singularity of D_p at a node (C. Jiang, C. Schroeder, A. Selle, J. Teran, A. Stomakhin,
+    D_p is dx²/4 I for the quadratic and dx²/3 I for the cubic kernel. For the linear kernel g_ip is the gradient of the
+    kernel, without the singularity of D_p at a node (C. Jiang, C. Schroeder, A. Selle, J. Teran, A. Stomakhin,
     ACM Trans. Graph. 34 (2015) 51, doi 10.1145/2766996; Y. Hu et al., ACM Trans. Graph. 37 (2018) 150,
-    doi 10.1145/3197517.3201293). The velocity gradient then is APIC's affine matrix.
+    doi 10.1145/3197517.3201293). The velocity gradient is then the affine matrix of APIC.
     """
 
     def derivatives(self, spline: Float[Array, "d s p"], least_squares: Float[Array, "d s p"]) -> Float[Array, "d s p"]:

@@ -14,19 +14,19 @@ _MOST_NODES = 2**31  # what an index of 32 bits counts
 class Grid(eqx.Module):
     """A uniform Cartesian grid of nodes at (origin + index) * spacing.
 
-    The grid is scratch: nothing on it outlives a step. It is a window on an unbounded lattice, and every node quantity
-    is an array over the window's nodes, flattened in C order: (n,) or (n, d).
+    It is a window on an unbounded lattice. A node quantity is an array over the nodes of the window, flattened in C
+    order, of shape (n,) or (n, d). None of them outlives a step.
 
-    A direction is *periodic* with the window's extent, shape * spacing, as its period; positions stay unwrapped, only
-    node indices wrap.
+    The period of a *periodic* direction is the extent of the window, shape * spacing. Positions stay unwrapped; node
+    indices wrap.
 
     Args:
         shape: nodes in each direction, d = 1, 2 or 3 of them.
         spacing: distance dx between nodes [m].
         origin: lattice index of the window's first node in each direction. Default: zeros.
-        periodic: whether each direction is periodic; one bool stands for all.
-        follow: move the window by whole spacings so that it stays centred on the particles' bounding box. `origin` is
-            then ignored. Results do not depend on where the window lies, only on whether it holds the particles.
+        periodic: whether each direction is periodic; one bool for all of them is allowed.
+        follow: whether the window moves by whole spacings to stay centred on the bounding box of the particles, with
+            `origin` ignored. Results do not depend on the place of the window as long as it holds the particles.
 
     Raises:
         ValueError: a shape that is not one to three integers of at least 4, a spacing that is not positive, an origin
@@ -88,20 +88,20 @@ class Grid(eqx.Module):
     def size(self) -> int:
         """Number of nodes n."""
         size = 1
-        for length in self.shape:
-            size *= length
+        for count in self.shape:
+            size *= count
         return size
 
     def window(self, x: ParticleVector) -> Int[Array, "d"]:
-        """The lattice index of the window's first node, for particles at x."""
+        """Lattice index of the window's first node, shape (d,), for particles at x [m], shape (p, d)."""
         if not self.follow:
             return jnp.asarray(np.asarray(self.origin, dtype=np.int32))
         middle = (x.min(axis=0) + x.max(axis=0)) / 2
         first = jnp.floor(jax.lax.stop_gradient(middle / self.spacing)).astype(jnp.int32)
-        return first - jnp.asarray([length // 2 for length in self.shape], dtype=jnp.int32)
+        return first - jnp.asarray([count // 2 for count in self.shape], dtype=jnp.int32)
 
     def wrapped(self, x: ParticleVector, window: Int[Array, "d"]) -> ParticleVector:
-        """Positions [m], shape (p, d), moved by whole periods into the window."""
+        """The positions x moved by whole periods into the window [m], shape (p, d)."""
         if not any(self.periodic):
             return x
         period = jnp.asarray(self.shape, x.dtype) * self.spacing
@@ -110,6 +110,6 @@ class Grid(eqx.Module):
 
     def nodes(self, window: Int[Array, "d"]) -> NodeVector:
         """Positions of the window's nodes [m], shape (n, d)."""
-        axes = [jnp.arange(length, dtype=jnp.int32) for length in self.shape]
+        axes = [jnp.arange(count, dtype=jnp.int32) for count in self.shape]
         index = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1).reshape(self.size, self.dim)
         return (index + window).astype(jnp.result_type(self.spacing)) * self.spacing

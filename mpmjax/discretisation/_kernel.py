@@ -10,13 +10,17 @@ from mpmjax.checks import require, require_fields
 class BSpline(eqx.Module):
     """The tensor-product B-spline of a given order: 1 linear, 2 quadratic, 3 cubic.
 
-    A particle touches order + 1 nodes in each direction. The weights are a partition of unity and reproduce affine
+    A particle has order + 1 nodes in each direction. The weights are a partition of unity and reproduce affine
     functions.
 
-    *When it breaks*: the linear kernel's gradient jumps at cell faces; particles that cross them make the error grow
-    under refinement (M. Steffen, R. M. Kirby, M. Berzins, Int. J. Numer. Methods Eng. 76 (2008) 922,
+    *When it breaks*: the gradient of the linear kernel jumps at cell faces. Particles that cross them make the error
+    grow under refinement (M. Steffen, R. M. Kirby, M. Berzins, Int. J. Numer. Methods Eng. 76 (2008) 922,
     doi 10.1002/nme.2360).
-    *Good values*: 2, the default; 3 where smoothness counts.
+
+    *Good values*: 2, the default; 3 where smoothness matters.
+
+    Args:
+        order: 1, 2 or 3.
     """
 
     order: int = eqx.field(static=True, default=2)
@@ -27,16 +31,17 @@ class BSpline(eqx.Module):
 
     @property
     def variance(self) -> float:
-        """Σ_i w_ip (x_i − x_p)²/dx² along an axis, which does not depend on the place for the quadratic and the cubic
-        kernel."""
+        """Σ_i w_ip (x_i − x_p)²/dx² along an axis [-], for the quadratic and the cubic kernel. For the linear one it
+        depends on the place."""
         return {2: 1 / 4, 3: 1 / 3}[self.order]
 
     def base(self, xi: Array) -> Array:
-        """First node of the stencil for a position xi in spacings."""
+        """Lattice index of the first stencil node along each axis, for positions xi in spacings, both (d, p)."""
         return jnp.floor(xi - (self.order - 1) / 2)
 
     def weights(self, f: Array) -> Array:
-        """Weights of the order + 1 nodes, (d, order + 1, p), at a distance f, (d, p), from the first, in spacings."""
+        """Weights of the order + 1 nodes along each axis [-], shape (d, order + 1, p), at a distance f from the first
+        node in spacings, shape (d, p)."""
         match self.order:
             case 1:
                 return jnp.stack([1 - f, f], axis=1)
@@ -49,7 +54,7 @@ class BSpline(eqx.Module):
                 return jnp.stack([(1 - t) ** 3 / 6, near, far, t**3 / 6], axis=1)
 
     def derivatives(self, f: Array) -> Array:
-        """Derivatives of the weights with respect to f [1 per spacing]."""
+        """Derivatives of the weights with respect to f [1/spacing], shape (d, order + 1, p)."""
         match self.order:
             case 1:
                 return jnp.stack([-jnp.ones_like(f), jnp.ones_like(f)], axis=1)

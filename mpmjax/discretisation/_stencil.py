@@ -1,4 +1,4 @@
-"""The stencil: for each particle its nodes, weights and weight gradients."""
+"""The stencil: the nodes, weights and weight gradients of each particle."""
 
 import math
 from collections.abc import Callable
@@ -16,21 +16,21 @@ from mpmjax.discretisation._kernel import BSpline
 class Stencil(eqx.Module):
     """The nodes of each particle, s = order + 1 along each axis, with their weights and weight derivatives.
 
-    Weights and gradients of the s^d stencil nodes are products of one factor an axis, and only those are stored: w_ip
-    is the product of the weights, g_ip in direction a the same with the derivative along a in the weight's place.
-    Built at the positions x (updated Lagrangian) or once at the reference positions X (total Lagrangian); gradients are
-    with respect to those. Component first: the particle axis is last.
+    Weights and gradients of the s^d stencil nodes are products of one factor for each axis, and only the factors are
+    stored. w_ip is the product of the weights; g_ip in direction a has the weight derivative along a in place of the
+    weight. The stencil is made at the positions x (updated Lagrangian), or once at the reference positions X (total
+    Lagrangian), and gradients are with respect to those. Component first: the particle axis is last.
     """
 
     index_factors: Int[Array, "d s p"]
-    """The part of the flat node index that each axis adds, shape (d, s, p); meaningless for a particle not `inside`."""
+    """Term of the flat node index from each axis, shape (d, s, p); meaningless for a particle that is not `inside`."""
     weights: Float[Array, "d s p"]
     """Weights along each axis [-], shape (d, s, p)."""
     weight_derivatives: Float[Array, "d s p"]
     """Derivatives of the weights along each axis [1/m], by the scene's gradient operator, shape (d, s, p)."""
     mls_weight_derivatives: Float[Array, "d s p"] | None
-    """The same by moving least squares, shape (d, s, p), if the transfer keeps an affine velocity and the scene's
-    gradient operator is another; else None."""
+    """The same by moving least squares, shape (d, s, p); None if the scene's gradient operator is that, or the transfer
+    keeps no affine velocity."""
     moment: Float[Array, "d p"]
     """Diagonal of D_p [m²], shape (d, p)."""
     inside: Bool[Array, "p"]
@@ -38,7 +38,7 @@ class Stencil(eqx.Module):
 
     @property
     def least_squares(self) -> "Stencil":
-        """The stencil whose gradient is that of moving least squares."""
+        """The stencil with the gradient of moving least squares."""
         if self.mls_weight_derivatives is None:
             return self
         return eqx.tree_at(
@@ -64,7 +64,7 @@ class Stencil(eqx.Module):
 
     @property
     def gradient(self) -> Float[Array, "k d p"]:
-        """g_ip [1/m], of the chosen operator, shape (s^d, d, p)."""
+        """g_ip [1/m] of the scene's gradient operator, shape (s^d, d, p)."""
         w, g = list(self.weights), list(self.weight_derivatives)
         return jnp.stack([_tensor(jnp.multiply, [*w[:a], g[a], *w[a + 1 :]]) for a in range(len(w))], axis=1)
 
@@ -115,7 +115,7 @@ def make_stencil(
 
 
 def _index_factors(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Array) -> Int[Array, "d s p"]:
-    """The part of the C-order node index that each axis adds, shape (d, s, p)."""
+    """Term of the C-order node index from each axis, shape (d, s, p)."""
     first = jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window[:, None]
     along = first[:, None] + jnp.arange(kernel.order + 1, dtype=jnp.int32)[:, None]
     periods, wraps, strides = (
@@ -126,7 +126,7 @@ def _index_factors(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Arr
 
 
 def _tensor(combine: Callable[[Array, Array], Array], factors: list[Array]) -> Array:
-    """The (outer) tensor combination of one (s, p) factor a direction, in C order, shape (s^d, p)."""
+    """The outer combination of one factor for each axis, each (s, p), in C order, shape (s^d, p)."""
     combined = factors[0]
     for factor in factors[1:]:
         combined = combine(combined[:, None], factor).reshape(-1, factor.shape[-1])

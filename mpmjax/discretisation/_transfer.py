@@ -13,7 +13,7 @@ from mpmjax.discretisation._transfer_sums import gather, scatter
 
 
 class Gathered(eqx.Module):
-    """A velocity field of the nodes as each particle sees it."""
+    """A velocity field of the nodes, gathered at the particles."""
 
     value: Float[Array, "d p"]
     """Σ_i w_ip v_i [m/s], shape (d, p)."""
@@ -24,13 +24,13 @@ class Gathered(eqx.Module):
 
 
 class AbstractTransfer(eqx.Module):
-    """What particles take over from the grid's velocity, and what they keep of their own."""
+    """The update of the particles' velocity, and of their affine velocity, from that of the nodes."""
 
     affine: ClassVar[bool] = False
     """Whether particles keep an affine velocity C [1/s]: P2G then gives Σ_p w_ip m_p (v_p + C_p (x_i − x_p))."""
     needs_change: ClassVar[bool] = False
-    """Whether `velocity` or `affine_velocity` uses the change of the nodes' velocity over the step. P2G then computes
-    v^n apart from the explicit force's impulse, which an explicit step pays for."""
+    """Whether `velocity` or `affine_velocity` uses the change of the nodes' velocity over the step. P2G then sums
+    momentum and force separately, which makes an explicit step dearer."""
 
     @abstractmethod
     def velocity(self, v: Float[Array, "d p"], new: Gathered, change: Gathered | None) -> Float[Array, "d p"]:
@@ -43,8 +43,8 @@ class AbstractTransfer(eqx.Module):
         """
 
     def affine_velocity(self, C: Matrix | None, new: Gathered, change: Gathered | None) -> Matrix | None:
-        """The particles' affine velocity after the step [1/s], shape (d, d, p). Default: the moving-least-squares
-        gradient of the new velocity, or None unless the transfer is `affine`.
+        """The particles' affine velocity after the step [1/s], shape (d, d, p); None unless the transfer is `affine`.
+        Default: the moving-least-squares gradient of the new velocity.
 
         Args:
             C: the affine velocity before the step [1/s], shape (d, d, p).
@@ -55,8 +55,8 @@ class AbstractTransfer(eqx.Module):
         return new.affine
 
     def steepness(self, inverse_moment: Array, gradient_bound: Array) -> tuple[Array, Array] | None:
-        """The two numbers [1/m²] with which `stable_dt` bounds Δt² Λ A/ρ0 + Δt Λ_v B/ρ0 ≤ 4: A of elasticity and B of
-        viscosity. Default: None, no bound is known.
+        """A and B [1/m²] of the bound Δt² Λ A/ρ0 + Δt Λ_v B/ρ0 ≤ 4 of `stable_dt`, for elasticity and viscosity.
+        Default: None, with which `stable_dt` raises.
 
         Args:
             inverse_moment: a, the largest eigenvalue of D_p⁻¹ [1/m²].
@@ -69,7 +69,7 @@ class AbstractTransfer(eqx.Module):
 class PIC(AbstractTransfer):
     """Particle-in-cell: particles take the grid's velocity (F. H. Harlow, Methods Comput. Phys. 3 (1964) 319).
 
-    Conserves linear momentum; loses angular momentum and, every step, all velocity that the grid does not resolve.
+    Conserves linear momentum. In every step it loses angular momentum, and all velocity that the grid does not resolve.
     First order in space.
     """
 
@@ -78,7 +78,7 @@ class PIC(AbstractTransfer):
         return new.value
 
     def steepness(self, inverse_moment: Array, gradient_bound: Array) -> tuple[Array, Array] | None:
-        """2Ξ and 4Ξ: the affine velocity is forgotten."""
+        """2Ξ and 4Ξ."""
         del inverse_moment
         return 2 * gradient_bound, 4 * gradient_bound
 
@@ -87,8 +87,8 @@ class FLIP(AbstractTransfer):
     """FLIP(α): particles take the change of the grid's velocity, blended with PIC (J. U. Brackbill, H. M. Ruppel,
     J. Comput. Phys. 65 (1986) 314, doi 10.1016/0021-9991(86)90211-1).
 
-    v ← α (v + Σ_i w_ip (v_i^{n+1} − v_i^n)) + (1 − α) Σ_i w_ip v_i^{n+1}. With α = 1 nothing is dissipated, noise in
-    the null space of the transfer included.
+    v ← α (v + Σ_i w_ip (v_i^{n+1} − v_i^n)) + (1 − α) Σ_i w_ip v_i^{n+1}. With α = 1 it dissipates nothing, not even
+    noise in the null space of the transfer.
 
     Args:
         alpha: share of FLIP, from 0 (PIC) to 1.
@@ -106,7 +106,7 @@ class FLIP(AbstractTransfer):
         return self.alpha * (v + change.value) + (1 - self.alpha) * new.value
 
     def steepness(self, inverse_moment: Array, gradient_bound: Array) -> tuple[Array, Array] | None:
-        """2Ξ and 4Ξ: the affine velocity is forgotten."""
+        """2Ξ and 4Ξ."""
         del inverse_moment
         return 2 * gradient_bound, 4 * gradient_bound
 
@@ -115,8 +115,8 @@ class APIC(AbstractTransfer):
     """Affine particle-in-cell (C. Jiang, C. Schroeder, A. Selle, J. Teran, A. Stomakhin, ACM Trans. Graph. 34 (2015)
     51, doi 10.1145/2766996).
 
-    Particles carry an affine velocity C [1/s]; linear and angular momentum are conserved by the transfers. Second order
-    in space with quadratic and cubic kernels.
+    Particles have an affine velocity C [1/s]. Conserves linear and angular momentum. Second order in space with
+    quadratic and cubic kernels.
     """
 
     affine: ClassVar[bool] = True
@@ -148,8 +148,9 @@ def p2g(
         v: v_p [m/s], shape (d, p).
         C: affine velocity [1/s], shape (d, d, p), or None.
         size: number of nodes.
-        impulse: what else the momentum receives in the same sum, Σ_p I_p g_ip [kg m²/s], shape (d, d, p), with g_ip the
+        impulse: I_p [kg m²/s], shape (d, d, p), to add Σ_p I_p g_ip to the momentum in the same sum. g_ip is the
             moving-least-squares gradient if there is a C.
+
     Returns:
         mass m_i [kg], shape (n,), and momentum m_i v_i [kg m/s], shape (n, d).
     """
@@ -183,13 +184,14 @@ def g2p(
         v: the particles' velocity before the step [m/s], shape (d, p).
         before: v_i^n [m/s], shape (n, d); needed by transfers with `needs_change` only.
         after: v_i^{n+1} [m/s], shape (n, d).
-        mean: the velocity v̄_i with which positions and deformation move over the step [m/s], shape (n, d), if it is not
-            v_i^{n+1}.
+        mean: the velocity v̄_i with which positions and deformation move [m/s], shape (n, d). Default: v_i^{n+1}.
         C: the particles' affine velocity before the step [1/s], shape (d, d, p), if they have one.
         kept: whether transfers that are not affine return a C too, Σ_i v_i^{n+1} g_ipᵀ.
+
     Returns:
-        the velocity with which particles move, Σ_i w_ip v̄_i; their new velocity; their new C, if any; and the velocity
-        gradient that deforms them, Σ_i v̄_i g_ipᵀ [1/s], shape (d, d, p).
+        the velocity with which particles move, Σ_i w_ip v̄_i [m/s], shape (d, p); their new velocity [m/s], shape
+        (d, p); their new C [1/s], shape (d, d, p), or None; the velocity gradient that deforms them, Σ_i v̄_i g_ipᵀ
+        [1/s], shape (d, d, p).
     """
     change = None
     if transfer.needs_change:
@@ -217,5 +219,5 @@ def g2p(
 
 
 def _split_gradients(gradients: Float[Array, "d c p"], fields: int) -> list[Matrix]:
-    """The velocity gradient of each field, shape (d, d, p), of the gradients of all of them."""
+    """The velocity gradient of each field, shape (d, d, p), from the stacked gradients of all fields."""
     return [jnp.swapaxes(g, 0, 1) for g in jnp.split(gradients, fields, axis=1)]

@@ -1,16 +1,16 @@
-"""The two sums that cross between particles and grid: `gather` and `scatter`, each other's transpose.
+"""The two sums between particles and grid: `gather` and `scatter`, each the transpose of the other.
 
-Weights and gradients of a stencil are products of one factor an axis, so both sums are factorised: what is summed along
-the last axis, with its weights and with its gradients, meets one factor for each axis before it, and a gradient costs
-hardly more than a value.
+Weights and gradients of a stencil are products of one factor for each axis, so both sums are factorised: partial sums
+along the last axis are multiplied by one factor for each axis before it. A gradient then costs little more than a
+value.
 
-Both are partial derivatives of one form, linear in each of its arguments,
+Both are partial derivatives of one multilinear form,
 
     B(factors; a, f) = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b),    scatter = ∂B/∂f,  gather = ∂B/∂a,
 
-and `_pull` is the third, by the factors. They are JAX primitives for the sake of their derivatives, which are each
-other, where JAX itself would transpose each read of a node to an addition of whole grids. Another back end replaces
-them here, and nothing else.
+and `_pull` is the third, ∂B/∂factors. They are JAX primitives so that each is the derivative of the other. JAX itself
+would transpose every read of a node to an addition of whole grids. Another back end would replace these sums and
+nothing else.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ three take it three times as long as four, being added one by one."""
 
 
 def gather(stencil: Stencil, nodes: Float[Array, "n c"]) -> tuple[Float[Array, "c p"], Float[Array, "d c p"]]:
-    """The sums over each particle's nodes Σ_i w_ip f_i, and Σ_i g_ip f_i for each direction of the gradient.
+    """Sums over the nodes of each particle: Σ_i w_ip f_i, and Σ_i g_ip f_i for each direction of the gradient.
 
     Args:
         stencil: stencil of the particles.
@@ -45,9 +45,9 @@ def gather(stencil: Stencil, nodes: Float[Array, "n c"]) -> tuple[Float[Array, "
 def scatter(
     stencil: Stencil, value: Float[Array, "c p"] | None, gradients: Float[Array, "d c p"] | None, size: int
 ) -> Float[Array, "n c"]:
-    """The sums at the nodes Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b): `gather`'s transpose.
+    """Sums at the nodes Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b), the transpose of `gather`.
 
-    What goes to a node that does not exist is dropped.
+    Terms at nodes outside of the window are dropped.
 
     Args:
         stencil: stencil of the particles.
@@ -79,7 +79,7 @@ def _widen(value: Array, gradients: list[Array], w: Array, g: Array) -> list[Arr
 def _along(axis: int, factors: tuple[Array, ...], step: Callable[..., tuple], start: Any, unroll: bool) -> Any:
     """`lax.scan` over the nodes along an axis, unrolled along the last one, or with `unroll` along all.
 
-    On a CPU a loop whose body is a few kernels over all particles is the fastest, on a GPU a single kernel.
+    A loop over a few kernels is the fastest on a CPU, a single kernel on a GPU.
     """
     each = tuple(factor[axis] for factor in factors)
     return jax.lax.scan(step, start, each, unroll=each[0].shape[0] if unroll or axis == len(factors[0]) - 1 else 1)
@@ -91,7 +91,7 @@ def _gather(*args: Array, unroll: bool) -> list[Array]:
     d, _, p = factors[0].shape
 
     def summed(axis: int, first: Array) -> list[Array]:
-        """Over this axis and those after it, from a first node: the value, then a gradient an axis."""
+        """The sums over this axis and those after it, from a first node: the value, then a gradient for each axis."""
         if axis == d:
             return [nodes.at[first].get(mode="clip", wrap_negative_indices=False)]
 
@@ -112,7 +112,7 @@ def _scatter(*args: Array, valued: bool, size: int, unroll: bool) -> list[Array]
     d, _, p = factors[0].shape
 
     def add(axis: int, first: Array, value: Array | None, gradients: list[Array], nodes: Array) -> Array:
-        """What the nodes along this axis and those after it receive, from a first node."""
+        """The nodes with the sums along this axis and those after it added, from a first node."""
         if axis == d:
             return nodes.at[first].add(value, mode="drop", wrap_negative_indices=False)
 
@@ -140,7 +140,7 @@ def _pull(*args: Array, valued: bool) -> tuple[Array, Array]:
     d, _, p = factors[0].shape
 
     def pulled(axis: int, first: Array, value: Array | None, gradients: list[Array]) -> tuple[list[Array], list]:
-        """What is collected over this axis and those after it, and the derivatives by their factors."""
+        """The gathered sums over this axis and those after it, and the derivatives with respect to their factors."""
         if axis == d:
             return [nodes.at[first].get(mode="clip", wrap_negative_indices=False)], []
 
@@ -164,8 +164,8 @@ def _pull(*args: Array, valued: bool) -> tuple[Array, Array]:
 
 
 def _by_factors(function: Callable[..., list[Array]]) -> Callable[..., list[Array]]:
-    """A sum's differential by its factors, of shares, weights, their derivatives, the differentials of both, and what
-    else it takes."""
+    """The differential of a sum with respect to its factors. Arguments: index factors, weights, weight derivatives, the
+    differentials of both, then the other arguments of the sum."""
 
     def differential(*args: Array, **params: Any) -> list[Array]:
         index_factors, rest = args[0], args[5:]
@@ -179,19 +179,19 @@ def _by_factors(function: Callable[..., list[Array]]) -> Callable[..., list[Arra
 
 
 def _members(function: Callable[..., Any], batched: int) -> Callable[..., Any]:
-    """The function for all members of a batch with so many axes."""
+    """The function mapped over `batched` leading axes."""
     for _ in range(batched):
         function = jax.vmap(function)
     return function
 
 
 def _primitive(name: str, function: Callable[..., list[Array]], shapes: Callable[..., list[tuple]]) -> Primitive:
-    """A primitive that does what the function does, on batches too.
+    """A primitive that evaluates a function, on batches too.
 
     Args:
-        name: of the primitive.
-        function: of arrays.
-        shapes: the shapes of its results, of its arguments.
+        name: name of the primitive.
+        function: the function of arrays.
+        shapes: the shapes of the results, as a function of the arguments.
     """
 
     def run(*args: Array, batched: int, unroll: bool = False, **params: Any) -> list[Array]:
@@ -235,8 +235,8 @@ _scatter_by_factors_p = _primitive("stencil_scatter_by_factors", _by_factors(_sc
 
 
 def _differentiate(primitive: Primitive, by_factors: Primitive, function: Callable[..., list[Array]]) -> None:
-    """Their forward rules. The differential by the factors is a primitive for its transpose; its own differential,
-    which only second derivatives want, is that of the sum as written."""
+    """Define the forward rules. The differential with respect to the factors is a primitive so that it has a transpose
+    of its own; its own differential, which only second derivatives need, is that of the sum as written."""
 
     def jvp(primals: tuple, tangents: tuple, **params: Any) -> tuple[list[Array], list[Any]]:
         factors, rest = primals[:3], primals[3:]
@@ -262,8 +262,8 @@ _differentiate(_scatter_p, _scatter_by_factors_p, _scatter)
 
 
 def _given(cotangents: list) -> tuple[list[Array], bool]:
-    """The cotangents of what was gathered, as what is scattered: value and gradients, or one of them where the other is
-    zero, and whether there is a value."""
+    """The cotangents of a gather as arguments of a scatter: value and gradients, or one of them if the other is zero;
+    and whether there is a value."""
     valued, graded = (any(type(t) is not ad.Zero for t in part) for part in (cotangents[:1], cotangents[1:]))
     parts = cotangents if valued and graded else cotangents[:1] if valued else cotangents[1:]
     return list(map(ad.instantiate_zeros, parts)), valued

@@ -1,5 +1,5 @@
-"""Prescribed motions: data, never callables, so that they can be saved, differentiated and changed without
-compiling."""
+"""Prescribed motions. They are data, not callables, so that they can be saved, differentiated and changed without
+compiling anew."""
 
 import abc
 from functools import partial
@@ -17,7 +17,7 @@ Displacements = Float[Array, "j d"] | Float[np.ndarray, "j d"] | tuple | list
 
 
 class AbstractMotion(eqx.Module):
-    """The motion of a rigid body. X are the positions of its points before the motion, x those at time t."""
+    """The motion of a rigid body, from positions X before the motion to positions x at time t."""
 
     @property
     @abc.abstractmethod
@@ -26,15 +26,15 @@ class AbstractMotion(eqx.Module):
 
     @abc.abstractmethod
     def origin(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
-        """The points X that are at x at time t [m], each (m, d)."""
+        """The positions X before the motion of the points that are at x at time t [m], both (m, d)."""
 
     @abc.abstractmethod
     def place(self, X: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
-        """The places x of the points X at time t [m], each (m, d)."""
+        """The positions x at time t of the points X [m], both (m, d)."""
 
     @abc.abstractmethod
     def turned(self, a: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
-        """Vectors that turn with the body, at time t, each (m, d)."""
+        """The vectors a, fixed in the body, as turned by it at time t, both (m, d)."""
 
     @abc.abstractmethod
     def velocity_of(self, X: Float[Array, "m d"], t: Scalar, dt: Scalar) -> Float[Array, "m d"]:
@@ -42,11 +42,11 @@ class AbstractMotion(eqx.Module):
 
     @abc.abstractmethod
     def pivot(self, middle: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
-        """The point about which torques are taken, at time t [m], shape (d,), for a body with a given middle."""
+        """The point for torques at time t [m], shape (d,), of a body with the given middle [m], shape (d,)."""
 
 
 class Motion(AbstractMotion):
-    """A displacement that is piecewise linear in time, at rest before the first and after the last of its times.
+    """A translation, piecewise linear in time, at rest before its first time and after its last.
 
     Args:
         times: increasing times [s], (j,).
@@ -69,7 +69,7 @@ class Motion(AbstractMotion):
         return _interpolated(t, jnp.asarray(self.times), jnp.asarray(self.displacement))
 
     def velocity(self, t: Scalar, dt: Scalar) -> Float[Array, "d"]:
-        """Mean velocity from t to t + dt [m/s], shape (d,): what moves a node exactly along the displacement."""
+        """Mean velocity from t to t + dt [m/s], shape (d,). A node with it follows the displacement exactly."""
         return _change(t, dt, jnp.asarray(self.times), jnp.asarray(self.displacement)) / dt
 
     def origin(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
@@ -92,18 +92,17 @@ class Motion(AbstractMotion):
 
 
 class RigidMotion(AbstractMotion):
-    """A displacement d and a rotation R about a centre, x = c + d(t) + R(t) (X − c): both are piecewise linear in time,
-    at rest before the first and after the last of its times.
+    """A displacement d and a rotation R about a centre c, x = c + d(t) + R(t) (X − c).
 
-    The rotation is an angle in 2-D, in 3-D a rotation vector, the axis times the angle; so between two times the spin
-    is constant where the axis is. A step takes points along chords: they end where the rotation takes them, whatever
-    the step.
+    Both are piecewise linear in time, at rest before the first time and after the last. The rotation is an angle in
+    2-D, and a rotation vector (axis times angle) in 3-D, so that between two times the spin is constant if the axis is.
+    A step moves points along chords, to their exact positions at its end.
 
     Args:
         times: increasing times [s], (j,).
         displacement: displacement of the centre at each of them [m], (j, d).
         rotation: rotation at each of them [rad], (j,) in 2-D, (j, 3) in 3-D.
-        centre: the point about which it turns, and torques are taken, before the motion [m], (d,).
+        centre: centre of the rotation and point for torques, before the motion [m], (d,).
     """
 
     times: Times
@@ -168,7 +167,7 @@ class RigidMotion(AbstractMotion):
 
 
 def still(dim: int) -> Motion:
-    """A motion that leaves everything in place, in `dim` dimensions."""
+    """No motion, in `dim` dimensions."""
     return Motion((0.0,), ((0.0,) * dim,))
 
 
@@ -189,16 +188,19 @@ def _interpolated(t: Scalar, times: Float[Array, "j"], values: Float[Array, "j c
 
 
 def _change(t: Scalar, dt: Scalar, times: Float[Array, "j"], values: Float[Array, "j c"]) -> Float[Array, "c"]:
-    """What each column grows by from t to t + dt. The difference of two values would have their rounding, divided by
-    dt: at 1e-5 s in single precision, a thousandth of the velocity."""
+    """The change of each column from t to t + dt, computed from the slopes.
+
+    A difference of two values would have their rounding, which divided by dt = 1e-5 s is a thousandth of the velocity
+    in single precision.
+    """
     slopes = jnp.diff(values, axis=0) / jnp.diff(times)[:, None]
     within = jnp.diff(jnp.clip(times - t, 0, dt))  # the part of the step that lies between two times
     return (within[:, None] * slopes).sum(axis=0)
 
 
 def _turn_further(a: Float[Array, "m d"], rotation: Float[Array, "r"], by: Float[Array, "r"]) -> Float[Array, "m d"]:
-    """R(rotation + by) a − R(rotation) a: where the difference would cancel, Gauss' rule of four points for the
-    integral of its derivative along the way, which is off by 6e-10 ‖by‖⁸ of itself."""
+    """R(rotation + by) a − R(rotation) a. For a small `by` it is the integral of the derivative by Gauss' rule of four
+    points, without cancellation, at a relative error of 6e-10 ‖by‖⁸."""
     turn = partial(_turn, a)
     nodes, weights = np.polynomial.legendre.leggauss(4)
     along = [
@@ -209,8 +211,8 @@ def _turn_further(a: Float[Array, "m d"], rotation: Float[Array, "r"], by: Float
 
 
 def _turn(a: Float[Array, "m d"], rotation: Float[Array, "r"]) -> Float[Array, "m d"]:
-    """Vectors turned by an angle, or by a rotation vector r (O. Rodrigues): a + (sin θ/θ) r × a + ((1 − cos θ)/θ²)
-    r × (r × a), θ = ‖r‖."""
+    """Vectors turned by an angle, or by a rotation vector r (O. Rodrigues):
+    a + (sin θ/θ) r × a + ((1 − cos θ)/θ²) r × (r × a), θ = ‖r‖."""
     if rotation.shape == (1,):
         cos, sin = jnp.cos(rotation[0]), jnp.sin(rotation[0])
         return jnp.stack([cos * a[:, 0] - sin * a[:, 1], sin * a[:, 0] + cos * a[:, 1]], axis=1)

@@ -1,8 +1,8 @@
-"""Regions of space: what `fill` fills, a grip holds and a collider is.
+"""Regions of space, for `fill`, grips and colliders.
 
-A region is its signed distance: negative inside, Euclidean, with a gradient of length one. Where several points of the
-surface are nearest (a ball's centre, a box's diagonal) the gradient is the direction of one of them or their mean:
-never NaN, and not zero either, so that a collider holds what is on its middle too.
+A region is its signed distance: Euclidean, negative inside, with a gradient of length one. Where several points of the
+surface are nearest (the centre of a ball, the diagonal of a box) the gradient is the direction of one of them or their
+mean. It is never NaN or zero, so that a collider acts on what is at its middle too.
 """
 
 import abc
@@ -25,7 +25,7 @@ class AbstractRegion(eqx.Module):
 
     @abc.abstractmethod
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
-        """The signed distance [m] of each of the points x [m], shape (m, d), from the surface: negative inside."""
+        """Signed distance of points x [m], shape (m, d), from the surface [m], shape (m,); negative inside."""
 
     @abc.abstractmethod
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -33,28 +33,28 @@ class AbstractRegion(eqx.Module):
 
     @abc.abstractmethod
     def middle(self) -> Float[Array, "d"]:
-        """A point that moves with the region [m], shape (d,): its centre if it has one."""
+        """The centre, or another point that moves with the region [m], shape (d,)."""
 
     def contains(self, x: Float[Array, "m d"], margin: Scalar = 0.0) -> Bool[Array, "m"]:
-        """Whether each of the points x [m], shape (m, d), lies in the region or within `margin` [m] of it."""
+        """Whether points x [m], shape (m, d), lie in the region or within `margin` [m] of it, shape (m,)."""
         return self.distance(x) <= margin
 
 
 def length(a: Float[Array, "*m d"]) -> Float[Array, "*m"]:
-    """The norm of each row; its derivative at zero is zero."""
+    """The length of each vector, the last axis; its derivative at zero is zero."""
     square = (a**2).sum(axis=-1)
     zero = square == 0
     return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, square)))
 
 
 def _from_axis(a: Float[Array, "m d"]) -> Float[Array, "m"]:
-    """The norm of each row; its derivative at zero is that along a fixed direction."""
+    """The length of each vector, the last axis; its derivative at zero is along a fixed direction."""
     some = jnp.asarray([0.8, 0.5, 0.3][: a.shape[-1]], a.dtype)
     return jnp.where((a == 0).all(axis=-1), (a * some).sum(axis=-1), length(a))
 
 
 def _common(slabs: Float[Array, "m j"]) -> Float[Array, "m"]:
-    """The signed distance of the intersection of sets at right angles to each other, from the distances of the sets."""
+    """Signed distance from the intersection of sets at right angles to each other, from those of the sets."""
     nearest = slabs.max(axis=-1)
     return jnp.where(nearest > 0, length(jnp.maximum(slabs, 0)), nearest)
 
@@ -73,7 +73,7 @@ class Box(AbstractRegion):
     """The axis-aligned box between two corners.
 
     Args:
-        lower: smallest coordinate in each direction [m], (d,). −inf is allowed where a grip is meant to reach so far.
+        lower: smallest coordinate in each direction [m], (d,). It may be −inf, for a grip without a bound.
         upper: largest coordinate in each direction [m], (d,), above `lower`.
     """
 
@@ -106,7 +106,7 @@ class Box(AbstractRegion):
         return np.asarray(self.lower, float), np.asarray(self.upper, float)
 
     def middle(self) -> Float[Array, "d"]:
-        """Half-way between the corners; with one of them at infinity the other, with both zero."""
+        """The middle of the corners; in a direction with one corner at infinity the other one, with both zero."""
         corners = jnp.stack([jnp.asarray(self.lower), jnp.asarray(self.upper)])
         finite = jnp.isfinite(corners)
         return jnp.where(finite, corners, 0).sum(axis=0) / jnp.maximum(finite.sum(axis=0), 1).astype(corners.dtype)
@@ -147,7 +147,7 @@ class Ball(AbstractRegion):
 
 
 class HalfSpace(AbstractRegion):
-    """All that lies behind a plane (a line in 2-D, a point in 1-D).
+    """The half-space behind a plane (a line in 2-D, a point in 1-D).
 
     Args:
         point: a point of the plane [m], (d,).
@@ -184,11 +184,11 @@ class HalfSpace(AbstractRegion):
 
 
 class Capsule(AbstractRegion):
-    """All that lies within a radius of a segment.
+    """The points within a radius of a segment.
 
     Args:
         start: one end of the segment [m], (d,).
-        end: the other [m], (d,).
+        end: the other end [m], (d,).
         radius: radius [m].
     """
 
@@ -225,7 +225,7 @@ class Cylinder(AbstractRegion):
 
     Args:
         start: centre of one end [m], (d,).
-        end: centre of the other [m], (d,).
+        end: centre of the other end [m], (d,).
         radius: radius [m].
     """
 
@@ -244,7 +244,7 @@ class Cylinder(AbstractRegion):
         return len(self.start)
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
-        """As for a box, with the distances beyond the ends and beyond the radius."""
+        """As for a box, from the distances to the ends and to the lateral surface."""
         start, end = jnp.asarray(self.start, x.dtype), jnp.asarray(self.end, x.dtype)
         height = length(end - start)
         axis, arm = (end - start) / height, x - (start + end) / 2
@@ -264,8 +264,8 @@ class Cylinder(AbstractRegion):
 
 
 class Union(AbstractRegion):
-    """The union of several regions. Its distance is exact outside; inside, where they overlap, it may be too small in
-    size.
+    """The union of several regions. Its distance is exact outside; inside, where regions overlap, it may be too small
+    in magnitude.
 
     Args:
         regions: the regions.

@@ -1,4 +1,4 @@
-"""A region by samples of its signed distance: any shape, that of a triangle mesh among them."""
+"""Regions of any shape, or of a triangle mesh, by samples of their signed distance."""
 
 import itertools
 import math
@@ -28,17 +28,17 @@ _PADDING = 3  # samples beyond the bounding box on each side: one and a half are
 
 
 class SampledDistance(AbstractRegion):
-    """A region by the signed distances of a lattice of points, joined by quadratic B-splines, so that the normal is
+    """A region by the signed distances of the points of a lattice, interpolated by quadratic B-splines. Its normal is
     continuous.
 
-    Second order in the lattice's spacing h: a surface of mean curvature κ in d dimensions is moved inward by
-    (d − 1)κh²/8, and edges are rounded over a spacing or two. Beyond the lattice the distance to it is added.
+    Second order in the spacing h of the lattice: a surface of mean curvature κ in d dimensions moves inward by
+    (d − 1)κh²/8, and edges are rounded over a spacing or two. Outside of the lattice, the distance to it is added.
 
     Args:
-        lower: place of the lattice's first point [m], (d,).
-        spacing: distance between its points [m].
-        values: signed distance of each of its points [m], negative inside; an array of d axes, at least 4 points each,
-            which reaches two spacings beyond the surface.
+        lower: position of the first point of the lattice [m], (d,).
+        spacing: distance h between its points [m].
+        values: signed distances of its points [m], negative inside, an array of d axes of at least 4 points each. The
+            lattice must reach two spacings beyond the surface.
     """
 
     lower: Point
@@ -92,7 +92,7 @@ class SampledDistance(AbstractRegion):
 
 @checked
 def sample_distance(region: AbstractRegion, spacing: float) -> SampledDistance:
-    """The samples of a bounded region's own distance.
+    """Sample the signed distance of a bounded region.
 
     Args:
         region: the region.
@@ -108,14 +108,14 @@ def sample_distance(region: AbstractRegion, spacing: float) -> SampledDistance:
 
 @checked
 def sample_mesh(mesh: str | Path | tuple[Any, Any], spacing: float) -> SampledDistance:
-    """The samples of the signed distance from a closed surface of triangles. Needs the extra `mesh` (trimesh, rtree).
+    """Sample the signed distance from a closed surface of triangles. Needs the extra `mesh` (trimesh, rtree).
 
     Args:
         mesh: a file that trimesh reads (STL, OBJ, PLY, ...), in metres, or vertices [m], (j, 3), and faces, (k, 3).
         spacing: distance between samples [m].
 
     Raises:
-        ImportError: trimesh or rtree is not there.
+        ImportError: trimesh or rtree is not installed.
         ValueError: a surface that is not closed, or whose faces do not all point outwards.
     """
     try:
@@ -138,7 +138,7 @@ def sample_mesh(mesh: str | Path | tuple[Any, Any], spacing: float) -> SampledDi
 
 
 def _lattice(lower: np.ndarray, upper: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """The first point of a lattice around a bounding box, and all of them, (..., d)."""
+    """The first point of a lattice around a bounding box, (d,), and all of its points, (..., d)."""
     require_positive("The samples' spacing [m]", spacing)
     require(
         np.isfinite(lower) & np.isfinite(upper), f"Only a region with bounds can be sampled, got {lower} to {upper}."

@@ -17,42 +17,46 @@ from mpmjax.implicit._inner_product import AbstractInnerProduct, DiagonalInnerPr
 from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, AbstractInnerProductSolver, default_rtol
 
 NEGLIGIBLE_CHANGE = 1e-3
-"""Largest share of the solution by which one more correction may change it, where rounding hides the tolerance."""
+"""Largest relative change of the solution by one more correction, where rounding hides the tolerance."""
 _REACH = 64.0  # the recurrence's own residual means nothing below so many units of rounding of the one it started from
 
 
 class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
-    """Conjugate residuals for a symmetric operator A, definite or not (E. Stiefel, Comment. Math. Helv. 29 (1955) 157,
-    doi 10.1007/BF02564277; the recurrences are those of the derivation, section 2.1).
+    """The conjugate residual method for a symmetric operator A, definite or not (E. Stiefel, Comment. Math. Helv. 29
+    (1955) 157, doi 10.1007/BF02564277; the recurrences are those of the derivation, section 2.1).
 
-    It works on E = W⁻¹A in the inner product ⟨a, b⟩ = aᵀ W b, in which E is self-adjoint; with W the mass this is the
-    derivation's algorithm, which in the plain inner product would not be conjugate residuals at all, E = I + βΔt²M⁻¹H
-    not being symmetric. The norm ‖r‖ of the residual r = W⁻¹(b − A x) never grows.
+    It works on E = W⁻¹A in the inner product ⟨a, b⟩ = aᵀ W b, in which E is self-adjoint. With W the mass this is the
+    algorithm of the derivation, whose E = I + βΔt²M⁻¹H is not symmetric in the plain inner product. The norm ‖r‖ of the
+    residual r = W⁻¹(b − A x) never grows.
 
-    Stops when ‖r‖ ≤ rtol ‖W⁻¹b‖ for the *true* residual. Where rounding forbids that, the recurrence is repeated with
-    the true residual as right-hand side until this does not halve it any more. The result then counts as a solution if
-    the last correction, which is an estimate of the error, changed x by no more than a thousandth in the norm of W. The
-    size of the residual would not do: of an ill-conditioned system it can be down to its own rounding while x is far
-    off. The residual that is returned says how far the tolerance was met.
+    It stops when ‖r‖ ≤ rtol ‖W⁻¹b‖ for the *true* residual. If rounding prevents that, the recurrence is restarted with
+    the true residual as right-hand side until a restart no longer halves it. The result is then accepted if the last
+    correction, which estimates the error, changed x by at most a thousandth in the norm of W. (A test of the residual
+    would not do: in an ill-conditioned system it can be down to rounding while x is far off.) The residual that is
+    returned shows how closely the tolerance was met.
 
     Options of `compute` (both optional):
 
-    - `inner_product`: that of W, an `AbstractInnerProduct`. Default: W = I.
+    - `inner_product`: the inner product of W, an `AbstractInnerProduct`. Default: W = I.
     - `y0`: the initial guess. Default: zeros.
 
-    Statistics returned: `num_steps` (applications of E in the recurrence), `residual` (the true ‖r‖/‖W⁻¹b‖),
-    `spectral_radius` (the estimate of ‖E‖), `indefinite` (whether rᵀA r < 0 was met, beyond rounding: A then is not
-    positive definite; the converse does not hold), `nearly_converged` (whether it did not converge, but came within ten
-    times `rtol`).
+    Statistics returned:
 
-    *When it breaks*: on an indefinite A the recurrence stops where rᵀA r = 0; the result is then
-    `RESULTS.breakdown`, never silence.
+    - `num_steps`: applications of E in the recurrence.
+    - `residual`: the true ‖r‖/‖W⁻¹b‖.
+    - `spectral_radius`: an estimate of ‖E‖.
+    - `indefinite`: whether rᵀA r < 0 beyond rounding was met. A is then not positive definite; the converse does not
+      hold.
+    - `nearly_converged`: whether it did not converge, but came within ten times `rtol`.
+
+    *When it breaks*: with an indefinite A the recurrence stops where rᵀA r = 0. The result is then
+    `RESULTS.breakdown`.
 
     Args:
         rtol: relative tolerance. Default: 1e-8 in float64, 1e-5 in float32.
-        increment_rtol: stop also when an increment is small, ‖α_k p_k‖² ≤ increment_rtol² ‖x‖² (the derivation's test,
-            made relative). Default: not used. It says nothing of the residual.
-        max_steps: most steps of the recurrence.
+        increment_rtol: stop also when an increment is small, ‖α_k p_k‖² ≤ increment_rtol² ‖x‖² (the test of the
+            derivation, made relative). Default: not used. It says nothing of the residual.
+        max_steps: largest number of steps of the recurrence.
     """
 
     rtol: Scalar | None = None
@@ -155,15 +159,15 @@ class _Recurrence(eqx.Module):
     restart_rr: Float[Array, ""]
     """‖r‖² at the last restart, of the true residual."""
     correction: Float[Array, ""]
-    """By how much x was changed between the last two restarts, in the norm of W."""
+    """Change of x between the last two restarts, in the norm of W."""
     stalled: Bool[Array, ""]
     """Whether the true residual has not halved between the last two restarts."""
     small_increment: Bool[Array, ""]
-    """Whether the last increment was as small as `increment_rtol` asks."""
+    """Whether the last increment was within `increment_rtol`."""
     breakdown: Bool[Array, ""]
-    """Whether rᵀA r = 0 was met, but for rounding."""
+    """Whether rᵀA r = 0 to rounding was met."""
     indefinite: Bool[Array, ""]
-    """Whether rᵀA r < 0 was met, beyond rounding."""
+    """Whether rᵀA r < 0 beyond rounding was met."""
     done: Bool[Array, ""]
 
 
@@ -207,7 +211,7 @@ def _goes_on(system: _System, c: _Recurrence) -> Bool[Array, ""]:
 
 
 def _restart(system: _System, c: _Recurrence) -> _Recurrence:
-    """The recurrence from the true residual, until it is content or at the end of its reach."""
+    """Run the recurrence from the true residual, until it meets the tolerance or reaches the rounding of its start."""
     r = system.b - system.apply(c.x)
     rr = system.dot(r, r)
     c = replace(
@@ -263,7 +267,7 @@ def _step(system: _System, c: _Recurrence) -> _Recurrence:
 
 
 def _outcome(system: _System, c: _Recurrence) -> tuple[lx.RESULTS, dict[str, Any]]:
-    """Result and statistics of an iteration that has ended."""
+    """The result and statistics at the end of the iteration."""
     residual, tolerance = jnp.sqrt(c.rr), system.rtol * system.b_norm
     negligible = c.correction <= NEGLIGIBLE_CHANGE * system.norm(c.x)
     exact = c.stalled & ~c.breakdown & (c.k < system.max_steps) & negligible

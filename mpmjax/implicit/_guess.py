@@ -8,17 +8,17 @@ from mpmjax._types import NodeVector
 
 
 class Guess(enum.Enum):
-    """The initial guess of an implicit update.
+    """The initial guess of an implicit solve.
 
-    At some hundred times the explicit limit v* is far off, since it is what the explicit step would have done.
+    v*, the result of an explicit step, is far off at a hundred times the explicit limit.
     """
 
     GRID_VELOCITY = "grid velocity"
-    """v^n, the velocity of the nodes before the step: the default."""
+    """v^n, the velocity of the nodes before the step. The default."""
     EXPLICIT = "explicit"
-    """v*, the choice of the derivation."""
+    """v*, as in the derivation."""
     ZERO = "zero"
-    """Rest."""
+    """Zero velocity."""
 
     def velocity(self, before: NodeVector, explicit: NodeVector) -> NodeVector:
         """The guess [m/s], shape (n, d), from v^n and v*."""

@@ -1,4 +1,4 @@
-"""Hessians of the elastic energy: where they are evaluated, and from what."""
+"""Hessians of the elastic energy."""
 
 import abc
 from collections.abc import Callable
@@ -15,11 +15,11 @@ from mpmjax.material import AbstractMaterial, AbstractTangent, projected_tangent
 
 
 class AbstractHessian(eqx.Module):
-    """How the elastic energy's Hessian acts in an implicit update.
+    """The Hessian of the elastic energy in an implicit update.
 
-    One linear solve solves the equation that the Hessian makes; Newton's method takes steps with it to the solution of
-    an equation in which it has no part. A Hessian of your own derives from this class; from stress differentials at a
-    deformation `TangentAction` makes the map that `at` returns.
+    With one linear solve the Hessian is part of the equation. With Newton's method it only sets the steps towards the
+    solution of an equation without it. Subclass it for a Hessian of your own: `at` can return a `TangentAction`, which
+    is made from stress differentials at a deformation.
     """
 
     @abc.abstractmethod
@@ -32,20 +32,19 @@ class AbstractHessian(eqx.Module):
 
     @abc.abstractmethod
     def exact(self) -> "AbstractHessian":
-        """The Hessian of which this may be an approximation. The derivatives of Newton's solution are taken with it."""
+        """The Hessian that this one approximates, or this one. Derivatives of a solution by Newton's method use it."""
 
 
 class AnalyticHessian(AbstractHessian):
-    """Hessian by the law's stress differential (derivation, eqs. 7 to 12). Faster than `JvpHessian`.
+    """The Hessian by the stress differential of the law (derivation, eqs. 7 to 12). Faster than `JvpHessian`.
 
-    With `projected`, each particle's stress differential is made positive semi-definite first (see
-    `projected_tangent`), so that M + cH is positive definite whatever the compression and the step. A particle whose
-    differential is so already is not changed by it. One linear solve then solves another, more strongly damped
-    equation where it matters; Newton's method only takes another way to the same solution. First derivatives stay
-    exact; second ones are refused.
+    With `projected`, the stress differential of each particle is made positive semi-definite first (see
+    `projected_tangent`). M + cH is then positive definite at every compression and step. Particles whose differential
+    is positive semi-definite already are not changed. One linear solve then solves another equation, with more damping;
+    Newton's method takes other steps to the same solution. First derivatives stay exact; second derivatives raise.
 
     Args:
-        projected: whether to project.
+        projected: whether the stress differentials are projected.
     """
 
     projected: bool = eqx.field(static=True, default=False)
@@ -73,8 +72,8 @@ class AnalyticHessian(AbstractHessian):
 
 
 class JvpHessian(AbstractHessian):
-    """Hessian by `jax.jvp` of the energy's gradient. It needs nothing of a law but its energy, and the tests hold
-    `AnalyticHessian` to it."""
+    """The Hessian by `jax.jvp` of the energy's gradient. It needs only the energy of a law, and is the reference of
+    the tests for `AnalyticHessian`."""
 
     def at(self, potential: ElasticPotential, u: NodeVector) -> AbstractHessianAction:
         return _JvpAction(potential, u)

@@ -15,7 +15,7 @@ from mpmjax.implicit._potential import ElasticPotential
 
 
 class AbstractHessianAction(eqx.Module):
-    """The symmetric linear map δu ↦ H δu [N] with H = ∂²Φ/∂u∂u [N/m], of nodal displacements δu [m], shape (n, d)."""
+    """The symmetric linear map δu ↦ H δu [N], H = ∂²Φ/∂u∂u [N/m], on nodal displacements δu [m], shape (n, d)."""
 
     @abc.abstractmethod
     def is_positive_semidefinite(self) -> bool:
@@ -27,11 +27,11 @@ class AbstractHessianAction(eqx.Module):
 
     @abc.abstractmethod
     def precomputed(self) -> "ParticleStiffness":
-        """The same map by one matrix a particle, made once for many applications."""
+        """The same map as one matrix for each particle, computed once for many applications."""
 
 
 class ParticleStiffness(AbstractHessianAction):
-    """H by one matrix a particle: d⁴ numbers each, and no evaluation of the law at each application."""
+    """H as one matrix for each particle, of d⁴ numbers. Applying it evaluates no law."""
 
     matrix: Float[Array, "m m p"]
     """K_p [J] (see `ElasticPotential.stiffness`), shape (d², d², p)."""
@@ -52,10 +52,10 @@ class ParticleStiffness(AbstractHessianAction):
         return self
 
     def diagonal(self, like: NodeVector) -> NodeVector:
-        """Σ_p Σ_b g_ip,b² K_p,ba,ba [N/m], shape (n, d): an approximation of H's diagonal that is never negative.
+        """Σ_p Σ_b g_ip,b² K_p,ba,ba [N/m], shape (n, d): a non-negative approximation of the diagonal of H.
 
-        Negative entries of K count as zero. Left out are the products of slopes along different axes, which an
-        isotropic law has none of at F = I, and at mirror planes those of a node's slopes with its image's.
+        Negative entries of K count as zero. It leaves out products of weight derivatives along different axes, which
+        are zero for an isotropic law at F = I, and at mirror planes those of a node with its image.
 
         Args:
             like: any node vector.
@@ -67,11 +67,11 @@ class ParticleStiffness(AbstractHessianAction):
 
 
 class TangentAction(AbstractHessianAction):
-    """H by stress differentials.
+    """H by the stress differentials of the materials.
 
     Args:
         potential: the elastic potential.
-        tangents: for each material the symmetric linear map δF ↦ δP [Pa] of its particles, of the shapes of F.
+        tangents: for each material, the symmetric linear map δF ↦ δP [Pa] of its particles, both of F's shape.
         positive_semidefinite: whether all of these maps are known to be positive semi-definite.
     """
 
@@ -93,7 +93,7 @@ class TangentAction(AbstractHessianAction):
 def particle_stiffness(
     potential: ElasticPotential, tangents: tuple[Callable[[Matrix], Matrix], ...], *, positive_semidefinite: bool
 ) -> ParticleStiffness:
-    """H by one matrix a particle, from the materials' stress differentials."""
+    """H as one matrix for each particle, from the stress differentials of the materials."""
     matrix = potential.stiffness(tangents)
     return ParticleStiffness(matrix, potential.stencil, potential.mirror, positive_semidefinite)
 
@@ -126,6 +126,8 @@ class _DampedAction(AbstractHessianAction):
 
 
 def damped(elastic: AbstractHessianAction, potential: ElasticPotential, rate: Scalar) -> AbstractHessianAction:
-    """H + r D, with D [N s/m] the matrix of the viscous force, positive semi-definite: for r = 1/c a stage of duration
-    c has M + c D + c² H. Without viscosity it is H."""
+    """H + r D, with D [N s/m] the positive semi-definite matrix of the viscous force; H without viscosity.
+
+    A stage of duration c has r = 1/c, which gives M + c D + c² H.
+    """
     return _DampedAction(elastic, potential, rate) if potential.viscous else elastic

@@ -13,14 +13,14 @@ from mpmjax._types import Array
 
 
 class AbstractInnerProduct(eqx.Module):
-    """⟨a, b⟩ = aᵀ W b with a symmetric positive definite W = L Lᵀ.
+    """The inner product ⟨a, b⟩ = aᵀ W b with a symmetric positive definite W = L Lᵀ.
 
-    For a symmetric A the map W⁻¹A is self-adjoint in it, so W is a preconditioner of A: iterations grow with the spread
-    of the eigenvalues of W⁻¹A. `ConjugateResidual` works on W⁻¹A; any other solver is given L⁻¹A L⁻ᵀ, which has the
-    same eigenvalues and is symmetric in the plain inner product.
+    W is a preconditioner of a symmetric A: W⁻¹A is self-adjoint in this inner product, and the number of iterations
+    grows with the spread of its eigenvalues. `ConjugateResidual` works on W⁻¹A. Any other solver is given L⁻¹A L⁻ᵀ,
+    which has the same eigenvalues and is symmetric in the plain inner product.
 
-    The W of an `ImplicitOperator` must commute with its projection Q, so that residuals and steps keep out of what is
-    held: W = Q W Q + (I − Q) W (I − Q).
+    The W of an `ImplicitOperator` must commute with its projection Q, W = Q W Q + (I − Q) W (I − Q), so that residuals
+    and steps have no part in held components.
     """
 
     @abc.abstractmethod
@@ -40,7 +40,7 @@ class AbstractInnerProduct(eqx.Module):
         return self.solve_factor_transpose(self.solve_factor(r))
 
     def flattened(self, unravel: Callable[[Array], Any]) -> "AbstractInnerProduct":
-        """The same inner product, of vectors that `jax.flatten_util.ravel_pytree` has flattened."""
+        """The same inner product on vectors flattened by `jax.flatten_util.ravel_pytree`."""
         return _FlatInnerProduct(self, unravel)
 
 
@@ -48,7 +48,7 @@ class DiagonalInnerProduct(AbstractInnerProduct):
     """The inner product of a diagonal W.
 
     Args:
-        weight: the diagonal, positive, of the vector's structure.
+        weight: the positive diagonal, of the structure of a vector.
     """
 
     weight: Any

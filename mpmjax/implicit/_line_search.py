@@ -17,20 +17,20 @@ def backtrack(
     slope: Float[Array, ""],
     slack: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    """The first step size a of 1, ½, ¼, ... with sufficient decrease, E(a) ≤ E(0) + 10⁻⁴ a E'(0) + slack.
+    """The first step size a of 1, ½, ¼, ... with sufficient decrease, E(a) ≤ E(0) + 10⁻⁴ a E'(0) + slack (L. Armijo,
+    Pacific J. Math. 16 (1966) 1, doi 10.2140/pjm.1966.16.1).
 
-    This is the condition of L. Armijo, Pacific J. Math. 16 (1966) 1, doi 10.2140/pjm.1966.16.1. The slack is the
-    rounding of E: near a minimum the decrease that the slope promises is below it, and a good step would be refused. An
-    E that is not a number is no decrease, so a step that leaves the domain of E is halved.
+    The slack is the rounding of E. Near a minimum the expected decrease is smaller than it, and without slack a good
+    step would be refused. NaN is no decrease, so a step that leaves the domain of E is halved.
 
     Args:
         merit: the function E of the step size [J].
         start: E(0).
         slope: E'(0), negative.
-        slack: what E may miss of the decrease [J].
+        slack: by how much E may miss the decrease [J].
 
     Returns:
-        The step size, and how often it was halved; at `MOST_HALVINGS` the search has failed.
+        The step size, and the number of halvings. At `MOST_HALVINGS` the search has failed.
     """
 
     def refused(trial: tuple[Array, Array]) -> Bool[Array, ""]:

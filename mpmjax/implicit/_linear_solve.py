@@ -1,4 +1,4 @@
-"""One linear solve by any symmetric solver of lineax, and what is known of its solution."""
+"""One linear solve by any symmetric solver of lineax, with the quality of its solution."""
 
 import abc
 import math
@@ -18,38 +18,38 @@ _State = TypeVar("_State")
 _DEFAULT_RTOL = {4: 1e-5, 8: 1e-8}  # by bytes a number
 
 NEARLY_CONVERGED = 10.0
-"""A solve that ends within so many times its tolerance has a solution, less accurate than was asked for: the error is
-proportional to the residual, so that of eight digits seven are left, of float32's five four."""
+"""A solve that ends within this many times its tolerance is accepted, and counted as less accurate. The error is
+proportional to the residual, so seven of eight digits are left, or four of the five of float32."""
 
 
 def default_rtol(dtype: Any) -> float:
-    """1e-8 in float64, 1e-5 in float32."""
+    """The default relative tolerance: 1e-8 in float64, 1e-5 in float32."""
     return _DEFAULT_RTOL[jnp.dtype(dtype).itemsize]
 
 
 class LinearSolution(eqx.Module):
-    """The solution of a linear system A x = b in an inner product W, and what is known of it."""
+    """The solution of a linear system A x = b in an inner product W, with its cost and quality."""
 
     value: NodeVector
     iterations: Int[Array, ""]
-    """Iterations of the solver; 0 of one that states none."""
+    """Iterations of the solver; 0 if it states none."""
     residual: Float[Array, ""]
     """True relative residual ‖b − A x‖/‖b‖ in the norm of W⁻¹."""
     converged: Bool[Array, ""]
-    """Whether the solver's tolerance, or the precision's own limit, was met."""
+    """Whether the residual is within the solver's tolerance, or at the limit of the precision."""
     nearly_converged: Bool[Array, ""]
-    """Whether neither was, but ten times the tolerance."""
+    """Whether it is not, but within ten times the tolerance."""
     indefinite: Bool[Array, ""]
     """Whether a direction of negative curvature was met."""
     spectral_radius: Float[Array, ""]
-    """Estimate from below of ‖W⁻¹A‖; 1 where nothing is known of it."""
+    """A lower estimate of ‖W⁻¹A‖; 1 if the solver gives none."""
 
 
 class AbstractInnerProductSolver(lx.AbstractLinearSolver[_State], Generic[_State]):
-    """A symmetric solver that works in an inner product itself, and says more of its solution than others do.
+    """A symmetric solver that takes an inner product itself.
 
-    It takes the option `inner_product`, an `AbstractInnerProduct`; the fields of `LinearSolution` but `value`, with
-    `num_steps` for its iterations, are statistics of what `compute` returns. `converged` is its result.
+    `compute` takes the option `inner_product`, an `AbstractInnerProduct`. Its result is successful if it converged. Its
+    statistics have the other fields of `LinearSolution` except `value`, with `num_steps` for `iterations`.
     """
 
     @abc.abstractmethod
@@ -66,16 +66,17 @@ def solve_linear(
 ) -> LinearSolution:
     """Solve A x = b.
 
-    A solver that does not take an inner product is given the scaled system L⁻¹A L⁻ᵀ y = L⁻¹b/‖b‖, W = L Lᵀ, of which
-    x = ‖b‖ L⁻ᵀ y: symmetric, preconditioned, and with a right-hand side of norm one, so that an absolute tolerance is a
-    number without a unit. Its residual is computed here, and must bear out its result.
+    A solver that does not take an inner product is given the scaled system L⁻¹A L⁻ᵀ y = L⁻¹b/‖b‖ with W = L Lᵀ and
+    x = ‖b‖ L⁻ᵀ y. It is symmetric and preconditioned, and its right-hand side has norm one, so that an absolute
+    tolerance has no unit. The residual is computed here: a solution counts as converged only if that is within the
+    tolerance too.
 
     Args:
         solver: a `lineax.AbstractLinearSolver` for symmetric operators.
         operator: A.
         rhs: b.
         inner: the inner product of W.
-        guess: where an iteration starts; zero by default. A direct solver has no use for it.
+        guess: where an iterative solver starts. Default: zero.
 
     Raises:
         ValueError: the solver refuses the operator, or returns no vector.
@@ -129,7 +130,7 @@ def _solve_scaled(
 
 
 class ScaledOperator(AbstractSymmetricOperator):
-    """L⁻¹A L⁻ᵀ, with A an operator and W = L Lᵀ an inner product."""
+    """L⁻¹A L⁻ᵀ for an operator A and the inner product of W = L Lᵀ."""
 
     operator: AbstractSymmetricOperator
     inner: AbstractInnerProduct
@@ -163,10 +164,10 @@ def _initialised(solver: lx.AbstractLinearSolver, operator: ScaledOperator, opti
 
 
 def require_solver(name: str, solver: lx.AbstractLinearSolver) -> None:
-    """An absolute tolerance must be above zero.
+    """Check a linear solver.
 
     Raises:
-        ValueError: it is not.
+        ValueError: an absolute tolerance that is not above zero.
     """
     if (atol := getattr(solver, "atol", None)) is not None:
         require_that(
@@ -178,8 +179,8 @@ def require_solver(name: str, solver: lx.AbstractLinearSolver) -> None:
 
 
 def _tolerance(solver: lx.AbstractLinearSolver, b: Array) -> Any:
-    """The relative residual that a solver promises: `rtol`, and `atol` in each component of a right-hand side of norm
-    one, where it has them; that of the precision for one that states none."""
+    """The relative residual of a solver's tolerances: `rtol`, plus `atol` in each component of a right-hand side of
+    norm one; that of the precision for a solver without them."""
     rtol, atol = getattr(solver, "rtol", None), getattr(solver, "atol", None)
     if rtol is None and atol is None:
         return default_rtol(b.dtype)

@@ -1,4 +1,4 @@
-"""One linear solve a stage."""
+"""One linear solve for each stage."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,10 +13,10 @@ from mpmjax.implicit._solve_info import SolveInfo
 
 
 class Linearised(eqx.Module):
-    """One linear solve: the force is f(0) − H u in the whole step.
+    """One linear solve with the force f(0) − H u, linear in the displacement u of the step.
 
     Args:
-        solver: of the linear system, any symmetric one of lineax. Default: `ConjugateResidual`, default tolerances.
+        solver: linear solver, any symmetric one of lineax. Default: `ConjugateResidual` with default tolerances.
     """
 
     solver: lx.AbstractLinearSolver = ConjugateResidual()
@@ -26,7 +26,12 @@ class Linearised(eqx.Module):
         require_solver("Linearised's solver", self.solver)
 
     def __call__(self, problem: LinearProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
-        """The solution, started from a guess [m/s], shape (n, d)."""
+        """The solution [m/s], shape (n, d), and the report of the solve.
+
+        Args:
+            problem: the problem.
+            guess: where the solve starts [m/s], shape (n, d).
+        """
         operator = problem.operator(guess).precomputed()
         split = problem.projection.combine
         lift = split(0, problem.prescribed)

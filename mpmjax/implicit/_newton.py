@@ -23,29 +23,34 @@ _ROUNDING = 4.0  # units of rounding that a sum over the particles and nodes is 
 class Newton(eqx.Module):
     """Newton's method with a backtracking line search on the incremental potential.
 
-    A direction along which the potential does not fall (the Hessian can be indefinite) is replaced by the steepest one
-    in the preconditioner's norm; a step is halved until the potential falls by a ten-thousandth of what its slope
-    promises, which also keeps out of deformations where the law has no energy. Stops when ‖residual‖ ≤ rtol ‖b‖, b the
-    right-hand side of the system linearised before anything moves, less what prescribed velocities contribute to it,
-    both in the norm of the inverse mass.
+    Direction: the Hessian can be indefinite. If the potential does not fall along Newton's direction, the steepest one
+    in the norm of the preconditioner is taken.
 
-    b vanishes where forces balance, and in single precision it can be smaller than the rounding of the residual, which
-    is 4 ε (‖W (|v| + dx/c)‖ + ‖M ṽ‖), W the diagonal of the operator: that of the terms that were added, F's being of
-    order one. A residual below that ends the iteration too, if the solution is known to be good in another way: the
-    last Newton step, taken whole, changed v by no more than a thousandth or strained by no more than √ε, the energy of
-    which is the potential's own rounding; or, M + cH being no less than M, the error ‖v − v*‖ ≤ ‖residual‖ is no more
-    than a thousandth of ‖v‖, in the norms of the mass and of its inverse. No guess is accepted because of rounding
-    alone.
+    Line search: a step is halved until the decrease is at least 10⁻⁴ of what the slope predicts. The potential is not
+    defined at deformations that a law does not admit, so these are avoided too.
 
-    Starts from the guess, or from rest where the potential is lower there or the guess is a deformation for which the
-    law has no energy; if that is so at rest too, for what is prescribed alone (a grip that closes a gap of one cell in
-    a step), the first step is that of the linearised system. An equation that is not finite even there gives NaN, never
-    rest.
+    Start: the guess, or rest if the potential is lower there or the law does not admit the guess. If it does not admit
+    rest either, because of prescribed velocities (a grip that closes a gap of one cell in a step), the first step is
+    that of the linearised system. An equation that is not finite even there gives NaN.
+
+    Termination: ‖residual‖ ≤ rtol ‖b‖ in the norm of the inverse mass. b is the right-hand side of the system
+    linearised at zero displacement, without the contribution of prescribed velocities.
+
+    Termination by rounding: b vanishes where forces balance, and in single precision it can be smaller than the
+    rounding of the residual, 4 ε (‖W (|v| + dx/c)‖ + ‖M ṽ‖) with W the diagonal of the operator. A residual below that
+    rounding ends the iteration too, if one of two tests shows that the solution is good:
+
+    - the last Newton step was taken whole, and changed v by at most a thousandth, or the strain by at most √ε, the
+      energy of which is the rounding of the potential;
+    - M + cH is not less than M, and the error ‖v − v*‖ ≤ ‖residual‖ is at most a thousandth of ‖v‖, in the norms of the
+      mass and of its inverse.
+
+    A guess is never accepted because of rounding alone.
 
     Args:
-        solver: of the linear systems, any symmetric one of lineax; a loose tolerance suffices.
-        rtol: relative tolerance. Default: that of the precision, 1e-8 or 1e-5.
-        max_steps: most Newton steps.
+        solver: linear solver, any symmetric one of lineax. A loose tolerance suffices.
+        rtol: relative tolerance. Default: 1e-8 in float64, 1e-5 in float32.
+        max_steps: largest number of Newton steps.
     """
 
     solver: lx.AbstractLinearSolver = ConjugateResidual(rtol=1e-3)
@@ -60,7 +65,12 @@ class Newton(eqx.Module):
         require(self.max_steps >= 1, f"Newton's max_steps must be at least 1, got {self.max_steps}.")
 
     def __call__(self, problem: NewtonProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
-        """The solution, started from a guess [m/s], shape (n, d)."""
+        """The solution [m/s], shape (n, d), and the report of the solve.
+
+        Args:
+            problem: the problem.
+            guess: where the iteration starts [m/s], shape (n, d).
+        """
         rtol = default_rtol(guess.dtype) if self.rtol is None else self.rtol
         setting, start = _setting(problem, guess, rtol)
 
@@ -72,23 +82,23 @@ class Newton(eqx.Module):
 
 
 class _Setting(eqx.Module):
-    """What an iteration does not change."""
+    """The constants of an iteration."""
 
     problem: NewtonProblem
     rtol: Scalar
     mass: NodeVector
-    """Nodal masses, 1 in components that are not free: the weight of the norms of the stopping rule."""
+    """Nodal masses [kg], 1 in components that are not free: the weight of the norms in the termination rule."""
     scale: Float[Array, ""]
-    """‖b‖, b the right-hand side of the system linearised where nothing is displaced."""
+    """‖b‖, with b the right-hand side of the system linearised at zero displacement."""
     inertia: Float[Array, ""]
     """‖M ṽ‖."""
     undisplaced: NodeVector
     """The velocity at which nothing is displaced [m/s]."""
     startable: Bool[Array, ""]
-    """Whether the guess or rest has an energy."""
+    """Whether the potential is defined at the guess or at rest."""
 
     def residual(self, v: NodeVector) -> NodeVector:
-        """The momentum residual of what is free."""
+        """The momentum residual, zero in components that are held."""
         return self.problem.projection.combine(self.problem.momentum_residual(v), 0)
 
     def norm(self, r: NodeVector) -> Float[Array, ""]:
@@ -101,9 +111,9 @@ class _NewtonState(eqx.Module):
     r: NodeVector
     """The residual at v."""
     rounding: Float[Array, ""]
-    """Of ‖r‖."""
+    """The rounding of ‖r‖."""
     settled: Bool[Array, ""]
-    """Whether the last Newton step was whole, and too small to matter."""
+    """Whether the last Newton step was taken whole and was negligible."""
     iterations: Int[Array, ""]
     newton: Int[Array, ""]
     halvings: Int[Array, ""]
@@ -113,19 +123,19 @@ class _NewtonState(eqx.Module):
 
 
 class _Direction(eqx.Module):
-    """Along which a Newton step goes, and what its solve was like."""
+    """The direction of a Newton step, and the report of its linear solve."""
 
     value: NodeVector
     slope: Float[Array, ""]
-    """Of the potential along it."""
+    """Derivative of the potential along it."""
     whole: Bool[Array, ""]
-    """Whether it is Newton's, from a solve that converged."""
+    """Whether it is Newton's direction, from a solve that converged."""
     iterations: Int[Array, ""]
     indefinite: Bool[Array, ""]
 
 
 def _setting(problem: NewtonProblem, guess: NodeVector, rtol: Scalar) -> tuple[_Setting, _NewtonState]:
-    """What the iteration does not change, and where it starts."""
+    """The constants and the initial state of an iteration."""
     split, free = problem.projection.combine, problem.projection.free
     rest = split(0, problem.prescribed)
     start = problem.apply_dirichlet(guess)

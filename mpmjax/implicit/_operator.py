@@ -1,4 +1,4 @@
-"""The matrix of the implicit solves, M + cH on what is free, as a lineax operator."""
+"""The matrix of implicit solves, M + cH on free components, as a lineax operator."""
 
 import abc
 from typing import Any
@@ -14,11 +14,11 @@ from mpmjax.implicit._projection import Projection
 
 
 class AbstractSymmetricOperator(lx.AbstractLinearOperator):
-    """A symmetric operator on arrays of one shape, given by its products with them."""
+    """A symmetric operator on arrays of one shape, given by its products with vectors."""
 
     @abc.abstractmethod
     def is_positive_semidefinite(self) -> bool:
-        """Whether it is known to be positive semi-definite, which solvers such as `lineax.CG` require."""
+        """Whether the operator is known to be positive semi-definite, as solvers such as `lineax.CG` require."""
 
     @abc.abstractmethod
     def mv(self, vector: Array) -> Array:
@@ -44,8 +44,8 @@ class ImplicitOperator(AbstractSymmetricOperator):
     """Q (M + c H) Q + I − Q [kg], with c = βΔt² for the semi-implicit step (derivation, eq. 6 times m_i) and the square
     of its duration for a stage.
 
-    Q keeps what is free (see `Projection`). Rows of prescribed components and of empty nodes are those of the identity;
-    along a held normal stands the mass.
+    Q projects on free components (see `Projection`). Rows of prescribed components and of empty nodes are those of the
+    identity; along a held normal the operator is the mass.
     """
 
     mass: NodeScalar
@@ -68,15 +68,15 @@ class ImplicitOperator(AbstractSymmetricOperator):
         return split(self.unconstrained(split(vector, 0)), self.projection.identity_rows(vector, self.mass))
 
     def precomputed(self) -> "ImplicitOperator":
-        """The same operator, with one matrix a particle made once for many applications."""
+        """The same operator, with H as one matrix for each particle, computed once for many applications."""
         return eqx.tree_at(lambda o: o.hessian, self, self.hessian.precomputed())
 
     def nodal_mass(self) -> NodeVector:
-        """m_i [kg] for each component, shape (n, d)."""
+        """m_i [kg] in each component, shape (n, d)."""
         return jnp.broadcast_to(self.mass[:, None], self.projection.free.shape)
 
     def diagonal(self) -> NodeVector:
-        """m_i + c H_ii [kg], shape (n, d), negative parts of H left out (see `AssembledHessian.diagonal`)."""
+        """m_i + c H_ii [kg], shape (n, d), without negative parts of H (see `ParticleStiffness.diagonal`)."""
         mass = self.nodal_mass()
         return mass + self.factor * self.hessian.precomputed().diagonal(mass)
 

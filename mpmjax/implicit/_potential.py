@@ -1,5 +1,5 @@
-"""The elastic potential of the grid: energy, force and deformation as functions of nodal displacement; and what
-viscosity makes of nodal velocity."""
+"""The elastic potential of the grid: energy, force and deformation as functions of nodal displacement, and the viscous
+force as a function of nodal velocity."""
 
 from collections.abc import Callable
 
@@ -15,14 +15,14 @@ from mpmjax.material import AbstractMaterial
 from mpmjax.state import MaterialPoints
 
 Matrices = tuple[Float[Array, "_ _ ..."], ...]
-"""One entry for each material, shape (d, d, q), or (1, 1, q) where its law knows J alone."""
+"""One entry for each material, shape (d, d, q), or (1, 1, q) for a law of J alone."""
 
 
 class ElasticPotential(eqx.Module):
-    """Φ(u) = Σ_p V0_p Ψ(F_p + Σ_i u_i h_ipᵀ), for a displacement u of the nodes [m] from where they are now.
+    """Φ(u) = Σ_p V0_p Ψ(F_p + Σ_i u_i h_ipᵀ) for a displacement u of the nodes [m], shape (n, d), in the step.
 
-    h_ip is the material gradient: F_pᵀ ∇_x w_ip in the updated description, ∇_X w_ip in the total one. Every use of it
-    goes through `strain` and its transpose `divergence`, so that force and Hessian are the derivatives of Φ.
+    h_ip is the material gradient: F_pᵀ ∇_x w_ip in the updated description, ∇_X w_ip in the total one. It enters only
+    by `strain` and its transpose `divergence`, so that force and Hessian are derivatives of Φ.
     """
 
     material_points: tuple[MaterialPoints, ...]
@@ -30,7 +30,7 @@ class ElasticPotential(eqx.Module):
     mirror: Mirror
 
     def strain(self, u: NodeVector) -> Matrices:
-        """δF_p = Σ_i u_i h_ipᵀ, one array a material."""
+        """δF_p = Σ_i u_i h_ipᵀ, one array for each material."""
         return self.deformed(self._gradient(u))
 
     def deformed(self, gradient: Matrix) -> Matrices:
@@ -38,11 +38,11 @@ class ElasticPotential(eqx.Module):
         return tuple(c.deformed(c.own(gradient)) for c in self.material_points)
 
     def current_deformation(self) -> Matrices:
-        """F_p at u = 0, one array a material."""
+        """F_p at u = 0, one array for each material."""
         return tuple(c.F for c in self.material_points)
 
     def deformation(self, u: NodeVector) -> Matrices:
-        """F_p + δF_p at a nodal displacement u [m], shape (n, d), one array a material."""
+        """F_p + δF_p at a nodal displacement u [m], shape (n, d), one array for each material."""
         return tuple(F + dF for F, dF in zip(self.current_deformation(), self.strain(u), strict=True))
 
     def divergence(self, P: Matrices, like: NodeVector) -> NodeVector:
@@ -57,7 +57,7 @@ class ElasticPotential(eqx.Module):
         return sum(parts[1:], parts[0])
 
     def admissible_energy(self, u: NodeVector) -> Float[Array, ""]:
-        """Φ(u) [J], NaN where a law is not defined, whatever its formula gives there: not to be differentiated."""
+        """Φ(u) [J], NaN if a law does not admit the deformation. It must not be differentiated."""
         parts = [
             jnp.where(c.law.is_admissible(F), c.volume * c.law.energy(F), jnp.nan).sum()
             for c, F in zip(self.material_points, self.deformation(u), strict=True)
@@ -65,15 +65,15 @@ class ElasticPotential(eqx.Module):
         return sum(parts[1:], parts[0])
 
     def force(self, u: NodeVector) -> NodeVector:
-        """f = −∂Φ/∂u [N]: at u = 0 f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
+        """f = −∂Φ/∂u [N], shape (n, d). At u = 0, f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
         return -self.divergence(self._stress(self.deformation(u)), u)
 
     def current_force(self, like: NodeVector) -> NodeVector:
-        """The force at u = 0, without the gather."""
+        """f at u = 0, without the gather. `like` is any node vector."""
         return -self.divergence(self._stress(self.current_deformation()), like)
 
     def current_flux(self) -> Matrix:
-        """V0_p P_p F_pᵀ at u = 0 [J], shape (d, d, p): the force there is f_i = −Σ_p (V0_p P_p F_pᵀ) g_ip."""
+        """V0_p P_p F_pᵀ at u = 0 [J], shape (d, d, p), of which the force is f_i = −Σ_p (V0_p P_p F_pᵀ) g_ip."""
         return self._flux(self._stress(self.current_deformation()))
 
     @property
@@ -82,15 +82,16 @@ class ElasticPotential(eqx.Module):
         return any(c.viscosity is not None for c in self.material_points)
 
     def viscous_flux(self, gradient: Matrix) -> Matrix:
-        """The viscous counterpart of `current_flux` [J], at a velocity gradient of the particles [1/s], (d, d, p)."""
+        """The viscous `current_flux` [J] at a velocity gradient of the particles [1/s], both of shape (d, d, p)."""
         return _joined([c.damping_force(c.own(gradient)) for c in self.material_points])
 
     def damping_force(self, v: NodeVector) -> NodeVector:
-        """D v [N], minus the viscous force at a velocity of the nodes; D is symmetric and positive semi-definite."""
+        """D v [N], the negative of the viscous force at a nodal velocity v [m/s]. D is symmetric and positive
+        semi-definite."""
         return self.sum_of(self.viscous_flux(self._gradient(v)), v)
 
     def power(self, v: NodeVector) -> Float[Array, ""]:
-        """v·D v [W], the power that viscosity dissipates at a velocity of the nodes."""
+        """v·D v [W], the power that viscosity dissipates at a nodal velocity v [m/s]."""
         gradient = self._gradient(v)
         return (self.viscous_flux(gradient) * gradient).sum()
 
@@ -99,7 +100,7 @@ class ElasticPotential(eqx.Module):
         return self.mirror.fold(scatter(self.stencil, None, jnp.swapaxes(flux, 0, 1), like.shape[0]))
 
     def damping_matrices(self) -> Float[Array, "m m p"]:
-        """Each particle's part of D [J s], as `stiffness` has that of H."""
+        """The matrices of D [J s], one for each particle, shape (d², d², p), as `stiffness` has those of H."""
 
         def matrix(c: MaterialPoints) -> Array:
             like = jnp.zeros((self._dim, self._dim, *c.volume.shape), c.volume.dtype)
@@ -108,9 +109,14 @@ class ElasticPotential(eqx.Module):
         return _joined([matrix(c) for c in self.material_points])
 
     def stiffness(self, tangents: tuple[Callable[[Matrix], Matrix], ...]) -> Float[Array, "m m p"]:
-        """K_p [J], each particle's part of the Hessian Σ_p g_ip K_p g_jp: of the stress differentials δF ↦ A : δF, one
-        for each material, the symmetric maps from the components of the displacement's gradient, direction of the slope
-        first, to those of what the force is the sum of. Shape (d², d², p)."""
+        """The matrices K_p [J] of the Hessian Σ_p g_ip K_p g_jp, one for each particle, shape (d², d², p).
+
+        K_p maps the gradient of the displacement to the flux of which the force is the sum; both are flattened with the
+        direction of the derivative first.
+
+        Args:
+            tangents: for each material, the stress differential δF ↦ A : δF of its particles.
+        """
 
         def matrix(c: MaterialPoints, tangent: Callable[[Matrix], Matrix]) -> Array:
             def flux_of(slopes: Matrix) -> Matrix:
@@ -141,5 +147,5 @@ def _joined(parts: list[Array]) -> Array:
 
 @jax.jit
 def _stress(law: AbstractMaterial, F: Matrix) -> Matrix:
-    """The law's stress, compiled as one function wherever it is called, so that it is traced once."""
+    """The stress of a law, compiled as one function so that it is traced once."""
     return law.stress(F)

@@ -1,4 +1,4 @@
-"""The nodal problems of the implicit updates: linear ones, and those that Newton's method solves."""
+"""The nodal problems of implicit integrators: linear ones, and nonlinear ones for Newton's method."""
 
 import abc
 
@@ -15,8 +15,8 @@ from mpmjax.implicit._projection import Projection
 
 
 class AbstractProblem(eqx.Module):
-    """An equation residual(v) = 0 for a velocity v of the nodes [m/s], shape (n, d), the new one or that of a stage,
-    with a symmetric Jacobian. Held components take the value of `prescribed`."""
+    """An equation residual(v) = 0 with a symmetric Jacobian, for the nodes' velocity v [m/s] in a step or stage, shape
+    (n, d). Held components of v have the value of `prescribed`."""
 
     projection: eqx.AbstractVar[Projection]
     prescribed: eqx.AbstractVar[NodeVector]
@@ -24,18 +24,18 @@ class AbstractProblem(eqx.Module):
 
     @abc.abstractmethod
     def momentum_residual(self, v: NodeVector) -> NodeVector:
-        """The momentum [kg m/s] by which each node misses its equation; on held nodes, the impulse that holds them."""
+        """The residual of momentum at each node [kg m/s], shape (n, d); in held components, the impulse that holds."""
 
     @abc.abstractmethod
     def operator(self, v: NodeVector) -> ImplicitOperator:
-        """The derivative of the momentum residual at v, constrained."""
+        """The derivative of `residual` at v."""
 
     def residual(self, v: NodeVector) -> NodeVector:
-        """The momentum residual of what is free, the error of what is prescribed."""
+        """The momentum residual in free components, and v − prescribed in held ones."""
         return self.projection.combine(self.momentum_residual(v), v - self.prescribed)
 
     def apply_dirichlet(self, guess: NodeVector) -> NodeVector:
-        """The guess, with the prescribed values where they are held."""
+        """The guess, with the prescribed values in held components."""
         return self.projection.combine(guess, self.prescribed)
 
 
@@ -63,11 +63,11 @@ class LinearProblem(AbstractProblem):
 
 
 class NewtonProblem(AbstractProblem):
-    """M (v − ṽ) − c f(u + c v) = 0: a stage of duration c that starts at the displacement u. Backward Euler
+    """M (v − ṽ) − c f(u + c v) = 0, a stage of duration c that starts at the displacement u. Backward Euler
     (derivation, eq. 2) has c = Δt, u = 0, ṽ = v^n + Δt g.
 
-    It is the gradient of the incremental potential E(v) = ½ ‖v − ṽ‖²_M + Φ(u + c v), which falls in every step that the
-    line search accepts. Viscosity adds c D v to the one and ½ c v·D v to the other.
+    The left side is the gradient of the incremental potential E(v) = ½ ‖v − ṽ‖²_M + Φ(u + c v), which the line search
+    decreases in every step. Viscosity adds c D v to the equation and ½ c v·D v to the potential.
     """
 
     mass: NodeScalar
@@ -101,7 +101,7 @@ class NewtonProblem(AbstractProblem):
         return self._operator(self.hessian.exact(), v)
 
     def newton_operator(self, v: NodeVector) -> ImplicitOperator:
-        """What a Newton step from v solves: the operator, or with a projected Hessian a positive definite stand-in."""
+        """The matrix of a Newton step from v: the operator, approximated if the Hessian is approximate."""
         return self._operator(self.hessian, v)
 
     def _operator(self, hessian: AbstractHessian, v: NodeVector) -> ImplicitOperator:
@@ -118,13 +118,13 @@ class NewtonProblem(AbstractProblem):
     def unit_strain_velocity(self) -> Float[Array, ""]:
         """The velocity dx/c [m/s] that strains a cell by one in the stage.
 
-        Deformation gradients are of order one, and are rounded as such, however small the strains: so ε times this,
-        times the operator's diagonal, is the rounding of the momentum residual, and times itself that of the potential.
+        Deformation gradients are of order one, and rounded to ε, at the smallest strains too. With w this velocity and
+        A the diagonal of the operator, ε A w is the rounding of the momentum residual and ε A w² that of the potential.
         """
         return self.spacing / self.stage_dt
 
     def incremental_potential(self, v: NodeVector) -> Float[Array, ""]:
-        """E(v) [J], without the constant of what is held; NaN where a law is not defined."""
+        """E(v) [J] up to a constant, that of held components; NaN if a law does not admit the deformation."""
         free = self.projection.free
         inertia = 0.5 * jnp.where(free, self.mass[:, None] * (v - self.inertial) ** 2, 0).sum()
         if self.potential.viscous:

@@ -1,4 +1,4 @@
-"""What velocities a system is solved for, and what is prescribed of the rest."""
+"""The projection on the components of velocity that nothing holds."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -7,16 +7,16 @@ from mpmjax._types import Array, Mask, NodeScalar, NodeVector, Scalar
 
 
 class Projection(eqx.Module):
-    """The projection Q of node vectors on the components that nothing holds; at a node with a held normal n, on those
-    of them at right angles to it, I − n nᵀ.
+    """The projection Q of node vectors on the components that nothing holds. At a node with a held normal n it also
+    removes the normal component, I − n nᵀ.
 
-    Without normals it is a mask, and nothing else is compiled.
+    Without normals it is a mask.
     """
 
     free: Mask
-    """Components that nothing prescribes, shape (n, d)."""
+    """Whether nothing prescribes a component, shape (n, d)."""
     normal: NodeVector | None = None
-    """Held normals of length one, zero in components that are not free and where none is held, shape (n, d)."""
+    """Held unit normals, shape (n, d); zero in components that are not free, and at nodes without one."""
 
     def combine(self, a: NodeVector | Scalar, b: NodeVector | Scalar) -> NodeVector:
         """Q a + (I − Q) b."""
@@ -26,14 +26,15 @@ class Projection(eqx.Module):
         return jnp.where(self.free, a + self.normal * gap, b)
 
     def commuting_weight(self, weight: NodeVector) -> NodeVector:
-        """A positive diagonal weight, changed so that it commutes with Q: 1 on components that are not free, and at a
-        node with a held normal the mean over its components."""
+        """A positive diagonal weight made to commute with Q: 1 in components that are not free, and the mean over its
+        components at a node with a held normal."""
         if self.normal is not None:
             oblique = (self.normal != 0).any(axis=1, keepdims=True)
             weight = jnp.where(oblique, weight.mean(axis=1, keepdims=True), weight)
         return jnp.where(self.free, weight, 1)
 
     def identity_rows(self, vector: NodeVector, mass: NodeScalar) -> Array:
-        """What an operator has in the rows of I − Q: the vector, and along a held normal the vector times the node's
-        mass, so that in an inner product of the mass or more it is not enlarged, however little a node has."""
+        """The part of an operator's product outside of the range of Q: the vector itself, and along a held normal the
+        vector times the nodal mass. An inner product of the mass or more then does not enlarge it, at light nodes
+        too."""
         return vector if self.normal is None else jnp.where(self.free, mass[:, None], 1) * vector

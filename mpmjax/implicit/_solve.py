@@ -1,8 +1,7 @@
 """Solutions of nodal problems, with one derivative rule for all of them.
 
-Whatever iteration finds the solution v of residual(v) = 0, its derivative is that of the implicit function theorem,
-J δv = −δ(residual): one more solve with the same operator, forward or backward, so that no iteration is ever
-differentiated.
+The derivative of the solution v of residual(v) = 0 is that of the implicit function theorem, J δv = −δ(residual): one
+more solve with the same operator, in forward or reverse mode. Iterations are never differentiated.
 """
 
 from typing import Any
@@ -22,12 +21,12 @@ from mpmjax.implicit._solve_info import SolveInfo
 
 
 class Reporting(eqx.Module):
-    """The solver of tangent and adjoint systems, with a way to hear of those that did not converge.
+    """The solver of tangent and adjoint systems, with a report of the solves that did not converge.
 
-    Their residuals cannot be returned: they are computed where only derivatives are. So they are themselves given out
-    as derivatives, of zeros: the tangent of a solve's `report` in forward mode, the cotangent of `slot` in reverse mode
-    is the sum of the relative residuals of the solves that did not converge, infinite where one is not finite. As such
-    a solve gives NaN, and what is solved after it is not counted, that is the residual of the first.
+    These solves run inside of a derivative, so they can report only by derivatives of zeros: the tangent of `report` in
+    forward mode, and the cotangent of `slot` in reverse mode. Either is the sum of the relative residuals of solves
+    that did not converge, infinite if one is not finite. Such a solve gives NaN, and solves after it are not counted,
+    so the sum is the residual of the first.
     """
 
     solver: lx.AbstractLinearSolver
@@ -45,11 +44,11 @@ def solve(
 
     Args:
         problem: the problem.
-        guess: where the iteration starts [m/s], shape (n, d); the result does not depend on it beyond the tolerance,
-            nor its derivative.
+        guess: where the iteration starts [m/s], shape (n, d). Result and derivative depend on it only within the
+            tolerance.
         find: the iteration.
-        adjoint: solver of the tangent and adjoint systems. What ends beyond ten times its tolerance gives NaN
-            derivatives, so that a wrong gradient cannot pass for a right one.
+        adjoint: solver of the tangent and adjoint systems. A solve that ends beyond ten times its tolerance gives NaN,
+            so that a wrong gradient cannot pass for a right one.
     """
     if not isinstance(adjoint, Reporting):
         adjoint = Reporting(adjoint, jnp.zeros((), guess.dtype))

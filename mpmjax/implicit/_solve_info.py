@@ -1,4 +1,4 @@
-"""What the solution of a step's equations cost, and how good it is."""
+"""Cost and quality of the solution of a step's equations."""
 
 from typing import Any
 
@@ -9,30 +9,29 @@ from mpmjax._types import Array, Bool, Float, Int
 
 
 class SolveInfo(eqx.Module):
-    """What the solution of one step's equations cost, and how good it is."""
+    """Cost and quality of the solution of one step's equations."""
 
     iterations: Int[Array, "*f"]
-    """Iterations of the linear solver, over all Newton steps; 0 of a solver that states none."""
+    """Iterations of the linear solver, summed over Newton steps; 0 if the solver states none."""
     newton: Int[Array, "*f"]
     """Newton steps."""
     line_search: Int[Array, "*f"]
     """Halvings of a Newton step by the line search."""
     residual: Float[Array, "*f"]
-    """True relative residual at the end: of one linear solve in the norm of the inverse preconditioner, of Newton's
-    method in that of the inverse mass, and there relative to the momentum that the forces balance where their sum
+    """True relative residual at the end. For one linear solve it is in the norm of the inverse preconditioner; for
+    Newton's method in that of the inverse mass, and relative to the momentum of the balanced forces if their sum
     vanishes."""
     converged: Bool[Array, "*f"]
-    """Whether the solver's tolerance, or the precision's own limit, was met."""
+    """Whether the residual is within the solver's tolerance, or at the limit of the precision."""
     nearly_converged: Bool[Array, "*f"]
-    """Whether neither was, but ten times the tolerance."""
+    """Whether it is not, but within ten times the tolerance."""
     indefinite: Bool[Array, "*f"]
-    """Whether the solver met a direction of negative curvature: M + cH is indefinite, and the step may be near a
-    singular one."""
+    """Whether the solver met a direction of negative curvature. M + cH is then indefinite, and may be near singular."""
     report: Float[Array, "*f"]
     """Zero. Its tangent is the relative residual of the tangent solves that did not converge (see `Reporting`)."""
 
     def followed_by(self, later: "SolveInfo") -> "SolveInfo":
-        """The cost of two solves of one equation, and the quality of the later one."""
+        """The summed cost of two solves of one equation, and the quality of the later one."""
         return SolveInfo(
             iterations=self.iterations + later.iterations,
             newton=self.newton + later.newton,
@@ -45,7 +44,7 @@ class SolveInfo(eqx.Module):
         )
 
     def together_with(self, other: "SolveInfo") -> "SolveInfo":
-        """The cost of two solves, both of which are needed, and the quality of the worse one."""
+        """The summed cost of two solves that are both needed, and the quality of the worse one."""
         both = self.followed_by(other)
         converged = self.converged & other.converged
         usable = (self.converged | self.nearly_converged) & (other.converged | other.nearly_converged)
@@ -54,7 +53,7 @@ class SolveInfo(eqx.Module):
 
 
 def no_solve(dtype: Any) -> SolveInfo:
-    """Of an update that solves nothing."""
+    """The report of an update without a solve."""
     zero = jnp.asarray(0, dtype=jnp.int32)
     no, none = jnp.asarray(False), jnp.asarray(0, dtype=dtype)
     return SolveInfo(zero, zero, zero, none, converged=~no, nearly_converged=no, indefinite=no, report=none)

@@ -1,6 +1,6 @@
-"""Algebra of small matrices, component first, (d, d, p): what laws are written with.
+"""Algebra of small matrices for laws, component first, (d, d, p).
 
-Products, determinants, decompositions and functions of symmetric matrices. All but `symmetric_eigen` and
+Products, determinants, decompositions and functions of symmetric matrices. All of them except `symmetric_eigen` and
 `principal_frame` can be differentiated to every order, at repeated stretches and eigenvalues too.
 """
 

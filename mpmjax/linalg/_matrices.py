@@ -1,13 +1,13 @@
 """Small-matrix algebra by components: products, determinant, cofactor, the rotation of the polar decomposition, and
 the principal frame.
 
-Every matrix has shape (d, d, *batch), d = 1, 2 or 3, with its two matrix axes first, so that XLA sees plain
-elementwise arithmetic over the batch: on a CPU that is some twenty times faster than batched LAPACK or tiny
-`dot_general`s, and its derivatives are as cheap. A product is one multiplication and one sum over an axis, which XLA
-turns into vector instructions; assembled from components it would not be, and an explicit step would take a tenth to a
-third longer. Other expressions are unrolled over the components. `entries` splits a matrix in one operation: in reverse
-mode each indexed component would be added to a whole matrix of zeros. `assemble` stacks row by row: XLA does not fuse
-one stack of nine components with what computes them, which doubles the time of a Hessian's action.
+Every matrix has shape (d, d, *batch), d = 1, 2 or 3. With the matrix axes first, XLA sees elementwise arithmetic over
+the batch. On a CPU that is some twenty times faster than batched LAPACK or tiny `dot_general`s, and its derivatives are
+as cheap. A product is one multiplication and one sum over an axis, which XLA vectorises; it would not vectorise a
+product by components, and an explicit step would take a tenth to a third longer. Other expressions are unrolled over
+the components. `entries` splits a matrix in one operation, since in reverse mode each indexed component would be added
+to a whole matrix of zeros. `assemble` stacks row by row, since XLA does not fuse one stack of nine components with
+their computation, which doubles the time of a Hessian's action.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,12 +25,12 @@ _JACOBI_SWEEPS = {1: 0, 2: 1, 3: 4}  # by dimension: in 2-D one rotation is the 
 
 
 def assemble(rows: list[list[Array]]) -> Matrix:
-    """A matrix from its components, `rows[i][j]` having the shape of the batch."""
+    """The matrix with components `rows[i][j]`, each of the shape of the batch."""
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
 def entries(A: Float[Array, "a b *p"]) -> list[list[Array]]:
-    """The components of a matrix, `rows[i][j]` having the shape of the batch."""
+    """The components of a matrix as `rows[i][j]`, each of the shape of the batch."""
     a, b, *batch = A.shape
     flat = jnp.unstack(A.reshape(a * b, *batch))
     return [list(flat[i * b : (i + 1) * b]) for i in range(a)]
@@ -66,11 +66,12 @@ def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
 def matrix_of(linear: Callable[[Matrix], Matrix], like: Matrix) -> Float[Array, "m m *p"]:
     """The matrix of a symmetric linear map between d x d matrices, on their d² components in C order.
 
-    Row m, and so column m, is the image of the m-th unit matrix.
+    Row m, which equals column m, is the image of the m-th unit matrix.
 
     Args:
         linear: the map, from (d, d, *p) to (d, d, *p).
         like: any matrices of that shape.
+
     Returns:
         shape (d², d², *p).
     """
@@ -86,7 +87,7 @@ def trace(A: Matrix) -> Array:
 
 
 def double_dot(A: Float[Array, "a b *p"], B: Float[Array, "a b *p"]) -> Array:
-    """The Frobenius inner product A : B = Σ_ij A_ij B_ij of matrices of any one size, shape (*batch)."""
+    """The Frobenius inner product A : B = Σ_ij A_ij B_ij of matrices of equal size, shape (*batch)."""
     return _dot(*([entry for row in entries(M) for entry in row] for M in (A, B)))
 
 
@@ -97,7 +98,7 @@ def determinant(A: Matrix) -> Array:
 
 
 def cofactor(A: Matrix) -> Matrix:
-    """The cofactor matrix det(A) A⁻ᵀ = ∂ det A / ∂A, polynomial in A and so defined for singular A."""
+    """The cofactor matrix det(A) A⁻ᵀ = ∂ det A / ∂A. It is a polynomial in A, defined for singular A too."""
     return assemble(_cofactors(entries(A)))
 
 
@@ -125,7 +126,7 @@ def _cofactors(a: list[list[Array]]) -> list[list[Array]]:
 
 
 def _cross_cofactors(a: list[list[Array]], b: list[list[Array]]) -> list[list[Array]]:
-    """In 3-D, the bilinear form whose value at (A, A) is the cofactor matrix of A."""
+    """The bilinear form in 3-D whose value at (A, A) is the cofactor matrix of A."""
 
     def minor(i: int, j: int) -> Array:
         i1, i2, j1, j2 = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
@@ -137,14 +138,15 @@ def _cross_cofactors(a: list[list[Array]], b: list[list[Array]]) -> list[list[Ar
 def symmetric_eigen(S: Matrix) -> tuple[Array, Matrix]:
     """The eigenvalues w of a symmetric matrix, in no order, and a rotation V of eigenvectors: S = V diag(w) Vᵀ.
 
-    Jacobi's cyclic method (G. H. Golub, C. F. Van Loan, Matrix Computations, 4th ed., 2013, section 8.5), in 2-D one
-    rotation and exact. Accurate to rounding of ‖S‖ for all eigenvalues, repeated ones included. Only the upper
-    triangle is read.
+    Jacobi's cyclic method (G. H. Golub, C. F. Van Loan, Matrix Computations, 4th ed., 2013, section 8.5), which in 2-D
+    is one exact rotation. All eigenvalues are accurate to rounding of ‖S‖, repeated ones too. Only the upper triangle
+    is read.
 
-    *When it breaks*: it must not be differentiated: V is not a differentiable function where eigenvalues coincide.
+    *When it breaks*: it must not be differentiated, since V is not differentiable where eigenvalues coincide.
 
     Args:
         S: shape (d, d, *batch).
+
     Returns:
         w, shape (d, *batch), and V, shape (d, d, *batch), det V = +1.
     """
@@ -180,15 +182,16 @@ def pairs(d: int) -> list[tuple[int, int]]:
 def principal_frame(F: Matrix) -> tuple[Matrix, Array, Matrix]:
     """F = U diag(s) Vᵀ with rotations U and V: the singular value decomposition with signed stretches.
 
-    R = `rotation(F)` and the eigenvectors V of S = RᵀF, U = R V. Where det F < 0 one stretch is negative, the smallest
-    in magnitude, so that s_i + s_j ≥ 0 for i ≠ j. The stretches come in no order. In 1-D U = V = 1 and s = F.
+    V are the eigenvectors of S = RᵀF with R = `rotation(F)`, and U = R V. If det F < 0, the stretch that is smallest in
+    magnitude is negative, so that s_i + s_j ≥ 0 for i ≠ j. The stretches have no order. In 1-D U = V = 1 and s = F.
 
-    *When it breaks*: it must not be differentiated, and says so: the frame is not a function of F where stretches
-    coincide, F = I for one. An isotropic function of F still has a derivative there: give that function a rule of its
-    own, in terms of this frame.
+    *When it breaks*: differentiating it raises, since the frame is not unique where stretches coincide, as at F = I. An
+    isotropic function of F has a derivative there nevertheless: give that function a derivative rule of its own, in
+    terms of this frame.
 
     Args:
         F: shape (d, d, *batch).
+
     Returns:
         U, shape (d, d, *batch), s, shape (d, *batch), and V, shape (d, d, *batch).
     """
@@ -199,7 +202,7 @@ def principal_frame(F: Matrix) -> tuple[Matrix, Array, Matrix]:
 
 
 def principal_modes(U: Matrix, V: Matrix) -> Float[Array, "m d d *p"]:
-    """An orthonormal basis of the d x d matrices in the frame: scalings, twists, flips, shape (d², d, d, *batch).
+    """An orthonormal basis of the d x d matrices in a frame: scalings, twists, flips, shape (d², d, d, *batch).
 
     With u_i, v_j the columns of U and V: u_i v_iᵀ for each direction, then (u_i v_jᵀ − u_j v_iᵀ)/√2 for each pair
     i < j, then (u_i v_jᵀ + u_j v_iᵀ)/√2.
@@ -225,23 +228,24 @@ def _principal_frame_jvp(primals: Any, tangents: Any) -> Any:
 def rotation(F: Matrix) -> Matrix:
     """The rotation R of the polar decomposition F = R S, with det R = +1.
 
-    R maximises tr(RᵀF) over the rotations. S = RᵀF is symmetric; where det F < 0 it is indefinite, its smallest
+    R maximises tr(RᵀF) over the rotations. S = RᵀF is symmetric. If det F < 0 it is indefinite, with its smallest
     principal stretch negative. In 1-D R = 1.
 
-    2-D: the closed form. 3-D: λ = tr S is the largest root of (λ² − ‖F‖²)² − 8 det(F) λ − 4 ‖cof F‖², the
-    characteristic polynomial of a symmetric 4 x 4 matrix K linear in F, whose eigenvector is the rotation's quaternion
-    (N. J. Higham, V. Noferini, Numer. Algorithms 73 (2016) 349, doi 10.1007/s11075-016-0098-7). Newton's method finds
-    λ, a column of adj(K − λI) the quaternion, and Newton steps of the derivation's eq. 12 refine it. It is
-    normalised, so the result is a rotation to rounding whatever F is.
+    In 2-D R is in closed form. In 3-D λ = tr S is the largest root of (λ² − ‖F‖²)² − 8 det(F) λ − 4 ‖cof F‖², the
+    characteristic polynomial of a symmetric 4 x 4 matrix K linear in F, whose eigenvector is the quaternion of R
+    (N. J. Higham, V. Noferini, Numer. Algorithms 73 (2016) 349, doi 10.1007/s11075-016-0098-7). λ is found by Newton's
+    method, and the quaternion as a column of adj(K − λI), which Newton steps of the derivation's eq. 12 refine. It is
+    normalised, so the result is a rotation to rounding for every F.
 
-    The derivative is that of `rotation_differential`, not of the iterations, and so finite at F = I and at repeated
+    The derivative is `rotation_differential`, not that of the iterations. It is finite at F = I and at repeated
     stretches, to every order.
 
-    *When it breaks*: where two signed principal stretches sum to zero R is not unique, and one of the maximisers is
-    returned. Near there its error grows like rounding over that sum, its derivative like the sum's inverse.
+    *When it breaks*: where two signed principal stretches sum to zero, R is not unique, and one of the maximisers is
+    returned. Near there the error grows like rounding over that sum, and the derivative like its inverse.
 
     Args:
         F: shape (d, d, *batch).
+
     Returns:
         R, same shape.
     """
@@ -267,9 +271,10 @@ def spin_compliance(S: Matrix) -> Compliance:
 
     Args:
         S: the stretch RᵀF, shape (d, d, *batch).
+
     Returns:
-        in 3-D shape (3, 3, *batch); in 2-D 1/tr S, shape (1, 1, *batch); in 1-D, where nothing turns, zero, shape
-        (1, 1, *batch).
+        shape (3, 3, *batch) in 3-D; 1/tr S, shape (1, 1, *batch), in 2-D; zero, shape (1, 1, *batch), in 1-D, where
+        nothing rotates.
     """
     match S.shape[0]:
         case 1:
@@ -336,7 +341,7 @@ def _rotation_3d(F: Matrix) -> Matrix:
 
 
 def _largest_root(F: Matrix) -> Array:
-    """tr S for ‖F‖ = 1, by Newton's method from √3 ≥ tr S, where it is monotone until rounding stops it."""
+    """tr S for ‖F‖ = 1, by Newton's method from √3 ≥ tr S, from where it falls monotonically until rounding."""
     cof = cofactor(F)
     J, cof2 = determinant(F), double_dot(cof, cof)
 

@@ -1,17 +1,17 @@
 """Functions of symmetric matrices, f(S) = V diag(f(s)) Vᵀ for S = V diag(s) Vᵀ: the logarithm, powers.
 
-The eigenvectors V have no derivative where eigenvalues coincide (F = I, the first step of every scene), so the
-derivatives of f(S) are written in divided differences of f, which are finite there: with A and B in the frame V,
+The eigenvectors V have no derivative where eigenvalues coincide, as at F = I in the first step of every scene. So the
+derivatives of f(S) are written with divided differences of f, which are finite there. With A and B in the frame V,
 
     (Df[A])_ij = f[s_i, s_j] A_ij,
     (D²f[A, B])_ij = Σ_k f[s_i, s_k, s_j] (A_ik B_kj + B_ik A_kj),
 
 and so on: Dⁿf is the sum over all orders of its n directions (J. L. Daleckii, S. G. Krein; N. J. Higham, Functions of
-Matrices, SIAM 2008, theorem 3.11 and its proof, doi 10.1137/1.9780898717778). The derivative of each is the next, and
-the adjoint of each is itself, so derivatives of any order and mode hold at every S. The derivative in a parameter of f
-is again a function of S in this frame.
+Matrices, SIAM 2008, theorem 3.11 and its proof, doi 10.1137/1.9780898717778). The derivative of each is the next one,
+and each is its own adjoint, so derivatives of any order and mode are right at every S. The derivative with respect to a
+parameter of f is again a function of S in this frame.
 
-Each function computes the frame; XLA merges equal computations, so that several functions of one S cost one frame.
+Each function computes the frame. XLA merges equal computations, so several functions of one S compute it once.
 """
 
 import abc
@@ -33,7 +33,7 @@ Frame = tuple[Array, Matrix]
 """Eigenvalues and eigenvectors, (d, *batch) and (d, d, *batch)."""
 
 _CLOSE = 0.01
-"""Relative to the sum of the outer two: three or more eigenvalues closer than this have their divided difference by a
+"""Relative to the sum of the outer two: the divided difference of three or more eigenvalues closer than this is a
 series. Elsewhere it is a quotient of differences, with an error of rounding over this."""
 _TERMS = 6
 """Terms of the series after the first; the remainder is of the order 1e-12."""
@@ -55,7 +55,7 @@ class AbstractSpectral(eqx.Module):
         """f⁽ⁿ⁾(s)/n! for n = `order` ≥ 2."""
 
     def alike(self, low: Array, high: Array) -> Bool[Array, "..."]:
-        """Whether f is smooth between two eigenvalues."""
+        """Whether f is smooth between two eigenvalues. Default: true."""
         return jnp.full(jnp.broadcast_shapes(low.shape, high.shape), True)
 
     def __call__(self, S: Matrix) -> Matrix:
@@ -85,7 +85,7 @@ class Logarithm(AbstractSpectral):
 
 
 class PowerLessOne(AbstractSpectral):
-    """eᶜ Sᵃ − I of positive definite S: exactly zero for a = c = 0, and of full relative precision near there."""
+    """eᶜ Sᵃ − I of positive definite S. It is zero for a = c = 0, and of full relative precision near there."""
 
     exponent: Array
     """a [-], shape (*batch)."""
@@ -97,7 +97,7 @@ class PowerLessOne(AbstractSpectral):
         return jnp.expm1(self.exponent * jnp.log(s) + self.shift)
 
     def slope(self, a: Array, b: Array) -> Array:
-        """eᶜ (b^n − a^n)/(b − a), n the exponent."""
+        """eᶜ (bⁿ − aⁿ)/(b − a), with n the exponent."""
         gap = (b - a) / a
         ratio = jnp.expm1(self.exponent * jnp.log1p(gap)) / jnp.where(gap == 0, 1, gap)
         return self._power(a) * jnp.where(gap == 0, self.exponent, ratio) / a
@@ -111,7 +111,7 @@ class PowerLessOne(AbstractSpectral):
 
 
 class _Partial(AbstractSpectral):
-    """The derivative of f by one of its parameters, a function of the same eigenvalue."""
+    """The derivative of f with respect to one of its parameters, a function of the same eigenvalue."""
 
     function: AbstractSpectral
     parameter: int = eqx.field(static=True)
@@ -137,7 +137,7 @@ class _Partial(AbstractSpectral):
 
 @ruled
 def _differential(f: AbstractSpectral, S: Matrix, frame: Frame, directions: tuple[Matrix, ...]) -> Matrix:
-    """Dⁿf(S)[A, B, ...] in n directions. The value is computed from the frame, and differentiated by S."""
+    """Dⁿf(S)[A, B, ...] in n directions. It is computed from the frame, and differentiated with respect to S."""
     del S
     s, V = frame
     order = len(directions)

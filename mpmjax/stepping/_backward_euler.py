@@ -23,19 +23,22 @@ from mpmjax.stepping._stage import Stage
 
 
 class BackwardEuler(AbstractImplicitIntegrator):
-    """Backward Euler: M (v^{n+1} − v^n) = Δt f(Δt v^{n+1}) + Δt M g (derivation, eq. 2), by Newton's method.
+    """Backward Euler by Newton's method: M (v^{n+1} − v^n) = Δt f(Δt v^{n+1}) + Δt M g (derivation, eq. 2).
 
-    First order in time, strongly damping; no linearisation error, so it holds where one linear solve does not.
+    First order in time, and strongly damping. It has no linearisation error, so it holds at large strains in a step,
+    where one linear solve does not.
 
-    *When it breaks*: where the incremental potential has several stationary points (steps that compress material to a
-    fraction of itself make H indefinite), Newton finds one of them, not always the one a smaller step would lead to.
+    *When it breaks*: steps that compress material to a fraction of itself make H indefinite. The incremental potential
+    then has several stationary points, and Newton's method finds one of them, which is not always the one that smaller
+    steps lead to.
 
     Args:
-        solution: `Newton()`, with its tolerances.
-        hessian: how H acts. Default: by the analytic stress differential.
-        preconditioner: of the linear solves. Default: the diagonal of M + cH.
-        adjoint_solver: of the tangent and adjoint solves, any symmetric one. Default: `ConjugateResidual`.
-        guess: where Newton starts.
+        solution: Newton's method, with its linear solver and tolerances.
+        hessian: the Hessian H of the elastic energy. Default: by the analytic stress differential.
+        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + cH.
+        adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. Its tolerance
+            bounds that of the gradient.
+        guess: where Newton's method starts. Default: the velocity of the nodes v^n.
     """
 
     solution: Newton = Newton()

@@ -1,4 +1,4 @@
-"""The explicit step."""
+"""The explicit integrator."""
 
 from typing import ClassVar
 
@@ -11,12 +11,13 @@ from mpmjax.stepping._nodes import Nodes
 
 
 class Explicit(AbstractIntegrator):
-    """Symplectic Euler: v^{n+1} = v* (derivation, eq. 4); positions then move with v^{n+1}.
+    """Symplectic Euler: v^{n+1} = v* = v^n + Δt (g + f/m) (derivation, eq. 4). Positions move with v^{n+1}.
 
-    Second order in space with APIC and FLIP, first order in time. Conserves linear and, with APIC, angular momentum.
+    First order in time; second order in space with APIC and FLIP. It conserves linear momentum, and with APIC angular
+    momentum too.
 
-    *When it breaks*: above Δt of about 0.4 to 1 times dx/c, depending on dimension, kernel and transfer
-    (c the pressure-wave speed of the *current* tangent, which stretching and compression raise): see `stable_dt`.
+    *When it breaks*: above a Δt of about 0.4 to 1 times dx/c, depending on dimension, kernel and transfer. c is the
+    pressure-wave speed of the *current* tangent, which stretching and compression raise. `stable_dt` gives the limit.
     """
 
     is_explicit: ClassVar[bool] = True

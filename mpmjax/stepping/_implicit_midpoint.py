@@ -24,25 +24,29 @@ from mpmjax.stepping._stage import Stage, stage_force
 
 
 class ImplicitMidpoint(AbstractImplicitIntegrator):
-    """The implicit midpoint rule: M (v^{n+1} − v^n) = Δt f(½Δt v̄) + Δt M g with v̄ = ½(v^n + v^{n+1}), positions and
-    deformation moving with v̄.
+    """The implicit midpoint rule: M (v^{n+1} − v^n) = Δt f(½Δt v̄) + Δt M g with v̄ = ½(v^n + v^{n+1})
+    (E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration, 2nd ed. 2006, II.1).
 
-    By one linear solve, (M + ¼Δt²H) v̄ = M v^n + ½Δt (f + M g), at the cost of `SemiImplicit`; or by Newton's method.
-    Second order in time either way, but for one solve with a projected Hessian, which is another equation. On a mode of
-    any frequency |λ| = 1 at every Δt: stable, and nothing is dissipated but by the transfers; a mode that Δt does not
-    resolve is slowed down, at most to a period of 2Δt, and not damped. Body forces are taken at the middle of the step.
-    *When it breaks*: as the semi-implicit step: one solve at large strains in a step; compression, at twice the Δt at
-    which β = 1 does. Newton's line search keeps the middle of the step admissible, not its end. What rings unresolved
-    (an impact, a start under load at a large Δt) rings on: `TRBDF2` damps it.
-    *Good values*: Δt that resolves the motion of interest, tens of steps a period, whatever the explicit limit.
-    (E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration, 2nd ed. 2006, II.1.)
+    Positions and deformation move with v̄; body forces are taken at the middle of the step. `Linearised()` solves
+    (M + ¼Δt²H) v̄ = M v^n + ½Δt (f + M g), at the cost of `SemiImplicit`; `Newton()` solves the nonlinear equation.
+
+    Second order in time with either, except for one linear solve with a projected Hessian, which solves another
+    equation. Stable at every Δt: a mode of any frequency has |λ| = 1, so that only the transfers dissipate energy. A
+    mode that Δt does not resolve is not damped but slowed down: its period is at least 2Δt.
+
+    *When it breaks*: as `SemiImplicit`. One linear solve fails at large strains in a step, and under compression at
+    twice the Δt at which β = 1 does. The line search of Newton's method keeps the middle of the step admissible, not
+    its end. Unresolved oscillations (from an impact, or a start under load at a large Δt) go on; `TRBDF2` damps them.
+
+    *Good values*: a Δt that resolves the motion of interest, tens of steps a period, whatever the explicit limit.
 
     Args:
-        solution: `Linearised()`, one linear solve, or `Newton()`.
-        hessian: how H acts. Default: by the analytic stress differential.
-        preconditioner: of the linear solves. Default: the diagonal of M + cH.
-        adjoint_solver: of the tangent and adjoint solves, any symmetric one. Default: `ConjugateResidual`.
-        guess: where the solve starts.
+        solution: `Linearised()` for one linear solve, or `Newton()`.
+        hessian: the Hessian H of the elastic energy. Default: by the analytic stress differential.
+        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + cH.
+        adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. Its tolerance
+            bounds that of the gradient.
+        guess: where the solve starts. Default: the velocity of the nodes v^n.
     """
 
     solution: Linearised | Newton = Linearised()

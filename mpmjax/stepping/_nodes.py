@@ -1,4 +1,4 @@
-"""The grid's side of a step: what the particles bring to the nodes, and what the nodes' new velocity is made from."""
+"""The nodes at the start of a step: mass, velocity and force from P2G, boundaries, and the elastic potential."""
 
 from collections.abc import Callable
 
@@ -13,45 +13,45 @@ from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.state import Particles, Scene
 
 Fold = Callable[[NodeVector], NodeVector]
-"""The sum of a nodal vector with its images at mirrors."""
+"""A map from a nodal vector to its sum with its images at mirrors."""
 
 _PARALLEL = 1e-2  # a normal whose part in free components is smaller is prescribed by the others
 
 
 class FreeNormal(eqx.Module):
-    """The part of the colliders' normals in the components that nothing prescribes."""
+    """The part of the colliders' normals in free components."""
 
     direction: NodeVector
-    """The unit vector along it, shape (n, d); zero where there is none."""
+    """Unit vector along that part, shape (n, d); zero where there is none."""
     length: NodeScalar
-    """Its length [-], shape (n,); 1 where there is none."""
+    """Length of that part [-], shape (n,); 1 where there is none."""
     speed: NodeScalar
-    """The velocity along it [m/s] with which the whole normal component is the collider's, shape (n,)."""
+    """Velocity along it [m/s], shape (n,), at which the whole normal velocity is that of the collider."""
 
 
 class SeparateSums(eqx.Module):
-    """What P2G gives when it sums momentum and force apart."""
+    """The result of P2G that sums momentum and force separately."""
 
     velocity: NodeVector
     """v_i^n [m/s], shape (n, d); zero on empty nodes."""
     force: NodeVector
-    """The internal force at the start of the step [N], shape (n, d): of elasticity, and of viscosity for integrators in
-    which that is explicit."""
+    """Internal force at the start of the step [N], shape (n, d): the elastic one, and for integrators with explicit
+    viscosity the viscous one."""
     viscous_force: NodeVector | None
-    """The part of `force` that is viscous [N], shape (n, d), where it was asked for."""
+    """The viscous part of `force` [N], shape (n, d); None unless it was asked for."""
 
     def explicit_velocity(self, nodes: "Nodes") -> NodeVector:
         """v^n + Δt g + Δt f/m [m/s], shape (n, d)."""
         return nodes.inertial_velocity() + nodes.dt * nodes.per_mass(self.force)
 
     def folded(self, velocity: Fold, force: Fold) -> "SeparateSums":
-        """With velocities and forces folded at mirrors."""
+        """The same, with velocities and forces folded at mirrors."""
         viscous = None if self.viscous_force is None else force(self.viscous_force)
         return SeparateSums(velocity(self.velocity), force(self.force), viscous)
 
 
 class JoinedSum(eqx.Module):
-    """What P2G gives when it adds the impulse of the force to the momentum in one sum, at half the cost."""
+    """The result of P2G that adds the impulse of the force to the momentum in one sum, at half the cost."""
 
     velocity_with_force: NodeVector
     """v^n + Δt f/m [m/s], shape (n, d); zero on empty nodes."""
@@ -61,20 +61,20 @@ class JoinedSum(eqx.Module):
         return self.velocity_with_force + nodes.dt * nodes.acceleration
 
     def folded(self, velocity: Fold, force: Fold) -> "JoinedSum":
-        """With velocities and forces folded at mirrors."""
+        """The same, with velocities and forces folded at mirrors."""
         del force
         return JoinedSum(velocity(self.velocity_with_force))
 
 
 class Nodes(AbstractNodes):
-    """What an integrator is given: the nodes at the start of a step, with the step and the boundaries."""
+    """The nodes at the start of a step, with the step and the boundaries: the input of an integrator."""
 
     mass: NodeScalar
-    """m_i [kg], shape (n,), folded at symmetry planes; zero on empty nodes, whose mass is but rounding."""
+    """m_i [kg], shape (n,), folded at symmetry planes; zero on empty nodes, whose mass is only rounding."""
     sums: SeparateSums | JoinedSum
-    """What P2G summed besides the mass."""
+    """The sums of P2G besides the mass."""
     occupied: Bool[Array, "n 1"]
-    """Whether the node has mass beyond rounding, that of the lightest particle, shape (n, 1)."""
+    """Whether a node has more mass than the rounding of the lightest particle's, shape (n, 1)."""
     acceleration: Array
     """Body acceleration g [m/s²], shape (d,), or (n, d) where it varies."""
     dt: Float[Array, ""]
@@ -82,18 +82,18 @@ class Nodes(AbstractNodes):
     spacing: Float[Array, ""]
     """dx [m]."""
     potential: ElasticPotential
-    """Φ, of nodal displacements."""
+    """Φ, a function of nodal displacements."""
     conditions: Conditions
-    """What the boundaries prescribe."""
+    """The conditions that the boundaries prescribe."""
     contacts: tuple[AbstractContact, ...] = ()
-    """The boundaries that may be left, of which none holds anything here."""
+    """The contacts of the scene; none of them is active here."""
 
     @property
     def velocity(self) -> NodeVector:
         """v_i^n [m/s], shape (n, d); zero on empty nodes.
 
         Raises:
-            ValueError: P2G summed momentum and force in one.
+            ValueError: P2G summed momentum and force together.
         """
         return self._separate.velocity
 
@@ -102,18 +102,18 @@ class Nodes(AbstractNodes):
         """The internal force at the start of the step [N], shape (n, d).
 
         Raises:
-            ValueError: P2G summed momentum and force in one.
+            ValueError: P2G summed momentum and force together.
         """
         return self._separate.force
 
     @property
     def viscous_force(self) -> NodeVector | None:
-        """The part of `force` that is viscous [N], shape (n, d); None where it was not asked for."""
+        """The viscous part of `force` [N], shape (n, d); None unless it was asked for."""
         return None if isinstance(self.sums, JoinedSum) else self.sums.viscous_force
 
     @property
     def separate(self) -> bool:
-        """Whether v^n and the force are known apart."""
+        """Whether v^n and the force are known separately."""
         return not isinstance(self.sums, JoinedSum)
 
     @property
@@ -127,20 +127,19 @@ class Nodes(AbstractNodes):
 
     @property
     def free(self) -> Mask:
-        """The components that nothing prescribes, on nodes that have mass."""
+        """Whether a component is not prescribed, and its node has mass, shape (n, d)."""
         return self.occupied & ~self.conditions.fixed
 
     @property
     def mirror(self) -> Mirror:
-        """The mirror images of symmetry planes, and of the columns of contact planes that are held."""
+        """The mirror images of symmetry planes, and of the active columns of contact planes."""
         return self.potential.mirror
 
     @property
     def free_normal(self) -> FreeNormal | None:
-        """The colliders' normals, held or not, as far as they ask for more than the prescribed components give; None
-        without colliders.
+        """The part of the colliders' normals in free components, held or not; None without colliders.
 
-        With components a prescribed, n·v = n·v_c says Σ_free n v = n·v_c − Σ_a n_a v_a.
+        With components a prescribed, n·v = n·v_c becomes Σ_free n v = n·v_c − Σ_a n_a v_a.
         """
         colliders = self.conditions.colliders
         if colliders is None:
@@ -158,7 +157,7 @@ class Nodes(AbstractNodes):
 
     @property
     def projection(self) -> Projection:
-        """The projection on what nothing holds."""
+        """The projection on the components of velocity that nothing holds."""
         colliders, part = self.conditions.colliders, self.free_normal
         if colliders is None or part is None:
             return Projection(self.free)
@@ -166,7 +165,7 @@ class Nodes(AbstractNodes):
 
     @property
     def prescribed(self) -> NodeVector:
-        """The velocity of the components that are held [m/s], shape (n, d)."""
+        """The velocity of held components [m/s], shape (n, d)."""
         part = self.free_normal
         if part is None:
             return self.conditions.velocity
@@ -181,7 +180,7 @@ class Nodes(AbstractNodes):
         return jnp.where(self.occupied, self.velocity + self.dt * self.acceleration, 0)
 
     def admitted_velocity(self) -> NodeVector:
-        """v^n with the prescribed components [m/s], shape (n, d): what a wall will hold stops as the step begins."""
+        """v^n with the prescribed values in held components [m/s], shape (n, d)."""
         return self.projection.combine(self.velocity, self.prescribed)
 
     def per_mass(self, impulse: NodeVector) -> NodeVector:
@@ -189,9 +188,9 @@ class Nodes(AbstractNodes):
         return jnp.where(self.occupied, impulse / jnp.where(self.occupied, self.mass[:, None], 1), 0)
 
     def folded(self, images: Mirror) -> "Nodes":
-        """The true nodes of mirror planes, with what their images received. Nothing changes without a plane.
+        """The nodes with the sums of their images at mirror planes added; the same nodes without a plane.
 
-        A force is folded like the momentum it makes: a plane's mirror image is pulled the other way.
+        A force is folded as the momentum that it makes is.
         """
         if not images.images:
             return self
@@ -209,7 +208,7 @@ class Nodes(AbstractNodes):
         return eqx.tree_at(lambda n: (n.sums, n.acceleration), nodes, parts)
 
     def constrained(self, images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None) -> "Nodes":
-        """These nodes folded on the mirrors, with the components `fixed` and the `normals` held too."""
+        """The nodes folded at these mirrors, with the components `fixed` and the `normals` held too."""
         nodes, colliders = (
             eqx.tree_at(lambda n: n.conditions.fixed, self.folded(images), fixed),
             self.conditions.colliders,
@@ -238,13 +237,12 @@ def particles_to_grid(
         particles: prepared particles.
         t: time at the start of the step [s].
         dt: step [s].
-        stencil: that of the particles.
-        body_force_at: when body forces are taken, as a fraction of the step from its start, at positions moved on with
-            the particles' velocity until then.
-        explicit_viscosity: whether the viscous stress of the particles' stored velocity gradients is part of the force.
-        joined: whether momentum and force may be summed in one, which is done where both have the same gradient
-            operator.
-        viscosity_apart: whether the viscous part of the force is also wanted for itself.
+        stencil: stencil of the particles.
+        body_force_at: the time at which body forces are evaluated, as a fraction of the step. Positions are moved on to
+            it with the particles' velocity.
+        explicit_viscosity: whether the force includes the viscous stress, at the particles' stored velocity gradients.
+        joined: whether momentum and force may be summed together. They are if both have the same gradient operator.
+        viscosity_apart: whether to compute the viscous part of the force separately too.
     """
     grid, window = scene.grid, scene.window(particles)
     v = components(particles.v)
@@ -297,7 +295,6 @@ def particles_to_grid(
 
 
 def _place(particles: Particles, stencil: Stencil, size: int) -> NodeVector:
-    """The current positions of reference nodes times their mass, Σ_p w_ip m_p (x_p + F_p (X_i − X_p)) [kg m], shape (n,
-    d)."""
+    """Current positions of reference nodes times their mass, Σ_p w_ip m_p (x_p + F_p (X_i − X_p)) [kg m], (n, d)."""
     F = jnp.concatenate([components(group) for group in jax.tree.leaves(particles.F)], axis=-1)
     return p2g(stencil, particles.mass, components(particles.x), F, size)[1]

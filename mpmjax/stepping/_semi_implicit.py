@@ -25,26 +25,30 @@ from mpmjax.stepping._nodes import Nodes
 
 
 class SemiImplicit(AbstractImplicitIntegrator):
-    """The semi-implicit update: (M + βΔt²H) v^{n+1} = M v*, force and H at the start of the step (derivation, eqs. 3,
-    6); with viscosity (M + βΔt D + βΔt²H) v^{n+1} = M v* − (1 − β) Δt D v^n.
+    """The semi-implicit update by one linear solve: (M + βΔt²H) v^{n+1} = M v* (derivation, eqs. 3, 6).
 
-    First order in time. On a mode of frequency ω the amplification is (1 + βz)^(−½) with z = (ωΔt)² while
-    z < 4/(1−β)²: stable for every Δt if β ≥ ½, else for z ≤ 4/(1−2β). β = 0 is the explicit step; β = 1 one Newton step
-    of backward Euler. β = ½ is *not* the trapezoidal rule, positions moving with v^{n+1}: for β > 0 motion is damped,
-    by a quarter in one period of a standing wave at the explicit limit. A method for slow, driven and overdamped
-    motion; `ImplicitMidpoint` costs as much and follows motion in time.
-    *When it breaks*: large strains within one step (the system is linearised once), and where compression makes H
-    indefinite and Δt brings M + βΔt²H near singular: `AnalyticHessian(projected=True)` holds there.
-    *Good values*: β = 1 with Δt up to some hundred times the explicit limit for quasi-static pulls.
+    The force and H are those at the start of the step. With viscosity the system is
+    (M + βΔt D + βΔt²H) v^{n+1} = M v* − (1 − β) Δt D v^n.
+
+    First order in time. A mode of frequency ω is amplified by (1 + βz)^(−½), z = (ωΔt)², as long as z < 4/(1−β)². So
+    the update is stable at every Δt if β ≥ ½, and for z ≤ 4/(1−2β) otherwise. β = 0 is the explicit step, and β = 1 one
+    Newton step of backward Euler. β = ½ is *not* the trapezoidal rule, since positions move with v^{n+1}. Every β > 0
+    damps motion: a standing wave at the explicit limit, by a quarter in one period. The method suits slow, driven and
+    overdamped motion; `ImplicitMidpoint` costs as much and follows motion in time.
+
+    *When it breaks*: at large strains within one step, since the system is linearised once; and where compression makes
+    H indefinite and Δt brings M + βΔt²H near singular. `AnalyticHessian(projected=True)` holds in the latter case.
+
+    *Good values*: for quasi-static pulls, β = 1 with Δt up to some hundred times the explicit limit.
 
     Args:
         beta: β, from 0 to 1.
-        hessian: how H acts. Default: by the analytic stress differential.
-        solver: of the forward solve, any symmetric one of lineax. Default: `ConjugateResidual`.
-        preconditioner: of the solves. Default: the diagonal of M + cH.
-        adjoint_solver: of the tangent and adjoint solves, whose tolerance bounds the gradient's. Default: default
-            tolerances.
-        guess: where the solve starts.
+        hessian: the Hessian H of the elastic energy. Default: by the analytic stress differential.
+        solver: linear solver of the update, any symmetric one of lineax.
+        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + cH.
+        adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. Its tolerance
+            bounds that of the gradient.
+        guess: where the solve starts. Default: the velocity of the nodes v^n.
     """
 
     beta: Scalar = 1.0

@@ -34,45 +34,47 @@ def stable_dt(
     safety: Scalar = SAFETY,
     t1: Scalar | None = None,
 ) -> Float[Array, ""]:
-    """The longest step Δt [s] for which the motion about the particles' present state does not grow.
+    """The longest step Δt [s] for which motion about the present state of the particles does not grow.
 
-    For each particle alone on the grid the step's limit is known exactly, and no assembly of particles has a lower one
-    than the lowest of its members (B. M. Irons, G. Treharne, Proc. 3rd Conf. on Matrix Methods in Structural Mechanics,
-    1971, for frequencies; for the step of APIC and PIC the same argument holds with the velocity that the transfer
-    keeps): Δt² = 4 ρ0 / (Λ (2Ξ − κa)), the least over particles, with
+    The limit of a particle alone on the grid is known exactly, and a set of particles has no lower limit than the
+    lowest of its members (B. M. Irons, G. Treharne, Proc. 3rd Conf. on Matrix Methods in Structural Mechanics, 1971,
+    for frequencies; for APIC and PIC the same argument holds with the velocity that the transfer keeps). So Δt is the
+    least over particles of Δt² = 4 ρ0 / (Λ (2Ξ − κa)), where
 
-    - Λ the largest eigenvalue of the present tangent L ↦ ∂²Ψ/∂F∂F : (L F) Fᵀ + τ Lᵀ, L = ∇v, τ = P Fᵀ, made symmetric,
-      from `principal_tangent` (in the total description that of ∂²Ψ/∂F∂F): stretching and compression raise it;
-    - Ξ a bound of Σ_i g_ip g_ipᵀ/w_ip: a for the moving-least-squares gradient; for the spline's its value where the
-      particle is in the total description, and in the updated one, since particles move, at the worst place in a cell,
-      6/dx² (quadratic) and 3.137/dx² (cubic);
-    - a = 4/dx² (quadratic), 3/dx² (cubic); κ = 1 for APIC and 0 for PIC and FLIP, which forget the affine velocity.
+    - Λ is the largest eigenvalue of the symmetric part of the present tangent L ↦ ∂²Ψ/∂F∂F : (L F) Fᵀ + τ Lᵀ with
+      L = ∇v and τ = P Fᵀ, by `principal_tangent`; in the total description, that of ∂²Ψ/∂F∂F. Stretching and
+      compression raise it.
+    - Ξ bounds Σ_i g_ip g_ipᵀ/w_ip. It is a for the moving-least-squares gradient. For the spline's gradient it is the
+      value at the particle in the total description, and in the updated one, where particles move, the largest value
+      in a cell: 6/dx² (quadratic) or 3.137/dx² (cubic).
+    - a = 4/dx² (quadratic) or 3/dx² (cubic).
+    - κ is 1 for APIC, and 0 for PIC and FLIP, which forget the affine velocity.
 
-    At F = I that is √(4ρ0/((2μ + dλ)(2Ξ − κa))). The semi-implicit step's is 1/√(1 − 2β) times it for β < ½; for
-    β ≥ ½, for backward Euler and for the methods of second order there is none: the result is infinite, and says
+    At F = I this is √(4ρ0/((2μ + dλ)(2Ξ − κa))). The limit of the semi-implicit step is 1/√(1 − 2β) times that for
+    β < ½. For β ≥ ½, backward Euler and the methods of second order there is no limit: the result is infinite, and says
     nothing of accuracy.
 
-    With viscosity it is Δt of Δt² Λ (2Ξ − κa)/ρ0 + Δt Λ_v b/ρ0 = 4, Λ_v the largest eigenvalue of L ↦ |J| σ_v, that is
-    |J| max(2η, 2η (1 − d/3) + dζ), and b = 2a for APIC, whose stored gradient a step multiplies by 1 − Δt a Λ_v/ρ0, or
-    4Ξ for PIC and FLIP, whose gradient of a step ago stands beside nothing that it changes; 8/(B + √(B² + 16A)) with
-    the factors A of Δt² and B of Δt. The semi-implicit step has (1 − 2β) times both.
+    With viscosity Δt solves Δt² Λ (2Ξ − κa)/ρ0 + Δt Λ_v b/ρ0 = 4, so it is 8/(B + √(B² + 16A)) with A the factor of Δt²
+    and B that of Δt. Λ_v = |J| max(2η, 2η (1 − d/3) + dζ) is the largest eigenvalue of L ↦ |J| σ_v. b is 2a for APIC,
+    whose stored gradient is multiplied by 1 − Δt a Λ_v/ρ0 in a step, and 4Ξ for PIC and FLIP, whose stored gradient is
+    that of a step ago. The semi-implicit step multiplies A and B by 1 − 2β.
 
-    The default safety of 0.7 is for what is not linear. Vibrations of a few per cent grow below the linear limit where
-    a mode's third or fourth harmonic resonates with the step, (ωΔt)² = 3 and 2, at 0.87 and 0.71 of the limit: a
-    particle released at a stretch of 1.2 blows up at 0.75 of it, and does not at 0.7. It also covers what the argument
-    leaves out in the updated description, the motion of stencils under stress: among random clouds in which stretches
-    of 0.6 and 1.6 are neighbours the linearised step fails down to 0.94 of the bound.
+    The default safety of 0.7 covers two effects beyond the linear limit. Vibrations of a few per cent grow where the
+    third or fourth harmonic of a mode resonates with the step, (ωΔt)² = 3 and 2, which is at 0.87 and 0.71 of the
+    limit: a particle released at a stretch of 1.2 blows up at 0.75 of it, and does not at 0.7. And in the updated
+    description stencils move under stress, which the argument leaves out: among random clouds in which stretches of 0.6
+    and 1.6 are neighbours the linearised step fails down to 0.94 of the bound.
 
-    *When it breaks*: Δt must be constant in a rollout, so ask for it at the state of the largest stretch expected. With
-    the linear kernel a = 1/(s(1 − s) dx²), s the particle's place in the cell, so that the bound holds only where the
-    particles are now and is zero at a cell's face. No step makes a physical instability (buckling) go away.
+    *When it breaks*: Δt is constant in a rollout, so compute it at the state of the largest stretch expected. With the
+    linear kernel a = 1/(s(1 − s) dx²), with s the place of the particle in its cell: the bound holds only at the
+    present positions, and is zero at a face of a cell. A physical instability (buckling) grows at every step.
 
     Args:
         scene: the scene.
-        particles: the particles; what the scene needs and they lack is added.
-        method: update of the grid velocity.
+        particles: the particles, prepared if they are not (see `prepare`).
+        method: the integrator.
         safety: factor of the bound.
-        t1: end time [s]: the result is then the longest step at or below the bound of which t1 is a whole number.
+        t1: end time [s]. If given, the result is the longest step within the bound of which t1 is a multiple.
 
     Raises:
         ValueError: from `prepare`; a safety that is not positive; an integrator, transfer or gradient operator that
@@ -96,10 +98,10 @@ def step_for(
     method: AbstractIntegrator,
     start: int,
 ) -> Scalar:
-    """The step that is asked for [s]: a number, or `stable_dt` of the particles as they start.
+    """The step of a run [s]: `dt`, or for "stable" the `stable_dt` of the particles at the start.
 
     Raises:
-        ValueError: of `stable_dt`; "stable" for a run that does not start at step 0.
+        ValueError: from `stable_dt`; "stable" for a run that does not start at step 0.
     """
     if not isinstance(dt, str):
         return dt
@@ -108,7 +110,7 @@ def step_for(
 
 
 def _whole(limit: Array, t1: Scalar, method: str) -> Float[Array, ""]:
-    """The longest step at or below a limit of which t1 is a whole number [s]."""
+    """The longest step within a limit of which t1 is a multiple [s]."""
     if is_traced((limit, t1)):
         raise ValueError(
             "The number of steps must be known, and the limit that fixes it is traced here: ask for "
@@ -132,7 +134,7 @@ def _whole(limit: Array, t1: Scalar, method: str) -> Float[Array, ""]:
 
 
 def longest_step(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Float[Array, ""]:
-    """`stable_dt` with a safety of one [s]; NaN where F is not finite, or too large.
+    """`stable_dt` with a safety of one [s]; NaN if an F is not finite, or too large.
 
     Raises:
         UnknownBoundError: an integrator, transfer or gradient operator gives no bound.
@@ -161,7 +163,7 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Fl
 
 
 def _stiffest_viscosity(body: MaterialPoints, dim: int) -> Float[Array, "q"]:
-    """The largest eigenvalue of each particle's ∇v ↦ |J| σ_v [Pa s]; in the total description a bound of it."""
+    """The largest eigenvalue of ∇v ↦ |J| σ_v for each particle [Pa s]; a bound of it in the total description."""
     J = jnp.abs(la.determinant(body.F))
     if body.viscosity is None:
         return jnp.zeros_like(J)
@@ -170,9 +172,11 @@ def _stiffest_viscosity(body: MaterialPoints, dim: int) -> Float[Array, "q"]:
 
 
 def _tangent_spectrum(body: MaterialPoints, dim: int) -> Float[Array, "m q"]:
-    """The eigenvalues of each particle's tangent [Pa], whose largest is Λ: in the principal frame the map is d x d
-    on the diagonal and 2 x 2 on (L_ij, L_ji) for each pair. Where the law knows J alone it is d/dJ(JΨ') J tr(L) I, of
-    which one is not zero."""
+    """The eigenvalues of the tangent of each particle [Pa], of which the largest is Λ.
+
+    In the principal frame the map is d x d on the diagonal, and 2 x 2 on (L_ij, L_ji) for each pair. For a law of J
+    alone it is d/dJ(JΨ') J tr(L) I, which has one eigenvalue that is not zero.
+    """
     _, s, _ = la.principal_frame(body.F)
     tangent = body.law.principal_tangent(s)
     d = s.shape[0]
@@ -194,7 +198,7 @@ def _tangent_spectrum(body: MaterialPoints, dim: int) -> Float[Array, "m q"]:
 
 
 def _steepness(scene: Scene, particles: Particles) -> tuple[Array, Array]:
-    """A and B [1/m²] of Δt² Λ A/ρ0 + Δt Λ_v B/ρ0 ≤ 4, by the scene's gradient operator and transfer."""
+    """A and B [1/m²] of the bound Δt² Λ A/ρ0 + Δt Λ_v B/ρ0 ≤ 4, from the scene's gradient operator and transfer."""
     spacing = jnp.asarray(scene.grid.spacing)
     if scene.kernel.order == 1:
         inverse_moment = 1 / scene.stencil(particles).moment.min(axis=0)
@@ -211,7 +215,7 @@ def _steepness(scene: Scene, particles: Particles) -> tuple[Array, Array]:
 
 
 def _steepness_here(stencil: Stencil) -> Float[Array, "p"]:
-    """Ξ [1/m²] where each particle is, shape (p,): Σ_i g_ip g_ipᵀ/w_ip is diagonal."""
+    """Ξ [1/m²] at the place of each particle, shape (p,). Σ_i g_ip g_ipᵀ/w_ip is diagonal."""
     touched = stencil.weights > 0
     parts = jnp.where(touched, stencil.weight_derivatives**2 / jnp.where(touched, stencil.weights, 1), 0)
     return parts.sum(axis=1).max(axis=0)

@@ -1,7 +1,7 @@
-"""The stage that backward Euler and the integrators of second order are made of.
+"""The implicit stage of backward Euler and of the integrators of second order.
 
-M (v − a) = c (f(u + c v) − D v), f(u) the elastic force at the nodal displacement u and D v that of viscosity: one
-linear solve, with f(u) = f(0) − H u, or Newton's method.
+It is M (v − a) = c (f(u + c v) − D v), where f(u) is the elastic force at a nodal displacement u and −D v the viscous
+force. One linear solve takes f(u) = f(0) − H u; Newton's method solves the nonlinear equation.
 """
 
 from functools import reduce
@@ -24,19 +24,19 @@ from mpmjax.stepping._nodes import Nodes
 
 
 class Stage(eqx.Module):
-    """M (v − a) = c (f(u + c v) − D v)."""
+    """The equation M (v − a) = c (f(u + c v) − D v) for a velocity v."""
 
     inertial: NodeVector
-    """a [m/s]."""
+    """a [m/s], shape (n, d): the velocity without internal forces."""
     stage_dt: Float[Array, ""]
-    """c [s]."""
+    """c [s], the duration of the stage."""
     initial_displacement: NodeVector | None = None
-    """u [m]; None for zero."""
+    """u [m], shape (n, d); None for zero."""
 
     def solve(
         self, nodes: Nodes, guess: NodeVector, method: AbstractImplicitIntegrator, solution: Linearised | Newton
     ) -> tuple[NodeVector, SolveInfo]:
-        """The velocity and the solve's report."""
+        """The velocity v [m/s], shape (n, d), and the report of the solve."""
         system = {
             "mass": nodes.mass,
             "projection": nodes.projection,
@@ -70,7 +70,7 @@ class Stage(eqx.Module):
 def stage_force(
     nodes: Nodes, method: AbstractImplicitIntegrator, solution: Linearised | Newton, *stages: tuple[Scalar, NodeVector]
 ) -> NodeVector:
-    """Σ q f(u) [N], the elastic forces at nodal displacements u with their weights q, as the stages take them."""
+    """Σ q f(u) [N], shape (n, d): the elastic forces of stages, for pairs of a weight q and a displacement u [m]."""
     match solution:
         case Linearised():
             mean = reduce(jnp.add, (q * u for q, u in stages))

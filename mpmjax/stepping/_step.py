@@ -28,7 +28,7 @@ from mpmjax.stepping._nodes import Nodes, particles_to_grid
 
 
 class StepInfo(eqx.Module):
-    """What one step reports."""
+    """The report of one step."""
 
     solve: SolveInfo
     contact: ContactInfo
@@ -39,30 +39,29 @@ class StepInfo(eqx.Module):
 
 
 class GridUpdate(eqx.Module):
-    """The nodes' new velocity and where it came from."""
+    """The nodes' motion over a step, and the impulses that made it."""
 
     before: NodeVector | None
-    """v_i^n [m/s], shape (n, d), mirrored where a contact plane holds; None where P2G summed momentum and force in
-    one."""
+    """v_i^n [m/s], shape (n, d), mirrored at active contact planes; None if P2G summed momentum and force together."""
     motion: NodeMotion
-    """How they move over the step, mirrored likewise."""
+    """The motion of the nodes over the step, mirrored likewise."""
     internal: NodeVector | None
-    """The impulse of internal forces [kg m/s], shape (n, d), elastic and viscous; None where P2G summed momentum and
-    force in one."""
+    """The impulse of internal forces [kg m/s], shape (n, d), elastic and viscous; None if P2G summed momentum and force
+    together."""
     viscous: NodeVector | None
-    """The viscous part of `internal` [kg m/s], shape (n, d); None without viscosity, or where it was not asked for."""
+    """The viscous part of `internal` [kg m/s], shape (n, d); None without viscosity, or if it was not asked for."""
     reaction: NodeVector
-    """The impulse of walls and grips [kg m/s], shape (n, d); on free components the residual of the solve."""
+    """The impulse of walls and grips [kg m/s], shape (n, d); in free components the residual of the solve."""
     friction: NodeVector | None
-    """The impulse of friction [kg m/s], shape (n, d), where there are walls that may be left."""
+    """The impulse of friction [kg m/s], shape (n, d); None without contacts."""
     free: Projection
-    """The projection on the components of velocity on which no boundary acts."""
+    """The projection on the components of velocity that no boundary acts on."""
     solve: SolveInfo
     contact: ContactInfo
     normal_impulse: NodeScalar | None = None
-    """The impulse of colliders along their normals [kg m/s], shape (n,), where there are colliders."""
+    """The impulse of colliders along their normals [kg m/s], shape (n,); None without colliders."""
     collider_friction: NodeVector | None = None
-    """Their part of the impulse of friction [kg m/s], shape (n, d)."""
+    """The part of `friction` that is from colliders [kg m/s], shape (n, d); None without colliders."""
 
 
 def advance(
@@ -80,8 +79,8 @@ def advance(
         particles: prepared particles.
         t: time at the start of the step [s].
         dt: step [s].
-        method: update of the grid velocity.
-        stencil: that of the reference positions, if the description is total and it was computed before.
+        method: the integrator.
+        stencil: stencil of the particles, if it is known already, as in the total description. Default: it is computed.
     """
     stencil = scene.stencil(particles) if stencil is None else stencil
     nodes = particles_to_grid(
@@ -107,11 +106,11 @@ def advance(
 
 
 advance_compiled = eqx.filter_jit(advance)
-"""`advance`, compiled as one program that is traced once wherever it is called."""
+"""`advance`, compiled as one program."""
 
 
 def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
-    """The motion of the nodes, with boundaries and contact."""
+    """The motion of the nodes by an integrator, with boundaries, contact and friction."""
     with jax.named_scope("update"):
         guess = method.initial_guess(nodes)
         if not nodes.contacts:
@@ -158,8 +157,8 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
 def impulses(
     nodes: Nodes, method: AbstractIntegrator, motion: NodeMotion
 ) -> tuple[NodeVector | None, NodeVector, NodeVector | None]:
-    """The impulses over the step [kg m/s], each of shape (n, d): of internal forces, as in `GridUpdate`; what walls and
-    grips must give for the nodes to move so; and the viscous part of the first."""
+    """The impulses over the step [kg m/s], each of shape (n, d): of internal forces, of walls and grips, and the
+    viscous part of the first, as in `GridUpdate`."""
     if nodes.potential.viscous and not method.explicit_viscosity and motion.resisted is None:
         raise ValueError(
             f"{type(method).__name__} has explicit_viscosity = False, so its advance must return the velocity that "
@@ -177,8 +176,8 @@ def impulses(
 
 
 def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: GridUpdate) -> Particles:
-    """G2P: the particles moved and deformed with the nodes, x ← x + Δt Σ w v̄_i, F ← F + Δt Σ v̄_i hᵀ; for laws that
-    yield that is the trial F_E, which `Scene.return_map` brings back."""
+    """G2P: the particles after the step, with x ← x + Δt Σ w v̄_i and F ← F + Δt Σ v̄_i hᵀ. For laws that yield this F is
+    the trial F_E of `Scene.return_map`."""
     potential, dt = nodes.potential, nodes.dt
     unfold = potential.mirror.unfold
     before, motion = jax.tree.map(unfold, (new.before, new.motion))
@@ -215,21 +214,20 @@ def step(
 ) -> tuple[Particles, StepInfo]:
     """One step of the Material Point Method, from t to t + dt.
 
-    P2G, the grid velocity's update by `method`, G2P, x ← x + Δt Σ_i w_ip v̄_i, F ← F + Δt Σ_i v̄_i h_ipᵀ, v̄ being
-    v^{n+1} or, for methods of second order, the nodes' mean velocity over the step; then the return map of laws that
-    yield.
+    P2G; the update of the nodes' velocity by `method`; G2P with x ← x + Δt Σ_i w_ip v̄_i and F ← F + Δt Σ_i v̄_i h_ipᵀ;
+    the return map of laws that yield. v̄ is v^{n+1} or, for methods of second order, the mean velocity over the step.
 
     Args:
         scene: the scene.
-        particles: particles; what the scene needs and they lack is added (see `prepare`).
+        particles: the particles, prepared if they are not (see `prepare`).
         t: time at the start of the step [s].
         dt: step [s].
         method: the integrator: `Explicit()`, `SemiImplicit(...)`, `BackwardEuler(...)`, `ImplicitMidpoint(...)`,
             `TRBDF2(...)` or one of your own.
 
     Returns:
-        the particles after the step, and a `StepInfo`. Nothing is raised for what only the numbers show: `StepInfo`
-        says whether the solve converged and whether particles left the window, and `simulate` acts on it.
+        the particles after the step, and a `StepInfo`. It says whether the solve converged and whether particles left
+        the window; only `simulate` raises for either.
 
     Raises:
         ValueError: from `prepare`, or a dt that is not positive.

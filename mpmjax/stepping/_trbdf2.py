@@ -1,4 +1,4 @@
-"""TR-BDF2 and its relatives."""
+"""TR-BDF2, and its relatives by ρ∞."""
 
 from typing import ClassVar
 
@@ -25,27 +25,30 @@ from mpmjax.stepping._stage import Stage, stage_force
 
 
 class TRBDF2(AbstractImplicitIntegrator):
-    """A trapezoidal stage to γΔt, then a step with what is known at 0, γΔt and Δt: for y' = F(y),
+    """TR-BDF2: a trapezoidal stage from 0 to γΔt, then a stage from 0, γΔt and Δt. For y' = F(y),
 
-        y_γ = y_0 + ½γΔt (F_0 + F_γ),    y_1 = y_0 + Δt (q_0 F_0 + q_1 F_γ + q_2 F_1).
+        y_γ = y_0 + ½γΔt (F_0 + F_γ),    y_1 = y_0 + Δt (q_0 F_0 + q_1 F_γ + q_2 F_1)
 
-    Second order in time, stable at every Δt, and a mode that Δt does not resolve is multiplied by ρ∞ in each step:
-    with ρ∞ = 0, TR-BDF2, it is gone at once (L-stable); with 1 the method is two trapezoidal steps of Δt/2. γ and q are
-    fixed by the order, by ρ∞ and by both stages having the same matrix, M + (½γΔt)²H: two solves a step, each of them
-    easier than that of `ImplicitMidpoint`, ½γ being 0.29 (ρ∞ = 0) to 0.25.
     (R. E. Bank et al., IEEE Trans. CAD 4 (1985) 436, doi 10.1109/TCAD.1985.1270142; with ρ∞: G. Noh, K.-J. Bathe,
-    Comput. Struct. 212 (2019) 299, doi 10.1016/j.compstruc.2018.11.001.)
+    Comput. Struct. 212 (2019) 299, doi 10.1016/j.compstruc.2018.11.001).
 
-    For motion to be followed in time in which unresolved frequencies would ring: contact, stiff starts.
+    Second order in time and stable at every Δt. A mode that Δt does not resolve is multiplied by ρ∞ in each step. With
+    ρ∞ = 0, which is TR-BDF2, it vanishes at once (the method is L-stable); with ρ∞ = 1 the method is two trapezoidal
+    steps of Δt/2. The order, ρ∞ and one matrix for both stages, M + (½γΔt)²H, determine γ and q. A step takes two
+    solves, each of them easier than that of `ImplicitMidpoint`: ½γ is 0.29 (ρ∞ = 0) to 0.25.
+
+    It is for motion to be followed in time in which unresolved frequencies would ring, as in contact and stiff starts.
+
     *When it breaks*: as `ImplicitMidpoint`.
 
     Args:
         rho: ρ∞, from 0 to 1.
-        solution: `Linearised()`, one linear solve a stage, or `Newton()`.
-        hessian: how H acts. Default: by the analytic stress differential.
-        preconditioner: of the linear solves. Default: the diagonal of M + cH.
-        adjoint_solver: of the tangent and adjoint solves, any symmetric one. Default: `ConjugateResidual`.
-        guess: where the first stage's solve starts; the second's does where the first ended.
+        solution: `Linearised()` for one linear solve a stage, or `Newton()`.
+        hessian: the Hessian H of the elastic energy. Default: by the analytic stress differential.
+        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + cH.
+        adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. Its tolerance
+            bounds that of the gradient.
+        guess: where the solve of the first stage starts; that of the second starts at the result of the first.
     """
 
     rho: Scalar = 0.0

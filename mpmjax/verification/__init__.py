@@ -1,5 +1,5 @@
-"""Problems with a known answer and a check of laws, for tests, benchmarks and new laws; not imported by `mpmjax`
-itself."""
+"""Problems with exact solutions and a check of laws, for tests, benchmarks and new laws. `mpmjax` does not import
+it."""
 
 from mpmjax.verification._aligned import AxisAligned
 from mpmjax.verification._bar import VibratingBar

@@ -19,12 +19,12 @@ class AxisAligned(AbstractProblem):
     """u_i = A sin(πX_i) sin(πct + φ_i) on the unit box, c² = E/ρ0 (M. Steffen, P. C. Wallstedt, J. E. Guilkey,
     R. M. Kirby, M. Berzins, Comput. Model. Eng. Sci. 31 (2008) 107).
 
-    φ = (0, π) in 2-D, (0, 2π/3, 4π/3) in 3-D. Odd at the faces, so that it is periodic over [−1, 1]^d.
+    φ = (0, π) in 2-D, (0, 2π/3, 4π/3) in 3-D. The motion is odd at the faces, so it is periodic over [−1, 1]^d.
 
     Args:
-        amplitude: A [m], below 1/π: 0.05 deforms by up to 16 per cent.
+        amplitude: A [m], below 1/π. 0.05 deforms by up to 16 per cent.
         dim: space dimension.
-        ends: what stands at the faces.
+        ends: boundary at the faces.
         material: any law; its Young's modulus sets c.
         density: ρ0 [kg/m^d].
     """

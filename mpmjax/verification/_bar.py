@@ -16,12 +16,13 @@ from mpmjax.verification._problem import AbstractProblem, Ends, box_grid
 class VibratingBar(AbstractProblem):
     """v = v0 cos(ωt) sin(βX), β = (2n − 1)π/2L, ω = β√(E/ρ0), on 0 ≤ X ≤ L.
 
-    Exact at any amplitude in one dimension with ν = 0, P = E (F − 1) being linear. The free end needs no condition.
+    Exact at any amplitude in one dimension with ν = 0, where P = E (F − 1) is linear. The free end needs no
+    condition.
 
     Args:
         speed: v0 [m/s].
         mode: n, from 1.
-        length: L [m].
+        length: length L of the bar [m].
     """
 
     speed: float = 0.1

@@ -25,15 +25,16 @@ _LOADING, _HOLDING = 20, 8  # steps, of which each is a Newton step towards equi
 
 
 class Column(AbstractProblem):
-    """A column 0 ≤ X ≤ 1 m that stands on a symmetry plane, its weight put on slowly: P = −a E (1 − X) at full load,
-    x = X − a (X − X²/2).
+    """A column 0 ≤ X ≤ 1 m on a symmetry plane under its weight, which is applied slowly. At full load
+    P = −a E (1 − X) and x = X − a (X − X²/2).
 
-    Exact at any load below E in one dimension with ν = 0, P = E (F − 1) being linear. The free end needs no condition.
+    Exact at any load below E in one dimension with ν = 0, where P = E (F − 1) is linear. The free end needs no
+    condition.
 
     Args:
         load: a, weight over stiffness.
-        shift: by which fraction of a cell the free end lies beyond a node. Particles are spaced to fill the column
-            exactly, so that with a shift they stand elsewhere in each cell.
+        shift: distance of the free end beyond a node, as a fraction of a cell. Particles fill the column exactly, so
+            that with a shift their place in the cell differs from cell to cell.
     """
 
     load: float = 0.04
@@ -45,7 +46,7 @@ class Column(AbstractProblem):
 
     @property
     def duration(self) -> float:
-        """So long that inertia does not show [s]."""
+        """Duration of the run [s], so long that inertia is negligible."""
         return 1e5 * (_LOADING + _HOLDING)
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
@@ -60,7 +61,7 @@ class Column(AbstractProblem):
         return Box((0.0,), (1.0,))
 
     def rest(self, cells: int, per_side: int) -> Particles:
-        """Particles at rest that fill the column exactly, `per_side` a cell."""
+        """Particles at rest that fill the column exactly, `per_side` to a cell."""
         n = cells * per_side
         X, volume = jnp.asarray((np.arange(n) + 0.5)[:, None] / n), jnp.full(n, 1 / n)
         return Particles(X, jnp.zeros_like(X), self.density * volume, volume)
@@ -69,13 +70,13 @@ class Column(AbstractProblem):
         return (SymmetryPlane(0, 0.0),)
 
     def errors(self, cells: int, *, per_side: int = 2, **choices: Any) -> tuple[float, float]:
-        """The errors of the state under full load: of the displacement over that of the top, a/2, and of the stress
-        over that at the bottom, a E.
+        """The relative errors under full load: of the displacement, over that of the top a/2, and of the stress, over
+        that at the bottom a E.
 
         Args:
-            cells: grid cells to the column's height.
+            cells: number of grid cells over the height of the column.
             per_side: particles to a cell.
-            choices: of the scene: kernel, gradient, transfer, description.
+            choices: kernel, gradient, transfer and description of the scene.
         """
         scene, particles = discretise(self, cells, rest=self.rest(cells, per_side), **choices)
         steps = _LOADING + _HOLDING

@@ -11,16 +11,18 @@ from mpmjax.state import Particles, Scene, fill
 
 
 class TwoDisks(eqx.Module):
-    """Two disks on one diagonal fly into each other and part (the scene of D. Sulsky, Z. Chen, H. L. Schreyer, Comput.
+    """Two disks that move along a diagonal, collide and part (the scene of D. Sulsky, Z. Chen, H. L. Schreyer, Comput.
     Methods Appl. Mech. Eng. 118 (1994) 179, doi 10.1016/0045-7825(94)90112-0).
 
-    No exact motion is known; momentum is zero throughout, the disks touch at t = (‖Δcentre‖ − 2R)/‖Δv‖ and no energy
-    appears.
+    No exact motion is known. The momentum is zero at all times, the disks touch at t = (‖Δcentre‖ − 2R)/‖Δv‖, and the
+    energy never grows.
 
     Args:
-        radius: R [m].
-        centre: the disks' centres are ±(centre, centre) [m].
-        speed: and their velocities ∓(speed, speed) [m/s].
+        radius: radius R [m].
+        centre: the centres of the disks are ±(centre, centre) [m].
+        speed: their initial velocities are ∓(speed, speed) [m/s].
+        density: ρ0 [kg/m²].
+        material: the law of both.
     """
 
     radius: float = 0.2
@@ -31,11 +33,11 @@ class TwoDisks(eqx.Module):
 
     @property
     def contact_time(self) -> float:
-        """When the circles touch [s]."""
+        """Time at which the circles touch [s]."""
         return (2**0.5 * self.centre - self.radius) / (2**0.5 * self.speed)
 
     def discretise(self, cells: int = 20, *, per_side: int = 2) -> tuple[Scene, Particles]:
-        """Scene and particles, with so many cells to the unit of length and room around the disks."""
+        """Scene and particles, with `cells` grid cells to a metre and `per_side` particles to the side of a cell."""
         half = round(0.75 * cells)
         grid = Grid((2 * half + 1,) * 2, 1 / cells, origin=(-half,) * 2)
         disks = [

@@ -1,4 +1,4 @@
-"""A law's closed forms against derivatives of its energy."""
+"""A check of a law's closed forms against derivatives of its energy."""
 
 from typing import Any
 
@@ -22,31 +22,33 @@ _CHECKED = (
     "the derivative of tangent by F and the law's parameters",
     "principal_tangent",
 )
-"""What is checked, in this order; the last where a law overrides it."""
+"""What is checked, in this order; the last only for a law that overrides it."""
 
 
 def check_law(law: Law | Viscous, *, dim: int = 3, F: Any = None, rtol: float = 1e-9) -> None:
-    """Check that a law's methods are derivatives of its energy, and finite where steps and gradients need them.
+    """Check that the methods of a law are derivatives of its energy, and finite where steps and gradients need them.
 
-    At each deformation that the law admits, in float64:
-    - the energy is finite, and a rotation of space does not change it;
-    - `stress` is the energy's gradient, `tangent` the derivative of that and `principal_tangent` its eigenstructure, as
-      `AbstractMaterial`'s defaults have them. Differences are relative to the size of the stress differential;
-    - the derivatives of the stress differential, by F and by the law's parameters, are finite.
+    The check is in float64, at each deformation that the law admits:
 
-    Of a law with a history the elastic law of its initial history is checked, of a viscous one the law beside the
-    viscosity; return maps are not.
+    - The energy is finite, and a rotation of space does not change it.
+    - `stress` is the gradient of the energy, `tangent` the derivative of that, and `principal_tangent` its
+      eigenstructure, as in the defaults of `AbstractMaterial`. Differences are relative to the size of the stress
+      differential.
+    - The derivatives of the stress differential by F and by the parameters of the law are finite.
+
+    For a law with a history, the elastic law of its initial history is checked. For a viscous law, the law without the
+    viscosity is. Return maps are not checked.
 
     Args:
         law: the law.
         dim: 1, 2 or 3.
-        F: deformation gradients, shape (p, dim, dim), of a law of J alone (p, 1, 1). Default: F = I, repeated and
-            nearly repeated stretches, turned and not, and stretches from 0.6 to 1.6.
-        rtol: the largest relative difference that is allowed.
+        F: deformation gradients, shape (p, dim, dim), or (p, 1, 1) for a law of J alone. Default: F = I, repeated and
+            nearly repeated stretches, stretches from 0.6 to 1.6, all of these rotated and not.
+        rtol: the largest relative difference allowed.
 
     Raises:
-        ValueError: a difference or a derivative that is not finite: the law's method, F and the relative difference.
-            None of the deformations is admitted.
+        ValueError: a difference, or a derivative that is not finite; the message names the method, F and the relative
+            difference. No deformation that the law admits.
     """
     law = law.law if isinstance(law, Viscous) else law
     size = 1 if isinstance(law, AbstractVolumetric) else dim
@@ -71,7 +73,7 @@ def check_law(law: Law | Viscous, *, dim: int = 3, F: Any = None, rtol: float = 
 
 
 def _faults(law: AbstractMaterial, F: Matrix) -> tuple[Bool[Array, "p"], tuple[Float[Array, "p"], ...]]:
-    """Which F the law admits, and the relative difference of each of `_CHECKED`, NaN where something is not finite."""
+    """Whether the law admits each F, and the relative differences of `_CHECKED`, NaN where a value is not finite."""
     base, d = AbstractMaterial, len(F)
     Q = jnp.broadcast_to(jnp.asarray(_rotation(np.random.default_rng(1), d))[..., None], F.shape)
     energy, turned = law.energy(F), law.energy(la.matmul(Q, F))
@@ -106,7 +108,7 @@ def _faults(law: AbstractMaterial, F: Matrix) -> tuple[Bool[Array, "p"], tuple[F
 
 
 def _assembled(law: AbstractMaterial, U: Matrix, s: Float[Array, "d p"], V: Matrix) -> Float[Array, "m m p"]:
-    """The stress differential at F = U diag(s) Vᵀ that `principal_tangent` stands for."""
+    """The stress differential at F = U diag(s) Vᵀ, assembled from `principal_tangent`."""
     d, tangent = len(s), law.principal_tangent(s)
     modes = la.principal_modes(U, V).reshape(d * d, d * d, -1)
     core = la.diagonal(jnp.concatenate([jnp.zeros_like(s), tangent.twist, tangent.flip]))
@@ -125,7 +127,7 @@ def _rotation(rng: np.random.Generator, d: int) -> np.ndarray:
 
 
 def _deformations(d: int) -> Float[np.ndarray, "p d d"]:
-    """See `check_law`."""
+    """The default deformations of `check_law`."""
     rng = np.random.default_rng(0)
     stretches = [np.ones(3), np.full(3, 1.2), np.array([1.2, 0.9, 0.9]), np.array([0.8, 0.8, 1.3])]
     stretches += [s + gap * np.array([0.4, -1.0, 0.7]) for s in stretches for gap in (1e-14, 1e-7, 1e-3)]

@@ -1,4 +1,4 @@
-"""Problems with an exact motion: how they are discretised, and how errors are measured."""
+"""Problems with an exact motion, their discretisation and their errors."""
 
 import abc
 import enum
@@ -25,7 +25,7 @@ class Ends(enum.Enum):
     """The boundary of a problem whose exact motion is odd at the faces of its box."""
 
     PERIODIC = "periodic"
-    """Twice the box is a period: no wall at all."""
+    """No wall; twice the box is a period."""
     MIRRORED = "mirrored"
     """Symmetry planes."""
     PLAIN = "plain"
@@ -33,9 +33,9 @@ class Ends(enum.Enum):
 
 
 class AbstractProblem(eqx.Module):
-    """An exact motion x(X, t) of a body with a law and a density, and the body force that makes it one.
+    """An exact motion x(X, t) of a body with a law and a density, with the body force that makes it exact.
 
-    A subclass gives the motion of one point; velocity, deformation gradient and the manufactured body force
+    A subclass has the motion of one point. Velocity, deformation gradient and the manufactured body force
     b = ẍ − Div P / ρ0 follow by automatic differentiation.
     """
 
@@ -56,33 +56,33 @@ class AbstractProblem(eqx.Module):
 
     @abc.abstractmethod
     def grid(self, cells: int) -> Grid:
-        """A grid with so many cells to the unit of length."""
+        """The grid, with `cells` cells to a metre."""
 
     @abc.abstractmethod
     def body(self, cells: int) -> AbstractRegion:
-        """The body at rest, on such a grid."""
+        """The region of the body at rest, on this grid."""
 
     def boundary(self) -> tuple[AbstractBoundary, ...]:
-        """Its boundary conditions. Default: none."""
+        """The boundaries. Default: none."""
         return ()
 
     @property
     def wave_speed(self) -> float:
-        """c = √((λ + 2μ) / ρ0) [m/s], of pressure waves at rest."""
+        """Speed of pressure waves at rest, c = √((λ + 2μ) / ρ0) [m/s]."""
         law: Any = self.material
         return math.sqrt(float(law.lame_lambda + 2 * law.shear_modulus) / self.density)
 
     def velocity(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
-        """∂x/∂t [m/s]."""
+        """∂x/∂t [m/s], shape (d,)."""
         t = jnp.asarray(t, X.dtype)
         return jax.jvp(lambda s: self.position(X, s), (t,), (jnp.ones_like(t),))[1]
 
     def deformation(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d d"]:
-        """F = ∂x/∂X [-]."""
+        """F = ∂x/∂X [-], shape (d, d)."""
         return jax.jacfwd(lambda Y: self.position(Y, t))(X)
 
     def body_force(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
-        """b = ẍ − Div P / ρ0 [m/s²], (Div P)_i = ∂P_ij/∂X_j."""
+        """b = ẍ − Div P / ρ0 [m/s²], shape (d,), with (Div P)_i = ∂P_ij/∂X_j."""
         t = jnp.asarray(t, X.dtype)
         inertia = jax.jvp(lambda s: self.velocity(X, s), (t,), (jnp.ones_like(t),))[1]
         slope = jax.jacfwd(lambda Y: self.material.stress(self.deformation(Y, t)))(X)
@@ -90,7 +90,7 @@ class AbstractProblem(eqx.Module):
 
 
 class Manufactured(AbstractBodyForce):
-    """The body force of a problem, on particles that know where they were."""
+    """The body force of a problem, on particles with known reference positions X [m], shape (p, d)."""
 
     problem: AbstractProblem
     X: ParticleVector
@@ -101,7 +101,7 @@ class Manufactured(AbstractBodyForce):
 
 
 def box_grid(lower: tuple[float, ...], upper: tuple[float, ...], cells: int, ends: Ends) -> Grid:
-    """A grid for a box whose sides are whole numbers of cells: the period, or the box with room around it."""
+    """A grid for a box whose sides are whole numbers of cells: one period, or the box with a margin."""
     counts = [round((b - a) * cells) for a, b in zip(lower, upper, strict=True)]
     first = [round(a * cells) for a in lower]
     if ends is Ends.PERIODIC:
@@ -111,7 +111,7 @@ def box_grid(lower: tuple[float, ...], upper: tuple[float, ...], cells: int, end
 
 
 def box_boundary(lower: tuple[float, ...], upper: tuple[float, ...], ends: Ends) -> tuple[AbstractBoundary, ...]:
-    """The boundary conditions of a box whose faces the motion leaves in place."""
+    """The boundaries of a box whose faces do not move along their normals."""
     if ends is Ends.MIRRORED:
         sides = (
             (a, place, keep) for a in range(len(lower)) for place, keep in ((lower[a], "above"), (upper[a], "below"))
@@ -129,16 +129,16 @@ def discretise(
     rest: Particles | None = None,
     **choices: Any,
 ) -> tuple[Scene, Particles]:
-    """The problem's scene and particles in their exact initial state.
+    """The scene of a problem, and its particles in their exact initial state.
 
     Args:
         problem: the problem.
-        cells: grid cells to the unit of length.
-        per_side: particles to a cell's side.
-        velocity_time: the time at which initial velocities are taken [s]. Symplectic Euler is the leap-frog method
-            whose velocities stand half a step early: with −Δt/2 it is second order in time, with 0 first.
-        rest: the particles at rest, with their mass and volume. Default: the grid's cells, filled evenly.
-        choices: of the scene: kernel, gradient, transfer, description.
+        cells: grid cells to a metre.
+        per_side: particles to the side of a cell.
+        velocity_time: time of the initial velocities [s]. Symplectic Euler is the leap-frog method, whose velocities
+            are half a step early: it is of second order in time with −Δt/2, of first order with 0.
+        rest: the particles at rest, with mass and volume. Default: the cells of the body, filled evenly.
+        choices: kernel, gradient, transfer and description of the scene.
     """
     grid = problem.grid(cells)
     d = problem.dim
@@ -167,7 +167,7 @@ def displacement_error(problem: AbstractProblem, particles: Particles, run: Run)
 
     Args:
         problem: the problem.
-        particles: as `discretise` made them, with X.
+        particles: the particles from `discretise`, with X.
         run: the run, with frames.
     """
     if run.frames is None or particles.X is None:
@@ -183,11 +183,12 @@ def displacement_error(problem: AbstractProblem, particles: Particles, run: Run)
 
 
 def stress_error(problem: AbstractProblem, particles: Particles, run: Run) -> Float[Array, "f"]:
-    """Σ V0 ‖P − P(X, t)‖ / Σ V0 [Pa] at each saved frame, P the first Piola-Kirchhoff stress, shape (f,).
+    """Σ V0 ‖P − P(X, t)‖ / Σ V0 [Pa] at each saved frame, shape (f,), with P the first Piola-Kirchhoff
+    stress.
 
     Args:
         problem: the problem.
-        particles: as `discretise` made them, with X.
+        particles: the particles from `discretise`, with X.
         run: the run, with frames.
     """
     if run.frames is None or particles.X is None:

@@ -1,4 +1,4 @@
-"""Errors under refinement, and the orders they show."""
+"""Errors under refinement, and observed orders of convergence."""
 
 import math
 from collections.abc import Sequence
@@ -22,19 +22,19 @@ def errors(
     staggered: bool | None = None,
     **discretisation: Any,
 ) -> np.ndarray:
-    """The largest of ten displacement errors, evenly over the problem's duration, for each grid [m].
+    """The displacement error on each grid [m]: the largest at ten times, evenly spaced over the duration.
 
-    A run that fails has the error inf.
+    The error of a run that fails is infinite.
 
     Args:
         problem: the problem.
-        cells: grid cells to the unit of length, for each grid.
-        courant: Δt c/dx, c the pressure-wave speed at rest; one for all grids, or one for each. It is rounded down so
-            that ten whole numbers of steps fill the duration.
-        method: update of the grid velocity.
-        staggered: whether initial velocities are those of half a step before the start, see `discretise`. Default:
-            yes, but with methods of second order, whose velocities stand at the time of the positions.
-        discretisation: of `discretise`.
+        cells: grid cells to a metre, for each grid.
+        courant: Δt c/dx with c the pressure-wave speed at rest, for all grids or for each. It is rounded down so that
+            ten whole numbers of steps fill the duration.
+        method: the integrator.
+        staggered: whether initial velocities are those half a step before the start (see `discretise`). Default: yes,
+            except with methods of second order, whose velocities are at the time of the positions.
+        discretisation: further arguments of `discretise`.
     """
     numbers = [courant] * len(cells) if isinstance(courant, (int, float)) else courant
     return np.array(

@@ -1,4 +1,4 @@
-"""The generalized vortex: a ring whose material turns, most in the middle of its width."""
+"""The generalized vortex: a ring whose material turns, most at the middle of its width."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ _INNER, _OUTER, _ROOM = 0.75, 1.25, 1.5
 
 
 class Ring(AbstractRegion):
-    """0.75 ≤ R ≤ 1.25."""
+    """The ring 0.75 m ≤ R ≤ 1.25 m."""
 
     @property
     def dim(self) -> int:
@@ -32,7 +32,7 @@ class Ring(AbstractRegion):
 
 
 class RestOutside(AbstractBoundary):
-    """Nodes that are not in the ring are at rest, as the motion is at its edges."""
+    """A boundary that holds nodes outside of the ring at rest, as the exact motion is at its edges."""
 
     @property
     def dim(self) -> int:
@@ -45,13 +45,13 @@ class RestOutside(AbstractBoundary):
 
 
 class Vortex(AbstractProblem):
-    """x = Q(g h) X, a turn by α = g(t) h(R), g = A sin(πt), h = 1 − 32(R−1)² + 256(R−1)⁴ (K. Kamojjala, R. Brannon,
+    """x = Q(g h) X, a rotation by g(t) h(R), g = A sin(πt), h = 1 − 32(R−1)² + 256(R−1)⁴ (K. Kamojjala, R. Brannon,
     A. Sadeghirad, J. Guilkey, Eng. Comput. 31 (2015) 201, doi 10.1007/s00366-013-0342-x).
 
-    Without change of volume, at rest at the ring's edges.
+    The volume does not change, and the edges of the ring are at rest.
 
     Args:
-        amplitude: A [rad]: the shear of F reaches 7 A in the ring.
+        amplitude: A [rad]. The shear of F reaches 7 A in the ring.
         material: any law.
         density: ρ0 [kg/m²].
     """
@@ -64,7 +64,7 @@ class Vortex(AbstractProblem):
 
     @property
     def duration(self) -> float:
-        """There and back [s]."""
+        """Duration of the run [s], the time of a turn and its return."""
         return 1.0
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:

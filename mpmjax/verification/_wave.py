@@ -19,13 +19,13 @@ _ACROSS = 4  # cells
 class StandingWave(AbstractProblem):
     """u₁ = A sin(πX₁) cos(πct) on 0 ≤ X₁ ≤ 1, c² = (λ + 2μ)/ρ0, without any force.
 
-    Exact at every amplitude with F₁₁ > 0, since under uniaxial strain fixed corotated elasticity has
-    P₁₁ = (λ + 2μ)(F₁₁ − 1) and no coupling to other directions. Across, the body is periodic over four cells.
+    Exact at every amplitude with F₁₁ > 0: under uniaxial strain fixed corotated elasticity has
+    P₁₁ = (λ + 2μ)(F₁₁ − 1), and no coupling to other directions. In these the body is periodic over four cells.
 
     Args:
         amplitude: A [m], below 1/π.
         dim: space dimension.
-        ends: what stands at X₁ = 0 and 1.
+        ends: boundary at X₁ = 0 and 1.
     """
 
     amplitude: float = 0.05
