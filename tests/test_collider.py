@@ -265,8 +265,9 @@ def test_what_colliders_receive_is_what_the_material_loses(method, d):
 
 @pytest.mark.thorough
 def test_forces_on_colliders_against_time(tmp_path):
-    """Between frames the mean force is the impulses of the steps over the time; restarted from a file it goes on from
-    where it was; a block presses on the ground with its weight and what its momentum loses."""
+    """Between frames the mean force is the impulses of the steps over the time, also where the run is observed. Resumed
+    from a file the impulse goes on from where it was, in a run that continues another it begins at zero. A block
+    presses on the ground with its weight and what its momentum loses."""
     grid = mpm.Grid((16, 16), DX, origin=(-3, -3))
     block = mpm.fill(mpm.Box((0.3, 0.0), (0.6, 0.3)), grid, particles_per_cell=4, density=1e3)
     ground = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0)), friction=0.5)
@@ -288,11 +289,24 @@ def test_forces_on_colliders_against_time(tmp_path):
     weight = float(block.mass.sum()) * 9.81
     gained = np.diff([mpm.momentum(run.frame(i))[1] for i in range(5)]) / (5 * DT)
     assert_close(-force[:, 0, 1], weight + gained, 1e-6)
-    path = tmp_path / "run.h5"
-    mpm.record(path, scene, block, t1=10 * DT, **settings)
-    mpm.record(path, scene, block, t1=20 * DT, resume=True, **settings)
-    assert np.array_equal(mpm.load(path).frames.received.impulse, run.frames.received.impulse)
-    assert np.array_equal(mpm.load(path).frames.received.angular, run.frames.received.angular)
+    half = mpm.simulate(scene, block, t1=10 * DT, **settings)
+    recorded, saved = tmp_path / "recorded.h5", tmp_path / "saved.h5"
+    mpm.record(recorded, scene, block, t1=10 * DT, **settings)
+    mpm.save(saved, half)
+    for path in (recorded, saved):
+        mpm.record(path, scene, block, t1=20 * DT, resume=True, **settings)
+        resumed = mpm.load(path)
+        pairs = [(resumed.collider_impulse, run.collider_impulse), (resumed.forces(), run.forces())]
+        pairs.append((resumed.final_collider_impulse, run.final_collider_impulse))
+        for a, b in zip(*map(jax.tree.leaves, zip(*pairs, strict=True)), strict=True):
+            assert np.array_equal(a, b)
+    observed = mpm.simulate(scene, block, t1=20 * DT, observe=lambda scene, particles: particles.x[0, 0], **settings)
+    for a, b in zip(observed.forces(), run.forces(), strict=True):
+        assert np.array_equal(a, b)
+    again = mpm.simulate(scene, half.final, t1=20 * DT, start=10, **settings)
+    assert not any(a[0].any() for a in jax.tree.leaves(again.collider_impulse))
+    for a, b in zip(again.forces(), run.forces(), strict=True):
+        assert_close(a, b[2:], 1e-12)
     with pytest.raises(ValueError, match="Forces need saved frames and colliders"):
         mpm.simulate(eqx.tree_at(lambda s: s.boundary, scene, ()), block, t1=DT, dt=DT, save_every=1).forces()
 
@@ -308,7 +322,7 @@ def test_the_force_on_a_collider_can_be_differentiated():
 
     def force(modulus):
         scene = mpm.Scene(grid, mpm.NeoHookean(modulus, 0.3), boundary=(press, floor))
-        return mpm.rollout(scene, block, steps=10, dt=2e-3).received.impulse[0, 1] / 2e-2
+        return mpm.simulate(scene, block, t1=2e-2, dt=2e-3, save_every=10).forces().force[0, 0, 1]
 
     slope = jax.grad(force)(1e5)
     assert float(force(1e5)) > 0

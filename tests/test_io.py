@@ -18,6 +18,7 @@ import mpmjax as mpm
 import mpmjax.io._runs
 from mpmjax.io._record import record
 from mpmjax.io._runs import FrameWriter, load, save
+from mpmjax.simulation._rollout_state import RolloutState, initial_state
 from mpmjax.simulation._run import Run
 from mpmjax.simulation._simulate import integrate
 from mpmjax.simulation._statistics import RunStatistics, no_steps
@@ -213,7 +214,7 @@ def test_the_file_says_what_it_holds(tmp_path):
     with h5py.File(tmp_path / "run.h5") as file:
         own = file["mpmjax"]
         assert own.attrs["units"].startswith(b"SI")
-        assert (own.attrs["format"], own.attrs["d"], own.attrs["dtype"]) == (5, 2, b"float64")
+        assert (own.attrs["format"], own.attrs["d"], own.attrs["dtype"]) == (6, 2, b"float64")
         scene = json.loads(own["scene"][...].tobytes())
         assert scene["material"] == {"kind": "FixedCorotated", "youngs_modulus": 1 / 3, "poisson_ratio": 0.3}
         assert own["frames"]["step"].tolist() == [0, 5, 7]
@@ -263,7 +264,7 @@ def test_a_file_being_written_can_be_read(tmp_path):
     frames = [jax.tree.map(lambda a, i=i: a[i], run.frames) for i in range(3)]
     with FrameWriter.create(path, run.scene, run.final, run.method, run.dt) as writer:
         for i, frame in enumerate(frames):
-            writer.append(i, frame, run.statistics)
+            writer.append(i, RolloutState(frame, None), run.statistics)
             shutil.copy(path, tmp_path / "copy.h5")
             for name in (path, tmp_path / "copy.h5"):
                 assert_same(load(name).frames, jax.tree.map(lambda a, i=i: a[: i + 1], run.frames))
@@ -529,8 +530,8 @@ def test_files_of_another_kind_are_named(tmp_path):
     of("other.h5", r"has no group /VTKHDF or /mpmjax: it is not a run that mpmjax wrote\.$")
     save(tmp_path / "later.h5", run)
     with h5py.File(tmp_path / "later.h5", "r+") as file:
-        file["mpmjax"].attrs["format"] = 6
-    of("later.h5", r"has format 6, this mpmjax reads format 5: use mpmjax [\d.]+, which wrote it\.$")
+        file["mpmjax"].attrs["format"] = 7
+    of("later.h5", r"has format 7, this mpmjax reads format 6: use mpmjax [\d.]+, which wrote it\.$")
     FrameWriter.create(tmp_path / "bare.h5", run.scene, run.final, run.method, run.dt).close()
     of("bare.h5", r"holds no frame: run the simulation again\.$")
     save(tmp_path / "lacking.h5", run)
@@ -666,7 +667,7 @@ def test_a_flipped_bit_is_caught_or_harmless(tmp_path):
             caught.append(bit)
         try:
             with FrameWriter.resume(path, run.scene, run.final, run.method, run.dt) as writer:
-                assert_same(writer.last(), (7, state_of(run.final), run.statistics))
+                assert_same(writer.last(), (7, RolloutState(state_of(run.final), None), run.statistics))
         except ValueError:
             continue
     assert set(positions) <= set(caught)
@@ -677,7 +678,7 @@ def test_no_steps_is_the_row_of_a_start(tmp_path):
     """A recorded run's first frame has the empty statistics."""
     run = made_up(2)
     with FrameWriter.create(tmp_path / "run.h5", run.scene, run.final, run.method, run.dt) as writer:
-        writer.append(3, state_of(run.final), no_steps(jnp.float64))
+        writer.append(3, initial_state(run.scene, run.final), no_steps(jnp.float64))
         step, state, statistics = writer.last()
     assert step == 3
-    assert_same((state, statistics), (state_of(run.final), no_steps(jnp.float64)))
+    assert_same((state, statistics), (initial_state(run.scene, run.final), no_steps(jnp.float64)))

@@ -13,8 +13,8 @@ import numpy as np
 import scipy.spatial
 
 from mpmjax.checks import canonical, shape_of
-from mpmjax.simulation import Run, SimulationError, integrate, raise_faults
-from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
+from mpmjax.simulation import Run, SimulationError, initial_state, integrate, raise_faults
+from mpmjax.state import Particles, Scene, State, prepare, with_state
 from mpmjax.stepping import AbstractIntegrator, stable_dt
 
 FRAMES = 8
@@ -157,11 +157,12 @@ class Bench(NamedTuple):
         with `throw`."""
         dtype = self.particles.x.dtype
         scene, dt, method = canonical((self.scene, self.t1 / steps, method), dtype)
-        state, states = state_of(self.particles), []
+        state, states = initial_state(scene, self.particles), []
         for k in range(frames):
             _, state, statistics, previous, _ = integrate(
                 scene,
-                with_state(self.particles, state),
+                self.particles,
+                state,
                 jnp.asarray(k * each, dtype),
                 jnp.asarray(each, dtype),
                 dt,
@@ -175,11 +176,12 @@ class Bench(NamedTuple):
             )
             if not bool(jax.block_until_ready(statistics.healthy)):
                 if throw:
-                    final, number = with_state(self.particles, state), k * each + statistics.steps.astype(dtype)
+                    final = with_state(self.particles, state.particles)
+                    number = k * each + statistics.steps.astype(dtype)
                     run = Run(scene, method, dt, jnp.zeros((0,), dtype), None, None, final, number, statistics)
                     raise_faults(run, self.particles, previous, k * each)
                 return None
-            states.append(state)
+            states.append(state.particles)
         return states
 
 

@@ -1,7 +1,7 @@
 """Walls, grips, mirrored planes and colliders, and what colliders receive."""
 
 from mpmjax.boundary._collider import AbstractCollider, SeparatingCollider, SlipCollider, StickyCollider
-from mpmjax.boundary._collider_impulse import ColliderImpulse, nothing_received, received
+from mpmjax.boundary._collider_impulse import ColliderImpulse, collider_impulse, no_impulse
 from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, Conditions, combine
 from mpmjax.boundary._contact import (
     AbstractContact,
@@ -39,6 +39,7 @@ __all__ = [
     "StickyBox",
     "StickyCollider",
     "SymmetryPlane",
+    "collider_impulse",
     "combine",
     "constrain",
     "contacts_of",
@@ -46,6 +47,5 @@ __all__ = [
     "fits",
     "mirror",
     "no_contact",
-    "nothing_received",
-    "received",
+    "no_impulse",
 ]

@@ -31,12 +31,12 @@ class ColliderImpulse(eqx.Module):
         return jax.tree.map(jnp.add, self, later)
 
 
-def nothing_received(colliders: int, dim: int, dtype: Any) -> ColliderImpulse:
+def no_impulse(colliders: int, dim: int, dtype: Any) -> ColliderImpulse:
     """No impulse yet on a number of colliders."""
     return ColliderImpulse(jnp.zeros((colliders, dim), dtype), jnp.zeros((colliders, len(pairs(dim))), dtype))
 
 
-def received(
+def collider_impulse(
     asked: ColliderConditions,
     reaction: NodeVector,
     normal_impulse: NodeScalar | None = None,

@@ -12,10 +12,10 @@ from mpmjax.io._aside import reason
 from mpmjax.io._staged import StagedFile, require_no_writer
 from mpmjax.io._vtkhdf import File, count_in
 
-FORMAT = 5
+FORMAT = 6
 LIBVER_HEAD = ("v108", "v108")
 _LIBVER = ("v110", "v110")  # what "latest" writes, VTK 9.7 cannot read
-_GROWING = ("VTKHDF/Points", "VTKHDF/PointData/", "VTKHDF/Steps/", "mpmjax/frames", "mpmjax/received")
+_GROWING = ("VTKHDF/Points", "VTKHDF/PointData/", "VTKHDF/Steps/", "mpmjax/frames", "mpmjax/collider_impulse")
 _GROUPS = ("VTKHDF", "mpmjax")
 _REMEDY = "restore it from a copy, or run the simulation again"
 _BUSY = "{} is being written by another run: wait until that ends or stop it, or choose another name."

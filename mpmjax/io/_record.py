@@ -15,16 +15,18 @@ from mpmjax.io._interrupt import reporting, undisturbed
 from mpmjax.io._runs import FrameWriter
 from mpmjax.simulation import (
     HEALTHY,
+    RolloutState,
     Run,
     RunStatistics,
     SimulationError,
+    initial_state,
     integrate,
     no_steps,
     number_of_steps,
     raise_faults,
     warn_of_inaccurate_solves,
 )
-from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
+from mpmjax.state import Particles, Scene, prepare, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator, Explicit, step_for
 
 
@@ -100,7 +102,8 @@ def record(
                 count = min(save_every - (step - start) % save_every, end - step)
                 _, state, new, previous, _ = integrate(
                     scene,
-                    with_state(particles, state),
+                    particles,
+                    state,
                     jnp.asarray(step, dtype),
                     jnp.asarray(count, dtype),
                     dt_,
@@ -124,15 +127,17 @@ def record(
             steps=jnp.zeros((0,), dtype),
             frames=None,
             observed=None,
-            final=with_state(particles, state),
+            final=with_state(particles, state.particles),
             final_step=jnp.asarray(step, dtype),
             statistics=statistics,
+            final_collider_impulse=state.collider_impulse,
         )
         try:
             raise_faults(run, particles, previous, start)
         except SimulationError as error:
             try:
-                _append(writer, int(error.run.final_step), state_of(error.run.final), statistics)
+                last = RolloutState(state_of(error.run.final), error.run.final_collider_impulse)
+                _append(writer, int(error.run.final_step), last, statistics)
                 again = "Resumed it would end there again: begin anew."
                 then = "It can be resumed as it is." if int(statistics.fault) == HEALTHY else again
                 said = f"{writer.standing()} {then}"
@@ -156,7 +161,7 @@ def _begun(
     with undisturbed():
         writer = FrameWriter.create(path, scene, particles, method, dt, overwrite=overwrite)
         try:
-            writer.append(start, state_of(particles), no_steps(particles.x.dtype))
+            writer.append(start, initial_state(scene, particles), no_steps(particles.x.dtype))
         except BaseException as error:
             writer.close()
             Path(path).unlink()
@@ -166,7 +171,7 @@ def _begun(
     return writer
 
 
-def _append(writer: FrameWriter, step: int, state: State, statistics: RunStatistics) -> None:
+def _append(writer: FrameWriter, step: int, state: RolloutState, statistics: RunStatistics) -> None:
     """Write a frame; an error says what the file holds."""
     try:
         writer.append(step, state, statistics)

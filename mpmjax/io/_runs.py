@@ -4,7 +4,7 @@
                 J = det F, with APIC affine_velocity, and what laws that yield remember
     /mpmjax     format, version, d, dtype, units, dt, counts, mass, volume, X, the scene and the method as JSON (see
                 `_schema`) with their arrays, and a table with one row a frame: its step and the run's `RunStatistics`
-                up to it; with colliders `received`, what each had received by then: impulse, then angular impulse
+                up to it; with colliders `collider_impulse`, the impulse on each by then, linear, then angular
 
 Whatever is not in a dataset with checksums lies in headers that HDF5 checks itself, so a flipped bit is found. `NSteps`
 is raised last, and what lies beyond it, the remains of a writer that was killed, is neither read nor kept. A frame that
@@ -17,7 +17,7 @@ import json
 import os
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -47,8 +47,8 @@ from mpmjax.io._hdf5 import (
 from mpmjax.io._schema import decode, encode
 from mpmjax.io._staged import StagedFile
 from mpmjax.io._vtkhdf import File, add_fixed, add_growing, add_topology, count_in, rows_of, set_count, states_in
-from mpmjax.simulation import Run, RunStatistics, no_steps
-from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
+from mpmjax.simulation import RolloutState, Run, RunStatistics, initial_state, no_steps
+from mpmjax.state import Particles, Scene, prepare, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator
 
 _UNITS = "SI: m, s, kg, Pa; deformation_gradient and J are pure numbers, affine_velocity is in 1/s"
@@ -61,7 +61,7 @@ class FrameWriter:
     A context manager: leaving it closes the file.
     """
 
-    def __init__(self, file: File, staged: StagedFile, path: Path, like: State):
+    def __init__(self, file: File, staged: StagedFile, path: Path, like: RolloutState):
         """Use `create` or `resume`."""
         self._file, self._staged, self._path, self._like = file, staged, path, like
         self._kept = self._standing()
@@ -95,7 +95,8 @@ class FrameWriter:
         path = Path(path)
         described = _describe(scene, particles, method, dt)
         _check_readable(path, described)
-        rows = _rows(0, 0, described["dt"], state_of(particles), no_steps(particles.x.dtype))
+        begin = initial_state(scene, particles)
+        rows = _rows(0, 0, described["dt"], begin, no_steps(particles.x.dtype))
         check_place(path, overwrite=overwrite)
         staged = staged_file(path, new=True)
         try:
@@ -115,7 +116,7 @@ class FrameWriter:
             if isinstance(error, OSError):
                 raise OSError(f"{path} was not begun: {reason(error)}. Make room, or name another place.") from None
             raise
-        return cls(file, staged, path, state_of(particles))
+        return cls(file, staged, path, begin)
 
     @classmethod
     def resume(
@@ -131,7 +132,8 @@ class FrameWriter:
         """
         path = Path(path)
         described = _describe(scene, particles, method, dt)
-        rows = _rows(0, 0, described["dt"], state_of(particles), no_steps(particles.x.dtype))
+        begin = initial_state(scene, particles)
+        rows = _rows(0, 0, described["dt"], begin, no_steps(particles.x.dtype))
         check_hdf5(path)
         staged = staged_file(path)
         try:
@@ -151,14 +153,14 @@ class FrameWriter:
             if isinstance(error, OSError):
                 raise OSError(f"{path} could not be written ({reason(error)}); it is as it was.") from None
             raise
-        return cls(file, staged, path, state_of(particles))
+        return cls(file, staged, path, begin)
 
-    def append(self, step: int, state: State, statistics: RunStatistics) -> None:
+    def append(self, step: int, state: RolloutState, statistics: RunStatistics) -> None:
         """Write a frame; one of the last frame's step replaces it.
 
         Args:
             step: its step number.
-            state: its state.
+            state: its state, with the impulse on the colliders by then.
             statistics: of the run up to it.
 
         Raises:
@@ -180,7 +182,7 @@ class FrameWriter:
             raise OSError(f"frame {n} could not be written ({reason(error)})") from None
         self._kept = self._standing()
 
-    def last(self) -> tuple[int, State, RunStatistics]:
+    def last(self) -> tuple[int, RolloutState, RunStatistics]:
         """Step number, state and statistics of the last frame."""
         n = count_in(self._file)
         steps, states, tallies = _frames(self._file, self._like, n - 1, n)
@@ -245,8 +247,9 @@ def save(path: str | os.PathLike, run: Run) -> None:
     ):
         for i in range(len(run)):
             if steps[i] < final_step:  # a run that met a fault has frames beyond its last good state
-                writer.append(int(steps[i]), jax.tree.map(lambda a, i=i: a[i], run.frames), unknown)
-        writer.append(final_step, state_of(run.final), run.statistics)
+                frame = jax.tree.map(lambda a, i=i: a[i], (run.frames, run.collider_impulse))
+                writer.append(int(steps[i]), RolloutState(*frame), unknown)
+        writer.append(final_step, RolloutState(state_of(run.final), run.final_collider_impulse), run.statistics)
 
 
 def steps_in(path: str | os.PathLike) -> int:
@@ -287,7 +290,7 @@ def load(path: str | os.PathLike) -> Run:
         blank = jnp.zeros((len(known["mass"]), described["d"]), dtype)
         particles = Particles(blank, blank, **known, counts=described["counts"])
         steps, frames, tallies = _frames(
-            file, jax.eval_shape(lambda: state_of(prepare(scene, particles))), 0, count_in(file)
+            file, jax.eval_shape(lambda: initial_state(scene, prepare(scene, particles))), 0, count_in(file)
         )
     last = jax.tree.map(lambda a: a[-1], frames)
     return Run(
@@ -295,11 +298,13 @@ def load(path: str | os.PathLike) -> Run:
         method=method,
         dt=jnp.asarray(described["dt"], dtype),
         steps=jnp.asarray(steps, dtype),
-        frames=frames,
+        frames=frames.particles,
         observed=None,
-        final=with_state(particles, last),
+        final=with_state(particles, last.particles),
         final_step=jnp.asarray(steps[-1], dtype),
         statistics=jax.tree.map(lambda a: a[-1], tallies),
+        collider_impulse=frames.collider_impulse,
+        final_collider_impulse=last.collider_impulse,
     )
 
 
@@ -362,27 +367,27 @@ def _description(group: File) -> dict[str, Any]:
     }
 
 
-def _rows(frame: int, step: int, dt: Any, state: State, statistics: RunStatistics) -> dict[str, np.ndarray]:
+def _rows(frame: int, step: int, dt: Any, state: RolloutState, statistics: RunStatistics) -> dict[str, np.ndarray]:
     """The rows that a frame adds to each dataset."""
     values = {"step": np.int64(step)} | {f.name: np.asarray(getattr(statistics, f.name)) for f in fields(RunStatistics)}
     row = np.array([tuple(values.values())], [(name, a.dtype) for name, a in values.items()])
-    rows = rows_of(frame, step * float(dt), state) | {"mpmjax/frames": row}
-    if state.received is not None:
-        both = state.received.impulse, state.received.angular
-        rows["mpmjax/received"] = np.concatenate([np.asarray(a) for a in both], axis=1)[None]
+    rows = rows_of(frame, step * float(dt), state.particles) | {"mpmjax/frames": row}
+    if state.collider_impulse is not None:
+        both = state.collider_impulse.impulse, state.collider_impulse.angular
+        rows["mpmjax/collider_impulse"] = np.concatenate([np.asarray(a) for a in both], axis=1)[None]
     return rows
 
 
-def _frames(file: File, like: State, start: int, stop: int) -> tuple[np.ndarray, State, RunStatistics]:
+def _frames(file: File, like: RolloutState, start: int, stop: int) -> tuple[np.ndarray, RolloutState, RunStatistics]:
     """Step numbers, states and statistics of frames `start` to `stop`, each with a leading axis. See `states_in`."""
     table = file["mpmjax/frames"][start:stop]
     require(len(table) == stop - start, "frames are missing")
     tallies = RunStatistics(**{f.name: jnp.asarray(table[f.name]) for f in fields(RunStatistics)})
-    states = states_in(file, like, start, stop)
-    if like.received is not None:
-        both = jnp.asarray(file["mpmjax/received"][start:stop])
-        states = replace(states, received=ColliderImpulse(*jnp.split(both, [like.x.shape[1]], axis=-1)))
-    return table["step"], states, tallies
+    particles, impulse = states_in(file, like.particles, start, stop), None
+    if like.collider_impulse is not None:
+        both = jnp.asarray(file["mpmjax/collider_impulse"][start:stop])
+        impulse = ColliderImpulse(*jnp.split(both, [like.particles.x.shape[1]], axis=-1))
+    return table["step"], RolloutState(particles, impulse), tallies
 
 
 def _check_same(path: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> None:

@@ -78,7 +78,7 @@ def rows_of(frame: int, time: float, state: State) -> dict[str, np.ndarray]:
 
 
 def states_in(file: File, like: State, start: int, stop: int) -> State:
-    """The states of frames `start` to `stop`, with a leading axis, but for what colliders have received.
+    """The states of frames `start` to `stop`, with a leading axis.
 
     Args:
         file: the file.

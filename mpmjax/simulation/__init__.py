@@ -1,15 +1,18 @@
 """Rollouts: many steps, driven by diffrax, and their faults in words."""
 
 from mpmjax.simulation._faults import raise_faults, warn_of_inaccurate_solves
+from mpmjax.simulation._rollout_state import RolloutState, initial_state
 from mpmjax.simulation._run import Run, SimulationError
 from mpmjax.simulation._simulate import integrate, number_of_steps, rollout, simulate
 from mpmjax.simulation._statistics import HEALTHY, RunStatistics, no_steps
 
 __all__ = [
     "HEALTHY",
+    "RolloutState",
     "Run",
     "RunStatistics",
     "SimulationError",
+    "initial_state",
     "integrate",
     "no_steps",
     "number_of_steps",

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Bool, Int, Scalar
 from mpmjax.checks import first_unmet, requirements
 from mpmjax.discretisation import Stencil, in_window
+from mpmjax.simulation._rollout_state import RolloutState
 from mpmjax.simulation._statistics import (
     BAD_PARAMETERS,
     BEYOND,
@@ -23,7 +24,7 @@ from mpmjax.simulation._statistics import (
     RunStatistics,
     no_steps,
 )
-from mpmjax.state import Particles, Scene, State, state_of, with_state
+from mpmjax.state import Particles, Scene, State, with_state
 from mpmjax.stepping import AbstractIntegrator, advance_compiled
 
 
@@ -91,13 +92,13 @@ def fault_of(problem: Problem, before: State, after: State, t: Scalar) -> Int[Ar
     return fault
 
 
-def examined(problem: Problem, state: State) -> tuple[Problem, State]:
+def examined(problem: Problem, state: RolloutState) -> tuple[Problem, RolloutState]:
     """The problem with the fault of its start, found from values that were not known when they were given, and the
     state, made NaN if a parameter is bad, since what follows would look like numbers."""
     arrays, rest = eqx.partition((problem, state), eqx.is_array)
     known, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
     unmet = first_unmet(requirements((known.scene, known.particles, known.method)))
-    fault = jnp.where(unmet > 0, BAD_PARAMETERS + unmet - 1, state_fault(known, begin))
+    fault = jnp.where(unmet > 0, BAD_PARAMETERS + unmet - 1, state_fault(known, begin.particles))
     valid = jnp.where(unmet > 0, jnp.nan, 1)
     state = jax.tree.map(lambda a: a * valid.astype(a.dtype), state)
     return eqx.tree_at(lambda p: p.fault, problem, fault, is_leaf=lambda a: a is None), state
@@ -123,24 +124,29 @@ class StepSolver(diffrax.AbstractSolver):
         del terms
         return 1
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: State, args: Problem) -> tuple[RunStatistics, State | None, Array]:
+    def init(
+        self, terms: Any, t0: Any, t1: Any, y0: RolloutState, args: Problem
+    ) -> tuple[RunStatistics, RolloutState | None, Array]:
         """Empty statistics, no previous state, and a report of zero."""
         del terms, t0, t1
-        statistics, silent = no_steps(y0.x.dtype), jnp.zeros((), y0.x.dtype)
+        dtype = y0.particles.x.dtype
+        statistics, silent = no_steps(dtype), jnp.zeros((), dtype)
         if args.fault is not None:
             statistics = eqx.tree_at(lambda statistics: statistics.fault, statistics, args.fault)
         return statistics, y0 if self.watch else None, silent
 
-    def step(self, terms: Any, t0: Any, t1: Any, y0: State, args: Problem, solver_state: Any, made_jump: Any) -> tuple:
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: RolloutState, args: Problem, solver_state: Any, made_jump: Any
+    ) -> tuple:
         """One step. A fault is reported as the solver's failure: as an event diffrax would ask for it once more."""
         del terms, t1, made_jump
         statistics, _, report = solver_state
         t = (args.start + step_number(t0)) * args.dt
         method = args.method.reporting(args.slot)
-        particles, info = advance_compiled(args.scene, args.at(y0), t, args.dt, method, args.stencil)
+        particles, info = advance_compiled(args.scene, args.at(y0.particles), t, args.dt, method, args.stencil)
         report = report + info.solve.report
-        y1 = state_of(particles)
-        arrays, rest = eqx.partition((args, y0, y1, t), eqx.is_array)
+        y1 = y0.after(particles, info)
+        arrays, rest = eqx.partition((args, y0.particles, y1.particles, t), eqx.is_array)
         statistics = statistics.plus(info, fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest)))
         dense = {"y0": y0, "y1": y1}
         if not self.watch:
@@ -149,12 +155,12 @@ class StepSolver(diffrax.AbstractSolver):
         result = results.where(statistics.fault == HEALTHY, results.successful, results.nonlinear_divergence)
         return y1, None, dense, (statistics, y0, report), result
 
-    def func(self, terms: Any, t0: Any, y0: State, args: Problem) -> State:
+    def func(self, terms: Any, t0: Any, y0: RolloutState, args: Problem) -> RolloutState:
         """Not a vector field; diffrax only asks for its shape."""
         return terms.vf(t0, y0, args)
 
 
-def no_vector_field(t: Any, y: State, args: Problem) -> State:
+def no_vector_field(t: Any, y: RolloutState, args: Problem) -> RolloutState:
     """A stand-in for the equation that diffrax expects; the solver does not evaluate it."""
     del t, args
     return jax.tree.map(jnp.zeros_like, y)

@@ -13,6 +13,7 @@ from mpmjax.checks import requirements, warn
 from mpmjax.material import Law
 from mpmjax.simulation._advice import advise, disallowed
 from mpmjax.simulation._diffrax import Problem, faulty_particles, passed_particles
+from mpmjax.simulation._rollout_state import RolloutState
 from mpmjax.simulation._run import Run, SimulationError
 from mpmjax.simulation._statistics import (
     BAD_PARAMETERS,
@@ -23,11 +24,11 @@ from mpmjax.simulation._statistics import (
     OUTSIDE,
     RunStatistics,
 )
-from mpmjax.state import Particles, State, state_of, with_state
+from mpmjax.state import Particles, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator
 
 
-def raise_faults(run: Run, began: Particles, previous: State | None, start: int) -> None:
+def raise_faults(run: Run, began: Particles, previous: RolloutState | None, start: int) -> None:
     """Raise the faults in the statistics of an untraced run.
 
     Args:
@@ -46,7 +47,7 @@ def raise_faults(run: Run, began: Particles, previous: State | None, start: int)
         what, advice = _FAULTS.get(fault, ("", ""))
         if fault == BEYOND:
             t = jnp.asarray(step - 1, run.final.x.dtype) * run.dt
-            passed = passed_particles(problem, previous, state_of(run.final), t)
+            passed = passed_particles(problem, previous.particles, state_of(run.final), t)
             number, bad[BEYOND] = next((i, mask) for i, mask in passed if mask.any())
             what = f"{what} boundary {number}, {type(run.scene.boundary[number]).__name__}"
             if run.scene.total:
@@ -54,21 +55,23 @@ def raise_faults(run: Run, began: Particles, previous: State | None, start: int)
         first = int(np.argmax(np.asarray(bad[fault])))
         if fault == INADMISSIBLE:
             what, advice = disallowed(_law(run, first), run.method)
-        last = with_state(run.final, previous)
+        last = with_state(run.final, previous.particles)
         reached = int((run.steps < step).sum())
         good = eqx.tree_at(
-            lambda r: (r.final, r.final_step, r.steps, r.frames, r.observed),
+            lambda r: (
+                *(r.final, r.final_collider_impulse, r.final_step),
+                *(r.steps, r.frames, r.observed, r.collider_impulse),
+            ),
             run,
             (
-                last,
-                jnp.asarray(step - 1, run.final_step.dtype),
-                *jax.tree.map(lambda a: a[:reached], (run.steps, run.frames, run.observed)),
+                *(last, previous.collider_impulse, jnp.asarray(step - 1, run.final_step.dtype)),
+                *jax.tree.map(lambda a: a[:reached], (run.steps, run.frames, run.observed, run.collider_impulse)),
             ),
             is_leaf=lambda leaf: leaf is None,
         )
         raise SimulationError(
             f"At step {step} (t = {step * float(run.dt):.6g} s) particle {first} {what}; the last good position was "
-            f"{np.asarray(previous.x[first])}. {advise(run.scene, run.method, run.dt, began, last, advice)}",
+            f"{np.asarray(previous.particles.x[first])}. {advise(run.scene, run.method, run.dt, began, last, advice)}",
             good,
         )
     if int(run.statistics.unconverged) > 0:

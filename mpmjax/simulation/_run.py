@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
+from mpmjax.boundary import ColliderImpulse
 from mpmjax.simulation._statistics import RunStatistics
 from mpmjax.state import Particles, Scene, State, with_state
 from mpmjax.stepping import AbstractIntegrator
@@ -56,6 +57,12 @@ class Run(eqx.Module):
     report: Float[Array, "..."] | None = None
     """Zero. Its tangent in forward mode is the relative residual of the first tangent solve that did not converge, zero
     if all did. None of a run from a file."""
+    collider_impulse: ColliderImpulse | None = None
+    """Linear and angular impulse on the scene's colliders from the run's start to each saved frame, with a leading axis
+    f; None without colliders, or where nothing was saved. The difference between two frames, over the time between
+    them, is the mean force and torque (see `forces`)."""
+    final_collider_impulse: ColliderImpulse | None = None
+    """The same to the end; None without colliders."""
 
     @property
     def times(self) -> Float[Array, "*f"]:
@@ -79,15 +86,15 @@ class Run(eqx.Module):
         """The mean force and torque on each collider between one saved frame and the next.
 
         Raises:
-            ValueError: no frames were saved, or the scene has no collider.
+            ValueError: nothing was saved on the way, or the scene has no collider.
         """
-        if self.frames is None or self.frames.received is None:
+        if self.collider_impulse is None:
             raise ValueError(
                 "Forces need saved frames and colliders: pass save_every to simulate, a collider to Scene."
             )
         times = self.times
         between = (times[1:] - times[:-1])[:, None, None]
-        mean = jax.tree.map(lambda a: (a[1:] - a[:-1]) / between, self.frames.received)
+        mean = jax.tree.map(lambda a: (a[1:] - a[:-1]) / between, self.collider_impulse)
         return Forces((times[1:] + times[:-1]) / 2, mean.impulse, mean.angular)
 
     def __len__(self) -> int:

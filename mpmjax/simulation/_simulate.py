@@ -25,6 +25,7 @@ from mpmjax.checks import (
 )
 from mpmjax.simulation._diffrax import Problem, StepSolver, examined, no_vector_field, step_number
 from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccurate_solves
+from mpmjax.simulation._rollout_state import RolloutState, initial_state
 from mpmjax.simulation._run import Run
 from mpmjax.simulation._statistics import HEALTHY, RunStatistics
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
@@ -66,7 +67,8 @@ def simulate(
         observe: instead of states, save what this function of (scene, particles) returns, so that a curve costs no more
             memory than its points. `save_every` then defaults to 1. It may be an `equinox.Module` with arrays; a plain
             function compiles anew unless it is the same object.
-        start: number of the first step, e.g. a former run's `final_step`; time there is start·dt.
+        start: number of the first step, e.g. a former run's `final_step`; time there is start·dt. The impulse on
+            colliders (`run.collider_impulse`) is summed from here on, in a run that continues another too.
         adjoint: how diffrax differentiates. Default: recursive checkpointing.
         checkpoint_bytes: memory for the checkpoints of the default adjoint [B]. Fewer of them cost recomputation.
         progress: show diffrax's progress meter.
@@ -92,7 +94,7 @@ def simulate(
         save_every = min(require_whole("save_every", save_every, 1), count)
     if observe is not None and save_every is None:
         save_every = 1
-    dtype = particles.x.dtype
+    dtype, state_bytes = particles.x.dtype, _bytes(initial_state(scene, particles))
     scene, dt_, method = canonical((scene, dt, method), dtype)
     requirements((scene, method))  # in this precision
     traced = is_traced((scene, particles, dt_, method, observe))  # under jax.jit also if all that was passed is known
@@ -100,7 +102,7 @@ def simulate(
         frames = count // save_every + 2
         require_memory(
             f"{frames} frames of {particles.count} particles",
-            float(frames) * _bytes(particles),
+            float(frames) * state_bytes,
             f"save less often than every {save_every} steps, observe what is needed of them, or use record.",
             device=True,
         )
@@ -109,10 +111,11 @@ def simulate(
         healthy, unsolved = jnp.asarray(HEALTHY, jnp.int32), UNSOLVED.format("the adjoint")
         (scene, particles, method), slot = guard((scene, particles, method), slot, healthy, (), unsolved)
     if adjoint is None:
-        adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=_checkpoints(particles, count, checkpoint_bytes))
+        adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=max(1, min(count, checkpoint_bytes // state_bytes)))
     saved, final, statistics, previous, report = integrate(
         scene,
         particles,
+        initial_state(scene, particles),
         jnp.asarray(start, dtype),
         None,
         dt_,
@@ -125,7 +128,7 @@ def simulate(
         progress=progress,
         watch=not traced,
     )
-    steps, values = (jnp.zeros((0,), dtype), None) if saved is None else saved
+    steps, values, impulse = (jnp.zeros((0,), dtype), None, None) if saved is None else saved
     run = Run(
         scene=scene,
         method=method,
@@ -133,10 +136,12 @@ def simulate(
         steps=steps,
         frames=values if observe is None else None,
         observed=None if observe is None else values,
-        final=with_state(particles, final),
+        final=with_state(particles, final.particles),
         final_step=jnp.asarray(start, dtype) + statistics.steps.astype(dtype),
         statistics=statistics,
         report=report if traced else None,
+        collider_impulse=impulse,
+        final_collider_impulse=final.collider_impulse,
     )
     if not throw:
         return run
@@ -216,19 +221,16 @@ def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
     return total - int(start)
 
 
-def _checkpoints(particles: Particles, count: int, budget: int) -> int:
-    return max(1, min(count, budget // _bytes(particles)))
-
-
-def _bytes(particles: Particles) -> int:
-    """Size of the evolving part of the particles [B]."""
-    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state_of(particles)))
+def _bytes(state: RolloutState) -> int:
+    """Size of a state [B]."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
 
 
 @eqx.filter_jit
 def integrate(
     scene: Scene,
     particles: Particles,
+    state: RolloutState,
     start: Float[Array, ""],
     count: Float[Array, ""] | None,
     dt: Scalar,
@@ -241,26 +243,26 @@ def integrate(
     adjoint: diffrax.AbstractAdjoint,
     progress: bool,
     watch: bool,
-) -> tuple[Any, State, RunStatistics, State | None, Array]:
-    """Integrate `count` ≤ `max_steps` steps from step `start`.
+) -> tuple[Any, RolloutState, RunStatistics, RolloutState | None, Array]:
+    """Integrate `count` ≤ `max_steps` steps from step `start`, at which the particles have this state.
 
-    Returns the steps and values saved, the final state, the statistics, with `watch`, which stops the run at a fault,
-    the state before the last step, and what tangent solves report. Adjoint solves report through the `slot` (see
-    `Reporting`).
+    Returns the steps, values and collider impulses saved, the final state, the statistics, with `watch`, which stops
+    the run at a fault, the state before the last step, and what tangent solves report. Adjoint solves report through
+    the `slot` (see `Reporting`).
 
     Without a count, all of them: what diffrax derives of its last time is then a constant, which XLA computes as it
     compiles, and not a program of two thousand operations.
     """
     stencil = scene.stencil(particles) if scene.total else None
     problem = Problem(scene, particles, stencil, dt, method, observe, start, jnp.asarray(slot, start.dtype))
-    state = state_of(particles)
     if not watch:
         problem, state = examined(problem, state)
     zero, one, all_steps = (np.asarray(n, start.dtype) for n in (0, 1, max_steps))
 
-    def kept(t: Any, y: State, args: Problem) -> Any:
+    def kept(t: Any, y: RolloutState, args: Problem) -> Any:
         del t
-        return y if args.observe is None else args.observe(args.scene, args.at(y))
+        value = y.particles if args.observe is None else args.observe(args.scene, args.at(y.particles))
+        return value, y.collider_impulse
 
     subs = {"final": diffrax.SubSaveAt(t1=True)}
     if save_every is not None:
@@ -281,5 +283,5 @@ def integrate(
     )
     times, values, (statistics, previous, report) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
     final = jax.tree.map(lambda a: a[-1], values["final"])
-    saved = None if save_every is None else (start + step_number(times["frames"]), values["frames"])
+    saved = None if save_every is None else (start + step_number(times["frames"]), *values["frames"])
     return saved, final, statistics, previous, report

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from mpmjax._types import Array, Matrix, ParticleMatrix, ParticleScalar, ParticleVector, components
-from mpmjax.boundary import ColliderImpulse
 from mpmjax.checks import checked, require, require_fields, require_positive
 
 Deformations = Float[Array, "*f _ _ _"] | tuple[Float[Array, "*f _ _ _"], ...]
@@ -19,7 +18,7 @@ Deformations = Float[Array, "*f _ _ _"] | tuple[Float[Array, "*f _ _ _"], ...]
 class Particles(eqx.Module):
     """A set of particles. `fill` makes x, v, mass and volume; `prepare` adds what the scene needs.
 
-    Only x, v, C, F, history and received change with time. Every leaf is a float array of one dtype. Particles
+    Only x, v, C, F and history change with time. Every leaf is a float array of one dtype. Particles
     of several materials lie group after group (see `join`), and F and history have one entry a group.
     """
 
@@ -41,9 +40,6 @@ class Particles(eqx.Module):
     """Reference positions [m], shape (p, d), in the total description."""
     history: Any = None
     """The history of laws that yield, a pytree of arrays of shape (p,) each; see the law."""
-    received: ColliderImpulse | None = None
-    """Linear and angular impulse on the scene's colliders since the particles were prepared; None without colliders.
-    The difference between two times, over the time between them, is the mean force and torque."""
     counts: tuple[int, ...] | None = eqx.field(static=True, default=None)
     """Number of particles of each of several materials; None if there is one."""
 
@@ -154,7 +150,6 @@ class State(eqx.Module):
     C: Float[Array, "*f p d d"] | None
     F: Deformations
     history: Any = None
-    received: ColliderImpulse | None = None
 
 
 def by_material(held: Particles | State) -> list[tuple[slice, Any, Any]]:
@@ -179,11 +174,9 @@ def histories(held: Particles | State) -> list[tuple[str, slice, Any]]:
 def state_of(particles: Particles) -> State:
     """The evolving part of prepared particles."""
     assert particles.F is not None
-    return State(particles.x, particles.v, particles.C, particles.F, particles.history, particles.received)
+    return State(particles.x, particles.v, particles.C, particles.F, particles.history)
 
 
 def with_state(particles: Particles, state: State) -> Particles:
     """The particles with their evolving part replaced."""
-    return replace(
-        particles, x=state.x, v=state.v, C=state.C, F=state.F, history=state.history, received=state.received
-    )
+    return replace(particles, x=state.x, v=state.v, C=state.C, F=state.F, history=state.history)

@@ -9,11 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, components
-from mpmjax.boundary import (
-    ColliderImpulse,
-    Plane,
-    nothing_received,
-)
+from mpmjax.boundary import Plane
 from mpmjax.checks import (
     canonical,
     checked,
@@ -37,10 +33,9 @@ from mpmjax.state._scene import Scene
 def prepare(scene: Scene, particles: Particles) -> Particles:
     """Add to the particles what the scene's laws, transfer and description need, where it is missing.
 
-    F = I (J = 1), the history of what never yielded, C = 0 with APIC or viscosity (and none without), X = x in the
-    total description (and none in the updated one), and nothing received by colliders. Of particles that meet a scene
-    for the first time it warns where walls or colliders lie over them, grips or colliders touch nothing, and a body is
-    thinner than two cells.
+    F = I (J = 1), the history of what never yielded, C = 0 with APIC or viscosity (and none without), and X = x in the
+    total description (and none in the updated one). Of particles that meet a scene for the first time it warns where
+    walls or colliders lie over them, grips or colliders touch nothing, and a body is thinner than two cells.
 
     Raises:
         ValueError: a value is not as its module requires (`equinox.tree_at` can make it so), the particles have
@@ -71,7 +66,6 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
         history=tuple(history for _, history in own) if several else own[0][1],
         C=(still if particles.C is None else particles.C) if scene.keeps_gradient else None,
         X=(particles.x if particles.X is None else particles.X) if scene.total else None,
-        received=_received(scene, particles),
     )
     _check_size(scene, prepared)
     if not is_traced((scene, prepared)):
@@ -94,15 +88,6 @@ def _check_size(scene: Scene, particles: Particles) -> None:
         f"take a smaller shape than {scene.grid.shape}, or fewer particles_per_cell.",
         device=True,
     )
-
-
-def _received(scene: Scene, particles: Particles) -> ColliderImpulse | None:
-    """The impulse that colliders have received: the particles' own if it fits the number of colliders, else zero."""
-    if scene.colliders == 0:
-        return None
-    nothing = nothing_received(scene.colliders, particles.dim, particles.x.dtype)
-    known = particles.received
-    return known if known is not None and known.impulse.shape == nothing.impulse.shape else nothing
 
 
 def _prepared(law: Law, group: Group, particles: Particles) -> tuple[Array, Any]:
@@ -138,8 +123,7 @@ def is_prepared(scene: Scene, particles: Particles) -> bool:
     several = isinstance(scene.material, tuple)
     if several != (particles.counts is not None) or (several and len(scene.laws) != len(particles.groups)):
         return False
-    known = 0 if particles.received is None else len(particles.received.impulse)
-    return known == scene.colliders and all(
+    return all(
         group.F is not None
         and (group.F.shape[-1] == 1 if isinstance(law, AbstractVolumetric) else group.F.shape[-1] == particles.dim)
         and (_remembers(law, group.F, group.history) if isinstance(law, AbstractInelastic) else group.history is None)

@@ -13,10 +13,10 @@ from mpmjax.boundary import (
     ColliderImpulse,
     ConstrainedNodes,
     ContactInfo,
+    collider_impulse,
     constrain,
     find_active_set,
     no_contact,
-    received,
 )
 from mpmjax.checks import canonical, checked, require_positive
 from mpmjax.discretisation import Stencil, g2p
@@ -98,10 +98,10 @@ def advance(
     asked = nodes.conditions.colliders
     if asked is not None and new.motion.mean is not None:
         asked = asked.after(dt / 2, new.motion.mean)
-    impulse = None if asked is None else received(asked, new.reaction, new.normal_impulse, new.collider_friction)
+    impulse = None
+    if asked is not None:
+        impulse = collider_impulse(asked, new.reaction, new.normal_impulse, new.collider_friction)
     after = scene.return_map(grid_to_particles(scene, particles, nodes, new))
-    if impulse is not None and after.received is not None:
-        after = replace(after, received=after.received.plus(impulse))
     return after, StepInfo(new.solve, new.contact, outside, impulse)
 
 
