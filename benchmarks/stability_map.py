@@ -31,7 +31,7 @@ import numpy as np
 
 import mpmjax as mpm
 from mpmjax._types import components
-from mpmjax.boundary._mirror import mirror
+from mpmjax.boundary import mirror
 from mpmjax.discretisation._transfer import p2g
 from mpmjax.implicit._potential import ElasticPotential
 

@@ -19,8 +19,10 @@ from mpmjax.analysis import (
 from mpmjax.boundary import (
     AbstractBoundary,
     AbstractCollider,
+    AbstractContact,
     ColliderImpulse,
     Conditions,
+    ConstrainedNodes,
     ContactPlane,
     Grip,
     SeparatingBox,
@@ -30,6 +32,7 @@ from mpmjax.boundary import (
     StickyBox,
     StickyCollider,
     SymmetryPlane,
+    Wall,
 )
 from mpmjax.discretisation import (
     APIC,
@@ -153,8 +156,10 @@ __all__ = [  # noqa: RUF022 (grouped)
     "APIC",
     # boundaries
     "AbstractBoundary",
+    "AbstractContact",
     "AbstractMotion",
     "Conditions",
+    "ConstrainedNodes",
     "ContactPlane",
     "Grip",
     "Motion",
@@ -163,6 +168,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "SlipBox",
     "StickyBox",
     "SymmetryPlane",
+    "Wall",
     "AbstractCollider",
     "SeparatingCollider",
     "SlipCollider",

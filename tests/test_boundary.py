@@ -9,9 +9,7 @@ from helpers import DESCRIPTIONS, KERNELS, LAWS, assert_close, cloud, ids, thoro
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.boundary._conditions import combine
-from mpmjax.boundary._mirror import Mirror, mirror
-from mpmjax.boundary._plane_contact import plane_contacts
+from mpmjax.boundary import Mirror, combine, contacts_of, mirror
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {
@@ -235,8 +233,9 @@ def test_fold_is_the_transpose_of_unfold_where_some_columns_are_held():
     """Two planes that meet, with random columns of either: every node is itself or a signed copy; no mass is lost."""
     grid, rng = mpm.Grid((7, 6), DX), np.random.default_rng(0)
     planes = (mpm.ContactPlane(0, 0.2), mpm.ContactPlane(1, 0.35, "below"))
+    nothing_prescribed = mpm.Conditions(jnp.zeros((42, 2), bool), jnp.zeros((42, 2)))
     columns = [np.broadcast_to(rng.random((1, 6)) < 0.5, (7, 6)), np.broadcast_to(rng.random((7, 1)) < 0.5, (7, 6))]
-    found = plane_contacts(planes, grid, grid.window(jnp.zeros((1, 2))))
+    found = contacts_of(planes, nothing_prescribed, grid, grid.window(jnp.zeros((1, 2))), 0.0, DT)
     images = Mirror(tuple(c.image.within(jnp.asarray(h.ravel())) for c, h in zip(found, columns, strict=True)))
     basis = jnp.eye(84).reshape(84, 42, 2)
     B, transpose = (np.asarray(jax.vmap(f)(basis)).reshape(84, 84).T for f in (images.unfold, images.fold))

@@ -12,7 +12,7 @@ from helpers import LAWS, QUICK, assert_close, cloud, explicit_limit, ids, thoro
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.boundary._conditions import combine
+from mpmjax.boundary import combine
 from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._projection import Projection
 

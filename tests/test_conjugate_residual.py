@@ -12,7 +12,7 @@ from helpers import LAWS, assert_close, explicit_limit
 
 import mpmjax as mpm
 from mpmjax._types import components
-from mpmjax.boundary._mirror import mirror
+from mpmjax.boundary import mirror
 from mpmjax.discretisation._transfer import p2g
 from mpmjax.implicit._inner_product import DiagonalInnerProduct
 from mpmjax.implicit._operator import ImplicitOperator

@@ -12,8 +12,7 @@ from helpers import DESCRIPTIONS, DIMS, ELASTIC, GRADIENTS, LAWS, cloud, thoroug
 
 import mpmjax as mpm
 from mpmjax._types import components
-from mpmjax.boundary._conditions import combine
-from mpmjax.boundary._mirror import mirror
+from mpmjax.boundary import combine, mirror
 from mpmjax.discretisation._stencil import make_stencil
 from mpmjax.discretisation._transfer import p2g
 from mpmjax.implicit._operator import ImplicitOperator

@@ -8,7 +8,7 @@ import pytest
 from helpers import DESCRIPTIONS, FLUIDS, LAWS, VISCOUS, assert_close, block, cloud, rotation_matrix, thorough
 
 import mpmjax as mpm
-from mpmjax.boundary._mirror import mirror
+from mpmjax.boundary import mirror
 from mpmjax.implicit._hessian_action import damped
 from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.material import Viscosity

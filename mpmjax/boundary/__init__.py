@@ -1,8 +1,10 @@
 """Walls, grips, mirrored planes and colliders, and what colliders receive."""
 
+from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall
 from mpmjax.boundary._collider import AbstractCollider, SeparatingCollider, SlipCollider, StickyCollider
 from mpmjax.boundary._collider_impulse import ColliderImpulse, collider_impulse, no_impulse
-from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, Conditions, combine
+from mpmjax.boundary._combined import combine, contacts_of, mirror
+from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import (
     AbstractContact,
     AbstractNodes,
@@ -12,10 +14,9 @@ from mpmjax.boundary._contact import (
     find_active_set,
     no_contact,
 )
-from mpmjax.boundary._contacts import contacts_of
 from mpmjax.boundary._grip import Grip
-from mpmjax.boundary._mirror import Mirror, mirror
-from mpmjax.boundary._planes import ContactPlane, Plane, SymmetryPlane, fits
+from mpmjax.boundary._mirror import Image, Mirror
+from mpmjax.boundary._planes import ContactPlane, SymmetryPlane
 from mpmjax.boundary._walls import SeparatingBox, SlipBox, StickyBox
 
 __all__ = [
@@ -30,8 +31,8 @@ __all__ = [
     "ContactInfo",
     "ContactPlane",
     "Grip",
+    "Image",
     "Mirror",
-    "Plane",
     "SeparatingBox",
     "SeparatingCollider",
     "SlipBox",
@@ -39,12 +40,12 @@ __all__ = [
     "StickyBox",
     "StickyCollider",
     "SymmetryPlane",
+    "Wall",
     "collider_impulse",
     "combine",
     "constrain",
     "contacts_of",
     "find_active_set",
-    "fits",
     "mirror",
     "no_contact",
     "no_impulse",

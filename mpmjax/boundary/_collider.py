@@ -6,14 +6,19 @@ no derivative; normals and velocities have, with respect to the motion and the s
 rules of `combine` apply.
 """
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, NodeVector, ParticleVector, Scalar
-from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, ColliderConditions, Conditions
+from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
+from mpmjax.boundary._conditions import ColliderConditions, Conditions
+from mpmjax.boundary._contact import refuse_contact
 from mpmjax.checks import canonical, require, require_between, require_fields
-from mpmjax.geometry import AbstractMotion, AbstractRegion, HalfSpace, Motion, length, still
+from mpmjax.discretisation import Grid
+from mpmjax.geometry import AbstractMotion, AbstractRegion, length, still
 
 _LOOKS = 4  # places of a particle's way in which a collider is looked for
 
@@ -22,7 +27,17 @@ class AbstractCollider(AbstractBoundary):
     """A rigid body in the way of the material."""
 
     shape: eqx.AbstractVar[AbstractRegion]
+    """The body before its motion."""
     motion: eqx.AbstractVar[AbstractMotion | None]
+    """How it moves; None for not at all."""
+    bodies: ClassVar[int] = 1
+
+    def __check_init__(self):
+        motion, d = self.motion, self.dim
+        require(
+            motion is None or motion.dim == d,
+            f"A collider's shape and motion must have the same dimension, got {d} and {motion and motion.dim}.",
+        )
 
     @property
     def dim(self) -> int:
@@ -31,6 +46,9 @@ class AbstractCollider(AbstractBoundary):
     def distance(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m"]:
         """The signed distance [m] of each of the points x [m], shape (m, d), from the body as it is at time t."""
         return self.shape.distance(x if self.motion is None else self.motion.origin(x, t))
+
+    def rests(self, *, total: bool) -> bool:
+        return total or self.motion is None or self.motion.rests()
 
     def passed(
         self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
@@ -70,7 +88,6 @@ class StickyCollider(AbstractCollider):
 
     def __check_init__(self):
         require_fields(self)
-        _check(self)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v = v_c."""
@@ -108,12 +125,15 @@ class SlipCollider(AbstractCollider):
 
     def __check_init__(self):
         require_fields(self)
-        _check(self)
 
-    @property
-    def flat(self) -> bool:
-        """Whether the normal is the same everywhere and always."""
-        return isinstance(self.shape, HalfSpace) and (self.motion is None or isinstance(self.motion, Motion))
+    def check(self, grid: Grid, *, total: bool) -> None:
+        """In the total description its normal must be the same everywhere and always."""
+        del grid
+        require(
+            not total or (self.shape.flat and (self.motion is None or not self.motion.turns)),
+            "In the total description material can slide along a half-space that does not turn and nothing else, its "
+            "nodes being those of the start: use the updated one, or StickyCollider.",
+        )
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v·n = v_c·n."""
@@ -146,7 +166,6 @@ class SeparatingCollider(AbstractCollider):
 
     def __check_init__(self):
         require_fields(self)
-        _check(self)
         require_between("SeparatingCollider's friction", self.friction, 0, 1e6)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
@@ -160,13 +179,9 @@ class SeparatingCollider(AbstractCollider):
         )
         return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), colliders=asked)
 
-
-def _check(collider: AbstractCollider) -> None:
-    motion, d = collider.motion, collider.dim
-    require(
-        motion is None or motion.dim == d,
-        f"A collider's shape and motion must have the same dimension, got {d} and {motion and motion.dim}.",
-    )
+    def check(self, grid: Grid, *, total: bool) -> None:
+        del grid
+        refuse_contact(total)
 
 
 class _Body(eqx.Module):
@@ -215,4 +230,5 @@ class _Body(eqx.Module):
             position=self.position,
             pivots=self.pivot[None],
             pivot_velocity=self.pivot_velocity[None],
+            slides=True,
         )

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Mask, NodeScalar, NodeVector
+from mpmjax._types import Array, Bool, NodeScalar, NodeVector
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
 
@@ -22,6 +22,10 @@ class ColliderContact(AbstractContact):
     """Coulomb coefficient there [-], shape (n,)."""
     of_collider: ClassVar[bool] = True
 
+    @property
+    def friction_order(self) -> float:
+        return 3.0
+
     def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> NodeScalar:
         """The velocity out of the collider, relative to it [m/s]; zero where the normal has no free part, what is
         prescribed leaving the collider nothing to hold."""
@@ -33,10 +37,6 @@ class ColliderContact(AbstractContact):
         impulse = held.collider_impulse(residual)
         assert impulse is not None
         return impulse
-
-    def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
-        """The rounding of a velocity [m/s], and of a node's momentum [kg m/s], shape (n,)."""
-        return noise, noise * held.mass
 
     def friction(self, held: ConstrainedNodes, active: Array, v: NodeVector, residual: NodeVector) -> NodeVector:
         """−min(1, μ r / (m ‖s‖)) s with the slip s = Q (v − v_c), r the normal impulse and v_c the collider's
@@ -51,11 +51,6 @@ class ColliderContact(AbstractContact):
         stopping = mass * jnp.sqrt(jnp.where(slides, square, 1))
         share = jnp.where(slides, jnp.minimum(limit / jnp.where(slides, stopping, 1), 1), 0)
         return -share[:, None] * slip
-
-    def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """None in whole: a normal need not lie along an axis."""
-        del active
-        return jnp.zeros(shape, bool)
 
     def normals(self, active: Array) -> Bool[Array, "n"]:
         return active

@@ -1,19 +1,9 @@
-"""Boundary conditions: functions of node position that prescribe grid velocities or mark contact.
-
-Every condition acts on the grid alone; the transfers know nothing of it. A wall acts on the nodes at and beyond it; a
-node within a thousandth of a spacing of a wall counts as on it. Where walls, planes and grips lie only selects nodes,
-so derivatives with respect to it are zero.
-"""
-
-import abc
+"""The conditions of boundaries on the nodes: prescribed velocities, separating walls, colliders."""
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, ParticleVector, Scalar
-
-ON_THE_WALL = 1e-3
-"""Distance within which a node is on a wall, in spacings."""
+from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
 
 
 class ColliderConditions(eqx.Module):
@@ -39,6 +29,8 @@ class ColliderConditions(eqx.Module):
     """Whether the node may leave, shape (n,); None where there is no such collider."""
     friction: NodeScalar | None = None
     """Coulomb coefficient there [-], shape (n,)."""
+    slides: bool = eqx.field(static=True, default=False)
+    """Whether there is a body along which nodes slide."""
 
     def beside(self, later: "ColliderConditions") -> "ColliderConditions":
         """Both conditions; where two normals meet at a node, that of the earlier collider."""
@@ -65,6 +57,7 @@ class ColliderConditions(eqx.Module):
             pivot_velocity=jnp.concatenate([self.pivot_velocity, later.pivot_velocity]),
             leavable=joined(self.leavable, later.leavable),
             friction=joined(self.friction, later.friction),
+            slides=self.slides or later.slides,
         )
 
     def after(self, time: Scalar, velocity: NodeVector) -> "ColliderConditions":
@@ -87,86 +80,3 @@ class Conditions(eqx.Module):
     """Coulomb coefficient of that wall [-]."""
     colliders: ColliderConditions | None = None
     """Conditions of colliders; None without any."""
-
-
-class AbstractBoundary(eqx.Module):
-    """A boundary condition."""
-
-    @property
-    @abc.abstractmethod
-    def dim(self) -> int | None:
-        """Space dimension d of the condition; None if it fits any."""
-
-    @abc.abstractmethod
-    def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        """The conditions on nodes at the given positions for the step from t to t + dt.
-
-        With `reference`, the nodes are those of the reference configuration and a region that moves stays where it was.
-        """
-
-    def passed(
-        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
-    ) -> Bool[Array, "p"] | None:
-        """Which particles passed the boundary in the step from t to t + dt; None if it keeps nothing out.
-
-        A particle that moves less than a spacing in a step stops before a wall, or so little beyond it that a node of
-        its stencil is still free. A particle has passed if it is deeper than that, or if it moved more than a spacing
-        towards the wall in the step and ended beyond it. One that began beyond has not passed.
-
-        Args:
-            start: positions at t [m], shape (p, d).
-            end: positions at t + dt [m], shape (p, d).
-            spacing: dx [m].
-            t: time [s].
-            dt: step [s].
-            reach: half the kernel's width in spacings.
-        """
-        del start, end, spacing, t, dt, reach
-        return None
-
-
-def crossed(
-    start: Array, end: Array, wall: Array | Scalar, deepest: Array | Scalar, spacing: Scalar
-) -> Bool[Array, "..."]:
-    """Whether a coordinate that moved from `start` to `end` passed a wall that keeps material above it: it moved by
-    more than a spacing and ended below the wall, or it ended below `deepest`."""
-    fast = (start >= wall) & (end < wall) & (start - end > spacing)
-    return fast | ((start >= deepest) & (end < deepest))
-
-
-def combine(
-    boundaries: tuple[AbstractBoundary, ...],
-    nodes: NodeVector,
-    spacing: Scalar,
-    t: Scalar,
-    dt: Scalar,
-    *,
-    reference: bool,
-) -> Conditions:
-    """The conditions of all boundaries of a scene. Where two prescribe the same component, the earlier one holds.
-
-    Contact acts on components that nothing prescribes. A node may have components that are prescribed and, besides
-    them, a collider's normal component: both hold (see `Nodes.free_normal`). A normal that lies within a hundredth of
-    the prescribed components asks for nothing more. Of two colliders' normals the earlier one holds.
-    """
-    total = Conditions(jnp.zeros(nodes.shape, dtype=bool), jnp.zeros_like(nodes))
-    for boundary in boundaries:
-        new = boundary.conditions(nodes, spacing, t, dt, reference=reference)
-        velocity = jnp.where(total.fixed, total.velocity, new.velocity)
-        side, friction = total.side, total.friction
-        if new.side is not None and new.friction is not None:
-            if side is None or friction is None:
-                side, friction = new.side, new.friction
-            else:
-                friction = jnp.where(side != 0, friction, new.friction)
-                side = jnp.where(side != 0, side, new.side)
-        colliders = total.colliders
-        if new.colliders is not None:
-            holder = jnp.where(total.fixed, -1, new.colliders.holder)
-            mine = eqx.tree_at(lambda c: c.holder, new.colliders, holder)
-            colliders = mine if colliders is None else colliders.beside(mine)
-        total = Conditions(total.fixed | new.fixed, velocity, side, friction, colliders)
-    if total.side is None:
-        return total
-    side = jnp.where(total.fixed, 0, total.side)
-    return Conditions(total.fixed, total.velocity, side, total.friction, total.colliders)

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._mirror import Image, Mirror
+from mpmjax.checks import require
 
 SWEEPS = 4
 """Most active sets that are tried in a step."""
@@ -80,10 +81,20 @@ class AbstractNodes(eqx.Module):
 
 
 class AbstractContact(eqx.Module):
-    """A boundary that pushes but does not pull."""
+    """A boundary that pushes but does not pull.
+
+    One of one's own is brought by `AbstractBoundary.contacts` and needs `gap_velocity`, `normal_impulse` and, to hold
+    components of velocity, `fixed`. The rest has defaults.
+    """
 
     of_collider: ClassVar[bool] = False
     """Whether colliders receive its friction."""
+
+    @property
+    def friction_order(self) -> float:
+        """Frictions act one after the other, from the lowest number on: that of a wall is its axis, of a contact plane
+        its axis and a half, of colliders 3. Default: 4, after all of these."""
+        return 4.0
 
     @property
     def mirror_image(self) -> Image | None:
@@ -102,25 +113,35 @@ class AbstractContact(eqx.Module):
 
     @abc.abstractmethod
     def normal_impulse(self, held: "ConstrainedNodes", residual: NodeVector) -> NodeScalar:
-        """The impulse by which the boundary holds each place [kg m/s], shape (n,): below zero where it pulls.
+        """The impulse by which the boundary holds each place [kg m/s], shape (n,): below zero where it pulls, and so
+        must let go. A boundary that can pull adds the most that it can pull with.
 
         Args:
             held: the nodes with an active set held.
             residual: the impulse that is missing at each node [kg m/s], shape (n, d).
         """
 
-    @abc.abstractmethod
+    def likely_held(self, held: "ConstrainedNodes", v: NodeVector) -> Bool[Array, "n"]:
+        """The places that are held in the first sweep, shape (n,). Default: those where the gap closes.
+
+        Args:
+            held: the nodes with nothing held.
+            v: the explicit velocity v* of all nodes [m/s], shape (n, d).
+        """
+        return self.gap_velocity(held, v) < 0
+
     def rounding(self, held: "ConstrainedNodes", noise: Array) -> tuple[Array, Array]:
         """How far the gap velocity and the normal impulse may lie below zero by rounding, each (n,) or a number.
+        Default: the rounding of a velocity, and of a node's momentum.
 
         Args:
             held: the nodes with an active set held.
             noise: the rounding of a velocity [m/s].
         """
+        return noise, noise * held.mass
 
-    @abc.abstractmethod
     def friction(self, held: "ConstrainedNodes", active: Array, v: NodeVector, residual: NodeVector) -> NodeVector:
-        """The change of velocity by Coulomb friction [m/s], shape (n, d), on true nodes.
+        """The change of velocity by friction [m/s], shape (n, d), on true nodes. Default: none.
 
         Args:
             held: the nodes with the active set held.
@@ -128,15 +149,22 @@ class AbstractContact(eqx.Module):
             v: velocity of all nodes [m/s], shape (n, d).
             residual: the impulse that is missing at each node [kg m/s], shape (n, d).
         """
-
-    @abc.abstractmethod
-    def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """The components of velocity on which the held places act, shape (n, d)."""
+        del held, active, residual
+        return jnp.zeros_like(v)
 
     def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """The components of velocity that are zero at the places held, shape (n, d)."""
+        """The components of velocity that are zero at the places held, shape (n, d). Default: none.
+
+        Args:
+            active: the places of this contact that are held, shape (n,).
+            shape: (n, d).
+        """
         del active
         return jnp.zeros(shape, bool)
+
+    def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
+        """The components of velocity on which the held places act, shape (n, d). Default: those of `fixed`."""
+        return self.fixed(active, shape)
 
     def normals(self, active: Array) -> Bool[Array, "n"] | None:
         """The nodes whose component along a collider's normal is held, shape (n,); None without any."""
@@ -215,6 +243,14 @@ class ConstrainedNodes(eqx.Module):
         """The residual without what colliders hold along their normals: what walls and planes hold."""
         impulse, colliders = self.collider_impulse(residual), self.free.conditions.colliders
         return residual if impulse is None else residual - impulse[:, None] * colliders.normal
+
+    def impulse(self, residual: NodeVector) -> NodeVector:
+        """The impulse of walls, planes and contacts, without colliders, on each true node [kg m/s], shape (n, d).
+
+        Args:
+            residual: the impulse that is missing at each node [kg m/s], shape (n, d).
+        """
+        return self.images.fold(self.beside_colliders(residual))
 
     def violations(self, v: NodeVector, residual: NodeVector) -> tuple[ActiveSet, ActiveSet]:
         """The held places that pull, and the others that are entered, beyond rounding.
@@ -303,7 +339,7 @@ def find_active_set(
 
     predictor = nodes.explicit_velocity()
     nothing_held = ConstrainedNodes(nodes, (), Mirror(()), nodes)
-    active = tuple(contact.gap_velocity(nothing_held, predictor) < 0 for contact in nodes.contacts)
+    active = tuple(contact.likely_held(nothing_held, predictor) for contact in nodes.contacts)
     start = (active, guess, cost, jnp.asarray(True), jnp.asarray(0, dtype=jnp.int32))
     active, guess, cost, _, count = jax.lax.while_loop(unsettled, sweep, start)
     return active, guess, cost, count
@@ -317,3 +353,16 @@ def _count(nodes: AbstractNodes, *sets: ActiveSet) -> Int[Array, ""]:
             one = contact.representative()
             total = total + (mask if one is None else mask & one).sum().astype(jnp.int32)
     return total
+
+
+def refuse_contact(total: bool) -> None:
+    """Refuse contact that is judged by where material is in the total description, whose nodes do not know it.
+
+    Raises:
+        ValueError: the description is total Lagrangian.
+    """
+    require(
+        not total,
+        "In the total description there is no contact: use the updated one, or SymmetryPlane or SlipBox for a wall "
+        "that is never left.",
+    )

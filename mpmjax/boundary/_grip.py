@@ -4,7 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import NodeVector, Scalar
-from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, Conditions
+from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
+from mpmjax.boundary._conditions import Conditions
 from mpmjax.checks import require, require_fields
 from mpmjax.geometry import AbstractMotion, AbstractRegion, Motion
 
@@ -55,3 +56,6 @@ class Grip(AbstractBoundary):
         axes = jnp.ones(nodes.shape[1], dtype=bool) if self.axes is None else jnp.asarray(self.axes)
         fixed = held & axes
         return Conditions(fixed, jnp.where(fixed, self.motion.velocity(t, dt), 0))
+
+    def rests(self, *, total: bool) -> bool:
+        return total or self.motion.rests()

@@ -10,9 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector
-from mpmjax.boundary._conditions import AbstractBoundary
-from mpmjax.boundary._planes import Plane, SymmetryPlane
+from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector, Scalar
 from mpmjax.discretisation import Grid
 
 
@@ -91,21 +89,24 @@ class Mirror(eqx.Module):
         return Mirror(self.images + other.images)
 
 
-def image_of(plane: Plane, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, Array]:
-    """The plane's map from true nodes to all nodes of the window, and how many half spacings each node along the axis
-    lies before the plane."""
-    length = grid.shape[plane.axis]
+def mirror_image(axis: int, position: Scalar, keep: str, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, Array]:
+    """The map of a mirror from true nodes to all nodes of the window, and how many half spacings each node along the
+    axis lies before it.
+
+    Args:
+        axis: direction of the mirror's normal.
+        position: its coordinate [m], a multiple of half a spacing.
+        keep: the side of the true nodes, "above" or "below".
+        grid: the grid.
+        window: lattice index of the window's first node, shape (d,).
+    """
+    length = grid.shape[axis]
     j = jnp.arange(length, dtype=jnp.int32)
-    halves = jnp.round(2 * jnp.asarray(plane.position) / grid.spacing).astype(jnp.int32) - 2 * window[plane.axis]
-    before = 2 * j - halves if plane.keep == "above" else halves - 2 * j
+    halves = jnp.round(2 * jnp.asarray(position) / grid.spacing).astype(jnp.int32) - 2 * window[axis]
+    before = 2 * j - halves if keep == "above" else halves - 2 * j
     ghost = before < 0
     source = jnp.where(ghost, halves - j, j)
     known = (source >= 0) & (source < length)
     even = jnp.where(known, 1, 0)
     odd = jnp.where(known & (before != 0), jnp.where(ghost, -1, 1), 0)
-    return Image(grid.shape, plane.axis, jnp.clip(source, 0, length - 1), even, odd), before
-
-
-def mirror(boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"]) -> Mirror:
-    """The mirror images of a scene's symmetry planes."""
-    return Mirror(tuple(image_of(b, grid, window)[0] for b in boundaries if isinstance(b, SymmetryPlane)))
+    return Image(grid.shape, axis, jnp.clip(source, 0, length - 1), even, odd), before

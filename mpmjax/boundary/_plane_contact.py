@@ -4,12 +4,9 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, Scalar
-from mpmjax.boundary._conditions import AbstractBoundary
 from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
-from mpmjax.boundary._mirror import Image, Mirror, image_of
-from mpmjax.boundary._planes import ContactPlane
+from mpmjax.boundary._mirror import Image, Mirror
 from mpmjax.boundary._wall_contact import friction_across
-from mpmjax.discretisation import Grid
 
 
 class PlaneContact(AbstractContact):
@@ -37,9 +34,8 @@ class PlaneContact(AbstractContact):
         return self.image
 
     @property
-    def axis(self) -> int:
-        """The direction of its normal."""
-        return self.image.axis
+    def friction_order(self) -> float:
+        return self.image.axis + 0.5
 
     def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> NodeScalar:
         """The momentum with which each column leaves the plane [kg m/s]: its weights times what its velocity lacks of
@@ -94,15 +90,3 @@ class PlaneContact(AbstractContact):
             if image.axis != self.image.axis:
                 columns = image.scalar(Mirror((image,)).fold_scalar(columns))
         return columns
-
-
-def plane_contacts(
-    boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"]
-) -> tuple[PlaneContact, ...]:
-    """A scene's contact planes."""
-    found = []
-    for plane in boundaries:
-        if isinstance(plane, ContactPlane):
-            image, before = image_of(plane, grid, window)
-            found.append(PlaneContact(image, 1 if plane.keep == "above" else -1, before, plane.friction))
-    return tuple(found)

@@ -1,29 +1,87 @@
 """Symmetry and contact planes."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, NodeVector, ParticleVector, Scalar
-from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, Conditions, crossed
-from mpmjax.checks import require, require_between, require_fields, require_finite
+from mpmjax._types import Array, Bool, Int, NodeVector, ParticleVector, Scalar
+from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
+from mpmjax.boundary._conditions import Conditions
+from mpmjax.boundary._contact import refuse_contact
+from mpmjax.boundary._mirror import Image, mirror_image
+from mpmjax.boundary._plane_contact import PlaneContact
+from mpmjax.checks import require, require_between, require_fields, require_finite, require_that
+from mpmjax.discretisation import Grid
 
 
-def _check_plane(name: str, axis: int, position: Scalar, keep: str) -> None:
-    require_finite(f"{name}'s position", position)
-    require(axis in (0, 1, 2), f"{name}'s axis must be 0, 1 or 2, got {axis}.")
-    require(keep in ("above", "below"), f'{name} keeps "above" or "below", got {keep!r}.')
+class AbstractPlane(AbstractBoundary):
+    """A plane beyond which nodes are mirror images."""
+
+    axis: eqx.AbstractVar[int]
+    """Direction of the normal, 0 to d − 1."""
+    position: eqx.AbstractVar[Scalar]
+    """Coordinate of the plane [m]."""
+    keep: eqx.AbstractVar[str]
+    """Which side holds the material: "above" or "below" the plane."""
+    plain_box: ClassVar[str]
+    """The box that is the same wall anywhere, to first order."""
+
+    def __check_init__(self):
+        name = type(self).__name__
+        require_finite(f"{name}'s position", self.position)
+        require(self.axis in (0, 1, 2), f"{name}'s axis must be 0, 1 or 2, got {self.axis}.")
+        require(self.keep in ("above", "below"), f'{name} keeps "above" or "below", got {self.keep!r}.')
+
+    @property
+    def dim(self) -> None:
+        return None
+
+    @property
+    def inward(self) -> int:
+        """The inward normal's component: +1 or −1."""
+        return 1 if self.keep == "above" else -1
+
+    def check(self, grid: Grid, *, total: bool) -> None:
+        """Its axis is not periodic, and it lies at a multiple of half a spacing."""
+        del total
+        name = type(self).__name__
+        require(self.axis < grid.dim, f"{name}'s axis must be below {grid.dim}, got {self.axis}.")
+        require(
+            not grid.periodic[self.axis],
+            f"Direction {self.axis} is periodic and cannot have a {name}: drop one of them.",
+        )
+
+        def fits(position: Any, spacing: Any) -> Any:
+            halves = 2 * position / spacing
+            return abs(halves - halves.round()) < ON_THE_WALL
+
+        require_that(
+            f"A {name} must lie at a multiple of half the grid's spacing (elsewhere use {self.plain_box})",
+            fits,
+            self.position,
+            grid.spacing,
+        )
+
+    def passed(
+        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
+    ) -> Bool[Array, "p"]:
+        """Which particles passed the plane: those that end more than half a spacing beyond it, among others
+        (`crossed`)."""
+        del t, dt, reach
+        place = self.inward * jnp.asarray(self.position, end.dtype)
+        coordinates = self.inward * start[:, self.axis], self.inward * end[:, self.axis]
+        return crossed(*coordinates, place, place - spacing / 2, spacing)
+
+    def walls(self) -> tuple[Wall, ...]:
+        return (Wall(self.axis, float(self.position), self.inward, mirrored=True),)
+
+    def image(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, Array]:
+        """Its mirror in the window, and how many half spacings each node along the axis lies before it."""
+        return mirror_image(self.axis, self.position, self.keep, grid, window)
 
 
-def _through_plane(plane: "Plane", start: ParticleVector, end: ParticleVector, spacing: Scalar) -> Bool[Array, "p"]:
-    """Which particles passed a plane: those that end more than half a spacing beyond it, among others (`crossed`)."""
-    inward = 1 if plane.keep == "above" else -1
-    place = inward * jnp.asarray(plane.position, end.dtype)
-    return crossed(inward * start[:, plane.axis], inward * end[:, plane.axis], place, place - spacing / 2, spacing)
-
-
-class SymmetryPlane(AbstractBoundary):
+class SymmetryPlane(AbstractPlane):
     """A plane of mirror symmetry: nodes beyond it are mirror images. It is also a frictionless wall that
     material cannot leave.
 
@@ -41,14 +99,10 @@ class SymmetryPlane(AbstractBoundary):
     axis: int = eqx.field(static=True)
     position: Scalar
     keep: str = eqx.field(static=True, default="above")
-
-    @property
-    def dim(self) -> None:
-        return None
+    plain_box: ClassVar[str] = "SlipBox"
 
     def __check_init__(self):
         require_fields(self)
-        _check_plane("SymmetryPlane", self.axis, self.position, self.keep)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v·n = 0 on the plane's own nodes."""
@@ -56,14 +110,12 @@ class SymmetryPlane(AbstractBoundary):
         on = jnp.abs(nodes[:, self.axis] - self.position) <= ON_THE_WALL * spacing
         return Conditions(jnp.zeros(nodes.shape, dtype=bool).at[:, self.axis].set(on), jnp.zeros_like(nodes))
 
-    def passed(
-        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
-    ) -> Bool[Array, "p"]:
-        del t, dt, reach
-        return _through_plane(self, start, end, spacing)
+    def mirror_images(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, ...]:
+        """Its own, everywhere."""
+        return (self.image(grid, window)[0],)
 
 
-class ContactPlane(AbstractBoundary):
+class ContactPlane(AbstractPlane):
     """A rigid plane that the material may leave, and along which it slides with Coulomb friction.
 
     Where it touches, nodes beyond the plane are mirror images, as at a `SymmetryPlane`; where it does not, they are
@@ -90,31 +142,24 @@ class ContactPlane(AbstractBoundary):
     position: Scalar
     keep: str = eqx.field(static=True, default="above")
     friction: Scalar = 0.0
-
-    @property
-    def dim(self) -> None:
-        return None
+    plain_box: ClassVar[str] = "SeparatingBox"
 
     def __check_init__(self):
         require_fields(self)
-        _check_plane("ContactPlane", self.axis, self.position, self.keep)
         require_between("ContactPlane's friction", self.friction, 0, 1e6)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         del spacing, t, dt, reference
         return Conditions(jnp.zeros(nodes.shape, dtype=bool), jnp.zeros_like(nodes))
 
-    def passed(
-        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
-    ) -> Bool[Array, "p"]:
-        del t, dt, reach
-        return _through_plane(self, start, end, spacing)
+    def check(self, grid: Grid, *, total: bool) -> None:
+        AbstractPlane.check(self, grid, total=total)
+        refuse_contact(total)
 
-
-Plane = SymmetryPlane | ContactPlane
-
-
-def fits(position: Any, spacing: Any) -> Any:
-    """Whether a plane lies at a multiple of half a spacing."""
-    halves = 2 * position / spacing
-    return abs(halves - halves.round()) < ON_THE_WALL
+    def contacts(
+        self, conditions: Conditions, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
+    ) -> tuple[PlaneContact, ...]:
+        """Its own, with a mirror in the columns that it holds."""
+        del conditions, t, dt
+        image, before = self.image(grid, window)
+        return (PlaneContact(image, self.inward, before, self.friction),)

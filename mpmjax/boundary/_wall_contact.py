@@ -18,6 +18,10 @@ class WallContact(AbstractContact):
     coefficient: NodeScalar
     """Coulomb coefficient [-], shape (n,)."""
 
+    @property
+    def friction_order(self) -> float:
+        return self.axis
+
     def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> NodeScalar:
         """The velocity along the inward normal [m/s]."""
         del held
@@ -25,7 +29,7 @@ class WallContact(AbstractContact):
 
     def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> NodeScalar:
         """The impulse along the inward normal [kg m/s]."""
-        return self.side * held.images.fold(held.beside_colliders(residual))[:, self.axis]
+        return self.side * held.impulse(residual)[:, self.axis]
 
     def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
         """The rounding of a velocity [m/s], and of a node's momentum [kg m/s], shape (n,)."""
@@ -38,10 +42,6 @@ class WallContact(AbstractContact):
     def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
         """The component along the axis."""
         return active[:, None] & (jnp.arange(shape[1]) == self.axis)
-
-    def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """The component along the axis."""
-        return self.fixed(active, shape)
 
     def blocked(self, held: ConstrainedNodes, v: NodeVector, noise: Array) -> Bool[Array, "n"] | None:
         """Nodes that a collider with the same normal drives off the wall, but cannot while the wall holds them."""

@@ -2,49 +2,74 @@
 
 from functools import reduce
 
+import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax._types import Array, Bool, NodeVector, ParticleVector, Point, Scalar
-from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, Conditions, crossed
+from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
+from mpmjax.boundary._conditions import Conditions
+from mpmjax.boundary._contact import refuse_contact
 from mpmjax.checks import coordinates, require, require_between, require_fields, require_that
+from mpmjax.discretisation import Grid
 
 
-def _through_box(
-    lower: Point, upper: Point, start: ParticleVector, end: ParticleVector, spacing: Scalar, reach: float
-) -> Bool[Array, "p"]:
-    """Which particles passed a wall of a box: the deepest place is where a stencil has free nodes no more."""
+class AbstractBox(AbstractBoundary):
+    """Walls around a box."""
 
-    def through(wall: Array, start: Array, end: Array) -> Array:
-        first_free = jnp.floor(wall / spacing + ON_THE_WALL) + 1
-        return crossed(start, end, wall, (first_free - reach - ON_THE_WALL) * spacing, spacing)
+    lower: eqx.AbstractVar[Point]
+    """Position of the lower wall in each direction [m], (d,); −inf for none."""
+    upper: eqx.AbstractVar[Point]
+    """Position of the upper wall in each direction [m], (d,); inf for none."""
 
-    below, above = jnp.asarray(lower, end.dtype), jnp.asarray(upper, end.dtype)
-    by_axis = zip(below, above, start.T, end.T, strict=True)
-    return reduce(jnp.logical_or, [through(lo, a, b) | through(-hi, -a, -b) for lo, hi, a, b in by_axis])
+    def __check_init__(self):
+        name = type(self).__name__
+        require(
+            coordinates(f"{name}'s lower corner", self.lower) == coordinates(f"{name}'s upper corner", self.upper),
+            f"{name} needs two corners with as many coordinates, got {self.lower} and {self.upper}.",
+        )
+        require_that(
+            f"{name}'s lower corner must lie below its upper one in each direction (infinite means no wall)",
+            lambda a, b: a < b,  # false of what is not a number
+            self.lower,
+            self.upper,
+        )
+
+    @property
+    def dim(self) -> int:
+        return len(self.lower)
+
+    def inward_normal(self, nodes: NodeVector, spacing: Scalar) -> NodeVector:
+        """The inward normal's component in each direction: +1 at and below `lower`, −1 at and above `upper`, else 0."""
+        margin = ON_THE_WALL * spacing
+        below = nodes <= jnp.asarray(self.lower, nodes.dtype) + margin
+        above = nodes >= jnp.asarray(self.upper, nodes.dtype) - margin
+        return jnp.where(below, 1, jnp.where(above, -1, 0)).astype(nodes.dtype)
+
+    def passed(
+        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
+    ) -> Bool[Array, "p"]:
+        """Which particles passed a wall: the deepest place is where a stencil has free nodes no more."""
+        del t, dt
+
+        def through(wall: Array, start: Array, end: Array) -> Array:
+            first_free = jnp.floor(wall / spacing + ON_THE_WALL) + 1
+            return crossed(start, end, wall, (first_free - reach - ON_THE_WALL) * spacing, spacing)
+
+        below, above = jnp.asarray(self.lower, end.dtype), jnp.asarray(self.upper, end.dtype)
+        by_axis = zip(below, above, start.T, end.T, strict=True)
+        return reduce(jnp.logical_or, [through(lo, a, b) | through(-hi, -a, -b) for lo, hi, a, b in by_axis])
+
+    def walls(self) -> tuple[Wall, ...]:
+        return tuple(
+            Wall(axis, float(at), inward)
+            for inward, corner in ((1, self.lower), (-1, self.upper))
+            for axis, at in enumerate(np.asarray(corner))
+            if np.isfinite(at)
+        )
 
 
-def _walls(lower: Point, upper: Point, nodes: NodeVector, spacing: Scalar) -> NodeVector:
-    """The inward normal's component in each direction: +1 at and below `lower`, −1 at and above `upper`, else 0."""
-    margin = ON_THE_WALL * spacing
-    below = nodes <= jnp.asarray(lower, nodes.dtype) + margin
-    above = nodes >= jnp.asarray(upper, nodes.dtype) - margin
-    return jnp.where(below, 1, jnp.where(above, -1, 0)).astype(nodes.dtype)
-
-
-def _check_box(name: str, lower: Point, upper: Point) -> None:
-    require(
-        coordinates(f"{name}'s lower corner", lower) == coordinates(f"{name}'s upper corner", upper),
-        f"{name} needs two corners with as many coordinates, got {lower} and {upper}.",
-    )
-    require_that(
-        f"{name}'s lower corner must lie below its upper one in each direction (infinite means no wall)",
-        lambda a, b: a < b,  # false of what is not a number
-        lower,
-        upper,
-    )
-
-
-class StickyBox(AbstractBoundary):
+class StickyBox(AbstractBox):
     """Walls that hold what touches them: the whole velocity is zero at and beyond them, exactly, also after a solve.
 
     Args:
@@ -57,26 +82,15 @@ class StickyBox(AbstractBoundary):
 
     def __check_init__(self):
         require_fields(self)
-        _check_box("StickyBox", self.lower, self.upper)
-
-    @property
-    def dim(self) -> int:
-        return len(self.lower)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v = 0."""
         del t, dt, reference
-        held = (_walls(self.lower, self.upper, nodes, spacing) != 0).any(axis=1, keepdims=True)
+        held = (self.inward_normal(nodes, spacing) != 0).any(axis=1, keepdims=True)
         return Conditions(jnp.broadcast_to(held, nodes.shape), jnp.zeros_like(nodes))
 
-    def passed(
-        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
-    ) -> Bool[Array, "p"]:
-        del t, dt
-        return _through_box(self.lower, self.upper, start, end, spacing, reach)
 
-
-class SlipBox(AbstractBoundary):
+class SlipBox(AbstractBox):
     """Walls along which the material slides freely and from which it cannot part: the normal velocity is zero at and
     beyond them, exactly, also after a solve.
 
@@ -93,25 +107,14 @@ class SlipBox(AbstractBoundary):
 
     def __check_init__(self):
         require_fields(self)
-        _check_box("SlipBox", self.lower, self.upper)
-
-    @property
-    def dim(self) -> int:
-        return len(self.lower)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v·n = 0."""
         del t, dt, reference
-        return Conditions(_walls(self.lower, self.upper, nodes, spacing) != 0, jnp.zeros_like(nodes))
-
-    def passed(
-        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
-    ) -> Bool[Array, "p"]:
-        del t, dt
-        return _through_box(self.lower, self.upper, start, end, spacing, reach)
+        return Conditions(self.inward_normal(nodes, spacing) != 0, jnp.zeros_like(nodes))
 
 
-class SeparatingBox(AbstractBoundary):
+class SeparatingBox(AbstractBox):
     """Walls that the material may leave, and along which it slides with Coulomb friction.
 
     At a wall node either the normal velocity is zero and the wall pushes, or the node moves inward and the wall does
@@ -133,22 +136,14 @@ class SeparatingBox(AbstractBoundary):
 
     def __check_init__(self):
         require_fields(self)
-        _check_box("SeparatingBox", self.lower, self.upper)
         require_between("SeparatingBox's friction", self.friction, 0, 1e6)
-
-    @property
-    def dim(self) -> int:
-        return len(self.lower)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v·n ≥ 0 ⟂ reaction ≥ 0."""
         del t, dt, reference
         nothing = jnp.zeros(nodes.shape, dtype=bool)
-        side = _walls(self.lower, self.upper, nodes, spacing)
+        side = self.inward_normal(nodes, spacing)
         return Conditions(nothing, jnp.zeros_like(nodes), side, jnp.abs(side) * self.friction)
 
-    def passed(
-        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
-    ) -> Bool[Array, "p"]:
-        del t, dt
-        return _through_box(self.lower, self.upper, start, end, spacing, reach)
+    def check(self, grid: Grid, *, total: bool) -> None:
+        refuse_contact(total)

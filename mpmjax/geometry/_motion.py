@@ -3,6 +3,7 @@ compiling anew."""
 
 import abc
 from functools import partial
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -18,6 +19,13 @@ Displacements = Float[Array, "j d"] | Float[np.ndarray, "j d"] | tuple | list
 
 class AbstractMotion(eqx.Module):
     """The motion of a rigid body, from positions X before the motion to positions x at time t."""
+
+    turns: ClassVar[bool] = True
+    """Whether it may turn the body."""
+
+    def rests(self) -> bool:
+        """Whether nothing ever moves, as far as is known. Default: False. It is asked only while numbers are known."""
+        return False
 
     @property
     @abc.abstractmethod
@@ -55,10 +63,14 @@ class Motion(AbstractMotion):
 
     times: Times
     displacement: Displacements
+    turns: ClassVar[bool] = False
 
     def __check_init__(self):
         require_fields(self)
         _check_rows("A motion", self.times, self.displacement)
+
+    def rests(self) -> bool:
+        return _constant(self.displacement)
 
     @property
     def dim(self) -> int:
@@ -124,6 +136,9 @@ class RigidMotion(AbstractMotion):
         )
         require_finite("A rigid motion's centre", self.centre)
 
+    def rests(self) -> bool:
+        return _constant(self.displacement) and _constant(self.rotation)
+
     @property
     def dim(self) -> int:
         return jnp.shape(jnp.asarray(self.displacement))[1]
@@ -169,6 +184,10 @@ class RigidMotion(AbstractMotion):
 def still(dim: int) -> Motion:
     """No motion, in `dim` dimensions."""
     return Motion((0.0,), ((0.0,) * dim,))
+
+
+def _constant(rows: Any) -> bool:
+    return bool((np.ptp(np.asarray(rows), axis=0) == 0).all())
 
 
 def _check_rows(name: str, times: Times, displacement: Displacements) -> None:

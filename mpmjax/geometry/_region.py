@@ -6,6 +6,7 @@ mean. It is never NaN or zero, so that a collider acts on what is at its middle 
 """
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,6 +18,9 @@ from mpmjax.checks import checked, coordinates, require, require_fields, require
 
 class AbstractRegion(eqx.Module):
     """A closed set of points."""
+
+    flat: ClassVar[bool] = False
+    """Whether its normal is the same everywhere."""
 
     @property
     @abc.abstractmethod
@@ -156,6 +160,7 @@ class HalfSpace(AbstractRegion):
 
     point: Point
     normal: Point
+    flat: ClassVar[bool] = True
 
     def __check_init__(self):
         require_fields(self)

@@ -6,25 +6,17 @@ touch a node with mass.
 
 import itertools
 from collections.abc import Iterator
+from functools import partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Bool, Float, Int, NodeVector, ParticleVector, Scalar
-from mpmjax.boundary import (
-    ON_THE_WALL,
-    AbstractBoundary,
-    AbstractCollider,
-    Grip,
-    Plane,
-    SeparatingBox,
-    SlipBox,
-    StickyBox,
-)
+from mpmjax._types import Array, Bool, Int, ParticleVector
+from mpmjax.boundary import ON_THE_WALL, AbstractBoundary, Conditions
 from mpmjax.checks import warn
 from mpmjax.discretisation import BSpline, Grid
-from mpmjax.geometry import Motion, RigidMotion
 from mpmjax.state._particles import Particles
 
 _THIN = 2.0
@@ -42,69 +34,62 @@ def warn_of_oversights(grid: Grid, kernel: BSpline, boundary: Boundaries, partic
         particles: the particles, as they start.
         total: whether the description is total Lagrangian: colliders that lie over the body then hold it.
     """
-    bodies = [] if total else [c for c in boundary if isinstance(c, AbstractCollider)]
-    fixed = [c for c in boundary if isinstance(c, Grip | AbstractCollider) and (total or _rests(c, grid))]
-    covers, holds = {}, {}
-    if bodies or fixed:
-        margin = jnp.asarray(ON_THE_WALL * grid.spacing, particles.x.dtype)
-        nodes = grid.nodes(grid.window(particles.x)).astype(particles.x.dtype)
-        inside, held = _probed(tuple(bodies), tuple(fixed), particles.x, nodes, margin, total)
-        covers = {id(c): int(count) for c, count in zip(bodies, inside, strict=True)}
-        holds = {id(c): np.asarray(mask) for c, mask in zip(fixed, held, strict=True)}
+    resting = tuple(c.rests(total=total) and not grid.follow for c in boundary)
+    probe = partial(_probe, resting=resting, total=total)
+    some = jax.tree.leaves(
+        eqx.filter_eval_shape(probe, boundary, grid, particles.x)
+    )  # none, and no compiling, of walls
+    within, touched = eqx.filter_jit(probe)(boundary, grid, particles.x) if some else ([None] * len(boundary),) * 2
     for number, condition in enumerate(boundary, 1):
         name = f"{type(condition).__name__} (boundary {number})"
-        covered = covers.get(id(condition), 0)
-        if isinstance(condition, StickyBox | SlipBox | SeparatingBox):
-            covered = _beyond(condition, grid, particles.x)
+        covered = _beyond(condition, grid, particles.x) if (inside := within[number - 1]) is None else int(inside)
         if covered:
             warn(
                 f"{covered} of {particles.count} particles lie in or beyond the {name} at the start: nodes there do "
                 "not move freely. Move one of them; to hold a body on purpose take a Grip."
             )
-        if id(condition) in holds:
-            may_meet = not total and not isinstance(condition, Grip)  # the body comes to it: any node will do
-            mask = holds[id(condition)]
-            if not (mask if may_meet else mask[_reached(grid, kernel, particles.x)]).any():
+        if (mask := touched[number - 1]) is not None:
+            may_meet = not total and condition.bodies > 0  # material comes to it: any node will do
+            if not (mask if may_meet else np.asarray(mask)[_reached(grid, kernel, particles.x)]).any():
                 where = "of the window lies in it" if may_meet else "that a particle reaches lies in it"
                 warn(f"The {name} touches nothing, since no node {where}: move it, or enlarge it to a spacing or more.")
     for text in _thin(grid, boundary, particles):
         warn(text)
 
 
-@eqx.filter_jit
-def _probed(
-    bodies: tuple[AbstractCollider, ...],
-    fixed: tuple[Grip | AbstractCollider, ...],
-    x: ParticleVector,
-    nodes: NodeVector,
-    margin: Scalar,
-    total: bool,
-) -> tuple[list[Int[Array, ""]], list[Bool[Array, "n"]]]:
-    """How many particles lie in each of `bodies` at the start, and which nodes lie in each of `fixed`."""
-    start = jnp.zeros((), x.dtype)
+def _probe(
+    boundary: Boundaries, grid: Grid, x: ParticleVector, *, resting: tuple[bool, ...], total: bool
+) -> tuple[list[Int[Array, ""] | None], list[Bool[Array, "n"] | None]]:
+    """How many particles lie in each body at the start, in the updated description; and on which nodes each boundary
+    acts that rests."""
+    t, dt, nodes = jnp.zeros((), x.dtype), jnp.ones((), x.dtype), grid.nodes(grid.window(x)).astype(x.dtype)
 
-    def depth(condition: Grip | AbstractCollider) -> Float[Array, "n"]:
-        if isinstance(condition, Grip):
-            return condition.region.distance(nodes if total else nodes - condition.motion.at(start))
-        return condition.shape.distance(nodes) if total else condition.distance(nodes, start)
+    def covered(body: AbstractBoundary) -> Int[Array, ""] | None:
+        distance = None if total else body.distance(x, t)
+        return None if distance is None else (distance < -ON_THE_WALL * grid.spacing).sum()
 
-    return [(body.distance(x, start) < -margin).sum() for body in bodies], [depth(c) <= margin for c in fixed]
+    def touched(body: AbstractBoundary) -> Bool[Array, "n"]:
+        return _acts(body.conditions(nodes, grid.spacing, t, dt, reference=total))
+
+    return [covered(b) for b in boundary], [touched(b) if r else None for b, r in zip(boundary, resting, strict=True)]
 
 
-def _beyond(box: StickyBox | SlipBox | SeparatingBox, grid: Grid, x: ParticleVector) -> int:
-    """How many particles lie beyond the walls."""
+def _acts(conditions: Conditions) -> Bool[Array, "n"]:
+    """The nodes on which a boundary acts, (n,)."""
+    acts, colliders = conditions.fixed.any(axis=1), conditions.colliders
+    if conditions.side is not None:
+        acts = acts | (conditions.side != 0).any(axis=1)
+    return acts if colliders is None else acts | (colliders.owner >= 0)
+
+
+def _beyond(boundary: AbstractBoundary, grid: Grid, x: ParticleVector) -> int:
+    """How many particles lie beyond its walls."""
     margin, places = ON_THE_WALL * float(grid.spacing), np.asarray(x)
-    outside = (places < np.asarray(box.lower) - margin) | (places > np.asarray(box.upper) + margin)
-    return int(outside.any(axis=1).sum())
-
-
-def _rests(condition: Grip | AbstractCollider, grid: Grid) -> bool:
-    """Whether neither the boundary condition nor the window moves."""
-    motion = condition.motion
-    if grid.follow or not isinstance(motion, Motion | RigidMotion):
-        return motion is None and not grid.follow
-    rows = [motion.displacement] + ([motion.rotation] if isinstance(motion, RigidMotion) else [])
-    return all((np.ptp(np.asarray(values), axis=0) == 0).all() for values in rows)
+    outside = np.zeros(len(places), bool)
+    for wall in boundary.walls():
+        along = places[:, wall.axis]
+        outside |= along < wall.position - margin if wall.inward > 0 else along > wall.position + margin
+    return int(outside.sum())
 
 
 def _reached(grid: Grid, kernel: BSpline, x: ParticleVector) -> np.ndarray:
@@ -129,20 +114,11 @@ def _thin(grid: Grid, boundary: Boundaries, particles: Particles) -> Iterator[st
             thickness = (upper[axis] - lower[axis]) / dx
             if thickness >= _THIN - 1e-3 or grid.periodic[axis]:
                 continue
-            if any(_is_beside(condition, axis, lower[axis] - dx, upper[axis] + dx) for condition in boundary):
+            walls = (wall for condition in boundary for wall in condition.walls() if wall.axis == axis)
+            if any(lower[axis] - dx <= wall.position <= upper[axis] + dx for wall in walls):
                 continue
             which = "The body" if particles.counts is None else f"The body of material {number}"
             yield (
                 f"{which} is {thickness:.2g} cells thick in direction {axis}, and below {_THIN:g} its stiffness is the "
                 "grid's: take a smaller spacing."
             )
-
-
-def _is_beside(condition: AbstractBoundary, axis: int, lower: float, upper: float) -> bool:
-    """Whether a wall or plane at right angles to an axis lies between two positions on it."""
-    if isinstance(condition, Plane):
-        return condition.axis == axis and bool(lower <= float(condition.position) <= upper)
-    if isinstance(condition, StickyBox | SlipBox | SeparatingBox):
-        walls = (float(condition.lower[axis]), float(condition.upper[axis]))
-        return any(bool(lower <= wall <= upper) for wall in walls)
-    return False

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, components
-from mpmjax.boundary import Plane
 from mpmjax.checks import (
     canonical,
     checked,
@@ -142,15 +141,14 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
             f"Every particle's stencil must lie in the window; particle {first} at {np.asarray(place[first])} and "
             f"{int((~inside).sum()) - 1} others do not: enlarge the grid's shape, move its origin, or use follow=True."
         )
-    for plane in scene.boundary:
-        if isinstance(plane, Plane):
-            name = type(plane).__name__
-            depth = np.asarray(place[:, plane.axis]) - float(plane.position)
-            wrong = depth < 0 if plane.keep == "above" else depth > 0
+    for boundary in scene.boundary:
+        for wall in boundary.walls():
+            name, keep = type(boundary).__name__, "above" if wall.inward > 0 else "below"
+            beyond = wall.inward * (np.asarray(place[:, wall.axis]) - wall.position) < 0
             require(
-                ~wrong,
-                f"Particles must lie {plane.keep} the {name} at {plane.position} on axis {plane.axis}, but "
-                f"particle {int(np.argmax(wrong))} does not: move it or change the plane's keep.",
+                not wall.mirrored or ~beyond,
+                f"Particles must lie {keep} the {name} at {wall.position:g} on axis {wall.axis}, but particle "
+                f"{int(np.argmax(beyond))} does not: move it or change the plane's keep.",
             )
     for law, group in zip(scene.laws, particles.groups, strict=True):
         rows = particles.count if group.rows is None else group.rows[1] - group.rows[0]

@@ -3,23 +3,12 @@
 import equinox as eqx
 
 from mpmjax._types import Array, Int, Point
-from mpmjax.boundary import (
-    AbstractBoundary,
-    AbstractCollider,
-    ContactPlane,
-    Plane,
-    SeparatingBox,
-    SeparatingCollider,
-    SlipCollider,
-    SymmetryPlane,
-    fits,
-)
+from mpmjax.boundary import AbstractBoundary
 from mpmjax.checks import (
     checked,
     coordinates,
     require,
     require_finite,
-    require_that,
 )
 from mpmjax.discretisation import (
     APIC,
@@ -108,42 +97,15 @@ class Scene(eqx.Module):
                 boundary.dim in (None, d),
                 f"{type(boundary).__name__} must have {d} coordinates, as the grid has, got {boundary.dim}.",
             )
-            if isinstance(boundary, Plane):
-                self._check_plane(boundary)
+            boundary.check(self.grid, total=self.total)
         if self.total:
             require(not self.grid.follow, "In the total description the window cannot follow: drop follow=True.")
-            require(
-                not any(isinstance(b, SeparatingBox | ContactPlane | SeparatingCollider) for b in self.boundary),
-                "In the total description there is no contact: use the updated one, or SymmetryPlane or SlipBox "
-                "for a wall that is never left.",
-            )
             flowing = [law for law in self.laws if isinstance(law, AbstractInelastic | AbstractVolumetric)]
             require(
                 not flowing,
                 "The total description keeps the deformation from the start, which what yields or flows does not know: "
                 f"use the updated one for {', '.join(type(law).__name__ for law in flowing)}.",
             )
-            for boundary in self.boundary:
-                require(
-                    not isinstance(boundary, SlipCollider) or boundary.flat,
-                    "In the total description material can slide along a half-space that does not turn and nothing "
-                    "else, its nodes being those of the start: use the updated one, or StickyCollider.",
-                )
-
-    def _check_plane(self, plane: Plane) -> None:
-        name = type(plane).__name__
-        require(plane.axis < self.grid.dim, f"{name}'s axis must be below {self.grid.dim}, got {plane.axis}.")
-        require(
-            not self.grid.periodic[plane.axis],
-            f"Direction {plane.axis} is periodic and cannot have a {name}: drop one of them.",
-        )
-        box = "SlipBox" if isinstance(plane, SymmetryPlane) else "SeparatingBox"
-        require_that(
-            f"A {name} must lie at a multiple of half the grid's spacing (elsewhere use {box})",
-            fits,
-            plane.position,
-            self.grid.spacing,
-        )
 
     @property
     def laws(self) -> tuple[Law, ...]:
@@ -170,12 +132,7 @@ class Scene(eqx.Module):
     @property
     def colliders(self) -> int:
         """Number of colliders."""
-        return sum(isinstance(boundary, AbstractCollider) for boundary in self.boundary)
-
-    @property
-    def slides(self) -> bool:
-        """Whether there is a collider along which material slides without leaving it."""
-        return any(isinstance(boundary, SlipCollider) for boundary in self.boundary)
+        return sum(boundary.bodies for boundary in self.boundary)
 
     @property
     def total(self) -> bool:

@@ -268,7 +268,7 @@ def particles_to_grid(
             force = scatter(stencil, push, None, grid.size)
             acceleration = acceleration + jnp.where(occupied, force / full, 0)
         conditions = combine(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total)
-        if scene.total and conditions.colliders is not None and scene.slides:
+        if scene.total and conditions.colliders is not None and conditions.colliders.slides:
             slid = (conditions.colliders.owner >= 0)[:, None] & occupied
             place = jnp.where(slid, _place(particles, stencil, grid.size) / full, conditions.colliders.position)
             conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
@@ -289,7 +289,7 @@ def particles_to_grid(
             spacing=jnp.asarray(grid.spacing),
             potential=potential,
             conditions=conditions,
-            contacts=contacts_of(scene.boundary, conditions, grid, window),
+            contacts=contacts_of(scene.boundary, conditions, grid, window, t, dt),
         )
         return nodes.folded(mirror(scene.boundary, grid, window))
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax.analysis import energy_density, volume_ratio
-from mpmjax.boundary import AbstractCollider, Plane, SeparatingBox, SlipBox, StickyBox
+from mpmjax.boundary import Wall
 from mpmjax.checks import canonical, checked, require, require_between
 from mpmjax.io import replacing, save_figure
 from mpmjax.simulation import Run
@@ -125,22 +125,19 @@ def _tinted(particles: Particles, bar: Any, values: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(values)[:, None], colours, bar.to_rgba(values)[:, :3])
 
 
-def _walls(scene: Scene) -> Iterator[tuple[int, float, int]]:
-    """The axis, the position [m] and the inward normal's sign of each wall and plane."""
+def _walls(scene: Scene) -> Iterator[Wall]:
+    """The walls and planes."""
     for boundary in scene.boundary:
-        if isinstance(boundary, StickyBox | SlipBox | SeparatingBox):
-            for side, corner in ((1, boundary.lower), (-1, boundary.upper)):
-                yield from ((a, float(at), side) for a, at in enumerate(np.asarray(corner)) if np.isfinite(at))
-        elif isinstance(boundary, Plane):
-            yield boundary.axis, float(boundary.position), 1 if boundary.keep == "above" else -1
+        yield from boundary.walls()
 
 
 def _obstacles(scene: Scene, t: float) -> Iterator[Callable[[np.ndarray], np.ndarray]]:
-    """The signed distance [m] of points [m], (m, d), to each collider where it is at time t."""
-    for boundary in scene.boundary:
-        if isinstance(boundary, AbstractCollider):
-            collider = canonical(boundary, jnp.zeros(()).dtype)
-            yield lambda x, collider=collider: np.asarray(collider.distance(jnp.asarray(x, jnp.zeros(()).dtype), t))
+    """The signed distance [m] of points [m], (m, d), to each body where it is at time t."""
+    dtype = jnp.zeros(()).dtype
+    nowhere = jnp.zeros((0, scene.grid.dim), dtype)
+    for boundary in canonical(scene.boundary, dtype):
+        if boundary.distance(nowhere, t) is not None:
+            yield lambda x, body=boundary: np.asarray(body.distance(jnp.asarray(x, dtype), t))
 
 
 def skin(
@@ -175,7 +172,10 @@ def _upright(scene: Scene) -> np.ndarray:
 def _bearing(scene: Scene, up: np.ndarray) -> float | None:
     """The height [m] of the highest wall or plane that bears what lies on it; None without any."""
     axis = int(np.abs(up).argmax())
-    return max((float(up[axis]) * at for a, at, side in _walls(scene) if a == axis and side == up[axis]), default=None)
+    heights = (
+        float(up[axis]) * wall.position for wall in _walls(scene) if wall.axis == axis and wall.inward == up[axis]
+    )
+    return max(heights, default=None)
 
 
 def _round_length(length: float) -> float:
@@ -276,7 +276,7 @@ def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
     lower, upper = x.min(axis=0) - 2 * margin, x.max(axis=0) + 2 * margin
     extent = float((upper - lower).max())
     walls = list(_walls(run.scene))
-    for axis, at, _ in walls:  # those near by are shown
+    for axis, at, *_ in walls:  # those near by are shown
         if lower[axis] - extent < at < upper[axis] + extent:
             lower[axis], upper[axis] = min(lower[axis], at - 0.03 * extent), max(upper[axis], at + 0.03 * extent)
     for distance in _obstacles(run.scene, float(run.times[0])) if d == 2 else ():
@@ -292,7 +292,7 @@ def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
         if d == 1
         else {"ylabel": "y [m]", "ylim": (lower[1], upper[1]), "aspect": "equal"}
     )
-    for axis, at, side in walls:
+    for axis, at, side, _ in walls:
         line, span = (axes.axvline, axes.axvspan) if axis == 0 else (axes.axhline, axes.axhspan)
         line(at, color=STONE, lw=1.5, zorder=3)
         span(at, at - side * 1e3 * extent, color=STONE, alpha=0.35, lw=0)

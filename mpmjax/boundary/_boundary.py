@@ -1,0 +1,140 @@
+"""What a boundary is.
+
+Every boundary acts on the grid alone; the transfers know nothing of it. A wall acts on the nodes at and beyond it; a
+node within a thousandth of a spacing of a wall counts as on it. Where walls, planes and grips lie only selects nodes,
+so derivatives with respect to it are zero.
+"""
+
+import abc
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+
+from mpmjax._types import Array, Bool, Float, Int, NodeVector, ParticleVector, Scalar
+from mpmjax.boundary._conditions import Conditions
+from mpmjax.boundary._contact import AbstractContact
+from mpmjax.boundary._mirror import Image
+from mpmjax.discretisation import Grid
+
+ON_THE_WALL = 1e-3
+"""Distance within which a node is on a wall, in spacings."""
+
+
+class Wall(NamedTuple):
+    """A wall at right angles to an axis."""
+
+    axis: int
+    """The axis."""
+    position: float
+    """Its coordinate [m]."""
+    inward: int
+    """The sign of the inward normal's component, +1 or −1."""
+    mirrored: bool = False
+    """Whether nodes beyond it are mirror images, so that no particle may start there."""
+
+
+class AbstractBoundary(eqx.Module):
+    """A boundary condition.
+
+    One of one's own needs `dim` and `conditions`. What holds material only while that pushes, a contact, is brought by
+    `contacts`. The rest has defaults.
+    """
+
+    bodies: ClassVar[int] = 0
+    """Number of bodies in its `Conditions.colliders`; what they receive is recorded."""
+
+    @property
+    @abc.abstractmethod
+    def dim(self) -> int | None:
+        """Space dimension d of the condition; None if it fits any."""
+
+    @abc.abstractmethod
+    def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
+        """The conditions on nodes at the given positions for the step from t to t + dt.
+
+        With `reference`, the nodes are those of the reference configuration and a region that moves stays where it was.
+        """
+
+    def passed(
+        self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
+    ) -> Bool[Array, "p"] | None:
+        """Which particles passed the boundary in the step from t to t + dt; None if it keeps nothing out.
+
+        A particle that moves less than a spacing in a step stops before a wall, or so little beyond it that a node of
+        its stencil is still free. A particle has passed if it is deeper than that, or if it moved more than a spacing
+        towards the wall in the step and ended beyond it. One that began beyond has not passed.
+
+        Args:
+            start: positions at t [m], shape (p, d).
+            end: positions at t + dt [m], shape (p, d).
+            spacing: dx [m].
+            t: time [s].
+            dt: step [s].
+            reach: half the kernel's width in spacings.
+        """
+        del start, end, spacing, t, dt, reach
+        return None
+
+    def contacts(
+        self, conditions: Conditions, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
+    ) -> tuple[AbstractContact, ...]:
+        """The contacts that it brings in the step from t to t + dt (see `AbstractContact`). Default: none.
+
+        Those of `Conditions.side` and `Conditions.colliders` are made for it.
+
+        Args:
+            conditions: the conditions of all of the scene's boundaries.
+            grid: the grid; `grid.nodes(window)` are the positions of the nodes [m], shape (n, d).
+            window: lattice index of the window's first node, shape (d,).
+            t: time [s].
+            dt: step [s].
+        """
+        del conditions, grid, window, t, dt
+        return ()
+
+    def mirror_images(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, ...]:
+        """The mirrors that it puts in the window (see `mirror_image`). Default: none."""
+        del grid, window
+        return ()
+
+    def check(self, grid: Grid, *, total: bool) -> None:
+        """Check that it can stand in a scene. Default: it can.
+
+        Args:
+            grid: the scene's grid.
+            total: whether the description is total Lagrangian.
+
+        Raises:
+            ValueError: it cannot; why, and what to do.
+        """
+        del grid, total
+
+    def walls(self) -> tuple[Wall, ...]:
+        """Its walls at right angles to an axis, for pictures and for warnings of what lies beyond or beside them.
+        Default: none. It is asked only while numbers are known."""
+        return ()
+
+    def distance(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m"] | None:
+        """The signed distance [m] of points x [m], shape (m, d), from the body that it is at time t, for pictures and
+        for warnings of what lies in it. Default: None, it is no body."""
+        del x, t
+        return None
+
+    def rests(self, *, total: bool) -> bool:
+        """Whether it acts on the same nodes at all times and is meant to act on some, so that it is an oversight if it
+        touches none. Default: False. It is asked only while numbers are known.
+
+        Args:
+            total: whether the description is total Lagrangian.
+        """
+        del total
+        return False
+
+
+def crossed(
+    start: Array, end: Array, wall: Array | Scalar, deepest: Array | Scalar, spacing: Scalar
+) -> Bool[Array, "..."]:
+    """Whether a coordinate that moved from `start` to `end` passed a wall that keeps material above it: it moved by
+    more than a spacing and ended below the wall, or it ended below `deepest`."""
+    fast = (start >= wall) & (end < wall) & (start - end > spacing)
+    return fast | ((start >= deepest) & (end < deepest))
