@@ -16,7 +16,7 @@ from mpmjax._types import Scalar
 from mpmjax.analysis import METHODS, Build, Trial, work_precision
 from mpmjax.checks import require, require_positive, shortened, warn
 from mpmjax.discretisation import Grid
-from mpmjax.fitting import FitResult, fit_curve, gauge, read_columns
+from mpmjax.fitting import FitResult, read_columns
 from mpmjax.geometry import AbstractRegion
 from mpmjax.io import arguments, decode, reason
 from mpmjax.simulation import number_of_steps

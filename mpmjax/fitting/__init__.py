@@ -5,7 +5,7 @@ from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import fit
 from mpmjax.fitting._observation import AbstractObservation, Curve, Series, Tracks
 from mpmjax.fitting._parameter import AbstractParameter, Bounded, Gaussian, Positive, Unbounded
-from mpmjax.fitting._quantities import CentreOfMass, Extent, Markers, StressStretch
+from mpmjax.fitting._quantities import CentreOfMass, Density, Extent, Markers, StressStretch
 from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "Bounded",
     "CentreOfMass",
     "Curve",
+    "Density",
     "Estimate",
     "Experiment",
     "Extent",

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, ParticleScalar, ParticleVector
-from mpmjax.checks import require
+from mpmjax.checks import canonical, require
+from mpmjax.discretisation import BSpline, Grid, SplineGradient, make_stencil, scatter
 from mpmjax.geometry import AbstractRegion
 from mpmjax.state import Particles, Scene
 
@@ -158,3 +159,47 @@ class StressStretch(eqx.Module):
         P = body.law.stress(body.F)
         a = self.axis
         return (self.weight * body.F[a, a]).sum(), (self.weight * P[a, a]).sum()
+
+
+class Density(eqx.Module):
+    """A picture of the body: its density on the nodes of a lattice, through a quadratic B-spline of the lattice's width.
+
+    For measured pictures, and for clouds of points whose correspondence is not known: a cloud becomes a picture by
+    `of_points`, and pictures are compared. The lattice's spacing is the distance over which points are told apart:
+    wide enough that shifted clouds still overlap, a tenth of the body or so, and no less than the spacing of the points.
+
+        picture = mpm.Density(mpm.Grid((40, 40), 0.05))
+        seen = mpm.Series(times, [picture.of_points(cloud, mass) for cloud in clouds], picture)
+
+    A series of it keeps a picture for each step, and for each parameter a derivative of that.
+
+    Args:
+        grid: the lattice; what lies outside is not in the picture.
+    """
+
+    grid: Grid
+
+    def __call__(self, scene: Scene, particles: Particles) -> Array:
+        """The density [kg/m^d], of the grid's shape."""
+        del scene
+        return self._picture(particles.x, particles.mass)
+
+    def of_points(self, points: ParticleVector | np.ndarray, mass: float | Array) -> np.ndarray:
+        """The picture of a cloud of points.
+
+        Args:
+            points: places [m], shape (m, d).
+            mass: of the body [kg], which they share evenly.
+        """
+        points = jnp.asarray(points, float)
+        require(
+            points.ndim == 2 and points.shape[1] == self.grid.dim and len(points) > 0,
+            f"A cloud needs points of shape (m, {self.grid.dim}), got {points.shape}.",
+        )
+        return np.asarray(self._picture(points, jnp.full(len(points), mass / len(points))))
+
+    def _picture(self, x: ParticleVector, mass: ParticleScalar) -> Array:
+        grid = canonical(self.grid, x.dtype)
+        stencil = make_stencil(BSpline(2), SplineGradient(), grid, grid.window(x), x, affine=False)
+        on_nodes = scatter(stencil, jnp.where(stencil.inside, mass, 0), None, grid.size)
+        return (on_nodes / grid.spacing**grid.dim).reshape(grid.shape)
