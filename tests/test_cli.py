@@ -11,7 +11,7 @@ from shell import refused, shell
 
 import mpmjax as mpm
 from mpmjax.cli._commands import _summary
-from mpmjax.cli._scene_file import read_job, read_plan
+from mpmjax.cli._scene_file import read_scene_file, read_simulation
 from mpmjax.fitting._columns import read_columns
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -59,10 +59,10 @@ def folder(tmp_path_factory) -> Path:
 @pytest.mark.thorough
 def test_summary_says_how_many_steps_were_indefinite(folder):
     """And is silent where none was."""
-    job, run = read_job(folder / "scene.toml"), mpm.load(folder / "run.h5")
+    simulation, run = read_simulation(folder / "scene.toml"), mpm.load(folder / "run.h5")
     assert "indefinite" not in (folder / "summary").read_text()
     run = eqx.tree_at(lambda r: r.statistics.indefinite, run, run.statistics.indefinite + 5)
-    assert re.search(r"\nindefinite +the system of 5 of 6 steps", _summary(job, run, 6, 1.0))
+    assert re.search(r"\nindefinite +the system of 5 of 6 steps", _summary(simulation, run, 6, 1.0))
 
 
 def test_run_writes_the_frames_and_a_summary(folder):
@@ -80,10 +80,12 @@ def test_run_writes_the_frames_and_a_summary(folder):
 @pytest.mark.thorough
 def test_run_reports_what_simulate_returns(folder):
     """The recorded run is the simulated one."""
-    from mpmjax.cli._scene_file import read_job
+    from mpmjax.cli._scene_file import read_simulation
 
-    job = read_job(folder / "scene.toml")
-    run = mpm.simulate(job.scene, job.particles, t1=job.run.t1, dt=job.run.dt, method=job.run.method)
+    simulation = read_simulation(folder / "scene.toml")
+    run = mpm.simulate(
+        simulation.scene, simulation.particles, t1=simulation.t1, dt=simulation.dt, method=simulation.method
+    )
     np.testing.assert_array_equal(mpm.load(folder / "run.h5").final.x, run.final.x)
 
 
@@ -233,22 +235,24 @@ material = 2
 def test_a_file_may_name_several_materials(tmp_path):
     """Particles stand by material, in the laws' order, whatever that of their tables; each obeys its own law."""
     (tmp_path / "two.toml").write_text(TWO)
-    job = read_job(tmp_path / "two.toml")
-    metal, jelly = job.scene.laws
+    simulation = read_simulation(tmp_path / "two.toml")
+    metal, jelly = simulation.scene.laws
     assert type(metal) is mpm.VonMises
     assert type(jelly) is mpm.FixedCorotated
-    assert job.particles.counts is not None
-    first, second = job.particles.counts
+    assert simulation.particles.counts is not None
+    first, second = simulation.particles.counts
     assert first == 12
-    density = np.asarray(job.particles.mass / job.particles.volume)
+    density = np.asarray(simulation.particles.mass / simulation.particles.volume)
     np.testing.assert_allclose(density[:first], 2e3)
     np.testing.assert_allclose(density[first:], [1e3] * 36 + [500.0] * (second - 36))
     code, out, err = shell("run", tmp_path / "two.toml", "-o", tmp_path / "two.h5", "--quiet")
     assert code == 0, err
     assert re.search(rf"particles +{first + second}\n", out)
     run = mpm.load(tmp_path / "two.h5")
-    np.testing.assert_array_equal(run.final.counts, job.particles.counts)
-    plain = mpm.simulate(job.scene, job.particles, t1=job.run.t1, dt=job.run.dt, method=job.run.method)
+    np.testing.assert_array_equal(run.final.counts, simulation.particles.counts)
+    plain = mpm.simulate(
+        simulation.scene, simulation.particles, t1=simulation.t1, dt=simulation.dt, method=simulation.method
+    )
     np.testing.assert_array_equal(run.final.x, plain.final.x)
 
 
@@ -280,7 +284,7 @@ def test_a_bad_material_gets_one_line(tmp_path, scene, old, new, says):
     assert old in scene
     (tmp_path / "bad.toml").write_text(scene.replace(old, new, 1))
     with pytest.raises(ValueError, match=says) as caught:
-        read_plan(tmp_path / "bad.toml")
+        read_scene_file(tmp_path / "bad.toml")
     assert "\n" not in str(caught.value)
 
 
@@ -315,8 +319,8 @@ def test_a_run_that_blows_up_keeps_what_was_written(tmp_path):
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.stem)
 def test_the_examples_can_be_run(path):
     """They are read, and name their own commands."""
-    plan = read_plan(path)
-    assert plan.particles.count > 50
+    file = read_scene_file(path)
+    assert file.particles.count > 50
     assert re.search(rf"#   mpmjax (run|fit) examples/{path.name}", path.read_text(encoding="utf-8"))
 
 
@@ -333,10 +337,10 @@ def test_a_stable_step_is_taken_and_told(tmp_path):
     assert code == 0, err
     chosen = re.search(r"chosen +dt = ([-.e\d]+) s \((\d+) steps\), the longest that is stable", out)
     assert chosen is not None, out
-    run, job = mpm.load(tmp_path / "run.h5"), read_plan(scene)
+    run, file = mpm.load(tmp_path / "run.h5"), read_scene_file(scene)
     assert int(run.statistics.steps) == int(chosen[2])
     np.testing.assert_allclose(float(run.dt) * int(chosen[2]), 0.06)
-    assert float(run.dt) <= float(mpm.stable_dt(job.scene, job.particles)) < 0.06 / (int(chosen[2]) - 1)
+    assert float(run.dt) <= float(mpm.stable_dt(file.scene, file.particles)) < 0.06 / (int(chosen[2]) - 1)
     scene.write_text(left)
     assert 'dt = "stable": SemiImplicit has no longest stable step' in refused("run", scene, "-o", tmp_path / "a.h5")
 
@@ -355,39 +359,39 @@ def test_the_step_is_chosen_where_it_is_left_open(tmp_path):
     assert chosen is not None, out
     run = mpm.load(tmp_path / "run.h5")
     assert int(run.statistics.steps) == int(chosen[2])
-    job = read_plan(scene)
-    assert float(run.dt) <= 0.7 * float(mpm.stable_dt(job.scene, job.particles, safety=1.0))
+    file = read_scene_file(scene)
+    assert float(run.dt) <= 0.7 * float(mpm.stable_dt(file.scene, file.particles, safety=1.0))
 
 
 def test_pilot_runs_are_bounded_from_file_and_shell(tmp_path):
     """By `most_seconds` in the file, and by the option, which has no use where nothing is left open."""
     scene = tmp_path / "scene.toml"
     scene.write_text(SCENE)
-    assert read_plan(scene).run.most_seconds == 60
+    assert read_scene_file(scene).run.most_seconds == 60
     assert "--most-seconds is for pilot runs" in refused("run", scene, "-o", tmp_path / "a.h5", "--most-seconds", 5)
     scene.write_text(SCENE.replace("dt = 1e-2", 'dt = "auto"\nmost_seconds = 1e-9').replace('"SlipBox"', '"StickyBox"'))
-    assert read_plan(scene).run.most_seconds == 1e-9
+    assert read_scene_file(scene).run.most_seconds == 1e-9
 
 
 def test_a_plan_refines(tmp_path):
     """The same body at the same place, on half the spacing."""
     scene = tmp_path / "scene.toml"
     scene.write_text(SCENE)
-    plan = read_plan(scene)
-    (coarse, few), (fine, many) = plan.build(1), plan.build(2)
+    file = read_scene_file(scene)
+    (coarse, few), (fine, many) = file.build(1), file.build(2)
     assert few.count * 4 == many.count
     np.testing.assert_allclose(few.mass.sum(), many.mass.sum(), rtol=1e-14)
     np.testing.assert_allclose(few.x.mean(axis=0), many.x.mean(axis=0), rtol=1e-14)
     assert (2 * float(fine.grid.spacing), *fine.grid.shape) == (float(coarse.grid.spacing), 20, 28)
     law = '[material]\nkind = "FixedCorotated"\nyoungs_modulus = 1e5\npoisson_ratio = 0.3\n'
     scene.write_text('material = "Snow"\n' + SCENE.replace(law, ""))
-    assert read_plan(scene).build(2)[1].count == many.count
+    assert read_scene_file(scene).build(2)[1].count == many.count
     each = f"youngs_modulus = {[1e5] * few.count}, poisson_ratio = 0.3"
     viscous = f'kind = "Viscous"\nshear_viscosity = 1.0\nlaw = {{ kind = "NeoHookean", {each} }}'
     for varied in (f'kind = "NeoHookean"\n{each.replace(", p", chr(10) + "p")}', viscous):
         scene.write_text(SCENE.replace(law, f"[material]\n{varied}\n"))
         with pytest.raises(ValueError, match="one number for all particles"):
-            read_plan(scene).build(2)
+            read_scene_file(scene).build(2)
 
 
 @pytest.mark.slow

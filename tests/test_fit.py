@@ -11,7 +11,7 @@ import pytest
 from shell import refused, shell
 
 import mpmjax as mpm
-from mpmjax.cli._scene_file import fit_job, read_job
+from mpmjax.cli._scene_file import read_simulation, run_fit
 from mpmjax.fitting._columns import read_columns
 from mpmjax.fitting._fit import fit_curve, gauge
 
@@ -19,18 +19,20 @@ RUBBER = Path(__file__).parents[1] / "examples" / "rubber.toml"
 
 
 @pytest.fixture(scope="module")
-def job():
-    """The example's job."""
-    return read_job(RUBBER)
+def simulation():
+    """The example's simulation."""
+    return read_simulation(RUBBER)
 
 
 @pytest.fixture(scope="module")
-def coarse(job):
+def coarse(simulation):
     """The same strip at twice the spacing, for what does not need the figure itself."""
     grid = mpm.Grid((8, 14), 5e-3, origin=(-3, -3))
     particles = mpm.fill(mpm.Box((0.0, 0.0), (0.01, 0.04)), grid, particles_per_cell=4, density=930.0, dtype="float64")
-    scene = mpm.Scene(grid, job.scene.material, boundary=job.scene.boundary, description=mpm.TotalLagrangian())
-    return job._replace(scene=scene, particles=particles, run=job.run._replace(dt=5e-3))
+    scene = mpm.Scene(
+        grid, simulation.scene.material, boundary=simulation.scene.boundary, description=mpm.TotalLagrangian()
+    )
+    return simulation._replace(scene=scene, particles=particles, dt=5e-3)
 
 
 @pytest.mark.slow
@@ -48,25 +50,25 @@ def test_the_fit_finds_rubbers_modulus(tmp_path):
     assert (tmp_path / "fit.png").stat().st_size > 10_000
 
 
-def test_the_step_is_far_beyond_the_explicit_limit(job):
+def test_the_step_is_far_beyond_the_explicit_limit(simulation):
     """More than 100 times dx/c."""
-    law = job.scene.material
+    law = simulation.scene.material
     speed = np.sqrt((law.lame_lambda + 2 * law.shear_modulus) / 930)
-    assert job.run.dt / (job.scene.grid.spacing / speed) > 100
+    assert simulation.dt / (simulation.scene.grid.spacing / speed) > 100
 
 
 @pytest.mark.slow
 def test_doubled_stresses_double_the_modulus(coarse):
     """A quasi-static curve is proportional to the modulus."""
-    once = fit_job(coarse)
-    twice = fit_job(coarse._replace(fit=coarse.fit._replace(stress=2 * coarse.fit.stress)))
+    once = run_fit(coarse)
+    twice = run_fit(coarse._replace(fit=coarse.fit._replace(stress=2 * coarse.fit.stress)))
     assert float(twice.value / once.value) == pytest.approx(2, rel=1e-4)
     assert float(twice.standard_error / once.standard_error) == pytest.approx(2, rel=1e-3)
 
 
 def test_the_fit_is_the_least_squares_answer_of_its_own_curve(coarse):
     """At the fit the residual is orthogonal to the curve, stress being proportional to the modulus."""
-    result = fit_job(coarse)
+    result = run_fit(coarse)
     fit = coarse.fit
     model = np.asarray(result.predicted)[fit.fitted]
     assert abs((model * (model - fit.stress[fit.fitted])).sum()) < 1e-4 * (model**2).sum()
@@ -75,14 +77,14 @@ def test_the_fit_is_the_least_squares_answer_of_its_own_curve(coarse):
 @pytest.mark.thorough
 def test_an_unreached_stretch_is_an_error_and_not_a_flat_curve(coarse):
     with pytest.raises(ValueError, match="leaves out measured points"):
-        fit_job(coarse._replace(run=coarse.run._replace(t1=0.1)))
+        run_fit(coarse._replace(t1=0.1))
 
 
 @pytest.mark.thorough
 def test_an_abscissa_that_turns_back_is_refused(coarse):
     """Interpolation in it would not be defined."""
     grip = next(b for b in coarse.scene.boundary if isinstance(b, mpm.Grip))
-    end = coarse.run.t1
+    end = coarse.t1
     back = mpm.Motion((0.0, end / 3, end / 2, end), ((0.0, 0.0), (0.0, 0.06), (0.0, 0.05), (0.0, 0.2)))
     scene = eqx.tree_at(
         lambda s: s.boundary,
@@ -90,7 +92,7 @@ def test_an_abscissa_that_turns_back_is_refused(coarse):
         (*(b for b in coarse.scene.boundary if b is not grip), mpm.Grip(grip.region, back, grip.axes)),
     )
     with pytest.raises(ValueError, match="must grow with every step"):
-        fit_job(coarse._replace(scene=scene))
+        run_fit(coarse._replace(scene=scene))
 
 
 @pytest.mark.thorough
@@ -129,18 +131,18 @@ def test_a_fit_without_a_derivative_says_why(options, says):
         )
 
 
-def test_a_gauge_without_particles_is_refused(job):
+def test_a_gauge_without_particles_is_refused(simulation):
     with pytest.raises(ValueError, match="holds no particle"):
-        gauge(mpm.Box((1.0, 1.0), (2.0, 2.0)), job.particles, 1)
+        gauge(mpm.Box((1.0, 1.0), (2.0, 2.0)), simulation.particles, 1)
 
 
-def test_the_gauge_weighs_by_volume(job):
-    curve = gauge(mpm.Box((0.0, 0.0), (0.01, 0.01)), job.particles, 1)
-    stretched = dataclasses.replace(job.particles, F=2 * job.particles.F)
+def test_the_gauge_weighs_by_volume(simulation):
+    curve = gauge(mpm.Box((0.0, 0.0), (0.01, 0.01)), simulation.particles, 1)
+    stretched = dataclasses.replace(simulation.particles, F=2 * simulation.particles.F)
     assert float(curve.weight.sum()) == pytest.approx(1)
-    stretch, stress = curve(job.scene, stretched)
+    stretch, stress = curve(simulation.scene, stretched)
     assert float(stretch) == pytest.approx(2)
-    assert float(stress) == pytest.approx(float(job.scene.material.stress(2 * jnp.eye(2)[..., None])[1, 1, 0]))
+    assert float(stress) == pytest.approx(float(simulation.scene.material.stress(2 * jnp.eye(2)[..., None])[1, 1, 0]))
 
 
 FIT_FAULTS = {

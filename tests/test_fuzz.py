@@ -12,7 +12,7 @@ from test_cli import SCENE
 
 import mpmjax as mpm
 from mpmjax.checks import _memory
-from mpmjax.cli._scene_file import read_plan
+from mpmjax.cli._scene_file import read_scene_file
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SPOILT = {"jelly": range(40), "rubber": range(200, 220)}
@@ -21,14 +21,14 @@ SPOILT = {"jelly": range(40), "rubber": range(200, 220)}
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(("name", "seeds"), SPOILT.items(), ids=SPOILT)
 def test_a_spoilt_scene_is_read_or_refused_in_one_line(name, seeds, tmp_path):
-    """Whatever its values have become; the shell says the same as `read_plan`."""
+    """Whatever its values have become; the shell says the same as `read_scene_file`."""
     scene = tomllib.loads((EXAMPLES / f"{name}.toml").read_text(encoding="utf-8"))
     (tmp_path / "data").symlink_to(EXAMPLES / "data")
     path, told = tmp_path / "scene.toml", []
     for seed in seeds:
         path.write_text(toml(spoilt(scene, seed)))
         try:
-            read_plan(path)
+            read_scene_file(path)
         except ValueError as error:
             told.append(str(error))
             if len(told) % 4 == 0:

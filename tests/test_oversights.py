@@ -14,7 +14,7 @@ from shell import refused, shell
 from test_cli import SCENE
 
 import mpmjax as mpm
-from mpmjax.cli._scene_file import read_plan
+from mpmjax.cli._scene_file import read_scene_file
 
 TOTAL = {"description": mpm.TotalLagrangian()}
 FAR, HALF, NEAR = mpm.Ball((0.9, 0.9), 0.05), mpm.Ball((0.15, 0.3), 0.12), mpm.Box((-1.0, -1.0), (1.0, 0.0))
@@ -119,7 +119,7 @@ def test_the_shell_prints_a_warning_in_a_line(tmp_path):
     with pytest.warns(
         UserWarning, match=r"36 particles of \[\[particles\]\] 2 lie in the region of \[\[particles\]\] 1"
     ):
-        read_plan(scene)
+        read_scene_file(scene)
     assert "no [fit] table" in refused("fit", scene)
     told = [line for line in shell("fit", scene)[2].splitlines() if "warning" in line]
     assert [line.split(" particles")[0] for line in told] == ["warning: 36", "warning: 36 of 72"]

@@ -16,7 +16,7 @@ import typer
 
 from mpmjax.analysis import Trial, energy, grid_mass, name_of, pieces, work_precision
 from mpmjax.checks import require
-from mpmjax.cli._scene_file import CurveSettings, Job, fit_job, read_job, read_plan, stable_step
+from mpmjax.cli._scene_file import CurveSettings, Simulation, read_scene_file, read_simulation, run_fit, stable_step
 from mpmjax.fitting import FitResult
 from mpmjax.io import check_place, end_on_signals, load, record, reporting, save_figure, steps_in
 from mpmjax.simulation import Run
@@ -86,13 +86,13 @@ Imports = Annotated[
         help="A module, or its .py file, that registers classes of your own (mpm.register); its code is executed.",
     ),
 ]
-SceneFile = Annotated[Path, typer.Argument(help="A TOML scene file; docs/scene_files.md is its schema.")]
+ScenePath = Annotated[Path, typer.Argument(help="A TOML scene file; docs/scene_files.md is its schema.")]
 
 
 @app.command("run")
 @_reporting
 def run_command(
-    scene: SceneFile,
+    scene: ScenePath,
     output: Annotated[Path, typer.Option("--output", "-o", help="The HDF5 file to write; ParaView opens it.")],
     overwrite: Annotated[bool, typer.Option(help="Replace the output file if it exists.")] = False,
     resume: Annotated[bool, typer.Option(help="Continue the output file from its last frame.")] = False,
@@ -106,44 +106,44 @@ def run_command(
     done = steps_in(output) if resume else 0
     if not resume:
         check_place(output, overwrite=overwrite)
-    job = _chosen(scene, most_seconds, quiet=quiet)
+    simulation = _chosen(scene, most_seconds, quiet=quiet)
     begun = time.perf_counter()
     run = record(
         output,
-        job.scene,
-        job.particles,
-        t1=job.run.t1,
-        dt=job.run.dt,
-        method=job.run.method,
-        save_every=job.run.save_every,
+        simulation.scene,
+        simulation.particles,
+        t1=simulation.t1,
+        dt=simulation.dt,
+        method=simulation.method,
+        save_every=simulation.save_every,
         overwrite=overwrite,
         resume=resume,
         progress=not quiet,
     )
     taken, seconds = int(run.statistics.steps) - done, time.perf_counter() - begun
     with reporting(lambda: f"{output} is complete."):
-        print(_summary(job, run, taken, seconds))
+        print(_summary(simulation, run, taken, seconds))
     reached = f"complete already: it reaches t = {float(run.final_step * run.dt):.6g} s" if resume and not taken else ""
     print(f"written            {output} {reached}".rstrip())
 
 
-def _chosen(scene: Path, most_seconds: float | None, *, quiet: bool = False) -> Job:
-    """The job of a scene file; pilot runs are reported on standard error, their choice on standard output."""
+def _chosen(scene: Path, most_seconds: float | None, *, quiet: bool = False) -> Simulation:
+    """The simulation of a scene file; pilot runs are reported on standard error, their choice on standard output."""
     told = {} if quiet else {"progress": lambda trial: _print_error(_line(trial)), "say": _print_error}
-    job = read_job(scene, most_seconds=most_seconds, **told)
-    if job.choice is not None:
-        print(f"{'chosen':<18} {job.choice}")
-    return job
+    simulation = read_simulation(scene, most_seconds=most_seconds, **told)
+    if simulation.choice is not None:
+        print(f"{'chosen':<18} {simulation.choice}")
+    return simulation
 
 
 def _print_error(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
-def _summary(job: Job, run: Run, taken: int, seconds: float) -> str:
+def _summary(simulation: Simulation, run: Run, taken: int, seconds: float) -> str:
     """The cost of a run, with `taken` of its steps done in these seconds, and how well it kept mass and energy."""
     steps, p = int(run.statistics.steps), run.final.count
-    before, after = energy(run.scene, job.particles), energy(run.scene, run.final)
+    before, after = energy(run.scene, simulation.particles), energy(run.scene, run.final)
     mass = float(run.final.mass.sum())
     lines = [
         ("particles", f"{p}"),
@@ -173,7 +173,7 @@ def _summary(job: Job, run: Run, taken: int, seconds: float) -> str:
         )
     if int(run.statistics.violations) > 0:
         lines.append(("contact", f"{int(run.statistics.violations)} conditions left violated"))
-    whole, parts = pieces(run.scene, job.particles), pieces(run.scene, run.final)
+    whole, parts = pieces(run.scene, simulation.particles), pieces(run.scene, run.final)
     if parts > whole:
         advice = "if nothing was to part, this is numerical fracture: more particles a cell, or TotalLagrangian"
         lines.append(("pieces", f"{whole} at the start, {parts} at the end; {advice}"))
@@ -188,7 +188,7 @@ def _summary(job: Job, run: Run, taken: int, seconds: float) -> str:
 @app.command("fit")
 @_reporting
 def fit_command(
-    scene: SceneFile,
+    scene: ScenePath,
     plot: Annotated[Path | None, typer.Option(help="The plot to write. Default: SCENE_fit.png here.")] = None,
     most_seconds: MostSeconds = None,
     imports: Imports = None,
@@ -196,15 +196,15 @@ def fit_command(
     """Fit a scene's parameter to the measured curve that its [fit] table names."""
     _import(imports)
     begun = time.perf_counter()
-    job = _chosen(scene, most_seconds)
-    result = fit_job(job)
-    assert job.fit is not None
-    print(_table(job.fit, result))
-    name = (job.fit.report or job.fit.parameter).rsplit(".", 1)[-1]
-    print(f"{job.fit.parameter} = {float(result.parameter):.5g}")
+    simulation = _chosen(scene, most_seconds)
+    result = run_fit(simulation)
+    assert simulation.fit is not None
+    print(_table(simulation.fit, result))
+    name = (simulation.fit.report or simulation.fit.parameter).rsplit(".", 1)[-1]
+    print(f"{simulation.fit.parameter} = {float(result.parameter):.5g}")
     print(f"{name} = {float(result.value):.5g} ± {float(result.standard_error):.2g} (standard error)")
     plot = Path(f"{scene.stem}_fit.png") if plot is None else plot
-    _plot(job.fit, result, name, plot)
+    _plot(simulation.fit, result, name, plot)
     print(f"{result.simulations} simulations with exact derivatives, {time.perf_counter() - begun:.3g} s in all")
     print(f"written {plot}")
 
@@ -243,7 +243,7 @@ def _plot(fit: CurveSettings, result: FitResult, name: str, path: Path) -> None:
 @app.command("chart")
 @_reporting
 def chart_command(
-    scene: SceneFile,
+    scene: ScenePath,
     error: Annotated[float, typer.Option(help="The relative error of the motion that is asked for.")] = 1e-2,
     most_seconds: MostSeconds = None,
     output: Annotated[
@@ -253,17 +253,17 @@ def chart_command(
 ) -> None:
     """Chart a scene's error against seconds, and name the cheapest setting for an error."""
     _import(imports)
-    plan = read_plan(scene)
+    file = read_scene_file(scene)
     output = Path(f"{scene.stem}_chart.png") if output is None else output
     print(f"{'method':>24} {'spacing':>10} {'dt [s]':>10} {'steps':>9} {'seconds':>9} {'error':>9}", flush=True)
-    dt = stable_step(scene, plan) if plan.run.dt == "stable" else plan.run.dt
-    own = () if dt is None or plan.run.method is None else ((plan.run.method, dt),)
+    dt = stable_step(scene, file) if file.run.dt == "stable" else file.run.dt
+    own = () if dt is None or file.run.method is None else ((file.run.method, dt),)
     found = work_precision(
-        plan.build,
-        t1=plan.run.t1,
+        file.build,
+        t1=file.run.t1,
         error=error,
         also=own,
-        most_seconds=plan.run.most_seconds if most_seconds is None else most_seconds,
+        most_seconds=file.run.most_seconds if most_seconds is None else most_seconds,
         progress=lambda trial: print(_line(trial), flush=True),
         say=_print_error,
     )

@@ -28,62 +28,66 @@ _FRAMES = 50
 
 
 class RunSettings(NamedTuple):
-    """The settings of a run."""
+    """The `[run]` table of a scene file."""
 
     t1: float
-    dt: float
-    method: AbstractIntegrator
-    save_every: int
-    dtype: str
-
-
-class RunTable(NamedTuple):
-    """The `[run]` table: the settings, with None for "auto"."""
-
-    t1: float
+    """End time [s]."""
     dt: float | Literal["stable"] | None
+    """Step [s]; None for "auto"."""
     method: AbstractIntegrator | None
+    """None for "auto"."""
     save_every: int | None
+    """Steps from frame to frame; None if the file does not say."""
     dtype: str
     error: float
+    """Relative error that "auto" aims at."""
     most_seconds: float
+    """What its pilot runs may take [s]."""
 
 
 class CurveSettings(NamedTuple):
-    """The `[fit]` table of kind "curve", its data read."""
+    """The `[fit]` table of kind "curve", with its data."""
 
     stretch: np.ndarray
+    """Measured stretches, shape (m,)."""
     stress: np.ndarray
+    """Measured nominal stresses [Pa], shape (m,)."""
     fitted: np.ndarray
+    """Which of the points are fitted, shape (m,)."""
     parameter: str
+    """Dotted path of the fitted parameter, such as "material.youngs_modulus"."""
     report: str | None
+    """Dotted path of the number that is reported; None for the parameter."""
     axis: int
     gauge: AbstractRegion
 
 
-class Plan(NamedTuple):
-    """The contents of a scene file."""
-
-    scene: Scene
-    particles: Particles
-    run: RunTable
-    fit: CurveSettings | None
-    build: Build
-    """From n to the scene on n times as many cells a direction, and its particles."""
-
-
-class Job(NamedTuple):
-    """A plan, ready to be run."""
+class SceneFile(NamedTuple):
+    """A scene file as it was read: "auto" and "stable" are left to be resolved."""
 
     scene: Scene
     particles: Particles
     run: RunSettings
     fit: CurveSettings | None
+    build: Build
+    """Makes the scene and its particles on n times as many cells a direction, from n."""
+
+
+class Simulation(NamedTuple):
+    """A scene file with its step and method resolved, ready to be run."""
+
+    scene: Scene
+    particles: Particles
+    t1: float
+    dt: float
+    method: AbstractIntegrator
+    save_every: int
+    fit: CurveSettings | None
     choice: str | None
-    """What was chosen for "auto" or "stable", and why."""
+    """What was chosen for "auto" or "stable", and why; None if nothing was."""
 
 
-def read_plan(path: Path) -> Plan:
+def read_scene_file(path: Path) -> SceneFile:
     """Read a scene file.
 
     Raises:
@@ -97,7 +101,7 @@ def read_plan(path: Path) -> Plan:
     groups, run_table = table.pop("particles"), table.pop("run")
     groups = groups if isinstance(groups, list) else [groups]
     try:
-        run = _run_table(run_table)
+        run = _run_settings(run_table)
 
         def build(n: int) -> tuple[Scene, Particles]:
             scene = decode(_refined(table, n), Scene)
@@ -114,17 +118,17 @@ def read_plan(path: Path) -> Plan:
         raise ValueError(f"{path}: {error}") from None
     except RecursionError:
         raise ValueError(f"{path}: tables are nested too deeply to be read.") from None
-    return Plan(scene, particles, run, fit, build)
+    return SceneFile(scene, particles, run, fit, build)
 
 
-def read_job(
+def read_simulation(
     path: Path,
     *,
     most_seconds: float | None = None,
     progress: Callable[[Trial], None] = lambda trial: None,
     say: Callable[[str], None] = lambda line: None,
-) -> Job:
-    """Read a scene file, and choose what it leaves to be chosen: the stable step, or what pilot runs find.
+) -> Simulation:
+    """Read a scene file, and resolve its "stable" step or what it leaves to pilot runs by "auto".
 
     Args:
         path: the file.
@@ -133,24 +137,24 @@ def read_job(
         say: called with each run of their reference.
 
     Raises:
-        ValueError: as `read_plan`, and as `stable_dt` and `work_precision`.
+        ValueError: as `read_scene_file`, and as `stable_dt` and `work_precision`.
     """
-    plan = read_plan(path)
-    t1, dt, method, save_every, dtype, error, seconds = plan.run
+    file = read_scene_file(path)
+    t1, dt, method, save_every, _, error, seconds = file.run
     choice = None
     require(
         most_seconds is None or dt is None or method is None,
         "--most-seconds is for pilot runs, and there are none: the file gives dt and method.",
     )
     if dt == "stable":
-        dt = stable_step(path, plan)
+        dt = stable_step(path, file)
         steps = round(t1 / dt)
         choice = f"dt = {dt:.6g} s ({steps} steps), the longest that is stable as the particles start"
         save_every = save_every or max(1, steps // _FRAMES)
     if dt is None or method is None:
         methods = METHODS if method is None else (method,)
         found = work_precision(
-            plan.build,
+            file.build,
             t1=t1,
             error=error,
             methods=methods,
@@ -164,39 +168,39 @@ def read_job(
             raise ValueError(f"{path}: {choice}")
         dt, method = best.dt, best.method
         save_every = save_every or max(1, best.steps // _FRAMES)
-    return Job(plan.scene, plan.particles, RunSettings(t1, dt, method, save_every or 1, dtype), plan.fit, choice)
+    return Simulation(file.scene, file.particles, t1, dt, method, save_every or 1, file.fit, choice)
 
 
-def stable_step(path: Path, plan: Plan) -> float:
+def stable_step(path: Path, file: SceneFile) -> float:
     """The step of dt = "stable" in a scene file [s].
 
     Raises:
         ValueError: as `stable_dt`.
     """
-    assert plan.run.method is not None
+    assert file.run.method is not None
     try:
-        return float(stable_dt(plan.scene, plan.particles, method=plan.run.method, t1=plan.run.t1))
+        return float(stable_dt(file.scene, file.particles, method=file.run.method, t1=file.run.t1))
     except ValueError as error:
         raise ValueError(f'{path}: [run] dt = "stable": {error}') from None
 
 
-def fit_job(job: Job) -> FitResult:
+def run_fit(simulation: Simulation) -> FitResult:
     """Carry out the fit that a scene file asks for.
 
     Raises:
         ValueError: it asks for none, or see `fit_curve`.
     """
-    fit, run = job.fit, job.run
+    fit = simulation.fit
     if fit is None:
         raise ValueError("The scene file has no [fit] table, so there is nothing to fit. See docs/scene_files.md.")
     report = fit.report
     return fit_curve(
-        job.scene,
-        job.particles,
-        t1=run.t1,
-        dt=run.dt,
-        method=run.method,
-        curve=gauge(fit.gauge, job.particles, fit.axis),
+        simulation.scene,
+        simulation.particles,
+        t1=simulation.t1,
+        dt=simulation.dt,
+        method=simulation.method,
+        curve=gauge(fit.gauge, simulation.particles, fit.axis),
         measured_x=fit.stretch,
         measured_y=fit.stress,
         fitted=fit.fitted,
@@ -248,7 +252,7 @@ def _toml(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} is not a TOML file: {shortened(str(error))}.") from None
 
 
-def _run_table(table: Any) -> RunTable:
+def _run_settings(table: Any) -> RunSettings:
     def run(
         *,
         t1: Scalar,
@@ -258,7 +262,7 @@ def _run_table(table: Any) -> RunTable:
         precision: str = "float64",
         error: Scalar = 1e-2,
         most_seconds: Scalar = 60.0,
-    ) -> RunTable:
+    ) -> RunSettings:
         require_positive("[run] t1", t1)
         if isinstance(dt, str):
             require(dt == "stable", f'[run] dt must be a step in seconds, "stable" or "auto", got {dt!r}.')
@@ -271,7 +275,7 @@ def _run_table(table: Any) -> RunTable:
         require(every, f"[run] save_every must be at least 1, got {save_every}.")
         known = precision in ("float32", "float64")
         require(known, f'[run] precision must be "float32" or "float64", got {precision!r}.')
-        return RunTable(float(t1), dt, method, save_every, precision, float(error), float(most_seconds))
+        return RunSettings(float(t1), dt, method, save_every, precision, float(error), float(most_seconds))
 
     require(isinstance(table, dict), f"[run] must be a table, got {shortened(repr(table))}.")
     left = {name for name in ("dt", "method") if table.get(name) == "auto"}
