@@ -69,6 +69,20 @@ class Experiment(eqx.Module):
         """Number of steps."""
         return number_of_steps(self.t1, self.dt, 0, self.dtype)
 
+    def with_observations(
+        self, observations: tuple[AbstractObservation, ...], t1: float | int | None = None
+    ) -> "Experiment":
+        """The same experiment with other observations, and to another end."""
+        return Experiment(
+            self.scene,
+            self.particles,
+            t1=self.t1 if t1 is None else t1,
+            dt=self.dt,
+            method=self.method,
+            observations=observations,
+            name=self.name,
+        )
+
     def run(self, *, adjoint: Any = None, throw: bool = True) -> Run:
         """The simulation of it, with what its observations observe after each step."""
         return simulate(

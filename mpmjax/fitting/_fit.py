@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -11,7 +12,7 @@ import numpy as np
 from mpmjax._types import Array
 from mpmjax.checks import checked, require, require_between, require_positive, require_whole, warn
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._least_squares import Iteration, Minimum, NoDerivative, levenberg_marquardt
+from mpmjax.fitting._least_squares import Iteration, Minimum, NoDerivativeError, levenberg_marquardt
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
@@ -27,7 +28,7 @@ def fit(
     level: float = 0.95,
     rtol: float = 1e-6,
     max_steps: int = 50,
-    progress: bool = False,
+    progress: Callable[[str], None] | None = None,
 ) -> FitResult:
     """Fit parameters of a scene to what was observed of it, with standard errors.
 
@@ -57,7 +58,7 @@ def fit(
         level: of the intervals [-].
         rtol: relative change of the parameters and residuals at which the search ends.
         max_steps: most iterations of a search.
-        progress: print a line an iteration.
+        progress: called with a line an iteration, such as `print`.
 
     Raises:
         ValueError: a parameter that is no number of the experiment, lies outside its bounds or does not influence the
@@ -73,8 +74,8 @@ def fit(
     begun = time.perf_counter()
 
     def say(iteration: Iteration) -> None:
-        if progress:
-            print(_line(problem, iteration, time.perf_counter() - begun), flush=True)
+        if progress is not None:
+            progress(_line(problem, iteration, time.perf_counter() - begun))
 
     known = [observation.sigma is not None for observation in problem.observations]
     sigmas = tuple(jnp.asarray(o.scale() if o.sigma is None else o.sigma, problem.dtype) for o in problem.observations)
@@ -88,7 +89,8 @@ def fit(
         if settled or len(known) == 1 or not found.converged or len(history) > _MOST_ROUNDS * max_steps:
             break
         z = found.z
-    result = _result(problem, found, factors, freedom, sigmas, known, report or {}, level)._replace(history=history)
+    result = _result(problem, found, factors, freedom, sigmas, known, report or {}, level)
+    result = replace(result, history=history)
     if not found.converged:
         warn(f"The fit did not converge in {len(history)} iterations: its errors hold only at a minimum. {_ADVICE}")
     for text in result.warnings:
@@ -113,22 +115,23 @@ def _search(
     """
     try:
         found = levenberg_marquardt(problem, z, sigmas, rtol=rtol, max_steps=max_steps, report=say)
-    except NoDerivative:
+    except NoDerivativeError:
         raise RuntimeError(
-            "The fit has no derivative: either the tangent solve of a step did not converge (raise the max_steps of the "
-            "method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner()), or a law or an "
+            "The fit has no derivative. Either the tangent solve of a step did not converge: raise the max_steps of "
+            "the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner(). Or a law or an "
             "observation cannot be differentiated where the run takes it."
         ) from None
     if not np.isfinite(found.history[0].cost):
         for experiment in problem.at(z):
             experiment.explain()
         raise ValueError("What is observed of the simulation at the first guess is not finite.")
+    rounding = _ROUNDING * float(jnp.finfo(problem.dtype).eps) * problem.size_of_data(sigmas)
     size = np.linalg.norm(np.asarray(found.J), axis=0)
-    unseen = [label for label, column in zip(problem.labels, size, strict=True) if column == 0]
+    unseen = [label for label, column in zip(problem.labels, size, strict=True) if column <= rounding]
     require(
         not unseen,
-        f"The data do not depend on {', '.join(unseen)}: its derivative is zero throughout. Leave it out, give it a "
-        "prior, or observe what it changes.",
+        f"The data do not depend on {', '.join(unseen)}: their derivative by it is zero but for rounding. Leave it "
+        "out, give it a prior, or observe what it changes.",
     )
     return found
 
@@ -164,7 +167,7 @@ def _result(
     for rows, factor in zip(problem.rows, factors, strict=True):
         r[rows], J[rows] = r[rows] / factor, J[rows] / factor
     errors = uncertainty(J, np.inf if all(known) else sum(freedoms))
-    experiments = jax.tree.map(jax.lax.stop_gradient, problem.at(found.z))
+    experiments = problem.at(found.z)
     priors = len(r) - problem.rows[-1].stop
     counts = [o.count for o in problem.observations]
     noises = tuple(
@@ -175,9 +178,7 @@ def _result(
             float(np.sqrt((r[rows] ** 2).sum() / max(count, 1))),
             count,
         )
-        for o, sigma, given, rows, count in zip(
-            problem.observations, sigmas, known, problem.rows, counts, strict=True
-        )
+        for o, sigma, given, rows, count in zip(problem.observations, sigmas, known, problem.rows, counts, strict=True)
     )
     result = FitResult(
         estimates=_estimates(problem, found.z, errors, level),
@@ -193,29 +194,26 @@ def _result(
         level=level,
         converged=found.converged,
         history=found.history,
-        warnings=tuple(seen_together(problem.labels, errors)),
+        warnings=tuple(seen_together(problem.labels, errors, problem.logarithmic)),
     )
     if result.p_value < _IMPROBABLE:
         text = (
             f"The misfit is {np.sqrt(result.chi_squared / result.degrees_of_freedom):.2g} times the noise given: the "
             "model or its discretisation does not explain the data, and the errors are too small by as much or more."
         )
-        result = result._replace(warnings=(*result.warnings, text))
+        result = replace(result, warnings=(*result.warnings, text))
     return result
 
 
 def _estimates(problem: FitProblem, z: Coordinates, errors: Uncertainty, level: float) -> tuple[Estimate, ...]:
     """The fitted numbers. An interval is symmetric in the coordinate, so it lies within the bounds."""
-    reach = errors.quantile(level) * errors.error
-    z = np.asarray(z, float)
-    ends = [np.where(np.isfinite(reach), z + side * reach, side * _FAR) for side in (-1, 1)]
-    at, lower, upper = (problem.values(jnp.asarray(place, problem.dtype)) for place in (z, *ends))
-    _, slope = jax.jvp(problem.values, (jnp.asarray(z, problem.dtype),), (jnp.ones(problem.size, problem.dtype),))
+    reach = jnp.asarray(errors.quantile(level) * errors.error, z.dtype)
+    lower, upper = (problem.values(jnp.where(jnp.isfinite(reach), z + side * reach, side * _FAR)) for side in (-1, 1))
+    at, slope = jax.jvp(problem.values, (z,), (jnp.ones_like(z),))
     numbers = zip(
         problem.labels, *(_flat(a) for a in (at, slope, lower, upper, problem.starts)), errors.error, strict=True
     )
-    own = problem.coordinates(jnp.asarray(z, problem.dtype))
-    each = zip(problem.parameters, problem.starts, own, strict=True)
+    each = zip(problem.parameters, problem.starts, problem.coordinates(z), strict=True)
     bound = [(p.unit, p.at_bound(start, part)) for p, start, part in each for _ in range(start.size)]
     return tuple(
         Estimate(label, value, abs(by) * error, (min(a, b), max(a, b)), unit, start, at_bound)
@@ -259,6 +257,8 @@ _NOISE_RTOL = 1e-3
 _MOST_ROUNDS = 20
 _LEAST = 1e-12
 """Smallest noise, in sizes of the data: exact data have none."""
+_ROUNDING = 1e3
+"""Derivatives by a coordinate below this many roundings of the data are none."""
 _FAR = 700.0
 """The end of an interval, in coordinates, where the data do not see the parameter."""
 _IMPROBABLE = 1e-3

@@ -39,7 +39,7 @@ class Minimum(NamedTuple):
     history: tuple[Iteration, ...]
 
 
-class NoDerivative(RuntimeError):
+class NoDerivativeError(RuntimeError):
     """The residuals are finite, their derivative is not."""
 
 
@@ -67,7 +67,7 @@ def levenberg_marquardt(
         report: called after each.
 
     Raises:
-        NoDerivative: a derivative is not finite.
+        NoDerivativeError: a derivative is not finite.
     """
     solver = optimistix.LevenbergMarquardt(rtol=rtol, atol=rtol)
     history: list[Iteration] = []
@@ -78,7 +78,7 @@ def levenberg_marquardt(
             z, state, r, J = _iterate(problem, solver, z, sigmas, state)
             cost, slope = float((r**2).sum()) / 2, float(jnp.abs(J.T @ r).max())
             if np.isfinite(cost) and not np.isfinite(slope):
-                raise NoDerivative
+                raise NoDerivativeError
             moved = not history or cost != history[-1].cost
             history.append(Iteration(number, cost, slope, moved, np.asarray(z)))
             if report is not None:

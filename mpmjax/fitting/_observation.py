@@ -74,10 +74,17 @@ class AbstractObservation(eqx.Module):
                 fits = np.broadcast_shapes(np.shape(self.sigma), self.data.shape) == self.data.shape
             except ValueError:
                 fits = False
-            require(fits, f"The sigma of {name} must fit its data of shape {self.data.shape}, got {np.shape(self.sigma)}.")
+            require(
+                fits, f"The sigma of {name} must fit its data of shape {self.data.shape}, got {np.shape(self.sigma)}."
+            )
         require_positive(f"The weight of {name}", self.weight)
         if self.robust is not None:
             require_positive(f"The robust limit of {name}", self.robust)
+
+    @property
+    def against(self) -> tuple[str, np.ndarray]:
+        """What pictures draw the data over: its name, and a number for each row of the data."""
+        return "number", np.arange(len(np.atleast_1d(self.data)))
 
     @property
     def count(self) -> int:
@@ -90,10 +97,10 @@ class AbstractObservation(eqx.Module):
         return float(np.ptp(data) or np.abs(data).max() or 1.0)
 
     def residuals(self, predicted: Array, sigma: Scalar | Array) -> Array:
-        """√weight (predicted − data)/σ [-], by `robust` with large ones drawn nearer, in C order, shape (m,); zero where
-        nothing was measured.
+        """√weight (predicted − data)/σ [-], in C order, shape (m,); zero where nothing was measured.
 
-        With a limit δ: r → r √(2/(1 + √(1 + r²/δ²))), of which half the square is δ² (√(1 + r²/δ²) − 1).
+        With `robust` δ large ones are drawn nearer: r becomes r √(2/(1 + √(1 + r²/δ²))), and half its square
+        δ² (√(1 + r²/δ²) − 1).
         """
         dtype = predicted.dtype
         data, sigma, weight = (jnp.asarray(a, dtype) for a in (self.data, sigma, self.weight))
@@ -150,14 +157,18 @@ class Series(AbstractObservation):
         require_finite(f"The times of {what} [s]", self.times)
         require(np.diff(self.times) > 0, f"The times of {what} must grow: sort the measurements by time.")
 
+    @property
+    def against(self) -> tuple[str, np.ndarray]:
+        return "time [s]", self.times
+
     def observe(self, scene: Scene, particles: Particles) -> Any:
         return self.of(scene, particles)
 
     def predict(self, seen: Array, dt: float) -> Array:
         place = jnp.asarray(self.times, seen.dtype) / dt
-        before = jnp.clip(jnp.floor(place + _ON_A_STEP).astype(int), 0, len(seen) - 2)
-        share = jnp.clip(place - before, 0, 1).reshape(-1, *[1] * (seen.ndim - 1))
-        return (1 - share) * seen[before] + share * seen[before + 1]
+        last = jnp.clip(jnp.floor(place + _ON_A_STEP), 0, len(seen) - 2)
+        share, at = jnp.clip(place - last, 0, 1).reshape(-1, *[1] * (seen.ndim - 1)), last.astype(int)
+        return (1 - share) * seen[at] + share * seen[at + 1]
 
     def check(self, particles: Particles, t1: float, dt: float) -> None:
         what = f"{type(self).__name__} {self.name!r}"
@@ -172,8 +183,8 @@ class Series(AbstractObservation):
         shape = np.shape(seen)[1:]
         require(
             shape == self.data.shape[1:],
-            f"{type(self).__name__} {self.name!r} has values of shape {self.data.shape[1:]} at each time, the simulation "
-            f"says {shape}.",
+            f"{type(self).__name__} {self.name!r} has values of shape {self.data.shape[1:]} at each time, what the "
+            f"simulation says has {shape}.",
         )
         require_finite(f"What the simulation says of {self.name!r}", seen)
 
@@ -183,7 +194,7 @@ _ON_A_STEP = 1e-6
 
 
 class Tracks(Series):
-    """Places of material points that were followed: markers, or features of a video, with correspondence.
+    """Places of material points that were followed: markers, or features of a video.
 
     Args:
         times: when they were seen [s], shape (f,), growing.
@@ -220,6 +231,7 @@ class Tracks(Series):
             self.data.shape[2] == particles.dim,
             f"Tracks {self.name!r} are {self.data.shape[2]}-dimensional, the particles {particles.dim}-dimensional.",
         )
+        assert isinstance(self.of, Markers)
         self.of.check(self.name, particles.count)
 
 
@@ -234,9 +246,11 @@ class Curve(AbstractObservation):
         weight: factor of the squares.
         robust: misfit in standard deviations beyond which squares grow but linearly.
         name: what tables and pictures call it.
+        x_name: what pictures call the abscissa.
     """
 
     x: np.ndarray
+    x_name: str = eqx.field(static=True)
     data: np.ndarray
     of: Callable[[Scene, Particles], Any]
     sigma: Scalar | np.ndarray | None
@@ -254,7 +268,9 @@ class Curve(AbstractObservation):
         weight: Scalar = 1.0,
         robust: Scalar | None = None,
         name: str = "curve",
+        x_name: str = "abscissa",
     ):
+        self.x_name = x_name
         self.x, self.data = np.asarray(x, float), np.asarray(y, float)
         self.of, self.weight, self.robust, self.name = of, weight, robust, name
         self.sigma = None if sigma is None else np.asarray(sigma, float)
@@ -263,6 +279,10 @@ class Curve(AbstractObservation):
             f"Curve {name!r} needs x and y of one shape (m,), got {self.x.shape} and {self.data.shape}.",
         )
         require_finite(f"The abscissae of Curve {name!r}", self.x)
+
+    @property
+    def against(self) -> tuple[str, np.ndarray]:
+        return self.x_name, self.x
 
     def observe(self, scene: Scene, particles: Particles) -> Any:
         return self.of(scene, particles)
@@ -278,8 +298,8 @@ class Curve(AbstractObservation):
         x, y = (np.asarray(a) for a in seen)
         require(
             np.isfinite(x).all() and (np.diff(x) > 0).all(),
-            f"The simulated abscissa of Curve {self.name!r} must grow with every step of the run: slow the loading down, "
-            "or reduce dt.",
+            f"The simulated abscissa of Curve {self.name!r} must grow with every step of the run: slow the loading "
+            "down, or reduce dt.",
         )
         outside = (self.x < x[0]) | (self.x > x[-1])
         require(

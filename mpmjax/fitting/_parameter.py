@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -44,6 +44,8 @@ class AbstractParameter(eqx.Module):
     first guess: so no bound is ever crossed, and a step of one is a large but not an absurd change.
     """
 
+    logarithmic: ClassVar[bool] = False
+    """Whether z is the logarithm of the value but for a constant."""
     where: eqx.AbstractVar[Callable[[Experiment], Any] | None]
     """The leaf, or a tuple of leaves that share the value, of an experiment, as in `equinox.tree_at`."""
     update: eqx.AbstractVar[Callable[[Experiment, Value], Experiment] | None]
@@ -147,6 +149,7 @@ class Positive(AbstractParameter):
         only: numbers of the experiments that it belongs to. Default: all.
     """
 
+    logarithmic: ClassVar[bool] = True
     where: Callable[[Experiment], Any] | None = None
     update: Callable[[Experiment, Value], Experiment] | None = None
     start: Scalar | Value | None = None

@@ -40,7 +40,7 @@ class FitProblem(eqx.Module):
         known = sum(s.size for s, p in zip(self.starts, self.parameters, strict=True) if p.prior is not None)
         require(
             points + known >= self.size,
-            f"{points} measured numbers cannot fix {self.size} parameters: measure more, give some a prior, or fit fewer.",
+            f"{points} measured numbers cannot fix {self.size} parameters: measure more, give priors, or fit fewer.",
         )
 
     def _start(self, name: str, parameter: AbstractParameter) -> Array:
@@ -73,6 +73,17 @@ class FitProblem(eqx.Module):
             places = np.ndindex(start.shape)
             labels += [name if start.ndim == 0 else f"{name}[{', '.join(map(str, place))}]" for place in places]
         return tuple(labels)
+
+    @property
+    def logarithmic(self) -> tuple[bool, ...]:
+        """Of each coordinate, whether it is the logarithm of its value."""
+        each = zip(self.parameters, self.starts, strict=True)
+        return tuple(parameter.logarithmic for parameter, start in each for _ in range(start.size))
+
+    def size_of_data(self, sigmas: tuple[Array, ...]) -> float:
+        """√Σ (data/σ)², the size of what the residuals are the difference of [-]."""
+        each = zip(self.observations, sigmas, strict=True)
+        return float(np.sqrt(sum(np.nansum((o.data / np.asarray(sigma)) ** 2) for o, sigma in each)))
 
     @property
     def rows(self) -> tuple[slice, ...]:

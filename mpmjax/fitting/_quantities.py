@@ -37,7 +37,7 @@ class Markers(eqx.Module):
         numbers = np.asarray(which)
         require(
             numbers.ndim == 1 and numbers.size > 0 and np.issubdtype(numbers.dtype, np.integer),
-            f"Markers must be whole numbers of particles, shape (m,), got shape {numbers.shape} of {numbers.dtype}; for "
+            f"Markers must be whole numbers of particles, shape (m,), got {numbers.shape} of {numbers.dtype}; for "
             "places between particles take Markers.at(particles, places).",
         )
         return cls(numbers[:, None], np.ones((len(numbers), 1)))
@@ -162,11 +162,11 @@ class StressStretch(eqx.Module):
 
 
 class Density(eqx.Module):
-    """A picture of the body: its density on the nodes of a lattice, through a quadratic B-spline of the lattice's width.
+    """A picture of the body: its density on the nodes of a lattice, smoothed by a quadratic B-spline.
 
     For measured pictures, and for clouds of points whose correspondence is not known: a cloud becomes a picture by
     `of_points`, and pictures are compared. The lattice's spacing is the distance over which points are told apart:
-    wide enough that shifted clouds still overlap, a tenth of the body or so, and no less than the spacing of the points.
+    wide enough that shifted clouds still overlap, a tenth of the body or so, and wider than the points' spacing.
 
         picture = mpm.Density(mpm.Grid((40, 40), 0.05))
         seen = mpm.Series(times, [picture.of_points(cloud, mass) for cloud in clouds], picture)
@@ -201,5 +201,5 @@ class Density(eqx.Module):
     def _picture(self, x: ParticleVector, mass: ParticleScalar) -> Array:
         grid = canonical(self.grid, x.dtype)
         stencil = make_stencil(BSpline(2), SplineGradient(), grid, grid.window(x), x, affine=False)
-        on_nodes = scatter(stencil, jnp.where(stencil.inside, mass, 0), None, grid.size)
+        (on_nodes,) = scatter(stencil, jnp.where(stencil.inside, mass, 0)[None], None, grid.size).T
         return (on_nodes / grid.spacing**grid.dim).reshape(grid.shape)

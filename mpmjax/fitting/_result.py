@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
 import scipy.stats
 
@@ -35,11 +36,11 @@ class NoiseEstimate(NamedTuple):
     """Whether the fit estimated it."""
     misfit: float
     """Root mean square of the residuals, in units of σ."""
-    count: int
+    points: int
     """How many numbers were measured."""
 
 
-class FitResult(NamedTuple):
+class FitResult(eqx.Module):
     """Fitted parameters, their errors, and the fitted scene.
 
     `print(result)` shows a table; `result["E"]` is the estimate of a parameter.
@@ -85,14 +86,16 @@ class FitResult(NamedTuple):
             return np.nan
         return float(scipy.stats.chi2.sf(self.chi_squared, self.degrees_of_freedom))
 
-    def __getitem__(self, key: Any) -> Any:
-        """The estimate with a label; by a number, an entry of the tuple."""
-        if not isinstance(key, str):
-            return tuple.__getitem__(self, key)
+    def __getitem__(self, label: str) -> Estimate:
+        """The estimate of a parameter, or of what was reported.
+
+        Raises:
+            KeyError: there is none of this name.
+        """
         for estimate in (*self.estimates, *self.reported):
-            if estimate.label == key:
+            if estimate.label == label:
                 return estimate
-        raise KeyError(f"There is no estimate {key!r}, but {', '.join(e.label for e in self.estimates)}.")
+        raise KeyError(f"There is no estimate {label!r}, but {', '.join(e.label for e in self.estimates)}.")
 
     def __str__(self) -> str:
         """A table."""
@@ -106,7 +109,7 @@ class FitResult(NamedTuple):
         lines += ["", f"{'':<24} {'numbers':>12}   {'noise σ':<22} misfit/σ"]
         for n in self.noise:
             sigma = f"{n.sigma:.3g} {'estimated' if n.estimated else 'given'}"
-            lines.append(f"{n.name:<24} {n.count:>12}   {sigma:<22} {n.misfit:.3g}")
+            lines.append(f"{n.name:<24} {n.points:>12}   {sigma:<22} {n.misfit:.3g}")
         said = f"χ² = {self.chi_squared:.4g} for {self.degrees_of_freedom} degrees of freedom"
         lines += ["", said + ("" if np.isnan(self.p_value) else f", probability {self.p_value:.2g}")]
         if not self.converged:

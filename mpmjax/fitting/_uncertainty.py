@@ -76,14 +76,38 @@ def noise(r: np.ndarray, J: np.ndarray, rows: slice, count: int) -> tuple[float,
     return (float(np.sqrt((r[rows] ** 2).sum() / freedom)) if freedom > 0 else np.nan), freedom
 
 
-def seen_together(labels: tuple[str, ...], found: Uncertainty) -> list[str]:
-    """What the data cannot tell apart, in words."""
-    said = [f"{label}: the data do not see it" for label, e in zip(labels, found.error, strict=True) if np.isinf(e)]
+def seen_together(labels: tuple[str, ...], found: Uncertainty, logarithmic: tuple[bool, ...]) -> list[str]:
+    """What the data cannot tell, in words: directions in which the coordinates may change and the data do not, and
+    pairs of coordinates that are nearly so.
+
+    Args:
+        labels: the coordinates' names.
+        found: their uncertainty.
+        logarithmic: whether they are logarithms of their values.
+    """
+    said, named = [], set()
+    for value, direction in zip(found.spectrum, found.directions.T, strict=True):
+        if value <= _UNSEEN * found.spectrum[-1]:
+            parts = [i for i in range(len(labels)) if abs(direction[i]) > 0.05]
+            named |= set(itertools.combinations(parts, 2))
+            said.append(_unseen(parts, direction, labels, logarithmic))
     for i, j in itertools.combinations(range(len(labels)), 2):
         rho = found.correlation[i, j]
-        if abs(rho) > _NEARLY_ONE:
-            what = "change in one direction" if rho > 0 else "change in opposite directions"
+        if abs(rho) > _NEARLY_ONE and (i, j) not in named:
+            together = "together" if rho > 0 else "in opposite directions"
             said.append(
-                f"{labels[i]} and {labels[j]}: {abs(rho):.5f} correlated, a common {what} is hardly seen by the data"
+                f"{labels[i]} and {labels[j]}: {abs(rho):.5f} correlated, a change of both {together} is hardly seen."
             )
     return said
+
+
+def _unseen(parts: list[int], direction: np.ndarray, labels: tuple[str, ...], logarithmic: tuple[bool, ...]) -> str:
+    """A direction that the data do not see, in words."""
+    names = [labels[i] for i in parts]
+    if len(parts) == 1:
+        return f"{names[0]}: the data do not see it."
+    change = direction[parts]
+    if len(parts) == 2 and all(logarithmic[i] for i in parts) and abs(abs(change[0] / change[1]) - 1) < 0.01:
+        return f"{names[0]} and {names[1]}: only their {'ratio' if change[0] * change[1] > 0 else 'product'} is seen."
+    shown = " : ".join(f"{c:+.2g}" for c in change)
+    return f"{', '.join(names)}: a change in the proportion {shown} of their coordinates is not seen by the data."
