@@ -16,11 +16,12 @@ import typer
 
 from mpmjax.analysis import Trial, energy, grid_mass, name_of, pieces, work_precision
 from mpmjax.checks import require
-from mpmjax.cli._scene_file import CurveSettings, Simulation, read_scene_file, read_simulation, run_fit, stable_step
-from mpmjax.fitting import FitResult
-from mpmjax.io import check_place, end_on_signals, load, record, reporting, save_figure, steps_in
+from mpmjax.cli._fit_file import read_fit
+from mpmjax.cli._scene_file import Simulation, read_scene_file, read_simulation, stable_step
+from mpmjax.fitting import fit
+from mpmjax.io import check_place, end_on_signals, load, record, reporting, steps_in
 from mpmjax.simulation import Run
-from mpmjax.viz import COLOURS, draw_chart, render, write_trials
+from mpmjax.viz import COLOURS, draw_chart, draw_fit, render, write_fit, write_trials
 
 app = typer.Typer(
     help="A differentiable Material Point Method.", no_args_is_help=True, add_completion=False, rich_markup_mode=None
@@ -189,55 +190,22 @@ def _summary(simulation: Simulation, run: Run, taken: int, seconds: float) -> st
 @_reporting
 def fit_command(
     scene: ScenePath,
-    plot: Annotated[Path | None, typer.Option(help="The plot to write. Default: SCENE_fit.png here.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="The picture to write. Default: SCENE_fit.png here.")] = None,
     most_seconds: MostSeconds = None,
     imports: Imports = None,
 ) -> None:
-    """Fit a scene's parameter to the measured curve that its [fit] table names."""
+    """Fit parameters to what was measured, as the file's [fit] table says: a table, a picture, and its numbers as
+    JSON."""
     _import(imports)
     begun = time.perf_counter()
-    simulation = _chosen(scene, most_seconds)
-    result = run_fit(simulation)
-    assert simulation.fit is not None
-    print(_table(simulation.fit, result))
-    name = (simulation.fit.report or simulation.fit.parameter).rsplit(".", 1)[-1]
-    print(f"{simulation.fit.parameter} = {float(result.parameter):.5g}")
-    print(f"{name} = {float(result.value):.5g} ± {float(result.standard_error):.2g} (standard error)")
+    asked = read_fit(scene, lambda file: _chosen(file, most_seconds))
     plot = Path(f"{scene.stem}_fit.png") if plot is None else plot
-    _plot(simulation.fit, result, name, plot)
-    print(f"{result.simulations} simulations with exact derivatives, {time.perf_counter() - begun:.3g} s in all")
-    print(f"written {plot}")
-
-
-def _table(fit: CurveSettings, result: FitResult) -> str:
-    """Misfit at each point."""
-    lines = [f"{'stretch':>10} {'measured [Pa]':>14} {'model [Pa]':>12} {'misfit':>8}"]
-    for x, y, model, used in zip(fit.stretch, fit.stress, np.asarray(result.predicted), fit.fitted, strict=True):
-        misfit = f"{model / y - 1:+8.1%}" if y else " " * 8
-        if np.isnan(model):
-            lines.append(f"{x:10.4f} {y:14.5g} {'-':>12} {'':>8} not reached by the run")
-        else:
-            lines.append(f"{x:10.4f} {y:14.5g} {model:12.5g} {misfit} {'fitted' if used else 'predicted'}")
-    return "\n".join(lines)
-
-
-def _plot(fit: CurveSettings, result: FitResult, name: str, path: Path) -> None:
-    from matplotlib import pyplot as plt  # here, since it takes a second that only pictures should pay
-
-    figure, axes = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
-    x, y = (np.asarray(a) for a in result.curve)
-    shown = x <= max(fit.stretch.max(), 1.02 * x[0])
-    axes.plot(x[shown], y[shown] / 1e6, color="tab:blue", label=f"{name} = {float(result.value):.4g}")
-    axes.plot(fit.stretch[fit.fitted], fit.stress[fit.fitted] / 1e6, "o", color="black", label="measured, fitted")
-    others = ~fit.fitted
-    axes.plot(
-        fit.stretch[others], fit.stress[others] / 1e6, "o", color="black", mfc="white", label="measured, predicted"
-    )
-    axes.set(xlabel="stretch of the gauge section [-]", ylabel="nominal stress [MPa]")
-    axes.grid(alpha=0.3)
-    axes.legend()
-    save_figure(figure, path, 140)
-    plt.close(figure)
+    numbers = plot.with_suffix(".json")
+    result = fit(asked.experiments, asked.parameters, report=asked.report, level=asked.level, progress=_print_error)
+    print(result)
+    print(f"{len(result.history)} simulations with exact derivatives, {time.perf_counter() - begun:.3g} s in all")
+    write_fit(result, numbers)
+    print(f"written {draw_fit(result, plot, asked.whole)} and {numbers}")
 
 
 @app.command("chart")

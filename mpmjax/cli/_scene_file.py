@@ -4,11 +4,10 @@ words."""
 import itertools
 import tomllib
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -16,7 +15,6 @@ from mpmjax._types import Scalar
 from mpmjax.analysis import METHODS, Build, Trial, work_precision
 from mpmjax.checks import require, require_positive, shortened, warn
 from mpmjax.discretisation import Grid
-from mpmjax.fitting import FitResult, fit_curve, gauge, read_columns
 from mpmjax.geometry import AbstractRegion
 from mpmjax.io import arguments, decode, reason
 from mpmjax.simulation import number_of_steps
@@ -45,30 +43,14 @@ class RunSettings(NamedTuple):
     """What its pilot runs may take [s]."""
 
 
-class CurveSettings(NamedTuple):
-    """The `[fit]` table of kind "curve", with its data."""
-
-    stretch: np.ndarray
-    """Measured stretches, shape (m,)."""
-    stress: np.ndarray
-    """Measured nominal stresses [Pa], shape (m,)."""
-    fitted: np.ndarray
-    """Which of the points are fitted, shape (m,)."""
-    parameter: str
-    """Dotted path of the fitted parameter, such as "material.youngs_modulus"."""
-    report: str | None
-    """Dotted path of the number that is reported; None for the parameter."""
-    axis: int
-    gauge: AbstractRegion
-
-
 class SceneFile(NamedTuple):
     """A scene file as it was read: "auto" and "stable" are left to be resolved."""
 
     scene: Scene
     particles: Particles
     run: RunSettings
-    fit: CurveSettings | None
+    fit: dict[str, Any] | None
+    """The `[fit]` table, not read yet; None without one."""
     build: Build
     """Makes the scene and its particles on n times as many cells a direction, from n."""
 
@@ -82,7 +64,8 @@ class Simulation(NamedTuple):
     dt: float
     method: AbstractIntegrator
     save_every: int
-    fit: CurveSettings | None
+    fit: dict[str, Any] | None
+    """The `[fit]` table, not read yet; None without one."""
     choice: str | None
     """What was chosen for "auto" or "stable", and why; None if nothing was."""
 
@@ -98,6 +81,7 @@ def read_scene_file(path: Path) -> SceneFile:
     for name in ("particles", "run"):
         require(name in table, f"{path}: needs the table [{name}]. See docs/scene_files.md.")
     fit_table = table.pop("fit", None)
+    require(fit_table is None or isinstance(fit_table, dict), f"{path}: [fit] must be a table.")
     groups, run_table = table.pop("particles"), table.pop("run")
     groups = groups if isinstance(groups, list) else [groups]
     try:
@@ -108,17 +92,13 @@ def read_scene_file(path: Path) -> SceneFile:
             return scene, prepare(scene, _filled(scene, groups, run.dtype))
 
         scene, particles = build(1)
-        fit = None if fit_table is None else _curve_settings(fit_table, path.parent)
         if isinstance(run.dt, float):
             number_of_steps(run.t1, run.dt, 0, particles.x.dtype)
-        if fit is not None:
-            gauge(fit.gauge, particles, fit.axis)
-            _check_paths(fit, scene)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     except RecursionError:
         raise ValueError(f"{path}: tables are nested too deeply to be read.") from None
-    return SceneFile(scene, particles, run, fit, build)
+    return SceneFile(scene, particles, run, fit_table, build)
 
 
 def read_simulation(
@@ -182,63 +162,6 @@ def stable_step(path: Path, file: SceneFile) -> float:
         return float(stable_dt(file.scene, file.particles, method=file.run.method, t1=file.run.t1))
     except ValueError as error:
         raise ValueError(f'{path}: [run] dt = "stable": {error}') from None
-
-
-def run_fit(simulation: Simulation) -> FitResult:
-    """Carry out the fit that a scene file asks for.
-
-    Raises:
-        ValueError: it asks for none, or see `fit_curve`.
-    """
-    fit = simulation.fit
-    if fit is None:
-        raise ValueError("The scene file has no [fit] table, so there is nothing to fit. See docs/scene_files.md.")
-    report = fit.report
-    return fit_curve(
-        simulation.scene,
-        simulation.particles,
-        t1=simulation.t1,
-        dt=simulation.dt,
-        method=simulation.method,
-        curve=gauge(fit.gauge, simulation.particles, fit.axis),
-        measured_x=fit.stretch,
-        measured_y=fit.stress,
-        fitted=fit.fitted,
-        parameter=lambda scene: leaf_of(fit.parameter, scene),
-        report=None if report is None else lambda scene: leaf_of(report, scene),
-    )
-
-
-def leaf_of(path: str, scene: Scene) -> Any:
-    """The value at a dotted path such as "material.youngs_modulus" or "boundary.0.friction"."""
-    value: Any = scene
-    for name in path.split("."):
-        try:
-            value = value[int(name)] if name.isdecimal() else getattr(value, name)
-        except (AttributeError, IndexError, TypeError):
-            raise ValueError(f"[fit] names {path!r}, but the scene has no {name!r} there.") from None
-    return value
-
-
-def _check_paths(fit: CurveSettings, scene: Scene) -> None:
-    """The fitted parameter must be a positive number of the scene's own, and what is reported a number."""
-    value, (owner, _, name) = leaf_of(fit.parameter, scene), fit.parameter.rpartition(".")
-    parent = leaf_of(owner, scene) if owner else scene
-    known = [f.name for f in fields(parent)] if is_dataclass(parent) else []
-    require(
-        not known or name in known,
-        f"[fit] parameter {fit.parameter!r} follows from others and cannot be fitted; name one of {', '.join(known)}.",
-    )
-    require(
-        not isinstance(value, eqx.Module) and np.ndim(value) == 0 and np.all(np.asarray(value) > 0),
-        f"[fit] parameter {fit.parameter!r} must be one positive number, but is {value}.",
-    )
-    if fit.report is not None:
-        reported = leaf_of(fit.report, scene)
-        require(
-            not isinstance(reported, eqx.Module) and np.ndim(reported) == 0,
-            f"[fit] report {fit.report!r} must be one number, but is {reported}.",
-        )
 
 
 def _toml(path: Path) -> dict[str, Any]:
@@ -365,28 +288,3 @@ def _check_place(region: AbstractRegion, grid: Grid) -> None:
         + ("" if grid.follow else f" from {first} m")
         + ": all lengths are in metres; enlarge the shape, move the origin, or use follow = true.",
     )
-
-
-def _curve_settings(table: Any, folder: Path) -> CurveSettings:
-    def curve(
-        *,
-        kind: str,
-        data: str,
-        stretch: str,
-        nominal_stress: str,
-        unit: Scalar = 1.0,
-        range: tuple[float, ...],  # noqa: A002 (the key in the file)
-        parameter: str,
-        report: str | None = None,
-        gauge: AbstractRegion,
-        axis: int,
-    ) -> CurveSettings:
-        require(kind == "curve", f'[fit] kind must be "curve", got {kind!r}.')
-        require(len(range) == 2 and range[0] < range[1], f"[fit] range must be two growing stretches, got {range}.")
-        require_positive("[fit] unit [Pa]", unit)
-        x, y = read_columns(folder / data, stretch, nominal_stress)
-        fitted = (x >= range[0]) & (x <= range[1])
-        require(fitted.sum() >= 2, f"[fit] range {range} holds {int(fitted.sum())} of {len(x)} points; two are needed.")
-        return CurveSettings(x, y * float(unit), fitted, parameter, report, axis, gauge)
-
-    return curve(**arguments(curve, table, "[fit]"))

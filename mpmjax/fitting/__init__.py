@@ -1,6 +1,32 @@
 """Fitting parameters to measured data."""
 
 from mpmjax.fitting._columns import read_columns
-from mpmjax.fitting._fit import FitResult, fit_curve, gauge
+from mpmjax.fitting._experiment import Experiment
+from mpmjax.fitting._fit import fit
+from mpmjax.fitting._observation import AbstractObservation, Curve, Series, Tracks
+from mpmjax.fitting._parameter import AbstractParameter, Bounded, Gaussian, Positive, Unbounded
+from mpmjax.fitting._quantities import CentreOfMass, Density, Extent, Markers, StressStretch
+from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
 
-__all__ = ["FitResult", "fit_curve", "gauge", "read_columns"]
+__all__ = [
+    "AbstractObservation",
+    "AbstractParameter",
+    "Bounded",
+    "CentreOfMass",
+    "Curve",
+    "Density",
+    "Estimate",
+    "Experiment",
+    "Extent",
+    "FitResult",
+    "Gaussian",
+    "Markers",
+    "NoiseEstimate",
+    "Positive",
+    "Series",
+    "StressStretch",
+    "Tracks",
+    "Unbounded",
+    "fit",
+    "read_columns",
+]

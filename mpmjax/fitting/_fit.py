@@ -1,241 +1,265 @@
-"""Fitting a material parameter to a measured curve, by exact differentiation through the rollout."""
+"""Fits of parameters to what was observed."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
-import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 
-from mpmjax._types import Array, Float, ParticleScalar, Scalar
-from mpmjax.checks import canonical, checked, require, require_finite, shape_of
-from mpmjax.geometry import AbstractRegion
-from mpmjax.simulation import simulate
-from mpmjax.state import Particles, Scene, prepare
-from mpmjax.stepping import AbstractIntegrator
-
-
-class StressStretch(eqx.Module):
-    """The curve of a tension test: mean stretch F_aa and mean nominal stress P_aa [Pa] of a gauge section.
-
-    Args:
-        weight: share of each particle in the means, summing to one, shape (p,).
-        axis: direction a of the pull.
-    """
-
-    weight: ParticleScalar
-    axis: int = eqx.field(static=True)
-
-    def __call__(self, scene: Scene, particles: Particles) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Stretch [-] and nominal stress [Pa]."""
-        (body,) = scene.material_points(particles)
-        P = body.law.stress(body.F)
-        a = self.axis
-        return (self.weight * body.F[a, a]).sum(), (self.weight * P[a, a]).sum()
-
-
-def gauge(region: AbstractRegion, particles: Particles, axis: int) -> StressStretch:
-    """The curve over the particles that start in a region, each weighted by its volume.
-
-    Raises:
-        ValueError: no particle starts in the region.
-    """
-    inside = np.asarray(region.contains(particles.x))
-    require(inside.any(), f"The gauge {region} holds no particle at the start: enlarge or move it.")
-    require(0 <= axis < particles.dim, f"The gauge's axis must be below {particles.dim}, got {axis}.")
-    weight = jnp.where(jnp.asarray(inside), particles.volume, 0)
-    return StressStretch(weight / weight.sum(), axis)
-
-
-class FitResult(eqx.Module):
-    """A fitted parameter."""
-
-    parameter: Float[Array, ""]
-    """The fitted parameter, in the unit of the scene."""
-    value: Float[Array, ""]
-    """The property reported, e.g. μ = E / (2 (1 + ν)) [Pa]."""
-    standard_error: Float[Array, ""]
-    """Standard error of `value`: √(s² / (JᵀJ)) with s² = Σ r² / (n − 1) and J the derivative of the n fitted points by
-    `value`."""
-    curve: tuple[Float[Array, "f"], Float[Array, "f"]]
-    """The simulated curve at the fit."""
-    predicted: Float[Array, "m"]
-    """The simulated ordinate at every measured abscissa; NaN where the run did not reach it."""
-    simulations: int = eqx.field(static=True)
-    """How many values of the parameter were tried, each with its exact derivative."""
+from mpmjax._types import Array
+from mpmjax.checks import checked, require, require_between, require_positive, require_whole, warn
+from mpmjax.fitting._experiment import Experiment
+from mpmjax.fitting._least_squares import Iteration, Minimum, NoDerivativeError, levenberg_marquardt
+from mpmjax.fitting._parameter import AbstractParameter
+from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
+from mpmjax.fitting._uncertainty import Uncertainty, noise, seen_together, uncertainty
 
 
 @checked
-def fit_curve(
-    scene: Scene,
-    particles: Particles,
+def fit(
+    experiments: Experiment | Sequence[Experiment],
+    parameters: Mapping[str, AbstractParameter],
     *,
-    t1: Scalar,
-    dt: Scalar,
-    method: AbstractIntegrator,
-    curve: Callable[[Scene, Particles], tuple[Array, Array]],
-    measured_x: np.ndarray,
-    measured_y: np.ndarray,
-    fitted: np.ndarray,
-    parameter: Callable[[Scene], Any],
-    report: Callable[[Scene], Any] | None = None,
+    report: Mapping[str, Callable[[Experiment], Any]] | None = None,
+    level: float = 0.95,
+    rtol: float = 1e-6,
+    max_steps: int = 50,
+    progress: Callable[[str], None] | None = None,
 ) -> FitResult:
-    """Least squares over a positive parameter, in units of its first guess, by SciPy's trust-region method.
+    """Fit parameters of a scene to what was observed of it, with standard errors.
 
-    The Jacobian is that of the whole rollout, in forward mode through every implicit solve.
+        pull = mpm.Experiment(
+            scene, particles, t1=0.5, dt=5e-3, method=mpm.SemiImplicit(),
+            observations=mpm.Tracks(times, positions, which=markers, sigma=1e-4),
+        )
+        result = mpm.fit(pull, {
+            "E": mpm.Positive(lambda e: e.scene.material.youngs_modulus, unit="Pa"),
+            "nu": mpm.Bounded(lambda e: e.scene.material.poisson_ratio, 0, 0.49),
+        })
+        print(result)
+
+    The least sum of squares of (simulated − measured)/σ over all observations of all experiments is searched by the
+    Levenberg-Marquardt method (optimistix), its Jacobian by forward mode through every step and every implicit solve.
+    A step at which a simulation fails is not taken. Where an observation gives no σ, it is estimated: as
+    √(Σ r²/(m − n)) of one observation, and of several so that each explains its own misfit, in rounds.
+
+    Errors are those of the Gauss-Newton Hessian (JᵀJ)⁻¹: what the noise of the data, independent and normal, does to
+    the parameters. They say nothing of what the law or the discretisation gets wrong, which often is more: fit on two
+    spacings and compare.
 
     Args:
-        scene: the scene, its own value of the parameter being the first guess.
-        particles: its particles.
-        t1: end time [s].
-        dt: step [s].
-        method: update of the grid velocity.
-        curve: (scene, particles) to one point of the simulated curve; x must grow with time over the measured range.
-        measured_x: measured abscissae, (m,).
-        measured_y: measured ordinates, (m,).
-        fitted: which of them the fit uses, bool (m,); the others are predicted.
-        parameter: selects the parameter's leaf, as in `eqx.tree_at`.
-        report: computes the property to report from the scene. Default: the parameter itself.
+        experiments: one or several, which share the parameters.
+        parameters: what is fitted, by name.
+        report: what else to report with its error, by name: functions of an experiment that return one number.
+        level: of the intervals [-].
+        rtol: relative change of the parameters and residuals at which the search ends.
+        max_steps: most iterations of a search.
+        progress: called with a line an iteration, such as `print`.
 
     Raises:
-        ValueError: fewer than two points, data that are not finite, or an abscissa that the simulation does not reach.
-        SimulationError: the rollout at the fit met a fault.
-        RuntimeError: the least-squares iteration did not converge, or a tangent solve of the rollout did not.
+        ValueError: a parameter that is no number of the experiment, lies outside its bounds or does not influence the
+            data; too few data; data that the simulation does not reach.
+        SimulationError: the simulation at the first guess meets a fault.
+        RuntimeError: the search did not converge, or there is no derivative. What was found is in its `result`, where
+            there is any.
     """
-    fitted = np.asarray(fitted, bool)
-    require(fitted.sum() >= 2, f"A fit with a standard error needs two points at least, got {int(fitted.sum())}.")
-    require_finite("Measured abscissae", measured_x)
-    require_finite("Measured ordinates", measured_y)
-    report = parameter if report is None else report
-    dtype = particles.x.dtype
-    scene = canonical(scene, dtype)
-    particles = prepare(scene, particles)
-    guess = parameter(scene)
-    require(
-        shape_of(guess) == () and np.all(guess > 0), f"The fitted parameter must be one positive number, got {guess}."
-    )
-    x, y = jnp.asarray(measured_x[fitted], dtype), jnp.asarray(measured_y[fitted], dtype)
-    scale = jnp.abs(y).max()
+    problem = FitProblem((experiments,) if isinstance(experiments, Experiment) else tuple(experiments), parameters)
+    require_between("level", level, 0, 1)
+    require_positive("rtol", rtol)
+    max_steps = require_whole("max_steps", max_steps, 1)
+    begun = time.perf_counter()
 
-    def at(ratio: Scalar) -> Scene:
-        return eqx.tree_at(parameter, scene, ratio * guess)
+    def say(iteration: Iteration) -> None:
+        if progress is not None:
+            progress(_line(problem, iteration, time.perf_counter() - begun))
 
-    def simulated(candidate: Scene) -> tuple[Array, Array]:
-        return simulate(candidate, particles, t1=t1, dt=dt, method=method, observe=curve).observed
-
-    first = simulated(scene)
-    _require_reached(first, measured_x[fitted])
-    until = _time_to_reach(np.asarray(first[0]), float(x.max()), float(dt))
-
-    def model(ratio: Scalar) -> tuple[Array, Array]:
-        run = simulate(
-            at(ratio),
-            particles,
-            t1=until,
-            dt=dt,
-            method=method,
-            observe=curve,
-            adjoint=diffrax.ForwardMode(),
-            throw=False,
-        )
-        misfit = (jnp.interp(x, *run.observed) - y) / scale
-        assert run.report is not None
-        return jnp.where(run.statistics.healthy, misfit, jnp.nan), run.report
-
-    @jax.jit
-    def misfit(ratio: Scalar) -> _Misfit:
-        (r, _), (J, unsolved) = jax.jvp(model, (ratio,), (jnp.ones_like(ratio),))
-        return _Misfit(r, J, unsolved)
-
-    ratio, variance, simulations = _least_squares(misfit, dtype)
-    best = at(ratio)
-    curve_x, curve_y = simulated(best)
-    _require_reached((curve_x[: round(until / float(dt)) + 1], curve_y), measured_x[fitted])
-    value, slope = jax.jvp(lambda r: report(at(r)), (ratio,), (jnp.ones_like(ratio),))
-    inside = (measured_x >= float(curve_x[0])) & (measured_x <= float(curve_x.max()))
-    predicted = jnp.interp(jnp.asarray(measured_x, dtype), curve_x, curve_y)
-    return FitResult(
-        parameter=parameter(best),
-        value=value,
-        standard_error=jnp.abs(slope) * np.sqrt(variance),
-        curve=(curve_x, curve_y),
-        predicted=jnp.where(jnp.asarray(inside), predicted, jnp.nan),
-        simulations=simulations,
-    )
+    known = [observation.sigma is not None for observation in problem.observations]
+    sigmas = tuple(jnp.asarray(o.scale() if o.sigma is None else o.sigma, problem.dtype) for o in problem.observations)
+    z, history = jnp.zeros(problem.size, problem.dtype), ()
+    while True:
+        found = _search(problem, z, sigmas, rtol, max_steps, say)
+        history += found.history
+        factors, freedom = _noise(problem, found, known)
+        settled = all(abs(factor - 1) < _NOISE_RTOL for factor in factors)
+        sigmas = tuple(sigma * factor for sigma, factor in zip(sigmas, factors, strict=True))
+        if settled or len(known) == 1 or not found.converged or len(history) > _MOST_ROUNDS * max_steps:
+            break
+        z = found.z
+    result = _result(problem, found, factors, freedom, sigmas, known, report or {}, level)
+    result = replace(result, history=history)
+    if not found.converged:
+        warn(f"The fit did not converge in {len(history)} iterations: its errors hold only at a minimum. {_ADVICE}")
+    for text in result.warnings:
+        warn(text)
+    return result
 
 
-class _Misfit(NamedTuple):
-    """r, NaN where the run met a fault; its derivative J by the parameter; and the relative residual of the first
-    tangent solve that did not converge, zero if all did."""
+def _search(
+    problem: FitProblem,
+    z: Coordinates,
+    sigmas: tuple[Array, ...],
+    rtol: float,
+    max_steps: int,
+    say: Callable[[Iteration], None],
+) -> Minimum:
+    """The least sum of squares with a noise.
 
-    r: Float[Array, "n"]
-    J: Float[Array, "n"]
-    unsolved: Float[Array, ""]
-
-
-def _least_squares(misfit: Callable[[Array], _Misfit], dtype: Any) -> tuple[Array, float, int]:
-    """The positive number that minimises Σ r², from 1, its variance s² / (JᵀJ), and the number of evaluations.
-
-    Where a run meets a fault the search tries a smaller change of the parameter.
-
-    Args:
-        misfit: One compiled function gives r and J, and what SciPy asks for twice is computed once.
-        dtype: of the number.
+    Raises:
+        SimulationError, ValueError: the first simulation is at fault, or does not reach the data.
+        ValueError: a parameter does not influence the data.
+        RuntimeError: there is no derivative.
     """
-    known: dict[float, _Misfit] = {}
-
-    def evaluate(ratio: np.ndarray) -> _Misfit:
-        key = float(ratio[0])
-        if key not in known:
-            known[key] = misfit(jnp.asarray(key, dtype))
-        return known[key]
-
-    def slope(ratio: np.ndarray) -> np.ndarray:
-        _, J, unsolved = evaluate(ratio)
-        if float(unsolved) > 0:
-            raise RuntimeError(
-                f"The fit has no derivative at {float(ratio[0]):.4g} times the first guess: the tangent solve of a "
-                f"step did not converge (relative residual {float(unsolved):.2g}). Raise the "
-                "max_steps of the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner()."
-            )
-        if not np.isfinite(J).all():
-            raise RuntimeError(
-                f"The fit has no derivative at {float(ratio[0]):.4g} times the first guess: that of the simulated "
-                "curve is not finite. Look for a law or a curve that cannot be differentiated where the run takes it."
-            )
-        return np.asarray(J)[:, None]
-
-    jacobian: Any = slope  # SciPy's annotation knows only strings
-    solution = scipy.optimize.least_squares(
-        lambda ratio: np.asarray(evaluate(ratio).r), np.ones(1), jac=jacobian, bounds=(0, np.inf), xtol=1e-6
-    )
-    if not solution.success:
+    try:
+        found = levenberg_marquardt(problem, z, sigmas, rtol=rtol, max_steps=max_steps, report=say)
+    except NoDerivativeError:
         raise RuntimeError(
-            f"The fit did not converge in {len(known)} simulations: start from a closer value, or check "
-            "the data's units."
+            "The fit has no derivative. Either the tangent solve of a step did not converge: raise the max_steps of "
+            "the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner(). Or a law or an "
+            "observation cannot be differentiated where the run takes it."
+        ) from None
+    if not np.isfinite(found.history[0].cost):
+        for experiment in problem.at(z):
+            experiment.explain()
+        raise ValueError("What is observed of the simulation at the first guess is not finite.")
+    rounding = _ROUNDING * float(jnp.finfo(problem.dtype).eps) * problem.size_of_data(sigmas)
+    size = np.linalg.norm(np.asarray(found.J), axis=0)
+    unseen = [label for label, column in zip(problem.labels, size, strict=True) if column <= rounding]
+    require(
+        not unseen,
+        f"The data do not depend on {', '.join(unseen)}: their derivative by it is zero but for rounding. Leave it "
+        "out, give it a prior, or observe what it changes.",
+    )
+    return found
+
+
+def _noise(problem: FitProblem, found: Minimum, known: list[bool]) -> tuple[list[float], list[float]]:
+    """By what each noise is to be multiplied, and the degrees of freedom of its estimate (zero of what is given)."""
+    r, J = np.asarray(found.r), np.asarray(found.J)
+    factors, freedoms = [], []
+    for observation, rows, given in zip(problem.observations, problem.rows, known, strict=True):
+        factor, freedom = (1.0, 0.0) if given else noise(r, J, rows, observation.count)
+        require(
+            np.isfinite(factor) and factor >= 0,
+            f"The noise of {observation.name!r} cannot be estimated from {observation.count} numbers, of which the "
+            "parameters take as many: give its sigma.",
         )
-    J2 = float((solution.jac**2).sum())
-    variance = 2 * solution.cost / (len(solution.fun) - 1) / J2
-    return jnp.asarray(solution.x[0], dtype), variance, len(known)
+        factors.append(max(factor, _LEAST))
+        freedoms.append(freedom)
+    return factors, freedoms
 
 
-def _time_to_reach(x: np.ndarray, wanted: float, dt: float) -> float:
-    """When the curve passes an abscissa, and a tenth more, since that shifts a little with the parameter [s]."""
-    steps = int(np.argmax(x >= wanted))
-    return min(int(np.ceil(1.1 * steps)) + 1, len(x) - 1) * dt
-
-
-def _require_reached(curve: tuple[Array, Array], wanted: np.ndarray) -> None:
-    x = np.asarray(curve[0])
-    require(
-        np.isfinite(x).all() and (np.diff(x) > 0).all(),
-        "The simulated abscissa must grow with every step of the run: slow the loading down, or reduce dt.",
+def _result(
+    problem: FitProblem,
+    found: Minimum,
+    factors: list[float],
+    freedoms: list[float],
+    sigmas: tuple[Array, ...],
+    known: list[bool],
+    report: Mapping[str, Callable[[Experiment], Any]],
+    level: float,
+) -> FitResult:
+    """The result, its residuals in units of the noise that was found."""
+    r, J = np.array(found.r, float), np.array(found.J, float)
+    for rows, factor in zip(problem.rows, factors, strict=True):
+        r[rows], J[rows] = r[rows] / factor, J[rows] / factor
+    errors = uncertainty(J, np.inf if all(known) else sum(freedoms))
+    experiments = problem.at(found.z)
+    priors = len(r) - problem.rows[-1].stop
+    counts = [o.count for o in problem.observations]
+    noises = tuple(
+        NoiseEstimate(
+            o.name,
+            float(np.sqrt((np.asarray(sigma) ** 2).mean())),
+            not given,
+            float(np.sqrt((r[rows] ** 2).sum() / max(count, 1))),
+            count,
+        )
+        for o, sigma, given, rows, count in zip(problem.observations, sigmas, known, problem.rows, counts, strict=True)
     )
-    require(
-        (x[0] <= wanted) & (wanted <= x[-1]),
-        f"The simulation covers {x[0]:.4g} to {x[-1]:.4g}, which leaves out measured points to be fitted "
-        f"({', '.join(f'{w:.4g}' for w in wanted if not x[0] <= w <= x[-1])}): pull further, or narrow the range.",
+    result = FitResult(
+        estimates=_estimates(problem, found.z, errors, level),
+        reported=tuple(_reported(problem, found.z, errors, level, name, of) for name, of in report.items()),
+        covariance=errors.covariance,
+        correlation=errors.correlation,
+        spectrum=errors.spectrum,
+        directions=errors.directions,
+        chi_squared=float((r**2).sum()),
+        degrees_of_freedom=sum(counts) + priors - problem.size,
+        noise=noises,
+        experiments=experiments,
+        level=level,
+        converged=found.converged,
+        history=found.history,
+        warnings=tuple(seen_together(problem.labels, errors, problem.logarithmic)),
     )
+    if result.p_value < _IMPROBABLE:
+        text = (
+            f"The misfit is {np.sqrt(result.chi_squared / result.degrees_of_freedom):.2g} times the noise given: the "
+            "model or its discretisation does not explain the data, and the errors are too small by as much or more."
+        )
+        result = replace(result, warnings=(*result.warnings, text))
+    return result
+
+
+def _estimates(problem: FitProblem, z: Coordinates, errors: Uncertainty, level: float) -> tuple[Estimate, ...]:
+    """The fitted numbers. An interval is symmetric in the coordinate, so it lies within the bounds."""
+    reach = jnp.asarray(errors.quantile(level) * errors.error, z.dtype)
+    lower, upper = (problem.values(jnp.where(jnp.isfinite(reach), z + side * reach, side * _FAR)) for side in (-1, 1))
+    at, slope = jax.jvp(problem.values, (z,), (jnp.ones_like(z),))
+    numbers = zip(
+        problem.labels, *(_flat(a) for a in (at, slope, lower, upper, problem.starts)), errors.error, strict=True
+    )
+    each = zip(problem.parameters, problem.starts, problem.coordinates(z), strict=True)
+    bound = [(p.unit, p.at_bound(start, part)) for p, start, part in each for _ in range(start.size)]
+    return tuple(
+        Estimate(label, value, abs(by) * error, (min(a, b), max(a, b)), unit, start, at_bound)
+        for (label, value, by, a, b, start, error), (unit, at_bound) in zip(numbers, bound, strict=True)
+    )
+
+
+def _reported(
+    problem: FitProblem, z: Coordinates, errors: Uncertainty, level: float, name: str, of: Callable[[Experiment], Any]
+) -> Estimate:
+    """A function of the first experiment, its error by its derivative."""
+
+    def value(z: Coordinates) -> Array:
+        return jnp.asarray(of(problem.at(z)[0]))
+
+    require(jnp.shape(value(z)) == (), f"What is reported as {name!r} must be one number, got {jnp.shape(value(z))}.")
+    slope = np.asarray(jax.jacfwd(value)(z), float)
+    at = slope != 0
+    error = float(np.sqrt(slope[at] @ errors.covariance[np.ix_(at, at)] @ slope[at]))
+    number, reach = float(value(z)), errors.quantile(level) * error
+    return Estimate(name, number, error, (number - reach, number + reach), start=float(value(jnp.zeros_like(z))))
+
+
+def _flat(arrays: tuple[Array, ...]) -> list[float]:
+    return [float(x) for a in arrays for x in np.asarray(a).reshape(-1)]
+
+
+def _line(problem: FitProblem, iteration: Iteration, seconds: float) -> str:
+    """Progress."""
+    values = _flat(problem.values(jnp.asarray(iteration.z, problem.dtype)))
+    shown = ", ".join(f"{label} {value:.5g}" for label, value in zip(problem.labels[:4], values, strict=False))
+    more = ", …" if problem.size > 4 else ""
+    return (
+        f"{iteration.number:4d}  misfit {2 * iteration.cost:10.4g}  gradient {iteration.gradient:8.2g}  {shown}{more}  "
+        f"{seconds:.1f} s"
+    )
+
+
+_NOISE_RTOL = 1e-3
+"""The noise of several observations is settled when its estimate changes less, relatively."""
+_MOST_ROUNDS = 20
+_LEAST = 1e-12
+"""Smallest noise, in sizes of the data: exact data have none."""
+_ROUNDING = 1e3
+"""Derivatives by a coordinate below this many roundings of the data are none."""
+_FAR = 700.0
+"""The end of an interval, in coordinates, where the data do not see the parameter."""
+_IMPROBABLE = 1e-3
+_ADVICE = "Raise max_steps, start closer, or give a rtol that the precision can reach."

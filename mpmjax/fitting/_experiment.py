@@ -1,0 +1,121 @@
+"""An experiment: a scene, how it is run, and what was measured of it."""
+
+from typing import Any
+
+import equinox as eqx
+
+from mpmjax._types import Array
+from mpmjax.checks import canonical, checked, is_traced, require
+from mpmjax.fitting._observation import AbstractObservation
+from mpmjax.simulation import Run, number_of_steps, simulate
+from mpmjax.state import Particles, Scene, prepare
+from mpmjax.stepping import AbstractIntegrator, Explicit
+
+
+class Experiment(eqx.Module):
+    """A scene as it was set up in the laboratory, and what was measured of it.
+
+    Args:
+        scene: the scene, with first guesses of what is fitted.
+        particles: the particles at the start.
+        t1: end time [s]: no later than the last measurement needs.
+        dt: step [s].
+        method: the integrator.
+        observations: what was measured.
+        name: what tables and pictures call it.
+
+    Raises:
+        ValueError: as `prepare`; a t1 that is not a whole number of steps; no observation, or one that does not fit the
+            particles or lies outside the run.
+    """
+
+    scene: Scene
+    particles: Particles
+    method: AbstractIntegrator
+    observations: tuple[AbstractObservation, ...]
+    t1: float = eqx.field(static=True)
+    dt: float = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+
+    @checked
+    def __init__(
+        self,
+        scene: Scene,
+        particles: Particles,
+        *,
+        t1: float | int,
+        dt: float | int,
+        observations: AbstractObservation | list[AbstractObservation] | tuple[AbstractObservation, ...],
+        method: AbstractIntegrator = Explicit(),
+        name: str = "experiment",
+    ):
+        self.particles = prepare(scene, particles)
+        self.scene, self.method = canonical((scene, method), particles.x.dtype)
+        self.t1, self.dt, self.name = float(t1), float(dt), name
+        given = (observations,) if isinstance(observations, AbstractObservation) else tuple(observations)
+        require(len(given) > 0, f"The experiment {name!r} needs an observation at least: what was measured.")
+        self.observations = given
+        number_of_steps(self.t1, self.dt, 0, particles.x.dtype)
+        for observation in given:
+            observation.check(self.particles, self.t1, self.dt)
+
+    @property
+    def dtype(self) -> Any:
+        """The precision of its particles."""
+        return self.particles.x.dtype
+
+    @property
+    def steps(self) -> int:
+        """Number of steps."""
+        return number_of_steps(self.t1, self.dt, 0, self.dtype)
+
+    def with_observations(
+        self, observations: tuple[AbstractObservation, ...], t1: float | int | None = None
+    ) -> "Experiment":
+        """The same experiment with other observations, and to another end."""
+        return Experiment(
+            self.scene,
+            self.particles,
+            t1=self.t1 if t1 is None else t1,
+            dt=self.dt,
+            method=self.method,
+            observations=observations,
+            name=self.name,
+        )
+
+    def run(self, *, adjoint: Any = None, throw: bool = True) -> Run:
+        """The simulation of it, with what its observations observe after each step."""
+        return simulate(
+            self.scene,
+            self.particles,
+            t1=self.t1,
+            dt=self.dt,
+            method=self.method,
+            observe=_Observe(self.observations),
+            adjoint=adjoint,
+            throw=throw,
+        )
+
+    def predictions(self, run: Run) -> tuple[Array, ...]:
+        """What each observation would have measured in a run of it, in the shape of its data."""
+        return tuple(o.predict(seen, self.dt) for o, seen in zip(self.observations, run.observed, strict=True))
+
+    def explain(self) -> None:
+        """Say why what is observed is not finite.
+
+        Raises:
+            SimulationError: the simulation met a fault.
+            ValueError: an observation is beyond what the simulation reaches.
+        """
+        assert not is_traced(self)
+        for observation, seen in zip(self.observations, self.run().observed, strict=True):
+            observation.explain(seen)
+
+
+class _Observe(eqx.Module):
+    """What all observations of an experiment need of a state."""
+
+    observations: tuple[AbstractObservation, ...]
+
+    def __call__(self, scene: Scene, particles: Particles) -> tuple[Any, ...]:
+        return tuple(observation.observe(scene, particles) for observation in self.observations)

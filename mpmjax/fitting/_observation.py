@@ -1,0 +1,310 @@
+"""Observations: what was measured, and what a simulation says in its place."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Array, Float, Scalar
+from mpmjax.checks import require, require_finite, require_positive
+from mpmjax.fitting._quantities import Markers
+from mpmjax.state import Particles, Scene
+
+Numbers = Float[np.ndarray, "..."] | Float[Array, "..."] | list | tuple | float | int
+
+
+class AbstractObservation(eqx.Module):
+    """What was measured in an experiment.
+
+    One of your own says what it needs of each state (`observe`), and what it would have measured in a run of which it
+    has seen all states (`predict`).
+    """
+
+    data: eqx.AbstractVar[np.ndarray]
+    """What was measured, of any shape; NaN where nothing was."""
+    sigma: eqx.AbstractVar[Scalar | np.ndarray | None]
+    """Standard deviation of its noise, a number or an array that broadcasts against the data, in the data's unit; None
+    to estimate it from the misfit."""
+    weight: eqx.AbstractVar[Scalar]
+    """Factor of its squares [-]: 1 believes the noise, less than 1 counts correlated points less."""
+    robust: eqx.AbstractVar[Scalar | None]
+    """The misfit, in standard deviations, beyond which squares grow but linearly (pseudo-Huber), so that outliers count
+    little; None for squares throughout."""
+    name: eqx.AbstractVar[str]
+    """What tables and pictures call it."""
+
+    @abc.abstractmethod
+    def observe(self, scene: Scene, particles: Particles) -> Any:
+        """What is needed of one state: an array, or a pytree of arrays."""
+
+    @abc.abstractmethod
+    def predict(self, seen: Any, dt: float) -> Array:
+        """What would have been measured, in the shape of the data; NaN where the run does not reach.
+
+        Args:
+            seen: what `observe` returned at the start and after each step, with a leading axis.
+            dt: step [s].
+        """
+
+    def check(self, particles: Particles, t1: float, dt: float) -> None:
+        """Check that the data fit an experiment with these prepared particles, until t1 in steps of dt [s].
+
+        Raises:
+            ValueError: they do not.
+        """
+
+    def explain(self, seen: Any) -> None:
+        """Say why a prediction is not finite.
+
+        Raises:
+            ValueError: always, where it is not.
+        """
+
+    def __check_init__(self):
+        name = f"{type(self).__name__} {self.name!r}"
+        measured = np.isfinite(self.data)
+        require(not np.isinf(self.data).any(), f"{name} must have finite data, or NaN where nothing was measured.")
+        require(measured.sum() > 0, f"{name} has no data: it needs a finite number at least.")
+        if self.sigma is not None:
+            require_positive(f"The sigma of {name}", self.sigma)
+            try:
+                fits = np.broadcast_shapes(np.shape(self.sigma), self.data.shape) == self.data.shape
+            except ValueError:
+                fits = False
+            require(
+                fits, f"The sigma of {name} must fit its data of shape {self.data.shape}, got {np.shape(self.sigma)}."
+            )
+        require_positive(f"The weight of {name}", self.weight)
+        if self.robust is not None:
+            require_positive(f"The robust limit of {name}", self.robust)
+
+    @property
+    def against(self) -> tuple[str, np.ndarray]:
+        """What pictures draw the data over: its name, and a number for each row of the data."""
+        return "number", np.arange(len(np.atleast_1d(self.data)))
+
+    @property
+    def count(self) -> int:
+        """How many numbers were measured."""
+        return int(np.isfinite(self.data).sum())
+
+    def scale(self) -> float:
+        """The size of the data, which stands for an unknown σ until it is estimated."""
+        data = self.data[np.isfinite(self.data)]
+        return float(np.ptp(data) or np.abs(data).max() or 1.0)
+
+    def residuals(self, predicted: Array, sigma: Scalar | Array) -> Array:
+        """√weight (predicted − data)/σ [-], in C order, shape (m,); zero where nothing was measured.
+
+        With `robust` δ large ones are drawn nearer: r becomes r √(2/(1 + √(1 + r²/δ²))), and half its square
+        δ² (√(1 + r²/δ²) − 1).
+        """
+        dtype = predicted.dtype
+        data, sigma, weight = (jnp.asarray(a, dtype) for a in (self.data, sigma, self.weight))
+        measured = jnp.isfinite(data)
+        r = jnp.where(measured, (predicted - jnp.where(measured, data, 0)) / sigma, 0).reshape(-1)
+        if self.robust is not None:
+            r = r * jnp.sqrt(2 / (1 + jnp.sqrt(1 + (r / self.robust) ** 2)))
+        return jnp.sqrt(weight) * r
+
+
+class Series(AbstractObservation):
+    """A quantity measured against time: a height, a front, an energy, an image, anything that a state says.
+
+    Between steps it is interpolated linearly.
+
+    Args:
+        times: when it was measured [s], shape (f,), growing, from 0 to the experiment's t1.
+        values: what was measured, shape (f, ...); NaN where nothing was.
+        of: function of (scene, particles) that returns it, shape (...).
+        sigma: standard deviation of the noise, in the unit of the values; None to estimate it.
+        weight: factor of the squares.
+        robust: misfit in standard deviations beyond which squares grow but linearly.
+        name: what tables and pictures call it.
+    """
+
+    times: np.ndarray
+    data: np.ndarray
+    of: Callable[[Scene, Particles], Any]
+    sigma: Scalar | np.ndarray | None
+    weight: Scalar
+    robust: Scalar | None
+    name: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        times: Numbers,
+        values: Numbers,
+        of: Callable[[Scene, Particles], Any],
+        *,
+        sigma: Numbers | None = None,
+        weight: Scalar = 1.0,
+        robust: Scalar | None = None,
+        name: str = "series",
+    ):
+        self.times, self.data = np.asarray(times, float), np.asarray(values, float)
+        self.of, self.weight, self.robust, self.name = of, weight, robust, name
+        self.sigma = None if sigma is None else np.asarray(sigma, float)
+        what = f"{type(self).__name__} {name!r}"
+        require(
+            self.times.ndim == 1 and self.data.shape[:1] == self.times.shape,
+            f"{what} needs times of shape (f,) and values of shape (f, ...), got {self.times.shape} and "
+            f"{self.data.shape}.",
+        )
+        require_finite(f"The times of {what} [s]", self.times)
+        require(np.diff(self.times) > 0, f"The times of {what} must grow: sort the measurements by time.")
+
+    @property
+    def against(self) -> tuple[str, np.ndarray]:
+        return "time [s]", self.times
+
+    def observe(self, scene: Scene, particles: Particles) -> Any:
+        return self.of(scene, particles)
+
+    def predict(self, seen: Array, dt: float) -> Array:
+        place = jnp.asarray(self.times, seen.dtype) / dt
+        last = jnp.clip(jnp.floor(place + _ON_A_STEP), 0, len(seen) - 2)
+        share, at = jnp.clip(place - last, 0, 1).reshape(-1, *[1] * (seen.ndim - 1)), last.astype(int)
+        return (1 - share) * seen[at] + share * seen[at + 1]
+
+    def check(self, particles: Particles, t1: float, dt: float) -> None:
+        what = f"{type(self).__name__} {self.name!r}"
+        outside = (self.times < 0) | (self.times > t1 * (1 + 1e-9))
+        require(
+            ~outside,
+            f"The times of {what} must lie in the run, from 0 to {t1:g} s, but {int(outside.sum())} do not, the first "
+            f"{self.times[outside][:1]}: raise t1, or leave them out.",
+        )
+
+    def explain(self, seen: Array) -> None:
+        shape = np.shape(seen)[1:]
+        require(
+            shape == self.data.shape[1:],
+            f"{type(self).__name__} {self.name!r} has values of shape {self.data.shape[1:]} at each time, what the "
+            f"simulation says has {shape}.",
+        )
+        require_finite(f"What the simulation says of {self.name!r}", seen)
+
+
+_ON_A_STEP = 1e-6
+"""Part of a step by which a time may miss a step and is on it."""
+
+
+class Tracks(Series):
+    """Places of material points that were followed: markers, or features of a video.
+
+    Args:
+        times: when they were seen [s], shape (f,), growing.
+        positions: where [m], shape (f, m, d); NaN where a marker was not seen.
+        which: the markers: numbers of particles, shape (m,), or `Markers.at` for places between particles.
+        sigma: standard deviation of the noise of a coordinate [m]; None to estimate it.
+        weight: factor of the squares.
+        robust: misfit in standard deviations beyond which squares grow but linearly.
+        name: what tables and pictures call it.
+    """
+
+    def __init__(
+        self,
+        times: Numbers,
+        positions: Numbers,
+        *,
+        which: Markers | np.ndarray | Array | list[int] | tuple[int, ...],
+        sigma: Numbers | None = None,
+        weight: Scalar = 1.0,
+        robust: Scalar | None = None,
+        name: str = "tracks",
+    ):
+        markers = which if isinstance(which, Markers) else Markers.of(which)
+        super().__init__(times, positions, markers, sigma=sigma, weight=weight, robust=robust, name=name)
+        require(
+            self.data.ndim == 3 and markers.count == self.data.shape[1],
+            f"Tracks {name!r} need positions of shape (f, m, d) of the m markers, got {self.data.shape} and "
+            f"{markers.count} markers.",
+        )
+
+    def check(self, particles: Particles, t1: float, dt: float) -> None:
+        super().check(particles, t1, dt)
+        require(
+            self.data.shape[2] == particles.dim,
+            f"Tracks {self.name!r} are {self.data.shape[2]}-dimensional, the particles {particles.dim}-dimensional.",
+        )
+        assert isinstance(self.of, Markers)
+        self.of.check(self.name, particles.count)
+
+
+class Curve(AbstractObservation):
+    """A quantity measured against another one: stress against stretch, a force against a displacement.
+
+    Args:
+        x: measured abscissae, shape (m,).
+        y: measured ordinates, shape (m,).
+        of: function of (scene, particles) that returns one point (x, y) of the simulated curve; x must grow in time.
+        sigma: standard deviation of the noise of y; None to estimate it.
+        weight: factor of the squares.
+        robust: misfit in standard deviations beyond which squares grow but linearly.
+        name: what tables and pictures call it.
+        x_name: what pictures call the abscissa.
+    """
+
+    x: np.ndarray
+    x_name: str = eqx.field(static=True)
+    data: np.ndarray
+    of: Callable[[Scene, Particles], Any]
+    sigma: Scalar | np.ndarray | None
+    weight: Scalar
+    robust: Scalar | None
+    name: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        x: Numbers,
+        y: Numbers,
+        of: Callable[[Scene, Particles], Any],
+        *,
+        sigma: Numbers | None = None,
+        weight: Scalar = 1.0,
+        robust: Scalar | None = None,
+        name: str = "curve",
+        x_name: str = "abscissa",
+    ):
+        self.x_name = x_name
+        self.x, self.data = np.asarray(x, float), np.asarray(y, float)
+        self.of, self.weight, self.robust, self.name = of, weight, robust, name
+        self.sigma = None if sigma is None else np.asarray(sigma, float)
+        require(
+            self.x.ndim == 1 and self.x.shape == self.data.shape,
+            f"Curve {name!r} needs x and y of one shape (m,), got {self.x.shape} and {self.data.shape}.",
+        )
+        require_finite(f"The abscissae of Curve {name!r}", self.x)
+
+    @property
+    def against(self) -> tuple[str, np.ndarray]:
+        return self.x_name, self.x
+
+    def observe(self, scene: Scene, particles: Particles) -> Any:
+        return self.of(scene, particles)
+
+    def predict(self, seen: Any, dt: float) -> Array:
+        del dt
+        x, y = seen
+        wanted = jnp.asarray(self.x, y.dtype)
+        reached = (wanted >= x[0]) & (wanted <= x[-1]) & (jnp.diff(x) > 0).all()
+        return jnp.where(reached, jnp.interp(wanted, x, y), jnp.nan)
+
+    def explain(self, seen: Any) -> None:
+        x, y = (np.asarray(a) for a in seen)
+        require(
+            np.isfinite(x).all() and (np.diff(x) > 0).all(),
+            f"The simulated abscissa of Curve {self.name!r} must grow with every step of the run: slow the loading "
+            "down, or reduce dt.",
+        )
+        outside = (self.x < x[0]) | (self.x > x[-1])
+        require(
+            ~outside,
+            f"The simulation covers {x[0]:.4g} to {x[-1]:.4g}, which leaves out measured points of Curve {self.name!r} "
+            f"({', '.join(f'{w:.4g}' for w in self.x[outside])}): pull further, or narrow the range.",
+        )
+        require_finite(f"The simulated ordinate of Curve {self.name!r}", y)

@@ -1,0 +1,215 @@
+"""Parameters that are fitted, and the coordinates in which they are searched."""
+
+import abc
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Array, Float, Scalar
+from mpmjax.checks import require, require_finite, require_positive
+from mpmjax.fitting._experiment import Experiment
+
+Value = Float[Array, "..."]
+
+
+class Gaussian(eqx.Module):
+    """Prior knowledge of a parameter: a normal distribution. It acts like one more measured point a number.
+
+    Args:
+        mean: expected value, in the parameter's unit, one number or one for each entry.
+        sigma: its standard deviation, likewise.
+    """
+
+    mean: Scalar | Value | tuple[float, ...]
+    sigma: Scalar | Value | tuple[float, ...]
+
+    def __check_init__(self):
+        require_finite("Gaussian's mean", self.mean)
+        require_positive("Gaussian's sigma", self.sigma)
+
+    def residuals(self, value: Value) -> Value:
+        """(value − mean)/σ [-]."""
+        mean, sigma = (jnp.asarray(a, value.dtype) for a in (self.mean, self.sigma))
+        return (value - mean) / sigma
+
+
+class AbstractParameter(eqx.Module):
+    """A number, or an array of them, that is fitted.
+
+    It is searched in a coordinate z of its own, shape as the value's, that takes every real number and is zero at the
+    first guess: so no bound is ever crossed, and a step of one is a large but not an absurd change.
+    """
+
+    logarithmic: ClassVar[bool] = False
+    """Whether z is the logarithm of the value but for a constant."""
+    where: eqx.AbstractVar[Callable[[Experiment], Any] | None]
+    """The leaf, or a tuple of leaves that share the value, of an experiment, as in `equinox.tree_at`."""
+    update: eqx.AbstractVar[Callable[[Experiment, Value], Experiment] | None]
+    """In the place of `where`: the experiment with the value put into it, for what is no single leaf."""
+    start: eqx.AbstractVar[Scalar | Value | None]
+    """The first guess. Default: the value of the first experiment."""
+    prior: eqx.AbstractVar[Gaussian | None]
+    """What is known of it beforehand."""
+    unit: eqx.AbstractVar[str]
+    """The unit that tables show."""
+    only: eqx.AbstractVar[tuple[int, ...] | None]
+    """The numbers, from 0, of the experiments that it belongs to. Default: all."""
+
+    def __check_init__(self):
+        name = type(self).__name__
+        require(
+            (self.where is None) != (self.update is None),
+            f"{name} takes either where (the leaf of an experiment) or update (a function that puts the value in), got "
+            f"{'neither' if self.where is None else 'both'}.",
+        )
+        require(self.update is None or self.start is not None, f"{name} with update needs a start: the first guess.")
+        if self.start is not None:
+            require_finite(f"{name}'s start", self.start)
+
+    @abc.abstractmethod
+    def value(self, start: Value, z: Value) -> Value:
+        """The value at a coordinate z [-]; `start` at zero."""
+
+    @abc.abstractmethod
+    def check(self, name: str, start: np.ndarray) -> None:
+        """Check that the first guess lies within the bounds.
+
+        Raises:
+            ValueError: it does not.
+        """
+
+    def at_bound(self, start: Value, z: Value) -> bool:
+        """Whether the value has come so near to a bound that the data want to go beyond it."""
+        del start, z
+        return False
+
+    def first_guess(self, experiment: Experiment) -> Array:
+        """The value that the search starts from."""
+        if self.start is not None:
+            return jnp.asarray(self.start, experiment.dtype)
+        assert self.where is not None
+        found = self.where(experiment)
+        return jnp.asarray(found[0] if isinstance(found, tuple) else found, experiment.dtype)
+
+    def put(self, experiment: Experiment, value: Value) -> Experiment:
+        """The experiment with this value."""
+        if self.update is not None:
+            return self.update(experiment, value)
+        where = self.where
+        assert where is not None
+        leaves = where(experiment)
+        count = len(leaves) if isinstance(leaves, tuple) else None
+        return eqx.tree_at(where, experiment, value if count is None else (value,) * count)
+
+
+class Unbounded(AbstractParameter):
+    """A parameter that may have any value, such as a velocity or an angle.
+
+    Args:
+        where: the leaf, `lambda e: e.particles.v`, or a tuple of leaves that share the value.
+        update: in its place, the experiment with the value put in, `lambda e, value: ...`.
+        start: first guess. Default: the value of the first experiment.
+        scale: a change that is large but not absurd. Default: the size of the first guess, or one if that is zero.
+        prior: what is known beforehand.
+        unit: the unit that tables show.
+        only: numbers of the experiments that it belongs to. Default: all.
+    """
+
+    where: Callable[[Experiment], Any] | None = None
+    update: Callable[[Experiment, Value], Experiment] | None = None
+    start: Scalar | Value | None = None
+    scale: Scalar | None = None
+    prior: Gaussian | None = None
+    unit: str = eqx.field(static=True, default="")
+    only: tuple[int, ...] | None = eqx.field(static=True, default=None)
+
+    def value(self, start: Value, z: Value) -> Value:
+        """start + scale z."""
+        size = jnp.abs(start).max()
+        return start + (jnp.where(size == 0, 1, size) if self.scale is None else self.scale) * z
+
+    def check(self, name: str, start: np.ndarray) -> None:
+        if self.scale is not None:
+            require_positive(f"The scale of the parameter {name!r}", self.scale)
+
+
+class Positive(AbstractParameter):
+    """A positive parameter, such as a modulus, a viscosity or a density: start·e^z.
+
+    Args:
+        where: the leaf, `lambda e: e.scene.material.youngs_modulus`, or a tuple of leaves that share the value.
+        update: in its place, the experiment with the value put in, `lambda e, value: ...`.
+        start: first guess. Default: the value of the first experiment.
+        prior: what is known beforehand.
+        unit: the unit that tables show.
+        only: numbers of the experiments that it belongs to. Default: all.
+    """
+
+    logarithmic: ClassVar[bool] = True
+    where: Callable[[Experiment], Any] | None = None
+    update: Callable[[Experiment, Value], Experiment] | None = None
+    start: Scalar | Value | None = None
+    prior: Gaussian | None = None
+    unit: str = eqx.field(static=True, default="")
+    only: tuple[int, ...] | None = eqx.field(static=True, default=None)
+
+    def value(self, start: Value, z: Value) -> Value:
+        """start·e^z."""
+        return start * jnp.exp(z)
+
+    def check(self, name: str, start: np.ndarray) -> None:
+        require(start > 0, f"The parameter {name!r} must start from positive numbers, got {start}.")
+
+
+class Bounded(AbstractParameter):
+    """A parameter between two bounds, such as Poisson's ratio: lower + (upper − lower)/(1 + e^{−(z0 + z)}).
+
+    Args:
+        where: the leaf, `lambda e: e.scene.material.poisson_ratio`, or a tuple of leaves that share the value.
+        lower: lower bound.
+        upper: upper bound.
+        update: in the place of `where`, the experiment with the value put in, `lambda e, value: ...`.
+        start: first guess, between the bounds. Default: the value of the first experiment.
+        prior: what is known beforehand.
+        unit: the unit that tables show.
+        only: numbers of the experiments that it belongs to. Default: all.
+    """
+
+    where: Callable[[Experiment], Any] | None = None
+    lower: float | int = eqx.field(static=True, default=0.0)
+    upper: float | int = eqx.field(static=True, default=1.0)
+    update: Callable[[Experiment, Value], Experiment] | None = None
+    start: Scalar | Value | None = None
+    prior: Gaussian | None = None
+    unit: str = eqx.field(static=True, default="")
+    only: tuple[int, ...] | None = eqx.field(static=True, default=None)
+
+    def value(self, start: Value, z: Value) -> Value:
+        """lower + (upper − lower)/(1 + e^{−(z0 + z)})."""
+        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(self._coordinate(start) + z)
+
+    def check(self, name: str, start: np.ndarray) -> None:
+        require(
+            self.lower < self.upper,
+            f"The bounds of the parameter {name!r} must grow, got {self.lower} and {self.upper}.",
+        )
+        require(
+            (start > self.lower) & (start < self.upper),
+            f"The parameter {name!r} must start between its bounds {self.lower} and {self.upper}, got {start}.",
+        )
+
+    def at_bound(self, start: Value, z: Value) -> bool:
+        return bool((jnp.abs(self._coordinate(start) + z) > _AT_BOUND).any())
+
+    def _coordinate(self, value: Value) -> Value:
+        """The logit of where the value lies between the bounds."""
+        share = (value - self.lower) / (self.upper - self.lower)
+        return jnp.log(share) - jnp.log1p(-share)
+
+
+_AT_BOUND = 6.0
+"""The logit at which a value is within a four-hundredth of its bound."""

@@ -1,0 +1,205 @@
+"""What is often measured of a body, as functions of (scene, particles)."""
+
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Array, Float, ParticleScalar, ParticleVector
+from mpmjax.checks import canonical, require
+from mpmjax.discretisation import BSpline, Grid, SplineGradient, make_stencil, scatter
+from mpmjax.geometry import AbstractRegion
+from mpmjax.state import Particles, Scene
+
+_NEIGHBOURS = 3
+"""Particles that carry a marker, in each direction."""
+
+
+class Markers(eqx.Module):
+    """Where some material points are: means of the particles beside them.
+
+    Make them by `Markers.of` or `Markers.at`.
+    """
+
+    which: np.ndarray
+    """Numbers of the particles that carry each marker, shape (m, k)."""
+    share: np.ndarray
+    """Their shares in its place, shape (m, k); they add up to one."""
+
+    @classmethod
+    def of(cls, which: Any) -> "Markers":
+        """Markers that are particles, by their numbers, shape (m,).
+
+        Raises:
+            ValueError: no whole numbers.
+        """
+        numbers = np.asarray(which)
+        require(
+            numbers.ndim == 1 and numbers.size > 0 and np.issubdtype(numbers.dtype, np.integer),
+            f"Markers must be whole numbers of particles, shape (m,), got {numbers.shape} of {numbers.dtype}; for "
+            "places between particles take Markers.at(particles, places).",
+        )
+        return cls(numbers[:, None], np.ones((len(numbers), 1)))
+
+    @classmethod
+    def at(cls, particles: Particles, places: ParticleVector | np.ndarray) -> "Markers":
+        """Markers painted on places of a body as it starts [m], shape (m, d).
+
+        A marker moves as the mean of its nearest particles, by shares of least squares that reproduce its place: it
+        then moves exactly with any motion that is affine beside it.
+
+        Raises:
+            ValueError: a place that does not lie among particles.
+        """
+        x, places = np.asarray(particles.x, float), np.asarray(places, float)
+        d = particles.dim
+        require(
+            places.ndim == 2 and places.shape[1] == d and len(places) > 0,
+            f"Markers need places of shape (m, {d}), got {places.shape}.",
+        )
+        k = min(_NEIGHBOURS**d, particles.count)
+        away = x[None] - places[:, None]
+        nearest = np.argsort((away**2).sum(axis=-1), axis=1, kind="stable")[:, :k]
+        arms = np.take_along_axis(away, nearest[..., None], axis=1)
+        far = np.sqrt((arms**2).sum(axis=-1).max(axis=1, keepdims=True))
+        weight = np.exp(-4 * (arms**2).sum(axis=-1) / far**2)
+        conditions = np.concatenate([np.ones((len(places), k, 1)), arms / far[..., None]], axis=-1)
+        matrix = np.einsum("mki,mk,mkj->mij", conditions, weight, conditions)
+        target = np.zeros((len(places), d + 1, 1))
+        target[:, 0] = 1
+        share = weight * (conditions @ np.linalg.pinv(matrix) @ target)[..., 0]
+        missed = np.abs(np.einsum("mk,mkd->md", share, arms)).max(axis=1) > 1e-6 * far[:, 0]
+        outside = missed | (np.abs(share.sum(axis=1) - 1) > 1e-6) | (np.abs(share).sum(axis=1) > 2)
+        require(
+            ~outside,
+            f"Markers must lie on the body as it starts; {int(outside.sum())} do not, the first at "
+            f"{places[outside][:1].tolist()}.",
+        )
+        return cls(nearest, share)
+
+    @property
+    def count(self) -> int:
+        """Number of markers m."""
+        return len(self.which)
+
+    def check(self, name: str, particles: int) -> None:
+        """Check that the particles are there.
+
+        Raises:
+            ValueError: they are not.
+        """
+        require(
+            (np.asarray(self.which) >= 0) & (np.asarray(self.which) < particles),
+            f"The markers of {name!r} must be numbers of the {particles} particles, from 0.",
+        )
+
+    def __call__(self, scene: Scene, particles: Particles) -> Float[Array, "m d"]:
+        """Positions [m], shape (m, d)."""
+        del scene
+        return (jnp.asarray(self.share, particles.x.dtype)[..., None] * particles.x[self.which]).sum(axis=1)
+
+
+class Extent(eqx.Module):
+    """How far the particles reach: a front, or a height [m].
+
+    Its derivative is that of the particle that reaches farthest.
+
+    Args:
+        axis: direction.
+        side: "upper" for the largest coordinate, "lower" for the smallest.
+    """
+
+    axis: int = eqx.field(static=True)
+    side: Literal["upper", "lower"] = eqx.field(static=True, default="upper")
+
+    def __check_init__(self):
+        require(self.side in ("upper", "lower"), f'Extent\'s side must be "upper" or "lower", got {self.side!r}.')
+
+    def __call__(self, scene: Scene, particles: Particles) -> Float[Array, ""]:
+        """The coordinate [m]."""
+        del scene
+        along = particles.x[:, self.axis]
+        return along.max() if self.side == "upper" else along.min()
+
+
+class CentreOfMass(eqx.Module):
+    """The centre of mass of all particles [m], shape (d,)."""
+
+    def __call__(self, scene: Scene, particles: Particles) -> Float[Array, "d"]:
+        """Σ m x / Σ m."""
+        del scene
+        return particles.mass @ particles.x / particles.mass.sum()
+
+
+class StressStretch(eqx.Module):
+    """The curve of a tension test: mean stretch F_aa and mean nominal stress P_aa [Pa] of a gauge section."""
+
+    weight: ParticleScalar
+    """Share of each particle in the means, summing to one, shape (p,)."""
+    axis: int = eqx.field(static=True)
+    """Direction a of the pull."""
+
+    @classmethod
+    def of(cls, region: AbstractRegion, particles: Particles, axis: int) -> "StressStretch":
+        """Over the particles that start in a region, each weighted by its volume.
+
+        Raises:
+            ValueError: no particle starts in the region, or there is no such axis.
+        """
+        inside = np.asarray(region.contains(particles.x))
+        require(inside.any(), f"The gauge {region} holds no particle at the start: enlarge or move it.")
+        require(0 <= axis < particles.dim, f"The gauge's axis must be below {particles.dim}, got {axis}.")
+        weight = jnp.where(jnp.asarray(inside), particles.volume, 0)
+        return cls(weight / weight.sum(), axis)
+
+    def __call__(self, scene: Scene, particles: Particles) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Stretch [-] and nominal stress [Pa]."""
+        (body,) = scene.material_points(particles)
+        P = body.law.stress(body.F)
+        a = self.axis
+        return (self.weight * body.F[a, a]).sum(), (self.weight * P[a, a]).sum()
+
+
+class Density(eqx.Module):
+    """A picture of the body: its density on the nodes of a lattice, smoothed by a quadratic B-spline.
+
+    For measured pictures, and for clouds of points whose correspondence is not known: a cloud becomes a picture by
+    `of_points`, and pictures are compared. The lattice's spacing is the distance over which points are told apart:
+    wide enough that shifted clouds still overlap, a tenth of the body or so, and wider than the points' spacing.
+
+        picture = mpm.Density(mpm.Grid((40, 40), 0.05))
+        seen = mpm.Series(times, [picture.of_points(cloud, mass) for cloud in clouds], picture)
+
+    A series of it keeps a picture for each step, and for each parameter a derivative of that.
+
+    Args:
+        grid: the lattice; what lies outside is not in the picture.
+    """
+
+    grid: Grid
+
+    def __call__(self, scene: Scene, particles: Particles) -> Array:
+        """The density [kg/m^d], of the grid's shape."""
+        del scene
+        return self._picture(particles.x, particles.mass)
+
+    def of_points(self, points: ParticleVector | np.ndarray, mass: float | Array) -> np.ndarray:
+        """The picture of a cloud of points.
+
+        Args:
+            points: places [m], shape (m, d).
+            mass: of the body [kg], which they share evenly.
+        """
+        points = jnp.asarray(points, float)
+        require(
+            points.ndim == 2 and points.shape[1] == self.grid.dim and len(points) > 0,
+            f"A cloud needs points of shape (m, {self.grid.dim}), got {points.shape}.",
+        )
+        return np.asarray(self._picture(points, jnp.full(len(points), mass / len(points))))
+
+    def _picture(self, x: ParticleVector, mass: ParticleScalar) -> Array:
+        grid = canonical(self.grid, x.dtype)
+        stencil = make_stencil(BSpline(2), SplineGradient(), grid, grid.window(x), x, affine=False)
+        (on_nodes,) = scatter(stencil, jnp.where(stencil.inside, mass, 0)[None], None, grid.size).T
+        return (on_nodes / grid.spacing**grid.dim).reshape(grid.shape)

@@ -1,0 +1,117 @@
+"""What a fit found."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+import scipy.stats
+
+from mpmjax.fitting._experiment import Experiment
+from mpmjax.fitting._least_squares import Iteration
+
+
+class Estimate(NamedTuple):
+    """A fitted number, or one that follows from those."""
+
+    label: str
+    value: float
+    error: float
+    """Standard error."""
+    interval: tuple[float, float]
+    """Where it lies at the level of the fit."""
+    unit: str = ""
+    start: float = np.nan
+    """The first guess."""
+    at_bound: bool = False
+    """Whether it came to lie at a bound, where errors mean little."""
+
+
+class NoiseEstimate(NamedTuple):
+    """The noise of an observation."""
+
+    name: str
+    sigma: float
+    """Standard deviation, the root mean square where it varies, in the data's unit."""
+    estimated: bool
+    """Whether the fit estimated it."""
+    misfit: float
+    """Root mean square of the residuals, in units of σ."""
+    points: int
+    """How many numbers were measured."""
+
+
+class FitResult(eqx.Module):
+    """Fitted parameters, their errors, and the fitted scene.
+
+    `print(result)` shows a table; `result["E"]` is the estimate of a parameter.
+    """
+
+    estimates: tuple[Estimate, ...]
+    """The fitted numbers, one for each entry of each parameter."""
+    reported: tuple[Estimate, ...]
+    """What else was asked for."""
+    covariance: np.ndarray
+    """Of the search's coordinates [-], shape (n, n)."""
+    correlation: np.ndarray
+    """Of the estimates, shape (n, n)."""
+    spectrum: np.ndarray
+    """The eigenvalues of the Fisher information JᵀJ, growing, shape (n,): 1/√λ is how far, in coordinates, the data
+    leave the direction open."""
+    directions: np.ndarray
+    """Its eigenvectors, one a column, shape (n, n)."""
+    chi_squared: float
+    """Σ r², priors included."""
+    degrees_of_freedom: int
+    """Measured numbers and priors, less parameters."""
+    noise: tuple[NoiseEstimate, ...]
+    """That of each observation."""
+    experiments: tuple[Experiment, ...]
+    """The experiments with the fitted values."""
+    level: float
+    """That of the intervals."""
+    converged: bool
+    history: tuple[Iteration, ...]
+    warnings: tuple[str, ...]
+    """What the data cannot tell, and what does not fit, in words."""
+
+    @property
+    def scene(self) -> Any:
+        """The fitted scene of the first experiment, ready to run."""
+        return self.experiments[0].scene
+
+    @property
+    def p_value(self) -> float:
+        """The probability of so large a χ² if the model and the noise given are right; NaN if noise was estimated."""
+        if any(noise.estimated for noise in self.noise) or self.degrees_of_freedom < 1:
+            return np.nan
+        return float(scipy.stats.chi2.sf(self.chi_squared, self.degrees_of_freedom))
+
+    def __getitem__(self, label: str) -> Estimate:
+        """The estimate of a parameter, or of what was reported.
+
+        Raises:
+            KeyError: there is none of this name.
+        """
+        for estimate in (*self.estimates, *self.reported):
+            if estimate.label == label:
+                return estimate
+        raise KeyError(f"There is no estimate {label!r}, but {', '.join(e.label for e in self.estimates)}.")
+
+    def __str__(self) -> str:
+        """A table."""
+        lines = [f"{'':<24} {'value':>12} ± {'error':<9} {f'{100 * self.level:g} % interval':<25} {'start':>10}"]
+        for e in (*self.estimates, *self.reported):
+            name = f"{e.label} [{e.unit}]" if e.unit else e.label
+            interval = f"{e.interval[0]:.5g} to {e.interval[1]:.5g}"
+            start = "" if np.isnan(e.start) else f"{e.start:.4g}"
+            bound = "  at its bound" if e.at_bound else ""
+            lines.append(f"{name:<24} {e.value:>12.6g} ± {e.error:<9.2g} {interval:<25} {start:>10}{bound}")
+        lines += ["", f"{'':<24} {'numbers':>12}   {'noise σ':<22} misfit/σ"]
+        for n in self.noise:
+            sigma = f"{n.sigma:.3g} {'estimated' if n.estimated else 'given'}"
+            lines.append(f"{n.name:<24} {n.points:>12}   {sigma:<22} {n.misfit:.3g}")
+        said = f"χ² = {self.chi_squared:.4g} for {self.degrees_of_freedom} degrees of freedom"
+        lines += ["", said + ("" if np.isnan(self.p_value) else f", probability {self.p_value:.2g}")]
+        if not self.converged:
+            lines.append("NOT CONVERGED: errors hold only at a minimum.")
+        return "\n".join([*lines, *self.warnings])
