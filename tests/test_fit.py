@@ -136,7 +136,7 @@ def test_a_gauge_without_particles_is_refused(job):
 
 def test_the_gauge_weighs_by_volume(job):
     curve = gauge(mpm.Box((0.0, 0.0), (0.01, 0.01)), job.particles, 1)
-    stretched = dataclasses.replace(job.particles, F=2 * job.particles.F)
+    stretched = dataclasses.replace(job.particles, deformations=(2 * job.particles.F,))
     assert float(curve.weight.sum()) == pytest.approx(1)
     stretch, stress = curve(job.scene, stretched)
     assert float(stretch) == pytest.approx(2)

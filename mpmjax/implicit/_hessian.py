@@ -7,11 +7,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Matrix, NodeVector
+from mpmjax._types import Deformation, NodeVector
 from mpmjax.checks import require_fields
 from mpmjax.implicit._hessian_action import AbstractHessianAction, ParticleStiffness, TangentAction, particle_stiffness
-from mpmjax.implicit._potential import ElasticPotential, Matrices
-from mpmjax.material import AbstractMaterial, AbstractTangent, projected_tangent
+from mpmjax.implicit._potential import Deformations, ElasticPotential
+from mpmjax.material import AbstractElastic, AbstractTangent
 
 
 class AbstractHessian(eqx.Module):
@@ -38,7 +38,7 @@ class AbstractHessian(eqx.Module):
 class AnalyticHessian(AbstractHessian):
     """Hessian by the law's stress differential (derivation, eqs. 7 to 12). Faster than `JvpHessian`.
 
-    With `projected`, each particle's stress differential is made positive semi-definite first (see
+    With `projected`, each particle's stress differential is made positive semi-definite first (see the law's
     `projected_tangent`), so that M + cH is positive definite whatever the compression and the step. A particle whose
     differential is so already is not changed by it. One linear solve then solves another, more strongly damped
     equation where it matters; Newton's method only takes another way to the same solution. First derivatives stay
@@ -63,9 +63,9 @@ class AnalyticHessian(AbstractHessian):
     def exact(self) -> "AnalyticHessian":
         return AnalyticHessian()
 
-    def _action(self, potential: ElasticPotential, F: Matrices) -> TangentAction:
-        def tangent(law: AbstractMaterial, F: Matrix) -> AbstractTangent:
-            return projected_tangent(law, F) if self.projected else law.tangent(F)
+    def _action(self, potential: ElasticPotential, F: Deformations) -> TangentAction:
+        def tangent(law: AbstractElastic, F: Deformation) -> AbstractTangent:
+            return law.projected_tangent(F) if self.projected else law.tangent(F)
 
         laws = (c.law for c in potential.material_points)
         tangents = tuple(tangent(law, own) for law, own in zip(laws, F, strict=True))
@@ -101,7 +101,7 @@ class _JvpAction(AbstractHessianAction):
         return particle_stiffness(self.potential, tangents, positive_semidefinite=False)
 
 
-def _jvp_tangent(law: AbstractMaterial, F: Matrix) -> Callable[[Matrix], Matrix]:
+def _jvp_tangent(law: AbstractElastic, F: Deformation) -> Callable[[Deformation], Deformation]:
     stress = jax.grad(lambda F: law.energy(F).sum())
     return lambda dF: jax.jvp(stress, (F,), (dF,))[1]
 
