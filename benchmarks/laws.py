@@ -43,7 +43,7 @@ def made(b: Block, law: Any) -> tuple[mpm.Scene, mpm.Particles]:
     particles = mpm.Particles(jnp.asarray(b.x, b.dtype), jnp.asarray(b.v, b.dtype), b.mass * one, b.volume * one)
     scene = mpm.Scene(mpm.Grid((b.nodes,) * 3, b.spacing), law, gravity=(0.0, 0.0, -9.81))
     particles = mpm.prepare(scene, particles)
-    if particles.F is not None and particles.F.shape[1] == 3:
+    if particles.F.ndim == 3:
         strained = jnp.asarray([0.98, 1.0, 1.01], b.dtype)
         particles = eqx.tree_at(lambda q: q.F, particles, particles.F * strained)
     return scene, particles

@@ -67,7 +67,7 @@ def compressed(block, compression, velocity, C) -> mpm.Particles:
     centre, scale = block.x.mean(axis=0), 1 - compression
     x = centre + scale * (block.x - centre)
     F = jnp.broadcast_to(scale * jnp.eye(2), (block.count, 2, 2))
-    return mpm.Particles(x, velocity(x - centre), block.mass, block.volume, F=F, C=jnp.broadcast_to(C, F.shape))
+    return mpm.Particles(x, velocity(x - centre), block.mass, block.volume, (F,), C=jnp.broadcast_to(C, F.shape))
 
 
 def particle_sweep(count: int) -> list[dict]:

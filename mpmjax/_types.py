@@ -39,6 +39,10 @@ ParticleMatrix = Float[Array, "p d d"]
 Matrix = Float[Array, "d d *p"]
 """A d x d matrix per particle (or a single one), component first."""
 
+Deformation = Float[Array, "..."]
+"""What particles store of their deformation (see `material/_kinematics.py`), component first: F, shape (d, d, *p), or
+J, shape (*p)."""
+
 Compliance = Float[Array, "s s *p"]
 """What turns the vector of a skew d x d matrix into a spin: s = 3 in 3-D, else 1."""
 
@@ -48,6 +52,7 @@ __all__ = [
     "Array",
     "Bool",
     "Compliance",
+    "Deformation",
     "Float",
     "Indices",
     "Int",

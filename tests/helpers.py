@@ -118,7 +118,7 @@ def cloud(d: int, *, p: int = 20, seed: int = 0, cells: int = 6, dx: float = 0.1
         v=jnp.asarray(rng.normal(size=(p, d))),
         mass=jnp.asarray(rng.uniform(0.5, 1.5, p)),
         volume=jnp.asarray(rng.uniform(0.5, 1.5, p) * (dx / 2) ** d),
-        F=jnp.asarray(np.eye(d) + 0.1 * rng.normal(size=(p, d, d))),
+        deformations=(jnp.asarray(np.eye(d) + 0.1 * rng.normal(size=(p, d, d))),),
         C=jnp.asarray(rng.normal(size=(p, d, d))),
         X=x,
     )

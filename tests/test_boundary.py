@@ -160,7 +160,7 @@ def with_images(planes, particles):
         arrays["x"] = arrays["x"] - shift
         arrays = {k: reflected(plane, a) for k, a in arrays.items()}
         place = arrays["x"] + shift
-        particles = mpm.Particles(**arrays | {"x": place, "X": place})
+        particles = mpm.Particles(deformations=(arrays.pop("F"),), **arrays | {"x": place, "X": place})
     return particles
 
 
@@ -259,7 +259,9 @@ def test_a_column_hangs_in_its_own_weight_from_a_symmetry_plane(kernel):
     rest = mpm.fill(mpm.Box((0.0,), (1.0,)), grid, particles_per_cell=2, density=1e3)
     X = rest.x[:, 0]
     u, strain = 1e3 * g / modulus * (X - X**2 / 2), 1e3 * g / modulus * (1 - X)
-    particles = mpm.Particles((X + u)[:, None], rest.v, rest.mass, rest.volume, (1 + strain)[:, None, None], X=rest.x)
+    particles = mpm.Particles(
+        (X + u)[:, None], rest.v, rest.mass, rest.volume, ((1 + strain)[:, None, None],), X=rest.x
+    )
     scene = mpm.Scene(
         grid,
         mpm.FixedCorotated(modulus, 0.0),

@@ -284,7 +284,7 @@ def test_a_fluid_stores_and_costs_less_than_a_solid(d):
     assert fluid[1] < 0.98 * solid[1]
     assert crossings(counted(d=d, material=mpm.Fluid(1e5))) == (1, 1)
     step, arrays = program(d=d, material=mpm.Fluid(1e5))
-    assert jax.eval_shape(step, arrays).F.shape[1:] == (1, 1)
+    assert jax.eval_shape(step, arrays).F.ndim == 1
 
 
 @pytest.mark.thorough

@@ -169,14 +169,14 @@ def test_the_fit_finds_rubbers_modulus(tmp_path):
 
 
 def test_a_gauge_weighs_by_volume_and_must_hold_particles():
-    grid = mpm.Grid((10, 22), 2.5e-3)
+    grid = mpm.Grid((10, 22), 2.5e-3, origin=(-3, -3))
     particles = mpm.fill(mpm.Box((0.0, 0.0), (0.01, 0.04)), grid, particles_per_cell=4, density=930.0)
     curve = mpm.StressStretch.of(mpm.Box((0.0, 0.0), (0.01, 0.01)), particles, 1)
     assert float(curve.weight.sum()) == pytest.approx(1)
     law = mpm.NeoHookean(1e6, 0.4)
     F = 2 * np.broadcast_to(np.eye(2), (particles.count, 2, 2))
     scene = mpm.Scene(grid, law)
-    stretched = mpm.prepare(scene, dataclasses.replace(particles, F=jnp.asarray(F)))
+    stretched = mpm.prepare(scene, dataclasses.replace(particles, deformations=(jnp.asarray(F),)))
     stretch, stress = curve(scene, stretched)
     assert float(stretch) == pytest.approx(2)
     assert float(stress) == pytest.approx(float(law.stress(2 * jnp.eye(2)[..., None])[1, 1, 0]))

@@ -16,10 +16,9 @@ EXPONENTS = (0.5, 1.0, 1.0 + 1e-5, 1.4, 7.0)
 @eqx.filter_jit
 def response(law, J):
     """Energy, stress and tangent of stretches, and the same by differentiation of the energy, the stress once more."""
-    F = J[None, None]
-    gradient = jax.grad(lambda F: law.energy(F).sum())
-    curvature = jax.jvp(gradient, (F,), (jnp.ones_like(F),))[1]
-    return law.energy(F), law.stress(F), law.tangent(F)(jnp.ones_like(F)), gradient(F), curvature
+    gradient = jax.grad(lambda J: law.energy(J).sum())
+    curvature = jax.jvp(gradient, (J,), (jnp.ones_like(J),))[1]
+    return law.energy(J), law.stress(J), law.tangent(J)(jnp.ones_like(J)), gradient(J), curvature
 
 
 @pytest.mark.parametrize("exponent", EXPONENTS)
@@ -51,7 +50,7 @@ def test_without_tension_there_is_none():
 
 def test_the_energy_has_its_derivative_by_the_exponent_also_where_it_is_one():
     """∂Ψ/∂γ against central differences, across the switch to the series and at γ = 1."""
-    J = jnp.asarray([0.7, 1.3])[None, None]
+    J = jnp.asarray([0.7, 1.3])
     energy = jax.jit(lambda g: Tait(2e4, g).energy(J))
     for exponent in (1.0, 1.0 + 2e-3, 0.9901, 1.02, 7.0):
         found = jax.jvp(energy, (jnp.asarray(exponent),), (jnp.ones(()),))[1]
@@ -74,17 +73,16 @@ def test_parameters_are_positive_scalars_or_one_per_particle():
 
 @pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_particles_store_one_number_in_the_place_of_deformation(d):
-    """J = 1, shape (p, 1, 1), and in two groups each its own; a full F is refused, and so is the total description."""
+    """J = 1, shape (p,), and in two groups each its own; a full F is refused, and so is the total description."""
     scene, particles = block(d, material=mpm.Fluid(1e4))
     prepared = mpm.prepare(scene, particles)
-    assert prepared.F.shape == (particles.count, 1, 1)
+    assert prepared.F.shape == (particles.count,)
     assert not jax.tree.leaves(prepared.history)
     both = eqx.tree_at(lambda s: s.material, scene, (mpm.Fluid(1e4), mpm.NeoHookean(1e4, 0.3)))
-    groups = mpm.prepare(both, mpm.join(particles, particles)).F
-    assert [F.shape[1:] for F in groups] == [(1, 1), (d, d)]
-    if d > 1:
-        with pytest.raises(ValueError, match="Fluid needs F of shape"):
-            mpm.prepare(scene, eqx.tree_at(lambda q: q.F, prepared, groups[1]))
+    groups = mpm.prepare(both, mpm.join(particles, particles)).deformations
+    assert [own.shape[1:] for own in groups] == [(), (d, d)]
+    with pytest.raises(ValueError, match="Fluid needs J of shape"):
+        mpm.prepare(scene, eqx.tree_at(lambda q: q.F, prepared, groups[1]))
     with pytest.raises(ValueError, match="use the updated one for Fluid"):
         mpm.Scene(scene.grid, mpm.Fluid(1e4), description=mpm.TotalLagrangian())
 

@@ -168,7 +168,9 @@ def constrained(d, description, law="fixed_corotated"):
     window = grid.window(particles.x)
     stencil = make(mpm.BSpline(), mpm.MLSGradient(), grid, window, particles.x, affine=False)
     F, images = components(particles.F), mirror(walls, grid, window)
-    body = MaterialPoints(jax.tree.map(jnp.asarray, LAWS[law]), particles.volume, F, description == "total")
+    body = MaterialPoints(
+        jax.tree.map(jnp.asarray, LAWS[law]), particles.volume, F, description == "total", (0, particles.count), None
+    )
     potential = ElasticPotential((body,), stencil, images)
     mass = images.fold_scalar(p2g(stencil, particles.mass, components(particles.v), None, grid.size)[0])
     fixed = combine(walls, grid.nodes(window), DX, 0.0, 1.0, reference=False).fixed

@@ -24,8 +24,8 @@ def jolted(speed=0.3, side=3, dtype="float64", **scene):
     shape = particles.x.shape
     v, F = speed * rng.normal(size=shape), np.eye(2) + 0.05 * rng.normal(size=(*shape, 2))
     arrays = (particles.x, v, particles.mass, particles.volume, F)
-    x, *others = (jnp.asarray(a, dtype) for a in arrays)
-    return scene, mpm.prepare(scene, mpm.Particles(x, *others, X=x))
+    x, v, mass, volume, F = (jnp.asarray(a, dtype) for a in arrays)
+    return scene, mpm.prepare(scene, mpm.Particles(x, v, mass, volume, (F,), X=x))
 
 
 def squeezed(rate):

@@ -42,7 +42,7 @@ def differences(value, F, G, orders, reach):
     """Derivatives of these orders of a function of F along G, by values at eleven points within a reach of F."""
     t = np.linspace(-1, 1, 11)
     points = F[..., None, :] + reach * t[:, None] * G[..., None, :]
-    values = np.asarray(jax.jit(lambda F: value(F))(points.reshape(*F.shape[:2], -1)))
+    values = np.asarray(jax.jit(lambda F: value(F))(points.reshape(*F.shape[:-1], -1)))
     values = values.reshape(*values.shape[:-1], len(t), F.shape[-1])
     weights = np.linalg.inv(np.vander(t, increasing=True))
     return [factorial(n) / reach**n * np.einsum("t,...tp->...p", weights[n], values) for n in orders]
@@ -119,6 +119,7 @@ def test_every_route_to_a_laws_derivative_is_right(name, d, order):
     """The stress's derivative of first, second and third order; those of implicit steps go as far as the third."""
     law = jax.tree.map(jnp.asarray, LAWS[name])
     F, G = moved_apart(COINCIDING, 1 if name == "tait" else d)
+    F, G = (F[0, 0], G[0, 0]) if name == "tait" else (F, G)
     (exact,) = differences(law.stress, F, G, [order], 0.05)
     found = jax.jit(lambda law, F: {name: route(F) for name, route in routes(law, G)[order].items()})(law, F)
     for route, value in found.items():
@@ -176,6 +177,7 @@ def test_every_route_to_a_return_maps_derivative_is_right(name, d):
     law = jax.tree.map(jnp.asarray, law)
     states = [moved_apart(stretches, d, size) for stretches in (within, beyond)]
     F, G = (jnp.concatenate(parts, axis=-1) for parts in zip(*states, strict=True))
+    F, G = (F[0, 0], G[0, 0]) if name == "fluid" else (F, G)
 
     def return_map(F):
         history = jax.tree.map(lambda a: a + 1e-3 * F[0, 0], law.initial_history(F))
@@ -204,5 +206,5 @@ def test_every_route_to_a_return_maps_derivative_is_right(name, d):
         order, transposed, _ = along[route]
         ours, true = np.asarray(value), exact[order - 1]
         if transposed:
-            ours, true = np.einsum("ijp,ijp->p", ours, G), np.einsum("rp,rp->p", W, true)
+            ours, true = (ours * np.asarray(G)).reshape(-1, ours.shape[-1]).sum(axis=0), np.einsum("rp,rp->p", W, true)
         assert np.abs(ours - true).max() < (1e-10, 1e-7)[order - 1] * max(np.abs(true).max(), 1), route

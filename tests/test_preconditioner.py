@@ -76,7 +76,7 @@ def test_negative_stiffness_is_left_out():
     """Of a fixed corotated body at a tenth of its volume, whose Hessian is indefinite."""
     scene, particles = block(2)
     F = jnp.broadcast_to(0.3 * jnp.eye(2), (len(particles.x), 2, 2))
-    squeezed = mpm.Particles(particles.x, particles.v, particles.mass, particles.volume, F)
+    squeezed = mpm.Particles(particles.x, particles.v, particles.mass, particles.volume, (F,))
     operator = operator_of(scene, squeezed, mpm.AnalyticHessian(), factor=1.0)
     weight, matrix = weight_and_matrix(operator)
     assert np.linalg.eigvalsh(matrix).min() < 0

@@ -11,7 +11,6 @@ from numpy_oracle import grid_update
 
 import mpmjax as mpm
 from mpmjax.implicit._operator import ImplicitOperator
-from mpmjax.material import projected_tangent
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 EACH_LAW = pytest.mark.parametrize("law", **ids(ELASTIC))
@@ -28,7 +27,7 @@ def assembled(tangent, F):
 
 @eqx.filter_jit
 def both(law, F):
-    return assembled(law.tangent(F), F), assembled(projected_tangent(law, F), F)
+    return assembled(law.tangent(F), F), assembled(law.projected_tangent(F), F)
 
 
 @EACH_LAW
@@ -56,7 +55,7 @@ def test_projection_keeps_what_is_positive_and_drops_the_rest(law, family, d):
 
 
 def projected_matrix(law, F):
-    return assembled(projected_tangent(law, F), F)
+    return assembled(law.projected_tangent(F), F)
 
 
 @eqx.filter_jit
@@ -126,7 +125,7 @@ def test_second_derivatives_are_refused(inner, outer, looped):
     law, F = LAWS["fixed_corotated"], jnp.eye(2)[..., None] * 0.95
 
     def once(F):
-        return projected_tangent(law, F).matrix[0, 1, 0]
+        return law.projected_tangent(F).matrix[0, 1, 0]
 
     def entry(F):
         return jax.lax.scan(lambda _, one: (None, once(one)), None, F[None])[1][0] if looped else once(F)
@@ -145,7 +144,9 @@ def compressed(stretch=(0.9, 0.9), spin=0.0, side=3, noise=0.0, law=LAWS["fixed_
     tile = (p.count, 1, 1)
     F = jnp.tile(G, tile) + noise * jnp.asarray(rng.normal(size=(p.count, 2, 2)))
     v = r @ W.T + noise * jnp.asarray(rng.normal(size=r.shape))
-    return scene, mpm.prepare(scene, mpm.Particles(p.x.mean(axis=0) + r, v, p.mass, p.volume, F=F, C=jnp.tile(W, tile)))
+    return scene, mpm.prepare(
+        scene, mpm.Particles(p.x.mean(axis=0) + r, v, p.mass, p.volume, deformations=(F,), C=jnp.tile(W, tile))
+    )
 
 
 def stiffness(scene, particles, hessian):

@@ -160,14 +160,14 @@ def test_particles_of_another_law_are_refused():
     sand, metal = mpm.DruckerPrager(1e4, 0.3, friction_angle=0.6), mpm.VonMises(1e4, 0.3, yield_stress=1e2)
     scene, particles = block(2, material=sand)
     prepared = mpm.prepare(scene, particles)
-    for other, says in ((metal, "history of its own"), (mpm.Fluid(1e4), "F of shape"), ((sand, metal), "2 laws")):
+    for other, says in ((metal, "history of its own"), (mpm.Fluid(1e4), "J of shape"), ((sand, metal), "2 laws")):
         scene = block(2, material=other)[0]
         for refusing in (mpm.prepare, mpm.stable_dt):
             with pytest.raises(ValueError, match=says):
                 refusing(scene, prepared)
     several = mpm.join(particles, particles)
     both = mpm.prepare(block(2, material=(sand, metal))[0], several)
-    with pytest.raises(ValueError, match="several materials"):
+    with pytest.raises(ValueError, match="counts of all materials"):
         mpm.prepare(block(2, material=sand)[0], replace(both, counts=None))
 
 

@@ -33,10 +33,12 @@ def still_run(x, *, volume=1e-3, v=None, **scene) -> mpm.Run:
     f, p, d = x.shape
     F, v = jnp.broadcast_to(jnp.eye(d), (f, p, d, d)), jnp.zeros_like(x) if v is None else v
     size = jnp.full(p, volume)
-    final = mpm.Particles(x=x[-1], v=v[-1], mass=size, volume=size, F=F[-1], C=F[-1])
+    final = mpm.Particles(x=x[-1], v=v[-1], mass=size, volume=size, deformations=(F[-1],), C=F[-1])
     whole = mpm.Scene(mpm.Grid((20,) * d, 0.1), LAWS["neo_hookean"], **scene)
     steps = jnp.arange(float(f))
-    return mpm.Run(whole, mpm.Explicit(), 0.5, steps, State(x, v, F, F), None, final, steps[-1], no_steps(x.dtype))
+    return mpm.Run(
+        whole, mpm.Explicit(), 0.5, steps, State(x, v, F, (F,), (None,)), None, final, steps[-1], no_steps(x.dtype)
+    )
 
 
 def level(width=SIZE[0], height=SIZE[1], focal=200.0) -> Camera:

@@ -127,7 +127,9 @@ def test_a_shift_by_whole_spacings_changes_nothing(method):
     """The frame's place on the lattice does not matter, whether the window is moved by hand or follows."""
     shift, dx = np.array([5, -3]), 0.125
     _, particles = cloud(2, dx=dx)
-    moved = mpm.Particles(particles.x + shift * dx, *(getattr(particles, k) for k in ("v", "mass", "volume", "F", "C")))
+    moved = mpm.Particles(
+        particles.x + shift * dx, *(getattr(particles, k) for k in ("v", "mass", "volume", "deformations", "C"))
+    )
 
     def advanced(particles, by, **window):
         floor = mpm.SlipBox((-np.inf, 0.125 + by[1] * dx), (np.inf, np.inf))

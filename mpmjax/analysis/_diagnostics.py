@@ -1,12 +1,10 @@
 """Mass, momentum and energy of a state."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse.csgraph
 
-from mpmjax import linalg as la
 from mpmjax._types import Array, Float, ParticleScalar, components
 from mpmjax.checks import canonical, checked
 from mpmjax.discretisation import p2g
@@ -60,7 +58,7 @@ _energy = eqx.filter_jit(energy_of)
 
 def energy_density(scene: Scene, particles: Particles) -> ParticleScalar:
     """Ψ of each prepared particle [J/m^d of undeformed volume], shape (p,)."""
-    return jnp.concatenate([c.law.energy(c.F) for c in scene.material_points(particles)])
+    return jnp.concatenate([c.law.energy(c.deformation) for c in scene.material_points(particles)])
 
 
 @checked
@@ -70,8 +68,8 @@ def momentum(particles: Particles) -> Float[Array, "d"]:
 
 
 def volume_ratio(particles: Particles) -> ParticleScalar:
-    """J = det F of each prepared particle [-], shape (p,); det F_E for laws that yield."""
-    return jnp.concatenate([la.determinant(components(F)) for F in jax.tree.leaves(particles.F)])
+    """J = det F of each prepared particle [-], for laws that yield det F_E, shape (p,)."""
+    return jnp.concatenate([group.volume_ratio() for group in particles.groups])
 
 
 def grid_mass(scene: Scene, particles: Particles) -> Float[Array, ""]:

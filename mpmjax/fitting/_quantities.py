@@ -156,9 +156,12 @@ class StressStretch(eqx.Module):
     def __call__(self, scene: Scene, particles: Particles) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Stretch [-] and nominal stress [Pa]."""
         (body,) = scene.material_points(particles)
-        P = body.law.stress(body.F)
-        a = self.axis
-        return (self.weight * body.F[a, a]).sum(), (self.weight * P[a, a]).sum()
+        F, a = body.deformation, self.axis
+        require(
+            F.ndim == 3, f"The curve of a tension test needs a law of F, got {type(body.law).__name__}, of J alone."
+        )
+        P = body.law.stress(F)
+        return (self.weight * F[a, a]).sum(), (self.weight * P[a, a]).sum()
 
 
 class Density(eqx.Module):

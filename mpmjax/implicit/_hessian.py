@@ -7,11 +7,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Matrix, NodeVector
+from mpmjax._types import Deformation, NodeVector
 from mpmjax.checks import require_fields
 from mpmjax.implicit._hessian_action import AbstractHessianAction, ParticleStiffness, TangentAction, particle_stiffness
-from mpmjax.implicit._potential import ElasticPotential, Matrices
-from mpmjax.material import AbstractMaterial, AbstractTangent, projected_tangent
+from mpmjax.implicit._potential import Deformations, ElasticPotential
+from mpmjax.material import AbstractElastic, AbstractTangent
 
 
 class AbstractHessian(eqx.Module):
@@ -38,8 +38,8 @@ class AbstractHessian(eqx.Module):
 class AnalyticHessian(AbstractHessian):
     """The Hessian by the stress differential of the law (derivation, eqs. 7 to 12). Faster than `JvpHessian`.
 
-    With `projected`, the stress differential of each particle is made positive semi-definite first (see
-    `projected_tangent`). M + cH is then positive definite at every compression and step. Particles whose differential
+    With `projected`, the stress differential of each particle is made positive semi-definite first (see the law's
+    `projected_tangent`). M + χH is then positive definite at every compression and step. Particles whose differential
     is positive semi-definite already are not changed. One linear solve then solves another equation, with more damping;
     Newton's method takes other steps to the same solution. First derivatives stay exact; second derivatives raise.
 
@@ -62,9 +62,9 @@ class AnalyticHessian(AbstractHessian):
     def exact(self) -> "AnalyticHessian":
         return AnalyticHessian()
 
-    def _action(self, potential: ElasticPotential, F: Matrices) -> TangentAction:
-        def tangent(law: AbstractMaterial, F: Matrix) -> AbstractTangent:
-            return projected_tangent(law, F) if self.projected else law.tangent(F)
+    def _action(self, potential: ElasticPotential, F: Deformations) -> TangentAction:
+        def tangent(law: AbstractElastic, F: Deformation) -> AbstractTangent:
+            return law.projected_tangent(F) if self.projected else law.tangent(F)
 
         laws = (c.law for c in potential.material_points)
         tangents = tuple(tangent(law, own) for law, own in zip(laws, F, strict=True))
@@ -100,7 +100,7 @@ class _JvpAction(AbstractHessianAction):
         return particle_stiffness(self.potential, tangents, positive_semidefinite=False)
 
 
-def _jvp_tangent(law: AbstractMaterial, F: Matrix) -> Callable[[Matrix], Matrix]:
+def _jvp_tangent(law: AbstractElastic, F: Deformation) -> Callable[[Deformation], Deformation]:
     stress = jax.grad(lambda F: law.energy(F).sum())
     return lambda dF: jax.jvp(stress, (F,), (dF,))[1]
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Float, Matrix, NodeVector, Scalar
+from mpmjax._types import Array, Deformation, Float, NodeVector, Scalar
 from mpmjax.boundary import Mirror
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.implicit._potential import ElasticPotential
@@ -76,7 +76,7 @@ class TangentAction(AbstractHessianAction):
     """
 
     potential: ElasticPotential
-    tangents: tuple[Callable[[Matrix], Matrix], ...]
+    tangents: tuple[Callable[[Deformation], Deformation], ...]
     positive_semidefinite: bool = eqx.field(static=True, default=False)
 
     def is_positive_semidefinite(self) -> bool:
@@ -91,7 +91,10 @@ class TangentAction(AbstractHessianAction):
 
 
 def particle_stiffness(
-    potential: ElasticPotential, tangents: tuple[Callable[[Matrix], Matrix], ...], *, positive_semidefinite: bool
+    potential: ElasticPotential,
+    tangents: tuple[Callable[[Deformation], Deformation], ...],
+    *,
+    positive_semidefinite: bool,
 ) -> ParticleStiffness:
     """H as one matrix for each particle, from the stress differentials of the materials."""
     matrix = potential.stiffness(tangents)
@@ -100,7 +103,7 @@ def particle_stiffness(
 
 @jax.jit
 def _tangent_action(
-    potential: ElasticPotential, tangents: tuple[Callable[[Matrix], Matrix], ...], du: NodeVector
+    potential: ElasticPotential, tangents: tuple[Callable[[Deformation], Deformation], ...], du: NodeVector
 ) -> NodeVector:
     changes = (tangent(dF) for tangent, dF in zip(tangents, potential.strain(du), strict=True))
     return potential.divergence(tuple(changes), du)

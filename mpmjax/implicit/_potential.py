@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Float, Matrix, NodeVector
+from mpmjax._types import Array, Deformation, Float, Matrix, NodeVector
 from mpmjax.boundary import Mirror
 from mpmjax.discretisation import Stencil, gather, scatter
-from mpmjax.material import AbstractMaterial
+from mpmjax.material import AbstractElastic
 from mpmjax.state import MaterialPoints
 
-Matrices = tuple[Float[Array, "_ _ ..."], ...]
-"""One entry for each material, shape (d, d, q), or (1, 1, q) for a law of J alone."""
+Deformations = tuple[Deformation, ...]
+"""One entry for each material, shape (d, d, q), or (q,) for a law of J alone."""
 
 
 class ElasticPotential(eqx.Module):
@@ -29,23 +29,23 @@ class ElasticPotential(eqx.Module):
     stencil: Stencil
     mirror: Mirror
 
-    def strain(self, u: NodeVector) -> Matrices:
+    def strain(self, u: NodeVector) -> Deformations:
         """δF_p = Σ_i u_i h_ipᵀ, one array for each material."""
-        return self.deformed(self._gradient(u))
+        return self.change(self._gradient(u))
 
-    def deformed(self, gradient: Matrix) -> Matrices:
+    def change(self, gradient: Matrix) -> Deformations:
         """δF_p from the gradient Σ_i u_i g_ipᵀ of the displacement."""
-        return tuple(c.deformed(c.own(gradient)) for c in self.material_points)
+        return tuple(c.change(c.own(gradient)) for c in self.material_points)
 
-    def current_deformation(self) -> Matrices:
+    def current_deformation(self) -> Deformations:
         """F_p at u = 0, one array for each material."""
-        return tuple(c.F for c in self.material_points)
+        return tuple(c.deformation for c in self.material_points)
 
-    def deformation(self, u: NodeVector) -> Matrices:
+    def deformation(self, u: NodeVector) -> Deformations:
         """F_p + δF_p at a nodal displacement u [m], shape (n, d), one array for each material."""
         return tuple(F + dF for F, dF in zip(self.current_deformation(), self.strain(u), strict=True))
 
-    def divergence(self, P: Matrices, like: NodeVector) -> NodeVector:
+    def divergence(self, P: Deformations, like: NodeVector) -> NodeVector:
         """Σ_p V0_p P_p h_ip [N], the transpose of `strain`; `like` is any node vector."""
         return self.sum_of(self._flux(P), like)
 
@@ -108,7 +108,7 @@ class ElasticPotential(eqx.Module):
 
         return _joined([matrix(c) for c in self.material_points])
 
-    def stiffness(self, tangents: tuple[Callable[[Matrix], Matrix], ...]) -> Float[Array, "m m p"]:
+    def stiffness(self, tangents: tuple[Callable[[Deformation], Deformation], ...]) -> Float[Array, "m m p"]:
         """The matrices K_p [J] of the Hessian Σ_p g_ip K_p g_jp, one for each particle, shape (d², d², p).
 
         K_p maps the gradient of the displacement to the flux of which the force is the sum; both are flattened with the
@@ -118,9 +118,9 @@ class ElasticPotential(eqx.Module):
             tangents: for each material, the stress differential δF ↦ A : δF of its particles.
         """
 
-        def matrix(c: MaterialPoints, tangent: Callable[[Matrix], Matrix]) -> Array:
+        def matrix(c: MaterialPoints, tangent: Callable[[Deformation], Deformation]) -> Array:
             def flux_of(slopes: Matrix) -> Matrix:
-                return la.transpose(c.flux(tangent(c.deformed(la.transpose(slopes))), self._dim))
+                return la.transpose(c.flux(tangent(c.change(la.transpose(slopes))), self._dim))
 
             return la.matrix_of(flux_of, jnp.zeros((self._dim, self._dim, *c.volume.shape), c.volume.dtype))
 
@@ -134,10 +134,10 @@ class ElasticPotential(eqx.Module):
     def _dim(self) -> int:
         return len(self.stencil.weights)
 
-    def _stress(self, F: Matrices) -> Matrices:
+    def _stress(self, F: Deformations) -> Deformations:
         return tuple(_stress(c.law, own) for c, own in zip(self.material_points, F, strict=True))
 
-    def _flux(self, P: Matrices) -> Matrix:
+    def _flux(self, P: Deformations) -> Matrix:
         return _joined([c.flux(own, self._dim) for c, own in zip(self.material_points, P, strict=True)])
 
 
@@ -146,6 +146,6 @@ def _joined(parts: list[Array]) -> Array:
 
 
 @jax.jit
-def _stress(law: AbstractMaterial, F: Matrix) -> Matrix:
+def _stress(law: AbstractElastic, F: Deformation) -> Deformation:
     """The stress of a law, compiled as one function so that it is traced once."""
     return law.stress(F)

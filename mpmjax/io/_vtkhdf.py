@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax.state import State, by_material, histories
+from mpmjax.state import State, by_material, history_arrays
 
 File = Any
 """An `h5py.File`, whose own annotations do not say what a name leads to."""
@@ -53,16 +53,15 @@ def rows_of(frame: int, time: float, state: State) -> dict[str, np.ndarray]:
     x, v = np.asarray(state.x), np.asarray(state.v)
     p, d = x.shape
     flat = ((0, 0), (0, 3 - d))
-    groups = [np.asarray(F) for F in jax.tree.leaves(state.F)]
-    full = [F if F.shape[1] == d else F ** (1 / d) * np.eye(d, dtype=F.dtype) for F in groups]
+    groups = [np.asarray(own) for _, own, _ in by_material(state)]
     data = {
         "velocity": np.pad(v, flat),
-        "J": np.concatenate([np.linalg.det(F) if F.shape[1] > 1 else F[:, 0, 0] for F in groups]),
-        "deformation_gradient": _padded(np.concatenate(full), 1.0),
+        "J": np.concatenate([_ratio(own) for own in groups]),
+        "deformation_gradient": _padded(np.concatenate([_gradient(own, d) for own in groups]), 1.0),
     }
     if state.C is not None:
         data["affine_velocity"] = _padded(np.asarray(state.C), 0.0)
-    for name, rows, leaf in histories(state):
+    for name, rows, leaf in history_arrays(state):
         data.setdefault(name, np.full(p, np.nan, x.dtype))[rows] = leaf
     first = frame * p
     steps = {"PartOffsets": 0, "NumberOfParts": 1, "PointOffsets": first}  # the one part, read anew at each step
@@ -94,16 +93,28 @@ def states_in(file: File, like: State, start: int, stop: int) -> State:
     def tensors(name: str) -> np.ndarray:
         return read(data[name], 3, 3)[..., :d, :d]
 
-    F, J = tensors("deformation_gradient"), read(data["J"])[..., None, None]
-    each = [(F if q.shape[1] == d else J)[:, rows] for rows, q, _ in by_material(like)]
-    history = [jnp.asarray(read(data[name])[:, rows]) for name, rows, _ in histories(like)]
+    F, J = tensors("deformation_gradient"), read(data["J"])
+    each = [(J if own.ndim == 1 else F)[:, rows] for rows, own, _ in by_material(like)]
+    history = [jnp.asarray(read(data[name])[:, rows]) for name, rows, _ in history_arrays(like)]
     return State(
         x=jnp.asarray(read(file["VTKHDF/Points"], 3)[..., :d]),
         v=jnp.asarray(read(data["velocity"], 3)[..., :d]),
-        F=jax.tree.unflatten(jax.tree.structure(like.F), [jnp.asarray(q) for q in each]),
+        deformations=tuple(jnp.asarray(own) for own in each),
         C=None if like.C is None else jnp.asarray(tensors("affine_velocity")),
-        history=jax.tree.unflatten(jax.tree.structure(like.history), history),
+        histories=jax.tree.unflatten(jax.tree.structure(like.histories), history),
     )
+
+
+def _ratio(own: np.ndarray) -> np.ndarray:
+    """J of one material's particles, of F, shape (q, d, d), or J itself, shape (q,)."""
+    if own.ndim == 1:
+        return own
+    return np.linalg.det(own) if own.shape[1] > 1 else own[:, 0, 0]
+
+
+def _gradient(own: np.ndarray, d: int) -> np.ndarray:
+    """F of one material's particles, shape (q, d, d), where J alone is known J^(1/d) I."""
+    return own if own.ndim > 1 else own[:, None, None] ** (1 / d) * np.eye(d, dtype=own.dtype)
 
 
 def _padded(a: np.ndarray, diagonal: float) -> np.ndarray:

@@ -1,12 +1,10 @@
-"""Base classes of laws, and what a law's stress differential is given as.
+"""Elastic laws of the deformation gradient.
 
 A law is its energy density Ψ(F). Its derivatives default to automatic differentiation; laws with closed forms override
 them.
 """
 
 import abc
-from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,7 +13,10 @@ import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
-from mpmjax.checks import require, require_fields, require_moduli
+from mpmjax.checks import require_fields, require_moduli
+from mpmjax.material._law import AbstractElastic
+from mpmjax.material._projection import projected_tangent
+from mpmjax.material._tangent import AbstractTangent, MatrixTangent, PrincipalTangent
 
 _STRETCHES = (1.25, 0.8, 1.0)
 """Where a law is asked whether it is isotropic: they differ and keep the volume, whose energy may hide the rest."""
@@ -23,69 +24,7 @@ _ANISOTROPIC = 1e-4
 """Relative change of the energy by a rotation from which a law is anisotropic, well above rounding in float32."""
 
 
-class AbstractTangent(eqx.Module):
-    """The stress differential at one deformation: the linear map δF ↦ δP = ∂²Ψ/∂F∂F : δF (derivation, eq. 8).
-
-    It holds everything that does not depend on δF, so that a solver that applies it many times computes that once.
-    """
-
-    @abc.abstractmethod
-    def __call__(self, dF: Matrix) -> Matrix:
-        """δP [Pa] for δF [-], both of shape (d, d, p)."""
-
-
-class MatrixTangent(AbstractTangent):
-    """The stress differential as a d² x d² matrix for each particle."""
-
-    matrix: Float[Array, "m m *p"]
-    """∂²Ψ/∂F∂F [Pa], on the d² components of δF in C order, shape (d², d², *p)."""
-
-    def __call__(self, dF: Matrix) -> Matrix:
-        return la.matmul(self.matrix, dF.reshape(-1, 1, *dF.shape[2:])).reshape(dF.shape)
-
-
-class PrincipalTangent(eqx.Module):
-    """The eigenstructure of an isotropic law's ∂²Ψ/∂F∂F at F = U diag(s) Vᵀ (B. Smith, F. de Goes, T. Kim, ACM Trans.
-    Graph. 38 (2019) 3, doi 10.1145/3241041).
-
-    With e_ij the unit matrices, U (e_ij − e_ji) Vᵀ/√2 is an eigenvector of eigenvalue `twist`, U (e_ij + e_ji) Vᵀ/√2
-    one of eigenvalue `flip`, and the d remaining eigenvectors are U diag(q) Vᵀ with q those of `scaling`.
-    """
-
-    twist: Float[Array, "c *p"]
-    """(∂Ψ/∂s_i + ∂Ψ/∂s_j)/(s_i + s_j) [Pa] for the pairs i < j, in the order (0, 1), (0, 2), (1, 2), shape
-    (d (d − 1)/2, *p)."""
-    flip: Float[Array, "c *p"]
-    """(∂Ψ/∂s_i − ∂Ψ/∂s_j)/(s_i − s_j) [Pa] for the same pairs."""
-    scaling: Matrix
-    """∂²Ψ/∂s_i∂s_j [Pa], shape (d, d, *p)."""
-
-    @classmethod
-    def of(
-        cls,
-        s: Float[Array, "d *p"],
-        twist: Callable[[int, int], Array],
-        flip: Callable[[int, int], Array],
-        scaling: Callable[[int, int], Array],
-    ) -> "PrincipalTangent":
-        """From functions of the indices i, j: twist and flip of each pair i < j, and each entry of the scaling.
-
-        Args:
-            s: signed principal stretches [-], shape (d, *p).
-            twist: the twist of a pair [Pa], shape (*p).
-            flip: the flip of a pair [Pa], shape (*p).
-            scaling: ∂²Ψ/∂s_i∂s_j [Pa], shape (*p).
-        """
-        d, none = s.shape[0], jnp.zeros((0, *s.shape[1:]), s.dtype)
-
-        def over_pairs(entry: Callable[[int, int], Array]) -> Array:
-            return jnp.stack([entry(i, j) for i, j in la.pairs(d)]) if d > 1 else none
-
-        entries = [[scaling(i, j) for j in range(d)] for i in range(d)]
-        return cls(over_pairs(twist), over_pairs(flip), la.assemble(entries))
-
-
-class AbstractMaterial(eqx.Module):
+class AbstractMaterial(AbstractElastic):
     """A hyperelastic law, given by its energy density Ψ(F).
 
     A law needs `energy` alone, and then works with every method, Hessian and description, and under every derivative:
@@ -123,7 +62,7 @@ class AbstractMaterial(eqx.Module):
 
     def stress(self, F: Matrix) -> Matrix:
         """The first Piola-Kirchhoff stress P = ∂Ψ/∂F [Pa], shape (d, d, p). Default: the energy's gradient."""
-        return jax.grad(lambda F: _density(self, F).sum())(F)
+        return super().stress(F)
 
     def tangent(self, F: Matrix) -> AbstractTangent:
         """The stress differential ∂²Ψ/∂F∂F at F, a symmetric map. Default: its matrix, by the derivative of the stress
@@ -159,21 +98,50 @@ class AbstractMaterial(eqx.Module):
             scaling=lambda i, j: entry(i, i, j, j),
         )
 
-    def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
-        """Whether the law is defined at F, shape (p,). Default: where its energy is finite."""
-        return jnp.isfinite(_density(self, F))
+    def projected_tangent(self, F: Matrix) -> MatrixTangent:
+        """The stress differential with its negative eigenvalues set to zero (see `projected_tangent`).
 
+        *When it breaks*: the law must be isotropic; where it has no `principal_tangent` of its own and is not, a
+        `RuntimeError` says so.
+        """
+        if type(self).principal_tangent is AbstractMaterial.principal_tangent:
+            name = type(self).__name__
+            F = eqx.error_if(
+                F,
+                ~is_isotropic(self, F),
+                f"{name} is not isotropic, and the projected Hessian needs a law that is: take AnalyticHessian() "
+                f"without projection or JvpHessian(), or write {name}'s energy in invariants of FᵀF.",
+            )
+        return projected_tangent(self, F)
 
-def _density(law: AbstractMaterial, F: Matrix) -> Array:
-    """A law's energy, which must have the shape of one number a particle."""
-    energy = law.energy(F)
-    require(
-        jnp.shape(energy) == F.shape[2:],
-        f"{type(law).__name__}'s energy must be one number a particle, shape {F.shape[2:]} for F of shape {F.shape}, "
-        f"got shape {jnp.shape(energy)}: F is component first, as the functions of mpmjax.linalg expect it and those "
-        "of jax.numpy.linalg do not.",
-    )
-    return energy
+    def tangent_eigenvalues(self, F: Matrix, dim: int, *, total: bool) -> Float[Array, "m p"]:
+        """All of them: in the principal frame the map is d x d on the diagonal and 2 x 2 on (L_ij, L_ji) for each
+        pair."""
+        del dim
+        _, s, _ = la.principal_frame(F)
+        tangent = self.principal_tangent(s)
+        d = s.shape[0]
+        if total:
+            pull, tau = jnp.ones_like(s), jnp.zeros_like(s)
+        else:
+            P = self.stress(la.diagonal(s))
+            pull, tau = s, s * jnp.stack([P[i, i] for i in range(d)])
+        scaling = tangent.scaling * pull[:, None] * pull + la.diagonal(tau)
+        values = [*la.symmetric_eigen(scaling)[0]]
+        for (i, j), twist, flip in zip(la.pairs(d), tangent.twist, tangent.flip, strict=True):
+            near, far = (flip + twist) / 2 * pull[j] ** 2, (flip + twist) / 2 * pull[i] ** 2
+            across = (flip - twist) / 2 * pull[i] * pull[j] + (tau[i] + tau[j]) / 2
+            centre, radius = (near + far) / 2, jnp.hypot((near - far) / 2, across)
+            values += [centre - radius, centre + radius]
+        return jnp.stack(values)
+
+    def of_gradient(self) -> "AbstractMaterial":
+        """The law itself."""
+        return self
+
+    def inadmissible(self, or_else: str) -> tuple[str, str]:
+        what, _ = super().inadmissible(or_else)
+        return what, f"Reduce dt{or_else}, or use FixedCorotated, which allows inversion."
 
 
 def is_isotropic(law: AbstractMaterial, like: Matrix) -> Bool[Array, "*p"]:
@@ -201,46 +169,6 @@ def is_isotropic(law: AbstractMaterial, like: Matrix) -> Bool[Array, "*p"]:
     one, other = energy(stretch), energy(turn(0.5) @ stretch @ turn(0.8).T)
     size = jnp.maximum(jnp.abs(one), jnp.abs(other))
     return ~(jnp.abs(one - other) > _ANISOTROPIC * size)
-
-
-class AbstractInelastic(eqx.Module):
-    """A law with a history: elastic within a step, and returned to what it admits at the step's end.
-
-    F is the elastic part F_E of the deformation. A step strains it by the elastic law in force, and the return map then
-    takes out of it what does not stay elastic: plastic flow, the opening of sand, a fluid's expansion. Implicit solves
-    see the elastic law alone.
-
-    The history is what a particle remembers besides F_E: a pytree of the law's own, of arrays of shape (p,).
-    """
-
-    @abc.abstractmethod
-    def initial_history(self, F: Matrix) -> Any:
-        """The history of particles that have never yielded, leaves of shape (p,).
-
-        Args:
-            F: F_E [-], shape (d, d, p).
-        """
-
-    @abc.abstractmethod
-    def elastic(self, history: Any) -> AbstractMaterial:
-        """The elastic law at a history."""
-
-    @abc.abstractmethod
-    def return_map(self, F: Matrix, history: Any) -> tuple[Matrix, Any]:
-        """The admissible F_E for a trial one, and the history after it.
-
-        Args:
-            F: the trial F_E [-], shape (d, d, p).
-            history: the history before the step.
-        """
-
-
-Law = AbstractMaterial | AbstractInelastic
-
-
-class AbstractVolumetric(eqx.Module):
-    """Marks a law that depends on J = det F alone: it gets J in the place of F, shape (1, 1, p), and its particles
-    store no more."""
 
 
 class AbstractIsotropic(AbstractMaterial):

@@ -6,8 +6,8 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Matrix, PerParticle
 from mpmjax.checks import require_between, require_fields, require_moduli
-from mpmjax.material._base import AbstractInelastic
 from mpmjax.material._hencky import ElasticStrain, Hencky, no_transverse_strain
+from mpmjax.material._law import AbstractInelastic
 
 
 class DruckerPragerHistory(eqx.Module):

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Compliance, Float, Matrix, PerParticle
-from mpmjax.material._base import AbstractIsotropic, AbstractTangent, PrincipalTangent
+from mpmjax.material._base import AbstractIsotropic
+from mpmjax.material._tangent import AbstractTangent, PrincipalTangent
 
 
 class FixedCorotated(AbstractIsotropic):

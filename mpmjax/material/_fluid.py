@@ -3,18 +3,15 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
+from mpmjax._types import Array, Bool, PerParticle, Scalar
 from mpmjax.checks import require_fields, require_positive
-from mpmjax.material._base import (
-    AbstractInelastic,
-    AbstractMaterial,
-    AbstractVolumetric,
-    MatrixTangent,
-    PrincipalTangent,
-)
+from mpmjax.material._kinematics import VolumeRatio
+from mpmjax.material._law import AbstractInelastic
+from mpmjax.material._tangent import VolumetricTangent
+from mpmjax.material._volumetric import AbstractVolumetric
 
 
-class Fluid(AbstractInelastic, AbstractVolumetric):
+class Fluid(AbstractInelastic):
     """A weakly compressible, inviscid fluid (J. J. Monaghan, J. Comput. Phys. 110 (1994) 399, eq. 2.3,
     doi 10.1006/jcph.1994.1034; in the Material Point Method by J alone: A. P. Tampubolon et al., ACM Trans. Graph. 36
     (2017) 105, doi 10.1145/3072959.3073651).
@@ -46,26 +43,25 @@ class Fluid(AbstractInelastic, AbstractVolumetric):
         require_positive("Fluid's bulk_modulus [Pa]", self.bulk_modulus)
         require_positive("Fluid's exponent", self.exponent)
 
-    def initial_history(self, F: Matrix) -> "NoHistory":
-        """No history."""
-        del F
-        return NoHistory()
+    @property
+    def kinematics(self) -> VolumeRatio:
+        return VolumeRatio()
 
-    def elastic(self, history: "NoHistory") -> "Tait":
+    def initial_history(self, J: Array, /) -> None:
+        """None."""
+        del J
+
+    def elastic(self, history: None) -> "Tait":
         """The equation of state."""
         del history
         return Tait(self.bulk_modulus, self.exponent, self.tension)
 
-    def return_map(self, F: Matrix, history: "NoHistory") -> tuple[Matrix, "NoHistory"]:
+    def return_map(self, J: Array, history: None, /) -> tuple[Array, None]:
         """min(J, 1); with tension J."""
-        return F if self.tension else _pressed(F), history
+        return J if self.tension else _pressed(J), history
 
 
-class NoHistory(eqx.Module):
-    """The empty history of a fluid."""
-
-
-class Tait(AbstractMaterial, AbstractVolumetric):
+class Tait(AbstractVolumetric):
     """Tait's equation of state, as F. D. Murnaghan integrated it (Proc. Natl. Acad. Sci. 30 (1944) 244,
     doi 10.1073/pnas.30.9.244): p = −dΨ/dJ = K/γ (J^−γ − 1), a bulk modulus that rises by γ p.
 
@@ -90,34 +86,26 @@ class Tait(AbstractMaterial, AbstractVolumetric):
         require_positive("Tait's bulk_modulus [Pa]", self.bulk_modulus)
         require_positive("Tait's exponent", self.exponent)
 
-    def energy(self, F: Matrix) -> Array:
+    def energy(self, J: Array, /) -> Array:
         """Ψ = K/γ (J − 1 + (J^{1−γ} − 1)/(γ − 1))."""
-        J = self._acting(F)[0, 0]
-        return self.bulk_modulus / self.exponent * (J - 1 + _raised(J, 1 - self.exponent))
+        acting = self._acting(J)
+        return self.bulk_modulus / self.exponent * (acting - 1 + _raised(acting, 1 - self.exponent))
 
-    def stress(self, F: Matrix) -> Matrix:
+    def stress(self, J: Array, /) -> Array:
         """dΨ/dJ = −p."""
-        return self.bulk_modulus / self.exponent * (1 - self._acting(F) ** -self.exponent)
+        return self.bulk_modulus / self.exponent * (1 - self._acting(J) ** -self.exponent)
 
-    def tangent(self, F: Matrix) -> MatrixTangent:
+    def tangent(self, J: Array, /) -> VolumetricTangent:
         """d²Ψ/dJ² = K J^{−1−γ}."""
-        return MatrixTangent(self._stiffness(F))
+        stiffness = self.bulk_modulus * self._acting(J) ** (-1 - self.exponent)
+        return VolumetricTangent(stiffness if self.tension else jnp.where(J > 1, 0, stiffness))
 
-    def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
-        """One stretch, J, and no pair."""
-        none = jnp.zeros((0, *s.shape[1:]), s.dtype)
-        return PrincipalTangent(none, none, self._stiffness(s[None]))
-
-    def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
+    def is_admissible(self, J: Array, /) -> Bool[Array, "p"]:
         """J > 0."""
-        return F[0, 0] > 0
+        return J > 0
 
     def _acting(self, J: Array) -> Array:
         return J if self.tension else _pressed(J)
-
-    def _stiffness(self, J: Array) -> Array:
-        stiffness = self.bulk_modulus * self._acting(J) ** (-1 - self.exponent)
-        return stiffness if self.tension else jnp.where(J > 1, 0, stiffness)
 
 
 def _pressed(J: Array) -> Array:

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 from mpmjax.linalg import Logarithm, PowerLessOne
-from mpmjax.material._base import AbstractIsotropic, PrincipalTangent
+from mpmjax.material._base import AbstractIsotropic
+from mpmjax.material._tangent import PrincipalTangent
 
 _log = Logarithm()
 

@@ -9,8 +9,8 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 from mpmjax.checks import require_between, require_fields, require_moduli, require_positive
 from mpmjax.linalg import AbstractSpectral
-from mpmjax.material._base import AbstractInelastic
 from mpmjax.material._elastic import FixedCorotated
+from mpmjax.material._law import AbstractInelastic
 
 
 class SnowHistory(eqx.Module):

@@ -1,35 +1,15 @@
 """Viscosity, added to any law."""
 
-import equinox as eqx
-import jax.numpy as jnp
+from typing import Any
 
-from mpmjax import linalg as la
-from mpmjax._types import Array, Matrix, PerParticle
+from mpmjax._types import Deformation, PerParticle
 from mpmjax.checks import require, require_between, require_fields
-from mpmjax.material._base import Law
+from mpmjax.material._kinematics import AbstractKinematics
+from mpmjax.material._law import AbstractElastic, AbstractLaw
+from mpmjax.material._viscosity import Viscosity
 
 
-class Viscosity(eqx.Module):
-    """A Newtonian viscous stress, linear in the velocity gradient L = ∇_x v."""
-
-    shear: PerParticle
-    """η [Pa s]."""
-    bulk: PerParticle
-    """ζ [Pa s]."""
-
-    def stress(self, L: Matrix) -> Matrix:
-        """σ_v = 2η dev D + ζ tr(D) I [Pa], D = ½ (L + Lᵀ), dev D = D − ⅓ tr(D) I in every dimension."""
-        twice = L + la.transpose(L)
-        spherical = (self.bulk - 2 / 3 * self.shear) * la.trace(L)
-        return self.shear * twice + spherical * la.identity_like(L)
-
-    def stiffest(self, dim: int) -> Array:
-        """The largest eigenvalue [Pa s] of L ↦ σ_v: 2η for shear, 2η (1 − d/3) + dζ for even expansion."""
-        even = 2 * (1 - dim / 3) * self.shear + dim * self.bulk
-        return jnp.asarray(even) if dim == 1 else jnp.maximum(2 * self.shear, even)
-
-
-class Viscous(eqx.Module):
+class Viscous(AbstractLaw):
     """A law with a Newtonian viscosity: to the law's stress is added
 
         σ_v = 2η dev D + ζ tr(D) I,    D = sym ∇_x v,    dev D = D − ⅓ tr(D) I (plane strain in two dimensions).
@@ -51,13 +31,13 @@ class Viscous(eqx.Module):
         bulk_viscosity: ζ [Pa s], likewise.
     """
 
-    law: Law
+    law: AbstractLaw
     shear_viscosity: PerParticle
     bulk_viscosity: PerParticle = 0.0
 
     def __check_init__(self):
-        require(not isinstance(self.law, Viscous), "Viscous takes a law that is not viscous yet: add the viscosities.")
         require_fields(self)
+        require(self.law.viscous_part() is None, "Viscous takes a law that is not viscous yet: add the viscosities.")
         require_between("Viscous's shear_viscosity [Pa s]", self.shear_viscosity, 0, float("inf"))
         require_between("Viscous's bulk_viscosity [Pa s]", self.bulk_viscosity, 0, float("inf"))
 
@@ -65,3 +45,29 @@ class Viscous(eqx.Module):
     def viscosity(self) -> Viscosity:
         """The viscosity without the law."""
         return Viscosity(self.shear_viscosity, self.bulk_viscosity)
+
+    @property
+    def kinematics(self) -> AbstractKinematics:
+        return self.law.kinematics
+
+    @property
+    def allows_total(self) -> bool:
+        return self.law.allows_total
+
+    def initial_history(self, F: Deformation) -> Any:
+        return self.law.initial_history(F)
+
+    def elastic(self, history: Any) -> AbstractElastic:
+        return self.law.elastic(history)
+
+    def return_map(self, F: Deformation, history: Any) -> tuple[Deformation, Any]:
+        return self.law.return_map(F, history)
+
+    def viscous_part(self) -> Viscosity:
+        return self.viscosity
+
+    def title(self) -> str:
+        return self.law.title()
+
+    def inadmissible(self, or_else: str) -> tuple[str, str]:
+        return self.law.inadmissible(or_else)

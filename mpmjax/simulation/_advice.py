@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from mpmjax.material import AbstractInelastic, AbstractVolumetric, Law
+from mpmjax.material import AbstractLaw
 from mpmjax.state import Particles, Scene
 from mpmjax.stepping import SAFETY, AbstractIntegrator, UnknownBoundError, longest_step
 
@@ -43,21 +43,11 @@ def advise(scene: Scene, method: AbstractIntegrator, dt: Any, began: Particles, 
     return f"{said}. Take a dt of {shorter}, or an implicit method that has no limit. If the fault stays, {shortly}"
 
 
-def disallowed(law: Law, method: AbstractIntegrator) -> tuple[str, str]:
-    """What is wrong with an F that the law does not allow, and what helps."""
+def disallowed(law: AbstractLaw, method: AbstractIntegrator) -> tuple[str, str]:
+    """What is wrong with a deformation that the law does not allow, and what helps."""
     newton = (
         ""
         if method.is_explicit or method.keeps_admissible
         else ", or take BackwardEuler(), whose line search forbids it"
     )
-    match law:
-        case AbstractVolumetric():
-            what = f"has a volume that {type(law).__name__} does not allow (J ≤ 0)"
-            advice = f"Reduce dt: a step must keep Δt |div v| below 1{newton}."
-        case AbstractInelastic():
-            what = f"has a deformation gradient that {type(law).__name__} does not allow (det F ≤ 0)"
-            advice = f"Reduce dt: a step must keep Δt |∇v| below 1{newton}."
-        case _:
-            what = f"has a deformation gradient that {type(law).__name__} does not allow (det F ≤ 0)"
-            advice = f"Reduce dt{newton}, or use FixedCorotated, which allows inversion."
-    return what, advice
+    return law.inadmissible(newton)

@@ -53,10 +53,10 @@ def faulty_particles(problem: Problem, state: State) -> tuple[Bool[Array, "p"], 
     """Which particles are not finite, which have left the window, and which have an F that the law does not allow."""
     scene, particles = problem.scene, problem.at(state)
     finite = _finite((particles.x, particles.v, particles.C))
-    finite = finite & jnp.concatenate([_finite((group.F, group.history)) for group in particles.groups])
+    finite = finite & jnp.concatenate([_finite((group.stored, group.history)) for group in particles.groups])
     anchor = scene.anchor(particles)
     outside = ~in_window(scene.kernel, scene.grid, scene.window(particles), anchor)
-    admitted = jnp.concatenate([c.law.is_admissible(c.F) for c in scene.material_points(particles)])
+    admitted = jnp.concatenate([c.law.is_admissible(c.deformation) for c in scene.material_points(particles)])
     return ~finite, finite & outside, finite & ~admitted
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from mpmjax._types import Array
 from mpmjax.autodiff import guard
 from mpmjax.checks import requirements, warn
-from mpmjax.material import Law
+from mpmjax.material import AbstractLaw
 from mpmjax.simulation._advice import advise, disallowed
 from mpmjax.simulation._diffrax import Problem, faulty_particles, passed_particles
 from mpmjax.simulation._rollout_state import RolloutState
@@ -105,9 +105,9 @@ def warn_of_inaccurate_solves(statistics: RunStatistics) -> None:
         )
 
 
-def _law(run: Run, particle: int) -> Law:
+def _law(run: Run, particle: int) -> AbstractLaw:
     """The law of a particle, by its number."""
-    last = np.cumsum(run.final.counts or (run.final.count,))
+    last = np.cumsum(run.final.sizes)
     return run.scene.laws[int(np.searchsorted(last, particle, side="right"))]
 
 

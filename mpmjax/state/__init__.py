@@ -4,7 +4,7 @@ from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, TotalLagrangian, UpdatedLagrangian
 from mpmjax.state._fill import fill
 from mpmjax.state._material_points import MaterialPoints
-from mpmjax.state._particles import Particles, State, by_material, histories, join, state_of, with_state
+from mpmjax.state._particles import Particles, State, by_material, history_arrays, join, state_of, with_state
 from mpmjax.state._preparation import is_prepared, prepare
 from mpmjax.state._scene import Scene
 
@@ -19,7 +19,7 @@ __all__ = [
     "UpdatedLagrangian",
     "by_material",
     "fill",
-    "histories",
+    "history_arrays",
     "is_prepared",
     "join",
     "prepare",

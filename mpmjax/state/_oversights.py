@@ -106,7 +106,7 @@ def _thin(grid: Grid, boundary: Boundaries, particles: Particles) -> Iterator[st
     """Warnings of materials less than two cells thick in a direction in which no wall or plane lies beside them."""
     dx, places = float(grid.spacing), np.asarray(particles.x)
     side = np.asarray(particles.volume) ** (1 / grid.dim)
-    ends = np.cumsum([0, *(particles.counts or (particles.count,))])
+    ends = np.cumsum([0, *particles.sizes])
     for number, (start, stop) in enumerate(itertools.pairwise(ends), 1):
         half = side[start:stop, None] / 2
         lower, upper = (places[start:stop] - half).min(axis=0), (places[start:stop] + half).max(axis=0)

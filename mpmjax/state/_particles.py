@@ -9,17 +9,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from mpmjax._types import Array, Matrix, ParticleMatrix, ParticleScalar, ParticleVector, components
+from mpmjax import linalg as la
+from mpmjax._types import Array, Deformation, ParticleMatrix, ParticleScalar, ParticleVector, components
 from mpmjax.checks import checked, require, require_fields, require_positive
 
-Deformations = Float[Array, "*f _ _ _"] | tuple[Float[Array, "*f _ _ _"], ...]
+Deformations = tuple[Float[Array, "..."] | None, ...]
 
 
 class Particles(eqx.Module):
     """A set of particles. `fill` makes x, v, mass and volume; `prepare` adds what the scene needs.
 
-    Only x, v, C, F and history change with time. Every leaf is a float array of one dtype. Particles
-    of several materials lie group after group (see `join`), and F and history have one entry a group.
+    Only x, v, C, deformations and histories change with time. Every leaf is a float array of one dtype. Particles of
+    several materials lie group after group (see `join`). Deformations and histories have one entry a material, None
+    until they are known; `F` and `history` are those of the only material.
     """
 
     x: ParticleVector
@@ -30,18 +32,26 @@ class Particles(eqx.Module):
     """Masses [kg], shape (p,)."""
     volume: ParticleScalar
     """Undeformed volumes V0 [m^d], shape (p,)."""
-    F: Deformations | None = None
-    """Deformation gradients [-], for laws that yield their elastic part, shape (p, d, d); J = det F, shape (p, 1, 1),
-    for laws that depend on J only."""
+    deformations: Deformations = ()
+    """For each material the deformation gradients F [-], for laws that yield their elastic part, shape (q, d, d); for
+    laws that depend on J = det F only, J, shape (q,)."""
     C: ParticleMatrix | None = None
     """Velocity gradients ∇_x v [1/s], in the total description ∇_X v, shape (p, d, d): the affine velocities of APIC,
     and what viscosity resists."""
     X: ParticleVector | None = None
     """Reference positions [m], shape (p, d), in the total description."""
-    history: Any = None
-    """The history of laws that yield, a pytree of arrays of shape (p,) each; see the law."""
+    histories: tuple[Any, ...] = ()
+    """For each material the history of a law that yields, a pytree of arrays of shape (q,) each (see the law); else
+    None."""
     counts: tuple[int, ...] | None = eqx.field(static=True, default=None)
     """Number of particles of each of several materials; None if there is one."""
+
+    def __post_init__(self):
+        materials = len(self.counts or (0,))
+        for name in ("deformations", "histories"):
+            known = getattr(self, name)
+            if isinstance(known, tuple) and not jax.tree.leaves(known):
+                setattr(self, name, (None,) * materials)
 
     def __check_init__(self):
         require_fields(self)
@@ -57,11 +67,15 @@ class Particles(eqx.Module):
             len(dtypes) == 1 and dtypes <= {"float32", "float64"},
             f"Particles need arrays of one precision, float32 or float64, got {', '.join(sorted(dtypes))}.",
         )
-        some = not isinstance(self.F, tuple) or len(self.F) > 0
-        require(some, "F of several materials must be a sequence of arrays, one a material, got none.")
         require(
             self.counts is None or (sum(self.counts) == p and min(self.counts) > 0),
             f"The counts of the materials' particles must be positive and add up to {p}, got {self.counts}.",
+        )
+        given = len(self.deformations), len(self.histories)
+        require(
+            given == (len(self.sizes),) * 2,
+            f"Particles of {len(self.sizes)} materials need as many deformations and histories, got {given[0]} and "
+            f"{given[1]}: give the counts of all materials, or drop deformations and histories.",
         )
         require_positive("Particle masses [kg]", self.mass)
         require_positive("Particle volumes [m^d]", self.volume)
@@ -77,46 +91,68 @@ class Particles(eqx.Module):
         return self.x.shape[1]
 
     @property
-    def groups(self) -> tuple["Group", ...]:
-        """The particles of each material."""
-        if self.counts is None:
-            if isinstance(self.F, tuple):
-                raise ValueError("F is that of several materials: give their counts, or drop F and history.")
-            return (Group(None, self.F, self.history),)
-        ends = pairwise(accumulate(self.counts, initial=0))
-        F, history = ((None,) * len(self.counts) if a is None else a for a in (self.F, self.history))
-        return tuple(Group(*group) for group in zip(ends, F, history, strict=True))
+    def sizes(self) -> tuple[int, ...]:
+        """Number of particles of each material."""
+        return self.counts or (self.count,)
 
-    def deformation(self) -> Matrix:
-        """F component first, shape (d, d, p).
+    @property
+    def F(self) -> Any:  # noqa: N802
+        """What `deformations` has of the only material: F, shape (p, d, d), or J, shape (p,); None until it is known.
 
         Raises:
-            ValueError: the particles are not prepared, or of several materials.
+            ValueError: the particles are of several materials.
         """
-        if self.counts is not None:
-            raise ValueError("The particles are of several materials, with an F each: ask one of their groups.")
-        return self.groups[0].deformation()
+        return _only(self.deformations, "F", "deformations")
+
+    @property
+    def history(self) -> Any:
+        """What `histories` has of the only material.
+
+        Raises:
+            ValueError: the particles are of several materials.
+        """
+        return _only(self.histories, "history", "histories")
+
+    @property
+    def groups(self) -> tuple["Group", ...]:
+        """The particles of each material."""
+        ends = pairwise(accumulate(self.sizes, initial=0))
+        return tuple(Group(*group) for group in zip(ends, self.deformations, self.histories, strict=True))
+
+
+def _only(each: tuple, name: str, field: str) -> Any:
+    """The entry of the only material."""
+    if len(each) != 1:
+        raise ValueError(
+            f"The particles are of {len(each)} materials, each with its own {name}: take {field}, one entry a material."
+        )
+    return each[0]
 
 
 class Group(eqx.Module):
     """The particles of one material."""
 
-    rows: tuple[int, int] | None = eqx.field(static=True)
-    """First particle, and the one after the last; None for all particles."""
-    F: Float[Array, "*f q e e"] | None
-    """Shape (q, e, e)."""
+    rows: tuple[int, int] = eqx.field(static=True)
+    """First particle, and the one after the last."""
+    stored: Float[Array, "q ..."] | None
+    """Their entry of `Particles.deformations`."""
     history: Any
     """Leaves of shape (q,)."""
 
-    def deformation(self) -> Matrix:
-        """F component first, shape (e, e, q).
+    def deformation(self) -> Deformation:
+        """F component first, shape (d, d, q), or J, shape (q,).
 
         Raises:
             ValueError: the particles are not prepared.
         """
-        if self.F is None:
+        if self.stored is None:
             raise ValueError("The particles have no deformation gradient yet: call prepare(scene, particles) first.")
-        return components(self.F)
+        return components(self.stored)
+
+    def volume_ratio(self) -> Float[Array, "q"]:
+        """J = det F [-], shape (q,)."""
+        found = self.deformation()
+        return found if found.ndim == 1 else la.determinant(found)
 
 
 @checked
@@ -125,20 +161,21 @@ def join(*sets: Particles) -> Particles:
     all sets have that one.
 
     Args:
-        sets: particles of one dimension and precision, as `fill` makes them: F, C, X and history are not joined.
+        sets: particles of one dimension and precision, as `fill` makes them: deformations, C, X and histories are not
+            joined.
 
     Raises:
         ValueError: sets that differ in dimension or precision, or that are prepared.
     """
     require(len(sets) > 0, "There must be particles to join.")
-    plain = all(leaf is None for q in sets for leaf in (q.F, q.C, q.X, q.history))
+    plain = not any(jax.tree.leaves((q.deformations, q.C, q.X, q.histories)) for q in sets)
     require(plain, "Join particles before they are prepared: F, C, X and history follow from the scene.")
     kinds = {(q.dim, str(q.x.dtype)) for q in sets}
     require(len(kinds) == 1, f"Joined particles must have one dimension and precision, got {sorted(kinds)}.")
     arrays: dict[str, Any] = {
         name: jnp.concatenate([getattr(q, name) for q in sets]) for name in ("x", "v", "mass", "volume")
     }
-    counts = tuple(n for q in sets for n in (q.counts or (q.count,)))
+    counts = tuple(n for q in sets for n in q.sizes)
     return Particles(**arrays, counts=counts if len(counts) > 1 else None)
 
 
@@ -148,22 +185,30 @@ class State(eqx.Module):
     x: Float[Array, "*f p d"]
     v: Float[Array, "*f p d"]
     C: Float[Array, "*f p d d"] | None
-    F: Deformations
-    history: Any = None
+    deformations: Deformations
+    histories: tuple[Any, ...]
+
+    @property
+    def F(self) -> Any:  # noqa: N802
+        """What `deformations` has of the only material (see `Particles.F`)."""
+        return _only(self.deformations, "F", "deformations")
+
+    @property
+    def history(self) -> Any:
+        """What `histories` has of the only material."""
+        return _only(self.histories, "history", "histories")
 
 
 def by_material(held: Particles | State) -> list[tuple[slice, Any, Any]]:
-    """Rows, F and history of each material, of prepared particles or of a state of them."""
-    groups, several = jax.tree.leaves(held.F), isinstance(held.F, tuple)
-    ends = pairwise(accumulate((len(F) for F in groups), initial=0))
-    return [
-        (slice(*rows), F, held.history[i] if several else held.history)
-        for i, (rows, F) in enumerate(zip(ends, groups, strict=True))
-    ]
+    """Rows, deformation and history of each material, of prepared particles or of a state of them."""
+    deformations: tuple[Any, ...] = held.deformations
+    ends = pairwise(accumulate(map(len, deformations), initial=0))
+    groups = zip(ends, deformations, held.histories, strict=True)
+    return [(slice(*rows), deformation, history) for rows, deformation, history in groups]
 
 
-def histories(held: Particles | State) -> list[tuple[str, slice, Any]]:
-    """Name, rows and values of each array of the laws' histories, in the order of the leaves of `history`."""
+def history_arrays(held: Particles | State) -> list[tuple[str, slice, Any]]:
+    """Name, rows and values of each array of the laws' histories, in the order of the leaves of `histories`."""
     return [
         (path[-1].name, rows, leaf)
         for rows, _, history in by_material(held)
@@ -173,10 +218,11 @@ def histories(held: Particles | State) -> list[tuple[str, slice, Any]]:
 
 def state_of(particles: Particles) -> State:
     """The evolving part of prepared particles."""
-    assert particles.F is not None
-    return State(particles.x, particles.v, particles.C, particles.F, particles.history)
+    return State(particles.x, particles.v, particles.C, particles.deformations, particles.histories)
 
 
 def with_state(particles: Particles, state: State) -> Particles:
     """The particles with their evolving part replaced."""
-    return replace(particles, x=state.x, v=state.v, C=state.C, F=state.F, history=state.history)
+    return replace(
+        particles, x=state.x, v=state.v, C=state.C, deformations=state.deformations, histories=state.histories
+    )

@@ -22,7 +22,7 @@ from mpmjax.checks import (
 from mpmjax.discretisation import (
     in_window,
 )
-from mpmjax.material import AbstractInelastic, AbstractVolumetric, Law
+from mpmjax.material import AbstractLaw
 from mpmjax.state._oversights import warn_of_oversights
 from mpmjax.state._particles import Group, Particles
 from mpmjax.state._scene import Scene
@@ -46,23 +46,23 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
     require(d == scene.grid.dim, f"The particles are {d}-dimensional, the grid {scene.grid.dim}-dimensional.")
     requirements((scene, particles))
     still = jnp.zeros((p, d, d), particles.x.dtype)
-    several = isinstance(scene.material, tuple)
-    counts = particles.counts or (p,)
+    sizes = particles.sizes if len(scene.laws) > 1 else (p,)
     require(
-        not several or len(counts) == len(scene.laws),
+        len(sizes) == len(scene.laws),
         f"The scene has {len(scene.laws)} laws, so the particles must be {len(scene.laws)} sets joined by mpmjax.join, "
-        f"in the laws' order, got {len(counts)}.",
+        f"in the laws' order, got {len(sizes)}.",
     )
-    particles = replace(particles, counts=counts if several else None)
+    first = not jax.tree.leaves(particles.deformations)
+    particles = replace(particles, counts=sizes if len(sizes) > 1 else None)
     require(
-        not scene.total or particles.X is not None or all(group.F is None for group in particles.groups),
+        not scene.total or particles.X is not None or first,
         "In the total description particles with an F need the X from which it is measured: give X, or drop F.",
     )
     own = [_prepared(law, group, particles) for law, group in zip(scene.laws, particles.groups, strict=True)]
     prepared = replace(
         particles,
-        F=tuple(F for F, _ in own) if several else own[0][0],
-        history=tuple(history for _, history in own) if several else own[0][1],
+        deformations=tuple(deformation for deformation, _ in own),
+        histories=tuple(history for _, history in own),
         C=(still if particles.C is None else particles.C) if scene.keeps_gradient else None,
         X=(particles.x if particles.X is None else particles.X) if scene.total else None,
     )
@@ -70,7 +70,7 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
     if not is_traced((scene, prepared)):
         known = canonical(scene, particles.x.dtype)
         _check_placement(known, prepared)
-        if particles.F is None:
+        if first:
             warn_of_oversights(known.grid, known.kernel, known.boundary, prepared, total=scene.total)
     return prepared
 
@@ -89,29 +89,29 @@ def _check_size(scene: Scene, particles: Particles) -> None:
     )
 
 
-def _prepared(law: Law, group: Group, particles: Particles) -> tuple[Array, Any]:
-    """F and history of one material's particles."""
-    start, stop = group.rows or (0, particles.count)
-    e = 1 if isinstance(law, AbstractVolumetric) else particles.dim
-    shape = (stop - start, e, e)
-    undeformed = jnp.asarray(np.eye(e, dtype=particles.x.dtype))
-    F = jnp.broadcast_to(undeformed, shape) if group.F is None else group.F
-    require(F.shape == shape, f"{type(law).__name__} needs F of shape {shape}, got {F.shape}.")
-    if not isinstance(law, AbstractInelastic):
-        return F, None
+def _prepared(law: AbstractLaw, group: Group, particles: Particles) -> tuple[Array, Any]:
+    """Deformation and history of one material's particles."""
+    start, stop = group.rows
+    kept = law.kinematics
+    undeformed = jnp.asarray(kept.undeformed(particles.dim), particles.x.dtype)
+    shape = (stop - start, *undeformed.shape)
+    known = jnp.broadcast_to(undeformed, shape) if group.stored is None else group.stored
+    require(known.shape == shape, f"{law.title()} needs {kept.symbol} of shape {shape}, got {known.shape}.")
+    if group.history is None:
+        return known, law.initial_history(components(known))
+    expected = jax.eval_shape(law.initial_history, components(known))
     require(
-        group.history is None or _remembers(law, F, group.history),
-        f"{type(law).__name__} needs a history of its own, got {type(group.history).__name__}: drop it to start anew.",
+        expected is None or _alike(expected, group.history),
+        f"{law.title()} needs a history of its own, got {type(group.history).__name__}: drop it to start anew.",
     )
-    return F, law.initial_history(components(F)) if group.history is None else group.history
+    return known, None if expected is None else group.history
 
 
-def _remembers(law: AbstractInelastic, F: Array, history: Any) -> bool:
-    """Whether a history is one of the law's, for particles with this F."""
-    own = jax.eval_shape(law.initial_history, components(F))
-    if jax.tree.structure(own) != jax.tree.structure(history):
+def _alike(own: Any, other: Any) -> bool:
+    """Whether histories are of one structure, and their arrays of one shape each."""
+    if jax.tree.structure(own) != jax.tree.structure(other):
         return False
-    return all(a.shape == b.shape for a, b in zip(jax.tree.leaves(own), jax.tree.leaves(history), strict=True))
+    return all(a.shape == b.shape for a, b in zip(jax.tree.leaves(own), jax.tree.leaves(other), strict=True))
 
 
 def is_prepared(scene: Scene, particles: Particles) -> bool:
@@ -119,15 +119,16 @@ def is_prepared(scene: Scene, particles: Particles) -> bool:
     has_affine, has_reference = particles.C is not None, particles.X is not None
     if has_affine != scene.keeps_gradient or has_reference != scene.total:
         return False
-    several = isinstance(scene.material, tuple)
-    if several != (particles.counts is not None) or (several and len(scene.laws) != len(particles.groups)):
+    if len(scene.laws) != len(particles.sizes):
         return False
-    return all(
-        group.F is not None
-        and (group.F.shape[-1] == 1 if isinstance(law, AbstractVolumetric) else group.F.shape[-1] == particles.dim)
-        and (_remembers(law, group.F, group.history) if isinstance(law, AbstractInelastic) else group.history is None)
-        for law, group in zip(scene.laws, particles.groups, strict=True)
-    )
+    return all(_fits(law, group, particles.dim) for law, group in zip(scene.laws, particles.groups, strict=True))
+
+
+def _fits(law: AbstractLaw, group: Group, dim: int) -> bool:
+    """Whether deformation and history of one material's particles are of the shapes that the law needs."""
+    if group.stored is None or group.stored.shape[1:] != law.kinematics.undeformed(dim).shape:
+        return False
+    return _alike(jax.eval_shape(law.initial_history, components(group.stored)), group.history)
 
 
 def _check_placement(scene: Scene, particles: Particles) -> None:
@@ -151,18 +152,19 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
                 f"{int(np.argmax(beyond))} does not: move it or change the plane's keep.",
             )
     for law, group in zip(scene.laws, particles.groups, strict=True):
-        rows = particles.count if group.rows is None else group.rows[1] - group.rows[0]
+        rows = group.rows[1] - group.rows[0]
         sizes = {jnp.size(leaf) for leaf in jax.tree.leaves(law)}
         require(
             sizes <= {1, rows},
-            f"{type(law).__name__}'s parameters must be one number or one for each of its {rows} particles, got "
+            f"{law.title()}'s parameters must be one number or one for each of its {rows} particles, got "
             f"{sorted(sizes - {1, rows})} of them.",
         )
     for part in scene.material_points(particles):
-        allowed = np.asarray(eqx.filter_jit(part.law.is_admissible)(part.F))
-        first = int(np.argmin(allowed)) + (part.rows[0] if part.rows else 0)
+        kept = part.law.kinematics
+        allowed = np.asarray(eqx.filter_jit(part.law.is_admissible)(part.deformation))
+        first = int(np.argmin(allowed)) + part.rows[0]
         require(
             allowed,
-            f"{type(part.law).__name__} does not allow the F of particle {first} (most laws need det F > 0): start "
-            "from an admissible one.",
+            f"{type(part.law).__name__} does not allow the {kept.symbol} of particle {first} (most laws need "
+            f"{kept.volume} > 0): start from an admissible one.",
         )

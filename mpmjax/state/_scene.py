@@ -21,10 +21,10 @@ from mpmjax.discretisation import (
     Stencil,
     make_stencil,
 )
-from mpmjax.material import AbstractInelastic, AbstractVolumetric, Law, Viscous
+from mpmjax.material import AbstractLaw
 from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, UpdatedLagrangian
-from mpmjax.state._material_points import Laws, MaterialPoints, material_points, return_map, split
+from mpmjax.state._material_points import MaterialPoints, material_points, return_map
 from mpmjax.state._particles import Particles
 
 
@@ -53,7 +53,7 @@ class Scene(eqx.Module):
     """
 
     grid: Grid
-    material: Laws
+    material: AbstractLaw | tuple[AbstractLaw, ...]
     gravity: Point
     boundary: tuple[AbstractBoundary, ...]
     kernel: BSpline
@@ -66,7 +66,7 @@ class Scene(eqx.Module):
     def __init__(
         self,
         grid: Grid,
-        material: Laws | list[Law | Viscous],
+        material: AbstractLaw | tuple[AbstractLaw, ...] | list[AbstractLaw],
         *,
         gravity: Point | None = None,
         boundary: AbstractBoundary | tuple[AbstractBoundary, ...] | list[AbstractBoundary] = (),
@@ -100,34 +100,30 @@ class Scene(eqx.Module):
             boundary.check(self.grid, total=self.total)
         if self.total:
             require(not self.grid.follow, "In the total description the window cannot follow: drop follow=True.")
-            flowing = [law for law in self.laws if isinstance(law, AbstractInelastic | AbstractVolumetric)]
+            flowing = [law.title() for law in self.laws if not law.allows_total]
             require(
                 not flowing,
                 "The total description keeps the deformation from the start, which what yields or flows does not know: "
-                f"use the updated one for {', '.join(type(law).__name__ for law in flowing)}.",
+                f"use the updated one for {', '.join(flowing)}.",
             )
 
     @property
-    def laws(self) -> tuple[Law, ...]:
-        """The laws, one for each material, without viscosities."""
-        return tuple(split(law)[0] for law in self._materials)
+    def laws(self) -> tuple[AbstractLaw, ...]:
+        """The laws, one for each material."""
+        return self.material if isinstance(self.material, tuple) else (self.material,)
 
     @property
     def keeps_gradient(self) -> bool:
         """Whether particles keep the velocity gradient C: for the transfer, or for a viscosity."""
-        return self.transfer.affine or any(isinstance(law, Viscous) for law in self._materials)
-
-    @property
-    def _materials(self) -> tuple[Law | Viscous, ...]:
-        return self.material if isinstance(self.material, tuple) else (self.material,)
+        return self.transfer.affine or any(law.viscous_part() is not None for law in self.laws)
 
     def material_points(self, particles: Particles) -> tuple[MaterialPoints, ...]:
         """The materials of prepared particles, with the elastic laws in force."""
-        return material_points(self.material, particles, total=self.total)
+        return material_points(self.laws, particles, total=self.total)
 
     def return_map(self, particles: Particles) -> Particles:
         """The particles after the return maps of laws that yield (see `return_map`)."""
-        return return_map(self.material, particles)
+        return return_map(self.laws, particles)
 
     @property
     def colliders(self) -> int:

@@ -296,5 +296,5 @@ def particles_to_grid(
 
 def _place(particles: Particles, stencil: Stencil, size: int) -> NodeVector:
     """Current positions of reference nodes times their mass, Σ_p w_ip m_p (x_p + F_p (X_i − X_p)) [kg m], (n, d)."""
-    F = jnp.concatenate([components(group) for group in jax.tree.leaves(particles.F)], axis=-1)
+    F = jnp.concatenate([group.deformation() for group in particles.groups], axis=-1)
     return p2g(stencil, particles.mass, components(particles.x), F, size)[1]

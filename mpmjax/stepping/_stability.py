@@ -148,7 +148,8 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Fl
     density = particles.mass / particles.volume
     elastic_steepness, viscous_steepness = _steepness(scene, particles)
     bodies = scene.material_points(particles)
-    stiffest = jnp.concatenate([_tangent_spectrum(c, particles.dim).max(axis=0) for c in bodies])
+    tangents = [c.law.tangent_eigenvalues(c.deformation, particles.dim, total=c.total) for c in bodies]
+    stiffest = jnp.concatenate([values.max(axis=0) for values in tangents])
     z = stiffest * elastic_steepness / density  # per Δt²
     factor = method.stability_factor()
     if factor is None:
@@ -164,37 +165,11 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Fl
 
 def _stiffest_viscosity(body: MaterialPoints, dim: int) -> Float[Array, "q"]:
     """The largest eigenvalue of ∇v ↦ |J| σ_v for each particle [Pa s]; a bound of it in the total description."""
-    J = jnp.abs(la.determinant(body.F))
+    J = jnp.abs(body.volume_ratio())
     if body.viscosity is None:
         return jnp.zeros_like(J)
     most = J * body.viscosity.stiffest(dim)
-    return most / (la.principal_frame(body.F)[1] ** 2).min(axis=0) if body.total else most
-
-
-def _tangent_spectrum(body: MaterialPoints, dim: int) -> Float[Array, "m q"]:
-    """The eigenvalues of the tangent of each particle [Pa], of which the largest is Λ.
-
-    In the principal frame the map is d x d on the diagonal, and 2 x 2 on (L_ij, L_ji) for each pair. For a law of J
-    alone it is d/dJ(JΨ') J tr(L) I, which has one eigenvalue that is not zero.
-    """
-    _, s, _ = la.principal_frame(body.F)
-    tangent = body.law.principal_tangent(s)
-    d = s.shape[0]
-    if body.total:
-        pull, tau = jnp.ones_like(s), jnp.zeros_like(s)
-    else:
-        P = body.law.stress(la.diagonal(s))
-        pull, tau = s, s * jnp.stack([P[i, i] for i in range(d)])
-    scaling = tangent.scaling * pull[:, None] * pull + la.diagonal(tau)
-    if d < dim:
-        return dim * scaling[0]
-    values = [*la.symmetric_eigen(scaling)[0]]
-    for (i, j), twist, flip in zip(la.pairs(d), tangent.twist, tangent.flip, strict=True):
-        near, far = (flip + twist) / 2 * pull[j] ** 2, (flip + twist) / 2 * pull[i] ** 2
-        across = (flip - twist) / 2 * pull[i] * pull[j] + (tau[i] + tau[j]) / 2
-        centre, radius = (near + far) / 2, jnp.hypot((near - far) / 2, across)
-        values += [centre - radius, centre + radius]
-    return jnp.stack(values)
+    return most / (la.principal_frame(body.deformation)[1] ** 2).min(axis=0) if body.total else most
 
 
 def _steepness(scene: Scene, particles: Particles) -> tuple[Array, Array]:

@@ -192,13 +192,13 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
             C=None if particles.C is None else components(particles.C),
             kept=scene.keeps_gradient,
         )
-        changes = zip(potential.current_deformation(), potential.deformed(gradient), strict=True)
-        F = tuple(particle_first(F + dt * rate) for F, rate in changes)
+        changes = zip(potential.current_deformation(), potential.change(gradient), strict=True)
+        deformations = tuple(particle_first(F + dt * rate) for F, rate in changes)
     return replace(
         particles,
         x=particle_first(components(particles.x) + dt * moved),
         v=particle_first(v),
-        F=F if isinstance(scene.material, tuple) else F[0],
+        deformations=deformations,
         C=None if C is None else particle_first(C),
     )
 

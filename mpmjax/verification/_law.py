@@ -10,7 +10,7 @@ import numpy as np
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix
 from mpmjax.checks import canonical, require
-from mpmjax.material import AbstractInelastic, AbstractMaterial, AbstractVolumetric, Law, Viscous
+from mpmjax.material import AbstractLaw, AbstractMaterial
 
 _CHECKED = (
     "the energy",
@@ -25,7 +25,7 @@ _CHECKED = (
 """What is checked, in this order; the last only for a law that overrides it."""
 
 
-def check_law(law: Law | Viscous, *, dim: int = 3, F: Any = None, rtol: float = 1e-9) -> None:
+def check_law(law: AbstractLaw, *, dim: int = 3, F: Any = None, rtol: float = 1e-9) -> None:
     """Check that the methods of a law are derivatives of its energy, and finite where steps and gradients need them.
 
     The check is in float64, at each deformation that the law admits:
@@ -42,26 +42,25 @@ def check_law(law: Law | Viscous, *, dim: int = 3, F: Any = None, rtol: float = 
     Args:
         law: the law.
         dim: 1, 2 or 3.
-        F: deformation gradients, shape (p, dim, dim), or (p, 1, 1) for a law of J alone. Default: F = I, repeated and
-            nearly repeated stretches, stretches from 0.6 to 1.6, all of these rotated and not.
+        F: deformation gradients, shape (p, dim, dim); a law of J alone is checked as the function Ψ(det F). Default:
+            F = I, repeated and nearly repeated stretches, stretches from 0.6 to 1.6, all of these rotated and not.
         rtol: the largest relative difference allowed.
 
     Raises:
         ValueError: a difference, or a derivative that is not finite; the message names the method, F and the relative
             difference. No deformation that the law admits.
     """
-    law = law.law if isinstance(law, Viscous) else law
-    size = 1 if isinstance(law, AbstractVolumetric) else dim
     with jax.enable_x64(True):
-        found = jnp.asarray(_deformations(size) if F is None else np.asarray(F, float))
+        found = jnp.asarray(_deformations(dim) if F is None else np.asarray(F, float))
         require(
-            found.ndim == 3 and found.shape[1:] == (size, size),
-            f"check_law's F must have shape (p, {size}, {size}), got {found.shape}.",
+            found.ndim == 3 and found.shape[1:] == (dim, dim),
+            f"check_law's F must have shape (p, {dim}, {dim}), got {found.shape}.",
         )
         place = jnp.moveaxis(found, 0, -1)
-        own: Law = canonical(law, place.dtype)
-        elastic = own.elastic(own.initial_history(place)) if isinstance(own, AbstractInelastic) else own
-        faults = eqx.filter_jit(_faults)(elastic, place)
+        own: AbstractLaw = canonical(law, place.dtype)
+        elastic = own.elastic(own.initial_history(own.kinematics.of(place)))
+        of_gradient: Any = elastic.of_gradient()
+        faults = eqx.filter_jit(_faults)(of_gradient, place)
     admitted, told = np.asarray(faults[0]), type(elastic).__name__
     require(admitted.any(), f"{told} admits none of check_law's {len(admitted)} deformations: give some by F.")
     for what, wrong in zip(_CHECKED, faults[1], strict=False):

@@ -159,7 +159,7 @@ def discretise(
         body_force=Manufactured(problem, X) if problem.forced else None,
         **choices,
     )
-    return scene, Particles(x, v, rest.mass, rest.volume, F=F, C=C, X=X)
+    return scene, Particles(x, v, rest.mass, rest.volume, deformations=(F,), C=C, X=X)
 
 
 def displacement_error(problem: AbstractProblem, particles: Particles, run: Run) -> Float[Array, "f"]:

@@ -13,7 +13,7 @@ from mpmjax.boundary import Wall
 from mpmjax.checks import canonical, checked, require, require_between
 from mpmjax.io import replacing, save_figure
 from mpmjax.simulation import Run
-from mpmjax.state import Particles, Scene, by_material, histories
+from mpmjax.state import Particles, Scene, by_material, history_arrays
 from mpmjax.viz._ray_casting import Balls, Camera, look, picture, surroundings
 
 COLOURS: dict[str, tuple[str, Callable[[Run, Particles], Any]]] = {
@@ -68,7 +68,9 @@ def render(
     require(path.suffix in suffixes, f"A picture's name must end in one of {', '.join(suffixes)}, got {path.name!r}.")
     colour = None if colour == "none" else colour
     require(len(run) > 0, "The run has no frames to draw: pass save_every to simulate.")
-    known = COLOURS | {name: (name.replace("_", " "), partial(_remembered, name)) for name, *_ in histories(run.final)}
+    known = COLOURS | {
+        name: (name.replace("_", " "), partial(_remembered, name)) for name, *_ in history_arrays(run.final)
+    }
     require(colour is None or colour in known, f"colour must be one of {', '.join(known)}, none, got {colour!r}.")
     require(run.final.count > 0, "The run has no particles to draw.")
     require(
@@ -108,7 +110,7 @@ def _remembered(name: str, run: Any, particles: Particles) -> np.ndarray:
     """The history variable of that name; NaN at particles whose law has none."""
     del run
     values = np.full(particles.count, np.nan)
-    for known, rows, leaf in histories(particles):
+    for known, rows, leaf in history_arrays(particles):
         if known == name:
             values[rows] = leaf
     return values

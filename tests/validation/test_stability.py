@@ -20,7 +20,6 @@ import mpmjax as mpm
 from mpmjax.checks._values import canonical
 from mpmjax.discretisation._gradient import _STEEPEST
 from mpmjax.state._particles import state_of, with_state
-from mpmjax.stepping import _stability
 from mpmjax.stepping._step import advance
 
 DX, DENSITY = 0.1, 1e3
@@ -36,7 +35,9 @@ def alone(d, stretch=1.0, place=WORST_PLACE, law=LAW, **scene):
     grid = mpm.Grid((6,) * d, DX)
     x, one = jnp.full((1, d), place * DX), jnp.ones(1)
     F = jnp.asarray(stretch * np.eye(d)[None])
-    return mpm.Scene(grid, law, **scene), mpm.Particles(x, 0 * x, DENSITY * 1e-3 * one, 1e-3 * one, F=F, X=x)
+    return mpm.Scene(grid, law, **scene), mpm.Particles(
+        x, 0 * x, DENSITY * 1e-3 * one, 1e-3 * one, deformations=(F,), X=x
+    )
 
 
 def lattice(d, per_cell, stretch=1.0, law=LAW, cells=4, **scene):
@@ -46,7 +47,7 @@ def lattice(d, per_cell, stretch=1.0, law=LAW, cells=4, **scene):
     x = jnp.asarray(np.stack(np.meshgrid(*[side] * d, indexing="ij"), axis=-1).reshape(-1, d))
     volume = jnp.full(len(x), (DX / per_cell / stretch) ** d)
     F = jnp.tile(stretch * jnp.eye(d), (len(x), 1, 1))
-    return mpm.Scene(grid, law, **scene), mpm.Particles(x, 0 * x, DENSITY * volume, volume, F=F, X=x)
+    return mpm.Scene(grid, law, **scene), mpm.Particles(x, 0 * x, DENSITY * volume, volume, deformations=(F,), X=x)
 
 
 def cloud(d, seed, strain, count=5, **scene):
@@ -61,7 +62,7 @@ def cloud(d, seed, strain, count=5, **scene):
     x = jnp.asarray(rng.uniform(0, 2 * DX, (count, d)))
     mass, volume = jnp.asarray(rng.uniform(0.5, 1.5, (2, count)) * np.array([[1.0], [1e-3]]))
     F = jnp.asarray(np.moveaxis(F, -1, 0))
-    return mpm.Scene(grid, **scene), mpm.Particles(x, 0 * x, mass, volume, F=F, X=x)
+    return mpm.Scene(grid, **scene), mpm.Particles(x, 0 * x, mass, volume, deformations=(F,), X=x)
 
 
 @eqx.filter_jit
@@ -136,7 +137,8 @@ def tangent_spectra(scene, particles):
     image = jax.vmap(law.tangent(F))(jnp.einsum("mij,jkp->mikp", L, pull))
     image = jnp.einsum("mijp,kjp->mikp", image, pull) + jnp.einsum("ijp,mkj->mikp", tau, L)
     (body,) = scene.material_points(particles)
-    return _stability._tangent_spectrum(body, d), jnp.moveaxis(image.reshape(d * d, d * d, -1), -1, 0)
+    found = body.law.tangent_eigenvalues(body.deformation, d, total=scene.total)
+    return found, jnp.moveaxis(image.reshape(d * d, d * d, -1), -1, 0)
 
 
 @pytest.mark.parametrize("law", **ids(ELASTIC))
@@ -154,17 +156,18 @@ def test_tangent_spectrum_is_that_of_the_assembled_map(law, description, d):
 def fluid_spectra(scene, particles):
     """The closed form's only eigenvalue, and the map L ↦ ∂τ/∂J J tr(L), τ = JΨ' I, assembled, (p, d², d²)."""
     d, (body,) = particles.dim, scene.material_points(particles)
-    kirchhoff = lambda J: (J * body.law.stress(J[None, None])[0, 0]).sum()  # noqa: E731
-    eye = jnp.eye(d).reshape(-1)
-    J = body.F[0, 0]
-    return _stability._tangent_spectrum(body, d), (jax.grad(kirchhoff)(J) * J)[:, None, None] * jnp.outer(eye, eye)
+    kirchhoff = lambda J: (J * body.law.stress(J)).sum()  # noqa: E731
+    eye, J = jnp.eye(d).reshape(-1), body.deformation
+    return body.law.tangent_eigenvalues(J, d, total=False), (jax.grad(kirchhoff)(J) * J)[:, None, None] * jnp.outer(
+        eye, eye
+    )
 
 
 @pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_tangent_spectrum_of_a_fluid_is_that_of_the_assembled_map(d):
     """d (J²Ψ'' + JΨ'), pressure and expansion included."""
     scene, particles = cloud(d, 0, None, material=FLUIDS["fluid_in_tension"])
-    J = jnp.asarray([0.5, 0.9, 1.0, 1.05, 1.3])[:, None, None]
+    J = jnp.asarray([0.5, 0.9, 1.0, 1.05, 1.3])
     particles = mpm.prepare(scene, eqx.tree_at(lambda q: q.F, particles, J))
     found, dense = map(np.asarray, fluid_spectra(*canonical((scene, particles), jnp.float64)))
     assert_close(found.max(axis=0), np.trace(dense, axis1=1, axis2=2), 1e-12)
@@ -177,14 +180,14 @@ def test_bound_of_a_fluid_from_both_sides(d):
     step fails between 0.999 and 1.001 of the bound alone; in the lattice not below it."""
     law = mpm.Fluid(1e4, tension=True)
     scene, one = alone(d, law=law)
-    one = eqx.tree_at(lambda q: q.F, one, jnp.ones((1, 1, 1)))
+    one = eqx.tree_at(lambda q: q.F, one, jnp.ones(1))
     bound = float(mpm.stable_dt(scene, one, safety=1.0))
     np.testing.assert_allclose(bound, DX / np.sqrt(10.0) / np.sqrt(d), rtol=1e-12)
     assert not alternates(scene, one, 0.999 * bound)
     assert alternates(scene, one, 1.001 * bound)
     if d < 3:
         scene, many = lattice(d, 1, law=law)
-        many = eqx.tree_at(lambda q: q.F, many, jnp.full((many.count, 1, 1), 0.9))
+        many = eqx.tree_at(lambda q: q.F, many, jnp.full(many.count, 0.9))
         bound = float(mpm.stable_dt(scene, many, safety=1.0))
         assert not alternates(scene, many, 0.999 * bound)
         if d == 1:
@@ -205,7 +208,7 @@ def test_bound_of_a_viscous_particle_from_both_sides(d, transfer, shear, bulk):
     fluid, solid = mpm.Fluid(1e4, tension=True), LAW
     for law, method in itertools.product((fluid, solid), (mpm.Explicit(), semi_implicit(0.25))):
         scene, one = alone(d, law=mpm.Viscous(law, eta, zeta), transfer=transfer, place=2.2637)
-        one = eqx.tree_at(lambda q: q.F, one, jnp.ones((1, 1, 1))) if law is fluid else one
+        one = eqx.tree_at(lambda q: q.F, one, jnp.ones(1)) if law is fluid else one
         bound = float(mpm.stable_dt(scene, one, method=method, safety=1.0))
         assert eigenvalues(scene, one, 0.999 * bound, method).real.min() > -1 - 1e-9
         even = 2 * eta * (1 - d / 3) + d * zeta

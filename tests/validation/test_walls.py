@@ -56,7 +56,7 @@ def wave_run(
         jnp.asarray(speed * np.sin(k * X)),
         rest.mass,
         rest.volume / stretch,
-        F=jnp.asarray(F)[:, None],
+        deformations=(jnp.asarray(F)[:, None],),
         C=jnp.asarray(speed * k * np.cos(k * X) / F)[:, None],
     )
     scene = mpm.Scene(grid, LAW, boundary=walls(kind, lower, upper), kernel=KERNELS[kernel], transfer=transfer)

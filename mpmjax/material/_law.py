@@ -1,0 +1,177 @@
+"""What a step asks of a law, elastic or with a history."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Bool, Deformation, Float
+from mpmjax.checks import require
+from mpmjax.material._kinematics import AbstractKinematics, DeformationGradient
+from mpmjax.material._tangent import AbstractTangent
+from mpmjax.material._viscosity import Viscosity
+
+
+class AbstractLaw(eqx.Module):
+    """What a step asks of any law. Laws derive from `AbstractMaterial` (elastic) or `AbstractInelastic` (with a
+    history), which answer most of it."""
+
+    @property
+    def kinematics(self) -> AbstractKinematics:
+        """What its particles store of their deformation. Default: F."""
+        return DeformationGradient()
+
+    @property
+    def allows_total(self) -> bool:
+        """Whether it may stand in the total description, in which the deformation is that from the start."""
+        return True
+
+    @abc.abstractmethod
+    def initial_history(self, F: Deformation, /) -> Any:
+        """The history of particles that have never yielded, leaves of shape (p,); None without.
+
+        Args:
+            F: the deformation [-], component first.
+        """
+
+    @abc.abstractmethod
+    def elastic(self, history: Any) -> "AbstractElastic":
+        """The elastic law at a history."""
+
+    @abc.abstractmethod
+    def return_map(self, F: Deformation, history: Any, /) -> tuple[Deformation, Any]:
+        """The admissible deformation for a trial one, and the history after it.
+
+        Args:
+            F: the trial deformation [-], component first.
+            history: the history before the step.
+        """
+
+    def viscous_part(self) -> Viscosity | None:
+        """The viscosity beside the law; None without."""
+        return None
+
+    def title(self) -> str:
+        """The law's name in messages."""
+        return type(self).__name__
+
+    def inadmissible(self, or_else: str) -> tuple[str, str]:
+        """What is wrong with a particle whose deformation the law does not allow, and what helps.
+
+        Args:
+            or_else: what else helps, as the end of a sentence; may be empty.
+        """
+        kept = self.kinematics
+        what = f"has a {kept.name} that {self.title()} does not allow ({kept.volume} ≤ 0)"
+        return what, f"Reduce dt: a step must keep Δt {kept.rate} below 1{or_else}."
+
+
+class AbstractElastic(AbstractLaw):
+    """A law without a history, given by its energy density: of F in `AbstractMaterial`, of J in `AbstractVolumetric`.
+
+    Deformations are component first: F of shape (d, d, p), J of shape (p,).
+    """
+
+    @abc.abstractmethod
+    def energy(self, F: Deformation, /) -> Array:
+        """Ψ [J/m³ of undeformed volume], shape (p,).
+
+        Args:
+            F: the deformation [-].
+        """
+
+    def stress(self, F: Deformation, /) -> Deformation:
+        """The energy's derivative by the deformation [Pa], of its shape. Default: the energy's gradient."""
+        return jax.grad(lambda F: _density(self, F).sum())(F)
+
+    @abc.abstractmethod
+    def tangent(self, F: Deformation, /) -> AbstractTangent:
+        """The stress differential at a deformation."""
+
+    @abc.abstractmethod
+    def projected_tangent(self, F: Deformation, /) -> AbstractTangent:
+        """The stress differential with its negative eigenvalues set to zero."""
+
+    @abc.abstractmethod
+    def tangent_eigenvalues(self, F: Deformation, /, dim: int, *, total: bool) -> Float[Array, "m p"]:
+        """Eigenvalues [Pa] of the tangent L ↦ (∂²Ψ/∂F∂F : (L F)) Fᵀ + τ Lᵀ, L = ∇v, τ = P Fᵀ, made symmetric; in the
+        total description of ∂²Ψ/∂F∂F. The largest, which `stable_dt` needs, is among them.
+
+        Args:
+            F: the deformation [-].
+            dim: d.
+            total: whether the description is total Lagrangian.
+        """
+
+    def is_admissible(self, F: Deformation, /) -> Bool[Array, "p"]:
+        """Whether the law is defined at a deformation, shape (p,). Default: where its energy is finite."""
+        return jnp.isfinite(_density(self, F))
+
+    @abc.abstractmethod
+    def of_gradient(self) -> "AbstractElastic":
+        """The same law as a function of F."""
+
+    def initial_history(self, F: Deformation, /) -> None:
+        """None."""
+        del F
+
+    def elastic(self, history: None) -> "AbstractElastic":
+        """The law itself."""
+        del history
+        return self
+
+    def return_map(self, F: Deformation, history: None, /) -> tuple[Deformation, None]:
+        """The deformation as it is."""
+        return F, history
+
+
+def _density(law: AbstractElastic, F: Deformation) -> Array:
+    """A law's energy, which must have the shape of one number a particle."""
+    energy, kept = law.energy(F), law.kinematics
+    batch = F.shape[kept.axes :]
+    require(
+        jnp.shape(energy) == batch,
+        f"{type(law).__name__}'s energy must be one number a particle, shape {batch} for {kept.symbol} of shape "
+        f"{F.shape}, got shape {jnp.shape(energy)}: F is component first, as the functions of mpmjax.linalg expect it "
+        "and those of jax.numpy.linalg do not.",
+    )
+    return energy
+
+
+class AbstractInelastic(AbstractLaw):
+    """A law with a history: elastic within a step, and returned to what it admits at the step's end.
+
+    F is the elastic part F_E of the deformation. A step strains it by the elastic law in force, and the return map then
+    takes out of it what does not stay elastic: plastic flow, the opening of sand, a fluid's expansion. Implicit solves
+    see the elastic law alone.
+
+    The history is what a particle remembers besides F_E: a pytree of the law's own, of arrays of shape (p,).
+    """
+
+    @property
+    def allows_total(self) -> bool:
+        """No: F_E is not the deformation from the start."""
+        return False
+
+    @abc.abstractmethod
+    def initial_history(self, F: Deformation, /) -> Any:
+        """The history of particles that have never yielded, leaves of shape (p,); None without.
+
+        Args:
+            F: F_E [-], shape (d, d, p).
+        """
+
+    @abc.abstractmethod
+    def elastic(self, history: Any) -> AbstractElastic:
+        """The elastic law at a history."""
+
+    @abc.abstractmethod
+    def return_map(self, F: Deformation, history: Any, /) -> tuple[Deformation, Any]:
+        """The admissible F_E for a trial one, and the history after it.
+
+        Args:
+            F: the trial F_E [-], shape (d, d, p).
+            history: the history before the step.
+        """
