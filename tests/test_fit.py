@@ -7,6 +7,7 @@ import pytest
 
 import mpmjax as mpm
 from mpmjax.fitting._least_squares import _iterate, levenberg_marquardt
+from mpmjax.fitting._observation import _between
 from mpmjax.fitting._problem import FitProblem
 
 DT, STEPS, NOISE = 4e-3, 15, 1e-4
@@ -106,8 +107,25 @@ def test_the_jacobian_is_that_of_differences():
 
 def test_between_steps_a_series_is_interpolated_linearly():
     seen = jnp.asarray([[0.0], [1.0], [4.0]])
-    series = mpm.Series([0.0, 0.25, 1.0, 1.5, 2.0], np.zeros((5, 1)), lambda s, p: p.x[0])
-    assert np.allclose(series.predict(seen, 1.0)[:, 0], [0, 0.25, 1, 2.5, 4])
+    assert np.allclose(_between(seen, jnp.asarray([0.0, 0.25, 1.0, 1.5, 2.0]))[:, 0], [0, 0.25, 1, 2.5, 4])
+
+
+@pytest.mark.thorough
+def test_the_force_on_a_collider_fixes_the_density_of_what_rests_on_it():
+    """A block on a plate presses with its weight; the estimate is that of the forces' mean."""
+    grid = mpm.Grid((10, 12), 0.1, origin=(-3, -3))
+    block = mpm.fill(mpm.Box((0.0, 0.0), (0.3, 0.3)), grid, particles_per_cell=4, density=800.0)
+    plate = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0)))
+    scene = mpm.Scene(grid, mpm.NeoHookean(1e4, 0.3), gravity=(0.0, -9.81), boundary=plate)
+    at = {"t1": 0.06, "dt": 2e-3}
+    forces = mpm.simulate(scene, block, save_every=1, **at).forces()
+    mass = np.asarray(block.mass)
+    scale = mpm.Positive(update=lambda e, f: eqx.tree_at(lambda e: e.particles.mass, e, f * mass), start=0.7)
+    seen = mpm.Force(np.asarray(forces.times)[::2], np.asarray(forces.force)[::2, 0], sigma=0.1)
+    found = mpm.fit(mpm.Experiment(scene, block, observations=seen, **at), {"density": scale})
+    assert found["density"].value == pytest.approx(1, rel=1e-4)
+    with pytest.raises(ValueError, match="the scene has 1"):
+        mpm.Experiment(scene, block, observations=eqx.tree_at(lambda o: o.collider, seen, 3), **at)
 
 
 @pytest.mark.parametrize(
@@ -299,12 +317,14 @@ def test_bad_data_get_one_line(observation, says):
 
 def test_a_curve_that_the_run_does_not_reach_is_an_error_and_not_a_flat_line():
     """Nor one whose abscissa turns round."""
+    scene, particles = bar()
+    run = mpm.simulate(scene, particles, t1=STEPS * DT, dt=DT, save_every=1)
     curve = mpm.Curve([0.5, 9.0], [1.0, 1.0], lambda s, p: (p.x.max(), p.x.min()))
     for seen, says in (([0.4, 0.5, 0.6], "leaves out measured points"), ([0.4, 0.5, 0.45], "must grow")):
         x = jnp.asarray(seen)
-        assert np.isnan(curve.predict((x, x), DT)).any()
+        assert np.isnan(curve.predict((x, x), run)).any()
         with pytest.raises(ValueError, match=says):
-            curve.explain((x, x))
+            curve.explain((x, x), run)
 
 
 @pytest.mark.thorough

@@ -3,7 +3,7 @@
 from mpmjax.fitting._columns import read_columns
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import fit
-from mpmjax.fitting._observation import AbstractObservation, Curve, Series, Tracks
+from mpmjax.fitting._observation import AbstractObservation, Curve, Force, Series, Tracks
 from mpmjax.fitting._parameter import AbstractParameter, Bounded, Gaussian, Positive, Unbounded
 from mpmjax.fitting._quantities import CentreOfMass, Density, Extent, Markers, StressStretch
 from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
@@ -19,6 +19,7 @@ __all__ = [
     "Experiment",
     "Extent",
     "FitResult",
+    "Force",
     "Gaussian",
     "Markers",
     "NoiseEstimate",

@@ -57,7 +57,7 @@ class Experiment(eqx.Module):
         self.observations = given
         number_of_steps(self.t1, self.dt, 0, particles.x.dtype)
         for observation in given:
-            observation.check(self.particles, self.t1, self.dt)
+            observation.check(self.scene, self.particles, self.t1)
 
     @property
     def dtype(self) -> Any:
@@ -98,7 +98,7 @@ class Experiment(eqx.Module):
 
     def predictions(self, run: Run) -> tuple[Array, ...]:
         """What each observation would have measured in a run of it, in the shape of its data."""
-        return tuple(o.predict(seen, self.dt) for o, seen in zip(self.observations, run.observed, strict=True))
+        return tuple(o.predict(seen, run) for o, seen in zip(self.observations, run.observed, strict=True))
 
     def explain(self) -> None:
         """Say why what is observed is not finite.
@@ -108,8 +108,9 @@ class Experiment(eqx.Module):
             ValueError: an observation is beyond what the simulation reaches.
         """
         assert not is_traced(self)
-        for observation, seen in zip(self.observations, self.run().observed, strict=True):
-            observation.explain(seen)
+        run = self.run()
+        for observation, seen in zip(self.observations, run.observed, strict=True):
+            observation.explain(seen, run)
 
 
 class _Observe(eqx.Module):

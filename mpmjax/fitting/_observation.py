@@ -11,6 +11,7 @@ import numpy as np
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import require, require_finite, require_positive
 from mpmjax.fitting._quantities import Markers
+from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene
 
 Numbers = Float[np.ndarray, "..."] | Float[Array, "..."] | list | tuple | float | int
@@ -41,22 +42,22 @@ class AbstractObservation(eqx.Module):
         """What is needed of one state: an array, or a pytree of arrays."""
 
     @abc.abstractmethod
-    def predict(self, seen: Any, dt: float) -> Array:
+    def predict(self, seen: Any, run: Run) -> Array:
         """What would have been measured, in the shape of the data; NaN where the run does not reach.
 
         Args:
             seen: what `observe` returned at the start and after each step, with a leading axis.
-            dt: step [s].
+            run: the run, for what states do not say: `run.dt`, `run.forces()`.
         """
 
-    def check(self, particles: Particles, t1: float, dt: float) -> None:
-        """Check that the data fit an experiment with these prepared particles, until t1 in steps of dt [s].
+    def check(self, scene: Scene, particles: Particles, t1: float) -> None:
+        """Check that the data fit an experiment with this scene and these prepared particles, until t1 [s].
 
         Raises:
             ValueError: they do not.
         """
 
-    def explain(self, seen: Any) -> None:
+    def explain(self, seen: Any, run: Run) -> None:
         """Say why a prediction is not finite.
 
         Raises:
@@ -164,13 +165,10 @@ class Series(AbstractObservation):
     def observe(self, scene: Scene, particles: Particles) -> Any:
         return self.of(scene, particles)
 
-    def predict(self, seen: Array, dt: float) -> Array:
-        place = jnp.asarray(self.times, seen.dtype) / dt
-        last = jnp.clip(jnp.floor(place + _ON_A_STEP), 0, len(seen) - 2)
-        share, at = jnp.clip(place - last, 0, 1).reshape(-1, *[1] * (seen.ndim - 1)), last.astype(int)
-        return (1 - share) * seen[at] + share * seen[at + 1]
+    def predict(self, seen: Array, run: Run) -> Array:
+        return _between(seen, jnp.asarray(self.times, seen.dtype) / run.dt)
 
-    def check(self, particles: Particles, t1: float, dt: float) -> None:
+    def check(self, scene: Scene, particles: Particles, t1: float) -> None:
         what = f"{type(self).__name__} {self.name!r}"
         outside = (self.times < 0) | (self.times > t1 * (1 + 1e-9))
         require(
@@ -179,7 +177,8 @@ class Series(AbstractObservation):
             f"{self.times[outside][:1]}: raise t1, or leave them out.",
         )
 
-    def explain(self, seen: Array) -> None:
+    def explain(self, seen: Array, run: Run) -> None:
+        del run
         shape = np.shape(seen)[1:]
         require(
             shape == self.data.shape[1:],
@@ -189,7 +188,19 @@ class Series(AbstractObservation):
         require_finite(f"What the simulation says of {self.name!r}", seen)
 
 
-_ON_A_STEP = 1e-6
+def _between(values: Array, place: Array) -> Array:
+    """Values between rows, by linear interpolation; before the first and after the last two, beyond them.
+
+    Args:
+        values: shape (f, ...).
+        place: numbers of rows, shape (m,), not whole.
+    """
+    last = jnp.clip(jnp.floor(place + _ON_A_ROW), 0, len(values) - 2)
+    share, at = (place - last).reshape(-1, *[1] * (values.ndim - 1)), last.astype(int)
+    return (1 - share) * values[at] + share * values[at + 1]
+
+
+_ON_A_ROW = 1e-6
 """Part of a step by which a time may miss a step and is on it."""
 
 
@@ -225,14 +236,65 @@ class Tracks(Series):
             f"{markers.count} markers.",
         )
 
-    def check(self, particles: Particles, t1: float, dt: float) -> None:
-        super().check(particles, t1, dt)
+    def check(self, scene: Scene, particles: Particles, t1: float) -> None:
+        super().check(scene, particles, t1)
         require(
             self.data.shape[2] == particles.dim,
             f"Tracks {self.name!r} are {self.data.shape[2]}-dimensional, the particles {particles.dim}-dimensional.",
         )
         assert isinstance(self.of, Markers)
         self.of.check(self.name, particles.count)
+
+
+class Force(Series):
+    """The force on a collider against time, such as that of a plate on which a body falls.
+
+    Compared with the mean force over each step, which stands at the step's middle.
+
+    Args:
+        times: when it was measured [s], shape (f,), growing.
+        forces: the force [N], shape (f, d); NaN where a component was not measured.
+        collider: number of the collider, from 0, in the order of the scene's boundaries.
+        sigma: standard deviation of the noise [N]; None to estimate it.
+        weight: factor of the squares.
+        robust: misfit in standard deviations beyond which squares grow but linearly.
+        name: what tables and pictures call it.
+    """
+
+    collider: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        times: Numbers,
+        forces: Numbers,
+        *,
+        collider: int = 0,
+        sigma: Numbers | None = None,
+        weight: Scalar = 1.0,
+        robust: Scalar | None = None,
+        name: str = "force",
+    ):
+        self.collider = collider
+        super().__init__(times, forces, _nothing, sigma=sigma, weight=weight, robust=robust, name=name)
+
+    def check(self, scene: Scene, particles: Particles, t1: float) -> None:
+        super().check(scene, particles, t1)
+        known = f"Force {self.name!r} is of collider {self.collider}, from 0, but the scene has {scene.colliders}."
+        require(0 <= self.collider < scene.colliders, known)
+
+    def predict(self, seen: Any, run: Run) -> Array:
+        del seen
+        force = run.forces().force[:, self.collider]
+        return _between(force, jnp.asarray(self.times, force.dtype) / run.dt - 0.5)
+
+    def explain(self, seen: Any, run: Run) -> None:
+        super().explain(run.forces().force[:, self.collider], run)
+
+
+def _nothing(scene: Scene, particles: Particles) -> Array:
+    """A zero: nothing is needed of the states."""
+    del scene
+    return jnp.zeros((), particles.x.dtype)
 
 
 class Curve(AbstractObservation):
@@ -287,14 +349,15 @@ class Curve(AbstractObservation):
     def observe(self, scene: Scene, particles: Particles) -> Any:
         return self.of(scene, particles)
 
-    def predict(self, seen: Any, dt: float) -> Array:
-        del dt
+    def predict(self, seen: Any, run: Run) -> Array:
+        del run
         x, y = seen
         wanted = jnp.asarray(self.x, y.dtype)
         reached = (wanted >= x[0]) & (wanted <= x[-1]) & (jnp.diff(x) > 0).all()
         return jnp.where(reached, jnp.interp(wanted, x, y), jnp.nan)
 
-    def explain(self, seen: Any) -> None:
+    def explain(self, seen: Any, run: Run) -> None:
+        del run
         x, y = (np.asarray(a) for a in seen)
         require(
             np.isfinite(x).all() and (np.diff(x) > 0).all(),
