@@ -125,7 +125,7 @@ def test_the_force_on_a_collider_fixes_the_density_of_what_rests_on_it():
     found = mpm.fit(mpm.Experiment(scene, block, observations=seen, **at), {"density": scale})
     assert found["density"].value == pytest.approx(1, rel=1e-4)
     with pytest.raises(ValueError, match="the scene has 1"):
-        mpm.Experiment(scene, block, observations=eqx.tree_at(lambda o: o.collider, seen, 3), **at)
+        mpm.Experiment(scene, block, observations=mpm.Force([0.01], [[0.0, 0.0]], collider=3), **at)
 
 
 @pytest.mark.parametrize(
