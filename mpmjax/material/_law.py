@@ -49,6 +49,13 @@ class AbstractLaw(eqx.Module):
             history: the history before the step.
         """
 
+    def remembers(self, history: Any, F: Deformation, /) -> bool:
+        """Whether a history is one of the law's: of the structure and shapes of that of particles with this F."""
+        own = jax.eval_shape(self.initial_history, F)
+        if jax.tree.structure(own) != jax.tree.structure(history):
+            return False
+        return all(a.shape == b.shape for a, b in zip(jax.tree.leaves(own), jax.tree.leaves(history), strict=True))
+
     def viscous_part(self) -> Viscosity | None:
         """The viscosity beside the law; None without."""
         return None
@@ -116,6 +123,10 @@ class AbstractElastic(AbstractLaw):
     def initial_history(self, F: Deformation, /) -> None:
         """None."""
         del F
+
+    def remembers(self, history: Any, F: Deformation, /) -> bool:
+        del F
+        return history is None
 
     def elastic(self, history: None) -> "AbstractElastic":
         """The law itself."""

@@ -57,6 +57,9 @@ class Viscous(AbstractLaw):
     def initial_history(self, F: Deformation) -> Any:
         return self.law.initial_history(F)
 
+    def remembers(self, history: Any, F: Deformation) -> bool:
+        return self.law.remembers(history, F)
+
     def elastic(self, history: Any) -> AbstractElastic:
         return self.law.elastic(history)
 

@@ -97,21 +97,15 @@ def _prepared(law: AbstractLaw, group: Group, particles: Particles) -> tuple[Arr
     shape = (stop - start, *undeformed.shape)
     known = jnp.broadcast_to(undeformed, shape) if group.stored is None else group.stored
     require(known.shape == shape, f"{law.title()} needs {kept.symbol} of shape {shape}, got {known.shape}.")
-    if group.history is None:
-        return known, law.initial_history(components(known))
-    expected = jax.eval_shape(law.initial_history, components(known))
+    place = components(known)
+    if group.history is not None and law.remembers(group.history, place):
+        return known, group.history
+    initial = law.initial_history(place)
     require(
-        expected is None or _alike(expected, group.history),
+        group.history is None or initial is None,
         f"{law.title()} needs a history of its own, got {type(group.history).__name__}: drop it to start anew.",
     )
-    return known, None if expected is None else group.history
-
-
-def _alike(own: Any, other: Any) -> bool:
-    """Whether histories are of one structure, and their arrays of one shape each."""
-    if jax.tree.structure(own) != jax.tree.structure(other):
-        return False
-    return all(a.shape == b.shape for a, b in zip(jax.tree.leaves(own), jax.tree.leaves(other), strict=True))
+    return known, initial
 
 
 def is_prepared(scene: Scene, particles: Particles) -> bool:
@@ -128,7 +122,7 @@ def _fits(law: AbstractLaw, group: Group, dim: int) -> bool:
     """Whether deformation and history of one material's particles are of the shapes that the law needs."""
     if group.stored is None or group.stored.shape[1:] != law.kinematics.undeformed(dim).shape:
         return False
-    return _alike(jax.eval_shape(law.initial_history, components(group.stored)), group.history)
+    return law.remembers(group.history, group.deformation())
 
 
 def _check_placement(scene: Scene, particles: Particles) -> None:
