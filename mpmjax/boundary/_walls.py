@@ -4,13 +4,13 @@ from functools import reduce
 
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, NodeVector, ParticleVector, Point, Scalar
+from mpmjax._types import Array, Bool, Corner, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._conditions import ON_THE_WALL, AbstractBoundary, Conditions, crossed
 from mpmjax.checks import coordinates, require, require_between, require_fields, require_that
 
 
 def _through_box(
-    lower: Point, upper: Point, start: ParticleVector, end: ParticleVector, spacing: Scalar, reach: float
+    lower: Corner, upper: Corner, start: ParticleVector, end: ParticleVector, spacing: Scalar, reach: float
 ) -> Bool[Array, "p"]:
     """Which particles passed a wall of a box: the deepest place is where a stencil has free nodes no more."""
 
@@ -23,7 +23,7 @@ def _through_box(
     return reduce(jnp.logical_or, [through(lo, a, b) | through(-hi, -a, -b) for lo, hi, a, b in by_axis])
 
 
-def _walls(lower: Point, upper: Point, nodes: NodeVector, spacing: Scalar) -> NodeVector:
+def _walls(lower: Corner, upper: Corner, nodes: NodeVector, spacing: Scalar) -> NodeVector:
     """The inward normal's component in each direction: +1 at and below `lower`, −1 at and above `upper`, else 0."""
     margin = ON_THE_WALL * spacing
     below = nodes <= jnp.asarray(lower, nodes.dtype) + margin
@@ -31,7 +31,7 @@ def _walls(lower: Point, upper: Point, nodes: NodeVector, spacing: Scalar) -> No
     return jnp.where(below, 1, jnp.where(above, -1, 0)).astype(nodes.dtype)
 
 
-def _check_box(name: str, lower: Point, upper: Point) -> None:
+def _check_box(name: str, lower: Corner, upper: Corner) -> None:
     require(
         coordinates(f"{name}'s lower corner", lower) == coordinates(f"{name}'s upper corner", upper),
         f"{name} needs two corners with as many coordinates, got {lower} and {upper}.",
@@ -52,8 +52,8 @@ class StickyBox(AbstractBoundary):
         upper: position of the upper wall in each direction [m], (d,); inf for none.
     """
 
-    lower: Point
-    upper: Point
+    lower: Corner
+    upper: Corner
 
     def __check_init__(self):
         require_fields(self)
@@ -88,8 +88,8 @@ class SlipBox(AbstractBoundary):
         upper: position of the upper wall in each direction [m], (d,); inf for none.
     """
 
-    lower: Point
-    upper: Point
+    lower: Corner
+    upper: Corner
 
     def __check_init__(self):
         require_fields(self)
@@ -127,8 +127,8 @@ class SeparatingBox(AbstractBoundary):
         friction: Coulomb coefficient [-], at least 0.
     """
 
-    lower: Point
-    upper: Point
+    lower: Corner
+    upper: Corner
     friction: Scalar = 0.0
 
     def __check_init__(self):
