@@ -1,6 +1,7 @@
 """A differentiable Material Point Method in JAX, with explicit and implicit grid updates."""
 
 from mpmjax import linalg
+from mpmjax._types import Corner
 from mpmjax.analysis import (
     Budget,
     Energy,
@@ -111,7 +112,7 @@ from mpmjax.material import (
     Viscous,
     VonMises,
 )
-from mpmjax.simulation import Run, SimulationError, rollout, simulate
+from mpmjax.simulation import Fault, Run, SimulationError, rollout, simulate
 from mpmjax.state import AbstractBodyForce, Particles, Scene, TotalLagrangian, UpdatedLagrangian, fill, join, prepare
 from mpmjax.stepping import (
     TRBDF2,
@@ -143,6 +144,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "prepare",
     "AbstractRegion",
     "Box",
+    "Corner",
     "Ball",
     "HalfSpace",
     "Capsule",
@@ -220,6 +222,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     # running
     "Run",
     "SimulationError",
+    "Fault",
     "StepInfo",
     "record",
     "rollout",

@@ -11,7 +11,7 @@ small matrices are *component first*, (d, d, p): `F[0, 1]` is then one contiguou
 what a CPU vectorises best, and a law reads as on paper. `components` and `particle_first` go between the two.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +29,14 @@ else:
 
 Point = tuple[float | int | Array, ...] | list[float | int] | Float[Array, "d"] | Float[np.ndarray, "d"]
 """A point or vector of d numbers."""
+
+
+class MayBeInfinite:
+    """A mark of annotations: the numbers may be infinite. Without it those in files must be finite."""
+
+
+Corner = Annotated[Point, MayBeInfinite]
+"""A corner of a box, with an infinite number in each direction in which the box has no end."""
 
 Mask = Bool[Array, "n d"]
 NodeScalar = Float[Array, "n"]
@@ -52,12 +60,14 @@ __all__ = [
     "Array",
     "Bool",
     "Compliance",
+    "Corner",
     "Deformation",
     "Float",
     "Indices",
     "Int",
     "Mask",
     "Matrix",
+    "MayBeInfinite",
     "NodeScalar",
     "NodeVector",
     "ParticleMatrix",

@@ -9,7 +9,7 @@ import pytest
 from helpers import FORWARD, LAWS, REVERSE, block
 
 import mpmjax as mpm
-from mpmjax.simulation._statistics import BAD_PARAMETERS, HEALTHY, INADMISSIBLE, NOT_FINITE, OUTSIDE
+from mpmjax.simulation._statistics import Fault
 
 DT = 0.01
 METHOD = mpm.SemiImplicit(
@@ -77,22 +77,25 @@ def test_a_member_without_a_derivative_leaves_the_others_alone(reverse):
 
     def member(x):
         value, run = outcome(x, None if reverse else diffrax.ForwardMode(), throw=False)
-        return value, (run.statistics.fault, run.statistics.unconverged, run.report)
+        return value, (run.statistics.fault, run.statistics.unconverged, run.statistics.unmet, run.report)
 
     def both(x):
         if reverse:
             (value, (*told, _)), slope = jax.value_and_grad(member, has_aux=True)(x)
             return value, slope, *told
-        (value, told), (slope, (_, _, report)) = jax.jvp(member, (x,), (jnp.ones_like(x),))
-        return value, slope, *told[:2], report
+        (value, told), (slope, (*_, report)) = jax.jvp(member, (x,), (jnp.ones_like(x),))
+        return value, slope, *told[:3], report
 
     batch = jax.jit(jax.vmap(both))
     good = batch(jnp.array([1.0, 1.125, 1.0, 1.0, 1.0, 1.0, 1.25]))
-    value, slope, fault, unconverged, *report = bad = batch(jnp.array([1.0, UNDERIVED, 6.0, 3.0, 4.0, 2.0, 1.25]))
+    value, slope, fault, unconverged, unmet, *report = bad = batch(
+        jnp.array([1.0, UNDERIVED, 6.0, 3.0, 4.0, 2.0, 1.25])
+    )
     for a, b in zip(good, bad, strict=True):
         np.testing.assert_array_equal(a[np.array([0, 6])], b[np.array([0, 6])])
-    assert list(fault) == [HEALTHY, HEALTHY, fault[2], OUTSIDE, INADMISSIBLE, NOT_FINITE, HEALTHY]
-    assert fault[2] >= BAD_PARAMETERS
+    fine = [Fault.NONE] * 2
+    assert list(fault) == [*fine, Fault.BAD_PARAMETERS, Fault.OUTSIDE, Fault.INADMISSIBLE, Fault.NOT_FINITE, Fault.NONE]
+    assert list(unmet > 0) == [False, False, True, False, False, False, False]
     assert list(np.isnan(value)) == [False, False, True, False, False, True, False]
     assert list(np.isnan(slope[:3])) == [False, True, True]
     assert np.isfinite(good[1]).all()

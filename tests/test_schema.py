@@ -160,6 +160,27 @@ def test_toml_may_leave_out_defaults_and_evident_kinds():
     assert_same(decode(tomllib.loads(text), mpm.Scene), scene)
 
 
+def test_numbers_of_files_are_finite_but_for_corners(monkeypatch):
+    """By their annotation, in a class of one's own too, and not by the argument's name."""
+    monkeypatch.setattr(_schema, "_registered", {})
+
+    @mpm.register
+    class Slab(mpm.Box):
+        edge: mpm.Corner | None = None
+        upwards: tuple[float, ...] = (0.0, 1.0)
+
+    data = {"kind": "Slab", "lower": [0, 0], "upper": [1, float("inf")], "edge": [0, float("-inf")]}
+    assert decode(data, AbstractRegion).edge == (0.0, -np.inf)
+    for key in ("upper", "edge"):
+        with pytest.raises(ValueError, match=f"{key} must be finite"):
+            decode(data | {key: [0, float("nan")]}, AbstractRegion)
+    with pytest.raises(ValueError, match="upwards must be finite"):
+        decode(data | {"upwards": [0, float("inf")]}, AbstractRegion)
+    samples = {"kind": "SampledDistance", "lower": [float("-inf")], "spacing": 0.1, "values": [-2, -1, 0, 1, 2]}
+    with pytest.raises(ValueError, match="lower must be finite"):
+        decode(samples, AbstractRegion)
+
+
 DISK = mpm.Ball((0.3, 0.4), 0.2)
 NESTED = mpm.Union((DISK, mpm.Union((mpm.HalfSpace((0.0, 0.1), (0.0, 1.0)), mpm.Box((0.1, 0.1), (0.2, 0.3))))))
 SLIDE = mpm.Motion((0.0, 0.5), ((0.0, 0.0), (0.1, 0.0)))

@@ -13,7 +13,7 @@ from helpers import DESCRIPTIONS, ELASTIC, FLUIDS, LAWS, PLASTIC, assert_close, 
 import mpmjax as mpm
 from mpmjax.simulation import _simulate
 from mpmjax.simulation._advice import advise, disallowed
-from mpmjax.simulation._statistics import NOT_FINITE
+from mpmjax.simulation._statistics import Fault
 
 DT = 5e-3
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(), "backward_euler": mpm.BackwardEuler()}
@@ -165,7 +165,7 @@ def test_a_particle_that_is_not_finite_is_named():
     particles = eqx.tree_at(lambda p: p.v, particles, particles.v.at[5].set(1e308))
     with pytest.raises(mpm.SimulationError, match=r"At step 1 .* particle \d+ is no longer finite") as caught:
         mpm.simulate(scene, particles, t1=10 * DT, dt=DT)
-    assert int(caught.value.run.statistics.fault) == NOT_FINITE
+    assert int(caught.value.run.statistics.fault) == Fault.NOT_FINITE
     assert_equal(caught.value.run.final.x, particles.x)
 
 
@@ -352,7 +352,7 @@ def test_a_batch_member_that_fails_leaves_the_others_alone(method):
     good, faults = batch(jnp.array([1.0, 1.0, 2.0]))
     bad, faulty = batch(jnp.array([1.0, jnp.nan, 2.0]))
     assert list(faults) == [0, 0, 0]
-    assert list(faulty) == [0, NOT_FINITE, 0]
+    assert list(faulty) == [Fault.NONE, Fault.NOT_FINITE, Fault.NONE]
     for a, b in zip(good, bad, strict=True):
         assert_equal(a[np.array([0, 2])], b[np.array([0, 2])])
         assert np.isnan(b[1]).any()

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, ParticleVector, Scalar
 from mpmjax.checks import checked, is_traced, require, require_positive, require_whole
-from mpmjax.simulation import HEALTHY, RunStatistics, number_of_steps, simulate
+from mpmjax.simulation import Fault, RunStatistics, number_of_steps, simulate
 from mpmjax.state import Particles, Scene, prepare
 from mpmjax.stepping import AbstractIntegrator, Explicit, step_for
 
@@ -139,7 +139,7 @@ def _measure(
         return jnp.sqrt((mass[:, None] * a**2).sum(axis=(-2, -1)))
 
     times = steps * dt
-    faulty = (statistics.fault != HEALTHY) & (steps >= statistics.fault_step.astype(steps.dtype))
+    faulty = (statistics.fault != Fault.NONE) & (steps >= statistics.fault_step.astype(steps.dtype))
     lost = faulty | (statistics.unconverged > 0) | (unsolved > 0)
     growth = jnp.where(lost, jnp.nan, norm(moved) / (times * norm(change)))
     usable = jnp.isfinite(growth) & (growth > 0)
@@ -158,7 +158,7 @@ def _complaint(report: Sensitivity, statistics: RunStatistics, unsolved: float, 
     if not statistics.healthy:
         what = (
             f"meets a fault at step {int(statistics.fault_step)}"
-            if int(statistics.fault)
+            if int(statistics.fault) != Fault.NONE
             else "does not solve its equations"
         )
         return told + f"the run {what} and has no derivative from there on: see what simulate says of it."

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Bool, NodeVector, ParticleVector, Point, Scalar
+from mpmjax._types import Array, Bool, Corner, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import refuse_contact
@@ -17,9 +17,9 @@ from mpmjax.discretisation import Grid
 class AbstractBox(AbstractBoundary):
     """Walls around a box."""
 
-    lower: eqx.AbstractVar[Point]
+    lower: eqx.AbstractVar[Corner]
     """Position of the lower wall in each direction [m], (d,); −inf for none."""
-    upper: eqx.AbstractVar[Point]
+    upper: eqx.AbstractVar[Corner]
     """Position of the upper wall in each direction [m], (d,); inf for none."""
 
     def __check_init__(self):
@@ -77,8 +77,8 @@ class StickyBox(AbstractBox):
         upper: position of the upper wall in each direction [m], (d,); inf for none.
     """
 
-    lower: Point
-    upper: Point
+    lower: Corner
+    upper: Corner
 
     def __check_init__(self):
         require_fields(self)
@@ -102,8 +102,8 @@ class SlipBox(AbstractBox):
         upper: position of the upper wall in each direction [m], (d,); inf for none.
     """
 
-    lower: Point
-    upper: Point
+    lower: Corner
+    upper: Corner
 
     def __check_init__(self):
         require_fields(self)
@@ -130,8 +130,8 @@ class SeparatingBox(AbstractBox):
         friction: Coulomb coefficient [-], at least 0.
     """
 
-    lower: Point
-    upper: Point
+    lower: Corner
+    upper: Corner
     friction: Scalar = 0.0
 
     def __check_init__(self):

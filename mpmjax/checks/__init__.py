@@ -1,6 +1,6 @@
 """What a user passes in: its values, its kind, the memory that it asks for."""
 
-from mpmjax.checks._kinds import alternatives, checked, is_enum, is_module, require_fields, shape_of
+from mpmjax.checks._kinds import alternatives, checked, is_enum, is_module, may_be_infinite, require_fields, shape_of
 from mpmjax.checks._memory import require_memory
 from mpmjax.checks._values import (
     canonical,
@@ -29,6 +29,7 @@ __all__ = [
     "is_enum",
     "is_module",
     "is_traced",
+    "may_be_infinite",
     "require",
     "require_between",
     "require_fields",

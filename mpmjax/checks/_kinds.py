@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import fields
 from functools import cache, wraps
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, cast, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
 
 import equinox as eqx
 import jax
@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import AbstractArray
 
+from mpmjax._types import MayBeInfinite
 from mpmjax.checks._values import shortened
 
 Function = TypeVar("Function", bound=Callable)
@@ -91,10 +92,20 @@ def require_kind(name: str, value: Any, hint: Any) -> None:
 
 
 def alternatives(hint: Any) -> list[Any]:
-    """The members of a union; of any other annotation, the annotation alone."""
+    """The members of a union; of any other annotation, the annotation alone. Marks are left out."""
+    if get_origin(hint) is Annotated:
+        return alternatives(get_args(hint)[0])
     if get_origin(hint) in (typing.Union, UnionType):
         return [a for member in get_args(hint) for a in alternatives(member)]
     return [hint]
+
+
+def may_be_infinite(hint: Any) -> bool:
+    """Whether an annotation is marked as one of numbers that may be infinite, or a member of its union is."""
+    if get_origin(hint) is Annotated:
+        inner, *marks = get_args(hint)
+        return MayBeInfinite in marks or may_be_infinite(inner)
+    return get_origin(hint) in (typing.Union, UnionType) and any(may_be_infinite(member) for member in get_args(hint))
 
 
 def is_module(hint: Any) -> bool:
@@ -123,6 +134,8 @@ def shape_of(value: Any) -> tuple[int, ...] | None:
 def _takes(hint: Any, value: Any) -> bool:
     """Whether a value is of a kind that an annotation names; True if that cannot be told."""
     origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _takes(args[0], value)
     if origin in (typing.Union, UnionType):
         return any(_takes(a, value) for a in args)
     if origin in (tuple, list):

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Bool, Float, Point, Scalar
+from mpmjax._types import Array, Bool, Corner, Float, Point, Scalar
 from mpmjax.checks import checked, coordinates, require, require_fields, require_finite, require_positive, require_that
 
 
@@ -81,8 +81,8 @@ class Box(AbstractRegion):
         upper: largest coordinate in each direction [m], (d,), above `lower`.
     """
 
-    lower: Point
-    upper: Point
+    lower: Corner
+    upper: Corner
 
     def __check_init__(self):
         require_fields(self)

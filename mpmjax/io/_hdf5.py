@@ -1,5 +1,6 @@
 """Opening a run's HDF5 file, with checks that it is one, holds all of its data itself, and is whole."""
 
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -107,8 +108,16 @@ def reading(path: Path) -> Iterator[File]:
     except ValueError as error:
         raise ValueError(f"{path} is damaged ({reason(error)}): {_REMEDY}.") from None
     except (OSError, KeyError, RuntimeError, TypeError, AttributeError, IndexError, UnicodeError) as error:
-        what = "is cut short" if "truncated" in str(error) else "is damaged, or just being written"
+        what = "is cut short" if _is_cut_short(path) else "is damaged, or just being written"
         raise ValueError(f"{path} {what} ({reason(error)}): {_REMEDY}.") from None
+
+
+def _is_cut_short(path: Path) -> bool:
+    """Whether a file is shorter than its superblock says, if that is one of HDF5 1.8 or later."""
+    with open(path, "rb") as raw:
+        head = raw.read(36)
+    stated = struct.unpack_from("<Q", head, 28)[0] if len(head) == 36 and head[8] in (2, 3) else 0
+    return len(head) < 36 or path.stat().st_size < stated
 
 
 def _check_format(path: Path, file: File) -> None:

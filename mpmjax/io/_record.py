@@ -14,7 +14,7 @@ from mpmjax.checks import canonical, checked, require, require_whole, requiremen
 from mpmjax.io._interrupt import reporting, undisturbed
 from mpmjax.io._runs import FrameWriter
 from mpmjax.simulation import (
-    HEALTHY,
+    Fault,
     RolloutState,
     Run,
     RunStatistics,
@@ -87,7 +87,7 @@ def record(
         step, state, statistics = writer.last()
         previous, start = None, step - int(statistics.steps)
         require(
-            int(statistics.fault) == HEALTHY,
+            int(statistics.fault) == Fault.NONE,
             f"{path} ends with a fault after step {step} and would meet it again: start anew with another dt or scene.",
         )
         bar = tqdm(initial=step, total=max(step, end), unit="step", file=sys.stderr, disable=not progress)
@@ -116,7 +116,7 @@ def record(
                     watch=True,
                 )
                 statistics, step = statistics.merged(new), step + int(new.steps)
-                healthy = int(new.fault) == HEALTHY and int(new.unconverged) == 0
+                healthy = int(new.fault) == Fault.NONE and int(new.unconverged) == 0
                 if healthy:
                     _append(writer, step, state, statistics)
                     bar.update(count)
@@ -139,7 +139,7 @@ def record(
                 last = RolloutState(state_of(error.run.final), error.run.final_collider_impulse)
                 _append(writer, int(error.run.final_step), last, statistics)
                 again = "Resumed it would end there again: begin anew."
-                then = "It can be resumed as it is." if int(statistics.fault) == HEALTHY else again
+                then = "It can be resumed as it is." if int(statistics.fault) == Fault.NONE else again
                 said = f"{writer.standing()} {then}"
             except OSError as refused:
                 said = str(refused)

@@ -35,7 +35,7 @@ from mpmjax.boundary import (
     StickyCollider,
     SymmetryPlane,
 )
-from mpmjax.checks import alternatives, is_enum, is_module, require
+from mpmjax.checks import alternatives, is_enum, is_module, may_be_infinite, require
 from mpmjax.discretisation import APIC, FLIP, PIC, BSpline, Grid, MLSGradient, SplineGradient
 from mpmjax.geometry import Ball, Box, Capsule, Cylinder, HalfSpace, Motion, RigidMotion, SampledDistance, Union
 from mpmjax.implicit import (
@@ -83,6 +83,7 @@ def register(cls: Registered) -> Registered:
     In a file such an object is a table whose `kind` is the class's name and whose other keys are its constructor's
     arguments. So each argument must be a field of the same name, annotated with what files can hold: float, int, bool,
     str, an array, an enumeration, an equinox module whose class is the package's or registered, or tuples of such.
+    Numbers in files are finite; a corner of a box that may have no end is annotated as `mpmjax.Corner`.
 
     A file names classes and never executes code: import the module that registers a class before reading a file with
     one, in the shell by `mpmjax run SCENE.toml --import MODULE`. A class that is defined anew, as in a notebook, takes
@@ -134,7 +135,6 @@ def _can_be_held(hint: Any) -> bool:
 
 _SMALL = 64  # most numbers that are written out, and that are read as a tuple where both are taken
 _MOST_AXES = 3  # of what is annotated as an array and nothing more
-_MAY_BE_INFINITE = ("lower", "upper")  # a corner at infinity is no wall
 _ONE = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
 _MANY = {float: "numbers", int: "whole numbers", bool: "true and false", str: "strings"}
 
@@ -258,7 +258,7 @@ def _numbers(data: Any, expected: Any, where: str, arrays: dict[str, np.ndarray]
         kinds = {kind for kind, d in forms if d == depth and all(_fits(leaf, kind) for leaf in leaves)}
         _require(kinds, where, f"must be {_words(forms)}, got {_short(data)}")
     if float in kinds:
-        bad = np.isnan if where.rsplit(" ", 1)[-1] in _MAY_BE_INFINITE else lambda x: ~np.isfinite(x)
+        bad = np.isnan if may_be_infinite(expected) else lambda x: ~np.isfinite(x)
         beyond = any(isinstance(x, int) and math.isinf(_float(x)) for x in leaves)
         _require(not (beyond or any(bad(_float(x)) for x in leaves)), where, f"must be finite, got {_short(data)}")
         data = _floats(data) if a is data else a
@@ -289,7 +289,7 @@ def _parameters(function: Callable) -> dict[str, tuple[Any, Any]]:
 def _field_types(cls: type) -> dict[str, Any]:
     """The annotation of each field; where a module postpones them, they are read now."""
     types = {f.name: f.type for f in fields(cls)}
-    return typing.get_type_hints(cls) if any(isinstance(t, str) for t in types.values()) else types
+    return typing.get_type_hints(cls, include_extras=True) if any(isinstance(t, str) for t in types.values()) else types
 
 
 def _forms(hint: Any, *, within: bool = False) -> set[tuple[type, int]]:

@@ -4,10 +4,10 @@ from mpmjax.simulation._faults import raise_faults, warn_of_inaccurate_solves
 from mpmjax.simulation._rollout_state import RolloutState, initial_state
 from mpmjax.simulation._run import Run, SimulationError
 from mpmjax.simulation._simulate import integrate, number_of_steps, rollout, simulate
-from mpmjax.simulation._statistics import HEALTHY, RunStatistics, no_steps
+from mpmjax.simulation._statistics import Fault, RunStatistics, no_steps
 
 __all__ = [
-    "HEALTHY",
+    "Fault",
     "RolloutState",
     "Run",
     "RunStatistics",

@@ -2,6 +2,7 @@
 own."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import reduce
 from typing import Any, ClassVar
 
@@ -14,16 +15,7 @@ from mpmjax._types import Array, Bool, Int, Scalar
 from mpmjax.checks import first_unmet, requirements
 from mpmjax.discretisation import Stencil, in_window
 from mpmjax.simulation._rollout_state import RolloutState
-from mpmjax.simulation._statistics import (
-    BAD_PARAMETERS,
-    BEYOND,
-    HEALTHY,
-    INADMISSIBLE,
-    NOT_FINITE,
-    OUTSIDE,
-    RunStatistics,
-    no_steps,
-)
+from mpmjax.simulation._statistics import Fault, RunStatistics, no_steps, one_step
 from mpmjax.state import Particles, Scene, State, with_state
 from mpmjax.stepping import AbstractIntegrator, advance_compiled
 
@@ -42,22 +34,24 @@ class Problem(eqx.Module):
     slot: Scalar = 0.0
     """Zero; adjoint solves report through its cotangent (see `Reporting`)."""
     fault: Int[Array, ""] | None = None
-    """Fault of the state before the first step; None if it is known that there is none."""
+    """`Fault` of the state before the first step; None if it is known that there is none."""
+    unmet: Int[Array, ""] | None = None
+    """See `RunStatistics`; likewise."""
 
     def at(self, state: State) -> Particles:
         """The particles with a state put in."""
         return with_state(self.particles, state)
 
 
-def faulty_particles(problem: Problem, state: State) -> tuple[Bool[Array, "p"], Bool[Array, "p"], Bool[Array, "p"]]:
-    """Which particles are not finite, which have left the window, and which have an F that the law does not allow."""
+def faulty_particles(problem: Problem, state: State) -> dict[Fault, Bool[Array, "p"]]:
+    """Which particles have each fault that a state may have, the gravest fault first."""
     scene, particles = problem.scene, problem.at(state)
     finite = _finite((particles.x, particles.v, particles.C))
     finite = finite & jnp.concatenate([_finite((group.stored, group.history)) for group in particles.groups])
     anchor = scene.anchor(particles)
     outside = ~in_window(scene.kernel, scene.grid, scene.window(particles), anchor)
     admitted = jnp.concatenate([c.law.is_admissible(c.deformation) for c in scene.material_points(particles)])
-    return ~finite, finite & outside, finite & ~admitted
+    return {Fault.NOT_FINITE: ~finite, Fault.OUTSIDE: finite & outside, Fault.INADMISSIBLE: finite & ~admitted}
 
 
 def _finite(fields: Any) -> Bool[Array, "p"]:
@@ -78,17 +72,17 @@ def passed_particles(problem: Problem, before: State, after: State, t: Scalar) -
 
 def state_fault(problem: Problem, state: State) -> Int[Array, ""]:
     """The gravest fault of a state."""
-    broken, outside, inadmissible = (a.any() for a in faulty_particles(problem, state))
-    fault = jnp.where(inadmissible, INADMISSIBLE, HEALTHY)
-    fault = jnp.where(outside, OUTSIDE, fault)
-    return jnp.where(broken, NOT_FINITE, fault).astype(jnp.int32)
+    gravest = jnp.asarray(Fault.NONE, jnp.int32)
+    for fault, particles in reversed(faulty_particles(problem, state).items()):
+        gravest = jnp.where(particles.any(), fault, gravest)
+    return gravest
 
 
 def fault_of(problem: Problem, before: State, after: State, t: Scalar) -> Int[Array, ""]:
     """The gravest fault of a state, or of the step from t [s] that led to it."""
     fault = state_fault(problem, after)
     for _, passed in passed_particles(problem, before, after, t):
-        fault = jnp.where(passed.any() & (fault != NOT_FINITE), BEYOND, fault)
+        fault = jnp.where(passed.any() & (fault != Fault.NOT_FINITE), Fault.PASSED, fault)
     return fault
 
 
@@ -98,10 +92,10 @@ def examined(problem: Problem, state: RolloutState) -> tuple[Problem, RolloutSta
     arrays, rest = eqx.partition((problem, state), eqx.is_array)
     known, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
     unmet = first_unmet(requirements((known.scene, known.particles, known.method)))
-    fault = jnp.where(unmet > 0, BAD_PARAMETERS + unmet - 1, state_fault(known, begin.particles))
+    fault = jnp.where(unmet > 0, Fault.BAD_PARAMETERS, state_fault(known, begin.particles))
     valid = jnp.where(unmet > 0, jnp.nan, 1)
     state = jax.tree.map(lambda a: a * valid.astype(a.dtype), state)
-    return eqx.tree_at(lambda p: p.fault, problem, fault, is_leaf=lambda a: a is None), state
+    return replace(problem, fault=fault, unmet=unmet), state
 
 
 def step_number(t: Array) -> Array:
@@ -130,10 +124,10 @@ class StepSolver(diffrax.AbstractSolver):
         """Empty statistics, no previous state, and a report of zero."""
         del terms, t0, t1
         dtype = y0.particles.x.dtype
-        statistics, silent = no_steps(dtype), jnp.zeros((), dtype)
+        statistics = no_steps(dtype)
         if args.fault is not None:
-            statistics = eqx.tree_at(lambda statistics: statistics.fault, statistics, args.fault)
-        return statistics, y0 if self.watch else None, silent
+            statistics = replace(statistics, fault=args.fault, unmet=args.unmet)
+        return statistics, y0 if self.watch else None, jnp.zeros((), dtype)
 
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: RolloutState, args: Problem, solver_state: Any, made_jump: Any
@@ -147,12 +141,13 @@ class StepSolver(diffrax.AbstractSolver):
         report = report + info.solve.report
         y1 = y0.after(particles, info)
         arrays, rest = eqx.partition((args, y0.particles, y1.particles, t), eqx.is_array)
-        statistics = statistics.plus(info, fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest)))
+        fault = fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest))
+        statistics = statistics.merged(one_step(info, fault))
         dense = {"y0": y0, "y1": y1}
         if not self.watch:
             return y1, None, dense, (statistics, None, report), diffrax.RESULTS.successful
         results: Any = diffrax.RESULTS  # whose members the type checker takes for another type
-        result = results.where(statistics.fault == HEALTHY, results.successful, results.nonlinear_divergence)
+        result = results.where(statistics.fault == Fault.NONE, results.successful, results.nonlinear_divergence)
         return y1, None, dense, (statistics, y0, report), result
 
     def func(self, terms: Any, t0: Any, y0: RolloutState, args: Problem) -> RolloutState:

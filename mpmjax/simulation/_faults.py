@@ -1,6 +1,7 @@
 """The errors and warnings of a run."""
 
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,15 +16,7 @@ from mpmjax.simulation._advice import advise, disallowed
 from mpmjax.simulation._diffrax import Problem, faulty_particles, passed_particles
 from mpmjax.simulation._rollout_state import RolloutState
 from mpmjax.simulation._run import Run, SimulationError
-from mpmjax.simulation._statistics import (
-    BAD_PARAMETERS,
-    BEYOND,
-    HEALTHY,
-    INADMISSIBLE,
-    NOT_FINITE,
-    OUTSIDE,
-    RunStatistics,
-)
+from mpmjax.simulation._statistics import Fault, RunStatistics
 from mpmjax.state import Particles, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator
 
@@ -37,37 +30,32 @@ def raise_faults(run: Run, began: Particles, previous: RolloutState | None, star
         previous: the state before the last step.
         start: number of the run's first step.
     """
-    fault = int(run.statistics.fault)
-    if fault != HEALTHY:
+    fault = Fault(int(run.statistics.fault))
+    if fault != Fault.NONE:
         assert previous is not None
         step = start + int(run.statistics.fault_step)
         problem = Problem(run.scene, run.final, None, run.dt, run.method)
-        broken, outside, inadmissible = faulty_particles(problem, state_of(run.final))
-        bad: dict[int, Array] = {NOT_FINITE: broken, OUTSIDE: outside, INADMISSIBLE: inadmissible}
-        what, advice = _FAULTS.get(fault, ("", ""))
-        if fault == BEYOND:
+        words, bad = _WORDS[fault], faulty_particles(problem, state_of(run.final))
+        what, advice = words.particle, words.advice
+        if fault == Fault.PASSED:
             t = jnp.asarray(step - 1, run.final.x.dtype) * run.dt
             passed = passed_particles(problem, previous.particles, state_of(run.final), t)
-            number, bad[BEYOND] = next((i, mask) for i, mask in passed if mask.any())
+            number, bad[fault] = next((i, mask) for i, mask in passed if mask.any())
             what = f"{what} boundary {number}, {type(run.scene.boundary[number]).__name__}"
             if run.scene.total:
                 advice = "In the total description it holds only what touched it from the start: use the updated one."
         first = int(np.argmax(np.asarray(bad[fault])))
-        if fault == INADMISSIBLE:
+        if fault == Fault.INADMISSIBLE:
             what, advice = disallowed(_law(run, first), run.method)
         last = with_state(run.final, previous.particles)
         reached = int((run.steps < step).sum())
-        good = eqx.tree_at(
-            lambda r: (
-                *(r.final, r.final_collider_impulse, r.final_step),
-                *(r.steps, r.frames, r.observed, r.collider_impulse),
-            ),
+        saved = {name: getattr(run, name) for name in ("steps", "frames", "observed", "collider_impulse")}
+        good = replace(
             run,
-            (
-                *(last, previous.collider_impulse, jnp.asarray(step - 1, run.final_step.dtype)),
-                *jax.tree.map(lambda a: a[:reached], (run.steps, run.frames, run.observed, run.collider_impulse)),
-            ),
-            is_leaf=lambda leaf: leaf is None,
+            **jax.tree.map(lambda a: a[:reached], saved),
+            final=last,
+            final_collider_impulse=previous.collider_impulse,
+            final_step=jnp.asarray(step - 1, run.final_step.dtype),
         )
         raise SimulationError(
             f"At step {step} (t = {step * float(run.dt):.6g} s) particle {first} {what}; the last good position was "
@@ -111,26 +99,35 @@ def _law(run: Run, particle: int) -> AbstractLaw:
     return run.scene.laws[int(np.searchsorted(last, particle, side="right"))]
 
 
-_FAULTS: dict[int, tuple[str, str]] = {
-    NOT_FINITE: (
+class _Words(NamedTuple):
+    """What is said of a fault."""
+
+    state: str
+    """Of the state, where no particle can be named."""
+    particle: str = ""
+    """Of a particle, after its number; empty where it depends on the law (`disallowed`)."""
+    advice: str = ""
+    """What helps; empty likewise."""
+
+
+_WORDS: dict[Fault, _Words] = {
+    Fault.NOT_FINITE: _Words(
+        "a state that is not finite",
         "is no longer finite",
         "Look in the frames before (save_every) for what grows out of scale: a force, a prescribed motion, a velocity.",
     ),
-    OUTSIDE: ("left the grid's window", "Enlarge the grid's shape, or use follow=True."),
-    BEYOND: (
+    Fault.OUTSIDE: _Words(
+        "a particle outside the grid's window",
+        "left the grid's window",
+        "Enlarge the grid's shape, or use follow=True.",
+    ),
+    Fault.INADMISSIBLE: _Words("a deformation gradient that its law does not allow"),
+    Fault.PASSED: _Words(
+        "a particle that passed a boundary",
         "passed",
         "Reduce dt: a boundary keeps out what comes less than a cell nearer in a step.",
     ),
 }
-
-
-_STATE_FAULTS = (
-    "a state that is not finite",
-    "a particle outside the grid's window",
-    "a deformation gradient that its law does not allow",
-    "a particle that passed a boundary",
-)
-"""The texts of NOT_FINITE and the following codes if no particle can be named."""
 _ADVICE = (
     "Call simulate outside of jax transformations to have step, time and particle named, or with throw=False to "
     "inspect run.statistics."
@@ -146,10 +143,13 @@ def guarded(run: Run, report: Array) -> Run:
     inputs, rest = eqx.partition((run.scene, run.final, run.method), eqx.is_array)
     names: list[str] = []
     jax.eval_shape(lambda a: names.extend(r.message for r in requirements(eqx.combine(a, rest))), inputs)
-    met = [f"the rollout met a fault: {what}. {_ADVICE}" for what in (*_STATE_FAULTS, "a solve that did not converge")]
-    bad = [f"the rollout met a fault: {name}" for name in names]
-    statistics, unsolved = run.statistics, len(met)
-    state = jnp.where((statistics.fault == HEALTHY) & (statistics.unconverged > 0), unsolved, statistics.fault)
-    number = jnp.where(statistics.fault >= BAD_PARAMETERS, unsolved + 1 + statistics.fault - BAD_PARAMETERS, state)
-    faults = [f"mpmjax: {message}" for message in (*met, *bad)]
+    statistics = run.statistics
+    unsolved = (statistics.fault == Fault.NONE) & (statistics.unconverged > 0)
+    known = [(words.state, statistics.fault == fault) for fault, words in _WORDS.items()]
+    known.append(("a solve that did not converge", unsolved))
+    met = jnp.stack([holds for _, holds in known])
+    number = jnp.where(met.any(), 1 + jnp.argmax(met).astype(jnp.int32), 0)
+    number = jnp.where(statistics.unmet > 0, len(known) + statistics.unmet, number)
+    said = [*(f"{what}. {_ADVICE}" for what, _ in known), *names]
+    faults = [f"mpmjax: the rollout met a fault: {what}" for what in said]
     return guard(run, report, number, faults, UNSOLVED.format("the tangent"))[0]

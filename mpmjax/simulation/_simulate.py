@@ -27,7 +27,7 @@ from mpmjax.simulation._diffrax import Problem, StepSolver, examined, no_vector_
 from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccurate_solves
 from mpmjax.simulation._rollout_state import RolloutState, initial_state
 from mpmjax.simulation._run import Run
-from mpmjax.simulation._statistics import HEALTHY, RunStatistics
+from mpmjax.simulation._statistics import RunStatistics
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
 from mpmjax.stepping import MOST_STEPS, AbstractIntegrator, Explicit, advance, step_for
 
@@ -108,8 +108,8 @@ def simulate(
         )
     slot = jnp.zeros((), dtype)
     if traced and throw:
-        healthy, unsolved = jnp.asarray(HEALTHY, jnp.int32), UNSOLVED.format("the adjoint")
-        (scene, particles, method), slot = guard((scene, particles, method), slot, healthy, (), unsolved)
+        no_fault, unsolved = jnp.zeros((), jnp.int32), UNSOLVED.format("the adjoint")
+        (scene, particles, method), slot = guard((scene, particles, method), slot, no_fault, (), unsolved)
     if adjoint is None:
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=max(1, min(count, checkpoint_bytes // state_bytes)))
     saved, final, statistics, previous, report = integrate(

@@ -1,5 +1,7 @@
 """Statistics of a run's steps."""
 
+import enum
+from dataclasses import fields
 from typing import Any
 
 import equinox as eqx
@@ -9,13 +11,21 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Bool, Float, Int
 from mpmjax.stepping import StepInfo
 
-HEALTHY, NOT_FINITE, OUTSIDE, INADMISSIBLE, BEYOND = 0, 1, 2, 3, 4
-"""The faults of a state."""
 
+class Fault(enum.IntEnum):
+    """What is wrong with a state or a step. A member may be compared with a traced whole number."""
 
-BAD_PARAMETERS = 100
-"""From here on: a value of scene, particles or method that its module does not allow, by its number among their
-`requirements`."""
+    NONE = 0
+    NOT_FINITE = 1
+    """A number of a particle is infinite or NaN."""
+    OUTSIDE = 2
+    """A particle's stencil has left the grid's window."""
+    INADMISSIBLE = 3
+    """A law does not allow a particle's deformation gradient."""
+    PASSED = 4
+    """A particle has passed a boundary that keeps it out."""
+    BAD_PARAMETERS = 5
+    """Scene, particles or method have a value that their module does not allow, which a jax transformation hid."""
 
 
 class RunStatistics(eqx.Module):
@@ -45,40 +55,21 @@ class RunStatistics(eqx.Module):
     violations: Int[Array, "*f"]
     """Contact conditions left violated, summed over steps."""
     fault: Int[Array, "*f"]
-    """The first fault of a state: HEALTHY, NOT_FINITE, OUTSIDE, INADMISSIBLE or BEYOND; or BAD_PARAMETERS and what
-    follows."""
+    """The first `Fault`."""
     fault_step: Int[Array, "*f"]
     """Number of steps that led to it."""
+    unmet: Int[Array, "*f"]
+    """With BAD_PARAMETERS the number, from one, of the first of the `requirements` on scene, particles and method that
+    is not met; else zero."""
 
     @property
     def healthy(self) -> Bool[Array, "*f"]:
         """Whether no state was at fault and no solve ended far from its tolerance."""
-        return (self.fault == HEALTHY) & (self.unconverged == 0)
-
-    def plus(self, info: StepInfo, fault: Int[Array, ""]) -> "RunStatistics":
-        """The statistics after one more step."""
-        s, c = info.solve, info.contact
-        steps = self.steps + 1
-        first = (self.fault == HEALTHY) & (fault != HEALTHY)
-        return RunStatistics(
-            steps=steps,
-            iterations=self.iterations + s.iterations,
-            most_iterations=jnp.maximum(self.most_iterations, s.iterations),
-            newton=self.newton + s.newton,
-            line_search=self.line_search + s.line_search,
-            worst_residual=jnp.maximum(self.worst_residual, jax.lax.stop_gradient(s.residual)),
-            unconverged=self.unconverged + jnp.where(s.converged | s.nearly_converged, 0, 1).astype(jnp.int32),
-            nearly_converged=self.nearly_converged + s.nearly_converged.astype(jnp.int32),
-            indefinite=self.indefinite + s.indefinite.astype(jnp.int32),
-            sweeps=self.sweeps + c.sweeps,
-            violations=self.violations + c.violations,
-            fault=jnp.where(first, fault, self.fault),
-            fault_step=jnp.where(first, steps, self.fault_step),
-        )
+        return (self.fault == Fault.NONE) & (self.unconverged == 0)
 
     def merged(self, later: "RunStatistics") -> "RunStatistics":
         """These statistics and those of the steps that followed."""
-        healthy = self.fault == HEALTHY
+        first = self.fault == Fault.NONE
         return RunStatistics(
             steps=self.steps + later.steps,
             iterations=self.iterations + later.iterations,
@@ -91,13 +82,36 @@ class RunStatistics(eqx.Module):
             indefinite=self.indefinite + later.indefinite,
             sweeps=self.sweeps + later.sweeps,
             violations=self.violations + later.violations,
-            fault=jnp.where(healthy, later.fault, self.fault),
-            fault_step=jnp.where(healthy & (later.fault != HEALTHY), self.steps + later.fault_step, self.fault_step),
+            fault=jnp.where(first, later.fault, self.fault),
+            fault_step=jnp.where(first & (later.fault != Fault.NONE), self.steps + later.fault_step, self.fault_step),
+            unmet=jnp.where(first, later.unmet, self.unmet),
         )
 
 
 def no_steps(dtype: Any) -> RunStatistics:
     """The statistics before the first step."""
-    zero = jnp.asarray(0, dtype=jnp.int32)
-    residual = jnp.asarray(0, dtype=dtype)
-    return RunStatistics(zero, zero, zero, zero, zero, residual, zero, zero, zero, zero, zero, zero, zero)
+    zero = jnp.asarray(0, jnp.int32)
+    zeros = {field.name: zero for field in fields(RunStatistics)}
+    return RunStatistics(**zeros | {"worst_residual": jnp.asarray(0, dtype)})
+
+
+def one_step(info: StepInfo, fault: Int[Array, ""]) -> RunStatistics:
+    """The statistics of one step, from what it reports and the fault of the state after it."""
+    solve, contact = info.solve, info.contact
+    zero, one = jnp.asarray(0, jnp.int32), jnp.asarray(1, jnp.int32)
+    return RunStatistics(
+        steps=one,
+        iterations=solve.iterations,
+        most_iterations=solve.iterations,
+        newton=solve.newton,
+        line_search=solve.line_search,
+        worst_residual=jax.lax.stop_gradient(solve.residual),
+        unconverged=(~(solve.converged | solve.nearly_converged)).astype(jnp.int32),
+        nearly_converged=solve.nearly_converged.astype(jnp.int32),
+        indefinite=solve.indefinite.astype(jnp.int32),
+        sweeps=contact.sweeps,
+        violations=contact.violations,
+        fault=fault,
+        fault_step=one,
+        unmet=zero,
+    )

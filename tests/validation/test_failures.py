@@ -11,7 +11,7 @@ from numpy_oracle import grid_update
 import mpmjax as mpm
 from mpmjax._types import components
 from mpmjax.analysis._diagnostics import volume_ratio
-from mpmjax.simulation._statistics import INADMISSIBLE
+from mpmjax.simulation._statistics import Fault
 from mpmjax.verification import AxisAligned, TwoDisks, VibratingBar, Vortex, discretise, errors, orders
 
 LAW = LAWS["fixed_corotated"]
@@ -269,7 +269,7 @@ def test_one_linear_solve_inverts_where_newton_holds():
     matter of chance whether thirty Newton steps suffice, and where they do not it says so."""
     assert bool(thrown(mpm.SemiImplicit(), 2.0, 0.1).healthy)
     for number in (0.5, 2.0, 8.0):
-        assert int(thrown(mpm.SemiImplicit(), 2.0, number).fault) == INADMISSIBLE
+        assert int(thrown(mpm.SemiImplicit(), 2.0, number).fault) == Fault.INADMISSIBLE
         held = thrown(mpm.BackwardEuler(), 2.0, number)
         assert bool(held.healthy)
         assert 1 <= int(held.line_search) <= 10
@@ -277,7 +277,7 @@ def test_one_linear_solve_inverts_where_newton_holds():
     assert not all(bool(statistics.healthy) for statistics in faster)
     assert all(bool(statistics.healthy) or int(statistics.unconverged) for statistics in faster)
     midpoint = thrown(mpm.ImplicitMidpoint(mpm.Newton()), 2.0, 2.0)  # admissible at the middle of the step only
-    assert int(midpoint.fault) == INADMISSIBLE
+    assert int(midpoint.fault) == Fault.INADMISSIBLE
 
 
 PATIENT = mpm.SemiImplicit(solver=mpm.ConjugateResidual(rtol=1e-6, max_steps=4000))
