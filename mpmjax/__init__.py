@@ -64,6 +64,7 @@ from mpmjax.geometry import (
 from mpmjax.implicit import (
     AbstractHessian,
     AbstractPreconditioner,
+    AbstractSolution,
     AnalyticHessian,
     ConjugateResidual,
     DiagonalPreconditioner,
@@ -185,6 +186,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "BackwardEuler",
     "ImplicitMidpoint",
     "TRBDF2",
+    "AbstractSolution",
     "Linearised",
     "Newton",
     "AbstractHessian",

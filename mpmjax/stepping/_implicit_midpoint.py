@@ -10,12 +10,12 @@ from mpmjax.checks import require_fields
 from mpmjax.implicit import (
     AbstractHessian,
     AbstractPreconditioner,
+    AbstractSolution,
     AnalyticHessian,
     ConjugateResidual,
     DiagonalPreconditioner,
     Guess,
     Linearised,
-    Newton,
     SolveInfo,
 )
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
@@ -38,14 +38,14 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
     (E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration, 2nd ed. 2006, II.1.)
 
     Args:
-        solution: `Linearised()`, one linear solve, or `Newton()`.
+        solution: `Linearised()`, one linear solve; `Newton()`; or one of your own.
         hessian: how H acts. Default: by the analytic stress differential.
         preconditioner: of the linear solves. Default: the diagonal of M + cH.
         adjoint_solver: of the tangent and adjoint solves, any symmetric one. Default: `ConjugateResidual`.
         guess: where the solve starts.
     """
 
-    solution: Linearised | Newton = Linearised()
+    solution: AbstractSolution = Linearised()
     hessian: AbstractHessian = AnalyticHessian()
     preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
     adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()

@@ -11,12 +11,12 @@ from mpmjax.checks import require_between, require_fields
 from mpmjax.implicit import (
     AbstractHessian,
     AbstractPreconditioner,
+    AbstractSolution,
     AnalyticHessian,
     ConjugateResidual,
     DiagonalPreconditioner,
     Guess,
     Linearised,
-    Newton,
     SolveInfo,
 )
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
@@ -41,7 +41,7 @@ class TRBDF2(AbstractImplicitIntegrator):
 
     Args:
         rho: ρ∞, from 0 to 1.
-        solution: `Linearised()`, one linear solve a stage, or `Newton()`.
+        solution: `Linearised()`, one linear solve a stage; `Newton()`; or one of your own.
         hessian: how H acts. Default: by the analytic stress differential.
         preconditioner: of the linear solves. Default: the diagonal of M + cH.
         adjoint_solver: of the tangent and adjoint solves, any symmetric one. Default: `ConjugateResidual`.
@@ -49,7 +49,7 @@ class TRBDF2(AbstractImplicitIntegrator):
     """
 
     rho: Scalar = 0.0
-    solution: Linearised | Newton = Linearised()
+    solution: AbstractSolution = Linearised()
     hessian: AbstractHessian = AnalyticHessian()
     preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
     adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
