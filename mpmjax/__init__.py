@@ -86,6 +86,7 @@ from mpmjax.geometry import (
 from mpmjax.implicit import (
     AbstractHessian,
     AbstractPreconditioner,
+    AbstractSolution,
     AnalyticHessian,
     ConjugateResidual,
     DiagonalPreconditioner,
@@ -208,6 +209,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "BackwardEuler",
     "ImplicitMidpoint",
     "TRBDF2",
+    "AbstractSolution",
     "Linearised",
     "Newton",
     "AbstractHessian",

@@ -7,7 +7,7 @@ from mpmjax._types import NodeVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.checks import require, require_fields
-from mpmjax.geometry import AbstractMotion, AbstractRegion, Motion
+from mpmjax.geometry import AbstractRegion, Motion
 
 
 class Grip(AbstractBoundary):
@@ -35,7 +35,7 @@ class Grip(AbstractBoundary):
 
     def __check_init__(self):
         require(
-            isinstance(self.motion, Motion) or not isinstance(self.motion, AbstractMotion),
+            not getattr(self.motion, "turns", False),  # anything may have been given
             f"A grip does not turn: take a StickyCollider, got the motion {self.motion}.",
         )
         require_fields(self)

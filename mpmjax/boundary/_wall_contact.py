@@ -20,7 +20,7 @@ class WallContact(AbstractContact):
 
     @property
     def friction_order(self) -> float:
-        return self.axis
+        return float(self.axis)
 
     def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> NodeScalar:
         """The velocity along the inward normal [m/s]."""

@@ -13,6 +13,7 @@ from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.implicit._preconditioner import AbstractPreconditioner, DiagonalPreconditioner, MassPreconditioner
 from mpmjax.implicit._problems import LinearProblem, NewtonProblem
 from mpmjax.implicit._projection import Projection
+from mpmjax.implicit._solution import AbstractSolution, StageEquation
 from mpmjax.implicit._solve import Reporting, solve
 from mpmjax.implicit._solve_info import SolveInfo, no_solve
 
@@ -22,6 +23,7 @@ __all__ = [
     "AbstractInnerProduct",
     "AbstractInnerProductSolver",
     "AbstractPreconditioner",
+    "AbstractSolution",
     "AnalyticHessian",
     "ConjugateResidual",
     "DiagonalInnerProduct",
@@ -39,6 +41,7 @@ __all__ = [
     "Projection",
     "Reporting",
     "SolveInfo",
+    "StageEquation",
     "TangentAction",
     "damped",
     "no_solve",

@@ -1,18 +1,22 @@
 """One linear solve for each stage."""
 
-import equinox as eqx
+from functools import reduce
+
 import jax.numpy as jnp
 import lineax as lx
 
-from mpmjax._types import NodeVector
+from mpmjax._types import NodeVector, Scalar
 from mpmjax.checks import require_fields
 from mpmjax.implicit._conjugate_residual import ConjugateResidual
+from mpmjax.implicit._hessian import AbstractHessian
 from mpmjax.implicit._linear_solve import require_solver, solve_linear
+from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.implicit._problems import LinearProblem
+from mpmjax.implicit._solution import AbstractSolution, StageEquation
 from mpmjax.implicit._solve_info import SolveInfo
 
 
-class Linearised(eqx.Module):
+class Linearised(AbstractSolution):
     """One linear solve with the force f(0) − H u, linear in the displacement u of the step.
 
     Args:
@@ -24,6 +28,20 @@ class Linearised(eqx.Module):
     def __check_init__(self):
         require_fields(self)
         require_solver("Linearised's solver", self.solver)
+
+    def problem(self, stage: StageEquation) -> LinearProblem:
+        return stage.linear()
+
+    def stage_force(
+        self,
+        potential: ElasticPotential,
+        hessian: AbstractHessian,
+        force: NodeVector,
+        *stages: tuple[Scalar, NodeVector],
+    ) -> NodeVector:
+        """Σ q f(0) − H Σ q u [N]."""
+        mean = reduce(jnp.add, (q * u for q, u in stages))
+        return sum(q for q, _ in stages) * force - hessian.at_current(potential, mean)(mean)
 
     def __call__(self, problem: LinearProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         """The solution [m/s], shape (n, d), and the report of the solve.

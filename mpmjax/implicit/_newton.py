@@ -1,6 +1,6 @@
 """Newton's method for the nodal problems."""
 
-from functools import partial
+from functools import partial, reduce
 
 import equinox as eqx
 import jax
@@ -10,17 +10,20 @@ import lineax as lx
 from mpmjax._types import Array, Bool, Float, Int, NodeVector, Scalar
 from mpmjax.checks import require, require_fields, require_tolerance
 from mpmjax.implicit._conjugate_residual import NEGLIGIBLE_CHANGE, ConjugateResidual
+from mpmjax.implicit._hessian import AbstractHessian
 from mpmjax.implicit._inner_product import AbstractInnerProduct
 from mpmjax.implicit._line_search import MOST_HALVINGS, backtrack
 from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, default_rtol, require_solver, solve_linear
 from mpmjax.implicit._operator import ImplicitOperator
+from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.implicit._problems import NewtonProblem
+from mpmjax.implicit._solution import AbstractSolution, StageEquation
 from mpmjax.implicit._solve_info import SolveInfo
 
 _ROUNDING = 4.0  # units of rounding that a sum over the particles and nodes is taken to have
 
 
-class Newton(eqx.Module):
+class Newton(AbstractSolution):
     """Newton's method with a backtracking line search on the incremental potential.
 
     Direction: the Hessian can be indefinite. If the potential does not fall along Newton's direction, the steepest one
@@ -63,6 +66,20 @@ class Newton(eqx.Module):
         if self.rtol is not None:
             require_tolerance("Newton's rtol", self.rtol)
         require(self.max_steps >= 1, f"Newton's max_steps must be at least 1, got {self.max_steps}.")
+
+    def problem(self, stage: StageEquation) -> NewtonProblem:
+        return stage.nonlinear()
+
+    def stage_force(
+        self,
+        potential: ElasticPotential,
+        hessian: AbstractHessian,
+        force: NodeVector,
+        *stages: tuple[Scalar, NodeVector],
+    ) -> NodeVector:
+        """Σ q f(u) [N]."""
+        del hessian, force
+        return reduce(jnp.add, (q * potential.force(u) for q, u in stages))
 
     def __call__(self, problem: NewtonProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         """The solution [m/s], shape (n, d), and the report of the solve.

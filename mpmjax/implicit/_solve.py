@@ -14,9 +14,8 @@ import lineax as lx
 from mpmjax._types import Array, NodeVector, Scalar
 from mpmjax.autodiff import ruled, without_derivative
 from mpmjax.implicit._linear_solve import solve_linear
-from mpmjax.implicit._linearised import Linearised
-from mpmjax.implicit._newton import Newton
 from mpmjax.implicit._problems import AbstractProblem
+from mpmjax.implicit._solution import AbstractSolution
 from mpmjax.implicit._solve_info import SolveInfo
 
 
@@ -37,16 +36,16 @@ class Reporting(eqx.Module):
 def solve(
     problem: AbstractProblem,
     guess: NodeVector,
-    find: Linearised | Newton,
+    find: AbstractSolution,
     adjoint: lx.AbstractLinearSolver | Reporting,
 ) -> tuple[NodeVector, SolveInfo]:
     """The solution of a problem, differentiable with respect to it in forward and reverse mode, to any order.
 
     Args:
         problem: the problem.
-        guess: where the iteration starts [m/s], shape (n, d). Result and derivative depend on it only within the
+        guess: where the search starts [m/s], shape (n, d). Result and derivative depend on it only within the
             tolerance.
-        find: the iteration.
+        find: how the solution is found.
         adjoint: solver of the tangent and adjoint systems. A solve that ends beyond ten times its tolerance gives NaN,
             so that a wrong gradient cannot pass for a right one.
     """

@@ -10,12 +10,12 @@ from mpmjax.checks import require_fields
 from mpmjax.implicit import (
     AbstractHessian,
     AbstractPreconditioner,
+    AbstractSolution,
     AnalyticHessian,
     ConjugateResidual,
     DiagonalPreconditioner,
     Guess,
     Linearised,
-    Newton,
     SolveInfo,
 )
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
@@ -41,15 +41,15 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
     *Good values*: a Δt that resolves the motion of interest, tens of steps a period, whatever the explicit limit.
 
     Args:
-        solution: `Linearised()` for one linear solve, or `Newton()`.
+        solution: `Linearised()` for one linear solve, `Newton()`, or one of your own.
         hessian: the Hessian H of the elastic energy. Default: by the analytic stress differential.
-        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + cH.
+        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH.
         adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. Its tolerance
             bounds that of the gradient.
         guess: where the solve starts. Default: the velocity of the nodes v^n.
     """
 
-    solution: Linearised | Newton = Linearised()
+    solution: AbstractSolution = Linearised()
     hessian: AbstractHessian = AnalyticHessian()
     preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
     adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()

@@ -11,12 +11,12 @@ from mpmjax.checks import require_between, require_fields
 from mpmjax.implicit import (
     AbstractHessian,
     AbstractPreconditioner,
+    AbstractSolution,
     AnalyticHessian,
     ConjugateResidual,
     DiagonalPreconditioner,
     Guess,
     Linearised,
-    Newton,
     SolveInfo,
 )
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
@@ -43,16 +43,16 @@ class TRBDF2(AbstractImplicitIntegrator):
 
     Args:
         rho: ρ∞, from 0 to 1.
-        solution: `Linearised()` for one linear solve a stage, or `Newton()`.
+        solution: `Linearised()` for one linear solve a stage, `Newton()`, or one of your own.
         hessian: the Hessian H of the elastic energy. Default: by the analytic stress differential.
-        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + cH.
+        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH.
         adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. Its tolerance
             bounds that of the gradient.
         guess: where the solve of the first stage starts; that of the second starts at the result of the first.
     """
 
     rho: Scalar = 0.0
-    solution: Linearised | Newton = Linearised()
+    solution: AbstractSolution = Linearised()
     hessian: AbstractHessian = AnalyticHessian()
     preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
     adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
