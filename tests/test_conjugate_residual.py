@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import pytest
-from helpers import LAWS, assert_close, explicit_limit
+from helpers import LAWS, assert_close, explicit_limit, ids, thorough
 
 import mpmjax as mpm
 from mpmjax._types import components
@@ -21,7 +21,7 @@ from mpmjax.implicit._projection import Projection
 
 N = 24
 DTYPES = {"float64": jnp.float64, "float32": jnp.float32}
-EACH_DTYPE = pytest.mark.parametrize("dtype", DTYPES.values(), ids=DTYPES)
+EACH_DTYPE = pytest.mark.parametrize("dtype", **ids(DTYPES, "float64"))
 R = lx.RESULTS
 
 
@@ -63,8 +63,8 @@ def true_residual(A, x, b, weight=1.0):
 
 
 @pytest.mark.parametrize("spectrum", ["definite", "indefinite"])
-@pytest.mark.parametrize("weighted", [False, True], ids=["plain", "weighted"])
-@pytest.mark.parametrize("guessed", [False, True], ids=["from_zero", "from_a_guess"])
+@pytest.mark.parametrize("weighted", **ids({"plain": False, "weighted": True}, "weighted"))
+@pytest.mark.parametrize("guessed", **ids({"from_zero": False, "from_a_guess": True}, "from_a_guess"))
 def test_solution_agrees_with_a_dense_solve(spectrum, weighted, guessed):
     """x = A⁻¹b for definite and indefinite A, in the plain and in a weighted inner product, from any start."""
     A, (b, y0, w) = symmetric(spectrum), vectors()
@@ -142,7 +142,7 @@ def test_an_exact_guess_takes_no_iteration(dtype):
 
 @EACH_DTYPE
 @pytest.mark.parametrize("spectrum", ["definite", "indefinite", "ill_conditioned"])
-@pytest.mark.parametrize("max_steps", [5, 1000])
+@pytest.mark.parametrize("max_steps", [*thorough(5), 1000])
 def test_reported_residual_is_the_true_one(dtype, spectrum, max_steps):
     """`residual` is recomputed from the x returned, converged or not, in both precisions."""
     A, (b, _, w) = symmetric(spectrum).astype(dtype), vectors()

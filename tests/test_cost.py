@@ -267,6 +267,7 @@ def test_pic_carries_no_affine_velocity_and_two_dimensions_no_third():
     assert all(less < more for less, more in zip(apic[:3], solid[:3], strict=True))
 
 
+@pytest.mark.thorough
 def test_the_cost_of_an_empty_window_is_that_of_its_nodes():
     """Twice the window each way: the same crossings, and at most 40 flops and 400 bytes for each node that is added."""
     small, large = compiled(nodes=12), compiled(nodes=24)

@@ -37,7 +37,6 @@ IN_THREE_DIMENSIONS = [("fixed_corotated", "updated", "spline"), ("neo_hookean",
 DEFAULT = [
     ("fixed_corotated", 2, "updated", "mls"),
     ("neo_hookean", 1, "total", "mls"),
-    ("hencky", 2, "updated", "spline"),
 ]
 """Cases of all families of F in the default run."""
 

@@ -103,7 +103,9 @@ def test_semi_implicit_and_backward_euler_agree_as_the_step_falls():
     assert (np.abs(orders - 3) < 0.2).all(), orders
 
 
-@pytest.mark.parametrize("method", [mpm.SemiImplicit, pytest.param(mpm.BackwardEuler, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "method", [*thorough(mpm.SemiImplicit), pytest.param(mpm.BackwardEuler, marks=pytest.mark.slow)]
+)
 def test_the_two_hessians_give_the_same_step(method):
     """Analytic differential or jvp of the energy's gradient."""
     scene, particles = jolted(material=LAWS["neo_hookean"])

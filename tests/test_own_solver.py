@@ -238,12 +238,13 @@ def test_a_solver_that_does_not_solve_is_found_out():
     assert np.isnan(gradient).all()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("preconditioner", "method"),
     [
-        pytest.param(ScaledMass(), OURS, id="diagonal_linear", marks=pytest.mark.thorough),
-        pytest.param(BlockJacobi(), NEWTON, id="blocks_newton", marks=pytest.mark.thorough),
-        pytest.param(ScaledMass(), NEWTON, id="diagonal_newton", marks=pytest.mark.thorough),
+        pytest.param(ScaledMass(), OURS, id="diagonal_linear"),
+        pytest.param(BlockJacobi(), NEWTON, id="blocks_newton"),
+        pytest.param(ScaledMass(), NEWTON, id="diagonal_newton"),
         pytest.param(BlockJacobi(), OURS, id="blocks_linear"),
     ],
 )

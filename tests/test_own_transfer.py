@@ -43,7 +43,7 @@ def moving(transfer, **choices):
     return scene, mpm.Particles(particles.x, v, particles.mass, particles.volume)
 
 
-@pytest.mark.parametrize("gradient", [mpm.MLSGradient(), *thorough(mpm.SplineGradient())])
+@pytest.mark.parametrize("gradient", thorough(mpm.MLSGradient(), mpm.SplineGradient()))
 @pytest.mark.parametrize("method", [mpm.Explicit(), *thorough(mpm.SemiImplicit())])
 def test_without_a_share_of_flip_it_is_apic(method, gradient):
     own, apic = (

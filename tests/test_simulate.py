@@ -90,6 +90,18 @@ def test_observations_are_curves():
     assert_equal(coarse.observed[0], run.observed[0][np.array([0, 4, 6])])
 
 
+def test_an_observation_has_a_derivative():
+    """A curve of a function of one's own, by gravity, against a central difference."""
+    scene, particles = pulled()
+
+    def area(gravity):
+        weighed = eqx.tree_at(lambda s: s.gravity, scene, (gravity,))
+        return mpm.simulate(weighed, particles, t1=4 * DT, dt=DT, observe=height).observed[0].sum()
+
+    (low, _), (_, slope), (high, _) = map(jax.jit(jax.value_and_grad(area)), (-9.82, -9.81, -9.80))
+    assert float(slope) == pytest.approx(float(high - low) / 0.02, rel=1e-6)
+
+
 @pytest.mark.thorough
 def test_a_run_continues_from_its_end():
     """With start = final_step a moving grip is where it should be: two halves equal the whole, bit for bit."""

@@ -108,8 +108,8 @@ def angular_momentum(particles, moment):
 @pytest.mark.parametrize(
     ("name", "method"),
     [
-        ("viscous_solid", mpm.Explicit()),
         *thorough(
+            ("viscous_solid", mpm.Explicit()),
             ("viscous_fluid", mpm.Explicit()),
             ("viscous_fluid", mpm.SemiImplicit(solver=mpm.ConjugateResidual(rtol=1e-13))),
         ),
@@ -135,6 +135,7 @@ def test_momentum_is_conserved_and_turning_is_free(name, method):
     assert_close(one.v, other.v, 1e-12)
 
 
+@pytest.mark.thorough
 def test_only_what_is_viscous_keeps_a_gradient():
     """FLIP and PIC store C for it, group beside group, and give none of it to the grid."""
     laws = LAWS["neo_hookean"], VISCOUS["viscous_fluid"]

@@ -38,7 +38,7 @@ def column(cells):
     return scene, mpm.fill(mpm.Box((0.0, 0.0), (wide, 1.0)), grid, particles_per_cell=4, density=DENSITY)
 
 
-@pytest.mark.parametrize(("cells", "within"), [(16, 1e-3), pytest.param(32, 5e-4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("cells", "within"), [*thorough((16, 1e-3)), pytest.param(32, 5e-4, marks=pytest.mark.slow)])
 def test_a_column_stays_at_rest_under_its_weight(cells, within):
     """In its exact state, p = ρ g (h − y) with compression, for a hundred times as long as sound takes from floor to
     surface: to 0.1 and 0.05 % of ρ g h at 16 and 32 cells, and speeds of 1e-4 of sound's."""
@@ -236,6 +236,7 @@ def poiseuille(cells, transfer=mpm.APIC()):
     return float(np.abs(np.asarray(final.v[:, 0]) - 4 * peak * y * (1 - y)).max() / peak)
 
 
+@pytest.mark.thorough
 def test_flow_between_plates_is_a_parabola():
     """Steady (8 s, of h²/π²ν = 1 s): of first order, as the plates are, and to 3 % at 32 cells."""
     errors = np.array([poiseuille(n) for n in (8, 16, 32)])

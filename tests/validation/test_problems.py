@@ -27,7 +27,7 @@ def aligned_force(law: str, u, stretch, J):
 
 
 @pytest.mark.parametrize(
-    "law", [mpm.NeoHookean(E, NU), *thorough(mpm.FixedCorotated(E, NU))], ids=["neo_hookean", "fixed_corotated"]
+    "law", thorough(mpm.NeoHookean(E, NU), mpm.FixedCorotated(E, NU)), ids=["neo_hookean", "fixed_corotated"]
 )
 @pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_the_axis_aligned_force_is_the_closed_form(d, law):
@@ -64,7 +64,10 @@ def test_the_vortex_force_is_the_closed_form():
             assert float(jnp.linalg.det(problem.deformation(X, t))) == pytest.approx(1, abs=1e-12)
 
 
-@pytest.mark.parametrize("problem", [StandingWave(0.2), StandingWave(0.2, 2), StandingWave(0.1, 3), VibratingBar(5.0)])
+@pytest.mark.parametrize(
+    "problem",
+    [*thorough(StandingWave(0.2)), StandingWave(0.2, 2), *thorough(StandingWave(0.1, 3)), VibratingBar(5.0)],
+)
 def test_what_needs_no_force_has_none(problem):
     """At any amplitude; relative to the motion's own acceleration."""
     assert not problem.forced

@@ -45,7 +45,7 @@ def slid(name, friction, *, number, time, stiffness, speed=0.0):
     return np.abs(distance - a * t**2 / 2).max() / (a * t[-1] ** 2 / 2), run
 
 
-@pytest.mark.parametrize("name", ["explicit", *thorough("semi_implicit")])
+@pytest.mark.parametrize("name", thorough("explicit", "semi_implicit"))
 def test_without_friction_a_block_slides_as_a_point_does(name):
     """The floor's push has no part along it: the solver's tolerance, or rounding."""
     error, run = slid(name, 0.0, number={"explicit": 0.3, "semi_implicit": 3.0}[name], time=0.2, stiffness=1e6)
