@@ -1,8 +1,8 @@
 """The implicit stage of backward Euler and of the integrators of second order.
 
 It is M (v − a) = Δt_s (f(u + Δt_s v) − D v), where f(u) is the elastic force at a nodal displacement u and −D v the
-viscous force. One linear solve takes f(u) = f(0) − H u; Newton's method or another `AbstractSolution` solves the nonlinear
-equation.
+viscous force. One linear solve takes f(u) = f(0) − H u; Newton's method, or another `AbstractSolution`, solves the
+nonlinear equation.
 """
 
 import equinox as eqx
