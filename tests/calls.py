@@ -134,7 +134,7 @@ def offences() -> Iterator[str]:
                     yield f"{call.__name__} takes {name}={what}"
 
 
-TAKEN = {(name, "empty") for name in ("boundary", "also", "history", "methods", "refinements")} | {
+TAKEN = {(name, "empty") for name in ("boundary", "also", "deformations", "histories", "methods", "refinements")} | {
     ("fitted", "array of words")
 }
 """What may be none of; and what NumPy takes for true."""

@@ -83,7 +83,8 @@ def scene_of(law, d, family, description, gradient):
     total = description == "total"
     images = mirror((), grid, window)
     material = jax.tree.map(jnp.asarray, ELASTIC[law])
-    potential = ElasticPotential((MaterialPoints(material, particles.volume, F, total),), stencil, images)
+    body = MaterialPoints(material, particles.volume, F, total, (0, particles.count), None)
+    potential = ElasticPotential((body,), stencil, images)
     du = jnp.asarray(DX * np.random.default_rng(1).normal(size=(grid.size, d)))
     return potential, du
 

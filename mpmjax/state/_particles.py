@@ -47,7 +47,7 @@ class Particles(eqx.Module):
     """Number of particles of each of several materials; None if there is one."""
 
     def __post_init__(self):
-        materials = len(self.counts or (0,))
+        materials = len(self.counts) if isinstance(self.counts, tuple) else 1  # what it is is checked below
         for name in ("deformations", "histories"):
             known = getattr(self, name)
             if isinstance(known, tuple) and not jax.tree.leaves(known):
