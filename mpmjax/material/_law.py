@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Deformation, Float
+from mpmjax._types import Array, Bool, Deformation, Float, components
 from mpmjax.checks import require
 from mpmjax.material._kinematics import AbstractKinematics, DeformationGradient
 from mpmjax.material._tangent import AbstractTangent
@@ -49,9 +49,14 @@ class AbstractLaw(eqx.Module):
             history: the history before the step.
         """
 
-    def remembers(self, history: Any, F: Deformation, /) -> bool:
-        """Whether a history is one of the law's: of the structure and shapes of that of particles with this F."""
-        own = jax.eval_shape(self.initial_history, F)
+    def remembers(self, history: Any, stored: Array, /) -> bool:
+        """Whether a history is one of the law's: of the structure and shapes of that of particles that store this.
+
+        Args:
+            history: the history.
+            stored: F or J of the particles [-], particle first.
+        """
+        own = jax.eval_shape(lambda stored: self.initial_history(components(stored)), stored)
         if jax.tree.structure(own) != jax.tree.structure(history):
             return False
         return all(a.shape == b.shape for a, b in zip(jax.tree.leaves(own), jax.tree.leaves(history), strict=True))
@@ -124,8 +129,8 @@ class AbstractElastic(AbstractLaw):
         """None."""
         del F
 
-    def remembers(self, history: Any, F: Deformation, /) -> bool:
-        del F
+    def remembers(self, history: Any, stored: Array, /) -> bool:
+        del stored
         return history is None
 
     def elastic(self, history: None) -> "AbstractElastic":

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from mpmjax._types import Deformation, PerParticle
+from mpmjax._types import Array, Deformation, PerParticle
 from mpmjax.checks import require, require_between, require_fields
 from mpmjax.material._kinematics import AbstractKinematics
 from mpmjax.material._law import AbstractElastic, AbstractLaw
@@ -57,8 +57,8 @@ class Viscous(AbstractLaw):
     def initial_history(self, F: Deformation) -> Any:
         return self.law.initial_history(F)
 
-    def remembers(self, history: Any, F: Deformation) -> bool:
-        return self.law.remembers(history, F)
+    def remembers(self, history: Any, stored: Array) -> bool:
+        return self.law.remembers(history, stored)
 
     def elastic(self, history: Any) -> AbstractElastic:
         return self.law.elastic(history)

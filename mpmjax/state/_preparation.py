@@ -97,10 +97,9 @@ def _prepared(law: AbstractLaw, group: Group, particles: Particles) -> tuple[Arr
     shape = (stop - start, *undeformed.shape)
     known = jnp.broadcast_to(undeformed, shape) if group.stored is None else group.stored
     require(known.shape == shape, f"{law.title()} needs {kept.symbol} of shape {shape}, got {known.shape}.")
-    place = components(known)
-    if group.history is not None and law.remembers(group.history, place):
+    if group.history is not None and law.remembers(group.history, known):
         return known, group.history
-    initial = law.initial_history(place)
+    initial = law.initial_history(components(known))
     require(
         group.history is None or initial is None,
         f"{law.title()} needs a history of its own, got {type(group.history).__name__}: drop it to start anew.",
@@ -122,7 +121,7 @@ def _fits(law: AbstractLaw, group: Group, dim: int) -> bool:
     """Whether deformation and history of one material's particles are of the shapes that the law needs."""
     if group.stored is None or group.stored.shape[1:] != law.kinematics.undeformed(dim).shape:
         return False
-    return law.remembers(group.history, group.deformation())
+    return law.remembers(group.history, group.stored)
 
 
 def _check_placement(scene: Scene, particles: Particles) -> None:
