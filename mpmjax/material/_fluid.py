@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, PerParticle, Scalar
 from mpmjax.checks import require_fields, require_positive
-from mpmjax.material._kinematics import VolumeRatio
+from mpmjax.material._kinematics import VOLUME_RATIO, VolumeRatio
 from mpmjax.material._law import AbstractInelastic
 from mpmjax.material._tangent import VolumetricTangent
 from mpmjax.material._volumetric import AbstractVolumetric
@@ -45,7 +45,7 @@ class Fluid(AbstractInelastic):
 
     @property
     def kinematics(self) -> VolumeRatio:
-        return VolumeRatio()
+        return VOLUME_RATIO
 
     def initial_history(self, J: Array, /) -> None:
         """None."""

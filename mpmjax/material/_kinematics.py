@@ -110,3 +110,7 @@ class VolumeRatio(AbstractKinematics):
 
     def determinant(self, deformation: Array) -> Array:
         return deformation
+
+
+DEFORMATION_GRADIENT, VOLUME_RATIO = DeformationGradient(), VolumeRatio()
+"""The two there are."""

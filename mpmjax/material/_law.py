@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Deformation, Float, components
 from mpmjax.checks import require
-from mpmjax.material._kinematics import AbstractKinematics, DeformationGradient
+from mpmjax.material._kinematics import DEFORMATION_GRADIENT, AbstractKinematics
 from mpmjax.material._tangent import AbstractTangent
 from mpmjax.material._viscosity import Viscosity
 
@@ -21,7 +21,7 @@ class AbstractLaw(eqx.Module):
     @property
     def kinematics(self) -> AbstractKinematics:
         """What its particles store of their deformation. Default: F."""
-        return DeformationGradient()
+        return DEFORMATION_GRADIENT
 
     @property
     def allows_total(self) -> bool:

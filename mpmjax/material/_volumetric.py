@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, Matrix
 from mpmjax.material._base import AbstractMaterial
-from mpmjax.material._kinematics import VolumeRatio
+from mpmjax.material._kinematics import VOLUME_RATIO, VolumeRatio
 from mpmjax.material._law import AbstractElastic
 from mpmjax.material._tangent import AbstractTangent, VolumetricTangent
 
@@ -22,7 +22,7 @@ class AbstractVolumetric(AbstractElastic):
 
     @property
     def kinematics(self) -> VolumeRatio:
-        return VolumeRatio()
+        return VOLUME_RATIO
 
     @property
     def allows_total(self) -> bool:

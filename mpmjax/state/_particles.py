@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from itertools import accumulate, pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -129,10 +129,10 @@ def _only(each: tuple, name: str, field: str) -> Any:
     return each[0]
 
 
-class Group(eqx.Module):
+class Group(NamedTuple):
     """The particles of one material."""
 
-    rows: tuple[int, int] = eqx.field(static=True)
+    rows: tuple[int, int]
     """First particle, and the one after the last."""
     stored: Float[Array, "q ..."] | None
     """Their entry of `Particles.deformations`."""
