@@ -21,6 +21,8 @@ class AbstractRegion(eqx.Module):
 
     flat: ClassVar[bool] = False
     """Whether its normal is the same everywhere."""
+    fills_bounds: ClassVar[bool] = False
+    """Whether every point of its bounding box lies in it."""
 
     @property
     @abc.abstractmethod
@@ -81,6 +83,7 @@ class Box(AbstractRegion):
         upper: largest coordinate in each direction [m], (d,), above `lower`.
     """
 
+    fills_bounds: ClassVar[bool] = True
     lower: Corner
     upper: Corner
 

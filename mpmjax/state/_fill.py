@@ -6,7 +6,7 @@ import numpy as np
 from mpmjax._types import Point, Scalar
 from mpmjax.checks import checked, coordinates, require, require_memory, require_positive, shortened
 from mpmjax.discretisation import Grid
-from mpmjax.geometry import AbstractRegion, Box
+from mpmjax.geometry import AbstractRegion
 from mpmjax.state._particles import Particles
 
 
@@ -81,7 +81,7 @@ def fill(
     cell = size / number
     axes = [low + (np.arange(n) + 0.5) * c for low, n, c in zip(lower, number, cell, strict=True)]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, d)
-    if not isinstance(region, Box):
+    if not region.fills_bounds:
         lattice = lattice[np.asarray(region.contains(jnp.asarray(lattice)))]
     require(len(lattice) > 0, f"{region} holds no particle at this spacing: refine the grid or enlarge the region.")
     x = jnp.asarray(lattice, dtype=precision)

@@ -1,6 +1,7 @@
 """The nodes at the start of a step: mass, velocity and force from P2G, boundaries, and the elastic potential."""
 
 from collections.abc import Callable
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -32,6 +33,7 @@ class FreeNormal(eqx.Module):
 class SeparateSums(eqx.Module):
     """The result of P2G that sums momentum and force separately."""
 
+    separate: ClassVar[bool] = True
     velocity: NodeVector
     """v_i^n [m/s], shape (n, d); zero on empty nodes."""
     force: NodeVector
@@ -53,8 +55,28 @@ class SeparateSums(eqx.Module):
 class JoinedSum(eqx.Module):
     """The result of P2G that adds the impulse of the force to the momentum in one sum, at half the cost."""
 
+    separate: ClassVar[bool] = False
+    viscous_force: ClassVar[None] = None
     velocity_with_force: NodeVector
     """v^n + Δt f/m [m/s], shape (n, d); zero on empty nodes."""
+
+    @property
+    def velocity(self) -> NodeVector:
+        """Not known.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError(_NOT_KNOWN_APART)
+
+    @property
+    def force(self) -> NodeVector:
+        """Not known.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError(_NOT_KNOWN_APART)
 
     def explicit_velocity(self, nodes: "Nodes") -> NodeVector:
         """v^n + Δt f/m + Δt g [m/s], shape (n, d)."""
@@ -64,6 +86,12 @@ class JoinedSum(eqx.Module):
         """The same, with velocities and forces folded at mirrors."""
         del force
         return JoinedSum(velocity(self.velocity_with_force))
+
+
+_NOT_KNOWN_APART = (
+    "P2G summed momentum and force in one, so v^n and the force are not known apart: only nodes.explicit_velocity() "
+    "is. An integrator that uses them must have needs_separate_force = True."
+)
 
 
 class Nodes(AbstractNodes):
@@ -95,7 +123,7 @@ class Nodes(AbstractNodes):
         Raises:
             ValueError: P2G summed momentum and force together.
         """
-        return self._separate.velocity
+        return self.sums.velocity
 
     @property
     def force(self) -> NodeVector:
@@ -104,26 +132,17 @@ class Nodes(AbstractNodes):
         Raises:
             ValueError: P2G summed momentum and force together.
         """
-        return self._separate.force
+        return self.sums.force
 
     @property
     def viscous_force(self) -> NodeVector | None:
         """The viscous part of `force` [N], shape (n, d); None unless it was asked for."""
-        return None if isinstance(self.sums, JoinedSum) else self.sums.viscous_force
+        return self.sums.viscous_force
 
     @property
     def separate(self) -> bool:
         """Whether v^n and the force are known separately."""
-        return not isinstance(self.sums, JoinedSum)
-
-    @property
-    def _separate(self) -> SeparateSums:
-        if isinstance(self.sums, JoinedSum):
-            raise ValueError(
-                "P2G summed momentum and force in one, so v^n and the force are not known apart: only "
-                "nodes.explicit_velocity() is. An integrator that uses them must have needs_separate_force = True."
-            )
-        return self.sums
+        return self.sums.separate
 
     @property
     def free(self) -> Mask:
