@@ -62,11 +62,13 @@ from mpmjax.fitting import (
     Gaussian,
     Markers,
     Positive,
+    RefinedFit,
     Series,
     StressStretch,
     Tracks,
     Unbounded,
     fit,
+    fit_refined,
 )
 from mpmjax.geometry import (
     AbstractMotion,
@@ -235,6 +237,8 @@ __all__ = [  # noqa: RUF022 (grouped)
     "work_precision",
     # fitting
     "fit",
+    "fit_refined",
+    "RefinedFit",
     "Experiment",
     "FitResult",
     "Estimate",

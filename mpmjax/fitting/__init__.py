@@ -6,6 +6,7 @@ from mpmjax.fitting._fit import fit
 from mpmjax.fitting._observation import AbstractObservation, Curve, Force, Series, Tracks
 from mpmjax.fitting._parameter import AbstractParameter, Bounded, Gaussian, Positive, Unbounded
 from mpmjax.fitting._quantities import CentreOfMass, Density, Extent, Markers, StressStretch
+from mpmjax.fitting._refined import RefinedFit, fit_refined
 from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
 
 __all__ = [
@@ -24,10 +25,12 @@ __all__ = [
     "Markers",
     "NoiseEstimate",
     "Positive",
+    "RefinedFit",
     "Series",
     "StressStretch",
     "Tracks",
     "Unbounded",
     "fit",
+    "fit_refined",
     "read_columns",
 ]

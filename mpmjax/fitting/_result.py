@@ -1,5 +1,7 @@
 """What a fit found."""
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -8,6 +10,7 @@ import scipy.stats
 
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._least_squares import Iteration
+from mpmjax.fitting._parameter import AbstractParameter
 
 
 class Estimate(NamedTuple):
@@ -67,12 +70,25 @@ class FitResult(eqx.Module):
     """That of each observation."""
     experiments: tuple[Experiment, ...]
     """The experiments with the fitted values."""
+    values: dict[str, np.ndarray]
+    """The value of each parameter, in its shape."""
     level: float
     """That of the intervals."""
+    quantile: float
+    """How many standard errors an interval reaches to each side, in the search's coordinate."""
     converged: bool
     history: tuple[Iteration, ...]
     warnings: tuple[str, ...]
     """What the data cannot tell, and what does not fit, in words."""
+
+    @property
+    def all(self) -> tuple[Estimate, ...]:
+        """The fitted numbers, and what was reported."""
+        return (*self.estimates, *self.reported)
+
+    def restarted(self, parameters: Mapping[str, AbstractParameter]) -> dict[str, AbstractParameter]:
+        """The parameters, to be searched from the values found."""
+        return {name: replace(p, start=self.values[name]) for name, p in parameters.items()}
 
     @property
     def scene(self) -> Any:
@@ -92,7 +108,7 @@ class FitResult(eqx.Module):
         Raises:
             KeyError: there is none of this name.
         """
-        for estimate in (*self.estimates, *self.reported):
+        for estimate in self.all:
             if estimate.label == label:
                 return estimate
         raise KeyError(f"There is no estimate {label!r}, but {', '.join(e.label for e in self.estimates)}.")
@@ -100,7 +116,7 @@ class FitResult(eqx.Module):
     def __str__(self) -> str:
         """A table."""
         lines = [f"{'':<24} {'value':>12} ± {'error':<9} {f'{100 * self.level:g} % interval':<25} {'start':>10}"]
-        for e in (*self.estimates, *self.reported):
+        for e in self.all:
             name = f"{e.label} [{e.unit}]" if e.unit else e.label
             interval = f"{e.interval[0]:.5g} to {e.interval[1]:.5g}"
             start = "" if np.isnan(e.start) else f"{e.start:.4g}"
