@@ -360,8 +360,8 @@ def problem_value(found):
 
 @pytest.mark.thorough
 def test_the_discretisation_stands_beside_the_noise_and_rules():
-    """A bar on a grid 8 times finer, with another kernel and transfer: the extrapolated fit is less than half as far off
-    as the coarse one, and its interval holds E."""
+    """A bar on a grid 8 times finer, with another kernel and transfer: the extrapolated fit is less than half as far
+    off as the coarse one, and its interval holds E."""
     times = np.arange(1, 13) * 5e-3
 
     def build(n, kernel=2, transfer=None, E=9e4, seen=None):
