@@ -15,7 +15,6 @@ from helpers import block
 from test_schema import EXAMPLES
 
 import mpmjax as mpm
-from mpmjax.fitting._fit import fit_curve
 
 SCENE, PARTICLES = block(2)
 
@@ -28,6 +27,8 @@ def reached(*args: object) -> NoReturn:
     raise Reached
 
 
+SEEN = mpm.Series([0.05], [0.1], reached)
+STIFFNESS = mpm.Positive(lambda e: e.scene.material.youngs_modulus)
 RUN = {"scene": SCENE, "particles": PARTICLES, "t1": 0.1, "dt": 0.01}
 FUNCTIONS = {
     mpm.fill: {"region": mpm.Ball((0.1, 0.1), 0.1), "grid": SCENE.grid, "density": 1e3},
@@ -48,15 +49,9 @@ FUNCTIONS = {
     mpm.load: {"path": "never.h5"},
     mpm.render: {"run": None, "path": "never.png"},
     mpm.work_precision: {"build": reached, "t1": 0.1},
-    fit_curve: RUN
-    | {
-        "method": mpm.SemiImplicit(),
-        "curve": reached,
-        "measured_x": np.array([1.0, 2.0]),
-        "measured_y": np.array([1.0, 2.0]),
-        "fitted": np.array([True, True]),
-        "parameter": lambda scene: scene.material.youngs_modulus,
-    },
+    mpm.Experiment: RUN | {"observations": SEEN},
+    mpm.fit: {"experiments": mpm.Experiment(**RUN, observations=SEEN), "parameters": {"E": STIFFNESS}},
+    mpm.fit_refined: {"build": reached, "parameters": {"E": STIFFNESS}},
 }
 """Each public function with arguments; of those the tests replace one at a time."""
 PARTICLE_FIELDS = {"x": PARTICLES.x, "v": PARTICLES.v, "mass": PARTICLES.mass, "volume": PARTICLES.volume}
@@ -102,6 +97,7 @@ MAY = {
     (mpm.render, "colour"),
     (mpm.sample_mesh, "mesh"),
     (mpm.fill, "dtype"),
+    (mpm.Experiment, "name"),
     *(
         (call, name)
         for call in CALLS

@@ -127,6 +127,7 @@ def test_it_tears_off_at_the_tension_it_bears():
     assert_close(found.energy.explained, found.energy.change, 1e-9)
 
 
+@pytest.mark.thorough
 def test_it_holds_beside_a_plane_of_symmetry():
     """Half a block beside a plane hangs as the whole one, by the same columns."""
     whole, particles = hanging(5 * WEIGHT, d=2, stiffness=1e5)
@@ -143,7 +144,7 @@ def test_it_holds_beside_a_plane_of_symmetry():
     assert_close(ends[1].x, ends[0].x[right], 1e-9)
 
 
-@pytest.mark.parametrize("method", [mpm.Explicit(), mpm.SemiImplicit()], ids=["explicit", "semi_implicit"])
+@pytest.mark.parametrize("method", [mpm.Explicit(), *thorough(mpm.SemiImplicit())], ids=["explicit", "semi_implicit"])
 def test_what_hangs_has_a_derivative(method):
     def height(stiffness):
         scene, particles = hanging(5 * WEIGHT, stiffness=stiffness)
@@ -164,6 +165,7 @@ def test_it_is_saved_and_loaded(tmp_path):
     np.testing.assert_array_equal(again.final.x, run.final.x)
 
 
+@pytest.mark.thorough
 def test_it_holds_in_the_total_description_too():
     """Which refuses contacts that are judged by where material is, but not one's own."""
     scene, particles = hanging(1.1 * WEIGHT, description=mpm.TotalLagrangian())

@@ -91,6 +91,7 @@ def test_trials_refine_until_they_are_good(waves):
     assert 1e-2 < waves.trials[-1].error < 1
 
 
+@pytest.mark.thorough
 def test_a_slow_pull_of_a_stiff_bar_is_not_run_explicitly():
     """It is foreseen to take too long, and the verdict says so; an explicit step of an implicit one's length fails."""
     tried = {"methods": (mpm.Explicit(), mpm.SemiImplicit()), "also": ((mpm.Explicit(), 1.25),)}

@@ -142,6 +142,8 @@ def _takes(hint: Any, value: Any) -> bool:
         sequence = isinstance(value, (tuple, list)) or (isinstance(value, np.ndarray) and value.ndim == 1)
         wanted = args[:1] * len(value) if sequence and (origin is list or Ellipsis in args) else args
         return sequence and len(value) == len(wanted) and all(_takes(a, v) for a, v in zip(wanted, value, strict=True))
+    if origin is dict:
+        return isinstance(value, dict) and all(_takes(args[0], k) and _takes(args[1], v) for k, v in value.items())
     if origin is Literal:
         return isinstance(value, str) and value in args
     if origin is Callable:
@@ -217,6 +219,8 @@ def _plain(hint: Any) -> str:
         return f"a sequence of {'whole numbers' if inner[0] is int else 'bools' if inner[0] is bool else 'numbers'}"
     if origin is Callable:
         return "a function"
+    if origin is dict:
+        return f"a dict with {_in_words(args[1])} for each name"
     if isinstance(hint, type) and issubclass(hint, AbstractArray):
         axes, more = _axes(hint)
         return "an array of numbers" if more else ("a number", "a sequence of numbers", "rows of numbers")[min(axes, 2)]

@@ -4,7 +4,7 @@ from typing import Any
 
 import equinox as eqx
 
-from mpmjax._types import Array
+from mpmjax._types import Array, Scalar
 from mpmjax.checks import canonical, checked, is_traced, require
 from mpmjax.fitting._observation import AbstractObservation
 from mpmjax.simulation import Run, number_of_steps, simulate
@@ -43,9 +43,9 @@ class Experiment(eqx.Module):
         scene: Scene,
         particles: Particles,
         *,
-        t1: float | int,
-        dt: float | int,
-        observations: AbstractObservation | list[AbstractObservation] | tuple[AbstractObservation, ...],
+        t1: Scalar,
+        dt: Scalar,
+        observations: AbstractObservation | tuple[AbstractObservation, ...] | list[AbstractObservation],
         method: AbstractIntegrator = Explicit(),
         name: str = "experiment",
     ):

@@ -1,7 +1,7 @@
 """Fits of parameters to what was observed."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array
-from mpmjax.checks import checked, require, require_between, require_positive, require_whole, warn
+from mpmjax._types import Array, Scalar
+from mpmjax.checks import checked, require, require_tolerance, require_whole, warn
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._least_squares import Iteration, Minimum, NoDerivativeError, levenberg_marquardt
 from mpmjax.fitting._parameter import AbstractParameter
@@ -21,12 +21,12 @@ from mpmjax.fitting._uncertainty import Uncertainty, noise, seen_together, uncer
 
 @checked
 def fit(
-    experiments: Experiment | Sequence[Experiment],
-    parameters: Mapping[str, AbstractParameter],
+    experiments: Experiment | tuple[Experiment, ...] | list[Experiment],
+    parameters: dict[str, AbstractParameter],
     *,
-    report: Mapping[str, Callable[[Experiment], Any]] | None = None,
-    level: float = 0.95,
-    rtol: float = 1e-6,
+    report: dict[str, Callable[[Experiment], Any]] | None = None,
+    level: Scalar = 0.95,
+    rtol: Scalar = 1e-6,
     max_steps: int = 50,
     progress: Callable[[str], None] | None = None,
 ) -> FitResult:
@@ -68,8 +68,9 @@ def fit(
             there is any.
     """
     problem = FitProblem((experiments,) if isinstance(experiments, Experiment) else tuple(experiments), parameters)
-    require_between("level", level, 0, 1)
-    require_positive("rtol", rtol)
+    require((level > 0) & (level < 1), f"level must lie between 0 and 1, got {level}.")
+    require_tolerance("rtol", rtol)
+    level, rtol = float(level), float(rtol)
     max_steps = require_whole("max_steps", max_steps, 1)
     begun = time.perf_counter()
 

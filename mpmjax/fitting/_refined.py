@@ -1,12 +1,13 @@
 """Fits on several grids: what is left of the discretisation in an estimate."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 
+from mpmjax._types import Scalar
 from mpmjax.checks import checked, require, require_positive
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import fit
@@ -59,13 +60,16 @@ class RefinedFit(eqx.Module):
 
 @checked
 def fit_refined(
-    build: Callable[[int], Experiment | Sequence[Experiment]],
-    parameters: Mapping[str, AbstractParameter],
+    build: Callable[[int], Any],
+    parameters: dict[str, AbstractParameter],
     *,
-    refinements: Sequence[int] = (1, 2),
-    order: float | int = 1,
-    report: Mapping[str, Callable[[Experiment], Any]] | None = None,
-    **options: Any,
+    refinements: tuple[int, ...] | list[int] = (1, 2),
+    order: Scalar = 1,
+    report: dict[str, Callable[[Experiment], Any]] | None = None,
+    level: Scalar = 0.95,
+    rtol: Scalar = 1e-6,
+    max_steps: int = 50,
+    progress: Callable[[str], None] | None = None,
 ) -> RefinedFit:
     """Fit on several grids, extrapolate to a spacing of zero, and count what is left as an error.
 
@@ -87,12 +91,15 @@ def fit_refined(
         refinements: the n, growing, two at least.
         order: p, the order in the spacing. One is careful: estimates that converge faster get a wider interval.
         report: what else to report, see `fit`.
-        options: of `fit`.
+        level: of the intervals, see `fit`.
+        rtol: see `fit`.
+        max_steps: see `fit`.
+        progress: see `fit`.
 
     Raises:
         ValueError: fewer than two refinements, or not growing ones; see `fit`.
     """
-    numbers = tuple(refinements)
+    numbers = list(refinements)
     require(
         len(numbers) >= 2 and numbers[0] >= 1 and all(a < b for a, b in pairwise(numbers)),
         f"refinements must be two or more growing whole numbers, got {numbers}.",
@@ -100,8 +107,9 @@ def fit_refined(
     require_positive("order", order)
     fits: list[FitResult] = []
     for n in numbers:
-        fits.append(fit(build(n), parameters, report=report, **options))
-        parameters = fits[-1].restarted(parameters)
+        found = fit(build(n), parameters, report=report, level=level, rtol=rtol, max_steps=max_steps, progress=progress)
+        fits.append(found)
+        parameters = found.restarted(parameters)
     values = np.array([[e.value for e in found.all] for found in fits])
     estimates, noise, left, orders = [], [], [], []
     for k, last in enumerate(fits[-1].all):
@@ -113,10 +121,10 @@ def fit_refined(
         noise.append(last.error)
         left.append(abs(float(correction)))
         orders.append(p)
-    return RefinedFit(tuple(fits), numbers, tuple(estimates), tuple(noise), tuple(left), tuple(orders))
+    return RefinedFit(tuple(fits), tuple(numbers), tuple(estimates), tuple(noise), tuple(left), tuple(orders))
 
 
-def _order(values: np.ndarray, refinements: tuple[int, ...], order: float) -> float:
+def _order(values: np.ndarray, refinements: list[int], order: float) -> float:
     """The order that the three finest grids show, if their ratios are one; else the one that was given."""
     if len(values) < 3 or refinements[-1] * refinements[-3] != refinements[-2] ** 2:
         return order
