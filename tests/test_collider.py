@@ -154,7 +154,7 @@ def test_what_the_earlier_holds_the_later_neither_lets_go_nor_rubs_nor_receives(
 @pytest.mark.thorough
 @pytest.mark.parametrize("preconditioner", [mpm.DiagonalPreconditioner(), mpm.MassPreconditioner()])
 def test_the_operator_is_symmetric_and_its_inner_product_commutes_with_the_projection(preconditioner):
-    """Q (M + cH) Q and the identity, or the mass, on the rest; beside fixed components too."""
+    """Q (M + χH) Q and the identity, or the mass, on the rest; beside fixed components too."""
     grid, particles = cloud(2, p=12, cells=3)
     ball = mpm.Ball((0.16, 0.02), 0.22)
     scene = scene_of(grid, mpm.SlipBox((-np.inf, 0.0), (np.inf, np.inf)), mpm.SlipCollider(ball))

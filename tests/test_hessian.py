@@ -1,4 +1,4 @@
-"""The Hessian action both ways, against each other and against finite differences, and the operator M + cH."""
+"""The Hessian action both ways, against each other and against finite differences, and the operator M + χH."""
 
 from functools import cache
 

@@ -40,12 +40,13 @@ class Newton(AbstractSolution):
     linearised at zero displacement, without the contribution of prescribed velocities.
 
     Termination by rounding: b vanishes where forces balance, and in single precision it can be smaller than the
-    rounding of the residual, 4 ε (‖W (|v| + dx/c)‖ + ‖M ṽ‖) with W the diagonal of the operator. A residual below that
-    rounding ends the iteration too, if one of two tests shows that the solution is good:
+    rounding of the residual, 4 ε (‖W (|v| + dx/Δt_s)‖ + ‖M a‖) with W the diagonal of the operator and a of the stage
+    (derivation, eq. 22). A residual below that rounding ends the iteration too, if one of two tests shows that the
+    solution is good:
 
     - the last Newton step was taken whole, and changed v by at most a thousandth, or the strain by at most √ε, the
       energy of which is the rounding of the potential;
-    - M + cH is not less than M, and the error ‖v − v*‖ ≤ ‖residual‖ is at most a thousandth of ‖v‖, in the norms of the
+    - M + χH is not less than M, and the error ‖v − v*‖ ≤ ‖residual‖ is at most a thousandth of ‖v‖, in the norms of the
       mass and of its inverse.
 
     A guess is never accepted because of rounding alone.
@@ -108,7 +109,7 @@ class _Setting(eqx.Module):
     scale: Float[Array, ""]
     """‖b‖, with b the right-hand side of the system linearised at zero displacement."""
     inertia: Float[Array, ""]
-    """‖M ṽ‖."""
+    """‖M a‖, with a of the stage."""
     undisplaced: NodeVector
     """The velocity at which nothing is displaced [m/s]."""
     startable: Bool[Array, ""]

@@ -26,7 +26,7 @@ class SolveInfo(eqx.Module):
     nearly_converged: Bool[Array, "*f"]
     """Whether it is not, but within ten times the tolerance."""
     indefinite: Bool[Array, "*f"]
-    """Whether the solver met a direction of negative curvature. M + cH is then indefinite, and may be near singular."""
+    """Whether the solver met a direction of negative curvature. M + χH is then indefinite, and may be near singular."""
     report: Float[Array, "*f"]
     """Zero. Its tangent is the relative residual of the tangent solves that did not converge (see `Reporting`)."""
 

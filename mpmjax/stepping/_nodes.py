@@ -176,7 +176,7 @@ class Nodes(AbstractNodes):
         return jnp.where(self.occupied, self.sums.explicit_velocity(self), 0)
 
     def inertial_velocity(self) -> NodeVector:
-        """ṽ = v^n + Δt g [m/s], shape (n, d)."""
+        """v^n + Δt g [m/s], shape (n, d)."""
         return jnp.where(self.occupied, self.velocity + self.dt * self.acceleration, 0)
 
     def admitted_velocity(self) -> NodeVector:

@@ -38,8 +38,8 @@ def stable_dt(
 
     The limit of a particle alone on the grid is known exactly, and a set of particles has no lower limit than the
     lowest of its members (B. M. Irons, G. Treharne, Proc. 3rd Conf. on Matrix Methods in Structural Mechanics, 1971,
-    for frequencies; for APIC and PIC the same argument holds with the velocity that the transfer keeps). So Δt is the
-    least over particles of Δt² = 4 ρ0 / (Λ (2Ξ − κa)), where
+    for frequencies; for APIC and PIC the same argument holds with the velocity that the transfer keeps: derivation,
+    section 12). So Δt is the least over particles of Δt² = 4 ρ0 / (Λ (2Ξ − κa)) (eq. 32), where
 
     - Λ is the largest eigenvalue of the symmetric part of the present tangent L ↦ ∂²Ψ/∂F∂F : (L F) Fᵀ + τ Lᵀ with
       L = ∇v and τ = P Fᵀ, by `principal_tangent`; in the total description, that of ∂²Ψ/∂F∂F. Stretching and
@@ -54,10 +54,10 @@ def stable_dt(
     β < ½. For β ≥ ½, backward Euler and the methods of second order there is no limit: the result is infinite, and says
     nothing of accuracy.
 
-    With viscosity Δt solves Δt² Λ (2Ξ − κa)/ρ0 + Δt Λ_v b/ρ0 = 4, so it is 8/(B + √(B² + 16A)) with A the factor of Δt²
-    and B that of Δt. Λ_v = |J| max(2η, 2η (1 − d/3) + dζ) is the largest eigenvalue of L ↦ |J| σ_v. b is 2a for APIC,
-    whose stored gradient is multiplied by 1 − Δt a Λ_v/ρ0 in a step, and 4Ξ for PIC and FLIP, whose stored gradient is
-    that of a step ago. The semi-implicit step multiplies A and B by 1 − 2β.
+    With viscosity Δt solves Δt² Λ A/ρ0 + Δt Λ_v B/ρ0 = 4 (derivation, eq. 34) with A = 2Ξ − κa, and B = 2a for APIC,
+    whose stored gradient is multiplied by 1 − Δt a Λ_v/ρ0 in a step, or 4Ξ for PIC and FLIP, whose stored gradient is
+    that of a step ago. Λ_v = |J| max(2η, 2η (1 − d/3) + dζ) is the largest eigenvalue of L ↦ |J| σ_v. The semi-implicit
+    step multiplies both terms by 1 − 2β.
 
     The default safety of 0.7 covers two effects beyond the linear limit. Vibrations of a few per cent grow where the
     third or fourth harmonic of a mode resonates with the step, (ωΔt)² = 3 and 2, which is at 0.87 and 0.71 of the
@@ -173,7 +173,8 @@ def _stiffest_viscosity(body: MaterialPoints, dim: int) -> Float[Array, "q"]:
 
 
 def _steepness(scene: Scene, particles: Particles) -> tuple[Array, Array]:
-    """A and B [1/m²] of the bound Δt² Λ A/ρ0 + Δt Λ_v B/ρ0 ≤ 4, from the scene's gradient operator and transfer."""
+    """A and B [1/m²] of the bound Δt² Λ A/ρ0 + Δt Λ_v B/ρ0 ≤ 4 (derivation, eq. 34), from the scene's gradient operator
+    and transfer."""
     spacing = jnp.asarray(scene.grid.spacing)
     if scene.kernel.order == 1:
         inverse_moment = 1 / scene.stencil(particles).moment.min(axis=0)
