@@ -105,8 +105,8 @@ def particle_stiffness(
 def _tangent_action(
     potential: ElasticPotential, tangents: tuple[Callable[[Deformation], Deformation], ...], du: NodeVector
 ) -> NodeVector:
-    changes = (tangent(dF) for tangent, dF in zip(tangents, potential.strain(du), strict=True))
-    return potential.divergence(tuple(changes), du)
+    changes = (tangent(dF) for tangent, dF in zip(tangents, potential.deformation_change(du), strict=True))
+    return potential.nodal_sum(potential.flux(tuple(changes)))
 
 
 class _DampedAction(AbstractHessianAction):
@@ -119,7 +119,7 @@ class _DampedAction(AbstractHessianAction):
 
     def __call__(self, du: NodeVector) -> NodeVector:
         """(H + r D) δu."""
-        return self.elastic(du) + self.rate * self.potential.damping_force(du)
+        return self.elastic(du) + self.rate * self.potential.viscous_resistance(du)
 
     def precomputed(self) -> ParticleStiffness:
         stiffness = self.elastic.precomputed()

@@ -41,7 +41,7 @@ class Linearised(AbstractSolution):
     ) -> NodeVector:
         """Σ q f(0) − H Σ q u [N]."""
         mean = reduce(jnp.add, (q * u for q, u in stages))
-        return sum(q for q, _ in stages) * force - hessian.at_current(potential, mean)(mean)
+        return sum(q for q, _ in stages) * force - hessian.at_step_start(potential)(mean)
 
     def __call__(self, problem: LinearProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         """The solution [m/s], shape (n, d), and the report of the solve.

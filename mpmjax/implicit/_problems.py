@@ -112,7 +112,7 @@ class NewtonProblem(AbstractProblem):
     def momentum_residual(self, v: NodeVector) -> NodeVector:
         force = self.potential.force(self.displacement(v))
         if self.potential.viscous:
-            force = force - self.potential.damping_force(v)
+            force = force - self.potential.viscous_resistance(v)
         return self.mass[:, None] * (v - self.inertial) - self.stage_dt * force
 
     def unit_strain_velocity(self) -> Float[Array, ""]:

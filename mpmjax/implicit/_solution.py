@@ -43,7 +43,7 @@ class StageEquation(eqx.Module):
 
     def linear(self) -> LinearProblem:
         """The problem with f(u) = f(0) − H u."""
-        action = self.hessian.at_current(self.potential, self.inertial)
+        action = self.hessian.at_step_start(self.potential)
         u = self.initial_displacement
         force = self.force if u is None else self.force - action(u)
         return LinearProblem(

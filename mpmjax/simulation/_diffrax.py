@@ -50,7 +50,8 @@ def faulty_particles(problem: Problem, state: State) -> dict[Fault, Bool[Array, 
     finite = finite & jnp.concatenate([_finite((group.stored, group.history)) for group in particles.groups])
     anchor = scene.anchor(particles)
     outside = ~in_window(scene.kernel, scene.grid, scene.window(particles), anchor)
-    admitted = jnp.concatenate([c.law.is_admissible(c.deformation) for c in scene.material_points(particles)])
+    materials = scene.material_points(particles)
+    admitted = jnp.concatenate([points.law.is_admissible(points.deformation) for points in materials])
     return {Fault.NOT_FINITE: ~finite, Fault.OUTSIDE: finite & outside, Fault.INADMISSIBLE: finite & ~admitted}
 
 

@@ -250,7 +250,7 @@ def particles_to_grid(
     affine = C if scene.transfer.affine else None
     acceleration = jnp.asarray(scene.gravity)
     with jax.named_scope("p2g"):
-        potential = ElasticPotential(scene.material_points(particles), stencil, Mirror(()))
+        potential = ElasticPotential(scene.material_points(particles), stencil, Mirror(()), grid.size)
         joined = joined and stencil.mls_weight_derivatives is None
         flux, viscous_flux = potential.current_flux(), None
         if explicit_viscosity and potential.viscous and C is not None:
@@ -278,8 +278,8 @@ def particles_to_grid(
         else:
             viscous_force = None
             if viscosity_apart and viscous_flux is not None:
-                viscous_force = -potential.sum_of(viscous_flux, momentum)
-            sums = SeparateSums(velocity, -potential.sum_of(flux, momentum), viscous_force)
+                viscous_force = -potential.nodal_sum(viscous_flux)
+            sums = SeparateSums(velocity, -potential.nodal_sum(flux), viscous_force)
         nodes = Nodes(
             mass=jnp.where(occupied[:, 0], mass, 0),
             sums=sums,

@@ -70,8 +70,8 @@ class SemiImplicit(AbstractImplicitIntegrator):
         problem = LinearProblem(
             mass=nodes.mass,
             factor=beta * nodes.dt**2,
-            hessian=damped(self.hessian.at_current(nodes.potential, predictor), nodes.potential, 1 / nodes.dt),
-            rhs=impulse - (1 - beta) * nodes.dt * nodes.potential.damping_force(v0) if viscous else impulse,
+            hessian=damped(self.hessian.at_step_start(nodes.potential), nodes.potential, 1 / nodes.dt),
+            rhs=impulse - (1 - beta) * nodes.dt * nodes.potential.viscous_resistance(v0) if viscous else impulse,
             projection=nodes.projection,
             prescribed=nodes.prescribed,
             preconditioner=self.preconditioner,
@@ -81,7 +81,7 @@ class SemiImplicit(AbstractImplicitIntegrator):
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt f(0) − βΔt² H v [kg m/s]."""
-        action = self.hessian.at_current(nodes.potential, motion.velocity)
+        action = self.hessian.at_step_start(nodes.potential)
         return nodes.dt * nodes.force - self.beta * nodes.dt**2 * action(motion.velocity)
 
     def stability_factor(self) -> Scalar:

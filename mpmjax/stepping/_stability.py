@@ -147,14 +147,16 @@ def longest_step(scene: Scene, particles: Particles, method: AbstractIntegrator)
 def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Float[Array, ""]:
     density = particles.mass / particles.volume
     elastic_steepness, viscous_steepness = _steepness(scene, particles)
-    bodies = scene.material_points(particles)
-    tangents = [c.law.tangent_eigenvalues(c.deformation, particles.dim, total=c.total) for c in bodies]
+    materials = scene.material_points(particles)
+    tangents = [
+        points.law.tangent_eigenvalues(points.deformation, particles.dim, total=points.total) for points in materials
+    ]
     stiffest = jnp.concatenate([values.max(axis=0) for values in tangents])
     z = stiffest * elastic_steepness / density  # per Δt²
     factor = method.stability_factor()
     if factor is None:
         raise UnknownBoundError(f"{type(method).__name__} gives no bound on its step: give dt.")
-    most = jnp.concatenate([_stiffest_viscosity(c, particles.dim) for c in bodies])
+    most = jnp.concatenate([_stiffest_viscosity(points, particles.dim) for points in materials])
     y = most * viscous_steepness / density  # per Δt
     z, y = jnp.maximum(factor * z, 0), jnp.maximum(factor * y, 0)
     square = y**2 + 16 * z
@@ -163,13 +165,13 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Fl
     return jnp.where(steepness == 0, jnp.inf, 8 / jnp.where(steepness == 0, 1, steepness))
 
 
-def _stiffest_viscosity(body: MaterialPoints, dim: int) -> Float[Array, "q"]:
+def _stiffest_viscosity(points: MaterialPoints, dim: int) -> Float[Array, "q"]:
     """The largest eigenvalue of ∇v ↦ |J| σ_v for each particle [Pa s]; a bound of it in the total description."""
-    J = jnp.abs(body.volume_ratio())
-    if body.viscosity is None:
+    J = jnp.abs(points.volume_ratio())
+    if points.viscosity is None:
         return jnp.zeros_like(J)
-    most = J * body.viscosity.stiffest(dim)
-    return most / (la.principal_frame(body.deformation)[1] ** 2).min(axis=0) if body.total else most
+    most = J * points.viscosity.stiffest(dim)
+    return most / (la.principal_frame(points.deformation)[1] ** 2).min(axis=0) if points.total else most
 
 
 def _steepness(scene: Scene, particles: Particles) -> tuple[Array, Array]:

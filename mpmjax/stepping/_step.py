@@ -168,7 +168,7 @@ def impulses(
         return None, nodes.mass[:, None] * (motion.velocity - nodes.explicit_velocity()), None
     internal, viscous = method.elastic_impulse(nodes, motion), None
     if motion.resisted is not None:
-        viscous = -nodes.dt * nodes.potential.damping_force(motion.resisted)
+        viscous = -nodes.dt * nodes.potential.viscous_resistance(motion.resisted)
         internal = internal + viscous
     elif nodes.viscous_force is not None:
         viscous = jnp.where(nodes.occupied, nodes.dt * nodes.viscous_force, 0)

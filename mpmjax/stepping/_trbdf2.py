@@ -74,7 +74,7 @@ class TRBDF2(AbstractImplicitIntegrator):
         dt, g, v0 = nodes.dt, nodes.acceleration, nodes.admitted_velocity()
         length = q2 * dt  # Δt_s = ½γΔt
         viscous = nodes.potential.viscous
-        pull = nodes.per_mass(nodes.force - nodes.potential.damping_force(v0) if viscous else nodes.force)
+        pull = nodes.per_mass(nodes.force - nodes.potential.viscous_resistance(v0) if viscous else nodes.force)
         trapezoidal = Stage(v0 + length * (pull + 2 * g), length, length * v0)
         middle, first = trapezoidal.solve(nodes, guess, self, self.solution)
         later_pull = (middle - trapezoidal.inertial) / length  # f_γ/m, viscosity's with it, by the stage's own equation

@@ -137,8 +137,8 @@ def tangent_spectra(scene, particles):
     L = jnp.eye(d * d).reshape(-1, d, d)
     image = jax.vmap(law.tangent(F))(jnp.einsum("mij,jkp->mikp", L, pull))
     image = jnp.einsum("mijp,kjp->mikp", image, pull) + jnp.einsum("ijp,mkj->mikp", tau, L)
-    (body,) = scene.material_points(particles)
-    found = body.law.tangent_eigenvalues(body.deformation, d, total=scene.total)
+    (points,) = scene.material_points(particles)
+    found = points.law.tangent_eigenvalues(points.deformation, d, total=scene.total)
     return found, jnp.moveaxis(image.reshape(d * d, d * d, -1), -1, 0)
 
 
@@ -156,10 +156,10 @@ def test_tangent_spectrum_is_that_of_the_assembled_map(law, description, d):
 @eqx.filter_jit
 def fluid_spectra(scene, particles):
     """The closed form's only eigenvalue, and the map L ↦ ∂τ/∂J J tr(L), τ = JΨ' I, assembled, (p, d², d²)."""
-    d, (body,) = particles.dim, scene.material_points(particles)
-    kirchhoff = lambda J: (J * body.law.stress(J)).sum()  # noqa: E731
-    eye, J = jnp.eye(d).reshape(-1), body.deformation
-    return body.law.tangent_eigenvalues(J, d, total=False), (jax.grad(kirchhoff)(J) * J)[:, None, None] * jnp.outer(
+    d, (points,) = particles.dim, scene.material_points(particles)
+    kirchhoff = lambda J: (J * points.law.stress(J)).sum()  # noqa: E731
+    eye, J = jnp.eye(d).reshape(-1), points.deformation
+    return points.law.tangent_eigenvalues(J, d, total=False), (jax.grad(kirchhoff)(J) * J)[:, None, None] * jnp.outer(
         eye, eye
     )
 
