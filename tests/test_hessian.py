@@ -12,7 +12,7 @@ from helpers import DESCRIPTIONS, DIMS, ELASTIC, GRADIENTS, LAWS, cloud, thoroug
 
 import mpmjax as mpm
 from mpmjax._types import components
-from mpmjax.boundary import combine, mirror
+from mpmjax.boundary import combined_conditions, mirror
 from mpmjax.discretisation._stencil import make_stencil
 from mpmjax.discretisation._transfer import p2g
 from mpmjax.implicit._operator import ImplicitOperator
@@ -173,7 +173,7 @@ def constrained(d, description, law="fixed_corotated"):
     )
     potential = ElasticPotential((points,), stencil, images, grid.size)
     mass = images.fold_scalar(p2g(stencil, particles.mass, components(particles.v), None, grid.size)[0])
-    fixed = combine(walls, grid.nodes(window), DX, 0.0, 1.0, reference=False).fixed
+    fixed = combined_conditions(walls, grid.nodes(window), DX, 0.0, 1.0, reference=False).fixed
     free = (mass > 0)[:, None] & ~fixed
     assert {"free", "fixed", "empty"} == {
         kind

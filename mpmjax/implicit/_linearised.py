@@ -51,11 +51,11 @@ class Linearised(AbstractSolution):
             guess: where the solve starts [m/s], shape (n, d).
         """
         operator = problem.operator(guess).precomputed()
-        split = problem.projection.combine
-        lift = split(0, problem.prescribed)
-        rhs = split(problem.rhs - operator.unconstrained(lift), 0)
+        combine = problem.projection.combine
+        lift = combine(0, problem.prescribed)
+        rhs = combine(problem.rhs - operator.unconstrained(lift), 0)
         inner = problem.preconditioner.inner_product(operator)
-        solution = solve_linear(self.solver, operator, rhs, inner, split(guess, 0))
+        solution = solve_linear(self.solver, operator, rhs, inner, combine(guess, 0))
         none = jnp.asarray(0, dtype=jnp.int32)
         info = SolveInfo(
             iterations=solution.iterations,

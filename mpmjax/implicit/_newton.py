@@ -154,21 +154,21 @@ class _Direction(eqx.Module):
 
 def _setting(problem: NewtonProblem, guess: NodeVector, rtol: Scalar) -> tuple[_Setting, _NewtonState]:
     """The constants and the initial state of an iteration."""
-    split, free = problem.projection.combine, problem.projection.free
-    rest = split(0, problem.prescribed)
+    combine, free = problem.projection.combine, problem.projection.free
+    rest = combine(0, problem.prescribed)
     start = problem.apply_dirichlet(guess)
     energies = problem.incremental_potential(start), problem.incremental_potential(rest)
     start = jnp.where(jnp.isfinite(energies[0]) & ~(energies[1] < energies[0]), start, rest)
     undisplaced = problem.undisplaced_velocity()
     linearised = problem.momentum_residual(undisplaced)
-    linearised = split(linearised + problem.operator(undisplaced).unconstrained(rest - undisplaced), 0)
+    linearised = combine(linearised + problem.operator(undisplaced).unconstrained(rest - undisplaced), 0)
     mass = jnp.where(free, problem.mass[:, None], 1)
     setting = _Setting(
         problem=problem,
         rtol=rtol,
         mass=mass,
         scale=_norm(linearised, mass),
-        inertia=_norm(split(problem.mass[:, None] * problem.inertial, 0), mass),
+        inertia=_norm(combine(problem.mass[:, None] * problem.inertial, 0), mass),
         undisplaced=undisplaced,
         startable=jnp.isfinite(energies[0]) | jnp.isfinite(energies[1]),
     )

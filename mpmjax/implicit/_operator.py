@@ -64,8 +64,8 @@ class ImplicitOperator(AbstractSymmetricOperator):
         return self.mass[:, None] * v + self.factor * self.hessian(v)
 
     def mv(self, vector: NodeVector) -> NodeVector:
-        split = self.projection.combine
-        return split(self.unconstrained(split(vector, 0)), self.projection.identity_rows(vector, self.mass))
+        combine = self.projection.combine
+        return combine(self.unconstrained(combine(vector, 0)), self.projection.identity_rows(vector, self.mass))
 
     def precomputed(self) -> "ImplicitOperator":
         """The same operator, with H as one matrix for each particle, computed once for many applications."""

@@ -80,9 +80,9 @@ def _solve_jvp(primals: Any, tangents: Any) -> Any:
         residual = jnp.where(jnp.isfinite(solution.residual), solution.residual, jnp.inf)
         return jnp.where(solved, solution.value, jnp.nan), jnp.where(finite & ~solved, residual, 0)
 
-    split = problem.projection.combine
-    lift = split(0, -d_residual)
-    rhs = split(-d_residual - operator.unconstrained(lift), 0)
+    combine = problem.projection.combine
+    lift = combine(0, -d_residual)
+    rhs = combine(-d_residual - operator.unconstrained(lift), 0)
     d_slot = rhs[:0].sum() + (0 if d_slot is None else d_slot)  # a zero that keeps d_slot linear in the tangents
 
     def matvec(x: tuple[NodeVector, Array]) -> tuple[NodeVector, Array]:

@@ -17,7 +17,7 @@ from mpmjax.discretisation import Stencil, in_window
 from mpmjax.simulation._rollout_state import RolloutState
 from mpmjax.simulation._statistics import Fault, RunStatistics, no_steps, one_step
 from mpmjax.state import Particles, Scene, State, with_state
-from mpmjax.stepping import AbstractIntegrator, advance_compiled
+from mpmjax.stepping import AbstractIntegrator, step_compiled
 
 
 class Problem(eqx.Module):
@@ -138,7 +138,7 @@ class StepSolver(diffrax.AbstractSolver):
         statistics, _, report = solver_state
         t = (args.start + step_number(t0)) * args.dt
         method = args.method.reporting(args.slot)
-        particles, info = advance_compiled(args.scene, args.at(y0.particles), t, args.dt, method, args.stencil)
+        particles, info = step_compiled(args.scene, args.at(y0.particles), t, args.dt, method, args.stencil)
         report = report + info.solve.report
         y1 = y0.after(particles, info)
         arrays, rest = eqx.partition((args, y0.particles, y1.particles, t), eqx.is_array)

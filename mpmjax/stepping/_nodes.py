@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
-from mpmjax.boundary import AbstractContact, AbstractNodes, Conditions, Mirror, combine, contacts_of, mirror
+from mpmjax.boundary import AbstractContact, AbstractNodes, Conditions, Mirror, combined_conditions, contacts_of, mirror
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.state import Particles, Scene
@@ -148,11 +148,11 @@ class Nodes(AbstractNodes):
         square = (part**2).sum(axis=1)
         some = square > _PARALLEL**2
         length = jnp.sqrt(jnp.where(some, square, 1))
-        asked = colliders.normal * (colliders.velocity - jnp.where(self.free, 0, self.conditions.velocity))
+        missing = colliders.normal * (colliders.velocity - jnp.where(self.free, 0, self.conditions.velocity))
         return FreeNormal(
             direction=jnp.where(some[:, None], part / length[:, None], 0),
             length=length,
-            speed=jnp.where(some, asked.sum(axis=1) / length, 0),
+            speed=jnp.where(some, missing.sum(axis=1) / length, 0),
         )
 
     @property
@@ -267,7 +267,7 @@ def particles_to_grid(
             push = particles.mass * components(scene.body_force.acceleration(x, at))
             force = scatter(stencil, push, None, grid.size)
             acceleration = acceleration + jnp.where(occupied, force / full, 0)
-        conditions = combine(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total)
+        conditions = combined_conditions(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total)
         if scene.total and conditions.colliders is not None and conditions.colliders.slides:
             slid = (conditions.colliders.owner >= 0)[:, None] & occupied
             place = jnp.where(slid, _place(particles, stencil, grid.size) / full, conditions.colliders.position)
