@@ -56,11 +56,11 @@ class Linearised(AbstractSolution):
         rhs = combine(problem.rhs - operator.unconstrained(lift), 0)
         inner = problem.preconditioner.inner_product(operator)
         solution = solve_linear(self.solver, operator, rhs, inner, combine(guess, 0))
-        none = jnp.asarray(0, dtype=jnp.int32)
+        zero_count = jnp.asarray(0, dtype=jnp.int32)
         info = SolveInfo(
             iterations=solution.iterations,
-            newton=none,
-            line_search=none,
+            newton=zero_count,
+            line_search=zero_count,
             residual=solution.residual,
             converged=solution.converged,
             nearly_converged=solution.nearly_converged,

@@ -173,8 +173,18 @@ def _setting(problem: NewtonProblem, guess: NodeVector, rtol: Scalar) -> tuple[_
         startable=jnp.isfinite(energies[0]) | jnp.isfinite(energies[1]),
     )
     first = jnp.where(setting.startable, setting.residual(start), linearised)
-    zero, none, no = jnp.zeros((), guess.dtype), jnp.asarray(0, dtype=jnp.int32), jnp.asarray(False)
-    return setting, _NewtonState(start, first, zero, no, none, none, none, no, no)
+    zero_count, no = jnp.asarray(0, dtype=jnp.int32), jnp.asarray(False)
+    return setting, _NewtonState(
+        v=start,
+        r=first,
+        rounding=jnp.zeros((), guess.dtype),
+        settled=no,
+        iterations=zero_count,
+        newton=zero_count,
+        halvings=zero_count,
+        stuck=no,
+        indefinite=no,
+    )
 
 
 def _norm(r: NodeVector, mass: NodeVector) -> Float[Array, ""]:

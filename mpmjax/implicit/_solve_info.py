@@ -54,6 +54,14 @@ class SolveInfo(eqx.Module):
 
 def no_solve(dtype: Any) -> SolveInfo:
     """The report of an update without a solve."""
-    zero = jnp.asarray(0, dtype=jnp.int32)
-    no, none = jnp.asarray(False), jnp.asarray(0, dtype=dtype)
-    return SolveInfo(zero, zero, zero, none, converged=~no, nearly_converged=no, indefinite=no, report=none)
+    zero_count, zero, no = jnp.asarray(0, dtype=jnp.int32), jnp.asarray(0, dtype=dtype), jnp.asarray(False)
+    return SolveInfo(
+        iterations=zero_count,
+        newton=zero_count,
+        line_search=zero_count,
+        residual=zero,
+        converged=~no,
+        nearly_converged=no,
+        indefinite=no,
+        report=zero,
+    )
