@@ -117,7 +117,7 @@ def level(n: int, dt: float, coarser: int, contrast: float) -> tuple[Level, Node
     """Of one semi-implicit step with β = 1."""
     scene, particles, _ = square(n, coarser=coarser, contrast=contrast)
     nodes = particles_to_grid(scene, particles, 0.0, jnp.asarray(dt), scene.stencil(particles))
-    action = mpm.AnalyticHessian().at_current(nodes.potential, nodes.velocity)
+    action = mpm.AnalyticHessian().at_step_start(nodes.potential)
     operator = ImplicitOperator(nodes.mass, jnp.asarray(dt) ** 2, action, nodes.projection)
     weight = mpm.MassPreconditioner().inner_product(operator).weight
 

@@ -106,7 +106,7 @@ def singular_step(compression: float) -> float:
     stencil = scene.stencil(q)
     mass = p2g(stencil, q.mass, components(q.v), None, scene.grid.size)[0]
     images = mirror((), scene.grid, scene.window(q))
-    potential = ElasticPotential(scene.material_points(q), stencil, images)
+    potential = ElasticPotential(scene.material_points(q), stencil, images, scene.grid.size)
     at_rest = jnp.zeros((scene.grid.size, 2))
     hessian = jax.jacfwd(lambda u: -potential.force(u))(at_rest).reshape(2 * len(mass), -1)
     keep = np.repeat(np.asarray(mass) > 1e-12 * float(mass.max()), 2)

@@ -14,7 +14,7 @@ import mpmjax as mpm
 from mpmjax.checks._values import canonical
 from mpmjax.stepping import _step
 from mpmjax.stepping._nodes import Nodes, particles_to_grid
-from mpmjax.stepping._step import StepInfo, advance, update
+from mpmjax.stepping._step import StepInfo, step_unchecked, update
 
 
 def kernel(order: int, u: float) -> tuple[float, float]:
@@ -167,7 +167,7 @@ def grid_update(scene: mpm.Scene, particles: mpm.Particles, dt: float, method, t
 @eqx.filter_jit
 def _grid_update(scene, particles, t, dt, method) -> GridUpdate:
     nodes = particles_to_grid(scene, particles, t, dt, scene.stencil(particles), body_force_at=method.body_force_at)
-    new, info = advance(scene, particles, t, dt, method)
+    new, info = step_unchecked(scene, particles, t, dt, method)
     grid = update(nodes, method)
     position = scene.grid.nodes(scene.window(particles))
     return GridUpdate(nodes, grid.motion.velocity, grid.reaction, info, new, position, grid)

@@ -8,7 +8,7 @@ from helpers import METHODS, SECOND_ORDER, block, ids
 
 import mpmjax as mpm
 from mpmjax._types import Array, ParticleVector, Scalar
-from mpmjax.stepping._step import advance_compiled
+from mpmjax.stepping._step import step_compiled
 
 
 class Wind(mpm.AbstractBodyForce):
@@ -66,6 +66,6 @@ def test_a_scene_with_a_body_force_cannot_be_written(tmp_path):
 def test_changing_a_body_force_does_not_compile():
     scene, particles = block(1, body_force=Wind(jnp.ones(1)))
     mpm.step(scene, particles, 0.0, 1e-3)
-    before = advance_compiled._cached._cache_size()
+    before = step_compiled._cached._cache_size()
     mpm.step(eqx.tree_at(lambda s: s.body_force.rate, scene, 0.5), particles, 0.0, 1e-3)
-    assert advance_compiled._cached._cache_size() == before
+    assert step_compiled._cached._cache_size() == before

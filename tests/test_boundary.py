@@ -9,7 +9,7 @@ from helpers import DESCRIPTIONS, KERNELS, LAWS, assert_close, cloud, ids, thoro
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.boundary import Mirror, combine, contacts_of, mirror
+from mpmjax.boundary import Mirror, combined_conditions, contacts_of, mirror
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {
@@ -88,14 +88,14 @@ def test_a_node_within_a_thousandth_of_a_spacing_of_a_wall_is_on_it():
     for share, met in ((0.9e-3, 2), (1.1e-3, 1)):
         lower, upper = (2 - share) * DX, (5 + share) * DX  # nodes 2 and 5 are just within; 0, 1, 6 and 7 beyond
         for box in boxes:
-            found = combine((box((lower,), (upper,)),), nodes, DX, 0.0, 0.1, reference=False)
+            found = combined_conditions((box((lower,), (upper,)),), nodes, DX, 0.0, 0.1, reference=False)
             held = found.fixed if found.side is None else found.side != 0
             np.testing.assert_array_equal(
                 held[:, 0], np.isin(np.arange(8), [0, 1, 6, 7, *([2, 5] if met == 2 else [])])
             )
         between = mpm.Box(((2 + share) * DX,), ((5 - share) * DX,))
         for holds in (mpm.Grip(between, rest), mpm.StickyCollider(between), mpm.SlipCollider(between)):
-            found = combine((holds,), nodes, DX, 0.0, 0.1, reference=False)
+            found = combined_conditions((holds,), nodes, DX, 0.0, 0.1, reference=False)
             held = found.fixed[:, 0] if isinstance(holds, (mpm.Grip, mpm.StickyCollider)) else found.colliders.held
             np.testing.assert_array_equal(held, np.isin(np.arange(8), [3, 4, *([2, 5] if met == 2 else [])]))
     for plane in (mpm.SymmetryPlane, mpm.ContactPlane):
@@ -112,7 +112,7 @@ def test_the_earlier_boundary_wins():
     grip = mpm.Grip(mpm.Box((-np.inf, -np.inf), (0.15, np.inf)), motion)
     slip = mpm.SlipBox((-np.inf, 0.0), (0.1, np.inf))
     rule = [(grip, slip), (slip, grip)]
-    first, second = (np.asarray(combine(b, nodes, DX, 0.0, 0.1, reference=False).velocity) for b in rule)
+    first, second = (np.asarray(combined_conditions(b, nodes, DX, 0.0, 0.1, reference=False).velocity) for b in rule)
     x = np.asarray(nodes)
     both = np.isclose(x[:, 0], 0.1)
     assert_close(first[both], np.broadcast_to([2.0, 3.0], (6, 2)), 1e-14)
@@ -121,14 +121,14 @@ def test_the_earlier_boundary_wins():
     np.testing.assert_allclose(first[x[:, 0] > 0.15][:, 0], 0)
     walls = (((-np.inf, 0.1), 0.2), ((-np.inf, 0.0), 0.3), ((0.1, -np.inf), 0.4))
     boxes = [mpm.SeparatingBox(lower, (0.4, np.inf), friction=mu) for lower, mu in walls]
-    found = combine((grip, *boxes), nodes, DX, 0.0, 0.1, reference=False)
+    found = combined_conditions((grip, *boxes), nodes, DX, 0.0, 0.1, reference=False)
     open_ = x[:, 0] > 0.15  # what a grip holds, no wall does
     np.testing.assert_array_equal(np.asarray(found.side)[~open_], 0)
     np.testing.assert_array_equal(np.asarray(found.side)[open_, 1], x[open_, 1] < 0.15)
     np.testing.assert_array_equal(np.asarray(found.side)[open_, 0], np.where(x[open_, 0] > 0.35, -1, 0))
     np.testing.assert_allclose(np.asarray(found.friction)[open_ & (x[:, 1] < 0.15), 1], 0.2)
     np.testing.assert_allclose(np.asarray(found.friction)[x[:, 0] > 0.35, 0], 0.2)
-    found = combine(tuple(boxes[2:] + boxes[:2]), nodes, DX, 0.0, 0.1, reference=False)
+    found = combined_conditions(tuple(boxes[2:] + boxes[:2]), nodes, DX, 0.0, 0.1, reference=False)
     np.testing.assert_array_equal(np.asarray(found.side)[x[:, 0] < 0.15, 0], 1)
     np.testing.assert_allclose(np.asarray(found.friction)[x[:, 1] < 0.15, 1], 0.2)
     np.testing.assert_allclose(np.asarray(found.friction)[x[:, 0] < 0.15, 0], 0.4)

@@ -72,7 +72,7 @@ def test_run_writes_the_frames_and_a_summary(folder):
     assert re.search(r"steps +6 of 0.01 s with SemiImplicit", summary)
     for word in ("particle-steps per second", "iterations a step", "total energy", "mass"):
         assert word in summary
-    lost = re.search(r"on the grid ([-+.e\d]+) of it", summary)
+    lost = re.search(r"relative error of the grid's mass ([-+.e\d]+)", summary)
     assert lost is not None
     assert abs(float(lost[1])) < 1e-14
 

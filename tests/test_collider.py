@@ -12,7 +12,7 @@ from helpers import LAWS, QUICK, assert_close, cloud, explicit_limit, ids, thoro
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.boundary import combine
+from mpmjax.boundary import combined_conditions
 from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._projection import Projection
 
@@ -91,7 +91,7 @@ def test_a_body_stands_where_its_motion_takes_it():
     nodes = grid.nodes(grid.window(jnp.zeros((1, 2))))
     bar = mpm.Box((-0.6, -0.15), (0.6, 0.15))
     motion = mpm.RigidMotion((0.0, 2.0), ((0.0, 0.0), (0.6, 0.4)), (0.0, 1.2), (0.0, 0.0))
-    touch = combine((mpm.SlipCollider(bar, motion),), nodes, DX, 1.0, 0.1, reference=False).colliders
+    touch = combined_conditions((mpm.SlipCollider(bar, motion),), nodes, DX, 1.0, 0.1, reference=False).colliders
     angle, shift = 0.6, np.array([0.3, 0.2])
     R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     back = (np.asarray(nodes) - shift) @ R
@@ -141,12 +141,12 @@ def test_what_the_earlier_holds_the_later_neither_lets_go_nor_rubs_nor_receives(
     x = np.asarray(nodes)
     left, floor = mpm.HalfSpace((0.25, 0.0), (1.0, 0.0)), mpm.HalfSpace((0.0, 0.25), (0.0, 1.0))
     pair = mpm.SlipCollider(left), mpm.SeparatingCollider(floor, friction=0.5)
-    touch = combine(pair, nodes, DX, 0.0, 0.1, reference=False).colliders
+    touch = combined_conditions(pair, nodes, DX, 0.0, 0.1, reference=False).colliders
     later = (x[:, 0] > 0.25) & (x[:, 1] < 0.25)
     np.testing.assert_array_equal(touch.leavable, later)
     np.testing.assert_array_equal(touch.friction, 0.5 * later)
     grip = mpm.Grip(left, mpm.Motion((0.0,), ((0.0, 0.0),)), axes=(True, False))
-    touch = combine((grip, mpm.StickyCollider(floor)), nodes, DX, 0.0, 0.1, reference=False).colliders
+    touch = combined_conditions((grip, mpm.StickyCollider(floor)), nodes, DX, 0.0, 0.1, reference=False).colliders
     np.testing.assert_array_equal(touch.holder[:, 1], np.where(x[:, 1] < 0.25, 0, -1))
     np.testing.assert_array_equal(touch.holder[:, 0], np.where(later, 0, -1))
 
@@ -154,13 +154,13 @@ def test_what_the_earlier_holds_the_later_neither_lets_go_nor_rubs_nor_receives(
 @pytest.mark.thorough
 @pytest.mark.parametrize("preconditioner", [mpm.DiagonalPreconditioner(), mpm.MassPreconditioner()])
 def test_the_operator_is_symmetric_and_its_inner_product_commutes_with_the_projection(preconditioner):
-    """Q (M + cH) Q and the identity, or the mass, on the rest; beside fixed components too."""
+    """Q (M + χH) Q and the identity, or the mass, on the rest; beside fixed components too."""
     grid, particles = cloud(2, p=12, cells=3)
     ball = mpm.Ball((0.16, 0.02), 0.22)
     scene = scene_of(grid, mpm.SlipBox((-np.inf, 0.0), (np.inf, np.inf)), mpm.SlipCollider(ball))
     step = grid_update(scene, particles, DT, METHODS["explicit"])
     nodes = step.nodes
-    action = mpm.AnalyticHessian().at_current(nodes.potential, nodes.velocity)
+    action = mpm.AnalyticHessian().at_step_start(nodes.potential)
     operator = ImplicitOperator(nodes.mass, jnp.asarray(1e-3), action, nodes.projection)
     A, W = np.asarray(operator.as_matrix()), np.asarray(preconditioner.inner_product(operator).weight).ravel()
     n = A.shape[0]
@@ -186,7 +186,7 @@ def test_a_linear_solve_with_a_collider_is_the_dense_one():
     scene = scene_of(grid, mpm.SlipCollider(mpm.Ball((0.16, 0.12), 0.22), ROLLING))
     step = grid_update(scene, particles, DT, METHODS["semi_implicit"])
     nodes = step.nodes
-    action = mpm.AnalyticHessian().at_current(nodes.potential, nodes.velocity)
+    action = mpm.AnalyticHessian().at_step_start(nodes.potential)
     whole = ImplicitOperator(nodes.mass, nodes.dt**2, action, Projection(jnp.ones_like(nodes.free)))
     A, n = np.asarray(whole.as_matrix()), nodes.velocity.size
     Q = np.asarray(jax.vmap(lambda e: nodes.projection.combine(e.reshape(-1, 2), 0).ravel())(jnp.eye(n))).T

@@ -366,8 +366,9 @@ def block_and_stray(multiple):
     node_mass, momentum = p2g(stencil, mass, components(v), components(particles.C), grid.size)
     occupied = node_mass > jnp.finfo(float).eps * mass[0]
     assert 0 < jnp.where(occupied, node_mass, jnp.inf).min() < 1e-10 * mass[0]
-    potential = ElasticPotential(scene.material_points(particles), stencil, mirror((), grid, scene.window(particles)))
-    hessian = mpm.AnalyticHessian().at_current(potential, momentum)
+    images = mirror((), grid, scene.window(particles))
+    potential = ElasticPotential(scene.material_points(particles), stencil, images, grid.size)
+    hessian = mpm.AnalyticHessian().at_step_start(potential)
     free = jnp.broadcast_to(occupied[:, None], momentum.shape)
     factor = jnp.asarray((multiple * explicit_limit(scene)) ** 2)
     return ImplicitOperator(node_mass, factor, hessian, Projection(free)), jnp.where(free, momentum, 0)

@@ -1,4 +1,4 @@
-"""The Hessian action both ways, against each other and against finite differences, and the operator M + cH."""
+"""The Hessian action both ways, against each other and against finite differences, and the operator M + χH."""
 
 from functools import cache
 
@@ -12,7 +12,7 @@ from helpers import DESCRIPTIONS, DIMS, ELASTIC, GRADIENTS, LAWS, cloud, thoroug
 
 import mpmjax as mpm
 from mpmjax._types import components
-from mpmjax.boundary import combine, mirror
+from mpmjax.boundary import combined_conditions, mirror
 from mpmjax.discretisation._stencil import make_stencil
 from mpmjax.discretisation._transfer import p2g
 from mpmjax.implicit._operator import ImplicitOperator
@@ -65,7 +65,7 @@ def linearised(potential, du, u, h):
     """About u: −∂Φ/∂u, the force there and at u ∓ h δu, and H δu by both routes, through the operator without mass."""
 
     def action(hessian):
-        H = hessian.at_current(potential, du) if u is None else hessian.at(potential, u)
+        H = hessian.at_step_start(potential) if u is None else hessian.at(potential, u)
         return ImplicitOperator(jnp.zeros(len(du)), jnp.asarray(1.0), H, Projection(jnp.ones(du.shape, bool))).mv(du)
 
     place = jnp.zeros_like(du) if u is None else u
@@ -83,8 +83,8 @@ def scene_of(law, d, family, description, gradient):
     total = description == "total"
     images = mirror((), grid, window)
     material = jax.tree.map(jnp.asarray, ELASTIC[law])
-    body = MaterialPoints(material, particles.volume, F, total, (0, particles.count), None)
-    potential = ElasticPotential((body,), stencil, images)
+    points = MaterialPoints(material, particles.volume, F, total, (0, particles.count), None)
+    potential = ElasticPotential((points,), stencil, images, grid.size)
     du = jnp.asarray(DX * np.random.default_rng(1).normal(size=(grid.size, d)))
     return potential, du
 
@@ -169,12 +169,12 @@ def constrained(d, description, law="fixed_corotated"):
     window = grid.window(particles.x)
     stencil = make(mpm.BSpline(), mpm.MLSGradient(), grid, window, particles.x, affine=False)
     F, images = components(particles.F), mirror(walls, grid, window)
-    body = MaterialPoints(
+    points = MaterialPoints(
         jax.tree.map(jnp.asarray, LAWS[law]), particles.volume, F, description == "total", (0, particles.count), None
     )
-    potential = ElasticPotential((body,), stencil, images)
+    potential = ElasticPotential((points,), stencil, images, grid.size)
     mass = images.fold_scalar(p2g(stencil, particles.mass, components(particles.v), None, grid.size)[0])
-    fixed = combine(walls, grid.nodes(window), DX, 0.0, 1.0, reference=False).fixed
+    fixed = combined_conditions(walls, grid.nodes(window), DX, 0.0, 1.0, reference=False).fixed
     free = (mass > 0)[:, None] & ~fixed
     assert {"free", "fixed", "empty"} == {
         kind
@@ -183,9 +183,8 @@ def constrained(d, description, law="fixed_corotated"):
     }
     # so that mass and stiffness are alike
     factor = jnp.asarray(1e-3)
-    like = jnp.zeros((grid.size, d))
     operators = [
-        ImplicitOperator(mass, factor, h.at_current(potential, like), Projection(free)) for h in HESSIANS.values()
+        ImplicitOperator(mass, factor, h.at_step_start(potential), Projection(free)) for h in HESSIANS.values()
     ]
     return operators, potential, free
 

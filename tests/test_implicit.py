@@ -250,7 +250,7 @@ def test_single_precision_converges_and_says_how_far(times):
     problem = LinearProblem(
         mass=nodes.mass,
         factor=nodes.dt**2,
-        hessian=AnalyticHessian().at_current(nodes.potential, predictor),
+        hessian=AnalyticHessian().at_step_start(nodes.potential),
         rhs=nodes.mass[:, None] * predictor,
         projection=nodes.projection,
         prescribed=nodes.prescribed,

@@ -64,7 +64,7 @@ class MinimalResidual(lx.AbstractLinearSolver):
 
 
 class BlockJacobi(mpm.AbstractPreconditioner):
-    """The d x d blocks of M + cH on the diagonal, by products with vectors of a colouring: a user's own."""
+    """The d x d blocks of M + χH on the diagonal, by products with vectors of a colouring: a user's own."""
 
     def inner_product(self, operator):
         matrix = operator.as_matrix()

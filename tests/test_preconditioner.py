@@ -27,11 +27,11 @@ def by_the_mass(method):
 
 
 def operator_of(scene, particles, hessian, factor=1e-3):
-    """M + cH at the particles, c such that mass and stiffness are alike, ."""
+    """M + χH at the particles, with χ such that mass and stiffness are alike."""
     particles = mpm.prepare(scene, particles)
     dt = jnp.asarray(1e-3)
     nodes = particles_to_grid(scene, particles, 0.0, dt, scene.stencil(particles))
-    action = hessian.at_current(nodes.potential, nodes.velocity)
+    action = hessian.at_step_start(nodes.potential)
     return ImplicitOperator(nodes.mass, jnp.asarray(factor), action, nodes.projection)
 
 

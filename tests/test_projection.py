@@ -153,7 +153,7 @@ def stiffness(scene, particles, hessian):
     """H restricted to the free components, and their masses."""
     nodes = grid_update(scene, particles, 1e-3, mpm.Explicit()).nodes
     free = nodes.free
-    action = hessian.at_current(nodes.potential, nodes.velocity)
+    action = hessian.at_step_start(nodes.potential)
     operator = ImplicitOperator(jnp.zeros_like(nodes.mass), jnp.asarray(1.0), action, nodes.projection)
     A, keep = np.asarray(eqx.filter_jit(ImplicitOperator.as_matrix)(operator)), np.asarray(free).ravel()
     return A[np.ix_(keep, keep)], np.repeat(np.asarray(nodes.mass), 2)[keep]

@@ -55,7 +55,7 @@ def test_a_step_is_that_of_the_first_order_system(method, description):
     nodes = grid_update(scene, particles, dt, mpm.Explicit()).nodes
     motion, info = move(method, nodes)
     assert info.converged
-    action = method.hessian.at_current(nodes.potential, nodes.force)
+    action = method.hessian.at_step_start(nodes.potential)
     everything = ImplicitOperator(0 * nodes.mass, jnp.asarray(1.0), action, Projection(jnp.ones_like(nodes.free)))
     H = np.asarray(eqx.filter_jit(ImplicitOperator.as_matrix)(everything))
     free = np.asarray(nodes.free).ravel()
@@ -113,7 +113,7 @@ def test_an_unconverged_first_stage_is_reported():
         _, q0, q1, q2 = method.weights()
         dt, v0, v, g = nodes.dt, nodes.velocity, motion.velocity, nodes.acceleration
         middle, c, pull = motion.inner / q2 - v0, q2 * dt, nodes.per_mass(nodes.force)
-        action = method.hessian.at_current(nodes.potential, v0)
+        action = method.hessian.at_step_start(nodes.potential)
         a = v0 + c * (pull + 2 * g)
         b = v0 + dt * (q0 * pull + q1 * (middle - a) / c + g)
 
@@ -191,6 +191,6 @@ def test_midpoint_by_newton_keeps_the_angular_momentum_of_the_nodes():
 def test_a_motion_counts_half_of_what_slows_it():
     """Where positions move with the mean velocity; all of it where they move with the new one."""
     one = jnp.ones((3, 2))
-    assert (NodeMotion(one).slowed(-one).carrier == 0).all()
-    assert (NodeMotion(one, one).slowed(-one).carrier == 0.5).all()
-    assert (NodeMotion(one, one).slowed(-one).velocity == 0).all()
+    assert (NodeMotion(one).with_friction(-one).carrier == 0).all()
+    assert (NodeMotion(one, one).with_friction(-one).carrier == 0.5).all()
+    assert (NodeMotion(one, one).with_friction(-one).velocity == 0).all()

@@ -14,7 +14,7 @@ from helpers import assert_close, block, explicit_limit
 
 import mpmjax as mpm
 from mpmjax.state._particles import state_of, with_state
-from mpmjax.stepping._step import advance
+from mpmjax.stepping._step import step_unchecked
 
 
 def quiet(scene, particles, **options):
@@ -34,7 +34,7 @@ def bar():
 
     def after(flat, dt):
         return jax.flatten_util.ravel_pytree(
-            state_of(advance(scene, with_state(rest, unflatten(flat)), 0.0, dt, mpm.Explicit())[0])
+            state_of(step_unchecked(scene, with_state(rest, unflatten(flat)), 0.0, dt, mpm.Explicit())[0])
         )[0]
 
     jacobian = jax.jit(jax.jacfwd(after))
@@ -56,7 +56,7 @@ def bar_limit():
 def test_free_flight_has_growth_one():
     """To rounding: a bar thrown as a whole, and a single particle, whatever its velocity."""
     scene, particles, _ = bar()
-    report = quiet(scene, particles, t1=400 * 5e-3, dt=5e-3, velocity=jnp.full_like(particles.v, 7.0))
+    report = quiet(scene, particles, t1=400 * 5e-3, dt=5e-3, direction=jnp.full_like(particles.v, 7.0))
     assert_close(report.growth, np.ones(100), 1e-12)
     assert abs(float(report.rate)) < 1e-12
     np.testing.assert_array_equal(report.steps, np.arange(4, 401, 4))
@@ -80,7 +80,7 @@ def test_growth_is_that_of_a_finite_change():
         thrown = eqx.tree_at(lambda p: p.v, particles, particles.v + sign * h * change)
         return mpm.simulate(scene, thrown, **run).frames.x[1:]
 
-    report = quiet(scene, particles, velocity=change, **run)
+    report = quiet(scene, particles, direction=change, **run)
     moved = (flown(1) - flown(-1)) / (2 * h)
     times = np.array([*5e-3 * 5 * np.arange(1, 13), 0.32])
     size = np.sqrt((moved**2).sum(axis=(1, 2))) / float(jnp.sqrt((change**2).sum()))
@@ -118,7 +118,7 @@ def test_a_fault_of_the_run_ends_the_report_and_warns():
     scene, particles, _ = bar()
     particles = eqx.tree_at(lambda p: p.v, particles, jnp.full_like(particles.v, 0.5))
     with pytest.warns(UserWarning, match=r"the run meets a fault at step \d+") as caught:
-        report = mpm.sensitivity(scene, particles, t1=2.0, dt=5e-3, velocity=jnp.ones_like(particles.v))
+        report = mpm.sensitivity(scene, particles, t1=2.0, dt=5e-3, direction=jnp.ones_like(particles.v))
     step = int(str(caught[0].message).split("at step ")[1].split()[0])
     good = np.asarray(report.steps) < step
     assert 0 < good.sum() < 100
@@ -163,7 +163,7 @@ def test_growth_is_that_of_the_reverse_mode_gradient(factor):
 
     @jax.vmap
     def tangent(direction):
-        return mpm.sensitivity(scene, particles, velocity=direction, **options).growth
+        return mpm.sensitivity(scene, particles, direction=direction, **options).growth
 
     def gradients(steps):
         def final(v):
@@ -184,8 +184,8 @@ def test_growth_is_that_of_the_reverse_mode_gradient(factor):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"velocity": jnp.ones((2, 1))}, "shape"),
-        ({"velocity": jnp.zeros((6, 1))}, "zero"),
+        ({"direction": jnp.ones((2, 1))}, "shape"),
+        ({"direction": jnp.zeros((6, 1))}, "zero"),
         ({"warn_at": 0.0}, "warn_at"),
         ({"t1": 0.0123}, "whole number"),
     ],

@@ -181,7 +181,7 @@ def test_velocity_and_its_gradient_are_those_of_the_new_velocity():
             alpha = transfer.alpha if isinstance(transfer, mpm.FLIP) else 0.0
             ends = [from_nodes(stencil, a)[0] for a in (after, after - before)]
             for mean_ in (None, mean):
-                _, new, C, _ = to_particles(transfer, stencil, jnp.asarray(v), before, after, mean_, kept=True)
+                _, new, C, _ = to_particles(transfer, stencil, jnp.asarray(v), before, after, mean_, keep_gradient=True)
                 assert_close(C, expected, 1e-14)
                 assert_close(new, (1 - alpha) * ends[0] + alpha * (v + ends[1]), 1e-14)
         if name == "spline":

@@ -46,7 +46,7 @@ def potential_of(law, d, description="updated"):
     scene, particles = jax.tree.map(jnp.asarray, (scene, mpm.prepare(scene, particles)))
     images = mirror(scene.boundary, grid, scene.window(particles))
     u = jnp.asarray(np.random.default_rng(1).normal(size=(2, grid.size, d)))
-    return ElasticPotential(scene.material_points(particles), scene.stencil(particles), images), u
+    return ElasticPotential(scene.material_points(particles), scene.stencil(particles), images, grid.size), u
 
 
 CASES = [("viscous_solid", "updated"), *thorough(("viscous_solid", "total"), ("viscous_fluid", "updated"))]
@@ -55,9 +55,9 @@ CASES = [("viscous_solid", "updated"), *thorough(("viscous_solid", "total"), ("v
 @eqx.filter_jit
 def applied(potential, u, hessian):
     """D u, both powers, and H + 3D through the law and assembled."""
-    action = damped(hessian.at_current(potential, u[0]), potential, jnp.asarray(3.0))
-    elastic = hessian.at_current(potential, u[0])(u[0])
-    drags, powers = jax.vmap(potential.damping_force)(u), jax.vmap(potential.power)(u)
+    action = damped(hessian.at_step_start(potential), potential, jnp.asarray(3.0))
+    elastic = hessian.at_step_start(potential)(u[0])
+    drags, powers = jax.vmap(potential.viscous_resistance)(u), jax.vmap(potential.power)(u)
     return drags, powers, elastic, action(u[0]), action.precomputed()(u[0])
 
 
@@ -89,14 +89,14 @@ def test_both_descriptions_resist_the_same_flow_alike(description):
     """A flow uniform in space, ∇_X v = L F: the flux Jσ_v(L) in space, or that times F⁻ᵀ."""
     rng = np.random.default_rng(4)
     potential, _ = potential_of(VISCOUS["viscous_solid"], 3, description)
-    (body,) = potential.material_points
-    F, L = np.asarray(body.deformation), rng.normal(size=(3, 3))
+    (points,) = potential.material_points
+    F, L = np.asarray(points.deformation), rng.normal(size=(3, 3))
     gradient = np.broadcast_to(L[..., None], F.shape)
     gradient = np.einsum("ij,jkp->ikp", L, F) if description == "total" else gradient
-    flux = np.asarray(body.damping_force(jnp.asarray(gradient)))
+    flux = np.asarray(points.viscous_flux(jnp.asarray(gradient)))
     flux = np.einsum("ijp,kjp->ikp", flux, F) if description == "total" else flux
-    stress = np.asarray(body.viscosity.stress(jnp.asarray(L)[..., None]))
-    assert_close(flux, np.abs(np.linalg.det(F.T)) * np.asarray(body.volume) * stress, 1e-12)
+    stress = np.asarray(points.viscosity.stress(jnp.asarray(L)[..., None]))
+    assert_close(flux, np.abs(np.linalg.det(F.T)) * np.asarray(points.volume) * stress, 1e-12)
 
 
 def angular_momentum(particles, moment):

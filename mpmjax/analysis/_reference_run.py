@@ -1,4 +1,4 @@
-"""The reference motion of `work_precision`: a run refined until it changes little, or until its time is up.
+"""The reference motion of `work_precision`: a run refined until it changes little or its time is up.
 
 If explicit steps are cheap it uses them, at the `stable_dt` of the whole motion, which resolves all that the grid does.
 Otherwise it uses TR-BDF2, and halves the step until that changes the motion by less than a third of the target error,
@@ -27,13 +27,13 @@ class Reference(NamedTuple):
     """The reference run."""
 
     limit: float
-    """The longest explicit step on the scene's own grid that is offered, `stable_dt` of the whole motion [s]."""
+    """The longest explicit step on the scene's own grid that trials may take, `stable_dt` of the whole motion [s]."""
     trial: Trial
     """The run; its error is an estimate."""
     motion: Displacements
 
 
-class _Look(NamedTuple):
+class _RefinedRun(NamedTuple):
     """A run, and its relative change of the motion of the run before."""
 
     bench: Bench
@@ -74,13 +74,13 @@ def settle(build: Build, bench: Bench, error: float, seconds: float, say: Say = 
         raise ValueError(f"{steps} explicit steps take {foreseen:.2g} s and two runs are needed: {_more(seconds)}")
     limit, good = _resolved_in_time(bench, method, steps, limit, error, clock, say)
     while growth * good.seconds < clock.left and (good.bench is bench or good.change > error / 3):
-        finer = _look(Bench.of(build, 2 * good.bench.refinement, bench.t1), method, 2 * good.steps, good, say)
+        finer = _refined_run(Bench.of(build, 2 * good.bench.refinement, bench.t1), method, 2 * good.steps, good, say)
         if finer.motion is None:
             break
         good = finer
     alone = good.bench is bench  # there was no time for a finer grid
     while alone and good.change > error / 3 and (math.isinf(good.change) or clock.allows(2 * good.seconds)):
-        again = _look(bench, method, 2 * good.steps, good, say)
+        again = _refined_run(bench, method, 2 * good.steps, good, say)
         if again.motion is None:
             break
         good = again
@@ -93,12 +93,12 @@ def settle(build: Build, bench: Bench, error: float, seconds: float, say: Say = 
 
 def _resolved_in_time(
     bench: Bench, method: AbstractIntegrator, steps: int, limit: float, error: float, clock: Clock, say: Say
-) -> tuple[float, _Look]:
+) -> tuple[float, _RefinedRun]:
     """The explicit limit over the motion on the scene's own grid [s], and the run whose step resolves the motion, or
     the last one within the time."""
     good = None
     while True:
-        new = _look(bench, method, steps, good, say)
+        new = _refined_run(bench, method, steps, good, say)
         if new.states is not None and new.motion is not None:
             require(new.motion.size > 0, "Nothing moves in this scene, so there is no motion to be right or wrong.")
             limit, good = min(limit, bench.limit(new.states)), new
@@ -114,7 +114,9 @@ def _resolved_in_time(
         steps = max(2 * steps, bench.whole(limit) if method.is_explicit else 0)
 
 
-def _look(bench: Bench, method: AbstractIntegrator, steps: int, before: _Look | None, say: Say) -> _Look:
+def _refined_run(
+    bench: Bench, method: AbstractIntegrator, steps: int, before: _RefinedRun | None, say: Say
+) -> _RefinedRun:
     states, seconds = bench.run(method, steps)
     motion = None if states is None else bench.motion(states)
     coarse = None if before is None else before.motion
@@ -122,7 +124,7 @@ def _look(bench: Bench, method: AbstractIntegrator, steps: int, before: _Look | 
     spacing = f", spacing / {bench.refinement}" if bench.refinement > 1 else ""
     outcome = "failed" if motion is None else "" if math.isinf(change) else f"changes the motion by {change:.2g}"
     say(f"reference: {name_of(method)}, {steps} steps{spacing}: {seconds:.2g} s {outcome}".rstrip())
-    return _Look(bench, steps, seconds, states, motion, change)
+    return _RefinedRun(bench, steps, seconds, states, motion, change)
 
 
 def _more(seconds: float) -> str:

@@ -45,14 +45,13 @@ def sensitivity(
     t1: Scalar,
     dt: Scalar | Literal["stable"],
     method: AbstractIntegrator = Explicit(),
-    velocity: ParticleVector | None = None,
+    direction: ParticleVector | None = None,
     seed: int = 0,
     save_every: int | None = None,
     start: Scalar = 0,
     warn_at: float | int = 1e3,
 ) -> Sensitivity:
-    """The growth of a small change of the initial velocities, which shows whether gradients over this horizon are
-    useful.
+    """Tells whether gradients over this horizon are useful: the growth of a small change of the initial velocities.
 
     The change δv0 is propagated to a change δx of the positions by forward-mode differentiation of the steps, and
     measured against free flight:
@@ -77,7 +76,7 @@ def sensitivity(
         t1: end time [s], a multiple of the step.
         dt: step [s], or "stable", as in `simulate`.
         method: the integrator.
-        velocity: the change δv0 of the initial velocities, of any size, shape (p, d). Default: normally distributed,
+        direction: the change δv0 of the initial velocities, of any size, shape (p, d). Default: normally distributed,
             of variance 1/m_p.
         seed: of the default change.
         save_every: measure every so many steps, and at the end. Default: about a hundred times.
@@ -94,12 +93,12 @@ def sensitivity(
     count = number_of_steps(t1, dt, start, particles.x.dtype)
     every = max(1, count // _POINTS) if save_every is None else save_every
     shape, dtype = particles.v.shape, particles.v.dtype
-    if velocity is None:
+    if direction is None:
         change = jax.random.normal(jax.random.key(seed), shape, dtype) / jnp.sqrt(particles.mass)[:, None]
     else:
-        change = jnp.asarray(velocity, dtype)
-    require(change.shape == shape, f"velocity must have the particles' shape {shape}, got {change.shape}.")
-    require((change != 0).any(), "velocity must not be zero everywhere: there is nothing to follow.")
+        change = jnp.asarray(direction, dtype)
+    require(change.shape == shape, f"direction must have the particles' shape {shape}, got {change.shape}.")
+    require((change != 0).any(), "direction must not be zero everywhere: there is nothing to follow.")
 
     def flown(v: ParticleVector) -> tuple[tuple[Array, Any], tuple[Array, RunStatistics]]:
         thrown = eqx.tree_at(lambda p: p.v, particles, v)

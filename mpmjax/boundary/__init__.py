@@ -2,8 +2,8 @@
 
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall
 from mpmjax.boundary._collider import AbstractCollider, SeparatingCollider, SlipCollider, StickyCollider
-from mpmjax.boundary._collider_impulse import ColliderImpulse, collider_impulse, no_impulse
-from mpmjax.boundary._combined import combine, contacts_of, mirror
+from mpmjax.boundary._collider_impulse import ColliderImpulse, impulse_on_colliders, no_impulse
+from mpmjax.boundary._combined import combined_conditions, contacts_of, mirror
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import (
     AbstractContact,
@@ -41,11 +41,11 @@ __all__ = [
     "StickyCollider",
     "SymmetryPlane",
     "Wall",
-    "collider_impulse",
-    "combine",
+    "combined_conditions",
     "constrain",
     "contacts_of",
     "find_active_set",
+    "impulse_on_colliders",
     "mirror",
     "no_contact",
     "no_impulse",

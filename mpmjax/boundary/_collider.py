@@ -95,7 +95,7 @@ class StickyCollider(AbstractCollider):
         inside = body.holds(spacing)[:, None]
         fixed = jnp.broadcast_to(inside, nodes.shape)
         nothing = jnp.zeros_like(nodes)
-        asked = ColliderConditions(
+        touched = ColliderConditions(
             normal=nothing,
             velocity=nothing,
             held=jnp.zeros(len(nodes), bool),
@@ -105,7 +105,7 @@ class StickyCollider(AbstractCollider):
             pivots=body.pivot[None],
             pivot_velocity=body.pivot_velocity[None],
         )
-        return Conditions(fixed, jnp.where(fixed, body.velocity, 0), colliders=asked)
+        return Conditions(fixed, jnp.where(fixed, body.velocity, 0), colliders=touched)
 
 
 class SlipCollider(AbstractCollider):
@@ -137,8 +137,8 @@ class SlipCollider(AbstractCollider):
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v·n = v_c·n."""
-        asked = _Body(self, nodes, t, dt, reference).conditions(spacing)
-        return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), colliders=asked)
+        touched = _Body(self, nodes, t, dt, reference).conditions(spacing)
+        return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), colliders=touched)
 
 
 class SeparatingCollider(AbstractCollider):
@@ -170,14 +170,14 @@ class SeparatingCollider(AbstractCollider):
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """(v − v_c)·n ≥ 0 ⟂ reaction ≥ 0."""
-        asked = _Body(self, nodes, t, dt, reference).conditions(spacing)
-        asked = eqx.tree_at(
+        touched = _Body(self, nodes, t, dt, reference).conditions(spacing)
+        touched = eqx.tree_at(
             lambda c: (c.held, c.leavable, c.friction),
-            asked,
-            (jnp.zeros_like(asked.held), asked.held, jnp.where(asked.held, self.friction, 0).astype(nodes.dtype)),
+            touched,
+            (jnp.zeros_like(touched.held), touched.held, jnp.where(touched.held, self.friction, 0).astype(nodes.dtype)),
             is_leaf=lambda leaf: leaf is None,
         )
-        return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), colliders=asked)
+        return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), colliders=touched)
 
     def check(self, grid: Grid, *, total: bool) -> None:
         del grid

@@ -36,8 +36,8 @@ def no_impulse(colliders: int, dim: int, dtype: Any) -> ColliderImpulse:
     return ColliderImpulse(jnp.zeros((colliders, dim), dtype), jnp.zeros((colliders, len(pairs(dim))), dtype))
 
 
-def collider_impulse(
-    asked: ColliderConditions,
+def impulse_on_colliders(
+    colliders: ColliderConditions,
     reaction: NodeVector,
     normal_impulse: NodeScalar | None = None,
     friction: NodeVector | None = None,
@@ -45,18 +45,19 @@ def collider_impulse(
     """The impulse on each collider: minus what it gives the nodes by prescribed components, along normals, by friction.
 
     Args:
-        asked: the conditions of the colliders, with which node and component is whose.
+        colliders: the conditions of the colliders, with which node and component is whose.
         reaction: the impulse of all walls and bodies on the nodes, without friction [kg m/s], shape (n, d).
         normal_impulse: the part of it by colliders, along their normals [kg m/s], shape (n,).
         friction: the impulse of the colliders' friction on the nodes [kg m/s], shape (n, d).
     """
-    along = jnp.zeros_like(reaction) if normal_impulse is None else normal_impulse[:, None] * asked.normal
+    along = jnp.zeros_like(reaction) if normal_impulse is None else normal_impulse[:, None] * colliders.normal
     along = along if friction is None else along + friction
     impulse, angular = [], []
-    for number, pivot in enumerate(asked.pivots):
-        given = jnp.where((asked.owner == number)[:, None], along, 0) + jnp.where(asked.holder == number, reaction, 0)
+    for number, pivot in enumerate(colliders.pivots):
+        given = jnp.where((colliders.owner == number)[:, None], along, 0)
+        given = given + jnp.where(colliders.holder == number, reaction, 0)
         impulse.append(-given.sum(axis=0))
-        angular.append(-_moment(asked.position - pivot, given).sum(axis=0))
+        angular.append(-_moment(colliders.position - pivot, given).sum(axis=0))
     return ColliderImpulse(jnp.stack(impulse), jnp.stack(angular))
 
 

@@ -13,7 +13,7 @@ from mpmjax.boundary._wall_contact import wall_contacts
 from mpmjax.discretisation import Grid
 
 
-def combine(
+def combined_conditions(
     boundaries: tuple[AbstractBoundary, ...],
     nodes: NodeVector,
     spacing: Scalar,

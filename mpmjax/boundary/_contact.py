@@ -17,7 +17,7 @@ the elastic response of one step.
 
 import abc
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -66,7 +66,7 @@ class AbstractNodes(eqx.Module):
         """The mirror images of symmetry planes, and of the columns that are held."""
 
     @abc.abstractmethod
-    def constrained(self, images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None) -> Any:
+    def constrained(self: "N", images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None) -> "N":
         """These nodes with more of them held.
 
         Args:
@@ -78,6 +78,9 @@ class AbstractNodes(eqx.Module):
     @abc.abstractmethod
     def explicit_velocity(self) -> NodeVector:
         """v* [m/s], shape (n, d)."""
+
+
+N = TypeVar("N", bound=AbstractNodes)
 
 
 class AbstractContact(eqx.Module):
@@ -196,32 +199,32 @@ def no_contact() -> ContactInfo:
     return ContactInfo(zero, zero)
 
 
-class ConstrainedNodes(eqx.Module):
+class ConstrainedNodes(eqx.Module, Generic[N]):
     """The nodes while an active set is held; see `constrain`."""
 
-    free: Any
+    unheld: N
     """The nodes of which no contact holds anything."""
     active: ActiveSet
     """What is held."""
     images: Mirror
     """The mirrors in the columns that are held."""
-    nodes: Any
+    nodes: N
     """The nodes with the active set held."""
 
     @property
     def normal(self) -> NodeVector | None:
         """The free parts of the normals that colliders hold, of length one, shape (n, d); None without colliders."""
-        return None if self.free.conditions.colliders is None else self.nodes.projection.normal
+        return None if self.unheld.conditions.colliders is None else self.nodes.projection.normal
 
     @property
     def mass(self) -> NodeScalar:
         """The nodes' mass, folded on the mirrors [kg], shape (n,)."""
-        return self.images.fold_scalar(self.free.mass)
+        return self.images.fold_scalar(self.unheld.mass)
 
     def beyond_boundaries(self) -> tuple[Mask, NodeVector | None]:
         """The components of velocity on which no boundary acts, shape (n, d), and the normals that colliders hold."""
-        free, normal = self.free.free, self.normal
-        for contact, active in zip(self.free.contacts, self.active, strict=True):
+        free, normal = self.unheld.free, self.normal
+        for contact, active in zip(self.unheld.contacts, self.active, strict=True):
             free = free & ~contact.reached(active, free.shape)
         return free, None if normal is None else jnp.where(free, normal, 0)
 
@@ -241,8 +244,10 @@ class ConstrainedNodes(eqx.Module):
 
     def beside_colliders(self, residual: NodeVector) -> NodeVector:
         """The residual without what colliders hold along their normals: what walls and planes hold."""
-        impulse, colliders = self.collider_impulse(residual), self.free.conditions.colliders
-        return residual if impulse is None else residual - impulse[:, None] * colliders.normal
+        impulse, colliders = self.collider_impulse(residual), self.unheld.conditions.colliders
+        if impulse is None or colliders is None:
+            return residual
+        return residual - impulse[:, None] * colliders.normal
 
     def impulse(self, residual: NodeVector) -> NodeVector:
         """The impulse of walls, planes and contacts, without colliders, on each true node [kg m/s], shape (n, d).
@@ -261,7 +266,7 @@ class ConstrainedNodes(eqx.Module):
         """
         noise = jnp.sqrt(jnp.finfo(v.dtype).eps) * jnp.abs(v).max()
         pulling, entering = [], []
-        for contact, active in zip(self.free.contacts, self.active, strict=True):
+        for contact, active in zip(self.unheld.contacts, self.active, strict=True):
             gap, impulse = contact.rounding(self, noise)
             pulls = contact.normal_impulse(self, residual) < -impulse
             blocked = contact.blocked(self, v, noise)
@@ -271,7 +276,7 @@ class ConstrainedNodes(eqx.Module):
 
     def count_violations(self, v: NodeVector, residual: NodeVector) -> Int[Array, ""]:
         """How many places pull or are entered."""
-        return _count(self.free, *self.violations(v, residual))
+        return _count(self.unheld, *self.violations(v, residual))
 
     def friction(self, v: NodeVector, residual: NodeVector) -> tuple[NodeVector, NodeVector | None]:
         """The velocity after Coulomb friction, one contact after the other, and the impulse of colliders' friction
@@ -282,15 +287,15 @@ class ConstrainedNodes(eqx.Module):
             residual: the impulse that is missing at each node [kg m/s], shape (n, d).
         """
         impulse = None
-        for contact, active in zip(self.free.contacts, self.active, strict=True):
+        for contact, active in zip(self.unheld.contacts, self.active, strict=True):
             change = contact.friction(self, active, v, residual)
             v = v + change
             if contact.of_collider:
-                impulse = self.free.mass[:, None] * self.images.unfold(change)
+                impulse = self.unheld.mass[:, None] * self.images.unfold(change)
         return self.images.unfold(v), impulse
 
 
-def constrain(nodes: AbstractNodes, active: ActiveSet) -> ConstrainedNodes:
+def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
     """The nodes with an active set held.
 
     Args:

@@ -41,7 +41,7 @@ class PlaneContact(AbstractContact):
         """The momentum with which each column leaves the plane [kg m/s]: its weights times what its velocity lacks of
         the mirror's."""
         lacking = (v - self.image.vector(v))[:, self.image.axis]
-        return self._tied(held, self.inward * self.image.column(self._weight(held.free.mass) * lacking))
+        return self._tied(held, self.inward * self.image.column(self._weight(held.unheld.mass) * lacking))
 
     def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> NodeScalar:
         """The normal impulse of each column [kg m/s]."""
@@ -49,7 +49,7 @@ class PlaneContact(AbstractContact):
 
     def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
         """The rounding of a column's momentum [kg m/s], shape (n,), for both."""
-        least = noise * self._tied(held, self.image.column(self._weight(held.free.mass)))
+        least = noise * self._tied(held, self.image.column(self._weight(held.unheld.mass)))
         return least, least
 
     def friction(self, held: ConstrainedNodes, active: Array, v: NodeVector, residual: NodeVector) -> NodeVector:
@@ -85,8 +85,8 @@ class PlaneContact(AbstractContact):
 
     def _tied(self, held: ConstrainedNodes, columns: NodeScalar) -> NodeScalar:
         """A quantity of the columns, summed over columns that are each other's image in other planes, shape (n,)."""
-        contacts = (image for c in held.free.contacts if (image := c.mirror_image) is not None)
-        for image in (*contacts, *held.free.mirror.images):
+        contacts = (image for c in held.unheld.contacts if (image := c.mirror_image) is not None)
+        for image in (*contacts, *held.unheld.mirror.images):
             if image.axis != self.image.axis:
                 columns = image.scalar(Mirror((image,)).fold_scalar(columns))
         return columns

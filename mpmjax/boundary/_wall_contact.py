@@ -33,7 +33,7 @@ class WallContact(AbstractContact):
 
     def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
         """The rounding of a velocity [m/s], and of a node's momentum [kg m/s], shape (n,)."""
-        return noise, noise * held.free.mass
+        return noise, noise * held.unheld.mass
 
     def friction(self, held: ConstrainedNodes, active: Array, v: NodeVector, residual: NodeVector) -> NodeVector:
         impulse = jnp.maximum(self.normal_impulse(held, residual), 0)
@@ -45,7 +45,7 @@ class WallContact(AbstractContact):
 
     def blocked(self, held: ConstrainedNodes, v: NodeVector, noise: Array) -> Bool[Array, "n"] | None:
         """Nodes that a collider with the same normal drives off the wall, but cannot while the wall holds them."""
-        colliders, part = held.free.conditions.colliders, held.nodes.free_normal
+        colliders, part = held.unheld.conditions.colliders, held.nodes.free_normal
         if colliders is None or part is None:
             return None
         driven = (part.direction == 0).all(axis=1) & (
@@ -78,5 +78,5 @@ def friction_across(held: ConstrainedNodes, axis: int, limit: NodeScalar, v: Nod
     square = (slip**2).sum(axis=1)
     speed = jnp.sqrt(jnp.where(square == 0, 1, square))
     share = jnp.minimum(limit / jnp.where(mass == 0, 1, mass) / speed, 1)
-    free = tangent & ~held.free.conditions.fixed
+    free = tangent & ~held.unheld.conditions.fixed
     return -jnp.where(free & (square > 0)[:, None], share[:, None] * slip, 0)

@@ -49,7 +49,7 @@ class AbstractBox(AbstractBoundary):
     def passed(
         self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
     ) -> Bool[Array, "p"]:
-        """Which particles passed a wall: the deepest place is where a stencil has free nodes no more."""
+        """Which particles passed a wall: those deeper than the place beyond which no node of their stencil is free."""
         del t, dt
 
         def through(wall: Array, start: Array, end: Array) -> Array:

@@ -118,7 +118,10 @@ def require_tolerance(name: str, value: Any) -> None:
     """Check that a relative tolerance is positive; warn of one that any guess meets."""
     require_positive(name, value)
     if not is_traced(value) and np.any(np.asarray(value) >= 1):
-        warn(f"{name} is {shortened(str(value))}: at 1 or more nothing is solved, zero meets it. Take 1e-2 or less.")
+        warn(
+            f"{name} is {shortened(str(value))}: at 1 or more the zero vector already meets it, so nothing is solved. "
+            "Take 1e-2 or less."
+        )
 
 
 def require_finite(name: str, value: Any) -> None:

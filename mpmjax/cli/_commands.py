@@ -149,7 +149,7 @@ def _summary(simulation: Simulation, run: Run, taken: int, seconds: float) -> st
     lines = [
         ("particles", f"{p}"),
         ("steps", f"{steps} of {float(run.dt):.4g} s with {type(run.method).__name__}"),
-        ("wall time", f"{seconds:.3g} s (compilation included), {taken * p / seconds:.3g} particle-steps per second"),
+        ("wall time", f"{seconds:.3g} s, {taken * p / seconds:.3g} particle-steps per second, both with compilation"),
     ]
     if int(run.statistics.iterations) > 0:
         lines.append(
@@ -182,7 +182,7 @@ def _summary(simulation: Simulation, run: Run, taken: int, seconds: float) -> st
         a, b = float(getattr(before, name)), float(getattr(after, name))
         lines.append((f"{name} energy", f"{a + 0.0:.6g} J to {b + 0.0:.6g} J, change {b - a:+.3g} J"))
     lost = (float(grid_mass(run.scene, run.final)) - mass) / mass
-    lines.append(("mass", f"{mass:.6g} kg; on the grid {lost:+.1e} of it"))
+    lines.append(("mass", f"{mass:.6g} kg; relative error of the grid's mass {lost:+.1e}"))
     return "\n".join(f"{name:<18} {text}" for name, text in lines)
 
 

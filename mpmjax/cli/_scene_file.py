@@ -273,7 +273,7 @@ def _warn_of_overlaps(regions: list[AbstractRegion], placed: list[np.ndarray], s
 
 
 def _check_place(region: AbstractRegion, grid: Grid) -> None:
-    """A region larger than the window, or beside it, is not worth filling to find that its particles are outside."""
+    """Refuse a region larger than the window or beside it, before it is filled."""
     lower, upper = region.bounds()
     if len(lower) != grid.dim:
         return  # as `fill` says

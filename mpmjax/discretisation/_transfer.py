@@ -1,7 +1,7 @@
 """Transfers between particles and grid: PIC, FLIP and APIC."""
 
 from abc import abstractmethod
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,6 +21,19 @@ class Gathered(eqx.Module):
     """Σ_i v_i g_ipᵀ [1/s], shape (d, d, p), by the scene's gradient operator."""
     affine: Matrix | None
     """Σ_i v_i g_ipᵀ [1/s], shape (d, d, p), by moving least squares; None unless the transfer is `affine`."""
+
+
+class ParticleMotion(NamedTuple):
+    """What G2P gives the particles."""
+
+    carrier: Float[Array, "d p"]
+    """The velocity with which they move, Σ_i w_ip v̄_i [m/s], shape (d, p)."""
+    velocity: Float[Array, "d p"]
+    """Their new velocity [m/s], shape (d, p)."""
+    affine: Matrix | None
+    """Their new C [1/s], shape (d, d, p); None if they keep none."""
+    gradient: Matrix
+    """The velocity gradient that deforms them, Σ_i v̄_i g_ipᵀ [1/s], shape (d, d, p)."""
 
 
 class AbstractTransfer(eqx.Module):
@@ -154,14 +167,16 @@ def p2g(
     Returns:
         mass m_i [kg], shape (n,), and momentum m_i v_i [kg m/s], shape (n, d).
     """
-    arms = [] if impulse is None else [impulse]
+    gradient_terms = [] if impulse is None else [impulse]
     if C is None:
-        along = stencil
+        used = stencil
     else:  # w (x_i − x_p) = D g, with g the moving-least-squares gradient
-        along = stencil.least_squares
-        arms.append(mass * C * stencil.moment)
-    gradients = jnp.pad(jnp.swapaxes(sum(arms), 0, 1), ((0, 0), (1, 0), (0, 0))) if arms else None
-    nodes = scatter(along, jnp.concatenate([mass[None], mass * v]), gradients, size)
+        used = stencil.least_squares
+        gradient_terms.append(mass * C * stencil.moment)
+    gradients = None
+    if gradient_terms:
+        gradients = jnp.pad(jnp.swapaxes(sum(gradient_terms), 0, 1), ((0, 0), (1, 0), (0, 0)))
+    nodes = scatter(used, jnp.concatenate([mass[None], mass * v]), gradients, size)
     return nodes[:, 0], nodes[:, 1:]
 
 
@@ -174,8 +189,8 @@ def g2p(
     mean: NodeVector | None = None,
     *,
     C: Matrix | None = None,
-    kept: bool = False,
-) -> tuple[Float[Array, "d p"], Float[Array, "d p"], Matrix | None, Matrix]:
+    keep_gradient: bool = False,
+) -> ParticleMotion:
     """Grid to particles.
 
     Args:
@@ -186,12 +201,7 @@ def g2p(
         after: v_i^{n+1} [m/s], shape (n, d).
         mean: the velocity v̄_i with which positions and deformation move [m/s], shape (n, d). Default: v_i^{n+1}.
         C: the particles' affine velocity before the step [1/s], shape (d, d, p), if they have one.
-        kept: whether transfers that are not affine return a C too, Σ_i v_i^{n+1} g_ipᵀ.
-
-    Returns:
-        the velocity with which particles move, Σ_i w_ip v̄_i [m/s], shape (d, p); their new velocity [m/s], shape
-        (d, p); their new C [1/s], shape (d, d, p), or None; the velocity gradient that deforms them, Σ_i v̄_i g_ipᵀ
-        [1/s], shape (d, d, p).
+        keep_gradient: whether transfers that are not affine return a C too, Σ_i v_i^{n+1} g_ipᵀ.
     """
     change = None
     if transfer.needs_change:
@@ -205,17 +215,15 @@ def g2p(
     if transfer.affine and stencil.mls_weight_derivatives is None:
         affine = [*gradients]
     elif transfer.affine:
-        kept_fields = [field for field in (after, change) if field is not None]
-        found = _split_gradients(
-            gather(stencil.least_squares, jnp.concatenate(kept_fields, axis=1))[1], len(kept_fields)
-        )
+        ends = [field for field in (after, change) if field is not None]
+        found = _split_gradients(gather(stencil.least_squares, jnp.concatenate(ends, axis=1))[1], len(ends))
         affine[0] = found[0]
         if change is not None:
             affine[-1] = found[-1]
     seen = [Gathered(*parts) for parts in zip(values, gradients, affine, strict=True)]
     new, carrier, changed = seen[0], seen[0 if mean is None else 1], None if change is None else seen[-1]
-    C = transfer.affine_velocity(C, new, changed) if transfer.affine else new.gradient if kept else None
-    return carrier.value, transfer.velocity(v, new, changed), C, carrier.gradient
+    C = transfer.affine_velocity(C, new, changed) if transfer.affine else new.gradient if keep_gradient else None
+    return ParticleMotion(carrier.value, transfer.velocity(v, new, changed), C, carrier.gradient)
 
 
 def _split_gradients(gradients: Float[Array, "d c p"], fields: int) -> list[Matrix]:

@@ -279,8 +279,8 @@ class Force(Series):
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
         super().check(scene, particles, t1)
-        known = f"Force {self.name!r} is of collider {self.collider}, from 0, but the scene has {scene.colliders}."
-        require(0 <= self.collider < scene.colliders, known)
+        known = f"Force {self.name!r} is of collider {self.collider}, from 0, but the scene has {scene.collider_count}."
+        require(0 <= self.collider < scene.collider_count, known)
 
     def predict(self, seen: Any, run: Run) -> Array:
         del seen

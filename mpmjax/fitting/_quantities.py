@@ -155,12 +155,12 @@ class StressStretch(eqx.Module):
 
     def __call__(self, scene: Scene, particles: Particles) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Stretch [-] and nominal stress [Pa]."""
-        (body,) = scene.material_points(particles)
-        F, a = body.deformation, self.axis
+        (points,) = scene.material_points(particles)
+        F, a = points.deformation, self.axis
         require(
-            F.ndim == 3, f"The curve of a tension test needs a law of F, got {type(body.law).__name__}, of J alone."
+            F.ndim == 3, f"The curve of a tension test needs a law of F, got {type(points.law).__name__}, of J alone."
         )
-        P = body.law.stress(F)
+        P = points.law.stress(F)
         return (self.weight * F[a, a]).sum(), (self.weight * P[a, a]).sum()
 
 

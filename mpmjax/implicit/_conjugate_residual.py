@@ -23,11 +23,11 @@ _REACH = 64.0  # the recurrence's own residual means nothing below so many units
 
 class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
     """The conjugate residual method for a symmetric operator A, definite or not (E. Stiefel, Comment. Math. Helv. 29
-    (1955) 157, doi 10.1007/BF02564277; the recurrences are those of the derivation, section 2.1).
+    (1955) 157, doi 10.1007/BF02564277; the recurrence is derivation, eq. 19).
 
-    It works on E = W⁻¹A in the inner product ⟨a, b⟩ = aᵀ W b, in which E is self-adjoint. With W the mass this is the
-    algorithm of the derivation, whose E = I + βΔt²M⁻¹H is not symmetric in the plain inner product. The norm ‖r‖ of the
-    residual r = W⁻¹(b − A x) never grows.
+    It works on E = W⁻¹A in the inner product ⟨a, b⟩ = aᵀ W b, in which E is self-adjoint (derivation, eq. 18). With W
+    the mass, E is the matrix I + βΔt²M⁻¹H of eq. 6, which is not symmetric in the plain inner product. The norm ‖r‖ of
+    the residual r = W⁻¹(b − A x) never grows.
 
     It stops when ‖r‖ ≤ rtol ‖W⁻¹b‖ for the *true* residual. If rounding prevents that, the recurrence is restarted with
     the true residual as right-hand side until a restart no longer halves it. The result is then accepted if the last
@@ -54,8 +54,8 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
 
     Args:
         rtol: relative tolerance. Default: 1e-8 in float64, 1e-5 in float32.
-        increment_rtol: stop also when an increment is small, ‖α_k p_k‖² ≤ increment_rtol² ‖x‖² (the test of the
-            derivation, made relative). Default: not used. It says nothing of the residual.
+        increment_rtol: stop also when an increment is small, ‖α_k p_k‖² ≤ increment_rtol² ‖x‖² (the
+            alternative named after eq. 20 of the derivation). Default: not used. It says nothing of the residual.
         max_steps: largest number of steps of the recurrence.
     """
 
@@ -83,9 +83,9 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
 
     # The recurrence is the derivation's, with the application of E moved to the head of the loop, which saves the last
     # one. Around it is a loop that this method's textbook form lacks: the recurrence's residual drifts from the true
-    # one (by ε‖E‖‖x‖ a step), so when the recurrence is content, or at the end of its reach, the true residual is
-    # computed, and if that is not small enough the recurrence starts anew from it. Three sums over the vector are all
-    # that an iteration takes: ‖s‖ follows from ‖q‖, the q being orthogonal.
+    # one (by ε‖E‖‖x‖ a step). So when the recurrence's residual meets the tolerance, or is too small to be trusted, the
+    # true residual is computed, and if that is not small enough the recurrence starts anew from it. Three sums over the
+    # vector are all that an iteration takes: ‖s‖ follows from ‖q‖, the q being orthogonal.
     def compute(
         self, state: lx.AbstractLinearOperator, vector: Any, options: dict[str, Any]
     ) -> tuple[Any, lx.RESULTS, dict[str, Any]]:
@@ -211,7 +211,8 @@ def _goes_on(system: _System, c: _Recurrence) -> Bool[Array, ""]:
 
 
 def _restart(system: _System, c: _Recurrence) -> _Recurrence:
-    """Run the recurrence from the true residual, until it meets the tolerance or reaches the rounding of its start."""
+    """Run the recurrence from the true residual, until its own residual meets the tolerance or is too small to be
+    trusted."""
     r = system.b - system.apply(c.x)
     rr = system.dot(r, r)
     c = replace(

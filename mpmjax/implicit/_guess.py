@@ -16,7 +16,7 @@ class Guess(enum.Enum):
     GRID_VELOCITY = "grid velocity"
     """v^n, the velocity of the nodes before the step. The default."""
     EXPLICIT = "explicit"
-    """v*, as in the derivation."""
+    """v*, the explicitly updated velocity (derivation, eq. 4)."""
     ZERO = "zero"
     """Zero velocity."""
 

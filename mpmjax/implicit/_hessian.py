@@ -5,7 +5,6 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 
 from mpmjax._types import Deformation, NodeVector
 from mpmjax.checks import require_fields
@@ -26,9 +25,9 @@ class AbstractHessian(eqx.Module):
     def at(self, potential: ElasticPotential, u: NodeVector) -> AbstractHessianAction:
         """The Hessian of the potential at a nodal displacement u [m], shape (n, d)."""
 
-    def at_current(self, potential: ElasticPotential, like: NodeVector) -> AbstractHessianAction:
-        """The Hessian at u = 0; `like` is any node vector."""
-        return self.at(potential, jnp.zeros_like(like))
+    def at_step_start(self, potential: ElasticPotential) -> AbstractHessianAction:
+        """The Hessian where no node has moved, u = 0."""
+        return self.at(potential, potential.no_displacement())
 
     @abc.abstractmethod
     def exact(self) -> "AbstractHessian":
@@ -55,8 +54,7 @@ class AnalyticHessian(AbstractHessian):
     def at(self, potential: ElasticPotential, u: NodeVector) -> AbstractHessianAction:
         return self._action(potential, potential.deformation(u))
 
-    def at_current(self, potential: ElasticPotential, like: NodeVector) -> AbstractHessianAction:
-        del like
+    def at_step_start(self, potential: ElasticPotential) -> AbstractHessianAction:
         return self._action(potential, potential.current_deformation())  # without the gather
 
     def exact(self) -> "AnalyticHessian":
@@ -66,7 +64,7 @@ class AnalyticHessian(AbstractHessian):
         def tangent(law: AbstractElastic, F: Deformation) -> AbstractTangent:
             return law.projected_tangent(F) if self.projected else law.tangent(F)
 
-        laws = (c.law for c in potential.material_points)
+        laws = (points.law for points in potential.material_points)
         tangents = tuple(tangent(law, own) for law, own in zip(laws, F, strict=True))
         return TangentAction(potential, tangents, self.projected)
 
@@ -94,7 +92,7 @@ class _JvpAction(AbstractHessianAction):
         return _jvp_action(self.potential, self.u, du)
 
     def precomputed(self) -> ParticleStiffness:
-        laws = (c.law for c in self.potential.material_points)
+        laws = (points.law for points in self.potential.material_points)
         F = self.potential.deformation(self.u)
         tangents = tuple(_jvp_tangent(law, own) for law, own in zip(laws, F, strict=True))
         return particle_stiffness(self.potential, tangents, positive_semidefinite=False)

@@ -83,7 +83,7 @@ class TangentAction(AbstractHessianAction):
         return self.positive_semidefinite
 
     def __call__(self, du: NodeVector) -> NodeVector:
-        """Σ_p V0_p A_p h_ip, with A_p = ∂²Ψ/∂F∂F : δF_p (derivation, eqs. 7 and 8)."""
+        """Σ_p V0_p δP_p h_ip, with δP_p = ∂²Ψ/∂F∂F : δF_p (derivation, eqs. 7 and 8)."""
         return _tangent_action(self.potential, self.tangents, du)
 
     def precomputed(self) -> ParticleStiffness:
@@ -105,8 +105,8 @@ def particle_stiffness(
 def _tangent_action(
     potential: ElasticPotential, tangents: tuple[Callable[[Deformation], Deformation], ...], du: NodeVector
 ) -> NodeVector:
-    changes = (tangent(dF) for tangent, dF in zip(tangents, potential.strain(du), strict=True))
-    return potential.divergence(tuple(changes), du)
+    changes = (tangent(dF) for tangent, dF in zip(tangents, potential.deformation_change(du), strict=True))
+    return potential.nodal_sum(potential.flux(tuple(changes)))
 
 
 class _DampedAction(AbstractHessianAction):
@@ -119,7 +119,7 @@ class _DampedAction(AbstractHessianAction):
 
     def __call__(self, du: NodeVector) -> NodeVector:
         """(H + r D) δu."""
-        return self.elastic(du) + self.rate * self.potential.damping_force(du)
+        return self.elastic(du) + self.rate * self.potential.viscous_resistance(du)
 
     def precomputed(self) -> ParticleStiffness:
         stiffness = self.elastic.precomputed()
@@ -131,6 +131,6 @@ class _DampedAction(AbstractHessianAction):
 def damped(elastic: AbstractHessianAction, potential: ElasticPotential, rate: Scalar) -> AbstractHessianAction:
     """H + r D, with D [N s/m] the positive semi-definite matrix of the viscous force; H without viscosity.
 
-    A stage of duration c has r = 1/c, which gives M + c D + c² H.
+    A stage of length Δt_s has r = 1/Δt_s, which gives M + Δt_s D + Δt_s² H.
     """
     return _DampedAction(elastic, potential, rate) if potential.viscous else elastic

@@ -38,5 +38,5 @@ def backtrack(
         decreased = merit(size) <= start + _SUFFICIENT_DECREASE * size * slope + slack
         return ~decreased & (halvings < MOST_HALVINGS)
 
-    whole, none = jnp.ones((), start.dtype), jnp.asarray(0, dtype=jnp.int32)
-    return jax.lax.while_loop(refused, lambda trial: (trial[0] / 2, trial[1] + 1), (whole, none))
+    whole, zero_count = jnp.ones((), start.dtype), jnp.asarray(0, dtype=jnp.int32)
+    return jax.lax.while_loop(refused, lambda trial: (trial[0] / 2, trial[1] + 1), (whole, zero_count))

@@ -158,7 +158,7 @@ def _initialised(solver: lx.AbstractLinearSolver, operator: ScaledOperator, opti
                 "way out, as its derivatives are those of the true Hessian"
             )
         raise ValueError(
-            f"{_name(solver)} refuses the matrix M + cH of an implicit step: {str(error).rstrip('.')}. The matrix is "
+            f"{_name(solver)} refuses the matrix M + χH of an implicit step: {str(error).rstrip('.')}. The matrix is "
             f"symmetric and {known}."
         ) from error
 

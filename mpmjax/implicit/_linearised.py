@@ -41,7 +41,7 @@ class Linearised(AbstractSolution):
     ) -> NodeVector:
         """Σ q f(0) − H Σ q u [N]."""
         mean = reduce(jnp.add, (q * u for q, u in stages))
-        return sum(q for q, _ in stages) * force - hessian.at_current(potential, mean)(mean)
+        return sum(q for q, _ in stages) * force - hessian.at_step_start(potential)(mean)
 
     def __call__(self, problem: LinearProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         """The solution [m/s], shape (n, d), and the report of the solve.
@@ -51,16 +51,16 @@ class Linearised(AbstractSolution):
             guess: where the solve starts [m/s], shape (n, d).
         """
         operator = problem.operator(guess).precomputed()
-        split = problem.projection.combine
-        lift = split(0, problem.prescribed)
-        rhs = split(problem.rhs - operator.unconstrained(lift), 0)
+        combine = problem.projection.combine
+        lift = combine(0, problem.prescribed)
+        rhs = combine(problem.rhs - operator.unconstrained(lift), 0)
         inner = problem.preconditioner.inner_product(operator)
-        solution = solve_linear(self.solver, operator, rhs, inner, split(guess, 0))
-        none = jnp.asarray(0, dtype=jnp.int32)
+        solution = solve_linear(self.solver, operator, rhs, inner, combine(guess, 0))
+        zero_count = jnp.asarray(0, dtype=jnp.int32)
         info = SolveInfo(
             iterations=solution.iterations,
-            newton=none,
-            line_search=none,
+            newton=zero_count,
+            line_search=zero_count,
             residual=solution.residual,
             converged=solution.converged,
             nearly_converged=solution.nearly_converged,

@@ -40,12 +40,13 @@ class Newton(AbstractSolution):
     linearised at zero displacement, without the contribution of prescribed velocities.
 
     Termination by rounding: b vanishes where forces balance, and in single precision it can be smaller than the
-    rounding of the residual, 4 ε (‖W (|v| + dx/c)‖ + ‖M ṽ‖) with W the diagonal of the operator. A residual below that
-    rounding ends the iteration too, if one of two tests shows that the solution is good:
+    rounding of the residual, 4 ε (‖W (|v| + dx/Δt_s)‖ + ‖M a‖) with W the diagonal of the operator and a of the stage
+    (derivation, eq. 22). A residual below that rounding ends the iteration too, if one of two tests shows that the
+    solution is good:
 
     - the last Newton step was taken whole, and changed v by at most a thousandth, or the strain by at most √ε, the
       energy of which is the rounding of the potential;
-    - M + cH is not less than M, and the error ‖v − v*‖ ≤ ‖residual‖ is at most a thousandth of ‖v‖, in the norms of the
+    - M + χH is not less than M, and the error ‖v − v*‖ ≤ ‖residual‖ is at most a thousandth of ‖v‖, in the norms of the
       mass and of its inverse.
 
     A guess is never accepted because of rounding alone.
@@ -108,7 +109,7 @@ class _Setting(eqx.Module):
     scale: Float[Array, ""]
     """‖b‖, with b the right-hand side of the system linearised at zero displacement."""
     inertia: Float[Array, ""]
-    """‖M ṽ‖."""
+    """‖M a‖, with a of the stage."""
     undisplaced: NodeVector
     """The velocity at which nothing is displaced [m/s]."""
     startable: Bool[Array, ""]
@@ -153,27 +154,37 @@ class _Direction(eqx.Module):
 
 def _setting(problem: NewtonProblem, guess: NodeVector, rtol: Scalar) -> tuple[_Setting, _NewtonState]:
     """The constants and the initial state of an iteration."""
-    split, free = problem.projection.combine, problem.projection.free
-    rest = split(0, problem.prescribed)
+    combine, free = problem.projection.combine, problem.projection.free
+    rest = combine(0, problem.prescribed)
     start = problem.apply_dirichlet(guess)
     energies = problem.incremental_potential(start), problem.incremental_potential(rest)
     start = jnp.where(jnp.isfinite(energies[0]) & ~(energies[1] < energies[0]), start, rest)
     undisplaced = problem.undisplaced_velocity()
     linearised = problem.momentum_residual(undisplaced)
-    linearised = split(linearised + problem.operator(undisplaced).unconstrained(rest - undisplaced), 0)
+    linearised = combine(linearised + problem.operator(undisplaced).unconstrained(rest - undisplaced), 0)
     mass = jnp.where(free, problem.mass[:, None], 1)
     setting = _Setting(
         problem=problem,
         rtol=rtol,
         mass=mass,
         scale=_norm(linearised, mass),
-        inertia=_norm(split(problem.mass[:, None] * problem.inertial, 0), mass),
+        inertia=_norm(combine(problem.mass[:, None] * problem.inertial, 0), mass),
         undisplaced=undisplaced,
         startable=jnp.isfinite(energies[0]) | jnp.isfinite(energies[1]),
     )
     first = jnp.where(setting.startable, setting.residual(start), linearised)
-    zero, none, no = jnp.zeros((), guess.dtype), jnp.asarray(0, dtype=jnp.int32), jnp.asarray(False)
-    return setting, _NewtonState(start, first, zero, no, none, none, none, no, no)
+    zero_count, no = jnp.asarray(0, dtype=jnp.int32), jnp.asarray(False)
+    return setting, _NewtonState(
+        v=start,
+        r=first,
+        rounding=jnp.zeros((), guess.dtype),
+        settled=no,
+        iterations=zero_count,
+        newton=zero_count,
+        halvings=zero_count,
+        stuck=no,
+        indefinite=no,
+    )
 
 
 def _norm(r: NodeVector, mass: NodeVector) -> Float[Array, ""]:

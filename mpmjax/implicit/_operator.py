@@ -1,4 +1,4 @@
-"""The matrix of implicit solves, M + cH on free components, as a lineax operator."""
+"""The matrix of implicit solves, M + χH on free components, as a lineax operator."""
 
 import abc
 from typing import Any
@@ -41,8 +41,8 @@ class AbstractSymmetricOperator(lx.AbstractLinearOperator):
 
 
 class ImplicitOperator(AbstractSymmetricOperator):
-    """Q (M + c H) Q + I − Q [kg], with c = βΔt² for the semi-implicit step (derivation, eq. 6 times m_i) and the square
-    of its duration for a stage.
+    """Q (M + χ H) Q + I − Q [kg] (derivation, eq. 21), with χ = βΔt² for the semi-implicit step and Δt_s² for a stage
+    of length Δt_s.
 
     Q projects on free components (see `Projection`). Rows of prescribed components and of empty nodes are those of the
     identity; along a held normal the operator is the mass.
@@ -51,7 +51,7 @@ class ImplicitOperator(AbstractSymmetricOperator):
     mass: NodeScalar
     """Nodal masses m_i [kg], shape (n,)."""
     factor: Scalar
-    """c [s²]."""
+    """χ [s²]."""
     hessian: AbstractHessianAction
     """H [N/m]."""
     projection: Projection
@@ -60,12 +60,12 @@ class ImplicitOperator(AbstractSymmetricOperator):
         return self.hessian.is_positive_semidefinite()
 
     def unconstrained(self, v: NodeVector) -> NodeVector:
-        """(M + c H) v."""
+        """(M + χ H) v."""
         return self.mass[:, None] * v + self.factor * self.hessian(v)
 
     def mv(self, vector: NodeVector) -> NodeVector:
-        split = self.projection.combine
-        return split(self.unconstrained(split(vector, 0)), self.projection.identity_rows(vector, self.mass))
+        combine = self.projection.combine
+        return combine(self.unconstrained(combine(vector, 0)), self.projection.identity_rows(vector, self.mass))
 
     def precomputed(self) -> "ImplicitOperator":
         """The same operator, with H as one matrix for each particle, computed once for many applications."""
@@ -76,7 +76,7 @@ class ImplicitOperator(AbstractSymmetricOperator):
         return jnp.broadcast_to(self.mass[:, None], self.projection.free.shape)
 
     def diagonal(self) -> NodeVector:
-        """m_i + c H_ii [kg], shape (n, d), without negative parts of H (see `ParticleStiffness.diagonal`)."""
+        """m_i + χ H_ii [kg], shape (n, d), without negative parts of H (see `ParticleStiffness.diagonal`)."""
         mass = self.nodal_mass()
         return mass + self.factor * self.hessian.precomputed().diagonal(mass)
 

@@ -10,9 +10,9 @@ from mpmjax.implicit._operator import ImplicitOperator
 
 
 class AbstractPreconditioner(eqx.Module):
-    """A symmetric positive definite approximation W of M + cH that is easily inverted.
+    """A symmetric positive definite approximation W of M + χH that is easily inverted.
 
-    The number of iterations grows with the spread of the eigenvalues of W⁻¹(M + cH). The tolerance of a solve is that
+    The number of iterations grows with the spread of the eigenvalues of W⁻¹(M + χH). The tolerance of a solve is that
     of its residual in the norm of W⁻¹. Subclass it for a preconditioner of your own.
     """
 
@@ -26,7 +26,7 @@ class AbstractPreconditioner(eqx.Module):
 
 
 class DiagonalPreconditioner(AbstractPreconditioner):
-    """M + c diag(H) without negative parts of H. The default.
+    """M + χ diag(H) without negative parts of H. The default.
 
     The saving depends on the scene. In bodies of halves, layers and inclusions at contrasts of 10 to 10 000, in two and
     three dimensions, it took between an eighth and three fifths of the iterations of `MassPreconditioner` at a hundred
@@ -39,7 +39,7 @@ class DiagonalPreconditioner(AbstractPreconditioner):
 
 
 class MassPreconditioner(AbstractPreconditioner):
-    """M. The solve is then the algorithm of the derivation, section 2.1."""
+    """M: W⁻¹A is then the matrix of eq. 6 of the derivation."""
 
     advice: ClassVar[str | None] = "take preconditioner=DiagonalPreconditioner(), which needs fewer iterations"
 

@@ -40,12 +40,12 @@ class AbstractProblem(eqx.Module):
 
 
 class LinearProblem(AbstractProblem):
-    """(M + c H) v = b (derivation, eq. 6 times m_i)."""
+    """(M + χ H) v = b (derivation, eq. 17)."""
 
     mass: NodeScalar
     """Nodal masses m_i [kg], shape (n,)."""
     factor: Scalar
-    """c [s²]."""
+    """χ [s²]."""
     hessian: AbstractHessianAction
     """H [N/m]."""
     rhs: NodeVector
@@ -63,19 +63,19 @@ class LinearProblem(AbstractProblem):
 
 
 class NewtonProblem(AbstractProblem):
-    """M (v − ṽ) − c f(u + c v) = 0, a stage of duration c that starts at the displacement u. Backward Euler
-    (derivation, eq. 2) has c = Δt, u = 0, ṽ = v^n + Δt g.
+    """M (v − a) − Δt_s f(u + Δt_s v) = 0 (derivation, eq. 22), a stage of length Δt_s that starts at the displacement
+    u. Backward Euler has Δt_s = Δt, u = 0, a = v^n + Δt g.
 
-    The left side is the gradient of the incremental potential E(v) = ½ ‖v − ṽ‖²_M + Φ(u + c v), which the line search
-    decreases in every step. Viscosity adds c D v to the equation and ½ c v·D v to the potential.
+    The left side is the gradient of the incremental potential 𝓔(v) = ½ ‖v − a‖²_M + Φ(u + Δt_s v) (eq. 23), which the
+    line search decreases in every step. Viscosity adds Δt_s D v to the equation and ½ Δt_s v·D v to the potential.
     """
 
     mass: NodeScalar
     """Nodal masses m_i [kg], shape (n,)."""
     inertial: NodeVector
-    """ṽ [m/s], the velocity without elastic and viscous forces."""
+    """a [m/s], the velocity of the stage without the force at its own end."""
     stage_dt: Float[Array, ""]
-    """c [s]."""
+    """Δt_s [s], the length of the stage."""
     initial_displacement: NodeVector | None
     """u [m]; None for zero."""
     spacing: Float[Array, ""]
@@ -87,12 +87,12 @@ class NewtonProblem(AbstractProblem):
     preconditioner: AbstractPreconditioner = MassPreconditioner()
 
     def displacement(self, v: NodeVector) -> NodeVector:
-        """u + c v [m]."""
+        """u + Δt_s v [m]."""
         moved = self.stage_dt * v
         return moved if self.initial_displacement is None else self.initial_displacement + moved
 
     def undisplaced_velocity(self) -> NodeVector:
-        """The velocity at which nothing is displaced, −u/c [m/s]."""
+        """The velocity at which nothing is displaced, −u/Δt_s [m/s]."""
         if self.initial_displacement is None:
             return jnp.zeros_like(self.inertial)
         return -self.initial_displacement / self.stage_dt
@@ -105,18 +105,18 @@ class NewtonProblem(AbstractProblem):
         return self._operator(self.hessian, v)
 
     def _operator(self, hessian: AbstractHessian, v: NodeVector) -> ImplicitOperator:
-        """M + c D + c² H."""
+        """M + Δt_s D + Δt_s² H."""
         action = damped(hessian.at(self.potential, self.displacement(v)), self.potential, 1 / self.stage_dt)
         return ImplicitOperator(self.mass, self.stage_dt**2, action, self.projection)
 
     def momentum_residual(self, v: NodeVector) -> NodeVector:
         force = self.potential.force(self.displacement(v))
         if self.potential.viscous:
-            force = force - self.potential.damping_force(v)
+            force = force - self.potential.viscous_resistance(v)
         return self.mass[:, None] * (v - self.inertial) - self.stage_dt * force
 
     def unit_strain_velocity(self) -> Float[Array, ""]:
-        """The velocity dx/c [m/s] that strains a cell by one in the stage.
+        """The velocity dx/Δt_s [m/s] that strains a cell by one in the stage.
 
         Deformation gradients are of order one, and rounded to ε, at the smallest strains too. With w this velocity and
         A the diagonal of the operator, ε A w is the rounding of the momentum residual and ε A w² that of the potential.
@@ -124,7 +124,7 @@ class NewtonProblem(AbstractProblem):
         return self.spacing / self.stage_dt
 
     def incremental_potential(self, v: NodeVector) -> Float[Array, ""]:
-        """E(v) [J] up to a constant, that of held components; NaN if a law does not admit the deformation."""
+        """𝓔(v) [J] up to a constant, that of held components; NaN if a law does not admit the deformation."""
         free = self.projection.free
         inertia = 0.5 * jnp.where(free, self.mass[:, None] * (v - self.inertial) ** 2, 0).sum()
         if self.potential.viscous:

@@ -16,14 +16,15 @@ from mpmjax.implicit._solve_info import SolveInfo
 
 
 class StageEquation(eqx.Module):
-    """M (v − a) = c (f(u + c v) − D v), f(u) the elastic force at nodal displacements u and D v that of viscosity."""
+    """M (v − a) = Δt_s (f(u + Δt_s v) − D v), with f(u) the elastic force at nodal displacements u and −D v the viscous
+    force (derivation, eq. 22 and section 10)."""
 
     mass: NodeScalar
     """Nodal masses m_i [kg], shape (n,)."""
     inertial: NodeVector
-    """a [m/s], shape (n, d)."""
+    """a [m/s], the velocity of the stage without the force at its own end, shape (n, d)."""
     stage_dt: Float[Array, ""]
-    """c [s]."""
+    """Δt_s [s], the length of the stage."""
     initial_displacement: NodeVector | None
     """u [m], shape (n, d); None for zero."""
     force: NodeVector
@@ -42,7 +43,7 @@ class StageEquation(eqx.Module):
 
     def linear(self) -> LinearProblem:
         """The problem with f(u) = f(0) − H u."""
-        action = self.hessian.at_current(self.potential, self.inertial)
+        action = self.hessian.at_step_start(self.potential)
         u = self.initial_displacement
         force = self.force if u is None else self.force - action(u)
         return LinearProblem(

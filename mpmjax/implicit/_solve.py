@@ -1,7 +1,7 @@
 """Solutions of nodal problems, with one derivative rule for all of them.
 
-The derivative of the solution v of residual(v) = 0 is that of the implicit function theorem, J δv = −δ(residual): one
-more solve with the same operator, in forward or reverse mode. Iterations are never differentiated.
+The derivative of the solution v of residual(v) = 0 is that of the implicit function theorem (derivation, eq. 30), and
+in reverse mode its transpose (eq. 31): one more solve with the same operator. Iterations are never differentiated.
 """
 
 from typing import Any
@@ -74,16 +74,16 @@ def _solve_jvp(primals: Any, tangents: Any) -> Any:
     inner = preconditioner.inner_product(known)
 
     def solve_symmetric(matvec: Any, b: tuple[NodeVector, Array]) -> tuple[NodeVector, Array]:
-        del matvec  # the same operator, slower
+        del matvec  # what JAX passes; `known`, the precomputed operator, is the same map and faster
         solution = solve_linear(adjoint, known, b[0], inner)
         solved, finite = solution.converged | solution.nearly_converged, jnp.isfinite(b[0]).all()
         residual = jnp.where(jnp.isfinite(solution.residual), solution.residual, jnp.inf)
         return jnp.where(solved, solution.value, jnp.nan), jnp.where(finite & ~solved, residual, 0)
 
-    split = problem.projection.combine
-    lift = split(0, -d_residual)
-    rhs = split(-d_residual - operator.unconstrained(lift), 0)
-    d_slot = rhs[:0].sum() + (0 if d_slot is None else d_slot)  # linear in tangents also where nobody listens
+    combine = problem.projection.combine
+    lift = combine(0, -d_residual)
+    rhs = combine(-d_residual - operator.unconstrained(lift), 0)
+    d_slot = rhs[:0].sum() + (0 if d_slot is None else d_slot)  # a zero that keeps d_slot linear in the tangents
 
     def matvec(x: tuple[NodeVector, Array]) -> tuple[NodeVector, Array]:
         y = operator.mv(x[0])

@@ -26,7 +26,7 @@ class SolveInfo(eqx.Module):
     nearly_converged: Bool[Array, "*f"]
     """Whether it is not, but within ten times the tolerance."""
     indefinite: Bool[Array, "*f"]
-    """Whether the solver met a direction of negative curvature. M + cH is then indefinite, and may be near singular."""
+    """Whether the solver met a direction of negative curvature. M + χH is then indefinite, and may be near singular."""
     report: Float[Array, "*f"]
     """Zero. Its tangent is the relative residual of the tangent solves that did not converge (see `Reporting`)."""
 
@@ -54,6 +54,14 @@ class SolveInfo(eqx.Module):
 
 def no_solve(dtype: Any) -> SolveInfo:
     """The report of an update without a solve."""
-    zero = jnp.asarray(0, dtype=jnp.int32)
-    no, none = jnp.asarray(False), jnp.asarray(0, dtype=dtype)
-    return SolveInfo(zero, zero, zero, none, converged=~no, nearly_converged=no, indefinite=no, report=none)
+    zero_count, zero, no = jnp.asarray(0, dtype=jnp.int32), jnp.asarray(0, dtype=dtype), jnp.asarray(False)
+    return SolveInfo(
+        iterations=zero_count,
+        newton=zero_count,
+        line_search=zero_count,
+        residual=zero,
+        converged=~no,
+        nearly_converged=no,
+        indefinite=no,
+        report=zero,
+    )

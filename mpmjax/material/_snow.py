@@ -24,9 +24,10 @@ class Snow(AbstractInelastic):
     """Snow (A. Stomakhin, C. Schroeder, L. Chai, J. Teran, A. Selle, ACM Trans. Graph. 32 (2013) 102,
     doi 10.1145/2461912.2461948).
 
-    Fixed corotated elasticity of F_E (eq. 1) whose moduli harden with plastic compression, E e^{ξ (1 − J_P)} (eq. 2).
-    The principal stretches of F_E stay within [1 − θ_c, 1 + θ_s]; what exceeds them goes into F_P (section 7), of which
-    only J_P has an effect (F = F_E F_P). In plane strain nothing yields normal to the plane, where the stretch is one.
+    Fixed corotated elasticity of F_E (the paper's eq. 1) whose moduli harden with plastic compression,
+    E e^{ξ (1 − J_P)} (its eq. 2). The principal stretches of F_E stay within [1 − θ_c, 1 + θ_s]; what exceeds them goes
+    into F_P (its section 7), of which only J_P has an effect (F = F_E F_P). In plane strain nothing yields normal to
+    the plane, where the stretch is one.
 
     *When it breaks*: it needs J > 0. Where hardening outruns yielding a return map creates energy: keep ξ J_P θ_c well
     below 2/d. The table's 0.25 is enough for packed snow; torn snow that is pressed again gains a little energy, but it

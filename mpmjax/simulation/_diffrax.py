@@ -17,7 +17,7 @@ from mpmjax.discretisation import Stencil, in_window
 from mpmjax.simulation._rollout_state import RolloutState
 from mpmjax.simulation._statistics import Fault, RunStatistics, no_steps, one_step
 from mpmjax.state import Particles, Scene, State, with_state
-from mpmjax.stepping import AbstractIntegrator, advance_compiled
+from mpmjax.stepping import AbstractIntegrator, step_compiled
 
 
 class Problem(eqx.Module):
@@ -50,7 +50,8 @@ def faulty_particles(problem: Problem, state: State) -> dict[Fault, Bool[Array, 
     finite = finite & jnp.concatenate([_finite((group.stored, group.history)) for group in particles.groups])
     anchor = scene.anchor(particles)
     outside = ~in_window(scene.kernel, scene.grid, scene.window(particles), anchor)
-    admitted = jnp.concatenate([c.law.is_admissible(c.deformation) for c in scene.material_points(particles)])
+    materials = scene.material_points(particles)
+    admitted = jnp.concatenate([points.law.is_admissible(points.deformation) for points in materials])
     return {Fault.NOT_FINITE: ~finite, Fault.OUTSIDE: finite & outside, Fault.INADMISSIBLE: finite & ~admitted}
 
 
@@ -137,7 +138,7 @@ class StepSolver(diffrax.AbstractSolver):
         statistics, _, report = solver_state
         t = (args.start + step_number(t0)) * args.dt
         method = args.method.reporting(args.slot)
-        particles, info = advance_compiled(args.scene, args.at(y0.particles), t, args.dt, method, args.stencil)
+        particles, info = step_compiled(args.scene, args.at(y0.particles), t, args.dt, method, args.stencil)
         report = report + info.solve.report
         y1 = y0.after(particles, info)
         arrays, rest = eqx.partition((args, y0.particles, y1.particles, t), eqx.is_array)

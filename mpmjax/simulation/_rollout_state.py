@@ -26,5 +26,5 @@ class RolloutState(eqx.Module):
 
 def initial_state(scene: Scene, particles: Particles) -> RolloutState:
     """The state in which a rollout of prepared particles begins."""
-    impulse = no_impulse(scene.colliders, particles.dim, particles.x.dtype) if scene.colliders else None
+    impulse = no_impulse(scene.collider_count, particles.dim, particles.x.dtype) if scene.collider_count else None
     return RolloutState(state_of(particles), impulse)

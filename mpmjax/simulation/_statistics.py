@@ -34,7 +34,7 @@ class RunStatistics(eqx.Module):
     steps: Int[Array, "*f"]
     """Steps taken."""
     iterations: Int[Array, "*f"]
-    """Conjugate-residual iterations."""
+    """Iterations of the linear solver."""
     most_iterations: Int[Array, "*f"]
     """Largest number of iterations in one step."""
     newton: Int[Array, "*f"]
@@ -48,7 +48,7 @@ class RunStatistics(eqx.Module):
     nearly_converged: Int[Array, "*f"]
     """Steps whose solve missed its tolerance, by less than ten times: the run is less accurate than was asked for."""
     indefinite: Int[Array, "*f"]
-    """Steps whose solve met negative curvature: compression has made M + cH indefinite, and near a singular one the
+    """Steps whose solve met negative curvature: compression has made M + χH indefinite, and near a singular one the
     motion is wrong however small the residual. `AnalyticHessian(projected=True)` or a smaller step avoids it."""
     sweeps: Int[Array, "*f"]
     """Solves for contact beyond one a step."""

@@ -28,7 +28,7 @@ class MaterialPoints(eqx.Module):
     viscosity: Viscosity | None
     """The viscosity beside the law; None without."""
 
-    def own(self, field: Array) -> Array:
+    def rows_of(self, field: Array) -> Array:
         """The part of an array over all particles (particle axis last) that belongs to this material."""
         return field if self.rows == (0, field.shape[-1]) else field[..., slice(*self.rows)]
 
@@ -38,8 +38,8 @@ class MaterialPoints(eqx.Module):
         return gradient if self.total else self.law.kinematics.change(gradient, self.deformation)
 
     def flux(self, P: Deformation, dim: int) -> Matrix:
-        """What the force is the sum of [J], shape (d, d, q), f_i = −Σ_p (V0 P Fᵀ) g_ip: the transpose of `change`. In
-        the total description V0 P; by P = dΨ/dJ it is V0 P J I."""
+        """The flux of a stress P [J], shape (d, d, q), V0 P Fᵀ, of which the force is the sum, f_i = −Σ_p (V0 P Fᵀ)
+        g_ip: the transpose of `change`. In the total description V0 P; by P = dΨ/dJ it is V0 P J I."""
         P = self.volume * P
         return P if self.total else self.law.kinematics.flux(P, self.deformation, dim)
 
@@ -47,9 +47,10 @@ class MaterialPoints(eqx.Module):
         """J = det F [-], shape (q,)."""
         return self.law.kinematics.determinant(self.deformation)
 
-    def damping_force(self, gradient: Matrix) -> Matrix:
-        """Likewise of the viscous stress, |J| V0 σ_v [J], by the velocity gradient ∇v [1/s], shape (d, d, q): in the
-        total description L = ∇v F⁻¹, and the flux |J| V0 σ_v F⁻ᵀ. A symmetric map, and positive semi-definite."""
+    def viscous_flux(self, gradient: Matrix) -> Matrix:
+        """|J| V0 σ_v [J], whose sum over g_ip is D v (derivation, eq. 28), at a velocity gradient ∇v [1/s], both of
+        shape (d, d, q). In the total description σ_v is of L = ∇v F⁻¹, and the flux |J| V0 σ_v F⁻ᵀ. The map is
+        symmetric and positive semi-definite."""
         if self.viscosity is None:
             return jnp.zeros_like(gradient)
         J = self.volume_ratio()

@@ -1,7 +1,7 @@
 """Warnings of what is no error but most likely not meant, given when particles are first prepared for a scene.
 
-Only certain cases are warned of: not a collider that the body may meet later, but a grip or collider that can never
-touch a node with mass.
+Only what is certain is warned of: a grip or collider that can never touch a node with mass is, one that the body may
+still reach is not.
 """
 
 import itertools

@@ -152,12 +152,12 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
             f"{law.title()}'s parameters must be one number or one for each of its {rows} particles, got "
             f"{sorted(sizes - {1, rows})} of them.",
         )
-    for part in scene.material_points(particles):
-        kept = part.law.kinematics
-        allowed = np.asarray(eqx.filter_jit(part.law.is_admissible)(part.deformation))
-        first = int(np.argmin(allowed)) + part.rows[0]
+    for points in scene.material_points(particles):
+        kept = points.law.kinematics
+        allowed = np.asarray(eqx.filter_jit(points.law.is_admissible)(points.deformation))
+        first = int(np.argmin(allowed)) + points.rows[0]
         require(
             allowed,
-            f"{type(part.law).__name__} does not allow the {kept.symbol} of particle {first} (most laws need "
+            f"{type(points.law).__name__} does not allow the {kept.symbol} of particle {first} (most laws need "
             f"{kept.volume} > 0): start from an admissible one.",
         )

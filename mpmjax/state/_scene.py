@@ -126,7 +126,7 @@ class Scene(eqx.Module):
         return return_map(self.laws, particles)
 
     @property
-    def colliders(self) -> int:
+    def collider_count(self) -> int:
         """Number of colliders."""
         return sum(boundary.bodies for boundary in self.boundary)
 

@@ -7,7 +7,7 @@ from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes, particles_to_grid
 from mpmjax.stepping._semi_implicit import SemiImplicit
 from mpmjax.stepping._stability import MOST_STEPS, SAFETY, UnknownBoundError, longest_step, stable_dt, step_for
-from mpmjax.stepping._step import GridUpdate, StepInfo, advance, advance_compiled, grid_to_particles, step, update
+from mpmjax.stepping._step import GridUpdate, StepInfo, grid_to_particles, step, step_compiled, step_unchecked, update
 from mpmjax.stepping._trbdf2 import TRBDF2
 
 __all__ = [
@@ -24,13 +24,13 @@ __all__ = [
     "SemiImplicit",
     "StepInfo",
     "UnknownBoundError",
-    "advance",
-    "advance_compiled",
     "grid_to_particles",
     "longest_step",
     "particles_to_grid",
     "stable_dt",
     "step",
+    "step_compiled",
     "step_for",
+    "step_unchecked",
     "update",
 ]

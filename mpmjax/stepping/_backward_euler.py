@@ -35,7 +35,7 @@ class BackwardEuler(AbstractImplicitIntegrator):
     Args:
         solution: Newton's method, with its linear solver and tolerances.
         hessian: the Hessian H of the elastic energy. Default: by the analytic stress differential.
-        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + cH.
+        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH.
         adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. Its tolerance
             bounds that of the gradient.
         guess: where Newton's method starts. Default: the velocity of the nodes v^n.

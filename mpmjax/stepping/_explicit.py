@@ -13,8 +13,8 @@ from mpmjax.stepping._nodes import Nodes
 class Explicit(AbstractIntegrator):
     """Symplectic Euler: v^{n+1} = v* = v^n + Δt (g + f/m) (derivation, eq. 4). Positions move with v^{n+1}.
 
-    First order in time; second order in space with APIC and FLIP. It conserves linear momentum, and with APIC angular
-    momentum too.
+    First order in time, and second if velocities start half a step before positions; second order in space with APIC
+    and FLIP. It conserves linear momentum, and with APIC angular momentum too.
 
     *When it breaks*: above a Δt of about 0.4 to 1 times dx/c, depending on dimension, kernel and transfer. c is the
     pressure-wave speed of the *current* tangent, which stretching and compression raise. `stable_dt` gives the limit.

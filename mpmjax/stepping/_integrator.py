@@ -28,11 +28,11 @@ class NodeMotion(eqx.Module):
         """The velocity with which positions and deformation move [m/s], shape (n, d)."""
         return self.velocity if self.mean is None else self.mean
 
-    def slowed(self, loss: NodeVector) -> "NodeMotion":
-        """The motion with the velocity changed by `loss` [m/s], and the mean by half of it, as by an impulse that acts
-        evenly over the step."""
+    def with_friction(self, change: NodeVector) -> "NodeMotion":
+        """The motion with the velocity changed by `change` [m/s], and the mean by half of it, as by an impulse that
+        acts evenly over the step."""
         return NodeMotion(
-            self.velocity + loss, None if self.mean is None else self.mean + loss / 2, self.inner, self.resisted
+            self.velocity + change, None if self.mean is None else self.mean + change / 2, self.inner, self.resisted
         )
 
 

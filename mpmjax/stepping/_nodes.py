@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
-from mpmjax.boundary import AbstractContact, AbstractNodes, Conditions, Mirror, combine, contacts_of, mirror
+from mpmjax.boundary import AbstractContact, AbstractNodes, Conditions, Mirror, combined_conditions, contacts_of, mirror
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.state import Particles, Scene
@@ -167,11 +167,11 @@ class Nodes(AbstractNodes):
         square = (part**2).sum(axis=1)
         some = square > _PARALLEL**2
         length = jnp.sqrt(jnp.where(some, square, 1))
-        asked = colliders.normal * (colliders.velocity - jnp.where(self.free, 0, self.conditions.velocity))
+        missing = colliders.normal * (colliders.velocity - jnp.where(self.free, 0, self.conditions.velocity))
         return FreeNormal(
             direction=jnp.where(some[:, None], part / length[:, None], 0),
             length=length,
-            speed=jnp.where(some, asked.sum(axis=1) / length, 0),
+            speed=jnp.where(some, missing.sum(axis=1) / length, 0),
         )
 
     @property
@@ -195,7 +195,7 @@ class Nodes(AbstractNodes):
         return jnp.where(self.occupied, self.sums.explicit_velocity(self), 0)
 
     def inertial_velocity(self) -> NodeVector:
-        """ṽ = v^n + Δt g [m/s], shape (n, d)."""
+        """v^n + Δt g [m/s], shape (n, d)."""
         return jnp.where(self.occupied, self.velocity + self.dt * self.acceleration, 0)
 
     def admitted_velocity(self) -> NodeVector:
@@ -269,7 +269,7 @@ def particles_to_grid(
     affine = C if scene.transfer.affine else None
     acceleration = jnp.asarray(scene.gravity)
     with jax.named_scope("p2g"):
-        potential = ElasticPotential(scene.material_points(particles), stencil, Mirror(()))
+        potential = ElasticPotential(scene.material_points(particles), stencil, Mirror(()), grid.size)
         joined = joined and stencil.mls_weight_derivatives is None
         flux, viscous_flux = potential.current_flux(), None
         if explicit_viscosity and potential.viscous and C is not None:
@@ -286,7 +286,7 @@ def particles_to_grid(
             push = particles.mass * components(scene.body_force.acceleration(x, at))
             force = scatter(stencil, push, None, grid.size)
             acceleration = acceleration + jnp.where(occupied, force / full, 0)
-        conditions = combine(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total)
+        conditions = combined_conditions(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total)
         if scene.total and conditions.colliders is not None and conditions.colliders.slides:
             slid = (conditions.colliders.owner >= 0)[:, None] & occupied
             place = jnp.where(slid, _place(particles, stencil, grid.size) / full, conditions.colliders.position)
@@ -297,8 +297,8 @@ def particles_to_grid(
         else:
             viscous_force = None
             if viscosity_apart and viscous_flux is not None:
-                viscous_force = -potential.sum_of(viscous_flux, momentum)
-            sums = SeparateSums(velocity, -potential.sum_of(flux, momentum), viscous_force)
+                viscous_force = -potential.nodal_sum(viscous_flux)
+            sums = SeparateSums(velocity, -potential.nodal_sum(flux), viscous_force)
         nodes = Nodes(
             mass=jnp.where(occupied[:, 0], mass, 0),
             sums=sums,

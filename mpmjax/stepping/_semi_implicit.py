@@ -25,10 +25,10 @@ from mpmjax.stepping._nodes import Nodes
 
 
 class SemiImplicit(AbstractImplicitIntegrator):
-    """The semi-implicit update by one linear solve: (M + βΔt²H) v^{n+1} = M v* (derivation, eqs. 3, 6).
+    """The semi-implicit update by one linear solve: (M + βΔt²H) v^{n+1} = M v* (derivation, eq. 17).
 
-    The force and H are those at the start of the step. With viscosity the system is
-    (M + βΔt D + βΔt²H) v^{n+1} = M v* − (1 − β) Δt D v^n.
+    Force and H are those at F^n. With viscosity the system is
+    (M + βΔt D + βΔt²H) v^{n+1} = M v* − (1 − β) Δt D v^n (eq. 29).
 
     First order in time. A mode of frequency ω is amplified by (1 + βz)^(−½), z = (ωΔt)², as long as z < 4/(1−β)². So
     the update is stable at every Δt if β ≥ ½, and for z ≤ 4/(1−2β) otherwise. β = 0 is the explicit step, and β = 1 one
@@ -45,7 +45,7 @@ class SemiImplicit(AbstractImplicitIntegrator):
         beta: β, from 0 to 1.
         hessian: the Hessian H of the elastic energy. Default: by the analytic stress differential.
         solver: linear solver of the update, any symmetric one of lineax.
-        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + cH.
+        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH.
         adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. Its tolerance
             bounds that of the gradient.
         guess: where the solve starts. Default: the velocity of the nodes v^n.
@@ -70,8 +70,8 @@ class SemiImplicit(AbstractImplicitIntegrator):
         problem = LinearProblem(
             mass=nodes.mass,
             factor=beta * nodes.dt**2,
-            hessian=damped(self.hessian.at_current(nodes.potential, predictor), nodes.potential, 1 / nodes.dt),
-            rhs=impulse - (1 - beta) * nodes.dt * nodes.potential.damping_force(v0) if viscous else impulse,
+            hessian=damped(self.hessian.at_step_start(nodes.potential), nodes.potential, 1 / nodes.dt),
+            rhs=impulse - (1 - beta) * nodes.dt * nodes.potential.viscous_resistance(v0) if viscous else impulse,
             projection=nodes.projection,
             prescribed=nodes.prescribed,
             preconditioner=self.preconditioner,
@@ -81,7 +81,7 @@ class SemiImplicit(AbstractImplicitIntegrator):
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt f(0) − βΔt² H v [kg m/s]."""
-        action = self.hessian.at_current(nodes.potential, motion.velocity)
+        action = self.hessian.at_step_start(nodes.potential)
         return nodes.dt * nodes.force - self.beta * nodes.dt**2 * action(motion.velocity)
 
     def stability_factor(self) -> Scalar:

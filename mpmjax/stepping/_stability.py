@@ -38,8 +38,8 @@ def stable_dt(
 
     The limit of a particle alone on the grid is known exactly, and a set of particles has no lower limit than the
     lowest of its members (B. M. Irons, G. Treharne, Proc. 3rd Conf. on Matrix Methods in Structural Mechanics, 1971,
-    for frequencies; for APIC and PIC the same argument holds with the velocity that the transfer keeps). So Δt is the
-    least over particles of Δt² = 4 ρ0 / (Λ (2Ξ − κa)), where
+    for frequencies; for APIC and PIC the same argument holds with the velocity that the transfer keeps: derivation,
+    section 12). So Δt is the least over particles of Δt² = 4 ρ0 / (Λ (2Ξ − κa)) (eq. 32), where
 
     - Λ is the largest eigenvalue of the symmetric part of the present tangent L ↦ ∂²Ψ/∂F∂F : (L F) Fᵀ + τ Lᵀ with
       L = ∇v and τ = P Fᵀ, by `principal_tangent`; in the total description, that of ∂²Ψ/∂F∂F. Stretching and
@@ -54,10 +54,10 @@ def stable_dt(
     β < ½. For β ≥ ½, backward Euler and the methods of second order there is no limit: the result is infinite, and says
     nothing of accuracy.
 
-    With viscosity Δt solves Δt² Λ (2Ξ − κa)/ρ0 + Δt Λ_v b/ρ0 = 4, so it is 8/(B + √(B² + 16A)) with A the factor of Δt²
-    and B that of Δt. Λ_v = |J| max(2η, 2η (1 − d/3) + dζ) is the largest eigenvalue of L ↦ |J| σ_v. b is 2a for APIC,
-    whose stored gradient is multiplied by 1 − Δt a Λ_v/ρ0 in a step, and 4Ξ for PIC and FLIP, whose stored gradient is
-    that of a step ago. The semi-implicit step multiplies A and B by 1 − 2β.
+    With viscosity Δt solves Δt² Λ A/ρ0 + Δt Λ_v B/ρ0 = 4 (derivation, eq. 34) with A = 2Ξ − κa, and B = 2a for APIC,
+    whose stored gradient is multiplied by 1 − Δt a Λ_v/ρ0 in a step, or 4Ξ for PIC and FLIP, whose stored gradient is
+    that of a step ago. Λ_v = |J| max(2η, 2η (1 − d/3) + dζ) is the largest eigenvalue of L ↦ |J| σ_v. The semi-implicit
+    step multiplies both terms by 1 − 2β.
 
     The default safety of 0.7 covers two effects beyond the linear limit. Vibrations of a few per cent grow where the
     third or fourth harmonic of a mode resonates with the step, (ωΔt)² = 3 and 2, which is at 0.87 and 0.71 of the
@@ -147,14 +147,16 @@ def longest_step(scene: Scene, particles: Particles, method: AbstractIntegrator)
 def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Float[Array, ""]:
     density = particles.mass / particles.volume
     elastic_steepness, viscous_steepness = _steepness(scene, particles)
-    bodies = scene.material_points(particles)
-    tangents = [c.law.tangent_eigenvalues(c.deformation, particles.dim, total=c.total) for c in bodies]
+    materials = scene.material_points(particles)
+    tangents = [
+        points.law.tangent_eigenvalues(points.deformation, particles.dim, total=points.total) for points in materials
+    ]
     stiffest = jnp.concatenate([values.max(axis=0) for values in tangents])
     z = stiffest * elastic_steepness / density  # per Δt²
     factor = method.stability_factor()
     if factor is None:
         raise UnknownBoundError(f"{type(method).__name__} gives no bound on its step: give dt.")
-    most = jnp.concatenate([_stiffest_viscosity(c, particles.dim) for c in bodies])
+    most = jnp.concatenate([_stiffest_viscosity(points, particles.dim) for points in materials])
     y = most * viscous_steepness / density  # per Δt
     z, y = jnp.maximum(factor * z, 0), jnp.maximum(factor * y, 0)
     square = y**2 + 16 * z
@@ -163,17 +165,18 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Fl
     return jnp.where(steepness == 0, jnp.inf, 8 / jnp.where(steepness == 0, 1, steepness))
 
 
-def _stiffest_viscosity(body: MaterialPoints, dim: int) -> Float[Array, "q"]:
+def _stiffest_viscosity(points: MaterialPoints, dim: int) -> Float[Array, "q"]:
     """The largest eigenvalue of ∇v ↦ |J| σ_v for each particle [Pa s]; a bound of it in the total description."""
-    J = jnp.abs(body.volume_ratio())
-    if body.viscosity is None:
+    J = jnp.abs(points.volume_ratio())
+    if points.viscosity is None:
         return jnp.zeros_like(J)
-    most = J * body.viscosity.stiffest(dim)
-    return most / (la.principal_frame(body.deformation)[1] ** 2).min(axis=0) if body.total else most
+    most = J * points.viscosity.stiffest(dim)
+    return most / (la.principal_frame(points.deformation)[1] ** 2).min(axis=0) if points.total else most
 
 
 def _steepness(scene: Scene, particles: Particles) -> tuple[Array, Array]:
-    """A and B [1/m²] of the bound Δt² Λ A/ρ0 + Δt Λ_v B/ρ0 ≤ 4, from the scene's gradient operator and transfer."""
+    """A and B [1/m²] of the bound Δt² Λ A/ρ0 + Δt Λ_v B/ρ0 ≤ 4 (derivation, eq. 34), from the scene's gradient operator
+    and transfer."""
     spacing = jnp.asarray(scene.grid.spacing)
     if scene.kernel.order == 1:
         inverse_moment = 1 / scene.stencil(particles).moment.min(axis=0)

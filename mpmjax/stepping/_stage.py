@@ -1,8 +1,8 @@
 """The implicit stage of backward Euler and of the integrators of second order.
 
-It is M (v − a) = Δt_s (f(u + Δt_s v) − D v), where f(u) is the elastic force at a nodal displacement u and −D v the
-viscous force. One linear solve takes f(u) = f(0) − H u; Newton's method, or another `AbstractSolution`, solves the
-nonlinear equation.
+It is M (v − a) = Δt_s (f(u + Δt_s v) − D v) (derivation, eq. 22 and section 10), where f(u) is the elastic force at a
+nodal displacement u and −D v the viscous force. One linear solve takes f(u) = f(0) − H u; Newton's method, or another
+`AbstractSolution`, solves the nonlinear equation.
 """
 
 import equinox as eqx
@@ -14,12 +14,12 @@ from mpmjax.stepping._nodes import Nodes
 
 
 class Stage(eqx.Module):
-    """The equation M (v − a) = c (f(u + c v) − D v) for a velocity v."""
+    """The equation M (v − a) = Δt_s (f(u + Δt_s v) − D v) for a velocity v."""
 
     inertial: NodeVector
-    """a [m/s], shape (n, d): the velocity without internal forces."""
+    """a [m/s], the velocity of the stage without the force at its own end, shape (n, d)."""
     stage_dt: Float[Array, ""]
-    """c [s], the duration of the stage."""
+    """Δt_s [s], the length of the stage."""
     initial_displacement: NodeVector | None = None
     """u [m], shape (n, d); None for zero."""
 

@@ -13,9 +13,9 @@ from mpmjax.boundary import (
     ColliderImpulse,
     ConstrainedNodes,
     ContactInfo,
-    collider_impulse,
     constrain,
     find_active_set,
+    impulse_on_colliders,
     no_contact,
 )
 from mpmjax.checks import canonical, checked, require_positive
@@ -64,7 +64,7 @@ class GridUpdate(eqx.Module):
     """The part of `friction` that is from colliders [kg m/s], shape (n, d); None without colliders."""
 
 
-def advance(
+def step_unchecked(
     scene: Scene,
     particles: Particles,
     t: Scalar,
@@ -94,19 +94,25 @@ def advance(
         joined=not (method.needs_separate_force or scene.transfer.needs_change),
     )
     new = update(nodes, method)
+    trial = grid_to_particles(scene, particles, nodes, new)
+    after = scene.return_map(trial)
     outside = (~stencil.inside).sum().astype(jnp.int32)
-    asked = nodes.conditions.colliders
-    if asked is not None and new.motion.mean is not None:
-        asked = asked.after(dt / 2, new.motion.mean)
-    impulse = None
-    if asked is not None:
-        impulse = collider_impulse(asked, new.reaction, new.normal_impulse, new.collider_friction)
-    after = scene.return_map(grid_to_particles(scene, particles, nodes, new))
-    return after, StepInfo(new.solve, new.contact, outside, impulse)
+    return after, StepInfo(new.solve, new.contact, outside, _given_to_colliders(nodes, new))
 
 
-advance_compiled = eqx.filter_jit(advance)
-"""`advance`, compiled as one program."""
+def _given_to_colliders(nodes: Nodes, new: GridUpdate) -> ColliderImpulse | None:
+    """The impulse on the scene's colliders, at their places in the middle of the step if positions move with the mean
+    velocity; None without colliders."""
+    colliders = nodes.conditions.colliders
+    if colliders is None:
+        return None
+    if new.motion.mean is not None:
+        colliders = colliders.after(nodes.dt / 2, new.motion.mean)
+    return impulse_on_colliders(colliders, new.reaction, new.normal_impulse, new.collider_friction)
+
+
+step_compiled = eqx.filter_jit(step_unchecked)
+"""`step_unchecked`, compiled as one program."""
 
 
 def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
@@ -138,14 +144,14 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
         internal, reaction, viscous = impulses(nodes, method, motion)
         normal = held.collider_impulse(reaction)
         slowed, friction = held.friction(motion.velocity, reaction)
-        loss = slowed - motion.velocity
+        change = slowed - motion.velocity
         return GridUpdate(
             before=held.images.unfold(held.nodes.velocity) if nodes.separate else None,
-            motion=motion.slowed(loss),
+            motion=motion.with_friction(change),
             internal=internal,
             viscous=viscous,
             reaction=reaction,
-            friction=nodes.mass[:, None] * loss,
+            friction=nodes.mass[:, None] * change,
             free=Projection(*held.beyond_boundaries()),
             solve=cost.followed_by(info),
             contact=ContactInfo(sweeps, held.count_violations(motion.velocity, reaction)),
@@ -168,7 +174,7 @@ def impulses(
         return None, nodes.mass[:, None] * (motion.velocity - nodes.explicit_velocity()), None
     internal, viscous = method.elastic_impulse(nodes, motion), None
     if motion.resisted is not None:
-        viscous = -nodes.dt * nodes.potential.damping_force(motion.resisted)
+        viscous = -nodes.dt * nodes.potential.viscous_resistance(motion.resisted)
         internal = internal + viscous
     elif nodes.viscous_force is not None:
         viscous = jnp.where(nodes.occupied, nodes.dt * nodes.viscous_force, 0)
@@ -182,7 +188,7 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
     unfold = potential.mirror.unfold
     before, motion = jax.tree.map(unfold, (new.before, new.motion))
     with jax.named_scope("g2p"):
-        moved, v, C, gradient = g2p(
+        found = g2p(
             scene.transfer,
             potential.stencil,
             components(particles.v),
@@ -190,16 +196,16 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
             motion.velocity,
             motion.mean,
             C=None if particles.C is None else components(particles.C),
-            kept=scene.keeps_gradient,
+            keep_gradient=scene.keeps_gradient,
         )
-        changes = zip(potential.current_deformation(), potential.change(gradient), strict=True)
+        changes = zip(potential.current_deformation(), potential.change(found.gradient), strict=True)
         deformations = tuple(particle_first(F + dt * rate) for F, rate in changes)
     return replace(
         particles,
-        x=particle_first(components(particles.x) + dt * moved),
-        v=particle_first(v),
+        x=particle_first(components(particles.x) + dt * found.carrier),
+        v=particle_first(found.velocity),
         deformations=deformations,
-        C=None if C is None else particle_first(C),
+        C=None if found.affine is None else particle_first(found.affine),
     )
 
 
@@ -235,4 +241,4 @@ def step(
     require_positive("dt [s]", dt)
     scene, t, dt, method = canonical((scene, t, dt, method), particles.x.dtype)
     particles = particles if is_prepared(scene, particles) else prepare(scene, particles)
-    return advance_compiled(scene, particles, t, dt, method)
+    return step_compiled(scene, particles, t, dt, method)

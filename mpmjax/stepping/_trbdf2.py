@@ -25,12 +25,12 @@ from mpmjax.stepping._stage import Stage, stage_force
 
 
 class TRBDF2(AbstractImplicitIntegrator):
-    """TR-BDF2: a trapezoidal stage from 0 to γΔt, then a stage from 0, γΔt and Δt. For y' = F(y),
+    """TR-BDF2: a trapezoidal stage from 0 to γΔt, then a stage from 0, γΔt and Δt. For y' = G(y),
 
-        y_γ = y_0 + ½γΔt (F_0 + F_γ),    y_1 = y_0 + Δt (q_0 F_0 + q_1 F_γ + q_2 F_1)
+        y_γ = y_0 + ½γΔt (G_0 + G_γ),    y_1 = y_0 + Δt (q_0 G_0 + q_1 G_γ + q_2 G_1)
 
-    (R. E. Bank et al., IEEE Trans. CAD 4 (1985) 436, doi 10.1109/TCAD.1985.1270142; with ρ∞: G. Noh, K.-J. Bathe,
-    Comput. Struct. 212 (2019) 299, doi 10.1016/j.compstruc.2018.11.001).
+    (derivation, eqs. 25 and 26; R. E. Bank et al., IEEE Trans. CAD 4 (1985) 436, doi 10.1109/TCAD.1985.1270142; with
+    ρ∞: G. Noh, K.-J. Bathe, Comput. Struct. 212 (2019) 299, doi 10.1016/j.compstruc.2018.11.001).
 
     Second order in time and stable at every Δt. A mode that Δt does not resolve is multiplied by ρ∞ in each step. With
     ρ∞ = 0, which is TR-BDF2, it vanishes at once (the method is L-stable); with ρ∞ = 1 the method is two trapezoidal
@@ -72,13 +72,13 @@ class TRBDF2(AbstractImplicitIntegrator):
     def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         _, q0, q1, q2 = self.weights()
         dt, g, v0 = nodes.dt, nodes.acceleration, nodes.admitted_velocity()
-        c = q2 * dt  # = ½γΔt
+        length = q2 * dt  # Δt_s = ½γΔt
         viscous = nodes.potential.viscous
-        pull = nodes.per_mass(nodes.force - nodes.potential.damping_force(v0) if viscous else nodes.force)
-        trapezoidal = Stage(v0 + c * (pull + 2 * g), c, c * v0)
+        pull = nodes.per_mass(nodes.force - nodes.potential.viscous_resistance(v0) if viscous else nodes.force)
+        trapezoidal = Stage(v0 + length * (pull + 2 * g), length, length * v0)
         middle, first = trapezoidal.solve(nodes, guess, self, self.solution)
-        later_pull = (middle - trapezoidal.inertial) / c  # f_γ/m, viscosity's with it, by the stage's own equation
-        last = Stage(v0 + dt * (q0 * pull + q1 * later_pull + g), c, dt * (q0 * v0 + q1 * middle))
+        later_pull = (middle - trapezoidal.inertial) / length  # f_γ/m, viscosity's with it, by the stage's own equation
+        last = Stage(v0 + dt * (q0 * pull + q1 * later_pull + g), length, dt * (q0 * v0 + q1 * middle))
         v, second = last.solve(nodes, middle, self, self.solution)
         inner, mean = q2 * (v0 + middle), q0 * v0 + q1 * middle + q2 * v
         return NodeMotion(v, mean, inner, mean if viscous else None), first.together_with(second)

@@ -22,6 +22,7 @@ from mpmjax.verification._problem import (
 )
 
 _LOADING, _HOLDING = 20, 8  # steps, of which each is a Newton step towards equilibrium
+_STEP = 1e5  # [s], long enough for inertia not to matter
 
 
 class Column(AbstractProblem):
@@ -47,10 +48,10 @@ class Column(AbstractProblem):
     @property
     def duration(self) -> float:
         """Duration of the run [s], so long that inertia is negligible."""
-        return 1e5 * (_LOADING + _HOLDING)
+        return _STEP * (_LOADING + _HOLDING)
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
-        share = jnp.minimum(t / (1e5 * (_LOADING - 1)), 1)
+        share = jnp.minimum(t / (_STEP * (_LOADING - 1)), 1)
         return X - self.load * share * (X - X**2 / 2)
 
     def grid(self, cells: int) -> Grid:

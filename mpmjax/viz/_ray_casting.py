@@ -233,10 +233,10 @@ def picture(
     """The picture, red, green and blue from 0 to 1, (height, width, 3).
 
     Args:
-        camera: whence.
+        camera: the view.
         light: a camera far away in the light's place, that holds all that casts shadows.
         balls: what is seen.
-        about: what shuts off the sky.
+        about: the filled space that blocks the sky's light.
         ground: height of the ground [m]; None for none. It is not seen from below.
         square: the side of the squares drawn on it [m].
     """

@@ -24,8 +24,8 @@ def misfit(scene, column, height):
     mean. With γ = 7 and compression (1 + 7p/K)^(6/7) = 1 + 6 ρ0 g (h − y)/K."""
     depth = height - column.x[:, 1]
     exact = K / 7 * ((1 + 6 * DENSITY * G * depth / K) ** (7 / 6) - 1)
-    (body,) = scene.material_points(column)
-    error = (-body.law.stress(body.deformation) - exact) / (DENSITY * G)
+    (points,) = scene.material_points(column)
+    error = (-points.law.stress(points.deformation) - exact) / (DENSITY * G)
     return jnp.abs(jnp.where(depth > 2 * scene.grid.spacing, error, 0)).max(), jnp.abs(error.mean())
 
 

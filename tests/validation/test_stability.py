@@ -20,7 +20,7 @@ import mpmjax as mpm
 from mpmjax.checks._values import canonical
 from mpmjax.discretisation._gradient import _STEEPEST
 from mpmjax.state._particles import state_of, with_state
-from mpmjax.stepping._step import advance
+from mpmjax.stepping._step import step_unchecked
 
 DX, DENSITY = 0.1, 1e3
 LAW = mpm.FixedCorotated(1e4, 0.3)
@@ -70,7 +70,7 @@ def jacobian(scene, particles, dt, method):
     start, unravel = ravel_pytree(state_of(particles))
 
     def after(y):
-        new, _ = advance(scene, with_state(particles, unravel(y)), 0 * dt, dt, method)
+        new, _ = step_unchecked(scene, with_state(particles, unravel(y)), 0 * dt, dt, method)
         return ravel_pytree(state_of(new))[0]
 
     return jax.jacfwd(after)(start)
@@ -137,8 +137,8 @@ def tangent_spectra(scene, particles):
     L = jnp.eye(d * d).reshape(-1, d, d)
     image = jax.vmap(law.tangent(F))(jnp.einsum("mij,jkp->mikp", L, pull))
     image = jnp.einsum("mijp,kjp->mikp", image, pull) + jnp.einsum("ijp,mkj->mikp", tau, L)
-    (body,) = scene.material_points(particles)
-    found = body.law.tangent_eigenvalues(body.deformation, d, total=scene.total)
+    (points,) = scene.material_points(particles)
+    found = points.law.tangent_eigenvalues(points.deformation, d, total=scene.total)
     return found, jnp.moveaxis(image.reshape(d * d, d * d, -1), -1, 0)
 
 
@@ -156,10 +156,10 @@ def test_tangent_spectrum_is_that_of_the_assembled_map(law, description, d):
 @eqx.filter_jit
 def fluid_spectra(scene, particles):
     """The closed form's only eigenvalue, and the map L ↦ ∂τ/∂J J tr(L), τ = JΨ' I, assembled, (p, d², d²)."""
-    d, (body,) = particles.dim, scene.material_points(particles)
-    kirchhoff = lambda J: (J * body.law.stress(J)).sum()  # noqa: E731
-    eye, J = jnp.eye(d).reshape(-1), body.deformation
-    return body.law.tangent_eigenvalues(J, d, total=False), (jax.grad(kirchhoff)(J) * J)[:, None, None] * jnp.outer(
+    d, (points,) = particles.dim, scene.material_points(particles)
+    kirchhoff = lambda J: (J * points.law.stress(J)).sum()  # noqa: E731
+    eye, J = jnp.eye(d).reshape(-1), points.deformation
+    return points.law.tangent_eigenvalues(J, d, total=False), (jax.grad(kirchhoff)(J) * J)[:, None, None] * jnp.outer(
         eye, eye
     )
 
@@ -380,7 +380,7 @@ def dilation_map(scene, particles, dt, method):
 
     def after(y):
         moved = eqx.tree_at(lambda q: (q.F, q.C), particles, ((1 + y[0]) * eye, y[1] / dt * eye))
-        new, _ = advance(scene, moved, 0 * dt, dt, method)
+        new, _ = step_unchecked(scene, moved, 0 * dt, dt, method)
         return jnp.stack([new.F[0, 0, 0] - 1, dt * new.C[0, 0, 0]])
 
     return jax.jacfwd(after)(jnp.zeros(2))
