@@ -139,6 +139,7 @@ def test_coordinates_start_at_zero_and_keep_to_the_bounds(parameter, start):
     assert lower <= far[0] < far[1] <= upper
 
 
+@pytest.mark.thorough
 def test_unknown_noise_is_estimated_and_errors_are_students():
     """The same data with σ given: the estimate is σ but for chance, the errors in proportion, the interval by t."""
     times, x, which = tracks()

@@ -208,6 +208,7 @@ def test_an_energy_of_a_wrong_shape_is_refused():
         mpm.step(*strained(1, Summed(1.0, 1.0), mpm.UpdatedLagrangian()), 0.0, 1e-4)
 
 
+@pytest.mark.thorough
 def test_an_anisotropic_law_moves_and_is_refused_where_its_frame_is_needed():
     """Fibres move implicitly as any law does; the stable step and the projected Hessian say what they lack."""
     law = Fibres(1e4, 1e4)

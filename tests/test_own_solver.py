@@ -154,13 +154,14 @@ OURS = mpm.SemiImplicit(hessian=PROJECTED, solver=TIGHT, adjoint_solver=TIGHT)
 NEWTON = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-11), PROJECTED, adjoint_solver=TIGHT)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "solver",
     [
-        pytest.param(lx.LU(), marks=pytest.mark.thorough),
-        pytest.param(lx.Cholesky(), marks=pytest.mark.thorough),
+        lx.LU(),
+        lx.Cholesky(),
         MinimalResidual(),
-        pytest.param(CG, marks=pytest.mark.thorough),
+        CG,
     ],
     ids=lambda solver: type(solver).__name__,
 )
