@@ -168,6 +168,34 @@ def test_the_fit_finds_rubbers_modulus(tmp_path):
     assert found.dt / (float(found.scene.grid.spacing) / speed) > 100
 
 
+@pytest.mark.slow
+def test_doubled_stresses_double_the_modulus():
+    """A quasi-static curve is proportional to the modulus; on twice the spacing and step."""
+    asked = read_fit(RUBBER)
+    (curve,) = asked.experiments[0].observations
+    grid = mpm.Grid((8, 14), 5e-3, origin=(-3, -3))
+    particles = mpm.fill(mpm.Box((0.0, 0.0), (0.01, 0.04)), grid, particles_per_cell=4, density=930.0, dtype="float64")
+    fine = asked.experiments[0].scene
+    scene = mpm.Scene(grid, fine.material, boundary=fine.boundary, description=mpm.TotalLagrangian())
+    of = mpm.StressStretch.of(mpm.Box((0.0, 0.0), (0.01, 0.01)), particles, 1)
+    once, twice = (
+        mpm.fit(
+            mpm.Experiment(
+                scene,
+                particles,
+                t1=0.35,
+                dt=5e-3,
+                method=mpm.SemiImplicit(),
+                observations=mpm.Curve(curve.x, factor * curve.data, of),
+            ),
+            {"E": mpm.Positive(lambda e: e.scene.material.youngs_modulus, start=1e6 * factor)},
+        )["E"]
+        for factor in (1, 2)
+    )
+    assert twice.value / once.value == pytest.approx(2, rel=1e-4)
+    assert twice.error / once.error == pytest.approx(2, rel=1e-3)
+
+
 def test_a_gauge_weighs_by_volume_and_must_hold_particles():
     grid = mpm.Grid((10, 22), 2.5e-3, origin=(-3, -3))
     particles = mpm.fill(mpm.Box((0.0, 0.0), (0.01, 0.04)), grid, particles_per_cell=4, density=930.0)
