@@ -138,7 +138,7 @@ SLOW = {
     "implicit_midpoint-viscous",
     "semi_implicit-viscous fluid-contact",
 }
-DEFAULT = {"semi_implicit-colliders", "snow"}
+DEFAULT = {"snow"}
 
 
 @pytest.mark.parametrize("case", **ids(CASES, DEFAULT, CASES.keys() - SLOW))

@@ -68,8 +68,8 @@ def boundaries(description, d):
 @pytest.mark.parametrize(
     ("description", "name", "d"),
     [
-        ("updated", "explicit", 2),
         *thorough(
+            ("updated", "explicit", 2),
             ("updated", "semi_implicit", 2),
             ("updated", "explicit", 3),
             ("total", "explicit", 2),
