@@ -27,7 +27,7 @@ def reached(*args: object) -> NoReturn:
     raise Reached
 
 
-SEEN = mpm.Series([0.05], [0.1], reached)
+SEEN = mpm.Curve([0.05], [0.1], reached)
 STIFFNESS = mpm.Positive(lambda e: e.scene.material.youngs_modulus)
 RUN = {"scene": SCENE, "particles": PARTICLES, "t1": 0.1, "dt": 0.01}
 FUNCTIONS = {

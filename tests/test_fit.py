@@ -105,6 +105,82 @@ def test_the_jacobian_is_that_of_differences():
         assert np.abs(J[:, k] - difference).max() < 1e-6 * np.abs(difference).max()
 
 
+class Line(FitProblem):
+    """y = a x of data with noise, in the place of a simulation: what is estimated is known in closed form."""
+
+    x: np.ndarray
+
+    def __init__(self, x, observations, prior=None):
+        (scene, particles), t1 = bar(), STEPS * DT
+        self.experiments = (mpm.Experiment(scene, particles, t1=t1, dt=DT, observations=observations),)
+        self.names, self.parameters = ("a",), (mpm.Unbounded(lambda e: e.scene.gravity[0], start=1.0, prior=prior),)
+        self.starts, self.x = (jnp.asarray(1.0),), x
+
+    def residuals(self, z, sigmas, adjoint):
+        parts = [o.residuals((1 + z[0]) * self.x, s) for o, s in zip(self.observations, sigmas, strict=True)]
+        prior = self.parameters[0].prior
+        return jnp.concatenate(parts + ([] if prior is None else [prior.residuals(1 + z)])), jnp.zeros(1)
+
+
+def fitted_line(monkeypatch, y, prior=None, **options):
+    times = np.linspace(0.001, 0.05, len(y))
+    seen = mpm.Series(times, y, mpm.Extent(0), **options)
+    monkeypatch.setattr("mpmjax.fitting._fit.FitProblem", lambda e, p: Line(times * 20, seen, prior))
+    return mpm.fit([], {})
+
+
+@pytest.mark.thorough
+def test_a_prior_and_outliers_are_weighed_by_the_estimated_noise(monkeypatch):
+    """Slope 2 with noise 0.01: a prior of 1 ± 0.3 hardly counts, outliers hardly count with a robust loss, and the
+    estimate of σ is right with a weight and with a robust loss."""
+    rng = np.random.default_rng(0)
+    x = np.linspace(0.02, 1, 400)
+    y = 2 * x + 0.01 * rng.normal(size=400)
+    exact = (x @ y) / (x @ x)
+    with_prior = fitted_line(monkeypatch, y, prior=mpm.Gaussian(1.0, 0.3))
+    assert with_prior["a"].value == pytest.approx(exact, abs=2e-4)
+    assert fitted_line(monkeypatch, y, weight=0.25).noise[0].sigma == pytest.approx(0.01, rel=0.1)
+    robust = fitted_line(monkeypatch, y, robust=1.0)
+    assert robust.noise[0].sigma == pytest.approx(0.01, rel=0.1)
+    assert np.isnan(robust.p_value)
+    y[::40] += 3.0
+    assert fitted_line(monkeypatch, y, robust=1.0)["a"].value == pytest.approx(2, abs=0.01)
+    assert abs(fitted_line(monkeypatch, y)["a"].value - 2) > 0.05
+
+
+@pytest.mark.thorough
+def test_fits_in_single_precision_converge_and_large_moduli_are_numbers():
+    """E = 1e9 Pa of a bar in float32, whose residuals are never still."""
+    grid = mpm.Grid((12,), 0.1, origin=(-4,))
+    q = mpm.fill(mpm.Box((0.0,), (0.4,)), grid, particles_per_cell=2, density=1e3, dtype="float32")
+    q = eqx.tree_at(lambda q: q.v, q, jnp.asarray(1.5, jnp.float32) * (q.x - 0.2))
+    scene = mpm.Scene(grid, mpm.NeoHookean(1e9, 0.3))
+    run = mpm.simulate(scene, q, t1=15 * 3e-5, dt=3e-5, save_every=1)
+    seen = mpm.Tracks(np.asarray(run.times)[1:], np.asarray(run.frames.x)[1:], which=np.arange(q.count), sigma=1e-6)
+    softer = mpm.Positive(lambda e: e.scene.material.youngs_modulus, start=8e8)
+    found = mpm.fit(mpm.Experiment(scene, q, t1=15 * 3e-5, dt=3e-5, observations=seen), {"E": softer})
+    assert found.converged
+    assert found["E"].value == pytest.approx(1e9, rel=2e-2)
+
+
+@pytest.mark.thorough
+def test_what_the_data_do_see_of_a_pair_has_an_error():
+    """Of E and density only the ratio is seen: it is reported with the error of E alone."""
+    times, x, which = tracks()
+    start = np.asarray(bar()[1].mass)
+    heavier = mpm.Positive(
+        update=lambda e, f: eqx.tree_at(lambda e: e.particles.mass, e, f * jnp.asarray(start)), start=1.0
+    )
+    seen = mpm.Tracks(times, x, which=which, sigma=NOISE)
+    ratio = {"ratio": lambda e: e.scene.material.youngs_modulus / e.particles.mass[0] * start[0]}
+    alone = mpm.fit(experiment(seen), {"E": STIFFNESS})
+    with pytest.warns(UserWarning, match="only their ratio"):
+        both = mpm.fit(experiment(seen), {"E": STIFFNESS, "density": heavier}, report=ratio)
+    assert both["ratio"].value == pytest.approx(alone["E"].value, rel=1e-4)
+    assert both["ratio"].error == pytest.approx(alone["E"].error, rel=1e-2)
+    assert both["E"].interval == (0, np.inf)
+
+
 def test_between_steps_a_series_is_interpolated_linearly():
     seen = jnp.asarray([[0.0], [1.0], [4.0]])
     assert np.allclose(_between(seen, jnp.asarray([0.0, 0.25, 1.0, 1.5, 2.0]))[:, 0], [0, 0.25, 1, 2.5, 4])
@@ -298,6 +374,8 @@ def test_bad_parameters_get_one_line(parameters, material, says):
 
 
 BAD_DATA = {
+    "another shape": (lambda: mpm.Series([0.01], ones(1), lambda s, p: p.x[3]), "but of returns shape"),
+    "no axis": (lambda: mpm.Series([0.01], ones(1), mpm.Extent(5)), "axis must be below"),
     "late": (lambda: mpm.Series([0.01, 9.0], ones(2), mpm.Extent(0)), "must lie in the run"),
     "unsorted": (lambda: mpm.Series([0.02, 0.01], ones(2), mpm.Extent(0)), "must grow"),
     "empty": (lambda: mpm.Series([0.02], np.array([np.nan]), mpm.Extent(0)), "has no data"),
@@ -346,7 +424,7 @@ def test_an_interruption_keeps_the_best_so_far():
         if len(lines) == 3:
             raise KeyboardInterrupt
 
-    with pytest.warns(UserWarning, match="did not converge"):
+    with pytest.warns(UserWarning, match="was interrupted"):
         found = mpm.fit(
             experiment(mpm.Tracks(times, x, which=which, sigma=NOISE)), {"E": STIFFNESS}, progress=interrupt
         )
@@ -382,7 +460,7 @@ def test_the_discretisation_stands_beside_the_noise_and_rules():
     data = np.asarray(run.observed)[1:13] * (1 + 1e-6 * np.random.default_rng(2).normal(size=12))
     seen = mpm.Series(times, data, spread)
     stiffness = mpm.Positive(lambda e: e.scene.material.youngs_modulus)
-    found = mpm.fit_refined(lambda n: build(n, seen=seen), {"E": stiffness})
+    found = mpm.fit_refined(lambda n: build(n, seen=seen), {"E": stiffness}, order=2)
     coarse, last = found.fits[0]["E"], found["E"]
     assert abs(last.value - 7e4) < 0.5 * abs(coarse.value - 7e4)
     assert last.interval[0] < 7e4 < last.interval[1]

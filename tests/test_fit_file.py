@@ -75,7 +75,7 @@ def bar(tmp_path_factory):
     made = read_simulation(folder / "plain.toml")
     law = mpm.NeoHookean(1.2e5, 0.3)
     scene = mpm.Scene(made.scene.grid, law, gravity=(0.0,), boundary=made.scene.boundary)
-    run = mpm.simulate(scene, made.particles, t1=0.048, dt=4e-3, save_every=1)
+    run = mpm.simulate(scene, made.particles, t1=0.06, dt=4e-3, save_every=1)
     times, x = np.asarray(run.times), np.asarray(run.frames.x)[:, :, 0]
     tracks = [(t, k, row[k]) for t, row in zip(times, x, strict=True) for k in (3, 5, 7) if k != 5 or t < 0.03]
     for name, head, rows in (
@@ -111,12 +111,14 @@ def test_another_scene_file_is_another_experiment(bar):
     assert len(found.experiments[1].observations) == 2
     assert found.experiments[0].t1 == 0.048
     assert found.whole[0].t1 == 0.06
+    assert found.experiments[0].observations[1].times[-1] == pytest.approx(0.048)
+    assert found.whole[0].observations[1].times[-1] == pytest.approx(0.06)
 
 
 def test_a_marker_that_is_lost_is_no_data(bar):
     seen = read_fit(bar / "bar.toml").experiments[0].observations[0]
-    assert seen.data.shape == (13, 3, 1)
-    assert np.isnan(seen.data[8:, 1]).all()
+    assert seen.data.shape == (12, 3, 1)
+    assert np.isnan(seen.data[7:, 1]).all()
     assert np.isfinite(seen.data[:, [0, 2]]).all()
 
 
@@ -132,6 +134,11 @@ FAULTS = {
     "unknown key": ("report =", "reports =", r"unknown key"),
     "late": ("t1 = 0.048", "t1 = 0.9", r"must not lie after"),
     "bounds": ('unit = "Pa"', 'unit = "Pa"\nlower = 1.0', r"go with kind"),
+    "twice": (
+        'unit = "Pa"',
+        'unit = "Pa"\n[[fit.parameter]]\npath = "scene.material.poisson_ratio"\nname = "E"',
+        r"a name",
+    ),
     "dimension": ('place = ["x"]', 'place = ["x", "y"]', r"must be 1 columns"),
 }
 

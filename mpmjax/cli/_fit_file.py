@@ -57,21 +57,22 @@ def read_fit(path: Path, read: Callable[[Path], Simulation] = read_simulation) -
     """
     simulation = read(path)
     table = _fit_table(path, simulation)
-    others = _tables(table, "experiment")
-    names = [_text(other, "scene", "[[fit.experiment]]") for other in others]
     sources = [(path, simulation, table)] if "observation" in table else []
-    for name in names:
-        other = read(path.parent / name)
-        sources.append((path.parent / name, other, _fit_table(path.parent / name, other)))
     try:
+        _require_keys(table, "[fit]", _KEYS)
+        for other in _tables(table, "experiment"):
+            _require_keys(other, "[[fit.experiment]]", {"scene"})
+            file = path.parent / _text(other, "scene", "[[fit.experiment]]")
+            own = read(file)
+            sources.append((file, own, _fit_table(file, own)))
+            _require_keys(sources[-1][2], f"[fit] of {file}", _KEYS)
         require(len(sources) > 0, "[fit] needs an [[fit.observation]], or an [[fit.experiment]] whose scene has one.")
         parts = [_experiments(*source) for source in sources]
-        known = {"parameter", "observation", "experiment", "report", "level", "t1"}
-        unknown = sorted(set(table) - known)
-        require(not unknown, f"[fit] has the unknown key {unknown[:1]}; known are {', '.join(sorted(known))}.")
         tables = _tables(table, "parameter")
         require(len(tables) > 0, "[fit] needs a [[fit.parameter]].")
-        parameters = dict(_parameter(t, parts[0][0]) for t in tables)
+        named = [_parameter(t, parts[0][0]) for t in tables]
+        names = [name for name, _ in named]
+        require(len(set(names)) == len(names), f"[[fit.parameter]] {', '.join(names)}: each needs a name of its own.")
         report = table.get("report", {})
         require(isinstance(report, dict), "[fit.report] must be a table of names and paths.")
         for name, where in report.items():
@@ -84,7 +85,15 @@ def read_fit(path: Path, read: Callable[[Path], Simulation] = read_simulation) -
         raise ValueError(f"{path}: {error}") from None
     found = {name: _getter(where) for name, where in report.items()}
     fitted, whole = zip(*parts, strict=True)
-    return FitFile(fitted, parameters, found, level, whole)
+    return FitFile(fitted, dict(named), found, level, whole)
+
+
+_KEYS = {"parameter", "observation", "experiment", "report", "level", "t1"}
+
+
+def _require_keys(table: dict[str, Any], where: str, known: set[str]) -> None:
+    unknown = sorted(set(table) - known)
+    require(not unknown, f"{where} has the unknown key {unknown[:1]}; known are {', '.join(sorted(known))}.")
 
 
 def leaf_of(path: str, experiment: Experiment) -> Any:
@@ -182,7 +191,7 @@ def _experiments(path: Path, simulation: Simulation, table: dict[str, Any]) -> t
     require(t1 <= simulation.t1, f"[fit] t1 must not lie after that of [run], got {t1} and {simulation.t1}.")
     tables = _tables(table, "observation")
     require(len(tables) > 0, f"{path} needs an [[fit.observation]].")
-    pairs = [_observation(t, path.parent, simulation.particles) for t in tables]
+    pairs = [_observation(t, path.parent, simulation.particles, t1) for t in tables]
     fitted, whole = zip(*pairs, strict=True)
 
     def experiment(observations: tuple[AbstractObservation, ...], t1: float) -> Experiment:
@@ -200,16 +209,16 @@ def _experiments(path: Path, simulation: Simulation, table: dict[str, Any]) -> t
 
 
 def _observation(
-    table: dict[str, Any], folder: Path, particles: Particles
+    table: dict[str, Any], folder: Path, particles: Particles, t1: float
 ) -> tuple[AbstractObservation, AbstractObservation]:
-    """An observation as it is fitted, and with all that was measured."""
+    """An observation as it is fitted, until t1 [s], and with all that was measured."""
     kind = _text(table, "kind", "[[fit.observation]]")
     kinds = {"StressStretch": _stress_stretch, "Extent": _extent, "CentreOfMass": _centre_of_mass, "Tracks": _tracks}
     require(kind in kinds, f"[[fit.observation]] kind must be one of {', '.join(kinds)}, got {kind!r}.")
     make = kinds[kind](folder, particles)
     given = {key: value for key, value in table.items() if key != "kind"}
     found = make(**arguments(make, given, f"[[fit.observation]] {kind}"))
-    return found if isinstance(found, tuple) else (found, found)
+    return found if isinstance(found, tuple) else (found.until(t1), found)
 
 
 def _stress_stretch(folder: Path, particles: Particles) -> Callable[..., Any]:
@@ -308,7 +317,8 @@ def _tracks(folder: Path, particles: Particles) -> Callable[..., Any]:
         require(
             known, f"{folder / data} must have the places of all markers at time 0, where they tell which they are."
         )
+        require(len(times) > 1, f"{folder / data} has no time after 0: there is nothing to fit.")
         markers = Markers.at(particles, positions[0])
-        return Tracks(times, positions, which=markers, sigma=sigma, weight=weight, robust=robust, name=name)
+        return Tracks(times[1:], positions[1:], which=markers, sigma=sigma, weight=weight, robust=robust, name=name)
 
     return observation

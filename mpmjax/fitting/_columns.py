@@ -17,12 +17,13 @@ def read_columns(path: Path, *names: str) -> list[np.ndarray]:
         ValueError: no such file or column, or an entry that is no number.
     """
     try:
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line and not line.startswith("#")]
+        text = path.read_text(encoding="utf-8-sig")
+        lines = [line for line in text.splitlines() if line and not line.startswith("#")]
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"Cannot read the data file {path}: {reason(error).lower()}.") from None
     columns: list[list[float]] = [[] for _ in names]
     try:
-        reader = csv.DictReader(lines)
+        reader = csv.DictReader(lines, skipinitialspace=True)
         known = reader.fieldnames or []
         for name in names:  # of what else is in the file nothing is said: it may be another file than was meant
             close = difflib.get_close_matches(name, known, 1)
@@ -40,4 +41,5 @@ def read_columns(path: Path, *names: str) -> list[np.ndarray]:
                 require(np.isfinite(column[-1]), f"{where} {shortened(cell, 20)!r}.")
     except csv.Error as error:
         raise ValueError(f"{path} is not a CSV file: {error}.") from None
+    require(len(columns[0]) > 0, f"{path} has a header and no rows: there is nothing to fit.")
     return [np.asarray(column) for column in columns]

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -16,7 +17,7 @@ from mpmjax.fitting._least_squares import Iteration, Minimum, NoDerivativeError,
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
-from mpmjax.fitting._uncertainty import Uncertainty, noise, seen_together, uncertainty
+from mpmjax.fitting._uncertainty import Uncertainty, noise, quantile, seen_together, uncertainty
 
 
 @checked
@@ -64,8 +65,7 @@ def fit(
         ValueError: a parameter that is no number of the experiment, lies outside its bounds or does not influence the
             data; too few data; data that the simulation does not reach.
         SimulationError: the simulation at the first guess meets a fault.
-        RuntimeError: the search did not converge, or there is no derivative. What was found is in its `result`, where
-            there is any.
+        RuntimeError: there is no derivative.
     """
     problem = FitProblem((experiments,) if isinstance(experiments, Experiment) else tuple(experiments), parameters)
     require((level > 0) & (level < 1), f"level must lie between 0 and 1, got {level}.")
@@ -80,23 +80,38 @@ def fit(
 
     known = [observation.sigma is not None for observation in problem.observations]
     sigmas = tuple(jnp.asarray(o.scale() if o.sigma is None else o.sigma, problem.dtype) for o in problem.observations)
-    z, history = jnp.zeros(problem.size, problem.dtype), ()
+    report = dict(report or {})
+    _check_report(problem, report)
+    z, history, rounds = jnp.zeros(problem.size, problem.dtype), (), 0
     while True:
         found = _search(problem, z, sigmas, rtol, max_steps, say)
-        history += found.history
-        factors, freedom = _noise(problem, found, known)
-        settled = all(abs(factor - 1) < _NOISE_RTOL for factor in factors)
+        z, history, rounds = found.z, history + found.history, rounds + 1
+        estimated, freedom = _noise(problem, found, known)
+        floor = [_LEAST * o.scale() / float(np.max(s)) for o, s in zip(problem.observations, sigmas, strict=True)]
+        factors = [max(factor, least) for factor, least in zip(estimated, floor, strict=True)]
         sigmas = tuple(sigma * factor for sigma, factor in zip(sigmas, factors, strict=True))
-        if settled or len(known) == 1 or not found.converged or len(history) > _MOST_ROUNDS * max_steps:
+        moved = [abs(factor - 1) > _NOISE_RTOL for factor in factors]
+        changing = any(m and factor > least for m, factor, least in zip(moved, factors, floor, strict=True))
+        if not changing or problem.scales_alike or not found.converged or rounds == _MOST_ROUNDS:
             break
-        z = found.z
-    result = _result(problem, found, factors, freedom, sigmas, known, report or {}, level)
+    result = _result(problem, found, factors, freedom, sigmas, known, report, level)
     result = replace(result, history=history)
     if not found.converged:
-        warn(f"The fit did not converge in {len(history)} iterations: its errors hold only at a minimum. {_ADVICE}")
+        stopped = "was interrupted" if found.interrupted else "did not converge"
+        advice = "" if found.interrupted else f" {_ADVICE}"
+        warn(f"The fit {stopped} after {len(history)} iterations: its errors hold only at a minimum.{advice}")
+    elif changing and not problem.scales_alike:
+        warn(f"The noise of the observations did not settle in {rounds} rounds: give the sigma of one of them.")
     for text in result.warnings:
         warn(text)
     return result
+
+
+def _check_report(problem: FitProblem, report: Mapping[str, Callable[[Experiment], Any]]) -> None:
+    for name, of in report.items():
+        require(name not in problem.labels, f"What is reported must not have a parameter's name, got {name!r}.")
+        shape = jnp.shape(of(problem.experiments[0]))
+        require(shape == (), f"What is reported as {name!r} must be one number, got shape {shape}.")
 
 
 def _search(
@@ -115,7 +130,8 @@ def _search(
         RuntimeError: there is no derivative.
     """
     try:
-        found = levenberg_marquardt(problem, z, sigmas, rtol=rtol, max_steps=max_steps, report=say)
+        begun = partial(_require_influence, problem, sigmas)
+        found = levenberg_marquardt(problem, z, sigmas, rtol=rtol, max_steps=max_steps, report=say, begun=begun)
     except NoDerivativeError:
         raise RuntimeError(
             "The fit has no derivative. Either the tangent solve of a step did not converge: raise the max_steps of "
@@ -126,15 +142,23 @@ def _search(
         for experiment in problem.at(z):
             experiment.explain()
         raise ValueError("What is observed of the simulation at the first guess is not finite.")
-    rounding = _ROUNDING * float(jnp.finfo(problem.dtype).eps) * problem.size_of_data(sigmas)
-    size = np.linalg.norm(np.asarray(found.J), axis=0)
+    return found
+
+
+def _require_influence(problem: FitProblem, sigmas: tuple[Array, ...], J: Array) -> None:
+    """Check that the data depend on every coordinate, at the first guess, where the Jacobian is J.
+
+    Raises:
+        ValueError: they do not.
+    """
+    rounding = _ROUNDINGS * float(jnp.finfo(problem.dtype).eps) * problem.size_of_data(sigmas)
+    size = np.linalg.norm(np.asarray(J), axis=0)
     unseen = [label for label, column in zip(problem.labels, size, strict=True) if column <= rounding]
     require(
         not unseen,
         f"The data do not depend on {', '.join(unseen)}: their derivative by it is zero but for rounding. Leave it "
         "out, give it a prior, or observe what it changes.",
     )
-    return found
 
 
 def _noise(problem: FitProblem, found: Minimum, known: list[bool]) -> tuple[list[float], list[float]]:
@@ -142,13 +166,13 @@ def _noise(problem: FitProblem, found: Minimum, known: list[bool]) -> tuple[list
     r, J = np.asarray(found.r), np.asarray(found.J)
     factors, freedoms = [], []
     for observation, rows, given in zip(problem.observations, problem.rows, known, strict=True):
-        factor, freedom = (1.0, 0.0) if given else noise(r, J, rows, observation.count)
+        factor, freedom = (1.0, 0.0) if given else noise(r, J, rows, observation.count, *observation.trust)
         require(
-            np.isfinite(factor) and factor >= 0,
-            f"The noise of {observation.name!r} cannot be estimated from {observation.count} numbers, of which the "
-            "parameters take as many: give its sigma.",
+            np.isfinite(factor),
+            f"The noise of {observation.name!r} cannot be estimated from its {observation.count} numbers: the "
+            "parameters use all of them up. Give its sigma.",
         )
-        factors.append(max(factor, _LEAST))
+        factors.append(factor)
         freedoms.append(freedom)
     return factors, freedoms
 
@@ -167,7 +191,9 @@ def _result(
     r, J = np.array(found.r, float), np.array(found.J, float)
     for rows, factor in zip(problem.rows, factors, strict=True):
         r[rows], J[rows] = r[rows] / factor, J[rows] / factor
-    errors = uncertainty(J, np.inf if all(known) else sum(freedoms))
+    eps = float(jnp.finfo(problem.dtype).eps)
+    estimated = [(rows, f) for rows, f, given in zip(problem.rows, freedoms, known, strict=True) if not given]
+    errors = uncertainty(J, eps, estimated)
     experiments = problem.at(found.z)
     priors = len(r) - problem.rows[-1].stop
     counts = [o.count for o in problem.observations]
@@ -189,12 +215,11 @@ def _result(
         spectrum=errors.spectrum,
         directions=errors.directions,
         chi_squared=float((r**2).sum()),
-        degrees_of_freedom=sum(counts) + priors - problem.size,
+        degrees_of_freedom=sum(counts) + priors - errors.rank,
         noise=noises,
         experiments=experiments,
         values={n: np.asarray(v) for n, v in zip(problem.names, problem.values(found.z), strict=True)},
         level=level,
-        quantile=errors.quantile(level),
         converged=found.converged,
         history=found.history,
         warnings=tuple(seen_together(problem.labels, errors, problem.logarithmic)),
@@ -210,14 +235,15 @@ def _result(
 
 def _estimates(problem: FitProblem, z: Coordinates, errors: Uncertainty, level: float) -> tuple[Estimate, ...]:
     """The fitted numbers. An interval is symmetric in the coordinate, so it lies within the bounds."""
-    reach = jnp.asarray(errors.quantile(level) * errors.error, z.dtype)
-    lower, upper = (problem.values(jnp.where(jnp.isfinite(reach), z + side * reach, side * _FAR)) for side in (-1, 1))
+    each_error = [errors.of(unit) for unit in np.eye(problem.size)]
+    reach = jnp.asarray([quantile(level, freedom) * error for error, freedom in each_error], z.dtype)
+    lower, upper = (problem.values(z + side * reach) for side in (-1, 1))
     at, slope = jax.jvp(problem.values, (z,), (jnp.ones_like(z),))
     numbers = zip(
         problem.labels, *(_flat(a) for a in (at, slope, lower, upper, problem.starts)), errors.error, strict=True
     )
     each = zip(problem.parameters, problem.starts, problem.coordinates(z), strict=True)
-    bound = [(p.unit, p.at_bound(start, part)) for p, start, part in each for _ in range(start.size)]
+    bound = [(p.unit, bool(at)) for p, start, part in each for at in p.at_bound(start, part).reshape(-1)]
     return tuple(
         Estimate(label, value, abs(by) * error, (min(a, b), max(a, b)), unit, start, at_bound)
         for (label, value, by, a, b, start, error), (unit, at_bound) in zip(numbers, bound, strict=True)
@@ -232,11 +258,8 @@ def _reported(
     def value(z: Coordinates) -> Array:
         return jnp.asarray(of(problem.at(z)[0]))
 
-    require(jnp.shape(value(z)) == (), f"What is reported as {name!r} must be one number, got {jnp.shape(value(z))}.")
-    slope = np.asarray(jax.jacfwd(value)(z), float)
-    at = slope != 0
-    error = float(np.sqrt(slope[at] @ errors.covariance[np.ix_(at, at)] @ slope[at]))
-    number, reach = float(value(z)), errors.quantile(level) * error
+    error, freedom = errors.of(np.asarray(jax.jacfwd(value)(z), float))
+    number, reach = float(value(z)), quantile(level, freedom) * error
     return Estimate(name, number, error, (number - reach, number + reach), start=float(value(jnp.zeros_like(z))))
 
 
@@ -260,9 +283,7 @@ _NOISE_RTOL = 1e-3
 _MOST_ROUNDS = 20
 _LEAST = 1e-12
 """Smallest noise, in sizes of the data: exact data have none."""
-_ROUNDING = 1e3
-"""Derivatives by a coordinate below this many roundings of the data are none."""
-_FAR = 700.0
-"""The end of an interval, in coordinates, where the data do not see the parameter."""
+_ROUNDINGS = 10
+"""Derivatives by a coordinate below so many roundings of the data are none."""
 _IMPROBABLE = 1e-3
 _ADVICE = "Raise max_steps, start closer, or give a rtol that the precision can reach."

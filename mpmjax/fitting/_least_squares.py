@@ -36,6 +36,7 @@ class Minimum(NamedTuple):
     J: Float[Array, "m n"]
     """Their derivative."""
     converged: bool
+    interrupted: bool
     history: tuple[Iteration, ...]
 
 
@@ -51,12 +52,16 @@ def levenberg_marquardt(
     rtol: float,
     max_steps: int,
     report: Callable[[Iteration], None] | None = None,
+    begun: Callable[[Array], None] | None = None,
 ) -> Minimum:
     """The least Σ r² near z, by optimistix's Levenberg-Marquardt method.
 
     One compiled function makes an iteration: it evaluates residuals and Jacobian together, once. A step at which a
     simulation fails has residuals of NaN, is not taken, and the next is shorter. An interruption (Ctrl-C) ends the
     search where it is.
+
+    It ends by optimistix's criterion, or where the next Gauss-Newton step would be less than a ten-thousandth of the
+    standard error that the misfit gives: in single precision residuals are never still.
 
     Args:
         problem: the residuals.
@@ -65,13 +70,15 @@ def levenberg_marquardt(
         rtol: relative and absolute tolerance of coordinates and residuals.
         max_steps: most iterations.
         report: called after each.
+        begun: called with the Jacobian where it starts, shape (m, n).
 
     Raises:
         NoDerivativeError: a derivative is not finite.
     """
     solver = optimistix.LevenbergMarquardt(rtol=rtol, atol=rtol)
+    z = z.astype(float)  # optimistix's own numbers are of JAX's default precision
     history: list[Iteration] = []
-    converged, r, J = False, jnp.zeros((0,)), jnp.zeros((0, problem.size))
+    converged, interrupted, r, J = False, False, jnp.zeros((0,)), jnp.zeros((0, problem.size))
     state = _begin(problem, solver, z, sigmas)
     try:
         for number in range(max_steps):
@@ -81,28 +88,48 @@ def levenberg_marquardt(
                 raise NoDerivativeError
             moved = not history or cost != history[-1].cost
             history.append(Iteration(number, cost, slope, moved, np.asarray(z)))
+            if number == 0 and begun is not None and np.isfinite(cost):
+                begun(J)
             if report is not None:
                 report(history[-1])
-            converged = bool(state.terminate)
+            converged = bool(state.terminate) or _is_done(np.asarray(r, float), np.asarray(J, float))
             if converged or not np.isfinite(cost):
                 break
     except KeyboardInterrupt:
         if not history:
             raise
-    return Minimum(z, r, J, converged, tuple(history))
+        interrupted = True
+    return Minimum(z.astype(problem.dtype), r, J, converged, interrupted, tuple(history))
+
+
+def _is_done(r: np.ndarray, J: np.ndarray) -> bool:
+    """Whether the next Gauss-Newton step p is far below the standard errors: ‖J p‖ against √(Σ r²/(m − n))."""
+    if len(r) <= J.shape[1] or not (np.isfinite(r).all() and np.isfinite(J).all()):
+        return False
+    U, singular, _ = np.linalg.svd(J, full_matrices=False)
+    change = U[:, singular > 1e-10 * singular.max(initial=0)].T @ r
+    return bool((change**2).sum() <= _NEGLIGIBLE**2 * (r**2).sum() / (len(r) - J.shape[1]))
+
+
+_NEGLIGIBLE = 1e-4
+"""A step of so many standard errors is none."""
 
 
 def _residuals(z: Coordinates, args: tuple[FitProblem, tuple[Array, ...]]) -> tuple[Array, None]:
     """The residuals, with a derivative by forward mode in one pass."""
     problem, sigmas = args
 
+    def jacobian(z: Coordinates) -> tuple[Array, Array]:
+        r, J = problem.jacobian(z.astype(problem.dtype), sigmas)
+        return r.astype(z.dtype), J.astype(z.dtype)
+
     @jax.custom_jvp
     def residuals(z: Coordinates) -> Array:
-        return problem.jacobian(z, sigmas)[0]
+        return jacobian(z)[0]
 
     @residuals.defjvp
     def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-        r, J = problem.jacobian(primals[0], sigmas)
+        r, J = jacobian(primals[0])
         return r, J @ tangents[0]
 
     return residuals(z), None

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -29,9 +30,9 @@ class AbstractObservation(eqx.Module):
     sigma: eqx.AbstractVar[Scalar | np.ndarray | None]
     """Standard deviation of its noise, a number or an array that broadcasts against the data, in the data's unit; None
     to estimate it from the misfit."""
-    weight: eqx.AbstractVar[Scalar]
-    """Factor of its squares [-]: 1 believes the noise, less than 1 counts correlated points less."""
-    robust: eqx.AbstractVar[Scalar | None]
+    weight: eqx.AbstractVar[np.ndarray]
+    """Factor of its squares [-]: 1 believes the noise, less than 1 counts points whose noise is correlated less."""
+    robust: eqx.AbstractVar[np.ndarray | None]
     """The misfit, in standard deviations, beyond which squares grow but linearly (pseudo-Huber), so that outliers count
     little; None for squares throughout."""
     name: eqx.AbstractVar[str]
@@ -88,6 +89,11 @@ class AbstractObservation(eqx.Module):
         return "number", np.arange(len(np.atleast_1d(self.data)))
 
     @property
+    def trust(self) -> tuple[float, float | None]:
+        """Weight and robust limit, as numbers."""
+        return float(self.weight), None if self.robust is None else float(self.robust)
+
+    @property
     def count(self) -> int:
         """How many numbers were measured."""
         return int(np.isfinite(self.data).sum())
@@ -103,6 +109,11 @@ class AbstractObservation(eqx.Module):
         With `robust` δ large ones are drawn nearer: r becomes r √(2/(1 + √(1 + r²/δ²))), and half its square
         δ² (√(1 + r²/δ²) − 1).
         """
+        require(
+            predicted.shape == self.data.shape,
+            f"{type(self).__name__} {self.name!r} has data of shape {self.data.shape}, what the simulation says has "
+            f"shape {predicted.shape}.",
+        )
         dtype = predicted.dtype
         data, sigma, weight = (jnp.asarray(a, dtype) for a in (self.data, sigma, self.weight))
         measured = jnp.isfinite(data)
@@ -131,8 +142,8 @@ class Series(AbstractObservation):
     data: np.ndarray
     of: Callable[[Scene, Particles], Any]
     sigma: Scalar | np.ndarray | None
-    weight: Scalar
-    robust: Scalar | None
+    weight: np.ndarray
+    robust: np.ndarray | None
     name: str = eqx.field(static=True)
 
     def __init__(
@@ -147,7 +158,8 @@ class Series(AbstractObservation):
         name: str = "series",
     ):
         self.times, self.data = np.asarray(times, float), np.asarray(values, float)
-        self.of, self.weight, self.robust, self.name = of, weight, robust, name
+        self.of, self.name = of, name
+        self.weight, self.robust = np.asarray(weight, float), None if robust is None else np.asarray(robust, float)
         self.sigma = None if sigma is None else np.asarray(sigma, float)
         what = f"{type(self).__name__} {name!r}"
         require(
@@ -176,15 +188,34 @@ class Series(AbstractObservation):
             f"The times of {what} must lie in the run, from 0 to {t1:g} s, but {int(outside.sum())} do not, the first "
             f"{self.times[outside][:1]}: raise t1, or leave them out.",
         )
+        self._check_shape(jax.eval_shape(lambda: self.observe(scene, particles)))
+
+    def _check_shape(self, seen: Any) -> None:
+        shape = getattr(seen, "shape", None)
+        require(
+            shape == self.data.shape[1:],
+            f"{type(self).__name__} {self.name!r} has values of shape {self.data.shape[1:]} at each time, but of "
+            f"returns {'no array' if shape is None else f'shape {shape}'}.",
+        )
+
+    def until(self, t1: float) -> "Series":
+        """The part of it that was measured until a time [s].
+
+        Raises:
+            ValueError: there is none.
+        """
+        kept = self.times <= t1 * (1 + 1e-9)
+        require(kept.any(), f"{type(self).__name__} {self.name!r} begins at {self.times[0]:g} s, after t1 = {t1:g} s.")
+        sigma = None if self.sigma is None else np.broadcast_to(self.sigma, self.data.shape)[kept]
+        return eqx.tree_at(
+            lambda o: (o.times, o.data, o.sigma),
+            self,
+            (self.times[kept], self.data[kept], sigma),
+            is_leaf=lambda leaf: leaf is None,
+        )
 
     def explain(self, seen: Array, run: Run) -> None:
         del run
-        shape = np.shape(seen)[1:]
-        require(
-            shape == self.data.shape[1:],
-            f"{type(self).__name__} {self.name!r} has values of shape {self.data.shape[1:]} at each time, what the "
-            f"simulation says has {shape}.",
-        )
         require_finite(f"What the simulation says of {self.name!r}", seen)
 
 
@@ -202,6 +233,8 @@ def _between(values: Array, place: Array) -> Array:
 
 _ON_A_ROW = 1e-6
 """Part of a step by which a time may miss a step and is on it."""
+_SLACK = 1e-6
+"""Part of a curve's length by which a point may lie beside it, as rounding of its start has it."""
 
 
 class Tracks(Series):
@@ -237,11 +270,11 @@ class Tracks(Series):
         )
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
-        super().check(scene, particles, t1)
         require(
             self.data.shape[2] == particles.dim,
             f"Tracks {self.name!r} are {self.data.shape[2]}-dimensional, the particles {particles.dim}-dimensional.",
         )
+        super().check(scene, particles, t1)
         assert isinstance(self.of, Markers)
         self.of.check(self.name, particles.count)
 
@@ -276,6 +309,10 @@ class Force(Series):
     ):
         self.collider = collider
         super().__init__(times, forces, _nothing, sigma=sigma, weight=weight, robust=robust, name=name)
+
+    def _check_shape(self, seen: Any) -> None:
+        """The forces' shape is checked when they are predicted."""
+        del seen
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
         super().check(scene, particles, t1)
@@ -316,8 +353,8 @@ class Curve(AbstractObservation):
     data: np.ndarray
     of: Callable[[Scene, Particles], Any]
     sigma: Scalar | np.ndarray | None
-    weight: Scalar
-    robust: Scalar | None
+    weight: np.ndarray
+    robust: np.ndarray | None
     name: str = eqx.field(static=True)
 
     def __init__(
@@ -334,7 +371,8 @@ class Curve(AbstractObservation):
     ):
         self.x_name = x_name
         self.x, self.data = np.asarray(x, float), np.asarray(y, float)
-        self.of, self.weight, self.robust, self.name = of, weight, robust, name
+        self.of, self.name = of, name
+        self.weight, self.robust = np.asarray(weight, float), None if robust is None else np.asarray(robust, float)
         self.sigma = None if sigma is None else np.asarray(sigma, float)
         require(
             self.x.ndim == 1 and self.x.shape == self.data.shape,
@@ -353,7 +391,8 @@ class Curve(AbstractObservation):
         del run
         x, y = seen
         wanted = jnp.asarray(self.x, y.dtype)
-        reached = (wanted >= x[0]) & (wanted <= x[-1]) & (jnp.diff(x) > 0).all()
+        slack = _SLACK * (x[-1] - x[0])
+        reached = (wanted >= x[0] - slack) & (wanted <= x[-1] + slack) & (jnp.diff(x) > 0).all()
         return jnp.where(reached, jnp.interp(wanted, x, y), jnp.nan)
 
     def explain(self, seen: Any, run: Run) -> None:
@@ -364,7 +403,8 @@ class Curve(AbstractObservation):
             f"The simulated abscissa of Curve {self.name!r} must grow with every step of the run: slow the loading "
             "down, or reduce dt.",
         )
-        outside = (self.x < x[0]) | (self.x > x[-1])
+        slack = _SLACK * (x[-1] - x[0])
+        outside = (self.x < x[0] - slack) | (self.x > x[-1] + slack)
         require(
             ~outside,
             f"The simulation covers {x[0]:.4g} to {x[-1]:.4g}, which leaves out measured points of Curve {self.name!r} "

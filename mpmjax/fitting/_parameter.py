@@ -24,16 +24,16 @@ class Gaussian(eqx.Module):
         sigma: its standard deviation, likewise.
     """
 
-    mean: Scalar | Value | tuple[float, ...]
-    sigma: Scalar | Value | tuple[float, ...]
+    mean: Scalar | np.ndarray | Value = eqx.field(converter=lambda a: np.asarray(a, float))
+    sigma: Scalar | np.ndarray | Value = eqx.field(converter=lambda a: np.asarray(a, float))
 
     def __check_init__(self):
         require_finite("Gaussian's mean", self.mean)
         require_positive("Gaussian's sigma", self.sigma)
 
     def residuals(self, value: Value) -> Value:
-        """(value − mean)/σ [-]."""
-        mean, sigma = (jnp.asarray(a, value.dtype) for a in (self.mean, self.sigma))
+        """(value − mean)/σ [-], of the value's shape."""
+        mean, sigma = (jnp.broadcast_to(jnp.asarray(a, value.dtype), value.shape) for a in (self.mean, self.sigma))
         return (value - mean) / sigma
 
 
@@ -75,6 +75,10 @@ class AbstractParameter(eqx.Module):
         """The value at a coordinate z [-]; `start` at zero."""
 
     @abc.abstractmethod
+    def coordinate(self, start: Value, value: Value) -> Value:
+        """z [-] at a value, with zero at `start`."""
+
+    @abc.abstractmethod
     def check(self, name: str, start: np.ndarray) -> None:
         """Check that the first guess lies within the bounds.
 
@@ -82,10 +86,10 @@ class AbstractParameter(eqx.Module):
             ValueError: it does not.
         """
 
-    def at_bound(self, start: Value, z: Value) -> bool:
-        """Whether the value has come so near to a bound that the data want to go beyond it."""
-        del start, z
-        return False
+    def at_bound(self, start: Value, z: Value) -> np.ndarray:
+        """Whether each number has come so near to a bound that the data want to go beyond it, of the value's shape."""
+        del z
+        return np.zeros(start.shape, bool)
 
     def first_guess(self, experiment: Experiment) -> Array:
         """The value that the search starts from."""
@@ -103,6 +107,8 @@ class AbstractParameter(eqx.Module):
         assert where is not None
         leaves = where(experiment)
         count = len(leaves) if isinstance(leaves, tuple) else None
+        shapes = {jnp.shape(leaf) for leaf in (leaves if isinstance(leaves, tuple) else (leaves,))}
+        require(shapes == {value.shape}, f"it has shape {sorted(shapes)}, and its start {value.shape}.")
         return eqx.tree_at(where, experiment, value if count is None else (value,) * count)
 
 
@@ -129,8 +135,14 @@ class Unbounded(AbstractParameter):
 
     def value(self, start: Value, z: Value) -> Value:
         """start + scale z."""
+        return start + self._scale(start) * z
+
+    def coordinate(self, start: Value, value: Value) -> Value:
+        return (value - start) / self._scale(start)
+
+    def _scale(self, start: Value) -> Value | Scalar:
         size = jnp.abs(start).max()
-        return start + (jnp.where(size == 0, 1, size) if self.scale is None else self.scale) * z
+        return jnp.where(size == 0, 1, size) if self.scale is None else self.scale
 
     def check(self, name: str, start: np.ndarray) -> None:
         if self.scale is not None:
@@ -161,6 +173,9 @@ class Positive(AbstractParameter):
         """start·e^z."""
         return start * jnp.exp(z)
 
+    def coordinate(self, start: Value, value: Value) -> Value:
+        return jnp.log(value / start)
+
     def check(self, name: str, start: np.ndarray) -> None:
         require(start > 0, f"The parameter {name!r} must start from positive numbers, got {start}.")
 
@@ -190,7 +205,10 @@ class Bounded(AbstractParameter):
 
     def value(self, start: Value, z: Value) -> Value:
         """lower + (upper − lower)/(1 + e^{−(z0 + z)})."""
-        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(self._coordinate(start) + z)
+        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(self._logit(start) + z)
+
+    def coordinate(self, start: Value, value: Value) -> Value:
+        return self._logit(value) - self._logit(start)
 
     def check(self, name: str, start: np.ndarray) -> None:
         require(
@@ -202,10 +220,11 @@ class Bounded(AbstractParameter):
             f"The parameter {name!r} must start between its bounds {self.lower} and {self.upper}, got {start}.",
         )
 
-    def at_bound(self, start: Value, z: Value) -> bool:
-        return bool((jnp.abs(self._coordinate(start) + z) > _AT_BOUND).any())
+    def at_bound(self, start: Value, z: Value) -> np.ndarray:
+        now, first = (np.abs(np.asarray(a)) for a in (self._logit(start) + z, self._logit(start)))
+        return np.asarray(now > np.maximum(_AT_BOUND, first + 1))
 
-    def _coordinate(self, value: Value) -> Value:
+    def _logit(self, value: Value) -> Value:
         """The logit of where the value lies between the bounds."""
         share = (value - self.lower) / (self.upper - self.lower)
         return jnp.log(share) - jnp.log1p(-share)

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import diffrax
@@ -36,18 +37,30 @@ class FitProblem(eqx.Module):
         require(len(dtypes) == 1, f"All experiments of a fit must have particles of one precision, got {dtypes}.")
         self.experiments, self.names, self.parameters = experiments, tuple(parameters), tuple(parameters.values())
         self.starts = tuple(self._start(name, p) for name, p in parameters.items())
+        self.parameters = tuple(replace(p, start=start) for p, start in zip(self.parameters, self.starts, strict=True))
         points = sum(o.count for o in self.observations)
         known = sum(s.size for s, p in zip(self.starts, self.parameters, strict=True) if p.prior is not None)
         require(
             points + known >= self.size,
             f"{points} measured numbers cannot fix {self.size} parameters: measure more, give priors, or fit fewer.",
         )
+        given = any(o.sigma is not None for o in self.observations)
+        require(
+            given or points + known > self.size,
+            f"{points} measured numbers fix {self.size} parameters and leave none to estimate the noise: give sigma.",
+        )
 
     def _start(self, name: str, parameter: AbstractParameter) -> Array:
-        unknown = [k for k in parameter.only or () if not 0 <= k < len(self.experiments)]
+        own = range(len(self.experiments)) if parameter.only is None else parameter.only
+        unknown = [k for k in own if not 0 <= k < len(self.experiments)]
         require(not unknown, f"The parameter {name!r} is only of experiments {unknown}, which there are not.")
-        start = _first_guess(name, parameter, self.experiments[(parameter.only or (0,))[0]])
+        require(len(own) > 0, f"The parameter {name!r} is of no experiment: only must name one at least.")
+        start = _first_guess(name, parameter, self.experiments[own[0]])
         parameter.check(name, np.asarray(start))
+        if parameter.prior is not None:
+            shapes = {np.shape(parameter.prior.mean), np.shape(parameter.prior.sigma)}
+            fits = shapes <= {(), start.shape}
+            require(fits, f"The prior of {name!r} must have one number or shape {start.shape}, got {sorted(shapes)}.")
         return start
 
     @property
@@ -73,6 +86,12 @@ class FitProblem(eqx.Module):
             places = np.ndindex(start.shape)
             labels += [name if start.ndim == 0 else f"{name}[{', '.join(map(str, place))}]" for place in places]
         return tuple(labels)
+
+    @property
+    def scales_alike(self) -> bool:
+        """Whether another noise would not move the minimum: of one observation, squares alone and no prior."""
+        (first, *others), priors = self.observations, [p for p in self.parameters if p.prior is not None]
+        return not others and not priors and first.robust is None
 
     @property
     def logarithmic(self) -> tuple[bool, ...]:
@@ -153,7 +172,7 @@ def _first_guess(name: str, parameter: AbstractParameter, experiment: Experiment
     """
     try:
         start = parameter.first_guess(experiment)
-        changed = parameter.put(experiment, start + 1)
+        changed = parameter.put(experiment, start + 1 + jnp.abs(start))
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"The parameter {name!r} must name a number of the experiment e, such as "

@@ -5,9 +5,10 @@ from typing import Any, Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import KDTree
 
 from mpmjax._types import Array, Float, ParticleScalar, ParticleVector
-from mpmjax.checks import canonical, require
+from mpmjax.checks import canonical, is_traced, require
 from mpmjax.discretisation import BSpline, Grid, SplineGradient, make_stencil, scatter
 from mpmjax.geometry import AbstractRegion
 from mpmjax.state import Particles, Scene
@@ -59,9 +60,9 @@ class Markers(eqx.Module):
             f"Markers need places of shape (m, {d}), got {places.shape}.",
         )
         k = min(_NEIGHBOURS**d, particles.count)
-        away = x[None] - places[:, None]
-        nearest = np.argsort((away**2).sum(axis=-1), axis=1, kind="stable")[:, :k]
-        arms = np.take_along_axis(away, nearest[..., None], axis=1)
+        require(k > d, f"Markers between particles need more than {d} of them, got {particles.count}.")
+        nearest = np.asarray(KDTree(x).query(places, k)[1])
+        arms = x[nearest] - places[:, None]
         far = np.sqrt((arms**2).sum(axis=-1).max(axis=1, keepdims=True))
         weight = np.exp(-4 * (arms**2).sum(axis=-1) / far**2)
         conditions = np.concatenate([np.ones((len(places), k, 1)), arms / far[..., None]], axis=-1)
@@ -97,6 +98,8 @@ class Markers(eqx.Module):
     def __call__(self, scene: Scene, particles: Particles) -> Float[Array, "m d"]:
         """Positions [m], shape (m, d)."""
         del scene
+        if not is_traced(self.which):
+            self.check("markers", particles.count)
         return (jnp.asarray(self.share, particles.x.dtype)[..., None] * particles.x[self.which]).sum(axis=1)
 
 
@@ -119,6 +122,7 @@ class Extent(eqx.Module):
     def __call__(self, scene: Scene, particles: Particles) -> Float[Array, ""]:
         """The coordinate [m]."""
         del scene
+        require(0 <= self.axis < particles.dim, f"Extent's axis must be below {particles.dim}, got {self.axis}.")
         along = particles.x[:, self.axis]
         return along.max() if self.side == "upper" else along.min()
 

@@ -5,14 +5,17 @@ from itertools import pairwise
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Scalar
-from mpmjax.checks import checked, require, require_positive
+from mpmjax._types import Array, Scalar
+from mpmjax.checks import checked, require, require_positive, warn
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import fit
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._result import Estimate, FitResult
+from mpmjax.fitting._uncertainty import quantile
 
 
 class RefinedFit(eqx.Module):
@@ -31,7 +34,7 @@ class RefinedFit(eqx.Module):
     from_discretisation: tuple[float, ...]
     """The part that is left of the discretisation."""
     order: tuple[float, ...]
-    """The order in the spacing with which each was extrapolated."""
+    """The order in the spacing with which each was extrapolated; NaN of what does not converge."""
 
     def __getitem__(self, label: str) -> Estimate:
         """The extrapolated estimate of a parameter.
@@ -55,6 +58,9 @@ class RefinedFit(eqx.Module):
             interval = f"{e.interval[0]:.5g} to {e.interval[1]:.5g}"
             name = f"{e.label} [{e.unit}]" if e.unit else e.label
             lines.append(f"{name:<20}{each} {e.value:>13.6g} ± {e.error:<9.2g} {interval:<25} {rules}")
+        for n, found in zip(self.refinements, self.fits, strict=True):
+            lines += [f"spacing/{n}: {text}" for text in found.warnings]
+            lines += [] if found.converged else [f"spacing/{n}: NOT CONVERGED"]
         return "\n".join(lines)
 
 
@@ -80,10 +86,11 @@ def fit_refined(
 
         print(mpm.fit_refined(build, {"E": ...}))
 
-    With estimates a and b on the two finest grids, their spacings in the ratio r, the extrapolation is
-    b + (b − a)/(r^p − 1), and its error from the discretisation is taken as that whole correction. With three grids or
-    more p is what the three finest show, between half and twice `order`. It is added to the error of the noise by
-    squares.
+    With estimates a and b on the two finest grids, in the search's coordinate, and their spacings in the ratio r, the
+    extrapolation is b + (b − a)/(r^p − 1), and the standard error that is left of the discretisation is taken as that
+    whole correction. p is `order`; with three grids of equal ratios it is what they show, between half and twice that.
+    Where they do not converge, the finest estimate stays, with its last change as the error, and a warning says so.
+    Intervals are made of both parts, in the coordinate, so they keep to the parameters' bounds.
 
     Args:
         build: the experiments on n times as many cells a direction, from n; take the step n times shorter too.
@@ -106,30 +113,73 @@ def fit_refined(
     )
     require_positive("order", order)
     fits: list[FitResult] = []
+    searched = parameters
     for n in numbers:
-        found = fit(build(n), parameters, report=report, level=level, rtol=rtol, max_steps=max_steps, progress=progress)
+        found = fit(build(n), searched, report=report, level=level, rtol=rtol, max_steps=max_steps, progress=progress)
         fits.append(found)
-        parameters = found.restarted(parameters)
-    values = np.array([[e.value for e in found.all] for found in fits])
-    estimates, noise, left, orders = [], [], [], []
-    for k, last in enumerate(fits[-1].all):
-        p = _order(values[:, k], numbers, float(order))
-        correction = (values[-1, k] - values[-2, k]) / ((numbers[-1] / numbers[-2]) ** p - 1)
-        value, error = values[-1, k] + correction, float(np.hypot(last.error, correction))
-        reach = fits[-1].quantile * error
-        estimates.append(last._replace(value=value, error=error, interval=(value - reach, value + reach)))
-        noise.append(last.error)
-        left.append(abs(float(correction)))
-        orders.append(p)
-    return RefinedFit(tuple(fits), tuple(numbers), tuple(estimates), tuple(noise), tuple(left), tuple(orders))
+        searched = found.restarted(parameters)
+    sizes = [(p, fits[-1].values[name].size) for name, p in parameters.items()]
+    kinds: list[AbstractParameter | None] = [p for p, size in sizes for _ in range(size)]
+    kinds += [None] * len(fits[-1].reported)
+    each = zip(kinds, zip(*(found.all for found in fits), strict=True), strict=True)
+    normal = quantile(float(level), np.inf)
+    extrapolated = [_extrapolate(kind, estimates, numbers, float(order), normal) for kind, estimates in each]
+    estimates, left, orders = zip(*extrapolated, strict=True)
+    return RefinedFit(tuple(fits), tuple(numbers), estimates, tuple(e.error for e in fits[-1].all), left, orders)
+
+
+def _extrapolate(
+    kind: AbstractParameter | None, found: tuple[Estimate, ...], refinements: list[int], order: float, normal: float
+) -> tuple[Estimate, float, float]:
+    """One number extrapolated; the part of its error that is left of the discretisation; and the order, NaN where the
+    estimates do not converge.
+
+    Args:
+        kind: its parameter; None for what was reported.
+        found: its estimates, from coarse to fine.
+        refinements: the grids.
+        order: the order in the spacing.
+        normal: the reach of an interval of the normal distribution, in standard errors.
+    """
+    last = found[-1]
+    at = jnp.asarray(last.value, float)
+
+    def coordinate(value: float) -> float:
+        return value - last.value if kind is None else float(kind.coordinate(at, jnp.asarray(value, at.dtype)))
+
+    def back(z: Any) -> Array:
+        return at + z if kind is None else kind.value(at, jnp.asarray(z, at.dtype))
+
+    values = np.array([coordinate(e.value) for e in found])
+    p = _order(values, refinements, order)
+    change = values[-1] - values[-2]
+    correction = 0.0 if np.isnan(p) else change / ((refinements[-1] / refinements[-2]) ** p - 1)
+    remains = abs(change) if np.isnan(p) else abs(correction)
+    if np.isnan(p):
+        shown = ", ".join(f"{e.value:.5g}" for e in found)
+        warn(f"{last.label} does not converge with the spacing ({shown}): it is not extrapolated.")
+    lower, upper = (coordinate(end) for end in last.interval)
+    reach = np.hypot([lower, upper], normal * remains)
+    discretisation = float(jax.grad(lambda z: back(z))(jnp.asarray(correction, at.dtype))) * remains
+    ends = float(back(correction - reach[0])), float(back(correction + reach[1]))
+    estimate = last._replace(
+        value=float(back(correction)),
+        error=float(np.hypot(last.error, discretisation)),
+        interval=(min(ends), max(ends)),
+        start=found[0].start,
+    )
+    return estimate, abs(discretisation), p
 
 
 def _order(values: np.ndarray, refinements: list[int], order: float) -> float:
-    """The order that the three finest grids show, if their ratios are one; else the one that was given."""
+    """The order that the three finest grids show, if their ratios are one, NaN if they do not converge; with fewer, or
+    other ratios, the one that was given."""
     if len(values) < 3 or refinements[-1] * refinements[-3] != refinements[-2] ** 2:
         return order
     first, second = values[-2] - values[-3], values[-1] - values[-2]
-    if second == 0 or first / second <= 1:
-        return order / 2
+    if second == 0:
+        return order
+    if first / second <= 1:
+        return float("nan")
     seen = np.log(first / second) / np.log(refinements[-1] / refinements[-2])
     return float(np.clip(seen, order / 2, 2 * order))

@@ -74,8 +74,6 @@ class FitResult(eqx.Module):
     """The value of each parameter, in its shape."""
     level: float
     """That of the intervals."""
-    quantile: float
-    """How many standard errors an interval reaches to each side, in the search's coordinate."""
     converged: bool
     history: tuple[Iteration, ...]
     warnings: tuple[str, ...]
@@ -97,8 +95,10 @@ class FitResult(eqx.Module):
 
     @property
     def p_value(self) -> float:
-        """The probability of so large a χ² if the model and the noise given are right; NaN if noise was estimated."""
-        if any(noise.estimated for noise in self.noise) or self.degrees_of_freedom < 1:
+        """The probability of so large a χ² if the model and the noise given are right; NaN if noise was estimated, or
+        an observation is robust or weighted."""
+        plain = all(o.trust == (1.0, None) for e in self.experiments for o in e.observations)
+        if not plain or any(noise.estimated for noise in self.noise) or self.degrees_of_freedom < 1:
             return np.nan
         return float(scipy.stats.chi2.sf(self.chi_squared, self.degrees_of_freedom))
 

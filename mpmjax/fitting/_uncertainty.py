@@ -1,79 +1,147 @@
 """How well a minimum of least squares fixes its parameters."""
 
 import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.integrate
 import scipy.stats
 
-_UNSEEN = 1e-12
-"""Eigenvalues of JᵀJ below this part of the largest are rounding: the data do not see the direction at all."""
+_ROUNDINGS = 1e3
+"""Singular values of J, its columns of length one, below this many roundings of the largest are none: the data do not
+see the direction."""
+_SHARE = 1e-6
+"""Part of a unit vector below which it does not lie in a direction."""
+_LEAST_FREEDOM = 1e-3
+"""Degrees of freedom below which there are none, but rounding."""
 _NEARLY_ONE = 0.99
 """Correlation from which two parameters are said to be seen only together."""
 
 
 class Uncertainty(NamedTuple):
-    """The covariance of the coordinates at a minimum."""
+    """The covariance of n coordinates at a minimum, by the Gauss-Newton Hessian."""
 
-    covariance: np.ndarray
-    """(JᵀJ)⁻¹, shape (n, n); infinite on its diagonal where the data do not see a coordinate."""
+    inverse: np.ndarray
+    """The pseudo-inverse of JᵀJ, shape (n, n): the covariance, but in directions that the data do not see."""
+    unseen: np.ndarray
+    """Directions that the data do not see, one a column, shape (n, u)."""
     spectrum: np.ndarray
     """The eigenvalues of the Fisher information JᵀJ, growing, shape (n,)."""
     directions: np.ndarray
-    """Their eigenvectors, shape (n, n), one a column."""
-    degrees_of_freedom: float
-    """Of Student's t: infinite where the noise is known."""
+    """Their eigenvectors, one a column, shape (n, n)."""
+    parts: tuple[np.ndarray, ...]
+    """For each observation whose noise was estimated, its part of the covariance, shape (n, n)."""
+    freedoms: tuple[float, ...]
+    """The degrees of freedom of each of these estimates."""
+
+    @property
+    def rank(self) -> int:
+        """Number of directions that the data see."""
+        return len(self.inverse) - self.unseen.shape[1]
 
     @property
     def error(self) -> np.ndarray:
         """Standard errors, shape (n,)."""
-        return np.sqrt(np.diag(self.covariance))
+        return np.array([self.of(unit)[0] for unit in np.eye(len(self.inverse))])
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """The covariance, shape (n, n); infinite on the diagonal of a coordinate that the data do not see."""
+        covariance = self.inverse.copy()
+        at = np.isinf(self.error)
+        covariance[at, at] = np.inf
+        return covariance
 
     @property
     def correlation(self) -> np.ndarray:
-        """Correlations, shape (n, n); NaN beside a coordinate that is not seen."""
+        """Correlations, shape (n, n); NaN beside a coordinate that the data do not see."""
         error = self.error
         with np.errstate(invalid="ignore"):
-            return self.covariance / np.outer(error, error)
+            found = self.inverse / np.outer(error, error)
+        found[np.isinf(error)] = np.nan
+        found[:, np.isinf(error)] = np.nan
+        return found
 
-    def quantile(self, level: float) -> float:
-        """How many standard errors an interval of this level reaches to each side: of Student's t, or of the normal
-        distribution where the noise is known."""
-        return float(scipy.stats.t.ppf((1 + level) / 2, self.degrees_of_freedom))
+    def of(self, gradient: np.ndarray) -> tuple[float, float]:
+        """The standard error of a number with this gradient by the coordinates, shape (n,), and its degrees of freedom:
+        infinite where all noise is known, else by Welch and Satterthwaite (B. L. Welch, Biometrika 34 (1947) 28,
+        doi 10.1093/biomet/34.1-2.28), (Σ_k v_k)²/Σ_k v_k²/ν_k with the variances v_k that the observations bring."""
+        if np.abs(self.unseen.T @ gradient).max(initial=0) > _SHARE * np.linalg.norm(gradient):
+            return np.inf, np.inf
+        variance = float(gradient @ self.inverse @ gradient)
+        brought = [float(gradient @ part @ gradient) for part in self.parts]
+        spread = sum(v**2 / freedom for v, freedom in zip(brought, self.freedoms, strict=True))
+        return np.sqrt(variance), variance**2 / spread if spread > 0 else np.inf
 
 
-def uncertainty(J: np.ndarray, degrees_of_freedom: float) -> Uncertainty:
-    """The covariance of the coordinates, by the Gauss-Newton Hessian.
+def quantile(level: float, degrees_of_freedom: float) -> float:
+    """How many standard errors an interval of this level reaches to each side: of Student's t, or with infinite degrees
+    of freedom of the normal distribution."""
+    return float(scipy.stats.t.ppf((1 + level) / 2, degrees_of_freedom))
+
+
+def uncertainty(J: np.ndarray, eps: float, estimated: Sequence[tuple[slice, float]]) -> Uncertainty:
+    """The uncertainty of the coordinates.
 
     Args:
         J: derivative of the residuals, in units of their noise, shape (m, n).
-        degrees_of_freedom: of the noise's estimate; infinite if it is known.
+        eps: the precision in which it was computed.
+        estimated: rows and degrees of freedom of each observation whose noise was estimated.
     """
-    _, singular, Vt = np.linalg.svd(J, full_matrices=len(J) < J.shape[1])
-    spectrum = np.zeros(J.shape[1])
-    spectrum[: len(singular)] = singular**2
-    seen = spectrum > _UNSEEN * spectrum.max(initial=0)
-    inverse = np.where(seen, 1 / np.where(seen, spectrum, 1), 0)
-    covariance = (Vt.T * inverse) @ Vt
-    unseen = (np.abs(Vt[~seen]) > 1e-6).any(axis=0)
-    covariance[unseen, unseen] = np.inf
-    return Uncertainty(covariance, spectrum[::-1], Vt[::-1].T, degrees_of_freedom)
+    n = J.shape[1]
+    length = np.linalg.norm(J, axis=0)
+    length = np.where(length == 0, 1, length)
+    _, singular, Vt = np.linalg.svd(J / length, full_matrices=len(J) < n)
+    values = np.zeros(n)
+    values[: len(singular)] = singular
+    seen = values > _ROUNDINGS * eps * values.max(initial=0)
+    root = Vt[seen] / values[seen, None] / length
+    inverse = root.T @ root
+    unseen = (Vt[~seen] / length).T
+    spectrum, directions = np.linalg.eigh(J.T @ J)
+    parts = tuple(inverse @ J[rows].T @ J[rows] @ inverse for rows, _ in estimated)
+    return Uncertainty(
+        inverse,
+        unseen / np.maximum(np.linalg.norm(unseen, axis=0), np.finfo(float).tiny),
+        np.maximum(spectrum, 0),
+        directions,
+        parts,
+        tuple(freedom for _, freedom in estimated),
+    )
 
 
-def noise(r: np.ndarray, J: np.ndarray, rows: slice, count: int) -> tuple[float, float]:
+def noise(
+    r: np.ndarray, J: np.ndarray, rows: slice, count: int, weight: float, robust: float | None
+) -> tuple[float, float]:
     """The factor by which an observation's noise is larger than was assumed, and its degrees of freedom: their number
-    less the share of the parameters that it fixes, m − tr(J_k (JᵀJ)⁻¹ J_kᵀ).
+    less the share of the parameters that it fixes, m − tr(J_k (JᵀJ)⁻¹ J_kᵀ). NaN where that leaves none.
 
     Args:
         r: residuals of all observations.
         J: their derivative.
         rows: those of the observation.
         count: how many of them were measured.
+        weight: the factor of its squares.
+        robust: its robust limit.
     """
-    U, singular, _ = np.linalg.svd(J, full_matrices=False)
-    seen = singular > np.sqrt(_UNSEEN) * singular.max(initial=0)
+    U, singular, _ = np.linalg.svd(J / np.maximum(np.linalg.norm(J, axis=0), np.finfo(float).tiny), full_matrices=False)
+    seen = singular > 1e-8 * singular.max(initial=0)
     freedom = count - float((U[rows][:, seen] ** 2).sum())
-    return (float(np.sqrt((r[rows] ** 2).sum() / freedom)) if freedom > 0 else np.nan), freedom
+    if freedom < _LEAST_FREEDOM:
+        return np.nan, freedom
+    return float(np.sqrt((r[rows] ** 2).sum() / (weight * freedom * _mean_square(robust)))), freedom
+
+
+def _mean_square(robust: float | None) -> float:
+    """The mean square of robust residuals of normal noise of variance one: 1 without a limit, less with one."""
+    if robust is None:
+        return 1.0
+
+    def density(r: float) -> float:
+        return 2 * r**2 / (1 + np.sqrt(1 + (r / robust) ** 2)) * scipy.stats.norm.pdf(r)
+
+    return 2 * scipy.integrate.quad(density, 0, 12)[0]
 
 
 def seen_together(labels: tuple[str, ...], found: Uncertainty, logarithmic: tuple[bool, ...]) -> list[str]:
@@ -85,15 +153,13 @@ def seen_together(labels: tuple[str, ...], found: Uncertainty, logarithmic: tupl
         found: their uncertainty.
         logarithmic: whether they are logarithms of their values.
     """
-    said, named = [], set()
-    for value, direction in zip(found.spectrum, found.directions.T, strict=True):
-        if value <= _UNSEEN * found.spectrum[-1]:
-            parts = [i for i in range(len(labels)) if abs(direction[i]) > 0.05]
-            named |= set(itertools.combinations(parts, 2))
-            said.append(_unseen(parts, direction, labels, logarithmic))
+    said, correlation = [], found.correlation
+    for direction in found.unseen.T:
+        parts = [i for i in range(len(labels)) if abs(direction[i]) > 0.05]
+        said.append(_unseen(parts, direction, labels, logarithmic))
     for i, j in itertools.combinations(range(len(labels)), 2):
-        rho = found.correlation[i, j]
-        if abs(rho) > _NEARLY_ONE and (i, j) not in named:
+        rho = correlation[i, j]
+        if abs(rho) > _NEARLY_ONE:
             together = "together" if rho > 0 else "in opposite directions"
             said.append(
                 f"{labels[i]} and {labels[j]}: {abs(rho):.5f} correlated, a change of both {together} is hardly seen."

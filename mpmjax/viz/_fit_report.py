@@ -31,12 +31,15 @@ def draw_fit(result: FitResult, path: Path, measured: tuple[Experiment, ...] = (
     figure, axes = plt.subplots(rows, 2, figsize=(9.6, 3.2 * rows), layout="constrained", squeeze=False)
     for (left, right), (observation, predicted, fitted), noise in zip(axes, panels, result.noise, strict=False):
         name, x = observation.against
-        data, model = (np.asarray(a, float).reshape(len(x), -1) for a in (observation.data, predicted))
+        order, sigma = np.argsort(x), noise.sigma if observation.sigma is None else np.asarray(observation.sigma)
+        arrays = observation.data, predicted, np.broadcast_to(sigma, observation.data.shape)
+        data, model, sigma = (np.asarray(a, float).reshape(len(x), -1)[order] for a in arrays)
+        x = x[order]
         for k in range(min(data.shape[1], _MOST_LINES)):
             left.plot(x, model[:, k], color=f"C{k}", linewidth=1.2)
             left.plot(x, data[:, k], "o", color=f"C{k}", markersize=3)
         right.axhspan(-2, 2, color="0.93")
-        right.plot(x, (model - data) / noise.sigma, ".", color="0.3", markersize=3)
+        right.plot(x, (model - data) / sigma, ".", color="0.3", markersize=3)
         last = float(fitted.against[1].max())
         if x.max() > last:
             for axis in (left, right):
@@ -45,8 +48,9 @@ def draw_fit(result: FitResult, path: Path, measured: tuple[Experiment, ...] = (
         left.set(xlabel=name, ylabel=observation.name)
         right.set(xlabel=name, ylabel="(simulated − measured) / σ")
     cost, text = axes[-1]
-    cost.semilogy([2 * iteration.cost for iteration in result.history], "o-", markersize=3)
-    cost.set(xlabel="iteration", ylabel="Σ r²")
+    last = max(i for i, iteration in enumerate(result.history) if iteration.number == 0)
+    cost.semilogy([2 * iteration.cost for iteration in result.history[last:]], "o-", markersize=3)
+    cost.set(xlabel="iteration", ylabel="Σ r²", title="the last search")
     text.axis("off")
     lines = [f"{e.label} = {e.value:.5g} ± {e.error:.2g} {e.unit}" for e in (*result.estimates, *result.reported)]
     text.text(0, 1, "\n".join([*lines, *result.warnings]), va="top", fontsize=9, wrap=True)
@@ -61,7 +65,10 @@ def write_fit(result: FitResult, path: Path) -> Path:
         "estimates": [e._asdict() for e in (*result.estimates, *result.reported)],
         "correlation": result.correlation,
         "fisher_spectrum": result.spectrum,
+        "covariance_of_coordinates": result.covariance,
+        "fisher_directions": result.directions,
         "chi_squared": result.chi_squared,
+        "p_value": result.p_value,
         "degrees_of_freedom": result.degrees_of_freedom,
         "level": result.level,
         "noise": [n._asdict() for n in result.noise],
