@@ -136,6 +136,7 @@ def block(d: int, *, side: int = 3, dx: float = 0.1, **scene: object) -> tuple[m
 def explicit_limit(scene: mpm.Scene) -> float:
     """dx / c [s], c the pressure-wave speed at rest."""
     (law,) = scene.laws
+    law = law.law if isinstance(law, mpm.Viscous) else law
     if isinstance(law, mpm.AbstractInelastic) and not isinstance(law, mpm.Fluid):
         law = law.elastic(law.initial_history(jnp.ones((1, 1))))
     modulus = law.bulk_modulus if isinstance(law, mpm.Fluid) else law.lame_lambda + 2 * law.shear_modulus

@@ -41,7 +41,7 @@ def potential_of(law, d, description="updated"):
     grid, particles = cloud(d)
     walls = mpm.SymmetryPlane(0, 0.0)
     scene = mpm.Scene(grid, law, boundary=walls, description=DESCRIPTIONS[description])
-    if isinstance(scene.laws[0], mpm.Fluid):
+    if isinstance(law.law, mpm.Fluid):
         particles = eqx.tree_at(lambda q: q.F, particles, jnp.linalg.det(particles.F))
     scene, particles = jax.tree.map(jnp.asarray, (scene, mpm.prepare(scene, particles)))
     images = mirror(scene.boundary, grid, scene.window(particles))
