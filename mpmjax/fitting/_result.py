@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-import scipy.stats
+from scipy.special import chdtrc
 
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._least_squares import Iteration
@@ -100,7 +100,7 @@ class FitResult(eqx.Module):
         plain = all(o.trust == (1.0, None) for e in self.experiments for o in e.observations)
         if not plain or any(noise.estimated for noise in self.noise) or self.degrees_of_freedom < 1:
             return np.nan
-        return float(scipy.stats.chi2.sf(self.chi_squared, self.degrees_of_freedom))
+        return float(chdtrc(self.degrees_of_freedom, self.chi_squared))
 
     def __getitem__(self, label: str) -> Estimate:
         """The estimate of a parameter, or of what was reported.

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.integrate
-import scipy.stats
+from scipy.special import ndtri, stdtrit
 
 _ROUNDINGS = 1e3
 """Singular values of J, its columns of length one, below this many roundings of the largest are none: the data do not
@@ -15,6 +14,8 @@ _SHARE = 1e-6
 """Part of a unit vector below which it does not lie in a direction."""
 _LEAST_FREEDOM = 1e-3
 """Degrees of freedom below which there are none, but rounding."""
+_NODES = 100
+"""Of Gauss-Hermite quadrature."""
 _NEARLY_ONE = 0.99
 """Correlation from which two parameters are said to be seen only together."""
 
@@ -78,7 +79,8 @@ class Uncertainty(NamedTuple):
 def quantile(level: float, degrees_of_freedom: float) -> float:
     """How many standard errors an interval of this level reaches to each side: of Student's t, or with infinite degrees
     of freedom of the normal distribution."""
-    return float(scipy.stats.t.ppf((1 + level) / 2, degrees_of_freedom))
+    p = (1 + level) / 2
+    return float(ndtri(p) if np.isinf(degrees_of_freedom) else stdtrit(degrees_of_freedom, p))
 
 
 def uncertainty(J: np.ndarray, eps: float, estimated: Sequence[tuple[slice, float]]) -> Uncertainty:
@@ -138,10 +140,8 @@ def _mean_square(robust: float | None) -> float:
     if robust is None:
         return 1.0
 
-    def density(r: float) -> float:
-        return 2 * r**2 / (1 + np.sqrt(1 + (r / robust) ** 2)) * scipy.stats.norm.pdf(r)
-
-    return 2 * scipy.integrate.quad(density, 0, 12)[0]
+    r, weight = np.polynomial.hermite_e.hermegauss(_NODES)
+    return float((weight * 2 * r**2 / (1 + np.sqrt(1 + (r / robust) ** 2))).sum() / np.sqrt(2 * np.pi))
 
 
 def seen_together(labels: tuple[str, ...], found: Uncertainty, logarithmic: tuple[bool, ...]) -> list[str]:
