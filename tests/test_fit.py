@@ -333,6 +333,10 @@ def test_a_step_at_which_the_simulation_fails_is_not_taken():
         def __init__(self):
             self.experiments, self.names, self.parameters, self.starts = (), ("z",), (STIFFNESS,), (jnp.zeros(()),)
 
+        @property
+        def dtype(self):
+            return jnp.float64
+
         def jacobian(self, z, sigmas):
             far = jnp.where(z < 1, z, jnp.nan)
             return 100 * ((0.3 + far) ** 3 - 0.5), 100 * (3 * (0.3 + far) ** 2)[:, None]

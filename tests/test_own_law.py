@@ -130,8 +130,9 @@ def test_the_stable_step_and_the_projection_are_those_of_the_closed_form(d):
 
 LAWS = [(law, d) for law in ELASTIC.values() for d in DIMS]
 LAWS += [(law, 2) for law in (*PLASTIC.values(), *VISCOUS.values(), *FLUIDS.values())]
+BY_DEFAULT = [(law, d) for law, d in LAWS if d == 2 or (d == 3 and type(law) is mpm.FixedCorotated)]
 CASES = [
-    pytest.param(law, d, id=f"{type(law).__name__}-{d}", marks=pytest.mark.thorough if d == 1 else ())
+    pytest.param(law, d, id=f"{type(law).__name__}-{d}", marks=() if (law, d) in BY_DEFAULT else pytest.mark.thorough)
     for law, d in LAWS
 ]
 
@@ -255,6 +256,7 @@ class Jelly(mpm.AbstractMaterial):
 """
 
 
+@pytest.mark.thorough
 def test_the_shell_imports_what_a_scene_file_names(tmp_path, monkeypatch):
     """By a file's path or a module's name; without it, the error says what to do. Loading a run imports nothing."""
     head, law = SCENE.split("[material]")[0], 'kind = "Jelly"\nstiffness = 1e5\n[[boundary]]'
