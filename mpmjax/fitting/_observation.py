@@ -119,7 +119,7 @@ class AbstractObservation(eqx.Module):
         measured = jnp.isfinite(data)
         r = jnp.where(measured, (predicted - jnp.where(measured, data, 0)) / sigma, 0).reshape(-1)
         if self.robust is not None:
-            r = r * jnp.sqrt(2 / (1 + jnp.sqrt(1 + (r / self.robust) ** 2)))
+            r = r * jnp.sqrt(2 / (1 + jnp.sqrt(1 + (r / jnp.asarray(self.robust, dtype)) ** 2)))
         return jnp.sqrt(weight) * r
 
 

@@ -67,13 +67,13 @@ class FitResult(eqx.Module):
     degrees_of_freedom: int
     """Measured numbers and priors, less parameters."""
     noise: tuple[NoiseEstimate, ...]
-    """That of each observation."""
+    """The noise of each observation."""
     experiments: tuple[Experiment, ...]
     """The experiments with the fitted values."""
     values: dict[str, np.ndarray]
     """The value of each parameter, in its shape."""
     level: float
-    """That of the intervals."""
+    """The level of the intervals [-], such as 0.95."""
     converged: bool
     history: tuple[Iteration, ...]
     warnings: tuple[str, ...]
