@@ -3,11 +3,11 @@
     python benchmarks/fit_pitfalls.py [--only NAME] [--quick]
 
 The body is a bar, held at one end, that vibrates; its exact motion (`mpmjax.verification.VibratingBar`) with noise is
-the data. For chaos it is a heap of disks.
+the data. For chaos they are disks that collide in a box.
 
 - identifiability: Σ r² over E and the density, without and with a prior;
 - false-minima: Σ r² over E for data of half a period, two, and six; where searches end;
-- chaos: the growth of derivatives, and the height of the heap over E, early and late;
+- chaos: the growth of derivatives, and the centre of mass over E, early and late;
 - law: the estimate of E by a neo-Hookean law for a linear bar that moves farther and farther;
 - discretisation: the estimate of E and its error from noise over the spacing, and the extrapolated one.
 
@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from scipy.interpolate import RectBivariateSpline
 
 import mpmjax as mpm
 from mpmjax.verification import VibratingBar, discretise
@@ -34,6 +35,8 @@ jax.config.update("jax_enable_x64", True)
 DOCS = Path(__file__).parents[1] / "docs"
 E, DENSITY, CELLS, STEPS = 1e4, 1e3, 10, 80
 """Young's modulus [Pa], density [kg/m], cells of the bar of one metre, steps a period."""
+SOFT = 5e4
+"""Young's modulus of the disks [Pa]."""
 STIFFNESS = mpm.Positive(lambda e: e.scene.material.youngs_modulus, unit="Pa")
 
 
@@ -88,9 +91,9 @@ def misfit(experiment: mpm.Experiment) -> Callable[[Any, Any], Any]:
 
 def identifiability(quick: bool) -> plt.Figure:
     """Only the ratio of E to the density is seen; a body that was weighed has both."""
-    n, sigma = (7 if quick else 31), 2e-3
+    n, sigma = (7 if quick else 31), 5e-3
     experiment = vibration(bar(), seen(bar(), 1.0, sigma))
-    factors = np.exp(np.linspace(-0.5, 0.5, n))
+    factors = np.linspace(0.7, 1.4, n)
     cost = jax.jit(lambda rho: jax.lax.map(lambda s: misfit(experiment)(s, rho), jnp.asarray(factors), batch_size=8))
     chi = np.stack([np.asarray(cost(rho)) for rho in factors])
     prior = mpm.Gaussian(1.0, 0.03)
@@ -106,9 +109,9 @@ def identifiability(quick: bool) -> plt.Figure:
     print("weighed to 3 %:", both, sep="\n")
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained", sharey=True)
     for axis, values, title in zip(axes, (chi, chi + weighed), ("motion alone", "and weighed to 3 %"), strict=True):
-        rise = values - values.min()
-        axis.contourf(factors, factors, rise, levels=[0, 2.3, 6.2, 11.8], cmap="Blues_r")
-        axis.contour(factors, factors, rise, levels=[2.3, 6.2, 11.8], colors="0.4", linewidths=0.6)
+        fine = np.linspace(factors[0], factors[-1], 10 * n)
+        smooth = RectBivariateSpline(factors, factors, values)(fine, fine)
+        axis.contourf(fine, fine, smooth - smooth.min(), levels=[0, 2.3, 6.2, 11.8], cmap="Blues_r")
         axis.plot(1, 1, "k+")
         axis.set(xlabel="E / true E", title=title)
     axes[0].set_ylabel("density / true density")
@@ -143,42 +146,43 @@ def false_minima(quick: bool) -> plt.Figure:
     return figure
 
 
-def heap() -> tuple[mpm.Scene, mpm.Particles]:
-    """Disks that fall into a box."""
-    grid = mpm.Grid((26, 34), 0.05, origin=(-3, -3))
-    places = [(0.25, 0.25), (0.6, 0.3), (0.42, 0.65), (0.8, 0.7), (0.3, 1.05), (0.65, 1.1)]
-    disks = [mpm.fill(mpm.Ball(p, 0.12), grid, particles_per_cell=4, density=DENSITY) for p in places]
+def billiard() -> tuple[mpm.Scene, mpm.Particles]:
+    """Disks that fly in a box."""
+    grid = mpm.Grid((28, 28), 0.05, origin=(-4, -4))
+    places = [(0.2, 0.2), (0.5, 0.25), (0.8, 0.2), (0.25, 0.55), (0.6, 0.6), (0.8, 0.85), (0.35, 0.85)]
+    velocities = 2 * np.random.default_rng(3).normal(size=(len(places), 2))
+    disks = [
+        mpm.fill(mpm.Ball(place, 0.1), grid, particles_per_cell=4, density=DENSITY, velocity=tuple(velocity))
+        for place, velocity in zip(places, velocities, strict=True)
+    ]
     particles = jax.tree.map(lambda *a: jnp.concatenate(a), *disks)
-    box = mpm.SeparatingBox((0.0, 0.0), (1.0, 5.0))
-    return mpm.Scene(grid, mpm.NeoHookean(2e4, 0.3), gravity=(0.0, -9.81), boundary=box), particles
+    return mpm.Scene(grid, mpm.NeoHookean(SOFT, 0.3), boundary=mpm.SeparatingBox((0.0, 0.0), (1.0, 1.0))), particles
 
 
 def chaos(quick: bool) -> plt.Figure:
-    """After many contacts derivatives are right and say nothing."""
-    scene, particles = heap()
-    t1, dt = (0.2 if quick else 3.0), 1e-3
+    """After many collisions derivatives are right and say nothing."""
+    scene, particles = billiard()
+    dt, early, late = 2e-3, *((0.1, 0.2) if quick else (1.0, 10.0))
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        grown = mpm.sensitivity(scene, particles, t1=t1, dt=dt)
+        grown = mpm.sensitivity(scene, particles, t1=late, dt=dt)
     print(*(str(w.message) for w in said), sep="\n")
-    early, late = 0.25 * t1, t1
-    factors = np.linspace(0.98, 1.02, 5 if quick else 61)
+    factors = np.linspace(0.98, 1.02, 5 if quick else 41)
 
     def place(factor: Any) -> Any:
-        changed = eqx.tree_at(lambda s: s.material.youngs_modulus, scene, 2e4 * factor)
-        run = mpm.simulate(changed, particles, t1=t1, dt=dt, save_every=round(early / dt), throw=False)
-        return run.frames.x[jnp.asarray([1, -1]), :, 0].std(axis=1)
+        changed = eqx.tree_at(lambda s: s.material.youngs_modulus, scene, SOFT * factor)
+        run = mpm.simulate(changed, particles, t1=late, dt=dt, save_every=round(early / dt), throw=False)
+        return run.frames.x[jnp.asarray([1, -1]), :, 0].mean(axis=1)
 
-    width = np.asarray(jax.jit(lambda f: jax.lax.map(place, f))(jnp.asarray(factors)))
+    centre = np.asarray(jax.jit(lambda f: jax.lax.map(place, f))(jnp.asarray(factors)))
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
     axes[0].semilogy(grown.times, grown.growth)
     axes[0].axhline(1e3, color="0.6", linewidth=0.8, linestyle="--")
     axes[0].set(xlabel="time [s]", ylabel="growth of a derivative [-]")
     for k, t in enumerate((early, late)):
-        axes[1].plot(factors, width[:, k] / width[:, k].mean(), ".-", markersize=3, label=f"t = {t:g} s")
-        jump = np.abs(np.diff(width[:, k])).max() / width[:, k].mean()
-        print(f"width at {t:g} s: largest change from one E to the next {jump:.2g}")
-    axes[1].set(xlabel="E / 20 kPa", ylabel="width / mean width")
+        axes[1].plot(factors, centre[:, k], ".-", markersize=3, label=f"t = {t:g} s")
+        print(f"centre of mass at {t:g} s: {np.abs(np.diff(centre[:, k])).max():.2g} m from one E to the next at most")
+    axes[1].set(xlabel=f"E / {SOFT / 1e3:g} kPa", ylabel="centre of mass [m]")
     axes[1].legend()
     return figure
 
@@ -186,7 +190,7 @@ def chaos(quick: bool) -> plt.Figure:
 def law(quick: bool) -> plt.Figure:
     """The wrong law's estimate depends on the data, by far more than its error."""
     sigma = 1e-3
-    amplitudes = (0.02, 0.2) if quick else (0.02, 0.05, 0.1, 0.15, 0.2, 0.25)
+    amplitudes = (0.02, 0.1) if quick else (0.02, 0.05, 0.1, 0.15)
     results = []
     for amplitude in amplitudes:
         exact = bar(amplitude)
