@@ -65,6 +65,8 @@ from mpmjax.fitting import (
     LevenbergMarquardt,
     Markers,
     Positive,
+    Prediction,
+    Profile,
     RefinedFit,
     Series,
     StressStretch,
@@ -72,6 +74,9 @@ from mpmjax.fitting import (
     Unbounded,
     fit,
     fit_refined,
+    predict,
+    predict_observations,
+    profile,
 )
 from mpmjax.geometry import (
     AbstractMotion,
@@ -247,6 +252,8 @@ __all__ = [  # noqa: RUF022 (grouped)
     "Estimate",
     "AbstractParameter",
     "Positive",
+    "Prediction",
+    "Profile",
     "Bounded",
     "Unbounded",
     "Gaussian",
