@@ -76,6 +76,8 @@ def fit_result(
         problem=problem,
         z=np.asarray(found.z),
         sigmas=sigmas,
+        residuals=r,
+        jacobian=J,
         uncertainty=errors,
         estimates=_estimates(problem, found.z, errors, level),
         reported=tuple(_reported(problem, found.z, errors, level, name, of) for name, of in report.items()),

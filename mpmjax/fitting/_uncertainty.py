@@ -1,6 +1,5 @@
 """How well a minimum of least squares fixes its parameters."""
 
-import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -82,19 +81,23 @@ class Uncertainty(NamedTuple):
         that the observations bring."""
         size = np.linalg.norm(gradient, axis=-1).max(initial=0)
         depends = np.abs(gradient @ self.unseen).max(axis=-1, initial=0) > _SHARE * size
-        variance = np.where(depends, np.inf, quadratic(gradient, self.inverse))
-        spread = sum(v**2 / freedom for v, freedom in zip(self.brought(gradient), self.freedoms, strict=True))
-        freedom = _ratio(np.where(depends, 1, variance) ** 2, np.where(depends, 0, spread))
-        return np.sqrt(variance), freedom
+        variance = quadratic(gradient, self.inverse)
+        freedom = np.where(depends, np.inf, self.freedom(variance, self.brought(gradient)))
+        return np.sqrt(np.where(depends, np.inf, variance)), freedom
 
     def brought(self, gradient: np.ndarray) -> list[np.ndarray]:
         """The part of their variance that each observation brings whose noise was estimated."""
         return [quadratic(gradient, part) for part in self.parts]
 
+    def freedom(self, variance: np.ndarray, brought: list[np.ndarray]) -> np.ndarray:
+        """The degrees of freedom of a variance, of which the estimated noise of observations brought parts."""
+        spread = sum((v**2 / freedom for v, freedom in zip(brought, self.freedoms, strict=True)), 0 * variance)
+        return _ratio(variance**2, spread)
+
 
 def quadratic(gradient: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """g·A g of gradients of shape (..., n), not negative."""
-    return np.maximum(np.einsum("...i,ij,...j->...", gradient, matrix, gradient), 0)
+    return np.asarray(np.maximum(np.einsum("...i,ij,...j->...", gradient, matrix, gradient), 0))
 
 
 def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -179,31 +182,26 @@ def _mean_square(robust: float | None) -> float:
 
 def seen_together(labels: tuple[str, ...], found: Uncertainty, logarithmic: tuple[bool, ...]) -> list[str]:
     """What the data cannot tell, in words: directions in which the coordinates may change and the data do not, or
-    hardly, and pairs of coordinates that are nearly so.
+    hardly.
 
     Args:
         labels: the coordinates' names.
         found: their uncertainty.
         logarithmic: whether they are logarithms of their values.
     """
-    said, named, correlation = [], [], found.correlation
     length = np.where(np.isinf(found.alone), 1, 1 / found.alone)
-    for effect in _simplest(found.unseen * length[:, None]).T:
-        said.append(_unseen(*_parts(effect, length), labels, logarithmic))
-    for i, j in itertools.combinations(range(len(labels)), 2):
-        rho = correlation[i, j]
-        if abs(rho) > _NEARLY_ONE:
+    said = [_unseen(*_parts(d, length), labels, logarithmic) for d in _simplest(found.unseen * length[:, None]).T]
+    for effect in _simplest(found.weak * length[:, None]).T:
+        parts, change = _parts(effect, length)
+        rho = found.correlation[parts[0], parts[-1]]
+        if len(parts) == 2 and np.isfinite(rho):
             together = "together" if rho > 0 else "in opposite directions"
-            named.append({i, j})
-            said.append(
-                f"{labels[i]} and {labels[j]}: {abs(rho):.5f} correlated, a change of both {together} is hardly seen."
-            )
-    for direction in found.weak.T:
-        parts, change = _parts(direction * length, length)
-        if len(parts) > 2 and not any(pair <= set(parts) for pair in named):
-            less = np.linalg.norm(direction * length) / np.sqrt((direction @ found.directions) ** 2 @ found.spectrum)
+            names = " and ".join(labels[i] for i in parts)
+            said.append(f"{names}: {abs(rho):.5f} correlated, a change of both {together} is hardly seen.")
+        else:
+            seen = np.sqrt((effect / length @ found.directions) ** 2 @ found.spectrum) / np.linalg.norm(effect)
             what = _proportion(parts, change, labels, logarithmic)
-            said.append(f"{what} is hardly seen, {less:.2g} times less than changes of one alone.")
+            said.append(f"{what} is hardly seen, {1 / seen:.2g} times less than of one alone.")
     return said
 
 
