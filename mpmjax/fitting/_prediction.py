@@ -222,16 +222,17 @@ def _prediction(
     level = result.level if level is None else float(level)
     require((level > 0) & (level < 1), f"level must lie between 0 and 1, got {level}.")
     mean, gradient = np.asarray(value, float), np.asarray(J, float)
-    known = np.isfinite(gradient).all(axis=-1)
+    known = np.asarray(np.isfinite(gradient).all(axis=-1))
+    seen = np.where(known[..., None], gradient, 0)
     lost = int((np.isfinite(mean) & ~known).sum())
     if lost:
         warn(f"{lost} of {mean.size} predicted numbers have no derivative, and so no band.")
-    error, freedom = result.uncertainty.of(np.where(known[..., None], gradient, 0))
+    error, freedom = result.uncertainty.of(seen)
     error = np.where(known, error, np.nan)
     reach = quantile(level, freedom) * error
     new_lower = new_upper = None
     if sigma is not None:
-        wider, freedom = _with_noise(result.uncertainty, np.where(known[..., None], gradient, 0), sigma, estimated)
+        wider, freedom = _with_noise(result.uncertainty, seen, sigma, estimated)
         beyond = quantile(level, freedom) * np.where(np.isfinite(error), wider, error)
         new_lower, new_upper = np.asarray(mean - beyond), np.asarray(mean + beyond)
     return Prediction(

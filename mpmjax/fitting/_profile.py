@@ -51,8 +51,8 @@ class Profile(eqx.Module):
 
     @property
     def signed_root(self) -> np.ndarray:
-        """±√Δχ², negative below the estimate, shape (p,): a straight line in the search's coordinate where the symmetric
-        interval is right."""
+        """±√Δχ², negative below the estimate, shape (p,): a straight line in the search's coordinate where the
+        symmetric interval is right."""
         return np.sign(self.values - self.estimate) * np.sqrt(np.maximum(self.statistic, 0))
 
     def along(self, label: str) -> np.ndarray:
@@ -260,14 +260,14 @@ class _Walk:
             if np.isfinite(end.at):
                 continue
             value = self.numbers(end.last.z)[self.at]
-            why = "the walk ended there"
+            beyond = ""
             if end.fault is not None:
                 held = self.start.z.copy()
                 held[self.at] = end.fault
-                why = f"at {self.numbers(held)[self.at]:.5g} the simulation fails"
+                beyond = f" Beyond, at {self.numbers(held)[self.at]:.5g}, the simulation fails."
             said.append(
-                f"{self.label}: the interval is open {where}. At {value:.5g} Δχ² is {max(end.last.growth, 0):.2g}, less "
-                f"than {reach**2:.3g}, and {why}: the data do not bound it."
+                f"{self.label}: the interval is open {where}. At {value:.5g} Δχ² is {max(end.last.growth, 0):.2g}, "
+                f"less than {reach**2:.3g}: the data do not bound it.{beyond}"
             )
         best = min(self.known, key=lambda point: point.growth)
         if best.growth < -_BETTER:
@@ -282,7 +282,7 @@ class _Walk:
     def _crossing(self, below: _Point, above: _Point, reach: float, rtol: float) -> float:
         """The coordinate at which √Δχ² is `reach`, by Brent's method. A value at which the simulation fails counts as
         beyond it."""
-        from scipy.optimize import brentq  # here, since it takes long to import
+        from scipy.optimize import root_scalar  # here, since it takes long to import
 
         seen = {below.z[self.at]: below.root - reach, above.z[self.at]: above.root - reach}
 
@@ -292,8 +292,9 @@ class _Walk:
                 seen[place] = reach if point is None else point.root - reach
             return seen[place]
 
-        a, b = below.z[self.at], above.z[self.at]
-        return float(brentq(excess, a, b, xtol=rtol / 2 * self._distance(above), rtol=1e-12))
+        within = rtol / 2 * self._distance(above)
+        found = root_scalar(excess, method="brentq", bracket=(below.z[self.at], above.z[self.at]), xtol=within)
+        return float(found.root)
 
     def _foretold(self, place: float, last: _Point, before: _Point) -> np.ndarray:
         """The coordinates on the line through two points, or along the direction of the covariance from the fit."""

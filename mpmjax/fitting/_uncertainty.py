@@ -1,7 +1,7 @@
 """How well a minimum of least squares fixes its parameters."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import qr
@@ -83,7 +83,7 @@ class Uncertainty(NamedTuple):
         depends = np.abs(gradient @ self.unseen).max(axis=-1, initial=0) > _SHARE * size
         variance = quadratic(gradient, self.inverse)
         freedom = np.where(depends, np.inf, self.freedom(variance, self.brought(gradient)))
-        return np.sqrt(np.where(depends, np.inf, variance)), freedom
+        return np.asarray(np.sqrt(np.where(depends, np.inf, variance))), freedom
 
     def brought(self, gradient: np.ndarray) -> list[np.ndarray]:
         """The part of their variance that each observation brings whose noise was estimated."""
@@ -91,8 +91,7 @@ class Uncertainty(NamedTuple):
 
     def freedom(self, variance: np.ndarray, brought: list[np.ndarray]) -> np.ndarray:
         """The degrees of freedom of a variance, of which the estimated noise of observations brought parts."""
-        spread = sum((v**2 / freedom for v, freedom in zip(brought, self.freedoms, strict=True)), 0 * variance)
-        return _ratio(variance**2, spread)
+        return _ratio(variance**2, sum(v**2 / f for v, f in zip(brought, self.freedoms, strict=True)))
 
 
 def quadratic(gradient: np.ndarray, matrix: np.ndarray) -> np.ndarray:
@@ -100,9 +99,10 @@ def quadratic(gradient: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return np.asarray(np.maximum(np.einsum("...i,ij,...j->...", gradient, matrix, gradient), 0))
 
 
-def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _ratio(a: Any, b: Any) -> np.ndarray:
     """a/b, infinite where b is zero."""
-    return np.where(b > 0, a / np.where(b > 0, b, 1), np.inf)
+    some = np.asarray(b) > 0
+    return np.where(some, a / np.where(some, b, 1), np.inf)
 
 
 def quantile(level: float, degrees_of_freedom: float | np.ndarray) -> np.ndarray:
@@ -209,7 +209,8 @@ def _simplest(columns: np.ndarray) -> np.ndarray:
     """The same space by columns of which each has a coordinate to itself, so that few coordinates meet in one."""
     if columns.shape[1] < 2:
         return columns
-    pivots = qr(columns.T, mode="r", pivoting=True)[1][: columns.shape[1]]
+    *_, pivots = qr(columns.T, mode="r", pivoting=True)
+    pivots = pivots[: columns.shape[1]]
     return columns @ np.linalg.inv(columns[pivots])
 
 
