@@ -171,9 +171,7 @@ WORDS = {
     "hardly two": ([a, a + 0.01 * c, b], ["E and nu: 0.99995 correlated, a change of both in opposite directions"]),
     "hardly three": (
         [a, b, a + b + 0.02 * c, d],
-        [
-            r"E, nu, rho: a change in the proportion \+1 : \+1 : -1 of their logarithms is hardly seen, 1e\+02 times less"
-        ],
+        ["E, nu, rho: a change in the proportion +1 : +1 : -1 of their logarithms is hardly seen, 1e+02 times"],
     ),
     "well": ([a, b, c, d], []),
 }

@@ -77,6 +77,7 @@ def predict(
         require(0 <= experiment < count, f"The fit has experiments 0 to {count - 1}, got {experiment}.")
     if sigma is not None:
         require_positive("predict's sigma", sigma)
+        require(np.size(sigma) > 0, "predict's sigma must be a number or an array of numbers, got an empty one.")
     try:
         value, J = _linearised(problem, _Function(of, experiment), _coordinates(result))
     except TypeError as error:
@@ -86,7 +87,12 @@ def predict(
             "What is predicted has no derivative by forward mode: give the runs in it adjoint=diffrax.ForwardMode()."
         ) from None
     (value,), (J,) = value, J
-    noise = None if sigma is None else np.broadcast_to(np.asarray(sigma, float), np.shape(value))
+    noise = None
+    if sigma is not None:
+        shape = np.shape(sigma)
+        fits = len(shape) <= value.ndim and all(a in (1, b) for a, b in zip(shape[::-1], value.shape[::-1], strict=False))
+        require(fits, f"predict's sigma must fit what is predicted, of shape {value.shape}, got shape {shape}.")
+        noise = np.broadcast_to(np.asarray(sigma, float), value.shape)
     return _prediction(result, value, J, noise, None, level)
 
 

@@ -27,7 +27,7 @@ class RestrictedProblem(FitProblem):
     def dtype(self) -> Any:
         return self.whole.dtype
 
-    def place(self, y: Coordinates) -> Coordinates:
+    def place(self, y: Float[Array, "f"]) -> Float[Array, "n"]:
         """The coordinates of the whole problem."""
         return self.origin + self.basis @ y
 
