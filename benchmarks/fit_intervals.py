@@ -11,7 +11,6 @@ from pathlib import Path
 import jax
 import numpy as np
 
-
 import mpmjax as mpm
 
 NU, NOISE = 0.4, 3e-3
@@ -37,11 +36,12 @@ def main(repetitions=200):
     run = mpm.simulate(*column(NU), save_every=1, observe=top, **at)
     times, height = np.asarray(run.times)[-4:], np.asarray(run.observed)[-4:]
     parameter = mpm.Bounded(lambda e: e.scene.material.poisson_ratio, 0.0, 0.499)
-    profiles, own = [], []
+    profiles, own, off = [], [], []
     for seed in range(repetitions):
         data = height + NOISE * np.random.default_rng(seed).normal(size=len(height))
         seen = mpm.Series(times, data, top, sigma=NOISE)
         result = mpm.fit(mpm.Experiment(*column(0.3), observations=seen, **at), {"nu": parameter})
+        off.append(data.mean() - height.mean())
         profiles.append(mpm.profile(result, "nu"))
         own.append(result["nu"].interval)
     by_profile = np.array([p.interval for p in profiles])
@@ -50,11 +50,16 @@ def main(repetitions=200):
         below, above = intervals[:, 1] <= NU, intervals[:, 0] >= NU
         width = np.median(intervals[:, 1] - intervals[:, 0])
         print(f"{name:<24} {(~below & ~above).sum():>6} {below.sum():>10} {above.sum():>10} {width:>13.3f}")
-    draw(profiles, np.array(own))
+    beyond = np.abs(off) > 1.96 * NOISE / np.sqrt(len(height))
+    print(f"means beyond 1.96 standard errors: {beyond.sum()}; settlement {1e3 * (0.375 - height.mean()):.2f} mm")
+    one = profiles[0]
+    end = np.interp(one.symmetric[1], one.values, one.signed_root) ** 2
+    print(f"first repetition: Δχ² is {end:.2f} at the upper end of the symmetric interval, {one.symmetric[1]:.3f}")
+    draw(profiles[:40], np.array(own[:40]))
 
 
 def draw(profiles, own):
-    """One profile, and the intervals of the first forty measurements."""
+    """One profile, and the intervals of all."""
     from matplotlib import pyplot as plt
 
     one = profiles[0]
@@ -65,8 +70,8 @@ def draw(profiles, own):
         left.axvline(end, color="C1", linestyle="--", linewidth=1, label=None if number else "by its standard error")
     left.axvline(NU, color="0.3", linewidth=0.8, label="truth")
     left.set(xlabel="Poisson's ratio", ylabel="Δχ²", ylim=(0, 1.5 * one.threshold))
-    left.legend(fontsize=8, frameon=False)
-    for row, (profile, symmetric) in enumerate(zip(profiles[:40], own[:40], strict=True)):
+    left.legend(fontsize=8, frameon=False, loc="upper center")
+    for row, (profile, symmetric) in enumerate(zip(profiles, own, strict=True)):
         right.plot(profile.interval, [row, row], color="C0", linewidth=1.5)
         right.plot(symmetric, [row + 0.4] * 2, color="C1", linewidth=1, alpha=0.8)
     right.axvline(NU, color="0.3", linewidth=0.8)

@@ -90,7 +90,9 @@ def predict(
     noise = None
     if sigma is not None:
         shape = np.shape(sigma)
-        fits = len(shape) <= value.ndim and all(a in (1, b) for a, b in zip(shape[::-1], value.shape[::-1], strict=False))
+        fits = len(shape) <= value.ndim and all(
+            a in (1, b) for a, b in zip(shape[::-1], value.shape[::-1], strict=False)
+        )
         require(fits, f"predict's sigma must fit what is predicted, of shape {value.shape}, got shape {shape}.")
         noise = np.broadcast_to(np.asarray(sigma, float), value.shape)
     return _prediction(result, value, J, noise, None, level)
@@ -123,7 +125,10 @@ def predict_observations(
         f"predict_observations needs experiments with as many observations as were fitted, {wanted}, got {shape}.",
     )
     observations = [o for e in asked for o in e.observations]
-    if experiments is None and all(o.robust is None and np.isfinite(o.data).all() for o in observations):
+    same = all(
+        e.t1 == f.t1 and eqx.tree_equal(e.observations, f.observations) for e, f in zip(asked, fitted, strict=True)
+    )
+    if same and all(o.robust is None and np.isfinite(o.data).all() for o in observations):
         found = _known(result)
     else:
         asked = tuple(e.with_observations(a.observations, a.t1) for e, a in zip(fitted, asked, strict=True))

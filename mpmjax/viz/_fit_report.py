@@ -6,7 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from mpmjax.fitting import AbstractObservation, Experiment, FitResult, Prediction, Profile, predict_observations
+from mpmjax.fitting import (
+    AbstractObservation,
+    Experiment,
+    FitResult,
+    Prediction,
+    Profile,
+    RefinedFit,
+    predict_observations,
+)
 from mpmjax.io import replacing, save_figure
 
 _MOST_LINES = 6
@@ -151,20 +159,44 @@ def _draw_profile(axis: Any, profile: Profile) -> None:
 
 
 def write_fit(
-    result: FitResult, path: Path, measured: tuple[Experiment, ...] = (), profiles: tuple[Profile, ...] = ()
+    found: FitResult | RefinedFit,
+    path: Path,
+    measured: tuple[Experiment, ...] = (),
+    profiles: tuple[Profile, ...] = (),
 ) -> Path:
     """The numbers of a fit as JSON: estimates with errors and intervals, correlations, noise, χ², iterations,
-    predictions with bands, and profiles. Numbers that are not finite are null.
+    predictions with bands, and profiles. Of a fit on several grids, the extrapolated estimates, and those numbers of
+    each grid. Numbers that are not finite are null.
 
     Args:
-        result: the fit.
+        found: the fit.
         path: the file.
-        measured: see `draw_fit`.
-        profiles: of the fit's parameters.
+        measured: see `draw_fit`; of the finest grid.
+        profiles: of the fit's parameters; of the finest grid.
     """
+    if isinstance(found, RefinedFit):
+        *coarser, finest = found.fits
+        numbers: dict[str, Any] = {
+            "estimates": [e._asdict() for e in found.estimates],
+            "error_from_noise": found.from_noise,
+            "error_from_discretisation": found.from_discretisation,
+            "order": found.order,
+            "refinements": found.refinements,
+            "fits": [*(_numbers(each) for each in coarser), _numbers(finest, measured, profiles)],
+        }
+    else:
+        numbers = _numbers(found, measured, profiles)
+    with replacing(path) as aside:
+        aside.write_text(json.dumps(_plain(numbers), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return path
+
+
+def _numbers(
+    result: FitResult, measured: tuple[Experiment, ...] = (), profiles: tuple[Profile, ...] = ()
+) -> dict[str, Any]:
     observations = [o for e in measured or result.experiments for o in e.observations]
     predictions = predict_observations(result, measured or None)
-    numbers = {
+    return {
         "estimates": [e._asdict() for e in (*result.estimates, *result.reported)],
         "correlation": result.correlation,
         "fisher_spectrum": result.spectrum,
@@ -181,9 +213,6 @@ def write_fit(
         "iterations": [i._asdict() for i in result.history],
         "warnings": result.warnings,
     }
-    with replacing(path) as aside:
-        aside.write_text(json.dumps(_plain(numbers), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    return path
 
 
 def _predicted(observation: AbstractObservation, predicted: Prediction) -> dict[str, object]:
