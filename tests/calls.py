@@ -10,11 +10,15 @@ from collections.abc import Iterator
 from typing import NoReturn
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from helpers import block
 from test_schema import EXAMPLES
 
 import mpmjax as mpm
+from mpmjax.fitting._estimates import fit_result
+from mpmjax.fitting._problem import FitProblem
+from mpmjax.fitting._search import Minimum
 
 SCENE, PARTICLES = block(2)
 
@@ -27,9 +31,19 @@ def reached(*args: object) -> NoReturn:
     raise Reached
 
 
-SEEN = mpm.Curve([0.05], [0.1], reached)
+SEEN = mpm.Curve([0.05], [0.1], reached, sigma=0.01)
 STIFFNESS = mpm.Positive(lambda e: e.scene.material.youngs_modulus)
 RUN = {"scene": SCENE, "particles": PARTICLES, "t1": 0.1, "dt": 0.01}
+
+
+def found() -> mpm.FitResult:
+    """A fit, as if it had been made."""
+    problem = FitProblem((mpm.Experiment(**RUN, observations=SEEN),), {"E": STIFFNESS})
+    at = Minimum(jnp.zeros(1), jnp.zeros(1), jnp.ones((1, 1)), True, False, ())
+    return fit_result(problem, at, [1.0], [1.0], (jnp.ones(()),), {}, 0.95)
+
+
+FITTED = found()
 FUNCTIONS = {
     mpm.fill: {"region": mpm.Ball((0.1, 0.1), 0.1), "grid": SCENE.grid, "density": 1e3},
     mpm.prepare: {"scene": SCENE, "particles": PARTICLES},
@@ -52,6 +66,9 @@ FUNCTIONS = {
     mpm.Experiment: RUN | {"observations": SEEN},
     mpm.fit: {"experiments": mpm.Experiment(**RUN, observations=SEEN), "parameters": {"E": STIFFNESS}},
     mpm.fit_refined: {"build": reached, "parameters": {"E": STIFFNESS}},
+    mpm.profile: {"result": FITTED, "label": "E"},
+    mpm.predict: {"result": FITTED, "of": reached},
+    mpm.predict_observations: {"result": FITTED},
 }
 """Each public function with arguments; of those the tests replace one at a time."""
 PARTICLE_FIELDS = {"x": PARTICLES.x, "v": PARTICLES.v, "mass": PARTICLES.mass, "volume": PARTICLES.volume}
@@ -98,6 +115,7 @@ MAY = {
     (mpm.sample_mesh, "mesh"),
     (mpm.fill, "dtype"),
     (mpm.Experiment, "name"),
+    (mpm.predict, "of"),
     *(
         (call, name)
         for call in CALLS

@@ -7,6 +7,8 @@ from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._observation import AbstractObservation, Curve, Force, Series, Tracks
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter, Bounded, Gaussian, Positive, Unbounded
+from mpmjax.fitting._prediction import Prediction, predict, predict_observations
+from mpmjax.fitting._profile import Profile, profile
 from mpmjax.fitting._quantities import CentreOfMass, Density, Extent, Markers, StressStretch
 from mpmjax.fitting._refined import RefinedFit, fit_refined
 from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
@@ -30,6 +32,8 @@ __all__ = [
     "Markers",
     "NoiseEstimate",
     "Positive",
+    "Prediction",
+    "Profile",
     "RefinedFit",
     "Series",
     "StressStretch",
@@ -37,5 +41,8 @@ __all__ = [
     "Unbounded",
     "fit",
     "fit_refined",
+    "predict",
+    "predict_observations",
+    "profile",
     "read_columns",
 ]

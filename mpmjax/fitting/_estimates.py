@@ -76,6 +76,8 @@ def fit_result(
         problem=problem,
         z=np.asarray(found.z),
         sigmas=sigmas,
+        residuals=r,
+        jacobian=J,
         uncertainty=errors,
         estimates=_estimates(problem, found.z, errors, level),
         reported=tuple(_reported(problem, found.z, errors, level, name, of) for name, of in report.items()),
@@ -99,12 +101,12 @@ def fit_result(
 
 def _estimates(problem: FitProblem, z: Coordinates, errors: Uncertainty, level: float) -> tuple[Estimate, ...]:
     """The fitted numbers. An interval is symmetric in the coordinate, so it lies within the bounds."""
-    each_error = [errors.of(unit) for unit in np.eye(problem.size)]
-    reach = jnp.asarray([quantile(level, freedom) * error for error, freedom in each_error], z.dtype)
+    error, freedom = errors.of(np.eye(problem.size))
+    reach = jnp.asarray(quantile(level, freedom) * error, z.dtype)
     lower, upper = (problem.values(z + side * reach) for side in (-1, 1))
     at, slope = jax.jvp(problem.values, (z,), (jnp.ones_like(z),))
     numbers = zip(
-        problem.labels, *(_flat(a) for a in (at, slope, lower, upper, problem.starts)), errors.error, strict=True
+        problem.labels, *(_flat(a) for a in (at, slope, lower, upper, problem.starts)), error.tolist(), strict=True
     )
     each = zip(problem.parameters, problem.starts, problem.coordinates(z), strict=True)
     bound = [(p.unit, bool(at)) for p, start, part in each for at in p.at_bound(start, part).reshape(-1)]
@@ -123,8 +125,8 @@ def _reported(
         return jnp.asarray(of(problem.at(z)[0]))
 
     error, freedom = errors.of(np.asarray(jax.jacfwd(value)(z), float))
-    number, reach = float(value(z)), quantile(level, freedom) * error
-    return Estimate(name, number, error, (number - reach, number + reach), start=float(value(jnp.zeros_like(z))))
+    number, reach = float(value(z)), float(quantile(level, freedom) * error)
+    return Estimate(name, number, float(error), (number - reach, number + reach), start=float(value(jnp.zeros_like(z))))
 
 
 def _flat(arrays: tuple[Array, ...]) -> list[float]:

@@ -131,13 +131,20 @@ class FitProblem(eqx.Module):
 
     def at(self, z: Coordinates) -> tuple[Experiment, ...]:
         """The experiments with these values."""
-        found = []
-        for number, experiment in enumerate(self.experiments):
-            for parameter, value in zip(self.parameters, self.values(z), strict=True):
-                if parameter.only is None or number in parameter.only:
-                    experiment = parameter.put(experiment, value)
-            found.append(experiment)
-        return tuple(found)
+        return tuple(self.put(experiment, z, number) for number, experiment in enumerate(self.experiments))
+
+    def put(self, experiment: Experiment, z: Coordinates, number: int | None) -> Experiment:
+        """An experiment with these values.
+
+        Args:
+            experiment: any one.
+            z: the coordinates.
+            number: the experiment of which it has the parameters; None for those that belong to all experiments.
+        """
+        for parameter, value in zip(self.parameters, self.values(z), strict=True):
+            if parameter.only is None or number in parameter.only:
+                experiment = parameter.put(experiment, value)
+        return experiment
 
     def residuals(self, z: Coordinates, sigmas: tuple[Array, ...], adjoint: Any) -> tuple[Array, Array]:
         """The residuals of all observations, then of priors [-], shape (m,), NaN where a simulation met a fault or does

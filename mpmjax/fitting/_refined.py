@@ -122,7 +122,7 @@ def fit_refined(
     kinds: list[AbstractParameter | None] = [p for p, size in sizes for _ in range(size)]
     kinds += [None] * len(fits[-1].reported)
     each = zip(kinds, zip(*(found.all for found in fits), strict=True), strict=True)
-    normal = quantile(float(level), np.inf)
+    normal = float(quantile(float(level), np.inf))
     extrapolated = [_extrapolate(kind, estimates, numbers, float(order), normal) for kind, estimates in each]
     estimates, left, orders = zip(*extrapolated, strict=True)
     return RefinedFit(tuple(fits), tuple(numbers), estimates, tuple(e.error for e in fits[-1].all), left, orders)

@@ -59,6 +59,10 @@ class FitResult(eqx.Module):
     """The coordinates found [-], shape (n,)."""
     sigmas: tuple[Array, ...]
     """The noise of each observation, given or estimated, in the data's unit."""
+    residuals: np.ndarray
+    """Those of all observations, then of priors, in units of their noise [-], shape (m,)."""
+    jacobian: np.ndarray
+    """Their derivative by the coordinates, shape (m, n)."""
     uncertainty: Uncertainty
     """That of the coordinates."""
     estimates: tuple[Estimate, ...]

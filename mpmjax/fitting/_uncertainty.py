@@ -1,10 +1,10 @@
 """How well a minimum of least squares fixes its parameters."""
 
-import itertools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import qr
 from scipy.special import ndtri, stdtrit
 
 _ROUNDINGS = 1e3
@@ -18,6 +18,8 @@ _NODES = 100
 """Of Gauss-Hermite quadrature."""
 _NEARLY_ONE = 0.99
 """Correlation from which two parameters are said to be seen only together."""
+_PART = 0.1
+"""Share of a direction's largest effect on the data from which a coordinate is named with it."""
 
 
 class Uncertainty(NamedTuple):
@@ -27,6 +29,8 @@ class Uncertainty(NamedTuple):
     """The pseudo-inverse of JᵀJ, shape (n, n): the covariance, but in directions that the data do not see."""
     unseen: np.ndarray
     """Directions that the data do not see, one a column, shape (n, u)."""
+    weak: np.ndarray
+    """Directions that the data hardly see, a tenth as well as each coordinate alone, one a column, shape (n, w)."""
     spectrum: np.ndarray
     """The eigenvalues of the Fisher information JᵀJ, growing, shape (n,)."""
     directions: np.ndarray
@@ -44,7 +48,12 @@ class Uncertainty(NamedTuple):
     @property
     def error(self) -> np.ndarray:
         """Standard errors, shape (n,)."""
-        return np.array([self.of(unit)[0] for unit in np.eye(len(self.inverse))])
+        return self.of(np.eye(len(self.inverse)))[0]
+
+    @property
+    def alone(self) -> np.ndarray:
+        """Standard errors if all other coordinates were known, shape (n,); infinite of one that changes nothing."""
+        return np.sqrt(_ratio(np.ones(len(self.spectrum)), self.directions**2 @ self.spectrum))
 
     @property
     def covariance(self) -> np.ndarray:
@@ -64,23 +73,43 @@ class Uncertainty(NamedTuple):
         found[:, np.isinf(error)] = np.nan
         return found
 
-    def of(self, gradient: np.ndarray) -> tuple[float, float]:
-        """The standard error of a number with this gradient by the coordinates, shape (n,), and its degrees of freedom:
-        infinite where all noise is known, else by Welch and Satterthwaite (B. L. Welch, Biometrika 34 (1947) 28,
-        doi 10.1093/biomet/34.1-2.28), (Σ_k v_k)²/Σ_k v_k²/ν_k with the variances v_k that the observations bring."""
-        if np.abs(self.unseen.T @ gradient).max(initial=0) > _SHARE * np.linalg.norm(gradient):
-            return np.inf, np.inf
-        variance = float(gradient @ self.inverse @ gradient)
-        brought = [float(gradient @ part @ gradient) for part in self.parts]
-        spread = sum(v**2 / freedom for v, freedom in zip(brought, self.freedoms, strict=True))
-        return np.sqrt(variance), variance**2 / spread if spread > 0 else np.inf
+    def of(self, gradient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The standard errors of numbers with these gradients by the coordinates, shape (..., n), and their degrees of
+        freedom, both of shape (...). An error is infinite where a gradient has a part in a direction that the data do
+        not see. The degrees of freedom are infinite where all noise is known, else by Welch and Satterthwaite (B. L.
+        Welch, Biometrika 34 (1947) 28, doi 10.1093/biomet/34.1-2.28), (Σ_k v_k)²/Σ_k v_k²/ν_k with the variances v_k
+        that the observations bring."""
+        size = np.linalg.norm(gradient, axis=-1).max(initial=0)
+        depends = np.abs(gradient @ self.unseen).max(axis=-1, initial=0) > _SHARE * size
+        variance = quadratic(gradient, self.inverse)
+        freedom = np.where(depends, np.inf, self.freedom(variance, self.brought(gradient)))
+        return np.asarray(np.sqrt(np.where(depends, np.inf, variance))), freedom
+
+    def brought(self, gradient: np.ndarray) -> list[np.ndarray]:
+        """The part of their variance that each observation brings whose noise was estimated."""
+        return [quadratic(gradient, part) for part in self.parts]
+
+    def freedom(self, variance: np.ndarray, brought: list[np.ndarray]) -> np.ndarray:
+        """The degrees of freedom of a variance, of which the estimated noise of observations brought parts."""
+        return _ratio(variance**2, sum(v**2 / f for v, f in zip(brought, self.freedoms, strict=True)))
 
 
-def quantile(level: float, degrees_of_freedom: float) -> float:
+def quadratic(gradient: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """g·A g of gradients of shape (..., n), not negative."""
+    return np.asarray(np.maximum(np.einsum("...i,ij,...j->...", gradient, matrix, gradient), 0))
+
+
+def _ratio(a: Any, b: Any) -> np.ndarray:
+    """a/b, infinite where b is zero."""
+    some = np.asarray(b) > 0
+    return np.where(some, a / np.where(some, b, 1), np.inf)
+
+
+def quantile(level: float, degrees_of_freedom: float | np.ndarray) -> np.ndarray:
     """How many standard errors an interval of this level reaches to each side: of Student's t, or with infinite degrees
     of freedom of the normal distribution."""
-    p = (1 + level) / 2
-    return float(ndtri(p) if np.isinf(degrees_of_freedom) else stdtrit(degrees_of_freedom, p))
+    p, normal = (1 + level) / 2, np.isinf(degrees_of_freedom)
+    return np.where(normal, ndtri(p), stdtrit(np.where(normal, 1, degrees_of_freedom), p))
 
 
 def uncertainty(J: np.ndarray, eps: float, estimated: Sequence[tuple[slice, float]]) -> Uncertainty:
@@ -101,16 +130,23 @@ def uncertainty(J: np.ndarray, eps: float, estimated: Sequence[tuple[slice, floa
     root = Vt[seen] / values[seen, None] / length
     inverse = root.T @ root
     unseen = (Vt[~seen] / length).T
+    weak = (Vt[seen & (values < np.sqrt(1 - _NEARLY_ONE))] / length).T
     spectrum, directions = np.linalg.eigh(J.T @ J)
     parts = tuple(inverse @ J[rows].T @ J[rows] @ inverse for rows, _ in estimated)
     return Uncertainty(
         inverse,
-        unseen / np.maximum(np.linalg.norm(unseen, axis=0), np.finfo(float).tiny),
+        _unit(unseen),
+        _unit(weak),
         np.maximum(spectrum, 0),
         directions,
         parts,
         tuple(freedom for _, freedom in estimated),
     )
+
+
+def _unit(columns: np.ndarray) -> np.ndarray:
+    """The columns, each of length one."""
+    return columns / np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
 
 
 def noise(
@@ -145,35 +181,66 @@ def _mean_square(robust: float | None) -> float:
 
 
 def seen_together(labels: tuple[str, ...], found: Uncertainty, logarithmic: tuple[bool, ...]) -> list[str]:
-    """What the data cannot tell, in words: directions in which the coordinates may change and the data do not, and
-    pairs of coordinates that are nearly so.
+    """What the data cannot tell, in words: directions in which the coordinates may change and the data do not, or
+    hardly.
 
     Args:
         labels: the coordinates' names.
         found: their uncertainty.
         logarithmic: whether they are logarithms of their values.
     """
-    said, correlation = [], found.correlation
-    for direction in found.unseen.T:
-        parts = [i for i in range(len(labels)) if abs(direction[i]) > 0.05]
-        said.append(_unseen(parts, direction, labels, logarithmic))
-    for i, j in itertools.combinations(range(len(labels)), 2):
-        rho = correlation[i, j]
-        if abs(rho) > _NEARLY_ONE:
+    length = np.where(np.isinf(found.alone), 1, 1 / found.alone)
+    said = [_unseen(*_parts(d, length), labels, logarithmic) for d in _simplest(found.unseen * length[:, None]).T]
+    for effect in _simplest(found.weak * length[:, None]).T:
+        parts, change = _parts(effect, length)
+        rho = found.correlation[parts[0], parts[-1]]
+        if len(parts) == 2 and np.isfinite(rho):
             together = "together" if rho > 0 else "in opposite directions"
-            said.append(
-                f"{labels[i]} and {labels[j]}: {abs(rho):.5f} correlated, a change of both {together} is hardly seen."
-            )
+            names = " and ".join(labels[i] for i in parts)
+            said.append(f"{names}: {abs(rho):.5f} correlated, a change of both {together} is hardly seen.")
+        else:
+            seen = np.sqrt((effect / length @ found.directions) ** 2 @ found.spectrum) / np.linalg.norm(effect)
+            what = _proportion(parts, change, labels, logarithmic)
+            said.append(f"{what} is hardly seen, {1 / seen:.2g} times less than of one alone.")
     return said
 
 
-def _unseen(parts: list[int], direction: np.ndarray, labels: tuple[str, ...], logarithmic: tuple[bool, ...]) -> str:
+def _simplest(columns: np.ndarray) -> np.ndarray:
+    """The same space by columns of which each has a coordinate to itself, so that few coordinates meet in one."""
+    if columns.shape[1] < 2:
+        return columns
+    *_, pivots = qr(columns.T, mode="r", pivoting=True)
+    pivots = pivots[: columns.shape[1]]
+    return columns @ np.linalg.inv(columns[pivots])
+
+
+def _parts(effect: np.ndarray, length: np.ndarray) -> tuple[list[int], np.ndarray]:
+    """The coordinates that a direction is of, and their changes, the largest one.
+
+    Args:
+        effect: the change of each coordinate times its effect on the data.
+        length: these effects.
+    """
+    parts = [i for i in range(len(effect)) if abs(effect[i]) > _PART * np.abs(effect).max()]
+    change = effect[parts] / length[parts]
+    return parts, change / change[np.abs(change).argmax()]
+
+
+def _unseen(parts: list[int], change: np.ndarray, labels: tuple[str, ...], logarithmic: tuple[bool, ...]) -> str:
     """A direction that the data do not see, in words."""
     names = [labels[i] for i in parts]
     if len(parts) == 1:
         return f"{names[0]}: the data do not see it."
-    change = direction[parts]
-    if len(parts) == 2 and all(logarithmic[i] for i in parts) and abs(abs(change[0] / change[1]) - 1) < 0.01:
-        return f"{names[0]} and {names[1]}: only their {'ratio' if change[0] * change[1] > 0 else 'product'} is seen."
+    if len(parts) == 2 and all(logarithmic[i] for i in parts):
+        power = change[0] / change[1]
+        if abs(abs(power) - 1) < 0.01:
+            return f"{names[0]} and {names[1]}: only their {'ratio' if power > 0 else 'product'} is seen."
+        return f"{names[0]} and {names[1]}: only {names[0]}·{names[1]}^{-power:.3g} is seen."
+    return f"{_proportion(parts, change, labels, logarithmic)} is not seen by the data."
+
+
+def _proportion(parts: list[int], change: np.ndarray, labels: tuple[str, ...], logarithmic: tuple[bool, ...]) -> str:
+    """A change of several coordinates together, in words."""
+    what = "logarithms" if all(logarithmic[i] for i in parts) else "coordinates"
     shown = " : ".join(f"{c:+.2g}" for c in change)
-    return f"{', '.join(names)}: a change in the proportion {shown} of their coordinates is not seen by the data."
+    return f"{', '.join(labels[i] for i in parts)}: a change in the proportion {shown} of their {what}"

@@ -2,66 +2,201 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from mpmjax.fitting import Experiment, FitResult
+from mpmjax.fitting import (
+    AbstractObservation,
+    Experiment,
+    FitResult,
+    Prediction,
+    Profile,
+    RefinedFit,
+    predict_observations,
+)
 from mpmjax.io import replacing, save_figure
 
 _MOST_LINES = 6
 """Components of an observation that are drawn."""
+_PROFILES_A_ROW = 3
 
 
-def draw_fit(result: FitResult, path: Path, measured: tuple[Experiment, ...] = ()) -> Path:
-    """Data and fitted simulation, residuals in units of the noise, and the misfit of each iteration.
+def draw_fit(
+    result: FitResult, path: Path, measured: tuple[Experiment, ...] = (), profiles: tuple[Profile, ...] = ()
+) -> Path:
+    """Data, the fitted simulation and its bands, residuals in units of the noise, the misfit of each iteration, and
+    profiles.
 
     Args:
         result: the fit.
         path: the picture.
         measured: the fitted experiments with more data, or longer: the fit predicts what it was not given.
+        profiles: of the fit's parameters.
     """
     from matplotlib import pyplot as plt  # here, since it takes a second that only pictures should pay
 
     shown = measured or result.experiments
-    panels = []
-    for fitted, whole in zip(result.experiments, shown, strict=True):
-        now = fitted.with_observations(whole.observations, whole.t1)
-        panels += zip(whole.observations, now.predictions(now.run(throw=False)), fitted.observations, strict=True)
-    rows = len(panels) + 1
-    figure, axes = plt.subplots(rows, 2, figsize=(9.6, 3.2 * rows), layout="constrained", squeeze=False)
-    for (left, right), (observation, predicted, fitted), noise in zip(axes, panels, result.noise, strict=False):
-        name, x = observation.against
-        order, sigma = np.argsort(x), noise.sigma if observation.sigma is None else np.asarray(observation.sigma)
-        arrays = observation.data, predicted, np.broadcast_to(sigma, observation.data.shape)
-        data, model, sigma = (np.asarray(a, float).reshape(len(x), -1)[order] for a in arrays)
-        x = x[order]
-        for k in range(min(data.shape[1], _MOST_LINES)):
-            left.plot(x, model[:, k], color=f"C{k}", linewidth=1.2)
-            left.plot(x, data[:, k], "o", color=f"C{k}", markersize=3)
-        right.axhspan(-2, 2, color="0.93")
-        right.plot(x, (model - data) / sigma, ".", color="0.3", markersize=3)
-        last = float(fitted.against[1].max())
-        if x.max() > last:
-            for axis in (left, right):
-                axis.axvline(last, color="0.6", linewidth=0.8, linestyle="--")
-            left.set_title("fitted to the dashed line, predicted beyond", fontsize=9)
-        left.set(xlabel=name, ylabel=observation.name)
-        right.set(xlabel=name, ylabel="(simulated − measured) / σ")
-    cost, text = axes[-1]
-    last = max(i for i, iteration in enumerate(result.history) if iteration.number == 0)
-    cost.semilogy([2 * iteration.cost for iteration in result.history[last:]], "o-", markersize=3)
-    cost.set(xlabel="iteration", ylabel="Σ r²", title="the last search")
-    text.axis("off")
-    lines = [f"{e.label} = {e.value:.5g} ± {e.error:.2g} {e.unit}" for e in (*result.estimates, *result.reported)]
-    text.text(0, 1, "\n".join([*lines, *result.warnings]), va="top", fontsize=9, wrap=True)
+    predictions = predict_observations(result, measured or None)
+    observations = [o for e in shown for o in e.observations]
+    fitted = [o for e in result.experiments for o in e.observations]
+    rows = len(observations) + 1 + -(-len(profiles) // _PROFILES_A_ROW)
+    heights = [3.0] * len(observations) + [2.6] * (rows - len(observations))
+    figure = plt.figure(figsize=(9.6, sum(heights)), layout="constrained")
+    grid = figure.add_gridspec(rows, 6, height_ratios=heights)
+    for row, (observation, predicted, known) in enumerate(zip(observations, predictions, fitted, strict=True)):
+        left, right = figure.add_subplot(grid[row, :4]), figure.add_subplot(grid[row, 4:])
+        _draw_observation(left, right, observation, predicted, float(known.against[1].max()))
+    row = len(observations)
+    _draw_history(figure.add_subplot(grid[row, :2]), result)
+    _write_numbers(figure.add_subplot(grid[row, 2:]), result, profiles)
+    for number, profile in enumerate(profiles):
+        below, along = divmod(number, _PROFILES_A_ROW)
+        _draw_profile(figure.add_subplot(grid[row + 1 + below, 2 * along : 2 * along + 2]), profile)
+    for axis in figure.axes:
+        axis.spines[["top", "right"]].set_visible(False)
     save_figure(figure, path, 140)
     plt.close(figure)
     return path
 
 
-def write_fit(result: FitResult, path: Path) -> Path:
-    """The numbers of a fit as JSON: estimates with errors and intervals, correlations, noise, χ² and iterations."""
-    numbers = {
+def _draw_observation(
+    left: Any, right: Any, observation: AbstractObservation, predicted: Prediction, last: float
+) -> None:
+    """Data, fit and bands, and beside them the residuals.
+
+    Args:
+        left: the axes of the data.
+        right: those of the residuals.
+        observation: what was measured.
+        predicted: what the fit says.
+        last: where the fitted data end.
+    """
+    name, x = observation.against
+    order = np.argsort(x)
+    x = x[order]
+
+    def columns(of: Any) -> np.ndarray:
+        return np.broadcast_to(np.asarray(of, float), predicted.value.shape).reshape(len(x), -1)[order]
+
+    data, model, lower, upper = (
+        columns(a) for a in (observation.data, predicted.value, predicted.lower, predicted.upper)
+    )
+    level = f"{100 * predicted.level:g} %"
+    for k in range(min(data.shape[1], _MOST_LINES)):
+        once = k == 0
+        if predicted.new_lower is not None:
+            new = columns(predicted.new_lower)[:, k], columns(predicted.new_upper)[:, k]
+            label = f"{level} of new measurements"
+            left.fill_between(x, *new, color=f"C{k}", alpha=0.12, linewidth=0, label=label if once else None)
+        label = f"{level} of the mean"
+        left.fill_between(
+            x, lower[:, k], upper[:, k], color=f"C{k}", alpha=0.35, linewidth=0, label=label if once else None
+        )
+        left.plot(x, model[:, k], color=f"C{k}", linewidth=1.2, label="fit" if once else None)
+        left.plot(
+            x, data[:, k], "o", color=f"C{k}", markersize=3.5, markeredgecolor="white", markeredgewidth=0.5,
+            label="measured" if once else None,
+        )  # fmt: skip
+    more = data.shape[1] - _MOST_LINES
+    left.legend(fontsize=7, frameon=False, title=f"{_MOST_LINES} of {data.shape[1]} shown" if more > 0 else None)
+    if predicted.sigma is not None:
+        right.axhspan(-2, 2, color="0.93", linewidth=0)
+        right.axhline(0, color="0.7", linewidth=0.8)
+        right.plot(x, (model - data) / columns(predicted.sigma), ".", color="0.3", markersize=4)
+    if x.max() > last:
+        for axis in (left, right):
+            axis.axvline(last, color="0.6", linewidth=0.8, linestyle="--")
+        left.set_title("fitted to the dashed line, predicted beyond", fontsize=9)
+    left.set(xlabel=name, ylabel=observation.name)
+    right.set(xlabel=name, ylabel="(fit − measured) / σ")
+
+
+def _draw_history(axis: Any, result: FitResult) -> None:
+    """The misfit of each iteration of the last search."""
+    last = max(i for i, iteration in enumerate(result.history) if iteration.number == 0)
+    misfit = [2 * iteration.cost for iteration in result.history[last:]]
+    axis.semilogy(misfit, "o-", color="0.3", markersize=3, linewidth=1)
+    axis.set(xlabel="iteration" if last == 0 else "iteration of the last search", ylabel="Σ r²")
+    axis.xaxis.get_major_locator().set_params(integer=True)
+
+
+def _write_numbers(axis: Any, result: FitResult, profiles: tuple[Profile, ...]) -> None:
+    """The estimates with their intervals, and what is to be said of them."""
+    by_profile = {p.label: p.interval for p in profiles}
+    lines = [f"{'':<14}{'value':>11} ± {'error':<9}{100 * result.level:g} % interval"]
+    for e in result.all:
+        lower, upper = by_profile.get(e.label, e.interval)
+        name = f"{e.label} [{e.unit}]" if e.unit else e.label
+        profiled = " by profile" if e.label in by_profile else ""
+        lines.append(f"{name:<14}{e.value:>11.5g} ± {e.error:<9.2g}{lower:.5g} to {upper:.5g}{profiled}")
+    degrees = result.degrees_of_freedom
+    lines += ["", f"χ² = {result.chi_squared:.4g}, {degrees} degrees of freedom"]
+    axis.axis("off")
+    axis.text(0, 1, "\n".join(lines), va="top", fontsize=7.5, family="monospace", transform=axis.transAxes)
+    said = [*result.warnings, *(text for p in profiles for text in p.warnings)]
+    axis.text(0, 0, "\n".join(said), va="bottom", fontsize=7, wrap=True, color="C3", transform=axis.transAxes)
+
+
+def _draw_profile(axis: Any, profile: Profile) -> None:
+    """Δχ² over the parameter, its threshold, and the interval; dashed, the interval of the standard error."""
+    from scipy.interpolate import PchipInterpolator
+
+    values, threshold = profile.values, profile.threshold
+    axis.axvspan(*np.clip(profile.interval, values[0], values[-1]), color="C0", alpha=0.12, linewidth=0)
+    axis.axhline(threshold, color="0.5", linewidth=0.8, linestyle=":")
+    fine = np.linspace(values[0], values[-1], 200)
+    root = PchipInterpolator(values, profile.signed_root)(fine)
+    axis.plot(fine, root**2, color="C0", linewidth=1.2, label="profile")
+    axis.plot(values, profile.statistic, "o", color="C0", markersize=3)
+    for end in profile.symmetric:
+        if values[0] <= end <= values[-1]:
+            axis.axvline(end, color="0.4", linewidth=1, linestyle="--")
+    axis.plot([], [], "--", color="0.4", linewidth=1, label="by its standard error")
+    unit = f" [{profile.unit}]" if profile.unit else ""
+    axis.set(xlabel=f"{profile.label}{unit}", ylabel="Δχ²", ylim=(0, 1.5 * threshold))
+    axis.legend(fontsize=7, frameon=False, loc="upper center")
+
+
+def write_fit(
+    found: FitResult | RefinedFit,
+    path: Path,
+    measured: tuple[Experiment, ...] = (),
+    profiles: tuple[Profile, ...] = (),
+) -> Path:
+    """The numbers of a fit as JSON: estimates with errors and intervals, correlations, noise, χ², iterations,
+    predictions with bands, and profiles. Of a fit on several grids, the extrapolated estimates, and those numbers of
+    each grid. Numbers that are not finite are null.
+
+    Args:
+        found: the fit.
+        path: the file.
+        measured: see `draw_fit`; of the finest grid.
+        profiles: of the fit's parameters; of the finest grid.
+    """
+    if isinstance(found, RefinedFit):
+        *coarser, finest = found.fits
+        numbers: dict[str, Any] = {
+            "estimates": [e._asdict() for e in found.estimates],
+            "error_from_noise": found.from_noise,
+            "error_from_discretisation": found.from_discretisation,
+            "order": found.order,
+            "refinements": found.refinements,
+            "fits": [*(_numbers(each) for each in coarser), _numbers(finest, measured, profiles)],
+        }
+    else:
+        numbers = _numbers(found, measured, profiles)
+    with replacing(path) as aside:
+        aside.write_text(json.dumps(_plain(numbers), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return path
+
+
+def _numbers(
+    result: FitResult, measured: tuple[Experiment, ...] = (), profiles: tuple[Profile, ...] = ()
+) -> dict[str, Any]:
+    observations = [o for e in measured or result.experiments for o in e.observations]
+    predictions = predict_observations(result, measured or None)
+    return {
         "estimates": [e._asdict() for e in (*result.estimates, *result.reported)],
         "correlation": result.correlation,
         "fisher_spectrum": result.spectrum,
@@ -72,13 +207,38 @@ def write_fit(result: FitResult, path: Path) -> Path:
         "degrees_of_freedom": result.degrees_of_freedom,
         "level": result.level,
         "noise": [n._asdict() for n in result.noise],
+        "predictions": [_predicted(o, p) for o, p in zip(observations, predictions, strict=True)],
+        "profiles": [_profiled(p) for p in profiles],
         "converged": result.converged,
         "iterations": [i._asdict() for i in result.history],
         "warnings": result.warnings,
     }
-    with replacing(path) as aside:
-        aside.write_text(json.dumps(_plain(numbers), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    return path
+
+
+def _predicted(observation: AbstractObservation, predicted: Prediction) -> dict[str, object]:
+    """An observation's data and prediction, rows over what it was measured against."""
+    name, x = observation.against
+    return {
+        "name": observation.name,
+        "against": name,
+        "x": x,
+        "measured": observation.data,
+        **{f: getattr(predicted, f) for f in ("value", "error", "lower", "upper", "sigma", "new_lower", "new_upper")},
+    }
+
+
+def _profiled(profile: Profile) -> dict[str, object]:
+    return {
+        "label": profile.label,
+        "interval": profile.interval,
+        "symmetric_interval": profile.symmetric,
+        "threshold": profile.threshold,
+        "degrees_of_freedom": profile.degrees_of_freedom,
+        "level": profile.level,
+        "delta_chi_squared": profile.statistic,
+        "numbers": {label: profile.along(label) for label in profile.labels},
+        "warnings": profile.warnings,
+    }
 
 
 def _plain(value: object) -> object:

@@ -1,0 +1,262 @@
+"""Predictions of a fit, with their errors."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Array, Scalar
+from mpmjax.checks import checked, require, require_positive, warn
+from mpmjax.fitting._experiment import Experiment
+from mpmjax.fitting._observation import AbstractObservation, Numbers
+from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._result import FitResult
+from mpmjax.fitting._uncertainty import Uncertainty, quantile
+
+
+class Prediction(eqx.Module):
+    """What a fit says of a quantity, with the error that the parameters' errors make. All arrays have its shape."""
+
+    value: np.ndarray
+    error: np.ndarray
+    """Standard error; infinite where the value depends on what the data do not see."""
+    lower: np.ndarray
+    """Where the value lies at the level: the confidence band. It holds at each point, not at all of them together."""
+    upper: np.ndarray
+    sigma: np.ndarray | None
+    """Standard deviation of the noise of a measurement of it, where that is known."""
+    new_lower: np.ndarray | None
+    """Where a new measurement lies at the level, its noise included: the prediction band."""
+    new_upper: np.ndarray | None
+    level: float
+    """The level of the bands [-], such as 0.95."""
+
+
+@checked
+def predict(
+    result: FitResult,
+    of: Callable[[Experiment], Any],
+    *,
+    experiment: Experiment | int = 0,
+    sigma: Numbers | None = None,
+    level: Scalar | None = None,
+) -> Prediction:
+    """What a fit says of anything that follows from its parameters, with its band.
+
+        def height(e):
+            run = mpm.simulate(heavier(e.scene), e.particles, t1=1.0, dt=e.dt, adjoint=diffrax.ForwardMode())
+            return run.final.x[:, 1].max()
+
+        mpm.predict(result, height)
+
+    The error is by the delta method: √(g·C g) of each number, g its derivative by the search's coordinates (forward
+    mode) and C their covariance. The band reaches as many errors to each side as a normal distribution, or Student's
+    where the noise was estimated, says. It holds as far as the quantity is linear in the coordinates over their errors:
+    where a parameter's profile is far from symmetric the band is approximate too.
+
+    Args:
+        result: the fit.
+        of: function of an experiment with the fitted parameters, that returns a number or an array. Runs in it need
+            `adjoint=diffrax.ForwardMode()`.
+        experiment: which one: its number among those that were fitted, or another one, into which the parameters are
+            put. One that belongs to some experiments only is left out of another.
+        sigma: standard deviation of the noise of a new measurement, in the unit of the quantity; a number or an array
+            that broadcasts against it. Default: no prediction band.
+        level: of the bands [-]. Default: that of the fit.
+
+    Raises:
+        ValueError: there is no such experiment; a run in `of` that has no forward derivative; a level that is none.
+    """
+    problem = result.problem
+    count = len(problem.experiments)
+    if isinstance(experiment, int):
+        require(0 <= experiment < count, f"The fit has experiments 0 to {count - 1}, got {experiment}.")
+    if sigma is not None:
+        require_positive("predict's sigma", sigma)
+        require(np.size(sigma) > 0, "predict's sigma must be a number or an array of numbers, got an empty one.")
+    try:
+        value, J = _linearised(problem, _Function(of, experiment), _coordinates(result))
+    except TypeError as error:
+        if "custom_vjp" not in str(error):
+            raise
+        raise ValueError(
+            "What is predicted has no derivative by forward mode: give the runs in it adjoint=diffrax.ForwardMode()."
+        ) from None
+    (value,), (J,) = value, J
+    noise = None
+    if sigma is not None:
+        shape = np.shape(sigma)
+        fits = len(shape) <= value.ndim and all(
+            a in (1, b) for a, b in zip(shape[::-1], value.shape[::-1], strict=False)
+        )
+        require(fits, f"predict's sigma must fit what is predicted, of shape {value.shape}, got shape {shape}.")
+        noise = np.broadcast_to(np.asarray(sigma, float), value.shape)
+    return _prediction(result, value, J, noise, None, level)
+
+
+@checked
+def predict_observations(
+    result: FitResult,
+    experiments: tuple[Experiment, ...] | list[Experiment] | None = None,
+    *,
+    level: Scalar | None = None,
+) -> tuple[Prediction, ...]:
+    """What a fit says of its observations, with bands, in their order. The noise of a new measurement is that which was
+    given or estimated.
+
+    Args:
+        result: the fit.
+        experiments: in the place of the fitted ones, as many with as many observations each, such as the same with more
+            data, or longer: their observations and end times are taken.
+        level: of the bands [-]. Default: that of the fit.
+
+    Raises:
+        ValueError: other experiments that are not as many, or have not as many observations.
+    """
+    fitted = result.problem.experiments
+    asked = fitted if experiments is None else tuple(experiments)
+    shape, wanted = ([len(e.observations) for e in each] for each in (asked, fitted))
+    require(
+        shape == wanted,
+        f"predict_observations needs experiments with as many observations as were fitted, {wanted}, got {shape}.",
+    )
+    observations = [o for e in asked for o in e.observations]
+    same = all(
+        e.t1 == f.t1 and eqx.tree_equal(e.observations, f.observations) for e, f in zip(asked, fitted, strict=True)
+    )
+    if same and all(o.robust is None and np.isfinite(o.data).all() for o in observations):
+        found = _known(result)
+    else:
+        asked = tuple(e.with_observations(a.observations, a.t1) for e, a in zip(fitted, asked, strict=True))
+        found = _linearised(result.problem, _Observed(asked), _coordinates(result))
+    own = _estimated(result.problem)
+    return tuple(
+        _prediction(result, value, J, _noise(o, sigma, np.shape(value)), at, level)
+        for value, J, o, sigma, at in zip(*found, observations, result.sigmas, own, strict=True)
+    )
+
+
+def _known(result: FitResult) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    """Predictions of plain observations and their derivatives, as the fit has them in its residuals."""
+    values, derivatives = [], []
+    for o, sigma, rows in zip(result.problem.observations, result.sigmas, result.problem.rows, strict=True):
+        scale = np.broadcast_to(np.asarray(sigma, float) / np.sqrt(o.trust[0]), o.data.shape)
+        values.append(o.data + scale * result.residuals[rows].reshape(o.data.shape))
+        derivatives.append(scale[..., None] * result.jacobian[rows].reshape(*o.data.shape, -1))
+    return tuple(values), tuple(derivatives)
+
+
+class _Function(eqx.Module):
+    """A function of one experiment with the parameters put in."""
+
+    of: Callable[[Experiment], Any]
+    experiment: Experiment | int = eqx.field()
+
+    def __call__(self, problem: FitProblem, z: Coordinates) -> tuple[Array, ...]:
+        if isinstance(self.experiment, Experiment):
+            found = problem.put(self.experiment, z, None)
+        else:
+            found = problem.at(z)[self.experiment]
+        return (jnp.asarray(self.of(found), problem.dtype),)
+
+
+class _Observed(eqx.Module):
+    """What the observations of some experiments say, NaN where a run fails."""
+
+    experiments: tuple[Experiment, ...]
+
+    def __call__(self, problem: FitProblem, z: Coordinates) -> tuple[Array, ...]:
+        said = []
+        for number, experiment in enumerate(self.experiments):
+            found = problem.put(experiment, z, number)
+            run = found.run(adjoint=diffrax.ForwardMode(), throw=False)
+            said += [jnp.where(run.statistics.healthy, p, jnp.nan) for p in found.predictions(run)]
+        return tuple(said)
+
+
+@eqx.filter_jit
+def _linearised(
+    problem: FitProblem, function: Callable[[FitProblem, Coordinates], tuple[Array, ...]], z: Coordinates
+) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Values and their derivatives by the coordinates, shape (..., n), in one pass, compiled."""
+
+    def twice(z: Coordinates) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        value = function(problem, z)
+        return value, value
+
+    J, value = jax.jacfwd(twice, has_aux=True)(z)
+    return value, J
+
+
+def _coordinates(result: FitResult) -> Coordinates:
+    return jnp.asarray(result.z, result.problem.dtype)
+
+
+def _estimated(problem: FitProblem) -> list[int | None]:
+    """Of each observation, its number among those whose noise was estimated."""
+    numbers = iter(range(len(problem.observations)))
+    return [None if given else next(numbers) for given in problem.noise_is_given]
+
+
+def _noise(observation: AbstractObservation, found: Array, shape: tuple[int, ...]) -> np.ndarray | None:
+    """The noise of new measurements: the observation's own, or the one found of the fitted observation, its root mean
+    square where the shapes differ."""
+    sigma = np.asarray(found if observation.sigma is None else observation.sigma, float)
+    try:
+        return np.broadcast_to(sigma, shape)
+    except ValueError:
+        return np.full(shape, np.sqrt((sigma**2).mean()))
+
+
+def _prediction(
+    result: FitResult,
+    value: Array | np.ndarray,
+    J: Array | np.ndarray,
+    sigma: np.ndarray | None,
+    estimated: int | None,
+    level: Scalar | None,
+) -> Prediction:
+    """Values with their bands.
+
+    Args:
+        result: the fit.
+        value: the values.
+        J: their derivative, shape (..., n).
+        sigma: the noise of new measurements, if it is known.
+        estimated: the number of that noise among those that the fit estimated.
+        level: of the bands.
+    """
+    level = result.level if level is None else float(level)
+    require((level > 0) & (level < 1), f"level must lie between 0 and 1, got {level}.")
+    mean, gradient = np.asarray(value, float), np.asarray(J, float)
+    known = np.asarray(np.isfinite(gradient).all(axis=-1))
+    seen = np.where(known[..., None], gradient, 0)
+    lost = int((np.isfinite(mean) & ~known).sum())
+    if lost:
+        warn(f"{lost} of {mean.size} predicted numbers have no derivative, and so no band.")
+    error, freedom = result.uncertainty.of(seen)
+    error = np.where(known, error, np.nan)
+    reach = quantile(level, freedom) * error
+    new_lower = new_upper = None
+    if sigma is not None:
+        wider, freedom = _with_noise(result.uncertainty, seen, sigma, estimated)
+        beyond = quantile(level, freedom) * np.where(np.isfinite(error), wider, error)
+        new_lower, new_upper = np.asarray(mean - beyond), np.asarray(mean + beyond)
+    return Prediction(
+        mean, np.asarray(error), np.asarray(mean - reach), np.asarray(mean + reach), sigma, new_lower, new_upper, level
+    )
+
+
+def _with_noise(
+    found: Uncertainty, gradient: np.ndarray, sigma: np.ndarray, estimated: int | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviation of a new measurement about its prediction, and its degrees of freedom (see `Uncertainty.of`):
+    of one observation √(s² + g·C g), Student's as that of a mean."""
+    error, _ = found.of(gradient)
+    total = np.where(np.isfinite(error), error, 0) ** 2 + sigma**2
+    brought = [part + (sigma**2 if k == estimated else 0) for k, part in enumerate(found.brought(gradient))]
+    return np.sqrt(total), found.freedom(total, brought)

@@ -1,0 +1,368 @@
+"""Profile likelihoods: intervals that need no straight line."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Array, Scalar
+from mpmjax.checks import checked, require, require_positive, require_whole, warn
+from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
+from mpmjax.fitting._optimiser import AbstractOptimiser
+from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._restricted import RestrictedProblem
+from mpmjax.fitting._result import FitResult
+from mpmjax.fitting._search import NoDerivativeError, search
+from mpmjax.fitting._uncertainty import quantile
+
+
+class Profile(eqx.Module):
+    """How the misfit grows when one parameter is held at other values and all others are fitted anew.
+
+    `print(profile)` says its interval.
+    """
+
+    label: str
+    """The parameter."""
+    unit: str
+    values: np.ndarray
+    """Its values, growing, shape (p,); the fit's is among them."""
+    statistic: np.ndarray
+    """Δχ² = Σ r² there less that of the fit, in units of the noise, shape (p,)."""
+    numbers: np.ndarray
+    """All fitted numbers along it, one a column in the order of `labels`, shape (p, n)."""
+    labels: tuple[str, ...]
+    estimate: float
+    """The value of the fit."""
+    symmetric: tuple[float, float]
+    """The interval of the standard error, symmetric in the search's coordinate."""
+    interval: tuple[float, float]
+    """Where Δχ² is below the threshold. An end that was not found is the parameter's bound, or infinite."""
+    threshold: float
+    """What Δχ² reaches at the interval's ends: the quantile of χ² of one degree of freedom, or of F(1, ν)."""
+    degrees_of_freedom: float
+    """ν of the noise's estimate; infinite where it was given."""
+    level: float
+    """The level of the interval [-], such as 0.95."""
+    warnings: tuple[str, ...]
+    """Where it ends without an end of the interval, in words."""
+
+    @property
+    def signed_root(self) -> np.ndarray:
+        """±√Δχ², negative below the estimate, shape (p,): a straight line in the search's coordinate where the
+        symmetric interval is right."""
+        return np.sign(self.values - self.estimate) * np.sqrt(np.maximum(self.statistic, 0))
+
+    def along(self, label: str) -> np.ndarray:
+        """Another fitted number where this one is held, shape (p,).
+
+        Raises:
+            ValueError: there is none of this name.
+        """
+        require(label in self.labels, f"The profile has {', '.join(self.labels)}, got {label!r}.")
+        return self.numbers[:, self.labels.index(label)]
+
+    def __str__(self) -> str:
+        """The interval in a line, and warnings."""
+        unit = f" {self.unit}" if self.unit else ""
+        (a, b), (c, d) = self.interval, self.symmetric
+        line = (
+            f"{self.label} = {self.estimate:.6g}{unit}, {100 * self.level:g} % interval by its profile {a:.5g} to "
+            f"{b:.5g}{unit} (by its standard error {c:.5g} to {d:.5g})"
+        )
+        return "\n".join([line, *self.warnings])
+
+
+@checked
+def profile(
+    result: FitResult,
+    label: str,
+    *,
+    level: Scalar | None = None,
+    points: int = 4,
+    rtol: Scalar = 1e-3,
+    optimiser: AbstractOptimiser = LevenbergMarquardt(),
+    progress: Callable[[str], None] | None = None,
+) -> Profile:
+    """The profile likelihood of a fitted number and the interval that follows from it.
+
+        stiffness = mpm.profile(result, "E")
+        print(stiffness)
+        lower, upper = stiffness.interval
+
+    The number is held at a value, all others are fitted anew, and Δχ² is by how much the misfit grew. The interval is
+    where Δχ² is below a threshold: the quantile of χ² of one degree of freedom where the noise was given, of F(1, ν)
+    where it was estimated with ν degrees of freedom (D. M. Bates, D. G. Watts, Nonlinear Regression Analysis and Its
+    Applications, Wiley 1988, chapter 6; D. J. Venzon, S. H. Moolgavkar, Applied Statistics 37 (1988) 87,
+    doi 10.2307/2347496). Unlike the interval of the standard error it does not depend on the coordinate, and need be
+    neither symmetric nor finite. In a linear problem both are one.
+
+    From the estimate it goes to either side in steps of equal growth of √Δχ², as the last two points foretell it, each
+    fit started on the line through them. A value at which the simulation fails is approached by halves. Where the
+    threshold is never reached the interval is open on that side, and a warning says how far Δχ² came. One program is
+    compiled for all points, and for all numbers of a fit.
+
+    The noise is held at what the fit found. With a robust or weighted observation the threshold is approximate.
+
+    Args:
+        result: the fit.
+        label: the fitted number, such as "E" or "E[2]".
+        level: of the interval [-]. Default: that of the fit.
+        points: how many on either side before the threshold, at least.
+        rtol: tolerance of an end, relative to its distance from the estimate in the search's coordinate.
+        optimiser: the method of the search, see `fit`.
+        progress: called with a line a point, such as `print`.
+
+    Raises:
+        ValueError: there is no such fitted number; a level that is none.
+    """
+    problem = result.problem
+    require(
+        label in problem.labels,
+        f"A profile is of a fitted number: {', '.join(problem.labels)}. Got {label!r}.",
+    )
+    level = result.level if level is None else float(level)
+    require((level > 0) & (level < 1), f"level must lie between 0 and 1, got {level}.")
+    require_whole("profile's points", points, 1)
+    require_positive("profile's rtol", rtol)
+    at = problem.labels.index(label)
+    _, freedom = result.uncertainty.of(np.eye(problem.size)[at])
+    walk = _Walk(result, at, optimiser, progress)
+    reach = float(quantile(level, freedom))
+    ends = [walk.end(side, reach, points, float(rtol)) for side in (-1, 1)]
+    found = sorted(walk.known, key=lambda point: point.z[at])
+    numbers = np.stack([walk.numbers(point.z) for point in found])
+    values = [_value(problem, result.z, at, end.at) for end in ends]
+    warnings = tuple(walk.warnings(ends, reach))
+    for text in warnings:
+        warn(text)
+    estimate = result.estimates[at]
+    return Profile(
+        label=label,
+        unit=estimate.unit,
+        values=numbers[:, at],
+        statistic=np.array([point.growth for point in found]),
+        numbers=numbers,
+        labels=problem.labels,
+        estimate=estimate.value,
+        symmetric=_symmetric(result, at, reach),
+        interval=(min(values), max(values)),
+        threshold=reach**2,
+        degrees_of_freedom=float(freedom),
+        level=level,
+        warnings=warnings,
+    )
+
+
+class _Point(NamedTuple):
+    """The least misfit where the coordinate is held."""
+
+    z: np.ndarray
+    """All coordinates, shape (n,)."""
+    growth: float
+    """Δχ²."""
+
+    @property
+    def root(self) -> float:
+        """√Δχ²; negative where the misfit is less than that of the fit."""
+        return float(np.sign(self.growth) * np.sqrt(abs(self.growth)))
+
+
+class _End(NamedTuple):
+    """Where one side of a profile ends."""
+
+    at: float
+    """The coordinate at the threshold; infinite where that is not reached."""
+    last: _Point
+    """The last point."""
+    fault: float | None = None
+    """The nearest coordinate at which the simulation fails."""
+
+
+class _Walk:
+    """A walk along a profile, which knows where it has been."""
+
+    def __init__(
+        self, result: FitResult, at: int, optimiser: AbstractOptimiser, progress: Callable[[str], None] | None
+    ):
+        self.problem, self.sigmas, self.at = result.problem, result.sigmas, at
+        self.optimiser, self.progress = optimiser, progress
+        self.label, self.unsettled = result.problem.labels[at], 0
+        z = np.asarray(result.z, float)
+        self.least = self._misfit(z)
+        self.start = _Point(z, 0.0)
+        self.known = [self.start]
+        self.rate = _direction(result, at)
+        self.error = float(result.uncertainty.error[at])
+        self.pace = self.error if np.isfinite(self.error) else min(float(result.uncertainty.alone[at]), 1.0)
+
+    def end(self, side: int, reach: float, points: int, rtol: float) -> _End:
+        """Walk to one side until √Δχ² is beyond `reach`, and find where it crosses."""
+        farthest = max(_FARTHEST, 3 * reach * self.error) if np.isfinite(self.error) else _FARTHEST
+        before, last, pace, nearest_fault = self.start, self.start, self.pace, np.inf
+        for _ in range(_MOST_POINTS):
+            gone = self._distance(last)
+            wanted = gone + _BEYOND * reach / points * pace
+            wanted = (gone + nearest_fault) / 2 if wanted >= nearest_fault else min(wanted, farthest)
+            point = self.visit(self.start.z[self.at] + side * wanted, last, before)
+            if point is None:
+                nearest_fault = wanted
+                if nearest_fault - gone < _NEAR_FAULT * nearest_fault:
+                    break
+                continue
+            if point.root >= reach:
+                return _End(self._crossing(last, point, reach, rtol), point)
+            grown = point.root - last.root
+            longest = _FASTER * (wanted - gone) * points / reach
+            pace = min((wanted - gone) / grown, longest) if grown > 0 else longest
+            before, last = last, point
+            if wanted >= farthest:
+                break
+        fault = self.start.z[self.at] + side * nearest_fault
+        return _End(side * np.inf, last, float(fault) if np.isfinite(fault) else None)
+
+    def _distance(self, point: _Point) -> float:
+        """Of a point's coordinate from the estimate's."""
+        return float(abs(point.z[self.at] - self.start.z[self.at]))
+
+    def visit(self, place: float, last: _Point, before: _Point) -> _Point | None:
+        """The least misfit with the coordinate held at a place; None where the simulation fails.
+
+        Args:
+            place: the coordinate.
+            last: a point from which the others are foretold,
+            before: and another, for the line through both.
+        """
+        guess = self._foretold(place, last, before)
+        try:
+            z, misfit = self._refitted(guess)
+        except NoDerivativeError:
+            return None
+        if not np.isfinite(misfit):
+            return None
+        point = _Point(z, misfit - self.least)
+        self.known.append(point)
+        if self.progress is not None:
+            shown = ", ".join(f"{n} {v:.5g}" for n, v in zip(self.problem.labels[:4], self.numbers(z), strict=False))
+            self.progress(f"profile of {self.label}: Δχ² {point.growth:8.4g}  {shown}")
+        return point
+
+    def numbers(self, z: np.ndarray) -> np.ndarray:
+        """All fitted numbers at coordinates."""
+        return np.asarray(self.problem.numbers(jnp.asarray(z, self.problem.dtype)), float)
+
+    def warnings(self, ends: list[_End], reach: float) -> list[str]:
+        """What is to be said of its ends."""
+        said = []
+        for end, where in zip(ends, ("below", "above"), strict=True):
+            if np.isfinite(end.at):
+                continue
+            value = self.numbers(end.last.z)[self.at]
+            beyond = ""
+            if end.fault is not None:
+                held = self.start.z.copy()
+                held[self.at] = end.fault
+                beyond = f" Beyond, at {self.numbers(held)[self.at]:.5g}, the simulation fails."
+            said.append(
+                f"{self.label}: the interval is open {where}. At {value:.5g} Δχ² is {max(end.last.growth, 0):.2g}, "
+                f"less than {reach**2:.3g}: the data do not bound it.{beyond}"
+            )
+        best = min(self.known, key=lambda point: point.growth)
+        if best.growth < -_BETTER:
+            said.append(
+                f"{self.label}: the profile found a misfit smaller by {-best.growth:.2g} at "
+                f"{self.numbers(best.z)[self.at]:.5g}: the fit is not at the least one. Fit again from there."
+            )
+        if self.unsettled:
+            said.append(f"{self.label}: at {self.unsettled} points of the profile the others did not converge.")
+        return said
+
+    def _crossing(self, below: _Point, above: _Point, reach: float, rtol: float) -> float:
+        """The coordinate at which √Δχ² is `reach`, by Brent's method. A value at which the simulation fails counts as
+        beyond it."""
+        from scipy.optimize import root_scalar  # here, since it takes long to import
+
+        seen = {below.z[self.at]: below.root - reach, above.z[self.at]: above.root - reach}
+
+        def excess(place: float) -> float:
+            if place not in seen:
+                point = self.visit(place, below, above)
+                seen[place] = reach if point is None else point.root - reach
+            return seen[place]
+
+        within = rtol / 2 * self._distance(above)
+        found = root_scalar(excess, method="brentq", bracket=(below.z[self.at], above.z[self.at]), xtol=within)
+        return float(found.root)
+
+    def _foretold(self, place: float, last: _Point, before: _Point) -> np.ndarray:
+        """The coordinates on the line through two points, or along the direction of the covariance from the fit."""
+        covered = last.z[self.at] - before.z[self.at]
+        rate = self.rate if covered == 0 else (last.z - before.z) / covered
+        guess = last.z + rate * (place - last.z[self.at])
+        guess[self.at] = place
+        return guess
+
+    def _refitted(self, guess: np.ndarray) -> tuple[np.ndarray, float]:
+        """All coordinates, the others fitted, and the misfit."""
+        if len(guess) == 1:
+            return guess, self._misfit(guess)
+        problem = self.problem
+        basis = np.delete(np.eye(len(guess)), self.at, axis=1)
+        held = RestrictedProblem(problem, jnp.asarray(guess, problem.dtype), jnp.asarray(basis, problem.dtype))
+        found = search(held, self.optimiser, jnp.zeros(basis.shape[1], problem.dtype), self.sigmas)
+        if found.interrupted:
+            raise KeyboardInterrupt
+        if not found.converged and np.isfinite(found.history[-1].cost):
+            self.unsettled += 1
+        return guess + basis @ np.asarray(found.z, float), float((np.asarray(found.r, float) ** 2).sum())
+
+    def _misfit(self, z: np.ndarray) -> float:
+        """Σ r²."""
+        r = _residuals(self.problem, jnp.asarray(z, self.problem.dtype), self.sigmas)
+        return float((np.asarray(r, float) ** 2).sum())
+
+
+@eqx.filter_jit
+def _residuals(problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> Array:
+    """The residuals, compiled."""
+    return problem.residuals(z, sigmas, None)[0]
+
+
+def _direction(result: FitResult, at: int) -> np.ndarray:
+    """How the other coordinates follow one that is moved, by the covariance, shape (n,)."""
+    found, unit = result.uncertainty, np.eye(result.problem.size)[at]
+    if found.unseen.shape[1] and np.isinf(found.error[at]):
+        along = found.unseen @ (found.unseen.T @ unit)
+    else:
+        along = found.inverse @ unit
+    return along / along[at]
+
+
+def _value(problem: FitProblem, z: np.ndarray, at: int, place: float) -> float:
+    """The value of a number where its coordinate is at a place, which may be infinite."""
+    moved = np.asarray(z, float).copy()
+    moved[at] = place
+    return float(problem.numbers(jnp.asarray(moved, problem.dtype))[at])
+
+
+def _symmetric(result: FitResult, at: int, reach: float) -> tuple[float, float]:
+    """The interval of so many standard errors to both sides in the coordinate."""
+    half = reach * float(result.uncertainty.error[at])
+    ends = [_value(result.problem, result.z, at, float(result.z[at]) + side * half) for side in (-1, 1)]
+    return min(ends), max(ends)
+
+
+_FARTHEST = 14.0
+"""How far a profile is followed, in the search's coordinate: to a millionth and a million-fold of a positive one."""
+_MOST_POINTS = 40
+"""On one side."""
+_BEYOND = 1.02
+"""Steps are so much longer than is foretold, so that in a linear problem the last one goes beyond the threshold."""
+_FASTER = 2.0
+"""A step is no longer than so many times the one before."""
+_NEAR_FAULT = 0.02
+"""A value at which the simulation fails is approached to this part of its distance from the estimate."""
+_BETTER = 1e-2
+"""A Δχ² below zero by more is another minimum."""
