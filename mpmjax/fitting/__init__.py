@@ -1,9 +1,12 @@
 """Fitting parameters to measured data."""
 
+from mpmjax.fitting._bootstrap import Bootstrap, bootstrap
 from mpmjax.fitting._columns import read_columns
+from mpmjax.fitting._ensemble import EnsembleFit, fit_ensemble
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import fit
 from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
+from mpmjax.fitting._multistart import LocalMinimum, MultistartFit, fit_multistart
 from mpmjax.fitting._observation import AbstractObservation, Curve, Force, Series, Tracks
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter, Bounded, Gaussian, Positive, Unbounded
@@ -15,10 +18,12 @@ __all__ = [
     "AbstractObservation",
     "AbstractOptimiser",
     "AbstractParameter",
+    "Bootstrap",
     "Bounded",
     "CentreOfMass",
     "Curve",
     "Density",
+    "EnsembleFit",
     "Estimate",
     "Evaluation",
     "Experiment",
@@ -27,7 +32,9 @@ __all__ = [
     "Force",
     "Gaussian",
     "LevenbergMarquardt",
+    "LocalMinimum",
     "Markers",
+    "MultistartFit",
     "NoiseEstimate",
     "Positive",
     "RefinedFit",
@@ -35,7 +42,10 @@ __all__ = [
     "StressStretch",
     "Tracks",
     "Unbounded",
+    "bootstrap",
     "fit",
+    "fit_ensemble",
+    "fit_multistart",
     "fit_refined",
     "read_columns",
 ]
