@@ -13,6 +13,7 @@ from mpmjax.fitting._parameter import AbstractParameter, Bounded, Gaussian, Posi
 from mpmjax.fitting._quantities import CentreOfMass, Density, Extent, Markers, StressStretch
 from mpmjax.fitting._refined import RefinedFit, fit_refined
 from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
+from mpmjax.fitting._staged import Stage, StagedFit, fit_staged
 
 __all__ = [
     "AbstractObservation",
@@ -39,6 +40,8 @@ __all__ = [
     "Positive",
     "RefinedFit",
     "Series",
+    "Stage",
+    "StagedFit",
     "StressStretch",
     "Tracks",
     "Unbounded",
@@ -47,5 +50,6 @@ __all__ = [
     "fit_ensemble",
     "fit_multistart",
     "fit_refined",
+    "fit_staged",
     "read_columns",
 ]

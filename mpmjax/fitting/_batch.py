@@ -90,6 +90,7 @@ def search_many(
     *,
     batch: int,
     joining: float = 0.0,
+    settling: float = 0.0,
     progress: Callable[[int, int], None] | None = None,
     begun: Callable[[int, Evaluation], None] | None = None,
 ) -> tuple[Member, ...]:
@@ -107,6 +108,8 @@ def search_many(
         batch: how many are computed together.
         joining: a search that comes so near to another one of one problem with a lower cost, in each coordinate, is
             ended: it would go the same way. Zero ends none.
+        settling: a search is at a minimum too where its last three moves lowered the cost by less than this part of it:
+            Gauss-Newton steps are slow where residuals are large, as at false minima. Zero ends none.
         progress: called with how many are done, and of how many.
         begun: called with the number of a search and what is known where it starts, unless it fails there.
     """
@@ -122,7 +125,7 @@ def search_many(
                 first = len(lanes.history[lane]) == 1 and np.isfinite(lanes.history[lane][0].cost)
                 if first and begun is not None:
                     begun(lanes.members[lane], lanes.seen[lane])
-                ended = lanes.ended(lane)
+                ended = lanes.ended(lane, settling)
                 if ended is not None:
                     done[lanes.leave(lane)] = ended
             if joining > 0:
@@ -195,7 +198,7 @@ class _Lanes:
             moved = not history or cost != history[-1].cost
             history.append(Iteration(len(history), cost, slope, moved, self.z[lane].copy()))
 
-    def ended(self, lane: int) -> Member | None:
+    def ended(self, lane: int, settling: float) -> Member | None:
         """What became of a search, once it is done."""
         last = self.history[lane][-1]
         if not np.isfinite(last.cost):
@@ -203,7 +206,11 @@ class _Lanes:
         if not np.isfinite(last.gradient):
             return Member(None, "there is no derivative")
         state = eqx.combine(jax.tree.map(lambda a: a[lane], self.state), self.rest)
-        if self.optimiser.has_converged(state, self.seen[lane]):
+        costs = [i.cost for i in self.history[lane] if i.accepted]
+        settled = (
+            len(costs) > _MOVES and costs[-1] > (1 - settling) * costs[-1 - _MOVES] and self.history[lane][-1].accepted
+        )
+        if settled or self.optimiser.has_converged(state, self.seen[lane]):
             return self.stopped(lane, converged=True)
         return self.stopped(lane) if len(self.history[lane]) == self.optimiser.max_steps else None
 
@@ -274,3 +281,5 @@ _DIFFERENT = (
     "The data sets of an ensemble must differ in numbers alone, but number {} has other shapes, choices or functions "
     "than the first: give each the same times and markers (NaN where nothing was measured), and the same functions."
 )
+_MOVES = 3
+"""How many moves must have lowered the cost by little."""

@@ -105,8 +105,9 @@ def fit_multistart(
     prior, between its bounds, from a tenth to ten times the first guess of a `Positive`, and one coordinate to each
     side of an `Unbounded` one. Searches run together, `batch` in one compiled program; one that is done leaves its
     place to the next. A search whose simulation fails ends alone. One that comes within a hundredth, in each
-    coordinate, of another with a lower cost is ended, and counted where that one ends. The best is then fitted as
-    `fit` does, from where its search ended.
+    coordinate, of another with a lower cost is ended, and counted where that one ends; one whose sum of squares three
+    moves have lowered by less than a thousandth is ended at that minimum. The best is then fitted as `fit` does, from
+    where its search ended.
 
     Two searches ended at one minimum where their coordinates differ by less than two hundredths, or where the data
     cannot tell them apart: Δᵀ JᵀJ Δ ≤ n in units of the noise, with the J of the better one.
@@ -153,6 +154,7 @@ def fit_multistart(
         Problems.of([sigmas], shared=True),
         batch=min(batch, starts),
         joining=_JOINED,
+        settling=_SETTLED,
         progress=say,
         begun=begun,
     )
@@ -235,6 +237,8 @@ def _listed(numbers: Any) -> str:
 
 _JOINED = 0.01
 """A search so near to a better one, in each coordinate, would go the same way."""
+_SETTLED = 1e-3
+"""A search that three moves have lowered by less than this part of its sum of squares is at a minimum."""
 _NEAR = 0.02
 """Ends of searches so near in each coordinate are one minimum."""
 _SHOWN = 8
