@@ -1,6 +1,7 @@
 """Many searches at once: starts, data sets, draws, and what is refused."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ class Oscillation(FitProblem):
         return self.observations[0].residuals(predicted, sigmas[0]), jnp.zeros(1)
 
 
-OMEGA = mpm.Positive(lambda e: e.scene.material.youngs_modulus, start=900.0)
+OMEGA = mpm.Positive(lambda e: e.scene.material.youngs_modulus, start=500.0)
 
 
 @pytest.fixture
@@ -46,28 +47,29 @@ def oscillation(monkeypatch):
 
 
 def test_many_starts_find_the_least_of_many_minima(oscillation):
-    """ω = 400 from 900, where a fit alone ends elsewhere; searches from beyond 2000 fail, and hinder no other."""
-    found = oscillation(starts=48, ranges={"omega": (100.0, 4000.0)}, batch=5)
-    alone = mpm.fit([], {"omega": OMEGA})
+    """ω = 400 from 500, from which a fit ends at 549; searches from beyond 2000 fail, and hinder no other."""
+    found = oscillation(starts=24, ranges={"omega": (100.0, 4000.0)}, batch=5)
+    with pytest.warns(UserWarning, match="times the noise given"):
+        alone = mpm.fit([], {"omega": OMEGA})
     assert abs(alone["omega"].value - 400) > 100
     assert found["omega"].value == pytest.approx(400, abs=4 * found["omega"].error)
-    assert len(found.minima) > 3
+    assert len(found.minima) > 2
     ends = [float(m.values["omega"]) for m in found.minima]
     misfits = [m.misfit for m in found.minima]
     assert misfits == sorted(misfits)
-    assert min(abs(alone["omega"].value / end - 1) for end in ends) < 1e-3
+    assert min(abs(alone["omega"].value / end - 1) for end in ends) < 2e-3
     counted = sum(len(m.members) for m in found.minima) + len(found.failures) + len(found.unfinished)
-    assert counted == found.count == 48
+    assert counted == found.count == 24
     started = found.starts["omega"]
     assert set(found.failures) == set(np.flatnonzero(started >= 2000))
-    assert started[0] == pytest.approx(900)
+    assert started[0] == pytest.approx(500)
     assert "searches" in str(found)
 
 
 def test_a_search_among_many_goes_where_it_goes_alone():
     """Iteration by iteration, whoever its neighbours are and wherever its place is."""
     problem = Oscillation([], {"omega": OMEGA})
-    starts = np.linspace(-1.5, 0.7, 7)[:, None]
+    starts = np.linspace(-1.0, 0.3, 7)[:, None]
     sigmas = problem.first_sigmas
     members = search_many(Problems.of([problem], shared=True), LM, starts, Problems.of([sigmas], shared=True), batch=3)
     for start, member in zip(starts, members, strict=True):
@@ -79,7 +81,8 @@ def test_a_search_among_many_goes_where_it_goes_alone():
 
 def test_starting_points_fill_what_is_known_of_each_parameter():
     """A prior's quantiles, the bounds, a range of a logarithm; the first is the first guess."""
-    one = experiment(mpm.Tracks(*tracks_arguments(), sigma=NOISE))
+    times, x, which = tracks()
+    one = experiment(mpm.Tracks(times, x, which=which, sigma=NOISE))
     parameters = {
         "E": STIFFNESS,
         "nu": mpm.Bounded(lambda e: e.scene.material.poisson_ratio, 0.1, 0.4),
@@ -90,18 +93,13 @@ def test_starting_points_fill_what_is_known_of_each_parameter():
     points = starting_points(problem, 129, {"E": (1e3, 1e6)}, 0)
     assert points.shape == (129, problem.size)
     assert not points[0].any()
-    values = {n: np.array([problem.values(jnp.asarray(z))[k] for z in points[1:]]) for k, n in enumerate(problem.names)}
+    values = dict(zip(problem.names, jax.jit(jax.vmap(problem.values))(jnp.asarray(points[1:])), strict=True))
     assert np.isfinite(points).all()
     assert np.histogram(np.log10(values["E"]), 4, (3, 6))[0] == pytest.approx([32] * 4, abs=1)
     assert np.histogram(values["nu"], 4, (0.1, 0.4))[0] == pytest.approx([32] * 4, abs=1)
     assert values["v"].mean() == pytest.approx(2, abs=0.02)
     assert values["v"].std() == pytest.approx(0.5, abs=0.02)
     assert values["m"].min() > 0
-
-
-def tracks_arguments():
-    times, x, which = tracks()
-    return {"times": times, "positions": x, "which": which}.values()
 
 
 REFUSED = {

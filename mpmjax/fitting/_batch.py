@@ -220,7 +220,7 @@ class _Lanes:
         if seen is None:
             return Member(None, "was not begun: the search was interrupted")
         problem, sigmas = self.problems.one(member), self.sigmas.one(member)
-        z = jnp.asarray(self.z[lane], problem.dtype)
+        z = jnp.array(self.z[lane], problem.dtype)  # a copy: `take` writes to self.z
         r, J = seen.residuals, seen.jacobian
         if r is None or J is None:
             r, J = jacobian(problem, z, sigmas)

@@ -109,8 +109,9 @@ def fit_multistart(
     moves have lowered by less than a thousandth is ended at that minimum. The best is then fitted as `fit` does, from
     where its search ended.
 
-    Two searches ended at one minimum where their coordinates differ by less than two hundredths, or where the data
-    cannot tell them apart: Δᵀ JᵀJ Δ ≤ n in units of the noise, with the J of the better one.
+    Two searches ended at one minimum where their coordinates differ by less than two hundredths, or where the misfit
+    hides the difference: Δᵀ JᵀJ Δ ≤ n s² of n coordinates, J and s² = Σ r²/(m − n), or one if σ is given and that is
+    less, being those of the better one.
 
     Where σ is not given, searches take the size of the data in its place: several observations without one weigh alike
     in them, and are only weighed by their noise in the last fit.
@@ -200,14 +201,11 @@ def _minima(problem: FitProblem, members: tuple[Member, ...]) -> list[tuple[Mini
     ends = {k: _end(members, k) for k in range(len(members))}
     found = [(k, m.minimum) for k, m in enumerate(members) if m.minimum is not None and ends[k] == k]
     groups: list[tuple[Minimum, list[int]]] = []
+    least = 1.0 if all(problem.noise_is_given) else 0.0
     for k, minimum in sorted(found, key=lambda pair: _cost(pair[1])):
         own = [number for number, end in ends.items() if end == k]
-        variance = 1.0
-        if groups and not all(problem.noise_is_given):
-            r = np.asarray(groups[0][0].r, float)
-            variance = float((r**2).sum()) / max(np.count_nonzero(r) - problem.size, 1)
         for there, numbers in groups:
-            if _same(np.asarray(minimum.z - there.z, float), np.asarray(there.J, float), variance):
+            if _same(np.asarray(minimum.z - there.z, float), there, least):
                 numbers += own
                 break
         else:
@@ -215,8 +213,16 @@ def _minima(problem: FitProblem, members: tuple[Member, ...]) -> list[tuple[Mini
     return groups
 
 
-def _same(change: np.ndarray, J: np.ndarray, variance: float) -> bool:
-    """Whether two ends of searches, so far apart, are one minimum."""
+def _same(change: np.ndarray, better: Minimum, least: float) -> bool:
+    """Whether an end of a search, so far from a better one, is the same minimum.
+
+    Args:
+        change: the difference of their coordinates.
+        better: the better one.
+        least: the least mean square of its residuals.
+    """
+    r, J = np.asarray(better.r, float), np.asarray(better.J, float)
+    variance = max(least, float((r**2).sum()) / max(np.count_nonzero(r) - len(change), 1))
     return bool((np.abs(change) <= _NEAR).all() or ((J @ change) ** 2).sum() <= len(change) * variance)
 
 
