@@ -8,7 +8,7 @@ from test_fit import DT, NOISE, STEPS, STIFFNESS, bar, experiment, tracks
 
 import mpmjax as mpm
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._staged import _cut, _first_horizon, _limits
+from mpmjax.fitting._staged import _first_horizon, _limits
 from mpmjax.verification import VibratingBar, discretise
 
 EXACT, PERIODS, FRAMES = VibratingBar(), 4, 40
@@ -84,8 +84,8 @@ class Known(FitProblem):
 
 
 def test_the_first_horizon_is_where_the_data_cease_to_be_linear():
-    """Of sin ωt by log ω: √(∫ (ωt cos ωt)²/∫ sin² ωt) is one at ωt = 1.9; of free fall by log g it is one at all
-    times, and the horizon is the end."""
+    """Of sin ωt by log ω, against sums over a fine line; of free fall by log g the ratio is one at all times, and the
+    horizon is the end."""
     omega = 200.0
     phase = np.linspace(1e-3, omega * STEPS * DT, 100_000)
     ratio = np.sqrt(np.cumsum((phase * np.cos(phase)) ** 2) / np.cumsum(np.sin(phase) ** 2))
@@ -99,16 +99,21 @@ def test_the_first_horizon_is_where_the_data_cease_to_be_linear():
 
 @pytest.mark.thorough
 def test_data_beyond_the_growth_of_derivatives_are_left_out():
-    """Of a drop that free-falls, whose growth is one, with a limit below it; the limit infinite leaves all."""
+    """Growth is below the limit until there, and above it after; without a limit all data are used."""
     times, x, which = tracks()
     whole = experiment(mpm.Tracks(times, x, which=which, sigma=NOISE))
-    problem = FitProblem((whole,), {"E": STIFFNESS})
-    assert _limits(problem.experiments, np.inf) == [whole.t1]
-    growth = mpm.sensitivity(whole.scene, whole.particles, t1=whole.t1, dt=DT)
-    bound = float(growth.growth[:6].max()) * (1 + 1e-9) if growth.growth[6] > growth.growth[:6].max() else None
-    limit = _limits(problem.experiments, 0.9 * float(growth.growth[4]) if bound is None else bound)[0]
-    assert limit < whole.t1
-    assert _cut(problem, [limit], whole.t1).experiments[0].t1 == pytest.approx(limit)
+    growth = np.asarray(mpm.sensitivity(whole.scene, whole.particles, t1=whole.t1, dt=DT).growth)
+    bound = float(np.median(growth))
+    (limit,) = _limits([whole], bound)
+    last = round(limit / DT)
+    assert 0 < last < STEPS
+    assert last == 1 or (growth[:last] <= bound).all()
+    assert (growth[: last + 1] > bound).any()
+    assert _limits([whole], np.inf) == [whole.t1]
+    with pytest.warns(UserWarning, match="data are used only until"):
+        found = mpm.fit_staged(whole, {"E": STIFFNESS}, horizons=[2 * DT], growth=float(growth[6:].min() * 0.999))
+    assert found.horizons[0] < whole.t1
+    assert found.said
 
 
 REFUSED = {

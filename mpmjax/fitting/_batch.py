@@ -108,8 +108,9 @@ def search_many(
         batch: how many are computed together.
         joining: a search that comes so near to another one of one problem with a lower cost, in each coordinate, is
             ended: it would go the same way. Zero ends none.
-        settling: a search is at a minimum too where its last three moves lowered the cost by less than this part of it:
-            Gauss-Newton steps are slow where residuals are large, as at false minima. Zero ends none.
+        settling: a search is at a minimum too where its last three moves, or six iterations, lowered the cost by less
+            than this part of it: Gauss-Newton steps are slow where residuals are large, as at false minima. Zero ends
+            none.
         progress: called with how many are done, and of how many.
         begun: called with the number of a search and what is known where it starts, unless it fails there.
     """
@@ -206,13 +207,16 @@ class _Lanes:
         if not np.isfinite(last.gradient):
             return Member(None, "there is no derivative")
         state = eqx.combine(jax.tree.map(lambda a: a[lane], self.state), self.rest)
-        costs = [i.cost for i in self.history[lane] if i.accepted]
-        settled = (
-            len(costs) > _MOVES and costs[-1] > (1 - settling) * costs[-1 - _MOVES] and self.history[lane][-1].accepted
-        )
-        if settled or self.optimiser.has_converged(state, self.seen[lane]):
+        if self._settled(lane, settling) or self.optimiser.has_converged(state, self.seen[lane]):
             return self.stopped(lane, converged=True)
         return self.stopped(lane) if len(self.history[lane]) == self.optimiser.max_steps else None
+
+    def _settled(self, lane: int, part: float) -> bool:
+        """Whether its last moves, or its last iterations, lowered the cost by less than this part."""
+        costs = [i.cost for i in self.history[lane]]
+        moves = [i.cost for i in self.history[lane] if i.accepted]
+        slow = len(moves) > 1 and len(costs) > _ITERATIONS and costs[-1] > (1 - part) * costs[-1 - _ITERATIONS]
+        return slow or (len(moves) > _MOVES and moves[-1] > (1 - part) * moves[-1 - _MOVES])
 
     def stopped(self, lane: int, *, converged: bool = False, interrupted: bool = False) -> Member:
         """A search as it is."""
@@ -283,3 +287,5 @@ _DIFFERENT = (
 )
 _MOVES = 3
 """How many moves must have lowered the cost by little."""
+_ITERATIONS = 6
+"""How many iterations must have lowered the cost by little."""

@@ -106,7 +106,7 @@ def fit_multistart(
     side of an `Unbounded` one. Searches run together, `batch` in one compiled program; one that is done leaves its
     place to the next. A search whose simulation fails ends alone. One that comes within a hundredth, in each
     coordinate, of another with a lower cost is ended, and counted where that one ends; one whose sum of squares three
-    moves have lowered by less than a thousandth is ended at that minimum. The best is then fitted as `fit` does, from
+    moves, or six iterations, have lowered by less than a hundredth is ended there, as at a minimum. The best is then fitted as `fit` does, from
     where its search ended.
 
     Two searches ended at one minimum where their coordinates differ by less than two hundredths, or where the misfit
@@ -243,8 +243,8 @@ def _listed(numbers: Any) -> str:
 
 _JOINED = 0.01
 """A search so near to a better one, in each coordinate, would go the same way."""
-_SETTLED = 1e-3
-"""A search that three moves have lowered by less than this part of its sum of squares is at a minimum."""
+_SETTLED = 1e-2
+"""A search that lately lowered its sum of squares by less than this part is at a minimum."""
 _NEAR = 0.02
 """Ends of searches so near in each coordinate are one minimum."""
 _SHOWN = 8
