@@ -1,6 +1,6 @@
 """What do 64 searches together cost, beside 64 fits one by one?
 
-    python benchmarks/multistart.py [--starts 64] [--rounds 2]
+    python benchmarks/multistart.py [--starts 64] [--rounds 2] [--scene explicit]
 
 E and ν of a free square that is stretched as it starts, from tracks of all its particles with noise, made by the same
 scene; once with explicit steps, once with semi-implicit ones. Both ways start from the same Sobol points, E over two
@@ -87,15 +87,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--starts", type=int, default=64)
     parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--scene", choices=SCENES, action="append")
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     warnings.simplefilter("ignore")
-    for name, (method, dt, steps) in SCENES.items():
+    for name in given.scene or SCENES:
+        method, dt, steps = SCENES[name]
         pull = experiment(method, dt, steps)
         points = starting_points(FitProblem((pull,), PARAMETERS), given.starts, {}, 0)
         calls = {batch: iteration(pull, points, batch) for batch in (1, 8, 32) if batch <= given.starts}
         seconds: dict[int, list[float]] = {batch: [] for batch in calls}
-        for _ in range(2 + 3 * given.rounds):
+        for _ in range(2 + given.rounds):
             for batch, call in calls.items():
                 seconds[batch].append(timed(call)[0] / batch)
         told = ", ".join(f"{batch}: {1e3 * np.median(s[1:]):.1f} ms" for batch, s in seconds.items())

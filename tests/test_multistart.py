@@ -71,7 +71,9 @@ def test_a_search_among_many_goes_where_it_goes_alone():
     problem = Oscillation([], {"omega": OMEGA})
     starts = np.linspace(-1.0, 0.3, 7)[:, None]
     sigmas = problem.first_sigmas
-    members = search_many(Problems.of([problem], shared=True), LM, starts, Problems.of([sigmas], shared=True), batch=3)
+    members = search_many(
+        Problems.of([problem], shared=True), LM, starts, sigmas=Problems.of([sigmas], shared=True), batch=3
+    )
     for start, member in zip(starts, members, strict=True):
         alone = search(problem, LM, jnp.asarray(start), sigmas)
         assert member.minimum.converged == alone.converged

@@ -113,7 +113,7 @@ def bootstrap(
         Problems.of(problems, shared=False),
         optimiser,
         np.repeat(np.asarray(result.z, float)[None], repeats, axis=0),
-        Problems.of([result.sigmas], shared=True),
+        sigmas=Problems.of([result.sigmas], shared=True),
         batch=min(batch, repeats),
         progress=say,
     )

@@ -174,7 +174,7 @@ def _fit_each(
             stacked.only(left),
             optimiser,
             starts[left],
-            Problems.of([sigmas[k] for k in left], shared=False),
+            sigmas=Problems.of([sigmas[k] for k in left], shared=False),
             batch=batch,
             progress=say,
         )

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -106,8 +107,8 @@ def fit_multistart(
     side of an `Unbounded` one. Searches run together, `batch` in one compiled program; one that is done leaves its
     place to the next. A search whose simulation fails ends alone. One that comes within a hundredth, in each
     coordinate, of another with a lower cost is ended, and counted where that one ends; one whose sum of squares three
-    moves, or six iterations, have lowered by less than a hundredth is ended there, as at a minimum. The best is then fitted as `fit` does, from
-    where its search ended.
+    moves, or six iterations, have lowered by less than a hundredth is ended there, as at a minimum. Those that come
+    within twice the least sum of squares are searched on, and the best is then fitted as `fit` does.
 
     Two searches ended at one minimum where their coordinates differ by less than two hundredths, or where the misfit
     hides the difference: Δᵀ JᵀJ Δ ≤ n s² of n coordinates, J and s² = Σ r²/(m − n), or one if σ is given and that is
@@ -148,21 +149,23 @@ def fit_multistart(
         if member == 0:
             require_influence(problem, sigmas, seen)
 
-    members = search_many(
+    together = partial(
+        search_many,
         Problems.of([problem], shared=True),
         optimiser,
-        points,
-        Problems.of([sigmas], shared=True),
+        sigmas=Problems.of([sigmas], shared=True),
         batch=min(batch, starts),
         joining=_JOINED,
-        settling=_SETTLED,
-        progress=say,
-        begun=begun,
     )
-    groups = _minima(problem, members)
+    members = together(points, settling=_SETTLED, progress=say, begun=begun)
+    groups = _grouped(problem, _ends(members))
     if not groups:
         explain(problem, jnp.zeros(problem.size, problem.dtype))
         raise ValueError(f"No search of {starts} came to a minimum: {_failures(members).get(0, 'raise max_steps')}.")
+    near = sum(_cost(found) <= _NEAR_BEST * _cost(groups[0][0]) for found, _ in groups[:_SHOWN])
+    further = together(np.array([found.z for found, _ in groups[:near]], float))
+    on = [(groups[k][0] if m.minimum is None else m.minimum, groups[k][1]) for k, m in enumerate(further)]
+    groups = _grouped(problem, [*on, *groups[near:]])
     minima = tuple(_local_minimum(problem, found, numbers) for found, numbers in groups)
     restarted = {name: replace(p, start=minima[0].values[name]) for name, p in parameters.items()}
     best = fit(experiments, restarted, report=report, level=level, optimiser=optimiser, progress=progress)
@@ -180,7 +183,7 @@ def fit_multistart(
         starts={name: np.stack([v[k] for v in values]) for k, name in enumerate(problem.names)},
         failures=_failures(members),
         unfinished=tuple(k for k, m in enumerate(found) if m is not None and _end(members, k) is None),
-        iterations=sum(len(m.history) for m in found if m is not None),
+        iterations=sum(len(m.minimum.history) for m in (*members, *further) if m.minimum is not None),
     )
 
 
@@ -196,20 +199,28 @@ def _end(members: tuple[Member, ...], k: int) -> int | None:
     return k if minimum is not None and minimum.converged else None
 
 
-def _minima(problem: FitProblem, members: tuple[Member, ...]) -> list[tuple[Minimum, list[int]]]:
-    """The distinct minima, the lowest first, and the numbers of the searches that ended there."""
-    ends = {k: _end(members, k) for k in range(len(members))}
-    found = [(k, m.minimum) for k, m in enumerate(members) if m.minimum is not None and ends[k] == k]
+def _ends(members: tuple[Member, ...]) -> list[tuple[Minimum, list[int]]]:
+    """Where searches ended, with the numbers of those that ended there."""
+    numbers: dict[int, list[int]] = {}
+    for k in range(len(members)):
+        end = _end(members, k)
+        if end is not None:
+            numbers.setdefault(end, []).append(k)
+    found = [(members[end].minimum, own) for end, own in numbers.items()]
+    return [(minimum, own) for minimum, own in found if minimum is not None]
+
+
+def _grouped(problem: FitProblem, ends: list[tuple[Minimum, list[int]]]) -> list[tuple[Minimum, list[int]]]:
+    """The distinct minima, the lowest first, with the numbers of the searches that ended there."""
     groups: list[tuple[Minimum, list[int]]] = []
     least = 1.0 if all(problem.noise_is_given) else 0.0
-    for k, minimum in sorted(found, key=lambda pair: _cost(pair[1])):
-        own = [number for number, end in ends.items() if end == k]
+    for minimum, own in sorted(ends, key=lambda pair: _cost(pair[0])):
         for there, numbers in groups:
             if _same(np.asarray(minimum.z - there.z, float), there, least):
                 numbers += own
                 break
         else:
-            groups.append((minimum, own))
+            groups.append((minimum, list(own)))
     return groups
 
 
@@ -245,6 +256,8 @@ _JOINED = 0.01
 """A search so near to a better one, in each coordinate, would go the same way."""
 _SETTLED = 1e-2
 """A search that lately lowered its sum of squares by less than this part is at a minimum."""
+_NEAR_BEST = 2.0
+"""Searches that end within this factor of the least sum of squares are searched on."""
 _NEAR = 0.02
 """Ends of searches so near in each coordinate are one minimum."""
 _SHOWN = 8
