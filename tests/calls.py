@@ -69,6 +69,10 @@ FUNCTIONS = {
     mpm.profile: {"result": FITTED, "label": "E"},
     mpm.predict: {"result": FITTED, "of": reached},
     mpm.predict_observations: {"result": FITTED},
+    mpm.fit_multistart: {"experiments": mpm.Experiment(**RUN, observations=SEEN), "parameters": {"E": STIFFNESS}},
+    mpm.fit_staged: {"experiments": mpm.Experiment(**RUN, observations=SEEN), "parameters": {"E": STIFFNESS}},
+    mpm.fit_ensemble: {"experiments": [mpm.Experiment(**RUN, observations=SEEN)], "parameters": {"E": STIFFNESS}},
+    mpm.bootstrap: {"result": None},
 }
 """Each public function with arguments; of those the tests replace one at a time."""
 PARTICLE_FIELDS = {"x": PARTICLES.x, "v": PARTICLES.v, "mass": PARTICLES.mass, "volume": PARTICLES.volume}

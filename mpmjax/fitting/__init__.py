@@ -1,9 +1,12 @@
 """Fitting parameters to measured data."""
 
+from mpmjax.fitting._bootstrap import Bootstrap, bootstrap
 from mpmjax.fitting._columns import read_columns
+from mpmjax.fitting._ensemble import EnsembleFit, fit_ensemble
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import fit
 from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
+from mpmjax.fitting._multistart import LocalMinimum, MultistartFit, fit_multistart
 from mpmjax.fitting._observation import AbstractObservation, Curve, Force, Series, Tracks
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter, Bounded, Gaussian, Positive, Unbounded
@@ -12,15 +15,18 @@ from mpmjax.fitting._profile import Profile, profile
 from mpmjax.fitting._quantities import CentreOfMass, Density, Extent, Markers, StressStretch
 from mpmjax.fitting._refined import RefinedFit, fit_refined
 from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
+from mpmjax.fitting._staged import Stage, StagedFit, fit_staged
 
 __all__ = [
     "AbstractObservation",
     "AbstractOptimiser",
     "AbstractParameter",
+    "Bootstrap",
     "Bounded",
     "CentreOfMass",
     "Curve",
     "Density",
+    "EnsembleFit",
     "Estimate",
     "Evaluation",
     "Experiment",
@@ -29,18 +35,26 @@ __all__ = [
     "Force",
     "Gaussian",
     "LevenbergMarquardt",
+    "LocalMinimum",
     "Markers",
+    "MultistartFit",
     "NoiseEstimate",
     "Positive",
     "Prediction",
     "Profile",
     "RefinedFit",
     "Series",
+    "Stage",
+    "StagedFit",
     "StressStretch",
     "Tracks",
     "Unbounded",
+    "bootstrap",
     "fit",
+    "fit_ensemble",
+    "fit_multistart",
     "fit_refined",
+    "fit_staged",
     "predict",
     "predict_observations",
     "profile",

@@ -33,6 +33,21 @@ def noise_factors(problem: FitProblem, found: Minimum) -> tuple[list[float], lis
     return factors, freedoms
 
 
+def settle_noise(
+    problem: FitProblem, found: Minimum, sigmas: tuple[Array, ...]
+) -> tuple[list[float], list[float], tuple[Array, ...], bool]:
+    """What a minimum says of the noise: by what each is to be multiplied, the degrees of freedom of its estimate, the
+    noise, and whether that moves the minimum, so that it must be searched again."""
+    estimated, freedom = noise_factors(problem, found)
+    floor = [_LEAST * o.scale() / float(np.max(s)) for o, s in zip(problem.observations, sigmas, strict=True)]
+    factors = [max(factor, least) for factor, least in zip(estimated, floor, strict=True)]
+    sigmas = tuple(sigma * factor for sigma, factor in zip(sigmas, factors, strict=True))
+    changing = any(
+        abs(factor - 1) > _NOISE_RTOL and factor > least for factor, least in zip(factors, floor, strict=True)
+    )
+    return factors, freedom, sigmas, changing and not problem.scales_alike
+
+
 def fit_result(
     problem: FitProblem,
     found: Minimum,
@@ -135,3 +150,7 @@ def _flat(arrays: tuple[Array, ...]) -> list[float]:
 
 _IMPROBABLE = 1e-3
 """Probability of a χ² from which the model is said not to explain the data."""
+_NOISE_RTOL = 1e-3
+"""The noise of several observations is settled when its estimate changes less, relatively."""
+_LEAST = 1e-12
+"""Smallest noise, in sizes of the data: exact data have none."""

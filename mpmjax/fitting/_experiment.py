@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import numpy as np
 
 from mpmjax._types import Array, Scalar
 from mpmjax.checks import canonical, checked, is_traced, require
@@ -83,6 +84,16 @@ class Experiment(eqx.Module):
             name=self.name,
         )
 
+    def until(self, t1: float) -> "Experiment":
+        """The same experiment, ended at the first step from a time [s] on, with what was measured until then; itself
+        where nothing was, or the time is not before its end. What has no times, such as a `Curve`, is left out."""
+        parts = [o.part_until(t1) for o in self.observations]
+        kept = tuple(part for part in parts if part is not None)
+        steps = int(np.ceil(t1 / self.dt - _ON_A_STEP))
+        if not kept or steps >= self.steps:
+            return self
+        return self.with_observations(kept, steps * self.dt)
+
     def run(self, *, adjoint: Any = None, throw: bool = True) -> Run:
         """The simulation of it, with what its observations observe after each step."""
         return simulate(
@@ -120,3 +131,7 @@ class _Observe(eqx.Module):
 
     def __call__(self, scene: Scene, particles: Particles) -> tuple[Any, ...]:
         return tuple(observation.observe(scene, particles) for observation in self.observations)
+
+
+_ON_A_STEP = 1e-6
+"""Part of a step by which a time may lie after it and is on it."""

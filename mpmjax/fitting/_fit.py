@@ -11,7 +11,7 @@ import numpy as np
 
 from mpmjax._types import Array, Scalar
 from mpmjax.checks import checked, require, warn
-from mpmjax.fitting._estimates import fit_result, noise_factors
+from mpmjax.fitting._estimates import fit_result, settle_noise
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
@@ -75,20 +75,15 @@ def fit(
         if progress is not None:
             progress(_line(problem, iteration, time.perf_counter() - begun))
 
-    sigmas = tuple(jnp.asarray(o.scale() if o.sigma is None else o.sigma, problem.dtype) for o in problem.observations)
+    sigmas = problem.first_sigmas
     report = dict(report or {})
     _check_report(problem, report)
     z, history, rounds = jnp.zeros(problem.size, problem.dtype), (), 0
     while True:
         found = _search(problem, optimiser, z, sigmas, say)
         z, history, rounds = found.z, history + found.history, rounds + 1
-        estimated, freedom = noise_factors(problem, found)
-        floor = [_LEAST * o.scale() / float(np.max(s)) for o, s in zip(problem.observations, sigmas, strict=True)]
-        factors = [max(factor, least) for factor, least in zip(estimated, floor, strict=True)]
-        sigmas = tuple(sigma * factor for sigma, factor in zip(sigmas, factors, strict=True))
-        moved = [abs(factor - 1) > _NOISE_RTOL for factor in factors]
-        changing = any(m and factor > least for m, factor, least in zip(moved, factors, floor, strict=True))
-        if not changing or problem.scales_alike or not found.converged or rounds == _MOST_ROUNDS:
+        factors, freedom, sigmas, changing = settle_noise(problem, found, sigmas)
+        if not changing or not found.converged or rounds == MOST_ROUNDS:
             break
     result = fit_result(problem, found, factors, freedom, sigmas, report, level)
     result = replace(result, history=history)
@@ -96,7 +91,7 @@ def fit(
         stopped = "was interrupted" if found.interrupted else "did not converge"
         advice = "" if found.interrupted else f" {_ADVICE}"
         warn(f"The fit {stopped} after {len(history)} iterations: its errors hold only at a minimum.{advice}")
-    elif changing and not problem.scales_alike:
+    elif changing:
         warn(f"The noise of the observations did not settle in {rounds} rounds: give the sigma of one of them.")
     for text in result.warnings:
         warn(text)
@@ -125,7 +120,7 @@ def _search(
         RuntimeError: there is no derivative.
     """
     try:
-        begun = partial(_require_influence, problem, sigmas)
+        begun = partial(require_influence, problem, sigmas)
         found = search(problem, optimiser, z, sigmas, report=say, begun=begun)
     except NoDerivativeError:
         raise RuntimeError(
@@ -134,13 +129,22 @@ def _search(
             "observation cannot be differentiated where the run takes it."
         ) from None
     if not np.isfinite(found.history[0].cost):
-        for experiment in problem.at(z):
-            experiment.explain()
+        explain(problem, z)
         raise ValueError("What is observed of the simulation at the first guess is not finite.")
     return found
 
 
-def _require_influence(problem: FitProblem, sigmas: tuple[Array, ...], seen: Evaluation) -> None:
+def explain(problem: FitProblem, z: Coordinates) -> None:
+    """Say why what is observed is not finite there.
+
+    Raises:
+        SimulationError, ValueError: see `Experiment.explain`.
+    """
+    for experiment in problem.at(z):
+        experiment.explain()
+
+
+def require_influence(problem: FitProblem, sigmas: tuple[Array, ...], seen: Evaluation) -> None:
     """Check that the data depend on every coordinate, at the first guess.
 
     Raises:
@@ -167,11 +171,8 @@ def _line(problem: FitProblem, iteration: Iteration, seconds: float) -> str:
     )
 
 
-_NOISE_RTOL = 1e-3
-"""The noise of several observations is settled when its estimate changes less, relatively."""
-_MOST_ROUNDS = 20
-_LEAST = 1e-12
-"""Smallest noise, in sizes of the data: exact data have none."""
+MOST_ROUNDS = 20
+"""Of searches with another noise."""
 _ROUNDINGS = 10
 """Derivatives by a coordinate below so many roundings of the data are none."""
 _ADVICE = "Raise max_steps, start closer, or give a rtol that the precision can reach."

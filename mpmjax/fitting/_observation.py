@@ -65,6 +65,11 @@ class AbstractObservation(eqx.Module):
             ValueError: always, where it is not.
         """
 
+    def part_until(self, t1: float) -> "AbstractObservation | None":
+        """The part of it that was measured until a time [s], for a run that ends there; None where there is none, or it
+        is not known, as of a curve."""
+        del t1
+
     def __check_init__(self):
         name = f"{type(self).__name__} {self.name!r}"
         measured = np.isfinite(self.data)
@@ -213,6 +218,10 @@ class Series(AbstractObservation):
             (self.times[kept], self.data[kept], sigma),
             is_leaf=lambda leaf: leaf is None,
         )
+
+    def part_until(self, t1: float) -> "Series | None":
+        seen = np.isfinite(self.data[self.times <= t1 * (1 + 1e-9)]).any()
+        return self.until(t1) if seen else None
 
     def explain(self, seen: Array, run: Run) -> None:
         del run

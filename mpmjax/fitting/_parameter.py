@@ -78,6 +78,11 @@ class AbstractParameter(eqx.Module):
     def coordinate(self, start: Value, value: Value) -> Value:
         """z [-] at a value, with zero at `start`."""
 
+    @property
+    def domain(self) -> tuple[float, float]:
+        """The open interval in which values lie."""
+        return -np.inf, np.inf
+
     @abc.abstractmethod
     def check(self, name: str, start: np.ndarray) -> None:
         """Check that the first guess lies within the bounds.
@@ -176,6 +181,10 @@ class Positive(AbstractParameter):
     def coordinate(self, start: Value, value: Value) -> Value:
         return jnp.log(value / start)
 
+    @property
+    def domain(self) -> tuple[float, float]:
+        return 0.0, np.inf
+
     def check(self, name: str, start: np.ndarray) -> None:
         require(start > 0, f"The parameter {name!r} must start from positive numbers, got {start}.")
 
@@ -209,6 +218,10 @@ class Bounded(AbstractParameter):
 
     def coordinate(self, start: Value, value: Value) -> Value:
         return self._logit(value) - self._logit(start)
+
+    @property
+    def domain(self) -> tuple[float, float]:
+        return self.lower, self.upper
 
     def check(self, name: str, start: np.ndarray) -> None:
         require(

@@ -84,6 +84,11 @@ class FitProblem(eqx.Module):
         return tuple(o.sigma is not None for o in self.observations)
 
     @property
+    def first_sigmas(self) -> tuple[Array, ...]:
+        """The noise of each observation, or what stands for it until it is estimated."""
+        return tuple(jnp.asarray(o.scale() if o.sigma is None else o.sigma, self.dtype) for o in self.observations)
+
+    @property
     def labels(self) -> tuple[str, ...]:
         """A name for each coordinate: that of its parameter, with an index where that has several."""
         labels = []

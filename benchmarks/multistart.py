@@ -1,0 +1,122 @@
+"""What do 64 searches together cost, beside 64 fits one by one?
+
+    python benchmarks/multistart.py [--starts 64] [--rounds 2] [--scene explicit]
+
+E and ν of a free square that is stretched as it starts, from tracks of all its particles with noise, made by the same
+scene; once with explicit steps, once with semi-implicit ones. Both ways start from the same Sobol points, E over two
+decades, ν between its bounds. Printed are seconds of the processor and of the clock, compilation left out by a first
+call of each, the two interleaved; and of one iteration, per search, against how many run together.
+"""
+
+import argparse
+import time
+import warnings
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import mpmjax as mpm
+from mpmjax.fitting._batch import Problems, _iterate
+from mpmjax.fitting._problem import FitProblem
+from mpmjax.fitting._search import begin
+from mpmjax.fitting._starting_points import starting_points
+
+NOISE = 1e-4
+PARAMETERS = {
+    "E": mpm.Positive(lambda e: e.scene.material.youngs_modulus, start=1e5),
+    "nu": mpm.Bounded(lambda e: e.scene.material.poisson_ratio, 0.0, 0.49, start=0.2),
+}
+SCENES = {"explicit": (mpm.Explicit(), 2e-3, 100), "semi-implicit": (mpm.SemiImplicit(), 1e-2, 20)}
+
+
+def experiment(method: Any, dt: float, steps: int) -> mpm.Experiment:
+    """What is fitted, and what a run of it with E = 7e4 Pa and ν = 0.3 says with noise, in five frames."""
+    grid = mpm.Grid((12, 12), 0.1, origin=(-4, -4))
+    particles = mpm.fill(mpm.Box((0.0, 0.0), (0.4, 0.4)), grid, particles_per_cell=4, density=1e3)
+    particles = eqx.tree_at(lambda q: q.v, particles, jnp.asarray([1.5, -1.0]) * (particles.x - 0.2))
+    scene = mpm.Scene(grid, mpm.NeoHookean(7e4, 0.3))
+    run = mpm.simulate(scene, particles, t1=steps * dt, dt=dt, method=method, save_every=steps // 5)
+    assert run.frames is not None
+    x = np.asarray(run.frames.x)[1:]
+    x = x + NOISE * np.random.default_rng(0).normal(size=x.shape)
+    seen = mpm.Tracks(np.asarray(run.times)[1:], x, which=np.arange(particles.count), sigma=NOISE)
+    return mpm.Experiment(scene, particles, t1=steps * dt, dt=dt, method=method, observations=seen)
+
+
+def timed(call: Callable[[], Any]) -> tuple[float, float, Any]:
+    """Seconds of the processor and of the clock, and what it returns."""
+    clock, processor = time.perf_counter(), time.process_time()
+    out = jax.block_until_ready(call())
+    return time.process_time() - processor, time.perf_counter() - clock, out
+
+
+def one_by_one(pull: mpm.Experiment, points: np.ndarray) -> list[float]:
+    """The misfit of a fit from each point; NaN where it fails."""
+    problem, misfits = FitProblem((pull,), PARAMETERS), []
+    for z in points:
+        values = problem.values(jnp.asarray(z))
+        starts = {
+            name: eqx.tree_at(lambda p: p.start, p, v) for (name, p), v in zip(PARAMETERS.items(), values, strict=True)
+        }
+        try:
+            misfits.append(mpm.fit(pull, starts).chi_squared)
+        except (ValueError, RuntimeError):
+            misfits.append(float("nan"))
+    return misfits
+
+
+def iteration(pull: mpm.Experiment, points: np.ndarray, batch: int) -> Callable[[], Any]:
+    """An iteration of so many searches together."""
+    problem, optimiser = FitProblem((pull,), PARAMETERS), mpm.LevenbergMarquardt()
+    one, sigmas = (Problems.of([a], shared=True) for a in (problem, problem.first_sigmas))
+    states = [begin(problem, optimiser, jnp.asarray(z), problem.first_sigmas) for z in points[:batch]]
+    arrays, rest = zip(*(eqx.partition(s, eqx.is_array) for s in states), strict=True)
+    state = eqx.combine(jax.tree.map(lambda *a: np.stack(a), *arrays), rest[0])
+    return lambda: eqx.filter(
+        _iterate(one.at(0), one.common, optimiser, points[:batch], sigmas.at(0), sigmas.common, state, (None, None)),
+        eqx.is_array,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--starts", type=int, default=64)
+    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--scene", choices=SCENES, action="append")
+    given = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    warnings.simplefilter("ignore")
+    for name in given.scene or SCENES:
+        method, dt, steps = SCENES[name]
+        pull = experiment(method, dt, steps)
+        points = starting_points(FitProblem((pull,), PARAMETERS), given.starts, {}, 0)
+        calls = {batch: iteration(pull, points, batch) for batch in (1, 8, 32) if batch <= given.starts}
+        seconds: dict[int, list[float]] = {batch: [] for batch in calls}
+        for _ in range(2 + given.rounds):
+            for batch, call in calls.items():
+                seconds[batch].append(timed(call)[0] / batch)
+        told = ", ".join(f"{batch}: {1e3 * np.median(s[1:]):.1f} ms" for batch, s in seconds.items())
+        print(f"{name}: an iteration of a search of so many together, processor: {told}", flush=True)
+        mpm.fit_multistart(pull, PARAMETERS, starts=9)
+        mpm.fit(pull, PARAMETERS)
+        for _ in range(given.rounds):
+            processor, clock, alone = timed(partial(one_by_one, pull, points))
+            print(f"{name}: {given.starts} fits: {processor:.1f} s of the processor, {clock:.1f} s", flush=True)
+            own, own_clock, found = timed(partial(mpm.fit_multistart, pull, PARAMETERS, starts=given.starts))
+            print(
+                f"{name}: together: {own:.1f} s of the processor, {own_clock:.1f} s; ratio {processor / own:.1f}; "
+                f"{found.iterations} iterations; {len(found.minima)} minima, "
+                f"the best by {len(found.minima[0].members)}, "
+                f"{len(found.failures)} failed; χ² {found.best.chi_squared:.6g}, the fits' best {np.nanmin(alone):.6g} "
+                f"({sum(np.isclose(alone, np.nanmin(alone), rtol=1e-3))} of them), {sum(np.isnan(alone))} failed",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

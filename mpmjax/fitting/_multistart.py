@@ -1,0 +1,264 @@
+"""Fits from many starting points, and the minima that they find."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Scalar
+from mpmjax.checks import checked, require_whole, warn
+from mpmjax.fitting._batch import Member, Problems, search_many
+from mpmjax.fitting._experiment import Experiment
+from mpmjax.fitting._fit import explain, fit, require_influence
+from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
+from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
+from mpmjax.fitting._parameter import AbstractParameter
+from mpmjax.fitting._problem import FitProblem
+from mpmjax.fitting._result import Estimate, FitResult
+from mpmjax.fitting._search import Minimum
+from mpmjax.fitting._starting_points import starting_points
+
+
+class LocalMinimum(NamedTuple):
+    """A minimum that searches found."""
+
+    values: dict[str, np.ndarray]
+    """The value of each parameter, in its shape."""
+    misfit: float
+    """Root mean square of the residuals, in units of σ, or of the size of the data where σ is not given."""
+    members: tuple[int, ...]
+    """The numbers, from 0, of the searches that ended there; the first guess is 0."""
+
+
+class MultistartFit(eqx.Module):
+    """The best of many fits, and the other minima.
+
+    `print(result)` shows a table; `result["E"]` is the estimate of a parameter by the best.
+    """
+
+    best: FitResult
+    """The fit from the best minimum, with its errors."""
+    minima: tuple[LocalMinimum, ...]
+    """The distinct minima, the best first."""
+    starts: dict[str, np.ndarray]
+    """Where each search started: the values of each parameter, shape (k, ...)."""
+    failures: dict[int, str]
+    """Why searches failed, by their number."""
+    unfinished: tuple[int, ...]
+    """The numbers of the searches that came to no minimum within the optimiser's steps."""
+    iterations: int
+    """How many iterations all searches took."""
+
+    @property
+    def count(self) -> int:
+        """Number of searches."""
+        return len(next(iter(self.starts.values())))
+
+    def __getitem__(self, label: str) -> Estimate:
+        """The estimate of a parameter by the best fit.
+
+        Raises:
+            KeyError: there is none of this name.
+        """
+        return self.best[label]
+
+    def __str__(self) -> str:
+        """The table of the best fit, then one of the minima."""
+        labels = self.best.problem.labels
+        lines = [str(self.best), "", f"{'searches':>8} {'misfit/σ':>10}  " + "".join(f"{a:>14}" for a in labels[:4])]
+        for found in self.minima[:_SHOWN]:
+            numbers = np.concatenate([value.reshape(-1) for value in found.values.values()])
+            shown = "".join(f"{number:>14.6g}" for number in numbers[:4])
+            lines.append(f"{len(found.members):>8} {found.misfit:>10.4g}  {shown}")
+        if len(self.minima) > _SHOWN:
+            lines.append(f"and {len(self.minima) - _SHOWN} minima with a larger misfit.")
+        if self.unfinished:
+            lines.append(f"{len(self.unfinished)} of {self.count} searches came to no minimum.")
+        if self.failures:
+            lines.append(f"{len(self.failures)} of {self.count} searches failed, number {_listed(self.failures)}.")
+        return "\n".join(lines)
+
+
+@checked
+def fit_multistart(
+    experiments: Experiment | tuple[Experiment, ...] | list[Experiment],
+    parameters: dict[str, AbstractParameter],
+    *,
+    starts: int = 64,
+    ranges: dict[str, tuple[float, float]] | None = None,
+    seed: int = 0,
+    batch: int = 8,
+    report: dict[str, Callable[[Experiment], Any]] | None = None,
+    level: Scalar = 0.95,
+    optimiser: AbstractOptimiser = LevenbergMarquardt(),
+    progress: Callable[[str], None] | None = None,
+) -> MultistartFit:
+    """Fit from many starting points at once: the best minimum, with its errors, and what other minima there are.
+
+        found = mpm.fit_multistart(pull, {"E": ...}, starts=64, ranges={"E": (1e4, 1e7)})
+        print(found)
+
+    It starts from the first guess and from scrambled Sobol points over the ranges; of a parameter without one, over its
+    prior, between its bounds, from a tenth to ten times the first guess of a `Positive`, and one coordinate to each
+    side of an `Unbounded` one. Searches run together, `batch` in one compiled program; one that is done leaves its
+    place to the next. A search whose simulation fails ends alone. One that comes within a hundredth, in each
+    coordinate, of another with a lower cost is ended, and counted where that one ends; one whose sum of squares three
+    moves, or six iterations, have lowered by less than a hundredth is ended there, as at a minimum. Those that come
+    within twice the least sum of squares are searched on, and the best is then fitted as `fit` does.
+
+    Two searches ended at one minimum where their coordinates differ by less than two hundredths, or where the misfit
+    hides the difference: Δᵀ JᵀJ Δ ≤ n s² of n coordinates, J and s² = Σ r²/(m − n), or one if σ is given and that is
+    less, being those of the better one.
+
+    Where σ is not given, searches take the size of the data in its place: several observations without one weigh alike
+    in them, and are only weighed by their noise in the last fit.
+
+    Args:
+        experiments: see `fit`.
+        parameters: see `fit`.
+        starts: how many searches.
+        ranges: lowest and highest value to start from, by the name of a parameter.
+        seed: of the starting points.
+        batch: how many searches run together. Measure it on your device (`benchmarks/multistart.py`).
+        report: see `fit`.
+        level: see `fit`.
+        optimiser: the method of each search, and of the last fit.
+        progress: called with a line, such as `print`, as searches end, and by the last fit.
+
+    Raises:
+        ValueError: as `fit`; a range of no parameter, or outside of its bounds; no search that could start.
+        SimulationError: no search could start, and the simulation at the first guess meets a fault.
+    """
+    require_whole("starts", starts, 1)
+    require_whole("batch", batch, 1)
+    problem = FitProblem((experiments,) if isinstance(experiments, Experiment) else tuple(experiments), parameters)
+    points = starting_points(problem, starts, dict(ranges or {}), seed)
+    sigmas = problem.first_sigmas
+    told = [0]
+
+    def say(done: int, count: int) -> None:
+        if progress is not None and done > told[0]:
+            told[0] = done
+            progress(f"{done} of {count} searches are done")
+
+    def begun(member: int, seen: Evaluation) -> None:
+        if member == 0:
+            require_influence(problem, sigmas, seen)
+
+    together = partial(
+        search_many,
+        Problems.of([problem], shared=True),
+        optimiser,
+        sigmas=Problems.of([sigmas], shared=True),
+        batch=min(batch, starts),
+        joining=_JOINED,
+    )
+    members = together(points, settling=_SETTLED, progress=say, begun=begun)
+    groups = _grouped(problem, _ends(members))
+    if not groups:
+        explain(problem, jnp.zeros(problem.size, problem.dtype))
+        raise ValueError(f"No search of {starts} came to a minimum: {_failures(members).get(0, 'raise max_steps')}.")
+    near = sum(_cost(found) <= _NEAR_BEST * _cost(groups[0][0]) for found, _ in groups[:_SHOWN])
+    further = together(np.array([found.z for found, _ in groups[:near]], float))
+    on = [(groups[k][0] if m.minimum is None else m.minimum, groups[k][1]) for k, m in enumerate(further)]
+    groups = _grouped(problem, [*on, *groups[near:]])
+    minima = tuple(_local_minimum(problem, found, numbers) for found, numbers in groups)
+    restarted = {name: replace(p, start=minima[0].values[name]) for name, p in parameters.items()}
+    best = fit(experiments, restarted, report=report, level=level, optimiser=optimiser, progress=progress)
+    ended = sum(len(numbers) for _, numbers in groups)
+    if len(minima[0].members) == 1 and ended > 1:
+        warn(
+            f"The best minimum was found by one search of {starts}: there may be a better one. Take more starts, or "
+            "narrower ranges."
+        )
+    values = [problem.values(jnp.asarray(point, problem.dtype)) for point in points]
+    found = [member.minimum for member in members]
+    return MultistartFit(
+        best=best,
+        minima=minima,
+        starts={name: np.stack([v[k] for v in values]) for k, name in enumerate(problem.names)},
+        failures=_failures(members),
+        unfinished=tuple(k for k, m in enumerate(found) if m is not None and _end(members, k) is None),
+        iterations=sum(len(m.minimum.history) for m in (*members, *further) if m.minimum is not None),
+    )
+
+
+def _failures(members: tuple[Member, ...]) -> dict[int, str]:
+    return {k: member.failure for k, member in enumerate(members) if member.minimum is None}
+
+
+def _end(members: tuple[Member, ...], k: int) -> int | None:
+    """The number of the search at whose minimum a search ended; None if it came to none."""
+    while (joined := members[k].joined) is not None:
+        k = joined
+    minimum = members[k].minimum
+    return k if minimum is not None and minimum.converged else None
+
+
+def _ends(members: tuple[Member, ...]) -> list[tuple[Minimum, list[int]]]:
+    """Where searches ended, with the numbers of those that ended there."""
+    numbers: dict[int, list[int]] = {}
+    for k in range(len(members)):
+        end = _end(members, k)
+        if end is not None:
+            numbers.setdefault(end, []).append(k)
+    found = [(members[end].minimum, own) for end, own in numbers.items()]
+    return [(minimum, own) for minimum, own in found if minimum is not None]
+
+
+def _grouped(problem: FitProblem, ends: list[tuple[Minimum, list[int]]]) -> list[tuple[Minimum, list[int]]]:
+    """The distinct minima, the lowest first, with the numbers of the searches that ended there."""
+    groups: list[tuple[Minimum, list[int]]] = []
+    least = 1.0 if all(problem.noise_is_given) else 0.0
+    for minimum, own in sorted(ends, key=lambda pair: _cost(pair[0])):
+        for there, numbers in groups:
+            if _same(np.asarray(minimum.z - there.z, float), there, least):
+                numbers += own
+                break
+        else:
+            groups.append((minimum, list(own)))
+    return groups
+
+
+def _same(change: np.ndarray, better: Minimum, least: float) -> bool:
+    """Whether an end of a search, so far from a better one, is the same minimum.
+
+    Args:
+        change: the difference of their coordinates.
+        better: the better one.
+        least: the least mean square of its residuals.
+    """
+    r, J = np.asarray(better.r, float), np.asarray(better.J, float)
+    variance = max(least, float((r**2).sum()) / max(np.count_nonzero(r) - len(change), 1))
+    return bool((np.abs(change) <= _NEAR).all() or ((J @ change) ** 2).sum() <= len(change) * variance)
+
+
+def _cost(minimum: Minimum) -> float:
+    return minimum.history[-1].cost
+
+
+def _local_minimum(problem: FitProblem, found: Minimum, members: list[int]) -> LocalMinimum:
+    values = {n: np.asarray(v) for n, v in zip(problem.names, problem.values(found.z), strict=True)}
+    numbers = sum(o.count for o in problem.observations)
+    return LocalMinimum(values, float(np.sqrt(2 * _cost(found) / numbers)), tuple(sorted(members)))
+
+
+def _listed(numbers: Any) -> str:
+    shown = [str(number) for number in list(numbers)[:_SHOWN]]
+    return ", ".join(shown) + (", …" if len(numbers) > _SHOWN else "")
+
+
+_JOINED = 0.01
+"""A search so near to a better one, in each coordinate, would go the same way."""
+_SETTLED = 1e-2
+"""A search that lately lowered its sum of squares by less than this part is at a minimum."""
+_NEAR_BEST = 2.0
+"""Searches that end within this factor of the least sum of squares are searched on."""
+_NEAR = 0.02
+"""Ends of searches so near in each coordinate are one minimum."""
+_SHOWN = 8
+"""How many minima a table shows."""

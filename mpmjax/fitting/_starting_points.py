@@ -1,0 +1,90 @@
+"""Where many searches of one problem start."""
+
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import ndtr, ndtri
+
+from mpmjax._types import Array, Float
+from mpmjax.checks import require, require_finite
+from mpmjax.fitting._parameter import AbstractParameter
+from mpmjax.fitting._problem import FitProblem
+
+Ranges = Mapping[str, tuple[float, float]]
+"""Lowest and highest value to start from, by the name of a parameter."""
+
+
+def starting_points(problem: FitProblem, count: int, ranges: Ranges, seed: int) -> Float[np.ndarray, "k n"]:
+    """Coordinates of the first guess and of scrambled Sobol points, which fill a space evenly (SciPy's).
+
+    Of a parameter they are evenly spread over its range, if it has one, else over its prior, else between its bounds,
+    else from a tenth to ten times the first guess of a positive one, and one coordinate to each side of any other. Over
+    the range of a positive parameter its logarithm is spread evenly.
+
+    Args:
+        problem: what is fitted.
+        count: how many.
+        ranges: see above.
+        seed: of the scrambling.
+
+    Raises:
+        ValueError: a range of no parameter, or outside of its bounds.
+    """
+    from scipy.stats import qmc
+
+    unknown = sorted(set(ranges) - set(problem.names))
+    require(not unknown, f"ranges must be of parameters ({', '.join(problem.names)}), got {', '.join(unknown)}.")
+    exponent = max(int(np.ceil(np.log2(max(count - 1, 1)))), 0)
+    shares = qmc.Sobol(problem.size, seed=seed).random_base2(exponent)[: count - 1]
+    shares = np.clip(shares, _EDGE, 1 - _EDGE)
+    parts, column = [], 0
+    for name, parameter, start in zip(problem.names, problem.parameters, problem.starts, strict=True):
+        own = shares[:, column : column + start.size].reshape(-1, *start.shape)
+        parts.append(_spread(name, parameter, start, own, ranges.get(name)).reshape(len(own), -1))
+        column += start.size
+    return np.concatenate([np.zeros((1, problem.size)), np.concatenate(parts, axis=1)])
+
+
+def _spread(
+    name: str, parameter: AbstractParameter, start: Array, shares: np.ndarray, given: tuple[float, float] | None
+) -> np.ndarray:
+    """Coordinates of a parameter at shares of its distribution between 0 and 1, shape (k, ...)."""
+    first, (lowest, highest) = np.asarray(start, float), parameter.domain
+    if given is None and parameter.prior is not None:
+        mean, sigma = parameter.prior.mean, parameter.prior.sigma
+        below, above = ndtr((lowest - mean) / sigma), ndtr((highest - mean) / sigma)
+        values = mean + sigma * ndtri(below + shares * (above - below))
+    else:
+        lower, upper = _range(name, parameter, first, given)
+        if parameter.logarithmic:
+            values = np.exp(np.log(lower) + shares * (np.log(upper) - np.log(lower)))
+        else:
+            values = lower + shares * (upper - lower)
+    return np.asarray(parameter.coordinate(start, jnp.asarray(values, start.dtype)), float)
+
+
+def _range(
+    name: str, parameter: AbstractParameter, first: np.ndarray, given: tuple[float, float] | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest value to start from."""
+    lowest, highest = parameter.domain
+    if given is not None:
+        require(len(given) == 2, f"The range of {name!r} must be two numbers, got {len(given)}.")
+        require_finite(f"The range of {name!r}", np.asarray(given, float))
+        inside = lowest <= given[0] < given[1] <= highest and (given[0] > 0 or not parameter.logarithmic)
+        within = "positive numbers" if parameter.logarithmic else f"between {lowest:g} and {highest:g}"
+        require(inside, f"The range of {name!r} must grow and be {within}, got {given[0]:g} to {given[1]:g}.")
+        return np.asarray(float(given[0])), np.asarray(float(given[1]))
+    if np.isfinite([lowest, highest]).all():
+        return np.asarray(lowest), np.asarray(highest)
+    if parameter.logarithmic:
+        return first / _DECADE, first * _DECADE
+    ends = [np.asarray(parameter.value(jnp.asarray(first), jnp.full(first.shape, side))) for side in (-1.0, 1.0)]
+    return ends[0], ends[1]
+
+
+_EDGE = 1e-3
+"""Shares nearer to 0 and 1 are none: a start at a bound does not move."""
+_DECADE = 10.0
+"""How far from the first guess a positive parameter starts, as a factor."""

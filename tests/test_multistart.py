@@ -1,0 +1,170 @@
+"""Many searches at once: starts, data sets, draws, and what is refused."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_fit import DT, NOISE, STEPS, STIFFNESS, bar, experiment, tracks
+
+import mpmjax as mpm
+from mpmjax.fitting._batch import Problems, search_many
+from mpmjax.fitting._problem import FitProblem
+from mpmjax.fitting._search import search
+from mpmjax.fitting._starting_points import starting_points
+
+LM = mpm.LevenbergMarquardt()
+TIMES = np.linspace(0.001, 0.05, 40)
+
+
+class Oscillation(FitProblem):
+    """cos ωt of data with noise, in the place of a simulation that fails beyond the ω of a limit: its minima lie a
+    period apart, and their places follow from a scan."""
+
+    def __init__(self, experiments, parameters, limit=4000.0):
+        del experiments
+        scene, particles = bar()
+        rng = np.random.default_rng(0)
+        seen = mpm.Series(TIMES, np.cos(400 * TIMES) + 0.01 * rng.normal(size=40), mpm.Extent(0), sigma=0.01)
+        self.experiments = (mpm.Experiment(scene, particles, t1=STEPS * DT, dt=DT, observations=seen),)
+        self.names, self.parameters = ("omega",), tuple(parameters.values())
+        self.starts = (jnp.asarray(self.parameters[0].start),)
+
+    def residuals(self, z, sigmas, adjoint):
+        (omega,) = self.values(z)
+        predicted = jnp.cos(jnp.where(omega < 2000, omega, jnp.nan) * jnp.asarray(TIMES))
+        return self.observations[0].residuals(predicted, sigmas[0]), jnp.zeros(1)
+
+
+OMEGA = mpm.Positive(lambda e: e.scene.material.youngs_modulus, start=500.0)
+
+
+@pytest.fixture
+def oscillation(monkeypatch):
+    for room in ("_multistart", "_fit"):
+        monkeypatch.setattr(f"mpmjax.fitting.{room}.FitProblem", Oscillation)
+    return lambda **options: mpm.fit_multistart([], {"omega": OMEGA}, **options)
+
+
+def test_many_starts_find_the_least_of_many_minima(oscillation):
+    """ω = 400 from 500, from which a fit ends at 549; searches from beyond 2000 fail, and hinder no other."""
+    found = oscillation(starts=24, ranges={"omega": (100.0, 4000.0)}, batch=5)
+    with pytest.warns(UserWarning, match="times the noise given"):
+        alone = mpm.fit([], {"omega": OMEGA})
+    assert abs(alone["omega"].value - 400) > 100
+    assert found["omega"].value == pytest.approx(400, abs=4 * found["omega"].error)
+    assert len(found.minima) > 2
+    ends = [float(m.values["omega"]) for m in found.minima]
+    misfits = [m.misfit for m in found.minima]
+    assert misfits == sorted(misfits)
+    assert min(abs(alone["omega"].value / end - 1) for end in ends) < 2e-3
+    counted = sum(len(m.members) for m in found.minima) + len(found.failures) + len(found.unfinished)
+    assert counted == found.count == 24
+    started = found.starts["omega"]
+    assert set(found.failures) == set(np.flatnonzero(started >= 2000))
+    assert started[0] == pytest.approx(500)
+    assert "searches" in str(found)
+
+
+def test_a_search_among_many_goes_where_it_goes_alone():
+    """Iteration by iteration, whoever its neighbours are and wherever its place is."""
+    problem = Oscillation([], {"omega": OMEGA})
+    starts = np.linspace(-1.0, 0.3, 7)[:, None]
+    sigmas = problem.first_sigmas
+    members = search_many(
+        Problems.of([problem], shared=True), LM, starts, sigmas=Problems.of([sigmas], shared=True), batch=3
+    )
+    for start, member in zip(starts, members, strict=True):
+        alone = search(problem, LM, jnp.asarray(start), sigmas)
+        assert member.minimum.converged == alone.converged
+        assert [i.cost for i in member.minimum.history] == pytest.approx([i.cost for i in alone.history], rel=1e-6)
+        assert np.allclose(member.minimum.z, alone.z, atol=1e-9)
+
+
+def test_starting_points_fill_what_is_known_of_each_parameter():
+    """A prior's quantiles, the bounds, a range of a logarithm; the first is the first guess."""
+    times, x, which = tracks()
+    one = experiment(mpm.Tracks(times, x, which=which, sigma=NOISE))
+    parameters = {
+        "E": STIFFNESS,
+        "nu": mpm.Bounded(lambda e: e.scene.material.poisson_ratio, 0.1, 0.4),
+        "v": mpm.Unbounded(lambda e: e.particles.v, prior=mpm.Gaussian(2.0, 0.5)),
+        "m": mpm.Positive(lambda e: e.particles.mass, prior=mpm.Gaussian(0.01, 0.01)),
+    }
+    problem = FitProblem((one,), parameters)
+    points = starting_points(problem, 129, {"E": (1e3, 1e6)}, 0)
+    assert points.shape == (129, problem.size)
+    assert not points[0].any()
+    values = dict(zip(problem.names, jax.jit(jax.vmap(problem.values))(jnp.asarray(points[1:])), strict=True))
+    assert np.isfinite(points).all()
+    assert np.histogram(np.log10(values["E"]), 4, (3, 6))[0] == pytest.approx([32] * 4, abs=1)
+    assert np.histogram(values["nu"], 4, (0.1, 0.4))[0] == pytest.approx([32] * 4, abs=1)
+    assert values["v"].mean() == pytest.approx(2, abs=0.02)
+    assert values["v"].std() == pytest.approx(0.5, abs=0.02)
+    assert values["m"].min() > 0
+
+
+REFUSED = {
+    "no parameter": ({"ranges": {"nu": (0.1, 0.2)}}, "must be of parameters"),
+    "a bound": ({"ranges": {"omega": (0.0, 2.0)}}, "positive numbers"),
+    "shrinking": ({"ranges": {"omega": (3.0, 2.0)}}, "must grow"),
+    "none": ({"starts": 0}, "at least 1"),
+}
+
+
+@pytest.mark.parametrize(("options", "says"), REFUSED.values(), ids=REFUSED)
+def test_bad_starts_get_one_line(oscillation, options, says):
+    with pytest.raises(ValueError, match=says):
+        oscillation(**options)
+
+
+def test_data_sets_of_other_shapes_are_refused():
+    times, x, which = tracks()
+    sets = [experiment(mpm.Tracks(times[:n], x[:n], which=which, sigma=NOISE)) for n in (5, 6)]
+    with pytest.raises(ValueError, match="number 1 has other shapes"):
+        mpm.fit_ensemble(sets, {"E": STIFFNESS})
+
+
+@pytest.mark.thorough
+def test_an_ensemble_says_what_fits_say_one_by_one():
+    """Three specimens of other stiffness and mass, one of which fails: the same estimates, errors and noise."""
+    sets = []
+    for k, E in enumerate((6e4, 7e4, 8e4, 7e4)):
+        times, x, which = tracks(E=E, seed=k)
+        seen = mpm.Tracks(times, x, which=which)
+        own = experiment(seen, E=E, density=900.0 + 50 * k)
+        sets.append(own)
+    sets[1] = eqx.tree_at(lambda e: e.particles.v, sets[1], 1e6 * sets[1].particles.v)
+    with pytest.warns(UserWarning, match="1 of 4 data sets could not be fitted: number 1"):
+        found = mpm.fit_ensemble(sets, {"E": STIFFNESS}, batch=2)
+    assert list(found.failures) == [1]
+    assert np.isnan(found.values["E"][1])
+    assert np.isnan(found.errors[1]).all()
+    for k in (0, 2, 3):
+        alone = mpm.fit(sets[k], {"E": STIFFNESS})
+        assert found.fits[k]["E"].value == pytest.approx(alone["E"].value, rel=1e-6)
+        assert found.fits[k]["E"].error == pytest.approx(alone["E"].error, rel=1e-4)
+        assert found.fits[k].noise[0].sigma == pytest.approx(alone.noise[0].sigma, rel=1e-4)
+    assert found.alike[0] < 1e-3
+    assert "spread" in str(found)
+
+
+@pytest.mark.thorough
+def test_specimens_with_one_value_are_said_to_be_alike():
+    """Of twelve draws of noise, the spread of the estimates is their standard error."""
+    sets = [experiment(mpm.Tracks(*a[:2], which=a[2], sigma=NOISE)) for a in (tracks(seed=k) for k in range(12))]
+    found = mpm.fit_ensemble(sets, {"E": STIFFNESS})
+    assert 0.01 < found.alike[0] < 0.99
+    assert found.values["E"].std(ddof=1) == pytest.approx(found.errors[:, 0].mean(), rel=0.6)
+
+
+@pytest.mark.thorough
+def test_the_bootstrap_agrees_with_the_linear_error():
+    """Of a problem that is nearly linear."""
+    times, x, which = tracks()
+    fitted = mpm.fit(experiment(mpm.Tracks(times, x, which=which, sigma=NOISE)), {"E": STIFFNESS})
+    drawn = mpm.bootstrap(fitted, repeats=200)
+    assert drawn.error("E") == pytest.approx(fitted["E"].error, rel=0.15)
+    assert drawn.interval("E") == pytest.approx(fitted["E"].interval, rel=0.3 * fitted["E"].error / 7e4)
+    with pytest.raises(KeyError, match="no estimate 'G'"):
+        drawn.interval("G")
