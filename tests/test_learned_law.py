@@ -1,5 +1,6 @@
 """Laws that hold networks, and the example that learns one."""
 
+import json
 import runpy
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from helpers import cloud, rotation_matrix
 
 import mpmjax as mpm
 from mpmjax import linalg as la
+from mpmjax.io._schema import decode, encode
 from mpmjax.verification import check_law
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "learned_law.py"
@@ -65,6 +67,31 @@ def test_numbers_of_a_law_itself_are_one_a_particle_beside_a_network():
     law = eqx.tree_at(lambda law: law.modulus, perceptron(), jnp.full(7, 1e4))
     with pytest.raises(ValueError, match=r"one for each of its 20 particles, got \[7\] of them\. What has another"):
         mpm.prepare(mpm.Scene(grid, law), particles)
+
+
+@mpm.register
+class Weighted(mpm.AbstractMaterial):
+    """Weights as arrays of several shapes."""
+
+    weights: tuple[jax.Array, ...]
+
+    def energy(self, F):
+        return sum((w**2).sum() for w in self.weights) * (la.double_dot(F, F) - len(F))
+
+
+def test_files_hold_weights_of_several_shapes():
+    """Few numbers are written out, many stand beside."""
+    rng, arrays = np.random.default_rng(0), {}
+    law = Weighted(tuple(rng.normal(size=shape) for shape in ((3, 2), (5,), (20, 20))))
+    data = json.loads(json.dumps(encode(law, arrays)))
+    for a, b in zip(decode(data, mpm.AbstractMaterial, "", arrays).weights, law.weights, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_law_that_files_cannot_hold_is_refused_as_it_is_registered():
+    """And not when a run is over and is to be saved."""
+    with pytest.raises(ValueError, match=r"Perceptron's argument 'network' is annotated as .*MLP.*, which files cannot"):
+        mpm.register(Perceptron)
 
 
 @pytest.fixture(scope="module")
