@@ -17,7 +17,7 @@ import mpmjax as mpm
 from mpmjax.verification import check_law
 
 SMALL = "--small" in sys.argv
-CELLS, FINER, ITERATIONS = (4, 2, 15) if SMALL else (8, 4, 200)
+CELLS, FINER, ITERATIONS = (4, 2, 120) if SMALL else (8, 4, 200)
 
 
 @mpm.register  # so that files can hold it
