@@ -103,6 +103,6 @@ def _jvp_tangent(law: AbstractElastic, F: Deformation) -> Callable[[Deformation]
     return lambda dF: jax.jvp(stress, (F,), (dF,))[1]
 
 
-@jax.jit
+@eqx.filter_jit
 def _jvp_action(potential: ElasticPotential, u: NodeVector, du: NodeVector) -> NodeVector:
     return jax.jvp(jax.grad(potential.energy), (u,), (du,))[1]

@@ -4,7 +4,6 @@ import abc
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
@@ -101,7 +100,7 @@ def particle_stiffness(
     return ParticleStiffness(matrix, potential.stencil, potential.mirror, positive_semidefinite)
 
 
-@jax.jit
+@eqx.filter_jit
 def _tangent_action(
     potential: ElasticPotential, tangents: tuple[Callable[[Deformation], Deformation], ...], du: NodeVector
 ) -> NodeVector:

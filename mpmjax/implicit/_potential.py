@@ -4,7 +4,6 @@ force as a function of nodal velocity."""
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
@@ -148,7 +147,7 @@ def _joined(parts: list[Array]) -> Array:
     return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=-1)
 
 
-@jax.jit
+@eqx.filter_jit  # a law may hold functions
 def _stress(law: AbstractElastic, F: Deformation) -> Deformation:
     """The stress of a law, compiled as one function so that it is traced once."""
     return law.stress(F)

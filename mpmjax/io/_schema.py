@@ -83,6 +83,8 @@ def register(cls: Registered) -> Registered:
     In a file such an object is a table whose `kind` is the class's name and whose other keys are its constructor's
     arguments. So each argument must be a field of the same name, annotated with what files can hold: float, int, bool,
     str, an array, an enumeration, an equinox module whose class is the package's or registered, or tuples of such.
+    Those of `equinox.nn` are none of these: write a network as layers of your own, each with its weights as fields
+    (`examples/learned_law.py`).
     Numbers in files are finite; a corner of a box that may have no end is annotated as `mpmjax.Corner`.
 
     A file names classes and never executes code: import the module that registers a class before reading a file with
@@ -128,9 +130,15 @@ def _can_be_held(hint: Any) -> bool:
 
     def can(a: Any) -> bool:
         items = get_args(a) if get_origin(a) in (tuple, list) else ()
-        return is_module(a) or is_enum(a) or any(_can_be_held(item) for item in items if item is not Ellipsis)
+        return is_enum(a) or _is_made_of_fields(a) or any(_can_be_held(item) for item in items if item is not Ellipsis)
 
     return bool(_forms(hint)) or any(can(a) for a in alternatives(hint))
+
+
+def _is_made_of_fields(cls: Any) -> bool:
+    """Whether an annotation is a class of modules that is made of its fields. Those of `equinox.nn` are made of sizes
+    and a key."""
+    return is_module(cls) and (inspect.isabstract(cls) or set(_parameters(cls)) <= {f.name for f in fields(cls)})
 
 
 _SMALL = 64  # most numbers that are written out, and that are read as a tuple where both are taken
@@ -192,6 +200,8 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
     classes = {c.__name__: c for c in _known() if any(is_module(a) and issubclass(c, a) for a in choices)}
     items = [get_args(a)[0] for a in choices if get_origin(a) in (tuple, list)]
     if classes and isinstance(data, list) and items:
+        return tuple(decode(d, items[0], _nth(where, i), arrays) for i, d in enumerate(data, 1))
+    if items and isinstance(data, list) and not _forms(expected):  # of arrays, each of its own shape
         return tuple(decode(d, items[0], _nth(where, i), arrays) for i, d in enumerate(data, 1))
     if any(is_module(a) for a in choices):
         return _object(data, classes, any(inspect.isabstract(a) for a in choices), where, arrays)

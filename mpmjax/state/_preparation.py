@@ -124,6 +124,13 @@ def _fits(law: AbstractLaw, group: Group, dim: int) -> bool:
     return law.remembers(group.history, group.stored)
 
 
+def _parameters(law: AbstractLaw) -> list[Any]:
+    """The numbers of a law and of the laws that it is made of; those of other modules within it, such as networks, are
+    their own."""
+    own = jax.tree.leaves(law, is_leaf=lambda node: isinstance(node, eqx.Module) and not isinstance(node, AbstractLaw))
+    return [leaf for leaf in own if eqx.is_array_like(leaf)]
+
+
 def _check_placement(scene: Scene, particles: Particles) -> None:
     place = scene.anchor(particles)
     require_finite("Particle positions", particles.x)
@@ -146,11 +153,12 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
             )
     for law, group in zip(scene.laws, particles.groups, strict=True):
         rows = group.rows[1] - group.rows[0]
-        sizes = {jnp.size(leaf) for leaf in jax.tree.leaves(law)}
+        sizes = {jnp.size(number) for number in _parameters(law)}
         require(
             sizes <= {1, rows},
             f"{law.title()}'s parameters must be one number or one for each of its {rows} particles, got "
-            f"{sorted(sizes - {1, rows})} of them.",
+            f"{sorted(sizes - {1, rows})} of them. What has another shape, as a network's weights, belongs in an "
+            "equinox.Module within the law.",
         )
     for points in scene.material_points(particles):
         kept = points.law.kinematics

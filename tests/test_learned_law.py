@@ -1,0 +1,171 @@
+"""Laws that hold networks, and the example that learns one."""
+
+import json
+import runpy
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import cloud, rotation_matrix
+
+import mpmjax as mpm
+from mpmjax import linalg as la
+from mpmjax.io._schema import decode, encode
+from mpmjax.verification import check_law
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "learned_law.py"
+
+
+class Perceptron(mpm.AbstractMaterial):
+    """A network of equinox beside a neo-Hookean law."""
+
+    modulus: float | jax.Array
+    network: eqx.nn.MLP
+
+    def energy(self, F):
+        log_J, stretch = jnp.log(la.determinant(F)), la.double_dot(F, F) - len(F)
+        learned = jax.vmap(self.network, in_axes=1, out_axes=1)(jnp.stack([stretch, log_J]))[0]
+        return self.modulus * (stretch / 2 - log_J + log_J**2 + log_J**2 * jnp.tanh(learned) / 2)
+
+
+def perceptron():
+    return Perceptron(1e4, eqx.nn.MLP(2, 1, 5, 1, jax.nn.softplus, key=jax.random.key(0)))
+
+
+def test_a_scene_takes_a_law_that_holds_a_network():
+    """Whose weights are not one a particle and whose activation is no number."""
+    grid, particles = cloud(2, p=20, cells=3)
+    after, _ = mpm.step(mpm.Scene(grid, perceptron()), particles, 0.0, 1e-4)
+    assert np.isfinite(after.x).all()
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("hessian", [mpm.AnalyticHessian(), mpm.JvpHessian()])
+def test_gradients_by_weights_of_a_network_are_differences(hessian):
+    """Through implicit steps."""
+    grid, particles = cloud(2, p=20, cells=3)
+    scene, solver = mpm.Scene(grid, perceptron()), mpm.ConjugateResidual(rtol=1e-13)
+    method = mpm.SemiImplicit(1.0, hessian, solver, adjoint_solver=solver)
+
+    @jax.jit
+    def moment(bias):
+        trial = eqx.tree_at(lambda s: s.material.network.layers[1].bias, scene, bias)
+        return (mpm.simulate(trial, particles, t1=2e-4, dt=1e-4, method=method).final.v ** 2).sum()
+
+    bias, h = scene.material.network.layers[1].bias, 1e-3
+    difference = (moment(bias + h) - moment(bias - h)) / (2 * h)
+    assert abs(float(difference)) > 0
+    np.testing.assert_allclose(jax.grad(moment)(bias)[0], difference, rtol=1e-5)
+
+
+def test_numbers_of_a_law_itself_are_one_a_particle_beside_a_network():
+    grid, particles = cloud(2, p=20, cells=3)
+    law = eqx.tree_at(lambda law: law.modulus, perceptron(), jnp.full(7, 1e4))
+    with pytest.raises(ValueError, match=r"one for each of its 20 particles, got \[7\] of them\. What has another"):
+        mpm.prepare(mpm.Scene(grid, law), particles)
+
+
+@mpm.register
+class Dense(eqx.Module):
+    """A layer of one's own."""
+
+    weight: jax.Array
+
+
+@mpm.register
+class Weighted(mpm.AbstractMaterial):
+    """Weights as arrays of several shapes, and in layers."""
+
+    weights: tuple[jax.Array, ...]
+    layers: tuple[Dense, ...]
+
+    def energy(self, F):
+        return sum((w**2).sum() for w in self.weights) * (la.double_dot(F, F) - len(F))
+
+
+def test_files_hold_weights_of_several_shapes():
+    """Few numbers are written out, many stand beside."""
+    rng, arrays = np.random.default_rng(0), {}
+    weights = tuple(rng.normal(size=shape) for shape in ((3, 2), (5,), (20, 20)))
+    law = Weighted(weights, tuple(Dense(weight) for weight in weights))
+    again = decode(json.loads(json.dumps(encode(law, arrays))), mpm.AbstractMaterial, "", arrays)
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(law), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_law_that_files_cannot_hold_is_refused_as_it_is_registered():
+    """And not when a run is over and is to be saved."""
+    with pytest.raises(ValueError, match=r"Perceptron's argument 'network' is annotated as .*MLP.*, which"):
+        mpm.register(Perceptron)
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory):
+    """What the example, in its small size, leaves: its names, and its files in the folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder := tmp_path_factory.mktemp("learned"))
+        patch.setattr(sys, "argv", [str(EXAMPLE), "--small"])
+        return runpy.run_path(str(EXAMPLE)) | {"folder": folder}
+
+
+def wild(example, seed):
+    """A law with large random weights."""
+    scattered = np.random.default_rng(seed)
+    return jax.tree.map(lambda a: jnp.asarray(scattered.normal(size=a.shape) * 2), example["law"])
+
+
+def deformations(d, count=200):
+    """Random ones with J > 0, shape (d, d, count)."""
+    rng = np.random.default_rng(d)
+    stretches = rng.uniform(0.4, 2.0, (count, d))
+    each = [rotation_matrix(d, rng) @ np.diag(s) @ rotation_matrix(d, rng) for s in stretches]
+    return jnp.asarray(np.stack(each, axis=-1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_learned_law_is_a_law_whatever_its_weights_are(example, d):
+    """Zero and free of stress at rest, frame-indifferent, isotropic, stiff at rest, elliptic everywhere."""
+    rng = np.random.default_rng(5)
+    F, rest = deformations(d), jnp.eye(d)[..., None]
+    Q = jnp.asarray(rotation_matrix(d, rng))[..., None]
+    for law in (example["law"], *(wild(example, seed) for seed in range(3))):
+        energy, size = law.energy(F), float(jnp.exp(law.shear))
+        assert abs(float(law.energy(rest)[0])) < 1e-12 * size
+        assert float(jnp.abs(law.stress(rest)).max()) < 1e-12 * size
+        assert float(energy.min()) > 0
+        np.testing.assert_allclose(law.energy(la.matmul(Q, F)), energy, rtol=1e-10)
+        np.testing.assert_allclose(law.energy(la.matmul(F, Q)), energy, rtol=1e-10)
+        check_law(law, dim=d)
+        shear, stretch = np.zeros((d, d)), np.eye(d)
+        shear[0, 1] = 1.0
+        for strain in (shear + shear.T, stretch):
+            stress = law.tangent(rest)(jnp.asarray(strain)[..., None])
+            assert float(la.double_dot(stress, jnp.asarray(strain)[..., None])[0]) > 0
+        a, n = rng.normal(size=(2, d, F.shape[-1]))
+        wave = jnp.asarray(a[:, None] * n[None])
+        acoustic = la.double_dot(wave, law.tangent(F)(wave))
+        assert float((acoustic / la.double_dot(wave, wave)).min()) > 0
+
+
+@pytest.mark.slow
+def test_the_learned_law_fits_and_generalises(example):
+    """Better than before its training, on the motion that it was trained on and on one that it has not seen."""
+    history, table = example["history"], example["table"]
+    assert np.isfinite(history).all()
+    assert min(history) < history[0] / 2
+    for before, after in zip(table["network, untrained"], table["network, trained"], strict=True):
+        assert after < before
+
+
+@pytest.mark.slow
+def test_the_learned_law_is_saved_and_loaded(example):
+    run = mpm.load(example["folder"] / "learned_law.h5")
+    law = run.scene.material
+    F = deformations(2)
+    np.testing.assert_array_equal(law.energy(F), example["law"].energy(F))
+    assert (example["folder"] / "learned_law.png").exists()
