@@ -150,7 +150,7 @@ stiffness = {
 }
 closed = {}
 for kind in (mpm.FixedCorotated, mpm.NeoHookean, mpm.Hencky):
-    fitted = mpm.fit(with_law(pulled, kind(2e4, 0.4)), stiffness, rtol=1e-3)
+    fitted = mpm.fit(with_law(pulled, kind(2e4, 0.4)), stiffness, optimiser=mpm.LevenbergMarquardt(rtol=1e-3))
     closed[kind.__name__] = fitted.experiments[0].scene.material
     table[kind.__name__] = errors(closed[kind.__name__])
 
