@@ -156,7 +156,7 @@ def test_a_file_without_a_fit_says_so(bar):
 
 def test_columns_name_the_row_that_is_no_number(tmp_path):
     (tmp_path / "a.csv").write_text("# comment\nx,y\n1,2\n3,four\n")
-    with pytest.raises(ValueError, match="data row 2: y must be a finite number, got 'four'"):
+    with pytest.raises(ValueError, match=r"a\.csv, line 4: y must be a finite number, got 'four'"):
         read_columns(tmp_path / "a.csv", "x", "y")
 
 

@@ -1,13 +1,15 @@
 """Fitting parameters to measured data."""
 
-from mpmjax.fitting._columns import read_columns
+from mpmjax.fitting._arrays import read_arrays
+from mpmjax.fitting._columns import Columns, read_columns
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import fit
 from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
-from mpmjax.fitting._observation import AbstractObservation, Curve, Force, Series, Tracks
+from mpmjax.fitting._observation import AbstractObservation, Curve, Series, Tracks
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter, Bounded, Gaussian, Positive, Unbounded
 from mpmjax.fitting._quantities import CentreOfMass, Density, Extent, Markers, StressStretch
+from mpmjax.fitting._reaction import Force, Torque
 from mpmjax.fitting._refined import RefinedFit, fit_refined
 from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
 
@@ -17,6 +19,7 @@ __all__ = [
     "AbstractParameter",
     "Bounded",
     "CentreOfMass",
+    "Columns",
     "Curve",
     "Density",
     "Estimate",
@@ -33,9 +36,11 @@ __all__ = [
     "RefinedFit",
     "Series",
     "StressStretch",
+    "Torque",
     "Tracks",
     "Unbounded",
     "fit",
     "fit_refined",
+    "read_arrays",
     "read_columns",
 ]

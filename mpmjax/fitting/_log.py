@@ -66,13 +66,13 @@ class FitLog:
 
     @property
     def last(self) -> tuple[tuple[Array, ...], Standing] | None:
-        """The noise of the round that the log ends in, and where its search stands; None of a log without iterations."""
+        """The noise of the round that the log ends in, and where its search stands; None if it has no iteration."""
         return (self._rounds[-1].sigmas, self._rounds[-1].standing) if self._rounds else None
 
     @property
     def seconds(self) -> float:
         """When the last iteration was done, since the fit began [s]."""
-        return self._rounds[-1].seconds[-1] if self._rounds else 0.0
+        return max(self._rounds[-1].seconds) if self._rounds else 0.0
 
     def append(self, sigmas: tuple[Array, ...], standing: Standing, seconds: float) -> None:
         """Write an iteration.
@@ -203,7 +203,8 @@ def _read(
 def _rounds(
     arrays: dict[str, np.ndarray], problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates
 ) -> list[_Round]:
-    rows, places = arrays["iterations"], arrays["coordinates"]
+    rows: Any = arrays["iterations"]
+    places = arrays["coordinates"]
     rounds = []
     for number in range(int(rows["round"][-1]) + 1 if len(rows) else 0):
         own = np.flatnonzero(rows["round"] == number)
@@ -256,6 +257,6 @@ def _require_same(path: Path, ours: dict[str, str], theirs: dict[str, str]) -> N
         here, there = ours.get(name, "none"), theirs.get(name, "none")
         require(
             here == there,
-            f"{path} is the log of another fit: {name} is {there} there and {here} here. Resume the same fit, or name a "
-            "new log.",
+            f"{path} is the log of another fit: {name} is {there} there and {here} here. Resume the same fit, or name "
+            "a new log.",
         )

@@ -70,7 +70,7 @@ class Progress:
         )
 
     def _left(self, done: int) -> str:
-        """The time that is left, in words; nothing while only the iteration that was compiled is timed, or at the end."""
+        """The time left, in words; nothing while only the iteration that was compiled is timed, and at the end."""
         most = self._optimiser.max_steps - done
         if len(self._durations) < 2 or most == 0 or self._distances[-1] <= 1:
             return ""

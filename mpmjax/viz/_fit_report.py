@@ -2,10 +2,11 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from mpmjax.fitting import Experiment, FitResult
+from mpmjax.fitting import Experiment, FitResult, RefinedFit
 from mpmjax.io import replacing, save_figure
 
 _MOST_LINES = 6
@@ -59,9 +60,27 @@ def draw_fit(result: FitResult, path: Path, measured: tuple[Experiment, ...] = (
     return path
 
 
-def write_fit(result: FitResult, path: Path) -> Path:
-    """The numbers of a fit as JSON: estimates with errors and intervals, correlations, noise, χ² and iterations."""
-    numbers = {
+def write_fit(found: FitResult | RefinedFit, path: Path) -> Path:
+    """The numbers of a fit as JSON: estimates with errors and intervals, correlations, noise, χ² and iterations. Of a
+    fit on several grids, the extrapolated estimates, and those numbers of each grid."""
+    if isinstance(found, RefinedFit):
+        numbers: dict[str, Any] = {
+            "estimates": [e._asdict() for e in found.estimates],
+            "error_from_noise": found.from_noise,
+            "error_from_discretisation": found.from_discretisation,
+            "order": found.order,
+            "refinements": found.refinements,
+            "fits": [_numbers(each) for each in found.fits],
+        }
+    else:
+        numbers = _numbers(found)
+    with replacing(path) as aside:
+        aside.write_text(json.dumps(_plain(numbers), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return path
+
+
+def _numbers(result: FitResult) -> dict[str, Any]:
+    return {
         "estimates": [e._asdict() for e in (*result.estimates, *result.reported)],
         "correlation": result.correlation,
         "fisher_spectrum": result.spectrum,
@@ -74,11 +93,9 @@ def write_fit(result: FitResult, path: Path) -> Path:
         "noise": [n._asdict() for n in result.noise],
         "converged": result.converged,
         "iterations": [i._asdict() for i in result.history],
+        "interrupted": result.interrupted,
         "warnings": result.warnings,
     }
-    with replacing(path) as aside:
-        aside.write_text(json.dumps(_plain(numbers), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    return path
 
 
 def _plain(value: object) -> object:
