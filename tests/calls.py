@@ -98,6 +98,8 @@ MAY = {
     (mpm.sample_mesh, "mesh"),
     (mpm.fill, "dtype"),
     (mpm.Experiment, "name"),
+    (mpm.fit, "log"),
+    (mpm.fit_refined, "log"),
     *(
         (call, name)
         for call in CALLS

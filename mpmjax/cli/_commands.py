@@ -39,6 +39,8 @@ def _reporting(command: Callable[..., None]) -> Callable[..., None]:
                 warnings.simplefilter("default", UserWarning)
                 warnings.showwarning = _print_warning
                 command(*args, **kwargs)
+        except typer.Exit:  # a RuntimeError too
+            raise
         except (ValueError, RuntimeError, OSError, MemoryError) as error:
             told = " ".join(str(error).split()) or "there is not enough memory for this"
             print(f"mpmjax: {told}", file=sys.stderr)
@@ -214,7 +216,6 @@ def fit_command(
     require(plot.resolve().parent.is_dir(), f"{plot} cannot be written (no folder {plot.parent}).")
     common: dict[str, Any] = {"report": asked.report, "level": asked.level, "optimiser": asked.optimiser}
     common |= {"log": log, "resume": resume}
-    whole = asked.whole
     with stopping("The fit ends after the iteration in progress; a second signal ends it at once.") as stop:
 
         def progress(line: str) -> None:
@@ -227,13 +228,12 @@ def fit_command(
             found = fit_refined(
                 lambda n: asked.refined(n)[0], asked.parameters, refinements=grids, progress=progress, **common
             )
-            print(found)
-            result = found.fits[-1]
-            whole = asked.refined(found.refinements[-1])[1]
+            fits, whole = found.fits, asked.refined(found.refinements[-1])[1]
         else:
-            found = result = fit(asked.experiments, asked.parameters, progress=progress, **common)
-            print(result)
-    iterations = sum(len(each.history) for each in (found.fits if grids else (result,)))
+            found = fit(asked.experiments, asked.parameters, progress=progress, **common)
+            fits, whole = (found,), asked.whole
+    print(found)
+    result, iterations = fits[-1], sum(len(each.history) for each in fits)
     print(f"{iterations} simulations with exact derivatives, {time.perf_counter() - begun:.3g} s in all", flush=True)
     numbers = write_fit(found, plot.with_suffix(".json"))
     print(f"written {draw_fit(result, plot, whole)} and {numbers}")

@@ -232,10 +232,10 @@ def _parameter(table: dict[str, Any], experiments: list[Experiment]) -> tuple[st
         require((kind == "Bounded") == bounds, f'{where}: lower and upper go with kind = "Bounded".')
         if kind in _OF_THE_BODY:
             require(path is None, f"{where}: {kind} is of all particles and takes no path.")
-            return name or kind.lower(), _of_the_body(kind, where, experiments[own[0]], common)
+            return name or kind.lower(), _of_the_body(kind, where, experiments[min(own)], common)
         require(path is not None, f'{where} needs a path, such as "scene.material.youngs_modulus".')
         path = str(path)
-        _require_number(path, where, experiments[own[0]])
+        _require_number(path, where, experiments[min(own)])
         common |= {"where": _getter(path)}
         last = path.rpartition(".")[2]
         if kind == "Bounded":

@@ -72,7 +72,7 @@ class FitLog:
     @property
     def seconds(self) -> float:
         """When the last iteration was done, since the fit began [s]."""
-        return max(self._rounds[-1].seconds) if self._rounds else 0.0
+        return self._rounds[-1].seconds[-1] if self._rounds else 0.0
 
     def append(self, sigmas: tuple[Array, ...], standing: Standing, seconds: float) -> None:
         """Write an iteration.
@@ -85,7 +85,7 @@ class FitLog:
         Raises:
             OSError: the disk refused; the log is what it was.
         """
-        past: tuple[float, ...] = ()
+        past = ()
         if len(standing.history) > 1:
             past = self._rounds.pop().seconds
         self._rounds.append(_Round(sigmas, standing, (*past, seconds)))
