@@ -10,7 +10,7 @@ import equinox as eqx
 import numpy as np
 
 from mpmjax._types import Array, Scalar
-from mpmjax.analysis import energy
+from mpmjax.analysis import energy_of
 from mpmjax.checks import require, require_positive
 from mpmjax.discretisation import Grid
 from mpmjax.fitting import (
@@ -294,7 +294,7 @@ class _EnergyPart(eqx.Module):
     part: str = eqx.field(static=True)
 
     def __call__(self, scene: Scene, particles: Particles) -> Array:
-        return getattr(energy(scene, particles), self.part)
+        return getattr(energy_of(scene, particles), self.part)
 
 
 @_kind("Density")

@@ -16,17 +16,16 @@ def read_arrays(path: Path, *names: str) -> list[np.ndarray]:
     Raises:
         ValueError: no such file or array, or one that is not numbers.
     """
+    suffixes = (".npz", ".h5", ".hdf5")
+    require(path.suffix in suffixes, f"{path} must be a {', '.join(suffixes)} file with the arrays {', '.join(names)}.")
     try:
-        if path.suffix in (".h5", ".hdf5"):
+        if path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as file:
+                found = {name: file[name] for name in names if name in file}
+        else:
             with h5py.File(path, "r", locking=False) as file:
                 found = {name: np.asarray(file[name]) for name in names if name in file}
-        else:
-            require(
-                path.suffix == ".npz", f"{path} must be a .npz, .h5 or .hdf5 file with the arrays {', '.join(names)}."
-            )
-            with np.load(path, allow_pickle=False) as file:
-                found = {name: file[name] for name in names if name in file.files}
-    except (OSError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, KeyError, EOFError, ValueError, TypeError, zipfile.BadZipFile) as error:
         raise ValueError(f"Cannot read the data file {path}: {reason(error).lower()}.") from None
     for name in names:
         require(name in found, f"{path} has no array {name!r}.")
