@@ -274,7 +274,7 @@ def _of_the_body(kind: str, where: str, experiment: Experiment, common: dict[str
         first, update, unit = np.zeros(() if d == 2 else 3), _turned, "rad/s"
     start = first if common["start"] is None else np.asarray(common["start"])
     require(start.shape == first.shape, f"{where} start must have shape {first.shape}, got {start.shape}.")
-    return Unbounded(update=update, **(common | {"start": start, "unit": common["unit"] or unit}))
+    return Unbounded(update=update, **(common | {"start": jnp.asarray(start), "unit": common["unit"] or unit}))
 
 
 def _moved(experiment: Experiment, velocity: Any) -> Experiment:
