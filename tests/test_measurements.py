@@ -3,6 +3,7 @@
 import csv
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -106,11 +107,11 @@ def test_velocity_and_spin_are_those_of_the_body(pushed):
     (experiment,) = asked.experiments
     velocity, spin = asked.parameters["velocity"], asked.parameters["spin"]
     assert np.allclose(velocity.start, [0.2, -0.3])
-    before, value = experiment.particles, np.array([1.0, 2.0])
+    before, value = experiment.particles, jnp.array([1.0, 2.0])
     for order in ((velocity, spin), (spin, velocity)):
         e = experiment
         for parameter in order:
-            e = parameter.put(e, value if parameter is velocity else np.asarray(3.0))
+            e = parameter.put(e, value if parameter is velocity else jnp.asarray(3.0))
         q = e.particles
         arms = np.asarray(q.x - q.mass @ q.x / q.mass.sum())
         assert np.allclose(q.mass @ q.v / q.mass.sum(), value)
