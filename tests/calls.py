@@ -120,6 +120,8 @@ MAY = {
     (mpm.fill, "dtype"),
     (mpm.Experiment, "name"),
     (mpm.predict, "of"),
+    (mpm.fit, "log"),
+    (mpm.fit_refined, "log"),
     *(
         (call, name)
         for call in CALLS

@@ -140,13 +140,13 @@ UNFIT_DATA = {
     "a typing error": (f"strech,stress,{SECRET}\n1,1,1\n", r"has no column 'stretch', did you mean 'strech'\?$"),
     "a long cell": (
         f"stretch,stress\n1,'{SECRET * 9}\n",
-        r"row 1: stress must be a finite number, got \"'root.*\.\.\.\"\.$",
+        r"line 2: stress must be a finite number, got \"'root.*\.\.\.\"\.$",
     ),
-    "an open quote": (f'stretch,stress\n1,"{SECRET}\n{SECRET}\n', r"row 1: stress .*, got 'root.*\.\.\.'\.$"),
-    "a short row": (f"{SECRET},stretch,stress\n{SECRET},1\n", r"row 1: stress .*, got a row that ends before it\.$"),
-    "not finite": ("stretch,stress\n1,nan\n", r"row 1: stress must be a finite number, got 'nan'\.$"),
-    "a cell beyond csv's limit": ("stretch,stress\n1," + "1" * 200_000, r"is not a CSV file: field larger than"),
-    "empty": ("", r"has no column 'stretch' among its 0\.$"),
+    "an open quote": (f'stretch,stress\n1,"{SECRET}\n{SECRET}\n', r"line 2: stress .*, got 'root.*\.\.\.'\.$"),
+    "a short row": (f"{SECRET},stretch,stress\n{SECRET},1\n", r"line 2: 2 fields, but the header has 3\.$"),
+    "not finite": ("stretch,stress\n1,nan\n", r"line 2: stress must be a finite number, got 'nan'\.$"),
+    "a cell beyond csv's limit": ("stretch,stress\n1," + "1" * 200_000, r"line 2: not CSV: field larger than"),
+    "empty": ("", r"is empty: it needs a header that names its columns, and rows\.$"),
 }
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mpmjax as mpm
-from mpmjax.fitting._observation import _between
+from mpmjax.fitting._observation import between
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._search import iterate, search
 
@@ -183,7 +183,7 @@ def test_what_the_data_do_see_of_a_pair_has_an_error():
 
 def test_between_steps_a_series_is_interpolated_linearly():
     seen = jnp.asarray([[0.0], [1.0], [4.0]])
-    assert np.allclose(_between(seen, jnp.asarray([0.0, 0.25, 1.0, 1.5, 2.0]))[:, 0], [0, 0.25, 1, 2.5, 4])
+    assert np.allclose(between(seen, jnp.asarray([0.0, 0.25, 1.0, 1.5, 2.0]))[:, 0], [0, 0.25, 1, 2.5, 4])
 
 
 @pytest.mark.thorough

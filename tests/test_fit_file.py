@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import re
+import tomllib
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from shell import refused, shell
 import mpmjax as mpm
 from mpmjax.cli._fit_file import read_fit
 from mpmjax.fitting import read_columns
+from mpmjax.fitting._columns import stated_unit
 
 RUBBER = Path(__file__).parents[1] / "examples" / "rubber.toml"
 BAR = """
@@ -122,6 +124,115 @@ def test_a_marker_that_is_lost_is_no_data(bar):
     assert np.isfinite(seen.data[:, [0, 2]]).all()
 
 
+DATA = {
+    "not a number": ("front.csv", 3, "0.008,wide", r"front\.csv, line 3: x must be a finite number, got 'wide'"),
+    "not finite": ("front.csv", 3, "0.008,inf", r"line 3: x must be a finite number, got 'inf'"),
+    "a field too many": ("tracks.csv", 5, "0.004,3,0.1,0.2", r"tracks\.csv, line 5: 4 fields, but the header has 3"),
+    "a field too few": ("tracks.csv", 5, "0.004,3", r"tracks\.csv, line 5: 2 fields, but the header has 3"),
+    "unsorted": ("front.csv", 4, "0.004,0.4", r"line 4: time 0\.004 must be later than in the row before: sort"),
+    "after the run": (
+        "front.csv",
+        17,
+        "60,0.4",
+        r"line 17: time 60 lies after the end of the run, t1 = 0\.06 s.*time_un",
+    ),
+    "before the run": ("front.csv", 2, "-0.1,0.4", r"front\.csv, line 2: time -0\.1 lies before the run"),
+    "millimetres": (
+        "front.csv",
+        6,
+        "0.02,410",
+        r"line 6: x 410 lies outside of the grid's window, from -0\.4 to 0\.7 m",
+    ),
+    "a marker twice": ("tracks.csv", 6, "0.004,3,0.1", r"tracks\.csv, line 6: marker 3 is there twice at time 0\.004"),
+    "a marker beside the body": ("tracks.csv", 2, "0.0,3,-0.2", r"tracks\.csv, line 2: Markers must lie on the body"),
+    "a new marker": ("tracks.csv", 6, "0.004,9,0.1", r"tracks\.csv, line 6: marker 9 has no row at time 0"),
+}
+"""A file, one of its lines, what stands there instead, and what is said."""
+
+
+@pytest.fixture(scope="module")
+def simulation(bar):
+    """The bar's scene, read once."""
+    from mpmjax.cli._scene_file import read_simulation
+
+    return read_simulation(bar / "bar.toml")
+
+
+@pytest.fixture
+def copied(bar, tmp_path):
+    for name in ("bar.toml", "tracks.csv", "front.csv"):
+        (tmp_path / name).write_text((bar / name).read_text())
+    return tmp_path
+
+
+@pytest.mark.parametrize(("name", "line", "text", "says"), DATA.values(), ids=DATA)
+def test_an_error_in_a_data_file_is_named_by_file_and_line(copied, simulation, name, line, text, says):
+    lines = (copied / name).read_text().splitlines()
+    (copied / name).write_text("\n".join([*lines[: line - 1], text, *lines[line:]]) + "\n")
+    with pytest.raises(ValueError, match=says) as refusal:
+        read_fit(copied / "bar.toml", lambda _: simulation)
+    assert "\n" not in str(refusal.value)
+
+
+WHOLE_FILES = {
+    "empty": ("", r"front\.csv is empty"),
+    "comments": ("# nothing\n", r"front\.csv is empty"),
+    "no rows": ("time,x\n", r"a header and no rows"),
+    "semicolons": ("time;x\n0.0;0.4\n", r"parted by ';'; part them by commas"),
+    "a column twice": ("time,x,x\n0.0,0.4,0.4\n", r"line 1: the column 'x' is there twice"),
+}
+
+
+@pytest.mark.parametrize(("content", "says"), WHOLE_FILES.values(), ids=WHOLE_FILES)
+def test_a_data_file_that_is_none_says_so(copied, simulation, content, says):
+    (copied / "front.csv").write_text(content)
+    with pytest.raises(ValueError, match=says):
+        read_fit(copied / "bar.toml", lambda _: simulation)
+
+
+def test_an_error_in_a_data_file_ends_the_command_and_keeps_what_was_written(copied):
+    """One line, exit code 2, and pictures and numbers of an earlier fit stay."""
+    for name in ("fit.png", "fit.json"):
+        (copied / name).write_text("there before")
+    (copied / "front.csv").write_text("time,x\n0.0,0.4\n0.004,?\n")
+    said = refused("fit", copied / "bar.toml", "--plot", copied / "fit.png")
+    assert "front.csv, line 3: x must be a finite number, got '?'" in said
+    assert [(copied / name).read_text() for name in ("fit.png", "fit.json")] == ["there before"] * 2
+
+
+def test_a_columns_unit_must_be_the_one_that_is_given(copied, simulation):
+    """Also milliseconds, which are far beyond the run."""
+    rows = (copied / "front.csv").read_text().splitlines()[1:]
+    scaled = [f"{1e3 * float(t)},{1e3 * float(x)}" for t, x in (row.split(",") for row in rows)]
+    (copied / "front.csv").write_text("\n".join(["time [ms],x_mm", *scaled]))
+    table, old = (copied / "bar.toml").read_text(), 'time = "time"\nvalue = "x"'
+    for keys, says in (
+        ("", r"line 1: the column 'x_mm' states another unit than unit = 1: give unit = 0\.001"),
+        ("unit = 1e-3", r"line 1: the column 'time \[ms\]' states another unit than time_unit = 1: give time_unit"),
+        ("unit = 1e-3\ntime_unit = 1e-3", None),
+    ):
+        (copied / "bar.toml").write_text(table.replace(old, f'time = "time [ms]"\nvalue = "x_mm"\n{keys}'))
+        if says is None:
+            (found,) = read_fit(copied / "bar.toml", lambda _: replaced(simulation, copied)).experiments
+            assert np.allclose(found.observations[1].times, np.arange(13) * 4e-3)
+        else:
+            with pytest.raises(ValueError, match=says):
+                read_fit(copied / "bar.toml", lambda _: replaced(simulation, copied))
+
+
+def replaced(simulation, folder):
+    """The simulation with the [fit] table of a file."""
+    return simulation._replace(fit=tomllib.loads((folder / "bar.toml").read_text())["fit"])
+
+
+@pytest.mark.parametrize(
+    ("head", "factor"),
+    [("x [mm]", 1e-3), ("t (ms)", 1e-3), ("p_MPa", 1e6), ("x [m]", 1.0), ("x_m", None), ("x_max", None), ("x", None)],
+)
+def test_a_head_may_state_a_unit(head, factor):
+    assert stated_unit(head) == factor
+
+
 FAULTS = {
     "no file": ('"tracks.csv"', '"none.csv"', r"none\.csv"),
     "no column": ('marker = "marker"', 'marker = "number"', r"no column 'number'"),
@@ -139,6 +250,14 @@ FAULTS = {
         'unit = "Pa"\n[[fit.parameter]]\npath = "scene.material.poisson_ratio"\nname = "E"',
         r"a name",
     ),
+    "refinement": ("t1 = 0.048", "t1 = 0.048\nrefine = 0", r"refine must be growing whole numbers"),
+    "optimiser": ("t1 = 0.048", 't1 = 0.048\noptimiser = "Newton"', r"optimiser must have a kind, one of Levenberg"),
+    "tolerance": ("t1 = 0.048", 't1 = 0.048\noptimiser = { kind = "LevenbergMarquardt", rtol = -1.0 }', r"rtol"),
+    "path and kind": ('unit = "Pa"', 'kind = "Velocity"', r"takes no path"),
+    "no path": ('path = "scene.material.youngs_modulus"', "", r"needs a path"),
+    "an experiment": ('unit = "Pa"', "only = [3]", r"only must name experiments from 0 to 0"),
+    "turning": ('path = "scene.material.youngs_modulus"', 'kind = "Spin"', r"in one dimension does not turn"),
+    "unit": ("axis = 0", "axis = 0\nunit = 0.0", r"unit must be"),
     "dimension": ('place = ["x"]', 'place = ["x", "y"]', r"must be 1 columns"),
 }
 
@@ -156,7 +275,7 @@ def test_a_file_without_a_fit_says_so(bar):
 
 def test_columns_name_the_row_that_is_no_number(tmp_path):
     (tmp_path / "a.csv").write_text("# comment\nx,y\n1,2\n3,four\n")
-    with pytest.raises(ValueError, match="data row 2: y must be a finite number, got 'four'"):
+    with pytest.raises(ValueError, match=r"a\.csv, line 4: y must be a finite number, got 'four'"):
         read_columns(tmp_path / "a.csv", "x", "y")
 
 

@@ -1,5 +1,6 @@
 """Ctrl-C and SIGTERM end a command at any moment with their own code and one line; a live run has one writer."""
 
+import json
 import os
 import re
 import signal
@@ -137,6 +138,51 @@ def test_a_signal_ends_what_writes_no_file(begun, tmp_path):
     assert "method" in process.stdout.readline()
     assert ended(process, signal.SIGTERM).endswith("No file was being written.")
     assert os.listdir(tmp_path) == ["scene.toml"]
+
+
+FIT = """
+[fit]
+[[fit.parameter]]
+path = "scene.material.youngs_modulus"
+start = 3e4
+[[fit.observation]]
+kind = "Extent"
+data = "front.csv"
+time = "t"
+value = "x"
+axis = 0
+"""
+
+
+@pytest.mark.thorough
+def test_a_signal_ends_a_fit_with_the_best_so_far(begun, tmp_path):
+    """Its table, picture and numbers are there; killed and resumed it ends with the numbers of the whole fit, to the
+    last bit."""
+    (tmp_path / "front.csv").write_text("t,x\n0.5,0.395\n1.0,0.385\n1.5,0.380\n2.0,0.384\n2.5,0.396\n")
+    scene = SCENE.replace("1e4\ndt", "2.5\ndt").replace("dt = 1e-3", "dt = 2e-4") + FIT
+    command = ("fit", "scene.toml", "--log", "fit.h5")
+    whole = begun("fit", "scene.toml", "--plot", "whole.png", scene=scene)
+    assert whole.wait() == 0, whole.communicate()
+    for number, line in ((signal.SIGINT, 1), (signal.SIGTERM, 2), (signal.SIGKILL, 3)):
+        process = begun(*command, *(["--resume"] if line > 1 else []), scene=scene)
+        assert process.stderr is not None
+        for said in process.stderr:
+            if said.startswith(f"{line:4d}  misfit"):
+                process.send_signal(number)
+                break
+        out, err = process.communicate(timeout=60)
+        if number == signal.SIGKILL:
+            break
+        code, what = SIGNALS[number]
+        assert process.returncode == code, err
+        assert f"mpmjax: {what}. The fit ends after the iteration in progress" in err
+        assert "NOT CONVERGED" in out
+        numbers = json.loads((tmp_path / "scene_fit.json").read_text())
+        assert numbers["interrupted"]
+        assert line < len(numbers["iterations"]) <= line + 2
+        assert (tmp_path / "scene_fit.png").stat().st_size > 10_000
+    assert begun(*command, "--resume", scene=scene).wait() == 0
+    assert (tmp_path / "scene_fit.json").read_text() == (tmp_path / "whole.json").read_text()
 
 
 def test_a_signal_that_is_ignored_stays_ignored(tmp_path):

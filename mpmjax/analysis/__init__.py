@@ -2,7 +2,16 @@
 
 from mpmjax.analysis._bench import Build, Trial, name_of
 from mpmjax.analysis._budget import Budget, EnergyBudget, MomentumBudget, budget
-from mpmjax.analysis._diagnostics import Energy, energy, energy_density, grid_mass, momentum, pieces, volume_ratio
+from mpmjax.analysis._diagnostics import (
+    Energy,
+    energy,
+    energy_density,
+    energy_of,
+    grid_mass,
+    momentum,
+    pieces,
+    volume_ratio,
+)
 from mpmjax.analysis._sensitivity import Sensitivity, sensitivity
 from mpmjax.analysis._work_precision import METHODS, WorkPrecision, work_precision
 
@@ -19,6 +28,7 @@ __all__ = [
     "budget",
     "energy",
     "energy_density",
+    "energy_of",
     "grid_mass",
     "momentum",
     "name_of",

@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import signal
 import sys
 import time
 import warnings
@@ -15,11 +16,11 @@ import numpy as np
 import typer
 
 from mpmjax.analysis import Trial, energy, grid_mass, name_of, pieces, work_precision
-from mpmjax.checks import require
-from mpmjax.cli._fit_file import read_fit
+from mpmjax.checks import require, shortened
+from mpmjax.cli._fit_file import read_fit, refinements
 from mpmjax.cli._scene_file import Simulation, read_scene_file, read_simulation, stable_step
-from mpmjax.fitting import fit
-from mpmjax.io import check_place, end_on_signals, load, record, reporting, steps_in
+from mpmjax.fitting import fit, fit_refined
+from mpmjax.io import check_place, end_on_signals, load, record, reporting, steps_in, stopping
 from mpmjax.simulation import Run
 from mpmjax.viz import COLOURS, draw_chart, draw_fit, render, write_fit, write_trials
 
@@ -38,6 +39,8 @@ def _reporting(command: Callable[..., None]) -> Callable[..., None]:
                 warnings.simplefilter("default", UserWarning)
                 warnings.showwarning = _print_warning
                 command(*args, **kwargs)
+        except typer.Exit:  # a RuntimeError too
+            raise
         except (ValueError, RuntimeError, OSError, MemoryError) as error:
             told = " ".join(str(error).split()) or "there is not enough memory for this"
             print(f"mpmjax: {told}", file=sys.stderr)
@@ -191,21 +194,62 @@ def _summary(simulation: Simulation, run: Run, taken: int, seconds: float) -> st
 def fit_command(
     scene: ScenePath,
     plot: Annotated[Path | None, typer.Option(help="The picture to write. Default: SCENE_fit.png here.")] = None,
+    log: Annotated[
+        Path | None, typer.Option(help="An HDF5 file that is to hold each iteration; with --refine one a grid.")
+    ] = None,
+    resume: Annotated[bool, typer.Option(help="Continue the fit of the log.")] = False,
+    refine: Annotated[
+        str | None,
+        typer.Option(metavar="N[,N]", help="Fit on N times as many cells a direction too, and extrapolate."),
+    ] = None,
     most_seconds: MostSeconds = None,
     imports: Imports = None,
 ) -> None:
     """Fit parameters to what was measured, as the file's [fit] table says: a table, a picture, and its numbers as
-    JSON."""
+    JSON. Ctrl-C ends it after the iteration in progress, with the best so far."""
     _import(imports)
     begun = time.perf_counter()
+    require(log is not None or not resume, "--resume continues the fit of a log: name it by --log.")
     asked = read_fit(scene, lambda file: _chosen(file, most_seconds))
+    grids = asked.refine if refine is None else _grids(refine)
     plot = Path(f"{scene.stem}_fit.png") if plot is None else plot
-    numbers = plot.with_suffix(".json")
-    result = fit(asked.experiments, asked.parameters, report=asked.report, level=asked.level, progress=_print_error)
-    print(result)
-    print(f"{len(result.history)} simulations with exact derivatives, {time.perf_counter() - begun:.3g} s in all")
-    write_fit(result, numbers)
-    print(f"written {draw_fit(result, plot, asked.whole)} and {numbers}")
+    require(plot.resolve().parent.is_dir(), f"{plot} cannot be written (no folder {plot.parent}).")
+    common: dict[str, Any] = {"report": asked.report, "level": asked.level, "optimiser": asked.optimiser}
+    common |= {"log": log, "resume": resume}
+    with stopping("The fit ends after the iteration in progress; a second signal ends it at once.") as stop:
+
+        def progress(line: str) -> None:
+            _print_error(line)
+            stop.ready = not line.startswith("compiling")
+            if stop.signal:
+                raise KeyboardInterrupt
+
+        if grids:
+            found = fit_refined(
+                lambda n: asked.refined(n)[0], asked.parameters, refinements=grids, progress=progress, **common
+            )
+            fits, whole = found.fits, asked.refined(found.refinements[-1])[1]
+        else:
+            found = fit(asked.experiments, asked.parameters, progress=progress, **common)
+            fits, whole = (found,), asked.whole
+    print(found)
+    result, iterations = fits[-1], sum(len(each.history) for each in fits)
+    print(f"{iterations} simulations with exact derivatives, {time.perf_counter() - begun:.3g} s in all", flush=True)
+    numbers = write_fit(found, plot.with_suffix(".json"))
+    print(f"written {draw_fit(result, plot, whole)} and {numbers}")
+    if stop.signal or result.interrupted:
+        raise typer.Exit(128 + (stop.signal or signal.SIGINT))
+
+
+def _grids(text: str) -> tuple[int, ...]:
+    """The grids that --refine names."""
+    try:
+        numbers = tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(
+            f"--refine must be whole numbers with commas, such as 2, got {shortened(text, 20)!r}."
+        ) from None
+    return refinements(numbers, "--refine")
 
 
 @app.command("chart")

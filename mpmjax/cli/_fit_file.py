@@ -1,37 +1,35 @@
 """The `[fit]` table of a scene file: what is fitted, and what was measured. `docs/scene_files.md` is the schema in
 words."""
 
+import difflib
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Scalar
 from mpmjax.checks import require, require_positive, shortened
+from mpmjax.cli._measurements import Source, observation
 from mpmjax.cli._scene_file import Simulation, read_simulation
 from mpmjax.fitting import (
     AbstractObservation,
+    AbstractOptimiser,
     AbstractParameter,
     Bounded,
-    CentreOfMass,
-    Curve,
     Experiment,
-    Extent,
     Gaussian,
-    Markers,
+    LevenbergMarquardt,
     Positive,
-    Series,
-    StressStretch,
-    Tracks,
     Unbounded,
-    read_columns,
 )
-from mpmjax.geometry import AbstractRegion
 from mpmjax.io import arguments
-from mpmjax.state import Particles
+
+_OPTIMISERS: dict[str, type[AbstractOptimiser]] = {"LevenbergMarquardt": LevenbergMarquardt}
+"""What [fit] optimiser may name."""
 
 
 class FitFile(NamedTuple):
@@ -41,8 +39,13 @@ class FitFile(NamedTuple):
     parameters: dict[str, AbstractParameter]
     report: dict[str, Callable[[Experiment], Any]]
     level: float
+    optimiser: AbstractOptimiser
+    refine: tuple[int, ...]
+    """On how many times as many cells a direction it is fitted besides; empty for none."""
     whole: tuple[Experiment, ...]
     """The experiments over the whole of their runs, with all that was measured: also what is not fitted."""
+    refined: Callable[[int], tuple[tuple[Experiment, ...], tuple[Experiment, ...]]]
+    """The experiments and the whole ones on n times as many cells a direction, with steps n times shorter, from n."""
 
 
 def read_fit(path: Path, read: Callable[[Path], Simulation] = read_simulation) -> FitFile:
@@ -68,9 +71,10 @@ def read_fit(path: Path, read: Callable[[Path], Simulation] = read_simulation) -
             _require_keys(sources[-1][2], f"[fit] of {file}", _KEYS)
         require(len(sources) > 0, "[fit] needs an [[fit.observation]], or an [[fit.experiment]] whose scene has one.")
         parts = [_experiments(*source) for source in sources]
+        settings = _settings(table)
         tables = _tables(table, "parameter")
         require(len(tables) > 0, "[fit] needs a [[fit.parameter]].")
-        named = [_parameter(t, parts[0][0]) for t in tables]
+        named = [_parameter(t, [fitted for fitted, _ in parts]) for t in tables]
         names = [name for name, _ in named]
         require(len(set(names)) == len(names), f"[[fit.parameter]] {', '.join(names)}: each needs a name of its own.")
         report = table.get("report", {})
@@ -79,21 +83,73 @@ def read_fit(path: Path, read: Callable[[Path], Simulation] = read_simulation) -
             value = leaf_of(_path(where, "[fit.report]"), parts[0][0])
             one = not isinstance(value, eqx.Module) and np.ndim(value) == 0
             require(one, f"[fit.report] {name} = {where!r} must be one number, but is {value}.")
-        level = table.get("level", 0.95)
-        require(isinstance(level, float) and 0 < level < 1, f"[fit] level must lie between 0 and 1, got {level!r}.")
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+
+    def refined(n: int) -> tuple[tuple[Experiment, ...], tuple[Experiment, ...]]:
+        finer = [_experiments(file, _refined(own, n), fit_table) for file, own, fit_table in sources]
+        fitted, whole = zip(*finer, strict=True)
+        return fitted, whole
+
     found = {name: _getter(where) for name, where in report.items()}
     fitted, whole = zip(*parts, strict=True)
-    return FitFile(fitted, dict(named), found, level, whole)
+    return FitFile(fitted, dict(named), found, *settings, whole, refined)
 
 
-_KEYS = {"parameter", "observation", "experiment", "report", "level", "t1"}
+_TABLES = ("parameter", "observation", "experiment", "report")
+_KEYS = {*_TABLES, "t1", "level", "optimiser", "refine"}
 
 
 def _require_keys(table: dict[str, Any], where: str, known: set[str]) -> None:
-    unknown = sorted(set(table) - known)
-    require(not unknown, f"{where} has the unknown key {unknown[:1]}; known are {', '.join(sorted(known))}.")
+    for key in table:
+        close = difflib.get_close_matches(key[:60], known, 1)
+        hint = f", did you mean {close[0]!r}?" if close else "."
+        require(key in known, f"{where} has the unknown key {key[:60]!r}{hint} Known are {', '.join(sorted(known))}.")
+
+
+def _settings(table: dict[str, Any]) -> tuple[float, AbstractOptimiser, tuple[int, ...]]:
+    """Level, optimiser and refinements of a [fit] table."""
+
+    def settings(*, level: Scalar = 0.95, refine: int | tuple[int, ...] = ()) -> tuple[float, tuple[int, ...]]:
+        require(0 < level < 1, f"[fit] level must lie between 0 and 1, got {level!r}.")
+        return float(level), refinements(refine if isinstance(refine, tuple) else (refine,), "[fit] refine")
+
+    own = {key: value for key, value in table.items() if key in ("level", "refine")}
+    level, refine = settings(**arguments(settings, own, "[fit]"))
+    return level, _optimiser(table.get("optimiser", "LevenbergMarquardt")), refine
+
+
+def refinements(numbers: tuple[int, ...], where: str) -> tuple[int, ...]:
+    """The refinements of a fit on several grids, from one; empty for none.
+
+    Raises:
+        ValueError: they are not growing whole numbers.
+    """
+    finer = tuple(n for n in numbers if n != 1)
+    grow = all(a < b for a, b in zip((1, *finer), finer, strict=False))
+    require(grow, f"{where} must be growing whole numbers of two at least, such as 2, got {list(numbers)}.")
+    return (1, *finer) if finer else ()
+
+
+def _optimiser(data: Any) -> AbstractOptimiser:
+    table = {"kind": data} if isinstance(data, str) else data
+    kind = table.get("kind") if isinstance(table, dict) else None
+    known = isinstance(kind, str) and kind in _OPTIMISERS
+    require(known, f"[fit] optimiser must have a kind, one of {', '.join(_OPTIMISERS)}, got {shortened(repr(data))}.")
+    cls = _OPTIMISERS[str(kind)]
+    where = "[fit.optimiser]"
+    try:
+        return cls(**arguments(cls, {key: value for key, value in table.items() if key != "kind"}, where))
+    except ValueError as error:
+        raise ValueError(str(error) if str(error).startswith(where) else f"{where}: {error}") from None
+
+
+def _refined(simulation: Simulation, n: int) -> Simulation:
+    """A simulation on n times as many cells a direction, with steps n times shorter."""
+    if n == 1:
+        return simulation
+    scene, particles = simulation.build(n)
+    return simulation._replace(scene=scene, particles=particles, dt=simulation.dt / n)
 
 
 def leaf_of(path: str, experiment: Experiment) -> Any:
@@ -146,42 +202,100 @@ def _text(table: dict[str, Any], key: str, where: str) -> str:
     return text or ""
 
 
-def _parameter(table: dict[str, Any], experiment: Experiment) -> tuple[str, AbstractParameter]:
+def _parameter(table: dict[str, Any], experiments: list[Experiment]) -> tuple[str, AbstractParameter]:
     def parameter(
         *,
-        path: str,
+        path: str | None = None,
         name: str | None = None,
-        kind: Literal["Positive", "Bounded", "Unbounded"] = "Positive",
+        kind: Literal["Positive", "Bounded", "Unbounded", "Velocity", "Spin"] = "Positive",
         lower: Scalar | None = None,
         upper: Scalar | None = None,
-        start: Scalar | None = None,
-        mean: Scalar | None = None,
-        sigma: Scalar | None = None,
+        start: Scalar | tuple[float, ...] | None = None,
+        mean: Scalar | tuple[float, ...] | None = None,
+        sigma: Scalar | tuple[float, ...] | None = None,
         unit: str = "",
+        only: tuple[int, ...] | None = None,
     ) -> tuple[str, AbstractParameter]:
-        where = f"[[fit.parameter]] {path!r}"
-        value, (owner, _, last) = leaf_of(_path(path, where), experiment), path.rpartition(".")
-        parent = leaf_of(owner, experiment)
-        known = [f.name for f in fields(parent)] if is_dataclass(parent) else []
+        where = f"[[fit.parameter]] {path or kind!r}"
         require(
-            not known or last in known,
-            f"{where} follows from others and cannot be fitted; name one of {', '.join(known)}.",
+            kind in ("Positive", "Bounded", "Unbounded", *_OF_THE_BODY),
+            f"{where}: there is no kind of parameter {kind!r}.",
         )
-        number = eqx.is_array_like(value) and np.issubdtype(np.asarray(value).dtype, np.floating)
-        require(number, f"{where} must be a number, but is {shortened(repr(value))}.")
+        own = (0,) if only is None else only
+        there = len(own) > 0 and all(0 <= k < len(experiments) for k in own)
+        require(there, f"{where}: only must name experiments from 0 to {len(experiments) - 1}, got {only}.")
         require((mean is None) == (sigma is None), f"{where} takes mean and sigma of a prior together.")
-        require(
-            (kind == "Bounded") == (lower is not None or upper is not None),
-            f'{where}: lower and upper go with kind = "Bounded".',
-        )
         prior = None if mean is None or sigma is None else Gaussian(mean, sigma)
-        common: dict[str, Any] = {"where": _getter(path), "start": start, "prior": prior, "unit": unit}
+        common: dict[str, Any] = {"start": None if start is None else jnp.asarray(start, float), "prior": prior}
+        common |= {"unit": unit, "only": only}
+        bounds = lower is not None or upper is not None
+        require((kind == "Bounded") == bounds, f'{where}: lower and upper go with kind = "Bounded".')
+        if kind in _OF_THE_BODY:
+            require(path is None, f"{where}: {kind} is of all particles and takes no path.")
+            return name or kind.lower(), _of_the_body(kind, where, experiments[min(own)], common)
+        require(path is not None, f'{where} needs a path, such as "scene.material.youngs_modulus".')
+        path = str(path)
+        _require_number(path, where, experiments[min(own)])
+        common |= {"where": _getter(path)}
+        last = path.rpartition(".")[2]
         if kind == "Bounded":
             require(lower is not None and upper is not None, f"{where} needs lower and upper.")
             return name or last, Bounded(lower=float(lower or 0.0), upper=float(upper or 0.0), **common)
         return name or last, (Positive if kind == "Positive" else Unbounded)(**common)
 
     return parameter(**arguments(parameter, table, "[[fit.parameter]]"))
+
+
+def _require_number(path: str, where: str, experiment: Experiment) -> None:
+    value, (owner, _, last) = leaf_of(_path(path, where), experiment), path.rpartition(".")
+    parent = leaf_of(owner, experiment)
+    known = [f.name for f in fields(parent)] if is_dataclass(parent) else []
+    require(
+        not known or last in known,
+        f"{where} follows from others and cannot be fitted; name one of {', '.join(known)}.",
+    )
+    number = eqx.is_array_like(value) and np.issubdtype(np.asarray(value).dtype, np.floating)
+    require(number, f"{where} must be a number, but is {shortened(repr(value))}.")
+
+
+_OF_THE_BODY = ("Velocity", "Spin")
+"""Parameters of the initial motion of all particles."""
+
+
+def _of_the_body(kind: str, where: str, experiment: Experiment, common: dict[str, Any]) -> Unbounded:
+    """The velocity of the centre of mass at the start [m/s], d numbers; or the rate at which the body turns about it
+    besides what the file says [rad/s], one number in two dimensions and three in three."""
+    particles = experiment.particles
+    d = particles.dim
+    if kind == "Velocity":
+        first, update, unit = np.asarray(particles.mass @ particles.v / particles.mass.sum()), _moved, "m/s"
+    else:
+        require(d > 1, f"{where}: a body in one dimension does not turn.")
+        first, update, unit = np.zeros(() if d == 2 else 3), _turned, "rad/s"
+    start = first if common["start"] is None else np.asarray(common["start"])
+    require(start.shape == first.shape, f"{where} start must have shape {first.shape}, got {start.shape}.")
+    return Unbounded(update=update, **(common | {"start": jnp.asarray(start), "unit": common["unit"] or unit}))
+
+
+def _moved(experiment: Experiment, velocity: Any) -> Experiment:
+    """The experiment with this velocity of the centre of mass."""
+    particles = experiment.particles
+    mean = particles.mass @ particles.v / particles.mass.sum()
+    return eqx.tree_at(lambda e: e.particles.v, experiment, particles.v + (velocity - mean))
+
+
+def _turned(experiment: Experiment, spin: Any) -> Experiment:
+    """The experiment with the velocities, and their gradients, of a rotation about the centre of mass added."""
+    q = experiment.particles
+    zero = jnp.zeros((), q.x.dtype)
+    if q.dim == 2:
+        W = jnp.array([[zero, -spin], [spin, zero]])
+    else:
+        a, b, c = spin
+        W = jnp.array([[zero, -c, b], [c, zero, -a], [-b, a, zero]])
+    arms = q.x - q.mass @ q.x / q.mass.sum()
+    turned = eqx.tree_at(lambda e: e.particles.v, experiment, q.v + arms @ W.T)
+    return turned if q.C is None else eqx.tree_at(lambda e: e.particles.C, turned, q.C + W)
 
 
 def _experiments(path: Path, simulation: Simulation, table: dict[str, Any]) -> tuple[Experiment, Experiment]:
@@ -191,7 +305,8 @@ def _experiments(path: Path, simulation: Simulation, table: dict[str, Any]) -> t
     require(t1 <= simulation.t1, f"[fit] t1 must not lie after that of [run], got {t1} and {simulation.t1}.")
     tables = _tables(table, "observation")
     require(len(tables) > 0, f"{path} needs an [[fit.observation]].")
-    pairs = [_observation(t, path.parent, simulation.particles, t1) for t in tables]
+    source = Source(path.parent, simulation.scene, simulation.particles, simulation.t1)
+    pairs = [observation(t, source, t1) for t in tables]
     fitted, whole = zip(*pairs, strict=True)
 
     def experiment(observations: tuple[AbstractObservation, ...], t1: float) -> Experiment:
@@ -206,119 +321,3 @@ def _experiments(path: Path, simulation: Simulation, table: dict[str, Any]) -> t
         )
 
     return experiment(fitted, t1), experiment(whole, simulation.t1)
-
-
-def _observation(
-    table: dict[str, Any], folder: Path, particles: Particles, t1: float
-) -> tuple[AbstractObservation, AbstractObservation]:
-    """An observation as it is fitted, until t1 [s], and with all that was measured."""
-    kind = _text(table, "kind", "[[fit.observation]]")
-    kinds = {"StressStretch": _stress_stretch, "Extent": _extent, "CentreOfMass": _centre_of_mass, "Tracks": _tracks}
-    require(kind in kinds, f"[[fit.observation]] kind must be one of {', '.join(kinds)}, got {kind!r}.")
-    make = kinds[kind](folder, particles)
-    given = {key: value for key, value in table.items() if key != "kind"}
-    found = make(**arguments(make, given, f"[[fit.observation]] {kind}"))
-    return found if isinstance(found, tuple) else (found.until(t1), found)
-
-
-def _stress_stretch(folder: Path, particles: Particles) -> Callable[..., Any]:
-    def observation(
-        *,
-        data: str,
-        stretch: str,
-        nominal_stress: str,
-        unit: Scalar = 1.0,
-        range: tuple[float, ...] = (0.0, 1e9),  # noqa: A002 (the key in the file)
-        gauge: AbstractRegion,
-        axis: int,
-        sigma: Scalar | None = None,
-        weight: Scalar = 1.0,
-        robust: Scalar | None = None,
-        name: str = "nominal stress [Pa]",
-    ) -> tuple[Curve, Curve]:
-        require(len(range) == 2 and range[0] < range[1], f"range must be two growing stretches, got {range}.")
-        require_positive("unit [Pa]", unit)
-        x, y = read_columns(folder / data, stretch, nominal_stress)
-        y = y * float(unit)
-        inside = (x >= range[0]) & (x <= range[1])
-        require(inside.sum() > 0, f"[[fit.observation]] range {range} holds none of the {len(x)} points.")
-        of = StressStretch.of(gauge, particles, axis)
-        noise: dict[str, Any] = {"sigma": sigma, "weight": weight, "robust": robust, "name": name, "x_name": "stretch"}
-        return Curve(x[inside], y[inside], of, **noise), Curve(x, y, of, **noise)
-
-    return observation
-
-
-def _extent(folder: Path, particles: Particles) -> Callable[..., Any]:
-    def observation(
-        *,
-        data: str,
-        time: str,
-        value: str,
-        axis: int,
-        side: Literal["upper", "lower"] = "upper",
-        unit: Scalar = 1.0,
-        sigma: Scalar | None = None,
-        weight: Scalar = 1.0,
-        robust: Scalar | None = None,
-        name: str = "extent",
-    ) -> Series:
-        require(0 <= axis < particles.dim, f"[[fit.observation]] axis must be below {particles.dim}, got {axis}.")
-        t, x = read_columns(folder / data, time, value)
-        return Series(t, x * float(unit), Extent(axis, side), sigma=sigma, weight=weight, robust=robust, name=name)
-
-    return observation
-
-
-def _centre_of_mass(folder: Path, particles: Particles) -> Callable[..., Any]:
-    def observation(
-        *,
-        data: str,
-        time: str,
-        place: tuple[str, ...],
-        unit: Scalar = 1.0,
-        sigma: Scalar | None = None,
-        weight: Scalar = 1.0,
-        robust: Scalar | None = None,
-        name: str = "centre of mass",
-    ) -> Series:
-        require(len(place) == particles.dim, f"[[fit.observation]] place must be {particles.dim} columns, got {place}.")
-        t, *x = read_columns(folder / data, time, *place)
-        places = np.stack(x, axis=1) * float(unit)
-        return Series(t, places, CentreOfMass(), sigma=sigma, weight=weight, robust=robust, name=name)
-
-    return observation
-
-
-def _tracks(folder: Path, particles: Particles) -> Callable[..., Any]:
-    def observation(
-        *,
-        data: str,
-        time: str,
-        marker: str,
-        place: tuple[str, ...],
-        unit: Scalar = 1.0,
-        sigma: Scalar | None = None,
-        weight: Scalar = 1.0,
-        robust: Scalar | None = None,
-        name: str = "tracks",
-    ) -> Tracks:
-        require(len(place) == particles.dim, f"[[fit.observation]] place must be {particles.dim} columns, got {place}.")
-        t, number, *x = read_columns(folder / data, time, marker, *place)
-        times, frame = np.unique(t, return_inverse=True)
-        numbers, which = np.unique(number, return_inverse=True)
-        positions = np.full((len(times), len(numbers), particles.dim), np.nan)
-        require(
-            len(set(zip(frame.tolist(), which.tolist(), strict=True))) == len(t),
-            f"{folder / data} has a marker twice at one time.",
-        )
-        positions[frame, which] = np.stack(x, axis=1) * float(unit)
-        known = bool(times[0] == 0 and np.isfinite(positions[0]).all())
-        require(
-            known, f"{folder / data} must have the places of all markers at time 0, where they tell which they are."
-        )
-        require(len(times) > 1, f"{folder / data} has no time after 0: there is nothing to fit.")
-        markers = Markers.at(particles, positions[0])
-        return Tracks(times[1:], positions[1:], which=markers, sigma=sigma, weight=weight, robust=robust, name=name)
-
-    return observation

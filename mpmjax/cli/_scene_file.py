@@ -68,6 +68,8 @@ class Simulation(NamedTuple):
     """The `[fit]` table, not read yet; None without one."""
     choice: str | None
     """What was chosen for "auto" or "stable", and why; None if nothing was."""
+    build: Build
+    """Makes the scene and its particles on n times as many cells a direction, from n."""
 
 
 def read_scene_file(path: Path) -> SceneFile:
@@ -148,7 +150,7 @@ def read_simulation(
             raise ValueError(f"{path}: {choice}")
         dt, method = best.dt, best.method
         save_every = save_every or max(1, best.steps // _FRAMES)
-    return Simulation(file.scene, file.particles, t1, dt, method, save_every or 1, file.fit, choice)
+    return Simulation(file.scene, file.particles, t1, dt, method, save_every or 1, file.fit, choice, file.build)
 
 
 def stable_step(path: Path, file: SceneFile) -> float:

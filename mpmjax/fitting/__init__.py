@@ -1,18 +1,20 @@
 """Fitting parameters to measured data."""
 
+from mpmjax.fitting._arrays import read_arrays
 from mpmjax.fitting._bootstrap import Bootstrap, bootstrap
-from mpmjax.fitting._columns import read_columns
+from mpmjax.fitting._columns import Columns, read_columns
 from mpmjax.fitting._ensemble import EnsembleFit, fit_ensemble
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import fit
 from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._multistart import LocalMinimum, MultistartFit, fit_multistart
-from mpmjax.fitting._observation import AbstractObservation, Curve, Force, Series, Tracks
+from mpmjax.fitting._observation import AbstractObservation, Curve, Series, Tracks
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter, Bounded, Gaussian, Positive, Unbounded
 from mpmjax.fitting._prediction import Prediction, predict, predict_observations
 from mpmjax.fitting._profile import Profile, profile
 from mpmjax.fitting._quantities import CentreOfMass, Density, Extent, Markers, StressStretch
+from mpmjax.fitting._reaction import Force, Torque
 from mpmjax.fitting._refined import RefinedFit, fit_refined
 from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
 from mpmjax.fitting._staged import Stage, StagedFit, fit_staged
@@ -24,6 +26,7 @@ __all__ = [
     "Bootstrap",
     "Bounded",
     "CentreOfMass",
+    "Columns",
     "Curve",
     "Density",
     "EnsembleFit",
@@ -47,6 +50,7 @@ __all__ = [
     "Stage",
     "StagedFit",
     "StressStretch",
+    "Torque",
     "Tracks",
     "Unbounded",
     "bootstrap",
@@ -58,5 +62,6 @@ __all__ = [
     "predict",
     "predict_observations",
     "profile",
+    "read_arrays",
     "read_columns",
 ]

@@ -2,6 +2,7 @@
 
 import csv
 import difflib
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,37 +10,155 @@ import numpy as np
 from mpmjax.checks import require, shortened
 from mpmjax.io import reason
 
+_PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "h": 1e2, "k": 1e3, "M": 1e6, "G": 1e9}
+_UNITS = {"m", "s", "N", "Pa", "J", "g"}
 
-def read_columns(path: Path, *names: str) -> list[np.ndarray]:
+
+class Columns:
     """Columns of a CSV file with a header; lines that start with # are comments.
 
+    Args:
+        path: the file.
+        names: the columns, by their heads.
+
     Raises:
-        ValueError: no such file or column, or an entry that is no number.
+        ValueError: no such file or column, a row with more or fewer fields than the header, or an entry that is no
+            finite number: one line that names the file and its line.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-        lines = [line for line in text.splitlines() if line and not line.startswith("#")]
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"Cannot read the data file {path}: {reason(error).lower()}.") from None
-    columns: list[list[float]] = [[] for _ in names]
-    try:
-        reader = csv.DictReader(lines, skipinitialspace=True)
-        known = reader.fieldnames or []
-        for name in names:  # of what else is in the file nothing is said: it may be another file than was meant
-            close = difflib.get_close_matches(name, known, 1)
-            hint = f", did you mean {close[0]!r}?" if close else f" among its {len(known)}."
-            require(name in known, f"{path} has no column {name!r}{hint}")
-        for row, record in enumerate(reader, 1):
-            for column, name in zip(columns, names, strict=True):
-                cell = record[name]
-                where = f"{path}, data row {row}: {name} must be a finite number, got"
-                require(cell is not None, f"{where} a row that ends before it.")
-                try:
-                    column.append(float(cell))
-                except ValueError:
-                    raise ValueError(f"{where} {shortened(cell, 20)!r}.") from None
-                require(np.isfinite(column[-1]), f"{where} {shortened(cell, 20)!r}.")
-    except csv.Error as error:
-        raise ValueError(f"{path} is not a CSV file: {error}.") from None
-    require(len(columns[0]) > 0, f"{path} has a header and no rows: there is nothing to fit.")
-    return [np.asarray(column) for column in columns]
+
+    def __init__(self, path: Path, *names: str):
+        self.path, self._names = path, names
+        try:
+            text = path.read_text(encoding="utf-8-sig")
+        except (OSError, UnicodeDecodeError) as error:
+            raise ValueError(f"Cannot read the data file {path}: {reason(error).lower()}.") from None
+        numbered = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != "#"]
+        require(len(numbered) > 0, f"{path} is empty: it needs a header that names its columns, and rows.")
+        reader = csv.reader((line for _, line in numbered), skipinitialspace=True)
+        rows = []
+        while reader.line_num < len(numbered):
+            line = numbered[reader.line_num][0]
+            try:
+                rows.append((line, next(reader)))
+            except csv.Error as error:
+                raise ValueError(f"{path}, line {line}: not CSV: {error}.") from None
+        (self.header_line, head), *rows = rows
+        head = [name.strip() for name in head]
+        self._at = {name: self._place(name, head) for name in names}
+        require(len(rows) > 0, f"{path} has a header and no rows: there is nothing to fit.")
+        for line, fields in rows:
+            require(
+                len(fields) == len(head),
+                f"{path}, line {line}: {len(fields)} fields, but the header has {len(head)}.",
+            )
+        self.lines = np.array([line for line, _ in rows])
+        """The line of each row, from 1."""
+        self._data = {
+            name: np.array([self._number(n, name, row[k]) for n, row in rows]) for name, k in self._at.items()
+        }
+
+    def _place(self, name: str, head: list[str]) -> int:
+        close = difflib.get_close_matches(name, head, 1)
+        apart = next((mark for mark in (";", "\t") if len(head) == 1 and mark in head[0]), None)
+        hint = f", did you mean {close[0]!r}?" if close else f" among its {len(head)}."
+        if apart is not None:
+            hint = f": its fields are parted by {apart!r}; part them by commas."
+        # of what else is in the file nothing is said: it may be another file than was meant
+        require(name in head, f"{self.path} has no column {name!r}{hint}")
+        require(head.count(name) == 1, f"{self.path}, line {self.header_line}: the column {name!r} is there twice.")
+        return head.index(name)
+
+    def _number(self, line: int, name: str, cell: str) -> float:
+        try:
+            number = float(cell)
+        except ValueError:
+            number = np.nan
+        require(
+            np.isfinite(number),
+            f"{self.path}, line {line}: {name} must be a finite number, got {shortened(cell, 20)!r}.",
+        )
+        return number
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """The numbers of a column, as they stand in the file."""
+        return self._data[name]
+
+    def require(self, condition: np.ndarray, message: str) -> None:
+        """Check every row.
+
+        Args:
+            condition: of each row, whether it is right.
+            message: what is wrong otherwise; {column} stands for the row's number in that column.
+
+        Raises:
+            ValueError: a row is not right; the first such line is named.
+        """
+        wrong = np.flatnonzero(~np.asarray(condition))
+        if len(wrong):
+            row = {name: f"{column[wrong[0]]:g}" for name, column in self._data.items()}
+            said = re.sub(r"\{(.+?)\}", lambda found: row.get(found[1], found[0]), message)
+            raise ValueError(f"{self.path}, line {self.lines[wrong[0]]}: {said}")
+
+    def scaled(self, name: str, unit: float, key: str = "unit") -> np.ndarray:
+        """The numbers of a column in SI units.
+
+        Args:
+            name: the column. A unit with a prefix in its head, "x [mm]" or "stress_MPa", must be that which was given.
+            unit: what they are multiplied by.
+            key: what the user calls it.
+
+        Raises:
+            ValueError: the head says another unit.
+        """
+        found = stated_unit(name)
+        require(
+            found is None or np.isclose(unit, found, rtol=1e-9),
+            f"{self.path}, line {self.header_line}: the column {name!r} states another unit than {key} = {unit:g}: "
+            f"give {key} = {found or 1:g}, or name the column otherwise.",
+        )
+        return self._data[name] * unit
+
+    def times(self, name: str, unit: float, t1: float, *, grow: bool = True) -> np.ndarray:
+        """The times [s] of a column, which must lie in a run.
+
+        Args:
+            name: the column.
+            unit: what they are multiplied by.
+            t1: end of the run [s].
+            grow: whether they must grow from row to row.
+
+        Raises:
+            ValueError: they do not.
+        """
+        times = self.scaled(name, unit, "time_unit")
+        read, advice = (f", with time_unit = {unit:g},", "") if unit != 1 else ("", ", or give time_unit")
+        self.require(times >= 0, f"{name} {{{name}}} lies before the run, which begins at 0: leave the row out.")
+        self.require(
+            times <= t1 * (1 + 1e-9),
+            f"{name} {{{name}}}{read} lies after the end of the run, t1 = {t1:g} s: raise [run] t1, leave the row out"
+            f"{advice}.",
+        )
+        if grow:
+            steps = np.diff(times, prepend=-np.inf)
+            self.require(steps > 0, f"{name} {{{name}}} must be later than in the row before: sort the rows by time.")
+        return times
+
+
+def stated_unit(name: str) -> float | None:
+    """The factor to SI units that a column's head states, as "x [mm]", "force (kN)" or "stress_MPa"; None if none."""
+    bracketed, underscored = re.search(r"[\[(]\s*(\S+?)\s*[\])]$", name), re.search(r"_([^\W_]+)$", name)
+    found = bracketed or underscored
+    if found is None:
+        return None
+    unit = found[1]
+    if bracketed and unit in _UNITS - {"g"}:
+        return 1.0
+    if unit[1:] in _UNITS and unit[0] in _PREFIXES:
+        return _PREFIXES[unit[0]] * (1e-3 if unit[1:] == "g" else 1.0)
+    return None
+
+
+def read_columns(path: Path, *names: str) -> list[np.ndarray]:
+    """Columns of a CSV file, see `Columns`."""
+    columns = Columns(path, *names)
+    return [columns[name] for name in names]

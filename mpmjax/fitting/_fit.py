@@ -1,9 +1,12 @@
 """Fits of parameters to what was observed."""
 
+import os
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -14,11 +17,14 @@ from mpmjax.checks import checked, require, warn
 from mpmjax.fitting._estimates import fit_result, settle_noise
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
+from mpmjax.fitting._log import FitLog, opened_log
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._progress import Progress
 from mpmjax.fitting._result import FitResult
-from mpmjax.fitting._search import Iteration, Minimum, NoDerivativeError, search
+from mpmjax.fitting._search import Iteration, Minimum, NoDerivativeError, Standing, search
+from mpmjax.io import reporting
 
 
 @checked
@@ -30,6 +36,8 @@ def fit(
     level: Scalar = 0.95,
     optimiser: AbstractOptimiser = LevenbergMarquardt(),
     progress: Callable[[str], None] | None = None,
+    log: str | os.PathLike | None = None,
+    resume: bool = False,
 ) -> FitResult:
     """Fit parameters of a scene to what was observed of it, with standard errors.
 
@@ -58,44 +66,80 @@ def fit(
         report: what else to report with its error, by name: functions of an experiment that return one number.
         level: of the intervals [-].
         optimiser: the method of the search.
-        progress: called with a line an iteration, such as `print`.
+        progress: called with a line before the first iteration, which is compiled, and one after each, such as `print`:
+            misfit, gradient, parameters, seconds, and about how many are left (see docs/fitting.md).
+        log: an HDF5 file that is to hold each iteration (its layout: docs/fitting.md). Whatever ends the fit, the file
+            is whole and lacks at most the iteration in progress.
+        resume: continue the fit of the log, bit for bit. Only the optimiser's `max_steps` may differ.
+
+    Ctrl-C ends a fit after the iteration in progress, and it returns the best that it has, not converged.
 
     Raises:
         ValueError: a parameter that is no number of the experiment, lies outside its bounds or does not influence the
-            data; too few data; data that the simulation does not reach.
+            data; too few data; data that the simulation does not reach; a log that is there already or, with `resume`,
+            is not, or is of another fit.
         SimulationError: the simulation at the first guess meets a fault.
         RuntimeError: there is no derivative.
+        OSError: the disk refused the log, which holds what it held before.
     """
+    require(log is not None or not resume, "resume continues the fit of a log: name it by log.")
     problem = FitProblem((experiments,) if isinstance(experiments, Experiment) else tuple(experiments), parameters)
     require((level > 0) & (level < 1), f"level must lie between 0 and 1, got {level}.")
     level = float(level)
-    begun = time.perf_counter()
-
-    def say(iteration: Iteration) -> None:
-        if progress is not None:
-            progress(_line(problem, iteration, time.perf_counter() - begun))
-
-    sigmas = problem.first_sigmas
     report = dict(report or {})
     _check_report(problem, report)
-    z, history, rounds = jnp.zeros(problem.size, problem.dtype), (), 0
-    while True:
-        found = _search(problem, optimiser, z, sigmas, say)
-        z, history, rounds = found.z, history + found.history, rounds + 1
-        factors, freedom, sigmas, changing = settle_noise(problem, found, sigmas)
-        if not changing or not found.converged or rounds == MOST_ROUNDS:
-            break
+    z = jnp.zeros(problem.size, problem.dtype)
+    with ExitStack() as stack:
+        kept = None
+        if log is not None:
+            kept = stack.enter_context(opened_log(Path(log), problem, optimiser, z, resume=resume))
+            stack.enter_context(reporting(kept.standing))
+        found, history, sigmas, factors, freedom, unsettled = _rounds(problem, optimiser, z, progress, kept)
     result = fit_result(problem, found, factors, freedom, sigmas, report, level)
-    result = replace(result, history=history)
+    result = replace(result, history=history, interrupted=found.interrupted)
     if not found.converged:
         stopped = "was interrupted" if found.interrupted else "did not converge"
         advice = "" if found.interrupted else f" {_ADVICE}"
         warn(f"The fit {stopped} after {len(history)} iterations: its errors hold only at a minimum.{advice}")
-    elif changing:
-        warn(f"The noise of the observations did not settle in {rounds} rounds: give the sigma of one of them.")
+    elif unsettled:
+        warn(f"The noise of the observations did not settle in {MOST_ROUNDS} rounds: give the sigma of one of them.")
     for text in result.warnings:
         warn(text)
     return result
+
+
+def _rounds(
+    problem: FitProblem,
+    optimiser: AbstractOptimiser,
+    z: Coordinates,
+    progress: Callable[[str], None] | None,
+    kept: FitLog | None,
+) -> tuple[Minimum, tuple[Iteration, ...], tuple[Array, ...], list[float], list[float], bool]:
+    """The search, again and again until the noise that it leaves is the noise that it was made with.
+
+    Returns:
+        the last minimum; all iterations; the noise; by how much it differs from that of the last search; the degrees of
+        freedom of its estimates; whether it did not settle.
+    """
+    sigmas = problem.first_sigmas
+    history, rounds, standing, before = (), 0, None, 0.0
+    if kept is not None and kept.last is not None:
+        history, rounds, (sigmas, standing), before = kept.earlier, kept.rounds, kept.last, kept.seconds
+    said, begun = Progress(problem, optimiser, progress), time.perf_counter() - before
+    said.begin(0 if standing is None else len(history) + len(standing.history))
+    while True:
+
+        def report(standing: Standing, sigmas: tuple[Array, ...] = sigmas) -> None:
+            seconds = time.perf_counter() - begun
+            if kept is not None:
+                kept.append(sigmas, standing, seconds)
+            said(standing, seconds)
+
+        found = _search(problem, optimiser, z, sigmas, standing, report)
+        z, history, rounds, standing = found.z, history + found.history, rounds + 1, None
+        factors, freedom, sigmas, changing = settle_noise(problem, found, sigmas)
+        if not changing or not found.converged or rounds == MOST_ROUNDS:
+            return found, history, sigmas, factors, freedom, found.converged and changing
 
 
 def _check_report(problem: FitProblem, report: Mapping[str, Callable[[Experiment], Any]]) -> None:
@@ -110,7 +154,8 @@ def _search(
     optimiser: AbstractOptimiser,
     z: Coordinates,
     sigmas: tuple[Array, ...],
-    say: Callable[[Iteration], None],
+    standing: Standing | None,
+    report: Callable[[Standing], None],
 ) -> Minimum:
     """The least sum of squares with a noise.
 
@@ -121,7 +166,7 @@ def _search(
     """
     try:
         begun = partial(require_influence, problem, sigmas)
-        found = search(problem, optimiser, z, sigmas, report=say, begun=begun)
+        found = search(problem, optimiser, z, sigmas, standing=standing, report=report, begun=begun)
     except NoDerivativeError:
         raise RuntimeError(
             "The fit has no derivative. Either the tangent solve of a step did not converge: raise the max_steps of "
@@ -157,17 +202,6 @@ def require_influence(problem: FitProblem, sigmas: tuple[Array, ...], seen: Eval
         not unseen,
         f"The data do not depend on {', '.join(unseen)}: their derivative by it is zero but for rounding. Leave it "
         "out, give it a prior, or observe what it changes.",
-    )
-
-
-def _line(problem: FitProblem, iteration: Iteration, seconds: float) -> str:
-    """Progress."""
-    values = problem.numbers(jnp.asarray(iteration.z, problem.dtype))
-    shown = ", ".join(f"{label} {value:.5g}" for label, value in zip(problem.labels[:4], values, strict=False))
-    more = ", …" if problem.size > 4 else ""
-    return (
-        f"{iteration.number:4d}  misfit {2 * iteration.cost:10.4g}  gradient {iteration.gradient:8.2g}  {shown}{more}  "
-        f"{seconds:.1f} s"
     )
 
 

@@ -47,7 +47,11 @@ class LevenbergMarquardt(AbstractOptimiser):
         return z, state, Evaluation((r**2).sum() / 2, J.T @ r, r, J)
 
     def has_converged(self, state: Any, seen: Evaluation) -> bool:
-        return bool(state.terminate) or _is_settled(np.asarray(seen.residuals, float), np.asarray(seen.jacobian, float))
+        return bool(state.terminate) or self.distance(state, seen) <= 1
+
+    def distance(self, state: Any, seen: Evaluation) -> float:
+        del state
+        return _next_step(np.asarray(seen.residuals, float), np.asarray(seen.jacobian, float)) / _NEGLIGIBLE
 
     @property
     def _solver(self) -> Any:
@@ -55,13 +59,14 @@ class LevenbergMarquardt(AbstractOptimiser):
         return optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
 
 
-def _is_settled(r: np.ndarray, J: np.ndarray) -> bool:
-    """Whether the next Gauss-Newton step p is far below the standard errors: ‖J p‖ against √(Σ r²/(m − n))."""
+def _next_step(r: np.ndarray, J: np.ndarray) -> float:
+    """The next Gauss-Newton step p in standard errors, ‖J p‖ against √(Σ r²/(m − n)); NaN where there are none."""
     if len(r) <= J.shape[1] or not (np.isfinite(r).all() and np.isfinite(J).all()):
-        return False
+        return float("nan")
     U, singular, _ = np.linalg.svd(J, full_matrices=False)
     change = U[:, singular > 1e-10 * singular.max(initial=0)].T @ r
-    return bool((change**2).sum() <= _NEGLIGIBLE**2 * (r**2).sum() / (len(r) - J.shape[1]))
+    total = (r**2).sum()
+    return float(np.sqrt((change**2).sum() / total * (len(r) - J.shape[1]))) if total > 0 else 0.0
 
 
 _NEGLIGIBLE = 1e-4

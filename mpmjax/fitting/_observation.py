@@ -183,7 +183,7 @@ class Series(AbstractObservation):
         return self.of(scene, particles)
 
     def predict(self, seen: Array, run: Run) -> Array:
-        return _between(seen, jnp.asarray(self.times, seen.dtype) / run.dt)
+        return between(seen, jnp.asarray(self.times, seen.dtype) / run.dt)
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
         what = f"{type(self).__name__} {self.name!r}"
@@ -228,7 +228,7 @@ class Series(AbstractObservation):
         require_finite(f"What the simulation says of {self.name!r}", seen)
 
 
-def _between(values: Array, place: Array) -> Array:
+def between(values: Array, place: Array) -> Array:
     """Values between rows, by linear interpolation; before the first and after the last two, beyond them.
 
     Args:
@@ -286,61 +286,6 @@ class Tracks(Series):
         super().check(scene, particles, t1)
         assert isinstance(self.of, Markers)
         self.of.check(self.name, particles.count)
-
-
-class Force(Series):
-    """The force on a collider against time, such as that of a plate on which a body falls.
-
-    Compared with the mean force over each step, which stands at the step's middle.
-
-    Args:
-        times: when it was measured [s], shape (f,), growing.
-        forces: the force [N], shape (f, d); NaN where a component was not measured.
-        collider: number of the collider, from 0, in the order of the scene's boundaries.
-        sigma: standard deviation of the noise [N]; None to estimate it.
-        weight: factor of the squares.
-        robust: misfit in standard deviations beyond which squares grow but linearly.
-        name: what tables and pictures call it.
-    """
-
-    collider: int = eqx.field(static=True)
-
-    def __init__(
-        self,
-        times: Numbers,
-        forces: Numbers,
-        *,
-        collider: int = 0,
-        sigma: Numbers | None = None,
-        weight: Scalar = 1.0,
-        robust: Scalar | None = None,
-        name: str = "force",
-    ):
-        self.collider = collider
-        super().__init__(times, forces, _nothing, sigma=sigma, weight=weight, robust=robust, name=name)
-
-    def _check_shape(self, seen: Any) -> None:
-        """The forces' shape is checked when they are predicted."""
-        del seen
-
-    def check(self, scene: Scene, particles: Particles, t1: float) -> None:
-        super().check(scene, particles, t1)
-        known = f"Force {self.name!r} is of collider {self.collider}, from 0, but the scene has {scene.collider_count}."
-        require(0 <= self.collider < scene.collider_count, known)
-
-    def predict(self, seen: Any, run: Run) -> Array:
-        del seen
-        force = run.forces().force[:, self.collider]
-        return _between(force, jnp.asarray(self.times, force.dtype) / run.dt - 0.5)
-
-    def explain(self, seen: Any, run: Run) -> None:
-        super().explain(run.forces().force[:, self.collider], run)
-
-
-def _nothing(scene: Scene, particles: Particles) -> Array:
-    """A zero: nothing is needed of the states."""
-    del scene
-    return jnp.zeros((), particles.x.dtype)
 
 
 class Curve(AbstractObservation):

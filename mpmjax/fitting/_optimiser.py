@@ -59,3 +59,9 @@ class AbstractOptimiser(eqx.Module):
     @abc.abstractmethod
     def has_converged(self, state: Any, seen: Evaluation) -> bool:
         """Whether the search is at a minimum."""
+
+    def distance(self, state: Any, seen: Evaluation) -> float:
+        """How far the search is from converged, as a multiple of where it ends; NaN if that is not known, which is the
+        default. The time left is estimated from how fast it falls."""
+        del state, seen
+        return float("nan")

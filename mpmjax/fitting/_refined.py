@@ -1,7 +1,9 @@
 """Fits on several grids: what is left of the discretisation in an estimate."""
 
+import os
 from collections.abc import Callable
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -57,6 +59,7 @@ class RefinedFit(eqx.Module):
         for k, e in enumerate(self.estimates):
             each = "".join(f"{found.all[k].value:>13.6g}" for found in self.fits)
             rules = "noise" if self.from_noise[k] > self.from_discretisation[k] else "discretisation"
+            rules = "one grid alone" if len(self.fits) == 1 else rules
             interval = f"{e.interval[0]:.5g} to {e.interval[1]:.5g}"
             name = f"{e.label} [{e.unit}]" if e.unit else e.label
             lines.append(f"{name:<20}{each} {e.value:>13.6g} ± {e.error:<9.2g} {interval:<25} {rules}")
@@ -77,6 +80,8 @@ def fit_refined(
     level: Scalar = 0.95,
     optimiser: AbstractOptimiser = LevenbergMarquardt(),
     progress: Callable[[str], None] | None = None,
+    log: str | os.PathLike | None = None,
+    resume: bool = False,
 ) -> RefinedFit:
     """Fit on several grids, extrapolate to a spacing of zero, and count what is left as an error.
 
@@ -102,6 +107,10 @@ def fit_refined(
         level: of the intervals, see `fit`.
         optimiser: see `fit`.
         progress: see `fit`.
+        log: the name of the logs, one a grid: of "fit.h5" they are "fit_1.h5", "fit_2.h5". See `fit`.
+        resume: continue from the logs that are there.
+
+    After Ctrl-C it returns what it has, and extrapolates from grids on which the fit was done.
 
     Raises:
         ValueError: fewer than two refinements, or not growing ones; see `fit`.
@@ -115,9 +124,27 @@ def fit_refined(
     fits: list[FitResult] = []
     searched = parameters
     for n in numbers:
-        found = fit(build(n), searched, report=report, level=level, optimiser=optimiser, progress=progress)
+        path = None if log is None else Path(log).with_stem(f"{Path(log).stem}_{n}")
+        again = resume and path is not None and (path.exists() or n == numbers[0])
+        found = fit(
+            build(n),
+            searched,
+            report=report,
+            level=level,
+            optimiser=optimiser,
+            progress=progress,
+            log=path,
+            resume=again,
+        )
+        if found.interrupted and fits:
+            break
         fits.append(found)
+        if found.interrupted:
+            break
         searched = found.restarted(parameters)
+    numbers = numbers[: len(fits)]
+    if len(fits) < len(refinements):
+        warn(f"The fit on several grids was interrupted: of {len(refinements)} grids it tells of {len(fits)}.")
     sizes = [(p, fits[-1].values[name].size) for name, p in parameters.items()]
     kinds: list[AbstractParameter | None] = [p for p, size in sizes for _ in range(size)]
     kinds += [None] * len(fits[-1].reported)
@@ -151,6 +178,8 @@ def _extrapolate(
         return at + z if kind is None else kind.value(at, jnp.asarray(z, at.dtype))
 
     values = np.array([coordinate(e.value) for e in found])
+    if len(values) == 1:
+        return last, float("nan"), float("nan")
     p = _order(values, refinements, order)
     change = values[-1] - values[-2]
     correction = 0.0 if np.isnan(p) else change / ((refinements[-1] / refinements[-2]) ** p - 1)

@@ -83,6 +83,8 @@ class FitResult(eqx.Module):
     history: tuple[Iteration, ...]
     warnings: tuple[str, ...]
     """What the data cannot tell, and what does not fit, in words."""
+    interrupted: bool = False
+    """Whether Ctrl-C ended it."""
 
     @property
     def values(self) -> dict[str, np.ndarray]:

@@ -26,6 +26,17 @@ class Iteration(NamedTuple):
     """The coordinates, shape (n,)."""
 
 
+class Standing(NamedTuple):
+    """Where a search stands after an iteration: all that the next one needs."""
+
+    z: Coordinates
+    state: Any
+    """What the optimiser remembers."""
+    seen: Evaluation
+    history: tuple[Iteration, ...]
+    """The iterations so far, one at least."""
+
+
 class Minimum(NamedTuple):
     """Where the search ended."""
 
@@ -49,7 +60,8 @@ def search(
     z: Coordinates,
     sigmas: tuple[Array, ...],
     *,
-    report: Callable[[Iteration], None] | None = None,
+    standing: Standing | None = None,
+    report: Callable[[Standing], None] | None = None,
     begun: Callable[[Evaluation], None] | None = None,
 ) -> Minimum:
     """The least Σ r² near z. An interruption (Ctrl-C) ends the search where it is.
@@ -59,41 +71,59 @@ def search(
         optimiser: the method.
         z: where it starts.
         sigmas: the noise of each observation.
+        standing: in the place of z, where an earlier search of the same kind stood; it is continued exactly.
         report: called after each iteration.
         begun: called with what is known where it starts.
 
     Raises:
         NoDerivativeError: a derivative is not finite.
     """
-    z = z.astype(float)  # optimistix's own numbers are of JAX's default precision
-    history: list[Iteration] = []
-    converged, interrupted, seen = False, False, None
-    state = begin(problem, optimiser, z, sigmas)
+    converged = interrupted = False
     try:
-        for number in range(optimiser.max_steps):
-            z, state, seen = iterate(problem, optimiser, z, sigmas, state)
-            cost, slope = float(seen.cost), float(jnp.abs(seen.gradient).max())
-            if np.isfinite(cost) and not np.isfinite(slope):
-                raise NoDerivativeError
-            moved = not history or cost != history[-1].cost
-            history.append(Iteration(number, cost, slope, moved, np.asarray(z)))
-            if number == 0 and begun is not None and np.isfinite(cost):
-                begun(seen)
+        while standing is None or not (
+            (converged := optimiser.has_converged(standing.state, standing.seen))
+            or not np.isfinite(standing.history[-1].cost)
+            or len(standing.history) >= optimiser.max_steps
+        ):
+            standing = _next(problem, optimiser, z, sigmas, standing)
+            if begun is not None and len(standing.history) == 1 and np.isfinite(standing.history[0].cost):
+                begun(standing.seen)
             if report is not None:
-                report(history[-1])
-            converged = optimiser.has_converged(state, seen)
-            if converged or not np.isfinite(cost):
-                break
+                report(standing)
     except KeyboardInterrupt:
-        if not history:
+        if standing is None:
             raise
         interrupted = True
-    assert seen is not None
-    z = z.astype(problem.dtype)
-    r, J = seen.residuals, seen.jacobian
+    z = standing.z.astype(problem.dtype)
+    r, J = standing.seen.residuals, standing.seen.jacobian
     if r is None or J is None:
         r, J = jacobian(problem, z, sigmas)
-    return Minimum(z, r, J, converged, interrupted, tuple(history))
+    return Minimum(z, r, J, converged, interrupted, standing.history)
+
+
+def _next(
+    problem: FitProblem,
+    optimiser: AbstractOptimiser,
+    z: Coordinates,
+    sigmas: tuple[Array, ...],
+    standing: Standing | None,
+) -> Standing:
+    """One iteration, the first one where there is none yet.
+
+    Raises:
+        NoDerivativeError: a derivative is not finite.
+    """
+    if standing is None:
+        z = z.astype(float)  # optimistix's own numbers are of JAX's default precision
+        state, history = begin(problem, optimiser, z, sigmas), ()
+    else:
+        z, state, _, history = standing
+    z, state, seen = iterate(problem, optimiser, z, sigmas, state)
+    cost, slope = float(seen.cost), float(jnp.abs(seen.gradient).max())
+    if np.isfinite(cost) and not np.isfinite(slope):
+        raise NoDerivativeError
+    moved = not history or cost != history[-1].cost
+    return Standing(z, state, seen, (*history, Iteration(len(history), cost, slope, moved, np.asarray(z))))
 
 
 @eqx.filter_jit

@@ -211,6 +211,7 @@ def _numbers(
         "profiles": [_profiled(p) for p in profiles],
         "converged": result.converged,
         "iterations": [i._asdict() for i in result.history],
+        "interrupted": result.interrupted,
         "warnings": result.warnings,
     }
 

@@ -1,0 +1,262 @@
+"""The log of a fit: an HDF5 file that has each iteration, and from which a fit continues bit for bit.
+
+    /iterations     a table with one row an iteration: round (of the noise's estimates), number (in the round), cost
+                    ½ Σ r², gradient (its largest component), accepted, seconds (since the fit began)
+    /coordinates    of the search [-], shape (iterations, n)
+    /values         of the parameters, shape (iterations, n); the attribute `labels` names the columns
+    /noise/k        the σ of observation k in each round, shape (rounds, ...); the attribute `name` is its name
+    /problem        JSON: what is fitted, as names and texts, by which another fit is told from this one
+    /resume         what the next iteration needs: what the optimiser remembers, and what it knows of its place
+
+The file is replaced as a whole after each iteration (see `mpmjax.io.ReplacedFile`): it holds whole iterations only,
+however the process ends.
+"""
+
+import io
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Array
+from mpmjax.checks import require
+from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
+from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._problem_text import described
+from mpmjax.fitting._search import Iteration, Standing, begin
+from mpmjax.io import ReplacedFile, check_hdf5, reason
+
+_FORMAT = 1
+_ROW = [("round", "i8"), ("number", "i8"), ("cost", "f8"), ("gradient", "f8"), ("accepted", "?"), ("seconds", "f8")]
+
+
+class _Round(NamedTuple):
+    """A search with one noise."""
+
+    sigmas: tuple[Array, ...]
+    standing: Standing
+    seconds: tuple[float, ...]
+    """When each iteration was done, since the fit began [s]."""
+
+
+class FitLog:
+    """The iterations of a fit in a file. Make it by `opened_log`."""
+
+    def __init__(self, path: Path, file: ReplacedFile, problem: FitProblem, text: dict[str, str], rounds: list[_Round]):
+        self._path, self._file, self._problem, self._text, self._rounds = path, file, problem, text, rounds
+        self._values = [self._numbers(i) for r in rounds for i in r.standing.history]
+
+    @property
+    def rounds(self) -> int:
+        """How many rounds are done before the one that the log ends in."""
+        return max(len(self._rounds) - 1, 0)
+
+    @property
+    def earlier(self) -> tuple[Iteration, ...]:
+        """The iterations of those rounds."""
+        return tuple(i for r in self._rounds[:-1] for i in r.standing.history)
+
+    @property
+    def last(self) -> tuple[tuple[Array, ...], Standing] | None:
+        """The noise of the round that the log ends in, and where its search stands; None if it has no iteration."""
+        return (self._rounds[-1].sigmas, self._rounds[-1].standing) if self._rounds else None
+
+    @property
+    def seconds(self) -> float:
+        """When the last iteration was done, since the fit began [s]."""
+        return self._rounds[-1].seconds[-1] if self._rounds else 0.0
+
+    def append(self, sigmas: tuple[Array, ...], standing: Standing, seconds: float) -> None:
+        """Write an iteration.
+
+        Args:
+            sigmas: the noise of its round.
+            standing: where the search stands.
+            seconds: since the fit began.
+
+        Raises:
+            OSError: the disk refused; the log is what it was.
+        """
+        past = ()
+        if len(standing.history) > 1:
+            past = self._rounds.pop().seconds
+        self._rounds.append(_Round(sigmas, standing, (*past, seconds)))
+        self._values.append(self._numbers(standing.history[-1]))
+        self.write()
+
+    def write(self) -> None:
+        """Write the file.
+
+        Raises:
+            OSError: the disk refused; the log is what it was.
+        """
+        whole = io.BytesIO()
+        with h5py.File(whole, "w", libver=("v110", "v110")) as file:
+            self._fill(file)
+        try:
+            self._file.write(whole.getvalue())
+        except OSError as error:
+            raise OSError(f"{error} The log holds what was there before: make room, then resume the fit.") from None
+
+    def standing(self) -> str:
+        """What the log holds, as a sentence."""
+        count = len(self._values)
+        return f"{self._path} holds {count} iteration{'s' * (count != 1)}. Resume it to continue."
+
+    def _numbers(self, iteration: Iteration) -> np.ndarray:
+        return np.asarray(self._problem.numbers(jnp.asarray(iteration.z, self._problem.dtype)), float)
+
+    def _fill(self, file: Any) -> None:
+        problem, n = self._problem, self._problem.size
+        for name, text in {"kind": "mpmjax fit log", "version": version("mpmjax")}.items():
+            file.attrs[name] = np.bytes_(text)
+        file.attrs["format"] = np.int64(_FORMAT)
+        _put(file, "problem", np.frombuffer(json.dumps(self._text).encode(), np.uint8))
+        rows = [
+            (number, i.number, i.cost, i.gradient, i.accepted, seconds)
+            for number, r in enumerate(self._rounds)
+            for i, seconds in zip(r.standing.history, r.seconds, strict=True)
+        ]
+        _put(file, "iterations", np.array(rows, _ROW))
+        z = [i.z for r in self._rounds for i in r.standing.history]
+        _put(file, "coordinates", np.array(z).reshape(-1, n))
+        _put(file, "values", np.array(self._values).reshape(-1, n))
+        file["values"].attrs["labels"] = json.dumps(problem.labels)
+        for k, observation in enumerate(problem.observations):
+            shape = np.shape(self._rounds[0].sigmas[k]) if self._rounds else ()
+            sigmas = [np.asarray(r.sigmas[k]) for r in self._rounds]
+            _put(file, f"noise/{k}", np.array(sigmas, None if sigmas else float).reshape(-1, *shape))
+            file[f"noise/{k}"].attrs["name"] = observation.name
+        if self._rounds:
+            _, state, seen, _ = self._rounds[-1].standing
+            for k, leaf in enumerate(jax.tree.leaves(eqx.filter(state, eqx.is_array))):
+                _put(file, f"resume/state/{k}", np.asarray(leaf))
+            for name, leaf in seen._asdict().items():
+                if leaf is not None:
+                    _put(file, f"resume/seen/{name}", np.asarray(leaf))
+
+
+@contextmanager
+def opened_log(
+    path: Path, problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, *, resume: bool
+) -> Iterator[FitLog]:
+    """A log that is begun or, with `resume`, read and continued.
+
+    Args:
+        path: the file.
+        problem: what is fitted.
+        optimiser: the method.
+        z: where the fit starts.
+        resume: continue what is there.
+
+    Raises:
+        ValueError: a file that is there or, with `resume`, is not, is damaged, no log, the log of another fit, or being
+            written.
+    """
+    text = described(problem, optimiser)
+    if not resume:
+        with ReplacedFile(path, new=True) as file:
+            log = FitLog(path, file, problem, text, [])
+            log.write()
+            yield log
+        return
+    check_hdf5(path)
+    with ReplacedFile(path, new=False) as file:
+        yield FitLog(path, file, problem, text, _read(path, problem, optimiser, z, text))
+
+
+def _read(
+    path: Path, problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, text: dict[str, str]
+) -> list[_Round]:
+    """The rounds in a log.
+
+    Raises:
+        ValueError: see `opened_log`.
+    """
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            known = file.attrs.get("kind") == b"mpmjax fit log"
+            found = int(file.attrs["format"]) if known else 0
+            datasets: list[Any] = []
+            file.visititems(lambda _, item: datasets.append(item) if isinstance(item, h5py.Dataset) else None)
+            arrays = {item.name.lstrip("/"): np.asarray(item[()]) for item in datasets}
+        theirs = json.loads(arrays["problem"].tobytes()) if found == _FORMAT else {}
+    except (OSError, KeyError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{path} is damaged ({reason(error)}): begin the fit anew with another log.") from None
+    require(known, f"{path} is not the log of a fit: check its name.")
+    require(found == _FORMAT, f"{path} is a log of format {found}, this mpmjax reads {_FORMAT}: begin the fit anew.")
+    _require_same(path, text, theirs)
+    try:
+        return _rounds(arrays, problem, optimiser, z)
+    except (KeyError, IndexError, TypeError) as error:
+        raise ValueError(f"{path} is damaged ({reason(error)}): begin the fit anew with another log.") from None
+
+
+def _rounds(
+    arrays: dict[str, np.ndarray], problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates
+) -> list[_Round]:
+    rows: Any = arrays["iterations"]
+    places = arrays["coordinates"]
+    rounds = []
+    for number in range(int(rows["round"][-1]) + 1 if len(rows) else 0):
+        own = np.flatnonzero(rows["round"] == number)
+        history = tuple(
+            Iteration(
+                int(rows["number"][k]),
+                float(rows["cost"][k]),
+                float(rows["gradient"][k]),
+                bool(rows["accepted"][k]),
+                places[k],
+            )
+            for k in own
+        )
+        sigmas = tuple(jnp.asarray(arrays[f"noise/{k}"][number]) for k in range(len(problem.observations)))
+        seen = Evaluation(
+            **{
+                name: jnp.asarray(a)
+                for name in Evaluation._fields
+                if (a := arrays.get(f"resume/seen/{name}")) is not None
+            }
+        )
+        standing = Standing(jnp.asarray(places[own[-1]]), None, seen, history)
+        rounds.append(_Round(sigmas, standing, tuple(rows["seconds"][own].tolist())))
+    if rounds:
+        last = rounds[-1]
+        like = eqx.filter_eval_shape(begin, problem, optimiser, z.astype(float), last.sigmas)
+        numbers, rest = eqx.partition(like, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
+        leaves, shape = jax.tree.flatten(numbers)
+        found = [_like(leaf, arrays[f"resume/state/{k}"]) for k, leaf in enumerate(leaves)]
+        state = eqx.combine(jax.tree.unflatten(shape, found), rest)
+        rounds[-1] = last._replace(standing=last.standing._replace(state=state))
+    return rounds
+
+
+def _like(leaf: Any, data: np.ndarray) -> Array:
+    """An array of the file, as weakly typed as the one that it stands for."""
+    if (data.shape, data.dtype) != (leaf.shape, leaf.dtype):
+        raise TypeError(f"the optimiser remembers {leaf.shape} of {leaf.dtype}, not {data.shape} of {data.dtype}")
+    return jnp.asarray(data.item() if leaf.weak_type and data.ndim == 0 else data)
+
+
+def _put(file: Any, name: str, data: np.ndarray) -> None:
+    """A dataset, with checksums where it has data."""
+    checked = {"chunks": data.shape, "fletcher32": True} if data.ndim and data.size else {}
+    file.create_dataset(name, data=data, **checked)
+
+
+def _require_same(path: Path, ours: dict[str, str], theirs: dict[str, str]) -> None:
+    for name in (*theirs, *ours):
+        here, there = ours.get(name, "none"), theirs.get(name, "none")
+        require(
+            here == there,
+            f"{path} is the log of another fit: {name} is {there} there and {here} here. Resume the same fit, or name "
+            "a new log.",
+        )

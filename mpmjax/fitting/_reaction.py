@@ -1,0 +1,80 @@
+"""Forces and torques on colliders, as observations."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Scalar
+from mpmjax.checks import require
+from mpmjax.fitting._observation import Numbers, Series, between
+from mpmjax.simulation import Run
+from mpmjax.state import Particles, Scene
+
+
+class Force(Series):
+    """The force on a collider against time, such as that of a plate on which a body falls.
+
+    Compared with the mean force over each step, which stands at the step's middle.
+
+    Args:
+        times: when it was measured [s], shape (f,), growing.
+        forces: the force [N], shape (f, d); NaN where a component was not measured.
+        collider: number of the collider, from 0, in the order of the scene's boundaries.
+        sigma: standard deviation of the noise [N]; None to estimate it.
+        weight: factor of the squares.
+        robust: misfit in standard deviations beyond which squares grow but linearly.
+        name: what tables and pictures call it.
+    """
+
+    collider: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        times: Numbers,
+        forces: Numbers,
+        *,
+        collider: int = 0,
+        sigma: Numbers | None = None,
+        weight: Scalar = 1.0,
+        robust: Scalar | None = None,
+        name: str = "force",
+    ):
+        self.collider = collider
+        super().__init__(times, forces, _nothing, sigma=sigma, weight=weight, robust=robust, name=name)
+
+    def _check_shape(self, seen: Any) -> None:
+        """The forces' shape is checked when they are predicted."""
+        del seen
+
+    def check(self, scene: Scene, particles: Particles, t1: float) -> None:
+        super().check(scene, particles, t1)
+        count, what = scene.collider_count, f"{type(self).__name__} {self.name!r}"
+        require(
+            0 <= self.collider < count, f"{what} is of collider {self.collider}, from 0, but the scene has {count}."
+        )
+
+    def predict(self, seen: Any, run: Run) -> Array:
+        del seen
+        mean = self._of(run.forces())[:, self.collider]
+        return between(mean, jnp.asarray(self.times, mean.dtype) / run.dt - 0.5)
+
+    def explain(self, seen: Any, run: Run) -> None:
+        super().explain(self._of(run.forces())[:, self.collider], run)
+
+    def _of(self, forces: Any) -> Array:
+        return forces.force
+
+
+class Torque(Force):
+    """The torque on a collider against time, as `Force`: [N m], shape (f, 1) in two dimensions and (f, 3) in three,
+    about the centre of the collider's rotation or, where it has none, about its shape's middle."""
+
+    def _of(self, forces: Any) -> Array:
+        return forces.torque
+
+
+def _nothing(scene: Scene, particles: Particles) -> Array:
+    """A zero: nothing is needed of the states."""
+    del scene
+    return jnp.zeros((), particles.x.dtype)
