@@ -102,7 +102,8 @@ def profile(
     From the estimate it goes to either side in steps of equal growth of √Δχ², as the last two points foretell it, each
     fit started on the line through them. A value at which the simulation fails is approached by halves. Where the
     threshold is never reached the interval is open on that side, and a warning says how far Δχ² came; where Δχ² jumps
-    over it, as a simulation does beyond its stable step, a warning says that. One program is compiled for all points, and for all numbers of a fit.
+    over it, as a simulation does beyond its stable step, a warning says that. One program is compiled for all points,
+    and for all numbers of a fit.
 
     The noise is held at what the fit found. With a robust or weighted observation the threshold is approximate.
 
