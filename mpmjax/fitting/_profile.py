@@ -220,7 +220,7 @@ class _Walk:
             grown = point.root - last.root
             longest = _FASTER * (wanted - gone) * points / reach
             pace = min((wanted - gone) / grown, longest) if grown > 0 else longest
-            still = self._moved(point, last) <= _STILL * self._moved(self.start, None)
+            still = self._moved(point, last) <= _STILL * (wanted - gone) * self._moved(self.start, None)
             before, last = last, point
             if wanted >= farthest or still:
                 break
@@ -387,7 +387,8 @@ _BEYOND = 1.02
 _FASTER = 2.0
 """A step is no longer than so many times the one before."""
 _STILL = 1e-6
-"""A walk ends where the number changes by less than so much of its estimate: at a bound."""
+"""A walk ends where the number changes, over a unit of the coordinate, by less than so much of its estimate: at a
+bound."""
 _JUMP = 0.2
 """√Δχ² that grows by more than this part of the threshold's within the tolerance jumps."""
 _NEAR_FAULT = 0.02
