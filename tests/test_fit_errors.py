@@ -168,15 +168,22 @@ class Abrupt(FitProblem):
     """Δχ² = z²/4 until z = 1, in the place of a simulation; from there on what `beyond` says."""
 
     beyond: jnp.ndarray
+    slope: float
 
-    def __init__(self, beyond):
+    def __init__(self, beyond, slope=0.5):
         whole = FitProblem((thrown(measured(sigma=1.0)),), {"v": SPEED})
         self.experiments, self.names = whole.experiments, whole.names
         self.parameters, self.starts = whole.parameters, whole.starts
-        self.beyond = jnp.asarray(beyond)
+        self.beyond, self.slope = jnp.asarray(beyond), slope
 
     def residuals(self, z, sigmas, adjoint):
-        return jnp.where(z < 1, z, self.beyond) * jnp.ones(STEPS) / np.sqrt(4 * STEPS), jnp.zeros(1)
+        return jnp.where(z < 1, z, self.beyond) * jnp.ones(STEPS) * self.slope / np.sqrt(STEPS), jnp.zeros(1)
+
+    def result(self):
+        """The fit, at z = 0."""
+        column = jnp.full((STEPS, 1), self.slope / np.sqrt(STEPS))
+        found = Minimum(jnp.zeros(1), jnp.zeros(STEPS), column, True, False, ())
+        return fit_result(self, found, [1.0], [0.0], (jnp.ones(()),), {}, 0.95)
 
 
 @pytest.mark.parametrize(
@@ -190,12 +197,14 @@ class Abrupt(FitProblem):
 )
 def test_an_end_that_is_not_the_datas_is_said(beyond, upper, says):
     """Below, the end is that of z = −1.96·2; the value is 1 + z."""
-    problem, column = Abrupt(beyond), jnp.ones((STEPS, 1)) / np.sqrt(4 * STEPS)
-    found = Minimum(jnp.zeros(1), jnp.zeros(STEPS), column, True, False, ())
-    result = fit_result(problem, found, [1.0], [0.0], (jnp.ones(()),), {}, 0.95)
     with pytest.warns(UserWarning, match=says):
-        profile = mpm.profile(result, "v")
+        profile = mpm.profile(Abrupt(beyond).result(), "v")
     assert profile.interval == pytest.approx((1 + 2 * norm.ppf(0.025), upper), abs=5e-3)
+
+
+def test_a_number_that_is_known_to_its_eighth_digit_has_a_profile():
+    profile = mpm.profile(Abrupt(1.0, slope=1e8).result(), "v")
+    assert np.subtract(profile.interval, 1) * 1e8 == pytest.approx(norm.ppf([0.025, 0.975]), rel=2e-3)
 
 
 a, b, c, d = np.random.default_rng(0).normal(size=(4, 50))
