@@ -101,8 +101,9 @@ def profile(
 
     From the estimate it goes to either side in steps of equal growth of √Δχ², as the last two points foretell it, each
     fit started on the line through them. A value at which the simulation fails is approached by halves. Where the
-    threshold is never reached the interval is open on that side, and a warning says how far Δχ² came. One program is
-    compiled for all points, and for all numbers of a fit.
+    threshold is never reached the interval is open on that side, and a warning says how far Δχ² came; where Δχ² jumps
+    over it, as a simulation does beyond its stable step, a warning says that. One program is compiled for all points,
+    and for all numbers of a fit.
 
     The noise is held at what the fit found. With a robust or weighted observation the threshold is approximate.
 
@@ -179,6 +180,8 @@ class _End(NamedTuple):
     """The last point."""
     fault: float | None = None
     """The nearest coordinate at which the simulation fails."""
+    jump: float | None = None
+    """What Δχ² jumps to at the threshold, if it jumps."""
 
 
 class _Walk:
@@ -213,15 +216,21 @@ class _Walk:
                     break
                 continue
             if point.root >= reach:
-                return _End(self._crossing(last, point, reach, rtol), point)
+                return self._crossing(last, point, reach, rtol)
             grown = point.root - last.root
             longest = _FASTER * (wanted - gone) * points / reach
             pace = min((wanted - gone) / grown, longest) if grown > 0 else longest
+            still = self._moved(point, last) <= _STILL * (wanted - gone) * self._moved(self.start, None)
             before, last = last, point
-            if wanted >= farthest:
+            if wanted >= farthest or still:
                 break
         fault = self.start.z[self.at] + side * nearest_fault
         return _End(side * np.inf, last, float(fault) if np.isfinite(fault) else None)
+
+    def _moved(self, point: _Point, other: _Point | None) -> float:
+        """How far the number itself is from another one, or from zero."""
+        from_ = 0.0 if other is None else self.numbers(other.z)[self.at]
+        return float(abs(self.numbers(point.z)[self.at] - from_))
 
     def _distance(self, point: _Point) -> float:
         """Of a point's coordinate from the estimate's."""
@@ -257,9 +266,15 @@ class _Walk:
         """What is to be said of its ends."""
         said = []
         for end, where in zip(ends, ("below", "above"), strict=True):
+            value = self.numbers(end.last.z)[self.at]
+            if end.jump is not None:
+                said.append(
+                    f"{self.label}: the interval ends {where} at {value:.5g}, where Δχ² jumps from "
+                    f"{max(end.last.growth, 0):.2g} to {end.jump:.2g}: the simulation changes abruptly there, and not "
+                    "the data end it. See whether its step is stable."
+                )
             if np.isfinite(end.at):
                 continue
-            value = self.numbers(end.last.z)[self.at]
             beyond = ""
             if end.fault is not None:
                 held = self.start.z.copy()
@@ -279,22 +294,31 @@ class _Walk:
             said.append(f"{self.label}: at {self.unsettled} points of the profile the others did not converge.")
         return said
 
-    def _crossing(self, below: _Point, above: _Point, reach: float, rtol: float) -> float:
-        """The coordinate at which √Δχ² is `reach`, by Brent's method. A value at which the simulation fails counts as
+    def _crossing(self, below: _Point, above: _Point, reach: float, rtol: float) -> _End:
+        """Where √Δχ² is `reach` between two points, by Brent's method. A value at which the simulation fails counts as
         beyond it."""
         from scipy.optimize import root_scalar  # here, since it takes long to import
 
-        seen = {below.z[self.at]: below.root - reach, above.z[self.at]: above.root - reach}
+        visited = {below.z[self.at]: below, above.z[self.at]: above}
 
         def excess(place: float) -> float:
-            if place not in seen:
-                point = self.visit(place, below, above)
-                seen[place] = reach if point is None else point.root - reach
-            return seen[place]
+            if place not in visited:
+                visited[place] = self.visit(place, below, above)
+            point = visited[place]
+            return reach if point is None else point.root - reach
 
         within = rtol / 2 * self._distance(above)
-        found = root_scalar(excess, method="brentq", bracket=(below.z[self.at], above.z[self.at]), xtol=within)
-        return float(found.root)
+        found = root_scalar(excess, method="brentq", bracket=(below.z[self.at], above.z[self.at]), xtol=within).root
+        apart = {place: excess(place) for place in visited}
+        inner = min((p for p in apart if apart[p] < 0), key=lambda p: abs(p - found))
+        outer = min((p for p in apart if apart[p] >= 0), key=lambda p: abs(p - found))
+        last, next_ = visited[inner], visited[outer]
+        assert last is not None
+        if apart[outer] - apart[inner] < _JUMP * reach or abs(outer - inner) > 4 * within:
+            return _End(float(found), last)
+        if next_ is None:
+            return _End(float(np.copysign(np.inf, outer - inner)), last, float(outer))
+        return _End(float(found), last, jump=next_.growth)
 
     def _foretold(self, place: float, last: _Point, before: _Point) -> np.ndarray:
         """The coordinates on the line through two points, or along the direction of the covariance from the fit."""
@@ -362,6 +386,11 @@ _BEYOND = 1.02
 """Steps are so much longer than is foretold, so that in a linear problem the last one goes beyond the threshold."""
 _FASTER = 2.0
 """A step is no longer than so many times the one before."""
+_STILL = 1e-6
+"""A walk ends where the number changes, over a unit of the coordinate, by less than so much of its estimate: at a
+bound."""
+_JUMP = 0.2
+"""√Δχ² that grows by more than this part of the threshold's within the tolerance jumps."""
 _NEAR_FAULT = 0.02
 """A value at which the simulation fails is approached to this part of its distance from the estimate."""
 _BETTER = 1e-2

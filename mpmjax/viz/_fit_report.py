@@ -124,12 +124,13 @@ def _draw_history(axis: Any, result: FitResult) -> None:
 def _write_numbers(axis: Any, result: FitResult, profiles: tuple[Profile, ...]) -> None:
     """The estimates with their intervals, and what is to be said of them."""
     by_profile = {p.label: p.interval for p in profiles}
-    lines = [f"{'':<14}{'value':>11} ± {'error':<9}{100 * result.level:g} % interval"]
-    for e in result.all:
+    names = [f"{e.label} [{e.unit}]" if e.unit else e.label for e in result.all]
+    wide = max(map(len, names))
+    lines = [f"{'':<{wide}}{'value':>12} ± {'error':<9}{100 * result.level:g} % interval"]
+    for name, e in zip(names, result.all, strict=True):
         lower, upper = by_profile.get(e.label, e.interval)
-        name = f"{e.label} [{e.unit}]" if e.unit else e.label
         profiled = " by profile" if e.label in by_profile else ""
-        lines.append(f"{name:<14}{e.value:>11.5g} ± {e.error:<9.2g}{lower:.5g} to {upper:.5g}{profiled}")
+        lines.append(f"{name:<{wide}}{e.value:>12.5g} ± {e.error:<9.2g}{lower:.5g} to {upper:.5g}{profiled}")
     degrees = result.degrees_of_freedom
     lines += ["", f"χ² = {result.chi_squared:.4g}, {degrees} degrees of freedom"]
     axis.axis("off")
