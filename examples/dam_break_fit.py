@@ -1,6 +1,6 @@
 # %% [markdown]
-# What a measured front says of a dam break: friction on the floor, and when the clock began. J. C. Martin and W. J. Moyce
-# (1952) let a column of water go, a = 1.125 in wide and 2a high, by the rupture of a diaphragm, which takes its time.
+# What a measured front says of a dam break: friction on the floor, and when the clock began. J. C. Martin and
+# W. J. Moyce (1952) let a column of water go, a = 1.125 in wide and 2a high, by the rupture of a diaphragm.
 
 # %%
 import argparse

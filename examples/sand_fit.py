@@ -1,6 +1,6 @@
 # %% [markdown]
-# A friction angle from how far columns of dry grains run out, with what the grid makes of it. The runouts are those of the
-# published laws, for columns 0.75 and 1.5 times as high as long; see data/README.md for the sources and their doubts.
+# A friction angle from how far columns of dry grains run out, with what the grid makes of it. The runouts are those of
+# the published laws, for columns 0.75 and 1.5 times as high as long: data/README.md has the sources and their doubts.
 
 # %%
 import argparse
@@ -72,7 +72,8 @@ if not quick:
         for k, estimate in enumerate(each):
             reach = np.abs(np.array(estimate.interval) - estimate.value)[:, None]
             axis.errorbar([place + 0.15 * (k - 1)], [estimate.value], reach, fmt="o", color=f"C{k}", capsize=4)
-        axis.fill_between([place - 0.3, place + 0.3], *np.array(REPOSE[grains]) + [-0.2, 0.2], color="0.8")
+        low, high = REPOSE[grains]
+        axis.fill_between([place - 0.3, place + 0.3], low - 0.2, high + 0.2, color="0.8")
     axis.set_xticks(range(len(found)), found)
     axis.set(ylabel="friction angle [degrees]", title=f"{CELLS}, {2 * CELLS} cells, extrapolated; grey: repose")
     figure.savefig(ROOT / "docs/sand_fit.png", dpi=130)

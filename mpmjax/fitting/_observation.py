@@ -220,9 +220,7 @@ class Series(AbstractObservation):
     def explain(self, seen: Array, run: Run) -> None:
         require_finite(f"What the simulation says of {self.name!r}", seen)
         reached = np.isfinite(np.asarray(self.predict(seen, run)))
-        require(
-            reached, f"A parameter moves times of {self.name!r} out of the run: raise t1, or start it closer to zero."
-        )
+        require(reached, f"A parameter moves times of {self.name!r} out of the run: raise t1.")
 
 
 def _between(values: Array, place: Array) -> Array:
