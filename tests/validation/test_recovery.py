@@ -120,7 +120,7 @@ def test_stiffness_and_poissons_ratio_from_exact_motions_of_two_laws():
     5 %."""
 
     def build(n):
-        vortex = Vortex(0.1, mpm.NeoHookean(E, NU))
+        vortex = Vortex(0.1, material=mpm.NeoHookean(E, NU))
         return [exact_wave(16 * n), exact(vortex, 16 * n, 0.5, vortex.amplitude, 60)]
 
     near = {"E": mpm.Positive(STIFFNESS.where, start=0.9 * E), "nu": RATIO}
