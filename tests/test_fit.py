@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import mpmjax as mpm
-from mpmjax.fitting._least_squares import _iterate, levenberg_marquardt
 from mpmjax.fitting._observation import _between
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._refined import _extrapolate, _missed
 from mpmjax.fitting._result import Estimate, NoiseEstimate
+from mpmjax.fitting._search import iterate, search
 
 DT, STEPS, NOISE = 4e-3, 15, 1e-4
 
@@ -343,7 +343,7 @@ def test_a_step_at_which_the_simulation_fails_is_not_taken():
             far = jnp.where(z < 1, z, jnp.nan)
             return 100 * ((0.3 + far) ** 3 - 0.5), 100 * (3 * (0.3 + far) ** 2)[:, None]
 
-    found = levenberg_marquardt(Failing(), jnp.zeros(1), (), rtol=1e-6, max_steps=50)
+    found = search(Failing(), mpm.LevenbergMarquardt(), jnp.zeros(1), ())
     assert found.converged
     assert not all(iteration.accepted for iteration in found.history)
     assert float(found.z[0]) == pytest.approx(0.5 ** (1 / 3) - 0.3, rel=1e-5)
@@ -520,6 +520,6 @@ def test_fits_with_new_data_do_not_compile_anew():
     times, x, which = tracks()
     seen = mpm.Tracks(times, x, which=which, sigma=NOISE)
     mpm.fit(experiment(seen), {"E": STIFFNESS})
-    known = _iterate._cached._cache_size()
+    known = iterate._cached._cache_size()
     mpm.fit(experiment(eqx.tree_at(lambda o: o.data, seen, x + 1e-5)), {"E": STIFFNESS})
-    assert _iterate._cached._cache_size() == known
+    assert iterate._cached._cache_size() == known

@@ -3,7 +3,9 @@
 from mpmjax.fitting._columns import read_columns
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import fit
+from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._observation import AbstractObservation, Curve, Force, Series, Tracks
+from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter, Bounded, Gaussian, Positive, Unbounded
 from mpmjax.fitting._quantities import CentreOfMass, Density, Extent, Markers, StressStretch
 from mpmjax.fitting._refined import RefinedFit, fit_refined
@@ -11,17 +13,20 @@ from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
 
 __all__ = [
     "AbstractObservation",
+    "AbstractOptimiser",
     "AbstractParameter",
     "Bounded",
     "CentreOfMass",
     "Curve",
     "Density",
     "Estimate",
+    "Evaluation",
     "Experiment",
     "Extent",
     "FitResult",
     "Force",
     "Gaussian",
+    "LevenbergMarquardt",
     "Markers",
     "NoiseEstimate",
     "Positive",

@@ -6,18 +6,19 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Scalar
-from mpmjax.checks import checked, require, require_tolerance, require_whole, warn
+from mpmjax.checks import checked, require, warn
+from mpmjax.fitting._estimates import fit_result, noise_factors
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._least_squares import Iteration, Minimum, NoDerivativeError, levenberg_marquardt
+from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
+from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
-from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
-from mpmjax.fitting._uncertainty import Uncertainty, noise, quantile, seen_together, uncertainty
+from mpmjax.fitting._result import FitResult
+from mpmjax.fitting._search import Iteration, Minimum, NoDerivativeError, search
 
 
 @checked
@@ -27,8 +28,7 @@ def fit(
     *,
     report: dict[str, Callable[[Experiment], Any]] | None = None,
     level: Scalar = 0.95,
-    rtol: Scalar = 1e-6,
-    max_steps: int = 50,
+    optimiser: AbstractOptimiser = LevenbergMarquardt(),
     progress: Callable[[str], None] | None = None,
 ) -> FitResult:
     """Fit parameters of a scene to what was observed of it, with standard errors.
@@ -57,8 +57,7 @@ def fit(
         parameters: what is fitted, by name.
         report: what else to report with its error, by name: functions of an experiment that return one number.
         level: of the intervals [-].
-        rtol: relative change of the parameters and residuals at which the search ends.
-        max_steps: most iterations of a search.
+        optimiser: the method of the search.
         progress: called with a line an iteration, such as `print`.
 
     Raises:
@@ -69,24 +68,21 @@ def fit(
     """
     problem = FitProblem((experiments,) if isinstance(experiments, Experiment) else tuple(experiments), parameters)
     require((level > 0) & (level < 1), f"level must lie between 0 and 1, got {level}.")
-    require_tolerance("rtol", rtol)
-    level, rtol = float(level), float(rtol)
-    max_steps = require_whole("max_steps", max_steps, 1)
+    level = float(level)
     begun = time.perf_counter()
 
     def say(iteration: Iteration) -> None:
         if progress is not None:
             progress(_line(problem, iteration, time.perf_counter() - begun))
 
-    known = [observation.sigma is not None for observation in problem.observations]
     sigmas = tuple(jnp.asarray(o.scale() if o.sigma is None else o.sigma, problem.dtype) for o in problem.observations)
     report = dict(report or {})
     _check_report(problem, report)
     z, history, rounds = jnp.zeros(problem.size, problem.dtype), (), 0
     while True:
-        found = _search(problem, z, sigmas, rtol, max_steps, say)
+        found = _search(problem, optimiser, z, sigmas, say)
         z, history, rounds = found.z, history + found.history, rounds + 1
-        estimated, freedom = _noise(problem, found, known)
+        estimated, freedom = noise_factors(problem, found)
         floor = [_LEAST * o.scale() / float(np.max(s)) for o, s in zip(problem.observations, sigmas, strict=True)]
         factors = [max(factor, least) for factor, least in zip(estimated, floor, strict=True)]
         sigmas = tuple(sigma * factor for sigma, factor in zip(sigmas, factors, strict=True))
@@ -94,7 +90,7 @@ def fit(
         changing = any(m and factor > least for m, factor, least in zip(moved, factors, floor, strict=True))
         if not changing or problem.scales_alike or not found.converged or rounds == _MOST_ROUNDS:
             break
-    result = _result(problem, found, factors, freedom, sigmas, known, report, level)
+    result = fit_result(problem, found, factors, freedom, sigmas, report, level)
     result = replace(result, history=history)
     if not found.converged:
         stopped = "was interrupted" if found.interrupted else "did not converge"
@@ -116,10 +112,9 @@ def _check_report(problem: FitProblem, report: Mapping[str, Callable[[Experiment
 
 def _search(
     problem: FitProblem,
+    optimiser: AbstractOptimiser,
     z: Coordinates,
     sigmas: tuple[Array, ...],
-    rtol: float,
-    max_steps: int,
     say: Callable[[Iteration], None],
 ) -> Minimum:
     """The least sum of squares with a noise.
@@ -131,7 +126,7 @@ def _search(
     """
     try:
         begun = partial(_require_influence, problem, sigmas)
-        found = levenberg_marquardt(problem, z, sigmas, rtol=rtol, max_steps=max_steps, report=say, begun=begun)
+        found = search(problem, optimiser, z, sigmas, report=say, begun=begun)
     except NoDerivativeError:
         raise RuntimeError(
             "The fit has no derivative. Either the tangent solve of a step did not converge: raise the max_steps of "
@@ -145,14 +140,14 @@ def _search(
     return found
 
 
-def _require_influence(problem: FitProblem, sigmas: tuple[Array, ...], J: Array) -> None:
-    """Check that the data depend on every coordinate, at the first guess, where the Jacobian is J.
+def _require_influence(problem: FitProblem, sigmas: tuple[Array, ...], seen: Evaluation) -> None:
+    """Check that the data depend on every coordinate, at the first guess.
 
     Raises:
         ValueError: they do not.
     """
     rounding = _ROUNDINGS * float(jnp.finfo(problem.dtype).eps) * problem.size_of_data(sigmas)
-    size = np.linalg.norm(np.asarray(J), axis=0)
+    size = np.linalg.norm(np.asarray(seen.jacobian), axis=0)
     unseen = [label for label, column in zip(problem.labels, size, strict=True) if column <= rounding]
     require(
         not unseen,
@@ -161,115 +156,9 @@ def _require_influence(problem: FitProblem, sigmas: tuple[Array, ...], J: Array)
     )
 
 
-def _noise(problem: FitProblem, found: Minimum, known: list[bool]) -> tuple[list[float], list[float]]:
-    """By what each noise is to be multiplied, and the degrees of freedom of its estimate (zero of what is given)."""
-    r, J = np.asarray(found.r), np.asarray(found.J)
-    factors, freedoms = [], []
-    for observation, rows, given in zip(problem.observations, problem.rows, known, strict=True):
-        factor, freedom = (1.0, 0.0) if given else noise(r, J, rows, observation.count, *observation.trust)
-        require(
-            np.isfinite(factor),
-            f"The noise of {observation.name!r} cannot be estimated from its {observation.count} numbers: the "
-            "parameters use all of them up. Give its sigma.",
-        )
-        factors.append(factor)
-        freedoms.append(freedom)
-    return factors, freedoms
-
-
-def _result(
-    problem: FitProblem,
-    found: Minimum,
-    factors: list[float],
-    freedoms: list[float],
-    sigmas: tuple[Array, ...],
-    known: list[bool],
-    report: Mapping[str, Callable[[Experiment], Any]],
-    level: float,
-) -> FitResult:
-    """The result, its residuals in units of the noise that was found."""
-    r, J = np.array(found.r, float), np.array(found.J, float)
-    for rows, factor in zip(problem.rows, factors, strict=True):
-        r[rows], J[rows] = r[rows] / factor, J[rows] / factor
-    eps = float(jnp.finfo(problem.dtype).eps)
-    estimated = [(rows, f) for rows, f, given in zip(problem.rows, freedoms, known, strict=True) if not given]
-    errors = uncertainty(J, eps, estimated)
-    experiments = problem.at(found.z)
-    priors = len(r) - problem.rows[-1].stop
-    counts = [o.count for o in problem.observations]
-    noises = tuple(
-        NoiseEstimate(
-            o.name,
-            float(np.sqrt((np.asarray(sigma) ** 2).mean())),
-            not given,
-            float(np.sqrt((r[rows] ** 2).sum() / max(count, 1))),
-            count,
-        )
-        for o, sigma, given, rows, count in zip(problem.observations, sigmas, known, problem.rows, counts, strict=True)
-    )
-    result = FitResult(
-        estimates=_estimates(problem, found.z, errors, level),
-        reported=tuple(_reported(problem, found.z, errors, level, name, of) for name, of in report.items()),
-        covariance=errors.covariance,
-        correlation=errors.correlation,
-        spectrum=errors.spectrum,
-        directions=errors.directions,
-        chi_squared=float((r**2).sum()),
-        degrees_of_freedom=sum(counts) + priors - errors.rank,
-        noise=noises,
-        experiments=experiments,
-        values={n: np.asarray(v) for n, v in zip(problem.names, problem.values(found.z), strict=True)},
-        level=level,
-        converged=found.converged,
-        history=found.history,
-        warnings=tuple(seen_together(problem.labels, errors, problem.logarithmic)),
-    )
-    if result.p_value < _IMPROBABLE:
-        text = (
-            f"The misfit is {np.sqrt(result.chi_squared / result.degrees_of_freedom):.2g} times the noise given: the "
-            "model or its discretisation does not explain the data, and the errors are too small by as much or more."
-        )
-        result = replace(result, warnings=(*result.warnings, text))
-    return result
-
-
-def _estimates(problem: FitProblem, z: Coordinates, errors: Uncertainty, level: float) -> tuple[Estimate, ...]:
-    """The fitted numbers. An interval is symmetric in the coordinate, so it lies within the bounds."""
-    each_error = [errors.of(unit) for unit in np.eye(problem.size)]
-    reach = jnp.asarray([quantile(level, freedom) * error for error, freedom in each_error], z.dtype)
-    lower, upper = (problem.values(z + side * reach) for side in (-1, 1))
-    at, slope = jax.jvp(problem.values, (z,), (jnp.ones_like(z),))
-    numbers = zip(
-        problem.labels, *(_flat(a) for a in (at, slope, lower, upper, problem.starts)), errors.error, strict=True
-    )
-    each = zip(problem.parameters, problem.starts, problem.coordinates(z), strict=True)
-    bound = [(p.unit, bool(at)) for p, start, part in each for at in p.at_bound(start, part).reshape(-1)]
-    return tuple(
-        Estimate(label, value, abs(by) * error, (min(a, b), max(a, b)), unit, start, at_bound)
-        for (label, value, by, a, b, start, error), (unit, at_bound) in zip(numbers, bound, strict=True)
-    )
-
-
-def _reported(
-    problem: FitProblem, z: Coordinates, errors: Uncertainty, level: float, name: str, of: Callable[[Experiment], Any]
-) -> Estimate:
-    """A function of the first experiment, its error by its derivative."""
-
-    def value(z: Coordinates) -> Array:
-        return jnp.asarray(of(problem.at(z)[0]))
-
-    error, freedom = errors.of(np.asarray(jax.jacfwd(value)(z), float))
-    number, reach = float(value(z)), quantile(level, freedom) * error
-    return Estimate(name, number, error, (number - reach, number + reach), start=float(value(jnp.zeros_like(z))))
-
-
-def _flat(arrays: tuple[Array, ...]) -> list[float]:
-    return [float(x) for a in arrays for x in np.asarray(a).reshape(-1)]
-
-
 def _line(problem: FitProblem, iteration: Iteration, seconds: float) -> str:
     """Progress."""
-    values = _flat(problem.values(jnp.asarray(iteration.z, problem.dtype)))
+    values = problem.numbers(jnp.asarray(iteration.z, problem.dtype))
     shown = ", ".join(f"{label} {value:.5g}" for label, value in zip(problem.labels[:4], values, strict=False))
     more = ", …" if problem.size > 4 else ""
     return (
@@ -285,5 +174,4 @@ _LEAST = 1e-12
 """Smallest noise, in sizes of the data: exact data have none."""
 _ROUNDINGS = 10
 """Derivatives by a coordinate below so many roundings of the data are none."""
-_IMPROBABLE = 1e-3
 _ADVICE = "Raise max_steps, start closer, or give a rtol that the precision can reach."

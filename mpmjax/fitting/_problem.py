@@ -79,6 +79,11 @@ class FitProblem(eqx.Module):
         return tuple(o for e in self.experiments for o in e.observations)
 
     @property
+    def noise_is_given(self) -> tuple[bool, ...]:
+        """Of each observation, whether its noise is given, and not to be estimated."""
+        return tuple(o.sigma is not None for o in self.observations)
+
+    @property
     def labels(self) -> tuple[str, ...]:
         """A name for each coordinate: that of its parameter, with an index where that has several."""
         labels = []
@@ -119,6 +124,10 @@ class FitProblem(eqx.Module):
         """The value of each parameter."""
         each = zip(self.parameters, self.starts, self.coordinates(z), strict=True)
         return tuple(parameter.value(start, own) for parameter, start, own in each)
+
+    def numbers(self, z: Coordinates) -> Float[Array, "n"]:
+        """The values of all parameters, one after the other."""
+        return jnp.concatenate([value.reshape(-1) for value in self.values(z)])
 
     def at(self, z: Coordinates) -> tuple[Experiment, ...]:
         """The experiments with these values."""

@@ -13,6 +13,8 @@ from mpmjax._types import Array, Scalar
 from mpmjax.checks import checked, require, require_positive, warn
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import fit
+from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
+from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
 from mpmjax.fitting._uncertainty import quantile
@@ -73,8 +75,7 @@ def fit_refined(
     order: Scalar = 1,
     report: dict[str, Callable[[Experiment], Any]] | None = None,
     level: Scalar = 0.95,
-    rtol: Scalar = 1e-6,
-    max_steps: int = 50,
+    optimiser: AbstractOptimiser = LevenbergMarquardt(),
     progress: Callable[[str], None] | None = None,
 ) -> RefinedFit:
     """Fit on several grids, extrapolate to a spacing of zero, and count what is left as an error.
@@ -106,8 +107,7 @@ def fit_refined(
         order: p, the order in the spacing. One is careful: estimates that converge faster get a wider interval.
         report: what else to report, see `fit`.
         level: of the intervals, see `fit`.
-        rtol: see `fit`.
-        max_steps: see `fit`.
+        optimiser: see `fit`.
         progress: see `fit`.
 
     Raises:
@@ -122,7 +122,7 @@ def fit_refined(
     fits: list[FitResult] = []
     searched = parameters
     for n in numbers:
-        found = fit(build(n), searched, report=report, level=level, rtol=rtol, max_steps=max_steps, progress=progress)
+        found = fit(build(n), searched, report=report, level=level, optimiser=optimiser, progress=progress)
         fits.append(found)
         searched = found.restarted(parameters)
     sizes = [(p, fits[-1].values[name].size) for name, p in parameters.items()]

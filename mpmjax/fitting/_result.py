@@ -5,12 +5,16 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from scipy.special import chdtrc
 
+from mpmjax._types import Array
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._least_squares import Iteration
 from mpmjax.fitting._parameter import AbstractParameter
+from mpmjax.fitting._problem import FitProblem
+from mpmjax.fitting._search import Iteration
+from mpmjax.fitting._uncertainty import Uncertainty
 
 
 class Estimate(NamedTuple):
@@ -49,19 +53,18 @@ class FitResult(eqx.Module):
     `print(result)` shows a table; `result["E"]` is the estimate of a parameter.
     """
 
+    problem: FitProblem
+    """What was fitted."""
+    z: np.ndarray
+    """The coordinates found [-], shape (n,)."""
+    sigmas: tuple[Array, ...]
+    """The noise of each observation, given or estimated, in the data's unit."""
+    uncertainty: Uncertainty
+    """That of the coordinates."""
     estimates: tuple[Estimate, ...]
     """The fitted numbers, one for each entry of each parameter."""
     reported: tuple[Estimate, ...]
     """What else was asked for."""
-    covariance: np.ndarray
-    """Of the search's coordinates [-], shape (n, n)."""
-    correlation: np.ndarray
-    """Of the estimates, shape (n, n)."""
-    spectrum: np.ndarray
-    """The eigenvalues of the Fisher information JᵀJ, growing, shape (n,): 1/√λ is how far, in coordinates, the data
-    leave the direction open."""
-    directions: np.ndarray
-    """Its eigenvectors, one a column, shape (n, n)."""
     chi_squared: float
     """Σ r², priors included."""
     degrees_of_freedom: int
@@ -70,14 +73,39 @@ class FitResult(eqx.Module):
     """The noise of each observation."""
     experiments: tuple[Experiment, ...]
     """The experiments with the fitted values."""
-    values: dict[str, np.ndarray]
-    """The value of each parameter, in its shape."""
     level: float
     """The level of the intervals [-], such as 0.95."""
     converged: bool
     history: tuple[Iteration, ...]
     warnings: tuple[str, ...]
     """What the data cannot tell, and what does not fit, in words."""
+
+    @property
+    def values(self) -> dict[str, np.ndarray]:
+        """The value of each parameter, in its shape."""
+        values = self.problem.values(jnp.asarray(self.z, self.problem.dtype))
+        return {name: np.asarray(value) for name, value in zip(self.problem.names, values, strict=True)}
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of the search's coordinates [-], shape (n, n)."""
+        return self.uncertainty.covariance
+
+    @property
+    def correlation(self) -> np.ndarray:
+        """Of the estimates, shape (n, n)."""
+        return self.uncertainty.correlation
+
+    @property
+    def spectrum(self) -> np.ndarray:
+        """The eigenvalues of the Fisher information JᵀJ, growing, shape (n,): 1/√λ is how far, in coordinates, the data
+        leave the direction open."""
+        return self.uncertainty.spectrum
+
+    @property
+    def directions(self) -> np.ndarray:
+        """The eigenvectors of the Fisher information, one a column, shape (n, n)."""
+        return self.uncertainty.directions
 
     @property
     def all(self) -> tuple[Estimate, ...]:

@@ -1,0 +1,135 @@
+"""The numbers of a fit and their errors."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Array
+from mpmjax.checks import require
+from mpmjax.fitting._experiment import Experiment
+from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
+from mpmjax.fitting._search import Minimum
+from mpmjax.fitting._uncertainty import Uncertainty, noise, quantile, seen_together, uncertainty
+
+
+def noise_factors(problem: FitProblem, found: Minimum) -> tuple[list[float], list[float]]:
+    """By what each noise is to be multiplied, and the degrees of freedom of its estimate (zero of what is given)."""
+    r, J = np.asarray(found.r), np.asarray(found.J)
+    factors, freedoms = [], []
+    for observation, rows, given in zip(problem.observations, problem.rows, problem.noise_is_given, strict=True):
+        factor, freedom = (1.0, 0.0) if given else noise(r, J, rows, observation.count, *observation.trust)
+        require(
+            np.isfinite(factor),
+            f"The noise of {observation.name!r} cannot be estimated from its {observation.count} numbers: the "
+            "parameters use all of them up. Give its sigma.",
+        )
+        factors.append(factor)
+        freedoms.append(freedom)
+    return factors, freedoms
+
+
+def fit_result(
+    problem: FitProblem,
+    found: Minimum,
+    factors: list[float],
+    freedoms: list[float],
+    sigmas: tuple[Array, ...],
+    report: Mapping[str, Callable[[Experiment], Any]],
+    level: float,
+) -> FitResult:
+    """The result at a minimum.
+
+    Args:
+        problem: what was fitted.
+        found: the minimum, its residuals in units of the noise of its search.
+        factors: by what the noise was found to be larger than in that search.
+        freedoms: degrees of freedom of each estimate of the noise.
+        sigmas: the noise that was found.
+        report: see `fit`.
+        level: of the intervals.
+    """
+    r, J = np.array(found.r, float), np.array(found.J, float)
+    for rows, factor in zip(problem.rows, factors, strict=True):
+        r[rows], J[rows] = r[rows] / factor, J[rows] / factor
+    eps = float(jnp.finfo(problem.dtype).eps)
+    given = problem.noise_is_given
+    estimated = [(rows, f) for rows, f, known in zip(problem.rows, freedoms, given, strict=True) if not known]
+    errors = uncertainty(J, eps, estimated)
+    priors = len(r) - problem.rows[-1].stop
+    counts = [o.count for o in problem.observations]
+    noises = tuple(
+        NoiseEstimate(
+            o.name,
+            float(np.sqrt((np.asarray(sigma) ** 2).mean())),
+            not known,
+            float(np.sqrt((r[rows] ** 2).sum() / max(count, 1))),
+            count,
+        )
+        for o, sigma, known, rows, count in zip(problem.observations, sigmas, given, problem.rows, counts, strict=True)
+    )
+    result = FitResult(
+        problem=problem,
+        z=np.asarray(found.z),
+        sigmas=sigmas,
+        uncertainty=errors,
+        estimates=_estimates(problem, found.z, errors, level),
+        reported=tuple(_reported(problem, found.z, errors, level, name, of) for name, of in report.items()),
+        chi_squared=float((r**2).sum()),
+        degrees_of_freedom=sum(counts) + priors - errors.rank,
+        noise=noises,
+        experiments=problem.at(found.z),
+        level=level,
+        converged=found.converged,
+        history=found.history,
+        warnings=tuple(seen_together(problem.labels, errors, problem.logarithmic)),
+    )
+    if result.p_value < _IMPROBABLE:
+        text = (
+            f"The misfit is {np.sqrt(result.chi_squared / result.degrees_of_freedom):.2g} times the noise given: the "
+            "model or its discretisation does not explain the data, and the errors are too small by as much or more."
+        )
+        result = replace(result, warnings=(*result.warnings, text))
+    return result
+
+
+def _estimates(problem: FitProblem, z: Coordinates, errors: Uncertainty, level: float) -> tuple[Estimate, ...]:
+    """The fitted numbers. An interval is symmetric in the coordinate, so it lies within the bounds."""
+    each_error = [errors.of(unit) for unit in np.eye(problem.size)]
+    reach = jnp.asarray([quantile(level, freedom) * error for error, freedom in each_error], z.dtype)
+    lower, upper = (problem.values(z + side * reach) for side in (-1, 1))
+    at, slope = jax.jvp(problem.values, (z,), (jnp.ones_like(z),))
+    numbers = zip(
+        problem.labels, *(_flat(a) for a in (at, slope, lower, upper, problem.starts)), errors.error, strict=True
+    )
+    each = zip(problem.parameters, problem.starts, problem.coordinates(z), strict=True)
+    bound = [(p.unit, bool(at)) for p, start, part in each for at in p.at_bound(start, part).reshape(-1)]
+    return tuple(
+        Estimate(label, value, abs(by) * error, (min(a, b), max(a, b)), unit, start, at_bound)
+        for (label, value, by, a, b, start, error), (unit, at_bound) in zip(numbers, bound, strict=True)
+    )
+
+
+def _reported(
+    problem: FitProblem, z: Coordinates, errors: Uncertainty, level: float, name: str, of: Callable[[Experiment], Any]
+) -> Estimate:
+    """A function of the first experiment, its error by its derivative."""
+
+    def value(z: Coordinates) -> Array:
+        return jnp.asarray(of(problem.at(z)[0]))
+
+    error, freedom = errors.of(np.asarray(jax.jacfwd(value)(z), float))
+    number, reach = float(value(z)), quantile(level, freedom) * error
+    return Estimate(name, number, error, (number - reach, number + reach), start=float(value(jnp.zeros_like(z))))
+
+
+def _flat(arrays: tuple[Array, ...]) -> list[float]:
+    return [float(x) for a in arrays for x in np.asarray(a).reshape(-1)]
+
+
+_IMPROBABLE = 1e-3
+"""Probability of a χ² from which the model is said not to explain the data."""

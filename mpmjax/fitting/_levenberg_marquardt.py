@@ -1,0 +1,88 @@
+"""Levenberg-Marquardt by optimistix, one iteration at a time."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+import optimistix
+
+from mpmjax._types import Array, Scalar
+from mpmjax.checks import require_tolerance, require_whole
+from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
+from mpmjax.fitting._problem import Coordinates, FitProblem
+
+
+class LevenbergMarquardt(AbstractOptimiser):
+    """The Levenberg-Marquardt method of optimistix on the residuals, their Jacobian by forward mode.
+
+    One compiled function makes an iteration: it evaluates residuals and Jacobian together, once. A step at which a
+    simulation fails has residuals of NaN, is not taken, and the next is shorter.
+
+    It ends by optimistix's criterion, or where the next Gauss-Newton step would be less than a ten-thousandth of the
+    standard error that the misfit gives: in single precision residuals are never still.
+
+    Args:
+        rtol: relative and absolute tolerance of coordinates and residuals.
+        max_steps: most iterations.
+    """
+
+    rtol: Scalar = 1e-6
+    max_steps: int = eqx.field(static=True, default=50)
+
+    def __check_init__(self):
+        require_tolerance("LevenbergMarquardt's rtol", self.rtol)
+        require_whole("LevenbergMarquardt's max_steps", self.max_steps, 1)
+
+    def begin(self, problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> Any:
+        args = problem, sigmas
+        shape, _ = jax.eval_shape(lambda z: _residuals(z, args), z)
+        return self._solver.init(_residuals, z, args, {}, shape, None, frozenset())
+
+    def iterate(
+        self, problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...], state: Any
+    ) -> tuple[Coordinates, Any, Evaluation]:
+        z, state, _ = self._solver.step(_residuals, z, (problem, sigmas), {}, state, frozenset())
+        r, J = state.f_info.residual, state.f_info.jac.as_matrix()
+        return z, state, Evaluation((r**2).sum() / 2, J.T @ r, r, J)
+
+    def has_converged(self, state: Any, seen: Evaluation) -> bool:
+        return bool(state.terminate) or _is_settled(np.asarray(seen.residuals, float), np.asarray(seen.jacobian, float))
+
+    @property
+    def _solver(self) -> Any:
+        tolerance: Any = self.rtol
+        return optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+
+
+def _is_settled(r: np.ndarray, J: np.ndarray) -> bool:
+    """Whether the next Gauss-Newton step p is far below the standard errors: ‖J p‖ against √(Σ r²/(m − n))."""
+    if len(r) <= J.shape[1] or not (np.isfinite(r).all() and np.isfinite(J).all()):
+        return False
+    U, singular, _ = np.linalg.svd(J, full_matrices=False)
+    change = U[:, singular > 1e-10 * singular.max(initial=0)].T @ r
+    return bool((change**2).sum() <= _NEGLIGIBLE**2 * (r**2).sum() / (len(r) - J.shape[1]))
+
+
+_NEGLIGIBLE = 1e-4
+"""A step of so many standard errors is none."""
+
+
+def _residuals(z: Coordinates, args: tuple[FitProblem, tuple[Array, ...]]) -> tuple[Array, None]:
+    """The residuals, with a derivative by forward mode in one pass."""
+    problem, sigmas = args
+
+    def jacobian(z: Coordinates) -> tuple[Array, Array]:
+        r, J = problem.jacobian(z.astype(problem.dtype), sigmas)
+        return r.astype(z.dtype), J.astype(z.dtype)
+
+    @jax.custom_jvp
+    def residuals(z: Coordinates) -> Array:
+        return jacobian(z)[0]
+
+    @residuals.defjvp
+    def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+        r, J = jacobian(primals[0])
+        return r, J @ tangents[0]
+
+    return residuals(z), None

@@ -1,0 +1,116 @@
+"""The search for the least sum of squares, iteration by iteration."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Array, Float
+from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
+from mpmjax.fitting._problem import Coordinates, FitProblem
+
+
+class Iteration(NamedTuple):
+    """What one iteration did."""
+
+    number: int
+    cost: float
+    """½ Σ r² where it is now."""
+    gradient: float
+    """Largest component of its derivative by the coordinates there."""
+    accepted: bool
+    """Whether it moved."""
+    z: np.ndarray
+    """The coordinates, shape (n,)."""
+
+
+class Minimum(NamedTuple):
+    """Where the search ended."""
+
+    z: Coordinates
+    r: Float[Array, "m"]
+    """The residuals there [-]."""
+    J: Float[Array, "m n"]
+    """Their derivative."""
+    converged: bool
+    interrupted: bool
+    history: tuple[Iteration, ...]
+
+
+class NoDerivativeError(RuntimeError):
+    """The residuals are finite, their derivative is not."""
+
+
+def search(
+    problem: FitProblem,
+    optimiser: AbstractOptimiser,
+    z: Coordinates,
+    sigmas: tuple[Array, ...],
+    *,
+    report: Callable[[Iteration], None] | None = None,
+    begun: Callable[[Evaluation], None] | None = None,
+) -> Minimum:
+    """The least Σ r² near z. An interruption (Ctrl-C) ends the search where it is.
+
+    Args:
+        problem: the residuals.
+        optimiser: the method.
+        z: where it starts.
+        sigmas: the noise of each observation.
+        report: called after each iteration.
+        begun: called with what is known where it starts.
+
+    Raises:
+        NoDerivativeError: a derivative is not finite.
+    """
+    z = z.astype(float)  # optimistix's own numbers are of JAX's default precision
+    history: list[Iteration] = []
+    converged, interrupted, seen = False, False, None
+    state = begin(problem, optimiser, z, sigmas)
+    try:
+        for number in range(optimiser.max_steps):
+            z, state, seen = iterate(problem, optimiser, z, sigmas, state)
+            cost, slope = float(seen.cost), float(jnp.abs(seen.gradient).max())
+            if np.isfinite(cost) and not np.isfinite(slope):
+                raise NoDerivativeError
+            moved = not history or cost != history[-1].cost
+            history.append(Iteration(number, cost, slope, moved, np.asarray(z)))
+            if number == 0 and begun is not None and np.isfinite(cost):
+                begun(seen)
+            if report is not None:
+                report(history[-1])
+            converged = optimiser.has_converged(state, seen)
+            if converged or not np.isfinite(cost):
+                break
+    except KeyboardInterrupt:
+        if not history:
+            raise
+        interrupted = True
+    assert seen is not None
+    z = z.astype(problem.dtype)
+    r, J = seen.residuals, seen.jacobian
+    if r is None or J is None:
+        r, J = jacobian(problem, z, sigmas)
+    return Minimum(z, r, J, converged, interrupted, tuple(history))
+
+
+@eqx.filter_jit
+def begin(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, sigmas: tuple[Array, ...]) -> Any:
+    """An optimiser's `begin`, compiled."""
+    return optimiser.begin(problem, z, sigmas)
+
+
+@eqx.filter_jit
+def iterate(
+    problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, sigmas: tuple[Array, ...], state: Any
+) -> tuple[Coordinates, Any, Evaluation]:
+    """An optimiser's `iterate`, compiled."""
+    return optimiser.iterate(problem, z, sigmas, state)
+
+
+@eqx.filter_jit
+def jacobian(problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> tuple[Array, Array]:
+    """The residuals and their Jacobian, compiled."""
+    return problem.jacobian(z, sigmas)
