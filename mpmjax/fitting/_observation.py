@@ -183,7 +183,10 @@ class Series(AbstractObservation):
         return self.of(scene, particles)
 
     def predict(self, seen: Array, run: Run) -> Array:
-        return between(seen, jnp.asarray(self.times, seen.dtype) / run.dt)
+        """NaN at times that a parameter has moved out of the run."""
+        place = jnp.asarray(self.times, seen.dtype) / run.dt
+        outside = (place < -_BEYOND) | (place > len(seen) - 1 + _BEYOND)
+        return jnp.where(outside.reshape(-1, *[1] * (seen.ndim - 1)), jnp.nan, between(seen, place))
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
         what = f"{type(self).__name__} {self.name!r}"
@@ -224,8 +227,9 @@ class Series(AbstractObservation):
         return self.until(t1) if seen else None
 
     def explain(self, seen: Array, run: Run) -> None:
-        del run
         require_finite(f"What the simulation says of {self.name!r}", seen)
+        reached = np.isfinite(np.asarray(self.predict(seen, run)))
+        require(reached, f"A parameter moves times of {self.name!r} out of the run: raise t1.")
 
 
 def between(values: Array, place: Array) -> Array:
@@ -242,6 +246,8 @@ def between(values: Array, place: Array) -> Array:
 
 _ON_A_ROW = 1e-6
 """Part of a step by which a time may miss a step and is on it."""
+_BEYOND = 1e-2
+"""Part of a step by which a time may lie beyond the run, as rounding has it."""
 _SLACK = 1e-6
 """Part of a curve's length by which a point may lie beside it, as rounding of its start has it."""
 

@@ -50,7 +50,7 @@ class AbstractParameter(eqx.Module):
     """The leaf, or a tuple of leaves that share the value, of an experiment, as in `equinox.tree_at`."""
     update: eqx.AbstractVar[Callable[[Experiment, Value], Experiment] | None]
     """In the place of `where`: the experiment with the value put into it, for what is no single leaf."""
-    start: eqx.AbstractVar[Scalar | Value | None]
+    start: eqx.AbstractVar[Scalar | Value | np.ndarray | None]
     """The first guess. Default: the value of the first experiment."""
     prior: eqx.AbstractVar[Gaussian | None]
     """What is known of it beforehand."""
@@ -132,7 +132,7 @@ class Unbounded(AbstractParameter):
 
     where: Callable[[Experiment], Any] | None = None
     update: Callable[[Experiment, Value], Experiment] | None = None
-    start: Scalar | Value | None = None
+    start: Scalar | Value | np.ndarray | None = None
     scale: Scalar | None = None
     prior: Gaussian | None = None
     unit: str = eqx.field(static=True, default="")
@@ -169,7 +169,7 @@ class Positive(AbstractParameter):
     logarithmic: ClassVar[bool] = True
     where: Callable[[Experiment], Any] | None = None
     update: Callable[[Experiment, Value], Experiment] | None = None
-    start: Scalar | Value | None = None
+    start: Scalar | Value | np.ndarray | None = None
     prior: Gaussian | None = None
     unit: str = eqx.field(static=True, default="")
     only: tuple[int, ...] | None = eqx.field(static=True, default=None)
@@ -207,7 +207,7 @@ class Bounded(AbstractParameter):
     lower: float | int = eqx.field(static=True, default=0.0)
     upper: float | int = eqx.field(static=True, default=1.0)
     update: Callable[[Experiment, Value], Experiment] | None = None
-    start: Scalar | Value | None = None
+    start: Scalar | Value | np.ndarray | None = None
     prior: Gaussian | None = None
     unit: str = eqx.field(static=True, default="")
     only: tuple[int, ...] | None = eqx.field(static=True, default=None)

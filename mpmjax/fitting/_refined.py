@@ -18,7 +18,7 @@ from mpmjax.fitting._fit import fit
 from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._result import Estimate, FitResult
+from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
 from mpmjax.fitting._uncertainty import quantile
 
 
@@ -96,7 +96,14 @@ def fit_refined(
     extrapolation is b + (b − a)/(r^p − 1), and the standard error that is left of the discretisation is taken as that
     whole correction. p is `order`; with three grids of equal ratios it is what they show, between half and twice that.
     Where they do not converge, the finest estimate stays, with its last change as the error, and a warning says so.
-    Intervals are made of both parts, in the coordinate, so they keep to the parameters' bounds.
+
+    Two estimates may agree by chance and both be wrong, as where an error changes its sign between the grids. What the
+    finest grid misses of the data then tells more: D, in units of σ. A discretisation that changes predictions by D in
+    ways that no parameter can follow may change them as much in ways that a parameter does follow. The parameter that
+    makes up for it moves by D times its standard error from the noise; half of this is the least error that is taken.
+    D² is what the sum of squares loses from the grid before to the finest, over r^2p − 1, and needs no σ.
+
+    Intervals are made of the noise's and the discretisation's part, in the coordinate, so they keep to the bounds.
 
     Args:
         build: the experiments on n times as many cells a direction, from n; take the step n times shorter too.
@@ -150,13 +157,29 @@ def fit_refined(
     kinds += [None] * len(fits[-1].reported)
     each = zip(kinds, zip(*(found.all for found in fits), strict=True), strict=True)
     normal = float(quantile(float(level), np.inf))
-    extrapolated = [_extrapolate(kind, estimates, numbers, float(order), normal) for kind, estimates in each]
+    missed = _missed(fits[-2].noise, fits[-1].noise, numbers, float(order))
+    extrapolated = [_extrapolate(kind, found, numbers, float(order), missed, normal) for kind, found in each]
     estimates, left, orders = zip(*extrapolated, strict=True)
     return RefinedFit(tuple(fits), tuple(numbers), estimates, tuple(e.error for e in fits[-1].all), left, orders)
 
 
+def _missed(
+    coarse: tuple[NoiseEstimate, ...], fine: tuple[NoiseEstimate, ...], refinements: list[int], order: float
+) -> float:
+    """D, by how much the finest grid misses the data beyond their noise, in units of its σ: by what the sum of squares
+    lost since the grid before, as the square of what falls with the spacing to the power of the order."""
+    pairs = zip(coarse, fine, strict=True)
+    lost = sum(b.points * ((a.misfit * a.sigma / b.sigma) ** 2 - b.misfit**2) for a, b in pairs)
+    return float(np.sqrt(max(lost, 0.0) / ((refinements[-1] / refinements[-2]) ** (2 * order) - 1)))
+
+
 def _extrapolate(
-    kind: AbstractParameter | None, found: tuple[Estimate, ...], refinements: list[int], order: float, normal: float
+    kind: AbstractParameter | None,
+    found: tuple[Estimate, ...],
+    refinements: list[int],
+    order: float,
+    missed: float,
+    normal: float,
 ) -> tuple[Estimate, float, float]:
     """One number extrapolated; the part of its error that is left of the discretisation; and the order, NaN where the
     estimates do not converge.
@@ -166,6 +189,7 @@ def _extrapolate(
         found: its estimates, from coarse to fine.
         refinements: the grids.
         order: the order in the spacing.
+        missed: by how much the finest grid misses the data, in units of σ.
         normal: the reach of an interval of the normal distribution, in standard errors.
     """
     last = found[-1]
@@ -183,13 +207,15 @@ def _extrapolate(
     p = _order(values, refinements, order)
     change = values[-1] - values[-2]
     correction = 0.0 if np.isnan(p) else change / ((refinements[-1] / refinements[-2]) ** p - 1)
-    remains = abs(change) if np.isnan(p) else abs(correction)
+    slope = jax.grad(lambda z: back(z))
+    hidden = missed / 2 * last.error / abs(float(slope(jnp.zeros_like(at))))
+    remains = max(abs(change) if np.isnan(p) else abs(correction), hidden)
     if np.isnan(p):
         shown = ", ".join(f"{e.value:.5g}" for e in found)
         warn(f"{last.label} does not converge with the spacing ({shown}): it is not extrapolated.")
     lower, upper = (coordinate(end) for end in last.interval)
     reach = np.hypot([lower, upper], normal * remains)
-    discretisation = float(jax.grad(lambda z: back(z))(jnp.asarray(correction, at.dtype))) * remains
+    discretisation = float(slope(jnp.asarray(correction, at.dtype))) * remains
     ends = float(back(correction - reach[0])), float(back(correction + reach[1]))
     estimate = last._replace(
         value=float(back(correction)),
