@@ -67,7 +67,8 @@ class Problems(eqx.Module):
             same = not all(numbers) or all(np.array_equal(first, leaf, equal_nan=True) for leaf in column)
             varying.append(None if same else np.stack([np.asarray(leaf) for leaf in column]))
         common = [first if stacked is None else None for first, stacked in zip(leaves[0], varying, strict=True)]
-        return Problems(*(jax.tree.unflatten(structures[0], a) for a in (varying, common)), shared)
+        own, rest = (jax.tree.unflatten(structures[0], a) for a in (varying, common))
+        return Problems(own, rest, shared)
 
     def only(self, numbers: list[int]) -> "Problems":
         """Some of them, one for each search."""
@@ -185,7 +186,7 @@ class _Lanes:
         members = np.array([spare if member < 0 else member for member in self.members])
         state = eqx.combine(self.state, self.rest)
         own, sigmas = self.problems.at(members), self.sigmas.at(members)
-        axes = tuple(None if a.shared else 0 for a in (self.problems, self.sigmas))
+        axes = None if self.problems.shared else 0, None if self.sigmas.shared else 0
         z, state, seen = _iterate(
             own, self.problems.common, self.optimiser, self.z, sigmas, self.sigmas.common, state, axes
         )
@@ -255,7 +256,7 @@ def _iterate(
     own: Any,
     common: Any,
     optimiser: AbstractOptimiser,
-    z: Array,
+    z: Float[np.ndarray, "b n"] | Array,
     sigmas: Any,
     common_sigmas: Any,
     state: Any,

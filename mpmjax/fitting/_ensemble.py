@@ -20,6 +20,7 @@ from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._result import FitResult
+from mpmjax.fitting._search import Iteration
 
 
 class EnsembleFit(eqx.Module):
@@ -161,7 +162,8 @@ def _fit_each(
     stacked, n = Problems.of(problems, shared=False), problems[0].size
     batch = min(batch, len(problems))
     sigmas = [p.first_sigmas for p in problems]
-    starts, history = np.zeros((len(problems), n)), [() for _ in problems]
+    starts = np.zeros((len(problems), n))
+    history: list[tuple[Iteration, ...]] = [()] * len(problems)
     fits: list[FitResult | str] = [""] * len(problems)
     left = list(range(len(problems)))
     for round_ in range(MOST_ROUNDS):

@@ -36,7 +36,8 @@ def starting_points(problem: FitProblem, count: int, ranges: Ranges, seed: int) 
     unknown = sorted(set(ranges) - set(problem.names))
     require(not unknown, f"ranges must be of parameters ({', '.join(problem.names)}), got {', '.join(unknown)}.")
     exponent = max(int(np.ceil(np.log2(max(count - 1, 1)))), 0)
-    shares = qmc.Sobol(problem.size, seed=seed).random_base2(exponent)[: count - 1]
+    sobol = qmc.Sobol(problem.size, seed=seed)  # pyright: ignore[reportCallIssue] (rng from SciPy 1.15 on)
+    shares = sobol.random_base2(exponent)[: count - 1]
     shares = np.clip(shares, _EDGE, 1 - _EDGE)
     parts, column = [], 0
     for name, parameter, start in zip(problem.names, problem.parameters, problem.starts, strict=True):
