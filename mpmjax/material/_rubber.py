@@ -154,7 +154,7 @@ class MooneyRivlin(AbstractRubber):
         require_fields(self)
         require_finite("MooneyRivlin's c1 [Pa]", self.c1)
         require_finite("MooneyRivlin's c2 [Pa]", self.c2)
-        require_that("MooneyRivlin's c1 and c2 [Pa] must have a positive sum", _sum_is_positive, self.c1, self.c2)
+        require_that("MooneyRivlin's c1 and c2 [Pa] must have a positive sum", lambda a, b: a + b > 0, self.c1, self.c2)
         require_positive("MooneyRivlin's bulk_modulus [Pa]", self.bulk_modulus)
 
     @property
@@ -317,7 +317,3 @@ class Ogden(AbstractRubber):
         """μ_k/α_k E_k."""
         each = zip(self.moduli, self.exponents, excess, strict=True)
         return tuple(_linear(modulus / exponent, E) for modulus, exponent, E in each)
-
-
-def _sum_is_positive(a: Array, b: Array) -> Array:
-    return a + b > 0
