@@ -1,7 +1,7 @@
 """Power sums of the isochoric principal stretches, of which the laws of rubber are functions.
 
-With J = det F and C = FᵀF, the isochoric stretches are λ̄_i = J^−1/3 λ_i: three of them, whatever d is, those normal to F
-being J^−1/3 (plane and uniaxial strain). A power sum is T_α = λ̄_1^α + λ̄_2^α + λ̄_3^α. The first two invariants of the
+With J = det F and C = FᵀF, the isochoric stretches are λ̄_i = J^−1/3 λ_i: three of them, whatever d is, those normal to
+F being J^−1/3 (plane and uniaxial strain). A power sum is T_α = λ̄_1^α + λ̄_2^α + λ̄_3^α. The first two invariants of the
 isochoric deformation are Ī1 = T_2 and Ī2 = T_−2, and the sums of other powers are Ogden's.
 """
 

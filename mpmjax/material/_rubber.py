@@ -257,8 +257,8 @@ class Gent(AbstractRubber):
         """J > 0 and Ī1 − 3 < J_m."""
         J = la.determinant(F)
         positive = J > 0
-        _, (E,) = self._strains(F, jnp.log(jnp.where(positive, J, 1)))
-        return positive & (E < self.limit)
+        _, (excess,) = self._strains(F, jnp.log(jnp.where(positive, J, 1)))
+        return positive & (excess < self.limit)
 
     def inadmissible(self, or_else: str) -> tuple[str, str]:
         what = "has a deformation gradient that Gent does not allow (det F ≤ 0, or a stretch beyond its limit)"
