@@ -30,7 +30,7 @@ def measured(kind, upto):
 
 # %% [markdown]
 # A homogeneous deformation needs one cell: an eighth of a cube (a quarter of a square) between slipping walls, its
-# planes of symmetry, its far faces pulled or free. A step of backward Euler leads from one measured stretch to the next.
+# planes of symmetry, its far faces pulled or free. A step of backward Euler leads from one measured stretch to another.
 
 
 # %%

@@ -277,7 +277,7 @@ class Ogden(AbstractRubber):
     uniaxial and biaxial tests tell apart; K as for `MooneyRivlin`.
 
     Args:
-        moduli: μ_k [Pa], a tuple with one entry a term, each one value or one per particle (p,).
+        moduli: μ_k [Pa], a tuple with one entry a term, all of them one value or all of them one per particle (p,).
         exponents: α_k [-], not zero, likewise.
         bulk_modulus: K [Pa].
     """
@@ -293,6 +293,8 @@ class Ogden(AbstractRubber):
             terms == len(self.exponents) > 0,
             f"Ogden needs a modulus and an exponent for each of its terms, got {terms} and {len(self.exponents)}.",
         )
+        alike = all(len({jnp.shape(a) for a in entries}) == 1 for entries in (self.moduli, self.exponents))
+        require(alike, "Ogden's moduli must be all numbers or all one per particle, and so must its exponents.")
         for modulus, exponent in zip(self.moduli, self.exponents, strict=True):
             require_finite("Ogden's moduli [Pa]", modulus)
             require_finite("Ogden's exponents", exponent)

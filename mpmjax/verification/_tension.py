@@ -2,11 +2,12 @@
 
 from typing import Literal
 
+import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float
-from mpmjax.checks import require, require_positive
+from mpmjax.checks import canonical, require, require_positive
 from mpmjax.material import AbstractMaterial
 
 Tension = Literal["uniaxial", "pure shear", "equibiaxial"]
@@ -31,7 +32,12 @@ def tension(law: AbstractMaterial, stretch: Float[Array, "m"], kind: Tension) ->
     require(kind in _STRETCHES, f"kind must be one of {', '.join(_STRETCHES)}, got {kind!r}.")
     require_positive("A stretch", stretch)
     stretch = jnp.asarray(stretch, float)
-    s = jnp.stack([stretch**power for power in _STRETCHES[kind]])
+    return _tension(canonical(law, stretch.dtype), stretch, jnp.asarray(_STRETCHES[kind], stretch.dtype))
+
+
+@eqx.filter_jit
+def _tension(law: AbstractMaterial, stretch: Float[Array, "m"], powers: Float[Array, "3"]) -> Float[Array, "m"]:
+    s = stretch ** powers[:, None]
     P = law.stress(la.diagonal(s))
     return P[0, 0] - s[2] / s[0] * P[2, 2]
 
