@@ -38,7 +38,7 @@ EXAMPLES = {
     mpm.MooneyRivlin: mpm.MooneyRivlin(1e5, 3e4, 2e8),
     mpm.Yeoh: mpm.Yeoh(np.array([1e5, 2e5]), -1e3, 30.0, 2e8),
     mpm.Gent: mpm.Gent(3e5, 80.0, 2e8),
-    mpm.Ogden: mpm.Ogden((np.array([6e5, 5e5]), np.array([-1e4, -2e4])), (1.3, -2.0), 2e8),
+    mpm.Ogden: mpm.Ogden((6e5, -1e4), (1.3, -2.0), 2e8),
     mpm.Snow: mpm.Snow(1.4e5, 0.2, hardening=7.0),
     mpm.VonMises: mpm.VonMises(2e11, 0.3, yield_stress=2.5e8, hardening_modulus=1e9),
     mpm.DruckerPrager: mpm.DruckerPrager(3.5e5, 0.3, friction_angle=0.6),

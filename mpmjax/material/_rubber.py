@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
+from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
 from mpmjax.checks import require, require_fields, require_finite, require_positive, require_that
 from mpmjax.linalg import PowerLessOne
 from mpmjax.material._base import AbstractMaterial
@@ -277,13 +277,13 @@ class Ogden(AbstractRubber):
     uniaxial and biaxial tests tell apart; K as for `MooneyRivlin`.
 
     Args:
-        moduli: μ_k [Pa], a tuple with one entry a term, all of them one value or all of them one per particle (p,).
+        moduli: μ_k [Pa], a tuple with one number a term.
         exponents: α_k [-], not zero, likewise.
         bulk_modulus: K [Pa].
     """
 
-    moduli: tuple[PerParticle, ...]
-    exponents: tuple[PerParticle, ...]
+    moduli: tuple[Scalar, ...]
+    exponents: tuple[Scalar, ...]
     bulk_modulus: PerParticle
 
     def __check_init__(self):
@@ -293,8 +293,10 @@ class Ogden(AbstractRubber):
             terms == len(self.exponents) > 0,
             f"Ogden needs a modulus and an exponent for each of its terms, got {terms} and {len(self.exponents)}.",
         )
-        alike = all(len({jnp.shape(a) for a in entries}) == 1 for entries in (self.moduli, self.exponents))
-        require(alike, "Ogden's moduli must be all numbers or all one per particle, and so must its exponents.")
+        single = all(jnp.ndim(a) == 0 for a in (*self.moduli, *self.exponents))
+        require(
+            single, "Ogden's moduli and exponents must be single numbers, not one per particle: use several materials."
+        )
         for modulus, exponent in zip(self.moduli, self.exponents, strict=True):
             require_finite("Ogden's moduli [Pa]", modulus)
             require_finite("Ogden's exponents", exponent)
@@ -307,7 +309,7 @@ class Ogden(AbstractRubber):
         require_positive("Ogden's bulk_modulus [Pa]", self.bulk_modulus)
 
     @property
-    def shear_modulus(self) -> PerParticle:
+    def shear_modulus(self) -> Scalar:
         """μ = ½ Σ_k μ_k α_k [Pa]."""
         return sum(modulus * exponent for modulus, exponent in zip(self.moduli, self.exponents, strict=True)) / 2
 
