@@ -6,7 +6,6 @@ isochoric deformation are Ī1 = T_2 and Ī2 = T_−2, and the sums of other powe
 """
 
 import abc
-from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -48,7 +47,7 @@ class AbstractPowerSum(eqx.Module):
 class FirstInvariant(AbstractPowerSum):
     """Ī1 = T_2."""
 
-    exponent: ClassVar[int] = 2
+    exponent: PerParticle = eqx.field(static=True, default=2)
 
     def strain(self, F: Matrix, log_J: Array) -> Matrix:
         """J^−2/3 C − I."""
@@ -58,7 +57,7 @@ class FirstInvariant(AbstractPowerSum):
 class SecondInvariant(AbstractPowerSum):
     """Ī2 = T_−2."""
 
-    exponent: ClassVar[int] = -2
+    exponent: PerParticle = eqx.field(static=True, default=-2)
 
     def strain(self, F: Matrix, log_J: Array) -> Matrix:
         """J^2/3 C⁻¹ − I, by the cofactor matrix J F⁻ᵀ."""

@@ -35,13 +35,12 @@ class AbstractRubber(AbstractMaterial):
     isochoric stretches λ̄_i = J^−1/3 λ_i. Every law here is of this form, and gives the exponents and functions w_k.
 
     P = F⁻ᵀ S with S = Σ_k w_k' α (C̄^{α/2} − (1 + E_k/3) I) + K/2 (J² − 1) I. In two dimensions and in one the stretches
-    normal to F are one: plane and uniaxial strain, of the same K.
+    normal to F are one: plane and uniaxial strain, of the same K. At small strains the law is Hooke's, with K and
+    μ = ½ Σ_k w_k'(0) α².
     """
 
     bulk_modulus: eqx.AbstractVar[PerParticle]
     """K [Pa]."""
-    shear_modulus: eqx.AbstractVar[PerParticle]
-    """μ [Pa] at small strains, ½ Σ_k w_k'(0) α²."""
 
     @abc.abstractmethod
     def sums(self) -> tuple[AbstractPowerSum, ...]:
@@ -54,11 +53,6 @@ class AbstractRubber(AbstractMaterial):
         Args:
             excess: E_k [-], each of shape (*p).
         """
-
-    @property
-    def lame_lambda(self) -> PerParticle:
-        """λ = K − 2/3 μ [Pa], at small strains."""
-        return self.bulk_modulus - 2 / 3 * self.shear_modulus
 
     def energy(self, F: Matrix) -> Array:
         """Ψ = Σ_k w_k(E_k) + K/4 (J² − 1 − 2 ln J)."""
