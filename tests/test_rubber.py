@@ -14,6 +14,7 @@ from helpers import RUBBER, assert_close, rotation_matrix, thorough
 from scipy.optimize import brentq
 
 import mpmjax as mpm
+from mpmjax.cli._fit_file import read_fit
 from mpmjax.verification import tension
 
 EACH_LAW = pytest.mark.parametrize("name", RUBBER)
@@ -257,3 +258,17 @@ def test_the_example_runs(tmp_path):
     ran = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
     assert "uniaxial, nominal stress [Pa]" in ran.stdout
+
+
+@pytest.mark.slow
+def test_the_uniaxial_file_finds_what_the_closed_form_finds():
+    """At a fixed Poisson's ratio stresses are E times a function of the stretch, so that E is linear least squares."""
+    asked = read_fit(Path(__file__).parents[1] / "examples" / "rubber_uniaxial.toml")
+    (curve,) = asked.experiments[0].observations
+    law = mpm.NeoHookean(1.0, 0.49)
+    of_unit, stress = np.array([across(law, x, 3) for x in curve.against[1]]), curve.data
+    expected = of_unit @ stress / (of_unit @ of_unit)
+    found = mpm.fit(asked.experiments, asked.parameters)["youngs_modulus"]
+    np.testing.assert_allclose(found.value, expected, rtol=5e-4)
+    noise = np.sqrt(((stress - expected * of_unit) ** 2).sum() / (len(stress) - 1))
+    np.testing.assert_allclose(found.error, noise / np.sqrt(of_unit @ of_unit), rtol=0.02)
