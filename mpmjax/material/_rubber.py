@@ -287,10 +287,6 @@ class Ogden(AbstractRubber):
             terms == len(self.exponents) > 0,
             f"Ogden needs a modulus and an exponent for each of its terms, got {terms} and {len(self.exponents)}.",
         )
-        single = all(jnp.ndim(a) == 0 for a in (*self.moduli, *self.exponents))
-        require(
-            single, "Ogden's moduli and exponents must be single numbers, not one per particle: use several materials."
-        )
         for modulus, exponent in zip(self.moduli, self.exponents, strict=True):
             require_finite("Ogden's moduli [Pa]", modulus)
             require_finite("Ogden's exponents", exponent)
