@@ -128,11 +128,15 @@ from mpmjax.material import (
     DruckerPrager,
     FixedCorotated,
     Fluid,
+    Gent,
     Hencky,
+    MooneyRivlin,
     NeoHookean,
+    Ogden,
     Snow,
     Viscous,
     VonMises,
+    Yeoh,
 )
 from mpmjax.simulation import Fault, Run, SimulationError, rollout, simulate
 from mpmjax.state import AbstractBodyForce, Particles, Scene, TotalLagrangian, UpdatedLagrangian, fill, join, prepare
@@ -183,6 +187,10 @@ __all__ = [  # noqa: RUF022 (grouped)
     "FixedCorotated",
     "Hencky",
     "NeoHookean",
+    "MooneyRivlin",
+    "Yeoh",
+    "Gent",
+    "Ogden",
     "Snow",
     "CamClay",
     "DruckerPrager",

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from helpers import DESCRIPTIONS, ELASTIC, FLUIDS, PLASTIC, VISCOUS, block
+from helpers import DESCRIPTIONS, ELASTIC, FLUIDS, PLASTIC, RUBBER, VISCOUS, block
 
 import mpmjax as mpm
 from mpmjax.boundary._contact import ConstrainedNodes
@@ -27,7 +27,7 @@ UPDATES = {
     "trbdf2_newton": mpm.TRBDF2(0.2, mpm.Newton(TIGHT, rtol=1e-14), adjoint_solver=TIGHT),
 }
 DX, DT, STEPS = 0.1, 1e-2, 20
-ALL_LAWS = ELASTIC | PLASTIC | FLUIDS | VISCOUS
+ALL_LAWS = ELASTIC | RUBBER | PLASTIC | FLUIDS | VISCOUS
 KINKED = (*PLASTIC, "fluid")
 """Laws whose return map does something."""
 

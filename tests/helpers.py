@@ -23,6 +23,13 @@ LAWS = {
 }
 ELASTIC = LAWS | {"hencky": mpm.Hencky(youngs_modulus=1e4, poisson_ratio=0.3)}
 """All elastic laws, for what is cheap or a law's own; `LAWS` for what is multiplied by other choices."""
+RUBBER = {
+    "mooney_rivlin": mpm.MooneyRivlin(1.5e3, 5e2, bulk_modulus=2e4),
+    "yeoh": mpm.Yeoh(2e3, -50.0, 5.0, bulk_modulus=2e4),
+    "gent": mpm.Gent(4e3, limit=10.0, bulk_modulus=2e4),
+    "ogden": mpm.Ogden((2e3, -500.0), (1.8, -2.5), bulk_modulus=2e4),
+}
+"""Laws of rubber, which are of one form (`AbstractRubber`)."""
 PLASTIC = {
     "snow": mpm.Snow(1e4, 0.2, critical_compression=2.5e-2, critical_stretch=7.5e-3, hardening=10.0),
     "von_mises": mpm.VonMises(1e4, 0.3, yield_stress=400.0, hardening_modulus=1e3),

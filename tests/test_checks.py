@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ELASTIC, FLUIDS, METHODS, PLASTIC, SECOND_ORDER, VISCOUS, block, ids
+from helpers import ELASTIC, FLUIDS, METHODS, PLASTIC, RUBBER, SECOND_ORDER, VISCOUS, block, ids
 
 import mpmjax as mpm
 from mpmjax.checks._values import canonical, first_unmet, requirements
@@ -18,7 +18,7 @@ MOTION = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.1, 0.1)))
 TURN = mpm.RigidMotion((0.0, 1.0), ((0.0, 0.0), (0.1, 0.1)), (0.0, 1.0), (0.2, 0.2))
 BALL = mpm.Ball((0.2, 0.2), 0.1)
 MODULES = {
-    **(ELASTIC | PLASTIC | FLUIDS | VISCOUS),
+    **(ELASTIC | RUBBER | PLASTIC | FLUIDS | VISCOUS),
     **(METHODS | SECOND_ORDER),
     "tait": Tait(1e4),
     "tolerances": mpm.BackwardEuler(mpm.Newton(mpm.ConjugateResidual(1e-3, 1e-6), 1e-8)),

@@ -47,7 +47,21 @@ from mpmjax.implicit import (
     MassPreconditioner,
     Newton,
 )
-from mpmjax.material import CamClay, DruckerPrager, FixedCorotated, Fluid, Hencky, NeoHookean, Snow, Viscous, VonMises
+from mpmjax.material import (
+    CamClay,
+    DruckerPrager,
+    FixedCorotated,
+    Fluid,
+    Gent,
+    Hencky,
+    MooneyRivlin,
+    NeoHookean,
+    Ogden,
+    Snow,
+    Viscous,
+    VonMises,
+    Yeoh,
+)
 from mpmjax.state import Scene, TotalLagrangian, UpdatedLagrangian
 from mpmjax.stepping import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
 
@@ -55,6 +69,7 @@ CLASSES: tuple[type, ...] = (
     Scene,
     Grid,
     *(FixedCorotated, NeoHookean, Hencky),
+    *(MooneyRivlin, Yeoh, Gent, Ogden),
     *(Snow, VonMises, DruckerPrager, CamClay, Fluid, Viscous),
     *(StickyBox, SlipBox, SeparatingBox, Grip, SymmetryPlane, ContactPlane),
     *(StickyCollider, SlipCollider, SeparatingCollider),

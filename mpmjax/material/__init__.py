@@ -8,6 +8,7 @@ from mpmjax.material._fluid import Fluid, Tait
 from mpmjax.material._hencky import Hencky
 from mpmjax.material._kinematics import AbstractKinematics, DeformationGradient, VolumeRatio
 from mpmjax.material._law import AbstractElastic, AbstractInelastic, AbstractLaw
+from mpmjax.material._rubber import AbstractRubber, Gent, MooneyRivlin, Ogden, Yeoh
 from mpmjax.material._snow import Snow, SnowElasticity, SnowHistory
 from mpmjax.material._tangent import AbstractTangent, MatrixTangent, PrincipalTangent, VolumetricTangent
 from mpmjax.material._viscosity import Viscosity
@@ -22,6 +23,7 @@ __all__ = [
     "AbstractKinematics",
     "AbstractLaw",
     "AbstractMaterial",
+    "AbstractRubber",
     "AbstractTangent",
     "AbstractVolumetric",
     "CamClay",
@@ -31,9 +33,12 @@ __all__ = [
     "DruckerPragerHistory",
     "FixedCorotated",
     "Fluid",
+    "Gent",
     "Hencky",
     "MatrixTangent",
+    "MooneyRivlin",
     "NeoHookean",
+    "Ogden",
     "PrincipalTangent",
     "Snow",
     "SnowElasticity",
@@ -45,4 +50,5 @@ __all__ = [
     "VolumetricTangent",
     "VonMises",
     "VonMisesHistory",
+    "Yeoh",
 ]

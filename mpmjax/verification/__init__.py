@@ -15,6 +15,7 @@ from mpmjax.verification._problem import (
     stress_error,
 )
 from mpmjax.verification._refinement import errors, orders
+from mpmjax.verification._tension import tension
 from mpmjax.verification._vortex import Vortex
 from mpmjax.verification._wave import StandingWave
 
@@ -34,4 +35,5 @@ __all__ = [
     "errors",
     "orders",
     "stress_error",
+    "tension",
 ]

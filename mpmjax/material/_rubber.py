@@ -1,0 +1,313 @@
+"""Laws of rubber: Mooney-Rivlin, Yeoh, Gent and Ogden."""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mpmjax import linalg as la
+from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
+from mpmjax.checks import require, require_fields, require_finite, require_positive, require_that
+from mpmjax.linalg import PowerLessOne
+from mpmjax.material._base import AbstractMaterial
+from mpmjax.material._power_sum import AbstractPowerSum, FirstInvariant, PowerSum, SecondInvariant
+from mpmjax.material._tangent import PrincipalTangent
+
+
+class Work(NamedTuple):
+    """What a power sum T adds to the energy, as a function w of E = T − 3."""
+
+    energy: Array
+    """w [Pa]."""
+    slope: Array
+    """dw/dE [Pa]."""
+    curvature: Array
+    """d²w/dE² [Pa]."""
+
+
+class AbstractRubber(AbstractMaterial):
+    """A nearly incompressible law: an energy of the isochoric stretches (P. J. Flory, Trans. Faraday Soc. 57 (1961)
+    829, doi 10.1039/tf9615700829), and one of the volume, convex and without bound at J = 0 (J. C. Simo, R. L. Taylor,
+    K. S. Pister, Comput. Methods Appl. Mech. Eng. 51 (1985) 177, doi 10.1016/0045-7825(85)90033-7).
+
+    Ψ = Σ_k w_k(E_k) + K/4 (J² − 1 − 2 ln J), where E_k = λ̄_1^α + λ̄_2^α + λ̄_3^α − 3 of an exponent α = α_k, with the
+    isochoric stretches λ̄_i = J^−1/3 λ_i. Every law here is of this form, and gives the exponents and functions w_k.
+
+    P = F⁻ᵀ S with S = Σ_k w_k' α (C̄^{α/2} − (1 + E_k/3) I) + K/2 (J² − 1) I. In two dimensions and in one the stretches
+    normal to F are one: plane and uniaxial strain, of the same K. At small strains the law is Hooke's, with K and
+    μ = ½ Σ_k w_k'(0) α².
+    """
+
+    bulk_modulus: eqx.AbstractVar[PerParticle]
+    """K [Pa]."""
+
+    @abc.abstractmethod
+    def sums(self) -> tuple[AbstractPowerSum, ...]:
+        """The power sums that the energy depends on."""
+
+    @abc.abstractmethod
+    def work(self, excess: tuple[Array, ...]) -> tuple[Work, ...]:
+        """w_k and its derivatives for each of the sums.
+
+        Args:
+            excess: E_k [-], each of shape (*p).
+        """
+
+    def energy(self, F: Matrix) -> Array:
+        """Ψ = Σ_k w_k(E_k) + K/4 (J² − 1 − 2 ln J)."""
+        J = la.determinant(F)
+        _, excess = self._strains(F, jnp.log(J))
+        volumetric = self.bulk_modulus / 4 * (J**2 - 1 - 2 * jnp.log(J))
+        return sum((part.energy for part in self.work(excess)), volumetric)
+
+    def stress(self, F: Matrix) -> Matrix:
+        """P = F⁻ᵀ S, S = Σ_k w_k' α (C̄^{α/2} − (1 + E_k/3) I) + K/2 (J² − 1) I."""
+        J, identity = la.determinant(F), la.identity_like(F)
+        strains, excess = self._strains(F, jnp.log(J))
+        S = self.bulk_modulus / 2 * (J**2 - 1) * identity
+        for power, strain, E, part in zip(self.sums(), strains, excess, self.work(excess), strict=True):
+            S = S + power.exponent * part.slope * (strain - E / 3 * identity)
+        return la.matmul(la.cofactor(F), S) / J
+
+    def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
+        """With p_i = λ̄_i^α − 1 and e_i = p_i − E/3: τ_i = Σ_k w' α e_i + K/2 (J² − 1),
+        ∂τ_i/∂ln s_j = Σ_k α² (w'' e_i e_j + w' ((1 + p_i)(δ_ij − 1/3) − e_j/3)) + K J²; scaling
+        (∂τ_i/∂ln s_j − δ_ij τ_i)/(s_i s_j), twist (τ_i/s_i + τ_j/s_j)/(s_i + s_j), flip
+        (s_j (τ_i − τ_j)/(s_i − s_j) − τ_j)/(s_i s_j)."""
+        d, J = len(s), s.prod(axis=0)
+        sums, log_J = self.sums(), jnp.log(J)
+        powers = [PowerLessOne(one.exponent * jnp.ones_like(J), -one.exponent / 3 * log_J) for one in sums]
+        p = [power.of(s) for power in powers]
+        excess = tuple(one.excess(part.sum(axis=0), log_J, d) for one, part in zip(sums, p, strict=True))
+        e = [part - E / 3 for part, E in zip(p, excess, strict=True)]
+        terms = [*zip([one.exponent for one in sums], self.work(excess), powers, p, e, strict=True)]
+        tau = sum((a * w.slope * e for a, w, _, _, e in terms), self.bulk_modulus / 2 * (J**2 - 1))
+
+        def growth(i: int, j: int) -> Array:
+            """∂τ_i/∂ln s_j."""
+            own = [
+                a**2 * (w.curvature * e[i] * e[j] + w.slope * ((1 + p[i]) * ((i == j) - 1 / 3) - e[j] / 3))
+                for a, w, _, p, e in terms
+            ]
+            return sum(own, self.bulk_modulus * J**2)
+
+        def scaling(i: int, j: int) -> Array:
+            return (growth(i, j) - (tau[i] if i == j else 0)) / (s[i] * s[j])
+
+        def twist(i: int, j: int) -> Array:
+            return (tau[i] / s[i] + tau[j] / s[j]) / (s[i] + s[j])
+
+        def flip(i: int, j: int) -> Array:
+            slope = sum(a * w.slope * power.slope(s[j], s[i]) for a, w, power, _, _ in terms)
+            return (s[j] * slope - tau[j]) / (s[i] * s[j])
+
+        return PrincipalTangent.of(s, twist, flip, scaling)
+
+    def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
+        """J > 0."""
+        return la.determinant(F) > 0
+
+    def _strains(self, F: Matrix, log_J: Array) -> tuple[tuple[Matrix, ...], tuple[Array, ...]]:
+        """C̄^{α/2} − I and E of each power sum."""
+        sums = self.sums()
+        strains = tuple(one.strain(F, log_J) for one in sums)
+        excess = tuple(one.excess(la.trace(A), log_J, len(F)) for one, A in zip(sums, strains, strict=True))
+        return strains, excess
+
+
+def _linear(slope: PerParticle, E: Array) -> Work:
+    """w = slope E."""
+    return Work(slope * E, slope * jnp.ones_like(E), jnp.zeros_like(E))
+
+
+class MooneyRivlin(AbstractRubber):
+    """Mooney-Rivlin rubber (M. Mooney, J. Appl. Phys. 11 (1940) 582, doi 10.1063/1.1712836; R. S. Rivlin, Phil. Trans.
+    R. Soc. A 241 (1948) 379, doi 10.1098/rsta.1948.0024).
+
+    Ψ = C1 (Ī1 − 3) + C2 (Ī2 − 3) + K/4 (J² − 1 − 2 ln J), μ = 2 (C1 + C2). With C2 = 0 it is the neo-Hookean law with
+    its volume apart.
+
+    *When it breaks*: it needs J > 0. It follows a tension test to a stretch of about 2 or 3: it has no upturn, and
+    overestimates equibiaxial tension with the C2 of a uniaxial test alone. With C2 < 0 it loses stability at some
+    stretch.
+    *Good values*: soft rubber C1 = 0.1 to 0.3 MPa and C2 = 0 to C1, K = 2 GPa; K of 100 to 1000 μ where pressures are
+    far below K.
+
+    Args:
+        c1: C1 [Pa], one value or one per particle (p,).
+        c2: C2 [Pa], likewise; C1 + C2 must be positive.
+        bulk_modulus: K [Pa].
+    """
+
+    c1: PerParticle
+    c2: PerParticle
+    bulk_modulus: PerParticle
+
+    def __check_init__(self):
+        require_fields(self)
+        require_finite("MooneyRivlin's c1 [Pa]", self.c1)
+        require_finite("MooneyRivlin's c2 [Pa]", self.c2)
+        require_that("MooneyRivlin's c1 and c2 [Pa] must have a positive sum", lambda a, b: a + b > 0, self.c1, self.c2)
+        require_positive("MooneyRivlin's bulk_modulus [Pa]", self.bulk_modulus)
+
+    @property
+    def shear_modulus(self) -> PerParticle:
+        """μ = 2 (C1 + C2) [Pa]."""
+        return 2 * (self.c1 + self.c2)
+
+    def sums(self) -> tuple[AbstractPowerSum, ...]:
+        """Ī1 and Ī2."""
+        return FirstInvariant(), SecondInvariant()
+
+    def work(self, excess: tuple[Array, ...]) -> tuple[Work, ...]:
+        """C1 E_1 and C2 E_2."""
+        return _linear(self.c1, excess[0]), _linear(self.c2, excess[1])
+
+
+class Yeoh(AbstractRubber):
+    """Yeoh's rubber (O. H. Yeoh, Rubber Chem. Technol. 66 (1993) 754, doi 10.5254/1.3538343).
+
+    Ψ = C1 E + C2 E² + C3 E³ + K/4 (J² − 1 − 2 ln J) with E = Ī1 − 3, and μ = 2 C1.
+
+    *When it breaks*: it needs J > 0. With C2 or C3 < 0 it may soften and lose stability at some stretch: keep
+    C1 + 2 C2 E + 3 C3 E² positive over the stretches in use. It knows Ī1 alone, and so underestimates equibiaxial
+    tension at small stretches.
+    *Good values*: C2 near −C1/100, C3 near C1/10 000 for gum rubber; K as for `MooneyRivlin`.
+
+    Args:
+        c1: C1 [Pa], positive, one value or one per particle (p,).
+        c2: C2 [Pa], likewise.
+        c3: C3 [Pa], likewise.
+        bulk_modulus: K [Pa].
+    """
+
+    c1: PerParticle
+    c2: PerParticle
+    c3: PerParticle
+    bulk_modulus: PerParticle
+
+    def __check_init__(self):
+        require_fields(self)
+        require_positive("Yeoh's c1 [Pa]", self.c1)
+        require_finite("Yeoh's c2 [Pa]", self.c2)
+        require_finite("Yeoh's c3 [Pa]", self.c3)
+        require_positive("Yeoh's bulk_modulus [Pa]", self.bulk_modulus)
+
+    @property
+    def shear_modulus(self) -> PerParticle:
+        """μ = 2 C1 [Pa]."""
+        return 2 * self.c1
+
+    def sums(self) -> tuple[AbstractPowerSum, ...]:
+        """Ī1."""
+        return (FirstInvariant(),)
+
+    def work(self, excess: tuple[Array, ...]) -> tuple[Work, ...]:
+        """C1 E + C2 E² + C3 E³."""
+        (E,) = excess
+        c1, c2, c3 = self.c1, self.c2, self.c3
+        return (Work(E * (c1 + E * (c2 + E * c3)), c1 + E * (2 * c2 + 3 * E * c3), 2 * c2 + 6 * E * c3),)
+
+
+class Gent(AbstractRubber):
+    """Gent's rubber, whose chains can be stretched so far and no farther (A. N. Gent, Rubber Chem. Technol. 69 (1996)
+    59, doi 10.5254/1.3538357).
+
+    Ψ = −μ J_m/2 ln(1 − (Ī1 − 3)/J_m) + K/4 (J² − 1 − 2 ln J).
+
+    *When it breaks*: it needs J > 0 and Ī1 − 3 < J_m; a step that takes a particle beyond is reported, and a fit does
+    not take parameters at which that happens. Near the limit it stiffens without bound, and steps must shrink. It knows
+    Ī1 alone, as `Yeoh` does.
+    *Good values*: J_m = 30 to 100 for rubber, below 3 for tissue; μ = 0.2 to 2 MPa; K as for `MooneyRivlin`.
+
+    Args:
+        shear_modulus: μ [Pa], one value or one per particle (p,).
+        limit: J_m [-], the largest Ī1 − 3, likewise.
+        bulk_modulus: K [Pa].
+    """
+
+    shear_modulus: PerParticle
+    limit: PerParticle
+    bulk_modulus: PerParticle
+
+    def __check_init__(self):
+        require_fields(self)
+        require_positive("Gent's shear_modulus [Pa]", self.shear_modulus)
+        require_positive("Gent's limit", self.limit)
+        require_positive("Gent's bulk_modulus [Pa]", self.bulk_modulus)
+
+    def sums(self) -> tuple[AbstractPowerSum, ...]:
+        """Ī1."""
+        return (FirstInvariant(),)
+
+    def work(self, excess: tuple[Array, ...]) -> tuple[Work, ...]:
+        """−μ J_m/2 ln(1 − E/J_m)."""
+        (E,) = excess
+        half, left = self.shear_modulus / 2, 1 - E / self.limit
+        return (Work(-half * self.limit * jnp.log1p(-E / self.limit), half / left, half / self.limit / left**2),)
+
+    def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
+        """J > 0 and Ī1 − 3 < J_m."""
+        J = la.determinant(F)
+        positive = J > 0
+        _, (excess,) = self._strains(F, jnp.log(jnp.where(positive, J, 1)))
+        return positive & (excess < self.limit)
+
+    def inadmissible(self, or_else: str) -> tuple[str, str]:
+        what = "has a deformation gradient that Gent does not allow (det F ≤ 0, or a stretch beyond its limit)"
+        return what, f"Reduce dt{or_else}, or raise the limit."
+
+
+class Ogden(AbstractRubber):
+    """Ogden's rubber (R. W. Ogden, Proc. R. Soc. Lond. A 326 (1972) 565, doi 10.1098/rspa.1972.0026).
+
+    Ψ = Σ_k μ_k/α_k (λ̄_1^α_k + λ̄_2^α_k + λ̄_3^α_k − 3) + K/4 (J² − 1 − 2 ln J), μ = ½ Σ_k μ_k α_k.
+
+    *When it breaks*: it needs J > 0. It is stable at every stretch if each μ_k α_k is positive. Two exponents of one
+    sign are nearly the same to data of one kind of test: fit several kinds together. Each particle needs an eigenvalue
+    problem; where the exponents are 2 and −2, `MooneyRivlin` is the same law without.
+    *Good values*: two or three terms, one exponent 1 to 2, one 4 to 6 for the upturn, one negative near −2 for what
+    uniaxial and biaxial tests tell apart; K as for `MooneyRivlin`.
+
+    Args:
+        moduli: μ_k [Pa], a tuple with one number a term.
+        exponents: α_k [-], not zero, likewise.
+        bulk_modulus: K [Pa].
+    """
+
+    moduli: tuple[Scalar, ...]
+    exponents: tuple[Scalar, ...]
+    bulk_modulus: PerParticle
+
+    def __check_init__(self):
+        require_fields(self)
+        terms = len(self.moduli)
+        require(
+            terms == len(self.exponents) > 0,
+            f"Ogden needs a modulus and an exponent for each of its terms, got {terms} and {len(self.exponents)}.",
+        )
+        for modulus, exponent in zip(self.moduli, self.exponents, strict=True):
+            require_finite("Ogden's moduli [Pa]", modulus)
+            require_finite("Ogden's exponents", exponent)
+            require_that("Ogden's exponents must not be zero", lambda a: a != 0, exponent)
+        require_that(
+            "Ogden's moduli [Pa] times their exponents must have a positive sum",
+            lambda *a: sum(a[k] * a[k + terms] for k in range(terms)) > 0,
+            *(self.moduli + self.exponents),
+        )
+        require_positive("Ogden's bulk_modulus [Pa]", self.bulk_modulus)
+
+    @property
+    def shear_modulus(self) -> Scalar:
+        """μ = ½ Σ_k μ_k α_k [Pa]."""
+        return sum(modulus * exponent for modulus, exponent in zip(self.moduli, self.exponents, strict=True)) / 2
+
+    def sums(self) -> tuple[AbstractPowerSum, ...]:
+        """One for each term."""
+        return tuple(PowerSum(exponent) for exponent in self.exponents)
+
+    def work(self, excess: tuple[Array, ...]) -> tuple[Work, ...]:
+        """μ_k/α_k E_k."""
+        each = zip(self.moduli, self.exponents, excess, strict=True)
+        return tuple(_linear(modulus / exponent, E) for modulus, exponent, E in each)
