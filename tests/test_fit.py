@@ -337,7 +337,7 @@ def test_a_step_at_which_the_simulation_fails_is_not_taken():
         def dtype(self):
             return jnp.float64
 
-        def jacobian(self, z, sigmas):
+        def jacobian(self, z, sigmas, mode=None):
             far = jnp.where(z < 1, z, jnp.nan)
             return 100 * ((0.3 + far) ** 3 - 0.5), 100 * (3 * (0.3 + far) ** 2)[:, None]
 

@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 
 from mpmjax._types import Array, Scalar
 from mpmjax.checks import canonical, checked, is_traced, require
@@ -83,8 +84,13 @@ class Experiment(eqx.Module):
             name=self.name,
         )
 
-    def run(self, *, adjoint: Any = None, throw: bool = True) -> Run:
-        """The simulation of it, with what its observations observe after each step."""
+    @property
+    def observed_shape(self) -> Any:
+        """The shape of what its observations need of one state."""
+        return jax.eval_shape(_Observe(self.observations), self.scene, self.particles)
+
+    def run(self, *, adjoint: Any = None, throw: bool = True, checkpoint_bytes: int = 2**28) -> Run:
+        """The simulation of it, with what its observations observe after each step (see `simulate`)."""
         return simulate(
             self.scene,
             self.particles,
@@ -93,6 +99,7 @@ class Experiment(eqx.Module):
             method=self.method,
             observe=_Observe(self.observations),
             adjoint=adjoint,
+            checkpoint_bytes=checkpoint_bytes,
             throw=throw,
         )
 

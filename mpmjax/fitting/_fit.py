@@ -11,14 +11,14 @@ import numpy as np
 
 from mpmjax._types import Array, Scalar
 from mpmjax.checks import checked, require, warn
+from mpmjax.fitting._choice import chosen_optimiser
 from mpmjax.fitting._estimates import fit_result, noise_factors
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._result import FitResult
-from mpmjax.fitting._search import Iteration, Minimum, NoDerivativeError, search
+from mpmjax.fitting._search import Iteration, Minimum, NoDerivativeError, influence, search
 
 
 @checked
@@ -28,7 +28,8 @@ def fit(
     *,
     report: dict[str, Callable[[Experiment], Any]] | None = None,
     level: Scalar = 0.95,
-    optimiser: AbstractOptimiser = LevenbergMarquardt(),
+    optimiser: AbstractOptimiser | None = None,
+    memory: int = 2**28,
     progress: Callable[[str], None] | None = None,
 ) -> FitResult:
     """Fit parameters of a scene to what was observed of it, with standard errors.
@@ -43,9 +44,9 @@ def fit(
         })
         print(result)
 
-    The least sum of squares of (simulated − measured)/σ over all observations of all experiments is searched by the
-    Levenberg-Marquardt method (optimistix), its Jacobian by forward mode through every step and every implicit solve.
-    A step at which a simulation fails is not taken. Where an observation gives no σ, it is estimated: as
+    The least sum of squares of (simulated − measured)/σ over all observations of all experiments is searched: with few
+    parameters, or few measured numbers, by the Levenberg-Marquardt method (optimistix), with many by L-BFGS (optax),
+    with derivatives through every step and every implicit solve. A step at which a simulation fails is not taken. Where an observation gives no σ, it is estimated: as
     √(Σ r²/(m − n)) of one observation, and of several so that each explains its own misfit, in rounds.
 
     Errors are those of the Gauss-Newton Hessian (JᵀJ)⁻¹: what the noise of the data, independent and normal, does to
@@ -57,7 +58,8 @@ def fit(
         parameters: what is fitted, by name.
         report: what else to report with its error, by name: functions of an experiment that return one number.
         level: of the intervals [-].
-        optimiser: the method of the search.
+        optimiser: the method of the search. Default: `LevenbergMarquardt` where its Jacobian is cheap, else `LBFGS`.
+        memory: for checkpoints of reverse mode, and for the tangents of forward mode that are made at once [B].
         progress: called with a line an iteration, such as `print`.
 
     Raises:
@@ -66,7 +68,9 @@ def fit(
         SimulationError: the simulation at the first guess meets a fault.
         RuntimeError: there is no derivative.
     """
-    problem = FitProblem((experiments,) if isinstance(experiments, Experiment) else tuple(experiments), parameters)
+    several = (experiments,) if isinstance(experiments, Experiment) else tuple(experiments)
+    problem = FitProblem(several, parameters, memory)
+    optimiser = chosen_optimiser(problem) if optimiser is None else optimiser
     require((level > 0) & (level < 1), f"level must lie between 0 and 1, got {level}.")
     level = float(level)
     begun = time.perf_counter()
@@ -91,7 +95,7 @@ def fit(
         if not changing or problem.scales_alike or not found.converged or rounds == _MOST_ROUNDS:
             break
     result = fit_result(problem, found, factors, freedom, sigmas, report, level)
-    result = replace(result, history=history)
+    result = replace(result, history=history, optimiser=optimiser)
     if not found.converged:
         stopped = "was interrupted" if found.interrupted else "did not converge"
         advice = "" if found.interrupted else f" {_ADVICE}"
@@ -129,7 +133,7 @@ def _search(
         found = search(problem, optimiser, z, sigmas, report=say, begun=begun)
     except NoDerivativeError:
         raise RuntimeError(
-            "The fit has no derivative. Either the tangent solve of a step did not converge: raise the max_steps of "
+            "The fit has no derivative. Either the tangent or adjoint solve of a step did not converge: raise the max_steps of "
             "the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner(). Or a law or an "
             "observation cannot be differentiated where the run takes it."
         ) from None
@@ -146,14 +150,26 @@ def _require_influence(problem: FitProblem, sigmas: tuple[Array, ...], seen: Eva
     Raises:
         ValueError: they do not.
     """
-    rounding = _ROUNDINGS * float(jnp.finfo(problem.dtype).eps) * problem.size_of_data(sigmas)
-    size = np.linalg.norm(np.asarray(seen.jacobian), axis=0)
-    unseen = [label for label, column in zip(problem.labels, size, strict=True) if column <= rounding]
+    rounding = _ROUNDINGS * float(jnp.finfo(problem.dtype).eps) * float(problem.size_of_data(sigmas))
+    if seen.jacobian is None:
+        # |Jᵀr| ≤ ‖r‖ times a column's length: where it is not small, the column is not.
+        size = np.abs(np.asarray(seen.gradient)) / max(np.sqrt(2 * float(seen.cost)), np.finfo(float).tiny)
+        if (size <= rounding).any():
+            size = influence(problem, jnp.zeros(problem.size, problem.dtype), sigmas)
+    else:
+        size = np.linalg.norm(np.asarray(seen.jacobian), axis=0)
+    unseen = [label for label, length in zip(problem.labels, size, strict=True) if length <= rounding]
     require(
         not unseen,
-        f"The data do not depend on {', '.join(unseen)}: their derivative by it is zero but for rounding. Leave it "
+        f"The data do not depend on {_listed(unseen)}: their derivative by it is zero but for rounding. Leave it "
         "out, give it a prior, or observe what it changes.",
     )
+
+
+def _listed(names: list[str]) -> str:
+    """The first names, and how many there are besides."""
+    more = len(names) - _MOST_NAMES
+    return ", ".join(names[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def _line(problem: FitProblem, iteration: Iteration, seconds: float) -> str:
@@ -170,6 +186,7 @@ def _line(problem: FitProblem, iteration: Iteration, seconds: float) -> str:
 _NOISE_RTOL = 1e-3
 """The noise of several observations is settled when its estimate changes less, relatively."""
 _MOST_ROUNDS = 20
+_MOST_NAMES = 6
 _LEAST = 1e-12
 """Smallest noise, in sizes of the data: exact data have none."""
 _ROUNDINGS = 10

@@ -59,3 +59,8 @@ class AbstractOptimiser(eqx.Module):
     @abc.abstractmethod
     def has_converged(self, state: Any, seen: Evaluation) -> bool:
         """Whether the search is at a minimum."""
+
+    def has_stalled(self, state: Any) -> bool:
+        """Whether the search goes no further, and is not known to be at a minimum."""
+        del state
+        return False
