@@ -131,9 +131,5 @@ def _flat(arrays: tuple[Array, ...]) -> list[float]:
     return [float(x) for a in arrays for x in np.asarray(a).reshape(-1)]
 
 
-def _flat(arrays: tuple[Array, ...]) -> list[float]:
-    return [float(x) for a in arrays for x in np.asarray(a).reshape(-1)]
-
-
 _IMPROBABLE = 1e-3
 """Probability of a χ² from which the model is said not to explain the data."""

@@ -58,7 +58,8 @@ class LevenbergMarquardt(AbstractOptimiser):
 
     @property
     def _solver(self) -> Any:
-        return optimistix.LevenbergMarquardt(rtol=self.rtol, atol=self.rtol)
+        tolerance: Any = self.rtol
+        return optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
 
 
 def _is_settled(r: np.ndarray, J: np.ndarray) -> bool:
