@@ -69,7 +69,8 @@ class Adam(AbstractOptimiser):
 
         fresh = _MOMENTS.init(z)
         start, from_here, moments = _where(back, (z, slope, fresh), (state.trial, gradient, state.moments))
-        direction, moments = _MOMENTS.update(from_here, moments)
+        with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
+            direction, moments = _MOMENTS.update(from_here, moments)
         factor = jnp.where(back, state.factor / 2, state.factor)
         step = factor * jnp.asarray(self.rate(state.number), z.dtype)
         after = AdamState(

@@ -46,8 +46,9 @@ def fit(
 
     The least sum of squares of (simulated − measured)/σ over all observations of all experiments is searched: with few
     parameters, or few measured numbers, by the Levenberg-Marquardt method (optimistix), with many by L-BFGS (optax),
-    with derivatives through every step and every implicit solve. A step at which a simulation fails is not taken. Where an observation gives no σ, it is estimated: as
-    √(Σ r²/(m − n)) of one observation, and of several so that each explains its own misfit, in rounds.
+    with derivatives through every step and every implicit solve. A step at which a simulation fails is not taken.
+    Where an observation gives no σ, it is estimated: as √(Σ r²/(m − n)) of one observation, and of several so that each
+    explains its own misfit, in rounds.
 
     Errors are those of the Gauss-Newton Hessian (JᵀJ)⁻¹: what the noise of the data, independent and normal, does to
     the parameters. They say nothing of what the law or the discretisation gets wrong, which often is more: fit on two
@@ -133,9 +134,9 @@ def _search(
         found = search(problem, optimiser, z, sigmas, report=say, begun=begun)
     except NoDerivativeError:
         raise RuntimeError(
-            "The fit has no derivative. Either the tangent or adjoint solve of a step did not converge: raise the max_steps of "
-            "the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner(). Or a law or an "
-            "observation cannot be differentiated where the run takes it."
+            "The fit has no derivative. Either the tangent or adjoint solve of a step did not converge: raise the "
+            "max_steps of the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner(). Or a law "
+            "or an observation cannot be differentiated where the run takes it."
         ) from None
     if not np.isfinite(found.history[0].cost):
         for experiment in problem.at(z):

@@ -66,7 +66,8 @@ class LBFGS(AbstractOptimiser):
             return z, state._replace(begun=~state.begun, cost=cost, gradient=gradient)
 
         search = partial(self._search, problem, sigmas)
-        z, state = jax.lax.cond(state.begun, search, start, z, state)
+        with jax.numpy_dtype_promotion("standard"):  # optax mixes integers
+            z, state = jax.lax.cond(state.begun, search, start, z, state)
         return z, state, Evaluation(state.cost, state.gradient)
 
     def has_converged(self, state: "LBFGSState", seen: Evaluation) -> bool:

@@ -16,6 +16,8 @@ _LEAST_FREEDOM = 1e-3
 """Degrees of freedom below which there are none, but rounding."""
 _NODES = 100
 """Of Gauss-Hermite quadrature."""
+_MOST_SAID = 8
+"""Directions and pairs that are named."""
 _NEARLY_ONE = 0.99
 """Correlation from which two parameters are said to be seen only together."""
 
@@ -164,7 +166,8 @@ def seen_together(labels: tuple[str, ...], found: Uncertainty, logarithmic: tupl
             said.append(
                 f"{labels[i]} and {labels[j]}: {abs(rho):.5f} correlated, a change of both {together} is hardly seen."
             )
-    return said
+    more = len(said) - _MOST_SAID
+    return said[:_MOST_SAID] + ([f"There are {more} more such directions and pairs."] if more > 0 else [])
 
 
 def _unseen(parts: list[int], direction: np.ndarray, labels: tuple[str, ...], logarithmic: tuple[bool, ...]) -> str:
