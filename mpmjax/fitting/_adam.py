@@ -110,7 +110,7 @@ class AdamState(NamedTuple):
     """How many simulations in a row found nothing lower."""
 
 
-_MOMENTS = optax.scale_by_adam()
+_MOMENTS: Any = optax.scale_by_adam()
 
 
 def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:

@@ -47,7 +47,7 @@ class Field(AbstractParameter):
         lattice: Grid,
         *,
         kernel: BSpline = BSpline(1),
-        start: Scalar | Value | np.ndarray | None = None,
+        start: Scalar | Value | None = None,
     ):
         self.of, self.lattice, self.kernel = of, lattice, kernel
         self.start = of.start if start is None else start
@@ -72,23 +72,23 @@ class Field(AbstractParameter):
         return Grid(tuple(map(int, shape)), spacing, origin=tuple(map(int, first[0])))
 
     @property
-    def where(self) -> Callable[[Experiment], Any] | None:
+    def where(self) -> Callable[[Experiment], Any] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.of.where
 
     @property
-    def update(self) -> Callable[[Experiment, Value], Experiment] | None:
+    def update(self) -> Callable[[Experiment, Value], Experiment] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.of.update
 
     @property
-    def prior(self) -> AbstractPrior | None:
+    def prior(self) -> AbstractPrior | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.of.prior
 
     @property
-    def unit(self) -> str:
+    def unit(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.of.unit
 
     @property
-    def only(self) -> tuple[int, ...] | None:
+    def only(self) -> tuple[int, ...] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.of.only
 
     @property

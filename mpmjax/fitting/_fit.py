@@ -135,8 +135,8 @@ def _search(
     except NoDerivativeError:
         raise RuntimeError(
             "The fit has no derivative. Either the tangent or adjoint solve of a step did not converge: raise the "
-            "max_steps of the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner(). Or a law "
-            "or an observation cannot be differentiated where the run takes it."
+            "max_steps of the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner(). Or a "
+            "law or an observation cannot be differentiated where the run takes it."
         ) from None
     if not np.isfinite(found.history[0].cost):
         for experiment in problem.at(z):

@@ -87,7 +87,7 @@ class LBFGS(AbstractOptimiser):
         along, past = _where(steep, steepest, newton)
         foreseen = jnp.where(steep, jnp.minimum(state.foreseen, gradient @ along), gradient @ along)
         slack = problem.rounding(cost, sigmas)
-        line = optax.scale_by_zoom_linesearch(self.line_search, approx_dec_rtol=slack / jnp.maximum(cost, slack))
+        line: Any = optax.scale_by_zoom_linesearch(self.line_search, approx_dec_rtol=slack / jnp.maximum(cost, slack))
         step, found = line.update(
             -along, line.init(z), z, value=cost, grad=gradient, value_fn=partial(_cost, problem, sigmas)
         )
@@ -108,7 +108,7 @@ class LBFGS(AbstractOptimiser):
         return _where(moved, (z + step, after), (z, stayed))
 
     @property
-    def _past(self) -> optax.GradientTransformation:
+    def _past(self) -> Any:
         return optax.scale_by_lbfgs(self.memory)
 
 
