@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, ParticleScalar, ParticleVector, Scalar
-from mpmjax.checks import canonical, require, require_finite, require_positive
+from mpmjax.checks import canonical, checked, require, require_finite, require_positive
 from mpmjax.discretisation import BSpline, Grid, SplineGradient, gather, in_window, make_stencil
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._parameter import AbstractParameter
@@ -41,6 +41,7 @@ class Field(AbstractParameter):
     kernel: BSpline
     start: Scalar | Value | None
 
+    @checked
     def __init__(
         self,
         of: AbstractParameter,
@@ -73,22 +74,27 @@ class Field(AbstractParameter):
 
     @property
     def where(self) -> Callable[[Experiment], Any] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The leaf, or the tuple of leaves, that takes the values on particles."""
         return self.of.where
 
     @property
     def update(self) -> Callable[[Experiment, Value], Experiment] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """In its place, a function that puts them in."""
         return self.of.update
 
     @property
     def prior(self) -> AbstractPrior | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What is known of the values on nodes."""
         return self.of.prior
 
     @property
     def unit(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Their unit."""
         return self.of.unit
 
     @property
     def only(self) -> tuple[int, ...] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The experiments that it belongs to."""
         return self.of.only
 
     @property

@@ -302,7 +302,7 @@ def _bytes(tree: Any) -> int:
     return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in leaves)
 
 
-ROW_COST = 4
+ROW_COST = 1.2
 """What a row of the Jacobian by reverse mode costs over a column by forward mode (docs/fit_cost.csv)."""
 _COPIES = 16
 """Memory that a tangent takes, in sizes of the particles' (benchmarks/fit_cost.py)."""
