@@ -14,5 +14,5 @@ def chosen_optimiser(problem: FitProblem) -> AbstractOptimiser:
     return LevenbergMarquardt() if columns <= MOST_COLUMNS else LBFGS()
 
 
-MOST_COLUMNS = 16
+MOST_COLUMNS = 32
 """Columns of a Jacobian, or rows at what they cost more, up to which Levenberg-Marquardt is the cheaper."""
