@@ -119,7 +119,7 @@ class Line(FitProblem):
     def residuals(self, z, sigmas, adjoint):
         parts = [o.residuals((1 + z[0]) * self.x, s) for o, s in zip(self.observations, sigmas, strict=True)]
         prior = self.parameters[0].prior
-        return jnp.concatenate(parts + ([] if prior is None else [prior.residuals(1 + z)])), jnp.zeros(1)
+        return jnp.concatenate(parts + ([] if prior is None else [prior.residuals(1 + z, 1 + z)])), jnp.zeros(1)
 
 
 def fitted_line(monkeypatch, y, prior=None, **options):

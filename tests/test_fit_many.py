@@ -43,7 +43,8 @@ class Valley(FitProblem):
     def residuals(self, z, sigmas, adjoint):
         y = jnp.where((z < 2.5).all(), z, jnp.nan) - 1
         if self.broken:
-            y = y + jnp.where((z > 2.2).any(), jnp.sqrt(jnp.abs(y - jax.lax.stop_gradient(y))), 0)
+            one = jnp.where((z > 2.2).any(), 0.0, 1.0)  # the root of zero has no derivative
+            y = y + jnp.sqrt(one + jnp.abs(y - jax.lax.stop_gradient(y))) - jnp.sqrt(one)
         return jnp.concatenate([10 * (y[1:] - y[:-1] ** 2), 1 - y[:-1]]), jnp.zeros(1)
 
 
