@@ -117,7 +117,8 @@ class FitProblem(eqx.Module):
     def size_of_data(self, sigmas: tuple[Array, ...]) -> Array:
         """√Σ (data/σ)², the size of what the residuals are the difference of [-]."""
         each = zip(self.observations, sigmas, strict=True)
-        return jnp.sqrt(sum((jnp.nansum((o.data / sigma) ** 2) for o, sigma in each), jnp.zeros(())))
+        ratios = (jnp.asarray(o.data, self.dtype) / jnp.asarray(sigma, self.dtype) for o, sigma in each)
+        return jnp.sqrt(sum((jnp.nansum(ratio**2) for ratio in ratios), jnp.zeros((), self.dtype)))
 
     def rounding(self, cost: Array, sigmas: tuple[Array, ...]) -> Array:
         """The part of ½ Σ r² that may be rounding: that of the data's size, ε √Σ (data/σ)², in each residual [-]."""
