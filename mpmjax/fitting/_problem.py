@@ -304,6 +304,6 @@ def _bytes(tree: Any) -> int:
 
 
 ROW_COST = 1.2
-"""What a row of the Jacobian by reverse mode costs over a column by forward mode (docs/fit_cost.csv)."""
+"""What a row of the Jacobian by reverse mode costs over a column by forward mode (benchmarks/fit_cost.py)."""
 _COPIES = 16
 """Memory that a tangent takes, in sizes of the particles' (benchmarks/fit_cost.py)."""
