@@ -121,7 +121,7 @@ class Line(FitProblem):
     def residuals(self, z, sigmas, adjoint):
         parts = [o.residuals((1 + z[0]) * self.x, s) for o, s in zip(self.observations, sigmas, strict=True)]
         prior = self.parameters[0].prior
-        return jnp.concatenate(parts + ([] if prior is None else [prior.residuals(1 + z)])), jnp.zeros(1)
+        return jnp.concatenate(parts + ([] if prior is None else [prior.residuals(1 + z, 1 + z)])), jnp.zeros(1)
 
 
 def fitted_line(monkeypatch, y, prior=None, **options):
@@ -339,7 +339,7 @@ def test_a_step_at_which_the_simulation_fails_is_not_taken():
         def dtype(self):
             return jnp.float64
 
-        def jacobian(self, z, sigmas):
+        def jacobian(self, z, sigmas, mode=None):
             far = jnp.where(z < 1, z, jnp.nan)
             return 100 * ((0.3 + far) ** 3 - 0.5), 100 * (3 * (0.3 + far) ** 2)[:, None]
 

@@ -1,17 +1,21 @@
 """Fitting parameters to measured data."""
 
+from mpmjax.fitting._adam import Adam
 from mpmjax.fitting._arrays import read_arrays
 from mpmjax.fitting._bootstrap import Bootstrap, bootstrap
 from mpmjax.fitting._columns import Columns, read_columns
 from mpmjax.fitting._ensemble import EnsembleFit, fit_ensemble
 from mpmjax.fitting._experiment import Experiment
+from mpmjax.fitting._field import Field
 from mpmjax.fitting._fit import fit
+from mpmjax.fitting._lbfgs import LBFGS
 from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._multistart import LocalMinimum, MultistartFit, fit_multistart
 from mpmjax.fitting._observation import AbstractObservation, Curve, Series, Tracks
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
-from mpmjax.fitting._parameter import AbstractParameter, Bounded, Gaussian, Positive, Unbounded
+from mpmjax.fitting._parameter import AbstractParameter, Bounded, Positive, Unbounded
 from mpmjax.fitting._prediction import Prediction, predict, predict_observations
+from mpmjax.fitting._prior import AbstractPrior, Gaussian, Smooth
 from mpmjax.fitting._profile import Profile, profile
 from mpmjax.fitting._quantities import CentreOfMass, Density, Extent, Markers, StressStretch
 from mpmjax.fitting._reaction import Force, Torque
@@ -20,9 +24,12 @@ from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
 from mpmjax.fitting._staged import Stage, StagedFit, fit_staged
 
 __all__ = [
+    "LBFGS",
     "AbstractObservation",
     "AbstractOptimiser",
     "AbstractParameter",
+    "AbstractPrior",
+    "Adam",
     "Bootstrap",
     "Bounded",
     "CentreOfMass",
@@ -34,6 +41,7 @@ __all__ = [
     "Evaluation",
     "Experiment",
     "Extent",
+    "Field",
     "FitResult",
     "Force",
     "Gaussian",
@@ -47,6 +55,7 @@ __all__ = [
     "Profile",
     "RefinedFit",
     "Series",
+    "Smooth",
     "Stage",
     "StagedFit",
     "StressStretch",

@@ -135,8 +135,5 @@ def _drawn(problem: FitProblem, predicted: list[np.ndarray], sigmas: tuple, rng:
         noisy = y + np.asarray(sigma) * rng.normal(size=y.shape)
         drawn.append(np.where(np.isfinite(observation.data), noisy, np.nan))
     problem = eqx.tree_at(lambda p: [o.data for o in p.observations], problem, drawn)
-    priors = [p.prior for p in problem.parameters if p.prior is not None]
-    if priors:
-        means = [np.asarray(p.mean + p.sigma * rng.normal(size=np.shape(p.mean))) for p in priors]
-        problem = eqx.tree_at(lambda q: [p.prior.mean for p in q.parameters if p.prior is not None], problem, means)
-    return problem
+    priors = [p.prior.drawn(rng) for p in problem.parameters if p.prior is not None]
+    return eqx.tree_at(lambda q: [p.prior for p in q.parameters if p.prior is not None], problem, priors)

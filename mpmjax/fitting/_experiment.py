@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 
 from mpmjax._types import Array, Scalar
@@ -94,8 +95,13 @@ class Experiment(eqx.Module):
             return self
         return self.with_observations(kept, steps * self.dt)
 
-    def run(self, *, adjoint: Any = None, throw: bool = True) -> Run:
-        """The simulation of it, with what its observations observe after each step."""
+    @property
+    def observed_shape(self) -> Any:
+        """The shape of what its observations need of one state."""
+        return jax.eval_shape(_Observe(self.observations), self.scene, self.particles)
+
+    def run(self, *, adjoint: Any = None, throw: bool = True, checkpoint_bytes: int = 2**28) -> Run:
+        """The simulation of it, with what its observations observe after each step (see `simulate`)."""
         return simulate(
             self.scene,
             self.particles,
@@ -104,6 +110,7 @@ class Experiment(eqx.Module):
             method=self.method,
             observe=_Observe(self.observations),
             adjoint=adjoint,
+            checkpoint_bytes=checkpoint_bytes,
             throw=throw,
         )
 

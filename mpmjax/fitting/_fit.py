@@ -14,16 +14,16 @@ import numpy as np
 
 from mpmjax._types import Array, Scalar
 from mpmjax.checks import checked, require, warn
+from mpmjax.fitting._choice import chosen_optimiser
 from mpmjax.fitting._estimates import fit_result, settle_noise
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._log import FitLog, opened_log
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._progress import Progress
 from mpmjax.fitting._result import FitResult
-from mpmjax.fitting._search import Iteration, Minimum, NoDerivativeError, Standing, search
+from mpmjax.fitting._search import Iteration, Minimum, NoDerivativeError, Standing, influence, search
 from mpmjax.io import reporting
 
 
@@ -34,7 +34,8 @@ def fit(
     *,
     report: dict[str, Callable[[Experiment], Any]] | None = None,
     level: Scalar = 0.95,
-    optimiser: AbstractOptimiser = LevenbergMarquardt(),
+    optimiser: AbstractOptimiser | None = None,
+    memory: int = 2**28,
     progress: Callable[[str], None] | None = None,
     log: str | os.PathLike | None = None,
     resume: bool = False,
@@ -51,10 +52,11 @@ def fit(
         })
         print(result)
 
-    The least sum of squares of (simulated − measured)/σ over all observations of all experiments is searched by the
-    Levenberg-Marquardt method (optimistix), its Jacobian by forward mode through every step and every implicit solve.
-    A step at which a simulation fails is not taken. Where an observation gives no σ, it is estimated: as
-    √(Σ r²/(m − n)) of one observation, and of several so that each explains its own misfit, in rounds.
+    The least sum of squares of (simulated − measured)/σ over all observations of all experiments is searched: with few
+    parameters, or few measured numbers, by the Levenberg-Marquardt method (optimistix), with many by L-BFGS (optax),
+    with derivatives through every step and every implicit solve. A step at which a simulation fails is not taken.
+    Where an observation gives no σ, it is estimated: as √(Σ r²/(m − n)) of one observation, and of several so that each
+    explains its own misfit, in rounds.
 
     Errors are those of the Gauss-Newton Hessian (JᵀJ)⁻¹: what the noise of the data, independent and normal, does to
     the parameters. They say nothing of what the law or the discretisation gets wrong, which often is more: fit on two
@@ -65,7 +67,8 @@ def fit(
         parameters: what is fitted, by name.
         report: what else to report with its error, by name: functions of an experiment that return one number.
         level: of the intervals [-].
-        optimiser: the method of the search.
+        optimiser: the method of the search. Default: `LevenbergMarquardt` where its Jacobian is cheap, else `LBFGS`.
+        memory: for checkpoints of reverse mode, and for the tangents of forward mode that are made at once [B].
         progress: called with a line before the first iteration, which is compiled, and one after each, such as `print`:
             misfit, gradient, parameters, seconds, and about how many are left (see docs/fitting.md).
         log: an HDF5 file that is to hold each iteration (its layout: docs/fitting.md). Whatever ends the fit, the file
@@ -83,7 +86,9 @@ def fit(
         OSError: the disk refused the log, which holds what it held before.
     """
     require(log is not None or not resume, "resume continues the fit of a log: name it by log.")
-    problem = FitProblem((experiments,) if isinstance(experiments, Experiment) else tuple(experiments), parameters)
+    several = (experiments,) if isinstance(experiments, Experiment) else tuple(experiments)
+    problem = FitProblem(several, parameters, memory)
+    optimiser = chosen_optimiser(problem) if optimiser is None else optimiser
     require((level > 0) & (level < 1), f"level must lie between 0 and 1, got {level}.")
     level = float(level)
     report = dict(report or {})
@@ -96,7 +101,7 @@ def fit(
             stack.enter_context(reporting(kept.standing))
         found, history, sigmas, factors, freedom, unsettled = _rounds(problem, optimiser, z, progress, kept)
     result = fit_result(problem, found, factors, freedom, sigmas, report, level)
-    result = replace(result, history=history, interrupted=found.interrupted)
+    result = replace(result, history=history, interrupted=found.interrupted, optimiser=optimiser)
     if not found.converged:
         stopped = "was interrupted" if found.interrupted else "did not converge"
         advice = "" if found.interrupted else f" {_ADVICE}"
@@ -169,9 +174,9 @@ def _search(
         found = search(problem, optimiser, z, sigmas, standing=standing, report=report, begun=begun)
     except NoDerivativeError:
         raise RuntimeError(
-            "The fit has no derivative. Either the tangent solve of a step did not converge: raise the max_steps of "
-            "the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner(). Or a law or an "
-            "observation cannot be differentiated where the run takes it."
+            "The fit has no derivative. Either the tangent or adjoint solve of a step did not converge: raise the "
+            "max_steps of the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner(). Or a "
+            "law or an observation cannot be differentiated where the run takes it."
         ) from None
     if not np.isfinite(found.history[0].cost):
         explain(problem, z)
@@ -195,18 +200,31 @@ def require_influence(problem: FitProblem, sigmas: tuple[Array, ...], seen: Eval
     Raises:
         ValueError: they do not.
     """
-    rounding = _ROUNDINGS * float(jnp.finfo(problem.dtype).eps) * problem.size_of_data(sigmas)
-    size = np.linalg.norm(np.asarray(seen.jacobian), axis=0)
-    unseen = [label for label, column in zip(problem.labels, size, strict=True) if column <= rounding]
+    rounding = _ROUNDINGS * float(jnp.finfo(problem.dtype).eps) * float(problem.size_of_data(sigmas))
+    if seen.jacobian is None:
+        # |Jᵀr| ≤ ‖r‖ times a column's length: where it is not small, the column is not.
+        size = np.abs(np.asarray(seen.gradient)) / max(np.sqrt(2 * float(seen.cost)), np.finfo(float).tiny)
+        if (size <= rounding).any():
+            size = influence(problem, jnp.zeros(problem.size, problem.dtype), sigmas)
+    else:
+        size = np.linalg.norm(np.asarray(seen.jacobian), axis=0)
+    unseen = [label for label, length in zip(problem.labels, size, strict=True) if length <= rounding]
     require(
         not unseen,
-        f"The data do not depend on {', '.join(unseen)}: their derivative by it is zero but for rounding. Leave it "
+        f"The data do not depend on {_listed(unseen)}: their derivative by it is zero but for rounding. Leave it "
         "out, give it a prior, or observe what it changes.",
     )
 
 
+def _listed(names: list[str]) -> str:
+    """The first names, and how many there are besides."""
+    more = len(names) - _MOST_NAMES
+    return ", ".join(names[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
+
+
 MOST_ROUNDS = 20
 """Of searches with another noise."""
+_MOST_NAMES = 6
 _ROUNDINGS = 10
 """Derivatives by a coordinate below so many roundings of the data are none."""
 _ADVICE = "Raise max_steps, start closer, or give a rtol that the precision can reach."

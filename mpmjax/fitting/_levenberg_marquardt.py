@@ -1,6 +1,6 @@
 """Levenberg-Marquardt by optimistix, one iteration at a time."""
 
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -8,13 +8,13 @@ import numpy as np
 import optimistix
 
 from mpmjax._types import Array, Scalar
-from mpmjax.checks import require_tolerance, require_whole
+from mpmjax.checks import require, require_tolerance, require_whole
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._problem import Coordinates, FitProblem
 
 
 class LevenbergMarquardt(AbstractOptimiser):
-    """The Levenberg-Marquardt method of optimistix on the residuals, their Jacobian by forward mode.
+    """The Levenberg-Marquardt method of optimistix on the residuals and their Jacobian.
 
     One compiled function makes an iteration: it evaluates residuals and Jacobian together, once. A step at which a
     simulation fails has residuals of NaN, is not taken, and the next is shorter.
@@ -25,24 +25,31 @@ class LevenbergMarquardt(AbstractOptimiser):
     Args:
         rtol: relative and absolute tolerance of coordinates and residuals.
         max_steps: most iterations.
+        mode: how the Jacobian is made: "forward", by a tangent a coordinate beside the simulation; "reverse", by a pass
+            back a measured number. Default: what costs less.
     """
 
     rtol: Scalar = 1e-6
     max_steps: int = eqx.field(static=True, default=50)
+    mode: Literal["forward", "reverse"] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         require_tolerance("LevenbergMarquardt's rtol", self.rtol)
         require_whole("LevenbergMarquardt's max_steps", self.max_steps, 1)
+        require(
+            self.mode in (None, "forward", "reverse"),
+            f'LevenbergMarquardt\'s mode must be "forward", "reverse" or None, got {self.mode!r}.',
+        )
 
     def begin(self, problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> Any:
-        args = problem, sigmas
+        args = problem, sigmas, self.mode
         shape, _ = jax.eval_shape(lambda z: _residuals(z, args), z)
         return self._solver.init(_residuals, z, args, {}, shape, None, frozenset())
 
     def iterate(
         self, problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...], state: Any
     ) -> tuple[Coordinates, Any, Evaluation]:
-        z, state, _ = self._solver.step(_residuals, z, (problem, sigmas), {}, state, frozenset())
+        z, state, _ = self._solver.step(_residuals, z, (problem, sigmas, self.mode), {}, state, frozenset())
         r, J = state.f_info.residual, state.f_info.jac.as_matrix()
         return z, state, Evaluation((r**2).sum() / 2, J.T @ r, r, J)
 
@@ -73,12 +80,12 @@ _NEGLIGIBLE = 1e-4
 """A step of so many standard errors is none."""
 
 
-def _residuals(z: Coordinates, args: tuple[FitProblem, tuple[Array, ...]]) -> tuple[Array, None]:
-    """The residuals, with a derivative by forward mode in one pass."""
-    problem, sigmas = args
+def _residuals(z: Coordinates, args: tuple[FitProblem, tuple[Array, ...], Any]) -> tuple[Array, None]:
+    """The residuals, evaluated together with their derivative, once."""
+    problem, sigmas, mode = args
 
     def jacobian(z: Coordinates) -> tuple[Array, Array]:
-        r, J = problem.jacobian(z.astype(problem.dtype), sigmas)
+        r, J = problem.jacobian(z.astype(problem.dtype), sigmas, mode)
         return r.astype(z.dtype), J.astype(z.dtype)
 
     @jax.custom_jvp

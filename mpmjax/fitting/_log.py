@@ -85,11 +85,11 @@ class FitLog:
         Raises:
             OSError: the disk refused; the log is what it was.
         """
-        past = ()
+        past: tuple[float, ...] = ()
         if len(standing.history) > 1:
             past = self._rounds.pop().seconds
         self._rounds.append(_Round(sigmas, standing, (*past, seconds)))
-        self._values.append(self._numbers(standing.history[-1]))
+        self._values.append(self._numbers(standing.history[len(standing.history) - 1]))
         self.write()
 
     def write(self) -> None:
@@ -184,7 +184,7 @@ def _read(
     try:
         with h5py.File(path, "r", locking=False) as file:
             known = file.attrs.get("kind") == b"mpmjax fit log"
-            found = int(file.attrs["format"]) if known else 0
+            found = int(np.asarray(file.attrs["format"])) if known else 0
             datasets: list[Any] = []
             file.visititems(lambda _, item: datasets.append(item) if isinstance(item, h5py.Dataset) else None)
             arrays = {item.name.lstrip("/"): np.asarray(item[()]) for item in datasets}

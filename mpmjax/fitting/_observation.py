@@ -11,6 +11,7 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import require, require_finite, require_positive
+from mpmjax.fitting._prior import drawn_nearer
 from mpmjax.fitting._quantities import Markers
 from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene
@@ -111,8 +112,7 @@ class AbstractObservation(eqx.Module):
     def residuals(self, predicted: Array, sigma: Scalar | Array) -> Array:
         """√weight (predicted − data)/σ [-], in C order, shape (m,); zero where nothing was measured.
 
-        With `robust` δ large ones are drawn nearer: r becomes r √(2/(1 + √(1 + r²/δ²))), and half its square
-        δ² (√(1 + r²/δ²) − 1).
+        With `robust` large ones are drawn nearer (see `drawn_nearer`).
         """
         require(
             predicted.shape == self.data.shape,
@@ -124,7 +124,7 @@ class AbstractObservation(eqx.Module):
         measured = jnp.isfinite(data)
         r = jnp.where(measured, (predicted - jnp.where(measured, data, 0)) / sigma, 0).reshape(-1)
         if self.robust is not None:
-            r = r * jnp.sqrt(2 / (1 + jnp.sqrt(1 + (r / jnp.asarray(self.robust, dtype)) ** 2)))
+            r = drawn_nearer(r, jnp.asarray(self.robust, dtype))
         return jnp.sqrt(weight) * r
 
 

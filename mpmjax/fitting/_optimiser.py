@@ -65,3 +65,8 @@ class AbstractOptimiser(eqx.Module):
         default. The time left is estimated from how fast it falls."""
         del state, seen
         return float("nan")
+
+    def has_stalled(self, state: Any) -> bool:
+        """Whether the search goes no further, and is not known to be at a minimum."""
+        del state
+        return False

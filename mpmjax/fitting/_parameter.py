@@ -2,39 +2,17 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Float, Scalar
+from mpmjax._types import Array, Scalar
 from mpmjax.checks import require, require_finite, require_positive
 from mpmjax.fitting._experiment import Experiment
-
-Value = Float[Array, "..."]
-
-
-class Gaussian(eqx.Module):
-    """Prior knowledge of a parameter: a normal distribution. It acts like one more measured point a number.
-
-    Args:
-        mean: expected value, in the parameter's unit, one number or one for each entry.
-        sigma: its standard deviation, likewise.
-    """
-
-    mean: Scalar | np.ndarray | Value = eqx.field(converter=lambda a: np.asarray(a, float))
-    sigma: Scalar | np.ndarray | Value = eqx.field(converter=lambda a: np.asarray(a, float))
-
-    def __check_init__(self):
-        require_finite("Gaussian's mean", self.mean)
-        require_positive("Gaussian's sigma", self.sigma)
-
-    def residuals(self, value: Value) -> Value:
-        """(value − mean)/σ [-], of the value's shape."""
-        mean, sigma = (jnp.broadcast_to(jnp.asarray(a, value.dtype), value.shape) for a in (self.mean, self.sigma))
-        return (value - mean) / sigma
+from mpmjax.fitting._prior import AbstractPrior, Value
 
 
 class AbstractParameter(eqx.Module):
@@ -44,15 +22,13 @@ class AbstractParameter(eqx.Module):
     first guess: so no bound is ever crossed, and a step of one is a large but not an absurd change.
     """
 
-    logarithmic: ClassVar[bool] = False
-    """Whether z is the logarithm of the value but for a constant."""
     where: eqx.AbstractVar[Callable[[Experiment], Any] | None]
     """The leaf, or a tuple of leaves that share the value, of an experiment, as in `equinox.tree_at`."""
     update: eqx.AbstractVar[Callable[[Experiment, Value], Experiment] | None]
     """In the place of `where`: the experiment with the value put into it, for what is no single leaf."""
     start: eqx.AbstractVar[Scalar | Value | np.ndarray | None]
     """The first guess. Default: the value of the first experiment."""
-    prior: eqx.AbstractVar[Gaussian | None]
+    prior: eqx.AbstractVar[AbstractPrior | None]
     """What is known of it beforehand."""
     unit: eqx.AbstractVar[str]
     """The unit that tables show."""
@@ -69,6 +45,11 @@ class AbstractParameter(eqx.Module):
         require(self.update is None or self.start is not None, f"{name} with update needs a start: the first guess.")
         if self.start is not None:
             require_finite(f"{name}'s start", self.start)
+
+    @property
+    def logarithmic(self) -> bool:
+        """Whether z is the logarithm of the value but for a constant."""
+        return False
 
     @abc.abstractmethod
     def value(self, start: Value, z: Value) -> Value:
@@ -89,6 +70,21 @@ class AbstractParameter(eqx.Module):
 
         Raises:
             ValueError: it does not.
+        """
+
+    @abc.abstractmethod
+    def free(self, value: Value) -> Value:
+        """The value in a measure without bounds, whatever the first guess: z but for a constant and a factor."""
+
+    def prior_residuals(self, value: Value) -> Array:
+        """The residuals of its prior [-], shape (k,); none without."""
+        return jnp.zeros(0, value.dtype) if self.prior is None else self.prior.residuals(value, self.free(value))
+
+    def check_experiment(self, name: str, experiment: Experiment) -> None:
+        """Check that it can be put into an experiment.
+
+        Raises:
+            ValueError: it cannot.
         """
 
     def at_bound(self, start: Value, z: Value) -> np.ndarray:
@@ -134,7 +130,7 @@ class Unbounded(AbstractParameter):
     update: Callable[[Experiment, Value], Experiment] | None = None
     start: Scalar | Value | np.ndarray | None = None
     scale: Scalar | None = None
-    prior: Gaussian | None = None
+    prior: AbstractPrior | None = None
     unit: str = eqx.field(static=True, default="")
     only: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
@@ -144,6 +140,10 @@ class Unbounded(AbstractParameter):
 
     def coordinate(self, start: Value, value: Value) -> Value:
         return (value - start) / self._scale(start)
+
+    def free(self, value: Value) -> Value:
+        """The value."""
+        return value
 
     def _scale(self, start: Value) -> Value | Scalar:
         size = jnp.abs(start).max()
@@ -166,13 +166,16 @@ class Positive(AbstractParameter):
         only: numbers of the experiments that it belongs to. Default: all.
     """
 
-    logarithmic: ClassVar[bool] = True
     where: Callable[[Experiment], Any] | None = None
     update: Callable[[Experiment, Value], Experiment] | None = None
     start: Scalar | Value | np.ndarray | None = None
-    prior: Gaussian | None = None
+    prior: AbstractPrior | None = None
     unit: str = eqx.field(static=True, default="")
     only: tuple[int, ...] | None = eqx.field(static=True, default=None)
+
+    @property
+    def logarithmic(self) -> bool:
+        return True
 
     def value(self, start: Value, z: Value) -> Value:
         """start·e^z."""
@@ -184,6 +187,10 @@ class Positive(AbstractParameter):
     @property
     def domain(self) -> tuple[float, float]:
         return 0.0, np.inf
+
+    def free(self, value: Value) -> Value:
+        """ln value."""
+        return jnp.log(value)
 
     def check(self, name: str, start: np.ndarray) -> None:
         require(start > 0, f"The parameter {name!r} must start from positive numbers, got {start}.")
@@ -208,7 +215,7 @@ class Bounded(AbstractParameter):
     upper: float | int = eqx.field(static=True, default=1.0)
     update: Callable[[Experiment, Value], Experiment] | None = None
     start: Scalar | Value | np.ndarray | None = None
-    prior: Gaussian | None = None
+    prior: AbstractPrior | None = None
     unit: str = eqx.field(static=True, default="")
     only: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
@@ -222,6 +229,10 @@ class Bounded(AbstractParameter):
     @property
     def domain(self) -> tuple[float, float]:
         return self.lower, self.upper
+
+    def free(self, value: Value) -> Value:
+        """The logit of where it lies between the bounds."""
+        return self._logit(value)
 
     def check(self, name: str, start: np.ndarray) -> None:
         require(

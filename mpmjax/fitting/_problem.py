@@ -1,9 +1,10 @@
 """A fit as a problem of least squares: residuals of all observations as a function of one vector."""
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
 import diffrax
 import equinox as eqx
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float
-from mpmjax.checks import require, shortened
+from mpmjax.checks import require, require_whole, shortened
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._observation import AbstractObservation
 from mpmjax.fitting._parameter import AbstractParameter
@@ -29,8 +30,16 @@ class FitProblem(eqx.Module):
     parameters: tuple[AbstractParameter, ...]
     starts: tuple[Array, ...]
     """The first guess of each."""
+    memory: int = eqx.field(static=True)
+    """Memory for checkpoints of reverse passes, and for tangents [B]."""
 
-    def __init__(self, experiments: tuple[Experiment, ...], parameters: Mapping[str, AbstractParameter]):
+    def __init__(
+        self,
+        experiments: tuple[Experiment, ...],
+        parameters: Mapping[str, AbstractParameter],
+        memory: int = 2**28,
+    ):
+        self.memory = require_whole("memory [B]", memory, 1)
         require(len(experiments) > 0, "A fit needs an experiment at least.")
         require(len(parameters) > 0, "A fit needs a parameter at least.")
         dtypes = sorted({str(e.dtype) for e in experiments})
@@ -39,7 +48,8 @@ class FitProblem(eqx.Module):
         self.starts = tuple(self._start(name, p) for name, p in parameters.items())
         self.parameters = tuple(replace(p, start=start) for p, start in zip(self.parameters, self.starts, strict=True))
         points = sum(o.count for o in self.observations)
-        known = sum(s.size for s, p in zip(self.starts, self.parameters, strict=True) if p.prior is not None)
+        each = zip(self.starts, self.parameters, strict=True)
+        known = sum(parameter.prior.fixes(start.shape) for start, parameter in each if parameter.prior is not None)
         require(
             points + known >= self.size,
             f"{points} measured numbers cannot fix {self.size} parameters: measure more, give priors, or fit fewer.",
@@ -58,9 +68,9 @@ class FitProblem(eqx.Module):
         start = _first_guess(name, parameter, self.experiments[own[0]])
         parameter.check(name, np.asarray(start))
         if parameter.prior is not None:
-            shapes = {np.shape(parameter.prior.mean), np.shape(parameter.prior.sigma)}
-            fits = shapes <= {(), start.shape}
-            require(fits, f"The prior of {name!r} must have one number or shape {start.shape}, got {sorted(shapes)}.")
+            parameter.prior.check(name, start.shape)
+        for k in own:
+            parameter.check_experiment(name, self.experiments[k])
         return start
 
     @property
@@ -109,10 +119,28 @@ class FitProblem(eqx.Module):
         each = zip(self.parameters, self.starts, strict=True)
         return tuple(parameter.logarithmic for parameter, start in each for _ in range(start.size))
 
-    def size_of_data(self, sigmas: tuple[Array, ...]) -> float:
+    def size_of_data(self, sigmas: tuple[Array, ...]) -> Array:
         """√Σ (data/σ)², the size of what the residuals are the difference of [-]."""
         each = zip(self.observations, sigmas, strict=True)
-        return float(np.sqrt(sum(np.nansum((o.data / np.asarray(sigma)) ** 2) for o, sigma in each)))
+        ratios = (jnp.asarray(o.data, self.dtype) / jnp.asarray(sigma, self.dtype) for o, sigma in each)
+        return jnp.sqrt(sum((jnp.nansum(ratio**2) for ratio in ratios), jnp.zeros((), self.dtype)))
+
+    def rounding(self, cost: Array, sigmas: tuple[Array, ...]) -> Array:
+        """The part of ½ Σ r² that may be rounding: that of the data's size, ε √Σ (data/σ)², in each residual [-]."""
+        noise = float(jnp.finfo(self.dtype).eps) * self.size_of_data(sigmas).astype(cost.dtype)
+        return jnp.sqrt(2 * cost) * noise + noise**2 + float(jnp.finfo(cost.dtype).eps) * cost
+
+    def mean_square(self, cost: Array) -> Array:
+        """Σ r²/(m − n) of m numbers, those of priors among them, and n coordinates."""
+        points = sum((jnp.isfinite(o.data).sum() for o in self.observations), jnp.zeros((), int))
+        each = zip(self.starts, self.parameters, strict=True)
+        known = sum(parameter.prior.fixes(start.shape) for start, parameter in each if parameter.prior is not None)
+        return 2 * cost / jnp.maximum(points + known - self.size, 1).astype(cost.dtype)
+
+    @property
+    def measured(self) -> int:
+        """How many residuals are of observations."""
+        return sum(o.data.size for o in self.observations)
 
     @property
     def rows(self) -> tuple[slice, ...]:
@@ -158,31 +186,75 @@ class FitProblem(eqx.Module):
         Args:
             z: the coordinates.
             sigmas: the noise of each observation.
-            adjoint: how diffrax differentiates.
+            adjoint: how diffrax differentiates; None for reverse mode from checkpoints within the memory.
         """
         parts, reports, noise = [], [], iter(sigmas)
         for experiment in self.at(z):
-            run = experiment.run(adjoint=adjoint, throw=False)
+            run = experiment.run(adjoint=adjoint, throw=False, checkpoint_bytes=self.memory)
             for observation, predicted in zip(experiment.observations, experiment.predictions(run), strict=True):
                 r = observation.residuals(predicted, next(noise))
                 parts.append(jnp.where(run.statistics.healthy, r, jnp.nan))
             assert run.report is not None
             reports.append(run.report)
-        for parameter, value in zip(self.parameters, self.values(z), strict=True):
-            if parameter.prior is not None:
-                parts.append(parameter.prior.residuals(value).reshape(-1))
-        return jnp.concatenate(parts), jnp.stack(reports)
+        return jnp.concatenate([*parts, self.prior_residuals(z)]), jnp.stack(reports)
 
-    def jacobian(self, z: Coordinates, sigmas: tuple[Array, ...]) -> tuple[Array, Array]:
-        """The residuals and their derivative by the coordinates, shape (m, n), in one pass of forward mode: the
-        simulation once, its tangents for all coordinates beside it. NaN where a tangent solve did not converge."""
+    def prior_residuals(self, z: Coordinates) -> Array:
+        """The residuals of all priors [-]."""
+        each = zip(self.parameters, self.values(z), strict=True)
+        return jnp.concatenate([parameter.prior_residuals(value) for parameter, value in each])
 
-        def both(z: Coordinates) -> tuple[tuple[Array, Array], Array]:
-            r, report = self.residuals(z, sigmas, diffrax.ForwardMode())
-            return (r, report), r
+    def gradient(self, z: Coordinates, sigmas: tuple[Array, ...]) -> tuple[Array, Array, Coordinates]:
+        """The residuals r, ½ Σ r² and its derivative by the coordinates, by one pass of reverse mode: its cost does not
+        grow with their number. NaN where a simulation met a fault, the derivative also where an adjoint solve did not
+        converge."""
 
-        (J, unsolved), r = jax.jacfwd(both, has_aux=True)(z)
-        return r, jnp.where((unsolved != 0).any(), jnp.nan, J)
+        def cost(z: Coordinates) -> tuple[Array, Array]:
+            r = self.residuals(z.astype(self.dtype), sigmas, None)[0].astype(z.dtype)
+            return (r**2).sum() / 2, r
+
+        (value, r), slope = jax.value_and_grad(cost, has_aux=True)(z)
+        return r, value, slope
+
+    def jacobian(
+        self, z: Coordinates, sigmas: tuple[Array, ...], mode: Literal["forward", "reverse"] | None = None
+    ) -> tuple[Array, Array]:
+        """The residuals and their derivative by the coordinates, shape (m, n). NaN where a tangent or adjoint solve did
+        not converge.
+
+        Args:
+            z: the coordinates.
+            sigmas: the noise of each observation.
+            mode: "forward": the simulation once, and beside it, in the same pass, the tangents of the coordinates;
+                "reverse": a pass back for each measured number. As many at once as the memory holds. Default: what
+                costs less.
+        """
+        if (self.cheaper_mode if mode is None else mode) == "reverse":
+            return self._jacobian_by_rows(z, sigmas)
+
+        def push(tangent: Coordinates) -> tuple[Array, Array, Array]:
+            evaluate = partial(self.residuals, sigmas=sigmas, adjoint=diffrax.ForwardMode())
+            (r, _), (column, unsolved) = jax.jvp(evaluate, (z,), (tangent,))
+            return r, column, unsolved
+
+        r, columns, unsolved = _chunked(push, jnp.eye(self.size, dtype=z.dtype), self._at_once, common=1)
+        return r, jnp.where((unsolved != 0).any(), jnp.nan, columns.T)
+
+    def _jacobian_by_rows(self, z: Coordinates, sigmas: tuple[Array, ...]) -> tuple[Array, Array]:
+        """The same by a pass back for each measured number; priors need no simulation."""
+        r, pull, _ = jax.vjp(lambda z: self.residuals(z, sigmas, None), z, has_aux=True)
+        (rows,) = _chunked(lambda unit: pull(unit), jnp.eye(self.measured, len(r), dtype=r.dtype), self._at_once)
+        return r, jnp.concatenate([rows, jax.jacfwd(self.prior_residuals)(z)])
+
+    @property
+    def cheaper_mode(self) -> Literal["forward", "reverse"]:
+        """The mode in which a Jacobian costs less."""
+        return "reverse" if 0 < ROW_COST * self.measured < self.size else "forward"
+
+    @property
+    def _at_once(self) -> int:
+        """How many tangents, or rows, of all experiments fit into the memory."""
+        each = sum(_COPIES * _bytes(e.particles) + _bytes(e.observed_shape) * (e.steps + 1) for e in self.experiments)
+        return max(1, int(self.memory // max(each, 1)))
 
 
 def _first_guess(name: str, parameter: AbstractParameter, experiment: Experiment) -> Array:
@@ -207,3 +279,43 @@ def _first_guess(name: str, parameter: AbstractParameter, experiment: Experiment
     )
     require(not same, f"The parameter {name!r} changes nothing of the experiment: name a number that it has.")
     return start
+
+
+def _chunked(function: Callable[[Array], tuple], units: Array, at_once: int, common: int = 0) -> tuple:
+    """What a function returns for each row of `units`, `at_once` of them in one batch, the batches one after the other.
+
+    Args:
+        function: returns a tuple, of which the first `common` are the same for all rows.
+        units: shape (k, ...).
+        at_once: size of a batch.
+        common: how many of the results come once.
+    """
+    count = len(units)
+    batches = -(-count // at_once)
+    size = -(-count // batches)
+
+    def batch(rows: Array) -> tuple[tuple, tuple]:
+        def split(row: Array) -> tuple[tuple, tuple]:
+            found = function(row)
+            return found[:common], found[common:]
+
+        return jax.vmap(split, out_axes=(None, 0))(rows)
+
+    if batches == 1:
+        once, each = batch(units)
+        return *once, *each
+    padded = jnp.concatenate([units, jnp.zeros((batches * size - count, *units.shape[1:]), units.dtype)])
+    once, each = jax.lax.map(batch, padded.reshape(batches, size, *units.shape[1:]))
+    return *(a[0] for a in once), *(a.reshape(-1, *a.shape[2:])[:count] for a in each)
+
+
+def _bytes(tree: Any) -> int:
+    """Size of all arrays, or of shapes that stand for them [B]."""
+    leaves = [leaf for leaf in jax.tree.leaves(tree) if hasattr(leaf, "dtype")]
+    return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in leaves)
+
+
+ROW_COST = 1.2
+"""What a row of the Jacobian by reverse mode costs over a column by forward mode (benchmarks/fit_cost.py)."""
+_COPIES = 16
+"""Memory that a tangent takes, in sizes of the particles' (benchmarks/fit_cost.py)."""

@@ -299,7 +299,7 @@ class _Walk:
         beyond it."""
         from scipy.optimize import root_scalar  # here, since it takes long to import
 
-        visited = {below.z[self.at]: below, above.z[self.at]: above}
+        visited: dict[float, _Point | None] = {below.z[self.at]: below, above.z[self.at]: above}
 
         def excess(place: float) -> float:
             if place not in visited:

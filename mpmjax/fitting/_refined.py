@@ -15,7 +15,6 @@ from mpmjax._types import Array, Scalar
 from mpmjax.checks import checked, require, require_positive, warn
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import fit
-from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
@@ -78,7 +77,7 @@ def fit_refined(
     order: Scalar = 1,
     report: dict[str, Callable[[Experiment], Any]] | None = None,
     level: Scalar = 0.95,
-    optimiser: AbstractOptimiser = LevenbergMarquardt(),
+    optimiser: AbstractOptimiser | None = None,
     progress: Callable[[str], None] | None = None,
     log: str | os.PathLike | None = None,
     resume: bool = False,

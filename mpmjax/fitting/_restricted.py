@@ -16,7 +16,7 @@ class RestrictedProblem(FitProblem):
 
     def __init__(self, whole: FitProblem, origin: Coordinates, basis: Float[Array, "n f"]):
         self.experiments, self.names = whole.experiments, whole.names
-        self.parameters, self.starts = whole.parameters, whole.starts
+        self.parameters, self.starts, self.memory = whole.parameters, whole.starts, whole.memory
         self.whole, self.origin, self.basis = whole, origin, basis
 
     @property

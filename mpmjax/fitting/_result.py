@@ -1,5 +1,6 @@
 """What a fit found."""
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from scipy.special import chdtrc
 
 from mpmjax._types import Array
 from mpmjax.fitting._experiment import Experiment
+from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._search import Iteration
@@ -85,6 +87,8 @@ class FitResult(eqx.Module):
     """What the data cannot tell, and what does not fit, in words."""
     interrupted: bool = False
     """Whether Ctrl-C ended it."""
+    optimiser: AbstractOptimiser | None = None
+    """The method of the search."""
 
     @property
     def values(self) -> dict[str, np.ndarray]:
@@ -150,7 +154,15 @@ class FitResult(eqx.Module):
     def __str__(self) -> str:
         """A table."""
         lines = [f"{'':<24} {'value':>12} ± {'error':<9} {f'{100 * self.level:g} % interval':<25} {'start':>10}"]
-        for e in self.all:
+        left = iter(self.estimates)
+        rows: list[Estimate] = []
+        for name, start in zip(self.problem.names, self.problem.starts, strict=True):
+            own = list(itertools.islice(left, start.size))
+            if start.size > _MOST_ROWS:
+                lines.append(_summary(name, start.shape, own))
+            else:
+                rows += own
+        for e in (*rows, *self.reported):
             name = f"{e.label} [{e.unit}]" if e.unit else e.label
             interval = f"{e.interval[0]:.5g} to {e.interval[1]:.5g}"
             start = "" if np.isnan(e.start) else f"{e.start:.4g}"
@@ -162,6 +174,22 @@ class FitResult(eqx.Module):
             lines.append(f"{n.name:<24} {n.points:>12}   {sigma:<22} {n.misfit:.3g}")
         said = f"χ² = {self.chi_squared:.4g} for {self.degrees_of_freedom} degrees of freedom"
         lines += ["", said + ("" if np.isnan(self.p_value) else f", probability {self.p_value:.2g}")]
+        if self.optimiser is not None:
+            lines.append(f"found by {type(self.optimiser).__name__} in {len(self.history)} iterations")
         if not self.converged:
             lines.append("NOT CONVERGED: errors hold only at a minimum.")
         return "\n".join([*lines, *self.warnings])
+
+
+def _summary(name: str, shape: tuple[int, ...], each: list[Estimate]) -> str:
+    """Many numbers of one parameter in a line."""
+    unit = f" [{each[0].unit}]" if each[0].unit else ""
+    values, errors = (np.array([getattr(e, field) for e in each]) for field in ("value", "error"))
+    return (
+        f"{name + unit:<24} {' x '.join(map(str, shape))} numbers, {values.min():.4g} to {values.max():.4g}, median "
+        f"{np.median(values):.4g}; errors {errors.min():.2g} to {errors.max():.2g}, median {np.median(errors):.2g}"
+    )
+
+
+_MOST_ROWS = 12
+"""Numbers of one parameter up to which each has a row of the table."""

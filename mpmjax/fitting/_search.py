@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -82,6 +83,7 @@ def search(
     try:
         while standing is None or not (
             (converged := optimiser.has_converged(standing.state, standing.seen))
+            or optimiser.has_stalled(standing.state)
             or not np.isfinite(standing.history[-1].cost)
             or len(standing.history) >= optimiser.max_steps
         ):
@@ -98,6 +100,8 @@ def search(
     r, J = standing.seen.residuals, standing.seen.jacobian
     if r is None or J is None:
         r, J = jacobian(problem, z, sigmas)
+        if not jnp.isfinite(J).all():
+            raise NoDerivativeError
     return Minimum(z, r, J, converged, interrupted, standing.history)
 
 
@@ -144,3 +148,15 @@ def iterate(
 def jacobian(problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> tuple[Array, Array]:
     """The residuals and their Jacobian, compiled."""
     return problem.jacobian(z, sigmas)
+
+
+def influence(problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> np.ndarray:
+    """How much the residuals change with each coordinate, shape (n,), by one pass of reverse mode: |Jᵀw| with random
+    numbers w of variance one, whose expected square is that of the length of J's columns."""
+    return np.abs(np.asarray(_pulled(problem, z, sigmas)))
+
+
+@eqx.filter_jit
+def _pulled(problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> Coordinates:
+    r, pull, _ = jax.vjp(lambda z: problem.residuals(z, sigmas, None), z, has_aux=True)
+    return pull(jax.random.normal(jax.random.key(0), r.shape, r.dtype))[0]

@@ -52,8 +52,9 @@ def _spread(
 ) -> np.ndarray:
     """Coordinates of a parameter at shares of its distribution between 0 and 1, shape (k, ...)."""
     first, (lowest, highest) = np.asarray(start, float), parameter.domain
-    if given is None and parameter.prior is not None:
-        mean, sigma = parameter.prior.mean, parameter.prior.sigma
+    known = None if parameter.prior is None else parameter.prior.distribution()
+    if given is None and known is not None:
+        mean, sigma = known
         below, above = ndtr((lowest - mean) / sigma), ndtr((highest - mean) / sigma)
         values = mean + sigma * ndtri(below + shares * (above - below))
     else:

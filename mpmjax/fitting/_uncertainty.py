@@ -16,6 +16,8 @@ _LEAST_FREEDOM = 1e-3
 """Degrees of freedom below which there are none, but rounding."""
 _NODES = 100
 """Of Gauss-Hermite quadrature."""
+_MOST_SAID = 8
+"""Directions that are named."""
 _NEARLY_ONE = 0.99
 """Correlation from which two parameters are said to be seen only together."""
 _PART = 0.1
@@ -202,7 +204,8 @@ def seen_together(labels: tuple[str, ...], found: Uncertainty, logarithmic: tupl
             seen = np.sqrt((effect / length @ found.directions) ** 2 @ found.spectrum) / np.linalg.norm(effect)
             what = _proportion(parts, change, labels, logarithmic)
             said.append(f"{what} is hardly seen, {1 / seen:.2g} times less than of one alone.")
-    return said
+    more = len(said) - _MOST_SAID
+    return said[:_MOST_SAID] + ([f"There are {more} more such directions."] if more > 0 else [])
 
 
 def _simplest(columns: np.ndarray) -> np.ndarray:
