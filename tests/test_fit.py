@@ -328,25 +328,38 @@ def test_two_experiments_share_a_parameter():
     assert two["E"].error * np.sqrt(2) == pytest.approx(one["E"].error, rel=1e-4)
 
 
+class Failing(FitProblem):
+    """r = 100 (0.3 + z)³ − 50, NaN from an end on."""
+
+    end: float
+
+    def __init__(self, end):
+        self.experiments, self.names, self.parameters, self.starts = (), ("z",), (STIFFNESS,), (jnp.zeros(()),)
+        self.memory, self.end = 2**28, end
+
+    @property
+    def dtype(self):
+        return jnp.float64
+
+    def jacobian(self, z, sigmas, mode=None):
+        far = jnp.where(z < self.end, z, jnp.nan)
+        return 100 * ((0.3 + far) ** 3 - 0.5), 100 * (3 * (0.3 + far) ** 2)[:, None]
+
+
 def test_a_step_at_which_the_simulation_fails_is_not_taken():
-    """r = 100 (0.3 + z)³ − 50, NaN from z = 1 on, where the first Gauss-Newton step goes."""
-
-    class Failing(FitProblem):
-        def __init__(self):
-            self.experiments, self.names, self.parameters, self.starts = (), ("z",), (STIFFNESS,), (jnp.zeros(()),)
-
-        @property
-        def dtype(self):
-            return jnp.float64
-
-        def jacobian(self, z, sigmas, mode=None):
-            far = jnp.where(z < 1, z, jnp.nan)
-            return 100 * ((0.3 + far) ** 3 - 0.5), 100 * (3 * (0.3 + far) ** 2)[:, None]
-
-    found = search(Failing(), mpm.LevenbergMarquardt(), jnp.zeros(1), ())
+    """The first Gauss-Newton step goes beyond z = 1."""
+    found = search(Failing(1.0), mpm.LevenbergMarquardt(), jnp.zeros(1), ())
     assert found.converged
     assert not all(iteration.accepted for iteration in found.history)
     assert float(found.z[0]) == pytest.approx(0.5 ** (1 / 3) - 0.3, rel=1e-5)
+
+
+def test_a_search_that_ends_where_simulations_begin_to_fail_has_not_converged():
+    """The minimum, z = 0.494, lies beyond z = 0.4, where they fail."""
+    found = search(Failing(0.4), mpm.LevenbergMarquardt(max_steps=200), jnp.zeros(1), ())
+    assert not found.converged
+    assert len(found.history) < 200
+    assert float(found.z[0]) == pytest.approx(0.4, abs=1e-2)
 
 
 @pytest.mark.thorough

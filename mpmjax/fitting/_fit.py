@@ -227,4 +227,7 @@ MOST_ROUNDS = 20
 _MOST_NAMES = 6
 _ROUNDINGS = 10
 """Derivatives by a coordinate below so many roundings of the data are none."""
-_ADVICE = "Raise max_steps, start closer, or give a rtol that the precision can reach."
+_ADVICE = (
+    "Raise max_steps, start closer, give a rtol that the precision can reach, or see whether simulations fail or the "
+    "misfit has a kink where it ended."
+)

@@ -20,7 +20,9 @@ class LevenbergMarquardt(AbstractOptimiser):
     simulation fails has residuals of NaN, is not taken, and the next is shorter.
 
     It ends by optimistix's criterion, or where the next Gauss-Newton step would be less than a ten-thousandth of the
-    standard error that the misfit gives: in single precision residuals are never still.
+    standard error that the misfit gives: in single precision residuals are never still. Where it can only make steps
+    far shorter than the Gauss-Newton step, since the simulation fails beyond or the misfit has a kink, it has not
+    converged.
 
     Args:
         rtol: relative and absolute tolerance of coordinates and residuals.
@@ -54,7 +56,21 @@ class LevenbergMarquardt(AbstractOptimiser):
         return z, state, Evaluation((r**2).sum() / 2, J.T @ r, r, J)
 
     def has_converged(self, state: Any, seen: Evaluation) -> bool:
-        return bool(state.terminate) or self.distance(state, seen) <= 1
+        return (bool(state.terminate) and not self._is_held_back(state)) or self.distance(state, seen) <= 1
+
+    def has_stalled(self, state: Any) -> bool:
+        return bool(state.terminate) and self._is_held_back(state)
+
+    def _is_held_back(self, state: Any) -> bool:
+        """Whether the steps are short because longer ones were refused, and not because the minimum is near: the
+        simulation fails beyond, or the misfit has a kink."""
+        r, J = np.asarray(state.f_info.residual, float), np.asarray(state.f_info.jac.as_matrix(), float)
+        if not (np.isfinite(r).all() and np.isfinite(J).all()):
+            return False
+        damping = np.eye(J.shape[1]) / float(state.search_state.step_size)
+        wanted, taken = np.linalg.lstsq(J, -r)[0], np.linalg.solve(J.T @ J + damping, -J.T @ r)
+        far = np.abs(wanted).max() > _FAR * float(self.rtol)
+        return bool(far and np.abs(taken).max() < _REFUSED * np.abs(wanted).max())
 
     def distance(self, state: Any, seen: Evaluation) -> float:
         del state
@@ -76,6 +92,10 @@ def _next_step(r: np.ndarray, J: np.ndarray) -> float:
     return float(np.sqrt((change**2).sum() / total * (len(r) - J.shape[1]))) if total > 0 else 0.0
 
 
+_FAR = 100.0
+"""A step is short below so many tolerances."""
+_REFUSED = 0.1
+"""Part of the Gauss-Newton step below which a step is held back."""
 _NEGLIGIBLE = 1e-4
 """A step of so many standard errors is none."""
 
