@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float
-from mpmjax.checks import require
+from mpmjax.checks import require, require_whole
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._search import Iteration, Minimum, begin, jacobian
@@ -138,6 +138,15 @@ def search_many(
         done |= {lanes.members[lane]: lanes.stopped(lane, interrupted=True) for lane in lanes.busy}
         done |= {k: Member(None, "was not begun: the search was interrupted") for k in range(count) if k not in done}
     return tuple(done[k] for k in range(count))
+
+
+def batch_size(problem: FitProblem, given: int | None, count: int) -> int:
+    """How many searches of `count` to compute together, unless it is given: eight with explicit steps, where they cost
+    less than one by one, and one with implicit ones, where all wait for the slowest solve (`benchmarks/multistart.py`).
+    """
+    if given is not None:
+        return min(require_whole("batch", given, 1), count)
+    return min(8 if all(e.method.is_explicit for e in problem.experiments) else 1, count)
 
 
 class _Lanes:

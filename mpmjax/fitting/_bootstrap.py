@@ -8,7 +8,7 @@ import numpy as np
 
 from mpmjax._types import Float
 from mpmjax.checks import checked, require, require_whole, warn
-from mpmjax.fitting._batch import Problems, search_many
+from mpmjax.fitting._batch import Problems, batch_size, search_many
 from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._problem import FitProblem
@@ -72,7 +72,7 @@ def bootstrap(
     *,
     repeats: int = 200,
     seed: int = 0,
-    batch: int = 8,
+    batch: int | None = None,
     optimiser: AbstractOptimiser = LevenbergMarquardt(),
     progress: Callable[[str], None] | None = None,
 ) -> Bootstrap:
@@ -91,7 +91,7 @@ def bootstrap(
         result: the fit.
         repeats: how many fits.
         seed: of the noise.
-        batch: how many fits run together.
+        batch: how many fits run together, see `fit_multistart`.
         optimiser: the method of each.
         progress: called with a line, such as `print`, as fits end.
 
@@ -99,7 +99,6 @@ def bootstrap(
         ValueError: fewer than two repeats; fewer than two fits that succeeded.
     """
     require_whole("repeats", repeats, 2)
-    require_whole("batch", batch, 1)
     rng = np.random.default_rng(require_whole("seed", seed, 0))
     problem, z = result.problem, jnp.asarray(result.z, result.problem.dtype)
     predicted = [np.asarray(y, float) for e in problem.at(z) for y in e.predictions(e.run())]
@@ -114,7 +113,7 @@ def bootstrap(
         optimiser,
         np.repeat(np.asarray(result.z, float)[None], repeats, axis=0),
         sigmas=Problems.of([result.sigmas], shared=True),
-        batch=min(batch, repeats),
+        batch=batch_size(problem, batch, repeats),
         progress=say,
     )
     ends = [m.minimum.z for m in members if m.minimum is not None and m.minimum.converged]

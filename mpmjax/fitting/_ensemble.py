@@ -10,8 +10,8 @@ import numpy as np
 from scipy.special import chdtrc
 
 from mpmjax._types import Scalar
-from mpmjax.checks import checked, require, require_whole, warn
-from mpmjax.fitting._batch import Problems, search_many
+from mpmjax.checks import checked, require, warn
+from mpmjax.fitting._batch import Problems, batch_size, search_many
 from mpmjax.fitting._estimates import fit_result, settle_noise
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import MOST_ROUNDS, explain
@@ -97,7 +97,7 @@ def fit_ensemble(
     experiments: tuple[Any, ...] | list[Any],
     parameters: dict[str, AbstractParameter],
     *,
-    batch: int = 8,
+    batch: int | None = None,
     report: dict[str, Callable[[Experiment], Any]] | None = None,
     level: Scalar = 0.95,
     optimiser: AbstractOptimiser = LevenbergMarquardt(),
@@ -117,7 +117,7 @@ def fit_ensemble(
             differ in every number (data, noise, places, velocities, materials), and in no shape, choice or function:
             give a marker that was not seen as NaN.
         parameters: see `fit`.
-        batch: how many searches run together.
+        batch: how many searches run together, see `fit_multistart`.
         report: see `fit`.
         level: see `fit`.
         optimiser: see `fit`.
@@ -126,7 +126,6 @@ def fit_ensemble(
     Raises:
         ValueError: as `fit`; data sets of different shapes; no fit that did not fail.
     """
-    require_whole("batch", batch, 1)
     require(len(experiments) > 0, "An ensemble needs a data set at least.")
     require((level > 0) & (level < 1), f"level must lie between 0 and 1, got {level}.")
     sets = [
@@ -153,14 +152,14 @@ def fit_ensemble(
 def _fit_each(
     problems: list[FitProblem],
     optimiser: AbstractOptimiser,
-    batch: int,
+    batch: int | None,
     report: dict[str, Callable[[Experiment], Any]],
     level: float,
     progress: Callable[[str], None] | None,
 ) -> list[FitResult | str]:
     """The fit of each, or why it failed; in rounds, as long as the noise of some changes."""
     stacked, n = Problems.of(problems, shared=False), problems[0].size
-    batch = min(batch, len(problems))
+    batch = batch_size(problems[0], batch, len(problems))
     sigmas = [p.first_sigmas for p in problems]
     starts = np.zeros((len(problems), n))
     history: list[tuple[Iteration, ...]] = [()] * len(problems)

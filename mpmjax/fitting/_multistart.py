@@ -11,7 +11,7 @@ import numpy as np
 
 from mpmjax._types import Scalar
 from mpmjax.checks import checked, require_whole, warn
-from mpmjax.fitting._batch import Member, Problems, search_many
+from mpmjax.fitting._batch import Member, Problems, batch_size, search_many
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import explain, fit, require_influence
 from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
@@ -91,7 +91,7 @@ def fit_multistart(
     starts: int = 64,
     ranges: dict[str, tuple[float, float]] | None = None,
     seed: int = 0,
-    batch: int = 8,
+    batch: int | None = None,
     report: dict[str, Callable[[Experiment], Any]] | None = None,
     level: Scalar = 0.95,
     optimiser: AbstractOptimiser = LevenbergMarquardt(),
@@ -123,7 +123,7 @@ def fit_multistart(
         starts: how many searches.
         ranges: lowest and highest value to start from, by the name of a parameter.
         seed: of the starting points.
-        batch: how many searches run together. Measure it on your device (`benchmarks/multistart.py`).
+        batch: how many searches run together. Default: eight with explicit steps, one with implicit ones.
         report: see `fit`.
         level: see `fit`.
         optimiser: the method of each search, and of the last fit.
@@ -134,7 +134,6 @@ def fit_multistart(
         SimulationError: no search could start, and the simulation at the first guess meets a fault.
     """
     require_whole("starts", starts, 1)
-    require_whole("batch", batch, 1)
     problem = FitProblem((experiments,) if isinstance(experiments, Experiment) else tuple(experiments), parameters)
     points = starting_points(problem, starts, dict(ranges or {}), seed)
     sigmas = problem.first_sigmas
@@ -154,7 +153,7 @@ def fit_multistart(
         Problems.of([problem], shared=True),
         optimiser,
         sigmas=Problems.of([sigmas], shared=True),
-        batch=min(batch, starts),
+        batch=batch_size(problem, batch, starts),
         joining=_JOINED,
     )
     members = together(points, settling=_SETTLED, progress=say, begun=begun)

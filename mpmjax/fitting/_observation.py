@@ -67,9 +67,7 @@ class AbstractObservation(eqx.Module):
         """
 
     def part_until(self, t1: float) -> "AbstractObservation | None":
-        """The part of it that was measured until a time [s], for a run that ends there; None where there is none, or it
-        is not known, as of a curve."""
-        del t1
+        """The part that was measured until a time [s]; None where there is none, or it is not known, as of a curve."""
 
     def __check_init__(self):
         name = f"{type(self).__name__} {self.name!r}"
