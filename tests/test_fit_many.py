@@ -277,7 +277,7 @@ def test_one_value_a_particle_one_a_material_and_a_field_are_fitted_together(met
         ),
     }
     problem = FitProblem((of,), parameters)
-    z, sigmas = 0.1 * jnp.arange(problem.size), (jnp.asarray(1.0),)
+    z, sigmas = 0.1 * jnp.arange(float(problem.size)), (jnp.asarray(1.0),)
     r, forward = eqx.filter_jit(problem.jacobian)(z, sigmas, "forward")
     _, reverse = eqx.filter_jit(problem.jacobian)(z, sigmas, "reverse")
     assert np.isfinite(r).all()
