@@ -17,9 +17,9 @@ import typer
 
 from mpmjax.analysis import Trial, energy, grid_mass, name_of, pieces, work_precision
 from mpmjax.checks import require, shortened
-from mpmjax.cli._fit_file import read_fit, refinements
+from mpmjax.cli._fit_file import FitFile, read_fit, refinements
 from mpmjax.cli._scene_file import Simulation, read_scene_file, read_simulation, stable_step
-from mpmjax.fitting import fit, fit_refined
+from mpmjax.fitting import AbstractParameter, fit, fit_multistart, fit_refined, fit_staged, profile
 from mpmjax.io import check_place, end_on_signals, load, record, reporting, steps_in, stopping
 from mpmjax.simulation import Run
 from mpmjax.viz import COLOURS, draw_chart, draw_fit, render, write_fit, write_trials
@@ -202,6 +202,12 @@ def fit_command(
         str | None,
         typer.Option(metavar="N[,N]", help="Fit on N times as many cells a direction too, and extrapolate."),
     ] = None,
+    profiles: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--profile", metavar="NAME", help="A fitted number whose profile likelihood is drawn; repeatable."
+        ),
+    ] = None,
     most_seconds: MostSeconds = None,
     imports: Imports = None,
 ) -> None:
@@ -224,21 +230,42 @@ def fit_command(
             if stop.signal:
                 raise KeyboardInterrupt
 
+        parameters = _from_a_better_start(asked, progress)
         if grids:
             found = fit_refined(
-                lambda n: asked.refined(n)[0], asked.parameters, refinements=grids, progress=progress, **common
+                lambda n: asked.refined(n)[0], parameters, refinements=grids, progress=progress, **common
             )
             fits, whole = found.fits, asked.refined(found.refinements[-1])[1]
         else:
-            found = fit(asked.experiments, asked.parameters, progress=progress, **common)
+            found = fit(asked.experiments, parameters, progress=progress, **common)
             fits, whole = (found,), asked.whole
-    print(found)
-    result, iterations = fits[-1], sum(len(each.history) for each in fits)
+        print(found)
+        result, iterations = fits[-1], sum(len(each.history) for each in fits)
+        drawn = [] if result.interrupted else [profile(result, name, progress=progress) for name in profiles or ()]
+    for each in drawn:
+        print(each)
     print(f"{iterations} simulations with exact derivatives, {time.perf_counter() - begun:.3g} s in all", flush=True)
-    numbers = write_fit(found, plot.with_suffix(".json"))
-    print(f"written {draw_fit(result, plot, whole)} and {numbers}")
+    numbers = write_fit(found, plot.with_suffix(".json"), whole, tuple(drawn))
+    print(f"written {draw_fit(result, plot, whole, tuple(drawn))} and {numbers}")
     if stop.signal or result.interrupted:
         raise typer.Exit(128 + (stop.signal or signal.SIGINT))
+
+
+def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> dict[str, AbstractParameter]:
+    """The parameters, from where many searches or a fit to growing horizons ended, where the file asks for these."""
+    common: dict[str, Any] = {"level": asked.level, "progress": progress}
+    if asked.optimiser is not None:
+        common["optimiser"] = asked.optimiser
+    if asked.starts > 1:
+        many = fit_multistart(asked.experiments, asked.parameters, starts=asked.starts, **common)
+        print(many)
+        return many.best.restarted(asked.parameters)
+    if asked.horizons:
+        times = None if asked.horizons is True else asked.horizons
+        staged = fit_staged(asked.experiments, asked.parameters, horizons=times, **common)
+        print(staged)
+        return staged.result.restarted(asked.parameters)
+    return asked.parameters
 
 
 def _grids(text: str) -> tuple[int, ...]:

@@ -16,9 +16,11 @@ from mpmjax.checks import require, require_positive, shortened
 from mpmjax.cli._measurements import Source, observation
 from mpmjax.cli._scene_file import Simulation, read_simulation
 from mpmjax.fitting import (
+    LBFGS,
     AbstractObservation,
     AbstractOptimiser,
     AbstractParameter,
+    Adam,
     Bounded,
     Experiment,
     Gaussian,
@@ -28,7 +30,11 @@ from mpmjax.fitting import (
 )
 from mpmjax.io import arguments
 
-_OPTIMISERS: dict[str, type[AbstractOptimiser]] = {"LevenbergMarquardt": LevenbergMarquardt}
+_OPTIMISERS: dict[str, type[AbstractOptimiser]] = {
+    "LevenbergMarquardt": LevenbergMarquardt,
+    "LBFGS": LBFGS,
+    "Adam": Adam,
+}
 """What [fit] optimiser may name."""
 
 
@@ -39,7 +45,11 @@ class FitFile(NamedTuple):
     parameters: dict[str, AbstractParameter]
     report: dict[str, Callable[[Experiment], Any]]
     level: float
-    optimiser: AbstractOptimiser
+    optimiser: AbstractOptimiser | None
+    starts: int
+    """From how many points it is searched first; one for none but the first guess."""
+    horizons: tuple[float, ...] | bool
+    """Until which times it is fitted first [s]; true to choose them, false for none."""
     refine: tuple[int, ...]
     """On how many times as many cells a direction it is fitted besides; empty for none."""
     whole: tuple[Experiment, ...]
@@ -93,11 +103,12 @@ def read_fit(path: Path, read: Callable[[Path], Simulation] = read_simulation) -
 
     found = {name: _getter(where) for name, where in report.items()}
     fitted, whole = zip(*parts, strict=True)
-    return FitFile(fitted, dict(named), found, *settings, whole, refined)
+    return FitFile(fitted, dict(named), found, whole=whole, refined=refined, **settings)
 
 
 _TABLES = ("parameter", "observation", "experiment", "report")
-_KEYS = {*_TABLES, "t1", "level", "optimiser", "refine"}
+_SETTINGS = ("level", "starts", "horizons", "refine")
+_KEYS = {*_TABLES, *_SETTINGS, "t1", "optimiser"}
 
 
 def _require_keys(table: dict[str, Any], where: str, known: set[str]) -> None:
@@ -107,16 +118,25 @@ def _require_keys(table: dict[str, Any], where: str, known: set[str]) -> None:
         require(key in known, f"{where} has the unknown key {key[:60]!r}{hint} Known are {', '.join(sorted(known))}.")
 
 
-def _settings(table: dict[str, Any]) -> tuple[float, AbstractOptimiser, tuple[int, ...]]:
-    """Level, optimiser and refinements of a [fit] table."""
+def _settings(table: dict[str, Any]) -> dict[str, Any]:
+    """Level, optimiser, starts, horizons and refinements of a [fit] table."""
 
-    def settings(*, level: Scalar = 0.95, refine: int | tuple[int, ...] = ()) -> tuple[float, tuple[int, ...]]:
+    def settings(
+        *,
+        level: Scalar = 0.95,
+        starts: int = 1,
+        horizons: tuple[float, ...] | bool = False,
+        refine: int | tuple[int, ...] = (),
+    ) -> dict[str, Any]:
         require(0 < level < 1, f"[fit] level must lie between 0 and 1, got {level!r}.")
-        return float(level), refinements(refine if isinstance(refine, tuple) else (refine,), "[fit] refine")
+        require(starts > 0, f"[fit] starts must be one at least, got {starts}.")
+        require(starts == 1 or not horizons, "[fit] takes either starts or horizons.")
+        finer = refinements(refine if isinstance(refine, tuple) else (refine,), "[fit] refine")
+        return {"level": float(level), "starts": starts, "horizons": horizons, "refine": finer}
 
-    own = {key: value for key, value in table.items() if key in ("level", "refine")}
-    level, refine = settings(**arguments(settings, own, "[fit]"))
-    return level, _optimiser(table.get("optimiser", "LevenbergMarquardt")), refine
+    own = {key: value for key, value in table.items() if key in _SETTINGS}
+    optimiser = _optimiser(table["optimiser"]) if "optimiser" in table else None
+    return settings(**arguments(settings, own, "[fit]")) | {"optimiser": optimiser}
 
 
 def refinements(numbers: tuple[int, ...], where: str) -> tuple[int, ...]:
