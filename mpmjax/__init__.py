@@ -110,6 +110,7 @@ from mpmjax.material import (
     FixedCorotated,
     Fluid,
     Hencky,
+    HerschelBulkley,
     NeoHookean,
     Snow,
     Viscous,
@@ -168,6 +169,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "CamClay",
     "DruckerPrager",
     "VonMises",
+    "HerschelBulkley",
     "Fluid",
     "Viscous",
     # discretisation

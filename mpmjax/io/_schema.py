@@ -47,7 +47,18 @@ from mpmjax.implicit import (
     MassPreconditioner,
     Newton,
 )
-from mpmjax.material import CamClay, DruckerPrager, FixedCorotated, Fluid, Hencky, NeoHookean, Snow, Viscous, VonMises
+from mpmjax.material import (
+    CamClay,
+    DruckerPrager,
+    FixedCorotated,
+    Fluid,
+    Hencky,
+    HerschelBulkley,
+    NeoHookean,
+    Snow,
+    Viscous,
+    VonMises,
+)
 from mpmjax.state import Scene, TotalLagrangian, UpdatedLagrangian
 from mpmjax.stepping import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
 
@@ -55,7 +66,7 @@ CLASSES: tuple[type, ...] = (
     Scene,
     Grid,
     *(FixedCorotated, NeoHookean, Hencky),
-    *(Snow, VonMises, DruckerPrager, CamClay, Fluid, Viscous),
+    *(Snow, VonMises, HerschelBulkley, DruckerPrager, CamClay, Fluid, Viscous),
     *(StickyBox, SlipBox, SeparatingBox, Grip, SymmetryPlane, ContactPlane),
     *(StickyCollider, SlipCollider, SeparatingCollider),
     *(Box, Ball, HalfSpace, Capsule, Cylinder, Union, SampledDistance, Motion, RigidMotion),
