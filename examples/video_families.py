@@ -80,8 +80,8 @@ FAMILIES = {
     ),
     "newtonian": Family(
         lambda eta, kappa: mpm.Viscous(mpm.Fluid(kappa), eta),
-        {"eta": 20.0, "kappa": 2e4},
-        {"eta": 30.0, "kappa": 3e4},
+        {"eta": 50.0, "kappa": 2e4},
+        {"eta": 80.0, "kappa": 3e4},
         {
             "eta": mpm.Positive(lambda e: law_of(e).shear_viscosity, unit="Pa s"),
             "kappa": mpm.Positive(lambda e: law_of(e).law.bulk_modulus, unit="Pa"),
@@ -90,10 +90,10 @@ FAMILIES = {
     ),
     "non-newtonian": Family(
         lambda mu, kappa, tau_Y, eta: mpm.HerschelBulkley(*young(mu, kappa), yield_stress=tau_Y, consistency=eta),
-        {"mu": 1e4, "kappa": 2e4, "tau_Y": 400.0, "eta": 50.0},
-        {"mu": 1.5e4, "kappa": 3e4, "tau_Y": 600.0, "eta": 30.0},
+        {"mu": 4e3, "kappa": 2e4, "tau_Y": 600.0, "eta": 40.0},
+        {"mu": 6e3, "kappa": 3e4, "tau_Y": 400.0, "eta": 60.0},
         {
-            "mu": mpm.Positive(update=set_modulus("mu"), start=1.5e4, unit="Pa"),
+            "mu": mpm.Positive(update=set_modulus("mu"), start=6e3, unit="Pa"),
             "kappa": mpm.Positive(update=set_modulus("kappa"), start=3e4, unit="Pa"),
             "tau_Y": YIELD,
             "eta": mpm.Positive(lambda e: law_of(e).consistency, unit="Pa s"),
@@ -144,7 +144,7 @@ def film(family: Family, n: int) -> list[np.ndarray]:
 
 
 # %% The fit
-def fitted(family: Family, clouds: list[np.ndarray], refinements: tuple[int, ...]) -> mpm.RefinedFit:
+def fitted(family: Family, clouds: list[np.ndarray], refinements: tuple[int, ...], progress: Any = None) -> mpm.RefinedFit:
     """The parameters from the clouds, on several grids, extrapolated."""
     pictures = [PICTURE.of_points(cloud, DENSITY * HALF * HEIGHT) for cloud in clouds]
     seen = mpm.Series(FRAMES, pictures, PICTURE, weight=SHARED, name="pictures")
@@ -153,7 +153,7 @@ def fitted(family: Family, clouds: list[np.ndarray], refinements: tuple[int, ...
         scene, particles = scene_of(family, family.start, n)
         return mpm.Experiment(scene, particles, t1=float(FRAMES[-1]), dt=STEP / n, observations=seen)
 
-    return mpm.fit_refined(build, family.parameters, refinements=refinements)
+    return mpm.fit_refined(build, family.parameters, refinements=refinements, rtol=1e-4, progress=progress)
 
 
 # %% The table

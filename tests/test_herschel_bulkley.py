@@ -149,3 +149,30 @@ def test_the_share_of_flow_solves_its_equation():
     np.testing.assert_allclose(w + np.asarray(c) * w ** np.asarray(n), 1, rtol=1e-13)
     assert_close(_share_of_flow(c, jnp.asarray(1.0)), 1 / (1 + c), 1e-14)
     assert (np.asarray(_share_of_flow(jnp.zeros(3), jnp.asarray(0.5))) == 1).all()
+
+
+def plug_flow(cells):
+    """Bingham's fluid between plates that hold it, pulled along them by g = 0.1 m/s², half of it a plug: particles'
+    places across, and their velocity over that of the plug."""
+    grid = mpm.Grid((4, cells + 8), 1 / cells, origin=(0, -4), periodic=(True, False))
+    plates = mpm.StickyBox((-np.inf, 0.0), (np.inf, 1.0))
+    law = mpm.HerschelBulkley(2e4, 0.3, yield_stress=25.0, consistency=50.0)  # ρ g h/2 = 50 Pa at the plates
+    scene = mpm.Scene(grid, law, gravity=(0.1, 0.0), boundary=plates)
+    rest = mpm.fill(mpm.Box((0.0, 0.0), (4 / cells, 1.0)), grid, particles_per_cell=4, density=1e3)
+    steps = 2000
+    final = mpm.rollout(scene, rest, steps=steps * cells // 8, dt=0.02 / cells)
+    return np.asarray(final.x[:, 1]), np.asarray(final.v[:, 0]) / (100 * 0.25**2 / (2 * 50))
+
+
+@pytest.mark.slow
+def test_flow_between_plates_has_a_plug():
+    """Steady, as Bingham's law has it: v = ρ g/2η ((h/2 − z_Y)² − (z − z_Y)²) beyond z_Y = τ_Y/ρ g from the middle, and
+    a plug within; of first order, as the plates are."""
+    errors = []
+    for cells in (8, 16):
+        y, v = plug_flow(cells)
+        beyond = np.maximum(np.abs(y - 0.5) - 0.25, 0) / 0.25
+        errors.append(np.abs(v - (1 - beyond**2)).max())
+    print(errors)
+    assert errors[1] < 0.1
+    assert errors[0] / errors[1] > 1.6
