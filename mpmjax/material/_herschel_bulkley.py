@@ -25,8 +25,8 @@ class HerschelBulkley(AbstractInelastic):
     (W. H. Herschel, R. Bulkley, Kolloid-Z. 39 (1926) 291; in the Material Point Method Y. Yue, B. Smith, C. Batty,
     C. Zheng, E. Grinspun, ACM Trans. Graph. 34 (2015) 160, doi 10.1145/2751541). With n = 1 it is Bingham's law.
 
-    Elastic as Hencky's law, with Kirchhoff stress s = 2μ e in the deviator e of the elastic logarithmic strain. With the
-    shear stress τ = ‖s‖/√2 and the shear rate of the flow γ̇ = √2 ‖d_p‖,
+    Elastic as Hencky's law, with Kirchhoff stress s = 2μ e in the deviator e of the elastic logarithmic strain. With
+    the shear stress τ = ‖s‖/√2 and the shear rate of the flow γ̇ = √2 ‖d_p‖,
 
         γ̇ = 0 where τ ≤ τ_Y,   else   τ = τ_Y + η γ̇ⁿ.
 
@@ -41,12 +41,12 @@ class HerschelBulkley(AbstractInelastic):
     1-D and 2-D the deviator is that of three dimensions. Where nothing yields F is unchanged to the last bit.
 
     *When it breaks*: it needs J > 0, as Hencky's law does. The stress lags a step behind the law, since the return map
-    follows the step, and in an implicit step the elastic law alone resists: steps longer than η/μ flow late. Explicit
-    steps are limited by the speed of sound, not by η. τ_Y is that of shear, a factor √3 below that of tension. With
-    n = 1 the derivative jumps where flow begins.
-    *Good values*: with density 1000 kg/m³, carbopol gel μ = 100 Pa, τ_Y = 50 Pa, η = 20 Pa sⁿ, n = 0.4; mud τ_Y = 10 to
-    100 Pa, η = 0.1 to 10 Pa s, n = 1. The elasticity of pastes hardly matters to their flow and limits the step: take
-    E as soft as a yield strain τ_Y/μ of a few per cent allows, ν = 0.45.
+    follows the step, and in an implicit step the elastic law alone resists: its part adds to the flow's stress some
+    μ Δt γ̇. Explicit steps are limited by the speed of sound, not by η. τ_Y is that of shear, a factor √3 below that of
+    tension. With n = 1 the derivative jumps where flow begins.
+    *Good values*: τ_Y of some tens to some hundreds of Pa, n = 0.3 to 1, and η so that η γ̇ⁿ is of the size of τ_Y. The
+    elasticity of pastes hardly matters to their flow and limits the step: take E as soft as a yield strain τ_Y/μ of a
+    few per cent allows, and ν = 0.45.
 
     Args:
         youngs_modulus: E [Pa], one value or one per particle (p,).
