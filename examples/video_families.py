@@ -1,10 +1,10 @@
-"""What a film of a falling body tells of its material: elastic, fluid, paste, plasticine and sand, each from clouds of
-points of which nobody knows which is which.
+"""What a film of a falling body tells of its material: elastic, fluid, paste, plasticine and sand, each from clouds
+of points of which nobody knows which is which.
 
-The families are those of X. Li et al., "PAC-NeRF", ICLR 2023. Each body falls on a floor and is seen in eight frames, as
-points with noise. Its parameters are fitted on two grids and extrapolated. The film is made by another discretisation: a
-grid four times finer than the finer of the two, with another kernel, transfer and gradient, a fifth of the step, and for
-the elastic body another integrator.
+The families are those of X. Li et al., "PAC-NeRF", ICLR 2023. Each body falls on a floor and is seen in eight frames,
+as points with noise. Its parameters are fitted on two grids and extrapolated. The film is made by another
+discretisation: a grid four times finer than the finer of the two, with another kernel, transfer and gradient, a fifth
+of the step, and for the elastic body another integrator.
 
     python examples/video_families.py                  # all of them
     python examples/video_families.py --family sand    # one of them
@@ -142,7 +142,7 @@ def scene_of(family: Family, values: dict[str, Any], n: int, **choices: Any) -> 
 # %% The film: points with noise
 def film(family: Family, n: int) -> list[np.ndarray]:
     """The clouds of all frames, shape (m, 2) each, of a body of 5n by 10n cells: a part of its particles at random."""
-    choices = {"kernel": mpm.BSpline(3), "gradient": mpm.SplineGradient(), "transfer": mpm.FLIP(0.95)}
+    choices = {"kernel": mpm.BSpline(3), "gradient": mpm.SplineGradient(), "transfer": mpm.FLIP(0.99)}
     scene, particles = scene_of(family, family.truth, n, **choices)
     every = family.film_steps * n
     run = mpm.simulate(

@@ -45,7 +45,7 @@ def followed(law):
     """Where twelve markers are seen, with noise: on a grid four times finer than the finest that is fitted, by another
     kernel, gradient and transfer, in steps a tenth as long. They are explicit: implicit ones, with the elastic law in
     their operator, stiffen what yields."""
-    choices = {"kernel": mpm.BSpline(3), "gradient": mpm.SplineGradient(), "transfer": mpm.FLIP(0.95)}
+    choices = {"kernel": mpm.BSpline(3), "gradient": mpm.SplineGradient(), "transfer": mpm.FLIP(0.99)}
     scene, particles = fallen(law, 8, **choices)
     markers = mpm.Markers.at(particles, PLACES)
     run = mpm.simulate(scene, particles, t1=float(TIMES[-1]), dt=2.5e-4, save_every=100, observe=markers)
