@@ -25,11 +25,12 @@ def law_of(**values):
 
 @eqx.filter_jit
 def driven(law, F, L, dt, steps):
-    """F and the Kirchhoff stress after each of some steps F ← (I + Δt L) F and its return."""
+    """F, the Kirchhoff stress and α after each of some steps F ← (I + Δt L) F and its return."""
 
     def body(state, _):
         F, history = law.return_map(state[0] + dt * la.matmul(L, state[0]), state[1], dt)
-        return (F, history), (F, la.matmul(law.elastic(history).stress(F), la.transpose(F)))
+        stress = la.matmul(law.elastic(history).stress(F), la.transpose(F))
+        return (F, history), (F, stress, history.plastic_strain)
 
     return jax.lax.scan(body, (F, law.initial_history(F)), None, length=steps)[1]
 
@@ -57,11 +58,13 @@ def test_steady_shear_has_the_stress_of_its_rate(dt):
     law = law_of(exponent=EXPONENTS, youngs_modulus=E / RATES)
     half = jnp.expm1(rates * dt / 2 * jnp.asarray([1.0, -1.0])[:, None]) / dt
     L = jnp.zeros((3, 3, len(rates))).at[0, 0].set(half[0]).at[1, 1].set(half[1])
-    tau = shear_stress(driven(law, at_rest(3, len(rates)), L, dt, steps)[1])
+    _, stress, alpha = driven(law, at_rest(3, len(rates)), L, dt, steps)
+    tau = shear_stress(stress)
     yielded = 60 + 5 * RATES**EXPONENTS
     if MU * dt < 60:
         np.testing.assert_allclose(tau[0], MU * dt, rtol=1e-12)
     np.testing.assert_allclose(tau[-1], yielded, rtol=1e-10)
+    np.testing.assert_allclose(np.sqrt(3) * (alpha[-1] - alpha[-2]), RATES * dt, rtol=1e-10)
 
 
 @pytest.mark.thorough

@@ -95,18 +95,14 @@ def invariants(F, transverse):
 
 
 def scalar_of(history):
-    """What a history holds besides ε_t; zero if that is nothing."""
-    rest = jax.tree.leaves(eqx.tree_at(lambda h: h.transverse_strain, history, None, is_leaf=lambda x: x is None))
-    return np.asarray(rest[0] if rest else 0.0)
-
-
-def named(name, value):
-    """A value of the history's scalar, by its name; empty where there is none."""
-    return {CASES[name][0]: value} if CASES[name][0] else {}
+    """What a history holds besides ε_t."""
+    return np.asarray(
+        jax.tree.leaves(eqx.tree_at(lambda h: h.transverse_strain, history, None, is_leaf=lambda x: x is None))[0]
+    )
 
 
 CASES = {
-    # name of the history's scalar, None without; then by case: mean, size of the deviator, that scalar
+    # name of the history's scalar; then by case: mean, size of the deviator, that scalar
     "von_mises": (
         "plastic_strain",
         {"elastic": (0.1, 0.009, 0.0), "yielding": (-0.1, 0.05, 0.03), "far": (0.05, 0.8, 0.0)},
@@ -134,8 +130,8 @@ CASES = {
         },
     ),
     "herschel_bulkley": (
-        None,
-        {"elastic": (0.1, 0.009, 0.0), "yielding": (-0.1, 0.05, 0.0), "far": (0.05, 0.8, 0.0)},
+        "plastic_strain",
+        {"elastic": (0.1, 0.009, 0.0), "yielding": (-0.1, 0.05, 0.03), "far": (0.05, 0.8, 0.0)},
     ),
 }
 
@@ -143,20 +139,21 @@ CASES = {
 def cases(name, d, seed=0):
     """Ten particles, each of a case that it is named after, away from all kinks."""
     rng = np.random.default_rng(seed)
-    table = CASES[name][1]
+    scalar, table = CASES[name]
     names = list(itertools.islice(itertools.cycle(table), 10))
     mean, deviation, value = np.array([table[case] for case in names]).T
     F, transverse = strained(d, mean, deviation, rng)
-    return names, F, with_history(law_of(name).initial_history(F), transverse, **named(name, value))
+    return names, F, with_history(law_of(name).initial_history(F), transverse, **{scalar: value})
 
 
 def random_states(name, d, p=300, seed=3):
     """Trial states of all cases at random."""
     rng = np.random.default_rng(seed)
     F, transverse = strained(d, 0.1 * rng.normal(size=p), 10 ** rng.uniform(-4, 0, p), rng)
+    scalar = CASES[name][0]
     value = 0.1 * rng.normal(size=p)
     value = value if name == "cam_clay" else np.abs(value) * (rng.uniform(size=p) > 0.5)
-    return F, with_history(law_of(name).initial_history(F), transverse, **named(name, value))
+    return F, with_history(law_of(name).initial_history(F), transverse, **{scalar: value})
 
 
 def yield_excess(name, mean, deviation, before, after, flowed=0.0):
@@ -294,9 +291,10 @@ def test_derivatives_are_finite_where_stretches_coincide(name, d, twice):
     diagonals = np.repeat([(1, 1, 1), (0.9, 0.9, 0.9), (1.1, 1.1, 1.1), (1.2, 1.2, 0.8), (0.7, 0.7, 0.8)], 2, axis=0)
     F = jnp.asarray(np.einsum("pi,ij->ijp", diagonals[:, :d], np.eye(d)))
     history = law.initial_history(F)
-    yielded = np.where(np.arange(len(diagonals)) % 2 == 0, scalar_of(history), 0.04)
+    scalar = CASES[name][0]
+    yielded = np.where(np.arange(len(diagonals)) % 2 == 0, getattr(history, scalar), 0.04)
     transverse = None if d == 3 else jnp.log(diagonals[:, 2])
-    q = (law, F, with_history(history, transverse, **named(name, yielded)))
+    q = (law, F, with_history(history, transverse, **{scalar: yielded}))
     for leaf in jax.tree.leaves(linearised(q, *directions(q, rng), twice=twice)):
         assert np.isfinite(leaf).all()
 

@@ -16,6 +16,9 @@ from mpmjax.material._law import AbstractInelastic
 class HerschelBulkleyHistory(eqx.Module):
     """The history of a particle of Herschel and Bulkley's law."""
 
+    plastic_strain: Float[Array, "*p"]
+    """α [-], the accumulated equivalent plastic strain ∫ γ̇/√3 dt, as `VonMises` has it, shape (p,). The law does not
+    depend on it."""
     transverse_strain: Float[Array, "*p"] | None
     """ε_t [-] (see `Hencky`), shape (p,); None in 3-D."""
 
@@ -70,8 +73,8 @@ class HerschelBulkley(AbstractInelastic):
         require_positive("HerschelBulkley's exponent", self.exponent)
 
     def initial_history(self, F: Matrix) -> HerschelBulkleyHistory:
-        """ε_t = 0."""
-        return HerschelBulkleyHistory(no_transverse_strain(F))
+        """α = 0, ε_t = 0."""
+        return HerschelBulkleyHistory(jnp.zeros(F.shape[2:], F.dtype), no_transverse_strain(F))
 
     def elastic(self, history: HerschelBulkleyHistory) -> Hencky:
         """Hencky's law with the history's ε_t."""
@@ -88,9 +91,10 @@ class HerschelBulkley(AbstractInelastic):
         excess = jnp.where(yields, trial - self.yield_stress, 1)
         fastest = excess / (stiffness * dt)  # the rate at which the flow of the step takes all of the excess
         share = _share_of_flow(self.consistency * fastest**self.exponent / excess, jnp.asarray(self.exponent, F.dtype))
-        ratio = 1 - jnp.where(yields, share * excess / jnp.where(yields, trial, 1), 0)
+        relaxed = jnp.where(yields, share * excess, 0)
+        ratio = 1 - relaxed / jnp.where(yields, trial, 1)
         F, transverse = strain.returned(ratio, strain.mean)
-        return F, HerschelBulkleyHistory(transverse)
+        return F, HerschelBulkleyHistory(history.plastic_strain + relaxed / (3**0.5 * stiffness), transverse)
 
 
 _NEWTON_STEPS = 8
