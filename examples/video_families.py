@@ -35,7 +35,7 @@ HALF, HEIGHT, WIDTH, TOP = 0.2, 0.4, 1.0, 0.48  # of the body's right half, and 
 FRAMES = np.arange(1, 9) / 20  # s
 NOISE = 2e-3  # m, of a point's coordinate
 POINTS = 4000
-PICTURE = mpm.Density(mpm.Grid((17, 13), 0.05, origin=(0, 0)))
+PICTURE = mpm.Density(mpm.Grid((23, 14), 0.05, origin=(-2, -2)))  # as wide as what may be seen, and a margin
 STEP = 2.5e-3  # s, of the fit on the coarsest grid
 SHARED = 1 / 3.6  # neighbouring pixels share points: so many of them are worth one
 
@@ -161,8 +161,8 @@ def film(family: Family, n: int) -> list[np.ndarray]:
 def experiment(family: Family, clouds: list[np.ndarray], n: int) -> mpm.Experiment:
     """The fall on n times as many cells a direction, and the pictures that the clouds are.
 
-    A fit keeps a picture and its derivative by each parameter for each step: on the finer grid 320 steps of 221 pixels,
-    for the paste with its four parameters 2.8 MB.
+    A fit keeps a picture and its derivative by each parameter for each step: on the finer grid 320 steps of 322 pixels,
+    for the paste with its four parameters 4 MB.
     """
     pictures = [PICTURE.of_points(cloud, DENSITY * HALF * HEIGHT) for cloud in clouds]
     seen = mpm.Series(FRAMES, pictures, PICTURE, weight=SHARED, name="pictures")
