@@ -87,7 +87,7 @@ FAMILIES = {
         {"E": 3e4, "nu": 0.2},
         {"E": YOUNG, "nu": POISSON},
         filmed_by=mpm.SemiImplicit(beta=0.5),
-        film_steps=12,
+        film_steps=6,
     ),
     "newtonian": Family(
         lambda eta, kappa: mpm.Viscous(mpm.Fluid(kappa), eta),
@@ -99,7 +99,7 @@ FAMILIES = {
         },
         friction=0.5,
         filmed_by=mpm.SemiImplicit(beta=0.5),
-        film_steps=12,
+        film_steps=6,
     ),
     "non-newtonian": Family(
         lambda mu, kappa, tau_Y, eta: mpm.HerschelBulkley(*young(mu, kappa), yield_stress=tau_Y, consistency=eta),
