@@ -214,5 +214,5 @@ if __name__ == "__main__":
         rows = rows_of(name, result, time.perf_counter() - begun)
         print(f"{name}\n{result}\n", flush=True)
         write(rows)
-        for _, label, _, _, true, found, *_ in rows:
-            assert abs(found - true) < WITHIN[label] * true, f"{label} is {found:.4g}, not {true:.4g}"
+        for _, label, _, _, true, _, lower, upper, *_ in rows:
+            assert lower < true < upper, f"{label} is {true:.4g}, which is not from {lower:.4g} to {upper:.4g}"
