@@ -3,8 +3,8 @@ of points of which nobody knows which is which.
 
 The families are those of X. Li et al., "PAC-NeRF", ICLR 2023. Each body falls on a floor and is seen in eight frames,
 as points with noise. Its parameters are fitted on two grids and extrapolated. The film is made by another
-discretisation: a grid four times finer than the finer of the two, with another kernel, transfer and gradient, a fifth
-of the step, and for the elastic body and the fluid another integrator.
+discretisation: a grid four times finer than the finer of the two, with another kernel, transfer, gradient and step, and
+for the elastic body and the fluid another integrator.
 
     python examples/video_families.py                  # all of them
     python examples/video_families.py --family sand    # one of them
