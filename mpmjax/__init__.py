@@ -135,6 +135,7 @@ from mpmjax.material import (
     Fluid,
     Gent,
     Hencky,
+    HerschelBulkley,
     MooneyRivlin,
     NeoHookean,
     Ogden,
@@ -200,6 +201,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "CamClay",
     "DruckerPrager",
     "VonMises",
+    "HerschelBulkley",
     "Fluid",
     "Viscous",
     # discretisation

@@ -35,6 +35,7 @@ PLASTIC = {
     "von_mises": mpm.VonMises(1e4, 0.3, yield_stress=400.0, hardening_modulus=1e3),
     "drucker_prager": mpm.DruckerPrager(1e4, 0.3, friction_angle=0.6),
     "cam_clay": mpm.CamClay(1e4, 0.3, friction=1.0, preconsolidation=300.0, cohesion=0.5, hardening=3.0),
+    "herschel_bulkley": mpm.HerschelBulkley(1e4, 0.3, yield_stress=200.0, consistency=10.0, exponent=0.7),
 }
 """Laws that yield."""
 FLUIDS = {"fluid": mpm.Fluid(1e4), "fluid_in_tension": mpm.Fluid(1e4, tension=True)}

@@ -162,6 +162,12 @@ YIELDING = {
         ((0.75, 0.75, 0.75), (1.3, 1.3, 1.3), (1.5, 0.75, 0.75)),
         0.1,
     ),
+    "herschel_bulkley": Yielding(
+        mpm.HerschelBulkley(1e4, 0.3, yield_stress=600.0, consistency=5.0, exponent=0.7),
+        ((1.0, 1.0, 1.0), (1.02, 0.99, 0.99)),
+        ((1.3, 0.8, 0.8), (0.7, 1.2, 1.2)),
+        0.1,
+    ),
     "fluid": Yielding(mpm.Fluid(1e4), ((0.9,),), ((1.1,),), 0.1),
 }
 
@@ -181,7 +187,7 @@ def test_every_route_to_a_return_maps_derivative_is_right(name, d):
 
     def return_map(F):
         history = jax.tree.map(lambda a: a + 1e-3 * F[0, 0], law.initial_history(F))
-        F, history = law.return_map(F, history)
+        F, history = law.return_map(F, history, 1e-3)
         return jnp.concatenate([F.reshape(-1, F.shape[-1]), *(a[None] for a in jax.tree.leaves(history))])
 
     changed = np.abs(return_map(F)[: d * d] - F.reshape(d * d, -1)).max(axis=0)

@@ -19,10 +19,12 @@ from mpmjax.checks._values import canonical
 
 E, NU = 1e4, 0.3
 MU, K = E / (2 * (1 + NU)), E / (3 * (1 - 2 * NU))
+DT = 1e-3
 PLASTIC = {
     "von_mises": mpm.VonMises(E, NU, yield_stress=100.0, hardening_modulus=500.0),
     "drucker_prager": mpm.DruckerPrager(E, NU, friction_angle=0.6),
     "cam_clay": mpm.CamClay(E, NU, friction=1.2, preconsolidation=300.0, cohesion=0.3, hardening=2.0),
+    "herschel_bulkley": mpm.HerschelBulkley(E, NU, yield_stress=60.0, consistency=5.0, exponent=0.6),
 }
 EACH_LAW = pytest.mark.parametrize("name", list(PLASTIC))
 EACH_DIM = pytest.mark.parametrize("d", [2, *thorough(1, 3)])
@@ -36,7 +38,7 @@ def law_of(name):
 @eqx.filter_jit
 def return_map(law, F, history):
     """The return map, and energy density before and after."""
-    after, new = law.return_map(F, history)
+    after, new = law.return_map(F, history, DT)
     return after, new, law.elastic(history).energy(F), law.elastic(new).energy(after)
 
 
@@ -45,7 +47,7 @@ def driven(law, F, history, L):
     """The states after each F ← (I + L_n) F and its return: F, the history and the Kirchhoff stress, steps first."""
 
     def body(state, L):
-        F, history = law.return_map(state[0] + la.matmul(L, state[0]), state[1])
+        F, history = law.return_map(state[0] + la.matmul(L, state[0]), state[1], DT)
         return (F, history), (F, history, la.matmul(law.elastic(history).stress(F), la.transpose(F)))
 
     return jax.lax.scan(body, (F, history), L)[1]
@@ -127,6 +129,10 @@ CASES = {
             "closing": (-0.05, 0.03, 0.02),
         },
     ),
+    "herschel_bulkley": (
+        "plastic_strain",
+        {"elastic": (0.1, 0.009, 0.0), "yielding": (-0.1, 0.05, 0.03), "far": (0.05, 0.8, 0.0)},
+    ),
 }
 
 
@@ -150,9 +156,11 @@ def random_states(name, d, p=300, seed=3):
     return F, with_history(law_of(name).initial_history(F), transverse, **{scalar: value})
 
 
-def yield_excess(name, mean, deviation, before, after):
+def yield_excess(name, mean, deviation, before, after, flowed=0.0):
     """By how much the yield condition is exceeded, in strains, for Cam clay in their squares: with the strength after
-    the return, for Cam clay before."""
+    the return, for Cam clay before, for Herschel and Bulkley's law at the rate at which the deviator has flowed."""
+    if name == "herschel_bulkley":
+        return deviation - (60 + 5 * (np.sqrt(2) * flowed / DT) ** 0.6) / (np.sqrt(2) * MU)
     if name == "von_mises":
         return deviation - np.sqrt(2 / 3) * (100 + 500 * after) / (2 * MU)
     p = -3 * mean
@@ -173,9 +181,11 @@ def test_a_return_meets_the_yield_condition_and_lowers_the_energy(name, d):
     after, new, energy_before, energy = return_map(law, F, history)
     before, then = scalar_of(history), scalar_of(new)
     mean, deviation = invariants(after, new.transverse_strain)
-    assert (yield_excess(name, mean, deviation, before, then) < 1e-14).all()
+    tried = invariants(F, history.transverse_strain)
+    flowed = np.maximum(tried[1] - deviation, 0)
+    assert (yield_excess(name, mean, deviation, before, then, flowed) < 1e-14).all()
     assert (energy <= energy_before * (1 + 1e-13)).all()
-    trial = yield_excess(name, *invariants(F, history.transverse_strain), before, before)
+    trial = yield_excess(name, *tried, before, before)
     elastic = (trial < -1e-13) & ((before == 0) if name == "drucker_prager" else True)
     assert 10 < elastic.sum() < 290
     for a, b in zip(jax.tree.leaves((after, new)), jax.tree.leaves((F, history)), strict=True):
@@ -207,7 +217,7 @@ def test_plane_and_uniaxial_strain_are_three_dimensional(name, d):
 
 def flat(law, F, history):
     """All that a return gives, as a vector; F in its place, the rest in strains."""
-    after, new = law.return_map(F, history)
+    after, new = law.return_map(F, history, DT)
     return jnp.concatenate([a.reshape(-1, F.shape[-1]) for a in jax.tree.leaves((after, new))])
 
 
@@ -243,7 +253,7 @@ def inner(a, b):
     return sum(float((x * y).sum()) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
-@pytest.mark.parametrize("name", ["von_mises", *thorough("drucker_prager", "cam_clay")])
+@pytest.mark.parametrize("name", ["von_mises", *thorough("drucker_prager", "cam_clay", "herschel_bulkley")])
 @EACH_ORDER
 def test_derivatives_are_central_differences(name, d, twice):
     """By F, history and all parameters at once and in each case apart, to 1e-7; the adjoint is the transpose, to 1e-12;
@@ -303,7 +313,7 @@ def test_what_has_come_apart_feels_no_strain(name, d):
     dF = jnp.asarray(np.random.default_rng(0).normal(size=F.shape))
 
     def after(F):
-        F, new = law.return_map(F, history)
+        F, new = law.return_map(F, history, DT)
         return la.matmul(la.transpose(F), F), new
 
     (squared, new), (change, rates) = jax.jvp(after, (F,), (dF,))
@@ -351,7 +361,7 @@ def triaxial(law, F, history, axial, confinement):
     lateral increments."""
 
     def strained(state, a, x):
-        F, history = law.return_map(jnp.exp(jnp.stack([a, x, x]))[:, None, None] * state[0], state[1])
+        F, history = law.return_map(jnp.exp(jnp.stack([a, x, x]))[:, None, None] * state[0], state[1], DT)
         return F, history, la.matmul(law.elastic(history).stress(F), la.transpose(F))
 
     def body(state, a):
@@ -598,6 +608,9 @@ def test_clay_tears_and_closes():
         ("drucker_prager", {"youngs_modulus": -1.0}, "DruckerPrager's youngs_modulus"),
         ("drucker_prager", {"poisson_ratio": -1.0}, "DruckerPrager's poisson_ratio"),
         ("drucker_prager", {"friction_angle": 30.0}, r"friction_angle \[rad\] must be strictly between 0 and 1.57"),
+        ("herschel_bulkley", {"yield_stress": 0.0}, r"HerschelBulkley's yield_stress \[Pa\] must be greater than zero"),
+        ("herschel_bulkley", {"consistency": -1.0}, r"consistency \[Pa s\^n\] must be from 0 to inf, got -1.0"),
+        ("herschel_bulkley", {"exponent": 0.0}, "HerschelBulkley's exponent must be greater than zero"),
         ("cam_clay", {"youngs_modulus": np.nan}, "CamClay's youngs_modulus .* must be finite"),
         ("cam_clay", {"poisson_ratio": 0.6}, "CamClay's poisson_ratio"),
         ("cam_clay", {"friction": 0.0}, "CamClay's friction must be greater than zero"),

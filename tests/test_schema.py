@@ -41,6 +41,7 @@ EXAMPLES = {
     mpm.Ogden: mpm.Ogden((6e5, -1e4), (1.3, -2.0), 2e8),
     mpm.Snow: mpm.Snow(1.4e5, 0.2, hardening=7.0),
     mpm.VonMises: mpm.VonMises(2e11, 0.3, yield_stress=2.5e8, hardening_modulus=1e9),
+    mpm.HerschelBulkley: mpm.HerschelBulkley(1e4, 0.4, yield_stress=50.0, consistency=20.0, exponent=0.4),
     mpm.DruckerPrager: mpm.DruckerPrager(3.5e5, 0.3, friction_angle=0.6),
     mpm.CamClay: mpm.CamClay(1e6, 0.3, friction=1.2, preconsolidation=3e4, cohesion=0.3, hardening=2.0),
     mpm.Snow: mpm.Snow(1e5, hardening=7.0),

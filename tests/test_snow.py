@@ -11,6 +11,7 @@ import mpmjax as mpm
 from mpmjax.material import SnowHistory
 
 SNOW = mpm.Snow(1.4e5, 0.2, critical_compression=2.5e-2, critical_stretch=7.5e-3, hardening=10.0)
+DT = 1e-3
 
 
 def trials(d, n=200, size=0.05, seed=0):
@@ -27,7 +28,7 @@ def test_the_return_map_clamps_the_singular_values(d):
     F, history = trials(d)
     U, s, Vt = np.linalg.svd(np.moveaxis(np.asarray(F), -1, 0))
     expected = U * np.clip(s, 1 - 2.5e-2, 1 + 7.5e-3)[:, None] @ Vt
-    clamped, after = jax.jit(SNOW.return_map)(F, history)
+    clamped, after = jax.jit(SNOW.return_map)(F, history, DT)
     assert_close(np.moveaxis(np.asarray(clamped), -1, 0), expected, 1e-14)
     volume = np.linalg.det(np.moveaxis(np.asarray(F), -1, 0)) * history.plastic_volume
     assert_close(np.linalg.det(expected) * after.plastic_volume, volume, 1e-13)
@@ -37,7 +38,7 @@ def test_the_return_map_clamps_the_singular_values(d):
 def test_what_does_not_yield_comes_back_bit_for_bit(d):
     """And its history too."""
     F, history = trials(d, size=2e-3)
-    clamped, after = jax.jit(SNOW.return_map)(F, history)
+    clamped, after = jax.jit(SNOW.return_map)(F, history, DT)
     assert np.array_equal(clamped, F)
     assert np.array_equal(after.plastic_volume, history.plastic_volume)
 
@@ -50,7 +51,7 @@ def squeezed(d, rates, steps):
     for _ in range(steps):
         F = F * (1 + jnp.asarray(rates))[:, None, None]
         total = total * (1 + np.asarray(rates))
-        F, history = returned(F, history)
+        F, history = returned(F, history, DT)
     return F, history, total
 
 
@@ -84,7 +85,7 @@ def test_simple_shear_turns_and_yields():
     F, history = jnp.eye(2)[..., None], SNOW.initial_history(jnp.eye(2)[..., None])
     step = jnp.asarray([[0.0, 1e-3], [0.0, 0.0]])
     for _ in range(200):
-        F, history = returned(F + jnp.einsum("ij,jkp->ikp", step, F), history)
+        F, history = returned(F + jnp.einsum("ij,jkp->ikp", step, F), history, DT)
     s = np.linalg.svd(np.asarray(F[..., 0]))[1]
     assert_close(s, np.array([1 + 7.5e-3, 1 - 2.5e-2]), 1e-12)
     assert float(history.plastic_volume[0]) == pytest.approx(1 / ((1 - 2.5e-2) * (1 + 7.5e-3)), rel=1e-12)
@@ -94,7 +95,7 @@ def test_simple_shear_turns_and_yields():
 def test_plane_strain_is_three_dimensional_strain_with_a_stretch_of_one():
     F, history = trials(2)
     solid = jnp.zeros((3, 3, F.shape[-1])).at[:2, :2].set(F).at[2, 2].set(1.0)
-    flat, thick = jax.jit(SNOW.return_map)(F, history), jax.jit(SNOW.return_map)(solid, history)
+    flat, thick = jax.jit(SNOW.return_map)(F, history, DT), jax.jit(SNOW.return_map)(solid, history, DT)
     assert_close(thick[0][:2, :2], flat[0], 1e-14)
     assert_close(thick[1].plastic_volume, flat[1].plastic_volume, 1e-14)
     stress = [SNOW.elastic(after).stress(E) for E, after in (flat, thick)]
@@ -109,7 +110,7 @@ def test_the_return_map_creates_no_energy(d):
 
     def gain(snow):
         F, history = trials(d, n=2000, size=0.02)
-        after, later = jax.jit(snow.return_map)(F, history)
+        after, later = jax.jit(snow.return_map)(F, history, DT)
         before = snow.elastic(history).energy(F)
         return float((snow.elastic(later).energy(after) / before - 1).max())
 
@@ -118,7 +119,7 @@ def test_the_return_map_creates_no_energy(d):
     F, _ = trials(d, n=2000, size=0.02)
     for torn in (1.5, 2.0, 3.0):
         history = SnowHistory(jnp.full(F.shape[2:], torn))
-        after, later = jax.jit(SNOW.return_map)(F, history)
+        after, later = jax.jit(SNOW.return_map)(F, history, DT)
         more = SNOW.elastic(later).energy(after) - SNOW.elastic(history).energy(F)
         first = 1 - SNOW.critical_compression
         yielding = SNOW.elastic(SNOW.initial_history(F)).energy(first * jnp.eye(d)[..., None])
@@ -134,7 +135,7 @@ def test_inverted_snow_is_a_fault():
 
 
 def outcome(snow, F, history):
-    after, later = snow.return_map(F, history)
+    after, later = snow.return_map(F, history, DT)
     return jnp.concatenate([after.reshape(-1), later.plastic_volume])
 
 

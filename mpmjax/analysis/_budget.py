@@ -166,7 +166,7 @@ def _budget(
         )
         new = update(nodes, method)
         trial = grid_to_particles(scene, before, nodes, new)
-        after = scene.return_map(trial)
+        after = scene.return_map(trial, dt)
         return after, _step_budget(scene, before, trial, after, nodes, new)
 
     numbers = jnp.arange(steps, dtype=particles.x.dtype)

@@ -204,9 +204,7 @@ def fit_command(
     ] = None,
     profiles: Annotated[
         list[str] | None,
-        typer.Option(
-            "--profile", metavar="NAME", help="A fitted number whose profile likelihood is drawn; repeatable."
-        ),
+        typer.Option("--profile", metavar="NAME", help="A fitted number whose profile is drawn; repeatable."),
     ] = None,
     most_seconds: MostSeconds = None,
     imports: Imports = None,

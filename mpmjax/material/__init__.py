@@ -6,6 +6,7 @@ from mpmjax.material._drucker_prager import DruckerPrager, DruckerPragerHistory
 from mpmjax.material._elastic import FixedCorotated, NeoHookean
 from mpmjax.material._fluid import Fluid, Tait
 from mpmjax.material._hencky import Hencky
+from mpmjax.material._herschel_bulkley import HerschelBulkley, HerschelBulkleyHistory
 from mpmjax.material._kinematics import AbstractKinematics, DeformationGradient, VolumeRatio
 from mpmjax.material._law import AbstractElastic, AbstractInelastic, AbstractLaw
 from mpmjax.material._rubber import AbstractRubber, Gent, MooneyRivlin, Ogden, Yeoh
@@ -35,6 +36,8 @@ __all__ = [
     "Fluid",
     "Gent",
     "Hencky",
+    "HerschelBulkley",
+    "HerschelBulkleyHistory",
     "MatrixTangent",
     "MooneyRivlin",
     "NeoHookean",

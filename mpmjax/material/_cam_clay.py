@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Float, Matrix, PerParticle
+from mpmjax._types import Array, Float, Matrix, PerParticle, Scalar
 from mpmjax.checks import require_between, require_fields, require_moduli, require_positive
 from mpmjax.material._hencky import ElasticStrain, Hencky, no_transverse_strain
 from mpmjax.material._law import AbstractInelastic
@@ -83,8 +83,9 @@ class CamClay(AbstractInelastic):
         """Hencky's law with the history's ε_t."""
         return Hencky(self.youngs_modulus, self.poisson_ratio, history.transverse_strain)
 
-    def return_map(self, F: Matrix, history: CamClayHistory) -> tuple[Matrix, CamClayHistory]:
+    def return_map(self, F: Matrix, history: CamClayHistory, dt: Scalar) -> tuple[Matrix, CamClayHistory]:
         """To a tip, or to the ellipse at the same pressure; all stresses are divided by K."""
+        del dt
         strain = ElasticStrain.of(F, history.transverse_strain)
         alpha, beta, M = history.volume_strain, self.cohesion, self.friction
         nu = self.poisson_ratio

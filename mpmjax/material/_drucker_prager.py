@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Float, Matrix, PerParticle
+from mpmjax._types import Array, Float, Matrix, PerParticle, Scalar
 from mpmjax.checks import require_between, require_fields, require_moduli
 from mpmjax.material._hencky import ElasticStrain, Hencky, no_transverse_strain
 from mpmjax.material._law import AbstractInelastic
@@ -73,8 +73,9 @@ class DruckerPrager(AbstractInelastic):
         """Hencky's law with the history's ε_t."""
         return Hencky(self.youngs_modulus, self.poisson_ratio, history.transverse_strain)
 
-    def return_map(self, F: Matrix, history: DruckerPragerHistory) -> tuple[Matrix, DruckerPragerHistory]:
+    def return_map(self, F: Matrix, history: DruckerPragerHistory, dt: Scalar) -> tuple[Matrix, DruckerPragerHistory]:
         """To the cone at the same volume, or to its tip."""
+        del dt
         strain = ElasticStrain.of(F, history.transverse_strain)
         mean = strain.mean + history.gap / 3
         apart = mean > 0

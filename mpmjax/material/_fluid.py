@@ -56,8 +56,9 @@ class Fluid(AbstractInelastic):
         del history
         return Tait(self.bulk_modulus, self.exponent, self.tension)
 
-    def return_map(self, J: Array, history: None, /) -> tuple[Array, None]:
+    def return_map(self, J: Array, history: None, dt: Scalar, /) -> tuple[Array, None]:
         """min(J, 1); with tension J."""
+        del dt
         return J if self.tension else _pressed(J), history
 
 

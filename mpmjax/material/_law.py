@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Deformation, Float, components
+from mpmjax._types import Array, Bool, Deformation, Float, Scalar, components
 from mpmjax.checks import require
 from mpmjax.material._kinematics import DEFORMATION_GRADIENT, AbstractKinematics
 from mpmjax.material._tangent import AbstractTangent
@@ -41,12 +41,13 @@ class AbstractLaw(eqx.Module):
         """The elastic law at a history."""
 
     @abc.abstractmethod
-    def return_map(self, F: Deformation, history: Any, /) -> tuple[Deformation, Any]:
+    def return_map(self, F: Deformation, history: Any, dt: Scalar, /) -> tuple[Deformation, Any]:
         """The admissible deformation for a trial one, and the history after it.
 
         Args:
             F: the trial deformation [-], component first.
             history: the history before the step.
+            dt: the step [s], in which what depends on the rate has flowed.
         """
 
     def remembers(self, history: Any, stored: Array, /) -> bool:
@@ -138,8 +139,9 @@ class AbstractElastic(AbstractLaw):
         del history
         return self
 
-    def return_map(self, F: Deformation, history: None, /) -> tuple[Deformation, None]:
+    def return_map(self, F: Deformation, history: None, dt: Scalar, /) -> tuple[Deformation, None]:
         """The deformation as it is."""
+        del dt
         return F, history
 
 
@@ -184,10 +186,11 @@ class AbstractInelastic(AbstractLaw):
         """The elastic law at a history."""
 
     @abc.abstractmethod
-    def return_map(self, F: Deformation, history: Any, /) -> tuple[Deformation, Any]:
+    def return_map(self, F: Deformation, history: Any, dt: Scalar, /) -> tuple[Deformation, Any]:
         """The admissible F_E for a trial one, and the history after it.
 
         Args:
             F: the trial F_E [-], shape (d, d, p).
             history: the history before the step.
+            dt: the step [s], in which what depends on the rate has flowed.
         """

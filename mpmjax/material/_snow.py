@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
+from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
 from mpmjax.checks import require_between, require_fields, require_moduli, require_positive
 from mpmjax.linalg import AbstractSpectral
 from mpmjax.material._elastic import FixedCorotated
@@ -67,8 +67,9 @@ class Snow(AbstractInelastic):
         harder = jnp.exp(jnp.maximum(self.hardening * (1 - history.plastic_volume), _DUST))
         return SnowElasticity(self.youngs_modulus * harder, self.poisson_ratio)
 
-    def return_map(self, F: Matrix, history: SnowHistory) -> tuple[Matrix, SnowHistory]:
+    def return_map(self, F: Matrix, history: SnowHistory, dt: Scalar) -> tuple[Matrix, SnowHistory]:
         """Clamp the principal stretches of F_E; J_P ← J_P det F_trial / det F_E."""
+        del dt
         least, most = (jnp.asarray(a, F.dtype) for a in (1 - self.critical_compression, 1 + self.critical_stretch))
         excess = _Clamp(least, most)(la.matmul(la.transpose(F), F))
         clamped = F + la.matmul(F, excess)

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from mpmjax._types import Array, Deformation, PerParticle
+from mpmjax._types import Array, Deformation, PerParticle, Scalar
 from mpmjax.checks import require, require_between, require_fields
 from mpmjax.material._kinematics import AbstractKinematics
 from mpmjax.material._law import AbstractElastic, AbstractLaw
@@ -63,8 +63,8 @@ class Viscous(AbstractLaw):
     def elastic(self, history: Any) -> AbstractElastic:
         return self.law.elastic(history)
 
-    def return_map(self, F: Deformation, history: Any) -> tuple[Deformation, Any]:
-        return self.law.return_map(F, history)
+    def return_map(self, F: Deformation, history: Any, dt: Scalar) -> tuple[Deformation, Any]:
+        return self.law.return_map(F, history, dt)
 
     def viscous_part(self) -> Viscosity:
         return self.viscosity

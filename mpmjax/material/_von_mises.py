@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Float, Matrix, PerParticle
+from mpmjax._types import Array, Float, Matrix, PerParticle, Scalar
 from mpmjax.checks import require_between, require_fields, require_moduli, require_positive
 from mpmjax.material._hencky import ElasticStrain, Hencky, no_transverse_strain
 from mpmjax.material._law import AbstractInelastic
@@ -67,8 +67,9 @@ class VonMises(AbstractInelastic):
         """Hencky's law with the history's ε_t."""
         return Hencky(self.youngs_modulus, self.poisson_ratio, history.transverse_strain)
 
-    def return_map(self, F: Matrix, history: VonMisesHistory) -> tuple[Matrix, VonMisesHistory]:
+    def return_map(self, F: Matrix, history: VonMisesHistory, dt: Scalar) -> tuple[Matrix, VonMisesHistory]:
         """Radial return of the deviator."""
+        del dt
         strain = ElasticStrain.of(F, history.transverse_strain)
         stiffness = 2 * self.elastic(history).shear_modulus
         allowed = (2 / 3) ** 0.5 * (self.yield_stress + self.hardening_modulus * history.plastic_strain)

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Deformation, Float, Matrix, particle_first
+from mpmjax._types import Array, Deformation, Float, Matrix, Scalar, particle_first
 from mpmjax.material import AbstractElastic, AbstractLaw, Viscosity
 from mpmjax.state._particles import Group, Particles
 
@@ -77,11 +77,12 @@ def material_points(laws: tuple[AbstractLaw, ...], particles: Particles, *, tota
     return tuple(one(law, group) for law, group in zip(laws, particles.groups, strict=True))
 
 
-def return_map(laws: tuple[AbstractLaw, ...], particles: Particles) -> Particles:
-    """The particles after the return maps of laws that yield: from the trial deformation to one that the law admits."""
+def return_map(laws: tuple[AbstractLaw, ...], particles: Particles, dt: Scalar) -> Particles:
+    """The particles after the return maps of laws that yield: from the trial deformation to one that the law
+    admits after a step dt [s]."""
 
     def one(law: AbstractLaw, group: Group) -> tuple[Array, Any]:
-        deformation, history = law.return_map(group.deformation(), group.history)
+        deformation, history = law.return_map(group.deformation(), group.history, dt)
         return particle_first(deformation), history
 
     found = [one(law, group) for law, group in zip(laws, particles.groups, strict=True)]

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 
-from mpmjax._types import Array, Int, Point
+from mpmjax._types import Array, Int, Point, Scalar
 from mpmjax.boundary import AbstractBoundary
 from mpmjax.checks import (
     checked,
@@ -121,9 +121,9 @@ class Scene(eqx.Module):
         """The materials of prepared particles, with the elastic laws in force."""
         return material_points(self.laws, particles, total=self.total)
 
-    def return_map(self, particles: Particles) -> Particles:
-        """The particles after the return maps of laws that yield (see `return_map`)."""
-        return return_map(self.laws, particles)
+    def return_map(self, particles: Particles, dt: Scalar) -> Particles:
+        """The particles after the return maps of laws that yield, at the end of a step dt [s] (see `return_map`)."""
+        return return_map(self.laws, particles, dt)
 
     @property
     def collider_count(self) -> int:

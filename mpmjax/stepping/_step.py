@@ -95,7 +95,7 @@ def step_unchecked(
     )
     new = update(nodes, method)
     trial = grid_to_particles(scene, particles, nodes, new)
-    after = scene.return_map(trial)
+    after = scene.return_map(trial, dt)
     outside = (~stencil.inside).sum().astype(jnp.int32)
     return after, StepInfo(new.solve, new.contact, outside, _given_to_colliders(nodes, new))
 

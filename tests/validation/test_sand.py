@@ -43,9 +43,9 @@ class Forgetful(mpm.AbstractInelastic):
         """That of sand."""
         return self.sand.elastic(history)
 
-    def return_map(self, F, history):
+    def return_map(self, F, history, dt):
         """That of sand, without a gap."""
-        F, history = self.sand.return_map(F, history)
+        F, history = self.sand.return_map(F, history, dt)
         return F, eqx.tree_at(lambda h: h.gap, history, jnp.zeros_like(history.gap))
 
 
