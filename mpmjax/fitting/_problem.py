@@ -30,7 +30,7 @@ class FitProblem(eqx.Module):
     parameters: tuple[AbstractParameter, ...]
     starts: tuple[Array, ...]
     """The first guess of each."""
-    memory: int = eqx.field(static=True)
+    memory: int = eqx.field(static=True, default=2**28)
     """Memory for checkpoints of reverse passes, and for tangents [B]."""
 
     def __init__(

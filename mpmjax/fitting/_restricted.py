@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import equinox as eqx
+
 from mpmjax._types import Array, Float
 from mpmjax.fitting._problem import Coordinates, FitProblem
 
@@ -10,9 +12,9 @@ class RestrictedProblem(FitProblem):
     """A problem on a plane of its coordinates, z = origin + basis y, as a function of y. Both are arrays: another plane
     of as many dimensions does not compile anew."""
 
-    whole: FitProblem
-    origin: Coordinates
-    basis: Float[Array, "n f"]
+    whole: FitProblem = eqx.field(kw_only=True)
+    origin: Coordinates = eqx.field(kw_only=True)
+    basis: Float[Array, "n f"] = eqx.field(kw_only=True)
 
     def __init__(self, whole: FitProblem, origin: Coordinates, basis: Float[Array, "n f"]):
         self.experiments, self.names = whole.experiments, whole.names

@@ -117,6 +117,7 @@ def fit_staged(
     require(float(growth) > 0, f"growth must be positive, or infinite to use all data, got {growth}.")
     given = None if horizons is None else [float(t) for t in horizons]
     if given is not None:
+        require(len(given) > 0, "horizons must hold a time at least; leave them out to have them chosen.")
         require_positive("horizons [s]", np.array(given))
         require(all(a < b for a, b in pairwise(given)), f"horizons must grow, got {given}.")
     problem = FitProblem((experiments,) if isinstance(experiments, Experiment) else tuple(experiments), parameters)
