@@ -173,7 +173,9 @@ def experiment(family: Family, clouds: list[np.ndarray], n: int) -> mpm.Experime
 def fitted(family: Family, clouds: list[np.ndarray], grids: tuple[int, ...], progress: Any = None) -> mpm.RefinedFit:
     """The parameters from the clouds, on several grids, extrapolated."""
     build = partial(experiment, family, clouds)
-    return mpm.fit_refined(build, family.parameters, refinements=grids, rtol=1e-4, progress=progress)
+    return mpm.fit_refined(
+        build, family.parameters, refinements=grids, optimiser=mpm.LevenbergMarquardt(rtol=1e-4), progress=progress
+    )
 
 
 # %% The table
