@@ -106,6 +106,27 @@ def test_the_command_fits_prints_and_writes(bar):
     assert [n["name"] for n in numbers["noise"]] == ["tracks", "extent"]
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize(("line", "says"), [("starts = 3", "3 searches"), ("horizons = [0.02]", "until")])
+def test_a_file_asks_for_a_better_start(bar, line, says):
+    """Then for the fit from there, and the profile that the option names."""
+    (bar / "start.toml").write_text(BAR + FIT.replace("[fit]\n", f"[fit]\n{line}\n"))
+    code, out, err = shell("fit", bar / "start.toml", "--plot", bar / "start.png", "--profile", "E")
+    assert code == 0, err
+    assert says in out
+    assert "interval by its profile" in out
+    numbers = json.loads((bar / "start.json").read_text())
+    assert numbers["estimates"][0]["value"] == pytest.approx(1.2e5, rel=2e-3)
+    assert [p["label"] for p in numbers["profiles"]] == ["E"]
+
+
+def test_starts_and_horizons_exclude_each_other(bar):
+    (bar / "start.toml").write_text(BAR + FIT.replace("[fit]\n", "[fit]\nstarts = 3\nhorizons = true\n"))
+    code, _, err = shell("fit", bar / "start.toml")
+    assert code == 2
+    assert "either starts or horizons" in err
+
+
 def test_another_scene_file_is_another_experiment(bar):
     (bar / "both.toml").write_text(BAR + FIT + '[[fit.experiment]]\nscene = "bar.toml"\n')
     found = read_fit(bar / "both.toml")

@@ -19,7 +19,7 @@ from mpmjax.analysis import Trial, energy, grid_mass, name_of, pieces, work_prec
 from mpmjax.checks import require, shortened
 from mpmjax.cli._fit_file import FitFile, read_fit, refinements
 from mpmjax.cli._scene_file import Simulation, read_scene_file, read_simulation, stable_step
-from mpmjax.fitting import AbstractParameter, fit, fit_multistart, fit_refined, fit_staged, profile
+from mpmjax.fitting import Experiment, fit, fit_multistart, fit_refined, fit_staged, profile
 from mpmjax.io import check_place, end_on_signals, load, record, reporting, steps_in, stopping
 from mpmjax.simulation import Run
 from mpmjax.viz import COLOURS, draw_chart, draw_fit, render, write_fit, write_trials
@@ -228,14 +228,14 @@ def fit_command(
             if stop.signal:
                 raise KeyboardInterrupt
 
-        parameters = _from_a_better_start(asked, progress)
+        asked = _from_a_better_start(asked, progress)
         if grids:
             found = fit_refined(
-                lambda n: asked.refined(n)[0], parameters, refinements=grids, progress=progress, **common
+                lambda n: asked.refined(n)[0], asked.parameters, refinements=grids, progress=progress, **common
             )
             fits, whole = found.fits, asked.refined(found.refinements[-1])[1]
         else:
-            found = fit(asked.experiments, parameters, progress=progress, **common)
+            found = fit(asked.experiments, asked.parameters, progress=progress, **common)
             fits, whole = (found,), asked.whole
         print(found)
         result, iterations = fits[-1], sum(len(each.history) for each in fits)
@@ -249,21 +249,31 @@ def fit_command(
         raise typer.Exit(128 + (stop.signal or signal.SIGINT))
 
 
-def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> dict[str, AbstractParameter]:
-    """The parameters, from where many searches or a fit to growing horizons ended, where the file asks for these."""
+def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> FitFile:
+    """What is asked, from where many searches or a fit to growing horizons ended, where the file asks for these; to the
+    data that the horizons reach."""
     common: dict[str, Any] = {"level": asked.level, "progress": progress}
     if asked.optimiser is not None:
         common["optimiser"] = asked.optimiser
     if asked.starts > 1:
         many = fit_multistart(asked.experiments, asked.parameters, starts=asked.starts, **common)
         print(many)
-        return many.best.restarted(asked.parameters)
-    if asked.horizons:
-        times = None if asked.horizons is True else asked.horizons
-        staged = fit_staged(asked.experiments, asked.parameters, horizons=times, **common)
-        print(staged)
-        return staged.result.restarted(asked.parameters)
-    return asked.parameters
+        return asked._replace(parameters=many.best.restarted(asked.parameters))
+    if not asked.horizons:
+        return asked
+    times = None if asked.horizons is True else asked.horizons
+    staged = fit_staged(asked.experiments, asked.parameters, horizons=times, **common)
+    print(staged)
+
+    def until(experiments: tuple[Experiment, ...]) -> tuple[Experiment, ...]:
+        return tuple(e.until(end) for e, end in zip(experiments, staged.horizons, strict=True))
+
+    def refined(n: int) -> tuple[tuple[Experiment, ...], tuple[Experiment, ...]]:
+        fitted, whole = asked.refined(n)
+        return until(fitted), whole
+
+    parameters = staged.result.restarted(asked.parameters)
+    return asked._replace(parameters=parameters, experiments=until(asked.experiments), refined=refined)
 
 
 def _grids(text: str) -> tuple[int, ...]:

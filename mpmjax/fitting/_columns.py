@@ -158,7 +158,7 @@ def stated_unit(name: str) -> float | None:
     return None
 
 
-def read_columns(path: Path, *names: str) -> list[np.ndarray]:
+def read_columns(path: Path | str, *names: str) -> list[np.ndarray]:
     """Columns of a CSV file, see `Columns`."""
-    columns = Columns(path, *names)
+    columns = Columns(Path(path), *names)
     return [columns[name] for name in names]
