@@ -128,13 +128,14 @@ def test_adam_reaches_it_too():
 
 @pytest.mark.thorough
 def test_fits_by_lbfgs_converge_in_single_precision():
-    """Whose costs are never still."""
+    """Whose costs are never still: to a fifth of a standard error of what double precision finds."""
     scene, q = bar()
-    q = jax.tree.map(lambda a: a.astype("float32"), q)
-    of = mpm.Experiment(scene, q, t1=STEPS * DT, dt=DT, observations=seen())
-    least, found = (mpm.fit(of, {"E": BANDS}, optimiser=o) for o in (mpm.LevenbergMarquardt(), mpm.LBFGS()))
+    single = jax.tree.map(lambda a: a.astype("float32"), q)
+    of, exact = (mpm.Experiment(scene, p, t1=STEPS * DT, dt=DT, observations=seen()) for p in (single, q))
+    found = mpm.fit(of, {"E": BANDS}, optimiser=mpm.LBFGS())
+    least = mpm.fit(exact, {"E": BANDS}, optimiser=mpm.LevenbergMarquardt())
     assert found.converged
-    assert np.allclose(found.z, least.z, atol=0.1 * least.uncertainty.error.min())
+    assert (np.abs(found.z - least.z) < 0.2 * least.uncertainty.error).all()
 
 
 @pytest.mark.thorough

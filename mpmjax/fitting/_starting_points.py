@@ -81,7 +81,7 @@ def _range(
     if np.isfinite([lowest, highest]).all():
         return np.asarray(lowest), np.asarray(highest)
     if parameter.logarithmic:
-        return first / _DECADE, first * _DECADE
+        return np.asarray(first / _DECADE), np.asarray(first * _DECADE)
     ends = [np.asarray(parameter.value(jnp.asarray(first), jnp.full(first.shape, side))) for side in (-1.0, 1.0)]
     return ends[0], ends[1]
 
