@@ -19,7 +19,7 @@ from mpmjax.analysis import Trial, energy, grid_mass, name_of, pieces, work_prec
 from mpmjax.checks import require, shortened
 from mpmjax.cli._fit_file import FitFile, read_fit, refinements
 from mpmjax.cli._scene_file import Simulation, read_scene_file, read_simulation, stable_step
-from mpmjax.fitting import Experiment, fit, fit_multistart, fit_refined, fit_staged, profile
+from mpmjax.fitting import Experiment, fit, fit_multistart, fit_refined, fit_staged, predict_observations, profile
 from mpmjax.io import check_place, end_on_signals, load, record, reporting, steps_in, stopping
 from mpmjax.simulation import Run
 from mpmjax.viz import COLOURS, draw_chart, draw_fit, render, write_fit, write_trials
@@ -243,8 +243,9 @@ def fit_command(
     for each in drawn:
         print(each)
     print(f"{iterations} simulations with exact derivatives, {time.perf_counter() - begun:.3g} s in all", flush=True)
-    numbers = write_fit(found, plot.with_suffix(".json"), whole, tuple(drawn))
-    print(f"written {draw_fit(result, plot, whole, tuple(drawn))} and {numbers}")
+    said = whole, tuple(drawn), predict_observations(result, whole)
+    numbers = write_fit(found, plot.with_suffix(".json"), *said)
+    print(f"written {draw_fit(result, plot, *said)} and {numbers}")
     if stop.signal or result.interrupted:
         raise typer.Exit(128 + (stop.signal or signal.SIGINT))
 

@@ -1,6 +1,7 @@
 """Predictions of a fit, with their errors."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import diffrax
@@ -13,7 +14,7 @@ from mpmjax._types import Array, Scalar
 from mpmjax.checks import checked, require, require_positive, warn
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._observation import AbstractObservation, Numbers
-from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._problem import Coordinates, FitProblem, in_batches
 from mpmjax.fitting._result import FitResult
 from mpmjax.fitting._uncertainty import Uncertainty, quantile
 
@@ -182,14 +183,13 @@ class _Observed(eqx.Module):
 def _linearised(
     problem: FitProblem, function: Callable[[FitProblem, Coordinates], tuple[Array, ...]], z: Coordinates
 ) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Values and their derivatives by the coordinates, shape (..., n), in one pass, compiled."""
+    """Values and their derivatives by the coordinates, shape (..., n), compiled."""
 
-    def twice(z: Coordinates) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-        value = function(problem, z)
-        return value, value
+    def push(tangent: Coordinates) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        return jax.jvp(partial(function, problem), (z,), (tangent,))
 
-    J, value = jax.jacfwd(twice, has_aux=True)(z)
-    return value, J
+    values, columns = in_batches(push, jnp.eye(problem.size, dtype=z.dtype), problem.at_once)
+    return values, tuple(jnp.moveaxis(column, 0, -1) for column in columns)
 
 
 def _coordinates(result: FitResult) -> Coordinates:

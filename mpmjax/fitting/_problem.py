@@ -231,18 +231,20 @@ class FitProblem(eqx.Module):
         if (self.cheaper_mode if mode is None else mode) == "reverse":
             return self._jacobian_by_rows(z, sigmas)
 
-        def push(tangent: Coordinates) -> tuple[Array, Array, Array]:
+        def push(tangent: Coordinates) -> tuple[Array, tuple[Array, Array]]:
             evaluate = partial(self.residuals, sigmas=sigmas, adjoint=diffrax.ForwardMode())
             (r, _), (column, unsolved) = jax.jvp(evaluate, (z,), (tangent,))
-            return r, column, unsolved
+            return r, (column, unsolved)
 
-        r, columns, unsolved = _chunked(push, jnp.eye(self.size, dtype=z.dtype), self._at_once, common=1)
+        r, (columns, unsolved) = in_batches(push, jnp.eye(self.size, dtype=z.dtype), self.at_once)
         return r, jnp.where((unsolved != 0).any(), jnp.nan, columns.T)
 
     def _jacobian_by_rows(self, z: Coordinates, sigmas: tuple[Array, ...]) -> tuple[Array, Array]:
         """The same by a pass back for each measured number; priors need no simulation."""
         r, pull, _ = jax.vjp(lambda z: self.residuals(z, sigmas, None), z, has_aux=True)
-        (rows,) = _chunked(lambda unit: pull(unit), jnp.eye(self.measured, len(r), dtype=r.dtype), self._at_once)
+        _, (rows,) = in_batches(
+            lambda unit: ((), pull(unit)), jnp.eye(self.measured, len(r), dtype=r.dtype), self.at_once
+        )
         return r, jnp.concatenate([rows, jax.jacfwd(self.prior_residuals)(z)])
 
     @property
@@ -251,7 +253,7 @@ class FitProblem(eqx.Module):
         return "reverse" if 0 < ROW_COST * self.measured < self.size else "forward"
 
     @property
-    def _at_once(self) -> int:
+    def at_once(self) -> int:
         """How many tangents, or rows, of all experiments fit into the memory."""
         each = sum(_COPIES * _bytes(e.particles) + _bytes(e.observed_shape) * (e.steps + 1) for e in self.experiments)
         return max(1, int(self.memory // max(each, 1)))
@@ -281,32 +283,32 @@ def _first_guess(name: str, parameter: AbstractParameter, experiment: Experiment
     return start
 
 
-def _chunked(function: Callable[[Array], tuple], units: Array, at_once: int, common: int = 0) -> tuple:
+def in_batches(function: Callable[[Array], tuple[Any, Any]], units: Array, at_once: int) -> tuple[Any, Any]:
     """What a function returns for each row of `units`, `at_once` of them in one batch, the batches one after the other.
 
     Args:
-        function: returns a tuple, of which the first `common` are the same for all rows.
+        function: returns a pair of pytrees: what is the same for all rows, and what is the row's own.
         units: shape (k, ...).
         at_once: size of a batch.
-        common: how many of the results come once.
+
+    Returns:
+        what is the same, and what is each row's own with a leading axis of k.
     """
     count = len(units)
     batches = -(-count // at_once)
     size = -(-count // batches)
 
-    def batch(rows: Array) -> tuple[tuple, tuple]:
-        def split(row: Array) -> tuple[tuple, tuple]:
-            found = function(row)
-            return found[:common], found[common:]
-
-        return jax.vmap(split, out_axes=(None, 0))(rows)
+    def batch(rows: Array) -> tuple[Any, Any]:
+        if size > 1:
+            return jax.vmap(function, out_axes=(None, 0))(rows)
+        once, own = function(rows[0])  # a third less to compile than a batch of one
+        return once, jax.tree.map(lambda a: a[None], own)
 
     if batches == 1:
-        once, each = batch(units)
-        return *once, *each
+        return batch(units)
     padded = jnp.concatenate([units, jnp.zeros((batches * size - count, *units.shape[1:]), units.dtype)])
-    once, each = jax.lax.map(batch, padded.reshape(batches, size, *units.shape[1:]))
-    return *(a[0] for a in once), *(a.reshape(-1, *a.shape[2:])[:count] for a in each)
+    once, own = jax.lax.map(batch, padded.reshape(batches, size, *units.shape[1:]))
+    return jax.tree.map(lambda a: a[0], once), jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:count], own)
 
 
 def _bytes(tree: Any) -> int:

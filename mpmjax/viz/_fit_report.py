@@ -23,7 +23,11 @@ _PROFILES_A_ROW = 3
 
 
 def draw_fit(
-    result: FitResult, path: Path, measured: tuple[Experiment, ...] = (), profiles: tuple[Profile, ...] = ()
+    result: FitResult,
+    path: Path,
+    measured: tuple[Experiment, ...] = (),
+    profiles: tuple[Profile, ...] = (),
+    predictions: tuple[Prediction, ...] | None = None,
 ) -> Path:
     """Data, the fitted simulation and its bands, residuals in units of the noise, the misfit of each iteration, and
     profiles.
@@ -33,11 +37,12 @@ def draw_fit(
         path: the picture.
         measured: the fitted experiments with more data, or longer: the fit predicts what it was not given.
         profiles: of the fit's parameters.
+        predictions: those of `measured`, where they are known already.
     """
     from matplotlib import pyplot as plt  # here, since it takes a second that only pictures should pay
 
     shown = measured or result.experiments
-    predictions = predict_observations(result, measured or None)
+    predictions = predict_observations(result, measured or None) if predictions is None else predictions
     observations = [o for e in shown for o in e.observations]
     fitted = [o for e in result.experiments for o in e.observations]
     rows = len(observations) + 1 + -(-len(profiles) // _PROFILES_A_ROW)
@@ -164,6 +169,7 @@ def write_fit(
     path: Path,
     measured: tuple[Experiment, ...] = (),
     profiles: tuple[Profile, ...] = (),
+    predictions: tuple[Prediction, ...] | None = None,
 ) -> Path:
     """The numbers of a fit as JSON: estimates with errors and intervals, correlations, noise, χ², iterations,
     predictions with bands, and profiles. Of a fit on several grids, the extrapolated estimates, and those numbers of
@@ -174,6 +180,7 @@ def write_fit(
         path: the file.
         measured: see `draw_fit`; of the finest grid.
         profiles: of the fit's parameters; of the finest grid.
+        predictions: those of `measured`, where they are known already.
     """
     if isinstance(found, RefinedFit):
         *coarser, finest = found.fits
@@ -183,20 +190,23 @@ def write_fit(
             "error_from_discretisation": found.from_discretisation,
             "order": found.order,
             "refinements": found.refinements,
-            "fits": [*(_numbers(each) for each in coarser), _numbers(finest, measured, profiles)],
+            "fits": [*(_numbers(each) for each in coarser), _numbers(finest, measured, profiles, predictions)],
         }
     else:
-        numbers = _numbers(found, measured, profiles)
+        numbers = _numbers(found, measured, profiles, predictions)
     with replacing(path) as aside:
         aside.write_text(json.dumps(_plain(numbers), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return path
 
 
 def _numbers(
-    result: FitResult, measured: tuple[Experiment, ...] = (), profiles: tuple[Profile, ...] = ()
+    result: FitResult,
+    measured: tuple[Experiment, ...] = (),
+    profiles: tuple[Profile, ...] = (),
+    predictions: tuple[Prediction, ...] | None = None,
 ) -> dict[str, Any]:
     observations = [o for e in measured or result.experiments for o in e.observations]
-    predictions = predict_observations(result, measured or None)
+    predictions = predict_observations(result, measured or None) if predictions is None else predictions
     return {
         "estimates": [e._asdict() for e in (*result.estimates, *result.reported)],
         "correlation": result.correlation,
