@@ -27,6 +27,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import FixedLocator, NullLocator
 
 import mpmjax as mpm
 from mpmjax.fitting._problem import FitProblem
@@ -125,8 +126,12 @@ def draw(rows: list[dict[str, Any]]) -> None:
             line = [row for row in rows if row["method"] == method and row["derivative"] == kind]
             axis.plot([row["numbers"] for row in line], [row["ratio"] for row in line], "o-", ms=4, label=label)
         axis.set(xscale="log", yscale="log", xlabel="parameters, or measured numbers", title=method)
+        for ticks, places in ((axis.xaxis, sorted({row["numbers"] for row in rows})), (axis.yaxis, (3, 5, 10, 20, 50))):
+            ticks.set_major_locator(FixedLocator(places))
+            ticks.set_minor_locator(NullLocator())
+            ticks.set_major_formatter("{x:g}")
     axes[0].set_ylabel("seconds over those of the simulation")
-    axes[0].legend(frameon=False)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     figure.savefig(DOCS / "fit_cost.png", dpi=110)
 
 
