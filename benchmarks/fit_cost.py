@@ -131,7 +131,7 @@ def draw(rows: list[dict[str, Any]]) -> None:
             ticks.set_minor_locator(NullLocator())
             ticks.set_major_formatter("{x:g}")
     axes[0].set_ylabel("seconds over those of the simulation")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=7)
     figure.savefig(DOCS / "fit_cost.png", dpi=110)
 
 
