@@ -1,5 +1,8 @@
 """Fits: parameters, observations, errors, and what is refused."""
 
+from types import SimpleNamespace
+from unittest.mock import Mock
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -181,6 +184,16 @@ def test_what_the_data_do_see_of_a_pair_has_an_error():
     assert both["ratio"].value == pytest.approx(alone["E"].value, rel=1e-4)
     assert both["ratio"].error == pytest.approx(alone["E"].error, rel=1e-2)
     assert both["E"].interval == (0, np.inf)
+
+
+def test_a_force_is_said_in_the_run_and_nowhere_else():
+    """Means over steps stand at their middles; a time that a parameter moves out of the run is not predicted."""
+    forces = SimpleNamespace(force=jnp.asarray([1.0, 3.0, 7.0])[:, None, None])
+    run = Mock(spec=mpm.Run, dt=0.1, forces=lambda: forces)
+    seen = mpm.Force([0.0, 0.05, 0.1, 0.3], np.ones((4, 1)))
+    assert np.allclose(seen.predict(None, run)[:, 0], [0, 1, 2, 9])
+    late = eqx.tree_at(lambda o: o.times, seen, seen.times + 0.2)
+    assert np.isfinite(late.predict(None, run)[:, 0]).tolist() == [True, True, True, False]
 
 
 def test_between_steps_a_series_is_interpolated_linearly():

@@ -120,6 +120,12 @@ def test_a_file_asks_for_a_better_start(bar, line, says):
     assert [p["label"] for p in numbers["profiles"]] == ["E"]
 
 
+def test_an_unknown_profile_is_refused_before_the_fit(bar):
+    code, out, err = shell("fit", bar / "bar.toml", "--profile", "nu")
+    assert (code, out) == (2, "")
+    assert "what is fitted is E" in err
+
+
 def test_starts_and_horizons_exclude_each_other(bar):
     (bar / "start.toml").write_text(BAR + FIT.replace("[fit]\n", "[fit]\nstarts = 3\nhorizons = true\n"))
     code, _, err = shell("fit", bar / "start.toml")

@@ -19,7 +19,18 @@ from mpmjax.analysis import Trial, energy, grid_mass, name_of, pieces, work_prec
 from mpmjax.checks import require, shortened
 from mpmjax.cli._fit_file import FitFile, read_fit, refinements
 from mpmjax.cli._scene_file import Simulation, read_scene_file, read_simulation, stable_step
-from mpmjax.fitting import Experiment, fit, fit_multistart, fit_refined, fit_staged, predict_observations, profile
+from mpmjax.fitting import (
+    Experiment,
+    FitProblem,
+    FitResult,
+    Profile,
+    fit,
+    fit_multistart,
+    fit_refined,
+    fit_staged,
+    predict_observations,
+    profile,
+)
 from mpmjax.io import check_place, end_on_signals, load, record, reporting, steps_in, stopping
 from mpmjax.simulation import Run
 from mpmjax.viz import COLOURS, draw_chart, draw_fit, render, write_fit, write_trials
@@ -218,6 +229,9 @@ def fit_command(
     grids = asked.refine if refine is None else _grids(refine)
     plot = Path(f"{scene.stem}_fit.png") if plot is None else plot
     require(plot.resolve().parent.is_dir(), f"{plot} cannot be written (no folder {plot.parent}).")
+    labels = FitProblem(asked.experiments, asked.parameters).labels
+    unknown = [name for name in profiles or () if name not in labels]
+    require(not unknown, f"--profile names {unknown[:1]}, but what is fitted is {', '.join(labels)}.")
     common: dict[str, Any] = {"report": asked.report, "level": asked.level, "optimiser": asked.optimiser}
     common |= {"log": log, "resume": resume}
     with stopping("The fit ends after the iteration in progress; a second signal ends it at once.") as stop:
@@ -239,15 +253,27 @@ def fit_command(
             fits, whole = (found,), asked.whole
         print(found)
         result, iterations = fits[-1], sum(len(each.history) for each in fits)
-        drawn = [] if result.interrupted else [profile(result, name, progress=progress) for name in profiles or ()]
+        drawn = _profiles(result, profiles, progress)
     for each in drawn:
         print(each)
     print(f"{iterations} simulations with exact derivatives, {time.perf_counter() - begun:.3g} s in all", flush=True)
-    said = whole, tuple(drawn), predict_observations(result, whole)
+    said = whole, drawn, predict_observations(result, whole)
     numbers = write_fit(found, plot.with_suffix(".json"), *said)
     print(f"written {draw_fit(result, plot, *said)} and {numbers}")
     if stop.signal or result.interrupted:
         raise typer.Exit(128 + (stop.signal or signal.SIGINT))
+
+
+def _profiles(result: FitResult, names: list[str] | None, progress: Callable[[str], None]) -> tuple[Profile, ...]:
+    """The profiles that were asked for; after a signal those that are done."""
+    wanted = [] if result.interrupted else names or []
+    found: list[Profile] = []
+    try:
+        for name in wanted:
+            found.append(profile(result, name, progress=progress))
+    except KeyboardInterrupt:
+        _print_error(f"{len(found)} of {len(wanted)} profiles are done.")
+    return tuple(found)
 
 
 def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> FitFile:

@@ -16,6 +16,7 @@ from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter, Bounded, Positive, Unbounded
 from mpmjax.fitting._prediction import Prediction, predict, predict_observations
 from mpmjax.fitting._prior import AbstractPrior, Gaussian, Smooth
+from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._profile import Profile, profile
 from mpmjax.fitting._quantities import CentreOfMass, Density, Extent, Markers, StressStretch
 from mpmjax.fitting._reaction import Force, Torque
@@ -42,6 +43,7 @@ __all__ = [
     "Experiment",
     "Extent",
     "Field",
+    "FitProblem",
     "FitResult",
     "Force",
     "Gaussian",

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mpmjax._types import Array, Bool, Float, Int, Scalar
+from mpmjax._types import Array, Float, Int, Scalar
 from mpmjax.checks import require_positive, require_whole
-from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
+from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation, where
 from mpmjax.fitting._problem import Coordinates, FitProblem
 
 
@@ -65,10 +65,10 @@ class Adam(AbstractOptimiser):
         lower = known & (cost < state.cost)
         fruitless = jnp.where(lower, 0, state.fruitless + 1)
         back = ~known | (fruitless >= self.patience)
-        z, best, slope = _where(lower | first, (state.trial, cost, gradient), (z, state.cost, state.gradient))
+        z, best, slope = where(lower | first, (state.trial, cost, gradient), (z, state.cost, state.gradient))
 
         fresh = _MOMENTS.init(z)
-        start, from_here, moments = _where(back, (z, slope, fresh), (state.trial, gradient, state.moments))
+        start, from_here, moments = where(back, (z, slope, fresh), (state.trial, gradient, state.moments))
         with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
             direction, moments = _MOMENTS.update(from_here, moments)
         factor = jnp.where(back, state.factor / 2, state.factor)
@@ -111,8 +111,3 @@ class AdamState(NamedTuple):
 
 
 _MOMENTS: Any = optax.scale_by_adam()
-
-
-def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
-    """One of two pytrees."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -11,7 +11,7 @@ import optax
 
 from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.checks import require_positive, require_whole
-from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
+from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation, where
 from mpmjax.fitting._problem import Coordinates, FitProblem
 
 
@@ -84,7 +84,7 @@ class LBFGS(AbstractOptimiser):
         cost, gradient, fresh = state.cost, state.gradient, self._past.init(z)
         newton, steepest = (self._past.update(gradient, past, z) for past in (state.past, fresh))
         steep = (state.past.count == 0) | (gradient @ newton[0] <= 0)
-        along, past = _where(steep, steepest, newton)
+        along, past = where(steep, steepest, newton)
         foreseen = jnp.where(steep, jnp.minimum(state.foreseen, gradient @ along), gradient @ along)
         slack = problem.rounding(cost, sigmas)
         line: Any = optax.scale_by_zoom_linesearch(self.line_search, approx_dec_rtol=slack / jnp.maximum(cost, slack))
@@ -105,7 +105,7 @@ class LBFGS(AbstractOptimiser):
             stalled=~moved & steep,
         )
         stayed = after._replace(cost=cost, gradient=gradient, past=fresh)
-        return _where(moved, (z + step, after), (z, stayed))
+        return where(moved, (z + step, after), (z, stayed))
 
     @property
     def _past(self) -> Any:
@@ -149,8 +149,3 @@ def _cost(problem: FitProblem, sigmas: tuple[Array, ...], z: Coordinates) -> Arr
         return cost, gradient @ tangents[0]
 
     return value(z)
-
-
-def _where(condition: Array, yes: Any, no: Any) -> Any:
-    """One of two pytrees."""
-    return jax.tree.map(partial(jnp.where, condition), yes, no)

@@ -181,10 +181,20 @@ class Series(AbstractObservation):
         return self.of(scene, particles)
 
     def predict(self, seen: Array, run: Run) -> Array:
-        """NaN at times that a parameter has moved out of the run."""
-        place = jnp.asarray(self.times, seen.dtype) / run.dt
-        outside = (place < -_BEYOND) | (place > len(seen) - 1 + _BEYOND)
-        return jnp.where(outside.reshape(-1, *[1] * (seen.ndim - 1)), jnp.nan, between(seen, place))
+        return self._at_times(seen, run, 0.0)
+
+    def _at_times(self, values: Array, run: Run, first: float) -> Array:
+        """Values at the times; NaN at times that a parameter has moved out of the run.
+
+        Args:
+            values: one for each step or state, shape (k, ...), as far before the run's end as after its start.
+            run: the run.
+            first: where the first one stands, in steps from the start.
+        """
+        step = jnp.asarray(self.times, values.dtype) / run.dt
+        outside = (step < -_BEYOND) | (step > len(values) - 1 + 2 * first + _BEYOND)
+        outside = outside.reshape(-1, *[1] * (values.ndim - 1))
+        return jnp.where(outside, jnp.nan, between(values, step - first))
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
         what = f"{type(self).__name__} {self.name!r}"

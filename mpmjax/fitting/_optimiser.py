@@ -4,8 +4,10 @@ import abc
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 
-from mpmjax._types import Array, Float
+from mpmjax._types import Array, Bool, Float
 from mpmjax.fitting._problem import Coordinates, FitProblem
 
 
@@ -70,3 +72,8 @@ class AbstractOptimiser(eqx.Module):
         """Whether the search goes no further, and is not known to be at a minimum."""
         del state
         return False
+
+
+def where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
+    """One of two pytrees."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Scalar
 from mpmjax.checks import require
-from mpmjax.fitting._observation import Numbers, Series, between
+from mpmjax.fitting._observation import Numbers, Series
 from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene
 
@@ -56,8 +56,7 @@ class Force(Series):
 
     def predict(self, seen: Any, run: Run) -> Array:
         del seen
-        mean = self._of(run.forces())[:, self.collider]
-        return between(mean, jnp.asarray(self.times, mean.dtype) / run.dt - 0.5)
+        return self._at_times(self._of(run.forces())[:, self.collider], run, 0.5)
 
     def explain(self, seen: Any, run: Run) -> None:
         super().explain(self._of(run.forces())[:, self.collider], run)

@@ -66,7 +66,7 @@ class FitResult(eqx.Module):
     jacobian: np.ndarray
     """Their derivative by the coordinates, shape (m, n)."""
     uncertainty: Uncertainty
-    """That of the coordinates."""
+    """Covariance of the coordinates, and the directions that the data do not see."""
     estimates: tuple[Estimate, ...]
     """The fitted numbers, one for each entry of each parameter."""
     reported: tuple[Estimate, ...]
