@@ -40,7 +40,7 @@ def found() -> mpm.FitResult:
     """A fit, as if it had been made."""
     problem = FitProblem((mpm.Experiment(**RUN, observations=SEEN),), {"E": STIFFNESS})
     at = Minimum(jnp.zeros(1), jnp.zeros(1), jnp.ones((1, 1)), True, False, ())
-    return fit_result(problem, at, [1.0], [1.0], (jnp.ones(()),), {}, 0.95)
+    return fit_result(problem, mpm.LevenbergMarquardt(), at, [1.0], [1.0], (jnp.ones(()),), {}, 0.95)
 
 
 FITTED = found()

@@ -77,7 +77,7 @@ class LevenbergMarquardt(AbstractOptimiser):
     def distance(self, state: Any, seen: Evaluation) -> float:
         del state
         total, gain = _squares(seen)
-        rows, columns = np.shape(seen.jacobian)
+        rows, columns = np.asarray(seen.jacobian).shape
         if rows <= columns or np.isnan(gain):
             return float("nan")
         return float(np.sqrt(gain / total * (rows - columns))) / _NEGLIGIBLE if total > 0 else 0.0

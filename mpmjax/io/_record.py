@@ -24,7 +24,7 @@ from mpmjax.simulation import (
     no_steps,
     number_of_steps,
     raise_faults,
-    warn_of_inaccurate_solves,
+    warn_of_inaccuracy,
 )
 from mpmjax.state import Particles, Scene, prepare, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator, Explicit, step_for
@@ -144,7 +144,7 @@ def record(
             except OSError as refused:
                 said = str(refused)
             raise SimulationError(f"{error} {said}", error.run) from None
-        warn_of_inaccurate_solves(run.statistics)
+        warn_of_inaccuracy(run.statistics)
         return run
 
 

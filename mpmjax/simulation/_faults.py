@@ -82,14 +82,22 @@ def unconverged_advice(method: AbstractIntegrator, dtype: Any) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def warn_of_inaccurate_solves(statistics: RunStatistics) -> None:
-    """A Python warning where solves of an untraced run missed their tolerance by less than ten times."""
+def warn_of_inaccuracy(statistics: RunStatistics) -> None:
+    """A Python warning where solves of an untraced run missed their tolerance by less than ten times, and one where
+    linearised steps left much of the elastic force undone."""
     if int(statistics.nearly_converged) > 0:
         warn(
             f"The solve of {int(statistics.nearly_converged)} of {int(statistics.steps)} steps missed its tolerance by "
             f"less than ten times (worst relative residual {float(statistics.worst_residual):.2g}): the run is that "
             "much less accurate than was asked for. Raise the solver's max_steps, or ask for what it can reach by its "
             "rtol."
+        )
+    part = float(statistics.left_undone.part)
+    if part > MOST_LEFT_UNDONE:
+        warn(
+            f"One linear solve a step left up to {100 * part:.2g} % of the elastic force undone, and stresses can be "
+            f"wrong by as much. Take a shorter step, {float(np.sqrt(part / MOST_LEFT_UNDONE)):.1f} times or more, or "
+            "Newton's method: BackwardEuler(), or solution=Newton() of ImplicitMidpoint and TRBDF2."
         )
 
 
@@ -128,6 +136,8 @@ _WORDS: dict[Fault, _Words] = {
         "Reduce dt: a boundary keeps out what comes less than a cell nearer in a step.",
     ),
 }
+MOST_LEFT_UNDONE = 0.05
+"""Part of the elastic force up to which what one linear solve leaves undone is not warned of."""
 _ADVICE = (
     "Call simulate outside of jax transformations to have step, time and particle named, or with throw=False to "
     "inspect run.statistics."

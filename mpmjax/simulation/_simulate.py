@@ -24,7 +24,7 @@ from mpmjax.checks import (
     requirements,
 )
 from mpmjax.simulation._diffrax import Problem, StepSolver, examined, no_vector_field, step_number
-from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccurate_solves
+from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccuracy
 from mpmjax.simulation._rollout_state import RolloutState, initial_state
 from mpmjax.simulation._run import Run
 from mpmjax.simulation._statistics import RunStatistics
@@ -148,7 +148,7 @@ def simulate(
     if traced:
         return guarded(run, report)
     raise_faults(run, particles, previous, start)
-    warn_of_inaccurate_solves(run.statistics)
+    warn_of_inaccuracy(run.statistics)
     return run
 
 

@@ -2,6 +2,7 @@
 yield."""
 
 from dataclasses import replace
+from functools import reduce
 
 import equinox as eqx
 import jax
@@ -24,6 +25,7 @@ from mpmjax.implicit import Projection, SolveInfo, no_solve
 from mpmjax.state import Particles, Scene, is_prepared, prepare
 from mpmjax.stepping._explicit import Explicit
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
+from mpmjax.stepping._left_undone import LeftUndone, norm, nothing_left_undone
 from mpmjax.stepping._nodes import Nodes, particles_to_grid
 
 
@@ -34,6 +36,8 @@ class StepInfo(eqx.Module):
     contact: ContactInfo
     outside: Int[Array, "*f"]
     """Particles whose stencil left the grid's window."""
+    left_undone: LeftUndone
+    """What one linear solve leaves undone of the elastic force; nothing of explicit steps and of Newton's method."""
     colliders: ColliderImpulse | None = None
     """Impulse on the scene's colliders, in the order of its boundaries; None without colliders."""
 
@@ -97,7 +101,9 @@ def step_unchecked(
     trial = grid_to_particles(scene, particles, nodes, new)
     after = scene.return_map(trial, dt)
     outside = (~stencil.inside).sum().astype(jnp.int32)
-    return after, StepInfo(new.solve, new.contact, outside, _given_to_colliders(nodes, new))
+    return after, StepInfo(
+        new.solve, new.contact, outside, _left_undone(nodes, method, new), _given_to_colliders(nodes, new)
+    )
 
 
 def _given_to_colliders(nodes: Nodes, new: GridUpdate) -> ColliderImpulse | None:
@@ -109,6 +115,18 @@ def _given_to_colliders(nodes: Nodes, new: GridUpdate) -> ColliderImpulse | None
     if new.motion.mean is not None:
         colliders = colliders.after(nodes.dt / 2, new.motion.mean)
     return impulse_on_colliders(colliders, new.reaction, new.normal_impulse, new.collider_friction)
+
+
+def _left_undone(nodes: Nodes, method: AbstractIntegrator, new: GridUpdate) -> LeftUndone:
+    """What the linearisation of the step leaves undone. No derivative passes."""
+    nodes, method, new = without_derivative((nodes, method, new))
+    exact = method.exact_impulse(nodes, new.motion)
+    if exact is None or new.internal is None:
+        return nothing_left_undone(nodes.mass.dtype)
+    elastic = new.internal if new.viscous is None else new.internal - new.viscous
+    momentum = nodes.mass[:, None] * new.motion.velocity
+    scale = reduce(jnp.maximum, (norm(exact), norm(elastic), nodes.dt * norm(nodes.force), norm(momentum)))
+    return LeftUndone(norm(exact - elastic) / nodes.dt, scale / nodes.dt)
 
 
 step_compiled = eqx.filter_jit(step_unchecked)
