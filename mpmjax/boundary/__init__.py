@@ -1,9 +1,18 @@
 """Walls, grips, mirrored planes and colliders, and what colliders receive."""
 
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall
+from mpmjax.boundary._boundary_impulse import (
+    BoundaryImpulse,
+    Given,
+    Owners,
+    impulse_on_boundaries,
+    no_boundary_impulse,
+    owners_of,
+    taken_by_mirrors,
+)
 from mpmjax.boundary._collider import AbstractCollider, SeparatingCollider, SlipCollider, StickyCollider
 from mpmjax.boundary._collider_impulse import ColliderImpulse, impulse_on_colliders, no_impulse
-from mpmjax.boundary._combined import combined_conditions, contacts_of, mirror
+from mpmjax.boundary._combined import brought_contacts, brought_images, combined_conditions, contacts_of, mirror
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import (
     AbstractContact,
@@ -25,14 +34,17 @@ __all__ = [
     "AbstractCollider",
     "AbstractContact",
     "AbstractNodes",
+    "BoundaryImpulse",
     "ColliderImpulse",
     "Conditions",
     "ConstrainedNodes",
     "ContactInfo",
     "ContactPlane",
+    "Given",
     "Grip",
     "Image",
     "Mirror",
+    "Owners",
     "SeparatingBox",
     "SeparatingCollider",
     "SlipBox",
@@ -41,12 +53,18 @@ __all__ = [
     "StickyCollider",
     "SymmetryPlane",
     "Wall",
+    "brought_contacts",
+    "brought_images",
     "combined_conditions",
     "constrain",
     "contacts_of",
     "find_active_set",
+    "impulse_on_boundaries",
     "impulse_on_colliders",
     "mirror",
+    "no_boundary_impulse",
     "no_contact",
     "no_impulse",
+    "owners_of",
+    "taken_by_mirrors",
 ]

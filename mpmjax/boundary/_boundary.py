@@ -120,6 +120,12 @@ class AbstractBoundary(eqx.Module):
         del x, t
         return None
 
+    def pivot(self, t: Scalar) -> Float[Array, "d"] | None:
+        """The point at time t [m], shape (d,), about which its torque is taken. Default: None, the origin of the
+        coordinates."""
+        del t
+        return None
+
     def rests(self, *, total: bool) -> bool:
         """Whether it acts on the same nodes at all times and is meant to act on some, so that it is an oversight if it
         touches none. Default: False. It is asked only while numbers are known.

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import NodeVector, Scalar
+from mpmjax._types import Array, Float, NodeVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.checks import require, require_fields
@@ -56,6 +56,10 @@ class Grip(AbstractBoundary):
         axes = jnp.ones(nodes.shape[1], dtype=bool) if self.axes is None else jnp.asarray(self.axes)
         fixed = held & axes
         return Conditions(fixed, jnp.where(fixed, self.motion.velocity(t, dt), 0))
+
+    def pivot(self, t: Scalar) -> Float[Array, "d"]:
+        """The region's middle."""
+        return self.motion.pivot(jnp.asarray(self.region.middle()), t)
 
     def rests(self, *, total: bool) -> bool:
         return total or self.motion.rests()

@@ -49,12 +49,15 @@ def raise_faults(run: Run, began: Particles, previous: RolloutState | None, star
             what, advice = disallowed(_law(run, first), run.method)
         last = with_state(run.final, previous.particles)
         reached = int((run.steps < step).sum())
-        saved = {name: getattr(run, name) for name in ("steps", "frames", "observed", "collider_impulse")}
+        saved = {
+            name: getattr(run, name) for name in ("steps", "frames", "observed", "collider_impulse", "boundary_impulse")
+        }
         good = replace(
             run,
             **jax.tree.map(lambda a: a[:reached], saved),
             final=last,
             final_collider_impulse=previous.collider_impulse,
+            final_boundary_impulse=previous.boundary_impulse,
             final_step=jnp.asarray(step - 1, run.final_step.dtype),
         )
         raise SimulationError(

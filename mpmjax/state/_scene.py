@@ -45,6 +45,7 @@ class Scene(eqx.Module):
         transfer: PIC, FLIP or APIC. Default: APIC.
         description: updated (default) or total Lagrangian.
         body_force: a force per mass that varies in space or time, besides gravity. Default: none.
+        boundary_forces: whether steps compute the force and torque on each boundary (see `Run.boundary_forces`).
 
     Raises:
         ValueError: dimensions that differ, a mirrored plane off the half-spacing lattice, or what the total description
@@ -61,6 +62,7 @@ class Scene(eqx.Module):
     transfer: AbstractTransfer
     description: AbstractDescription
     body_force: AbstractBodyForce | None
+    boundary_forces: bool = eqx.field(static=True)
 
     @checked
     def __init__(
@@ -75,6 +77,7 @@ class Scene(eqx.Module):
         transfer: AbstractTransfer = APIC(),
         description: AbstractDescription = UpdatedLagrangian(),
         body_force: AbstractBodyForce | None = None,
+        boundary_forces: bool = False,
     ):
         self.grid = grid
         self.material = tuple(material) if isinstance(material, list) else material
@@ -86,12 +89,17 @@ class Scene(eqx.Module):
         self.transfer = transfer
         self.description = description
         self.body_force = body_force
+        self.boundary_forces = boundary_forces
 
     def __check_init__(self):
         d = self.grid.dim
         require(coordinates("gravity", self.gravity) == d, f"gravity must have {d} components, got {self.gravity}.")
         require_finite("gravity", self.gravity)
         require(len(self.laws) > 0, "A scene needs at least one law, got none.")
+        require(
+            not self.boundary_forces or len(self.boundary) > 0,
+            "A scene with boundary_forces needs a boundary at least, got none: give one, or leave boundary_forces out.",
+        )
         for boundary in self.boundary:
             require(
                 boundary.dim in (None, d),

@@ -248,6 +248,7 @@ def particles_to_grid(
     explicit_viscosity: bool = False,
     joined: bool = False,
     viscosity_apart: bool = False,
+    folded: bool = True,
 ) -> Nodes:
     """P2G, folded at symmetry planes, with the elastic potential and the boundaries of the step from t to t + dt.
 
@@ -262,6 +263,7 @@ def particles_to_grid(
         explicit_viscosity: whether the force includes the viscous stress, at the particles' stored velocity gradients.
         joined: whether momentum and force may be summed together. They are if both have the same gradient operator.
         viscosity_apart: whether to compute the viscous part of the force separately too.
+        folded: whether to fold at symmetry planes.
     """
     grid, window = scene.grid, scene.window(particles)
     v = components(particles.v)
@@ -289,7 +291,7 @@ def particles_to_grid(
         conditions = combined_conditions(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total)
         if scene.total and conditions.colliders is not None and conditions.colliders.slides:
             slid = (conditions.colliders.owner >= 0)[:, None] & occupied
-            place = jnp.where(slid, _place(particles, stencil, grid.size) / full, conditions.colliders.position)
+            place = jnp.where(slid, places_of(particles, stencil, grid.size) / full, conditions.colliders.position)
             conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
         velocity = jnp.where(occupied, momentum / full, 0)
         if joined:
@@ -310,10 +312,16 @@ def particles_to_grid(
             conditions=conditions,
             contacts=contacts_of(scene.boundary, conditions, grid, window, t, dt),
         )
-        return nodes.folded(mirror(scene.boundary, grid, window))
+        return folded_at_planes(scene, particles, nodes) if folded else nodes
 
 
-def _place(particles: Particles, stencil: Stencil, size: int) -> NodeVector:
+def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes) -> Nodes:
+    """The nodes, folded at the scene's symmetry planes."""
+    with jax.named_scope("p2g"):
+        return nodes.folded(mirror(scene.boundary, scene.grid, scene.window(particles)))
+
+
+def places_of(particles: Particles, stencil: Stencil, size: int) -> NodeVector:
     """Current positions of reference nodes times their mass, Σ_p w_ip m_p (x_p + F_p (X_i − X_p)) [kg m], (n, d)."""
     F = jnp.concatenate([group.deformation() for group in particles.groups], axis=-1)
     return p2g(stencil, particles.mass, components(particles.x), F, size)[1]
