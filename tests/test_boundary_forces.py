@@ -230,11 +230,17 @@ def test_forces_on_boundaries_against_time(tmp_path):
         own = eqx.tree_at(lambda s: s.gravity, scene, (0.0, g))
         return mpm.simulate(own, particles, t1=1e-2, **settings).boundary_forces().force[0, 1, 1]
 
+    fine = mpm.simulate(scene, particles, t1=1e-2, **settings | {"save_every": 1}).boundary_forces()
+    seen = mpm.Force(fine.times, fine.force[:, 1], boundary=1)
+    experiment = mpm.Experiment(scene, particles, t1=1e-2, dt=2e-3, method=mpm.SemiImplicit(), observations=seen)
+    assert_close(experiment.predictions(experiment.run())[0], fine.force[:, 1], 1e-9)
     slope = jax.grad(pull)(-9.81)
     assert float(slope) == pytest.approx(float(pull(-9.8) - pull(-9.82)) / 0.02, rel=1e-5)
     assert_close(jax.vmap(pull)(jnp.asarray([-9.81, -5.0]))[0], pull(-9.81), 1e-12)
     plain = mpm.Scene(scene.grid, scene.material, boundary=scene.boundary)
     with pytest.raises(ValueError, match="boundary_forces=True"):
         mpm.simulate(plain, particles, t1=1e-2, **settings).boundary_forces()
+    with pytest.raises(ValueError, match="on which the scene computes no force"):
+        mpm.Experiment(plain, particles, t1=1e-2, dt=2e-3, observations=seen)
     with pytest.raises(ValueError, match="needs a boundary at least"):
         mpm.Scene(scene.grid, scene.material, boundary_forces=True)

@@ -89,9 +89,9 @@ class Force(Series):
 
 
 class Torque(Force):
-    """The torque on a collider or boundary against time, as `Force`: [N m], shape (f, 1) in two dimensions and (f, 3) in
-    three, about the centre of the collider's rotation or, where it has none, about its shape's middle; of a grip about
-    its region's middle, of other boundaries about the origin."""
+    """The torque on a collider or boundary against time, as `Force`: [N m], shape (f, 1) in two dimensions and (f, 3)
+    in three, about the centre of the collider's rotation or, where it has none, about its shape's middle; of a grip
+    about its region's middle, of other boundaries about the origin."""
 
     def _of(self, forces: Any) -> Array:
         return forces.torque
