@@ -106,6 +106,7 @@ from mpmjax.geometry import (
     Motion,
     RigidMotion,
     SampledDistance,
+    TimeSeries,
     Union,
     sample_distance,
     sample_mesh,
@@ -146,7 +147,25 @@ from mpmjax.material import (
     Yeoh,
 )
 from mpmjax.simulation import Fault, Run, SimulationError, rollout, simulate
-from mpmjax.state import AbstractBodyForce, Particles, Scene, TotalLagrangian, UpdatedLagrangian, fill, join, prepare
+from mpmjax.state import (
+    AbstractBodyForce,
+    AbstractLoad,
+    AttachedPoints,
+    Particles,
+    Patch,
+    PointLoad,
+    PointsAt,
+    Pressure,
+    Scene,
+    Spring,
+    TotalLagrangian,
+    Traction,
+    UpdatedLagrangian,
+    attach,
+    fill,
+    join,
+    prepare,
+)
 from mpmjax.stepping import (
     TRBDF2,
     AbstractIntegrator,
@@ -225,6 +244,17 @@ __all__ = [  # noqa: RUF022 (grouped)
     "Grip",
     "Motion",
     "RigidMotion",
+    "TimeSeries",
+    # loads
+    "AbstractLoad",
+    "Traction",
+    "Pressure",
+    "PointLoad",
+    "Spring",
+    "Patch",
+    "PointsAt",
+    "AttachedPoints",
+    "attach",
     "SeparatingBox",
     "SlipBox",
     "StickyBox",

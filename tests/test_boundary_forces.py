@@ -45,6 +45,7 @@ HELD = ("walls", "planes", "grip", "walls and planes", "between planes")
 def shaken(dim=2, **scene):
     """A block that is shaken and strained, in a scene that computes the forces on its boundaries."""
     scene, particles = block(dim, gravity=(1.0, -9.81, 2.0)[:dim], boundary_forces=True, **scene)
+    scene = mpm.attach(scene, particles)
     particles = mpm.prepare(scene, particles)
     rng = np.random.default_rng(3)
     strain = 0.05 * rng.normal(size=particles.F.shape)

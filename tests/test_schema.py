@@ -20,6 +20,7 @@ from mpmjax.stepping import AbstractIntegrator
 
 GRID = mpm.Grid((8, 9), 0.1, origin=(-2, 3), periodic=(True, False))
 GRIP = mpm.Grip(mpm.Box((-np.inf, 0.0), (0.1, 1.0)), mpm.Motion((0.0, 0.3), ((0.0, 0.0), (0.1, 0.7))), (True, False))
+PATCH = mpm.Patch(mpm.Ball((0.1, 0.2), 0.3), mpm.Box((0.0, 0.0), (1.0, 1.0)), 0.05)
 EXAMPLES = {
     mpm.Scene: mpm.Scene(
         GRID,
@@ -63,6 +64,14 @@ EXAMPLES = {
     mpm.StickyCollider: mpm.StickyCollider(mpm.Ball((0.1, 0.2), 0.3), GRIP.motion),
     mpm.SlipCollider: mpm.SlipCollider(mpm.HalfSpace((0.1, 0.2), (0.0, 1.0))),
     mpm.SeparatingCollider: mpm.SeparatingCollider(mpm.Ball((0.1,), 0.3), friction=0.2),
+    mpm.Traction: mpm.Traction(PATCH, (1.0, 2.0)),
+    mpm.Pressure: mpm.Pressure(PATCH, mpm.TimeSeries((0.0, 1.0), (0.0, 2.0)), following=False),
+    mpm.PointLoad: mpm.PointLoad(mpm.PointsAt(((0.1, 0.2), (0.3, 0.4))), (1.0, 2.0)),
+    mpm.Spring: mpm.Spring(mpm.PointsAt(((0.1, 0.2),), (2.0,)), (1.0, 2.0), 3.0, GRIP.motion),
+    mpm.Patch: PATCH,
+    mpm.PointsAt: mpm.PointsAt(((0.1, 0.2), (0.3, 0.4)), (0.5, 1.5)),
+    mpm.AttachedPoints: mpm.AttachedPoints((0.0,), ((0.1, 0.2),), (1.0,), ((0.3, 0.4),), ((0.0, 1.0),)),
+    mpm.TimeSeries: mpm.TimeSeries((0.0, 1.0), ((0.0, 1.0), (2.0, 3.0))),
     mpm.Motion: GRIP.motion,
     mpm.RigidMotion: mpm.RigidMotion((0.0, 1.0), ((0.0, 0.0), (0.1, 0.2)), (0.0, 0.5), (0.3, 0.4)),
     mpm.BSpline: mpm.BSpline(1),

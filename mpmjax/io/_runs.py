@@ -4,8 +4,7 @@
                 J = det F, with APIC affine_velocity, and what laws that yield remember
     /mpmjax     format, version, d, dtype, units, dt, counts, mass, volume, X, the scene and the method as JSON (see
                 `_schema`) with their arrays, and a table with one row a frame: its step and the run's `RunStatistics`
-                up to it; with colliders `collider_impulse`, the impulse on each by then, linear, then angular, and
-                with the scene's boundary_forces `boundary_impulse` likewise
+                up to it; `collider_impulse` and `boundary_impulse`, those on each by then, linear, then angular
 
 Whatever is not in a dataset with checksums lies in headers that HDF5 checks itself, so a flipped bit is found. `NSteps`
 is raised last, and what lies beyond it, the remains of a writer that was killed, is neither read nor kept. A frame that
@@ -379,9 +378,8 @@ def _rows(frame: int, step: int, dt: Any, state: RolloutState, statistics: RunSt
     row = np.array([tuple(values.values())], [(name, a.dtype) for name, a in values.items()])
     rows = rows_of(frame, step * float(dt), state.particles) | {"mpmjax/frames": row}
     for name in _IMPULSES:
-        if (received := getattr(state, name)) is not None:
-            both = received.impulse, received.angular
-            rows[f"mpmjax/{name}"] = np.concatenate([np.asarray(a) for a in both], axis=1)[None]
+        if (both := getattr(state, name)) is not None:
+            rows[f"mpmjax/{name}"] = np.concatenate([np.asarray(both.impulse), np.asarray(both.angular)], axis=1)[None]
     return rows
 
 
@@ -395,8 +393,8 @@ def _frames(file: File, like: RolloutState, start: int, stop: int) -> tuple[np.n
         if getattr(like, name) is not None:
             both = jnp.asarray(file[f"mpmjax/{name}"][start:stop])
             received[name] = kind(*jnp.split(both, [like.particles.x.shape[1]], axis=-1))
-    particles = states_in(file, like.particles, start, stop)
-    return table["step"], RolloutState(particles, **{name: received.get(name) for name in _IMPULSES}), tallies
+    kept = (received.get(name) for name in _IMPULSES)
+    return table["step"], RolloutState(states_in(file, like.particles, start, stop), *kept), tallies
 
 
 def _check_same(path: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> None:

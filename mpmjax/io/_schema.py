@@ -24,62 +24,8 @@ import jax
 import numpy as np
 from jaxtyping import AbstractArray
 
-from mpmjax.boundary import (
-    ContactPlane,
-    Grip,
-    SeparatingBox,
-    SeparatingCollider,
-    SlipBox,
-    SlipCollider,
-    StickyBox,
-    StickyCollider,
-    SymmetryPlane,
-)
 from mpmjax.checks import alternatives, is_enum, is_module, may_be_infinite, require
-from mpmjax.discretisation import APIC, FLIP, PIC, BSpline, Grid, MLSGradient, SplineGradient
-from mpmjax.geometry import Ball, Box, Capsule, Cylinder, HalfSpace, Motion, RigidMotion, SampledDistance, Union
-from mpmjax.implicit import (
-    AnalyticHessian,
-    ConjugateResidual,
-    DiagonalPreconditioner,
-    JvpHessian,
-    Linearised,
-    MassPreconditioner,
-    Newton,
-)
-from mpmjax.material import (
-    CamClay,
-    DruckerPrager,
-    FixedCorotated,
-    Fluid,
-    Gent,
-    Hencky,
-    HerschelBulkley,
-    MooneyRivlin,
-    NeoHookean,
-    Ogden,
-    Snow,
-    Viscous,
-    VonMises,
-    Yeoh,
-)
-from mpmjax.state import Scene, TotalLagrangian, UpdatedLagrangian
-from mpmjax.stepping import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
-
-CLASSES: tuple[type, ...] = (
-    Scene,
-    Grid,
-    *(FixedCorotated, NeoHookean, Hencky),
-    *(MooneyRivlin, Yeoh, Gent, Ogden),
-    *(Snow, VonMises, HerschelBulkley, DruckerPrager, CamClay, Fluid, Viscous),
-    *(StickyBox, SlipBox, SeparatingBox, Grip, SymmetryPlane, ContactPlane),
-    *(StickyCollider, SlipCollider, SeparatingCollider),
-    *(Box, Ball, HalfSpace, Capsule, Cylinder, Union, SampledDistance, Motion, RigidMotion),
-    *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
-    *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),
-    *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual, DiagonalPreconditioner, MassPreconditioner),
-)
-"""The package's own classes that files can hold."""
+from mpmjax.io._classes import CLASSES
 
 _registered: dict[str, type] = {}
 """The registered classes that files can hold, by name."""

@@ -24,6 +24,7 @@ from mpmjax.discretisation import (
 from mpmjax.material import AbstractLaw
 from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, UpdatedLagrangian
+from mpmjax.state._loads import AbstractLoad
 from mpmjax.state._material_points import MaterialPoints, material_points, return_map
 from mpmjax.state._particles import Particles
 
@@ -45,6 +46,7 @@ class Scene(eqx.Module):
         transfer: PIC, FLIP or APIC. Default: APIC.
         description: updated (default) or total Lagrangian.
         body_force: a force per mass that varies in space or time, besides gravity. Default: none.
+        loads: forces on the body's surface or at points of it, springs and dashpots; see `attach`.
         boundary_forces: whether steps compute the force and torque on each boundary (see `Run.boundary_forces`).
 
     Raises:
@@ -63,6 +65,7 @@ class Scene(eqx.Module):
     description: AbstractDescription
     body_force: AbstractBodyForce | None
     boundary_forces: bool = eqx.field(static=True)
+    loads: tuple[AbstractLoad, ...]
 
     @checked
     def __init__(
@@ -78,6 +81,7 @@ class Scene(eqx.Module):
         description: AbstractDescription = UpdatedLagrangian(),
         body_force: AbstractBodyForce | None = None,
         boundary_forces: bool = False,
+        loads: AbstractLoad | tuple[AbstractLoad, ...] | list[AbstractLoad] = (),
     ):
         self.grid = grid
         self.material = tuple(material) if isinstance(material, list) else material
@@ -90,6 +94,7 @@ class Scene(eqx.Module):
         self.description = description
         self.body_force = body_force
         self.boundary_forces = boundary_forces
+        self.loads = (loads,) if isinstance(loads, AbstractLoad) else tuple(loads)
 
     def __check_init__(self):
         d = self.grid.dim
@@ -106,6 +111,8 @@ class Scene(eqx.Module):
                 f"{type(boundary).__name__} must have {d} coordinates, as the grid has, got {boundary.dim}.",
             )
             boundary.check(self.grid, total=self.total)
+        for load in self.loads:
+            load.check(d)
         if self.total:
             require(not self.grid.follow, "In the total description the window cannot follow: drop follow=True.")
             flowing = [law.title() for law in self.laws if not law.allows_total]
@@ -161,3 +168,21 @@ class Scene(eqx.Module):
             self.anchor(particles),
             affine=self.transfer.affine,
         )
+
+
+@checked
+def attach(scene: Scene, particles: Particles) -> Scene:
+    """The scene with its loads attached to the particles as they are: each `Patch` of a surface and all `PointsAt`
+    become points that move with the nearest particle.
+
+    Args:
+        scene: the scene.
+        particles: its particles at the start.
+
+    Raises:
+        ValueError: a place with no surface, or with a point off the body; particles inside a jax transformation.
+    """
+    if not scene.loads:
+        return scene
+    loads = tuple(eqx.tree_at(lambda own: own.on, load, load.on.attached(particles)) for load in scene.loads)
+    return eqx.tree_at(lambda s: s.loads, scene, loads)

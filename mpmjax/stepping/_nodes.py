@@ -11,7 +11,7 @@ from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scal
 from mpmjax.boundary import AbstractContact, AbstractNodes, Conditions, Mirror, combined_conditions, contacts_of, mirror
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
-from mpmjax.state import Particles, Scene
+from mpmjax.state import Particles, Scene, load_force, points_of, supports_of
 
 Fold = Callable[[NodeVector], NodeVector]
 """A map from a nodal vector to its sum with its images at mirrors."""
@@ -271,16 +271,21 @@ def particles_to_grid(
     affine = C if scene.transfer.affine else None
     acceleration = jnp.asarray(scene.gravity)
     with jax.named_scope("p2g"):
-        potential = ElasticPotential(scene.material_points(particles), stencil, Mirror(()), grid.size)
+        points = points_of(scene.loads, scene.laws, particles, stencil, total=scene.total)
+        supports = supports_of(scene.loads, points, t + body_force_at * dt)
+        potential = ElasticPotential(scene.material_points(particles), stencil, Mirror(()), grid.size, supports)
         joined = joined and stencil.mls_weight_derivatives is None
         flux, viscous_flux = potential.current_flux(), None
-        if explicit_viscosity and potential.viscous and C is not None:
+        if explicit_viscosity and potential.material_viscous and C is not None:
             viscous_flux = potential.viscous_flux(C)
             flux = flux + viscous_flux
         mass, momentum = p2g(stencil, particles.mass, v, affine, grid.size, -dt * flux if joined else None)
         lightest = particles.mass.min()  # a mean would empty the nodes of a body much lighter than the others
         occupied = (mass > jnp.finfo(mass.dtype).eps * lightest)[:, None]
         full = jnp.where(occupied, mass[:, None], 1)
+        loaded = load_force(scene.loads, points, t, dt, body_force_at, grid.size)
+        if loaded is not None:
+            acceleration = acceleration + jnp.where(occupied, loaded / full, 0)
         if scene.body_force is not None:
             x, at = particles.x, t
             if body_force_at > 0:
@@ -293,14 +298,22 @@ def particles_to_grid(
             slid = (conditions.colliders.owner >= 0)[:, None] & occupied
             place = jnp.where(slid, places_of(particles, stencil, grid.size) / full, conditions.colliders.position)
             conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
-        velocity = jnp.where(occupied, momentum / full, 0)
+        drag = potential.support_drag() if explicit_viscosity else None
         if joined:
-            sums = JoinedSum(velocity)
+            if supports:
+                pull = potential.support_force() if drag is None else potential.support_force() + drag
+                momentum = momentum + dt * pull
+            sums = JoinedSum(jnp.where(occupied, momentum / full, 0))
         else:
-            viscous_force = None
+            force, viscous_force = -potential.nodal_sum(flux), None
             if viscosity_apart and viscous_flux is not None:
                 viscous_force = -potential.nodal_sum(viscous_flux)
-            sums = SeparateSums(velocity, -potential.nodal_sum(flux), viscous_force)
+            if supports:
+                force = force + potential.support_force()
+            if drag is not None:
+                force = force + drag
+                viscous_force = drag if viscous_force is None else viscous_force + drag
+            sums = SeparateSums(jnp.where(occupied, momentum / full, 0), force, viscous_force)
         nodes = Nodes(
             mass=jnp.where(occupied[:, 0], mass, 0),
             sums=sums,
