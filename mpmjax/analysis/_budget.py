@@ -154,11 +154,12 @@ def _budget(
     scene: Scene, particles: Particles, start: Array, dt: Scalar, method: AbstractIntegrator, steps: int
 ) -> tuple[Particles, Budget]:
     def body(before: Particles, n: Array) -> tuple[Particles, Budget]:
-        stencil = scene.stencil(before)
+        t = (start + n) * dt
+        stencil = scene.stencil(before, t)
         nodes = particles_to_grid(
             scene,
             before,
-            (start + n) * dt,
+            t,
             dt,
             stencil,
             body_force_at=method.body_force_at,

@@ -12,7 +12,14 @@ from mpmjax.boundary._boundary_impulse import (
 )
 from mpmjax.boundary._collider import AbstractCollider, SeparatingCollider, SlipCollider, StickyCollider
 from mpmjax.boundary._collider_impulse import ColliderImpulse, impulse_on_colliders, no_impulse
-from mpmjax.boundary._combined import brought_contacts, brought_images, combined_conditions, contacts_of, mirror
+from mpmjax.boundary._combined import (
+    brought_contacts,
+    brought_images,
+    combined_conditions,
+    contacts_of,
+    mirror,
+    mirror_motion,
+)
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import (
     AbstractContact,
@@ -24,7 +31,7 @@ from mpmjax.boundary._contact import (
     no_contact,
 )
 from mpmjax.boundary._grip import Grip
-from mpmjax.boundary._mirror import Image, Mirror
+from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion
 from mpmjax.boundary._planes import ContactPlane, SymmetryPlane
 from mpmjax.boundary._walls import SeparatingBox, SlipBox, StickyBox
 
@@ -44,6 +51,7 @@ __all__ = [
     "Grip",
     "Image",
     "Mirror",
+    "MirrorMotion",
     "Owners",
     "SeparatingBox",
     "SeparatingCollider",
@@ -62,6 +70,7 @@ __all__ = [
     "impulse_on_boundaries",
     "impulse_on_colliders",
     "mirror",
+    "mirror_motion",
     "no_boundary_impulse",
     "no_contact",
     "no_impulse",

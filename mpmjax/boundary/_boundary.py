@@ -13,8 +13,9 @@ import equinox as eqx
 from mpmjax._types import Array, Bool, Float, Int, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact
-from mpmjax.boundary._mirror import Image
+from mpmjax.boundary._mirror import Image, MirrorMotion
 from mpmjax.discretisation import Grid
+from mpmjax.geometry import Motion
 
 ON_THE_WALL = 1e-3
 """Distance within which a node is on a wall, in spacings."""
@@ -97,6 +98,19 @@ class AbstractBoundary(eqx.Module):
         del grid, window
         return ()
 
+    def mirror_motion(self, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar) -> MirrorMotion | None:
+        """What its mirrors that move add to the velocity of the nodes beyond them in the step from t to t + dt. None if
+        none moves, which is the default."""
+        del grid, window, t, dt
+        return None
+
+    def mirror(self) -> tuple[int, Motion | None] | None:
+        """The axis across which it has a mirror, and its motion, None if it rests. Default: None, it has no mirror.
+
+        In the updated description the grid moves with a mirror, so that it lies on nodes or half-way between them.
+        """
+        return None
+
     def check(self, grid: Grid, *, total: bool) -> None:
         """Check that it can stand in a scene. Default: it can.
 
@@ -118,6 +132,12 @@ class AbstractBoundary(eqx.Module):
         """The signed distance [m] of points x [m], shape (m, d), from the body that it is at time t, for pictures and
         for warnings of what lies in it. Default: None, it is no body."""
         del x, t
+        return None
+
+    def carried(self, nodes: NodeVector, t: Scalar) -> NodeVector | None:
+        """Where reference nodes at these positions are at time t [m], shape (n, d), if it holds them with all of their
+        components. Default: None, that is not known."""
+        del nodes, t
         return None
 
     def pivot(self, t: Scalar) -> Float[Array, "d"] | None:

@@ -8,7 +8,7 @@ from mpmjax.boundary._boundary import AbstractBoundary
 from mpmjax.boundary._collider_contact import collider_contacts
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact
-from mpmjax.boundary._mirror import Image, Mirror
+from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion
 from mpmjax.boundary._wall_contact import wall_contacts
 from mpmjax.discretisation import Grid
 
@@ -95,6 +95,19 @@ def brought_contacts(
 def mirror(boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"]) -> Mirror:
     """The mirror images that the boundaries of a scene put in the window."""
     return Mirror(tuple(image for _, image in brought_images(boundaries, grid, window)))
+
+
+def mirror_motion(
+    boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
+) -> MirrorMotion | None:
+    """What all mirrors that move add to the velocity of the nodes beyond them; None if none moves."""
+    total = None
+    for boundary in boundaries:
+        own = boundary.mirror_motion(grid, window, t, dt)
+        if own is not None and total is not None:
+            own = MirrorMotion(total.beyond | own.beyond, jnp.where(total.beyond, total.velocity, own.velocity))
+        total = total if own is None else own
+    return total
 
 
 def brought_images(

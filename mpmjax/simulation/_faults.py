@@ -35,7 +35,7 @@ def raise_faults(run: Run, began: Particles, previous: RolloutState | None, star
         assert previous is not None
         step = start + int(run.statistics.fault_step)
         problem = Problem(run.scene, run.final, None, run.dt, run.method)
-        words, bad = _WORDS[fault], faulty_particles(problem, state_of(run.final))
+        words, bad = _WORDS[fault], faulty_particles(problem, state_of(run.final), step * run.dt)
         what, advice = words.particle, words.advice
         if fault == Fault.PASSED:
             t = jnp.asarray(step - 1, run.final.x.dtype) * run.dt

@@ -1,12 +1,14 @@
 """The scene: everything that a step needs and does not change."""
 
 import equinox as eqx
+import jax.numpy as jnp
 
-from mpmjax._types import Array, Int, Point, Scalar
+from mpmjax._types import Array, Float, Int, NodeVector, Point, Scalar
 from mpmjax.boundary import AbstractBoundary
 from mpmjax.checks import (
     checked,
     coordinates,
+    is_traced,
     require,
     require_finite,
 )
@@ -113,6 +115,13 @@ class Scene(eqx.Module):
             boundary.check(self.grid, total=self.total)
         for load in self.loads:
             load.check(d)
+        for axis in range(d if not self.total else 0):
+            mirrors = [found[1] for b in self.boundary if (found := b.mirror()) is not None and found[0] == axis]
+            require(
+                all(is_traced((m, mirrors[0])) or bool(eqx.tree_equal(m, mirrors[0])) for m in mirrors),
+                f"In the updated description the grid moves with the planes across axis {axis}, so that all of them "
+                "must move alike: give them one motion, take the total description, or a SlipCollider of a HalfSpace.",
+            )
         if self.total:
             require(not self.grid.follow, "In the total description the window cannot follow: drop follow=True.")
             flowing = [law.title() for law in self.laws if not law.allows_total]
@@ -150,6 +159,22 @@ class Scene(eqx.Module):
         """Whether the description is total Lagrangian."""
         return self.description.total
 
+    def shift(self, t: Scalar) -> Float[Array, "d"] | None:
+        """How far the grid has moved at time t [m], shape (d,), with planes that move; None where it rests."""
+        if self.total:
+            return None
+        mirrors = [found for boundary in self.boundary if (found := boundary.mirror()) is not None]
+        moving = {axis: motion for axis, motion in mirrors if motion is not None}  # across one axis all move alike
+        if not moving:
+            return None
+        along = {axis: motion.at(t)[axis] for axis, motion in moving.items()}
+        return jnp.stack([jnp.asarray(along.get(axis, jnp.zeros_like(t))) for axis in range(self.grid.dim)])
+
+    def nodes(self, particles: Particles, t: Scalar) -> NodeVector:
+        """Positions of the window's nodes at time t [m], shape (n, d)."""
+        places, shift = self.grid.nodes(self.window(particles)), self.shift(t)
+        return places if shift is None else places + shift
+
     def window(self, particles: Particles) -> Int[Array, "d"]:
         """Lattice index of the grid window's first node."""
         return self.grid.window(self.anchor(particles))
@@ -158,14 +183,19 @@ class Scene(eqx.Module):
         """The positions at which stencils stand [m], shape (p, d): x, or X in the total description."""
         return self.description.anchor(particles)
 
-    def stencil(self, particles: Particles) -> Stencil:
-        """The particles' stencil, with the moving-least-squares gradient where the transfer needs it."""
+    def on_grid(self, particles: Particles, t: Scalar) -> Array:
+        """The `anchor` relative to the grid at time t [m], shape (p, d)."""
+        place, shift = self.anchor(particles), self.shift(t)
+        return place if shift is None else place - shift
+
+    def stencil(self, particles: Particles, t: Scalar = 0.0) -> Stencil:
+        """The particles' stencil at time t, with the moving-least-squares gradient where the transfer needs it."""
         return make_stencil(
             self.kernel,
             self.gradient,
             self.grid,
             self.window(particles),
-            self.anchor(particles),
+            self.on_grid(particles, t),
             affine=self.transfer.affine,
         )
 

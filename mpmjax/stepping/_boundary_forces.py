@@ -7,6 +7,7 @@ from mpmjax.boundary import (
     BoundaryImpulse,
     ConstrainedNodes,
     Given,
+    Owners,
     brought_contacts,
     brought_images,
     impulse_on_boundaries,
@@ -51,7 +52,8 @@ def given_to_boundaries(
     where = scene.boundary, nodes.conditions, grid, window, t, dt
     images, contacts = brought_images(scene.boundary, grid, window), brought_contacts(*where)
     unfold, colliders = nodes.mirror.unfold, nodes.conditions.colliders
-    owners = owners_of(scene.boundary, nodes.conditions, grid.nodes(window), grid.spacing, t, dt, reference=scene.total)
+    at = scene.nodes(particles, t)
+    owners = owners_of(scene.boundary, nodes.conditions, at, grid.spacing, t, dt, reference=scene.total)
 
     # what symmetry planes take of the impulses on all nodes, and what reaches the folded ones
     residual = reaction
@@ -85,7 +87,9 @@ def given_to_boundaries(
         of_planes, friction = taken_by_mirrors(unfolded.mass[:, None] * unfold(change), images)
         given += [*of_planes, Given(friction, owner)]
 
-    places, pivots = _places(scene, particles, stencil, unfolded), _pivots(scene, t, residual)
+    places, pivots = at, _pivots(scene, t, residual)
+    if scene.total:
+        places = _moved_places(scene, particles, stencil, unfolded, owners, at, t)
     if mean is not None:
         places = places + dt / 2 * mean
         pivots = (pivots + _pivots(scene, t + dt, residual)) / 2
@@ -100,13 +104,16 @@ def _share_of_change(transfer: AbstractTransfer, dim: int, dtype: jnp.dtype) -> 
     return (transfer.velocity(zero, none, all_of_it) - transfer.velocity(zero, none, none)).T
 
 
-def _places(scene: Scene, particles: Particles, stencil: Stencil, nodes: Nodes) -> NodeVector:
-    """Where the nodes are [m], shape (n, d); in the total description, where the body has moved them."""
-    places = scene.grid.nodes(scene.window(particles))
-    colliders = nodes.conditions.colliders
-    if not scene.total:
-        return places
+def _moved_places(
+    scene: Scene, particles: Particles, stencil: Stencil, nodes: Nodes, owners: Owners, reference: NodeVector, t: Scalar
+) -> NodeVector:
+    """Where the body has moved the nodes of the reference configuration at time t [m], shape (n, d)."""
+    colliders, places = nodes.conditions.colliders, reference
     places = jnp.where(nodes.occupied, nodes.per_mass(places_of(particles, stencil, scene.grid.size)), places)
+    for number, boundary in enumerate(scene.boundary):
+        carried = boundary.carried(reference, t)
+        if carried is not None:
+            places = jnp.where((owners.fixed == number).all(axis=1, keepdims=True), carried, places)
     if colliders is None:
         return places
     touched = (colliders.owner >= 0) | (colliders.holder >= 0).any(axis=1)

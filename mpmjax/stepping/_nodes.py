@@ -8,7 +8,17 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
-from mpmjax.boundary import AbstractContact, AbstractNodes, Conditions, Mirror, combined_conditions, contacts_of, mirror
+from mpmjax.boundary import (
+    AbstractContact,
+    AbstractNodes,
+    Conditions,
+    Mirror,
+    MirrorMotion,
+    combined_conditions,
+    contacts_of,
+    mirror,
+    mirror_motion,
+)
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.state import Particles, Scene, load_force, points_of, supports_of
@@ -115,6 +125,8 @@ class Nodes(AbstractNodes):
     """The conditions that the boundaries prescribe."""
     contacts: tuple[AbstractContact, ...] = ()
     """The contacts of the scene; none of them is active here."""
+    mirror_motion: MirrorMotion | None = None
+    """What mirrors that move add to the velocity of the nodes beyond them; None if none moves."""
 
     @property
     def velocity(self) -> NodeVector:
@@ -185,10 +197,12 @@ class Nodes(AbstractNodes):
     @property
     def prescribed(self) -> NodeVector:
         """The velocity of held components [m/s], shape (n, d)."""
-        part = self.free_normal
+        part, velocity = self.free_normal, self.conditions.velocity
+        if self.mirror_motion is not None:
+            velocity = jnp.where(self.mirror_motion.beyond, self.mirror_motion.velocity, velocity)
         if part is None:
-            return self.conditions.velocity
-        return jnp.where(self.free, part.direction * part.speed[:, None], self.conditions.velocity)
+            return velocity
+        return jnp.where(self.free, part.direction * part.speed[:, None], velocity)
 
     def explicit_velocity(self) -> NodeVector:
         """v* = v^n + Δt f/m + Δt g [m/s], shape (n, d) (derivation, eq. 4)."""
@@ -225,6 +239,10 @@ class Nodes(AbstractNodes):
 
         parts = self.sums.folded(fold_per_mass, images.fold), fold_per_mass(self.acceleration)
         return eqx.tree_at(lambda n: (n.sums, n.acceleration), nodes, parts)
+
+    def moved_by(self, change: NodeVector) -> "Nodes":
+        """The nodes with a velocity [m/s], shape (n, d), added to theirs."""
+        return eqx.tree_at(lambda n: n.sums, self, self.sums.folded(lambda v: v + change, lambda force: force))
 
     def constrained(self, images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None) -> "Nodes":
         """The nodes folded at these mirrors, with the components `fixed` and the `normals` held too."""
@@ -293,7 +311,8 @@ def particles_to_grid(
             push = particles.mass * components(scene.body_force.acceleration(x, at))
             force = scatter(stencil, push, None, grid.size)
             acceleration = acceleration + jnp.where(occupied, force / full, 0)
-        conditions = combined_conditions(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total)
+        places = scene.nodes(particles, t)
+        conditions = combined_conditions(scene.boundary, places, grid.spacing, t, dt, reference=scene.total)
         if scene.total and conditions.colliders is not None and conditions.colliders.slides:
             slid = (conditions.colliders.owner >= 0)[:, None] & occupied
             place = jnp.where(slid, places_of(particles, stencil, grid.size) / full, conditions.colliders.position)
@@ -324,14 +343,22 @@ def particles_to_grid(
             potential=potential,
             conditions=conditions,
             contacts=contacts_of(scene.boundary, conditions, grid, window, t, dt),
+            mirror_motion=mirror_motion(scene.boundary, grid, window, t, dt),
         )
         return folded_at_planes(scene, particles, nodes) if folded else nodes
 
 
 def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes) -> Nodes:
     """The nodes, folded at the scene's symmetry planes."""
+    images, moving = mirror(scene.boundary, scene.grid, scene.window(particles)), nodes.mirror_motion
     with jax.named_scope("p2g"):
-        return nodes.folded(mirror(scene.boundary, scene.grid, scene.window(particles)))
+        if moving is None:
+            return nodes.folded(images)
+        # at rest with the mirrors: the velocity less what they add, which is put back
+        added = jnp.where(nodes.conditions.fixed, nodes.conditions.velocity, 0)
+        added = jnp.where(moving.beyond, moving.velocity, added)
+        added = images.added(added)
+        return nodes.moved_by(-images.unfold(added)).folded(images).moved_by(added)
 
 
 def places_of(particles: Particles, stencil: Stencil, size: int) -> NodeVector:

@@ -92,7 +92,7 @@ def step_unchecked(
         method: the integrator.
         stencil: stencil of the particles, if it is known already, as in the total description. Default: it is computed.
     """
-    stencil = scene.stencil(particles) if stencil is None else stencil
+    stencil = scene.stencil(particles, t) if stencil is None else stencil
     nodes = particles_to_grid(
         scene,
         particles,
