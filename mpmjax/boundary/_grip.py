@@ -7,7 +7,7 @@ from mpmjax._types import Array, Float, NodeVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.checks import require, require_fields
-from mpmjax.geometry import AbstractMotion, AbstractRegion
+from mpmjax.geometry import AbstractMotion, AbstractRegion, Motion
 
 
 class Grip(AbstractBoundary):
@@ -25,7 +25,7 @@ class Grip(AbstractBoundary):
     """
 
     region: AbstractRegion
-    motion: AbstractMotion
+    motion: Motion | AbstractMotion  # in files a Motion where no kind is given
     axes: tuple[bool, ...] | None = eqx.field(
         static=True, default=None, converter=lambda a: tuple(a) if isinstance(a, list) else a
     )

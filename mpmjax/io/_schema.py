@@ -166,7 +166,8 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
     if items and isinstance(data, list) and not _forms(expected):  # of arrays, each of its own shape
         return tuple(decode(d, items[0], _nth(where, i), arrays) for i, d in enumerate(data, 1))
     if any(is_module(a) for a in choices):
-        return _object(data, classes, any(inspect.isabstract(a) for a in choices), where, arrays)
+        plain = [a.__name__ for a in choices if is_module(a) and not inspect.isabstract(a)]
+        return _object(data, classes, any(inspect.isabstract(a) for a in choices), where, arrays, plain)
     if enums := [a for a in choices if is_enum(a)]:
         words = [member.value for member in enums[0]]
         _require(isinstance(data, str) and data in words, where, f"must be one of {_quoted(words)}, got {_short(data)}")
@@ -196,12 +197,20 @@ def arguments(
     return {key: decode(value, known[key][0], _inside(where, key, value), arrays) for key, value in table.items()}
 
 
-def _object(data: Any, classes: dict[str, type], opened: bool, where: str, arrays: dict[str, np.ndarray] | None) -> Any:
-    """The table of an object that may be of one of several classes; where `opened` also of one that is registered."""
+def _object(
+    data: Any,
+    classes: dict[str, type],
+    opened: bool,
+    where: str,
+    arrays: dict[str, np.ndarray] | None,
+    plain: list[str],
+) -> Any:
+    """The table of an object that may be of one of several classes; where `opened` also of one that is registered. Where
+    one of them is `plain`, named by itself beside a base class, it is meant where no kind is given."""
     table = {"kind": data} if isinstance(data, str) else data
     _require(classes or opened, where, "takes an object of Python, which files cannot hold: leave it out")
     choice = f"one of {', '.join(classes)}" if len(classes) > 1 else next(iter(classes), "a class of your own")
-    evident = [name for name, c in classes.items() if c in CLASSES]
+    evident = plain if len(plain) == 1 else [name for name, c in classes.items() if c in CLASSES]
     _require(isinstance(table, dict), where, f"must be a table with a kind, {choice}, got {_short(data)}")
     _require("kind" in table or len(evident) == 1, where, f"needs a kind: {choice}")
     kind = table.get("kind", *evident) if len(evident) == 1 else table["kind"]
