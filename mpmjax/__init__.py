@@ -150,6 +150,7 @@ from mpmjax.simulation import Fault, Run, SimulationError, rollout, simulate
 from mpmjax.state import (
     AbstractBodyForce,
     AbstractLoad,
+    AbstractPlace,
     AttachedPoints,
     Particles,
     Patch,
@@ -247,6 +248,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "TimeSeries",
     # loads
     "AbstractLoad",
+    "AbstractPlace",
     "Traction",
     "Pressure",
     "PointLoad",

@@ -46,6 +46,7 @@ def found() -> mpm.FitResult:
 FITTED = found()
 FUNCTIONS = {
     mpm.fill: {"region": mpm.Ball((0.1, 0.1), 0.1), "grid": SCENE.grid, "density": 1e3},
+    mpm.attach: {"scene": SCENE, "particles": PARTICLES},
     mpm.prepare: {"scene": SCENE, "particles": PARTICLES},
     mpm.stable_dt: {"scene": SCENE, "particles": PARTICLES},
     mpm.simulate: RUN,

@@ -79,6 +79,30 @@ def test_loads_have_the_force_and_moment_that_was_asked_for(description):
         assert_close(found[1], np.array([moment]), 1e-9)
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize("description", DESCRIPTIONS.values(), ids=DESCRIPTIONS)
+def test_loads_in_three_dimensions(description):
+    """Of a nearly incompressible ball: a pressure all over it has no force and no moment; a traction on the part of its
+    surface above a plane has the force of that area."""
+    ball, grid = mpm.Ball((0.31, 0.3, 0.32), 0.22), mpm.Grid((13,) * 3, 0.1, origin=(-3,) * 3)
+    particles = mpm.fill(ball, grid, particles_per_cell=8, density=1e3)
+    material, settings = mpm.NeoHookean(1e4, 0.49), {"description": description, "gradient": mpm.MLSGradient()}
+    cap = mpm.Patch(ball, mpm.Box((-1.0, -1.0, 0.42), (1.0, 1.0, 1.0)), 0.02)  # of height 0.12
+    for load, force in (
+        (mpm.Pressure(mpm.Patch(ball), 1e4), 0.0),
+        (mpm.Traction(cap, (0.0, 1e3, 2e3)), 2 * np.pi * 0.22 * 0.12),
+    ):
+        scene = mpm.attach(mpm.Scene(grid, material, loads=load, **settings), particles)
+        prepared = mpm.prepare(scene, particles)
+        found, moment = gained(scene, prepared, mpm.Explicit(), 1e-5)
+        if force == 0:
+            size = 1e4 * np.pi * 0.22**2
+            np.testing.assert_allclose(found, 0, rtol=0, atol=1e-9 * size)
+            np.testing.assert_allclose(moment, 0, rtol=0, atol=1e-9 * size)
+        else:
+            np.testing.assert_allclose(found, force * np.array([0, 1e3, 2e3]), rtol=0, atol=0.03 * 2e3 * force)
+
+
 def test_a_pressure_follows_the_surface_and_a_traction_does_not():
     """On a body that is turned and stretched: −p cof(F) A, and A t."""
     turn = jnp.asarray([[0.0, -2.0], [1.5, 0.0]])  # by a right angle, and sheared out
@@ -220,6 +244,20 @@ def test_loads_have_derivatives():
     for i, (number, slope) in enumerate(zip(numbers, slopes, strict=True)):
         ends = [end(tuple(n * (1 + e) if j == i else n for j, n in enumerate(numbers))) for e in (1e-3, -1e-3)]
         assert float(slope) == pytest.approx(float(ends[0] - ends[1]) / (2e-3 * number), rel=1e-4)
+
+
+def test_loads_forces_and_planes_that_move_in_single_precision():
+    """All together keep the particles' precision, explicit and implicit."""
+    loads = mpm.Traction(TOP, RAMP), mpm.Pressure(RIGHT, 1.0), mpm.Spring(mpm.PointsAt(((0.1, 0.1),)), 1e3, 1.0)
+    plane = mpm.SymmetryPlane(1, 0.0, motion=mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.0, 0.1))))
+    scene, particles = block(2, loads=loads, boundary=plane, boundary_forces=True)
+    particles = jax.tree.map(lambda a: a.astype(jnp.float32), particles)
+    scene = mpm.attach(scene, particles)
+    for method in (mpm.Explicit(), mpm.ImplicitMidpoint()):
+        after, info = mpm.step(scene, particles, 0.5, 1e-4, method=method)
+        assert {a.dtype for a in jax.tree.leaves((after, info.boundaries))} == {jnp.dtype(jnp.float32)}
+        assert np.isfinite(after.x).all()
+    assert float(mpm.stable_dt(scene, particles)) > 0
 
 
 @pytest.mark.parametrize("method", **ids(METHODS, "explicit"))

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, Matrix, NodeVector, Scalar, components
 from mpmjax.analysis._diagnostics import energy_density, energy_of
-from mpmjax.checks import canonical, checked, require_positive
+from mpmjax.checks import canonical, checked, require, require_positive
 from mpmjax.discretisation import Gathered, Stencil, gather, scatter
 from mpmjax.state import Particles, Scene, prepare
 from mpmjax.stepping import (
@@ -142,9 +142,14 @@ def budget(
         the particles after the last step, and the budget, each of its terms with a leading axis f.
 
     Raises:
-        ValueError: from `prepare`, or a step that is not positive.
+        ValueError: from `prepare`, a step that is not positive, or a plane of symmetry that moves.
     """
     require_positive("dt [s]", dt)
+    require(
+        not scene.moving_mirrors,
+        "A budget does not know the work of a SymmetryPlane that moves: take a plane at rest, in the frame of the plane, "
+        "or a SlipCollider of a HalfSpace.",
+    )
     scene, dt, method = canonical((scene, dt, method), particles.x.dtype)
     return _budget(scene, prepare(scene, particles), jnp.asarray(start, particles.x.dtype), dt, method, steps)
 

@@ -205,8 +205,8 @@ def _object(
     arrays: dict[str, np.ndarray] | None,
     plain: list[str],
 ) -> Any:
-    """The table of an object that may be of one of several classes; where `opened` also of one that is registered. Where
-    one of them is `plain`, named by itself beside a base class, it is meant where no kind is given."""
+    """The table of an object that may be of one of several classes; where `opened` also of one that is registered.
+    Where one of them is `plain`, named by itself beside a base class, it is meant where no kind is given."""
     table = {"kind": data} if isinstance(data, str) else data
     _require(classes or opened, where, "takes an object of Python, which files cannot hold: leave it out")
     choice = f"one of {', '.join(classes)}" if len(classes) > 1 else next(iter(classes), "a class of your own")

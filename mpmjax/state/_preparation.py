@@ -165,7 +165,7 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
     require_finite("Particle positions", particles.x)
     require_finite("Particle velocities", particles.v)
     inside = np.ones(particles.count, bool)
-    if scene.shift(0.0) is None:  # else the grid is where the time says
+    if scene.total or not scene.moving_mirrors:  # else the grid is where the time says
         inside = np.asarray(in_window(scene.kernel, scene.grid, scene.window(particles), place))
     if not inside.all():
         first = int(np.argmin(inside))

@@ -23,6 +23,7 @@ from mpmjax.discretisation import (
     Stencil,
     make_stencil,
 )
+from mpmjax.geometry import Motion
 from mpmjax.material import AbstractLaw
 from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, UpdatedLagrangian
@@ -159,16 +160,19 @@ class Scene(eqx.Module):
         """Whether the description is total Lagrangian."""
         return self.description.total
 
+    @property
+    def moving_mirrors(self) -> dict[int, Motion]:
+        """The motions of mirrors that move, by the axis across which they are."""
+        mirrors = (found for boundary in self.boundary if (found := boundary.mirror()) is not None)
+        return {axis: motion for axis, motion in mirrors if motion is not None}
+
     def shift(self, t: Scalar) -> Float[Array, "d"] | None:
         """How far the grid has moved at time t [m], shape (d,), with planes that move; None where it rests."""
-        if self.total:
+        if self.total or not self.moving_mirrors:
             return None
-        mirrors = [found for boundary in self.boundary if (found := boundary.mirror()) is not None]
-        moving = {axis: motion for axis, motion in mirrors if motion is not None}  # across one axis all move alike
-        if not moving:
-            return None
-        along = {axis: motion.at(t)[axis] for axis, motion in moving.items()}
-        return jnp.stack([jnp.asarray(along.get(axis, jnp.zeros_like(t))) for axis in range(self.grid.dim)])
+        along = {axis: motion.at(t)[axis] for axis, motion in self.moving_mirrors.items()}  # one axis: all move alike
+        rest = jnp.zeros_like(next(iter(along.values())))
+        return jnp.stack([along.get(axis, rest) for axis in range(self.grid.dim)])
 
     def nodes(self, particles: Particles, t: Scalar) -> NodeVector:
         """Positions of the window's nodes at time t [m], shape (n, d)."""
