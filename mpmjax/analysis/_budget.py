@@ -147,7 +147,7 @@ def budget(
     require_positive("dt [s]", dt)
     require(
         not scene.moving_mirrors,
-        "A budget does not know the work of a SymmetryPlane that moves: take a plane at rest, in the frame of the plane, "
+        "A budget does not know the work of a SymmetryPlane that moves: take a plane at rest, in its own frame, "
         "or a SlipCollider of a HalfSpace.",
     )
     scene, dt, method = canonical((scene, dt, method), particles.x.dtype)

@@ -97,7 +97,7 @@ def _cut(corners: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarra
             vertices = [crossing(i, j, rows) for i, j in piece]
             area = _area(vertices)
             side = np.sign((area * outward[rows]).sum(axis=1, keepdims=True))
-            middles.append(sum(vertices) / len(vertices))
+            middles.append(np.mean(vertices, axis=0))
             areas.append(side * area)
     return np.concatenate(middles), np.concatenate(areas)
 

@@ -124,7 +124,9 @@ class ElasticPotential(eqx.Module):
 
     def power(self, v: NodeVector) -> Float[Array, ""]:
         """v·D v [W], the power that viscosity dissipates at a nodal velocity v [m/s]."""
-        power = sum((support.power(v) for support in self.held_by()), jnp.zeros((), v.dtype))
+        power = jnp.zeros((), v.dtype)
+        for support in self.held_by():
+            power = power + support.power(v)
         if not self.material_viscous:
             return power
         gradient = self._gradient(v)

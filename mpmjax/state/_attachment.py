@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy.spatial
+from scipy.spatial import KDTree
 
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import is_traced, require, require_fields, require_positive
@@ -177,7 +177,7 @@ def _known(particles: Particles, place: AbstractPlace) -> tuple[np.ndarray, floa
 
 def _nearest(x: np.ndarray, places: np.ndarray, apart: float, place: AbstractPlace) -> np.ndarray:
     """The number of the particle nearest to each place."""
-    far, particle = scipy.spatial.cKDTree(x).query(places)
+    far, particle = KDTree(x).query(places)
     require(
         far <= _FAR * apart,
         f"The {type(place).__name__} has a point at {places[far.argmax()]} m, {far.max():.3g} m off the nearest "

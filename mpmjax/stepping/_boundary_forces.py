@@ -67,9 +67,7 @@ def given_to_boundaries(
     if along is not None and colliders is not None:
         given.append(Given(along[:, None] * colliders.normal, owners.collider[:, None]))
         residual = residual - given[-1].impulse
-    of_contact = [
-        number if (found := contact.owner(owners)) is None else found[:, None] for number, contact in contacts
-    ]
+    of_contact = [_owner(number, contact.owner(owners)) for number, contact in contacts]
     columns = [
         (number, image.within(active))
         for (number, contact), active in zip(contacts, held.active, strict=True)
@@ -94,6 +92,14 @@ def given_to_boundaries(
         places = places + dt / 2 * mean
         pivots = (pivots + _pivots(scene, t + dt, residual)) / 2
     return impulse_on_boundaries(given, places, pivots)
+
+
+def _owner(number: int | None, found: Array | None) -> Array | int:
+    """The boundary whose contact it is, at each node or everywhere: what the contact says or, by default, the one that
+    brought it."""
+    if found is not None:
+        return found[:, None]
+    return -1 if number is None else number
 
 
 def _share_of_change(transfer: AbstractTransfer, dim: int, dtype: jnp.dtype) -> Array:
