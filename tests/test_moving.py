@@ -34,6 +34,31 @@ def test_a_grip_that_turns_holds_as_a_sticky_body_does(motion, description):
     assert_close(ends[0][0][deep], motion.place(particles.x, 0.01)[deep], 1e-4 if not scene.total else 1e-6)
 
 
+WAY = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.3, 0.6)))
+PAIRS = {
+    "sticky": (mpm.StickyBox((-np.inf, 0.1), (np.inf, np.inf), WAY), mpm.Grip(mpm.Box((-9.0, -9.0), (9.0, 0.1)), WAY)),
+    "slip": (
+        mpm.SlipBox((-np.inf, 0.1), (np.inf, np.inf), WAY),
+        mpm.SlipCollider(mpm.HalfSpace((0.0, 0.1), (0.0, 1.0)), WAY),
+    ),
+}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("description", DESCRIPTIONS.values(), ids=DESCRIPTIONS)
+@pytest.mark.parametrize("pair", PAIRS.values(), ids=PAIRS)
+def test_walls_that_move_are_grips_or_colliders_of_a_half_space(pair, description):
+    """In motion and force, over steps in which the wall passes a node."""
+    ends = []
+    for wall in pair:
+        scene, particles = block(2, boundary=wall, boundary_forces=True, description=description)
+        particles = dataclasses.replace(particles, v=particles.v + jnp.asarray([0.0, 0.6]))
+        run = mpm.simulate(scene, particles, t1=0.2, dt=2e-3, save_every=20)
+        ends.append((run.final.x, run.final.v, run.boundary_forces().force))
+    for a, b in zip(*ends, strict=True):
+        assert_close(a, b, 1e-9)
+
+
 PLANE = mpm.SymmetryPlane(1, 0.0, motion=mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.0, 0.6))))
 MOVING = {
     "explicit": (mpm.Explicit(), mpm.APIC()),

@@ -48,7 +48,7 @@ EXAMPLES = {
     mpm.Snow: mpm.Snow(1e5, hardening=7.0),
     mpm.Viscous: mpm.Viscous(mpm.NeoHookean(1e5, 0.4), 3.0, 1.0),
     mpm.Fluid: mpm.Fluid(2e5, 1.4, tension=True),
-    mpm.StickyBox: mpm.StickyBox((0.1,), (0.9,)),
+    mpm.StickyBox: mpm.StickyBox((0.1,), (0.9,), mpm.Motion((0.0, 1.0), ((0.0,), (0.1,)))),
     mpm.SlipBox: mpm.SlipBox((0.1, -np.inf), (np.inf, 0.7)),
     mpm.SeparatingBox: mpm.SeparatingBox((0.1,), (0.9,), friction=0.3),
     mpm.Grip: GRIP,
