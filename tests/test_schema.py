@@ -52,6 +52,7 @@ EXAMPLES = {
     mpm.SlipBox: mpm.SlipBox((0.1, -np.inf), (np.inf, 0.7)),
     mpm.SeparatingBox: mpm.SeparatingBox((0.1,), (0.9,), friction=0.3),
     mpm.Grip: GRIP,
+    mpm.RigidPart: mpm.RigidPart(mpm.Ball((0.1, 0.2), 0.3), (True, False)),
     mpm.SymmetryPlane: mpm.SymmetryPlane(1, 0.05, "below"),
     mpm.ContactPlane: mpm.ContactPlane(1, 0.05, "below", friction=0.3),
     mpm.Box: mpm.Box((0.0, 0.1, 0.2), (1.0, 1.1, 1.2)),

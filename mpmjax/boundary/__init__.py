@@ -31,8 +31,9 @@ from mpmjax.boundary._contact import (
     no_contact,
 )
 from mpmjax.boundary._grip import Grip
-from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion
+from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion, Tie
 from mpmjax.boundary._planes import ContactPlane, SymmetryPlane
+from mpmjax.boundary._rigid_part import RigidPart
 from mpmjax.boundary._walls import SeparatingBox, SlipBox, StickyBox
 
 __all__ = [
@@ -53,6 +54,7 @@ __all__ = [
     "Mirror",
     "MirrorMotion",
     "Owners",
+    "RigidPart",
     "SeparatingBox",
     "SeparatingCollider",
     "SlipBox",
@@ -60,6 +62,7 @@ __all__ = [
     "StickyBox",
     "StickyCollider",
     "SymmetryPlane",
+    "Tie",
     "Wall",
     "brought_contacts",
     "brought_images",

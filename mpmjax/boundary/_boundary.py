@@ -13,7 +13,7 @@ import equinox as eqx
 from mpmjax._types import Array, Bool, Float, Int, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact
-from mpmjax.boundary._mirror import Image, MirrorMotion
+from mpmjax.boundary._mirror import Image, MirrorMotion, Tie
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import Motion
 
@@ -93,7 +93,7 @@ class AbstractBoundary(eqx.Module):
         del conditions, grid, window, t, dt
         return ()
 
-    def mirror_images(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, ...]:
+    def mirror_images(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image | Tie, ...]:
         """The mirrors that it puts in the window (see `mirror_image`). Default: none."""
         del grid, window
         return ()

@@ -18,7 +18,7 @@ from mpmjax._types import Array, Float, Int, NodeVector, Scalar
 from mpmjax.boundary._boundary import AbstractBoundary
 from mpmjax.boundary._collider_impulse import moment
 from mpmjax.boundary._conditions import Conditions
-from mpmjax.boundary._mirror import Image, Mirror
+from mpmjax.boundary._mirror import Image, Mirror, Tie
 from mpmjax.linalg import pairs
 
 
@@ -88,7 +88,9 @@ class Given(eqx.Module):
     """The number of the boundary, −1 for none: of all nodes, or of shape (n, 1) or (n, d)."""
 
 
-def taken_by_mirrors(field: NodeVector, images: list[tuple[int, Image]]) -> tuple[list[Given], NodeVector]:
+def taken_by_mirrors(
+    field: NodeVector, images: list[tuple[int, Image]] | list[tuple[int, Image | Tie]]
+) -> tuple[list[Given], NodeVector]:
     """What mirrors take of impulses on all nodes, each by its boundary's number, and the impulses that remain on true
     nodes.
 

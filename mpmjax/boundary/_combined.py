@@ -8,7 +8,7 @@ from mpmjax.boundary._boundary import AbstractBoundary
 from mpmjax.boundary._collider_contact import collider_contacts
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact
-from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion
+from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion, Tie
 from mpmjax.boundary._wall_contact import wall_contacts
 from mpmjax.discretisation import Grid
 
@@ -112,6 +112,6 @@ def mirror_motion(
 
 def brought_images(
     boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"]
-) -> list[tuple[int, Image]]:
+) -> list[tuple[int, Image | Tie]]:
     """The images of `mirror`, each with the number of its boundary."""
     return [(n, image) for n, boundary in enumerate(boundaries) for image in boundary.mirror_images(grid, window)]

@@ -7,6 +7,7 @@ a `ContactPlane` only in the *columns* (lines of nodes along the normal) that it
 """
 
 from dataclasses import replace
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -42,6 +43,10 @@ class Image(eqx.Module):
             return copied
         return copied + jnp.where(self.along(self.odd <= 0)[:, None] & normal, field, 0)
 
+    def at_rest(self) -> "Image":
+        """The same of a mirror that does not move."""
+        return replace(self, moving=False)
+
     def within(self, held: Bool[Array, "n"]) -> "Image":
         """The mirror in some columns only."""
         return Image(self.shape, self.axis, self.source, self.even, self.odd, held, self.moving)
@@ -67,6 +72,27 @@ class Image(eqx.Module):
         return copied if self.held is None else jnp.where(self.held[:, None], copied, field)
 
 
+class Tie(eqx.Module):
+    """One velocity for several nodes, that of the first: the map B of a rigid part, used as those of mirrors are."""
+
+    tied: Bool[Array, "n"]
+    """The nodes tied together."""
+    axis: ClassVar[int] = -1
+    moving: ClassVar[bool] = False
+
+    def scalar(self, field: NodeScalar) -> NodeScalar:
+        """B for a scalar field."""
+        return jnp.where(self.tied, field[jnp.argmax(self.tied)], field)
+
+    def vector(self, field: NodeVector) -> NodeVector:
+        """B for a vector field."""
+        return jnp.where(self.tied[:, None], field[jnp.argmax(self.tied)], field)
+
+    def at_rest(self) -> "Tie":
+        """Itself."""
+        return self
+
+
 class MirrorMotion(eqx.Module):
     """What mirrors that move add to the velocity of the nodes beyond them (see `Image.moving`)."""
 
@@ -79,7 +105,7 @@ class MirrorMotion(eqx.Module):
 class Mirror(eqx.Module):
     """The mirrors of several planes: `unfold` applies B, from true nodes to all nodes; `fold` applies Bᵀ."""
 
-    images: tuple[Image, ...]
+    images: tuple[Image | Tie, ...]
 
     def unfold(self, field: NodeVector) -> NodeVector:
         """B v: fill in the mirror images."""
@@ -89,14 +115,14 @@ class Mirror(eqx.Module):
 
     def fold(self, field: NodeVector) -> NodeVector:
         """Bᵀ f: add to the true nodes what their mirror images received, and leave nothing on the others."""
-        at_rest = Mirror(tuple(replace(image, moving=False) for image in self.images))
+        at_rest = Mirror(tuple(image.at_rest() for image in self.images))
         return jax.linear_transpose(at_rest.unfold, field)(field)[0] if self.images else field
 
     def added(self, field: NodeVector) -> NodeVector:
         """The part of a field that mirrors which move add to it (see `Image.moving`), zero elsewhere."""
         total = jnp.zeros_like(field)
         for image in self.images:
-            if image.moving:
+            if isinstance(image, Image) and image.moving:
                 own = image.along(image.odd <= 0)[:, None] & (jnp.arange(field.shape[1]) == image.axis)
                 total = jnp.where(own, field, total)
         return total

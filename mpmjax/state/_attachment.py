@@ -183,7 +183,7 @@ def _nearest(x: np.ndarray, places: np.ndarray, apart: float, place: AbstractPla
         f"The {type(place).__name__} has a point at {places[far.argmax()]} m, {far.max():.3g} m off the nearest "
         "particle: place it on the body.",
     )
-    return particle
+    return np.asarray(particle)
 
 
 def _attached(
