@@ -78,7 +78,7 @@ def assert_sums_to_change(scene, particles, method):
     return received
 
 
-@pytest.mark.parametrize("method", **ids(METHODS, ("explicit", "trbdf2")))
+@pytest.mark.parametrize("method", **ids(METHODS, "explicit", ("explicit", "semi_implicit", "trbdf2")))
 @pytest.mark.parametrize("boundary", **ids(BOUNDARIES, ("colliders", "a corner of contact")))
 def test_forces_on_boundaries_sum_to_the_change_of_momentum(boundary, method):
     """Every integrator, every kind of boundary, with a body force."""
