@@ -87,6 +87,36 @@ def test_forces_on_boundaries_and_rigid_parts_sum_to_the_change_of_momentum(turn
     assert np.abs(received[1]).max() < 1e-9 * np.abs(received[0]).max()
 
 
+@pytest.mark.thorough
+def test_what_holds_a_node_of_a_rigid_part_holds_all_of_it():
+    """A body that is rigid and touches a wall with its lowest nodes does not move, and the wall has its weight; sliding
+    along a plane it falls sideways as one."""
+    for wall, gravity in (
+        (mpm.StickyBox((-np.inf, 0.0), (np.inf, np.inf)), (1.0, -9.81)),
+        (mpm.SlipBox((-np.inf, 0.0), (np.inf, np.inf)), (1.0, -9.81)),
+    ):
+        scene, particles = block(
+            2, boundary=(mpm.RigidPart(EVERYWHERE), wall), description=mpm.TotalLagrangian(), gravity=gravity,
+            boundary_forces=True,
+        )  # fmt: skip
+        after, info = mpm.step(scene, particles, 0.0, 0.01)
+        slides = isinstance(wall, mpm.SlipBox)
+        assert_close(after.v, jnp.broadcast_to(jnp.asarray([0.01 * slides, 0.0]), after.v.shape), 1e-12, 1e-14)
+        force = np.asarray(info.boundaries.impulse[1]) / 0.01
+        expected = float(particles.mass.sum()) * np.array([0.0 if slides else 1.0, -9.81])
+        np.testing.assert_allclose(force, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.thorough
+def test_the_budget_of_a_rigid_part_closes():
+    """Energy and momentum of a shaken block, half of which is rigid."""
+    part = mpm.RigidPart(mpm.Box((-1.0, 0.15), (1.0, 1.0)), (False, True))
+    scene, particles = shaken(boundary=part, description=mpm.TotalLagrangian())
+    _, budget = mpm.budget(scene, particles, steps=3, dt=1e-3, method=METHODS["implicit_midpoint"])
+    for terms, scale in ((budget.energy, budget.energy.kinetic), (budget.momentum, budget.momentum.change)):
+        np.testing.assert_allclose(terms.change, terms.explained, rtol=0, atol=1e-9 * np.abs(scale).max())
+
+
 def test_a_rigid_part_needs_the_total_description():
     with pytest.raises(ValueError, match="nodes that stay with the body: use the total description"):
         mpm.Scene(mpm.Grid((9, 9), 0.1), LAWS["fixed_corotated"], boundary=mpm.RigidPart(EVERYWHERE))

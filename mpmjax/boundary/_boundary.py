@@ -10,7 +10,7 @@ from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 
-from mpmjax._types import Array, Bool, Float, Int, NodeVector, ParticleVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, Mask, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._mirror import Image, MirrorMotion, Tie
@@ -133,6 +133,18 @@ class AbstractBoundary(eqx.Module):
         for warnings of what lies in it. Default: None, it is no body."""
         del x, t
         return None
+
+    def spread(self, fixed: Mask, value: Array, nodes: NodeVector, spacing: Scalar) -> tuple[Mask, Array]:
+        """What boundaries prescribe, where one that does so at one of its nodes means all of them. Default: as it is.
+
+        Args:
+            fixed: components of velocity that are prescribed, shape (n, d).
+            value: what belongs to them, shape (n, d).
+            nodes: positions of the nodes [m], shape (n, d).
+            spacing: dx [m].
+        """
+        del nodes, spacing
+        return fixed, value
 
     def carried(self, nodes: NodeVector, t: Scalar) -> NodeVector | None:
         """Where reference nodes at these positions are at time t [m], shape (n, d), if it holds them with all of their

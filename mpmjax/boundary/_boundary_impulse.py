@@ -72,6 +72,8 @@ def owners_of(
         if own.side is not None:
             side = jnp.where((side < 0) & (own.side != 0), number, side)
         bodies += [number] * (0 if own.colliders is None else len(own.colliders.pivots))
+    for boundary in boundaries:
+        fixed = boundary.spread(fixed >= 0, fixed, nodes, spacing)[1]
     collider = nobody[:, 0]
     if conditions.colliders is not None:
         owner = conditions.colliders.owner

@@ -45,6 +45,9 @@ def combined_conditions(
             mine = eqx.tree_at(lambda c: c.holder, new.colliders, holder)
             colliders = mine if colliders is None else colliders.beside(mine)
         total = Conditions(total.fixed | new.fixed, velocity, side, friction, colliders)
+    for boundary in boundaries:
+        fixed, velocity = boundary.spread(total.fixed, total.velocity, nodes, spacing)
+        total = Conditions(fixed, velocity, total.side, total.friction, total.colliders)
     if total.side is None:
         return total
     side = jnp.where(total.fixed, 0, total.side)

@@ -331,6 +331,7 @@ def particles_to_grid(
                 force = force + potential.support_force()
             if drag is not None:
                 force = force + drag
+            if viscosity_apart and drag is not None:
                 viscous_force = drag if viscous_force is None else viscous_force + drag
             sums = SeparateSums(jnp.where(occupied, momentum / full, 0), force, viscous_force)
         nodes = Nodes(
