@@ -13,6 +13,7 @@ from helpers import DESCRIPTIONS, GRADIENTS, TRANSFERS, assert_close, block, exp
 from test_boundary_forces import METHODS, angular_momentum, shaken
 
 import mpmjax as mpm
+from mpmjax.cli._scene_file import read_scene_file
 from mpmjax.geometry import surface_pieces
 from mpmjax.io._schema import decode, encode
 
@@ -307,3 +308,48 @@ def test_loads_can_be_written_and_are_refused_with_reasons():
     metal = mpm.attach(mpm.Scene(scene.grid, mpm.VonMises(1e4, 0.3, 400.0), loads=mpm.Pressure(TOP, 1.0)), particles)
     with pytest.raises(ValueError, match="following Pressure needs the whole deformation gradient"):
         mpm.prepare(metal, particles)
+
+
+SCENE_FILE = """
+boundary_forces = true
+[grid]
+shape = [9, 9]
+spacing = 0.1
+origin = [-3, -3]
+[material]
+kind = "NeoHookean"
+youngs_modulus = 1e4
+poisson_ratio = 0.3
+[[boundary]]
+kind = "Grip"
+region = { kind = "Box", lower = [-1.0, -1.0], upper = [1.0, 0.0] }
+motion = { times = [0.0], displacement = [[0.0, 0.0]] }
+[[loads]]
+kind = "Traction"
+traction = { kind = "TimeSeries", times = [0.0, 1.0], values = [[0.0, 0.0], [0.0, -2e3]] }
+on = { kind = "Patch", region = { kind = "Box", lower = [0.0, 0.0], upper = [0.3, 0.3] }, within = { kind = "Box", lower = [-1.0, 0.29], upper = [1.0, 1.0] } }
+[[loads]]
+kind = "Spring"
+stiffness = 1e4
+on = { kind = "PointsAt", positions = [[0.3, 0.0]] }
+[particles]
+region = { kind = "Box", lower = [0.0, 0.0], upper = [0.3, 0.3] }
+density = 1e3
+[run]
+t1 = 1e-3
+dt = 1e-3
+"""  # noqa: E501
+
+
+def test_a_scene_file_attaches_its_loads(tmp_path):
+    """To the particles that it fills, also where it is refined; a grip's motion needs no kind."""
+    path = tmp_path / "loaded.toml"
+    path.write_text(SCENE_FILE)
+    file = read_scene_file(path)
+    for (scene, particles), count in ((file[:2], 6), (file.build(2), 12)):
+        traction, spring = scene.loads
+        assert len(traction.on.particle) == count
+        assert float(jnp.sum(jnp.asarray(traction.on.weight))) == pytest.approx(SIDE, rel=1e-12)
+        place = particles.x[int(spring.on.particle[0])] + jnp.asarray(spring.on.offset)[0]
+        np.testing.assert_allclose(place, [0.3, 0.0], rtol=0, atol=1e-12)
+    assert isinstance(file.scene.boundary[0].motion, mpm.Motion)
