@@ -155,9 +155,9 @@ def offences() -> Iterator[str]:
                     yield f"{call.__name__} takes {name}={what}"
 
 
-TAKEN = {(name, "empty") for name in ("boundary", "also", "deformations", "histories", "methods", "refinements")} | {
-    ("fitted", "array of words")
-}
+TAKEN = {
+    (name, "empty") for name in ("boundary", "loads", "also", "deformations", "histories", "methods", "refinements")
+} | {("fitted", "array of words")}
 """What may be none of; and what NumPy takes for true."""
 
 if __name__ == "__main__":

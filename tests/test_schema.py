@@ -71,7 +71,9 @@ EXAMPLES = {
     mpm.Spring: mpm.Spring(mpm.PointsAt(((0.1, 0.2),), (2.0,)), (1.0, 2.0), 3.0, GRIP.motion),
     mpm.Patch: PATCH,
     mpm.PointsAt: mpm.PointsAt(((0.1, 0.2), (0.3, 0.4)), (0.5, 1.5)),
-    mpm.AttachedPoints: mpm.AttachedPoints((0.0,), ((0.1, 0.2),), (1.0,), ((0.3, 0.4),), ((0.0, 1.0),)),
+    mpm.AttachedPoints: mpm.AttachedPoints(
+        np.zeros(1), np.ones((1, 2)), np.ones(1), np.full((1, 2), 0.3), np.array([[0.0, 1.0]])
+    ),
     mpm.TimeSeries: mpm.TimeSeries((0.0, 1.0), ((0.0, 1.0), (2.0, 3.0))),
     mpm.Motion: GRIP.motion,
     mpm.RigidMotion: mpm.RigidMotion((0.0, 1.0), ((0.0, 0.0), (0.1, 0.2)), (0.0, 0.5), (0.3, 0.4)),

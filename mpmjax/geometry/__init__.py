@@ -4,7 +4,7 @@ from mpmjax.geometry._motion import AbstractMotion, Motion, RigidMotion, still
 from mpmjax.geometry._region import AbstractRegion, Ball, Box, Capsule, Cylinder, HalfSpace, Union, length
 from mpmjax.geometry._sampled import SampledDistance, sample_distance, sample_mesh
 from mpmjax.geometry._surface import Pieces, surface_pieces
-from mpmjax.geometry._time_series import Changing, ChangingVector, TimeSeries, value_at, vector_size
+from mpmjax.geometry._time_series import Changing, ChangingVector, TimeSeries, require_some, value_at, vector_size
 
 __all__ = [
     "AbstractMotion",
@@ -23,6 +23,7 @@ __all__ = [
     "TimeSeries",
     "Union",
     "length",
+    "require_some",
     "sample_distance",
     "sample_mesh",
     "still",

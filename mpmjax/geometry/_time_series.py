@@ -50,6 +50,17 @@ def value_at(value: Changing | ChangingVector, t: Scalar) -> Float[Array, "..."]
     return value.at(t) if isinstance(value, TimeSeries) else jnp.asarray(value)
 
 
+def require_some(name: str, value: Changing | ChangingVector) -> None:
+    """Check that a value has numbers, and finite ones; a series has been checked.
+
+    Raises:
+        ValueError: it has none, or one that is not finite.
+    """
+    if not isinstance(value, TimeSeries):
+        require(jnp.size(jnp.asarray(value)) > 0, f"{name} must have a number at least, got {value}.")
+        require_finite(name, value)
+
+
 def vector_size(value: ChangingVector) -> int | None:
     """How many components a vector has that is constant or a time series; None of a number."""
     shape = jnp.shape(jnp.asarray(value.values if isinstance(value, TimeSeries) else value))

@@ -70,7 +70,7 @@ CLASSES: tuple[type, ...] = (
     *(FixedCorotated, NeoHookean, Hencky),
     *(MooneyRivlin, Yeoh, Gent, Ogden),
     *(Snow, VonMises, HerschelBulkley, DruckerPrager, CamClay, Fluid, Viscous),
-    *(StickyBox, SlipBox, SeparatingBox, Grip, RigidPart, SymmetryPlane, ContactPlane),
+    *(StickyBox, SlipBox, SeparatingBox, Grip, SymmetryPlane, ContactPlane, RigidPart),
     *(StickyCollider, SlipCollider, SeparatingCollider),
     *(Box, Ball, HalfSpace, Capsule, Cylinder, Union, SampledDistance, Motion, RigidMotion),
     *(Traction, Pressure, PointLoad, Spring, Patch, PointsAt, AttachedPoints, TimeSeries),

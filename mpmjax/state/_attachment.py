@@ -49,11 +49,11 @@ class AttachedPoints(AbstractPlace):
         area: outward normal times area of the undeformed surface [m^(d−1)], shape (s, d); None of points.
     """
 
-    particle: Numbers
-    offset: Rows
-    weight: Numbers
-    place: Rows
-    area: Rows | None = None
+    particle: Float[Array, "s"] | Float[np.ndarray, "s"]
+    offset: Float[Array, "s d"] | Float[np.ndarray, "s d"]
+    weight: Float[Array, "s"] | Float[np.ndarray, "s"]
+    place: Float[Array, "s d"] | Float[np.ndarray, "s d"]
+    area: Float[Array, "s d"] | Float[np.ndarray, "s d"] | None = None
 
     def __check_init__(self):
         require_fields(self)

@@ -5,9 +5,17 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, NodeVector, Point, Scalar
-from mpmjax.checks import require, require_fields, require_finite, require_that
+from mpmjax.checks import require, require_fields, require_that
 from mpmjax.discretisation import Stencil
-from mpmjax.geometry import AbstractMotion, Changing, ChangingVector, TimeSeries, value_at, vector_size
+from mpmjax.geometry import (
+    AbstractMotion,
+    Changing,
+    ChangingVector,
+    TimeSeries,
+    require_some,
+    value_at,
+    vector_size,
+)
 from mpmjax.material import AbstractLaw
 from mpmjax.state._attachment import AbstractPlace, AttachedPoints
 from mpmjax.state._loaded_points import LoadedPoints, loaded_points
@@ -58,11 +66,6 @@ def _check_vector(name: str, value: ChangingVector, dim: int) -> None:
     require(size == dim, f"{name} must have {dim} components, as the grid has directions, got {size or 'a number'}.")
 
 
-def _check_numbers(name: str, value: Changing | ChangingVector) -> None:
-    if not isinstance(value, TimeSeries):
-        require_finite(name, value)
-
-
 class Traction(AbstractLoad):
     """A dead traction on a surface: a force per undeformed area that keeps its direction.
 
@@ -78,7 +81,7 @@ class Traction(AbstractLoad):
 
     def __check_init__(self):
         require_fields(self)
-        _check_numbers("Traction's traction [N/m²]", self.traction)
+        require_some("Traction's traction [N/m²]", self.traction)
 
     def check(self, dim: int) -> None:
         AbstractLoad.check(self, dim)
@@ -106,7 +109,7 @@ class PointLoad(AbstractLoad):
 
     def __check_init__(self):
         require_fields(self)
-        _check_numbers("PointLoad's total [N]", self.total)
+        require_some("PointLoad's total [N]", self.total)
 
     def check(self, dim: int) -> None:
         AbstractLoad.check(self, dim)
@@ -140,7 +143,7 @@ class Pressure(AbstractLoad):
 
     def __check_init__(self):
         require_fields(self)
-        _check_numbers("Pressure's pressure [Pa]", self.pressure)
+        require_some("Pressure's pressure [Pa]", self.pressure)
         if isinstance(self.pressure, TimeSeries):
             require(vector_size(self.pressure) is None, "Pressure's pressure must be a series of numbers, got vectors.")
 
@@ -182,7 +185,7 @@ class Spring(AbstractLoad):
         require_fields(self)
         for name, value in (("stiffness", self.stiffness), ("damping", self.damping)):
             if value is not None:
-                require_finite(f"A Spring's {name}", value)
+                require_some(f"A Spring's {name}", value)
                 require_that(f"A Spring's {name} must be at least 0", lambda k: k >= 0, value)
 
     def check(self, dim: int) -> None:
