@@ -1,5 +1,7 @@
 """Loads on a body's surface and at points of it, and springs and dashpots to the ground."""
 
+import abc
+
 import equinox as eqx
 import jax.numpy as jnp
 
@@ -32,11 +34,9 @@ class AbstractLoad(eqx.Module):
     on: eqx.AbstractVar[AbstractPlace]
     """Where it acts."""
 
+    @abc.abstractmethod
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"] | None:
-        """The force on each point [N], shape (d, s), at time t, in a step of dt; constant over the step. Default: None,
-        for none."""
-        del points, t, dt
-        return None
+        """The force on each point [N], shape (d, s), at time t, in a step of dt; constant over the step. None for none."""
 
     def support(self, points: LoadedPoints, t: Scalar) -> Support | None:
         """What it adds to the elastic energy of the grid and to its viscosity, linear in the motion of the points.
