@@ -36,7 +36,7 @@ class AbstractLoad(eqx.Module):
 
     @abc.abstractmethod
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"] | None:
-        """The force on each point [N], shape (d, s), at time t, in a step of dt; constant over the step. None for none."""
+        """The force on each point [N], shape (d, s), at time t, in a step of dt, or None for none; constant over it."""
 
     def support(self, points: LoadedPoints, t: Scalar) -> Support | None:
         """What it adds to the elastic energy of the grid and to its viscosity, linear in the motion of the points.
