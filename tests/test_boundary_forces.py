@@ -216,7 +216,7 @@ def test_forces_on_boundaries_against_time(tmp_path):
     gained = np.diff([mpm.momentum(run.frame(i)) for i in range(5)], axis=0) / 1e-2
     weight = float(particles.mass.sum()) * np.array([0.0, -9.81])
     assert_close(force.sum(axis=1), weight - gained, 1e-6)
-    assert not np.asarray(force[:, 0, 1]).any()  # a plane is frictionless
+    assert np.abs(force[:, 0, 1]).max() < 1e-12 * np.abs(force).max()  # a plane is frictionless
     saved, recorded = tmp_path / "saved.h5", tmp_path / "recorded.h5"
     mpm.save(saved, mpm.simulate(scene, particles, t1=2e-2, **settings))
     mpm.record(recorded, scene, particles, t1=2e-2, **settings)
