@@ -46,6 +46,7 @@ def found() -> mpm.FitResult:
 FITTED = found()
 FUNCTIONS = {
     mpm.fill: {"region": mpm.Ball((0.1, 0.1), 0.1), "grid": SCENE.grid, "density": 1e3},
+    mpm.attach: {"scene": SCENE, "particles": PARTICLES},
     mpm.prepare: {"scene": SCENE, "particles": PARTICLES},
     mpm.stable_dt: {"scene": SCENE, "particles": PARTICLES},
     mpm.simulate: RUN,
@@ -154,9 +155,9 @@ def offences() -> Iterator[str]:
                     yield f"{call.__name__} takes {name}={what}"
 
 
-TAKEN = {(name, "empty") for name in ("boundary", "also", "deformations", "histories", "methods", "refinements")} | {
-    ("fitted", "array of words")
-}
+TAKEN = {
+    (name, "empty") for name in ("boundary", "loads", "also", "deformations", "histories", "methods", "refinements")
+} | {("fitted", "array of words")}
 """What may be none of; and what NumPy takes for true."""
 
 if __name__ == "__main__":

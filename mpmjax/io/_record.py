@@ -131,12 +131,14 @@ def record(
             final_step=jnp.asarray(step, dtype),
             statistics=statistics,
             final_collider_impulse=state.collider_impulse,
+            final_boundary_impulse=state.boundary_impulse,
         )
         try:
             raise_faults(run, particles, previous, start)
         except SimulationError as error:
             try:
-                last = RolloutState(state_of(error.run.final), error.run.final_collider_impulse)
+                received = error.run.final_collider_impulse, error.run.final_boundary_impulse
+                last = RolloutState(state_of(error.run.final), *received)
                 _append(writer, int(error.run.final_step), last, statistics)
                 again = "Resumed it would end there again: begin anew."
                 then = "It can be resumed as it is." if int(statistics.fault) == Fault.NONE else again

@@ -35,7 +35,7 @@ def raise_faults(run: Run, began: Particles, previous: RolloutState | None, star
         assert previous is not None
         step = start + int(run.statistics.fault_step)
         problem = Problem(run.scene, run.final, None, run.dt, run.method)
-        words, bad = _WORDS[fault], faulty_particles(problem, state_of(run.final))
+        words, bad = _WORDS[fault], faulty_particles(problem, state_of(run.final), step * run.dt)
         what, advice = words.particle, words.advice
         if fault == Fault.PASSED:
             t = jnp.asarray(step - 1, run.final.x.dtype) * run.dt
@@ -49,12 +49,15 @@ def raise_faults(run: Run, began: Particles, previous: RolloutState | None, star
             what, advice = disallowed(_law(run, first), run.method)
         last = with_state(run.final, previous.particles)
         reached = int((run.steps < step).sum())
-        saved = {name: getattr(run, name) for name in ("steps", "frames", "observed", "collider_impulse")}
+        saved = {
+            name: getattr(run, name) for name in ("steps", "frames", "observed", "collider_impulse", "boundary_impulse")
+        }
         good = replace(
             run,
             **jax.tree.map(lambda a: a[:reached], saved),
             final=last,
             final_collider_impulse=previous.collider_impulse,
+            final_boundary_impulse=previous.boundary_impulse,
             final_step=jnp.asarray(step - 1, run.final_step.dtype),
         )
         raise SimulationError(
