@@ -97,6 +97,7 @@ from mpmjax.fitting import (
 from mpmjax.geometry import (
     AbstractMotion,
     AbstractRegion,
+    Annulus,
     Ball,
     Box,
     Capsule,
@@ -105,6 +106,7 @@ from mpmjax.geometry import (
     Motion,
     RigidMotion,
     SampledDistance,
+    Tube,
     Union,
     sample_distance,
     sample_mesh,
@@ -145,7 +147,17 @@ from mpmjax.material import (
     Yeoh,
 )
 from mpmjax.simulation import Fault, Run, SimulationError, rollout, simulate
-from mpmjax.state import AbstractBodyForce, Particles, Scene, TotalLagrangian, UpdatedLagrangian, fill, join, prepare
+from mpmjax.state import (
+    AbstractBodyForce,
+    Particles,
+    Scene,
+    TotalLagrangian,
+    UpdatedLagrangian,
+    fill,
+    fill_mapped,
+    join,
+    prepare,
+)
 from mpmjax.stepping import (
     TRBDF2,
     AbstractIntegrator,
@@ -172,6 +184,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     # particles and regions
     "Particles",
     "fill",
+    "fill_mapped",
     "join",
     "prepare",
     "AbstractRegion",
@@ -181,6 +194,8 @@ __all__ = [  # noqa: RUF022 (grouped)
     "HalfSpace",
     "Capsule",
     "Cylinder",
+    "Annulus",
+    "Tube",
     "Union",
     "SampledDistance",
     "sample_distance",

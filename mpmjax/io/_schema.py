@@ -24,6 +24,7 @@ import jax
 import numpy as np
 from jaxtyping import AbstractArray
 
+from mpmjax import geometry
 from mpmjax.boundary import (
     ContactPlane,
     Grip,
@@ -37,7 +38,6 @@ from mpmjax.boundary import (
 )
 from mpmjax.checks import alternatives, is_enum, is_module, may_be_infinite, require
 from mpmjax.discretisation import APIC, FLIP, PIC, BSpline, Grid, MLSGradient, SplineGradient
-from mpmjax.geometry import Ball, Box, Capsule, Cylinder, HalfSpace, Motion, RigidMotion, SampledDistance, Union
 from mpmjax.implicit import (
     AnalyticHessian,
     ConjugateResidual,
@@ -74,7 +74,8 @@ CLASSES: tuple[type, ...] = (
     *(Snow, VonMises, HerschelBulkley, DruckerPrager, CamClay, Fluid, Viscous),
     *(StickyBox, SlipBox, SeparatingBox, Grip, SymmetryPlane, ContactPlane),
     *(StickyCollider, SlipCollider, SeparatingCollider),
-    *(Box, Ball, HalfSpace, Capsule, Cylinder, Union, SampledDistance, Motion, RigidMotion),
+    *(geometry.Box, geometry.Ball, geometry.HalfSpace, geometry.Capsule, geometry.Cylinder, geometry.Annulus),
+    *(geometry.Tube, geometry.Union, geometry.SampledDistance, geometry.Motion, geometry.RigidMotion),
     *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
     *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),
     *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual, DiagonalPreconditioner, MassPreconditioner),

@@ -2,7 +2,7 @@
 
 from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, TotalLagrangian, UpdatedLagrangian
-from mpmjax.state._fill import fill
+from mpmjax.state._fill import fill, fill_mapped
 from mpmjax.state._material_points import MaterialPoints
 from mpmjax.state._particles import Particles, State, by_material, history_arrays, join, state_of, with_state
 from mpmjax.state._preparation import is_prepared, prepare
@@ -19,6 +19,7 @@ __all__ = [
     "UpdatedLagrangian",
     "by_material",
     "fill",
+    "fill_mapped",
     "history_arrays",
     "is_prepared",
     "join",

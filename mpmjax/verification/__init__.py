@@ -15,6 +15,7 @@ from mpmjax.verification._problem import (
     stress_error,
 )
 from mpmjax.verification._refinement import errors, orders
+from mpmjax.verification._ring import ExpandingRing
 from mpmjax.verification._tension import tension
 from mpmjax.verification._vortex import Vortex
 from mpmjax.verification._wave import StandingWave
@@ -24,6 +25,7 @@ __all__ = [
     "AxisAligned",
     "Column",
     "Ends",
+    "ExpandingRing",
     "Manufactured",
     "StandingWave",
     "TwoDisks",

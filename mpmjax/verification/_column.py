@@ -61,8 +61,9 @@ class Column(AbstractProblem):
         del cells
         return Box((0.0,), (1.0,))
 
-    def rest(self, cells: int, per_side: int) -> Particles:
+    def rest(self, cells: int, per_side: int, *, fitted: bool = False) -> Particles:
         """Particles at rest that fill the column exactly, `per_side` to a cell."""
+        del fitted  # they always are
         n = cells * per_side
         X, volume = jnp.asarray((np.arange(n) + 0.5)[:, None] / n), jnp.full(n, 1 / n)
         return Particles(X, jnp.zeros_like(X), self.density * volume, volume)
@@ -79,7 +80,7 @@ class Column(AbstractProblem):
             per_side: particles to a cell.
             choices: kernel, gradient, transfer and description of the scene.
         """
-        scene, particles = discretise(self, cells, rest=self.rest(cells, per_side), **choices)
+        scene, particles = discretise(self, cells, per_side=per_side, **choices)
         steps = _LOADING + _HOLDING
         run = simulate(
             scene, particles, t1=self.duration, dt=self.duration / steps, method=SemiImplicit(), save_every=steps
