@@ -15,7 +15,9 @@ from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractRegion, Box, box_cells, inside_parts
 from mpmjax.state._particles import Particles
 
-_SMALL = 0.1
+_ALIKE = 1e-6
+"""Part of a cell by which a region may reach into the next for rounding's sake."""
+_SMALL = 0.02
 """The least share of a cell that is a particle of its own."""
 
 
@@ -34,9 +36,9 @@ def fill(
 
     In a box the lattice is fitted to the box (its counts are rounded, its spacing then is the box's side over the
     count), so that the particles' total mass and volume are the box's exactly. In any other region the lattice is that
-    of the bounding box. A cell that the surface cuts has a particle too: at the centroid of the part of the cell that
-    lies inside, with the volume of that part. So volume, mass and centre of mass are of second order in the spacing,
-    and no particle lies outside. A part smaller than a tenth of a cell is given to the neighbour of the largest part.
+    of the grid, subdivided. A cell that the surface cuts has a particle too: at the centroid of the part that lies
+    inside, with the volume of that part. So volume, mass and centre of mass are of second order in the spacing. A part
+    smaller than a fiftieth of a cell is given to the neighbour with the largest part.
 
     With `fitted` the cells follow the surface instead: rings of equal sectors in a `Ball` of 2-D, an `Annulus`, and in
     3-D a `Cylinder` and a `Tube`. Volume and mass are then exact, and all particles nearly alike.
@@ -182,11 +184,13 @@ def _velocity(velocity: Point | None, d: int) -> Point:
 
 
 def _cut_cells(region: AbstractRegion, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centroids [m], (m, d), and volumes [m^d], (m,), of the parts inside a region of the cells of its bounding box."""
+    """Centroids [m], (m, d), and volumes [m^d], (m,), of the parts inside a region of the cells of the subdivided
+    grid."""
     lower, upper = region.bounds()
-    number = np.maximum(np.rint((upper - lower) / size), 1).astype(int)
-    centres, volume = box_cells(lower, upper, size)
-    share, centroid = inside_parts(region, centres, (upper - lower) / number)
+    first, last = np.floor(lower / size + _ALIKE), np.ceil(upper / size - _ALIKE)
+    number = np.maximum(last - first, 1).astype(int)
+    centres, volume = box_cells(first * size, (first + number) * size, size)
+    share, centroid = inside_parts(region, centres, size)
     share, centroid = _merged(share.reshape(number), centroid.reshape(*number, -1))
     kept = share > 0
     return centroid[kept], share[kept] * volume[kept.reshape(-1)]

@@ -3,7 +3,7 @@ it."""
 
 from mpmjax.verification._aligned import AxisAligned
 from mpmjax.verification._bar import VibratingBar
-from mpmjax.verification._column import Column
+from mpmjax.verification._column import Column, HenckyColumn
 from mpmjax.verification._disks import TwoDisks
 from mpmjax.verification._law import check_law
 from mpmjax.verification._problem import (
@@ -26,6 +26,7 @@ __all__ = [
     "Column",
     "Ends",
     "ExpandingRing",
+    "HenckyColumn",
     "Manufactured",
     "StandingWave",
     "TwoDisks",

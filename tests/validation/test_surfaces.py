@@ -96,8 +96,8 @@ def test_a_problem_takes_ones_own_particles():
 
 @pytest.mark.thorough
 def test_a_scene_with_cut_cells_conserves_what_others_do():
-    """A ball in 3-D that spins and deforms, with parts of cells down to a tenth: momentum to rounding, and no energy is
-    made."""
+    """A ball in 3-D that spins and deforms, with parts of cells down to a fiftieth: momentum to rounding, and no energy
+    is made."""
     grid = mpm.Grid((16,) * 3, 0.1)
     ball = mpm.fill(mpm.Ball((0.8, 0.79, 0.81), 0.31), grid, density=1e3)
     spin = jnp.asarray([[0.0, -1.0, 0.5], [1.0, 0.0, -0.3], [-0.5, 0.3, 0.0]])
