@@ -88,8 +88,8 @@ def _by_plane(distance: np.ndarray, normal: np.ndarray, size: np.ndarray) -> np.
     d = len(size)
     rows, along = np.arange(len(distance)), np.abs(normal).argmax(axis=1)
     places = (np.arange(_LINES) + 0.5) / _LINES - 0.5
-    across = np.array(list(itertools.product(places, repeat=d - 1))).reshape(-1, d - 1)  # in sides of the cell
-    beside = np.array([[b for b in range(d) if b != a] for a in range(d)]).reshape(d, d - 1)[along]
+    across = np.array(list(itertools.product(places, repeat=d - 1))).reshape(_LINES ** (d - 1), d - 1)  # in sides
+    beside = np.array([[b for b in range(d) if b != a] for a in range(d)], int)[along]
     slope = normal[rows, along]
     height = distance[:, None] + np.einsum("mb,lb->ml", np.take_along_axis(normal, beside, axis=1), across)
     crossing = np.clip(-height / np.where(slope == 0, 1, slope)[:, None], -0.5, 0.5)
