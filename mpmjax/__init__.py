@@ -99,6 +99,7 @@ from mpmjax.fitting import (
 from mpmjax.geometry import (
     AbstractMotion,
     AbstractRegion,
+    Annulus,
     Ball,
     Box,
     Capsule,
@@ -108,6 +109,7 @@ from mpmjax.geometry import (
     RigidMotion,
     SampledDistance,
     TimeSeries,
+    Tube,
     Union,
     sample_distance,
     sample_mesh,
@@ -165,6 +167,7 @@ from mpmjax.state import (
     UpdatedLagrangian,
     attach,
     fill,
+    fill_mapped,
     join,
     prepare,
 )
@@ -194,6 +197,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     # particles and regions
     "Particles",
     "fill",
+    "fill_mapped",
     "join",
     "prepare",
     "AbstractRegion",
@@ -203,6 +207,8 @@ __all__ = [  # noqa: RUF022 (grouped)
     "HalfSpace",
     "Capsule",
     "Cylinder",
+    "Annulus",
+    "Tube",
     "Union",
     "SampledDistance",
     "sample_distance",

@@ -47,6 +47,12 @@ FITTED = found()
 FUNCTIONS = {
     mpm.fill: {"region": mpm.Ball((0.1, 0.1), 0.1), "grid": SCENE.grid, "density": 1e3},
     mpm.attach: {"scene": SCENE, "particles": PARTICLES},
+    mpm.fill_mapped: {
+        "mapping": reached,
+        "box": mpm.Box((0.1, 0.1), (0.2, 0.2)),
+        "counts": (2, 2),
+        "density": 1e3,
+    },
     mpm.prepare: {"scene": SCENE, "particles": PARTICLES},
     mpm.stable_dt: {"scene": SCENE, "particles": PARTICLES},
     mpm.simulate: RUN,
@@ -119,6 +125,8 @@ MAY = {
     (mpm.render, "colour"),
     (mpm.sample_mesh, "mesh"),
     (mpm.fill, "dtype"),
+    (mpm.fill_mapped, "dtype"),
+    (mpm.fill_mapped, "mapping"),
     (mpm.Experiment, "name"),
     (mpm.predict, "of"),
     (mpm.fit, "log"),

@@ -60,6 +60,8 @@ EXAMPLES = {
     mpm.HalfSpace: mpm.HalfSpace((0.1, 0.2), (3.0, 4.0)),
     mpm.Capsule: mpm.Capsule((0.1, 0.2), (0.3, 0.4), 0.1),
     mpm.Cylinder: mpm.Cylinder((0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 0.1),
+    mpm.Annulus: mpm.Annulus((0.1, 0.2), 0.3, 0.4),
+    mpm.Tube: mpm.Tube((0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 0.1, 0.2),
     mpm.Union: mpm.Union((mpm.Ball((0.1, 0.2), 0.3), mpm.Box((0.0, 0.1), (1.0, 1.1)))),
     mpm.SampledDistance: mpm.SampledDistance((0.1, 0.2), 0.1, np.linspace(-1, 1, 20).reshape(4, 5)),
     mpm.StickyCollider: mpm.StickyCollider(mpm.Ball((0.1, 0.2), 0.3), GRIP.motion),
@@ -240,6 +242,14 @@ BODIES = {
     "capsule": (
         'kind = "SeparatingCollider"\nshape = { kind = "Capsule", start = [0, 0], end = [0.5, 0.5], radius = 0.1 }',
         mpm.SeparatingCollider(mpm.Capsule((0.0, 0.0), (0.5, 0.5), 0.1)),
+    ),
+    "annulus": (
+        'kind = "SlipCollider"\nshape = { kind = "Annulus", centre = [0, 0], inner = 0.1, outer = 0.2 }',
+        mpm.SlipCollider(mpm.Annulus((0.0, 0.0), 0.1, 0.2)),
+    ),
+    "tube": (
+        'kind = "SlipCollider"\nshape = { kind = "Tube", start = [0, 0, 0], end = [0, 0, 1], inner = 1, outer = 2 }',
+        mpm.SlipCollider(mpm.Tube((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 1.0, 2.0)),
     ),
     "samples": (
         'kind = "SlipCollider"\n'

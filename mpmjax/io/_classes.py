@@ -14,6 +14,7 @@ from mpmjax.boundary import (
 )
 from mpmjax.discretisation import APIC, FLIP, PIC, BSpline, Grid, MLSGradient, SplineGradient
 from mpmjax.geometry import (
+    Annulus,
     Ball,
     Box,
     Capsule,
@@ -23,6 +24,7 @@ from mpmjax.geometry import (
     RigidMotion,
     SampledDistance,
     TimeSeries,
+    Tube,
     Union,
 )
 from mpmjax.implicit import (
@@ -72,7 +74,7 @@ CLASSES: tuple[type, ...] = (
     *(Snow, VonMises, HerschelBulkley, DruckerPrager, CamClay, Fluid, Viscous),
     *(StickyBox, SlipBox, SeparatingBox, Grip, SymmetryPlane, ContactPlane, RigidPart),
     *(StickyCollider, SlipCollider, SeparatingCollider),
-    *(Box, Ball, HalfSpace, Capsule, Cylinder, Union, SampledDistance, Motion, RigidMotion),
+    *(Box, Ball, HalfSpace, Capsule, Cylinder, Annulus, Tube, Union, SampledDistance, Motion, RigidMotion),
     *(Traction, Pressure, PointLoad, Spring, Patch, PointsAt, AttachedPoints, TimeSeries),
     *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
     *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),

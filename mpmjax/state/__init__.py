@@ -3,7 +3,7 @@
 from mpmjax.state._attachment import AbstractPlace, AttachedPoints, Patch, PointsAt
 from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, TotalLagrangian, UpdatedLagrangian
-from mpmjax.state._fill import fill
+from mpmjax.state._fill import fill, fill_mapped
 from mpmjax.state._loaded_points import LoadedPoints
 from mpmjax.state._loads import AbstractLoad, PointLoad, Pressure, Spring, Traction, load_force, points_of, supports_of
 from mpmjax.state._material_points import MaterialPoints
@@ -36,6 +36,7 @@ __all__ = [
     "attach",
     "by_material",
     "fill",
+    "fill_mapped",
     "history_arrays",
     "is_prepared",
     "join",
