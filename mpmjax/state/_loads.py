@@ -101,7 +101,7 @@ class PointLoad(AbstractLoad):
 
     Args:
         on: the points, `PointsAt`.
-        force: the whole force [N], (d,), or a `TimeSeries` of it; in 2-D per metre of thickness.
+        total: the whole force [N], (d,), or a `TimeSeries` of it; in 2-D per metre of thickness.
     """
 
     on: AbstractPlace
