@@ -96,16 +96,26 @@ def taken_by_mirrors(
     """What mirrors take of impulses on all nodes, each by its boundary's number, and the impulses that remain on true
     nodes.
 
+    Where planes meet, each takes its normal component before the others fold it, so that its torque has the places of
+    all nodes.
+
     Args:
         field: impulses on all nodes [kg m/s], shape (n, d).
         images: the mirrors in the order in which they unfold, with their boundaries' numbers.
     """
-    given = []
-    for number, image in reversed(images):
-        folded = Mirror((image,)).fold(field)
-        given.append(Given(field - folded, number))
-        field = folded
-    return given, field
+    given, remaining = [], jnp.zeros_like(field)
+    planes = all(isinstance(image, Image) for _, image in images)  # they commute
+    for axis in range(field.shape[1]):
+        part = jnp.zeros_like(field).at[:, axis].set(field[:, axis])
+        order = list(reversed(images))
+        if planes:
+            order.sort(key=lambda pair: pair[1].axis != axis)
+        for number, image in order:
+            folded = Mirror((image,)).fold(part)
+            given.append(Given(part - folded, number))
+            part = folded
+        remaining = remaining + part
+    return given, remaining
 
 
 def impulse_on_boundaries(given: list[Given], places: NodeVector, pivots: Float[Array, "b d"]) -> BoundaryImpulse:
