@@ -14,13 +14,17 @@ from mpmjax.boundary._contact import (
     find_active_set,
     no_contact,
 )
+from mpmjax.boundary._faces import STIFFNESS, Faces, FaceShape
 from mpmjax.boundary._grip import Grip
 from mpmjax.boundary._mirror import Image, Mirror
 from mpmjax.boundary._planes import ContactPlane, SymmetryPlane
+from mpmjax.boundary._springs import Springs, spring_diagonal, spring_energy, spring_force, spring_resistance
+from mpmjax.boundary._surface_contact import Surface
 from mpmjax.boundary._walls import SeparatingBox, SlipBox, StickyBox
 
 __all__ = [
     "ON_THE_WALL",
+    "STIFFNESS",
     "AbstractBoundary",
     "AbstractCollider",
     "AbstractContact",
@@ -30,6 +34,8 @@ __all__ = [
     "ConstrainedNodes",
     "ContactInfo",
     "ContactPlane",
+    "FaceShape",
+    "Faces",
     "Grip",
     "Image",
     "Mirror",
@@ -37,8 +43,10 @@ __all__ = [
     "SeparatingCollider",
     "SlipBox",
     "SlipCollider",
+    "Springs",
     "StickyBox",
     "StickyCollider",
+    "Surface",
     "SymmetryPlane",
     "Wall",
     "combined_conditions",
@@ -49,4 +57,8 @@ __all__ = [
     "mirror",
     "no_contact",
     "no_impulse",
+    "spring_diagonal",
+    "spring_energy",
+    "spring_force",
+    "spring_resistance",
 ]

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Int, NodeVector, Scalar
 from mpmjax.boundary._boundary import AbstractBoundary
-from mpmjax.boundary._collider_contact import collider_contacts
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact
+from mpmjax.boundary._faces import Faces
 from mpmjax.boundary._mirror import Mirror
-from mpmjax.boundary._wall_contact import wall_contacts
+from mpmjax.boundary._surface_contact import surface_contact
 from mpmjax.discretisation import Grid
 
 
@@ -32,23 +32,13 @@ def combined_conditions(
     for boundary in boundaries:
         new = boundary.conditions(nodes, spacing, t, dt, reference=reference)
         velocity = jnp.where(total.fixed, total.velocity, new.velocity)
-        side, friction = total.side, total.friction
-        if new.side is not None and new.friction is not None:
-            if side is None or friction is None:
-                side, friction = new.side, new.friction
-            else:
-                friction = jnp.where(side != 0, friction, new.friction)
-                side = jnp.where(side != 0, side, new.side)
         colliders = total.colliders
         if new.colliders is not None:
             holder = jnp.where(total.fixed, -1, new.colliders.holder)
             mine = eqx.tree_at(lambda c: c.holder, new.colliders, holder)
             colliders = mine if colliders is None else colliders.beside(mine)
-        total = Conditions(total.fixed | new.fixed, velocity, side, friction, colliders)
-    if total.side is None:
-        return total
-    side = jnp.where(total.fixed, 0, total.side)
-    return Conditions(total.fixed, total.velocity, side, total.friction, total.colliders)
+        total = Conditions(total.fixed | new.fixed, velocity, colliders)
+    return total
 
 
 def contacts_of(
@@ -58,11 +48,11 @@ def contacts_of(
     window: Int[Array, "d"],
     t: Scalar,
     dt: Scalar,
+    faces: Faces | None,
+    force_time: Scalar,
 ) -> tuple[AbstractContact, ...]:
-    """The contacts of a scene, in the order of their friction.
-
-    Of separating walls and of colliders a node has one of each, where several meet the earlier: so their contacts are
-    those of the combined conditions. Any other contact is brought by a boundary itself.
+    """The contacts of a scene, in the order of their friction: those that boundaries bring, and those of their surfaces
+    with the particles' faces.
 
     Args:
         boundaries: the scene's boundaries.
@@ -71,10 +61,17 @@ def contacts_of(
         window: lattice index of the window's first node, shape (d,).
         t: time [s].
         dt: step [s].
+        faces: the particles' faces; None if no boundary has a surface.
+        force_time: the time at which forces act [s].
     """
-    found: list[AbstractContact] = [*wall_contacts(conditions), *collider_contacts(conditions)]
+    found: list[AbstractContact] = []
+    bodies = 0
     for boundary in boundaries:
         found += boundary.contacts(conditions, grid, window, t, dt)
+        if faces is not None and boundary.pushes:
+            body = bodies if boundary.bodies else None
+            found += [surface_contact(one, faces, body) for one in boundary.surfaces(faces.x, t, dt, force_time)]
+        bodies += boundary.bodies
     return tuple(sorted(found, key=lambda contact: contact.friction_order))
 
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
+from mpmjax.boundary._friction import friction_across
 from mpmjax.boundary._mirror import Image, Mirror
-from mpmjax.boundary._wall_contact import friction_across
 
 
 class PlaneContact(AbstractContact):

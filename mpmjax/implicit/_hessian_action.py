@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, Float, NodeVector, Scalar
-from mpmjax.boundary import Mirror
+from mpmjax.boundary import Mirror, Springs, spring_diagonal, spring_resistance
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.implicit._potential import ElasticPotential
 
@@ -37,6 +37,8 @@ class ParticleStiffness(AbstractHessianAction):
     stencil: Stencil
     mirror: Mirror
     positive_semidefinite: bool = eqx.field(static=True, default=False)
+    springs: tuple[Springs, ...] = ()
+    """The springs of contact, whose Hessian is added."""
 
     def is_positive_semidefinite(self) -> bool:
         return self.positive_semidefinite
@@ -45,7 +47,7 @@ class ParticleStiffness(AbstractHessianAction):
         """Σ_p g_ip K_p Σ_j g_jp δu_j."""
         _, slopes = gather(self.stencil, self.mirror.unfold(du))
         flux = la.matmul(self.matrix, slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
-        return self.mirror.fold(scatter(self.stencil, None, flux, du.shape[0]))
+        return _with_springs(self.mirror.fold(scatter(self.stencil, None, flux, du.shape[0])), self, du)
 
     def precomputed(self) -> "ParticleStiffness":
         return self
@@ -62,7 +64,10 @@ class ParticleStiffness(AbstractHessianAction):
         d = like.shape[1]
         stiff = jnp.stack([jnp.maximum(self.matrix[m, m], 0) for m in range(d * d)])
         nodes = scatter(self.stencil.squared, None, stiff.reshape(d, d, -1), like.shape[0])
-        return jnp.stack([self.mirror.fold_scalar(component) for component in nodes.T], axis=1)
+        diagonal = jnp.stack([self.mirror.fold_scalar(component) for component in nodes.T], axis=1)
+        if self.springs:
+            diagonal = diagonal + spring_diagonal(self.springs, self.stencil, self.mirror, like.shape[0])
+        return diagonal
 
 
 class TangentAction(AbstractHessianAction):
@@ -97,7 +102,12 @@ def particle_stiffness(
 ) -> ParticleStiffness:
     """H as one matrix for each particle, from the stress differentials of the materials."""
     matrix = potential.stiffness(tangents)
-    return ParticleStiffness(matrix, potential.stencil, potential.mirror, positive_semidefinite)
+    return ParticleStiffness(matrix, potential.stencil, potential.mirror, positive_semidefinite, potential.springs)
+
+
+def _with_springs(force: NodeVector, of: ElasticPotential | ParticleStiffness, du: NodeVector) -> NodeVector:
+    """A force with that by which springs answer a displacement."""
+    return force + spring_resistance(of.springs, of.stencil, of.mirror, du) if of.springs else force
 
 
 @eqx.filter_jit
@@ -105,7 +115,7 @@ def _tangent_action(
     potential: ElasticPotential, tangents: tuple[Callable[[Deformation], Deformation], ...], du: NodeVector
 ) -> NodeVector:
     changes = (tangent(dF) for tangent, dF in zip(tangents, potential.deformation_change(du), strict=True))
-    return potential.nodal_sum(potential.flux(tuple(changes)))
+    return _with_springs(potential.nodal_sum(potential.flux(tuple(changes))), potential, du)
 
 
 class _DampedAction(AbstractHessianAction):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, Float, Matrix, NodeVector
-from mpmjax.boundary import Mirror
+from mpmjax.boundary import Mirror, Springs, spring_energy, spring_force
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.material import AbstractElastic
 from mpmjax.state import MaterialPoints
@@ -30,6 +30,8 @@ class ElasticPotential(eqx.Module):
     mirror: Mirror
     size: int = eqx.field(static=True)
     """Number of nodes n."""
+    springs: tuple[Springs, ...] = ()
+    """The springs of contact, whose energy is part of Φ."""
 
     def deformation_change(self, u: NodeVector) -> Deformations:
         """δF_p = Σ_i u_i h_ipᵀ, one array for each material."""
@@ -57,7 +59,7 @@ class ElasticPotential(eqx.Module):
             (points.volume * points.law.energy(F)).sum()
             for points, F in zip(self.material_points, self.deformation(u), strict=True)
         ]
-        return sum(parts[1:], parts[0])
+        return sum(parts[1:], parts[0] + self._spring_energy(u))
 
     def admissible_energy(self, u: NodeVector) -> Float[Array, ""]:
         """Φ(u) [J], NaN if a law does not admit the deformation. It must not be differentiated."""
@@ -65,11 +67,19 @@ class ElasticPotential(eqx.Module):
             jnp.where(points.law.is_admissible(F), points.volume * points.law.energy(F), jnp.nan).sum()
             for points, F in zip(self.material_points, self.deformation(u), strict=True)
         ]
-        return sum(parts[1:], parts[0])
+        return sum(parts[1:], parts[0] + self._spring_energy(u))
 
     def force(self, u: NodeVector) -> NodeVector:
         """f = −∂Φ/∂u [N], shape (n, d). At u = 0, f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
-        return -self.nodal_sum(self.flux(self._stress(self.deformation(u))))
+        force = -self.nodal_sum(self.flux(self._stress(self.deformation(u))))
+        return force + self.spring_force(u) if self.springs else force
+
+    def spring_force(self, u: NodeVector | None) -> NodeVector:
+        """The part of `force` by springs [N], shape (n, d); None for u = 0."""
+        return spring_force(self.springs, self.stencil, self.mirror, u, self.size)
+
+    def _spring_energy(self, u: NodeVector) -> Float[Array, ""] | float:
+        return spring_energy(self.springs, gather(self.stencil, self.mirror.unfold(u))) if self.springs else 0.0
 
     def flux(self, P: Deformations) -> Matrix:
         """V0_p P_p F_pᵀ [J], shape (d, d, p), from the stress of each material; in the total description V0_p P_p."""

@@ -77,8 +77,6 @@ def _probe(
 def _acts(conditions: Conditions) -> Bool[Array, "n"]:
     """The nodes on which a boundary acts, (n,)."""
     acts, colliders = conditions.fixed.any(axis=1), conditions.colliders
-    if conditions.side is not None:
-        acts = acts | (conditions.side != 0).any(axis=1)
     return acts if colliders is None else acts | (colliders.owner >= 0)
 
 

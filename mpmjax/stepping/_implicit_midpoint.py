@@ -69,5 +69,9 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
         """Δt f(½Δt v̄) [kg m/s]."""
         return nodes.dt * stage_force(nodes, self, self.solution, (1, nodes.dt / 2 * motion.carrier))
 
+    def force_at(self) -> Scalar:
+        """½."""
+        return 0.5
+
     def stability_factor(self) -> Scalar:
         return 0.0

@@ -8,7 +8,19 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
-from mpmjax.boundary import AbstractContact, AbstractNodes, Conditions, Mirror, combined_conditions, contacts_of, mirror
+from mpmjax.boundary import (
+    STIFFNESS,
+    AbstractContact,
+    AbstractNodes,
+    Conditions,
+    Faces,
+    FaceShape,
+    Mirror,
+    Springs,
+    combined_conditions,
+    contacts_of,
+    mirror,
+)
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.state import Particles, Scene
@@ -46,6 +58,11 @@ class SeparateSums(eqx.Module):
         """v^n + Δt g + Δt f/m [m/s], shape (n, d)."""
         return nodes.inertial_velocity() + nodes.dt * nodes.per_mass(self.force)
 
+    def with_force(self, nodes: "Nodes", force: NodeVector) -> "SeparateSums":
+        """The same, with a force [N] more."""
+        del nodes
+        return SeparateSums(self.velocity, self.force + force, self.viscous_force)
+
     def folded(self, velocity: Fold, force: Fold) -> "SeparateSums":
         """The same, with velocities and forces folded at mirrors."""
         viscous = None if self.viscous_force is None else force(self.viscous_force)
@@ -81,6 +98,10 @@ class JoinedSum(eqx.Module):
     def explicit_velocity(self, nodes: "Nodes") -> NodeVector:
         """v^n + Δt f/m + Δt g [m/s], shape (n, d)."""
         return self.velocity_with_force + nodes.dt * nodes.acceleration
+
+    def with_force(self, nodes: "Nodes", force: NodeVector) -> "JoinedSum":
+        """The same, with a force [N] more."""
+        return JoinedSum(self.velocity_with_force + nodes.dt * nodes.per_mass(force))
 
     def folded(self, velocity: Fold, force: Fold) -> "JoinedSum":
         """The same, with velocities and forces folded at mirrors."""
@@ -226,12 +247,18 @@ class Nodes(AbstractNodes):
         parts = self.sums.folded(fold_per_mass, images.fold), fold_per_mass(self.acceleration)
         return eqx.tree_at(lambda n: (n.sums, n.acceleration), nodes, parts)
 
-    def constrained(self, images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None) -> "Nodes":
-        """The nodes folded at these mirrors, with the components `fixed` and the `normals` held too."""
+    def constrained(
+        self, images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None, springs: tuple[Springs, ...]
+    ) -> "Nodes":
+        """The nodes folded at these mirrors, with the components `fixed` and the `normals` held too, and the force of
+        the springs."""
         nodes, colliders = (
             eqx.tree_at(lambda n: n.conditions.fixed, self.folded(images), fixed),
             self.conditions.colliders,
         )
+        if springs:
+            nodes = eqx.tree_at(lambda n: n.potential.springs, nodes, springs)
+            nodes = eqx.tree_at(lambda n: n.sums, nodes, nodes.sums.with_force(nodes, nodes.potential.spring_force(None)))
         if normals is None or colliders is None:
             return nodes
         return eqx.tree_at(lambda n: n.conditions.colliders.held, nodes, colliders.held | normals)
@@ -245,6 +272,7 @@ def particles_to_grid(
     stencil: Stencil,
     *,
     body_force_at: float = 0.0,
+    force_at: Scalar = 0.0,
     explicit_viscosity: bool = False,
     joined: bool = False,
     viscosity_apart: bool = False,
@@ -259,6 +287,7 @@ def particles_to_grid(
         stencil: stencil of the particles.
         body_force_at: the time at which body forces are evaluated, as a fraction of the step. Positions are moved on to
             it with the particles' velocity.
+        force_at: the time at which surfaces push, as a fraction of the step.
         explicit_viscosity: whether the force includes the viscous stress, at the particles' stored velocity gradients.
         joined: whether momentum and force may be summed together. They are if both have the same gradient operator.
         viscosity_apart: whether to compute the viscous part of the force separately too.
@@ -308,9 +337,32 @@ def particles_to_grid(
             spacing=jnp.asarray(grid.spacing),
             potential=potential,
             conditions=conditions,
-            contacts=contacts_of(scene.boundary, conditions, grid, window, t, dt),
+            contacts=contacts_of(
+                scene.boundary, conditions, grid, window, t, dt, _faces(scene, particles, potential, dt), t + force_at * dt
+            ),
         )
         return nodes.folded(mirror(scene.boundary, grid, window))
+
+
+def _faces(scene: Scene, particles: Particles, potential: ElasticPotential, dt: Scalar) -> Faces | None:
+    """The particles' faces; None if no boundary has a surface."""
+    if not any(boundary.pushes for boundary in scene.boundary):
+        return None
+    shapes, stiffness = [], []
+    for law, points in zip(scene.laws, potential.material_points, strict=True):
+        side = points.volume ** (1 / particles.dim)
+        shape = points.deformation if law.allows_total else points.volume_ratio()
+        shapes.append(FaceShape(side / 2, shape, points.rows, points.total))
+        modulus = STIFFNESS * points.law.wave_modulus(particles.dim, points.volume.dtype)
+        stiffness.append(modulus * points.volume / (side * scene.grid.spacing))
+    return Faces(
+        x=particles.x,
+        shapes=tuple(shapes),
+        stiffness=jnp.concatenate(stiffness),
+        stencil=potential.stencil,
+        spacing=jnp.asarray(scene.grid.spacing),
+        dt=jnp.asarray(dt),
+    )
 
 
 def _place(particles: Particles, stencil: Stencil, size: int) -> NodeVector:

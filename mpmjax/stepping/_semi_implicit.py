@@ -84,6 +84,10 @@ class SemiImplicit(AbstractImplicitIntegrator):
         action = self.hessian.at_step_start(nodes.potential)
         return nodes.dt * nodes.force - self.beta * nodes.dt**2 * action(motion.velocity)
 
+    def force_at(self) -> Scalar:
+        """β."""
+        return self.beta
+
     def stability_factor(self) -> Scalar:
         return 1 - 2 * jnp.asarray(self.beta)
 
