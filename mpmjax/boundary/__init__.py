@@ -14,7 +14,7 @@ from mpmjax.boundary._contact import (
     find_active_set,
     no_contact,
 )
-from mpmjax.boundary._faces import STIFFNESS, Faces, FaceShape
+from mpmjax.boundary._faces import EXPLICIT_STIFFNESS, IMPLICIT_STIFFNESS, Faces, FaceShape
 from mpmjax.boundary._grip import Grip
 from mpmjax.boundary._mirror import Image, Mirror
 from mpmjax.boundary._planes import ContactPlane, SymmetryPlane
@@ -23,8 +23,9 @@ from mpmjax.boundary._surface_contact import Surface
 from mpmjax.boundary._walls import SeparatingBox, SlipBox, StickyBox
 
 __all__ = [
+    "EXPLICIT_STIFFNESS",
+    "IMPLICIT_STIFFNESS",
     "ON_THE_WALL",
-    "STIFFNESS",
     "AbstractBoundary",
     "AbstractCollider",
     "AbstractContact",

@@ -14,6 +14,7 @@ import equinox as eqx
 from mpmjax._types import Array, Bool, Float, Int, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact
+from mpmjax.boundary._faces import Faces
 from mpmjax.boundary._mirror import Image
 from mpmjax.boundary._surface_contact import Surface
 from mpmjax.discretisation import Grid
@@ -46,6 +47,8 @@ class AbstractBoundary(eqx.Module):
     """Number of bodies in its `Conditions.colliders`; what they receive is recorded."""
     pushes: ClassVar[bool] = False
     """Whether it has surfaces that push material away (see `surfaces`)."""
+    sees_faces: ClassVar[bool] = False
+    """Whether its contacts ask where the faces of particles are (see `facing`)."""
 
     @property
     @abc.abstractmethod
@@ -96,6 +99,16 @@ class AbstractBoundary(eqx.Module):
         del conditions, grid, window, t, dt
         return ()
 
+    def facing(self, own: tuple[AbstractContact, ...], faces: Faces) -> tuple[AbstractContact, ...]:
+        """Its contacts with the faces of particles known, if it `sees_faces`. Default: as they are.
+
+        Args:
+            own: its `contacts`.
+            faces: the faces of the particles at the start of the step.
+        """
+        del faces
+        return own
+
     def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, force_time: Scalar) -> tuple[Surface, ...]:
         """The rigid surfaces that push the faces of particles in the step from t to t + dt, if it `pushes`. Default:
         none.
@@ -104,7 +117,7 @@ class AbstractBoundary(eqx.Module):
             x: the particles' positions at t [m], shape (p, d).
             t: time [s].
             dt: step [s].
-            force_time: the time between t and t + dt at which the surfaces stand when they push [s].
+            force_time: the time at which they push [s]: t in an explicit step, else t + dt.
         """
         del x, t, dt, force_time
         return ()

@@ -67,7 +67,8 @@ def contacts_of(
     found: list[AbstractContact] = []
     bodies = 0
     for boundary in boundaries:
-        found += boundary.contacts(conditions, grid, window, t, dt)
+        own = boundary.contacts(conditions, grid, window, t, dt)
+        found += own if faces is None or not boundary.sees_faces else boundary.facing(own, faces)
         if faces is not None and boundary.pushes:
             body = bodies if boundary.bodies else None
             found += [surface_contact(one, faces, body) for one in boundary.surfaces(faces.x, t, dt, force_time)]

@@ -326,7 +326,10 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
             change = contact.friction(self, active, v, residual)
             v = v + change
             if contact.collider is not None:
-                rubbed, impulse = self.unheld.mass[:, None] * self.images.unfold(change), contact.spring_impulse(self, active)
+                rubbed, impulse = (
+                    self.unheld.mass[:, None] * self.images.unfold(change),
+                    contact.spring_impulse(self, active),
+                )
                 pushes.append((contact.collider, rubbed if impulse is None else rubbed + impulse))
         return self.images.unfold(v), tuple(pushes)
 

@@ -7,8 +7,11 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, Float, Matrix, ParticleVector, Scalar
 from mpmjax.discretisation import Stencil
 
-STIFFNESS = 2.0
-"""Stiffness of contact, in the material's wave modulus over a spacing: that of half a spacing of the material."""
+EXPLICIT_STIFFNESS = 2.0
+"""Stiffness of contact in explicit steps, in the material's wave modulus over a spacing: that of half a spacing of the
+material. More would shorten the longest stable step."""
+IMPLICIT_STIFFNESS = 20.0
+"""The same in implicit steps."""
 
 
 class FaceShape(eqx.Module):
@@ -49,12 +52,22 @@ class Faces(eqx.Module):
     """Their shapes, one for each material."""
     stiffness: Float[Array, "p"]
     """Stiffness of contact k_p = A α M/dx [N/m], shape (p,), on a face of area A = V0/l0, with M the wave modulus of
-    the law at rest and α = `STIFFNESS`."""
+    the law at rest and α the stiffness of explicit or implicit steps."""
     stencil: Stencil
     spacing: Scalar
     """dx [m]."""
     dt: Scalar
     """Δt [s]."""
+    force_at: Scalar = 0.0
+    """The share θ of the step's displacement at which the integrator evaluates forces; 0 at its start."""
+    explicit: bool = eqx.field(static=True, default=True)
+    """Whether the step is explicit."""
+
+    @property
+    def share(self) -> Scalar:
+        """θ, or 1 where forces are those at the start of the step."""
+        at = jnp.asarray(self.force_at)
+        return jnp.where(at > 0, at, 1)
 
     def width(self, n: Float[Array, "d p"]) -> tuple[Float[Array, "p"], Matrix]:
         """Half-widths h [m] along unit vectors n, shape (p,), and B [m], shape (d, d, p), with δh = B : ∇u."""

@@ -32,13 +32,21 @@ class SurfaceContact(AbstractContact):
     """A surface that pushes the faces of particles. Each particle is a place.
 
     The gap g_p is the particle's distance from the surface less its half-width along the normal. A particle that is
-    held has a spring of stiffness k_p on its gap (see `Springs`), and it is held if its gap is below zero where the
-    integrator evaluates the force: then the spring pushes, and the two conditions exclude each other. Friction is at
-    most μ times the push of the particles around each node.
+    held has a spring of stiffness k_p on its gap (see `Springs`), which pushes with −k_p g_p: with the gap at the end
+    of the step, in an explicit step with that at its start. It is held if that gap is below zero, so that the spring
+    pushes and the two conditions exclude each other.
+
+    The energy ½ k_p min(g_p, 0)² is convex in g_p. So a force by the gap at the end of the step takes at least as much
+    energy as the spring keeps, −k_p g¹ (g¹ − g⁰) ≤ ½ k_p (min(g⁰, 0)² − min(g¹, 0)²), at any stiffness and step. An
+    integrator that evaluates forces at θ of the step's displacement gets the force by springs of gap θ g⁰ and stiffness
+    k_p/θ.
+
+    Friction is at most μ times the push of the particles around each node.
     """
 
     gap: Float[Array, "p"]
-    """g_p at the start of the step, from the surface as it is when forces act [m], shape (p,)."""
+    """g_p with the particles at the start of the step, and the surface at its end or, in an explicit step, at its start
+    [m], shape (p,)."""
     normal: Float[Array, "d p"]
     """n_p [-], shape (d, p)."""
     widening: Array
@@ -52,6 +60,8 @@ class SurfaceContact(AbstractContact):
     """The axis of its normal; None if that is along no axis."""
     body: int | None = eqx.field(static=True)
     """The number of the collider that it belongs to; None if it belongs to none."""
+    beside: Bool[Array, "p"] | None = None
+    """The particles that it may push, shape (p,); None for all."""
 
     @property
     def friction_order(self) -> float:
@@ -67,23 +77,26 @@ class SurfaceContact(AbstractContact):
         return True
 
     def springs(self, active: Array) -> Springs:
-        held = active & self.near
+        held, share = active & self.near, self.faces.share
         return Springs(
-            jnp.where(held, self.gap, 0), jnp.where(held, self.faces.stiffness, 0), self.normal, self.widening
+            gap=jnp.where(held, share * self.gap, 0),
+            stiffness=jnp.where(held, self.faces.stiffness / share, 0),
+            normal=self.normal,
+            widening=self.widening,
         )
 
     @property
     def near(self) -> Bool[Array, "p"]:
         """The particles whose face is less than a spacing before or behind the surface, shape (p,): what is further
         does not come to it in a step, or has passed it."""
-        return jnp.abs(self.gap) < self.faces.spacing
+        near = jnp.abs(self.gap) < self.faces.spacing
+        return near if self.beside is None else near & self.beside
 
     def gap_felt(self, held: ConstrainedNodes) -> Float[Array, "p"]:
-        """The gap where the force is evaluated [m], shape (p,); infinite for particles that are not near."""
-        every = Springs(jnp.where(self.near, self.gap, 0), self.faces.stiffness, self.normal, self.widening)
-        u = held.displacement
+        """The gap that the spring feels [m], shape (p,); infinite for particles that are not near."""
+        every, u = self.springs(jnp.ones(self.gap.shape, bool)), held.displacement
         moved = None if u is None else gather(self.faces.stencil, held.unheld.mirror.unfold(u))
-        return jnp.where(self.near, every.opened(moved), jnp.inf)
+        return jnp.where(self.near, every.opened(moved) / self.faces.share, jnp.inf)
 
     def push(self, held: ConstrainedNodes, active: Array) -> Float[Array, "p"]:
         """The normal impulse on each particle in the step [kg m/s], shape (p,)."""
@@ -134,7 +147,7 @@ class SurfaceContact(AbstractContact):
         return friction_along(held, mirror.fold(normal), moving, limit, v)
 
 
-def surface_contact(surface: Surface, faces: Faces, body: int | None) -> SurfaceContact:
+def surface_contact(surface: Surface, faces: Faces, body: int | None = None) -> SurfaceContact:
     """The contact of the particles' faces with a surface.
 
     Args:

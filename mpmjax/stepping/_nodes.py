@@ -9,7 +9,8 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
 from mpmjax.boundary import (
-    STIFFNESS,
+    EXPLICIT_STIFFNESS,
+    IMPLICIT_STIFFNESS,
     AbstractContact,
     AbstractNodes,
     Conditions,
@@ -23,7 +24,7 @@ from mpmjax.boundary import (
 )
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
-from mpmjax.state import Particles, Scene
+from mpmjax.state import MaterialPoints, Particles, Scene
 
 Fold = Callable[[NodeVector], NodeVector]
 """A map from a nodal vector to its sum with its images at mirrors."""
@@ -258,7 +259,9 @@ class Nodes(AbstractNodes):
         )
         if springs:
             nodes = eqx.tree_at(lambda n: n.potential.springs, nodes, springs)
-            nodes = eqx.tree_at(lambda n: n.sums, nodes, nodes.sums.with_force(nodes, nodes.potential.spring_force(None)))
+            nodes = eqx.tree_at(
+                lambda n: n.sums, nodes, nodes.sums.with_force(nodes, nodes.potential.spring_force(None))
+            )
         if normals is None or colliders is None:
             return nodes
         return eqx.tree_at(lambda n: n.conditions.colliders.held, nodes, colliders.held | normals)
@@ -272,7 +275,7 @@ def particles_to_grid(
     stencil: Stencil,
     *,
     body_force_at: float = 0.0,
-    force_at: Scalar = 0.0,
+    force_at: Scalar | None = None,
     explicit_viscosity: bool = False,
     joined: bool = False,
     viscosity_apart: bool = False,
@@ -287,7 +290,7 @@ def particles_to_grid(
         stencil: stencil of the particles.
         body_force_at: the time at which body forces are evaluated, as a fraction of the step. Positions are moved on to
             it with the particles' velocity.
-        force_at: the time at which surfaces push, as a fraction of the step.
+        force_at: the share of the step's displacement at which forces are evaluated; None if the step is explicit.
         explicit_viscosity: whether the force includes the viscous stress, at the particles' stored velocity gradients.
         joined: whether momentum and force may be summed together. They are if both have the same gradient operator.
         viscosity_apart: whether to compute the viscous part of the force separately too.
@@ -338,30 +341,56 @@ def particles_to_grid(
             potential=potential,
             conditions=conditions,
             contacts=contacts_of(
-                scene.boundary, conditions, grid, window, t, dt, _faces(scene, particles, potential, dt), t + force_at * dt
+                scene.boundary,
+                conditions,
+                grid,
+                window,
+                t,
+                dt,
+                faces_of(scene, particles, potential.material_points, stencil, dt, force_at),
+                t if force_at is None else t + jnp.where(jnp.asarray(force_at) > 0, dt, 0),
             ),
         )
         return nodes.folded(mirror(scene.boundary, grid, window))
 
 
-def _faces(scene: Scene, particles: Particles, potential: ElasticPotential, dt: Scalar) -> Faces | None:
-    """The particles' faces; None if no boundary has a surface."""
-    if not any(boundary.pushes for boundary in scene.boundary):
+def faces_of(
+    scene: Scene,
+    particles: Particles,
+    materials: tuple[MaterialPoints, ...],
+    stencil: Stencil,
+    dt: Scalar,
+    force_at: Scalar | None = None,
+) -> Faces | None:
+    """The faces of prepared particles; None if no boundary of the scene asks for them.
+
+    Args:
+        scene: the scene.
+        particles: prepared particles.
+        materials: their materials.
+        stencil: their stencil.
+        dt: step [s].
+        force_at: as in `particles_to_grid`.
+    """
+    if not any(boundary.pushes or boundary.sees_faces for boundary in scene.boundary):
         return None
-    shapes, stiffness = [], []
-    for law, points in zip(scene.laws, potential.material_points, strict=True):
+    shapes, stiffness, explicit = [], [], force_at is None
+    factor = EXPLICIT_STIFFNESS if explicit else IMPLICIT_STIFFNESS
+    for law, points in zip(scene.laws, materials, strict=True):
         side = points.volume ** (1 / particles.dim)
         shape = points.deformation if law.allows_total else points.volume_ratio()
         shapes.append(FaceShape(side / 2, shape, points.rows, points.total))
-        modulus = STIFFNESS * points.law.wave_modulus(particles.dim, points.volume.dtype)
+        modulus = factor * points.law.wave_modulus(particles.dim, points.volume.dtype)
         stiffness.append(modulus * points.volume / (side * scene.grid.spacing))
     return Faces(
         x=particles.x,
         shapes=tuple(shapes),
         stiffness=jnp.concatenate(stiffness),
-        stencil=potential.stencil,
+        stencil=stencil,
         spacing=jnp.asarray(scene.grid.spacing),
         dt=jnp.asarray(dt),
+        force_at=0.0 if force_at is None else jnp.asarray(force_at),
+        explicit=explicit,
     )
 
 
