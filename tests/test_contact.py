@@ -9,10 +9,8 @@ from helpers import QUICK, assert_close, explicit_limit, ids, thorough
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.boundary._collider_contact import ColliderContact
 from mpmjax.boundary._contact import SWEEPS, constrain, find_active_set
 from mpmjax.boundary._plane_contact import PlaneContact
-from mpmjax.boundary._wall_contact import WallContact
 from mpmjax.checks._values import canonical
 from mpmjax.implicit._solve_info import no_solve
 from mpmjax.stepping import NodeMotion

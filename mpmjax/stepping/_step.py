@@ -128,7 +128,7 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
             motion, info = method.advance(nodes, guess)
             internal, reaction, viscous = impulses(nodes, method, motion)
             normal = constrain(nodes, ()).collider_impulse(reaction)
-            before, free = nodes.velocity if nodes.separate else None, nodes.projection
+            before, free = nodes.admitted_velocity() if nodes.separate else None, nodes.projection
             return GridUpdate(before, motion, internal, viscous, reaction, None, free, info, no_contact(), normal)
 
         def moved(
@@ -156,7 +156,7 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
         slowed, pushes = held.friction(motion.velocity, holding)
         change = slowed - motion.velocity
         return GridUpdate(
-            before=held.images.unfold(held.nodes.velocity) if nodes.separate else None,
+            before=held.images.unfold(held.nodes.admitted_velocity()) if nodes.separate else None,
             motion=motion.with_friction(change),
             internal=internal,
             viscous=viscous,
