@@ -146,7 +146,9 @@ def main(quick: bool) -> None:
             for wall in WALLS:
                 some = [a for a in places if wall != "ContactPlane" or (2 * a).is_integer()]
                 found = [bounce(cells, 1, wall, at=a, method=method) for a in some]
-                worst = {k: max((f[k] - e for f in found), key=abs) for k, e in (("onset", 0), ("time", 1), ("return", 1))}
+                worst = {
+                    k: max((f[k] - e for f in found), key=abs) for k, e in (("onset", 0), ("time", 1), ("return", 1))
+                }
                 rows.append((f"{wall[:12]} {cells} {method[:4]}", *worst.values(), max(f["most"] for f in found)))
     _print(rows, ("wall, cells", "onset", "time − 1", "return − 1", "energy"))
     print("\nA block of 8 x 8 cells, ν = 0.3, against the same of 32 x 32 cells")

@@ -45,7 +45,9 @@ class PlaneContact(AbstractContact):
             shut: those particles, shape (p,).
             stencil: stencil of the particles.
         """
-        reached = self.image.column(scatter(stencil, shut.astype(stencil.weights.dtype)[None], None, math.prod(self.image.shape))[:, 0])
+        reached = self.image.column(
+            scatter(stencil, shut.astype(stencil.weights.dtype)[None], None, math.prod(self.image.shape))[:, 0]
+        )
         return replace(self, shut=reached > 0)
 
     @property
