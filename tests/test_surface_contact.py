@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DESCRIPTIONS, assert_close, cloud, ids, thorough
+from helpers import assert_close, cloud, ids, thorough
 
 import mpmjax as mpm
-from mpmjax.boundary import Faces, FaceShape, Springs, spring_energy, spring_force, spring_resistance
+from mpmjax.boundary import FaceShape, Springs, spring_energy, spring_force, spring_resistance
 from mpmjax.boundary._mirror import Mirror
 from mpmjax.discretisation import gather
 

@@ -18,7 +18,14 @@ from mpmjax.boundary._faces import EXPLICIT_STIFFNESS, IMPLICIT_STIFFNESS, Faces
 from mpmjax.boundary._grip import Grip
 from mpmjax.boundary._mirror import Image, Mirror
 from mpmjax.boundary._planes import ContactPlane, SymmetryPlane
-from mpmjax.boundary._springs import Springs, spring_diagonal, spring_energy, spring_force, spring_resistance
+from mpmjax.boundary._springs import (
+    Springs,
+    spring_answer,
+    spring_diagonal,
+    spring_energy,
+    spring_force,
+    spring_resistance,
+)
 from mpmjax.boundary._surface_contact import Surface
 from mpmjax.boundary._walls import SeparatingBox, SlipBox, StickyBox
 
@@ -58,6 +65,7 @@ __all__ = [
     "mirror",
     "no_contact",
     "no_impulse",
+    "spring_answer",
     "spring_diagonal",
     "spring_energy",
     "spring_force",

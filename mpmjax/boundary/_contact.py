@@ -7,10 +7,11 @@ with its spring's length (see `Springs`). The *active set* is the mask of the pl
 contact, of shape (p,) or (n,).
 
 The active set is guessed as the places that the start of the step, or the explicit velocity v*, closes. Then, at most
-`SWEEPS` times: solve with the active set held; release the places that would have to pull, hold those that are entered; stop
-when nothing changes. The conditions that are violated after that are counted in `ContactInfo.violations`. The last
+`SWEEPS` times: solve with the active set held; release the places that would have to pull, hold those that are entered;
+stop when nothing changes. The conditions that are violated after that are counted in `ContactInfo.violations`. The last
 solve, with the set settled and started from the last sweep's result, is the one that is differentiated: its derivative
-is that of the active set found, and does not exist where the set changes.
+is that of the active set found, and does not exist where the set changes. An explicit step's force is known at its
+start, and with it which faces are behind their surface: it needs no sweep.
 
 Friction is an impulse at the places held, applied after the solve against the tangential velocity (at a collider, that
 relative to it) and at most μ times the normal impulse (Coulomb). It is not part of the implicit system, so it lags by

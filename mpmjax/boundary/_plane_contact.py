@@ -24,7 +24,8 @@ class PlaneContact(AbstractContact):
     what r works on: the mean, with weights 2 m m'/(m + m'), of the v + v' of nodes and their images, and of the v of
     nodes on the plane (where the two are one). So an explicit step that holds the column has
     r = −Σ 2 m m'/(m + m') (v* + v*'), and the two conditions exclude each other. Columns that no particle reaches whose
-    face is at the plane are not held. Columns that are each other's image in another plane are held together. Friction acts on the column's node on the plane, or half a spacing before it.
+    face is at the plane are not held. Columns that are each other's image in another plane are held together. Friction
+    acts on the column's node on the plane, or half a spacing before it.
     """
 
     image: Image

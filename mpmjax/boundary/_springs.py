@@ -4,8 +4,8 @@ The gap is that of a particle's face, linear in the displacement u of the nodes 
 
     g_p(u) = g_p(0) + n_p · Σ_i w_ip u_i − B_p : Σ_i u_i g_ipᵀ,
 
-where n is the surface's unit normal and B : ∇u the growth of the particle's half-width along it. The force on the nodes,
-−k_p g_p (w_ip n_p − B_p g_ip), acts at the particle's face: its moment is that of −k_p g_p n_p there.
+where n is the surface's unit normal and B : ∇u the growth of the particle's half-width along it. The force on the
+nodes, −k_p g_p (w_ip n_p − B_p g_ip), acts at the particle's face: its moment is that of −k_p g_p n_p there.
 """
 
 from collections.abc import Sequence
@@ -55,24 +55,30 @@ def spring_force(
 ) -> NodeVector:
     """The force of springs on the nodes [N], shape (n, d), at a displacement [m]; None for no displacement."""
     moved = None if u is None else gather(stencil, mirror.unfold(u))
-    return _sum([one.push(-one.stiffness * one.opened(moved)) for one in springs], stencil, mirror, size)
+    pushes = _added([one.push(-one.stiffness * one.opened(moved)) for one in springs])
+    return mirror.fold(scatter(stencil, *pushes, size))
 
 
 def spring_resistance(springs: Sequence[Springs], stencil: Stencil, mirror: Mirror, du: NodeVector) -> NodeVector:
     """The springs' Hessian times a change of the displacement [N], shape (n, d)."""
-    moved = gather(stencil, mirror.unfold(du))
-    return _sum([one.push(one.stiffness * one.opening(moved)) for one in springs], stencil, mirror, du.shape[0])
+    answer = spring_answer(springs, gather(stencil, mirror.unfold(du)))
+    return mirror.fold(scatter(stencil, *answer, du.shape[0]))
+
+
+def spring_answer(springs: Sequence[Springs], moved: tuple[Array, Array]) -> tuple[Array, Array]:
+    """What scattered is the springs' Hessian times a displacement, from that displacement gathered at the particles."""
+    return _added([one.push(one.stiffness * one.opening(moved)) for one in springs])
 
 
 def spring_diagonal(springs: Sequence[Springs], stencil: Stencil, mirror: Mirror, size: int) -> NodeVector:
     """An approximation of the diagonal of their Hessian [N/m], shape (n, d), without the products of weights and their
     derivatives."""
     parts = [(one.stiffness * one.normal**2, one.stiffness * jnp.swapaxes(one.widening, 0, 1) ** 2) for one in springs]
-    value, slopes = (sum(part[1:], part[0]) for part in zip(*parts, strict=True))
+    value, slopes = _added(parts)
     nodes = scatter(stencil.squared, value, slopes, size)
     return jnp.stack([mirror.fold_scalar(component) for component in nodes.T], axis=1)
 
 
-def _sum(pushes: list[tuple[Array, Array]], stencil: Stencil, mirror: Mirror, size: int) -> NodeVector:
-    value, slopes = (sum(part[1:], part[0]) for part in zip(*pushes, strict=True))
-    return mirror.fold(scatter(stencil, value, slopes, size))
+def _added(parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    value, slopes = (sum(part[1:], part[0]) for part in zip(*parts, strict=True))
+    return value, slopes

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, Float, NodeVector, Scalar
-from mpmjax.boundary import Mirror, Springs, spring_diagonal, spring_resistance
+from mpmjax.boundary import Mirror, Springs, spring_answer, spring_diagonal, spring_resistance
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.implicit._potential import ElasticPotential
 
@@ -45,9 +45,13 @@ class ParticleStiffness(AbstractHessianAction):
 
     def __call__(self, du: NodeVector) -> NodeVector:
         """Σ_p g_ip K_p Σ_j g_jp δu_j."""
-        _, slopes = gather(self.stencil, self.mirror.unfold(du))
+        moved = gather(self.stencil, self.mirror.unfold(du))
+        slopes, value = moved[1], None
         flux = la.matmul(self.matrix, slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
-        return _with_springs(self.mirror.fold(scatter(self.stencil, None, flux, du.shape[0])), self, du)
+        if self.springs:
+            value, more = spring_answer(self.springs, moved)
+            flux = flux + more
+        return self.mirror.fold(scatter(self.stencil, value, flux, du.shape[0]))
 
     def precomputed(self) -> "ParticleStiffness":
         return self
@@ -105,17 +109,15 @@ def particle_stiffness(
     return ParticleStiffness(matrix, potential.stencil, potential.mirror, positive_semidefinite, potential.springs)
 
 
-def _with_springs(force: NodeVector, of: ElasticPotential | ParticleStiffness, du: NodeVector) -> NodeVector:
-    """A force with that by which springs answer a displacement."""
-    return force + spring_resistance(of.springs, of.stencil, of.mirror, du) if of.springs else force
-
-
 @eqx.filter_jit
 def _tangent_action(
     potential: ElasticPotential, tangents: tuple[Callable[[Deformation], Deformation], ...], du: NodeVector
 ) -> NodeVector:
     changes = (tangent(dF) for tangent, dF in zip(tangents, potential.deformation_change(du), strict=True))
-    return _with_springs(potential.nodal_sum(potential.flux(tuple(changes))), potential, du)
+    force = potential.nodal_sum(potential.flux(tuple(changes)))
+    if potential.springs:
+        force = force + spring_resistance(potential.springs, potential.stencil, potential.mirror, du)
+    return force
 
 
 class _DampedAction(AbstractHessianAction):
