@@ -5,9 +5,9 @@ as it was, and of contact at the particles' faces, as it is.
     python benchmarks/contact_surface.py --quick    one grid (a minute)
 
 A bar, or a square block of 8 cells, falls on a plain wall that lies anywhere between nodes. Its mean velocity tells
-when the wall has given 2 and 98 % of its impulse; by the exact solution of the bar, the time between is 0.96 of 2L/c, and
-the first comes 0.04 L/c after its face is at the wall. The reference of the block is the same block at four times the
-resolution.
+when the wall has given 2 and 98 % of its impulse; by the exact solution of the bar, the time between is 0.96 of 2L/c,
+and the first comes 0.04 L/c after its face is at the wall. The reference of the block is the same block at four times
+the resolution.
 """
 
 import argparse

@@ -32,6 +32,7 @@ from mpmjax.boundary import (
     SlipCollider,
     StickyBox,
     StickyCollider,
+    Surface,
     SymmetryPlane,
     Wall,
 )
@@ -227,6 +228,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "SeparatingBox",
     "SlipBox",
     "StickyBox",
+    "Surface",
     "SymmetryPlane",
     "Wall",
     "AbstractCollider",

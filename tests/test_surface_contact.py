@@ -81,7 +81,8 @@ def test_half_widths_are_those_of_the_deformed_particle(d):
 
 @pytest.mark.parametrize("d", [2, *thorough(3)])
 def test_the_force_of_springs_is_that_of_their_energy_and_acts_at_the_face(d):
-    """f = −∂E/∂u, with its derivative; Σ f is −k g n, and Σ x_i × f_i that of −k g n at the face, x − ½ l0 F Fᵀn/‖Fᵀn‖."""
+    """f = −∂E/∂u, with its derivative; Σ f is −k g n, and Σ x_i × f_i that of −k g n at the face,
+    x − ½ l0 F Fᵀn/‖Fᵀn‖."""
     grid, particles = cloud(d, p=4)
     scene = mpm.Scene(grid, LAW)
     stencil, rng = scene.stencil(particles), np.random.default_rng(1)
@@ -143,7 +144,7 @@ def test_where_a_wall_is_has_the_derivative_of_differences(method, wall):
 @pytest.mark.parametrize("d", [2, 3])
 def test_a_ball_s_place_size_and_motion_have_the_derivatives_of_differences(method, d):
     grid, body = block(d, gap=0.0, speed=0.1, at=0.3, cells=2)
-    middle = jnp.asarray([0.11, 0.09, 0.08][: d - 1] + [-0.15])
+    middle = jnp.asarray([*[0.11, 0.09, 0.08][: d - 1], -0.15])
 
     def after(q):
         motion = mpm.Motion((0.0, 1.0), jnp.stack([jnp.zeros(d), jnp.zeros(d).at[-1].set(q[d + 1])]))

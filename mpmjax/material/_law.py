@@ -119,8 +119,8 @@ class AbstractElastic(AbstractLaw):
         """
 
     def wave_modulus(self, dim: int, dtype: Any) -> Float[Array, "*p"]:
-        """The modulus M of pressure waves where nothing is deformed [Pa], λ + 2μ of an isotropic solid: the stress along
-        an axis by a strain along it alone. One number, or one a particle.
+        """The modulus M of pressure waves where nothing is deformed [Pa], λ + 2μ of an isotropic solid: the stress
+        along an axis by a strain along it alone. One number, or one a particle.
 
         Args:
             dim: d.

@@ -153,7 +153,7 @@ def test_a_contact_plane_that_is_pressed_upon_is_a_symmetry_plane(kernel, method
 SPEED, LENGTH = 0.05, 1.0
 
 
-def bounce(cells, kernel="quadratic", *, keep="above", offset=0.0):
+def bounce(cells, kernel="quadratic", *, keep="above", offset=0.0, plain=False):
     """Time [L/c] and mean velocity away from the wall [of the impact] of a bar that hits a wall at t = 0.
 
     Exactly: −1 + tc/L until it leaves at 2L/c, as fast as it came.
@@ -170,7 +170,9 @@ def bounce(cells, kernel="quadratic", *, keep="above", offset=0.0):
         velocity=(-sign * SPEED,),
     )
     c = np.sqrt(E / DENSITY)
-    scene = mpm.Scene(grid, mpm.FixedCorotated(E, 0.0), boundary=mpm.ContactPlane(0, at, keep), kernel=KERNELS[kernel])
+    bounds = ((at,), (np.inf,)) if keep == "above" else ((-np.inf,), (at,))
+    wall = mpm.SeparatingBox(*bounds) if plain else mpm.ContactPlane(0, at, keep)
+    scene = mpm.Scene(grid, mpm.FixedCorotated(E, 0.0), boundary=wall, kernel=KERNELS[kernel])
     steps = 8 * cells
     t1 = 2.5 * LENGTH / c
     run = mpm.simulate(scene, bar, t1=t1, dt=t1 / steps, observe=lambda scene, bar: bar.v.mean())
@@ -195,4 +197,20 @@ def test_a_bar_bounces_off_as_fast_as_it_came(kernel, offset, keep):
     errors, lost = np.array(errors), np.array(lost)
     assert (np.log2(errors[:-1] / errors[1:]) > 0.7).all(), errors
     assert (np.log2(lost[:-1] / lost[1:]) > 0.65).all(), lost
+    assert lost[-1] < 0.03
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("offset", "keep"), [(0.3, "above"), (0.8, "below")])
+def test_a_bar_bounces_off_a_plain_wall_anywhere_between_nodes(offset, keep):
+    """Contact lasts 2 L/c, and the error falls with the spacing, with the order of a shock."""
+    errors, lost = [], []
+    for cells in (16, 32, 64):
+        t, v = bounce(cells, keep=keep, offset=offset, plain=True)
+        errors.append(np.abs(v - np.minimum(t - 1, 1)).mean())
+        lost.append(1 - v[-1])
+        assert np.ptp(v[t > 2.3]) < 1e-12
+    errors, lost = np.array(errors), np.array(lost)
+    assert (np.log2(errors[:-1] / errors[1:]) > 0.7).all(), errors
+    assert (np.log2(lost[:-1] / lost[1:]) > 0.5).all(), lost
     assert lost[-1] < 0.03
