@@ -314,25 +314,32 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
             residual = residual if impulse is None else residual - impulse
         return residual
 
-    def friction(self, v: NodeVector, residual: NodeVector) -> tuple[NodeVector, tuple[tuple[int, NodeVector], ...]]:
-        """The velocity after Coulomb friction, one contact after the other, and the impulses of colliders on the nodes
-        by springs and friction [kg m/s], each with the collider's number.
+    def friction(self, v: NodeVector, residual: NodeVector) -> tuple[NodeVector, tuple[NodeVector, ...]]:
+        """The velocity after Coulomb friction, one contact after the other, and the change of velocity by each [m/s].
 
         Args:
             v: velocity of all nodes after the solve [m/s], shape (n, d).
             residual: the impulse that holds components of velocity [kg m/s], shape (n, d).
         """
-        pushes = []
+        changes = []
         for contact, active in zip(self.unheld.contacts, self.active, strict=True):
             change = contact.friction(self, active, v, residual)
             v = v + change
+            changes.append(self.images.unfold(change))
+        return self.images.unfold(v), tuple(changes)
+
+    def pushes(self, slowed: tuple[NodeVector, ...]) -> tuple[tuple[int, NodeVector], ...]:
+        """The impulses of colliders on the nodes by springs and friction [kg m/s], each with the collider's number.
+
+        Args:
+            slowed: the change of velocity by the friction of each contact [m/s], shape (n, d).
+        """
+        found = []
+        for contact, active, change in zip(self.unheld.contacts, self.active, slowed, strict=True):
             if contact.collider is not None:
-                rubbed, impulse = (
-                    self.unheld.mass[:, None] * self.images.unfold(change),
-                    contact.spring_impulse(self, active),
-                )
-                pushes.append((contact.collider, rubbed if impulse is None else rubbed + impulse))
-        return self.images.unfold(v), tuple(pushes)
+                rubbed, impulse = self.unheld.mass[:, None] * change, contact.spring_impulse(self, active)
+                found.append((contact.collider, rubbed if impulse is None else rubbed + impulse))
+        return tuple(found)
 
 
 def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:

@@ -153,8 +153,8 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
         internal, reaction, viscous = impulses(nodes, method, motion)
         holding = held.beside_springs(reaction)
         normal = held.collider_impulse(holding)
-        slowed, pushes = held.friction(motion.velocity, holding)
-        change = slowed - motion.velocity
+        final, slowed = held.friction(motion.velocity, holding)
+        change = final - motion.velocity
         return GridUpdate(
             before=held.images.unfold(held.nodes.admitted_velocity()) if nodes.separate else None,
             motion=motion.with_friction(change),
@@ -167,7 +167,7 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
             contact=ContactInfo(sweeps, held.count_violations(motion.velocity, holding)),
             holding=holding,
             normal_impulse=normal,
-            pushes=pushes,
+            pushes=held.pushes(slowed),
         )
 
 

@@ -214,3 +214,28 @@ def test_a_bar_bounces_off_a_plain_wall_anywhere_between_nodes(offset, keep):
     assert (np.log2(errors[:-1] / errors[1:]) > 0.7).all(), errors
     assert (np.log2(lost[:-1] / lost[1:]) > 0.5).all(), lost
     assert lost[-1] < 0.03
+
+
+HELD = {
+    "slip box": mpm.SlipBox((0.0,), (np.inf,)),
+    "grip": mpm.Grip(mpm.Box((-1.0,), (0.0,)), mpm.Motion((0.0,), ((0.0,),))),
+    "mirror": mpm.SymmetryPlane(0, 0.0),
+}
+
+
+@pytest.mark.thorough
+def test_flip_at_a_plain_wall_or_grip_keeps_what_is_not_the_walls():
+    """Of a bar of 20 cells that vibrates for ten periods, held at one end, a plain wall takes no more than mirrors do:
+    0.2 % of its energy, where the velocity of nodes that it holds, taken from the particles, was 0.9 %."""
+    cells, steps, lost = 20, 2600, {}
+    dx, k = 1.0 / cells, np.pi / 2
+    grid = mpm.Grid((cells + 12,), dx, origin=(-4,))
+    bar = mpm.fill(mpm.Box((0.0,), (1.0,)), grid, particles_per_cell=2, density=1.0)
+    bar = mpm.Particles(bar.x, 0.01 * jnp.sin(k * bar.x), bar.mass, bar.volume)
+    for name, wall in HELD.items():
+        scene = mpm.Scene(grid, mpm.FixedCorotated(1.0, 0.0), boundary=wall, transfer=mpm.FLIP(1.0))
+        run = mpm.simulate(scene, bar, t1=40.0, dt=40 / steps, observe=lambda s, q: mpm.energy(s, q).total)
+        energy = np.asarray(run.observed)
+        lost[name] = 1 - energy[-steps // 10 :].mean() / energy[: steps // 10].mean()
+    assert 0 < lost["mirror"] < 4e-3, lost
+    assert max(lost["slip box"], lost["grip"]) < 1.1 * lost["mirror"], lost
