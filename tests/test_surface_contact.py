@@ -187,6 +187,16 @@ def test_a_block_comes_to_rest_on_the_floor(wall):
     assert float(jnp.abs(run.final.v).max()) < 1e-4
 
 
+@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
+def test_single_precision_stays_single(method):
+    grid, body = block(2)
+    body = jax.tree.map(lambda a: a.astype(jnp.float32), body)
+    for wall in (floor(0.0), level(0.0), mpm.ContactPlane(1, 0.0)):
+        scene = mpm.Scene(grid, LAW, boundary=wall)
+        after, _ = jax.eval_shape(lambda body, s=scene: mpm.step(s, body, 0.0, 1e-3, method=method), body)
+        assert {str(leaf.dtype) for leaf in jax.tree.leaves(after)} == {"float32"}
+
+
 @pytest.mark.thorough
 def test_a_particle_behind_the_surface_by_a_spacing_is_left_alone():
     _, body = block(1)

@@ -66,6 +66,8 @@ class Faces(eqx.Module):
     @property
     def share(self) -> Scalar:
         """θ, or 1 where forces are those at the start of the step."""
+        if self.explicit:
+            return 1.0
         at = jnp.asarray(self.force_at)
         return jnp.where(at > 0, at, 1)
 

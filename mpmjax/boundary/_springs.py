@@ -47,7 +47,8 @@ class Springs(eqx.Module):
 
 def spring_energy(springs: Sequence[Springs], moved: tuple[Array, Array]) -> Float[Array, ""]:
     """½ Σ_p k_p g_p² [J]."""
-    return sum((0.5 * (one.stiffness * one.opened(moved) ** 2).sum() for one in springs), start=jnp.zeros(()))
+    parts = [0.5 * (one.stiffness * one.opened(moved) ** 2).sum() for one in springs]
+    return sum(parts[1:], parts[0])
 
 
 def spring_force(

@@ -79,7 +79,7 @@ class SurfaceContact(AbstractContact):
     def springs(self, active: Array) -> Springs:
         held, share = active & self.near, self.faces.share
         return Springs(
-            gap=jnp.where(held, share * self.gap, 0),
+            gap=share * jnp.where(held, self.gap, 0),
             stiffness=jnp.where(held, self.faces.stiffness / share, 0),
             normal=self.normal,
             widening=self.widening,

@@ -389,7 +389,7 @@ def faces_of(
         stencil=stencil,
         spacing=jnp.asarray(scene.grid.spacing),
         dt=jnp.asarray(dt),
-        force_at=0.0 if force_at is None else jnp.asarray(force_at),
+        force_at=0.0 if force_at is None else jnp.asarray(force_at, particles.x.dtype),
         explicit=explicit,
     )
 
