@@ -115,7 +115,7 @@ def test_the_force_of_springs_is_that_of_their_energy_and_acts_at_the_face(d):
     assert_close(moment - moment.T + 1, np.ones((d, d)), 1e-12)
 
 
-EACH = pytest.mark.parametrize("method", **ids(METHODS, ("explicit", "semi_implicit")))
+EACH = pytest.mark.parametrize("method", **ids(METHODS, "explicit"))
 
 
 def landed(method, wall, body, grid, steps, dt, **scene):
@@ -173,7 +173,11 @@ def test_a_wall_makes_no_energy(method):
     assert float(run.final.v.mean()) > 0.02  # it came back
 
 
-@pytest.mark.parametrize("wall", [floor, *thorough(level, lambda at, d=2: mpm.ContactPlane(d - 1, at))])
+def mirrored(at, d=2):
+    return mpm.ContactPlane(d - 1, at)
+
+
+@pytest.mark.parametrize("wall", [floor, *thorough(level, mirrored)])
 def test_a_block_comes_to_rest_on_the_floor(wall):
     """Its face within 2 % of a spacing of where it is by the exact solution, from more than a spacing above."""
     strain, dx, cells = 4e-3, 0.1, 4
@@ -187,7 +191,7 @@ def test_a_block_comes_to_rest_on_the_floor(wall):
     assert float(jnp.abs(run.final.v).max()) < 1e-4
 
 
-@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
+@EACH
 def test_single_precision_stays_single(method):
     grid, body = block(2)
     body = jax.tree.map(lambda a: a.astype(jnp.float32), body)

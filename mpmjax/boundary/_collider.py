@@ -16,8 +16,7 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Bool, Float, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import ColliderConditions, Conditions
-from mpmjax.boundary._contact import refuse_contact
-from mpmjax.boundary._surface_contact import Surface
+from mpmjax.boundary._surface_contact import Surface, refuse_contact
 from mpmjax.checks import canonical, require, require_between, require_fields
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractMotion, AbstractRegion, length, still

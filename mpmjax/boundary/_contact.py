@@ -30,7 +30,6 @@ from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._mirror import Image, Mirror
 from mpmjax.boundary._springs import Springs
-from mpmjax.checks import require
 
 SWEEPS = 4
 """Most active sets that are tried in a step."""
@@ -414,16 +413,3 @@ def _count(nodes: AbstractNodes, *sets: ActiveSet) -> Int[Array, ""]:
             one = contact.representative()
             total = total + (mask if one is None else mask & one).sum().astype(jnp.int32)
     return total
-
-
-def refuse_contact(total: bool) -> None:
-    """Refuse contact that is judged by where material is in the total description, whose nodes do not know it.
-
-    Raises:
-        ValueError: the description is total Lagrangian.
-    """
-    require(
-        not total,
-        "In the total description there is no contact: use the updated one, or SymmetryPlane or SlipBox for a wall "
-        "that is never left.",
-    )

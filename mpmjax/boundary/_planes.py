@@ -9,11 +9,11 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Bool, Int, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
 from mpmjax.boundary._conditions import Conditions
-from mpmjax.boundary._contact import AbstractContact, refuse_contact
+from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._faces import Faces
 from mpmjax.boundary._mirror import Image, mirror_image
 from mpmjax.boundary._plane_contact import SHUT, PlaneContact
-from mpmjax.boundary._surface_contact import Surface, surface_contact
+from mpmjax.boundary._surface_contact import Surface, refuse_contact, surface_contact
 from mpmjax.checks import require, require_between, require_fields, require_finite, require_that
 from mpmjax.discretisation import Grid
 

@@ -10,6 +10,7 @@ from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
 from mpmjax.boundary._faces import Faces
 from mpmjax.boundary._friction import friction_across, friction_along
 from mpmjax.boundary._springs import Springs, spring_force
+from mpmjax.checks import require
 from mpmjax.discretisation import gather, scatter
 
 
@@ -165,4 +166,17 @@ def surface_contact(surface: Surface, faces: Faces, body: int | None = None) -> 
         coefficient=surface.friction,
         axis=surface.axis,
         body=body,
+    )
+
+
+def refuse_contact(total: bool) -> None:
+    """Refuse contact that is judged by where material is in the total description, whose nodes do not know it.
+
+    Raises:
+        ValueError: the description is total Lagrangian.
+    """
+    require(
+        not total,
+        "In the total description there is no contact: use the updated one, or SymmetryPlane or SlipBox for a wall "
+        "that is never left.",
     )

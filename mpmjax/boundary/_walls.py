@@ -10,8 +10,7 @@ import numpy as np
 from mpmjax._types import Array, Bool, Corner, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
 from mpmjax.boundary._conditions import Conditions
-from mpmjax.boundary._contact import refuse_contact
-from mpmjax.boundary._surface_contact import Surface
+from mpmjax.boundary._surface_contact import Surface, refuse_contact
 from mpmjax.checks import coordinates, require, require_between, require_fields, require_that
 from mpmjax.discretisation import Grid
 
