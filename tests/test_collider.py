@@ -220,7 +220,7 @@ def judged(contact, step, method):
 def pushes(contact, step, method):
     """At the nodes: the sums of the pushes around, and their mean normal and velocity of the surface."""
     gap, nothing_held = judged(contact, step, method)
-    push = contact.push(nothing_held, gap < 0)
+    push = contact.push(nothing_held, jnp.asarray(gap < 0))
     velocity = jnp.zeros_like(contact.normal) if contact.velocity is None else contact.velocity
     fields = jnp.concatenate([push[None], push * contact.normal, push * velocity])
     sums, d = np.asarray(scatter(contact.faces.stencil, fields, None, len(step.velocity))), len(contact.normal)
@@ -243,7 +243,7 @@ def test_a_separating_collider_pushes_never_pulls_and_is_not_entered(method):
     total = 0
     for contact in step.nodes.contacts:
         gap, nothing_held = judged(contact, step, method)
-        given = np.asarray(contact.spring_impulse(nothing_held, gap < 0))
+        given = np.asarray(contact.spring_impulse(nothing_held, jnp.asarray(gap < 0)))
         total = total + given
         if contact.collider is not None:
             assert (gap < 0).any()

@@ -58,11 +58,11 @@ class GridUpdate(eqx.Module):
     """The projection on the components of velocity that no boundary acts on."""
     solve: SolveInfo
     contact: ContactInfo
+    normal_impulse: NodeScalar | None = None
+    """The impulse of colliders along their normals [kg m/s], shape (n,); None without colliders."""
     holding: NodeVector | None = None
     """The part of `reaction` that holds components of velocity, without springs [kg m/s], shape (n, d); None if that is
     all."""
-    normal_impulse: NodeScalar | None = None
-    """The impulse of colliders along their normals [kg m/s], shape (n,); None without colliders."""
     pushes: tuple[tuple[int, NodeVector], ...] = ()
     """The impulses of colliders by springs and friction [kg m/s], shape (n, d), each with its collider's number."""
 
