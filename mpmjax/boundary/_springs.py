@@ -9,6 +9,7 @@ nodes, −k_p g_p (w_ip n_p − B_p g_ip), acts at the particle's face: its mome
 """
 
 from collections.abc import Sequence
+from functools import reduce
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -81,5 +82,5 @@ def spring_diagonal(springs: Sequence[Springs], stencil: Stencil, mirror: Mirror
 
 
 def _added(parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-    value, slopes = (sum(part[1:], part[0]) for part in zip(*parts, strict=True))
-    return value, slopes
+    values, slopes = zip(*parts, strict=True)
+    return reduce(jnp.add, values), reduce(jnp.add, slopes)
