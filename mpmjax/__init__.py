@@ -34,6 +34,7 @@ from mpmjax.boundary import (
     SlipCollider,
     StickyBox,
     StickyCollider,
+    Surface,
     SymmetryPlane,
     Wall,
 )
@@ -268,6 +269,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "SeparatingBox",
     "SlipBox",
     "StickyBox",
+    "Surface",
     "SymmetryPlane",
     "Wall",
     "AbstractCollider",

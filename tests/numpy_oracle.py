@@ -166,7 +166,15 @@ def grid_update(scene: mpm.Scene, particles: mpm.Particles, dt: float, method, t
 
 @eqx.filter_jit
 def _grid_update(scene, particles, t, dt, method) -> GridUpdate:
-    nodes = particles_to_grid(scene, particles, t, dt, scene.stencil(particles), body_force_at=method.body_force_at)
+    nodes = particles_to_grid(
+        scene,
+        particles,
+        t,
+        dt,
+        scene.stencil(particles),
+        body_force_at=method.body_force_at,
+        force_at=method.force_at(),
+    )
     new, info = step_unchecked(scene, particles, t, dt, method)
     grid = update(nodes, method)
     position = scene.grid.nodes(scene.window(particles))

@@ -118,6 +118,20 @@ class AbstractElastic(AbstractLaw):
             total: whether the description is total Lagrangian.
         """
 
+    def wave_modulus(self, dim: int, dtype: Any) -> Float[Array, "*p"]:
+        """The modulus M of pressure waves where nothing is deformed [Pa], λ + 2μ of an isotropic solid: the stress
+        along an axis by a strain along it alone. One number, or one a particle.
+
+        Args:
+            dim: d.
+            dtype: that of a deformation.
+        """
+        if self.kinematics.axes == 0:
+            one = jnp.ones(1, dtype)
+            return self.tangent(one)(one)
+        none = jnp.eye(dim, dtype=dtype)[..., None]
+        return self.tangent(none)(jnp.zeros_like(none).at[0, 0].set(1))[0, 0]
+
     def is_admissible(self, F: Deformation, /) -> Bool[Array, "p"]:
         """Whether the law is defined at a deformation, shape (p,). Default: where its energy is finite."""
         return jnp.isfinite(_density(self, F))

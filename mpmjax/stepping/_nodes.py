@@ -9,19 +9,24 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
 from mpmjax.boundary import (
+    EXPLICIT_STIFFNESS,
+    IMPLICIT_STIFFNESS,
     AbstractContact,
     AbstractNodes,
     Conditions,
+    Faces,
+    FaceShape,
     Mirror,
     MirrorMotion,
+    Springs,
+    brought_contacts,
     combined_conditions,
-    contacts_of,
     mirror,
     mirror_motion,
 )
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
-from mpmjax.state import Particles, Scene, load_force, points_of, supports_of
+from mpmjax.state import MaterialPoints, Particles, Scene, load_force, points_of, supports_of
 
 Fold = Callable[[NodeVector], NodeVector]
 """A map from a nodal vector to its sum with its images at mirrors."""
@@ -55,6 +60,11 @@ class SeparateSums(eqx.Module):
     def explicit_velocity(self, nodes: "Nodes") -> NodeVector:
         """v^n + Δt g + Δt f/m [m/s], shape (n, d)."""
         return nodes.inertial_velocity() + nodes.dt * nodes.per_mass(self.force)
+
+    def with_force(self, nodes: "Nodes", force: NodeVector) -> "SeparateSums":
+        """The same, with a force [N] more."""
+        del nodes
+        return SeparateSums(self.velocity, self.force + force, self.viscous_force)
 
     def folded(self, velocity: Fold, force: Fold) -> "SeparateSums":
         """The same, with velocities and forces folded at mirrors."""
@@ -92,6 +102,10 @@ class JoinedSum(eqx.Module):
         """v^n + Δt f/m + Δt g [m/s], shape (n, d)."""
         return self.velocity_with_force + nodes.dt * nodes.acceleration
 
+    def with_force(self, nodes: "Nodes", force: NodeVector) -> "JoinedSum":
+        """The same, with a force [N] more."""
+        return JoinedSum(self.velocity_with_force + nodes.dt * nodes.per_mass(force))
+
     def folded(self, velocity: Fold, force: Fold) -> "JoinedSum":
         """The same, with velocities and forces folded at mirrors."""
         del force
@@ -125,6 +139,8 @@ class Nodes(AbstractNodes):
     """The conditions that the boundaries prescribe."""
     contacts: tuple[AbstractContact, ...] = ()
     """The contacts of the scene; none of them is active here."""
+    brought_by: tuple[int, ...] = eqx.field(static=True, default=())
+    """The number of the boundary that brings each contact."""
     mirror_motion: MirrorMotion | None = None
     """What mirrors that move add to the velocity of the nodes beyond them; None if none moves."""
 
@@ -244,12 +260,20 @@ class Nodes(AbstractNodes):
         """The nodes with a velocity [m/s], shape (n, d), added to theirs."""
         return eqx.tree_at(lambda n: n.sums, self, self.sums.folded(lambda v: v + change, lambda force: force))
 
-    def constrained(self, images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None) -> "Nodes":
-        """The nodes folded at these mirrors, with the components `fixed` and the `normals` held too."""
+    def constrained(
+        self, images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None, springs: tuple[Springs, ...]
+    ) -> "Nodes":
+        """The nodes folded at these mirrors, with the components `fixed` and the `normals` held too, and the force of
+        the springs."""
         nodes, colliders = (
             eqx.tree_at(lambda n: n.conditions.fixed, self.folded(images), fixed),
             self.conditions.colliders,
         )
+        if springs:
+            nodes = eqx.tree_at(lambda n: n.potential.springs, nodes, springs)
+            nodes = eqx.tree_at(
+                lambda n: n.sums, nodes, nodes.sums.with_force(nodes, nodes.potential.spring_force(None))
+            )
         if normals is None or colliders is None:
             return nodes
         return eqx.tree_at(lambda n: n.conditions.colliders.held, nodes, colliders.held | normals)
@@ -263,6 +287,7 @@ def particles_to_grid(
     stencil: Stencil,
     *,
     body_force_at: float = 0.0,
+    force_at: Scalar | None = None,
     explicit_viscosity: bool = False,
     joined: bool = False,
     viscosity_apart: bool = False,
@@ -278,6 +303,7 @@ def particles_to_grid(
         stencil: stencil of the particles.
         body_force_at: the time at which body forces are evaluated, as a fraction of the step. Positions are moved on to
             it with the particles' velocity.
+        force_at: the share of the step's displacement at which forces are evaluated; None if the step is explicit.
         explicit_viscosity: whether the force includes the viscous stress, at the particles' stored velocity gradients.
         joined: whether momentum and force may be summed together. They are if both have the same gradient operator.
         viscosity_apart: whether to compute the viscous part of the force separately too.
@@ -334,6 +360,9 @@ def particles_to_grid(
             if viscosity_apart and drag is not None:
                 viscous_force = drag if viscous_force is None else viscous_force + drag
             sums = SeparateSums(jnp.where(occupied, momentum / full, 0), force, viscous_force)
+        faces = faces_of(scene, particles, potential.material_points, stencil, dt, force_at)
+        acts_at = t if force_at is None else t + jnp.where(jnp.asarray(force_at) > 0, dt, 0)
+        brought = brought_contacts(scene.boundary, conditions, grid, window, t, dt, faces, acts_at)
         nodes = Nodes(
             mass=jnp.where(occupied[:, 0], mass, 0),
             sums=sums,
@@ -343,7 +372,8 @@ def particles_to_grid(
             spacing=jnp.asarray(grid.spacing),
             potential=potential,
             conditions=conditions,
-            contacts=contacts_of(scene.boundary, conditions, grid, window, t, dt),
+            contacts=tuple(contact for _, contact in brought),
+            brought_by=tuple(number for number, _ in brought),
             mirror_motion=mirror_motion(scene.boundary, grid, window, t, dt),
         )
         return folded_at_planes(scene, particles, nodes) if folded else nodes
@@ -360,6 +390,46 @@ def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes) -> Nodes:
         added = jnp.where(moving.beyond, moving.velocity, added)
         added = images.added(added)
         return nodes.moved_by(-images.unfold(added)).folded(images).moved_by(added)
+
+
+def faces_of(
+    scene: Scene,
+    particles: Particles,
+    materials: tuple[MaterialPoints, ...],
+    stencil: Stencil,
+    dt: Scalar,
+    force_at: Scalar | None = None,
+) -> Faces | None:
+    """The faces of prepared particles; None if no boundary of the scene asks for them.
+
+    Args:
+        scene: the scene.
+        particles: prepared particles.
+        materials: their materials.
+        stencil: their stencil.
+        dt: step [s].
+        force_at: as in `particles_to_grid`.
+    """
+    if not any(boundary.pushes or boundary.sees_faces for boundary in scene.boundary):
+        return None
+    shapes, stiffness, explicit = [], [], force_at is None
+    factor = EXPLICIT_STIFFNESS if explicit else IMPLICIT_STIFFNESS
+    for law, points in zip(scene.laws, materials, strict=True):
+        side = points.volume ** (1 / particles.dim)
+        shape = points.deformation if law.allows_total else points.volume_ratio()
+        shapes.append(FaceShape(side / 2, shape, points.rows, points.total))
+        modulus = factor * points.law.wave_modulus(particles.dim, points.volume.dtype)
+        stiffness.append(modulus * points.volume / (side * scene.grid.spacing))
+    return Faces(
+        x=particles.x,
+        shapes=tuple(shapes),
+        stiffness=jnp.concatenate(stiffness),
+        stencil=stencil,
+        spacing=jnp.asarray(scene.grid.spacing),
+        dt=jnp.asarray(dt),
+        force_at=0.0 if force_at is None else jnp.asarray(force_at, particles.x.dtype),
+        explicit=explicit,
+    )
 
 
 def places_of(particles: Particles, stencil: Stencil, size: int) -> NodeVector:
