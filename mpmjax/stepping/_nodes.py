@@ -9,13 +9,9 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
 from mpmjax.boundary import (
-    EXPLICIT_STIFFNESS,
-    IMPLICIT_STIFFNESS,
     AbstractContact,
     AbstractNodes,
     Conditions,
-    Faces,
-    FaceShape,
     Mirror,
     MirrorMotion,
     Springs,
@@ -26,7 +22,8 @@ from mpmjax.boundary import (
 )
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
-from mpmjax.state import MaterialPoints, Particles, Scene, load_force, points_of, supports_of
+from mpmjax.state import Particles, Scene, load_force, points_of, supports_of
+from mpmjax.stepping._particle_faces import faces_of
 
 Fold = Callable[[NodeVector], NodeVector]
 """A map from a nodal vector to its sum with its images at mirrors."""
@@ -390,46 +387,6 @@ def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes) -> Nodes:
         added = jnp.where(moving.beyond, moving.velocity, added)
         added = images.added(added)
         return nodes.moved_by(-images.unfold(added)).folded(images).moved_by(added)
-
-
-def faces_of(
-    scene: Scene,
-    particles: Particles,
-    materials: tuple[MaterialPoints, ...],
-    stencil: Stencil,
-    dt: Scalar,
-    force_at: Scalar | None = None,
-) -> Faces | None:
-    """The faces of prepared particles; None if no boundary of the scene asks for them.
-
-    Args:
-        scene: the scene.
-        particles: prepared particles.
-        materials: their materials.
-        stencil: their stencil.
-        dt: step [s].
-        force_at: as in `particles_to_grid`.
-    """
-    if not any(boundary.pushes or boundary.sees_faces for boundary in scene.boundary):
-        return None
-    shapes, stiffness, explicit = [], [], force_at is None
-    factor = EXPLICIT_STIFFNESS if explicit else IMPLICIT_STIFFNESS
-    for law, points in zip(scene.laws, materials, strict=True):
-        side = points.volume ** (1 / particles.dim)
-        shape = points.deformation if law.allows_total else points.volume_ratio()
-        shapes.append(FaceShape(side / 2, shape, points.rows, points.total))
-        modulus = factor * points.law.wave_modulus(particles.dim, points.volume.dtype)
-        stiffness.append(modulus * points.volume / (side * scene.grid.spacing))
-    return Faces(
-        x=particles.x,
-        shapes=tuple(shapes),
-        stiffness=jnp.concatenate(stiffness),
-        stencil=stencil,
-        spacing=jnp.asarray(scene.grid.spacing),
-        dt=jnp.asarray(dt),
-        force_at=0.0 if force_at is None else jnp.asarray(force_at, particles.x.dtype),
-        explicit=explicit,
-    )
 
 
 def places_of(particles: Particles, stencil: Stencil, size: int) -> NodeVector:

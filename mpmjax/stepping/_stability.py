@@ -14,7 +14,7 @@ from mpmjax.discretisation import Stencil
 from mpmjax.state import AttachedPoints, MaterialPoints, Particles, Scene, is_prepared, points_of, prepare
 from mpmjax.stepping._explicit import Explicit
 from mpmjax.stepping._integrator import AbstractIntegrator
-from mpmjax.stepping._nodes import faces_of
+from mpmjax.stepping._particle_faces import faces_of
 
 MOST_STEPS = 2**31 - 1
 """The largest number of steps of a run."""
