@@ -103,7 +103,8 @@ def test_moments_of_all_boundaries_are_the_change_of_angular_momentum(descriptio
             return cross(place, np.asarray(impulse)).sum(axis=0)
 
         pivots = np.stack([np.asarray(m.centre) + np.asarray(m.at((n + late) * dt)) for m in motions])
-        rub = 0 if new.collider_friction is None else np.asarray(new.collider_friction)
+        rub = sum(np.asarray(given) for _, given in new.pushes)  # by springs and friction
+        holding = np.asarray(new.reaction if new.holding is None else new.holding)
         friction = 0 if new.friction is None else np.asarray(new.friction)
         push = (
             0
@@ -111,7 +112,7 @@ def test_moments_of_all_boundaries_are_the_change_of_angular_momentum(descriptio
             else np.asarray(new.normal_impulse)[:, None] * np.asarray(step.nodes.conditions.colliders.normal)
         )
         holder = np.asarray(step.nodes.conditions.colliders.holder)
-        of_colliders = np.where(holder >= 0, np.asarray(new.reaction), 0) + push + rub
+        of_colliders = np.where(holder >= 0, holding, 0) + push + rub
         of_walls = np.where(walled, np.asarray(new.reaction) + friction - of_colliders, 0)
         received = step.info.colliders
         given = -np.asarray(received.angular) - cross(pivots, np.asarray(received.impulse))

@@ -14,7 +14,8 @@ from mpmjax.linalg import pairs
 class ColliderImpulse(eqx.Module):
     """Linear and angular impulse on each of k colliders. Divided by the step they are its mean force and torque.
 
-    At a symmetry plane only the true nodes count, not their images.
+    At a symmetry plane only the true nodes count, not their images; but springs push
+    the faces of particles, and so all nodes.
     """
 
     impulse: Float[Array, "*f k d"]

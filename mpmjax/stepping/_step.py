@@ -137,7 +137,7 @@ def _given_to_colliders(nodes: Nodes, new: GridUpdate) -> ColliderImpulse | None
     if colliders is None:
         return None
     if new.motion.mean is not None:
-        colliders = colliders.after(nodes.dt / 2, new.motion.mean)
+        colliders = colliders.after(nodes.dt / 2, nodes.mirror.unfold(new.motion.mean))
     holding = new.reaction if new.holding is None else new.holding
     return impulse_on_colliders(colliders, holding, new.normal_impulse, new.pushes)
 
