@@ -90,3 +90,17 @@ def test_only_linearised_steps_leave_some(name, dtype):
 
     assert (left(x * jnp.asarray([10.0, 0.0])) > 1e-4) is linearised
     assert left(jnp.asarray([3.0, -2.0]) + 0.1 * x[:, ::-1] * jnp.asarray([1.0, -1.0])) < 1e-5
+
+
+@pytest.mark.thorough
+def test_friction_is_not_taken_for_some():
+    """A block that slides on a floor: friction slows nodes after the solve, and is no part of what the solve left."""
+
+    def left(friction):
+        floor = (mpm.ContactPlane(1, 0.0, friction=friction),)
+        scene, particles = block(2, side=4, gravity=(0.0, -9.81), boundary=floor)
+        sliding = eqx.tree_at(lambda q: q.v, particles, particles.v + jnp.asarray([2.0, -0.2]))
+        return float(mpm.step(scene, sliding, 0.0, 2e-2, method=mpm.SemiImplicit())[1].left_undone.force)
+
+    assert left(0.8) == pytest.approx(left(0.0), rel=1e-6)
+    assert left(0.0) > 0

@@ -89,7 +89,7 @@ class Tie(eqx.Module):
         return jnp.where(self.tied[:, None], field[jnp.argmax(self.tied)], field)
 
     def at_rest(self) -> "Tie":
-        """Itself."""
+        """The same map: a tie has no motion of its own."""
         return self
 
 

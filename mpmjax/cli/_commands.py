@@ -240,8 +240,8 @@ def fit_command(
     with stopping("The fit ends after the iteration in progress; a second signal ends it at once.") as stop:
 
         def progress(line: str) -> None:
-            _print_error(line)
             stop.ready = not line.startswith("compiling")
+            _print_error(line)
             if stop.signal:
                 raise KeyboardInterrupt
 

@@ -68,7 +68,8 @@ class Run(eqx.Module):
     """As `collider_impulse`, on each of the scene's boundaries (see `boundary_forces`); None unless the scene has
     `boundary_forces`, or where nothing was saved."""
     final_boundary_impulse: BoundaryImpulse | None = None
-    """The same to the end."""
+    """Impulse on each of the scene's boundaries from the run's start to its end; None unless the scene has
+    `boundary_forces`."""
 
     @property
     def times(self) -> Float[Array, "*f"]:

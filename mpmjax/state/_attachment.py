@@ -69,7 +69,7 @@ class AttachedPoints(AbstractPlace):
         return jnp.shape(jnp.asarray(self.offset))[1]
 
     def attached(self, particles: Particles) -> "AttachedPoints":
-        """Itself."""
+        """The points as they are, attached already."""
         del particles
         return self
 

@@ -33,7 +33,7 @@ class LoadedPoints(eqx.Module):
     arm: Float[Array, "d s"]
     """r_s [m]: F_p R_s, in the total description R_s."""
     stencil: Stencil
-    """That of their particles."""
+    """Nodes, weights and derivatives of the particle that each point is attached to."""
     mirror: Mirror
     """The mirrors on which the nodes are folded."""
 

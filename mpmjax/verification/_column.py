@@ -26,7 +26,34 @@ _HALLEY = 6  # iterations, of third order, from a good start
 _STEP = 1e5  # [s], long enough for inertia not to matter
 
 
-class Column(AbstractProblem):
+class AbstractColumn(AbstractProblem):
+    """A column 0 ≤ X ≤ 1 m on a symmetry plane, under its weight, which is applied slowly."""
+
+    shift: eqx.AbstractVar[float]
+    """Distance of the free end beyond a node, as a fraction of a cell."""
+
+    @property
+    def duration(self) -> float:
+        """Duration of the run [s], so long that inertia is negligible."""
+        return _STEP * (_LOADING + _HOLDING)
+
+    def grid(self, cells: int) -> Grid:
+        return Grid((cells + 8,), 1 / (cells + self.shift), origin=(-3,))
+
+    def body(self, cells: int) -> Box:
+        del cells
+        return Box((0.0,), (1.0,))
+
+    def rest(self, cells: int, per_side: int, *, fitted: bool = False) -> Particles:
+        """Particles at rest that fill the column exactly, `per_side` to a cell."""
+        del fitted  # they always are
+        return _fitted(self.density, cells * per_side)
+
+    def boundary(self) -> tuple[AbstractBoundary, ...]:
+        return (SymmetryPlane(0, 0.0),)
+
+
+class Column(AbstractColumn):
     """A column 0 ≤ X ≤ 1 m on a symmetry plane under its weight, which is applied slowly. At full load
     P = −a E (1 − X) and x = X − a (X − X²/2).
 
@@ -46,29 +73,9 @@ class Column(AbstractProblem):
     dim: int = eqx.field(static=True, default=1)
     forced: bool = eqx.field(static=True, default=True)
 
-    @property
-    def duration(self) -> float:
-        """Duration of the run [s], so long that inertia is negligible."""
-        return _STEP * (_LOADING + _HOLDING)
-
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
         share = jnp.minimum(t / (_STEP * (_LOADING - 1)), 1)
         return X - self.load * share * (X - X**2 / 2)
-
-    def grid(self, cells: int) -> Grid:
-        return Grid((cells + 8,), 1 / (cells + self.shift), origin=(-3,))
-
-    def body(self, cells: int) -> Box:
-        del cells
-        return Box((0.0,), (1.0,))
-
-    def rest(self, cells: int, per_side: int, *, fitted: bool = False) -> Particles:
-        """Particles at rest that fill the column exactly, `per_side` to a cell."""
-        del fitted  # they always are
-        return _fitted(self.density, cells * per_side)
-
-    def boundary(self) -> tuple[AbstractBoundary, ...]:
-        return (SymmetryPlane(0, 0.0),)
 
     def errors(self, cells: int, *, per_side: int = 2, **choices: Any) -> tuple[float, float]:
         """The relative errors under full load: of the displacement, over that of the top a/2, and of the stress, over
@@ -82,7 +89,7 @@ class Column(AbstractProblem):
         return _errors_at_rest(self, self.load, self.load / 2, SemiImplicit(), cells, per_side, choices)
 
 
-class HenckyColumn(AbstractProblem):
+class HenckyColumn(AbstractColumn):
     """A column of Hencky's law 0 ≤ X ≤ 1 m on a symmetry plane under its weight, which is applied slowly, at any load.
 
     At full load the Cauchy stress is σ = P = −a E (1 − X) (with ν = 0 the section stays). From E ln F/F = σ follow,
@@ -102,31 +109,11 @@ class HenckyColumn(AbstractProblem):
     dim: int = eqx.field(static=True, default=1)
     forced: bool = eqx.field(static=True, default=True)
 
-    @property
-    def duration(self) -> float:
-        """Duration of the run [s], so long that inertia is negligible."""
-        return _STEP * (_LOADING + _HOLDING)
-
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
         a = self.load * jnp.minimum(t / (_STEP * (_LOADING - 1)), 1)
         none = a == 0
         a = jnp.where(none, 1.0, a)
         return jnp.where(none, X, (_potential(a) - _potential(a * (1 - X))) / a)
-
-    def grid(self, cells: int) -> Grid:
-        return Grid((cells + 8,), 1 / (cells + self.shift), origin=(-3,))
-
-    def body(self, cells: int) -> Box:
-        del cells
-        return Box((0.0,), (1.0,))
-
-    def rest(self, cells: int, per_side: int, *, fitted: bool = False) -> Particles:
-        """Particles at rest that fill the column exactly, `per_side` to a cell."""
-        del fitted  # they always are
-        return _fitted(self.density, cells * per_side)
-
-    def boundary(self) -> tuple[AbstractBoundary, ...]:
-        return (SymmetryPlane(0, 0.0),)
 
     def errors(self, cells: int, *, per_side: int = 2, **choices: Any) -> tuple[float, float]:
         """The relative errors under full load: of the displacement, over that of the top, and of the stress, over that
