@@ -422,7 +422,8 @@ def test_a_collider_lets_go_freely(name):
 @pytest.mark.thorough
 def test_a_turning_body_drags_what_it_touches_and_is_braked():
     """A cylinder under a block, turning anticlockwise: friction drives the block to the left; the torque on the body is
-    clockwise and that of μ times the load at arms between the surface and a particle's width above it: it acts at their centres."""
+    clockwise and that of μ times the load at arms between the surface and a particle's width above it, since friction
+    acts at the particles' centres."""
     grid = mpm.Grid((14, 12), DX, origin=(-7, -6))
     block = mpm.fill(mpm.Box((-0.4, 0.0), (0.4, 0.2)), grid, density=1e3)
     wheel = mpm.Ball((0.0, -0.45), 0.46)
