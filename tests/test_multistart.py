@@ -11,7 +11,7 @@ import mpmjax as mpm
 from mpmjax.fitting._batch import Problems, search_many
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._search import search
-from mpmjax.fitting._starting_points import starting_points
+from mpmjax.fitting._starting_points import starting_points, unit_points
 
 LM = mpm.LevenbergMarquardt()
 TIMES = np.linspace(0.001, 0.05, 40)
@@ -92,7 +92,7 @@ def test_starting_points_fill_what_is_known_of_each_parameter():
         "m": mpm.Positive(lambda e: e.particles.mass, prior=mpm.Gaussian(0.01, 0.01)),
     }
     problem = FitProblem((one,), parameters)
-    points = starting_points(problem, 129, {"E": (1e3, 1e6)}, 0)
+    points = starting_points(problem, unit_points(128, problem.size, 0), {"E": (1e3, 1e6)})
     assert points.shape == (129, problem.size)
     assert not points[0].any()
     values = dict(zip(problem.names, jax.jit(jax.vmap(problem.values))(jnp.asarray(points[1:])), strict=True))

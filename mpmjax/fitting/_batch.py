@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -140,6 +141,31 @@ def search_many(
     return tuple(done[k] for k in range(count))
 
 
+def costs_at(
+    problem: FitProblem,
+    points: Float[np.ndarray, "k n"],
+    sigmas: tuple[Array, ...],
+    batch: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> Float[np.ndarray, "k"]:
+    """½ Σ r² at many points, without derivatives; NaN where a simulation fails.
+
+    Args:
+        problem: the problem.
+        points: the coordinates.
+        sigmas: the noise of each observation.
+        batch: how many are computed together.
+        progress: called with how many are done, and of how many.
+    """
+    costs = np.empty(len(points))
+    for first in range(0, len(points), batch):
+        own = points[np.minimum(np.arange(first, first + batch), len(points) - 1)]
+        costs[first : first + batch] = _costs(problem, own, sigmas)[: len(points) - first]
+        if progress is not None:
+            progress(min(first + batch, len(points)), len(points))
+    return costs
+
+
 def batch_size(problem: FitProblem, given: int | None, count: int) -> int:
     """How many searches of `count` to compute together, unless it is given: eight with explicit steps, where they cost
     less than one by one, and one with implicit ones, where all wait for the slowest solve (`benchmarks/multistart.py`).
@@ -258,6 +284,19 @@ class _Lanes:
                 ended[member] = self.stopped(lane)._replace(joined=near[0])
                 self.leave(lane)
         return ended
+
+
+@eqx.filter_jit
+def _costs(
+    problem: FitProblem, points: Float[np.ndarray, "b n"] | Array, sigmas: tuple[Array, ...]
+) -> Float[Array, "b"]:
+    """½ Σ r² at some points together, compiled."""
+
+    def cost(z: Coordinates) -> Array:
+        r, _ = problem.residuals(z, sigmas, diffrax.ForwardMode())
+        return (r**2).sum() / 2
+
+    return jax.vmap(cost)(jnp.asarray(points, problem.dtype))
 
 
 @eqx.filter_jit
