@@ -9,7 +9,7 @@ decades, ν between its bounds. Printed are seconds of the processor and of the 
 call of each, the three interleaved; and of one iteration, per search, against how many run together.
 
 `--reliability`: how often searches find the best minimum, from all of 64, or 256, scrambled Sobol points, and from
-those that `fit_multistart` searches from, of 40 scramblings each. The problems are oscillations whose frequency,
+those that `fit_multistart` searches from, of 20 scramblings each. The problems are oscillations whose frequency,
 amplitude, damping and phase are searched, the better known the longer they last, and sums of two and three of them.
 """
 
@@ -27,6 +27,7 @@ import numpy as np
 
 import mpmjax as mpm
 from mpmjax.fitting._batch import Member, Problems, _iterate, batch_size, search_many
+from mpmjax.fitting._linkage import linked
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._search import begin
 from mpmjax.fitting._starting_points import starting_points, unit_points
@@ -35,6 +36,15 @@ NOISE = 1e-4
 PARAMETERS = {
     "E": mpm.Positive(lambda e: e.scene.material.youngs_modulus, start=1e5),
     "nu": mpm.Bounded(lambda e: e.scene.material.poisson_ratio, 0.0, 0.49, start=0.2),
+}
+OSCILLATIONS = {
+    "frequency, 5 periods": ((1.0,), (1.0,), 30.0, 0),
+    "frequency, 13 periods": ((1.0,), (1.0,), 80.0, 0),
+    "and amplitude, 10 periods": ((1.0,), (1.0,), 60.0, 1),
+    "and damping, 10 periods": ((1.0,), (1.0,), 60.0, 2),
+    "and phase, 6 periods": ((1.0,), (1.0,), 40.0, 3),
+    "two frequencies, 1.6 and 4 periods": ((1.0, 0.5), (1.0, 2.7), 10.0, 0),
+    "three frequencies, 1 to 5 periods": ((1.0, 0.6, 0.4), (1.0, 2.2, 5.0), 6.0, 0),
 }
 SCENES = {"explicit": (mpm.Explicit(), 2e-3, 100), "semi-implicit": (mpm.SemiImplicit(), 1e-2, 20)}
 
@@ -96,12 +106,73 @@ def iteration(pull: mpm.Experiment, points: np.ndarray, batch: int) -> Callable[
     )
 
 
+def oscillations(
+    amplitudes: tuple[float, ...], frequencies: tuple[float, ...], duration: float, others: int
+) -> tuple[Callable[[np.ndarray], np.ndarray], np.ndarray, np.ndarray]:
+    """The residuals of a sum of oscillations a e^{-dt} cos(ωt + φ), beside its values with noise of 0.01, shape (k, m)
+    of coordinates (k, n); and the ends of their ranges. Searched are the logarithms of the frequencies, from a quarter
+    to ten, and so many of: logarithm of a scale of the amplitudes, logarithm of the damping, phase."""
+    t = np.linspace(duration / 80, duration, 80)
+    number, damping = len(frequencies), 0.3 / duration
+    lowest = np.array([np.log(0.25)] * number + [np.log(0.3), np.log(0.1 * damping), -1.0][:others])
+    highest = np.array([np.log(10.0)] * number + [np.log(3.0), np.log(30 * damping), 1.0][:others])
+
+    def signal(z: np.ndarray) -> np.ndarray:
+        rest = np.concatenate([z[:, number:], np.tile([0.0, np.log(damping), 0.0][others:], (len(z), 1))], axis=1)
+        scale, rate, phase = rest.T[:, :, None]
+        omega = np.exp(z[:, :number, None])
+        waves = np.array(amplitudes)[:, None] * np.cos(omega * t + phase[:, None])
+        return np.exp(scale - np.exp(rate) * t) * waves.sum(1)
+
+    true = np.array([[*np.log(frequencies), *[0.0, np.log(damping), 0.0][:others]]])
+    seen = signal(true) + 0.01 * np.random.default_rng(1).normal(size=80)
+    return lambda z: (signal(z) - seen) / 0.01, lowest, highest
+
+
+def ends(residuals: Callable[[np.ndarray], np.ndarray], z: np.ndarray) -> np.ndarray:
+    """Where Levenberg-Marquardt searches from each of z, shape (k, n), end: their Σ r², shape (k,)."""
+    damping, step = np.ones(len(z)), 1e-6 * np.eye(z.shape[1])
+    r = residuals(z)
+    for _ in range(60):
+        J = np.stack([(residuals(z + h) - residuals(z - h)) / 2e-6 for h in step], axis=-1)
+        hessian = J.swapaxes(1, 2) @ J + damping[:, None, None] * np.eye(z.shape[1])
+        tried = z - np.linalg.solve(hessian, (J * r[:, :, None]).sum(1)[..., None])[..., 0]
+        new = residuals(np.clip(tried, -20, 20))
+        better = (new**2).sum(1) < (r**2).sum(1)
+        z, r = np.where(better[:, None], tried, z), np.where(better[:, None], new, r)
+        damping = np.clip(np.where(better, damping / 3, damping * 4), 1e-9, 1e12)
+    return (r**2).sum(1)
+
+
+def reliability(scramblings: int = 20) -> None:
+    """How often the best minimum is found, and by how many searches."""
+    print("problem, n: from all of 64: found; of 64, 256: found (searches); of", scramblings)
+    for text, (amplitudes, frequencies, duration, others) in OSCILLATIONS.items():
+        residuals, lowest, highest = oscillations(amplitudes, frequencies, duration, others)
+        told = []
+        for count in (64, 256):
+            every, few, searches = 0, 0, 0
+            for seed in range(scramblings):
+                shares = unit_points(count - 1, len(lowest), seed)
+                z = lowest + shares * (highest - lowest)
+                own = np.unique(linked(shares, (residuals(z) ** 2).sum(1)))
+                found = ends(residuals, z if count == 64 else z[own]) < 2 * 80
+                every += found.any()
+                few += (found[own] if count == 64 else found).any()
+                searches += len(own)
+            told += [f"{every}; " * (count == 64) + f"{few} ({searches / scramblings:.0f})"]
+        print(f"{text}, {len(lowest)}: {', '.join(told)}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--starts", type=int, default=64)
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--scene", choices=SCENES, action="append")
+    parser.add_argument("--reliability", action="store_true")
     given = parser.parse_args()
+    if given.reliability:
+        return reliability()
     jax.config.update("jax_enable_x64", True)
     warnings.simplefilter("ignore")
     for name in given.scene or SCENES:
