@@ -167,8 +167,9 @@ def costs_at(
 
 
 def batch_size(problem: FitProblem, given: int | None, count: int) -> int:
-    """How many points or searches of `count` to compute together, unless it is given: eight with explicit steps, where they cost
-    less than one by one, and one with implicit ones, where all wait for the slowest solve (`benchmarks/multistart.py`).
+    """How many points or searches of `count` to compute together, unless it is given: eight with explicit steps, where
+    they cost less than one by one, and one with implicit ones, where all wait for the slowest solve
+    (`benchmarks/multistart.py`).
     """
     if given is not None:
         return min(require_whole("batch", given, 1), count)
