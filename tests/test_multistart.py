@@ -19,8 +19,8 @@ TIMES = np.linspace(0.001, 0.05, 40)
 
 
 class Oscillation(FitProblem):
-    """cos ωt of data with noise, in the place of a simulation that fails beyond ω = 2000, and has no derivative beyond
-    1500: its minima lie a period apart."""
+    """cos ωt of data with noise, in the place of a simulation that fails beyond ω = 2000, and has no derivative around
+    795: its minima lie a period apart."""
 
     def __init__(self, experiments, parameters, memory=None):
         del experiments, memory
@@ -34,7 +34,7 @@ class Oscillation(FitProblem):
     def residuals(self, z, sigmas, adjoint):
         (omega,) = self.values(z)
         predicted = jnp.cos(jnp.where(omega < 2000, omega, jnp.nan) * jnp.asarray(TIMES))
-        predicted += jnp.where(omega > 1500, jnp.sqrt(0 * omega), 0)  # zero, without a derivative there
+        predicted += jnp.where(abs(omega - 795) < 15, jnp.sqrt(0 * omega), 0)  # zero, without a derivative there
         return self.observations[0].residuals(predicted, sigmas[0]), jnp.zeros(1)
 
 
@@ -49,7 +49,7 @@ def oscillation(monkeypatch):
 
 
 def test_many_starts_find_the_least_of_many_minima(oscillation):
-    """ω = 400 from 500, from which a fit ends at 549. Simulations fail beyond 2000, searches beyond 1500, and hinder
+    """ω = 400 from 500, from which a fit ends at 549. Simulations fail beyond 2000, the search to 795, and they hinder
     no other; few searches stand for all points."""
     found = oscillation(starts=32, ranges={"omega": (100.0, 4000.0)}, batch=5)
     with pytest.warns(UserWarning, match="times the noise given"):
@@ -65,8 +65,8 @@ def test_many_starts_find_the_least_of_many_minima(oscillation):
     assert sorted(counted) == list(range(32))
     assert found.count == 32
     started = found.starts["omega"]
-    assert set(np.flatnonzero(started >= 2000)) <= set(found.failures) <= set(np.flatnonzero(started > 1500))
-    assert {found.failures[k] for k in found.searched if started[k] > 1500} == {"there is no derivative"}
+    assert set(np.flatnonzero(started >= 2000)) <= set(found.failures)
+    assert {found.failures[k] for k in found.searched if k in found.failures} == {"there is no derivative"}
     assert started[0] == pytest.approx(500)
     successes = set(found.searched) - set(found.failures)
     assert sum(m.searches for m in found.minima) == len(successes) < 16
@@ -81,7 +81,7 @@ def test_searches_from_few_points_find_what_searches_from_all_find():
     sigmas, found = problem.first_sigmas, []
     for seed in range(10):
         shares = unit_points(63, 1, seed)
-        points = starting_points(problem, shares, {"omega": (100.0, 1500.0)})[1:]
+        points = starting_points(problem, shares, {"omega": (100.0, 750.0)})[1:]
         members = search_many(
             Problems.of([problem], shared=True), LM, points, sigmas=Problems.of([sigmas], shared=True), batch=63
         )
