@@ -401,10 +401,10 @@ class Runner:
             early = -bench.t1 / steps / 2
             start = bench_of(self.problem, line, bench.refinement, velocity_time=early)
             bench = bench._replace(particles=start.particles)
-        states, seconds = bench.timed(method, steps, FRAMES, steps // FRAMES)
+        states, _, seconds = bench.timed(method, steps, FRAMES, steps // FRAMES)
         error = math.inf if states is None else bench.motion(states).distance(truth)
         if states is not None and seconds < self.limits.run_seconds / 10:
-            self._again[len(self.points)] = lambda: bench.timed(method, steps, 1, steps)[1]
+            self._again[len(self.points)] = lambda: bench.timed(method, steps, 1, steps).seconds
         return self._note(bench, line, steps, seconds, error)
 
     def _note(self, bench: Bench, line: str, steps: int, seconds: float, error: float) -> Point:

@@ -40,12 +40,19 @@ def found() -> mpm.FitResult:
     """A fit, as if it had been made."""
     problem = FitProblem((mpm.Experiment(**RUN, observations=SEEN),), {"E": STIFFNESS})
     at = Minimum(jnp.zeros(1), jnp.zeros(1), jnp.ones((1, 1)), True, False, ())
-    return fit_result(problem, at, [1.0], [1.0], (jnp.ones(()),), {}, 0.95)
+    return fit_result(problem, mpm.LevenbergMarquardt(), at, [1.0], [1.0], (jnp.ones(()),), {}, 0.95)
 
 
 FITTED = found()
 FUNCTIONS = {
     mpm.fill: {"region": mpm.Ball((0.1, 0.1), 0.1), "grid": SCENE.grid, "density": 1e3},
+    mpm.attach: {"scene": SCENE, "particles": PARTICLES},
+    mpm.fill_mapped: {
+        "mapping": reached,
+        "box": mpm.Box((0.1, 0.1), (0.2, 0.2)),
+        "counts": (2, 2),
+        "density": 1e3,
+    },
     mpm.prepare: {"scene": SCENE, "particles": PARTICLES},
     mpm.stable_dt: {"scene": SCENE, "particles": PARTICLES},
     mpm.simulate: RUN,
@@ -118,6 +125,8 @@ MAY = {
     (mpm.render, "colour"),
     (mpm.sample_mesh, "mesh"),
     (mpm.fill, "dtype"),
+    (mpm.fill_mapped, "dtype"),
+    (mpm.fill_mapped, "mapping"),
     (mpm.Experiment, "name"),
     (mpm.predict, "of"),
     (mpm.fit, "log"),
@@ -154,9 +163,9 @@ def offences() -> Iterator[str]:
                     yield f"{call.__name__} takes {name}={what}"
 
 
-TAKEN = {(name, "empty") for name in ("boundary", "also", "deformations", "histories", "methods", "refinements")} | {
-    ("fitted", "array of words")
-}
+TAKEN = {
+    (name, "empty") for name in ("boundary", "loads", "also", "deformations", "histories", "methods", "refinements")
+} | {("fitted", "array of words")}
 """What may be none of; and what NumPy takes for true."""
 
 if __name__ == "__main__":

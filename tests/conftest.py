@@ -2,6 +2,7 @@
 how far XLA optimises what they compile."""
 
 import os
+from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -27,7 +28,18 @@ def pytest_configure(config: Any) -> None:
 
 
 def pytest_runtest_teardown(item: Any, nextitem: Any) -> None:
-    """Drop compiled programs that no later test shares. Each holds memory maps, of which a process may have 65530, and
-    XLA crashes when there are no more."""
-    if nextitem is None or nextitem.module is not item.module or item.get_closest_marker("slow"):
+    """Drop compiled programs that no later test shares, or that are too many. Each holds memory maps, of which a
+    process may have 65530, and XLA crashes when there are no more."""
+    leaves = nextitem is None or nextitem.module is not item.module
+    if leaves or item.get_closest_marker("slow") or (item.get_closest_marker("thorough") and _maps() > MOST_MAPS):
         jax.clear_caches()
+
+
+def _maps() -> int:
+    """Memory maps of this process, zero where the system does not say."""
+    maps = Path("/proc/self/maps")
+    return maps.read_bytes().count(b"\n") if maps.exists() else 0
+
+
+MOST_MAPS = 30_000
+"""Memory maps up to which a module's programs are kept."""

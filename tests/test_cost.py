@@ -302,3 +302,9 @@ def test_viscosity_adds_no_crossing(law, transfer):
     step, arrays = program(mpm.SemiImplicit(), material=viscous, transfer=transfer)
     (body,) = innermost_loops(jax.make_jaxpr(step)(arrays).jaxpr)
     assert operations(body) == {"stencil_scatter": 1, "stencil_gather": 1}
+
+
+def test_forces_on_boundaries_add_no_crossing_to_an_explicit_step():
+    """Sums over the nodes, and nothing between particles and nodes."""
+    walls = mpm.StickyBox((0.0, -1.0), (9.0, 9.0)), mpm.Grip(mpm.Box((0.3, -1.0), (1.0, 1.0)), mpm.geometry.still(2))
+    assert counted(boundary=walls, boundary_forces=True) == counted(boundary=walls)

@@ -375,6 +375,30 @@ def test_a_search_that_ends_where_simulations_begin_to_fail_has_not_converged():
     assert float(found.z[0]) == pytest.approx(0.4, abs=1e-2)
 
 
+class Rounded(Failing):
+    """r = 100 + x (z − 1) + z²/1000 and a rounding of single precision that its derivative does not know."""
+
+    @property
+    def dtype(self):
+        return jnp.float32
+
+    def jacobian(self, z, sigmas, mode=None):
+        x, z = jnp.linspace(-1.0, 1.0, 400), z.astype("f4").astype(float)
+        rounding = 5e-4 * jnp.cos(1e7 * z * x)
+        return (100 + x * (z - 1) + z**2 / 1000 + rounding).astype("f4"), (x + z / 500)[:, None].astype("f4")
+
+
+def test_a_search_ends_where_no_step_can_lower_the_sum_of_squares_by_more_than_its_rounding():
+    """The misfit is large, as that of a law which does not explain the data, and so is its rounding. The standard error
+    of z is 8.7."""
+    found = search(Rounded(jnp.inf), mpm.LevenbergMarquardt(), jnp.zeros(1), ())
+    z, squares = np.linspace(0.0, 1.0, 100_001), (np.linspace(-1.0, 1.0, 400) ** 2).sum()
+    least = z[np.argmin(400 * (100 + z**2 / 1000) ** 2 + squares * (z - 1) ** 2)]
+    assert found.converged
+    assert len(found.history) < 20
+    assert float(found.z[0]) == pytest.approx(least, abs=0.1)
+
+
 @pytest.mark.thorough
 def test_a_simulation_at_fault_has_residuals_of_nan():
     times, x, which = tracks()

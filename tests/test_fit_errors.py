@@ -183,7 +183,7 @@ class Abrupt(FitProblem):
         """The fit, at z = 0."""
         column = jnp.full((STEPS, 1), self.slope / np.sqrt(STEPS))
         found = Minimum(jnp.zeros(1), jnp.zeros(STEPS), column, True, False, ())
-        return fit_result(self, found, [1.0], [0.0], (jnp.ones(()),), {}, 0.95)
+        return fit_result(self, mpm.LevenbergMarquardt(), found, [1.0], [0.0], (jnp.ones(()),), {}, 0.95)
 
 
 @pytest.mark.parametrize(

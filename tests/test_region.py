@@ -21,6 +21,8 @@ REGIONS = {
     "capsule-3d": mpm.Capsule((-0.3, -0.1, 0.1), (0.3, 0.2, -0.1), 0.2),
     "cylinder-2d": mpm.Cylinder((-0.3, -0.1), (0.3, 0.2), 0.2),
     "cylinder-3d": mpm.Cylinder((-0.3, -0.1, 0.1), (0.3, 0.2, -0.1), 0.25),
+    "annulus-2d": mpm.Annulus((0.1, -0.1), 0.3, 0.5),
+    "tube-3d": mpm.Tube((-0.3, -0.1, 0.1), (0.3, 0.2, -0.1), 0.15, 0.35),
     "half_space-2d": mpm.HalfSpace((0.1, 0.1), (3.0, 4.0)),
     "half_space-3d": mpm.HalfSpace((0.1, 0.1, 0.0), (3.0, 4.0, -1.0)),
     "union-2d": mpm.Union((mpm.Ball((-0.4, 0.0), 0.2), mpm.Box((0.1, -0.3), (0.5, 0.3)))),
@@ -34,6 +36,19 @@ def points(region, count=200):
     return jnp.asarray(np.random.default_rng(1).uniform(-0.8, 0.8, (count, region.dim)))
 
 
+def across_of(a, b, sphere):
+    """Directions at right angles to an axis."""
+    axis = (b - a) / np.linalg.norm(b - a)
+    across = sphere - (sphere @ axis)[:, None] * axis
+    return across / np.linalg.norm(across, axis=1, keepdims=True)
+
+
+def lateral_points(region, sphere, rng):
+    """Points of the lateral surface about an axis."""
+    a, b = np.asarray(region.start), np.asarray(region.end)
+    return a + rng.random((len(sphere), 1)) * (b - a) + region.radius * across_of(a, b, sphere)
+
+
 @functools.cache
 def surface_of(region_name):
     """Points of the surface and whether a point is inside, each from the set's own definition."""
@@ -45,6 +60,15 @@ def surface_of(region_name):
     match region:
         case mpm.Ball():
             return np.asarray(region.centre) + region.radius * sphere
+        case mpm.Annulus():
+            radius = np.where(rng.random((n, 1)) < 0.5, region.inner, region.outer)
+            return np.asarray(region.centre) + radius * sphere
+        case mpm.Tube():
+            round_one = [mpm.Cylinder(region.start, region.end, r) for r in (region.inner, region.outer)]
+            lateral = np.concatenate([lateral_points(c, sphere, rng) for c in round_one])
+            a, b = np.asarray(region.start), np.asarray(region.end)
+            radii = np.sqrt(rng.uniform(region.inner**2, region.outer**2, (n, 1)))
+            return np.concatenate([lateral, np.where(rng.random((n, 1)) < 0.5, a, b) + radii * across_of(a, b, sphere)])
         case mpm.Box():
             lower, upper = (np.asarray(a) for a in region.bounds())
             x = rng.uniform(lower, upper, (n, d))
@@ -53,10 +77,8 @@ def surface_of(region_name):
             return x
         case mpm.Capsule() | mpm.Cylinder():
             a, b = np.asarray(region.start), np.asarray(region.end)
-            axis = (b - a) / np.linalg.norm(b - a)
-            across = sphere - (sphere @ axis)[:, None] * axis
-            across /= np.linalg.norm(across, axis=1, keepdims=True)
-            side = a + rng.random((n, 1)) * (b - a) + region.radius * across
+            axis, across = (b - a) / np.linalg.norm(b - a), across_of(a, b, sphere)
+            side = lateral_points(region, sphere, rng)
             if isinstance(region, mpm.Cylinder):
                 cap = np.where(rng.random((n, 1)) < 0.5, a, b) + region.radius * np.sqrt(rng.random((n, 1))) * across
             else:
@@ -92,6 +114,12 @@ def inside(region, x):
             return (x - np.asarray(region.point)) @ np.asarray(region.normal) < 0
         case mpm.Union():
             return np.any([inside(r, x) for r in region.regions], axis=0)
+        case mpm.Annulus():
+            r = np.linalg.norm(x - np.asarray(region.centre), axis=1)
+            return (r > region.inner) & (r < region.outer)
+        case mpm.Tube():
+            inner, outer = (mpm.Cylinder(region.start, region.end, r) for r in (region.inner, region.outer))
+            return inside(outer, x) & ~inside(inner, x)
     a, axis = np.asarray(region.start), np.asarray(region.end) - np.asarray(region.start)
     s = (x - a) @ axis / (axis @ axis)
     near = s.clip(0, 1) if isinstance(region, mpm.Capsule) else s
@@ -159,6 +187,8 @@ def test_the_middle_has_a_direction_too():
         mpm.Capsule((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.2): [[0.5, 0.0, 0.0]],
         mpm.Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 2.0): [[0.3, 0.0, 0.5], [0.0, 0.0, 0.5]],
         mpm.Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 4.0), 0.5): [[0.0, 0.0, 2.0]],
+        mpm.Annulus((0.2, 0.1), 0.3, 0.5): [[0.2, 0.1], [0.6, 0.1]],
+        mpm.Tube((0.0, 0.0, 0.0), (0.0, 0.0, 4.0), 0.5, 0.7): [[0.0, 0.0, 2.0], [0.6, 0.0, 2.0]],
     }
     for region, points in middles.items():
         gradient = jax.grad(lambda x, region=region: region.distance(x).sum())(jnp.asarray(points))
@@ -221,7 +251,7 @@ def test_any_bounded_region_can_be_filled(region):
     axis = 0.0 if isinstance(region, mpm.Union) else float(np.linalg.norm(np.subtract(region.end, region.start)))
     volume = {2: 0.4 * axis + np.pi * 0.2**2, 3: np.pi * 0.25**2 * axis}[region.dim]
     volume = np.pi * 0.2**2 + 0.24 if isinstance(region, mpm.Union) else volume
-    np.testing.assert_allclose(particles.volume.sum(), volume, rtol=0.02)
+    np.testing.assert_allclose(particles.volume.sum(), volume, rtol=5e-4)
 
 
 @pytest.mark.parametrize(
@@ -231,6 +261,10 @@ def test_any_bounded_region_can_be_filled(region):
         (lambda: mpm.HalfSpace((0.0, 0.0), (0.0, 0.0, 1.0)), "as many coordinates"),
         (lambda: mpm.Capsule((0.0, 0.0), (0.0, 0.0), 1.0), "ends must differ"),
         (lambda: mpm.Cylinder((0.0,), (1.0,), 1.0), "take a Box"),
+        (lambda: mpm.Annulus((0.0, 0.0, 0.0), 0.1, 0.2), "take a Tube"),
+        (lambda: mpm.Annulus((0.0, 0.0), 0.2, 0.1), "inner radius must lie below"),
+        (lambda: mpm.Tube((0.0, 0.0), (1.0, 0.0), 0.1, 0.2), "take an Annulus"),
+        (lambda: mpm.Tube((0.0,) * 3, (1.0, 0.0, 0.0), 0.0, 0.2), "inner radius must be greater than zero"),
         (lambda: mpm.Cylinder((0.0, 0.0), (1.0, 0.0), -1.0), "radius must be greater than zero"),
         (lambda: mpm.Union(()), "at least one region"),
         (lambda: mpm.Union((mpm.Ball((0.0,), 1.0), mpm.Ball((0.0, 0.0), 1.0))), "the same dimension"),

@@ -20,6 +20,7 @@ from mpmjax.stepping import AbstractIntegrator
 
 GRID = mpm.Grid((8, 9), 0.1, origin=(-2, 3), periodic=(True, False))
 GRIP = mpm.Grip(mpm.Box((-np.inf, 0.0), (0.1, 1.0)), mpm.Motion((0.0, 0.3), ((0.0, 0.0), (0.1, 0.7))), (True, False))
+PATCH = mpm.Patch(mpm.Ball((0.1, 0.2), 0.3), mpm.Box((0.0, 0.0), (1.0, 1.0)), 0.05)
 EXAMPLES = {
     mpm.Scene: mpm.Scene(
         GRID,
@@ -47,10 +48,11 @@ EXAMPLES = {
     mpm.Snow: mpm.Snow(1e5, hardening=7.0),
     mpm.Viscous: mpm.Viscous(mpm.NeoHookean(1e5, 0.4), 3.0, 1.0),
     mpm.Fluid: mpm.Fluid(2e5, 1.4, tension=True),
-    mpm.StickyBox: mpm.StickyBox((0.1,), (0.9,)),
+    mpm.StickyBox: mpm.StickyBox((0.1,), (0.9,), mpm.Motion((0.0, 1.0), ((0.0,), (0.1,)))),
     mpm.SlipBox: mpm.SlipBox((0.1, -np.inf), (np.inf, 0.7)),
     mpm.SeparatingBox: mpm.SeparatingBox((0.1,), (0.9,), friction=0.3),
     mpm.Grip: GRIP,
+    mpm.RigidPart: mpm.RigidPart(mpm.Ball((0.1, 0.2), 0.3), (True, False)),
     mpm.SymmetryPlane: mpm.SymmetryPlane(1, 0.05, "below"),
     mpm.ContactPlane: mpm.ContactPlane(1, 0.05, "below", friction=0.3),
     mpm.Box: mpm.Box((0.0, 0.1, 0.2), (1.0, 1.1, 1.2)),
@@ -58,11 +60,23 @@ EXAMPLES = {
     mpm.HalfSpace: mpm.HalfSpace((0.1, 0.2), (3.0, 4.0)),
     mpm.Capsule: mpm.Capsule((0.1, 0.2), (0.3, 0.4), 0.1),
     mpm.Cylinder: mpm.Cylinder((0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 0.1),
+    mpm.Annulus: mpm.Annulus((0.1, 0.2), 0.3, 0.4),
+    mpm.Tube: mpm.Tube((0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 0.1, 0.2),
     mpm.Union: mpm.Union((mpm.Ball((0.1, 0.2), 0.3), mpm.Box((0.0, 0.1), (1.0, 1.1)))),
     mpm.SampledDistance: mpm.SampledDistance((0.1, 0.2), 0.1, np.linspace(-1, 1, 20).reshape(4, 5)),
     mpm.StickyCollider: mpm.StickyCollider(mpm.Ball((0.1, 0.2), 0.3), GRIP.motion),
     mpm.SlipCollider: mpm.SlipCollider(mpm.HalfSpace((0.1, 0.2), (0.0, 1.0))),
     mpm.SeparatingCollider: mpm.SeparatingCollider(mpm.Ball((0.1,), 0.3), friction=0.2),
+    mpm.Traction: mpm.Traction(PATCH, (1.0, 2.0)),
+    mpm.Pressure: mpm.Pressure(PATCH, mpm.TimeSeries((0.0, 1.0), (0.0, 2.0)), following=False),
+    mpm.PointLoad: mpm.PointLoad(mpm.PointsAt(((0.1, 0.2), (0.3, 0.4))), (1.0, 2.0)),
+    mpm.Spring: mpm.Spring(mpm.PointsAt(((0.1, 0.2),), (2.0,)), (1.0, 2.0), 3.0, GRIP.motion),
+    mpm.Patch: PATCH,
+    mpm.PointsAt: mpm.PointsAt(((0.1, 0.2), (0.3, 0.4)), (0.5, 1.5)),
+    mpm.AttachedPoints: mpm.AttachedPoints(
+        np.zeros(1), np.ones((1, 2)), np.ones(1), np.full((1, 2), 0.3), np.array([[0.0, 1.0]])
+    ),
+    mpm.TimeSeries: mpm.TimeSeries((0.0, 1.0), ((0.0, 1.0), (2.0, 3.0))),
     mpm.Motion: GRIP.motion,
     mpm.RigidMotion: mpm.RigidMotion((0.0, 1.0), ((0.0, 0.0), (0.1, 0.2)), (0.0, 0.5), (0.3, 0.4)),
     mpm.BSpline: mpm.BSpline(1),
@@ -228,6 +242,14 @@ BODIES = {
     "capsule": (
         'kind = "SeparatingCollider"\nshape = { kind = "Capsule", start = [0, 0], end = [0.5, 0.5], radius = 0.1 }',
         mpm.SeparatingCollider(mpm.Capsule((0.0, 0.0), (0.5, 0.5), 0.1)),
+    ),
+    "annulus": (
+        'kind = "SlipCollider"\nshape = { kind = "Annulus", centre = [0, 0], inner = 0.1, outer = 0.2 }',
+        mpm.SlipCollider(mpm.Annulus((0.0, 0.0), 0.1, 0.2)),
+    ),
+    "tube": (
+        'kind = "SlipCollider"\nshape = { kind = "Tube", start = [0, 0, 0], end = [0, 0, 1], inner = 1, outer = 2 }',
+        mpm.SlipCollider(mpm.Tube((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 1.0, 2.0)),
     ),
     "samples": (
         'kind = "SlipCollider"\n'

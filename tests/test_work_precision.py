@@ -11,7 +11,7 @@ from helpers import assert_close
 
 import mpmjax as mpm
 from mpmjax import Trial, WorkPrecision
-from mpmjax.analysis._bench import FRAMES, Bench
+from mpmjax.analysis._bench import FRAMES, Bench, Timed
 from mpmjax.analysis._reference_run import settle
 from mpmjax.verification import StandingWave, discretise
 from mpmjax.viz._chart import draw_chart, write_trials
@@ -123,7 +123,7 @@ def test_a_reference_that_takes_too_long_is_foreseen_and_refused():
 
 def test_what_a_call_takes_is_not_foreseen_for_every_step(monkeypatch):
     """With 5 ms a call and 50 µs a step, a million steps are foreseen to take 50 s to a few per cent."""
-    monkeypatch.setattr(Bench, "timed", lambda self, method, steps, frames, each: (None, 5e-3 + 50e-6 * each))
+    monkeypatch.setattr(Bench, "timed", lambda self, method, steps, frames, each: Timed(None, 0.0, 5e-3 + 50e-6 * each))
     bench = Bench.of(pulled, 1, 10.0)
     assert_close(bench.foresee(mpm.Explicit(), 10**6), 50.0, 0.03)
 

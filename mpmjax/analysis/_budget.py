@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, Matrix, NodeVector, Scalar, components
 from mpmjax.analysis._diagnostics import energy_density, energy_of
-from mpmjax.checks import canonical, checked, require_positive
+from mpmjax.checks import canonical, checked, require, require_positive
 from mpmjax.discretisation import Gathered, Stencil, gather, scatter
 from mpmjax.state import Particles, Scene, prepare
 from mpmjax.stepping import (
@@ -33,7 +33,8 @@ class EnergyBudget(eqx.Module):
     kinetic: Float[Array, "*f"]
     """Change of the particles' kinetic energy, with that of their affine motion."""
     elastic: Float[Array, "*f"]
-    """Change of Σ V0 Ψ(F)."""
+    """Change of Σ V0 Ψ(F), and of the energy of springs to the ground by what they hold; that by a ground that moves is
+    left out."""
     potential: Float[Array, "*f"]
     """Change of −Σ m g·x, minus the work of gravity."""
     p2g: Float[Array, "*f"]
@@ -50,9 +51,9 @@ class EnergyBudget(eqx.Module):
     friction: Float[Array, "*f"]
     """Work of friction, ≤ 0."""
     body_force: Float[Array, "*f"]
-    """Work of the scene's body force."""
+    """Work of the scene's body force and loads."""
     viscous: Float[Array, "*f"]
-    """Dissipation by viscosity, Δt Σ V σ_v : D ≥ 0, at the velocity in the viscous force."""
+    """Dissipation by viscosity and dashpots, Δt Σ V σ_v : D ≥ 0, at the velocity in the viscous force."""
     plastic: Float[Array, "*f"]
     """Dissipation by return maps, Σ V0 (Ψ(trial deformation) − Ψ(returned deformation)), with the change of Ψ by
     hardening. If a step strains by many times the yield strain, the energy that it stores before the return is in
@@ -91,15 +92,15 @@ class MomentumBudget(eqx.Module):
     gravity: Float[Array, "*f d"]
     """Impulse of gravity."""
     body_force: Float[Array, "*f d"]
-    """Impulse of the scene's body force."""
+    """Impulse of the scene's body force and loads."""
     boundary: Float[Array, "*f d"]
     """Impulse of walls and grips, and the residual of the solve."""
     friction: Float[Array, "*f d"]
     """Impulse of friction."""
     elastic: Float[Array, "*f d"]
-    """Impulse of the elastic force."""
+    """Impulse of the elastic force, and of springs to the ground."""
     viscous: Float[Array, "*f d"]
-    """Impulse of viscosity."""
+    """Impulse of viscosity and dashpots."""
     transfer: Float[Array, "*f d"]
     """Change by the transfers."""
 
@@ -141,9 +142,14 @@ def budget(
         the particles after the last step, and the budget, each of its terms with a leading axis f.
 
     Raises:
-        ValueError: from `prepare`, or a step that is not positive.
+        ValueError: from `prepare`, a step that is not positive, or a plane of symmetry that moves.
     """
     require_positive("dt [s]", dt)
+    require(
+        not scene.moving_mirrors,
+        "A budget does not know the work of a SymmetryPlane that moves: take a plane at rest, in its own frame, "
+        "or a SlipCollider of a HalfSpace.",
+    )
     scene, dt, method = canonical((scene, dt, method), particles.x.dtype)
     return _budget(scene, prepare(scene, particles), jnp.asarray(start, particles.x.dtype), dt, method, steps)
 
@@ -153,11 +159,12 @@ def _budget(
     scene: Scene, particles: Particles, start: Array, dt: Scalar, method: AbstractIntegrator, steps: int
 ) -> tuple[Particles, Budget]:
     def body(before: Particles, n: Array) -> tuple[Particles, Budget]:
-        stencil = scene.stencil(before)
+        t = (start + n) * dt
+        stencil = scene.stencil(before, t)
         nodes = particles_to_grid(
             scene,
             before,
-            (start + n) * dt,
+            t,
             dt,
             stencil,
             body_force_at=method.body_force_at,
@@ -194,8 +201,13 @@ def _step_budget(
     # viscosity: its impulse, and what it dissipates of the velocity that it resists
     C, resisted = None if before.C is None else components(before.C), new.motion.resisted
     viscous, dissipated = jnp.zeros_like(v0), jnp.zeros((), v0.dtype)
-    if new.viscous is not None and C is not None:
-        power = (potential.viscous_flux(C) * C).sum() if resisted is None else potential.power(resisted)
+    if new.viscous is not None:
+        if resisted is not None:
+            power = potential.power(resisted)
+        else:
+            power = sum((support.drag_power() for support in potential.supports), dissipated)
+            if potential.material_viscous and C is not None:
+                power = power + (potential.viscous_flux(C) * C).sum()
         viscous, dissipated = new.viscous, dt * power
     assert new.internal is not None and new.before is not None  # P2G was asked for momentum and force apart
     elastic = new.internal if new.viscous is None else new.internal - new.viscous
@@ -217,13 +229,15 @@ def _step_budget(
             kept = kept + (before.mass * (C_new**2 * turn).sum(axis=(0, 1))).sum() / 2
 
     old, new_energy = energy_of(scene, before), energy_of(scene, after)
-    stored = potential.energy(dt * new.motion.carrier)
+    moved_by = dt * new.motion.carrier
+    stored = potential.energy(moved_by)
+    springs = sum(potential.support_energies(moved_by)) - sum(potential.support_energies(jnp.zeros_like(v0)))
     share = jnp.where(nodes.occupied, images.fold(jnp.broadcast_to(raw, v0.shape)), 0)
     share = nodes.per_mass(share)  # of an impulse at a node in the particles' momentum: 1 but at symmetry planes
     return Budget(
         EnergyBudget(
             kinetic=new_energy.kinetic - old.kinetic,
-            elastic=new_energy.elastic - old.elastic,
+            elastic=new_energy.elastic - old.elastic + springs,
             potential=new_energy.potential - old.potential,
             p2g=lost_p2g,
             g2p=lost_g2p - kept,

@@ -117,7 +117,7 @@ def _resolved_in_time(
 def _refined_run(
     bench: Bench, method: AbstractIntegrator, steps: int, before: _RefinedRun | None, say: Say
 ) -> _RefinedRun:
-    states, seconds = bench.run(method, steps)
+    states, _, seconds = bench.run(method, steps)
     motion = None if states is None else bench.motion(states)
     coarse = None if before is None else before.motion
     change = math.inf if motion is None or coarse is None else coarse.distance(motion)

@@ -1,9 +1,25 @@
 """Walls, grips, mirrored planes and colliders, and what colliders receive."""
 
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall
+from mpmjax.boundary._boundary_impulse import (
+    BoundaryImpulse,
+    Given,
+    Owners,
+    impulse_on_boundaries,
+    no_boundary_impulse,
+    owners_of,
+    taken_by_mirrors,
+)
 from mpmjax.boundary._collider import AbstractCollider, SeparatingCollider, SlipCollider, StickyCollider
 from mpmjax.boundary._collider_impulse import ColliderImpulse, impulse_on_colliders, no_impulse
-from mpmjax.boundary._combined import combined_conditions, contacts_of, mirror
+from mpmjax.boundary._combined import (
+    brought_contacts,
+    brought_images,
+    combined_conditions,
+    contacts_of,
+    mirror,
+    mirror_motion,
+)
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import (
     AbstractContact,
@@ -15,8 +31,9 @@ from mpmjax.boundary._contact import (
     no_contact,
 )
 from mpmjax.boundary._grip import Grip
-from mpmjax.boundary._mirror import Image, Mirror
+from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion, Tie
 from mpmjax.boundary._planes import ContactPlane, SymmetryPlane
+from mpmjax.boundary._rigid_part import RigidPart
 from mpmjax.boundary._walls import SeparatingBox, SlipBox, StickyBox
 
 __all__ = [
@@ -25,14 +42,19 @@ __all__ = [
     "AbstractCollider",
     "AbstractContact",
     "AbstractNodes",
+    "BoundaryImpulse",
     "ColliderImpulse",
     "Conditions",
     "ConstrainedNodes",
     "ContactInfo",
     "ContactPlane",
+    "Given",
     "Grip",
     "Image",
     "Mirror",
+    "MirrorMotion",
+    "Owners",
+    "RigidPart",
     "SeparatingBox",
     "SeparatingCollider",
     "SlipBox",
@@ -40,13 +62,21 @@ __all__ = [
     "StickyBox",
     "StickyCollider",
     "SymmetryPlane",
+    "Tie",
     "Wall",
+    "brought_contacts",
+    "brought_images",
     "combined_conditions",
     "constrain",
     "contacts_of",
     "find_active_set",
+    "impulse_on_boundaries",
     "impulse_on_colliders",
     "mirror",
+    "mirror_motion",
+    "no_boundary_impulse",
     "no_contact",
     "no_impulse",
+    "owners_of",
+    "taken_by_mirrors",
 ]

@@ -10,11 +10,12 @@ from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 
-from mpmjax._types import Array, Bool, Float, Int, NodeVector, ParticleVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, Mask, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact
-from mpmjax.boundary._mirror import Image
+from mpmjax.boundary._mirror import Image, MirrorMotion, Tie
 from mpmjax.discretisation import Grid
+from mpmjax.geometry import Motion
 
 ON_THE_WALL = 1e-3
 """Distance within which a node is on a wall, in spacings."""
@@ -92,10 +93,23 @@ class AbstractBoundary(eqx.Module):
         del conditions, grid, window, t, dt
         return ()
 
-    def mirror_images(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, ...]:
+    def mirror_images(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image | Tie, ...]:
         """The mirrors that it puts in the window (see `mirror_image`). Default: none."""
         del grid, window
         return ()
+
+    def mirror_motion(self, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar) -> MirrorMotion | None:
+        """What its mirrors that move add to the velocity of the nodes beyond them in the step from t to t + dt. None if
+        none moves, which is the default."""
+        del grid, window, t, dt
+        return None
+
+    def mirror(self) -> tuple[int, Motion | None] | None:
+        """The axis across which it has a mirror, and its motion, None if it rests. Default: None, it has no mirror.
+
+        In the updated description the grid moves with a mirror, so that it lies on nodes or half-way between them.
+        """
+        return None
 
     def check(self, grid: Grid, *, total: bool) -> None:
         """Check that it can stand in a scene. Default: it can.
@@ -118,6 +132,30 @@ class AbstractBoundary(eqx.Module):
         """The signed distance [m] of points x [m], shape (m, d), from the body that it is at time t, for pictures and
         for warnings of what lies in it. Default: None, it is no body."""
         del x, t
+        return None
+
+    def spread(self, fixed: Mask, value: Array, nodes: NodeVector, spacing: Scalar) -> tuple[Mask, Array]:
+        """What boundaries prescribe, where one that does so at one of its nodes means all of them. Default: as it is.
+
+        Args:
+            fixed: components of velocity that are prescribed, shape (n, d).
+            value: what belongs to them, shape (n, d).
+            nodes: positions of the nodes [m], shape (n, d).
+            spacing: dx [m].
+        """
+        del nodes, spacing
+        return fixed, value
+
+    def carried(self, nodes: NodeVector, t: Scalar) -> NodeVector | None:
+        """Where reference nodes at these positions are at time t [m], shape (n, d), if it holds them with all of their
+        components. Default: None, that is not known."""
+        del nodes, t
+        return None
+
+    def pivot(self, t: Scalar) -> Float[Array, "d"] | None:
+        """The point at time t [m], shape (d,), about which its torque is taken. Default: None, the origin of the
+        coordinates."""
+        del t
         return None
 
     def rests(self, *, total: bool) -> bool:

@@ -47,6 +47,11 @@ class AbstractCollider(AbstractBoundary):
         """The signed distance [m] of each of the points x [m], shape (m, d), from the body as it is at time t."""
         return self.shape.distance(x if self.motion is None else self.motion.origin(x, t))
 
+    def pivot(self, t: Scalar) -> Float[Array, "d"]:
+        """The centre of the rotation or, without one, the shape's middle."""
+        middle = jnp.asarray(self.shape.middle())
+        return middle if self.motion is None else self.motion.pivot(middle, t)
+
     def rests(self, *, total: bool) -> bool:
         return total or self.motion is None or self.motion.rests()
 

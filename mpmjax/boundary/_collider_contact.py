@@ -1,10 +1,10 @@
 """Contact with separating colliders."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, NodeScalar, NodeVector
+from mpmjax._types import Array, Bool, Int, NodeScalar, NodeVector
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
 
@@ -51,6 +51,9 @@ class ColliderContact(AbstractContact):
         stopping = mass * jnp.sqrt(jnp.where(slides, square, 1))
         share = jnp.where(slides, jnp.minimum(limit / jnp.where(slides, stopping, 1), 1), 0)
         return -share[:, None] * slip
+
+    def owner(self, owners: Any) -> Int[Array, "n"]:
+        return owners.collider
 
     def normals(self, active: Array) -> Bool[Array, "n"]:
         return active

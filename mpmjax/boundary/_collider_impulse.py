@@ -57,11 +57,11 @@ def impulse_on_colliders(
         given = jnp.where((colliders.owner == number)[:, None], along, 0)
         given = given + jnp.where(colliders.holder == number, reaction, 0)
         impulse.append(-given.sum(axis=0))
-        angular.append(-_moment(colliders.position - pivot, given).sum(axis=0))
+        angular.append(-moment(colliders.position - pivot, given).sum(axis=0))
     return ColliderImpulse(jnp.stack(impulse), jnp.stack(angular))
 
 
-def _moment(arm: NodeVector, force: NodeVector) -> Float[Array, "n r"]:
+def moment(arm: NodeVector, force: NodeVector) -> Float[Array, "n r"]:
     """arm × force: (r_y f_z − r_z f_y, r_z f_x − r_x f_z, r_x f_y − r_y f_x), in 2-D the last alone."""
     d = arm.shape[1]
     if d == 3:

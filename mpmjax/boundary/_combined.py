@@ -8,7 +8,7 @@ from mpmjax.boundary._boundary import AbstractBoundary
 from mpmjax.boundary._collider_contact import collider_contacts
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact
-from mpmjax.boundary._mirror import Mirror
+from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion, Tie
 from mpmjax.boundary._wall_contact import wall_contacts
 from mpmjax.discretisation import Grid
 
@@ -45,6 +45,9 @@ def combined_conditions(
             mine = eqx.tree_at(lambda c: c.holder, new.colliders, holder)
             colliders = mine if colliders is None else colliders.beside(mine)
         total = Conditions(total.fixed | new.fixed, velocity, side, friction, colliders)
+    for boundary in boundaries:
+        fixed, velocity = boundary.spread(total.fixed, total.velocity, nodes, spacing)
+        total = Conditions(fixed, velocity, total.side, total.friction, total.colliders)
     if total.side is None:
         return total
     side = jnp.where(total.fixed, 0, total.side)
@@ -72,12 +75,46 @@ def contacts_of(
         t: time [s].
         dt: step [s].
     """
-    found: list[AbstractContact] = [*wall_contacts(conditions), *collider_contacts(conditions)]
-    for boundary in boundaries:
-        found += boundary.contacts(conditions, grid, window, t, dt)
-    return tuple(sorted(found, key=lambda contact: contact.friction_order))
+    return tuple(contact for _, contact in brought_contacts(boundaries, conditions, grid, window, t, dt))
+
+
+def brought_contacts(
+    boundaries: tuple[AbstractBoundary, ...],
+    conditions: Conditions,
+    grid: Grid,
+    window: Int[Array, "d"],
+    t: Scalar,
+    dt: Scalar,
+) -> list[tuple[int | None, AbstractContact]]:
+    """The contacts of `contacts_of`, each with the number of the boundary that brings it, None for those of the
+    combined conditions."""
+    found: list[tuple[int | None, AbstractContact]]
+    found = [(None, contact) for contact in (*wall_contacts(conditions), *collider_contacts(conditions))]
+    for number, boundary in enumerate(boundaries):
+        found += [(number, contact) for contact in boundary.contacts(conditions, grid, window, t, dt)]
+    return sorted(found, key=lambda brought: brought[1].friction_order)
 
 
 def mirror(boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"]) -> Mirror:
     """The mirror images that the boundaries of a scene put in the window."""
-    return Mirror(tuple(image for boundary in boundaries for image in boundary.mirror_images(grid, window)))
+    return Mirror(tuple(image for _, image in brought_images(boundaries, grid, window)))
+
+
+def mirror_motion(
+    boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
+) -> MirrorMotion | None:
+    """What all mirrors that move add to the velocity of the nodes beyond them; None if none moves."""
+    total = None
+    for boundary in boundaries:
+        own = boundary.mirror_motion(grid, window, t, dt)
+        if own is not None and total is not None:
+            own = MirrorMotion(total.beyond | own.beyond, jnp.where(total.beyond, total.velocity, own.velocity))
+        total = total if own is None else own
+    return total
+
+
+def brought_images(
+    boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"]
+) -> list[tuple[int, Image | Tie]]:
+    """The images of `mirror`, each with the number of its boundary."""
+    return [(n, image) for n, boundary in enumerate(boundaries) for image in boundary.mirror_images(grid, window)]

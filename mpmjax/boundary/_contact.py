@@ -179,6 +179,16 @@ class AbstractContact(eqx.Module):
         del held, v, noise
         return None
 
+    def owner(self, owners: Any) -> Int[Array, "n"] | None:
+        """The number of the boundary whose contact it is at each node, shape (n,). Default: None, the one that brought
+        it is everywhere.
+
+        Args:
+            owners: which boundaries act where (`Owners`).
+        """
+        del owners
+        return None
+
     def representative(self) -> Bool[Array, "n"] | None:
         """One node of each place, shape (n,), by which places are counted; None where each node is a place."""
         return None
@@ -278,21 +288,19 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         """How many places pull or are entered."""
         return _count(self.unheld, *self.violations(v, residual))
 
-    def friction(self, v: NodeVector, residual: NodeVector) -> tuple[NodeVector, NodeVector | None]:
-        """The velocity after Coulomb friction, one contact after the other, and the impulse of colliders' friction
-        [kg m/s]; None without any.
+    def friction(self, v: NodeVector, residual: NodeVector) -> tuple[NodeVector, tuple[NodeVector, ...]]:
+        """The velocity after Coulomb friction, one contact after the other, and the change of velocity by each [m/s].
 
         Args:
             v: velocity of all nodes after the solve [m/s], shape (n, d).
             residual: the impulse that is missing at each node [kg m/s], shape (n, d).
         """
-        impulse = None
+        changes = []
         for contact, active in zip(self.unheld.contacts, self.active, strict=True):
             change = contact.friction(self, active, v, residual)
             v = v + change
-            if contact.of_collider:
-                impulse = self.unheld.mass[:, None] * self.images.unfold(change)
-        return self.images.unfold(v), impulse
+            changes.append(self.images.unfold(change))
+        return self.images.unfold(v), tuple(changes)
 
 
 def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:

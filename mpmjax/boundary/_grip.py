@@ -3,41 +3,38 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import NodeVector, Scalar
+from mpmjax._types import Array, Float, NodeVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.checks import require, require_fields
-from mpmjax.geometry import AbstractRegion, Motion
+from mpmjax.geometry import AbstractMotion, AbstractRegion, Motion
 
 
 class Grip(AbstractBoundary):
-    """A region of nodes with a prescribed velocity. The region moves with that velocity.
+    """A region of nodes with a prescribed motion, which may turn. The region moves with it.
 
-    In the total description the region is that of the reference configuration. In a periodic direction the region does
-    not wrap: it must stay within the window's extent. The region only selects nodes, so derivatives by
-    its floats are zero; those by the floats of the motion are not.
+    A node has the velocity of the grip's own point that is there, the chord over the step; where the grip turns,
+    material in it follows the circle and not its tangent. In the total description the region is that of the reference
+    configuration. In a periodic direction the region does not wrap: it must stay within the window's extent. The region
+    only selects nodes, so derivatives by its floats are zero; those by the floats of the motion are not.
 
     Args:
         region: region at zero displacement.
-        motion: displacement of the grip in time.
-        axes: the directions in which it holds, one bool each. Default: all of them.
+        motion: how it moves: a `Motion`, or a `RigidMotion`, which turns too.
+        axes: the directions in which it holds, one bool each. Default: all of them. They do not turn.
     """
 
     region: AbstractRegion
-    motion: Motion
+    motion: Motion | AbstractMotion  # in files a Motion where no kind is given
     axes: tuple[bool, ...] | None = eqx.field(
         static=True, default=None, converter=lambda a: tuple(a) if isinstance(a, list) else a
     )
 
     @property
     def dim(self) -> int:
-        return jnp.shape(jnp.asarray(self.motion.displacement))[1]
+        return self.motion.dim
 
     def __check_init__(self):
-        require(
-            not getattr(self.motion, "turns", False),  # anything may have been given
-            f"A grip does not turn: take a StickyCollider, got the motion {self.motion}.",
-        )
         require_fields(self)
         d = self.dim
         require(
@@ -51,11 +48,18 @@ class Grip(AbstractBoundary):
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v is the velocity of the motion."""
-        place = nodes if reference else nodes - self.motion.at(t)
+        place = nodes if reference else self.motion.origin(nodes, t)
         held = self.region.contains(place, ON_THE_WALL * spacing)[:, None]
         axes = jnp.ones(nodes.shape[1], dtype=bool) if self.axes is None else jnp.asarray(self.axes)
         fixed = held & axes
-        return Conditions(fixed, jnp.where(fixed, self.motion.velocity(t, dt), 0))
+        return Conditions(fixed, jnp.where(fixed, self.motion.velocity_of(place, t, dt), 0))
+
+    def carried(self, nodes: NodeVector, t: Scalar) -> NodeVector:
+        return nodes + self.motion.place(nodes, t) - self.motion.place(nodes, 0.0)
+
+    def pivot(self, t: Scalar) -> Float[Array, "d"]:
+        """The region's middle."""
+        return self.motion.pivot(jnp.asarray(self.region.middle()), t)
 
     def rests(self, *, total: bool) -> bool:
         return total or self.motion.rests()

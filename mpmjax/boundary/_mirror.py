@@ -6,11 +6,14 @@ implicit one is Bᵀ(M + βΔt²H)B. The transfers know nothing of it. At a `Sym
 a `ContactPlane` only in the *columns* (lines of nodes along the normal) that it holds.
 """
 
+from dataclasses import replace
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, Int, NodeScalar, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.discretisation import Grid
 
 
@@ -24,6 +27,9 @@ class Image(eqx.Module):
     odd: Int[Array, "m"]
     held: Bool[Array, "n"] | None = None
     """The nodes in columns where there is a mirror; None for all of them."""
+    moving: bool = eqx.field(static=True, default=False)
+    """Whether the mirror moves along its normal with a velocity V. The normal velocity of a node beyond it is then 2V
+    minus that of its image, and V on it. What a node on it or beyond has itself, V or 2V, is the part that is added."""
 
     def scalar(self, field: NodeScalar) -> NodeScalar:
         """B for an even scalar field."""
@@ -32,11 +38,18 @@ class Image(eqx.Module):
     def vector(self, field: NodeVector) -> NodeVector:
         """B for a vector field: tangential components even, the normal one odd."""
         normal = jnp.arange(field.shape[1]) == self.axis
-        return self._copy(field, jnp.where(normal, self.odd[:, None], self.even[:, None]))
+        copied = self._copy(field, jnp.where(normal, self.odd[:, None], self.even[:, None]))
+        if not self.moving:
+            return copied
+        return copied + jnp.where(self.along(self.odd <= 0)[:, None] & normal, field, 0)
+
+    def at_rest(self) -> "Image":
+        """The same of a mirror that does not move."""
+        return replace(self, moving=False)
 
     def within(self, held: Bool[Array, "n"]) -> "Image":
         """The mirror in some columns only."""
-        return Image(self.shape, self.axis, self.source, self.even, self.odd, held)
+        return Image(self.shape, self.axis, self.source, self.even, self.odd, held, self.moving)
 
     def along(self, values: Array) -> Array:
         """Values along the axis, shape (m,), at all nodes, shape (n,)."""
@@ -59,10 +72,40 @@ class Image(eqx.Module):
         return copied if self.held is None else jnp.where(self.held[:, None], copied, field)
 
 
+class Tie(eqx.Module):
+    """One velocity for several nodes, that of the first: the map B of a rigid part, used as those of mirrors are."""
+
+    tied: Bool[Array, "n"]
+    """The nodes tied together."""
+    axis: ClassVar[int] = -1
+    moving: ClassVar[bool] = False
+
+    def scalar(self, field: NodeScalar) -> NodeScalar:
+        """B for a scalar field."""
+        return jnp.where(self.tied, field[jnp.argmax(self.tied)], field)
+
+    def vector(self, field: NodeVector) -> NodeVector:
+        """B for a vector field."""
+        return jnp.where(self.tied[:, None], field[jnp.argmax(self.tied)], field)
+
+    def at_rest(self) -> "Tie":
+        """The same map: a tie has no motion of its own."""
+        return self
+
+
+class MirrorMotion(eqx.Module):
+    """What mirrors that move add to the velocity of the nodes beyond them (see `Image.moving`)."""
+
+    beyond: Mask
+    """The normal components of the nodes beyond such a mirror, shape (n, d)."""
+    velocity: NodeVector
+    """2V there [m/s], shape (n, d); zero elsewhere."""
+
+
 class Mirror(eqx.Module):
     """The mirrors of several planes: `unfold` applies B, from true nodes to all nodes; `fold` applies Bᵀ."""
 
-    images: tuple[Image, ...]
+    images: tuple[Image | Tie, ...]
 
     def unfold(self, field: NodeVector) -> NodeVector:
         """B v: fill in the mirror images."""
@@ -71,8 +114,18 @@ class Mirror(eqx.Module):
         return field
 
     def fold(self, field: NodeVector) -> NodeVector:
-        """Bᵀ f: add to the true nodes what their mirror images received."""
-        return jax.linear_transpose(self.unfold, field)(field)[0] if self.images else field
+        """Bᵀ f: add to the true nodes what their mirror images received, and leave nothing on the others."""
+        at_rest = Mirror(tuple(image.at_rest() for image in self.images))
+        return jax.linear_transpose(at_rest.unfold, field)(field)[0] if self.images else field
+
+    def added(self, field: NodeVector) -> NodeVector:
+        """The part of a field that mirrors which move add to it (see `Image.moving`), zero elsewhere."""
+        total = jnp.zeros_like(field)
+        for image in self.images:
+            if isinstance(image, Image) and image.moving:
+                own = image.along(image.odd <= 0)[:, None] & (jnp.arange(field.shape[1]) == image.axis)
+                total = jnp.where(own, field, total)
+        return total
 
     def unfold_scalar(self, field: Float[Array, "n"]) -> Float[Array, "n"]:
         """B for an even scalar, such as mass."""

@@ -1,5 +1,6 @@
 """Symmetry and contact planes."""
 
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -9,10 +10,11 @@ from mpmjax._types import Array, Bool, Int, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import refuse_contact
-from mpmjax.boundary._mirror import Image, mirror_image
+from mpmjax.boundary._mirror import Image, MirrorMotion, mirror_image
 from mpmjax.boundary._plane_contact import PlaneContact
 from mpmjax.checks import require, require_between, require_fields, require_finite, require_that
 from mpmjax.discretisation import Grid
+from mpmjax.geometry import Motion
 
 
 class AbstractPlane(AbstractBoundary):
@@ -34,8 +36,13 @@ class AbstractPlane(AbstractBoundary):
         require(self.keep in ("above", "below"), f'{name} keeps "above" or "below", got {self.keep!r}.')
 
     @property
-    def dim(self) -> None:
+    def dim(self) -> int | None:
         return None
+
+    def displacement(self, t: Scalar) -> Scalar:
+        """How far the plane has moved along its axis at time t [m]. Default: it does not move."""
+        del t
+        return 0.0
 
     @property
     def inward(self) -> int:
@@ -68,10 +75,14 @@ class AbstractPlane(AbstractBoundary):
     ) -> Bool[Array, "p"]:
         """Which particles passed the plane: those that end more than half a spacing beyond it, among others
         (`crossed`)."""
-        del t, dt, reach
+        del reach
         place = self.inward * jnp.asarray(self.position, end.dtype)
-        coordinates = self.inward * start[:, self.axis], self.inward * end[:, self.axis]
+        start, end = start[:, self.axis] - self.displacement(t), end[:, self.axis] - self.displacement(t + dt)
+        coordinates = self.inward * start, self.inward * end
         return crossed(*coordinates, place, place - spacing / 2, spacing)
+
+    def mirror(self) -> tuple[int, Motion | None]:
+        return self.axis, None
 
     def walls(self) -> tuple[Wall, ...]:
         return (Wall(self.axis, float(self.position), self.inward, mirrored=True),)
@@ -88,31 +99,69 @@ class SymmetryPlane(AbstractPlane):
     Exact inside the implicit solve, and second order in the spacing, where a wall that fixes the velocity of its nodes
     is first.
 
-    *When it breaks*: particles must start on the kept side, and the plane must lie at a multiple of half a spacing.
+    It may move along its normal, as a smooth plate does: nodes beyond it then have twice its velocity minus their
+    image's. In the updated description the grid moves with it, so that all mirrored planes across one axis must move
+    alike there; in the total description each moves on its own.
+
+    *When it breaks*: particles must start on the kept side, and the plane must start at a multiple of half a spacing.
 
     Args:
         axis: direction of the normal, 0 to d − 1.
         position: coordinate of the plane [m].
         keep: which side holds the material: "above" or "below" the plane.
+        motion: how it moves; of its displacement the component along the normal counts. Default: not at all.
     """
 
     axis: int = eqx.field(static=True)
     position: Scalar
     keep: str = eqx.field(static=True, default="above")
+    motion: Motion | None = None
     plain_box: ClassVar[str] = "SlipBox"
 
     def __check_init__(self):
         require_fields(self)
 
+    @property
+    def dim(self) -> int | None:
+        return None if self.motion is None else self.motion.dim
+
+    def walls(self) -> tuple[Wall, ...]:
+        """Where it starts."""
+        return (Wall(self.axis, float(self.position), self.inward, mirrored=self.motion is None),)
+
+    def displacement(self, t: Scalar) -> Scalar:
+        return 0.0 if self.motion is None else self.motion.at(t)[self.axis]
+
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        """v·n = 0 on the plane's own nodes."""
-        del t, dt, reference
-        on = jnp.abs(nodes[:, self.axis] - self.position) <= ON_THE_WALL * spacing
-        return Conditions(jnp.zeros(nodes.shape, dtype=bool).at[:, self.axis].set(on), jnp.zeros_like(nodes))
+        """v·n = V·n on the plane's own nodes."""
+        at = self.position if reference or self.motion is None else self.position + self.displacement(t)
+        on = jnp.abs(nodes[:, self.axis] - at) <= ON_THE_WALL * spacing
+        fixed, velocity = jnp.zeros(nodes.shape, dtype=bool).at[:, self.axis].set(on), jnp.zeros_like(nodes)
+        if self.motion is not None:
+            velocity = jnp.where(fixed, self.motion.velocity(t, dt), 0)
+        return Conditions(fixed, velocity)
+
+    def mirror(self) -> tuple[int, Motion | None]:
+        return self.axis, self.motion
+
+    def check(self, grid: Grid, *, total: bool) -> None:
+        """A window cannot follow the material and a plane."""
+        AbstractPlane.check(self, grid, total=total)
+        require(
+            self.motion is None or total or not grid.follow,
+            "The grid moves with a SymmetryPlane that moves, so it cannot follow the particles: drop follow=True.",
+        )
 
     def mirror_images(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, ...]:
         """Its own, everywhere."""
-        return (self.image(grid, window)[0],)
+        return (replace(self.image(grid, window)[0], moving=self.motion is not None),)
+
+    def mirror_motion(self, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar) -> MirrorMotion | None:
+        if self.motion is None:
+            return None
+        image, before = self.image(grid, window)
+        beyond = image.along(before < 0)[:, None] & (jnp.arange(grid.dim) == self.axis)
+        return MirrorMotion(beyond, jnp.where(beyond, 2 * self.motion.velocity(t, dt), 0))
 
 
 class ContactPlane(AbstractPlane):

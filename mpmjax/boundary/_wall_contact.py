@@ -1,9 +1,11 @@
 """Contact with the walls of separating boxes, and friction along an axis of the grid."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Mask, NodeScalar, NodeVector
+from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
 
@@ -42,6 +44,9 @@ class WallContact(AbstractContact):
     def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
         """The component along the axis."""
         return active[:, None] & (jnp.arange(shape[1]) == self.axis)
+
+    def owner(self, owners: Any) -> Int[Array, "n"]:
+        return owners.side[:, self.axis]
 
     def blocked(self, held: ConstrainedNodes, v: NodeVector, noise: Array) -> Bool[Array, "n"] | None:
         """Nodes that a collider with the same normal drives off the wall, but cannot while the wall holds them."""

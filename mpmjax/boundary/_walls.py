@@ -6,12 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Bool, Corner, NodeVector, ParticleVector, Scalar
+from mpmjax._types import Array, Bool, Corner, Float, Mask, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import refuse_contact
 from mpmjax.checks import coordinates, require, require_between, require_fields, require_that
 from mpmjax.discretisation import Grid
+from mpmjax.geometry import Motion
 
 
 class AbstractBox(AbstractBoundary):
@@ -39,6 +40,11 @@ class AbstractBox(AbstractBoundary):
     def dim(self) -> int:
         return len(self.lower)
 
+    def displacement(self, t: Scalar) -> Float[Array, "d"] | float:
+        """How far the walls have moved at time t [m], shape (d,). Default: they rest."""
+        del t
+        return 0.0
+
     def inward_normal(self, nodes: NodeVector, spacing: Scalar) -> NodeVector:
         """The inward normal's component in each direction: +1 at and below `lower`, −1 at and above `upper`, else 0."""
         margin = ON_THE_WALL * spacing
@@ -50,7 +56,7 @@ class AbstractBox(AbstractBoundary):
         self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
     ) -> Bool[Array, "p"]:
         """Which particles passed a wall: those deeper than the place beyond which no node of their stencil is free."""
-        del t, dt
+        start, end = start - self.displacement(t), end - self.displacement(t + dt)
 
         def through(wall: Array, start: Array, end: Array) -> Array:
             first_free = jnp.floor(wall / spacing + ON_THE_WALL) + 1
@@ -75,19 +81,26 @@ class StickyBox(AbstractBox):
     Args:
         lower: position of the lower wall in each direction [m], (d,); −inf for none.
         upper: position of the upper wall in each direction [m], (d,); inf for none.
+        motion: how the walls move together, in any direction. Default: not at all.
     """
 
     lower: Corner
     upper: Corner
+    motion: Motion | None = None
 
     def __check_init__(self):
         require_fields(self)
+        _check_motion(self, self.motion)
+
+    def displacement(self, t: Scalar) -> Float[Array, "d"] | float:
+        return 0.0 if self.motion is None else self.motion.at(t)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        """v = 0."""
-        del t, dt, reference
-        held = (self.inward_normal(nodes, spacing) != 0).any(axis=1, keepdims=True)
-        return Conditions(jnp.broadcast_to(held, nodes.shape), jnp.zeros_like(nodes))
+        """v = V."""
+        place = nodes if reference or self.motion is None else nodes - self.displacement(t)
+        held = (self.inward_normal(place, spacing) != 0).any(axis=1, keepdims=True)
+        fixed = jnp.broadcast_to(held, nodes.shape)
+        return Conditions(fixed, _prescribed(fixed, self.motion, nodes, t, dt))
 
 
 class SlipBox(AbstractBox):
@@ -100,18 +113,25 @@ class SlipBox(AbstractBox):
     Args:
         lower: position of the lower wall in each direction [m], (d,); −inf for none.
         upper: position of the upper wall in each direction [m], (d,); inf for none.
+        motion: how the walls move together; of it the component along each wall's normal counts. Default: not at all.
     """
 
     lower: Corner
     upper: Corner
+    motion: Motion | None = None
 
     def __check_init__(self):
         require_fields(self)
+        _check_motion(self, self.motion)
+
+    def displacement(self, t: Scalar) -> Float[Array, "d"] | float:
+        return 0.0 if self.motion is None else self.motion.at(t)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        """v·n = 0."""
-        del t, dt, reference
-        return Conditions(self.inward_normal(nodes, spacing) != 0, jnp.zeros_like(nodes))
+        """v·n = V·n."""
+        place = nodes if reference or self.motion is None else nodes - self.displacement(t)
+        fixed = self.inward_normal(place, spacing) != 0
+        return Conditions(fixed, _prescribed(fixed, self.motion, nodes, t, dt))
 
 
 class SeparatingBox(AbstractBox):
@@ -147,3 +167,15 @@ class SeparatingBox(AbstractBox):
 
     def check(self, grid: Grid, *, total: bool) -> None:
         refuse_contact(total)
+
+
+def _check_motion(box: AbstractBox, motion: Motion | None) -> None:
+    require(
+        motion is None or motion.dim == box.dim,
+        f"{type(box).__name__}'s motion must have {box.dim} coordinates, got {motion and motion.dim}.",
+    )
+
+
+def _prescribed(fixed: Mask, motion: Motion | None, nodes: NodeVector, t: Scalar, dt: Scalar) -> NodeVector:
+    """The velocity of walls in the components that they hold [m/s], shape (n, d)."""
+    return jnp.zeros_like(nodes) if motion is None else jnp.where(fixed, motion.velocity(t, dt), 0)

@@ -206,12 +206,13 @@ def _force(
     time: str,
     force: tuple[str, ...],
     collider: int = 0,
+    boundary: int | None = None,
     unit: Scalar = 1.0,
     time_unit: Scalar = 1.0,
 ) -> Force:
     d = source.particles.dim
     t, values = _components(source, data, time, force, d, unit, time_unit)
-    return Force(t, values, collider=collider, **trust("force [N]"))
+    return Force(t, values, collider=collider, boundary=boundary, **trust("force [N]"))
 
 
 @_kind("Torque")
@@ -223,13 +224,14 @@ def _torque(
     time: str,
     torque: tuple[str, ...],
     collider: int = 0,
+    boundary: int | None = None,
     unit: Scalar = 1.0,
     time_unit: Scalar = 1.0,
 ) -> Torque:
     d = source.particles.dim
     require(d > 1, f"{_HEADER} Torque needs two or three dimensions.")
     t, values = _components(source, data, time, torque, d * (d - 1) // 2, unit, time_unit)
-    return Torque(t, values, collider=collider, **trust("torque [N m]"))
+    return Torque(t, values, collider=collider, boundary=boundary, **trust("torque [N m]"))
 
 
 @_kind("ForceDisplacement")
@@ -242,14 +244,18 @@ def _force_displacement(
     force: str,
     axis: int,
     collider: int = 0,
+    boundary: int | None = None,
     unit: Scalar = 1.0,
     length_unit: Scalar = 1.0,
 ) -> Force:
-    d, bodies = source.particles.dim, [b for b in source.scene.boundary if b.bodies]
+    d, what, number = source.particles.dim, "collider", collider
+    bodies = [b for b in source.scene.boundary if b.bodies]
+    if boundary is not None:
+        what, number, bodies = "boundary", boundary, source.scene.boundary
     require(0 <= axis < d, f"{_HEADER} axis must be below {d}, got {axis}.")
-    require(0 <= collider < len(bodies), f"{_HEADER} collider must be from 0 to {len(bodies) - 1}, got {collider}.")
-    motion: Any = getattr(bodies[collider], "motion", None)
-    require(motion is not None, f"{_HEADER} ForceDisplacement needs a collider that moves, but {collider} is at rest.")
+    require(0 <= number < len(bodies), f"{_HEADER} {what} must be from 0 to {len(bodies) - 1}, got {number}.")
+    motion: Any = getattr(bodies[number], "motion", None)
+    require(motion is not None, f"{_HEADER} ForceDisplacement needs a {what} that moves, but {number} is at rest.")
     columns = _columns(source, data, unit, length_unit, displacement, force, sign=True)
     times, path = np.asarray(motion.times, float), np.asarray(motion.displacement, float)[:, axis]
     last = np.searchsorted(times, source.t1)
@@ -257,17 +263,17 @@ def _force_displacement(
     way = np.sign(path[-1] - path[0])
     grows = way * np.diff(path)
     moves = np.append(grows > 0, True) | np.append(False, grows > 0)
-    require((grows >= 0).all() and way != 0, f"{_HEADER} the collider must move one way along axis {axis}.")
+    require((grows >= 0).all() and way != 0, f"{_HEADER} the {what} must move one way along axis {axis}.")
     x = columns.scaled(displacement, float(length_unit), "length_unit")
     columns.require(
         (way * x >= way * path[0]) & (way * x <= way * path[-1] * (1 + 1e-9)),
-        f"{displacement} {{{displacement}}} is not reached: the collider moves from {path[0]:g} to {path[-1]:g} m.",
+        f"{displacement} {{{displacement}}} is not reached: the {what} moves from {path[0]:g} to {path[-1]:g} m.",
     )
     t = np.interp(way * x, way * path[moves], times[moves])
     columns.require(np.diff(t, prepend=-1) > 0, f"{displacement} {{{displacement}}} must go on: sort the rows.")
     values = np.full((len(t), d), np.nan)
     values[:, axis] = columns.scaled(force, float(unit))
-    return Force(t, values, collider=collider, **trust("force [N]"))
+    return Force(t, values, collider=collider, boundary=boundary, **trust("force [N]"))
 
 
 @_kind("Energy")

@@ -18,7 +18,7 @@ from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractRegion
 from mpmjax.io import arguments, decode, reason
 from mpmjax.simulation import number_of_steps
-from mpmjax.state import Particles, Scene, fill, join, prepare
+from mpmjax.state import Particles, Scene, attach, fill, join, prepare
 from mpmjax.stepping import AbstractIntegrator, Explicit, stable_dt
 
 _FRAMES = 50
@@ -91,7 +91,9 @@ def read_scene_file(path: Path) -> SceneFile:
 
         def build(n: int) -> tuple[Scene, Particles]:
             scene = decode(_refined(table, n), Scene)
-            return scene, prepare(scene, _filled(scene, groups, run.dtype))
+            particles = _filled(scene, groups, run.dtype)
+            scene = attach(scene, particles)
+            return scene, prepare(scene, particles)
 
         scene, particles = build(1)
         if isinstance(run.dt, float):

@@ -52,6 +52,11 @@ class Stencil(eqx.Module):
             lambda s: (s.weights, s.weight_derivatives), self, (self.weights**2, self.weight_derivatives**2)
         )
 
+    def of(self, particles: Int[Array, "s"]) -> "Stencil":
+        """The stencil of some of the particles, by their numbers, with the scene's gradient operator alone."""
+        whole = eqx.tree_at(lambda s: s.mls_weight_derivatives, self, None, is_leaf=lambda leaf: leaf is None)
+        return jax.tree.map(lambda factor: factor[..., particles], whole)
+
     @property
     def index(self) -> Indices:
         """Flat index of each stencil node, shape (s^d, p)."""

@@ -9,7 +9,6 @@ import numpy as np
 from mpmjax._types import Float
 from mpmjax.checks import checked, require, require_whole, warn
 from mpmjax.fitting._batch import Problems, batch_size, search_many
-from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._result import FitResult
@@ -73,7 +72,7 @@ def bootstrap(
     repeats: int = 200,
     seed: int = 0,
     batch: int | None = None,
-    optimiser: AbstractOptimiser = LevenbergMarquardt(),
+    optimiser: AbstractOptimiser | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Bootstrap:
     """Errors and intervals of a fit without linearisation: the fitted simulation's data with new normal noise of the
@@ -92,7 +91,7 @@ def bootstrap(
         repeats: how many fits.
         seed: of the noise.
         batch: how many fits run together, see `fit_multistart`.
-        optimiser: the method of each.
+        optimiser: the method of each. Default: that of the fit.
         progress: called with a line, such as `print`, as fits end.
 
     Raises:
@@ -110,7 +109,7 @@ def bootstrap(
 
     members = search_many(
         Problems.of(problems, shared=False),
-        optimiser,
+        result.optimiser if optimiser is None else optimiser,
         np.repeat(np.asarray(result.z, float)[None], repeats, axis=0),
         sigmas=Problems.of([result.sigmas], shared=True),
         batch=batch_size(problem, batch, repeats),

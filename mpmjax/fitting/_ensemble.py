@@ -12,10 +12,10 @@ from scipy.special import chdtrc
 from mpmjax._types import Scalar
 from mpmjax.checks import checked, require, warn
 from mpmjax.fitting._batch import Problems, batch_size, search_many
+from mpmjax.fitting._choice import chosen_optimiser
 from mpmjax.fitting._estimates import fit_result, settle_noise
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import MOST_ROUNDS, explain
-from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import FitProblem
@@ -100,7 +100,7 @@ def fit_ensemble(
     batch: int | None = None,
     report: dict[str, Callable[[Experiment], Any]] | None = None,
     level: Scalar = 0.95,
-    optimiser: AbstractOptimiser = LevenbergMarquardt(),
+    optimiser: AbstractOptimiser | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> EnsembleFit:
     """Fit each of many data sets by itself, together in one compiled program: repeated specimens, for instance.
@@ -135,6 +135,7 @@ def fit_ensemble(
         known = len(own) > 0 and all(isinstance(e, Experiment) for e in own)
         require(known, f"Data set {k} must be an Experiment, or a tuple of some, got {type(experiments[k]).__name__}.")
     problems = [FitProblem(own, parameters) for own in sets]
+    optimiser = chosen_optimiser(problems[0]) if optimiser is None else optimiser
     fits = _fit_each(problems, optimiser, batch, dict(report or {}), float(level), progress)
     failures = {k: fit for k, fit in enumerate(fits) if isinstance(fit, str)}
     if len(failures) == len(fits):
@@ -190,7 +191,7 @@ def _fit_each(
             if changing and found.converged and round_ < MOST_ROUNDS - 1:
                 again.append(k)
             else:
-                result = fit_result(problems[k], found, factors, freedom, sigmas[k], report, level)
+                result = fit_result(problems[k], optimiser, found, factors, freedom, sigmas[k], report, level)
                 fits[k] = replace(result, history=history[k])
         left = again
         if not left:

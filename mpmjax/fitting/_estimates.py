@@ -11,6 +11,7 @@ import numpy as np
 from mpmjax._types import Array
 from mpmjax.checks import require
 from mpmjax.fitting._experiment import Experiment
+from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
 from mpmjax.fitting._search import Minimum
@@ -50,6 +51,7 @@ def settle_noise(
 
 def fit_result(
     problem: FitProblem,
+    optimiser: AbstractOptimiser,
     found: Minimum,
     factors: list[float],
     freedoms: list[float],
@@ -61,6 +63,7 @@ def fit_result(
 
     Args:
         problem: what was fitted.
+        optimiser: by which method.
         found: the minimum, its residuals in units of the noise of its search.
         factors: by what the noise was found to be larger than in that search.
         freedoms: degrees of freedom of each estimate of the noise.
@@ -101,6 +104,7 @@ def fit_result(
         noise=noises,
         experiments=problem.at(found.z),
         level=level,
+        optimiser=optimiser,
         converged=found.converged,
         history=found.history,
         warnings=tuple(seen_together(problem.labels, errors, problem.logarithmic)),

@@ -100,8 +100,8 @@ def fit(
             kept = stack.enter_context(opened_log(Path(log), problem, optimiser, z, resume=resume))
             stack.enter_context(reporting(kept.standing))
         found, history, sigmas, factors, freedom, unsettled = _rounds(problem, optimiser, z, progress, kept)
-    result = fit_result(problem, found, factors, freedom, sigmas, report, level)
-    result = replace(result, history=history, interrupted=found.interrupted, optimiser=optimiser)
+    result = fit_result(problem, optimiser, found, factors, freedom, sigmas, report, level)
+    result = replace(result, history=history, interrupted=found.interrupted)
     if not found.converged:
         stopped = "was interrupted" if found.interrupted else "did not converge"
         advice = "" if found.interrupted else f" {_ADVICE}"

@@ -20,9 +20,9 @@ class LevenbergMarquardt(AbstractOptimiser):
     simulation fails has residuals of NaN, is not taken, and the next is shorter.
 
     It ends by optimistix's criterion, or where the next Gauss-Newton step would be less than a ten-thousandth of the
-    standard error that the misfit gives: in single precision residuals are never still. Where it can only make steps
-    far shorter than the Gauss-Newton step, since the simulation fails beyond or the misfit has a kink, it has not
-    converged.
+    standard error that the misfit gives, or where a step is refused and could lower the sum of squares by no more than
+    its rounding: in single precision residuals are never still. Where it can only make steps far shorter than the
+    Gauss-Newton step, since the simulation fails beyond or the misfit has a kink, it has not converged.
 
     Args:
         rtol: relative and absolute tolerance of coordinates and residuals.
@@ -53,10 +53,12 @@ class LevenbergMarquardt(AbstractOptimiser):
     ) -> tuple[Coordinates, Any, Evaluation]:
         z, state, _ = self._solver.step(_residuals, z, (problem, sigmas, self.mode), {}, state, frozenset())
         r, J = state.f_info.residual, state.f_info.jac.as_matrix()
-        return z, state, Evaluation((r**2).sum() / 2, J.T @ r, r, J)
+        own = problem.dtype
+        return z, state, Evaluation((r**2).sum() / 2, J.T @ r, r.astype(own), J.astype(own))
 
     def has_converged(self, state: Any, seen: Evaluation) -> bool:
-        return (bool(state.terminate) and not self._is_held_back(state)) or self.distance(state, seen) <= 1
+        ended = bool(state.terminate) and not self._is_held_back(state)
+        return ended or self.distance(state, seen) <= 1 or _is_lost_in_rounding(state, seen)
 
     def has_stalled(self, state: Any) -> bool:
         return bool(state.terminate) and self._is_held_back(state)
@@ -74,7 +76,11 @@ class LevenbergMarquardt(AbstractOptimiser):
 
     def distance(self, state: Any, seen: Evaluation) -> float:
         del state
-        return _next_step(np.asarray(seen.residuals, float), np.asarray(seen.jacobian, float)) / _NEGLIGIBLE
+        total, gain = _squares(seen)
+        rows, columns = np.asarray(seen.jacobian).shape
+        if rows <= columns or np.isnan(gain):
+            return float("nan")
+        return float(np.sqrt(gain / total * (rows - columns))) / _NEGLIGIBLE if total > 0 else 0.0
 
     @property
     def _solver(self) -> Any:
@@ -82,14 +88,21 @@ class LevenbergMarquardt(AbstractOptimiser):
         return optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
 
 
-def _next_step(r: np.ndarray, J: np.ndarray) -> float:
-    """The next Gauss-Newton step p in standard errors, ‖J p‖ against √(Σ r²/(m − n)); NaN where there are none."""
-    if len(r) <= J.shape[1] or not (np.isfinite(r).all() and np.isfinite(J).all()):
-        return float("nan")
+def _is_lost_in_rounding(state: Any, seen: Evaluation) -> bool:
+    """Whether a step was refused which could lower Σ r² by no more than its rounding."""
+    total, gain = _squares(seen)
+    rounding = _ROUNDINGS * float(np.finfo(np.asarray(seen.residuals).dtype).eps) * total
+    return bool(int(state.num_steps_since_acceptance) > 0 and gain <= rounding)
+
+
+def _squares(seen: Evaluation) -> tuple[float, float]:
+    """Σ r², and what the next Gauss-Newton step p would take off it were r linear, ‖J p‖²; NaN if that is unknown."""
+    r, J = np.asarray(seen.residuals, float), np.asarray(seen.jacobian, float)
+    if not (np.isfinite(r).all() and np.isfinite(J).all()):
+        return float("nan"), float("nan")
     U, singular, _ = np.linalg.svd(J, full_matrices=False)
     change = U[:, singular > 1e-10 * singular.max(initial=0)].T @ r
-    total = (r**2).sum()
-    return float(np.sqrt((change**2).sum() / total * (len(r) - J.shape[1]))) if total > 0 else 0.0
+    return float((r**2).sum()), float((change**2).sum())
 
 
 _FAR = 100.0
@@ -98,6 +111,8 @@ _REFUSED = 0.1
 """Part of the Gauss-Newton step below which a step is held back."""
 _NEGLIGIBLE = 1e-4
 """A step of so many standard errors is none."""
+_ROUNDINGS = 10
+"""Of Σ r²: a smaller change of it cannot be told."""
 
 
 def _residuals(z: Coordinates, args: tuple[FitProblem, tuple[Array, ...], Any]) -> tuple[Array, None]:

@@ -12,9 +12,9 @@ import numpy as np
 from mpmjax._types import Float, Int, Scalar
 from mpmjax.checks import checked, require_whole, warn
 from mpmjax.fitting._batch import Member, Problems, batch_size, costs_at, search_many
+from mpmjax.fitting._choice import chosen_optimiser
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import explain, fit, require_influence
-from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._linkage import linked
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
@@ -101,7 +101,7 @@ def fit_multistart(
     batch: int | None = None,
     report: dict[str, Callable[[Experiment], Any]] | None = None,
     level: Scalar = 0.95,
-    optimiser: AbstractOptimiser = LevenbergMarquardt(),
+    optimiser: AbstractOptimiser | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> MultistartFit:
     """Look over many points for where fits start: the best minimum, with its errors, and what other minima there are.
@@ -139,7 +139,7 @@ def fit_multistart(
         batch: how many points, and searches, run together. Default: eight with explicit steps, one with implicit ones.
         report: see `fit`.
         level: see `fit`.
-        optimiser: the method of each search, and of the last fit.
+        optimiser: the method of each search, and of the last fit. Default: as `fit` chooses.
         progress: called with a line, such as `print`, as points are done, as searches end, and by the last fit.
 
     Raises:
@@ -148,6 +148,7 @@ def fit_multistart(
     """
     require_whole("starts", starts, 1)
     problem = FitProblem((experiments,) if isinstance(experiments, Experiment) else tuple(experiments), parameters)
+    optimiser = chosen_optimiser(problem) if optimiser is None else optimiser
     shares = unit_points(starts - 1, problem.size, require_whole("seed", seed, 0))
     points = starting_points(problem, shares, dict(ranges or {}))
     sigmas = problem.first_sigmas

@@ -9,7 +9,6 @@ import numpy as np
 
 from mpmjax._types import Array, Scalar
 from mpmjax.checks import checked, require, require_positive, require_whole, warn
-from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._restricted import RestrictedProblem
@@ -83,7 +82,7 @@ def profile(
     level: Scalar | None = None,
     points: int = 4,
     rtol: Scalar = 1e-3,
-    optimiser: AbstractOptimiser = LevenbergMarquardt(),
+    optimiser: AbstractOptimiser | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Profile:
     """The profile likelihood of a fitted number and the interval that follows from it.
@@ -113,7 +112,7 @@ def profile(
         level: of the interval [-]. Default: that of the fit.
         points: how many on either side before the threshold, at least.
         rtol: tolerance of an end, relative to its distance from the estimate in the search's coordinate.
-        optimiser: the method of the search, see `fit`.
+        optimiser: the method of the search. Default: that of the fit.
         progress: called with a line a point, such as `print`.
 
     Raises:
@@ -130,7 +129,7 @@ def profile(
     require_positive("profile's rtol", rtol)
     at = problem.labels.index(label)
     _, freedom = result.uncertainty.of(np.eye(problem.size)[at])
-    walk = _Walk(result, at, optimiser, progress)
+    walk = _Walk(result, at, result.optimiser if optimiser is None else optimiser, progress)
     reach = float(quantile(level, freedom))
     ends = [walk.end(side, reach, points, float(rtol)) for side in (-1, 1)]
     found = sorted(walk.known, key=lambda point: point.z[at])

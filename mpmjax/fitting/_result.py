@@ -81,14 +81,14 @@ class FitResult(eqx.Module):
     """The experiments with the fitted values."""
     level: float
     """The level of the intervals [-], such as 0.95."""
+    optimiser: AbstractOptimiser
+    """The method of the search."""
     converged: bool
     history: tuple[Iteration, ...]
     warnings: tuple[str, ...]
     """What the data cannot tell, and what does not fit, in words."""
     interrupted: bool = False
     """Whether Ctrl-C ended it."""
-    optimiser: AbstractOptimiser | None = None
-    """The method of the search."""
 
     @property
     def values(self) -> dict[str, np.ndarray]:
@@ -174,8 +174,7 @@ class FitResult(eqx.Module):
             lines.append(f"{n.name:<24} {n.points:>12}   {sigma:<22} {n.misfit:.3g}")
         said = f"χ² = {self.chi_squared:.4g} for {self.degrees_of_freedom} degrees of freedom"
         lines += ["", said + ("" if np.isnan(self.p_value) else f", probability {self.p_value:.2g}")]
-        if self.optimiser is not None:
-            lines.append(f"found by {type(self.optimiser).__name__} in {len(self.history)} iterations")
+        lines.append(f"found by {type(self.optimiser).__name__} in {len(self.history)} iterations")
         if not self.converged:
             lines.append("NOT CONVERGED: errors hold only at a minimum.")
         return "\n".join([*lines, *self.warnings])

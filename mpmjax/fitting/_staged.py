@@ -13,9 +13,9 @@ import numpy as np
 from mpmjax._types import Scalar
 from mpmjax.analysis import sensitivity
 from mpmjax.checks import checked, require, require_positive, warn
+from mpmjax.fitting._choice import chosen_optimiser
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import explain, fit
-from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._observation import Series
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
@@ -78,7 +78,7 @@ def fit_staged(
     growth: Scalar = 1e3,
     report: dict[str, Callable[[Experiment], Any]] | None = None,
     level: Scalar = 0.95,
-    optimiser: AbstractOptimiser = LevenbergMarquardt(),
+    optimiser: AbstractOptimiser | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> StagedFit:
     """Fit to the data until a first time, then until later ones, each from where the last search ended.
@@ -107,7 +107,7 @@ def fit_staged(
         growth: sensitivity [-] beyond which data are left out; infinite to use all.
         report: see `fit`.
         level: see `fit`.
-        optimiser: the method of each search.
+        optimiser: the method of each search. Default: as `fit` chooses.
         progress: called with a line an iteration, and with what is said, such as `print`.
 
     Raises:
@@ -121,6 +121,7 @@ def fit_staged(
         require_positive("horizons [s]", np.array(given))
         require(all(a < b for a, b in pairwise(given)), f"horizons must grow, got {given}.")
     problem = FitProblem((experiments,) if isinstance(experiments, Experiment) else tuple(experiments), parameters)
+    optimiser = chosen_optimiser(problem) if optimiser is None else optimiser
     end = max(e.t1 for e in problem.experiments)
     said: list[str] = []
 

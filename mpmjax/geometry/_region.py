@@ -14,6 +14,7 @@ import numpy as np
 
 from mpmjax._types import Array, Bool, Corner, Float, Point, Scalar
 from mpmjax.checks import checked, coordinates, require, require_fields, require_finite, require_positive, require_that
+from mpmjax.geometry._cells import Cells, box_cells, polar_cells, round_cells
 
 
 class AbstractRegion(eqx.Module):
@@ -45,6 +46,11 @@ class AbstractRegion(eqx.Module):
         """Whether points x [m], shape (m, d), lie in the region or within `margin` [m] of it, shape (m,)."""
         return self.distance(x) <= margin
 
+    def fitted(self, size: np.ndarray) -> Cells | None:
+        """Centroids [m], (m, d), and volumes [m^d], (m,), of cells that fill the region to its surface, near `size` in
+        their sides [m], (d,). Default: those of its bounding box where that is the region, else None."""
+        return box_cells(*self.bounds(), size) if self.fills_bounds else None
+
 
 def length(a: Float[Array, "*m d"]) -> Float[Array, "*m"]:
     """The length of each vector, the last axis; its derivative at zero is zero."""
@@ -53,19 +59,20 @@ def length(a: Float[Array, "*m d"]) -> Float[Array, "*m"]:
     return jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, square)))
 
 
-def _from_axis(a: Float[Array, "m d"]) -> Float[Array, "m"]:
+def from_axis(a: Float[Array, "m d"]) -> Float[Array, "m"]:
     """The length of each vector, the last axis; its derivative at zero is along a fixed direction."""
     some = jnp.asarray([0.8, 0.5, 0.3][: a.shape[-1]], a.dtype)
     return jnp.where((a == 0).all(axis=-1), (a * some).sum(axis=-1), length(a))
 
 
-def _common(slabs: Float[Array, "m j"]) -> Float[Array, "m"]:
+def common(slabs: Float[Array, "m j"]) -> Float[Array, "m"]:
     """Signed distance from the intersection of sets at right angles to each other, from those of the sets."""
     nearest = slabs.max(axis=-1)
     return jnp.where(nearest > 0, length(jnp.maximum(slabs, 0)), nearest)
 
 
-def _check_segment(name: str, start: Point, end: Point) -> None:
+def check_segment(name: str, start: Point, end: Point) -> None:
+    """Check the two ends of a segment."""
     require(
         coordinates(f"{name}'s start", start) == coordinates(f"{name}'s end", end),
         f"{name} needs two ends with as many coordinates, got {start} and {end}.",
@@ -107,7 +114,7 @@ class Box(AbstractRegion):
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         """max(q) inside, ‖max(q, 0)‖ outside, q = max(lower − x, x − upper)."""
         below, above = jnp.asarray(self.lower, x.dtype) - x, x - jnp.asarray(self.upper, x.dtype)
-        return _common(jnp.where(below > above, below, above))
+        return common(jnp.where(below > above, below, above))
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         return np.asarray(self.lower, float), np.asarray(self.upper, float)
@@ -142,7 +149,7 @@ class Ball(AbstractRegion):
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         """‖x − centre‖ − radius."""
-        return _from_axis(x - jnp.asarray(self.centre, x.dtype)) - self.radius
+        return from_axis(x - jnp.asarray(self.centre, x.dtype)) - self.radius
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Centre minus and plus the radius."""
@@ -151,6 +158,15 @@ class Ball(AbstractRegion):
 
     def middle(self) -> Float[Array, "d"]:
         return jnp.asarray(self.centre)
+
+    def fitted(self, size: np.ndarray) -> Cells | None:
+        """In 2-D sectors of concentric rings; in 3-D none."""
+        if self.dim == 1:
+            return box_cells(*self.bounds(), size)
+        if self.dim == 3:
+            return None
+        centroids, areas = polar_cells(0.0, float(self.radius), size)
+        return np.asarray(self.centre, float) + centroids, areas
 
 
 class HalfSpace(AbstractRegion):
@@ -206,7 +222,7 @@ class Capsule(AbstractRegion):
 
     def __check_init__(self):
         require_fields(self)
-        _check_segment("A capsule", self.start, self.end)
+        check_segment("A capsule", self.start, self.end)
         require_positive("A capsule's radius", self.radius)
 
     @property
@@ -218,7 +234,7 @@ class Capsule(AbstractRegion):
         start, end = jnp.asarray(self.start, x.dtype), jnp.asarray(self.end, x.dtype)
         axis, arm = end - start, x - start
         along = jnp.clip((arm * axis).sum(axis=-1) / (axis**2).sum(), 0, 1)
-        return _from_axis(arm - along[:, None] * axis) - self.radius
+        return from_axis(arm - along[:, None] * axis) - self.radius
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         ends, radius = np.stack([np.asarray(self.start, float), np.asarray(self.end, float)]), float(self.radius)
@@ -243,7 +259,7 @@ class Cylinder(AbstractRegion):
 
     def __check_init__(self):
         require_fields(self)
-        _check_segment("A cylinder", self.start, self.end)
+        check_segment("A cylinder", self.start, self.end)
         require(len(self.start) > 1, f"A cylinder has two or three coordinates, got {self.start}: take a Box.")
         require_positive("A cylinder's radius", self.radius)
 
@@ -257,9 +273,9 @@ class Cylinder(AbstractRegion):
         height = length(end - start)
         axis, arm = (end - start) / height, x - (start + end) / 2
         along = (arm * axis).sum(axis=-1)
-        beside = _from_axis(arm - along[:, None] * axis)
+        beside = from_axis(arm - along[:, None] * axis)
         beyond = jnp.where(along < 0, -along, along) - height / 2
-        return _common(jnp.stack([beyond, beside - self.radius], axis=-1))
+        return common(jnp.stack([beyond, beside - self.radius], axis=-1))
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         ends = np.stack([np.asarray(self.start, float), np.asarray(self.end, float)])
@@ -269,6 +285,17 @@ class Cylinder(AbstractRegion):
 
     def middle(self) -> Float[Array, "d"]:
         return (jnp.asarray(self.start) + jnp.asarray(self.end)) / 2
+
+    def fitted(self, size: np.ndarray) -> Cells:
+        """Sectors of concentric rings, in slices along the axis; in 2-D the cells of the rectangle, along the axis and
+        across."""
+        start, end, radius = np.asarray(self.start, float), np.asarray(self.end, float), float(self.radius)
+        if self.dim == 3:
+            return round_cells(start, end, 0.0, radius, size)
+        height = np.linalg.norm(end - start)
+        along, across = (end - start) / height, np.array([start[1] - end[1], end[0] - start[0]]) / height
+        cells, areas = box_cells(np.array([0.0, -radius]), np.array([height, radius]), size)
+        return start + cells @ np.stack([along, across]), areas
 
 
 class Union(AbstractRegion):

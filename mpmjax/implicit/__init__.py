@@ -13,7 +13,7 @@ from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.implicit._preconditioner import AbstractPreconditioner, DiagonalPreconditioner, MassPreconditioner
 from mpmjax.implicit._problems import LinearProblem, NewtonProblem
 from mpmjax.implicit._projection import Projection
-from mpmjax.implicit._solution import AbstractSolution, StageEquation
+from mpmjax.implicit._solution import AbstractSolution, StageEquation, exact_force
 from mpmjax.implicit._solve import Reporting, solve
 from mpmjax.implicit._solve_info import SolveInfo, no_solve
 
@@ -44,6 +44,7 @@ __all__ = [
     "StageEquation",
     "TangentAction",
     "damped",
+    "exact_force",
     "no_solve",
     "require_solver",
     "solve",

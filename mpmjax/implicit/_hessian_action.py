@@ -11,6 +11,7 @@ from mpmjax._types import Array, Deformation, Float, NodeVector, Scalar
 from mpmjax.boundary import Mirror
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.implicit._potential import ElasticPotential
+from mpmjax.state import SupportStiffness, stiffness_of
 
 
 class AbstractHessianAction(eqx.Module):
@@ -37,15 +38,18 @@ class ParticleStiffness(AbstractHessianAction):
     stencil: Stencil
     mirror: Mirror
     positive_semidefinite: bool = eqx.field(static=True, default=False)
+    supports: tuple[SupportStiffness, ...] = ()
+    """Of the springs to the ground."""
 
     def is_positive_semidefinite(self) -> bool:
         return self.positive_semidefinite
 
     def __call__(self, du: NodeVector) -> NodeVector:
-        """Σ_p g_ip K_p Σ_j g_jp δu_j."""
+        """Σ_p g_ip K_p Σ_j g_jp δu_j, and what the supports add."""
         _, slopes = gather(self.stencil, self.mirror.unfold(du))
         flux = la.matmul(self.matrix, slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
-        return self.mirror.fold(scatter(self.stencil, None, flux, du.shape[0]))
+        force = self.mirror.fold(scatter(self.stencil, None, flux, du.shape[0]))
+        return force + sum(support(du) for support in self.supports) if self.supports else force
 
     def precomputed(self) -> "ParticleStiffness":
         return self
@@ -62,7 +66,8 @@ class ParticleStiffness(AbstractHessianAction):
         d = like.shape[1]
         stiff = jnp.stack([jnp.maximum(self.matrix[m, m], 0) for m in range(d * d)])
         nodes = scatter(self.stencil.squared, None, stiff.reshape(d, d, -1), like.shape[0])
-        return jnp.stack([self.mirror.fold_scalar(component) for component in nodes.T], axis=1)
+        found = jnp.stack([self.mirror.fold_scalar(component) for component in nodes.T], axis=1)
+        return found + sum(support.diagonal(like) for support in self.supports) if self.supports else found
 
 
 class TangentAction(AbstractHessianAction):
@@ -97,7 +102,8 @@ def particle_stiffness(
 ) -> ParticleStiffness:
     """H as one matrix for each particle, from the stress differentials of the materials."""
     matrix = potential.stiffness(tangents)
-    return ParticleStiffness(matrix, potential.stencil, potential.mirror, positive_semidefinite)
+    supports = stiffness_of(potential.held_by())
+    return ParticleStiffness(matrix, potential.stencil, potential.mirror, positive_semidefinite, supports)
 
 
 @eqx.filter_jit
@@ -105,7 +111,9 @@ def _tangent_action(
     potential: ElasticPotential, tangents: tuple[Callable[[Deformation], Deformation], ...], du: NodeVector
 ) -> NodeVector:
     changes = (tangent(dF) for tangent, dF in zip(tangents, potential.deformation_change(du), strict=True))
-    return potential.nodal_sum(potential.flux(tuple(changes)))
+    force = potential.nodal_sum(potential.flux(tuple(changes)))
+    supports = stiffness_of(potential.held_by())
+    return force + sum(support(du) for support in supports) if supports else force
 
 
 class _DampedAction(AbstractHessianAction):
@@ -121,10 +129,10 @@ class _DampedAction(AbstractHessianAction):
         return self.elastic(du) + self.rate * self.potential.viscous_resistance(du)
 
     def precomputed(self) -> ParticleStiffness:
-        stiffness = self.elastic.precomputed()
-        return eqx.tree_at(
-            lambda s: s.matrix, stiffness, stiffness.matrix + self.rate * self.potential.damping_matrices()
-        )
+        stiffness, matrix = self.elastic.precomputed(), self.potential.damping_matrices()
+        matrix = stiffness.matrix if matrix is None else stiffness.matrix + self.rate * matrix
+        supports = stiffness_of(self.potential.held_by(), self.rate)
+        return eqx.tree_at(lambda s: (s.matrix, s.supports), stiffness, (matrix, supports))
 
 
 def damped(elastic: AbstractHessianAction, potential: ElasticPotential, rate: Scalar) -> AbstractHessianAction:

@@ -1,6 +1,7 @@
 """One linear solve for each stage."""
 
 from functools import reduce
+from typing import ClassVar
 
 import jax.numpy as jnp
 import lineax as lx
@@ -24,6 +25,7 @@ class Linearised(AbstractSolution):
     """
 
     solver: lx.AbstractLinearSolver = ConjugateResidual()
+    linearises: ClassVar[bool] = True
 
     def __check_init__(self):
         require_fields(self)

@@ -1,6 +1,6 @@
 """Newton's method for the nodal problems."""
 
-from functools import partial, reduce
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, default_rtol, requir
 from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.implicit._problems import NewtonProblem
-from mpmjax.implicit._solution import AbstractSolution, StageEquation
+from mpmjax.implicit._solution import AbstractSolution, StageEquation, exact_force
 from mpmjax.implicit._solve_info import SolveInfo
 
 _ROUNDING = 4.0  # units of rounding that a sum over the particles and nodes is taken to have
@@ -80,7 +80,7 @@ class Newton(AbstractSolution):
     ) -> NodeVector:
         """Σ q f(u) [N]."""
         del hessian, force
-        return reduce(jnp.add, (q * potential.force(u) for q, u in stages))
+        return exact_force(potential, *stages)
 
     def __call__(self, problem: NewtonProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         """The solution [m/s], shape (n, d), and the report of the solve.

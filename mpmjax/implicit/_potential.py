@@ -11,7 +11,7 @@ from mpmjax._types import Array, Deformation, Float, Matrix, NodeVector
 from mpmjax.boundary import Mirror
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.material import AbstractElastic
-from mpmjax.state import MaterialPoints
+from mpmjax.state import MaterialPoints, Support
 
 Deformations = tuple[Deformation, ...]
 """One entry for each material, shape (d, d, q), or (q,) for a law of J alone."""
@@ -30,6 +30,8 @@ class ElasticPotential(eqx.Module):
     mirror: Mirror
     size: int = eqx.field(static=True)
     """Number of nodes n."""
+    supports: tuple[Support, ...] = ()
+    """Springs and dashpots to the ground, whose energy and resistance are added."""
 
     def deformation_change(self, u: NodeVector) -> Deformations:
         """δF_p = Σ_i u_i h_ipᵀ, one array for each material."""
@@ -57,7 +59,7 @@ class ElasticPotential(eqx.Module):
             (points.volume * points.law.energy(F)).sum()
             for points, F in zip(self.material_points, self.deformation(u), strict=True)
         ]
-        return sum(parts[1:], parts[0])
+        return sum([*parts[1:], *self.support_energies(u)], parts[0])
 
     def admissible_energy(self, u: NodeVector) -> Float[Array, ""]:
         """Φ(u) [J], NaN if a law does not admit the deformation. It must not be differentiated."""
@@ -65,11 +67,30 @@ class ElasticPotential(eqx.Module):
             jnp.where(points.law.is_admissible(F), points.volume * points.law.energy(F), jnp.nan).sum()
             for points, F in zip(self.material_points, self.deformation(u), strict=True)
         ]
-        return sum(parts[1:], parts[0])
+        return sum([*parts[1:], *self.support_energies(u)], parts[0])
+
+    def support_energies(self, u: NodeVector) -> list[Float[Array, ""]]:
+        """The energy of each support's springs [J]."""
+        return [support.energy(u) for support in self.held_by()]
+
+    def held_by(self) -> tuple[Support, ...]:
+        """The supports, on the nodes as the mirrors fold them."""
+        return tuple(support.mirrored(self.mirror) for support in self.supports)
+
+    def support_force(self) -> NodeVector:
+        """The force of the supports' springs at u = 0 [N], shape (n, d). There must be one."""
+        first, *others = (support.force(None, self.size) for support in self.held_by())
+        return sum(others, first)
+
+    def support_drag(self) -> NodeVector | None:
+        """The force of their dashpots at the points' velocity at the start of the step [N]; None without any."""
+        found = [drag for support in self.held_by() if (drag := support.drag(self.size)) is not None]
+        return sum(found[1:], found[0]) if found else None
 
     def force(self, u: NodeVector) -> NodeVector:
         """f = −∂Φ/∂u [N], shape (n, d). At u = 0, f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
-        return -self.nodal_sum(self.flux(self._stress(self.deformation(u))))
+        force = -self.nodal_sum(self.flux(self._stress(self.deformation(u))))
+        return force + sum(support.force(u, self.size) for support in self.held_by()) if self.supports else force
 
     def flux(self, P: Deformations) -> Matrix:
         """V0_p P_p F_pᵀ [J], shape (d, d, p), from the stress of each material; in the total description V0_p P_p."""
@@ -81,6 +102,11 @@ class ElasticPotential(eqx.Module):
 
     @property
     def viscous(self) -> bool:
+        """Whether any of the materials has viscosity, or a support a dashpot."""
+        return self.material_viscous or any(support.damping is not None for support in self.supports)
+
+    @property
+    def material_viscous(self) -> bool:
         """Whether any of the materials has viscosity."""
         return any(points.viscosity is not None for points in self.material_points)
 
@@ -92,19 +118,29 @@ class ElasticPotential(eqx.Module):
     def viscous_resistance(self, v: NodeVector) -> NodeVector:
         """D v [N], the negative of the viscous force at a nodal velocity v [m/s]. D is symmetric and positive
         semi-definite."""
-        return self.nodal_sum(self.viscous_flux(self._gradient(v)))
+        parts = [self.nodal_sum(self.viscous_flux(self._gradient(v)))] if self.material_viscous else []
+        parts += [r for support in self.held_by() if (r := support.resistance(v)) is not None]
+        return sum(parts[1:], parts[0]) if parts else jnp.zeros_like(v)
 
     def power(self, v: NodeVector) -> Float[Array, ""]:
         """v·D v [W], the power that viscosity dissipates at a nodal velocity v [m/s]."""
+        power = jnp.zeros((), v.dtype)
+        for support in self.held_by():
+            power = power + support.power(v)
+        if not self.material_viscous:
+            return power
         gradient = self._gradient(v)
-        return (self.viscous_flux(gradient) * gradient).sum()
+        return power + (self.viscous_flux(gradient) * gradient).sum()
 
     def nodal_sum(self, flux: Matrix) -> NodeVector:
         """Σ_p flux_p g_ip [N], shape (n, d)."""
         return self.mirror.fold(scatter(self.stencil, None, jnp.swapaxes(flux, 0, 1), self.size))
 
-    def damping_matrices(self) -> Float[Array, "m m p"]:
-        """The matrices of D [J s], one for each particle, shape (d², d², p), as `stiffness` has those of H."""
+    def damping_matrices(self) -> Float[Array, "m m p"] | None:
+        """The matrices of the materials' D [J s], one for each particle, shape (d², d², p), as `stiffness` has those of
+        H; None if no material has viscosity."""
+        if not self.material_viscous:
+            return None
 
         def matrix(points: MaterialPoints) -> Array:
             like = jnp.zeros((self._dim, self._dim, *points.volume.shape), points.volume.dtype)

@@ -1,9 +1,11 @@
 """The equation of an implicit stage, and what a way to solve it is."""
 
 import abc
-from typing import Any
+from functools import reduce
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, NodeScalar, NodeVector, Scalar
 from mpmjax.implicit._hessian import AbstractHessian
@@ -75,6 +77,9 @@ class StageEquation(eqx.Module):
 class AbstractSolution(eqx.Module):
     """How the equation of a stage is solved."""
 
+    linearises: ClassVar[bool] = False
+    """Whether `stage_force` has other forces than the law."""
+
     @abc.abstractmethod
     def problem(self, stage: StageEquation) -> AbstractProblem:
         """The problem that is solved in the place of the stage's equation: `stage.linear()`, `stage.nonlinear()` or one
@@ -105,3 +110,13 @@ class AbstractSolution(eqx.Module):
             problem: the problem.
             guess: where an iteration starts [m/s], shape (n, d).
         """
+
+
+def exact_force(potential: ElasticPotential, *stages: tuple[Scalar, NodeVector]) -> NodeVector:
+    """Σ q f(u) [N], shape (n, d), the elastic forces of the law.
+
+    Args:
+        potential: whose force f is.
+        stages: the weights q [-] and displacements u [m], shape (n, d).
+    """
+    return reduce(jnp.add, (q * potential.force(u) for q, u in stages))

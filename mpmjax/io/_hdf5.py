@@ -13,10 +13,17 @@ from mpmjax.io._aside import reason
 from mpmjax.io._staged import StagedFile, require_no_writer
 from mpmjax.io._vtkhdf import File, count_in
 
-FORMAT = 6
+FORMAT = 7
 LIBVER_HEAD = ("v108", "v108")
 _LIBVER = ("v110", "v110")  # what "latest" writes, VTK 9.7 cannot read
-_GROWING = ("VTKHDF/Points", "VTKHDF/PointData/", "VTKHDF/Steps/", "mpmjax/frames", "mpmjax/collider_impulse")
+_GROWING = (
+    "VTKHDF/Points",
+    "VTKHDF/PointData/",
+    "VTKHDF/Steps/",
+    "mpmjax/frames",
+    "mpmjax/collider_impulse",
+    "mpmjax/boundary_impulse",
+)
 _GROUPS = ("VTKHDF", "mpmjax")
 _REMEDY = "restore it from a copy, or run the simulation again"
 _BUSY = "{} is being written by another run: wait until that ends or stop it, or choose another name."

@@ -24,7 +24,7 @@ from mpmjax.simulation import (
     no_steps,
     number_of_steps,
     raise_faults,
-    warn_of_inaccurate_solves,
+    warn_of_inaccuracy,
 )
 from mpmjax.state import Particles, Scene, prepare, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator, Explicit, step_for
@@ -131,12 +131,14 @@ def record(
             final_step=jnp.asarray(step, dtype),
             statistics=statistics,
             final_collider_impulse=state.collider_impulse,
+            final_boundary_impulse=state.boundary_impulse,
         )
         try:
             raise_faults(run, particles, previous, start)
         except SimulationError as error:
             try:
-                last = RolloutState(state_of(error.run.final), error.run.final_collider_impulse)
+                received = error.run.final_collider_impulse, error.run.final_boundary_impulse
+                last = RolloutState(state_of(error.run.final), *received)
                 _append(writer, int(error.run.final_step), last, statistics)
                 again = "Resumed it would end there again: begin anew."
                 then = "It can be resumed as it is." if int(statistics.fault) == Fault.NONE else again
@@ -144,7 +146,7 @@ def record(
             except OSError as refused:
                 said = str(refused)
             raise SimulationError(f"{error} {said}", error.run) from None
-        warn_of_inaccurate_solves(run.statistics)
+        warn_of_inaccuracy(run.statistics)
         return run
 
 

@@ -4,7 +4,7 @@
                 J = det F, with APIC affine_velocity, and what laws that yield remember
     /mpmjax     format, version, d, dtype, units, dt, counts, mass, volume, X, the scene and the method as JSON (see
                 `_schema`) with their arrays, and a table with one row a frame: its step and the run's `RunStatistics`
-                up to it; with colliders `collider_impulse`, the impulse on each by then, linear, then angular
+                up to it; `collider_impulse` and `boundary_impulse`, those on each by then, linear, then angular
 
 Whatever is not in a dataset with checksums lies in headers that HDF5 checks itself, so a flipped bit is found. `NSteps`
 is raised last, and what lies beyond it, the remains of a writer that was killed, is neither read nor kept. A frame that
@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax.boundary import ColliderImpulse
+from mpmjax.boundary import BoundaryImpulse, ColliderImpulse
 from mpmjax.checks import canonical, checked, is_traced, require
 from mpmjax.io._aside import reason, replacing
 from mpmjax.io._hdf5 import (
@@ -53,6 +53,7 @@ from mpmjax.stepping import AbstractIntegrator
 
 _UNITS = "SI: m, s, kg, Pa; deformation_gradient and J are pure numbers, affine_velocity is in 1/s"
 _UNCHANGING = ("mass", "volume", "X")
+_IMPULSES = {"collider_impulse": ColliderImpulse, "boundary_impulse": BoundaryImpulse}
 
 
 class FrameWriter:
@@ -247,9 +248,11 @@ def save(path: str | os.PathLike, run: Run) -> None:
     ):
         for i in range(len(run)):
             if steps[i] < final_step:  # a run that met a fault has frames beyond its last good state
-                frame = jax.tree.map(lambda a, i=i: a[i], (run.frames, run.collider_impulse))
+                kept = run.frames, run.collider_impulse, run.boundary_impulse
+                frame = jax.tree.map(lambda a, i=i: a[i], kept)
                 writer.append(int(steps[i]), RolloutState(*frame), unknown)
-        writer.append(final_step, RolloutState(state_of(run.final), run.final_collider_impulse), run.statistics)
+        received = run.final_collider_impulse, run.final_boundary_impulse
+        writer.append(final_step, RolloutState(state_of(run.final), *received), run.statistics)
 
 
 def steps_in(path: str | os.PathLike) -> int:
@@ -305,6 +308,8 @@ def load(path: str | os.PathLike) -> Run:
         statistics=jax.tree.map(lambda a: a[-1], tallies),
         collider_impulse=frames.collider_impulse,
         final_collider_impulse=last.collider_impulse,
+        boundary_impulse=frames.boundary_impulse,
+        final_boundary_impulse=last.boundary_impulse,
     )
 
 
@@ -372,9 +377,9 @@ def _rows(frame: int, step: int, dt: Any, state: RolloutState, statistics: RunSt
     values = {"step": np.int64(step)} | {f.name: np.asarray(getattr(statistics, f.name)) for f in fields(RunStatistics)}
     row = np.array([tuple(values.values())], [(name, a.dtype) for name, a in values.items()])
     rows = rows_of(frame, step * float(dt), state.particles) | {"mpmjax/frames": row}
-    if state.collider_impulse is not None:
-        both = state.collider_impulse.impulse, state.collider_impulse.angular
-        rows["mpmjax/collider_impulse"] = np.concatenate([np.asarray(a) for a in both], axis=1)[None]
+    for name in _IMPULSES:
+        if (both := getattr(state, name)) is not None:
+            rows[f"mpmjax/{name}"] = np.concatenate([np.asarray(both.impulse), np.asarray(both.angular)], axis=1)[None]
     return rows
 
 
@@ -383,11 +388,13 @@ def _frames(file: File, like: RolloutState, start: int, stop: int) -> tuple[np.n
     table = file["mpmjax/frames"][start:stop]
     require(len(table) == stop - start, "frames are missing")
     tallies = RunStatistics(**{f.name: jnp.asarray(table[f.name]) for f in fields(RunStatistics)})
-    particles, impulse = states_in(file, like.particles, start, stop), None
-    if like.collider_impulse is not None:
-        both = jnp.asarray(file["mpmjax/collider_impulse"][start:stop])
-        impulse = ColliderImpulse(*jnp.split(both, [like.particles.x.shape[1]], axis=-1))
-    return table["step"], RolloutState(particles, impulse), tallies
+    received: dict[str, Any] = {}
+    for name, kind in _IMPULSES.items():
+        if getattr(like, name) is not None:
+            both = jnp.asarray(file[f"mpmjax/{name}"][start:stop])
+            received[name] = kind(*jnp.split(both, [like.particles.x.shape[1]], axis=-1))
+    kept = (received.get(name) for name in _IMPULSES)
+    return table["step"], RolloutState(states_in(file, like.particles, start, stop), *kept), tallies
 
 
 def _check_same(path: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> None:

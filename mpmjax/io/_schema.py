@@ -24,62 +24,8 @@ import jax
 import numpy as np
 from jaxtyping import AbstractArray
 
-from mpmjax.boundary import (
-    ContactPlane,
-    Grip,
-    SeparatingBox,
-    SeparatingCollider,
-    SlipBox,
-    SlipCollider,
-    StickyBox,
-    StickyCollider,
-    SymmetryPlane,
-)
 from mpmjax.checks import alternatives, is_enum, is_module, may_be_infinite, require
-from mpmjax.discretisation import APIC, FLIP, PIC, BSpline, Grid, MLSGradient, SplineGradient
-from mpmjax.geometry import Ball, Box, Capsule, Cylinder, HalfSpace, Motion, RigidMotion, SampledDistance, Union
-from mpmjax.implicit import (
-    AnalyticHessian,
-    ConjugateResidual,
-    DiagonalPreconditioner,
-    JvpHessian,
-    Linearised,
-    MassPreconditioner,
-    Newton,
-)
-from mpmjax.material import (
-    CamClay,
-    DruckerPrager,
-    FixedCorotated,
-    Fluid,
-    Gent,
-    Hencky,
-    HerschelBulkley,
-    MooneyRivlin,
-    NeoHookean,
-    Ogden,
-    Snow,
-    Viscous,
-    VonMises,
-    Yeoh,
-)
-from mpmjax.state import Scene, TotalLagrangian, UpdatedLagrangian
-from mpmjax.stepping import TRBDF2, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
-
-CLASSES: tuple[type, ...] = (
-    Scene,
-    Grid,
-    *(FixedCorotated, NeoHookean, Hencky),
-    *(MooneyRivlin, Yeoh, Gent, Ogden),
-    *(Snow, VonMises, HerschelBulkley, DruckerPrager, CamClay, Fluid, Viscous),
-    *(StickyBox, SlipBox, SeparatingBox, Grip, SymmetryPlane, ContactPlane),
-    *(StickyCollider, SlipCollider, SeparatingCollider),
-    *(Box, Ball, HalfSpace, Capsule, Cylinder, Union, SampledDistance, Motion, RigidMotion),
-    *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
-    *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),
-    *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual, DiagonalPreconditioner, MassPreconditioner),
-)
-"""The package's own classes that files can hold."""
+from mpmjax.io._classes import CLASSES
 
 _registered: dict[str, type] = {}
 """The registered classes that files can hold, by name."""
@@ -220,7 +166,8 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
     if items and isinstance(data, list) and not _forms(expected):  # of arrays, each of its own shape
         return tuple(decode(d, items[0], _nth(where, i), arrays) for i, d in enumerate(data, 1))
     if any(is_module(a) for a in choices):
-        return _object(data, classes, any(inspect.isabstract(a) for a in choices), where, arrays)
+        plain = [a.__name__ for a in choices if is_module(a) and not inspect.isabstract(a)]
+        return _object(data, classes, any(inspect.isabstract(a) for a in choices), where, arrays, plain)
     if enums := [a for a in choices if is_enum(a)]:
         words = [member.value for member in enums[0]]
         _require(isinstance(data, str) and data in words, where, f"must be one of {_quoted(words)}, got {_short(data)}")
@@ -250,12 +197,20 @@ def arguments(
     return {key: decode(value, known[key][0], _inside(where, key, value), arrays) for key, value in table.items()}
 
 
-def _object(data: Any, classes: dict[str, type], opened: bool, where: str, arrays: dict[str, np.ndarray] | None) -> Any:
-    """The table of an object that may be of one of several classes; where `opened` also of one that is registered."""
+def _object(
+    data: Any,
+    classes: dict[str, type],
+    opened: bool,
+    where: str,
+    arrays: dict[str, np.ndarray] | None,
+    plain: list[str],
+) -> Any:
+    """The table of an object that may be of one of several classes; where `opened` also of one that is registered.
+    Where one of them is `plain`, named by itself beside a base class, it is meant where no kind is given."""
     table = {"kind": data} if isinstance(data, str) else data
     _require(classes or opened, where, "takes an object of Python, which files cannot hold: leave it out")
     choice = f"one of {', '.join(classes)}" if len(classes) > 1 else next(iter(classes), "a class of your own")
-    evident = [name for name, c in classes.items() if c in CLASSES]
+    evident = plain if len(plain) == 1 else [name for name, c in classes.items() if c in CLASSES]
     _require(isinstance(table, dict), where, f"must be a table with a kind, {choice}, got {_short(data)}")
     _require("kind" in table or len(evident) == 1, where, f"needs a kind: {choice}")
     kind = table.get("kind", *evident) if len(evident) == 1 else table["kind"]

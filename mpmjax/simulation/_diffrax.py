@@ -43,13 +43,12 @@ class Problem(eqx.Module):
         return with_state(self.particles, state)
 
 
-def faulty_particles(problem: Problem, state: State) -> dict[Fault, Bool[Array, "p"]]:
-    """Which particles have each fault that a state may have, the gravest fault first."""
+def faulty_particles(problem: Problem, state: State, t: Scalar) -> dict[Fault, Bool[Array, "p"]]:
+    """Which particles have each fault that a state may have at time t [s], the gravest fault first."""
     scene, particles = problem.scene, problem.at(state)
     finite = _finite((particles.x, particles.v, particles.C))
     finite = finite & jnp.concatenate([_finite((group.stored, group.history)) for group in particles.groups])
-    anchor = scene.anchor(particles)
-    outside = ~in_window(scene.kernel, scene.grid, scene.window(particles), anchor)
+    outside = ~in_window(scene.kernel, scene.grid, scene.window(particles), scene.on_grid(particles, t))
     materials = scene.material_points(particles)
     admitted = jnp.concatenate([points.law.is_admissible(points.deformation) for points in materials])
     return {Fault.NOT_FINITE: ~finite, Fault.OUTSIDE: finite & outside, Fault.INADMISSIBLE: finite & ~admitted}
@@ -71,17 +70,17 @@ def passed_particles(problem: Problem, before: State, after: State, t: Scalar) -
     return [(number, passed) for number, passed in enumerate(found) if passed is not None]
 
 
-def state_fault(problem: Problem, state: State) -> Int[Array, ""]:
-    """The gravest fault of a state."""
+def state_fault(problem: Problem, state: State, t: Scalar) -> Int[Array, ""]:
+    """The gravest fault of a state at time t [s]."""
     gravest = jnp.asarray(Fault.NONE, jnp.int32)
-    for fault, particles in reversed(faulty_particles(problem, state).items()):
+    for fault, particles in reversed(faulty_particles(problem, state, t).items()):
         gravest = jnp.where(particles.any(), fault, gravest)
     return gravest
 
 
 def fault_of(problem: Problem, before: State, after: State, t: Scalar) -> Int[Array, ""]:
     """The gravest fault of a state, or of the step from t [s] that led to it."""
-    fault = state_fault(problem, after)
+    fault = state_fault(problem, after, t + problem.dt)
     for _, passed in passed_particles(problem, before, after, t):
         fault = jnp.where(passed.any() & (fault != Fault.NOT_FINITE), Fault.PASSED, fault)
     return fault
@@ -93,7 +92,7 @@ def examined(problem: Problem, state: RolloutState) -> tuple[Problem, RolloutSta
     arrays, rest = eqx.partition((problem, state), eqx.is_array)
     known, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
     unmet = first_unmet(requirements((known.scene, known.particles, known.method)))
-    fault = jnp.where(unmet > 0, Fault.BAD_PARAMETERS, state_fault(known, begin.particles))
+    fault = jnp.where(unmet > 0, Fault.BAD_PARAMETERS, state_fault(known, begin.particles, known.start * known.dt))
     valid = jnp.where(unmet > 0, jnp.nan, 1)
     state = jax.tree.map(lambda a: a * valid.astype(a.dtype), state)
     return replace(problem, fault=fault, unmet=unmet), state

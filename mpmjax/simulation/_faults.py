@@ -35,7 +35,7 @@ def raise_faults(run: Run, began: Particles, previous: RolloutState | None, star
         assert previous is not None
         step = start + int(run.statistics.fault_step)
         problem = Problem(run.scene, run.final, None, run.dt, run.method)
-        words, bad = _WORDS[fault], faulty_particles(problem, state_of(run.final))
+        words, bad = _WORDS[fault], faulty_particles(problem, state_of(run.final), step * run.dt)
         what, advice = words.particle, words.advice
         if fault == Fault.PASSED:
             t = jnp.asarray(step - 1, run.final.x.dtype) * run.dt
@@ -49,12 +49,15 @@ def raise_faults(run: Run, began: Particles, previous: RolloutState | None, star
             what, advice = disallowed(_law(run, first), run.method)
         last = with_state(run.final, previous.particles)
         reached = int((run.steps < step).sum())
-        saved = {name: getattr(run, name) for name in ("steps", "frames", "observed", "collider_impulse")}
+        saved = {
+            name: getattr(run, name) for name in ("steps", "frames", "observed", "collider_impulse", "boundary_impulse")
+        }
         good = replace(
             run,
             **jax.tree.map(lambda a: a[:reached], saved),
             final=last,
             final_collider_impulse=previous.collider_impulse,
+            final_boundary_impulse=previous.boundary_impulse,
             final_step=jnp.asarray(step - 1, run.final_step.dtype),
         )
         raise SimulationError(
@@ -82,14 +85,22 @@ def unconverged_advice(method: AbstractIntegrator, dtype: Any) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def warn_of_inaccurate_solves(statistics: RunStatistics) -> None:
-    """A Python warning where solves of an untraced run missed their tolerance by less than ten times."""
+def warn_of_inaccuracy(statistics: RunStatistics) -> None:
+    """A Python warning where solves of an untraced run missed their tolerance by less than ten times, and one where
+    linearised steps left much of the elastic force undone."""
     if int(statistics.nearly_converged) > 0:
         warn(
             f"The solve of {int(statistics.nearly_converged)} of {int(statistics.steps)} steps missed its tolerance by "
             f"less than ten times (worst relative residual {float(statistics.worst_residual):.2g}): the run is that "
             "much less accurate than was asked for. Raise the solver's max_steps, or ask for what it can reach by its "
             "rtol."
+        )
+    part = float(statistics.left_undone.part)
+    if part > MOST_LEFT_UNDONE:
+        warn(
+            f"One linear solve a step left up to {100 * part:.2g} % of the elastic force undone, and stresses can be "
+            f"wrong by as much. Take a shorter step, {float(np.sqrt(part / MOST_LEFT_UNDONE)):.1f} times or more, or "
+            "Newton's method: BackwardEuler(), or solution=Newton() of ImplicitMidpoint and TRBDF2."
         )
 
 
@@ -128,6 +139,8 @@ _WORDS: dict[Fault, _Words] = {
         "Reduce dt: a boundary keeps out what comes less than a cell nearer in a step.",
     ),
 }
+MOST_LEFT_UNDONE = 0.05
+"""Part of the elastic force up to which what one linear solve leaves undone is not warned of."""
 _ADVICE = (
     "Call simulate outside of jax transformations to have step, time and particle named, or with throw=False to "
     "inspect run.statistics."

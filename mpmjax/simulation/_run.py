@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.boundary import ColliderImpulse
+from mpmjax.boundary import BoundaryImpulse, ColliderImpulse
 from mpmjax.simulation._statistics import RunStatistics
 from mpmjax.state import Particles, Scene, State, with_state
 from mpmjax.stepping import AbstractIntegrator
@@ -22,7 +22,7 @@ class SimulationError(RuntimeError):
 
 
 class Forces(NamedTuple):
-    """Mean forces and torques on k colliders between one saved frame and the next, of f frames."""
+    """Mean forces and torques on k colliders or boundaries between one saved frame and the next, of f frames."""
 
     times: Float[Array, "g"]
     """Half way between frames [s], shape (f − 1,)."""
@@ -30,7 +30,8 @@ class Forces(NamedTuple):
     """Friction included [N], shape (f − 1, k, d)."""
     torque: Float[Array, "g k r"]
     """About the centre of the collider's rotation, or where it has none about its shape's middle, as it moves [N m],
-    shape (f − 1, k, r): r = 1 in 2-D, 3 in 3-D, 0 in 1-D."""
+    shape (f − 1, k, r): r = 1 in 2-D, 3 in 3-D, 0 in 1-D. Of a grip about its region's middle, of other boundaries
+    about the origin of the coordinates."""
 
 
 class Run(eqx.Module):
@@ -63,6 +64,12 @@ class Run(eqx.Module):
     them, is the mean force and torque (see `forces`)."""
     final_collider_impulse: ColliderImpulse | None = None
     """The same to the end; None without colliders."""
+    boundary_impulse: BoundaryImpulse | None = None
+    """As `collider_impulse`, on each of the scene's boundaries (see `boundary_forces`); None unless the scene has
+    `boundary_forces`, or where nothing was saved."""
+    final_boundary_impulse: BoundaryImpulse | None = None
+    """Impulse on each of the scene's boundaries from the run's start to its end; None unless the scene has
+    `boundary_forces`."""
 
     @property
     def times(self) -> Float[Array, "*f"]:
@@ -92,9 +99,26 @@ class Run(eqx.Module):
             raise ValueError(
                 "Forces need saved frames and colliders: pass save_every to simulate, a collider to Scene."
             )
+        return self._mean_forces(self.collider_impulse)
+
+    def boundary_forces(self) -> Forces:
+        """The mean force and torque of the material on each of the scene's boundaries (walls, planes, grips and
+        colliders, in their order) between one saved frame and the next.
+
+        Raises:
+            ValueError: nothing was saved on the way, or the scene does not have `boundary_forces`.
+        """
+        if self.boundary_impulse is None:
+            raise ValueError(
+                "Forces on boundaries need saved frames and a scene that computes them: pass save_every to simulate, "
+                "boundary_forces=True to Scene."
+            )
+        return self._mean_forces(self.boundary_impulse)
+
+    def _mean_forces(self, impulses: ColliderImpulse | BoundaryImpulse) -> Forces:
         times = self.times
         between = (times[1:] - times[:-1])[:, None, None]
-        mean = jax.tree.map(lambda a: (a[1:] - a[:-1]) / between, self.collider_impulse)
+        mean = jax.tree.map(lambda a: (a[1:] - a[:-1]) / between, impulses)
         return Forces((times[1:] + times[:-1]) / 2, mean.impulse, mean.angular)
 
     def __len__(self) -> int:

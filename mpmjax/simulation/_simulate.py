@@ -24,7 +24,7 @@ from mpmjax.checks import (
     requirements,
 )
 from mpmjax.simulation._diffrax import Problem, StepSolver, examined, no_vector_field, step_number
-from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccurate_solves
+from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccuracy
 from mpmjax.simulation._rollout_state import RolloutState, initial_state
 from mpmjax.simulation._run import Run
 from mpmjax.simulation._statistics import RunStatistics
@@ -68,7 +68,8 @@ def simulate(
             memory than its points. `save_every` then defaults to 1. It may be an `equinox.Module` with arrays; a plain
             function compiles anew unless it is the same object.
         start: number of the first step, e.g. a former run's `final_step`; time there is start·dt. The impulse on
-            colliders (`run.collider_impulse`) is summed from here on, in a run that continues another too.
+            colliders and boundaries (`run.collider_impulse`) is summed from here on, also in a run that continues
+            another.
         adjoint: how diffrax differentiates. Default: recursive checkpointing.
         checkpoint_bytes: memory for the checkpoints of the default adjoint [B]. Fewer of them cost recomputation.
         progress: show diffrax's progress meter.
@@ -128,7 +129,7 @@ def simulate(
         progress=progress,
         watch=not traced,
     )
-    steps, values, impulse = (jnp.zeros((0,), dtype), None, None) if saved is None else saved
+    steps, values, *impulses = (jnp.zeros((0,), dtype), None, None, None) if saved is None else saved
     run = Run(
         scene=scene,
         method=method,
@@ -140,15 +141,17 @@ def simulate(
         final_step=jnp.asarray(start, dtype) + statistics.steps.astype(dtype),
         statistics=statistics,
         report=report if traced else None,
-        collider_impulse=impulse,
+        collider_impulse=impulses[0],
         final_collider_impulse=final.collider_impulse,
+        boundary_impulse=impulses[1],
+        final_boundary_impulse=final.boundary_impulse,
     )
     if not throw:
         return run
     if traced:
         return guarded(run, report)
     raise_faults(run, particles, previous, start)
-    warn_of_inaccurate_solves(run.statistics)
+    warn_of_inaccuracy(run.statistics)
     return run
 
 
@@ -246,7 +249,7 @@ def integrate(
 ) -> tuple[Any, RolloutState, RunStatistics, RolloutState | None, Array]:
     """Integrate `count` ≤ `max_steps` steps from step `start`, at which the particles have this state.
 
-    Returns the steps, values and collider impulses saved, the final state, the statistics, with `watch`, which stops
+    Returns the steps, values and impulses saved, the final state, the statistics, with `watch`, which stops
     the run at a fault, the state before the last step, and what tangent solves report. Adjoint solves report through
     the `slot` (see `Reporting`).
 
@@ -262,7 +265,7 @@ def integrate(
     def kept(t: Any, y: RolloutState, args: Problem) -> Any:
         del t
         value = y.particles if args.observe is None else args.observe(args.scene, args.at(y.particles))
-        return value, y.collider_impulse
+        return value, y.collider_impulse, y.boundary_impulse
 
     subs = {"final": diffrax.SubSaveAt(t1=True)}
     if save_every is not None:

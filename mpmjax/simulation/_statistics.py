@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Int
-from mpmjax.stepping import StepInfo
+from mpmjax.stepping import LeftUndone, StepInfo
 
 
 class Fault(enum.IntEnum):
@@ -43,6 +43,10 @@ class RunStatistics(eqx.Module):
     """Halvings by the line search."""
     worst_residual: Float[Array, "*f"]
     """Largest relative residual at the end of a solve."""
+    undone_force: Float[Array, "*f"]
+    """Largest force that a linearised step left undone [N] (see `left_undone`)."""
+    undone_scale: Float[Array, "*f"]
+    """Largest scale of these forces [N]."""
     unconverged: Int[Array, "*f"]
     """Steps whose solve met neither ten times its tolerance nor the precision's limit: the run is not a solution."""
     nearly_converged: Int[Array, "*f"]
@@ -63,6 +67,12 @@ class RunStatistics(eqx.Module):
     is not met; else zero."""
 
     @property
+    def left_undone(self) -> LeftUndone:
+        """What one linear solve a step left undone of the elastic force: the most of any step, and the largest scale of
+        any, so that quiet steps do not count."""
+        return LeftUndone(self.undone_force, self.undone_scale)
+
+    @property
     def healthy(self) -> Bool[Array, "*f"]:
         """Whether no state was at fault and no solve ended far from its tolerance."""
         return (self.fault == Fault.NONE) & (self.unconverged == 0)
@@ -77,6 +87,8 @@ class RunStatistics(eqx.Module):
             newton=self.newton + later.newton,
             line_search=self.line_search + later.line_search,
             worst_residual=jnp.maximum(self.worst_residual, later.worst_residual),
+            undone_force=jnp.maximum(self.undone_force, later.undone_force),
+            undone_scale=jnp.maximum(self.undone_scale, later.undone_scale),
             unconverged=self.unconverged + later.unconverged,
             nearly_converged=self.nearly_converged + later.nearly_converged,
             indefinite=self.indefinite + later.indefinite,
@@ -92,7 +104,8 @@ def no_steps(dtype: Any) -> RunStatistics:
     """The statistics before the first step."""
     zero = jnp.asarray(0, jnp.int32)
     zeros = {field.name: zero for field in fields(RunStatistics)}
-    return RunStatistics(**zeros | {"worst_residual": jnp.asarray(0, dtype)})
+    nothing = dict.fromkeys(("worst_residual", "undone_force", "undone_scale"), jnp.asarray(0, dtype))
+    return RunStatistics(**zeros | nothing)
 
 
 def one_step(info: StepInfo, fault: Int[Array, ""]) -> RunStatistics:
@@ -106,6 +119,8 @@ def one_step(info: StepInfo, fault: Int[Array, ""]) -> RunStatistics:
         newton=solve.newton,
         line_search=solve.line_search,
         worst_residual=jax.lax.stop_gradient(solve.residual),
+        undone_force=info.left_undone.force,
+        undone_scale=info.left_undone.scale,
         unconverged=(~(solve.converged | solve.nearly_converged)).astype(jnp.int32),
         nearly_converged=solve.nearly_converged.astype(jnp.int32),
         indefinite=solve.indefinite.astype(jnp.int32),

@@ -1,28 +1,50 @@
 """Particles, scene and what a step needs of them."""
 
+from mpmjax.state._attachment import AbstractPlace, AttachedPoints, Patch, PointsAt
 from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, TotalLagrangian, UpdatedLagrangian
-from mpmjax.state._fill import fill
+from mpmjax.state._fill import fill, fill_mapped
+from mpmjax.state._loaded_points import LoadedPoints
+from mpmjax.state._loads import AbstractLoad, PointLoad, Pressure, Spring, Traction, load_force, points_of, supports_of
 from mpmjax.state._material_points import MaterialPoints
 from mpmjax.state._particles import Particles, State, by_material, history_arrays, join, state_of, with_state
 from mpmjax.state._preparation import is_prepared, prepare
-from mpmjax.state._scene import Scene
+from mpmjax.state._scene import Scene, attach
+from mpmjax.state._support import Support, SupportStiffness, stiffness_of
 
 __all__ = [
     "AbstractBodyForce",
     "AbstractDescription",
+    "AbstractLoad",
+    "AbstractPlace",
+    "AttachedPoints",
+    "LoadedPoints",
     "MaterialPoints",
     "Particles",
+    "Patch",
+    "PointLoad",
+    "PointsAt",
+    "Pressure",
     "Scene",
+    "Spring",
     "State",
+    "Support",
+    "SupportStiffness",
     "TotalLagrangian",
+    "Traction",
     "UpdatedLagrangian",
+    "attach",
     "by_material",
     "fill",
+    "fill_mapped",
     "history_arrays",
     "is_prepared",
     "join",
+    "load_force",
+    "points_of",
     "prepare",
     "state_of",
+    "stiffness_of",
+    "supports_of",
     "with_state",
 ]

@@ -1,13 +1,24 @@
 """Filling a region with particles."""
 
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Point, Scalar
+from mpmjax._types import Array, Float, Point, Scalar
 from mpmjax.checks import checked, coordinates, require, require_memory, require_positive, shortened
 from mpmjax.discretisation import Grid
-from mpmjax.geometry import AbstractRegion
+from mpmjax.geometry import AbstractRegion, Box, box_cells, inside_parts
 from mpmjax.state._particles import Particles
+
+_ALIKE = 1e-6
+"""Part of a cell by which a region may reach into the next for rounding's sake."""
+_SMALL = 0.02
+"""The least share of a cell that is a particle of its own."""
 
 
 @checked
@@ -19,30 +30,35 @@ def fill(
     density: Scalar,
     velocity: Point | None = None,
     dtype: type | str | None = None,
+    fitted: bool = False,
 ) -> Particles:
     """Fill a region with a lattice of particles at cell centres of a subdivided grid.
 
     In a box the lattice is fitted to the box (its counts are rounded, its spacing then is the box's side over the
-    count), so that the particles' total mass and volume are the box's exactly. Any other region keeps the lattice
-    points inside it, each with the volume of a lattice cell.
+    count), so that the particles' total mass and volume are the box's exactly. In any other region the lattice is that
+    of the grid, subdivided. A cell that the surface cuts has a particle too: at the centroid of the part that lies
+    inside, with the volume of that part. So volume, mass and centre of mass are of second order in the spacing. A part
+    smaller than a fiftieth of a cell is given to the neighbour with the largest part.
+
+    With `fitted` the cells follow the surface instead: rings of equal sectors in a `Ball` of 2-D, an `Annulus`, and in
+    3-D a `Cylinder` and a `Tube`. Volume and mass are then exact, and all particles nearly alike.
 
     Args:
         region: what to fill.
         grid: sets the spacing.
         particles_per_cell: a d-th power (4 in 2-D is 2 x 2), or a count for each direction. Default: two in each, 2^d.
+            In fitted cells the directions are: across the rings, around, along the axis.
         density: mass density [kg/m^d].
         velocity: initial velocity [m/s], (d,). Default: rest.
         dtype: float32 or float64. Default: jax's own, float32 unless 64-bit mode is on.
+        fitted: whether the cells follow the region's surface.
 
     Raises:
-        ValueError: a count that is no d-th power, a region of another dimension, or one that holds no particle.
+        ValueError: a count that is no d-th power, a region of another dimension, one that holds no particle, or one to
+            which no cells can be fitted.
     """
     d = grid.dim
-    try:
-        precision = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
-    except TypeError:
-        precision = None
-    require(precision in (jnp.float32, jnp.float64), f"dtype must be float32 or float64, got {shortened(repr(dtype))}.")
+    precision = _precision(dtype)
     require_positive("density [kg/m^d]", density)
     if particles_per_cell is None:
         counts = np.full(d, 2)
@@ -60,31 +76,145 @@ def fill(
             counts.shape == (d,) and (counts >= 1).all() and counts.dtype.kind == "i",
             f"particles_per_cell must be one or {d} positive whole numbers, got {particles_per_cell}.",
         )
-    velocity = (0.0,) * d if velocity is None else velocity
-    require(coordinates("velocity", velocity) == d, f"velocity must have {d} components, got {velocity}.")
+    velocity = _velocity(velocity, d)
     lower, upper = region.bounds()
     require(lower.shape == (d,), f"The region is {lower.size}-dimensional, the grid {d}-dimensional.")
     require(
         np.isfinite(lower) & np.isfinite(upper), "A region to fill must be finite; infinite corners are for grips only."
     )
-    size = upper - lower
+    cell = float(grid.spacing) / counts
     with np.errstate(over="ignore"):
-        number = np.maximum(np.rint(size * counts / float(grid.spacing)), 1)
-        total = number.prod()
+        total = np.maximum(np.rint((upper - lower) / cell), 1).prod()
     require_memory(
         f"A lattice of {total:.3g} particles",
         total * d * 2 * 8,  # the coordinates and the points made of them
         f"take a smaller region (it reaches from {lower} to {upper} m), a larger spacing (it is {grid.spacing} m) or "
         "fewer particles_per_cell.",
     )
-    number = number.astype(int)
-    cell = size / number
-    axes = [low + (np.arange(n) + 0.5) * c for low, n, c in zip(lower, number, cell, strict=True)]
-    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, d)
-    if not region.fills_bounds:
-        lattice = lattice[np.asarray(region.contains(jnp.asarray(lattice)))]
-    require(len(lattice) > 0, f"{region} holds no particle at this spacing: refine the grid or enlarge the region.")
-    x = jnp.asarray(lattice, dtype=precision)
-    v = jnp.broadcast_to(jnp.asarray(velocity, dtype=precision), x.shape)
-    volume = jnp.asarray(np.full(len(lattice), np.prod(cell)), dtype=precision)
-    return Particles(x=x, v=v, mass=jnp.asarray(density, precision) * volume, volume=volume)
+    found = region.fitted(cell) if fitted or region.fills_bounds else _cut_cells(region, cell)
+    if found is None:
+        raise ValueError(
+            f"No cells can be fitted to {region}: leave out fitted, for a lattice cut by the surface, or map one by "
+            "fill_mapped."
+        )
+    require(len(found[0]) > 0, f"{region} holds no particle at this spacing: refine the grid or enlarge the region.")
+    return _particles(*found, density, velocity, precision)
+
+
+@checked
+def fill_mapped(
+    mapping: Callable[[Float[Array, "d"]], Float[Array, "d"]],
+    box: Box,
+    counts: tuple[int, ...] | list[int],
+    *,
+    density: Scalar,
+    velocity: Point | None = None,
+    dtype: type | str | None = None,
+) -> Particles:
+    """Fill the image of a box under a smooth map x(ξ) with the images of equal cells: a lattice fitted to any boundary
+    that such a map has.
+
+        def quarter(xi):  # of a ring, by radius and angle
+            return jnp.stack([xi[0] * jnp.cos(xi[1]), xi[0] * jnp.sin(xi[1])])
+
+        mpm.fill_mapped(quarter, mpm.Box((0.4, 0.0), (0.6, jnp.pi / 2)), (8, 32), density=1e3)
+
+    A particle is the centroid of its cell's image and has its volume, ∫ |det ∂x/∂ξ| dξ, by three Gauss points in each
+    direction.
+
+    Args:
+        mapping: x(ξ) [m], shape (d,), of one point ξ of the box, shape (d,), written with jax.numpy.
+        box: the box of ξ, in the units of ξ.
+        counts: number of cells along each axis of the box.
+        density: mass density [kg/m^d].
+        velocity: initial velocity [m/s], (d,). Default: rest.
+        dtype: float32 or float64. Default: jax's own, float32 unless 64-bit mode is on.
+
+    Raises:
+        ValueError: a map whose Jacobian vanishes or changes its sign in the box, counts that are no whole numbers, or
+            a box without bounds.
+    """
+    d, precision = box.dim, _precision(dtype)
+    require_positive("density [kg/m^d]", density)
+    number = np.asarray(counts)
+    require(
+        number.shape == (d,) and number.dtype.kind == "i" and (number >= 1).all(),
+        f"counts must be {d} positive whole numbers, got {counts}.",
+    )
+    velocity = _velocity(velocity, d)
+    lower, upper = box.bounds()
+    require(np.isfinite(lower) & np.isfinite(upper), "A box to map must be finite.")
+    require_memory(
+        f"A lattice of {number.prod():.3g} particles", float(number.prod()) * 3**d * 2 * d * 8, "take smaller counts."
+    )
+    size = (upper - lower) / number
+    centres, volume = box_cells(lower, upper, size)
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    offsets = np.array(list(itertools.product(nodes / 2, repeat=d))) * size
+    share = np.array(list(itertools.product(weights / 2, repeat=d))).prod(axis=1)
+    points = jnp.asarray((centres[:, None] + offsets).reshape(-1, d))
+    mapped, slopes = eqx.filter_jit(jax.vmap(lambda xi: (mapping(xi), jax.jacfwd(mapping)(xi))))(points)
+    require(mapped.shape == points.shape, f"A map must take {d} coordinates to {d}, got {mapped.shape[1:]} of them.")
+    jacobian = np.linalg.det(np.asarray(slopes, float))
+    require(
+        (jacobian > 0).all() or (jacobian < 0).all(),
+        "A map must not fold: its Jacobian det ∂x/∂ξ must have one sign in the box, got values from "
+        f"{jacobian.min():.3g} to {jacobian.max():.3g}.",
+    )
+    part = np.abs(jacobian).reshape(-1, len(share)) * share
+    x = np.einsum("mq,mqd->md", part, np.asarray(mapped, float).reshape(*part.shape, d))
+    return _particles(x / part.sum(axis=1)[:, None], part.sum(axis=1) * volume, density, velocity, precision)
+
+
+def _precision(dtype: type | str | None) -> Any:
+    """The precision asked for."""
+    try:
+        precision = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
+    except TypeError:
+        precision = None
+    require(precision in (jnp.float32, jnp.float64), f"dtype must be float32 or float64, got {shortened(repr(dtype))}.")
+    return precision
+
+
+def _velocity(velocity: Point | None, d: int) -> Point:
+    """The velocity asked for, zero by default."""
+    velocity = (0.0,) * d if velocity is None else velocity
+    require(coordinates("velocity", velocity) == d, f"velocity must have {d} components, got {velocity}.")
+    return velocity
+
+
+def _cut_cells(region: AbstractRegion, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centroids [m], (m, d), and volumes [m^d], (m,), of the parts inside a region of the cells of the subdivided
+    grid."""
+    lower, upper = region.bounds()
+    first, last = np.floor(lower / size + _ALIKE), np.ceil(upper / size - _ALIKE)
+    number = np.maximum(last - first, 1).astype(int)
+    centres, volume = box_cells(first * size, (first + number) * size, size)
+    share, centroid = inside_parts(region, centres, size)
+    share, centroid = _merged(share.reshape(number), centroid.reshape(*number, -1))
+    kept = share > 0
+    return centroid[kept], share[kept] * volume[kept.reshape(-1)]
+
+
+def _merged(share: np.ndarray, centroid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Shares and centroids after parts smaller than `_SMALL` were given to the neighbour, across a face, of the largest
+    part. A part without such a neighbour stays."""
+    small = (share > 0) & (share < _SMALL)
+    padded = np.pad(share, 1)
+    middle = (slice(1, -1),) * share.ndim
+    shifts = [step * np.eye(share.ndim, dtype=int)[a] for a in range(share.ndim) for step in (-1, 1)]
+    beside = np.stack([np.roll(padded, tuple(-shift), axis=tuple(range(share.ndim)))[middle] for shift in shifts])
+    small &= beside.max(axis=0) >= _SMALL
+    place = np.argwhere(small)
+    target = tuple((place + np.array(shifts)[beside.argmax(axis=0)[small]]).T)
+    total, moment = np.where(small, 0, share), np.where(small[..., None], 0, share[..., None] * centroid)
+    np.add.at(total, target, share[small])
+    np.add.at(moment, target, share[small][:, None] * centroid[small])
+    return total, moment / np.where(total > 0, total, 1)[..., None]
+
+
+def _particles(x: np.ndarray, volume: np.ndarray, density: Scalar, velocity: Point, dtype: Any) -> Particles:
+    """Particles at x [m], (p, d), of volumes [m^d], (p,), alike in density and velocity."""
+    places, volumes = jnp.asarray(x, dtype), jnp.asarray(volume, dtype)
+    v = jnp.broadcast_to(jnp.asarray(velocity, dtype), places.shape)
+    return Particles(x=places, v=v, mass=jnp.asarray(density, dtype) * volumes, volume=volumes)

@@ -23,6 +23,8 @@ from mpmjax.discretisation import (
     in_window,
 )
 from mpmjax.material import AbstractLaw
+from mpmjax.state._attachment import AttachedPoints
+from mpmjax.state._loaded_points import keeps_deformation
 from mpmjax.state._oversights import warn_of_oversights
 from mpmjax.state._particles import Group, Particles
 from mpmjax.state._scene import Scene
@@ -52,6 +54,7 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
         f"The scene has {len(scene.laws)} laws, so the particles must be {len(scene.laws)} sets joined by mpmjax.join, "
         f"in the laws' order, got {len(sizes)}.",
     )
+    _check_loads(scene, particles)
     first = not jax.tree.leaves(particles.deformations)
     particles = replace(particles, counts=sizes if len(sizes) > 1 else None)
     require(
@@ -73,6 +76,32 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
         if first:
             warn_of_oversights(known.grid, known.kernel, known.boundary, prepared, total=scene.total)
     return prepared
+
+
+def _check_loads(scene: Scene, particles: Particles) -> None:
+    """Check that loads are attached to particles that there are, and whose law keeps what they need."""
+    for load in scene.loads:
+        name, on = type(load).__name__, load.on
+        require(
+            isinstance(on, AttachedPoints),
+            f"The {name} is on a {type(on).__name__} that is not attached to particles yet: call "
+            "scene = mpmjax.attach(scene, particles) first.",
+        )
+        if is_traced(on):
+            continue
+        rows = np.asarray(getattr(on, "particle", ()))
+        require(
+            (rows >= 0) & (rows < particles.count),
+            f"The {name} is attached to particle {rows.max():.0f}, but there are {particles.count}: attach it to these "
+            "particles.",
+        )
+        ends = np.cumsum([0, *particles.sizes])
+        for law, start, stop in zip(scene.laws, ends[:-1], ends[1:], strict=True):
+            require(
+                not load.needs_deformation() or keeps_deformation(law) or not ((rows >= start) & (rows < stop)).any(),
+                f"A following {name} needs the whole deformation gradient, which {law.title()} does not keep: take "
+                "following=False, or a Traction.",
+            )
 
 
 def _check_size(scene: Scene, particles: Particles) -> None:
@@ -135,7 +164,9 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
     place = scene.anchor(particles)
     require_finite("Particle positions", particles.x)
     require_finite("Particle velocities", particles.v)
-    inside = np.asarray(in_window(scene.kernel, scene.grid, scene.window(particles), place))
+    inside = np.ones(particles.count, bool)
+    if scene.total or not scene.moving_mirrors:  # else the grid is where the time says
+        inside = np.asarray(in_window(scene.kernel, scene.grid, scene.window(particles), place))
     if not inside.all():
         first = int(np.argmin(inside))
         raise ValueError(

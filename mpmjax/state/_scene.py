@@ -1,12 +1,14 @@
 """The scene: everything that a step needs and does not change."""
 
 import equinox as eqx
+import jax.numpy as jnp
 
-from mpmjax._types import Array, Int, Point, Scalar
+from mpmjax._types import Array, Float, Int, NodeVector, Point, Scalar
 from mpmjax.boundary import AbstractBoundary
 from mpmjax.checks import (
     checked,
     coordinates,
+    is_traced,
     require,
     require_finite,
 )
@@ -21,9 +23,11 @@ from mpmjax.discretisation import (
     Stencil,
     make_stencil,
 )
+from mpmjax.geometry import Motion
 from mpmjax.material import AbstractLaw
 from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, UpdatedLagrangian
+from mpmjax.state._loads import AbstractLoad
 from mpmjax.state._material_points import MaterialPoints, material_points, return_map
 from mpmjax.state._particles import Particles
 
@@ -45,6 +49,8 @@ class Scene(eqx.Module):
         transfer: PIC, FLIP or APIC. Default: APIC.
         description: updated (default) or total Lagrangian.
         body_force: a force per mass that varies in space or time, besides gravity. Default: none.
+        loads: forces on the body's surface or at points of it, springs and dashpots; see `attach`.
+        boundary_forces: whether steps compute the force and torque on each boundary (see `Run.boundary_forces`).
 
     Raises:
         ValueError: dimensions that differ, a mirrored plane off the half-spacing lattice, or what the total description
@@ -61,6 +67,8 @@ class Scene(eqx.Module):
     transfer: AbstractTransfer
     description: AbstractDescription
     body_force: AbstractBodyForce | None
+    boundary_forces: bool = eqx.field(static=True)
+    loads: tuple[AbstractLoad, ...]
 
     @checked
     def __init__(
@@ -75,6 +83,8 @@ class Scene(eqx.Module):
         transfer: AbstractTransfer = APIC(),
         description: AbstractDescription = UpdatedLagrangian(),
         body_force: AbstractBodyForce | None = None,
+        boundary_forces: bool = False,
+        loads: AbstractLoad | tuple[AbstractLoad, ...] | list[AbstractLoad] = (),
     ):
         self.grid = grid
         self.material = tuple(material) if isinstance(material, list) else material
@@ -86,18 +96,33 @@ class Scene(eqx.Module):
         self.transfer = transfer
         self.description = description
         self.body_force = body_force
+        self.boundary_forces = boundary_forces
+        self.loads = (loads,) if isinstance(loads, AbstractLoad) else tuple(loads)
 
     def __check_init__(self):
         d = self.grid.dim
         require(coordinates("gravity", self.gravity) == d, f"gravity must have {d} components, got {self.gravity}.")
         require_finite("gravity", self.gravity)
         require(len(self.laws) > 0, "A scene needs at least one law, got none.")
+        require(
+            not self.boundary_forces or len(self.boundary) > 0,
+            "A scene with boundary_forces needs a boundary at least, got none: give one, or leave boundary_forces out.",
+        )
         for boundary in self.boundary:
             require(
                 boundary.dim in (None, d),
                 f"{type(boundary).__name__} must have {d} coordinates, as the grid has, got {boundary.dim}.",
             )
             boundary.check(self.grid, total=self.total)
+        for load in self.loads:
+            load.check(d)
+        for axis in range(d if not self.total else 0):
+            mirrors = [found[1] for b in self.boundary if (found := b.mirror()) is not None and found[0] == axis]
+            require(
+                all(is_traced((m, mirrors[0])) or bool(eqx.tree_equal(m, mirrors[0])) for m in mirrors),
+                f"In the updated description the grid moves with the planes across axis {axis}, so that all of them "
+                "must move alike: give them one motion, take the total description, or a SlipCollider of a HalfSpace.",
+            )
         if self.total:
             require(not self.grid.follow, "In the total description the window cannot follow: drop follow=True.")
             flowing = [law.title() for law in self.laws if not law.allows_total]
@@ -135,6 +160,25 @@ class Scene(eqx.Module):
         """Whether the description is total Lagrangian."""
         return self.description.total
 
+    @property
+    def moving_mirrors(self) -> dict[int, Motion]:
+        """The motions of mirrors that move, by the axis across which they are."""
+        mirrors = (found for boundary in self.boundary if (found := boundary.mirror()) is not None)
+        return {axis: motion for axis, motion in mirrors if motion is not None}
+
+    def shift(self, t: Scalar) -> Float[Array, "d"] | None:
+        """How far the grid has moved at time t [m], shape (d,), with planes that move; None where it rests."""
+        if self.total or not self.moving_mirrors:
+            return None
+        along = {axis: motion.at(t)[axis] for axis, motion in self.moving_mirrors.items()}  # one axis: all move alike
+        rest = jnp.zeros_like(next(iter(along.values())))
+        return jnp.stack([along.get(axis, rest) for axis in range(self.grid.dim)])
+
+    def nodes(self, particles: Particles, t: Scalar) -> NodeVector:
+        """Positions of the window's nodes at time t [m], shape (n, d)."""
+        places, shift = self.grid.nodes(self.window(particles)), self.shift(t)
+        return places if shift is None else places + shift
+
     def window(self, particles: Particles) -> Int[Array, "d"]:
         """Lattice index of the grid window's first node."""
         return self.grid.window(self.anchor(particles))
@@ -143,13 +187,36 @@ class Scene(eqx.Module):
         """The positions at which stencils stand [m], shape (p, d): x, or X in the total description."""
         return self.description.anchor(particles)
 
-    def stencil(self, particles: Particles) -> Stencil:
-        """The particles' stencil, with the moving-least-squares gradient where the transfer needs it."""
+    def on_grid(self, particles: Particles, t: Scalar) -> Array:
+        """The `anchor` relative to the grid at time t [m], shape (p, d)."""
+        place, shift = self.anchor(particles), self.shift(t)
+        return place if shift is None else place - shift
+
+    def stencil(self, particles: Particles, t: Scalar = 0.0) -> Stencil:
+        """The particles' stencil at time t, with the moving-least-squares gradient where the transfer needs it."""
         return make_stencil(
             self.kernel,
             self.gradient,
             self.grid,
             self.window(particles),
-            self.anchor(particles),
+            self.on_grid(particles, t),
             affine=self.transfer.affine,
         )
+
+
+@checked
+def attach(scene: Scene, particles: Particles) -> Scene:
+    """The scene with its loads attached to the particles as they are: each `Patch` of a surface and all `PointsAt`
+    become points that move with the nearest particle.
+
+    Args:
+        scene: the scene.
+        particles: its particles at the start.
+
+    Raises:
+        ValueError: a place with no surface, or with a point off the body; particles inside a jax transformation.
+    """
+    if not scene.loads:
+        return scene
+    loads = tuple(eqx.tree_at(lambda own: own.on, load, load.on.attached(particles)) for load in scene.loads)
+    return eqx.tree_at(lambda s: s.loads, scene, loads)

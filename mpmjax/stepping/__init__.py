@@ -4,6 +4,7 @@ from mpmjax.stepping._backward_euler import BackwardEuler
 from mpmjax.stepping._explicit import Explicit
 from mpmjax.stepping._implicit_midpoint import ImplicitMidpoint
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
+from mpmjax.stepping._left_undone import LeftUndone
 from mpmjax.stepping._nodes import Nodes, particles_to_grid
 from mpmjax.stepping._semi_implicit import SemiImplicit
 from mpmjax.stepping._stability import MOST_STEPS, SAFETY, UnknownBoundError, longest_step, stable_dt, step_for
@@ -19,6 +20,7 @@ __all__ = [
     "Explicit",
     "GridUpdate",
     "ImplicitMidpoint",
+    "LeftUndone",
     "NodeMotion",
     "Nodes",
     "SemiImplicit",

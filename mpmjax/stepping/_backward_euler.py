@@ -10,6 +10,7 @@ from mpmjax.checks import require_fields
 from mpmjax.implicit import (
     AbstractHessian,
     AbstractPreconditioner,
+    AbstractSolution,
     AnalyticHessian,
     ConjugateResidual,
     DiagonalPreconditioner,
@@ -52,12 +53,15 @@ class BackwardEuler(AbstractImplicitIntegrator):
         require_fields(self)
 
     def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
-        v, info = Stage(nodes.inertial_velocity(), nodes.dt).solve(nodes, guess, self, self.solution)
+        v, info = Stage(nodes.inertial_velocity(), nodes.dt).solve(nodes, guess, self)
         return NodeMotion(v, resisted=v if nodes.potential.viscous else None), info
 
-    def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
-        """Δt f(Δt v) [kg m/s]."""
-        return nodes.dt * nodes.potential.force(nodes.dt * motion.velocity)
+    def solved_by(self) -> AbstractSolution:
+        return self.solution
+
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
+        """One, at Δt v^{n+1}."""
+        return ((1, nodes.dt * motion.velocity),)
 
     def stability_factor(self) -> Scalar:
         return 0.0

@@ -20,7 +20,7 @@ from mpmjax.implicit import (
 )
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
-from mpmjax.stepping._stage import Stage, stage_force
+from mpmjax.stepping._stage import Stage
 
 
 class ImplicitMidpoint(AbstractImplicitIntegrator):
@@ -62,12 +62,15 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
     def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         v0, half = nodes.admitted_velocity(), nodes.dt / 2
         stage = Stage(v0 + half * nodes.acceleration, half)
-        mean, info = stage.solve(nodes, guess, self, self.solution)
+        mean, info = stage.solve(nodes, guess, self)
         return NodeMotion(2 * mean - v0, mean, resisted=mean if nodes.potential.viscous else None), info
 
-    def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
-        """Δt f(½Δt v̄) [kg m/s]."""
-        return nodes.dt * stage_force(nodes, self, self.solution, (1, nodes.dt / 2 * motion.carrier))
+    def solved_by(self) -> AbstractSolution:
+        return self.solution
+
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
+        """One, at ½Δt v̄."""
+        return ((1, nodes.dt / 2 * motion.carrier),)
 
     def stability_factor(self) -> Scalar:
         return 0.0

@@ -7,7 +7,16 @@ import equinox as eqx
 import lineax as lx
 
 from mpmjax._types import NodeVector, Scalar
-from mpmjax.implicit import AbstractHessian, AbstractPreconditioner, Guess, Reporting, SolveInfo, require_solver
+from mpmjax.implicit import (
+    AbstractHessian,
+    AbstractPreconditioner,
+    AbstractSolution,
+    Guess,
+    Reporting,
+    SolveInfo,
+    exact_force,
+    require_solver,
+)
 from mpmjax.stepping._nodes import Nodes
 
 
@@ -77,6 +86,11 @@ class AbstractIntegrator(eqx.Module):
         elsewhere, from `NodeMotion.resisted`.
         """
 
+    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
+        """`elastic_impulse` with the forces of the law, where it has others; None where it has those. Default: None."""
+        del nodes, motion
+        return None
+
     def stability_factor(self) -> Scalar | None:
         """The number c for which a step is stable if c (Δt² Λ A/ρ0 + Δt Λ_v B/ρ0) ≤ 4 (see `stable_dt`). It is 1 for
         the explicit step, and 0 or less if every step is stable. Default: None, for which `stable_dt` raises."""
@@ -103,7 +117,8 @@ class AbstractIntegrator(eqx.Module):
 
 
 class AbstractImplicitIntegrator(AbstractIntegrator):
-    """An integrator that solves with the elastic Hessian, and treats viscosity implicitly."""
+    """An integrator that solves with the elastic Hessian, and treats viscosity implicitly. A subclass must have
+    `advance`, `solved_by` and `stages`."""
 
     explicit_viscosity: ClassVar[bool] = False
 
@@ -118,6 +133,25 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
 
     def __check_init__(self):
         require_solver(f"{type(self).__name__}'s adjoint_solver", self.adjoint_solver)
+
+    @abstractmethod
+    def solved_by(self) -> AbstractSolution:
+        """How the equation of a stage is solved."""
+
+    @abstractmethod
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
+        """The stages in which the elastic force acts on displaced nodes: weights q [-] and displacements u [m], shape
+        (n, d), of the impulse Δt Σ q f(u)."""
+
+    def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """Δt Σ q f(u) [kg m/s], with the forces that the solution takes."""
+        stages = self.stages(nodes, motion)
+        return nodes.dt * self.solved_by().stage_force(nodes.potential, self.hessian, nodes.force, *stages)
+
+    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
+        if not self.solved_by().linearises:
+            return None
+        return nodes.dt * exact_force(nodes.potential, *self.stages(nodes, motion))
 
     def initial_guess(self, nodes: Nodes) -> NodeVector:
         return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())

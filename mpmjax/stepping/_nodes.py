@@ -8,10 +8,20 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
-from mpmjax.boundary import AbstractContact, AbstractNodes, Conditions, Mirror, combined_conditions, contacts_of, mirror
+from mpmjax.boundary import (
+    AbstractContact,
+    AbstractNodes,
+    Conditions,
+    Mirror,
+    MirrorMotion,
+    combined_conditions,
+    contacts_of,
+    mirror,
+    mirror_motion,
+)
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
-from mpmjax.state import Particles, Scene
+from mpmjax.state import Particles, Scene, load_force, points_of, supports_of
 
 Fold = Callable[[NodeVector], NodeVector]
 """A map from a nodal vector to its sum with its images at mirrors."""
@@ -115,6 +125,8 @@ class Nodes(AbstractNodes):
     """The conditions that the boundaries prescribe."""
     contacts: tuple[AbstractContact, ...] = ()
     """The contacts of the scene; none of them is active here."""
+    mirror_motion: MirrorMotion | None = None
+    """What mirrors that move add to the velocity of the nodes beyond them; None if none moves."""
 
     @property
     def velocity(self) -> NodeVector:
@@ -185,10 +197,12 @@ class Nodes(AbstractNodes):
     @property
     def prescribed(self) -> NodeVector:
         """The velocity of held components [m/s], shape (n, d)."""
-        part = self.free_normal
+        part, velocity = self.free_normal, self.conditions.velocity
+        if self.mirror_motion is not None:
+            velocity = jnp.where(self.mirror_motion.beyond, self.mirror_motion.velocity, velocity)
         if part is None:
-            return self.conditions.velocity
-        return jnp.where(self.free, part.direction * part.speed[:, None], self.conditions.velocity)
+            return velocity
+        return jnp.where(self.free, part.direction * part.speed[:, None], velocity)
 
     def explicit_velocity(self) -> NodeVector:
         """v* = v^n + Δt f/m + Δt g [m/s], shape (n, d) (derivation, eq. 4)."""
@@ -226,6 +240,10 @@ class Nodes(AbstractNodes):
         parts = self.sums.folded(fold_per_mass, images.fold), fold_per_mass(self.acceleration)
         return eqx.tree_at(lambda n: (n.sums, n.acceleration), nodes, parts)
 
+    def moved_by(self, change: NodeVector) -> "Nodes":
+        """The nodes with a velocity [m/s], shape (n, d), added to theirs."""
+        return eqx.tree_at(lambda n: n.sums, self, self.sums.folded(lambda v: v + change, lambda force: force))
+
     def constrained(self, images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None) -> "Nodes":
         """The nodes folded at these mirrors, with the components `fixed` and the `normals` held too."""
         nodes, colliders = (
@@ -248,6 +266,7 @@ def particles_to_grid(
     explicit_viscosity: bool = False,
     joined: bool = False,
     viscosity_apart: bool = False,
+    folded: bool = True,
 ) -> Nodes:
     """P2G, folded at symmetry planes, with the elastic potential and the boundaries of the step from t to t + dt.
 
@@ -262,6 +281,7 @@ def particles_to_grid(
         explicit_viscosity: whether the force includes the viscous stress, at the particles' stored velocity gradients.
         joined: whether momentum and force may be summed together. They are if both have the same gradient operator.
         viscosity_apart: whether to compute the viscous part of the force separately too.
+        folded: whether to fold at symmetry planes.
     """
     grid, window = scene.grid, scene.window(particles)
     v = components(particles.v)
@@ -269,16 +289,21 @@ def particles_to_grid(
     affine = C if scene.transfer.affine else None
     acceleration = jnp.asarray(scene.gravity)
     with jax.named_scope("p2g"):
-        potential = ElasticPotential(scene.material_points(particles), stencil, Mirror(()), grid.size)
+        points = points_of(scene.loads, scene.laws, particles, stencil, total=scene.total)
+        supports = supports_of(scene.loads, points, t + body_force_at * dt)
+        potential = ElasticPotential(scene.material_points(particles), stencil, Mirror(()), grid.size, supports)
         joined = joined and stencil.mls_weight_derivatives is None
         flux, viscous_flux = potential.current_flux(), None
-        if explicit_viscosity and potential.viscous and C is not None:
+        if explicit_viscosity and potential.material_viscous and C is not None:
             viscous_flux = potential.viscous_flux(C)
             flux = flux + viscous_flux
         mass, momentum = p2g(stencil, particles.mass, v, affine, grid.size, -dt * flux if joined else None)
         lightest = particles.mass.min()  # a mean would empty the nodes of a body much lighter than the others
         occupied = (mass > jnp.finfo(mass.dtype).eps * lightest)[:, None]
         full = jnp.where(occupied, mass[:, None], 1)
+        loaded = load_force(scene.loads, points, t, dt, body_force_at, grid.size)
+        if loaded is not None:
+            acceleration = acceleration + jnp.where(occupied, loaded / full, 0)
         if scene.body_force is not None:
             x, at = particles.x, t
             if body_force_at > 0:
@@ -286,19 +311,29 @@ def particles_to_grid(
             push = particles.mass * components(scene.body_force.acceleration(x, at))
             force = scatter(stencil, push, None, grid.size)
             acceleration = acceleration + jnp.where(occupied, force / full, 0)
-        conditions = combined_conditions(scene.boundary, grid.nodes(window), grid.spacing, t, dt, reference=scene.total)
+        places = scene.nodes(particles, t)
+        conditions = combined_conditions(scene.boundary, places, grid.spacing, t, dt, reference=scene.total)
         if scene.total and conditions.colliders is not None and conditions.colliders.slides:
             slid = (conditions.colliders.owner >= 0)[:, None] & occupied
-            place = jnp.where(slid, _place(particles, stencil, grid.size) / full, conditions.colliders.position)
+            place = jnp.where(slid, places_of(particles, stencil, grid.size) / full, conditions.colliders.position)
             conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
-        velocity = jnp.where(occupied, momentum / full, 0)
+        drag = potential.support_drag() if explicit_viscosity else None
         if joined:
-            sums = JoinedSum(velocity)
+            if supports:
+                pull = potential.support_force() if drag is None else potential.support_force() + drag
+                momentum = momentum + dt * pull
+            sums = JoinedSum(jnp.where(occupied, momentum / full, 0))
         else:
-            viscous_force = None
+            force, viscous_force = -potential.nodal_sum(flux), None
             if viscosity_apart and viscous_flux is not None:
                 viscous_force = -potential.nodal_sum(viscous_flux)
-            sums = SeparateSums(velocity, -potential.nodal_sum(flux), viscous_force)
+            if supports:
+                force = force + potential.support_force()
+            if drag is not None:
+                force = force + drag
+            if viscosity_apart and drag is not None:
+                viscous_force = drag if viscous_force is None else viscous_force + drag
+            sums = SeparateSums(jnp.where(occupied, momentum / full, 0), force, viscous_force)
         nodes = Nodes(
             mass=jnp.where(occupied[:, 0], mass, 0),
             sums=sums,
@@ -309,11 +344,25 @@ def particles_to_grid(
             potential=potential,
             conditions=conditions,
             contacts=contacts_of(scene.boundary, conditions, grid, window, t, dt),
+            mirror_motion=mirror_motion(scene.boundary, grid, window, t, dt),
         )
-        return nodes.folded(mirror(scene.boundary, grid, window))
+        return folded_at_planes(scene, particles, nodes) if folded else nodes
 
 
-def _place(particles: Particles, stencil: Stencil, size: int) -> NodeVector:
+def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes) -> Nodes:
+    """The nodes, folded at the scene's symmetry planes."""
+    images, moving = mirror(scene.boundary, scene.grid, scene.window(particles)), nodes.mirror_motion
+    with jax.named_scope("p2g"):
+        if moving is None:
+            return nodes.folded(images)
+        # at rest with the mirrors: the velocity less what they add, which is put back
+        added = jnp.where(nodes.conditions.fixed, nodes.conditions.velocity, 0)
+        added = jnp.where(moving.beyond, moving.velocity, added)
+        added = images.added(added)
+        return nodes.moved_by(-images.unfold(added)).folded(images).moved_by(added)
+
+
+def places_of(particles: Particles, stencil: Stencil, size: int) -> NodeVector:
     """Current positions of reference nodes times their mass, Σ_p w_ip m_p (x_p + F_p (X_i − X_p)) [kg m], (n, d)."""
     F = jnp.concatenate([group.deformation() for group in particles.groups], axis=-1)
     return p2g(stencil, particles.mass, components(particles.x), F, size)[1]

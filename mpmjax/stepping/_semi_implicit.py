@@ -76,13 +76,15 @@ class SemiImplicit(AbstractImplicitIntegrator):
             prescribed=nodes.prescribed,
             preconditioner=self.preconditioner,
         )
-        v, info = solve(problem, guess, Linearised(self.solver), self.adjoint_solver)
+        v, info = solve(problem, guess, self.solved_by(), self.adjoint_solver)
         return NodeMotion(v, resisted=(1 - beta) * v0 + beta * v if viscous else None), info
 
-    def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
-        """Δt f(0) − βΔt² H v [kg m/s]."""
-        action = self.hessian.at_step_start(nodes.potential)
-        return nodes.dt * nodes.force - self.beta * nodes.dt**2 * action(motion.velocity)
+    def solved_by(self) -> Linearised:
+        return Linearised(self.solver)
+
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
+        """One, at βΔt v^{n+1}."""
+        return ((1, self.beta * nodes.dt * motion.velocity),)
 
     def stability_factor(self) -> Scalar:
         return 1 - 2 * jnp.asarray(self.beta)

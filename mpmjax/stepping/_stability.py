@@ -11,7 +11,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import canonical, checked, is_traced, require, require_positive
 from mpmjax.discretisation import Stencil
-from mpmjax.state import MaterialPoints, Particles, Scene, is_prepared, prepare
+from mpmjax.state import AttachedPoints, MaterialPoints, Particles, Scene, is_prepared, points_of, prepare
 from mpmjax.stepping._explicit import Explicit
 from mpmjax.stepping._integrator import AbstractIntegrator
 
@@ -158,11 +158,35 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Fl
         raise UnknownBoundError(f"{type(method).__name__} gives no bound on its step: give dt.")
     most = jnp.concatenate([_stiffest_viscosity(points, particles.dim) for points in materials])
     y = most * viscous_steepness / density  # per Δt
+    if scene.loads:
+        springs, dashpots = _supports(scene, particles, elastic_steepness)
+        z, y = z + springs, y + dashpots
     z, y = jnp.maximum(factor * z, 0), jnp.maximum(factor * y, 0)
     square = y**2 + 16 * z
     none = square == 0  # and not what is NaN, which the least must keep
     steepness = (y + jnp.where(none, 0, jnp.sqrt(jnp.where(none, 1, square)))).max()
     return jnp.where(steepness == 0, jnp.inf, 8 / jnp.where(steepness == 0, 1, steepness))
+
+
+def _supports(scene: Scene, particles: Particles, steepness: Array) -> tuple[Array, Array]:
+    """What springs [1/s²] and dashpots [1/s] to the ground add to the two terms of the bound at each particle.
+
+    A particle alone with a spring k at an arm r has Σ_i N_i² k/(w_ip m_p) ≤ (1 + r·Ξr) k/m_p, and A is no less
+    than Ξ. Twice that covers transfers that forget the affine velocity.
+    """
+    z, y = jnp.zeros_like(particles.mass), jnp.zeros_like(particles.mass)
+    steepness = jnp.broadcast_to(steepness, z.shape)
+    points = points_of(scene.loads, scene.laws, particles, scene.stencil(particles), total=scene.total)
+    for load, own in zip(scene.loads, points, strict=True):
+        support = load.support(own, jnp.zeros((), z.dtype))
+        if support is None or not isinstance(load.on, AttachedPoints):
+            continue
+        rows = jnp.asarray(load.on.particle).astype(jnp.int32)
+        reach = (1 + (own.arm**2).sum(axis=0) * steepness[rows]) / particles.mass[rows]
+        z = z.at[rows].add(2 * reach * support.stiffness.max(axis=0))
+        if support.damping is not None:
+            y = y.at[rows].add(4 * reach * support.damping.max(axis=0))
+    return z, y
 
 
 def _stiffest_viscosity(points: MaterialPoints, dim: int) -> Float[Array, "q"]:

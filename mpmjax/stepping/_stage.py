@@ -7,8 +7,8 @@ nodal displacement u and −D v the viscous force. One linear solve takes f(u) =
 
 import equinox as eqx
 
-from mpmjax._types import Array, Float, NodeVector, Scalar
-from mpmjax.implicit import AbstractSolution, SolveInfo, StageEquation, solve
+from mpmjax._types import Array, Float, NodeVector
+from mpmjax.implicit import SolveInfo, StageEquation, solve
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator
 from mpmjax.stepping._nodes import Nodes
 
@@ -24,7 +24,7 @@ class Stage(eqx.Module):
     """u [m], shape (n, d); None for zero."""
 
     def solve(
-        self, nodes: Nodes, guess: NodeVector, method: AbstractImplicitIntegrator, solution: AbstractSolution
+        self, nodes: Nodes, guess: NodeVector, method: AbstractImplicitIntegrator
     ) -> tuple[NodeVector, SolveInfo]:
         """The velocity v [m/s], shape (n, d), and the report of the solve."""
         equation = StageEquation(
@@ -40,11 +40,5 @@ class Stage(eqx.Module):
             prescribed=nodes.prescribed,
             preconditioner=method.preconditioner,
         )
+        solution = method.solved_by()
         return solve(solution.problem(equation), guess, solution, method.adjoint_solver)
-
-
-def stage_force(
-    nodes: Nodes, method: AbstractImplicitIntegrator, solution: AbstractSolution, *stages: tuple[Scalar, NodeVector]
-) -> NodeVector:
-    """Σ q f(u) [N], shape (n, d): the elastic forces of stages, for pairs of a weight q and a displacement u [m]."""
-    return solution.stage_force(nodes.potential, method.hessian, nodes.force, *stages)

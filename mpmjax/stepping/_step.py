@@ -2,6 +2,7 @@
 yield."""
 
 from dataclasses import replace
+from functools import reduce
 
 import equinox as eqx
 import jax
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Int, NodeScalar, NodeVector, Scalar, components, particle_first
 from mpmjax.autodiff import without_derivative
 from mpmjax.boundary import (
+    BoundaryImpulse,
     ColliderImpulse,
     ConstrainedNodes,
     ContactInfo,
@@ -22,9 +24,11 @@ from mpmjax.checks import canonical, checked, require_positive
 from mpmjax.discretisation import Stencil, g2p
 from mpmjax.implicit import Projection, SolveInfo, no_solve
 from mpmjax.state import Particles, Scene, is_prepared, prepare
+from mpmjax.stepping._boundary_forces import given_to_boundaries
 from mpmjax.stepping._explicit import Explicit
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
-from mpmjax.stepping._nodes import Nodes, particles_to_grid
+from mpmjax.stepping._left_undone import LeftUndone, norm, nothing_left_undone
+from mpmjax.stepping._nodes import Nodes, folded_at_planes, particles_to_grid
 
 
 class StepInfo(eqx.Module):
@@ -34,8 +38,12 @@ class StepInfo(eqx.Module):
     contact: ContactInfo
     outside: Int[Array, "*f"]
     """Particles whose stencil left the grid's window."""
+    left_undone: LeftUndone
+    """What one linear solve leaves undone of the elastic force; nothing of explicit steps and of Newton's method."""
     colliders: ColliderImpulse | None = None
     """Impulse on the scene's colliders, in the order of its boundaries; None without colliders."""
+    boundaries: BoundaryImpulse | None = None
+    """Impulse on each of the scene's boundaries; None unless the scene has `boundary_forces`."""
 
 
 class GridUpdate(eqx.Module):
@@ -58,6 +66,12 @@ class GridUpdate(eqx.Module):
     """The projection on the components of velocity that no boundary acts on."""
     solve: SolveInfo
     contact: ContactInfo
+    held: ConstrainedNodes
+    """The nodes with what contacts hold."""
+    solved: NodeMotion
+    """`motion` before friction."""
+    slowed: tuple[NodeVector, ...] = ()
+    """The change of velocity by the friction of each contact [m/s], shape (n, d)."""
     normal_impulse: NodeScalar | None = None
     """The impulse of colliders along their normals [kg m/s], shape (n,); None without colliders."""
     collider_friction: NodeVector | None = None
@@ -82,7 +96,7 @@ def step_unchecked(
         method: the integrator.
         stencil: stencil of the particles, if it is known already, as in the total description. Default: it is computed.
     """
-    stencil = scene.stencil(particles) if stencil is None else stencil
+    stencil = scene.stencil(particles, t) if stencil is None else stencil
     nodes = particles_to_grid(
         scene,
         particles,
@@ -92,12 +106,24 @@ def step_unchecked(
         body_force_at=method.body_force_at,
         explicit_viscosity=method.explicit_viscosity,
         joined=not (method.needs_separate_force or scene.transfer.needs_change),
+        folded=False,
     )
+    unfolded, nodes = nodes, folded_at_planes(scene, particles, nodes)
     new = update(nodes, method)
     trial = grid_to_particles(scene, particles, nodes, new)
     after = scene.return_map(trial, dt)
     outside = (~stencil.inside).sum().astype(jnp.int32)
-    return after, StepInfo(new.solve, new.contact, outside, _given_to_colliders(nodes, new))
+    boundaries = None
+    if scene.boundary_forces:
+        before, mean = jax.tree.map(nodes.mirror.unfold, (new.before, new.motion.mean))
+        reaction = new.reaction
+        if nodes.mirror.images:  # of all nodes
+            reaction = impulses(unfolded, method, jax.tree.map(nodes.mirror.unfold, new.solved))[1]
+        boundaries = given_to_boundaries(
+            scene, particles, stencil, t, unfolded, nodes, reaction, before, mean, new.held, new.slowed
+        )
+    undone = _left_undone(nodes, method, new)
+    return after, StepInfo(new.solve, new.contact, outside, undone, _given_to_colliders(nodes, new), boundaries)
 
 
 def _given_to_colliders(nodes: Nodes, new: GridUpdate) -> ColliderImpulse | None:
@@ -111,6 +137,18 @@ def _given_to_colliders(nodes: Nodes, new: GridUpdate) -> ColliderImpulse | None
     return impulse_on_colliders(colliders, new.reaction, new.normal_impulse, new.collider_friction)
 
 
+def _left_undone(nodes: Nodes, method: AbstractIntegrator, new: GridUpdate) -> LeftUndone:
+    """What the linearisation of the step leaves undone. No derivative passes."""
+    nodes, method, new = without_derivative((nodes, method, new))
+    exact = method.exact_impulse(nodes, new.solved)
+    if exact is None or new.internal is None:
+        return nothing_left_undone(nodes.mass.dtype)
+    elastic = new.internal if new.viscous is None else new.internal - new.viscous
+    momentum = nodes.mass[:, None] * new.solved.velocity
+    scale = reduce(jnp.maximum, (norm(exact), norm(elastic), nodes.dt * norm(nodes.force), norm(momentum)))
+    return LeftUndone(norm(exact - elastic) / nodes.dt, scale / nodes.dt)
+
+
 step_compiled = eqx.filter_jit(step_unchecked)
 """`step_unchecked`, compiled as one program."""
 
@@ -122,9 +160,21 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
         if not nodes.contacts:
             motion, info = method.advance(nodes, guess)
             internal, reaction, viscous = impulses(nodes, method, motion)
-            normal = constrain(nodes, ()).collider_impulse(reaction)
-            before, free = nodes.velocity if nodes.separate else None, nodes.projection
-            return GridUpdate(before, motion, internal, viscous, reaction, None, free, info, no_contact(), normal)
+            held = constrain(nodes, ())
+            return GridUpdate(
+                before=nodes.velocity if nodes.separate else None,
+                motion=motion,
+                internal=internal,
+                viscous=viscous,
+                reaction=reaction,
+                friction=None,
+                free=nodes.projection,
+                solve=info,
+                contact=no_contact(),
+                held=held,
+                solved=motion,
+                normal_impulse=held.collider_impulse(reaction),
+            )
 
         def moved(
             held: ConstrainedNodes, method: AbstractIntegrator, guess: NodeVector
@@ -142,9 +192,9 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
         held = constrain(nodes, active)
         motion, info = moved(held, method, guess)
         internal, reaction, viscous = impulses(nodes, method, motion)
-        normal = held.collider_impulse(reaction)
-        slowed, friction = held.friction(motion.velocity, reaction)
-        change = slowed - motion.velocity
+        after, slowed = held.friction(motion.velocity, reaction)
+        change = after - motion.velocity
+        of_colliders = [by for contact, by in zip(nodes.contacts, slowed, strict=True) if contact.of_collider]
         return GridUpdate(
             before=held.images.unfold(held.nodes.velocity) if nodes.separate else None,
             motion=motion.with_friction(change),
@@ -155,8 +205,11 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
             free=Projection(*held.beyond_boundaries()),
             solve=cost.followed_by(info),
             contact=ContactInfo(sweeps, held.count_violations(motion.velocity, reaction)),
-            normal_impulse=normal,
-            collider_friction=friction,
+            held=held,
+            solved=motion,
+            slowed=slowed,
+            normal_impulse=held.collider_impulse(reaction),
+            collider_friction=nodes.mass[:, None] * of_colliders[0] if of_colliders else None,
         )
 
 

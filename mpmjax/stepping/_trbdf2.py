@@ -21,7 +21,7 @@ from mpmjax.implicit import (
 )
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
-from mpmjax.stepping._stage import Stage, stage_force
+from mpmjax.stepping._stage import Stage
 
 
 class TRBDF2(AbstractImplicitIntegrator):
@@ -76,19 +76,29 @@ class TRBDF2(AbstractImplicitIntegrator):
         viscous = nodes.potential.viscous
         pull = nodes.per_mass(nodes.force - nodes.potential.viscous_resistance(v0) if viscous else nodes.force)
         trapezoidal = Stage(v0 + length * (pull + 2 * g), length, length * v0)
-        middle, first = trapezoidal.solve(nodes, guess, self, self.solution)
+        middle, first = trapezoidal.solve(nodes, guess, self)
         later_pull = (middle - trapezoidal.inertial) / length  # f_γ/m, viscosity's with it, by the stage's own equation
         last = Stage(v0 + dt * (q0 * pull + q1 * later_pull + g), length, dt * (q0 * v0 + q1 * middle))
-        v, second = last.solve(nodes, middle, self, self.solution)
+        v, second = last.solve(nodes, middle, self)
         inner, mean = q2 * (v0 + middle), q0 * v0 + q1 * middle + q2 * v
         return NodeMotion(v, mean, inner, mean if viscous else None), first.together_with(second)
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt (q_0 f_0 + q_1 f_γ + q_2 f_1) [kg m/s]."""
-        _, q0, q1, q2 = self.weights()
+        return nodes.dt * self.weights()[1] * nodes.force + super().elastic_impulse(nodes, motion)
+
+    def solved_by(self) -> AbstractSolution:
+        return self.solution
+
+    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
+        later = super().exact_impulse(nodes, motion)
+        return None if later is None else nodes.dt * self.weights()[1] * nodes.force + later
+
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
+        """Those at γΔt and Δt."""
+        _, _, q1, q2 = self.weights()
         inner = motion.carrier if motion.inner is None else motion.inner
-        stages = (q1, nodes.dt * inner), (q2, nodes.dt * motion.carrier)
-        return nodes.dt * (q0 * nodes.force + stage_force(nodes, self, self.solution, *stages))
+        return (q1, nodes.dt * inner), (q2, nodes.dt * motion.carrier)
 
     def stability_factor(self) -> Scalar:
         return 0.0

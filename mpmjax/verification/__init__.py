@@ -3,7 +3,7 @@ it."""
 
 from mpmjax.verification._aligned import AxisAligned
 from mpmjax.verification._bar import VibratingBar
-from mpmjax.verification._column import Column
+from mpmjax.verification._column import Column, HenckyColumn
 from mpmjax.verification._disks import TwoDisks
 from mpmjax.verification._law import check_law
 from mpmjax.verification._problem import (
@@ -15,6 +15,7 @@ from mpmjax.verification._problem import (
     stress_error,
 )
 from mpmjax.verification._refinement import errors, orders
+from mpmjax.verification._ring import ExpandingRing
 from mpmjax.verification._tension import tension
 from mpmjax.verification._vortex import Vortex
 from mpmjax.verification._wave import StandingWave
@@ -24,6 +25,8 @@ __all__ = [
     "AxisAligned",
     "Column",
     "Ends",
+    "ExpandingRing",
+    "HenckyColumn",
     "Manufactured",
     "StandingWave",
     "TwoDisks",

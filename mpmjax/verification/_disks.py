@@ -1,5 +1,7 @@
 """Two elastic disks that collide."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -36,8 +38,17 @@ class TwoDisks(eqx.Module):
         """Time at which the circles touch [s]."""
         return (2**0.5 * self.centre - self.radius) / (2**0.5 * self.speed)
 
-    def discretise(self, cells: int = 20, *, per_side: int = 2) -> tuple[Scene, Particles]:
-        """Scene and particles, with `cells` grid cells to a metre and `per_side` particles to the side of a cell."""
+    def discretise(
+        self, cells: int = 20, *, per_side: int = 2, fitted: bool = False, **choices: Any
+    ) -> tuple[Scene, Particles]:
+        """Scene and particles, with `cells` grid cells to a metre and `per_side` particles to the side of a cell.
+
+        Args:
+            cells: grid cells to a metre.
+            per_side: particles to the side of a cell.
+            fitted: whether they are fitted to the circles (see `fill`).
+            choices: kernel, gradient and transfer of the scene.
+        """
         half = round(0.75 * cells)
         grid = Grid((2 * half + 1,) * 2, 1 / cells, origin=(-half,) * 2)
         disks = [
@@ -47,7 +58,8 @@ class TwoDisks(eqx.Module):
                 particles_per_cell=per_side**2,
                 density=self.density,
                 velocity=(-side * self.speed,) * 2,
+                fitted=fitted,
             )
             for side in (-1, 1)
         ]
-        return Scene(grid, self.material), jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *disks)
+        return Scene(grid, self.material, **choices), jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *disks)

@@ -3,6 +3,7 @@
 import abc
 import enum
 import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -61,6 +62,11 @@ class AbstractProblem(eqx.Module):
     @abc.abstractmethod
     def body(self, cells: int) -> AbstractRegion:
         """The region of the body at rest, on this grid."""
+
+    def rest(self, cells: int, per_side: int, *, fitted: bool = False) -> Particles:
+        """The particles at rest on this grid, `per_side` to the side of a cell. Default: those of `fill`."""
+        number = per_side**self.dim
+        return fill(self.body(cells), self.grid(cells), particles_per_cell=number, density=self.density, fitted=fitted)
 
     def boundary(self) -> tuple[AbstractBoundary, ...]:
         """The boundaries. Default: none."""
@@ -126,7 +132,8 @@ def discretise(
     *,
     per_side: int = 2,
     velocity_time: float = 0.0,
-    rest: Particles | None = None,
+    rest: Particles | Callable[[int], Particles] | None = None,
+    fitted: bool = False,
     **choices: Any,
 ) -> tuple[Scene, Particles]:
     """The scene of a problem, and its particles in their exact initial state.
@@ -137,14 +144,18 @@ def discretise(
         per_side: particles to the side of a cell.
         velocity_time: time of the initial velocities [s]. Symplectic Euler is the leap-frog method, whose velocities
             are half a step early: it is of second order in time with −Δt/2, of first order with 0.
-        rest: the particles at rest, with mass and volume. Default: the cells of the body, filled evenly.
+        rest: the particles at rest, with mass and volume, or a function of `cells` that makes them: any of one's own.
+            Default: the problem's.
+        fitted: whether these are fitted to the body's surface (see `fill`).
         choices: kernel, gradient, transfer and description of the scene.
     """
     grid = problem.grid(cells)
     d = problem.dim
     require(grid.dim == d, f"The problem is {d}-dimensional, its grid {grid.dim}-dimensional.")
     if rest is None:
-        rest = fill(problem.body(cells), grid, particles_per_cell=per_side**d, density=problem.density)
+        rest = problem.rest(cells, per_side, fitted=fitted)
+    elif callable(rest):
+        rest = rest(cells)
     X = rest.x
     x, F = jax.vmap(lambda Y: (problem.position(Y, 0.0), problem.deformation(Y, 0.0)))(X)
     v, rate = jax.vmap(

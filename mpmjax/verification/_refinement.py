@@ -1,16 +1,20 @@
 """Errors under refinement, and observed orders of convergence."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from mpmjax.simulation import simulate
+from mpmjax._types import Array, Float
+from mpmjax.simulation import Run, simulate
+from mpmjax.state import Particles
 from mpmjax.stepping import AbstractIntegrator, Explicit
 from mpmjax.verification._problem import AbstractProblem, discretise, displacement_error
 
 _SAMPLES = 10
+Measure = Callable[[AbstractProblem, Particles, Run], Float[Array, "f"]]
+"""The error of a run of a problem at each saved frame, shape (f,)."""
 
 
 def errors(
@@ -20,9 +24,10 @@ def errors(
     courant: float | Sequence[float],
     method: AbstractIntegrator = Explicit(),
     staggered: bool | None = None,
+    measure: Measure = displacement_error,
     **discretisation: Any,
 ) -> np.ndarray:
-    """The displacement error on each grid [m]: the largest at ten times, evenly spaced over the duration.
+    """The displacement error on each grid [m], or another: the largest at ten times, evenly spaced over the duration.
 
     The error of a run that fails is infinite.
 
@@ -34,11 +39,12 @@ def errors(
         method: the integrator.
         staggered: whether initial velocities are those half a step before the start (see `discretise`). Default: yes,
             except with methods of second order, whose velocities are at the time of the positions.
-        discretisation: further arguments of `discretise`.
+        measure: the error of a run at each saved frame: `displacement_error`, `stress_error`, or one's own.
+        discretisation: further arguments of `discretise`, with `rest` particles of one's own.
     """
     numbers = [courant] * len(cells) if isinstance(courant, (int, float)) else courant
     return np.array(
-        [_error(problem, n, c, method, staggered, discretisation) for n, c in zip(cells, numbers, strict=True)]
+        [_error(problem, n, c, method, staggered, measure, discretisation) for n, c in zip(cells, numbers, strict=True)]
     )
 
 
@@ -53,6 +59,7 @@ def _error(
     courant: float,
     method: AbstractIntegrator,
     staggered: bool | None,
+    measure: Measure,
     discretisation: dict[str, Any],
 ) -> float:
     longest = courant / (cells * problem.wave_speed)
@@ -61,5 +68,5 @@ def _error(
     start = -dt / 2 if staggered or (staggered is None and method.body_force_at == 0) else 0.0
     scene, particles = discretise(problem, cells, velocity_time=start, **discretisation)
     run = simulate(scene, particles, t1=problem.duration, dt=dt, method=method, save_every=every, throw=False)
-    worst = float(displacement_error(problem, particles, run).max())
+    worst = float(measure(problem, particles, run).max())
     return worst if bool(run.statistics.healthy) and math.isfinite(worst) else math.inf

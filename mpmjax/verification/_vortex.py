@@ -2,33 +2,15 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 
 from mpmjax._types import Array, Float, NodeVector, Scalar
 from mpmjax.boundary import AbstractBoundary, Conditions
 from mpmjax.discretisation import Grid
-from mpmjax.geometry import AbstractRegion, length
+from mpmjax.geometry import Annulus
 from mpmjax.material import AbstractMaterial, NeoHookean
 from mpmjax.verification._problem import AbstractProblem, Ends, box_grid
 
-_INNER, _OUTER, _ROOM = 0.75, 1.25, 1.5
-
-
-class Ring(AbstractRegion):
-    """The ring 0.75 m ≤ R ≤ 1.25 m."""
-
-    @property
-    def dim(self) -> int:
-        return 2
-
-    def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
-        return jnp.abs(length(x) - (_INNER + _OUTER) / 2) - (_OUTER - _INNER) / 2
-
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        return np.full(2, -_OUTER), np.full(2, _OUTER)
-
-    def middle(self) -> Float[Array, "d"]:
-        return jnp.zeros(2)
+_RING, _ROOM = Annulus((0.0, 0.0), 0.75, 1.25), 1.5
 
 
 class RestOutside(AbstractBoundary):
@@ -40,7 +22,7 @@ class RestOutside(AbstractBoundary):
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         del spacing, t, dt, reference
-        outside = Ring().distance(nodes)[:, None] >= 0
+        outside = _RING.distance(nodes)[:, None] >= 0
         return Conditions(jnp.broadcast_to(outside, nodes.shape), jnp.zeros_like(nodes))
 
 
@@ -76,9 +58,9 @@ class Vortex(AbstractProblem):
     def grid(self, cells: int) -> Grid:
         return box_grid((-_ROOM,) * 2, (_ROOM,) * 2, cells, Ends.PLAIN)
 
-    def body(self, cells: int) -> Ring:
+    def body(self, cells: int) -> Annulus:
         del cells
-        return Ring()
+        return _RING
 
     def boundary(self) -> tuple[AbstractBoundary, ...]:
         return (RestOutside(),)

@@ -9,7 +9,16 @@ import pytest
 from helpers import ids, thorough
 
 import mpmjax as mpm
-from mpmjax.verification import AxisAligned, Ends, StandingWave, TwoDisks, VibratingBar, Vortex, discretise
+from mpmjax.verification import (
+    AxisAligned,
+    Ends,
+    HenckyColumn,
+    StandingWave,
+    TwoDisks,
+    VibratingBar,
+    Vortex,
+    discretise,
+)
 
 E, NU, DENSITY = 1e7, 0.3, 1e3
 MU, LAMBDA = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
@@ -120,6 +129,22 @@ def test_a_wave_of_another_law_or_beyond_folding_is_refused():
         StandingWave(0.05, material=mpm.NeoHookean(1e4, 0.3))
     with pytest.raises(ValueError, match="below 1/π"):
         StandingWave(0.5)
+
+
+@pytest.mark.parametrize("load", [0.04, 4.0])
+def test_the_hencky_column_carries_its_weight(load):
+    """P = −a (1 − X), x(0) = 0, F = ∂x/∂X with E ln F/F = P, the body force −a, and F = 0.3 at the bottom at a = 4."""
+    column = HenckyColumn(load)
+    for X in (0.0, 0.3, 0.99):
+        place = jnp.asarray([X])
+        F = column.deformation(place, column.duration)
+        np.testing.assert_allclose(column.material.stress(F)[0, 0], -load * (1 - X), rtol=1e-12)
+        np.testing.assert_allclose(jnp.log(F) / F, [[-load * (1 - X)]], rtol=1e-12)
+        np.testing.assert_allclose(column.body_force(place, column.duration), [-load], rtol=1e-9)
+    assert float(column.position(jnp.zeros(1), column.duration)[0]) == pytest.approx(0, abs=1e-15)
+    if load == 4:
+        assert float(column.deformation(jnp.zeros(1), column.duration)[0, 0]) == pytest.approx(0.3005, abs=1e-3)
+    np.testing.assert_array_equal(column.position(jnp.asarray([0.3]), 0.0), [0.3])
 
 
 @pytest.mark.thorough

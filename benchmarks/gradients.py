@@ -1,0 +1,142 @@
+"""Which gradient operator, which kernel, which description? Errors of displacement and stress where surfaces do not
+follow the grid.
+
+    python benchmarks/gradients.py [--fine] [ring] [vortex] [disks] [column]
+
+Prints rows of docs/accuracy.md, of all problems or of those named. `--fine` adds a grid of twice the resolution.
+
+- ring: the expanding ring with free edges, filled by cells that the surface cuts; displacement over that of the inner
+  edge, stress over that at it.
+- vortex: A = 0.1, its edges held; displacement in metres, stress over that at the edges.
+- disks: two of them, filled by cells that the surface cuts or fitted to it, collide and part. No motion is known, so
+  what is left of the kinetic energy is shown, and the largest growth of the energy. In the total description bodies do
+  not meet.
+- column: Hencky's law under four times its stiffness, the free end 0.3 of a cell beyond a node.
+"""
+
+import argparse
+import math
+from collections.abc import Iterable, Iterator
+
+import jax
+import numpy as np
+
+import mpmjax as mpm
+from mpmjax.verification import (
+    AbstractProblem,
+    ExpandingRing,
+    HenckyColumn,
+    TwoDisks,
+    Vortex,
+    displacement_error,
+    errors,
+    orders,
+    stress_error,
+)
+
+TOTAL, UPDATED = mpm.TotalLagrangian(), mpm.UpdatedLagrangian()
+SPLINE, MLS = mpm.SplineGradient(), mpm.MLSGradient()
+NAMES = {SPLINE: "spline", MLS: "moving least squares"}
+
+
+def choices(kernels: tuple[int, ...] = (2, 3), finer: int = 4) -> Iterator[tuple[str, dict]]:
+    """Each choice, with its name; those of the defaults again with more particles."""
+    for description in (TOTAL, UPDATED):
+        place = "total" if description is TOTAL else "updated"
+        for order in kernels:
+            for gradient in (SPLINE, MLS):
+                name = f"{place}, {NAMES[gradient]}, {'quadratic' if order == 2 else 'cubic'}"
+                yield name, {"description": description, "gradient": gradient, "kernel": mpm.BSpline(order)}
+    for description, gradient in ((TOTAL, SPLINE), (UPDATED, MLS)) if finer else ():
+        name = f"{'total' if description is TOTAL else 'updated'}, {NAMES[gradient]}, quadratic, {finer} a side"
+        yield name, {"description": description, "gradient": gradient, "per_side": finer}
+
+
+def moving(
+    title: str,
+    problem: AbstractProblem,
+    length: float,
+    stress: float,
+    cells: tuple[int, ...],
+    each: Iterable[tuple[str, dict]],
+) -> None:
+    """Rows of a problem in motion."""
+    for name, chosen in each:
+        strained: list[float] = []
+
+        def measure(problem, particles, run, strained=strained):
+            strained.append(float(stress_error(problem, particles, run).max()) / stress)
+            return displacement_error(problem, particles, run) / length
+
+        row(
+            f"{title}: {name}",
+            errors(problem, cells, courant=0.3, measure=measure, **chosen),
+            np.array(strained),
+            cells,
+        )
+
+
+def row(name: str, displacement: np.ndarray, stress: np.ndarray, cells: tuple[int, ...]) -> None:
+    """Errors and observed orders."""
+    shown = [
+        f"{', '.join(f'{e:.1e}' for e in field)} | {', '.join(f'{o:.1f}' for o in orders(field, cells))}"
+        for field in (displacement, stress)
+    ]
+    print(f"| {name} | {' | '.join(shown)} |", flush=True)
+
+
+def column(cells: tuple[int, ...]) -> None:
+    """Rows of the column under four times its stiffness (accuracy.py has those of small loads)."""
+    for name, chosen in choices(kernels=(2,)):
+        e = np.array([HenckyColumn(4.0, 0.3).errors(n, **chosen) for n in cells])
+        row(f"column: {name}", e[:, 0], e[:, 1], cells)
+
+
+def disks(cells: tuple[int, ...]) -> None:
+    """What is left of the kinetic energy when the disks have parted, and the largest growth of energy."""
+    for fitted in (False, True):
+        for gradient in (SPLINE, MLS):
+            left, most = [], []
+            for n in cells:
+                scene, particles = TwoDisks().discretise(n, fitted=fitted, gradient=gradient)
+                law = scene.material
+                speed = math.sqrt((law.lame_lambda + 2 * law.shear_modulus) / 1e3)
+                steps = math.ceil(3.0 * speed * n / 0.3 / 30) * 30
+                run = mpm.simulate(scene, particles, t1=3.0, dt=3.0 / steps, save_every=steps // 30, observe=mpm.energy)
+                kinetic, total = np.asarray(run.observed.kinetic), np.asarray(run.observed.total)
+                left.append(kinetic[-1] / kinetic[0])
+                most.append(total.max() / total[0] - 1)
+            shown = ", ".join(f"{e:.4f}" for e in left), ", ".join(f"{e:.1e}" for e in most)
+            print(
+                f"| disks, {'fitted' if fitted else 'cut'}: updated, {NAMES[gradient]} | {' | '.join(shown)} |",
+                flush=True,
+            )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--fine", action="store_true", help="a grid of twice the resolution besides")
+    parser.add_argument("problems", nargs="*", help="ring, vortex, disks, column; default: all")
+    given = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    unknown = set(given.problems) - {"ring", "vortex", "disks", "column"}
+    if unknown:
+        parser.error(f"no such problem: {', '.join(sorted(unknown))}")
+
+    def grids(*cells: int) -> tuple[int, ...]:
+        return (*cells, 2 * cells[-1]) if given.fine else cells
+
+    for problem in given.problems or ("ring", "vortex", "disks", "column"):
+        match problem:
+            case "ring":
+                moving("ring", ExpandingRing(), 0.1, 1e7 * 0.25, grids(20, 40), choices())
+            case "vortex":
+                moving("vortex", Vortex(0.1), 1.0, 1e3 / 2.6 * 0.7, grids(10, 20), choices((2,), 0))
+            case "disks":
+                disks(grids(20, 40))
+            case _:
+                column(grids(16, 32))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,141 @@
+"""The impulse that each boundary of a scene receives from the material in a step.
+
+The impulses of all boundaries together are a partition of what the nodes receive besides gravity, body forces and the
+material's own forces, but for the residual of the solve. So their sum is minus the change of the particles' momentum
+that these leave, to rounding.
+
+At a mirror plane the nodes' equations are folded, Bᵀ(...) (see `_mirror`). What the folding takes from the impulses of
+all nodes is the plane's; what remains, on true nodes, belongs to the boundary that prescribes the component there.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Float, Int, NodeVector, Scalar
+from mpmjax.boundary._boundary import AbstractBoundary
+from mpmjax.boundary._collider_impulse import moment
+from mpmjax.boundary._conditions import Conditions
+from mpmjax.boundary._mirror import Image, Mirror, Tie
+from mpmjax.linalg import pairs
+
+
+class BoundaryImpulse(eqx.Module):
+    """Linear and angular impulse on each of a scene's b boundaries, in their order. Divided by the step they are its
+    mean force and torque."""
+
+    impulse: Float[Array, "*f b d"]
+    """Impulse [kg m/s], friction included."""
+    angular: Float[Array, "*f b r"]
+    """Angular impulse [kg m²/s] about the boundary's `pivot` as it moves: r = 1 component in 2-D, 3 in 3-D, none in
+    1-D. Nodes are taken where `ColliderImpulse` takes them, in the total description where the body has moved them."""
+
+    def plus(self, later: "BoundaryImpulse") -> "BoundaryImpulse":
+        """The sum of both."""
+        return jax.tree.map(jnp.add, self, later)
+
+
+def no_boundary_impulse(boundaries: int, dim: int, dtype: Any) -> BoundaryImpulse:
+    """No impulse yet on a number of boundaries."""
+    return BoundaryImpulse(jnp.zeros((boundaries, dim), dtype), jnp.zeros((boundaries, len(pairs(dim))), dtype))
+
+
+class Owners(eqx.Module):
+    """The numbers of the boundaries that act on each component of the nodes' velocity, −1 for none."""
+
+    fixed: Int[Array, "n d"]
+    """Which one prescribes it, shape (n, d)."""
+    side: Int[Array, "n d"]
+    """Whose separating wall is there, shape (n, d)."""
+    collider: Int[Array, "n"]
+    """Whose normal is held or pushed, shape (n,)."""
+
+
+def owners_of(
+    boundaries: tuple[AbstractBoundary, ...],
+    conditions: Conditions,
+    nodes: NodeVector,
+    spacing: Scalar,
+    t: Scalar,
+    dt: Scalar,
+    *,
+    reference: bool,
+) -> Owners:
+    """The owners by the rules of `combined_conditions`, whose result is `conditions`: the earlier one holds."""
+    nobody = jnp.full(nodes.shape, -1, jnp.int32)
+    fixed, side, bodies = nobody, nobody, []
+    for number, boundary in enumerate(boundaries):
+        own = boundary.conditions(nodes, spacing, t, dt, reference=reference)
+        fixed = jnp.where((fixed < 0) & own.fixed, number, fixed)
+        if own.side is not None:
+            side = jnp.where((side < 0) & (own.side != 0), number, side)
+        bodies += [number] * (0 if own.colliders is None else len(own.colliders.pivots))
+    for boundary in boundaries:
+        fixed = boundary.spread(fixed >= 0, fixed, nodes, spacing)[1]
+    collider = nobody[:, 0]
+    if conditions.colliders is not None:
+        owner = conditions.colliders.owner
+        collider = jnp.where(owner < 0, -1, jnp.asarray(bodies, jnp.int32)[owner])
+    return Owners(fixed, side, collider)
+
+
+class Given(eqx.Module):
+    """Impulses on the nodes, and the boundaries that give them."""
+
+    impulse: NodeVector
+    """[kg m/s], shape (n, d)."""
+    owner: Int[Array, "..."] | int
+    """The number of the boundary, −1 for none: of all nodes, or of shape (n, 1) or (n, d)."""
+
+
+def taken_by_mirrors(
+    field: NodeVector, images: list[tuple[int, Image]] | list[tuple[int, Image | Tie]]
+) -> tuple[list[Given], NodeVector]:
+    """What mirrors take of impulses on all nodes, each by its boundary's number, and the impulses that remain on true
+    nodes.
+
+    Where planes meet, each takes its normal component before the others fold it, so that its torque has the places of
+    all nodes.
+
+    Args:
+        field: impulses on all nodes [kg m/s], shape (n, d).
+        images: the mirrors in the order in which they unfold, with their boundaries' numbers.
+    """
+    given, remaining = [], jnp.zeros_like(field)
+    planes = all(isinstance(image, Image) for _, image in images)  # they commute
+    for axis in range(field.shape[1]):
+        part = jnp.zeros_like(field).at[:, axis].set(field[:, axis])
+        order = list(reversed(images))
+        if planes:
+            order.sort(key=lambda pair: pair[1].axis != axis)
+        for number, image in order:
+            folded = Mirror((image,)).fold(part)
+            given.append(Given(part - folded, number))
+            part = folded
+        remaining = remaining + part
+    return given, remaining
+
+
+def impulse_on_boundaries(given: list[Given], places: NodeVector, pivots: Float[Array, "b d"]) -> BoundaryImpulse:
+    """The impulse on each boundary: minus what it gives the nodes.
+
+    Args:
+        given: what they give.
+        places: positions of the nodes [m], shape (n, d).
+        pivots: the points for torques [m], shape (b, d).
+    """
+
+    def on(number: int, pivot: Array) -> tuple[Array, Array]:
+        parts = [
+            (part.impulse if part.owner == number else None)
+            if isinstance(part.owner, int)
+            else jnp.where(part.owner == number, part.impulse, 0)
+            for part in given
+        ]
+        total = sum((part for part in parts if part is not None), jnp.zeros_like(places))
+        return -total.sum(axis=0), -moment(places - pivot, total).sum(axis=0)
+
+    each = [on(number, pivot) for number, pivot in enumerate(pivots)]
+    return BoundaryImpulse(jnp.stack([linear for linear, _ in each]), jnp.stack([angular for _, angular in each]))

@@ -1,0 +1,78 @@
+"""Rigid parts of a body, which move freely."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Bool, Int, Mask, NodeVector, Scalar
+from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
+from mpmjax.boundary._conditions import Conditions
+from mpmjax.boundary._mirror import Image, Tie
+from mpmjax.checks import require, require_fields
+from mpmjax.discretisation import Grid
+from mpmjax.geometry import AbstractRegion
+
+
+class RigidPart(AbstractBoundary):
+    """A part of a body in which all nodes have one velocity, that of their common momentum: a plate or a mass that is
+    dropped, pushed by a force or hung from a spring, without turning.
+
+    It moves as the loads on its particles, gravity and the rest of the body make it. Its mass is that of its particles:
+    give them the density of the plate, and push it by a `PointLoad` or a `Traction`. The nodes are those of the
+    reference configuration, in the total description. Where another boundary holds one of them, it holds all. It is a
+    linear map of the nodes, as a mirror is, exact inside
+    every implicit solve, and no number of it needs a state of its own.
+
+    *When it breaks*: in the updated description, where nodes do not stay with the body; it says so. Material within a
+    stencil of its edge is partly rigid, so that the edge is felt up to a cell early. It does not turn: the torque that
+    holds it upright is its part of the scene's `boundary_forces`. A body along which its nodes would slide acts on the
+    first of them alone: guide it by `free`.
+
+    Args:
+        region: the nodes of the reference configuration that are tied together.
+        free: the directions in which it may move, one bool each; in the others it rests. Default: all of them.
+    """
+
+    region: AbstractRegion
+    free: tuple[bool, ...] | None = eqx.field(
+        static=True, default=None, converter=lambda a: tuple(a) if isinstance(a, list) else a
+    )
+
+    def __check_init__(self):
+        require_fields(self)
+        require(
+            self.free is None or len(self.free) == self.dim,
+            f"A RigidPart's free directions must be {self.dim} bools, got {self.free}.",
+        )
+
+    @property
+    def dim(self) -> int:
+        return self.region.dim
+
+    def holds(self, nodes: NodeVector, spacing: Scalar) -> Bool[Array, "n"]:
+        """Which nodes are tied together, shape (n,)."""
+        return self.region.contains(nodes, ON_THE_WALL * spacing)
+
+    def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
+        """v = 0 in the directions in which it may not move."""
+        del t, dt, reference
+        guided = jnp.zeros(self.dim, bool) if self.free is None else ~jnp.asarray(self.free)
+        return Conditions(self.holds(nodes, spacing)[:, None] & guided, jnp.zeros_like(nodes))
+
+    def spread(self, fixed: Mask, value: Array, nodes: NodeVector, spacing: Scalar) -> tuple[Mask, Array]:
+        """A component that is prescribed at one of its nodes is so at all of them, as at the first."""
+        tied = self.holds(nodes, spacing)[:, None]
+        held = tied & fixed
+        first = jnp.take_along_axis(value, held.argmax(axis=0)[None], axis=0)
+        means = tied & held.any(axis=0)
+        return fixed | means, jnp.where(means, first, value)
+
+    def mirror_images(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image | Tie, ...]:
+        """The map that gives all of its nodes the velocity of the first one."""
+        return (Tie(self.holds(grid.nodes(window), grid.spacing)),)
+
+    def check(self, grid: Grid, *, total: bool) -> None:
+        del grid
+        require(
+            total,
+            "A RigidPart is of nodes that stay with the body: use the total description, or a stiff law for the part.",
+        )

@@ -1,0 +1,219 @@
+"""Points of a body's surface or inside of it, attached to its particles, with which they move."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial import KDTree
+
+from mpmjax._types import Array, Float, Scalar
+from mpmjax.checks import is_traced, require, require_fields, require_positive
+from mpmjax.geometry import AbstractRegion, surface_pieces
+from mpmjax.state._particles import Particles
+
+Rows = Float[Array, "s d"] | Float[np.ndarray, "s d"] | tuple | list
+Numbers = Float[Array, "s"] | Float[np.ndarray, "s"] | tuple[float | int | Array, ...] | list[float | int]
+
+_FAR = 2.0
+"""How many particle spacings a point may lie off the nearest particle."""
+
+
+class AbstractPlace(eqx.Module):
+    """Where a load acts."""
+
+    @property
+    @abc.abstractmethod
+    def dim(self) -> int:
+        """Space dimension d."""
+
+    @abc.abstractmethod
+    def attached(self, particles: Particles) -> "AttachedPoints":
+        """The points of it, attached to the particles.
+
+        Raises:
+            ValueError: there are none, or one of them lies off the body.
+        """
+
+
+class AttachedPoints(AbstractPlace):
+    """Points that move with the nearest particle, x_s = x_p + F_p R_s. `Patch` and `PointsAt` make them.
+
+    Args:
+        particle: the number of each point's particle, as a float, as all numbers of a scene are, shape (s,).
+        offset: R_s = F_p⁻¹ (x_s − x_p) [m], shape (s, d).
+        weight: the undeformed area of the surface that each stands for [m^(d−1)], or its share of a whole [-], shape
+            (s,).
+        place: where they were when they were attached [m], shape (s, d).
+        area: outward normal times area of the undeformed surface [m^(d−1)], shape (s, d); None of points.
+    """
+
+    particle: Float[Array, "s"] | Float[np.ndarray, "s"]
+    offset: Float[Array, "s d"] | Float[np.ndarray, "s d"]
+    weight: Float[Array, "s"] | Float[np.ndarray, "s"]
+    place: Float[Array, "s d"] | Float[np.ndarray, "s d"]
+    area: Float[Array, "s d"] | Float[np.ndarray, "s d"] | None = None
+
+    def __check_init__(self):
+        require_fields(self)
+        s = jnp.shape(jnp.asarray(self.particle))
+        rows = [jnp.shape(jnp.asarray(a)) for a in (self.offset, self.place, self.area) if a is not None]
+        require(
+            len(s) == 1 and jnp.shape(jnp.asarray(self.weight)) == s and all(r[:1] == s for r in rows) and s[0] > 0,
+            f"AttachedPoints need one row a point in each of their arrays, got {s} and {rows}.",
+        )
+
+    @property
+    def dim(self) -> int:
+        return jnp.shape(jnp.asarray(self.offset))[1]
+
+    def attached(self, particles: Particles) -> "AttachedPoints":
+        """The points as they are, attached already."""
+        del particles
+        return self
+
+
+class Patch(AbstractPlace):
+    """The surface of a region, or the part of it in another region.
+
+    It is made of flat pieces (see `surface_pieces`), of second order in the spacing. Pieces that are attached to one
+    particle and look along the same axis count as one, at their common centroid.
+
+    Args:
+        region: the body, or any region whose surface is that of the body where it counts.
+        within: where the surface belongs to the patch. Default: all of it.
+        spacing: the size of the pieces [m]. Default: the distance between particles.
+    """
+
+    region: AbstractRegion
+    within: AbstractRegion | None = None
+    spacing: Scalar | None = None
+
+    def __check_init__(self):
+        require_fields(self)
+        if self.spacing is not None:
+            require_positive("A Patch's spacing [m]", self.spacing)
+        require(
+            self.within is None or self.within.dim == self.region.dim,
+            "A Patch's regions must have the same dimension, got "
+            f"{self.region.dim} and {self.within and self.within.dim}.",
+        )
+
+    @property
+    def dim(self) -> int:
+        return self.region.dim
+
+    def attached(self, particles: Particles) -> AttachedPoints:
+        x, apart = _known(particles, self)
+        spacing = apart if self.spacing is None else float(self.spacing)
+        margin = _FAR * apart
+        middle, area = surface_pieces(self.region, spacing, x.min(axis=0) - margin, x.max(axis=0) + margin)
+        if self.within is not None:
+            chosen = np.asarray(self.within.contains(jnp.asarray(middle), 1e-6 * spacing))
+            middle, area = middle[chosen], area[chosen]
+        require(len(middle) > 0, f"The {self} has no surface at the particles: move or enlarge it.")
+        weight = np.sqrt((area**2).sum(axis=1))
+        particle = _nearest(x, middle, apart, self)
+        axis = np.abs(area).argmax(axis=1)
+        facing = 2 * axis + (np.take_along_axis(area, axis[:, None], axis=1)[:, 0] > 0)
+        _, piece = np.unique(np.stack([particle, facing]), axis=1, return_inverse=True)
+
+        def summed(a: np.ndarray) -> np.ndarray:
+            total = np.zeros((piece.max() + 1, *a.shape[1:]))
+            np.add.at(total, piece.reshape(-1), a)
+            return total
+
+        whole = summed(weight)
+        middle = summed(weight[:, None] * middle) / whole[:, None]
+        first = np.zeros(len(whole), int)
+        first[piece.reshape(-1)] = particle
+        return _attached(particles, first, middle, whole, summed(area))
+
+
+class PointsAt(AbstractPlace):
+    """Single points in or on the body, or those of a line.
+
+    Args:
+        positions: where they are at the start [m], (s, d).
+        weights: the share of each [-], (s,). Default: equal shares that sum to one.
+    """
+
+    positions: Rows
+    weights: Numbers | None = None
+
+    def __check_init__(self):
+        require_fields(self)
+        shape = jnp.shape(jnp.asarray(self.positions))
+        require(len(shape) == 2 and shape[0] > 0, f"PointsAt need positions of shape (s, d), got {shape}.")
+        require(
+            self.weights is None or jnp.shape(jnp.asarray(self.weights)) == shape[:1],
+            f"PointsAt need one weight a position, got {self.weights}.",
+        )
+
+    @property
+    def dim(self) -> int:
+        return jnp.shape(jnp.asarray(self.positions))[1]
+
+    def attached(self, particles: Particles) -> AttachedPoints:
+        x, apart = _known(particles, self)
+        places = np.asarray(self.positions, float)
+        weight = np.full(len(places), 1 / len(places)) if self.weights is None else np.asarray(self.weights, float)
+        return _attached(particles, _nearest(x, places, apart, self), places, weight, None)
+
+
+def _known(particles: Particles, place: AbstractPlace) -> tuple[np.ndarray, float]:
+    """The particles' positions, and the distance between them [m]."""
+    require(
+        not is_traced((particles.x, place)),
+        "Loads are attached to particles whose positions are known: call attach outside of the jax transformation.",
+    )
+    require(
+        place.dim == particles.dim,
+        f"{type(place).__name__} must have {particles.dim} coordinates, as the particles have, got {place.dim}.",
+    )
+    return np.asarray(particles.x, float), float(np.median(np.asarray(particles.volume)) ** (1 / particles.dim))
+
+
+def _nearest(x: np.ndarray, places: np.ndarray, apart: float, place: AbstractPlace) -> np.ndarray:
+    """The number of the particle nearest to each place."""
+    far, particle = KDTree(x).query(places)
+    require(
+        far <= _FAR * apart,
+        f"The {type(place).__name__} has a point at {places[far.argmax()]} m, {far.max():.3g} m off the nearest "
+        "particle: place it on the body.",
+    )
+    return np.asarray(particle)
+
+
+def _attached(
+    particles: Particles, particle: np.ndarray, places: np.ndarray, weight: np.ndarray, area: np.ndarray | None
+) -> AttachedPoints:
+    """Points at places, with their undeformed offsets and areas (Nanson's formula): A = Fᵀ a / det F."""
+    dtype = particles.x.dtype
+    require(
+        particles.count < 2 ** (jnp.finfo(dtype).nmant + 1),
+        f"{dtype} counts particles exactly only below {2 ** (jnp.finfo(dtype).nmant + 1)}: use float64.",
+    )
+    offset, F = places - np.asarray(particles.x, float)[particle], _deformation(particles)
+    if F is not None:
+        F = F[particle]
+        offset = np.linalg.solve(F, offset[:, :, None])[:, :, 0]
+        turned = None if area is None else (np.swapaxes(F, 1, 2) @ area[:, :, None])[:, :, 0]
+        area = None if turned is None else turned / np.linalg.det(F)[:, None]
+        weight = weight if area is None else np.sqrt((area**2).sum(axis=1))
+
+    def cast(a: np.ndarray) -> Any:
+        return jnp.asarray(a, dtype)
+
+    return AttachedPoints(
+        cast(particle), cast(offset), cast(weight), cast(places), None if area is None else cast(area)
+    )
+
+
+def _deformation(particles: Particles) -> np.ndarray | None:
+    """F of all particles, shape (p, d, d); None of particles that have none, or not all of it."""
+    stored = particles.deformations
+    if any(F is None or F.ndim != 3 for F in stored):
+        return None
+    return np.concatenate([np.asarray(F, float) for F in stored])

@@ -1,0 +1,268 @@
+"""Loads on a body's surface and at points of it, and springs and dashpots to the ground."""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mpmjax import linalg as la
+from mpmjax._types import Array, Float, NodeVector, Point, Scalar
+from mpmjax.checks import require, require_fields, require_that
+from mpmjax.discretisation import Stencil
+from mpmjax.geometry import (
+    AbstractMotion,
+    Changing,
+    ChangingVector,
+    TimeSeries,
+    require_some,
+    value_at,
+    vector_size,
+)
+from mpmjax.material import AbstractLaw
+from mpmjax.state._attachment import AbstractPlace, AttachedPoints
+from mpmjax.state._loaded_points import LoadedPoints, loaded_points
+from mpmjax.state._particles import Particles
+from mpmjax.state._support import Support
+
+
+class AbstractLoad(eqx.Module):
+    """A force on points that are attached to a body.
+
+    One of one's own says `on` which points and gives their `force`.
+    """
+
+    on: eqx.AbstractVar[AbstractPlace]
+    """Where it acts."""
+
+    @abc.abstractmethod
+    def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"] | None:
+        """The force on each point [N], shape (d, s), at time t, in a step of dt, or None for none; constant over it."""
+
+    def support(self, points: LoadedPoints, t: Scalar) -> Support | None:
+        """What it adds to the elastic energy of the grid and to its viscosity, linear in the motion of the points.
+        Default: None, nothing."""
+        del points, t
+        return None
+
+    def check(self, dim: int) -> None:
+        """Check that it can stand in a scene of a dimension. Default: the place has that dimension.
+
+        Raises:
+            ValueError: it cannot.
+        """
+        name = type(self).__name__
+        require(
+            self.on.dim == dim, f"{name} must be on a place with {dim} coordinates, as the grid, got {self.on.dim}."
+        )
+
+    def needs_deformation(self) -> bool:
+        """Whether `force` needs the whole deformation gradient, which laws that yield or flow do not keep. Default:
+        False."""
+        return False
+
+
+def _check_vector(name: str, value: ChangingVector, dim: int) -> None:
+    size = vector_size(value)
+    require(size == dim, f"{name} must have {dim} components, as the grid has directions, got {size or 'a number'}.")
+
+
+class Traction(AbstractLoad):
+    """A dead traction on a surface: a force per undeformed area that keeps its direction.
+
+    Linear, and so exact inside an implicit solve.
+
+    Args:
+        on: the surface, a `Patch`.
+        traction: force per undeformed area [N/m^(d−1)], (d,), or a `TimeSeries` of it.
+    """
+
+    on: AbstractPlace
+    traction: ChangingVector
+
+    def __check_init__(self):
+        require_fields(self)
+        require_some("Traction's traction [N/m²]", self.traction)
+
+    def check(self, dim: int) -> None:
+        AbstractLoad.check(self, dim)
+        _check_vector("Traction's traction", self.traction, dim)
+
+    def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
+        """A t."""
+        del dt
+        return points.weight * value_at(self.traction, t)[:, None]
+
+
+class PointLoad(AbstractLoad):
+    """A force at a point, or shared by several, as by those of a line. It keeps its direction.
+
+    Linear, and so exact inside an implicit solve. What is stressed by a force at a point has an infinite stress there,
+    so that its displacement grows as the grid is refined.
+
+    Args:
+        on: the points, `PointsAt`.
+        total: the whole force [N], (d,), or a `TimeSeries` of it; in 2-D per metre of thickness.
+    """
+
+    on: AbstractPlace
+    total: ChangingVector
+
+    def __check_init__(self):
+        require_fields(self)
+        require_some("PointLoad's total [N]", self.total)
+
+    def check(self, dim: int) -> None:
+        AbstractLoad.check(self, dim)
+        _check_vector("PointLoad's total", self.total, dim)
+
+    def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
+        """The share of each point."""
+        del dt
+        return points.weight * value_at(self.total, t)[:, None]
+
+
+class Pressure(AbstractLoad):
+    """A pressure on a surface, against its outward normal.
+
+    A following pressure acts on the deformed surface, f = −p cof(F) A by Nanson's formula. An implicit solve takes it
+    with the surface at the start of the step, in methods of second order half-way through it (with APIC, whose velocity
+    gradient says how the surface turns): it is of the order of the method, but not part of its matrix.
+
+    *When it breaks*: a following pressure needs F, which laws that yield or flow do not keep. Where pressure drives a
+    fast turning or growth, the lag of a step limits Δt.
+
+    Args:
+        on: the surface, a `Patch`.
+        pressure: [Pa], a number or a `TimeSeries`; positive presses.
+        following: whether it acts on the deformed surface. Default: it does; else on the undeformed one.
+    """
+
+    on: AbstractPlace
+    pressure: Changing
+    following: bool = eqx.field(static=True, default=True)
+
+    def __check_init__(self):
+        require_fields(self)
+        require_some("Pressure's pressure [Pa]", self.pressure)
+        if isinstance(self.pressure, TimeSeries):
+            require(vector_size(self.pressure) is None, "Pressure's pressure must be a series of numbers, got vectors.")
+
+    def needs_deformation(self) -> bool:
+        return self.following
+
+    def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
+        """−p cof(F) A, or −p A."""
+        del dt
+        area, F = points.area, points.deformation
+        if area is None:
+            raise ValueError("Pressure acts on a surface: give it a Patch, not points.")
+        if self.following and F is not None:
+            area = la.matmul(la.cofactor(F), area[:, None])[:, 0]
+        return -value_at(self.pressure, t) * area
+
+
+class Spring(AbstractLoad):
+    """Springs and dashpots to the ground: f = −k (x − x_0 − d(t)) − c (v − ḋ(t)), with x_0 where the point was when it
+    was attached, and d(t) a motion of the ground.
+
+    Linear: part of the energy of the grid and of its viscosity, and exact inside an implicit solve. `stable_dt` knows
+    it. Of points, k and c are those of all together, divided by their shares; of a surface they are per undeformed area
+    (an elastic foundation).
+
+    Args:
+        on: `PointsAt`, or a `Patch`.
+        stiffness: k [N/m], per area [N/m^d] of a surface: a number, or one for each direction, (d,), at least 0.
+        damping: c [N s/m], likewise.
+        motion: how the ground moves. Default: not at all.
+    """
+
+    on: AbstractPlace
+    stiffness: Scalar | Point = 0.0
+    damping: Scalar | Point | None = None
+    motion: AbstractMotion | None = None
+
+    def __check_init__(self):
+        require_fields(self)
+        for name, value in (("stiffness", self.stiffness), ("damping", self.damping)):
+            if value is not None:
+                require_some(f"A Spring's {name}", value)
+                require_that(f"A Spring's {name} must be at least 0", lambda k: k >= 0, value)
+
+    def check(self, dim: int) -> None:
+        AbstractLoad.check(self, dim)
+        for name, value in (("stiffness", self.stiffness), ("damping", self.damping)):
+            shape = () if value is None else jnp.shape(jnp.asarray(value))
+            require(shape in ((), (dim,)), f"A Spring's {name} must be a number or {dim} of them, got {value}.")
+        require(
+            self.motion is None or self.motion.dim == dim,
+            f"A Spring's motion must have {dim} coordinates, got {self.motion and self.motion.dim}.",
+        )
+
+    def support(self, points: LoadedPoints, t: Scalar) -> Support:
+        """Its energy ½ k (x + u − x_0 − d)² and its resistance c."""
+        ground = points.place if self.motion is None else self.motion.place(points.place.T, t).T
+        stiffness = _along(self.stiffness, points)
+        damping = None if self.damping is None else _along(self.damping, points)
+        return Support(points, stiffness, points.x - ground, damping)
+
+    def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"] | None:
+        """c ḋ, with which a ground that moves drags the points along."""
+        if self.motion is None or self.damping is None:
+            return None
+        return _along(self.damping, points) * self.motion.velocity_of(points.place.T, t, dt).T
+
+
+def _along(coefficient: Scalar | Point, points: LoadedPoints) -> Float[Array, "d s"]:
+    """A coefficient of each point in each direction."""
+    each = jnp.broadcast_to(jnp.asarray(coefficient, points.x.dtype), points.x.shape[:1])
+    return each[:, None] * points.weight
+
+
+def points_of(
+    loads: tuple[AbstractLoad, ...],
+    laws: tuple[AbstractLaw, ...],
+    particles: Particles,
+    stencil: Stencil,
+    *,
+    total: bool,
+) -> tuple[LoadedPoints, ...]:
+    """The points of each load at the start of a step."""
+    found = []
+    for load in loads:
+        assert isinstance(load.on, AttachedPoints)  # `prepare` says so
+        found.append(loaded_points(load.on, laws, particles, stencil, total=total))
+    return tuple(found)
+
+
+def load_force(
+    loads: tuple[AbstractLoad, ...],
+    points: tuple[LoadedPoints, ...],
+    t: Scalar,
+    dt: Scalar,
+    part: float,
+    size: int,
+) -> NodeVector | None:
+    """The forces of loads at the nodes [N], shape (n, d), without their supports; None without any.
+
+    Args:
+        loads: the loads.
+        points: the points of each at the start of the step.
+        t: time at the start of the step [s].
+        dt: step [s].
+        part: the time at which forces are taken, as a fraction of the step.
+        size: number of nodes.
+    """
+    total = None
+    for load, own in zip(loads, points, strict=True):
+        at, later = (t + part * dt, own.after(part * dt)) if part > 0 else (t, own)
+        force = load.force(later, at, dt)
+        if force is not None:
+            nodal = own.nodal(force, size)
+            total = nodal if total is None else total + nodal
+    return total
+
+
+def supports_of(loads: tuple[AbstractLoad, ...], points: tuple[LoadedPoints, ...], t: Scalar) -> tuple[Support, ...]:
+    """The supports of loads, with the ground where it is at time t [s]."""
+    found = (load.support(own, t) for load, own in zip(loads, points, strict=True))
+    return tuple(support for support in found if support is not None)

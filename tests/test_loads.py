@@ -1,0 +1,355 @@
+"""Loads: their forces and moments are what was asked for, in every description; springs and dashpots are exact in every
+solve; all have derivatives."""
+
+import dataclasses
+import json
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import DESCRIPTIONS, GRADIENTS, TRANSFERS, assert_close, block, explicit_limit, ids
+from test_boundary_forces import METHODS, angular_momentum, shaken
+
+import mpmjax as mpm
+from mpmjax.cli._scene_file import read_scene_file
+from mpmjax.geometry import surface_pieces
+from mpmjax.io._schema import decode, encode
+
+SIDE = 0.3
+TOP = mpm.Patch(mpm.Box((0.0, 0.0), (SIDE, SIDE)), mpm.Box((-1.0, 0.29), (1.0, 1.0)))
+RIGHT = mpm.Patch(mpm.Box((0.0, 0.0), (SIDE, SIDE)), mpm.Box((0.29, -1.0), (1.0, 1.0)))
+RAMP = mpm.TimeSeries((0.0, 1.0), ((1e3, -2e3), (5e5, -2e3)))
+
+
+def loaded(*loads, dim=2, **scene):
+    """A block with loads on it, at rest."""
+    scene, particles = block(dim, loads=loads, **scene)
+    return mpm.attach(scene, particles), mpm.prepare(mpm.attach(scene, particles), particles)
+
+
+def gained(scene, particles, method, dt):
+    """The change of momentum and of angular momentum in a step, over its length."""
+    after, _ = mpm.step(scene, particles, 0.0, dt, method=method)
+    mass = np.asarray(particles.mass)
+    turn = angular_momentum(scene, after) - angular_momentum(scene, particles)
+    return mass @ np.asarray(after.v - particles.v) / dt, turn / dt
+
+
+@pytest.mark.parametrize(
+    ("region", "area", "volume"),
+    [
+        (mpm.Box((0.0, 0.0), (1.0, 0.5)), 3.0, 0.5),
+        (mpm.Ball((0.02, 0.01), 1.0), 2 * np.pi, np.pi),
+        (mpm.Box((0.0, 0.0, 0.0), (1.0, 0.5, 0.25)), 1.75, 0.125),
+        (mpm.Ball((0.02, 0.01, 0.0), 1.0), 4 * np.pi, 4 / 3 * np.pi),
+        (mpm.Box((0.0,), (1.0,)), 2.0, 1.0),
+    ],
+)
+def test_surfaces_are_closed_and_have_their_area(region, area, volume):
+    """Σ a = 0; Σ |a| is the area and Σ x·a d times the volume, of boxes on the lattice to rounding, of balls to second
+    order."""
+    errors = []
+    for spacing in (1 / 4, 1 / 8):
+        middle, areas = surface_pieces(region, spacing)
+        assert np.abs(areas.sum(axis=0)).max() < 1e-12
+        found = np.sqrt((areas**2).sum(axis=1)).sum() / area, (middle * areas).sum() / region.dim / volume
+        errors.append(np.abs(np.array(found) - 1))
+    if isinstance(region, mpm.Box):
+        assert np.max(errors) < 1e-14
+    else:
+        assert (errors[1] < 1e-2).all()
+        assert (np.log2(errors[0] / errors[1]) > 1.8).all()
+
+
+@pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
+def test_loads_have_the_force_and_moment_that_was_asked_for(description):
+    """Of a traction, a pressure, a force at a point beside the particles' lattice: the change of momentum, linear and
+    angular, of a free body, to rounding."""
+    gradient = mpm.MLSGradient()  # of which w + g·r has the right moment
+    point = mpm.PointsAt(((0.13, 0.07),))
+    for load, force, moment in (
+        (mpm.Traction(TOP, (3e3, -2e3)), SIDE * np.array([3e3, -2e3]), SIDE * (SIDE / 2 * -2e3 - SIDE * 3e3)),
+        (mpm.Pressure(RIGHT, 4e3), SIDE * np.array([-4e3, 0.0]), SIDE * SIDE / 2 * 4e3),
+        (mpm.PointLoad(point, (50.0, 20.0)), np.array([50.0, 20.0]), 0.13 * 20 - 0.07 * 50),
+    ):
+        scene, particles = loaded(load, description=description, gradient=gradient)
+        found = gained(scene, particles, mpm.Explicit(), 1e-5)
+        assert_close(found[0], force, 1e-9)
+        assert_close(found[1], np.array([moment]), 1e-9)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("description", DESCRIPTIONS.values(), ids=DESCRIPTIONS)
+def test_loads_in_three_dimensions(description):
+    """Of a nearly incompressible ball: a pressure all over it has no force and, to second order, no moment; a traction
+    on the part of its surface above a plane has the force of that area."""
+    ball, grid = mpm.Ball((0.31, 0.3, 0.32), 0.22), mpm.Grid((13,) * 3, 0.1, origin=(-3,) * 3)
+    particles = mpm.fill(ball, grid, particles_per_cell=8, density=1e3)
+    material, settings = mpm.NeoHookean(1e4, 0.49), {"description": description, "gradient": mpm.MLSGradient()}
+    cap = mpm.Patch(ball, mpm.Box((-1.0, -1.0, 0.42), (1.0, 1.0, 1.0)), 0.02)  # of height 0.12
+    for load, force in (
+        (mpm.Pressure(mpm.Patch(ball), 1e4), 0.0),
+        (mpm.Traction(cap, (0.0, 1e3, 2e3)), 2 * np.pi * 0.22 * 0.12),
+    ):
+        scene = mpm.attach(mpm.Scene(grid, material, loads=load, **settings), particles)
+        prepared = mpm.prepare(scene, particles)
+        found, moment = gained(scene, prepared, mpm.Explicit(), 1e-5)
+        if force == 0:
+            size = 1e4 * np.pi * 0.22**2
+            np.testing.assert_allclose(found, 0, rtol=0, atol=1e-9 * size)
+            np.testing.assert_allclose(moment, 0, rtol=0, atol=1e-3 * size * 0.22)  # of second order
+        else:
+            np.testing.assert_allclose(found, force * np.array([0, 1e3, 2e3]), rtol=0, atol=0.03 * 2e3 * force)
+
+
+def test_a_pressure_follows_the_surface_and_a_traction_does_not():
+    """On a body that is turned and stretched: −p cof(F) A, and A t."""
+    turn = jnp.asarray([[0.0, -2.0], [1.5, 0.0]])  # by a right angle, and sheared out
+    for load, expected in (
+        (mpm.Pressure(RIGHT, 4e3), SIDE * 1.5 * np.array([0.0, -4e3]) * 2.0 / 2.0),
+        (mpm.Pressure(RIGHT, 4e3, following=False), SIDE * np.array([-4e3, 0.0])),
+        (mpm.Traction(RIGHT, (1e3, 2e3)), SIDE * np.array([1e3, 2e3])),
+    ):
+        scene, particles = loaded(load, description=mpm.TotalLagrangian())
+        deformations = (jnp.broadcast_to(turn, particles.F.shape),)
+        particles = dataclasses.replace(particles, x=particles.X @ turn.T, deformations=deformations)
+        force, _ = gained(scene, particles, mpm.Explicit(), 1e-7)
+        cofactor = np.linalg.det(turn) * np.linalg.inv(turn).T
+        if isinstance(load, mpm.Pressure) and load.following:
+            expected = -4e3 * cofactor @ np.array([SIDE, 0.0])
+        np.testing.assert_allclose(force, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
+def test_loads_change_in_time():
+    """A series is taken where each integrator takes body forces: at the start of the step, or in its middle."""
+    scene, particles = loaded(mpm.Traction(TOP, RAMP))
+    for method in (mpm.Explicit(), mpm.ImplicitMidpoint()):
+        dt = 1e-3
+        force, _ = gained(scene, particles, method, dt)
+        expected = SIDE * (1e3 + method.body_force_at * dt * 499e3)
+        assert force[0] == pytest.approx(expected, rel=1e-6)
+
+
+def oscillator(method, stiffness=4e3, damping=None, steps=3, dt=0.02, **scene):
+    """Velocity and place of a body held by a spring at all of its particles, which moves as one mass: [[x, v], ...]."""
+    _, free = block(2)
+    everywhere = mpm.PointsAt(np.asarray(free.x), np.asarray(free.mass) / float(free.mass.sum()))
+    scene, particles = loaded(mpm.Spring(everywhere, stiffness, damping), **scene)
+    particles = dataclasses.replace(particles, v=jnp.broadcast_to(jnp.asarray([0.1, 0.0]), particles.x.shape))
+    found = []
+    for n in range(steps):
+        particles, info = mpm.step(scene, particles, n * dt, dt, method=method)
+        assert info.solve.converged
+        np.testing.assert_allclose(particles.v, particles.v[:1] + 0 * particles.v, rtol=0, atol=1e-9)
+        found.append([float(particles.x[0, 0] - free.x[0, 0]), float(particles.v[0, 0])])
+    return np.array(found), float(free.mass.sum())
+
+
+@pytest.mark.parametrize("method", **ids(METHODS, ("explicit", "implicit_midpoint")))
+def test_springs_and_dashpots_are_exact_in_the_solve(method):
+    """A mass on a spring with a dashpot, far beyond the explicit limit for implicit methods, moves as the integrator's
+    own formula says."""
+    name = next(key for key, value in METHODS.items() if value == method)
+    dt, (k, c) = (2e-3, (4e3, 30.0)) if name == "explicit" else (0.5, (4e3, 30.0))
+    found, m = oscillator(method, k, c, dt=dt)
+    expected, (x, v) = [], (0.0, 0.1)
+    A = np.array([[0.0, 1.0], [-k / m, -c / m]])
+    for _ in found:
+        if name == "explicit":
+            v = v + dt * (-k * x - c * v) / m
+            x = x + dt * v
+        elif name in ("semi_implicit", "backward_euler"):
+            x, v = np.linalg.solve(np.eye(2) - dt * A, [x, v])
+        elif name == "implicit_midpoint":
+            x, v = np.linalg.solve(np.eye(2) - dt / 2 * A, (np.eye(2) + dt / 2 * A) @ [x, v])
+        else:
+            g, q0, q1, q2 = (float(w) for w in method.weights())
+            start = np.array([x, v])
+            inner = np.linalg.solve(np.eye(2) - g * dt / 2 * A, (np.eye(2) + g * dt / 2 * A) @ start)
+            x, v = np.linalg.solve(np.eye(2) - q2 * dt * A, start + dt * A @ (q0 * start + q1 * inner))
+        expected.append([x, v])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+def test_the_stable_step_knows_springs():
+    """Springs much stiffer than the body: at the limit that is given nothing grows, at three times of it the velocity
+    grows by more than ten a step. A dashpot lowers the limit too."""
+    _, free = block(2)
+    everywhere = mpm.PointsAt(np.asarray(free.x), np.asarray(free.mass) / float(free.mass.sum()))
+    limits = []
+    for spring in (None, mpm.Spring(everywhere, 1e8), mpm.Spring(everywhere, 1e8, 1e5)):
+        scene, particles = loaded(*([] if spring is None else [spring]))
+        limits.append(float(mpm.stable_dt(scene, particles, safety=1.0)))
+    assert limits[2] < limits[1] < limits[0] / 10
+    grown = {}
+    for factor, steps in ((1.0, 30), (3.0, 4)):
+        found, _ = oscillator(mpm.Explicit(), 1e8, steps=steps, dt=factor * limits[1])
+        grown[factor] = np.abs(found[-1, 1]) / 0.1
+    assert grown[1.0] < 2
+    assert grown[3.0] > 1e3
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("description", DESCRIPTIONS.values(), ids=DESCRIPTIONS)
+@pytest.mark.parametrize(
+    ("gradient", "transfer", "method"),
+    [("mls", "apic", "explicit"), ("spline", "flip", "implicit_midpoint"), ("spline", "pic", "semi_implicit")],
+)
+def test_budgets_close_with_loads(description, gradient, transfer, method):
+    """Energy and momentum, with every kind of load."""
+    method, choices = METHODS[method], {"gradient": GRADIENTS[gradient], "transfer": TRANSFERS[transfer]}
+    loads = (
+        mpm.Traction(TOP, RAMP),
+        mpm.Pressure(RIGHT, 4e3),
+        mpm.Spring(mpm.PointsAt(((0.1, 0.1), (0.2, 0.15))), (1e4, 2e4), 30.0),
+    )
+    scene, particles = loaded(
+        *loads, description=description, gravity=(1.0, -9.81), boundary=mpm.SymmetryPlane(1, 0.0), **choices
+    )
+    v = jnp.asarray(np.random.default_rng(3).normal(size=particles.v.shape))
+    particles = dataclasses.replace(particles, v=v)
+    _, budget = mpm.budget(scene, particles, steps=3, dt=0.3 * explicit_limit(scene), method=method)
+    energy, momentum = budget.energy, budget.momentum
+    scale = np.abs(energy.kinetic).max() + np.abs(energy.body_force).max() + np.abs(energy.elastic).max()
+    np.testing.assert_allclose(energy.change, energy.explained, rtol=0, atol=1e-9 * scale)
+    scale = np.abs(momentum.body_force).max() + np.abs(momentum.elastic).max()
+    np.testing.assert_allclose(momentum.change, momentum.explained, rtol=0, atol=1e-9 * scale)
+
+
+@pytest.mark.thorough
+def test_loads_have_derivatives():
+    """By traction, pressure, the values of a series, stiffness, damping and the ground's motion, through an implicit
+    solve, against central differences."""
+    loads = (
+        mpm.Traction(TOP, mpm.TimeSeries((0.0, 0.01), ((0.0, 0.0), (1e3, -2e3)))),
+        mpm.Pressure(RIGHT, 4e3),
+        mpm.Spring(mpm.PointsAt(((0.1, 0.1),)), 1e4, 30.0, mpm.Motion((0.0, 0.1), ((0.0, 0.0), (0.01, 0.0)))),
+    )
+    scene, particles = loaded(*loads)
+    numbers = (2e3, 4e3, 1e4, 30.0, 0.01)
+
+    def end(numbers):
+        traction, pressure, stiffness, damping, way = numbers
+        own = eqx.tree_at(
+            lambda s: (
+                s.loads[0].traction.values[1][0], s.loads[1].pressure, s.loads[2].stiffness, s.loads[2].damping,
+                s.loads[2].motion.displacement[1][0],
+            ),
+            scene, (traction, pressure, stiffness, damping, way),
+        )  # fmt: skip
+        run = mpm.simulate(own, particles, t1=0.02, dt=5e-3, method=METHODS["implicit_midpoint"])
+        return (run.final.x * jnp.asarray([1.0, 0.3])).sum()
+
+    slopes = jax.grad(end)(numbers)
+    for i, (number, slope) in enumerate(zip(numbers, slopes, strict=True)):
+        ends = [end(tuple(n * (1 + e) if j == i else n for j, n in enumerate(numbers))) for e in (1e-3, -1e-3)]
+        assert float(slope) == pytest.approx(float(ends[0] - ends[1]) / (2e-3 * number), rel=1e-4)
+
+
+def test_loads_forces_and_planes_that_move_in_single_precision():
+    """All together keep the particles' precision, explicit and implicit."""
+    loads = mpm.Traction(TOP, RAMP), mpm.Pressure(RIGHT, 1.0), mpm.Spring(mpm.PointsAt(((0.1, 0.1),)), 1e3, 1.0)
+    plane = mpm.SymmetryPlane(1, 0.0, motion=mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.0, 0.1))))
+    scene, particles = block(2, loads=loads, boundary=plane, boundary_forces=True)
+    particles = jax.tree.map(lambda a: a.astype(jnp.float32), particles)
+    scene = mpm.attach(scene, particles)
+    for method in (mpm.Explicit(), mpm.ImplicitMidpoint()):
+        after, info = mpm.step(scene, particles, 0.5, 1e-4, method=method)
+        assert {a.dtype for a in jax.tree.leaves((after, info.boundaries))} == {jnp.dtype(jnp.float32)}
+        assert np.isfinite(after.x).all()
+    assert float(mpm.stable_dt(scene, particles)) > 0
+
+
+@pytest.mark.parametrize("method", **ids(METHODS, "explicit"))
+def test_loads_and_boundaries_sum_to_the_change_of_momentum(method):
+    """What the boundaries receive is what loads and gravity give and the body does not keep."""
+    scene, particles = shaken(
+        boundary=(mpm.SymmetryPlane(0, 0.0), mpm.StickyBox((-np.inf, 0.0), (np.inf, np.inf))),
+        loads=(mpm.Traction(TOP, (3e3, -2e3)),),
+    )
+    dt = 0.3 * explicit_limit(scene)
+    after, info = mpm.step(scene, particles, 0.0, dt, method=method)
+    mass = np.asarray(particles.mass)
+    given = dt * (mass.sum() * np.asarray(scene.gravity) + SIDE * np.array([3e3, -2e3]))
+    lost = given - mass @ np.asarray(after.v - particles.v)
+    np.testing.assert_allclose(info.boundaries.impulse.sum(axis=0), lost, rtol=0, atol=1e-10 * np.abs(given).max())
+
+
+@pytest.mark.thorough
+def test_runs_with_loads_go_on_from_files(tmp_path):
+    """To the same numbers, bit for bit."""
+    scene, particles = block(2, loads=(mpm.Traction(TOP, RAMP), mpm.Spring(mpm.PointsAt(((0.1, 0.1),)), 1e3)))
+    run = mpm.simulate(mpm.attach(scene, particles), particles, t1=2e-3, dt=1e-3, save_every=1)
+    mpm.save(tmp_path / "run.h5", run)
+    again = mpm.load(tmp_path / "run.h5")
+    onward = [mpm.simulate(r.scene, r.final, t1=4e-3, dt=1e-3, start=2).final.x for r in (run, again)]
+    assert np.array_equal(*onward)
+
+
+def test_loads_can_be_written_and_are_refused_with_reasons():
+    """Attached and not; what does not fit says so."""
+    loads = (mpm.Traction(TOP, RAMP), mpm.Spring(mpm.PointsAt(((0.1, 0.1),)), 1e3))
+    scene, particles = block(2, loads=loads)
+    for value in (scene, mpm.attach(scene, particles)):
+        arrays: dict = {}
+        again = decode(json.loads(json.dumps(encode(value, arrays))), mpm.Scene, "", arrays)
+        assert encode(again) == encode(value)
+    with pytest.raises(ValueError, match=r"not attached to particles yet: call scene = mpmjax\.attach"):
+        mpm.step(scene, particles, 0.0, 1e-4)
+    with pytest.raises(ValueError, match="off the nearest particle"):
+        mpm.attach(
+            mpm.Scene(scene.grid, scene.material, loads=mpm.PointLoad(mpm.PointsAt(((0.9, 0.9),)), (1.0, 0.0))),
+            particles,
+        )
+    with pytest.raises(ValueError, match="Traction's traction must have 2 components"):
+        mpm.Scene(scene.grid, scene.material, loads=mpm.Traction(TOP, (1.0, 2.0, 3.0)))
+    metal = mpm.attach(mpm.Scene(scene.grid, mpm.VonMises(1e4, 0.3, 400.0), loads=mpm.Pressure(TOP, 1.0)), particles)
+    with pytest.raises(ValueError, match="following Pressure needs the whole deformation gradient"):
+        mpm.prepare(metal, particles)
+
+
+SCENE_FILE = """
+boundary_forces = true
+[grid]
+shape = [9, 9]
+spacing = 0.1
+origin = [-3, -3]
+[material]
+kind = "NeoHookean"
+youngs_modulus = 1e4
+poisson_ratio = 0.3
+[[boundary]]
+kind = "Grip"
+region = { kind = "Box", lower = [-1.0, -1.0], upper = [1.0, 0.0] }
+motion = { times = [0.0], displacement = [[0.0, 0.0]] }
+[[loads]]
+kind = "Traction"
+traction = { kind = "TimeSeries", times = [0.0, 1.0], values = [[0.0, 0.0], [0.0, -2e3]] }
+on = { kind = "Patch", region = { kind = "Box", lower = [0.0, 0.0], upper = [0.3, 0.3] }, within = { kind = "Box", lower = [-1.0, 0.29], upper = [1.0, 1.0] } }
+[[loads]]
+kind = "Spring"
+stiffness = 1e4
+on = { kind = "PointsAt", positions = [[0.3, 0.0]] }
+[particles]
+region = { kind = "Box", lower = [0.0, 0.0], upper = [0.3, 0.3] }
+density = 1e3
+[run]
+t1 = 1e-3
+dt = 1e-3
+"""  # noqa: E501
+
+
+def test_a_scene_file_attaches_its_loads(tmp_path):
+    """To the particles that it fills, also where it is refined; a grip's motion needs no kind."""
+    path = tmp_path / "loaded.toml"
+    path.write_text(SCENE_FILE)
+    file = read_scene_file(path)
+    for (scene, particles), count in ((file[:2], 6), (file.build(2), 12)):
+        traction, spring = scene.loads
+        assert len(traction.on.particle) == count
+        assert float(jnp.sum(jnp.asarray(traction.on.weight))) == pytest.approx(SIDE, rel=1e-12)
+        place = particles.x[int(spring.on.particle[0])] + jnp.asarray(spring.on.offset)[0]
+        np.testing.assert_allclose(place, [0.3, 0.0], rtol=0, atol=1e-12)
+    assert isinstance(file.scene.boundary[0].motion, mpm.Motion)

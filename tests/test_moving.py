@@ -1,0 +1,148 @@
+"""Grips that turn, and planes of symmetry that move."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import DESCRIPTIONS, LAWS, TRANSFERS, assert_close, block, explicit_limit, ids
+from test_boundary_forces import METHODS, assert_sums_to_change, shaken
+
+import mpmjax as mpm
+
+SIDE = 0.3
+TURN = mpm.RigidMotion((0.0, 0.1), ((0.0, 0.0), (0.02, 0.01)), (0.0, 0.8), (0.1, 0.3))
+TURN_3D = mpm.RigidMotion((0.0, 0.1), ((0.0,) * 3, (0.02, 0.01, 0.0)), ((0.0,) * 3, (0.1, 0.3, 0.8)), (0.1, 0.3, 0.2))
+
+
+@pytest.mark.parametrize("description", **ids(DESCRIPTIONS, "total"))
+@pytest.mark.parametrize("motion", **ids({"2d": TURN, "3d": TURN_3D}, "2d"))
+def test_a_grip_that_turns_holds_as_a_sticky_body_does(motion, description):
+    """In motion, force and torque; its particles follow the circle exactly."""
+    d = motion.dim
+    region = mpm.Box((-1.0,) * (d - 1) + (0.15,), (1.0,) * d)
+    ends = []
+    for holder in (mpm.Grip(region, motion), mpm.StickyCollider(region, motion)):
+        scene, particles = block(d, boundary=holder, boundary_forces=True, description=description)
+        run = mpm.simulate(scene, particles, t1=0.01, dt=1e-3, save_every=5)
+        ends.append((run.final.x, run.final.v, *run.boundary_forces()[1:]))
+    for a, b in zip(*ends, strict=True):
+        assert_close(a, b, 1e-12, 1e-9)
+    deep = np.asarray(particles.x[:, -1]) > 0.25  # where every node is held
+    assert_close(ends[0][0][deep], motion.place(particles.x, 0.01)[deep], 1e-4 if not scene.total else 1e-6)
+
+
+WAY = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.3, 0.6)))
+PAIRS = {
+    "sticky": (mpm.StickyBox((-np.inf, 0.1), (np.inf, np.inf), WAY), mpm.Grip(mpm.Box((-9.0, -9.0), (9.0, 0.1)), WAY)),
+    "slip": (
+        mpm.SlipBox((-np.inf, 0.1), (np.inf, np.inf), WAY),
+        mpm.SlipCollider(mpm.HalfSpace((0.0, 0.1), (0.0, 1.0)), WAY),
+    ),
+}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("description", DESCRIPTIONS.values(), ids=DESCRIPTIONS)
+@pytest.mark.parametrize("pair", PAIRS.values(), ids=PAIRS)
+def test_walls_that_move_are_grips_or_colliders_of_a_half_space(pair, description):
+    """In motion and force, over steps in which the wall passes a node."""
+    ends = []
+    for wall in pair:
+        scene, particles = block(2, boundary=wall, boundary_forces=True, description=description)
+        particles = dataclasses.replace(particles, v=particles.v + jnp.asarray([0.0, 0.6]))
+        run = mpm.simulate(scene, particles, t1=0.2, dt=2e-3, save_every=20)
+        ends.append((run.final.x, run.final.v, run.boundary_forces().force))
+    for a, b in zip(*ends, strict=True):
+        assert_close(a, b, 1e-9)
+
+
+PLANE = mpm.SymmetryPlane(1, 0.0, motion=mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.0, 0.6))))
+MOVING = {
+    "explicit": (mpm.Explicit(), mpm.APIC()),
+    "flip": (mpm.Explicit(), mpm.FLIP(0.95)),
+    "semi_implicit": (METHODS["semi_implicit"], mpm.APIC()),
+    "backward_euler": (METHODS["backward_euler"], mpm.PIC()),
+    "implicit_midpoint": (METHODS["implicit_midpoint"], mpm.APIC()),
+    "trbdf2": (METHODS["trbdf2"], mpm.FLIP(0.95)),
+}
+
+
+@pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
+@pytest.mark.parametrize("how", **ids(MOVING, "explicit"))
+def test_a_plane_that_moves_is_one_at_rest_seen_by_somebody_who_moves(how, description):
+    """A shaken block on a plane that moves evenly, against the same at rest: positions, velocities and forces."""
+    (method, transfer), V, found = how, jnp.asarray([0.0, 0.6]), []
+    for plane, drift in ((mpm.SymmetryPlane(1, 0.0), 0 * V), (PLANE, V)):
+        scene, particles = shaken(boundary=plane, transfer=transfer, description=description)
+        dt = 0.3 * explicit_limit(scene)
+        particles = dataclasses.replace(particles, v=particles.v + drift)
+        for n in range(4):
+            particles, info = mpm.step(scene, particles, n * dt, dt, method=method)
+        found.append((particles.x - 4 * dt * drift, particles.v - drift, info.boundaries.impulse))
+    for a, b in zip(*found, strict=True):
+        assert_close(a, b, 1e-9)
+
+
+@pytest.mark.thorough
+def test_a_block_is_compressed_evenly_between_planes_that_move_apart_from_each_other():
+    """In the total description; by one long step of a linear solve, to its tolerance; each plane is pressed by the
+    stress of that strain times its side."""
+    planes = (
+        mpm.SymmetryPlane(0, 0.0),
+        mpm.SymmetryPlane(0, SIDE, keep="below"),
+        mpm.SymmetryPlane(1, 0.0, motion=mpm.Motion((0.0, 1e3), ((0.0, 0.0), (0.0, 0.001)))),
+        mpm.SymmetryPlane(1, SIDE, keep="below", motion=mpm.Motion((0.0, 1e3), ((0.0, 0.0), (0.0, -0.002)))),
+    )
+    scene, particles = block(2, boundary=planes, boundary_forces=True, description=mpm.TotalLagrangian())
+    after, info = mpm.step(scene, particles, 0.0, 1e3, method=METHODS["backward_euler"])
+    stretch = 1 - 0.003 / SIDE
+    assert_close(after.x[:, 1], 0.001 + stretch * particles.x[:, 1], 1e-9)
+    assert_close(after.F[:, 1, 1], jnp.full(particles.count, stretch), 1e-9)
+    P = np.asarray(LAWS["fixed_corotated"].stress(jnp.diag(jnp.asarray([1.0, stretch]))[..., None])[..., 0])
+    force = np.asarray(info.boundaries.impulse / 1e3)
+    assert_close(force[:, 0], SIDE * P[0, 0] * np.array([1, -1, 0, 0]), 1e-7)
+    assert_close(force[:, 1], SIDE * P[1, 1] * np.array([0, 0, 1, -1]), 1e-7)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("transfer", TRANSFERS.values(), ids=TRANSFERS)
+def test_forces_on_planes_that_move_sum_to_the_change_of_momentum(transfer):
+    """In a corner of two, with a wall, in both descriptions."""
+    boundary = (
+        PLANE,
+        mpm.SymmetryPlane(0, 0.0, motion=mpm.Motion((0.0, 1.0), ((0.0, 0.0), (-0.4, 0.0)))),
+        mpm.StickyBox((-np.inf, -np.inf), (0.3, np.inf)),
+    )
+    for description in DESCRIPTIONS.values():
+        for method in (METHODS["explicit"], METHODS["implicit_midpoint"]):
+            assert_sums_to_change(*shaken(boundary=boundary, transfer=transfer, description=description), method)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("description", DESCRIPTIONS.values(), ids=DESCRIPTIONS)
+def test_the_motion_of_a_plane_can_be_differentiated(description):
+    """Against central differences, through a rollout; and a run with a plane that moves goes on from its end."""
+    scene, particles = block(2, boundary=PLANE, description=description, gravity=(0.0, -9.81))
+
+    def end(way):
+        own = eqx.tree_at(lambda s: s.boundary[0].motion.displacement[1][1], scene, way)
+        return (mpm.simulate(own, particles, t1=0.02, dt=2e-3).final.x ** 2).sum()
+
+    slope = jax.grad(end)(0.6)
+    assert float(slope) == pytest.approx(float(end(0.601) - end(0.599)) / 2e-3, rel=1e-5)
+    whole = mpm.simulate(scene, particles, t1=0.02, dt=2e-3).final
+    half = mpm.simulate(scene, particles, t1=0.01, dt=2e-3).final
+    assert_close(mpm.simulate(scene, half, t1=0.02, dt=2e-3, start=5).final.x, whole.x, 1e-12)
+
+
+def test_planes_that_cannot_move_as_asked_say_so():
+    """Two across one axis in the updated description, and a window that follows."""
+    still = mpm.SymmetryPlane(1, SIDE, keep="below")
+    with pytest.raises(ValueError, match="all of them must move alike"):
+        block(2, boundary=(PLANE, still))
+    block(2, boundary=(PLANE, still), description=mpm.TotalLagrangian())
+    with pytest.raises(ValueError, match="cannot follow the particles"):
+        mpm.Scene(mpm.Grid((9, 9), 0.1, follow=True), LAWS["fixed_corotated"], boundary=PLANE)

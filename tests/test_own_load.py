@@ -1,0 +1,37 @@
+"""A load of one's own, as a user would write it: the drag of still air on a surface."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from helpers import assert_files_hold, block
+
+import mpmjax as mpm
+from mpmjax._types import Array, Float, Scalar
+from mpmjax.state import LoadedPoints
+
+
+class Drag(mpm.AbstractLoad):
+    """−½ ρ c ‖v‖ v per area."""
+
+    on: mpm.AbstractPlace
+    density: Scalar
+    coefficient: Scalar = 1.0
+
+    def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
+        """At the points' velocity at the start of the step, or in its middle."""
+        speed = jnp.sqrt((points.v**2).sum(axis=0))
+        return -self.density / 2 * self.coefficient * points.weight * speed * points.v
+
+
+def test_a_load_of_ones_own_acts_and_is_kept_in_files(tmp_path):
+    """It brakes a flying block by the drag on its four sides, and a run with it comes back from a file."""
+    mpm.register(Drag)
+    side, speed, dt = 0.3, 2.0, 1e-3
+    scene, particles = block(2, loads=Drag(mpm.Patch(mpm.Box((0.0, 0.0), (side, side))), 1.2, 1.1))
+    particles = dataclasses.replace(particles, v=particles.v + jnp.asarray([speed, 0.0]))
+    scene = mpm.attach(scene, particles)
+    run = mpm.simulate(scene, particles, t1=dt, dt=dt)
+    lost = float(particles.mass.sum()) * speed - float(mpm.momentum(run.final)[0])
+    np.testing.assert_allclose(lost, dt * 1.2 / 2 * 1.1 * 4 * side * speed**2, rtol=1e-9)
+    assert_files_hold(tmp_path / "run.h5", run, Drag)
