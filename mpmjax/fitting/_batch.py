@@ -27,6 +27,11 @@ class Member(NamedTuple):
     joined: int | None = None
     """The number of the search that it came upon, and was ended for."""
 
+    @property
+    def interrupted(self) -> bool:
+        """Whether it was ended, or not begun, by an interruption."""
+        return self.failure == _NOT_BEGUN or (self.minimum is not None and self.minimum.interrupted)
+
 
 class Problems(eqx.Module):
     """Problems that differ in numbers: the leaves that differ are stacked, the others stored once."""
@@ -137,7 +142,7 @@ def search_many(
                 progress(len(done), count)
     except KeyboardInterrupt:
         done |= {lanes.members[lane]: lanes.stopped(lane, interrupted=True) for lane in lanes.busy}
-        done |= {k: Member(None, "was not begun: the search was interrupted") for k in range(count) if k not in done}
+        done |= {k: Member(None, _NOT_BEGUN) for k in range(count) if k not in done}
     return tuple(done[k] for k in range(count))
 
 
@@ -259,7 +264,7 @@ class _Lanes:
         """A search as it is."""
         member, seen = self.members[lane], self.seen[lane] if self.history[lane] else None
         if seen is None:
-            return Member(None, "was not begun: the search was interrupted")
+            return Member(None, _NOT_BEGUN)
         problem, sigmas = self.problems.one(member), self.sigmas.one(member)
         z = jnp.array(self.z[lane], problem.dtype)  # a copy: `take` writes to self.z
         r, J = seen.residuals, seen.jacobian
@@ -331,6 +336,7 @@ def _iterate(
     return eqx.filter_vmap(one, in_axes=(axes[0], 0, axes[1], eqx.if_array(0)))(own, z, sigmas, state)
 
 
+_NOT_BEGUN = "was not begun: the search was interrupted"
 _DIFFERENT = (
     "The data sets of an ensemble must differ in numbers alone, but number {} has other shapes, choices or functions "
     "than the first: give each the same times and markers (NaN where nothing was measured), and the same functions."

@@ -4,10 +4,12 @@ import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.special import gammaln
 
-from mpmjax._types import Float, Int
+from mpmjax._types import Float, Int, Scalar
 
 
-def linked(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"]) -> Int[np.ndarray, "k"]:
+def linked(
+    shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"], fraction: Scalar
+) -> Int[np.ndarray, "k"]:
     """For each point the number of the one that stands for it, from which a search starts; its own where one starts
     there, and -1 where the cost is not finite.
 
@@ -17,12 +19,13 @@ def linked(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"]) -> I
         r = π^(-1/2) (Γ(1 + n/2) σ ln k / k)^(1/n),  σ = 2,
 
     of k even points of the unit cube: in a ball of this radius lie σ ln k of them. Any other point is linked to the
-    nearest better one, and so on to one that is searched from. Of a rough function that is too greedy: the best eighth
-    of all points is searched from besides, whatever their neighbours (`benchmarks/multistart.py --reliability`).
+    nearest better one, and so on to one that is searched from. Of a rough function that is too few: a fraction of all
+    points, the best ones, is searched from besides, whatever their neighbours.
 
     Args:
         shares: the points, evenly spread over the unit cube.
         costs: the function there; not finite where it is not known.
+        fraction: from 0, none besides, to 1, all.
     """
     count, size = shares.shape
     stands = np.full(count, -1)
@@ -32,7 +35,7 @@ def linked(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"]) -> I
     for place, k in enumerate(order):
         better = order[:place]
         distances = cdist(shares[k : k + 1], shares[better])[0]
-        alone = place < np.ceil(_BEST * count) or (distances > near).all()
+        alone = place < fraction * count or (distances > near).all()
         stands[k] = k if alone else stands[better[distances.argmin()]]
     return stands
 
@@ -47,5 +50,3 @@ def critical_distance(count: int, size: int) -> float:
 
 _SIGMA = 2.0
 """σ of the critical distance."""
-_BEST = 1 / 8
-"""Part of all points that is searched from whatever their neighbours."""

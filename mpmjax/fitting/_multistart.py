@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Float, Int, Scalar
-from mpmjax.checks import checked, require_whole, warn
+from mpmjax.checks import checked, require_between, require_whole, warn
 from mpmjax.fitting._batch import Member, Problems, batch_size, costs_at, search_many
 from mpmjax.fitting._choice import chosen_optimiser
 from mpmjax.fitting._experiment import Experiment
@@ -96,6 +96,7 @@ def fit_multistart(
     parameters: dict[str, AbstractParameter],
     *,
     starts: int = 64,
+    fraction: Scalar = 0.375,
     ranges: dict[str, tuple[float, float]] | None = None,
     seed: int = 0,
     batch: int | None = None,
@@ -112,10 +113,10 @@ def fit_multistart(
     The points are the first guess and scrambled Sobol points over the ranges; of a parameter without one, over its
     prior, between its bounds, from a tenth to ten times the first guess of a `Positive`, and one coordinate to each
     side of an `Unbounded` one. The simulation runs once at each of them, without derivatives. Searches start from the
-    first guess, from the best eighth of the points, and from each that has no better one within the critical distance
-    of multi-level single linkage (A. H. G. Rinnooy Kan, G. T. Timmer, Mathematical Programming 39 (1987) 57-78); they
-    stand for the others, each of which is linked to the nearest better one. Where one comes to no minimum, the points
-    that it stood for are linked anew, without it.
+    first guess, from a fraction of the points, the best ones, and from each that has no better one within the critical
+    distance of multi-level single linkage (A. H. G. Rinnooy Kan, G. T. Timmer, Mathematical Programming 39 (1987)
+    57-78). They stand for the others, each of which is linked to the nearest better one. Where a search comes to no
+    minimum, the points that it stood for are linked anew, without it.
 
     Searches run together, `batch` in one compiled program; one that is done leaves its place to the next. Points and
     searches whose simulation fails hinder no others. A search that comes within a hundredth, in each coordinate, of
@@ -134,6 +135,8 @@ def fit_multistart(
         experiments: see `fit`.
         parameters: see `fit`.
         starts: how many points, the first guess among them.
+        fraction: of the points, the best ones, from which searches start whatever is near. 1 searches from all of them,
+            without a look; 0 only from those of single linkage and the first guess.
         ranges: lowest and highest value to start from, by the name of a parameter.
         seed: of the starting points.
         batch: how many points, and searches, run together. Default: eight with explicit steps, one with implicit ones.
@@ -147,13 +150,15 @@ def fit_multistart(
         SimulationError: no search came to a minimum, and the simulation at the first guess meets a fault.
     """
     require_whole("starts", starts, 1)
+    require_between("fraction", fraction, 0, 1)
     problem = FitProblem((experiments,) if isinstance(experiments, Experiment) else tuple(experiments), parameters)
     optimiser = chosen_optimiser(problem) if optimiser is None else optimiser
     shares = unit_points(starts - 1, problem.size, require_whole("seed", seed, 0))
     points = starting_points(problem, shares, dict(ranges or {}))
     sigmas = problem.first_sigmas
     size = batch_size(problem, batch, starts)
-    costs = costs_at(problem, points, sigmas, size, _teller(progress, "simulations"))
+    look = fraction < 1
+    costs = costs_at(problem, points, sigmas, size, _teller(progress, "simulations")) if look else np.zeros(starts)
     failures = {int(k): _FAILS for k in np.flatnonzero(~np.isfinite(costs))}
     together = partial(
         search_many,
@@ -164,20 +169,21 @@ def fit_multistart(
         joining=_JOINED,
     )
     members: dict[int, Member] = {}
+    chosen: list[int] = []
+
+    def begun(number: int, seen: Evaluation) -> None:
+        if chosen[number] == 0:
+            require_influence(problem, sigmas, seen)
+
     while True:
-        stands = _stands(shares, costs)
+        stands = _stands(shares, costs, fraction)
         chosen = sorted(set(stands.tolist()) - {-1, *members}, key=lambda k: (k > 0, costs[k]))
         if not chosen:
             break
-
-        def begun(number: int, seen: Evaluation, first: int = chosen[0]) -> None:
-            if number == first == 0:
-                require_influence(problem, sigmas, seen)
-
         found = together(points[chosen], settling=_SETTLED, progress=_teller(progress, "searches"), begun=begun)
         joined = [None if m.joined is None else chosen[m.joined] for m in found]
         members |= {k: m._replace(joined=end) for k, m, end in zip(chosen, found, joined, strict=True)}
-        if any(m.minimum is not None and m.minimum.interrupted for m in found):
+        if any(m.interrupted for m in found):
             break
         costs[[k for k in chosen if _end(members, k) is None]] = np.nan
     failures |= {k: m.failure for k, m in members.items() if m.minimum is None}
@@ -223,10 +229,12 @@ def _teller(progress: Callable[[str], None] | None, what: str) -> Callable[[int,
     return say
 
 
-def _stands(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "l"]) -> Int[np.ndarray, "l"]:
+def _stands(
+    shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "l"], fraction: Scalar
+) -> Int[np.ndarray, "l"]:
     """For each point the number of the one that stands for it, and is searched from; -1 where the cost is not known.
     The first guess, which is none of the cube's points, stands for itself."""
-    others = linked(shares, costs[1:])
+    others = linked(shares, costs[1:], fraction)
     return np.concatenate([[0 if np.isfinite(costs[0]) else -1], np.where(others < 0, -1, others + 1)])
 
 
