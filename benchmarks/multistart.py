@@ -1,16 +1,17 @@
-"""What does a look over 64 points cost, beside searches from all of them and beside 64 fits? What does it miss?
+"""What do 64 starts cost, beside searches from all of them and beside 64 fits? What do they miss?
 
     python benchmarks/multistart.py [--starts 64] [--rounds 2] [--scene explicit]
     python benchmarks/multistart.py --reliability
 
 E and ν of a free square that is stretched as it starts, from tracks of all its particles with noise, made by the same
-scene; once with explicit steps, once with semi-implicit ones. All three start from the same Sobol points, E over two
-decades, ν between its bounds. Printed are seconds of the processor and of the clock, compilation left out by a first
-call of each, the three interleaved; and of one iteration, per search, against how many run together.
+scene; once with explicit steps, once with semi-implicit ones. Fits one by one and `fit_multistart`, with `fraction=1`,
+which searches from all points, and with its default, start from the same Sobol points, E over two decades, ν between
+its bounds. Printed are seconds of the processor and of the clock, compilation left out by a first call of each, the
+three interleaved; and of one iteration, per search, against how many run together.
 
-`--reliability`: how often searches find the best minimum, from all of 64, or 256, scrambled Sobol points, and from
-those that `fit_multistart` searches from, of 20 scramblings each. The problems are oscillations whose frequency,
-amplitude, damping and phase are searched, the better known the longer they last, and sums of two and three of them.
+`--reliability`: how often searches find the best minimum, and how many they are, of 40 scramblings of the Sobol points,
+for several fractions. The problems are oscillations whose frequency, amplitude, damping and phase are searched, the
+better known the longer they last, and sums of two and three of them.
 """
 
 import argparse
@@ -26,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpmjax as mpm
-from mpmjax.fitting._batch import Member, Problems, _iterate, batch_size, search_many
+from mpmjax.fitting._batch import Problems, _iterate
 from mpmjax.fitting._linkage import linked
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._search import begin
@@ -46,6 +47,7 @@ OSCILLATIONS = {
     "two frequencies, 1.6 and 4 periods": ((1.0, 0.5), (1.0, 2.7), 10.0, 0),
     "three frequencies, 1 to 5 periods": ((1.0, 0.6, 0.4), (1.0, 2.2, 5.0), 6.0, 0),
 }
+FRACTIONS = {64: (0.0, 0.125, 0.375, 0.5, 1.0), 256: (0.125,)}
 SCENES = {"explicit": (mpm.Explicit(), 2e-3, 100), "semi-implicit": (mpm.SemiImplicit(), 1e-2, 20)}
 
 
@@ -83,14 +85,6 @@ def one_by_one(pull: mpm.Experiment, points: np.ndarray) -> list[float]:
         except (ValueError, RuntimeError):
             misfits.append(float("nan"))
     return misfits
-
-
-def from_all(pull: mpm.Experiment, points: np.ndarray) -> tuple[Member, ...]:
-    """The searches of `fit_multistart`, from all points."""
-    problem = FitProblem((pull,), PARAMETERS)
-    one, sigmas = (Problems.of([a], shared=True) for a in (problem, problem.first_sigmas))
-    batch = batch_size(problem, None, len(points))
-    return search_many(one, mpm.LevenbergMarquardt(), points, sigmas=sigmas, batch=batch, joining=0.01, settling=0.01)
 
 
 def iteration(pull: mpm.Experiment, points: np.ndarray, batch: int) -> Callable[[], Any]:
@@ -144,23 +138,26 @@ def ends(residuals: Callable[[np.ndarray], np.ndarray], z: np.ndarray) -> np.nda
     return (r**2).sum(1)
 
 
-def reliability(scramblings: int = 20) -> None:
+def reliability(scramblings: int = 40) -> None:
     """How often the best minimum is found, and by how many searches."""
-    print("problem, n: from all of 64: found; of 64, 256: found (searches); of", scramblings)
+    columns = ", ".join(f"{f:g} of {count}" for count, fractions in FRACTIONS.items() for f in fractions)
+    print(f"problem, unknowns: found of {scramblings} (searches) by a fraction of {columns}")
     for text, (amplitudes, frequencies, duration, others) in OSCILLATIONS.items():
         residuals, lowest, highest = oscillations(amplitudes, frequencies, duration, others)
         told = []
-        for count in (64, 256):
-            every, few, searches = 0, 0, 0
+        for count, fractions in FRACTIONS.items():
+            found, searches = (dict.fromkeys(fractions, 0) for _ in range(2))
             for seed in range(scramblings):
                 shares = unit_points(count - 1, len(lowest), seed)
                 z = lowest + shares * (highest - lowest)
-                own = np.unique(linked(shares, (residuals(z) ** 2).sum(1)))
-                found = ends(residuals, z if count == 64 else z[own]) < 2 * 80
-                every += found.any()
-                few += (found[own] if count == 64 else found).any()
-                searches += len(own)
-            told += [f"{every}; " * (count == 64) + f"{few} ({searches / scramblings:.0f})"]
+                costs = (residuals(z) ** 2).sum(1)
+                own = {f: np.unique(linked(shares, costs, f)) for f in fractions}
+                most = own[max(fractions)]
+                best = set(most[ends(residuals, z[most]) < 2 * 80])
+                for f in fractions:
+                    found[f] += not best.isdisjoint(own[f])
+                    searches[f] += len(own[f])
+            told += [f"{found[f]} ({searches[f] / scramblings:.0f})" for f in fractions]
         print(f"{text}, {len(lowest)}: {', '.join(told)}", flush=True)
 
 
@@ -192,22 +189,18 @@ def main() -> None:
         for _ in range(given.rounds):
             processor, clock, alone = timed(partial(one_by_one, pull, points))
             print(f"{name}: {given.starts} fits: {processor:.1f} s of the processor, {clock:.1f} s", flush=True)
-            every, every_clock, all_found = timed(partial(from_all, pull, points))
-            iterations = sum(len(m.minimum.history) for m in all_found if m.minimum is not None)
-            print(
-                f"{name}: searches from all: {every:.1f} s of the processor, {every_clock:.1f} s; "
-                f"ratio {processor / every:.1f}; {iterations} iterations",
-                flush=True,
-            )
-            own, own_clock, found = timed(partial(mpm.fit_multistart, pull, PARAMETERS, starts=given.starts))
-            print(
-                f"{name}: fit_multistart: {own:.1f} s of the processor, {own_clock:.1f} s; "
-                f"ratio {processor / own:.1f}; {len(found.searched)} searches, {found.iterations} iterations; "
-                f"{len(found.minima)} minima, the best of {len(found.minima[0].members)} points, "
-                f"{len(found.failures)} failed; χ² {found.best.chi_squared:.6g}, the fits' best {np.nanmin(alone):.6g} "
-                f"({sum(np.isclose(alone, np.nanmin(alone), rtol=1e-3))} of them), {sum(np.isnan(alone))} failed",
-                flush=True,
-            )
+            for fraction in (1.0, 0.375):
+                call = partial(mpm.fit_multistart, pull, PARAMETERS, starts=given.starts, fraction=fraction)
+                own, own_clock, found = timed(call)
+                print(
+                    f"{name}: fraction {fraction:g}: {own:.1f} s of the processor, {own_clock:.1f} s; "
+                    f"ratio {processor / own:.1f}; {len(found.searched)} searches, {found.iterations} iterations; "
+                    f"{len(found.minima)} minima, the best of {len(found.minima[0].members)} points, "
+                    f"{len(found.failures)} failed; χ² {found.best.chi_squared:.6g}, the fits' best "
+                    f"{np.nanmin(alone):.6g} ({sum(np.isclose(alone, np.nanmin(alone), rtol=1e-3))} of them), "
+                    f"{sum(np.isnan(alone))} failed",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

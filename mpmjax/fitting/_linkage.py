@@ -7,9 +7,7 @@ from scipy.special import gammaln
 from mpmjax._types import Float, Int, Scalar
 
 
-def linked(
-    shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"], fraction: Scalar
-) -> Int[np.ndarray, "k"]:
+def linked(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"], fraction: Scalar) -> Int[np.ndarray, "k"]:
     """For each point the number of the one that stands for it, from which a search starts; its own where one starts
     there, and -1 where the cost is not finite.
 

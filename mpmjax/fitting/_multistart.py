@@ -199,10 +199,10 @@ def fit_multistart(
     restarted = {name: replace(p, start=minima[0].values[name]) for name, p in parameters.items()}
     best = fit(experiments, restarted, report=report, level=level, optimiser=optimiser, progress=progress)
     ended = {k for _, numbers in groups for k in numbers}
-    if len(minima[0].members) == 1 and len(ended) > 1:
+    if minima[0].searches == 1 and len(ended & members.keys()) > 1:
         warn(
-            f"The best minimum was found from one point of {starts}: there may be a better one. Take more starts, or "
-            "narrower ranges."
+            f"The best minimum was found by one search of {len(members)}: there may be a better one. Take more starts, "
+            "a larger fraction, or narrower ranges."
         )
     values = [problem.values(jnp.asarray(point, problem.dtype)) for point in points]
     return MultistartFit(
@@ -229,9 +229,7 @@ def _teller(progress: Callable[[str], None] | None, what: str) -> Callable[[int,
     return say
 
 
-def _stands(
-    shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "l"], fraction: Scalar
-) -> Int[np.ndarray, "l"]:
+def _stands(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "l"], fraction: Scalar) -> Int[np.ndarray, "l"]:
     """For each point the number of the one that stands for it, and is searched from; -1 where the cost is not known.
     The first guess, which is none of the cube's points, stands for itself."""
     others = linked(shares, costs[1:], fraction)
