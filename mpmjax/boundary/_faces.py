@@ -56,8 +56,8 @@ class Faces(eqx.Module):
     """Stiffness of contact of a face at rest A α M/dx [N/m], shape (p,), on its area A = V0/l0, with M the wave modulus
     of the law at rest and α the stiffness of explicit or implicit steps."""
     inertia: Float[Array, "p"]
-    """A α ρ0/dx [kg/m²], shape (p,): times the square of the velocity of approach, the stiffness of contact that a shock
-    adds."""
+    """A α ρ0/dx [kg/m²], shape (p,): times the square of the velocity of approach, the stiffness of contact that a
+    shock adds."""
     stencil: Stencil
     spacing: Scalar
     """dx [m]."""
@@ -77,7 +77,7 @@ class Faces(eqx.Module):
         return jnp.where(at > 0, at, 1)
 
     def stiffness_at(self, approach: Float[Array, "p"]) -> Float[Array, "p"]:
-        """k_p = A α (M + ρ0 w²)/dx [N/m], shape (p,), at the velocity of approach w [m/s]; none where w is below zero."""
+        """k_p = A α (M + ρ0 max(w, 0)²)/dx [N/m], shape (p,), at the velocity of approach w [m/s]."""
         return self.stiffness + self.inertia * jnp.maximum(approach, 0) ** 2
 
     def width(self, n: Float[Array, "d p"]) -> tuple[Float[Array, "p"], Matrix]:
