@@ -35,7 +35,7 @@ def faces_of(
         shape = points.deformation if law.allows_total else points.volume_ratio()
         shapes.append(FaceShape(side / 2, shape, points.rows, points.total))
         over = factor / (side * scene.grid.spacing)
-        stiffness.append(over * points.law.wave_modulus(particles.dim, points.volume.dtype) * points.volume)
+        stiffness.append(over * points.law.wave_modulus(points.deformation) * points.volume)
         inertia.append(over * particles.mass[slice(*points.rows)])
     return Faces(
         x=particles.x,
