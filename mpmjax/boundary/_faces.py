@@ -11,7 +11,7 @@ EXPLICIT_STIFFNESS = 2.0
 """Stiffness of contact in explicit steps, in the material's wave modulus over a spacing: that of half a spacing of the
 material. More would shorten the longest stable step."""
 IMPLICIT_STIFFNESS = 20.0
-"""The same in implicit steps."""
+"""Stiffness of contact in implicit steps, in the material's wave modulus over a spacing."""
 
 
 class FaceShape(eqx.Module):

@@ -39,12 +39,12 @@ class SurfaceContact(AbstractContact):
     pushes and the two conditions exclude each other.
 
     The stiffness of a face that comes with the velocity w is that of M + ρ0 w² in the place of the wave modulus M, as
-    in a shock: it is stopped within half a spacing at any speed (explicit steps; two particles along a cell's edge).
+    in a shock: a particle by itself, of half a spacing, is stopped within half a spacing at any speed.
 
     The energy ½ k_p min(g_p, 0)² is convex in g_p. So a force by the gap at the end of the step takes at least as much
-    energy as the spring keeps, −k_p g¹ (g¹ − g⁰) ≤ ½ k_p (min(g⁰, 0)² − min(g¹, 0)²), at any stiffness and step. An
-    integrator that evaluates forces at θ of the step's displacement gets the force by springs of gap θ g⁰ and stiffness
-    k_p/θ.
+    energy as the spring keeps, −k_p g¹ (g¹ − g⁰) ≤ ½ k_p (min(g⁰, 0)² − min(g¹, 0)²), at any step, as long as k_p
+    does not grow. An integrator that evaluates forces at θ of the step's displacement gets the force by springs of gap
+    θ g⁰ and stiffness k_p/θ.
 
     Friction is at most μ times the push of the particles around each node.
     """

@@ -126,10 +126,10 @@ class AbstractElastic(AbstractLaw):
             F: deformations of the particles, of which only the shape counts [-], component first.
         """
         alike = all(jnp.ndim(leaf) == 0 for leaf in jax.tree.leaves(self))
-        axes, count = F.shape[:-1], 1 if alike else F.shape[-1]
-        none = jnp.asarray(self.kinematics.undeformed(len(axes) and axes[0]), F.dtype)[..., None]
-        none = jnp.broadcast_to(none, (*axes, count))
-        if not axes:
+        of_one = self.kinematics.undeformed(len(F))  # len(F) is d, and not looked at by laws of J
+        none = jnp.asarray(of_one, F.dtype)[..., None]
+        none = jnp.broadcast_to(none, (*of_one.shape, 1 if alike else F.shape[-1]))
+        if none.ndim == 1:
             return self.tangent(none)(jnp.ones_like(none))
         return self.tangent(none)(jnp.zeros_like(none).at[0, 0].set(1))[0, 0]
 
