@@ -156,6 +156,7 @@ from mpmjax.state import (
     AbstractLoad,
     AbstractPlace,
     AttachedPoints,
+    AveragedVolume,
     Particles,
     Patch,
     PointLoad,
@@ -195,6 +196,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "Scene",
     "UpdatedLagrangian",
     "TotalLagrangian",
+    "AveragedVolume",
     # particles and regions
     "Particles",
     "fill",

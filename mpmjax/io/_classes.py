@@ -54,6 +54,7 @@ from mpmjax.material import (
 )
 from mpmjax.state import (
     AttachedPoints,
+    AveragedVolume,
     Patch,
     PointLoad,
     PointsAt,
@@ -77,6 +78,7 @@ CLASSES: tuple[type, ...] = (
     *(Box, Ball, HalfSpace, Capsule, Cylinder, Annulus, Tube, Union, SampledDistance, Motion, RigidMotion),
     *(Traction, Pressure, PointLoad, Spring, Patch, PointsAt, AttachedPoints, TimeSeries),
     *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
+    AveragedVolume,
     *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),
     *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual, DiagonalPreconditioner, MassPreconditioner),
 )
