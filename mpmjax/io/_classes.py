@@ -34,6 +34,7 @@ from mpmjax.implicit import (
     JvpHessian,
     Linearised,
     MassPreconditioner,
+    MixedResidual,
     Newton,
 )
 from mpmjax.material import (
@@ -80,6 +81,7 @@ CLASSES: tuple[type, ...] = (
     *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
     AveragedVolume,
     *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),
-    *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual, DiagonalPreconditioner, MassPreconditioner),
+    *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual, MixedResidual),
+    *(DiagonalPreconditioner, MassPreconditioner),
 )
 """The package's own classes that files can hold."""
