@@ -99,7 +99,6 @@ EXAMPLES = {
     mpm.AnalyticHessian: mpm.AnalyticHessian(),
     mpm.JvpHessian: mpm.JvpHessian(),
     mpm.ConjugateResidual: mpm.ConjugateResidual(1e-7, increment_rtol=1e-3, max_steps=17),
-    mpm.MixedResidual: mpm.MixedResidual(1e-7, max_steps=17, most_rounds=3),
     mpm.AveragedVolume: mpm.AveragedVolume((0, 1)),
     mpm.DiagonalPreconditioner: mpm.DiagonalPreconditioner(),
     mpm.MassPreconditioner: mpm.MassPreconditioner(),

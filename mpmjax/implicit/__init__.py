@@ -7,7 +7,6 @@ from mpmjax.implicit._hessian_action import AbstractHessianAction, ParticleStiff
 from mpmjax.implicit._inner_product import AbstractInnerProduct, DiagonalInnerProduct
 from mpmjax.implicit._linear_solve import AbstractInnerProductSolver, require_solver
 from mpmjax.implicit._linearised import Linearised
-from mpmjax.implicit._mixed_residual import MixedResidual
 from mpmjax.implicit._newton import Newton
 from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._potential import ElasticPotential
@@ -35,7 +34,6 @@ __all__ = [
     "JvpHessian",
     "LinearProblem",
     "Linearised",
-    "MixedResidual",
     "MassPreconditioner",
     "Newton",
     "NewtonProblem",

@@ -1,8 +1,7 @@
 """The elastic energy's Hessian as a linear map of nodal displacements."""
 
 import abc
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -97,14 +96,10 @@ class ParticleStiffness(AbstractHessianAction):
     def __call__(self, du: NodeVector) -> NodeVector:
         """Σ_p g_ip K_p Σ_j g_jp δu_j, and what supports and springs add."""
         moved = gather(self.stencil, self.mirror.unfold(du))
-        return self.of_moved(du, moved, [one(moved[1]) for one in self.averaged])
-
-    def of_moved(self, du: NodeVector, moved: tuple[Array, Array], averaged: Sequence[Matrix]) -> NodeVector:
-        """The same, from δu gathered at the particles, with what averaged volumes add to the flux [J]."""
         slopes, value = moved[1], None
         flux = la.matmul(self.matrix, slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
-        for part in averaged:
-            flux = flux + part
+        for one in self.averaged:
+            flux = flux + one(slopes)
         if self.springs:
             value, more = spring_answer(self.springs, moved)
             flux = flux + more
@@ -113,10 +108,6 @@ class ParticleStiffness(AbstractHessianAction):
 
     def precomputed(self) -> "ParticleStiffness":
         return self
-
-    def without_averages(self) -> "ParticleStiffness":
-        """The map at mean volumes that do not change."""
-        return replace(self, averaged=())
 
     def diagonal(self, like: NodeVector) -> NodeVector:
         """Σ_p Σ_b g_ip,b² K_p,ba,ba [N/m], shape (n, d): a non-negative approximation of the diagonal of H.

@@ -34,7 +34,6 @@ from mpmjax.implicit import (
     JvpHessian,
     Linearised,
     MassPreconditioner,
-    MixedResidual,
     Newton,
 )
 from mpmjax.material import (
@@ -81,7 +80,6 @@ CLASSES: tuple[type, ...] = (
     *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
     AveragedVolume,
     *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),
-    *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual, MixedResidual),
-    *(DiagonalPreconditioner, MassPreconditioner),
+    *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual, DiagonalPreconditioner, MassPreconditioner),
 )
 """The package's own classes that files can hold."""
