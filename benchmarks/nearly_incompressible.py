@@ -2,6 +2,7 @@
 
 python benchmarks/nearly_incompressible.py              # measures, and draws docs/nearly_incompressible.png
 python benchmarks/nearly_incompressible.py --quick      # 8 and 16 cells, no picture
+python benchmarks/nearly_incompressible.py --swing      # a block that swings, over time
 python benchmarks/nearly_incompressible.py --reference  # Cook's membrane by Taylor-Hood elements (needs scikit-fem)
 
 Both are plane strain at small strains, in the total description with particles fitted to the body, three along a cell's
@@ -15,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.spatial import KDTree
 
 import mpmjax as mpm
 
@@ -23,10 +25,11 @@ CENTRE = {0.3: 21.9460, 0.49: 18.7378, 0.499: 18.5336, 0.4999: 18.5129}
 """Deflection of the middle of Cook's loaded edge for E = 1 and a total force of 1, by `--reference`: Richardson's
 extrapolation of 32 and 64 elements a side."""
 INNER, OUTER = 0.5, 1.0
+Volume = mpm.AveragedVolume | None
 VOLUMES = {"own volumes": None, "averaged": mpm.AveragedVolume()}
 
 
-def cook(cells: int, nu: float, volume: mpm.AveragedVolume | None, load: float = 1e-4) -> tuple[mpm.Scene, mpm.Particles]:
+def cook(cells: int, nu: float, volume: Volume, load: float = 1e-4) -> tuple[mpm.Scene, mpm.Particles]:
     """The membrane with corners (0, 0), (48, 44), (48, 60), (0, 44), with so many cells along its length."""
     dx = 48 / cells
     grid = mpm.Grid((cells + 8, int(62 / dx) + 9), dx, origin=(-4, -4))
@@ -49,7 +52,7 @@ def cook(cells: int, nu: float, volume: mpm.AveragedVolume | None, load: float =
     return mpm.attach(scene, particles), particles
 
 
-def tube(cells: int, nu: float, volume: mpm.AveragedVolume | None, load: float = 1e-4) -> tuple[mpm.Scene, mpm.Particles]:
+def tube(cells: int, nu: float, volume: Volume, load: float = 1e-4) -> tuple[mpm.Scene, mpm.Particles]:
     """A quarter of a tube with so many cells to its outer radius, under a dead pressure in its bore."""
     grid = mpm.Grid((cells + 8,) * 2, OUTER / cells, origin=(-4, -4))
     particles = mpm.fill_mapped(
@@ -78,10 +81,10 @@ def deflection(particles: mpm.Particles, after: mpm.Particles, load: float = 1e-
     return float(fit[0] / load)
 
 
-def lame(r: np.ndarray, nu: float, load: float = 1e-4) -> tuple[np.ndarray, float]:
-    """u_r(r) and the pressure −tr σ/3, the same everywhere, of the tube for E = 1 (G. Lamé), in plane strain."""
+def lame(r: np.ndarray, nu: float, load: float = 1e-4) -> np.ndarray:
+    """u_r(r) of the tube for E = 1 (G. Lamé), in plane strain."""
     scale = load * INNER**2 / (OUTER**2 - INNER**2)
-    return (1 + nu) * scale * ((1 - 2 * nu) * r + OUTER**2 / r), -2 * (1 + nu) / 3 * scale
+    return (1 + nu) * scale * ((1 - 2 * nu) * r + OUTER**2 / r)
 
 
 def pressures(scene: mpm.Scene, after: mpm.Particles) -> np.ndarray:
@@ -96,8 +99,6 @@ def pressures(scene: mpm.Scene, after: mpm.Particles) -> np.ndarray:
 
 def roughness(particles: mpm.Particles, field: np.ndarray, spacing: float) -> float:
     """The root mean square of what a field has beside its linear fits over neighbourhoods of one cell."""
-    from scipy.spatial import KDTree
-
     X, tree = np.asarray(particles.x), KDTree(np.asarray(particles.x))
     left = []
     for i in range(0, len(X), 3):
@@ -107,7 +108,7 @@ def roughness(particles: mpm.Particles, field: np.ndarray, spacing: float) -> fl
     return float(np.sqrt(np.mean(np.square(left))))
 
 
-def measured(problem: str, cells: int, nu: float, volume: mpm.AveragedVolume | None) -> dict:
+def measured(problem: str, cells: int, nu: float, volume: Volume) -> dict:
     """Displacement over its reference, roughness of pressure and of J, iterations."""
     scene, particles = (cook if problem == "cook" else tube)(cells, nu, volume)
     after, info = mpm.step(scene, particles, 0.0, 1e4, method=TIGHT)
@@ -118,7 +119,7 @@ def measured(problem: str, cells: int, nu: float, volume: mpm.AveragedVolume | N
     else:
         r = np.linalg.norm(np.asarray(particles.x), axis=1)
         u = ((np.asarray(after.x) - particles.x) * np.asarray(particles.x)).sum(axis=1) / r
-        exact, p0 = lame(r, nu)
+        exact = lame(r, nu)
         ratio, size = float((u * exact).sum() / (exact**2).sum()), 1.0
     return {
         "ratio": ratio,
@@ -154,6 +155,65 @@ def reference(n: int, nu: float) -> float:
     return float((u.probes(np.array([[48 - 1e-9], [52]])) @ found[: u.N])[1])
 
 
+def swing(
+    cells: int,
+    volume: Volume,
+    description: mpm.AbstractDescription,
+    method: mpm.AbstractIntegrator,
+    dt: float | None = None,
+    nu: float = 0.4999,
+    periods: float = 4.0,
+) -> np.ndarray:
+    """A unit block of μ = ρ = 1 in the standing shear wave u = A sin(ωt) (−cos kx sin ky, sin kx cos ky), k = π, ω = √2 k,
+    which keeps the volume and leaves the sides free, whatever ν is. At each quarter of a period: error of displacement
+    over A, roughness of the pressure and of J over k A."""
+    k, size = np.pi, 5e-3
+    omega = 2**0.5 * k
+    grid = mpm.Grid((2 * cells, 2 * cells), 1 / cells, origin=(-cells // 2,) * 2)
+    rest = mpm.fill(mpm.Box((0.0, 0.0), (1.0, 1.0)), grid, density=1.0)
+    X, Y = k * np.asarray(rest.x).T
+    shape = np.stack([-np.cos(X) * np.sin(Y), np.sin(X) * np.cos(Y)], axis=1)
+    particles = mpm.Particles(rest.x, size * omega * jnp.asarray(shape), rest.mass, rest.volume)
+    scene = mpm.Scene(grid, mpm.NeoHookean(2 * (1 + nu), nu), volume=volume, description=description)
+    longest = float(mpm.stable_dt(scene, particles)) if dt is None else dt
+    quarter = np.pi / omega / 2
+    steps = int(np.ceil(quarter / longest))
+    run = mpm.simulate(scene, particles, t1=4 * periods * quarter, dt=quarter / steps, method=method, save_every=steps)
+    found = []
+    for frame in range(1, len(run.times)):
+        x, F, t = (np.asarray(a[frame]) for a in (run.frames.x, run.frames.F, run.times))
+        u = x - np.asarray(rest.x)
+        state = mpm.Particles(jnp.asarray(x), rest.v, rest.mass, rest.volume, deformations=(jnp.asarray(F),), X=rest.x)
+        error = np.sqrt(((u / size - np.sin(omega * t) * shape) ** 2).sum(axis=1).mean())
+        rough = [
+            roughness(rest, field / (k * size), 1 / cells) for field in (pressures(scene, state), np.linalg.det(F))
+        ]
+        found.append((error, *rough))
+    return np.array(found)
+
+
+def swings() -> None:
+    """Print the block's errors after one and four periods."""
+    runs = (
+        ("explicit, updated", mpm.UpdatedLagrangian(), mpm.Explicit(), None),
+        ("midpoint, updated", mpm.UpdatedLagrangian(), mpm.ImplicitMidpoint(), 0.01),
+        ("midpoint, total", mpm.TotalLagrangian(), mpm.ImplicitMidpoint(), 0.01),
+    )
+    for cells in (8, 16):
+        for words, description, method, dt in runs if cells == 8 else runs[1:]:
+            for name, volume in VOLUMES.items():
+                found = swing(cells, volume, description, method, dt)
+                worst = [found[part].max(axis=0) for part in (slice(0, 4), slice(12, 16))]
+                print(
+                    f"swing {cells:3} cells, {words}, {name:11}: "
+                    + "; ".join(
+                        f"period {number}: displacement {e:.3f}, roughness of p {p:.3f}, of J {J:.2e}"
+                        for number, (e, p, J) in zip((1, 4), worst, strict=True)
+                    ),
+                    flush=True,
+                )
+
+
 def main(quick: bool) -> None:
     """Print the table, and draw the pressures."""
     sizes = (8, 16) if quick else (16, 32)
@@ -165,9 +225,9 @@ def main(quick: bool) -> None:
                     found = measured(problem, cells, nu, volume)
                     drawn[problem, cells, nu, name] = found
                     print(
-                        f"{problem} {cells:3} cells, nu {nu:6}, {name:11}: displacement / reference {found['ratio']:.4f}, "
-                        f"roughness of p {found['pressure']:.2e}, of J {found['J']:.2e}, {found['iterations']:6} "
-                        f"iterations{'' if found['converged'] else ' (not converged)'}",
+                        f"{problem} {cells:3} cells, nu {nu:6}, {name:11}: displacement / reference "
+                        f"{found['ratio']:.4f}, roughness of p {found['pressure']:.2e}, of J {found['J']:.2e}, "
+                        f"{found['iterations']:6} iterations{'' if found['converged'] else ' (not converged)'}",
                         flush=True,
                     )
     if quick:
@@ -189,5 +249,7 @@ if __name__ == "__main__":
         for nu in CENTRE:
             one, two = reference(32, nu), reference(64, nu)
             print(f"nu {nu}: {one:.4f}, {two:.4f}, extrapolated {2 * two - one:.4f}", flush=True)
+    elif "--swing" in sys.argv:
+        swings()
     else:
         main("--quick" in sys.argv)

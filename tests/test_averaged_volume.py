@@ -55,15 +55,18 @@ def test_a_projected_hessian_is_positive_semidefinite_and_right_without_stress()
     scene, particles = stretched(2, LAWS["fixed_corotated"])
     still = eqx.tree_at(lambda p: p.deformations, particles, (jnp.broadcast_to(jnp.eye(2), (particles.count, 2, 2)),))
     w = jnp.asarray(np.random.default_rng(1).normal(size=(scene.grid.size, 2)))
-    for state, definite in ((particles, True), (still, False)):
+
+    @eqx.filter_jit
+    def action(hessian, state, vectors):
         potential = particles_to_grid(scene, state, 0.0, 1e-3, scene.stencil(state)).potential
-        whole, projected = (mpm.AnalyticHessian(projected=p).at_step_start(potential).precomputed() for p in (0 > 1, 0 < 1))
-        if definite:
-            columns = jax.jit(jax.vmap(lambda e: projected(e.reshape(w.shape)).reshape(-1)))(jnp.eye(w.size))
-            values = np.linalg.eigvalsh(np.asarray(columns))
-            assert values.min() > -1e-12 * values.max()
-        else:
-            assert np.abs(whole(w) - projected(w)).max() < 1e-12 * np.abs(whole(w)).max()
+        return jax.vmap(hessian.at_step_start(potential).precomputed())(vectors.reshape(-1, *w.shape))
+
+    projected = mpm.AnalyticHessian(projected=True)
+    columns = action(projected, particles, jnp.eye(w.size)).reshape(w.size, -1)
+    values = np.linalg.eigvalsh(np.asarray(columns))
+    assert values.min() > -1e-12 * values.max()
+    one, other = (action(hessian, still, w) for hessian in (projected, mpm.AnalyticHessian()))
+    np.testing.assert_allclose(one, other, atol=1e-12 * np.abs(other).max())
 
 
 @pytest.mark.parametrize("d", [2, *thorough(3)])
@@ -80,7 +83,8 @@ def test_the_average_keeps_constants_and_the_volume_and_mirrors_a_body(d):
     )
     whole = eqx.tree_at(lambda s: s.boundary, scene, ())
     (doubled,) = whole.material_points(mpm.prepare(whole, both))
-    np.testing.assert_allclose(doubled.average(jnp.concatenate([J, J])), jnp.concatenate([points.average(J)] * 2), rtol=1e-12)
+    own = points.average(J)
+    np.testing.assert_allclose(doubled.average(jnp.concatenate([J, J])), jnp.concatenate([own, own]), rtol=1e-12)
 
 
 @pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
@@ -115,10 +119,14 @@ def test_momentum_is_kept_to_rounding(method, d):
     scene, before, after = flying(1e4, *method, d=d, steps=10)
     momentum = mpm.momentum(before)
     np.testing.assert_allclose(mpm.momentum(after), momentum, rtol=1e-12, atol=1e-12 * np.abs(momentum).max())
-    spins = [np.cross(p.x, p.mass[:, None] * p.v).sum(axis=0) for p in (before, after)]
-    moment = [float(((p.mass * scene.stencil(p).moment[0])[:, None, None] * (p.C - jnp.swapaxes(p.C, 1, 2))).sum(axis=0)[1, 0]) for p in (before, after)]
-    total = [np.atleast_1d(spin)[-1] + m for spin, m in zip(spins, moment, strict=True)]
-    np.testing.assert_allclose(total[1], total[0], rtol=1e-9)
+
+    def spin(p):
+        """Σ m (x v_y − y v_x) with the part of the affine velocity, by the diagonal moment D."""
+        D = scene.stencil(p).moment
+        own = D[0] * p.C[:, 1, 0] - D[1] * p.C[:, 0, 1]
+        return (p.mass * (p.x[:, 0] * p.v[:, 1] - p.x[:, 1] * p.v[:, 0] + own)).sum()
+
+    np.testing.assert_allclose(spin(after), spin(before), rtol=1e-11)
 
 
 @pytest.mark.parametrize("description", **ids(DESCRIPTIONS, "updated"))
@@ -146,7 +154,7 @@ def test_what_cannot_be_averaged_is_refused():
     with pytest.raises(ValueError, match="from 0"):
         mpm.AveragedVolume(materials=())
     chosen = mpm.Scene(grid, (rubber, sand), volume=mpm.AveragedVolume(materials=[0]))
-    assert chosen.volume.covers(0) and not chosen.volume.covers(1)
+    assert [chosen.volume.covers(number) for number in (0, 1)] == [True, False]
 
 
 def test_only_the_materials_that_are_named_are_averaged():
@@ -171,26 +179,3 @@ def test_turned_out_particles_are_named():
     F = particles.deformations[0].at[3].set(jnp.diag(jnp.array([-1.0, 1.0])))
     with pytest.raises(ValueError, match="particle 3"):
         mpm.prepare(scene, eqx.tree_at(lambda p: p.deformations, particles, (F,)))
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("nu", [0.49, 0.4999])
-def test_cooks_membrane_deflects_as_taylor_hood_elements_say(nu):
-    """And its pressures vary from particle to particle by a sixth or less of what they do without averages."""
-    import nearly_incompressible as problem
-
-    own, averaged = (problem.measured("cook", 16, nu, volume) for volume in (None, AVERAGED))
-    assert own["converged"] and averaged["converged"]
-    assert abs(averaged["ratio"] - 1) < 0.02
-    if nu > 0.499:
-        assert own["ratio"] < 0.94
-        assert averaged["pressure"] < own["pressure"] / 6
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["cook", "tube"])
-@pytest.mark.parametrize("nu", [0.49, 0.4999])
-def test_both_problems_are_right_to_one_per_cent_at_32_cells(kind, nu):
-    import nearly_incompressible as problem
-
-    assert abs(problem.measured(kind, 32, nu, AVERAGED)["ratio"] - 1) < 0.01

@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from mpmjax import linalg as la

@@ -150,8 +150,9 @@ class Scene(eqx.Module):
         refused = [law.title() for law in covered if not law.allows_averaged_volume]
         require(
             not refused,
-            "AveragedVolume is for elastic laws of F: what yields returns to a volume of its own, and a fluid has nothing "
-            f"else that resists. Name the other materials, AveragedVolume(materials=(0,)), without {', '.join(refused)}.",
+            "AveragedVolume is for elastic laws of F: what yields returns to a volume of its own, and a fluid has "
+            "nothing else that resists. Name the other materials, AveragedVolume(materials=(0,)), without "
+            f"{', '.join(refused)}.",
         )
 
     @property
