@@ -115,10 +115,11 @@ def flying(modulus, method, dt, d=2, steps=40, description=DESCRIPTIONS["updated
 
 @pytest.mark.parametrize("method", **ids(METHODS, "explicit"))
 @pytest.mark.parametrize("d", [2, *thorough(3)])
-def test_momentum_is_kept_to_rounding(method, d):
+def test_momentum_is_kept_to_rounding_or_to_what_the_solve_leaves(method, d):
     scene, before, after = flying(1e4, *method, d=d, steps=10)
     momentum = mpm.momentum(before)
-    np.testing.assert_allclose(mpm.momentum(after), momentum, rtol=1e-12, atol=1e-12 * np.abs(momentum).max())
+    missed = 1e-12 if method is METHODS["explicit"] else 1e-8  # the solve's tolerance: its residual is an impulse
+    np.testing.assert_allclose(mpm.momentum(after), momentum, rtol=missed)
 
     def spin(p):
         """Σ m (x v_y − y v_x) with the part of the affine velocity, by the diagonal moment D."""
