@@ -135,6 +135,7 @@ def numpy_step(scene: mpm.Scene, particles: mpm.Particles, dt: float, beta: floa
         after[keep] = np.linalg.solve(A[np.ix_(keep, keep)], (b - A @ after)[keep])
         after = after.reshape(n, d)
     after = np.where(free, after, held)
+    before = np.where(free, before, held)  # a particle takes no change from what a boundary holds
 
     # grid to particles
     moved = w @ after

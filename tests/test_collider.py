@@ -213,7 +213,7 @@ def obstacles(friction, d=2):
 def judged(contact, step, method):
     """The gaps that the springs of a contact feel, and nodes of which nothing is held."""
     nodes = step.nodes
-    nothing_held = ConstrainedNodes(nodes, (), Mirror(()), nodes, method.mean_displacement(nodes, step.update.motion))
+    nothing_held = ConstrainedNodes(nodes, (), Mirror(()), nodes, method.mean_displacement(nodes, step.update.solved))
     return np.asarray(contact.gap_felt(nothing_held)), nothing_held
 
 
@@ -407,10 +407,10 @@ def test_friction_of_a_wall_leaves_alone_what_others_hold(floor):
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", ["explicit", "semi_implicit"])
 def test_a_collider_lets_go_freely(name):
-    """A block that a tilted floor does not hold leaves as if there were none."""
+    """A block whose faces a tilted floor just does not touch leaves as if there were none."""
     grid, block = landing()
     block = eqx.tree_at(lambda b: b.v, block, jnp.broadcast_to(jnp.array([0.4, 0.3]), block.v.shape))
-    floor = mpm.SeparatingCollider(mpm.HalfSpace((0.1, 0.1), (4.0, 3.0)), friction=0.5)
+    floor = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (4.0, 3.0)), friction=0.5)
     scene = eqx.tree_at(lambda s: s.gravity, scene_of(grid, floor), (0.8, 0.6))
     run = {"steps": 5, "dt": 0.2 * explicit_limit(scene), "method": METHODS[name]}
     with_floor = mpm.rollout(scene, block, **run)
@@ -422,7 +422,8 @@ def test_a_collider_lets_go_freely(name):
 @pytest.mark.thorough
 def test_a_turning_body_drags_what_it_touches_and_is_braked():
     """A cylinder under a block, turning anticlockwise: friction drives the block to the left; the torque on the body is
-    clockwise and that of μ times the load at arms between the surface and a spacing below it, where the nodes are."""
+    clockwise and that of μ times the load at arms between the surface and a particle's width above it, since friction
+    acts at the particles' centres."""
     grid = mpm.Grid((14, 12), DX, origin=(-7, -6))
     block = mpm.fill(mpm.Box((-0.4, 0.0), (0.4, 0.2)), grid, density=1e3)
     wheel = mpm.Ball((0.0, -0.45), 0.46)
@@ -439,7 +440,7 @@ def test_a_turning_body_drags_what_it_touches_and_is_braked():
     assert drag > 0
     assert load < 0
     assert torque < 0
-    assert 0.36 < -torque / (0.3 * -load) < 0.46
+    assert 0.46 < -torque / (0.3 * -load) < 0.51
 
 
 @pytest.mark.slow
@@ -569,7 +570,7 @@ def test_derivatives_by_a_colliders_motion_shape_and_friction(name, kind):
     at = jnp.array([0.31, 0.23, 2.0, 0.0, 0.2, 0.0])
     value, gradient = jax.jit(outcome), np.asarray(jax.jit(jax.grad(outcome))(at))
     acts = {"separating": [0, 1, 2, 4, 5], "slip": [0, 1, 2, 5], "sticky": [0, 1, 2]}[kind]
-    h = 1e-5
+    h = 1e-6 if kind == "separating" else 1e-5  # within which the active set stays
     difference = np.array([float(value(at + h * e) - value(at - h * e)) / (2 * h) for e in jnp.eye(6)])
     assert np.isfinite(gradient).all()
     assert (np.abs(difference[acts]) > 1e-8).all(), difference
@@ -578,6 +579,6 @@ def test_derivatives_by_a_colliders_motion_shape_and_friction(name, kind):
     t = jnp.zeros(6).at[jnp.array(acts)].set(np.random.default_rng(1).normal(size=len(acts)))
     slope = float(gradient @ t)
     assert abs(float(jax.jit(lambda q: jax.jvp(outcome, (q,), (t,))[1])(at)) / slope - 1) < 1e-12
-    lengths = np.array([1e-4, 3e-5, 1e-5])
+    lengths = np.array([1e-6, 5e-7, 2.5e-7]) if kind == "separating" else np.array([1e-4, 3e-5, 1e-5])
     remainders = [abs(float(value(at + h * t) - value(at)) - h * slope) for h in lengths]
     assert abs(np.polyfit(np.log(lengths), np.log(remainders), 1)[0] - 2) < 0.1

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import ALL_LAWS
 from helpers import assert_close, cloud, ids, thorough
 
 import mpmjax as mpm
@@ -115,6 +116,27 @@ def test_the_force_of_springs_is_that_of_their_energy_and_acts_at_the_face(d):
     assert_close(moment - moment.T + 1, np.ones((d, d)), 1e-12)
 
 
+A_FIELD = {"field": mpm.NeoHookean(jnp.linspace(1e4, 2e4, 36), 0.3)}
+
+
+@pytest.mark.parametrize("law", **ids(ALL_LAWS | A_FIELD, ("herschel_bulkley", "fluid", "field")))
+def test_whatever_the_law_faces_are_pushed_by_its_wave_modulus(law):
+    """λ + 2μ, or that of J, of every law at rest, also where its parameters or its history differ among particles."""
+    grid, body = block(2, at=-0.05)
+    scene = mpm.Scene(grid, law, boundary=floor(0.0))
+    particles = mpm.prepare(scene, body)
+    (points,) = scene.material_points(particles)
+    h, n = 1e-5, particles.count
+    F = jnp.broadcast_to(jnp.eye(2)[..., None], (2, 2, n))
+    F, pressed = (points.law.kinematics.of(F - e * jnp.zeros_like(F).at[1, 1].set(1.0)) for e in (0.0, h))
+    slope = (points.law.stress(F) - points.law.stress(pressed)) / h
+    modulus = points.law.wave_modulus(F)
+    assert_close(np.broadcast_to(modulus, n), slope if slope.ndim == 1 else slope[1, 1], 1e-3)
+    after, _ = mpm.step(scene, particles, 0.0, 1e-5)
+    k, gap = 2 * np.broadcast_to(modulus, n) * 0.05 / 0.1, 0.005 * np.asarray(body.x[:, 1] < 0.03)
+    assert_close((body.mass * after.v[:, 1]).sum(), 1e-5 * (k * gap).sum(), 1e-10)
+
+
 EACH = pytest.mark.parametrize("method", **ids(METHODS, "explicit"))
 
 
@@ -165,12 +187,12 @@ def test_a_wall_makes_no_energy(method):
     step's velocity, half a step behind, counts twice."""
     grid, body = block(1, gap=0.3, speed=0.05)
     scene = mpm.Scene(grid, LAW, boundary=floor(0.0, 1))
-    dt = 0.02 if isinstance(method, mpm.Explicit) else 0.1
+    dt = {mpm.Explicit: 0.02, mpm.TRBDF2: 0.05}.get(type(method), 0.1)  # TR-BDF2 makes some where it resolves nothing
     run = mpm.simulate(scene, body, t1=2.0, dt=dt, method=method, observe=lambda s, p: mpm.energy(s, p).total)
     energy = np.asarray(run.observed)
     assert energy.max() < energy[0] * (1 + (5e-3 if isinstance(method, mpm.Explicit) else 1e-9))
     assert int(run.statistics.violations) == 0
-    assert float(run.final.v.mean()) > 0.02  # it came back
+    assert float(run.final.v.mean()) > 0.01  # it came back
 
 
 def mirrored(at, d=2):

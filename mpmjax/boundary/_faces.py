@@ -11,7 +11,7 @@ EXPLICIT_STIFFNESS = 2.0
 """Stiffness of contact in explicit steps, in the material's wave modulus over a spacing: that of half a spacing of the
 material. More would shorten the longest stable step."""
 IMPLICIT_STIFFNESS = 20.0
-"""The same in implicit steps."""
+"""Stiffness of contact in implicit steps, in the material's wave modulus over a spacing."""
 
 
 class FaceShape(eqx.Module):
@@ -48,11 +48,16 @@ class Faces(eqx.Module):
 
     x: ParticleVector
     """Positions at the start of the step [m], shape (p, d)."""
+    v: ParticleVector
+    """Velocities at the start of the step [m/s], shape (p, d)."""
     shapes: tuple[FaceShape, ...]
     """Their shapes, one for each material."""
     stiffness: Float[Array, "p"]
-    """Stiffness of contact k_p = A α M/dx [N/m], shape (p,), on a face of area A = V0/l0, with M the wave modulus of
-    the law at rest and α the stiffness of explicit or implicit steps."""
+    """Stiffness of contact of a face at rest A α M/dx [N/m], shape (p,), on its area A = V0/l0, with M the wave modulus
+    of the law at rest and α the stiffness of explicit or implicit steps."""
+    inertia: Float[Array, "p"]
+    """A α ρ0/dx [kg/m²], shape (p,): times the square of the velocity of approach, the stiffness of contact that a
+    shock adds."""
     stencil: Stencil
     spacing: Scalar
     """dx [m]."""
@@ -70,6 +75,10 @@ class Faces(eqx.Module):
             return 1.0
         at = jnp.asarray(self.force_at)
         return jnp.where(at > 0, at, 1)
+
+    def stiffness_at(self, approach: Float[Array, "p"]) -> Float[Array, "p"]:
+        """k_p = A α (M + ρ0 max(w, 0)²)/dx [N/m], shape (p,), at the velocity of approach w [m/s]."""
+        return self.stiffness + self.inertia * jnp.maximum(approach, 0) ** 2
 
     def width(self, n: Float[Array, "d p"]) -> tuple[Float[Array, "p"], Matrix]:
         """Half-widths h [m] along unit vectors n, shape (p,), and B [m], shape (d, d, p), with δh = B : ∇u."""

@@ -18,7 +18,10 @@ def friction_across(held: ConstrainedNodes, axis: int, limit: NodeScalar, v: Nod
     mass, normal = held.mass, held.normal
     tangent = jnp.arange(v.shape[1]) != axis
     slip = jnp.where(tangent, v, 0)
-    slip = slip if normal is None else slip - normal * (normal * slip).sum(axis=1, keepdims=True)
+    if normal is not None:  # what a collider holds along it, without the part that is not along the wall
+        along = jnp.where(tangent, normal, 0)
+        square = (along**2).sum(axis=1, keepdims=True)
+        slip = slip - along * (along * slip).sum(axis=1, keepdims=True) / jnp.where(square == 0, 1, square)
     square = (slip**2).sum(axis=1)
     speed = jnp.sqrt(jnp.where(square == 0, 1, square))
     share = jnp.minimum(limit / jnp.where(mass == 0, 1, mass) / speed, 1)

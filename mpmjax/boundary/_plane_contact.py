@@ -63,8 +63,8 @@ class PlaneContact(AbstractContact):
         """The momentum with which each column leaves the plane [kg m/s]: its weights times what its velocity lacks of
         the mirror's."""
         lacking = (v - self.image.vector(v))[:, self.image.axis]
-        columns = self._tied(held, self.inward * self.image.column(self._weight(held.unheld.mass) * lacking))
-        return columns if self.shut is None else jnp.where(self.shut, columns, 0)
+        columns = self.inward * self.image.column(self._weight(held.unheld.mass) * lacking)
+        return self._tied(held, columns if self.shut is None else jnp.where(self.shut, columns, 0))
 
     def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> NodeScalar:
         """The normal impulse of each column [kg m/s]."""

@@ -38,10 +38,13 @@ class SurfaceContact(AbstractContact):
     of the step, in an explicit step with that at its start. It is held if that gap is below zero, so that the spring
     pushes and the two conditions exclude each other.
 
+    The stiffness of a face that comes with the velocity w is that of M + ρ0 w² in the place of the wave modulus M, as
+    in a shock: a particle by itself, of half a spacing, is stopped within half a spacing at any speed.
+
     The energy ½ k_p min(g_p, 0)² is convex in g_p. So a force by the gap at the end of the step takes at least as much
-    energy as the spring keeps, −k_p g¹ (g¹ − g⁰) ≤ ½ k_p (min(g⁰, 0)² − min(g¹, 0)²), at any stiffness and step. An
-    integrator that evaluates forces at θ of the step's displacement gets the force by springs of gap θ g⁰ and stiffness
-    k_p/θ.
+    energy as the spring keeps, −k_p g¹ (g¹ − g⁰) ≤ ½ k_p (min(g⁰, 0)² − min(g¹, 0)²), at any step, as long as k_p
+    does not grow. An integrator that evaluates forces at θ of the step's displacement gets the force by springs of gap
+    θ g⁰ and stiffness k_p/θ.
 
     Friction is at most μ times the push of the particles around each node.
     """
@@ -53,6 +56,8 @@ class SurfaceContact(AbstractContact):
     """n_p [-], shape (d, p)."""
     widening: Array
     """B_p [m], shape (d, d, p)."""
+    stiffness: Float[Array, "p"]
+    """k_p at the velocities of the start of the step [N/m], shape (p,) (see `Faces.stiffness_at`)."""
     velocity: Float[Array, "d p"] | None
     """Velocity of the surface [m/s], shape (d, p); None at rest."""
     faces: Faces
@@ -82,7 +87,7 @@ class SurfaceContact(AbstractContact):
         held, share = active & self.near, self.faces.share
         return Springs(
             gap=share * jnp.where(held, self.gap, 0),
-            stiffness=jnp.where(held, self.faces.stiffness / share, 0),
+            stiffness=jnp.where(held, self.stiffness / share, 0),
             normal=self.normal,
             widening=self.widening,
         )
@@ -103,7 +108,7 @@ class SurfaceContact(AbstractContact):
     def push(self, held: ConstrainedNodes, active: Array) -> Float[Array, "p"]:
         """The normal impulse on each particle in the step [kg m/s], shape (p,)."""
         shut = active & self.near
-        return jnp.where(shut, -self.faces.dt * self.faces.stiffness * jnp.where(shut, self.gap_felt(held), 0), 0)
+        return jnp.where(shut, -self.faces.dt * self.stiffness * jnp.where(shut, self.gap_felt(held), 0), 0)
 
     def likely_held(self, held: ConstrainedNodes, v: NodeVector) -> Bool[Array, "p"]:
         del v
@@ -116,11 +121,11 @@ class SurfaceContact(AbstractContact):
 
     def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> Float[Array, "p"]:
         del residual
-        return -self.faces.dt * self.faces.stiffness * self.gap_felt(held)
+        return -self.faces.dt * self.stiffness * self.gap_felt(held)
 
     def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
         """The rounding of a velocity [m/s], and what that makes of a push [kg m/s]."""
-        return noise, noise * self.faces.stiffness * self.faces.dt**2
+        return noise, noise * self.stiffness * self.faces.dt**2
 
     def reached(self, active: Array, shape: tuple[int, ...]) -> Bool[Array, "n d"]:
         """All components of the nodes around the particles held."""
@@ -157,10 +162,12 @@ def surface_contact(surface: Surface, faces: Faces, body: int | None = None) -> 
         body: the number of the collider that it belongs to; None if it belongs to none.
     """
     width, widening = faces.width(surface.normal)
+    relative = faces.v.T if surface.velocity is None else faces.v.T - surface.velocity
     return SurfaceContact(
         gap=surface.distance - width,
         normal=surface.normal,
         widening=widening,
+        stiffness=faces.stiffness_at(-(surface.normal * relative).sum(axis=0)),
         velocity=surface.velocity,
         faces=faces,
         coefficient=surface.friction,

@@ -56,16 +56,26 @@ class AbstractBox(AbstractBoundary):
     def passed(
         self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
     ) -> Bool[Array, "p"]:
-        """Which particles passed a wall: those deeper than the place beyond which no node of their stencil is free."""
+        """Which particles passed a wall: those deeper than `deepest`, among others (`crossed`)."""
         start, end = start - self.displacement(t), end - self.displacement(t + dt)
 
         def through(wall: Array, start: Array, end: Array) -> Array:
-            first_free = jnp.floor(wall / spacing + ON_THE_WALL) + 1
-            return crossed(start, end, wall, (first_free - reach - ON_THE_WALL) * spacing, spacing)
+            return crossed(start, end, wall, self.deepest(wall, spacing, reach), spacing)
 
         below, above = jnp.asarray(self.lower, end.dtype), jnp.asarray(self.upper, end.dtype)
         by_axis = zip(below, above, start.T, end.T, strict=True)
         return reduce(jnp.logical_or, [through(lo, a, b) | through(-hi, -a, -b) for lo, hi, a, b in by_axis])
+
+    def deepest(self, wall: Array, spacing: Scalar, reach: float) -> Array:
+        """How deep a lower wall lets a particle come [m]: to where no node of its stencil is free.
+
+        Args:
+            wall: position of the wall [m].
+            spacing: dx [m].
+            reach: half the kernel's width in spacings.
+        """
+        first_free = jnp.floor(wall / spacing + ON_THE_WALL) + 1
+        return (first_free - reach - ON_THE_WALL) * spacing
 
     def walls(self) -> tuple[Wall, ...]:
         return tuple(
@@ -179,6 +189,11 @@ class SeparatingBox(AbstractBox):
             inward = jnp.zeros_like(x.T).at[axis].set(jnp.where(lower, 1, -1).astype(x.dtype))
             found.append(Surface(jnp.where(lower, above, below), inward, self.friction, axis=axis))
         return tuple(found)
+
+    def deepest(self, wall: Array, spacing: Scalar, reach: float) -> Array:
+        """A spacing beyond the wall: what is deeper is not pushed."""
+        del reach
+        return wall - spacing
 
     def check(self, grid: Grid, *, total: bool) -> None:
         refuse_contact(total)

@@ -59,7 +59,7 @@ class SeparateSums(eqx.Module):
         return nodes.inertial_velocity() + nodes.dt * nodes.per_mass(self.force)
 
     def with_force(self, nodes: "Nodes", force: NodeVector) -> "SeparateSums":
-        """The same, with a force [N] more."""
+        """The sums with a force on the nodes added [N], shape (n, d)."""
         del nodes
         return SeparateSums(self.velocity, self.force + force, self.viscous_force)
 
@@ -100,7 +100,7 @@ class JoinedSum(eqx.Module):
         return self.velocity_with_force + nodes.dt * nodes.acceleration
 
     def with_force(self, nodes: "Nodes", force: NodeVector) -> "JoinedSum":
-        """The same, with a force [N] more."""
+        """The sums with a force on the nodes added [N], shape (n, d)."""
         return JoinedSum(self.velocity_with_force + nodes.dt * nodes.per_mass(force))
 
     def folded(self, velocity: Fold, force: Fold) -> "JoinedSum":

@@ -28,18 +28,21 @@ def faces_of(
     """
     if not any(boundary.pushes or boundary.sees_faces for boundary in scene.boundary):
         return None
-    shapes, stiffness, explicit = [], [], force_at is None
+    shapes, stiffness, inertia, explicit = [], [], [], force_at is None
     factor = EXPLICIT_STIFFNESS if explicit else IMPLICIT_STIFFNESS
     for law, points in zip(scene.laws, materials, strict=True):
         side = points.volume ** (1 / particles.dim)
         shape = points.deformation if law.allows_total else points.volume_ratio()
         shapes.append(FaceShape(side / 2, shape, points.rows, points.total))
-        modulus = factor * points.law.wave_modulus(particles.dim, points.volume.dtype)
-        stiffness.append(modulus * points.volume / (side * scene.grid.spacing))
+        over = factor / (side * scene.grid.spacing)
+        stiffness.append(over * points.law.wave_modulus(points.deformation) * points.volume)
+        inertia.append(over * particles.mass[slice(*points.rows)])
     return Faces(
         x=particles.x,
+        v=particles.v,
         shapes=tuple(shapes),
         stiffness=jnp.concatenate(stiffness),
+        inertia=jnp.concatenate(inertia),
         stencil=stencil,
         spacing=jnp.asarray(scene.grid.spacing),
         dt=jnp.asarray(dt),
