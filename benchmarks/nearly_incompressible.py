@@ -3,6 +3,7 @@
 python benchmarks/nearly_incompressible.py              # measures, and draws docs/nearly_incompressible.png
 python benchmarks/nearly_incompressible.py --quick      # 8 and 16 cells, no picture
 python benchmarks/nearly_incompressible.py --swing      # a block that swings, over time
+python benchmarks/nearly_incompressible.py --solves     # iterations and seconds of its preconditioners
 python benchmarks/nearly_incompressible.py --reference  # Cook's membrane by Taylor-Hood elements (needs scikit-fem)
 
 Both are plane strain at small strains, in the total description with particles fitted to the body, three along a cell's
@@ -10,6 +11,7 @@ edge. One linear solve with a step so long that inertia does not count gives the
 """
 
 import sys
+import time
 from pathlib import Path
 
 import jax
@@ -26,6 +28,7 @@ CENTRE = {0.3: 21.9460, 0.49: 18.7378, 0.499: 18.5336, 0.4999: 18.5129}
 extrapolation of 32 and 64 elements a side."""
 INNER, OUTER = 0.5, 1.0
 Volume = mpm.AveragedVolume | None
+PRECONDITIONERS = {"diagonal": mpm.DiagonalPreconditioner(), "volume": mpm.VolumePreconditioner()}
 VOLUMES = {"own volumes": None, "averaged": mpm.AveragedVolume()}
 
 
@@ -214,6 +217,32 @@ def swings() -> None:
                 )
 
 
+def timed(scene: mpm.Scene, particles: mpm.Particles, dt: float, rtol: float, choice: str) -> tuple[int, float]:
+    """Iterations of one step's solve and the least processor seconds of three steps, compiled before; −1 if it fails."""
+    solver = mpm.ConjugateResidual(rtol=rtol, max_steps=100_000)
+    method = mpm.SemiImplicit(solver=solver, preconditioner=PRECONDITIONERS[choice])
+    step = jax.jit(lambda p: mpm.step(scene, p, 0.0, dt, method=method))
+    seconds = []
+    for _ in range(4):
+        start = time.process_time()
+        _, info = jax.block_until_ready(step(particles))
+        seconds.append(time.process_time() - start)
+    return int(info.solve.iterations) if bool(info.solve.converged) else -1, min(seconds[1:])
+
+
+def solves(sizes: tuple[int, ...]) -> None:
+    """Print what solves take with each preconditioner: of Cook's membrane to rest, to 1e-9, and in a step of five times
+    dx/c_s, to 1e-8."""
+    for cells in sizes:
+        for nu in (0.3, 0.49, 0.499, 0.4999):
+            scene, particles = cook(cells, nu, VOLUMES["averaged"])
+            wave = 5 * float(scene.grid.spacing) * (2 * (1 + nu)) ** 0.5
+            for words, dt, rtol in (("to rest", 1e4, 1e-9), ("a step ", wave, 1e-8)):
+                found = [(name, *timed(scene, particles, dt, rtol, name)) for name in PRECONDITIONERS]
+                told = ", ".join(f"{name} {count:5} iterations {1e3 * s:8.1f} ms" for name, count, s in found)
+                print(f"cook {cells:3} cells, nu {nu:6}, {words}: {told}", flush=True)
+
+
 def main(quick: bool) -> None:
     """Print the table, and draw the pressures."""
     sizes = (8, 16) if quick else (16, 32)
@@ -249,6 +278,8 @@ if __name__ == "__main__":
         for nu in CENTRE:
             one, two = reference(32, nu), reference(64, nu)
             print(f"nu {nu}: {one:.4f}, {two:.4f}, extrapolated {2 * two - one:.4f}", flush=True)
+    elif "--solves" in sys.argv:
+        solves((16,) if "--quick" in sys.argv else (32, 16))
     elif "--swing" in sys.argv:
         swings()
     else:

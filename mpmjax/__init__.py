@@ -128,6 +128,7 @@ from mpmjax.implicit import (
     MassPreconditioner,
     Newton,
     SolveInfo,
+    VolumePreconditioner,
     no_solve,
 )
 from mpmjax.io import load, record, register, save
@@ -299,6 +300,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "ConjugateResidual",
     "AbstractPreconditioner",
     "DiagonalPreconditioner",
+    "VolumePreconditioner",
     "MassPreconditioner",
     "Guess",
     "stable_dt",

@@ -35,6 +35,7 @@ from mpmjax.implicit import (
     Linearised,
     MassPreconditioner,
     Newton,
+    VolumePreconditioner,
 )
 from mpmjax.material import (
     CamClay,
@@ -80,6 +81,7 @@ CLASSES: tuple[type, ...] = (
     *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
     AveragedVolume,
     *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),
-    *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual, DiagonalPreconditioner, MassPreconditioner),
+    *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual),
+    *(DiagonalPreconditioner, MassPreconditioner, VolumePreconditioner),
 )
 """The package's own classes that files can hold."""

@@ -66,6 +66,10 @@ class VolumeAverage(eqx.Module):
     """1/Σ_q N_i V0 [1/m^d] of each node, shape (n,); zero where there is no particle."""
     mirror: Mirror
     """The mirror images of the scene's symmetry planes."""
+    shape: tuple[int, ...] = eqx.field(static=True)
+    """Number of nodes along each axis."""
+    periodic: tuple[bool, ...] = eqx.field(static=True)
+    """Whether the last node of an axis neighbours its first."""
 
     def __call__(self, field: Array) -> Array:
         """S V0 f, shape (q,)."""
@@ -101,7 +105,9 @@ def volume_average(grid: Grid, window: Any, x: Array, volume: Array, mirror: Mir
     hats = make_stencil(BSpline(1), SplineGradient(), grid, window, x, affine=False)
     total = _at_nodes(hats, mirror, volume, grid.size)
     some = total > 0
-    return VolumeAverage(hats, volume, jnp.where(some, 1 / jnp.where(some, total, 1), 0), mirror)
+    return VolumeAverage(
+        hats, volume, jnp.where(some, 1 / jnp.where(some, total, 1), 0), mirror, grid.shape, grid.periodic
+    )
 
 
 class AveragedDeformation(eqx.Module):

@@ -13,10 +13,10 @@ from mpmjax.implicit import (
     AbstractSolution,
     AnalyticHessian,
     ConjugateResidual,
-    DiagonalPreconditioner,
     Guess,
     Linearised,
     SolveInfo,
+    VolumePreconditioner,
 )
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
@@ -43,7 +43,8 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
     Args:
         solution: `Linearised()` for one linear solve, `Newton()`, or one of your own.
         hessian: the Hessian H of the elastic energy. Default: by the analytic stress differential.
-        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH.
+        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH, and with averaged
+            volumes `VolumePreconditioner`.
         adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. Its tolerance
             bounds that of the gradient.
         guess: where the solve starts. Default: the velocity of the nodes v^n.
@@ -51,7 +52,7 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
 
     solution: AbstractSolution = Linearised()
     hessian: AbstractHessian = AnalyticHessian()
-    preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
+    preconditioner: AbstractPreconditioner = VolumePreconditioner()
     adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     body_force_at: ClassVar[float] = 0.5
