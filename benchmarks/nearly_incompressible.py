@@ -218,7 +218,7 @@ def swings() -> None:
 
 
 def timed(scene: mpm.Scene, particles: mpm.Particles, dt: float, rtol: float, choice: str) -> tuple[int, float]:
-    """Iterations of one step's solve and the least processor seconds of three steps, compiled before; −1 if it fails."""
+    """Iterations of a step's solve and the least processor seconds of three steps, compiled before; −1 if it fails."""
     solver = mpm.ConjugateResidual(rtol=rtol, max_steps=100_000)
     method = mpm.SemiImplicit(solver=solver, preconditioner=PRECONDITIONERS[choice])
     step = jax.jit(lambda p: mpm.step(scene, p, 0.0, dt, method=method))

@@ -27,21 +27,24 @@ _STIFFEST = 0.3  # of C s, times √ε: where S⁻¹ is known to ε C s, P⁻¹ 
 class VolumePreconditioner(AbstractPreconditioner):
     """The diagonal of M + χH without the stiffness of averaged volumes, and that stiffness as a whole:
 
-        W = P + Bᵀ C B,    W⁻¹ = P⁻¹ − P⁻¹Bᵀ S⁻¹ B P⁻¹,    S = C⁻¹ + B P⁻¹ Bᵀ.
+        W = P + Bᵀ C B,    W⁻¹ = P⁻¹ − P⁻¹Bᵀ S⁻¹ B P⁻¹,    S = C⁻¹ + B P⁻¹ Bᵀ
 
-    Row i of B is the change of volume Σ_p N_i(x_p) V0_p δJ_p by the nodes' displacement, and C, diagonal, its stiffness
-    χ Σ_p N_i k_p/(Σ_p N_i V0_p)² [kg/m^2d] (the lumped one). W and M + χH then have the same large eigenvalues, and the
-    number of iterations does not grow as ν goes to ½: eigenvalues of W⁻¹(M + χH) lie between those of its first parts
-    and of its second ones. S, of one number a node of the window, is factored once a solve, as a band matrix. Without
-    averaged volumes it is `DiagonalPreconditioner`.
+    (Woodbury's identity). (B u)_i = Σ_p N_i(x_p) V0_p δJ_p is the change of volume at a node, and C the diagonal of its
+    lumped stiffness χ Σ_p N_i k_p/(Σ_p N_i V0_p)² [kg/m^2d], with N and k as in `AveragedVolume` and its Hessian. The
+    eigenvalues of W⁻¹(M + χH) then lie between those of the parts without averages and those of the average's stiffness
+    over the lumped one, so that the number of iterations does not grow as ν goes to ½. S, which has one number a node
+    of the window and material, is factored once a solve, as a band matrix. Without averaged volumes it is
+    `DiagonalPreconditioner`.
 
-    *When it breaks*: the factor has (10/3) K b³ operations, with b about four of the window's planes across its
-    longest axis and K a fourth of that axis: a window of 40 x 50 nodes has K b² = 3·10⁵, one of 24³ 3·10⁷. Where it has
+    *When it breaks*: the factor takes (10/3) K b³ operations, with b the nodes of four of the window's planes across
+    its longest axis and K a fourth of its length: it is for two dimensions and for small windows in three. Where it has
     more than `largest` numbers, on periodic grids and with rigid parts, the diagonal is taken. In float32, C is bounded
-    by what the precision can tell, a thousand times the shear. Solvers other than `ConjugateResidual` take the diagonal.
+    by what the precision can tell, about a thousand times shear. Solvers other than `ConjugateResidual` take the
+    diagonal too.
+    *Good values*: for ν above 0.495 (docs/nearly_incompressible.md has iterations and times).
 
     Args:
-        largest: largest number of entries of the factor, 2 K b².
+        largest: largest number of entries of the factor, 2 K b². Default: 2·10⁷, 160 MB in float64.
     """
 
     largest: int = eqx.field(static=True, default=20_000_000)

@@ -13,10 +13,10 @@ from mpmjax.implicit import (
     AbstractSolution,
     AnalyticHessian,
     ConjugateResidual,
+    DiagonalPreconditioner,
     Guess,
     Newton,
     SolveInfo,
-    VolumePreconditioner,
 )
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
@@ -36,8 +36,7 @@ class BackwardEuler(AbstractImplicitIntegrator):
     Args:
         solution: Newton's method, with its linear solver and tolerances.
         hessian: the Hessian H of the elastic energy. Default: by the analytic stress differential.
-        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH, and with averaged
-            volumes `VolumePreconditioner`.
+        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH.
         adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. Its tolerance
             bounds that of the gradient.
         guess: where Newton's method starts. Default: the velocity of the nodes v^n.
@@ -45,7 +44,7 @@ class BackwardEuler(AbstractImplicitIntegrator):
 
     solution: Newton = Newton()
     hessian: AbstractHessian = AnalyticHessian()
-    preconditioner: AbstractPreconditioner = VolumePreconditioner()
+    preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
     adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     keeps_admissible: ClassVar[bool] = True

@@ -13,10 +13,10 @@ from mpmjax.implicit import (
     AbstractSolution,
     AnalyticHessian,
     ConjugateResidual,
+    DiagonalPreconditioner,
     Guess,
     Linearised,
     SolveInfo,
-    VolumePreconditioner,
 )
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
@@ -43,8 +43,7 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
     Args:
         solution: `Linearised()` for one linear solve, `Newton()`, or one of your own.
         hessian: the Hessian H of the elastic energy. Default: by the analytic stress differential.
-        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH, and with averaged
-            volumes `VolumePreconditioner`.
+        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH.
         adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. Its tolerance
             bounds that of the gradient.
         guess: where the solve starts. Default: the velocity of the nodes v^n.
@@ -52,7 +51,7 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
 
     solution: AbstractSolution = Linearised()
     hessian: AbstractHessian = AnalyticHessian()
-    preconditioner: AbstractPreconditioner = VolumePreconditioner()
+    preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
     adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     body_force_at: ClassVar[float] = 0.5

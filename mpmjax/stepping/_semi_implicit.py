@@ -11,11 +11,11 @@ from mpmjax.implicit import (
     AbstractPreconditioner,
     AnalyticHessian,
     ConjugateResidual,
+    DiagonalPreconditioner,
     Guess,
     Linearised,
     LinearProblem,
     SolveInfo,
-    VolumePreconditioner,
     damped,
     require_solver,
     solve,
@@ -45,8 +45,7 @@ class SemiImplicit(AbstractImplicitIntegrator):
         beta: β, from 0 to 1.
         hessian: the Hessian H of the elastic energy. Default: by the analytic stress differential.
         solver: linear solver of the update, any symmetric one of lineax.
-        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH, and with averaged
-            volumes `VolumePreconditioner`.
+        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH.
         adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. Its tolerance
             bounds that of the gradient.
         guess: where the solve starts. Default: the velocity of the nodes v^n.
@@ -55,7 +54,7 @@ class SemiImplicit(AbstractImplicitIntegrator):
     beta: Scalar = 1.0
     hessian: AbstractHessian = AnalyticHessian()
     solver: lx.AbstractLinearSolver = ConjugateResidual()
-    preconditioner: AbstractPreconditioner = VolumePreconditioner()
+    preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
     adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
 

@@ -14,10 +14,10 @@ from mpmjax.implicit import (
     AbstractSolution,
     AnalyticHessian,
     ConjugateResidual,
+    DiagonalPreconditioner,
     Guess,
     Linearised,
     SolveInfo,
-    VolumePreconditioner,
 )
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
@@ -45,8 +45,7 @@ class TRBDF2(AbstractImplicitIntegrator):
         rho: ρ∞, from 0 to 1.
         solution: `Linearised()` for one linear solve a stage, `Newton()`, or one of your own.
         hessian: the Hessian H of the elastic energy. Default: by the analytic stress differential.
-        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH, and with averaged
-            volumes `VolumePreconditioner`.
+        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH.
         adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. Its tolerance
             bounds that of the gradient.
         guess: where the solve of the first stage starts; that of the second starts at the result of the first.
@@ -55,7 +54,7 @@ class TRBDF2(AbstractImplicitIntegrator):
     rho: Scalar = 0.0
     solution: AbstractSolution = Linearised()
     hessian: AbstractHessian = AnalyticHessian()
-    preconditioner: AbstractPreconditioner = VolumePreconditioner()
+    preconditioner: AbstractPreconditioner = DiagonalPreconditioner()
     adjoint_solver: lx.AbstractLinearSolver = ConjugateResidual()
     guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY)
     body_force_at: ClassVar[float] = 0.5
