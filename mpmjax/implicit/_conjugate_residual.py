@@ -112,7 +112,7 @@ class _System(eqx.Module):
     operator: lx.AbstractLinearOperator
     inner: AbstractInnerProduct
     unravel: Callable[[Array], Any] = eqx.field(static=True)
-    b: Float[Array, "m"]
+    b: Float[Array, "*pair m"]
     """W⁻¹ times the right-hand side."""
     b_norm: Float[Array, ""]
     rtol: Scalar
