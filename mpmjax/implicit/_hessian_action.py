@@ -119,10 +119,11 @@ class ParticleStiffness(AbstractHessianAction):
             like: any node vector.
         """
         d = like.shape[1]
-        stiff = jnp.stack([self.matrix[m, m] for m in range(d * d)])
+        own = [self.matrix[m, m] for m in range(d * d)]
         for one in self.averaged:
-            stiff = stiff.at[..., slice(*one.rows)].add(one.diagonal().reshape(d * d, -1))
-        stiff = jnp.maximum(stiff, 0)
+            more = one.diagonal().reshape(d * d, -1)
+            own = [a.at[slice(*one.rows)].add(b) for a, b in zip(own, more, strict=True)]
+        stiff = jnp.stack([jnp.maximum(a, 0) for a in own])
         nodes = scatter(self.stencil.squared, None, stiff.reshape(d, d, -1), like.shape[0])
         found = jnp.stack([self.mirror.fold_scalar(component) for component in nodes.T], axis=1)
         if self.springs:
