@@ -119,10 +119,15 @@ class ParticleStiffness(AbstractHessianAction):
             like: any node vector.
         """
         d = like.shape[1]
-        stiff = jnp.stack([self.matrix[m, m] for m in range(d * d)])
-        for one in self.averaged:
-            stiff = stiff.at[..., slice(*one.rows)].add(one.diagonal().reshape(d * d, -1))
-        stiff = jnp.maximum(stiff, 0)
+        added = [(slice(*one.rows), one.diagonal().reshape(d * d, -1)) for one in self.averaged]
+
+        def entry(m: int) -> Array:
+            own = self.matrix[m, m]
+            for rows, more in added:
+                own = own.at[rows].add(more[m])
+            return own
+
+        stiff = jnp.stack([jnp.maximum(entry(m), 0) for m in range(d * d)])
         nodes = scatter(self.stencil.squared, None, stiff.reshape(d, d, -1), like.shape[0])
         found = jnp.stack([self.mirror.fold_scalar(component) for component in nodes.T], axis=1)
         if self.springs:
