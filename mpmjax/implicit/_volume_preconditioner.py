@@ -41,7 +41,7 @@ class VolumePreconditioner(AbstractPreconditioner):
     more than `largest` numbers, on periodic grids and with rigid parts, the diagonal is taken. In float32, C is bounded
     by what the precision can tell, about a thousand times shear. Solvers other than `ConjugateResidual` take the
     diagonal too.
-    *Good values*: for ν above 0.495 (docs/nearly_incompressible.md has iterations and times).
+    *Good values*: for ν above 0.499 (docs/nearly_incompressible.md has iterations and times).
 
     Args:
         largest: largest number of entries of the factor, 2 K b². Default: 2·10⁷, 160 MB in float64.
@@ -196,7 +196,7 @@ class _Order(eqx.Module):
         """A number for each node, shape (n,), that no two nodes within reach of one share."""
         period = 2 * self.reach + 1
         each = np.meshgrid(*(np.arange(length) % period for length in self.shape), indexing="ij")
-        return sum(colour.reshape(-1) * period**axis for axis, colour in enumerate(each))
+        return np.sum([colour.reshape(-1) * period**axis for axis, colour in enumerate(each)], axis=0)
 
     def matrix(self, columns: Float[Array, "c a t n"]) -> tuple[Float[Array, "k b b"], Float[Array, "k b b"]]:
         """The blocks on the diagonal and those below it, from the products of S with each colour's nodes.

@@ -30,7 +30,8 @@ class AveragedVolume(eqx.Module):
     *When it breaks*: it needs det F > 0, with fixed corotated elasticity too. What the average does not see, a change
     of volume that alternates within a cell, is resisted by the shear modulus alone. Where volumes truly change from
     cell to cell, as where ν is 0.3, the average smooths them over a cell and is the less accurate one at edges. Linear
-    solves take more iterations the nearer ν is to ½, as √K, with averages and without.
+    solves take more iterations the nearer ν is to ½, as √K, with averages and without; `VolumePreconditioner` bounds
+    them.
     *Good values*: for ν from 0.45 on, or a bulk modulus of ten times μ and more; three particles along a cell's edge.
 
     Args:
