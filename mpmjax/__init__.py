@@ -128,6 +128,7 @@ from mpmjax.implicit import (
     MassPreconditioner,
     Newton,
     SolveInfo,
+    VolumePreconditioner,
     no_solve,
 )
 from mpmjax.io import load, record, register, save
@@ -156,6 +157,7 @@ from mpmjax.state import (
     AbstractLoad,
     AbstractPlace,
     AttachedPoints,
+    AveragedVolume,
     Particles,
     Patch,
     PointLoad,
@@ -195,6 +197,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "Scene",
     "UpdatedLagrangian",
     "TotalLagrangian",
+    "AveragedVolume",
     # particles and regions
     "Particles",
     "fill",
@@ -297,6 +300,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "ConjugateResidual",
     "AbstractPreconditioner",
     "DiagonalPreconditioner",
+    "VolumePreconditioner",
     "MassPreconditioner",
     "Guess",
     "stable_dt",
