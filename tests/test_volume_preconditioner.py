@@ -90,7 +90,8 @@ def test_iterations_do_not_grow_and_the_motion_is_the_same(d):
     assert plain.converged
     assert_close(found, velocity, 1e-6)
     assert stiffer.converged
-    assert int(stiffer.iterations) < 1.5 * int(solve.iterations)  # ten times the bulk modulus
+    growth = int(stiffer.iterations) / int(solve.iterations)  # by ten times the bulk modulus; the diagonal's is 1.85
+    assert growth < (1.2 if d == 2 else 1.7)
     assert int(solve.iterations) < int(plain.iterations) / 3
 
 
