@@ -112,7 +112,7 @@ class VolumeInnerProduct(AbstractInnerProduct):
         return True
 
     def factored(self) -> DiagonalInnerProduct:
-        """That of the diagonal of M + χH."""
+        """The inner product of the diagonal of M + χH."""
         return self.diagonal
 
     def apply(self, v: NodeVector) -> NodeVector:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, components
+from mpmjax._types import Array, Bool, components
 from mpmjax.checks import (
     canonical,
     checked,
@@ -25,6 +25,7 @@ from mpmjax.discretisation import (
 from mpmjax.material import AbstractLaw
 from mpmjax.state._attachment import AttachedPoints
 from mpmjax.state._loaded_points import keeps_deformation
+from mpmjax.state._material_points import MaterialPoints
 from mpmjax.state._oversights import warn_of_oversights
 from mpmjax.state._particles import Group, Particles
 from mpmjax.state._scene import Scene
@@ -160,6 +161,12 @@ def _parameters(law: AbstractLaw) -> list[Any]:
     return [leaf for leaf in own if eqx.is_array_like(leaf)]
 
 
+@eqx.filter_jit
+def _admissible(points: MaterialPoints) -> Bool[Array, "q"]:
+    """Whether the law allows the deformation of each particle, shape (q,)."""
+    return points.is_admissible(points.deformation)
+
+
 def _check_placement(scene: Scene, particles: Particles) -> None:
     place = scene.anchor(particles)
     require_finite("Particle positions", particles.x)
@@ -193,7 +200,7 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
         )
     for points in scene.material_points(particles):
         kept = points.law.kinematics
-        allowed = np.asarray(eqx.filter_jit(lambda points: points.is_admissible(points.deformation))(points))
+        allowed = np.asarray(_admissible(points))
         first = int(np.argmin(allowed)) + points.rows[0]
         require(
             allowed,
