@@ -320,3 +320,14 @@ def test_forces_on_boundaries_add_no_crossing_to_an_explicit_step():
     """Sums over the nodes, and nothing between particles and nodes."""
     walls = mpm.StickyBox((0.0, -1.0), (9.0, 9.0)), mpm.Grip(mpm.Box((0.3, -1.0), (1.0, 1.0)), mpm.geometry.still(2))
     assert counted(boundary=walls, boundary_forces=True) == counted(boundary=walls)
+
+
+def test_a_second_preparation_compiles_nothing(caplog):
+    """Of other particles in another scene of the same kind."""
+    scene, particles = block(2)
+    mpm.prepare(scene, particles)
+    softer = eqx.tree_at(lambda s: s.material.youngs_modulus, scene, 50.0)
+    faster = eqx.tree_at(lambda p: p.v, particles, particles.v + 1)
+    with jax.log_compiles():
+        mpm.prepare(softer, faster)
+    assert not [record for record in caplog.records if "Compiling" in record.getMessage()]
