@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 import shutil
+from threading import Thread
 
 import equinox as eqx
 import h5py
@@ -16,8 +17,10 @@ from helpers import DESCRIPTIONS, TRANSFERS, block, cloud, ids, thorough
 
 import mpmjax as mpm
 import mpmjax.io._runs
+from mpmjax.io._interrupt import undisturbed
 from mpmjax.io._record import record
 from mpmjax.io._runs import FrameWriter, load, save
+from mpmjax.io._staged import StagedFile
 from mpmjax.simulation._rollout_state import RolloutState, initial_state
 from mpmjax.simulation._run import Run
 from mpmjax.simulation._simulate import integrate
@@ -269,6 +272,33 @@ def test_a_file_being_written_can_be_read(tmp_path):
             shutil.copy(path, tmp_path / "copy.h5")
             for name in (path, tmp_path / "copy.h5"):
                 assert_same(load(name).frames, jax.tree.map(lambda a, i=i: a[: i + 1], run.frames))
+
+
+def test_a_signal_is_told_what_the_file_holds(tmp_path, monkeypatch):
+    """Also where it comes right after a frame has reached the disk."""
+    path, run = tmp_path / "run.h5", made_up(2)
+    commit, told, threads = StagedFile.commit, [], []
+
+    def signalled():
+        with undisturbed():
+            told.append((writer.standing(), len(load(path))))
+
+    def committed(file):
+        commit(file)
+        if len(threads) < 2:
+            threads.append(Thread(target=signalled))
+            threads[-1].start()
+            threads[-1].join(0.2)
+
+    with FrameWriter.create(path, run.scene, run.final, run.method, run.dt) as writer:
+        frame = RolloutState(jax.tree.map(lambda a: a[0], run.frames), None)
+        writer.append(0, frame, run.statistics)
+        monkeypatch.setattr(StagedFile, "commit", committed)
+        writer.append(1, frame, run.statistics)
+        for thread in threads:
+            thread.join()
+    for standing, count in told:
+        assert f"run.h5 holds {count} frame" in standing
 
 
 @pytest.mark.thorough

@@ -44,6 +44,7 @@ from mpmjax.io._hdf5 import (
     require_of_file,
     staged_file,
 )
+from mpmjax.io._interrupt import undisturbed
 from mpmjax.io._schema import decode, encode
 from mpmjax.io._staged import StagedFile
 from mpmjax.io._vtkhdf import File, add_fixed, add_growing, add_topology, count_in, rows_of, set_count, states_in
@@ -178,10 +179,12 @@ class FrameWriter:
             self._staged.commit()
             set_count(file, n + 1)
             file.flush()
-            self._staged.commit()
+            kept = self._standing()
+            with undisturbed():  # a signal is told of this frame or of the one before it, as the file is then
+                self._staged.commit()
+                self._kept = kept
         except (OSError, RuntimeError) as error:
             raise OSError(f"frame {n} could not be written ({reason(error)})") from None
-        self._kept = self._standing()
 
     def last(self) -> tuple[int, RolloutState, RunStatistics]:
         """Step number, state and statistics of the last frame."""
