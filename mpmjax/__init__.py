@@ -149,6 +149,7 @@ from mpmjax.material import (
     VonMises,
     Yeoh,
 )
+from mpmjax.native import Backend, backend
 from mpmjax.simulation import Fault, Run, SimulationError, rollout, simulate
 from mpmjax.state import (
     AbstractBodyForce,
@@ -357,6 +358,8 @@ __all__ = [  # noqa: RUF022 (grouped)
     "Markers",
     "StressStretch",
     # results
+    "Backend",
+    "backend",
     "Budget",
     "EnergyBudget",
     "MomentumBudget",

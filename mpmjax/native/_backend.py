@@ -3,13 +3,15 @@
 import os
 from typing import NamedTuple
 
+import jax
+
 from mpmjax.native._library import library
 
 VARIABLE = "MPMJAX_BACKEND"
 
 
 class Backend(NamedTuple):
-    """Who sums between particles and nodes on a CPU, and why."""
+    """Who sums between particles and nodes, and why."""
 
     name: str
     """`native` or `xla`."""
@@ -49,13 +51,16 @@ def uses_native() -> tuple[bool, str]:
 
 
 def backend() -> Backend:
-    """Who sums between particles and nodes on a CPU: `native`, compiled kernels, or `xla`. On other devices it is XLA.
+    """Who sums between particles and nodes, and why: `native`, compiled kernels for CPUs, or `xla`.
 
-    The environment variable MPMJAX_BACKEND chooses, `native` or `xla`, when a program is compiled; by default it is
-    `native` where the library was built. The two differ by rounding.
+    The environment variable MPMJAX_BACKEND, `native` or `xla`, chooses when a program is compiled; without it CPUs take
+    the native sums where these were built, and other devices always take XLA's. The two differ by rounding.
 
     Raises:
         ValueError: MPMJAX_BACKEND asks for what there is not.
     """
+    device = jax.default_backend()
+    if device != "cpu":
+        return Backend("xla", f"the device is a {device}")
     native, reason = uses_native()
     return Backend("native", reason, library().instructions, library().threads) if native else Backend("xla", reason)
