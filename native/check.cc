@@ -118,9 +118,8 @@ struct Example {
       }
     }
     if (oddity > 1) {
-      for (int64_t i = 0; i < w.size; i += 97) w[i] = g[i] = std::numeric_limits<T>::quiet_NaN();
-      // In one dimension a value that is not given counts as zero times infinity.
-      for (int64_t i = 5; sh.d > 1 && i < nodes.size; i += 89) nodes[i] = std::numeric_limits<T>::infinity();
+      for (int64_t i = 0; i < w.size; i += 97) w[i] = g[i] = dw[i] = dg[i] = std::numeric_limits<T>::quiet_NaN();
+      for (int64_t i = 5; i < nodes.size; i += 89) nodes[i] = std::numeric_limits<T>::infinity();
     }
   }
 

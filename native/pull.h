@@ -98,6 +98,9 @@ void pull(const Pull<T>& task, int64_t first, int64_t last) {
         }
       }
     }
+    // What has no part in B is zero, also where it would be zero times what is not finite.
+    if (task.given[1] == nullptr) std::memset(by_derivatives, 0, sizeof by_derivatives);
+    if (task.given[0] == nullptr && d == 1) std::memset(by_weights, 0, sizeof by_weights);
     for (int a = 0; a < d; ++a) {
       for (int i = 0; i < s; ++i) {
         const int64_t at = (a * s + i) * particles + start;

@@ -12,18 +12,26 @@ namespace {
 using mpmjax::Range;
 using mpmjax::Scatter;
 
-// Some columns of the nodes from a first to a last one.
+// Up to four columns of the nodes from a first to a last one. How many is known when this is compiled, or where speed
+// matters less than the size of the code it is 0 and `count` says it.
 template <class T, int used>
 struct NodeSums {
   T* nodes;  // at the first of the columns
   int64_t columns, first, last;
+  int count;
 
   // Whether any of the nodes from a least to a most may be in the range.
   MPMJAX_INLINE bool may_have(int64_t least, int64_t most) const { return most >= first && least < last; }
 
   template <bool inside>
   MPMJAX_INLINE void add(int32_t node, Vector<T> row) const {
-    if (inside || (node >= first && node < last)) add_some<used>(nodes + node * columns, row);
+    if (!inside && (node < first || node >= last)) return;
+    T* to = nodes + node * columns;
+    if constexpr (used > 0) {
+      add_some<used>(to, row);
+    } else {
+      for (int c = 0; c < count; ++c) to[c] += row[c];
+    }
   }
 };
 
@@ -89,7 +97,8 @@ void find_ranges(const Stencils<T>& stencils, int64_t first, int64_t last, Range
 template <class T, int d, int s, bool differential, bool graded, int used>
 void scatter_columns(const Scatter<T>& task, int64_t column, int64_t first, int64_t last) {
   const int64_t particles = task.stencils.particles;
-  const NodeSums<T, used> nodes{task.nodes + column, task.columns, first, last};
+  const int width = used > 0 ? used : smaller(task.columns - column, kLanes);
+  const NodeSums<T, used> nodes{task.nodes + column, task.columns, first, last, width};
   for (int64_t start = 0; start < particles; start += kBlock) {
     if (task.ranges != nullptr) {
       const Range range = task.ranges[start / kBlock];
@@ -110,7 +119,7 @@ void scatter_columns(const Scatter<T>& task, int64_t column, int64_t first, int6
       if (task.given[b] == nullptr) {
         std::memset(rows[b], 0, sizeof rows[b]);
       } else {
-        read_rows(task.given[b] + column * particles + start, particles, count, used, rows[b]);
+        read_rows(task.given[b] + column * particles + start, particles, count, width, rows[b]);
       }
     }
     for (int k = 0; k < some; ++k) {
@@ -138,12 +147,15 @@ void scatter_given(const Scatter<T>& task, int64_t first, int64_t last) {
   const int64_t columns = task.columns;
   std::memset(task.nodes + first * columns, 0, static_cast<size_t>((last - first) * columns) * sizeof(T));
   int64_t c = 0;
-  for (; c + 4 <= columns; c += 4) scatter_columns<T, d, s, differential, graded, 4>(task, c, first, last);
-  switch (columns - c) {
-    case 3: return scatter_columns<T, d, s, differential, graded, 3>(task, c, first, last);
-    case 2: return scatter_columns<T, d, s, differential, graded, 2>(task, c, first, last);
-    case 1: return scatter_columns<T, d, s, differential, graded, 1>(task, c, first, last);
-    default: return;
+  if constexpr (graded && !differential) {
+    for (; c + 4 <= columns; c += 4) scatter_columns<T, d, s, false, true, 4>(task, c, first, last);
+    switch (columns - c) {
+      case 3: return scatter_columns<T, d, s, false, true, 3>(task, c, first, last);
+      case 2: return scatter_columns<T, d, s, false, true, 2>(task, c, first, last);
+      case 1: return scatter_columns<T, d, s, false, true, 1>(task, c, first, last);
+    }
+  } else {
+    for (; c < columns; c += kLanes) scatter_columns<T, d, s, differential, graded, 0>(task, c, first, last);
   }
 }
 
