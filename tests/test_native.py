@@ -1,7 +1,5 @@
 """The native sums are those of XLA to rounding, whatever they are given, and one place chooses between them."""
 
-import shutil
-import subprocess
 import warnings
 from functools import partial
 from pathlib import Path
@@ -247,12 +245,3 @@ def test_a_library_of_another_version_is_not_used(other_library, monkeypatch):
 def test_numbers_that_have_to_be_equal_are():
     """The interface of the library and of the package."""
     assert f"MPMJAX_INTERFACE={_library.INTERFACE})" in (ROOT / "native" / "CMakeLists.txt").read_text()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("c++") is None, reason="there is no C++ compiler")
-@pytest.mark.parametrize("sanitizer", ["address", "thread"])
-def test_sanitizers_find_nothing(sanitizer):
-    """Neither memory beyond its end, nor undefined behaviour, nor a race of threads."""
-    done = subprocess.run([ROOT / "native" / "check", sanitizer], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
