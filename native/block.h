@@ -34,9 +34,9 @@ template <class T>
 MPMJAX_INLINE void copy(const T* from, int count, T* to) {
   if (__builtin_expect(count != kBlock, 0)) return copy_some(from, count, to);
   std::memcpy(to, from, kBlock * sizeof(T));
-  const char* later = reinterpret_cast<const char*>(from + kAhead);
-  __builtin_prefetch(later);
-  if (kBlock * sizeof(T) > 64) __builtin_prefetch(later + 64);
+  const uintptr_t later = reinterpret_cast<uintptr_t>(from) + kAhead * sizeof(T);  // perhaps beyond the array's end
+  __builtin_prefetch(reinterpret_cast<const void*>(later));
+  if (kBlock * sizeof(T) > 64) __builtin_prefetch(reinterpret_cast<const void*>(later + 64));
 }
 
 // The factors of a block: numbers, or with `differential` numbers with their changes.
