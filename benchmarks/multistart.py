@@ -1,11 +1,17 @@
-"""What do 64 searches together cost, beside 64 fits one by one?
+"""What do 64 starts cost, beside searches from all of them and beside 64 fits? What do they miss?
 
     python benchmarks/multistart.py [--starts 64] [--rounds 2] [--scene explicit]
+    python benchmarks/multistart.py --reliability
 
 E and ν of a free square that is stretched as it starts, from tracks of all its particles with noise, made by the same
-scene; once with explicit steps, once with semi-implicit ones. Both ways start from the same Sobol points, E over two
-decades, ν between its bounds. Printed are seconds of the processor and of the clock, compilation left out by a first
-call of each, the two interleaved; and of one iteration, per search, against how many run together.
+scene; once with explicit steps, once with semi-implicit ones. Fits one by one and `fit_multistart`, with `fraction=1`,
+which searches from all points, and with its default, start from the same Sobol points, E over two decades, ν between
+its bounds. Printed are seconds of the processor and of the clock, compilation left out by a first call of each, the
+three interleaved; and of one iteration, per search, against how many run together.
+
+`--reliability`: how often searches find the best minimum, and how many they are, of 40 scramblings of the Sobol points,
+for several fractions. The problems are oscillations whose frequency, amplitude, damping and phase are searched, the
+better known the longer they last, and sums of two and three of them.
 """
 
 import argparse
@@ -22,15 +28,26 @@ import numpy as np
 
 import mpmjax as mpm
 from mpmjax.fitting._batch import Problems, _iterate
+from mpmjax.fitting._linkage import linked
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._search import begin
-from mpmjax.fitting._starting_points import starting_points
+from mpmjax.fitting._starting_points import starting_points, unit_points
 
 NOISE = 1e-4
 PARAMETERS = {
     "E": mpm.Positive(lambda e: e.scene.material.youngs_modulus, start=1e5),
     "nu": mpm.Bounded(lambda e: e.scene.material.poisson_ratio, 0.0, 0.49, start=0.2),
 }
+OSCILLATIONS = {
+    "frequency, 5 periods": ((1.0,), (1.0,), 30.0, 0),
+    "frequency, 13 periods": ((1.0,), (1.0,), 80.0, 0),
+    "and amplitude, 10 periods": ((1.0,), (1.0,), 60.0, 1),
+    "and damping, 10 periods": ((1.0,), (1.0,), 60.0, 2),
+    "and phase, 6 periods": ((1.0,), (1.0,), 40.0, 3),
+    "two frequencies, 1.6 and 4 periods": ((1.0, 0.5), (1.0, 2.7), 10.0, 0),
+    "three frequencies, 1 to 5 periods": ((1.0, 0.6, 0.4), (1.0, 2.2, 5.0), 6.0, 0),
+}
+FRACTIONS = {64: (0.0, 0.125, 0.375, 0.5, 1.0), 256: (0.125,)}
 SCENES = {"explicit": (mpm.Explicit(), 2e-3, 100), "semi-implicit": (mpm.SemiImplicit(), 1e-2, 20)}
 
 
@@ -83,18 +100,83 @@ def iteration(pull: mpm.Experiment, points: np.ndarray, batch: int) -> Callable[
     )
 
 
+def oscillations(
+    amplitudes: tuple[float, ...], frequencies: tuple[float, ...], duration: float, others: int
+) -> tuple[Callable[[np.ndarray], np.ndarray], np.ndarray, np.ndarray]:
+    """The residuals of a sum of oscillations a e^{-dt} cos(ωt + φ), beside its values with noise of 0.01, shape (k, m)
+    of coordinates (k, n); and the ends of their ranges. Searched are the logarithms of the frequencies, from a quarter
+    to ten, and so many of: logarithm of a scale of the amplitudes, logarithm of the damping, phase."""
+    t = np.linspace(duration / 80, duration, 80)
+    number, damping = len(frequencies), 0.3 / duration
+    lowest = np.array([np.log(0.25)] * number + [np.log(0.3), np.log(0.1 * damping), -1.0][:others])
+    highest = np.array([np.log(10.0)] * number + [np.log(3.0), np.log(30 * damping), 1.0][:others])
+
+    def signal(z: np.ndarray) -> np.ndarray:
+        rest = np.concatenate([z[:, number:], np.tile([0.0, np.log(damping), 0.0][others:], (len(z), 1))], axis=1)
+        scale, rate, phase = rest.T[:, :, None]
+        omega = np.exp(z[:, :number, None])
+        waves = np.array(amplitudes)[:, None] * np.cos(omega * t + phase[:, None])
+        return np.exp(scale - np.exp(rate) * t) * waves.sum(1)
+
+    true = np.array([[*np.log(frequencies), *[0.0, np.log(damping), 0.0][:others]]])
+    seen = signal(true) + 0.01 * np.random.default_rng(1).normal(size=80)
+    return lambda z: (signal(z) - seen) / 0.01, lowest, highest
+
+
+def ends(residuals: Callable[[np.ndarray], np.ndarray], z: np.ndarray) -> np.ndarray:
+    """Where Levenberg-Marquardt searches from each of z, shape (k, n), end: their Σ r², shape (k,)."""
+    damping, step = np.ones(len(z)), 1e-6 * np.eye(z.shape[1])
+    r = residuals(z)
+    for _ in range(60):
+        J = np.stack([(residuals(z + h) - residuals(z - h)) / 2e-6 for h in step], axis=-1)
+        hessian = J.swapaxes(1, 2) @ J + damping[:, None, None] * np.eye(z.shape[1])
+        tried = z - np.linalg.solve(hessian, (J * r[:, :, None]).sum(1)[..., None])[..., 0]
+        new = residuals(np.clip(tried, -20, 20))
+        better = (new**2).sum(1) < (r**2).sum(1)
+        z, r = np.where(better[:, None], tried, z), np.where(better[:, None], new, r)
+        damping = np.clip(np.where(better, damping / 3, damping * 4), 1e-9, 1e12)
+    return (r**2).sum(1)
+
+
+def reliability(scramblings: int = 40) -> None:
+    """How often the best minimum is found, and by how many searches."""
+    columns = ", ".join(f"{f:g} of {count}" for count, fractions in FRACTIONS.items() for f in fractions)
+    print(f"problem, unknowns: found of {scramblings} (searches) by a fraction of {columns}")
+    for text, (amplitudes, frequencies, duration, others) in OSCILLATIONS.items():
+        residuals, lowest, highest = oscillations(amplitudes, frequencies, duration, others)
+        told = []
+        for count, fractions in FRACTIONS.items():
+            found, searches = (dict.fromkeys(fractions, 0) for _ in range(2))
+            for seed in range(scramblings):
+                shares = unit_points(count - 1, len(lowest), seed)
+                z = lowest + shares * (highest - lowest)
+                costs = (residuals(z) ** 2).sum(1)
+                own = {f: np.unique(linked(shares, costs, f)) for f in fractions}
+                most = own[max(fractions)]
+                best = set(most[ends(residuals, z[most]) < 2 * 80])
+                for f in fractions:
+                    found[f] += not best.isdisjoint(own[f])
+                    searches[f] += len(own[f])
+            told += [f"{found[f]} ({searches[f] / scramblings:.0f})" for f in fractions]
+        print(f"{text}, {len(lowest)}: {', '.join(told)}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--starts", type=int, default=64)
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--scene", choices=SCENES, action="append")
+    parser.add_argument("--reliability", action="store_true")
     given = parser.parse_args()
+    if given.reliability:
+        return reliability()
     jax.config.update("jax_enable_x64", True)
     warnings.simplefilter("ignore")
     for name in given.scene or SCENES:
         method, dt, steps = SCENES[name]
         pull = experiment(method, dt, steps)
-        points = starting_points(FitProblem((pull,), PARAMETERS), given.starts, {}, 0)
+        problem = FitProblem((pull,), PARAMETERS)
+        points = starting_points(problem, unit_points(given.starts - 1, problem.size, 0), {})
         calls = {batch: iteration(pull, points, batch) for batch in (1, 8, 32) if batch <= given.starts}
         seconds: dict[int, list[float]] = {batch: [] for batch in calls}
         for _ in range(2 + given.rounds):
@@ -107,15 +189,18 @@ def main() -> None:
         for _ in range(given.rounds):
             processor, clock, alone = timed(partial(one_by_one, pull, points))
             print(f"{name}: {given.starts} fits: {processor:.1f} s of the processor, {clock:.1f} s", flush=True)
-            own, own_clock, found = timed(partial(mpm.fit_multistart, pull, PARAMETERS, starts=given.starts))
-            print(
-                f"{name}: together: {own:.1f} s of the processor, {own_clock:.1f} s; ratio {processor / own:.1f}; "
-                f"{found.iterations} iterations; {len(found.minima)} minima, "
-                f"the best by {len(found.minima[0].members)}, "
-                f"{len(found.failures)} failed; χ² {found.best.chi_squared:.6g}, the fits' best {np.nanmin(alone):.6g} "
-                f"({sum(np.isclose(alone, np.nanmin(alone), rtol=1e-3))} of them), {sum(np.isnan(alone))} failed",
-                flush=True,
-            )
+            for fraction in (1.0, 0.375):
+                call = partial(mpm.fit_multistart, pull, PARAMETERS, starts=given.starts, fraction=fraction)
+                own, own_clock, found = timed(call)
+                print(
+                    f"{name}: fraction {fraction:g}: {own:.1f} s of the processor, {own_clock:.1f} s; "
+                    f"ratio {processor / own:.1f}; {len(found.searched)} searches, {found.iterations} iterations; "
+                    f"{len(found.minima)} minima, the best of {len(found.minima[0].members)} points, "
+                    f"{len(found.failures)} failed; χ² {found.best.chi_squared:.6g}, the fits' best "
+                    f"{np.nanmin(alone):.6g} ({sum(np.isclose(alone, np.nanmin(alone), rtol=1e-3))} of them), "
+                    f"{sum(np.isnan(alone))} failed",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

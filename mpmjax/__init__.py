@@ -34,6 +34,7 @@ from mpmjax.boundary import (
     SlipCollider,
     StickyBox,
     StickyCollider,
+    Surface,
     SymmetryPlane,
     Wall,
 )
@@ -269,6 +270,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "SeparatingBox",
     "SlipBox",
     "StickyBox",
+    "Surface",
     "SymmetryPlane",
     "Wall",
     "AbstractCollider",

@@ -135,6 +135,7 @@ def numpy_step(scene: mpm.Scene, particles: mpm.Particles, dt: float, beta: floa
         after[keep] = np.linalg.solve(A[np.ix_(keep, keep)], (b - A @ after)[keep])
         after = after.reshape(n, d)
     after = np.where(free, after, held)
+    before = np.where(free, before, held)  # a particle takes no change from what a boundary holds
 
     # grid to particles
     moved = w @ after
@@ -166,7 +167,15 @@ def grid_update(scene: mpm.Scene, particles: mpm.Particles, dt: float, method, t
 
 @eqx.filter_jit
 def _grid_update(scene, particles, t, dt, method) -> GridUpdate:
-    nodes = particles_to_grid(scene, particles, t, dt, scene.stencil(particles), body_force_at=method.body_force_at)
+    nodes = particles_to_grid(
+        scene,
+        particles,
+        t,
+        dt,
+        scene.stencil(particles),
+        body_force_at=method.body_force_at,
+        force_at=method.force_at(),
+    )
     new, info = step_unchecked(scene, particles, t, dt, method)
     grid = update(nodes, method)
     position = scene.grid.nodes(scene.window(particles))

@@ -9,7 +9,7 @@ from helpers import DESCRIPTIONS, KERNELS, LAWS, assert_close, cloud, ids, thoro
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.boundary import Mirror, combined_conditions, contacts_of, mirror
+from mpmjax.boundary import Mirror, brought_contacts, combined_conditions, mirror
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {
@@ -84,14 +84,13 @@ def test_a_node_within_a_thousandth_of_a_spacing_of_a_wall_is_on_it():
     """Of boxes, grips and colliders, from either side; a plane may lie off the half lattice by half as much."""
     grid = mpm.Grid((8,), DX)
     nodes, rest = grid.nodes(grid.window(jnp.zeros((1, 1)))), mpm.Motion((0.0,), ((0.0,),))
-    boxes = mpm.StickyBox, mpm.SlipBox, mpm.SeparatingBox
+    boxes = mpm.StickyBox, mpm.SlipBox
     for share, met in ((0.9e-3, 2), (1.1e-3, 1)):
         lower, upper = (2 - share) * DX, (5 + share) * DX  # nodes 2 and 5 are just within; 0, 1, 6 and 7 beyond
         for box in boxes:
             found = combined_conditions((box((lower,), (upper,)),), nodes, DX, 0.0, 0.1, reference=False)
-            held = found.fixed if found.side is None else found.side != 0
             np.testing.assert_array_equal(
-                held[:, 0], np.isin(np.arange(8), [0, 1, 6, 7, *([2, 5] if met == 2 else [])])
+                found.fixed[:, 0], np.isin(np.arange(8), [0, 1, 6, 7, *([2, 5] if met == 2 else [])])
             )
         between = mpm.Box(((2 + share) * DX,), ((5 - share) * DX,))
         for holds in (mpm.Grip(between, rest), mpm.StickyCollider(between), mpm.SlipCollider(between)):
@@ -119,19 +118,6 @@ def test_the_earlier_boundary_wins():
     np.testing.assert_allclose(second[both & (x[:, 1] > 0.05)], np.broadcast_to([0.0, 3.0], (5, 2)), atol=1e-14)
     np.testing.assert_allclose(second[both & (x[:, 1] < 0.05)], np.zeros((1, 2)), atol=1e-14)
     np.testing.assert_allclose(first[x[:, 0] > 0.15][:, 0], 0)
-    walls = (((-np.inf, 0.1), 0.2), ((-np.inf, 0.0), 0.3), ((0.1, -np.inf), 0.4))
-    boxes = [mpm.SeparatingBox(lower, (0.4, np.inf), friction=mu) for lower, mu in walls]
-    found = combined_conditions((grip, *boxes), nodes, DX, 0.0, 0.1, reference=False)
-    open_ = x[:, 0] > 0.15  # what a grip holds, no wall does
-    np.testing.assert_array_equal(np.asarray(found.side)[~open_], 0)
-    np.testing.assert_array_equal(np.asarray(found.side)[open_, 1], x[open_, 1] < 0.15)
-    np.testing.assert_array_equal(np.asarray(found.side)[open_, 0], np.where(x[open_, 0] > 0.35, -1, 0))
-    np.testing.assert_allclose(np.asarray(found.friction)[open_ & (x[:, 1] < 0.15), 1], 0.2)
-    np.testing.assert_allclose(np.asarray(found.friction)[x[:, 0] > 0.35, 0], 0.2)
-    found = combined_conditions(tuple(boxes[2:] + boxes[:2]), nodes, DX, 0.0, 0.1, reference=False)
-    np.testing.assert_array_equal(np.asarray(found.side)[x[:, 0] < 0.15, 0], 1)
-    np.testing.assert_allclose(np.asarray(found.friction)[x[:, 1] < 0.15, 1], 0.2)
-    np.testing.assert_allclose(np.asarray(found.friction)[x[:, 0] < 0.15, 0], 0.4)
 
 
 # Two planes, at a node and half-way between two, that keep opposite sides.
@@ -237,7 +223,8 @@ def test_fold_is_the_transpose_of_unfold_where_some_columns_are_held():
     planes = (mpm.ContactPlane(0, 0.2), mpm.ContactPlane(1, 0.35, "below"))
     nothing_prescribed = mpm.Conditions(jnp.zeros((42, 2), bool), jnp.zeros((42, 2)))
     columns = [np.broadcast_to(rng.random((1, 6)) < 0.5, (7, 6)), np.broadcast_to(rng.random((7, 1)) < 0.5, (7, 6))]
-    found = contacts_of(planes, nothing_prescribed, grid, grid.window(jnp.zeros((1, 2))), 0.0, DT)
+    window = grid.window(jnp.zeros((1, 2)))
+    found = [c for _, c in brought_contacts(planes, nothing_prescribed, grid, window, 0.0, DT, None, 0.0)]
     images = Mirror(tuple(c.image.within(jnp.asarray(h.ravel())) for c, h in zip(found, columns, strict=True)))
     basis = jnp.eye(84).reshape(84, 42, 2)
     B, transpose = (np.asarray(jax.vmap(f)(basis)).reshape(84, 84).T for f in (images.unfold, images.fold))

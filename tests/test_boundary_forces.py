@@ -143,6 +143,19 @@ def test_torques_on_boundaries_sum_to_the_change_of_angular_momentum(boundary):
     np.testing.assert_allclose(torque_about_origin(scene, received), gravity - gained, rtol=0, atol=1e-10 * scale)
 
 
+@pytest.mark.parametrize("method", **ids(METHODS, "explicit"))
+def test_what_a_collider_that_is_hit_receives_is_what_it_gives_the_faces(method):
+    """At a symmetry plane that its normal is not along: the same as `StepInfo.colliders`."""
+    slope = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.03), (0.3, 1.0)))
+    scene, particles = shaken(boundary=(mpm.SymmetryPlane(0, 0.0), slope))
+    _, info = mpm.step(scene, particles, 0.0, 0.3 * explicit_limit(scene), method=method)
+    assert np.abs(np.asarray(info.boundaries.impulse[1])).min() > 0
+    assert_close(info.boundaries.impulse[1:], info.colliders.impulse, 1e-12)
+    assert_close(info.boundaries.angular[1:], info.colliders.angular, 1e-12)
+    push = np.asarray(info.boundaries.impulse[1])
+    assert push[0] == pytest.approx(0.3 * push[1], rel=1e-12)
+
+
 @pytest.mark.thorough
 def test_forces_and_torques_sum_in_three_dimensions():
     """Walls, a plane, a contact plane and a collider that turns."""

@@ -193,8 +193,9 @@ def test_flip_without_blending_loses_nothing_over_a_step():
 def test_each_boundary_appears_where_it_acts():
     """A wall and friction only take energy; a grip that moves gives it; a plane does no work."""
     contact = budget_of(boundary=BOUNDARIES["contact"])[0]
-    assert (np.asarray(contact.energy.friction) <= 0).all()
-    assert float(contact.energy.friction.sum()) < 0
+    taken = -np.asarray(contact.energy.friction)
+    assert taken.max() > 0
+    assert taken.min() > -1e-12 * taken.max()
     assert float(contact.momentum.boundary[:, 1].sum()) > 0
     grip = budget_of(boundary=BOUNDARIES["grip"], speed=0.0, gravity=(0.0, 0.0))[0]
     assert float(grip.energy.boundary.sum()) > 0

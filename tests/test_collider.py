@@ -12,7 +12,8 @@ from helpers import LAWS, QUICK, assert_close, cloud, explicit_limit, ids, thoro
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.boundary import combined_conditions
+from mpmjax.boundary import ConstrainedNodes, Mirror, combined_conditions
+from mpmjax.discretisation import scatter
 from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._projection import Projection
 
@@ -127,24 +128,16 @@ def test_of_two_bodies_normals_the_earlier_holds_and_a_prescribed_component_is_a
         below = (np.asarray(step.position)[:, 1] < 0.25) & mass
         expected = alone.velocity[below] if tilt < 1e-2 else np.broadcast_to([5 / tilt, 0.0], (below.sum(), 2))
         assert_close(step.velocity[below], expected, 1e-12)
-    level = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.3), (0.0, 1.0)), rising)
-    step = grid_update(scene_of(grid, box, level), particles, DT, METHODS["explicit"])
-    assert_close(step.velocity[below], alone.velocity[below], 1e-14)
-    assert step.info.contact.violations == 0  # what a wall holds already cannot get out of its way
 
 
 @pytest.mark.thorough
-def test_what_the_earlier_holds_the_later_neither_lets_go_nor_rubs_nor_receives():
-    """Of a body that holds and one that may be left, and of a grip and a body that sticks."""
+def test_what_the_earlier_holds_the_later_does_not_receive():
+    """Of a grip and a body that sticks."""
     grid = mpm.Grid((6, 6), DX)
     nodes = grid.nodes(grid.window(jnp.zeros((1, 2))))
     x = np.asarray(nodes)
     left, floor = mpm.HalfSpace((0.25, 0.0), (1.0, 0.0)), mpm.HalfSpace((0.0, 0.25), (0.0, 1.0))
-    pair = mpm.SlipCollider(left), mpm.SeparatingCollider(floor, friction=0.5)
-    touch = combined_conditions(pair, nodes, DX, 0.0, 0.1, reference=False).colliders
     later = (x[:, 0] > 0.25) & (x[:, 1] < 0.25)
-    np.testing.assert_array_equal(touch.leavable, later)
-    np.testing.assert_array_equal(touch.friction, 0.5 * later)
     grip = mpm.Grip(left, mpm.Motion((0.0,), ((0.0, 0.0),)), axes=(True, False))
     touch = combined_conditions((grip, mpm.StickyCollider(floor)), nodes, DX, 0.0, 0.1, reference=False).colliders
     np.testing.assert_array_equal(touch.holder[:, 1], np.where(x[:, 1] < 0.25, 0, -1))
@@ -217,29 +210,46 @@ def obstacles(friction, d=2):
     return ball, slope
 
 
+def judged(contact, step, method):
+    """The gaps that the springs of a contact feel, and nodes of which nothing is held."""
+    nodes = step.nodes
+    nothing_held = ConstrainedNodes(nodes, (), Mirror(()), nodes, method.mean_displacement(nodes, step.update.solved))
+    return np.asarray(contact.gap_felt(nothing_held)), nothing_held
+
+
+def pushes(contact, step, method):
+    """At the nodes: the sums of the pushes around, and their mean normal and velocity of the surface."""
+    gap, nothing_held = judged(contact, step, method)
+    push = contact.push(nothing_held, jnp.asarray(gap < 0))
+    velocity = jnp.zeros_like(contact.normal) if contact.velocity is None else contact.velocity
+    fields = jnp.concatenate([push[None], push * contact.normal, push * velocity])
+    sums, d = np.asarray(scatter(contact.faces.stencil, fields, None, len(step.velocity))), len(contact.normal)
+    total = np.where(sums[:, 0] == 0, 1, sums[:, 0])[:, None]
+    normal = sums[:, 1 : d + 1]
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return sums[:, 0], normal / np.where(length == 0, 1, length), sums[:, d + 1 :] / total
+
+
 @pytest.mark.parametrize("method", **ids(METHODS, "explicit", QUICK))
 def test_a_separating_collider_pushes_never_pulls_and_is_not_entered(method):
-    """(v − v_c)·n ≥ 0, push ≥ 0, and their product zero at every node, with a wall beside."""
+    """What is given is what springs give that push where gaps are below zero, with a wall beside; each collider
+    receives its own."""
     grid, particles = landing()
+    particles = eqx.tree_at(lambda q: q.x, particles, particles.x + jnp.asarray([0.0, -1e-3]))
     wall = mpm.SeparatingBox((-np.inf, 0.0), (np.inf, np.inf))
     scene = scene_of(grid, *obstacles(0.0), wall)
     step = grid_update(scene, particles, 0.5 * explicit_limit(scene), method)
-    touch, mass = step.nodes.conditions.colliders, np.asarray(step.nodes.mass)
-    v, n = np.asarray(step.velocity), np.asarray(touch.normal)
-    inside = (np.asarray(touch.owner) >= 0) & (mass > 0)
-    departure = ((v - np.asarray(touch.velocity)) * n).sum(axis=1)
-    push = np.asarray(step.update.normal_impulse)
-    scale = np.abs(v).max()
     assert int(step.info.contact.violations) == 0
-    held = inside & (np.abs(departure) < 1e-12 * scale)
-    assert held.sum() > 3
-    assert (inside & ~held).sum() > 3
-    assert departure[inside].min() > -1e-12 * scale
-    assert push.min() > -1e-9 * push.max()
-    assert np.abs(push[~held]).max() <= 1e-9 * push.max()
-    assert (push[held] > 0).all()
-    side = np.asarray(step.nodes.conditions.side[:, 1]) == 1
-    assert (v[side, 1] >= 0).all()
+    total = 0
+    for contact in step.nodes.contacts:
+        gap, nothing_held = judged(contact, step, method)
+        given = np.asarray(contact.spring_impulse(nothing_held, jnp.asarray(gap < 0)))
+        total = total + given
+        if contact.collider is not None:
+            assert (gap < 0).any()
+            assert (gap[np.asarray(contact.near)] > 0).any()
+            assert_close(step.info.colliders.impulse[contact.collider], -given.sum(axis=0), 1e-7)
+    assert np.abs(np.asarray(step.reaction) - total).max() < 1e-7 * np.abs(total).max()
 
 
 @pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.slow)])
@@ -332,30 +342,29 @@ def test_the_force_on_a_collider_can_be_differentiated():
 @pytest.mark.parametrize("mu", [0.2, *thorough(1e5)])
 @pytest.mark.parametrize("name", ["explicit", *thorough("semi_implicit", "implicit_midpoint")])
 def test_friction_opposes_slip_by_at_most_mu_times_the_push(name, mu):
-    """Relative to the collider: where it does not stop a node, exactly μ push, against the slip that is left."""
+    """Relative to the collider: where it does not stop a node, exactly μ times the push of the particles around,
+    against the slip that is left."""
     grid, particles = landing()
-    scene = scene_of(grid, *obstacles(mu))
-    step = grid_update(scene, particles, 0.5 * explicit_limit(scene), METHODS[name])
-    touch, rub, push = (
-        step.nodes.conditions.colliders,
-        np.asarray(step.update.collider_friction),
-        np.asarray(step.update.normal_impulse),
-    )
-    slip = np.asarray(step.velocity - touch.velocity)
-    n = np.asarray(touch.normal)
-    slip = slip - n * (n * slip).sum(axis=1, keepdims=True)
-    held = push > 1e-9 * push.max()
-    size, left = np.linalg.norm(rub, axis=1), np.linalg.norm(slip, axis=1)
-    slides = held & (left > 1e-9)
-    assert_close((rub * n).sum(axis=1), np.zeros(len(n)), 0, 1e-12 * push.max())
-    assert (size <= mu * np.maximum(push, 0) * (1 + 1e-12)).all()
-    assert not rub[~held].any()
-    if mu < 1:
-        assert slides.sum() > 2
-        assert_close(rub[slides], -mu * push[slides, None] * slip[slides] / left[slides, None], 1e-10)
-    else:
-        assert held.any()
-        assert not slides.any()
+    particles = eqx.tree_at(lambda q: q.x, particles, particles.x + jnp.asarray([0.0, -1e-3]))
+    scene, method = scene_of(grid, *obstacles(mu)), METHODS[name]
+    step = grid_update(scene, particles, 0.5 * explicit_limit(scene), method)
+    rub, mass = np.asarray(step.update.friction), np.asarray(step.nodes.mass)
+    found = [pushes(contact, step, method) for contact in step.nodes.contacts]
+    limit = mu * sum(push for push, _, _ in found)
+    assert (np.linalg.norm(rub, axis=1) <= limit * (1 + 1e-9)).all()
+    sliding = 0
+    for push, n, velocity in found:
+        alone = (mu * push == limit) & (push > 1e-6 * push.max()) & (mass > 0)
+        slip = np.asarray(step.velocity) - velocity
+        slip = slip - n * (n * slip).sum(axis=1, keepdims=True)
+        left = np.linalg.norm(slip, axis=1)
+        slides = alone & (left > 1e-9)
+        assert alone.sum() > 2
+        assert np.abs((rub * n).sum(axis=1)[alone]).max() < 1e-10 * push.max()
+        if slides.any():
+            assert_close(rub[slides], -limit[slides, None] * slip[slides] / left[slides, None], 1e-8)
+        sliding += slides.sum()
+    assert sliding > 4 if mu < 1 else sliding == 0
 
 
 @pytest.mark.thorough
@@ -373,6 +382,7 @@ def test_friction_of_a_wall_leaves_alone_what_others_hold(floor):
         "box": mpm.SeparatingBox((-np.inf, -np.inf, 0.0), (np.inf,) * 3, friction=mu),
         "plane": mpm.ContactPlane(2, 0.0, friction=mu),
     }[floor]
+    block = eqx.tree_at(lambda b: b.x, block, block.x - jnp.array([0.0, 0.0, 1e-3]))
     scene = scene_of(grid, drag, side, wall)
     step = grid_update(scene, block, 0.3 * explicit_limit(scene), mpm.Explicit())
     x, v, mass = np.asarray(step.position), np.asarray(step.velocity), np.asarray(step.nodes.mass) > 0
@@ -388,9 +398,7 @@ def test_friction_of_a_wall_leaves_alone_what_others_hold(floor):
     friction = np.asarray(step.update.friction)
     assert ((friction * v).sum(axis=1)[rubbed & ~held & ~gripped] < 0).all()
     if floor == "box":  # what the body pushes is not the wall's
-        push = (
-            np.asarray(step.reaction) - np.asarray(step.update.normal_impulse)[:, None] * np.where(held[:, None], n, 0)
-        )[:, 2]
+        push = pushes(step.nodes.contacts[2], step, mpm.Explicit())[0]
         size = np.linalg.norm(friction, axis=1)
         assert (size <= mu * push * (1 + 1e-9))[rubbed].all()
         assert np.isclose(size, mu * push, rtol=1e-9)[rubbed & held].sum() > 3
@@ -399,10 +407,10 @@ def test_friction_of_a_wall_leaves_alone_what_others_hold(floor):
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", ["explicit", "semi_implicit"])
 def test_a_collider_lets_go_freely(name):
-    """A block that a tilted floor does not hold leaves as if there were none."""
+    """A block whose faces a tilted floor just does not touch leaves as if there were none."""
     grid, block = landing()
     block = eqx.tree_at(lambda b: b.v, block, jnp.broadcast_to(jnp.array([0.4, 0.3]), block.v.shape))
-    floor = mpm.SeparatingCollider(mpm.HalfSpace((0.1, 0.1), (4.0, 3.0)), friction=0.5)
+    floor = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (4.0, 3.0)), friction=0.5)
     scene = eqx.tree_at(lambda s: s.gravity, scene_of(grid, floor), (0.8, 0.6))
     run = {"steps": 5, "dt": 0.2 * explicit_limit(scene), "method": METHODS[name]}
     with_floor = mpm.rollout(scene, block, **run)
@@ -414,7 +422,8 @@ def test_a_collider_lets_go_freely(name):
 @pytest.mark.thorough
 def test_a_turning_body_drags_what_it_touches_and_is_braked():
     """A cylinder under a block, turning anticlockwise: friction drives the block to the left; the torque on the body is
-    clockwise and that of μ times the load at arms between the surface and a spacing below it, where the nodes are."""
+    clockwise and that of μ times the load at arms between the surface and a particle's width above it, since friction
+    acts at the particles' centres."""
     grid = mpm.Grid((14, 12), DX, origin=(-7, -6))
     block = mpm.fill(mpm.Box((-0.4, 0.0), (0.4, 0.2)), grid, density=1e3)
     wheel = mpm.Ball((0.0, -0.45), 0.46)
@@ -431,7 +440,7 @@ def test_a_turning_body_drags_what_it_touches_and_is_braked():
     assert drag > 0
     assert load < 0
     assert torque < 0
-    assert 0.36 < -torque / (0.3 * -load) < 0.46
+    assert 0.46 < -torque / (0.3 * -load) < 0.51
 
 
 @pytest.mark.slow
@@ -561,7 +570,7 @@ def test_derivatives_by_a_colliders_motion_shape_and_friction(name, kind):
     at = jnp.array([0.31, 0.23, 2.0, 0.0, 0.2, 0.0])
     value, gradient = jax.jit(outcome), np.asarray(jax.jit(jax.grad(outcome))(at))
     acts = {"separating": [0, 1, 2, 4, 5], "slip": [0, 1, 2, 5], "sticky": [0, 1, 2]}[kind]
-    h = 1e-5
+    h = 1e-6 if kind == "separating" else 1e-5  # within which the active set stays
     difference = np.array([float(value(at + h * e) - value(at - h * e)) / (2 * h) for e in jnp.eye(6)])
     assert np.isfinite(gradient).all()
     assert (np.abs(difference[acts]) > 1e-8).all(), difference
@@ -570,6 +579,6 @@ def test_derivatives_by_a_colliders_motion_shape_and_friction(name, kind):
     t = jnp.zeros(6).at[jnp.array(acts)].set(np.random.default_rng(1).normal(size=len(acts)))
     slope = float(gradient @ t)
     assert abs(float(jax.jit(lambda q: jax.jvp(outcome, (q,), (t,))[1])(at)) / slope - 1) < 1e-12
-    lengths = np.array([1e-4, 3e-5, 1e-5])
+    lengths = np.array([1e-6, 5e-7, 2.5e-7]) if kind == "separating" else np.array([1e-4, 3e-5, 1e-5])
     remainders = [abs(float(value(at + h * t) - value(at)) - h * slope) for h in lengths]
     assert abs(np.polyfit(np.log(lengths), np.log(remainders), 1)[0] - 2) < 0.1

@@ -9,10 +9,8 @@ from helpers import QUICK, assert_close, explicit_limit, ids, thorough
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.boundary._collider_contact import ColliderContact
-from mpmjax.boundary._contact import SWEEPS, constrain, find_active_set
-from mpmjax.boundary._plane_contact import PlaneContact
-from mpmjax.boundary._wall_contact import WallContact
+from mpmjax.boundary._contact import SWEEPS, ConstrainedNodes, constrain, find_active_set
+from mpmjax.boundary._mirror import Mirror
 from mpmjax.checks._values import canonical
 from mpmjax.implicit._solve_info import no_solve
 from mpmjax.stepping import NodeMotion
@@ -62,7 +60,7 @@ def _watch(scene, particles):
 
 def tumbling(floor, method, steps=1):
     """A step of a block that lands with one end and lifts off with the other."""
-    scene, particles = on_a_floor(floor, velocity=(0.3, -1.0))
+    scene, particles = on_a_floor(floor, velocity=(0.3, -1.0), height=-0.005 * DX if floor == "plain" else 0.0)
     spin = 8.0 * jnp.stack([-particles.x[:, 1], particles.x[:, 0] - 0.2], axis=1)
     particles = eqx.tree_at(lambda p: p.v, particles, particles.v + spin)
     return scene, particles, grid_update(scene, particles, 0.5 * explicit_limit(scene), method)
@@ -72,22 +70,32 @@ EACH_METHOD = pytest.mark.parametrize("method", **ids(METHODS | OTHERS, "semi_im
 NAMES = pytest.mark.parametrize("name", ["explicit", pytest.param("semi_implicit", marks=pytest.mark.slow)])
 
 
+def judged(step, method):
+    """For each contact of faces: the gaps that the springs feel, and the pushes where they are below zero."""
+    nodes = step.nodes
+    felt = method.mean_displacement(nodes, step.update.motion)
+    nothing_held = ConstrainedNodes(nodes, (), Mirror(()), nodes, felt)
+    for contact in nodes.contacts:
+        gap = contact.gap_felt(nothing_held)
+        yield contact, np.asarray(gap), contact.spring_impulse(nothing_held, gap < 0)
+
+
 @pytest.mark.parametrize("method", **ids(METHODS | OTHERS, "explicit", QUICK))
 def test_a_plain_wall_pushes_never_pulls_and_is_not_entered(method):
-    """v·n ≥ 0, reaction ≥ 0, and their product is zero, at every node."""
+    """What the walls give is what springs give that push where gaps are below zero, and nothing where they are not:
+    some of the foot is pushed, some has left."""
     _, _, step = tumbling("plain", method)
-    nodes, v = step.nodes, np.asarray(step.velocity)
-    wall, occupied = np.asarray(nodes.conditions.side[:, 1]) == 1, np.asarray(nodes.mass) > 0
-    held = wall & occupied & (v[:, 1] == 0)
-    impulse = np.asarray(step.reaction[:, 1])
-    assert int(step.info.contact.sweeps) <= SWEEPS
     assert int(step.info.contact.violations) == 0
-    assert held.any()
-    assert (v[wall & occupied, 1] > 0.1).any()
-    assert v[wall, 1].min() >= 0
-    assert impulse[held].min() >= 0
-    assert impulse[held].max() > 0
-    assert np.abs(impulse[~held]).max() < 1e-9 * impulse[held].max()
+    assert int(step.info.contact.sweeps) <= SWEEPS
+    (_, sides, _), (contact, gap, given) = judged(step, method)
+    assert sides.min() > 0
+    foot = np.asarray(contact.near)
+    assert (gap[foot] < 0).any()
+    assert (gap[foot] > 1e-4 * DX).any()
+    assert gap.min() > -0.02 * DX
+    impulse = np.asarray(step.reaction)
+    assert impulse[:, 1].sum() > 0
+    assert np.abs(impulse - np.asarray(given)).max() < 1e-8 * np.abs(given).max()
 
 
 @EACH_METHOD
@@ -301,9 +309,9 @@ def test_whatever_columns_are_held_mirroring_twice_is_mirroring_once(number):
         def attempt(held, guess):
             motion, info = method.advance(held.nodes, guess)
             motion = jax.tree.map(held.images.unfold, motion)
-            return motion.velocity, impulses(nodes, method, motion)[1], motion.carrier, info
+            return held, motion.velocity, impulses(nodes, method, motion)[1], motion.carrier, info
 
-        active, _, _, sweeps = find_active_set(nodes, nodes.velocity, attempt, no_solve(nodes.velocity.dtype))
+        active, _, _, sweeps = find_active_set(nodes, nodes.velocity, None, attempt, no_solve(nodes.velocity.dtype))
         held_on_plane = active[0].reshape(grid.shape)[4]  # the first plane's node along its axis
         held = constrain(nodes, active)
         loose = (held.nodes.free[:, 0].reshape(grid.shape)[4] & held_on_plane).any()
@@ -323,59 +331,42 @@ def test_whatever_columns_are_held_mirroring_twice_is_mirroring_once(number):
     assert partly > 10
 
 
-def in_touch(boundary):
-    """The nodes of a block on a boundary, of which nothing is held yet."""
+def in_touch(boundary, height=0.0):
+    """The nodes of a block on a boundary, or above it, of which nothing is held yet."""
     grid = mpm.Grid((10, 9), DX, origin=(-4, -3))
     block = mpm.fill(mpm.Box((-0.1, 0.0), (0.3, 0.2)), grid, density=1e3)
     scene = canonical(mpm.Scene(grid, LAW, boundary=boundary), float)
-    start = mpm.prepare(scene, block)
+    start = mpm.prepare(scene, eqx.tree_at(lambda b: b.x, block, block.x + jnp.asarray([0.0, height])))
     return particles_to_grid(scene, start, jnp.zeros(()), jnp.asarray(1e-3), scene.stencil(start))
-
-
-def places(contact):
-    """Where a contact can hold, shape (n,): at its walls, in its colliders, in all columns of its plane."""
-    match contact:
-        case WallContact():
-            return contact.side != 0
-        case ColliderContact():
-            return contact.leavable
-        case PlaneContact():
-            return jnp.ones_like(contact.image.along(contact.before), bool)
 
 
 @pytest.mark.thorough
 def test_a_verdict_is_given_beyond_rounding_only():
-    """Of what is held, what pulls by more than 1.5e-8 of its mass times the largest velocity, the root of the machine
-    precision; of what is not, what enters by more than 1.5e-8 of it. What a solver leaves does not count."""
-    slope = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (3.0, 4.0)))
-    for boundary in (FLOORS["plain"](0.0), FLOORS["mirrored"](0.0), slope):
-        nodes = in_touch(boundary)
-        touch, side, mass = nodes.conditions.colliders, nodes.conditions.side, np.asarray(nodes.mass)
-        inward, weight = np.array([0.0, 1.0]), mass
-        if touch is not None:
-            met, inward = touch.leavable, np.asarray(touch.normal)
-        elif side is not None:
-            met = side[:, 1] == 1
-        else:  # columns are seen at their nodes on the plane
-            (contact,) = nodes.contacts
-            met = contact.image.along(contact.before == 0)
-            weight = np.asarray(contact.image.column(contact._weight(nodes.mass)))
-        met = np.asarray(met) & (mass > 0)
+    """Of the columns that are held, those that pull by more than 1.5e-8 of their mass times the largest velocity, the
+    root of the machine precision; of those that are not, those that enter by more than 1.5e-8 of it. What a solver
+    leaves does not count."""
+    nodes = in_touch(FLOORS["mirrored"](0.0))
+    (contact,) = nodes.contacts
+    mass = np.asarray(nodes.mass)
+    met = np.asarray(contact.image.along(contact.before == 0)) & (
+        mass > 0
+    )  # columns are seen at their node on the plane
+    weight = np.asarray(contact.image.column(contact._weight(nodes.mass)))
 
-        def found(held, share):
-            """How many pull where all are held, or enter where none is, by a share of the largest velocity, 3 m/s."""
-            along = np.where(met[:, None], 3 * share * inward, 0)  # noqa: B023
-            fast = np.zeros_like(along)
-            fast[-1, 0] = 3.0
-            active = tuple(held & places(contact) for contact in nodes.contacts)  # noqa: B023
-            v = fast if held else fast + along * (weight / np.where(met, mass, 1))[:, None]  # noqa: B023
-            momentum_residual = weight[:, None] * along if held else 0 * along  # noqa: B023
-            return int(constrain(nodes, active).count_violations(jnp.asarray(v), jnp.asarray(momentum_residual)))  # noqa: B023
+    def found(held, share):
+        """How many pull where all are held, or enter where none is, by a share of the largest velocity, 3 m/s."""
+        along = np.where(met[:, None], 3 * share * np.array([0.0, 1.0]), 0)
+        fast = np.zeros_like(along)
+        fast[-1, 0] = 3.0
+        active = (jnp.full(len(mass), held),)
+        v = fast if held else fast + along * (weight / np.where(met, mass, 1))[:, None]
+        momentum_residual = weight[:, None] * along if held else 0 * along
+        return int(constrain(nodes, active).count_violations(jnp.asarray(v), jnp.asarray(momentum_residual)))
 
-        assert met.sum() > 3
-        for held in (True, False):
-            assert found(held, 1.0) == found(held, -1.4e-8) == 0
-            assert found(held, -1.6e-8) == met.sum()
+    assert met.sum() > 3
+    for held in (True, False):
+        assert found(held, 1.0) == found(held, -1.4e-8) == 0
+        assert found(held, -1.6e-8) == met.sum()
 
 
 @pytest.mark.thorough
@@ -383,10 +374,14 @@ def test_there_is_no_friction_where_a_wall_would_have_to_pull():
     """In a set that did not settle: friction takes speed, and never gives it."""
     slope = mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0)), friction=0.3)
     for boundary in (FLOORS["plain"](0.3), FLOORS["mirrored"](0.3), slope):
-        nodes = in_touch(boundary)
-        held = constrain(nodes, tuple(places(contact) for contact in nodes.contacts))
-        v = jnp.zeros_like(nodes.velocity).at[:, 0].set(1.0)
         for up in (-1.0, 1.0):
+            nodes = in_touch(boundary, -up * 0.02 * DX if boundary.pushes else 0.0)
+            places = [
+                contact.likely_held(ConstrainedNodes(nodes, (), Mirror(()), nodes), nodes.velocity)
+                for contact in nodes.contacts
+            ]
+            held = constrain(nodes, tuple(jnp.ones_like(place) for place in places))
+            v = jnp.zeros_like(nodes.velocity).at[:, 0].set(1.0)
             momentum_residual = up * nodes.mass[:, None] * jnp.asarray([0.0, 1.0])
             slowed = held.friction(v, momentum_residual)[0][:, 0]
             assert slowed.max() == 1
@@ -394,21 +389,23 @@ def test_there_is_no_friction_where_a_wall_would_have_to_pull():
 
 
 class Stubborn(mpm.Explicit):
-    """Nodes that a wall would have to pull where it holds them, and that enter it where it does not."""
+    """Nodes that a plane would have to pull where it holds them, and that enter it where it does not."""
 
     def advance(self, nodes, guess):
         del guess
-        return NodeMotion(-nodes.conditions.side), no_solve(float)
+        return NodeMotion(jnp.zeros_like(nodes.velocity).at[:, 1].set(-1.0)), no_solve(float)
 
 
 @pytest.mark.thorough
 def test_an_active_set_that_does_not_settle_is_given_up_after_four_sweeps():
     """And what is still wrong is reported."""
-    nodes = in_touch(FLOORS["plain"](0.0))
+    nodes = in_touch(FLOORS["mirrored"](0.0))
     pulled = eqx.tree_at(lambda n: n.sums.velocity, nodes, jnp.ones_like(nodes.velocity))
     new = update(pulled, Stubborn())
     assert new.contact.sweeps == SWEEPS == 4
-    assert int(new.contact.violations) == int(((nodes.conditions.side[:, 1] == 1) & (nodes.mass > 0)).sum())
+    (contact,) = nodes.contacts
+    columns = contact.image.along(contact.before == 0) & (nodes.mass > 0)
+    assert int(new.contact.violations) == int(columns.sum()) > 3
 
 
 @pytest.mark.thorough

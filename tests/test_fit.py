@@ -56,6 +56,18 @@ def both():
     return mpm.fit(experiment(seen, n=2), {"E": STIFFNESS, "nu": RATIO}, report=shear)
 
 
+def test_an_energy_as_analysis_says_it_is_an_observation():
+    """`mpm.energy` takes the particles of a run that is traced as it takes those of one that is done."""
+
+    def stored(scene, particles):
+        return mpm.energy(scene, particles).elastic
+
+    scene, particles = bar()
+    run = mpm.simulate(scene, particles, t1=STEPS * DT, dt=DT, save_every=3, observe=stored)
+    seen = mpm.Series(np.asarray(run.times)[1:], np.asarray(run.observed)[1:], stored, sigma=1e-4)
+    assert mpm.fit(experiment(seen), {"E": STIFFNESS}).values["E"] == pytest.approx(7e4, rel=1e-6)
+
+
 def test_tracks_fix_stiffness_and_poissons_ratio(both):
     """Within four standard errors, of which they are few per cent; missing markers count as none."""
     assert both.converged

@@ -107,7 +107,9 @@ def test_the_command_fits_prints_and_writes(bar):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(("line", "says"), [("starts = 3", "searches "), ("horizons = [0.02]", "until")])
+@pytest.mark.parametrize(
+    ("line", "says"), [("starts = 3\nfraction = 1", "3 points, 3 searches"), ("horizons = [0.02]", "until")]
+)
 def test_a_file_asks_for_a_better_start(bar, line, says):
     """Then for the fit from there, and the profile that the option names."""
     (bar / "start.toml").write_text(BAR + FIT.replace("[fit]\n", f"[fit]\n{line}\n"))
@@ -126,11 +128,19 @@ def test_an_unknown_profile_is_refused_before_the_fit(bar):
     assert "what is fitted is E" in err
 
 
-def test_starts_and_horizons_exclude_each_other(bar):
-    (bar / "start.toml").write_text(BAR + FIT.replace("[fit]\n", "[fit]\nstarts = 3\nhorizons = true\n"))
+@pytest.mark.parametrize(
+    ("lines", "says"),
+    [
+        ("starts = 3\nhorizons = true", "either starts or horizons"),
+        ("starts = 3\nfraction = 1.5", "fraction must be from 0 to 1, got 1.5"),
+        ("fraction = 0.5", "fraction is one of starts"),
+    ],
+)
+def test_starts_that_do_not_fit_get_one_line(bar, lines, says):
+    (bar / "start.toml").write_text(BAR + FIT.replace("[fit]\n", f"[fit]\n{lines}\n"))
     code, _, err = shell("fit", bar / "start.toml")
     assert code == 2
-    assert "either starts or horizons" in err
+    assert says in err
 
 
 def test_another_scene_file_is_another_experiment(bar):

@@ -13,9 +13,11 @@ from helpers import DESCRIPTIONS, GRADIENTS, TRANSFERS, assert_close, block, exp
 from test_boundary_forces import METHODS, angular_momentum, shaken
 
 import mpmjax as mpm
+from mpmjax.boundary import constrain
 from mpmjax.cli._scene_file import read_scene_file
 from mpmjax.geometry import surface_pieces
 from mpmjax.io._schema import decode, encode
+from mpmjax.stepping._nodes import particles_to_grid
 
 SIDE = 0.3
 TOP = mpm.Patch(mpm.Box((0.0, 0.0), (SIDE, SIDE)), mpm.Box((-1.0, 0.29), (1.0, 1.0)))
@@ -171,6 +173,29 @@ def test_springs_and_dashpots_are_exact_in_the_solve(method):
             x, v = np.linalg.solve(np.eye(2) - q2 * dt * A, start + dt * A @ (q0 * start + q1 * inner))
         expected.append([x, v])
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+def test_springs_to_the_ground_and_of_contact_make_one_potential():
+    """At a symmetry plane, with a floor that pushes: the force is minus the energy's derivative, and the Hessian minus
+    the force's, also as matrices; both kinds of springs take part."""
+    floor = mpm.SeparatingBox((-np.inf, 0.02), (np.inf, np.inf))
+    scene, particles = loaded(mpm.Spring(TOP, 5e4), boundary=(mpm.SymmetryPlane(0, 0.0), floor))
+    nodes = particles_to_grid(scene, particles, 0.0, 1e-3, scene.stencil(particles), force_at=1.0)
+    shut = tuple(contact.gap < 0 for contact in nodes.contacts)
+    potential = constrain(nodes, shut).nodes.potential
+    assert potential.springs
+    assert potential.supports
+    u, du = (
+        jnp.where(nodes.occupied, a, 0) for a in 1e-3 * np.random.default_rng(0).normal(size=(2, *nodes.force.shape))
+    )
+    assert_close(potential.force(u), -jax.grad(potential.energy)(u), 1e-10)
+    action = mpm.AnalyticHessian().at_step_start(potential)
+    resistance = -jax.jvp(potential.force, (jnp.zeros_like(u),), (du,))[1]
+    assert_close(action(du), resistance, 1e-10)
+    assert_close(action.precomputed()(du), resistance, 1e-10)
+    for without in ("springs", "supports"):
+        other = eqx.tree_at(lambda q, name=without: getattr(q, name), potential, ())
+        assert np.abs(np.asarray(other.force(u) - potential.force(u))).max() > 1e-3
 
 
 def test_the_stable_step_knows_springs():

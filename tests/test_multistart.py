@@ -1,5 +1,7 @@
 """Many searches at once: starts, data sets, draws, and what is refused."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,31 +10,36 @@ import pytest
 from test_fit import DT, NOISE, STEPS, STIFFNESS, bar, experiment, tracks
 
 import mpmjax as mpm
-from mpmjax.fitting._batch import Problems, search_many
+from mpmjax.fitting._batch import Problems, costs_at, search_many
+from mpmjax.fitting._linkage import critical_distance, linked
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._search import search
-from mpmjax.fitting._starting_points import starting_points
+from mpmjax.fitting._starting_points import starting_points, unit_points
 
 LM = mpm.LevenbergMarquardt()
 TIMES = np.linspace(0.001, 0.05, 40)
 
 
 class Oscillation(FitProblem):
-    """cos ωt of data with noise, in the place of a simulation that fails beyond the ω of a limit: its minima lie a
-    period apart, and their places follow from a scan."""
+    """cos ωt of data with noise, in the place of a simulation that fails beyond ω = 2000, and has no derivative within
+    15 of `gap`: its minima lie a period apart."""
 
-    def __init__(self, experiments, parameters, limit=4000.0):
-        del experiments
+    gap: float
+
+    def __init__(self, experiments, parameters, memory=None, gap=np.inf):
+        del experiments, memory
         scene, particles = bar()
         rng = np.random.default_rng(0)
         seen = mpm.Series(TIMES, np.cos(400 * TIMES) + 0.01 * rng.normal(size=40), mpm.Extent(0), sigma=0.01)
         self.experiments = (mpm.Experiment(scene, particles, t1=STEPS * DT, dt=DT, observations=seen),)
         self.names, self.parameters = ("omega",), tuple(parameters.values())
         self.starts = (jnp.asarray(self.parameters[0].start),)
+        self.gap = gap
 
     def residuals(self, z, sigmas, adjoint):
         (omega,) = self.values(z)
         predicted = jnp.cos(jnp.where(omega < 2000, omega, jnp.nan) * jnp.asarray(TIMES))
+        predicted += jnp.where(abs(omega - self.gap) < 15, jnp.sqrt(0 * omega), 0)  # zero, without a derivative there
         return self.observations[0].residuals(predicted, sigmas[0]), jnp.zeros(1)
 
 
@@ -41,14 +48,23 @@ OMEGA = mpm.Positive(lambda e: e.scene.material.youngs_modulus, start=500.0)
 
 @pytest.fixture
 def oscillation(monkeypatch):
-    for room in ("_multistart", "_fit"):
-        monkeypatch.setattr(f"mpmjax.fitting.{room}.FitProblem", Oscillation)
-    return lambda **options: mpm.fit_multistart([], {"omega": OMEGA}, **options)
+    def fitted(gap=np.inf, **options):
+        for room in ("_multistart", "_fit"):
+            monkeypatch.setattr(f"mpmjax.fitting.{room}.FitProblem", partial(Oscillation, gap=gap))
+        return mpm.fit_multistart([], {"omega": OMEGA}, **options)
+
+    return fitted
 
 
-def test_many_starts_find_the_least_of_many_minima(oscillation):
-    """ω = 400 from 500, from which a fit ends at 549; searches from beyond 2000 fail, and hinder no other."""
-    found = oscillation(starts=24, ranges={"omega": (100.0, 4000.0)}, batch=5)
+RANGES = {"omega": (100.0, 4000.0)}
+NO_DERIVATIVE = "there is no derivative"
+
+
+@pytest.mark.parametrize("fraction", [0.375, 1.0])
+def test_many_starts_find_the_least_of_many_minima(oscillation, fraction):
+    """ω = 400 from 500, from which a fit ends at 549. Simulations fail beyond 2000, a search from 804 has no
+    derivative, and they hinder no other. Searches from fewer than half of the points stand for all, or all are."""
+    found = oscillation(gap=795.0, starts=32, fraction=fraction, ranges=RANGES, batch=5)
     with pytest.warns(UserWarning, match="times the noise given"):
         alone = mpm.fit([], {"omega": OMEGA})
     assert abs(alone["omega"].value - 400) > 100
@@ -58,12 +74,79 @@ def test_many_starts_find_the_least_of_many_minima(oscillation):
     misfits = [m.misfit for m in found.minima]
     assert misfits == sorted(misfits)
     assert min(abs(alone["omega"].value / end - 1) for end in ends) < 2e-3
-    counted = sum(len(m.members) for m in found.minima) + len(found.failures) + len(found.unfinished)
-    assert counted == found.count == 24
+    counted = sorted(k for m in found.minima for k in m.members) + list(found.failures) + list(found.unfinished)
+    assert sorted(counted) == list(range(32))
+    assert found.count == 32
     started = found.starts["omega"]
-    assert set(found.failures) == set(np.flatnonzero(started >= 2000))
     assert started[0] == pytest.approx(500)
-    assert "searches" in str(found)
+    (gap,) = np.flatnonzero(abs(started - 795) < 15)
+    assert {k for k, why in found.failures.items() if why == NO_DERIVATIVE} == {gap}
+    assert set(found.failures) == {gap, *np.flatnonzero(started >= 2000)}
+    assert {0, gap} <= set(found.searched)
+    assert sum(m.searches for m in found.minima) == len(set(found.searched) - set(found.failures))
+    assert len(found.searched) == 32 if fraction == 1 else len(found.searched) < 16
+    assert f"32 points, {len(found.searched)} searches" in str(found)
+
+
+def test_points_are_linked_anew_where_a_search_fails(oscillation):
+    """The best point, 362, stands for all that lead to ω = 400, and has no derivative."""
+    with pytest.warns(UserWarning, match="found by one search of"):
+        found = oscillation(gap=362.0, starts=32, fraction=0, ranges=RANGES, batch=5)
+    (best,) = np.flatnonzero(abs(found.starts["omega"] - 362) < 15)
+    assert best in found.searched
+    assert found.failures[best] == NO_DERIVATIVE
+    assert found["omega"].value == pytest.approx(400, abs=4 * found["omega"].error)
+    assert len(found.searched) < 10
+
+
+@pytest.mark.thorough
+def test_searches_from_few_points_find_what_searches_from_all_find():
+    """The least minimum of the oscillation, for each of ten scramblings of 63 points, by half of the searches."""
+    problem = Oscillation([], {"omega": OMEGA})
+    sigmas, found = problem.first_sigmas, []
+    for seed in range(10):
+        shares = unit_points(63, 1, seed)
+        points = starting_points(problem, shares, {"omega": (100.0, 750.0)})[1:]
+        members = search_many(
+            Problems.of([problem], shared=True), LM, points, sigmas=Problems.of([sigmas], shared=True), batch=63
+        )
+        least = np.array([m.minimum.history[-1].cost for m in members])
+        stands = linked(shares, costs_at(problem, points, sigmas, 63), fraction=0.375)
+        assert least[np.unique(stands)].min() == pytest.approx(least.min(), rel=1e-3)
+        found.append((len(np.unique(stands)), np.median(least) / least.min()))
+    searches, worse = np.array(found).T
+    assert worse.min() > 100  # most searches end at false minima
+    assert searches.mean() < 63 / 2
+
+
+@pytest.mark.parametrize(("size", "volume"), [(1, 2.0), (2, np.pi), (3, 4 / 3 * np.pi)])
+def test_the_critical_ball_holds_a_known_part_of_the_points(size, volume):
+    """2 ln k of k even points of the unit cube."""
+    for count in (8, 64, 1000):
+        assert volume * critical_distance(count, size) ** size * count == pytest.approx(2 * np.log(count))
+
+
+def test_points_are_linked_to_better_neighbours():
+    """Of two basins and a failure: searches start from the best eighth, and from the bottom of the other basin."""
+    shares = unit_points(255, 2, 0)
+    centres, depths = np.array([[0.2, 0.3], [0.8, 0.7]]), np.array([1.0, 0.8])
+    bowls = ((shares[:, None] - centres) ** 2).sum(-1) + 1 - depths
+    costs, right = bowls.min(1), bowls.argmin(1) == 1
+    costs[7] = np.nan
+    stands = linked(shares, costs, fraction=1 / 8)
+    own = np.flatnonzero(stands == np.arange(255))
+    assert stands[7] == -1
+    assert set(np.argsort(costs)[:32]) <= set(own)
+    distances = np.linalg.norm(shares[:, None] - shares, axis=-1)
+    for k in set(np.flatnonzero(costs > np.sort(costs[np.isfinite(costs)])[31])):
+        nearer = distances[k] <= critical_distance(255, 2)
+        assert (k in own) == (not (costs[nearer] < costs[k]).any())
+        assert costs[stands[k]] <= costs[k]
+    deep, bottom = (np.flatnonzero(side)[np.nanargmin(costs[side])] for side in (~right, right))
+    assert {deep, bottom} <= set(own)
+    assert len(own) < 40
+    assert linked(shares[:0], costs[:0], fraction=1 / 8).shape == (0,)
+    assert np.flatnonzero(linked(shares, costs, fraction=1) != np.arange(255)) == [7]
 
 
 def test_a_search_among_many_goes_where_it_goes_alone():
@@ -92,7 +175,7 @@ def test_starting_points_fill_what_is_known_of_each_parameter():
         "m": mpm.Positive(lambda e: e.particles.mass, prior=mpm.Gaussian(0.01, 0.01)),
     }
     problem = FitProblem((one,), parameters)
-    points = starting_points(problem, 129, {"E": (1e3, 1e6)}, 0)
+    points = starting_points(problem, unit_points(128, problem.size, 0), {"E": (1e3, 1e6)})
     assert points.shape == (129, problem.size)
     assert not points[0].any()
     values = dict(zip(problem.names, jax.jit(jax.vmap(problem.values))(jnp.asarray(points[1:])), strict=True))
@@ -109,6 +192,7 @@ REFUSED = {
     "a bound": ({"ranges": {"omega": (0.0, 2.0)}}, "positive numbers"),
     "shrinking": ({"ranges": {"omega": (3.0, 2.0)}}, "must grow"),
     "none": ({"starts": 0}, "at least 1"),
+    "more than all": ({"fraction": 1.5}, "from 0 to 1"),
 }
 
 

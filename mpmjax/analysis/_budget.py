@@ -168,6 +168,7 @@ def _budget(
             dt,
             stencil,
             body_force_at=method.body_force_at,
+            force_at=method.force_at(),
             explicit_viscosity=method.explicit_viscosity,
             viscosity_apart=True,
         )

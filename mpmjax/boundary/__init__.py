@@ -16,7 +16,6 @@ from mpmjax.boundary._combined import (
     brought_contacts,
     brought_images,
     combined_conditions,
-    contacts_of,
     mirror,
     mirror_motion,
 )
@@ -30,13 +29,25 @@ from mpmjax.boundary._contact import (
     find_active_set,
     no_contact,
 )
+from mpmjax.boundary._faces import EXPLICIT_STIFFNESS, IMPLICIT_STIFFNESS, Faces, FaceShape
 from mpmjax.boundary._grip import Grip
 from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion, Tie
 from mpmjax.boundary._planes import ContactPlane, SymmetryPlane
 from mpmjax.boundary._rigid_part import RigidPart
+from mpmjax.boundary._springs import (
+    Springs,
+    spring_answer,
+    spring_diagonal,
+    spring_energy,
+    spring_force,
+    spring_resistance,
+)
+from mpmjax.boundary._surface_contact import Surface
 from mpmjax.boundary._walls import SeparatingBox, SlipBox, StickyBox
 
 __all__ = [
+    "EXPLICIT_STIFFNESS",
+    "IMPLICIT_STIFFNESS",
     "ON_THE_WALL",
     "AbstractBoundary",
     "AbstractCollider",
@@ -48,6 +59,8 @@ __all__ = [
     "ConstrainedNodes",
     "ContactInfo",
     "ContactPlane",
+    "FaceShape",
+    "Faces",
     "Given",
     "Grip",
     "Image",
@@ -59,8 +72,10 @@ __all__ = [
     "SeparatingCollider",
     "SlipBox",
     "SlipCollider",
+    "Springs",
     "StickyBox",
     "StickyCollider",
+    "Surface",
     "SymmetryPlane",
     "Tie",
     "Wall",
@@ -68,7 +83,6 @@ __all__ = [
     "brought_images",
     "combined_conditions",
     "constrain",
-    "contacts_of",
     "find_active_set",
     "impulse_on_boundaries",
     "impulse_on_colliders",
@@ -78,5 +92,10 @@ __all__ = [
     "no_contact",
     "no_impulse",
     "owners_of",
+    "spring_answer",
+    "spring_diagonal",
+    "spring_energy",
+    "spring_force",
+    "spring_resistance",
     "taken_by_mirrors",
 ]

@@ -1,8 +1,9 @@
 """What a boundary is.
 
-Every boundary acts on the grid alone; the transfers know nothing of it. A wall acts on the nodes at and beyond it; a
-node within a thousandth of a spacing of a wall counts as on it. Where walls, planes and grips lie only selects nodes,
-so derivatives with respect to it are zero.
+Every boundary acts on the grid alone; the transfers know nothing of it. What holds material acts on the nodes at and
+beyond it; a node within a thousandth of a spacing of a wall counts as on it. Where such walls, planes and grips lie
+only selects nodes, so derivatives with respect to it are zero. What pushes material and may be left acts where the
+particles' faces touch its surface (`surfaces`), and has derivatives by its place and size.
 """
 
 import abc
@@ -13,7 +14,9 @@ import equinox as eqx
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact
+from mpmjax.boundary._faces import Faces
 from mpmjax.boundary._mirror import Image, MirrorMotion, Tie
+from mpmjax.boundary._surface_contact import Surface
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import Motion
 
@@ -43,6 +46,10 @@ class AbstractBoundary(eqx.Module):
 
     bodies: ClassVar[int] = 0
     """Number of bodies in its `Conditions.colliders`; what they receive is recorded."""
+    pushes: ClassVar[bool] = False
+    """Whether it has surfaces that push material away (see `surfaces`)."""
+    sees_faces: ClassVar[bool] = False
+    """Whether its contacts ask where the faces of particles are (see `facing`)."""
 
     @property
     @abc.abstractmethod
@@ -81,7 +88,7 @@ class AbstractBoundary(eqx.Module):
     ) -> tuple[AbstractContact, ...]:
         """The contacts that it brings in the step from t to t + dt (see `AbstractContact`). Default: none.
 
-        Those of `Conditions.side` and `Conditions.colliders` are made for it.
+        Those of its `surfaces` are made for it.
 
         Args:
             conditions: the conditions of all of the scene's boundaries.
@@ -91,6 +98,29 @@ class AbstractBoundary(eqx.Module):
             dt: step [s].
         """
         del conditions, grid, window, t, dt
+        return ()
+
+    def facing(self, own: tuple[AbstractContact, ...], faces: Faces) -> tuple[AbstractContact, ...]:
+        """Its contacts with the faces of particles known, if it `sees_faces`. Default: as they are.
+
+        Args:
+            own: its `contacts`.
+            faces: the faces of the particles at the start of the step.
+        """
+        del faces
+        return own
+
+    def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, force_time: Scalar) -> tuple[Surface, ...]:
+        """The rigid surfaces that push the faces of particles in the step from t to t + dt, if it `pushes`. Default:
+        none.
+
+        Args:
+            x: the particles' positions at t [m], shape (p, d).
+            t: time [s].
+            dt: step [s].
+            force_time: the time at which they push [s]: t in an explicit step, else t + dt.
+        """
+        del x, t, dt, force_time
         return ()
 
     def mirror_images(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image | Tie, ...]:

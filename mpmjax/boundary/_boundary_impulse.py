@@ -43,14 +43,12 @@ def no_boundary_impulse(boundaries: int, dim: int, dtype: Any) -> BoundaryImpuls
 
 
 class Owners(eqx.Module):
-    """The numbers of the boundaries that act on each component of the nodes' velocity, −1 for none."""
+    """The numbers of the boundaries that hold each component of the nodes' velocity, −1 for none."""
 
     fixed: Int[Array, "n d"]
     """Which one prescribes it, shape (n, d)."""
-    side: Int[Array, "n d"]
-    """Whose separating wall is there, shape (n, d)."""
     collider: Int[Array, "n"]
-    """Whose normal is held or pushed, shape (n,)."""
+    """Whose normal is held, shape (n,)."""
 
 
 def owners_of(
@@ -65,12 +63,10 @@ def owners_of(
 ) -> Owners:
     """The owners by the rules of `combined_conditions`, whose result is `conditions`: the earlier one holds."""
     nobody = jnp.full(nodes.shape, -1, jnp.int32)
-    fixed, side, bodies = nobody, nobody, []
+    fixed, bodies = nobody, []
     for number, boundary in enumerate(boundaries):
         own = boundary.conditions(nodes, spacing, t, dt, reference=reference)
         fixed = jnp.where((fixed < 0) & own.fixed, number, fixed)
-        if own.side is not None:
-            side = jnp.where((side < 0) & (own.side != 0), number, side)
         bodies += [number] * (0 if own.colliders is None else len(own.colliders.pivots))
     for boundary in boundaries:
         fixed = boundary.spread(fixed >= 0, fixed, nodes, spacing)[1]
@@ -78,7 +74,7 @@ def owners_of(
     if conditions.colliders is not None:
         owner = conditions.colliders.owner
         collider = jnp.where(owner < 0, -1, jnp.asarray(bodies, jnp.int32)[owner])
-    return Owners(fixed, side, collider)
+    return Owners(fixed, collider)
 
 
 class Given(eqx.Module):

@@ -1,4 +1,5 @@
-"""Colliders: rigid bodies of any shape that move as prescribed, and hold or push the nodes that lie in them.
+"""Colliders: rigid bodies of any shape that move as prescribed, and hold the nodes that lie in them, or push the
+particles' faces.
 
 A node lies in a collider up to a thousandth of a spacing off its surface; its normal there is the gradient of the
 shape's distance, and its velocity that of the collider's own point, the chord over the step. Which nodes lie in it has
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Bool, Float, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import ColliderConditions, Conditions
-from mpmjax.boundary._contact import refuse_contact
+from mpmjax.boundary._surface_contact import Surface, refuse_contact
 from mpmjax.checks import canonical, require, require_between, require_fields
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractMotion, AbstractRegion, length, still
@@ -99,17 +100,8 @@ class StickyCollider(AbstractCollider):
         body = _Body(self, nodes, t, dt, reference)
         inside = body.holds(spacing)[:, None]
         fixed = jnp.broadcast_to(inside, nodes.shape)
-        nothing = jnp.zeros_like(nodes)
-        touched = ColliderConditions(
-            normal=nothing,
-            velocity=nothing,
-            held=jnp.zeros(len(nodes), bool),
-            owner=jnp.full(len(nodes), -1, jnp.int32),
-            holder=jnp.where(fixed, 0, -1).astype(jnp.int32),
-            position=body.position,
-            pivots=body.pivot[None],
-            pivot_velocity=body.pivot_velocity[None],
-        )
+        holder = jnp.where(fixed, 0, -1).astype(jnp.int32)
+        touched = eqx.tree_at(lambda c: c.holder, body.nothing_held(), holder)
         return Conditions(fixed, jnp.where(fixed, body.velocity, 0), colliders=touched)
 
 
@@ -149,15 +141,15 @@ class SlipCollider(AbstractCollider):
 class SeparatingCollider(AbstractCollider):
     """A body that the material may leave, and along which it slides with Coulomb friction.
 
-    At a node in it either the normal velocity is the body's and the body pushes, or the node moves outward and the body
-    does nothing (see `AbstractContact`). Friction is an impulse applied after the solve, opposed to the
-    tangential velocity relative to the body and at most `friction` times the normal impulse: it lags the solve by one
-    step's elastic response.
+    It pushes where a particle's face, half its width before its centre, is behind its surface, as the walls of a
+    `SeparatingBox` do. Friction is an impulse applied after the solve, opposed to the tangential velocity relative to
+    the body and at most `friction` times the normal impulse: it lags the solve by one step's elastic response.
 
-    Accurate to first order in the spacing: contact is felt at the nodes, one layer of which is up to a spacing deep in
-    the body.
-    *When it breaks*: a body or part of it that is thinner than two spacings holds too few nodes to keep material out,
-    and one that moves through more than a spacing in a step leaves some behind. Not in the total description.
+    It has derivatives by its place and size, and those of its motion.
+
+    *When it breaks*: as a `SeparatingBox`. A body or part of it that is thinner than two spacings does not keep
+    material out, and one that moves through more than a spacing in a step leaves some behind. Not in the total
+    description.
 
     Args:
         shape: the body before its motion.
@@ -168,21 +160,31 @@ class SeparatingCollider(AbstractCollider):
     shape: AbstractRegion
     motion: AbstractMotion | None = None
     friction: Scalar = 0.0
+    pushes: ClassVar[bool] = True
 
     def __check_init__(self):
         require_fields(self)
         require_between("SeparatingCollider's friction", self.friction, 0, 1e6)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        """(v − v_c)·n ≥ 0 ⟂ reaction ≥ 0."""
-        touched = _Body(self, nodes, t, dt, reference).conditions(spacing)
-        touched = eqx.tree_at(
-            lambda c: (c.held, c.leavable, c.friction),
-            touched,
-            (jnp.zeros_like(touched.held), touched.held, jnp.where(touched.held, self.friction, 0).astype(nodes.dtype)),
-            is_leaf=lambda leaf: leaf is None,
+        """None on nodes: it acts on faces. Its pivot, for torques."""
+        return Conditions(
+            jnp.zeros(nodes.shape, bool),
+            jnp.zeros_like(nodes),
+            colliders=_Body(self, nodes, t, dt, reference).nothing_held(),
         )
-        return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), colliders=touched)
+
+    def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, force_time: Scalar) -> tuple[Surface, ...]:
+        """That of the body; none where the distance has no slope, as a sampled one may have none."""
+        motion = canonical(still(self.dim), x.dtype) if self.motion is None else self.motion
+        place = motion.origin(x, force_time)
+        distance, slope = jax.vjp(self.shape.distance, place)
+        (slope,) = slope(jnp.ones_like(distance))
+        steepness = length(slope)
+        sloping = steepness > 0
+        normal = motion.turned(slope / jnp.where(sloping, steepness, 1)[:, None], force_time)
+        velocity = motion.velocity_of(motion.origin(x, t), t, dt)
+        return (Surface(jnp.where(sloping, distance, jnp.inf), normal.T, self.friction, velocity.T),)
 
     def check(self, grid: Grid, *, total: bool) -> None:
         del grid
@@ -218,6 +220,20 @@ class _Body(eqx.Module):
     def holds(self, spacing: Scalar) -> Bool[Array, "n"]:
         """Which nodes lie in the body, shape (n,)."""
         return self.shape.contains(self.place, ON_THE_WALL * spacing)
+
+    def nothing_held(self) -> ColliderConditions:
+        """The conditions of a body that holds no node."""
+        nothing = jnp.zeros_like(self.nodes)
+        return ColliderConditions(
+            normal=nothing,
+            velocity=nothing,
+            held=jnp.zeros(len(self.nodes), bool),
+            owner=jnp.full(len(self.nodes), -1, jnp.int32),
+            holder=jnp.full(self.nodes.shape, -1, jnp.int32),
+            position=self.position,
+            pivots=self.pivot[None],
+            pivot_velocity=self.pivot_velocity[None],
+        )
 
     def conditions(self, spacing: Scalar) -> ColliderConditions:
         """The conditions of a body that holds the normal velocity of every node in it, but for nodes where the distance

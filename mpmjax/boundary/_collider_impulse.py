@@ -14,7 +14,8 @@ from mpmjax.linalg import pairs
 class ColliderImpulse(eqx.Module):
     """Linear and angular impulse on each of k colliders. Divided by the step they are its mean force and torque.
 
-    At a symmetry plane only the true nodes count, not their images.
+    At a symmetry plane only the true nodes count, not their images; but springs push
+    the faces of particles, and so all nodes.
     """
 
     impulse: Float[Array, "*f k d"]
@@ -40,22 +41,23 @@ def impulse_on_colliders(
     colliders: ColliderConditions,
     reaction: NodeVector,
     normal_impulse: NodeScalar | None = None,
-    friction: NodeVector | None = None,
+    pushes: tuple[tuple[int, NodeVector], ...] = (),
 ) -> ColliderImpulse:
-    """The impulse on each collider: minus what it gives the nodes by prescribed components, along normals, by friction.
+    """The impulse on each collider: minus what it gives the nodes by prescribed components, along normals, by springs
+    and friction.
 
     Args:
         colliders: the conditions of the colliders, with which node and component is whose.
-        reaction: the impulse of all walls and bodies on the nodes, without friction [kg m/s], shape (n, d).
+        reaction: the impulse of all that holds nodes, without springs and friction [kg m/s], shape (n, d).
         normal_impulse: the part of it by colliders, along their normals [kg m/s], shape (n,).
-        friction: the impulse of the colliders' friction on the nodes [kg m/s], shape (n, d).
+        pushes: impulses by springs and friction on the nodes [kg m/s], shape (n, d), each with its collider's number.
     """
     along = jnp.zeros_like(reaction) if normal_impulse is None else normal_impulse[:, None] * colliders.normal
-    along = along if friction is None else along + friction
     impulse, angular = [], []
     for number, pivot in enumerate(colliders.pivots):
         given = jnp.where((colliders.owner == number)[:, None], along, 0)
         given = given + jnp.where(colliders.holder == number, reaction, 0)
+        given = sum((push for owner, push in pushes if owner == number), start=given)
         impulse.append(-given.sum(axis=0))
         angular.append(-moment(colliders.position - pivot, given).sum(axis=0))
     return ColliderImpulse(jnp.stack(impulse), jnp.stack(angular))

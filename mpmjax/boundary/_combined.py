@@ -5,11 +5,11 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Int, NodeVector, Scalar
 from mpmjax.boundary._boundary import AbstractBoundary
-from mpmjax.boundary._collider_contact import collider_contacts
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact
+from mpmjax.boundary._faces import Faces
 from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion, Tie
-from mpmjax.boundary._wall_contact import wall_contacts
+from mpmjax.boundary._surface_contact import surface_contact
 from mpmjax.discretisation import Grid
 
 
@@ -32,50 +32,16 @@ def combined_conditions(
     for boundary in boundaries:
         new = boundary.conditions(nodes, spacing, t, dt, reference=reference)
         velocity = jnp.where(total.fixed, total.velocity, new.velocity)
-        side, friction = total.side, total.friction
-        if new.side is not None and new.friction is not None:
-            if side is None or friction is None:
-                side, friction = new.side, new.friction
-            else:
-                friction = jnp.where(side != 0, friction, new.friction)
-                side = jnp.where(side != 0, side, new.side)
         colliders = total.colliders
         if new.colliders is not None:
             holder = jnp.where(total.fixed, -1, new.colliders.holder)
             mine = eqx.tree_at(lambda c: c.holder, new.colliders, holder)
             colliders = mine if colliders is None else colliders.beside(mine)
-        total = Conditions(total.fixed | new.fixed, velocity, side, friction, colliders)
+        total = Conditions(total.fixed | new.fixed, velocity, colliders)
     for boundary in boundaries:
         fixed, velocity = boundary.spread(total.fixed, total.velocity, nodes, spacing)
-        total = Conditions(fixed, velocity, total.side, total.friction, total.colliders)
-    if total.side is None:
-        return total
-    side = jnp.where(total.fixed, 0, total.side)
-    return Conditions(total.fixed, total.velocity, side, total.friction, total.colliders)
-
-
-def contacts_of(
-    boundaries: tuple[AbstractBoundary, ...],
-    conditions: Conditions,
-    grid: Grid,
-    window: Int[Array, "d"],
-    t: Scalar,
-    dt: Scalar,
-) -> tuple[AbstractContact, ...]:
-    """The contacts of a scene, in the order of their friction.
-
-    Of separating walls and of colliders a node has one of each, where several meet the earlier: so their contacts are
-    those of the combined conditions. Any other contact is brought by a boundary itself.
-
-    Args:
-        boundaries: the scene's boundaries.
-        conditions: what they ask of the nodes.
-        grid: the grid.
-        window: lattice index of the window's first node, shape (d,).
-        t: time [s].
-        dt: step [s].
-    """
-    return tuple(contact for _, contact in brought_contacts(boundaries, conditions, grid, window, t, dt))
+        total = Conditions(fixed, velocity, total.colliders)
+    return total
 
 
 def brought_contacts(
@@ -85,13 +51,33 @@ def brought_contacts(
     window: Int[Array, "d"],
     t: Scalar,
     dt: Scalar,
-) -> list[tuple[int | None, AbstractContact]]:
-    """The contacts of `contacts_of`, each with the number of the boundary that brings it, None for those of the
-    combined conditions."""
-    found: list[tuple[int | None, AbstractContact]]
-    found = [(None, contact) for contact in (*wall_contacts(conditions), *collider_contacts(conditions))]
+    faces: Faces | None,
+    force_time: Scalar,
+) -> list[tuple[int, AbstractContact]]:
+    """The contacts of a scene, in the order of their friction, each with the number of its boundary: those that
+    boundaries bring, and those of their surfaces with the particles' faces.
+
+    Args:
+        boundaries: the scene's boundaries.
+        conditions: what they ask of the nodes.
+        grid: the grid.
+        window: lattice index of the window's first node, shape (d,).
+        t: time [s].
+        dt: step [s].
+        faces: the particles' faces; None if no boundary has a surface.
+        force_time: the time at which forces act [s].
+    """
+    found: list[tuple[int, AbstractContact]] = []
+    bodies = 0
     for number, boundary in enumerate(boundaries):
-        found += [(number, contact) for contact in boundary.contacts(conditions, grid, window, t, dt)]
+        own = boundary.contacts(conditions, grid, window, t, dt)
+        own = own if faces is None or not boundary.sees_faces else boundary.facing(own, faces)
+        if faces is not None and boundary.pushes:
+            body = bodies if boundary.bodies else None
+            surfaces = boundary.surfaces(faces.x, t, dt, force_time)
+            own = (*own, *(surface_contact(one, faces, body) for one in surfaces))
+        found += [(number, contact) for contact in own]
+        bodies += boundary.bodies
     return sorted(found, key=lambda brought: brought[1].friction_order)
 
 

@@ -1,16 +1,16 @@
-"""The conditions of boundaries on the nodes: prescribed velocities, separating walls, colliders."""
+"""The conditions of boundaries on the nodes: prescribed velocities, and those of colliders."""
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, Mask, NodeVector, Scalar
 
 
 class ColliderConditions(eqx.Module):
     """The conditions of k colliders on the nodes that lie in them."""
 
     normal: NodeVector
-    """Unit normal out of the collider that holds or pushes the node along it, shape (n, d); zero where none does."""
+    """Unit normal out of the collider that holds the node along it, shape (n, d); zero where none does."""
     velocity: NodeVector
     """Velocity of that collider there [m/s], shape (n, d)."""
     held: Bool[Array, "n"]
@@ -25,10 +25,6 @@ class ColliderConditions(eqx.Module):
     """The points about which the colliders' torques are taken [m], shape (k, d)."""
     pivot_velocity: Float[Array, "k d"]
     """Their velocity [m/s], shape (k, d)."""
-    leavable: Bool[Array, "n"] | None = None
-    """Whether the node may leave, shape (n,); None where there is no such collider."""
-    friction: NodeScalar | None = None
-    """Coulomb coefficient there [-], shape (n,)."""
     slides: bool = eqx.field(static=True, default=False)
     """Whether there is a body along which nodes slide."""
 
@@ -38,11 +34,6 @@ class ColliderConditions(eqx.Module):
 
         def numbered(n: Array) -> Array:
             return jnp.where(n < 0, n, n + number)
-
-        def joined(a: Array | None, b: Array | None) -> Array | None:
-            if a is None or b is None:
-                return a if b is None else jnp.where(mine, jnp.zeros_like(b), b)
-            return jnp.where(mine, a, b)
 
         mine = self.owner >= 0
         touched = mine | (self.holder >= 0).any(axis=1)
@@ -55,8 +46,6 @@ class ColliderConditions(eqx.Module):
             position=jnp.where(touched[:, None], self.position, later.position),
             pivots=jnp.concatenate([self.pivots, later.pivots]),
             pivot_velocity=jnp.concatenate([self.pivot_velocity, later.pivot_velocity]),
-            leavable=joined(self.leavable, later.leavable),
-            friction=joined(self.friction, later.friction),
             slides=self.slides or later.slides,
         )
 
@@ -74,9 +63,5 @@ class Conditions(eqx.Module):
     """Components of velocity that are prescribed, shape (n, d)."""
     velocity: NodeVector
     """Their values [m/s], shape (n, d); zero elsewhere."""
-    side: NodeVector | None = None
-    """Inward normal (+1 or −1) of a separating wall in each direction, 0 where there is none; None without any."""
-    friction: NodeVector | None = None
-    """Coulomb coefficient of that wall [-]."""
     colliders: ColliderConditions | None = None
     """Conditions of colliders; None without any."""

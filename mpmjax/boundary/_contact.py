@@ -1,14 +1,17 @@
 """Contact: boundaries that push but do not pull.
 
-At each place of such a boundary the velocity v with which the gap opens and the normal impulse r obey v ≥ 0, r ≥ 0,
-v r = 0. A place is a node, or for a contact plane a column of nodes, described at all of its nodes; masks of places
-have shape (n,). The *active set* is the mask of the places that are held shut, one for each contact.
+A place of such a boundary is a particle, whose face is before or behind a surface; for a contact plane a column of
+nodes, described at all of its nodes; for a contact of one's own a node. Its gap g and the normal impulse r obey g ≥ 0,
+r ≥ 0, g r = 0; for columns and nodes g is the velocity with which the gap opens. For particles this holds of the gap
+with its spring's length (see `Springs`). The *active set* is the mask of the places that are held shut, one for each
+contact, of shape (p,) or (n,).
 
-The active set is guessed as the places into which the explicit velocity v* drives the material. Then, at most `SWEEPS`
-times: solve with the active set held; release the places that would have to pull, hold those that are entered; stop
-when nothing changes. The conditions that are violated after that are counted in `ContactInfo.violations`. The last
+The active set is guessed as the places that the start of the step, or the explicit velocity v*, closes. Then, at most
+`SWEEPS` times: solve with the active set held; release the places that would have to pull, hold those that are entered;
+stop when nothing changes. The conditions that are violated after that are counted in `ContactInfo.violations`. The last
 solve, with the set settled and started from the last sweep's result, is the one that is differentiated: its derivative
-is that of the active set found, and does not exist where the set changes.
+is that of the active set found, and does not exist where the set changes. An explicit step's force is known at its
+start, and with it which faces are behind their surface: it needs no sweep.
 
 Friction is an impulse at the places held, applied after the solve against the tangential velocity (at a collider, that
 relative to it) and at most μ times the normal impulse (Coulomb). It is not part of the implicit system, so it lags by
@@ -17,7 +20,7 @@ the elastic response of one step.
 
 import abc
 from collections.abc import Callable
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -26,12 +29,12 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._mirror import Image, Mirror
-from mpmjax.checks import require
+from mpmjax.boundary._springs import Springs
 
 SWEEPS = 4
 """Most active sets that are tried in a step."""
 
-ActiveSet = tuple[Bool[Array, "n"], ...]
+ActiveSet = tuple[Bool[Array, "..."], ...]
 """The places that are held, one mask for each contact."""
 
 
@@ -66,13 +69,16 @@ class AbstractNodes(eqx.Module):
         """The mirror images of symmetry planes, and of the columns that are held."""
 
     @abc.abstractmethod
-    def constrained(self: "N", images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None) -> "N":
+    def constrained(
+        self: "N", images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None, springs: tuple[Springs, ...]
+    ) -> "N":
         """These nodes with more of them held.
 
         Args:
             images: mirrors on which the nodes are folded.
             fixed: components of velocity that are prescribed, shape (n, d).
             normals: nodes whose component along a collider's normal is held too, shape (n,).
+            springs: the springs of what is held by springs.
         """
 
     @abc.abstractmethod
@@ -90,14 +96,21 @@ class AbstractContact(eqx.Module):
     components of velocity, `fixed`. The rest has defaults.
     """
 
-    of_collider: ClassVar[bool] = False
-    """Whether colliders receive its friction."""
+    @property
+    def collider(self) -> int | None:
+        """The number of the collider that receives its impulse by springs and friction; None if none does."""
+        return None
 
     @property
     def friction_order(self) -> float:
         """Frictions act one after the other, from the lowest number on: that of a wall is its axis, of a contact plane
         its axis and a half, of colliders 3. Default: 4, after all of these."""
         return 4.0
+
+    @property
+    def known_at_start(self) -> bool:
+        """Whether `likely_held` is the active set of a step whose force is that at its start. Default: False."""
+        return False
 
     @property
     def mirror_image(self) -> Image | None:
@@ -165,6 +178,21 @@ class AbstractContact(eqx.Module):
         del active
         return jnp.zeros(shape, bool)
 
+    def springs(self, active: Array) -> Springs | None:
+        """The springs of the places held; None without any."""
+        del active
+        return None
+
+    def spring_impulse(self, held: "ConstrainedNodes", active: Array) -> NodeVector | None:
+        """The impulse of its springs on all nodes [kg m/s], shape (n, d), not folded at mirrors; None without springs.
+
+        Args:
+            held: the nodes with the active set held, and their displacement.
+            active: the places of this contact that are held.
+        """
+        del held, active
+        return None
+
     def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
         """The components of velocity on which the held places act, shape (n, d). Default: those of `fixed`."""
         return self.fixed(active, shape)
@@ -172,21 +200,6 @@ class AbstractContact(eqx.Module):
     def normals(self, active: Array) -> Bool[Array, "n"] | None:
         """The nodes whose component along a collider's normal is held, shape (n,); None without any."""
         del active
-        return None
-
-    def blocked(self, held: "ConstrainedNodes", v: NodeVector, noise: Array) -> Bool[Array, "n"] | None:
-        """The places that must be released because another boundary drives their nodes away; None without any."""
-        del held, v, noise
-        return None
-
-    def owner(self, owners: Any) -> Int[Array, "n"] | None:
-        """The number of the boundary whose contact it is at each node, shape (n,). Default: None, the one that brought
-        it is everywhere.
-
-        Args:
-            owners: which boundaries act where (`Owners`).
-        """
-        del owners
         return None
 
     def representative(self) -> Bool[Array, "n"] | None:
@@ -220,6 +233,9 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     """The mirrors in the columns that are held."""
     nodes: N
     """The nodes with the active set held."""
+    displacement: NodeVector | None = None
+    """The displacement at which forces that are linear in it have their mean over the step [m], shape (n, d), mirrored
+    as velocities are; None for none, as in an explicit step."""
 
     @property
     def normal(self) -> NodeVector | None:
@@ -278,9 +294,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         pulling, entering = [], []
         for contact, active in zip(self.unheld.contacts, self.active, strict=True):
             gap, impulse = contact.rounding(self, noise)
-            pulls = contact.normal_impulse(self, residual) < -impulse
-            blocked = contact.blocked(self, v, noise)
-            pulling.append(active & (pulls if blocked is None else pulls | blocked))
+            pulling.append(active & (contact.normal_impulse(self, residual) < -impulse))
             entering.append(~active & (contact.gap_velocity(self, v) < -gap))
         return tuple(pulling), tuple(entering)
 
@@ -288,12 +302,23 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         """How many places pull or are entered."""
         return _count(self.unheld, *self.violations(v, residual))
 
+    def beside_springs(self, residual: NodeVector) -> NodeVector:
+        """The residual without the impulses of springs: what holds components of velocity.
+
+        Args:
+            residual: the impulse that is missing at each node [kg m/s], shape (n, d).
+        """
+        for contact, active in zip(self.unheld.contacts, self.active, strict=True):
+            impulse = contact.spring_impulse(self, active)
+            residual = residual if impulse is None else residual - self.unheld.mirror.fold(impulse)
+        return residual
+
     def friction(self, v: NodeVector, residual: NodeVector) -> tuple[NodeVector, tuple[NodeVector, ...]]:
         """The velocity after Coulomb friction, one contact after the other, and the change of velocity by each [m/s].
 
         Args:
             v: velocity of all nodes after the solve [m/s], shape (n, d).
-            residual: the impulse that is missing at each node [kg m/s], shape (n, d).
+            residual: the impulse that holds components of velocity [kg m/s], shape (n, d).
         """
         changes = []
         for contact, active in zip(self.unheld.contacts, self.active, strict=True):
@@ -301,6 +326,19 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
             v = v + change
             changes.append(self.images.unfold(change))
         return self.images.unfold(v), tuple(changes)
+
+    def pushes(self, slowed: tuple[NodeVector, ...]) -> tuple[tuple[int, NodeVector], ...]:
+        """The impulses of colliders on the nodes by springs and friction [kg m/s], each with the collider's number.
+
+        Args:
+            slowed: the change of velocity by the friction of each contact [m/s], shape (n, d).
+        """
+        found = []
+        for contact, active, change in zip(self.unheld.contacts, self.active, slowed, strict=True):
+            if contact.collider is not None:
+                rubbed, impulse = self.unheld.mass[:, None] * change, contact.spring_impulse(self, active)
+                found.append((contact.collider, rubbed if impulse is None else rubbed + impulse))
+        return tuple(found)
 
 
 def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
@@ -317,23 +355,29 @@ def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
         fixed = fixed | contact.fixed(mask, fixed.shape)
         along = contact.normals(mask)
         normals = along if normals is None else normals
-    return ConstrainedNodes(nodes, active, images, nodes.constrained(images, fixed, normals))
+    springs = tuple(found for contact, mask in pairs if (found := contact.springs(mask)) is not None)
+    return ConstrainedNodes(nodes, active, images, nodes.constrained(images, fixed, normals, springs))
 
 
 def find_active_set(
     nodes: AbstractNodes,
     guess: NodeVector,
-    attempt: Callable[[ConstrainedNodes, NodeVector], tuple[NodeVector, NodeVector, NodeVector, Any]],
+    start: NodeVector | None,
+    attempt: Callable[[ConstrainedNodes, NodeVector], tuple[ConstrainedNodes, NodeVector, NodeVector, NodeVector, Any]],
     cost: Any,
+    *,
+    explicit: bool = False,
 ) -> tuple[ActiveSet, NodeVector, Any, Int[Array, ""]]:
     """The active set, a velocity to start the last solve from, and what the sweeps cost.
 
     Args:
         nodes: nodes of which no contact holds anything yet.
         guess: where the first solve starts [m/s], shape (n, d).
-        attempt: (constrained nodes, guess) to (velocity, missing impulse [kg m/s] of all nodes, guess of the next
-            solve, report). It is not differentiated.
+        start: a guess of `ConstrainedNodes.displacement` [m], shape (n, d).
+        attempt: (constrained nodes, guess) to (constrained nodes with their displacement, velocity, missing impulse
+            [kg m/s] of all nodes, guess of the next solve, report). It is not differentiated.
         cost: the report of no solve.
+        explicit: whether forces are those at the start of the step.
 
     Returns:
         active set, velocity, the sweeps' reports added up, number of sweeps.
@@ -342,7 +386,7 @@ def find_active_set(
     def sweep(state: tuple) -> tuple:
         active, guess, cost, _, count = state
         held = constrain(nodes, active)
-        v, residual, guess, info = attempt(held, guess)
+        held, v, residual, guess, info = attempt(held, guess)
         pulls, enters = held.violations(v, residual)
         active = jax.tree.map(lambda was, pulled, entered: (was & ~pulled) | entered, active, pulls, enters)
         return active, guess, cost.followed_by(info), _count(nodes, pulls, enters) > 0, count + 1
@@ -351,10 +395,13 @@ def find_active_set(
         return state[3] & (state[4] < SWEEPS)
 
     predictor = nodes.explicit_velocity()
-    nothing_held = ConstrainedNodes(nodes, (), Mirror(()), nodes)
+    nothing_held = ConstrainedNodes(nodes, (), Mirror(()), nodes, start)
     active = tuple(contact.likely_held(nothing_held, predictor) for contact in nodes.contacts)
-    start = (active, guess, cost, jnp.asarray(True), jnp.asarray(0, dtype=jnp.int32))
-    active, guess, cost, _, count = jax.lax.while_loop(unsettled, sweep, start)
+    none = jnp.asarray(0, dtype=jnp.int32)
+    if explicit and all(contact.known_at_start for contact in nodes.contacts):
+        return active, guess, cost, none
+    first = (active, guess, cost, jnp.asarray(True), none)
+    active, guess, cost, _, count = jax.lax.while_loop(unsettled, sweep, first)
     return active, guess, cost, count
 
 
@@ -366,16 +413,3 @@ def _count(nodes: AbstractNodes, *sets: ActiveSet) -> Int[Array, ""]:
             one = contact.representative()
             total = total + (mask if one is None else mask & one).sum().astype(jnp.int32)
     return total
-
-
-def refuse_contact(total: bool) -> None:
-    """Refuse contact that is judged by where material is in the total description, whose nodes do not know it.
-
-    Raises:
-        ValueError: the description is total Lagrangian.
-    """
-    require(
-        not total,
-        "In the total description there is no contact: use the updated one, or SymmetryPlane or SlipBox for a wall "
-        "that is never left.",
-    )

@@ -1,12 +1,19 @@
 """Contact with mirrored planes."""
 
+import math
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
+from mpmjax.boundary._friction import friction_across
 from mpmjax.boundary._mirror import Image, Mirror
-from mpmjax.boundary._wall_contact import friction_across
+from mpmjax.discretisation import Stencil, scatter
+
+SHUT = 1e-2
+"""The gap up to which a plane holds what is before it, in spacings."""
 
 
 class PlaneContact(AbstractContact):
@@ -16,8 +23,9 @@ class PlaneContact(AbstractContact):
     column's nodes on the plane and twice that of the images (a node and its image share equally). The gap velocity is
     what r works on: the mean, with weights 2 m m'/(m + m'), of the v + v' of nodes and their images, and of the v of
     nodes on the plane (where the two are one). So an explicit step that holds the column has
-    r = −Σ 2 m m'/(m + m') (v* + v*'), and the two conditions exclude each other. Columns that are each other's image in
-    another plane are held together. Friction acts on the column's node on the plane, or half a spacing before it.
+    r = −Σ 2 m m'/(m + m') (v* + v*'), and the two conditions exclude each other. Columns that no particle reaches whose
+    face is at the plane are not held. Columns that are each other's image in another plane are held together. Friction
+    acts on the column's node on the plane, or half a spacing before it.
     """
 
     image: Image
@@ -28,6 +36,20 @@ class PlaneContact(AbstractContact):
     """How many half spacings each node along the axis lies before the plane, shape (m,)."""
     coefficient: Scalar
     """Coulomb coefficient [-]."""
+    shut: Bool[Array, "n"] | None = None
+    """The columns that may be held, shape (n,); None for all."""
+
+    def where(self, shut: Bool[Array, "p"], stencil: Stencil) -> "PlaneContact":
+        """This contact in the columns that the stencil of some particles reaches.
+
+        Args:
+            shut: those particles, shape (p,).
+            stencil: stencil of the particles.
+        """
+        reached = self.image.column(
+            scatter(stencil, shut.astype(stencil.weights.dtype)[None], None, math.prod(self.image.shape))[:, 0]
+        )
+        return replace(self, shut=reached > 0)
 
     @property
     def mirror_image(self) -> Image:
@@ -41,7 +63,8 @@ class PlaneContact(AbstractContact):
         """The momentum with which each column leaves the plane [kg m/s]: its weights times what its velocity lacks of
         the mirror's."""
         lacking = (v - self.image.vector(v))[:, self.image.axis]
-        return self._tied(held, self.inward * self.image.column(self._weight(held.unheld.mass) * lacking))
+        columns = self.inward * self.image.column(self._weight(held.unheld.mass) * lacking)
+        return self._tied(held, columns if self.shut is None else jnp.where(self.shut, columns, 0))
 
     def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> NodeScalar:
         """The normal impulse of each column [kg m/s]."""

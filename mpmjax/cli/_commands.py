@@ -289,7 +289,8 @@ def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> Fit
     if asked.optimiser is not None:
         common["optimiser"] = asked.optimiser
     if asked.starts > 1:
-        many = fit_multistart(asked.experiments, asked.parameters, starts=asked.starts, **common)
+        look = {"starts": asked.starts, "fraction": asked.fraction}
+        many = fit_multistart(asked.experiments, asked.parameters, **look, **common)
         print(many)
         return asked._replace(parameters=many.best.restarted(asked.parameters))
     if not asked.horizons:

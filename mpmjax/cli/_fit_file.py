@@ -47,7 +47,9 @@ class FitFile(NamedTuple):
     level: float
     optimiser: AbstractOptimiser | None
     starts: int
-    """From how many points it is searched first; one for none but the first guess."""
+    """Over how many points a first guess is looked for; one for none but the file's own."""
+    fraction: float
+    """Of these the fraction, the best ones, from which it is searched whatever is near."""
     horizons: tuple[float, ...] | bool
     """Until which times it is fitted first [s]; true to choose them, false for none."""
     refine: tuple[int, ...]
@@ -107,7 +109,7 @@ def read_fit(path: Path, read: Callable[[Path], Simulation] = read_simulation) -
 
 
 _TABLES = ("parameter", "observation", "experiment", "report")
-_SETTINGS = ("level", "starts", "horizons", "refine")
+_SETTINGS = ("level", "starts", "fraction", "horizons", "refine")
 _KEYS = {*_TABLES, *_SETTINGS, "t1", "optimiser"}
 
 
@@ -119,20 +121,24 @@ def _require_keys(table: dict[str, Any], where: str, known: set[str]) -> None:
 
 
 def _settings(table: dict[str, Any]) -> dict[str, Any]:
-    """Level, optimiser, starts, horizons and refinements of a [fit] table."""
+    """Level, optimiser, starts and their fraction, horizons and refinements of a [fit] table."""
 
     def settings(
         *,
         level: Scalar = 0.95,
         starts: int = 1,
+        fraction: Scalar = 0.375,
         horizons: tuple[float, ...] | bool = False,
         refine: int | tuple[int, ...] = (),
     ) -> dict[str, Any]:
         require(0 < level < 1, f"[fit] level must lie between 0 and 1, got {level!r}.")
         require(starts > 0, f"[fit] starts must be one at least, got {starts}.")
+        require(0 <= fraction <= 1, f"[fit] fraction must be from 0 to 1, got {fraction!r}.")
+        require(starts > 1 or "fraction" not in table, "[fit] fraction is one of starts: give these too.")
         require(starts == 1 or not horizons, "[fit] takes either starts or horizons.")
         finer = refinements(refine if isinstance(refine, tuple) else (refine,), "[fit] refine")
-        return {"level": float(level), "starts": starts, "horizons": horizons, "refine": finer}
+        numbers = {"level": float(level), "starts": starts, "fraction": float(fraction)}
+        return numbers | {"horizons": horizons, "refine": finer}
 
     own = {key: value for key, value in table.items() if key in _SETTINGS}
     optimiser = _optimiser(table["optimiser"]) if "optimiser" in table else None

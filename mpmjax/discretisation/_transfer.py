@@ -100,8 +100,9 @@ class FLIP(AbstractTransfer):
     """FLIP(α): particles take the change of the grid's velocity, blended with PIC (J. U. Brackbill, H. M. Ruppel,
     J. Comput. Phys. 65 (1986) 314, doi 10.1016/0021-9991(86)90211-1).
 
-    v ← α (v + Σ_i w_ip (v_i^{n+1} − v_i^n)) + (1 − α) Σ_i w_ip v_i^{n+1}. With α = 1 it dissipates nothing, not even
-    noise in the null space of the transfer.
+    v ← α (v + Σ_i w_ip (v_i^{n+1} − v_i^n)) + (1 − α) Σ_i w_ip v_i^{n+1}. Where a wall or grip holds a component of a
+    node's velocity, v_i^n has the prescribed value too, so that the particles keep what the boundary has no claim to.
+    With α = 1 it dissipates nothing, not even noise in the null space of the transfer.
 
     Args:
         alpha: share of FLIP, from 0 (PIC) to 1.
@@ -197,7 +198,8 @@ def g2p(
         transfer: the transfer.
         stencil: stencil of the particles.
         v: the particles' velocity before the step [m/s], shape (d, p).
-        before: v_i^n [m/s], shape (n, d); needed by transfers with `needs_change` only.
+        before: v_i^n with the prescribed values where a boundary holds [m/s], shape (n, d); needed by transfers with
+            `needs_change` only.
         after: v_i^{n+1} [m/s], shape (n, d).
         mean: the velocity v̄_i with which positions and deformation move [m/s], shape (n, d). Default: v_i^{n+1}.
         C: the particles' affine velocity before the step [1/s], shape (d, d, p), if they have one.

@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -25,6 +26,11 @@ class Member(NamedTuple):
     """Why it failed, in words."""
     joined: int | None = None
     """The number of the search that it came upon, and was ended for."""
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether it was ended, or not begun, by an interruption."""
+        return self.failure == _NOT_BEGUN or (self.minimum is not None and self.minimum.interrupted)
 
 
 class Problems(eqx.Module):
@@ -136,13 +142,39 @@ def search_many(
                 progress(len(done), count)
     except KeyboardInterrupt:
         done |= {lanes.members[lane]: lanes.stopped(lane, interrupted=True) for lane in lanes.busy}
-        done |= {k: Member(None, "was not begun: the search was interrupted") for k in range(count) if k not in done}
+        done |= {k: Member(None, _NOT_BEGUN) for k in range(count) if k not in done}
     return tuple(done[k] for k in range(count))
 
 
+def costs_at(
+    problem: FitProblem,
+    points: Float[np.ndarray, "k n"],
+    sigmas: tuple[Array, ...],
+    batch: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> Float[np.ndarray, "k"]:
+    """½ Σ r² at many points, without derivatives; NaN where a simulation fails.
+
+    Args:
+        problem: the problem.
+        points: the coordinates.
+        sigmas: the noise of each observation.
+        batch: how many are computed together.
+        progress: called with how many are done, and of how many.
+    """
+    costs = np.empty(len(points))
+    for first in range(0, len(points), batch):
+        own = points[np.minimum(np.arange(first, first + batch), len(points) - 1)]
+        costs[first : first + batch] = _costs(problem, own, sigmas)[: len(points) - first]
+        if progress is not None:
+            progress(min(first + batch, len(points)), len(points))
+    return costs
+
+
 def batch_size(problem: FitProblem, given: int | None, count: int) -> int:
-    """How many searches of `count` to compute together, unless it is given: eight with explicit steps, where they cost
-    less than one by one, and one with implicit ones, where all wait for the slowest solve (`benchmarks/multistart.py`).
+    """How many points or searches of `count` to compute together, unless it is given: eight with explicit steps, where
+    they cost less than one by one, and one with implicit ones, where all wait for the slowest solve
+    (`benchmarks/multistart.py`).
     """
     if given is not None:
         return min(require_whole("batch", given, 1), count)
@@ -232,7 +264,7 @@ class _Lanes:
         """A search as it is."""
         member, seen = self.members[lane], self.seen[lane] if self.history[lane] else None
         if seen is None:
-            return Member(None, "was not begun: the search was interrupted")
+            return Member(None, _NOT_BEGUN)
         problem, sigmas = self.problems.one(member), self.sigmas.one(member)
         z = jnp.array(self.z[lane], problem.dtype)  # a copy: `take` writes to self.z
         r, J = seen.residuals, seen.jacobian
@@ -258,6 +290,19 @@ class _Lanes:
                 ended[member] = self.stopped(lane)._replace(joined=near[0])
                 self.leave(lane)
         return ended
+
+
+@eqx.filter_jit
+def _costs(
+    problem: FitProblem, points: Float[np.ndarray, "b n"] | Array, sigmas: tuple[Array, ...]
+) -> Float[Array, "b"]:
+    """½ Σ r² at some points together, compiled."""
+
+    def cost(z: Coordinates) -> Array:
+        r, _ = problem.residuals(z, sigmas, diffrax.ForwardMode())
+        return (r**2).sum() / 2
+
+    return jax.vmap(cost)(jnp.asarray(points, problem.dtype))
 
 
 @eqx.filter_jit
@@ -291,6 +336,7 @@ def _iterate(
     return eqx.filter_vmap(one, in_axes=(axes[0], 0, axes[1], eqx.if_array(0)))(own, z, sigmas, state)
 
 
+_NOT_BEGUN = "was not begun: the search was interrupted"
 _DIFFERENT = (
     "The data sets of an ensemble must differ in numbers alone, but number {} has other shapes, choices or functions "
     "than the first: give each the same times and markers (NaN where nothing was measured), and the same functions."

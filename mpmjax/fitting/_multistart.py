@@ -9,18 +9,19 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Scalar
-from mpmjax.checks import checked, require_whole, warn
-from mpmjax.fitting._batch import Member, Problems, batch_size, search_many
+from mpmjax._types import Float, Int, Scalar
+from mpmjax.checks import checked, require_between, require_whole, warn
+from mpmjax.fitting._batch import Member, Problems, batch_size, costs_at, search_many
 from mpmjax.fitting._choice import chosen_optimiser
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import explain, fit, require_influence
+from mpmjax.fitting._linkage import linked
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._result import Estimate, FitResult
 from mpmjax.fitting._search import Minimum
-from mpmjax.fitting._starting_points import starting_points
+from mpmjax.fitting._starting_points import starting_points, unit_points
 
 
 class LocalMinimum(NamedTuple):
@@ -30,8 +31,10 @@ class LocalMinimum(NamedTuple):
     """The value of each parameter, in its shape."""
     misfit: float
     """Root mean square of the residuals, in units of σ, or of the size of the data where σ is not given."""
+    searches: int
+    """How many searches ended there."""
     members: tuple[int, ...]
-    """The numbers, from 0, of the searches that ended there; the first guess is 0."""
+    """The numbers, from 0, of the points that these searches stand for; the first guess is 0."""
 
 
 class MultistartFit(eqx.Module):
@@ -45,17 +48,19 @@ class MultistartFit(eqx.Module):
     minima: tuple[LocalMinimum, ...]
     """The distinct minima, the best first."""
     starts: dict[str, np.ndarray]
-    """Where each search started: the values of each parameter, shape (k, ...)."""
+    """The points: the values of each parameter, shape (k, ...)."""
+    searched: tuple[int, ...]
+    """The numbers of the points from which searches started."""
     failures: dict[int, str]
-    """Why searches failed, by their number."""
+    """Why the simulation at a point, or the search from it, failed, by the number of the point."""
     unfinished: tuple[int, ...]
-    """The numbers of the searches that came to no minimum within the optimiser's steps."""
+    """The numbers of the points from which no search came to a minimum within the optimiser's steps."""
     iterations: int
     """How many iterations all searches took."""
 
     @property
     def count(self) -> int:
-        """Number of searches."""
+        """Number of points."""
         return len(next(iter(self.starts.values())))
 
     def __getitem__(self, label: str) -> Estimate:
@@ -69,17 +74,19 @@ class MultistartFit(eqx.Module):
     def __str__(self) -> str:
         """The table of the best fit, then one of the minima."""
         labels = self.best.problem.labels
-        lines = [str(self.best), "", f"{'searches':>8} {'misfit/σ':>10}  " + "".join(f"{a:>14}" for a in labels[:4])]
+        head = f"{'points':>8} {'searches':>8} {'misfit/σ':>10}  " + "".join(f"{label:>14}" for label in labels[:4])
+        told = f"{self.count} points, {len(self.searched)} searches, {self.iterations} iterations"
+        lines = [str(self.best), "", told, head]
         for found in self.minima[:_SHOWN]:
             numbers = np.concatenate([value.reshape(-1) for value in found.values.values()])
             shown = "".join(f"{number:>14.6g}" for number in numbers[:4])
-            lines.append(f"{len(found.members):>8} {found.misfit:>10.4g}  {shown}")
+            lines.append(f"{len(found.members):>8} {found.searches:>8} {found.misfit:>10.4g}  {shown}")
         if len(self.minima) > _SHOWN:
             lines.append(f"and {len(self.minima) - _SHOWN} minima with a larger misfit.")
         if self.unfinished:
-            lines.append(f"{len(self.unfinished)} of {self.count} searches came to no minimum.")
+            lines.append(f"{len(self.unfinished)} of {self.count} points led to no minimum.")
         if self.failures:
-            lines.append(f"{len(self.failures)} of {self.count} searches failed, number {_listed(self.failures)}.")
+            lines.append(f"{len(self.failures)} of {self.count} points failed, number {_listed(self.failures)}.")
         return "\n".join(lines)
 
 
@@ -89,6 +96,7 @@ def fit_multistart(
     parameters: dict[str, AbstractParameter],
     *,
     starts: int = 64,
+    fraction: Scalar = 0.375,
     ranges: dict[str, tuple[float, float]] | None = None,
     seed: int = 0,
     batch: int | None = None,
@@ -97,18 +105,24 @@ def fit_multistart(
     optimiser: AbstractOptimiser | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> MultistartFit:
-    """Fit from many starting points at once: the best minimum, with its errors, and what other minima there are.
+    """Look over many points for where fits start: the best minimum, with its errors, and what other minima there are.
 
         found = mpm.fit_multistart(pull, {"E": ...}, starts=64, ranges={"E": (1e4, 1e7)})
         print(found)
 
-    It starts from the first guess and from scrambled Sobol points over the ranges; of a parameter without one, over its
+    The points are the first guess and scrambled Sobol points over the ranges; of a parameter without one, over its
     prior, between its bounds, from a tenth to ten times the first guess of a `Positive`, and one coordinate to each
-    side of an `Unbounded` one. Searches run together, `batch` in one compiled program; one that is done leaves its
-    place to the next. A search whose simulation fails ends alone. One that comes within a hundredth, in each
-    coordinate, of another with a lower cost is ended, and counted where that one ends; one whose sum of squares three
-    moves, or six iterations, have lowered by less than a hundredth is ended there, as at a minimum. Those that come
-    within twice the least sum of squares are searched on, and the best is then fitted as `fit` does.
+    side of an `Unbounded` one. The simulation runs once at each of them, without derivatives. Searches start from the
+    first guess, from a fraction of the points, the best ones, and from each that has no better one within the critical
+    distance of multi-level single linkage (A. H. G. Rinnooy Kan, G. T. Timmer, Mathematical Programming 39 (1987)
+    57-78). They stand for the others, each of which is linked to the nearest better one. Where a search comes to no
+    minimum, the points that it stood for are linked anew, without it.
+
+    Searches run together, `batch` in one compiled program; one that is done leaves its place to the next. Points and
+    searches whose simulation fails hinder no others. A search that comes within a hundredth, in each coordinate, of
+    another with a lower cost is ended, and counted where that one ends; one whose sum of squares three moves, or six
+    iterations, have lowered by less than a hundredth is ended there, as at a minimum. Those that come within twice the
+    least sum of squares are searched on, and the best is then fitted as `fit` does.
 
     Two searches ended at one minimum where their coordinates differ by less than two hundredths, or where the misfit
     hides the difference: Δᵀ JᵀJ Δ ≤ n s² of n coordinates, J and s² = Σ r²/(m − n), or one if σ is given and that is
@@ -120,78 +134,109 @@ def fit_multistart(
     Args:
         experiments: see `fit`.
         parameters: see `fit`.
-        starts: how many searches.
+        starts: how many points, the first guess among them.
+        fraction: of the points, the best ones, from which searches start whatever is near. 1 searches from all of them,
+            without a look; 0 only from those of single linkage and the first guess.
         ranges: lowest and highest value to start from, by the name of a parameter.
         seed: of the starting points.
-        batch: how many searches run together. Default: eight with explicit steps, one with implicit ones.
+        batch: how many points, and searches, run together. Default: eight with explicit steps, one with implicit ones.
         report: see `fit`.
         level: see `fit`.
         optimiser: the method of each search, and of the last fit. Default: as `fit` chooses.
-        progress: called with a line, such as `print`, as searches end, and by the last fit.
+        progress: called with a line, such as `print`, as points are done, as searches end, and by the last fit.
 
     Raises:
-        ValueError: as `fit`; a range of no parameter, or outside of its bounds; no search that could start.
-        SimulationError: no search could start, and the simulation at the first guess meets a fault.
+        ValueError: as `fit`; a range of no parameter, or outside of its bounds; no search that came to a minimum.
+        SimulationError: no search came to a minimum, and the simulation at the first guess meets a fault.
     """
     require_whole("starts", starts, 1)
+    require_between("fraction", fraction, 0, 1)
     problem = FitProblem((experiments,) if isinstance(experiments, Experiment) else tuple(experiments), parameters)
     optimiser = chosen_optimiser(problem) if optimiser is None else optimiser
-    points = starting_points(problem, starts, dict(ranges or {}), seed)
+    shares = unit_points(starts - 1, problem.size, require_whole("seed", seed, 0))
+    points = starting_points(problem, shares, dict(ranges or {}))
     sigmas = problem.first_sigmas
-    told = [0]
-
-    def say(done: int, count: int) -> None:
-        if progress is not None and done > told[0]:
-            told[0] = done
-            progress(f"{done} of {count} searches are done")
-
-    def begun(member: int, seen: Evaluation) -> None:
-        if member == 0:
-            require_influence(problem, sigmas, seen)
-
+    size = batch_size(problem, batch, starts)
+    look = fraction < 1
+    costs = costs_at(problem, points, sigmas, size, _teller(progress, "simulations")) if look else np.zeros(starts)
+    failures = {int(k): _FAILS for k in np.flatnonzero(~np.isfinite(costs))}
     together = partial(
         search_many,
         Problems.of([problem], shared=True),
         optimiser,
         sigmas=Problems.of([sigmas], shared=True),
-        batch=batch_size(problem, batch, starts),
+        batch=size,
         joining=_JOINED,
     )
-    members = together(points, settling=_SETTLED, progress=say, begun=begun)
-    groups = _grouped(problem, _ends(members))
+    members: dict[int, Member] = {}
+    chosen: list[int] = []
+
+    def begun(number: int, seen: Evaluation) -> None:
+        if chosen[number] == 0:
+            require_influence(problem, sigmas, seen)
+
+    while True:
+        stands = _stands(shares, costs, fraction)
+        chosen = sorted(set(stands.tolist()) - {-1, *members}, key=lambda k: (k > 0, costs[k]))
+        if not chosen:
+            break
+        found = together(points[chosen], settling=_SETTLED, progress=_teller(progress, "searches"), begun=begun)
+        joined = [None if m.joined is None else chosen[m.joined] for m in found]
+        members |= {k: m._replace(joined=end) for k, m, end in zip(chosen, found, joined, strict=True)}
+        if any(m.interrupted for m in found):
+            break
+        costs[[k for k in chosen if _end(members, k) is None]] = np.nan
+    failures |= {k: m.failure for k, m in members.items() if m.minimum is None}
+    groups = _grouped(problem, _ends(members, stands))
     if not groups:
         explain(problem, jnp.zeros(problem.size, problem.dtype))
-        raise ValueError(f"No search of {starts} came to a minimum: {_failures(members).get(0, 'raise max_steps')}.")
+        raise ValueError(f"No search of {len(members)} came to a minimum: {failures.get(0, 'raise max_steps')}.")
     near = sum(_cost(found) <= _NEAR_BEST * _cost(groups[0][0]) for found, _ in groups[:_SHOWN])
     further = together(np.array([found.z for found, _ in groups[:near]], float))
     on = [(groups[k][0] if m.minimum is None else m.minimum, groups[k][1]) for k, m in enumerate(further)]
     groups = _grouped(problem, [*on, *groups[near:]])
-    minima = tuple(_local_minimum(problem, found, numbers) for found, numbers in groups)
+    minima = tuple(_local_minimum(problem, found, numbers, len(members.keys() & numbers)) for found, numbers in groups)
     restarted = {name: replace(p, start=minima[0].values[name]) for name, p in parameters.items()}
     best = fit(experiments, restarted, report=report, level=level, optimiser=optimiser, progress=progress)
-    ended = sum(len(numbers) for _, numbers in groups)
-    if len(minima[0].members) == 1 and ended > 1:
+    ended = {k for _, numbers in groups for k in numbers}
+    if minima[0].searches == 1 and len(ended & members.keys()) > 1:
         warn(
-            f"The best minimum was found by one search of {starts}: there may be a better one. Take more starts, or "
-            "narrower ranges."
+            f"The best minimum was found by one search of {len(members)}: there may be a better one. Take more starts, "
+            "a larger fraction, or narrower ranges."
         )
     values = [problem.values(jnp.asarray(point, problem.dtype)) for point in points]
-    found = [member.minimum for member in members]
     return MultistartFit(
         best=best,
         minima=minima,
         starts={name: np.stack([v[k] for v in values]) for k, name in enumerate(problem.names)},
-        failures=_failures(members),
-        unfinished=tuple(k for k, m in enumerate(found) if m is not None and _end(members, k) is None),
-        iterations=sum(len(m.minimum.history) for m in (*members, *further) if m.minimum is not None),
+        searched=tuple(sorted(members)),
+        failures=dict(sorted(failures.items())),
+        unfinished=tuple(k for k in range(starts) if k not in ended and k not in failures),
+        iterations=sum(len(m.minimum.history) for m in (*members.values(), *further) if m.minimum is not None),
     )
 
 
-def _failures(members: tuple[Member, ...]) -> dict[int, str]:
-    return {k: member.failure for k, member in enumerate(members) if member.minimum is None}
+def _teller(progress: Callable[[str], None] | None, what: str) -> Callable[[int, int], None]:
+    """Says how many are done whenever there are more."""
+    told = 0
+
+    def say(done: int, count: int) -> None:
+        nonlocal told
+        if progress is not None and done > told:
+            told = done
+            progress(f"{done} of {count} {what} are done")
+
+    return say
 
 
-def _end(members: tuple[Member, ...], k: int) -> int | None:
+def _stands(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "l"], fraction: Scalar) -> Int[np.ndarray, "l"]:
+    """For each point the number of the one that stands for it, and is searched from; -1 where the cost is not known.
+    The first guess, which is none of the cube's points, stands for itself."""
+    others = linked(shares, costs[1:], fraction)
+    return np.concatenate([[0 if np.isfinite(costs[0]) else -1], np.where(others < 0, -1, others + 1)])
+
+
+def _end(members: dict[int, Member], k: int) -> int | None:
     """The number of the search at whose minimum a search ended; None if it came to none."""
     while (joined := members[k].joined) is not None:
         k = joined
@@ -199,11 +244,11 @@ def _end(members: tuple[Member, ...], k: int) -> int | None:
     return k if minimum is not None and minimum.converged else None
 
 
-def _ends(members: tuple[Member, ...]) -> list[tuple[Minimum, list[int]]]:
-    """Where searches ended, with the numbers of those that ended there."""
+def _ends(members: dict[int, Member], stands: Int[np.ndarray, "k"]) -> list[tuple[Minimum, list[int]]]:
+    """Where searches ended, with the numbers of the points that those stand for."""
     numbers: dict[int, list[int]] = {}
-    for k in range(len(members)):
-        end = _end(members, k)
+    for k, own in enumerate(stands.tolist()):
+        end = None if own < 0 else _end(members, own)
         if end is not None:
             numbers.setdefault(end, []).append(k)
     found = [(members[end].minimum, own) for end, own in numbers.items()]
@@ -211,7 +256,7 @@ def _ends(members: tuple[Member, ...]) -> list[tuple[Minimum, list[int]]]:
 
 
 def _grouped(problem: FitProblem, ends: list[tuple[Minimum, list[int]]]) -> list[tuple[Minimum, list[int]]]:
-    """The distinct minima, the lowest first, with the numbers of the searches that ended there."""
+    """The distinct minima, the lowest first, with the numbers of the points that lead there."""
     groups: list[tuple[Minimum, list[int]]] = []
     least = 1.0 if all(problem.noise_is_given) else 0.0
     for minimum, own in sorted(ends, key=lambda pair: _cost(pair[0])):
@@ -241,10 +286,10 @@ def _cost(minimum: Minimum) -> float:
     return minimum.history[-1].cost
 
 
-def _local_minimum(problem: FitProblem, found: Minimum, members: list[int]) -> LocalMinimum:
+def _local_minimum(problem: FitProblem, found: Minimum, members: list[int], searches: int) -> LocalMinimum:
     values = {n: np.asarray(v) for n, v in zip(problem.names, problem.values(found.z), strict=True)}
     numbers = sum(o.count for o in problem.observations)
-    return LocalMinimum(values, float(np.sqrt(2 * _cost(found) / numbers)), tuple(sorted(members)))
+    return LocalMinimum(values, float(np.sqrt(2 * _cost(found) / numbers)), searches, tuple(sorted(members)))
 
 
 def _listed(numbers: Any) -> str:
@@ -252,6 +297,7 @@ def _listed(numbers: Any) -> str:
     return ", ".join(shown) + (", …" if len(numbers) > _SHOWN else "")
 
 
+_FAILS = "the simulation fails there, or does not reach the data"
 _JOINED = 0.01
 """A search so near to a better one, in each coordinate, would go the same way."""
 _SETTLED = 1e-2

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -204,7 +203,7 @@ class Series(AbstractObservation):
             f"The times of {what} must lie in the run, from 0 to {t1:g} s, but {int(outside.sum())} do not, the first "
             f"{self.times[outside][:1]}: raise t1, or leave them out.",
         )
-        self._check_shape(jax.eval_shape(lambda: self.observe(scene, particles)))
+        self._check_shape(eqx.filter_eval_shape(lambda *state: self.observe(*state), scene, particles))
 
     def _check_shape(self, seen: Any) -> None:
         shape = getattr(seen, "shape", None)

@@ -15,30 +15,41 @@ Ranges = Mapping[str, tuple[float, float]]
 """Lowest and highest value to start from, by the name of a parameter."""
 
 
-def starting_points(problem: FitProblem, count: int, ranges: Ranges, seed: int) -> Float[np.ndarray, "k n"]:
-    """Coordinates of the first guess and of scrambled Sobol points, which fill a space evenly (SciPy's).
+def unit_points(count: int, size: int, seed: int) -> Float[np.ndarray, "k n"]:
+    """Scrambled Sobol points of the open unit cube, which fill it evenly (SciPy's).
 
-    Of a parameter they are evenly spread over its range, if it has one, else over its prior, else between its bounds,
-    else from a tenth to ten times the first guess of a positive one, and one coordinate to each side of any other. Over
-    the range of a positive parameter its logarithm is spread evenly.
+    Args:
+        count: how many, k.
+        size: dimension of the cube, n.
+        seed: of the scrambling.
+    """
+    from scipy.stats import qmc
+
+    exponent = max(int(np.ceil(np.log2(max(count, 1)))), 0)
+    sobol = qmc.Sobol(size, seed=seed)  # pyright: ignore[reportCallIssue] (rng from SciPy 1.15 on)
+    return np.clip(sobol.random_base2(exponent)[:count], _EDGE, 1 - _EDGE)
+
+
+def starting_points(problem: FitProblem, shares: Float[np.ndarray, "k n"], ranges: Ranges) -> Float[np.ndarray, "l n"]:
+    """Coordinates of the first guess and of points of the unit cube.
+
+    The cube's sides are, of a parameter, its range, if it has one, else its prior's distribution, else from bound to
+    bound, else from a tenth to ten times the first guess of a positive one, and one coordinate to each side of any
+    other. The range of a positive parameter is one of its logarithm.
 
     Args:
         problem: what is fitted.
-        count: how many.
+        shares: the points of the unit cube.
         ranges: see above.
-        seed: of the scrambling.
+
+    Returns:
+        one more than points.
 
     Raises:
         ValueError: a range of no parameter, or outside of its bounds.
     """
-    from scipy.stats import qmc
-
     unknown = sorted(set(ranges) - set(problem.names))
     require(not unknown, f"ranges must be of parameters ({', '.join(problem.names)}), got {', '.join(unknown)}.")
-    exponent = max(int(np.ceil(np.log2(max(count - 1, 1)))), 0)
-    sobol = qmc.Sobol(problem.size, seed=seed)  # pyright: ignore[reportCallIssue] (rng from SciPy 1.15 on)
-    shares = sobol.random_base2(exponent)[: count - 1]
-    shares = np.clip(shares, _EDGE, 1 - _EDGE)
     parts, column = [], 0
     for name, parameter, start in zip(problem.names, problem.parameters, problem.starts, strict=True):
         own = shares[:, column : column + start.size].reshape(-1, *start.shape)

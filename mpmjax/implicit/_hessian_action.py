@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, Float, NodeVector, Scalar
-from mpmjax.boundary import Mirror
+from mpmjax.boundary import Mirror, Springs, spring_answer, spring_diagonal, spring_resistance
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.state import SupportStiffness, stiffness_of
@@ -40,15 +40,21 @@ class ParticleStiffness(AbstractHessianAction):
     positive_semidefinite: bool = eqx.field(static=True, default=False)
     supports: tuple[SupportStiffness, ...] = ()
     """Of the springs to the ground."""
+    springs: tuple[Springs, ...] = ()
+    """The springs of contact, whose Hessian is added."""
 
     def is_positive_semidefinite(self) -> bool:
         return self.positive_semidefinite
 
     def __call__(self, du: NodeVector) -> NodeVector:
-        """Σ_p g_ip K_p Σ_j g_jp δu_j, and what the supports add."""
-        _, slopes = gather(self.stencil, self.mirror.unfold(du))
+        """Σ_p g_ip K_p Σ_j g_jp δu_j, and what supports and springs add."""
+        moved = gather(self.stencil, self.mirror.unfold(du))
+        slopes, value = moved[1], None
         flux = la.matmul(self.matrix, slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
-        force = self.mirror.fold(scatter(self.stencil, None, flux, du.shape[0]))
+        if self.springs:
+            value, more = spring_answer(self.springs, moved)
+            flux = flux + more
+        force = self.mirror.fold(scatter(self.stencil, value, flux, du.shape[0]))
         return force + sum(support(du) for support in self.supports) if self.supports else force
 
     def precomputed(self) -> "ParticleStiffness":
@@ -67,6 +73,8 @@ class ParticleStiffness(AbstractHessianAction):
         stiff = jnp.stack([jnp.maximum(self.matrix[m, m], 0) for m in range(d * d)])
         nodes = scatter(self.stencil.squared, None, stiff.reshape(d, d, -1), like.shape[0])
         found = jnp.stack([self.mirror.fold_scalar(component) for component in nodes.T], axis=1)
+        if self.springs:
+            found = found + spring_diagonal(self.springs, self.stencil, self.mirror, like.shape[0])
         return found + sum(support.diagonal(like) for support in self.supports) if self.supports else found
 
 
@@ -102,8 +110,8 @@ def particle_stiffness(
 ) -> ParticleStiffness:
     """H as one matrix for each particle, from the stress differentials of the materials."""
     matrix = potential.stiffness(tangents)
-    supports = stiffness_of(potential.held_by())
-    return ParticleStiffness(matrix, potential.stencil, potential.mirror, positive_semidefinite, supports)
+    supports, springs = stiffness_of(potential.held_by()), potential.springs
+    return ParticleStiffness(matrix, potential.stencil, potential.mirror, positive_semidefinite, supports, springs)
 
 
 @eqx.filter_jit
@@ -112,6 +120,8 @@ def _tangent_action(
 ) -> NodeVector:
     changes = (tangent(dF) for tangent, dF in zip(tangents, potential.deformation_change(du), strict=True))
     force = potential.nodal_sum(potential.flux(tuple(changes)))
+    if potential.springs:
+        force = force + spring_resistance(potential.springs, potential.stencil, potential.mirror, du)
     supports = stiffness_of(potential.held_by())
     return force + sum(support(du) for support in supports) if supports else force
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, Float, Matrix, NodeVector
-from mpmjax.boundary import Mirror
+from mpmjax.boundary import Mirror, Springs, spring_energy, spring_force
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.material import AbstractElastic
 from mpmjax.state import MaterialPoints, Support
@@ -32,6 +32,8 @@ class ElasticPotential(eqx.Module):
     """Number of nodes n."""
     supports: tuple[Support, ...] = ()
     """Springs and dashpots to the ground, whose energy and resistance are added."""
+    springs: tuple[Springs, ...] = ()
+    """The springs of contact, whose energy is part of Φ."""
 
     def deformation_change(self, u: NodeVector) -> Deformations:
         """δF_p = Σ_i u_i h_ipᵀ, one array for each material."""
@@ -59,7 +61,7 @@ class ElasticPotential(eqx.Module):
             (points.volume * points.law.energy(F)).sum()
             for points, F in zip(self.material_points, self.deformation(u), strict=True)
         ]
-        return sum([*parts[1:], *self.support_energies(u)], parts[0])
+        return sum([*parts[1:], *self.spring_energies(u)], parts[0])
 
     def admissible_energy(self, u: NodeVector) -> Float[Array, ""]:
         """Φ(u) [J], NaN if a law does not admit the deformation. It must not be differentiated."""
@@ -67,11 +69,16 @@ class ElasticPotential(eqx.Module):
             jnp.where(points.law.is_admissible(F), points.volume * points.law.energy(F), jnp.nan).sum()
             for points, F in zip(self.material_points, self.deformation(u), strict=True)
         ]
-        return sum([*parts[1:], *self.support_energies(u)], parts[0])
+        return sum([*parts[1:], *self.spring_energies(u)], parts[0])
 
     def support_energies(self, u: NodeVector) -> list[Float[Array, ""]]:
         """The energy of each support's springs [J]."""
         return [support.energy(u) for support in self.held_by()]
+
+    def spring_energies(self, u: NodeVector) -> list[Float[Array, ""]]:
+        """The energies of the springs of supports and of contact [J]."""
+        contact = [spring_energy(self.springs, gather(self.stencil, self.mirror.unfold(u)))] if self.springs else []
+        return self.support_energies(u) + contact
 
     def held_by(self) -> tuple[Support, ...]:
         """The supports, on the nodes as the mirrors fold them."""
@@ -90,7 +97,13 @@ class ElasticPotential(eqx.Module):
     def force(self, u: NodeVector) -> NodeVector:
         """f = −∂Φ/∂u [N], shape (n, d). At u = 0, f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
         force = -self.nodal_sum(self.flux(self._stress(self.deformation(u))))
+        if self.springs:
+            force = force + self.spring_force(u)
         return force + sum(support.force(u, self.size) for support in self.held_by()) if self.supports else force
+
+    def spring_force(self, u: NodeVector | None) -> NodeVector:
+        """The part of `force` by the springs of contact [N], shape (n, d); None for u = 0."""
+        return spring_force(self.springs, self.stencil, self.mirror, u, self.size)
 
     def flux(self, P: Deformations) -> Matrix:
         """V0_p P_p F_pᵀ [J], shape (d, d, p), from the stress of each material; in the total description V0_p P_p."""

@@ -118,6 +118,21 @@ class AbstractElastic(AbstractLaw):
             total: whether the description is total Lagrangian.
         """
 
+    def wave_modulus(self, F: Deformation) -> Float[Array, "*p"]:
+        """The modulus M of pressure waves where nothing is deformed [Pa], λ + 2μ of an isotropic solid: the stress
+        along an axis by a strain along it alone. One number, or one a particle where parameters differ among them.
+
+        Args:
+            F: deformations of the particles, of which only the shape counts [-], component first.
+        """
+        alike = all(jnp.ndim(leaf) == 0 for leaf in jax.tree.leaves(self))
+        of_one = self.kinematics.undeformed(len(F))  # len(F) is d, and not looked at by laws of J
+        none = jnp.asarray(of_one, F.dtype)[..., None]
+        none = jnp.broadcast_to(none, (*of_one.shape, 1 if alike else F.shape[-1]))
+        if none.ndim == 1:
+            return self.tangent(none)(jnp.ones_like(none))
+        return self.tangent(none)(jnp.zeros_like(none).at[0, 0].set(1))[0, 0]
+
     def is_admissible(self, F: Deformation, /) -> Bool[Array, "p"]:
         """Whether the law is defined at a deformation, shape (p,). Default: where its energy is finite."""
         return jnp.isfinite(_density(self, F))

@@ -35,15 +35,19 @@ def warn_of_oversights(grid: Grid, kernel: BSpline, boundary: Boundaries, partic
         total: whether the description is total Lagrangian: colliders that lie over the body then hold it.
     """
     resting = tuple(c.rests(total=total) and not grid.follow for c in boundary)
-    probe = partial(_probe, resting=resting, total=total)
-    some = jax.tree.leaves(
-        eqx.filter_eval_shape(probe, boundary, grid, particles.x)
-    )  # none, and no compiling, of walls
-    within, touched = eqx.filter_jit(probe)(boundary, grid, particles.x) if some else ([None] * len(boundary),) * 2
+    probe, given = partial(_probe, resting=resting, total=total), (boundary, grid, particles.x, particles.volume)
+    some = jax.tree.leaves(eqx.filter_eval_shape(probe, *given))  # none, and no compiling, of walls
+    within, touched = eqx.filter_jit(probe)(*given) if some else ([None] * len(boundary),) * 2
     for number, condition in enumerate(boundary, 1):
         name = f"{type(condition).__name__} (boundary {number})"
-        covered = _beyond(condition, grid, particles.x) if (inside := within[number - 1]) is None else int(inside)
-        if covered:
+        covered = _beyond(condition, grid, particles) if (inside := within[number - 1]) is None else int(inside)
+        if covered and condition.pushes:
+            warn(
+                f"{covered} of {particles.count} particles lie in or beyond the {name} at the start, or nearer to it "
+                "than a quarter of their width: it pushes their faces away, half a width before their centres. Move "
+                "one of them."
+            )
+        elif covered:
             warn(
                 f"{covered} of {particles.count} particles lie in or beyond the {name} at the start: nodes there do "
                 "not move freely. Move one of them; to hold a body on purpose take a Grip."
@@ -58,7 +62,7 @@ def warn_of_oversights(grid: Grid, kernel: BSpline, boundary: Boundaries, partic
 
 
 def _probe(
-    boundary: Boundaries, grid: Grid, x: ParticleVector, *, resting: tuple[bool, ...], total: bool
+    boundary: Boundaries, grid: Grid, x: ParticleVector, volume: Array, *, resting: tuple[bool, ...], total: bool
 ) -> tuple[list[Int[Array, ""] | None], list[Bool[Array, "n"] | None]]:
     """How many particles lie in each body at the start, in the updated description; and on which nodes each boundary
     acts that rests."""
@@ -66,29 +70,37 @@ def _probe(
 
     def covered(body: AbstractBoundary) -> Int[Array, ""] | None:
         distance = None if total else body.distance(x, t)
-        return None if distance is None else (distance < -ON_THE_WALL * grid.spacing).sum()
+        return None if distance is None else (distance < _nearest(body, grid, volume)).sum()
 
     def touched(body: AbstractBoundary) -> Bool[Array, "n"]:
+        distance = body.distance(nodes, t) if body.pushes else None
+        if distance is not None:
+            return distance <= grid.spacing
         return _acts(body.conditions(nodes, grid.spacing, t, dt, reference=total))
 
     return [covered(b) for b in boundary], [touched(b) if r else None for b, r in zip(boundary, resting, strict=True)]
 
 
+def _nearest(boundary: AbstractBoundary, grid: Grid, volume: Array) -> Array:
+    """How near particles may start to what holds or pushes them [m], (p,): to what pushes their faces, a quarter of
+    their width."""
+    if boundary.pushes:
+        return volume ** (1 / grid.dim) / 4
+    return jnp.full(volume.shape, -ON_THE_WALL * grid.spacing)
+
+
 def _acts(conditions: Conditions) -> Bool[Array, "n"]:
     """The nodes on which a boundary acts, (n,)."""
     acts, colliders = conditions.fixed.any(axis=1), conditions.colliders
-    if conditions.side is not None:
-        acts = acts | (conditions.side != 0).any(axis=1)
     return acts if colliders is None else acts | (colliders.owner >= 0)
 
 
-def _beyond(boundary: AbstractBoundary, grid: Grid, x: ParticleVector) -> int:
-    """How many particles lie beyond its walls."""
-    margin, places = ON_THE_WALL * float(grid.spacing), np.asarray(x)
+def _beyond(boundary: AbstractBoundary, grid: Grid, particles: Particles) -> int:
+    """How many particles lie beyond its walls, or too near to walls that push."""
+    nearest, places = np.asarray(_nearest(boundary, grid, particles.volume)), np.asarray(particles.x)
     outside = np.zeros(len(places), bool)
     for wall in boundary.walls():
-        along = places[:, wall.axis]
-        outside |= along < wall.position - margin if wall.inward > 0 else along > wall.position + margin
+        outside |= wall.inward * (places[:, wall.axis] - wall.position) < nearest
     return int(outside.sum())
 
 

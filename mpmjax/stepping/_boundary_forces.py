@@ -8,7 +8,6 @@ from mpmjax.boundary import (
     ConstrainedNodes,
     Given,
     Owners,
-    brought_contacts,
     brought_images,
     impulse_on_boundaries,
     owners_of,
@@ -49,41 +48,48 @@ def given_to_boundaries(
         slowed: the change of velocity by the friction of each contact [m/s], shape (n, d).
     """
     grid, window, dt = scene.grid, scene.window(particles), nodes.dt
-    where = scene.boundary, nodes.conditions, grid, window, t, dt
-    images, contacts = brought_images(scene.boundary, grid, window), brought_contacts(*where)
+    images = brought_images(scene.boundary, grid, window)
+    contacts = list(zip(nodes.brought_by, nodes.contacts, held.active, strict=True))
     unfold, colliders = nodes.mirror.unfold, nodes.conditions.colliders
     at = scene.nodes(particles, t)
     owners = owners_of(scene.boundary, nodes.conditions, at, grid.spacing, t, dt, reference=scene.total)
 
+    # springs act on all nodes
+    given, residual = [], reaction
+    for number, contact, active in contacts:
+        push = contact.spring_impulse(held, active)
+        if push is not None:
+            given.append(Given(push, number))
+            residual = residual - push
+
     # what symmetry planes take of the impulses on all nodes, and what reaches the folded ones
-    residual = reaction
     if scene.transfer.needs_change and before is not None:
         kept = _share_of_change(scene.transfer, scene.grid.dim, residual.dtype)
         residual = residual + kept * unfolded.mass[:, None] * (unfolded.velocity - before)
-    given, residual = taken_by_mirrors(residual, images)
+    of_planes, residual = taken_by_mirrors(residual, images)
+    given += of_planes
 
     # then colliders along their normals, contact planes, and what is prescribed
     along = held.collider_impulse(residual)
     if along is not None and colliders is not None:
         given.append(Given(along[:, None] * colliders.normal, owners.collider[:, None]))
         residual = residual - given[-1].impulse
-    of_contact = [_owner(number, contact.owner(owners)) for number, contact in contacts]
     columns = [
         (number, image.within(active))
-        for (number, contact), active in zip(contacts, held.active, strict=True)
-        if (image := contact.mirror_image) is not None and number is not None
+        for number, contact, active in contacts
+        if (image := contact.mirror_image) is not None
     ]
     of_planes, residual = taken_by_mirrors(residual, columns)
     given += [*of_planes, Given(residual, owners.fixed)]
     taken = owners.fixed >= 0
-    for owner, (_, contact), active in zip(of_contact, contacts, held.active, strict=True):
+    for number, contact, active in contacts:
         mine = contact.fixed(active, residual.shape) & ~taken
-        given.append(Given(jnp.where(mine, residual, 0), owner))
+        given.append(Given(jnp.where(mine, residual, 0), number))
         taken = taken | mine
 
-    for owner, change in zip(of_contact, slowed, strict=True):
+    for (number, _, _), change in zip(contacts, slowed, strict=True):
         of_planes, friction = taken_by_mirrors(unfolded.mass[:, None] * unfold(change), images)
-        given += [*of_planes, Given(friction, owner)]
+        given += [*of_planes, Given(friction, number)]
 
     places, pivots = at, _pivots(scene, t, residual)
     if scene.total:
@@ -92,14 +98,6 @@ def given_to_boundaries(
         places = places + dt / 2 * mean
         pivots = (pivots + _pivots(scene, t + dt, residual)) / 2
     return impulse_on_boundaries(given, places, pivots)
-
-
-def _owner(number: int | None, found: Array | None) -> Array | int:
-    """The boundary whose contact it is, at each node or everywhere: what the contact says or, by default, the one that
-    brought it."""
-    if found is not None:
-        return found[:, None]
-    return -1 if number is None else number
 
 
 def _share_of_change(transfer: AbstractTransfer, dim: int, dtype: jnp.dtype) -> Array:

@@ -72,5 +72,9 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
         """One, at ½Δt v̄."""
         return ((1, nodes.dt / 2 * motion.carrier),)
 
+    def force_at(self) -> Scalar:
+        """½."""
+        return 0.5
+
     def stability_factor(self) -> Scalar:
         return 0.0

@@ -96,6 +96,18 @@ class AbstractIntegrator(eqx.Module):
         the explicit step, and 0 or less if every step is stable. Default: None, for which `stable_dt` raises."""
         return None
 
+    def force_at(self) -> Scalar | None:
+        """The share θ of the step's displacement at which forces are evaluated, on the mean over the step; None for
+        forces at its start. Default: None of an explicit method, 1 of any other."""
+        return None if self.is_explicit else 1.0
+
+    def mean_displacement(self, nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
+        """The displacement of the nodes at which a force that is linear in it has its mean over the step [m], shape
+        (n, d): contact is judged and gives its impulse there. None for zero. Default: None of an explicit method,
+        `force_at` of the step's displacement of any other."""
+        share = self.force_at()
+        return None if share is None else share * nodes.dt * motion.carrier
+
     def limit_name(self) -> str:
         """The name of the bound on the step in messages."""
         return f"limit of {type(self).__name__}"

@@ -14,14 +14,16 @@ from mpmjax.boundary import (
     Conditions,
     Mirror,
     MirrorMotion,
+    Springs,
+    brought_contacts,
     combined_conditions,
-    contacts_of,
     mirror,
     mirror_motion,
 )
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.state import Particles, Scene, load_force, points_of, supports_of
+from mpmjax.stepping._particle_faces import faces_of
 
 Fold = Callable[[NodeVector], NodeVector]
 """A map from a nodal vector to its sum with its images at mirrors."""
@@ -55,6 +57,11 @@ class SeparateSums(eqx.Module):
     def explicit_velocity(self, nodes: "Nodes") -> NodeVector:
         """v^n + Δt g + Δt f/m [m/s], shape (n, d)."""
         return nodes.inertial_velocity() + nodes.dt * nodes.per_mass(self.force)
+
+    def with_force(self, nodes: "Nodes", force: NodeVector) -> "SeparateSums":
+        """The sums with a force on the nodes added [N], shape (n, d)."""
+        del nodes
+        return SeparateSums(self.velocity, self.force + force, self.viscous_force)
 
     def folded(self, velocity: Fold, force: Fold) -> "SeparateSums":
         """The same, with velocities and forces folded at mirrors."""
@@ -92,6 +99,10 @@ class JoinedSum(eqx.Module):
         """v^n + Δt f/m + Δt g [m/s], shape (n, d)."""
         return self.velocity_with_force + nodes.dt * nodes.acceleration
 
+    def with_force(self, nodes: "Nodes", force: NodeVector) -> "JoinedSum":
+        """The sums with a force on the nodes added [N], shape (n, d)."""
+        return JoinedSum(self.velocity_with_force + nodes.dt * nodes.per_mass(force))
+
     def folded(self, velocity: Fold, force: Fold) -> "JoinedSum":
         """The same, with velocities and forces folded at mirrors."""
         del force
@@ -125,6 +136,8 @@ class Nodes(AbstractNodes):
     """The conditions that the boundaries prescribe."""
     contacts: tuple[AbstractContact, ...] = ()
     """The contacts of the scene; none of them is active here."""
+    brought_by: tuple[int, ...] = eqx.field(static=True, default=())
+    """The number of the boundary that brings each contact."""
     mirror_motion: MirrorMotion | None = None
     """What mirrors that move add to the velocity of the nodes beyond them; None if none moves."""
 
@@ -244,12 +257,20 @@ class Nodes(AbstractNodes):
         """The nodes with a velocity [m/s], shape (n, d), added to theirs."""
         return eqx.tree_at(lambda n: n.sums, self, self.sums.folded(lambda v: v + change, lambda force: force))
 
-    def constrained(self, images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None) -> "Nodes":
-        """The nodes folded at these mirrors, with the components `fixed` and the `normals` held too."""
+    def constrained(
+        self, images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None, springs: tuple[Springs, ...]
+    ) -> "Nodes":
+        """The nodes folded at these mirrors, with the components `fixed` and the `normals` held too, and the force of
+        the springs."""
         nodes, colliders = (
             eqx.tree_at(lambda n: n.conditions.fixed, self.folded(images), fixed),
             self.conditions.colliders,
         )
+        if springs:
+            nodes = eqx.tree_at(lambda n: n.potential.springs, nodes, springs)
+            nodes = eqx.tree_at(
+                lambda n: n.sums, nodes, nodes.sums.with_force(nodes, nodes.potential.spring_force(None))
+            )
         if normals is None or colliders is None:
             return nodes
         return eqx.tree_at(lambda n: n.conditions.colliders.held, nodes, colliders.held | normals)
@@ -263,6 +284,7 @@ def particles_to_grid(
     stencil: Stencil,
     *,
     body_force_at: float = 0.0,
+    force_at: Scalar | None = None,
     explicit_viscosity: bool = False,
     joined: bool = False,
     viscosity_apart: bool = False,
@@ -278,6 +300,7 @@ def particles_to_grid(
         stencil: stencil of the particles.
         body_force_at: the time at which body forces are evaluated, as a fraction of the step. Positions are moved on to
             it with the particles' velocity.
+        force_at: the share of the step's displacement at which forces are evaluated; None if the step is explicit.
         explicit_viscosity: whether the force includes the viscous stress, at the particles' stored velocity gradients.
         joined: whether momentum and force may be summed together. They are if both have the same gradient operator.
         viscosity_apart: whether to compute the viscous part of the force separately too.
@@ -334,6 +357,9 @@ def particles_to_grid(
             if viscosity_apart and drag is not None:
                 viscous_force = drag if viscous_force is None else viscous_force + drag
             sums = SeparateSums(jnp.where(occupied, momentum / full, 0), force, viscous_force)
+        faces = faces_of(scene, particles, potential.material_points, stencil, dt, force_at)
+        acts_at = t if force_at is None else t + jnp.where(jnp.asarray(force_at) > 0, dt, 0)
+        brought = brought_contacts(scene.boundary, conditions, grid, window, t, dt, faces, acts_at)
         nodes = Nodes(
             mass=jnp.where(occupied[:, 0], mass, 0),
             sums=sums,
@@ -343,7 +369,8 @@ def particles_to_grid(
             spacing=jnp.asarray(grid.spacing),
             potential=potential,
             conditions=conditions,
-            contacts=contacts_of(scene.boundary, conditions, grid, window, t, dt),
+            contacts=tuple(contact for _, contact in brought),
+            brought_by=tuple(number for number, _ in brought),
             mirror_motion=mirror_motion(scene.boundary, grid, window, t, dt),
         )
         return folded_at_planes(scene, particles, nodes) if folded else nodes

@@ -86,6 +86,10 @@ class SemiImplicit(AbstractImplicitIntegrator):
         """One, at βΔt v^{n+1}."""
         return ((1, self.beta * nodes.dt * motion.velocity),)
 
+    def force_at(self) -> Scalar:
+        """β."""
+        return self.beta
+
     def stability_factor(self) -> Scalar:
         return 1 - 2 * jnp.asarray(self.beta)
 

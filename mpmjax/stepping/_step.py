@@ -74,8 +74,11 @@ class GridUpdate(eqx.Module):
     """The change of velocity by the friction of each contact [m/s], shape (n, d)."""
     normal_impulse: NodeScalar | None = None
     """The impulse of colliders along their normals [kg m/s], shape (n,); None without colliders."""
-    collider_friction: NodeVector | None = None
-    """The part of `friction` that is from colliders [kg m/s], shape (n, d); None without colliders."""
+    holding: NodeVector | None = None
+    """The part of `reaction` that holds components of velocity, without springs [kg m/s], shape (n, d); None if that is
+    all."""
+    pushes: tuple[tuple[int, NodeVector], ...] = ()
+    """The impulses of colliders by springs and friction [kg m/s], shape (n, d), each with its collider's number."""
 
 
 def step_unchecked(
@@ -104,6 +107,7 @@ def step_unchecked(
         dt,
         stencil,
         body_force_at=method.body_force_at,
+        force_at=method.force_at(),
         explicit_viscosity=method.explicit_viscosity,
         joined=not (method.needs_separate_force or scene.transfer.needs_change),
         folded=False,
@@ -133,8 +137,9 @@ def _given_to_colliders(nodes: Nodes, new: GridUpdate) -> ColliderImpulse | None
     if colliders is None:
         return None
     if new.motion.mean is not None:
-        colliders = colliders.after(nodes.dt / 2, new.motion.mean)
-    return impulse_on_colliders(colliders, new.reaction, new.normal_impulse, new.collider_friction)
+        colliders = colliders.after(nodes.dt / 2, nodes.mirror.unfold(new.motion.mean))
+    holding = new.reaction if new.holding is None else new.holding
+    return impulse_on_colliders(colliders, holding, new.normal_impulse, new.pushes)
 
 
 def _left_undone(nodes: Nodes, method: AbstractIntegrator, new: GridUpdate) -> LeftUndone:
@@ -162,7 +167,7 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
             internal, reaction, viscous = impulses(nodes, method, motion)
             held = constrain(nodes, ())
             return GridUpdate(
-                before=nodes.velocity if nodes.separate else None,
+                before=nodes.admitted_velocity() if nodes.separate else None,
                 motion=motion,
                 internal=internal,
                 viscous=viscous,
@@ -178,25 +183,30 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
 
         def moved(
             held: ConstrainedNodes, method: AbstractIntegrator, guess: NodeVector
-        ) -> tuple[NodeMotion, SolveInfo]:
+        ) -> tuple[ConstrainedNodes, NodeMotion, SolveInfo]:
             motion, info = method.advance(held.nodes, guess)
-            return jax.tree.map(held.images.unfold, motion), info
+            motion = jax.tree.map(held.images.unfold, motion)
+            return replace(held, displacement=method.mean_displacement(held.nodes, motion)), motion, info
 
         frozen, frozen_method, guess = without_derivative((nodes, method, guess))
 
         def attempt(held: ConstrainedNodes, guess: NodeVector) -> tuple:
-            motion, info = moved(held, frozen_method, guess)
-            return motion.velocity, impulses(frozen, frozen_method, motion)[1], motion.carrier, info
+            held, motion, info = moved(held, frozen_method, guess)
+            missing = impulses(frozen, frozen_method, motion)[1]
+            return held, motion.velocity, held.beside_springs(missing), motion.carrier, info
 
-        active, guess, cost, sweeps = find_active_set(frozen, guess, attempt, no_solve(guess.dtype))
-        held = constrain(nodes, active)
-        motion, info = moved(held, method, guess)
+        start = frozen_method.mean_displacement(frozen, NodeMotion(guess))
+        active, guess, cost, sweeps = find_active_set(
+            frozen, guess, start, attempt, no_solve(guess.dtype), explicit=method.is_explicit
+        )
+        held, motion, info = moved(constrain(nodes, active), method, guess)
         internal, reaction, viscous = impulses(nodes, method, motion)
-        after, slowed = held.friction(motion.velocity, reaction)
-        change = after - motion.velocity
-        of_colliders = [by for contact, by in zip(nodes.contacts, slowed, strict=True) if contact.of_collider]
+        holding = held.beside_springs(reaction)
+        normal = held.collider_impulse(holding)
+        final, slowed = held.friction(motion.velocity, holding)
+        change = final - motion.velocity
         return GridUpdate(
-            before=held.images.unfold(held.nodes.velocity) if nodes.separate else None,
+            before=held.images.unfold(held.nodes.admitted_velocity()) if nodes.separate else None,
             motion=motion.with_friction(change),
             internal=internal,
             viscous=viscous,
@@ -204,12 +214,13 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
             friction=nodes.mass[:, None] * change,
             free=Projection(*held.beyond_boundaries()),
             solve=cost.followed_by(info),
-            contact=ContactInfo(sweeps, held.count_violations(motion.velocity, reaction)),
+            contact=ContactInfo(sweeps, held.count_violations(motion.velocity, holding)),
             held=held,
             solved=motion,
             slowed=slowed,
-            normal_impulse=held.collider_impulse(reaction),
-            collider_friction=nodes.mass[:, None] * of_colliders[0] if of_colliders else None,
+            normal_impulse=normal,
+            holding=holding,
+            pushes=held.pushes(slowed),
         )
 
 

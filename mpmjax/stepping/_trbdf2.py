@@ -100,5 +100,15 @@ class TRBDF2(AbstractImplicitIntegrator):
         inner = motion.carrier if motion.inner is None else motion.inner
         return (q1, nodes.dt * inner), (q2, nodes.dt * motion.carrier)
 
+    def force_at(self) -> Scalar:
+        """½."""
+        return 0.5
+
+    def mean_displacement(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """q_1 u_γ + q_2 u_1 [m]."""
+        _, _, q1, q2 = self.weights()
+        inner = motion.carrier if motion.inner is None else motion.inner
+        return nodes.dt * (q1 * inner + q2 * motion.carrier)
+
     def stability_factor(self) -> Scalar:
         return 0.0

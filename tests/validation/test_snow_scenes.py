@@ -14,15 +14,16 @@ sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 
 @pytest.mark.slow
 def test_explicit_and_semi_implicit_steps_agree_as_they_shrink():
-    """A snowball packs to less than 0.8 of its volume as it hits the ground; while fragments have not gone their ways
-    the distance between the two motions, and between the two J_P, halves with the step."""
-    from snow import drop
+    """Snowballs pack to less than 0.8 of their volume as they hit each other; while fragments have not gone their ways
+    the distance between the two motions, and between the two J_P, halves with the step. (On a wall the two keep a
+    distance of first order in the spacing: faces are pressed deeper into it in explicit steps.)"""
+    from snow import collision
 
-    scene, particles, _ = drop(32, mpm.Snow())
+    scene, particles, _ = collision(32, mpm.Snow())
     gaps = []
     for dt in (1e-4, 5e-5, 2.5e-5):
         ends = [
-            mpm.simulate(scene, particles, t1=0.012, dt=dt, method=method).final
+            mpm.simulate(scene, particles, t1=0.018, dt=dt, method=method).final
             for method in (mpm.Explicit(), mpm.SemiImplicit())
         ]
         packed = [end.history.plastic_volume for end in ends]

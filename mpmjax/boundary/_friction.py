@@ -1,0 +1,54 @@
+"""Coulomb friction at nodes: an impulse after the solve, opposed to what slides."""
+
+import jax.numpy as jnp
+
+from mpmjax._types import NodeScalar, NodeVector
+from mpmjax.boundary._contact import ConstrainedNodes
+
+
+def friction_across(held: ConstrainedNodes, axis: int, limit: NodeScalar, v: NodeVector) -> NodeVector:
+    """The change of velocity by friction on walls at right angles to an axis [m/s], shape (n, d).
+
+    Args:
+        held: the nodes with an active set held.
+        axis: the wall's normal.
+        limit: the largest impulse of friction at each node [kg m/s], shape (n,).
+        v: velocity of all nodes [m/s], shape (n, d).
+    """
+    mass, normal = held.mass, held.normal
+    tangent = jnp.arange(v.shape[1]) != axis
+    slip = jnp.where(tangent, v, 0)
+    if normal is not None:  # what a collider holds along it, without the part that is not along the wall
+        along = jnp.where(tangent, normal, 0)
+        square = (along**2).sum(axis=1, keepdims=True)
+        slip = slip - along * (along * slip).sum(axis=1, keepdims=True) / jnp.where(square == 0, 1, square)
+    square = (slip**2).sum(axis=1)
+    speed = jnp.sqrt(jnp.where(square == 0, 1, square))
+    share = jnp.minimum(limit / jnp.where(mass == 0, 1, mass) / speed, 1)
+    free = tangent & ~held.unheld.conditions.fixed
+    return -jnp.where(free & (square > 0)[:, None], share[:, None] * slip, 0)
+
+
+def friction_along(
+    held: ConstrainedNodes, normal: NodeVector, moving: NodeVector, limit: NodeScalar, v: NodeVector
+) -> NodeVector:
+    """The change of velocity by friction on a surface of any direction [m/s], shape (n, d): −min(1, limit/(m ‖s‖)) s
+    with the slip s, the tangential part of v − v_c.
+
+    Args:
+        held: the nodes with an active set held.
+        normal: a multiple of the surface's normal at each node, shape (n, d); zero where it does not push.
+        moving: velocity v_c of the surface [m/s], shape (n, d).
+        limit: the largest impulse of friction at each node [kg m/s], shape (n,).
+        v: velocity of all nodes [m/s], shape (n, d).
+    """
+    mass = held.nodes.mass
+    square = (normal**2).sum(axis=1)
+    unit = normal / jnp.sqrt(jnp.where(square == 0, 1, square))[:, None]
+    slip = v - moving
+    slip = held.nodes.projection.combine(slip - unit * (unit * slip).sum(axis=1, keepdims=True), 0)
+    speed = (slip**2).sum(axis=1)
+    slides = (square > 0) & (speed > 0) & (mass > 0)
+    stopping = mass * jnp.sqrt(jnp.where(slides, speed, 1))
+    share = jnp.where(slides, jnp.minimum(limit / jnp.where(slides, stopping, 1), 1), 0)
+    return -share[:, None] * slip

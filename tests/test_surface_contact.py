@@ -1,0 +1,247 @@
+"""Contact at the faces of particles: walls and colliders push where the material's surface is."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from derivatives import ALL_LAWS
+from helpers import assert_close, cloud, ids, thorough
+
+import mpmjax as mpm
+from mpmjax.boundary import FaceShape, Springs, spring_energy, spring_force, spring_resistance
+from mpmjax.boundary._mirror import Mirror
+from mpmjax.discretisation import gather
+
+INF = np.inf
+LAW = mpm.FixedCorotated(1.0, 0.3)
+TIGHT = mpm.ConjugateResidual(rtol=1e-12)
+METHODS = {
+    "explicit": mpm.Explicit(),
+    "semi_implicit": mpm.SemiImplicit(solver=TIGHT),
+    "backward_euler": mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12)),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
+    "trbdf2": mpm.TRBDF2(0.0, mpm.Linearised(TIGHT)),
+}
+for _name in METHODS.keys() - {"explicit"}:
+    METHODS[_name] = eqx.tree_at(lambda m: m.adjoint_solver, METHODS[_name], TIGHT)
+
+
+def floor(at, d=2):
+    return mpm.SeparatingBox((*(-INF,) * (d - 1), at), (INF,) * d)
+
+
+def level(at, d=2):
+    """The same as a collider."""
+    return mpm.SeparatingCollider(mpm.HalfSpace((*(0.0,) * (d - 1), at), (*(0.0,) * (d - 1), 1.0)))
+
+
+def block(d=2, *, gap=0.0, cells=3, speed=0.0, dx=0.1, per_cell=2, at=0.0):
+    """A block some spacings above a floor at a height [spacings], and its grid."""
+    grid = mpm.Grid((cells + 8,) * d, dx, origin=(-4,) * d)
+    body = mpm.fill(mpm.Box((0.0,) * d, (cells * dx,) * d), grid, density=1.0, particles_per_cell=per_cell**d)
+    x, v = body.x.at[:, -1].add((at + gap) * dx), body.v.at[:, -1].set(-speed)
+    return grid, dataclasses.replace(body, x=x, v=v)
+
+
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
+def test_half_widths_are_those_of_the_deformed_particle(d):
+    """Of a cube that is stretched and then turned, along its edges: half the stretched edges. B is their derivative by
+    the displacement's gradient; for J alone that of a cube of its volume."""
+    rng = np.random.default_rng(0)
+    R = np.linalg.qr(rng.normal(size=(d, d)))[0]
+    s, l0 = np.array([0.7, 1.3, 1.1])[:d], 0.05
+    F = jnp.asarray(R @ np.diag(s))
+    gradient = jnp.asarray(rng.normal(size=(d, d)))
+    for edge in range(d):
+        n = jnp.asarray(R[:, edge])[:, None]
+        cases = {
+            "updated": (F, lambda e: F + e * gradient @ F, s[edge] * l0 / 2),
+            "total": (F, lambda e: F + e * gradient, s[edge] * l0 / 2),
+            "of J": (
+                jnp.linalg.det(F),
+                lambda e: jnp.linalg.det(F + e * gradient @ F),
+                s.prod() ** (1 / d) * l0 / 2,
+            ),
+        }
+        for name, (stored, moved, exact) in cases.items():
+            stored = jnp.abs(stored) if stored.ndim == 0 else stored
+
+            def width(e, moved=moved, name=name):
+                now = moved(e)
+                now = now[..., None] if now.ndim else jnp.abs(now)[None]
+                return FaceShape(jnp.asarray([l0 / 2]), now, (0, 1), name == "total").width(n)  # noqa: B023
+
+            h, B = width(0.0)
+            assert_close(h, np.array([exact]), 1e-12)
+            slope = jax.jvp(lambda e: width(e)[0], (0.0,), (1.0,))[1]
+            assert_close((B[..., 0] * gradient).sum(), slope[0], 1e-10)
+
+
+@pytest.mark.parametrize("d", [2, *thorough(3)])
+def test_the_force_of_springs_is_that_of_their_energy_and_acts_at_the_face(d):
+    """f = −∂E/∂u, with its derivative; Σ f is −k g n, and Σ x_i × f_i that of −k g n at the face,
+    x − ½ l0 F Fᵀn/‖Fᵀn‖."""
+    grid, particles = cloud(d, p=4)
+    scene = mpm.Scene(grid, LAW)
+    stencil, rng = scene.stencil(particles), np.random.default_rng(1)
+    n = rng.normal(size=(d, 4))
+    n = jnp.asarray(n / np.linalg.norm(n, axis=0))
+    F = jnp.moveaxis(particles.F, 0, -1)
+    half = particles.volume ** (1 / d) / 2
+    width, B = FaceShape(half, F, (0, 4), total=False).width(n)
+    springs = (Springs(-0.1 * width, 3.0 + jnp.arange(4.0), n, B),)
+    u = jnp.asarray(0.01 * rng.normal(size=(grid.size, d)))
+    mirror = Mirror(())
+
+    def energy(u):
+        return spring_energy(springs, gather(stencil, u))
+
+    def force(u):
+        return spring_force(springs, stencil, mirror, u, grid.size)
+
+    assert_close(force(u), -jax.grad(energy)(u), 1e-12)
+    du = jnp.asarray(rng.normal(size=u.shape))
+    resistance = spring_resistance(springs, stencil, mirror, du)
+    assert_close(resistance, -jax.jvp(force, (u,), (du,))[1], 1e-12)
+    rest = spring_force(springs, stencil, mirror, None, grid.size)
+    push = -springs[0].stiffness * springs[0].gap * n
+    assert_close(rest.sum(axis=0), push.sum(axis=1), 1e-12)
+    m = jnp.einsum("bap,bp->ap", F, n)
+    face = particles.x.T - half * jnp.einsum("abp,bp->ap", F, m) / jnp.linalg.norm(m, axis=0)
+    x = grid.nodes(grid.window(particles.x))
+    moment = jnp.einsum("ia,ib->ab", x, rest) - jnp.einsum("ap,bp->ab", face, push)
+    assert_close(moment - moment.T + 1, np.ones((d, d)), 1e-12)
+
+
+A_FIELD = {"field": mpm.NeoHookean(jnp.linspace(1e4, 2e4, 36), 0.3)}
+
+
+@pytest.mark.parametrize("law", **ids(ALL_LAWS | A_FIELD, ("herschel_bulkley", "fluid", "field")))
+def test_whatever_the_law_faces_are_pushed_by_its_wave_modulus(law):
+    """λ + 2μ, or that of J, of every law at rest, also where its parameters or its history differ among particles."""
+    grid, body = block(2, at=-0.05)
+    scene = mpm.Scene(grid, law, boundary=floor(0.0))
+    particles = mpm.prepare(scene, body)
+    (points,) = scene.material_points(particles)
+    h, n = 1e-5, particles.count
+    F = jnp.broadcast_to(jnp.eye(2)[..., None], (2, 2, n))
+    F, pressed = (points.law.kinematics.of(F - e * jnp.zeros_like(F).at[1, 1].set(1.0)) for e in (0.0, h))
+    slope = (points.law.stress(F) - points.law.stress(pressed)) / h
+    modulus = points.law.wave_modulus(F)
+    assert_close(np.broadcast_to(modulus, n), slope if slope.ndim == 1 else slope[1, 1], 1e-3)
+    after, _ = mpm.step(scene, particles, 0.0, 1e-5)
+    k, gap = 2 * np.broadcast_to(modulus, n) * 0.05 / 0.1, 0.005 * np.asarray(body.x[:, 1] < 0.03)
+    assert_close((body.mass * after.v[:, 1]).sum(), 1e-5 * (k * gap).sum(), 1e-10)
+
+
+EACH = pytest.mark.parametrize("method", **ids(METHODS, "explicit"))
+
+
+def landed(method, wall, body, grid, steps, dt, **scene):
+    made = mpm.Scene(grid, LAW, boundary=wall, **scene)
+    return mpm.rollout(made, body, steps=steps, dt=dt, method=method)
+
+
+@EACH
+@pytest.mark.parametrize("wall", [floor, *thorough(level)])
+def test_where_a_wall_is_has_the_derivative_of_differences(method, wall):
+    """Of the height, velocity and strain of a bar in the middle of its bounce, by the height of the floor."""
+    grid, body = block(1, gap=0.05, speed=0.05, at=0.3, cells=2)
+
+    @jax.jit
+    def after(at):
+        final = landed(method, wall(at, 1), body, grid, 12, 0.04)
+        return jnp.stack([final.x.mean(), final.v.mean(), final.F.min()])
+
+    slope, step = jax.jit(jax.jacrev(after))(0.03), 1e-6
+    difference = (after(0.03 + step) - after(0.03 - step)) / (2 * step)
+    assert np.abs(np.asarray(slope)).min() > 1e-2
+    assert_close(slope, difference, 1e-5)
+
+
+@pytest.mark.parametrize("method", **ids(METHODS, (), ("explicit", "implicit_midpoint")))
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_ball_s_place_size_and_motion_have_the_derivatives_of_differences(method, d):
+    grid, body = block(d, gap=0.0, speed=0.1, at=0.3, cells=2)
+    middle = jnp.asarray([*[0.11, 0.09, 0.08][: d - 1], -0.15])
+
+    def after(q):
+        motion = mpm.Motion((0.0, 1.0), jnp.stack([jnp.zeros(d), jnp.zeros(d).at[-1].set(q[d + 1])]))
+        ball = mpm.SeparatingCollider(mpm.Ball(q[:d], q[d]), motion, friction=0.2)
+        final = landed(method, ball, body, grid, 8, 0.03)
+        return final.x.mean(axis=0) @ jnp.arange(1.0, d + 1) + final.v.mean(axis=0) @ jnp.arange(2.0, d + 2)
+
+    q = jnp.concatenate([middle, jnp.asarray([0.179, 0.05])])
+    slope, step = jax.grad(after)(q), 1e-6
+    difference = np.array([(after(q + step * e) - after(q - step * e)) / (2 * step) for e in np.eye(d + 2)])
+    assert np.abs(np.asarray(slope)).min() > 1e-4
+    assert_close(slope, difference, 1e-5)
+
+
+@EACH
+def test_a_wall_makes_no_energy(method):
+    """In a bounce that starts behind the wall by nothing: energy never exceeds what it was, but for what an explicit
+    step's velocity, half a step behind, counts twice."""
+    grid, body = block(1, gap=0.3, speed=0.05)
+    scene = mpm.Scene(grid, LAW, boundary=floor(0.0, 1))
+    dt = {mpm.Explicit: 0.02, mpm.TRBDF2: 0.05}.get(type(method), 0.1)  # TR-BDF2 makes some where it resolves nothing
+    run = mpm.simulate(scene, body, t1=2.0, dt=dt, method=method, observe=lambda s, p: mpm.energy(s, p).total)
+    energy = np.asarray(run.observed)
+    assert energy.max() < energy[0] * (1 + (5e-3 if isinstance(method, mpm.Explicit) else 1e-9))
+    assert int(run.statistics.violations) == 0
+    assert float(run.final.v.mean()) > 0.01  # it came back
+
+
+def mirrored(at, d=2):
+    return mpm.ContactPlane(d - 1, at)
+
+
+@pytest.mark.parametrize("wall", [floor, *thorough(level, mirrored)])
+def test_a_block_comes_to_rest_on_the_floor(wall):
+    """Its face within 2 % of a spacing of where it is by the exact solution, from more than a spacing above."""
+    strain, dx, cells = 4e-3, 0.1, 4
+    grid, body = block(1, gap=1.3, cells=cells)
+    law = mpm.FixedCorotated(1.0, 0.0)
+    gravity = (-strain / (cells * dx),)
+    scene = mpm.Scene(grid, law, boundary=wall(0.0, 1), gravity=gravity)
+    run = mpm.simulate(scene, body, t1=120.0, dt=1.0, method=mpm.BackwardEuler())
+    exact = cells * dx * (0.5 - strain / 3)
+    assert abs(float(run.final.x.mean()) - exact) < 0.02 * dx
+    assert float(jnp.abs(run.final.v).max()) < 1e-4
+
+
+@EACH
+def test_single_precision_stays_single(method):
+    grid, body = block(2)
+    body = jax.tree.map(lambda a: a.astype(jnp.float32), body)
+    for wall in (floor(0.0), level(0.0), mpm.ContactPlane(1, 0.0)):
+        scene = mpm.Scene(grid, LAW, boundary=wall)
+        after, _ = jax.eval_shape(lambda body, s=scene: mpm.step(s, body, 0.0, 1e-3, method=method), body)
+        assert {str(leaf.dtype) for leaf in jax.tree.leaves(after)} == {"float32"}
+
+
+@pytest.mark.thorough
+def test_a_particle_behind_the_surface_by_a_spacing_is_left_alone():
+    _, body = block(1)
+    behind, grid = dataclasses.replace(body, x=body.x - 0.5), mpm.Grid((30,), 0.1, origin=(-15,))
+    with pytest.warns(UserWarning, match="6 of 6 particles lie in or beyond the SeparatingBox"):
+        final = landed(mpm.Explicit(), floor(0.0, 1), behind, grid, 3, 0.02)
+    assert_close(final.x, behind.x, 1e-14)
+
+
+@pytest.mark.thorough
+def test_explicit_steps_within_the_bound_of_stable_dt_stay_bounded_in_contact():
+    """A block squeezed between walls a tenth of a spacing too near, at 0.95 of the bound; at 1.6 of it, it blows up."""
+    grid, body = block(2, cells=3)
+    walls = mpm.SeparatingBox((0.0, 0.0), (0.299, 0.299))
+    scene = mpm.Scene(grid, LAW, boundary=walls)
+    limit = float(mpm.stable_dt(scene, body, safety=1.0))
+    free = float(mpm.stable_dt(mpm.Scene(grid, LAW), body, safety=1.0))
+    assert 0.5 < limit / free < 0.9
+    for share, holds in ((0.95, True), (1.7, False)):
+        final = mpm.rollout(scene, mpm.prepare(scene, body), steps=400, dt=share * limit, method=mpm.Explicit())
+        speed = float(jnp.abs(final.v).max())
+        assert (np.isfinite(speed) and speed < 0.05) == holds
