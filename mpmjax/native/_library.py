@@ -1,4 +1,4 @@
-"""The shared library of native sums: found beside this file, checked, and registered with XLA."""
+"""The shared library of native sums: found in lib, checked, and registered with XLA."""
 
 import ctypes
 import functools
@@ -10,7 +10,8 @@ import jax
 
 INTERFACE = 1
 """What the library has to answer, as in native/CMakeLists.txt: both change with the handlers' arguments."""
-PATH = Path(__file__).with_name("sums.so")
+PATH = Path(__file__).parent / "lib" / "sums.so"
+"""In a folder of its own: Python takes a shared library among modules for a module."""
 SUMS = ("gather", "scatter", "pull")
 
 
