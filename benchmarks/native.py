@@ -3,9 +3,9 @@
     python benchmarks/native.py            # needs the native library: mpmjax info
     python benchmarks/native.py --quick
 
-Each back end has a process of its own, for a program keeps the one that it was compiled with; the processes take turns, and
-medians are compared as ratios. The states after some steps must agree to rounding before anything is timed. A gradient is that
-of 20 steps by all initial velocities.
+Each back end has a process of its own, for a program keeps the one that it was compiled with; the processes take turns,
+and medians are compared as ratios. The states after some steps must agree to rounding before anything is timed. A
+gradient is that of 20 steps by all initial velocities.
 """
 
 import argparse

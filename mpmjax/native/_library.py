@@ -49,7 +49,7 @@ def target(name: str) -> str:
 def library() -> Library:
     """The library, loaded and registered once. One that is there and does not fit is warned of, once."""
     if not PATH.is_file():
-        return Library(None, "it was not built: the installation found no C++ compiler")
+        return Library(None, "it was not built: the installation found no C++ compiler that it could use")
     try:
         return Library(_registered(ctypes.CDLL(str(PATH))), "")
     except Exception as error:  # whatever the loader or XLA says of a library that does not fit
