@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Float, Int, Scalar
+from mpmjax._types import Array, Float, Int, Scalar
 from mpmjax.checks import checked, require_between, require_whole, warn
 from mpmjax.fitting._batch import Member, Problems, batch_size, costs_at, search_many
 from mpmjax.fitting._choice import chosen_optimiser
@@ -168,33 +168,13 @@ def fit_multistart(
         batch=size,
         joining=_JOINED,
     )
-    members: dict[int, Member] = {}
-    chosen: list[int] = []
-
-    def begun(number: int, seen: Evaluation) -> None:
-        if chosen[number] == 0:
-            require_influence(problem, sigmas, seen)
-
-    while True:
-        stands = _stands(shares, costs, fraction)
-        chosen = sorted(set(stands.tolist()) - {-1, *members}, key=lambda k: (k > 0, costs[k]))
-        if not chosen:
-            break
-        found = together(points[chosen], settling=_SETTLED, progress=_teller(progress, "searches"), begun=begun)
-        joined = [None if m.joined is None else chosen[m.joined] for m in found]
-        members |= {k: m._replace(joined=end) for k, m, end in zip(chosen, found, joined, strict=True)}
-        if any(m.interrupted for m in found):
-            break
-        costs[[k for k in chosen if _end(members, k) is None]] = np.nan
+    members, stands = _searched(problem, sigmas, points, shares, costs, fraction, together, progress)
     failures |= {k: m.failure for k, m in members.items() if m.minimum is None}
     groups = _grouped(problem, _ends(members, stands))
     if not groups:
         explain(problem, jnp.zeros(problem.size, problem.dtype))
         raise ValueError(f"No search of {len(members)} came to a minimum: {failures.get(0, 'raise max_steps')}.")
-    near = sum(_cost(found) <= _NEAR_BEST * _cost(groups[0][0]) for found, _ in groups[:_SHOWN])
-    further = together(np.array([found.z for found, _ in groups[:near]], float))
-    on = [(groups[k][0] if m.minimum is None else m.minimum, groups[k][1]) for k, m in enumerate(further)]
-    groups = _grouped(problem, [*on, *groups[near:]])
+    groups, further = _searched_on(problem, groups, together)
     minima = tuple(_local_minimum(problem, found, numbers, len(members.keys() & numbers)) for found, numbers in groups)
     restarted = {name: replace(p, start=minima[0].values[name]) for name, p in parameters.items()}
     best = fit(experiments, restarted, report=report, level=level, optimiser=optimiser, progress=progress)
@@ -214,6 +194,51 @@ def fit_multistart(
         unfinished=tuple(k for k in range(starts) if k not in ended and k not in failures),
         iterations=sum(len(m.minimum.history) for m in (*members.values(), *further) if m.minimum is not None),
     )
+
+
+def _searched(
+    problem: FitProblem,
+    sigmas: tuple[Array, ...],
+    points: Float[np.ndarray, "k n"],
+    shares: Float[np.ndarray, "l n"],
+    costs: Float[np.ndarray, "k"],
+    fraction: Scalar,
+    together: Callable[..., tuple[Member, ...]],
+    progress: Callable[[str], None] | None,
+) -> tuple[dict[int, Member], Int[np.ndarray, "k"]]:
+    """Searches from the points that stand for the others, until each point is stood for by one that came to a minimum.
+
+    Returns:
+        the searches by the numbers of their points, and for each point the number of the one that stands for it.
+    """
+    members: dict[int, Member] = {}
+    costs = costs.copy()
+    while True:
+        stands = _stands(shares, costs, fraction)
+        chosen = sorted(set(stands.tolist()) - {-1, *members}, key=lambda k: (k > 0, costs[k]))
+        if not chosen:
+            return members, stands
+
+        def begun(number: int, seen: Evaluation, chosen: list[int] = chosen) -> None:
+            if chosen[number] == 0:
+                require_influence(problem, sigmas, seen)
+
+        found = together(points[chosen], settling=_SETTLED, progress=_teller(progress, "searches"), begun=begun)
+        joined = [None if m.joined is None else chosen[m.joined] for m in found]
+        members |= {k: m._replace(joined=end) for k, m, end in zip(chosen, found, joined, strict=True)}
+        if any(m.interrupted for m in found):
+            return members, stands
+        costs[[k for k in chosen if _end(members, k) is None]] = np.nan
+
+
+def _searched_on(
+    problem: FitProblem, groups: list[tuple[Minimum, list[int]]], together: Callable[..., tuple[Member, ...]]
+) -> tuple[list[tuple[Minimum, list[int]]], tuple[Member, ...]]:
+    """The minima after searches from those near to the best one, and these searches."""
+    near = sum(_cost(found) <= _NEAR_BEST * _cost(groups[0][0]) for found, _ in groups[:_SHOWN])
+    further = together(np.array([found.z for found, _ in groups[:near]], float))
+    on = [(groups[k][0] if m.minimum is None else m.minimum, groups[k][1]) for k, m in enumerate(further)]
+    return _grouped(problem, [*on, *groups[near:]]), further
 
 
 def _teller(progress: Callable[[str], None] | None, what: str) -> Callable[[int, int], None]:
