@@ -187,6 +187,16 @@ def _members(function: Callable[..., Any], batched: int) -> Callable[..., Any]:
     return function
 
 
+def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A compiled function that `jax.disable_jit` leaves compiled, as it does JAX's own primitives."""
+
+    def call(*args: Array, **params: Any) -> Any:
+        with jax.disable_jit(False):
+            return function(*args, **params)
+
+    return call
+
+
 def _primitive(
     name: str, function: Callable[..., list[Array]], shapes: Callable[..., list[tuple]], **attributes: bool
 ) -> Primitive:
@@ -217,7 +227,7 @@ def _primitive(
     static = ("batched", "unroll", "valued", "size")
     once = jax.jit(run, static_argnames=static)  # traced once for all its uses
     written = mlir.lower_fun(once, multiple_results=True)
-    primitive.def_impl(jax.jit(primitive.bind, static_argnames=static))
+    primitive.def_impl(_compiled(jax.jit(primitive.bind, static_argnames=static)))
     primitive.def_abstract_eval(results)
     batching.primitive_batchers[primitive] = batch
     mlir.register_lowering(primitive, mlir.lower_fun(partial(once, unroll=True), multiple_results=True))
