@@ -20,6 +20,11 @@ NEEDS_LIBRARY = pytest.mark.skipif(not _library.PATH.is_file(), reason="the nati
 SIDE = 6
 
 
+@pytest.fixture(autouse=True)
+def as_if_nothing_were_asked(monkeypatch):
+    monkeypatch.delenv("MPMJAX_BACKEND", raising=False)
+
+
 @pytest.fixture
 def choose(monkeypatch):
     """Makes the back end of what is compiled next."""
