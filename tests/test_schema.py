@@ -99,8 +99,10 @@ EXAMPLES = {
     mpm.AnalyticHessian: mpm.AnalyticHessian(),
     mpm.JvpHessian: mpm.JvpHessian(),
     mpm.ConjugateResidual: mpm.ConjugateResidual(1e-7, increment_rtol=1e-3, max_steps=17),
+    mpm.AveragedVolume: mpm.AveragedVolume((0, 1)),
     mpm.DiagonalPreconditioner: mpm.DiagonalPreconditioner(),
     mpm.MassPreconditioner: mpm.MassPreconditioner(),
+    mpm.VolumePreconditioner: mpm.VolumePreconditioner(1000),
 }
 """One of each class that files hold; the next test says so."""
 

@@ -1,6 +1,7 @@
 """Particles, scene and what a step needs of them."""
 
 from mpmjax.state._attachment import AbstractPlace, AttachedPoints, Patch, PointsAt
+from mpmjax.state._averaged_volume import AveragedTangent, AveragedVolume, VolumeAverage
 from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, TotalLagrangian, UpdatedLagrangian
 from mpmjax.state._fill import fill, fill_mapped
@@ -18,6 +19,8 @@ __all__ = [
     "AbstractLoad",
     "AbstractPlace",
     "AttachedPoints",
+    "AveragedTangent",
+    "AveragedVolume",
     "LoadedPoints",
     "MaterialPoints",
     "Particles",
@@ -33,6 +36,7 @@ __all__ = [
     "TotalLagrangian",
     "Traction",
     "UpdatedLagrangian",
+    "VolumeAverage",
     "attach",
     "by_material",
     "fill",

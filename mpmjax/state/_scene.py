@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, Int, NodeVector, Point, Scalar
-from mpmjax.boundary import AbstractBoundary
+from mpmjax.boundary import AbstractBoundary, mirror
 from mpmjax.checks import (
     checked,
     coordinates,
@@ -25,11 +25,12 @@ from mpmjax.discretisation import (
 )
 from mpmjax.geometry import Motion
 from mpmjax.material import AbstractLaw
+from mpmjax.state._averaged_volume import AveragedVolume, VolumeAverage, volume_average
 from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, UpdatedLagrangian
 from mpmjax.state._loads import AbstractLoad
 from mpmjax.state._material_points import MaterialPoints, material_points, return_map
-from mpmjax.state._particles import Particles
+from mpmjax.state._particles import Group, Particles
 
 
 class Scene(eqx.Module):
@@ -50,12 +51,13 @@ class Scene(eqx.Module):
         description: updated (default) or total Lagrangian.
         body_force: a force per mass that varies in space or time, besides gravity. Default: none.
         loads: forces on the body's surface or at points of it, springs and dashpots; see `attach`.
+        volume: `AveragedVolume()` for nearly incompressible bodies. Default: each particle has its own volume.
         boundary_forces: whether steps compute the force and torque on each boundary (see `Run.boundary_forces`).
 
     Raises:
         ValueError: dimensions that differ, a mirrored plane off the half-spacing lattice, or what the total description
             cannot do (a window that follows, walls that separate, colliders along which it would slide around, laws
-            that yield or flow).
+            that yield or flow), or laws of which volumes cannot be averaged.
     """
 
     grid: Grid
@@ -69,6 +71,7 @@ class Scene(eqx.Module):
     body_force: AbstractBodyForce | None
     boundary_forces: bool = eqx.field(static=True)
     loads: tuple[AbstractLoad, ...]
+    volume: AveragedVolume | None
 
     @checked
     def __init__(
@@ -85,6 +88,7 @@ class Scene(eqx.Module):
         body_force: AbstractBodyForce | None = None,
         boundary_forces: bool = False,
         loads: AbstractLoad | tuple[AbstractLoad, ...] | list[AbstractLoad] = (),
+        volume: AveragedVolume | None = None,
     ):
         self.grid = grid
         self.material = tuple(material) if isinstance(material, list) else material
@@ -98,6 +102,7 @@ class Scene(eqx.Module):
         self.body_force = body_force
         self.boundary_forces = boundary_forces
         self.loads = (loads,) if isinstance(loads, AbstractLoad) else tuple(loads)
+        self.volume = volume
 
     def __check_init__(self):
         d = self.grid.dim
@@ -132,6 +137,24 @@ class Scene(eqx.Module):
                 f"use the updated one for {', '.join(flowing)}.",
             )
 
+        if self.volume is not None:
+            self._check_averaged(self.volume)
+
+    def _check_averaged(self, volume: AveragedVolume) -> None:
+        require(
+            all(number < len(self.laws) for number in volume.materials or ()),
+            f"AveragedVolume's materials must be numbers below {len(self.laws)}, of the scene's laws, got "
+            f"{volume.materials}.",
+        )
+        covered = [law for number, law in enumerate(self.laws) if volume.covers(number)]
+        refused = [law.title() for law in covered if not law.allows_averaged_volume]
+        require(
+            not refused,
+            "AveragedVolume is for elastic laws of F: what yields returns to a volume of its own, and a fluid has "
+            "nothing else that resists. Name the other materials, AveragedVolume(materials=(0,)), without "
+            f"{', '.join(refused)}.",
+        )
+
     @property
     def laws(self) -> tuple[AbstractLaw, ...]:
         """The laws, one for each material."""
@@ -142,9 +165,21 @@ class Scene(eqx.Module):
         """Whether particles keep the velocity gradient C: for the transfer, or for a viscosity."""
         return self.transfer.affine or any(law.viscous_part() is not None for law in self.laws)
 
-    def material_points(self, particles: Particles) -> tuple[MaterialPoints, ...]:
-        """The materials of prepared particles, with the elastic laws in force."""
-        return material_points(self.laws, particles, total=self.total)
+    def material_points(self, particles: Particles, t: Scalar = 0.0) -> tuple[MaterialPoints, ...]:
+        """The materials of prepared particles at time t [s], with the elastic laws in force."""
+        volume = self.volume
+        if volume is None:
+            return material_points(self.laws, particles, total=self.total)
+        window, places = self.window(particles), self.on_grid(particles, t)
+        images = mirror(self.boundary, self.grid, window).without_ties()
+
+        def average(number: int, group: Group) -> VolumeAverage | None:
+            rows = slice(*group.rows)
+            if not volume.covers(number):
+                return None
+            return volume_average(self.grid, window, places[rows], particles.volume[rows], images)
+
+        return material_points(self.laws, particles, total=self.total, average=average)
 
     def return_map(self, particles: Particles, dt: Scalar) -> Particles:
         """The particles after the return maps of laws that yield, at the end of a step dt [s] (see `return_map`)."""
