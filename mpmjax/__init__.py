@@ -151,6 +151,7 @@ from mpmjax.material import (
     VonMises,
     Yeoh,
 )
+from mpmjax.native import Backend, backend
 from mpmjax.simulation import Fault, Run, SimulationError, rollout, simulate
 from mpmjax.state import (
     AbstractBodyForce,
@@ -363,6 +364,8 @@ __all__ = [  # noqa: RUF022 (grouped)
     "Markers",
     "StressStretch",
     # results
+    "Backend",
+    "backend",
     "Budget",
     "EnergyBudget",
     "MomentumBudget",

@@ -159,8 +159,9 @@ def test_a_member_that_is_not_finite_leaves_the_others_as_they_are():
 
 
 @pytest.mark.parametrize("d", [1, *thorough(2, 3)])
-def test_the_program_for_other_platforms_is_the_same_sum(d):
-    """Where it is not for a CPU nothing is left of the loops: the same numbers, in one kernel a sum."""
+def test_the_program_for_other_platforms_is_the_same_sum(d, monkeypatch):
+    """Where it is not for a CPU nothing is left of XLA's loops: the same numbers, in one kernel a sum."""
+    monkeypatch.setenv("MPMJAX_BACKEND", "xla")
     _, stencil, given, nodes = example(d)
     factors = stencil.index_factors, stencil.weights, stencil.weight_derivatives
     loops, kernel = (_transfer_sums._gather(*factors, nodes, unroll=unroll) for unroll in (False, True))

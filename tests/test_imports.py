@@ -19,6 +19,7 @@ ROOMS = (
     "autodiff",
     "linalg",
     "material",
+    "native",
     "discretisation",
     "geometry",
     "boundary",

@@ -1,4 +1,4 @@
-"""The shell's commands: `mpmjax run`, `mpmjax fit`, `mpmjax chart`, `mpmjax render`."""
+"""The shell's commands: `mpmjax run`, `mpmjax fit`, `mpmjax chart`, `mpmjax render`, `mpmjax info`."""
 
 import importlib
 import importlib.util
@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Callable
 from functools import wraps
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,6 +33,7 @@ from mpmjax.fitting import (
     profile,
 )
 from mpmjax.io import check_place, end_on_signals, load, record, reporting, steps_in, stopping
+from mpmjax.native import backend
 from mpmjax.simulation import Run
 from mpmjax.viz import COLOURS, draw_chart, draw_fit, render, write_fit, write_trials
 
@@ -164,6 +166,7 @@ def _summary(simulation: Simulation, run: Run, taken: int, seconds: float) -> st
         ("particles", f"{p}"),
         ("steps", f"{steps} of {float(run.dt):.4g} s with {type(run.method).__name__}"),
         ("wall time", f"{seconds:.3g} s, {taken * p / seconds:.3g} particle-steps per second, both with compilation"),
+        ("sums", f"{backend()}"),
     ]
     if int(run.statistics.iterations) > 0:
         lines.append(
@@ -392,6 +395,15 @@ def render_command(
     _import(imports)
     render(load(run), output, colour=colour, frame=frame, view=view, fps=fps, dpi=dpi)
     print(f"written {output}")
+
+
+@app.command("info")
+@_reporting
+def info_command() -> None:
+    """Say which versions run, on which devices, and who sums between particles and nodes."""
+    lines = [(name, version(name)) for name in ("mpmjax", "jax", "jaxlib")]
+    lines += [("devices", ", ".join(map(str, jax.devices()))), ("sums", f"{backend()}")]
+    print("\n".join(f"{name:<10} {text}" for name, text in lines))
 
 
 def main() -> None:

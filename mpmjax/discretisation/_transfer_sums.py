@@ -8,9 +8,9 @@ Both are partial derivatives of one multilinear form,
 
     B(factors; a, f) = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b),    scatter = ∂B/∂f,  gather = ∂B/∂a,
 
-and `_pull` is the third, ∂B/∂factors. They are JAX primitives so that each is the derivative of the other. JAX itself
-would transpose every read of a node to an addition of whole grids. Another back end would replace these sums and
-nothing else.
+and the pull is the third, ∂B/∂factors. They are JAX primitives so that each is the derivative of the others. JAX itself
+would transpose every read of a node to an addition of whole grids. On CPUs the native library replaces these sums and
+nothing else; as written here they are the reference, and what other devices run.
 """
 
 from collections.abc import Callable
@@ -25,6 +25,7 @@ from jax.interpreters import ad, batching, mlir
 
 from mpmjax._types import Array, Float
 from mpmjax.discretisation._stencil import Stencil
+from mpmjax.native import with_native
 
 _ROW = 4
 """Largest number of columns that are added to the nodes at once. A CPU adds one, two or four numbers as one vector;
@@ -134,8 +135,9 @@ def _scatter(*args: Array, valued: bool, size: int, unroll: bool) -> list[Array]
     return [jnp.concatenate(blocks, axis=1)]
 
 
-def _pull(*args: Array, valued: bool) -> tuple[Array, Array]:
+def _pull(*args: Array, valued: bool, unroll: bool) -> list[Array]:
     """∂B/∂factors at f and a: by the weights and by their derivatives, each (d, s, p)."""
+    del unroll  # one kernel would be very long
     factors, nodes, given = args[:3], args[3], [a.T for a in args[4:]]
     d, _, p = factors[0].shape
 
@@ -160,7 +162,7 @@ def _pull(*args: Array, valued: bool) -> tuple[Array, Array]:
     value, gradients = (given[0], given[1:]) if valued else (None, given)
     by_axis = pulled(0, jnp.zeros((p,), factors[0].dtype), value, gradients)[1]
     weights, derivatives = zip(*by_axis, strict=True)
-    return jnp.stack(weights), jnp.stack(derivatives)
+    return [jnp.stack(weights), jnp.stack(derivatives)]
 
 
 def _by_factors(function: Callable[..., list[Array]]) -> Callable[..., list[Array]]:
@@ -185,13 +187,26 @@ def _members(function: Callable[..., Any], batched: int) -> Callable[..., Any]:
     return function
 
 
-def _primitive(name: str, function: Callable[..., list[Array]], shapes: Callable[..., list[tuple]]) -> Primitive:
+def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A compiled function that `jax.disable_jit` leaves compiled, as it does JAX's own primitives."""
+
+    def call(*args: Array, **params: Any) -> Any:
+        with jax.disable_jit(False):
+            return function(*args, **params)
+
+    return call
+
+
+def _primitive(
+    name: str, function: Callable[..., list[Array]], shapes: Callable[..., list[tuple]], **attributes: bool
+) -> Primitive:
     """A primitive that evaluates a function, on batches too.
 
     Args:
-        name: name of the primitive.
+        name: name of the primitive; its second word is that of the native sum.
         function: the function of arrays.
         shapes: the shapes of the results, as a function of the arguments.
+        attributes: what the native sum is told besides the primitive's parameters.
     """
 
     def run(*args: Array, batched: int, unroll: bool = False, **params: Any) -> list[Array]:
@@ -209,12 +224,14 @@ def _primitive(name: str, function: Callable[..., list[Array]], shapes: Callable
 
     primitive = Primitive(name)
     primitive.multiple_results = True
-    once = jax.jit(run, static_argnames=("batched", "unroll", "valued", "size"))  # traced once for all its uses
-    primitive.def_impl(once)
+    static = ("batched", "unroll", "valued", "size")
+    once = jax.jit(run, static_argnames=static)  # traced once for all its uses
+    written = mlir.lower_fun(once, multiple_results=True)
+    primitive.def_impl(_compiled(jax.jit(primitive.bind, static_argnames=static)))
     primitive.def_abstract_eval(results)
     batching.primitive_batchers[primitive] = batch
     mlir.register_lowering(primitive, mlir.lower_fun(partial(once, unroll=True), multiple_results=True))
-    mlir.register_lowering(primitive, mlir.lower_fun(once, multiple_results=True), platform="cpu")
+    mlir.register_lowering(primitive, with_native(name.split("_")[1], written, **attributes), platform="cpu")
     return primitive
 
 
@@ -228,10 +245,16 @@ def _node_rows(*args: ShapedArray, valued: bool, size: int) -> list[tuple]:
     return [(size, args[-1].shape[-2])]
 
 
-_gather_p = _primitive("stencil_gather", _gather, _particle_rows)
-_scatter_p = _primitive("stencil_scatter", _scatter, _node_rows)
-_gather_by_factors_p = _primitive("stencil_gather_by_factors", _by_factors(_gather), _particle_rows)
-_scatter_by_factors_p = _primitive("stencil_scatter_by_factors", _by_factors(_scatter), _node_rows)
+def _factor_rows(index_factors: ShapedArray, *others: ShapedArray, valued: bool) -> list[tuple]:
+    del others, valued
+    return [index_factors.shape[-3:]] * 2
+
+
+_gather_p = _primitive("stencil_gather", _gather, _particle_rows, differential=False)
+_scatter_p = _primitive("stencil_scatter", _scatter, _node_rows, differential=False)
+_pull_p = _primitive("stencil_pull", _pull, _factor_rows)
+_gather_by_factors_p = _primitive("stencil_gather_by_factors", _by_factors(_gather), _particle_rows, differential=True)
+_scatter_by_factors_p = _primitive("stencil_scatter_by_factors", _by_factors(_scatter), _node_rows, differential=True)
 
 
 def _differentiate(primitive: Primitive, by_factors: Primitive, function: Callable[..., list[Array]]) -> None:
@@ -257,8 +280,27 @@ def _differentiate(primitive: Primitive, by_factors: Primitive, function: Callab
     ad.primitive_jvps[by_factors] = jvp_by_factors
 
 
+def _jvp_pull(primals: tuple, tangents: tuple, *, valued: bool, batched: int) -> tuple[list[Array], list[Any]]:
+    """The pull is linear in f, and in a: its differential is a pull for each, and that of the sum as written by the
+    factors."""
+    factors, nodes, given = primals[:3], primals[3], primals[4:]
+    params = {"valued": valued, "batched": batched}
+    out = _pull_p.bind(*primals, **params)
+    parts = [[ad.Zero(jax.typeof(o)) for o in out]]
+    if type(tangents[3]) is not ad.Zero:
+        parts.append(_pull_p.bind(*factors, tangents[3], *given, **params))
+    if any(type(t) is not ad.Zero for t in tangents[4:]):
+        parts.append(_pull_p.bind(*factors, nodes, *map(ad.instantiate_zeros, tangents[4:]), **params))
+    if any(type(t) is not ad.Zero for t in tangents[1:3]):
+        written = _members(partial(_pull, valued=valued, unroll=False), batched)
+        along = tuple(map(ad.instantiate_zeros, tangents[1:3]))
+        parts.append(jax.jvp(lambda w, g: written(factors[0], w, g, *primals[3:]), factors[1:], along)[1])
+    return out, [reduce(ad.add_tangents, part) for part in zip(*parts, strict=True)]
+
+
 _differentiate(_gather_p, _gather_by_factors_p, _gather)
 _differentiate(_scatter_p, _scatter_by_factors_p, _scatter)
+ad.primitive_jvps[_pull_p] = _jvp_pull
 
 
 def _given(cotangents: list) -> tuple[list[Array], bool]:
@@ -288,18 +330,37 @@ def _transpose_scatter(cotangents: list, *args: Any, valued: bool, size: int, ba
 
 def _transpose_gather_by_factors(cotangents: list, *args: Any, batched: int) -> list:
     given, valued = _given(cotangents)
-    found = _members(partial(_pull, valued=valued), batched)(*args[:3], args[5], *given)
+    found = _pull_p.bind(*args[:3], args[5], *given, valued=valued, batched=batched)
     return [None, None, None, *_of_undefined(found, args[3:5]), None]
 
 
 def _transpose_scatter_by_factors(cotangents: list, *args: Any, valued: bool, size: int, batched: int) -> list:
     del size
     nodes = ad.instantiate_zeros(cotangents[0])
-    found = _members(partial(_pull, valued=valued), batched)(*args[:3], nodes, *args[5:])
+    found = _pull_p.bind(*args[:3], nodes, *args[5:], valued=valued, batched=batched)
     return [None, None, None, *_of_undefined(found, args[3:5]), *(None for _ in args[5:])]
+
+
+def _transpose_pull(cotangents: list, *args: Any, valued: bool, batched: int) -> list:
+    """Of what is linear in f, the scatter's differential by the factors; of what is linear in a, the gather's."""
+    factors, changes = args[:3], map(ad.instantiate_zeros, cotangents)
+    if ad.is_undefined_primal(args[3]):
+        size = args[3].aval.shape[-2]
+        params = {"valued": valued, "size": size, "batched": batched}
+        return [
+            None,
+            None,
+            None,
+            *_scatter_by_factors_p.bind(*factors, *changes, *args[4:], **params),
+            *(None for _ in args[4:]),
+        ]
+    found = _gather_by_factors_p.bind(*factors, *changes, args[3], batched=batched)
+    found = found[: len(args) - 4] if valued else found[1:]
+    return [None, None, None, None, *_of_undefined(found, args[4:])]
 
 
 ad.primitive_transposes[_gather_p] = _transpose_gather
 ad.primitive_transposes[_scatter_p] = _transpose_scatter
 ad.primitive_transposes[_gather_by_factors_p] = _transpose_gather_by_factors
 ad.primitive_transposes[_scatter_by_factors_p] = _transpose_scatter_by_factors
+ad.primitive_transposes[_pull_p] = _transpose_pull

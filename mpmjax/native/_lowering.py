@@ -1,0 +1,53 @@
+"""How JAX lowers a sum to a call of the native library."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from mpmjax.native._backend import uses_native
+from mpmjax.native._library import target
+
+_Rule = Callable[..., Any]
+
+
+def with_native(sum_name: str, written: _Rule, **attributes: bool) -> _Rule:
+    """The lowering rule for CPUs of a sum: a call of the native library where it has a kernel, else the sum as written.
+
+    A program that XLA itself divides among devices is left to XLA, which would gather whole arrays for a call that it
+    cannot look into. Within `shard_map` each device calls.
+
+    Args:
+        sum_name: name of the sum in the library.
+        written: lowering rule of the sum written in JAX.
+        attributes: what the library is told besides.
+    """
+
+    def rule(ctx: Any, *args: Any, **params: Any) -> Any:
+        avals = ctx.avals_in
+        if not uses_native()[0] or not _has_kernel(avals, params["batched"]) or _is_divided(ctx.module_context):
+            return written(ctx, *args, **params)
+        told = {"valued": np.bool_(params["valued"])} if "valued" in params else {}
+        told |= {name: np.bool_(value) for name, value in attributes.items()}
+        return jax.ffi.ffi_lowering(target(sum_name))(ctx, *args, **told)
+
+    return rule
+
+
+def _has_kernel(avals: Any, batched: int) -> bool:
+    """Whether the library has a kernel for these arrays: index factors, weights, and others of the weights' dtype."""
+    index, weights = avals[:2]
+    d, s, _ = index.shape[batched:]
+    known = index.dtype == np.int32 and weights.dtype in (np.float32, np.float64)
+    same = all(aval.dtype == weights.dtype for aval in avals[1:])
+    return known and same and d in (1, 2, 3) and s in (2, 3, 4)
+
+
+def _is_divided(context: Any) -> bool:
+    """Whether XLA divides the program that is being lowered among several devices."""
+    axes = context.axis_context
+    manual = getattr(axes, "manual_axes", None)
+    if manual is None:
+        return (getattr(axes, "num_devices", 1) or 1) > 1
+    return set(manual) != set(axes.mesh.axis_names)

@@ -1,0 +1,301 @@
+// Checks the three sums against sums written node by node, on random problems: all dimensions, orders, precisions and
+// numbers of columns, batches, indices beyond the window and as large as integers are, factors that are not finite, no
+// particle and one. Any number of threads must give the same bits. Arrays end where they end, so that a sanitizer sees
+// what reads or writes beyond; native/check compiles this with each of them.
+
+#include <cmath>
+#include <condition_variable>
+#include <cstdio>
+#include <cstring>
+#include <deque>
+#include <limits>
+#include <memory>
+#include <mutex>
+#include <random>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include "sums.h"
+#include "targets.h"
+
+using namespace mpmjax;
+
+namespace {
+
+class Threads : public Pool {
+ public:
+  explicit Threads(int count) : count_(count) {
+    for (int i = 1; i < count; ++i) threads_.emplace_back([this] { work(); });
+  }
+  ~Threads() override {
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      ended_ = true;
+    }
+    changed_.notify_all();
+    for (std::thread& thread : threads_) thread.join();
+  }
+  int threads() const override { return count_; }
+  void schedule(std::function<void()> task) const override {
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      tasks_.push_back(std::move(task));
+    }
+    changed_.notify_one();
+  }
+
+ private:
+  void work() {
+    for (;;) {
+      std::unique_lock<std::mutex> lock(mutex_);
+      changed_.wait(lock, [this] { return ended_ || !tasks_.empty(); });
+      if (ended_) return;
+      const std::function<void()> task = std::move(tasks_.front());
+      tasks_.pop_front();
+      lock.unlock();
+      task();
+    }
+  }
+
+  int count_;
+  bool ended_ = false;
+  mutable std::mutex mutex_;
+  mutable std::condition_variable changed_;
+  mutable std::deque<std::function<void()>> tasks_;
+  std::vector<std::thread> threads_;
+};
+
+// Numbers that end where their memory ends.
+template <class T>
+struct Array {
+  std::unique_ptr<T[]> data;
+  int64_t size;
+  explicit Array(int64_t n) : data(new T[n]()), size(n) {}
+  Array(const Array& other) : Array(other.size) { std::memcpy(data.get(), other.data.get(), size * sizeof(T)); }
+  T& operator[](int64_t i) const { return data[i]; }
+};
+
+struct Shape {
+  int d, s;
+  int64_t batch, particles, along, columns;
+  int64_t size() const { return int64_t(std::pow(along, d) + 0.5); }
+};
+
+// The arrays of all three sums and of their differentials.
+template <class T>
+struct Example {
+  Shape shape;
+  Array<int32_t> index;
+  Array<T> w, g, dw, dg, nodes, given;
+  Array<T> to_nodes, gathered, by_w, by_g;  // results
+
+  Example(Shape sh, int oddity, std::mt19937& random)
+      : shape(sh),
+        index(sh.batch * sh.d * sh.s * sh.particles),
+        w(index.size), g(index.size), dw(index.size), dg(index.size),
+        nodes(sh.batch * sh.size() * sh.columns),
+        given((sh.d + 1) * sh.batch * sh.columns * sh.particles),
+        to_nodes(nodes.size), gathered(given.size), by_w(index.size), by_g(index.size) {
+    std::normal_distribution<T> normal;
+    for (const Array<T>* array : {&w, &g, &dw, &dg, &nodes, &given}) {
+      for (int64_t i = 0; i < array->size; ++i) (*array)[i] = normal(random);
+    }
+    const int64_t beyond = oddity > 0 ? 2 : 0;
+    std::uniform_int_distribution<int64_t> first(-beyond, sh.along - sh.s + beyond);
+    std::uniform_int_distribution<int32_t> any(std::numeric_limits<int32_t>::min());
+    for (int64_t m = 0; m < sh.batch; ++m) {
+      for (int64_t p = 0; p < sh.particles; ++p) {
+        const bool wild = oddity > 1 && p % 7 == 3;
+        int64_t stride = 1;
+        for (int a = sh.d - 1; a >= 0; --a, stride *= sh.along) {
+          const int64_t base = oddity < 0 ? 0 : first(random);
+          for (int i = 0; i < sh.s; ++i) {
+            const int64_t at = ((m * sh.d + a) * sh.s + i) * sh.particles + p;
+            index[at] = wild ? any(random) : int32_t((base + i) * stride);
+          }
+        }
+      }
+    }
+    if (oddity > 1) {
+      for (int64_t i = 0; i < w.size; i += 97) w[i] = g[i] = dw[i] = dg[i] = std::numeric_limits<T>::quiet_NaN();
+      for (int64_t i = 5; i < nodes.size; i += 89) nodes[i] = std::numeric_limits<T>::infinity();
+    }
+  }
+
+  Stencils<T> stencils(bool differential) const {
+    return {index.data.get(), w.data.get(), g.data.get(), differential ? dw.data.get() : nullptr,
+            differential ? dg.data.get() : nullptr, shape.particles};
+  }
+  int64_t rows() const { return shape.batch * shape.columns * shape.particles; }
+};
+
+// Calls visit(m, p, node, basis, offsets) for each member, particle and stencil node; `basis` has the weight and the
+// gradient's components, or their differentials.
+template <class T, class Visit>
+void each_node(const Example<T>& e, bool differential, const Visit& visit) {
+  const Shape& sh = e.shape;
+  const int64_t count = int64_t(std::pow(sh.s, sh.d) + 0.5);
+  for (int64_t m = 0; m < sh.batch; ++m) {
+    for (int64_t p = 0; p < sh.particles; ++p) {
+      for (int64_t k = 0; k < count; ++k) {
+        uint32_t node = 0;
+        int offsets[3];
+        for (int64_t a = sh.d - 1, rest = k; a >= 0; --a, rest /= sh.s) {
+          offsets[a] = int(rest % sh.s);
+          node += uint32_t(e.index[((m * sh.d + a) * sh.s + offsets[a]) * sh.particles + p]);
+        }
+        double basis[4];
+        for (int b = 0; b <= sh.d; ++b) {
+          double value = 1, change = 0;
+          for (int a = 0; a < sh.d; ++a) {
+            const int64_t at = ((m * sh.d + a) * sh.s + offsets[a]) * sh.particles + p;
+            const double factor = b == a + 1 ? e.g[at] : e.w[at], its = b == a + 1 ? e.dg[at] : e.dw[at];
+            change = change * factor + value * its;
+            value *= factor;
+          }
+          basis[b] = differential ? change : value;
+        }
+        visit(m, p, int32_t(node), basis, offsets);
+      }
+    }
+  }
+}
+
+int faults = 0;
+
+template <class T>
+void compare(const char* what, const Shape& sh, const Array<T>& found, const std::vector<double>& expected,
+             const std::vector<double>& scale) {
+  const double tolerance = 64 * std::numeric_limits<T>::epsilon();
+  for (int64_t i = 0; i < found.size; ++i) {
+    const double error = std::abs(found[i] - expected[i]);
+    const bool both = !std::isfinite(expected[i]) && !std::isfinite(found[i]);
+    if (both || error <= tolerance * scale[i]) continue;
+    if (++faults < 20) {
+      std::printf("%s d=%d s=%d columns=%lld particles=%lld: [%lld] is %g, expected %g\n", what, sh.d, sh.s,
+                  (long long)sh.columns, (long long)sh.particles, (long long)i, double(found[i]), expected[i]);
+    }
+    return;
+  }
+}
+
+template <class T>
+void expect_same(const char* what, const Array<T>& one, const Array<T>& other) {
+  if (std::memcmp(one.data.get(), other.data.get(), one.size * sizeof(T)) == 0) return;
+  if (++faults < 20) std::printf("%s: other bits with another number of threads\n", what);
+}
+
+template <class T>
+void check(const Example<T>& e, const std::vector<const Pool*>& pools) {
+  const Shape& sh = e.shape;
+  const int64_t rows = e.rows(), n = sh.size();
+  for (int kind = 0; kind < 4; ++kind) {  // of a scatter or pull: all given, value alone, gradients alone; differential
+    const bool valued = kind != 2, graded = kind != 1, differential = kind == 3;
+    const Form form{sh.d, sh.s, differential};
+    Scatter<T> scattered = {e.stencils(differential), {}, e.to_nodes.data.get(), nullptr, n, sh.columns};
+    Gather<T> gathered = {e.stencils(differential), e.nodes.data.get(), {}, n, sh.columns};
+    Pull<T> pulled = {e.stencils(false), e.nodes.data.get(), {}, e.by_w.data.get(), e.by_g.data.get(), n, sh.columns};
+    for (int b = 0; b <= sh.d; ++b) {
+      gathered.sums[b] = e.gathered.data.get() + b * rows;
+      if (b == 0 ? valued : graded) scattered.given[b] = pulled.given[b] = e.given.data.get() + b * rows;
+    }
+    std::unique_ptr<Array<T>> bits[4];
+    for (const Pool* pool : pools) {
+      const bool known = scatter(*pool, form, sh.batch, scattered) && gather(*pool, form, sh.batch, gathered) &&
+                         (differential || pull(*pool, form, sh.batch, pulled));
+      if (!known) ++faults, std::printf("no kernel for d=%d s=%d\n", sh.d, sh.s);
+      int k = 0;
+      for (const Array<T>* result : {&e.to_nodes, &e.gathered, &e.by_w, &e.by_g}) {
+        if (bits[k] == nullptr) {
+          bits[k] = std::make_unique<Array<T>>(*result);
+        } else {
+          expect_same("sums", *bits[k], *result);
+        }
+        ++k;
+      }
+    }
+    std::vector<double> to(e.to_nodes.size), to_scale(e.to_nodes.size), from(e.gathered.size), from_scale(from.size());
+    std::vector<double> by_w(e.by_w.size), by_g(e.by_g.size), by_scale(e.by_w.size), by_g_scale(e.by_g.size);
+    each_node(e, differential, [&](int64_t m, int64_t p, int32_t node, const double* basis, const int* offsets) {
+      const bool inside = node >= 0 && node < n;
+      const int64_t clipped = node < 0 ? 0 : node >= n ? n - 1 : node;
+      for (int64_t c = 0; c < sh.columns; ++c) {
+        const double f = e.nodes[(m * n + clipped) * sh.columns + c];
+        const int64_t at = (m * n + node) * sh.columns + c;
+        const int64_t row = (m * sh.columns + c) * sh.particles + p;
+        for (int b = 0; b <= sh.d; ++b) {
+          from[b * rows + row] += basis[b] * f;
+          from_scale[b * rows + row] += 30 * std::abs(basis[b] * f) + 30 * std::abs(f);
+          if (!(b == 0 ? valued : graded)) continue;
+          const double a = e.given[b * rows + row];
+          if (inside) to[at] += basis[b] * a;
+          if (inside) to_scale[at] += 30 * std::abs(basis[b] * a) + 30 * std::abs(a);
+          for (int axis = 0; axis < sh.d && !differential; ++axis) {
+            double rest = f * a;
+            for (int other = 0; other < sh.d; ++other) {
+              const int64_t o = ((m * sh.d + other) * sh.s + offsets[other]) * sh.particles + p;
+              if (other != axis) rest *= b == other + 1 ? e.g[o] : e.w[o];
+            }
+            const int64_t own = ((m * sh.d + axis) * sh.s + offsets[axis]) * sh.particles + p;
+            (b == axis + 1 ? by_g : by_w)[own] += rest;
+            (b == axis + 1 ? by_g_scale : by_scale)[own] += 30 * std::abs(rest) + 30 * std::abs(f * a);
+          }
+        }
+      }
+    });
+    compare("scatter", sh, e.to_nodes, to, to_scale);
+    compare("gather", sh, e.gathered, from, from_scale);
+    if (!differential) compare("pull by weights", sh, e.by_w, by_w, by_scale);
+    if (!differential) compare("pull by derivatives", sh, e.by_g, by_g, by_g_scale);
+  }
+}
+
+template <class T>
+int check_all(const std::vector<const Pool*>& pools) {
+  std::mt19937 random(1);
+  int examples = 0;
+  for (int d = 1; d <= 3; ++d) {
+    for (int s = 2; s <= 4; ++s) {
+      for (const int64_t particles : {0, 1, 16, 53}) {
+        for (const int64_t columns : {1, 2, 3, 4, 6}) {
+          const int oddity = int(random() % 4) - 1;  // all in one cell, inside, at the edge, anywhere
+          check(Example<T>({d, s, 1 + int64_t(random() % 2), particles, 5, columns}, oddity, random), pools);
+          ++examples;
+        }
+      }
+    }
+  }
+  for (int oddity = -1; oddity < 3; ++oddity, ++examples) {  // enough for several threads
+    check(Example<T>({2, 3, 1, 20011, 40, 3}, oddity, random), pools);
+  }
+  check(Example<T>({1, 2, 3, 30011, 999, 1}, 1, random), pools);
+  return examples + 1;
+}
+
+}  // namespace
+
+int main() {
+  const Threads one(1), two(2), five(5);
+  const std::vector<const Pool*> pools = {&one, &two, &five};
+  int examples = check_all<float>(pools) + check_all<double>(pools);
+  // Several callers at a time, as XLA's, on one pool.
+  std::vector<std::thread> callers;
+  for (int i = 0; i < 3; ++i) {
+    callers.emplace_back([&, i] {
+      std::mt19937 random(i);
+      const Example<float> e({2, 3, 1, 9001 + i, 30, 3}, 1, random);
+      Scatter<float> task = {e.stencils(false), {}, e.to_nodes.data.get(), nullptr, e.shape.size(), 3};
+      for (int b = 0; b <= 2; ++b) task.given[b] = e.given.data.get() + b * e.rows();
+      scatter(one, {2, 3, false}, 1, task);
+      const Array<float> alone(e.to_nodes);
+      for (int k = 0; k < 5; ++k) {
+        scatter(five, {2, 3, false}, 1, task);
+        expect_same("a scatter among others", alone, e.to_nodes);
+      }
+    });
+  }
+  for (std::thread& caller : callers) caller.join();
+  std::printf("%d examples, %s: %d faults\n", examples, instructions(), faults);
+  return faults == 0 ? 0 : 1;
+}

@@ -1,0 +1,245 @@
+// What XLA calls: each sum as a handler of its foreign function interface. Operands are checked against each other, so
+// that nothing is read or written beyond them.
+//
+//   gather   index, weights, derivatives [, their changes], nodes      ->  a, a_b for each direction
+//   scatter  index, weights, derivatives [, their changes], given ...  ->  nodes
+//   pull     index, weights, derivatives, nodes, given ...             ->  by weights, by derivatives
+//
+// Factors are (..., d, s, p), given and gathered (..., c, p), nodes (..., n, c), with the same leading axes everywhere.
+// `valued` says whether the first of the given is the value; `differential` whether changes of the factors follow them.
+
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "sums.h"
+#include "targets.h"
+#include "xla/ffi/api/ffi.h"
+
+namespace ffi = xla::ffi;
+
+namespace mpmjax {
+namespace {
+
+using Shape = std::vector<int64_t>;
+
+class XlaPool : public Pool {
+ public:
+  explicit XlaPool(ffi::ThreadPool pool) : pool_(pool), threads_(static_cast<int>(pool.num_threads())) {}
+  int threads() const override { return threads_ > 1 ? threads_ : 1; }
+  void schedule(std::function<void()> task) const override { pool_.Schedule(std::move(task)); }
+
+ private:
+  mutable ffi::ThreadPool pool_;
+  int threads_;
+};
+
+ffi::Error wrong(const std::string& what) {
+  return ffi::Error::InvalidArgument("mpmjax's native sums: " + what + ". This is a fault of mpmjax.");
+}
+
+Shape shape_of(const ffi::AnyBuffer& buffer) {
+  const auto dims = buffer.dimensions();
+  return Shape(dims.begin(), dims.end());
+}
+
+// A call's buffers, operands and then results, with what is common to all sums.
+struct Call {
+  std::vector<ffi::AnyBuffer> buffers;
+  size_t operands = 0;
+  ffi::DataType type = ffi::DataType::INVALID;
+  Shape leading;
+  int64_t d = 0, s = 0, particles = 0, batch = 1;
+  std::string fault;
+
+  void expect(bool holds, const char* what) {
+    if (!holds && fault.empty()) fault = what;
+  }
+
+  // The k-th buffer, once it was seen to be of this shape.
+  template <class T>
+  T* at(size_t k, std::initializer_list<int64_t> trailing) {
+    Shape shape = leading;
+    shape.insert(shape.end(), trailing);
+    expect(k < buffers.size(), "an array is missing");
+    if (!fault.empty()) return nullptr;
+    expect(buffers[k].element_type() == type, "arrays of different precision");
+    expect(shape_of(buffers[k]) == shape, "arrays whose shapes do not fit each other");
+    return static_cast<T*>(buffers[k].untyped_data());
+  }
+
+  int64_t dim(size_t k, size_t from_behind) {
+    if (k >= buffers.size()) return 0;
+    const Shape shape = shape_of(buffers[k]);
+    return shape.size() >= from_behind ? shape[shape.size() - from_behind] : 0;
+  }
+
+  template <class T>
+  Stencils<T> stencils(bool differential) {
+    Stencils<T> found = {};
+    found.index = static_cast<const int32_t*>(buffers[0].untyped_data());
+    found.particles = particles;
+    found.weights = at<T>(1, {d, s, particles});
+    found.derivatives = at<T>(2, {d, s, particles});
+    if (differential) {
+      found.weight_changes = at<T>(3, {d, s, particles});
+      found.derivative_changes = at<T>(4, {d, s, particles});
+    }
+    return found;
+  }
+
+  // What particles give, of the operands from the k-th on.
+  template <class T>
+  void given(size_t k, bool valued, int64_t columns, const T** to) {
+    const size_t count = operands - k;
+    expect(operands >= k && (count == size_t(valued) || count == size_t(valued) + d), "too many or too few given");
+    for (size_t b = 0; fault.empty() && b < count; ++b) to[b + (valued ? 0 : 1)] = at<T>(k + b, {columns, particles});
+  }
+};
+
+Call read(const ffi::RemainingArgs& arguments, const ffi::RemainingRets& results) {
+  Call call;
+  call.operands = arguments.size();
+  for (size_t i = 0; i < arguments.size(); ++i) {
+    const auto buffer = arguments.get<ffi::AnyBuffer>(i);
+    if (buffer.has_value()) call.buffers.push_back(*buffer);
+  }
+  for (size_t i = 0; i < results.size(); ++i) {
+    auto buffer = results.get<ffi::AnyBuffer>(i);
+    if (buffer.has_value()) call.buffers.push_back(**buffer);
+  }
+  call.expect(call.buffers.size() == arguments.size() + results.size() && call.operands >= 4, "an array is missing");
+  if (!call.fault.empty()) return call;
+  const Shape shape = shape_of(call.buffers[0]);
+  call.expect(shape.size() >= 3 && call.buffers[0].element_type() == ffi::DataType::S32, "no index (..., d, s, p)");
+  if (!call.fault.empty()) return call;
+  call.type = call.buffers[1].element_type();
+  call.leading.assign(shape.begin(), shape.end() - 3);
+  call.d = shape[shape.size() - 3];
+  call.s = shape[shape.size() - 2];
+  call.particles = shape.back();
+  call.expect(call.d >= 1 && call.d <= kMostAxes, "no dimension of one to three");
+  for (const int64_t n : call.leading) call.batch *= n;
+  return call;
+}
+
+// One problem of each kind from a call; `run` sums it.
+struct GatherOf {
+  bool differential;
+
+  template <class T>
+  bool run(const Pool& pool, Call& call) const {
+    const size_t k = differential ? 5 : 3;
+    Gather<T> task = {};
+    task.stencils = call.stencils<T>(differential);
+    task.size = call.dim(k, 2);
+    task.columns = call.dim(k, 1);
+    task.nodes = call.at<T>(k, {task.size, task.columns});
+    call.expect(call.operands == k + 1 && call.buffers.size() == k + 2 + call.d, "too many or too few arrays");
+    call.expect(task.size > 0 || call.particles == 0, "no nodes to gather from");
+    for (int64_t b = 0; b <= call.d; ++b) task.sums[b] = call.at<T>(k + 1 + b, {task.columns, call.particles});
+    if (!call.fault.empty()) return true;
+    return gather(pool, {int(call.d), int(call.s), differential}, call.batch, task);
+  }
+};
+
+struct ScatterOf {
+  bool differential, valued;
+
+  template <class T>
+  bool run(const Pool& pool, Call& call) const {
+    const size_t k = differential ? 5 : 3;
+    Scatter<T> task = {};
+    task.stencils = call.stencils<T>(differential);
+    task.size = call.dim(call.operands, 2);
+    task.columns = call.dim(call.operands, 1);
+    task.nodes = call.at<T>(call.operands, {task.size, task.columns});
+    call.expect(call.buffers.size() == call.operands + 1, "too many or too few results");
+    call.given<T>(k, valued, task.columns, task.given);
+    if (!call.fault.empty()) return true;
+    return scatter(pool, {int(call.d), int(call.s), differential}, call.batch, task);
+  }
+};
+
+struct PullOf {
+  bool valued;
+
+  template <class T>
+  bool run(const Pool& pool, Call& call) const {
+    Pull<T> task = {};
+    task.stencils = call.stencils<T>(false);
+    task.size = call.dim(3, 2);
+    task.columns = call.dim(3, 1);
+    task.nodes = call.at<T>(3, {task.size, task.columns});
+    call.given<T>(4, valued, task.columns, task.given);
+    call.expect(call.buffers.size() == call.operands + 2, "too many or too few results");
+    call.expect(task.size > 0 || call.particles == 0, "no nodes to gather from");
+    task.by_weights = call.at<T>(call.operands, {call.d, call.s, call.particles});
+    task.by_derivatives = call.at<T>(call.operands + 1, {call.d, call.s, call.particles});
+    if (!call.fault.empty()) return true;
+    return pull(pool, {int(call.d), int(call.s), false}, call.batch, task);
+  }
+};
+
+template <class Problem>
+ffi::Error run(const Problem& problem, ffi::ThreadPool threads, const ffi::RemainingArgs& arguments,
+               const ffi::RemainingRets& results) {
+  Call call = read(arguments, results);
+  if (!call.fault.empty()) return wrong(call.fault);
+  const XlaPool pool(threads);
+  bool known = false;
+  if (call.type == ffi::DataType::F32) known = problem.template run<float>(pool, call);
+  if (call.type == ffi::DataType::F64) known = problem.template run<double>(pool, call);
+  if (!call.fault.empty()) return wrong(call.fault);
+  return known ? ffi::Error::Success() : wrong("there is no kernel of this order or type");
+}
+
+ffi::Error run_gather(ffi::ThreadPool threads, bool differential, ffi::RemainingArgs arguments,
+                      ffi::RemainingRets results) {
+  return run(GatherOf{differential}, threads, arguments, results);
+}
+
+ffi::Error run_scatter(ffi::ThreadPool threads, bool differential, bool valued, ffi::RemainingArgs arguments,
+                       ffi::RemainingRets results) {
+  return run(ScatterOf{differential, valued}, threads, arguments, results);
+}
+
+ffi::Error run_pull(ffi::ThreadPool threads, bool valued, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  return run(PullOf{valued}, threads, arguments, results);
+}
+
+ffi::Error run_threads(ffi::ThreadPool threads, ffi::ResultBuffer<ffi::DataType::S32> count) {
+  *count->typed_data() = static_cast<int32_t>(threads.num_threads());
+  return ffi::Error::Success();
+}
+
+}  // namespace
+}  // namespace mpmjax
+
+#pragma GCC visibility push(default)
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_gather, mpmjax::run_gather,
+                              ffi::Ffi::Bind()
+                                  .Ctx<ffi::ThreadPool>()
+                                  .Attr<bool>("differential")
+                                  .RemainingArgs()
+                                  .RemainingRets());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_scatter, mpmjax::run_scatter,
+                              ffi::Ffi::Bind()
+                                  .Ctx<ffi::ThreadPool>()
+                                  .Attr<bool>("differential")
+                                  .Attr<bool>("valued")
+                                  .RemainingArgs()
+                                  .RemainingRets());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_pull, mpmjax::run_pull,
+                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<bool>("valued").RemainingArgs().RemainingRets());
+
+// The threads that sums are shared among.
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_threads, mpmjax::run_threads,
+                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Ret<ffi::Buffer<ffi::DataType::S32>>());
+
+// What the package asks of a library before it uses it.
+extern "C" int mpmjax_interface() { return MPMJAX_INTERFACE; }
+extern "C" const char* mpmjax_instructions() { return mpmjax::instructions(); }
+
+#pragma GCC visibility pop

@@ -1,0 +1,81 @@
+// The three sums, as plain data: arrays in C order with their sizes.
+//
+// With the stencil weights w_ip and gradients g_ip,b of nodes i, particles p and directions b, values f at the nodes and
+// a, a_b at the particles,
+//
+//   scatter  f_i  = Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b)
+//   gather   a_p  = Σ_i w_ip f_i,   a_p,b = Σ_i g_ip,b f_i
+//   pull     ∂B/∂factors,   B = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b)
+//
+// Weights are products of one factor along each axis; of a gradient's factors the one along its direction is a
+// derivative. Only the factors are stored, (d, s, p) with s nodes along an axis.
+
+#pragma once
+
+#include <cstdint>
+
+namespace mpmjax {
+
+constexpr int kMostAxes = 3;
+constexpr int kBlock = 16;  // particles that are handled together
+
+template <class T>
+struct Stencils {
+  // Terms of the flat node index. They wrap as 32-bit integers do: those of a particle outside of the window have no
+  // meaning, and may be any number.
+  const int32_t* index;
+  const T* weights;
+  const T* derivatives;
+  // The changes of both, for the differential of a sum by its factors; null for the sum itself.
+  const T* weight_changes;
+  const T* derivative_changes;
+  int64_t particles;
+};
+
+template <class T>
+struct Gather {
+  Stencils<T> stencils;
+  const T* nodes;          // (n, c)
+  T* sums[kMostAxes + 1];  // a, then a_b for each direction, each (c, p)
+  int64_t size;            // n
+  int64_t columns;         // c
+};
+
+// The flat indices that a block of particles may reach.
+struct Range {
+  int32_t least, most;
+};
+
+template <class T>
+struct Scatter {
+  Stencils<T> stencils;
+  const T* given[kMostAxes + 1];  // a, null for zero, and a_b, all null for zero, each (c, p)
+  T* nodes;                       // (n, c)
+  const Range* ranges;            // of each block, or null
+  int64_t size;
+  int64_t columns;
+};
+
+template <class T>
+struct Pull {
+  Stencils<T> stencils;
+  const T* nodes;                 // (n, c)
+  const T* given[kMostAxes + 1];  // as in a scatter
+  T* by_weights;                  // (d, s, p)
+  T* by_derivatives;              // (d, s, p)
+  int64_t size;
+  int64_t columns;
+};
+
+// The sums for one dimension and kernel. Gather and pull take particles from a first to a last. A scatter takes all
+// particles, and sets the nodes from a first to a last; it passes over blocks whose range of indices says that they give
+// nothing to these.
+template <class T>
+struct Kernels {
+  void (*gather)(const Gather<T>&, int64_t first, int64_t last);
+  void (*scatter)(const Scatter<T>&, int64_t first, int64_t last);
+  void (*find_ranges)(const Stencils<T>&, int64_t first_block, int64_t last_block, Range* ranges);
+  void (*pull)(const Pull<T>&, int64_t first, int64_t last);
+};
+
+}  // namespace mpmjax

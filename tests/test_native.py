@@ -1,0 +1,252 @@
+"""The native sums are those of XLA to rounding, whatever they are given, and one place chooses between them."""
+
+import warnings
+from functools import partial
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, block, thorough
+
+import mpmjax as mpm
+from mpmjax.discretisation import _transfer_sums as sums
+from mpmjax.native import _library
+
+ROOT = Path(__file__).parents[1]
+NEEDS_LIBRARY = pytest.mark.skipif(not _library.PATH.is_file(), reason="the native sums were not built")
+SIDE = 6
+
+
+@pytest.fixture(autouse=True)
+def as_if_nothing_were_asked(monkeypatch):
+    monkeypatch.delenv("MPMJAX_BACKEND", raising=False)
+
+
+@pytest.fixture
+def choose(monkeypatch):
+    """Makes the back end of what is compiled next."""
+
+    def chosen(name):
+        jax.clear_caches()
+        monkeypatch.setenv("MPMJAX_BACKEND", name)
+
+    yield chosen
+    jax.clear_caches()
+
+
+def problem(d, s, c, p, dtype, seed=0, *, wild=True):
+    """Index factors, weights and derivatives, what particles give, and node values. With `wild` some particles reach
+    over the window's edges, and one has indices without meaning."""
+    rng = np.random.default_rng(seed)
+    strides = SIDE ** np.arange(d)[::-1]
+    along = rng.integers(-wild, SIDE - s + 1 + wild, size=(d, 1, p)) + np.arange(s)[:, None]
+    index = (along * strides[:, None, None]).astype("int32")
+    if wild and p > 3:
+        index[..., 3] = rng.integers(-(2**31), 2**31, size=(d, s))
+    w, g, given, nodes = (
+        rng.normal(size=shape).astype(dtype) for shape in ((d, s, p), (d, s, p), (d + 1, c, p), (SIDE**d, c))
+    )
+    return tuple(jnp.asarray(a) for a in (index, w, g, given, nodes))
+
+
+def native(index, w, g, given, nodes, valued=True, graded=True):
+    """All three sums by the primitives."""
+    parts = [*given[:1]] * valued + [*given[1:]] * graded
+    params = {"valued": valued, "batched": 0}
+    return (
+        sums._gather_p.bind(index, w, g, nodes, batched=0),
+        sums._scatter_p.bind(index, w, g, *parts, size=nodes.shape[0], **params),
+        sums._pull_p.bind(index, w, g, nodes, *parts, **params),
+    )
+
+
+def written(index, w, g, given, nodes, valued=True, graded=True):
+    """The same as they are written in JAX."""
+    parts = [*given[:1]] * valued + [*given[1:]] * graded
+    return (
+        sums._gather(index, w, g, nodes, unroll=False),
+        sums._scatter(index, w, g, *parts, valued=valued, size=nodes.shape[0], unroll=False),
+        sums._pull(index, w, g, nodes, *parts, valued=valued, unroll=False),
+    )
+
+
+def agree(found, expected, dtype):
+    """Equal to rounding, relative to the largest number."""
+    jax.tree.map(lambda a, b: assert_close(a, b, 100 * float(jnp.finfo(dtype).eps)), found, expected)
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize("dtype", ["float32", *thorough("float64")])
+@pytest.mark.parametrize(("d", "s", "c"), [(2, 3, 3), *thorough((1, 2, 1), (1, 4, 5), (2, 4, 4), (3, 2, 2), (3, 3, 6))])
+def test_back_ends_agree(d, s, c, dtype):
+    """Over random inputs, whichever part is given, with indices beyond the window; and in a batch."""
+    args = problem(d, s, c, 45, dtype)
+    for which in ({}, {"graded": False}, {"valued": False}):
+        agree(jax.jit(partial(native, **which))(*args), jax.jit(partial(written, **which))(*args), dtype)
+    other = problem(d, s, c, 45, dtype, seed=1)
+    both = [jnp.stack(pair) for pair in zip(args, other, strict=True)]
+    alone = [jax.jit(native)(*each) for each in (args, other)]
+    together = jax.jit(jax.vmap(native))(*both)
+    jax.tree.map(lambda a, *b: np.testing.assert_array_equal(a, jnp.stack(b)), together, *alone)
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize("d", [1, *thorough(2, 3)])
+def test_derivatives_agree(d):
+    """First in both modes and second in all four orders of modes, by everything. All within the window: beyond it,
+    where a gather clips, its derivative drops."""
+    index, *floats = problem(d, 3, 2, 9, "float64", wild=False)
+    to = jax.tree.map(lambda a: jnp.cos(jnp.arange(a.size, dtype=a.dtype)).reshape(a.shape), native(index, *floats))
+    along = tuple(jnp.sin(jnp.arange(a.size, dtype=a.dtype)).reshape(a.shape) for a in floats)
+
+    def derivatives(of):
+        def loss(*args):
+            parts = jax.tree.map(lambda t, s: (t * s**2).sum(), to, of(index, *args))
+            return sum(jax.tree.leaves(parts))
+
+        def slope(f):
+            return lambda *args: jax.jvp(f, args, along)[1]
+
+        by = (0, 1, 2, 3)
+        grad = jax.grad(loss, by)
+        back = jax.grad(lambda *a: sum((g * b).sum() for g, b in zip(grad(*a), along, strict=True)), by)
+        every = slope(loss), grad, slope(slope(loss)), slope(grad), jax.grad(slope(loss), by), back
+        return jax.jit(lambda *a: [f(*a) for f in every])(*floats)
+
+    agree(derivatives(native), derivatives(written), "float64")
+
+
+@NEEDS_LIBRARY
+def test_the_library_is_called_and_only_on_a_cpu(choose):
+    """By default on a CPU, not when XLA is asked for, not for another platform, not for a program that XLA divides."""
+    args = problem(2, 3, 3, 10, "float32")
+
+    def program(platform):
+        return jax.jit(native).trace(*args).lower(lowering_platforms=(platform,)).as_text()
+
+    for name, called in (("native", True), ("xla", False), ("", True)):
+        choose(name)
+        assert [f"mpmjax_{kind}" in program("cpu") for kind in ("gather", "scatter", "pull")] == 3 * [called]
+        assert "mpmjax_" not in program("cuda")
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize("p", [0, 1])
+def test_few_particles(p):
+    """None gives nodes of zero and arrays of no length; one is summed as among others."""
+    args = problem(2, 3, 3, p, "float32", wild=False)
+    found, expected = jax.jit(native)(*args), jax.jit(written)(*args)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-5), found, expected)
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize("place", ["one cell", "anywhere"])
+def test_many_particles_on_many_threads(place):
+    """Enough for several threads, all in one cell or disordered: right, and with the same bits in every run."""
+    index, *floats = problem(2, 3, 3, 30_000, "float32")
+    if place == "one cell":
+        index = jnp.broadcast_to(index[..., :1], index.shape)
+    run = jax.jit(native)
+    found = [run(index, *floats) for _ in range(5)]
+    for again in found[1:]:
+        jax.tree.map(np.testing.assert_array_equal, again, found[0])
+    wide = jax.jit(written)(index, *(a.astype("float64") for a in floats))
+    jax.tree.map(lambda a, b: assert_close(a.astype("float64"), b, 2e-4), found[0], wide)
+
+
+@NEEDS_LIBRARY
+def test_a_particle_that_is_not_finite_spoils_its_own_nodes_alone():
+    """As in XLA: the same entries are finite."""
+    index, w, g, given, nodes = problem(2, 3, 3, 20, "float32")
+    args = index, w.at[..., 5].set(jnp.nan), g.at[..., 5].set(jnp.nan), given, nodes
+    found, expected = jax.jit(native)(*args), jax.jit(written)(*args)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(jnp.isfinite(a), jnp.isfinite(b)), found, expected)
+
+
+@NEEDS_LIBRARY
+def test_wrong_arrays_are_refused():
+    """By the library itself: arrays whose shapes do not fit each other end in an error, not in a read beyond them."""
+    index, w, g, _, nodes = problem(2, 3, 3, 10, "float32")
+    bad = jax.ffi.ffi_call("mpmjax_gather", [jax.ShapeDtypeStruct((3, 10), "float32")] * 3)
+    assert mpm.backend().name == "native"
+    with pytest.raises(Exception, match="shapes do not fit"):
+        jax.block_until_ready(jax.jit(lambda *a: bad(*a, differential=np.bool_(False)))(index, w[..., :9], g, nodes))
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize("method", [mpm.Explicit(), *thorough(mpm.SemiImplicit())])
+def test_runs_agree(choose, method):
+    """A few steps and their gradient by both back ends."""
+    scene, particles = block(2)
+
+    start = mpm.prepare(scene, particles)
+    v = jnp.asarray(np.random.default_rng(0).normal(size=particles.v.shape))
+
+    def outcome(v):
+        end = mpm.rollout(scene, eqx.tree_at(lambda p: p.v, start, v), steps=3, dt=1e-3, method=method)
+        return (end.x**2).sum() + (end.F**2).sum(), end.x
+
+    found = {}
+    for name in ("native", "xla"):
+        choose(name)
+        found[name] = jax.value_and_grad(outcome, has_aux=True)(v)
+    jax.tree.map(lambda a, b: assert_close(a, b, 1e-10), found["native"], found["xla"])
+
+
+def test_one_variable_chooses(choose):
+    """MPMJAX_BACKEND is native, xla or nothing; native where there is no library is an error that says why."""
+    choose("xla")
+    assert mpm.backend().name == "xla"
+    assert "MPMJAX_BACKEND=xla" in str(mpm.backend())
+    choose("cuda")
+    with pytest.raises(ValueError, match="must be native or xla"):
+        mpm.backend()
+
+
+@pytest.fixture
+def other_library(monkeypatch):
+    """Another library, or none, in the place of the installed one."""
+    yield lambda path: (monkeypatch.setattr(_library, "PATH", path), _library.library.cache_clear())
+    monkeypatch.undo()
+    _library.library.cache_clear()
+    jax.clear_caches()
+
+
+def test_without_a_library_xla_sums(other_library, choose, tmp_path):
+    """It says why, and does not warn; asked for, it is an error."""
+    other_library(tmp_path / "none.so")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert "found no C++ compiler" in str(mpm.backend())
+    choose("native")
+    with pytest.raises(ValueError, match="no library of them"):
+        mpm.backend()
+
+
+def test_a_library_that_does_not_fit_is_warned_of_once(other_library, tmp_path):
+    """What is no library at all."""
+    broken = tmp_path / "broken.so"
+    broken.write_bytes(b"not a library")
+    other_library(broken)
+    with pytest.warns(UserWarning, match="are not used"):
+        assert mpm.backend().name == "xla"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert mpm.backend().name == "xla"
+
+
+@NEEDS_LIBRARY
+def test_a_library_of_another_version_is_not_used(other_library, monkeypatch):
+    """Its interface has another number."""
+    monkeypatch.setattr(_library, "INTERFACE", -1)
+    other_library(_library.PATH)
+    with pytest.warns(UserWarning, match="interface"):
+        assert mpm.backend().name == "xla"
+
+
+def test_numbers_that_have_to_be_equal_are():
+    """The interface of the library and of the package."""
+    assert f"MPMJAX_INTERFACE={_library.INTERFACE})" in (ROOT / "native" / "CMakeLists.txt").read_text()
