@@ -28,6 +28,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
 from mpmjax.boundary._conditions import Conditions
+from mpmjax.boundary._coupling import Coupling
 from mpmjax.boundary._mirror import Image, Mirror
 from mpmjax.boundary._springs import Springs
 
@@ -70,7 +71,12 @@ class AbstractNodes(eqx.Module):
 
     @abc.abstractmethod
     def constrained(
-        self: "N", images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None, springs: tuple[Springs, ...]
+        self: "N",
+        images: Mirror,
+        fixed: Mask,
+        normals: Bool[Array, "n"] | None,
+        springs: tuple[Springs, ...],
+        couplings: tuple[Coupling, ...],
     ) -> "N":
         """These nodes with more of them held.
 
@@ -79,6 +85,7 @@ class AbstractNodes(eqx.Module):
             fixed: components of velocity that are prescribed, shape (n, d).
             normals: nodes whose component along a collider's normal is held too, shape (n,).
             springs: the springs of what is held by springs.
+            couplings: the springs between bodies that are held by such.
         """
 
     @abc.abstractmethod
@@ -180,6 +187,11 @@ class AbstractContact(eqx.Module):
 
     def springs(self, active: Array) -> Springs | None:
         """The springs of the places held; None without any."""
+        del active
+        return None
+
+    def coupling(self, active: Array) -> Coupling | None:
+        """The springs between two bodies at the places held; None without any."""
         del active
         return None
 
@@ -356,7 +368,8 @@ def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
         along = contact.normals(mask)
         normals = along if normals is None else normals
     springs = tuple(found for contact, mask in pairs if (found := contact.springs(mask)) is not None)
-    return ConstrainedNodes(nodes, active, images, nodes.constrained(images, fixed, normals, springs))
+    couplings = tuple(found for contact, mask in pairs if (found := contact.coupling(mask)) is not None)
+    return ConstrainedNodes(nodes, active, images, nodes.constrained(images, fixed, normals, springs, couplings))
 
 
 def find_active_set(

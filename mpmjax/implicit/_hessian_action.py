@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, Float, NodeVector, Scalar
-from mpmjax.boundary import Mirror, Springs, spring_answer, spring_diagonal, spring_resistance
+from mpmjax.boundary import Coupling, Mirror, Springs, spring_answer, spring_diagonal, spring_resistance
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.state import SupportStiffness, stiffness_of
@@ -42,6 +42,8 @@ class ParticleStiffness(AbstractHessianAction):
     """Of the springs to the ground."""
     springs: tuple[Springs, ...] = ()
     """The springs of contact, whose Hessian is added."""
+    couplings: tuple[Coupling, ...] = ()
+    """Those between bodies."""
 
     def is_positive_semidefinite(self) -> bool:
         return self.positive_semidefinite
@@ -55,6 +57,7 @@ class ParticleStiffness(AbstractHessianAction):
             value, more = spring_answer(self.springs, moved)
             flux = flux + more
         force = self.mirror.fold(scatter(self.stencil, value, flux, du.shape[0]))
+        force = _with_couplings(force, self.couplings, self.mirror, du)
         return force + sum(support(du) for support in self.supports) if self.supports else force
 
     def precomputed(self) -> "ParticleStiffness":
@@ -75,6 +78,9 @@ class ParticleStiffness(AbstractHessianAction):
         found = jnp.stack([self.mirror.fold_scalar(component) for component in nodes.T], axis=1)
         if self.springs:
             found = found + spring_diagonal(self.springs, self.stencil, self.mirror, like.shape[0])
+        for coupling in self.couplings:
+            each = coupling.diagonal(len(like)).T
+            found = found + jnp.stack([self.mirror.fold_scalar(component) for component in each], axis=1)
         return found + sum(support.diagonal(like) for support in self.supports) if self.supports else found
 
 
@@ -110,8 +116,10 @@ def particle_stiffness(
 ) -> ParticleStiffness:
     """H as one matrix for each particle, from the stress differentials of the materials."""
     matrix = potential.stiffness(tangents)
-    supports, springs = stiffness_of(potential.held_by()), potential.springs
-    return ParticleStiffness(matrix, potential.stencil, potential.mirror, positive_semidefinite, supports, springs)
+    supports, springs, couplings = stiffness_of(potential.held_by()), potential.springs, potential.couplings
+    return ParticleStiffness(
+        matrix, potential.stencil, potential.mirror, positive_semidefinite, supports, springs, couplings
+    )
 
 
 @eqx.filter_jit
@@ -122,8 +130,17 @@ def _tangent_action(
     force = potential.nodal_sum(potential.flux(tuple(changes)))
     if potential.springs:
         force = force + spring_resistance(potential.springs, potential.stencil, potential.mirror, du)
+    force = _with_couplings(force, potential.couplings, potential.mirror, du)
     supports = stiffness_of(potential.held_by())
     return force + sum(support(du) for support in supports) if supports else force
+
+
+def _with_couplings(force: NodeVector, couplings: tuple[Coupling, ...], mirror: Mirror, du: NodeVector) -> NodeVector:
+    """A force with what the springs between bodies add to it [N], shape (n, d)."""
+    if not couplings:
+        return force
+    moved = mirror.unfold(du)
+    return force + sum(mirror.fold(coupling.resistance(moved)) for coupling in couplings)
 
 
 class _DampedAction(AbstractHessianAction):

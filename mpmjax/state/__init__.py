@@ -1,6 +1,7 @@
 """Particles, scene and what a step needs of them."""
 
 from mpmjax.state._attachment import AbstractPlace, AttachedPoints, Patch, PointsAt
+from mpmjax.state._bodies import Bodies
 from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, TotalLagrangian, UpdatedLagrangian
 from mpmjax.state._fill import fill, fill_mapped
@@ -18,6 +19,7 @@ __all__ = [
     "AbstractLoad",
     "AbstractPlace",
     "AttachedPoints",
+    "Bodies",
     "LoadedPoints",
     "MaterialPoints",
     "Particles",

@@ -2,9 +2,10 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax._types import Array, Float, Int, NodeVector, Point, Scalar
-from mpmjax.boundary import AbstractBoundary
+from mpmjax.boundary import AbstractBoundary, refuse_contact
 from mpmjax.checks import (
     checked,
     coordinates,
@@ -25,6 +26,7 @@ from mpmjax.discretisation import (
 )
 from mpmjax.geometry import Motion
 from mpmjax.material import AbstractLaw
+from mpmjax.state._bodies import Bodies
 from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, UpdatedLagrangian
 from mpmjax.state._loads import AbstractLoad
@@ -50,6 +52,7 @@ class Scene(eqx.Module):
         description: updated (default) or total Lagrangian.
         body_force: a force per mass that varies in space or time, besides gravity. Default: none.
         loads: forces on the body's surface or at points of it, springs and dashpots; see `attach`.
+        bodies: which materials are bodies of their own, that touch each other. Default: all share the nodes.
         boundary_forces: whether steps compute the force and torque on each boundary (see `Run.boundary_forces`).
 
     Raises:
@@ -69,6 +72,7 @@ class Scene(eqx.Module):
     body_force: AbstractBodyForce | None
     boundary_forces: bool = eqx.field(static=True)
     loads: tuple[AbstractLoad, ...]
+    bodies: Bodies | None
 
     @checked
     def __init__(
@@ -85,9 +89,11 @@ class Scene(eqx.Module):
         body_force: AbstractBodyForce | None = None,
         boundary_forces: bool = False,
         loads: AbstractLoad | tuple[AbstractLoad, ...] | list[AbstractLoad] = (),
+        bodies: Bodies | None = None,
     ):
-        self.grid = grid
         self.material = tuple(material) if isinstance(material, list) else material
+        layers = 1 if bodies is None else 1 + max(bodies.of_materials(len(self.laws)))
+        self.grid = grid if grid.layers == layers else grid.with_layers(layers)
         self.gravity = (0.0,) * grid.dim if gravity is None else gravity
         self.boundary = (boundary,) if isinstance(boundary, AbstractBoundary) else tuple(boundary)
         self.kernel = kernel
@@ -98,6 +104,7 @@ class Scene(eqx.Module):
         self.body_force = body_force
         self.boundary_forces = boundary_forces
         self.loads = (loads,) if isinstance(loads, AbstractLoad) else tuple(loads)
+        self.bodies = bodies
 
     def __check_init__(self):
         d = self.grid.dim
@@ -122,6 +129,12 @@ class Scene(eqx.Module):
                 all(is_traced((m, mirrors[0])) or bool(eqx.tree_equal(m, mirrors[0])) for m in mirrors),
                 f"In the updated description the grid moves with the planes across axis {axis}, so that all of them "
                 "must move alike: give them one motion, take the total description, or a SlipCollider of a HalfSpace.",
+            )
+        if self.bodies is not None:
+            refuse_contact(self.total)
+            require(
+                self.kernel.order > 1,
+                "Bodies that touch need a kernel that sees their surface: take BSpline(2), the default, or BSpline(3).",
             )
         if self.total:
             require(not self.grid.follow, "In the total description the window cannot follow: drop follow=True.")
@@ -201,7 +214,14 @@ class Scene(eqx.Module):
             self.window(particles),
             self.on_grid(particles, t),
             affine=self.transfer.affine,
+            layer=self.layer(particles),
         )
+
+    def layer(self, particles: Particles) -> Int[np.ndarray, "p"] | None:
+        """The number of each particle's body, shape (p,); None without `bodies`."""
+        if self.bodies is None:
+            return None
+        return np.repeat(self.bodies.of_materials(len(self.laws)), particles.sizes).astype(np.int32)
 
 
 @checked
