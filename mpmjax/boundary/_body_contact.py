@@ -220,9 +220,9 @@ def body_contact(
     """
     felt = (a.part > _EMPTY) & (b.part > _EMPTY)
     normal = _normal(a, b, felt)
-    first, second = (
-        _distance(body, sign * (normal * body.middle).sum(axis=0), order) for body, sign in ((a, 1), (b, -1))
-    )
+    depths = [sign * (normal * body.middle).sum(axis=0) for body, sign in ((a, 1), (b, -1))]
+    felt = felt & (depths[0] > 0) & (depths[1] > 0)  # else one lies on the other's side: no plane is between them
+    first, second = (_distance(body, depth, order) for body, depth in zip((a, b), depths, strict=True))
     area = in_a_row(a.part, b.part, felt) / _reduced(order) * spacing ** (len(normal) - 1)
     approach = jnp.maximum(-(normal * (a.velocity - b.velocity)).sum(axis=0), 0)
     modulus = in_a_row(*(body.modulus + body.density * approach**2 for body in (a, b)), felt)

@@ -54,6 +54,7 @@ from mpmjax.material import (
 )
 from mpmjax.state import (
     AttachedPoints,
+    Bodies,
     Patch,
     PointLoad,
     PointsAt,
@@ -76,6 +77,7 @@ CLASSES: tuple[type, ...] = (
     *(StickyCollider, SlipCollider, SeparatingCollider),
     *(Box, Ball, HalfSpace, Capsule, Cylinder, Annulus, Tube, Union, SampledDistance, Motion, RigidMotion),
     *(Traction, Pressure, PointLoad, Spring, Patch, PointsAt, AttachedPoints, TimeSeries),
+    Bodies,
     *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
     *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),
     *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual, DiagonalPreconditioner, MassPreconditioner),

@@ -16,6 +16,7 @@ def contacts_of_bodies(
     materials: tuple[MaterialPoints, ...],
     stencil: Stencil,
     images: Mirror,
+    t: Scalar,
     dt: Scalar,
     force_at: Scalar | None = None,
 ) -> tuple[BodyContact, ...]:
@@ -27,12 +28,13 @@ def contacts_of_bodies(
         materials: their materials.
         stencil: their stencil.
         images: the mirrors of symmetry planes, beyond which bodies go on.
+        t: time at the start of the step [s].
         dt: step [s].
         force_at: the share of the step's displacement at which forces are evaluated; None if the step is explicit.
     """
     if scene.bodies is None:
         return ()
-    bodies = _bodies(scene, particles, materials, stencil, images)
+    bodies = _bodies(scene, particles, materials, stencil, images, t)
     at = jnp.ones(()) if force_at is None else jnp.asarray(force_at)
     return tuple(
         body_contact(
@@ -51,7 +53,12 @@ def contacts_of_bodies(
 
 
 def _bodies(
-    scene: Scene, particles: Particles, materials: tuple[MaterialPoints, ...], stencil: Stencil, images: Mirror
+    scene: Scene,
+    particles: Particles,
+    materials: tuple[MaterialPoints, ...],
+    stencil: Stencil,
+    images: Mirror,
+    t: Scalar,
 ) -> list[Body]:
     """The bodies, one for each layer of nodes."""
     d, dx, layers = particles.dim, jnp.asarray(scene.grid.spacing), scene.grid.layers
@@ -63,15 +70,15 @@ def _bodies(
     scalars, velocity = sums[:4], images.fold(sums[4:].T).T
 
     # w (x_p − x_i)_a = −D_a g_a, with g the moving-least-squares gradient
-    origin = scene.window(particles) * dx
-    places = components(scene.on_grid(particles, 0.0) - origin) / dx
+    nodes = scene.grid.nodes(scene.window(particles))
+    places = components(scene.on_grid(particles, t) - nodes[0]) / dx
+    nodes = (nodes - nodes[0]).T / dx
     pairs = list(combinations_with_replacement(range(d), 2))
     arms = -volume * stencil.moment / dx
     across = [jnp.eye(d, dtype=volume.dtype)[:, a, None] * arms[a] for a in range(d)]
     across += [jnp.eye(d, dtype=volume.dtype)[:, a, None] * arms[a] * places[b] for a, b in pairs]
     found = scatter(stencil.least_squares, None, jnp.stack(across, axis=1), scene.grid.size).T
     first, second = found[:d], found[d:]
-    nodes = (scene.grid.nodes(scene.window(particles)) - origin).T / dx
     second = [own - nodes[b] * first[a] for own, (a, b) in zip(second, pairs, strict=True)]
     second = {pair: _fold(images, own, pair) for own, pair in zip(second, pairs, strict=True)}
     first = images.fold(first.T).T

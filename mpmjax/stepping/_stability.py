@@ -221,7 +221,7 @@ def _between_bodies(
 ) -> Float[Array, ""] | float:
     """The most that the springs between two bodies add to Λ A/ρ0 [1/s²]: 4 k/(ρ dx²), with the stiffness k of the two
     in a row and the density ρ of the lighter. At a node it is N k/(ρ dx²) times c_a c_b/(c_a + c_b) (1/c_a + 1/c_b) = 1
-    (see `BodyContact`), with N = 3.6 for the quadratic kernel and 3.1 for the cubic one."""
+    (see `BodyContact`), with N = 3.5 for the quadratic kernel and 3.1 for the cubic one."""
     if scene.bodies is None:
         return 0.0
     density, speed = particles.mass / particles.volume, length(particles.v)
