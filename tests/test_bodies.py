@@ -226,9 +226,7 @@ BAD = {
     ),
     "negative friction": (lambda: mpm.Bodies(-0.1), "friction"),
     "the total description": (
-        lambda: mpm.Scene(
-            mpm.Grid((8, 8), 0.1), (LAW, LAW), bodies=mpm.Bodies(), description=mpm.TotalLagrangian()
-        ),
+        lambda: mpm.Scene(mpm.Grid((8, 8), 0.1), (LAW, LAW), bodies=mpm.Bodies(), description=mpm.TotalLagrangian()),
         "no contact",
     ),
     "the linear kernel": (

@@ -1,28 +1,28 @@
 """Contact of two bodies, each of which has a layer of nodes of its own."""
 
 import math
+from functools import reduce
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Bool, Float, Mask, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, Mask, Matrix, NodeVector, Scalar
 from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
 from mpmjax.boundary._coupling import Coupling
+from mpmjax.discretisation import Grid
 
 _SAMPLES = 128
 """Distances at which a half-space is tabulated."""
-_FINE = 1 / 64
-"""The side of particles that are taken for none, in spacings."""
 _EMPTY = 1e-9
 """The part of a cell below which a body is not felt at a node."""
 _LEAST_SPREAD = 1e-2
-"""A variance of this many square spacings is added to those of bodies, of which one particle has none."""
-_POWER = 4
-"""The power of C⁻¹ in the normal. A block that slides without friction loses 0.63, 0.25, 0.09 and 0.02 % of what it gains
-by the normals at its edges, with powers 1, 2, 4 and 8; around round bodies a high power follows noise."""
+"""A variance of this many square spacings is added to that of where two bodies meet."""
+_POWER = 2
+"""k of the normal."""
 
 
 class HalfSpace(NamedTuple):
@@ -61,8 +61,6 @@ class Body(NamedTuple):
     """Σ_p w_ip V_p / dx^d [-], shape (m,): about the part of the kernel that the body fills."""
     middle: Float[Array, "d m"]
     """The mean of x_p − x_i [-], shape (d, m)."""
-    spread: Float[Array, "d d m"]
-    """The covariance of x_p [-], shape (d, d, m)."""
     side: Float[Array, "m"]
     """The mean side of the particles, V_p^(1/d) [-], shape (m,)."""
     velocity: Float[Array, "d m"]
@@ -76,21 +74,19 @@ class Body(NamedTuple):
 class BodyContact(AbstractContact):
     """Two bodies that push and rub each other, and may part. Each node is a place.
 
-    The normal at a node is C⁻⁴ Δ, with Δ the difference of the bodies' middles around it and C the mean of their
-    covariances. C⁻¹ Δ is Fisher's discriminant, the direction along which the bodies are farthest apart for what each
-    is wide (R. A. Fisher, Ann. Eugenics 7 (1936) 179). The higher power turns it further to where both are thin, and so
-    away from an edge that one of them has beside the node.
+    The normal at a node is C⁻ᵏ Δ, k = 2, with Δ the difference of the bodies' middles around it, and C the covariance of
+    where they meet: of c_a c_b, c the parts of the kernel in the bodies, on the nodes around. They meet in a
+    sheet. It is thin along the normal and wide across it, at an edge of a body too, where Δ alone is oblique.
 
     Along the normal a body around a node looks like a half-space. How deep it lies on average, weighted with the
-    kernel, tells how far its surface is: an edge of the body beside the node does not change that. The gap is the sum of
-    both bodies' distances.
+    kernel, tells how far its surface is: an edge of the body beside the node does not change that. The gap is the sum
+    of both bodies' distances.
 
     A node at which the gap is below zero at the end of the step, in an explicit step at its start, has a spring
     between the two bodies (see `Coupling`): those of both in a row, of stiffness α (M + ρ w²)/dx each on the node's
     share of the surface, with the wave modulus M and the density ρ of the body, and w the velocity with which the two
-    meet. The share is that of the reduced volume, N dx^(d−1) c_a c_b/(c_a + c_b) with c the parts of the kernel in the
-    bodies and N the number with which shares sum to one over the nodes along the normal. So springs of two bodies of
-    one density have one frequency at all nodes, however little of a body a node sees.
+    meet. The share is dx^(d−1) cos²(πs/2dx) (c_a + c_b) at a distance s < dx from the surface; over the nodes along the
+    normal it sums to that part of the surface in which there are bodies.
 
     Friction is at most μ times the push at each node, against the slip of the two bodies.
     """
@@ -200,7 +196,7 @@ def body_contact(
     *,
     friction: Scalar,
     order: int,
-    spacing: Scalar,
+    grid: Grid,
     dt: Scalar,
     stiffness: float,
     share: Scalar,
@@ -213,17 +209,18 @@ def body_contact(
         pair: their numbers.
         friction: Coulomb coefficient [-].
         order: that of the kernel.
-        spacing: dx [m].
+        grid: the grid.
         dt: Δt [s].
         stiffness: α [-], that of contact in the wave modulus over a spacing.
         share: θ (see `BodyContact`).
     """
-    felt = (a.part > _EMPTY) & (b.part > _EMPTY)
-    normal = _normal(a, b, felt)
+    spacing, felt = jnp.asarray(grid.spacing), (a.part > _EMPTY) & (b.part > _EMPTY)
+    normal = _normal(a, b, felt, grid)
     depths = [sign * (normal * body.middle).sum(axis=0) for body, sign in ((a, 1), (b, -1))]
-    felt = felt & (depths[0] > 0) & (depths[1] > 0)  # else one lies on the other's side: no plane is between them
     first, second = (_distance(body, depth, order) for body, depth in zip((a, b), depths, strict=True))
-    area = in_a_row(a.part, b.part, felt) / _reduced(order) * spacing ** (len(normal) - 1)
+    away = jnp.minimum(jnp.maximum(first, second), 1)
+    felt = felt & (depths[0] > 0) & (depths[1] > 0) & (away < 1)
+    area = jnp.cos(jnp.pi / 2 * away) ** 2 * (a.part + b.part) * spacing ** (len(normal) - 1)
     approach = jnp.maximum(-(normal * (a.velocity - b.velocity)).sum(axis=0), 0)
     modulus = in_a_row(*(body.modulus + body.density * approach**2 for body in (a, b)), felt)
     return BodyContact(
@@ -242,18 +239,51 @@ def in_a_row(a: Array, b: Array, felt: Array | bool = True) -> Array:
     return a * b / jnp.where(felt, a + b, 1)
 
 
-def _normal(a: Body, b: Body, felt: Bool[Array, "m"]) -> Float[Array, "d m"]:
+def _normal(a: Body, b: Body, felt: Bool[Array, "m"], grid: Grid) -> Float[Array, "d m"]:
     """The unit normal from the second body to the first, shape (d, m); any where one of them is not felt."""
-    wide = (a.spread + b.spread) / 2 + _LEAST_SPREAD * la.identity_like(a.spread)
-    inverse = la.cofactor(wide)  # of a symmetric matrix, times its determinant
-    inverse = inverse / la.trace(inverse)
+    thin = la.cofactor(_spread(a.part * b.part, grid))  # C⁻¹, times its determinant
+    thin = thin / la.trace(thin)
     direction = (a.middle - b.middle)[:, None]
     for _ in range(_POWER):
-        direction = la.matmul(inverse, direction)
+        direction = la.matmul(thin, direction)
     direction = direction[:, 0]
     square = (direction**2).sum(axis=0)
     felt = felt & (square > 0)
     return jnp.where(felt, direction, 0) / jnp.sqrt(jnp.where(felt, square, 1))
+
+
+def _spread(field: Float[Array, "m"], grid: Grid) -> Matrix:
+    """The covariance of a field's places, in the five nodes a direction around each node, in square spacings, shape
+    (d, d, m); a little more where the field has one node alone."""
+    d = grid.dim
+    moments = {(0,) * d: field.reshape(grid.shape)}
+    for axis in range(d):
+        moments = {
+            (*powers[:axis], power, *powers[axis + 1 :]): _moment(found, axis, power, periodic=grid.periodic[axis])
+            for powers, found in moments.items()
+            for power in range(3 - sum(powers))
+        }
+
+    def of(*axes: int) -> Array:
+        return moments[tuple(sum(axis == own for axis in axes) for own in range(d))].reshape(-1)
+
+    total = of()
+    total = jnp.where(total > 0, total, 1)
+    mean = [of(axis) / total for axis in range(d)]
+    C = la.assemble([[of(a, b) / total - mean[a] * mean[b] for b in range(d)] for a in range(d)])
+    return C + _LEAST_SPREAD * la.identity_like(C)
+
+
+def _moment(field: Array, axis: int, power: int, *, periodic: bool) -> Array:
+    """Σ_k k^power f_{i+k} along an axis, k from −2 to 2."""
+    around = [(2, 2) if own == axis else (0, 0) for own in range(field.ndim)]
+    wide = jnp.pad(field, around, mode="wrap" if periodic else "constant")
+    parts = [
+        k**power * jax.lax.slice_in_dim(wide, k + 2, k + 2 + field.shape[axis], axis=axis)
+        for k in range(-2, 3)
+        if k != 0 or power == 0
+    ]
+    return reduce(jnp.add, parts)
 
 
 def _distance(body: Body, depth: Float[Array, "m"], order: int) -> Float[Array, "m"]:
@@ -261,12 +291,6 @@ def _distance(body: Body, depth: Float[Array, "m"], order: int) -> Float[Array, 
     half-spaces of particles of no side and of half a spacing. What the side changes is of second order in it."""
     fine, coarse = (
         jnp.interp(depth, jnp.asarray(table.depth, depth.dtype), jnp.asarray(table.distance, depth.dtype))
-        for table in (half_space(order, _FINE), half_space(order, 1 / 2))
+        for table in (half_space(order, 1 / 64), half_space(order, 1 / 2))
     )
     return fine + 4 * body.side**2 * (coarse - fine)
-
-
-def _reduced(order: int) -> float:
-    """Σ_i G_i (1 − G_i) over the nodes along the normal, 1/N, with G the part of the kernel in a half-space."""
-    table = half_space(order, _FINE)
-    return float(np.trapezoid(table.part * (1 - table.part), table.distance))

@@ -370,7 +370,7 @@ def particles_to_grid(
             *brought_contacts(scene.boundary, conditions, grid, window, t, dt, faces, acts_at)
         ]
         images = mirror(scene.boundary, grid, window)
-        touching = contacts_of_bodies(scene, particles, potential.material_points, stencil, images, t, dt, force_at)
+        touching = contacts_of_bodies(scene, particles, potential.material_points, stencil, images, dt, force_at)
         brought += [(None, contact) for contact in touching]
         nodes = Nodes(
             mass=jnp.where(occupied[:, 0], mass, 0),
