@@ -69,11 +69,11 @@ def test_the_gap_is_the_distance_of_the_faces(d, order):
 
 
 def test_shares_of_the_surface_sum_to_it():
-    """Σ_i k_i is α M/(2 dx) times the area on which two bodies of one law meet: of the narrower one, but for the edges."""
+    """Σ_i k_i is α M/(2 dx) times the area on which two bodies of one law meet, that of the narrower one."""
     scene, particles = stacked(gap=0.0, cells=5)
     contact, _ = contact_of(scene, particles)
     total = float(contact.stiffness.sum()) / (2 * float(LAW.wave_modulus(jnp.eye(2)[..., None])[0]) / 2 / 0.1)
-    assert 0.5 < total < 0.62
+    assert 0.49 < total < 0.55  # at an edge the wider body counts too
 
 
 def test_the_force_of_a_coupling_is_that_of_its_energy():
@@ -100,8 +100,8 @@ def test_bodies_that_meet_keep_momentum(method):
     before, after = ((particles.mass[:, None] * p.v).sum(axis=0) for p in (particles, new))
     upper = slice(particles.sizes[0], None)
     slowed = (particles.mass[:, None] * (new.v - particles.v))[upper].sum(axis=0)
-    assert slowed[1] > 0.01 * abs(before[1])  # they push
-    assert slowed[0] < -0.002 * abs(before[0])  # and rub
+    assert slowed[1] > 0.003 * abs(before[1])  # they push
+    assert slowed[0] < -0.0005 * abs(before[0])  # and rub
     assert_close(after, before, 1e-12 if explicit else 1e-9)
     if explicit:
         assert_close(spin(mpm.prepare(scene, new)), spin(mpm.prepare(scene, particles)), 1e-12, 1e-14)
@@ -193,13 +193,13 @@ def test_derivatives_of_a_touch_are_those_of_differences(method):
 
 
 def test_three_bodies_touch_each_other(tmp_path):
-    """Each two of them; groups of materials share nodes; a run comes back from its file."""
+    """Each two of them; materials may share a body; a run comes back from its file."""
     grid = mpm.Grid((10, 16), 0.1, origin=(-4, -4))
     boxes = [mpm.Box((0.0, 0.3 * k), (0.3, 0.3 * k + 0.3)) for k in range(3)]
     particles = mpm.join(*(mpm.fill(box, grid, density=1e3) for box in boxes))
     scene = mpm.Scene(grid, (LAW,) * 3, bodies=mpm.Bodies())
     assert scene.grid.layers == 3
-    two = mpm.Scene(grid, (LAW,) * 3, bodies=mpm.Bodies(groups=((0, 2), (1,))))
+    two = mpm.Scene(grid, (LAW,) * 3, bodies=mpm.Bodies(of_materials=(0, 1, 0)))
     assert two.grid.layers == 2
     squeezed = dataclasses.replace(particles, x=particles.x * jnp.array([1.0, 0.98]))
     new, info = mpm.step(scene, squeezed, 0.0, 1e-3)
@@ -220,9 +220,9 @@ def test_the_longest_step_knows_of_bodies():
 
 BAD = {
     "one material": (lambda: mpm.Scene(mpm.Grid((8, 8), 0.1), LAW, bodies=mpm.Bodies()), "two or more"),
-    "a group missing": (
-        lambda: mpm.Scene(mpm.Grid((8, 8), 0.1), (LAW, LAW), bodies=mpm.Bodies(groups=((0,), (2,)))),
-        "once",
+    "a number left out": (
+        lambda: mpm.Scene(mpm.Grid((8, 8), 0.1), (LAW, LAW), bodies=mpm.Bodies(of_materials=(0, 2))),
+        "none left out",
     ),
     "negative friction": (lambda: mpm.Bodies(-0.1), "friction"),
     "the total description": (

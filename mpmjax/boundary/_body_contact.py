@@ -22,7 +22,7 @@ _EMPTY = 1e-9
 _LEAST_SPREAD = 1e-2
 """A variance of this many square spacings is added to that of where two bodies meet."""
 _POWER = 2
-"""k of the normal."""
+"""How often C⁻¹ is applied for the normal."""
 
 
 class HalfSpace(NamedTuple):
@@ -74,9 +74,9 @@ class Body(NamedTuple):
 class BodyContact(AbstractContact):
     """Two bodies that push and rub each other, and may part. Each node is a place.
 
-    The normal at a node is C⁻ᵏ Δ, k = 2, with Δ the difference of the bodies' middles around it, and C the covariance of
-    where they meet: of c_a c_b, c the parts of the kernel in the bodies, on the nodes around. They meet in a
-    sheet. It is thin along the normal and wide across it, at an edge of a body too, where Δ alone is oblique.
+    The normal at a node is along C⁻² Δ, with Δ the difference of the bodies' middles around it, and C the covariance of
+    where they meet: of c_a c_b, c the parts of the kernel in the bodies, on the nodes around. They meet in a sheet. It
+    is thin along the normal and wide across it, at an edge of a body too, where Δ alone is oblique.
 
     Along the normal a body around a node looks like a half-space. How deep it lies on average, weighted with the
     kernel, tells how far its surface is: an edge of the body beside the node does not change that. The gap is the sum

@@ -92,7 +92,7 @@ class Scene(eqx.Module):
         bodies: Bodies | None = None,
     ):
         self.material = tuple(material) if isinstance(material, list) else material
-        layers = 1 if bodies is None else 1 + max(bodies.of_materials(len(self.laws)))
+        layers = 1 if bodies is None else 1 + max(bodies.numbers(len(self.laws)))
         self.grid = grid if grid.layers == layers else grid.with_layers(layers)
         self.gravity = (0.0,) * grid.dim if gravity is None else gravity
         self.boundary = (boundary,) if isinstance(boundary, AbstractBoundary) else tuple(boundary)
@@ -221,7 +221,7 @@ class Scene(eqx.Module):
         """The number of each particle's body, shape (p,); None without `bodies`."""
         if self.bodies is None:
             return None
-        return np.repeat(self.bodies.of_materials(len(self.laws)), particles.sizes).astype(np.int32)
+        return np.repeat(self.bodies.numbers(len(self.laws)), particles.sizes).astype(np.int32)
 
 
 @checked

@@ -220,14 +220,14 @@ def _between_bodies(
     scene: Scene, particles: Particles, materials: tuple[MaterialPoints, ...]
 ) -> Float[Array, ""] | float:
     """The most that the springs between two bodies add to Λ A/ρ0 [1/s²]: 4 k/(ρ dx²), with the stiffness k of the two
-    in a row and the density ρ of the lighter. At a node it is N k/(ρ dx²) times c_a c_b/(c_a + c_b) (1/c_a + 1/c_b) = 1
-    (see `BodyContact`), with N = 3.5 for the quadratic kernel and 3.1 for the cubic one."""
+    in a row and the density ρ of the lighter. A node at a distance s from the surface has the share cos²(πs/2dx) of a
+    spring, and by its mass, G(s) of the one body and G(−s) of the other, no more than 4 times k/(ρ dx²)."""
     if scene.bodies is None:
         return 0.0
     density, speed = particles.mass / particles.volume, length(particles.v)
     moduli = [jnp.broadcast_to(p.law.wave_modulus(p.deformation), p.volume.shape) for p in materials]
     modulus = jnp.concatenate(moduli) + density * (speed + speed.max()) ** 2
-    of_body = scene.bodies.of_materials(len(scene.laws))
+    of_body = scene.bodies.numbers(len(scene.laws))
     rows = [slice(*points.rows) for points in materials]
 
     def over(numbers: Array, most: Callable[..., Array]) -> list[Array]:
