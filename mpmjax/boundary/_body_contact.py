@@ -15,8 +15,8 @@ from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
 from mpmjax.boundary._coupling import Coupling
 from mpmjax.discretisation import Grid
 
-_SAMPLES = 128
-"""Distances at which a half-space is tabulated."""
+_SAMPLES = 256
+"""Depths at which the distance of a half-space is tabulated."""
 _EMPTY = 1e-9
 """The part of a cell below which a body is not felt at a node."""
 _LEAST_SPREAD = 1e-2
@@ -25,32 +25,21 @@ _POWER = 2
 """How often C⁻¹ is applied for the normal."""
 
 
-class HalfSpace(NamedTuple):
-    """How a kernel sees a half-space whose surface lies at a distance from the kernel's middle, tabulated. It is filled
-    with particles of a given side, the first of them half a side behind the surface."""
-
-    distance: np.ndarray
-    """Distance of the surface in spacings, positive outside."""
-    depth: np.ndarray
-    """How far in the particles lie from the kernel's middle, on average over the kernel, in spacings."""
-    part: np.ndarray
-    """The part of the kernel in which particles lie."""
-
-
-def half_space(order: int, side: float) -> HalfSpace:
-    """The table for the B-spline of an order, by its truncated powers.
+def half_space(order: int, side: float) -> np.ndarray:
+    """How far the surface of a half-space lies from the kernel's middle, in spacings and positive outside, by how deep
+    its particles lie on average over the kernel: at equal depths from none to that of a particle at the kernel's end.
 
     Args:
-        order: that of the B-spline.
-        side: that of the particles in spacings.
+        order: that of the B-spline, which is made of its truncated powers.
+        side: that of the particles in spacings; the first of them lie half a side behind the surface.
     """
     reach = (order + 1) / 2
-    distance = np.linspace(-reach, reach - side / 2, _SAMPLES, endpoint=False)
+    distance = np.linspace(-reach, reach - side / 2, 16 * _SAMPLES, endpoint=False)
     y = distance[:, None] + side * (0.5 + np.arange(int(2 * reach / side) + 1))
     powers = [(-1) ** j * math.comb(order + 1, j) * np.maximum(y + reach - j, 0) ** order for j in range(order + 2)]
     kernel = np.where(y < reach, sum(powers) / math.factorial(order), 0)
-    part = kernel.sum(axis=1) * side
-    return HalfSpace(distance, np.maximum.accumulate((kernel * y).sum(axis=1) * side / part), part)
+    depth = np.maximum.accumulate((kernel * y).sum(axis=1) / kernel.sum(axis=1))
+    return np.interp(np.linspace(0, reach, _SAMPLES + 1), depth, distance)
 
 
 class Body(NamedTuple):
@@ -289,8 +278,9 @@ def _moment(field: Array, axis: int, power: int, *, periodic: bool) -> Array:
 def _distance(body: Body, depth: Float[Array, "m"], order: int) -> Float[Array, "m"]:
     """The distance of a body's surface from each node in spacings, positive outside, shape (m,): interpolated between
     half-spaces of particles of no side and of half a spacing. What the side changes is of second order in it."""
-    fine, coarse = (
-        jnp.interp(depth, jnp.asarray(table.depth, depth.dtype), jnp.asarray(table.distance, depth.dtype))
-        for table in (half_space(order, 1 / 64), half_space(order, 1 / 2))
-    )
-    return fine + 4 * body.side**2 * (coarse - fine)
+    fine, coarse = half_space(order, 1 / 64), half_space(order, 1 / 2)
+    place = jnp.clip(depth / ((order + 1) / 2), 0, 1) * _SAMPLES
+    low = jnp.minimum(place.astype(jnp.int32), _SAMPLES - 1)
+    rows = jnp.asarray(np.stack([fine, 4 * (coarse - fine)], axis=1), depth.dtype)
+    found = rows[low] + (place - low.astype(place.dtype))[:, None] * (rows[low + 1] - rows[low])
+    return found[:, 0] + body.side**2 * found[:, 1]
