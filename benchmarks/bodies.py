@@ -53,7 +53,7 @@ def rest(quick: bool) -> None:
         contact, x = contact_of(scene, run.final, 4.0)
         inside = np.isfinite(contact.gap) & (np.abs(x[:, 0] - 0.5) < 0.11) & (np.asarray(contact.stiffness) > 0)
         seen = np.average(np.asarray(contact.gap)[inside], weights=np.asarray(contact.stiffness)[inside]) / dx
-        pressed = DENSITY * G * 0.6 / (2 * 1.346e6 / 2)  # by springs of explicit steps, as contact_of makes them
+        pressed = DENSITY * G * 0.6 / 1.346e6  # α M/2 = M a spacing, of two bodies in a row
         print(f"  {place:4.2f} spacings from a node: {seen:+.4f} ({pressed:.4f} by the load)")
 
 

@@ -1,6 +1,6 @@
 """Walls, grips, mirrored planes and colliders, and what colliders receive."""
 
-from mpmjax.boundary._body_contact import Body, BodyContact, body_contact, in_a_row
+from mpmjax.boundary._body_contact import STIFFNESS, Body, BodyContact, body_contact, in_a_row
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall
 from mpmjax.boundary._boundary_impulse import (
     BoundaryImpulse,
@@ -51,6 +51,7 @@ __all__ = [
     "EXPLICIT_STIFFNESS",
     "IMPLICIT_STIFFNESS",
     "ON_THE_WALL",
+    "STIFFNESS",
     "AbstractBoundary",
     "AbstractCollider",
     "AbstractContact",

@@ -5,7 +5,7 @@ from itertools import combinations
 import jax.numpy as jnp
 
 from mpmjax._types import Scalar, components
-from mpmjax.boundary import EXPLICIT_STIFFNESS, IMPLICIT_STIFFNESS, Body, BodyContact, Mirror, body_contact
+from mpmjax.boundary import Body, BodyContact, Mirror, body_contact
 from mpmjax.discretisation import Stencil, scatter
 from mpmjax.state import MaterialPoints, Particles, Scene
 
@@ -43,7 +43,6 @@ def contacts_of_bodies(
             order=scene.kernel.order,
             grid=scene.grid,
             dt=dt,
-            stiffness=EXPLICIT_STIFFNESS if force_at is None else IMPLICIT_STIFFNESS,
             share=jnp.where(at > 0, at, 1).astype(particles.x.dtype),
         )
         for pair in combinations(range(scene.grid.layers), 2)

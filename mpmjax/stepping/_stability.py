@@ -11,7 +11,7 @@ import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.boundary import EXPLICIT_STIFFNESS, in_a_row
+from mpmjax.boundary import STIFFNESS, in_a_row
 from mpmjax.checks import canonical, checked, is_traced, require, require_positive
 from mpmjax.discretisation import Stencil
 from mpmjax.geometry import length
@@ -241,7 +241,7 @@ def _between_bodies(
     added = [
         in_a_row(stiff[a], stiff[b]) / jnp.minimum(light[a], light[b]) for a, b in combinations(range(len(stiff)), 2)
     ]
-    return 4 * EXPLICIT_STIFFNESS * jnp.stack(added).max() / jnp.asarray(scene.grid.spacing) ** 2
+    return 4 * STIFFNESS * jnp.stack(added).max() / jnp.asarray(scene.grid.spacing) ** 2
 
 
 def _stiffest_viscosity(points: MaterialPoints, dim: int) -> Float[Array, "q"]:
