@@ -78,8 +78,8 @@ class BodyContact(AbstractContact):
     A node at which the gap is below zero at the end of the step, in an explicit step at its start, has a spring
     between the two bodies (see `Coupling`): those of both in a row, of stiffness α (M + ρ w²)/dx each, α = 2, on the
     node's share of the surface, with the wave modulus M and the density ρ of the body, and w the velocity with which
-    the two meet. The share is dx^(d−1) cos²(πs/2dx) (c_a + c_b) at a distance s < dx from the surface; over the nodes along the
-    normal it sums to that part of the surface in which there are bodies.
+    the two meet. The share is dx^(d−1) cos²(πs/2dx) (c_a + c_b) at a distance s < dx from the surface; over the nodes
+    along the normal it sums to that part of the surface in which there are bodies.
 
     Friction is at most μ times the push at each node, against the slip of the two bodies.
     """
