@@ -162,7 +162,7 @@ def billiard() -> tuple[mpm.Scene, mpm.Particles]:
 def chaos(quick: bool) -> plt.Figure:
     """After many collisions derivatives are right and say nothing."""
     scene, particles = billiard()
-    dt, early, late = 2e-3, *((0.1, 0.2) if quick else (1.0, 10.0))
+    dt, early, late = 2e-3, *((0.1, 0.2) if quick else (1.0, 20.0))
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         grown = mpm.sensitivity(scene, particles, t1=late, dt=dt)

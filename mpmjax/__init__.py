@@ -128,6 +128,7 @@ from mpmjax.implicit import (
     MassPreconditioner,
     Newton,
     SolveInfo,
+    VolumePreconditioner,
     no_solve,
 )
 from mpmjax.io import load, record, register, save
@@ -156,6 +157,7 @@ from mpmjax.state import (
     AbstractLoad,
     AbstractPlace,
     AttachedPoints,
+    AveragedVolume,
     Bodies,
     Particles,
     Patch,
@@ -196,6 +198,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "Scene",
     "UpdatedLagrangian",
     "TotalLagrangian",
+    "AveragedVolume",
     # particles and regions
     "Particles",
     "fill",
@@ -299,6 +302,7 @@ __all__ = [  # noqa: RUF022 (grouped)
     "ConjugateResidual",
     "AbstractPreconditioner",
     "DiagonalPreconditioner",
+    "VolumePreconditioner",
     "MassPreconditioner",
     "Guess",
     "stable_dt",

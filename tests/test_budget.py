@@ -81,6 +81,8 @@ CASES = {
         "boundary": BOUNDARIES["planes"],
         "material": LAWS["neo_hookean"],
     },
+    "averaged volumes": {"volume": mpm.AveragedVolume(), "boundary": BOUNDARIES["planes"]},
+    "midpoint-averaged volumes": {"volume": mpm.AveragedVolume(), "method": SECOND_ORDER["implicit_midpoint"]},
     "fluid": {"material": FLUIDS["fluid"], "boundary": BOUNDARIES["walls"]},
     "semi_implicit-fluid": {"material": FLUIDS["fluid"], "method": METHODS["semi_implicit"], "transfer": mpm.PIC()},
     **{

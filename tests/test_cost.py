@@ -136,6 +136,18 @@ def test_the_diagonal_preconditioner_adds_one_crossing_to_a_solve_and_nothing_to
     assert operations(body) == {"stencil_scatter": 1, "stencil_gather": 1}
 
 
+@pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
+def test_averaged_volumes_cross_by_hats_and_what_does_not_ask_for_them_does_not(description):
+    """The hats' volumes, the sum and the average of J, and of the pressure; in an iteration two averages."""
+    law, gradient = mpm.NeoHookean(1e5, 0.49), mpm.MLSGradient()
+    choices = {"material": law, "gradient": gradient, "description": description}
+    assert crossings(counted(**choices)) == (1, 1)
+    assert crossings(counted(**choices, volume=mpm.AveragedVolume())) == (1 + 3, 1 + 2)
+    step, arrays = program(mpm.SemiImplicit(), **choices, volume=mpm.AveragedVolume())
+    (body,) = innermost_loops(jax.make_jaxpr(step)(arrays).jaxpr)
+    assert operations(body) == {"stencil_scatter": 1 + 2, "stencil_gather": 1 + 2}
+
+
 HELD = {
     "sticky": mpm.StickyBox((-0.2, -0.2), (0.8, 0.8)),
     "slip": mpm.SlipBox((-0.2, -0.2), (0.8, 0.8)),

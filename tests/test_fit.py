@@ -562,6 +562,19 @@ def test_two_grids_that_agree_by_chance_are_not_believed():
     assert held[True] > 0.94 * 120
 
 
+def test_an_order_above_the_one_that_is_asked_for_does_not_narrow_the_interval():
+    """Where errors c h + e h⁴ are fitted on three grids: extrapolated with the order that they show, with the error of
+    the correction with the first order. That of the order shown would miss the truth, which is 0."""
+    for h4 in (10.0, 30.0, 100.0):
+        values = [h + h4 * h**4 for h in (1.0, 0.5, 0.25)]
+        found = tuple(Estimate(str(k), value, 0.0, (value, value)) for k, value in enumerate(values))
+        last, left, p = _extrapolate(None, found, [1, 2, 4], 1.0, 0.0, 1.96)
+        assert p == 2
+        assert last.value == pytest.approx(values[2] - (values[1] - values[2]) / 3)
+        assert left == pytest.approx(values[1] - values[2])
+        assert last.interval[0] < 0 < last.interval[1]
+
+
 @pytest.mark.thorough
 def test_a_measurements_zero_of_time_is_a_parameter():
     """A front that was read off a clock two steps late; a clock that leaves the run says so."""

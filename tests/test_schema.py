@@ -55,6 +55,7 @@ EXAMPLES = {
     mpm.RigidPart: mpm.RigidPart(mpm.Ball((0.1, 0.2), 0.3), (True, False)),
     mpm.SymmetryPlane: mpm.SymmetryPlane(1, 0.05, "below"),
     mpm.ContactPlane: mpm.ContactPlane(1, 0.05, "below", friction=0.3),
+    mpm.Bodies: mpm.Bodies(0.3, (0, 1, 0)),
     mpm.Box: mpm.Box((0.0, 0.1, 0.2), (1.0, 1.1, 1.2)),
     mpm.Ball: mpm.Ball((0.1, 0.2), 0.3),
     mpm.HalfSpace: mpm.HalfSpace((0.1, 0.2), (3.0, 4.0)),
@@ -99,8 +100,10 @@ EXAMPLES = {
     mpm.AnalyticHessian: mpm.AnalyticHessian(),
     mpm.JvpHessian: mpm.JvpHessian(),
     mpm.ConjugateResidual: mpm.ConjugateResidual(1e-7, increment_rtol=1e-3, max_steps=17),
+    mpm.AveragedVolume: mpm.AveragedVolume((0, 1)),
     mpm.DiagonalPreconditioner: mpm.DiagonalPreconditioner(),
     mpm.MassPreconditioner: mpm.MassPreconditioner(),
+    mpm.VolumePreconditioner: mpm.VolumePreconditioner(1000),
 }
 """One of each class that files hold; the next test says so."""
 

@@ -8,6 +8,7 @@ from mpmjax._types import Array, Float, Matrix, NodeVector, Scalar, components
 from mpmjax.analysis._diagnostics import energy_density, energy_of
 from mpmjax.checks import canonical, checked, require, require_positive
 from mpmjax.discretisation import Gathered, Stencil, gather, scatter
+from mpmjax.implicit import ElasticPotential
 from mpmjax.state import Particles, Scene, prepare
 from mpmjax.stepping import (
     AbstractIntegrator,
@@ -23,7 +24,7 @@ from mpmjax.stepping import (
 class EnergyBudget(eqx.Module):
     """The budget of energy for each of f steps [J]:
 
-    Δkinetic + Δelastic + Δpotential = boundary + friction + body_force + solver + time_integration
+    Δkinetic + Δelastic + Δpotential = boundary + friction + body_force + solver + time_integration + averaging
     − p2g − g2p − implicit − viscous − plastic.
 
     Below, v̄ = (v^n + v^{n+1})/2 at the nodes and u_ip = v_p + C_p (x_i − x_p). Each term has its own expression, and
@@ -58,6 +59,9 @@ class EnergyBudget(eqx.Module):
     """Dissipation by return maps, Σ V0 (Ψ(trial deformation) − Ψ(returned deformation)), with the change of Ψ by
     hardening. If a step strains by many times the yield strain, the energy that it stores before the return is in
     `time_integration`: read the two together."""
+    averaging: Float[Array, "*f"]
+    """Change of Σ V0 Ψ(F̄) where volumes are averaged, by the particles' new places on the grid at the same F. Zero in
+    the total description, and without averages."""
     solver: Float[Array, "*f"]
     """Work of the residual of the solve."""
     time_integration: Float[Array, "*f"]
@@ -74,7 +78,7 @@ class EnergyBudget(eqx.Module):
     @property
     def explained(self) -> Float[Array, "*f"]:
         """The sum of all terms on the right, equal to `change`."""
-        gains = self.boundary + self.friction + self.body_force + self.solver + self.time_integration
+        gains = self.boundary + self.friction + self.body_force + self.solver + self.time_integration + self.averaging
         return gains - self.p2g - self.g2p - self.implicit - self.viscous - self.plastic
 
 
@@ -248,6 +252,7 @@ def _step_budget(
             body_force=(body * mean).sum(),
             viscous=dissipated,
             plastic=(before.volume * (energy_density(scene, trial) - energy_density(scene, after))).sum(),
+            averaging=_averaged_anew(scene, potential, after),
             solver=(missed * mean).sum(),
             time_integration=stored
             - potential.energy(jnp.zeros_like(v0))
@@ -267,6 +272,17 @@ def _step_budget(
             transfer=gained_p2g + (before.mass * beside).sum(axis=1),
         ),
     )
+
+
+def _averaged_anew(scene: Scene, potential: ElasticPotential, after: Particles) -> Float[Array, ""]:
+    """The change of the elastic energy [J] by the averages of the particles' new places."""
+    change = jnp.zeros((), after.x.dtype)
+    if scene.volume is None:
+        return change
+    for old, new in zip(potential.material_points, scene.material_points(after), strict=True):
+        gained = new.energy_density(new.deformation) - old.energy_density(new.deformation)
+        change = change + (new.volume * gained).sum()
+    return change
 
 
 def _gathered(scene: Scene, stencil: Stencil, nodes: NodeVector) -> Gathered:

@@ -58,7 +58,7 @@ _energy = eqx.filter_jit(energy_of)
 
 def energy_density(scene: Scene, particles: Particles) -> ParticleScalar:
     """Ψ of each prepared particle [J/m^d of undeformed volume], shape (p,)."""
-    return jnp.concatenate([points.law.energy(points.deformation) for points in scene.material_points(particles)])
+    return jnp.concatenate([points.energy_density(points.deformation) for points in scene.material_points(particles)])
 
 
 @checked

@@ -25,11 +25,10 @@ from mpmjax.boundary._contact import (
     AbstractContact,
     AbstractNodes,
     ConstrainedNodes,
-    ContactInfo,
     constrain,
     find_active_set,
-    no_contact,
 )
+from mpmjax.boundary._contact_info import ContactInfo, no_contact
 from mpmjax.boundary._coupling import Coupling
 from mpmjax.boundary._faces import EXPLICIT_STIFFNESS, IMPLICIT_STIFFNESS, Faces, FaceShape
 from mpmjax.boundary._grip import Grip

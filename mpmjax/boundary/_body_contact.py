@@ -213,7 +213,8 @@ def body_contact(
     felt = felt & (depths[0] > 0) & (depths[1] > 0) & (away < 1)
     area = jnp.cos(jnp.pi / 2 * away) ** 2 * (a.part + b.part) * spacing ** (len(normal) - 1)
     approach = jnp.maximum(-(normal * (a.velocity - b.velocity)).sum(axis=0), 0)
-    modulus = in_a_row(*(body.modulus + body.density * approach**2 for body in (a, b)), felt)
+    stiff, other = (body.modulus + body.density * approach**2 for body in (a, b))
+    modulus = in_a_row(stiff, other, felt)
     return BodyContact(
         gap=jnp.where(felt, spacing * (first + second), jnp.inf),
         normal=normal.T,

@@ -219,21 +219,6 @@ class AbstractContact(eqx.Module):
         return None
 
 
-class ContactInfo(eqx.Module):
-    """How the active set was found."""
-
-    sweeps: Int[Array, "*f"]
-    """Solves before the last one."""
-    violations: Int[Array, "*f"]
-    """Places that pull or are entered all the same."""
-
-
-def no_contact() -> ContactInfo:
-    """The report of a scene without contact."""
-    zero = jnp.asarray(0, dtype=jnp.int32)
-    return ContactInfo(zero, zero)
-
-
 class ConstrainedNodes(eqx.Module, Generic[N]):
     """The nodes while an active set is held; see `constrain`."""
 
@@ -368,7 +353,7 @@ def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
         along = contact.normals(mask)
         normals = along if normals is None else normals
     springs = tuple(found for contact, mask in pairs if (found := contact.springs(mask)) is not None)
-    couplings = tuple(found for contact, mask in pairs if (found := contact.coupling(mask)) is not None)
+    couplings = tuple(joined for contact, mask in pairs if (joined := contact.coupling(mask)) is not None)
     return ConstrainedNodes(nodes, active, images, nodes.constrained(images, fixed, normals, springs, couplings))
 
 

@@ -139,6 +139,10 @@ class Mirror(eqx.Module):
         """Bᵀ for an even scalar."""
         return jax.linear_transpose(self.unfold_scalar, field)(field)[0] if self.images else field
 
+    def without_ties(self) -> "Mirror":
+        """The mirrors without rigid parts."""
+        return Mirror(tuple(image for image in self.images if isinstance(image, Image)))
+
     def then(self, other: "Mirror") -> "Mirror":
         """The mirror that unfolds by this one first, then by the other."""
         return Mirror(self.images + other.images)

@@ -94,7 +94,9 @@ def fit_refined(
     With estimates a and b on the two finest grids, in the search's coordinate, and their spacings in the ratio r, the
     extrapolation is b + (b − a)/(r^p − 1), and the standard error that is left of the discretisation is taken as that
     whole correction. p is `order`; with three grids of equal ratios it is what they show, between half and twice that.
-    Where they do not converge, the finest estimate stays, with its last change as the error, and a warning says so.
+    A higher order than `order` may be shown by grids that are too coarse to tell, so the error then is the correction
+    by `order`. Where the estimates do not converge, the finest stays, with its last change as the error, and a warning
+    says so.
 
     Two estimates may agree by chance and both be wrong, as where an error changes its sign between the grids. What the
     finest grid misses of the data then tells more: D, in units of σ. A discretisation that changes predictions by D in
@@ -205,10 +207,11 @@ def _extrapolate(
         return last, float("nan"), float("nan")
     p = _order(values, refinements, order)
     change = values[-1] - values[-2]
-    correction = 0.0 if np.isnan(p) else change / ((refinements[-1] / refinements[-2]) ** p - 1)
+    ratio = refinements[-1] / refinements[-2]
+    correction = 0.0 if np.isnan(p) else change / (ratio**p - 1)
     slope = jax.grad(lambda z: back(z))
     hidden = missed / 2 * last.error / abs(float(slope(jnp.zeros_like(at))))
-    remains = max(abs(change) if np.isnan(p) else abs(correction), hidden)
+    remains = max(abs(change) / (1 if np.isnan(p) else ratio ** min(p, order) - 1), hidden)
     if np.isnan(p):
         shown = ", ".join(f"{e.value:.5g}" for e in found)
         warn(f"{last.label} does not converge with the spacing ({shown}): it is not extrapolated.")

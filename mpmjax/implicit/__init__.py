@@ -16,6 +16,7 @@ from mpmjax.implicit._projection import Projection
 from mpmjax.implicit._solution import AbstractSolution, StageEquation, exact_force
 from mpmjax.implicit._solve import Reporting, solve
 from mpmjax.implicit._solve_info import SolveInfo, no_solve
+from mpmjax.implicit._volume_preconditioner import VolumePreconditioner
 
 __all__ = [
     "AbstractHessian",
@@ -43,6 +44,7 @@ __all__ = [
     "SolveInfo",
     "StageEquation",
     "TangentAction",
+    "VolumePreconditioner",
     "damped",
     "exact_force",
     "no_solve",

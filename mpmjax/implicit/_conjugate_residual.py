@@ -91,10 +91,10 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
     ) -> tuple[Any, lx.RESULTS, dict[str, Any]]:
         system = _system(self, state, vector, options.get("inner_product"))
         y0 = options.get("y0")
-        x = jnp.zeros_like(system.b) if y0 is None else ravel_pytree(y0)[0]
+        x = jnp.zeros_like(system.b) if y0 is None else system.started(ravel_pytree(y0)[0])
         c = jax.lax.while_loop(lambda c: ~c.done, partial(_restart, system), _start(x, system.b))
         result, stats = _outcome(system, c)
-        return system.unravel(c.x), result, stats
+        return system.unravel(system.plain(c.x)), result, stats
 
     def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         return state, options
@@ -112,7 +112,7 @@ class _System(eqx.Module):
     operator: lx.AbstractLinearOperator
     inner: AbstractInnerProduct
     unravel: Callable[[Array], Any] = eqx.field(static=True)
-    b: Float[Array, "m"]
+    b: Float[Array, "*pair m"]
     """W⁻¹ times the right-hand side."""
     b_norm: Float[Array, ""]
     rtol: Scalar
@@ -131,10 +131,35 @@ class _System(eqx.Module):
         """‖a‖ in the norm of W."""
         return jnp.sqrt(self.dot(a, a))
 
+    def started(self, x: Array) -> Array:
+        """A plain vector as those of the recurrence."""
+        return x
+
+    def plain(self, x: Array) -> Array:
+        """And back."""
+        return x
+
     @property
     def eps(self) -> Any:
         """The rounding unit."""
         return jnp.finfo(self.b.dtype).eps
+
+
+class _PairedSystem(_System):
+    """The same on pairs (v, W v), shape (2, m), for a W that is dear to apply: a step takes W⁻¹ once, and W never."""
+
+    def apply(self, u: Array) -> Array:
+        image = ravel_pytree(self.operator.mv(self.unravel(u[0])))[0]
+        return jnp.stack([self.inner.solve(image), image])
+
+    def dot(self, a: Array, c: Array) -> Float[Array, ""]:
+        return (a[1] * c[0]).sum()
+
+    def started(self, x: Array) -> Array:
+        return jnp.stack([x, self.inner.apply(x)])
+
+    def plain(self, x: Array) -> Array:
+        return x[0]
 
 
 class _Recurrence(eqx.Module):
@@ -176,9 +201,10 @@ def _system(
 ) -> _System:
     flat, unravel = ravel_pytree(vector)
     inner = DiagonalInnerProduct(jnp.ones_like(flat)) if inner is None else inner.flattened(unravel)
-    b = inner.solve(flat)
+    b = jnp.stack([inner.solve(flat), flat]) if inner.paired else inner.solve(flat)
     rtol = default_rtol(flat.dtype) if solver.rtol is None else solver.rtol
-    system = _System(operator, inner, unravel, b, b[0], rtol, solver.increment_rtol, solver.max_steps)
+    kind = _PairedSystem if inner.paired else _System
+    system = kind(operator, inner, unravel, b, b.ravel()[0], rtol, solver.increment_rtol, solver.max_steps)
     return replace(system, b_norm=system.norm(b))
 
 

@@ -64,8 +64,8 @@ class AnalyticHessian(AbstractHessian):
         def tangent(law: AbstractElastic, F: Deformation) -> AbstractTangent:
             return law.projected_tangent(F) if self.projected else law.tangent(F)
 
-        laws = (points.law for points in potential.material_points)
-        tangents = tuple(tangent(law, own) for law, own in zip(laws, F, strict=True))
+        pairs = zip(potential.material_points, F, strict=True)
+        tangents = tuple(points.tangent(own, tangent, definite=self.projected) for points, own in pairs)
         return TangentAction(potential, tangents, self.projected)
 
 
@@ -92,9 +92,8 @@ class _JvpAction(AbstractHessianAction):
         return _jvp_action(self.potential, self.u, du)
 
     def precomputed(self) -> ParticleStiffness:
-        laws = (points.law for points in self.potential.material_points)
-        F = self.potential.deformation(self.u)
-        tangents = tuple(_jvp_tangent(law, own) for law, own in zip(laws, F, strict=True))
+        pairs = zip(self.potential.material_points, self.potential.deformation(self.u), strict=True)
+        tangents = tuple(points.tangent(own, _jvp_tangent) for points, own in pairs)
         return particle_stiffness(self.potential, tangents, positive_semidefinite=False)
 
 

@@ -2,16 +2,17 @@
 
 import abc
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Deformation, Float, NodeVector, Scalar
+from mpmjax._types import Array, Deformation, Float, Matrix, NodeVector, Scalar
 from mpmjax.boundary import Coupling, Mirror, Springs, spring_answer, spring_diagonal, spring_resistance
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.implicit._potential import ElasticPotential
-from mpmjax.state import SupportStiffness, stiffness_of
+from mpmjax.state import MaterialPoints, SupportStiffness, VolumeAverage, stiffness_of
 
 
 class AbstractHessianAction(eqx.Module):
@@ -30,6 +31,50 @@ class AbstractHessianAction(eqx.Module):
         """The same map as one matrix for each particle, computed once for many applications."""
 
 
+class AveragedStiffness(eqx.Module):
+    """What averaged volumes add to the stiffness of the particles of one material, which then is no longer that of each
+    by itself: with the slopes g of the displacement, δJ = c : g, and the mean δJ̄ = S V0 δJ,
+
+        flux = K g + b δJ̄ + V0 c S (b : g + k δJ̄)
+
+    (see `AveragedTangent`)."""
+
+    rows: tuple[int, int] = eqx.field(static=True)
+    """First particle and the one after the last."""
+    average: VolumeAverage
+    """S."""
+    volumetric: Matrix
+    """V0 c [m^d], shape (d, d, q), the derivative's direction first."""
+    coupling: Matrix
+    """b [J], likewise."""
+    bulk: Float[Array, "q"]
+    """k [J], shape (q,)."""
+
+    def __call__(self, slopes: Matrix) -> Matrix:
+        """b δJ̄ + V0 c S (b : g + k δJ̄) [J], from the slopes of all particles; zero for those of other materials."""
+        g, count = slopes[..., slice(*self.rows)], slopes.shape[-1]
+        mean = self.average.spread(la.double_dot(self.volumetric, g))
+        back = self.average.spread(la.double_dot(self.coupling, g) + self.bulk * mean)
+        own = self.coupling * mean + self.volumetric * back
+        return own if self.rows == (0, count) else jnp.zeros_like(slopes).at[..., slice(*self.rows)].set(own)
+
+    def diagonal(self) -> Matrix:
+        """The diagonal of each particle's matrix if volumes were not averaged, without that of K [J], (d, d, q)."""
+        c = self.volumetric / self.average.volume
+        return 2 * self.coupling * c + self.bulk * c**2
+
+
+def _averaged_stiffness(points: MaterialPoints, average: VolumeAverage, tangent: Any) -> AveragedStiffness:
+    """From the stress differential of a material whose volumes are averaged, an `AveragedTangent`."""
+    cofactor, d = tangent.cofactor, tangent.at.dim
+    own, mean = tangent.local(jnp.zeros_like(cofactor), jnp.ones_like(points.volume))
+
+    def flux(P: Matrix) -> Matrix:
+        return la.transpose(points.flux(P, d))
+
+    return AveragedStiffness(points.rows, average, flux(cofactor), flux(own), points.volume * mean)
+
+
 class ParticleStiffness(AbstractHessianAction):
     """H as one matrix for each particle, of d⁴ numbers. Applying it evaluates no law."""
 
@@ -42,6 +87,8 @@ class ParticleStiffness(AbstractHessianAction):
     """Of the springs to the ground."""
     springs: tuple[Springs, ...] = ()
     """The springs of contact, whose Hessian is added."""
+    averaged: tuple[AveragedStiffness, ...] = ()
+    """The materials whose volumes are averaged."""
     couplings: tuple[Coupling, ...] = ()
     """Those between bodies."""
 
@@ -53,6 +100,8 @@ class ParticleStiffness(AbstractHessianAction):
         moved = gather(self.stencil, self.mirror.unfold(du))
         slopes, value = moved[1], None
         flux = la.matmul(self.matrix, slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
+        for one in self.averaged:
+            flux = flux + one(slopes)
         if self.springs:
             value, more = spring_answer(self.springs, moved)
             flux = flux + more
@@ -73,7 +122,15 @@ class ParticleStiffness(AbstractHessianAction):
             like: any node vector.
         """
         d = like.shape[1]
-        stiff = jnp.stack([jnp.maximum(self.matrix[m, m], 0) for m in range(d * d)])
+        added = [(slice(*one.rows), one.diagonal().reshape(d * d, -1)) for one in self.averaged]
+
+        def entry(m: int) -> Array:
+            own = self.matrix[m, m]
+            for rows, more in added:
+                own = own.at[rows].add(more[m])
+            return own
+
+        stiff = jnp.stack([jnp.maximum(entry(m), 0) for m in range(d * d)])
         nodes = scatter(self.stencil.squared, None, stiff.reshape(d, d, -1), like.shape[0])
         found = jnp.stack([self.mirror.fold_scalar(component) for component in nodes.T], axis=1)
         if self.springs:
@@ -115,11 +172,26 @@ def particle_stiffness(
     positive_semidefinite: bool,
 ) -> ParticleStiffness:
     """H as one matrix for each particle, from the stress differentials of the materials."""
-    matrix = potential.stiffness(tangents)
-    supports, springs, couplings = stiffness_of(potential.held_by()), potential.springs, potential.couplings
-    return ParticleStiffness(
-        matrix, potential.stencil, potential.mirror, positive_semidefinite, supports, springs, couplings
+    materials = tuple(zip(potential.material_points, tangents, strict=True))
+    matrix = potential.stiffness(tuple(t if points.average is None else _own_part(t) for points, t in materials))
+    averaged = tuple(
+        _averaged_stiffness(points, points.average, t) for points, t in materials if points.average is not None
     )
+    return ParticleStiffness(
+        matrix,
+        potential.stencil,
+        potential.mirror,
+        positive_semidefinite,
+        stiffness_of(potential.held_by()),
+        potential.springs,
+        averaged,
+        potential.couplings,
+    )
+
+
+def _own_part(tangent: Any) -> Callable[[Deformation], Deformation]:
+    """The part of an `AveragedTangent` at means that do not change."""
+    return lambda dF: tangent.local(dF, jnp.zeros_like(tangent.tau))[0]
 
 
 @eqx.filter_jit

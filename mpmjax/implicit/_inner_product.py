@@ -39,6 +39,15 @@ class AbstractInnerProduct(eqx.Module):
         """W⁻¹ r."""
         return self.solve_factor_transpose(self.solve_factor(r))
 
+    @property
+    def paired(self) -> bool:
+        """Whether W v takes much longer than W⁻¹ r, so that `ConjugateResidual` keeps W v beside each vector v."""
+        return False
+
+    def factored(self) -> "AbstractInnerProduct":
+        """The inner product for solvers that need L: this one, if it has the factor."""
+        return self
+
     def flattened(self, unravel: Callable[[Array], Any]) -> "AbstractInnerProduct":
         """The same inner product on vectors flattened by `jax.flatten_util.ravel_pytree`."""
         return _FlatInnerProduct(self, unravel)
@@ -73,8 +82,15 @@ class _FlatInnerProduct(AbstractInnerProduct):
     inner: AbstractInnerProduct
     unravel: Callable[[Array], Any] = eqx.field(static=True)
 
+    @property
+    def paired(self) -> bool:
+        return self.inner.paired
+
     def apply(self, v: Array) -> Array:
         return ravel_pytree(self.inner.apply(self.unravel(v)))[0]
+
+    def solve(self, r: Array) -> Array:
+        return ravel_pytree(self.inner.solve(self.unravel(r)))[0]
 
     def solve_factor(self, r: Array) -> Array:
         return ravel_pytree(self.inner.solve_factor(self.unravel(r)))[0]

@@ -82,7 +82,7 @@ def solve_linear(
         ValueError: the solver refuses the operator, or returns no vector.
     """
     if not isinstance(solver, AbstractInnerProductSolver):
-        return _solve_scaled(solver, operator, rhs, inner, guess)
+        return _solve_scaled(solver, operator, rhs, inner.factored(), guess)
     options = {"inner_product": inner} if guess is None else {"inner_product": inner, "y0": guess}
     x, result, stats = solver.compute(solver.init(operator, options), rhs, options)
     return LinearSolution(

@@ -11,7 +11,6 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, Float, Matrix, NodeVector
 from mpmjax.boundary import Coupling, Mirror, Springs, spring_energy, spring_force
 from mpmjax.discretisation import Stencil, gather, scatter
-from mpmjax.material import AbstractElastic
 from mpmjax.state import MaterialPoints, Support
 
 Deformations = tuple[Deformation, ...]
@@ -61,7 +60,7 @@ class ElasticPotential(eqx.Module):
     def energy(self, u: NodeVector) -> Float[Array, ""]:
         """Φ(u) [J]."""
         parts = [
-            (points.volume * points.law.energy(F)).sum()
+            (points.volume * points.energy_density(F)).sum()
             for points, F in zip(self.material_points, self.deformation(u), strict=True)
         ]
         return sum([*parts[1:], *self.spring_energies(u)], parts[0])
@@ -69,7 +68,7 @@ class ElasticPotential(eqx.Module):
     def admissible_energy(self, u: NodeVector) -> Float[Array, ""]:
         """Φ(u) [J], NaN if a law does not admit the deformation. It must not be differentiated."""
         parts = [
-            jnp.where(points.law.is_admissible(F), points.volume * points.law.energy(F), jnp.nan).sum()
+            jnp.where(points.is_admissible(F), points.volume * points.energy_density(F), jnp.nan).sum()
             for points, F in zip(self.material_points, self.deformation(u), strict=True)
         ]
         return sum([*parts[1:], *self.spring_energies(u)], parts[0])
@@ -196,14 +195,8 @@ class ElasticPotential(eqx.Module):
         return len(self.stencil.weights)
 
     def _stress(self, F: Deformations) -> Deformations:
-        return tuple(_stress(points.law, own) for points, own in zip(self.material_points, F, strict=True))
+        return tuple(points.stress(own) for points, own in zip(self.material_points, F, strict=True))
 
 
 def _joined(parts: list[Array]) -> Array:
     return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=-1)
-
-
-@eqx.filter_jit  # a law may hold functions
-def _stress(law: AbstractElastic, F: Deformation) -> Deformation:
-    """The stress of a law, compiled as one function so that it is traced once."""
-    return law.stress(F)

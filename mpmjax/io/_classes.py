@@ -35,6 +35,7 @@ from mpmjax.implicit import (
     Linearised,
     MassPreconditioner,
     Newton,
+    VolumePreconditioner,
 )
 from mpmjax.material import (
     CamClay,
@@ -54,6 +55,7 @@ from mpmjax.material import (
 )
 from mpmjax.state import (
     AttachedPoints,
+    AveragedVolume,
     Bodies,
     Patch,
     PointLoad,
@@ -79,7 +81,9 @@ CLASSES: tuple[type, ...] = (
     *(Traction, Pressure, PointLoad, Spring, Patch, PointsAt, AttachedPoints, TimeSeries),
     Bodies,
     *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
+    AveragedVolume,
     *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),
-    *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual, DiagonalPreconditioner, MassPreconditioner),
+    *(Linearised, Newton, AnalyticHessian, JvpHessian, ConjugateResidual),
+    *(DiagonalPreconditioner, MassPreconditioner, VolumePreconditioner),
 )
 """The package's own classes that files can hold."""

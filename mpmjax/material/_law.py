@@ -28,6 +28,11 @@ class AbstractLaw(eqx.Module):
         """Whether it may stand in the total description, in which the deformation is that from the start."""
         return True
 
+    @property
+    def allows_averaged_volume(self) -> bool:
+        """Whether the volumes of its particles may be averaged (see `AveragedVolume`). Default: yes."""
+        return True
+
     @abc.abstractmethod
     def initial_history(self, F: Deformation, /) -> Any:
         """The history of particles that have never yielded, leaves of shape (p,); None without.
@@ -186,6 +191,11 @@ class AbstractInelastic(AbstractLaw):
     @property
     def allows_total(self) -> bool:
         """No: F_E is not the deformation from the start."""
+        return False
+
+    @property
+    def allows_averaged_volume(self) -> bool:
+        """No: the return map would act on another volume than the stress."""
         return False
 
     @abc.abstractmethod

@@ -54,6 +54,10 @@ class Viscous(AbstractLaw):
     def allows_total(self) -> bool:
         return self.law.allows_total
 
+    @property
+    def allows_averaged_volume(self) -> bool:
+        return self.law.allows_averaged_volume
+
     def initial_history(self, F: Deformation) -> Any:
         return self.law.initial_history(F)
 

@@ -29,6 +29,11 @@ class AbstractVolumetric(AbstractElastic):
         """No: that description needs F."""
         return False
 
+    @property
+    def allows_averaged_volume(self) -> bool:
+        """No: nothing would resist what the average does not see."""
+        return False
+
     @abc.abstractmethod
     def energy(self, J: Array, /) -> Array:
         """Ψ(J) [J/m³ of undeformed volume], shape (p,).

@@ -49,8 +49,8 @@ def faulty_particles(problem: Problem, state: State, t: Scalar) -> dict[Fault, B
     finite = _finite((particles.x, particles.v, particles.C))
     finite = finite & jnp.concatenate([_finite((group.stored, group.history)) for group in particles.groups])
     outside = ~in_window(scene.kernel, scene.grid, scene.window(particles), scene.on_grid(particles, t))
-    materials = scene.material_points(particles)
-    admitted = jnp.concatenate([points.law.is_admissible(points.deformation) for points in materials])
+    materials = scene.material_points(particles, t)
+    admitted = jnp.concatenate([points.is_admissible(points.deformation) for points in materials])
     return {Fault.NOT_FINITE: ~finite, Fault.OUTSIDE: finite & outside, Fault.INADMISSIBLE: finite & ~admitted}
 
 

@@ -1,6 +1,7 @@
 """Particles, scene and what a step needs of them."""
 
 from mpmjax.state._attachment import AbstractPlace, AttachedPoints, Patch, PointsAt
+from mpmjax.state._averaged_volume import AveragedTangent, AveragedVolume, VolumeAverage
 from mpmjax.state._bodies import Bodies
 from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, TotalLagrangian, UpdatedLagrangian
@@ -19,6 +20,8 @@ __all__ = [
     "AbstractLoad",
     "AbstractPlace",
     "AttachedPoints",
+    "AveragedTangent",
+    "AveragedVolume",
     "Bodies",
     "LoadedPoints",
     "MaterialPoints",
@@ -35,6 +38,7 @@ __all__ = [
     "TotalLagrangian",
     "Traction",
     "UpdatedLagrangian",
+    "VolumeAverage",
     "attach",
     "by_material",
     "fill",

@@ -1,5 +1,6 @@
 """The particles of one material in a step: their law, their deformation, and how the grid's motion changes it."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -7,8 +8,9 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Deformation, Float, Matrix, Scalar, particle_first
+from mpmjax._types import Array, Bool, Deformation, Float, Matrix, Scalar, particle_first
 from mpmjax.material import AbstractElastic, AbstractLaw, Viscosity
+from mpmjax.state._averaged_volume import VolumeAverage, averaged_deformation
 from mpmjax.state._particles import Group, Particles
 
 
@@ -27,6 +29,48 @@ class MaterialPoints(eqx.Module):
     """First particle and the one after the last."""
     viscosity: Viscosity | None
     """The viscosity beside the law; None without."""
+    average: VolumeAverage | None = None
+    """The average by which the energy knows volumes; None if each particle has its own."""
+
+    def strained(self, F: Deformation) -> Deformation:
+        """The deformation at which the law is taken: F, or F̄ where volumes are averaged (see `AveragedVolume`)."""
+        return F if self.average is None else averaged_deformation(self.average, F).averaged
+
+    def energy_density(self, F: Deformation) -> Float[Array, "q"]:
+        """Ψ [J/m^d of undeformed volume] at deformations F [-], shape (q,)."""
+        return self.law.energy(self.strained(F))
+
+    def stress(self, F: Deformation) -> Deformation:
+        """The derivative of Σ V0 Ψ by F, over V0 [Pa], of its shape."""
+        if self.average is None:
+            return _stress(self.law, F)
+        at = averaged_deformation(self.average, F)
+        return at.stress(_stress(self.law, at.averaged))
+
+    def tangent(
+        self,
+        F: Deformation,
+        of_law: Callable[[AbstractElastic, Deformation], Callable[[Deformation], Deformation]],
+        *,
+        definite: bool = False,
+    ) -> Callable[[Deformation], Deformation]:
+        """The derivative of `stress`, δF ↦ δP; symmetric if weighted with V0.
+
+        Args:
+            F: the deformation [-].
+            of_law: the stress differential of a law at a deformation.
+            definite: whether that is positive semi-definite, and the result is to be.
+        """
+        if self.average is None:
+            return of_law(self.law, F)
+        at = averaged_deformation(self.average, F)
+        return at.tangent(_stress(self.law, at.averaged), of_law(self.law, at.averaged), definite=definite)
+
+    def is_admissible(self, F: Deformation) -> Bool[Array, "q"]:
+        """Whether the law is defined at deformations F, shape (q,)."""
+        if self.average is None:
+            return self.law.is_admissible(F)
+        return averaged_deformation(self.average, F).admitted(self.law)
 
     def rows_of(self, field: Array) -> Array:
         """The part of an array over all particles (particle axis last) that belongs to this material."""
@@ -61,10 +105,29 @@ class MaterialPoints(eqx.Module):
         return self.volume * jnp.abs(J) * la.matmul(stress, la.transpose(inverse))
 
 
-def material_points(laws: tuple[AbstractLaw, ...], particles: Particles, *, total: bool) -> tuple[MaterialPoints, ...]:
-    """The materials of prepared particles."""
+@eqx.filter_jit  # a law may hold functions
+def _stress(law: AbstractElastic, F: Deformation) -> Deformation:
+    """The stress of a law, compiled as one function so that it is traced once."""
+    return law.stress(F)
 
-    def one(law: AbstractLaw, group: Group) -> MaterialPoints:
+
+def material_points(
+    laws: tuple[AbstractLaw, ...],
+    particles: Particles,
+    *,
+    total: bool,
+    average: Callable[[int, Group], VolumeAverage | None] = lambda number, group: None,
+) -> tuple[MaterialPoints, ...]:
+    """The materials of prepared particles.
+
+    Args:
+        laws: their laws.
+        particles: the particles.
+        total: whether gradients are with respect to the reference positions.
+        average: the average of the volumes of a material, by its number and its particles; None without. Default: none.
+    """
+
+    def one(number: int, law: AbstractLaw, group: Group) -> MaterialPoints:
         return MaterialPoints(
             law=law.elastic(group.history),
             volume=particles.volume[slice(*group.rows)],
@@ -72,9 +135,10 @@ def material_points(laws: tuple[AbstractLaw, ...], particles: Particles, *, tota
             total=total,
             rows=group.rows,
             viscosity=law.viscous_part(),
+            average=average(number, group),
         )
 
-    return tuple(one(law, group) for law, group in zip(laws, particles.groups, strict=True))
+    return tuple(one(n, law, group) for n, (law, group) in enumerate(zip(laws, particles.groups, strict=True)))
 
 
 def return_map(laws: tuple[AbstractLaw, ...], particles: Particles, dt: Scalar) -> Particles:

@@ -193,7 +193,7 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
         )
     for points in scene.material_points(particles):
         kept = points.law.kinematics
-        allowed = np.asarray(eqx.filter_jit(points.law.is_admissible)(points.deformation))
+        allowed = np.asarray(eqx.filter_jit(lambda points: points.is_admissible(points.deformation))(points))
         first = int(np.argmin(allowed)) + points.rows[0]
         require(
             allowed,

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Int, NodeVector, Point, Scalar
-from mpmjax.boundary import AbstractBoundary, refuse_contact
+from mpmjax.boundary import AbstractBoundary, mirror, refuse_contact
 from mpmjax.checks import (
     checked,
     coordinates,
@@ -26,12 +26,13 @@ from mpmjax.discretisation import (
 )
 from mpmjax.geometry import Motion
 from mpmjax.material import AbstractLaw
+from mpmjax.state._averaged_volume import AveragedVolume, VolumeAverage, volume_average
 from mpmjax.state._bodies import Bodies
 from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, UpdatedLagrangian
 from mpmjax.state._loads import AbstractLoad
 from mpmjax.state._material_points import MaterialPoints, material_points, return_map
-from mpmjax.state._particles import Particles
+from mpmjax.state._particles import Group, Particles
 
 
 class Scene(eqx.Module):
@@ -53,12 +54,13 @@ class Scene(eqx.Module):
         body_force: a force per mass that varies in space or time, besides gravity. Default: none.
         loads: forces on the body's surface or at points of it, springs and dashpots; see `attach`.
         bodies: which materials are bodies of their own, that touch each other. Default: all share the nodes.
+        volume: `AveragedVolume()` for nearly incompressible bodies. Default: each particle has its own volume.
         boundary_forces: whether steps compute the force and torque on each boundary (see `Run.boundary_forces`).
 
     Raises:
         ValueError: dimensions that differ, a mirrored plane off the half-spacing lattice, or what the total description
             cannot do (a window that follows, walls that separate, colliders along which it would slide around, laws
-            that yield or flow).
+            that yield or flow), or laws of which volumes cannot be averaged.
     """
 
     grid: Grid
@@ -73,6 +75,7 @@ class Scene(eqx.Module):
     boundary_forces: bool = eqx.field(static=True)
     loads: tuple[AbstractLoad, ...]
     bodies: Bodies | None
+    volume: AveragedVolume | None
 
     @checked
     def __init__(
@@ -90,6 +93,7 @@ class Scene(eqx.Module):
         boundary_forces: bool = False,
         loads: AbstractLoad | tuple[AbstractLoad, ...] | list[AbstractLoad] = (),
         bodies: Bodies | None = None,
+        volume: AveragedVolume | None = None,
     ):
         self.material = tuple(material) if isinstance(material, list) else material
         layers = 1 if bodies is None else 1 + max(bodies.numbers(len(self.laws)))
@@ -105,6 +109,7 @@ class Scene(eqx.Module):
         self.boundary_forces = boundary_forces
         self.loads = (loads,) if isinstance(loads, AbstractLoad) else tuple(loads)
         self.bodies = bodies
+        self.volume = volume
 
     def __check_init__(self):
         d = self.grid.dim
@@ -145,6 +150,24 @@ class Scene(eqx.Module):
                 f"use the updated one for {', '.join(flowing)}.",
             )
 
+        if self.volume is not None:
+            self._check_averaged(self.volume)
+
+    def _check_averaged(self, volume: AveragedVolume) -> None:
+        require(
+            all(number < len(self.laws) for number in volume.materials or ()),
+            f"AveragedVolume's materials must be numbers below {len(self.laws)}, of the scene's laws, got "
+            f"{volume.materials}.",
+        )
+        covered = [law for number, law in enumerate(self.laws) if volume.covers(number)]
+        refused = [law.title() for law in covered if not law.allows_averaged_volume]
+        require(
+            not refused,
+            "AveragedVolume is for elastic laws of F: what yields returns to a volume of its own, and a fluid has "
+            "nothing else that resists. Name the other materials, AveragedVolume(materials=(0,)), without "
+            f"{', '.join(refused)}.",
+        )
+
     @property
     def laws(self) -> tuple[AbstractLaw, ...]:
         """The laws, one for each material."""
@@ -155,9 +178,21 @@ class Scene(eqx.Module):
         """Whether particles keep the velocity gradient C: for the transfer, or for a viscosity."""
         return self.transfer.affine or any(law.viscous_part() is not None for law in self.laws)
 
-    def material_points(self, particles: Particles) -> tuple[MaterialPoints, ...]:
-        """The materials of prepared particles, with the elastic laws in force."""
-        return material_points(self.laws, particles, total=self.total)
+    def material_points(self, particles: Particles, t: Scalar = 0.0) -> tuple[MaterialPoints, ...]:
+        """The materials of prepared particles at time t [s], with the elastic laws in force."""
+        volume = self.volume
+        if volume is None:
+            return material_points(self.laws, particles, total=self.total)
+        grid, window, places = self.grid.with_layers(1), self.window(particles), self.on_grid(particles, t)
+        images = mirror(self.boundary, grid, window).without_ties()
+
+        def average(number: int, group: Group) -> VolumeAverage | None:
+            rows = slice(*group.rows)
+            if not volume.covers(number):
+                return None
+            return volume_average(grid, window, places[rows], particles.volume[rows], images)
+
+        return material_points(self.laws, particles, total=self.total, average=average)
 
     def return_map(self, particles: Particles, dt: Scalar) -> Particles:
         """The particles after the return maps of laws that yield, at the end of a step dt [s] (see `return_map`)."""

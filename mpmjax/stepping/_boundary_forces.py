@@ -78,7 +78,7 @@ def given_to_boundaries(
     columns = [
         (number, image.within(active))
         for number, contact, active in contacts
-        if (image := contact.mirror_image) is not None
+        if number is not None and (image := contact.mirror_image) is not None
     ]
     of_planes, residual = taken_by_mirrors(residual, columns)
     given += [*of_planes, Given(residual, owners.fixed)]

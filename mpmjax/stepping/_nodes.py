@@ -321,7 +321,7 @@ def particles_to_grid(
     with jax.named_scope("p2g"):
         points = points_of(scene.loads, scene.laws, particles, stencil, total=scene.total)
         supports = supports_of(scene.loads, points, t + body_force_at * dt)
-        potential = ElasticPotential(scene.material_points(particles), stencil, Mirror(()), grid.size, supports)
+        potential = ElasticPotential(scene.material_points(particles, t), stencil, Mirror(()), grid.size, supports)
         joined = joined and stencil.mls_weight_derivatives is None
         flux, viscous_flux = potential.current_flux(), None
         if explicit_viscosity and potential.material_viscous and C is not None:

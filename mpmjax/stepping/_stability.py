@@ -64,6 +64,8 @@ def stable_dt(
     that of a step ago. Λ_v = |J| max(2η, 2η (1 − d/3) + dζ) is the largest eigenvalue of L ↦ |J| σ_v. The semi-implicit
     step multiplies both terms by 1 − 2β.
 
+    With averaged volumes Λ is that at F̄, or its average where that is larger: an average has no larger eigenvalue.
+
     In a scene with surfaces that push (`SeparatingBox`, `SeparatingCollider`) the springs of contact add
     Δt² k (1 + A ‖B‖²)/m to the left side, whether or not anything touches, with the stiffness k of a particle that
     comes with all of its speed (see `SurfaceContact`): with two particles along a cell's edge the limit falls by a
@@ -159,10 +161,7 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Fl
     density = particles.mass / particles.volume
     elastic_steepness, viscous_steepness = _steepness(scene, particles)
     materials = scene.material_points(particles)
-    tangents = [
-        points.law.tangent_eigenvalues(points.deformation, particles.dim, total=points.total) for points in materials
-    ]
-    stiffest = jnp.concatenate([values.max(axis=0) for values in tangents])
+    stiffest = jnp.concatenate([_stiffest(points, particles.dim) for points in materials])
     z = stiffest * elastic_steepness / density + _contact(scene, particles, materials, elastic_steepness)  # per Δt²
     factor = method.stability_factor()
     if factor is None:
@@ -242,6 +241,14 @@ def _between_bodies(
         in_a_row(stiff[a], stiff[b]) / jnp.minimum(light[a], light[b]) for a, b in combinations(range(len(stiff)), 2)
     ]
     return 4 * STIFFNESS * jnp.stack(added).max() / jnp.asarray(scene.grid.spacing) ** 2
+
+
+def _stiffest(points: MaterialPoints, dim: int) -> Float[Array, "q"]:
+    """Λ of each particle [Pa]. Where volumes are averaged, the larger of Λ and its average: the average A, of weights
+    V0 A symmetric, has Σ V0 Λ (A J)² ≤ Σ V0 (A Λ) J²."""
+    F = points.strained(points.deformation)
+    own = points.law.tangent_eigenvalues(F, dim, total=points.total).max(axis=0)
+    return own if points.average is None else jnp.maximum(own, points.average(own))
 
 
 def _stiffest_viscosity(points: MaterialPoints, dim: int) -> Float[Array, "q"]:

@@ -1,0 +1,130 @@
+"""The preconditioner of averaged volumes: its inverse, and iterations that do not grow as ν goes to ½."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from helpers import DESCRIPTIONS, assert_close, block, ids, thorough
+
+import mpmjax as mpm
+from mpmjax.implicit import DiagonalInnerProduct, ImplicitOperator
+from mpmjax.stepping._nodes import particles_to_grid
+
+AVERAGED = mpm.AveragedVolume()
+CHOICES = mpm.DiagonalPreconditioner(), mpm.VolumePreconditioner()
+
+
+def operator_of(scene, particles, factor=1e-2):
+    """M + χH at the particles, with χ such that shear counts a hundred times as much as the mass."""
+    particles = mpm.prepare(scene, particles)
+    nodes = particles_to_grid(scene, particles, 0.0, 1e-3, scene.stencil(particles))
+    action = mpm.AnalyticHessian().at_step_start(nodes.potential)
+    return ImplicitOperator(nodes.mass, jnp.asarray(factor), action, nodes.projection)
+
+
+def bodies(d, nu, side=2, description=DESCRIPTIONS["updated"]):
+    """Two materials side by side, both averaged, beside a plane of symmetry and in a grip."""
+    laws = mpm.NeoHookean(1e4, nu), mpm.NeoHookean(5e3, nu)
+    one = block(d, side=side)[1]
+    other = eqx.tree_at(lambda p: p.x, one, one.x + jnp.array([side * 0.1] + [0.0] * (d - 1)))
+    held = mpm.Grip(mpm.Box((0.0,) * d, (1.0,) * (d - 1) + (0.05,)), mpm.Motion((0.0,), ((0.0,) * d,)))
+    grid = mpm.Grid((2 * side + 6, *(side + 6,) * (d - 1)), 0.1, origin=(-3,) * d)
+    boundary = mpm.SymmetryPlane(0, 0.0), held
+    scene = mpm.Scene(grid, laws, volume=AVERAGED, description=description, boundary=boundary)
+    return scene, mpm.join(one, other)
+
+
+@eqx.filter_jit
+def matrices(operator, preconditioner):
+    """A, and W and W⁻¹ column by column."""
+    inner, shape = preconditioner.inner_product(operator), operator.projection.free.shape
+    columns = jnp.eye(np.prod(shape)).reshape(-1, *shape)
+    maps = operator.mv, inner.apply, inner.solve
+    return [jax.vmap(f)(columns).reshape(columns.shape[0], -1) for f in maps]
+
+
+@pytest.mark.parametrize("d", [2, *thorough(3)])
+@pytest.mark.parametrize("description", **ids(DESCRIPTIONS, "updated"))
+def test_it_is_symmetric_and_definite_and_its_inverse_is_one(description, d):
+    A, W, inverse = matrices(operator_of(*bodies(d, 0.499, 2 if d == 2 else 1, description)), CHOICES[1])
+    for matrix in (W, inverse):
+        assert_close(matrix, matrix.T, 1e-13)
+        assert np.linalg.eigvalsh(matrix).min() > 0
+    np.testing.assert_allclose(W @ inverse, np.eye(len(W)), atol=1e-9)
+    held = np.abs(A - np.eye(len(A))).sum(axis=1) == 0
+    assert held.any()
+    np.testing.assert_allclose(W[held], np.eye(len(W))[held], atol=0)
+
+
+@pytest.mark.parametrize("d", [2, *thorough(3)])
+def test_its_eigenvalues_are_between_those_of_shear_and_those_of_lumping_whatever_the_bulk_modulus(d):
+    """W⁻¹A is a mean of P⁻¹A0, of shear alone, and of the average's stiffness over the lumped one, which is from 4⁻ᵈ,
+    for volumes that alternate from node to node with two particles along a cell's edge, to 1."""
+    operator = operator_of(*bodies(d, 0.49999, 2 if d == 2 else 1))
+    A, W, _ = matrices(operator, CHOICES[1])
+    A0, P, _ = matrices(eqx.tree_at(lambda o: o.hessian.averaged, operator.precomputed(), ()), CHOICES[0])
+    shear, own = (scipy.linalg.eigh(*pair, eigvals_only=True) for pair in ((A0, P), (A, W)))
+    assert own[0] > min(shear[0], 4.0**-d) * (1 - 1e-6)
+    assert own[-1] < max(shear[-1], 1) * (1 + 1e-6)
+    assert scipy.linalg.eigh(A, P, eigvals_only=True)[-1] > 100 * own[-1]
+
+
+@pytest.mark.parametrize("d", [2, *thorough(3)])
+def test_iterations_do_not_grow_and_the_motion_is_the_same(d):
+    def stepped(nu, preconditioner):
+        scene, particles = block(d, material=mpm.NeoHookean(1e4, nu), volume=AVERAGED)
+        turned = particles.x[:, ::-1] - particles.x.mean(axis=0)
+        particles = eqx.tree_at(lambda p: p.v, particles, 0.1 * turned)
+        solver = mpm.ConjugateResidual(rtol=1e-9, max_steps=10_000)
+        method = mpm.SemiImplicit(solver=solver, preconditioner=preconditioner)
+        after, info = mpm.step(scene, particles, 0.0, 1e-1, method=method)
+        return after.v, info.solve
+
+    one, other = (jax.jit(lambda nu, choice=choice: stepped(nu, choice)) for choice in CHOICES)
+    (velocity, plain), (found, solve), (_, stiffer) = one(0.4999), other(0.4999), other(0.49999)
+    assert solve.converged
+    assert plain.converged
+    assert_close(found, velocity, 1e-6)
+    assert stiffer.converged
+    assert int(stiffer.iterations) < 1.5 * int(solve.iterations)  # ten times the bulk modulus
+    assert int(solve.iterations) < int(plain.iterations) / 3
+
+
+def test_it_is_the_diagonal_where_there_is_no_average_or_no_band():
+    scene, particles = block(2, material=mpm.NeoHookean(1e4, 0.49))
+    averaged = eqx.tree_at(lambda s: s.volume, scene, AVERAGED, is_leaf=lambda leaf: leaf is None)
+    periodic = mpm.Grid((8, 9), 0.1, origin=(0, -3), periodic=(True, False))
+    around = mpm.Scene(periodic, mpm.NeoHookean(1e4, 0.49), volume=AVERAGED)
+
+    def kind(scene, preconditioner=CHOICES[1]):
+        found = []
+        jax.eval_shape(lambda: found.append(type(preconditioner.inner_product(operator_of(scene, particles)))))
+        return found[0]
+
+    assert kind(scene) is kind(around) is DiagonalInnerProduct
+    assert kind(averaged, mpm.VolumePreconditioner(largest=10)) is DiagonalInnerProduct
+    assert kind(averaged) is not DiagonalInnerProduct
+    with pytest.raises(ValueError, match="largest"):
+        mpm.VolumePreconditioner(largest=-1)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
+def test_newtons_method_and_gradients_are_those_of_the_diagonal(description):
+    tight = mpm.ConjugateResidual(rtol=1e-11, max_steps=10_000)
+    method = mpm.ImplicitMidpoint(mpm.Newton(rtol=1e-10, solver=tight), adjoint_solver=tight)
+
+    def outcome(scale, preconditioner):
+        law = mpm.NeoHookean(1e4 * scale, 0.499)
+        scene, particles = block(2, material=law, volume=AVERAGED, description=description)
+        particles = eqx.tree_at(lambda p: p.v, particles, 3 * (particles.x - particles.x.mean(axis=0))[:, ::-1])
+        own = dataclasses.replace(method, preconditioner=preconditioner)
+        after = mpm.rollout(scene, particles, steps=3, dt=5e-3, method=own)
+        return (after.F**2).sum()
+
+    one, other = (jax.jit(jax.value_and_grad(lambda s, c=choice: outcome(s, c)))(1.0) for choice in CHOICES)
+    np.testing.assert_allclose(one, other, rtol=1e-6)
