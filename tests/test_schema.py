@@ -55,6 +55,7 @@ EXAMPLES = {
     mpm.RigidPart: mpm.RigidPart(mpm.Ball((0.1, 0.2), 0.3), (True, False)),
     mpm.SymmetryPlane: mpm.SymmetryPlane(1, 0.05, "below"),
     mpm.ContactPlane: mpm.ContactPlane(1, 0.05, "below", friction=0.3),
+    mpm.Bodies: mpm.Bodies(0.3, (0, 1, 0)),
     mpm.Box: mpm.Box((0.0, 0.1, 0.2), (1.0, 1.1, 1.2)),
     mpm.Ball: mpm.Ball((0.1, 0.2), 0.3),
     mpm.HalfSpace: mpm.HalfSpace((0.1, 0.2), (3.0, 4.0)),

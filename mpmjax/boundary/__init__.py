@@ -1,5 +1,6 @@
 """Walls, grips, mirrored planes and colliders, and what colliders receive."""
 
+from mpmjax.boundary._body_contact import STIFFNESS, Body, BodyContact, body_contact, in_a_row
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall
 from mpmjax.boundary._boundary_impulse import (
     BoundaryImpulse,
@@ -24,11 +25,11 @@ from mpmjax.boundary._contact import (
     AbstractContact,
     AbstractNodes,
     ConstrainedNodes,
-    ContactInfo,
     constrain,
     find_active_set,
-    no_contact,
 )
+from mpmjax.boundary._contact_info import ContactInfo, no_contact
+from mpmjax.boundary._coupling import Coupling
 from mpmjax.boundary._faces import EXPLICIT_STIFFNESS, IMPLICIT_STIFFNESS, Faces, FaceShape
 from mpmjax.boundary._grip import Grip
 from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion, Tie
@@ -42,23 +43,27 @@ from mpmjax.boundary._springs import (
     spring_force,
     spring_resistance,
 )
-from mpmjax.boundary._surface_contact import Surface
+from mpmjax.boundary._surface_contact import Surface, refuse_contact
 from mpmjax.boundary._walls import SeparatingBox, SlipBox, StickyBox
 
 __all__ = [
     "EXPLICIT_STIFFNESS",
     "IMPLICIT_STIFFNESS",
     "ON_THE_WALL",
+    "STIFFNESS",
     "AbstractBoundary",
     "AbstractCollider",
     "AbstractContact",
     "AbstractNodes",
+    "Body",
+    "BodyContact",
     "BoundaryImpulse",
     "ColliderImpulse",
     "Conditions",
     "ConstrainedNodes",
     "ContactInfo",
     "ContactPlane",
+    "Coupling",
     "FaceShape",
     "Faces",
     "Given",
@@ -79,6 +84,7 @@ __all__ = [
     "SymmetryPlane",
     "Tie",
     "Wall",
+    "body_contact",
     "brought_contacts",
     "brought_images",
     "combined_conditions",
@@ -86,12 +92,14 @@ __all__ = [
     "find_active_set",
     "impulse_on_boundaries",
     "impulse_on_colliders",
+    "in_a_row",
     "mirror",
     "mirror_motion",
     "no_boundary_impulse",
     "no_contact",
     "no_impulse",
     "owners_of",
+    "refuse_contact",
     "spring_answer",
     "spring_diagonal",
     "spring_energy",

@@ -28,6 +28,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
 from mpmjax.boundary._conditions import Conditions
+from mpmjax.boundary._coupling import Coupling
 from mpmjax.boundary._mirror import Image, Mirror
 from mpmjax.boundary._springs import Springs
 
@@ -70,7 +71,12 @@ class AbstractNodes(eqx.Module):
 
     @abc.abstractmethod
     def constrained(
-        self: "N", images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None, springs: tuple[Springs, ...]
+        self: "N",
+        images: Mirror,
+        fixed: Mask,
+        normals: Bool[Array, "n"] | None,
+        springs: tuple[Springs, ...],
+        couplings: tuple[Coupling, ...],
     ) -> "N":
         """These nodes with more of them held.
 
@@ -79,6 +85,7 @@ class AbstractNodes(eqx.Module):
             fixed: components of velocity that are prescribed, shape (n, d).
             normals: nodes whose component along a collider's normal is held too, shape (n,).
             springs: the springs of what is held by springs.
+            couplings: the springs between bodies that are held by such.
         """
 
     @abc.abstractmethod
@@ -183,6 +190,11 @@ class AbstractContact(eqx.Module):
         del active
         return None
 
+    def coupling(self, active: Array) -> Coupling | None:
+        """The springs between two bodies at the places held; None without any."""
+        del active
+        return None
+
     def spring_impulse(self, held: "ConstrainedNodes", active: Array) -> NodeVector | None:
         """The impulse of its springs on all nodes [kg m/s], shape (n, d), not folded at mirrors; None without springs.
 
@@ -205,21 +217,6 @@ class AbstractContact(eqx.Module):
     def representative(self) -> Bool[Array, "n"] | None:
         """One node of each place, shape (n,), by which places are counted; None where each node is a place."""
         return None
-
-
-class ContactInfo(eqx.Module):
-    """How the active set was found."""
-
-    sweeps: Int[Array, "*f"]
-    """Solves before the last one."""
-    violations: Int[Array, "*f"]
-    """Places that pull or are entered all the same."""
-
-
-def no_contact() -> ContactInfo:
-    """The report of a scene without contact."""
-    zero = jnp.asarray(0, dtype=jnp.int32)
-    return ContactInfo(zero, zero)
 
 
 class ConstrainedNodes(eqx.Module, Generic[N]):
@@ -356,7 +353,8 @@ def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
         along = contact.normals(mask)
         normals = along if normals is None else normals
     springs = tuple(found for contact, mask in pairs if (found := contact.springs(mask)) is not None)
-    return ConstrainedNodes(nodes, active, images, nodes.constrained(images, fixed, normals, springs))
+    couplings = tuple(joined for contact, mask in pairs if (joined := contact.coupling(mask)) is not None)
+    return ConstrainedNodes(nodes, active, images, nodes.constrained(images, fixed, normals, springs, couplings))
 
 
 def find_active_set(

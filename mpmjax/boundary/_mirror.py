@@ -21,6 +21,8 @@ class Image(eqx.Module):
     """Signed copies of true nodes at their mirror images, along one axis of the window."""
 
     shape: tuple[int, ...] = eqx.field(static=True)
+    """The grid's shape, of each of its layers."""
+    layers: int = eqx.field(static=True)
     axis: int = eqx.field(static=True)
     source: Int[Array, "m"]
     even: Int[Array, "m"]
@@ -49,25 +51,25 @@ class Image(eqx.Module):
 
     def within(self, held: Bool[Array, "n"]) -> "Image":
         """The mirror in some columns only."""
-        return Image(self.shape, self.axis, self.source, self.even, self.odd, held, self.moving)
+        return replace(self, held=held)
 
     def along(self, values: Array) -> Array:
         """Values along the axis, shape (m,), at all nodes, shape (n,)."""
         by_axis = [1] * len(self.shape)
         by_axis[self.axis] = -1
-        return jnp.broadcast_to(values.reshape(by_axis), self.shape).reshape(-1)
+        return jnp.broadcast_to(values.reshape(by_axis), (self.layers, *self.shape)).reshape(-1)
 
     def column(self, field: NodeScalar) -> NodeScalar:
         """The sum over each column, at all of its nodes."""
-        total = field.reshape(self.shape).sum(axis=self.axis, keepdims=True)
-        return jnp.broadcast_to(total, self.shape).reshape(-1)
+        blocks = field.reshape(self.layers, *self.shape)
+        return jnp.broadcast_to(blocks.sum(axis=self.axis + 1, keepdims=True), blocks.shape).reshape(-1)
 
     def _copy(self, field: Array, sign: Array) -> Array:
         """Copy along the axis; `sign` has one row a node of the axis and one column a component."""
-        blocks = field.reshape(*self.shape, -1)
-        by_axis = [1] * (len(self.shape) + 1)
-        by_axis[self.axis], by_axis[-1] = sign.shape
-        copied = jnp.take(blocks, self.source, axis=self.axis) * sign.reshape(by_axis).astype(field.dtype)
+        blocks = field.reshape(self.layers, *self.shape, -1)
+        by_axis = [1] * blocks.ndim
+        by_axis[self.axis + 1], by_axis[-1] = sign.shape
+        copied = jnp.take(blocks, self.source, axis=self.axis + 1) * sign.reshape(by_axis).astype(field.dtype)
         copied = copied.reshape(field.shape)
         return copied if self.held is None else jnp.where(self.held[:, None], copied, field)
 
@@ -166,4 +168,4 @@ def mirror_image(axis: int, position: Scalar, keep: str, grid: Grid, window: Int
     known = (source >= 0) & (source < length)
     even = jnp.where(known, 1, 0)
     odd = jnp.where(known & (before != 0), jnp.where(ghost, -1, 1), 0)
-    return Image(grid.shape, axis, jnp.clip(source, 0, length - 1), even, odd), before
+    return Image(grid.shape, grid.layers, axis, jnp.clip(source, 0, length - 1), even, odd), before

@@ -1,12 +1,14 @@
 """The background grid: a window of static shape on an unbounded lattice, placed by its integer origin."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Int, NodeVector, ParticleVector, Scalar
-from mpmjax.checks import checked, require, require_positive
+from mpmjax.checks import checked, require, require_positive, require_whole
 
 _MOST_NODES = 2**31  # what an index of 32 bits counts
 
@@ -15,7 +17,7 @@ class Grid(eqx.Module):
     """A uniform Cartesian grid of nodes at (origin + index) * spacing.
 
     It is a window on an unbounded lattice. A node quantity is an array over the nodes of the window, flattened in C
-    order, of shape (n,) or (n, d). None of them outlives a step.
+    order, of shape (n,) or (n, d). None of them outlives a step. Nodes of several layers follow each other.
 
     The period of a *periodic* direction is the extent of the window, shape * spacing. Positions stay unwrapped; node
     indices wrap.
@@ -27,6 +29,7 @@ class Grid(eqx.Module):
         periodic: whether each direction is periodic; one bool for all of them is allowed.
         follow: whether the window moves by whole spacings to stay centred on the bounding box of the particles, with
             `origin` ignored. Results do not depend on the place of the window as long as it holds the particles.
+        layers: how many nodes there are at each place. A scene sets it to the number of its `bodies`.
 
     Raises:
         ValueError: a shape that is not one to three integers of at least 4, a spacing that is not positive, an origin
@@ -38,6 +41,7 @@ class Grid(eqx.Module):
     origin: tuple[int, ...] = eqx.field(static=True)
     periodic: tuple[bool, ...] = eqx.field(static=True)
     follow: bool = eqx.field(static=True)
+    layers: int = eqx.field(static=True)
 
     @checked
     def __init__(
@@ -48,6 +52,7 @@ class Grid(eqx.Module):
         origin: tuple[int, ...] | list[int] | None = None,
         periodic: bool | tuple[bool, ...] | list[bool] = False,
         follow: bool = False,
+        layers: int = 1,
     ):
         self.shape = tuple(int(n) for n in shape)
         self.spacing = spacing
@@ -55,6 +60,7 @@ class Grid(eqx.Module):
         every = (periodic,) * len(self.shape) if isinstance(periodic, bool) else periodic
         self.periodic = tuple(bool(p) for p in every)
         self.follow = follow
+        self.layers = require_whole("layers", layers, 1)
 
     def __check_init__(self):
         d = len(self.shape)
@@ -86,11 +92,19 @@ class Grid(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Number of nodes n."""
-        size = 1
-        for count in self.shape:
-            size *= count
-        return size
+        """Number of nodes n, in all layers."""
+        return self.layers * math.prod(self.shape)
+
+    def with_layers(self, count: int) -> "Grid":
+        """The grid with so many nodes at each place."""
+        return Grid(
+            self.shape,
+            self.spacing,
+            origin=self.origin,
+            periodic=self.periodic,
+            follow=self.follow,
+            layers=count,
+        )
 
     def window(self, x: ParticleVector) -> Int[Array, "d"]:
         """Lattice index of the window's first node, shape (d,), for particles at x [m], shape (p, d)."""
@@ -111,5 +125,6 @@ class Grid(eqx.Module):
     def nodes(self, window: Int[Array, "d"]) -> NodeVector:
         """Positions of the window's nodes [m], shape (n, d)."""
         axes = [jnp.arange(count, dtype=jnp.int32) for count in self.shape]
-        index = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1).reshape(self.size, self.dim)
+        index = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.dim)
+        index = index if self.layers == 1 else jnp.tile(index, (self.layers, 1))
         return (index + window).astype(jnp.result_type(self.spacing)) * self.spacing

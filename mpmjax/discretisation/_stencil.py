@@ -6,6 +6,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Indices, Int, ParticleVector, components
 from mpmjax.discretisation._gradient import AbstractGradient
@@ -84,7 +85,14 @@ def in_window(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleV
 
 
 def make_stencil(
-    kernel: BSpline, gradient: AbstractGradient, grid: Grid, window: Int[Array, "d"], x: ParticleVector, *, affine: bool
+    kernel: BSpline,
+    gradient: AbstractGradient,
+    grid: Grid,
+    window: Int[Array, "d"],
+    x: ParticleVector,
+    *,
+    affine: bool,
+    layer: Int[np.ndarray, "p"] | None = None,
 ) -> Stencil:
     """The stencil of particles at x.
 
@@ -95,6 +103,7 @@ def make_stencil(
         window: lattice index of the window's first node.
         x: positions [m], shape (p, d).
         affine: whether the transfer keeps an affine velocity, which needs the moving-least-squares gradient.
+        layer: the number of the nodes' layer of each particle, shape (p,). Default: there is one.
     """
     dx = grid.spacing
     xi = components(x) / dx
@@ -109,8 +118,11 @@ def make_stencil(
         offset = jnp.arange(kernel.order + 1, dtype=f.dtype)[:, None] - f[:, None]
         least_squares = weights * offset / (variance * dx)
     derivatives = gradient.derivatives(spline, least_squares)
+    index_factors = _index_factors(kernel, grid, window, xi)
+    if layer is not None:
+        index_factors = index_factors.at[0].add(jnp.asarray(layer * math.prod(grid.shape), jnp.int32))
     return Stencil(
-        index_factors=_index_factors(kernel, grid, window, xi),
+        index_factors=index_factors,
         weights=weights,
         weight_derivatives=derivatives,
         mls_weight_derivatives=least_squares if affine and derivatives is not least_squares else None,

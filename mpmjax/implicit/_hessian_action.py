@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, Float, Matrix, NodeVector, Scalar
-from mpmjax.boundary import Mirror, Springs, spring_answer, spring_diagonal, spring_resistance
+from mpmjax.boundary import Coupling, Mirror, Springs, spring_answer, spring_diagonal, spring_resistance
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.state import MaterialPoints, SupportStiffness, VolumeAverage, stiffness_of
@@ -89,6 +89,8 @@ class ParticleStiffness(AbstractHessianAction):
     """The springs of contact, whose Hessian is added."""
     averaged: tuple[AveragedStiffness, ...] = ()
     """The materials whose volumes are averaged."""
+    couplings: tuple[Coupling, ...] = ()
+    """Those between bodies."""
 
     def is_positive_semidefinite(self) -> bool:
         return self.positive_semidefinite
@@ -104,6 +106,7 @@ class ParticleStiffness(AbstractHessianAction):
             value, more = spring_answer(self.springs, moved)
             flux = flux + more
         force = self.mirror.fold(scatter(self.stencil, value, flux, du.shape[0]))
+        force = _with_couplings(force, self.couplings, self.mirror, du)
         return force + sum(support(du) for support in self.supports) if self.supports else force
 
     def precomputed(self) -> "ParticleStiffness":
@@ -132,6 +135,9 @@ class ParticleStiffness(AbstractHessianAction):
         found = jnp.stack([self.mirror.fold_scalar(component) for component in nodes.T], axis=1)
         if self.springs:
             found = found + spring_diagonal(self.springs, self.stencil, self.mirror, like.shape[0])
+        for coupling in self.couplings:
+            each = coupling.diagonal(len(like)).T
+            found = found + jnp.stack([self.mirror.fold_scalar(component) for component in each], axis=1)
         return found + sum(support.diagonal(like) for support in self.supports) if self.supports else found
 
 
@@ -179,6 +185,7 @@ def particle_stiffness(
         stiffness_of(potential.held_by()),
         potential.springs,
         averaged,
+        potential.couplings,
     )
 
 
@@ -195,8 +202,17 @@ def _tangent_action(
     force = potential.nodal_sum(potential.flux(tuple(changes)))
     if potential.springs:
         force = force + spring_resistance(potential.springs, potential.stencil, potential.mirror, du)
+    force = _with_couplings(force, potential.couplings, potential.mirror, du)
     supports = stiffness_of(potential.held_by())
     return force + sum(support(du) for support in supports) if supports else force
+
+
+def _with_couplings(force: NodeVector, couplings: tuple[Coupling, ...], mirror: Mirror, du: NodeVector) -> NodeVector:
+    """A force with what the springs between bodies add to it [N], shape (n, d)."""
+    if not couplings:
+        return force
+    moved = mirror.unfold(du)
+    return force + sum(mirror.fold(coupling.resistance(moved)) for coupling in couplings)
 
 
 class _DampedAction(AbstractHessianAction):

@@ -2,13 +2,14 @@
 force as a function of nodal velocity."""
 
 from collections.abc import Callable
+from functools import reduce
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, Float, Matrix, NodeVector
-from mpmjax.boundary import Mirror, Springs, spring_energy, spring_force
+from mpmjax.boundary import Coupling, Mirror, Springs, spring_energy, spring_force
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.state import MaterialPoints, Support
 
@@ -33,6 +34,8 @@ class ElasticPotential(eqx.Module):
     """Springs and dashpots to the ground, whose energy and resistance are added."""
     springs: tuple[Springs, ...] = ()
     """The springs of contact, whose energy is part of Φ."""
+    couplings: tuple[Coupling, ...] = ()
+    """Those between bodies."""
 
     def deformation_change(self, u: NodeVector) -> Deformations:
         """δF_p = Σ_i u_i h_ipᵀ, one array for each material."""
@@ -77,7 +80,8 @@ class ElasticPotential(eqx.Module):
     def spring_energies(self, u: NodeVector) -> list[Float[Array, ""]]:
         """The energies of the springs of supports and of contact [J]."""
         contact = [spring_energy(self.springs, gather(self.stencil, self.mirror.unfold(u)))] if self.springs else []
-        return self.support_energies(u) + contact
+        coupled = [coupling.energy(self.mirror.unfold(u)) for coupling in self.couplings]
+        return self.support_energies(u) + contact + coupled
 
     def held_by(self) -> tuple[Support, ...]:
         """The supports, on the nodes as the mirrors fold them."""
@@ -96,13 +100,16 @@ class ElasticPotential(eqx.Module):
     def force(self, u: NodeVector) -> NodeVector:
         """f = −∂Φ/∂u [N], shape (n, d). At u = 0, f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
         force = -self.nodal_sum(self.flux(self._stress(self.deformation(u))))
-        if self.springs:
+        if self.springs or self.couplings:
             force = force + self.spring_force(u)
         return force + sum(support.force(u, self.size) for support in self.held_by()) if self.supports else force
 
     def spring_force(self, u: NodeVector | None) -> NodeVector:
         """The part of `force` by the springs of contact [N], shape (n, d); None for u = 0."""
-        return spring_force(self.springs, self.stencil, self.mirror, u, self.size)
+        parts = [spring_force(self.springs, self.stencil, self.mirror, u, self.size)] if self.springs else []
+        moved = None if u is None else self.mirror.unfold(u)
+        parts += [self.mirror.fold(coupling.force(moved, self.size)) for coupling in self.couplings]
+        return reduce(jnp.add, parts)
 
     def flux(self, P: Deformations) -> Matrix:
         """V0_p P_p F_pᵀ [J], shape (d, d, p), from the stress of each material; in the total description V0_p P_p."""

@@ -56,6 +56,7 @@ from mpmjax.material import (
 from mpmjax.state import (
     AttachedPoints,
     AveragedVolume,
+    Bodies,
     Patch,
     PointLoad,
     PointsAt,
@@ -78,6 +79,7 @@ CLASSES: tuple[type, ...] = (
     *(StickyCollider, SlipCollider, SeparatingCollider),
     *(Box, Ball, HalfSpace, Capsule, Cylinder, Annulus, Tube, Union, SampledDistance, Motion, RigidMotion),
     *(Traction, Pressure, PointLoad, Spring, Patch, PointsAt, AttachedPoints, TimeSeries),
+    Bodies,
     *(BSpline, SplineGradient, MLSGradient, PIC, FLIP, APIC, UpdatedLagrangian, TotalLagrangian),
     AveragedVolume,
     *(Explicit, SemiImplicit, BackwardEuler, ImplicitMidpoint, TRBDF2),

@@ -2,6 +2,7 @@
 
 from mpmjax.state._attachment import AbstractPlace, AttachedPoints, Patch, PointsAt
 from mpmjax.state._averaged_volume import AveragedTangent, AveragedVolume, VolumeAverage
+from mpmjax.state._bodies import Bodies
 from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, TotalLagrangian, UpdatedLagrangian
 from mpmjax.state._fill import fill, fill_mapped
@@ -21,6 +22,7 @@ __all__ = [
     "AttachedPoints",
     "AveragedTangent",
     "AveragedVolume",
+    "Bodies",
     "LoadedPoints",
     "MaterialPoints",
     "Particles",

@@ -2,9 +2,10 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax._types import Array, Float, Int, NodeVector, Point, Scalar
-from mpmjax.boundary import AbstractBoundary, mirror
+from mpmjax.boundary import AbstractBoundary, mirror, refuse_contact
 from mpmjax.checks import (
     checked,
     coordinates,
@@ -26,6 +27,7 @@ from mpmjax.discretisation import (
 from mpmjax.geometry import Motion
 from mpmjax.material import AbstractLaw
 from mpmjax.state._averaged_volume import AveragedVolume, VolumeAverage, volume_average
+from mpmjax.state._bodies import Bodies
 from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, UpdatedLagrangian
 from mpmjax.state._loads import AbstractLoad
@@ -51,6 +53,7 @@ class Scene(eqx.Module):
         description: updated (default) or total Lagrangian.
         body_force: a force per mass that varies in space or time, besides gravity. Default: none.
         loads: forces on the body's surface or at points of it, springs and dashpots; see `attach`.
+        bodies: which materials are bodies of their own, that touch each other. Default: all share the nodes.
         volume: `AveragedVolume()` for nearly incompressible bodies. Default: each particle has its own volume.
         boundary_forces: whether steps compute the force and torque on each boundary (see `Run.boundary_forces`).
 
@@ -71,6 +74,7 @@ class Scene(eqx.Module):
     body_force: AbstractBodyForce | None
     boundary_forces: bool = eqx.field(static=True)
     loads: tuple[AbstractLoad, ...]
+    bodies: Bodies | None
     volume: AveragedVolume | None
 
     @checked
@@ -88,10 +92,12 @@ class Scene(eqx.Module):
         body_force: AbstractBodyForce | None = None,
         boundary_forces: bool = False,
         loads: AbstractLoad | tuple[AbstractLoad, ...] | list[AbstractLoad] = (),
+        bodies: Bodies | None = None,
         volume: AveragedVolume | None = None,
     ):
-        self.grid = grid
         self.material = tuple(material) if isinstance(material, list) else material
+        layers = 1 if bodies is None else 1 + max(bodies.numbers(len(self.laws)))
+        self.grid = grid if grid.layers == layers else grid.with_layers(layers)
         self.gravity = (0.0,) * grid.dim if gravity is None else gravity
         self.boundary = (boundary,) if isinstance(boundary, AbstractBoundary) else tuple(boundary)
         self.kernel = kernel
@@ -102,6 +108,7 @@ class Scene(eqx.Module):
         self.body_force = body_force
         self.boundary_forces = boundary_forces
         self.loads = (loads,) if isinstance(loads, AbstractLoad) else tuple(loads)
+        self.bodies = bodies
         self.volume = volume
 
     def __check_init__(self):
@@ -127,6 +134,12 @@ class Scene(eqx.Module):
                 all(is_traced((m, mirrors[0])) or bool(eqx.tree_equal(m, mirrors[0])) for m in mirrors),
                 f"In the updated description the grid moves with the planes across axis {axis}, so that all of them "
                 "must move alike: give them one motion, take the total description, or a SlipCollider of a HalfSpace.",
+            )
+        if self.bodies is not None:
+            refuse_contact(self.total)
+            require(
+                self.kernel.order > 1,
+                "Bodies that touch need a kernel that sees their surface: take BSpline(2), the default, or BSpline(3).",
             )
         if self.total:
             require(not self.grid.follow, "In the total description the window cannot follow: drop follow=True.")
@@ -170,14 +183,14 @@ class Scene(eqx.Module):
         volume = self.volume
         if volume is None:
             return material_points(self.laws, particles, total=self.total)
-        window, places = self.window(particles), self.on_grid(particles, t)
-        images = mirror(self.boundary, self.grid, window).without_ties()
+        grid, window, places = self.grid.with_layers(1), self.window(particles), self.on_grid(particles, t)
+        images = mirror(self.boundary, grid, window).without_ties()
 
         def average(number: int, group: Group) -> VolumeAverage | None:
             rows = slice(*group.rows)
             if not volume.covers(number):
                 return None
-            return volume_average(self.grid, window, places[rows], particles.volume[rows], images)
+            return volume_average(grid, window, places[rows], particles.volume[rows], images)
 
         return material_points(self.laws, particles, total=self.total, average=average)
 
@@ -236,7 +249,14 @@ class Scene(eqx.Module):
             self.window(particles),
             self.on_grid(particles, t),
             affine=self.transfer.affine,
+            layer=self.layer(particles),
         )
+
+    def layer(self, particles: Particles) -> Int[np.ndarray, "p"] | None:
+        """The number of each particle's body, shape (p,); None without `bodies`."""
+        if self.bodies is None:
+            return None
+        return np.repeat(self.bodies.numbers(len(self.laws)), particles.sizes).astype(np.int32)
 
 
 @checked

@@ -59,8 +59,9 @@ def given_to_boundaries(
     for number, contact, active in contacts:
         push = contact.spring_impulse(held, active)
         if push is not None:
-            given.append(Given(push, number))
             residual = residual - push
+            if number is not None:  # else two bodies push each other
+                given.append(Given(push, number))
 
     # what symmetry planes take of the impulses on all nodes, and what reaches the folded ones
     if scene.transfer.needs_change and before is not None:
@@ -77,19 +78,22 @@ def given_to_boundaries(
     columns = [
         (number, image.within(active))
         for number, contact, active in contacts
-        if (image := contact.mirror_image) is not None
+        if number is not None and (image := contact.mirror_image) is not None
     ]
     of_planes, residual = taken_by_mirrors(residual, columns)
     given += [*of_planes, Given(residual, owners.fixed)]
     taken = owners.fixed >= 0
     for number, contact, active in contacts:
-        mine = contact.fixed(active, residual.shape) & ~taken
-        given.append(Given(jnp.where(mine, residual, 0), number))
-        taken = taken | mine
+        if number is not None:
+            mine = contact.fixed(active, residual.shape) & ~taken
+            given.append(Given(jnp.where(mine, residual, 0), number))
+            taken = taken | mine
 
     for (number, _, _), change in zip(contacts, slowed, strict=True):
         of_planes, friction = taken_by_mirrors(unfolded.mass[:, None] * unfold(change), images)
-        given += [*of_planes, Given(friction, number)]
+        given += of_planes
+        if number is not None:
+            given.append(Given(friction, number))
 
     places, pivots = at, _pivots(scene, t, residual)
     if scene.total:

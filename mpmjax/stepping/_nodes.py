@@ -12,6 +12,7 @@ from mpmjax.boundary import (
     AbstractContact,
     AbstractNodes,
     Conditions,
+    Coupling,
     Mirror,
     MirrorMotion,
     Springs,
@@ -23,6 +24,7 @@ from mpmjax.boundary import (
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.state import Particles, Scene, load_force, points_of, supports_of
+from mpmjax.stepping._body_surfaces import contacts_of_bodies
 from mpmjax.stepping._particle_faces import faces_of
 
 Fold = Callable[[NodeVector], NodeVector]
@@ -136,8 +138,8 @@ class Nodes(AbstractNodes):
     """The conditions that the boundaries prescribe."""
     contacts: tuple[AbstractContact, ...] = ()
     """The contacts of the scene; none of them is active here."""
-    brought_by: tuple[int, ...] = eqx.field(static=True, default=())
-    """The number of the boundary that brings each contact."""
+    brought_by: tuple[int | None, ...] = eqx.field(static=True, default=())
+    """The number of the boundary that brings each contact; None for that of two bodies."""
     mirror_motion: MirrorMotion | None = None
     """What mirrors that move add to the velocity of the nodes beyond them; None if none moves."""
 
@@ -258,16 +260,21 @@ class Nodes(AbstractNodes):
         return eqx.tree_at(lambda n: n.sums, self, self.sums.folded(lambda v: v + change, lambda force: force))
 
     def constrained(
-        self, images: Mirror, fixed: Mask, normals: Bool[Array, "n"] | None, springs: tuple[Springs, ...]
+        self,
+        images: Mirror,
+        fixed: Mask,
+        normals: Bool[Array, "n"] | None,
+        springs: tuple[Springs, ...],
+        couplings: tuple[Coupling, ...],
     ) -> "Nodes":
         """The nodes folded at these mirrors, with the components `fixed` and the `normals` held too, and the force of
-        the springs."""
+        the springs and couplings."""
         nodes, colliders = (
             eqx.tree_at(lambda n: n.conditions.fixed, self.folded(images), fixed),
             self.conditions.colliders,
         )
-        if springs:
-            nodes = eqx.tree_at(lambda n: n.potential.springs, nodes, springs)
+        if springs or couplings:
+            nodes = eqx.tree_at(lambda n: (n.potential.springs, n.potential.couplings), nodes, (springs, couplings))
             nodes = eqx.tree_at(
                 lambda n: n.sums, nodes, nodes.sums.with_force(nodes, nodes.potential.spring_force(None))
             )
@@ -359,7 +366,12 @@ def particles_to_grid(
             sums = SeparateSums(jnp.where(occupied, momentum / full, 0), force, viscous_force)
         faces = faces_of(scene, particles, potential.material_points, stencil, dt, force_at)
         acts_at = t if force_at is None else t + jnp.where(jnp.asarray(force_at) > 0, dt, 0)
-        brought = brought_contacts(scene.boundary, conditions, grid, window, t, dt, faces, acts_at)
+        brought: list[tuple[int | None, AbstractContact]] = [
+            *brought_contacts(scene.boundary, conditions, grid, window, t, dt, faces, acts_at)
+        ]
+        images = mirror(scene.boundary, grid, window)
+        touching = contacts_of_bodies(scene, particles, potential.material_points, stencil, images, dt, force_at)
+        brought += [(None, contact) for contact in touching]
         nodes = Nodes(
             mass=jnp.where(occupied[:, 0], mass, 0),
             sums=sums,

@@ -1,0 +1,250 @@
+"""Two bodies that touch: where contact is felt, by which normals, and what slides, rolls and is pressed.
+
+python benchmarks/bodies.py                     all tables, and docs/bodies.png (minutes)
+python benchmarks/bodies.py --only slope        one of rest, normals, slope, roll, hertz
+python benchmarks/bodies.py --quick             the same, coarser, without a picture
+"""
+
+import argparse
+import dataclasses
+from collections.abc import Callable
+from itertools import product
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import mpmjax as mpm
+from mpmjax.checks import canonical
+from mpmjax.stepping import particles_to_grid
+
+jax.config.update("jax_enable_x64", True)
+DOCS = Path(__file__).parents[1] / "docs"
+G = 10.0  # m/s²
+DENSITY = 1e3  # kg/m²
+HELD = mpm.StickyBox((-np.inf, 0.0), (np.inf, np.inf))
+
+
+def contact_of(scene: mpm.Scene, particles: mpm.Particles, t: float = 0.0) -> tuple:
+    """The contact of two bodies as it is felt, and the places of its nodes."""
+    scene = canonical(scene, particles.x.dtype)
+    particles = mpm.prepare(scene, particles)
+    nodes = particles_to_grid(scene, particles, t, jnp.asarray(1e-3), scene.stencil(particles, t))
+    return nodes.contacts[-1], np.asarray(scene.grid.nodes(scene.window(particles)))[: len(nodes.contacts[-1].gap)]
+
+
+def moved(body: mpm.Particles, by: tuple[float, float]) -> mpm.Particles:
+    return dataclasses.replace(body, x=body.x + jnp.asarray(by))
+
+
+def rest(quick: bool) -> None:
+    """A block that has come to rest on another: the gap between faces, by place on the lattice."""
+    law, dx = mpm.NeoHookean(1e6, 0.3), 0.1
+    print("block at rest on a block: gap of the faces in spacings, less what the load presses in")
+    for place in (0.0, 0.37) if quick else (0.0, 0.13, 0.25, 0.37, 0.5):
+        grid = mpm.Grid((18, 22), dx, origin=(-3, -3))
+        low = mpm.fill(mpm.Box((0.0, 0.0), (1.0, 0.4 + place * dx)), grid, density=DENSITY)
+        top = 0.4 + place * dx
+        high = mpm.fill(mpm.Box((0.2, top), (0.8, top + 0.6)), grid, density=DENSITY)
+        scene = mpm.Scene(grid, (law, law), gravity=(0.0, -G), boundary=HELD, bodies=mpm.Bodies(0.3))
+        run = mpm.simulate(scene, mpm.join(low, high), t1=4.0, dt=0.1, method=mpm.BackwardEuler())
+        contact, x = contact_of(scene, run.final, 4.0)
+        inside = np.isfinite(contact.gap) & (np.abs(x[:, 0] - 0.5) < 0.11) & (np.asarray(contact.stiffness) > 0)
+        seen = np.average(np.asarray(contact.gap)[inside], weights=np.asarray(contact.stiffness)[inside]) / dx
+        pressed = DENSITY * G * 0.6 / 1.346e6  # α M/2 = M a spacing, of two bodies in a row
+        print(f"  {place:4.2f} spacings from a node: {seen:+.4f} ({pressed:.4f} by the load)")
+
+
+def normals(quick: bool) -> None:
+    """Root mean square of the angle between normals and the true one, weighted with the springs' stiffness."""
+    law, dx, rng = mpm.NeoHookean(1e6, 0.3), 0.1, np.random.default_rng(0)
+    grid = mpm.Grid((40, 40), dx, origin=(-20, -20))
+
+    def beside(k: int) -> tuple:
+        """A block, somewhere on a wider one."""
+        low = mpm.fill(mpm.Box((-1.0, -0.6), (1.0, 0.0)), grid, density=DENSITY)
+        high = mpm.fill(mpm.Box((-0.3, 0.0), (0.3, 0.6)), grid, density=DENSITY)
+        by = rng.uniform(-0.05, 0.05, 2)
+        return moved(low, by), moved(high, (*(by[:1] + rng.uniform(-0.05, 0.05)), by[1] - 0.002)), lambda x: (0.0, -1.0)
+
+    def flush(k: int) -> tuple:
+        """Two blocks of one width, edge on edge."""
+        low = mpm.fill(mpm.Box((-0.4, -0.6), (0.4, 0.0)), grid, density=DENSITY)
+        high = mpm.fill(mpm.Box((-0.4, 0.0), (0.4, 0.6)), grid, density=DENSITY)
+        by = rng.uniform(-0.05, 0.05, 2)
+        return moved(low, by), moved(high, (by[0] + rng.uniform(-0.05, 0.05), by[1] - 0.002)), lambda x: (0.0, -1.0)
+
+    def disks(k: int) -> tuple:
+        """Two disks of ten cells' radius that overlap a little, in some direction."""
+        angle, R = rng.uniform(0, 2 * np.pi), 0.8
+        n, by = np.array([np.cos(angle), np.sin(angle)]), rng.uniform(-0.05, 0.05, 2)
+        pair = [mpm.fill(mpm.Ball((0.0, 0.0), R), grid, density=DENSITY, fitted=True) for _ in range(2)]
+        a, b = by - (R - 0.01) * n, by + (R - 0.01) * n
+        return (
+            moved(pair[0], a),
+            moved(pair[1], b),
+            lambda x: _unit((a - x) / np.hypot(*(x - a)) - (b - x) / np.hypot(*(x - b))),
+        )
+
+    print("angle of normals at the nodes held, degrees (root mean square, by stiffness)")
+    for name, make in {"block on a wider one": beside, "edge on edge": flush, "two disks": disks}.items():
+        errors: dict[str, list] = {}
+        for k in range(3 if quick else 20):
+            a, b, true = make(k)
+            scene = mpm.Scene(grid, (law, law), bodies=mpm.Bodies())
+            contact, x = contact_of(scene, mpm.join(a, b))
+            stiffness = np.asarray(contact.stiffness)
+            for i in np.flatnonzero((stiffness > 0) & (np.asarray(contact.gap) < 0.02 * dx)):
+                found = {"of the sheet (taken)": np.asarray(contact.normal)[i], **_others(a, b, x[i], dx)}
+                for method, n in found.items():
+                    angle = np.degrees(np.arccos(np.clip(np.dot(n, true(x[i])), -1, 1)))
+                    errors.setdefault(method, []).append((stiffness[i], angle))
+        parts = (
+            f"{m} {np.sqrt(np.average(np.array(e)[:, 1] ** 2, weights=np.array(e)[:, 0])):.1f}"
+            for m, e in errors.items()
+        )
+        print(f"  {name}: " + ", ".join(parts))
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    return v / np.linalg.norm(v)
+
+
+def _others(a: mpm.Particles, b: mpm.Particles, node: np.ndarray, dx: float) -> dict[str, np.ndarray]:
+    """Normals at a node by other methods, from the particles in its reach."""
+    arms = [(np.asarray(body.x) - node) / dx for body in (a, b)]
+    weights = [
+        np.where(np.abs(r) < 0.5, 0.75 - r**2, 0.5 * np.maximum(1.5 - np.abs(r), 0) ** 2).prod(axis=1) for r in arms
+    ]
+    volumes = [np.asarray(body.volume) / dx**2 for body in (a, b)]
+    moments = [(w * v) @ r for w, v, r in zip(weights, volumes, arms, strict=True)]
+    found = {
+        "gradient of one mass": _unit(moments[0]),
+        "difference of gradients": _unit(moments[0] - moments[1]),
+    }
+    x, w = np.concatenate(arms), np.concatenate([w * v for w, v in zip(weights, volumes, strict=True)])
+    label = np.repeat([1.0, -1.0], [len(r) for r in arms])
+    near = w > 0
+    found["logistic regression"] = _unit(_logistic(x[near], w[near], label[near]))
+    return found
+
+
+def _logistic(x: np.ndarray, w: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """The normal of the plane that tells two sets of points apart: least Σ w log(1 + exp(−label z)) + 1e-6 ‖β‖²."""
+    X, beta = np.concatenate([x, np.ones((len(x), 1))], axis=1), np.zeros(3)
+    for _ in range(30):
+        p = 1 / (1 + np.exp(np.clip(label * (X @ beta), -50, 50)))
+        H = (X * (w * p * (1 - p))[:, None]).T @ X + 1e-6 * np.eye(3)
+        step = np.linalg.solve(H, X.T @ (w * p * label) - 1e-6 * beta)
+        beta = beta + step * min(1, 20 / np.linalg.norm(step))
+    return beta[:2]
+
+
+def slope(quick: bool) -> None:
+    """A block of 6 by 4 cells on a slab that is 30 degrees steep."""
+    angle, law = np.pi / 6, mpm.NeoHookean(1e6, 0.3)
+    grid = mpm.Grid((46, 16), 0.1, origin=(-3, -3))
+    slab = mpm.fill(mpm.Box((0.0, 0.0), (4.0, 0.4)), grid, density=DENSITY)
+    block = mpm.fill(mpm.Box((0.43, 0.4), (1.03, 0.8)), grid, density=DENSITY)
+    particles, rows = mpm.join(slab, block), slice(slab.count, None)
+    print("a block on a slope of 30 degrees, from 0.25 to 0.5 s: what it gains over what the closed form says")
+    for name, friction in product(("explicit", "semi-implicit"), (0.0, 0.3, 0.8)):
+        method, steps = (mpm.Explicit(), 420) if name == "explicit" else (mpm.SemiImplicit(), 60)
+        gravity = (G * np.sin(angle), -G * np.cos(angle))
+        scene = mpm.Scene(grid, (law, law), gravity=gravity, boundary=HELD, bodies=mpm.Bodies(friction))
+        run = mpm.simulate(scene, particles, t1=0.5, dt=0.5 / steps, method=method, save_every=steps // 2)
+        v = np.asarray(run.frames.v)[1:, rows].mean(axis=1)
+        gained = v[1] - v[0]
+        if friction > np.tan(angle):
+            print(
+                f"  {name}, μ = {friction}: slides at {v[1, 0]:+.4f} m/s where it would at {G / 4:.2f} without friction"
+            )
+            continue
+        push = G * np.cos(angle) / 4 + gained[1]
+        exact = G * np.sin(angle) / 4 - friction * push
+        print(f"  {name}, μ = {friction}: {gained[0] / exact - 1:+.2%}")
+
+
+def roll(quick: bool) -> None:
+    """A disk of ten cells' diameter on a slab of 0.1 radians, with friction."""
+    R, angle, law = 0.5, 0.1, mpm.NeoHookean(1e6, 0.3)
+    grid = mpm.Grid((46, 22), 0.1, origin=(-3, -3))
+    slab = mpm.fill(mpm.Box((0.0, 0.0), (4.0, 0.4)), grid, density=DENSITY)
+    disk = mpm.fill(mpm.Ball((0.9, 0.4 + R), R), grid, density=DENSITY, fitted=True)
+    gravity = (G * np.sin(angle), -G * np.cos(angle))
+    scene = mpm.Scene(grid, (law, law), gravity=gravity, boundary=HELD, bodies=mpm.Bodies(0.5))
+    t1 = 0.3 if quick else 1.0
+    for name, method, steps in (("explicit", mpm.Explicit(), 900), ("semi-implicit", mpm.SemiImplicit(), 200)):
+        run = mpm.simulate(scene, mpm.join(slab, disk), t1=t1, dt=t1 / steps, method=method)
+        x, v = (np.asarray(a)[slab.count :] for a in (run.final.x, run.final.v))
+        arm, slip = x - x.mean(axis=0), v - v.mean(axis=0)
+        spin = (arm[:, 0] * slip[:, 1] - arm[:, 1] * slip[:, 0]).sum() / (arm**2).sum()
+        way = x.mean(axis=0)[0] - float(disk.x[:, 0].mean())
+        print(
+            f"a disk rolls, {name}: way over g sin θ t²/3 {way / (G * np.sin(angle) * t1**2 / 3):.4f}, "
+            f"−ωR/v {-spin * R / v.mean(axis=0)[0]:.3f}"
+        )
+
+
+def hertz(quick: bool) -> list[tuple]:
+    """Two equal cylinders that are pressed together: the half-width of contact over Hertz's, a² = 4PR*/(πE*)."""
+    E, nu, R, rows = 1e5, 0.3, 1.0, []
+    modulus = E / (2 * (1 - nu**2))
+    print("two cylinders: half-width over Hertz's")
+    for cells, press in ((24, 0.05),) if quick else ((32, 0.05), (48, 0.03), (48, 0.05)):
+        dx = R / cells
+        grid = mpm.Grid((int(1.05 * cells) + 6, 2 * cells + 6), dx, origin=(-3, -3))
+        whole = mpm.fill(
+            mpm.Ball((0.0, 0.0), R),
+            mpm.Grid((2 * cells + 8,) * 2, dx, origin=(-cells - 4,) * 2),
+            density=DENSITY,
+            fitted=True,
+        )
+        quarter = np.asarray((whole.x > 0).all(axis=1))
+        low = mpm.Particles(*(getattr(whole, name)[quarter] for name in ("x", "v", "mass", "volume")))
+        high = dataclasses.replace(low, x=jnp.stack([low.x[:, 0], 2 * R - low.x[:, 1]], axis=1))
+        down = mpm.Motion((0.0, 16.0, 20.0), ((0.0, 0.0), (0.0, -press), (0.0, -press)))
+        top = mpm.Grip(mpm.HalfSpace((0.0, 2 * R - 1e-9), (0.0, -1.0)), down, axes=(False, True))
+        walls = mpm.SymmetryPlane(0, 0.0), mpm.SymmetryPlane(1, 0.0), top
+        law = mpm.NeoHookean(E, nu)
+        scene = mpm.Scene(grid, (law, law), boundary=walls, bodies=mpm.Bodies(), boundary_forces=True)
+        run = mpm.simulate(scene, mpm.join(low, high), t1=20.0, dt=2.0, method=mpm.BackwardEuler(), save_every=2)
+        load = 2 * abs(float(run.boundary_forces().force[-1, 1, 1]))
+        contact, x = contact_of(scene, run.final, 20.0)
+        push = np.maximum(-np.where(np.isfinite(contact.gap), contact.gap, 0) * np.asarray(contact.stiffness), 0)
+        half = 2 * np.sqrt((push * x[:, 0] ** 2).sum() / push.sum())  # <x²> = a²/4 of Hertz's pressure
+        exact = np.sqrt(4 * load * (R / 2) / (np.pi * modulus))
+        print(f"  {cells} cells to the radius, {half / dx:.1f} to the half-width: {half / exact:.3f}")
+        rows.append((x[push > 0, 0], push[push > 0], exact, dx))
+    return rows
+
+
+def draw(rows: list[tuple]) -> None:
+    """The pressure between the cylinders against Hertz's."""
+    x, push, exact, dx = rows[-1]
+    columns = np.unique(np.round(x / dx).astype(int))
+    force = np.array([push[np.round(x / dx).astype(int) == k].sum() for k in columns])
+    share = np.where(columns == 0, 2, 1) * force / force.sum() / 2  # the node on the axis is half a node
+    figure, axis = plt.subplots(figsize=(5, 3), layout="constrained")
+    axis.plot(columns * dx / exact, share / dx * exact, "o", label="push of the nodes")
+    s = np.linspace(0, 1, 200)
+    axis.plot(s, 2 / np.pi * np.sqrt(1 - s**2), label="Hertz")
+    axis.set(xlabel="x / a", ylabel="pressure · a / P", ylim=(0, None))
+    axis.legend(frameon=False)
+    figure.savefig(DOCS / "bodies.png", dpi=130)
+
+
+TABLES: dict[str, Callable] = {"rest": rest, "normals": normals, "slope": slope, "roll": roll, "hertz": hertz}
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", choices=TABLES)
+    parser.add_argument("--quick", action="store_true")
+    options = parser.parse_args()
+    for name, table in TABLES.items():
+        if options.only in (None, name):
+            found = table(options.quick)
+            if name == "hertz" and not options.quick:
+                draw(found)

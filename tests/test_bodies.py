@@ -1,0 +1,243 @@
+"""Bodies that touch: the gap between them, what they give each other, friction, derivatives, bad input."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, assert_files_hold, ids, thorough
+
+import mpmjax as mpm
+from mpmjax.boundary import Coupling
+from mpmjax.checks import canonical
+from mpmjax.stepping._nodes import particles_to_grid
+
+LAW = mpm.NeoHookean(1e4, 0.3)
+TIGHT = mpm.ConjugateResidual(rtol=1e-12)
+METHODS = {
+    "explicit": mpm.Explicit(),
+    "semi_implicit": mpm.SemiImplicit(solver=TIGHT),
+    "backward_euler": mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12)),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
+    "trbdf2": mpm.TRBDF2(0.0, mpm.Linearised(TIGHT)),
+}
+for _name in METHODS.keys() - {"explicit"}:
+    METHODS[_name] = eqx.tree_at(lambda m: m.adjoint_solver, METHODS[_name], TIGHT)
+
+
+def stacked(d=2, *, gap=0.0, axis=-1, friction=0.3, speed=0.0, shift=0.0, cells=3, dx=0.1, order=2, law=LAW, **scene):
+    """A block of some cells on a wider one, a gap between them [spacings], that comes and slides with a speed [m/s]."""
+    grid = mpm.Grid((cells + 8,) * d, dx, origin=(-4,) * d)
+    wide = np.full(d, (cells + 1) * dx)
+    wide[axis] = 2 * dx
+    top, start = np.full(d, cells * dx), np.zeros(d)
+    start[axis], top[axis] = 2 * dx, 4 * dx
+    lower = mpm.fill(mpm.Box((0.0,) * d, tuple(wide)), grid, density=1e3)
+    upper = mpm.fill(mpm.Box(tuple(start), tuple(top)), grid, density=1e3)
+    x = upper.x.at[:, axis].add(gap * dx).at[:, axis - 1].add(shift * dx)
+    v = upper.v.at[:, axis].set(-speed).at[:, axis - 1].set(speed)
+    particles = mpm.join(lower, dataclasses.replace(upper, x=x, v=v))
+    kernel = mpm.BSpline(order)
+    return mpm.Scene(grid, (law, law), kernel=kernel, bodies=mpm.Bodies(friction), **scene), particles
+
+
+def contact_of(scene, particles):
+    """The contact of the first two bodies at the start, and the places of its nodes."""
+    scene = canonical(scene, particles.x.dtype)
+    particles = mpm.prepare(scene, particles)
+    nodes = particles_to_grid(scene, particles, 0.0, jnp.asarray(1e-3), scene.stencil(particles))
+    (found,) = nodes.contacts
+    return found, scene.grid.nodes(scene.window(particles))[: len(found.gap)]
+
+
+@pytest.mark.parametrize("d", [2, *thorough(3)])
+@pytest.mark.parametrize("order", [2, *thorough(3)])
+def test_the_gap_is_the_distance_of_the_faces(d, order):
+    """Between flat faces, at the nodes within half a spacing of the middle between them and a kernel's reach from the
+    edges: to a part in a thousand of a spacing, with a normal across them. And whichever axis is across."""
+    for axis, gap in ((d - 1, -0.07), (0, 0.0), (d - 1, 0.31)):
+        scene, particles = stacked(d, gap=gap, axis=axis, cells=5, order=order)
+        contact, x = contact_of(scene, particles)
+        sides = np.delete(np.asarray(x), axis, axis=1)
+        at = np.abs(np.asarray(x)[:, axis] - 0.2 - gap * 0.05) < 0.0501
+        inside = at & (np.abs(sides - 0.25) < 0.0501 + 0.05 * (order == 2)).all(axis=1)
+        assert inside.sum() >= 2
+        assert_close(contact.gap[inside], np.full(inside.sum(), gap * 0.1), 0, 1e-4 if order == 2 else 2e-4)
+        assert_close(contact.normal[inside, axis], -np.ones(inside.sum()), 1e-3)
+
+
+def test_shares_of_the_surface_sum_to_it():
+    """Σ_i k_i is α M/(2 dx) times the area on which two bodies of one law meet, that of the narrower one."""
+    scene, particles = stacked(gap=0.0, cells=5)
+    contact, _ = contact_of(scene, particles)
+    total = float(contact.stiffness.sum()) / (2 * float(LAW.wave_modulus(jnp.eye(2)[..., None])[0]) / 2 / 0.1)
+    assert 0.49 < total < 0.55  # at an edge the wider body counts too
+
+
+def test_the_force_of_a_coupling_is_that_of_its_energy():
+    """f = −∂E/∂u, with its Hessian and diagonal; the two bodies' forces are opposite."""
+    rng = np.random.default_rng(0)
+    normal = rng.normal(size=(5, 2))
+    own = Coupling(*(jnp.asarray(a) for a in (rng.normal(size=5), rng.uniform(1, 2, 5), normal)), (0, 2))
+    u, du = (jnp.asarray(rng.normal(size=(15, 2))) for _ in range(2))
+    assert_close(own.force(u, 15), -jax.grad(own.energy)(u))
+    assert_close(own.resistance(du), -jax.jvp(lambda u: own.force(u, 15), (u,), (du,))[1])
+    assert_close(own.diagonal(15).reshape(-1), jnp.diag(jax.hessian(lambda u: own.energy(u.reshape(15, 2)))(u.ravel())))
+    layers = own.force(u, 15).reshape(3, 5, 2)
+    assert_close(layers[0], -layers[2])
+    assert not layers[1].any()
+
+
+@pytest.mark.parametrize("method", **ids(METHODS, ("explicit", "semi_implicit")))
+def test_bodies_that_meet_keep_momentum(method):
+    """Linear and, with APIC in explicit steps, angular momentum to rounding, while they push and rub."""
+    scene, particles = stacked(gap=-0.05, speed=1.0, shift=0.3)
+    explicit = method.is_explicit
+    dt = 1e-3 if explicit else 4e-3
+    new, info = mpm.step(scene, particles, 0.0, dt, method=method)
+    before, after = ((particles.mass[:, None] * p.v).sum(axis=0) for p in (particles, new))
+    upper = slice(particles.sizes[0], None)
+    slowed = (particles.mass[:, None] * (new.v - particles.v))[upper].sum(axis=0)
+    assert slowed[1] > 0.003 * abs(before[1])  # they push
+    assert slowed[0] < -0.0005 * abs(before[0])  # and rub
+    assert_close(after, before, 1e-12 if explicit else 1e-9)
+    if explicit:
+        assert_close(spin(mpm.prepare(scene, new)), spin(mpm.prepare(scene, particles)), 1e-12, 1e-14)
+        assert info.contact.sweeps == 0
+    assert info.contact.violations == 0
+
+
+def spin(particles):
+    """Angular momentum about the origin, that of the affine velocity with it, for the quadratic kernel."""
+    x, v, C, m = particles.x, particles.v, particles.C, particles.mass
+    own = (C[:, 1, 0] - C[:, 0, 1]) * 0.1**2 / 4
+    return (m * (x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0] + own)).sum()
+
+
+def test_bodies_that_do_not_touch_move_as_each_alone():
+    """To rounding, though they share cells' nodes."""
+    scene, particles = stacked(gap=0.4, speed=0.3)
+    both, _ = mpm.step(scene, particles, 0.0, 1e-3)
+    rows = np.split(np.arange(particles.count), [particles.sizes[0]])
+    for own in rows:
+        parts = {name: getattr(particles, name)[own] for name in ("x", "v", "mass", "volume")}
+        new, _ = mpm.step(mpm.Scene(scene.grid.with_layers(1), LAW), mpm.Particles(**parts), 0.0, 1e-3)
+        assert_close(both.v[own], new.v)
+        assert_close(both.x[own], new.x)
+
+
+def slid(name, friction, *, steps, dt):
+    """What a block has moved down a slab of 30 degrees, and how fast it is at half of the time and at its end."""
+    law = mpm.NeoHookean(1e6, 0.3)
+    grid = mpm.Grid((46, 16), 0.1, origin=(-3, -3))
+    slab = mpm.fill(mpm.Box((0.0, 0.0), (4.0, 0.4)), grid, density=1e3)
+    block = mpm.fill(mpm.Box((0.43, 0.4), (1.03, 0.8)), grid, density=1e3)
+    particles, angle = mpm.join(slab, block), np.pi / 6
+    gravity = (10 * np.sin(angle), -10 * np.cos(angle))
+    held = mpm.StickyBox((-np.inf, 0.0), (np.inf, np.inf))
+    scene = mpm.Scene(grid, (law, law), gravity=gravity, boundary=held, bodies=mpm.Bodies(friction))
+    run = mpm.simulate(scene, particles, t1=steps * dt, dt=dt, method=METHODS[name], save_every=steps // 2)
+    rows = slice(particles.sizes[0], None)
+    return run.frames.x[-1, rows].mean(axis=0) - block.x.mean(axis=0), run.frames.v[1:, rows].mean(axis=1)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", ["explicit", "semi_implicit"])
+def test_a_block_slides_down_a_slope_as_the_closed_form_says(name):
+    """Δv = g t sin θ − μ (g t cos θ + Δv_n) within 1 %, from when it slides; what is in brackets is the push by the
+    block's own momentum across the slope. Without vibrations that is Δv = g t (sin θ − μ cos θ)."""
+    steps, dt = (420, 0.5 / 420) if name == "explicit" else (60, 0.5 / 60)
+    _, v = slid(name, 0.3, steps=steps, dt=dt)
+    gained, push = v[1] - v[0], 10 * np.cos(np.pi / 6) * 0.25 + (v[1] - v[0])[1]
+    assert_close(gained[0], 10 * np.sin(np.pi / 6) * 0.25 - 0.3 * push, 1e-2)
+    if name == "semi_implicit":
+        assert_close(gained[0], 2.5 * (0.5 - 0.3 * np.cos(np.pi / 6)), 1e-2)
+
+
+@pytest.mark.thorough
+def test_a_block_rests_on_a_rough_slope():
+    """tan 30° = 0.577 < 0.8: it does not slide, but for what the slab gives and the lag of friction."""
+    moved, v = slid("semi_implicit", 0.8, steps=60, dt=0.5 / 60)
+    assert abs(moved[0]) < 0.05 * 1.25  # of what it falls without friction
+    assert abs(v[-1][0]) < 0.1 * 2.5
+
+
+@pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in ("explicit", "semi_implicit")}, "explicit"))
+def test_derivatives_of_a_touch_are_those_of_differences(method):
+    """By friction, by a law, and by the place and speed of a body."""
+    scene, particles = stacked(gap=-0.05, speed=1.0, shift=0.3)
+    dt, rows = 1e-3 if method.is_explicit else 4e-3, slice(particles.sizes[0], None)
+
+    def end(numbers):
+        friction, stiffer, place, speed = numbers
+        own = eqx.tree_at(lambda s: s.bodies.friction, scene, friction)
+        own = eqx.tree_at(lambda s: s.material[1].youngs_modulus, own, 1e4 * stiffer)
+        moved = dataclasses.replace(
+            particles,
+            x=particles.x.at[rows, 1].add(0.1 * place),
+            v=particles.v.at[rows].multiply(speed),
+        )
+        new = mpm.rollout(own, moved, steps=3, dt=dt, method=method)
+        return (new.x * jnp.sin(jnp.arange(new.x.size)).reshape(new.x.shape)).sum() + (new.v**2).sum()
+
+    at = jnp.array([0.1, 1.0, 0.0, 1.0])
+    value = jax.jit(end)
+    found = jax.jit(jax.grad(end))(at)
+    h = 1e-5
+    differences = [(value(at.at[k].add(h)) - value(at.at[k].add(-h))) / (2 * h) for k in range(4)]
+    assert np.abs(np.asarray(differences)).min() > 1e-6
+    for one, other in zip(found, differences, strict=True):
+        assert_close(one, other, 1e-5)
+
+
+def test_three_bodies_touch_each_other(tmp_path):
+    """Each two of them; materials may share a body; a run comes back from its file."""
+    grid = mpm.Grid((10, 16), 0.1, origin=(-4, -4))
+    boxes = [mpm.Box((0.0, 0.3 * k), (0.3, 0.3 * k + 0.3)) for k in range(3)]
+    particles = mpm.join(*(mpm.fill(box, grid, density=1e3) for box in boxes))
+    scene = mpm.Scene(grid, (LAW,) * 3, bodies=mpm.Bodies())
+    assert scene.grid.layers == 3
+    two = mpm.Scene(grid, (LAW,) * 3, bodies=mpm.Bodies(of_materials=(0, 1, 0)))
+    assert two.grid.layers == 2
+    squeezed = dataclasses.replace(particles, x=particles.x * jnp.array([1.0, 0.98]))
+    new, info = mpm.step(scene, squeezed, 0.0, 1e-3)
+    v = np.stack([new.v[k * 36 : k * 36 + 36, 1].mean() for k in range(3)])
+    assert v[0] < 0 < v[2]
+    assert abs(v.sum()) < 1e-12 * v[2]
+    assert info.contact.violations == 0
+    assert_files_hold(tmp_path / "run.h5", mpm.simulate(two, squeezed, t1=2e-3, dt=1e-3))
+
+
+def test_the_longest_step_knows_of_bodies():
+    """A block between others at the limit does not gain energy; the limit is that of one law times √½ at least."""
+    scene, particles = stacked()
+    alone = mpm.Scene(scene.grid, scene.material)
+    ratio = float(mpm.stable_dt(scene, particles) / mpm.stable_dt(alone, particles))
+    assert 0.7 < ratio < 0.78
+
+
+BAD = {
+    "one material": (lambda: mpm.Scene(mpm.Grid((8, 8), 0.1), LAW, bodies=mpm.Bodies()), "two or more"),
+    "a number left out": (
+        lambda: mpm.Scene(mpm.Grid((8, 8), 0.1), (LAW, LAW), bodies=mpm.Bodies(of_materials=(0, 2))),
+        "none left out",
+    ),
+    "negative friction": (lambda: mpm.Bodies(-0.1), "friction"),
+    "the total description": (
+        lambda: mpm.Scene(mpm.Grid((8, 8), 0.1), (LAW, LAW), bodies=mpm.Bodies(), description=mpm.TotalLagrangian()),
+        "no contact",
+    ),
+    "the linear kernel": (
+        lambda: mpm.Scene(mpm.Grid((8, 8), 0.1), (LAW, LAW), bodies=mpm.Bodies(), kernel=mpm.BSpline(1)),
+        "kernel",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_bodies_are_refused(case):
+    make, words = BAD[case]
+    with pytest.raises(ValueError, match=words):
+        make()
