@@ -13,12 +13,9 @@ the disk does not take leaves the file as it was (see `_staged`).
 A file is read only if it holds all of its data itself: HDF5 follows links to other files, and would write into them.
 """
 
-import json
 import os
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import fields
-from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -31,10 +28,9 @@ import numpy as np
 from mpmjax.boundary import BoundaryImpulse, ColliderImpulse
 from mpmjax.checks import canonical, checked, is_traced, require
 from mpmjax.io._aside import reason, replacing
+from mpmjax.io._description import check_readable, check_same, describe, description_in, write_description
 from mpmjax.io._hdf5 import (
-    FORMAT,
     LIBVER_HEAD,
-    FileRefusedError,
     check_hdf5,
     check_no_writer,
     check_place,
@@ -45,15 +41,13 @@ from mpmjax.io._hdf5 import (
     staged_file,
 )
 from mpmjax.io._interrupt import undisturbed
-from mpmjax.io._schema import decode, encode
+from mpmjax.io._schema import decode
 from mpmjax.io._staged import StagedFile
-from mpmjax.io._vtkhdf import File, add_fixed, add_growing, add_topology, count_in, rows_of, set_count, states_in
+from mpmjax.io._vtkhdf import File, add_growing, add_topology, count_in, rows_of, set_count, states_in
 from mpmjax.simulation import RolloutState, Run, RunStatistics, initial_state, no_steps
 from mpmjax.state import Particles, Scene, prepare, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator
 
-_UNITS = "SI: m, s, kg, Pa; deformation_gradient and J are pure numbers, affine_velocity is in 1/s"
-_UNCHANGING = ("mass", "volume", "X")
 _IMPULSES = {"collider_impulse": ColliderImpulse, "boundary_impulse": BoundaryImpulse}
 
 
@@ -95,8 +89,8 @@ class FrameWriter:
             OSError: the disk has no room for it; no file is left.
         """
         path = Path(path)
-        described = _describe(scene, particles, method, dt)
-        _check_readable(path, described)
+        described = describe(scene, particles, method, dt)
+        check_readable(path, described)
         begin = initial_state(scene, particles)
         rows = _rows(0, 0, described["dt"], begin, no_steps(particles.x.dtype))
         check_place(path, overwrite=overwrite)
@@ -109,7 +103,7 @@ class FrameWriter:
             file.create_group("mpmjax/arrays")
             for name, data in rows.items():
                 add_growing(file, name, data)
-            _write_description(file["mpmjax"], described)
+            write_description(file["mpmjax"], described)
             file.flush()
             staged.commit()
         except BaseException as error:
@@ -133,7 +127,7 @@ class FrameWriter:
                 file's.
         """
         path = Path(path)
-        described = _describe(scene, particles, method, dt)
+        described = describe(scene, particles, method, dt)
         begin = initial_state(scene, particles)
         rows = _rows(0, 0, described["dt"], begin, no_steps(particles.x.dtype))
         check_hdf5(path)
@@ -141,7 +135,7 @@ class FrameWriter:
         try:
             with reading(path) as file:
                 check_whole(file)
-                _check_same(path, described, _description(file["mpmjax"]))
+                check_same(path, described, description_in(file["mpmjax"]))
                 require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
             file = opened(staged, path)
             count = count_in(file)
@@ -280,7 +274,7 @@ def load(path: str | os.PathLike) -> Run:
     """
     path = Path(path)
     with reading(path) as file:
-        described = _description(file["mpmjax"])
+        described = description_in(file["mpmjax"])
         dtype, arrays = np.dtype(described["dtype"]), described["arrays"]
         require_of_file(
             dtype.itemsize <= jnp.zeros(()).dtype.itemsize,
@@ -316,65 +310,6 @@ def load(path: str | os.PathLike) -> Run:
     )
 
 
-def _describe(scene: Scene, particles: Particles, method: AbstractIntegrator, dt: Any) -> dict[str, Any]:
-    """The description of a run in its file, without the frames."""
-    dtype = particles.x.dtype
-    scene, method, dt = canonical((scene, method, dt), dtype)
-    arrays: dict[str, np.ndarray] = {}
-    parts = {name: getattr(particles, name) for name in _UNCHANGING}
-    return {
-        "dtype": str(dtype),
-        "d": particles.dim,
-        "counts": particles.counts,
-        "dt": np.asarray(dt)[()],
-        "scene": encode(scene, arrays),
-        "method": encode(method, arrays, "method"),
-        "arrays": arrays,
-        "particles": {name: None if a is None else np.asarray(a) for name, a in parts.items()},
-    }
-
-
-def _check_readable(path: Path, described: dict[str, Any]) -> None:
-    """Check that `load` will take what is written: a number may be rounded by the run's dtype to one that is not
-    allowed."""
-    dtype, arrays = np.dtype(described["dtype"]), described["arrays"]
-    try:
-        decode(described["scene"], Scene, "", arrays)
-        decode(described["method"], AbstractIntegrator, "method", arrays)
-    except ValueError as error:
-        raise FileRefusedError(f"{path} could not be loaded again, as {dtype} rounds it: {error}") from None
-
-
-def _write_description(group: File, described: dict[str, Any]) -> None:
-    for name, text in {"version": version("mpmjax"), "units": _UNITS, "dtype": described["dtype"]}.items():
-        group.attrs.create(name, np.bytes_(text))  # of fixed length: others lie where HDF5 has no checksum
-    group.attrs["format"] = np.int64(FORMAT)
-    group.attrs["d"] = np.int64(described["d"])
-    if described["counts"] is not None:
-        group.attrs["counts"] = np.asarray(described["counts"], np.int64)
-    group.attrs["dt"] = described["dt"]
-    for name in ("scene", "method"):
-        add_fixed(group, name, np.frombuffer(json.dumps(described[name]).encode(), np.uint8))
-    for name, data in described["particles"].items():
-        if data is not None:
-            add_fixed(group, name, data)
-    for name, data in described["arrays"].items():
-        add_fixed(group, f"arrays/{name}", data)
-
-
-def _description(group: File) -> dict[str, Any]:
-    """The description of the run in a file (see `_describe`)."""
-    return {
-        "dtype": group.attrs["dtype"].decode(),
-        "d": int(group.attrs["d"]),
-        "counts": tuple(group.attrs["counts"].tolist()) if "counts" in group.attrs else None,
-        "dt": group.attrs["dt"],
-        **{name: json.loads(group[name][...].tobytes()) for name in ("scene", "method")},
-        "arrays": {name: dataset[...] for name, dataset in group["arrays"].items()},
-        "particles": {name: group[name][...] if name in group else None for name in _UNCHANGING},
-    }
-
-
 def _rows(frame: int, step: int, dt: Any, state: RolloutState, statistics: RunStatistics) -> dict[str, np.ndarray]:
     """The rows that a frame adds to each dataset."""
     values = {"step": np.int64(step)} | {f.name: np.asarray(getattr(statistics, f.name)) for f in fields(RunStatistics)}
@@ -398,26 +333,3 @@ def _frames(file: File, like: RolloutState, start: int, stop: int) -> tuple[np.n
             received[name] = kind(*jnp.split(both, [like.particles.x.shape[1]], axis=-1))
     kept = (received.get(name) for name in _IMPULSES)
     return table["step"], RolloutState(states_in(file, like.particles, start, stop), *kept), tallies
-
-
-def _check_same(path: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> None:
-    """Check that the run to be continued is the one in the file."""
-    mine, other = dict(_flat(ours)), dict(_flat(theirs))
-    for name in (*other, *mine):
-        pair: Any = mine.get(name), other.get(name)
-        a, b = pair
-        show = "another array" if isinstance(b, np.ndarray) else "none" if b is None else repr(b)
-        got = "" if isinstance(a, np.ndarray) else f" instead of {a!r}"
-        require_of_file(
-            type(a) is type(b) and np.array_equal(*pair),
-            f"{path} holds another run: its {name} is {show}{got}. Resume the same run, or name a new file.",
-        )
-
-
-def _flat(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every leaf under its dotted path."""
-    if isinstance(data, (dict, list)):
-        for key, value in data.items() if isinstance(data, dict) else enumerate(data):
-            yield from _flat(value, f"{path}.{key}".lstrip("."))
-    else:
-        yield path, data.item() if isinstance(data, np.generic) else data
