@@ -32,7 +32,7 @@ from mpmjax.boundary._contact_info import ContactInfo, no_contact
 from mpmjax.boundary._coupling import Coupling
 from mpmjax.boundary._faces import EXPLICIT_STIFFNESS, IMPLICIT_STIFFNESS, Faces, FaceShape
 from mpmjax.boundary._grip import Grip
-from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion, Tie
+from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion, RigidImage, Tie
 from mpmjax.boundary._planes import ContactPlane, SymmetryPlane
 from mpmjax.boundary._rigid_part import RigidPart
 from mpmjax.boundary._springs import (
@@ -72,6 +72,7 @@ __all__ = [
     "Mirror",
     "MirrorMotion",
     "Owners",
+    "RigidImage",
     "RigidPart",
     "SeparatingBox",
     "SeparatingCollider",

@@ -50,6 +50,8 @@ class AbstractBoundary(eqx.Module):
     """Whether it has surfaces that push material away (see `surfaces`)."""
     sees_faces: ClassVar[bool] = False
     """Whether its contacts ask where the faces of particles are (see `facing`)."""
+    meets_rigid_bodies: ClassVar[bool] = True
+    """Whether it may stand in a scene with rigid bodies. What it prescribes of a node it prescribes of the body."""
 
     @property
     @abc.abstractmethod

@@ -91,6 +91,7 @@ class StickyCollider(AbstractCollider):
 
     shape: AbstractRegion
     motion: AbstractMotion | None = None
+    meets_rigid_bodies: ClassVar[bool] = False
 
     def __check_init__(self):
         require_fields(self)
@@ -119,6 +120,7 @@ class SlipCollider(AbstractCollider):
 
     shape: AbstractRegion
     motion: AbstractMotion | None = None
+    meets_rigid_bodies: ClassVar[bool] = False
 
     def __check_init__(self):
         require_fields(self)

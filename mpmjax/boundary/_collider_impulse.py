@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, NodeScalar, NodeVector
 from mpmjax.boundary._conditions import ColliderConditions
+from mpmjax.geometry import moment
 from mpmjax.linalg import pairs
 
 
@@ -61,12 +62,3 @@ def impulse_on_colliders(
         impulse.append(-given.sum(axis=0))
         angular.append(-moment(colliders.position - pivot, given).sum(axis=0))
     return ColliderImpulse(jnp.stack(impulse), jnp.stack(angular))
-
-
-def moment(arm: NodeVector, force: NodeVector) -> Float[Array, "n r"]:
-    """arm × force: (r_y f_z − r_z f_y, r_z f_x − r_x f_z, r_x f_y − r_y f_x), in 2-D the last alone."""
-    d = arm.shape[1]
-    if d == 3:
-        return jnp.cross(arm, force)
-    moments = [arm[:, i] * force[:, j] - arm[:, j] * force[:, i] for i, j in pairs(d)]
-    return jnp.stack(moments, axis=1) if moments else jnp.zeros((len(arm), 0), arm.dtype)

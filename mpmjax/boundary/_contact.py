@@ -20,6 +20,7 @@ the elastic response of one step.
 
 import abc
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Generic, TypeVar
 
 import equinox as eqx
@@ -48,6 +49,8 @@ class AbstractNodes(eqx.Module):
     """What boundaries prescribe."""
     contacts: eqx.AbstractVar[tuple["AbstractContact", ...]]
     """The boundaries that may be left."""
+    loose: eqx.AbstractVar[Any]
+    """The same nodes with those of rigid bodies each by itself; None without rigid bodies."""
 
     @property
     @abc.abstractmethod
@@ -317,9 +320,13 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
             v: velocity of all nodes after the solve [m/s], shape (n, d).
             residual: the impulse that holds components of velocity [kg m/s], shape (n, d).
         """
-        changes = []
+        changes, loosened = [], self._loosened()
+        tied, nodes = self.nodes.mirror.of_rigid_bodies(), self.nodes
         for contact, active in zip(self.unheld.contacts, self.active, strict=True):
-            change = contact.friction(self, active, v, residual)
+            change = contact.friction(loosened, active, tied.unfold(v), residual)
+            if tied.images:  # the impulses on a rigid body's nodes are those on the whole of it
+                mass, impulse = nodes.mass[:, None], tied.fold(loosened.nodes.mass[:, None] * change)
+                change = nodes.projection.combine(jnp.where(mass > 0, impulse / jnp.where(mass > 0, mass, 1), 0), 0)
             v = v + change
             changes.append(self.images.unfold(change))
         return self.images.unfold(v), tuple(changes)
@@ -330,12 +337,23 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         Args:
             slowed: the change of velocity by the friction of each contact [m/s], shape (n, d).
         """
-        found = []
+        found, mass, tied = [], self._loosened().unheld.mass, self.nodes.mirror.of_rigid_bodies()
         for contact, active, change in zip(self.unheld.contacts, self.active, slowed, strict=True):
             if contact.collider is not None:
-                rubbed, impulse = self.unheld.mass[:, None] * change, contact.spring_impulse(self, active)
+                rubbed, impulse = mass[:, None] * tied.unfold(change), contact.spring_impulse(self, active)
                 found.append((contact.collider, rubbed if impulse is None else rubbed + impulse))
         return tuple(found)
+
+    def _loosened(self) -> "ConstrainedNodes":
+        """The same with the nodes of rigid bodies each by itself, as friction acts on them; gaps are those with the
+        bodies rigid."""
+        loose = self.unheld.loose
+        if loose is None:
+            return self
+        unheld = eqx.tree_at(
+            lambda n: (n.mass, n.conditions.fixed), self.unheld, (loose.mass, loose.conditions.fixed)
+        )
+        return replace(self, unheld=unheld, nodes=loose)
 
 
 def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:

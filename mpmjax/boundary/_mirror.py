@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.discretisation import Grid
+from mpmjax.geometry import spinning
 
 
 class Image(eqx.Module):
@@ -95,6 +96,46 @@ class Tie(eqx.Module):
         return self
 
 
+class RigidImage(eqx.Module):
+    """The velocities V + ω × r_i of the nodes of a rigid body, which has a layer of nodes of its own, from two of them:
+    the first has V and the second s = Gω, with GᵀG = I/M, so that both have the mass M."""
+
+    layer: int = eqx.field(static=True)
+    layers: int = eqx.field(static=True)
+    arms: Float[Array, "m d"]
+    """r_i = x_i − c [m], shape (m, d)."""
+    per_root: Float[Array, "r r"]
+    """G⁻¹ [1/m]."""
+    axis: ClassVar[int] = -1
+    moving: ClassVar[bool] = False
+
+    def spin(self, s: Float[Array, "d"]) -> Float[Array, "r"]:
+        """ω [rad/s] from what the second node has [m/s]."""
+        return self.per_root @ s[: len(self.per_root)]
+
+    def own(self, field: Array) -> Array:
+        """The part of a field of all nodes that is of its layer, shape (m, ...)."""
+        return field.reshape(self.layers, len(self.arms), *field.shape[1:])[self.layer]
+
+    def with_own(self, field: Array, own: Array) -> Array:
+        """The field with that part replaced."""
+        return field.reshape(self.layers, *own.shape).at[self.layer].set(own).reshape(field.shape)
+
+    def scalar(self, field: NodeScalar) -> NodeScalar:
+        """A map whose transpose gives both nodes the whole mass."""
+        own = self.own(field)
+        return self.with_own(field, jnp.broadcast_to(own[0] + own[1], own.shape))
+
+    def vector(self, field: NodeVector) -> NodeVector:
+        """B for a vector field."""
+        own = self.own(field)
+        return self.with_own(field, own[0] + spinning(self.spin(own[1]), self.arms))
+
+    def at_rest(self) -> "RigidImage":
+        """The same map: it has no motion of its own."""
+        return self
+
+
 class MirrorMotion(eqx.Module):
     """What mirrors that move add to the velocity of the nodes beyond them (see `Image.moving`)."""
 
@@ -107,7 +148,7 @@ class MirrorMotion(eqx.Module):
 class Mirror(eqx.Module):
     """The mirrors of several planes: `unfold` applies B, from true nodes to all nodes; `fold` applies Bᵀ."""
 
-    images: tuple[Image | Tie, ...]
+    images: tuple[Image | Tie | RigidImage, ...]
 
     def unfold(self, field: NodeVector) -> NodeVector:
         """B v: fill in the mirror images."""
@@ -140,8 +181,12 @@ class Mirror(eqx.Module):
         return jax.linear_transpose(self.unfold_scalar, field)(field)[0] if self.images else field
 
     def without_ties(self) -> "Mirror":
-        """The mirrors without rigid parts."""
+        """The mirrors without rigid parts and bodies."""
         return Mirror(tuple(image for image in self.images if isinstance(image, Image)))
+
+    def of_rigid_bodies(self) -> "Mirror":
+        """The maps of rigid bodies alone."""
+        return Mirror(tuple(image for image in self.images if isinstance(image, RigidImage)))
 
     def then(self, other: "Mirror") -> "Mirror":
         """The mirror that unfolds by this one first, then by the other."""

@@ -158,16 +158,16 @@ class RigidMotion(AbstractMotion):
     def origin(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
         """c + Rᵀ (x − c − d)."""
         centre = jnp.asarray(self.centre, x.dtype)
-        return centre + _turn(x - centre - self.at(t), -self.rotation_at(t))
+        return centre + turn(x - centre - self.at(t), -self.rotation_at(t))
 
     def place(self, X: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
         """c + d + R (X − c)."""
         centre = jnp.asarray(self.centre, X.dtype)
-        return centre + self.at(t) + _turn(X - centre, self.rotation_at(t))
+        return centre + self.at(t) + turn(X - centre, self.rotation_at(t))
 
     def turned(self, a: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
         """R a."""
-        return _turn(a, self.rotation_at(t))
+        return turn(a, self.rotation_at(t))
 
     def velocity_of(self, X: Float[Array, "m d"], t: Scalar, dt: Scalar) -> Float[Array, "m d"]:
         """The mean velocity of the centre plus the change of R over the step times (X − c)/dt."""
@@ -220,16 +220,16 @@ def _change(t: Scalar, dt: Scalar, times: Float[Array, "j"], values: Float[Array
 def _turn_further(a: Float[Array, "m d"], rotation: Float[Array, "r"], by: Float[Array, "r"]) -> Float[Array, "m d"]:
     """R(rotation + by) a − R(rotation) a. For a small `by` it is the integral of the derivative by Gauss' rule of four
     points, without cancellation, at a relative error of 6e-10 ‖by‖⁸."""
-    turn = partial(_turn, a)
+    turned = partial(turn, a)
     nodes, weights = np.polynomial.legendre.leggauss(4)
     along = [
-        weight / 2 * jax.jvp(turn, (rotation + (1 + node) / 2 * by,), (by,))[1]
+        weight / 2 * jax.jvp(turned, (rotation + (1 + node) / 2 * by,), (by,))[1]
         for node, weight in zip(nodes.tolist(), weights.tolist(), strict=True)
     ]
-    return jnp.where((by**2).sum() < 0.1, sum(along), turn(rotation + by) - turn(rotation))
+    return jnp.where((by**2).sum() < 0.1, sum(along), turned(rotation + by) - turned(rotation))
 
 
-def _turn(a: Float[Array, "m d"], rotation: Float[Array, "r"]) -> Float[Array, "m d"]:
+def turn(a: Float[Array, "m d"], rotation: Float[Array, "r"]) -> Float[Array, "m d"]:
     """Vectors turned by an angle, or by a rotation vector r (O. Rodrigues):
     a + (sin θ/θ) r × a + ((1 − cos θ)/θ²) r × (r × a), θ = ‖r‖."""
     if rotation.shape == (1,):

@@ -11,7 +11,7 @@ import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, NodeVector
-from mpmjax.boundary import Mirror, Tie
+from mpmjax.boundary import Image, Mirror
 from mpmjax.checks import require, require_fields
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.implicit._band_cholesky import BandCholesky, band_cholesky
@@ -146,7 +146,7 @@ class _Order(eqx.Module):
     def of(stiffness: ParticleStiffness) -> "_Order | None":
         """None where S is no band matrix."""
         average = stiffness.averaged[0].average
-        if any(average.periodic) or any(isinstance(image, Tie) for image in stiffness.mirror.images):
+        if any(average.periodic) or any(not isinstance(image, Image) for image in stiffness.mirror.images):
             return None
         support = stiffness.stencil.weights.shape[1]
         reach = 2 * (math.ceil(1 + support / 2) - 1)  # twice that of a hat and a spline of so many cells

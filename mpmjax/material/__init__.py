@@ -5,10 +5,12 @@ from mpmjax.material._cam_clay import CamClay, CamClayHistory
 from mpmjax.material._drucker_prager import DruckerPrager, DruckerPragerHistory
 from mpmjax.material._elastic import FixedCorotated, NeoHookean
 from mpmjax.material._fluid import Fluid, Tait
+from mpmjax.material._freedom import Freedom
 from mpmjax.material._hencky import Hencky
 from mpmjax.material._herschel_bulkley import HerschelBulkley, HerschelBulkleyHistory
 from mpmjax.material._kinematics import AbstractKinematics, DeformationGradient, VolumeRatio
 from mpmjax.material._law import AbstractElastic, AbstractInelastic, AbstractLaw
+from mpmjax.material._rigid import Rigid
 from mpmjax.material._rubber import AbstractRubber, Gent, MooneyRivlin, Ogden, Yeoh
 from mpmjax.material._snow import Snow, SnowElasticity, SnowHistory
 from mpmjax.material._tangent import AbstractTangent, MatrixTangent, PrincipalTangent, VolumetricTangent
@@ -34,6 +36,7 @@ __all__ = [
     "DruckerPragerHistory",
     "FixedCorotated",
     "Fluid",
+    "Freedom",
     "Gent",
     "Hencky",
     "HerschelBulkley",
@@ -43,6 +46,7 @@ __all__ = [
     "NeoHookean",
     "Ogden",
     "PrincipalTangent",
+    "Rigid",
     "Snow",
     "SnowElasticity",
     "SnowHistory",

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Deformation, Float, Scalar, components
 from mpmjax.checks import require
+from mpmjax.material._freedom import Freedom
 from mpmjax.material._kinematics import DEFORMATION_GRADIENT, AbstractKinematics
 from mpmjax.material._tangent import AbstractTangent
 from mpmjax.material._viscosity import Viscosity
@@ -69,6 +70,10 @@ class AbstractLaw(eqx.Module):
 
     def viscous_part(self) -> Viscosity | None:
         """The viscosity beside the law; None without."""
+        return None
+
+    def freedom(self) -> Freedom | None:
+        """What a body of it may do, if it is rigid; None of a law of what deforms."""
         return None
 
     def title(self) -> str:

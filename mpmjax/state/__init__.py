@@ -11,8 +11,9 @@ from mpmjax.state._loads import AbstractLoad, PointLoad, Pressure, Spring, Tract
 from mpmjax.state._material_points import MaterialPoints
 from mpmjax.state._particles import Particles, State, by_material, history_arrays, join, state_of, with_state
 from mpmjax.state._preparation import is_prepared, prepare
-from mpmjax.state._scene import Scene, attach
+from mpmjax.state._scene import RigidMaterial, Scene, attach
 from mpmjax.state._support import Support, SupportStiffness, stiffness_of
+from mpmjax.state._torque import Torque
 
 __all__ = [
     "AbstractBodyForce",
@@ -30,11 +31,13 @@ __all__ = [
     "PointLoad",
     "PointsAt",
     "Pressure",
+    "RigidMaterial",
     "Scene",
     "Spring",
     "State",
     "Support",
     "SupportStiffness",
+    "Torque",
     "TotalLagrangian",
     "Traction",
     "UpdatedLagrangian",

@@ -1,5 +1,7 @@
 """The scene: everything that a step needs and does not change."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +27,7 @@ from mpmjax.discretisation import (
     make_stencil,
 )
 from mpmjax.geometry import Motion
-from mpmjax.material import AbstractLaw
+from mpmjax.material import AbstractLaw, Freedom
 from mpmjax.state._averaged_volume import AveragedVolume, VolumeAverage, volume_average
 from mpmjax.state._bodies import Bodies
 from mpmjax.state._body_force import AbstractBodyForce
@@ -33,6 +35,17 @@ from mpmjax.state._description import AbstractDescription, UpdatedLagrangian
 from mpmjax.state._loads import AbstractLoad
 from mpmjax.state._material_points import MaterialPoints, material_points, return_map
 from mpmjax.state._particles import Group, Particles
+
+
+class RigidMaterial(NamedTuple):
+    """A material that is a rigid body."""
+
+    number: int
+    """That of the material."""
+    layer: int
+    """That of its nodes."""
+    freedom: Freedom
+    """What it may do."""
 
 
 class Scene(eqx.Module):
@@ -152,6 +165,39 @@ class Scene(eqx.Module):
 
         if self.volume is not None:
             self._check_averaged(self.volume)
+        if self.rigid_bodies:
+            self._check_rigid()
+
+    def _check_rigid(self) -> None:
+        require(
+            not self.total,
+            "A Rigid body needs nodes of its own, which the total description has not: use the updated one, or "
+            "RigidPart.",
+        )
+        numbers = (0,) * len(self.laws) if self.bodies is None else self.bodies.numbers(len(self.laws))
+        layers = [body.layer for body in self.rigid_bodies]
+        require(
+            all(numbers.count(layer) == 1 for layer in layers),
+            "A Rigid body must be of one material alone, and no other material of its body: give the scene bodies, "
+            f"Bodies() or with of_materials in which its number appears once, got {numbers}.",
+        )
+        refused = [type(boundary).__name__ for boundary in self.boundary if not boundary.meets_rigid_bodies]
+        require(
+            not refused,
+            f"{', '.join(refused)} cannot stand in a scene with a Rigid body: take a SeparatingBox, a "
+            "SeparatingCollider, or a Grip.",
+        )
+        require(
+            not self.moving_mirrors,
+            "A SymmetryPlane that moves cannot stand in a scene with a Rigid body: take a SeparatingCollider, or a "
+            "plane at rest.",
+        )
+        for body in self.rigid_bodies:
+            directions = body.freedom.directions
+            require(
+                directions is None or len(directions) == self.grid.dim,
+                f"Rigid's free directions must be {self.grid.dim} bools, as the grid has directions, got {directions}.",
+            )
 
     def _check_averaged(self, volume: AveragedVolume) -> None:
         require(
@@ -172,6 +218,13 @@ class Scene(eqx.Module):
     def laws(self) -> tuple[AbstractLaw, ...]:
         """The laws, one for each material."""
         return self.material if isinstance(self.material, tuple) else (self.material,)
+
+    @property
+    def rigid_bodies(self) -> tuple[RigidMaterial, ...]:
+        """The materials that are rigid bodies."""
+        layers = (0,) * len(self.laws) if self.bodies is None else self.bodies.numbers(len(self.laws))
+        found = ((number, layer, law.freedom()) for number, (law, layer) in enumerate(zip(self.laws, layers, strict=True)))
+        return tuple(RigidMaterial(n, layer, freedom) for n, layer, freedom in found if freedom is not None)
 
     @property
     def keeps_gradient(self) -> bool:

@@ -26,6 +26,7 @@ from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.state import Particles, Scene, load_force, points_of, supports_of
 from mpmjax.stepping._body_surfaces import contacts_of_bodies
 from mpmjax.stepping._particle_faces import faces_of
+from mpmjax.stepping._rigid_layers import RigidLayers, rigid_layers
 
 Fold = Callable[[NodeVector], NodeVector]
 """A map from a nodal vector to its sum with its images at mirrors."""
@@ -142,6 +143,8 @@ class Nodes(AbstractNodes):
     """The number of the boundary that brings each contact; None for that of two bodies."""
     mirror_motion: MirrorMotion | None = None
     """What mirrors that move add to the velocity of the nodes beyond them; None if none moves."""
+    loose: "Nodes | None" = None
+    """The same nodes with those of rigid bodies each by itself; None without rigid bodies."""
 
     @property
     def velocity(self) -> NodeVector:
@@ -255,6 +258,18 @@ class Nodes(AbstractNodes):
         parts = self.sums.folded(fold_per_mass, images.fold), fold_per_mass(self.acceleration)
         return eqx.tree_at(lambda n: (n.sums, n.acceleration), nodes, parts)
 
+    def tied(self, rigid: RigidLayers) -> "Nodes":
+        """The nodes with those of rigid bodies folded to the two that move each of them."""
+        nodes = self.folded(Mirror(rigid.images))
+        velocity = jnp.where(rigid.own, rigid.velocity, nodes.velocity)
+        conditions = eqx.tree_at(lambda c: (c.fixed, c.velocity), self.conditions, (rigid.fixed, rigid.prescribed))
+        return eqx.tree_at(
+            lambda n: (n.sums.velocity, n.conditions, n.loose),
+            nodes,
+            (velocity, conditions, self),
+            is_leaf=lambda leaf: leaf is None,
+        )
+
     def moved_by(self, change: NodeVector) -> "Nodes":
         """The nodes with a velocity [m/s], shape (n, d), added to theirs."""
         return eqx.tree_at(lambda n: n.sums, self, self.sums.folded(lambda v: v + change, lambda force: force))
@@ -322,7 +337,7 @@ def particles_to_grid(
         points = points_of(scene.loads, scene.laws, particles, stencil, total=scene.total)
         supports = supports_of(scene.loads, points, t + body_force_at * dt)
         potential = ElasticPotential(scene.material_points(particles, t), stencil, Mirror(()), grid.size, supports)
-        joined = joined and stencil.mls_weight_derivatives is None
+        joined = joined and stencil.mls_weight_derivatives is None and not scene.rigid_bodies
         flux, viscous_flux = potential.current_flux(), None
         if explicit_viscosity and potential.material_viscous and C is not None:
             viscous_flux = potential.viscous_flux(C)
@@ -389,9 +404,12 @@ def particles_to_grid(
 
 
 def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes) -> Nodes:
-    """The nodes, folded at the scene's symmetry planes."""
+    """The nodes, folded at the scene's symmetry planes, and those of rigid bodies to the two that move each."""
     images, moving = mirror(scene.boundary, scene.grid, scene.window(particles)), nodes.mirror_motion
     with jax.named_scope("p2g"):
+        if scene.rigid_bodies:
+            rigid = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images)
+            return nodes.folded(images).tied(rigid)
         if moving is None:
             return nodes.folded(images)
         # at rest with the mirrors: the velocity less what they add, which is put back

@@ -29,6 +29,7 @@ from mpmjax.stepping._explicit import Explicit
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
 from mpmjax.stepping._left_undone import LeftUndone, norm, nothing_left_undone
 from mpmjax.stepping._nodes import Nodes, folded_at_planes, particles_to_grid
+from mpmjax.stepping._rigid_layers import moved_rigidly
 
 
 class StepInfo(eqx.Module):
@@ -264,12 +265,17 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
         )
         changes = zip(potential.current_deformation(), potential.change(found.gradient), strict=True)
         deformations = tuple(particle_first(F + dt * rate) for F, rate in changes)
-    return replace(
+    after = replace(
         particles,
         x=particle_first(components(particles.x) + dt * found.carrier),
         v=particle_first(found.velocity),
         deformations=deformations,
         C=None if found.affine is None else particle_first(found.affine),
+    )
+    if not scene.rigid_bodies:
+        return after
+    return moved_rigidly(
+        scene, particles, after, potential.mirror, new.motion.velocity, new.motion.carrier, nodes.dt
     )
 
 

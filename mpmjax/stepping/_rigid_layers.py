@@ -1,0 +1,156 @@
+"""The layers of nodes of a scene's rigid bodies: from particles to the two nodes that move each body, and back."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Float, Mask, NodeScalar, NodeVector, Scalar
+from mpmjax.boundary import Conditions, Image, Mirror, RigidImage
+from mpmjax.geometry import RigidBody, inertia, moment, rigid_body, rotation_of, spinning
+from mpmjax.state import Particles, RigidMaterial, Scene
+
+
+class RigidLayers(eqx.Module):
+    """What the nodes of rigid bodies are folded to: two nodes of each layer, of which the first has the velocity V and
+    the second s = Gω (see `RigidImage`)."""
+
+    images: tuple[RigidImage, ...]
+    own: Mask
+    """The nodes of rigid bodies, shape (n, 1)."""
+    velocity: NodeVector
+    """Their velocity at the start of the step [m/s], shape (n, d), zero elsewhere."""
+    fixed: Mask
+    """The components that are prescribed, of all nodes, shape (n, d)."""
+    prescribed: NodeVector
+    """Their values [m/s], shape (n, d)."""
+
+
+def rigid_layers(
+    scene: Scene, particles: Particles, mass: NodeScalar, conditions: Conditions, planes: Mirror
+) -> RigidLayers:
+    """The rigid bodies of a scene.
+
+    Args:
+        scene: the scene.
+        particles: prepared particles.
+        mass: masses of all nodes, not folded at planes [kg], shape (n,).
+        conditions: what boundaries prescribe of all nodes.
+        planes: the mirrors of symmetry planes.
+    """
+    places = scene.grid.nodes(scene.window(particles))
+    own, velocity = jnp.zeros((len(mass), 1), bool), jnp.zeros_like(places)
+    fixed, prescribed, images = conditions.fixed, conditions.velocity, []
+    for material in scene.rigid_bodies:
+        body = _body(particles, material)
+        image = _image(scene, body, places, material.layer)
+        held, value = _held(material, body, image, mass, conditions, planes)
+        images.append(image)
+        own = image.with_own(own, jnp.ones((len(image.arms), 1), bool))
+        velocity = image.with_own(velocity, _first_two(image, body.velocity, body.root() @ body.spin))
+        fixed = image.with_own(fixed, jnp.zeros(image.arms.shape, bool).at[:2].set(held))
+        prescribed = image.with_own(prescribed, jnp.zeros_like(image.arms).at[:2].set(jnp.where(held, value, 0)))
+    return RigidLayers(tuple(images), own, velocity, fixed, prescribed)
+
+
+def moved_rigidly(
+    scene: Scene, before: Particles, after: Particles, mirror: Mirror, new: NodeVector, mean: NodeVector, dt: Scalar
+) -> Particles:
+    """The particles after G2P with those of rigid bodies moved as one, whatever the transfer:
+
+        c ← c + Δt V̄,    x_p ← c + R (x_p − c),    v_p ← V + ω × (x_p − c),    F_p ← R F_p,
+
+    where R is the rotation at the mean angular momentum I ω̄, and the spin at the end has the angular momentum after the
+    step.
+
+    Args:
+        scene: the scene.
+        before: the particles at the start of the step.
+        after: those after G2P.
+        mirror: the mirrors of the nodes.
+        new: velocity of the nodes after the step [m/s], shape (n, d), folded.
+        mean: the velocity with which positions move [m/s], likewise.
+        dt: step [s].
+    """
+    x, v, C, deformations = after.x, after.v, after.C, list(after.deformations)
+    for material, image in zip(scene.rigid_bodies, mirror.of_rigid_bodies().images, strict=True):
+        assert isinstance(image, RigidImage)
+        rows, body = slice(*before.groups[material.number].rows), _body(before, material)
+        end, over = image.own(new), image.own(mean)
+        R = rotation_of(body, body.inertia @ image.spin(over[1]), dt)
+        arms = (R @ body.arms.T).T
+        spin = _spin_after(body, R, body.inertia @ image.spin(end[1]))
+        x = x.at[rows].set(body.centre + dt * over[0] + arms)
+        v = v.at[rows].set(end[0] + spinning(spin, arms))
+        if C is not None:
+            C = C.at[rows].set(spinning(spin, jnp.eye(before.dim, dtype=x.dtype)).T)
+        deformations[material.number] = R @ before.deformations[material.number]
+    return replace(after, x=x, v=v, C=C, deformations=tuple(deformations))
+
+
+def _spin_after(body: RigidBody, R: Array, momentum: Array) -> Float[Array, "r"]:
+    """ω at the end of the step, (R I Rᵀ)⁻¹ L."""
+    if len(momentum) < 3:
+        return momentum / body.inertia.diagonal()
+    return R @ jnp.linalg.solve(body.inertia, R.T @ momentum)
+
+
+def _body(particles: Particles, material: RigidMaterial) -> RigidBody:
+    rows = slice(*particles.groups[material.number].rows)
+    return rigid_body(particles.x[rows], particles.v[rows], particles.mass[rows], particles.volume[rows])
+
+
+def _image(scene: Scene, body: RigidBody, places: NodeVector, layer: int) -> RigidImage:
+    grid = scene.grid
+    per_root, count = jnp.linalg.inv(body.root()), len(places) // grid.layers
+    arms = places[:count] - body.centre
+    if any(grid.periodic):  # to the nearest image
+        period = jnp.asarray(grid.shape, arms.dtype) * grid.spacing
+        arms = jnp.where(jnp.asarray(grid.periodic), arms - period * jnp.round(arms / period), arms)
+    return RigidImage(layer, grid.layers, arms, per_root)
+
+
+def _first_two(image: RigidImage, velocity: Array, s: Array) -> NodeVector:
+    """The layer's nodes with V at the first, s at the second and zero elsewhere, shape (m, d)."""
+    return jnp.zeros_like(image.arms).at[0].set(velocity).at[1, : len(s)].set(s)
+
+
+def _held(
+    material: RigidMaterial, body: RigidBody, image: RigidImage, mass: NodeScalar, conditions: Conditions, planes: Mirror
+) -> tuple[Array, Array]:
+    """Which components of V and s are held, and at what [m/s], both of shape (2, d).
+
+    What is held of any of its nodes is held of all. The velocity is that of the rigid motion nearest to what is
+    prescribed.
+    """
+    own, d = image.own(mass), image.arms.shape[1]
+    held = image.own(conditions.fixed) & (own > 0)[:, None]
+    of_planes = [_reaches(image, plane, own) for plane in planes.images if isinstance(plane, Image)]
+    guided = jnp.zeros(d, bool) if material.freedom.directions is None else ~jnp.asarray(material.freedom.directions)
+    by_nodes = held.any(axis=0)
+    by_planes = jnp.stack(of_planes).any(axis=0) if of_planes else jnp.zeros(d, bool)
+    spins = material.freedom.turns & ~by_nodes.any() & ~by_planes.any()
+
+    # the mean of what is prescribed, and the turning of what is prescribed with all components
+    weight = jnp.where(held, own[:, None], 0)
+    total = weight.sum(axis=0)
+    per_total = jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0)
+    value = image.own(conditions.velocity)
+    mean, middle = per_total * (weight * value).sum(axis=0), per_total * (weight * image.arms).sum(axis=0)
+    whole = jnp.where(held.all(axis=1), own, 0)
+    arms = jnp.where((whole > 0)[:, None], image.arms - middle, 0)
+    momentum = moment(arms, whole[:, None] * (value - mean)).sum(axis=0)
+    resists = inertia(arms, whole)
+    some = whole.sum() > 0
+    turned = resists + jnp.sqrt(jnp.finfo(arms.dtype).eps) * jnp.trace(resists) * jnp.eye(len(resists), dtype=arms.dtype)
+    spin = jnp.linalg.solve(jnp.where(some, turned, jnp.eye(len(resists), dtype=arms.dtype)), momentum)
+    spin = jnp.where(some & material.freedom.turns, spin, 0)
+    velocity = jnp.where(by_nodes & ~guided, mean - spinning(spin, middle[None])[0], 0)
+    fixed = jnp.stack([guided | by_nodes | by_planes, jnp.broadcast_to(~spins, (d,))])
+    return fixed, _first_two(image, velocity, body.root() @ spin)[:2]
+
+
+def _reaches(image: RigidImage, plane: Image, own: Float[Array, "m"]) -> Array:
+    """The axis of a plane that holds a body, which has mass on it or beyond, as a mask of the directions."""
+    beyond = image.own(plane.along(plane.odd <= 0).reshape(-1))
+    return (beyond & (own > 0)).any() & (jnp.arange(image.arms.shape[1]) == plane.axis)

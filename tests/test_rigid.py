@@ -1,0 +1,151 @@
+"""Rigid bodies that move freely: Newton's and Euler's equations, what holds them, contact, derivatives, bad input."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import TRANSFERS, assert_close, assert_files_hold, ids, thorough
+from test_bodies import METHODS
+
+import mpmjax as mpm
+from mpmjax.geometry import moment, rigid_body, spinning
+
+RIGID = mpm.Rigid(1e6)
+
+
+def thrown(d=2, *, spin=None, v=None, sides=None, cells=20, dx=0.1, seed=None, **scene):
+    """A block of a rigid material that flies with a velocity and spins, in a window with room."""
+    sides = (0.4, 0.3, 0.2)[:d] if sides is None else sides
+    grid = mpm.Grid((cells,) * d, dx, origin=(-cells // 2,) * d)
+    particles = mpm.fill(mpm.Box(tuple(-s / 2 for s in sides), tuple(s / 2 for s in sides)), grid, density=1e3)
+    spin = jnp.asarray([3.0] if d == 2 else [1.0, 3.0, 0.5]) if spin is None else jnp.asarray(spin)
+    v = jnp.zeros(d) if v is None else jnp.asarray(v)
+    particles = dataclasses.replace(particles, v=v + spinning(spin, particles.x - particles.x.mean(axis=0)))
+    return mpm.Scene(grid, RIGID, **scene), particles
+
+
+def body_of(particles, rows=slice(None)):
+    return rigid_body(particles.x[rows], particles.v[rows], particles.mass[rows], particles.volume[rows])
+
+
+def spin_momentum(particles, rows=slice(None)):
+    """Angular momentum about the origin."""
+    body = body_of(particles, rows)
+    return moment(body.centre[None], body.mass * body.velocity[None])[0] + body.inertia @ body.spin
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_inertia_is_that_of_the_block(d):
+    """M (a² + b²)/12 about each axis: the cells of the particles count."""
+    _, particles = thrown(d)
+    body, (a, b, *c) = body_of(particles), (0.4, 0.3, 0.2)[:d]
+    if d == 2:
+        expected = [[(a**2 + b**2) / 12]]
+    else:
+        expected = np.diag([b**2 + c[0] ** 2, a**2 + c[0] ** 2, a**2 + b**2]) / 12
+    assert_close(body.inertia, float(body.mass) * np.asarray(expected))
+    assert_close(body.root().T @ body.root() * body.mass, body.inertia)
+    assert_close(body.spin, [3.0] if d == 2 else [1.0, 3.0, 0.5])
+
+
+@pytest.mark.parametrize("transfer", **ids(TRANSFERS, "apic"))
+@pytest.mark.parametrize("method", **ids(METHODS, ("explicit", "implicit_midpoint")))
+def test_a_block_that_is_thrown_moves_as_newton_and_euler_say(method, transfer):
+    """In two dimensions exactly: the centre on its parabola of the integrator, the spin constant, the shape turned by
+    ω t after more than ten turns."""
+    scene, particles = thrown(spin=[20.0], v=(0.3, 0.1), gravity=(0.0, -0.2), transfer=transfer)
+    dt, steps = 4e-3, 1000
+    run = mpm.simulate(scene, particles, t1=steps * dt, dt=dt, method=method)
+    body, t = body_of(run.final), steps * dt
+    lag = dt / 2 * (0.0 if method.body_force_at else 1.0)
+    assert_close(body.velocity, [0.3, 0.1 - 0.2 * t], 1e-9)
+    assert_close(body.spin, [20.0], 1e-9)
+    assert_close(body.centre, [0.3 * t, 0.1 * t - 0.1 * t * (t + 2 * lag)], 1e-9)
+    c, s = np.cos(20 * t), np.sin(20 * t)
+    R = np.array([[c, -s], [s, c]])
+    assert_close(body.arms, np.asarray(particles.x) @ R.T, 0, 1e-9)
+    assert_close(run.final.F, np.broadcast_to(R, (particles.count, 2, 2)), 0, 1e-9)
+
+
+@pytest.mark.thorough
+def test_a_block_that_tumbles_keeps_energy_and_angular_momentum():
+    """In three dimensions, about no principal axis, to rounding; and its motion is of second order."""
+    found = []
+    for dt in (0.02, 0.01, 0.005):
+        scene, particles = thrown(3)
+        run = mpm.simulate(scene, particles, t1=4.0, dt=dt)
+        start, end = body_of(particles), body_of(run.final)
+        assert_close(end.inertia @ end.spin, start.inertia @ start.spin, 1e-11)
+        assert float(end.spin @ end.inertia @ end.spin) == pytest.approx(
+            float(start.spin @ start.inertia @ start.spin), rel=1e-11
+        )
+        assert_close(np.linalg.norm(end.arms, axis=1), np.linalg.norm(start.arms, axis=1), 1e-11)
+        found.append(np.asarray(end.arms))
+    ratio = np.linalg.norm(found[1] - found[0]) / np.linalg.norm(found[2] - found[1])
+    assert 3.7 < ratio < 4.3
+
+
+@pytest.mark.parametrize("method", **ids(METHODS, ("explicit", "backward_euler")))
+@pytest.mark.parametrize("d", [2, *thorough(3)])
+def test_a_torque_makes_it_turn(method, d):
+    """ω = T t/I about a principal axis, and nothing else."""
+    sides = (0.4, 0.3) if d == 2 else (0.4, 0.4, 0.2)
+    scene, particles = thrown(d, spin=[0.0] if d == 2 else [0.0, 0.0, 0.0], sides=sides)
+    at = [(0.15, 0.1), (-0.15, 0.1), (0.0, -0.1)] if d == 2 else [(0.15, 0.1, 0.0), (-0.15, 0.1, 0.0), (0.0, -0.1, 0.0)]
+    torque = mpm.Torque(mpm.PointsAt(at), 5.0 if d == 2 else (0.0, 0.0, 5.0))
+    scene = mpm.attach(mpm.Scene(scene.grid, RIGID, loads=torque), particles)
+    run = mpm.simulate(scene, particles, t1=0.2, dt=0.01, method=method)
+    body = body_of(run.final)
+    expected = 5.0 * 0.2 / float(body_of(particles).inertia[-1, -1])
+    assert_close(body.spin, [expected] if d == 2 else [0, 0, expected], 1e-9, 1e-9)
+    assert_close(body.velocity, np.zeros(d), 0, 1e-10)
+
+
+def pressed(*, friction=0.3, method="explicit", d=2, offset=0.13, speed=1.0, **settings):
+    """A rigid block that falls on an elastic one off its middle, sliding and spinning."""
+    dx = 0.1
+    grid = mpm.Grid((13, 11, 11)[:d], dx, origin=(-4,) * d)
+    wide = mpm.Box((0.0,) * d, (0.5,) * (d - 1) + (0.2,))
+    lower = mpm.fill(wide, grid, density=1e3)
+    upper = mpm.fill(mpm.Box((0.0,) * (d - 1) + (0.2,), (0.3,) * (d - 1) + (0.4,)), grid, density=3e3)
+    x = upper.x.at[:, 0].add(offset).at[:, -1].add(-0.005)
+    v = upper.v.at[:, -1].set(-speed).at[:, 0].set(speed)
+    particles = mpm.join(lower, dataclasses.replace(upper, x=x, v=v))
+    scene = mpm.Scene(
+        grid, (mpm.NeoHookean(1e4, 0.3), mpm.Rigid(1e6)), bodies=mpm.Bodies(friction), **settings
+    )  # fmt: skip
+    return scene, particles
+
+
+@pytest.mark.parametrize("d", [2, *thorough(3)])
+@pytest.mark.parametrize("method", **ids(METHODS, ("explicit", "semi_implicit")))
+def test_what_falls_on_a_soft_block_keeps_momentum(method, d):
+    """Linear, and in explicit steps angular, to rounding, while they push and rub; it starts to turn."""
+    scene, particles = pressed(d=d)
+    dt = 5e-4 if method.is_explicit else 4e-3
+    rows = slice(particles.sizes[0], None)
+
+    def all_of(p):
+        soft = slice(0, particles.sizes[0])
+        x, v, C, m = p.x[soft], p.v[soft], p.C[soft], p.mass[soft]
+        own = (C - jnp.swapaxes(C, 1, 2)) * 0.1**2 / 4
+        turning = own[:, 1, 0, None] if d == 2 else jnp.stack([own[:, 2, 1], own[:, 0, 2], own[:, 1, 0]], axis=1)
+        return (m[:, None] * (moment(x, v) + turning)).sum(axis=0) + spin_momentum(p, rows)
+
+    first = new = mpm.prepare(scene, particles)
+    for n in range(2):
+        new, info = mpm.step(scene, new, n * dt, dt, method=method)
+        assert info.solve.converged
+        assert info.contact.violations == 0
+    before, after = ((particles.mass[:, None] * p.v).sum(axis=0) for p in (first, new))
+    assert_close(after, before, 1e-12 if method.is_explicit else 1e-8)
+    if method.is_explicit:
+        assert_close(all_of(new), all_of(first), 1e-11, 1e-13)
+    change = body_of(new, rows).velocity - body_of(first, rows).velocity
+    assert change[-1] > 1e-3
+    assert change[0] < -1e-4
+    assert np.abs(body_of(new, rows).spin).max() > 1e-2
+    R = new.deformations[1][0]
+    assert_close(new.x[rows] - new.x[rows].mean(axis=0), (first.x[rows] - first.x[rows].mean(axis=0)) @ R.T, 0, 1e-14)
