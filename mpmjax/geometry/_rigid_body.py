@@ -38,7 +38,7 @@ def rigid_body(
     x: ParticleVector, v: ParticleVector, mass: Float[Array, "p"], volume: Float[Array, "p"]
 ) -> RigidBody:
     """The rigid body of some particles. Its momentum is theirs; its spin is that which has their angular momentum
-    Σ r × m v. To its inertia that of each particle's cell about its own middle is added, of m a²/12 about each axis.
+    Σ r × m v. To its inertia that of each particle's cell about its own middle is added, of m a²/6.
 
     Args:
         x: positions [m], shape (p, d), not all of them on one line in 3-D, nor at one point in 2-D.
@@ -52,7 +52,7 @@ def rigid_body(
     arms = x - centre
     momentum = moment(arms, mass[:, None] * (v - velocity)).sum(axis=0)
     of_points = inertia(arms, mass)
-    of_cells = (d - 1) / 12 * (mass * volume ** (2 / d)).sum()
+    of_cells = (mass * volume ** (2 / d)).sum() / 6
     spin = momentum if d == 1 else jnp.linalg.solve(of_points, momentum)
     return RigidBody(total, centre, velocity, spin, of_points + of_cells * jnp.eye(len(momentum), dtype=x.dtype), arms)
 

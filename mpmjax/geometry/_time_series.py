@@ -61,7 +61,7 @@ def require_some(name: str, value: Changing | ChangingVector) -> None:
         require_finite(name, value)
 
 
-def vector_size(value: ChangingVector) -> int | None:
+def vector_size(value: Changing | ChangingVector) -> int | None:
     """How many components a vector has that is constant or a time series; None of a number."""
     shape = jnp.shape(jnp.asarray(value.values if isinstance(value, TimeSeries) else value))
     rest = shape[1:] if isinstance(value, TimeSeries) else shape

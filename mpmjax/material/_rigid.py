@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, Matrix, Scalar
+from mpmjax._types import Array, Bool, Deformation, Float, Matrix, Scalar
 from mpmjax.checks import require, require_fields, require_positive
 from mpmjax.material._base import AbstractMaterial
 from mpmjax.material._freedom import Freedom
@@ -73,7 +73,7 @@ class Rigid(AbstractMaterial):
         none = jnp.zeros_like(s[0])
         return PrincipalTangent.of(s, lambda i, j: none, lambda i, j: none, lambda i, j: none)
 
-    def wave_modulus(self, F: Matrix) -> Float[Array, "*p"]:
+    def wave_modulus(self, F: Deformation) -> Float[Array, "*p"]:
         """M, by which contact takes its stiffness."""
         return jnp.broadcast_to(jnp.asarray(self.modulus, F.dtype), (1,))
 

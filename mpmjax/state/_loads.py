@@ -1,6 +1,7 @@
 """Loads on a body's surface and at points of it, and springs and dashpots to the ground."""
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -33,6 +34,8 @@ class AbstractLoad(eqx.Module):
 
     on: eqx.AbstractVar[AbstractPlace]
     """Where it acts."""
+    moves_points_on: ClassVar[bool] = True
+    """Whether `force` has the points where they are at its time t; else where they are as the step begins."""
 
     @abc.abstractmethod
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"] | None:
@@ -254,8 +257,8 @@ def load_force(
     """
     total = None
     for load, own in zip(loads, points, strict=True):
-        at, later = (t + part * dt, own.after(part * dt)) if part > 0 else (t, own)
-        force = load.force(later, at, dt)
+        later = own.after(part * dt) if part > 0 and load.moves_points_on else own
+        force = load.force(later, t + part * dt if part > 0 else t, dt)
         if force is not None:
             nodal = own.nodal(force, size)
             total = nodal if total is None else total + nodal

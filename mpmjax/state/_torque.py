@@ -1,5 +1,7 @@
 """Torques on points of a body."""
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, Point, Scalar
@@ -13,9 +15,9 @@ from mpmjax.state._loads import AbstractLoad
 class Torque(AbstractLoad):
     """A torque on several points of a body, by forces f_s = w_s α × r_s without a sum.
 
-    r_s are the points' distances from their common centre, with the weights w_s, as they are in the step, and
-    α = (Σ w_s (‖r_s‖² 1 − r_s r_sᵀ))⁻¹ T. The torque keeps its direction in 3-D. It is that of the points at the time
-    at which loads are taken, and not part of an implicit solve's matrix.
+    r_s are the points' distances from their common centre, with the weights w_s, as the step begins, and
+    α = (Σ w_s (‖r_s‖² 1 − r_s r_sᵀ))⁻¹ T. The torque is exact and keeps its direction; how the forces turn with the
+    points is not part of an implicit solve's matrix.
 
     Args:
         on: the points, `PointsAt` or a `Patch`: two at least, in 3-D three that are not on one line.
@@ -24,6 +26,7 @@ class Torque(AbstractLoad):
 
     on: AbstractPlace
     total: Scalar | Point | TimeSeries
+    moves_points_on: ClassVar[bool] = False  # forces act on the nodes as the step begins
 
     def __check_init__(self):
         require_fields(self)

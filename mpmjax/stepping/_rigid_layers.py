@@ -5,7 +5,7 @@ from dataclasses import replace
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Float, Mask, NodeScalar, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary import Conditions, Image, Mirror, RigidImage
 from mpmjax.geometry import RigidBody, inertia, moment, rigid_body, rotation_of, spinning
 from mpmjax.state import Particles, RigidMaterial, Scene
@@ -16,7 +16,7 @@ class RigidLayers(eqx.Module):
     the second s = Gω (see `RigidImage`)."""
 
     images: tuple[RigidImage, ...]
-    own: Mask
+    own: Bool[Array, "n 1"]
     """The nodes of rigid bodies, shape (n, 1)."""
     velocity: NodeVector
     """Their velocity at the start of the step [m/s], shape (n, d), zero elsewhere."""
