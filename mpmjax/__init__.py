@@ -359,7 +359,6 @@ __all__ = [  # noqa: RUF022 (grouped)
     "LBFGS",
     "Adam",
     "AbstractObservation",
-    "Torque",
     "Tracks",
     "Series",
     "Curve",

@@ -9,7 +9,8 @@ from helpers import QUICK, assert_close, explicit_limit, ids, thorough
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.boundary._contact import SWEEPS, ConstrainedNodes, constrain, find_active_set
+from mpmjax.boundary._active_set import SWEEPS, find_active_set
+from mpmjax.boundary._contact import ConstrainedNodes, constrain
 from mpmjax.boundary._mirror import Mirror
 from mpmjax.checks._values import canonical
 from mpmjax.implicit._solve_info import no_solve

@@ -3,11 +3,10 @@
 import dataclasses
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import TRANSFERS, assert_close, assert_files_hold, ids, thorough
+from helpers import TRANSFERS, assert_close, thorough
 from test_bodies import METHODS
 
 import mpmjax as mpm
@@ -92,7 +91,8 @@ def test_a_block_that_tumbles_keeps_energy_and_angular_momentum():
 
 
 @pytest.mark.parametrize(
-    ("d", "method"), [(2, "explicit"), *thorough((3, "explicit"), *((2, name) for name in METHODS if name != "explicit"))]
+    ("d", "method"),
+    [(2, "explicit"), *thorough((3, "explicit"), *((2, name) for name in METHODS if name != "explicit"))],
 )
 def test_a_torque_makes_it_turn(method, d):
     """ω = T t/I about a principal axis, and nothing else."""

@@ -146,9 +146,13 @@ def budget(
         the particles after the last step, and the budget, each of its terms with a leading axis f.
 
     Raises:
-        ValueError: from `prepare`, a step that is not positive, or a plane of symmetry that moves.
+        ValueError: from `prepare`, a step that is not positive, a plane of symmetry that moves, or a rigid body.
     """
     require_positive("dt [s]", dt)
+    require(
+        not scene.rigid_bodies,
+        "A budget does not know the transfers of a Rigid body: ask for energy and momentum, or give the body a stiff law.",
+    )
     require(
         not scene.moving_mirrors,
         "A budget does not know the work of a SymmetryPlane that moves: take a plane at rest, in its own frame, "

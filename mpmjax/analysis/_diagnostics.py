@@ -15,7 +15,7 @@ class Energy(eqx.Module):
     """The energy of a state [J] (per metre of thickness in 2-D, per square metre of section in 1-D)."""
 
     kinetic: Float[Array, "*f"]
-    """½ Σ m (‖v‖² + tr(C D Cᵀ)), with the affine part for APIC."""
+    """½ Σ m (‖v‖² + tr(C D Cᵀ)), with the affine part for APIC; of a rigid body ½ M ‖V‖² + ½ ω·Iω with it."""
     elastic: Float[Array, "*f"]
     """Σ V0 Ψ(F), with the elastic law for the present history."""
     potential: Float[Array, "*f"]
@@ -44,6 +44,10 @@ def energy_of(scene: Scene, particles: Particles) -> Energy:
     speed2 = (particles.v**2).sum(axis=1)
     if scene.transfer.affine and particles.C is not None:
         moment = scene.stencil(particles).moment.T[:, None, :]
+        for body in scene.rigid_bodies:  # whose inertia is that of the particles' cells
+            rows = slice(*particles.groups[body.number].rows)
+            own = particles.volume[rows, None, None] ** (2 / particles.dim) / 12
+            moment = jnp.broadcast_to(moment, (particles.count, 1, particles.dim)).at[rows].set(own)
         speed2 = speed2 + (particles.C**2 * moment).sum(axis=(1, 2))
     gravity = jnp.asarray(scene.gravity, particles.x.dtype)
     return Energy(

@@ -1,5 +1,6 @@
 """Walls, grips, mirrored planes and colliders, and what colliders receive."""
 
+from mpmjax.boundary._active_set import find_active_set
 from mpmjax.boundary._body_contact import STIFFNESS, Body, BodyContact, body_contact, in_a_row
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall
 from mpmjax.boundary._boundary_impulse import (
@@ -26,7 +27,6 @@ from mpmjax.boundary._contact import (
     AbstractNodes,
     ConstrainedNodes,
     constrain,
-    find_active_set,
 )
 from mpmjax.boundary._contact_info import ContactInfo, no_contact
 from mpmjax.boundary._coupling import Coupling

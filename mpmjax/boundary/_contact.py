@@ -19,12 +19,10 @@ the elastic response of one step.
 """
 
 import abc
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Generic, TypeVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
@@ -32,9 +30,6 @@ from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._coupling import Coupling
 from mpmjax.boundary._mirror import Image, Mirror
 from mpmjax.boundary._springs import Springs
-
-SWEEPS = 4
-"""Most active sets that are tried in a step."""
 
 ActiveSet = tuple[Bool[Array, "..."], ...]
 """The places that are held, one mask for each contact."""
@@ -300,7 +295,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
 
     def count_violations(self, v: NodeVector, residual: NodeVector) -> Int[Array, ""]:
         """How many places pull or are entered."""
-        return _count(self.unheld, *self.violations(v, residual))
+        return count_places(self.unheld, *self.violations(v, residual))
 
     def beside_springs(self, residual: NodeVector) -> NodeVector:
         """The residual without the impulses of springs: what holds components of velocity.
@@ -321,7 +316,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
             residual: the impulse that holds components of velocity [kg m/s], shape (n, d).
         """
         changes, loosened = [], self._loosened()
-        tied, nodes = self.nodes.mirror.of_rigid_bodies(), self.nodes
+        tied, nodes = Mirror(self.nodes.mirror.rigid), self.nodes
         for contact, active in zip(self.unheld.contacts, self.active, strict=True):
             change = contact.friction(loosened, active, tied.unfold(v), residual)
             if tied.images:  # the impulses on a rigid body's nodes are those on the whole of it
@@ -337,7 +332,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         Args:
             slowed: the change of velocity by the friction of each contact [m/s], shape (n, d).
         """
-        found, mass, tied = [], self._loosened().unheld.mass, self.nodes.mirror.of_rigid_bodies()
+        found, mass, tied = [], self._loosened().unheld.mass, Mirror(self.nodes.mirror.rigid)
         for contact, active, change in zip(self.unheld.contacts, self.active, slowed, strict=True):
             if contact.collider is not None:
                 rubbed, impulse = mass[:, None] * tied.unfold(change), contact.spring_impulse(self, active)
@@ -350,9 +345,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         loose = self.unheld.loose
         if loose is None:
             return self
-        unheld = eqx.tree_at(
-            lambda n: (n.mass, n.conditions.fixed), self.unheld, (loose.mass, loose.conditions.fixed)
-        )
+        unheld = eqx.tree_at(lambda n: (n.mass, n.conditions.fixed), self.unheld, (loose.mass, loose.conditions.fixed))
         return replace(self, unheld=unheld, nodes=loose)
 
 
@@ -375,53 +368,7 @@ def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
     return ConstrainedNodes(nodes, active, images, nodes.constrained(images, fixed, normals, springs, couplings))
 
 
-def find_active_set(
-    nodes: AbstractNodes,
-    guess: NodeVector,
-    start: NodeVector | None,
-    attempt: Callable[[ConstrainedNodes, NodeVector], tuple[ConstrainedNodes, NodeVector, NodeVector, NodeVector, Any]],
-    cost: Any,
-    *,
-    explicit: bool = False,
-) -> tuple[ActiveSet, NodeVector, Any, Int[Array, ""]]:
-    """The active set, a velocity to start the last solve from, and what the sweeps cost.
-
-    Args:
-        nodes: nodes of which no contact holds anything yet.
-        guess: where the first solve starts [m/s], shape (n, d).
-        start: a guess of `ConstrainedNodes.displacement` [m], shape (n, d).
-        attempt: (constrained nodes, guess) to (constrained nodes with their displacement, velocity, missing impulse
-            [kg m/s] of all nodes, guess of the next solve, report). It is not differentiated.
-        cost: the report of no solve.
-        explicit: whether forces are those at the start of the step.
-
-    Returns:
-        active set, velocity, the sweeps' reports added up, number of sweeps.
-    """
-
-    def sweep(state: tuple) -> tuple:
-        active, guess, cost, _, count = state
-        held = constrain(nodes, active)
-        held, v, residual, guess, info = attempt(held, guess)
-        pulls, enters = held.violations(v, residual)
-        active = jax.tree.map(lambda was, pulled, entered: (was & ~pulled) | entered, active, pulls, enters)
-        return active, guess, cost.followed_by(info), _count(nodes, pulls, enters) > 0, count + 1
-
-    def unsettled(state: tuple) -> Array:
-        return state[3] & (state[4] < SWEEPS)
-
-    predictor = nodes.explicit_velocity()
-    nothing_held = ConstrainedNodes(nodes, (), Mirror(()), nodes, start)
-    active = tuple(contact.likely_held(nothing_held, predictor) for contact in nodes.contacts)
-    none = jnp.asarray(0, dtype=jnp.int32)
-    if explicit and all(contact.known_at_start for contact in nodes.contacts):
-        return active, guess, cost, none
-    first = (active, guess, cost, jnp.asarray(True), none)
-    active, guess, cost, _, count = jax.lax.while_loop(unsettled, sweep, first)
-    return active, guess, cost, count
-
-
-def _count(nodes: AbstractNodes, *sets: ActiveSet) -> Int[Array, ""]:
+def count_places(nodes: AbstractNodes, *sets: ActiveSet) -> Int[Array, ""]:
     """How many places some sets have."""
     total = jnp.asarray(0, dtype=jnp.int32)
     for part in sets:

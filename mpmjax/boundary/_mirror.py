@@ -184,9 +184,10 @@ class Mirror(eqx.Module):
         """The mirrors without rigid parts and bodies."""
         return Mirror(tuple(image for image in self.images if isinstance(image, Image)))
 
-    def of_rigid_bodies(self) -> "Mirror":
-        """The maps of rigid bodies alone."""
-        return Mirror(tuple(image for image in self.images if isinstance(image, RigidImage)))
+    @property
+    def rigid(self) -> tuple[RigidImage, ...]:
+        """The maps of rigid bodies."""
+        return tuple(image for image in self.images if isinstance(image, RigidImage))
 
     def then(self, other: "Mirror") -> "Mirror":
         """The mirror that unfolds by this one first, then by the other."""

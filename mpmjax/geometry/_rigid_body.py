@@ -34,9 +34,7 @@ class RigidBody(eqx.Module):
         return jnp.sqrt(scaled) if len(scaled) < 2 else jnp.linalg.cholesky(scaled).T
 
 
-def rigid_body(
-    x: ParticleVector, v: ParticleVector, mass: Float[Array, "p"], volume: Float[Array, "p"]
-) -> RigidBody:
+def rigid_body(x: ParticleVector, v: ParticleVector, mass: Float[Array, "p"], volume: Float[Array, "p"]) -> RigidBody:
     """The rigid body of some particles. Its momentum is theirs; its spin is that which has their angular momentum
     Σ r × m v. To its inertia that of each particle's cell about its own middle is added, of m a²/6.
 

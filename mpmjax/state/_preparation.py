@@ -189,6 +189,15 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
                 f"Particles must lie {keep} the {name} at {wall.position:g} on axis {wall.axis}, but particle "
                 f"{int(np.argmax(beyond))} does not: move it or change the plane's keep.",
             )
+    for body in scene.rigid_bodies:
+        x = np.asarray(particles.x[slice(*particles.groups[body.number].rows)], float)
+        spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
+        most = min(len(spread), particles.dim - 1)
+        require(
+            most == particles.dim - 1 and spread[:most] > 1e-6 * float(scene.grid.spacing),
+            f"A Rigid body's particles must not all lie {'at one point' if particles.dim < 3 else 'on one line'}, where "
+            f"nothing says how it turns: give material {body.number} more of them.",
+        )
     for law, group in zip(scene.laws, particles.groups, strict=True):
         rows = group.rows[1] - group.rows[0]
         sizes = {jnp.size(number) for number in _parameters(law)}

@@ -223,7 +223,9 @@ class Scene(eqx.Module):
     def rigid_bodies(self) -> tuple[RigidMaterial, ...]:
         """The materials that are rigid bodies."""
         layers = (0,) * len(self.laws) if self.bodies is None else self.bodies.numbers(len(self.laws))
-        found = ((number, layer, law.freedom()) for number, (law, layer) in enumerate(zip(self.laws, layers, strict=True)))
+        found = (
+            (number, layer, law.freedom()) for number, (law, layer) in enumerate(zip(self.laws, layers, strict=True))
+        )
         return tuple(RigidMaterial(n, layer, freedom) for n, layer, freedom in found if freedom is not None)
 
     @property

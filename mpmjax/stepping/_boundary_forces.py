@@ -1,13 +1,15 @@
 """What each boundary of a scene receives in a step, from the motion of the nodes and the impulses that made it."""
 
+import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import Array, NodeVector, Scalar
+from mpmjax._types import Array, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary import (
     BoundaryImpulse,
     ConstrainedNodes,
     Given,
     Owners,
+    RigidImage,
     brought_images,
     impulse_on_boundaries,
     owners_of,
@@ -53,6 +55,8 @@ def given_to_boundaries(
     unfold, colliders = nodes.mirror.unfold, nodes.conditions.colliders
     at = scene.nodes(particles, t)
     owners = owners_of(scene.boundary, nodes.conditions, at, grid.spacing, t, dt, reference=scene.total)
+    for image in nodes.mirror.rigid:
+        owners = _held_as_one(owners, image, unfolded.mass)
 
     # springs act on all nodes
     given, residual = [], reaction
@@ -102,6 +106,21 @@ def given_to_boundaries(
         places = places + dt / 2 * mean
         pivots = (pivots + _pivots(scene, t + dt, residual)) / 2
     return impulse_on_boundaries(given, places, pivots)
+
+
+def _held_as_one(owners: Owners, image: RigidImage, mass: NodeScalar) -> Owners:
+    """The owners where the first that holds a node of a rigid body holds all of them in this direction.
+
+    Args:
+        owners: what boundaries hold, node by node.
+        image: the map of the rigid body.
+        mass: masses of all nodes [kg], shape (n,).
+    """
+    own, full = image.own(owners.fixed), image.own(mass) > 0
+    count = jnp.iinfo(own.dtype).max
+    first = jnp.where((own >= 0) & full[:, None], own, count).min(axis=0)
+    spread = jnp.broadcast_to(jnp.where(first == count, -1, first), own.shape)
+    return eqx.tree_at(lambda o: o.fixed, owners, image.with_own(owners.fixed, spread))
 
 
 def _share_of_change(transfer: AbstractTransfer, dim: int, dtype: jnp.dtype) -> Array:

@@ -1,6 +1,7 @@
 """The nodes at the start of a step: mass, velocity and force from P2G, boundaries, and the elastic potential."""
 
 from collections.abc import Callable
+from operator import attrgetter
 from typing import ClassVar
 
 import equinox as eqx
@@ -262,13 +263,9 @@ class Nodes(AbstractNodes):
         """The nodes with those of rigid bodies folded to the two that move each of them."""
         nodes = self.folded(Mirror(rigid.images))
         velocity = jnp.where(rigid.own, rigid.velocity, nodes.velocity)
-        conditions = eqx.tree_at(lambda c: (c.fixed, c.velocity), self.conditions, (rigid.fixed, rigid.prescribed))
-        return eqx.tree_at(
-            lambda n: (n.sums.velocity, n.conditions, n.loose),
-            nodes,
-            (velocity, conditions, self),
-            is_leaf=lambda leaf: leaf is None,
-        )
+        parts = velocity, Conditions(rigid.fixed, rigid.prescribed, self.conditions.colliders), self
+        fields = attrgetter("sums.velocity", "conditions", "loose")
+        return eqx.tree_at(fields, nodes, parts, is_leaf=lambda leaf: leaf is None)
 
     def moved_by(self, change: NodeVector) -> "Nodes":
         """The nodes with a velocity [m/s], shape (n, d), added to theirs."""
@@ -408,8 +405,8 @@ def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes) -> Nodes:
     images, moving = mirror(scene.boundary, scene.grid, scene.window(particles)), nodes.mirror_motion
     with jax.named_scope("p2g"):
         if scene.rigid_bodies:
-            rigid = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images)
-            return nodes.folded(images).tied(rigid)
+            found = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images, nodes.dt)
+            return nodes.folded(images).tied(found)
         if moving is None:
             return nodes.folded(images)
         # at rest with the mirrors: the velocity less what they add, which is put back

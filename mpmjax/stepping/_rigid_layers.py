@@ -27,7 +27,7 @@ class RigidLayers(eqx.Module):
 
 
 def rigid_layers(
-    scene: Scene, particles: Particles, mass: NodeScalar, conditions: Conditions, planes: Mirror
+    scene: Scene, particles: Particles, mass: NodeScalar, conditions: Conditions, planes: Mirror, dt: Scalar
 ) -> RigidLayers:
     """The rigid bodies of a scene.
 
@@ -37,6 +37,7 @@ def rigid_layers(
         mass: masses of all nodes, not folded at planes [kg], shape (n,).
         conditions: what boundaries prescribe of all nodes.
         planes: the mirrors of symmetry planes.
+        dt: step [s].
     """
     places = scene.grid.nodes(scene.window(particles))
     own, velocity = jnp.zeros((len(mass), 1), bool), jnp.zeros_like(places)
@@ -44,7 +45,7 @@ def rigid_layers(
     for material in scene.rigid_bodies:
         body = _body(particles, material)
         image = _image(scene, body, places, material.layer)
-        held, value = _held(material, body, image, mass, conditions, planes)
+        held, value = _held(material, body, image, mass, conditions, planes, dt)
         images.append(image)
         own = image.with_own(own, jnp.ones((len(image.arms), 1), bool))
         velocity = image.with_own(velocity, _first_two(image, body.velocity, body.root() @ body.spin))
@@ -73,8 +74,7 @@ def moved_rigidly(
         dt: step [s].
     """
     x, v, C, deformations = after.x, after.v, after.C, list(after.deformations)
-    for material, image in zip(scene.rigid_bodies, mirror.of_rigid_bodies().images, strict=True):
-        assert isinstance(image, RigidImage)
+    for material, image in zip(scene.rigid_bodies, mirror.rigid, strict=True):
         rows, body = slice(*before.groups[material.number].rows), _body(before, material)
         end, over = image.own(new), image.own(mean)
         R = rotation_of(body, body.inertia @ image.spin(over[1]), dt)
@@ -116,7 +116,13 @@ def _first_two(image: RigidImage, velocity: Array, s: Array) -> NodeVector:
 
 
 def _held(
-    material: RigidMaterial, body: RigidBody, image: RigidImage, mass: NodeScalar, conditions: Conditions, planes: Mirror
+    material: RigidMaterial,
+    body: RigidBody,
+    image: RigidImage,
+    mass: NodeScalar,
+    conditions: Conditions,
+    planes: Mirror,
+    dt: Scalar,
 ) -> tuple[Array, Array]:
     """Which components of V and s are held, and at what [m/s], both of shape (2, d).
 
@@ -142,15 +148,27 @@ def _held(
     momentum = moment(arms, whole[:, None] * (value - mean)).sum(axis=0)
     resists = inertia(arms, whole)
     some = whole.sum() > 0
-    turned = resists + jnp.sqrt(jnp.finfo(arms.dtype).eps) * jnp.trace(resists) * jnp.eye(len(resists), dtype=arms.dtype)
+    turned = resists + jnp.sqrt(jnp.finfo(arms.dtype).eps) * jnp.trace(resists) * jnp.eye(
+        len(resists), dtype=arms.dtype
+    )
     spin = jnp.linalg.solve(jnp.where(some, turned, jnp.eye(len(resists), dtype=arms.dtype)), momentum)
-    spin = jnp.where(some & material.freedom.turns, spin, 0)
+    spin = jnp.where(some & material.freedom.turns, _of_chords(spin, dt), 0)
     velocity = jnp.where(by_nodes & ~guided, mean - spinning(spin, middle[None])[0], 0)
     fixed = jnp.stack([guided | by_nodes | by_planes, jnp.broadcast_to(~spins, (d,))])
     return fixed, _first_two(image, velocity, body.root() @ spin)[:2]
 
 
+def _of_chords(spin: Float[Array, "r"], dt: Scalar) -> Float[Array, "r"]:
+    """ω [rad/s] of points that move along the chords of their circles, from the spin of their velocities, sin(ωΔt)/Δt
+    about the axis."""
+    square = (dt**2 * spin**2).sum()
+    small = square < 1e-4  # where it is its series, to the last digit
+    sine = jnp.sqrt(jnp.where(small, 0.25, jnp.minimum(square, 0.99)))
+    series = 1 + square / 6 + 3 * square**2 / 40 + 5 * square**3 / 112
+    return spin * jnp.where(small, series, jnp.arcsin(sine) / sine)
+
+
 def _reaches(image: RigidImage, plane: Image, own: Float[Array, "m"]) -> Array:
     """The axis of a plane that holds a body, which has mass on it or beyond, as a mask of the directions."""
-    beyond = image.own(plane.along(plane.odd <= 0).reshape(-1))
+    beyond = image.own(plane.along(plane.odd <= 0))
     return (beyond & (own > 0)).any() & (jnp.arange(image.arms.shape[1]) == plane.axis)
