@@ -99,7 +99,7 @@ def test_a_torque_makes_it_turn(method, d):
     sides = (0.4, 0.3) if d == 2 else (0.4, 0.4, 0.2)
     scene, particles = thrown(d, spin=[0.0] if d == 2 else [0.0, 0.0, 0.0], sides=sides)
     at = [(0.15, 0.1), (-0.15, 0.1), (0.0, -0.1)] if d == 2 else [(0.15, 0.1, 0.0), (-0.15, 0.1, 0.0), (0.0, -0.1, 0.0)]
-    torque = mpm.Torque(mpm.PointsAt(at), 5.0 if d == 2 else (0.0, 0.0, 5.0))
+    torque = mpm.Couple(mpm.PointsAt(at), 5.0 if d == 2 else (0.0, 0.0, 5.0))
     scene = mpm.attach(mpm.Scene(scene.grid, RIGID, loads=torque), particles)
     run = mpm.simulate(scene, particles, t1=0.2, dt=0.01, method=METHODS[method])
     body = body_of(run.final)
@@ -159,7 +159,7 @@ def test_what_falls_on_a_soft_block_keeps_momentum(method, d):
 
 
 def weighed(force=-50.0, density=2e3, *, method="semi_implicit", steps=40, plate=None, offset=0.0):
-    """What a rigid plate with a force on it does on a soft block that stands on a plane, between planes at its sides."""
+    """A rigid plate with a force on it, on a soft block that stands on a plane, between planes at its sides."""
     grid = mpm.Grid((12, 13), 0.1, origin=(-4, -3))
     foam = mpm.fill(mpm.Box((0.0, 0.0), (0.4, 0.4)), grid, density=1e2)
     top = mpm.fill(mpm.Box((0.0, 0.4), (0.4, 0.6)), grid, density=1.0)

@@ -151,7 +151,7 @@ def budget(
     require_positive("dt [s]", dt)
     require(
         not scene.rigid_bodies,
-        "A budget does not know the transfers of a Rigid body: ask for energy and momentum, or give the body a stiff law.",
+        "A budget does not know how a Rigid body moves: ask for energy and momentum, or give the body a stiff law.",
     )
     require(
         not scene.moving_mirrors,

@@ -4,6 +4,7 @@ from mpmjax.state._attachment import AbstractPlace, AttachedPoints, Patch, Point
 from mpmjax.state._averaged_volume import AveragedTangent, AveragedVolume, VolumeAverage
 from mpmjax.state._bodies import Bodies
 from mpmjax.state._body_force import AbstractBodyForce
+from mpmjax.state._couple import Couple
 from mpmjax.state._description import AbstractDescription, TotalLagrangian, UpdatedLagrangian
 from mpmjax.state._fill import fill, fill_mapped
 from mpmjax.state._loaded_points import LoadedPoints
@@ -13,7 +14,6 @@ from mpmjax.state._particles import Particles, State, by_material, history_array
 from mpmjax.state._preparation import is_prepared, prepare
 from mpmjax.state._scene import RigidMaterial, Scene, attach
 from mpmjax.state._support import Support, SupportStiffness, stiffness_of
-from mpmjax.state._torque import Torque
 
 __all__ = [
     "AbstractBodyForce",
@@ -24,6 +24,7 @@ __all__ = [
     "AveragedTangent",
     "AveragedVolume",
     "Bodies",
+    "Couple",
     "LoadedPoints",
     "MaterialPoints",
     "Particles",
@@ -37,7 +38,6 @@ __all__ = [
     "State",
     "Support",
     "SupportStiffness",
-    "Torque",
     "TotalLagrangian",
     "Traction",
     "UpdatedLagrangian",

@@ -195,7 +195,7 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
         most = min(len(spread), particles.dim - 1)
         require(
             most == particles.dim - 1 and spread[:most] > 1e-6 * float(scene.grid.spacing),
-            f"A Rigid body's particles must not all lie {'at one point' if particles.dim < 3 else 'on one line'}, where "
+            f"A Rigid body's particles must not lie {'at one point' if particles.dim < 3 else 'on one line'}, by which "
             f"nothing says how it turns: give material {body.number} more of them.",
         )
     for law, group in zip(scene.laws, particles.groups, strict=True):

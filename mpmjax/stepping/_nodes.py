@@ -262,8 +262,7 @@ class Nodes(AbstractNodes):
     def tied(self, rigid: RigidLayers) -> "Nodes":
         """The nodes with those of rigid bodies folded to the two that move each of them."""
         nodes = self.folded(Mirror(rigid.images))
-        velocity = jnp.where(rigid.own, rigid.velocity, nodes.velocity)
-        parts = velocity, Conditions(rigid.fixed, rigid.prescribed, self.conditions.colliders), self
+        parts = jnp.where(rigid.own, rigid.velocity, nodes.velocity), rigid.conditions, self
         fields = attrgetter("sums.velocity", "conditions", "loose")
         return eqx.tree_at(fields, nodes, parts, is_leaf=lambda leaf: leaf is None)
 
@@ -405,8 +404,8 @@ def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes) -> Nodes:
     images, moving = mirror(scene.boundary, scene.grid, scene.window(particles)), nodes.mirror_motion
     with jax.named_scope("p2g"):
         if scene.rigid_bodies:
-            found = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images, nodes.dt)
-            return nodes.folded(images).tied(found)
+            rigid = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images, nodes.dt)
+            return nodes.folded(images).tied(rigid)
         if moving is None:
             return nodes.folded(images)
         # at rest with the mirrors: the velocity less what they add, which is put back

@@ -5,7 +5,7 @@ from dataclasses import replace
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary import Conditions, Image, Mirror, RigidImage
 from mpmjax.geometry import RigidBody, inertia, moment, rigid_body, rotation_of, spinning
 from mpmjax.state import Particles, RigidMaterial, Scene
@@ -20,10 +20,8 @@ class RigidLayers(eqx.Module):
     """The nodes of rigid bodies, shape (n, 1)."""
     velocity: NodeVector
     """Their velocity at the start of the step [m/s], shape (n, d), zero elsewhere."""
-    fixed: Mask
-    """The components that are prescribed, of all nodes, shape (n, d)."""
-    prescribed: NodeVector
-    """Their values [m/s], shape (n, d)."""
+    conditions: Conditions
+    """What is prescribed of all nodes: of those of rigid bodies, of these two."""
 
 
 def rigid_layers(
@@ -51,7 +49,7 @@ def rigid_layers(
         velocity = image.with_own(velocity, _first_two(image, body.velocity, body.root() @ body.spin))
         fixed = image.with_own(fixed, jnp.zeros(image.arms.shape, bool).at[:2].set(held))
         prescribed = image.with_own(prescribed, jnp.zeros_like(image.arms).at[:2].set(jnp.where(held, value, 0)))
-    return RigidLayers(tuple(images), own, velocity, fixed, prescribed)
+    return RigidLayers(tuple(images), own, velocity, Conditions(fixed, prescribed, conditions.colliders))
 
 
 def moved_rigidly(

@@ -1,4 +1,4 @@
-"""Torques on points of a body."""
+"""Couples on points of a body."""
 
 from typing import ClassVar
 
@@ -12,8 +12,8 @@ from mpmjax.state._loaded_points import LoadedPoints
 from mpmjax.state._loads import AbstractLoad
 
 
-class Torque(AbstractLoad):
-    """A torque on several points of a body, by forces f_s = w_s α × r_s without a sum.
+class Couple(AbstractLoad):
+    """A couple, a torque on several points of a body by forces f_s = w_s α × r_s without a sum.
 
     r_s are the points' distances from their common centre, with the weights w_s, as the step begins, and
     α = (Σ w_s (‖r_s‖² 1 − r_s r_sᵀ))⁻¹ T. The torque is exact and keeps its direction; how the forces turn with the
@@ -30,18 +30,18 @@ class Torque(AbstractLoad):
 
     def __check_init__(self):
         require_fields(self)
-        require_some("Torque's total [N m]", self.total)
+        require_some("Couple's total [N m]", self.total)
         if isinstance(self.on, AttachedPoints):
             count = jnp.shape(jnp.asarray(self.on.particle))[0]
-            require(count >= self.on.dim, f"A Torque needs {self.on.dim} points at least, got {count}.")
+            require(count >= self.on.dim, f"A Couple needs {self.on.dim} points at least, got {count}.")
 
     def check(self, dim: int) -> None:
         AbstractLoad.check(self, dim)
-        require(dim > 1, "A Torque needs two or three dimensions, got one.")
+        require(dim > 1, "A Couple needs two or three dimensions, got one.")
         size = vector_size(self.total)
         require(
             size == {2: None, 3: 3}[dim],
-            f"Torque's total must be {'a number in 2-D' if dim == 2 else 'three numbers in 3-D'}, got "
+            f"Couple's total must be {'a number in 2-D' if dim == 2 else 'three numbers in 3-D'}, got "
             f"{'a number' if size is None else f'{size} of them'}.",
         )
 
