@@ -262,9 +262,8 @@ class Nodes(AbstractNodes):
     def tied(self, rigid: RigidLayers) -> "Nodes":
         """The nodes with those of rigid bodies folded to the two that move each of them."""
         nodes = self.folded(Mirror(rigid.images))
-        parts = jnp.where(rigid.own, rigid.velocity, nodes.velocity), rigid.conditions, self
-        fields = attrgetter("sums.velocity", "conditions", "loose")
-        return eqx.tree_at(fields, nodes, parts, is_leaf=lambda leaf: leaf is None)
+        new = jnp.where(rigid.own, rigid.velocity, nodes.velocity), rigid.conditions, self
+        return eqx.tree_at(attrgetter("sums.velocity", "conditions", "loose"), nodes, new, is_leaf=lambda x: x is None)
 
     def moved_by(self, change: NodeVector) -> "Nodes":
         """The nodes with a velocity [m/s], shape (n, d), added to theirs."""
