@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import TRANSFERS, assert_close, thorough
+from helpers import TRANSFERS, assert_close, assert_files_hold, ids, thorough
 from test_bodies import METHODS
 
 import mpmjax as mpm
