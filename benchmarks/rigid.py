@@ -63,9 +63,8 @@ def roll(quick: bool) -> None:
         gyration = float(start.inertia[0, 0] / start.mass) / R**2
         exact = G * np.sin(angle) * t1**2 / 2 / (1 + gyration)
         way = float(body.centre[0] - start.centre[0])
-        print(
-            f"  {name}: way over that of rolling {way / exact:.4f}, −ωR/v {float(-body.spin[0] * R / body.velocity[0]):.3f}"
-        )
+        slips = float(-body.spin[0] * R / body.velocity[0])
+        print(f"  {name}: way over that of rolling {way / exact:.4f}, −ωR/v {slips:.3f}")
 
 
 def plate(quick: bool) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -223,14 +224,14 @@ def test_what_falls_on_a_floor_gets_its_force(method):
     floor = mpm.SeparatingBox((-np.inf, -0.155), (np.inf, np.inf), friction=0.4)
     scene = mpm.Scene(scene.grid, mpm.Rigid(1e5), gravity=(0.0, -9.81), boundary=floor, boundary_forces=True)
     new, impulse, dt = particles, 0.0, 1e-3
-    for n in range(6):
+    for n in range(16):
         new, info = mpm.step(scene, new, n * dt, dt, method=method)
         impulse = impulse + np.asarray(info.boundaries.impulse[0])
     mass = float(particles.mass.sum())
     change = np.asarray((particles.mass[:, None] * (new.v - particles.v)).sum(axis=0))
-    assert_close(change, -impulse + 6 * dt * mass * np.array([0.0, -9.81]), 1e-9)
+    assert_close(change, -impulse + 16 * dt * mass * np.array([0.0, -9.81]), 1e-9)
     assert -impulse[1] > 0.1 * mass
-    assert -impulse[0] < -0.01 * mass
+    assert -impulse[0] > 0.01 * mass
     assert_close(new.x[0] - new.x[-1], new.F[0] @ (particles.x[0] - particles.x[-1]), 1e-12)
 
 

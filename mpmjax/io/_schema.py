@@ -165,7 +165,8 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
         return tuple(decode(d, items[0], _nth(where, i), arrays) for i, d in enumerate(data, 1))
     if items and isinstance(data, list) and not _forms(expected):  # of arrays, each of its own shape
         return tuple(decode(d, items[0], _nth(where, i), arrays) for i, d in enumerate(data, 1))
-    if any(is_module(a) for a in choices):
+    number = isinstance(data, (int, float)) and not isinstance(data, bool) and (float, 0) in _forms(expected)
+    if any(is_module(a) for a in choices) and not number:
         plain = [a.__name__ for a in choices if is_module(a) and not inspect.isabstract(a)]
         return _object(data, classes, any(inspect.isabstract(a) for a in choices), where, arrays, plain)
     if enums := [a for a in choices if is_enum(a)]:
