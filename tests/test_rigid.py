@@ -216,6 +216,14 @@ def test_guides_hold_it():
     assert_close(particles.F, np.broadcast_to(np.eye(2), particles.F.shape))
 
 
+@pytest.mark.thorough
+def test_in_one_dimension_it_only_moves():
+    """There is nothing to turn."""
+    scene, particles = thrown(1, v=(0.1,), gravity=(-1.0,))
+    particles, _ = mpm.step(scene, particles, 0.0, 0.01)
+    assert_close(particles.v, np.full(particles.v.shape, 0.09))
+
+
 @pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in ("explicit", "implicit_midpoint")}, "explicit"))
 def test_what_falls_on_a_floor_gets_its_force(method):
     """The change of momentum is that by gravity and the floor's push and friction; a spinning block is driven along by
@@ -311,6 +319,7 @@ BAD = {
         ),
         "at one point",
     ),
+    "a viscosity": (lambda: mpm.Viscous(RIGID, 1.0), "nothing that flows"),
     "a budget": (lambda: mpm.budget(*thrown(), steps=1, dt=1e-3), "how a Rigid body moves"),
 }
 

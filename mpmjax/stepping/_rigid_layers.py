@@ -100,7 +100,8 @@ def _body(particles: Particles, material: RigidMaterial) -> RigidBody:
 
 def _image(scene: Scene, body: RigidBody, places: NodeVector, layer: int) -> RigidImage:
     grid = scene.grid
-    per_root, count = jnp.linalg.inv(body.root()), len(places) // grid.layers
+    root, count = body.root(), len(places) // grid.layers
+    per_root = jnp.linalg.inv(root) if len(root) else root
     arms = places[:count] - body.centre
     if any(grid.periodic):  # to the nearest image
         period = jnp.asarray(grid.shape, arms.dtype) * grid.spacing
@@ -149,7 +150,9 @@ def _held(
     turned = resists + jnp.sqrt(jnp.finfo(arms.dtype).eps) * jnp.trace(resists) * jnp.eye(
         len(resists), dtype=arms.dtype
     )
-    spin = jnp.linalg.solve(jnp.where(some, turned, jnp.eye(len(resists), dtype=arms.dtype)), momentum)
+    spin = momentum
+    if len(spin):
+        spin = jnp.linalg.solve(jnp.where(some, turned, jnp.eye(len(spin), dtype=arms.dtype)), momentum)
     spin = jnp.where(some & material.freedom.turns, _of_chords(spin, dt), 0)
     velocity = jnp.where(by_nodes & ~guided, mean - spinning(spin, middle[None])[0], 0)
     fixed = jnp.stack([guided | by_nodes | by_planes, jnp.broadcast_to(~spins, (d,))])
