@@ -82,7 +82,7 @@ def moved_rigidly(
         v = v.at[rows].set(end[0] + spinning(spin, arms))
         if C is not None:
             C = C.at[rows].set(spinning(spin, jnp.eye(before.dim, dtype=x.dtype)).T)
-        deformations[material.number] = R @ before.deformations[material.number]
+        deformations[material.number] = R @ jnp.asarray(before.deformations[material.number])
     return replace(after, x=x, v=v, C=C, deformations=tuple(deformations))
 
 
