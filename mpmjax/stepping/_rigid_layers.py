@@ -5,9 +5,9 @@ from dataclasses import replace
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, NodeScalar, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary import Conditions, Image, Mirror, RigidImage
-from mpmjax.geometry import RigidBody, inertia, moment, rigid_body, rotation_of, spinning
+from mpmjax.geometry import RigidBody, inertia, moment, rigid_body, rotation_of, spinning, turn
 from mpmjax.state import Particles, RigidMaterial, Scene
 
 
@@ -53,20 +53,28 @@ def rigid_layers(
 
 
 def moved_rigidly(
-    scene: Scene, before: Particles, after: Particles, mirror: Mirror, new: NodeVector, mean: NodeVector, dt: Scalar
+    scene: Scene,
+    before: Particles,
+    after: Particles,
+    mirror: Mirror,
+    fixed: Mask,
+    new: NodeVector,
+    mean: NodeVector,
+    dt: Scalar,
 ) -> Particles:
     """The particles after G2P with those of rigid bodies moved as one, whatever the transfer:
 
         c ← c + Δt V̄,    x_p ← c + R (x_p − c),    v_p ← V + ω × (x_p − c),    F_p ← R F_p,
 
     where R is the rotation at the mean angular momentum I ω̄, and the spin at the end has the angular momentum after the
-    step.
+    step; of a body whose spin is prescribed, R is the rotation by Δt ω̄ and the spin is that.
 
     Args:
         scene: the scene.
         before: the particles at the start of the step.
         after: those after G2P.
         mirror: the mirrors of the nodes.
+        fixed: the components of the nodes' velocity that are prescribed, shape (n, d).
         new: velocity of the nodes after the step [m/s], shape (n, d), folded.
         mean: the velocity with which positions move [m/s], likewise.
         dt: step [s].
@@ -76,8 +84,12 @@ def moved_rigidly(
         rows, body = slice(*before.groups[material.number].rows), _body(before, material)
         end, over = image.own(new), image.own(mean)
         R = rotation_of(body, body.inertia @ image.spin(over[1]), dt)
-        arms = (R @ body.arms.T).T
         spin = _spin_after(body, R, body.inertia @ image.spin(end[1]))
+        if before.dim == 3:  # else the two are the same
+            held, axes = image.own(fixed)[1].any(), jnp.eye(3, dtype=x.dtype)
+            R = jnp.where(held, turn(axes, dt * image.spin(over[1])).T, R)
+            spin = jnp.where(held, image.spin(end[1]), spin)
+        arms = (R @ body.arms.T).T
         x = x.at[rows].set(body.centre + dt * over[0] + arms)
         v = v.at[rows].set(end[0] + spinning(spin, arms))
         if C is not None:

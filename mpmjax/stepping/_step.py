@@ -274,7 +274,16 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
     )
     if not scene.rigid_bodies:
         return after
-    return moved_rigidly(scene, particles, after, potential.mirror, new.motion.velocity, new.motion.carrier, nodes.dt)
+    return moved_rigidly(
+        scene,
+        particles,
+        after,
+        potential.mirror,
+        nodes.conditions.fixed,
+        new.motion.velocity,
+        new.motion.carrier,
+        nodes.dt,
+    )
 
 
 @checked
