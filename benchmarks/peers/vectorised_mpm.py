@@ -8,6 +8,7 @@ import ctypes
 import os
 import subprocess
 import tempfile
+import weakref
 from functools import cache
 from pathlib import Path
 
@@ -68,9 +69,7 @@ class VectorisedMPM:
             volume,
             len(os.sched_getaffinity(0)),
         )
-
-    def __del__(self):
-        self._library.end(self._body)
+        weakref.finalize(self, self._library.end, self._body)
 
     def run(self, steps: int, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Go on for some steps. Returns x, v and F, in double precision."""
