@@ -196,13 +196,15 @@ def test_a_plate_with_a_force_on_it_presses_with_its_weight_and_the_force():
     assert np.ptp(plate, axis=0).max() < 1e-12
 
 
-@pytest.mark.parametrize("d", [2])  # in 3-D it follows to the order of the step alone: see docs/bodies.md
-def test_a_grip_that_turns_carries_it_along(d):
-    """To where the motion takes it, though a grip's nodes move along chords."""
+@pytest.mark.parametrize(("d", "reach"), [(2, 0.6), pytest.param(3, 0.6, marks=pytest.mark.thorough), (2, 0.25)])
+def test_a_grip_that_turns_carries_it_along(d, reach):
+    """To where the motion takes it, though a grip's nodes move along chords, whether it holds all of it or an end."""
     scene, particles = thrown(d, spin=[0.0] * (1 if d == 2 else 3))
+    corner = tuple(float(c) for c in np.asarray(particles.x).max(axis=0))
+    region = mpm.Ball((0.0,) * d, reach) if reach > 0.5 else mpm.Ball(corner, reach)
     times, turned = (0.0, 1.0), (0.0, 2.0) if d == 2 else ((0.0, 0.0, 0.0), (0.3, 2.0, 0.0))
     motion = mpm.RigidMotion(times, ((0.0,) * d, (0.2,) + (0.0,) * (d - 1)), turned, (0.0,) * d)
-    scene = mpm.Scene(scene.grid, RIGID, boundary=mpm.Grip(mpm.Ball((0.0,) * d, 0.6), motion))
+    scene = mpm.Scene(scene.grid, RIGID, boundary=mpm.Grip(region, motion))
     run = mpm.simulate(scene, particles, t1=0.5, dt=0.05)
     assert_close(run.final.x, motion.place(particles.x, 0.5), 0, 1e-8)
 

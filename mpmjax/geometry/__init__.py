@@ -5,7 +5,15 @@ from mpmjax.geometry._hollow import Annulus, Tube
 from mpmjax.geometry._motion import AbstractMotion, Motion, RigidMotion, still, turn
 from mpmjax.geometry._parts import inside_parts
 from mpmjax.geometry._region import AbstractRegion, Ball, Box, Capsule, Cylinder, HalfSpace, Union, length
-from mpmjax.geometry._rigid_body import RigidBody, inertia, moment, rigid_body, rotation_of, spinning
+from mpmjax.geometry._rigid_body import (
+    RigidBody,
+    inertia,
+    moment,
+    rigid_body,
+    rotation_of,
+    rotation_of_chords,
+    spinning,
+)
 from mpmjax.geometry._sampled import SampledDistance, sample_distance, sample_mesh
 from mpmjax.geometry._surface import Pieces, surface_pieces
 from mpmjax.geometry._time_series import Changing, ChangingVector, TimeSeries, require_some, value_at, vector_size
@@ -37,6 +45,7 @@ __all__ = [
     "require_some",
     "rigid_body",
     "rotation_of",
+    "rotation_of_chords",
     "sample_distance",
     "sample_mesh",
     "spinning",

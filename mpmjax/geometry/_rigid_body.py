@@ -8,8 +8,8 @@ from mpmjax._types import Array, Float, ParticleVector, Scalar
 from mpmjax.geometry._motion import turn
 
 _NEWTON = 6
-"""Steps of Newton's method for the mean angular momentum in a body's frame. The first error is that of ½ ω Δt, and
-squared by each step; three would do at a tenth of a radian a step."""
+"""Steps of Newton's method for the mean angular momentum in a body's frame, and for the rotation of chords. The first
+error is of the order of the angle of a step, and squared by each; three would do at a tenth of a radian."""
 
 
 class RigidBody(eqx.Module):
@@ -113,6 +113,37 @@ def rotation_of(body: RigidBody, momentum: Float[Array, "r"], dt: Scalar) -> Flo
     for _ in range(_NEWTON):
         mean = mean - jnp.linalg.solve(jax.jacfwd(missing)(mean), missing(mean))
     return turn(axes, dt * inverse @ mean).T
+
+
+def rotation_of_chords(
+    arms: Float[Array, "m d"], chords: Float[Array, "m d"], mass: Float[Array, "m"]
+) -> Float[Array, "r"]:
+    """The angle or rotation vector [rad] by which points turn that move along chords, u = R r − r: that with
+
+        Σ m r × (R r − r) = Σ m r × u.
+
+    Of chords that are no rotation's it is one near them. Points that leave a direction open do not turn about it.
+
+    Args:
+        arms: places r before, from their middle [m], shape (m, d).
+        chords: displacements u [m], less their mean, shape (m, d).
+        mass: weights, shape (m,). Where all are zero nothing turns.
+    """
+    d, axes = arms.shape[1], jnp.eye(arms.shape[1], dtype=arms.dtype)
+    given = moment(arms, mass[:, None] * chords).sum(axis=0)
+    if d == 1:
+        return given
+    second = (mass * arms.T) @ arms  # Σ m r rᵀ
+    size = jnp.trace(second)
+    second = second / jnp.where(size > 0, size, 1) + jnp.where(size > 0, jnp.sqrt(jnp.finfo(arms.dtype).eps), 1) * axes
+
+    def missing(rotation: Array) -> Array:
+        return moment(axes, turn(second, rotation) - second).sum(axis=0) - given / jnp.where(size > 0, size, 1)
+
+    rotation = jnp.zeros_like(given)
+    for _ in range(_NEWTON):
+        rotation = rotation - jnp.linalg.solve(jax.jacfwd(missing)(rotation), missing(rotation))
+    return rotation
 
 
 def _stretched(dt: Scalar, spin: Array) -> Array:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary import Conditions, Image, Mirror, RigidImage
-from mpmjax.geometry import RigidBody, inertia, moment, rigid_body, rotation_of, spinning, turn
+from mpmjax.geometry import RigidBody, rigid_body, rotation_of, rotation_of_chords, spinning, turn
 from mpmjax.state import Particles, RigidMaterial, Scene
 
 
@@ -156,29 +156,11 @@ def _held(
     mean, middle = per_total * (weight * value).sum(axis=0), per_total * (weight * image.arms).sum(axis=0)
     whole = jnp.where(held.all(axis=1), own, 0)
     arms = jnp.where((whole > 0)[:, None], image.arms - middle, 0)
-    momentum = moment(arms, whole[:, None] * (value - mean)).sum(axis=0)
-    resists = inertia(arms, whole)
-    some = whole.sum() > 0
-    turned = resists + jnp.sqrt(jnp.finfo(arms.dtype).eps) * jnp.trace(resists) * jnp.eye(
-        len(resists), dtype=arms.dtype
-    )
-    spin = momentum
-    if len(spin):
-        spin = jnp.linalg.solve(jnp.where(some, turned, jnp.eye(len(spin), dtype=arms.dtype)), momentum)
-    spin = jnp.where(some & material.freedom.turns, _of_chords(spin, dt), 0)
-    velocity = jnp.where(by_nodes & ~guided, mean - spinning(spin, middle[None])[0], 0)
+    angle = jnp.where(material.freedom.turns, rotation_of_chords(arms, dt * (value - mean), whole), 0)
+    back = turn(middle[None], angle)[0] - middle if len(angle) else 0.0  # the centre too moves along its chord
+    velocity = jnp.where(by_nodes & ~guided, mean - back / dt, 0)
     fixed = jnp.stack([guided | by_nodes | by_planes, jnp.broadcast_to(~spins, (d,))])
-    return fixed, _first_two(image, velocity, body.root() @ spin)[:2]
-
-
-def _of_chords(spin: Float[Array, "r"], dt: Scalar) -> Float[Array, "r"]:
-    """ω [rad/s] of points that move along the chords of their circles, from the spin of their velocities, sin(ωΔt)/Δt
-    about the axis."""
-    square = (dt**2 * spin**2).sum()
-    small = square < 1e-4  # where it is its series, to the last digit
-    sine = jnp.sqrt(jnp.where(small, 0.25, jnp.minimum(square, 0.99)))
-    series = 1 + square / 6 + 3 * square**2 / 40 + 5 * square**3 / 112
-    return spin * jnp.where(small, series, jnp.arcsin(sine) / sine)
+    return fixed, _first_two(image, velocity, body.root() @ angle / dt)[:2]
 
 
 def _reaches(image: RigidImage, plane: Image, own: Float[Array, "m"]) -> Array:
