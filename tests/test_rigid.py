@@ -209,6 +209,38 @@ def test_a_grip_that_turns_carries_it_along(d, reach):
     assert_close(run.final.x, motion.place(particles.x, 0.5), 0, 1e-8)
 
 
+def test_a_grip_that_turns_it_gets_its_angular_momentum():
+    """By which it is turned from rest."""
+    scene, particles = thrown(spin=[0.0])
+    motion = mpm.RigidMotion((0.0, 1.0), ((0.0, 0.0), (0.0, 0.0)), (0.0, 2.0), (0.0, 0.0))
+    grip = mpm.Grip(mpm.Ball((0.2, 0.1), 0.25), motion)
+    scene = mpm.Scene(scene.grid, RIGID, boundary=grip, boundary_forces=True)
+    new, info = mpm.step(scene, particles, 0.0, 0.05)
+    assert_close(body_of(new).spin, [2.0], 1e-9)
+    assert_close(info.boundaries.angular[0], -spin_momentum(new), 1e-9)
+
+
+@pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in ("explicit", "implicit_midpoint")}, "explicit"))
+@pytest.mark.parametrize("wall", ["plane", "slip"])
+def test_a_plane_or_a_wall_that_it_reaches_is_told_what_holds_it(wall, method, d):
+    """It stops the spin of a body, which slides on upright. It gets the weight and the angular momentum."""
+    scene, particles = thrown(d, v=(0.0, 0.1, 0.2)[:d], cells=14)
+    particles = dataclasses.replace(particles, x=particles.x + jnp.array([0.23, 0.03, 0.01])[:d])
+    held = mpm.SymmetryPlane(0, 0.0) if wall == "plane" else mpm.SlipBox((0.0,) + (-np.inf,) * (d - 1), (np.inf,) * d)
+    gravity = jnp.array([-2.0, -1.0, -0.5])[:d]
+    scene = mpm.Scene(scene.grid, RIGID, gravity=gravity, boundary=held, boundary_forces=True)
+    new, info = mpm.step(scene, particles, 0.0, 0.01, method=method)
+    given, weight, before = info.boundaries, 0.01 * particles.mass.sum() * gravity, body_of(particles)
+    normal = jnp.eye(d)[0]
+    assert_close(given.impulse[0], normal * weight, 1e-9)
+    assert_close(body_of(new).velocity, (1 - normal) * (before.velocity + 0.01 * gravity), 1e-12)
+    about = before.centre if method == METHODS["explicit"] else (before.centre + body_of(new).centre) / 2
+    assert scene.boundary[0].pivot(0.0) is None, "torques are about the origin"
+    turned = spin_momentum(particles) - spin_momentum(new) + moment(about[None], weight[None])[0]
+    assert_close(given.angular[0], turned, 1e-9)
+
+
 def test_guides_hold_it():
     """It falls sideways alone, upright, where it may do nothing else."""
     scene, particles = thrown(spin=[3.0], v=(0.1, 0.2))

@@ -6,6 +6,7 @@ from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall
 from mpmjax.boundary._boundary_impulse import (
     BoundaryImpulse,
     Given,
+    GivenCouple,
     Owners,
     impulse_on_boundaries,
     no_boundary_impulse,
@@ -67,6 +68,7 @@ __all__ = [
     "FaceShape",
     "Faces",
     "Given",
+    "GivenCouple",
     "Grip",
     "Image",
     "Mirror",

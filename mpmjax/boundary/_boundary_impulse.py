@@ -114,11 +114,23 @@ def taken_by_mirrors(
     return given, remaining
 
 
-def impulse_on_boundaries(given: list[Given], places: NodeVector, pivots: Float[Array, "b d"]) -> BoundaryImpulse:
+class GivenCouple(eqx.Module):
+    """A couple on a rigid body, and the boundary that gives it."""
+
+    moment: Float[Array, "r"]
+    """[kg m²/s], shape (r,)."""
+    owner: Int[Array, ""]
+    """The number of the boundary, −1 for none."""
+
+
+def impulse_on_boundaries(
+    given: list[Given], couples: list[GivenCouple], places: NodeVector, pivots: Float[Array, "b d"]
+) -> BoundaryImpulse:
     """The impulse on each boundary: minus what it gives the nodes.
 
     Args:
         given: what they give.
+        couples: what they give besides.
         places: positions of the nodes [m], shape (n, d).
         pivots: the points for torques [m], shape (b, d).
     """
@@ -131,7 +143,9 @@ def impulse_on_boundaries(given: list[Given], places: NodeVector, pivots: Float[
             for part in given
         ]
         total = sum((part for part in parts if part is not None), jnp.zeros_like(places))
-        return -total.sum(axis=0), -moment(places - pivot, total).sum(axis=0)
+        angular = moment(places - pivot, total).sum(axis=0)
+        angular = sum((jnp.where(part.owner == number, part.moment, 0) for part in couples), angular)
+        return -total.sum(axis=0), -angular
 
     each = [on(number, pivot) for number, pivot in enumerate(pivots)]
     return BoundaryImpulse(jnp.stack([linear for linear, _ in each]), jnp.stack([angular for _, angular in each]))

@@ -131,6 +131,21 @@ class RigidImage(eqx.Module):
         own = self.own(field)
         return self.with_own(field, own[0] + spinning(self.spin(own[1]), self.arms))
 
+    def angular(self, momentum: Float[Array, "d"]) -> Float[Array, "r"]:
+        """Iω = Gᵀ M s [kg m²/s] from M s [kg m/s] of the second node."""
+        rank = len(self.per_root)
+        return jnp.linalg.solve(self.per_root.T, momentum[:rank]) if rank else momentum[:0]
+
+    def reaches(self, plane: Image, mass: NodeScalar) -> Bool[Array, "d"]:
+        """The axis of a plane on or beyond which the body has mass, as a mask of the directions; else nothing.
+
+        Args:
+            plane: the mirror.
+            mass: masses of all nodes [kg], shape (n,).
+        """
+        there = self.own(plane.along(plane.odd <= 0)) & (self.own(mass) > 0)
+        return there.any() & (jnp.arange(self.arms.shape[1]) == plane.axis)
+
     def at_rest(self) -> "RigidImage":
         """The same map: it has no motion of its own."""
         return self

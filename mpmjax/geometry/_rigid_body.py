@@ -135,10 +135,12 @@ def rotation_of_chords(
         return given
     second = (mass * arms.T) @ arms  # Σ m r rᵀ
     size = jnp.trace(second)
-    second = second / jnp.where(size > 0, size, 1) + jnp.where(size > 0, jnp.sqrt(jnp.finfo(arms.dtype).eps), 1) * axes
+    per_size = 1 / jnp.where(size > 0, size, 1)
+    least = jnp.sqrt(jnp.finfo(arms.dtype).eps) if d == 3 else 0.0  # of points on one line
+    second = per_size * second + jnp.where(size > 0, least, 1) * axes
 
     def missing(rotation: Array) -> Array:
-        return moment(axes, turn(second, rotation) - second).sum(axis=0) - given / jnp.where(size > 0, size, 1)
+        return moment(axes, turn(second, rotation) - second).sum(axis=0) - per_size * given
 
     rotation = jnp.zeros_like(given)
     for _ in range(_NEWTON):

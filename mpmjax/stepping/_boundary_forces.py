@@ -3,11 +3,13 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import Array, NodeScalar, NodeVector, Scalar
+from mpmjax._types import Array, Float, Int, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary import (
     BoundaryImpulse,
     ConstrainedNodes,
     Given,
+    GivenCouple,
+    Image,
     Owners,
     RigidImage,
     brought_images,
@@ -16,6 +18,8 @@ from mpmjax.boundary import (
     taken_by_mirrors,
 )
 from mpmjax.discretisation import AbstractTransfer, Gathered, Stencil
+from mpmjax.geometry import moment
+from mpmjax.material import Freedom
 from mpmjax.state import Particles, Scene
 from mpmjax.stepping._nodes import Nodes, places_of
 
@@ -29,6 +33,7 @@ def given_to_boundaries(
     nodes: Nodes,
     reaction: NodeVector,
     before: NodeVector | None,
+    solved: NodeVector,
     mean: NodeVector | None,
     held: ConstrainedNodes,
     slowed: tuple[NodeVector, ...],
@@ -44,8 +49,10 @@ def given_to_boundaries(
         nodes: the same, folded.
         reaction: the impulse on all nodes besides gravity, body forces and internal ones, without friction [kg m/s],
             shape (n, d).
-        before: the velocity whose change over the step transfers take [m/s], shape (n, d); None if it is not known.
-        mean: the velocity with which positions move [m/s], shape (n, d); None if it is v^{n+1}.
+        before: the folded nodes' velocity whose change over the step transfers take [m/s], shape (n, d); None if it is
+            not known.
+        solved: their velocity v^{n+1} before friction [m/s], shape (n, d).
+        mean: their velocity with which positions move [m/s], shape (n, d); None if it is v^{n+1}.
         held: the nodes with what contacts hold.
         slowed: the change of velocity by the friction of each contact [m/s], shape (n, d).
     """
@@ -55,8 +62,12 @@ def given_to_boundaries(
     unfold, colliders = nodes.mirror.unfold, nodes.conditions.colliders
     at = scene.nodes(particles, t)
     owners = owners_of(scene.boundary, nodes.conditions, at, grid.spacing, t, dt, reference=scene.total)
-    for image in nodes.mirror.rigid:
-        owners = _held_as_one(owners, image, unfolded.mass)
+    planes = [(number, image) for number, image in images if isinstance(image, Image)]
+    couples, soft = [], jnp.ones_like(unfolded.mass, dtype=bool)
+    for body, image in zip(scene.rigid_bodies, nodes.mirror.rigid, strict=True):
+        owners, of_spin = _spread(owners, image, unfolded.mass, planes, body.freedom)
+        couples.append(GivenCouple(_couple(image, unfolded, nodes, solved), of_spin))
+        soft = image.with_own(soft, jnp.zeros(len(image.arms), dtype=bool))
 
     # springs act on all nodes
     given, residual = [], reaction
@@ -70,7 +81,8 @@ def given_to_boundaries(
     # what symmetry planes take of the impulses on all nodes, and what reaches the folded ones
     if scene.transfer.needs_change and before is not None:
         kept = _share_of_change(scene.transfer, scene.grid.dim, residual.dtype)
-        residual = residual + kept * unfolded.mass[:, None] * (unfolded.velocity - before)
+        mass = jnp.where(soft, unfolded.mass, 0) if couples else unfolded.mass  # a rigid body takes the velocity
+        residual = residual + kept * mass[:, None] * (unfolded.velocity - unfold(before))
     of_planes, residual = taken_by_mirrors(residual, images)
     given += of_planes
 
@@ -103,24 +115,56 @@ def given_to_boundaries(
     if scene.total:
         places = _moved_places(scene, particles, stencil, unfolded, owners, at, t)
     if mean is not None:
-        places = places + dt / 2 * mean
+        carried = unfold(mean)
+        for image in nodes.mirror.rigid:  # to where its centre goes; its couple is about that
+            carried = image.with_own(carried, jnp.broadcast_to(image.own(mean)[0], image.arms.shape))
+        places = places + dt / 2 * carried
         pivots = (pivots + _pivots(scene, t + dt, residual)) / 2
-    return impulse_on_boundaries(given, places, pivots)
+    return impulse_on_boundaries(given, couples, places, pivots)
 
 
-def _held_as_one(owners: Owners, image: RigidImage, mass: NodeScalar) -> Owners:
-    """The owners where the first that holds a node of a rigid body holds all of them in this direction.
+def _spread(
+    owners: Owners, image: RigidImage, mass: NodeScalar, planes: list[tuple[int, Image]], freedom: Freedom
+) -> tuple[Owners, Int[Array, ""]]:
+    """The owners where what holds a node of a rigid body holds all of them in this direction, and who holds its spin.
+
+    The first one holds. Directions in which nothing is held add up to no force; their moment is that of who holds the
+    spin. What the body's own guides hold is nobody's.
 
     Args:
         owners: what boundaries hold, node by node.
         image: the map of the rigid body.
         mass: masses of all nodes [kg], shape (n,).
+        planes: the symmetry planes, with their boundaries' numbers.
+        freedom: what the body may do.
     """
     own, full = image.own(owners.fixed), image.own(mass) > 0
-    count = jnp.iinfo(own.dtype).max
-    first = jnp.where((own >= 0) & full[:, None], own, count).min(axis=0)
-    spread = jnp.broadcast_to(jnp.where(first == count, -1, first), own.shape)
-    return eqx.tree_at(lambda o: o.fixed, owners, image.with_own(owners.fixed, spread))
+    nobody = jnp.iinfo(own.dtype).max
+    first = jnp.where((own >= 0) & full[:, None], own, nobody).min(axis=0)
+    for number, plane in planes:
+        first = jnp.where(image.reaches(plane, mass), jnp.minimum(first, number), first)
+    of_spin = first.min()
+    first = jnp.where(first == nobody, of_spin, first)
+    if freedom.directions is not None:
+        first = jnp.where(jnp.asarray(freedom.directions), first, nobody)
+    first, of_spin = (jnp.where(number == nobody, -1, number) for number in (first, of_spin))
+    spread = image.with_own(owners.fixed, jnp.broadcast_to(first, own.shape))
+    return eqx.tree_at(lambda o: o.fixed, owners, spread), of_spin
+
+
+def _couple(image: RigidImage, unfolded: Nodes, nodes: Nodes, solved: NodeVector) -> Float[Array, "r"]:
+    """The change of a rigid body's angular momentum Iω less that of its nodes [kg m²/s], shape (r,): the nodes have an
+    inertia and a spin of their own.
+
+    Args:
+        image: the map of the rigid body.
+        unfolded: the nodes at the start of the step, not folded.
+        nodes: the same, folded.
+        solved: the folded nodes' velocity at the end, before friction [m/s], shape (n, d).
+    """
+    changed = image.own(solved - nodes.velocity)[1]
+    of_nodes = image.own(unfolded.mass[:, None] * (nodes.mirror.unfold(solved) - unfolded.velocity))
+    return image.angular(image.own(nodes.mass)[1] * changed) - moment(image.arms, of_nodes).sum(axis=0)
 
 
 def _share_of_change(transfer: AbstractTransfer, dim: int, dtype: jnp.dtype) -> Array:

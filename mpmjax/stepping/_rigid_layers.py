@@ -142,7 +142,7 @@ def _held(
     """
     own, d = image.own(mass), image.arms.shape[1]
     held = image.own(conditions.fixed) & (own > 0)[:, None]
-    of_planes = [_reaches(image, plane, own) for plane in planes.images if isinstance(plane, Image)]
+    of_planes = [image.reaches(plane, mass) for plane in planes.images if isinstance(plane, Image)]
     guided = jnp.zeros(d, bool) if material.freedom.directions is None else ~jnp.asarray(material.freedom.directions)
     by_nodes = held.any(axis=0)
     by_planes = jnp.stack(of_planes).any(axis=0) if of_planes else jnp.zeros(d, bool)
@@ -161,9 +161,3 @@ def _held(
     velocity = jnp.where(by_nodes & ~guided, mean - back / dt, 0)
     fixed = jnp.stack([guided | by_nodes | by_planes, jnp.broadcast_to(~spins, (d,))])
     return fixed, _first_two(image, velocity, body.root() @ angle / dt)[:2]
-
-
-def _reaches(image: RigidImage, plane: Image, own: Float[Array, "m"]) -> Array:
-    """The axis of a plane that holds a body, which has mass on it or beyond, as a mask of the directions."""
-    beyond = image.own(plane.along(plane.odd <= 0))
-    return (beyond & (own > 0)).any() & (jnp.arange(image.arms.shape[1]) == plane.axis)

@@ -120,12 +120,22 @@ def step_unchecked(
     outside = (~stencil.inside).sum().astype(jnp.int32)
     boundaries = None
     if scene.boundary_forces:
-        before, mean = jax.tree.map(nodes.mirror.unfold, (new.before, new.motion.mean))
         reaction = new.reaction
         if nodes.mirror.images:  # of all nodes
             reaction = impulses(unfolded, method, jax.tree.map(nodes.mirror.unfold, new.solved))[1]
         boundaries = given_to_boundaries(
-            scene, particles, stencil, t, unfolded, nodes, reaction, before, mean, new.held, new.slowed
+            scene,
+            particles,
+            stencil,
+            t,
+            unfolded,
+            nodes,
+            reaction,
+            new.before,
+            new.solved.velocity,
+            new.motion.mean,
+            new.held,
+            new.slowed,
         )
     undone = _left_undone(nodes, method, new)
     return after, StepInfo(new.solve, new.contact, outside, undone, _given_to_colliders(nodes, new), boundaries)
