@@ -4,8 +4,10 @@
 //   gather   index, weights, derivatives [, their changes], nodes      ->  a, a_b for each direction
 //   scatter  index, weights, derivatives [, their changes], given ...  ->  nodes
 //   pull     index, weights, derivatives, nodes, given ...             ->  by weights, by derivatives
+//   resist   index, weights, derivatives, matrices, nodes              ->  nodes
 //
-// Factors are (..., d, s, p), given and gathered (..., c, p), nodes (..., n, c), with the same leading axes everywhere.
+// Factors are (..., d, s, p), given and gathered (..., c, p), nodes (..., n, c), matrices (..., d² (d² + 1) / 2, p), with
+// the same leading axes everywhere.
 // `valued` says whether the first of the given is the value; `differential` whether changes of the factors follow them.
 
 #include <string>
@@ -181,6 +183,24 @@ struct PullOf {
   }
 };
 
+struct ResistOf {
+  template <class T>
+  bool run(const Pool& pool, Call& call) const {
+    const int64_t m = call.d * call.d;
+    Resist<T> task = {};
+    task.stencils = call.stencils<T>(false);
+    task.size = call.dim(4, 2);
+    task.columns = call.d;
+    task.matrices = call.at<T>(3, {m * (m + 1) / 2, call.particles});
+    task.moved = call.at<T>(4, {task.size, call.d});
+    task.nodes = call.at<T>(5, {task.size, call.d});
+    call.expect(call.operands == 5 && call.buffers.size() == 6, "too many or too few arrays");
+    call.expect(task.size > 0 || call.particles == 0, "no nodes to gather from");
+    if (!call.fault.empty()) return true;
+    return resist(pool, {int(call.d), int(call.s), false}, call.batch, task);
+  }
+};
+
 template <class Problem>
 ffi::Error run(const Problem& problem, ffi::ThreadPool threads, const ffi::RemainingArgs& arguments,
                const ffi::RemainingRets& results) {
@@ -208,6 +228,10 @@ ffi::Error run_pull(ffi::ThreadPool threads, bool valued, ffi::RemainingArgs arg
   return run(PullOf{valued}, threads, arguments, results);
 }
 
+ffi::Error run_resist(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  return run(ResistOf{}, threads, arguments, results);
+}
+
 ffi::Error run_threads(ffi::ThreadPool threads, ffi::ResultBuffer<ffi::DataType::S32> count) {
   *count->typed_data() = static_cast<int32_t>(threads.num_threads());
   return ffi::Error::Success();
@@ -233,6 +257,8 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_scatter, mpmjax::run_scatter,
                                   .RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_pull, mpmjax::run_pull,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<bool>("valued").RemainingArgs().RemainingRets());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_resist, mpmjax::run_resist,
+                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
 
 // The threads that sums are shared among.
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_threads, mpmjax::run_threads,

@@ -57,9 +57,9 @@ def native(index, w, g, given, nodes, valued=True, graded=True):
     parts = [*given[:1]] * valued + [*given[1:]] * graded
     params = {"valued": valued, "batched": 0}
     return (
-        sums._gather_p.bind(index, w, g, nodes, batched=0),
-        sums._scatter_p.bind(index, w, g, *parts, size=nodes.shape[0], **params),
-        sums._pull_p.bind(index, w, g, nodes, *parts, **params),
+        sums.gather_p.bind(index, w, g, nodes, batched=0),
+        sums.scatter_p.bind(index, w, g, *parts, size=nodes.shape[0], **params),
+        sums.pull_p.bind(index, w, g, nodes, *parts, **params),
     )
 
 

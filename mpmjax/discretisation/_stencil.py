@@ -59,6 +59,11 @@ class Stencil(eqx.Module):
         return jax.tree.map(lambda factor: factor[..., particles], whole)
 
     @property
+    def factors(self) -> tuple[Array, Array, Array]:
+        """What sums are told of it: terms of the index, weights and their derivatives, each (d, s, p)."""
+        return self.index_factors, self.weights, self.weight_derivatives
+
+    @property
     def index(self) -> Indices:
         """Flat index of each stencil node, shape (s^d, p)."""
         return _tensor(jnp.add, list(self.index_factors))
