@@ -28,15 +28,21 @@ MPMJAX_APART void copy_some(const T* from, int count, T* to) {
   for (int q = 0; q < count; ++q) to[q] = from[q];
 }
 
-// The same. Blocks come one after the other, in more streams than a processor foresees by itself: a later one is asked
-// for here.
+// Asks for what a later block has of an array. Blocks come one after the other, in more streams than a processor foresees
+// by itself.
+template <class T>
+MPMJAX_INLINE void ask(const T* from) {
+  const uintptr_t later = reinterpret_cast<uintptr_t>(from) + kAhead * sizeof(T);  // perhaps beyond the array's end
+  __builtin_prefetch(reinterpret_cast<const void*>(later));
+}
+
+// Copies a block, or what there is of it.
 template <class T>
 MPMJAX_INLINE void copy(const T* from, int count, T* to) {
   if (__builtin_expect(count != kBlock, 0)) return copy_some(from, count, to);
   std::memcpy(to, from, kBlock * sizeof(T));
-  const uintptr_t later = reinterpret_cast<uintptr_t>(from) + kAhead * sizeof(T);  // perhaps beyond the array's end
-  __builtin_prefetch(reinterpret_cast<const void*>(later));
-  if (kBlock * sizeof(T) > 64) __builtin_prefetch(reinterpret_cast<const void*>(later + 64));
+  ask(from);
+  if (kBlock * sizeof(T) > 64) ask(from + kBlock / 2);
 }
 
 // The factors of a block: numbers, or with `differential` numbers with their changes.

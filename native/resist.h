@@ -10,10 +10,39 @@ namespace {
 
 using mpmjax::Resist;
 
+// The rows of components of a block: those of a gradient along b are the first d of four from the (4 b)-th on, as they
+// are split.
+template <class T, int d>
+using Components = T[d * kLanes][kBlock];
+
+// K G for a block, some particles at once, with all sums in registers. K's entries are a stride apart.
+template <class T, int d>
+MPMJAX_APART void multiply(const T* entries, int64_t stride, const Components<T, d>& slopes, Components<T, d>& products) {
+  constexpr int bytes = 64, step = bytes / sizeof(T), m = d * d;
+  typedef T Some __attribute__((vector_size(bytes)));
+  const auto place = [](int i) { return i / d * kLanes + i % d; };
+  for (int q = 0; q < kBlock; q += step) {
+    Some slope[m], sum[m] = {}, entry;
+    for (int i = 0; i < m; ++i) std::memcpy(&slope[i], slopes[place(i)] + q, bytes);
+    const T* from = entries + q;
+#pragma GCC unroll 9
+    for (int i = 0; i < m; ++i) {
+#pragma GCC unroll 9
+      for (int j = i; j < m; ++j, from += stride) {
+        ask(from);
+        std::memcpy(&entry, from, bytes);
+        sum[i] += entry * slope[j];
+        if (j > i) sum[j] += entry * slope[i];
+      }
+    }
+    for (int i = 0; i < m; ++i) std::memcpy(products[place(i)] + q, &sum[i], bytes);
+  }
+}
+
 // r_p for the particles of a block, as a row for each direction.
 template <class T, int d, int s>
-MPMJAX_INLINE void resist_block(const Resist<T>& task, const Block<T, d, s, false>& block, int64_t start, int count,
-                                Vector<T> (*rows)[kBlock]) {
+MPMJAX_APART void resist_block(const Resist<T>& task, const Block<T, d, s, false>& block, int64_t start, int count,
+                               Vector<T> (*rows)[kBlock]) {
   const NodeRows<T> nodes(task.moved, task.size, d, 0);
   for (int q = 0; q < kBlock; ++q) {  // beyond the count weights are zero and the index is 0
     const auto put = [&](const auto& found) MPMJAX_INLINE_LAMBDA {
@@ -25,20 +54,18 @@ MPMJAX_INLINE void resist_block(const Resist<T>& task, const Block<T, d, s, fals
       put(Gatherer<T, d, s, false, false>{block, nodes, q}.template sums<0>(0));
     }
   }
-  // Lanes beyond the d-th are split and joined, and nothing else.
-  alignas(64) T slopes[d][kLanes][kBlock], found[d][kLanes][kBlock] = {}, entry[kBlock];
-  for (int b = 0; b < d; ++b) split<T>(rows[b], slopes[b]);
-  const T* from = task.matrices + start;
-  for (int i = 0; i < d * d; ++i) {
-    for (int j = i; j < d * d; ++j, from += task.stencils.particles) {
-      copy(from, count, entry);
-      T *to_i = found[i / d][i % d], *to_j = found[j / d][j % d];
-      const T *by_i = slopes[i / d][i % d], *by_j = slopes[j / d][j % d];
-      for (int q = 0; q < kBlock; ++q) to_i[q] += entry[q] * by_j[q];
-      for (int q = 0; q < kBlock && i != j; ++q) to_j[q] += entry[q] * by_i[q];
-    }
+  constexpr int entries = d * d * (d * d + 1) / 2;
+  const int64_t particles = task.stencils.particles;
+  alignas(64) Components<T, d> slopes, products = {};
+  for (int b = 0; b < d; ++b) split<T>(rows[b], slopes + b * kLanes);
+  if (count == kBlock) {
+    multiply<T, d>(task.matrices + start, particles, slopes, products);
+  } else {
+    alignas(64) T few[entries][kBlock];
+    for (int k = 0; k < entries; ++k) copy_some(task.matrices + k * particles + start, count, few[k]);
+    multiply<T, d>(few[0], kBlock, slopes, products);
   }
-  for (int b = 0; b < d; ++b) join<T>(found[b], rows[b]);
+  for (int b = 0; b < d; ++b) join<T>(products + b * kLanes, rows[b]);
 }
 
 // Sets the nodes of a range.

@@ -12,6 +12,8 @@ import pytest
 from helpers import assert_close, block, thorough
 
 import mpmjax as mpm
+from mpmjax import linalg as la
+from mpmjax.discretisation import _resistance
 from mpmjax.discretisation import _transfer_sums as sums
 from mpmjax.native import _library
 
@@ -37,19 +39,39 @@ def choose(monkeypatch):
     jax.clear_caches()
 
 
-def problem(d, s, c, p, dtype, seed=0, *, wild=True):
+def problem(d, s, c, p, dtype, seed=0, *, wild=True, side=SIDE):
     """Index factors, weights and derivatives, what particles give, and node values. With `wild` some particles reach
     over the window's edges, and one has indices without meaning."""
     rng = np.random.default_rng(seed)
-    strides = SIDE ** np.arange(d)[::-1]
-    along = rng.integers(-wild, SIDE - s + 1 + wild, size=(d, 1, p)) + np.arange(s)[:, None]
+    strides = side ** np.arange(d)[::-1]
+    along = rng.integers(-wild, side - s + 1 + wild, size=(d, 1, p)) + np.arange(s)[:, None]
     index = (along * strides[:, None, None]).astype("int32")
     if wild and p > 3:
         index[..., 3] = rng.integers(-(2**31), 2**31, size=(d, s))
     w, g, given, nodes = (
-        rng.normal(size=shape).astype(dtype) for shape in ((d, s, p), (d, s, p), (d + 1, c, p), (SIDE**d, c))
+        rng.normal(size=shape).astype(dtype) for shape in ((d, s, p), (d, s, p), (d + 1, c, p), (side**d, c))
     )
     return tuple(jnp.asarray(a) for a in (index, w, g, given, nodes))
+
+
+def resistance(d, p, dtype, seed=0, *, wild=True, side=SIDE):
+    """What `resist` is given: factors, upper triangles and a displacement."""
+    index, w, g, _, u = problem(d, 3, d, p, dtype, seed, wild=wild, side=side)
+    upper = np.random.default_rng(seed + 1).normal(size=(d * d * (d * d + 1) // 2, p)).astype(dtype)
+    return index, w, g, jnp.asarray(upper), u
+
+
+def resisted(*args):
+    """By the primitive."""
+    return _resistance._resist_p.bind(*args, batched=0)[0]
+
+
+def resisted_in_parts(index, w, g, upper, u):
+    """By a gather, a matrix a particle and a scatter, as they are written in JAX."""
+    d = len(index)
+    slopes = jnp.concatenate(sums._gather(index, w, g, u, unroll=False)[1:])
+    flux = jnp.einsum("ijp,jp->ip", la.symmetric(upper), slopes).reshape(d, d, -1)
+    return sums._scatter(index, w, g, *flux, valued=False, size=len(u), unroll=False)[0]
 
 
 def native(index, w, g, given, nodes, valued=True, graded=True):
@@ -120,6 +142,60 @@ def test_derivatives_agree(d):
 
 
 @NEEDS_LIBRARY
+@pytest.mark.parametrize("dtype", ["float32", *thorough("float64")])
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
+def test_resistances_agree(d, dtype):
+    """With indices beyond the window, for one particle and none, and in a batch that shares its matrices."""
+    run, parts = jax.jit(resisted), jax.jit(resisted_in_parts)
+    for p in (45, 1, 0):
+        args = resistance(d, p, dtype)
+        agree(run(*args), parts(*args), dtype)
+    index, w, g, upper, u = resistance(d, 45, dtype)
+    both = jnp.stack([u, resistance(d, 45, dtype, seed=7)[-1]])
+    together = jax.jit(jax.vmap(resisted, in_axes=(None, None, None, None, 0)))(index, w, g, upper, both)
+    np.testing.assert_array_equal(together, jnp.stack([run(index, w, g, upper, one) for one in both]))
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize("d", [1, *thorough(2, 3)])
+def test_derivatives_of_resistances_agree(d):
+    """First in both modes, second, and under remat, by everything."""
+    index, *floats = resistance(d, 9, "float64", wild=False)
+    to, *along = (jnp.sin(3 + jnp.arange(a.size, dtype=a.dtype)).reshape(a.shape) for a in (floats[-1], *floats))
+
+    def derivatives(of):
+        def loss(*args):
+            return (to * of(index, *args) ** 2).sum()
+
+        def slope(f):
+            return lambda *args: jax.jvp(f, args, tuple(along))[1]
+
+        by = (0, 1, 2, 3)
+        grad = jax.grad(jax.checkpoint(loss), by)
+        every = slope(loss), grad, slope(slope(loss)), slope(grad), jax.grad(slope(loss), by)
+        return jax.jit(lambda *a: [f(*a) for f in every])(*floats)
+
+    agree(derivatives(resisted), derivatives(resisted_in_parts), "float64")
+
+
+@NEEDS_LIBRARY
+def test_a_resistance_is_one_call_and_symmetric(choose):
+    """Forward and transposed: no gather or scatter is left, and ⟨a, H b⟩ = ⟨H a, b⟩."""
+    choose("native")
+    index, w, g, upper, a = resistance(2, 30, "float64", wild=False)
+
+    def back(a):
+        return jax.vjp(lambda u: resisted(index, w, g, upper, u), a)[1](a)[0]
+
+    for program in (lambda a: resisted(index, w, g, upper, a), back):
+        text = jax.jit(program).lower(a).as_text()
+        assert "mpmjax_resist" in text
+        assert "mpmjax_gather" not in text
+        assert "mpmjax_scatter" not in text
+    agree(jax.jit(back)(a), resisted(index, w, g, upper, a), "float64")
+
+
+@NEEDS_LIBRARY
 def test_the_library_is_called_and_only_on_a_cpu(choose):
     """By default on a CPU, not when XLA is asked for, not for another platform, not for a program that XLA divides."""
     args = problem(2, 3, 3, 10, "float32")
@@ -155,6 +231,22 @@ def test_many_particles_on_many_threads(place):
         jax.tree.map(np.testing.assert_array_equal, again, found[0])
     wide = jax.jit(written)(index, *(a.astype("float64") for a in floats))
     jax.tree.map(lambda a, b: assert_close(a.astype("float64"), b, 2e-4), found[0], wide)
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize("place", ["in order", "anywhere"])
+def test_resistances_of_many_particles_on_many_threads(place):
+    """In one pass, and with what particles give stored first, where ranges of nodes share most of them."""
+    index, w, g, upper, u = resistance(2, 30_000, "float32", side=40)
+    if place == "in order":
+        order = jnp.argsort(index[0, 0])
+        index, w, g, upper = (a[..., order] for a in (index, w, g, upper))
+    run = jax.jit(resisted)
+    found = [run(index, w, g, upper, u) for _ in range(5)]
+    for again in found[1:]:
+        np.testing.assert_array_equal(again, found[0])
+    wide = jax.jit(resisted_in_parts)(index, *(a.astype("float64") for a in (w, g, upper, u)))
+    assert_close(found[0].astype("float64"), wide, 2e-4)
 
 
 @NEEDS_LIBRARY
