@@ -4,10 +4,10 @@
     python benchmarks/native.py --quick
 
 Each back end has a process of its own, for a program keeps the one that it was compiled with; the processes take turns,
-and medians are compared as ratios. The states after some steps must agree to rounding before anything is timed. The rest
-is that of a semi-implicit step without its iterations. `resist` is a gather, a matrix for each particle and a scatter in
-one call, and in parts they are three; an iteration is one of them and vectors over the grid. A gradient is that of 20
-steps by all initial velocities.
+and medians are compared as ratios. The states after some steps must agree to rounding before anything is timed. The
+rest is that of a semi-implicit step without its iterations. `resist` is a gather, a matrix for each particle and a
+scatter in one call, and in parts they are three; an iteration is one of them and vectors over the grid. A gradient is
+that of 20 steps by all initial velocities.
 """
 
 import argparse

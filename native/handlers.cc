@@ -5,9 +5,10 @@
 //   scatter  index, weights, derivatives [, their changes], given ...  ->  nodes
 //   pull     index, weights, derivatives, nodes, given ...             ->  by weights, by derivatives
 //   resist   index, weights, derivatives, matrices, nodes              ->  nodes
+//   combine  a, b, c, d, scales, weight, active                        ->  y, z, sum
 //
 // Factors are (..., d, s, p), given and gathered (..., c, p), nodes (..., n, c), matrices (..., d² (d² + 1) / 2, p), with
-// the same leading axes everywhere.
+// the same leading axes everywhere. Vectors to combine are (..., m), scales (..., 2), active (..., ⌈m/64⌉).
 // `valued` says whether the first of the given is the value; `differential` whether changes of the factors follow them.
 
 #include <string>
@@ -16,6 +17,7 @@
 
 #include "sums.h"
 #include "targets.h"
+#include "vectors.h"
 #include "xla/ffi/api/ffi.h"
 
 namespace ffi = xla::ffi;
@@ -99,7 +101,7 @@ struct Call {
   }
 };
 
-Call read(const ffi::RemainingArgs& arguments, const ffi::RemainingRets& results) {
+Call collect(const ffi::RemainingArgs& arguments, const ffi::RemainingRets& results) {
   Call call;
   call.operands = arguments.size();
   for (size_t i = 0; i < arguments.size(); ++i) {
@@ -110,7 +112,14 @@ Call read(const ffi::RemainingArgs& arguments, const ffi::RemainingRets& results
     auto buffer = results.get<ffi::AnyBuffer>(i);
     if (buffer.has_value()) call.buffers.push_back(**buffer);
   }
-  call.expect(call.buffers.size() == arguments.size() + results.size() && call.operands >= 4, "an array is missing");
+  call.expect(call.buffers.size() == arguments.size() + results.size(), "an array is missing");
+  return call;
+}
+
+// A sum's call, with the sizes that its index and weights have.
+Call read(const ffi::RemainingArgs& arguments, const ffi::RemainingRets& results) {
+  Call call = collect(arguments, results);
+  call.expect(call.operands >= 4, "an array is missing");
   if (!call.fault.empty()) return call;
   const Shape shape = shape_of(call.buffers[0]);
   call.expect(shape.size() >= 3 && call.buffers[0].element_type() == ffi::DataType::S32, "no index (..., d, s, p)");
@@ -232,6 +241,45 @@ ffi::Error run_resist(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi
   return run(ResistOf{}, threads, arguments, results);
 }
 
+template <class T>
+bool combine_call(const Pool& pool, Call& call, int64_t size, const bool* active) {
+  Combine<T> task = {};
+  task.size = size;
+  const T** from[] = {&task.a, &task.b, &task.c, &task.d};
+  for (size_t k = 0; k < 4; ++k) *from[k] = call.at<T>(k, {size});
+  task.scales = call.at<T>(4, {2});
+  task.weight = call.at<T>(5, {size});
+  task.y = call.at<T>(7, {size});
+  task.z = call.at<T>(8, {size});
+  task.sum = call.at<T>(9, {});
+  task.active = active;
+  if (call.fault.empty()) combine(pool, call.batch, task);
+  return true;
+}
+
+ffi::Error run_combine(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  Call call = collect(arguments, results);
+  call.expect(call.operands == 7 && call.buffers.size() == 10, "too many or too few arrays");
+  if (!call.fault.empty()) return wrong(call.fault);
+  const Shape shape = shape_of(call.buffers[0]);
+  call.expect(!shape.empty() && call.buffers[6].element_type() == ffi::DataType::PRED, "no vectors, or no active blocks");
+  if (!call.fault.empty()) return wrong(call.fault);
+  call.type = call.buffers[0].element_type();
+  call.leading.assign(shape.begin(), shape.end() - 1);
+  for (const int64_t n : call.leading) call.batch *= n;
+  Shape blocks = call.leading;
+  blocks.push_back((shape.back() + kTogether - 1) / kTogether);
+  call.expect(shape_of(call.buffers[6]) == blocks, "arrays whose shapes do not fit each other");
+  if (!call.fault.empty()) return wrong(call.fault);
+  const bool* active = static_cast<const bool*>(call.buffers[6].untyped_data());
+  const XlaPool pool(threads);
+  bool known = false;
+  if (call.type == ffi::DataType::F32) known = combine_call<float>(pool, call, shape.back(), active);
+  if (call.type == ffi::DataType::F64) known = combine_call<double>(pool, call, shape.back(), active);
+  if (!call.fault.empty()) return wrong(call.fault);
+  return known ? ffi::Error::Success() : wrong("there is no kernel of this type");
+}
+
 ffi::Error run_threads(ffi::ThreadPool threads, ffi::ResultBuffer<ffi::DataType::S32> count) {
   *count->typed_data() = static_cast<int32_t>(threads.num_threads());
   return ffi::Error::Success();
@@ -258,6 +306,8 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_scatter, mpmjax::run_scatter,
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_pull, mpmjax::run_pull,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<bool>("valued").RemainingArgs().RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_resist, mpmjax::run_resist,
+                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_combine, mpmjax::run_combine,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
 
 // The threads that sums are shared among.

@@ -15,8 +15,8 @@ from jax.interpreters import ad
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, NodeVector
 from mpmjax.discretisation._stencil import Stencil
-from mpmjax.discretisation._sum_primitive import members, sum_primitive
 from mpmjax.discretisation._transfer_sums import gather_p, scatter_p
+from mpmjax.native import members, native_primitive, sums_fit
 
 
 def resist(stencil: Stencil, upper: Float[Array, "t p"], u: NodeVector) -> NodeVector:
@@ -44,7 +44,7 @@ def _like_nodes(*args: ShapedArray) -> list[tuple]:
     return [args[-1].shape[-2:]]
 
 
-_resist_p = sum_primitive("stencil_resist", _resist, _like_nodes)
+_resist_p = native_primitive("stencil_resist", _resist, _like_nodes, sums_fit)
 
 
 def _jvp(primals: tuple, tangents: tuple, *, batched: int) -> tuple[list[Array], list[Any]]:

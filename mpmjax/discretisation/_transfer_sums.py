@@ -25,7 +25,7 @@ from jax.interpreters import ad
 
 from mpmjax._types import Array, Float
 from mpmjax.discretisation._stencil import Stencil
-from mpmjax.discretisation._sum_primitive import members, sum_primitive
+from mpmjax.native import members, native_primitive, sums_fit
 
 _ROW = 4
 """Largest number of columns that are added to the nodes at once. A CPU adds one, two or four numbers as one vector;
@@ -172,7 +172,7 @@ def _by_factors(function: Callable[..., list[Array]]) -> Callable[..., list[Arra
     return differential
 
 
-# What makes them primitives.
+# What makes them primitives. Arguments are the factors, and then what the sum is of.
 
 
 def _particle_rows(index_factors: ShapedArray, *others: ShapedArray) -> list[tuple]:
@@ -190,13 +190,14 @@ def _factor_rows(index_factors: ShapedArray, *others: ShapedArray, valued: bool)
     return [index_factors.shape[-3:]] * 2
 
 
-gather_p = sum_primitive("stencil_gather", _gather, _particle_rows, differential=False)
-scatter_p = sum_primitive("stencil_scatter", _scatter, _node_rows, differential=False)
-pull_p = sum_primitive("stencil_pull", _pull, _factor_rows)
-_gather_by_factors_p = sum_primitive(
+_sum_primitive = partial(native_primitive, fits=sums_fit)
+gather_p = _sum_primitive("stencil_gather", _gather, _particle_rows, differential=False)
+scatter_p = _sum_primitive("stencil_scatter", _scatter, _node_rows, differential=False)
+pull_p = _sum_primitive("stencil_pull", _pull, _factor_rows)
+_gather_by_factors_p = _sum_primitive(
     "stencil_gather_by_factors", _by_factors(_gather), _particle_rows, differential=True
 )
-_scatter_by_factors_p = sum_primitive(
+_scatter_by_factors_p = _sum_primitive(
     "stencil_scatter_by_factors", _by_factors(_scatter), _node_rows, differential=True
 )
 

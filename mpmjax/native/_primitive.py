@@ -1,8 +1,4 @@
-"""Sums between particles and nodes as JAX primitives: on batches, by XLA, and on CPUs by the native library.
-
-Arguments of a primitive are the index factors of a stencil, its weights, their derivatives, and what the sum is of,
-each with as many leading axes as the batch has.
-"""
+"""Functions of arrays as JAX primitives: on batches, by XLA, and on CPUs by the native library."""
 
 from collections.abc import Callable
 from functools import partial
@@ -14,7 +10,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
 from mpmjax._types import Array
-from mpmjax.native import with_native
+from mpmjax.native._lowering import with_native
 
 
 def members(function: Callable[..., Any], batched: int) -> Callable[..., Any]:
@@ -34,16 +30,23 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def sum_primitive(
-    name: str, function: Callable[..., list[Array]], shapes: Callable[..., list[tuple]], **attributes: bool
+def native_primitive(
+    name: str,
+    function: Callable[..., list[Array]],
+    shapes: Callable[..., list[tuple]],
+    fits: Callable[..., bool],
+    aliases: dict[int, int] | None = None,
+    **attributes: bool,
 ) -> Primitive:
-    """A primitive that evaluates a function, on batches too.
+    """A primitive that evaluates a function. In a batch all its arguments have as many leading axes as the batch.
 
     Args:
-        name: name of the primitive; its second word is that of the native sum.
-        function: the function of arrays.
+        name: name of the primitive; its second word is that in the native library.
+        function: the function of arrays. Results have the dtype of its second argument.
         shapes: the shapes of the results, as a function of the arguments.
-        attributes: what the native sum is told besides the primitive's parameters.
+        fits: whether the library has a kernel for arguments, given their shapes and dtypes and the batch's axes.
+        aliases: arguments whose memory results may take, from their number to that of the result.
+        attributes: what the library is told besides the primitive's parameters.
     """
 
     def run(*args: Array, batched: int, unroll: bool = False, **params: Any) -> list[Array]:
@@ -64,9 +67,10 @@ def sum_primitive(
     static = ("batched", "unroll", "valued", "size")
     once = jax.jit(run, static_argnames=static)  # traced once for all its uses
     written = mlir.lower_fun(once, multiple_results=True)
+    native = with_native(name.split("_")[1], written, fits, aliases or {}, **attributes)
     primitive.def_impl(_compiled(jax.jit(primitive.bind, static_argnames=static)))
     primitive.def_abstract_eval(results)
     batching.primitive_batchers[primitive] = batch
     mlir.register_lowering(primitive, mlir.lower_fun(partial(once, unroll=True), multiple_results=True))
-    mlir.register_lowering(primitive, with_native(name.split("_")[1], written, **attributes), platform="cpu")
+    mlir.register_lowering(primitive, native, platform="cpu")
     return primitive
