@@ -18,6 +18,7 @@
 
 #include "sums.h"
 #include "targets.h"
+#include "vectors.h"
 
 using namespace mpmjax;
 
@@ -318,6 +319,43 @@ void check_in_order(Shape shape, std::mt19937& random, const std::vector<const P
   check_resistance(e, pools);
 }
 
+// Vectors of which some blocks are zero, combined in place and elsewhere; whatever is passed over stays or becomes zero.
+template <class T>
+void check_vectors(int64_t size, bool in_place, std::mt19937& random, const std::vector<const Pool*>& pools) {
+  const int64_t batch = 2, blocks = (size + kTogether - 1) / kTogether;
+  std::normal_distribution<T> normal;
+  const Array<T> a(batch * size), b(a.size), c(a.size), d(a.size), weight(a.size), scales(2 * batch), sum(batch);
+  const Array<bool> active(batch * blocks);
+  for (int64_t i = 0; i < active.size; ++i) active[i] = random() % 3 == 0;
+  for (int64_t i = 0; i < a.size; ++i) {
+    weight[i] = normal(random);
+    if (!active[i / size * blocks + i % size / kTogether]) continue;
+    a[i] = normal(random), b[i] = normal(random), c[i] = normal(random), d[i] = normal(random);
+  }
+  for (int64_t i = 0; i < scales.size; ++i) scales[i] = normal(random);
+  std::vector<double> y(a.size), z(a.size), total(batch), ones(a.size, 30), bound(batch, 1);
+  for (int64_t i = 0; i < a.size; ++i) {
+    y[i] = a[i] + double(scales[i / size * 2]) * b[i];
+    z[i] = c[i] + double(scales[i / size * 2 + 1]) * d[i];
+    total[i / size] += weight[i] * z[i] * z[i];
+    bound[i / size] += std::abs(weight[i] * z[i] * z[i]);
+  }
+  std::unique_ptr<Array<T>> bits;
+  for (const Pool* pool : pools) {
+    Array<T> to_y(in_place ? b : a), to_z(in_place ? d : c);
+    for (int64_t i = 0; i < to_y.size && !in_place; ++i) to_y[i] = to_z[i] = 7;
+    combine(*pool, batch, Combine<T>{a.data.get(), in_place ? to_y.data.get() : b.data.get(), c.data.get(),
+                                     in_place ? to_z.data.get() : d.data.get(), scales.data.get(), weight.data.get(),
+                                     active.data.get(), to_y.data.get(), to_z.data.get(), sum.data.get(), size});
+    const Shape shape = {1, 0, batch, size, 0, 0};
+    compare("combine y", shape, to_y, y, ones);
+    compare("combine z", shape, to_z, z, ones);
+    compare("combine sum", shape, sum, total, bound);
+    if (bits == nullptr) bits = std::make_unique<Array<T>>(sum);
+    expect_same("a norm", *bits, sum);
+  }
+}
+
 template <class T>
 int check_all(const std::vector<const Pool*>& pools) {
   std::mt19937 random(1);
@@ -342,6 +380,9 @@ int check_all(const std::vector<const Pool*>& pools) {
   for (int oddity = -1; oddity < 3; ++oddity) check_both({2, 3, 1, 20011, 40, 3}, oddity);
   check_both({1, 2, 3, 30011, 999, 1}, 1);
   check_in_order<T>({2, 3, 2, 20011, 40, 2}, random, pools);
+  for (const int64_t size : {0, 1, 64, 200, 100003}) {
+    for (const bool in_place : {false, true}) check_vectors<T>(size, in_place, random, pools), ++examples;
+  }
   return examples + 1;
 }
 

@@ -15,6 +15,7 @@ import mpmjax as mpm
 from mpmjax import linalg as la
 from mpmjax.discretisation import _resistance
 from mpmjax.discretisation import _transfer_sums as sums
+from mpmjax.implicit import _vectors
 from mpmjax.native import _library
 
 ROOT = Path(__file__).parents[1]
@@ -193,6 +194,38 @@ def test_a_resistance_is_one_call_and_symmetric(choose):
         assert "mpmjax_gather" not in text
         assert "mpmjax_scatter" not in text
     agree(jax.jit(back)(a), resisted(index, w, g, upper, a), "float64")
+
+
+@NEEDS_LIBRARY
+def test_combined_vectors_agree(choose):
+    """In place or not, with blocks of zeros passed over, in a batch, and their derivative; two sums and a norm."""
+    choose("native")
+    rng = np.random.default_rng(0)
+    a, b, c, d, weight = rng.normal(size=(5, 2, 1000))
+    some = np.arange(1000) % 500 < 100
+    a, b, c, d = (jnp.asarray(v * some) for v in (a, b, c, d))
+    weight, (s, t) = jnp.asarray(weight), jnp.asarray([0.3, -2.0])
+
+    def combined(onto):
+        def of(a, b, c, d, weight, s):
+            active = _vectors.active_blocks(a != 0, b != 0, c != 0, d != 0)
+            assert active.shape == (16,)
+            return tuple(_vectors.combine((a, s, b), (c, t, d), weight, active, onto=onto))
+
+        return of
+
+    def expected(a, b, c, d, weight, s):
+        z = c + t * d
+        return a + s * b, z, (weight * z**2).sum()
+
+    for onto in (0, 1):
+        over = partial(jax.vmap, in_axes=(0, 0, 0, 0, 0, None))
+        args = a, b, c, d, weight, s
+        assert "mpmjax_combine" in jax.jit(combined(onto)).lower(*(v[0] for v in args[:5]), s).as_text()
+        agree(jax.jit(over(combined(onto)))(*args), over(expected)(*args), "float64")
+        along = tuple(jnp.cos(v) for v in args)
+        jvps = [jax.jit(lambda f=f: jax.jvp(over(f), args, along)[1])() for f in (combined(onto), expected)]
+        agree(*jvps, "float64")
 
 
 @NEEDS_LIBRARY
