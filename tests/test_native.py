@@ -218,14 +218,13 @@ def test_combined_vectors_agree(choose):
         z = c + t * d
         return a + s * b, z, (weight * z**2).sum()
 
+    over = partial(jax.vmap, in_axes=(0, 0, 0, 0, 0, None))
+    args = a, b, c, d, weight, s
+    along = tuple(jnp.cos(v) for v in args)
     for onto in (0, 1):
-        over = partial(jax.vmap, in_axes=(0, 0, 0, 0, 0, None))
-        args = a, b, c, d, weight, s
         assert "mpmjax_combine" in jax.jit(combined(onto)).lower(*(v[0] for v in args[:5]), s).as_text()
         agree(jax.jit(over(combined(onto)))(*args), over(expected)(*args), "float64")
-        along = tuple(jnp.cos(v) for v in args)
-        jvps = [jax.jit(lambda f=f: jax.jvp(over(f), args, along)[1])() for f in (combined(onto), expected)]
-        agree(*jvps, "float64")
+        agree(*(jax.jvp(jax.jit(over(f)), args, along)[1] for f in (combined(onto), expected)), "float64")
 
 
 @NEEDS_LIBRARY
