@@ -1,7 +1,7 @@
 """Two bodies that touch: where contact is felt, by which normals, and what slides, rolls and is pressed.
 
 python benchmarks/bodies.py                     all tables, and docs/bodies.png (minutes)
-python benchmarks/bodies.py --only slope        one of rest, normals, slope, roll, hertz
+python benchmarks/bodies.py --only slope        one of rest, normals, slope, roll, hertz, rings
 python benchmarks/bodies.py --quick             the same, coarser, without a picture
 """
 
@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from scipy.stats import qmc
 
 import mpmjax as mpm
 from mpmjax.checks import canonical
@@ -221,6 +222,55 @@ def hertz(quick: bool) -> list[tuple]:
     return rows
 
 
+def rings(quick: bool) -> None:
+    """Two rings that meet at 60 m/s: the energy after 0.2 s, amid the contact, and after 0.6 s, when they have parted.
+
+    The problem, its scattered points and the energy after 0.2 s, of one velocity field, are those of a test of
+    Tesserae.jl (`docs/literate/tutorials/collision.jl`, 2026).
+    """
+    E, nu, density, dx, speed, L, W = 1e8, 0.2, 1e3, 0.2, 30.0, 20.0, 7.5
+    law, grid = mpm.NeoHookean(E, nu), mpm.Grid((201, 77), dx, origin=(-100, -38))
+    wave = np.sqrt(E * (1 - nu) / ((1 + nu) * (1 - 2 * nu)) / density)
+
+    def scattered(seed: int) -> list[mpm.Particles]:
+        side = dx / 2
+        radius = (0.938001956 / 1.42825365**0.5 + 0.0951151 * (side / (2 * L) + side / (2 * W))) * side
+        sampler = qmc.PoissonDisk(2, radius=radius, rng=np.random.default_rng(seed), l_bounds=[-L, -W], u_bounds=[L, W])
+        x = sampler.fill_space()
+        volume = 4 * L * W / len(x)
+        found = []
+        for centre in (-L / 4, L / 4):
+            r = np.hypot(x[:, 0] - centre, x[:, 1])
+            part = x[(r > 3.0) & (r < 4.0)]
+            v = jnp.tile(jnp.asarray([-np.sign(centre) * speed, 0.0]), (len(part), 1))
+            volumes = jnp.full(len(part), volume)
+            found.append(mpm.Particles(jnp.asarray(part), v, density * volumes, volumes))
+        return found
+
+    def fitted(seed: int) -> list[mpm.Particles]:
+        return [
+            mpm.fill(
+                mpm.Annulus((x, 0.0), 3.0, 4.0), grid, density=density, velocity=(-np.sign(x) * speed, 0.0), fitted=True
+            )
+            for x in (-L / 4, L / 4)
+        ]
+
+    print("two rings that meet at 60 m/s: energy [J] at first and in the end")
+    cases = [(scattered, seed, 0.2) for seed in range(1 if quick else 3)] + [(fitted, 0, 0.6)] * (not quick)
+    for (points, seed, t1), bodies in product(cases, (None, mpm.Bodies())):
+        particles = mpm.join(*points(seed))
+        scene = mpm.Scene(grid, (law, law), gradient=mpm.SplineGradient(), bodies=bodies)
+        steps = int(np.ceil(t1 * (wave + speed) / (0.8 * dx)))
+        run = mpm.simulate(scene, particles, t1=t1, dt=t1 / steps)
+        first, last = mpm.energy(scene, particles), mpm.energy(scene, run.final)
+        momenta = [(body.mass[:, None] * body.v).sum(axis=0) for body in (particles, run.final)]
+        momentum = float(jnp.abs(momenta[1] - momenta[0]).max())
+        print(
+            f"  {points.__name__} {seed}, {'bodies' if bodies else 'one field'}, {t1} s: {float(first.total):.4g} "
+            f"{float(last.total):.4g}, of which kinetic {float(last.kinetic):.3g}; momentum changed by {momentum:.0e}"
+        )
+
+
 def draw(rows: list[tuple]) -> None:
     """The pressure between the cylinders against Hertz's."""
     x, push, exact, dx = rows[-1]
@@ -236,7 +286,14 @@ def draw(rows: list[tuple]) -> None:
     figure.savefig(DOCS / "bodies.png", dpi=130)
 
 
-TABLES: dict[str, Callable] = {"rest": rest, "normals": normals, "slope": slope, "roll": roll, "hertz": hertz}
+TABLES: dict[str, Callable] = {
+    "rest": rest,
+    "normals": normals,
+    "slope": slope,
+    "roll": roll,
+    "hertz": hertz,
+    "rings": rings,
+}
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -1,4 +1,4 @@
-"""How fast is a step? Explicit steps of a free elastic block, beside MLS-MPM in Taichi and in Warp.
+"""How fast is a step? Explicit steps of a free elastic block, beside MLS-MPM in Taichi, in Warp, and by hand in C++.
 
     python benchmarks/throughput.py            # this package alone
     python benchmarks/throughput.py --peers    # needs: python -m pip install -e ".[peers]"
@@ -120,8 +120,10 @@ def codes_of(b: Block, steps: int, peers: bool) -> dict[str, Code]:
     }
     if peers:
         from peers.taichi_mpm import TaichiMPM
+        from peers.vectorised_mpm import VectorisedMPM
         from peers.warp_mpm import WarpMPM
 
+        found["C++"] = partial(peer(b, VectorisedMPM).run, steps, b.dt)
         found["Taichi"] = partial(peer(b, TaichiMPM).run, steps, b.dt)
         if b.dtype == "float32":
             found["Warp"] = partial(peer(b, WarpMPM).run, steps, b.dt)
@@ -200,7 +202,7 @@ def compare(name: str, b: Block, *, steps: int, repeats: int, peers: bool) -> di
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--peers", action="store_true", help="Taichi and Warp too")
+    parser.add_argument("--peers", action="store_true", help="C++, Taichi and Warp too")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--quick", action="store_true", help="small scenes")
     parser.add_argument("--device", choices=("cpu", "gpu"), help="where this package runs; peers run on the CPU")

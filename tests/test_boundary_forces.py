@@ -78,7 +78,7 @@ def assert_sums_to_change(scene, particles, method):
     return received
 
 
-@pytest.mark.parametrize("method", **ids(METHODS, "explicit", ("explicit", "semi_implicit", "trbdf2")))
+@pytest.mark.parametrize("method", **ids(METHODS, "explicit", ("explicit", "semi_implicit", "implicit_midpoint")))
 @pytest.mark.parametrize("boundary", **ids(BOUNDARIES, ("colliders", "a corner of contact")))
 def test_forces_on_boundaries_sum_to_the_change_of_momentum(boundary, method):
     """Every integrator, every kind of boundary, with a body force."""
@@ -156,9 +156,9 @@ def test_what_a_collider_that_is_hit_receives_is_what_it_gives_the_faces(method)
     assert push[0] == pytest.approx(0.3 * push[1], rel=1e-12)
 
 
-@pytest.mark.thorough
-def test_forces_and_torques_sum_in_three_dimensions():
-    """Walls, a plane, a contact plane and a collider that turns."""
+@pytest.mark.parametrize("method", **ids(METHODS, (), ("explicit", "semi_implicit")))
+def test_forces_and_torques_sum_in_three_dimensions(method):
+    """Walls, a plane, a contact plane and a collider that turns; torques in an explicit step."""
     ball = mpm.RigidMotion((0.0, 1.0), ((0.0,) * 3, (0.4, 0.3, 0.2)), ((0.0,) * 3, (1.0, 3.0, 2.0)), (0.3, 0.3, 0.3))
     boundary = (
         mpm.SymmetryPlane(0, 0.0),
@@ -167,9 +167,10 @@ def test_forces_and_torques_sum_in_three_dimensions():
         mpm.SeparatingCollider(mpm.Ball((0.3, 0.3, 0.3), 0.15), ball, friction=0.3),
     )
     scene, particles = shaken(3, boundary=boundary)
-    for method in METHODS.values():
-        assert_sums_to_change(scene, particles, method)
-    after, dt, received = stepped(scene, particles, mpm.Explicit())
+    assert_sums_to_change(scene, particles, method)
+    if not isinstance(method, mpm.Explicit):
+        return
+    after, dt, received = stepped(scene, particles, method)
     weight = dt * np.asarray(particles.mass)[:, None] * np.asarray(scene.gravity)
     gained = angular_momentum(scene, after) - angular_momentum(scene, particles)
     gravity = axial((weight[:, :, None] * np.asarray(particles.x)[:, None, :]).sum(axis=0))

@@ -37,7 +37,7 @@ def kernels(d: int) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
     if d == 2:
 
         @wp.func
-        def scatter(mass: scalars, momentum: vectors, base: vec, f: vec, m: float, p: vec, affine: mat, dx: float):
+        def to_nodes(mass: scalars, momentum: vectors, base: vec, f: vec, m: float, p: vec, affine: mat, dx: float):
             """Mass and momentum to the nodes."""
             w, i, j = weights(f), int(base[0]), int(base[1])
             for a in range(3):
@@ -48,7 +48,7 @@ def kernels(d: int) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
                     wp.atomic_add(mass, i + a, j + c, weight * m)
 
         @wp.func
-        def gather(velocity: vectors, base: vec, f: vec):
+        def from_nodes(velocity: vectors, base: vec, f: vec):
             """Velocity from the nodes, and its product with the arms."""
             w, i, j = weights(f), int(base[0]), int(base[1])
             new, gradient = vec(), mat()
@@ -72,7 +72,7 @@ def kernels(d: int) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
     else:
 
         @wp.func
-        def scatter(mass: scalars, momentum: vectors, base: vec, f: vec, m: float, p: vec, affine: mat, dx: float):
+        def to_nodes(mass: scalars, momentum: vectors, base: vec, f: vec, m: float, p: vec, affine: mat, dx: float):
             """Mass and momentum to the nodes."""
             w, i, j, k = weights(f), int(base[0]), int(base[1]), int(base[2])
             for a in range(3):
@@ -84,7 +84,7 @@ def kernels(d: int) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
                         wp.atomic_add(mass, i + a, j + c, k + e, weight * m)
 
         @wp.func
-        def gather(velocity: vectors, base: vec, f: vec):
+        def from_nodes(velocity: vectors, base: vec, f: vec):
             """Velocity from the nodes, and its product with the arms."""
             w, i, j, k = weights(f), int(base[0]), int(base[1]), int(base[2])
             new, gradient = vec(), mat()
@@ -128,7 +128,7 @@ def kernels(d: int) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
         b = F[q] * wp.transpose(F[q])
         tau = mu * b + (lam * wp.log(wp.determinant(F[q])) - mu) * wp.identity(n=wp.static(d), dtype=float)
         affine = m * C[q] - (4.0 * dt * volume * inv_dx * inv_dx) * tau
-        scatter(mass, momentum, base, x[q] * inv_dx - base, m, m * v[q], affine, dx)
+        to_nodes(mass, momentum, base, x[q] * inv_dx - base, m, m * v[q], affine, dx)
 
     @wp.kernel
     def gather(
@@ -144,7 +144,7 @@ def kernels(d: int) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
         q = wp.tid()
         inv_dx = 1.0 / dx
         base = place(x[q] * inv_dx)
-        new, gradient = gather(velocity, base, x[q] * inv_dx - base)
+        new, gradient = from_nodes(velocity, base, x[q] * inv_dx - base)
         gradient = 4.0 * inv_dx * gradient
         v[q] = new
         C[q] = gradient

@@ -33,6 +33,11 @@ class Bodies(eqx.Module):
     def __check_init__(self):
         require_fields(self)
         require_between("The friction of Bodies", self.friction, 0, 1e6)
+        require(
+            self.of_materials is None or len(self.of_materials) > 0,
+            "The of_materials of Bodies must be one number for each material, got none: leave it out to make each "
+            "material a body.",
+        )
 
     def numbers(self, count: int) -> tuple[int, ...]:
         """The number of the body of each of so many materials.
