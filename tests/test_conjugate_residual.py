@@ -400,7 +400,7 @@ def test_the_references_plain_inner_product_fails_on_a_nearly_empty_node():
 @pytest.mark.parametrize("condition", [1e4, 1e8])
 def test_converged_below_the_tolerance_of_float32_means_a_small_error(condition):
     """Asked for what rounding forbids, the solver calls a solution what is one. At a condition beyond float32's digits
-    a residual as small as its own rounding leaves errors of up to fifty per cent, and is none."""
+    a residual as small as its own rounding leaves errors of one to fifty per cent, and is none."""
     for seed in range(6):
         rng = np.random.default_rng(seed)
         Q = np.linalg.qr(rng.normal(size=(N, N)))[0]
@@ -412,7 +412,7 @@ def test_converged_below_the_tolerance_of_float32_means_a_small_error(condition)
             exact = np.linalg.solve(A.astype(float), b.astype(float))
             error = np.linalg.norm(np.asarray(x) - exact) / np.linalg.norm(exact)
             assert bool(result == R.successful) == (condition < 1e5)
-            assert (error < 1e-3) == (condition < 1e5)
+            assert error < 1e-3 if condition < 1e5 else error > 5e-3
 
 
 def test_a_residual_that_cannot_be_corrected_is_no_solution():

@@ -95,7 +95,6 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
         system = _system(self, state, vector, options)
         y0 = options.get("y0")
         x = jnp.zeros_like(system.b) if y0 is None else system.started(ravel_pytree(y0)[0])
-        system = system.supported(options.get("support"), x)
         c = jax.lax.while_loop(lambda c: ~c.done, partial(_restart, system), _start(x, system.b))
         result, stats = _outcome(system, c)
         return system.unravel(system.plain(c.x)), result, stats
@@ -152,11 +151,6 @@ class _System(eqx.Module):
         second = c + t * d
         return a + s * b, second, self.dot(second, second)
 
-    def supported(self, support: Any, x: Array) -> "_System":
-        """The system that passes over what stays zero."""
-        del support, x
-        return self
-
     @property
     def eps(self) -> Any:
         """The rounding unit."""
@@ -164,19 +158,17 @@ class _System(eqx.Module):
 
 
 class _DiagonalSystem(_System):
-    """The same for a diagonal W."""
+    """The same for a diagonal W. Where no vector is different from zero, none becomes so, and all are passed over."""
 
-    inner: DiagonalInnerProduct
-    active: Bool[Array, "k"] | None = None
+    weight: Float[Array, "m"]
+    """W."""
+    active: Bool[Array, "k"]
+    """Where vectors may be different from zero (see `active_blocks`)."""
 
     def combined(
         self, one: tuple[Array, Scalar, Array], other: tuple[Array, Scalar, Array], *, onto: int
     ) -> tuple[Array, Array, Float[Array, ""]]:
-        return combine(one, other, self.inner.weight, self.active, onto=onto)
-
-    def supported(self, support: Any, x: Array) -> "_DiagonalSystem":
-        inside = jnp.ones(x.shape, bool) if support is None else ravel_pytree(support)[0]
-        return replace(self, active=active_blocks(inside, self.b != 0, x != 0))
+        return combine(one, other, self.weight, self.active, onto=onto)
 
 
 class _PairedSystem(_System):
@@ -238,9 +230,21 @@ def _system(
     inner = DiagonalInnerProduct(jnp.ones_like(flat)) if inner is None else inner.flattened(unravel)
     b = jnp.stack([inner.solve(flat), flat]) if inner.paired else inner.solve(flat)
     rtol = default_rtol(flat.dtype) if solver.rtol is None else solver.rtol
-    kind = _PairedSystem if inner.paired else _DiagonalSystem if isinstance(inner, DiagonalInnerProduct) else _System
-    system = kind(operator, inner, unravel, b, b.ravel()[0], rtol, solver.increment_rtol, solver.max_steps)
+    given = operator, inner, unravel, b, b.ravel()[0], rtol, solver.increment_rtol, solver.max_steps
+    if inner.paired:
+        system = _PairedSystem(*given)
+    elif isinstance(inner, DiagonalInnerProduct):
+        system = _DiagonalSystem(*given, inner.weight, _active(flat, options))
+    else:
+        system = _System(*given)
     return replace(system, b_norm=system.norm(b))
+
+
+def _active(rhs: Array, options: dict[str, Any]) -> Bool[Array, "k"]:
+    """Where a vector of a solve with a diagonal W may be different from zero, as `active_blocks` has it."""
+    support, y0 = options.get("support"), options.get("y0")
+    inside = jnp.ones(rhs.shape, bool) if support is None else ravel_pytree(support)[0]
+    return active_blocks(inside, rhs != 0, *([] if y0 is None else [ravel_pytree(y0)[0] != 0]))
 
 
 def _start(x: Array, b: Array) -> _Recurrence:
