@@ -138,7 +138,7 @@ def make_stencil(
 
 def _index_factors(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Array) -> Int[Array, "d s p"]:
     """Term of the C-order node index from each axis, shape (d, s, p)."""
-    first = jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window[:, None]
+    first = jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window.astype(jnp.int32)[:, None]
     along = first[:, None] + jnp.arange(kernel.order + 1, dtype=jnp.int32)[:, None]
     periods, wraps, strides = (
         jnp.asarray(numbers)[:, None, None]
