@@ -242,7 +242,7 @@ ffi::Error run_resist(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi
 }
 
 template <class T>
-bool combine_call(const Pool& pool, Call& call, int64_t size, const bool* active) {
+void combine_call(const Pool& pool, Call& call, int64_t size, const bool* active) {
   Combine<T> task = {};
   task.size = size;
   const T** from[] = {&task.a, &task.b, &task.c, &task.d};
@@ -254,7 +254,6 @@ bool combine_call(const Pool& pool, Call& call, int64_t size, const bool* active
   task.sum = call.at<T>(9, {});
   task.active = active;
   if (call.fault.empty()) combine(pool, call.batch, task);
-  return true;
 }
 
 ffi::Error run_combine(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
@@ -273,11 +272,10 @@ ffi::Error run_combine(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ff
   if (!call.fault.empty()) return wrong(call.fault);
   const bool* active = static_cast<const bool*>(call.buffers[6].untyped_data());
   const XlaPool pool(threads);
-  bool known = false;
-  if (call.type == ffi::DataType::F32) known = combine_call<float>(pool, call, shape.back(), active);
-  if (call.type == ffi::DataType::F64) known = combine_call<double>(pool, call, shape.back(), active);
-  if (!call.fault.empty()) return wrong(call.fault);
-  return known ? ffi::Error::Success() : wrong("there is no kernel of this type");
+  call.expect(call.type == ffi::DataType::F32 || call.type == ffi::DataType::F64, "there is no kernel of this type");
+  if (call.type == ffi::DataType::F32) combine_call<float>(pool, call, shape.back(), active);
+  if (call.type == ffi::DataType::F64) combine_call<double>(pool, call, shape.back(), active);
+  return call.fault.empty() ? ffi::Error::Success() : wrong(call.fault);
 }
 
 ffi::Error run_threads(ffi::ThreadPool threads, ffi::ResultBuffer<ffi::DataType::S32> count) {
