@@ -4,8 +4,10 @@
     python benchmarks/native.py --quick
 
 Each back end has a process of its own, for a program keeps the one that it was compiled with; the processes take turns,
-and medians are compared as ratios. The states after some steps must agree to rounding before anything is timed. A
-gradient is that of 20 steps by all initial velocities.
+and medians are compared as ratios. The states after some steps must agree to rounding before anything is timed. The
+rest is that of a semi-implicit step without its iterations. `resist` is a gather, a matrix for each particle and a
+scatter in one call, and in parts they are three; an iteration is one of them and vectors over the grid. A gradient is
+that of 20 steps by all initial velocities.
 """
 
 import argparse
@@ -13,13 +15,16 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 SCENES = {"A 100k": (3, 100_000, 64, 8), "C 10k": (2, 10_000, 128, 4), "C 100k": (2, 100_000, 256, 4)}
 QUICK = {"A 5k": (3, 5_000, 32, 8), "C 2k": (2, 2_000, 64, 4)}
-TASKS = ("step", "iteration", "gradient")
+TASKS = ("step", "iteration", "rest", "resist", "in parts", "gradient")
+MEASURED = ("step", "few", "more", "resist", "in parts", "gradient")
 STEPS = 20
 
 
@@ -43,12 +48,44 @@ def tasks(numbers: tuple, dtype: str) -> dict:
 
     slope = jax.jit(jax.value_and_grad(height))
     few, more = iterations(b).values()
+    whole, parts = resistances(b)
     return {
         "step": (ours(b, mpm.UpdatedLagrangian(), STEPS), STEPS),
         "few": (few, 1),
         "more": (more, 40),
+        "resist": (whole, 1),
+        "in parts": (parts, 1),
         "gradient": (lambda: (np.asarray(slope(v)[1]),), STEPS),
     }
+
+
+def resistances(b: Any) -> tuple[Callable[[], tuple], Callable[[], tuple]]:
+    """A resistance by one call and by three, with matrices of no meaning."""
+    import jax
+    import jax.numpy as jnp
+
+    import mpmjax as mpm
+    from mpmjax import linalg as la
+    from mpmjax.discretisation import gather, make_stencil, resist, scatter
+
+    p, d = b.x.shape
+    grid, window = mpm.Grid((b.nodes,) * d, b.spacing), jnp.zeros(d, "int32")
+    make = jax.jit(lambda x: make_stencil(mpm.BSpline(2), mpm.MLSGradient(), grid, window, x, affine=False))
+    stencil = make(jnp.asarray(b.x, b.dtype))
+    random = np.random.default_rng(0)
+    upper = jnp.asarray(random.normal(size=(d * d * (d * d + 1) // 2, p)), b.dtype)
+    u = jnp.asarray(random.normal(size=(b.nodes**d, d)), b.dtype)
+
+    def in_parts(stencil: Any, upper: jax.Array, u: jax.Array) -> jax.Array:
+        slopes = jax.lax.optimization_barrier(gather(stencil, u)[1])
+        flux = la.matmul(la.symmetric(upper), slopes.reshape(d * d, 1, p)).reshape(d, d, p)
+        return scatter(stencil, None, flux, len(u))
+
+    def of(function: Callable[..., jax.Array]) -> Callable[[], tuple]:
+        compiled = jax.jit(function)
+        return lambda: (jax.block_until_ready(compiled(stencil, upper, u)),)
+
+    return of(resist), of(in_parts)
 
 
 def work(name: str, dtype: str) -> None:
@@ -95,7 +132,7 @@ def compare(name: str, dtype: str, repeats: int, folder: Path) -> None:
     apart = np.abs(states["native"] - states["xla"]).max() / np.abs(states["xla"]).max()
     if not apart < {"float32": 1e-4, "float64": 1e-11}[dtype]:
         raise SystemExit(f"{name}, {dtype}: the back ends differ by {apart:.1e}.")
-    seconds: dict = {kind: {what: [] for what in ("step", "few", "more", "gradient")} for kind in workers}
+    seconds: dict = {kind: {what: [] for what in MEASURED} for kind in workers}
     for _ in range(repeats):
         for what in seconds["xla"]:
             for kind in workers:
@@ -106,6 +143,7 @@ def compare(name: str, dtype: str, repeats: int, folder: Path) -> None:
     found = {kind: {what: float(np.median(s)) for what, s in own.items()} for kind, own in seconds.items()}
     for own in found.values():
         own["iteration"] = own["more"] - own["few"] / 40
+        own["rest"] = own["few"] - 4 * own["iteration"]
     print(f"{name}, {dtype}: {said['native']}; apart by {apart:.0e}")
     for what in TASKS:
         one, other = (1e3 * found[kind][what] for kind in ("native", "xla"))

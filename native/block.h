@@ -28,15 +28,21 @@ MPMJAX_APART void copy_some(const T* from, int count, T* to) {
   for (int q = 0; q < count; ++q) to[q] = from[q];
 }
 
-// The same. Blocks come one after the other, in more streams than a processor foresees by itself: a later one is asked
-// for here.
+// Asks for what a later block has of an array. Blocks come one after the other, in more streams than a processor foresees
+// by itself.
+template <class T>
+MPMJAX_INLINE void ask(const T* from) {
+  const uintptr_t later = reinterpret_cast<uintptr_t>(from) + kAhead * sizeof(T);  // perhaps beyond the array's end
+  __builtin_prefetch(reinterpret_cast<const void*>(later));
+}
+
+// Copies a block, or what there is of it.
 template <class T>
 MPMJAX_INLINE void copy(const T* from, int count, T* to) {
   if (__builtin_expect(count != kBlock, 0)) return copy_some(from, count, to);
   std::memcpy(to, from, kBlock * sizeof(T));
-  const uintptr_t later = reinterpret_cast<uintptr_t>(from) + kAhead * sizeof(T);  // perhaps beyond the array's end
-  __builtin_prefetch(reinterpret_cast<const void*>(later));
-  if (kBlock * sizeof(T) > 64) __builtin_prefetch(reinterpret_cast<const void*>(later + 64));
+  ask(from);
+  if (kBlock * sizeof(T) > 64) ask(from + kBlock / 2);
 }
 
 // The factors of a block: numbers, or with `differential` numbers with their changes.
@@ -125,11 +131,9 @@ MPMJAX_INLINE void write(const T* from, int count, T* to) {
   }
 }
 
-// Four columns of a block's rows: from (c, p), of which `used` columns exist, the row of each particle.
+// Columns of a block as rows: row q has the q-th number of each column.
 template <class T>
-MPMJAX_APART void read_rows(const T* from, int64_t particles, int count, int used, Vector<T>* rows) {
-  alignas(64) T columns[kLanes][kBlock];
-  for (int c = 0; c < kLanes; ++c) copy(from + (c < used ? c : 0) * particles, c < used ? count : 0, columns[c]);
+MPMJAX_INLINE void join(const T (*columns)[kBlock], Vector<T>* rows) {
   for (int q = 0; q < kBlock; q += kLanes) {
     Vector<T> turned[kLanes];
     for (int c = 0; c < kLanes; ++c) turned[c] = load(columns[c] + q);
@@ -137,15 +141,29 @@ MPMJAX_APART void read_rows(const T* from, int64_t particles, int count, int use
   }
 }
 
-// The other way round: writes the rows of a block as columns of (c, p).
+// The other way round.
 template <class T>
-MPMJAX_APART void write_rows(const Vector<T>* rows, T* to, int64_t particles, int count, int used) {
-  alignas(64) T columns[kLanes][kBlock];
+MPMJAX_INLINE void split(const Vector<T>* rows, T (*columns)[kBlock]) {
   for (int q = 0; q < kBlock; q += kLanes) {
     Vector<T> turned[kLanes];
     transpose<T>(rows + q, turned);
     for (int c = 0; c < kLanes; ++c) store(columns[c] + q, turned[c]);
   }
+}
+
+// Four columns of a block's rows: from (c, p), of which `used` columns exist, the row of each particle.
+template <class T>
+MPMJAX_APART void read_rows(const T* from, int64_t particles, int count, int used, Vector<T>* rows) {
+  alignas(64) T columns[kLanes][kBlock];
+  for (int c = 0; c < kLanes; ++c) copy(from + (c < used ? c : 0) * particles, c < used ? count : 0, columns[c]);
+  join<T>(columns, rows);
+}
+
+// The other way round: writes the rows of a block as columns of (c, p).
+template <class T>
+MPMJAX_APART void write_rows(const Vector<T>* rows, T* to, int64_t particles, int count, int used) {
+  alignas(64) T columns[kLanes][kBlock];
+  split<T>(rows, columns);
   for (int c = 0; c < used; ++c) write(columns[c], count, to + c * particles);
 }
 

@@ -1,4 +1,4 @@
-// Checks the three sums against sums written node by node, on random problems: all dimensions, orders, precisions and
+// Checks the sums against sums written node by node, on random problems: all dimensions, orders, precisions and
 // numbers of columns, batches, indices beyond the window and as large as integers are, factors that are not finite, no
 // particle and one. Any number of threads must give the same bits. Arrays end where they end, so that a sanitizer sees
 // what reads or writes beyond; native/check compiles this with each of them.
@@ -18,6 +18,7 @@
 
 #include "sums.h"
 #include "targets.h"
+#include "vectors.h"
 
 using namespace mpmjax;
 
@@ -82,13 +83,14 @@ struct Shape {
   int64_t size() const { return int64_t(std::pow(along, d) + 0.5); }
 };
 
-// The arrays of all three sums and of their differentials.
+// The arrays of all sums and of their differentials. Those of a resistance have d columns and matrices of their own.
 template <class T>
 struct Example {
   Shape shape;
   Array<int32_t> index;
   Array<T> w, g, dw, dg, nodes, given;
-  Array<T> to_nodes, gathered, by_w, by_g;  // results
+  Array<T> matrices, moved;
+  Array<T> to_nodes, gathered, by_w, by_g, resisted;  // results
 
   Example(Shape sh, int oddity, std::mt19937& random)
       : shape(sh),
@@ -96,9 +98,11 @@ struct Example {
         w(index.size), g(index.size), dw(index.size), dg(index.size),
         nodes(sh.batch * sh.size() * sh.columns),
         given((sh.d + 1) * sh.batch * sh.columns * sh.particles),
-        to_nodes(nodes.size), gathered(given.size), by_w(index.size), by_g(index.size) {
+        matrices(sh.batch * sh.d * sh.d * (sh.d * sh.d + 1) / 2 * sh.particles),
+        moved(sh.batch * sh.size() * sh.d),
+        to_nodes(nodes.size), gathered(given.size), by_w(index.size), by_g(index.size), resisted(moved.size) {
     std::normal_distribution<T> normal;
-    for (const Array<T>* array : {&w, &g, &dw, &dg, &nodes, &given}) {
+    for (const Array<T>* array : {&w, &g, &dw, &dg, &nodes, &given, &matrices, &moved}) {
       for (int64_t i = 0; i < array->size; ++i) (*array)[i] = normal(random);
     }
     const int64_t beyond = oddity > 0 ? 2 : 0;
@@ -120,6 +124,7 @@ struct Example {
     if (oddity > 1) {
       for (int64_t i = 0; i < w.size; i += 97) w[i] = g[i] = dw[i] = dg[i] = std::numeric_limits<T>::quiet_NaN();
       for (int64_t i = 5; i < nodes.size; i += 89) nodes[i] = std::numeric_limits<T>::infinity();
+      for (int64_t i = 7; i < matrices.size; i += 997) matrices[i] = std::numeric_limits<T>::quiet_NaN();
     }
   }
 
@@ -251,25 +256,133 @@ void check(const Example<T>& e, const std::vector<const Pool*>& pools) {
   }
 }
 
+// A resistance, against the gather, the product and the scatter one after the other.
+template <class T>
+void check_resistance(const Example<T>& e, const std::vector<const Pool*>& pools) {
+  const Shape& sh = e.shape;
+  const int d = sh.d, m = d * d;
+  const int64_t n = sh.size(), particles = sh.particles, packed = m * (m + 1) / 2;
+  const Resist<T> task = {e.stencils(false), e.matrices.data.get(), e.moved.data.get(), e.resisted.data.get(), {},
+                          nullptr, n, d};
+  std::unique_ptr<Array<T>> bits;
+  for (const Pool* pool : pools) {
+    if (!resist(*pool, {d, sh.s, false}, sh.batch, task)) ++faults, std::printf("no kernel for d=%d s=%d\n", d, sh.s);
+    if (bits == nullptr) bits = std::make_unique<Array<T>>(e.resisted);
+    expect_same("a resistance", *bits, e.resisted);
+  }
+  // Of each particle the slopes G, m numbers, and r = K G; and what bounds their rounding.
+  std::vector<double> G(sh.batch * particles * m), G_scale(G.size()), r(G.size()), r_scale(G.size());
+  each_node(e, false, [&](int64_t b, int64_t p, int32_t node, const double* basis, const int*) {
+    const int64_t clipped = node < 0 ? 0 : node >= n ? n - 1 : node;
+    for (int i = 0; i < m; ++i) {
+      const double u = e.moved[(b * n + clipped) * d + i % d];
+      G[(b * particles + p) * m + i] += basis[1 + i / d] * u;
+      G_scale[(b * particles + p) * m + i] += std::abs(basis[1 + i / d] * u) + std::abs(u);
+    }
+  });
+  for (int64_t b = 0; b < sh.batch; ++b) {
+    for (int64_t p = 0; p < particles; ++p) {
+      for (int i = 0, k = 0; i < m; ++i) {
+        for (int j = i; j < m; ++j, ++k) {
+          const double entry = e.matrices[(b * packed + k) * particles + p];
+          const int64_t at = (b * particles + p) * m;
+          r[at + i] += entry * G[at + j];
+          r_scale[at + i] += std::abs(entry) * G_scale[at + j];
+          if (j > i) r[at + j] += entry * G[at + i];
+          if (j > i) r_scale[at + j] += std::abs(entry) * G_scale[at + i];
+        }
+      }
+    }
+  }
+  std::vector<double> expected(e.resisted.size), scale(e.resisted.size);
+  each_node(e, false, [&](int64_t b, int64_t p, int32_t node, const double* basis, const int*) {
+    if (node < 0 || node >= n) return;
+    for (int i = 0; i < m; ++i) {
+      expected[(b * n + node) * d + i % d] += basis[1 + i / d] * r[(b * particles + p) * m + i];
+      scale[(b * n + node) * d + i % d] += 30 * (std::abs(basis[1 + i / d]) + 1) * r_scale[(b * particles + p) * m + i];
+    }
+  });
+  compare("resist", sh, e.resisted, expected, scale);
+}
+
+// Particles in the order of their cells, so that ranges of nodes share few of them.
+template <class T>
+void check_in_order(Shape shape, std::mt19937& random, const std::vector<const Pool*>& pools) {
+  Example<T> e(shape, 0, random);
+  for (int64_t p = 0; p < shape.particles; ++p) {
+    for (int i = 0; i < shape.s; ++i) {  // the first axis goes up evenly; its terms are multiples of a plane's nodes
+      const int64_t stride = shape.size() / shape.along, first = p * (shape.along - shape.s + 1) / shape.particles;
+      e.index[i * shape.particles + p] = int32_t((first + i) * stride);
+    }
+  }
+  check(e, pools);
+  check_resistance(e, pools);
+}
+
+// Vectors of which some blocks are zero, combined in place and elsewhere; whatever is passed over stays or becomes zero.
+template <class T>
+void check_vectors(int64_t size, bool in_place, std::mt19937& random, const std::vector<const Pool*>& pools) {
+  const int64_t batch = 2, blocks = (size + kTogether - 1) / kTogether;
+  std::normal_distribution<T> normal;
+  const Array<T> a(batch * size), b(a.size), c(a.size), d(a.size), weight(a.size), scales(2 * batch), sum(batch);
+  const Array<bool> active(batch * blocks);
+  for (int64_t i = 0; i < active.size; ++i) active[i] = random() % 3 == 0;
+  for (int64_t i = 0; i < a.size; ++i) {
+    weight[i] = normal(random);
+    if (!active[i / size * blocks + i % size / kTogether]) continue;
+    a[i] = normal(random), b[i] = normal(random), c[i] = normal(random), d[i] = normal(random);
+  }
+  for (int64_t i = 0; i < scales.size; ++i) scales[i] = normal(random);
+  std::vector<double> y(a.size), z(a.size), total(batch), ones(a.size, 30), bound(batch, 1);
+  for (int64_t i = 0; i < a.size; ++i) {
+    y[i] = a[i] + double(scales[i / size * 2]) * b[i];
+    z[i] = c[i] + double(scales[i / size * 2 + 1]) * d[i];
+    total[i / size] += weight[i] * z[i] * z[i];
+    bound[i / size] += std::abs(weight[i] * z[i] * z[i]);
+  }
+  std::unique_ptr<Array<T>> bits;
+  for (const Pool* pool : pools) {
+    Array<T> to_y(in_place ? b : a), to_z(in_place ? d : c);
+    for (int64_t i = 0; i < to_y.size && !in_place; ++i) to_y[i] = to_z[i] = 7;
+    combine(*pool, batch, Combine<T>{a.data.get(), in_place ? to_y.data.get() : b.data.get(), c.data.get(),
+                                     in_place ? to_z.data.get() : d.data.get(), scales.data.get(), weight.data.get(),
+                                     active.data.get(), to_y.data.get(), to_z.data.get(), sum.data.get(), size});
+    const Shape shape = {1, 0, batch, size, 0, 0};
+    compare("combine y", shape, to_y, y, ones);
+    compare("combine z", shape, to_z, z, ones);
+    compare("combine sum", shape, sum, total, bound);
+    if (bits == nullptr) bits = std::make_unique<Array<T>>(sum);
+    expect_same("a norm", *bits, sum);
+  }
+}
+
 template <class T>
 int check_all(const std::vector<const Pool*>& pools) {
   std::mt19937 random(1);
   int examples = 0;
+  const auto check_both = [&](const Shape& shape, int oddity) {
+    const Example<T> e(shape, oddity, random);
+    check(e, pools);
+    check_resistance(e, pools);
+    ++examples;
+  };
   for (int d = 1; d <= 3; ++d) {
     for (int s = 2; s <= 4; ++s) {
       for (const int64_t particles : {0, 1, 16, 53}) {
         for (const int64_t columns : {1, 2, 3, 4, 6}) {
           const int oddity = int(random() % 4) - 1;  // all in one cell, inside, at the edge, anywhere
-          check(Example<T>({d, s, 1 + int64_t(random() % 2), particles, 5, columns}, oddity, random), pools);
-          ++examples;
+          check_both({d, s, 1 + int64_t(random() % 2), particles, 5, columns}, oddity);
         }
       }
     }
   }
-  for (int oddity = -1; oddity < 3; ++oddity, ++examples) {  // enough for several threads
-    check(Example<T>({2, 3, 1, 20011, 40, 3}, oddity, random), pools);
+  // Enough for several threads.
+  for (int oddity = -1; oddity < 3; ++oddity) check_both({2, 3, 1, 20011, 40, 3}, oddity);
+  check_both({1, 2, 3, 30011, 999, 1}, 1);
+  check_in_order<T>({2, 3, 2, 20011, 40, 2}, random, pools);
+  for (const int64_t size : {0, 1, 64, 200, 100003}) {
+    for (const bool in_place : {false, true}) check_vectors<T>(size, in_place, random, pools), ++examples;
   }
-  check(Example<T>({1, 2, 3, 30011, 999, 1}, 1, random), pools);
   return examples + 1;
 }
 

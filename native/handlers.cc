@@ -4,8 +4,11 @@
 //   gather   index, weights, derivatives [, their changes], nodes      ->  a, a_b for each direction
 //   scatter  index, weights, derivatives [, their changes], given ...  ->  nodes
 //   pull     index, weights, derivatives, nodes, given ...             ->  by weights, by derivatives
+//   resist   index, weights, derivatives, matrices, nodes              ->  nodes
+//   combine  a, b, c, d, scales, weight, active                        ->  y, z, sum
 //
-// Factors are (..., d, s, p), given and gathered (..., c, p), nodes (..., n, c), with the same leading axes everywhere.
+// Factors are (..., d, s, p), given and gathered (..., c, p), nodes (..., n, c), matrices (..., d² (d² + 1) / 2, p), with
+// the same leading axes everywhere. Vectors to combine are (..., m), scales (..., 2), active (..., ⌈m/64⌉).
 // `valued` says whether the first of the given is the value; `differential` whether changes of the factors follow them.
 
 #include <string>
@@ -14,6 +17,7 @@
 
 #include "sums.h"
 #include "targets.h"
+#include "vectors.h"
 #include "xla/ffi/api/ffi.h"
 
 namespace ffi = xla::ffi;
@@ -97,7 +101,7 @@ struct Call {
   }
 };
 
-Call read(const ffi::RemainingArgs& arguments, const ffi::RemainingRets& results) {
+Call collect(const ffi::RemainingArgs& arguments, const ffi::RemainingRets& results) {
   Call call;
   call.operands = arguments.size();
   for (size_t i = 0; i < arguments.size(); ++i) {
@@ -108,7 +112,14 @@ Call read(const ffi::RemainingArgs& arguments, const ffi::RemainingRets& results
     auto buffer = results.get<ffi::AnyBuffer>(i);
     if (buffer.has_value()) call.buffers.push_back(**buffer);
   }
-  call.expect(call.buffers.size() == arguments.size() + results.size() && call.operands >= 4, "an array is missing");
+  call.expect(call.buffers.size() == arguments.size() + results.size(), "an array is missing");
+  return call;
+}
+
+// A sum's call, with the sizes that its index and weights have.
+Call read(const ffi::RemainingArgs& arguments, const ffi::RemainingRets& results) {
+  Call call = collect(arguments, results);
+  call.expect(call.operands >= 4, "an array is missing");
   if (!call.fault.empty()) return call;
   const Shape shape = shape_of(call.buffers[0]);
   call.expect(shape.size() >= 3 && call.buffers[0].element_type() == ffi::DataType::S32, "no index (..., d, s, p)");
@@ -181,6 +192,24 @@ struct PullOf {
   }
 };
 
+struct ResistOf {
+  template <class T>
+  bool run(const Pool& pool, Call& call) const {
+    const int64_t m = call.d * call.d;
+    Resist<T> task = {};
+    task.stencils = call.stencils<T>(false);
+    task.size = call.dim(4, 2);
+    task.columns = call.d;
+    task.matrices = call.at<T>(3, {m * (m + 1) / 2, call.particles});
+    task.moved = call.at<T>(4, {task.size, call.d});
+    task.nodes = call.at<T>(5, {task.size, call.d});
+    call.expect(call.operands == 5 && call.buffers.size() == 6, "too many or too few arrays");
+    call.expect(task.size > 0 || call.particles == 0, "no nodes to gather from");
+    if (!call.fault.empty()) return true;
+    return resist(pool, {int(call.d), int(call.s), false}, call.batch, task);
+  }
+};
+
 template <class Problem>
 ffi::Error run(const Problem& problem, ffi::ThreadPool threads, const ffi::RemainingArgs& arguments,
                const ffi::RemainingRets& results) {
@@ -208,6 +237,47 @@ ffi::Error run_pull(ffi::ThreadPool threads, bool valued, ffi::RemainingArgs arg
   return run(PullOf{valued}, threads, arguments, results);
 }
 
+ffi::Error run_resist(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  return run(ResistOf{}, threads, arguments, results);
+}
+
+template <class T>
+void combine_call(const Pool& pool, Call& call, int64_t size, const bool* active) {
+  Combine<T> task = {};
+  task.size = size;
+  const T** from[] = {&task.a, &task.b, &task.c, &task.d};
+  for (size_t k = 0; k < 4; ++k) *from[k] = call.at<T>(k, {size});
+  task.scales = call.at<T>(4, {2});
+  task.weight = call.at<T>(5, {size});
+  task.y = call.at<T>(7, {size});
+  task.z = call.at<T>(8, {size});
+  task.sum = call.at<T>(9, {});
+  task.active = active;
+  if (call.fault.empty()) combine(pool, call.batch, task);
+}
+
+ffi::Error run_combine(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  Call call = collect(arguments, results);
+  call.expect(call.operands == 7 && call.buffers.size() == 10, "too many or too few arrays");
+  if (!call.fault.empty()) return wrong(call.fault);
+  const Shape shape = shape_of(call.buffers[0]);
+  call.expect(!shape.empty() && call.buffers[6].element_type() == ffi::DataType::PRED, "no vectors, or no active blocks");
+  if (!call.fault.empty()) return wrong(call.fault);
+  call.type = call.buffers[0].element_type();
+  call.leading.assign(shape.begin(), shape.end() - 1);
+  for (const int64_t n : call.leading) call.batch *= n;
+  Shape blocks = call.leading;
+  blocks.push_back((shape.back() + kTogether - 1) / kTogether);
+  call.expect(shape_of(call.buffers[6]) == blocks, "arrays whose shapes do not fit each other");
+  if (!call.fault.empty()) return wrong(call.fault);
+  const bool* active = static_cast<const bool*>(call.buffers[6].untyped_data());
+  const XlaPool pool(threads);
+  call.expect(call.type == ffi::DataType::F32 || call.type == ffi::DataType::F64, "there is no kernel of this type");
+  if (call.type == ffi::DataType::F32) combine_call<float>(pool, call, shape.back(), active);
+  if (call.type == ffi::DataType::F64) combine_call<double>(pool, call, shape.back(), active);
+  return call.fault.empty() ? ffi::Error::Success() : wrong(call.fault);
+}
+
 ffi::Error run_threads(ffi::ThreadPool threads, ffi::ResultBuffer<ffi::DataType::S32> count) {
   *count->typed_data() = static_cast<int32_t>(threads.num_threads());
   return ffi::Error::Success();
@@ -233,6 +303,10 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_scatter, mpmjax::run_scatter,
                                   .RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_pull, mpmjax::run_pull,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<bool>("valued").RemainingArgs().RemainingRets());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_resist, mpmjax::run_resist,
+                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_combine, mpmjax::run_combine,
+                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
 
 // The threads that sums are shared among.
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_threads, mpmjax::run_threads,

@@ -1,7 +1,8 @@
-// The three sums for every dimension and kernel, compiled once for each instruction set: MPMJAX_TARGET is its name.
+// The sums for every dimension and kernel, compiled once for each instruction set: MPMJAX_TARGET is its name.
 
 #include "gather.h"
 #include "pull.h"
+#include "resist.h"
 #include "scatter.h"
 #include "targets.h"
 
@@ -12,9 +13,9 @@ using mpmjax::Kernels;
 template <class T, int d, int s>
 const Kernels<T>* of(bool differential) {
   static constexpr Kernels<T> sums = {gather<T, d, s, false>, scatter<T, d, s, false>, find_ranges<T, d, s>,
-                                      pull<T, d, s>};
+                                      pull<T, d, s>,          resist<T, d, s>,         resist_particles<T, d, s>};
   static constexpr Kernels<T> differentials = {gather<T, d, s, true>, scatter<T, d, s, true>, find_ranges<T, d, s>,
-                                               nullptr};
+                                               nullptr,               nullptr,                nullptr};
   return differential ? &differentials : &sums;
 }
 

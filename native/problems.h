@@ -1,4 +1,4 @@
-// The three sums, as plain data: arrays in C order with their sizes.
+// The sums, as plain data: arrays in C order with their sizes.
 //
 // With the stencil weights w_ip and gradients g_ip,b of nodes i, particles p and directions b, values f at the nodes and
 // a, a_b at the particles,
@@ -6,6 +6,7 @@
 //   scatter  f_i  = Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b)
 //   gather   a_p  = Σ_i w_ip f_i,   a_p,b = Σ_i g_ip,b f_i
 //   pull     ∂B/∂factors,   B = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b)
+//   resist   the scatter of K_p times the gather's gradients, with a symmetric matrix K_p for each particle
 //
 // Weights are products of one factor along each axis; of a gradient's factors the one along its direction is a
 // derivative. Only the factors are stored, (d, s, p) with s nodes along an axis.
@@ -67,15 +68,31 @@ struct Pull {
   int64_t columns;
 };
 
-// The sums for one dimension and kernel. Gather and pull take particles from a first to a last. A scatter takes all
-// particles, and sets the nodes from a first to a last; it passes over blocks whose range of indices says that they give
-// nothing to these.
+// Σ_p Σ_b g_ip,b r_p,b with r_p = K_p G_p and G_p,b = Σ_j g_jp,b u_j, all in d columns. K_p is a symmetric matrix on the
+// d² components of a gradient, b first, given by its upper triangle, row by row.
+template <class T>
+struct Resist {
+  Stencils<T> stencils;
+  const T* matrices;       // K, (d² (d² + 1) / 2, p)
+  const T* moved;          // u, (n, d)
+  T* nodes;                // (n, d)
+  T* sums[kMostAxes + 1];  // r_b for each direction after a null, each (d, p), where they are stored
+  const Range* ranges;     // of each block, or null
+  int64_t size;
+  int64_t columns;  // d
+};
+
+// The sums for one dimension and kernel. Gather and pull take particles from a first to a last. Scatter and resist take
+// all particles, and set the nodes from a first to a last; they pass over blocks whose range of indices says that they
+// give nothing to these. `resist_particles` stores what the particles from a first to a last give.
 template <class T>
 struct Kernels {
   void (*gather)(const Gather<T>&, int64_t first, int64_t last);
   void (*scatter)(const Scatter<T>&, int64_t first, int64_t last);
   void (*find_ranges)(const Stencils<T>&, int64_t first_block, int64_t last_block, Range* ranges);
   void (*pull)(const Pull<T>&, int64_t first, int64_t last);
+  void (*resist)(const Resist<T>&, int64_t first, int64_t last);
+  void (*resist_particles)(const Resist<T>&, int64_t first, int64_t last);
 };
 
 }  // namespace mpmjax

@@ -93,35 +93,26 @@ void find_ranges(const Stencils<T>& stencils, int64_t first, int64_t last, Range
   }
 }
 
-// The particles' share in four columns or fewer, for a range of nodes that is zero at first.
-template <class T, int d, int s, bool differential, bool graded, int used>
-void scatter_columns(const Scatter<T>& task, int64_t column, int64_t first, int64_t last) {
-  const int64_t particles = task.stencils.particles;
-  const int width = used > 0 ? used : smaller(task.columns - column, kLanes);
-  const NodeSums<T, used> nodes{task.nodes + column, task.columns, first, last, width};
+// Adds what all particles give to a range of nodes, in four columns or fewer. `give(block, start, count, rows)` makes it
+// of a block: for each particle the row of its value, and with `graded` then those of its gradients.
+template <class T, int d, int s, bool differential, bool graded, int used, class Give>
+MPMJAX_INLINE void add_blocks(const Stencils<T>& stencils, const Range* ranges, const NodeSums<T, used>& nodes,
+                              const Give& give) {
+  const int64_t particles = stencils.particles;
   for (int64_t start = 0; start < particles; start += kBlock) {
-    if (task.ranges != nullptr) {
-      const Range range = task.ranges[start / kBlock];
-      if (range.most < first || range.least >= last) continue;
-    }
+    if (ranges != nullptr && !nodes.may_have(ranges[start / kBlock].least, ranges[start / kBlock].most)) continue;
     const int count = smaller(particles - start, kBlock);
     Block<T, d, s, differential> block;
-    block.find_range(task.stencils, start, count);
+    block.find_range(stencils, start, count);
     int taken[kBlock], some = 0;
     for (int q = 0; q < count; ++q) {
       taken[some] = q;
-      some += block.most[q] < first || block.least[q] >= last ? 0 : 1;
+      some += nodes.may_have(block.least[q], block.most[q]) ? 1 : 0;
     }
     if (some == 0) continue;
-    block.read(task.stencils, start, count);
+    block.read(stencils, start, count);
     Vector<T> rows[graded ? d + 1 : 1][kBlock];
-    for (int b = 0; b < (graded ? d + 1 : 1); ++b) {
-      if (task.given[b] == nullptr) {
-        std::memset(rows[b], 0, sizeof rows[b]);
-      } else {
-        read_rows(task.given[b] + column * particles + start, particles, count, width, rows[b]);
-      }
-    }
+    give(block, start, count, rows);
     for (int k = 0; k < some; ++k) {
       const int q = taken[k];
       const auto add = [&](const auto& scatterer) MPMJAX_INLINE_LAMBDA {
@@ -133,13 +124,31 @@ void scatter_columns(const Scatter<T>& task, int64_t column, int64_t first, int6
           scatterer.template add<0>(0, rows[0][q]);
         }
       };
-      if (block.least[q] >= first && block.most[q] < last) {
+      if (block.least[q] >= nodes.first && block.most[q] < nodes.last) {
         add(Scatterer<T, d, s, differential, true, used>{block, nodes, q});
       } else {
         add(Scatterer<T, d, s, differential, false, used>{block, nodes, q});
       }
     }
   }
+}
+
+// The particles' share in four columns or fewer, for a range of nodes that is zero at first.
+template <class T, int d, int s, bool differential, bool graded, int used>
+void scatter_columns(const Scatter<T>& task, int64_t column, int64_t first, int64_t last) {
+  const int64_t particles = task.stencils.particles;
+  const int width = used > 0 ? used : smaller(task.columns - column, kLanes);
+  const NodeSums<T, used> nodes{task.nodes + column, task.columns, first, last, width};
+  const auto give = [&](const auto&, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
+    for (int b = 0; b < (graded ? d + 1 : 1); ++b) {
+      if (task.given[b] == nullptr) {
+        std::memset(rows[b], 0, sizeof rows[b]);
+      } else {
+        read_rows(task.given[b] + column * particles + start, particles, count, width, rows[b]);
+      }
+    }
+  };
+  add_blocks<T, d, s, differential, graded, used>(task.stencils, task.ranges, nodes, give);
 }
 
 template <class T, int d, int s, bool differential, bool graded>

@@ -1,6 +1,7 @@
 #include "sums.h"
 
 #include <algorithm>
+#include <memory>
 #include <vector>
 
 #include "targets.h"
@@ -14,6 +15,8 @@ constexpr int64_t kLeastVisits = 1 << 14;
 // have one, because what is near a cut is done on both sides of it.
 constexpr int64_t kShares = 4;
 constexpr int64_t kSamples = 512;
+// Ranges of nodes may reach so many times all particles together before a resistance stores what these give.
+constexpr double kMostReached = 1.5;
 constexpr int64_t kRound = 64;  // particles of a share are a multiple of this: no two write to one line of a cache
 
 int64_t power(int64_t base, int exponent) { return exponent == 0 ? 1 : base * power(base, exponent - 1); }
@@ -72,6 +75,16 @@ Pull<T> member(Pull<T> all, Form form, int64_t i) {
   return all;
 }
 
+template <class T>
+Resist<T> member(Resist<T> all, Form form, int64_t i) {
+  all.stencils = member(all.stencils, form, i);
+  all.matrices += i * form.d * form.d * (form.d * form.d + 1) / 2 * all.stencils.particles;
+  all.moved += i * all.size * all.columns;
+  all.nodes += i * all.size * all.columns;
+  move(all.sums, i * all.columns * all.stencils.particles);
+  return all;
+}
+
 // Calls run(problem, first, last) for all particles of all members.
 template <class Problem, class Run>
 void over_particles(const Pool& pool, Form form, int64_t batch, const Problem& all, const Run& run) {
@@ -87,15 +100,15 @@ void over_particles(const Pool& pool, Form form, int64_t batch, const Problem& a
 // Where the nodes are cut into parts with about as many particles each, by a sample: the k-th part goes from the k-th
 // number to the next. How well they are chosen changes seconds, never sums.
 template <class T>
-std::vector<int64_t> cut(const Scatter<T>& task, Form form, int64_t parts) {
-  const int64_t particles = task.stencils.particles, samples = std::min(kSamples, particles);
+std::vector<int64_t> cut(const Stencils<T>& stencils, int64_t size, Form form, int64_t parts) {
+  const int64_t particles = stencils.particles, samples = std::min(kSamples, particles);
   std::vector<int64_t> places;
   for (int64_t k = 0; parts > 1 && k < samples; ++k) {
     int64_t middle = 0;
     for (int a = 0; a < form.d; ++a) {
-      middle += task.stencils.index[(a * form.s + form.s / 2) * particles + k * particles / samples];
+      middle += stencils.index[(a * form.s + form.s / 2) * particles + k * particles / samples];
     }
-    if (middle >= 0 && middle < task.size) places.push_back(middle);
+    if (middle >= 0 && middle < size) places.push_back(middle);
   }
   std::sort(places.begin(), places.end());
   std::vector<int64_t> found = {0};
@@ -103,7 +116,56 @@ std::vector<int64_t> cut(const Scatter<T>& task, Form form, int64_t parts) {
     const int64_t place = places.empty() ? 0 : places[k * places.size() / parts];
     found.push_back(std::max(found.back(), place));
   }
-  found.push_back(task.size);
+  found.push_back(size);
+  return found;
+}
+
+// The nodes of each member cut into parts, one for each thread, and the ranges of nodes that its blocks of particles
+// reach, of which there are none where there is one part.
+struct Division {
+  int64_t parts, blocks;
+  std::vector<Range> ranges;
+  std::vector<std::vector<int64_t>> cuts;
+
+  // Calls run(problem, first, last) for the nodes of all members.
+  template <class Problem, class Run>
+  void over_nodes(const Pool& pool, Form form, int64_t batch, const Problem& all, const Run& run) const {
+    share(pool, batch * parts, [&](int64_t i) {
+      const std::vector<int64_t>& own = cuts[i / parts];
+      const int64_t first = own[i % parts], last = own[i % parts + 1];
+      Problem task = member(all, form, i / parts);
+      task.ranges = parts > 1 ? ranges.data() + i / parts * blocks : nullptr;
+      if (first < last) run(task, first, last);
+    });
+  }
+
+  // How many times the particles of all members are reached by the parts together.
+  double reached() const {
+    int64_t count = 0;
+    for (size_t m = 0; m < cuts.size() && !ranges.empty(); ++m) {
+      for (int64_t k = 0; k < blocks; ++k) {
+        const Range& range = ranges[m * blocks + k];
+        for (int64_t i = 0; i < parts; ++i) count += range.most >= cuts[m][i] && range.least < cuts[m][i + 1];
+      }
+    }
+    return ranges.empty() ? 1 : double(count) / ranges.size();
+  }
+};
+
+template <class T, class Problem>
+Division divide(const Pool& pool, Form form, int64_t batch, const Problem& all, const Kernels<T>& kernels) {
+  const int64_t particles = all.stencils.particles, blocks = (particles + kBlock - 1) / kBlock;
+  Division found = {shares(pool, form, batch, particles, all.columns, 1), blocks, {}, {}};
+  const int64_t parts = found.parts, each = (blocks + parts - 1) / parts;
+  found.cuts.assign(batch, {0, all.size});
+  if (parts == 1) return found;
+  found.ranges.resize(batch * blocks);
+  share(pool, batch * parts, [&](int64_t i) {
+    const int64_t k = i / parts, first = i % parts * each, last = std::min(blocks, first + each);
+    const Stencils<T> stencils = member(all.stencils, form, k);
+    if (first < last) kernels.find_ranges(stencils, first, last, found.ranges.data() + k * blocks);
+    if (first == 0) found.cuts[k] = cut(stencils, all.size, form, parts);
+  });
   return found;
 }
 
@@ -127,28 +189,27 @@ template <class T>
 bool scatter_all(const Pool& pool, Form form, int64_t batch, const Scatter<T>& all) {
   const Kernels<T>* found = kernels(T(), form.d, form.s, form.differential);
   if (found == nullptr) return false;
-  const int64_t particles = all.stencils.particles, blocks = (particles + kBlock - 1) / kBlock;
-  const int64_t parts = shares(pool, form, batch, particles, all.columns, 1);
-  if (parts == 1) {
-    share(pool, batch, [&](int64_t i) { found->scatter(member(all, form, i), 0, all.size); });
+  divide(pool, form, batch, all, *found).over_nodes(pool, form, batch, all, found->scatter);
+  return true;
+}
+
+template <class T>
+bool resist_all(const Pool& pool, Form form, int64_t batch, const Resist<T>& all) {
+  const Kernels<T>* found = kernels(T(), form.d, form.s, false);
+  if (found == nullptr) return false;
+  const Division division = divide(pool, form, batch, all, *found);
+  if (division.reached() <= kMostReached) {
+    division.over_nodes(pool, form, batch, all, found->resist);
     return true;
   }
-  std::vector<Range> ranges(batch * blocks);
-  std::vector<std::vector<int64_t>> cuts(batch);
-  const int64_t each = (blocks + parts - 1) / parts;
-  share(pool, batch * parts, [&](int64_t i) {
-    const int64_t k = i / parts, first = i % parts * each, last = std::min(blocks, first + each);
-    const Scatter<T> task = member(all, form, k);
-    if (first < last) found->find_ranges(task.stencils, first, last, ranges.data() + k * blocks);
-    if (first == 0) cuts[k] = cut(task, form, parts);
-  });
-  share(pool, batch * parts, [&](int64_t i) {
-    const std::vector<int64_t>& own = cuts[i / parts];
-    const int64_t first = own[i % parts], last = own[i % parts + 1];
-    Scatter<T> task = member(all, form, i / parts);
-    task.ranges = ranges.data() + i / parts * blocks;
-    if (first < last) found->scatter(task, first, last);
-  });
+  // Each particle once, and then a scatter: the parts would do most particles several times.
+  const int64_t rows = batch * all.columns * all.stencils.particles;
+  const std::unique_ptr<T[]> stored(new T[form.d * rows]);
+  Resist<T> first = all;
+  Scatter<T> rest = {all.stencils, {}, all.nodes, nullptr, all.size, all.columns};
+  for (int b = 1; b <= form.d; ++b) rest.given[b] = first.sums[b] = stored.get() + (b - 1) * rows;
+  over_particles(pool, form, batch, first, found->resist_particles);
+  division.over_nodes(pool, form, batch, rest, found->scatter);
   return true;
 }
 
@@ -160,5 +221,7 @@ bool scatter(const Pool& p, Form f, int64_t b, const Scatter<float>& s) { return
 bool scatter(const Pool& p, Form f, int64_t b, const Scatter<double>& s) { return scatter_all(p, f, b, s); }
 bool pull(const Pool& p, Form f, int64_t b, const Pull<float>& q) { return pull_all(p, f, b, q); }
 bool pull(const Pool& p, Form f, int64_t b, const Pull<double>& q) { return pull_all(p, f, b, q); }
+bool resist(const Pool& p, Form f, int64_t b, const Resist<float>& r) { return resist_all(p, f, b, r); }
+bool resist(const Pool& p, Form f, int64_t b, const Resist<double>& r) { return resist_all(p, f, b, r); }
 
 }  // namespace mpmjax

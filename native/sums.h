@@ -1,4 +1,4 @@
-// The three sums for a batch, on all threads.
+// The sums for a batch, on all threads.
 
 #pragma once
 
@@ -21,5 +21,7 @@ bool scatter(const Pool& pool, Form form, int64_t batch, const Scatter<float>& f
 bool scatter(const Pool& pool, Form form, int64_t batch, const Scatter<double>& first);
 bool pull(const Pool& pool, Form form, int64_t batch, const Pull<float>& first);
 bool pull(const Pool& pool, Form form, int64_t batch, const Pull<double>& first);
+bool resist(const Pool& pool, Form form, int64_t batch, const Resist<float>& first);
+bool resist(const Pool& pool, Form form, int64_t batch, const Resist<double>& first);
 
 }  // namespace mpmjax

@@ -14,6 +14,7 @@ import mpmjax as mpm
 from mpmjax._types import components
 from mpmjax.boundary import mirror
 from mpmjax.discretisation._transfer import p2g
+from mpmjax.implicit._conjugate_residual import NEGLIGIBLE_CHANGE
 from mpmjax.implicit._inner_product import DiagonalInnerProduct
 from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._potential import ElasticPotential
@@ -400,19 +401,20 @@ def test_the_references_plain_inner_product_fails_on_a_nearly_empty_node():
 @pytest.mark.parametrize("condition", [1e4, 1e8])
 def test_converged_below_the_tolerance_of_float32_means_a_small_error(condition):
     """Asked for what rounding forbids, the solver calls a solution what is one. At a condition beyond float32's digits
-    a residual as small as its own rounding leaves errors of one to fifty per cent, and is none."""
+    none is: where the right-hand side hides what A makes small, a residual as small as its own rounding leaves errors
+    of seven to fifty-six per cent; and for any other right-hand side the error is more than a solution may have."""
     for seed in range(6):
         rng = np.random.default_rng(seed)
         Q = np.linalg.qr(rng.normal(size=(N, N)))[0]
         A = (Q @ np.diag(np.logspace(-np.log10(condition), 0, N)) @ Q.T).astype(np.float32)
         A = (A + A.T) / 2
-        for b in (A @ rng.normal(size=N), rng.normal(size=N)):
+        for b, least in ((A @ rng.normal(size=N), 2e-2), (rng.normal(size=N), NEGLIGIBLE_CHANGE)):
             b = b.astype(np.float32)
             x, result, _ = solve(mpm.ConjugateResidual(rtol=1e-12, max_steps=4000), jnp.asarray(A), jnp.asarray(b))
             exact = np.linalg.solve(A.astype(float), b.astype(float))
             error = np.linalg.norm(np.asarray(x) - exact) / np.linalg.norm(exact)
             assert bool(result == R.successful) == (condition < 1e5)
-            assert error < 1e-3 if condition < 1e5 else error > 5e-3
+            assert error < NEGLIGIBLE_CHANGE if condition < 1e5 else error > least
 
 
 def test_a_residual_that_cannot_be_corrected_is_no_solution():

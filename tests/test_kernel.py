@@ -198,6 +198,21 @@ def test_stencil_does_not_depend_on_where_the_window_lies(kernel, d):
     assert_close(here.gradient, there.gradient, 1e-13)
 
 
+def test_indices_have_32_bits_whatever_a_window_has():
+    """Those that native sums have kernels for."""
+    x, window = places(2), np.zeros(2)
+    for dtype in ("int32", "int64"):
+        stencil = make_stencil(
+            mpm.BSpline(),
+            mpm.MLSGradient(),
+            mpm.Grid((8, 8), DX),
+            jnp.asarray(window, dtype),
+            jnp.asarray(x),
+            affine=False,
+        )
+        assert stencil.index_factors.dtype == jnp.int32
+
+
 @pytest.mark.parametrize("d", [2, *thorough(1, 3)])
 def test_following_window_keeps_the_material_in_its_middle(d):
     """Wherever the particles go they are inside, their window moves by whole spacings, their stencil stays."""

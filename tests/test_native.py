@@ -12,7 +12,10 @@ import pytest
 from helpers import assert_close, block, thorough
 
 import mpmjax as mpm
+from mpmjax import linalg as la
+from mpmjax.discretisation import _resistance
 from mpmjax.discretisation import _transfer_sums as sums
+from mpmjax.implicit import _vectors
 from mpmjax.native import _library
 
 ROOT = Path(__file__).parents[1]
@@ -37,19 +40,39 @@ def choose(monkeypatch):
     jax.clear_caches()
 
 
-def problem(d, s, c, p, dtype, seed=0, *, wild=True):
+def problem(d, s, c, p, dtype, seed=0, *, wild=True, side=SIDE):
     """Index factors, weights and derivatives, what particles give, and node values. With `wild` some particles reach
     over the window's edges, and one has indices without meaning."""
     rng = np.random.default_rng(seed)
-    strides = SIDE ** np.arange(d)[::-1]
-    along = rng.integers(-wild, SIDE - s + 1 + wild, size=(d, 1, p)) + np.arange(s)[:, None]
+    strides = side ** np.arange(d)[::-1]
+    along = rng.integers(-wild, side - s + 1 + wild, size=(d, 1, p)) + np.arange(s)[:, None]
     index = (along * strides[:, None, None]).astype("int32")
     if wild and p > 3:
         index[..., 3] = rng.integers(-(2**31), 2**31, size=(d, s))
     w, g, given, nodes = (
-        rng.normal(size=shape).astype(dtype) for shape in ((d, s, p), (d, s, p), (d + 1, c, p), (SIDE**d, c))
+        rng.normal(size=shape).astype(dtype) for shape in ((d, s, p), (d, s, p), (d + 1, c, p), (side**d, c))
     )
     return tuple(jnp.asarray(a) for a in (index, w, g, given, nodes))
+
+
+def resistance(d, p, dtype, seed=0, *, wild=True, side=SIDE):
+    """What `resist` is given: factors, upper triangles and a displacement."""
+    index, w, g, _, u = problem(d, 3, d, p, dtype, seed, wild=wild, side=side)
+    upper = np.random.default_rng(seed + 1).normal(size=(d * d * (d * d + 1) // 2, p)).astype(dtype)
+    return index, w, g, jnp.asarray(upper), u
+
+
+def resisted(*args):
+    """By the primitive."""
+    return _resistance._resist_p.bind(*args, batched=0)[0]
+
+
+def resisted_in_parts(index, w, g, upper, u):
+    """By a gather, a matrix a particle and a scatter, as they are written in JAX."""
+    d = len(index)
+    slopes = jnp.concatenate(sums._gather(index, w, g, u, unroll=False)[1:])
+    flux = jnp.einsum("ijp,jp->ip", la.symmetric(upper), slopes).reshape(d, d, -1)
+    return sums._scatter(index, w, g, *flux, valued=False, size=len(u), unroll=False)[0]
 
 
 def native(index, w, g, given, nodes, valued=True, graded=True):
@@ -57,9 +80,9 @@ def native(index, w, g, given, nodes, valued=True, graded=True):
     parts = [*given[:1]] * valued + [*given[1:]] * graded
     params = {"valued": valued, "batched": 0}
     return (
-        sums._gather_p.bind(index, w, g, nodes, batched=0),
-        sums._scatter_p.bind(index, w, g, *parts, size=nodes.shape[0], **params),
-        sums._pull_p.bind(index, w, g, nodes, *parts, **params),
+        sums.gather_p.bind(index, w, g, nodes, batched=0),
+        sums.scatter_p.bind(index, w, g, *parts, size=nodes.shape[0], **params),
+        sums.pull_p.bind(index, w, g, nodes, *parts, **params),
     )
 
 
@@ -120,6 +143,91 @@ def test_derivatives_agree(d):
 
 
 @NEEDS_LIBRARY
+@pytest.mark.parametrize("dtype", ["float32", *thorough("float64")])
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
+def test_resistances_agree(d, dtype):
+    """With indices beyond the window, for one particle and none, and in a batch that shares its matrices."""
+    run, parts = jax.jit(resisted), jax.jit(resisted_in_parts)
+    for p in (45, 1, 0):
+        args = resistance(d, p, dtype)
+        agree(run(*args), parts(*args), dtype)
+    index, w, g, upper, u = resistance(d, 45, dtype)
+    both = jnp.stack([u, resistance(d, 45, dtype, seed=7)[-1]])
+    together = jax.jit(jax.vmap(resisted, in_axes=(None, None, None, None, 0)))(index, w, g, upper, both)
+    np.testing.assert_array_equal(together, jnp.stack([run(index, w, g, upper, one) for one in both]))
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize("d", [1, *thorough(2, 3)])
+def test_derivatives_of_resistances_agree(d):
+    """First in both modes, second, and under remat, by everything."""
+    index, *floats = resistance(d, 9, "float64", wild=False)
+    to, *along = (jnp.sin(3 + jnp.arange(a.size, dtype=a.dtype)).reshape(a.shape) for a in (floats[-1], *floats))
+
+    def derivatives(of):
+        def loss(*args):
+            return (to * of(index, *args) ** 2).sum()
+
+        def slope(f):
+            return lambda *args: jax.jvp(f, args, tuple(along))[1]
+
+        by = (0, 1, 2, 3)
+        grad = jax.grad(jax.checkpoint(loss), by)
+        every = slope(loss), grad, slope(slope(loss)), slope(grad), jax.grad(slope(loss), by)
+        return jax.jit(lambda *a: [f(*a) for f in every])(*floats)
+
+    agree(derivatives(resisted), derivatives(resisted_in_parts), "float64")
+
+
+@NEEDS_LIBRARY
+def test_a_resistance_is_one_call_and_symmetric(choose):
+    """Forward and transposed: no gather or scatter is left, and ⟨a, H b⟩ = ⟨H a, b⟩."""
+    choose("native")
+    index, w, g, upper, a = resistance(2, 30, "float64", wild=False)
+
+    def back(a):
+        return jax.vjp(lambda u: resisted(index, w, g, upper, u), a)[1](a)[0]
+
+    for program in (lambda a: resisted(index, w, g, upper, a), back):
+        text = jax.jit(program).lower(a).as_text()
+        assert "mpmjax_resist" in text
+        assert "mpmjax_gather" not in text
+        assert "mpmjax_scatter" not in text
+    agree(jax.jit(back)(a), resisted(index, w, g, upper, a), "float64")
+
+
+@NEEDS_LIBRARY
+def test_combined_vectors_agree(choose):
+    """In place or not, with blocks of zeros passed over, in a batch, and their derivative; two sums and a norm."""
+    choose("native")
+    rng = np.random.default_rng(0)
+    a, b, c, d, weight = rng.normal(size=(5, 2, 1000))
+    some = np.arange(1000) % 500 < 100
+    a, b, c, d = (jnp.asarray(v * some) for v in (a, b, c, d))
+    weight, (s, t) = jnp.asarray(weight), jnp.asarray([0.3, -2.0])
+
+    def combined(onto):
+        def of(a, b, c, d, weight, s):
+            active = _vectors.active_blocks(a != 0, b != 0, c != 0, d != 0)
+            assert active.shape == (16,)
+            return tuple(_vectors.combine((a, s, b), (c, t, d), weight, active, onto=onto))
+
+        return of
+
+    def expected(a, b, c, d, weight, s):
+        z = c + t * d
+        return a + s * b, z, (weight * z**2).sum()
+
+    over = partial(jax.vmap, in_axes=(0, 0, 0, 0, 0, None))
+    args = a, b, c, d, weight, s
+    along = tuple(jnp.cos(v) for v in args)
+    for onto in (0, 1):
+        assert "mpmjax_combine" in jax.jit(combined(onto)).lower(*(v[0] for v in args[:5]), s).as_text()
+        agree(jax.jit(over(combined(onto)))(*args), over(expected)(*args), "float64")
+        agree(*(jax.jvp(jax.jit(over(f)), args, along)[1] for f in (combined(onto), expected)), "float64")
+
+
+@NEEDS_LIBRARY
 def test_the_library_is_called_and_only_on_a_cpu(choose):
     """By default on a CPU, not when XLA is asked for, not for another platform, not for a program that XLA divides."""
     args = problem(2, 3, 3, 10, "float32")
@@ -155,6 +263,22 @@ def test_many_particles_on_many_threads(place):
         jax.tree.map(np.testing.assert_array_equal, again, found[0])
     wide = jax.jit(written)(index, *(a.astype("float64") for a in floats))
     jax.tree.map(lambda a, b: assert_close(a.astype("float64"), b, 2e-4), found[0], wide)
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize("place", ["in order", "anywhere"])
+def test_resistances_of_many_particles_on_many_threads(place):
+    """In one pass, and with what particles give stored first, where ranges of nodes share most of them."""
+    index, w, g, upper, u = resistance(2, 30_000, "float32", side=40)
+    if place == "in order":
+        order = jnp.argsort(index[0, 0])
+        index, w, g, upper = (a[..., order] for a in (index, w, g, upper))
+    run = jax.jit(resisted)
+    found = [run(index, w, g, upper, u) for _ in range(5)]
+    for again in found[1:]:
+        np.testing.assert_array_equal(again, found[0])
+    wide = jax.jit(resisted_in_parts)(index, *(a.astype("float64") for a in (w, g, upper, u)))
+    assert_close(found[0].astype("float64"), wide, 2e-4)
 
 
 @NEEDS_LIBRARY

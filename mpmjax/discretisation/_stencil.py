@@ -59,6 +59,11 @@ class Stencil(eqx.Module):
         return jax.tree.map(lambda factor: factor[..., particles], whole)
 
     @property
+    def factors(self) -> tuple[Array, Array, Array]:
+        """What sums are told of it: terms of the index, weights and their derivatives, each (d, s, p)."""
+        return self.index_factors, self.weights, self.weight_derivatives
+
+    @property
     def index(self) -> Indices:
         """Flat index of each stencil node, shape (s^d, p)."""
         return _tensor(jnp.add, list(self.index_factors))
@@ -133,7 +138,7 @@ def make_stencil(
 
 def _index_factors(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Array) -> Int[Array, "d s p"]:
     """Term of the C-order node index from each axis, shape (d, s, p)."""
-    first = jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window[:, None]
+    first = jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window.astype(jnp.int32)[:, None]
     along = first[:, None] + jnp.arange(kernel.order + 1, dtype=jnp.int32)[:, None]
     periods, wraps, strides = (
         jnp.asarray(numbers)[:, None, None]

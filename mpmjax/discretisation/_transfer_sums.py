@@ -21,11 +21,11 @@ import jax
 import jax.numpy as jnp
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import ad
 
 from mpmjax._types import Array, Float
 from mpmjax.discretisation._stencil import Stencil
-from mpmjax.native import with_native
+from mpmjax.native import members, native_primitive, sums_fit
 
 _ROW = 4
 """Largest number of columns that are added to the nodes at once. A CPU adds one, two or four numbers as one vector;
@@ -39,7 +39,7 @@ def gather(stencil: Stencil, nodes: Float[Array, "n c"]) -> tuple[Float[Array, "
         stencil: stencil of the particles.
         nodes: f_i, shape (n, c).
     """
-    value, *gradients = _gather_p.bind(*_factors(stencil), nodes, batched=0)
+    value, *gradients = gather_p.bind(*stencil.factors, nodes, batched=0)
     return value, jnp.stack(gradients)
 
 
@@ -57,11 +57,7 @@ def scatter(
         size: number of nodes n.
     """
     given = [*([] if value is None else [value]), *([] if gradients is None else gradients)]
-    return _scatter_p.bind(*_factors(stencil), *given, valued=value is not None, size=size, batched=0)[0]
-
-
-def _factors(stencil: Stencil) -> tuple[Array, ...]:
-    return stencil.index_factors, stencil.weights, stencil.weight_derivatives
+    return scatter_p.bind(*stencil.factors, *given, valued=value is not None, size=size, batched=0)[0]
 
 
 # The sums themselves, of rows (p, c): `_narrow` takes what a particle gives one axis further in, to one node along it;
@@ -176,63 +172,7 @@ def _by_factors(function: Callable[..., list[Array]]) -> Callable[..., list[Arra
     return differential
 
 
-# What makes them primitives: arguments are shares, weights, their derivatives and what the sum is linear in, each with
-# as many leading axes as the batch has.
-
-
-def _members(function: Callable[..., Any], batched: int) -> Callable[..., Any]:
-    """The function mapped over `batched` leading axes."""
-    for _ in range(batched):
-        function = jax.vmap(function)
-    return function
-
-
-def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A compiled function that `jax.disable_jit` leaves compiled, as it does JAX's own primitives."""
-
-    def call(*args: Array, **params: Any) -> Any:
-        with jax.disable_jit(False):
-            return function(*args, **params)
-
-    return call
-
-
-def _primitive(
-    name: str, function: Callable[..., list[Array]], shapes: Callable[..., list[tuple]], **attributes: bool
-) -> Primitive:
-    """A primitive that evaluates a function, on batches too.
-
-    Args:
-        name: name of the primitive; its second word is that of the native sum.
-        function: the function of arrays.
-        shapes: the shapes of the results, as a function of the arguments.
-        attributes: what the native sum is told besides the primitive's parameters.
-    """
-
-    def run(*args: Array, batched: int, unroll: bool = False, **params: Any) -> list[Array]:
-        return _members(partial(function, unroll=unroll, **params), batched)(*args)
-
-    def results(*args: ShapedArray, batched: int, **params: Any) -> list[ShapedArray]:
-        batch = args[0].shape[:batched]
-        return [ShapedArray((*batch, *shape), args[1].dtype) for shape in shapes(*args, **params)]
-
-    def batch(args: tuple, axes: tuple, *, batched: int, **params: Any) -> tuple[list[Array], list[int]]:
-        size = next(a.shape[x] for a, x in zip(args, axes, strict=True) if x is not batching.not_mapped)
-        args = tuple(batching.bdim_at_front(a, x, size) for a, x in zip(args, axes, strict=True))
-        out = primitive.bind(*args, batched=batched + 1, **params)
-        return out, [0] * len(out)
-
-    primitive = Primitive(name)
-    primitive.multiple_results = True
-    static = ("batched", "unroll", "valued", "size")
-    once = jax.jit(run, static_argnames=static)  # traced once for all its uses
-    written = mlir.lower_fun(once, multiple_results=True)
-    primitive.def_impl(_compiled(jax.jit(primitive.bind, static_argnames=static)))
-    primitive.def_abstract_eval(results)
-    batching.primitive_batchers[primitive] = batch
-    mlir.register_lowering(primitive, mlir.lower_fun(partial(once, unroll=True), multiple_results=True))
-    mlir.register_lowering(primitive, with_native(name.split("_")[1], written, **attributes), platform="cpu")
-    return primitive
+# What makes them primitives. Arguments are the factors, and then what the sum is of.
 
 
 def _particle_rows(index_factors: ShapedArray, *others: ShapedArray) -> list[tuple]:
@@ -250,11 +190,16 @@ def _factor_rows(index_factors: ShapedArray, *others: ShapedArray, valued: bool)
     return [index_factors.shape[-3:]] * 2
 
 
-_gather_p = _primitive("stencil_gather", _gather, _particle_rows, differential=False)
-_scatter_p = _primitive("stencil_scatter", _scatter, _node_rows, differential=False)
-_pull_p = _primitive("stencil_pull", _pull, _factor_rows)
-_gather_by_factors_p = _primitive("stencil_gather_by_factors", _by_factors(_gather), _particle_rows, differential=True)
-_scatter_by_factors_p = _primitive("stencil_scatter_by_factors", _by_factors(_scatter), _node_rows, differential=True)
+_sum_primitive = partial(native_primitive, fits=sums_fit)
+gather_p = _sum_primitive("stencil_gather", _gather, _particle_rows, differential=False)
+scatter_p = _sum_primitive("stencil_scatter", _scatter, _node_rows, differential=False)
+pull_p = _sum_primitive("stencil_pull", _pull, _factor_rows)
+_gather_by_factors_p = _sum_primitive(
+    "stencil_gather_by_factors", _by_factors(_gather), _particle_rows, differential=True
+)
+_scatter_by_factors_p = _sum_primitive(
+    "stencil_scatter_by_factors", _by_factors(_scatter), _node_rows, differential=True
+)
 
 
 def _differentiate(primitive: Primitive, by_factors: Primitive, function: Callable[..., list[Array]]) -> None:
@@ -272,7 +217,7 @@ def _differentiate(primitive: Primitive, by_factors: Primitive, function: Callab
         return out, [reduce(ad.add_tangents, part) for part in zip(*parts, strict=True)]
 
     def jvp_by_factors(primals: tuple, tangents: tuple, *, batched: int, **params: Any) -> tuple:
-        written = _members(partial(_by_factors(function), unroll=False, **params), batched)
+        written = members(partial(_by_factors(function), unroll=False, **params), batched)
         rest = tuple(map(ad.instantiate_zeros, tangents[1:]))
         return jax.jvp(lambda *floats: written(primals[0], *floats), primals[1:], rest)
 
@@ -285,22 +230,22 @@ def _jvp_pull(primals: tuple, tangents: tuple, *, valued: bool, batched: int) ->
     factors."""
     factors, nodes, given = primals[:3], primals[3], primals[4:]
     params = {"valued": valued, "batched": batched}
-    out = _pull_p.bind(*primals, **params)
+    out = pull_p.bind(*primals, **params)
     parts = [[ad.Zero(jax.typeof(o)) for o in out]]
     if type(tangents[3]) is not ad.Zero:
-        parts.append(_pull_p.bind(*factors, tangents[3], *given, **params))
+        parts.append(pull_p.bind(*factors, tangents[3], *given, **params))
     if any(type(t) is not ad.Zero for t in tangents[4:]):
-        parts.append(_pull_p.bind(*factors, nodes, *map(ad.instantiate_zeros, tangents[4:]), **params))
+        parts.append(pull_p.bind(*factors, nodes, *map(ad.instantiate_zeros, tangents[4:]), **params))
     if any(type(t) is not ad.Zero for t in tangents[1:3]):
-        written = _members(partial(_pull, valued=valued, unroll=False), batched)
+        written = members(partial(_pull, valued=valued, unroll=False), batched)
         along = tuple(map(ad.instantiate_zeros, tangents[1:3]))
         parts.append(jax.jvp(lambda w, g: written(factors[0], w, g, *primals[3:]), factors[1:], along)[1])
     return out, [reduce(ad.add_tangents, part) for part in zip(*parts, strict=True)]
 
 
-_differentiate(_gather_p, _gather_by_factors_p, _gather)
-_differentiate(_scatter_p, _scatter_by_factors_p, _scatter)
-ad.primitive_jvps[_pull_p] = _jvp_pull
+_differentiate(gather_p, _gather_by_factors_p, _gather)
+_differentiate(scatter_p, _scatter_by_factors_p, _scatter)
+ad.primitive_jvps[pull_p] = _jvp_pull
 
 
 def _given(cotangents: list) -> tuple[list[Array], bool]:
@@ -318,26 +263,26 @@ def _of_undefined(found: Any, args: Any) -> list:
 def _transpose_gather(cotangents: list, *args: Any, batched: int) -> list:
     given, valued = _given(cotangents)
     size = args[3].aval.shape[-2]
-    return [None, None, None, *_scatter_p.bind(*args[:3], *given, valued=valued, size=size, batched=batched)]
+    return [None, None, None, *scatter_p.bind(*args[:3], *given, valued=valued, size=size, batched=batched)]
 
 
 def _transpose_scatter(cotangents: list, *args: Any, valued: bool, size: int, batched: int) -> list:
     del size
-    found = _gather_p.bind(*args[:3], ad.instantiate_zeros(cotangents[0]), batched=batched)
+    found = gather_p.bind(*args[:3], ad.instantiate_zeros(cotangents[0]), batched=batched)
     found = found[: len(args) - 3] if valued else found[1:]
     return [None, None, None, *_of_undefined(found, args[3:])]
 
 
 def _transpose_gather_by_factors(cotangents: list, *args: Any, batched: int) -> list:
     given, valued = _given(cotangents)
-    found = _pull_p.bind(*args[:3], args[5], *given, valued=valued, batched=batched)
+    found = pull_p.bind(*args[:3], args[5], *given, valued=valued, batched=batched)
     return [None, None, None, *_of_undefined(found, args[3:5]), None]
 
 
 def _transpose_scatter_by_factors(cotangents: list, *args: Any, valued: bool, size: int, batched: int) -> list:
     del size
     nodes = ad.instantiate_zeros(cotangents[0])
-    found = _pull_p.bind(*args[:3], nodes, *args[5:], valued=valued, batched=batched)
+    found = pull_p.bind(*args[:3], nodes, *args[5:], valued=valued, batched=batched)
     return [None, None, None, *_of_undefined(found, args[3:5]), *(None for _ in args[5:])]
 
 
@@ -359,8 +304,8 @@ def _transpose_pull(cotangents: list, *args: Any, valued: bool, batched: int) ->
     return [None, None, None, None, *_of_undefined(found, args[4:])]
 
 
-ad.primitive_transposes[_gather_p] = _transpose_gather
-ad.primitive_transposes[_scatter_p] = _transpose_scatter
+ad.primitive_transposes[gather_p] = _transpose_gather
+ad.primitive_transposes[scatter_p] = _transpose_scatter
 ad.primitive_transposes[_gather_by_factors_p] = _transpose_gather_by_factors
 ad.primitive_transposes[_scatter_by_factors_p] = _transpose_scatter_by_factors
-ad.primitive_transposes[_pull_p] = _transpose_pull
+ad.primitive_transposes[pull_p] = _transpose_pull

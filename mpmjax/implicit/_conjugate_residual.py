@@ -15,6 +15,7 @@ from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.checks import require, require_fields, require_positive, require_tolerance
 from mpmjax.implicit._inner_product import AbstractInnerProduct, DiagonalInnerProduct
 from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, AbstractInnerProductSolver, default_rtol
+from mpmjax.implicit._vectors import active_blocks, combine
 
 NEGLIGIBLE_CHANGE = 1e-3
 """Largest relative change of the solution by one more correction, where rounding hides the tolerance."""
@@ -35,10 +36,12 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
     would not do: in an ill-conditioned system it can be down to rounding while x is far off.) The residual that is
     returned shows how closely the tolerance was met.
 
-    Options of `compute` (both optional):
+    Options of `compute` (all optional):
 
     - `inner_product`: the inner product of W, an `AbstractInnerProduct`. Default: W = I.
     - `y0`: the initial guess. Default: zeros.
+    - `support`: where A is not the identity, booleans of the vector's structure. What is zero elsewhere stays zero
+      there, and is passed over. Default: everywhere.
 
     Statistics returned:
 
@@ -89,7 +92,7 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
     def compute(
         self, state: lx.AbstractLinearOperator, vector: Any, options: dict[str, Any]
     ) -> tuple[Any, lx.RESULTS, dict[str, Any]]:
-        system = _system(self, state, vector, options.get("inner_product"))
+        system = _system(self, state, vector, options)
         y0 = options.get("y0")
         x = jnp.zeros_like(system.b) if y0 is None else system.started(ravel_pytree(y0)[0])
         c = jax.lax.while_loop(lambda c: ~c.done, partial(_restart, system), _start(x, system.b))
@@ -139,10 +142,33 @@ class _System(eqx.Module):
         """And back."""
         return x
 
+    def combined(
+        self, one: tuple[Array, Scalar, Array], other: tuple[Array, Scalar, Array], *, onto: int
+    ) -> tuple[Array, Array, Float[Array, ""]]:
+        """From (a, s, b) and (c, t, d): a + s b, c + t d, and the square of the latter's norm (see `combine`)."""
+        del onto
+        (a, s, b), (c, t, d) = one, other
+        second = c + t * d
+        return a + s * b, second, self.dot(second, second)
+
     @property
     def eps(self) -> Any:
         """The rounding unit."""
         return jnp.finfo(self.b.dtype).eps
+
+
+class _DiagonalSystem(_System):
+    """The same for a diagonal W. Where no vector is different from zero, none becomes so, and all are passed over."""
+
+    weight: Float[Array, "m"]
+    """W."""
+    active: Bool[Array, "k"]
+    """Where vectors may be different from zero (see `active_blocks`)."""
+
+    def combined(
+        self, one: tuple[Array, Scalar, Array], other: tuple[Array, Scalar, Array], *, onto: int
+    ) -> tuple[Array, Array, Float[Array, ""]]:
+        return combine(one, other, self.weight, self.active, onto=onto)
 
 
 class _PairedSystem(_System):
@@ -197,15 +223,28 @@ class _Recurrence(eqx.Module):
 
 
 def _system(
-    solver: ConjugateResidual, operator: lx.AbstractLinearOperator, vector: Any, inner: AbstractInnerProduct | None
+    solver: ConjugateResidual, operator: lx.AbstractLinearOperator, vector: Any, options: dict[str, Any]
 ) -> _System:
     flat, unravel = ravel_pytree(vector)
+    inner: AbstractInnerProduct | None = options.get("inner_product")
     inner = DiagonalInnerProduct(jnp.ones_like(flat)) if inner is None else inner.flattened(unravel)
     b = jnp.stack([inner.solve(flat), flat]) if inner.paired else inner.solve(flat)
     rtol = default_rtol(flat.dtype) if solver.rtol is None else solver.rtol
-    kind = _PairedSystem if inner.paired else _System
-    system = kind(operator, inner, unravel, b, b.ravel()[0], rtol, solver.increment_rtol, solver.max_steps)
+    given = operator, inner, unravel, b, b.ravel()[0], rtol, solver.increment_rtol, solver.max_steps
+    if inner.paired:
+        system = _PairedSystem(*given)
+    elif isinstance(inner, DiagonalInnerProduct):
+        system = _DiagonalSystem(*given, inner.weight, _active(flat, options))
+    else:
+        system = _System(*given)
     return replace(system, b_norm=system.norm(b))
+
+
+def _active(rhs: Array, options: dict[str, Any]) -> Bool[Array, "k"]:
+    """Where a vector of a solve with a diagonal W may be different from zero, as `active_blocks` has it."""
+    support, y0 = options.get("support"), options.get("y0")
+    inside = jnp.ones(rhs.shape, bool) if support is None else ravel_pytree(support)[0]
+    return active_blocks(inside, rhs != 0, *([] if y0 is None else [ravel_pytree(y0)[0] != 0]))
 
 
 def _start(x: Array, b: Array) -> _Recurrence:
@@ -264,14 +303,11 @@ def _step(system: _System, c: _Recurrence) -> _Recurrence:
     s = system.apply(c.r)
     gamma = system.dot(c.r, s)
     beta = gamma / c.gamma
-    p = c.r + beta * c.p
-    q = s + beta * c.q
-    qq = system.dot(q, q)
+    p, q, qq = system.combined((c.r, beta, c.p), (s, beta, c.q), onto=1)
     rounding = system.eps * jnp.sqrt(c.rr * (qq + beta**2 * c.qq))  # of γ: ε‖r‖‖s‖
     breakdown = jnp.abs(gamma) <= rounding
     alpha = jnp.where(breakdown, 0, gamma / jnp.where(breakdown, 1, qq))
-    x = c.x + alpha * p
-    r = c.r - alpha * q
+    x, r, rr = system.combined((c.x, alpha, p), (c.r, -alpha, q), onto=0)
     small_increment = c.small_increment
     if system.increment_rtol is not None:
         small = alpha**2 * system.dot(p, p) <= system.increment_rtol**2 * system.dot(x, x)
@@ -282,7 +318,7 @@ def _step(system: _System, c: _Recurrence) -> _Recurrence:
         r=r,
         p=p,
         q=q,
-        rr=system.dot(r, r),
+        rr=rr,
         qq=qq,
         gamma=gamma,
         k=c.k + 1,

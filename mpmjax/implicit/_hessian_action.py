@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, Float, Matrix, NodeVector, Scalar
 from mpmjax.boundary import Coupling, Mirror, Springs, spring_answer, spring_diagonal, spring_resistance
-from mpmjax.discretisation import Stencil, gather, scatter
+from mpmjax.discretisation import Stencil, gather, resist, scatter
 from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.state import MaterialPoints, SupportStiffness, VolumeAverage, stiffness_of
 
@@ -76,10 +76,10 @@ def _averaged_stiffness(points: MaterialPoints, average: VolumeAverage, tangent:
 
 
 class ParticleStiffness(AbstractHessianAction):
-    """H as one matrix for each particle, of d⁴ numbers. Applying it evaluates no law."""
+    """H as one symmetric matrix for each particle. Applying it evaluates no law."""
 
-    matrix: Float[Array, "m m p"]
-    """K_p [J] (see `ElasticPotential.stiffness`), shape (d², d², p)."""
+    upper: Float[Array, "t p"]
+    """The upper triangle of K_p [J] (see `ElasticPotential.stiffness`), row by row, shape (d²(d² + 1)/2, p)."""
     stencil: Stencil
     mirror: Mirror
     positive_semidefinite: bool = eqx.field(static=True, default=False)
@@ -97,17 +97,23 @@ class ParticleStiffness(AbstractHessianAction):
 
     def __call__(self, du: NodeVector) -> NodeVector:
         """Σ_p g_ip K_p Σ_j g_jp δu_j, and what supports and springs add."""
-        moved = gather(self.stencil, self.mirror.unfold(du))
+        u = self.mirror.unfold(du)
+        alone = not self.averaged and not self.springs
+        force = self.mirror.fold(resist(self.stencil, self.upper, u) if alone else self._with_others(u))
+        force = _with_couplings(force, self.couplings, self.mirror, du)
+        return force + sum(support(du) for support in self.supports) if self.supports else force
+
+    def _with_others(self, u: NodeVector) -> NodeVector:
+        """The same with what averaged volumes and the springs of contact add to the sums, before these are folded."""
+        moved = gather(self.stencil, u)
         slopes, value = moved[1], None
-        flux = la.matmul(self.matrix, slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
+        flux = la.matmul(la.symmetric(self.upper), slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
         for one in self.averaged:
             flux = flux + one(slopes)
         if self.springs:
             value, more = spring_answer(self.springs, moved)
             flux = flux + more
-        force = self.mirror.fold(scatter(self.stencil, value, flux, du.shape[0]))
-        force = _with_couplings(force, self.couplings, self.mirror, du)
-        return force + sum(support(du) for support in self.supports) if self.supports else force
+        return scatter(self.stencil, value, flux, len(u))
 
     def precomputed(self) -> "ParticleStiffness":
         return self
@@ -124,8 +130,10 @@ class ParticleStiffness(AbstractHessianAction):
         d = like.shape[1]
         added = [(slice(*one.rows), one.diagonal().reshape(d * d, -1)) for one in self.averaged]
 
+        matrix = la.symmetric(self.upper)
+
         def entry(m: int) -> Array:
-            own = self.matrix[m, m]
+            own = matrix[m, m]
             for rows, more in added:
                 own = own.at[rows].add(more[m])
             return own
@@ -173,12 +181,12 @@ def particle_stiffness(
 ) -> ParticleStiffness:
     """H as one matrix for each particle, from the stress differentials of the materials."""
     materials = tuple(zip(potential.material_points, tangents, strict=True))
-    matrix = potential.stiffness(tuple(t if points.average is None else _own_part(t) for points, t in materials))
+    upper = potential.stiffness(tuple(t if points.average is None else _own_part(t) for points, t in materials))
     averaged = tuple(
         _averaged_stiffness(points, points.average, t) for points, t in materials if points.average is not None
     )
     return ParticleStiffness(
-        matrix,
+        upper,
         potential.stencil,
         potential.mirror,
         positive_semidefinite,
@@ -228,10 +236,10 @@ class _DampedAction(AbstractHessianAction):
         return self.elastic(du) + self.rate * self.potential.viscous_resistance(du)
 
     def precomputed(self) -> ParticleStiffness:
-        stiffness, matrix = self.elastic.precomputed(), self.potential.damping_matrices()
-        matrix = stiffness.matrix if matrix is None else stiffness.matrix + self.rate * matrix
+        stiffness, damping = self.elastic.precomputed(), self.potential.damping_matrices()
+        upper = stiffness.upper if damping is None else stiffness.upper + self.rate * damping
         supports = stiffness_of(self.potential.held_by(), self.rate)
-        return eqx.tree_at(lambda s: (s.matrix, s.supports), stiffness, (matrix, supports))
+        return eqx.tree_at(lambda s: (s.upper, s.supports), stiffness, (upper, supports))
 
 
 def damped(elastic: AbstractHessianAction, potential: ElasticPotential, rate: Scalar) -> AbstractHessianAction:

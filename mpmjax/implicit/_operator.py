@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 
-from mpmjax._types import Array, Float, NodeScalar, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.implicit._hessian_action import AbstractHessianAction
 from mpmjax.implicit._projection import Projection
 
@@ -27,6 +27,10 @@ class AbstractSymmetricOperator(lx.AbstractLinearOperator):
     @abc.abstractmethod
     def in_structure(self) -> jax.ShapeDtypeStruct:
         """Shape and dtype of a vector."""
+
+    def support(self) -> Bool[Array, "..."] | None:
+        """Where the operator is not the identity, in the shape of a vector; None if that is not known."""
+        return None
 
     def out_structure(self) -> jax.ShapeDtypeStruct:
         return self.in_structure()
@@ -66,6 +70,9 @@ class ImplicitOperator(AbstractSymmetricOperator):
     def mv(self, vector: NodeVector) -> NodeVector:
         combine = self.projection.combine
         return combine(self.unconstrained(combine(vector, 0)), self.projection.identity_rows(vector, self.mass))
+
+    def support(self) -> Mask:
+        return self.projection.free
 
     def precomputed(self) -> "ImplicitOperator":
         """The same operator, with H as one matrix for each particle, computed once for many applications."""

@@ -155,22 +155,27 @@ class ElasticPotential(eqx.Module):
         """Σ_p flux_p g_ip [N], shape (n, d)."""
         return self.mirror.fold(scatter(self.stencil, None, jnp.swapaxes(flux, 0, 1), self.size))
 
-    def damping_matrices(self) -> Float[Array, "m m p"] | None:
-        """The matrices of the materials' D [J s], one for each particle, shape (d², d², p), as `stiffness` has those of
-        H; None if no material has viscosity."""
+    def damping_matrices(self) -> Float[Array, "t p"] | None:
+        """The matrices of the materials' D [J s], one for each particle, as `stiffness` has those of H; None if no
+        material has viscosity."""
         if not self.material_viscous:
             return None
 
         def matrix(points: MaterialPoints) -> Array:
+            def flux_of(slopes: Matrix) -> Matrix:
+                return la.transpose(points.viscous_flux(la.transpose(slopes)))
+
             like = jnp.zeros((self._dim, self._dim, *points.volume.shape), points.volume.dtype)
-            return la.matrix_of(lambda slopes: la.transpose(points.viscous_flux(la.transpose(slopes))), like)
+            return la.upper_triangle(la.matrix_of(flux_of, like))
 
         return _joined([matrix(points) for points in self.material_points])
 
-    def stiffness(self, tangents: tuple[Callable[[Deformation], Deformation], ...]) -> Float[Array, "m m p"]:
-        """Each particle's matrix K_p [J], with H = Σ_p g_ip K_p g_jpᵀ, made from its material's stress differential.
+    def stiffness(self, tangents: tuple[Callable[[Deformation], Deformation], ...]) -> Float[Array, "t p"]:
+        """Each particle's symmetric matrix K_p [J], with H = Σ_p g_ip K_p g_jpᵀ, made from its material's stress
+        differential.
 
-        Rows and columns are the components of ∇u, the derivative's direction first; shape (d², d², p).
+        Rows and columns are the components of ∇u, the derivative's direction first. What is returned is the upper
+        triangle, row by row, shape (d²(d² + 1)/2, p).
 
         Args:
             tangents: for each material, the stress differential δF ↦ δP of its particles.
@@ -180,7 +185,8 @@ class ElasticPotential(eqx.Module):
             def flux_of(slopes: Matrix) -> Matrix:
                 return la.transpose(points.flux(tangent(points.change(la.transpose(slopes))), self._dim))
 
-            return la.matrix_of(flux_of, jnp.zeros((self._dim, self._dim, *points.volume.shape), points.volume.dtype))
+            like = jnp.zeros((self._dim, self._dim, *points.volume.shape), points.volume.dtype)
+            return la.upper_triangle(la.matrix_of(flux_of, like))
 
         return _joined(
             [matrix(points, tangent) for points, tangent in zip(self.material_points, tangents, strict=True)]

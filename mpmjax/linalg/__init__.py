@@ -21,9 +21,11 @@ from mpmjax.linalg._matrices import (
     rotation,
     rotation_differential,
     spin_compliance,
+    symmetric,
     symmetric_eigen,
     trace,
     transpose,
+    upper_triangle,
 )
 from mpmjax.linalg._spectral import AbstractSpectral, Logarithm, PowerLessOne
 
@@ -47,7 +49,9 @@ __all__ = [
     "rotation",
     "rotation_differential",
     "spin_compliance",
+    "symmetric",
     "symmetric_eigen",
     "trace",
     "transpose",
+    "upper_triangle",
 ]

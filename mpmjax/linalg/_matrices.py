@@ -10,11 +10,13 @@ to a whole matrix of zeros. `assemble` stacks row by row, since XLA does not fus
 their computation, which doubles the time of a Hessian's action.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax._types import Array, Compliance, Float, Matrix
 from mpmjax.autodiff import ruled
@@ -78,6 +80,19 @@ def matrix_of(linear: Callable[[Matrix], Matrix], like: Matrix) -> Float[Array, 
     d, batch = like.shape[0], like.shape[2:]
     units = jnp.eye(d * d, dtype=like.dtype).reshape(d * d, d, d, *[1] * len(batch))
     return jax.vmap(lambda unit: linear(jnp.broadcast_to(unit, like.shape)))(units).reshape(d * d, d * d, *batch)
+
+
+def upper_triangle(A: Float[Array, "m m *p"]) -> Float[Array, "t *p"]:
+    """The upper triangle of a symmetric matrix, row by row: its m(m+1)/2 different components."""
+    return A[np.triu_indices(len(A))]
+
+
+def symmetric(upper: Float[Array, "t *p"]) -> Float[Array, "m m *p"]:
+    """The symmetric matrix with this upper triangle."""
+    m = (math.isqrt(8 * len(upper) + 1) - 1) // 2
+    place = np.zeros((m, m), int)
+    place[np.triu_indices(m)] = np.arange(len(upper))
+    return upper[np.maximum(place, place.T)]
 
 
 def trace(A: Matrix) -> Array:

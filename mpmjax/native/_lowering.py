@@ -1,4 +1,4 @@
-"""How JAX lowers a sum to a call of the native library."""
+"""How JAX lowers a primitive to a call of the native library."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,31 +12,35 @@ from mpmjax.native._library import target
 _Rule = Callable[..., Any]
 
 
-def with_native(sum_name: str, written: _Rule, **attributes: bool) -> _Rule:
-    """The lowering rule for CPUs of a sum: a call of the native library where it has a kernel, else the sum as written.
+def with_native(
+    name: str, written: _Rule, fits: Callable[..., bool], aliases: dict[int, int], **attributes: bool
+) -> _Rule:
+    """The lowering rule for CPUs of a primitive: a call of the native library where it has a kernel, else as written.
 
     A program that XLA itself divides among devices is left to XLA, which would gather whole arrays for a call that it
     cannot look into. Within `shard_map` each device calls.
 
     Args:
-        sum_name: name of the sum in the library.
-        written: lowering rule of the sum written in JAX.
+        name: name in the library.
+        written: lowering rule of the function written in JAX.
+        fits: whether the library has a kernel for arguments, given their shapes and dtypes and the batch's axes.
+        aliases: arguments whose memory results may take.
         attributes: what the library is told besides.
     """
 
     def rule(ctx: Any, *args: Any, **params: Any) -> Any:
         avals = ctx.avals_in
-        if not uses_native()[0] or not _has_kernel(avals, params["batched"]) or _is_divided(ctx.module_context):
+        if not uses_native()[0] or not fits(avals, params["batched"]) or _is_divided(ctx.module_context):
             return written(ctx, *args, **params)
         told = {"valued": np.bool_(params["valued"])} if "valued" in params else {}
         told |= {name: np.bool_(value) for name, value in attributes.items()}
-        return jax.ffi.ffi_lowering(target(sum_name))(ctx, *args, **told)
+        return jax.ffi.ffi_lowering(target(name), operand_output_aliases=aliases)(ctx, *args, **told)
 
     return rule
 
 
-def _has_kernel(avals: Any, batched: int) -> bool:
-    """Whether the library has a kernel for these arrays: index factors, weights, and others of the weights' dtype."""
+def sums_fit(avals: Any, batched: int) -> bool:
+    """Whether the library has a kernel for sums of these: index factors, weights, and others of the weights' dtype."""
     index, weights = avals[:2]
     d, s, _ = index.shape[batched:]
     known = index.dtype == np.int32 and weights.dtype in (np.float32, np.float64)

@@ -1,0 +1,76 @@
+"""Functions of arrays as JAX primitives: on batches, by XLA, and on CPUs by the native library."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
+
+from mpmjax._types import Array
+from mpmjax.native._lowering import with_native
+
+
+def members(function: Callable[..., Any], batched: int) -> Callable[..., Any]:
+    """The function mapped over `batched` leading axes."""
+    for _ in range(batched):
+        function = jax.vmap(function)
+    return function
+
+
+def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A compiled function that `jax.disable_jit` leaves compiled, as it does JAX's own primitives."""
+
+    def call(*args: Array, **params: Any) -> Any:
+        with jax.disable_jit(False):
+            return function(*args, **params)
+
+    return call
+
+
+def native_primitive(
+    name: str,
+    function: Callable[..., list[Array]],
+    shapes: Callable[..., list[tuple]],
+    fits: Callable[..., bool],
+    aliases: dict[int, int] | None = None,
+    **attributes: bool,
+) -> Primitive:
+    """A primitive that evaluates a function. In a batch all its arguments have as many leading axes as the batch.
+
+    Args:
+        name: name of the primitive; its second word is that in the native library.
+        function: the function of arrays. Results have the dtype of its second argument.
+        shapes: the shapes of the results, as a function of the arguments.
+        fits: whether the library has a kernel for arguments, given their shapes and dtypes and the batch's axes.
+        aliases: arguments whose memory results may take, from their number to that of the result.
+        attributes: what the library is told besides the primitive's parameters.
+    """
+
+    def run(*args: Array, batched: int, unroll: bool = False, **params: Any) -> list[Array]:
+        return members(partial(function, unroll=unroll, **params), batched)(*args)
+
+    def results(*args: ShapedArray, batched: int, **params: Any) -> list[ShapedArray]:
+        batch = args[0].shape[:batched]
+        return [ShapedArray((*batch, *shape), args[1].dtype) for shape in shapes(*args, **params)]
+
+    def batch(args: tuple, axes: tuple, *, batched: int, **params: Any) -> tuple[list[Array], list[int]]:
+        size = next(a.shape[x] for a, x in zip(args, axes, strict=True) if x is not batching.not_mapped)
+        args = tuple(batching.bdim_at_front(a, x, size) for a, x in zip(args, axes, strict=True))
+        out = primitive.bind(*args, batched=batched + 1, **params)
+        return out, [0] * len(out)
+
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    static = ("batched", "unroll", "valued", "size")
+    once = jax.jit(run, static_argnames=static)  # traced once for all its uses
+    written = mlir.lower_fun(once, multiple_results=True)
+    native = with_native(name.split("_")[1], written, fits, aliases or {}, **attributes)
+    primitive.def_impl(_compiled(jax.jit(primitive.bind, static_argnames=static)))
+    primitive.def_abstract_eval(results)
+    batching.primitive_batchers[primitive] = batch
+    mlir.register_lowering(primitive, mlir.lower_fun(partial(once, unroll=True), multiple_results=True))
+    mlir.register_lowering(primitive, native, platform="cpu")
+    return primitive

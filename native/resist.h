@@ -1,0 +1,97 @@
+// The resistance of particles to a displacement of the nodes: f_i = Σ_p Σ_b g_ip,b r_p,b with r_p = K_p G_p and
+// G_p,b = Σ_j g_jp,b u_j. A gather, a symmetric matrix for each particle and a scatter, of which nothing is stored.
+
+#pragma once
+
+#include "gather.h"
+#include "scatter.h"
+
+namespace {
+
+using mpmjax::Resist;
+
+// The rows of components of a block: those of a gradient along b are the first d of four from the (4 b)-th on, as they
+// are split.
+template <class T, int d>
+using Components = T[d * kLanes][kBlock];
+
+// K G for a block, some particles at once, with all sums in registers. K's entries are a stride apart.
+template <class T, int d>
+MPMJAX_APART void multiply(const T* entries, int64_t stride, const Components<T, d>& slopes, Components<T, d>& products) {
+  constexpr int bytes = 64, step = bytes / sizeof(T), m = d * d;
+  typedef T Some __attribute__((vector_size(bytes)));
+  const auto place = [](int i) { return i / d * kLanes + i % d; };
+  for (int q = 0; q < kBlock; q += step) {
+    Some slope[m], sum[m] = {}, entry;
+    for (int i = 0; i < m; ++i) std::memcpy(&slope[i], slopes[place(i)] + q, bytes);
+    const T* from = entries + q;
+#pragma GCC unroll 9
+    for (int i = 0; i < m; ++i) {
+#pragma GCC unroll 9
+      for (int j = i; j < m; ++j, from += stride) {
+        ask(from);
+        std::memcpy(&entry, from, bytes);
+        sum[i] += entry * slope[j];
+        if (j > i) sum[j] += entry * slope[i];
+      }
+    }
+    for (int i = 0; i < m; ++i) std::memcpy(products[place(i)] + q, &sum[i], bytes);
+  }
+}
+
+// r_p for the particles of a block, as a row for each direction.
+template <class T, int d, int s>
+MPMJAX_APART void resist_block(const Resist<T>& task, const Block<T, d, s, false>& block, int64_t start, int count,
+                               Vector<T> (*rows)[kBlock]) {
+  const NodeRows<T> nodes(task.moved, task.size, d, 0);
+  for (int q = 0; q < kBlock; ++q) {  // beyond the count weights are zero and the index is 0
+    const auto put = [&](const auto& found) MPMJAX_INLINE_LAMBDA {
+      for (int b = 0; b < d; ++b) rows[b][q] = found.gradients[b];
+    };
+    if (nodes.holds(block.least[q], block.most[q])) {
+      put(Gatherer<T, d, s, false, true>{block, nodes, q}.template sums<0>(0));
+    } else {
+      put(Gatherer<T, d, s, false, false>{block, nodes, q}.template sums<0>(0));
+    }
+  }
+  constexpr int entries = d * d * (d * d + 1) / 2;
+  const int64_t particles = task.stencils.particles;
+  alignas(64) Components<T, d> slopes, products = {};
+  for (int b = 0; b < d; ++b) split<T>(rows[b], slopes + b * kLanes);
+  if (count == kBlock) {
+    multiply<T, d>(task.matrices + start, particles, slopes, products);
+  } else {
+    alignas(64) T few[entries][kBlock];
+    for (int k = 0; k < entries; ++k) copy_some(task.matrices + k * particles + start, count, few[k]);
+    multiply<T, d>(few[0], kBlock, slopes, products);
+  }
+  for (int b = 0; b < d; ++b) join<T>(products + b * kLanes, rows[b]);
+}
+
+// Sets the nodes of a range.
+template <class T, int d, int s>
+void resist(const Resist<T>& task, int64_t first, int64_t last) {
+  std::memset(task.nodes + first * d, 0, static_cast<size_t>((last - first) * d) * sizeof(T));
+  const NodeSums<T, d> nodes{task.nodes, d, first, last, d};
+  const auto give = [&](const auto& block, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
+    std::memset(rows[0], 0, sizeof rows[0]);
+    resist_block<T, d, s>(task, block, start, count, rows + 1);
+  };
+  add_blocks<T, d, s, false, true, d>(task.stencils, task.ranges, nodes, give);
+}
+
+// Stores r_p,b, for a scatter.
+template <class T, int d, int s>
+void resist_particles(const Resist<T>& task, int64_t first, int64_t last) {
+  for (int64_t start = first; start < last; start += kBlock) {
+    const int count = smaller(last - start, kBlock);
+    Block<T, d, s, false> block;
+    block.find_range(task.stencils, start, count);
+    block.read(task.stencils, start, count);
+    Vector<T> rows[d][kBlock];
+    resist_block<T, d, s>(task, block, start, count, rows);
+    for (int b = 0; b < d; ++b) write_rows<T>(rows[b], task.sums[b + 1] + start, task.stencils.particles, count, d);
+  }
+}
+
+}  // namespace
