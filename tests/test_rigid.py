@@ -261,17 +261,18 @@ def test_in_one_dimension_it_only_moves():
 @pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in ("explicit", "implicit_midpoint")}, "explicit"))
 def test_what_falls_on_a_floor_gets_its_force(method):
     """The change of momentum is that by gravity and the floor's push and friction; a spinning block is driven along by
-    the floor against its spin."""
+    the floor against its spin, until it rolls."""
     scene, particles = thrown(spin=[-4.0], v=(0.0, -1.0), cells=14)
     floor = mpm.SeparatingBox((-np.inf, -0.155), (np.inf, np.inf), friction=0.4)
     scene = mpm.Scene(scene.grid, mpm.Rigid(1e5), gravity=(0.0, -9.81), boundary=floor, boundary_forces=True)
     new, impulse, dt = particles, 0.0, 1e-3
-    for n in range(16):
+    steps = 16 if method.is_explicit else 7  # whose contact is stiffer
+    for n in range(steps):
         new, info = mpm.step(scene, new, n * dt, dt, method=method)
         impulse = impulse + np.asarray(info.boundaries.impulse[0])
     mass = float(particles.mass.sum())
     change = np.asarray((particles.mass[:, None] * (new.v - particles.v)).sum(axis=0))
-    assert_close(change, -impulse + 16 * dt * mass * np.array([0.0, -9.81]), 1e-9)
+    assert_close(change, -impulse + steps * dt * mass * np.array([0.0, -9.81]), 1e-9)
     assert -impulse[1] > 0.1 * mass
     assert -impulse[0] > 0.01 * mass
     assert_close(new.x[0] - new.x[-1], new.F[0] @ (particles.x[0] - particles.x[-1]), 1e-12)
@@ -296,7 +297,7 @@ def test_derivatives_of_its_motion_are_those_of_differences(method):
         new = mpm.rollout(own, dataclasses.replace(particles, mass=mass), steps=3, dt=dt, method=method)
         return (new.x * jnp.sin(jnp.arange(new.x.size)).reshape(new.x.shape)).sum() + (new.v**2).sum()
 
-    value, point, h = jax.jit(end), jnp.array([1.0, 1.0, 1.0, 0.1, 1.0]), 1e-5
+    value, point, h = jax.jit(end), jnp.array([1.0, 1.0, 1.0, 0.1, 1.0]), 1e-4
     found = jax.jit(jax.grad(end))(point)
     differences = [(value(point.at[k].add(h)) - value(point.at[k].add(-h))) / (2 * h) for k in range(len(point))]
     assert np.abs(np.asarray(differences)).min() > 1e-7
