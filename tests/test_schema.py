@@ -69,6 +69,8 @@ EXAMPLES = {
     mpm.SlipCollider: mpm.SlipCollider(mpm.HalfSpace((0.1, 0.2), (0.0, 1.0))),
     mpm.SeparatingCollider: mpm.SeparatingCollider(mpm.Ball((0.1,), 0.3), friction=0.2),
     mpm.Traction: mpm.Traction(PATCH, (1.0, 2.0)),
+    mpm.Couple: mpm.Couple(PATCH, 3.0),
+    mpm.Rigid: mpm.Rigid(1e6, (True, False), turns=False),
     mpm.Pressure: mpm.Pressure(PATCH, mpm.TimeSeries((0.0, 1.0), (0.0, 2.0)), following=False),
     mpm.PointLoad: mpm.PointLoad(mpm.PointsAt(((0.1, 0.2), (0.3, 0.4))), (1.0, 2.0)),
     mpm.Spring: mpm.Spring(mpm.PointsAt(((0.1, 0.2),), (2.0,)), (1.0, 2.0), 3.0, GRIP.motion),
