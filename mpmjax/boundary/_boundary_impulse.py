@@ -130,7 +130,7 @@ def impulse_on_boundaries(
 
     Args:
         given: what they give.
-        couples: what they give besides.
+        couples: the couples that they give rigid bodies besides.
         places: positions of the nodes [m], shape (n, d).
         pivots: the points for torques [m], shape (b, d).
     """

@@ -41,9 +41,9 @@ class RigidMaterial(NamedTuple):
     """A material that is a rigid body."""
 
     number: int
-    """That of the material."""
+    """Its index among the scene's materials."""
     layer: int
-    """That of its nodes."""
+    """The layer of nodes that it moves."""
     freedom: Freedom
     """What it may do."""
 
