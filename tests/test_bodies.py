@@ -218,6 +218,18 @@ def test_the_longest_step_knows_of_bodies():
     assert 0.7 < ratio < 0.78
 
 
+def test_torn_snow_that_has_lost_its_stiffness_lies_on_a_body():
+    """It has nearly no modulus and its whole mass, and the steps that `stable_dt` gives hold it."""
+    scene, particles = stacked(gap=0.2, law=mpm.Snow(1e5, 0.2), gravity=(0.0, -10.0))
+    held = mpm.StickyBox((-np.inf, 0.1), (np.inf, np.inf))
+    scene = dataclasses.replace(scene, boundary=held)
+    particles = mpm.prepare(scene, particles)
+    upper = slice(particles.sizes[0], None)
+    torn = eqx.tree_at(lambda p: p.histories[1].plastic_volume, particles, jnp.full(particles.sizes[1], 9.0))
+    final = mpm.rollout(scene, torn, steps=400, dt=1e-3)
+    assert float(final.x[upper, 1].min()) > 0.15
+
+
 BAD = {
     "one material": (lambda: mpm.Scene(mpm.Grid((8, 8), 0.1), LAW, bodies=mpm.Bodies()), "two or more"),
     "a number left out": (

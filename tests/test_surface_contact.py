@@ -245,3 +245,32 @@ def test_explicit_steps_within_the_bound_of_stable_dt_stay_bounded_in_contact():
         final = mpm.rollout(scene, mpm.prepare(scene, body), steps=400, dt=share * limit, method=mpm.Explicit())
         speed = float(jnp.abs(final.v).max())
         assert (np.isfinite(speed) and speed < 0.05) == holds
+
+
+@pytest.mark.parametrize("method", **ids(METHODS, ("explicit", "semi_implicit")))
+@pytest.mark.parametrize("d", [2, *thorough(3)])
+def test_torn_snow_that_has_lost_its_stiffness_lies_on_the_floor(method, d):
+    """It has nearly no modulus and its whole mass. It stays above the floor for the time in which it would fall by
+    eight spacings, in steps that `stable_dt` knows of."""
+    grid, body = block(d, gap=0.2)
+    scene = mpm.Scene(grid, mpm.Snow(1e2, 0.2), boundary=floor(0.0, d), gravity=(*(0.0,) * (d - 1), -10.0))
+    torn = torn_snow(mpm.prepare(scene, body))
+    dt = 1e-3
+    assert dt < float(mpm.stable_dt(scene, torn)) < 0.01
+    final = mpm.rollout(scene, torn, steps=400, dt=dt, method=method)
+    assert float(final.x[:, -1].min()) > 0.0
+
+
+def torn_snow(particles):
+    """The same snow, torn until nothing is left of its stiffness."""
+    return eqx.tree_at(lambda p: p.histories[0].plastic_volume, particles, jnp.full(particles.count, 9.0))
+
+
+@pytest.mark.parametrize("d", [2, *thorough(3)])
+def test_slivers_at_a_curved_edge_do_not_shorten_explicit_steps(d):
+    """A floor shortens the longest step of a ball, whose edge `fill` cuts, hardly more than that of a block (√½)."""
+    grid = mpm.Grid((14,) * d, 0.1, origin=(-4,) * d)
+    ball = mpm.fill(mpm.Ball((0.31,) * d, 0.3), grid, density=1.0)
+    assert float(ball.volume.min()) < 0.1 * float(ball.volume.max())
+    limit, free = (float(mpm.stable_dt(mpm.Scene(grid, LAW, boundary=b), ball)) for b in (floor(0.0, d), ()))
+    assert limit > 0.65 * free

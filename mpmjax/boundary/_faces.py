@@ -53,8 +53,9 @@ class Faces(eqx.Module):
     shapes: tuple[FaceShape, ...]
     """Their shapes, one for each material."""
     stiffness: Float[Array, "p"]
-    """Stiffness of contact of a face at rest A α M/dx [N/m], shape (p,), on its area A = V0/l0, with M the wave modulus
-    of the law at rest and α the stiffness of explicit or implicit steps."""
+    """Stiffness of contact of a face at rest A α M/dx [N/m], shape (p,), with M the modulus of contact (see
+    `AbstractLaw.contact_modulus`), α the stiffness of explicit or implicit steps, and A the face's area: V0/l0, and in
+    explicit steps V0 over the side of its material's largest particle."""
     inertia: Float[Array, "p"]
     """A α ρ0/dx [kg/m²], shape (p,): times the square of the velocity of approach, the stiffness of contact that a
     shock adds."""

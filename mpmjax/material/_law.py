@@ -56,6 +56,17 @@ class AbstractLaw(eqx.Module):
             dt: the step [s], in which what depends on the rate has flowed.
         """
 
+    def contact_modulus(self, F: Deformation, history: Any, /) -> Float[Array, "p"]:
+        """The modulus [Pa] by which contact takes its stiffness, shape (p,): the wave modulus, now or before anything
+        yielded, whichever is larger. Torn material has lost its stiffness and not its mass, and walls must hold it.
+
+        Args:
+            F: the deformation [-], component first.
+            history: the history.
+        """
+        now, intact = (self.elastic(a).wave_modulus(F) for a in (history, self.initial_history(F)))
+        return jnp.broadcast_to(jnp.maximum(now, intact), F.shape[self.kinematics.axes :])
+
     def remembers(self, history: Any, stored: Array, /) -> bool:
         """Whether a history is one of the law's: of the structure and shapes of that of particles that store this.
 

@@ -8,6 +8,7 @@ from mpmjax._types import Scalar, components
 from mpmjax.boundary import Body, BodyContact, Mirror, body_contact
 from mpmjax.discretisation import Stencil, scatter
 from mpmjax.state import MaterialPoints, Particles, Scene
+from mpmjax.stepping._particle_faces import contact_moduli
 
 
 def contacts_of_bodies(
@@ -55,8 +56,7 @@ def _bodies(
     """The bodies, one for each layer of nodes."""
     d, dx, layers = particles.dim, jnp.asarray(scene.grid.spacing), scene.grid.layers
     volume = jnp.concatenate([points.volume * jnp.abs(points.volume_ratio()) for points in materials])
-    modulus = jnp.concatenate([jnp.broadcast_to(p.law.wave_modulus(p.deformation), p.volume.shape) for p in materials])
-    means = jnp.stack([modulus, particles.mass / volume, volume ** (1 / d) / dx])
+    means = jnp.stack([contact_moduli(scene, particles, materials), particles.mass / volume, volume ** (1 / d) / dx])
     part = volume / dx**d
     values = part * jnp.concatenate([jnp.ones_like(part)[None], means, components(particles.v)])
     sums = scatter(stencil, values, None, scene.grid.size)

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from mpmjax._types import Scalar
+from mpmjax._types import Array, Float, Scalar
 from mpmjax.boundary import EXPLICIT_STIFFNESS, IMPLICIT_STIFFNESS, Faces, FaceShape
 from mpmjax.discretisation import Stencil
 from mpmjax.state import MaterialPoints, Particles, Scene
@@ -28,24 +28,30 @@ def faces_of(
     """
     if not any(boundary.pushes or boundary.sees_faces for boundary in scene.boundary):
         return None
-    shapes, stiffness, inertia, explicit = [], [], [], force_at is None
+    shapes, areas, explicit = [], [], force_at is None
     factor = EXPLICIT_STIFFNESS if explicit else IMPLICIT_STIFFNESS
     for law, points in zip(scene.laws, materials, strict=True):
         side = points.volume ** (1 / particles.dim)
         shape = points.deformation if law.allows_total else points.volume_ratio()
         shapes.append(FaceShape(side / 2, shape, points.rows, points.total))
-        over = factor / (side * scene.grid.spacing)
-        stiffness.append(over * points.law.wave_modulus(points.deformation) * points.volume)
-        inertia.append(over * particles.mass[slice(*points.rows)])
+        # of a sliver A = V0/l0 is large for its mass, and would shorten explicit steps
+        areas.append(points.volume / (side.max(initial=0) if explicit else side))
+    per_modulus = jnp.concatenate(areas) * (factor / jnp.asarray(scene.grid.spacing))
     return Faces(
         x=particles.x,
         v=particles.v,
         shapes=tuple(shapes),
-        stiffness=jnp.concatenate(stiffness),
-        inertia=jnp.concatenate(inertia),
+        stiffness=per_modulus * contact_moduli(scene, particles, materials),
+        inertia=per_modulus * particles.mass / particles.volume,
         stencil=stencil,
         spacing=jnp.asarray(scene.grid.spacing),
         dt=jnp.asarray(dt),
         force_at=0.0 if force_at is None else jnp.asarray(force_at, particles.x.dtype),
         explicit=explicit,
     )
+
+
+def contact_moduli(scene: Scene, particles: Particles, materials: tuple[MaterialPoints, ...]) -> Float[Array, "p"]:
+    """The modulus of contact [Pa] of each prepared particle, shape (p,) (see `AbstractLaw.contact_modulus`)."""
+    each = zip(scene.laws, materials, particles.histories, strict=True)
+    return jnp.concatenate([law.contact_modulus(points.deformation, history) for law, points, history in each])

@@ -18,7 +18,7 @@ from mpmjax.geometry import length
 from mpmjax.state import AttachedPoints, MaterialPoints, Particles, Scene, is_prepared, points_of, prepare
 from mpmjax.stepping._explicit import Explicit
 from mpmjax.stepping._integrator import AbstractIntegrator
-from mpmjax.stepping._particle_faces import faces_of
+from mpmjax.stepping._particle_faces import contact_moduli, faces_of
 
 MOST_STEPS = 2**31 - 1
 """The largest number of steps of a run."""
@@ -224,8 +224,7 @@ def _between_bodies(
     if scene.bodies is None:
         return 0.0
     density, speed = particles.mass / particles.volume, length(particles.v)
-    moduli = [jnp.broadcast_to(p.law.wave_modulus(p.deformation), p.volume.shape) for p in materials]
-    modulus = jnp.concatenate(moduli) + density * (speed + speed.max()) ** 2
+    modulus = contact_moduli(scene, particles, materials) + density * (speed + speed.max()) ** 2
     of_body = scene.bodies.numbers(len(scene.laws))
     rows = [slice(*points.rows) for points in materials]
 
