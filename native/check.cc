@@ -356,6 +356,40 @@ void check_vectors(int64_t size, bool in_place, std::mt19937& random, const std:
   }
 }
 
+// What is left of a product, in place; nothing is free and all is zero where blocks are passed over.
+template <class T>
+void check_product(int64_t nodes, int64_t each, std::mt19937& random, const std::vector<const Pool*>& pools) {
+  const int64_t batch = 2, size = nodes * each, blocks = (size + kTogether - 1) / kTogether;
+  std::normal_distribution<T> normal;
+  const Array<T> force(batch * size), v(force.size), weight(force.size), mass(batch * nodes), factor(batch), sum(batch);
+  const Array<bool> active(batch * blocks), free(force.size);
+  for (int64_t i = 0; i < active.size; ++i) active[i] = random() % 3 == 0;
+  for (int64_t i = 0; i < mass.size; ++i) mass[i] = normal(random);
+  for (int64_t i = 0; i < factor.size; ++i) factor[i] = normal(random);
+  std::vector<double> image(force.size), total(batch), scale(force.size, 1), bound(batch, 1);
+  for (int64_t i = 0; i < force.size; ++i) {
+    const int64_t m = i / size;
+    force[i] = normal(random), weight[i] = 1 + std::abs(normal(random));
+    if (!active[m * blocks + i % size / kTogether]) continue;
+    v[i] = normal(random), free[i] = random() % 3 > 0;
+    const double held = mass[m * nodes + i % size / each] * v[i], pushed = double(factor[m]) * force[i];
+    const double of_a = free[i] ? held + pushed : double(v[i]);
+    image[i] = of_a / weight[i], scale[i] += std::abs(held) + std::abs(pushed);
+    total[m] += of_a * v[i], bound[m] += scale[i] * std::abs(v[i]);
+  }
+  std::unique_ptr<Array<T>> bits;
+  for (const Pool* pool : pools) {
+    const Array<T> to(force);
+    product(*pool, batch, Product<T>{to.data.get(), v.data.get(), mass.data.get(), factor.data.get(), free.data.get(),
+                                     weight.data.get(), active.data.get(), to.data.get(), sum.data.get(), size, nodes});
+    const Shape shape = {1, 0, batch, size, 0, 0};
+    compare("product", shape, to, image, scale);
+    compare("product's sum", shape, sum, total, bound);
+    if (bits == nullptr) bits = std::make_unique<Array<T>>(sum);
+    expect_same("a product's sum", *bits, sum);
+  }
+}
+
 template <class T>
 int check_all(const std::vector<const Pool*>& pools) {
   std::mt19937 random(1);
@@ -382,6 +416,9 @@ int check_all(const std::vector<const Pool*>& pools) {
   check_in_order<T>({2, 3, 2, 20011, 40, 2}, random, pools);
   for (const int64_t size : {0, 1, 64, 200, 100003}) {
     for (const bool in_place : {false, true}) check_vectors<T>(size, in_place, random, pools), ++examples;
+  }
+  for (const int64_t nodes : {0, 1, 64, 200, 50003}) {
+    for (int each = 1; each <= 3; ++each) check_product<T>(nodes, each, random, pools), ++examples;
   }
   return examples + 1;
 }

@@ -6,9 +6,10 @@
 //   pull     index, weights, derivatives, nodes, given ...             ->  by weights, by derivatives
 //   resist   index, weights, derivatives, matrices, nodes              ->  nodes
 //   combine  a, b, c, d, scales, weight, active                        ->  y, z, sum
+//   product  force, v, mass, factor, free, weight, active              ->  image, sum
 //
 // Factors are (..., d, s, p), given and gathered (..., c, p), nodes (..., n, c), matrices (..., d² (d² + 1) / 2, p), with
-// the same leading axes everywhere. Vectors to combine are (..., m), scales (..., 2), active (..., ⌈m/64⌉).
+// the same leading axes everywhere. Vectors are (..., m), scales (..., 2), mass (..., n), active (..., ⌈m/64⌉).
 // `valued` says whether the first of the given is the value; `differential` whether changes of the factors follow them.
 
 #include <string>
@@ -241,41 +242,85 @@ ffi::Error run_resist(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi
   return run(ResistOf{}, threads, arguments, results);
 }
 
+// Calls on vectors of one size, beside booleans of their blocks, the last operand.
+struct Vectors {
+  Call call;
+  int64_t size = 0;
+  const bool* active = nullptr;
+
+  Vectors(const ffi::RemainingArgs& arguments, const ffi::RemainingRets& results, size_t operands, size_t given)
+      : call(collect(arguments, results)) {
+    call.expect(call.operands == operands && call.buffers.size() == operands + given, "too many or too few arrays");
+    if (!call.fault.empty()) return;
+    const Shape shape = shape_of(call.buffers[0]);
+    call.expect(!shape.empty(), "no vectors");
+    if (!call.fault.empty()) return;
+    call.type = call.buffers[0].element_type();
+    call.leading.assign(shape.begin(), shape.end() - 1);
+    for (const int64_t n : call.leading) call.batch *= n;
+    size = shape.back();
+    active = booleans(operands - 1, (size + kTogether - 1) / kTogether);
+    call.expect(call.type == ffi::DataType::F32 || call.type == ffi::DataType::F64, "there is no kernel of this type");
+  }
+
+  const bool* booleans(size_t k, int64_t count) {
+    Shape shape = call.leading;
+    shape.push_back(count);
+    call.expect(call.buffers[k].element_type() == ffi::DataType::PRED, "no booleans");
+    call.expect(shape_of(call.buffers[k]) == shape, "arrays whose shapes do not fit each other");
+    return static_cast<const bool*>(call.buffers[k].untyped_data());
+  }
+};
+
 template <class T>
-void combine_call(const Pool& pool, Call& call, int64_t size, const bool* active) {
+void combine_call(const Pool& pool, Vectors& vectors) {
+  Call& call = vectors.call;
   Combine<T> task = {};
-  task.size = size;
+  task.size = vectors.size;
   const T** from[] = {&task.a, &task.b, &task.c, &task.d};
-  for (size_t k = 0; k < 4; ++k) *from[k] = call.at<T>(k, {size});
+  for (size_t k = 0; k < 4; ++k) *from[k] = call.at<T>(k, {task.size});
   task.scales = call.at<T>(4, {2});
-  task.weight = call.at<T>(5, {size});
-  task.y = call.at<T>(7, {size});
-  task.z = call.at<T>(8, {size});
+  task.weight = call.at<T>(5, {task.size});
+  task.active = vectors.active;
+  task.y = call.at<T>(7, {task.size});
+  task.z = call.at<T>(8, {task.size});
   task.sum = call.at<T>(9, {});
-  task.active = active;
   if (call.fault.empty()) combine(pool, call.batch, task);
 }
 
+template <class T>
+void product_call(const Pool& pool, Vectors& vectors) {
+  Call& call = vectors.call;
+  Product<T> task = {};
+  task.size = vectors.size;
+  task.nodes = call.dim(2, 1);
+  task.force = call.at<T>(0, {task.size});
+  task.v = call.at<T>(1, {task.size});
+  task.mass = call.at<T>(2, {task.nodes});
+  task.factor = call.at<T>(3, {});
+  task.free = vectors.booleans(4, task.size);
+  task.weight = call.at<T>(5, {task.size});
+  task.active = vectors.active;
+  task.image = call.at<T>(7, {task.size});
+  task.sum = call.at<T>(8, {});
+  call.expect(task.nodes > 0 ? task.size % task.nodes == 0 : task.size == 0, "nodes with unlike numbers of components");
+  if (call.fault.empty()) product(pool, call.batch, task);
+}
+
 ffi::Error run_combine(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
-  Call call = collect(arguments, results);
-  call.expect(call.operands == 7 && call.buffers.size() == 10, "too many or too few arrays");
-  if (!call.fault.empty()) return wrong(call.fault);
-  const Shape shape = shape_of(call.buffers[0]);
-  call.expect(!shape.empty() && call.buffers[6].element_type() == ffi::DataType::PRED, "no vectors, or no active blocks");
-  if (!call.fault.empty()) return wrong(call.fault);
-  call.type = call.buffers[0].element_type();
-  call.leading.assign(shape.begin(), shape.end() - 1);
-  for (const int64_t n : call.leading) call.batch *= n;
-  Shape blocks = call.leading;
-  blocks.push_back((shape.back() + kTogether - 1) / kTogether);
-  call.expect(shape_of(call.buffers[6]) == blocks, "arrays whose shapes do not fit each other");
-  if (!call.fault.empty()) return wrong(call.fault);
-  const bool* active = static_cast<const bool*>(call.buffers[6].untyped_data());
+  Vectors vectors(arguments, results, 7, 3);
   const XlaPool pool(threads);
-  call.expect(call.type == ffi::DataType::F32 || call.type == ffi::DataType::F64, "there is no kernel of this type");
-  if (call.type == ffi::DataType::F32) combine_call<float>(pool, call, shape.back(), active);
-  if (call.type == ffi::DataType::F64) combine_call<double>(pool, call, shape.back(), active);
-  return call.fault.empty() ? ffi::Error::Success() : wrong(call.fault);
+  if (!vectors.call.fault.empty()) return wrong(vectors.call.fault);
+  vectors.call.type == ffi::DataType::F32 ? combine_call<float>(pool, vectors) : combine_call<double>(pool, vectors);
+  return vectors.call.fault.empty() ? ffi::Error::Success() : wrong(vectors.call.fault);
+}
+
+ffi::Error run_product(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  Vectors vectors(arguments, results, 7, 2);
+  const XlaPool pool(threads);
+  if (!vectors.call.fault.empty()) return wrong(vectors.call.fault);
+  vectors.call.type == ffi::DataType::F32 ? product_call<float>(pool, vectors) : product_call<double>(pool, vectors);
+  return vectors.call.fault.empty() ? ffi::Error::Success() : wrong(vectors.call.fault);
 }
 
 ffi::Error run_threads(ffi::ThreadPool threads, ffi::ResultBuffer<ffi::DataType::S32> count) {
@@ -306,6 +351,8 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_pull, mpmjax::run_pull,
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_resist, mpmjax::run_resist,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_combine, mpmjax::run_combine,
+                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_product, mpmjax::run_product,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
 
 // The threads that sums are shared among.

@@ -22,8 +22,25 @@ struct Combine {
   int64_t size;
 };
 
+// What is left of a product with A = M + χH on free components, once the force f = H v is known: the image y = W⁻¹A v, with
+// (A v)_i = m_i v_i + χ f_i where i is free and v_i elsewhere, and Σ v (A v). Where `active` is false v is zero, and nothing
+// free. The image may be where the force was.
+template <class T>
+struct Product {
+  const T *force, *v;
+  const T* mass;    // (nodes), each that of size/nodes components
+  const T* factor;  // χ
+  const bool* free;
+  const T* weight;
+  const bool* active;  // (⌈size/64⌉)
+  T *image, *sum;
+  int64_t size, nodes;
+};
+
 // `batch` problems follow each other in every array. The sums have the same bits for any number of threads.
 void combine(const Pool& pool, int64_t batch, const Combine<float>& first);
 void combine(const Pool& pool, int64_t batch, const Combine<double>& first);
+void product(const Pool& pool, int64_t batch, const Product<float>& first);
+void product(const Pool& pool, int64_t batch, const Product<double>& first);
 
 }  // namespace mpmjax

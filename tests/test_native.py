@@ -228,6 +228,36 @@ def test_combined_vectors_agree(choose):
 
 
 @NEEDS_LIBRARY
+@pytest.mark.parametrize("each", [1, 2, 3])
+def test_products_of_vectors_agree(choose, each):
+    """W⁻¹A v and vᵀA v, with nodes that are held and empty, in a batch, and their derivatives; a force that is not
+    finite where it is held is not felt."""
+    choose("native")
+    rng = np.random.default_rng(each)
+    force, v, weight = rng.normal(size=(3, 2, 400 * each))
+    some = np.arange(400 * each) % 300 < 100
+    free = some & (rng.uniform(size=some.shape) < 0.7)
+    force[:, ~free] = np.nan
+    v, mass, weight = v * some, rng.uniform(1, 2, size=(2, 400)), 1 + weight**2
+    some, free = jnp.asarray(some), jnp.asarray(free)
+
+    def agreeing(*args):
+        return tuple(_vectors.product(*args[:4], free, args[4], _vectors.active_blocks(some)))
+
+    def expected(force, v, mass, factor, weight):
+        image = jnp.where(free, jnp.repeat(mass, each) * v + factor * jnp.where(free, force, 0), v)
+        return image / weight, (v * image).sum()
+
+    args = tuple(map(jnp.asarray, (force, v, mass, 0.3, weight)))
+    over = partial(jax.vmap, in_axes=(0, 0, 0, None, 0))
+    assert "mpmjax_product" in jax.jit(agreeing).lower(*(a[0] if a.ndim else a for a in args)).as_text()
+    agree(jax.jit(over(agreeing))(*args), over(expected)(*args), "float64")
+    finite = (jnp.where(free, args[0], 0), *args[1:])
+    along = tuple(jnp.cos(a) for a in finite)
+    agree(*(jax.jvp(jax.jit(over(f)), finite, along)[1] for f in (agreeing, expected)), "float64")
+
+
+@NEEDS_LIBRARY
 def test_the_library_is_called_and_only_on_a_cpu(choose):
     """By default on a CPU, not when XLA is asked for, not for another platform, not for a program that XLA divides."""
     args = problem(2, 3, 3, 10, "float32")

@@ -42,6 +42,8 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
     - `y0`: the initial guess. Default: zeros.
     - `support`: where A is not the identity, booleans of the vector's structure. What is zero elsewhere stays zero
       there, and is passed over. Default: everywhere.
+    - `product`: for a diagonal W, the operator's `product` (see `AbstractSymmetricOperator`), which may be faster than
+      its `mv` and sums. Default: these.
 
     Statistics returned:
 
@@ -126,6 +128,11 @@ class _System(eqx.Module):
         """E u."""
         return self.inner.solve(ravel_pytree(self.operator.mv(self.unravel(u)))[0])
 
+    def product(self, u: Array) -> tuple[Array, Float[Array, ""]]:
+        """E u, and uᵀA u."""
+        image = self.apply(u)
+        return image, self.dot(u, image)
+
     def dot(self, a: Array, c: Array) -> Float[Array, ""]:
         """aᵀ W c."""
         return (self.inner.apply(a) * c).sum()
@@ -164,6 +171,14 @@ class _DiagonalSystem(_System):
     """W."""
     active: Bool[Array, "k"]
     """Where vectors may be different from zero (see `active_blocks`)."""
+    fused: Callable[..., tuple[Array, Float[Array, ""]]] | None
+    """The operator's `product`, if it was given."""
+
+    def product(self, u: Array) -> tuple[Array, Float[Array, ""]]:
+        if self.fused is None:
+            return super().product(u)
+        image, square = self.fused(self.unravel(u), self.unravel(self.weight), self.active)
+        return image.reshape(-1), square
 
     def combined(
         self, one: tuple[Array, Scalar, Array], other: tuple[Array, Scalar, Array], *, onto: int
@@ -234,7 +249,7 @@ def _system(
     if inner.paired:
         system = _PairedSystem(*given)
     elif isinstance(inner, DiagonalInnerProduct):
-        system = _DiagonalSystem(*given, inner.weight, _active(flat, options))
+        system = _DiagonalSystem(*given, inner.weight, _active(flat, options), options.get("product"))
     else:
         system = _System(*given)
     return replace(system, b_norm=system.norm(b))
@@ -300,8 +315,7 @@ def _restart(system: _System, c: _Recurrence) -> _Recurrence:
 
 def _step(system: _System, c: _Recurrence) -> _Recurrence:
     """One step of the recurrence."""
-    s = system.apply(c.r)
-    gamma = system.dot(c.r, s)
+    s, gamma = system.product(c.r)
     beta = gamma / c.gamma
     p, q, qq = system.combined((c.r, beta, c.p), (s, beta, c.q), onto=1)
     rounding = system.eps * jnp.sqrt(c.rr * (qq + beta**2 * c.qq))  # of γ: ε‖r‖‖s‖

@@ -11,6 +11,7 @@ import lineax as lx
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.implicit._hessian_action import AbstractHessianAction
 from mpmjax.implicit._projection import Projection
+from mpmjax.implicit._vectors import product
 
 
 class AbstractSymmetricOperator(lx.AbstractLinearOperator):
@@ -31,6 +32,20 @@ class AbstractSymmetricOperator(lx.AbstractLinearOperator):
     def support(self) -> Bool[Array, "..."] | None:
         """Where the operator is not the identity, in the shape of a vector; None if that is not known."""
         return None
+
+    def product(
+        self, v: Array, weight: Float[Array, "..."], active: Bool[Array, "k"]
+    ) -> tuple[Array, Float[Array, ""]]:
+        """W⁻¹A v and vᵀA v for this operator A, as an iteration needs them.
+
+        Args:
+            v: v.
+            weight: the diagonal of W, of the same shape.
+            active: where vectors may differ from zero, and where they are passed over (see `active_blocks`).
+        """
+        del active
+        image = self.mv(v)
+        return image / weight, (v * image).sum()
 
     def out_structure(self) -> jax.ShapeDtypeStruct:
         return self.in_structure()
@@ -70,6 +85,19 @@ class ImplicitOperator(AbstractSymmetricOperator):
     def mv(self, vector: NodeVector) -> NodeVector:
         combine = self.projection.combine
         return combine(self.unconstrained(combine(vector, 0)), self.projection.identity_rows(vector, self.mass))
+
+    def product(
+        self, v: NodeVector, weight: NodeVector, active: Bool[Array, "k"]
+    ) -> tuple[NodeVector, Float[Array, ""]]:
+        """Without held normals, all but H v in one pass."""
+        free = self.projection.free
+        if self.projection.normal is not None:
+            return super().product(v, weight, active)
+        force = self.hessian(self.projection.combine(v, 0)).reshape(-1)
+        image, square = product(
+            force, v.reshape(-1), self.mass, self.factor, free.reshape(-1), weight.reshape(-1), active
+        )
+        return image.reshape(v.shape), square
 
     def support(self) -> Mask:
         return self.projection.free

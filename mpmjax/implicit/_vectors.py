@@ -1,10 +1,11 @@
-"""The vectors of an iteration, combined in one pass.
+"""What an iteration does with vectors, in two passes.
 
-Two sums of two vectors each and a norm are half of what the conjugate residual method does with vectors. Written in JAX
-they are three passes over the window, of which a body may fill a small part. On CPUs the native library does them in
-one, in place, and passes over numbers that are known to stay zero.
+Besides H v the conjugate residual method needs the rest of the product with M + χH, with an inner product, and two sums
+of two vectors each, with a norm. Written in JAX these are some eight passes over the window, of which a body may fill a
+small part. On CPUs the native library does them in two, in place, and passes over numbers that are known to stay zero.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad
 
-from mpmjax._types import Array, Bool, Float, Scalar
+from mpmjax._types import Array, Bool, Float, NodeScalar, Scalar
 from mpmjax.native import members, native_primitive
 
 _TOGETHER = 64
@@ -27,6 +28,15 @@ class Combined(NamedTuple):
     first: Float[Array, "m"]
     second: Float[Array, "m"]
     square: Float[Array, ""]
+
+
+class Product(NamedTuple):
+    """The image of a vector, and its inner product with the vector."""
+
+    image: Float[Array, "m"]
+    """W⁻¹A v."""
+    square: Float[Array, ""]
+    """vᵀA v."""
 
 
 def active_blocks(*may_differ_from_zero: Bool[Array, "m"]) -> Bool[Array, "k"]:
@@ -63,6 +73,40 @@ def _combine(*args: Array, unroll: bool = False) -> list[Array]:
     return [y, z, (weight * z * z).sum()]
 
 
+def product(
+    force: Float[Array, "m"],
+    v: Float[Array, "m"],
+    mass: NodeScalar,
+    factor: Scalar,
+    free: Bool[Array, "m"],
+    weight: Float[Array, "m"],
+    active: Bool[Array, "k"],
+) -> Product:
+    """W⁻¹A v and vᵀA v, with (A v)_i = m_i v_i + χ f_i where i is free, and v_i elsewhere.
+
+    Args:
+        force: f = H v, shape (m,).
+        v: v, shape (m,).
+        mass: nodal masses, shape (n,), each that of m/n components.
+        factor: χ.
+        free: what is free, shape (m,).
+        weight: the diagonal of W, shape (m,).
+        active: `active_blocks`. In others v is zero and nothing free.
+    """
+    return Product(*_product_p.bind(force, v, mass, jnp.asarray(factor, v.dtype), free, weight, active, batched=0))
+
+
+def _product(*args: Array, unroll: bool = False) -> list[Array]:
+    del unroll  # there is no loop
+    force, v, mass, factor, free, weight, _ = args
+    image = jnp.where(free, jnp.repeat(mass, len(v) // max(1, len(mass))) * v + factor * force, v)
+    return [image / weight, (v * image).sum()]
+
+
+def _image_and_number(*args: ShapedArray) -> list[tuple]:
+    return [(args[0].shape[-1],), ()]
+
+
 def _results(*args: ShapedArray) -> list[tuple]:
     size = args[0].shape[-1]
     return [(size,), (size,), ()]
@@ -70,23 +114,29 @@ def _results(*args: ShapedArray) -> list[tuple]:
 
 def _fits(avals: Any, batched: int) -> bool:
     del batched
-    return avals[0].dtype in (np.float32, np.float64) and all(aval.dtype == avals[0].dtype for aval in avals[:6])
+    floats = [aval.dtype for aval in avals if aval.dtype != np.bool_]
+    return floats[0] in (np.float32, np.float64) and set(floats) == {floats[0]}
 
 
-def _differentiable(primitive: Primitive) -> Primitive:
+def _differentiable(primitive: Primitive, function: Callable[..., list[Array]]) -> Primitive:
     """With the derivative of what is written in JAX. Solves are never differentiated through their iterations."""
 
     def jvp(primals: tuple, tangents: tuple, *, batched: int) -> tuple[list[Array], list[Array]]:
-        *floats, active = primals
-        written = members(_combine, batched)
-        along = tuple(map(ad.instantiate_zeros, tangents[:-1]))
-        return jax.jvp(lambda *floats: written(*floats, active), tuple(floats), along)
+        floats = [k for k, primal in enumerate(primals) if primal.dtype != np.bool_]
+
+        def written(*given: Array) -> list[Array]:
+            at = dict(zip(floats, given, strict=True))
+            return members(function, batched)(*(at.get(k, primal) for k, primal in enumerate(primals)))
+
+        along = tuple(ad.instantiate_zeros(tangents[k]) for k in floats)
+        return jax.jvp(written, tuple(primals[k] for k in floats), along)
 
     ad.primitive_jvps[primitive] = jvp
     return primitive
 
 
 _combine_p = tuple(
-    _differentiable(native_primitive(f"vectors_combine_{k}", _combine, _results, _fits, {k: 0, 2 + k: 1}))
+    _differentiable(native_primitive(f"vectors_combine_{k}", _combine, _results, _fits, {k: 0, 2 + k: 1}), _combine)
     for k in (0, 1)
 )
+_product_p = _differentiable(native_primitive("vectors_product", _product, _image_and_number, _fits, {0: 0}), _product)
