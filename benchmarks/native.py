@@ -32,7 +32,7 @@ def tasks(numbers: tuple, dtype: str) -> dict:
     """What is timed, each with the steps or iterations that its seconds are divided by."""
     import jax
     import jax.numpy as jnp
-    from throughput import E_MODULUS, NU, block, iterations, ours
+    from throughput import E_MODULUS, NU, Ours, block, iterations
 
     import mpmjax as mpm
 
@@ -47,10 +47,10 @@ def tasks(numbers: tuple, dtype: str) -> dict:
         return mpm.rollout(scene, particles, steps=STEPS, dt=b.dt).x[:, -1].mean()
 
     slope = jax.jit(jax.value_and_grad(height))
-    few, more = iterations(b).values()
+    few, more = iterations(b)
     whole, parts = resistances(b)
     return {
-        "step": (ours(b, mpm.UpdatedLagrangian(), STEPS), STEPS),
+        "step": (Ours(b, mpm.UpdatedLagrangian(), STEPS), STEPS),
         "few": (few, 1),
         "more": (more, 40),
         "resist": (whole, 1),

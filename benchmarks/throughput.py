@@ -5,19 +5,23 @@
     python benchmarks/throughput.py --json --quick
     python benchmarks/throughput.py --device gpu
 
-Scenes: A, 3-D, 97 336 particles on 64³ nodes, 8 a cell; C, 2-D, 10 000 on 128² and 99 856 on 256², 4 a cell. All codes:
-neo-Hookean, quadratic kernel, APIC, moving least squares, the same initial particles, gravity, no walls reached. Before
-anything is timed, their centres of mass and their energies after some steps must agree to what the precision allows.
+Scenes: A, 3-D, 97 336 particles on 64³ nodes and, in float32 alone, 1 000 000 and 4 019 679 on 128³, 8 a cell; C, 2-D,
+10 000 on 128² and 99 856 on 256², 4 a cell. All codes: neo-Hookean, quadratic kernel, APIC, moving least squares, the
+same initial particles, gravity, no walls reached. This package is timed with the native sums and by XLA alone. Before
+anything is timed, centres of mass and energies after some steps must agree to what the precision allows.
 The codes take turns, and medians are compared as ratios: seconds on a shared machine mean little. What an iteration of
 the implicit solve costs is told from semi-implicit steps of two lengths of the iteration; and from the bytes that any
-explicit step has to move, the fraction of the memory's bandwidth, which is that of a copy.
+explicit step has to move, the fraction of the memory's bandwidth, which is that of a copy. Memory is that of the
+compiled program: what it is given, what it returns, and its temporaries.
 """
 
 import argparse
 import json
+import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,6 +37,7 @@ jax.config.update("jax_enable_x64", True)
 
 E_MODULUS, NU, DENSITY, GRAVITY = 1e5, 0.3, 1e3, 9.81
 SCENES = {"A 100k": (3, 100_000, 64, 8), "C 10k": (2, 10_000, 128, 4), "C 100k": (2, 100_000, 256, 4)}
+LARGE = {"A 1M": (3, 1_000_000, 128, 8), "A 4M": (3, 4_000_000, 128, 8)}
 QUICK = {"A 5k": (3, 5_000, 32, 8), "C 2k": (2, 2_000, 64, 4)}
 ITERATIONS = 4, 44
 Code = Callable[[], tuple[np.ndarray, np.ndarray, np.ndarray]]
@@ -67,22 +72,48 @@ def block(d: int, particles: int, nodes: int, per_cell: int, dtype: str) -> Bloc
     return Block(x, v, DENSITY * volume, volume, nodes, spacing, 0.3 * spacing / speed, dtype)
 
 
-def ours(b: Block, description: Any, steps: int, method: Any = mpm.Explicit()) -> Code:
-    """This package's `rollout`."""
-    d = b.x.shape[1]
-    grid = mpm.Grid((b.nodes,) * d, b.spacing)
-    one = jnp.ones(len(b.x), b.dtype)
-    particles = mpm.Particles(jnp.asarray(b.x, b.dtype), jnp.asarray(b.v, b.dtype), b.mass * one, b.volume * one)
-    gravity = (*[0.0] * (d - 1), -GRAVITY)
-    choices = {"gravity": gravity, "description": description, "gradient": mpm.MLSGradient()}
-    scene = mpm.Scene(grid, mpm.NeoHookean(E_MODULUS, NU), **choices)
-    state = [mpm.prepare(scene, particles)]
+@contextmanager
+def summed_by(backend: str | None) -> Iterator[None]:
+    """Programs that are compiled within take this back end, and keep it. None: that of the environment."""
+    asked = os.environ.get("MPMJAX_BACKEND")
+    if backend is not None:
+        os.environ["MPMJAX_BACKEND"] = backend
+    yield
+    os.environ.pop("MPMJAX_BACKEND", None)
+    if asked is not None:
+        os.environ["MPMJAX_BACKEND"] = asked
 
-    def go() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        state[0] = mpm.rollout(scene, state[0], steps=steps, dt=b.dt, method=method)
-        return tuple(np.asarray(a) for a in (state[0].x, state[0].v, state[0].F))
 
-    return go
+class Ours:
+    """This package's `rollout`, compiled for one back end. A call goes on by the timed steps."""
+
+    memory: int
+    """What the program is given, what it returns, and its temporaries [B]."""
+
+    def __init__(
+        self,
+        b: Block,
+        description: Any,
+        steps: int,
+        method: Any = mpm.Explicit(),
+        backend: str | None = None,
+    ):
+        d, one = b.x.shape[1], jnp.ones(len(b.x), b.dtype)
+        particles = mpm.Particles(jnp.asarray(b.x, b.dtype), jnp.asarray(b.v, b.dtype), b.mass * one, b.volume * one)
+        gravity = (*[0.0] * (d - 1), -GRAVITY)
+        choices = {"gravity": gravity, "description": description, "gradient": mpm.MLSGradient()}
+        scene = mpm.Scene(mpm.Grid((b.nodes,) * d, b.spacing), mpm.NeoHookean(E_MODULUS, NU), **choices)
+        self._state = mpm.prepare(scene, particles)
+        self._given = scene, jnp.asarray(b.dt, b.dtype)
+        go_on = jax.jit(lambda scene, dt, state: mpm.rollout(scene, state, steps=steps, dt=dt, method=method))
+        with summed_by(backend):
+            self._program = go_on.lower(*self._given, self._state).compile()
+        said = self._program.memory_analysis()
+        self.memory = said.argument_size_in_bytes + said.output_size_in_bytes + said.temp_size_in_bytes
+
+    def __call__(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self._state = self._program(*self._given, self._state)
+        return np.asarray(self._state.x), np.asarray(self._state.v), np.asarray(self._state.F)
 
 
 def peer(b: Block, make: Callable[..., Any]) -> Any:
@@ -115,9 +146,11 @@ def energies(b: Block, x: np.ndarray, v: np.ndarray, F: np.ndarray) -> tuple[np.
 def codes_of(b: Block, steps: int, peers: bool) -> dict[str, Code]:
     """The codes that run this block."""
     found = {
-        "mpmjax, updated": ours(b, mpm.UpdatedLagrangian(), steps),
-        "mpmjax, total": ours(b, mpm.TotalLagrangian(), steps),
+        "mpmjax": Ours(b, mpm.UpdatedLagrangian(), steps),
+        "total": Ours(b, mpm.TotalLagrangian(), steps),
     }
+    if mpm.backend().name == "native":
+        found["XLA"] = Ours(b, mpm.UpdatedLagrangian(), steps, backend="xla")
     if peers:
         from peers.taichi_mpm import TaichiMPM
         from peers.vectorised_mpm import VectorisedMPM
@@ -144,23 +177,24 @@ def medians(codes: dict[str, Callable[[], Any]], repeats: int) -> dict[str, floa
 def check(name: str, b: Block, codes: dict[str, Code]) -> None:
     """That all codes compute the same motion."""
     outcomes = {code: energies(b, *go()) for code, go in codes.items()}
-    (centre, total), tolerance = outcomes["mpmjax, updated"], {"float32": 1e-5, "float64": 1e-9}[b.dtype]
+    (centre, total), tolerance = outcomes["mpmjax"], {"float32": 1e-5, "float64": 1e-9}[b.dtype]
     for code, (other, energy) in outcomes.items():
-        allowed = tolerance if code != "mpmjax, total" else 1e-4  # another discretisation: X for x
+        allowed = tolerance if code != "total" else 1e-4  # another discretisation: X for x
         if np.abs(other - centre).max() > allowed or abs(energy / total - 1) > allowed:
             raise SystemExit(
                 f"{name}, {b.dtype}: {code} disagrees: centre {other} and {centre}, energy {energy}, {total}."
             )
 
 
-def iterations(b: Block) -> dict[str, Code]:
+def iterations(b: Block, backend: str | None = None) -> tuple[Code, Code]:
     """Semi-implicit steps of twenty times the block's own, cut off after few and after more iterations."""
 
     def cut(most: int) -> Code:
-        solver = mpm.ConjugateResidual(rtol=1e-30, max_steps=most)
-        return ours(b._replace(dt=20 * b.dt), mpm.UpdatedLagrangian(), 1, mpm.SemiImplicit(solver=solver))
+        method = mpm.SemiImplicit(solver=mpm.ConjugateResidual(rtol=1e-30, max_steps=most))
+        return Ours(b._replace(dt=20 * b.dt), mpm.UpdatedLagrangian(), 1, method, backend)
 
-    return {f"{most} iterations": cut(most) for most in ITERATIONS}
+    few, more = ITERATIONS
+    return cut(few), cut(more)
 
 
 def copied() -> float:
@@ -183,21 +217,41 @@ def compare(name: str, b: Block, *, steps: int, repeats: int, peers: bool) -> di
     """Agreement first, then medians of interleaved runs."""
     codes = codes_of(b, steps, peers)
     check(name, b, codes)
-    solves = iterations(b)
+    solves = {
+        (kind, most): go
+        for kind in ("mpmjax", "XLA")
+        if kind in codes
+        for most, go in zip(ITERATIONS, iterations(b, "xla" if kind == "XLA" else None), strict=True)
+    }
     for go in solves.values():
         go()
     seconds = medians(codes | solves, repeats)
-    few, more = (seconds.pop(solve) for solve in solves)
-    step = {code: s / steps for code, s in seconds.items()}
-    iteration = (more - few) / (ITERATIONS[1] - ITERATIONS[0])
+    few, more = ITERATIONS
+    iteration = {
+        kind: (seconds[kind, more] - seconds[kind, few]) / (more - few) for kind, most in solves if most == few
+    }
+    step = {code: seconds[code] / steps for code in codes}
     return {
         "scene": name,
         "dtype": b.dtype,
         "particles": len(b.x),
         "milliseconds": {code: 1e3 * s for code, s in step.items()},
-        "iteration_over_step": iteration / step["mpmjax, updated"],
-        "bandwidth_fraction": least_bytes(b) / step["mpmjax, updated"] / copied(),
+        "iteration": {kind: 1e3 * s for kind, s in iteration.items()},
+        "bandwidth_fraction": least_bytes(b) / step["mpmjax"] / copied(),
+        "megabytes": codes["mpmjax"].memory / 1e6,
     }
+
+
+def shown(row: dict[str, Any]) -> str:
+    """A row in words, with each time over ours in brackets."""
+    ms, iteration = row["milliseconds"], row["iteration"]
+    each = ", ".join(f"{code} {t:.2f} ms ({t / ms['mpmjax']:.2f})" for code, t in ms.items())
+    solve = ", ".join(f"{kind} {t:.2f} ms" for kind, t in iteration.items())
+    return (
+        f"{row['scene']}, {row['dtype']}, {row['particles']} particles: {each}\n"
+        f"    an iteration of the solve: {solve}, {iteration['mpmjax'] / ms['mpmjax']:.2f} of a step; "
+        f"{row['bandwidth_fraction']:.1%} of a copy's rate, {row['megabytes']:.0f} MB"
+    )
 
 
 def main() -> None:
@@ -205,27 +259,22 @@ def main() -> None:
     parser.add_argument("--peers", action="store_true", help="C++, Taichi and Warp too")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--quick", action="store_true", help="small scenes")
+    parser.add_argument("--scene", help="one scene alone")
     parser.add_argument("--device", choices=("cpu", "gpu"), help="where this package runs; peers run on the CPU")
     options = parser.parse_args()
     if options.device:
         jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[options.device])
-    steps, repeats = (10, 3) if options.quick else (20, 7)
     rows = []
-    for name, numbers in (QUICK if options.quick else SCENES).items():
-        for dtype in ("float32", "float64"):
+    for name, numbers in (QUICK if options.quick else SCENES | LARGE).items():
+        if options.scene not in (None, name):
+            continue
+        for dtype in ("float32",) if name in LARGE else ("float32", "float64"):
+            steps, repeats = (10, 3) if options.quick else (5, 3) if name in LARGE else (20, 7)
             rows.append(compare(name, block(*numbers, dtype), steps=steps, repeats=repeats, peers=options.peers))
             if not options.json:
-                ms = rows[-1]["milliseconds"]
-                base = ms["mpmjax, updated"]
-                shown = ", ".join(f"{code} {t:.2f} ms ({t / base:.2f})" for code, t in ms.items())
-                print(f"{name}, {dtype}, {rows[-1]['particles']} particles: {shown}", flush=True)
-                print(
-                    f"    an iteration of the solve takes {rows[-1]['iteration_over_step']:.2f} of an explicit step, "
-                    f"which moves its bytes at {rows[-1]['bandwidth_fraction']:.1%} of a copy's rate",
-                    flush=True,
-                )
+                print(shown(rows[-1]), flush=True)
     if options.json:
-        print(json.dumps({"jax": jax.__version__, "device": str(jax.devices()[0]), "steps": steps, "rows": rows}))
+        print(json.dumps({"jax": jax.__version__, "device": str(jax.devices()[0]), "rows": rows}))
 
 
 if __name__ == "__main__":
