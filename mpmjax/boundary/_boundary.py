@@ -15,10 +15,9 @@ from mpmjax._types import Array, Bool, Float, Int, Mask, NodeVector, ParticleVec
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._faces import Faces
-from mpmjax.boundary._mirror import Image, MirrorMotion, Tie
+from mpmjax.boundary._mirror import Image, MirrorMotion, MirrorPlace, Tie
 from mpmjax.boundary._surface_contact import Surface
 from mpmjax.discretisation import Grid
-from mpmjax.geometry import Motion
 
 ON_THE_WALL = 1e-3
 """Distance within which a node is on a wall, in spacings."""
@@ -136,8 +135,8 @@ class AbstractBoundary(eqx.Module):
         del grid, window, t, dt
         return None
 
-    def mirror(self) -> tuple[int, Motion | None] | None:
-        """The axis across which it has a mirror, and its motion, None if it rests. Default: None, it has no mirror.
+    def mirror(self) -> MirrorPlace | None:
+        """Where its mirror is. Default: None, it has none.
 
         In the updated description the grid moves with a mirror, so that it lies on nodes or half-way between them.
         """
