@@ -345,6 +345,20 @@ def test_derivatives_of_its_motion_are_those_of_differences(method):
         assert_close(one, other, 2e-5)
 
 
+@pytest.mark.parametrize("d", [2, *thorough(3)])
+def test_single_precision_stays_single(d):
+    """And keeps momentum to its rounding, while bodies push and rub."""
+    scene, particles = pressed(d=d)
+    new = particles = jax.tree.map(lambda a: a.astype(jnp.float32), particles)
+    for n in range(3):
+        new, _ = mpm.step(scene, new, n * 5e-4, 5e-4)
+    assert {str(leaf.dtype) for leaf in jax.tree.leaves(new)} == {"float32"}
+    change = (particles.mass[:, None] * (new.v - particles.v)).sum(axis=0)
+    assert_close(change, jnp.zeros(d), 0, 1e-6 * float((particles.mass[:, None] * abs(particles.v)).sum()))
+    upper = slice(particles.sizes[0], None)
+    assert np.abs(np.asarray(new.v - particles.v)[upper]).max() > 1e-4
+
+
 def test_its_energy_is_that_of_a_rigid_body():
     """½ M V² + ½ ω·Iω, with no part of the grid's."""
     scene, particles = thrown(3, v=(0.1, 0.2, 0.3))

@@ -2,8 +2,9 @@
 
 Every boundary acts on the grid alone; the transfers know nothing of it. What holds material acts on the nodes at and
 beyond it; a node within a thousandth of a spacing of a wall counts as on it. Where such walls, planes and grips lie
-only selects nodes, so derivatives with respect to it are zero. What pushes material and may be left acts where the
-particles' faces touch its surface (`surfaces`), and has derivatives by its place and size.
+only selects nodes, so derivatives with respect to it are zero; but a mirrored plane takes the lattice along, and has
+derivatives by its place (see `carried_by`). What pushes material and may be left acts where the particles' faces touch
+its surface (`surfaces`), and has derivatives by its place and size.
 """
 
 import abc

@@ -109,7 +109,8 @@ class SymmetryPlane(AbstractPlane):
 
     Args:
         axis: direction of the normal, 0 to d − 1.
-        position: coordinate of the plane [m].
+        position: coordinate of the plane [m]. Derivatives by it are those of the plane and the lattice of nodes
+            together; there are none between two planes across one axis.
         keep: which side holds the material: "above" or "below" the plane.
         motion: how it moves; of its displacement the component along the normal counts. Default: not at all.
     """
@@ -187,7 +188,8 @@ class ContactPlane(AbstractPlane):
 
     Args:
         axis: direction of the normal, 0 to d − 1.
-        position: coordinate of the plane [m].
+        position: coordinate of the plane [m]. Derivatives by it are those of the plane and the lattice of nodes
+            together; there are none between two planes across one axis.
         keep: which side holds the material: "above" or "below" the plane.
         friction: Coulomb coefficient [-], at least 0.
     """

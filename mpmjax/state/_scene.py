@@ -110,6 +110,11 @@ class Scene(eqx.Module):
     ):
         self.material = tuple(material) if isinstance(material, list) else material
         layers = 1 if bodies is None else 1 + max(bodies.numbers(len(self.laws)))
+        require(
+            grid.layers in (1, layers),
+            f"A grid has as many layers as the scene has bodies, {layers}, got {grid.layers}: leave out layers, or "
+            "take grid.with_layers(1) of another scene's grid.",
+        )
         self.grid = grid if grid.layers == layers else grid.with_layers(layers)
         self.gravity = (0.0,) * grid.dim if gravity is None else gravity
         self.boundary = (boundary,) if isinstance(boundary, AbstractBoundary) else tuple(boundary)
@@ -131,8 +136,8 @@ class Scene(eqx.Module):
         require(len(self.laws) > 0, "A scene needs at least one law, got none.")
         require(
             not self.boundary_forces or len(self.boundary) + len(self.guides) > 0,
-            "A scene with boundary_forces needs a boundary at least, or a Rigid body with guides, got none: give one, or "
-            "leave boundary_forces out.",
+            "A scene with boundary_forces needs a boundary at least, or a Rigid body with guides, got none: give one, "
+            "or leave boundary_forces out.",
         )
         for boundary in self.boundary:
             require(
