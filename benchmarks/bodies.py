@@ -1,7 +1,7 @@
 """Two bodies that touch: where contact is felt, by which normals, and what slides, rolls and is pressed.
 
 python benchmarks/bodies.py                     all tables, and docs/bodies.png (minutes)
-python benchmarks/bodies.py --only slope        one of rest, normals, slope, roll, hertz, rings
+python benchmarks/bodies.py --only slope        one of rest, normals, slope, roll, hertz, rings, balls
 python benchmarks/bodies.py --quick             the same, coarser, without a picture
 """
 
@@ -271,6 +271,33 @@ def rings(quick: bool) -> None:
         )
 
 
+def balls(quick: bool) -> None:
+    """Two disks, or balls, that meet at 1 m/s, 0.09 of the speed of sound, and part: the most energy on the way, that
+    in the end, and the speed with which they part. Explicit steps, as long as `stable_dt` says."""
+    print("two disks or balls: cells a diameter, most energy, energy in the end, speed [over the first], momentum")
+    cases = ((2, 6, 0.3), (2, 12, 0.3), (2, 24, 0.3), (2, 6, 0.49), (3, 6, 0.3), (3, 6, 0.49))
+    for (d, cells, nu), volume in product(cases[:1] if quick else cases, (None, mpm.AveragedVolume())):
+        if volume and nu < 0.4:
+            continue
+        dx, R = 0.6 / cells, 0.3
+        shape = (3 * cells + 4, *(2 * cells,) * (d - 1))
+        grid, law = mpm.Grid(shape, dx, origin=[-n // 2 for n in shape]), mpm.NeoHookean(1e5, nu)
+        places = [((s * 1.1 * R, s * 0.02, 0.01)[:d], (-0.5 * s, 0.0, 0.0)[:d]) for s in (-1, 1)]
+        two = [mpm.fill(mpm.Ball(x, R), grid, density=DENSITY, velocity=v) for x, v in places]
+        scene = mpm.Scene(grid, (law, law), bodies=mpm.Bodies(), volume=volume)
+        particles = mpm.join(*two)
+        steps = int(np.ceil(0.5 / float(mpm.stable_dt(scene, particles))))
+        run = mpm.simulate(scene, particles, t1=0.5, dt=0.5 / steps, observe=lambda s, p: mpm.energy(s, p).total)
+        energy, mass = np.asarray(run.observed), particles.mass[:, None]
+        momentum = float(jnp.abs((mass * run.final.v).sum(axis=0)).max() / (mass * jnp.abs(particles.v)).sum())
+        back = -float(run.final.v[: two[0].count, 0].mean()) / 0.5
+        print(
+            f"  {d}-D, {cells}, ν = {nu}, {'averaged' if volume else 'own'} volumes: {energy.max() / energy[0]:.3f} "
+            f"{energy[-1] / energy[0]:.3f} {back:.3f} {momentum:.0e}",
+            flush=True,
+        )
+
+
 def draw(rows: list[tuple]) -> None:
     """The pressure between the cylinders against Hertz's."""
     x, push, exact, dx = rows[-1]
@@ -293,6 +320,7 @@ TABLES: dict[str, Callable] = {
     "roll": roll,
     "hertz": hertz,
     "rings": rings,
+    "balls": balls,
 }
 
 if __name__ == "__main__":

@@ -230,6 +230,24 @@ def test_torn_snow_that_has_lost_its_stiffness_lies_on_a_body():
     assert float(final.x[upper, 1].min()) > 0.15
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize("volume", [None, mpm.AveragedVolume()], ids=["own", "averaged"])
+def test_nearly_incompressible_balls_part_again(volume):
+    """In three dimensions, at ν = 0.49: with the momentum that they had, and less energy."""
+    grid, law = mpm.Grid((16, 10, 10), 0.1, origin=(-8, -5, -5)), mpm.NeoHookean(1e5, 0.49)
+    places = ((-0.21, -0.02, 0.01), (0.5, 0.0, 0.0)), ((0.21, 0.02, 0.01), (-0.5, 0.0, 0.0))
+    two = [mpm.fill(mpm.Ball(x, 0.2), grid, density=1e3, velocity=v) for x, v in places]
+    scene = mpm.Scene(grid, (law, law), bodies=mpm.Bodies(0.2), volume=volume)
+    particles = mpm.prepare(scene, mpm.join(*two))
+    new = mpm.rollout(scene, particles, steps=400, dt=8e-4)
+    mass = particles.mass[:, None]
+    assert_close((mass * new.v).sum(axis=0), jnp.zeros(3), 0, 1e-13 * float((mass * abs(particles.v)).sum()))
+    assert mpm.energy(scene, new).total < mpm.energy(scene, particles).total
+    left, right = slice(0, two[0].count), slice(two[0].count, None)
+    assert new.x[left, 0].max() + 0.02 < new.x[right, 0].min()
+    assert new.v[left, 0].mean() < -0.1
+
+
 BAD = {
     "one material": (lambda: mpm.Scene(mpm.Grid((8, 8), 0.1), LAW, bodies=mpm.Bodies()), "two or more"),
     "a number left out": (
@@ -237,6 +255,7 @@ BAD = {
         "none left out",
     ),
     "negative friction": (lambda: mpm.Bodies(-0.1), "friction"),
+    "layers that no body has": (lambda: mpm.Scene(mpm.Grid((8, 8), 0.1, layers=2), LAW), "as many layers"),
     "the total description": (
         lambda: mpm.Scene(mpm.Grid((8, 8), 0.1), (LAW, LAW), bodies=mpm.Bodies(), description=mpm.TotalLagrangian()),
         "no contact",

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DESCRIPTIONS, LAWS, TRANSFERS, assert_close, block, explicit_limit, ids
+from helpers import DESCRIPTIONS, LAWS, TRANSFERS, assert_close, block, explicit_limit, ids, thorough
 from test_boundary_forces import METHODS, assert_sums_to_change, shaken
 
 import mpmjax as mpm
@@ -146,3 +146,64 @@ def test_planes_that_cannot_move_as_asked_say_so():
     block(2, boundary=(PLANE, still), description=mpm.TotalLagrangian())
     with pytest.raises(ValueError, match="cannot follow the particles"):
         mpm.Scene(mpm.Grid((9, 9), 0.1, follow=True), LAWS["fixed_corotated"], boundary=PLANE)
+
+
+def half_bar(e, plane, method, total):
+    """A bar that a plane at the height 0 bounces or holds, all but the plane lowered by e: with the plane at e,
+    lowered by e as a whole."""
+    grid = mpm.Grid((14,), 0.1, origin=(-5,))
+    x = 0.1 * (jnp.arange(6.0)[:, None] / 2 + 0.25) - e
+    v = jnp.linspace(-0.05, -0.03, 6)[:, None]
+    body = mpm.Particles(x=x, v=v, mass=jnp.full(6, 0.05), volume=jnp.full(6, 0.05))
+    push = mpm.SeparatingCollider(mpm.HalfSpace((0.31 - e,), (-1.0,)))
+    boundary = (plane,) if total else (plane, push)
+    scene = mpm.Scene(
+        grid,
+        mpm.FixedCorotated(1.0, 0.3),
+        boundary=boundary,
+        gravity=(-0.3,),
+        description=mpm.TotalLagrangian() if total else mpm.UpdatedLagrangian(),
+    )
+    final = mpm.rollout(scene, body, steps=12, dt=0.03, method=method)
+    return jnp.stack([final.x.mean(), final.v.mean(), final.F.min()])
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "total"),
+    [
+        ("contact", "explicit", False),
+        *thorough(
+            ("contact", "backward_euler", False),
+            ("contact", "implicit_midpoint", False),
+            ("contact", "trbdf2", False),
+            ("symmetry", "explicit", False),
+            ("symmetry", "semi_implicit", True),
+        ),
+    ],
+)
+def test_the_place_of_a_mirrored_plane_has_the_derivative_of_what_moves_the_other_way(kind, name, total):
+    """A plane raised by e above the body, with the grid that goes with it, is the plane where it was under all else
+    lowered by e, seen from e above."""
+    plane, method = {"contact": mpm.ContactPlane, "symmetry": mpm.SymmetryPlane}[kind], METHODS[name]
+
+    def after(raised, lowered):
+        return half_bar(lowered, plane(0, raised), method, total)
+
+    slope, step, moved = jax.jit(jax.jacrev(after))(0.0, 0.0), 1e-6, jax.jit(after)
+    difference = np.asarray(moved(0.0, step) - moved(0.0, -step)) / (2 * step) + np.array([1.0, 0.0, 0.0])
+    assert np.abs(difference).min() > 1e-2
+    assert_close(slope, difference, 1e-5)
+
+
+def test_between_planes_across_one_axis_there_is_no_derivative_by_their_places():
+    """Which is said; others have theirs."""
+    grid, body = mpm.Grid((8,), 0.1, origin=(-2,)), mpm.fill(mpm.Box((0.0,), (0.2,)), mpm.Grid((8,), 0.1), density=1.0)
+
+    def after(place, modulus):
+        planes = mpm.SymmetryPlane(0, place), mpm.SymmetryPlane(0, 0.2, "below")
+        scene = mpm.Scene(grid, mpm.FixedCorotated(modulus, 0.3), boundary=planes, gravity=(-1.0,))
+        return mpm.rollout(scene, body, steps=3, dt=0.01).x.sum()
+
+    with pytest.raises(ValueError, match="2 mirrored planes across one axis"):
+        jax.grad(after)(0.0, 1.0)
+    assert float(jax.grad(after, argnums=1)(0.0, 1.0)) != 0

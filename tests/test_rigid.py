@@ -250,6 +250,46 @@ def test_guides_hold_it():
     assert_close(particles.F, np.broadcast_to(np.eye(2), particles.F.shape))
 
 
+@pytest.mark.parametrize(
+    ("free", "turns", "held", "name"),
+    [
+        ((True, False), False, False, "explicit"),
+        *thorough(
+            ((True, False), True, False, "implicit_midpoint"),
+            ((True, False), False, True, "semi_implicit"),
+            ((False, True, True), False, False, "explicit"),
+            ((False, True, False), True, False, "semi_implicit"),
+            (None, False, False, "implicit_midpoint"),
+        ),
+    ],
+)
+def test_guides_are_told_what_they_hold(free, turns, held, name):
+    """With gravity and what a wall holds, force and torque on them are what is lost of both momenta."""
+    d = 2 if free is None else len(free)
+    forbidden = ~np.asarray(free or (True,) * d)
+    v = jnp.array([0.2, 0.1, -0.3])[:d]
+    if name == "implicit_midpoint":  # in which what is stopped stops before the step
+        v = jnp.where(forbidden, 0, v)
+    scene, particles = thrown(d, v=v, cells=14)
+    particles = dataclasses.replace(particles, x=particles.x + jnp.array([0.03, 0.23, 0.01])[:d])
+    wall = mpm.SlipBox((-np.inf, 0.0, -np.inf)[:d], (np.inf,) * d) if held else ()
+    gravity = jnp.array([-2.0, -1.0, -0.5])[:d]
+    law = mpm.Rigid(1e6, free, turns)
+    scene = mpm.Scene(scene.grid, law, gravity=gravity, boundary=wall, boundary_forces=True)
+    new, info = mpm.step(scene, particles, 0.0, 0.01, method=METHODS[name])
+    weight, before, after = 0.01 * particles.mass.sum() * gravity, body_of(particles), body_of(new)
+    assert info.boundaries.impulse.shape == (1 + held, d)
+    lost = before.mass * (before.velocity - after.velocity) + weight
+    about = (before.centre + after.centre) / 2 if name == "implicit_midpoint" else before.centre
+    turned = spin_momentum(particles) - spin_momentum(new) + moment(about[None], weight[None])[0]
+    scale = 0.1 * float(before.mass)
+    assert_close(info.boundaries.impulse.sum(axis=0), lost, 0, 1e-9 * scale)
+    assert_close(info.boundaries.angular.sum(axis=0), turned, 0, 1e-9 * scale)
+    along = np.asarray(info.boundaries.impulse[-1])
+    assert (np.abs(along[forbidden]) > 0.04 * scale).all()
+    assert (np.abs(along[~forbidden]) < 1e-9 * scale).all()
+
+
 @pytest.mark.thorough
 def test_in_one_dimension_it_only_moves():
     """There is nothing to turn."""
@@ -303,6 +343,20 @@ def test_derivatives_of_its_motion_are_those_of_differences(method):
     assert np.abs(np.asarray(differences)).min() > 1e-7
     for one, other in zip(found, differences, strict=True):
         assert_close(one, other, 2e-5)
+
+
+@pytest.mark.parametrize("d", [2, *thorough(3)])
+def test_single_precision_stays_single(d):
+    """And keeps momentum to its rounding, while bodies push and rub."""
+    scene, particles = pressed(d=d)
+    new = particles = jax.tree.map(lambda a: a.astype(jnp.float32), particles)
+    for n in range(3):
+        new, _ = mpm.step(scene, new, n * 5e-4, 5e-4)
+    assert {str(leaf.dtype) for leaf in jax.tree.leaves(new)} == {"float32"}
+    change = (particles.mass[:, None] * (new.v - particles.v)).sum(axis=0)
+    assert_close(change, jnp.zeros(d), 0, 1e-6 * float((particles.mass[:, None] * abs(particles.v)).sum()))
+    upper = slice(particles.sizes[0], None)
+    assert np.abs(np.asarray(new.v - particles.v)[upper]).max() > 1e-4
 
 
 def test_its_energy_is_that_of_a_rigid_body():

@@ -33,7 +33,7 @@ from mpmjax.boundary._contact_info import ContactInfo, no_contact
 from mpmjax.boundary._coupling import Coupling
 from mpmjax.boundary._faces import EXPLICIT_STIFFNESS, IMPLICIT_STIFFNESS, Faces, FaceShape
 from mpmjax.boundary._grip import Grip
-from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion, RigidImage, Tie
+from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion, MirrorPlace, RigidImage, Tie, carried_by
 from mpmjax.boundary._planes import ContactPlane, SymmetryPlane
 from mpmjax.boundary._rigid_part import RigidPart
 from mpmjax.boundary._springs import (
@@ -73,6 +73,7 @@ __all__ = [
     "Image",
     "Mirror",
     "MirrorMotion",
+    "MirrorPlace",
     "Owners",
     "RigidImage",
     "RigidPart",
@@ -90,6 +91,7 @@ __all__ = [
     "body_contact",
     "brought_contacts",
     "brought_images",
+    "carried_by",
     "combined_conditions",
     "constrain",
     "find_active_set",

@@ -2,8 +2,9 @@
 
 Every boundary acts on the grid alone; the transfers know nothing of it. What holds material acts on the nodes at and
 beyond it; a node within a thousandth of a spacing of a wall counts as on it. Where such walls, planes and grips lie
-only selects nodes, so derivatives with respect to it are zero. What pushes material and may be left acts where the
-particles' faces touch its surface (`surfaces`), and has derivatives by its place and size.
+only selects nodes, so derivatives with respect to it are zero; but a mirrored plane takes the lattice along, and has
+derivatives by its place (see `carried_by`). What pushes material and may be left acts where the particles' faces touch
+its surface (`surfaces`), and has derivatives by its place and size.
 """
 
 import abc
@@ -15,10 +16,9 @@ from mpmjax._types import Array, Bool, Float, Int, Mask, NodeVector, ParticleVec
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._faces import Faces
-from mpmjax.boundary._mirror import Image, MirrorMotion, Tie
+from mpmjax.boundary._mirror import Image, MirrorMotion, MirrorPlace, Tie
 from mpmjax.boundary._surface_contact import Surface
 from mpmjax.discretisation import Grid
-from mpmjax.geometry import Motion
 
 ON_THE_WALL = 1e-3
 """Distance within which a node is on a wall, in spacings."""
@@ -136,8 +136,8 @@ class AbstractBoundary(eqx.Module):
         del grid, window, t, dt
         return None
 
-    def mirror(self) -> tuple[int, Motion | None] | None:
-        """The axis across which it has a mirror, and its motion, None if it rests. Default: None, it has no mirror.
+    def mirror(self) -> MirrorPlace | None:
+        """Where its mirror is. Default: None, it has none.
 
         In the updated description the grid moves with a mirror, so that it lies on nodes or half-way between them.
         """

@@ -23,8 +23,8 @@ from mpmjax.linalg import pairs
 
 
 class BoundaryImpulse(eqx.Module):
-    """Linear and angular impulse on each of a scene's b boundaries, in their order. Divided by the step they are its
-    mean force and torque."""
+    """Linear and angular impulse on each of a scene's b boundaries, in their order, the guides of `Rigid` bodies that
+    have some among them, after all others. Divided by the step they are its mean force and torque."""
 
     impulse: Float[Array, "*f b d"]
     """Impulse [kg m/s], friction included."""

@@ -7,15 +7,50 @@ a `ContactPlane` only in the *columns* (lines of nodes along the normal) that it
 """
 
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
+from mpmjax.autodiff import ruled
+from mpmjax.checks import require
 from mpmjax.discretisation import Grid
-from mpmjax.geometry import spinning
+from mpmjax.geometry import Motion, spinning
+
+
+class MirrorPlace(NamedTuple):
+    """Where a boundary's mirror is."""
+
+    axis: int
+    """The direction of its normal."""
+    position: Scalar
+    """Its coordinate on the lattice of nodes [m]."""
+    motion: Motion | None
+    """How it moves; None if it rests."""
+
+
+@ruled
+def carried_by(*places: Array) -> Float[Array, ""]:
+    """How far the grid is carried along an axis by the mirrors across it [m]: zero, with the derivative by the place
+    of a mirror. A mirror lies on the lattice of nodes, so where it is elsewhere the lattice is too.
+
+    Args:
+        places: coordinates of the mirrors [m].
+    """
+    return jnp.zeros_like(jnp.asarray(places[0]))
+
+
+@carried_by.defjvp
+def _(places: tuple[Array, ...], changes: tuple[Any, ...]) -> tuple[Array, Any]:
+    moved = [change for change in changes if change is not None]
+    require(
+        len(places) == 1 or not moved,
+        f"There are {len(places)} mirrored planes across one axis, and the grid cannot go with one of them: no "
+        "derivative by their places. Take SeparatingBox, or jax.lax.stop_gradient(position) of all of them.",
+    )
+    return carried_by(*places), moved[0] if moved else None
 
 
 class Image(eqx.Module):

@@ -11,7 +11,7 @@ from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, cross
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._faces import Faces
-from mpmjax.boundary._mirror import Image, MirrorMotion, mirror_image
+from mpmjax.boundary._mirror import Image, MirrorMotion, MirrorPlace, mirror_image
 from mpmjax.boundary._plane_contact import SHUT, PlaneContact
 from mpmjax.boundary._surface_contact import Surface, refuse_contact, surface_contact
 from mpmjax.checks import require, require_between, require_fields, require_finite, require_that
@@ -83,8 +83,8 @@ class AbstractPlane(AbstractBoundary):
         coordinates = self.inward * start, self.inward * end
         return crossed(*coordinates, place, place - spacing / 2, spacing)
 
-    def mirror(self) -> tuple[int, Motion | None]:
-        return self.axis, None
+    def mirror(self) -> MirrorPlace:
+        return MirrorPlace(self.axis, self.position, None)
 
     def walls(self) -> tuple[Wall, ...]:
         return (Wall(self.axis, float(self.position), self.inward, mirrored=True),)
@@ -109,7 +109,8 @@ class SymmetryPlane(AbstractPlane):
 
     Args:
         axis: direction of the normal, 0 to d − 1.
-        position: coordinate of the plane [m].
+        position: coordinate of the plane [m]. Derivatives by it are those of the plane and the lattice of nodes
+            together; there are none between two planes across one axis.
         keep: which side holds the material: "above" or "below" the plane.
         motion: how it moves; of its displacement the component along the normal counts. Default: not at all.
     """
@@ -143,8 +144,8 @@ class SymmetryPlane(AbstractPlane):
             velocity = jnp.where(fixed, self.motion.velocity(t, dt), 0)
         return Conditions(fixed, velocity)
 
-    def mirror(self) -> tuple[int, Motion | None]:
-        return self.axis, self.motion
+    def mirror(self) -> MirrorPlace:
+        return MirrorPlace(self.axis, self.position, self.motion)
 
     def check(self, grid: Grid, *, total: bool) -> None:
         """A window cannot follow the material and a plane."""
@@ -187,7 +188,8 @@ class ContactPlane(AbstractPlane):
 
     Args:
         axis: direction of the normal, 0 to d − 1.
-        position: coordinate of the plane [m].
+        position: coordinate of the plane [m]. Derivatives by it are those of the plane and the lattice of nodes
+            together; there are none between two planes across one axis.
         keep: which side holds the material: "above" or "below" the plane.
         friction: Coulomb coefficient [-], at least 0.
     """

@@ -56,7 +56,7 @@ class Force(Series):
         super().check(scene, particles, t1)
         what = f"{type(self).__name__} {self.name!r}"
         if self.boundary is not None:
-            number = len(scene.boundary)
+            number = len(scene.boundary) + len(scene.guides)
             require(
                 0 <= self.boundary < number,
                 f"{what} is of boundary {self.boundary}, from 0, but the scene has {number}.",

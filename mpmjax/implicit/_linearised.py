@@ -3,6 +3,7 @@
 from functools import reduce
 from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
 import lineax as lx
 
@@ -55,7 +56,8 @@ class Linearised(AbstractSolution):
         operator = problem.operator(guess).precomputed()
         combine = problem.projection.combine
         lift = combine(0, problem.prescribed)
-        rhs = combine(problem.rhs - operator.unconstrained(lift), 0)
+        moved = jax.lax.cond((lift != 0).any(), operator.unconstrained, jnp.zeros_like, lift)  # as dear as an iteration
+        rhs = combine(problem.rhs - moved, 0)
         inner = problem.preconditioner.inner_product(operator)
         solution = solve_linear(self.solver, operator, rhs, inner, combine(guess, 0))
         zero_count = jnp.asarray(0, dtype=jnp.int32)

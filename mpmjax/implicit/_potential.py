@@ -181,16 +181,8 @@ class ElasticPotential(eqx.Module):
             tangents: for each material, the stress differential δF ↦ δP of its particles.
         """
 
-        def matrix(points: MaterialPoints, tangent: Callable[[Deformation], Deformation]) -> Array:
-            def flux_of(slopes: Matrix) -> Matrix:
-                return la.transpose(points.flux(tangent(points.change(la.transpose(slopes))), self._dim))
-
-            like = jnp.zeros((self._dim, self._dim, *points.volume.shape), points.volume.dtype)
-            return la.upper_triangle(la.matrix_of(flux_of, like))
-
-        return _joined(
-            [matrix(points, tangent) for points, tangent in zip(self.material_points, tangents, strict=True)]
-        )
+        pairs = zip(self.material_points, tangents, strict=True)
+        return _joined([points.stiffness(tangent, self._dim) for points, tangent in pairs])
 
     def _gradient(self, field: NodeVector) -> Matrix:
         _, slopes = gather(self.stencil, self.mirror.unfold(field))

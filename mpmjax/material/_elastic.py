@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Compliance, Float, Matrix, PerParticle
 from mpmjax.material._base import AbstractIsotropic
+from mpmjax.material._isotropic_tangent import isotropic_matrix
 from mpmjax.material._tangent import AbstractTangent, PrincipalTangent
 
 
@@ -44,7 +46,7 @@ class FixedCorotated(AbstractIsotropic):
         R, cof = la.rotation(F), la.cofactor(F)
         compliance = la.spin_compliance(la.matmul(la.transpose(R), F))
         volumetric = self.lame_lambda * (la.determinant(F) - 1)
-        return FixedCorotatedTangent(F, R, compliance, cof, volumetric, self.shear_modulus, self.lame_lambda)
+        return FixedCorotatedTangent(self, F, R, compliance, cof, volumetric)
 
     def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
         """With v = λ (J − 1) J/(s_i s_j): twist 2μ (1 − 2/(s_i + s_j)) + v, flip 2μ − v, scaling
@@ -60,22 +62,24 @@ class FixedCorotated(AbstractIsotropic):
 class FixedCorotatedTangent(AbstractTangent):
     """δP = 2μ (δF − δR) + λ (J F⁻ᵀ : δF) J F⁻ᵀ + λ (J − 1) δ(J F⁻ᵀ) (derivation, eq. 11)."""
 
+    law: FixedCorotated
     F: Matrix
     R: Matrix
     compliance: Compliance
     cofactor: Matrix
     volumetric: Array
-    shear_modulus: PerParticle
-    lame_lambda: PerParticle
 
     def __call__(self, dF: Matrix) -> Matrix:
         dR = la.rotation_differential(self.R, self.compliance, dF)
         dJ = la.double_dot(self.cofactor, dF)
         return (
-            2 * self.shear_modulus * (dF - dR)
-            + self.lame_lambda * dJ * self.cofactor
+            2 * self.law.shear_modulus * (dF - dR)
+            + self.law.lame_lambda * dJ * self.cofactor
             + self.volumetric * la.cofactor_differential(self.F, dF)
         )
+
+    def pushed_forward(self, A: Matrix, weight: Float[Array, "*p"]) -> Float[Array, "t *p"]:
+        return isotropic_matrix(self.law, self.F, A, weight)
 
 
 class NeoHookean(AbstractIsotropic):
@@ -141,6 +145,32 @@ class NeoHookeanTangent(AbstractTangent):
         return (
             self.shear_modulus * dF + self.pull * la.cofactor_differential(self.F, dF) + self.bulk * dJ * self.cofactor
         )
+
+    def pushed_forward(self, A: Matrix, weight: Float[Array, "*p"]) -> Float[Array, "t *p"]:
+        """w (μ δ_ac (A Aᵀ)_bd + b T_ab T_cd + q ε_ace ε_bdf Y_fe), with T = J F⁻ᵀ Aᵀ and, in 3-D, Y = cof(A) Fᵀ; in
+        2-D the last term is q ε_ac ε_bd det A, and in 1-D none."""
+        d, back, pull = len(A), la.transpose(A), weight * self.pull
+        square, first = weight * self.shear_modulus * la.matmul(A, back), la.matmul(self.cofactor, back)
+        if d == 3:
+            second = pull * la.matmul(la.cofactor(A), la.transpose(self.F))
+        else:
+            second = (pull * la.determinant(A))[None, None]
+        # once, and not again in each component
+        computed = jax.lax.optimization_barrier((square, first, weight * self.bulk * first, second))
+        square, first, bulk, second = map(la.entries, computed)
+
+        def entry(b: int, a: int, e: int, c: int) -> Array:
+            """In the row of G_ab and the column of G_ce."""
+            found = bulk[a][b] * first[c][e]
+            if a == c:
+                return found + square[b][e]
+            if b == e:
+                return found
+            cross = second[3 - b - e][3 - a - c] if d == 3 else second[0][0]
+            return found + cross if (c - a - e + b) % 3 == 0 else found - cross
+
+        places = [(b, a) for b in range(d) for a in range(d)]
+        return jnp.stack([entry(*row, *column) for k, row in enumerate(places) for column in places[k:]])
 
 
 def _with_volumetric(

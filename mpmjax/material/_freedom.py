@@ -10,3 +10,8 @@ class Freedom(NamedTuple):
     """In which directions it may move, one bool each; None for all of them."""
     turns: bool
     """Whether it may turn."""
+
+    @property
+    def guided(self) -> bool:
+        """Whether there is anything that it may not do."""
+        return not self.turns or not all(self.directions or ())

@@ -7,6 +7,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 from mpmjax.linalg import Logarithm, PowerLessOne
 from mpmjax.material._base import AbstractIsotropic
+from mpmjax.material._isotropic_tangent import IsotropicTangent
 from mpmjax.material._tangent import PrincipalTangent
 
 _log = Logarithm()
@@ -25,7 +26,7 @@ class Hencky(AbstractIsotropic):
     separates changes of volume from changes of shape.
 
     *When it breaks*: it needs J > 0. The force in a stretched fibre falls beyond a stretch of e: not a law for rubber.
-    Each particle needs an eigenvalue problem, and an implicit step the matrix of its stress differential.
+    Each particle needs an eigenvalue problem.
     *Good values*: as for fixed corotated.
 
     Args:
@@ -51,6 +52,9 @@ class Hencky(AbstractIsotropic):
         dilation = self._dilation(la.trace(strain), F)
         kirchhoff = 2 * self.shear_modulus * strain + self.lame_lambda * dilation * la.identity_like(F)
         return la.matmul(la.cofactor(F), kirchhoff) / la.determinant(F)
+
+    def tangent(self, F: Matrix) -> IsotropicTangent:
+        return IsotropicTangent(self, F)
 
     def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
         """With τ_i = 2μ ln s_i + λ (ln J + (3 − d) ε_t): scaling (2μ δ_ij + λ)/(s_i s_j) − δ_ij τ_i/s_i², twist

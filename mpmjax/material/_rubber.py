@@ -11,6 +11,7 @@ from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
 from mpmjax.checks import require, require_fields, require_finite, require_positive, require_that
 from mpmjax.linalg import PowerLessOne
 from mpmjax.material._base import AbstractMaterial
+from mpmjax.material._isotropic_tangent import IsotropicTangent
 from mpmjax.material._power_sum import AbstractPowerSum, FirstInvariant, PowerSum, SecondInvariant
 from mpmjax.material._tangent import PrincipalTangent
 
@@ -69,6 +70,9 @@ class AbstractRubber(AbstractMaterial):
         for power, strain, E, part in zip(self.sums(), strains, excess, self.work(excess), strict=True):
             S = S + power.exponent * part.slope * (strain - E / 3 * identity)
         return la.matmul(la.cofactor(F), S) / J
+
+    def tangent(self, F: Matrix) -> IsotropicTangent:
+        return IsotropicTangent(self, F)
 
     def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
         """With p_i = λ̄_i^α − 1 and e_i = p_i − E/3: τ_i = Σ_k w' α e_i + K/2 (J² − 1),

@@ -20,6 +20,18 @@ class AbstractTangent(eqx.Module):
     def __call__(self, dF: Deformation) -> Deformation:
         """δP [Pa] for δF [-], both of shape (d, d, p); for laws of J alone δ(dΨ/dJ) for δJ, both of shape (p,)."""
 
+    def pushed_forward(self, A: Matrix, weight: Float[Array, "*p"]) -> Float[Array, "t *p"] | None:
+        """The upper triangle of the symmetric matrix of G ↦ w (∂²Ψ/∂F∂F : (G A)) Aᵀ, row by row, in closed form, shape
+        (d²(d² + 1)/2, *p). Rows and columns are the components G_ab, b before a. Default: None, and the map is applied
+        to the d² unit matrices instead, which takes several times as long. It is never differentiated.
+
+        Args:
+            A: any matrices [-], shape (d, d, *p).
+            weight: w, shape (*p).
+        """
+        del A, weight
+        return None
+
 
 class MatrixTangent(AbstractTangent):
     """The stress differential as a d² x d² matrix for each particle."""

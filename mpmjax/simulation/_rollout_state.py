@@ -32,5 +32,5 @@ def initial_state(scene: Scene, particles: Particles) -> RolloutState:
     """The state in which a rollout of prepared particles begins."""
     of = particles.dim, particles.x.dtype
     colliders = no_impulse(scene.collider_count, *of) if scene.collider_count else None
-    boundaries = no_boundary_impulse(len(scene.boundary), *of) if scene.boundary_forces else None
+    boundaries = no_boundary_impulse(len(scene.boundary) + len(scene.guides), *of) if scene.boundary_forces else None
     return RolloutState(state_of(particles), colliders, boundaries)

@@ -103,7 +103,8 @@ class Run(eqx.Module):
 
     def boundary_forces(self) -> Forces:
         """The mean force and torque of the material on each of the scene's boundaries (walls, planes, grips and
-        colliders, in their order) between one saved frame and the next.
+        colliders, in their order) and then on the guides of each `Rigid` body that has some, between one saved frame
+        and the next.
 
         Raises:
             ValueError: nothing was saved on the way, or the scene does not have `boundary_forces`.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix, Scalar, particle_first
-from mpmjax.material import AbstractElastic, AbstractLaw, Viscosity
+from mpmjax.material import AbstractElastic, AbstractLaw, AbstractTangent, Viscosity
 from mpmjax.state._averaged_volume import VolumeAverage, averaged_deformation
 from mpmjax.state._particles import Group, Particles
 
@@ -86,6 +86,25 @@ class MaterialPoints(eqx.Module):
         g_ip: the transpose of `change`. In the total description V0 P; by P = dΨ/dJ it is V0 P J I."""
         P = self.volume * P
         return P if self.total else self.law.kinematics.flux(P, self.deformation, dim)
+
+    def stiffness(self, tangent: Callable[[Deformation], Deformation], dim: int) -> Float[Array, "t q"]:
+        """The upper triangle of the symmetric matrix of ∇u ↦ `flux` of the stress differential [J], row by row, shape
+        (d²(d² + 1)/2, q). Rows and columns are the components of ∇u, the derivative's direction first.
+
+        Args:
+            tangent: the stress differential δF ↦ δP.
+            dim: d.
+        """
+        like = jnp.zeros((dim, dim, *self.volume.shape), self.volume.dtype)
+        if isinstance(tangent, AbstractTangent) and self.deformation.ndim == like.ndim:
+            A = la.identity_like(like) if self.total else self.deformation
+            if (closed := tangent.pushed_forward(A, self.volume)) is not None:
+                return closed
+
+        def flux_of(slopes: Matrix) -> Matrix:
+            return la.transpose(self.flux(tangent(self.change(la.transpose(slopes))), dim))
+
+        return la.upper_triangle(la.matrix_of(flux_of, like))
 
     def volume_ratio(self) -> Float[Array, "q"]:
         """J = det F [-], shape (q,)."""

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Int, NodeVector, Point, Scalar
-from mpmjax.boundary import AbstractBoundary, mirror, refuse_contact
+from mpmjax.boundary import AbstractBoundary, MirrorPlace, carried_by, mirror, refuse_contact
 from mpmjax.checks import (
     checked,
     coordinates,
@@ -110,6 +110,11 @@ class Scene(eqx.Module):
     ):
         self.material = tuple(material) if isinstance(material, list) else material
         layers = 1 if bodies is None else 1 + max(bodies.numbers(len(self.laws)))
+        require(
+            grid.layers in (1, layers),
+            f"A grid has as many layers as the scene has bodies, {layers}, got {grid.layers}: leave out layers, or "
+            "take grid.with_layers(1) of another scene's grid.",
+        )
         self.grid = grid if grid.layers == layers else grid.with_layers(layers)
         self.gravity = (0.0,) * grid.dim if gravity is None else gravity
         self.boundary = (boundary,) if isinstance(boundary, AbstractBoundary) else tuple(boundary)
@@ -130,8 +135,9 @@ class Scene(eqx.Module):
         require_finite("gravity", self.gravity)
         require(len(self.laws) > 0, "A scene needs at least one law, got none.")
         require(
-            not self.boundary_forces or len(self.boundary) > 0,
-            "A scene with boundary_forces needs a boundary at least, got none: give one, or leave boundary_forces out.",
+            not self.boundary_forces or len(self.boundary) + len(self.guides) > 0,
+            "A scene with boundary_forces needs a boundary at least, or a Rigid body with guides, got none: give one, "
+            "or leave boundary_forces out.",
         )
         for boundary in self.boundary:
             require(
@@ -142,9 +148,9 @@ class Scene(eqx.Module):
         for load in self.loads:
             load.check(d)
         for axis in range(d if not self.total else 0):
-            mirrors = [found[1] for b in self.boundary if (found := b.mirror()) is not None and found[0] == axis]
+            motions = [found.motion for found in self.mirrors if found.axis == axis]
             require(
-                all(is_traced((m, mirrors[0])) or bool(eqx.tree_equal(m, mirrors[0])) for m in mirrors),
+                all(is_traced((m, motions[0])) or bool(eqx.tree_equal(m, motions[0])) for m in motions),
                 f"In the updated description the grid moves with the planes across axis {axis}, so that all of them "
                 "must move alike: give them one motion, take the total description, or a SlipCollider of a HalfSpace.",
             )
@@ -229,6 +235,13 @@ class Scene(eqx.Module):
         return tuple(RigidMaterial(n, layer, freedom) for n, layer, freedom in found if freedom is not None)
 
     @property
+    def guides(self) -> dict[int, int]:
+        """The numbers of what guides rigid bodies among the boundaries, after which they are counted, by the number of
+        the body's material."""
+        guided = [body.number for body in self.rigid_bodies if body.freedom.guided]
+        return {number: len(self.boundary) + place for place, number in enumerate(guided)}
+
+    @property
     def keeps_gradient(self) -> bool:
         """Whether particles keep the velocity gradient C: for the transfer, or for a viscosity."""
         return self.transfer.affine or any(law.viscous_part() is not None for law in self.laws)
@@ -266,14 +279,23 @@ class Scene(eqx.Module):
     @property
     def moving_mirrors(self) -> dict[int, Motion]:
         """The motions of mirrors that move, by the axis across which they are."""
-        mirrors = (found for boundary in self.boundary if (found := boundary.mirror()) is not None)
-        return {axis: motion for axis, motion in mirrors if motion is not None}
+        return {found.axis: found.motion for found in self.mirrors if found.motion is not None}
+
+    @property
+    def mirrors(self) -> tuple[MirrorPlace, ...]:
+        """Where the mirrors of the boundaries are."""
+        return tuple(found for boundary in self.boundary if (found := boundary.mirror()) is not None)
 
     def shift(self, t: Scalar) -> Float[Array, "d"] | None:
-        """How far the grid has moved at time t [m], shape (d,), with planes that move; None where it rests."""
-        if self.total or not self.moving_mirrors:
+        """How far the grid has moved at time t [m], shape (d,), with planes that move, and with the derivative by the
+        places of all mirrored ones (see `carried_by`); None where it rests."""
+        along = {} if self.total else {axis: motion.at(t)[axis] for axis, motion in self.moving_mirrors.items()}
+        for axis in range(self.grid.dim):
+            places = [found.position for found in self.mirrors if found.axis == axis]
+            if is_traced(places):
+                along[axis] = along.get(axis, 0) + carried_by(*places)
+        if not along:
             return None
-        along = {axis: motion.at(t)[axis] for axis, motion in self.moving_mirrors.items()}  # one axis: all move alike
         rest = jnp.zeros_like(next(iter(along.values())))
         return jnp.stack([along.get(axis, rest) for axis in range(self.grid.dim)])
 

@@ -38,7 +38,7 @@ def given_to_boundaries(
     held: ConstrainedNodes,
     slowed: tuple[NodeVector, ...],
 ) -> BoundaryImpulse:
-    """The impulse on each boundary of the scene in the step from t.
+    """The impulse on each boundary of the scene, and on what guides its rigid bodies, in the step from t.
 
     Args:
         scene: the scene.
@@ -65,7 +65,8 @@ def given_to_boundaries(
     planes = [(number, image) for number, image in images if isinstance(image, Image)]
     couples, soft = [], jnp.ones_like(unfolded.mass, dtype=bool)
     for body, image in zip(scene.rigid_bodies, nodes.mirror.rigid, strict=True):
-        owners, of_spin = _spread(owners, image, unfolded.mass, planes, body.freedom)
+        guide = scene.guides.get(body.number)
+        owners, of_spin = _spread(owners, image, unfolded.mass, planes, body.freedom, guide)
         couples.append(GivenCouple(_couple(image, unfolded, nodes, solved), of_spin))
         soft = image.with_own(soft, jnp.zeros(len(image.arms), dtype=bool))
 
@@ -124,12 +125,17 @@ def given_to_boundaries(
 
 
 def _spread(
-    owners: Owners, image: RigidImage, mass: NodeScalar, planes: list[tuple[int, Image]], freedom: Freedom
+    owners: Owners,
+    image: RigidImage,
+    mass: NodeScalar,
+    planes: list[tuple[int, Image]],
+    freedom: Freedom,
+    guide: int | None,
 ) -> tuple[Owners, Int[Array, ""]]:
     """The owners where what holds a node of a rigid body holds all of them in this direction, and who holds its spin.
 
-    The first one holds. Directions in which nothing is held add up to no force; their moment is that of who holds the
-    spin. What the body's own guides hold is nobody's.
+    The body's own guides hold what they forbid, else the first one holds. Directions in which nothing is held add up to
+    no force; their moment is that of who holds the spin, or of the guides, about the body's centre then none.
 
     Args:
         owners: what boundaries hold, node by node.
@@ -137,6 +143,7 @@ def _spread(
         mass: masses of all nodes [kg], shape (n,).
         planes: the symmetry planes, with their boundaries' numbers.
         freedom: what the body may do.
+        guide: the number of its guides; None if it has none.
     """
     own, full = image.own(owners.fixed), image.own(mass) > 0
     nobody = jnp.iinfo(own.dtype).max
@@ -144,9 +151,11 @@ def _spread(
     for number, plane in planes:
         first = jnp.where(image.reaches(plane, mass), jnp.minimum(first, number), first)
     of_spin = first.min()
+    if guide is not None:
+        of_spin = jnp.where(freedom.turns & (of_spin < nobody), of_spin, guide)
     first = jnp.where(first == nobody, of_spin, first)
-    if freedom.directions is not None:
-        first = jnp.where(jnp.asarray(freedom.directions), first, nobody)
+    if guide is not None and freedom.directions is not None:
+        first = jnp.where(jnp.asarray(freedom.directions), first, guide)
     first, of_spin = (jnp.where(number == nobody, -1, number) for number in (first, of_spin))
     spread = image.with_own(owners.fixed, jnp.broadcast_to(first, own.shape))
     return eqx.tree_at(lambda o: o.fixed, owners, spread), of_spin
@@ -193,6 +202,6 @@ def _moved_places(
 
 def _pivots(scene: Scene, t: Scalar, like: NodeVector) -> Array:
     """The points about which torques are taken at time t [m], shape (b, d)."""
-    found = [boundary.pivot(t) for boundary in scene.boundary]
+    found = [boundary.pivot(t) for boundary in scene.boundary] + [None] * len(scene.guides)
     origin = jnp.zeros(like.shape[1], like.dtype)
     return jnp.stack([origin if pivot is None else jnp.asarray(pivot, like.dtype) for pivot in found])

@@ -37,7 +37,7 @@ def rigid_layers(
         planes: the mirrors of symmetry planes.
         dt: step [s].
     """
-    places = scene.grid.nodes(scene.window(particles))
+    places = scene.nodes(particles, 0.0)  # at any time: planes beside rigid bodies rest
     own, velocity = jnp.zeros((len(mass), 1), bool), jnp.zeros_like(places)
     fixed, prescribed, images = conditions.fixed, conditions.velocity, []
     for material in scene.rigid_bodies:
