@@ -56,7 +56,8 @@ class Linearised(AbstractSolution):
         operator = problem.operator(guess).precomputed()
         combine = problem.projection.combine
         lift = combine(0, problem.prescribed)
-        moved = jax.lax.cond((lift != 0).any(), operator.unconstrained, jnp.zeros_like, lift)  # as dear as an iteration
+        still = jnp.zeros_like(lift)
+        moved = jax.lax.cond((lift != 0).any(), lambda: operator.unconstrained(lift), lambda: still)
         rhs = combine(problem.rhs - moved, 0)
         inner = problem.preconditioner.inner_product(operator)
         solution = solve_linear(self.solver, operator, rhs, inner, combine(guess, 0))
