@@ -16,6 +16,7 @@ from mpmjax.boundary._contact import ConstrainedNodes
 from mpmjax.checks._values import canonical
 from mpmjax.implicit._projection import Projection
 from mpmjax.simulation._diffrax import Problem
+from mpmjax.state import state_of
 from mpmjax.stepping._nodes import Nodes
 from mpmjax.stepping._step import step_unchecked
 
@@ -333,3 +334,40 @@ def test_a_second_preparation_compiles_nothing(caplog):
     with jax.log_compiles():
         mpm.prepare(softer, faster)
     assert not [record for record in caplog.records if "Compiling" in record.getMessage()]
+
+
+def reverse(method, **scene):
+    """The program of a rollout of three steps and that of its gradient by velocities, and the particles."""
+    grid = mpm.Grid((12, 12), 0.1, origin=(-3, -3))
+    scene = mpm.Scene(grid, LAW, **scene)
+    body = mpm.fill(mpm.Box((0.0, 0.0), (0.4, 0.4)), grid, particles_per_cell=4, density=1e3)
+    particles = mpm.prepare(scene, body)
+
+    def moved(v):
+        start = eqx.tree_at(lambda p: p.v, particles, v)
+        return (mpm.rollout(scene, start, steps=3, dt=1e-3, method=method).x ** 2).sum()
+
+    v = jnp.asarray(particles.v)
+    return jax.make_jaxpr(moved)(v).jaxpr, jax.make_jaxpr(jax.grad(moved))(v).jaxpr, particles
+
+
+def every(jaxpr, name):
+    """All equations of a primitive, in inner programs too; the code of a derivative rule is not looked into."""
+    own = [e for e in jaxpr.eqns if e.primitive.name == name]
+    inner = [i for e in jaxpr.eqns if e.primitive.name != "ruled" for i in inner_programs(e)]
+    return sum((every(i, name) for i in inner), own)
+
+
+@pytest.mark.parametrize("boundary", [(), mpm.ContactPlane(1, 0.0)], ids=["free", "contact"])
+def test_a_gradient_repeats_no_solve(boundary):
+    """Steps are computed again in reverse mode, solutions and active sets are not."""
+    forward, gradient, _ = reverse(mpm.SemiImplicit(), boundary=boundary)
+    assert len(every(gradient, "ruled")) == len(every(forward, "ruled")) > 0
+
+
+def test_a_gradient_stores_no_more_than_the_state_before_each_step():
+    _, gradient, particles = reverse(mpm.Explicit())
+    (ahead, _) = every(gradient, "scan")
+    stored = ahead.outvars[ahead.params["num_carry"] :]
+    state = jax.tree.leaves(state_of(particles))
+    assert sum(a.aval.size for a in stored) <= 3 * (sum(a.size for a in state) + 1)

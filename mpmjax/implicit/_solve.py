@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._types import Array, NodeVector, Scalar
-from mpmjax.autodiff import ruled, without_derivative
+from mpmjax.autodiff import kept, ruled, without_derivative
 from mpmjax.implicit._linear_solve import solve_linear
 from mpmjax.implicit._problems import AbstractProblem
 from mpmjax.implicit._solution import AbstractSolution
@@ -66,7 +66,7 @@ def _solve(
 def _solve_jvp(primals: Any, tangents: Any) -> Any:
     problem, slot, guess, find, adjoint = primals
     d_problem, d_slot = tangents[:2]
-    v, info = _solve(problem, slot, guess, find, adjoint)
+    v, info = kept(_solve(problem, slot, guess, find, adjoint))
     d_residual = eqx.filter_jvp(lambda q: q.residual(v), (problem,), (d_problem,))[1]
     operator = problem.operator(v)
     known, preconditioner = without_derivative((operator, problem.preconditioner))

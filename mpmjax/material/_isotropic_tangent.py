@@ -1,5 +1,6 @@
 """The stress differential of an isotropic law, and its matrix by the principal frame."""
 
+from functools import reduce
 from typing import Any
 
 import jax
@@ -67,6 +68,6 @@ def isotropic_matrix(law: Any, F: Matrix, A: Matrix, weight: Float[Array, "*p"])
             scaled[i, b, a] * mixed[i] + straight[i, b][:, None] * left[i, a] + mixed[i, :, a][:, None] * crossed[i, b]
             for i in range(d)
         ]
-        return sum(terms[1:], terms[0]).reshape(d * d, *s.shape[1:])
+        return reduce(jnp.add, terms).reshape(d * d, *s.shape[1:])
 
     return jnp.concatenate([row(b, a)[b * d + a :] for b in range(d) for a in range(d)])

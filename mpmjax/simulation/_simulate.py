@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.autodiff import guard
+from mpmjax.autodiff import guard, recomputed
 from mpmjax.checks import (
     canonical,
     checked,
@@ -165,8 +165,8 @@ def rollout(
     method: AbstractIntegrator = Explicit(),
     start: Scalar = 0,
 ) -> Particles:
-    """The plain rollout: `jax.lax.scan` over steps, without saving, checks or checkpoints. Tests compare `simulate`
-    with it.
+    """The plain rollout: `jax.lax.scan` over steps, without saving or checks. Tests compare `simulate` with it. Reverse
+    mode stores the state before each step and the solutions of implicit solves, and computes the rest again.
 
     Args:
         scene: the scene.
@@ -192,7 +192,7 @@ def _rollout(
         return state_of(new), None
 
     number = start + jnp.arange(steps, dtype=particles.x.dtype)
-    return with_state(particles, jax.lax.scan(body, state_of(particles), number)[0])
+    return with_state(particles, jax.lax.scan(recomputed(body), state_of(particles), number)[0])
 
 
 def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:

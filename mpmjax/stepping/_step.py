@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Int, NodeScalar, NodeVector, Scalar, components, particle_first
-from mpmjax.autodiff import without_derivative
+from mpmjax.autodiff import kept, without_derivative
 from mpmjax.boundary import (
     BoundaryImpulse,
     ColliderImpulse,
@@ -207,8 +207,8 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
             return held, motion.velocity, held.beside_springs(missing), motion.carrier, info
 
         start = frozen_method.mean_displacement(frozen, NodeMotion(guess))
-        active, guess, cost, sweeps = find_active_set(
-            frozen, guess, start, attempt, no_solve(guess.dtype), explicit=method.is_explicit
+        active, guess, cost, sweeps = kept(
+            find_active_set(frozen, guess, start, attempt, no_solve(guess.dtype), explicit=method.is_explicit)
         )
         held, motion, info = moved(constrain(nodes, active), method, guess)
         internal, reaction, viscous = impulses(nodes, method, motion)
