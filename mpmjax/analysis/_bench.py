@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import fields
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -13,7 +14,7 @@ import numpy as np
 import scipy.spatial
 
 from mpmjax.checks import canonical, shape_of
-from mpmjax.simulation import Run, SimulationError, initial_state, integrate, no_steps, raise_faults
+from mpmjax.simulation import Run, SimulationError, before_fault, initial_state, integrate, no_steps, raise_faults
 from mpmjax.state import Particles, Scene, State, prepare, with_state
 from mpmjax.stepping import AbstractIntegrator, stable_dt
 
@@ -171,14 +172,17 @@ class Bench(NamedTuple):
         scene, dt, method = canonical((self.scene, self.t1 / steps, method), dtype)
         state, states, statistics = initial_state(scene, self.particles), [], no_steps(dtype)
         for k in range(frames):
-            _, state, new, previous, _ = integrate(
+            begin = state
+            go = partial(
+                integrate,
                 scene,
                 self.particles,
-                state,
+                begin,
                 jnp.asarray(k * each, dtype),
                 jnp.asarray(each, dtype),
                 dt,
                 method,
+                until=np.asarray(np.inf, dtype),
                 max_steps=_MOST_STEPS,
                 save_every=None,
                 observe=None,
@@ -186,13 +190,14 @@ class Bench(NamedTuple):
                 progress=False,
                 watch=True,
             )
+            _, state, new, _ = go()
             statistics = statistics.merged(new)
             if not bool(jax.block_until_ready(statistics.healthy)):
                 if throw:
                     final = with_state(self.particles, state.particles)
                     number = statistics.steps.astype(dtype)
                     run = Run(scene, method, dt, jnp.zeros((0,), dtype), None, None, final, number, statistics)
-                    raise_faults(run, self.particles, previous, 0)
+                    raise_faults(run, self.particles, partial(before_fault, go, begin, new), 0)
                 return None, 0.0
             states.append(state.particles)
         return states, float(statistics.left_undone.part)

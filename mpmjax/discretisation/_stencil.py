@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import reduce
 
 import equinox as eqx
 import jax
@@ -86,7 +87,8 @@ def in_window(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleV
     base = kernel.base(components(x) / grid.spacing)
     first = base - window.astype(base.dtype)[:, None]  # in floats: what is far outside overflows an integer
     shape = jnp.asarray(grid.shape, dtype=base.dtype)[:, None]
-    return (jnp.asarray(grid.periodic)[:, None] | ((first >= 0) & (first + kernel.order < shape))).all(axis=0)
+    along_axis = jnp.asarray(grid.periodic)[:, None] | ((first >= 0) & (first + kernel.order < shape))
+    return reduce(jnp.logical_and, along_axis)
 
 
 def make_stencil(

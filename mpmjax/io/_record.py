@@ -2,11 +2,13 @@
 
 import os
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import diffrax
 import jax.numpy as jnp
+import numpy as np
 from tqdm import tqdm
 
 from mpmjax._types import Scalar
@@ -19,6 +21,7 @@ from mpmjax.simulation import (
     Run,
     RunStatistics,
     SimulationError,
+    before_fault,
     initial_state,
     integrate,
     no_steps,
@@ -85,7 +88,7 @@ def record(
     scene, dt_, method = canonical((scene, dt, method), dtype)
     with writer:
         step, state, statistics = writer.last()
-        previous, start = None, step - int(statistics.steps)
+        start = step - int(statistics.steps)
         require(
             int(statistics.fault) == Fault.NONE,
             f"{path} ends with a fault after step {step} and would meet it again: start anew with another dt or scene.",
@@ -100,14 +103,17 @@ def record(
             healthy = True
             while healthy and step < end:
                 count = min(save_every - (step - start) % save_every, end - step)
-                _, state, new, previous, _ = integrate(
+                begin = state
+                go = partial(
+                    integrate,
                     scene,
                     particles,
-                    state,
+                    begin,
                     jnp.asarray(step, dtype),
                     jnp.asarray(count, dtype),
                     dt_,
                     method,
+                    until=np.asarray(np.inf, dtype),
                     max_steps=save_every,
                     save_every=None,
                     observe=None,
@@ -115,11 +121,16 @@ def record(
                     progress=False,
                     watch=True,
                 )
+                _, state, new, _ = go()
                 statistics, step = statistics.merged(new), step + int(new.steps)
                 healthy = int(new.fault) == Fault.NONE and int(new.unconverged) == 0
                 if healthy:
                     _append(writer, step, state, statistics)
                     bar.update(count)
+
+        def before() -> RolloutState:
+            return before_fault(go, begin, new)
+
         run = Run(
             scene=scene,
             method=method,
@@ -134,7 +145,7 @@ def record(
             final_boundary_impulse=state.boundary_impulse,
         )
         try:
-            raise_faults(run, particles, previous, start)
+            raise_faults(run, particles, before, start)
         except SimulationError as error:
             try:
                 received = error.run.final_collider_impulse, error.run.final_boundary_impulse

@@ -4,6 +4,7 @@ Products, determinants, decompositions and functions of symmetric matrices. All 
 `principal_frame` can be differentiated to every order, at repeated stretches and eigenvalues too.
 """
 
+from mpmjax.linalg._finite import finite
 from mpmjax.linalg._matrices import (
     assemble,
     cofactor,
@@ -40,6 +41,7 @@ __all__ = [
     "diagonal",
     "double_dot",
     "entries",
+    "finite",
     "identity_like",
     "matmul",
     "matrix_of",

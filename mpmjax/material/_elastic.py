@@ -56,7 +56,7 @@ class FixedCorotated(AbstractIsotropic):
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         """Every finite F."""
-        return jnp.isfinite(F).all(axis=(0, 1))
+        return la.finite(F)
 
 
 class FixedCorotatedTangent(AbstractTangent):

@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 
+from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix, Scalar
 from mpmjax.checks import require, require_fields, require_positive
 from mpmjax.material._base import AbstractMaterial
@@ -79,4 +80,4 @@ class Rigid(AbstractMaterial):
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         """Every finite F."""
-        return jnp.isfinite(F).all(axis=(0, 1))
+        return la.finite(F)

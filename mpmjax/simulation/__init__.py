@@ -3,7 +3,7 @@
 from mpmjax.simulation._faults import MOST_LEFT_UNDONE, raise_faults, warn_of_inaccuracy
 from mpmjax.simulation._rollout_state import RolloutState, initial_state
 from mpmjax.simulation._run import Run, SimulationError
-from mpmjax.simulation._simulate import integrate, number_of_steps, rollout, simulate
+from mpmjax.simulation._simulate import before_fault, integrate, number_of_steps, rollout, simulate
 from mpmjax.simulation._statistics import Fault, RunStatistics, no_steps
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "Run",
     "RunStatistics",
     "SimulationError",
+    "before_fault",
     "initial_state",
     "integrate",
     "no_steps",

@@ -10,8 +10,10 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from mpmjax._types import Array, Bool, Int, Scalar
+from mpmjax import linalg as la
+from mpmjax._types import Array, Bool, Int, Scalar, components
 from mpmjax.checks import first_unmet, requirements
 from mpmjax.discretisation import Stencil, in_window
 from mpmjax.simulation._rollout_state import RolloutState
@@ -31,6 +33,8 @@ class Problem(eqx.Module):
     observe: Callable[[Scene, Particles], Any] | None = None
     start: Scalar = 0.0
     """Number of the first step."""
+    until: Scalar = np.inf
+    """Number of steps after which a watched run ends, if it is less than were asked for."""
     slot: Scalar = 0.0
     """Zero; adjoint solves report through its cotangent (see `Reporting`)."""
     fault: Int[Array, ""] | None = None
@@ -56,8 +60,7 @@ def faulty_particles(problem: Problem, state: State, t: Scalar) -> dict[Fault, B
 
 def _finite(fields: Any) -> Bool[Array, "p"]:
     """Whether all numbers of each particle are finite, of fields whose first axis is the particles'."""
-    finite = [jnp.isfinite(a).reshape(a.shape[0], -1).all(axis=1) for a in jax.tree.leaves(fields)]
-    return reduce(jnp.logical_and, finite)
+    return reduce(jnp.logical_and, [la.finite(components(a)) for a in jax.tree.leaves(fields)])
 
 
 def passed_particles(problem: Problem, before: State, after: State, t: Scalar) -> list[tuple[int, Bool[Array, "p"]]]:
@@ -70,18 +73,22 @@ def passed_particles(problem: Problem, before: State, after: State, t: Scalar) -
     return [(number, passed) for number, passed in enumerate(found) if passed is not None]
 
 
-def state_fault(problem: Problem, state: State, t: Scalar) -> Int[Array, ""]:
-    """The gravest fault of a state at time t [s]."""
-    gravest = jnp.asarray(Fault.NONE, jnp.int32)
-    for fault, particles in reversed(faulty_particles(problem, state, t).items()):
-        gravest = jnp.where(particles.any(), fault, gravest)
-    return gravest
+def gravest(faults: dict[Fault, Bool[Array, "p"]]) -> Int[Array, ""]:
+    """The gravest fault that any particle has, of faults in their order, by one reduction over the particles."""
+    ranks = {fault: len(faults) - i for i, fault in enumerate(faults)}
+    of_particle = jnp.zeros_like(next(iter(faults.values())), jnp.int32)
+    for fault, particles in reversed(faults.items()):
+        of_particle = jnp.where(particles, ranks[fault], of_particle)
+    worst, found = of_particle.max(initial=0), jnp.asarray(Fault.NONE, jnp.int32)
+    for fault, rank in ranks.items():
+        found = jnp.where(worst == rank, fault, found)
+    return found
 
 
 def fault_of(problem: Problem, before: State, after: State, t: Scalar) -> Int[Array, ""]:
     """The gravest fault of a state, or of the step from t [s] that led to it."""
-    fault = state_fault(problem, after, t + problem.dt)
-    for _, passed in passed_particles(problem, before, after, t):
+    fault = gravest(faulty_particles(problem, after, t + problem.dt))
+    for _, passed in passed_particles(problem, before, after, t):  # apart: one loop for all would not be vectorised
         fault = jnp.where(passed.any() & (fault != Fault.NOT_FINITE), Fault.PASSED, fault)
     return fault
 
@@ -92,7 +99,9 @@ def examined(problem: Problem, state: RolloutState) -> tuple[Problem, RolloutSta
     arrays, rest = eqx.partition((problem, state), eqx.is_array)
     known, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
     unmet = first_unmet(requirements((known.scene, known.particles, known.method)))
-    fault = jnp.where(unmet > 0, Fault.BAD_PARAMETERS, state_fault(known, begin.particles, known.start * known.dt))
+    fault = jnp.where(
+        unmet > 0, Fault.BAD_PARAMETERS, gravest(faulty_particles(known, begin.particles, known.start * known.dt))
+    )
     valid = jnp.where(unmet > 0, jnp.nan, 1)
     state = jax.tree.map(lambda a: a * valid.astype(a.dtype), state)
     return replace(problem, fault=fault, unmet=unmet), state
@@ -110,31 +119,28 @@ class StepSolver(diffrax.AbstractSolver):
     term_structure: ClassVar = diffrax.ODETerm
     interpolation_cls: ClassVar[Callable[..., diffrax.LocalLinearInterpolation]] = diffrax.LocalLinearInterpolation
     watch: bool = False
-    """Whether a fault stops the run, and the state before the last step, then the last good one, is carried. All values
-    are then known and were checked; else that is done here."""
+    """Whether a fault stops the run. All values are then known and were checked; else that is done here."""
 
     def order(self, terms: Any) -> int:
         """Order in time; nothing depends on it, since Δt is constant."""
         del terms
         return 1
 
-    def init(
-        self, terms: Any, t0: Any, t1: Any, y0: RolloutState, args: Problem
-    ) -> tuple[RunStatistics, RolloutState | None, Array]:
-        """Empty statistics, no previous state, and a report of zero."""
+    def init(self, terms: Any, t0: Any, t1: Any, y0: RolloutState, args: Problem) -> tuple[RunStatistics, Array]:
+        """Empty statistics, and a report of zero."""
         del terms, t0, t1
         dtype = y0.particles.x.dtype
         statistics = no_steps(dtype)
         if args.fault is not None:
             statistics = replace(statistics, fault=args.fault, unmet=args.unmet)
-        return statistics, y0 if self.watch else None, jnp.zeros((), dtype)
+        return statistics, jnp.zeros((), dtype)
 
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: RolloutState, args: Problem, solver_state: Any, made_jump: Any
     ) -> tuple:
         """One step. A fault is reported as the solver's failure: as an event diffrax would ask for it once more."""
         del terms, t1, made_jump
-        statistics, _, report = solver_state
+        statistics, report = solver_state
         t = (args.start + step_number(t0)) * args.dt
         method = args.method.reporting(args.slot)
         particles, info = step_compiled(args.scene, args.at(y0.particles), t, args.dt, method, args.stencil)
@@ -142,13 +148,14 @@ class StepSolver(diffrax.AbstractSolver):
         y1 = y0.after(particles, info)
         arrays, rest = eqx.partition((args, y0.particles, y1.particles, t), eqx.is_array)
         fault = fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest))
-        statistics = statistics.merged(one_step(info, fault))
+        statistics = statistics.after_step(one_step(info, fault), solved=not args.method.is_explicit)
         dense = {"y0": y0, "y1": y1}
         if not self.watch:
-            return y1, None, dense, (statistics, None, report), diffrax.RESULTS.successful
+            return y1, None, dense, (statistics, report), diffrax.RESULTS.successful
         results: Any = diffrax.RESULTS  # whose members the type checker takes for another type
-        result = results.where(statistics.fault == Fault.NONE, results.successful, results.nonlinear_divergence)
-        return y1, None, dense, (statistics, y0, report), result
+        goes_on = (statistics.fault == Fault.NONE) & (step_number(t0) + 1 < args.until)
+        result = results.where(goes_on, results.successful, results.nonlinear_divergence)
+        return y1, None, dense, (statistics, report), result
 
     def func(self, terms: Any, t0: Any, y0: RolloutState, args: Problem) -> RolloutState:
         """Not a vector field; diffrax only asks for its shape."""

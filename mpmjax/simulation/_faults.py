@@ -1,5 +1,6 @@
 """The errors and warnings of a run."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -21,18 +22,18 @@ from mpmjax.state import Particles, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator
 
 
-def raise_faults(run: Run, began: Particles, previous: RolloutState | None, start: int) -> None:
+def raise_faults(run: Run, began: Particles, before: Callable[[], RolloutState], start: int) -> None:
     """Raise the faults in the statistics of an untraced run.
 
     Args:
         run: the run, its final state possibly bad.
         began: the particles at the start.
-        previous: the state before the last step.
+        before: gives the state before the last step.
         start: number of the run's first step.
     """
     fault = Fault(int(run.statistics.fault))
     if fault != Fault.NONE:
-        assert previous is not None
+        previous = before()
         step = start + int(run.statistics.fault_step)
         problem = Problem(run.scene, run.final, None, run.dt, run.method)
         words, bad = _WORDS[fault], faulty_particles(problem, state_of(run.final), step * run.dt)
@@ -95,7 +96,7 @@ def warn_of_inaccuracy(statistics: RunStatistics) -> None:
             "much less accurate than was asked for. Raise the solver's max_steps, or ask for what it can reach by its "
             "rtol."
         )
-    part = float(statistics.left_undone.part)
+    part = float(statistics.left_undone.part) if float(statistics.undone_force) > 0 else 0.0
     if part > MOST_LEFT_UNDONE:
         warn(
             f"One linear solve a step left up to {100 * part:.2g} % of the elastic force undone, and stresses can be "

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal, cast
 
 import diffrax
@@ -88,16 +89,18 @@ def simulate(
             `equinox.error_if`. With `throw=False` such values make the state NaN and such a solve the derivative.
     """
     start = require_whole("start", start, 0)
+    dtype = particles.x.dtype
+    scene, method = canonical((scene, method), dtype)
+    requirements(method)
     particles = prepare(scene, particles)
     dt = step_for(scene, particles, t1, dt, method, start)
-    count = number_of_steps(t1, dt, start, particles.x.dtype)
+    count = number_of_steps(t1, dt, start, dtype)
     if save_every is not None:
         save_every = min(require_whole("save_every", save_every, 1), count)
     if observe is not None and save_every is None:
         save_every = 1
-    dtype, state_bytes = particles.x.dtype, _bytes(initial_state(scene, particles))
-    scene, dt_, method = canonical((scene, dt, method), dtype)
-    requirements((scene, method))  # in this precision
+    begin, first, dt_ = initial_state(scene, particles), *canonical((start, dt), dtype)
+    state_bytes = _bytes(begin)
     traced = is_traced((scene, particles, dt_, method, observe))  # under jax.jit also if all that was passed is known
     if save_every is not None and observe is None:
         frames = count // save_every + 2
@@ -113,15 +116,17 @@ def simulate(
         (scene, particles, method), slot = guard((scene, particles, method), slot, no_fault, (), unsolved)
     if adjoint is None:
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=max(1, min(count, checkpoint_bytes // state_bytes)))
-    saved, final, statistics, previous, report = integrate(
+    go = partial(
+        integrate,
         scene,
         particles,
-        initial_state(scene, particles),
-        jnp.asarray(start, dtype),
+        begin,
+        first,
         None,
         dt_,
         method,
         slot,
+        until=np.asarray(np.inf, dtype),
         max_steps=count,
         save_every=save_every,
         observe=observe,
@@ -129,6 +134,7 @@ def simulate(
         progress=progress,
         watch=not traced,
     )
+    saved, final, statistics, report = go()
     steps, values, *impulses = (jnp.zeros((0,), dtype), None, None, None) if saved is None else saved
     run = Run(
         scene=scene,
@@ -138,7 +144,7 @@ def simulate(
         frames=values if observe is None else None,
         observed=None if observe is None else values,
         final=with_state(particles, final.particles),
-        final_step=jnp.asarray(start, dtype) + statistics.steps.astype(dtype),
+        final_step=first + statistics.steps.astype(dtype),
         statistics=statistics,
         report=report if traced else None,
         collider_impulse=impulses[0],
@@ -150,7 +156,7 @@ def simulate(
         return run
     if traced:
         return guarded(run, report)
-    raise_faults(run, particles, previous, start)
+    raise_faults(run, particles, lambda: before_fault(go, begin, statistics), start)
     warn_of_inaccuracy(run.statistics)
     return run
 
@@ -240,27 +246,28 @@ def integrate(
     method: AbstractIntegrator,
     slot: Scalar = 0.0,
     *,
+    until: Scalar,
     max_steps: int,
     save_every: int | None,
     observe: Callable[[Scene, Particles], Any] | None,
     adjoint: diffrax.AbstractAdjoint,
     progress: bool,
     watch: bool,
-) -> tuple[Any, RolloutState, RunStatistics, RolloutState | None, Array]:
+) -> tuple[Any, RolloutState, RunStatistics, Array]:
     """Integrate `count` ≤ `max_steps` steps from step `start`, at which the particles have this state.
 
-    Returns the steps, values and impulses saved, the final state, the statistics, with `watch`, which stops
-    the run at a fault, the state before the last step, and what tangent solves report. Adjoint solves report through
-    the `slot` (see `Reporting`).
+    Returns the steps, values and impulses saved, the final state, the statistics and what tangent solves report.
+    Adjoint solves report through the `slot` (see `Reporting`). With `watch` the run stops at a fault, and `until` so
+    many steps.
 
     Without a count, all of them: what diffrax derives of its last time is then a constant, which XLA computes as it
     compiles, and not a program of two thousand operations.
     """
     stencil = scene.stencil(particles) if scene.total else None
-    problem = Problem(scene, particles, stencil, dt, method, observe, start, jnp.asarray(slot, start.dtype))
+    zero, one, all_steps = (np.asarray(n, start.dtype) for n in (0, 1, max_steps))
+    problem = Problem(scene, particles, stencil, dt, method, observe, start, until, jnp.asarray(slot, start.dtype))
     if not watch:
         problem, state = examined(problem, state)
-    zero, one, all_steps = (np.asarray(n, start.dtype) for n in (0, 1, max_steps))
 
     def kept(t: Any, y: RolloutState, args: Problem) -> Any:
         del t
@@ -284,7 +291,19 @@ def integrate(
         throw=False,
         progress_meter=diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter(),
     )
-    times, values, (statistics, previous, report) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
+    times, values, (statistics, report) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
     final = jax.tree.map(lambda a: a[-1], values["final"])
     saved = None if save_every is None else (start + step_number(times["frames"]), *values["frames"])
-    return saved, final, statistics, previous, report
+    return saved, final, statistics, report
+
+
+def before_fault(go: Callable[..., Any], begin: RolloutState, statistics: RunStatistics) -> RolloutState:
+    """The last good state of a run that met a fault, computed once more by the same program: no run carries it.
+
+    Args:
+        go: the run's `integrate`, with all its arguments but `until`.
+        begin: the state in which it began.
+        statistics: its statistics.
+    """
+    good = int(statistics.fault_step) - 1
+    return begin if good == 0 else go(until=np.asarray(good, begin.particles.x.dtype))[1]

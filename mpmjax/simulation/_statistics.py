@@ -1,7 +1,7 @@
 """Statistics of a run's steps."""
 
 import enum
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import equinox as eqx
@@ -98,6 +98,15 @@ class RunStatistics(eqx.Module):
             fault_step=jnp.where(first & (later.fault != Fault.NONE), self.steps + later.fault_step, self.fault_step),
             unmet=jnp.where(first, later.unmet, self.unmet),
         )
+
+    def after_step(self, step: "RunStatistics", *, solved: bool) -> "RunStatistics":
+        """These statistics and those of one more step. Of a step that solves nothing the largest numbers of solves stay
+        as they are, which XLA does not see of a maximum with zero."""
+        new = self.merged(step)
+        if solved:
+            return new
+        of_solves = ("most_iterations", "worst_residual", "undone_force", "undone_scale")
+        return replace(new, **{name: getattr(self, name) for name in of_solves})
 
 
 def no_steps(dtype: Any) -> RunStatistics:

@@ -53,7 +53,8 @@ class AbstractIntegrator(eqx.Module):
     """
 
     is_explicit: ClassVar[bool] = False
-    """Whether the update solves no system. Advice on faults and `work_precision` use it."""
+    """Whether the update solves no system, so that a run takes no statistics of solves. Advice on faults and
+    `work_precision` use it."""
     needs_separate_force: ClassVar[bool] = True
     """Whether v^n and the force are needed separately. An integrator whose v^{n+1} is `nodes.explicit_velocity()`
     wherever nothing is prescribed may set it to False. P2G then sums momentum and force together where it can, at half
