@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -101,6 +102,7 @@ def record(
 
         with bar, reporting(stopped):
             healthy = True
+            before: Callable[[], RolloutState] = partial(initial_state, scene, particles)
             while healthy and step < end:
                 count = min(save_every - (step - start) % save_every, end - step)
                 begin = state
@@ -122,15 +124,12 @@ def record(
                     watch=True,
                 )
                 _, state, new, _ = go()
+                before = partial(before_fault, go, begin, new)
                 statistics, step = statistics.merged(new), step + int(new.steps)
                 healthy = int(new.fault) == Fault.NONE and int(new.unconverged) == 0
                 if healthy:
                     _append(writer, step, state, statistics)
                     bar.update(count)
-
-        def before() -> RolloutState:
-            return before_fault(go, begin, new)
-
         run = Run(
             scene=scene,
             method=method,

@@ -246,7 +246,7 @@ def integrate(
     method: AbstractIntegrator,
     slot: Scalar = 0.0,
     *,
-    until: Scalar,
+    until: Scalar | Float[np.ndarray, ""],
     max_steps: int,
     save_every: int | None,
     observe: Callable[[Scene, Particles], Any] | None,
@@ -265,7 +265,8 @@ def integrate(
     """
     stencil = scene.stencil(particles) if scene.total else None
     zero, one, all_steps = (np.asarray(n, start.dtype) for n in (0, 1, max_steps))
-    problem = Problem(scene, particles, stencil, dt, method, observe, start, until, jnp.asarray(slot, start.dtype))
+    until, slot = (jnp.asarray(a, start.dtype) for a in (until, slot))
+    problem = Problem(scene, particles, stencil, dt, method, observe, start, until, slot)
     if not watch:
         problem, state = examined(problem, state)
 
