@@ -7,15 +7,18 @@
 //   resist   index, weights, derivatives, matrices, nodes              ->  nodes
 //   combine  a, b, c, d, scales, weight, active                        ->  y, z, sum
 //   product  force, v, mass, factor, free, weight, active              ->  image, sum
+//   recur    index, weights, derivatives, matrices, mass, factor, free, weight, active, x, r, limits  ->  x, numbers
 //
 // Factors are (..., d, s, p), given and gathered (..., c, p), nodes (..., n, c), matrices (..., d² (d² + 1) / 2, p), with
-// the same leading axes everywhere. Vectors are (..., m), scales (..., 2), mass (..., n), active (..., ⌈m/64⌉).
+// the same leading axes everywhere. Vectors are (..., m), scales (..., 2), mass (..., n), active (..., ⌈m/64⌉), and those
+// of a recurrence have m = n d.
 // `valued` says whether the first of the given is the value; `differential` whether changes of the factors follow them.
 
 #include <string>
 #include <utility>
 #include <vector>
 
+#include "recurrence.h"
 #include "sums.h"
 #include "targets.h"
 #include "vectors.h"
@@ -71,6 +74,16 @@ struct Call {
     expect(buffers[k].element_type() == type, "arrays of different precision");
     expect(shape_of(buffers[k]) == shape, "arrays whose shapes do not fit each other");
     return static_cast<T*>(buffers[k].untyped_data());
+  }
+
+  const bool* booleans(size_t k, int64_t count) {
+    Shape shape = leading;
+    shape.push_back(count);
+    expect(k < buffers.size(), "an array is missing");
+    if (!fault.empty()) return nullptr;
+    expect(buffers[k].element_type() == ffi::DataType::PRED, "no booleans");
+    expect(shape_of(buffers[k]) == shape, "arrays whose shapes do not fit each other");
+    return static_cast<const bool*>(buffers[k].untyped_data());
   }
 
   int64_t dim(size_t k, size_t from_behind) {
@@ -211,6 +224,32 @@ struct ResistOf {
   }
 };
 
+struct RecurrenceOf {
+  template <class T>
+  bool run(const Pool& pool, Call& call) const {
+    const int64_t m = call.d * call.d, nodes = call.dim(4, 1), size = nodes * call.d;
+    Recurrence<T> task = {};
+    task.stencils = call.stencils<T>(false);
+    task.nodes = nodes;
+    task.columns = call.d;
+    task.matrices = call.at<T>(3, {m * (m + 1) / 2, call.particles});
+    task.mass = call.at<T>(4, {nodes});
+    task.factor = call.at<T>(5, {});
+    task.free = call.booleans(6, size);
+    task.weight = call.at<T>(7, {size});
+    task.active = call.booleans(8, (size + kTogether - 1) / kTogether);
+    task.start = call.at<T>(9, {size});
+    task.residual = call.at<T>(10, {size});
+    task.limits = call.at<T>(11, {kLimits});
+    task.x = call.at<T>(12, {size});
+    task.numbers = call.at<T>(13, {kNumbers});
+    call.expect(call.operands == 12 && call.buffers.size() == 14, "too many or too few arrays");
+    call.expect(nodes > 0 || call.particles == 0, "no nodes to gather from");
+    if (!call.fault.empty()) return true;
+    return recur(pool, {int(call.d), int(call.s), false}, call.batch, task);
+  }
+};
+
 template <class Problem>
 ffi::Error run(const Problem& problem, ffi::ThreadPool threads, const ffi::RemainingArgs& arguments,
                const ffi::RemainingRets& results) {
@@ -242,6 +281,10 @@ ffi::Error run_resist(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi
   return run(ResistOf{}, threads, arguments, results);
 }
 
+ffi::Error run_recurrence(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  return run(RecurrenceOf{}, threads, arguments, results);
+}
+
 // Calls on vectors of one size, beside booleans of their blocks, the last operand.
 struct Vectors {
   Call call;
@@ -259,16 +302,8 @@ struct Vectors {
     call.leading.assign(shape.begin(), shape.end() - 1);
     for (const int64_t n : call.leading) call.batch *= n;
     size = shape.back();
-    active = booleans(operands - 1, (size + kTogether - 1) / kTogether);
+    active = call.booleans(operands - 1, (size + kTogether - 1) / kTogether);
     call.expect(call.type == ffi::DataType::F32 || call.type == ffi::DataType::F64, "there is no kernel of this type");
-  }
-
-  const bool* booleans(size_t k, int64_t count) {
-    Shape shape = call.leading;
-    shape.push_back(count);
-    call.expect(call.buffers[k].element_type() == ffi::DataType::PRED, "no booleans");
-    call.expect(shape_of(call.buffers[k]) == shape, "arrays whose shapes do not fit each other");
-    return static_cast<const bool*>(call.buffers[k].untyped_data());
   }
 };
 
@@ -298,7 +333,7 @@ void product_call(const Pool& pool, Vectors& vectors) {
   task.v = call.at<T>(1, {task.size});
   task.mass = call.at<T>(2, {task.nodes});
   task.factor = call.at<T>(3, {});
-  task.free = vectors.booleans(4, task.size);
+  task.free = call.booleans(4, task.size);
   task.weight = call.at<T>(5, {task.size});
   task.active = vectors.active;
   task.image = call.at<T>(7, {task.size});
@@ -353,6 +388,8 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_resist, mpmjax::run_resist,
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_combine, mpmjax::run_combine,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_product, mpmjax::run_product,
+                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_recur, mpmjax::run_recurrence,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
 
 // The threads that sums are shared among.

@@ -15,6 +15,7 @@ from mpmjax.autodiff._rule import _values
 from mpmjax.boundary._contact import ConstrainedNodes
 from mpmjax.checks._values import canonical
 from mpmjax.implicit._projection import Projection
+from mpmjax.implicit._recurrence import _recur
 from mpmjax.simulation._diffrax import Problem
 from mpmjax.state import state_of
 from mpmjax.stepping._nodes import Nodes
@@ -55,9 +56,12 @@ def operations(jaxpr, times=1):
 
 
 def inner_programs(equation):
-    """The programs in an equation's parameters, or of a function with a derivative rule."""
+    """The programs in an equation's parameters, of a function with a derivative rule, or of a solve's recurrence."""
     if equation.primitive.name == "ruled":
         yield jax.make_jaxpr(partial(_values, **equation.params))(*(a.aval for a in equation.invars)).jaxpr
+        return
+    if equation.primitive.name == "solve_recur":
+        yield jax.make_jaxpr(_recur)(*(a.aval for a in equation.invars)).jaxpr
         return
     for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda a: hasattr(a, "eqns")):
         inner = getattr(inner, "jaxpr", inner)

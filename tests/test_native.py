@@ -15,7 +15,7 @@ import mpmjax as mpm
 from mpmjax import linalg as la
 from mpmjax.discretisation import _resistance
 from mpmjax.discretisation import _transfer_sums as sums
-from mpmjax.implicit import _vectors
+from mpmjax.implicit import _recurrence, _vectors
 from mpmjax.native import _library
 
 ROOT = Path(__file__).parents[1]
@@ -255,6 +255,46 @@ def test_products_of_vectors_agree(choose, each):
     finite = (jnp.where(free, args[0], 0), *args[1:])
     along = tuple(jnp.cos(a) for a in finite)
     agree(*(jax.jvp(jax.jit(over(f)), finite, along)[1] for f in (agreeing, expected)), "float64")
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
+def test_recurrences_agree(choose, d):
+    """Native and by XLA, in a batch whose members end after other numbers of steps: at the tolerance, at the most
+    steps, at once. Each is bit for bit what it is alone, beside one that is not finite too."""
+    rng = np.random.default_rng(d)
+    index, w, g, upper, u = resistance(d, 30, "float64", wild=False, side=8)
+    size = u.size
+    row, column = np.triu_indices(d * d)
+    upper = jnp.asarray(np.where((row == column)[:, None], 2.0, 0.1) * np.ones((len(upper), 30)))
+    mass, free = jnp.asarray(rng.uniform(1, 2, len(u))), jnp.asarray(rng.uniform(size=size) < 0.7)
+    r, weight = jnp.where(free, jnp.asarray(rng.normal(size=size)), 0), jnp.asarray(rng.uniform(1, 2, size))
+    active = _vectors.active_blocks(free)
+
+    def run(factor, steps, r):
+        matrices = _recurrence.ParticleMatrices((index, w, g), upper, mass, factor, free)
+        rr = (weight * r * r).sum()
+        limits = _recurrence.Limits(1e-6 * jnp.sqrt(rr), 0.0, steps)
+        c = _recurrence.recur_by_matrices(matrices, weight, active, limits, _recurrence.Recurrence.begun(0 * r, r, rr))
+        return c.x, c.rr, c.k, c.radius, c.breakdown, c.indefinite
+
+    given = jnp.asarray([1e-2, 1e-4, 1.0, 1.0, 0.1]), jnp.asarray([500, 500, 5, 0, 500]), jnp.stack([r] * 4 + [r / 0])
+    found = {}
+    for backend in ("native", "xla"):
+        choose(backend)
+        together, alone = jax.jit(jax.vmap(run)), jax.jit(run)
+        assert ("mpmjax_recur" in together.lower(*given).as_text()) == (backend == "native")
+        found[backend] = [np.asarray(a) for a in together(*given)]
+        if backend == "native":
+            for k in range(5):
+                for one, member in zip(alone(*(a[k] for a in given)), found[backend], strict=True):
+                    np.testing.assert_array_equal(one, member[k])
+    x, _, k, *_ = found["native"]
+    assert k[0] > k[1] > 0
+    assert list(k[2:4]) == [5, 0]
+    assert np.isfinite(x[:4]).all()
+    for native, xla in zip(found["native"], found["xla"], strict=True):
+        assert_close(native[:4], xla[:4], rtol=1e-9)
 
 
 @NEEDS_LIBRARY

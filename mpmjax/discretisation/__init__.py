@@ -3,7 +3,7 @@
 from mpmjax.discretisation._gradient import AbstractGradient, MLSGradient, SplineGradient
 from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._kernel import BSpline
-from mpmjax.discretisation._resistance import resist
+from mpmjax.discretisation._resistance import resist, resist_by
 from mpmjax.discretisation._stencil import Stencil, in_window, make_stencil
 from mpmjax.discretisation._transfer import APIC, FLIP, PIC, AbstractTransfer, Gathered, g2p, p2g
 from mpmjax.discretisation._transfer_sums import gather, scatter
@@ -26,5 +26,6 @@ __all__ = [
     "make_stencil",
     "p2g",
     "resist",
+    "resist_by",
     "scatter",
 ]

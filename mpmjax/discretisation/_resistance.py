@@ -28,7 +28,12 @@ def resist(stencil: Stencil, upper: Float[Array, "t p"], u: NodeVector) -> NodeV
             columns are the components of G_p, the direction b first.
         u: what is gathered, shape (n, d).
     """
-    return _resist_p.bind(*stencil.factors, upper, u, batched=0)[0]
+    return resist_by(stencil.factors, upper, u)
+
+
+def resist_by(factors: tuple[Array, Array, Array], upper: Float[Array, "t p"], u: NodeVector) -> NodeVector:
+    """The same by the factors of the stencil."""
+    return _resist_p.bind(*factors, upper, u, batched=0)[0]
 
 
 def _resist(*args: Array, unroll: bool = False) -> list[Array]:

@@ -15,6 +15,7 @@ from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.checks import require, require_fields, require_positive, require_tolerance
 from mpmjax.implicit._inner_product import AbstractInnerProduct, DiagonalInnerProduct
 from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, AbstractInnerProductSolver, default_rtol
+from mpmjax.implicit._recurrence import Limits, ParticleMatrices, Passes, Recurrence, recur, recur_by_matrices
 from mpmjax.implicit._vectors import active_blocks, combine
 
 NEGLIGIBLE_CHANGE = 1e-3
@@ -44,6 +45,8 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
       there, and is passed over. Default: everywhere.
     - `product`: for a diagonal W, the operator's `product` (see `AbstractSymmetricOperator`), which may be faster than
       its `mv` and sums. Default: these.
+    - `matrices`: for a diagonal W, the operator as one matrix for each particle (see `ParticleMatrices`), with which
+      the recurrence is one call of the native library. Default: that it is not of this kind.
 
     Statistics returned:
 
@@ -97,7 +100,7 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
         system = _system(self, state, vector, options)
         y0 = options.get("y0")
         x = jnp.zeros_like(system.b) if y0 is None else system.started(ravel_pytree(y0)[0])
-        c = jax.lax.while_loop(lambda c: ~c.done, partial(_restart, system), _start(x, system.b))
+        c = jax.lax.while_loop(lambda c: ~c.done, partial(_restart, system), _start(x, system.b.dtype))
         result, stats = _outcome(system, c)
         return system.unravel(system.plain(c.x)), result, stats
 
@@ -158,6 +161,10 @@ class _System(eqx.Module):
         second = c + t * d
         return a + s * b, second, self.dot(second, second)
 
+    def recur(self, limits: Limits, c: Recurrence) -> Recurrence:
+        """The state at the end of the recurrence."""
+        return recur(Passes(self.product, self.combined, self.dot), limits, c)
+
     @property
     def eps(self) -> Any:
         """The rounding unit."""
@@ -173,6 +180,13 @@ class _DiagonalSystem(_System):
     """Where vectors may be different from zero (see `active_blocks`)."""
     fused: Callable[..., tuple[Array, Float[Array, ""]]] | None
     """The operator's `product`, if it was given."""
+    matrices: ParticleMatrices | None
+    """The operator's `matrices`, likewise."""
+
+    def recur(self, limits: Limits, c: Recurrence) -> Recurrence:
+        if self.matrices is None or limits.increment_rtol is not None:
+            return super().recur(limits, c)
+        return recur_by_matrices(self.matrices, self.weight, self.active, limits, c)
 
     def product(self, u: Array) -> tuple[Array, Float[Array, ""]]:
         if self.fused is None:
@@ -203,19 +217,12 @@ class _PairedSystem(_System):
         return x[0]
 
 
-class _Recurrence(eqx.Module):
-    """The state of the iteration, in the letters of the derivation."""
+class _Restarts(eqx.Module):
+    """The state between two restarts of the recurrence."""
 
     x: Array
-    r: Array
-    p: Array
-    q: Array
     rr: Float[Array, ""]
     """‖r‖²."""
-    qq: Float[Array, ""]
-    """‖q‖²."""
-    gamma: Float[Array, ""]
-    """rᵀA r; infinite where the recurrence starts anew, which makes β zero."""
     k: Int[Array, ""]
     """Steps taken."""
     radius: Float[Array, ""]
@@ -249,7 +256,8 @@ def _system(
     if inner.paired:
         system = _PairedSystem(*given)
     elif isinstance(inner, DiagonalInnerProduct):
-        system = _DiagonalSystem(*given, inner.weight, _active(flat, options), options.get("product"))
+        found = options.get("product"), options.get("matrices")
+        system = _DiagonalSystem(*given, inner.weight, _active(flat, options), *found)
     else:
         system = _System(*given)
     return replace(system, b_norm=system.norm(b))
@@ -262,16 +270,11 @@ def _active(rhs: Array, options: dict[str, Any]) -> Bool[Array, "k"]:
     return active_blocks(inside, rhs != 0, *([] if y0 is None else [ravel_pytree(y0)[0] != 0]))
 
 
-def _start(x: Array, b: Array) -> _Recurrence:
-    zero, infinite, no = jnp.zeros((), b.dtype), jnp.full((), jnp.inf, b.dtype), jnp.asarray(False)
-    return _Recurrence(
+def _start(x: Array, dtype: Any) -> _Restarts:
+    zero, infinite, no = jnp.zeros((), dtype), jnp.full((), jnp.inf, dtype), jnp.asarray(False)
+    return _Restarts(
         x=x,
-        r=b,
-        p=jnp.zeros_like(b),
-        q=jnp.zeros_like(b),
         rr=infinite,
-        qq=zero,
-        gamma=infinite,
         k=jnp.asarray(0, dtype=jnp.int32),
         radius=zero,
         restart_x=x,
@@ -285,65 +288,46 @@ def _start(x: Array, b: Array) -> _Recurrence:
     )
 
 
-def _goes_on(system: _System, c: _Recurrence) -> Bool[Array, ""]:
+def _goes_on(system: _System, c: _Restarts) -> Bool[Array, ""]:
     above = jnp.sqrt(c.rr) > system.rtol * system.b_norm
     return above & ~c.small_increment & ~c.breakdown & (c.k < system.max_steps)
 
 
-def _restart(system: _System, c: _Recurrence) -> _Recurrence:
+def _restart(system: _System, c: _Restarts) -> _Restarts:
     """Run the recurrence from the true residual, until its own residual meets the tolerance or is too small to be
     trusted."""
     r = system.b - system.apply(c.x)
     rr = system.dot(r, r)
     c = replace(
         c,
-        r=r,
         rr=rr,
-        gamma=jnp.full_like(rr, jnp.inf),
         restart_x=c.x,
         restart_rr=rr,
         correction=system.norm(c.x - c.restart_x),
         stalled=rr > c.restart_rr / 4,
     )
-    c = replace(c, done=c.stalled | ~_goes_on(system, c))
-
-    def within_reach(c: _Recurrence) -> Bool[Array, ""]:
-        return _goes_on(system, c) & ~c.done & (c.rr > (_REACH * system.eps) ** 2 * c.restart_rr)
-
-    return jax.lax.while_loop(within_reach, partial(_step, system), c)
-
-
-def _step(system: _System, c: _Recurrence) -> _Recurrence:
-    """One step of the recurrence."""
-    s, gamma = system.product(c.r)
-    beta = gamma / c.gamma
-    p, q, qq = system.combined((c.r, beta, c.p), (s, beta, c.q), onto=1)
-    rounding = system.eps * jnp.sqrt(c.rr * (qq + beta**2 * c.qq))  # of γ: ε‖r‖‖s‖
-    breakdown = jnp.abs(gamma) <= rounding
-    alpha = jnp.where(breakdown, 0, gamma / jnp.where(breakdown, 1, qq))
-    x, r, rr = system.combined((c.x, alpha, p), (c.r, -alpha, q), onto=0)
-    small_increment = c.small_increment
-    if system.increment_rtol is not None:
-        small = alpha**2 * system.dot(p, p) <= system.increment_rtol**2 * system.dot(x, x)
-        small_increment = ~breakdown & small
+    done = c.stalled | ~_goes_on(system, c)
+    limits = Limits(
+        tolerance=system.rtol * system.b_norm,
+        floor=(_REACH * system.eps) ** 2 * rr,
+        steps=jnp.where(done, 0, system.max_steps - c.k),
+        increment_rtol=system.increment_rtol,
+    )
+    end = system.recur(limits, Recurrence.begun(c.x, r, rr))
     return replace(
         c,
-        x=x,
-        r=r,
-        p=p,
-        q=q,
-        rr=rr,
-        qq=qq,
-        gamma=gamma,
-        k=c.k + 1,
-        radius=jnp.maximum(c.radius, jnp.abs(gamma) / c.rr),
-        small_increment=small_increment,
-        breakdown=breakdown,
-        indefinite=c.indefinite | (gamma < -rounding),
+        x=end.x,
+        rr=end.rr,
+        k=c.k + end.k,
+        radius=jnp.maximum(c.radius, end.radius),
+        small_increment=c.small_increment | end.small_increment,
+        breakdown=c.breakdown | end.breakdown,
+        indefinite=c.indefinite | end.indefinite,
+        done=done,
     )
 
 
-def _outcome(system: _System, c: _Recurrence) -> tuple[lx.RESULTS, dict[str, Any]]:
+def _outcome(system: _System, c: _Restarts) -> tuple[lx.RESULTS, dict[str, Any]]:
     """The result and statistics at the end of the iteration."""
     residual, tolerance = jnp.sqrt(c.rr), system.rtol * system.b_norm
     negligible = c.correction <= NEGLIGIBLE_CHANGE * system.norm(c.x)

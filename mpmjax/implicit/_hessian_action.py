@@ -96,11 +96,16 @@ class ParticleStiffness(AbstractHessianAction):
     def is_positive_semidefinite(self) -> bool:
         return self.positive_semidefinite
 
+    @property
+    def alone(self) -> bool:
+        """Whether H is the resistance of the particles and nothing else."""
+        return not (self.mirror.images or self.supports or self.springs or self.averaged or self.couplings)
+
     def __call__(self, du: NodeVector) -> NodeVector:
         """Σ_p g_ip K_p Σ_j g_jp δu_j, and what supports and springs add."""
         u = self.mirror.unfold(du)
-        alone = not self.averaged and not self.springs
-        force = self.mirror.fold(resist(self.stencil, self.upper, u) if alone else self._with_others(u))
+        separate = not self.averaged and not self.springs
+        force = self.mirror.fold(resist(self.stencil, self.upper, u) if separate else self._with_others(u))
         force = _with_couplings(force, self.couplings, self.mirror, du)
         return force + sum(support(du) for support in self.supports) if self.supports else force
 

@@ -48,9 +48,9 @@ class LinearSolution(eqx.Module):
 class AbstractInnerProductSolver(lx.AbstractLinearSolver[_State], Generic[_State]):
     """A symmetric solver that takes an inner product itself.
 
-    `compute` takes the options `inner_product`, an `AbstractInnerProduct`, and `support` and `product`, those of the
-    operator. Its result is successful if it converged. Its statistics have the other fields of `LinearSolution` except
-    `value`, with `num_steps` for `iterations`.
+    `compute` takes the options `inner_product`, an `AbstractInnerProduct`, and `support`, `product` and `matrices`,
+    those of the operator. Its result is successful if it converged. Its statistics have the other fields of
+    `LinearSolution` except `value`, with `num_steps` for `iterations`.
     """
 
     @abc.abstractmethod
@@ -85,6 +85,7 @@ def solve_linear(
     if not isinstance(solver, AbstractInnerProductSolver):
         return _solve_scaled(solver, operator, rhs, inner.factored(), guess)
     options = {"inner_product": inner, "support": operator.support(), "product": operator.product}
+    options["matrices"] = operator.matrices()
     options |= {} if guess is None else {"y0": guess}
     x, result, stats = solver.compute(solver.init(operator, options), rhs, options)
     return LinearSolution(

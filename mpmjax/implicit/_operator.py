@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
-from mpmjax.implicit._hessian_action import AbstractHessianAction
+from mpmjax.implicit._hessian_action import AbstractHessianAction, ParticleStiffness
 from mpmjax.implicit._projection import Projection
+from mpmjax.implicit._recurrence import ParticleMatrices
 from mpmjax.implicit._vectors import product
 
 
@@ -46,6 +47,10 @@ class AbstractSymmetricOperator(lx.AbstractLinearOperator):
         del active
         image = self.mv(v)
         return image / weight, (v * image).sum()
+
+    def matrices(self) -> ParticleMatrices | None:
+        """The operator as one matrix for each particle; None if it is more than that."""
+        return None
 
     def out_structure(self) -> jax.ShapeDtypeStruct:
         return self.in_structure()
@@ -101,6 +106,12 @@ class ImplicitOperator(AbstractSymmetricOperator):
 
     def support(self) -> Mask:
         return self.projection.free
+
+    def matrices(self) -> ParticleMatrices | None:
+        hessian, free = self.hessian, self.projection.free
+        if self.projection.normal is not None or not isinstance(hessian, ParticleStiffness) or not hessian.alone:
+            return None
+        return ParticleMatrices(hessian.stencil.factors, hessian.upper, self.mass, self.factor, free.reshape(-1))
 
     def precomputed(self) -> "ImplicitOperator":
         """The same operator, with H as one matrix for each particle, computed once for many applications."""

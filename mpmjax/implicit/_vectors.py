@@ -118,11 +118,11 @@ def _fits(avals: Any, batched: int) -> bool:
     return floats[0] in (np.float32, np.float64) and set(floats) == {floats[0]}
 
 
-def _differentiable(primitive: Primitive, function: Callable[..., list[Array]]) -> Primitive:
+def differentiable(primitive: Primitive, function: Callable[..., list[Array]]) -> Primitive:
     """With the derivative of what is written in JAX. Solves are never differentiated through their iterations."""
 
     def jvp(primals: tuple, tangents: tuple, *, batched: int) -> tuple[list[Array], list[Array]]:
-        floats = [k for k, primal in enumerate(primals) if primal.dtype != np.bool_]
+        floats = [k for k, primal in enumerate(primals) if jnp.issubdtype(primal.dtype, jnp.floating)]
 
         def written(*given: Array) -> list[Array]:
             at = dict(zip(floats, given, strict=True))
@@ -136,7 +136,7 @@ def _differentiable(primitive: Primitive, function: Callable[..., list[Array]]) 
 
 
 _combine_p = tuple(
-    _differentiable(native_primitive(f"vectors_combine_{k}", _combine, _results, _fits, {k: 0, 2 + k: 1}), _combine)
+    differentiable(native_primitive(f"vectors_combine_{k}", _combine, _results, _fits, {k: 0, 2 + k: 1}), _combine)
     for k in (0, 1)
 )
-_product_p = _differentiable(native_primitive("vectors_product", _product, _image_and_number, _fits, {0: 0}), _product)
+_product_p = differentiable(native_primitive("vectors_product", _product, _image_and_number, _fits, {0: 0}), _product)

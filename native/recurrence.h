@@ -1,0 +1,38 @@
+// The recurrence of the conjugate residual method with one matrix for each particle, as a whole.
+
+#pragma once
+
+#include "problems.h"
+#include "share.h"
+#include "sums.h"
+
+namespace mpmjax {
+
+constexpr int kLimits = 4, kNumbers = 5;
+
+// From x with the residual r: p = r + β p, q = W⁻¹A r + β q, x += α p, r −= α q, with A = M + χH on free components and
+// the identity on others, H the resistance of the particles, and the sums of problems.h and vectors.h. It goes on while
+// ‖r‖ is above the tolerance, ‖r‖² above the floor, steps are left, and rᵀA r does not vanish to rounding.
+template <class T>
+struct Recurrence {
+  Stencils<T> stencils;
+  const T* matrices;  // as in a resistance
+  const T* mass;      // (n)
+  const T* factor;    // χ
+  const bool* free;   // (n, d), as all vectors
+  const T* weight;    // W
+  const bool* active;  // (⌈n d/64⌉), as in vectors.h
+  const T *start, *residual;
+  const T* limits;  // tolerance of ‖r‖, floor of ‖r‖², most steps, ‖r‖² at the start
+  T* x;
+  T* numbers;  // ‖r‖², steps, largest |rᵀA r|/‖r‖², whether rᵀA r vanished, whether it was negative
+  int64_t nodes, columns;
+};
+
+// Each returns false where there is no kernel of this form. `batch` problems follow each other in every array, and each
+// ends by itself. As many as there are threads or more are shared among them whole, each with its arrays in the cache of
+// one core; fewer are done one after the other by all threads.
+bool recur(const Pool& pool, Form form, int64_t batch, const Recurrence<float>& first);
+bool recur(const Pool& pool, Form form, int64_t batch, const Recurrence<double>& first);
+
+}  // namespace mpmjax
