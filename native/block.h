@@ -6,7 +6,7 @@
 #pragma once
 
 #include "problems.h"
-#include "vector.h"
+#include "row.h"
 
 namespace {
 
@@ -15,11 +15,17 @@ using mpmjax::Stencils;
 
 constexpr int kSafeBits = 29;  // three terms of fewer bits add up to fewer than 32
 constexpr int kAhead = 4 * kBlock;
+constexpr int kRoom = kBlock + 3;  // a block's rows of four, with room for what is read beyond the last one
 
 // A flat index from its terms, wrapping as XLA's integers do.
 MPMJAX_INLINE int32_t after(int32_t first, int32_t term) {
   return static_cast<int32_t>(static_cast<uint32_t>(first) + static_cast<uint32_t>(term));
 }
+
+// The same for a whole block.
+typedef int32_t Whole __attribute__((vector_size(kBlock * sizeof(int32_t))));
+typedef uint32_t Wrapping __attribute__((vector_size(kBlock * sizeof(int32_t))));
+MPMJAX_INLINE Whole after(Whole first, Whole term) { return (Whole)((Wrapping)first + (Wrapping)term); }
 
 // Copies up to a block of numbers; what is missing is zero.
 template <class T>
@@ -28,12 +34,12 @@ MPMJAX_APART void copy_some(const T* from, int count, T* to) {
   for (int q = 0; q < count; ++q) to[q] = from[q];
 }
 
-// Asks for what a later block has of an array. Blocks come one after the other, in more streams than a processor foresees
-// by itself.
-template <class T>
+// Asks for what a later block has of an array, to read it or to write it. Blocks come one after the other, in more streams
+// than a processor foresees by itself.
+template <bool to_write = false, class T>
 MPMJAX_INLINE void ask(const T* from) {
   const uintptr_t later = reinterpret_cast<uintptr_t>(from) + kAhead * sizeof(T);  // perhaps beyond the array's end
-  __builtin_prefetch(reinterpret_cast<const void*>(later));
+  __builtin_prefetch(reinterpret_cast<const void*>(later), to_write);
 }
 
 // Copies a block, or what there is of it.
@@ -45,16 +51,32 @@ MPMJAX_INLINE void copy(const T* from, int count, T* to) {
   if (kBlock * sizeof(T) > 64) ask(from + kBlock / 2);
 }
 
+// Columns of a block as rows: row q has the q-th number of each column, and zeros.
+template <class T, int columns>
+MPMJAX_INLINE void join(const T (*from)[kBlock], Vector<T>* rows) {
+  for (int q = 0; q < kBlock; q += kLanes) {
+    Vector<T> turned[kLanes] = {};
+    for (int c = 0; c < columns; ++c) turned[c] = load(from[c] + q);
+    transpose<T>(turned, rows + q);
+  }
+}
+
 // The factors of a block: numbers, or with `differential` numbers with their changes.
 template <class T, int d, int s, bool differential>
 struct Block {
+  static constexpr int axes = d;
+
   int32_t index[d][s][kBlock];
   T weights[d][s][kBlock];
   T derivatives[d][s][kBlock];
   T weight_changes[differential ? d : 1][s][kBlock];
   T derivative_changes[differential ? d : 1][s][kBlock];
-  // The least and the largest flat index of a particle's nodes, and those from the
-  // axes after the first alone.
+  // The last axis' factors of each particle as rows of four.
+  Vector<T> last_weights[kRoom], last_derivatives[kRoom];
+  Vector<T> last_weight_changes[differential ? kRoom : 1], last_derivative_changes[differential ? kRoom : 1];
+  // Whether the nodes along the last axis follow each other.
+  int32_t straight[kBlock];
+  // The least and the largest flat index of a particle's nodes, and those from the axes after the first alone.
   int32_t least[kBlock], most[kBlock];
   int32_t least_beyond[kBlock], most_beyond[kBlock];
 
@@ -71,37 +93,44 @@ struct Block {
         }
       }
     }
+    join<T, s>(weights[d - 1], last_weights);
+    join<T, s>(derivatives[d - 1], last_derivatives);
+    if constexpr (differential) {
+      join<T, s>(weight_changes[d - 1], last_weight_changes);
+      join<T, s>(derivative_changes[d - 1], last_derivative_changes);
+    }
   }
 
   // The range of flat indices, from the terms of the index alone. Where a term is so large that a sum may leave 32 bits
   // and wrap, the range is that of all integers.
   MPMJAX_APART void find_range(const Stencils<T>& from, int64_t first, int count) {
-    int32_t large[kBlock] = {};
-    for (int q = 0; q < kBlock; ++q) least_beyond[q] = most_beyond[q] = 0;
+    Whole large = {}, bent = {}, low_sum = {}, high_sum = {};
     for (int a = d - 1; a >= 0; --a) {
-      int32_t low[kBlock], high[kBlock];
+      Whole first_term = {}, low = {}, high = {};
       for (int i = 0; i < s; ++i) {
-        int32_t* term = index[a][i];
-        copy(from.index + (a * s + i) * from.particles + first, count, term);
-        for (int q = 0; q < kBlock; ++q) {
-          low[q] = i == 0 || term[q] < low[q] ? term[q] : low[q];
-          high[q] = i == 0 || term[q] > high[q] ? term[q] : high[q];
-          large[q] |= (term[q] ^ (term[q] >> 31)) >> kSafeBits;
-        }
+        copy(from.index + (a * s + i) * from.particles + first, count, index[a][i]);
+        Whole term;
+        std::memcpy(&term, index[a][i], sizeof term);
+        if (i == 0) first_term = low = high = term;
+        low = term < low ? term : low;
+        high = term > high ? term : high;
+        large |= (term ^ (term >> 31)) >> kSafeBits;
+        if (a == d - 1) bent |= term ^ after(first_term, Whole{} + i);
       }
-      int32_t* to_least = a == 0 ? least : least_beyond;
-      int32_t* to_most = a == 0 ? most : most_beyond;
-      for (int q = 0; q < kBlock; ++q) {
-        to_least[q] = after(least_beyond[q], low[q]);
-        to_most[q] = after(most_beyond[q], high[q]);
-      }
+      if (a == 0) put(low_sum, high_sum, large, least_beyond, most_beyond);
+      low_sum = after(low_sum, low);
+      high_sum = after(high_sum, high);
     }
-    for (int q = 0; q < kBlock; ++q) {
-      least[q] = large[q] ? INT32_MIN : least[q];
-      most[q] = large[q] ? INT32_MAX : most[q];
-      least_beyond[q] = large[q] ? INT32_MIN : least_beyond[q];
-      most_beyond[q] = large[q] ? INT32_MAX : most_beyond[q];
-    }
+    put(low_sum, high_sum, large, least, most);
+    const Whole even = bent == 0;
+    std::memcpy(straight, &even, sizeof even);
+  }
+
+  static MPMJAX_INLINE void put(Whole low, Whole high, Whole large, int32_t* to_least, int32_t* to_most) {
+    low = large != 0 ? Whole{} + INT32_MIN : low;
+    high = large != 0 ? Whole{} + INT32_MAX : high;
+    std::memcpy(to_least, &low, sizeof low);
+    std::memcpy(to_most, &high, sizeof high);
   }
 
   MPMJAX_INLINE auto weight(int a, int i, int q) const {
@@ -119,6 +148,25 @@ struct Block {
       return derivatives[a][i][q];
     }
   }
+
+  // The same of the last axis, for all its nodes.
+  template <class R>
+  MPMJAX_INLINE auto last_weight(int q) const {
+    if constexpr (differential) {
+      return Dual<R>{by_node<R, T>(last_weights[q]), by_node<R, T>(last_weight_changes[q])};
+    } else {
+      return by_node<R, T>(last_weights[q]);
+    }
+  }
+
+  template <class R>
+  MPMJAX_INLINE auto last_derivative(int q) const {
+    if constexpr (differential) {
+      return Dual<R>{by_node<R, T>(last_derivatives[q]), by_node<R, T>(last_derivative_changes[q])};
+    } else {
+      return by_node<R, T>(last_derivatives[q]);
+    }
+  }
 };
 
 // Copies back as many numbers as there are.
@@ -126,18 +174,10 @@ template <class T>
 MPMJAX_INLINE void write(const T* from, int count, T* to) {
   if (count == kBlock) {
     std::memcpy(to, from, kBlock * sizeof(T));
+    ask<true>(to);
+    if (kBlock * sizeof(T) > 64) ask<true>(to + kBlock / 2);
   } else {
     for (int q = 0; q < count; ++q) to[q] = from[q];
-  }
-}
-
-// Columns of a block as rows: row q has the q-th number of each column.
-template <class T>
-MPMJAX_INLINE void join(const T (*columns)[kBlock], Vector<T>* rows) {
-  for (int q = 0; q < kBlock; q += kLanes) {
-    Vector<T> turned[kLanes];
-    for (int c = 0; c < kLanes; ++c) turned[c] = load(columns[c] + q);
-    transpose<T>(turned, rows + q);
   }
 }
 
@@ -156,7 +196,7 @@ template <class T>
 MPMJAX_APART void read_rows(const T* from, int64_t particles, int count, int used, Vector<T>* rows) {
   alignas(64) T columns[kLanes][kBlock];
   for (int c = 0; c < kLanes; ++c) copy(from + (c < used ? c : 0) * particles, c < used ? count : 0, columns[c]);
-  join<T>(columns, rows);
+  join<T, kLanes>(columns, rows);
 }
 
 // The other way round: writes the rows of a block as columns of (c, p).

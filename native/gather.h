@@ -2,8 +2,6 @@
 
 #pragma once
 
-#include <type_traits>
-
 #include "node_rows.h"
 
 namespace {
@@ -17,36 +15,63 @@ struct Sums {
   X gradients[count == 0 ? 1 : count];
 };
 
-// Each axis takes the sums over the axes after it one step further out: Σ_i over the nodes along it, of the value times
-// weights and times derivatives, of the gradients times weights.
-template <class T, int d, int s, bool differential, bool inside>
+// Each axis but the last takes the sums of rows over the axes after it one step further out: Σ_i over the nodes along
+// it, of the value times weights and times derivatives, of the gradients times weights. The last axis is summed at the
+// end, within the row.
+template <class T, int d, int s, bool differential, bool inside, int columns>
 struct Gatherer {
   const Block<T, d, s, differential>& block;
-  const NodeRows<T>& rows;
+  const NodeRows<T, s, columns>& rows;
   int q;
 
-  using Number = typename std::conditional<differential, Dual<Vector<T>>, Vector<T>>::type;
+  static constexpr int last = d - 1;
+  using R = RowOf<T, s, columns>;
+  using Number = typename std::conditional<differential, Dual<R>, R>::type;
 
   template <int a>
   MPMJAX_INLINE auto sums(int32_t first) const {
-    if constexpr (a == d) {
-      return Sums<Vector<T>, 0>{rows.template at<inside>(first), {}};
+    if constexpr (a == last) {
+      return Sums<R, 0>{rows.template at<inside>(block, q, first), {}};
     } else {
-      Sums<Number, d - a> total = {};
-      each<s, inside && !differential && a + 1 >= d>([&](int i) MPMJAX_INLINE_LAMBDA {
+      Sums<Number, last - a> total = {};
+      each<s, inside && !differential>([&](int i) MPMJAX_INLINE_LAMBDA {
         const auto inner = sums<a + 1>(after(first, block.index[a][i][q]));
         const auto w = block.weight(a, i, q), g = block.derivative(a, i, q);
         total.value = total.value + product(w, inner.value);
         total.gradients[0] = total.gradients[0] + product(g, inner.value);
-        for (int b = 1; b < d - a; ++b) total.gradients[b] = total.gradients[b] + product(w, inner.gradients[b - 1]);
+        for (int b = 1; b < last - a; ++b) total.gradients[b] = total.gradients[b] + product(w, inner.gradients[b - 1]);
       });
       return total;
     }
   }
+
+  // The value and all gradients, in four lanes of which those of the columns count.
+  MPMJAX_INLINE Sums<Vector<T>, d> all() const {
+    const auto w = block.template last_weight<R>(q), g = block.template last_derivative<R>(q);
+    const auto found = sums<0>(0);
+    Sums<Vector<T>, d> total;
+    total.value = sum(result(product(w, found.value)));
+    for (int b = 0; b < last; ++b) total.gradients[b] = sum(result(product(w, found.gradients[b])));
+    total.gradients[last] = sum(result(product(g, found.value)));
+    return total;
+  }
 };
 
-template <class T, int d, int s, bool differential>
-void gather(const Gather<T>& task, int64_t first, int64_t last) {
+// The sums of a block's particles, each handed to put(q, sums).
+template <class T, int d, int s, bool differential, int columns, class Put>
+MPMJAX_INLINE void gather_block(const Block<T, d, s, differential>& block, const NodeRows<T, s, columns>& rows,
+                                const Put& put) {
+  for (int q = 0; q < kBlock; ++q) {  // beyond the count weights are zero and the index is 0
+    if (rows.holds(block, q)) {
+      put(q, Gatherer<T, d, s, differential, true, columns>{block, rows, q}.all());
+    } else {
+      put(q, Gatherer<T, d, s, differential, false, columns>{block, rows, q}.all());
+    }
+  }
+}
+
+template <class T, int d, int s, bool differential, int columns>
+void gather_columns(const Gather<T>& task, int64_t first, int64_t last) {
   const int64_t particles = task.stencils.particles;
   for (int64_t start = first; start < last; start += kBlock) {
     const int count = smaller(last - start, kBlock);
@@ -54,24 +79,30 @@ void gather(const Gather<T>& task, int64_t first, int64_t last) {
     block.find_range(task.stencils, start, count);
     block.read(task.stencils, start, count);
     for (int64_t c = 0; c < task.columns; c += kLanes) {
-      const NodeRows<T> rows(task.nodes, task.size, task.columns, c);
+      const NodeRows<T, s, columns> rows(task.nodes, task.size, task.columns, c);
       Vector<T> sums[d + 1][kBlock];
-      const auto put = [&](int q, const auto& found) MPMJAX_INLINE_LAMBDA {
-        sums[0][q] = result(found.value);
-        for (int b = 0; b < d; ++b) sums[b + 1][q] = result(found.gradients[b]);
-      };
-      for (int q = 0; q < kBlock; ++q) {  // beyond the count weights are zero and the index is 0
-        if (rows.holds(block.least[q], block.most[q])) {
-          put(q, Gatherer<T, d, s, differential, true>{block, rows, q}.template sums<0>(0));
-        } else {
-          put(q, Gatherer<T, d, s, differential, false>{block, rows, q}.template sums<0>(0));
-        }
-      }
+      gather_block(block, rows, [&](int q, const auto& found) MPMJAX_INLINE_LAMBDA {
+        sums[0][q] = found.value;
+        for (int b = 0; b < d; ++b) sums[b + 1][q] = found.gradients[b];
+      });
       for (int b = 0; b <= d; ++b) {
         write_rows<T>(sums[b], task.sums[b] + c * particles + start, particles, count, rows.used);
       }
     }
   }
+}
+
+template <class T, int d, int s, bool differential>
+void gather(const Gather<T>& task, int64_t first, int64_t last) {
+  if constexpr (!differential) {
+    switch (task.columns) {
+      case 1: return gather_columns<T, d, s, false, 1>(task, first, last);
+      case 2: return gather_columns<T, d, s, false, 2>(task, first, last);
+      case 3: return gather_columns<T, d, s, false, 3>(task, first, last);
+      case 4: return gather_columns<T, d, s, false, 4>(task, first, last);
+    }
+  }
+  gather_columns<T, d, s, differential, 0>(task, first, last);
 }
 
 }  // namespace

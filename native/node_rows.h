@@ -1,4 +1,4 @@
-// The row of a node, read for a gather or a pull.
+// The rows of nodes, read for a gather or a pull.
 
 #pragma once
 
@@ -6,42 +6,66 @@
 
 namespace {
 
-// Four columns of the nodes (n, c), from a first column. An index beyond the window is clipped to its ends, as in XLA's
-// gather with mode "clip".
-template <class T>
+// Columns of the nodes (n, c): all, or where `columns` is 0 up to four from a first one. An index beyond the window is
+// clipped to its ends, as in XLA's gather with mode "clip".
+template <class T, int s, int columns>
 struct NodeRows {
-  const T* nodes;  // at the first of the four columns
-  int64_t size, columns;
+  using R = RowOf<T, s, columns>;
+
+  const T* nodes;  // at the first of the columns
+  int64_t size, given_stride;
   int64_t extent;  // how many numbers there are from `nodes` on
-  int used;        // columns from the first on, at most four
-  Lanes<T> present;
+  int used;        // columns from the first on
+  Present<R> present;
 
   MPMJAX_INLINE NodeRows(const T* whole, int64_t n, int64_t c, int64_t column)
-      : nodes(whole + column), size(n), columns(c), extent(n * c - column), used(smaller(c - column, kLanes)) {
-    for (int lane = 0; lane < kLanes; ++lane) present[lane] = lane < used ? -1 : 0;
+      : nodes(whole + column), size(n), given_stride(c), extent(n * c - column), used(smaller(c - column, R::columns)),
+        present(used) {}
+
+  MPMJAX_INLINE int64_t stride() const { return columns == 0 ? given_stride : columns; }
+
+  // Whether rows can be read in whole parts for a particle of a block: where there are lanes beyond the nodes of a row
+  // they reach into what comes next, which the last row has not.
+  template <class B>
+  MPMJAX_INLINE bool holds(const B& block, int q) const {
+    return block.straight[q] && block.least[q] >= 0 && block.most[q] < size &&
+           (block.most[q] - (s - 1)) * stride() + R::reach(stride()) <= extent;
   }
 
-  // Whether four numbers can be read at all nodes of a range. Where there are fewer columns they reach into the next
-  // row, which the last one has not.
-  MPMJAX_INLINE bool holds(int64_t least, int64_t most) const {
-    return least >= 0 && most < size && most * columns + kLanes <= extent;
-  }
-
-  // Lanes beyond the columns hold anything, such as what comes next in memory.
-  template <bool inside>
-  MPMJAX_INLINE Vector<T> at(int32_t node) const {
+  // The row whose index along the axes before the last adds up to `first`.
+  template <bool inside, class B>
+  MPMJAX_INLINE R at(const B& block, int q, int32_t first) const {
+    constexpr int last = B::axes - 1;
     if constexpr (inside) {
-      return load(nodes + node * columns);
+      const T* from = nodes + after(first, block.index[last][0][q]) * stride();
+      return row_of<R>([&](int k) MPMJAX_INLINE_LAMBDA {
+        typename R::Part part;
+        std::memcpy(&part, from + k * R::together * stride(), sizeof part);
+        return part;
+      });
     } else {
-      const int64_t clipped = node < 0 ? 0 : node >= size ? size - 1 : node;
-      return load_some(nodes + clipped * columns, used);
+      int32_t index[s];
+      for (int i = 0; i < s; ++i) index[i] = after(first, block.index[last][i][q]);
+      return apart(index);
     }
   }
 
-  // Lanes beyond the columns are zero.
-  template <bool inside>
-  MPMJAX_INLINE Vector<T> only(int32_t node) const {
-    return (Vector<T>)((Lanes<T>)at<inside>(node) & present);
+  // The row of any nodes, zero in other lanes.
+  MPMJAX_APART R apart(const int32_t* index) const {
+    alignas(R) T numbers[R::count * R::lanes] = {};
+    for (int i = 0; i < s; ++i) {
+      const int64_t clipped = index[i] < 0 ? 0 : index[i] >= size ? size - 1 : index[i];
+      std::memcpy(numbers + R::place(i), nodes + clipped * stride(), used * sizeof(T));
+    }
+    R row;
+    std::memcpy(&row, numbers, sizeof row);
+    return row;
+  }
+
+  // The same, zero in other lanes wherever it lies.
+  template <bool inside, class B>
+  MPMJAX_INLINE R only(const B& block, int q, int32_t first) const {
+    return present.of(at<inside>(block, q, first));
   }
 };
 

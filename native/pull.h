@@ -1,6 +1,7 @@
 // The pull: the derivative of B = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b) by the factors along each axis.
 //
-// By a factor along axis a, B is a product of what the axes before it narrow and what those after it gather.
+// By a factor along axis a, B is a product of what the axes before it and the last narrow and what those after it gather;
+// by one along the last axis it is a product of what is given and what all other axes gather.
 
 #pragma once
 
@@ -10,43 +11,69 @@ namespace {
 
 using mpmjax::Pull;
 
-// Four numbers for each factor, whose sum is the derivative by it.
-template <class T, int d, int s>
+// A row for each factor of the axes but the last, whose sum is the derivative by it.
+template <class R, int d>
 struct Slopes {
-  Vector<T> by_weights[d][s];
-  Vector<T> by_derivatives[d][s];
+  R by_weights[d][R::s];
+  R by_derivatives[d][R::s];
 };
 
-template <class T, int d, int s, bool inside>
+template <class T, int d, int s, bool inside, int columns>
 struct Puller {
   const Block<T, d, s, false>& block;
-  const NodeRows<T>& rows;
+  const NodeRows<T, s, columns>& rows;
   int q;
 
-  // Adds the derivatives by the factors of the axes from a on, and returns the sums over these axes.
+  static constexpr int last = d - 1;
+  using R = RowOf<T, s, columns>;
+
+  // Adds the derivatives by the factors of the axes from a on but the last, and returns the sums over these axes.
   template <int a>
-  MPMJAX_INLINE Sums<Vector<T>, d - a> pull(int32_t first, Vector<T> value, const Vector<T>* gradients,
-                                              Slopes<T, d, s>& slopes) const {
-    Sums<Vector<T>, d - a> total = {};
-    if constexpr (a == d) {
-      total.value = rows.template only<inside>(first);
+  MPMJAX_INLINE Sums<R, last - a> pull(int32_t first, R value, const R* gradients, Slopes<R, d>& slopes) const {
+    Sums<R, last - a> total = {};
+    if constexpr (a == last) {
+      total.value = rows.template only<inside>(block, q, first);
     } else {
-      each<s, inside && a + 2 >= d>([&](int i) MPMJAX_INLINE_LAMBDA {
+      each<s, inside && a + 1 >= last>([&](int i) MPMJAX_INLINE_LAMBDA {
         const T w = block.weights[a][i][q], g = block.derivatives[a][i][q];
-        Vector<T> inner[d - a];
-        for (int b = 1; b < d - a; ++b) inner[b - 1] = w * gradients[b];
-        const Vector<T> narrow = w * value + g * gradients[0];
+        R inner[d - a];
+        for (int b = 1; b < last - a; ++b) inner[b - 1] = product(w, gradients[b]);
+        const R narrow = product(w, value) + product(g, gradients[0]);
         const auto found = pull<a + 1>(after(first, block.index[a][i][q]), narrow, inner, slopes);
-        Vector<T> by_weight = value * found.value;
-        for (int b = 1; b < d - a; ++b) by_weight += gradients[b] * found.gradients[b - 1];
-        slopes.by_weights[a][i] += by_weight;
-        slopes.by_derivatives[a][i] += gradients[0] * found.value;
-        total.value += w * found.value;
-        total.gradients[0] += g * found.value;
-        for (int b = 1; b < d - a; ++b) total.gradients[b] += w * found.gradients[b - 1];
+        R by_weight = product(value, found.value);
+        for (int b = 1; b < last - a; ++b) by_weight = by_weight + product(gradients[b], found.gradients[b - 1]);
+        slopes.by_weights[a][i] = slopes.by_weights[a][i] + by_weight;
+        slopes.by_derivatives[a][i] = slopes.by_derivatives[a][i] + product(gradients[0], found.value);
+        total.value = total.value + product(w, found.value);
+        total.gradients[0] = total.gradients[0] + product(g, found.value);
+        for (int b = 1; b < last - a; ++b) {
+          total.gradients[b] = total.gradients[b] + product(w, found.gradients[b - 1]);
+        }
       });
     }
     return total;
+  }
+
+  // The derivatives by all factors, of the particle's rows of four: add(a, i, by the weight, by the derivative), each as
+  // four lanes to be summed.
+  template <class Add>
+  MPMJAX_INLINE void all(const Vector<T> (*given)[kRoom], const Add& add) const {
+    const R w = block.template last_weight<R>(q), g = block.template last_derivative<R>(q);
+    const R value = at_each<R, T>(given[0][q]), along = at_each<R, T>(given[d][q]);
+    R gradients[d], narrow[d];
+    for (int b = 0; b < last; ++b) gradients[b] = at_each<R, T>(given[b + 1][q]), narrow[b] = product(w, gradients[b]);
+    Slopes<R, d> slopes = {};
+    const auto found = pull<0>(0, product(w, value) + product(g, along), narrow, slopes);
+    for (int a = 0; a < last; ++a) {
+      for (int i = 0; i < s; ++i) add(a, i, sum(slopes.by_weights[a][i]), sum(slopes.by_derivatives[a][i]));
+    }
+    R by_weight = product(value, found.value);
+    for (int b = 0; b < last; ++b) by_weight = by_weight + product(gradients[b], found.gradients[b]);
+    const R by_derivative = product(along, found.value);
+    each<s, true>([&](auto i) MPMJAX_INLINE_LAMBDA {
+      constexpr int node = decltype(i)::value;
+      add(last, node, columns_at<node>(by_weight), columns_at<node>(by_derivative));
+    });
   }
 };
 
@@ -62,18 +89,19 @@ MPMJAX_APART void add_lanes(const Vector<T>* from, int count, T* to) {
   write(sums, count, to);
 }
 
-template <class T, int d, int s>
-void pull(const Pull<T>& task, int64_t first, int64_t last) {
+template <class T, int d, int s, int columns>
+void pull_columns(const Pull<T>& task, int64_t first, int64_t last) {
   const int64_t particles = task.stencils.particles;
   for (int64_t start = first; start < last; start += kBlock) {
     const int count = smaller(last - start, kBlock);
     Block<T, d, s, false> block;
     block.find_range(task.stencils, start, count);
     block.read(task.stencils, start, count);
-    Vector<T> by_weights[d][s][kBlock] = {}, by_derivatives[d][s][kBlock] = {};
-    for (int64_t c = 0; c < task.columns; c += kLanes) {
-      const NodeRows<T> rows(task.nodes, task.size, task.columns, c);
-      Vector<T> given[d + 1][kBlock];
+    Vector<T> by_weights[d][s][kBlock], by_derivatives[d][s][kBlock];
+    for (int64_t c = 0; c < (columns == 0 ? task.columns : columns); c += kLanes) {
+      const NodeRows<T, s, columns> rows(task.nodes, task.size, task.columns, c);
+      const Present<Row<T, 1, kLanes, 1>> present(rows.used);
+      Vector<T> given[d + 1][kRoom];
       for (int b = 0; b <= d; ++b) {
         if (task.given[b] == nullptr) {
           std::memset(given[b], 0, sizeof given[b]);
@@ -82,19 +110,18 @@ void pull(const Pull<T>& task, int64_t first, int64_t last) {
         }
       }
       for (int q = 0; q < kBlock; ++q) {
-        Vector<T> gradients[d];
-        for (int b = 0; b < d; ++b) gradients[b] = given[b + 1][q];
-        Slopes<T, d, s> slopes = {};
-        if (rows.holds(block.least[q], block.most[q])) {
-          Puller<T, d, s, true>{block, rows, q}.template pull<0>(0, given[0][q], gradients, slopes);
+        const auto add = [&](int a, int i, Vector<T> by_weight, Vector<T> by_derivative) MPMJAX_INLINE_LAMBDA {
+          const auto put = [&](Vector<T>& to, Vector<T> found) MPMJAX_INLINE_LAMBDA {
+            if constexpr (columns != kLanes) found = present.of({{found}}).parts[0];
+            to = c == 0 ? found : to + found;
+          };
+          put(by_weights[a][i][q], by_weight);
+          put(by_derivatives[a][i][q], by_derivative);
+        };
+        if (rows.holds(block, q)) {
+          Puller<T, d, s, true, columns>{block, rows, q}.all(given, add);
         } else {
-          Puller<T, d, s, false>{block, rows, q}.template pull<0>(0, given[0][q], gradients, slopes);
-        }
-        for (int a = 0; a < d; ++a) {
-          for (int i = 0; i < s; ++i) {
-            by_weights[a][i][q] += slopes.by_weights[a][i];
-            by_derivatives[a][i][q] += slopes.by_derivatives[a][i];
-          }
+          Puller<T, d, s, false, columns>{block, rows, q}.all(given, add);
         }
       }
     }
@@ -108,6 +135,17 @@ void pull(const Pull<T>& task, int64_t first, int64_t last) {
         add_lanes<T>(by_derivatives[a][i], count, task.by_derivatives + at);
       }
     }
+  }
+}
+
+template <class T, int d, int s>
+void pull(const Pull<T>& task, int64_t first, int64_t last) {
+  switch (task.columns) {
+    case 1: return pull_columns<T, d, s, 1>(task, first, last);
+    case 2: return pull_columns<T, d, s, 2>(task, first, last);
+    case 3: return pull_columns<T, d, s, 3>(task, first, last);
+    case 4: return pull_columns<T, d, s, 4>(task, first, last);
+    default: return pull_columns<T, d, s, 0>(task, first, last);
   }
 }
 

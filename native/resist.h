@@ -42,18 +42,11 @@ MPMJAX_APART void multiply(const T* entries, int64_t stride, const Components<T,
 // r_p for the particles of a block, as a row for each direction.
 template <class T, int d, int s>
 MPMJAX_APART void resist_block(const Resist<T>& task, const Block<T, d, s, false>& block, int64_t start, int count,
-                               Vector<T> (*rows)[kBlock]) {
-  const NodeRows<T> nodes(task.moved, task.size, d, 0);
-  for (int q = 0; q < kBlock; ++q) {  // beyond the count weights are zero and the index is 0
-    const auto put = [&](const auto& found) MPMJAX_INLINE_LAMBDA {
-      for (int b = 0; b < d; ++b) rows[b][q] = found.gradients[b];
-    };
-    if (nodes.holds(block.least[q], block.most[q])) {
-      put(Gatherer<T, d, s, false, true>{block, nodes, q}.template sums<0>(0));
-    } else {
-      put(Gatherer<T, d, s, false, false>{block, nodes, q}.template sums<0>(0));
-    }
-  }
+                               Vector<T> (*rows)[kRoom]) {
+  const NodeRows<T, s, d> nodes(task.moved, task.size, d, 0);
+  gather_block(block, nodes, [&](int q, const auto& found) MPMJAX_INLINE_LAMBDA {
+    for (int b = 0; b < d; ++b) rows[b][q] = found.gradients[b];
+  });
   constexpr int entries = d * d * (d * d + 1) / 2;
   const int64_t particles = task.stencils.particles;
   alignas(64) Components<T, d> slopes, products = {};
@@ -65,14 +58,14 @@ MPMJAX_APART void resist_block(const Resist<T>& task, const Block<T, d, s, false
     for (int k = 0; k < entries; ++k) copy_some(task.matrices + k * particles + start, count, few[k]);
     multiply<T, d>(few[0], kBlock, slopes, products);
   }
-  for (int b = 0; b < d; ++b) join<T>(products + b * kLanes, rows[b]);
+  for (int b = 0; b < d; ++b) join<T, kLanes>(products + b * kLanes, rows[b]);
 }
 
 // Sets the nodes of a range.
 template <class T, int d, int s>
 void resist(const Resist<T>& task, int64_t first, int64_t last) {
   std::memset(task.nodes + first * d, 0, static_cast<size_t>((last - first) * d) * sizeof(T));
-  const NodeSums<T, d> nodes{task.nodes, d, first, last, d};
+  const NodeSums<T, s, d> nodes(task.nodes, d, 0, first, last);
   const auto give = [&](const auto& block, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
     std::memset(rows[0], 0, sizeof rows[0]);
     resist_block<T, d, s>(task, block, start, count, rows + 1);
@@ -88,7 +81,7 @@ void resist_particles(const Resist<T>& task, int64_t first, int64_t last) {
     Block<T, d, s, false> block;
     block.find_range(task.stencils, start, count);
     block.read(task.stencils, start, count);
-    Vector<T> rows[d][kBlock];
+    Vector<T> rows[d][kRoom];
     resist_block<T, d, s>(task, block, start, count, rows);
     for (int b = 0; b < d; ++b) write_rows<T>(rows[b], task.sums[b + 1] + start, task.stencils.particles, count, d);
   }

@@ -12,67 +12,130 @@ namespace {
 using mpmjax::Range;
 using mpmjax::Scatter;
 
-// Up to four columns of the nodes from a first to a last one. How many is known when this is compiled, or where speed
-// matters less than the size of the code it is 0 and `count` says it.
-template <class T, int used>
+// Columns of the nodes from a first to a last one: all columns, or where `columns` is 0 up to four.
+template <class T, int s, int columns>
 struct NodeSums {
+  using R = RowOf<T, s, columns>;
+
   T* nodes;  // at the first of the columns
-  int64_t columns, first, last;
-  int count;
+  int64_t given_stride, first, last;
+  int64_t extent;  // how many numbers there are from `nodes` to the last of the range
+  int used;
+  Present<R> present;
+
+  MPMJAX_INLINE NodeSums(T* whole, int64_t c, int64_t column, int64_t first, int64_t last)
+      : nodes(whole + column), given_stride(c), first(first), last(last), extent(last * c - column),
+        used(smaller(c - column, R::columns)), present(used) {}
+
+  MPMJAX_INLINE int64_t stride() const { return columns == 0 ? given_stride : columns; }
 
   // Whether any of the nodes from a least to a most may be in the range.
   MPMJAX_INLINE bool may_have(int64_t least, int64_t most) const { return most >= first && least < last; }
 
-  template <bool inside>
-  MPMJAX_INLINE void add(int32_t node, Vector<T> row) const {
-    if (!inside && (node < first || node >= last)) return;
-    T* to = nodes + node * columns;
-    if constexpr (used > 0) {
-      add_some<used>(to, row);
+  // Whether rows can be added in whole parts for a particle of a block: all that these reach over is in the range, and
+  // zeros may be added to what comes after a row.
+  template <class B>
+  MPMJAX_INLINE bool holds(const B& block, int q) const {
+    return block.straight[q] && block.least[q] >= first && block.most[q] < last &&
+           (block.most[q] - (s - 1)) * stride() + R::reach(stride()) <= extent;
+  }
+
+  // Adds to the row whose index along the axes before the last adds up to `first`.
+  template <bool inside, class B>
+  MPMJAX_INLINE void add(const B& block, int q, int32_t first, const R& row) const {
+    constexpr int last = B::axes - 1;
+    if constexpr (inside) {
+      T* to = nodes + after(first, block.index[last][0][q]) * stride();
+      const R added = present.of(row);
+      // All is read before anything is written: a part's last lanes may be the next one's first, which writes them last.
+      const R sums = row_of<R>([&](int k) MPMJAX_INLINE_LAMBDA {
+        typename R::Part found;
+        std::memcpy(&found, to + k * R::together * stride(), sizeof found);
+        return found + added.parts[k];
+      });
+      each<R::count, true>([&](int k) MPMJAX_INLINE_LAMBDA {
+        std::memcpy(to + k * R::together * stride(), &sums.parts[k], sizeof(typename R::Part));
+      });
     } else {
-      for (int c = 0; c < count; ++c) to[c] += row[c];
+      int32_t index[s];
+      for (int i = 0; i < s; ++i) index[i] = after(first, block.index[last][i][q]);
+      add_apart(index, row);
+    }
+  }
+
+  // Adds to any nodes, of which those beyond the range are passed over.
+  MPMJAX_APART void add_apart(const int32_t* index, const R& row) const {
+    alignas(R) T numbers[R::count * R::lanes];
+    std::memcpy(numbers, &row, sizeof row);
+    for (int i = 0; i < s; ++i) {
+      if (index[i] < first || index[i] >= last) continue;
+      T* to = nodes + index[i] * stride();
+      for (int c = 0; c < used; ++c) to[c] += numbers[R::place(i) + c];
     }
   }
 };
 
-// One step further in: what a particle gives, times the factors of one node along axis a. Gradients are those of the
-// axes from a on.
-template <class T, int d, int s, bool differential, bool inside, int used>
+// What a particle gives to all rows. Gradients are those of the axes from a on, without the last.
+template <class T, int d, int s, bool differential, bool inside, int columns>
 struct Scatterer {
   const Block<T, d, s, differential>& block;
-  const NodeSums<T, used>& nodes;
+  const NodeSums<T, s, columns>& nodes;
   int q;
 
-  // With gradients.
+  static constexpr int last = d - 1;
+  using R = RowOf<T, s, columns>;
+
+  // With gradients: the particle's rows of four. The last axis is the first to be multiplied by, within the row.
+  MPMJAX_INLINE void add_graded(const Vector<T> (*rows)[kRoom]) const {
+    const auto w = block.template last_weight<R>(q), g = block.template last_derivative<R>(q);
+    using X = typename std::conditional<differential, Dual<R>, R>::type;
+    const X value = product(w, at_each<R, T>(rows[0][q])) + product(g, at_each<R, T>(rows[d][q]));
+    X gradients[d];
+    for (int b = 0; b < last; ++b) gradients[b] = product(w, at_each<R, T>(rows[b + 1][q]));
+    add<0>(0, value, gradients);
+  }
+
+  // Without.
+  MPMJAX_INLINE void add_value(const Vector<T> (*rows)[kRoom]) const {
+    add<0>(0, product(block.template last_weight<R>(q), at_each<R, T>(rows[0][q])));
+  }
+
+  // One step further in: the same times the factors of one node along axis a.
   template <int a, class X>
   MPMJAX_INLINE void add(int32_t first, X value, const X* gradients) const {
-    if constexpr (a == d) {
-      nodes.template add<inside>(first, result(value));
+    if constexpr (a == last) {
+      nodes.template add<inside>(block, q, first, result(value));
     } else {
-      each<s, inside && !differential && a + 1 >= d>([&](int i) MPMJAX_INLINE_LAMBDA {
-        if constexpr (!inside && a == 0) {
-          const int64_t term = block.index[0][i][q];
-          if (!nodes.may_have(term + block.least_beyond[q], term + block.most_beyond[q])) return;
-        }
+      each<s, inside && !differential>([&](int i) MPMJAX_INLINE_LAMBDA {
+        if (passed_over<a>(i)) return;
         const auto w = block.weight(a, i, q), g = block.derivative(a, i, q);
-        using Y = decltype(product(w, value));
-        const Y narrow = product(w, value) + product(g, gradients[0]);
-        Y inner[d - a];
-        for (int b = 1; b < d - a; ++b) inner[b - 1] = product(w, gradients[b]);
-        add<a + 1>(after(first, block.index[a][i][q]), narrow, inner);
+        X inner[d - a];
+        for (int b = 1; b < last - a; ++b) inner[b - 1] = product(w, gradients[b]);
+        add<a + 1>(after(first, block.index[a][i][q]), product(w, value) + product(g, gradients[0]), inner);
       });
     }
   }
 
-  // Without.
   template <int a, class X>
   MPMJAX_INLINE void add(int32_t first, X value) const {
-    if constexpr (a == d) {
-      nodes.template add<inside>(first, result(value));
+    if constexpr (a == last) {
+      nodes.template add<inside>(block, q, first, result(value));
     } else {
       each<s, false>([&](int i) MPMJAX_INLINE_LAMBDA {
+        if (passed_over<a>(i)) return;
         add<a + 1>(after(first, block.index[a][i][q]), product(block.weight(a, i, q), value));
       });
+    }
+  }
+
+  // Whether the nodes with the i-th index of the first axis are all beyond the range.
+  template <int a>
+  MPMJAX_INLINE bool passed_over(int i) const {
+    if constexpr (inside || a > 0) {
+      return false;
+    } else {
+      const int64_t term = block.index[0][i][q];
+      return !nodes.may_have(term + block.least_beyond[q], term + block.most_beyond[q]);
     }
   }
 };
@@ -95,8 +158,8 @@ void find_ranges(const Stencils<T>& stencils, int64_t first, int64_t last, Range
 
 // Adds what all particles give to a range of nodes, in four columns or fewer. `give(block, start, count, rows)` makes it
 // of a block: for each particle the row of its value, and with `graded` then those of its gradients.
-template <class T, int d, int s, bool differential, bool graded, int used, class Give>
-MPMJAX_INLINE void add_blocks(const Stencils<T>& stencils, const Range* ranges, const NodeSums<T, used>& nodes,
+template <class T, int d, int s, bool differential, bool graded, int columns, class Give>
+MPMJAX_INLINE void add_blocks(const Stencils<T>& stencils, const Range* ranges, const NodeSums<T, s, columns>& nodes,
                               const Give& give) {
   const int64_t particles = stencils.particles;
   for (int64_t start = 0; start < particles; start += kBlock) {
@@ -111,60 +174,57 @@ MPMJAX_INLINE void add_blocks(const Stencils<T>& stencils, const Range* ranges, 
     }
     if (some == 0) continue;
     block.read(stencils, start, count);
-    Vector<T> rows[graded ? d + 1 : 1][kBlock];
+    Vector<T> rows[graded ? d + 1 : 1][kRoom];
     give(block, start, count, rows);
     for (int k = 0; k < some; ++k) {
       const int q = taken[k];
       const auto add = [&](const auto& scatterer) MPMJAX_INLINE_LAMBDA {
         if constexpr (graded) {
-          Vector<T> gradients[d];
-          for (int b = 0; b < d; ++b) gradients[b] = rows[b + 1][q];
-          scatterer.template add<0>(0, rows[0][q], gradients);
+          scatterer.add_graded(rows);
         } else {
-          scatterer.template add<0>(0, rows[0][q]);
+          scatterer.add_value(rows);
         }
       };
-      if (block.least[q] >= nodes.first && block.most[q] < nodes.last) {
-        add(Scatterer<T, d, s, differential, true, used>{block, nodes, q});
+      if (nodes.holds(block, q)) {
+        add(Scatterer<T, d, s, differential, true, columns>{block, nodes, q});
       } else {
-        add(Scatterer<T, d, s, differential, false, used>{block, nodes, q});
+        add(Scatterer<T, d, s, differential, false, columns>{block, nodes, q});
       }
     }
   }
 }
 
-// The particles' share in four columns or fewer, for a range of nodes that is zero at first.
-template <class T, int d, int s, bool differential, bool graded, int used>
+// All columns, or where `columns` is 0 up to four from a first one, of a range of nodes that is zero at first.
+template <class T, int d, int s, bool differential, bool graded, int columns>
 void scatter_columns(const Scatter<T>& task, int64_t column, int64_t first, int64_t last) {
   const int64_t particles = task.stencils.particles;
-  const int width = used > 0 ? used : smaller(task.columns - column, kLanes);
-  const NodeSums<T, used> nodes{task.nodes + column, task.columns, first, last, width};
+  const NodeSums<T, s, columns> nodes(task.nodes, task.columns, column, first, last);
   const auto give = [&](const auto&, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
     for (int b = 0; b < (graded ? d + 1 : 1); ++b) {
       if (task.given[b] == nullptr) {
         std::memset(rows[b], 0, sizeof rows[b]);
       } else {
-        read_rows(task.given[b] + column * particles + start, particles, count, width, rows[b]);
+        read_rows(task.given[b] + column * particles + start, particles, count, nodes.used, rows[b]);
       }
     }
   };
-  add_blocks<T, d, s, differential, graded, used>(task.stencils, task.ranges, nodes, give);
+  add_blocks<T, d, s, differential, graded, columns>(task.stencils, task.ranges, nodes, give);
 }
 
 template <class T, int d, int s, bool differential, bool graded>
 void scatter_given(const Scatter<T>& task, int64_t first, int64_t last) {
   const int64_t columns = task.columns;
   std::memset(task.nodes + first * columns, 0, static_cast<size_t>((last - first) * columns) * sizeof(T));
-  int64_t c = 0;
   if constexpr (graded && !differential) {
-    for (; c + 4 <= columns; c += 4) scatter_columns<T, d, s, false, true, 4>(task, c, first, last);
-    switch (columns - c) {
-      case 3: return scatter_columns<T, d, s, false, true, 3>(task, c, first, last);
-      case 2: return scatter_columns<T, d, s, false, true, 2>(task, c, first, last);
-      case 1: return scatter_columns<T, d, s, false, true, 1>(task, c, first, last);
+    switch (columns) {
+      case 1: return scatter_columns<T, d, s, false, true, 1>(task, 0, first, last);
+      case 2: return scatter_columns<T, d, s, false, true, 2>(task, 0, first, last);
+      case 3: return scatter_columns<T, d, s, false, true, 3>(task, 0, first, last);
+      case 4: return scatter_columns<T, d, s, false, true, 4>(task, 0, first, last);
     }
-  } else {
-    for (; c < columns; c += kLanes) scatter_columns<T, d, s, differential, graded, 0>(task, c, first, last);
+  }
+  for (int64_t c = 0; c < columns; c += kLanes) {
+    scatter_columns<T, d, s, differential, graded, 0>(task, c, first, last);
   }
 }
 

@@ -8,6 +8,7 @@
 
 #include <cstdint>
 #include <cstring>
+#include <type_traits>
 
 #define MPMJAX_INLINE inline __attribute__((always_inline))
 #define MPMJAX_INLINE_LAMBDA __attribute__((always_inline))
@@ -20,7 +21,6 @@ constexpr int kLanes = 4;
 template <class T>
 struct VectorOf {
   typedef T type __attribute__((vector_size(kLanes * sizeof(T))));
-  typedef T half __attribute__((vector_size(kLanes / 2 * sizeof(T))));
 };
 
 template <class T>
@@ -39,44 +39,19 @@ MPMJAX_INLINE void store(T* to, Vector<T> v) {
   std::memcpy(to, &v, sizeof v);
 }
 
-// The first `count` lanes; the others are zero.
-template <class T>
-MPMJAX_INLINE Vector<T> load_some(const T* from, int count) {
-  Vector<T> v = {};
-  for (int lane = 0; lane < kLanes; ++lane) {
-    if (lane < count) v[lane] = from[lane];
-  }
-  return v;
-}
-
-// Adds the first `count` lanes to as many numbers. What is beyond them is not touched, not even by a zero.
-template <int count, class T>
-MPMJAX_INLINE void add_some(T* to, Vector<T> v) {
-  static_assert(count >= 1 && count <= kLanes, "a vector has four lanes");
-  if constexpr (count == kLanes) {
-    store(to, load(to) + v);
-  } else if constexpr (count == 1) {
-    to[0] += v[0];
-  } else {
-    typename VectorOf<T>::half low = {v[0], v[1]}, sum;
-    std::memcpy(&sum, to, sizeof sum);
-    sum += low;
-    std::memcpy(to, &sum, sizeof sum);
-    if constexpr (count == 3) to[2] += v[2];
-  }
-}
-
-// Four integers as wide as the numbers: choices of lanes and masks of their bits.
-template <class T>
-struct LanesOf {
-  typedef int32_t type __attribute__((vector_size(kLanes * sizeof(int32_t))));
+// As many integers as wide as the numbers: choices of lanes and masks of their bits.
+template <class T, int lanes>
+struct LanesOf;
+template <int lanes>
+struct LanesOf<float, lanes> {
+  typedef int32_t type __attribute__((vector_size(lanes * sizeof(int32_t))));
 };
-template <>
-struct LanesOf<double> {
-  typedef int64_t type __attribute__((vector_size(kLanes * sizeof(int64_t))));
+template <int lanes>
+struct LanesOf<double, lanes> {
+  typedef int64_t type __attribute__((vector_size(lanes * sizeof(int64_t))));
 };
 template <class T>
-using Lanes = typename LanesOf<T>::type;
+using Lanes = typename LanesOf<T, kLanes>::type;
 
 #if defined(__clang__)
 #define MPMJAX_SHUFFLE(a, b, i, j, k, l) __builtin_shufflevector(a, b, i, j, k, l)
@@ -95,15 +70,16 @@ MPMJAX_INLINE void transpose(const Vector<T>* from, Vector<T>* to) {
   to[3] = MPMJAX_SHUFFLE(b, d, 2, 3, 6, 7);
 }
 
-// Calls f(0), ..., f(count - 1): written out, or as a loop where speed matters less than the size of the code.
+// Calls f(0), ..., f(count - 1): written out with constants, or as a loop where speed matters less than the size of the
+// code.
 template <int count, bool written_out, class F>
 MPMJAX_INLINE void each(const F& f) {
   if constexpr (written_out) {
     static_assert(count <= 4, "as many nodes as the cubic kernel has");
-    f(0);
-    if constexpr (count > 1) f(1);
-    if constexpr (count > 2) f(2);
-    if constexpr (count > 3) f(3);
+    f(std::integral_constant<int, 0>());
+    if constexpr (count > 1) f(std::integral_constant<int, 1>());
+    if constexpr (count > 2) f(std::integral_constant<int, 2>());
+    if constexpr (count > 3) f(std::integral_constant<int, 3>());
   } else {
 #if defined(__clang__)
 #pragma clang loop unroll(disable) vectorize(disable)
@@ -121,17 +97,14 @@ struct Dual {
   X change;
 };
 
-MPMJAX_INLINE Vector<float> product(float a, Vector<float> x) { return a * x; }
-MPMJAX_INLINE Vector<double> product(double a, Vector<double> x) { return a * x; }
-
-template <class T>
-MPMJAX_INLINE Dual<Vector<T>> product(Dual<T> a, Vector<T> x) {
-  return {a.value * x, a.change * x};
+template <class A, class X>
+MPMJAX_INLINE auto product(Dual<A> a, X x) {
+  return Dual<X>{product(a.value, x), product(a.change, x)};
 }
 
-template <class T>
-MPMJAX_INLINE Dual<Vector<T>> product(Dual<T> a, Dual<Vector<T>> x) {
-  return {a.value * x.value, a.value * x.change + a.change * x.value};
+template <class A, class X>
+MPMJAX_INLINE auto product(Dual<A> a, Dual<X> x) {
+  return Dual<X>{product(a.value, x.value), product(a.value, x.change) + product(a.change, x.value)};
 }
 
 template <class X>
