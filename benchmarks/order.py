@@ -12,7 +12,7 @@ import argparse
 import time
 
 import numpy as np
-from throughput import block, ours
+from throughput import Ours, block
 
 import mpmjax as mpm
 
@@ -32,7 +32,7 @@ def main() -> None:
         rows = block(*numbers, "float32")
         order = np.random.default_rng(0).permutation(len(rows.x))
         shuffled = rows._replace(x=rows.x[order], v=rows.v[order])
-        runs = [ours(b, mpm.UpdatedLagrangian(), STEPS) for b in (rows, shuffled)]
+        runs = [Ours(b, mpm.UpdatedLagrangian(), STEPS) for b in (rows, shuffled)]
         (x, *_), (y, *_) = (run() for run in runs)  # compiles too
         assert np.abs(x[order] - y).max() < 1e-5, "the order changes the motion"
         seconds = np.empty((options.rounds, 2))
