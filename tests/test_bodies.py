@@ -123,7 +123,7 @@ def test_bodies_that_do_not_touch_move_as_each_alone():
     rows = np.split(np.arange(particles.count), [particles.sizes[0]])
     for own in rows:
         parts = {name: getattr(particles, name)[own] for name in ("x", "v", "mass", "volume")}
-        new, _ = mpm.step(mpm.Scene(scene.grid.with_layers(1), LAW), mpm.Particles(**parts), 0.0, 1e-3)
+        new, _ = mpm.step(mpm.Scene(scene.grid, LAW), mpm.Particles(**parts), 0.0, 1e-3)
         assert_close(both.v[own], new.v)
         assert_close(both.x[own], new.x)
 
@@ -255,7 +255,6 @@ BAD = {
         "none left out",
     ),
     "negative friction": (lambda: mpm.Bodies(-0.1), "friction"),
-    "layers that no body has": (lambda: mpm.Scene(mpm.Grid((8, 8), 0.1, layers=2), LAW), "as many layers"),
     "the total description": (
         lambda: mpm.Scene(mpm.Grid((8, 8), 0.1), (LAW, LAW), bodies=mpm.Bodies(), description=mpm.TotalLagrangian()),
         "no contact",

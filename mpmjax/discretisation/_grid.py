@@ -29,7 +29,7 @@ class Grid(eqx.Module):
         periodic: whether each direction is periodic; one bool for all of them is allowed.
         follow: whether the window moves by whole spacings to stay centred on the bounding box of the particles, with
             `origin` ignored. Results do not depend on the place of the window as long as it holds the particles.
-        layers: how many nodes there are at each place. A scene sets it to the number of its `bodies`.
+        layers: how many nodes there are at each place. A scene sets it to the number of its `bodies`, whatever it was.
 
     Raises:
         ValueError: a shape that is not one to three integers of at least 4, a spacing that is not positive, an origin

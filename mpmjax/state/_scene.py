@@ -110,11 +110,6 @@ class Scene(eqx.Module):
     ):
         self.material = tuple(material) if isinstance(material, list) else material
         layers = 1 if bodies is None else 1 + max(bodies.numbers(len(self.laws)))
-        require(
-            grid.layers in (1, layers),
-            f"A grid has as many layers as the scene has bodies, {layers}, got {grid.layers}: leave out layers, or "
-            "take grid.with_layers(1) of another scene's grid.",
-        )
         self.grid = grid if grid.layers == layers else grid.with_layers(layers)
         self.gravity = (0.0,) * grid.dim if gravity is None else gravity
         self.boundary = (boundary,) if isinstance(boundary, AbstractBoundary) else tuple(boundary)
