@@ -25,7 +25,7 @@ class ParticleMatrices(eqx.Module):
     """A = M + χH on free components and the identity on others, H with one matrix for each particle."""
 
     factors: tuple[Array, Array, Array]
-    """Those of the particles' stencil."""
+    """Terms of the flat node index, weights and their derivatives of the particles' stencil, each (d, s, p)."""
     upper: Float[Array, "t p"]
     """See `resist`."""
     mass: NodeScalar
@@ -98,7 +98,6 @@ class Passes(NamedTuple):
 
 def recur(passes: Passes, limits: Limits, c: Recurrence) -> Recurrence:
     """The state at the end of the recurrence."""
-
     steps = jnp.asarray(limits.steps)
 
     def goes_on(c: Recurrence) -> Bool[Array, ""]:
