@@ -11,8 +11,8 @@ same initial particles, gravity, no walls reached. This package is timed with th
 anything is timed, centres of mass and energies after some steps must agree to what the precision allows.
 The codes take turns, and medians are compared as ratios: seconds on a shared machine mean little. What an iteration of
 the implicit solve costs, in all blocks but the largest, is told from semi-implicit steps of two lengths; and from the
-bytes that any explicit step has to move, the fraction of the memory's bandwidth, which is that of a copy. Memory is that of the
-compiled program: what it is given, what it returns, and its temporaries.
+bytes that any explicit step has to move, the fraction of the memory's bandwidth, which is that of a copy. Memory
+is that of the compiled program: what it is given, what it returns, and its temporaries.
 """
 
 import argparse
