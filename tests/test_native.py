@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, block, thorough
+from helpers import NEEDS_LIBRARY, assert_close, block, thorough
 
 import mpmjax as mpm
 from mpmjax import linalg as la
@@ -19,25 +19,12 @@ from mpmjax.implicit import _recurrence, _vectors
 from mpmjax.native import _library
 
 ROOT = Path(__file__).parents[1]
-NEEDS_LIBRARY = pytest.mark.skipif(not _library.PATH.is_file(), reason="the native sums were not built")
 SIDE = 6
 
 
 @pytest.fixture(autouse=True)
 def as_if_nothing_were_asked(monkeypatch):
     monkeypatch.delenv("MPMJAX_BACKEND", raising=False)
-
-
-@pytest.fixture
-def choose(monkeypatch):
-    """Makes the back end of what is compiled next."""
-
-    def chosen(name):
-        jax.clear_caches()
-        monkeypatch.setenv("MPMJAX_BACKEND", name)
-
-    yield chosen
-    jax.clear_caches()
 
 
 def problem(d, s, c, p, dtype, seed=0, *, wild=True, side=SIDE):
