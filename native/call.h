@@ -100,10 +100,16 @@ struct Call {
 
   // What particles give, of the operands from the k-th on.
   template <class T>
-  void given(size_t k, bool valued, int64_t columns, const T** to) {
-    const size_t count = operands - k;
-    expect(operands >= k && (count == size_t(valued) || count == size_t(valued) + d), "too many or too few given");
-    for (size_t b = 0; fault.empty() && b < count; ++b) to[b + (valued ? 0 : 1)] = at<T>(k + b, {columns, particles});
+  Given<T> given(size_t k, bool valued, int64_t columns) {
+    Given<T> found = {};
+    expect(operands >= k && (operands == k + valued || operands == k + valued + 1), "too many or too few given");
+    if (fault.empty() && valued) found.value = at<T>(k, {columns, particles});
+    if (fault.empty() && operands == k + valued + 1) {
+      found.graded = dim(k + valued, 2);
+      expect(found.graded <= columns, "more columns of gradients than of nodes");
+      found.gradients = at<T>(k + valued, {d, found.graded, particles});
+    }
+    return found;
   }
 };
 

@@ -104,16 +104,24 @@ template <class T>
 void check(const Example<T>& e, const std::vector<const Pool*>& pools) {
   const Shape& sh = e.shape;
   const int64_t rows = e.rows(), n = sh.size();
-  for (int kind = 0; kind < 4; ++kind) {  // of a scatter or pull: all given, value alone, gradients alone; differential
-    const bool valued = kind != 2, graded = kind != 1, differential = kind == 3;
+  // Of a scatter or pull: all given, value alone, gradients alone; differential; gradients with a column less.
+  for (int kind = 0; kind < 5; ++kind) {
+    const bool valued = kind != 2, differential = kind == 3;
+    const int64_t graded = kind == 1 ? 0 : kind == 4 ? sh.columns - 1 : sh.columns;
     const Form form{sh.d, sh.s, differential};
     Scatter<T> scattered = {e.stencils(differential), {}, e.to_nodes.data.get(), nullptr, n, sh.columns};
-    Gather<T> gathered = {e.stencils(differential), e.nodes.data.get(), {}, n, sh.columns};
+    T *value = e.gathered.data.get(), *gradients = value + rows;
+    const Gather<T> gathered = {e.stencils(differential), e.nodes.data.get(), value, gradients, n, sh.columns};
     Pull<T> pulled = {e.stencils(false), e.nodes.data.get(), {}, e.by_w.data.get(), e.by_g.data.get(), n, sh.columns};
-    for (int b = 0; b <= sh.d; ++b) {
-      gathered.sums[b] = e.gathered.data.get() + b * rows;
-      if (b == 0 ? valued : graded) scattered.given[b] = pulled.given[b] = e.given.data.get() + b * rows;
-    }
+    if (valued) scattered.given.value = e.given.data.get();
+    if (kind != 1) scattered.given.gradients = e.given.data.get() + rows;
+    scattered.given.graded = graded;
+    pulled.given = scattered.given;
+    // Where a value, or one of a gradient's columns, is in such arrays.
+    const auto place = [&](int b, int64_t columns, int64_t m, int64_t c, int64_t p) {
+      const int64_t row = b == 0 ? m * sh.columns + c : (m * sh.d + b - 1) * columns + c;
+      return (b == 0 ? 0 : rows) + row * sh.particles + p;
+    };
     std::unique_ptr<Array<T>> bits[4];
     for (const Pool* pool : pools) {
       const bool known = scatter(*pool, form, sh.batch, scattered) && gather(*pool, form, sh.batch, gathered) &&
@@ -137,12 +145,11 @@ void check(const Example<T>& e, const std::vector<const Pool*>& pools) {
       for (int64_t c = 0; c < sh.columns; ++c) {
         const double f = e.nodes[(m * n + clipped) * sh.columns + c];
         const int64_t at = (m * n + node) * sh.columns + c;
-        const int64_t row = (m * sh.columns + c) * sh.particles + p;
         for (int b = 0; b <= sh.d; ++b) {
-          from[b * rows + row] += basis[b] * f;
-          from_scale[b * rows + row] += 30 * std::abs(basis[b] * f) + 30 * std::abs(f);
-          if (!(b == 0 ? valued : graded)) continue;
-          const double a = e.given[b * rows + row];
+          from[place(b, sh.columns, m, c, p)] += basis[b] * f;
+          from_scale[place(b, sh.columns, m, c, p)] += 30 * std::abs(basis[b] * f) + 30 * std::abs(f);
+          if (b == 0 ? !valued : kind == 1) continue;
+          const double a = b > 0 && c >= graded ? 0 : e.given[place(b, graded, m, c, p)];
           if (inside) to[at] += basis[b] * a;
           if (inside) to_scale[at] += 30 * std::abs(basis[b] * a) + 30 * std::abs(a);
           for (int axis = 0; axis < sh.d && !differential; ++axis) {
@@ -316,7 +323,7 @@ int main() {
       std::mt19937 random(i);
       const Example<float> e({2, 3, 1, 9001 + i, 30, 3}, 1, random);
       Scatter<float> task = {e.stencils(false), {}, e.to_nodes.data.get(), nullptr, e.shape.size(), 3};
-      for (int b = 0; b <= 2; ++b) task.given[b] = e.given.data.get() + b * e.rows();
+      task.given = {e.given.data.get(), e.given.data.get() + e.rows(), 3};
       scatter(one, {2, 3, false}, 1, task);
       const Array<float> alone(e.to_nodes);
       for (int k = 0; k < 5; ++k) {

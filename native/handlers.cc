@@ -1,15 +1,16 @@
 // What XLA calls: each sum as a handler of its foreign function interface. Operands are checked against each other, so
 // that nothing is read or written beyond them.
 //
-//   gather   index, weights, derivatives [, their changes], nodes      ->  a, a_b for each direction
+//   gather   index, weights, derivatives [, their changes], nodes      ->  a, a_b
 //   scatter  index, weights, derivatives [, their changes], given ...  ->  nodes
 //   pull     index, weights, derivatives, nodes, given ...             ->  by weights, by derivatives
 //   resist   index, weights, derivatives, matrices, nodes              ->  nodes
 //   recur    index, weights, derivatives, matrices, mass, factor, free, weight, active, x, r, limits  ->  x, numbers
 //
-// Factors are (..., d, s, p), given and gathered (..., c, p), nodes (..., n, c), matrices (..., d² (d² + 1) / 2, p), with
-// the same leading axes everywhere. In a recurrence vectors are (..., n d), mass (..., n), active (..., ⌈n d/64⌉).
-// `valued` says whether the first of the given is the value; `differential` whether changes of the factors follow them.
+// Factors are (..., d, s, p), values (..., c, p) and gradients (..., d, c, p), nodes (..., n, c), matrices
+// (..., d² (d² + 1) / 2, p), with the same leading axes everywhere. Given are a value or gradients or both; gradients may
+// have fewer columns than the value. In a recurrence vectors are (..., n d), mass (..., n), active (..., ⌈n d/64⌉).
+// `valued` says whether there is a value; `differential` whether changes of the factors follow them.
 
 #include "call.h"
 #include "recurrence.h"
@@ -49,9 +50,10 @@ struct GatherOf {
     task.size = call.dim(k, 2);
     task.columns = call.dim(k, 1);
     task.nodes = call.at<T>(k, {task.size, task.columns});
-    call.expect(call.operands == k + 1 && call.buffers.size() == k + 2 + call.d, "too many or too few arrays");
+    call.expect(call.operands == k + 1 && call.buffers.size() == k + 3, "too many or too few arrays");
     call.expect(task.size > 0 || call.particles == 0, "no nodes to gather from");
-    for (int64_t b = 0; b <= call.d; ++b) task.sums[b] = call.at<T>(k + 1 + b, {task.columns, call.particles});
+    task.value = call.at<T>(k + 1, {task.columns, call.particles});
+    task.gradients = call.at<T>(k + 2, {call.d, task.columns, call.particles});
     if (!call.fault.empty()) return true;
     return gather(pool, {int(call.d), int(call.s), differential}, call.batch, task);
   }
@@ -69,7 +71,7 @@ struct ScatterOf {
     task.columns = call.dim(call.operands, 1);
     task.nodes = call.at<T>(call.operands, {task.size, task.columns});
     call.expect(call.buffers.size() == call.operands + 1, "too many or too few results");
-    call.given<T>(k, valued, task.columns, task.given);
+    task.given = call.given<T>(k, valued, task.columns);
     if (!call.fault.empty()) return true;
     return scatter(pool, {int(call.d), int(call.s), differential}, call.batch, task);
   }
@@ -85,7 +87,7 @@ struct PullOf {
     task.size = call.dim(3, 2);
     task.columns = call.dim(3, 1);
     task.nodes = call.at<T>(3, {task.size, task.columns});
-    call.given<T>(4, valued, task.columns, task.given);
+    task.given = call.given<T>(4, valued, task.columns);
     call.expect(call.buffers.size() == call.operands + 2, "too many or too few results");
     call.expect(task.size > 0 || call.particles == 0, "no nodes to gather from");
     task.by_weights = call.at<T>(call.operands, {call.d, call.s, call.particles});
