@@ -338,6 +338,7 @@ void product_call(const Pool& pool, Vectors& vectors) {
   task.active = vectors.active;
   task.image = call.at<T>(7, {task.size});
   task.sum = call.at<T>(8, {});
+  task.whole = true;
   call.expect(task.nodes > 0 ? task.size % task.nodes == 0 : task.size == 0, "nodes with unlike numbers of components");
   if (call.fault.empty()) product(pool, call.batch, task);
 }

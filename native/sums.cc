@@ -28,6 +28,11 @@ int64_t shares(const Pool& pool, Form form, int64_t batch, int64_t particles, in
   return std::max<int64_t>(1, std::min(visits / kLeastVisits, most));
 }
 
+// The blocks of nodes that are wanted of the i-th member.
+const bool* member(const bool* wanted, int64_t i, int64_t numbers) {
+  return wanted == nullptr ? nullptr : wanted + i * ((numbers + kTogether - 1) / kTogether);
+}
+
 template <class T>
 Stencils<T> member(Stencils<T> all, Form form, int64_t i) {
   const int64_t factors = i * form.d * form.s * all.particles;
@@ -61,6 +66,7 @@ Scatter<T> member(Scatter<T> all, Form form, int64_t i) {
   all.stencils = member(all.stencils, form, i);
   all.nodes += i * all.size * all.columns;
   move(all.given, i * all.columns * all.stencils.particles);
+  all.wanted = member(all.wanted, i, all.size * all.columns);
   return all;
 }
 
@@ -82,6 +88,7 @@ Resist<T> member(Resist<T> all, Form form, int64_t i) {
   all.moved += i * all.size * all.columns;
   all.nodes += i * all.size * all.columns;
   move(all.sums, i * all.columns * all.stencils.particles);
+  all.wanted = member(all.wanted, i, all.size * all.columns);
   return all;
 }
 
@@ -206,7 +213,7 @@ bool resist_all(const Pool& pool, Form form, int64_t batch, const Resist<T>& all
   const int64_t rows = batch * all.columns * all.stencils.particles;
   const std::unique_ptr<T[]> stored(new T[form.d * rows]);
   Resist<T> first = all;
-  Scatter<T> rest = {all.stencils, {}, all.nodes, nullptr, all.size, all.columns};
+  Scatter<T> rest = {all.stencils, {}, all.nodes, nullptr, all.size, all.columns, all.wanted};
   for (int b = 1; b <= form.d; ++b) rest.given[b] = first.sums[b] = stored.get() + (b - 1) * rows;
   over_particles(pool, form, batch, first, found->resist_particles);
   division.over_nodes(pool, form, batch, rest, found->scatter);
