@@ -4,8 +4,8 @@
 
 Of the mean of ‖x‖² after some steps, by a factor of the stiffness, in float32:
 
-- scene D: 100 explicit steps of a free 2-D block of 10 000 particles on 128² nodes, beside Taichi's tape (`--peers`),
-  whose value and derivative must agree with ours before anything is timed;
+- scene D: 100 explicit steps of a free 2-D block of 10 000 particles on 128² nodes, beside the tapes of Taichi and Warp
+  (`--peers`), whose value and derivative must agree with ours before anything is timed;
 - a semi-implicit rollout of the same block, 100 steps of twenty times the explicit limit, solver tolerance 1e-5;
 - memory and seconds against the number of steps and of checkpoints: docs/gradient_cost.png and .csv.
 
@@ -69,22 +69,24 @@ def with_checkpoints(size: Callable[..., Any], checkpoints: int) -> Callable[...
 
 
 def scene_d(b: Block, steps: int, repeats: int, peers: bool) -> dict[str, Any]:
-    """Explicit steps, with a checkpoint each and with a tenth as many."""
+    """Explicit steps, with a checkpoint each, and with a quarter and a tenth as many."""
     size = rollout(b, mpm.Explicit(), steps, b.dt)
-    names = {f"{n} checkpoints": n for n in (steps, steps // 10)}
+    names = {f"{n} checkpoints": n for n in (steps, steps // 4, steps // 10)}
     programs = {"forward": compiled(size)} | {name: compiled(with_checkpoints(size, n)) for name, n in names.items()}
     calls = {name: call for name, (call, _) in programs.items()}
     megabytes = {name: size / 1e6 for name, (_, size) in programs.items()}
     if peers:
         from peers.taichi_gradient import TaichiGradient
+        from peers.warp_gradient import WarpGradient
 
-        tape = peer(b, partial(TaichiGradient, steps=steps, dt=b.dt))
         value, slope = (float(a) for a in calls[f"{steps} checkpoints"]())
-        other, other_slope = tape.gradient()
-        if abs(other / value - 1) > 1e-5 or abs(other_slope / slope - 1) > 1e-2:
-            raise SystemExit(f"Taichi disagrees: {other} and {value}, derivative {other_slope} and {slope}.")
-        calls |= {"Taichi, forward": tape.forward, "Taichi, tape": tape.gradient}
-        megabytes["Taichi, tape"] = tape.bytes() / 1e6
+        for name, kind in (("Taichi", TaichiGradient), ("Warp", WarpGradient)):
+            tape = peer(b, partial(kind, steps=steps, dt=b.dt))
+            other, other_slope = tape.gradient()
+            if abs(other / value - 1) > 1e-5 or abs(other_slope / slope - 1) > 1e-2:
+                raise SystemExit(f"{name} disagrees: {other} and {value}, derivative {other_slope} and {slope}.")
+            calls |= {f"{name}, forward": tape.forward, f"{name}, tape": tape.gradient}
+            megabytes[f"{name}, tape"] = tape.bytes() / 1e6
     return {"steps": steps, "seconds": medians(calls, repeats), "megabytes": megabytes}
 
 
@@ -135,7 +137,7 @@ def draw(rows: list[dict[str, Any]]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a small block, few steps, no chart")
-    parser.add_argument("--peers", action="store_true", help="Taichi's tape too")
+    parser.add_argument("--peers", action="store_true", help="the tapes of Taichi and Warp too")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     b = block(*(QUICK["C 2k"] if options.quick else SCENES["C 10k"]), "float32")

@@ -10,12 +10,15 @@
 
 namespace {
 
+using mpmjax::Given;
 using mpmjax::kBlock;
 using mpmjax::Stencils;
 
 constexpr int kSafeBits = 29;  // three terms of fewer bits add up to fewer than 32
 constexpr int kAhead = 4 * kBlock;
 constexpr int kRoom = kBlock + 3;  // a block's rows of four, with room for what is read beyond the last one
+
+MPMJAX_INLINE int smaller(int64_t a, int b) { return a < b ? static_cast<int>(a) : b; }
 
 // A flat index from its terms, wrapping as XLA's integers do.
 MPMJAX_INLINE int32_t after(int32_t first, int32_t term) {
@@ -199,6 +202,26 @@ MPMJAX_APART void read_rows(const T* from, int64_t particles, int count, int use
   join<T, kLanes>(columns, rows);
 }
 
+// The rows of what a block's particles give, up to four columns of the value and with `graded` of each gradient after it.
+template <class T, int d, bool graded>
+MPMJAX_INLINE void read_given(const Given<T>& given, int64_t particles, int64_t column, int used, int64_t start, int count,
+                              Vector<T> (*rows)[kRoom]) {
+  const auto read = [&](const T* from, int64_t columns, Vector<T>* to) MPMJAX_INLINE_LAMBDA {
+    if (from == nullptr || column >= columns) {
+      std::memset(to, 0, kRoom * sizeof *to);
+    } else {
+      read_rows(from + column * particles + start, particles, count, smaller(columns - column, used), to);
+    }
+  };
+  read(given.value, column + used, rows[0]);
+  if constexpr (graded) {
+    const int64_t each = given.graded * particles;
+    for (int b = 0; b < d; ++b) {
+      read(given.gradients == nullptr ? nullptr : given.gradients + b * each, given.graded, rows[b + 1]);
+    }
+  }
+}
+
 // The other way round: writes the rows of a block as columns of (c, p).
 template <class T>
 MPMJAX_APART void write_rows(const Vector<T>* rows, T* to, int64_t particles, int count, int used) {
@@ -206,7 +229,5 @@ MPMJAX_APART void write_rows(const Vector<T>* rows, T* to, int64_t particles, in
   split<T>(rows, columns);
   for (int c = 0; c < used; ++c) write(columns[c], count, to + c * particles);
 }
-
-MPMJAX_INLINE int smaller(int64_t a, int b) { return a < b ? static_cast<int>(a) : b; }
 
 }  // namespace

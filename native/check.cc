@@ -3,19 +3,10 @@
 // particle and one. Any number of threads must give the same bits. Arrays end where they end, so that a sanitizer sees
 // what reads or writes beyond; native/check compiles this with each of them.
 
-#include <cmath>
-#include <condition_variable>
-#include <cstdio>
-#include <cstring>
-#include <deque>
-#include <limits>
-#include <memory>
-#include <mutex>
 #include <random>
 #include <string>
-#include <thread>
-#include <vector>
 
+#include "check.h"
 #include "recurrence.h"
 #include "sums.h"
 #include "targets.h"
@@ -24,65 +15,6 @@
 using namespace mpmjax;
 
 namespace {
-
-class Threads : public Pool {
- public:
-  explicit Threads(int count) : count_(count) {
-    for (int i = 1; i < count; ++i) threads_.emplace_back([this] { work(); });
-  }
-  ~Threads() override {
-    {
-      const std::lock_guard<std::mutex> lock(mutex_);
-      ended_ = true;
-    }
-    changed_.notify_all();
-    for (std::thread& thread : threads_) thread.join();
-  }
-  int threads() const override { return count_; }
-  void schedule(std::function<void()> task) const override {
-    {
-      const std::lock_guard<std::mutex> lock(mutex_);
-      tasks_.push_back(std::move(task));
-    }
-    changed_.notify_one();
-  }
-
- private:
-  void work() {
-    for (;;) {
-      std::unique_lock<std::mutex> lock(mutex_);
-      changed_.wait(lock, [this] { return ended_ || !tasks_.empty(); });
-      if (ended_) return;
-      const std::function<void()> task = std::move(tasks_.front());
-      tasks_.pop_front();
-      lock.unlock();
-      task();
-    }
-  }
-
-  int count_;
-  bool ended_ = false;
-  mutable std::mutex mutex_;
-  mutable std::condition_variable changed_;
-  mutable std::deque<std::function<void()>> tasks_;
-  std::vector<std::thread> threads_;
-};
-
-// Numbers that end where their memory ends.
-template <class T>
-struct Array {
-  std::unique_ptr<T[]> data;
-  int64_t size;
-  explicit Array(int64_t n) : data(new T[n]()), size(n) {}
-  Array(const Array& other) : Array(other.size) { std::memcpy(data.get(), other.data.get(), size * sizeof(T)); }
-  T& operator[](int64_t i) const { return data[i]; }
-};
-
-struct Shape {
-  int d, s;
-  int64_t batch, particles, along, columns;
-  int64_t size() const { return int64_t(std::pow(along, d) + 0.5); }
-};
 
 // The arrays of all sums and of their differentials. Those of a resistance have d columns and matrices of their own.
 template <class T>
@@ -168,44 +100,28 @@ void each_node(const Example<T>& e, bool differential, const Visit& visit) {
   }
 }
 
-int faults = 0;
-
-template <class T>
-void compare(const char* what, const Shape& sh, const Array<T>& found, const std::vector<double>& expected,
-             const std::vector<double>& scale) {
-  const double tolerance = 64 * std::numeric_limits<T>::epsilon();
-  for (int64_t i = 0; i < found.size; ++i) {
-    const double error = std::abs(found[i] - expected[i]);
-    const bool both = !std::isfinite(expected[i]) && !std::isfinite(found[i]);
-    if (both || error <= tolerance * scale[i]) continue;
-    if (++faults < 20) {
-      std::printf("%s d=%d s=%d columns=%lld particles=%lld: [%lld] is %g, expected %g\n", what, sh.d, sh.s,
-                  (long long)sh.columns, (long long)sh.particles, (long long)i, double(found[i]), expected[i]);
-    }
-    return;
-  }
-}
-
-template <class T>
-void expect_same(const char* what, const Array<T>& one, const Array<T>& other) {
-  if (std::memcmp(one.data.get(), other.data.get(), one.size * sizeof(T)) == 0) return;
-  if (++faults < 20) std::printf("%s: other bits with another number of threads\n", what);
-}
-
 template <class T>
 void check(const Example<T>& e, const std::vector<const Pool*>& pools) {
   const Shape& sh = e.shape;
   const int64_t rows = e.rows(), n = sh.size();
-  for (int kind = 0; kind < 4; ++kind) {  // of a scatter or pull: all given, value alone, gradients alone; differential
-    const bool valued = kind != 2, graded = kind != 1, differential = kind == 3;
+  // Of a scatter or pull: all given, value alone, gradients alone; differential; gradients with a column less.
+  for (int kind = 0; kind < 5; ++kind) {
+    const bool valued = kind != 2, differential = kind == 3;
+    const int64_t graded = kind == 1 ? 0 : kind == 4 ? sh.columns - 1 : sh.columns;
     const Form form{sh.d, sh.s, differential};
     Scatter<T> scattered = {e.stencils(differential), {}, e.to_nodes.data.get(), nullptr, n, sh.columns, nullptr};
-    Gather<T> gathered = {e.stencils(differential), e.nodes.data.get(), {}, n, sh.columns};
+    T *value = e.gathered.data.get(), *gradients = value + rows;
+    const Gather<T> gathered = {e.stencils(differential), e.nodes.data.get(), value, gradients, n, sh.columns};
     Pull<T> pulled = {e.stencils(false), e.nodes.data.get(), {}, e.by_w.data.get(), e.by_g.data.get(), n, sh.columns};
-    for (int b = 0; b <= sh.d; ++b) {
-      gathered.sums[b] = e.gathered.data.get() + b * rows;
-      if (b == 0 ? valued : graded) scattered.given[b] = pulled.given[b] = e.given.data.get() + b * rows;
-    }
+    if (valued) scattered.given.value = e.given.data.get();
+    if (kind != 1) scattered.given.gradients = e.given.data.get() + rows;
+    scattered.given.graded = graded;
+    pulled.given = scattered.given;
+    // Where a value, or one of a gradient's columns, is in such arrays.
+    const auto place = [&](int b, int64_t columns, int64_t m, int64_t c, int64_t p) {
+      const int64_t row = b == 0 ? m * sh.columns + c : (m * sh.d + b - 1) * columns + c;
+      return (b == 0 ? 0 : rows) + row * sh.particles + p;
+    };
     std::unique_ptr<Array<T>> bits[4];
     for (const Pool* pool : pools) {
       const bool known = scatter(*pool, form, sh.batch, scattered) && gather(*pool, form, sh.batch, gathered) &&
@@ -229,12 +145,11 @@ void check(const Example<T>& e, const std::vector<const Pool*>& pools) {
       for (int64_t c = 0; c < sh.columns; ++c) {
         const double f = e.nodes[(m * n + clipped) * sh.columns + c];
         const int64_t at = (m * n + node) * sh.columns + c;
-        const int64_t row = (m * sh.columns + c) * sh.particles + p;
         for (int b = 0; b <= sh.d; ++b) {
-          from[b * rows + row] += basis[b] * f;
-          from_scale[b * rows + row] += 30 * std::abs(basis[b] * f) + 30 * std::abs(f);
-          if (!(b == 0 ? valued : graded)) continue;
-          const double a = e.given[b * rows + row];
+          from[place(b, sh.columns, m, c, p)] += basis[b] * f;
+          from_scale[place(b, sh.columns, m, c, p)] += 30 * std::abs(basis[b] * f) + 30 * std::abs(f);
+          if (b == 0 ? !valued : kind == 1) continue;
+          const double a = b > 0 && c >= graded ? 0 : e.given[place(b, graded, m, c, p)];
           if (inside) to[at] += basis[b] * a;
           if (inside) to_scale[at] += 30 * std::abs(basis[b] * a) + 30 * std::abs(a);
           for (int axis = 0; axis < sh.d && !differential; ++axis) {
@@ -335,78 +250,6 @@ void check_in_order(Shape shape, std::mt19937& random, const std::vector<const P
   check_resistance(e, pools);
 }
 
-// Vectors of which some blocks are zero, combined in place and elsewhere; whatever is passed over stays or becomes zero.
-template <class T>
-void check_vectors(int64_t size, bool in_place, std::mt19937& random, const std::vector<const Pool*>& pools) {
-  const int64_t batch = 2, blocks = (size + kTogether - 1) / kTogether;
-  std::normal_distribution<T> normal;
-  const Array<T> a(batch * size), b(a.size), c(a.size), d(a.size), weight(a.size), scales(2 * batch), sum(batch);
-  const Array<bool> active(batch * blocks);
-  for (int64_t i = 0; i < active.size; ++i) active[i] = random() % 3 == 0;
-  for (int64_t i = 0; i < a.size; ++i) {
-    weight[i] = normal(random);
-    if (!active[i / size * blocks + i % size / kTogether]) continue;
-    a[i] = normal(random), b[i] = normal(random), c[i] = normal(random), d[i] = normal(random);
-  }
-  for (int64_t i = 0; i < scales.size; ++i) scales[i] = normal(random);
-  std::vector<double> y(a.size), z(a.size), total(batch), ones(a.size, 30), bound(batch, 1);
-  for (int64_t i = 0; i < a.size; ++i) {
-    y[i] = a[i] + double(scales[i / size * 2]) * b[i];
-    z[i] = c[i] + double(scales[i / size * 2 + 1]) * d[i];
-    total[i / size] += weight[i] * z[i] * z[i];
-    bound[i / size] += std::abs(weight[i] * z[i] * z[i]);
-  }
-  std::unique_ptr<Array<T>> bits;
-  for (const Pool* pool : pools) {
-    Array<T> to_y(in_place ? b : a), to_z(in_place ? d : c);
-    for (int64_t i = 0; i < to_y.size && !in_place; ++i) to_y[i] = to_z[i] = 7;
-    combine(*pool, batch, Combine<T>{a.data.get(), in_place ? to_y.data.get() : b.data.get(), c.data.get(),
-                                     in_place ? to_z.data.get() : d.data.get(), scales.data.get(), weight.data.get(),
-                                     active.data.get(), to_y.data.get(), to_z.data.get(), sum.data.get(), size});
-    const Shape shape = {1, 0, batch, size, 0, 0};
-    compare("combine y", shape, to_y, y, ones);
-    compare("combine z", shape, to_z, z, ones);
-    compare("combine sum", shape, sum, total, bound);
-    if (bits == nullptr) bits = std::make_unique<Array<T>>(sum);
-    expect_same("a norm", *bits, sum);
-  }
-}
-
-// What is left of a product, in place; nothing is free and all is zero where blocks are passed over.
-template <class T>
-void check_product(int64_t nodes, int64_t each, std::mt19937& random, const std::vector<const Pool*>& pools) {
-  const int64_t batch = 2, size = nodes * each, blocks = (size + kTogether - 1) / kTogether;
-  std::normal_distribution<T> normal;
-  const Array<T> force(batch * size), v(force.size), weight(force.size), mass(batch * nodes), factor(batch), sum(batch);
-  const Array<bool> active(batch * blocks), free(force.size);
-  for (int64_t i = 0; i < active.size; ++i) active[i] = random() % 3 == 0;
-  for (int64_t i = 0; i < mass.size; ++i) mass[i] = normal(random);
-  for (int64_t i = 0; i < factor.size; ++i) factor[i] = normal(random);
-  std::vector<double> image(force.size), total(batch), scale(force.size, 1), bound(batch, 1);
-  for (int64_t i = 0; i < force.size; ++i) {
-    const int64_t m = i / size;
-    force[i] = normal(random), weight[i] = 1 + std::abs(normal(random));
-    if (!active[m * blocks + i % size / kTogether]) continue;
-    v[i] = normal(random), free[i] = random() % 3 > 0;
-    const double held = mass[m * nodes + i % size / each] * v[i], pushed = double(factor[m]) * force[i];
-    const double of_a = free[i] ? held + pushed : double(v[i]);
-    image[i] = of_a / weight[i], scale[i] += std::abs(held) + std::abs(pushed);
-    total[m] += of_a * v[i], bound[m] += scale[i] * std::abs(v[i]);
-  }
-  std::unique_ptr<Array<T>> bits;
-  for (const Pool* pool : pools) {
-    const Array<T> to(force);
-    product(*pool, batch, Product<T>{to.data.get(), v.data.get(), mass.data.get(), factor.data.get(), free.data.get(),
-                                     weight.data.get(), active.data.get(), to.data.get(), sum.data.get(), size, nodes,
-                                     true});
-    const Shape shape = {1, 0, batch, size, 0, 0};
-    compare("product", shape, to, image, scale);
-    compare("product's sum", shape, sum, total, bound);
-    if (bits == nullptr) bits = std::make_unique<Array<T>>(sum);
-    expect_same("a product's sum", *bits, sum);
-  }
-}
-
 // Recurrences of a batch: the residual never grows, a member that may take no step is left as it was, and one that is not
 // finite spoils no other. `e` has no indices beyond the window.
 template <class T>
@@ -481,12 +324,6 @@ int check_all(const std::vector<const Pool*>& pools) {
   }
   const Example<T> large({2, 3, 3, 20011, 40, 1}, 0, random);
   check_recurrence(large, random, pools), ++examples;
-  for (const int64_t size : {0, 1, 64, 200, 100003}) {
-    for (const bool in_place : {false, true}) check_vectors<T>(size, in_place, random, pools), ++examples;
-  }
-  for (const int64_t nodes : {0, 1, 64, 200, 50003}) {
-    for (int each = 1; each <= 3; ++each) check_product<T>(nodes, each, random, pools), ++examples;
-  }
   return examples + 1;
 }
 
@@ -495,7 +332,7 @@ int check_all(const std::vector<const Pool*>& pools) {
 int main() {
   const Threads one(1), two(2), five(5);
   const std::vector<const Pool*> pools = {&one, &two, &five};
-  int examples = check_all<float>(pools) + check_all<double>(pools);
+  int examples = check_all<float>(pools) + check_all<double>(pools) + check_arrays(pools);
   // Several callers at a time, as XLA's, on one pool.
   std::vector<std::thread> callers;
   for (int i = 0; i < 3; ++i) {
@@ -503,7 +340,7 @@ int main() {
       std::mt19937 random(i);
       const Example<float> e({2, 3, 1, 9001 + i, 30, 3}, 1, random);
       Scatter<float> task = {e.stencils(false), {}, e.to_nodes.data.get(), nullptr, e.shape.size(), 3, nullptr};
-      for (int b = 0; b <= 2; ++b) task.given[b] = e.given.data.get() + b * e.rows();
+      task.given = {e.given.data.get(), e.given.data.get() + e.rows(), 3};
       scatter(one, {2, 3, false}, 1, task);
       const Array<float> alone(e.to_nodes);
       for (int k = 0; k < 5; ++k) {

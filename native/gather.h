@@ -85,8 +85,10 @@ void gather_columns(const Gather<T>& task, int64_t first, int64_t last) {
         sums[0][q] = found.value;
         for (int b = 0; b < d; ++b) sums[b + 1][q] = found.gradients[b];
       });
-      for (int b = 0; b <= d; ++b) {
-        write_rows<T>(sums[b], task.sums[b] + c * particles + start, particles, count, rows.used);
+      write_rows<T>(sums[0], task.value + c * particles + start, particles, count, rows.used);
+      for (int b = 0; b < d; ++b) {
+        T* gradient = task.gradients + b * task.columns * particles;
+        write_rows<T>(sums[b + 1], gradient + c * particles + start, particles, count, rows.used);
       }
     }
   }

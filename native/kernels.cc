@@ -1,8 +1,11 @@
-// The sums for every dimension and kernel, compiled once for each instruction set: MPMJAX_TARGET is its name.
+// The sums for every dimension and kernel, and the decompositions of matrices, compiled once for each instruction set:
+// MPMJAX_TARGET is its name.
 
+#include "eigen.h"
 #include "gather.h"
 #include "pull.h"
 #include "resist.h"
+#include "rotation.h"
 #include "scatter.h"
 #include "targets.h"
 
@@ -39,12 +42,19 @@ const Kernels<T>* of(int d, int s, bool differential) {
   }
 }
 
+template <class T>
+const mpmjax::MatrixKernels<T>& matrices() {
+  static constexpr mpmjax::MatrixKernels<T> kernels = {eigen<T>, rotation<T>};
+  return kernels;
+}
+
 }  // namespace
 
 namespace mpmjax {
 
 #define MPMJAX_JOINED(a, b) a##b
 #define MPMJAX_KERNELS(target) MPMJAX_JOINED(kernels_, target)
+#define MPMJAX_MATRIX_KERNELS(target) MPMJAX_JOINED(matrix_kernels_, target)
 
 const Kernels<float>* MPMJAX_KERNELS(MPMJAX_TARGET)(float, int d, int s, bool differential) {
   return of<float>(d, s, differential);
@@ -53,5 +63,8 @@ const Kernels<float>* MPMJAX_KERNELS(MPMJAX_TARGET)(float, int d, int s, bool di
 const Kernels<double>* MPMJAX_KERNELS(MPMJAX_TARGET)(double, int d, int s, bool differential) {
   return of<double>(d, s, differential);
 }
+
+const MatrixKernels<float>& MPMJAX_MATRIX_KERNELS(MPMJAX_TARGET)(float) { return matrices<float>(); }
+const MatrixKernels<double>& MPMJAX_MATRIX_KERNELS(MPMJAX_TARGET)(double) { return matrices<double>(); }
 
 }  // namespace mpmjax

@@ -37,10 +37,19 @@ struct Stencils {
 template <class T>
 struct Gather {
   Stencils<T> stencils;
-  const T* nodes;          // (n, c)
-  T* sums[kMostAxes + 1];  // a, then a_b for each direction, each (c, p)
-  int64_t size;            // n
-  int64_t columns;         // c
+  const T* nodes;   // (n, c)
+  T* value;         // a, (c, p)
+  T* gradients;     // a_b for each direction, (d, c, p)
+  int64_t size;     // n
+  int64_t columns;  // c
+};
+
+// What particles give in a scatter or a pull.
+template <class T>
+struct Given {
+  const T* value;      // a, (c, p), or null for zero
+  const T* gradients;  // a_b, (d, k, p), zero in columns from k on; or null for zero
+  int64_t graded;      // k
 };
 
 // The flat indices that a block of particles may reach.
@@ -51,9 +60,9 @@ struct Range {
 template <class T>
 struct Scatter {
   Stencils<T> stencils;
-  const T* given[kMostAxes + 1];  // a, null for zero, and a_b, all null for zero, each (c, p)
-  T* nodes;                       // (n, c)
-  const Range* ranges;            // of each block, or null
+  Given<T> given;
+  T* nodes;             // (n, c)
+  const Range* ranges;  // of each block, or null
   int64_t size;
   int64_t columns;
   const bool* wanted;  // which of the nodes' ⌈n c/64⌉ blocks are, null for all; others may become anything
@@ -62,10 +71,10 @@ struct Scatter {
 template <class T>
 struct Pull {
   Stencils<T> stencils;
-  const T* nodes;                 // (n, c)
-  const T* given[kMostAxes + 1];  // as in a scatter
-  T* by_weights;                  // (d, s, p)
-  T* by_derivatives;              // (d, s, p)
+  const T* nodes;     // (n, c)
+  Given<T> given;
+  T* by_weights;      // (d, s, p)
+  T* by_derivatives;  // (d, s, p)
   int64_t size;
   int64_t columns;
 };
@@ -75,11 +84,11 @@ struct Pull {
 template <class T>
 struct Resist {
   Stencils<T> stencils;
-  const T* matrices;       // K, (d² (d² + 1) / 2, p)
-  const T* moved;          // u, (n, d)
-  T* nodes;                // (n, d)
-  T* sums[kMostAxes + 1];  // r_b for each direction after a null, each (d, p), where they are stored
-  const Range* ranges;     // of each block, or null
+  const T* matrices;    // K, (d² (d² + 1) / 2, p)
+  const T* moved;       // u, (n, d)
+  T* nodes;             // (n, d)
+  T* gradients;         // r_b for each direction, (d, d, p), where they are stored
+  const Range* ranges;  // of each block, or null
   int64_t size;
   int64_t columns;  // d
   const bool* wanted;  // as in a scatter

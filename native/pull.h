@@ -102,13 +102,7 @@ void pull_columns(const Pull<T>& task, int64_t first, int64_t last) {
       const NodeRows<T, s, columns> rows(task.nodes, task.size, task.columns, c);
       const Present<Row<T, 1, kLanes, 1>> present(rows.used);
       Vector<T> given[d + 1][kRoom];
-      for (int b = 0; b <= d; ++b) {
-        if (task.given[b] == nullptr) {
-          std::memset(given[b], 0, sizeof given[b]);
-        } else {
-          read_rows(task.given[b] + c * particles + start, particles, count, rows.used, given[b]);
-        }
-      }
+      read_given<T, d, true>(task.given, particles, c, rows.used, start, count, given);
       for (int q = 0; q < kBlock; ++q) {
         const auto add = [&](int a, int i, Vector<T> by_weight, Vector<T> by_derivative) MPMJAX_INLINE_LAMBDA {
           const auto put = [&](Vector<T>& to, Vector<T> found) MPMJAX_INLINE_LAMBDA {
@@ -126,8 +120,8 @@ void pull_columns(const Pull<T>& task, int64_t first, int64_t last) {
       }
     }
     // What has no part in B is zero, also where it would be zero times what is not finite.
-    if (task.given[1] == nullptr) std::memset(by_derivatives, 0, sizeof by_derivatives);
-    if (task.given[0] == nullptr && d == 1) std::memset(by_weights, 0, sizeof by_weights);
+    if (task.given.gradients == nullptr) std::memset(by_derivatives, 0, sizeof by_derivatives);
+    if (task.given.value == nullptr && d == 1) std::memset(by_weights, 0, sizeof by_weights);
     for (int a = 0; a < d; ++a) {
       for (int i = 0; i < s; ++i) {
         const int64_t at = (a * s + i) * particles + start;

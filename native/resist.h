@@ -83,7 +83,8 @@ void resist_particles(const Resist<T>& task, int64_t first, int64_t last) {
     block.read(task.stencils, start, count);
     Vector<T> rows[d][kRoom];
     resist_block<T, d, s>(task, block, start, count, rows);
-    for (int b = 0; b < d; ++b) write_rows<T>(rows[b], task.sums[b + 1] + start, task.stencils.particles, count, d);
+    const int64_t particles = task.stencils.particles;
+    for (int b = 0; b < d; ++b) write_rows<T>(rows[b], task.gradients + b * d * particles + start, particles, count, d);
   }
 }
 

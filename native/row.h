@@ -11,14 +11,6 @@
 
 namespace {
 
-#if defined(__AVX512F__)
-constexpr int kWidest = 64;  // bytes of a vector
-#elif defined(__AVX__)
-constexpr int kWidest = 32;
-#else
-constexpr int kWidest = 16;
-#endif
-
 constexpr int power_of_two(int least) { return least <= 1 ? 1 : 2 * power_of_two((least + 1) / 2); }
 
 // How many nodes, at most so many, fit into one vector.

@@ -215,13 +215,7 @@ void scatter_columns(const Scatter<T>& task, int64_t column, int64_t first, int6
   const int64_t particles = task.stencils.particles;
   const NodeSums<T, s, columns> nodes(task.nodes, task.columns, column, first, last);
   const auto give = [&](const auto&, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
-    for (int b = 0; b < (graded ? d + 1 : 1); ++b) {
-      if (task.given[b] == nullptr) {
-        std::memset(rows[b], 0, sizeof rows[b]);
-      } else {
-        read_rows(task.given[b] + column * particles + start, particles, count, nodes.used, rows[b]);
-      }
-    }
+    read_given<T, d, graded>(task.given, particles, column, nodes.used, start, count, rows);
   };
   add_blocks<T, d, s, differential, graded, columns>(task.stencils, task.ranges, nodes, give);
 }
@@ -245,7 +239,7 @@ void scatter_given(const Scatter<T>& task, int64_t first, int64_t last) {
 
 template <class T, int d, int s, bool differential>
 void scatter(const Scatter<T>& task, int64_t first, int64_t last) {
-  if (task.given[1] == nullptr) {
+  if (task.given.gradients == nullptr) {
     scatter_given<T, d, s, differential, false>(task, first, last);
   } else {
     scatter_given<T, d, s, differential, true>(task, first, last);

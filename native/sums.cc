@@ -47,17 +47,18 @@ Stencils<T> member(Stencils<T> all, Form form, int64_t i) {
 }
 
 template <class T>
-void move(T** rows, int64_t by) {
-  for (int b = 0; b <= kMostAxes; ++b) {
-    if (rows[b] != nullptr) rows[b] += by;
-  }
+Given<T> member(Given<T> all, Form form, int64_t i, int64_t columns, int64_t particles) {
+  if (all.value != nullptr) all.value += i * columns * particles;
+  if (all.gradients != nullptr) all.gradients += i * form.d * all.graded * particles;
+  return all;
 }
 
 template <class T>
 Gather<T> member(Gather<T> all, Form form, int64_t i) {
   all.stencils = member(all.stencils, form, i);
   all.nodes += i * all.size * all.columns;
-  move(all.sums, i * all.columns * all.stencils.particles);
+  all.value += i * all.columns * all.stencils.particles;
+  all.gradients += i * form.d * all.columns * all.stencils.particles;
   return all;
 }
 
@@ -65,7 +66,7 @@ template <class T>
 Scatter<T> member(Scatter<T> all, Form form, int64_t i) {
   all.stencils = member(all.stencils, form, i);
   all.nodes += i * all.size * all.columns;
-  move(all.given, i * all.columns * all.stencils.particles);
+  all.given = member(all.given, form, i, all.columns, all.stencils.particles);
   all.wanted = member(all.wanted, i, all.size * all.columns);
   return all;
 }
@@ -77,7 +78,7 @@ Pull<T> member(Pull<T> all, Form form, int64_t i) {
   all.nodes += i * all.size * all.columns;
   all.by_weights += factors;
   all.by_derivatives += factors;
-  move(all.given, i * all.columns * all.stencils.particles);
+  all.given = member(all.given, form, i, all.columns, all.stencils.particles);
   return all;
 }
 
@@ -87,7 +88,7 @@ Resist<T> member(Resist<T> all, Form form, int64_t i) {
   all.matrices += i * form.d * form.d * (form.d * form.d + 1) / 2 * all.stencils.particles;
   all.moved += i * all.size * all.columns;
   all.nodes += i * all.size * all.columns;
-  move(all.sums, i * all.columns * all.stencils.particles);
+  if (all.gradients != nullptr) all.gradients += i * form.d * all.columns * all.stencils.particles;
   all.wanted = member(all.wanted, i, all.size * all.columns);
   return all;
 }
@@ -210,11 +211,11 @@ bool resist_all(const Pool& pool, Form form, int64_t batch, const Resist<T>& all
     return true;
   }
   // Each particle once, and then a scatter: the parts would do most particles several times.
-  const int64_t rows = batch * all.columns * all.stencils.particles;
-  const std::unique_ptr<T[]> stored(new T[form.d * rows]);
+  const std::unique_ptr<T[]> stored(new T[batch * form.d * all.columns * all.stencils.particles]);
   Resist<T> first = all;
-  Scatter<T> rest = {all.stencils, {}, all.nodes, nullptr, all.size, all.columns, all.wanted};
-  for (int b = 1; b <= form.d; ++b) rest.given[b] = first.sums[b] = stored.get() + (b - 1) * rows;
+  first.gradients = stored.get();
+  const Given<T> given = {nullptr, stored.get(), all.columns};
+  const Scatter<T> rest = {all.stencils, given, all.nodes, nullptr, all.size, all.columns, all.wanted};
   over_particles(pool, form, batch, first, found->resist_particles);
   division.over_nodes(pool, form, batch, rest, found->scatter);
   return true;

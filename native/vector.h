@@ -18,6 +18,14 @@ namespace {
 
 constexpr int kLanes = 4;
 
+#if defined(__AVX512F__)
+constexpr int kWidest = 64;  // bytes of the widest vector
+#elif defined(__AVX__)
+constexpr int kWidest = 32;
+#else
+constexpr int kWidest = 16;
+#endif
+
 template <class T>
 struct VectorOf {
   typedef T type __attribute__((vector_size(kLanes * sizeof(T))));

@@ -10,6 +10,7 @@ import matplotlib
 matplotlib.use("Agg")
 
 import jax
+import pytest
 from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
@@ -43,3 +44,15 @@ def _maps() -> int:
 
 MOST_MAPS = 30_000
 """Memory maps up to which a module's programs are kept."""
+
+
+@pytest.fixture
+def choose(monkeypatch):
+    """Makes the back end of what is compiled next."""
+
+    def chosen(name):
+        jax.clear_caches()
+        monkeypatch.setenv("MPMJAX_BACKEND", name)
+
+    yield chosen
+    jax.clear_caches()

@@ -12,6 +12,7 @@ import pytest
 import mpmjax as mpm
 from mpmjax._types import Array
 from mpmjax.io import _schema
+from mpmjax.native import _library
 
 DIMS = (1, 2, 3)
 KERNELS = {"linear": mpm.BSpline(1), "quadratic": mpm.BSpline(2), "cubic": mpm.BSpline(3)}
@@ -102,6 +103,9 @@ def ids(registry: dict, default: str | Collection[str] | None = None, thorough: 
         further = pytest.mark.thorough if name in thorough else pytest.mark.slow
         values.append(value if name in default else pytest.param(value, marks=further))
     return {"argvalues": values, "ids": list(registry)}
+
+
+NEEDS_LIBRARY = pytest.mark.skipif(not _library.PATH.is_file(), reason="the native library was not built")
 
 
 def thorough(*cases: object) -> list:

@@ -17,9 +17,9 @@ FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.r
 ROOMS = (
     "checks",
     "autodiff",
+    "native",
     "linalg",
     "material",
-    "native",
     "discretisation",
     "geometry",
     "boundary",

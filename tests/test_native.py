@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, block, thorough
+from helpers import NEEDS_LIBRARY, assert_close, block, thorough
 
 import mpmjax as mpm
 from mpmjax import linalg as la
@@ -19,25 +19,12 @@ from mpmjax.implicit import _recurrence, _vectors
 from mpmjax.native import _library
 
 ROOT = Path(__file__).parents[1]
-NEEDS_LIBRARY = pytest.mark.skipif(not _library.PATH.is_file(), reason="the native sums were not built")
 SIDE = 6
 
 
 @pytest.fixture(autouse=True)
 def as_if_nothing_were_asked(monkeypatch):
     monkeypatch.delenv("MPMJAX_BACKEND", raising=False)
-
-
-@pytest.fixture
-def choose(monkeypatch):
-    """Makes the back end of what is compiled next."""
-
-    def chosen(name):
-        jax.clear_caches()
-        monkeypatch.setenv("MPMJAX_BACKEND", name)
-
-    yield chosen
-    jax.clear_caches()
 
 
 def problem(d, s, c, p, dtype, seed=0, *, wild=True, side=SIDE):
@@ -70,14 +57,20 @@ def resisted(*args):
 def resisted_in_parts(index, w, g, upper, u):
     """By a gather, a matrix a particle and a scatter, as they are written in JAX."""
     d = len(index)
-    slopes = jnp.concatenate(sums._gather(index, w, g, u, unroll=False)[1:])
+    slopes = sums._gather(index, w, g, u, unroll=False)[1].reshape(d * d, -1)
     flux = jnp.einsum("ijp,jp->ip", la.symmetric(upper), slopes).reshape(d, d, -1)
-    return sums._scatter(index, w, g, *flux, valued=False, size=len(u), unroll=False)[0]
+    return sums._scatter(index, w, g, flux, valued=False, size=len(u), unroll=False)[0]
+
+
+def parts_of(given, valued, graded):
+    """The value and the gradients (d, c, p), either or both; with `graded` a number of columns, only so many."""
+    gradients = given[1:] if graded is True else given[1:, :graded]
+    return [given[0]] * valued + [gradients] * (graded is not False)
 
 
 def native(index, w, g, given, nodes, valued=True, graded=True):
     """All three sums by the primitives."""
-    parts = [*given[:1]] * valued + [*given[1:]] * graded
+    parts = parts_of(given, valued, graded)
     params = {"valued": valued, "batched": 0}
     return (
         sums.gather_p.bind(index, w, g, nodes, batched=0),
@@ -88,7 +81,7 @@ def native(index, w, g, given, nodes, valued=True, graded=True):
 
 def written(index, w, g, given, nodes, valued=True, graded=True):
     """The same as they are written in JAX."""
-    parts = [*given[:1]] * valued + [*given[1:]] * graded
+    parts = parts_of(given, valued, graded)
     return (
         sums._gather(index, w, g, nodes, unroll=False),
         sums._scatter(index, w, g, *parts, valued=valued, size=nodes.shape[0], unroll=False),
@@ -96,18 +89,19 @@ def written(index, w, g, given, nodes, valued=True, graded=True):
     )
 
 
-def agree(found, expected, dtype):
-    """Equal to rounding, relative to the largest number."""
-    jax.tree.map(lambda a, b: assert_close(a, b, 100 * float(jnp.finfo(dtype).eps)), found, expected)
+def agree(found, expected, dtype, roundings=100):
+    """Equal to so many roundings of the largest number."""
+    jax.tree.map(lambda a, b: assert_close(a, b, roundings * float(jnp.finfo(dtype).eps)), found, expected)
 
 
 @NEEDS_LIBRARY
 @pytest.mark.parametrize("dtype", ["float32", *thorough("float64")])
 @pytest.mark.parametrize(("d", "s", "c"), [(2, 3, 3), *thorough((1, 2, 1), (1, 4, 5), (2, 4, 4), (3, 2, 2), (3, 3, 6))])
 def test_back_ends_agree(d, s, c, dtype):
-    """Over random inputs, whichever part is given, with indices beyond the window; and in a batch."""
+    """Over random inputs, whichever part is given, also gradients of fewer columns, with indices beyond the window; and
+    in a batch."""
     args = problem(d, s, c, 45, dtype)
-    for which in ({}, {"graded": False}, {"valued": False}):
+    for which in ({}, {"graded": False}, {"valued": False}, {"graded": c - 1}):
         agree(jax.jit(partial(native, **which))(*args), jax.jit(partial(written, **which))(*args), dtype)
     other = problem(d, s, c, 45, dtype, seed=1)
     both = [jnp.stack(pair) for pair in zip(args, other, strict=True)]
@@ -117,12 +111,14 @@ def test_back_ends_agree(d, s, c, dtype):
 
 
 @NEEDS_LIBRARY
-@pytest.mark.parametrize("d", [1, *thorough(2, 3)])
-def test_derivatives_agree(d):
-    """First in both modes and second in all four orders of modes, by everything. All within the window: beyond it,
-    where a gather clips, its derivative drops."""
+@pytest.mark.parametrize(("d", "graded"), [(1, 1), *thorough((1, True), (2, True), (2, 1), (3, True))])
+def test_derivatives_agree(d, graded):
+    """First in both modes and second in all four orders of modes, by everything, gradients of fewer columns too. All
+    within the window: beyond it, where a gather clips, its derivative drops."""
     index, *floats = problem(d, 3, 2, 9, "float64", wild=False)
-    to = jax.tree.map(lambda a: jnp.cos(jnp.arange(a.size, dtype=a.dtype)).reshape(a.shape), native(index, *floats))
+    to = jax.tree.map(
+        lambda a: jnp.cos(jnp.arange(a.size, dtype=a.dtype)).reshape(a.shape), native(index, *floats, graded=graded)
+    )
     along = tuple(jnp.sin(jnp.arange(a.size, dtype=a.dtype)).reshape(a.shape) for a in floats)
 
     def derivatives(of):
@@ -139,7 +135,8 @@ def test_derivatives_agree(d):
         every = slope(loss), grad, slope(slope(loss)), slope(grad), jax.grad(slope(loss), by), back
         return jax.jit(lambda *a: [f(*a) for f in every])(*floats)
 
-    agree(derivatives(native), derivatives(written), "float64")
+    native_, written_ = (partial(of, graded=graded) for of in (native, written))
+    agree(derivatives(native_), derivatives(written_), "float64", 500)  # slopes along all at once are sums that cancel
 
 
 @NEEDS_LIBRARY

@@ -8,7 +8,6 @@ from functools import reduce
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax.core import ShapedArray
 from jax.interpreters import ad
 
@@ -39,10 +38,9 @@ def resist_by(factors: tuple[Array, Array, Array], upper: Float[Array, "t p"], u
 def _resist(*args: Array, unroll: bool = False) -> list[Array]:
     del unroll  # the sums know
     *factors, upper, u = args
-    _, *slopes = gather_p.bind(*factors, u, batched=0)
-    d = len(slopes)
-    flux = la.matmul(la.symmetric(upper), jnp.concatenate(slopes)[:, None])
-    return scatter_p.bind(*factors, *flux.reshape(d, d, -1), valued=False, size=len(u), batched=0)
+    _, slopes = gather_p.bind(*factors, u, batched=0)
+    flux = la.matmul(la.symmetric(upper), slopes.reshape(len(slopes) ** 2, 1, -1))
+    return scatter_p.bind(*factors, flux.reshape(slopes.shape), valued=False, size=len(u), batched=0)
 
 
 def _like_nodes(*args: ShapedArray) -> list[tuple]:

@@ -174,11 +174,9 @@ def p2g(
     else:  # w (x_i − x_p) = D g, with g the moving-least-squares gradient
         used = stencil.least_squares
         gradient_terms.append(mass * C * stencil.moment)
-    gradients = None
-    if gradient_terms:
-        gradients = jnp.pad(jnp.swapaxes(sum(gradient_terms), 0, 1), ((0, 0), (1, 0), (0, 0)))
-    nodes = scatter(used, jnp.concatenate([mass[None], mass * v]), gradients, size)
-    return nodes[:, 0], nodes[:, 1:]
+    gradients = jnp.swapaxes(sum(gradient_terms), 0, 1) if gradient_terms else None
+    nodes = scatter(used, jnp.concatenate([mass * v, mass[None]]), gradients, size)  # gradients give momentum alone
+    return nodes[:, -1], nodes[:, :-1]
 
 
 def g2p(

@@ -13,7 +13,7 @@ would transpose every read of a node to an addition of whole grids. On CPUs the 
 nothing else; as written here they are the reference, and what other devices run.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial, reduce
 from typing import Any
 
@@ -39,12 +39,12 @@ def gather(stencil: Stencil, nodes: Float[Array, "n c"]) -> tuple[Float[Array, "
         stencil: stencil of the particles.
         nodes: f_i, shape (n, c).
     """
-    value, *gradients = gather_p.bind(*stencil.factors, nodes, batched=0)
-    return value, jnp.stack(gradients)
+    value, gradients = gather_p.bind(*stencil.factors, nodes, batched=0)
+    return value, gradients
 
 
 def scatter(
-    stencil: Stencil, value: Float[Array, "c p"] | None, gradients: Float[Array, "d c p"] | None, size: int
+    stencil: Stencil, value: Float[Array, "c p"] | None, gradients: Float[Array, "d k p"] | None, size: int
 ) -> Float[Array, "n c"]:
     """Sums at the nodes Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b), the transpose of `gather`.
 
@@ -53,10 +53,11 @@ def scatter(
     Args:
         stencil: stencil of the particles.
         value: a_p, shape (c, p), or None for zero.
-        gradients: a_p,b for each direction b, shape (d, c, p), or None for zero.
+        gradients: a_p,b for each direction b, shape (d, k, p), or None for zero. Where it has fewer columns than the
+            value, k < c, it is zero in those that come after.
         size: number of nodes n.
     """
-    given = [*([] if value is None else [value]), *([] if gradients is None else gradients)]
+    given = [a for a in (value, gradients) if a is not None]
     return scatter_p.bind(*stencil.factors, *given, valued=value is not None, size=size, batched=0)[0]
 
 
@@ -83,7 +84,7 @@ def _along(axis: int, factors: tuple[Array, ...], step: Callable[..., tuple], st
 
 
 def _gather(*args: Array, unroll: bool) -> list[Array]:
-    """∂B/∂a: value and gradients, each (c, p)."""
+    """∂B/∂a: the value (c, p), and the gradients (d, c, p)."""
     *factors, nodes = args
     d, _, p = factors[0].shape
 
@@ -100,13 +101,15 @@ def _gather(*args: Array, unroll: bool) -> list[Array]:
         zeros = [jnp.zeros((p, nodes.shape[1]), nodes.dtype)] * (d - axis + 1)
         return _along(axis, tuple(factors), add, zeros, unroll)[0]
 
-    return [rows.T for rows in summed(0, jnp.zeros((p,), factors[0].dtype))]
+    value, *gradients = (rows.T for rows in summed(0, jnp.zeros((p,), factors[0].dtype)))
+    return [value, jnp.stack(gradients)]
 
 
 def _scatter(*args: Array, valued: bool, size: int, unroll: bool) -> list[Array]:
     """∂B/∂f: the nodes' sums, (n, c)."""
     factors, given = args[:3], args[3:]
-    d, _, p = factors[0].shape
+    columns, p = given[0].shape[-2:]
+    d = len(factors[0])
 
     def add(axis: int, first: Array, value: Array | None, gradients: list[Array], nodes: Array) -> Array:
         """The nodes with the sums along this axis and those after it added, from a first node."""
@@ -120,21 +123,28 @@ def _scatter(*args: Array, valued: bool, size: int, unroll: bool) -> list[Array]
         return _along(axis, factors, step, nodes, unroll)[0]
 
     blocks = []
-    for start in range(0, given[0].shape[0], _ROW):
-        block = [a[start : start + _ROW] for a in given]
-        width = block[0].shape[0]
-        spare = (1 << (width - 1).bit_length()) - width
-        rows = [jnp.pad(a, ((0, spare), (0, 0))).T for a in block]
-        value, gradients = (rows[0], rows[1:]) if valued else (None, rows)
-        nodes = jnp.zeros((size, width + spare), given[0].dtype)
+    for start in range(0, columns, _ROW):
+        width = min(columns - start, _ROW)
+        value, gradients = _rows(given, valued, start, 1 << (width - 1).bit_length())
+        nodes = jnp.zeros((size, 1 << (width - 1).bit_length()), given[0].dtype)
         blocks.append(add(0, jnp.zeros((p,), factors[0].dtype), value, gradients, nodes)[:, :width])
     return [jnp.concatenate(blocks, axis=1)]
+
+
+def _rows(given: Sequence[Array], valued: bool, start: int, width: int) -> tuple[Array | None, list[Array]]:
+    """So many columns of the value and the gradients, as rows (p, width): zero in columns that they do not have."""
+
+    def rows(a: Array) -> Array:
+        block = a[start : start + width]
+        return jnp.pad(block, ((0, width - len(block)), (0, 0))).T
+
+    return rows(given[0]) if valued else None, [rows(a) for part in given[valued:] for a in part]
 
 
 def _pull(*args: Array, valued: bool, unroll: bool) -> list[Array]:
     """∂B/∂factors at f and a: by the weights and by their derivatives, each (d, s, p)."""
     del unroll  # one kernel would be very long
-    factors, nodes, given = args[:3], args[3], [a.T for a in args[4:]]
+    factors, nodes, given = args[:3], args[3], args[4:]
     d, _, p = factors[0].shape
 
     def pulled(axis: int, first: Array, value: Array | None, gradients: list[Array]) -> tuple[list[Array], list]:
@@ -155,7 +165,7 @@ def _pull(*args: Array, valued: bool, unroll: bool) -> list[Array]:
         (totals, inner), here = _along(axis, factors, step, (zeros, inner), unroll=False)
         return totals, [here, *inner]
 
-    value, gradients = (given[0], given[1:]) if valued else (None, given)
+    value, gradients = _rows(given, valued, 0, nodes.shape[1])
     by_axis = pulled(0, jnp.zeros((p,), factors[0].dtype), value, gradients)[1]
     weights, derivatives = zip(*by_axis, strict=True)
     return [jnp.stack(weights), jnp.stack(derivatives)]
@@ -177,12 +187,14 @@ def _by_factors(function: Callable[..., list[Array]]) -> Callable[..., list[Arra
 
 def _particle_rows(index_factors: ShapedArray, *others: ShapedArray) -> list[tuple]:
     d, _, p = index_factors.shape[-3:]
-    return [(others[-1].shape[-1], p)] * (d + 1)
+    columns = others[-1].shape[-1]
+    return [(columns, p), (d, columns, p)]
 
 
-def _node_rows(*args: ShapedArray, valued: bool, size: int) -> list[tuple]:
+def _node_rows(*args: ShapedArray, valued: bool, size: int, first: int) -> list[tuple]:
+    """Of a sum whose first given argument has this number."""
     del valued
-    return [(size, args[-1].shape[-2])]
+    return [(size, args[first].shape[-2])]
 
 
 def _factor_rows(index_factors: ShapedArray, *others: ShapedArray, valued: bool) -> list[tuple]:
@@ -192,13 +204,13 @@ def _factor_rows(index_factors: ShapedArray, *others: ShapedArray, valued: bool)
 
 _sum_primitive = partial(native_primitive, fits=sums_fit)
 gather_p = _sum_primitive("stencil_gather", _gather, _particle_rows, differential=False)
-scatter_p = _sum_primitive("stencil_scatter", _scatter, _node_rows, differential=False)
+scatter_p = _sum_primitive("stencil_scatter", _scatter, partial(_node_rows, first=3), differential=False)
 pull_p = _sum_primitive("stencil_pull", _pull, _factor_rows)
 _gather_by_factors_p = _sum_primitive(
     "stencil_gather_by_factors", _by_factors(_gather), _particle_rows, differential=True
 )
 _scatter_by_factors_p = _sum_primitive(
-    "stencil_scatter_by_factors", _by_factors(_scatter), _node_rows, differential=True
+    "stencil_scatter_by_factors", _by_factors(_scatter), partial(_node_rows, first=5), differential=True
 )
 
 
@@ -251,13 +263,19 @@ ad.primitive_jvps[pull_p] = _jvp_pull
 def _given(cotangents: list) -> tuple[list[Array], bool]:
     """The cotangents of a gather as arguments of a scatter: value and gradients, or one of them if the other is zero;
     and whether there is a value."""
-    valued, graded = (any(type(t) is not ad.Zero for t in part) for part in (cotangents[:1], cotangents[1:]))
-    parts = cotangents if valued and graded else cotangents[:1] if valued else cotangents[1:]
+    valued = type(cotangents[0]) is not ad.Zero
+    parts = [t for t in cotangents if type(t) is not ad.Zero] or cotangents[1:]
     return list(map(ad.instantiate_zeros, parts)), valued
 
 
 def _of_undefined(found: Any, args: Any) -> list:
     return [f if ad.is_undefined_primal(a) else None for f, a in zip(found, args, strict=True)]
+
+
+def _of_given(found: list[Array], args: Any, valued: bool) -> list:
+    """The gathered value and gradients as cotangents of what is given, in the columns that it has."""
+    parts = zip(found if valued else found[1:], args, strict=False)
+    return [f[..., : a.aval.shape[-2], :] if ad.is_undefined_primal(a) else None for f, a in parts]
 
 
 def _transpose_gather(cotangents: list, *args: Any, batched: int) -> list:
@@ -269,8 +287,7 @@ def _transpose_gather(cotangents: list, *args: Any, batched: int) -> list:
 def _transpose_scatter(cotangents: list, *args: Any, valued: bool, size: int, batched: int) -> list:
     del size
     found = gather_p.bind(*args[:3], ad.instantiate_zeros(cotangents[0]), batched=batched)
-    found = found[: len(args) - 3] if valued else found[1:]
-    return [None, None, None, *_of_undefined(found, args[3:])]
+    return [None, None, None, *_of_given(found, args[3:], valued)]
 
 
 def _transpose_gather_by_factors(cotangents: list, *args: Any, batched: int) -> list:
@@ -300,8 +317,7 @@ def _transpose_pull(cotangents: list, *args: Any, valued: bool, batched: int) ->
             *(None for _ in args[4:]),
         ]
     found = _gather_by_factors_p.bind(*factors, *changes, args[3], batched=batched)
-    found = found[: len(args) - 4] if valued else found[1:]
-    return [None, None, None, None, *_of_undefined(found, args[4:])]
+    return [None, None, None, None, *_of_given(found, args[4:], valued)]
 
 
 ad.primitive_transposes[gather_p] = _transpose_gather

@@ -16,18 +16,13 @@ from mpmjax.linalg._matrices import (
     identity_like,
     matmul,
     matrix_of,
-    pairs,
-    principal_frame,
-    principal_modes,
-    rotation,
-    rotation_differential,
-    spin_compliance,
     symmetric,
-    symmetric_eigen,
     trace,
     transpose,
     upper_triangle,
 )
+from mpmjax.linalg._principal import pairs, principal_frame, principal_modes, symmetric_eigen
+from mpmjax.linalg._rotation import rotation, rotation_differential, spin_compliance
 from mpmjax.linalg._spectral import AbstractSpectral, Logarithm, PowerLessOne
 
 __all__ = [

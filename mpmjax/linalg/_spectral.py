@@ -27,7 +27,8 @@ import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Matrix
 from mpmjax.autodiff import ruled
-from mpmjax.linalg._matrices import diagonal, matmul, symmetric_eigen, transpose
+from mpmjax.linalg._matrices import diagonal, matmul, transpose
+from mpmjax.linalg._principal import symmetric_eigen
 
 Frame = tuple[Array, Matrix]
 """Eigenvalues and eigenvectors, (d, *batch) and (d, d, *batch)."""

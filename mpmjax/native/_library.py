@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import jax
 
-INTERFACE = 4
+INTERFACE = 5
 """What the library has to answer, as in native/CMakeLists.txt: both change with the handlers' arguments."""
 PATH = Path(__file__).parent / "lib" / "sums.so"
 """In a folder of its own: Python takes a shared library among modules for a module."""
-SUMS = ("gather", "scatter", "pull", "resist", "combine", "product", "recur")
+HANDLERS = ("gather", "scatter", "pull", "resist", "combine", "product", "recur", "eigen", "rotation")
 
 
 class Library(NamedTuple):
@@ -66,7 +66,7 @@ def _registered(handle: ctypes.CDLL) -> ctypes.CDLL:
     found = handle.mpmjax_interface()
     if found != INTERFACE:
         raise RuntimeError(f"it has interface {found}, and this version of mpmjax needs {INTERFACE}")
-    for name in (*SUMS, "threads"):
+    for name in (*HANDLERS, "threads"):
         capsule = jax.ffi.pycapsule(getattr(handle, target(name)))
         jax.ffi.register_ffi_target(target(name), capsule, platform="cpu")
     return handle

@@ -36,16 +36,18 @@ def native_primitive(
     shapes: Callable[..., list[tuple]],
     fits: Callable[..., bool],
     aliases: dict[int, int] | None = None,
+    like: int = 1,
     **attributes: bool,
 ) -> Primitive:
     """A primitive that evaluates a function. In a batch all its arguments have as many leading axes as the batch.
 
     Args:
         name: name of the primitive; its second word is that in the native library.
-        function: the function of arrays. Results have the dtype of its second argument.
+        function: the function of arrays.
         shapes: the shapes of the results, as a function of the arguments.
         fits: whether the library has a kernel for arguments, given their shapes and dtypes and the batch's axes.
         aliases: arguments whose memory results may take, from their number to that of the result.
+        like: the argument whose dtype results have.
         attributes: what the library is told besides the primitive's parameters.
     """
 
@@ -54,7 +56,7 @@ def native_primitive(
 
     def results(*args: ShapedArray, batched: int, **params: Any) -> list[ShapedArray]:
         batch = args[0].shape[:batched]
-        return [ShapedArray((*batch, *shape), args[1].dtype) for shape in shapes(*args, **params)]
+        return [ShapedArray((*batch, *shape), args[like].dtype) for shape in shapes(*args, **params)]
 
     def batch(args: tuple, axes: tuple, *, batched: int, **params: Any) -> tuple[list[Array], list[int]]:
         size = next(a.shape[x] for a, x in zip(args, axes, strict=True) if x is not batching.not_mapped)

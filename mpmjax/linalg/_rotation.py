@@ -1,0 +1,213 @@
+"""The rotation of the polar decomposition of small matrices, and its differential."""
+
+import jax
+import jax.numpy as jnp
+from jax.core import ShapedArray
+
+from mpmjax._types import Array, Compliance, Matrix
+from mpmjax.autodiff import ruled
+from mpmjax.linalg._matrices import (
+    assemble,
+    cofactor,
+    cofactors,
+    determinant,
+    dot,
+    double_dot,
+    entries,
+    identity_like,
+    matmul,
+    trace,
+    transpose,
+)
+from mpmjax.linalg._native import matrices_fit
+from mpmjax.native import native_primitive
+
+_NEWTON_STEPS = 30  # on the quartic of the 3-D rotation: halves the error at a double root, else squares it
+_POLISH_STEPS = 2  # on the rotation itself
+
+
+@ruled
+def rotation(F: Matrix) -> Matrix:
+    """The rotation R of the polar decomposition F = R S, with det R = +1.
+
+    R maximises tr(RᵀF) over the rotations. S = RᵀF is symmetric. If det F < 0 it is indefinite, with its smallest
+    principal stretch negative. In 1-D R = 1.
+
+    In 2-D R is in closed form. In 3-D λ = tr S is the largest root of (λ² − ‖F‖²)² − 8 det(F) λ − 4 ‖cof F‖², the
+    characteristic polynomial of a symmetric 4 x 4 matrix K linear in F, whose eigenvector is the quaternion of R
+    (N. J. Higham, V. Noferini, Numer. Algorithms 73 (2016) 349, doi 10.1007/s11075-016-0098-7). λ is found by Newton's
+    method, and the quaternion as a column of adj(K − λI), which Newton steps of the derivation's eq. 12 refine. It is
+    normalised, so the result is a rotation to rounding for every F.
+
+    The derivative is `rotation_differential`, not that of the iterations. It is finite at F = I and at repeated
+    stretches, to every order.
+
+    *When it breaks*: where two signed principal stretches sum to zero, R is not unique, and one of the maximisers is
+    returned. Near there the error grows like rounding over that sum, and the derivative like its inverse.
+
+    Args:
+        F: shape (d, d, *batch).
+
+    Returns:
+        R, same shape.
+    """
+    match F.shape[0]:
+        case 1:
+            return jnp.ones_like(F)
+        case 2:
+            return _rotation_2d(F)
+        case _:
+            (R,) = _rotation_p.bind(F.reshape(3, 3, -1), batched=0)
+            return R.reshape(F.shape)
+
+
+@rotation.defjvp
+def _rotation_jvp(primals: tuple[Matrix], tangents: tuple[Matrix]) -> tuple[Matrix, Matrix]:
+    (F,), (dF,) = primals, tangents
+    R = rotation(F)
+    return R, rotation_differential(R, spin_compliance(matmul(transpose(R), F)), dF)
+
+
+def spin_compliance(S: Matrix) -> Compliance:
+    """(tr(S) I − S)⁻¹, which maps the vector of RᵀδF − δFᵀR to the spin ω of `rotation_differential` (derivation,
+    eq. 12).
+
+    Args:
+        S: the stretch RᵀF, shape (d, d, *batch).
+
+    Returns:
+        shape (3, 3, *batch) in 3-D; 1/tr S, shape (1, 1, *batch), in 2-D; zero, shape (1, 1, *batch), in 1-D, where
+        nothing rotates.
+    """
+    match S.shape[0]:
+        case 1:
+            return jnp.zeros_like(S)
+        case 2:
+            return (1 / trace(S))[None, None]
+        case _:
+            system = trace(S) * identity_like(S) - S
+            return transpose(cofactor(system)) / determinant(system)
+
+
+def rotation_differential(R: Matrix, compliance: Compliance, dF: Matrix) -> Matrix:
+    """δR = R [ω]ₓ with (tr(S) I − S) ω = vee(RᵀδF − δFᵀR) (derivation, eq. 12).
+
+    Args:
+        R: rotation of F, shape (d, d, *batch).
+        compliance: `spin_compliance(RᵀF)`.
+        dF: δF, shape (d, d, *batch).
+    """
+    d = R.shape[0]
+    if d == 1:
+        return jnp.zeros_like(dF)
+    if d == 2:
+        V, r = entries(matmul(transpose(R), dF)), entries(R)
+        omega = compliance[0, 0] * (V[1][0] - V[0][1])
+        return omega * assemble([[r[0][1], -r[0][0]], [r[1][1], -r[1][0]]])
+    return matmul(R, _skew(_spin(R, compliance, dF)))
+
+
+def _spin(R: Matrix, compliance: Compliance, dF: Matrix) -> tuple[Array, Array, Array]:
+    """ω in 3-D."""
+    V = entries(matmul(transpose(R), dF))
+    v = (V[2][1] - V[1][2], V[0][2] - V[2][0], V[1][0] - V[0][1])
+    x, y, z = (dot(row, v) for row in entries(compliance))
+    return x, y, z
+
+
+def _skew(w: tuple[Array, Array, Array]) -> Matrix:
+    """[w]ₓ, with [w]ₓ a = w × a."""
+    zero = jnp.zeros_like(w[0])
+    return assemble([[zero, -w[2], w[1]], [w[2], zero, -w[0]], [-w[1], w[0], zero]])
+
+
+def _rotation_2d(F: Matrix) -> Matrix:
+    (a, b), (c, d) = entries(F)
+    cos, sin = a + d, c - b
+    unit = jnp.hypot(cos, sin)
+    singular = unit == 0
+    cos = jnp.where(singular, 1, cos) / jnp.where(singular, 1, unit)
+    sin = sin / jnp.where(singular, 1, unit)
+    return assemble([[cos, -sin], [sin, cos]])
+
+
+def _rotation_3d(F: Matrix, *, unroll: bool = False) -> list[Array]:
+    del unroll  # the loop's steps are few operations each
+    size = jnp.sqrt(double_dot(F, F))
+    F = F / jnp.where(size == 0, 1, size)  # ‖F‖ = 1 from here on
+    q = _dominant_quaternion(F, _largest_root(F))
+    for _ in range(_POLISH_STEPS):
+        R = _rotation_of(q)
+        x, y, z = _spin(R, spin_compliance(matmul(transpose(R), F)), F)
+        near = x * x + y * y + z * z < 0.1  # not where R is hardly determined
+        q = _normalised([a + jnp.where(near, b / 2, 0) for a, b in zip(q, _times_spin(q, (x, y, z)), strict=True)])
+    return [_rotation_of(q)]
+
+
+def _largest_root(F: Matrix) -> Array:
+    """tr S for ‖F‖ = 1, by Newton's method from √3 ≥ tr S, from where it falls monotonically until rounding."""
+    cof = cofactor(F)
+    J, cof2 = determinant(F), double_dot(cof, cof)
+
+    def step(_: Array, root: Array) -> Array:
+        square = root * root - 1
+        slope = 4 * root * square - 8 * J
+        lower = root - (square * square - 8 * J * root - 4 * cof2) / jnp.where(slope == 0, 1, slope)
+        return jnp.where(lower < root, lower, root)
+
+    return jax.lax.fori_loop(0, _NEWTON_STEPS, step, jnp.full_like(J, jnp.sqrt(3.0).astype(F.dtype)))
+
+
+def _dominant_quaternion(F: Matrix, root: Array) -> list[Array]:
+    """The unit quaternion that maximises tr(RᵀF) = qᵀ K q: the largest column of adj(K − λI), λ the largest root."""
+    t, f = trace(F), entries(F)
+    z = [f[2][1] - f[1][2], f[0][2] - f[2][0], f[1][0] - f[0][1]]
+    K = [[t, *z], *([z[i], *(f[i][j] + f[j][i] - (t if i == j else 0) for j in range(3))] for i in range(3))]
+    K = [[K[i][j] - (root if i == j else 0) for j in range(4)] for i in range(4)]
+
+    def signed_minor(i: int, j: int) -> Array:
+        rows, columns = ([k for k in range(4) if k != skip] for skip in (i, j))
+        minor = [[K[r][c] for c in columns] for r in rows]
+        return (-1) ** (i + j) * dot(minor[0], cofactors(minor)[0])
+
+    upper = {(i, j): signed_minor(i, j) for i in range(4) for j in range(i, 4)}
+    columns = [[upper[min(i, j), max(i, j)] for i in range(4)] for j in range(4)]
+    best, size = columns[0], jnp.abs(columns[0][0])
+    for j in range(1, 4):
+        larger = jnp.abs(columns[j][j]) > size
+        best = [jnp.where(larger, a, b) for a, b in zip(columns[j], best, strict=True)]
+        size = jnp.where(larger, jnp.abs(columns[j][j]), size)
+    return _normalised(best)
+
+
+def _normalised(q: list[Array]) -> list[Array]:
+    """q / ‖q‖, and the identity for q = 0."""
+    size = jnp.sqrt(sum((a * a for a in q[1:]), q[0] * q[0]))
+    nothing = size == 0
+    w, *rest = (a / jnp.where(nothing, 1, size) for a in q)
+    return [jnp.where(nothing, 1, w), *rest]
+
+
+def _times_spin(q: list[Array], spin: tuple[Array, Array, Array]) -> list[Array]:
+    """The quaternion product of q with (0, spin)."""
+    (w, x, y, z), (a, b, c) = q, spin
+    return [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
+
+
+def _rotation_of(q: list[Array]) -> Matrix:
+    """The rotation of a unit quaternion."""
+    w, x, y, z = q
+    return assemble(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _one_matrix(F: ShapedArray) -> list[tuple]:
+    return [F.shape[-3:]]
+
+
+_rotation_p = native_primitive("matrix_rotation", _rotation_3d, _one_matrix, matrices_fit, like=0)

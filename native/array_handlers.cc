@@ -1,0 +1,115 @@
+// What XLA calls of passes over arrays, beside the sums of handlers.cc.
+//
+//   combine   a, b, c, d, scales, weight, active             ->  y, z, sum
+//   product   force, v, mass, factor, free, weight, active   ->  image, sum
+//   eigen     S                                              ->  w, V
+//   rotation  F                                              ->  R
+//
+// Vectors are (..., m), scales (..., 2), mass (..., n), active (..., ⌈m/64⌉), matrices (..., 3, 3, p), w (..., 3, p), with
+// the same leading axes everywhere.
+
+#include "call.h"
+#include "matrices.h"
+#include "vectors.h"
+
+namespace mpmjax {
+namespace {
+
+struct CombineOf {
+  template <class T>
+  void run(const Pool& pool, Call& call) const {
+    Combine<T> task = {};
+    task.size = call.dim(0, 1);
+    const T** from[] = {&task.a, &task.b, &task.c, &task.d};
+    for (size_t k = 0; k < 4; ++k) *from[k] = call.at<T>(k, {task.size});
+    task.scales = call.at<T>(4, {2});
+    task.weight = call.at<T>(5, {task.size});
+    task.active = call.booleans(6, (task.size + kTogether - 1) / kTogether);
+    task.y = call.at<T>(7, {task.size});
+    task.z = call.at<T>(8, {task.size});
+    task.sum = call.at<T>(9, {});
+    if (call.fault.empty()) combine(pool, call.batch, task);
+  }
+};
+
+struct ProductOf {
+  template <class T>
+  void run(const Pool& pool, Call& call) const {
+    Product<T> task = {};
+    task.size = call.dim(0, 1);
+    task.nodes = call.dim(2, 1);
+    task.force = call.at<T>(0, {task.size});
+    task.v = call.at<T>(1, {task.size});
+    task.mass = call.at<T>(2, {task.nodes});
+    task.factor = call.at<T>(3, {});
+    task.free = call.booleans(4, task.size);
+    task.weight = call.at<T>(5, {task.size});
+    task.active = call.booleans(6, (task.size + kTogether - 1) / kTogether);
+    task.image = call.at<T>(7, {task.size});
+    task.sum = call.at<T>(8, {});
+    task.whole = true;
+    call.expect(task.nodes > 0 ? task.size % task.nodes == 0 : task.size == 0, "nodes with unlike numbers of components");
+    if (call.fault.empty()) product(pool, call.batch, task);
+  }
+};
+
+struct EigenOf {
+  template <class T>
+  void run(const Pool& pool, Call& call) const {
+    const int64_t p = call.dim(0, 1);
+    const Eigen<T> task = {call.at<T>(0, {3, 3, p}), call.at<T>(1, {3, p}), call.at<T>(2, {3, 3, p}), p};
+    if (call.fault.empty()) eigen(pool, call.batch, task);
+  }
+};
+
+struct RotationOf {
+  template <class T>
+  void run(const Pool& pool, Call& call) const {
+    const int64_t p = call.dim(0, 1);
+    const Rotation<T> task = {call.at<T>(0, {3, 3, p}), call.at<T>(1, {3, 3, p}), p};
+    if (call.fault.empty()) rotation(pool, call.batch, task);
+  }
+};
+
+// Runs a problem on so many operands and results, of the first operand's type. Leading axes are those before the last
+// ones of the first operand, whose number is given.
+template <class Problem, size_t operands, size_t results, size_t trailing>
+ffi::Error run(ffi::ThreadPool threads, ffi::RemainingArgs from, ffi::RemainingRets to) {
+  Call call = collect(from, to);
+  call.expect(call.operands == operands && call.buffers.size() == operands + results, "too many or too few arrays");
+  if (!call.fault.empty()) return wrong(call.fault);
+  const Shape shape = shape_of(call.buffers[0]);
+  if (shape.size() < trailing) return wrong("too few axes");
+  call.type = call.buffers[0].element_type();
+  call.lead(shape, trailing);
+  const XlaPool pool(threads);
+  if (call.type == ffi::DataType::F32) {
+    Problem().template run<float>(pool, call);
+  } else if (call.type == ffi::DataType::F64) {
+    Problem().template run<double>(pool, call);
+  } else {
+    call.expect(false, "there is no kernel of this type");
+  }
+  return call.fault.empty() ? ffi::Error::Success() : wrong(call.fault);
+}
+
+constexpr auto run_combine = run<CombineOf, 7, 3, 1>;
+constexpr auto run_product = run<ProductOf, 7, 2, 1>;
+constexpr auto run_eigen = run<EigenOf, 1, 2, 3>;
+constexpr auto run_rotation = run<RotationOf, 1, 1, 3>;
+
+}  // namespace
+}  // namespace mpmjax
+
+#pragma GCC visibility push(default)
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_combine, mpmjax::run_combine,
+                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_product, mpmjax::run_product,
+                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_eigen, mpmjax::run_eigen,
+                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_rotation, mpmjax::run_rotation,
+                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
+
+#pragma GCC visibility pop

@@ -1,0 +1,41 @@
+// Decompositions of 3 x 3 matrices, one for each particle: what JAX makes slow loops of.
+
+#pragma once
+
+#include <cstdint>
+
+#include "share.h"
+
+namespace mpmjax {
+
+// S = V diag(w) Vᵀ of symmetric S, of which only the upper triangle is read. Eigenvalues have no order, det V = 1.
+template <class T>
+struct Eigen {
+  const T* matrices;  // S, (3, 3, p)
+  T* values;          // w, (3, p)
+  T* vectors;         // V, (3, 3, p)
+  int64_t particles;
+};
+
+// The rotation R of F = R S, which maximises tr(RᵀF).
+template <class T>
+struct Rotation {
+  const T* matrices;  // F, (3, 3, p)
+  T* rotations;       // R, (3, 3, p)
+  int64_t particles;
+};
+
+// Both take particles from a first to a last.
+template <class T>
+struct MatrixKernels {
+  void (*eigen)(const Eigen<T>&, int64_t first, int64_t last);
+  void (*rotation)(const Rotation<T>&, int64_t first, int64_t last);
+};
+
+// `batch` problems follow each other in every array.
+void eigen(const Pool& pool, int64_t batch, const Eigen<float>& first);
+void eigen(const Pool& pool, int64_t batch, const Eigen<double>& first);
+void rotation(const Pool& pool, int64_t batch, const Rotation<float>& first);
+void rotation(const Pool& pool, int64_t batch, const Rotation<double>& first);
+
+}  // namespace mpmjax

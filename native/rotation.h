@@ -1,0 +1,155 @@
+// The rotation of the polar decomposition of 3 x 3 matrices, as mpmjax/linalg/_rotation.py writes it (N. J. Higham, V.
+// Noferini, Numer. Algorithms 73 (2016) 349, doi 10.1007/s11075-016-0098-7).
+
+#pragma once
+
+#include "abreast.h"
+#include "matrices.h"
+
+namespace {
+
+constexpr int kNewtonSteps = 30;  // on the quartic: halves the error at a double root, else squares it
+constexpr int kPolishSteps = 2;   // on the rotation itself
+
+template <class V>
+struct Quaternion {
+  V at[4];
+};
+
+template <class V>
+MPMJAX_INLINE V cofactor(const Matrix<V>& A, int i, int j) {
+  const int i1 = (i + 1) % 3, i2 = (i + 2) % 3, j1 = (j + 1) % 3, j2 = (j + 2) % 3;
+  return A.at[i1][j1] * A.at[i2][j2] - A.at[i1][j2] * A.at[i2][j1];
+}
+
+template <class V>
+MPMJAX_INLINE V determinant(const Matrix<V>& A) {
+  return A.at[0][0] * cofactor(A, 0, 0) + A.at[0][1] * cofactor(A, 0, 1) + A.at[0][2] * cofactor(A, 0, 2);
+}
+
+// Σ f(i, j) over all components.
+template <class V, class F>
+MPMJAX_INLINE V total(const F& f) {
+  V sum = {};
+  components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { sum += f(i, j); });
+  return sum;
+}
+
+// tr S for ‖F‖ = 1, by Newton's method from √3 ≥ tr S, from where it falls until rounding. A lane that no longer falls
+// has ended, whatever others do.
+template <class V>
+MPMJAX_INLINE V largest_root(const Matrix<V>& F) {
+  const V J = determinant(F), one = V() + 1;
+  const V squares = total<V>([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { return cofactor(F, i, j) * cofactor(F, i, j); });
+  V found = V() + std::sqrt(static_cast<decltype(J[0] + 0)>(3));
+  for (int step = 0; step < kNewtonSteps; ++step) {
+    const V square = found * found - one, slope = 4 * found * square - 8 * J;
+    const V lower = found - (square * square - 8 * J * found - 4 * squares) / (slope == 0 ? one : slope);
+    const auto falls = lower < found;
+    if (!any(falls)) break;
+    found = falls ? lower : found;
+  }
+  return found;
+}
+
+template <class V>
+MPMJAX_INLINE void normalise(Quaternion<V>& q) {
+  const V one = V() + 1;
+  const V size = root(q.at[0] * q.at[0] + q.at[1] * q.at[1] + q.at[2] * q.at[2] + q.at[3] * q.at[3]);
+  const auto nothing = size == 0;
+  const V scale = nothing ? one : size;
+  each<4, true>([&](auto i) MPMJAX_INLINE_LAMBDA { q.at[i] /= scale; });
+  q.at[0] = nothing ? one : q.at[0];
+}
+
+// The determinant of what K has left without row i and column j, with its sign.
+template <int i, int j, class V>
+MPMJAX_INLINE V signed_minor(const V (&K)[4][4]) {
+  Matrix<V> left;
+  components([&](auto r, auto c) MPMJAX_INLINE_LAMBDA { left.at[r][c] = K[r + (r >= i)][c + (c >= j)]; });
+  return (i + j) % 2 == 0 ? determinant(left) : -determinant(left);
+}
+
+// The unit quaternion that maximises tr(RᵀF) = qᵀ K q: the largest column of adj(K − λI), λ the largest root.
+template <class V>
+MPMJAX_INLINE Quaternion<V> dominant_quaternion(const Matrix<V>& F, V largest) {
+  const V trace = F.at[0][0] + F.at[1][1] + F.at[2][2];
+  const V z[3] = {F.at[2][1] - F.at[1][2], F.at[0][2] - F.at[2][0], F.at[1][0] - F.at[0][1]};
+  V K[4][4];
+  K[0][0] = trace - largest;
+  each<3, true>([&](auto i) MPMJAX_INLINE_LAMBDA { K[0][i + 1] = K[i + 1][0] = z[i]; });
+  components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA {
+    const V sum = F.at[i][j] + F.at[j][i];
+    K[i + 1][j + 1] = i == j ? sum - trace - largest : sum;
+  });
+  V adjoint[4][4];
+  each<4, true>([&](auto i) MPMJAX_INLINE_LAMBDA {
+    each<4, true>([&](auto j) MPMJAX_INLINE_LAMBDA {
+      if constexpr (j >= i) {
+        const V minor = signed_minor<i, j>(K);
+        adjoint[i][j] = minor;
+        adjoint[j][i] = minor;
+      }
+    });
+  });
+  Quaternion<V> q = {{adjoint[0][0], adjoint[0][1], adjoint[0][2], adjoint[0][3]}};
+  V size = magnitude(adjoint[0][0]);
+  each<3, true>([&](auto other) MPMJAX_INLINE_LAMBDA {
+    constexpr int j = other + 1;
+    const auto larger = magnitude(adjoint[j][j]) > size;
+    each<4, true>([&](auto i) MPMJAX_INLINE_LAMBDA { q.at[i] = larger ? adjoint[j][i] : q.at[i]; });
+    size = larger ? magnitude(adjoint[j][j]) : size;
+  });
+  normalise(q);
+  return q;
+}
+
+template <class V>
+MPMJAX_INLINE Matrix<V> rotation_of(const Quaternion<V>& q) {
+  const V w = q.at[0], x = q.at[1], y = q.at[2], z = q.at[3], one = V() + 1;
+  return {{{one - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)},
+           {2 * (x * y + w * z), one - 2 * (x * x + z * z), 2 * (y * z - w * x)},
+           {2 * (x * z - w * y), 2 * (y * z + w * x), one - 2 * (x * x + y * y)}}};
+}
+
+// A step of Newton's method on q: by half the spin ω with (tr(S) I − S) ω = vee(S − Sᵀ), S = RᵀF.
+template <class V>
+MPMJAX_INLINE void polish(Quaternion<V>& q, const Matrix<V>& F) {
+  const Matrix<V> R = rotation_of(q);
+  Matrix<V> S, system;
+  components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA {
+    S.at[i][j] = R.at[0][i] * F.at[0][j] + R.at[1][i] * F.at[1][j] + R.at[2][i] * F.at[2][j];
+  });
+  const V trace = S.at[0][0] + S.at[1][1] + S.at[2][2];
+  components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { system.at[i][j] = i == j ? trace - S.at[i][j] : -S.at[i][j]; });
+  const V v[3] = {S.at[2][1] - S.at[1][2], S.at[0][2] - S.at[2][0], S.at[1][0] - S.at[0][1]};
+  const V det = determinant(system);
+  V spin[3];
+  each<3, true>([&](auto i) MPMJAX_INLINE_LAMBDA {
+    spin[i] = (cofactor(system, 0, i) * v[0] + cofactor(system, 1, i) * v[1] + cofactor(system, 2, i) * v[2]) / det;
+  });
+  const V w = q.at[0], x = q.at[1], y = q.at[2], z = q.at[3], a = spin[0], b = spin[1], c = spin[2];
+  const V turned[4] = {-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a};
+  const auto near = a * a + b * b + c * c < V() + static_cast<decltype(a[0] + 0)>(0.1);  // not where R is hardly determined
+  each<4, true>([&](auto i) MPMJAX_INLINE_LAMBDA { q.at[i] = near ? q.at[i] + turned[i] / 2 : q.at[i]; });
+  normalise(q);
+}
+
+template <class T>
+void rotation(const mpmjax::Rotation<T>& task, int64_t first, int64_t last) {
+  using V = Abreast<T>;
+  for (int64_t k = first; k < last; k += kAbreast<T>) {
+    const Place<T> place(k, last, task.particles);
+    Matrix<V> F;
+    components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { F.at[i][j] = place.load(task.matrices, 3 * i + j); });
+    const V norm = root(total<V>([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { return F.at[i][j] * F.at[i][j]; }));
+    const V size = norm == 0 ? V() + 1 : norm;
+    components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { F.at[i][j] /= size; });
+    Quaternion<V> q = dominant_quaternion(F, largest_root(F));
+    for (int step = 0; step < kPolishSteps; ++step) polish(q, F);
+    const Matrix<V> R = rotation_of(q);
+    components([&](auto i, auto j) MPMJAX_INLINE_LAMBDA { place.store(task.rotations, 3 * i + j, R.at[i][j]); });
+  }
+}
+
+}  // namespace
