@@ -5,10 +5,10 @@ turns.
     python benchmarks/order.py --quick
 
 A block is in the order of `fill`, row by row, which is near that of the cells. A dam break has been in motion: a column
-of water has run against the far wall of a tank and come back. By cell is the order that a counting sort makes, and
-shuffled the worst that motion can make. Own order against by cell is the most that sorting saves, before its own cost,
-of which numpy's sort of the cells and the permutation of all the particles' arrays are an estimate: the second is what
-any sort costs at least.
+of water has run against the far wall of a tank and come back. By cell is the order that a counting sort makes, some
+steps ago that of one so many steps before, and shuffled the worst that motion can make. Own order against these is what
+sorting saves before its own cost, of which numpy's sort of the cells and the permutation of all the particles' arrays
+are an estimate: the second is what any sort costs at least.
 """
 
 import argparse
@@ -29,6 +29,8 @@ DAMS = {"dam 3-D": (3, 74, 8), "dam 2-D": (2, 448, 4)}
 QUICK_DAMS = {"dam 3-D": (3, 24, 8), "dam 2-D": (2, 64, 4)}
 SECONDS = 1.5  # of a dam break: by then the front has been at the far wall and back
 STEPS = 3  # that are timed
+OWN = "own order"
+AGE = 50  # steps since an older sort
 WATER = mpm.Fluid(1e5)  # 20 ρ g h
 
 
@@ -66,24 +68,30 @@ def permuted(state: mpm.Particles, order: jax.Array) -> mpm.Particles:
 
 
 def codes(scene: mpm.Scene, state: mpm.Particles, dt: Any) -> dict[str, Callable[[], Any]]:
-    """What is timed: steps of the state in three orders, the sort, and the permutation."""
+    """What is timed: steps of the state, some steps on, in each order; the sort, and the permutation."""
     step = jax.jit(lambda state: mpm.rollout(scene, state, steps=STEPS, dt=dt))
+    older = np.argsort(cells_of(scene, state), kind="stable")
+    state = mpm.rollout(scene, state, steps=AGE, dt=dt)
     cells = cells_of(scene, state)
-    by_cell = np.argsort(cells, kind="stable")
-    shuffled = np.random.default_rng(0).permutation(len(cells))
-    states = {"own order": state, "by cell": permuted(state, by_cell), "shuffled": permuted(state, shuffled)}
+    orders = {
+        OWN: np.arange(len(cells)),
+        "by cell": np.argsort(cells, kind="stable"),
+        f"by cell {AGE} steps ago": older,
+        "shuffled": np.random.default_rng(0).permutation(len(cells)),
+    }
+    states = {name: permuted(state, order) for name, order in orders.items()}
     ends = {name: np.asarray(step(one).x) for name, one in states.items()}  # compiles too
-    for name, order in (("by cell", by_cell), ("shuffled", shuffled)):
-        assert np.abs(ends["own order"][order] - ends[name]).max() < 1e-5, "the order changes the motion"
+    for name, order in orders.items():
+        assert np.abs(ends[OWN][order] - ends[name]).max() < 1e-5, "the order changes the motion"
     steps = {name: lambda one=one: step(one).x for name, one in states.items()}
     return steps | {
         "sort": lambda: np.argsort(cells, kind="stable"),
-        "permutation": lambda: permuted(state, by_cell),
+        "permutation": lambda: permuted(state, orders["by cell"]),
     }
 
 
 def main() -> None:
-    """Print milliseconds, medians and fastest in brackets."""
+    """Print milliseconds, and ratios to a step in the order that the state has."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small scenes")
     parser.add_argument("--scene", help="one scene alone")
@@ -98,19 +106,19 @@ def main() -> None:
         scene, state, dt = make(*numbers)
         runs = codes(scene, state, dt)
         seconds = {what: np.empty(options.rounds) for what in runs}
+        random = np.random.default_rng(0)
         for turn in range(options.rounds):
-            for what, run in runs.items():
+            for what in random.permutation(list(runs)):  # no order always follows the same one in the caches
                 began = time.perf_counter()
-                jax.block_until_ready(run())
+                jax.block_until_ready(runs[what]())
                 seconds[what][turn] = time.perf_counter() - began
-        each = {what: 1e3 * taken / (1 if what in ("sort", "permutation") else STEPS) for what, taken in seconds.items()}
-        words = ", ".join(f"{what} {np.median(ms):.2f} ({ms.min():.2f})" for what, ms in each.items())
-        median, fastest = ({what: float(of(ms)) for what, ms in each.items()} for of in (np.median, np.min))
-        print(f"{name}, {state.count} particles, ms: {words}")
-        for base in ("by cell", "own order"):
-            other = "own order" if base == "by cell" else "shuffled"
-            ratio, least = median[other] / median[base], fastest[other] / fastest[base]
-            print(f"    {other} over {base}: {ratio:.2f} ({least:.2f})", flush=True)
+        print(f"{name}, {state.count} particles, ms, medians and fastest, and their ratios to a step in own order:")
+        own = seconds[OWN] / STEPS
+        for what, taken in seconds.items():
+            each = taken / (1 if what in ("sort", "permutation") else STEPS)
+            median, least = np.median(each), each.min()
+            ratios = f"{median / np.median(own):.2f} {least / own.min():.2f}"
+            print(f"    {what:22} {1e3 * median:8.2f} {1e3 * least:8.2f}   {ratios}", flush=True)
 
 
 if __name__ == "__main__":

@@ -85,8 +85,8 @@ def summed_by(backend: str | None) -> Iterator[None]:
 
 
 class Ours:
-    """This package's `rollout`, compiled for one back end, in a window so many times as wide along each axis. A call goes
-    on by the timed steps."""
+    """This package's `rollout`, compiled for one back end, in a window so many times as wide along each axis. A call
+    goes on by the timed steps."""
 
     memory: int
     """What the program is given, what it returns, and its temporaries [B]."""
