@@ -85,7 +85,8 @@ def summed_by(backend: str | None) -> Iterator[None]:
 
 
 class Ours:
-    """This package's `rollout`, compiled for one back end. A call goes on by the timed steps."""
+    """This package's `rollout`, compiled for one back end, in a window so many times as wide along each axis. A call
+    goes on by the timed steps."""
 
     memory: int
     """What the program is given, what it returns, and its temporaries [B]."""
@@ -97,12 +98,14 @@ class Ours:
         steps: int,
         method: Any = mpm.Explicit(),
         backend: str | None = None,
+        wider: tuple[int, ...] = (1, 1, 1),
     ):
         d, one = b.x.shape[1], jnp.ones(len(b.x), b.dtype)
         particles = mpm.Particles(jnp.asarray(b.x, b.dtype), jnp.asarray(b.v, b.dtype), b.mass * one, b.volume * one)
         gravity = (*[0.0] * (d - 1), -GRAVITY)
         choices = {"gravity": gravity, "description": description, "gradient": mpm.MLSGradient()}
-        scene = mpm.Scene(mpm.Grid((b.nodes,) * d, b.spacing), mpm.NeoHookean(E_MODULUS, NU), **choices)
+        grid = mpm.Grid(tuple(b.nodes * times for times in wider[:d]), b.spacing)
+        scene = mpm.Scene(grid, mpm.NeoHookean(E_MODULUS, NU), **choices)
         self._state = mpm.prepare(scene, particles)
         self._given = scene, jnp.asarray(b.dt, b.dtype)
         go_on = jax.jit(lambda scene, dt, state: mpm.rollout(scene, state, steps=steps, dt=dt, method=method))
@@ -186,12 +189,12 @@ def check(name: str, b: Block, codes: dict[str, Code]) -> None:
             )
 
 
-def iterations(b: Block, backend: str | None = None) -> tuple[Code, Code]:
+def iterations(b: Block, backend: str | None = None, wider: tuple[int, ...] = (1, 1, 1)) -> tuple[Code, Code]:
     """Semi-implicit steps of twenty times the block's own, cut off after few and after more iterations."""
 
     def cut(most: int) -> Code:
         method = mpm.SemiImplicit(solver=mpm.ConjugateResidual(rtol=1e-30, max_steps=most))
-        return Ours(b._replace(dt=20 * b.dt), mpm.UpdatedLagrangian(), 1, method, backend)
+        return Ours(b._replace(dt=20 * b.dt), mpm.UpdatedLagrangian(), 1, method, backend, wider)
 
     few, more = ITERATIONS
     return cut(few), cut(more)

@@ -47,6 +47,7 @@ struct ProductOf {
     task.active = call.booleans(6, (task.size + kTogether - 1) / kTogether);
     task.image = call.at<T>(7, {task.size});
     task.sum = call.at<T>(8, {});
+    task.whole = true;
     call.expect(task.nodes > 0 ? task.size % task.nodes == 0 : task.size == 0, "nodes with unlike numbers of components");
     if (call.fault.empty()) product(pool, call.batch, task);
   }

@@ -109,7 +109,7 @@ void check(const Example<T>& e, const std::vector<const Pool*>& pools) {
     const bool valued = kind != 2, differential = kind == 3;
     const int64_t graded = kind == 1 ? 0 : kind == 4 ? sh.columns - 1 : sh.columns;
     const Form form{sh.d, sh.s, differential};
-    Scatter<T> scattered = {e.stencils(differential), {}, e.to_nodes.data.get(), nullptr, n, sh.columns};
+    Scatter<T> scattered = {e.stencils(differential), {}, e.to_nodes.data.get(), nullptr, n, sh.columns, nullptr};
     T *value = e.gathered.data.get(), *gradients = value + rows;
     const Gather<T> gathered = {e.stencils(differential), e.nodes.data.get(), value, gradients, n, sh.columns};
     Pull<T> pulled = {e.stencils(false), e.nodes.data.get(), {}, e.by_w.data.get(), e.by_g.data.get(), n, sh.columns};
@@ -179,12 +179,27 @@ void check_resistance(const Example<T>& e, const std::vector<const Pool*>& pools
   const int d = sh.d, m = d * d;
   const int64_t n = sh.size(), particles = sh.particles, packed = m * (m + 1) / 2;
   const Resist<T> task = {e.stencils(false), e.matrices.data.get(), e.moved.data.get(), e.resisted.data.get(), {},
-                          nullptr, n, d};
+                          nullptr, n, d, nullptr};
   std::unique_ptr<Array<T>> bits;
   for (const Pool* pool : pools) {
     if (!resist(*pool, {d, sh.s, false}, sh.batch, task)) ++faults, std::printf("no kernel for d=%d s=%d\n", d, sh.s);
     if (bits == nullptr) bits = std::make_unique<Array<T>>(e.resisted);
     expect_same("a resistance", *bits, e.resisted);
+  }
+  // The same where only some blocks of nodes are wanted, over other numbers.
+  const int64_t size = n * d, blocks = (size + kTogether - 1) / kTogether;
+  const Array<bool> wanted(sh.batch * blocks);
+  for (int64_t i = 0; i < wanted.size; ++i) wanted[i] = i % 3 > 0;
+  for (const Pool* pool : pools) {
+    const Array<T> some(e.resisted.size);
+    for (int64_t i = 0; i < some.size; ++i) some[i] = 7;
+    Resist<T> part = task;
+    part.nodes = some.data.get(), part.wanted = wanted.data.get();
+    resist(*pool, {d, sh.s, false}, sh.batch, part);
+    for (int64_t i = 0; i < some.size; ++i) {
+      if (!wanted[i / size * blocks + i % size / kTogether]) some[i] = e.resisted[i];
+    }
+    expect_same("the wanted part of a resistance", *bits, some);
   }
   // Of each particle the slopes G, m numbers, and r = K G; and what bounds their rounding.
   std::vector<double> G(sh.batch * particles * m), G_scale(G.size()), r(G.size()), r_scale(G.size());
@@ -247,9 +262,11 @@ void check_recurrence(const Example<T>& e, std::mt19937& random, const std::vect
   std::uniform_real_distribution<T> some(1, 2);
   for (int64_t i = 0; i < packed; ++i) matrices[i] = e.matrices[i] / 10;
   for (int64_t i = 0; i < mass.size; ++i) mass[i] = some(random);
-  for (int64_t i = 0; i < active.size; ++i) active[i] = true;
+  for (int64_t i = 0; i < active.size; ++i) active[i] = random() % 4 > 0;
   for (int64_t i = 0; i < weight.size; ++i) {
-    free[i] = random() % 3 > 0, weight[i] = some(random), start[i] = some(random), residual[i] = free[i] ? some(random) : 0;
+    const bool zero = !active[i / size * blocks + i % size / kTogether];
+    free[i] = !zero && random() % 3 > 0, weight[i] = some(random), start[i] = zero ? 0 : some(random);
+    residual[i] = free[i] ? some(random) : 0;
     limits[i / size * kLimits + 3] += weight[i] * residual[i] * residual[i];
   }
   for (int64_t m = 0; m < sh.batch; ++m) {
@@ -322,7 +339,7 @@ int main() {
     callers.emplace_back([&, i] {
       std::mt19937 random(i);
       const Example<float> e({2, 3, 1, 9001 + i, 30, 3}, 1, random);
-      Scatter<float> task = {e.stencils(false), {}, e.to_nodes.data.get(), nullptr, e.shape.size(), 3};
+      Scatter<float> task = {e.stencils(false), {}, e.to_nodes.data.get(), nullptr, e.shape.size(), 3, nullptr};
       task.given = {e.given.data.get(), e.given.data.get() + e.rows(), 3};
       scatter(one, {2, 3, false}, 1, task);
       const Array<float> alone(e.to_nodes);

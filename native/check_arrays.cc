@@ -71,7 +71,8 @@ void check_product(int64_t nodes, int64_t each, std::mt19937& random, const std:
   for (const Pool* pool : pools) {
     const Array<T> to(force);
     product(*pool, batch, Product<T>{to.data.get(), v.data.get(), mass.data.get(), factor.data.get(), free.data.get(),
-                                     weight.data.get(), active.data.get(), to.data.get(), sum.data.get(), size, nodes});
+                                     weight.data.get(), active.data.get(), to.data.get(), sum.data.get(), size, nodes,
+                                     true});
     const Shape shape = {1, 0, batch, size, 0, 0};
     compare("product", shape, to, image, scale);
     compare("product's sum", shape, sum, total, bound);

@@ -19,6 +19,7 @@ namespace mpmjax {
 
 constexpr int kMostAxes = 3;
 constexpr int kBlock = 16;  // particles that are handled together
+constexpr int64_t kTogether = 64;  // numbers of the nodes that are passed over together
 
 template <class T>
 struct Stencils {
@@ -64,6 +65,7 @@ struct Scatter {
   const Range* ranges;  // of each block, or null
   int64_t size;
   int64_t columns;
+  const bool* wanted;  // which of the nodes' ⌈n c/64⌉ blocks are, null for all; others may become anything
 };
 
 template <class T>
@@ -89,6 +91,7 @@ struct Resist {
   const Range* ranges;  // of each block, or null
   int64_t size;
   int64_t columns;  // d
+  const bool* wanted;  // as in a scatter
 };
 
 // The sums for one dimension and kernel. Gather and pull take particles from a first to a last. Scatter and resist take

@@ -3,9 +3,11 @@
 #include <algorithm>
 #include <atomic>
 #include <cmath>
+#include <cstdlib>
 #include <cstring>
 #include <limits>
 #include <memory>
+#include <new>
 
 #include "vectors.h"
 
@@ -18,52 +20,64 @@ class OneThread : public Pool {
   void schedule(std::function<void()> task) const override { task(); }
 };
 
-// `to` becomes v in free components. It is zero wherever nothing is active.
+struct Freed {
+  void operator()(void* memory) const { std::free(memory); }
+};
+
+// Zeros. Where they are many, the memory of those that nothing is written to is never touched.
 template <class T>
-void mask(const Recurrence<T>& task, const T* v, T* to) {
+std::unique_ptr<T[], Freed> zeros(int64_t count) {
+  T* memory = static_cast<T*>(std::calloc(static_cast<size_t>(std::max<int64_t>(count, 1)), sizeof(T)));
+  if (memory == nullptr) throw std::bad_alloc();
+  return std::unique_ptr<T[], Freed>(memory);
+}
+
+// Calls run(first, last) for the numbers of each active block.
+template <class T, class Run>
+void over_active(const Recurrence<T>& task, const Run& run) {
   const int64_t size = task.nodes * task.columns, blocks = (size + kTogether - 1) / kTogether;
   for (int64_t k = 0; k < blocks; ++k) {
-    if (!task.active[k]) continue;
-    const int64_t last = std::min(size, (k + 1) * kTogether);
-    for (int64_t i = k * kTogether; i < last; ++i) to[i] = task.free[i] ? v[i] : T(0);
+    if (task.active[k]) run(k * kTogether, std::min(size, (k + 1) * kTogether));
   }
 }
 
 template <class T>
 bool run(const Pool& pool, Form form, const Recurrence<T>& task) {
   const int64_t size = task.nodes * task.columns;
-  const size_t bytes = static_cast<size_t>(size) * sizeof(T);
-  const std::unique_ptr<T[]> r(new T[size]), p(new T[size]()), q(new T[size]()), moved(new T[size]()), image(new T[size]);
-  std::memcpy(r.get(), task.residual, bytes);
-  if (task.x != task.start) std::memcpy(task.x, task.start, bytes);
+  // What is not active stays zero, but in the image, where it is never read.
+  const auto memory = zeros<T>(5 * size);
+  T *const r = memory.get(), *const p = r + size, *const q = p + size, *const moved = q + size, *const image = moved + size;
+  over_active(task, [&](int64_t i, int64_t last) { std::copy(task.residual + i, task.residual + last, r + i); });
+  if (task.x != task.start) std::memcpy(task.x, task.start, static_cast<size_t>(size) * sizeof(T));
   Resist<T> resistance = {};
   resistance.stencils = task.stencils;
   resistance.matrices = task.matrices;
-  resistance.moved = moved.get();
-  resistance.nodes = image.get();
+  resistance.moved = moved;
+  resistance.nodes = image;
   resistance.size = task.nodes;
   resistance.columns = task.columns;
+  resistance.wanted = task.active;
   const T eps = std::numeric_limits<T>::epsilon();
   T rr = task.limits[3], qq = 0, before = std::numeric_limits<T>::infinity(), radius = 0;
   int64_t steps = 0;
   bool vanished = false, negative = false;
   while (std::sqrt(rr) > task.limits[0] && rr > task.limits[1] && T(steps) < task.limits[2] && !vanished) {
-    mask(task, r.get(), moved.get());
+    over_active(task, [&](int64_t i, int64_t last) {
+      for (; i < last; ++i) moved[i] = task.free[i] ? r[i] : T(0);
+    });
     if (!resist(pool, form, 1, resistance)) return false;
     T gamma, square;
-    product(pool, 1, Product<T>{image.get(), r.get(), task.mass, task.factor, task.free, task.weight, task.active,
-                                image.get(), &gamma, size, task.nodes});
+    product(pool, 1, Product<T>{image, r, task.mass, task.factor, task.free, task.weight, task.active, image, &gamma, size,
+                                task.nodes, false});
     const T beta = gamma / before, onward[] = {beta, beta};
-    combine(pool, 1, Combine<T>{r.get(), p.get(), image.get(), q.get(), onward, task.weight, task.active, p.get(), q.get(),
-                                &square, size});
+    combine(pool, 1, Combine<T>{r, p, image, q, onward, task.weight, task.active, p, q, &square, size});
     const T rounding = eps * std::sqrt(rr * (square + beta * beta * qq));  // of γ: ε‖r‖‖s‖
     vanished = std::abs(gamma) <= rounding;
     negative = negative || gamma < -rounding;
     const T alpha = vanished ? T(0) : gamma / square, along[] = {alpha, -alpha};
     const T quotient = std::abs(gamma) / rr;
     if (!(quotient <= radius)) radius = quotient;
-    combine(pool, 1, Combine<T>{task.x, p.get(), r.get(), q.get(), along, task.weight, task.active, task.x, r.get(), &rr,
-                                size});
+    combine(pool, 1, Combine<T>{task.x, p, r, q, along, task.weight, task.active, task.x, r, &rr, size});
     before = gamma, qq = square, ++steps;
   }
   const T numbers[kNumbers] = {rr, T(steps), radius, T(vanished), T(negative)};

@@ -64,7 +64,7 @@ MPMJAX_APART void resist_block(const Resist<T>& task, const Block<T, d, s, false
 // Sets the nodes of a range.
 template <class T, int d, int s>
 void resist(const Resist<T>& task, int64_t first, int64_t last) {
-  std::memset(task.nodes + first * d, 0, static_cast<size_t>((last - first) * d) * sizeof(T));
+  clear(task.nodes, task.wanted, first * d, last * d);
   const NodeSums<T, s, d> nodes(task.nodes, d, 0, first, last);
   const auto give = [&](const auto& block, int64_t start, int count, auto& rows) MPMJAX_INLINE_LAMBDA {
     std::memset(rows[0], 0, sizeof rows[0]);

@@ -11,6 +11,21 @@ namespace {
 
 using mpmjax::Range;
 using mpmjax::Scatter;
+using mpmjax::kTogether;
+
+// Numbers from a first to a last one become zero, or of these only the blocks that are wanted.
+template <class T>
+void clear(T* numbers, const bool* wanted, int64_t first, int64_t last) {
+  if (wanted == nullptr) {
+    std::memset(numbers + first, 0, static_cast<size_t>(last - first) * sizeof(T));
+    return;
+  }
+  for (int64_t end, i = first; i < last; i = end) {
+    end = (i / kTogether + 1) * kTogether;
+    end = end < last ? end : last;
+    if (wanted[i / kTogether]) std::memset(numbers + i, 0, static_cast<size_t>(end - i) * sizeof(T));
+  }
+}
 
 // Columns of the nodes from a first to a last one: all columns, or where `columns` is 0 up to four.
 template <class T, int s, int columns>
@@ -208,7 +223,7 @@ void scatter_columns(const Scatter<T>& task, int64_t column, int64_t first, int6
 template <class T, int d, int s, bool differential, bool graded>
 void scatter_given(const Scatter<T>& task, int64_t first, int64_t last) {
   const int64_t columns = task.columns;
-  std::memset(task.nodes + first * columns, 0, static_cast<size_t>((last - first) * columns) * sizeof(T));
+  clear(task.nodes, task.wanted, first * columns, last * columns);
   if constexpr (graded && !differential) {
     switch (columns) {
       case 1: return scatter_columns<T, d, s, false, true, 1>(task, 0, first, last);

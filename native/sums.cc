@@ -28,6 +28,11 @@ int64_t shares(const Pool& pool, Form form, int64_t batch, int64_t particles, in
   return std::max<int64_t>(1, std::min(visits / kLeastVisits, most));
 }
 
+// The blocks of nodes that are wanted of the i-th member.
+const bool* member(const bool* wanted, int64_t i, int64_t numbers) {
+  return wanted == nullptr ? nullptr : wanted + i * ((numbers + kTogether - 1) / kTogether);
+}
+
 template <class T>
 Stencils<T> member(Stencils<T> all, Form form, int64_t i) {
   const int64_t factors = i * form.d * form.s * all.particles;
@@ -62,6 +67,7 @@ Scatter<T> member(Scatter<T> all, Form form, int64_t i) {
   all.stencils = member(all.stencils, form, i);
   all.nodes += i * all.size * all.columns;
   all.given = member(all.given, form, i, all.columns, all.stencils.particles);
+  all.wanted = member(all.wanted, i, all.size * all.columns);
   return all;
 }
 
@@ -83,6 +89,7 @@ Resist<T> member(Resist<T> all, Form form, int64_t i) {
   all.moved += i * all.size * all.columns;
   all.nodes += i * all.size * all.columns;
   if (all.gradients != nullptr) all.gradients += i * form.d * all.columns * all.stencils.particles;
+  all.wanted = member(all.wanted, i, all.size * all.columns);
   return all;
 }
 
@@ -208,7 +215,7 @@ bool resist_all(const Pool& pool, Form form, int64_t batch, const Resist<T>& all
   Resist<T> first = all;
   first.gradients = stored.get();
   const Given<T> given = {nullptr, stored.get(), all.columns};
-  const Scatter<T> rest = {all.stencils, given, all.nodes, nullptr, all.size, all.columns};
+  const Scatter<T> rest = {all.stencils, given, all.nodes, nullptr, all.size, all.columns, all.wanted};
   over_particles(pool, form, batch, first, found->resist_particles);
   division.over_nodes(pool, form, batch, rest, found->scatter);
   return true;

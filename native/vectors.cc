@@ -45,7 +45,7 @@ double product_part(const Product<T>& task, int64_t first, int64_t last) {
   for (int64_t k = first; k < last; ++k) {
     const int64_t start = k * kTogether, count = std::min(kTogether, task.size - start);
     if (!task.active[k]) {
-      std::memset(task.image + start, 0, static_cast<size_t>(count) * sizeof(T));
+      if (task.whole) std::memset(task.image + start, 0, static_cast<size_t>(count) * sizeof(T));
       continue;
     }
     T mass[kTogether], image[kTogether];  // the image may lie where the force is
@@ -98,7 +98,7 @@ void product_all(const Pool& pool, int64_t batch, const Product<T>& all) {
     const int64_t by = m * all.size;
     const Product<T> task = {all.force + by,  all.v + by,               all.mass + m * all.nodes, all.factor + m,
                              all.free + by,   all.weight + by,          all.active + m * blocks,  all.image + by,
-                             nullptr,         all.size,                 all.nodes};
+                             nullptr,         all.size,                 all.nodes,                all.whole};
     return product_part(task, first, last);
   });
 }

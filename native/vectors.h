@@ -4,11 +4,10 @@
 
 #include <cstdint>
 
+#include "problems.h"
 #include "share.h"
 
 namespace mpmjax {
-
-constexpr int64_t kTogether = 64;  // numbers that are passed over together
 
 // y = a + s_0 b, z = c + s_1 d and Σ w z². Where `active` is false, all of a, b, c and d are zero. A result may be what one
 // of its two vectors was.
@@ -24,7 +23,7 @@ struct Combine {
 
 // What is left of a product with A = M + χH on free components, once the force f = H v is known: the image y = W⁻¹A v, with
 // (A v)_i = m_i v_i + χ f_i where i is free and v_i elsewhere, and Σ v (A v). Where `active` is false v is zero, and nothing
-// free. The image may be where the force was.
+// free; the image is zero there if it is `whole`, and else left as it was. It may be where the force was.
 template <class T>
 struct Product {
   const T *force, *v;
@@ -35,6 +34,7 @@ struct Product {
   const bool* active;  // (⌈size/64⌉)
   T *image, *sum;
   int64_t size, nodes;
+  bool whole;
 };
 
 // `batch` problems follow each other in every array. The sums have the same bits for any number of threads.

@@ -230,6 +230,10 @@ class Mirror(eqx.Module):
         """Bᵀ for an even scalar."""
         return jax.linear_transpose(self.unfold_scalar, field)(field)[0] if self.images else field
 
+    def fold_scalars(self, field: Float[Array, "n c"]) -> Float[Array, "n c"]:
+        """Bᵀ for even scalars in columns."""
+        return jnp.stack([self.fold_scalar(column) for column in field.T], axis=1) if self.images else field
+
     def without_ties(self) -> "Mirror":
         """The mirrors without rigid parts and bodies."""
         return Mirror(tuple(image for image in self.images if isinstance(image, Image)))

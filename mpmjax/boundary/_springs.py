@@ -78,7 +78,7 @@ def spring_diagonal(springs: Sequence[Springs], stencil: Stencil, mirror: Mirror
     parts = [(one.stiffness * one.normal**2, one.stiffness * jnp.swapaxes(one.widening, 0, 1) ** 2) for one in springs]
     value, slopes = _added(parts)
     nodes = scatter(stencil.squared, value, slopes, size)
-    return jnp.stack([mirror.fold_scalar(component) for component in nodes.T], axis=1)
+    return mirror.fold_scalars(nodes)
 
 
 def _added(parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:

@@ -227,8 +227,6 @@ class _Restarts(eqx.Module):
     """Steps taken."""
     radius: Float[Array, ""]
     """Largest Rayleigh quotient rᵀA r/‖r‖² so far."""
-    restart_x: Array
-    """x at the last restart."""
     restart_rr: Float[Array, ""]
     """‖r‖² at the last restart, of the true residual."""
     correction: Float[Array, ""]
@@ -277,7 +275,6 @@ def _start(x: Array, dtype: Any) -> _Restarts:
         rr=infinite,
         k=jnp.asarray(0, dtype=jnp.int32),
         radius=zero,
-        restart_x=x,
         restart_rr=infinite,
         correction=infinite,
         stalled=no,
@@ -296,16 +293,9 @@ def _goes_on(system: _System, c: _Restarts) -> Bool[Array, ""]:
 def _restart(system: _System, c: _Restarts) -> _Restarts:
     """Run the recurrence from the true residual, until its own residual meets the tolerance or is too small to be
     trusted."""
-    r = system.b - system.apply(c.x)
+    r = system.b - system.product(c.x)[0]
     rr = system.dot(r, r)
-    c = replace(
-        c,
-        rr=rr,
-        restart_x=c.x,
-        restart_rr=rr,
-        correction=system.norm(c.x - c.restart_x),
-        stalled=rr > c.restart_rr / 4,
-    )
+    c = replace(c, rr=rr, restart_rr=rr, stalled=rr > c.restart_rr / 4)
     done = c.stalled | ~_goes_on(system, c)
     limits = Limits(
         tolerance=system.rtol * system.b_norm,
@@ -323,6 +313,7 @@ def _restart(system: _System, c: _Restarts) -> _Restarts:
         small_increment=c.small_increment | end.small_increment,
         breakdown=c.breakdown | end.breakdown,
         indefinite=c.indefinite | end.indefinite,
+        correction=jnp.where(done, c.correction, system.norm(end.x - c.x)),
         done=done,
     )
 

@@ -146,12 +146,11 @@ class ParticleStiffness(AbstractHessianAction):
 
         stiff = jnp.stack([jnp.maximum(entry(m), 0) for m in range(d * d)])
         nodes = scatter(self.stencil.squared, None, stiff.reshape(d, d, -1), like.shape[0])
-        found = jnp.stack([self.mirror.fold_scalar(component) for component in nodes.T], axis=1)
+        found = self.mirror.fold_scalars(nodes)
         if self.springs:
             found = found + spring_diagonal(self.springs, self.stencil, self.mirror, like.shape[0])
         for coupling in self.couplings:
-            each = coupling.diagonal(len(like)).T
-            found = found + jnp.stack([self.mirror.fold_scalar(component) for component in each], axis=1)
+            found = found + self.mirror.fold_scalars(coupling.diagonal(len(like)))
         return found + sum(support.diagonal(like) for support in self.supports) if self.supports else found
 
 

@@ -56,9 +56,9 @@ class Linearised(AbstractSolution):
         operator = problem.operator(guess).precomputed()
         combine = problem.projection.combine
         lift = combine(0, problem.prescribed)
-        still = jnp.zeros_like(lift)
-        moved = jax.lax.cond((lift != 0).any(), lambda: operator.unconstrained(lift), lambda: still)
-        rhs = combine(problem.rhs - moved, 0)
+        at_rest = problem.rhs
+        rhs = jax.lax.cond((lift != 0).any(), lambda: at_rest - operator.unconstrained(lift), lambda: at_rest)
+        rhs = combine(rhs, 0)
         inner = problem.preconditioner.inner_product(operator)
         solution = solve_linear(self.solver, operator, rhs, inner, combine(guess, 0))
         zero_count = jnp.asarray(0, dtype=jnp.int32)

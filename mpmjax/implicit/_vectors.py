@@ -6,6 +6,7 @@ small part. On CPUs the native library does them in two, in place, and passes ov
 """
 
 from collections.abc import Callable
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -41,7 +42,7 @@ class Product(NamedTuple):
 
 def active_blocks(*may_differ_from_zero: Bool[Array, "m"]) -> Bool[Array, "k"]:
     """Whether any of 64 numbers that follow each other may differ from zero, for each such block, shape (⌈m/64⌉,)."""
-    some = jnp.stack(may_differ_from_zero).any(axis=0)
+    some = reduce(jnp.logical_or, may_differ_from_zero)
     return jnp.pad(some, (0, -len(some) % _TOGETHER)).reshape(-1, _TOGETHER).any(axis=1)
 
 

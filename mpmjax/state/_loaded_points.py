@@ -59,7 +59,7 @@ class LoadedPoints(eqx.Module):
         """Σ_s (w_ip² + Σ_b g_ip,b² r_sb²) k_s [N/m], shape (n, d): a non-negative approximation of the diagonal of
         Σ_s N_is k_s N_js, exact where the arms are zero."""
         squares = scatter(self.stencil.squared, coefficient, self.arm[:, None] ** 2 * coefficient, like.shape[0])
-        return jnp.stack([self.mirror.fold_scalar(component) for component in squares.T], axis=1)
+        return self.mirror.fold_scalars(squares)
 
 
 def loaded_points(
