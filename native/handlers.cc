@@ -7,18 +7,18 @@
 //   resist   index, weights, derivatives, matrices, nodes              ->  nodes
 //   combine  a, b, c, d, scales, weight, active                        ->  y, z, sum
 //   product  force, v, mass, factor, free, weight, active              ->  image, sum
-//   recur    index, weights, derivatives, matrices, mass, factor, free, weight, active, x, r, limits  ->  x, numbers
+//   solve    index, weights, derivatives, matrices, mass, factor, free, weight, active, x, rhs, limits  ->  x, numbers
 //
 // Factors are (..., d, s, p), given and gathered (..., c, p), nodes (..., n, c), matrices (..., d² (d² + 1) / 2, p), with
 // the same leading axes everywhere. Vectors are (..., m), scales (..., 2), mass (..., n), active (..., ⌈m/64⌉), and those
-// of a recurrence have m = n d.
+// of a solve have m = n d.
 // `valued` says whether the first of the given is the value; `differential` whether changes of the factors follow them.
 
 #include <string>
 #include <utility>
 #include <vector>
 
-#include "recurrence.h"
+#include "solve.h"
 #include "sums.h"
 #include "targets.h"
 #include "vectors.h"
@@ -224,29 +224,30 @@ struct ResistOf {
   }
 };
 
-struct RecurrenceOf {
+struct SolveOf {
   template <class T>
   bool run(const Pool& pool, Call& call) const {
     const int64_t m = call.d * call.d, nodes = call.dim(4, 1), size = nodes * call.d;
-    Recurrence<T> task = {};
-    task.stencils = call.stencils<T>(false);
-    task.nodes = nodes;
-    task.columns = call.d;
-    task.matrices = call.at<T>(3, {m * (m + 1) / 2, call.particles});
-    task.mass = call.at<T>(4, {nodes});
-    task.factor = call.at<T>(5, {});
-    task.free = call.booleans(6, size);
-    task.weight = call.at<T>(7, {size});
-    task.active = call.booleans(8, (size + kTogether - 1) / kTogether);
-    task.start = call.at<T>(9, {size});
-    task.residual = call.at<T>(10, {size});
-    task.limits = call.at<T>(11, {kLimits});
-    task.x = call.at<T>(12, {size});
-    task.numbers = call.at<T>(13, {kNumbers});
+    Solve<T> task = {};
+    Recurrence<T>& of = task.recurrence;
+    of.stencils = call.stencils<T>(false);
+    of.nodes = nodes;
+    of.columns = call.d;
+    of.matrices = call.at<T>(3, {m * (m + 1) / 2, call.particles});
+    of.mass = call.at<T>(4, {nodes});
+    of.factor = call.at<T>(5, {});
+    of.free = call.booleans(6, size);
+    of.weight = call.at<T>(7, {size});
+    of.active = call.booleans(8, (size + kTogether - 1) / kTogether);
+    of.start = call.at<T>(9, {size});
+    task.rhs = call.at<T>(10, {size});
+    task.limits = call.at<T>(11, {kTolerances});
+    of.x = call.at<T>(12, {size});
+    task.numbers = call.at<T>(13, {kOutcome});
     call.expect(call.operands == 12 && call.buffers.size() == 14, "too many or too few arrays");
     call.expect(nodes > 0 || call.particles == 0, "no nodes to gather from");
     if (!call.fault.empty()) return true;
-    return recur(pool, {int(call.d), int(call.s), false}, call.batch, task);
+    return solve(pool, {int(call.d), int(call.s), false}, call.batch, task);
   }
 };
 
@@ -281,8 +282,8 @@ ffi::Error run_resist(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi
   return run(ResistOf{}, threads, arguments, results);
 }
 
-ffi::Error run_recurrence(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
-  return run(RecurrenceOf{}, threads, arguments, results);
+ffi::Error run_solve(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  return run(SolveOf{}, threads, arguments, results);
 }
 
 // Calls on vectors of one size, beside booleans of their blocks, the last operand.
@@ -389,7 +390,7 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_combine, mpmjax::run_combine,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_product, mpmjax::run_product,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
-XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_recur, mpmjax::run_recurrence,
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_solve, mpmjax::run_solve,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
 
 // The threads that sums are shared among.

@@ -1,7 +1,6 @@
 #include "recurrence.h"
 
 #include <algorithm>
-#include <atomic>
 #include <cmath>
 #include <cstring>
 #include <limits>
@@ -11,12 +10,6 @@
 
 namespace mpmjax {
 namespace {
-
-class OneThread : public Pool {
- public:
-  int threads() const override { return 1; }
-  void schedule(std::function<void()> task) const override { task(); }
-};
 
 // `to` becomes v in free components. It is zero wherever nothing is active.
 template <class T>
@@ -71,39 +64,9 @@ bool run(const Pool& pool, Form form, const Recurrence<T>& task) {
   return true;
 }
 
-template <class T>
-Recurrence<T> member(Recurrence<T> all, Form form, int64_t i) {
-  const int64_t particles = all.stencils.particles, factors = i * form.d * form.s * particles;
-  const int64_t size = all.nodes * all.columns, vectors = i * size;
-  all.stencils.index += factors;
-  all.stencils.weights += factors;
-  all.stencils.derivatives += factors;
-  all.matrices += i * form.d * form.d * (form.d * form.d + 1) / 2 * particles;
-  all.mass += i * all.nodes;
-  all.factor += i;
-  all.free += vectors, all.weight += vectors, all.start += vectors, all.residual += vectors, all.x += vectors;
-  all.active += i * ((size + kTogether - 1) / kTogether);
-  all.limits += i * kLimits;
-  all.numbers += i * kNumbers;
-  return all;
-}
-
-template <class T>
-bool recur_all(const Pool& pool, Form form, int64_t batch, const Recurrence<T>& all) {
-  std::atomic<bool> known{true};
-  if (batch >= pool.threads()) {
-    share(pool, batch, [&](int64_t i) {
-      if (!run(OneThread(), form, member(all, form, i))) known = false;
-    });
-  } else {
-    for (int64_t i = 0; i < batch; ++i) known = run(pool, form, member(all, form, i)) && known;
-  }
-  return known;
-}
-
 }  // namespace
 
-bool recur(const Pool& p, Form f, int64_t b, const Recurrence<float>& r) { return recur_all(p, f, b, r); }
-bool recur(const Pool& p, Form f, int64_t b, const Recurrence<double>& r) { return recur_all(p, f, b, r); }
+bool recur(const Pool& p, Form f, const Recurrence<float>& r) { return run(p, f, r); }
+bool recur(const Pool& p, Form f, const Recurrence<double>& r) { return run(p, f, r); }
 
 }  // namespace mpmjax
