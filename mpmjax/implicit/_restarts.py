@@ -43,7 +43,7 @@ class Found(eqx.Module):
     k: Int[Array, ""]
     """Steps taken."""
     radius: Float[Array, ""]
-    """Largest Rayleigh quotient rᵀA r/‖r‖² so far."""
+    """Largest Rayleigh quotient rᵀA r/‖r‖²."""
     small_increment: Bool[Array, ""]
     """Whether the last increment was within `increment_rtol`."""
     breakdown: Bool[Array, ""]
@@ -51,7 +51,7 @@ class Found(eqx.Module):
     indefinite: Bool[Array, ""]
     """Whether rᵀA r < 0 beyond rounding was met."""
     correction: Float[Array, ""]
-    """Change of x between the last two restarts."""
+    """Change of x between the last two restarts, which estimates its error."""
     stalled: Bool[Array, ""]
     """Whether the true residual has not halved between the last two restarts."""
     b_norm: Float[Array, ""]

@@ -86,6 +86,7 @@ def gravest(faults: dict[Fault, Bool[Array, "p"]]) -> Int[Array, ""]:
 
 
 _GRAVEST_FIRST = (Fault.NOT_FINITE, Fault.PASSED, Fault.OUTSIDE, Fault.INADMISSIBLE)
+"""The faults of a state, and of the step that led to it."""
 
 
 def fault_of(problem: Problem, before: State, after: State, t: Scalar) -> Int[Array, ""]:
