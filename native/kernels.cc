@@ -1,8 +1,9 @@
-// The sums for every dimension and kernel, and the decompositions of matrices, compiled once for each instruction set:
+// The sums for every dimension and kernel, and the passes over arrays, compiled once for each instruction set:
 // MPMJAX_TARGET is its name.
 
 #include "eigen.h"
 #include "gather.h"
+#include "passes.h"
 #include "pull.h"
 #include "resist.h"
 #include "rotation.h"
@@ -43,8 +44,8 @@ const Kernels<T>* of(int d, int s, bool differential) {
 }
 
 template <class T>
-const mpmjax::MatrixKernels<T>& matrices() {
-  static constexpr mpmjax::MatrixKernels<T> kernels = {eigen<T>, rotation<T>};
+const mpmjax::ArrayKernels<T>& arrays() {
+  static constexpr mpmjax::ArrayKernels<T> kernels = {eigen<T>, rotation<T>, combine<T>, product<T>};
   return kernels;
 }
 
@@ -54,7 +55,7 @@ namespace mpmjax {
 
 #define MPMJAX_JOINED(a, b) a##b
 #define MPMJAX_KERNELS(target) MPMJAX_JOINED(kernels_, target)
-#define MPMJAX_MATRIX_KERNELS(target) MPMJAX_JOINED(matrix_kernels_, target)
+#define MPMJAX_ARRAY_KERNELS(target) MPMJAX_JOINED(array_kernels_, target)
 
 const Kernels<float>* MPMJAX_KERNELS(MPMJAX_TARGET)(float, int d, int s, bool differential) {
   return of<float>(d, s, differential);
@@ -64,7 +65,7 @@ const Kernels<double>* MPMJAX_KERNELS(MPMJAX_TARGET)(double, int d, int s, bool 
   return of<double>(d, s, differential);
 }
 
-const MatrixKernels<float>& MPMJAX_MATRIX_KERNELS(MPMJAX_TARGET)(float) { return matrices<float>(); }
-const MatrixKernels<double>& MPMJAX_MATRIX_KERNELS(MPMJAX_TARGET)(double) { return matrices<double>(); }
+const ArrayKernels<float>& MPMJAX_ARRAY_KERNELS(MPMJAX_TARGET)(float) { return arrays<float>(); }
+const ArrayKernels<double>& MPMJAX_ARRAY_KERNELS(MPMJAX_TARGET)(double) { return arrays<double>(); }
 
 }  // namespace mpmjax

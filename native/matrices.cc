@@ -23,7 +23,7 @@ template <class T>
 void eigen_all(const Pool& pool, int64_t batch, const Eigen<T>& all) {
   const int64_t n = all.particles;
   over_particles(pool, batch, n, [&](int64_t m, int64_t first, int64_t last) {
-    matrix_kernels(T()).eigen({all.matrices + 9 * n * m, all.values + 3 * n * m, all.vectors + 9 * n * m, n}, first, last);
+    array_kernels(T()).eigen({all.matrices + 9 * n * m, all.values + 3 * n * m, all.vectors + 9 * n * m, n}, first, last);
   });
 }
 
@@ -31,7 +31,7 @@ template <class T>
 void rotation_all(const Pool& pool, int64_t batch, const Rotation<T>& all) {
   const int64_t n = all.particles;
   over_particles(pool, batch, n, [&](int64_t m, int64_t first, int64_t last) {
-    matrix_kernels(T()).rotation({all.matrices + 9 * n * m, all.rotations + 9 * n * m, n}, first, last);
+    array_kernels(T()).rotation({all.matrices + 9 * n * m, all.rotations + 9 * n * m, n}, first, last);
   });
 }
 

@@ -25,13 +25,6 @@ struct Rotation {
   int64_t particles;
 };
 
-// Both take particles from a first to a last.
-template <class T>
-struct MatrixKernels {
-  void (*eigen)(const Eigen<T>&, int64_t first, int64_t last);
-  void (*rotation)(const Rotation<T>&, int64_t first, int64_t last);
-};
-
 // `batch` problems follow each other in every array.
 void eigen(const Pool& pool, int64_t batch, const Eigen<float>& first);
 void eigen(const Pool& pool, int64_t batch, const Eigen<double>& first);

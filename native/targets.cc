@@ -47,13 +47,13 @@ const Kernels<T>* of(int d, int s, bool differential) {
 }
 
 template <class T>
-const MatrixKernels<T>& matrices_of() {
+const ArrayKernels<T>& arrays_of() {
   switch (target()) {
 #if defined(MPMJAX_X86)
-    case Target::avx512: return matrix_kernels_avx512(T());
-    case Target::avx2: return matrix_kernels_avx2(T());
+    case Target::avx512: return array_kernels_avx512(T());
+    case Target::avx2: return array_kernels_avx2(T());
 #endif
-    default: return matrix_kernels_baseline(T());
+    default: return array_kernels_baseline(T());
   }
 }
 
@@ -61,8 +61,8 @@ const MatrixKernels<T>& matrices_of() {
 
 const Kernels<float>* kernels(float, int d, int s, bool differential) { return of<float>(d, s, differential); }
 const Kernels<double>* kernels(double, int d, int s, bool differential) { return of<double>(d, s, differential); }
-const MatrixKernels<float>& matrix_kernels(float) { return matrices_of<float>(); }
-const MatrixKernels<double>& matrix_kernels(double) { return matrices_of<double>(); }
+const ArrayKernels<float>& array_kernels(float) { return arrays_of<float>(); }
+const ArrayKernels<double>& array_kernels(double) { return arrays_of<double>(); }
 
 const char* instructions() {
   switch (target()) {

@@ -4,16 +4,27 @@
 
 #include "matrices.h"
 #include "problems.h"
+#include "vectors.h"
 
 namespace mpmjax {
 
+// Passes over arrays: decompositions of particles' matrices from a first to a last, and over blocks of vectors, which return
+// their sum.
+template <class T>
+struct ArrayKernels {
+  void (*eigen)(const Eigen<T>&, int64_t first, int64_t last);
+  void (*rotation)(const Rotation<T>&, int64_t first, int64_t last);
+  double (*combine)(const Combine<T>&, int64_t first, int64_t last);
+  double (*product)(const Product<T>&, int64_t first, int64_t last);
+};
+
 // The sums of d dimensions with s nodes along an axis; of a differential by the factors if asked for. Null where
-// there is none. The first argument names the type, here as of the decompositions of matrices.
+// there is none. The first argument names the type, here as of the passes over arrays.
 #define MPMJAX_DECLARE(target)                                       \
   const Kernels<float>* kernels_##target(float, int, int, bool);     \
   const Kernels<double>* kernels_##target(double, int, int, bool);   \
-  const MatrixKernels<float>& matrix_kernels_##target(float);        \
-  const MatrixKernels<double>& matrix_kernels_##target(double);
+  const ArrayKernels<float>& array_kernels_##target(float);          \
+  const ArrayKernels<double>& array_kernels_##target(double);
 MPMJAX_DECLARE(baseline)
 #if defined(MPMJAX_X86)
 MPMJAX_DECLARE(avx2)
@@ -25,8 +36,8 @@ MPMJAX_DECLARE(avx512)
 const Kernels<float>* kernels(float, int d, int s, bool differential);
 const Kernels<double>* kernels(double, int d, int s, bool differential);
 
-const MatrixKernels<float>& matrix_kernels(float);
-const MatrixKernels<double>& matrix_kernels(double);
+const ArrayKernels<float>& array_kernels(float);
+const ArrayKernels<double>& array_kernels(double);
 
 // Its name.
 const char* instructions();
