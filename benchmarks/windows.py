@@ -5,8 +5,8 @@
 
 A semi-implicit step is one of twenty times the block's own; what an iteration of it costs is told from steps cut off
 after few and after more of them. A gradient is that of some explicit steps by all initial velocities. Medians are
-compared as ratios, which would all be one if cost followed material alone; the ratio of the fastest is in brackets. Times
-are those of all threads together, on which other work on the machine has less influence than on the clock.
+compared as ratios, which would all be one if cost followed material alone; the ratio of the fastest is in brackets.
+Times are those of all threads together, on which other work on the machine has less influence than on the clock.
 """
 
 import argparse
