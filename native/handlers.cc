@@ -5,15 +5,15 @@
 //   scatter  index, weights, derivatives [, their changes], given ...  ->  nodes
 //   pull     index, weights, derivatives, nodes, given ...             ->  by weights, by derivatives
 //   resist   index, weights, derivatives, matrices, nodes              ->  nodes
-//   recur    index, weights, derivatives, matrices, mass, factor, free, weight, active, x, r, limits  ->  x, numbers
+//   solve    index, weights, derivatives, matrices, mass, factor, free, weight, active, x, rhs, limits  ->  x, numbers
 //
 // Factors are (..., d, s, p), values (..., c, p) and gradients (..., d, c, p), nodes (..., n, c), matrices
 // (..., d² (d² + 1) / 2, p), with the same leading axes everywhere. Given are a value or gradients or both; gradients may
-// have fewer columns than the value. In a recurrence vectors are (..., n d), mass (..., n), active (..., ⌈n d/64⌉).
+// have fewer columns than the value. In a solve vectors are (..., n d), mass (..., n), active (..., ⌈n d/64⌉).
 // `valued` says whether there is a value; `differential` whether changes of the factors follow them.
 
 #include "call.h"
-#include "recurrence.h"
+#include "solve.h"
 #include "sums.h"
 #include "targets.h"
 #include "vectors.h"
@@ -115,29 +115,30 @@ struct ResistOf {
   }
 };
 
-struct RecurrenceOf {
+struct SolveOf {
   template <class T>
   bool run(const Pool& pool, Call& call) const {
     const int64_t m = call.d * call.d, nodes = call.dim(4, 1), size = nodes * call.d;
-    Recurrence<T> task = {};
-    task.stencils = call.stencils<T>(false);
-    task.nodes = nodes;
-    task.columns = call.d;
-    task.matrices = call.at<T>(3, {m * (m + 1) / 2, call.particles});
-    task.mass = call.at<T>(4, {nodes});
-    task.factor = call.at<T>(5, {});
-    task.free = call.booleans(6, size);
-    task.weight = call.at<T>(7, {size});
-    task.active = call.booleans(8, (size + kTogether - 1) / kTogether);
-    task.start = call.at<T>(9, {size});
-    task.residual = call.at<T>(10, {size});
-    task.limits = call.at<T>(11, {kLimits});
-    task.x = call.at<T>(12, {size});
-    task.numbers = call.at<T>(13, {kNumbers});
+    Solve<T> task = {};
+    Recurrence<T>& of = task.recurrence;
+    of.stencils = call.stencils<T>(false);
+    of.nodes = nodes;
+    of.columns = call.d;
+    of.matrices = call.at<T>(3, {m * (m + 1) / 2, call.particles});
+    of.mass = call.at<T>(4, {nodes});
+    of.factor = call.at<T>(5, {});
+    of.free = call.booleans(6, size);
+    of.weight = call.at<T>(7, {size});
+    of.active = call.booleans(8, (size + kTogether - 1) / kTogether);
+    of.start = call.at<T>(9, {size});
+    task.rhs = call.at<T>(10, {size});
+    task.limits = call.at<T>(11, {kTolerances});
+    of.x = call.at<T>(12, {size});
+    task.numbers = call.at<T>(13, {kOutcome});
     call.expect(call.operands == 12 && call.buffers.size() == 14, "too many or too few arrays");
     call.expect(nodes > 0 || call.particles == 0, "no nodes to gather from");
     if (!call.fault.empty()) return true;
-    return recur(pool, {int(call.d), int(call.s), false}, call.batch, task);
+    return solve(pool, {int(call.d), int(call.s), false}, call.batch, task);
   }
 };
 
@@ -172,8 +173,8 @@ ffi::Error run_resist(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi
   return run(ResistOf{}, threads, arguments, results);
 }
 
-ffi::Error run_recurrence(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
-  return run(RecurrenceOf{}, threads, arguments, results);
+ffi::Error run_solve(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  return run(SolveOf{}, threads, arguments, results);
 }
 
 ffi::Error run_threads(ffi::ThreadPool threads, ffi::ResultBuffer<ffi::DataType::S32> count) {
@@ -203,7 +204,7 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_pull, mpmjax::run_pull,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<bool>("valued").RemainingArgs().RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_resist, mpmjax::run_resist,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
-XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_recur, mpmjax::run_recurrence,
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_solve, mpmjax::run_solve,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
 
 // The threads that sums are shared among.

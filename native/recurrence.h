@@ -1,4 +1,4 @@
-// The recurrence of the conjugate residual method with one matrix for each particle, as a whole.
+// The recurrence of the conjugate residual method with one matrix for each particle.
 
 #pragma once
 
@@ -29,10 +29,8 @@ struct Recurrence {
   int64_t nodes, columns;
 };
 
-// Each returns false where there is no kernel of this form. `batch` problems follow each other in every array, and each
-// ends by itself. As many as there are threads or more are shared among them whole, each with its arrays in the cache of
-// one core; fewer are done one after the other by all threads.
-bool recur(const Pool& pool, Form form, int64_t batch, const Recurrence<float>& first);
-bool recur(const Pool& pool, Form form, int64_t batch, const Recurrence<double>& first);
+// Each returns false where there is no kernel of this form.
+bool recur(const Pool& pool, Form form, const Recurrence<float>& task);
+bool recur(const Pool& pool, Form form, const Recurrence<double>& task);
 
 }  // namespace mpmjax

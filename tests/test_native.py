@@ -15,7 +15,7 @@ import mpmjax as mpm
 from mpmjax import linalg as la
 from mpmjax.discretisation import _resistance
 from mpmjax.discretisation import _transfer_sums as sums
-from mpmjax.implicit import _recurrence, _vectors
+from mpmjax.implicit import _recurrence, _restarts, _vectors
 from mpmjax.native import _library
 
 ROOT = Path(__file__).parents[1]
@@ -256,9 +256,10 @@ def test_products_of_vectors_agree(choose, each):
 
 @NEEDS_LIBRARY
 @pytest.mark.parametrize("d", [2, *thorough(1, 3)])
-def test_recurrences_agree(choose, d):
-    """Native and by XLA, in a batch whose members end after other numbers of steps: at the tolerance, at the most
-    steps, at once. Each is bit for bit what it is alone, beside one that is not finite too."""
+def test_solves_agree(choose, d):
+    """Native and by XLA, in a batch whose members end after other numbers of steps: at the tolerance, after restarts
+    from a guess far off, at the most steps, at once, at the limit of the precision. Each is bit for bit what it is
+    alone, beside one that is not finite too."""
     rng = np.random.default_rng(d)
     index, w, g, upper, u = resistance(d, 30, "float64", wild=False, side=8)
     size = u.size
@@ -268,30 +269,41 @@ def test_recurrences_agree(choose, d):
     r, weight = jnp.where(free, jnp.asarray(rng.normal(size=size)), 0), jnp.asarray(rng.uniform(1, 2, size))
     active = _vectors.active_blocks(free)
 
-    def run(factor, steps, r):
+    def run(factor, steps, r, rtol, far):
         matrices = _recurrence.ParticleMatrices((index, w, g), upper, mass, factor, free)
-        rr = (weight * r * r).sum()
-        limits = _recurrence.Limits(1e-6 * jnp.sqrt(rr), 0.0, steps)
-        c = _recurrence.recur_by_matrices(matrices, weight, active, limits, _recurrence.Recurrence.begun(0 * r, r, rr))
-        return c.x, c.rr, c.k, c.radius, c.breakdown, c.indefinite
+        return _restarts.restarted_by_matrices(matrices, weight, active, _restarts.Ends(rtol, steps), r, far * x)
 
-    given = jnp.asarray([1e-2, 1e-4, 1.0, 1.0, 0.1]), jnp.asarray([500, 500, 5, 0, 500]), jnp.stack([r] * 4 + [r / 0])
+    x = jnp.where(free, jnp.asarray(rng.normal(size=size)), 0)
+    given = (
+        jnp.asarray([1e-2, 1e-4, 1e-2, 1.0, 1.0, 1.0, 0.1]),
+        jnp.asarray([500.0, 500, 500, 5, 0, 500, 500]),
+        jnp.stack([r] * 6 + [r / 0]),
+        jnp.asarray([1e-6, 1e-6, 1e-12, 1e-6, 1e-6, 1e-18, 1e-6]),
+        jnp.asarray([0.0, 0, 1e9, 0, 1, 0, 0]),
+    )
     found = {}
     for backend in ("native", "xla"):
         choose(backend)
         together, alone = jax.jit(jax.vmap(run)), jax.jit(run)
-        assert ("mpmjax_recur" in together.lower(*given).as_text()) == (backend == "native")
-        found[backend] = [np.asarray(a) for a in together(*given)]
+        assert ("mpmjax_solve" in together.lower(*given).as_text()) == (backend == "native")
+        found[backend] = together(*given)
         if backend == "native":
-            for k in range(5):
-                for one, member in zip(alone(*(a[k] for a in given)), found[backend], strict=True):
+            for k in range(7):
+                ended = alone(*(a[k] for a in given))
+                for one, member in zip(jax.tree.leaves(ended), jax.tree.leaves(found[backend]), strict=True):
                     np.testing.assert_array_equal(one, member[k])
-    x, _, k, *_ = found["native"]
-    assert k[0] > k[1] > 0
-    assert list(k[2:4]) == [5, 0]
-    assert np.isfinite(x[:4]).all()
-    for native, xla in zip(found["native"], found["xla"], strict=True):
-        assert_close(native[:4], xla[:4], rtol=1e-9)
+    native, xla = found["native"], found["xla"]
+    assert native.k[0] > native.k[1] > 0
+    assert list(native.k[3:5]) == [5, 0]
+    assert native.stalled[5]
+    assert not native.stalled[:3].any()
+    assert np.isfinite(native.x[:6]).all()
+    assert (np.sqrt(native.rr) <= given[3] * native.b_norm)[:3].all()
+    for name in ("x", "rr", "k", "radius", "breakdown", "indefinite", "b_norm", "x_norm"):
+        ours, theirs = (np.asarray(getattr(one, name)) for one in (native, xla))
+        assert_close(ours[[0, 1, 3, 4]], theirs[[0, 1, 3, 4]], rtol=1e-9)
+    for k in (2, 5):  # down to rounding the steps are not the same
+        assert_close(native.x[k], xla.x[k], rtol=1e-9)
 
 
 @NEEDS_LIBRARY

@@ -190,7 +190,8 @@ class Bench(NamedTuple):
                 progress=False,
                 watch=True,
             )
-            _, state, new, _ = go()
+            reached = go()
+            state, new = reached.state, reached.statistics
             statistics = statistics.merged(new)
             if not bool(jax.block_until_ready(statistics.healthy)):
                 if throw:

@@ -1,6 +1,5 @@
 """Walls along the axes: boxes that hold, let slide, or let go."""
 
-from functools import reduce
 from typing import ClassVar
 
 import equinox as eqx
@@ -59,12 +58,10 @@ class AbstractBox(AbstractBoundary):
         """Which particles passed a wall: those deeper than `deepest`, among others (`crossed`)."""
         start, end = start - self.displacement(t), end - self.displacement(t + dt)
 
-        def through(wall: Array, start: Array, end: Array) -> Array:
-            return crossed(start, end, wall, self.deepest(wall, spacing, reach), spacing)
-
-        below, above = jnp.asarray(self.lower, end.dtype), jnp.asarray(self.upper, end.dtype)
-        by_axis = zip(below, above, start.T, end.T, strict=True)
-        return reduce(jnp.logical_or, [through(lo, a, b) | through(-hi, -a, -b) for lo, hi, a, b in by_axis])
+        corners = jnp.asarray(self.lower, end.dtype), jnp.asarray(self.upper, end.dtype)
+        walls = _on_both_sides(*corners)[:, None]
+        start, end = _on_both_sides(start.T, start.T), _on_both_sides(end.T, end.T)
+        return crossed(start, end, walls, self.deepest(walls, spacing, reach), spacing).any(axis=0)
 
     def deepest(self, wall: Array, spacing: Scalar, reach: float) -> Array:
         """How deep a lower wall lets a particle come [m]: to where no node of its stencil is free.
@@ -197,6 +194,12 @@ class SeparatingBox(AbstractBox):
 
     def check(self, grid: Grid, *, total: bool) -> None:
         refuse_contact(total)
+
+
+def _on_both_sides(lower: Array, upper: Array) -> Array:
+    """Coordinates along the inward normals of the lower walls, and then of the upper ones, shape (2d, ...). XLA stores
+    what is concatenated, and only then makes vectors of what follows."""
+    return jnp.concatenate([lower, -upper])
 
 
 def _check_motion(box: AbstractBox, motion: Motion | None) -> None:

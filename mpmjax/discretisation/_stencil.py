@@ -142,11 +142,11 @@ def _index_factors(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Arr
     """Term of the C-order node index from each axis, shape (d, s, p)."""
     first = jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window.astype(jnp.int32)[:, None]
     along = first[:, None] + jnp.arange(kernel.order + 1, dtype=jnp.int32)[:, None]
-    periods, wraps, strides = (
-        jnp.asarray(numbers)[:, None, None]
-        for numbers in (grid.shape, grid.periodic, [math.prod(grid.shape[a + 1 :]) for a in range(grid.dim)])
-    )
-    return jnp.where(wraps, along % periods.astype(jnp.int32), along) * strides.astype(jnp.int32)
+    if any(grid.periodic):  # by whole numbers in the code: XLA divides by those in an array one by one
+        axes = zip(along, grid.shape, grid.periodic, strict=True)
+        along = jnp.stack([index % period if wraps else index for index, period, wraps in axes])
+    strides = np.array([math.prod(grid.shape[a + 1 :]) for a in range(grid.dim)], np.int32)
+    return along * strides[:, None, None]
 
 
 def _tensor(combine: Callable[[Array, Array], Array], factors: list[Array]) -> Array:

@@ -1,26 +1,23 @@
 """The conjugate residual method."""
 
 from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import lineax as lx
 from jax.flatten_util import ravel_pytree
 
-from mpmjax._types import Array, Bool, Float, Int, Scalar
+from mpmjax._types import Array, Bool, Float, Scalar
 from mpmjax.checks import require, require_fields, require_positive, require_tolerance
 from mpmjax.implicit._inner_product import AbstractInnerProduct, DiagonalInnerProduct
 from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, AbstractInnerProductSolver, default_rtol
-from mpmjax.implicit._recurrence import Limits, ParticleMatrices, Passes, Recurrence, recur, recur_by_matrices
+from mpmjax.implicit._recurrence import ParticleMatrices, Passes
+from mpmjax.implicit._restarts import Ends, Found, restarted, restarted_by_matrices
 from mpmjax.implicit._vectors import active_blocks, combine
 
 NEGLIGIBLE_CHANGE = 1e-3
 """Largest relative change of the solution by one more correction, where rounding hides the tolerance."""
-_REACH = 64.0  # the recurrence's own residual means nothing below so many units of rounding of the one it started from
 
 
 class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
@@ -46,7 +43,7 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
     - `product`: for a diagonal W, the operator's `product` (see `AbstractSymmetricOperator`), which may be faster than
       its `mv` and sums. Default: these.
     - `matrices`: for a diagonal W, the operator as one matrix for each particle (see `ParticleMatrices`), with which
-      the recurrence is one call of the native library. Default: that it is not of this kind.
+      the whole iteration is one call of the native library. Default: that it is not of this kind.
 
     Statistics returned:
 
@@ -100,9 +97,9 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
         system = _system(self, state, vector, options)
         y0 = options.get("y0")
         x = jnp.zeros_like(system.b) if y0 is None else system.started(ravel_pytree(y0)[0])
-        c = jax.lax.while_loop(lambda c: ~c.done, partial(_restart, system), _start(x, system.b.dtype))
-        result, stats = _outcome(system, c)
-        return system.unravel(system.plain(c.x)), result, stats
+        found = system.solve(x)
+        result, stats = _outcome(system, found)
+        return system.unravel(system.plain(found.x)), result, stats
 
     def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         return state, options
@@ -122,10 +119,7 @@ class _System(eqx.Module):
     unravel: Callable[[Array], Any] = eqx.field(static=True)
     b: Float[Array, "*pair m"]
     """W⁻¹ times the right-hand side."""
-    b_norm: Float[Array, ""]
-    rtol: Scalar
-    increment_rtol: Scalar | None
-    max_steps: int = eqx.field(static=True)
+    ends: Ends
 
     def apply(self, u: Array) -> Array:
         """E u."""
@@ -139,10 +133,6 @@ class _System(eqx.Module):
     def dot(self, a: Array, c: Array) -> Float[Array, ""]:
         """aᵀ W c."""
         return (self.inner.apply(a) * c).sum()
-
-    def norm(self, a: Array) -> Float[Array, ""]:
-        """‖a‖ in the norm of W."""
-        return jnp.sqrt(self.dot(a, a))
 
     def started(self, x: Array) -> Array:
         """A plain vector as those of the recurrence."""
@@ -161,14 +151,9 @@ class _System(eqx.Module):
         second = c + t * d
         return a + s * b, second, self.dot(second, second)
 
-    def recur(self, limits: Limits, c: Recurrence) -> Recurrence:
-        """The state at the end of the recurrence."""
-        return recur(Passes(self.product, self.combined, self.dot), limits, c)
-
-    @property
-    def eps(self) -> Any:
-        """The rounding unit."""
-        return jnp.finfo(self.b.dtype).eps
+    def solve(self, x: Array) -> Found:
+        """The end of the iteration, which starts at x."""
+        return restarted(Passes(self.product, self.combined, self.dot), self.ends, self.b, x)
 
 
 class _DiagonalSystem(_System):
@@ -183,10 +168,10 @@ class _DiagonalSystem(_System):
     matrices: ParticleMatrices | None
     """The operator's `matrices`, likewise."""
 
-    def recur(self, limits: Limits, c: Recurrence) -> Recurrence:
-        if self.matrices is None or limits.increment_rtol is not None:
-            return super().recur(limits, c)
-        return recur_by_matrices(self.matrices, self.weight, self.active, limits, c)
+    def solve(self, x: Array) -> Found:
+        if self.matrices is None or self.ends.increment_rtol is not None:
+            return super().solve(x)
+        return restarted_by_matrices(self.matrices, self.weight, self.active, self.ends, self.b, x)
 
     def product(self, u: Array) -> tuple[Array, Float[Array, ""]]:
         if self.fused is None:
@@ -217,31 +202,6 @@ class _PairedSystem(_System):
         return x[0]
 
 
-class _Restarts(eqx.Module):
-    """The state between two restarts of the recurrence."""
-
-    x: Array
-    rr: Float[Array, ""]
-    """‖r‖²."""
-    k: Int[Array, ""]
-    """Steps taken."""
-    radius: Float[Array, ""]
-    """Largest Rayleigh quotient rᵀA r/‖r‖² so far."""
-    restart_rr: Float[Array, ""]
-    """‖r‖² at the last restart, of the true residual."""
-    correction: Float[Array, ""]
-    """Change of x between the last two restarts, in the norm of W."""
-    stalled: Bool[Array, ""]
-    """Whether the true residual has not halved between the last two restarts."""
-    small_increment: Bool[Array, ""]
-    """Whether the last increment was within `increment_rtol`."""
-    breakdown: Bool[Array, ""]
-    """Whether rᵀA r = 0 to rounding was met."""
-    indefinite: Bool[Array, ""]
-    """Whether rᵀA r < 0 beyond rounding was met."""
-    done: Bool[Array, ""]
-
-
 def _system(
     solver: ConjugateResidual, operator: lx.AbstractLinearOperator, vector: Any, options: dict[str, Any]
 ) -> _System:
@@ -250,15 +210,13 @@ def _system(
     inner = DiagonalInnerProduct(jnp.ones_like(flat)) if inner is None else inner.flattened(unravel)
     b = jnp.stack([inner.solve(flat), flat]) if inner.paired else inner.solve(flat)
     rtol = default_rtol(flat.dtype) if solver.rtol is None else solver.rtol
-    given = operator, inner, unravel, b, b.ravel()[0], rtol, solver.increment_rtol, solver.max_steps
+    given = operator, inner, unravel, b, Ends(rtol, solver.max_steps, solver.increment_rtol)
     if inner.paired:
-        system = _PairedSystem(*given)
-    elif isinstance(inner, DiagonalInnerProduct):
+        return _PairedSystem(*given)
+    if isinstance(inner, DiagonalInnerProduct):
         found = options.get("product"), options.get("matrices")
-        system = _DiagonalSystem(*given, inner.weight, _active(flat, options), *found)
-    else:
-        system = _System(*given)
-    return replace(system, b_norm=system.norm(b))
+        return _DiagonalSystem(*given, inner.weight, _active(flat, options), *found)
+    return _System(*given)
 
 
 def _active(rhs: Array, options: dict[str, Any]) -> Bool[Array, "k"]:
@@ -268,71 +226,21 @@ def _active(rhs: Array, options: dict[str, Any]) -> Bool[Array, "k"]:
     return active_blocks(inside, rhs != 0, *([] if y0 is None else [ravel_pytree(y0)[0] != 0]))
 
 
-def _start(x: Array, dtype: Any) -> _Restarts:
-    zero, infinite, no = jnp.zeros((), dtype), jnp.full((), jnp.inf, dtype), jnp.asarray(False)
-    return _Restarts(
-        x=x,
-        rr=infinite,
-        k=jnp.asarray(0, dtype=jnp.int32),
-        radius=zero,
-        restart_rr=infinite,
-        correction=infinite,
-        stalled=no,
-        small_increment=no,
-        breakdown=no,
-        indefinite=no,
-        done=no,
-    )
-
-
-def _goes_on(system: _System, c: _Restarts) -> Bool[Array, ""]:
-    above = jnp.sqrt(c.rr) > system.rtol * system.b_norm
-    return above & ~c.small_increment & ~c.breakdown & (c.k < system.max_steps)
-
-
-def _restart(system: _System, c: _Restarts) -> _Restarts:
-    """Run the recurrence from the true residual, until its own residual meets the tolerance or is too small to be
-    trusted."""
-    r = system.b - system.product(c.x)[0]
-    rr = system.dot(r, r)
-    c = replace(c, rr=rr, restart_rr=rr, stalled=rr > c.restart_rr / 4)
-    done = c.stalled | ~_goes_on(system, c)
-    limits = Limits(
-        tolerance=system.rtol * system.b_norm,
-        floor=(_REACH * system.eps) ** 2 * rr,
-        steps=jnp.where(done, 0, system.max_steps - c.k),
-        increment_rtol=system.increment_rtol,
-    )
-    end = system.recur(limits, Recurrence.begun(c.x, r, rr))
-    return replace(
-        c,
-        x=end.x,
-        rr=end.rr,
-        k=c.k + end.k,
-        radius=jnp.maximum(c.radius, end.radius),
-        small_increment=c.small_increment | end.small_increment,
-        breakdown=c.breakdown | end.breakdown,
-        indefinite=c.indefinite | end.indefinite,
-        correction=jnp.where(done, c.correction, system.norm(end.x - c.x)),
-        done=done,
-    )
-
-
-def _outcome(system: _System, c: _Restarts) -> tuple[lx.RESULTS, dict[str, Any]]:
+def _outcome(system: _System, found: Found) -> tuple[lx.RESULTS, dict[str, Any]]:
     """The result and statistics at the end of the iteration."""
-    residual, tolerance = jnp.sqrt(c.rr), system.rtol * system.b_norm
-    negligible = c.correction <= NEGLIGIBLE_CHANGE * system.norm(c.x)
-    exact = c.stalled & ~c.breakdown & (c.k < system.max_steps) & negligible
-    converged = ((residual <= tolerance) | exact | c.small_increment) & jnp.isfinite(residual)
-    result = lx.RESULTS.where(c.k < system.max_steps, lx.RESULTS.stagnation, lx.RESULTS.max_steps_reached)
-    result = lx.RESULTS.where(c.breakdown, lx.RESULTS.breakdown, result)
+    residual, rtol, most = jnp.sqrt(found.rr), system.ends.rtol, system.ends.steps
+    negligible = found.correction <= NEGLIGIBLE_CHANGE * found.x_norm
+    exact = found.stalled & ~found.breakdown & (found.k < most) & negligible
+    converged = ((residual <= rtol * found.b_norm) | exact | found.small_increment) & jnp.isfinite(residual)
+    result = lx.RESULTS.where(found.k < most, lx.RESULTS.stagnation, lx.RESULTS.max_steps_reached)
+    result = lx.RESULTS.where(found.breakdown, lx.RESULTS.breakdown, result)
     result = lx.RESULTS.where(jnp.isfinite(residual), result, lx.RESULTS.nonfinite_input)
     result = lx.RESULTS.where(converged, lx.RESULTS.successful, result)
     return result, {
-        "num_steps": c.k,
-        "max_steps": system.max_steps,
-        "residual": residual / jnp.where(system.b_norm == 0, 1, system.b_norm),
-        "spectral_radius": c.radius,
-        "indefinite": c.indefinite,
-        "nearly_converged": ~converged & (residual <= NEARLY_CONVERGED * system.rtol * system.b_norm),
+        "num_steps": found.k,
+        "max_steps": most,
+        "residual": residual / jnp.where(found.b_norm == 0, 1, found.b_norm),
+        "spectral_radius": found.radius,
+        "indefinite": found.indefinite,
+        "nearly_converged": ~converged & (residual <= NEARLY_CONVERGED * rtol * found.b_norm),
     }

@@ -1,24 +1,16 @@
-"""The recurrence of the conjugate residual method (derivation, eq. 19): what it carries, its step, and its loop.
-
-Where the operator is M + χH with one matrix for each particle, the loop is a JAX primitive. On CPUs the native library
-runs it as a whole, and in a batch each member by itself: a loop of JAX goes on for all members until the last one is
-done, and selects whole vectors in every step.
-"""
+"""The recurrence of the conjugate residual method (derivation, eq. 19): what it carries, its step, and its loop."""
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.core import ShapedArray
 
 from mpmjax._types import Array, Bool, Float, Int, NodeScalar, Scalar
 from mpmjax.discretisation import resist_by
-from mpmjax.implicit._vectors import combine, differentiable, product
-from mpmjax.native import native_primitive, sums_fit
+from mpmjax.implicit._vectors import product
 
 
 class ParticleMatrices(eqx.Module):
@@ -95,6 +87,10 @@ class Passes(NamedTuple):
     dot: Callable[[Array, Array], Float[Array, ""]]
     """aᵀ W c of a and c."""
 
+    def norm(self, a: Array) -> Float[Array, ""]:
+        """‖a‖ in the norm of W."""
+        return jnp.sqrt(self.dot(a, a))
+
 
 def recur(passes: Passes, limits: Limits, c: Recurrence) -> Recurrence:
     """The state at the end of the recurrence."""
@@ -134,56 +130,3 @@ def _step(passes: Passes, limits: Limits, c: Recurrence) -> Recurrence:
         breakdown=breakdown,
         indefinite=c.indefinite | (gamma < -rounding),
     )
-
-
-def recur_by_matrices(
-    matrices: ParticleMatrices,
-    weight: Float[Array, "m"],
-    active: Bool[Array, "k"],
-    limits: Limits,
-    c: Recurrence,
-) -> Recurrence:
-    """The same for these matrices and a diagonal W. Of the vectors only x is returned; the others are as they were.
-
-    Args:
-        matrices: A.
-        weight: the diagonal of W, shape (m,).
-        active: `active_blocks`. In others x and r are zero.
-        limits: what ends it, without an `increment_rtol`.
-        c: the state before the first step.
-    """
-    numbers = (limits.tolerance, limits.floor, limits.steps, c.rr)
-    numbers = jnp.stack([jnp.asarray(number, c.rr.dtype) for number in numbers])
-    factor = jnp.asarray(matrices.factor, c.rr.dtype)
-    given = matrices.upper, matrices.mass, factor, matrices.free, weight, active, c.x, c.r, numbers
-    x, (rr, k, radius, breakdown, indefinite) = _recur_p.bind(*matrices.factors, *given, batched=0)
-    return eqx.tree_at(
-        lambda c: (c.x, c.rr, c.k, c.radius, c.breakdown, c.indefinite),
-        c,
-        (x, rr, k.astype(jnp.int32), radius, breakdown > 0, indefinite > 0),
-    )
-
-
-def _recur(*args: Array, unroll: bool = False) -> list[Array]:
-    del unroll  # the sums know
-    index, weights, derivatives, upper, mass, factor, free, weight, active, x, r, numbers = args
-    matrices = ParticleMatrices((index, weights, derivatives), upper, mass, factor, free)
-    passes = Passes(
-        product=lambda u: matrices.product(u, weight, active),
-        combined=lambda one, other, onto: combine(one, other, weight, active, onto=onto),
-        dot=lambda a, c: (weight * a * c).sum(),
-    )
-    tolerance, floor, steps, rr = numbers
-    c = recur(passes, Limits(tolerance, floor, steps), Recurrence.begun(x, r, rr))
-    return [c.x, jnp.stack([a.astype(rr.dtype) for a in (c.rr, c.k, c.radius, c.breakdown, c.indefinite)])]
-
-
-def _vector_and_numbers(*args: ShapedArray) -> list[tuple]:
-    return [args[-3].shape[-1:], (5,)]
-
-
-def _fits(avals: Any, batched: int) -> bool:
-    return sums_fit([aval for aval in avals if aval.dtype != np.bool_], batched)
-
-
-_recur_p = differentiable(native_primitive("solve_recur", _recur, _vector_and_numbers, _fits, {9: 0}), _recur)

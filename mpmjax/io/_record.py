@@ -123,7 +123,8 @@ def record(
                     progress=False,
                     watch=True,
                 )
-                _, state, new, _ = go()
+                reached = go()
+                state, new = reached.state, reached.statistics
                 before = partial(before_fault, go, begin, new)
                 statistics, step = statistics.merged(new), step + int(new.steps)
                 healthy = int(new.fault) == Fault.NONE and int(new.unconverged) == 0

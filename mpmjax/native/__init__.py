@@ -1,4 +1,4 @@
-"""The compiled sums of CPUs: whether there are any, and how JAX calls them."""
+"""The compiled library of CPUs: whether there is one, and how JAX calls it."""
 
 from mpmjax.native._backend import Backend, backend
 from mpmjax.native._lowering import sums_fit

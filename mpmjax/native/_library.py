@@ -12,7 +12,7 @@ INTERFACE = 5
 """What the library has to answer, as in native/CMakeLists.txt: both change with the handlers' arguments."""
 PATH = Path(__file__).parent / "lib" / "sums.so"
 """In a folder of its own: Python takes a shared library among modules for a module."""
-HANDLERS = ("gather", "scatter", "pull", "resist", "combine", "product", "recur", "eigen", "rotation")
+HANDLERS = ("gather", "scatter", "pull", "resist", "combine", "product", "solve", "eigen", "rotation")
 
 
 class Library(NamedTuple):

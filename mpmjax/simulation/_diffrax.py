@@ -85,12 +85,17 @@ def gravest(faults: dict[Fault, Bool[Array, "p"]]) -> Int[Array, ""]:
     return found
 
 
+_GRAVEST_FIRST = (Fault.NOT_FINITE, Fault.PASSED, Fault.OUTSIDE, Fault.INADMISSIBLE)
+"""The faults of a state, and of the step that led to it."""
+
+
 def fault_of(problem: Problem, before: State, after: State, t: Scalar) -> Int[Array, ""]:
     """The gravest fault of a state, or of the step from t [s] that led to it."""
-    fault = gravest(faulty_particles(problem, after, t + problem.dt))
-    for _, passed in passed_particles(problem, before, after, t):  # apart: one loop for all would not be vectorised
-        fault = jnp.where(passed.any() & (fault != Fault.NOT_FINITE), Fault.PASSED, fault)
-    return fault
+    faults = faulty_particles(problem, after, t + problem.dt)
+    passed = [particles for _, particles in passed_particles(problem, before, after, t)]
+    if passed:
+        faults[Fault.PASSED] = reduce(jnp.logical_or, passed)
+    return gravest({fault: faults[fault] for fault in _GRAVEST_FIRST if fault in faults})
 
 
 def examined(problem: Problem, state: RolloutState) -> tuple[Problem, RolloutState]:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import diffrax
 import equinox as eqx
@@ -13,6 +13,7 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.autodiff import guard, recomputed
+from mpmjax.boundary import BoundaryImpulse, ColliderImpulse
 from mpmjax.checks import (
     canonical,
     checked,
@@ -111,10 +112,10 @@ def simulate(
             f"save less often than every {save_every} steps, observe what is needed of them, or use record.",
             device=True,
         )
-    slot = jnp.zeros((), dtype)
+    slot = np.zeros((), dtype)
     if traced and throw:
         no_fault, unsolved = jnp.zeros((), jnp.int32), UNSOLVED.format("the adjoint")
-        (scene, particles, method), slot = guard((scene, particles, method), slot, no_fault, (), unsolved)
+        (scene, particles, method), slot = guard((scene, particles, method), jnp.asarray(slot), no_fault, (), unsolved)
     if adjoint is None:
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=max(1, min(count, checkpoint_bytes // state_bytes)))
     go = partial(
@@ -135,29 +136,28 @@ def simulate(
         progress=progress,
         watch=not traced,
     )
-    saved, final, statistics, report = go()
-    steps, values, *impulses = (jnp.zeros((0,), dtype), None, None, None) if saved is None else saved
+    end = go()
     run = Run(
         scene=scene,
         method=method,
         dt=dt_,
-        steps=steps,
-        frames=values if observe is None else None,
-        observed=None if observe is None else values,
-        final=with_state(particles, final.particles),
-        final_step=first + statistics.steps.astype(dtype),
-        statistics=statistics,
-        report=report if traced else None,
-        collider_impulse=impulses[0],
-        final_collider_impulse=final.collider_impulse,
-        boundary_impulse=impulses[1],
-        final_boundary_impulse=final.boundary_impulse,
+        steps=end.saved.steps,
+        frames=end.saved.values if observe is None else None,
+        observed=None if observe is None else end.saved.values,
+        final=end.particles,
+        final_step=end.step,
+        statistics=end.statistics,
+        report=end.report if traced else None,
+        collider_impulse=end.saved.collider_impulse,
+        final_collider_impulse=end.state.collider_impulse,
+        boundary_impulse=end.saved.boundary_impulse,
+        final_boundary_impulse=end.state.boundary_impulse,
     )
     if not throw:
         return run
     if traced:
-        return guarded(run, report)
-    raise_faults(run, particles, lambda: before_fault(go, begin, statistics), start)
+        return guarded(run, end.report)
+    raise_faults(run, particles, lambda: before_fault(go, begin, end.statistics), start)
     warn_of_inaccuracy(run.statistics)
     return run
 
@@ -236,6 +236,30 @@ def _bytes(state: RolloutState) -> int:
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
 
 
+class Saved(NamedTuple):
+    """What was saved on the way, along a first axis; no steps and None if nothing was."""
+
+    steps: Float[Array, "f"]
+    """Their numbers."""
+    values: Any = None
+    collider_impulse: ColliderImpulse | None = None
+    boundary_impulse: BoundaryImpulse | None = None
+
+
+class End(NamedTuple):
+    """The end of an integration."""
+
+    saved: Saved
+    state: RolloutState
+    particles: Particles
+    """The particles in this state."""
+    step: Float[Array, ""]
+    """The number of the last step."""
+    statistics: RunStatistics
+    report: Float[Array, ""]
+    """What tangent solves report."""
+
+
 @eqx.filter_jit
 def integrate(
     scene: Scene,
@@ -254,10 +278,9 @@ def integrate(
     adjoint: diffrax.AbstractAdjoint,
     progress: bool,
     watch: bool,
-) -> tuple[Any, RolloutState, RunStatistics, Array]:
+) -> End:
     """Integrate `count` ≤ `max_steps` steps from step `start`, at which the particles have this state.
 
-    Returns the steps, values and impulses saved, the final state, the statistics and what tangent solves report.
     Adjoint solves report through the `slot` (see `Reporting`). With `watch` the run stops at a fault, and `until` so
     many steps.
 
@@ -295,8 +318,11 @@ def integrate(
     )
     times, values, (statistics, report) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
     final = jax.tree.map(lambda a: a[-1], values["final"])
-    saved = None if save_every is None else (start + step_number(times["frames"]), *values["frames"])
-    return saved, final, statistics, report
+    saved = Saved(jnp.zeros((0,), start.dtype))
+    if save_every is not None:
+        saved = Saved(start + step_number(times["frames"]), *values["frames"])
+    last = start + statistics.steps.astype(start.dtype)
+    return End(saved, final, with_state(particles, final.particles), last, statistics, report)
 
 
 def before_fault(go: Callable[..., Any], begin: RolloutState, statistics: RunStatistics) -> RolloutState:
@@ -308,4 +334,4 @@ def before_fault(go: Callable[..., Any], begin: RolloutState, statistics: RunSta
         statistics: its statistics.
     """
     good = int(statistics.fault_step) - 1
-    return begin if good == 0 else go(until=np.asarray(good, begin.particles.x.dtype))[1]
+    return begin if good == 0 else go(until=np.asarray(good, begin.particles.x.dtype)).state
