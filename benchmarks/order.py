@@ -8,7 +8,8 @@ A block is in the order of `fill`, row by row, which is near that of the cells. 
 of water has run against the far wall of a tank and come back. By cell is the order that a counting sort makes, some
 steps ago that of one so many steps before, and shuffled the worst that motion can make. Own order against these is what
 sorting saves before its own cost, of which numpy's sort of the cells and the permutation of all the particles' arrays
-are an estimate: the second is what any sort costs at least.
+are an estimate: the second is what any sort costs at least. Milliseconds are those of all threads together, on which
+other work on the machine has less influence than on the clock.
 """
 
 import argparse
@@ -109,10 +110,10 @@ def main() -> None:
         random = np.random.default_rng(0)
         for turn in range(options.rounds):
             for what in random.permutation(list(runs)):  # no order always follows the same one in the caches
-                began = time.perf_counter()
+                began = time.process_time()
                 jax.block_until_ready(runs[what]())
-                seconds[what][turn] = time.perf_counter() - began
-        print(f"{name}, {state.count} particles, ms, medians and fastest, and their ratios to a step in own order:")
+                seconds[what][turn] = time.process_time() - began
+        print(f"{name}, {state.count} particles: ms of all threads, medians and fastest; ratios to a step in own order")
         own = seconds[OWN] / STEPS
         for what, taken in seconds.items():
             each = taken / (1 if what in ("sort", "permutation") else STEPS)

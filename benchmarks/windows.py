@@ -6,6 +6,7 @@
 A semi-implicit step is one of twenty times the block's own; what an iteration of it costs is told from steps cut off
 after few and after more of them. A gradient is that of some explicit steps by all initial velocities. Medians are
 compared as ratios, which would all be one if cost followed material alone; the ratio of the fastest is in brackets.
+Times are those of all threads together, on which other work on the machine has less influence than on the clock.
 """
 
 import argparse
@@ -82,9 +83,9 @@ def main() -> None:
         for turn in range(options.rounds):
             for what, taken in seconds.items():
                 for k, go in enumerate(windows.values()):
-                    began = time.perf_counter()
+                    began = time.process_time()
                     go[what]()
-                    taken[k, turn] = time.perf_counter() - began
+                    taken[k, turn] = time.process_time() - began
         for what, ms in told(seconds).items():
             median, least = np.median(ms, axis=1), ms.min(axis=1)
             wide = zip(windows, median / median[0], least / least[0], strict=True)
