@@ -190,7 +190,8 @@ def roll(quick: bool) -> None:
 
 
 def hertz(quick: bool) -> list[tuple]:
-    """Two equal cylinders that are pressed together: the half-width of contact over Hertz's, a² = 4PR*/(πE*)."""
+    """Two equal cylinders that are pressed together: the half-width of contact over Hertz's, a² = 4PR*/(πE*), by the
+    pressure of the springs, and by the forces that they spread on the nodes around."""
     E, nu, R, rows = 1e5, 0.3, 1.0, []
     modulus = E / (2 * (1 - nu**2))
     print("two cylinders: half-width over Hertz's")
@@ -215,9 +216,12 @@ def hertz(quick: bool) -> list[tuple]:
         load = 2 * abs(float(run.boundary_forces().force[-1, 1, 1]))
         contact, x = contact_of(scene, run.final, 20.0)
         push = np.maximum(-np.where(np.isfinite(contact.gap), contact.gap, 0) * np.asarray(contact.stiffness), 0)
-        half = 2 * np.sqrt((push * x[:, 0] ** 2).sum() / push.sum())  # <x²> = a²/4 of Hertz's pressure
+        spread = np.asarray(contact.patch.spread(jnp.asarray(push)[:, None]))[:, 0]
+        half, wide = (2 * np.sqrt((p * x[:, 0] ** 2).sum() / p.sum()) for p in (push, spread))  # <x²> = a²/4 of Hertz's
         exact = np.sqrt(4 * load * (R / 2) / (np.pi * modulus))
-        print(f"  {cells} cells to the radius, {half / dx:.1f} to the half-width: {half / exact:.3f}")
+        print(
+            f"  {cells} cells to the radius, {exact / dx:.1f} to the half-width: {half / exact:.3f}, {wide / exact:.3f}"
+        )
         rows.append((x[push > 0, 0], push[push > 0], exact, dx))
     return rows
 
