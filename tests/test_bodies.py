@@ -165,6 +165,28 @@ def test_bodies_that_do_not_touch_move_as_each_alone():
         assert_close(both.x[own], new.x)
 
 
+def test_half_of_two_bodies_is_pushed_as_the_whole():
+    """At a symmetry plane through nodes: the push makes the accelerations that it makes without the plane, but for what
+    normals know of the side beyond."""
+    grid = mpm.Grid((20, 16), 0.1, origin=(-10, -4))
+    blocks = mpm.Box((-0.5, 0.0), (0.5, 0.2)), mpm.Box((-0.3, 0.19), (0.3, 0.39))
+    found = []
+    for plane in ((), mpm.SymmetryPlane(0, 0.0)):
+        bodies = [mpm.fill(block, grid, density=1e3) for block in blocks]
+        if plane:
+            rows = [np.asarray(body.x[:, 0] > 0) for body in bodies]
+            names = ("x", "v", "mass", "volume")
+            bodies = [mpm.Particles(*(getattr(b, n)[own] for n in names)) for b, own in zip(bodies, rows, strict=True)]
+        scene = mpm.Scene(grid, (LAW, LAW), boundary=plane, bodies=mpm.Bodies())
+        scene, particles = canonical(scene, bodies[0].x.dtype), mpm.prepare(scene, mpm.join(*bodies))
+        nodes = particles_to_grid(scene, particles, 0.0, jnp.asarray(1e-3), scene.stencil(particles))
+        contact = nodes.contacts[0]
+        force = nodes.mirror.fold(contact.coupling(contact.gap < 0).force(None, len(nodes.mass)))
+        found.append(np.asarray(nodes.per_mass(force)).reshape(2, 20, 16, 2)[:, 10:])
+    assert abs(found[0]).max() > 10
+    assert_close(found[1], found[0], 0, 3e-4 * abs(found[0]).max())
+
+
 def slid(name, friction, *, steps, dt):
     """What a block has moved down a slab of 30 degrees, and how fast it is at half of the time and at its end."""
     law = mpm.NeoHookean(1e6, 0.3)

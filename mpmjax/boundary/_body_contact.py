@@ -11,6 +11,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Mask, Matrix, NodeVector, Scalar
 from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
 from mpmjax.boundary._coupling import Coupling
+from mpmjax.boundary._mirror import Mirror
 from mpmjax.boundary._patch import Patch, moment
 from mpmjax.discretisation import Grid
 
@@ -196,6 +197,7 @@ def body_contact(
     friction: Scalar,
     order: int,
     grid: Grid,
+    images: Mirror,
     dt: Scalar,
     share: Scalar,
 ) -> BodyContact:
@@ -208,6 +210,7 @@ def body_contact(
         friction: Coulomb coefficient [-].
         order: that of the kernel.
         grid: the grid.
+        images: the mirrors of symmetry planes.
         dt: Δt [s].
         share: θ (see `BodyContact`).
     """
@@ -221,6 +224,7 @@ def body_contact(
     approach = jnp.maximum(-(normal * (a.velocity - b.velocity)).sum(axis=0), 0)
     stiff, other = (body.modulus + body.density * approach**2 for body in (a, b))
     modulus, reduced = in_a_row(stiff, other, felt), in_a_row(a.part * a.density, b.part * b.density, both)
+    weight = images.continued(jnp.tile(jnp.where(both, reduced, 0), grid.layers))[: len(reduced)]
     return BodyContact(
         gap=jnp.where(felt, spacing * (first + second), jnp.inf),
         normal=normal.T,
@@ -228,7 +232,7 @@ def body_contact(
         coefficient=friction,
         dt=dt,
         share=share,
-        patch=Patch(jnp.where(both, reduced, 0), grid.shape, grid.periodic),
+        patch=Patch(weight, grid.shape, grid.periodic),
         pair=pair,
     )
 
