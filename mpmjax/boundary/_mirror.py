@@ -232,9 +232,10 @@ class Mirror(eqx.Module):
 
     def continued(self, field: Float[Array, "n"]) -> Float[Array, "n"]:
         """A folded even scalar as it is where bodies go on beyond the planes: on a plane twice what is folded there."""
-        for image in self.without_ties().images:
-            on_it = image.along((image.odd == 0) & (image.even == 1))
-            field = image.scalar(jnp.where(on_it, 2 * field, field))
+        for image in self.images:
+            if isinstance(image, Image):
+                on_it = image.along((image.odd == 0) & (image.even == 1))
+                field = image.scalar(jnp.where(on_it, 2 * field, field))
         return field
 
     def without_ties(self) -> "Mirror":
