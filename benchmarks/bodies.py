@@ -1,7 +1,7 @@
 """Two bodies that touch: where contact is felt, by which normals, and what slides, rolls and is pressed.
 
 python benchmarks/bodies.py                     all tables, and docs/bodies.png (minutes)
-python benchmarks/bodies.py --only slope        one of rest, normals, slope, roll, hertz, rings, balls
+python benchmarks/bodies.py --only slope        one of rest, normals, slope, roll, hertz, rings, balls, work
 python benchmarks/bodies.py --quick             the same, coarser, without a picture
 """
 
@@ -190,7 +190,8 @@ def roll(quick: bool) -> None:
 
 
 def hertz(quick: bool) -> list[tuple]:
-    """Two equal cylinders that are pressed together: the half-width of contact over Hertz's, a² = 4PR*/(πE*)."""
+    """Two equal cylinders that are pressed together: the half-width of contact over Hertz's, a² = 4PR*/(πE*), by the
+    pressure of the springs, and by the forces that they spread on the nodes around."""
     E, nu, R, rows = 1e5, 0.3, 1.0, []
     modulus = E / (2 * (1 - nu**2))
     print("two cylinders: half-width over Hertz's")
@@ -215,9 +216,12 @@ def hertz(quick: bool) -> list[tuple]:
         load = 2 * abs(float(run.boundary_forces().force[-1, 1, 1]))
         contact, x = contact_of(scene, run.final, 20.0)
         push = np.maximum(-np.where(np.isfinite(contact.gap), contact.gap, 0) * np.asarray(contact.stiffness), 0)
-        half = 2 * np.sqrt((push * x[:, 0] ** 2).sum() / push.sum())  # <x²> = a²/4 of Hertz's pressure
+        spread = np.asarray(contact.patch.spread(jnp.asarray(push)[:, None]))[:, 0]
+        half, wide = (2 * np.sqrt((p * x[:, 0] ** 2).sum() / p.sum()) for p in (push, spread))  # <x²> = a²/4 of Hertz's
         exact = np.sqrt(4 * load * (R / 2) / (np.pi * modulus))
-        print(f"  {cells} cells to the radius, {half / dx:.1f} to the half-width: {half / exact:.3f}")
+        print(
+            f"  {cells} cells to the radius, {exact / dx:.1f} to the half-width: {half / exact:.3f}, {wide / exact:.3f}"
+        )
         rows.append((x[push > 0, 0], push[push > 0], exact, dx))
     return rows
 
@@ -271,6 +275,17 @@ def rings(quick: bool) -> None:
         )
 
 
+def two_round(d: int, cells: int, nu: float, volume: mpm.AveragedVolume | None = None) -> tuple:
+    """A scene of two disks, or balls, of so many cells a diameter that meet at 1 m/s, their particles, and how many
+    particles the first of them has."""
+    dx, R = 0.6 / cells, 0.3
+    shape = (3 * cells + 4, *(2 * cells,) * (d - 1))
+    grid, law = mpm.Grid(shape, dx, origin=[-n // 2 for n in shape]), mpm.NeoHookean(1e5, nu)
+    places = [((s * 1.1 * R, s * 0.02, 0.01)[:d], (-0.5 * s, 0.0, 0.0)[:d]) for s in (-1, 1)]
+    two = [mpm.fill(mpm.Ball(x, R), grid, density=DENSITY, velocity=v) for x, v in places]
+    return mpm.Scene(grid, (law, law), bodies=mpm.Bodies(), volume=volume), mpm.join(*two), two[0].count
+
+
 def balls(quick: bool) -> None:
     """Two disks, or balls, that meet at 1 m/s, 0.09 of the speed of sound, and part: the most energy on the way, that
     in the end, and the speed with which they part. Explicit steps, as long as `stable_dt` says."""
@@ -279,23 +294,33 @@ def balls(quick: bool) -> None:
     for (d, cells, nu), volume in product(cases[:1] if quick else cases, (None, mpm.AveragedVolume())):
         if volume and nu < 0.4:
             continue
-        dx, R = 0.6 / cells, 0.3
-        shape = (3 * cells + 4, *(2 * cells,) * (d - 1))
-        grid, law = mpm.Grid(shape, dx, origin=[-n // 2 for n in shape]), mpm.NeoHookean(1e5, nu)
-        places = [((s * 1.1 * R, s * 0.02, 0.01)[:d], (-0.5 * s, 0.0, 0.0)[:d]) for s in (-1, 1)]
-        two = [mpm.fill(mpm.Ball(x, R), grid, density=DENSITY, velocity=v) for x, v in places]
-        scene = mpm.Scene(grid, (law, law), bodies=mpm.Bodies(), volume=volume)
-        particles = mpm.join(*two)
+        scene, particles, first = two_round(d, cells, nu, volume)
         steps = int(np.ceil(0.5 / float(mpm.stable_dt(scene, particles))))
         run = mpm.simulate(scene, particles, t1=0.5, dt=0.5 / steps, observe=lambda s, p: mpm.energy(s, p).total)
         energy, mass = np.asarray(run.observed), particles.mass[:, None]
         momentum = float(jnp.abs((mass * run.final.v).sum(axis=0)).max() / (mass * jnp.abs(particles.v)).sum())
-        back = -float(run.final.v[: two[0].count, 0].mean()) / 0.5
+        back = -float(run.final.v[:first, 0].mean()) / 0.5
         print(
             f"  {d}-D, {cells}, ν = {nu}, {'averaged' if volume else 'own'} volumes: {energy.max() / energy[0]:.3f} "
             f"{energy[-1] / energy[0]:.3f} {back:.3f} {momentum:.0e}",
             flush=True,
         )
+
+
+def work(quick: bool) -> None:
+    """The work of the push over the whole touch of two disks of six cells, and what the transfers take, over the energy
+    that the disks bring: by the length of explicit steps, and of one other integrator."""
+    print("two disks of 6 cells: steps over stable_dt, most energy, work of the push, loss of the transfers")
+    methods = (mpm.Explicit(), 1.0), (mpm.Explicit(), 0.25), (mpm.Explicit(), 0.0625), (mpm.ImplicitMidpoint(), 4.0)
+    scene, particles, _ = two_round(2, 6, 0.3)
+    limit, start = float(mpm.stable_dt(scene, particles)), float(mpm.energy(scene, particles).total)
+    for method, length in methods[:1] if quick else methods:
+        steps = int(np.ceil(0.5 / (length * limit)))
+        _, found = mpm.budget(scene, particles, steps=steps, dt=0.5 / steps, method=method)
+        energy = found.energy
+        most = 1 + np.cumsum(np.asarray(energy.change)).max() / start
+        push, lost = (float(part.sum()) / start for part in (energy.boundary, energy.p2g + energy.g2p))
+        print(f"  {type(method).__name__}, {length}: {most:.3f} {push:+.3f} {lost:.3f}", flush=True)
 
 
 def draw(rows: list[tuple]) -> None:
@@ -321,6 +346,7 @@ TABLES: dict[str, Callable] = {
     "hertz": hertz,
     "rings": rings,
     "balls": balls,
+    "work": work,
 }
 
 if __name__ == "__main__":

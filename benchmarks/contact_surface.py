@@ -3,6 +3,7 @@ as it was, and of contact at the particles' faces, as it is.
 
     python benchmarks/contact_surface.py            prints the tables (minutes)
     python benchmarks/contact_surface.py --quick    one grid (a minute)
+    python benchmarks/contact_surface.py --only block    one of rest, bar, block
 
 A bar, or a square block, falls on a plain wall that lies anywhere between nodes. Its mean velocity tells
 when the wall has given 2 and 98 % of its impulse; by the exact solution of the bar, the time between is 0.96 of 2L/c,
@@ -127,14 +128,18 @@ def _print(rows: list[tuple], names: tuple[str, ...]) -> None:
         print(" | ".join(f"{v:>22}" if isinstance(v, str) else f"{v:10.4f}" for v in row), flush=True)
 
 
-def main(quick: bool) -> None:
-    def places(wall: str, *some: float) -> list[float]:
-        """Those at which a wall may lie, in spacings from a node."""
-        return [a for a in some if wall != "ContactPlane" or (2 * a).is_integer()]
+def places(wall: str, *some: float) -> list[float]:
+    """Those at which a wall may lie, in spacings from a node."""
+    return [a for a in some if wall != "ContactPlane" or (2 * a).is_integer()]
 
+
+def rests(quick: bool) -> None:
     print("Rest: height of the face over the wall [spacings], worst over the wall's places; 16 cells")
     rows = [(wall, max((rest(16, 1, wall, at=a) for a in places(wall, 0.3, 0.5)), key=abs)) for wall in WALLS]
     _print(rows, ("wall", "height"))
+
+
+def bars(quick: bool) -> None:
     print("\nA bar on a wall, v = 0.01 c, ν = 0: worst over the wall's places; exact: 0, 1, 1")
     rows = []
     for method, cells in itertools.product(METHODS, (16,) if quick else (8, 16, 32, 64)):
@@ -144,20 +149,43 @@ def main(quick: bool) -> None:
             worst = (max((f[k] - e for f in found), key=abs) for k, e in EXACT.items())
             rows.append((f"{wall[:12]} {cells} {method[:4]}", *worst, max(f["most"] for f in found)))
     _print(rows, ("wall, cells", "onset", "time − 1", "return − 1", "energy"))
-    print("\nA block, ν = 0.3, less the same of four times the resolution: root mean squares over the wall's places")
-    rows = []
+
+
+def blocks(quick: bool) -> None:
+    print("\nA block, ν = 0.3, less the same of four times the resolution: root mean squares over the wall's places,")
+    print("and the mean of the return's error with its sign; then root mean squares over all sizes too")
+    rows, over_sizes = [], {wall: [] for wall in list(WALLS)[:2]}
     for cells in (8,) if quick else (6, 8, 12, 16):
         reference = bounce(4 * cells, 2, "SeparatingBox", at=0.3, nu=0.3)
-        rows.append((f"reference {4 * cells}", *(reference[k] for k in ("onset", "time", "return", "most"))))
-        for wall in WALLS if cells == 8 and not quick else list(WALLS)[:2]:
+        rows.append(
+            (f"reference {4 * cells}", *(reference[k] for k in ("onset", "time", "return")), 0.0, reference["most"])
+        )
+        for wall in WALLS if cells == 8 and not quick else over_sizes:
             found = [bounce(cells, 2, wall, at=a, nu=0.3) for a in places(wall, 0.0, 0.3, 0.5, 0.8)]
-            errors = [np.sqrt(np.mean([(f[k] - reference[k]) ** 2 for f in found])) for k in ("time", "return")]
+            errors = np.array([[f[k] - reference[k] for k in ("time", "return")] for f in found])
             onset = max((f["onset"] for f in found), key=abs)
-            rows.append((f"{wall[:18]} {cells}", onset, *errors, max(f["most"] for f in found)))
-    _print(rows, ("wall, cells", "onset", "time", "return", "energy"))
+            rows.append(
+                (f"{wall[:18]} {cells}", onset, *_rms(errors), errors[:, 1].mean(), max(f["most"] for f in found))
+            )
+            if wall in over_sizes:
+                over_sizes[wall].append(_rms(errors))
+    before, now = (_rms(np.array(errors)) for errors in over_sizes.values())
+    _print(rows, ("wall, cells", "onset", "time", "return", "with sign", "energy"))
+    summary = {"all sizes, before": before, "all sizes, now": now, "nearer, times": before / now}
+    _print([(name, *found) for name, found in summary.items()], ("over all sizes", "time", "return"))
 
+
+def _rms(errors: np.ndarray) -> np.ndarray:
+    return np.sqrt((errors**2).mean(axis=0))
+
+
+TABLES = {"rest": rests, "bar": bars, "block": blocks}
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="one grid")
-    main(parser.parse_args().quick)
+    parser.add_argument("--only", choices=TABLES, help="one table")
+    options = parser.parse_args()
+    for name, table in TABLES.items():
+        if options.only in (None, name):
+            table(options.quick)

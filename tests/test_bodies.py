@@ -10,7 +10,7 @@ import pytest
 from helpers import assert_close, assert_files_hold, ids, thorough
 
 import mpmjax as mpm
-from mpmjax.boundary import Coupling
+from mpmjax.boundary import Coupling, Patch
 from mpmjax.checks import canonical
 from mpmjax.stepping._nodes import particles_to_grid
 
@@ -43,12 +43,19 @@ def stacked(d=2, *, gap=0.0, axis=-1, friction=0.3, speed=0.0, shift=0.0, cells=
     return mpm.Scene(grid, (law, law), kernel=kernel, bodies=mpm.Bodies(friction), **scene), particles
 
 
-def contact_of(scene, particles):
-    """The contact of the first two bodies at the start, and the places of its nodes."""
+@eqx.filter_jit
+def touching(scene, particles):
+    """The contact of the first two bodies at the start, and the masses of all nodes."""
     scene = canonical(scene, particles.x.dtype)
     particles = mpm.prepare(scene, particles)
     nodes = particles_to_grid(scene, particles, 0.0, jnp.asarray(1e-3), scene.stencil(particles))
     (found,) = nodes.contacts
+    return found, nodes.mass
+
+
+def contact_of(scene, particles):
+    """The contact of the first two bodies at the start, and the places of its nodes."""
+    found, _ = touching(scene, particles)
     return found, scene.grid.nodes(scene.window(particles))[: len(found.gap)]
 
 
@@ -76,18 +83,48 @@ def test_shares_of_the_surface_sum_to_it():
     assert 0.49 < total < 0.55  # at an edge the wider body counts too
 
 
-def test_the_force_of_a_coupling_is_that_of_its_energy():
-    """f = −∂E/∂u, with its Hessian and diagonal; the two bodies' forces are opposite."""
-    rng = np.random.default_rng(0)
-    normal = rng.normal(size=(5, 2))
-    own = Coupling(*(jnp.asarray(a) for a in (rng.normal(size=5), rng.uniform(1, 2, 5), normal)), (0, 2))
-    u, du = (jnp.asarray(rng.normal(size=(15, 2))) for _ in range(2))
-    assert_close(own.force(u, 15), -jax.grad(own.energy)(u))
-    assert_close(own.resistance(du), -jax.jvp(lambda u: own.force(u, 15), (u,), (du,))[1])
-    assert_close(own.diagonal(15).reshape(-1), jnp.diag(jax.hessian(lambda u: own.energy(u.reshape(15, 2)))(u.ravel())))
-    layers = own.force(u, 15).reshape(3, 5, 2)
+def a_patch(grid, rng):
+    """Nodes of which some have no weight."""
+    m = int(np.prod(grid.shape))
+    return Patch(jnp.asarray(rng.uniform(0, 1, m) * (rng.uniform(size=m) > 0.3)), grid.shape, grid.periodic)
+
+
+@pytest.mark.parametrize(
+    ("shape", "periodic"), [((4, 5), False), *thorough(((6,), True), ((4, 5, 4), (True, False, False)))]
+)
+def test_the_force_of_a_coupling_is_that_of_its_energy(shape, periodic):
+    """f = −∂E/∂u, with its Hessian and diagonal; the two bodies' forces are opposite at each node."""
+    rng, d, m = np.random.default_rng(0), len(shape), int(np.prod(shape))
+    patch = a_patch(mpm.Grid(shape, 0.1, periodic=periodic), rng)
+    parts = rng.normal(size=m), rng.uniform(1, 2, m), rng.normal(size=(m, d))
+    own = Coupling(*(jnp.asarray(part) for part in parts), patch, (0, 2))
+    u, du = (jnp.asarray(rng.normal(size=(3 * m, d))) for _ in range(2))
+    assert_close(own.force(u, 3 * m), -jax.grad(own.energy)(u))
+    assert_close(own.resistance(du), -jax.jvp(lambda u: own.force(u, 3 * m), (u,), (du,))[1])
+    hessian = jax.hessian(lambda u: own.energy(u.reshape(3 * m, d)))(u.ravel())
+    assert_close(own.diagonal(3 * m).reshape(-1), jnp.diag(hessian))
+    layers = own.force(u, 3 * m).reshape(3, m, d)
     assert_close(layers[0], -layers[2])
     assert not layers[1].any()
+
+
+def test_the_mean_over_a_patch():
+    """That of a constant is the constant, wherever any of the nodes around has weight, and what is spread keeps its
+    sum; a node beyond the window is none, and one across a period is."""
+    rng = np.random.default_rng(1)
+    for periodic in (False, (True, False)):
+        grid = mpm.Grid((4, 5), 0.1, periodic=periodic)
+        patch = a_patch(grid, rng)
+        near = np.asarray(patch.total(patch.weight)) > 0
+        assert near.sum() > 5
+        assert_close(patch.mean(jnp.full((20, 2), 3.0))[near], np.full((near.sum(), 2), 3.0))
+        amount = jnp.asarray(rng.normal(size=(20, 2)) * near[:, None])
+        assert_close(patch.spread(amount).sum(axis=0), amount.sum(axis=0))
+        weight, field = np.asarray(patch.weight).reshape(4, 5), rng.normal(size=(4, 5))
+        rows = [3, 0, 1] if periodic else [0, 1]  # around the first
+        block = np.ix_(rows, [1, 2, 3])
+        found = patch.mean(jnp.asarray(field).reshape(-1, 1)).reshape(4, 5)[0, 2]
+        assert_close(found, (weight * field)[block].sum() / weight[block].sum())
 
 
 @pytest.mark.parametrize("method", **ids(METHODS, ("explicit", "semi_implicit")))
@@ -126,6 +163,28 @@ def test_bodies_that_do_not_touch_move_as_each_alone():
         new, _ = mpm.step(mpm.Scene(scene.grid, LAW), mpm.Particles(**parts), 0.0, 1e-3)
         assert_close(both.v[own], new.v)
         assert_close(both.x[own], new.x)
+
+
+def test_half_of_two_bodies_is_pushed_as_the_whole():
+    """At a symmetry plane through nodes: the push makes the accelerations that it makes without the plane, but for what
+    normals know of the side beyond."""
+    grid = mpm.Grid((20, 16), 0.1, origin=(-10, -4))
+    blocks = mpm.Box((-0.5, 0.0), (0.5, 0.2)), mpm.Box((-0.3, 0.19), (0.3, 0.39))
+    found = []
+    for plane in ((), mpm.SymmetryPlane(0, 0.0)):
+        bodies = [mpm.fill(block, grid, density=1e3) for block in blocks]
+        if plane:
+            rows = [np.asarray(body.x[:, 0] > 0) for body in bodies]
+            names = ("x", "v", "mass", "volume")
+            bodies = [mpm.Particles(*(getattr(b, n)[own] for n in names)) for b, own in zip(bodies, rows, strict=True)]
+        scene = mpm.Scene(grid, (LAW, LAW), boundary=plane, bodies=mpm.Bodies())
+        scene, particles = canonical(scene, bodies[0].x.dtype), mpm.prepare(scene, mpm.join(*bodies))
+        nodes = particles_to_grid(scene, particles, 0.0, jnp.asarray(1e-3), scene.stencil(particles))
+        contact = nodes.contacts[0]
+        force = nodes.mirror.fold(contact.coupling(contact.gap < 0).force(None, len(nodes.mass)))
+        found.append(np.asarray(nodes.per_mass(force)).reshape(2, 20, 16, 2)[:, 10:])
+    assert abs(found[0]).max() > 10
+    assert_close(found[1], found[0], 0, 3e-4 * abs(found[0]).max())
 
 
 def slid(name, friction, *, steps, dt):
@@ -228,6 +287,68 @@ def test_torn_snow_that_has_lost_its_stiffness_lies_on_a_body():
     torn = eqx.tree_at(lambda p: p.histories[1].plastic_volume, particles, jnp.full(particles.sizes[1], 9.0))
     final = mpm.rollout(scene, torn, steps=400, dt=1e-3)
     assert float(final.x[upper, 1].min()) > 0.15
+
+
+def two_round_bodies(d, dx, *, nu=0.3, by=(0.0, 0.0, 0.0)):
+    """Two of 0.6 m diameter that meet at 1 m/s."""
+    cells = round(0.6 / dx)
+    shape = (3 * cells + 4, *(2 * cells,) * (d - 1))
+    grid, law = mpm.Grid(shape, dx, origin=[-n // 2 for n in shape]), mpm.NeoHookean(1e5, nu)
+    centres = [np.array((0.33 * s, 0.02 * s, 0.01)) + np.array(by) * dx for s in (-1, 1)]
+    two = [
+        mpm.fill(mpm.Ball(tuple(c[:d]), 0.3), grid, density=1e3, velocity=(-0.5 * s, 0.0, 0.0)[:d])
+        for c, s in zip(centres, (-1, 1), strict=True)
+    ]
+    scene = mpm.Scene(grid, (law, law), bodies=mpm.Bodies())
+    return scene, mpm.prepare(scene, mpm.join(*two))
+
+
+@pytest.mark.parametrize(
+    ("d", "by", "share"),
+    [(2, (0.0, 0.0, 0.0), 1.0), *thorough((2, (0.31, 0.17, 0.0), 0.25), (3, (0.0, 0.0, 0.0), 1.0))],
+)
+def test_small_round_bodies_make_no_energy(d, by, share):
+    """Bodies of six cells that meet and part: never more energy than they brought, and the work of the push, which all
+    of a touch is none but for what the gap's places on the lattice make, is less than a twentieth of it."""
+    scene, particles = two_round_bodies(d, 0.1, by=by)
+    dt = share * float(mpm.stable_dt(scene, particles))
+    new, found = mpm.budget(scene, particles, steps=round(0.35 / dt), dt=dt)
+    start = float(mpm.energy(scene, particles).total)
+    most = np.cumsum(np.asarray(found.energy.change)).max() / start
+    work = np.cumsum(np.asarray(found.energy.boundary)) / start
+    assert most < 1e-3
+    assert work.min() < -0.02  # they were pressed
+    assert abs(work[-1]) < 0.05
+    assert abs(np.asarray(found.energy.solver).sum()) < 1e-12 * start  # the push is all that boundaries do
+    assert float(new.x[: particles.sizes[0], 0].max()) < float(new.x[particles.sizes[0] :, 0].min())
+
+
+@eqx.filter_jit
+def fastest(coupling, mass):
+    """The largest ω² [1/s²] of springs between nodes of these masses."""
+    root = jnp.where(mass > 0, 1 / jnp.sqrt(jnp.where(mass > 0, mass, 1)), 0)[:, None]
+
+    def power(_, u):
+        v = root * coupling.resistance(root * u)
+        return v / jnp.sqrt((v**2).sum())
+
+    start = root * jnp.asarray(np.random.default_rng(0).normal(size=(len(mass), 2)))
+    u = jax.lax.fori_loop(0, 60, power, start)
+    return (u * root * coupling.resistance(root * u)).sum()
+
+
+def test_springs_between_bodies_are_no_stiffer_than_the_longest_step_knows():
+    """The largest ω² of the springs alone is 4 k/(ρ dx²) at most, wherever on the lattice two blocks touch; at their
+    edges a hundredth more."""
+    rng = np.random.default_rng(2)
+    bound = 4 * 2 * float(LAW.wave_modulus(jnp.eye(2)[..., None])[0]) / 2 / 1e3 / 0.1**2
+    most = []
+    for _ in range(8):
+        scene, particles = stacked(gap=-0.1 * rng.uniform(), shift=rng.uniform(), cells=4)
+        by = jnp.asarray(rng.uniform(-0.05, 0.05, 2))
+        contact, mass = touching(scene, dataclasses.replace(particles, x=particles.x + by))
+        most.append(float(fastest(contact.coupling(jnp.ones(contact.gap.shape, bool)), mass)) / bound)
+    assert 0.5 < max(most) < 1.02
 
 
 @pytest.mark.thorough

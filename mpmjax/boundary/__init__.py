@@ -34,6 +34,7 @@ from mpmjax.boundary._coupling import Coupling
 from mpmjax.boundary._faces import EXPLICIT_STIFFNESS, IMPLICIT_STIFFNESS, Faces, FaceShape
 from mpmjax.boundary._grip import Grip
 from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion, MirrorPlace, RigidImage, Tie, carried_by
+from mpmjax.boundary._patch import Patch
 from mpmjax.boundary._planes import ContactPlane, SymmetryPlane
 from mpmjax.boundary._rigid_part import RigidPart
 from mpmjax.boundary._springs import (
@@ -75,6 +76,7 @@ __all__ = [
     "MirrorMotion",
     "MirrorPlace",
     "Owners",
+    "Patch",
     "RigidImage",
     "RigidPart",
     "SeparatingBox",

@@ -1,11 +1,9 @@
 """Contact of two bodies, each of which has a layer of nodes of its own."""
 
 import math
-from functools import reduce
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -13,6 +11,8 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Mask, Matrix, NodeVector, Scalar
 from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
 from mpmjax.boundary._coupling import Coupling
+from mpmjax.boundary._mirror import Mirror
+from mpmjax.boundary._patch import Patch, moment
 from mpmjax.discretisation import Grid
 
 _SAMPLES = 256
@@ -27,6 +27,8 @@ _LEAST_SPREAD = 1e-2
 """A variance of this many square spacings is added to that of where two bodies meet."""
 _POWER = 2
 """How often C⁻¹ is applied for the normal."""
+_SHEET = 2
+"""How many nodes a direction C reaches on either side."""
 
 
 def half_space(order: int, side: float) -> np.ndarray:
@@ -79,7 +81,8 @@ class BodyContact(AbstractContact):
     between the two bodies (see `Coupling`): those of both in a row, of stiffness α (M + ρ w²)/dx each, α = 2, on the
     node's share of the surface, with the wave modulus M and the density ρ of the body, and w the velocity with which
     the two meet. The share is dx^(d−1) cos²(πs/2dx) (c_a + c_b) at a distance s < dx from the surface; over the nodes
-    along the normal it sums to that part of the surface in which there are bodies.
+    along the normal it sums to that part of the surface in which there are bodies. The spring feels the mean
+    displacement of the nodes around it, and pushes all of them.
 
     Friction is at most μ times the push at each node, against the slip of the two bodies.
     """
@@ -96,6 +99,8 @@ class BodyContact(AbstractContact):
     """Δt [s]."""
     share: Scalar
     """θ, the share of the step's displacement at which the integrator evaluates forces; 1 in an explicit step."""
+    patch: Patch
+    """The nodes around each, by the reduced mass of the two bodies."""
     pair: tuple[int, int] = eqx.field(static=True)
     """The numbers of the bodies."""
 
@@ -115,6 +120,7 @@ class BodyContact(AbstractContact):
             gap=self.share * jnp.where(held, self.gap, 0),
             stiffness=jnp.where(held, self.stiffness / self.share, 0),
             normal=self.normal,
+            patch=self.patch,
             pair=self.pair,
         )
 
@@ -148,8 +154,9 @@ class BodyContact(AbstractContact):
         return noise, noise * self.stiffness * self.dt**2
 
     def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """All components of the two bodies' nodes that are held."""
-        shut, layers = active & self.near, np.arange(shape[0] // len(active))
+        """All components of the two bodies' nodes around those that are held."""
+        shut = (self.patch.total((active & self.near).astype(self.gap.dtype)) > 0) & (self.patch.weight > 0)
+        layers = np.arange(shape[0] // len(active))
         both = jnp.asarray((layers == self.pair[0]) | (layers == self.pair[1]))
         return jnp.broadcast_to((both[:, None] & shut).reshape(-1)[:, None], shape)
 
@@ -190,6 +197,7 @@ def body_contact(
     friction: Scalar,
     order: int,
     grid: Grid,
+    images: Mirror,
     dt: Scalar,
     share: Scalar,
 ) -> BodyContact:
@@ -202,19 +210,21 @@ def body_contact(
         friction: Coulomb coefficient [-].
         order: that of the kernel.
         grid: the grid.
+        images: the mirrors of symmetry planes.
         dt: Δt [s].
         share: θ (see `BodyContact`).
     """
-    spacing, felt = jnp.asarray(grid.spacing), (a.part > _EMPTY) & (b.part > _EMPTY)
-    normal = _normal(a, b, felt, grid)
+    spacing, both = jnp.asarray(grid.spacing), (a.part > _EMPTY) & (b.part > _EMPTY)
+    normal = _normal(a, b, both, grid)
     depths = [sign * (normal * body.middle).sum(axis=0) for body, sign in ((a, 1), (b, -1))]
     first, second = (_distance(body, depth, order) for body, depth in zip((a, b), depths, strict=True))
     away = jnp.minimum(jnp.maximum(first, second), 1)
-    felt = felt & (depths[0] > 0) & (depths[1] > 0) & (away < 1)
+    felt = both & (depths[0] > 0) & (depths[1] > 0) & (away < 1)
     area = jnp.cos(jnp.pi / 2 * away) ** 2 * (a.part + b.part) * spacing ** (len(normal) - 1)
     approach = jnp.maximum(-(normal * (a.velocity - b.velocity)).sum(axis=0), 0)
     stiff, other = (body.modulus + body.density * approach**2 for body in (a, b))
-    modulus = in_a_row(stiff, other, felt)
+    modulus, reduced = in_a_row(stiff, other, felt), in_a_row(a.part * a.density, b.part * b.density, both)
+    weight = images.continued(jnp.tile(jnp.where(both, reduced, 0), grid.layers))[: len(reduced)]
     return BodyContact(
         gap=jnp.where(felt, spacing * (first + second), jnp.inf),
         normal=normal.T,
@@ -222,12 +232,13 @@ def body_contact(
         coefficient=friction,
         dt=dt,
         share=share,
+        patch=Patch(weight, grid.shape, grid.periodic),
         pair=pair,
     )
 
 
 def in_a_row(a: Array, b: Array, felt: Array | bool = True) -> Array:
-    """The stiffness of two springs one behind the other, a b/(a + b)."""
+    """The stiffness of two springs one behind the other, a b/(a + b), and the reduced mass of two bodies."""
     return a * b / jnp.where(felt, a + b, 1)
 
 
@@ -251,7 +262,9 @@ def _spread(field: Float[Array, "m"], grid: Grid) -> Matrix:
     moments = {(0,) * d: field.reshape(grid.shape)}
     for axis in range(d):
         moments = {
-            (*powers[:axis], power, *powers[axis + 1 :]): _moment(found, axis, power, periodic=grid.periodic[axis])
+            (*powers[:axis], power, *powers[axis + 1 :]): moment(
+                found, axis, power, reach=_SHEET, periodic=grid.periodic[axis]
+            )
             for powers, found in moments.items()
             for power in range(3 - sum(powers))
         }
@@ -264,18 +277,6 @@ def _spread(field: Float[Array, "m"], grid: Grid) -> Matrix:
     mean = [of(axis) / total for axis in range(d)]
     C = la.assemble([[of(a, b) / total - mean[a] * mean[b] for b in range(d)] for a in range(d)])
     return C + _LEAST_SPREAD * la.identity_like(C)
-
-
-def _moment(field: Array, axis: int, power: int, *, periodic: bool) -> Array:
-    """Σ_k k^power f_{i+k} along an axis, k from −2 to 2."""
-    around = [(2, 2) if own == axis else (0, 0) for own in range(field.ndim)]
-    wide = jnp.pad(field, around, mode="wrap" if periodic else "constant")
-    parts = [
-        k**power * jax.lax.slice_in_dim(wide, k + 2, k + 2 + field.shape[axis], axis=axis)
-        for k in range(-2, 3)
-        if k != 0 or power == 0
-    ]
-    return reduce(jnp.add, parts)
 
 
 def _distance(body: Body, depth: Float[Array, "m"], order: int) -> Float[Array, "m"]:

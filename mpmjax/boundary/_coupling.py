@@ -3,16 +3,19 @@
 Both bodies have a layer of nodes at the same places. The gap is linear in the displacement u of the nodes about the
 start of the step,
 
-    g_i(u) = g_i(0) + n_i · (u_i^a − u_i^b),
+    g_i(u) = g_i(0) + n_i · Σ_j q_ij (u_j^a − u_j^b),    Σ_j q_ij = 1,
 
-where n is the unit normal from the body b to the body a. The forces on the two nodes are opposite and at one place, so
-that they have neither sum nor moment.
+where n is the unit normal from the body b to the body a and q_ij the mean over the patch of nodes around i. The gap is
+that of the particles around, which do not follow a node that moves by itself: with u_i in place of the mean the forces
+would do work that the gap knows nothing of. The forces on the two nodes of a place are opposite, so that they have
+neither sum nor moment.
 """
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, NodeVector
+from mpmjax.boundary._patch import Patch
 
 
 class Coupling(eqx.Module):
@@ -24,14 +27,16 @@ class Coupling(eqx.Module):
     """k_i [N/m], shape (m,); zero where nothing is held."""
     normal: Float[Array, "m d"]
     """n_i [-], shape (m, d)."""
+    patch: Patch
+    """The nodes over which displacements are averaged, by the reduced mass of the two bodies."""
     pair: tuple[int, int] = eqx.field(static=True)
     """The numbers of the bodies a and b."""
 
     def opening(self, u: NodeVector) -> Float[Array, "m"]:
-        """n · (u^a − u^b) [m], shape (m,), for a displacement of the nodes of all layers, shape (n, d)."""
+        """n_i · Σ_j q_ij (u_j^a − u_j^b) [m], shape (m,), for a displacement of the nodes of all layers, (n, d)."""
         layers = u.reshape(-1, *self.normal.shape)
         first, second = self.pair
-        return (self.normal * (layers[first] - layers[second])).sum(axis=1)
+        return (self.normal * self.patch.mean(layers[first] - layers[second])).sum(axis=1)
 
     def opened(self, u: NodeVector | None) -> Float[Array, "m"]:
         """The gap [m], shape (m,), at a displacement of the nodes; None for no displacement."""
@@ -51,11 +56,12 @@ class Coupling(eqx.Module):
 
     def diagonal(self, size: int) -> NodeVector:
         """The diagonal of their Hessian [N/m], shape (n, d)."""
-        return self._on_both(self.stiffness[:, None] * self.normal**2, 1, size)
+        return self._on_both(self.patch.spread_square(self.stiffness[:, None] * self.normal**2), 1, size)
 
     def pushed(self, amount: Float[Array, "m"], size: int) -> NodeVector:
-        """An amount along the normal on the nodes of the first body, and against it on those of the second, (n, d)."""
-        return self._on_both(amount[:, None] * self.normal, -1, size)
+        """An amount along the normal at each place, spread on the nodes of the first body, and against it on those of
+        the second, shape (n, d)."""
+        return self._on_both(self.patch.spread(amount[:, None] * self.normal), -1, size)
 
     def _on_both(self, own: Float[Array, "m d"], sign: int, size: int) -> NodeVector:
         first, second = self.pair

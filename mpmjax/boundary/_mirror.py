@@ -234,6 +234,14 @@ class Mirror(eqx.Module):
         """Bᵀ for even scalars in columns."""
         return jnp.stack([self.fold_scalar(column) for column in field.T], axis=1) if self.images else field
 
+    def continued(self, field: Float[Array, "n"]) -> Float[Array, "n"]:
+        """A folded even scalar as it is where bodies go on beyond the planes: on a plane twice what is folded there."""
+        for image in self.images:
+            if isinstance(image, Image):
+                on_it = image.along((image.odd == 0) & (image.even == 1))
+                field = image.scalar(jnp.where(on_it, 2 * field, field))
+        return field
+
     def without_ties(self) -> "Mirror":
         """The mirrors without rigid parts and bodies."""
         return Mirror(tuple(image for image in self.images if isinstance(image, Image)))

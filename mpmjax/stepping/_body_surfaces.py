@@ -43,6 +43,7 @@ def contacts_of_bodies(
             friction=scene.bodies.friction,
             order=scene.kernel.order,
             grid=scene.grid,
+            images=images,
             dt=dt,
             share=jnp.where(at > 0, at, 1).astype(particles.x.dtype),
         )
