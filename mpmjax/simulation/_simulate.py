@@ -112,10 +112,10 @@ def simulate(
             f"save less often than every {save_every} steps, observe what is needed of them, or use record.",
             device=True,
         )
-    slot = np.zeros((), dtype)
+    slot: Scalar = 0.0
     if traced and throw:
-        no_fault, unsolved = jnp.zeros((), jnp.int32), UNSOLVED.format("the adjoint")
-        (scene, particles, method), slot = guard((scene, particles, method), jnp.asarray(slot), no_fault, (), unsolved)
+        no_fault, unsolved, zero = jnp.zeros((), jnp.int32), UNSOLVED.format("the adjoint"), jnp.zeros((), dtype)
+        (scene, particles, method), slot = guard((scene, particles, method), zero, no_fault, (), unsolved)
     if adjoint is None:
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=max(1, min(count, checkpoint_bytes // state_bytes)))
     go = partial(
