@@ -100,7 +100,7 @@ class BodyContact(AbstractContact):
     share: Scalar
     """θ, the share of the step's displacement at which the integrator evaluates forces; 1 in an explicit step."""
     patch: Patch
-    """The nodes around each, by the reduced mass of the two bodies."""
+    """The nodes around each, by c_a c_b/(c_a + c_b) of the two bodies."""
     pair: tuple[int, int] = eqx.field(static=True)
     """The numbers of the bodies."""
 
@@ -223,7 +223,7 @@ def body_contact(
     area = jnp.cos(jnp.pi / 2 * away) ** 2 * (a.part + b.part) * spacing ** (len(normal) - 1)
     approach = jnp.maximum(-(normal * (a.velocity - b.velocity)).sum(axis=0), 0)
     stiff, other = (body.modulus + body.density * approach**2 for body in (a, b))
-    modulus, reduced = in_a_row(stiff, other, felt), in_a_row(a.part * a.density, b.part * b.density, both)
+    modulus, reduced = in_a_row(stiff, other, felt), in_a_row(a.part, b.part, both)
     weight = images.continued(jnp.tile(jnp.where(both, reduced, 0), grid.layers))[: len(reduced)]
     return BodyContact(
         gap=jnp.where(felt, spacing * (first + second), jnp.inf),
@@ -238,7 +238,7 @@ def body_contact(
 
 
 def in_a_row(a: Array, b: Array, felt: Array | bool = True) -> Array:
-    """The stiffness of two springs one behind the other, a b/(a + b), and the reduced mass of two bodies."""
+    """The stiffness of two springs one behind the other, a b/(a + b)."""
     return a * b / jnp.where(felt, a + b, 1)
 
 

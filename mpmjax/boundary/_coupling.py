@@ -28,7 +28,7 @@ class Coupling(eqx.Module):
     normal: Float[Array, "m d"]
     """n_i [-], shape (m, d)."""
     patch: Patch
-    """The nodes over which displacements are averaged, by the reduced mass of the two bodies."""
+    """The nodes over which displacements are averaged, by c_a c_b/(c_a + c_b) of the two bodies."""
     pair: tuple[int, int] = eqx.field(static=True)
     """The numbers of the bodies a and b."""
 
