@@ -63,6 +63,7 @@ def test_what_is_not_finite_spoils_its_own_particle_alone(choose):
     others = np.delete(np.arange(40), [3, 20])
     for a, b in zip(found, clean, strict=True):
         np.testing.assert_array_equal(a[..., others], b[..., others])
+    for a in found[:3]:  # R, w and V diag(w) Vᵀ; V itself may be the identity
         assert not jnp.isfinite(a[..., [3, 20]]).all(axis=tuple(range(a.ndim - 1))).any()
 
 
