@@ -31,7 +31,7 @@ MPMJAX_INLINE V root(V x) {
 #if defined(__clang__)
   return __builtin_elementwise_sqrt(x);
 #else
-  V y;
+  V y = {};
 #pragma GCC unroll 16
   for (size_t i = 0; i < sizeof x / sizeof x[0]; ++i) y[i] = std::sqrt(x[i]);
   return y;

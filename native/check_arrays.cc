@@ -134,7 +134,7 @@ void check_matrices(int64_t particles, std::mt19937& random, const std::vector<c
           squares[at(i, j)] = T(v), squares[given.size + at(i, j)] = T(r);
           one[at(i, j)] = one[given.size + at(i, j)] = std::isfinite(size) ? i == j : size;
           stretch[at(i, j)] = T(s), transposed[at(i, j)] = t;
-          if (!std::isfinite(size)) A[at(i, j)] = size;
+          if (!std::isfinite(size)) A[at(i, j)] = size, squares[at(i, j)] = T(size);  // V may be the identity
           scale[at(i, j)] = size;
         }
       }
