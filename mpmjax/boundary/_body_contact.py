@@ -223,8 +223,8 @@ def body_contact(
     area = jnp.cos(jnp.pi / 2 * away) ** 2 * (a.part + b.part) * spacing ** (len(normal) - 1)
     approach = jnp.maximum(-(normal * (a.velocity - b.velocity)).sum(axis=0), 0)
     stiff, other = (body.modulus + body.density * approach**2 for body in (a, b))
-    modulus, reduced = in_a_row(stiff, other, felt), in_a_row(a.part, b.part, both)
-    weight = images.continued(jnp.tile(jnp.where(both, reduced, 0), grid.layers))[: len(reduced)]
+    modulus, weight = in_a_row(stiff, other, felt), in_a_row(a.part, b.part, both)
+    weight = images.continued(jnp.tile(jnp.where(both, weight, 0), grid.layers))[: len(weight)]
     return BodyContact(
         gap=jnp.where(felt, spacing * (first + second), jnp.inf),
         normal=normal.T,
