@@ -125,8 +125,9 @@ def _scatter(*args: Array, valued: bool, size: int, unroll: bool) -> list[Array]
     blocks = []
     for start in range(0, columns, _ROW):
         width = min(columns - start, _ROW)
-        value, gradients = _rows(given, valued, start, 1 << (width - 1).bit_length())
-        nodes = jnp.zeros((size, 1 << (width - 1).bit_length()), given[0].dtype)
+        padded = 1 << (width - 1).bit_length()
+        value, gradients = _rows(given, valued, start, padded)
+        nodes = jnp.zeros((size, padded), given[0].dtype)
         blocks.append(add(0, jnp.zeros((p,), factors[0].dtype), value, gradients, nodes)[:, :width])
     return [jnp.concatenate(blocks, axis=1)]
 
