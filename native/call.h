@@ -68,9 +68,10 @@ struct Call {
     return static_cast<T*>(buffers[k].untyped_data());
   }
 
-  const bool* booleans(size_t k, int64_t count) {
+  // The same of booleans.
+  const bool* booleans(size_t k, std::initializer_list<int64_t> trailing) {
     Shape shape = leading;
-    shape.push_back(count);
+    shape.insert(shape.end(), trailing);
     expect(k < buffers.size(), "an array is missing");
     if (!fault.empty()) return nullptr;
     expect(buffers[k].element_type() == ffi::DataType::PRED, "no booleans");

@@ -97,7 +97,7 @@ void compare(const char* what, const Shape& sh, const Array<T>& found, const std
 template <class T>
 void expect_same(const char* what, const Array<T>& one, const Array<T>& other) {
   if (std::memcmp(one.data.get(), other.data.get(), one.size * sizeof(T)) == 0) return;
-  if (++faults < 20) std::printf("%s: other bits with another number of threads\n", what);
+  if (++faults < 20) std::printf("%s: other bits than expected\n", what);
 }
 
 // Passes over arrays, by every pool with the same bits; returns the number of examples.

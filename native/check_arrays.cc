@@ -1,9 +1,12 @@
-// Checks the passes over arrays: vectors of a solve, and decompositions of matrices.
+// Checks the passes over arrays: vectors of a solve, decompositions of matrices, and the order of numbers.
 
+#include <algorithm>
+#include <numeric>
 #include <random>
 
 #include "check.h"
 #include "matrices.h"
+#include "order.h"
 #include "vectors.h"
 
 namespace mpmjax {
@@ -159,8 +162,35 @@ int check_all(const std::vector<const Pool*>& pools) {
   return examples;
 }
 
+// Keys of few and of many values, and those that lie farthest apart, against the standard library's stable sort.
+int check_order(const std::vector<const Pool*>& pools) {
+  std::mt19937 random(1);
+  int examples = 0;
+  for (const int64_t count : {0, 1, 2, 1000, 70001}) {
+    for (const int64_t reach : {int64_t(1), int64_t(30), int64_t(1) << 20, int64_t(1) << 32}) {
+      const int64_t batch = 2;
+      const Array<int32_t> keys(batch * count), expected(keys.size);
+      for (int64_t i = 0; i < keys.size; ++i) keys[i] = static_cast<int32_t>(random() % reach - reach / 2);
+      for (int64_t m = 0; m < batch; ++m) {
+        int32_t *first = expected.data.get() + m * count, *last = first + count;
+        std::iota(first, last, 0);
+        std::stable_sort(first, last, [&](int32_t a, int32_t b) { return keys[m * count + a] < keys[m * count + b]; });
+      }
+      for (const Pool* pool : pools) {
+        const Array<int32_t> found(keys.size);
+        order(*pool, batch, Order{keys.data.get(), found.data.get(), count});
+        expect_same("an order", expected, found);
+      }
+      ++examples;
+    }
+  }
+  return examples;
+}
+
 }  // namespace
 
-int check_arrays(const std::vector<const Pool*>& pools) { return check_all<float>(pools) + check_all<double>(pools); }
+int check_arrays(const std::vector<const Pool*>& pools) {
+  return check_all<float>(pools) + check_all<double>(pools) + check_order(pools);
+}
 
 }  // namespace mpmjax

@@ -127,9 +127,9 @@ struct SolveOf {
     of.matrices = call.at<T>(3, {m * (m + 1) / 2, call.particles});
     of.mass = call.at<T>(4, {nodes});
     of.factor = call.at<T>(5, {});
-    of.free = call.booleans(6, size);
+    of.free = call.booleans(6, {size});
     of.weight = call.at<T>(7, {size});
-    of.active = call.booleans(8, (size + kTogether - 1) / kTogether);
+    of.active = call.booleans(8, {(size + kTogether - 1) / kTogether});
     of.start = call.at<T>(9, {size});
     task.rhs = call.at<T>(10, {size});
     task.limits = call.at<T>(11, {kTolerances});

@@ -1,5 +1,6 @@
 """Grid, B-spline kernels, stencils, and the transfers between particles and grid."""
 
+from mpmjax.discretisation._cell_order import Order, by_cell, cells_of, rearranged
 from mpmjax.discretisation._gradient import AbstractGradient, MLSGradient, SplineGradient
 from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._kernel import BSpline
@@ -18,13 +19,17 @@ __all__ = [
     "Gathered",
     "Grid",
     "MLSGradient",
+    "Order",
     "SplineGradient",
     "Stencil",
+    "by_cell",
+    "cells_of",
     "g2p",
     "gather",
     "in_window",
     "make_stencil",
     "p2g",
+    "rearranged",
     "resist",
     "resist_by",
     "scatter",

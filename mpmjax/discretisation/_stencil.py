@@ -125,11 +125,11 @@ def make_stencil(
         offset = jnp.arange(kernel.order + 1, dtype=f.dtype)[:, None] - f[:, None]
         least_squares = weights * offset / (variance * dx)
     derivatives = gradient.derivatives(spline, least_squares)
-    index_factors = _index_factors(kernel, grid, window, xi)
+    factors = index_factors(kernel, grid, window, xi)
     if layer is not None:
-        index_factors = index_factors.at[0].add(jnp.asarray(layer * math.prod(grid.shape), jnp.int32))
+        factors = factors.at[0].add(jnp.asarray(layer * math.prod(grid.shape), jnp.int32))
     return Stencil(
-        index_factors=index_factors,
+        index_factors=factors,
         weights=weights,
         weight_derivatives=derivatives,
         mls_weight_derivatives=least_squares if affine and derivatives is not least_squares else None,
@@ -138,7 +138,7 @@ def make_stencil(
     )
 
 
-def _index_factors(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Array) -> Int[Array, "d s p"]:
+def index_factors(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Array) -> Int[Array, "d s p"]:
     """Term of the C-order node index from each axis, shape (d, s, p)."""
     first = jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window.astype(jnp.int32)[:, None]
     along = first[:, None] + jnp.arange(kernel.order + 1, dtype=jnp.int32)[:, None]

@@ -1,7 +1,7 @@
 """The compiled library of CPUs: whether there is one, and how JAX calls it."""
 
-from mpmjax.native._backend import Backend, backend
+from mpmjax.native._backend import Backend, backend, is_native
 from mpmjax.native._lowering import sums_fit
 from mpmjax.native._primitive import members, native_primitive
 
-__all__ = ["Backend", "backend", "members", "native_primitive", "sums_fit"]
+__all__ = ["Backend", "backend", "is_native", "members", "native_primitive", "sums_fit"]

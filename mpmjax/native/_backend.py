@@ -50,6 +50,11 @@ def uses_native() -> tuple[bool, str]:
     return True, f"{VARIABLE}=native" if asked else "the default"
 
 
+def is_native() -> bool:
+    """Whether what is compiled next for the default device has native sums."""
+    return jax.default_backend() == "cpu" and uses_native()[0]
+
+
 def backend() -> Backend:
     """Who sums between particles and nodes, and why: `native`, compiled kernels for CPUs, or `xla`.
 

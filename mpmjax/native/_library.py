@@ -8,11 +8,23 @@ from typing import NamedTuple
 
 import jax
 
-INTERFACE = 5
+INTERFACE = 6
 """What the library has to answer, as in native/CMakeLists.txt: both change with the handlers' arguments."""
 PATH = Path(__file__).parent / "lib" / "sums.so"
 """In a folder of its own: Python takes a shared library among modules for a module."""
-HANDLERS = ("gather", "scatter", "pull", "resist", "combine", "product", "solve", "eigen", "rotation")
+HANDLERS = (
+    "gather",
+    "scatter",
+    "pull",
+    "resist",
+    "combine",
+    "product",
+    "solve",
+    "eigen",
+    "rotation",
+    "order",
+    "rearrange",
+)
 
 
 class Library(NamedTuple):

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Bool, Int, Scalar, components
+from mpmjax._types import Array, Bool, Int, Scalar, components, particle_first
 from mpmjax.checks import first_unmet, requirements
 from mpmjax.discretisation import Stencil, in_window
 from mpmjax.simulation._rollout_state import RolloutState
+from mpmjax.simulation._sorting import resorted
 from mpmjax.simulation._statistics import Fault, RunStatistics, no_steps, one_step
 from mpmjax.state import Particles, Scene, State, with_state
 from mpmjax.stepping import AbstractIntegrator, step_compiled
@@ -41,10 +42,28 @@ class Problem(eqx.Module):
     """`Fault` of the state before the first step; None if it is known that there is none."""
     unmet: Int[Array, ""] | None = None
     """See `RunStatistics`; likewise."""
+    save_every: int | None = eqx.field(static=True, default=None)
+    """Number of steps between saved frames, if there are any."""
 
     def at(self, state: State) -> Particles:
         """The particles with a state put in."""
         return with_state(self.particles, state)
+
+    def resorted(self, y: RolloutState, step: Array) -> "tuple[Problem, RolloutState]":
+        """The problem and the state before a step, their particles in the order of the state, which are sorted if it is
+        time to.
+
+        Args:
+            y: the state as the loop carries it.
+            step: the number of steps since the rollout began.
+        """
+        if y.order is None:
+            return self, y
+        t = (self.start + step) * self.dt
+        state = jax.tree.map(particle_first, y.particles)
+        state, order = resorted(y.order, self.scene, self.particles, state, t, step, self.save_every)
+        scene, particles = order.put_into(self.scene, self.particles)
+        return replace(self, scene=scene, particles=particles), replace(y, particles=state, order=order)
 
 
 def faulty_particles(problem: Problem, state: State, t: Scalar) -> dict[Fault, Bool[Array, "p"]]:
@@ -146,14 +165,16 @@ class StepSolver(diffrax.AbstractSolver):
         """One step. A fault is reported as the solver's failure: as an event diffrax would ask for it once more."""
         del terms, t1, made_jump
         statistics, report = solver_state
+        args, y = args.resorted(y0, step_number(t0))
         t = (args.start + step_number(t0)) * args.dt
         method = args.method.reporting(args.slot)
-        particles, info = step_compiled(args.scene, args.at(y0.particles), t, args.dt, method, args.stencil)
+        particles, info = step_compiled(args.scene, args.at(y.particles), t, args.dt, method, args.stencil)
         report = report + info.solve.report
-        y1 = y0.after(particles, info)
-        arrays, rest = eqx.partition((args, y0.particles, y1.particles, t), eqx.is_array)
+        y1 = y.after(particles, info)
+        arrays, rest = eqx.partition((args, y.particles, y1.particles, t), eqx.is_array)
         fault = fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest))
         statistics = statistics.after_step(one_step(info, fault), solved=not args.method.is_explicit)
+        y1 = y1.carried()
         dense = {"y0": y0, "y1": y1}
         if not self.watch:
             return y1, None, dense, (statistics, report), diffrax.RESULTS.successful

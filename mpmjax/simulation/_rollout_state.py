@@ -3,9 +3,11 @@
 from dataclasses import replace
 
 import equinox as eqx
+import jax
 
+from mpmjax._types import components, particle_first
 from mpmjax.boundary import BoundaryImpulse, ColliderImpulse, no_boundary_impulse, no_impulse
-from mpmjax.state import Particles, Scene, State, state_of
+from mpmjax.state import MemoryOrder, Particles, Scene, State, state_of
 from mpmjax.stepping import StepInfo
 
 
@@ -17,6 +19,20 @@ class RolloutState(eqx.Module):
     """Linear and angular impulse on the scene's colliders since the rollout began; None without colliders."""
     boundary_impulse: BoundaryImpulse | None = None
     """The same of each of its boundaries; None unless the scene has `boundary_forces`."""
+    order: MemoryOrder | None = None
+    """The order of the particles in memory; None if it is that in which they were given."""
+
+    def carried(self) -> "RolloutState":
+        """The same state as the loop over steps carries it, if it has an order: component first, as a step has its
+        arrays and rearranges them. XLA would else transpose all of them in each step."""
+        return self if self.order is None else replace(self, particles=jax.tree.map(components, self.particles))
+
+    def as_given(self) -> "RolloutState":
+        """A carried state with the particles in the order in which they were given."""
+        if self.order is None:
+            return self
+        state = jax.tree.map(particle_first, self.particles)
+        return replace(self, particles=self.order.undone(state), order=None)
 
     def after(self, particles: Particles, info: StepInfo) -> "RolloutState":
         """The state after a step, from the particles after it and what it reports."""

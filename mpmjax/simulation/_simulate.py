@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, NamedTuple, cast
 
@@ -29,8 +30,9 @@ from mpmjax.simulation._diffrax import Problem, StepSolver, examined, no_vector_
 from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccuracy
 from mpmjax.simulation._rollout_state import RolloutState, initial_state
 from mpmjax.simulation._run import Run
+from mpmjax.simulation._sorting import memory_order
 from mpmjax.simulation._statistics import RunStatistics
-from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
+from mpmjax.state import Particles, Scene, prepare, state_of, with_state
 from mpmjax.stepping import MOST_STEPS, AbstractIntegrator, Explicit, step_for, step_unchecked
 
 _CHECKPOINT_BYTES = 2**28
@@ -192,14 +194,17 @@ def rollout(
 def _rollout(
     scene: Scene, particles: Particles, dt: Scalar, method: AbstractIntegrator, steps: int, start: Float[Array, ""]
 ) -> Particles:
-    stencil = scene.stencil(particles) if scene.total else None
+    problem = Problem(scene, particles, scene.stencil(particles) if scene.total else None, dt, method, start=start)
 
-    def body(state: State, n: Array) -> tuple[State, None]:
-        new, _ = step_unchecked(scene, with_state(particles, state), n * dt, dt, method, stencil)
-        return state_of(new), None
+    def body(y: RolloutState, n: Array) -> tuple[RolloutState, None]:
+        here, y = problem.resorted(y, n)
+        t = (start + n) * dt
+        new, _ = step_unchecked(here.scene, here.at(y.particles), t, dt, method, here.stencil)
+        return replace(y, particles=state_of(new)).carried(), None
 
-    number = start + jnp.arange(steps, dtype=particles.x.dtype)
-    return with_state(particles, jax.lax.scan(recomputed(body), state_of(particles), number)[0])
+    begin = RolloutState(state_of(particles), None, order=memory_order(scene, particles, steps)).carried()
+    end, _ = jax.lax.scan(recomputed(body), begin, jnp.arange(steps, dtype=particles.x.dtype))
+    return with_state(particles, end.as_given().particles)
 
 
 def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
@@ -290,12 +295,14 @@ def integrate(
     stencil = scene.stencil(particles) if scene.total else None
     zero, one, all_steps = (np.asarray(n, start.dtype) for n in (0, 1, max_steps))
     until, slot = (jnp.asarray(a, start.dtype) for a in (until, slot))
-    problem = Problem(scene, particles, stencil, dt, method, observe, start, until, slot)
+    problem = Problem(scene, particles, stencil, dt, method, observe, start, until, slot, save_every=save_every)
     if not watch:
         problem, state = examined(problem, state)
+    state = replace(state, order=memory_order(scene, particles, save_every or max_steps)).carried()
 
     def kept(t: Any, y: RolloutState, args: Problem) -> Any:
         del t
+        y = y.as_given()
         value = y.particles if args.observe is None else args.observe(args.scene, args.at(y.particles))
         return value, y.collider_impulse, y.boundary_impulse
 
@@ -317,7 +324,7 @@ def integrate(
         progress_meter=diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter(),
     )
     times, values, (statistics, report) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
-    final = jax.tree.map(lambda a: a[-1], values["final"])
+    final = jax.tree.map(lambda a: a[-1], values["final"]).as_given()
     saved = Saved(jnp.zeros((0,), start.dtype))
     if save_every is not None:
         saved = Saved(start + step_number(times["frames"]), *values["frames"])

@@ -10,6 +10,7 @@ from mpmjax.state._fill import fill, fill_mapped
 from mpmjax.state._loaded_points import LoadedPoints
 from mpmjax.state._loads import AbstractLoad, PointLoad, Pressure, Spring, Traction, load_force, points_of, supports_of
 from mpmjax.state._material_points import MaterialPoints
+from mpmjax.state._order import MemoryOrder, Rearrangement, given_order, places, rearrangement, whole_numbers
 from mpmjax.state._particles import Particles, State, by_material, history_arrays, join, state_of, with_state
 from mpmjax.state._preparation import is_prepared, prepare
 from mpmjax.state._scene import RigidMaterial, Scene, attach
@@ -27,11 +28,13 @@ __all__ = [
     "Couple",
     "LoadedPoints",
     "MaterialPoints",
+    "MemoryOrder",
     "Particles",
     "Patch",
     "PointLoad",
     "PointsAt",
     "Pressure",
+    "Rearrangement",
     "RigidMaterial",
     "Scene",
     "Spring",
@@ -46,14 +49,18 @@ __all__ = [
     "by_material",
     "fill",
     "fill_mapped",
+    "given_order",
     "history_arrays",
     "is_prepared",
     "join",
     "load_force",
+    "places",
     "points_of",
     "prepare",
+    "rearrangement",
     "state_of",
     "stiffness_of",
     "supports_of",
+    "whole_numbers",
     "with_state",
 ]

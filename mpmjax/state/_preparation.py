@@ -26,6 +26,7 @@ from mpmjax.material import AbstractLaw
 from mpmjax.state._attachment import AttachedPoints
 from mpmjax.state._loaded_points import keeps_deformation
 from mpmjax.state._material_points import MaterialPoints
+from mpmjax.state._order import is_foreign
 from mpmjax.state._oversights import warn_of_oversights
 from mpmjax.state._particles import Group, Particles
 from mpmjax.state._scene import Scene
@@ -157,7 +158,7 @@ def _fits(law: AbstractLaw, group: Group, dim: int) -> bool:
 def _parameters(law: AbstractLaw) -> list[Any]:
     """The numbers of a law and of the laws that it is made of; those of other modules within it, such as networks, are
     their own."""
-    own = jax.tree.leaves(law, is_leaf=lambda node: isinstance(node, eqx.Module) and not isinstance(node, AbstractLaw))
+    own = jax.tree.leaves(law, is_leaf=is_foreign)
     return [leaf for leaf in own if eqx.is_array_like(leaf)]
 
 
