@@ -187,10 +187,51 @@ int check_order(const std::vector<const Pool*>& pools) {
   return examples;
 }
 
+// Numbers in another order and back, in place and elsewhere, wanted and not, with particles that there are not.
+template <class T>
+int check_rearrangement(const std::vector<const Pool*>& pools) {
+  std::mt19937 random(1);
+  int examples = 0;
+  for (const int64_t count : {1, 30, 9001}) {
+    for (const bool inverse : {false, true}) {
+      const int64_t batch = 2, rows = 3, last = count - 1;
+      const Array<bool> wanted(batch);
+      const Array<int32_t> order(batch * count);
+      const Array<T> from(batch * rows * count);
+      wanted[1] = true;
+      for (int64_t m = 0; m < batch; ++m) {
+        std::iota(order.data.get() + m * count, order.data.get() + (m + 1) * count, 0);
+        std::shuffle(order.data.get() + m * count, order.data.get() + (m + 1) * count, random);
+      }
+      order[count] = std::numeric_limits<int32_t>::max(), order[2 * count - 1] = -7;
+      for (int64_t i = 0; i < from.size; ++i) from[i] = T(random() % 1000);
+      Array<T> expected(from);
+      for (int64_t i = 0; i < rows * count; ++i) {
+        const int64_t row = (rows + i / count) * count, k = i % count, other = order[count + k];
+        const int64_t clipped = std::min(std::max<int64_t>(other, 0), last);
+        if (!inverse) expected[row + k] = from[row + clipped];
+        if (inverse && other == clipped) expected[row + other] = from[row + k];
+      }
+      for (const Pool* pool : pools) {
+        for (const bool in_place : {false, true}) {
+          const Array<T> source(from), to(from.size);
+          T* target = in_place ? source.data.get() : to.data.get();
+          rearrange(*pool, batch, Rearrangement<T>{wanted.data.get(), order.data.get(), source.data.get(), target, rows,
+                                                   count, inverse});
+          expect_same("a rearrangement", expected, in_place ? source : to);
+        }
+      }
+      ++examples;
+    }
+  }
+  return examples;
+}
+
 }  // namespace
 
 int check_arrays(const std::vector<const Pool*>& pools) {
-  return check_all<float>(pools) + check_all<double>(pools) + check_order(pools);
+  return check_all<float>(pools) + check_all<double>(pools) + check_order(pools) +
+         check_rearrangement<float>(pools) + check_rearrangement<double>(pools);
 }
 
 }  // namespace mpmjax
