@@ -1,5 +1,7 @@
 """Particles that flow are sorted by cell in memory, which changes nothing but the rounding of sums."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -50,6 +52,11 @@ def mixed(d=2):
     return mpm.attach(scene, particles), particles
 
 
+class Still(mpm.AbstractBodyForce):
+    def acceleration(self, x, t):
+        return jnp.zeros_like(x)
+
+
 def is_sorted(scene, particles, steps=STEPS):
     scene = mpm.simulate(scene, particles, t1=DT, dt=DT).scene  # its numbers as arrays
     return _sorting.memory_order(scene, mpm.prepare(scene, particles), steps) is not None
@@ -80,6 +87,30 @@ def test_frames_and_observations_keep_the_order_given(d, monkeypatch):
         seen = mpm.simulate(scene, particles, t1=STEPS * DT, dt=DT, save_every=5, observe=lambda _, q: q.x[:7])
         plain = mpm.rollout(scene, particles, steps=STEPS, dt=DT)
         return saved.frames, saved.final, seen.observed, plain
+
+    agree(run(), unsorted(monkeypatch, run))
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize(
+    "method", [mpm.Explicit(), *thorough(mpm.SemiImplicit())], ids=lambda method: type(method).__name__
+)
+@pytest.mark.parametrize(
+    "law",
+    [mpm.Fluid(1e4), *thorough(mpm.Snow(1e4, 0.2), mpm.VonMises(1e4, 0.3, 10.0))],
+    ids=lambda law: type(law).__name__,
+)
+def test_one_material_without_loads(law, method, monkeypatch):
+    """With what it remembers of each particle, which flow here by half a spacing."""
+    grid = mpm.Grid((14, 14), 1 / 8)
+    particles = shuffled(mpm.fill(mpm.Box((0.4, 0.4), (0.9, 0.9)), grid, particles_per_cell=4, density=1e3), 0)
+    particles = eqx.tree_at(lambda q: q.v, particles, particles.v.at[:, 0].set(5 * (particles.x[:, 1] - 0.65)))
+    scene = mpm.Scene(grid, law)
+    assert is_sorted(scene, particles)
+
+    def run():
+        done = mpm.simulate(scene, particles, t1=STEPS * DT, dt=DT, method=method, save_every=6)
+        return done.frames, done.final
 
     agree(run(), unsorted(monkeypatch, run))
 
@@ -157,6 +188,7 @@ def test_what_keeps_its_order_is_not_sorted(monkeypatch):
     alone = mpm.fill(mpm.Box((0.5, 0.5), (0.9, 0.9)), scene.grid, particles_per_cell=4, density=1e3)
     assert not is_sorted(body, alone)
     assert not is_sorted(scene, particles, steps=2)
+    assert not is_sorted(replace(scene, body_force=Still()), particles)
     monkeypatch.setattr(_sorting, "LEAST", 10_000)
     assert not is_sorted(scene, particles)
 

@@ -52,7 +52,8 @@ def record(
     """Simulate as `simulate` does, writing each frame to a file when it is reached; memory holds one frame only.
 
     The steps between two frames are one compiled program, called again and again, and give the same numbers as
-    `simulate`, bit for bit on a CPU. A run that is interrupted or meets a fault leaves a whole file.
+    `simulate` with the same `save_every`, bit for bit on a CPU. A run that is interrupted or meets a fault leaves a
+    whole file.
 
     Args:
         path: the file to be (see `save`).

@@ -306,7 +306,7 @@ def integrate(
         value = y.particles if args.observe is None else args.observe(args.scene, args.at(y.particles))
         return value, y.collider_impulse, y.boundary_impulse
 
-    subs = {"final": diffrax.SubSaveAt(t1=True)}
+    subs = {"final": diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: y.as_given())}
     if save_every is not None:
         subs["frames"] = diffrax.SubSaveAt(t0=True, t1=True, steps=save_every, fn=kept)
     solution = diffrax.diffeqsolve(
@@ -324,7 +324,7 @@ def integrate(
         progress_meter=diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter(),
     )
     times, values, (statistics, report) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
-    final = jax.tree.map(lambda a: a[-1], values["final"]).as_given()
+    final = jax.tree.map(lambda a: a[-1], values["final"])
     saved = Saved(jnp.zeros((0,), start.dtype))
     if save_every is not None:
         saved = Saved(start + step_number(times["frames"]), *values["frames"])

@@ -14,7 +14,17 @@ from equinox.internal import unvmap_any
 from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.discretisation import Order, by_cell, cells_of
 from mpmjax.native import is_native
-from mpmjax.state import MemoryOrder, Particles, Scene, State, given_order, places, rearrangement, whole_numbers
+from mpmjax.state import (
+    MemoryOrder,
+    Particles,
+    Scene,
+    State,
+    attached_particles,
+    given_order,
+    places,
+    rearrangement,
+    whole_numbers,
+)
 
 VARIABLE = "MPMJAX_ORDER"
 LEAST = 16_384
@@ -74,7 +84,7 @@ def resorted(
         save_every: number of steps between frames; None if none is saved.
     """
     due = (step if save_every is None else step % save_every) % STEPS == 0
-    attached = given_order(scene, particles).attached
+    attached = attached_particles(scene)
 
     def found() -> tuple[Order, tuple[Array, ...]]:
         place = places(order.number)

@@ -10,7 +10,15 @@ from mpmjax.state._fill import fill, fill_mapped
 from mpmjax.state._loaded_points import LoadedPoints
 from mpmjax.state._loads import AbstractLoad, PointLoad, Pressure, Spring, Traction, load_force, points_of, supports_of
 from mpmjax.state._material_points import MaterialPoints
-from mpmjax.state._order import MemoryOrder, Rearrangement, given_order, places, rearrangement, whole_numbers
+from mpmjax.state._order import (
+    MemoryOrder,
+    Rearrangement,
+    attached_particles,
+    given_order,
+    places,
+    rearrangement,
+    whole_numbers,
+)
 from mpmjax.state._particles import Particles, State, by_material, history_arrays, join, state_of, with_state
 from mpmjax.state._preparation import is_prepared, prepare
 from mpmjax.state._scene import RigidMaterial, Scene, attach
@@ -46,6 +54,7 @@ __all__ = [
     "UpdatedLagrangian",
     "VolumeAverage",
     "attach",
+    "attached_particles",
     "by_material",
     "fill",
     "fill_mapped",

@@ -23,7 +23,7 @@ class Rearrangement(eqx.Module):
     own: tuple[Int[Array, "..."], ...]
     """The same of each material, by numbers among its particles, shape (q,)."""
     wanted: Bool[Array, ""]
-    """Whether anything is rearranged."""
+    """If False, everything stays where it is."""
 
     def __call__(self, a: Array) -> Array:
         """An array over all particles, shape (p, ...), in this order."""
@@ -95,9 +95,14 @@ def given_order(scene: Scene, particles: Particles) -> MemoryOrder:
     """The order in which prepared particles were given, of a scene whose floats are arrays and whose loads are
     attached."""
     own = (eqx.filter(law, _one_a_particle(law, n)) for law, n in zip(scene.laws, particles.sizes, strict=True))
-    attached = (jnp.asarray(load.on.particle) for load in scene.loads if isinstance(load.on, AttachedPoints))
     number = jnp.arange(particles.count, dtype=particles.x.dtype)
-    return MemoryOrder(jnp.stack([number, particles.mass, particles.volume]), tuple(own), tuple(attached))
+    numbers = jnp.stack([number, particles.mass, particles.volume])
+    return MemoryOrder(numbers, tuple(own), attached_particles(scene))
+
+
+def attached_particles(scene: Scene) -> tuple[Float[Array, "..."], ...]:
+    """Of each load the numbers of the particles that its points are attached to."""
+    return tuple(jnp.asarray(load.on.particle) for load in scene.loads if isinstance(load.on, AttachedPoints))
 
 
 def whole_numbers(numbers: Float[Array, "..."]) -> Array:
