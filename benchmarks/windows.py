@@ -24,7 +24,7 @@ import mpmjax as mpm
 SCENES = {"A 100k": (3, 100_000, 64, 8), "C 100k": (2, 100_000, 256, 4)}
 QUICK = {"A 5k": (3, 5_000, 32, 8), "C 2k": (2, 2_000, 64, 4)}
 WIDER = {"its own": (1, 1, 1), "2 x 2": (2, 2, 1), "4 x 1": (4, 1, 1), "1 x 4": (1, 4, 1)}
-STEPS = {"explicit step": 20, "semi-implicit step": 4, "gradient, a step": 5}
+STEPS = {"explicit step": 40, "semi-implicit step": 12, "gradient, a step": 20}
 """Enough in a call that its first touch of memory, which windows share out too, does not matter."""
 
 

@@ -2,17 +2,20 @@
 //
 //   combine   a, b, c, d, scales, weight, active             ->  y, z, sum
 //   product   force, v, mass, factor, free, weight, active   ->  image, sum
+//   slope     whole, means, by means, by whole               ->  by sums
 //   eigen     S                                              ->  w, V
 //   rotation  F                                              ->  R
 //   order     keys                                           ->  order
 //   rearrange wanted, order, numbers                         ->  numbers
 //
-// Vectors are (..., m), scales (..., 2), mass (..., n), active (..., ⌈m/64⌉), matrices (..., 3, 3, p), w (..., 3, p), keys
+// Vectors are (..., m), scales (..., 2), mass and whole (..., n), means (..., n, c − 1), sums (..., n, c), active
+// (..., ⌈m/64⌉), matrices (..., 3, 3, p), w (..., 3, p), keys
 // and their order (..., p), wanted (...), numbers (..., c, p), with the same leading axes everywhere.
 
 #include "call.h"
 #include "matrices.h"
 #include "order.h"
+#include "slope.h"
 #include "vectors.h"
 
 namespace mpmjax {
@@ -53,6 +56,17 @@ struct ProductOf {
     task.whole = true;
     call.expect(task.nodes > 0 ? task.size % task.nodes == 0 : task.size == 0, "nodes with unlike numbers of components");
     if (call.fault.empty()) product(pool, call.batch, task);
+  }
+};
+
+struct SlopeOf {
+  template <class T>
+  void run(const Pool& pool, Call& call) const {
+    const int64_t n = call.dim(0, 1), others = call.dim(1, 1);
+    const Slope<T> task = {call.at<T>(0, {n}), call.at<T>(1, {n, others}),     call.at<T>(2, {n, others}),
+                           call.at<T>(3, {n}), call.at<T>(4, {n, others + 1}), n,
+                           others + 1};
+    if (call.fault.empty()) slope(pool, call.batch, task);
   }
 };
 
@@ -141,6 +155,7 @@ ffi::Error run_rearrange(ffi::ThreadPool threads, bool inverse, ffi::RemainingAr
 
 constexpr auto run_combine = run<CombineOf, 7, 3, 1>;
 constexpr auto run_product = run<ProductOf, 7, 2, 1>;
+constexpr auto run_slope = run<SlopeOf, 4, 1, 1>;
 constexpr auto run_eigen = run<EigenOf, 1, 2, 3>;
 constexpr auto run_rotation = run<RotationOf, 1, 1, 3>;
 
@@ -152,6 +167,8 @@ constexpr auto run_rotation = run<RotationOf, 1, 1, 3>;
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_combine, mpmjax::run_combine,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_product, mpmjax::run_product,
+                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_slope, mpmjax::run_slope,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_eigen, mpmjax::run_eigen,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());

@@ -109,7 +109,7 @@ void check(const Example<T>& e, const std::vector<const Pool*>& pools) {
     const bool valued = kind != 2, differential = kind == 3;
     const int64_t graded = kind == 1 ? 0 : kind == 4 ? sh.columns - 1 : sh.columns;
     const Form form{sh.d, sh.s, differential};
-    Scatter<T> scattered = {e.stencils(differential), {}, e.to_nodes.data.get(), nullptr, n, sh.columns, nullptr};
+    Scatter<T> scattered = {e.stencils(differential), {}, e.to_nodes.data.get(), nullptr, nullptr, n, sh.columns, nullptr};
     T *value = e.gathered.data.get(), *gradients = value + rows;
     const Gather<T> gathered = {e.stencils(differential), e.nodes.data.get(), value, gradients, n, sh.columns};
     Pull<T> pulled = {e.stencils(false), e.nodes.data.get(), {}, e.by_w.data.get(), e.by_g.data.get(), n, sh.columns};
@@ -169,6 +169,35 @@ void check(const Example<T>& e, const std::vector<const Pool*>& pools) {
     compare("gather", sh, e.gathered, from, from_scale);
     if (!differential) compare("pull by weights", sh, e.by_w, by_w, by_scale);
     if (!differential) compare("pull by derivatives", sh, e.by_g, by_g, by_g_scale);
+  }
+}
+
+// An average, against the scatter of the same: the divided columns to rounding, in memory of any content.
+template <class T>
+void check_average(const Example<T>& e, const std::vector<const Pool*>& pools) {
+  const Shape& sh = e.shape;
+  const int64_t rows = e.rows(), n = sh.size(), others = sh.columns - 1;
+  const Given<T> given = {e.given.data.get(), e.given.data.get() + rows, others};
+  const Scatter<T> scattered = {e.stencils(false), given, e.to_nodes.data.get(), nullptr, nullptr, n, sh.columns, nullptr};
+  const Array<T> least(sh.batch), whole(sh.batch * n), means(sh.batch * n * others), work(e.to_nodes.size);
+  for (int64_t i = 0; i < least.size; ++i) least[i] = T(0.1);
+  const Average<T> task = {e.stencils(false), given, least.data.get(), whole.data.get(), means.data.get(),
+                           work.data.get(), nullptr, nullptr, n, sh.columns};
+  scatter(*pools[0], {sh.d, sh.s, false}, sh.batch, scattered);
+  const Array<T> expected_whole(whole.size), expected_means(means.size);
+  for (int64_t i = 0; i < whole.size; ++i) {
+    const T* sums = &e.to_nodes[i * sh.columns];
+    const bool some = sums[others] > T(0.1);
+    expected_whole[i] = some ? sums[others] : 0;
+    for (int64_t k = 0; k < others; ++k) expected_means[i * others + k] = some ? sums[k] / sums[others] : 0;
+  }
+  for (const Pool* pool : pools) {
+    for (const Array<T>* array : {&whole, &means, &work}) {
+      for (int64_t i = 0; i < array->size; ++i) (*array)[i] = 7;
+    }
+    if (!average(*pool, {sh.d, sh.s, false}, sh.batch, task)) ++faults, std::printf("no kernel for an average\n");
+    expect_same("the whole of an average", expected_whole, whole);
+    expect_same("the means of an average", expected_means, means);
   }
 }
 
@@ -247,6 +276,7 @@ void check_in_order(Shape shape, std::mt19937& random, const std::vector<const P
     }
   }
   check(e, pools);
+  check_average(e, pools);
   check_resistance(e, pools);
 }
 
@@ -276,12 +306,14 @@ void check_solve(const Example<T>& e, std::mt19937& random, const std::vector<co
   factor[last] = std::numeric_limits<T>::quiet_NaN();
   std::unique_ptr<Array<T>> bits;
   for (const Pool* pool : pools) {
-    const Array<T> x(weight.size);
+    const Array<T> x(weight.size), memory(kVectors * weight.size);
+    for (int64_t i = 0; i < memory.size; ++i) memory[i] = std::numeric_limits<T>::quiet_NaN();
     Solve<T> task = {};
+    task.memory = pool == pools[0] ? nullptr : memory.data.get();
     task.recurrence = {e.stencils(false), matrices.data.get(), mass.data.get(), factor.data.get(), free.data.get(),
-                       weight.data.get(), active.data.get(), start.data.get(), nullptr, nullptr, x.data.get(), nullptr, n,
-                       sh.d};
-    task.rhs = rhs.data.get(), task.limits = limits.data.get(), task.numbers = numbers.data.get();
+                       weight.data.get(), active.data.get(), nullptr, x.data.get(), nullptr, nullptr, nullptr, nullptr,
+                       nullptr, nullptr, n, sh.d};
+    task.start = start.data.get(), task.rhs = rhs.data.get(), task.limits = limits.data.get(), task.numbers = numbers.data.get();
     if (!solve(*pool, {sh.d, sh.s, false}, sh.batch, task)) ++faults, std::printf("no kernel for a solve\n");
     bool fine = numbers[1] == 0;
     for (int64_t i = 0; i < size; ++i) fine = fine && x[i] == start[i];
@@ -304,6 +336,7 @@ int check_all(const std::vector<const Pool*>& pools) {
   const auto check_both = [&](const Shape& shape, int oddity) {
     const Example<T> e(shape, oddity, random);
     check(e, pools);
+    if (shape.columns > 1) check_average(e, pools);
     check_resistance(e, pools);
     ++examples;
   };
@@ -342,7 +375,7 @@ int main() {
     callers.emplace_back([&, i] {
       std::mt19937 random(i);
       const Example<float> e({2, 3, 1, 9001 + i, 30, 3}, 1, random);
-      Scatter<float> task = {e.stencils(false), {}, e.to_nodes.data.get(), nullptr, e.shape.size(), 3, nullptr};
+      Scatter<float> task = {e.stencils(false), {}, e.to_nodes.data.get(), nullptr, nullptr, e.shape.size(), 3, nullptr};
       task.given = {e.given.data.get(), e.given.data.get() + e.rows(), 3};
       scatter(one, {2, 3, false}, 1, task);
       const Array<float> alone(e.to_nodes);

@@ -7,6 +7,7 @@
 #include "check.h"
 #include "matrices.h"
 #include "order.h"
+#include "slope.h"
 #include "vectors.h"
 
 namespace mpmjax {
@@ -227,11 +228,49 @@ int check_rearrangement(const std::vector<const Pool*>& pools) {
   return examples;
 }
 
+// Slopes by the sums of an average, over memory of any content; most nodes are empty, and say nothing whatever is there.
+template <class T>
+int check_slope(const std::vector<const Pool*>& pools) {
+  std::mt19937 random(4);
+  std::normal_distribution<T> normal;
+  int examples = 0;
+  for (const int64_t n : {0, 1, 700, 300000}) {
+    for (const int64_t others : {1, 2, 3, 5}) {
+      const int64_t batch = 2, c = others + 1;
+      const Array<T> whole(batch * n), means(whole.size * others), by_means(means.size), by_whole(whole.size);
+      const Array<T> found(whole.size * c);
+      std::vector<double> expected(found.size), scale(found.size, 1);
+      for (int64_t i = 0; i < whole.size; ++i) {
+        by_whole[i] = normal(random);
+        if (i % 500 < 100 && i % 3 > 0) whole[i] = 1 + std::abs(normal(random));
+        if (whole[i] == 0) by_whole[i] = std::numeric_limits<T>::quiet_NaN();
+        expected[i * c + others] = whole[i] == 0 ? 0 : by_whole[i];
+        for (int64_t k = 0; k < others; ++k) {
+          const int64_t at = i * others + k;
+          means[at] = normal(random), by_means[at] = normal(random);
+          expected[i * c + k] = whole[i] == 0 ? 0 : by_means[at] / double(whole[i]);
+          expected[i * c + others] -= expected[i * c + k] * means[at];
+          scale[i * c + others] += std::abs(means[at] * by_means[at]);
+        }
+      }
+      for (const Pool* pool : pools) {
+        for (int64_t i = 0; i < found.size; ++i) found[i] = 7;
+        slope(*pool, batch, Slope<T>{whole.data.get(), means.data.get(), by_means.data.get(), by_whole.data.get(),
+                                     found.data.get(), n, c});
+        compare("slope", {1, 0, batch, 0, n, c}, found, expected, scale);
+      }
+      ++examples;
+    }
+  }
+  return examples;
+}
+
 }  // namespace
 
 int check_arrays(const std::vector<const Pool*>& pools) {
   return check_all<float>(pools) + check_all<double>(pools) + check_order(pools) +
-         check_rearrangement<float>(pools) + check_rearrangement<double>(pools);
+         check_rearrangement<float>(pools) + check_rearrangement<double>(pools) + check_slope<float>(pools) +
+         check_slope<double>(pools);
 }
 
 }  // namespace mpmjax

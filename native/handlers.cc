@@ -3,9 +3,11 @@
 //
 //   gather   index, weights, derivatives [, their changes], nodes      ->  a, a_b
 //   scatter  index, weights, derivatives [, their changes], given ...  ->  nodes
+//   average  index, weights, derivatives, least, given ...             ->  whole, means, memory to work in
 //   pull     index, weights, derivatives, nodes, given ...             ->  by weights, by derivatives
 //   resist   index, weights, derivatives, matrices, nodes              ->  nodes
-//   solve    index, weights, derivatives, matrices, mass, factor, free, weight, active, x, rhs, limits  ->  x, numbers
+//   solve    index, weights, derivatives, matrices, mass, factor, free, weight, active, x, rhs, limits  ->  x, numbers,
+//                                                                         memory to work in (of a batch none)
 //
 // Factors are (..., d, s, p), values (..., c, p) and gradients (..., d, c, p), nodes (..., n, c), matrices
 // (..., d² (d² + 1) / 2, p), with the same leading axes everywhere. Given are a value or gradients or both; gradients may
@@ -77,6 +79,24 @@ struct ScatterOf {
   }
 };
 
+struct AverageOf {
+  template <class T>
+  bool run(const Pool& pool, Call& call) const {
+    Average<T> task = {};
+    task.stencils = call.stencils<T>(false);
+    task.least = call.at<T>(3, {});
+    task.size = call.dim(call.operands, 1);
+    task.columns = call.dim(4, 2);
+    task.given = call.given<T>(4, true, task.columns);
+    task.whole = call.at<T>(call.operands, {task.size});
+    task.means = call.at<T>(call.operands + 1, {task.size, task.columns - 1});
+    task.sums = call.at<T>(call.operands + 2, {task.size, task.columns});
+    call.expect(call.buffers.size() == call.operands + 3, "too many or too few results");
+    if (!call.fault.empty()) return true;
+    return average(pool, {int(call.d), int(call.s), false}, call.batch, task);
+  }
+};
+
 struct PullOf {
   bool valued;
 
@@ -130,12 +150,15 @@ struct SolveOf {
     of.free = call.booleans(6, {size});
     of.weight = call.at<T>(7, {size});
     of.active = call.booleans(8, {(size + kTogether - 1) / kTogether});
-    of.start = call.at<T>(9, {size});
+    task.start = call.at<T>(9, {size});
     task.rhs = call.at<T>(10, {size});
     task.limits = call.at<T>(11, {kTolerances});
     of.x = call.at<T>(12, {size});
     task.numbers = call.at<T>(13, {kOutcome});
-    call.expect(call.operands == 12 && call.buffers.size() == 14, "too many or too few arrays");
+    const int64_t memory = call.leading.empty() ? kVectors * size : 0;
+    T* const given = call.at<T>(14, {memory});
+    task.memory = memory > 0 ? given : nullptr;
+    call.expect(call.operands == 12 && call.buffers.size() == 15, "too many or too few arrays");
     call.expect(nodes > 0 || call.particles == 0, "no nodes to gather from");
     if (!call.fault.empty()) return true;
     return solve(pool, {int(call.d), int(call.s), false}, call.batch, task);
@@ -163,6 +186,10 @@ ffi::Error run_gather(ffi::ThreadPool threads, bool differential, ffi::Remaining
 ffi::Error run_scatter(ffi::ThreadPool threads, bool differential, bool valued, ffi::RemainingArgs arguments,
                        ffi::RemainingRets results) {
   return run(ScatterOf{differential, valued}, threads, arguments, results);
+}
+
+ffi::Error run_average(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  return run(AverageOf{}, threads, arguments, results);
 }
 
 ffi::Error run_pull(ffi::ThreadPool threads, bool valued, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
@@ -200,6 +227,8 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_scatter, mpmjax::run_scatter,
                                   .Attr<bool>("valued")
                                   .RemainingArgs()
                                   .RemainingRets());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_average, mpmjax::run_average,
+                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_pull, mpmjax::run_pull,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<bool>("valued").RemainingArgs().RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_resist, mpmjax::run_resist,

@@ -1,13 +1,13 @@
 // The sums for every dimension and kernel, and the passes over arrays, compiled once for each instruction set:
 // MPMJAX_TARGET is its name.
 
+#include "average.h"
 #include "eigen.h"
 #include "gather.h"
 #include "passes.h"
 #include "pull.h"
 #include "resist.h"
 #include "rotation.h"
-#include "scatter.h"
 #include "targets.h"
 
 namespace {
@@ -16,9 +16,10 @@ using mpmjax::Kernels;
 
 template <class T, int d, int s>
 const Kernels<T>* of(bool differential) {
-  static constexpr Kernels<T> sums = {gather<T, d, s, false>, scatter<T, d, s, false>, find_ranges<T, d, s>,
-                                      pull<T, d, s>,          resist<T, d, s>,         resist_particles<T, d, s>};
-  static constexpr Kernels<T> differentials = {gather<T, d, s, true>, scatter<T, d, s, true>, find_ranges<T, d, s>,
+  static constexpr Kernels<T> sums = {gather<T, d, s, false>, scatter<T, d, s, false>, average<T, d, s>,
+                                      find_ranges<T, d, s>,   pull<T, d, s>,           resist<T, d, s>,
+                                      resist_particles<T, d, s>};
+  static constexpr Kernels<T> differentials = {gather<T, d, s, true>, scatter<T, d, s, true>, nullptr, find_ranges<T, d, s>,
                                                nullptr,               nullptr,                nullptr};
   return differential ? &differentials : &sums;
 }

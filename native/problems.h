@@ -5,6 +5,7 @@
 //
 //   scatter  f_i  = Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b)
 //   gather   a_p  = Σ_i w_ip f_i,   a_p,b = Σ_i g_ip,b f_i
+//   average  m_i, the last column of a scatter, and the others divided by it
 //   pull     ∂B/∂factors,   B = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b)
 //   resist   the scatter of K_p times the gather's gradients, with a symmetric matrix K_p for each particle
 //
@@ -20,6 +21,7 @@ namespace mpmjax {
 constexpr int kMostAxes = 3;
 constexpr int kBlock = 16;  // particles that are handled together
 constexpr int64_t kTogether = 64;  // numbers of the nodes that are passed over together
+constexpr int64_t kCached = 1 << 21;  // bytes of an array that a cache may hold from one pass to the next
 
 template <class T>
 struct Stencils {
@@ -63,9 +65,25 @@ struct Scatter {
   Given<T> given;
   T* nodes;             // (n, c)
   const Range* ranges;  // of each block, or null
+  bool* reached;        // false, for each of the ⌈n/64⌉ blocks of nodes; or null, where it does not matter
   int64_t size;
   int64_t columns;
   const bool* wanted;  // which of the nodes' ⌈n c/64⌉ blocks are, null for all; others may become anything
+};
+
+// Where the last column is not more than the least, all are zero.
+template <class T>
+struct Average {
+  Stencils<T> stencils;
+  Given<T> given;
+  const T* least;
+  T* whole;             // the last column, (n)
+  T* means;             // the others divided by it, (n, c − 1)
+  T* sums;              // memory to work in, (n, c)
+  const Range* ranges;  // of each block
+  bool* reached;        // false, for each of the ⌈n/64⌉ blocks of nodes
+  int64_t size;
+  int64_t columns;  // c
 };
 
 template <class T>
@@ -94,13 +112,13 @@ struct Resist {
   const bool* wanted;  // as in a scatter
 };
 
-// The sums for one dimension and kernel. Gather and pull take particles from a first to a last. Scatter and resist take
-// all particles, and set the nodes from a first to a last; they pass over blocks whose range of indices says that they
+// The sums for one dimension and kernel. Gather and pull take particles from a first to a last. Others take all particles, and set the nodes from a first to a last; they pass over blocks whose range of indices says that they
 // give nothing to these. `resist_particles` stores what the particles from a first to a last give.
 template <class T>
 struct Kernels {
   void (*gather)(const Gather<T>&, int64_t first, int64_t last);
   void (*scatter)(const Scatter<T>&, int64_t first, int64_t last);
+  void (*average)(const Average<T>&, int64_t first, int64_t last);
   void (*find_ranges)(const Stencils<T>&, int64_t first_block, int64_t last_block, Range* ranges);
   void (*pull)(const Pull<T>&, int64_t first, int64_t last);
   void (*resist)(const Resist<T>&, int64_t first, int64_t last);

@@ -1,7 +1,6 @@
 #include "recurrence.h"
 
 #include <cmath>
-#include <cstring>
 #include <limits>
 
 #include "active.h"
@@ -13,11 +12,8 @@ namespace {
 template <class T>
 bool run(const Pool& pool, Form form, const Recurrence<T>& task) {
   const int64_t size = task.nodes * task.columns;
-  // What is not active stays zero, but in the image, where it is never read.
-  const Vectors<T> memory = zeros<T>(5 * size);
-  T *const r = memory.get(), *const p = r + size, *const q = p + size, *const moved = q + size, *const image = moved + size;
-  over_active(task.active, size, [&](int64_t i) { r[i] = task.residual[i]; });
-  if (task.x != task.start) std::memcpy(task.x, task.start, static_cast<size_t>(size) * sizeof(T));
+  T *const r = task.r, *const p = task.p, *const q = task.q, *const moved = task.moved, *const image = task.image;
+  over_active(task.active, size, [&](int64_t i) { p[i] = q[i] = 0; });
   Resist<T> resistance = {};
   resistance.stencils = task.stencils;
   resistance.matrices = task.matrices;

@@ -22,9 +22,9 @@ struct Recurrence {
   const bool* free;   // (n, d), as all vectors
   const T* weight;    // W
   const bool* active;  // (⌈n d/64⌉), as in vectors.h
-  const T *start, *residual;
   const T* limits;  // tolerance of ‖r‖, floor of ‖r‖², most steps, ‖r‖² at the start
-  T* x;
+  T *x, *r;           // where it starts, and where it ends
+  T *p, *q, *moved, *image;  // memory to work in; zero in `moved` wherever nothing is active
   T* numbers;  // ‖r‖², steps, largest |rᵀA r|/‖r‖², whether rᵀA r vanished, whether it was negative
   int64_t nodes, columns;
 };

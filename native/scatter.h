@@ -5,27 +5,11 @@
 
 #pragma once
 
-#include "block.h"
+#include "reach.h"
 
 namespace {
 
-using mpmjax::Range;
 using mpmjax::Scatter;
-using mpmjax::kTogether;
-
-// Numbers from a first to a last one become zero, or of these only the blocks that are wanted.
-template <class T>
-void clear(T* numbers, const bool* wanted, int64_t first, int64_t last) {
-  if (wanted == nullptr) {
-    std::memset(numbers + first, 0, static_cast<size_t>(last - first) * sizeof(T));
-    return;
-  }
-  for (int64_t end, i = first; i < last; i = end) {
-    end = (i / kTogether + 1) * kTogether;
-    end = end < last ? end : last;
-    if (wanted[i / kTogether]) std::memset(numbers + i, 0, static_cast<size_t>(end - i) * sizeof(T));
-  }
-}
 
 // Columns of the nodes from a first to a last one: all columns, or where `columns` is 0 up to four.
 template <class T, int s, int columns>
@@ -58,9 +42,10 @@ struct NodeSums {
   // Adds to the row whose index along the axes before the last adds up to `first`.
   template <bool inside, class B>
   MPMJAX_INLINE void add(const B& block, int q, int32_t first, const R& row) const {
-    constexpr int last = B::axes - 1;
-    if constexpr (inside) {
-      T* to = nodes + after(first, block.index[last][0][q]) * stride();
+    constexpr int axis = B::axes - 1;
+    const int32_t node = after(first, block.index[axis][0][q]);
+    if (inside || (block.straight[q] && holds_row(node))) {
+      T* to = nodes + node * stride();
       const R added = present.of(row);
       // All is read before anything is written: a part's last lanes may be the next one's first, which writes them last.
       const R sums = row_of<R>([&](int k) MPMJAX_INLINE_LAMBDA {
@@ -73,9 +58,14 @@ struct NodeSums {
       });
     } else {
       int32_t index[s];
-      for (int i = 0; i < s; ++i) index[i] = after(first, block.index[last][i][q]);
+      for (int i = 0; i < s; ++i) index[i] = after(first, block.index[axis][i][q]);
       add_apart(index, row);
     }
+  }
+
+  // The same of the row of nodes that follow one another from this one on.
+  MPMJAX_INLINE bool holds_row(int64_t node) const {
+    return node >= first && node + s <= last && node * stride() + R::reach(stride()) <= extent;
   }
 
   // Adds to any nodes, of which those beyond the range are passed over.
@@ -209,7 +199,7 @@ MPMJAX_INLINE void add_blocks(const Stencils<T>& stencils, const Range* ranges, 
   }
 }
 
-// All columns, or where `columns` is 0 up to four from a first one, of a range of nodes that is zero at first.
+// Adds to a range of nodes all columns, or where `columns` is 0 up to four from a first one.
 template <class T, int d, int s, bool differential, bool graded, int columns>
 void scatter_columns(const Scatter<T>& task, int64_t column, int64_t first, int64_t last) {
   const int64_t particles = task.stencils.particles;
@@ -220,10 +210,10 @@ void scatter_columns(const Scatter<T>& task, int64_t column, int64_t first, int6
   add_blocks<T, d, s, differential, graded, columns>(task.stencils, task.ranges, nodes, give);
 }
 
+// Adds to a range of nodes.
 template <class T, int d, int s, bool differential, bool graded>
 void scatter_given(const Scatter<T>& task, int64_t first, int64_t last) {
   const int64_t columns = task.columns;
-  clear(task.nodes, task.wanted, first * columns, last * columns);
   if constexpr (graded && !differential) {
     switch (columns) {
       case 1: return scatter_columns<T, d, s, false, true, 1>(task, 0, first, last);
@@ -238,12 +228,30 @@ void scatter_given(const Scatter<T>& task, int64_t first, int64_t last) {
 }
 
 template <class T, int d, int s, bool differential>
-void scatter(const Scatter<T>& task, int64_t first, int64_t last) {
+void add_all(const Scatter<T>& task, int64_t first, int64_t last) {
   if (task.given.gradients == nullptr) {
     scatter_given<T, d, s, differential, false>(task, first, last);
   } else {
     scatter_given<T, d, s, differential, true>(task, first, last);
   }
+}
+
+template <class T, int d, int s, bool differential>
+void scatter(const Scatter<T>& task, int64_t first, int64_t last) {
+  const int64_t columns = task.columns;
+  if (task.reached == nullptr) {
+    clear(task.nodes, task.wanted, first * columns, last * columns);
+  } else {
+    mark<T, d, s>(task.stencils, task.ranges, task.reached, first, last);
+    over_alike(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
+      if (reached) {
+        clear(task.nodes, nullptr, from * columns, to * columns);
+      } else {
+        wipe(task.nodes, task.size * columns, from * columns, to * columns);
+      }
+    });
+  }
+  add_all<T, d, s, differential>(task, first, last);
 }
 
 }  // namespace

@@ -7,6 +7,7 @@
 
 #include "active.h"
 #include "vectors.h"
+#include "wipe.h"
 
 namespace mpmjax {
 namespace {
@@ -17,25 +18,23 @@ class OneThread : public Pool {
   void schedule(std::function<void()> task) const override { task(); }
 };
 
-// What a solve needs beside its recurrence. What is not active stays zero, but in the image, where it is never read.
+// The products and norms of a solve. What is not active is never read, but of what the resistance moves.
 template <class T>
 struct Space {
   const Pool& pool;
   const Recurrence<T>& of;
   int64_t size = of.nodes * of.columns;
-  Vectors<T> memory = zeros<T>(2 * size);
-  T *moved = memory.get(), *image = moved + size;
 
   // W⁻¹A x into the image; false where there is no kernel of this form.
-  bool apply(Form form, const T* x) {
-    over_active(of.active, size, [&](int64_t i) { moved[i] = of.free[i] ? x[i] : T(0); });
+  bool apply(Form form) const {
+    over_active(of.active, size, [&](int64_t i) { of.moved[i] = of.free[i] ? of.x[i] : T(0); });
     Resist<T> force = {};
-    force.stencils = of.stencils, force.matrices = of.matrices, force.moved = moved, force.nodes = image;
+    force.stencils = of.stencils, force.matrices = of.matrices, force.moved = of.moved, force.nodes = of.image;
     force.size = of.nodes, force.columns = of.columns, force.wanted = of.active;
     if (!resist(pool, form, 1, force)) return false;
     T square;
-    product(pool, 1, Product<T>{image, x, of.mass, of.factor, of.free, of.weight, of.active, image, &square, size, of.nodes,
-                                false});
+    product(pool, 1, Product<T>{of.image, of.x, of.mass, of.factor, of.free, of.weight, of.active, of.image, &square, size,
+                                of.nodes, false});
     return true;
   }
 
@@ -60,19 +59,22 @@ struct Space {
 template <class T>
 bool run(const Pool& pool, Form form, const Solve<T>& task) {
   Recurrence<T> pass = task.recurrence;
-  Space<T> space{pool, task.recurrence};
+  const Space<T> space{pool, pass};
   const int64_t size = space.size;
-  const Vectors<T> memory = zeros<T>(2 * size);
-  T *const x = pass.x, *const r = memory.get(), *const last = r + size;
-  if (x != pass.start) std::memcpy(x, pass.start, static_cast<size_t>(size) * sizeof(T));
+  const std::unique_ptr<T[]> own(task.memory == nullptr ? new T[kVectors * size] : nullptr);
+  T* const memory = task.memory == nullptr ? own.get() : task.memory;
+  T *const x = pass.x, *const r = memory, *const last = r + size;
+  pass.r = r, pass.p = last + size, pass.q = pass.p + size, pass.moved = pass.q + size, pass.image = pass.moved + size;
+  wipe(pass.moved, size, 0, size);
+  if (x != task.start) std::memcpy(x, task.start, static_cast<size_t>(size) * sizeof(T));
   const T b = space.norm(task.rhs), most = task.limits[1];
   T limits[kLimits] = {task.limits[0] * b, 0, 0, 0}, numbers[kNumbers] = {};
   T rr, before = std::numeric_limits<T>::infinity(), change = before, steps = 0, radius = 0;
   bool vanished = false, negative = false, stalled = false;
-  pass.start = x, pass.residual = r, pass.limits = limits, pass.numbers = numbers;
+  pass.limits = limits, pass.numbers = numbers;
   while (true) {
-    if (!space.apply(form, x)) return false;
-    rr = space.square([&](int64_t i) { return task.rhs[i] - space.image[i]; }, [&](int64_t i, T v) { r[i] = v; });
+    if (!space.apply(form)) return false;
+    rr = space.square([&](int64_t i) { return task.rhs[i] - pass.image[i]; }, [&](int64_t i, T v) { r[i] = v; });
     stalled = rr > before / 4, before = rr;
     if (stalled || vanished || !(std::sqrt(rr) > limits[0]) || !(steps < most)) break;
     limits[1] = task.limits[2] * rr, limits[2] = most - steps, limits[3] = rr;
@@ -98,10 +100,11 @@ Solve<T> member(Solve<T> all, Form form, int64_t i) {
   of.matrices += i * form.d * form.d * (form.d * form.d + 1) / 2 * particles;
   of.mass += i * of.nodes;
   of.factor += i;
-  of.free += vectors, of.weight += vectors, of.start += vectors, of.x += vectors, all.rhs += vectors;
+  of.free += vectors, of.weight += vectors, of.x += vectors, all.start += vectors, all.rhs += vectors;
   of.active += i * ((size + kTogether - 1) / kTogether);
   all.limits += i * kTolerances;
   all.numbers += i * kOutcome;
+  if (all.memory != nullptr) all.memory += i * kVectors * size;
   return all;
 }
 

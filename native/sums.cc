@@ -4,6 +4,7 @@
 #include <memory>
 #include <vector>
 
+#include "active.h"
 #include "targets.h"
 
 namespace mpmjax {
@@ -28,9 +29,11 @@ int64_t shares(const Pool& pool, Form form, int64_t batch, int64_t particles, in
   return std::max<int64_t>(1, std::min(visits / kLeastVisits, most));
 }
 
+int64_t blocks_of(int64_t numbers) { return (numbers + kTogether - 1) / kTogether; }
+
 // The blocks of nodes that are wanted of the i-th member.
 const bool* member(const bool* wanted, int64_t i, int64_t numbers) {
-  return wanted == nullptr ? nullptr : wanted + i * ((numbers + kTogether - 1) / kTogether);
+  return wanted == nullptr ? nullptr : wanted + i * blocks_of(numbers);
 }
 
 template <class T>
@@ -68,6 +71,19 @@ Scatter<T> member(Scatter<T> all, Form form, int64_t i) {
   all.nodes += i * all.size * all.columns;
   all.given = member(all.given, form, i, all.columns, all.stencils.particles);
   all.wanted = member(all.wanted, i, all.size * all.columns);
+  if (all.reached != nullptr) all.reached += i * blocks_of(all.size);
+  return all;
+}
+
+template <class T>
+Average<T> member(Average<T> all, Form form, int64_t i) {
+  all.stencils = member(all.stencils, form, i);
+  all.given = member(all.given, form, i, all.columns, all.stencils.particles);
+  all.least += i;
+  all.whole += i * all.size;
+  all.means += i * all.size * (all.columns - 1);
+  all.sums += i * all.size * all.columns;
+  all.reached += i * blocks_of(all.size);
   return all;
 }
 
@@ -106,7 +122,7 @@ void over_particles(const Pool& pool, Form form, int64_t batch, const Problem& a
 }
 
 // Where the nodes are cut into parts with about as many particles each, by a sample: the k-th part goes from the k-th
-// number to the next. How well they are chosen changes seconds, never sums.
+// number to the next. None cuts a block of kTogether nodes. How well they are chosen changes seconds, never sums.
 template <class T>
 std::vector<int64_t> cut(const Stencils<T>& stencils, int64_t size, Form form, int64_t parts) {
   const int64_t particles = stencils.particles, samples = std::min(kSamples, particles);
@@ -122,14 +138,14 @@ std::vector<int64_t> cut(const Stencils<T>& stencils, int64_t size, Form form, i
   std::vector<int64_t> found = {0};
   for (int64_t k = 1; k < parts; ++k) {
     const int64_t place = places.empty() ? 0 : places[k * places.size() / parts];
-    found.push_back(std::max(found.back(), place));
+    found.push_back(std::max(found.back(), place / kTogether * kTogether));
   }
   found.push_back(size);
   return found;
 }
 
 // The nodes of each member cut into parts, one for each thread, and the ranges of nodes that its blocks of particles
-// reach, of which there are none where there is one part.
+// reach. Where there is one part there are none, unless they are `wanted`.
 struct Division {
   int64_t parts, blocks;
   std::vector<Range> ranges;
@@ -142,7 +158,7 @@ struct Division {
       const std::vector<int64_t>& own = cuts[i / parts];
       const int64_t first = own[i % parts], last = own[i % parts + 1];
       Problem task = member(all, form, i / parts);
-      task.ranges = parts > 1 ? ranges.data() + i / parts * blocks : nullptr;
+      task.ranges = ranges.empty() ? nullptr : ranges.data() + i / parts * blocks;
       if (first < last) run(task, first, last);
     });
   }
@@ -161,12 +177,13 @@ struct Division {
 };
 
 template <class T, class Problem>
-Division divide(const Pool& pool, Form form, int64_t batch, const Problem& all, const Kernels<T>& kernels) {
+Division divide(const Pool& pool, Form form, int64_t batch, const Problem& all, const Kernels<T>& kernels,
+                bool wanted = false) {
   const int64_t particles = all.stencils.particles, blocks = (particles + kBlock - 1) / kBlock;
   Division found = {shares(pool, form, batch, particles, all.columns, 1), blocks, {}, {}};
   const int64_t parts = found.parts, each = (blocks + parts - 1) / parts;
   found.cuts.assign(batch, {0, all.size});
-  if (parts == 1) return found;
+  if (parts == 1 && !wanted) return found;
   found.ranges.resize(batch * blocks);
   share(pool, batch * parts, [&](int64_t i) {
     const int64_t k = i / parts, first = i % parts * each, last = std::min(blocks, first + each);
@@ -197,7 +214,22 @@ template <class T>
 bool scatter_all(const Pool& pool, Form form, int64_t batch, const Scatter<T>& all) {
   const Kernels<T>* found = kernels(T(), form.d, form.s, form.differential);
   if (found == nullptr) return false;
-  divide(pool, form, batch, all, *found).over_nodes(pool, form, batch, all, found->scatter);
+  const bool large = all.size * all.columns * static_cast<int64_t>(sizeof(T)) > kCached && all.wanted == nullptr;
+  const Vectors<bool> reached = large ? zeros<bool>(batch * blocks_of(all.size)) : nullptr;
+  Scatter<T> task = all;
+  task.reached = reached.get();
+  divide(pool, form, batch, task, *found, large).over_nodes(pool, form, batch, task, found->scatter);
+  return true;
+}
+
+template <class T>
+bool average_all(const Pool& pool, Form form, int64_t batch, const Average<T>& all) {
+  const Kernels<T>* found = kernels(T(), form.d, form.s, false);
+  if (found == nullptr) return false;
+  const Vectors<bool> reached = zeros<bool>(batch * blocks_of(all.size));
+  Average<T> task = all;
+  task.reached = reached.get();
+  divide(pool, form, batch, task, *found, true).over_nodes(pool, form, batch, task, found->average);
   return true;
 }
 
@@ -215,7 +247,7 @@ bool resist_all(const Pool& pool, Form form, int64_t batch, const Resist<T>& all
   Resist<T> first = all;
   first.gradients = stored.get();
   const Given<T> given = {nullptr, stored.get(), all.columns};
-  const Scatter<T> rest = {all.stencils, given, all.nodes, nullptr, all.size, all.columns, all.wanted};
+  const Scatter<T> rest = {all.stencils, given, all.nodes, nullptr, nullptr, all.size, all.columns, all.wanted};
   over_particles(pool, form, batch, first, found->resist_particles);
   division.over_nodes(pool, form, batch, rest, found->scatter);
   return true;
@@ -227,6 +259,8 @@ bool gather(const Pool& p, Form f, int64_t b, const Gather<float>& g) { return g
 bool gather(const Pool& p, Form f, int64_t b, const Gather<double>& g) { return gather_all(p, f, b, g); }
 bool scatter(const Pool& p, Form f, int64_t b, const Scatter<float>& s) { return scatter_all(p, f, b, s); }
 bool scatter(const Pool& p, Form f, int64_t b, const Scatter<double>& s) { return scatter_all(p, f, b, s); }
+bool average(const Pool& p, Form f, int64_t b, const Average<float>& a) { return average_all(p, f, b, a); }
+bool average(const Pool& p, Form f, int64_t b, const Average<double>& a) { return average_all(p, f, b, a); }
 bool pull(const Pool& p, Form f, int64_t b, const Pull<float>& q) { return pull_all(p, f, b, q); }
 bool pull(const Pool& p, Form f, int64_t b, const Pull<double>& q) { return pull_all(p, f, b, q); }
 bool resist(const Pool& p, Form f, int64_t b, const Resist<float>& r) { return resist_all(p, f, b, r); }

@@ -19,6 +19,8 @@ bool gather(const Pool& pool, Form form, int64_t batch, const Gather<float>& fir
 bool gather(const Pool& pool, Form form, int64_t batch, const Gather<double>& first);
 bool scatter(const Pool& pool, Form form, int64_t batch, const Scatter<float>& first);
 bool scatter(const Pool& pool, Form form, int64_t batch, const Scatter<double>& first);
+bool average(const Pool& pool, Form form, int64_t batch, const Average<float>& first);
+bool average(const Pool& pool, Form form, int64_t batch, const Average<double>& first);
 bool pull(const Pool& pool, Form form, int64_t batch, const Pull<float>& first);
 bool pull(const Pool& pool, Form form, int64_t batch, const Pull<double>& first);
 bool resist(const Pool& pool, Form form, int64_t batch, const Resist<float>& first);

@@ -22,7 +22,8 @@ from mpmjax.stepping._nodes import Nodes
 from mpmjax.stepping._step import step_unchecked
 
 LAW = mpm.NeoHookean(1e5, 0.3)
-COUNTED = ("stencil_scatter", "stencil_gather", "stencil_resist", "while", "floor", "exp", "log", "rem")
+SUMS = ("stencil_scatter", "stencil_average", "stencil_gather", "stencil_resist")
+COUNTED = (*SUMS, "while", "floor", "exp", "log", "rem")
 
 
 def program(method=mpm.Explicit(), *, d=2, nodes=12, material=LAW, periodic=False, **scene):
@@ -96,8 +97,9 @@ def compiled(method=mpm.Explicit(), **scene):
 
 
 def crossings(found):
-    """Sums to the nodes, and from them; a resistance is one of each."""
-    return tuple(found[name] + found["stencil_resist"] for name in ("stencil_scatter", "stencil_gather"))
+    """Sums to the nodes, and from them; an average is one of the first, a resistance one of each."""
+    to_nodes = found["stencil_scatter"] + found["stencil_average"] + found["stencil_resist"]
+    return to_nodes, found["stencil_gather"] + found["stencil_resist"]
 
 
 @pytest.mark.parametrize("d", [2, *thorough(1, 3)])

@@ -13,7 +13,7 @@ from helpers import NEEDS_LIBRARY, assert_close, block, thorough
 
 import mpmjax as mpm
 from mpmjax import linalg as la
-from mpmjax.discretisation import _resistance
+from mpmjax.discretisation import _average, _resistance
 from mpmjax.discretisation import _transfer_sums as sums
 from mpmjax.implicit import _recurrence, _restarts, _vectors
 from mpmjax.native import _library
@@ -59,7 +59,7 @@ def resisted_in_parts(index, w, g, upper, u):
     d = len(index)
     slopes = sums._gather(index, w, g, u, unroll=False)[1].reshape(d * d, -1)
     flux = jnp.einsum("ijp,jp->ip", la.symmetric(upper), slopes).reshape(d, d, -1)
-    return sums._scatter(index, w, g, flux, valued=False, size=len(u), unroll=False)[0]
+    return sums.written_scatter(index, w, g, flux, valued=False, size=len(u), unroll=False)[0]
 
 
 def parts_of(given, valued, graded):
@@ -84,7 +84,7 @@ def written(index, w, g, given, nodes, valued=True, graded=True):
     parts = parts_of(given, valued, graded)
     return (
         sums._gather(index, w, g, nodes, unroll=False),
-        sums._scatter(index, w, g, *parts, valued=valued, size=nodes.shape[0], unroll=False),
+        sums.written_scatter(index, w, g, *parts, valued=valued, size=nodes.shape[0], unroll=False),
         sums._pull(index, w, g, nodes, *parts, valued=valued, unroll=False),
     )
 
@@ -137,6 +137,61 @@ def test_derivatives_agree(d, graded):
 
     native_, written_ = (partial(of, graded=graded) for of in (native, written))
     agree(derivatives(native_), derivatives(written_), "float64", 500)  # slopes along all at once are sums that cancel
+
+
+def averaged(of, index, w, g, given, gradients, k=2):
+    """Whole weights and averages of k columns, of positive numbers: some nodes are light, and some are empty."""
+    positive = index, jnp.abs(w), g, jnp.asarray(0.3, w.dtype), jnp.abs(given[: k + 1])
+    parts = positive if gradients is None else (*positive, gradients[:, :k])
+    return of(*parts, size=2 * SIDE ** len(index))
+
+
+averaged_by_library = partial(averaged, partial(_average._average_p.bind, batched=0))
+averaged_as_written = partial(averaged, partial(_average._average, unroll=False))
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize("dtype", ["float32", *thorough("float64")])
+@pytest.mark.parametrize(("d", "k"), [(2, 2), *thorough((1, 1), (2, 4), (3, 3))])
+def test_averages_agree(d, k, dtype, choose):
+    """With gradients and without, with nodes that are empty, indices beyond the window, for no particle, in a batch."""
+    choose("native")
+    library, plain = (jax.jit(partial(of, k=k)) for of in (averaged_by_library, averaged_as_written))
+    for p in (45, 1, 0):
+        index, w, g, given, _ = problem(d, 3, k + 1, p, dtype)
+        for gradients in (given[1:], None):
+            found = library(index, w, g, given[0], gradients)
+            agree(found, plain(index, w, g, given[0], gradients), dtype)
+            assert (found[0] == 0).any()
+    pair = [problem(d, 3, k + 1, 45, dtype, seed=seed) for seed in (0, 1)]
+    each = [(index, w, g, given[0], given[1:]) for index, w, g, given, _ in pair]
+    together = jax.jit(jax.vmap(partial(averaged_by_library, k=k)))(*map(jnp.stack, zip(*each, strict=True)))
+    jax.tree.map(
+        lambda a, *b: np.testing.assert_array_equal(a, jnp.stack(b)), together, *(library(*one) for one in each)
+    )
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize("gradients", [True, *thorough(False)])
+def test_derivatives_of_averages_agree(gradients, choose):
+    """First in both modes and second, by everything, and of a batch."""
+    choose("native")
+    index, w, g, given, _ = problem(2, 3, 3, 45, "float64", wild=False)
+    floats = w, g, given[0], given[1:] if gradients else None
+    along = jax.tree.map(lambda a: jnp.sin(jnp.arange(a.size, dtype=a.dtype)).reshape(a.shape), floats)
+
+    def derivatives(of):
+        def loss(floats):
+            return sum((jnp.cos(jnp.arange(a.size)).reshape(a.shape) * a**2).sum() for a in of(index, *floats))
+
+        def slope(f):
+            return lambda floats: jax.jvp(f, (floats,), (along,))[1]
+
+        every = slope(loss), jax.grad(loss), slope(slope(loss)), slope(jax.grad(loss)), jax.grad(slope(loss))
+        both = jax.tree.map(lambda a: jnp.stack([a, 1.5 * a]), floats)
+        return jax.jit(lambda a: [f(a) for f in every])(floats), jax.jit(jax.vmap(jax.grad(loss)))(both)
+
+    agree(derivatives(averaged_by_library), derivatives(averaged_as_written), "float64", 500)
 
 
 @NEEDS_LIBRARY

@@ -7,6 +7,7 @@ no derivative; normals and velocities have, with respect to the motion and the s
 rules of `combine` apply.
 """
 
+from dataclasses import replace
 from typing import ClassVar
 
 import equinox as eqx
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
-from mpmjax.boundary._conditions import ColliderConditions, Conditions
+from mpmjax.boundary._conditions import ColliderConditions, Conditions, no_conditions
 from mpmjax.boundary._surface_contact import Surface, refuse_contact
 from mpmjax.checks import canonical, require, require_between, require_fields
 from mpmjax.discretisation import Grid
@@ -103,7 +104,8 @@ class StickyCollider(AbstractCollider):
         fixed = jnp.broadcast_to(inside, nodes.shape)
         holder = jnp.where(fixed, 0, -1).astype(jnp.int32)
         touched = eqx.tree_at(lambda c: c.holder, body.nothing_held(), holder)
-        return Conditions(fixed, jnp.where(fixed, body.velocity, 0), colliders=touched)
+        velocity = jnp.where(fixed, body.velocity, 0)
+        return Conditions(fixed, velocity, touched, moves=self.motion is not None)
 
 
 class SlipCollider(AbstractCollider):
@@ -137,7 +139,7 @@ class SlipCollider(AbstractCollider):
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v·n = v_c·n."""
         touched = _Body(self, nodes, t, dt, reference).conditions(spacing)
-        return Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes), colliders=touched)
+        return replace(no_conditions(nodes), colliders=touched, holds=True, moves=self.motion is not None)
 
 
 class SeparatingCollider(AbstractCollider):
@@ -170,11 +172,8 @@ class SeparatingCollider(AbstractCollider):
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """None on nodes: it acts on faces. Its pivot, for torques."""
-        return Conditions(
-            jnp.zeros(nodes.shape, bool),
-            jnp.zeros_like(nodes),
-            colliders=_Body(self, nodes, t, dt, reference).nothing_held(),
-        )
+        touched = _Body(self, nodes, t, dt, reference).nothing_held()
+        return replace(no_conditions(nodes), colliders=touched, holds=True, moves=self.motion is not None)
 
     def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, force_time: Scalar) -> tuple[Surface, ...]:
         """That of the body; none where the distance has no slope, as a sampled one may have none."""

@@ -1,11 +1,13 @@
 """What the boundaries of a scene ask of the nodes together: conditions, contacts, mirrors."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Int, NodeVector, Scalar
 from mpmjax.boundary._boundary import AbstractBoundary
-from mpmjax.boundary._conditions import Conditions
+from mpmjax.boundary._conditions import Conditions, no_conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._faces import Faces
 from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion, Tie
@@ -28,7 +30,7 @@ def combined_conditions(
     them, a collider's normal component: both hold (see `Nodes.free_normal`). A normal that lies within a hundredth of
     the prescribed components asks for nothing more. Of two colliders' normals the earlier one holds.
     """
-    total = Conditions(jnp.zeros(nodes.shape, dtype=bool), jnp.zeros_like(nodes))
+    total = no_conditions(nodes)
     for boundary in boundaries:
         new = boundary.conditions(nodes, spacing, t, dt, reference=reference)
         velocity = jnp.where(total.fixed, total.velocity, new.velocity)
@@ -37,10 +39,11 @@ def combined_conditions(
             holder = jnp.where(total.fixed, -1, new.colliders.holder)
             mine = eqx.tree_at(lambda c: c.holder, new.colliders, holder)
             colliders = mine if colliders is None else colliders.beside(mine)
-        total = Conditions(total.fixed | new.fixed, velocity, colliders)
+        either = total.holds or new.holds, total.moves or new.moves
+        total = Conditions(total.fixed | new.fixed, velocity, colliders, *either)
     for boundary in boundaries:
         fixed, velocity = boundary.spread(total.fixed, total.velocity, nodes, spacing)
-        total = Conditions(fixed, velocity, total.colliders)
+        total = replace(total, fixed=fixed, velocity=velocity)
     return total
 
 

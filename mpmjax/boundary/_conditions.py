@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeVector, Scalar
+from mpmjax.geometry import Motion
 
 
 class ColliderConditions(eqx.Module):
@@ -65,3 +66,19 @@ class Conditions(eqx.Module):
     """Their values [m/s], shape (n, d); zero elsewhere."""
     colliders: ColliderConditions | None = None
     """Conditions of colliders; None without any."""
+    holds: bool = eqx.field(static=True, default=True)
+    """Whether any component may be held. What is known here costs a step nothing where the answer is no."""
+    moves: bool = eqx.field(static=True, default=True)
+    """Whether one may be held at another velocity than zero, by a collider too."""
+
+
+def no_conditions(nodes: NodeVector) -> Conditions:
+    """No condition on these nodes, shape (n, d)."""
+    return Conditions(jnp.zeros(nodes.shape, dtype=bool), jnp.zeros_like(nodes), holds=False, moves=False)
+
+
+def held_by_wall(fixed: Mask, motion: Motion | None, nodes: NodeVector, t: Scalar, dt: Scalar) -> Conditions:
+    """Components that a wall holds, shape (n, d), at rest or at the velocity of its motion."""
+    if motion is None:
+        return Conditions(fixed, jnp.zeros_like(nodes), moves=False)
+    return Conditions(fixed, jnp.where(fixed, motion.velocity(t, dt), 0))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
-from mpmjax.boundary._conditions import Conditions
+from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._faces import Faces
 from mpmjax.boundary._mirror import Image, MirrorMotion, MirrorPlace, mirror_image
@@ -139,10 +139,8 @@ class SymmetryPlane(AbstractPlane):
         """v·n = V·n on the plane's own nodes."""
         at = self.position if reference or self.motion is None else self.position + self.displacement(t)
         on = jnp.abs(nodes[:, self.axis] - at) <= ON_THE_WALL * spacing
-        fixed, velocity = jnp.zeros(nodes.shape, dtype=bool).at[:, self.axis].set(on), jnp.zeros_like(nodes)
-        if self.motion is not None:
-            velocity = jnp.where(fixed, self.motion.velocity(t, dt), 0)
-        return Conditions(fixed, velocity)
+        fixed = jnp.zeros(nodes.shape, dtype=bool).at[:, self.axis].set(on)
+        return held_by_wall(fixed, self.motion, nodes, t, dt)
 
     def mirror(self) -> MirrorPlace:
         return MirrorPlace(self.axis, self.position, self.motion)
@@ -208,7 +206,7 @@ class ContactPlane(AbstractPlane):
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         del spacing, t, dt, reference
-        return Conditions(jnp.zeros(nodes.shape, dtype=bool), jnp.zeros_like(nodes))
+        return no_conditions(nodes)
 
     def check(self, grid: Grid, *, total: bool) -> None:
         AbstractPlane.check(self, grid, total=total)

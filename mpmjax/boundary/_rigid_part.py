@@ -56,7 +56,7 @@ class RigidPart(AbstractBoundary):
         """v = 0 in the directions in which it may not move."""
         del t, dt, reference
         guided = jnp.zeros(self.dim, bool) if self.free is None else ~jnp.asarray(self.free)
-        return Conditions(self.holds(nodes, spacing)[:, None] & guided, jnp.zeros_like(nodes))
+        return Conditions(self.holds(nodes, spacing)[:, None] & guided, jnp.zeros_like(nodes), moves=False)
 
     def spread(self, fixed: Mask, value: Array, nodes: NodeVector, spacing: Scalar) -> tuple[Mask, Array]:
         """A component that is prescribed at one of its nodes is so at all of them, as at the first."""

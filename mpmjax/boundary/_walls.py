@@ -6,9 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Bool, Corner, Float, Mask, NodeVector, ParticleVector, Scalar
+from mpmjax._types import Array, Bool, Corner, Float, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
-from mpmjax.boundary._conditions import Conditions
+from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
 from mpmjax.boundary._surface_contact import Surface, refuse_contact
 from mpmjax.checks import coordinates, require, require_between, require_fields, require_that
 from mpmjax.discretisation import Grid
@@ -108,7 +108,7 @@ class StickyBox(AbstractBox):
         place = nodes if reference or self.motion is None else nodes - self.displacement(t)
         held = (self.inward_normal(place, spacing) != 0).any(axis=1, keepdims=True)
         fixed = jnp.broadcast_to(held, nodes.shape)
-        return Conditions(fixed, _prescribed(fixed, self.motion, nodes, t, dt))
+        return held_by_wall(fixed, self.motion, nodes, t, dt)
 
 
 class SlipBox(AbstractBox):
@@ -139,7 +139,7 @@ class SlipBox(AbstractBox):
         """v·n = V·n."""
         place = nodes if reference or self.motion is None else nodes - self.displacement(t)
         fixed = self.inward_normal(place, spacing) != 0
-        return Conditions(fixed, _prescribed(fixed, self.motion, nodes, t, dt))
+        return held_by_wall(fixed, self.motion, nodes, t, dt)
 
 
 class SeparatingBox(AbstractBox):
@@ -173,7 +173,7 @@ class SeparatingBox(AbstractBox):
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """None: it acts on faces."""
         del spacing, t, dt, reference
-        return Conditions(jnp.zeros(nodes.shape, dtype=bool), jnp.zeros_like(nodes))
+        return no_conditions(nodes)
 
     def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, force_time: Scalar) -> tuple[Surface, ...]:
         """One an axis: the nearer of its two walls."""
@@ -207,8 +207,3 @@ def _check_motion(box: AbstractBox, motion: Motion | None) -> None:
         motion is None or motion.dim == box.dim,
         f"{type(box).__name__}'s motion must have {box.dim} coordinates, got {motion and motion.dim}.",
     )
-
-
-def _prescribed(fixed: Mask, motion: Motion | None, nodes: NodeVector, t: Scalar, dt: Scalar) -> NodeVector:
-    """The velocity of walls in the components that they hold [m/s], shape (n, d)."""
-    return jnp.zeros_like(nodes) if motion is None else jnp.where(fixed, motion.velocity(t, dt), 0)

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, Matrix, NodeScalar, NodeVector, Scalar
 from mpmjax.checks import require_between, require_fields
+from mpmjax.discretisation._average import average
 from mpmjax.discretisation._stencil import Stencil
-from mpmjax.discretisation._transfer_sums import gather, scatter
+from mpmjax.discretisation._transfer_sums import gather
 
 
 class Gathered(eqx.Module):
@@ -154,7 +155,8 @@ def p2g(
 ) -> tuple[NodeScalar, NodeVector]:
     """Particles to grid: m_i = Σ_p w_ip m_p and m_i v_i = Σ_p w_ip m_p (v_p + C_p (x_i − x_p)).
 
-    Conserves mass and linear momentum, and with the affine term angular momentum, to rounding.
+    Conserves mass and linear momentum, and with the affine term angular momentum, to rounding. Nodes whose mass is only
+    the rounding of the lightest particle's are empty: a mean would empty the nodes of a body much lighter than others.
 
     Args:
         stencil: stencil of the particles.
@@ -166,7 +168,7 @@ def p2g(
             moving-least-squares gradient if there is a C.
 
     Returns:
-        mass m_i [kg], shape (n,), and momentum m_i v_i [kg m/s], shape (n, d).
+        mass m_i [kg], shape (n,), and velocity v_i [m/s], shape (n, d); both are zero on empty nodes.
     """
     gradient_terms = [] if impulse is None else [impulse]
     if C is None:
@@ -175,8 +177,7 @@ def p2g(
         used = stencil.least_squares
         gradient_terms.append(mass * C * stencil.moment)
     gradients = jnp.swapaxes(sum(gradient_terms), 0, 1) if gradient_terms else None
-    nodes = scatter(used, jnp.concatenate([mass * v, mass[None]]), gradients, size)  # gradients give momentum alone
-    return nodes[:, -1], nodes[:, :-1]
+    return average(used, mass, mass * v, gradients, jnp.finfo(mass.dtype).eps * mass.min(), size)
 
 
 def g2p(

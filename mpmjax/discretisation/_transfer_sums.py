@@ -105,7 +105,7 @@ def _gather(*args: Array, unroll: bool) -> list[Array]:
     return [value, jnp.stack(gradients)]
 
 
-def _scatter(*args: Array, valued: bool, size: int, unroll: bool) -> list[Array]:
+def written_scatter(*args: Array, valued: bool, size: int, unroll: bool) -> list[Array]:
     """∂B/∂f: the nodes' sums, (n, c)."""
     factors, given = args[:3], args[3:]
     columns, p = given[0].shape[-2:]
@@ -205,14 +205,31 @@ def _factor_rows(index_factors: ShapedArray, *others: ShapedArray, valued: bool)
 
 _sum_primitive = partial(native_primitive, fits=sums_fit)
 gather_p = _sum_primitive("stencil_gather", _gather, _particle_rows, differential=False)
-scatter_p = _sum_primitive("stencil_scatter", _scatter, partial(_node_rows, first=3), differential=False)
+scatter_p = _sum_primitive("stencil_scatter", written_scatter, partial(_node_rows, first=3), differential=False)
 pull_p = _sum_primitive("stencil_pull", _pull, _factor_rows)
 _gather_by_factors_p = _sum_primitive(
     "stencil_gather_by_factors", _by_factors(_gather), _particle_rows, differential=True
 )
 _scatter_by_factors_p = _sum_primitive(
-    "stencil_scatter_by_factors", _by_factors(_scatter), partial(_node_rows, first=5), differential=True
+    "stencil_scatter_by_factors", _by_factors(written_scatter), partial(_node_rows, first=5), differential=True
 )
+
+
+def _tangents(primitive: Primitive, by_factors: Primitive, primals: tuple, tangents: tuple, params: dict) -> list[Any]:
+    """The differentials of a sum's results, by what it is of and by its factors; nothing if both are zero."""
+    factors, rest = primals[:3], primals[3:]
+    parts = []
+    if any(type(t) is not ad.Zero for t in tangents[3:]):
+        parts.append(primitive.bind(*factors, *map(ad.instantiate_zeros, tangents[3:]), **params))
+    if any(type(t) is not ad.Zero for t in tangents[1:3]):
+        parts.append(by_factors.bind(*factors, *map(ad.instantiate_zeros, tangents[1:3]), *rest, **params))
+    return [reduce(ad.add_tangents, part) for part in zip(*parts, strict=True)]
+
+
+def scatter_tangent(primals: tuple, tangents: tuple, **params: Any) -> Array | None:
+    """The differential of a scatter's result; None if nothing changes."""
+    found = _tangents(scatter_p, _scatter_by_factors_p, primals, tangents, params)
+    return found[0] if found else None
 
 
 def _differentiate(primitive: Primitive, by_factors: Primitive, function: Callable[..., list[Array]]) -> None:
@@ -220,14 +237,9 @@ def _differentiate(primitive: Primitive, by_factors: Primitive, function: Callab
     of its own; its own differential, which only second derivatives need, is that of the sum as written."""
 
     def jvp(primals: tuple, tangents: tuple, **params: Any) -> tuple[list[Array], list[Any]]:
-        factors, rest = primals[:3], primals[3:]
         out = primitive.bind(*primals, **params)
-        parts = [[ad.Zero(jax.typeof(o)) for o in out]]
-        if any(type(t) is not ad.Zero for t in tangents[3:]):
-            parts.append(primitive.bind(*factors, *map(ad.instantiate_zeros, tangents[3:]), **params))
-        if any(type(t) is not ad.Zero for t in tangents[1:3]):
-            parts.append(by_factors.bind(*factors, *map(ad.instantiate_zeros, tangents[1:3]), *rest, **params))
-        return out, [reduce(ad.add_tangents, part) for part in zip(*parts, strict=True)]
+        changes = _tangents(primitive, by_factors, primals, tangents, params)
+        return out, changes or [ad.Zero(jax.typeof(o)) for o in out]
 
     def jvp_by_factors(primals: tuple, tangents: tuple, *, batched: int, **params: Any) -> tuple:
         written = members(partial(_by_factors(function), unroll=False, **params), batched)
@@ -257,7 +269,7 @@ def _jvp_pull(primals: tuple, tangents: tuple, *, valued: bool, batched: int) ->
 
 
 _differentiate(gather_p, _gather_by_factors_p, _gather)
-_differentiate(scatter_p, _scatter_by_factors_p, _scatter)
+_differentiate(scatter_p, _scatter_by_factors_p, written_scatter)
 ad.primitive_jvps[pull_p] = _jvp_pull
 
 

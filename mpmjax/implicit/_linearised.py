@@ -55,9 +55,10 @@ class Linearised(AbstractSolution):
         """
         operator = problem.operator(guess).precomputed()
         combine = problem.projection.combine
-        lift = combine(0, problem.prescribed)
-        at_rest = problem.rhs
-        rhs = jax.lax.cond((lift != 0).any(), lambda: at_rest - operator.unconstrained(lift), lambda: at_rest)
+        rhs, lift = problem.rhs, None
+        if problem.prescribed is not None:
+            lift, at_rest = combine(0, problem.prescribed), rhs
+            rhs = jax.lax.cond((lift != 0).any(), lambda: at_rest - operator.unconstrained(lift), lambda: at_rest)
         rhs = combine(rhs, 0)
         inner = problem.preconditioner.inner_product(operator)
         solution = solve_linear(self.solver, operator, rhs, inner, combine(guess, 0))
@@ -72,4 +73,4 @@ class Linearised(AbstractSolution):
             indefinite=solution.indefinite,
             report=jnp.zeros_like(solution.residual),
         )
-        return solution.value + lift, info
+        return solution.value if lift is None else solution.value + lift, info

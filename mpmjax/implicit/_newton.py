@@ -155,7 +155,7 @@ class _Direction(eqx.Module):
 def _setting(problem: NewtonProblem, guess: NodeVector, rtol: Scalar) -> tuple[_Setting, _NewtonState]:
     """The constants and the initial state of an iteration."""
     combine, free = problem.projection.combine, problem.projection.free
-    rest = combine(0, problem.prescribed)
+    rest = problem.apply_dirichlet(jnp.zeros_like(guess))
     start = problem.apply_dirichlet(guess)
     energies = problem.incremental_potential(start), problem.incremental_potential(rest)
     start = jnp.where(jnp.isfinite(energies[0]) & ~(energies[1] < energies[0]), start, rest)

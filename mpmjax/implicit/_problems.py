@@ -16,10 +16,10 @@ from mpmjax.implicit._projection import Projection
 
 class AbstractProblem(eqx.Module):
     """An equation residual(v) = 0 with a symmetric Jacobian, for the nodes' velocity v [m/s] in a step or stage, shape
-    (n, d). Held components of v have the value of `prescribed`."""
+    (n, d). Held components of v have the value of `prescribed`; where it is None they are at rest."""
 
     projection: eqx.AbstractVar[Projection]
-    prescribed: eqx.AbstractVar[NodeVector]
+    prescribed: eqx.AbstractVar[NodeVector | None]
     preconditioner: eqx.AbstractVar[AbstractPreconditioner]
 
     @abc.abstractmethod
@@ -32,11 +32,11 @@ class AbstractProblem(eqx.Module):
 
     def residual(self, v: NodeVector) -> NodeVector:
         """The momentum residual in free components, and v − prescribed in held ones."""
-        return self.projection.combine(self.momentum_residual(v), v - self.prescribed)
+        return self.projection.combine(self.momentum_residual(v), v if self.prescribed is None else v - self.prescribed)
 
     def apply_dirichlet(self, guess: NodeVector) -> NodeVector:
         """The guess, with the prescribed values in held components."""
-        return self.projection.combine(guess, self.prescribed)
+        return self.projection.combine(guess, 0 if self.prescribed is None else self.prescribed)
 
 
 class LinearProblem(AbstractProblem):
@@ -51,7 +51,7 @@ class LinearProblem(AbstractProblem):
     rhs: NodeVector
     """b [kg m/s]."""
     projection: Projection
-    prescribed: NodeVector
+    prescribed: NodeVector | None
     preconditioner: AbstractPreconditioner = MassPreconditioner()
 
     def operator(self, v: NodeVector) -> ImplicitOperator:
@@ -83,7 +83,7 @@ class NewtonProblem(AbstractProblem):
     potential: ElasticPotential
     hessian: AbstractHessian
     projection: Projection
-    prescribed: NodeVector
+    prescribed: NodeVector | None
     preconditioner: AbstractPreconditioner = MassPreconditioner()
 
     def displacement(self, v: NodeVector) -> NodeVector:

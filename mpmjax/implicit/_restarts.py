@@ -17,8 +17,8 @@ from jax.core import ShapedArray
 
 from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.implicit._recurrence import Limits, ParticleMatrices, Passes, Recurrence, recur
-from mpmjax.implicit._vectors import combine, differentiable
-from mpmjax.native import native_primitive, sums_fit
+from mpmjax.implicit._vectors import combine
+from mpmjax.native import differentiable, native_primitive, sums_fit
 
 _REACH = 64.0  # the recurrence's own residual means nothing below so many units of rounding of the one it started from
 
@@ -174,8 +174,17 @@ def _vector_and_numbers(*args: ShapedArray) -> list[tuple]:
     return [args[-3].shape[-1:], (9,)]
 
 
+def _vectors(*args: ShapedArray) -> tuple:
+    """Six vectors to work in. Members of a batch, which run one after the other in a thread, take their own."""
+    *batch, size = args[-3].shape
+    return (0 if batch else 6 * size,)
+
+
 def _fits(avals: Any, batched: int) -> bool:
     return sums_fit([aval for aval in avals if aval.dtype != np.bool_], batched)
 
 
-_solve_p = differentiable(native_primitive("matrices_solve", _solve, _vector_and_numbers, _fits, {9: 0}), _solve)
+# The derivative of what is written in JAX: solves are never differentiated through their iterations.
+_solve_p = differentiable(
+    native_primitive("matrices_solve", _solve, _vector_and_numbers, _fits, {9: 0}, workspace=_vectors), _solve
+)

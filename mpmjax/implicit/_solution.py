@@ -39,8 +39,8 @@ class StageEquation(eqx.Module):
     """How its Hessian acts."""
     projection: Projection
     """The projection on what is free."""
-    prescribed: NodeVector
-    """The velocity of what is held [m/s], shape (n, d)."""
+    prescribed: NodeVector | None
+    """The velocity of what is held [m/s], shape (n, d); None if it is at rest."""
     preconditioner: AbstractPreconditioner
 
     def linear(self) -> LinearProblem:

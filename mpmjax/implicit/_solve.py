@@ -81,8 +81,10 @@ def _solve_jvp(primals: Any, tangents: Any) -> Any:
         return jnp.where(solved, solution.value, jnp.nan), jnp.where(finite & ~solved, residual, 0)
 
     combine = problem.projection.combine
-    lift = combine(0, -d_residual)
-    rhs = combine(-d_residual - operator.unconstrained(lift), 0)
+    rhs, lift = combine(-d_residual, 0), None
+    if problem.prescribed is not None or problem.projection.normal is not None:  # else it stays at rest
+        lift = combine(0, -d_residual)
+        rhs = combine(rhs - operator.unconstrained(lift), 0)
     d_slot = rhs[:0].sum() + (0 if d_slot is None else d_slot)  # a zero that keeps d_slot linear in the tangents
 
     def matvec(x: tuple[NodeVector, Array]) -> tuple[NodeVector, Array]:
@@ -91,4 +93,4 @@ def _solve_jvp(primals: Any, tangents: Any) -> Any:
 
     dv, d_report = jax.lax.custom_linear_solve(matvec, (rhs, d_slot), solve_symmetric, symmetric=True)
     d_info = eqx.tree_at(lambda i: i.report, jax.tree.map(lambda _: None, info), d_report, is_leaf=lambda a: a is None)
-    return (v, info), (dv + lift, d_info)
+    return (v, info), (dv if lift is None else dv + lift, d_info)

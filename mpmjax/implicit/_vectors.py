@@ -5,19 +5,15 @@ of two vectors each, with a norm. Written in JAX these are some eight passes ove
 small part. On CPUs the native library does them in two, in place, and passes over numbers that are known to stay zero.
 """
 
-from collections.abc import Callable
 from functools import reduce
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
-from jax.extend.core import Primitive
-from jax.interpreters import ad
 
 from mpmjax._types import Array, Bool, Float, NodeScalar, Scalar
-from mpmjax.native import members, native_primitive
+from mpmjax.native import differentiable, native_primitive
 
 _TOGETHER = 64
 """Numbers that are passed over together, as in native/vectors.h."""
@@ -117,23 +113,6 @@ def _fits(avals: Any, batched: int) -> bool:
     del batched
     floats = [aval.dtype for aval in avals if aval.dtype != np.bool_]
     return floats[0] in (np.float32, np.float64) and set(floats) == {floats[0]}
-
-
-def differentiable(primitive: Primitive, function: Callable[..., list[Array]]) -> Primitive:
-    """With the derivative of what is written in JAX. Solves are never differentiated through their iterations."""
-
-    def jvp(primals: tuple, tangents: tuple, *, batched: int) -> tuple[list[Array], list[Array]]:
-        floats = [k for k, primal in enumerate(primals) if jnp.issubdtype(primal.dtype, jnp.floating)]
-
-        def written(*given: Array) -> list[Array]:
-            at = dict(zip(floats, given, strict=True))
-            return members(function, batched)(*(at.get(k, primal) for k, primal in enumerate(primals)))
-
-        along = tuple(ad.instantiate_zeros(tangents[k]) for k in floats)
-        return jax.jvp(written, tuple(primals[k] for k in floats), along)
-
-    ad.primitive_jvps[primitive] = jvp
-    return primitive
 
 
 _combine_p = tuple(

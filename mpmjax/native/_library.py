@@ -8,18 +8,20 @@ from typing import NamedTuple
 
 import jax
 
-INTERFACE = 6
+INTERFACE = 7
 """What the library has to answer, as in native/CMakeLists.txt: both change with the handlers' arguments."""
 PATH = Path(__file__).parent / "lib" / "sums.so"
 """In a folder of its own: Python takes a shared library among modules for a module."""
 HANDLERS = (
     "gather",
     "scatter",
+    "average",
     "pull",
     "resist",
     "combine",
     "product",
     "solve",
+    "slope",
     "eigen",
     "rotation",
     "order",

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import ShapedArray
 
 from mpmjax.native._backend import uses_native
 from mpmjax.native._library import target
@@ -13,7 +14,12 @@ _Rule = Callable[..., Any]
 
 
 def with_native(
-    name: str, written: _Rule, fits: Callable[..., bool], aliases: dict[int, int], **attributes: bool
+    name: str,
+    written: _Rule,
+    fits: Callable[..., bool],
+    aliases: dict[int, int],
+    memory: Callable[..., list[ShapedArray]],
+    **attributes: bool,
 ) -> _Rule:
     """The lowering rule for CPUs of a primitive: a call of the native library where it has a kernel, else as written.
 
@@ -25,6 +31,8 @@ def with_native(
         written: lowering rule of the function written in JAX.
         fits: whether the library has a kernel for arguments, given their shapes and dtypes and the batch's axes.
         aliases: arguments whose memory results may take.
+        memory: arrays that the kernel works in, as a function of its arguments and parameters. It is given them as
+            further results, whose memory XLA then keeps from step to step.
         attributes: what the library is told besides.
     """
 
@@ -34,7 +42,9 @@ def with_native(
             return written(ctx, *args, **params)
         told = {"valued": np.bool_(params["valued"])} if "valued" in params else {}
         told |= {name: np.bool_(value) for name, value in attributes.items()}
-        return jax.ffi.ffi_lowering(target(name), operand_output_aliases=aliases)(ctx, *args, **told)
+        results = len(ctx.avals_out)
+        ctx = ctx.replace(avals_out=[*ctx.avals_out, *memory(*avals, **params)])
+        return jax.ffi.ffi_lowering(target(name), operand_output_aliases=aliases)(ctx, *args, **told)[:results]
 
     return rule
 

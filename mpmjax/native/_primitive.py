@@ -5,9 +5,10 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
-from jax.interpreters import batching, mlir
+from jax.interpreters import ad, batching, mlir
 
 from mpmjax._types import Array
 from mpmjax.native._lowering import with_native
@@ -37,6 +38,7 @@ def native_primitive(
     fits: Callable[..., bool],
     aliases: dict[int, int] | None = None,
     like: int = 1,
+    workspace: Callable[..., tuple] | None = None,
     **attributes: bool,
 ) -> Primitive:
     """A primitive that evaluates a function. In a batch all its arguments have as many leading axes as the batch.
@@ -48,6 +50,8 @@ def native_primitive(
         fits: whether the library has a kernel for arguments, given their shapes and dtypes and the batch's axes.
         aliases: arguments whose memory results may take, from their number to that of the result.
         like: the argument whose dtype results have.
+        workspace: the shape of memory that the library's kernel works in, as a function of the arguments; None if it
+            needs none.
         attributes: what the library is told besides the primitive's parameters.
     """
 
@@ -64,15 +68,37 @@ def native_primitive(
         out = primitive.bind(*args, batched=batched + 1, **params)
         return out, [0] * len(out)
 
+    def memory(*args: ShapedArray, batched: int, **params: Any) -> list[ShapedArray]:
+        if workspace is None:
+            return []
+        return [ShapedArray((*args[0].shape[:batched], *workspace(*args, **params)), args[like].dtype)]
+
     primitive = Primitive(name)
     primitive.multiple_results = True
     static = ("batched", "unroll", "valued", "size")
     once = jax.jit(run, static_argnames=static)  # traced once for all its uses
     written = mlir.lower_fun(once, multiple_results=True)
-    native = with_native(name.split("_")[1], written, fits, aliases or {}, **attributes)
+    native = with_native(name.split("_")[1], written, fits, aliases or {}, memory, **attributes)
     primitive.def_impl(_compiled(jax.jit(primitive.bind, static_argnames=static)))
     primitive.def_abstract_eval(results)
     batching.primitive_batchers[primitive] = batch
     mlir.register_lowering(primitive, mlir.lower_fun(partial(once, unroll=True), multiple_results=True))
     mlir.register_lowering(primitive, native, platform="cpu")
+    return primitive
+
+
+def differentiable(primitive: Primitive, function: Callable[..., list[Array]]) -> Primitive:
+    """A primitive with the derivative of the function that it evaluates, as that is written in JAX."""
+
+    def jvp(primals: tuple, tangents: tuple, *, batched: int) -> tuple[list[Array], list[Array]]:
+        floats = [k for k, primal in enumerate(primals) if jnp.issubdtype(primal.dtype, jnp.floating)]
+
+        def written(*given: Array) -> list[Array]:
+            at = dict(zip(floats, given, strict=True))
+            return members(function, batched)(*(at.get(k, primal) for k, primal in enumerate(primals)))
+
+        along = tuple(ad.instantiate_zeros(tangents[k]) for k in floats)
+        return jax.jvp(written, tuple(primals[k] for k in floats), along)
+
+    ad.primitive_jvps[primitive] = jvp
     return primitive

@@ -189,7 +189,7 @@ def _moved_places(
 ) -> NodeVector:
     """Where the body has moved the nodes of the reference configuration at time t [m], shape (n, d)."""
     colliders, places = nodes.conditions.colliders, reference
-    places = jnp.where(nodes.occupied, nodes.per_mass(places_of(particles, stencil, scene.grid.size)), places)
+    places = jnp.where(nodes.occupied, places_of(particles, stencil, scene.grid.size), places)
     for number, boundary in enumerate(scene.boundary):
         carried = boundary.carried(reference, t)
         if carried is not None:

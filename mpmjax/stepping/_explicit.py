@@ -25,7 +25,7 @@ class Explicit(AbstractIntegrator):
 
     def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         del guess
-        v = nodes.projection.combine(nodes.explicit_velocity(), nodes.prescribed)
+        v = nodes.admitted(nodes.explicit_velocity())
         return NodeMotion(v), no_solve(v.dtype)
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:

@@ -1,6 +1,8 @@
 """The nodes at the start of a step: mass, velocity and force from P2G, boundaries, and the elastic potential."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import reduce
 from operator import attrgetter
 from typing import ClassVar
 
@@ -35,6 +37,12 @@ Fold = Callable[[NodeVector], NodeVector]
 _PARALLEL = 1e-2  # a normal whose part in free components is smaller is prescribed by the others
 
 
+def per_mass(impulse: NodeVector, mass: NodeScalar) -> NodeVector:
+    """An impulse or force divided by the nodes' mass; zero on empty nodes."""
+    occupied = (mass > 0)[:, None]
+    return jnp.where(occupied, impulse / jnp.where(occupied, mass[:, None], 1), 0)
+
+
 class FreeNormal(eqx.Module):
     """The part of the colliders' normals in free components."""
 
@@ -57,6 +65,8 @@ class SeparateSums(eqx.Module):
     viscosity the viscous one."""
     viscous_force: NodeVector | None
     """The viscous part of `force` [N], shape (n, d); None unless it was asked for."""
+    acceleration: Array
+    """Body acceleration g [m/s²], shape (d,), or (n, d) where it varies."""
 
     def explicit_velocity(self, nodes: "Nodes") -> NodeVector:
         """v^n + Δt g + Δt f/m [m/s], shape (n, d)."""
@@ -65,21 +75,25 @@ class SeparateSums(eqx.Module):
     def with_force(self, nodes: "Nodes", force: NodeVector) -> "SeparateSums":
         """The sums with a force on the nodes added [N], shape (n, d)."""
         del nodes
-        return SeparateSums(self.velocity, self.force + force, self.viscous_force)
+        return replace(self, force=self.force + force)
+
+    def moved_by(self, change: NodeVector) -> "SeparateSums":
+        """The sums with a velocity [m/s], shape (n, d), added to that of the nodes."""
+        return replace(self, velocity=self.velocity + change)
 
     def folded(self, velocity: Fold, force: Fold) -> "SeparateSums":
-        """The same, with velocities and forces folded at mirrors."""
+        """The same, with velocities, accelerations and forces folded at mirrors."""
         viscous = None if self.viscous_force is None else force(self.viscous_force)
-        return SeparateSums(velocity(self.velocity), force(self.force), viscous)
+        return SeparateSums(velocity(self.velocity), force(self.force), viscous, velocity(self.acceleration))
 
 
 class JoinedSum(eqx.Module):
-    """The result of P2G that adds the impulse of the force to the momentum in one sum, at half the cost."""
+    """The result of P2G that adds the impulses of forces to the momentum in one sum, at half the cost."""
 
     separate: ClassVar[bool] = False
     viscous_force: ClassVar[None] = None
     velocity_with_force: NodeVector
-    """v^n + Δt f/m [m/s], shape (n, d); zero on empty nodes."""
+    """v^n + Δt (g + f/m) [m/s], shape (n, d); zero on empty nodes."""
 
     @property
     def velocity(self) -> NodeVector:
@@ -99,9 +113,23 @@ class JoinedSum(eqx.Module):
         """
         raise ValueError(_NOT_KNOWN_APART)
 
+    @property
+    def acceleration(self) -> Array:
+        """Not known.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError(_NOT_KNOWN_APART)
+
     def explicit_velocity(self, nodes: "Nodes") -> NodeVector:
-        """v^n + Δt f/m + Δt g [m/s], shape (n, d)."""
-        return self.velocity_with_force + nodes.dt * nodes.acceleration
+        """v^n + Δt (g + f/m) [m/s], shape (n, d)."""
+        del nodes
+        return self.velocity_with_force
+
+    def moved_by(self, change: NodeVector) -> "JoinedSum":
+        """The sum with a velocity [m/s], shape (n, d), added to that of the nodes."""
+        return JoinedSum(self.velocity_with_force + change)
 
     def with_force(self, nodes: "Nodes", force: NodeVector) -> "JoinedSum":
         """The sums with a force on the nodes added [N], shape (n, d)."""
@@ -114,8 +142,8 @@ class JoinedSum(eqx.Module):
 
 
 _NOT_KNOWN_APART = (
-    "P2G summed momentum and force in one, so v^n and the force are not known apart: only nodes.explicit_velocity() "
-    "is. An integrator that uses them must have needs_separate_force = True."
+    "P2G summed momentum and forces in one, so v^n, g and the force are not known apart: only "
+    "nodes.explicit_velocity() is. An integrator that uses them must have needs_separate_force = True."
 )
 
 
@@ -123,13 +151,9 @@ class Nodes(AbstractNodes):
     """The nodes at the start of a step, with the step and the boundaries: the input of an integrator."""
 
     mass: NodeScalar
-    """m_i [kg], shape (n,), folded at symmetry planes; zero on empty nodes, whose mass is only rounding."""
+    """m_i [kg], shape (n,), folded at symmetry planes; zero on empty nodes (see `p2g`)."""
     sums: SeparateSums | JoinedSum
     """The sums of P2G besides the mass."""
-    occupied: Bool[Array, "n 1"]
-    """Whether a node has more mass than the rounding of the lightest particle's, shape (n, 1)."""
-    acceleration: Array
-    """Body acceleration g [m/s²], shape (d,), or (n, d) where it varies."""
     dt: Float[Array, ""]
     """Δt [s]."""
     spacing: Float[Array, ""]
@@ -148,6 +172,11 @@ class Nodes(AbstractNodes):
     """The same nodes with those of rigid bodies each by itself; None without rigid bodies."""
 
     @property
+    def occupied(self) -> Bool[Array, "n 1"]:
+        """Whether a node has mass, shape (n, 1)."""
+        return (self.mass > 0)[:, None]
+
+    @property
     def velocity(self) -> NodeVector:
         """v_i^n [m/s], shape (n, d); zero on empty nodes.
 
@@ -164,6 +193,15 @@ class Nodes(AbstractNodes):
             ValueError: P2G summed momentum and force together.
         """
         return self.sums.force
+
+    @property
+    def acceleration(self) -> Array:
+        """Body acceleration g [m/s²], shape (d,), or (n, d) where it varies.
+
+        Raises:
+            ValueError: P2G summed momentum and force together.
+        """
+        return self.sums.acceleration
 
     @property
     def viscous_force(self) -> NodeVector | None:
@@ -214,6 +252,11 @@ class Nodes(AbstractNodes):
         return Projection(self.free, jnp.where(colliders.held[:, None], part.direction, 0))
 
     @property
+    def moves_held(self) -> bool:
+        """Whether held components may have another velocity than zero."""
+        return self.conditions.moves or self.mirror_motion is not None
+
+    @property
     def prescribed(self) -> NodeVector:
         """The velocity of held components [m/s], shape (n, d)."""
         part, velocity = self.free_normal, self.conditions.velocity
@@ -225,19 +268,23 @@ class Nodes(AbstractNodes):
 
     def explicit_velocity(self) -> NodeVector:
         """v* = v^n + Δt f/m + Δt g [m/s], shape (n, d) (derivation, eq. 4)."""
-        return jnp.where(self.occupied, self.sums.explicit_velocity(self), 0)
+        return self.sums.explicit_velocity(self)
 
     def inertial_velocity(self) -> NodeVector:
         """v^n + Δt g [m/s], shape (n, d)."""
         return jnp.where(self.occupied, self.velocity + self.dt * self.acceleration, 0)
 
+    def admitted(self, velocity: NodeVector) -> NodeVector:
+        """A velocity that is zero on empty nodes, with the prescribed values in held components [m/s], shape (n, d)."""
+        return self.projection.combine(velocity, self.prescribed) if self.conditions.holds else velocity
+
     def admitted_velocity(self) -> NodeVector:
         """v^n with the prescribed values in held components [m/s], shape (n, d)."""
-        return self.projection.combine(self.velocity, self.prescribed)
+        return self.admitted(self.velocity)
 
     def per_mass(self, impulse: NodeVector) -> NodeVector:
         """An impulse or force divided by the nodes' mass; zero on empty nodes."""
-        return jnp.where(self.occupied, impulse / jnp.where(self.occupied, self.mass[:, None], 1), 0)
+        return per_mass(impulse, self.mass)
 
     def folded(self, images: Mirror) -> "Nodes":
         """The nodes with the sums of their images at mirror planes added; the same nodes without a plane.
@@ -246,18 +293,13 @@ class Nodes(AbstractNodes):
         """
         if not images.images:
             return self
-        mass = images.fold_scalar(self.mass)
-        nodes = eqx.tree_at(
-            lambda n: (n.mass, n.occupied, n.potential.mirror),
-            self,
-            (mass, (mass > 0)[:, None], images.then(self.potential.mirror)),
-        )
+        folded = images.fold_scalar(self.mass), images.then(self.potential.mirror)
+        nodes = eqx.tree_at(lambda n: (n.mass, n.potential.mirror), self, folded)
 
         def fold_per_mass(v: Array) -> NodeVector:
             return nodes.per_mass(images.fold(self.mass[:, None] * v))
 
-        parts = self.sums.folded(fold_per_mass, images.fold), fold_per_mass(self.acceleration)
-        return eqx.tree_at(lambda n: (n.sums, n.acceleration), nodes, parts)
+        return replace(nodes, sums=self.sums.folded(fold_per_mass, images.fold))
 
     def tied(self, rigid: RigidLayers) -> "Nodes":
         """The nodes with those of rigid bodies folded to the two that move each of them."""
@@ -267,7 +309,7 @@ class Nodes(AbstractNodes):
 
     def moved_by(self, change: NodeVector) -> "Nodes":
         """The nodes with a velocity [m/s], shape (n, d), added to theirs."""
-        return eqx.tree_at(lambda n: n.sums, self, self.sums.folded(lambda v: v + change, lambda force: force))
+        return replace(self, sums=self.sums.moved_by(jnp.where(self.occupied, change, 0)))
 
     def constrained(
         self,
@@ -279,15 +321,11 @@ class Nodes(AbstractNodes):
     ) -> "Nodes":
         """The nodes folded at these mirrors, with the components `fixed` and the `normals` held too, and the force of
         the springs and couplings."""
-        nodes, colliders = (
-            eqx.tree_at(lambda n: n.conditions.fixed, self.folded(images), fixed),
-            self.conditions.colliders,
-        )
+        colliders = self.conditions.colliders
+        nodes = replace(self.folded(images), conditions=replace(self.conditions, fixed=fixed, holds=True))
         if springs or couplings:
             nodes = eqx.tree_at(lambda n: (n.potential.springs, n.potential.couplings), nodes, (springs, couplings))
-            nodes = eqx.tree_at(
-                lambda n: n.sums, nodes, nodes.sums.with_force(nodes, nodes.potential.spring_force(None))
-            )
+            nodes = replace(nodes, sums=nodes.sums.with_force(nodes, nodes.potential.spring_force(None)))
         if normals is None or colliders is None:
             return nodes
         return eqx.tree_at(lambda n: n.conditions.colliders.held, nodes, colliders.held | normals)
@@ -327,7 +365,6 @@ def particles_to_grid(
     v = components(particles.v)
     C = None if particles.C is None else components(particles.C)
     affine = C if scene.transfer.affine else None
-    acceleration = jnp.asarray(scene.gravity)
     with jax.named_scope("p2g"):
         points = points_of(scene.loads, scene.laws, particles, stencil, total=scene.total)
         supports = supports_of(scene.loads, points, t + body_force_at * dt)
@@ -337,43 +374,39 @@ def particles_to_grid(
         if explicit_viscosity and potential.material_viscous and C is not None:
             viscous_flux = potential.viscous_flux(C)
             flux = flux + viscous_flux
-        mass, momentum = p2g(stencil, particles.mass, v, affine, grid.size, -dt * flux if joined else None)
-        lightest = particles.mass.min()  # a mean would empty the nodes of a body much lighter than the others
-        occupied = (mass > jnp.finfo(mass.dtype).eps * lightest)[:, None]
-        full = jnp.where(occupied, mass[:, None], 1)
+        pushed = _body_force(scene, particles, t, dt, body_force_at)
+        if joined:
+            g = jnp.asarray(scene.gravity)[:, None]
+            v = v + dt * (g if pushed is None else g + pushed)
+        mass, velocity = p2g(stencil, particles.mass, v, affine, grid.size, -dt * flux if joined else None)
         loaded = load_force(scene.loads, points, t, dt, body_force_at, grid.size)
-        if loaded is not None:
-            acceleration = acceleration + jnp.where(occupied, loaded / full, 0)
-        if scene.body_force is not None:
-            x, at = particles.x, t
-            if body_force_at > 0:
-                x, at = x + body_force_at * dt * particles.v, t + body_force_at * dt
-            push = particles.mass * components(scene.body_force.acceleration(x, at))
-            force = scatter(stencil, push, None, grid.size)
-            acceleration = acceleration + jnp.where(occupied, force / full, 0)
-        places = scene.nodes(particles, t)
-        conditions = combined_conditions(scene.boundary, places, grid.spacing, t, dt, reference=scene.total)
-        if scene.total and conditions.colliders is not None and conditions.colliders.slides:
-            slid = (conditions.colliders.owner >= 0)[:, None] & occupied
-            place = jnp.where(slid, places_of(particles, stencil, grid.size) / full, conditions.colliders.position)
-            conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
+        held = potential.support_force() if supports else None
         drag = potential.support_drag() if explicit_viscosity else None
         if joined:
-            if supports:
-                pull = potential.support_force() if drag is None else potential.support_force() + drag
-                momentum = momentum + dt * pull
-            sums = JoinedSum(jnp.where(occupied, momentum / full, 0))
+            at_nodes = [force for force in (loaded, held, drag) if force is not None]
+            sums = JoinedSum(velocity + dt * per_mass(reduce(jnp.add, at_nodes), mass) if at_nodes else velocity)
         else:
+            acceleration = jnp.asarray(scene.gravity)
+            if loaded is not None:
+                acceleration = acceleration + per_mass(loaded, mass)
+            if pushed is not None:
+                acceleration = acceleration + per_mass(scatter(stencil, particles.mass * pushed, None, grid.size), mass)
             force, viscous_force = -potential.nodal_sum(flux), None
             if viscosity_apart and viscous_flux is not None:
                 viscous_force = -potential.nodal_sum(viscous_flux)
-            if supports:
-                force = force + potential.support_force()
+            if held is not None:
+                force = force + held
             if drag is not None:
                 force = force + drag
             if viscosity_apart and drag is not None:
                 viscous_force = drag if viscous_force is None else viscous_force + drag
-            sums = SeparateSums(jnp.where(occupied, momentum / full, 0), force, viscous_force)
+            sums = SeparateSums(velocity, force, viscous_force, acceleration)
+        places = scene.nodes(particles, t)
+        conditions = combined_conditions(scene.boundary, places, grid.spacing, t, dt, reference=scene.total)
+        if scene.total and conditions.colliders is not None and conditions.colliders.slides:
+            slid = (conditions.colliders.owner >= 0) & (mass > 0)
+            place = jnp.where(slid[:, None], places_of(particles, stencil, grid.size), conditions.colliders.position)
+            conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
         faces = faces_of(scene, particles, potential.material_points, stencil, dt, force_at)
         acts_at = t if force_at is None else t + jnp.where(jnp.asarray(force_at) > 0, dt, 0)
         brought: list[tuple[int | None, AbstractContact]] = [
@@ -383,10 +416,8 @@ def particles_to_grid(
         touching = contacts_of_bodies(scene, particles, potential.material_points, stencil, images, dt, force_at)
         brought += [(None, contact) for contact in touching]
         nodes = Nodes(
-            mass=jnp.where(occupied[:, 0], mass, 0),
+            mass=mass,
             sums=sums,
-            occupied=occupied,
-            acceleration=acceleration,
             dt=jnp.asarray(dt),
             spacing=jnp.asarray(grid.spacing),
             potential=potential,
@@ -414,7 +445,18 @@ def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes) -> Nodes:
         return nodes.moved_by(-images.unfold(added)).folded(images).moved_by(added)
 
 
+def _body_force(scene: Scene, particles: Particles, t: Scalar, dt: Scalar, part: float) -> Float[Array, "d p"] | None:
+    """The scene's body force per unit mass [m/s²], at a part of the step, to which positions are moved on with the
+    particles' velocity; None without one."""
+    if scene.body_force is None:
+        return None
+    if part > 0:
+        return components(scene.body_force.acceleration(particles.x + part * dt * particles.v, t + part * dt))
+    return components(scene.body_force.acceleration(particles.x, t))
+
+
 def places_of(particles: Particles, stencil: Stencil, size: int) -> NodeVector:
-    """Current positions of reference nodes times their mass, Σ_p w_ip m_p (x_p + F_p (X_i − X_p)) [kg m], (n, d)."""
+    """Current positions of reference nodes, Σ_p w_ip m_p (x_p + F_p (X_i − X_p)) / m_i [m], shape (n, d); zero on empty
+    nodes."""
     F = jnp.concatenate([group.deformation() for group in particles.groups], axis=-1)
     return p2g(stencil, particles.mass, components(particles.x), F, size)[1]

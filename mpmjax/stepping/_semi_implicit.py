@@ -73,7 +73,7 @@ class SemiImplicit(AbstractImplicitIntegrator):
             hessian=damped(self.hessian.at_step_start(nodes.potential), nodes.potential, 1 / nodes.dt),
             rhs=impulse - (1 - beta) * nodes.dt * nodes.potential.viscous_resistance(v0) if viscous else impulse,
             projection=nodes.projection,
-            prescribed=nodes.prescribed,
+            prescribed=nodes.prescribed if nodes.moves_held else None,
             preconditioner=self.preconditioner,
         )
         v, info = solve(problem, guess, self.solved_by(), self.adjoint_solver)

@@ -37,7 +37,7 @@ class Stage(eqx.Module):
             potential=nodes.potential,
             hessian=method.hessian,
             projection=nodes.projection,
-            prescribed=nodes.prescribed,
+            prescribed=nodes.prescribed if nodes.moves_held else None,
             preconditioner=method.preconditioner,
         )
         solution = method.solved_by()

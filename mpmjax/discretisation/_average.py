@@ -1,0 +1,114 @@
+"""Averages at the nodes: velocity is momentum over mass."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
+from jax.interpreters import ad
+
+from mpmjax._types import Array, Float, Scalar
+from mpmjax.discretisation._stencil import Stencil
+from mpmjax.discretisation._transfer_sums import scatter_tangent, written_scatter
+from mpmjax.native import differentiable, native_primitive, sums_fit
+
+
+def average(
+    stencil: Stencil,
+    weight: Float[Array, "p"],
+    value: Float[Array, "k p"],
+    gradients: Float[Array, "d k p"] | None,
+    least: Scalar,
+    size: int,
+) -> tuple[Float[Array, "n"], Float[Array, "n k"]]:
+    """Whole weights at the nodes, M_i = Σ_p w_ip m_p, and the averages Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b) / M_i.
+
+    Where a whole weight is not more than the least, both are zero. On CPUs nodes that no particle reaches cost nothing
+    but being set to zero.
+
+    Args:
+        stencil: stencil of the particles.
+        weight: m_p, shape (p,).
+        value: a_p, which has the factor m_p already, shape (k, p).
+        gradients: a_p,b for each direction b, shape (d, k, p), or None for zero.
+        least: the least whole weight, not negative.
+        size: number of nodes n.
+    """
+    given = [jnp.concatenate([value, weight[None]])] + ([] if gradients is None else [gradients])
+    whole, means = _average_p.bind(*stencil.factors, jnp.asarray(least, weight.dtype), *given, size=size, batched=0)
+    return whole, means
+
+
+def _average(*args: Array, size: int, unroll: bool) -> list[Array]:
+    """The whole weights, (n,), and the averages, (n, k)."""
+    *factors, least = args[:4]
+    sums = written_scatter(*factors, *args[4:], valued=True, size=size, unroll=unroll)[0]
+    some = sums[:, -1] > least
+    whole = jnp.where(some, sums[:, -1], 0)
+    return [whole, jnp.where(some[:, None], sums[:, :-1] / jnp.where(some, whole, 1)[:, None], 0)]
+
+
+def _jvp(primals: tuple, tangents: tuple, *, size: int, batched: int) -> tuple[list[Array], list[Any]]:
+    """Of the sums' differentials, what `_divided` makes of them. The least weight has no part in it."""
+    out = _average_p.bind(*primals, size=size, batched=batched)
+    sums, changes = ((*values[:3], *values[4:]) for values in (primals, tangents))
+    change = scatter_tangent(sums, changes, valued=True, size=size, batched=batched)
+    if change is None:
+        return out, [ad.Zero(jax.typeof(o)) for o in out]
+    return out, _divided_p.bind(change, *out, batched=batched)
+
+
+def _divided(change: Array, whole: Array, means: Array, unroll: bool = False) -> list[Array]:
+    """dM and (d(Σ) − a dM) / M, (n,) and (n, k), from the differentials of the sums, (n, k + 1)."""
+    del unroll  # there is no loop
+    some = whole > 0
+    d_whole = jnp.where(some, change[:, -1], 0)
+    d_means = (change[:, :-1] - means * d_whole[:, None]) / jnp.where(some, whole, 1)[:, None]
+    return [d_whole, jnp.where(some[:, None], d_means, 0)]
+
+
+def _slope(whole: Array, means: Array, by_means: Array, by_whole: Array, unroll: bool = False) -> list[Array]:
+    """The transpose of `_divided`: slopes by the sums, (n, k + 1), from those by averages and whole weights."""
+    del unroll  # there is no loop
+    some = whole > 0
+    by_value = jnp.where(some[:, None], by_means, 0) / jnp.where(some, whole, 1)[:, None]
+    by_weight = jnp.where(some, by_whole, 0) - (by_value * means).sum(axis=1)
+    return [jnp.concatenate([by_value, by_weight[:, None]], axis=1)]
+
+
+def _transpose_divided(cotangents: list, change: Any, whole: Array, means: Array, *, batched: int) -> list:
+    del change
+    by_whole, by_means = map(ad.instantiate_zeros, cotangents)
+    return [*_slope_p.bind(whole, means, by_means, by_whole, batched=batched), None, None]
+
+
+def _shapes(*args: ShapedArray, size: int) -> list[tuple]:
+    return [(size,), (size, args[4].shape[-2] - 1)]
+
+
+def _sums(*args: ShapedArray, size: int) -> tuple:
+    """The native sums are made here before they are divided."""
+    return size, args[4].shape[-2]
+
+
+def _like_averages(change: ShapedArray, whole: ShapedArray, means: ShapedArray) -> list[tuple]:
+    del change
+    return [whole.shape[-1:], means.shape[-2:]]
+
+
+def _like_sums(whole: ShapedArray, means: ShapedArray, *others: ShapedArray) -> list[tuple]:
+    del whole, others
+    return [(*means.shape[-2:-1], means.shape[-1] + 1)]
+
+
+def _nodes_fit(avals: Any, batched: int) -> bool:
+    del batched
+    return avals[0].dtype in (np.float32, np.float64) and len({aval.dtype for aval in avals}) == 1
+
+
+_average_p = native_primitive("stencil_average", _average, _shapes, sums_fit, workspace=_sums)
+ad.primitive_jvps[_average_p] = _jvp
+_divided_p = differentiable(native_primitive("nodes_divided", _divided, _like_averages, lambda *_: False), _divided)
+_slope_p = differentiable(native_primitive("nodes_slope", _slope, _like_sums, _nodes_fit, like=0), _slope)
+ad.primitive_transposes[_divided_p] = _transpose_divided
