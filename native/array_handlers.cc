@@ -7,10 +7,13 @@
 //   rotation  F                                              ->  R
 //   order     keys                                           ->  order
 //   rearrange wanted, order, numbers                         ->  numbers
+//   written   any arrays                                     ->  the same
 //
 // Vectors are (..., m), scales (..., 2), mass and whole (..., n), means (..., n, c − 1), sums (..., n, c), active
 // (..., ⌈m/64⌉), matrices (..., 3, 3, p), w (..., 3, p), keys
 // and their order (..., p), wanted (...), numbers (..., c, p), with the same leading axes everywhere.
+
+#include <cstring>
 
 #include "call.h"
 #include "matrices.h"
@@ -153,6 +156,19 @@ ffi::Error run_rearrange(ffi::ThreadPool threads, bool inverse, ffi::RemainingAr
   return call.fault.empty() ? ffi::Error::Success() : wrong(call.fault);
 }
 
+// Results lie where the operands do, if XLA has done what it was asked.
+ffi::Error run_written(ffi::RemainingArgs from, ffi::RemainingRets to) {
+  Call call = collect(from, to);
+  call.expect(call.buffers.size() == 2 * call.operands, "as many arrays as results");
+  for (size_t k = 0; call.fault.empty() && k < call.operands; ++k) {
+    const ffi::AnyBuffer &given = call.buffers[k], &result = call.buffers[call.operands + k];
+    call.expect(given.size_bytes() == result.size_bytes(), "arrays of another size");
+    if (!call.fault.empty() || given.untyped_data() == result.untyped_data()) continue;
+    std::memcpy(result.untyped_data(), given.untyped_data(), given.size_bytes());
+  }
+  return call.fault.empty() ? ffi::Error::Success() : wrong(call.fault);
+}
+
 constexpr auto run_combine = run<CombineOf, 7, 3, 1>;
 constexpr auto run_product = run<ProductOf, 7, 2, 1>;
 constexpr auto run_slope = run<SlopeOf, 4, 1, 1>;
@@ -182,5 +198,6 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_rearrange, mpmjax::run_rearrange,
                                   .Attr<bool>("inverse")
                                   .RemainingArgs()
                                   .RemainingRets());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_written, mpmjax::run_written, ffi::Ffi::Bind().RemainingArgs().RemainingRets());
 
 #pragma GCC visibility pop

@@ -96,6 +96,10 @@ struct Block {
         }
       }
     }
+  }
+
+  // The last axis' rows, once the numbers were read.
+  MPMJAX_APART void join_last() {
     join<T, s>(weights[d - 1], last_weights);
     join<T, s>(derivatives[d - 1], last_derivatives);
     if constexpr (differential) {

@@ -23,7 +23,7 @@ struct Example {
   Array<int32_t> index;
   Array<T> w, g, dw, dg, nodes, given;
   Array<T> matrices, moved;
-  Array<T> to_nodes, gathered, by_w, by_g, resisted;  // results
+  Array<T> to_nodes, gathered, by_w, by_g, beside, resisted;  // results; `beside` the pull is the gather again
 
   Example(Shape sh, int oddity, std::mt19937& random)
       : shape(sh),
@@ -33,7 +33,8 @@ struct Example {
         given((sh.d + 1) * sh.batch * sh.columns * sh.particles),
         matrices(sh.batch * sh.d * sh.d * (sh.d * sh.d + 1) / 2 * sh.particles),
         moved(sh.batch * sh.size() * sh.d),
-        to_nodes(nodes.size), gathered(given.size), by_w(index.size), by_g(index.size), resisted(moved.size) {
+        to_nodes(nodes.size), gathered(given.size), by_w(index.size), by_g(index.size), beside(given.size),
+        resisted(moved.size) {
     std::normal_distribution<T> normal;
     for (const Array<T>* array : {&w, &g, &dw, &dg, &nodes, &given, &matrices, &moved}) {
       for (int64_t i = 0; i < array->size; ++i) (*array)[i] = normal(random);
@@ -112,7 +113,9 @@ void check(const Example<T>& e, const std::vector<const Pool*>& pools) {
     Scatter<T> scattered = {e.stencils(differential), {}, e.to_nodes.data.get(), nullptr, nullptr, n, sh.columns, nullptr};
     T *value = e.gathered.data.get(), *gradients = value + rows;
     const Gather<T> gathered = {e.stencils(differential), e.nodes.data.get(), value, gradients, n, sh.columns};
-    Pull<T> pulled = {e.stencils(false), e.nodes.data.get(), {}, e.by_w.data.get(), e.by_g.data.get(), n, sh.columns};
+    Pull<T> pulled = {e.stencils(false), e.nodes.data.get(), {}, e.by_w.data.get(), e.by_g.data.get(),
+                      e.beside.data.get(), e.beside.data.get() + rows, n, sh.columns};
+    if (kind == 4) pulled.value = pulled.gradients = nullptr;
     if (valued) scattered.given.value = e.given.data.get();
     if (kind != 1) scattered.given.gradients = e.given.data.get() + rows;
     scattered.given.graded = graded;
@@ -122,13 +125,13 @@ void check(const Example<T>& e, const std::vector<const Pool*>& pools) {
       const int64_t row = b == 0 ? m * sh.columns + c : (m * sh.d + b - 1) * columns + c;
       return (b == 0 ? 0 : rows) + row * sh.particles + p;
     };
-    std::unique_ptr<Array<T>> bits[4];
+    std::unique_ptr<Array<T>> bits[5];
     for (const Pool* pool : pools) {
       const bool known = scatter(*pool, form, sh.batch, scattered) && gather(*pool, form, sh.batch, gathered) &&
                          (differential || pull(*pool, form, sh.batch, pulled));
       if (!known) ++faults, std::printf("no kernel for d=%d s=%d\n", sh.d, sh.s);
       int k = 0;
-      for (const Array<T>* result : {&e.to_nodes, &e.gathered, &e.by_w, &e.by_g}) {
+      for (const Array<T>* result : {&e.to_nodes, &e.gathered, &e.by_w, &e.by_g, &e.beside}) {
         if (bits[k] == nullptr) {
           bits[k] = std::make_unique<Array<T>>(*result);
         } else {
@@ -167,6 +170,7 @@ void check(const Example<T>& e, const std::vector<const Pool*>& pools) {
     });
     compare("scatter", sh, e.to_nodes, to, to_scale);
     compare("gather", sh, e.gathered, from, from_scale);
+    if (!differential && kind != 4) compare("gather beside a pull", sh, e.beside, from, from_scale);
     if (!differential) compare("pull by weights", sh, e.by_w, by_w, by_scale);
     if (!differential) compare("pull by derivatives", sh, e.by_g, by_g, by_g_scale);
   }

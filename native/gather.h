@@ -2,6 +2,7 @@
 
 #pragma once
 
+#include "field.h"
 #include "node_rows.h"
 
 namespace {
@@ -70,6 +71,21 @@ MPMJAX_INLINE void gather_block(const Block<T, d, s, differential>& block, const
   }
 }
 
+// Some columns of a block, row by row, to where the block's particles begin.
+template <class T, int d, int s, bool differential, int columns>
+MPMJAX_INLINE void gather_rows(const Block<T, d, s, differential>& block, const NodeRows<T, s, columns>& rows,
+                               int64_t particles, int64_t all_columns, int count, T* value, T* gradients) {
+  Vector<T> sums[d + 1][kBlock];
+  gather_block(block, rows, [&](int q, const auto& found) MPMJAX_INLINE_LAMBDA {
+    sums[0][q] = found.value;
+    for (int b = 0; b < d; ++b) sums[b + 1][q] = found.gradients[b];
+  });
+  write_rows<T>(sums[0], value, particles, count, rows.used);
+  for (int b = 0; b < d; ++b) {
+    write_rows<T>(sums[b + 1], gradients + b * all_columns * particles, particles, count, rows.used);
+  }
+}
+
 template <class T, int d, int s, bool differential, int columns>
 void gather_columns(const Gather<T>& task, int64_t first, int64_t last) {
   const int64_t particles = task.stencils.particles;
@@ -78,18 +94,20 @@ void gather_columns(const Gather<T>& task, int64_t first, int64_t last) {
     Block<T, d, s, differential> block;
     block.find_range(task.stencils, start, count);
     block.read(task.stencils, start, count);
+    if constexpr (!differential && columns > 0) {
+      if (has_fields<T, d, s, columns>(block, task.size)) {
+        for (int q = 0; q < kBlock; q += kAbreast<T>) {
+          Fields<T, d, s, columns> some(block, q, task.nodes);
+          some.write_sums(some.gather(), particles, task.value + start + q, task.gradients + start + q);
+        }
+        continue;
+      }
+    }
+    block.join_last();
     for (int64_t c = 0; c < task.columns; c += kLanes) {
       const NodeRows<T, s, columns> rows(task.nodes, task.size, task.columns, c);
-      Vector<T> sums[d + 1][kBlock];
-      gather_block(block, rows, [&](int q, const auto& found) MPMJAX_INLINE_LAMBDA {
-        sums[0][q] = found.value;
-        for (int b = 0; b < d; ++b) sums[b + 1][q] = found.gradients[b];
-      });
-      write_rows<T>(sums[0], task.value + c * particles + start, particles, count, rows.used);
-      for (int b = 0; b < d; ++b) {
-        T* gradient = task.gradients + b * task.columns * particles;
-        write_rows<T>(sums[b + 1], gradient + c * particles + start, particles, count, rows.used);
-      }
+      const int64_t at = c * particles + start;
+      gather_rows(block, rows, particles, task.columns, count, task.value + at, task.gradients + at);
     }
   }
 }

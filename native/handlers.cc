@@ -4,7 +4,7 @@
 //   gather   index, weights, derivatives [, their changes], nodes      ->  a, a_b
 //   scatter  index, weights, derivatives [, their changes], given ...  ->  nodes
 //   average  index, weights, derivatives, least, given ...             ->  whole, means, memory to work in
-//   pull     index, weights, derivatives, nodes, given ...             ->  by weights, by derivatives
+//   pull     index, weights, derivatives, nodes, given ...             ->  by weights, by derivatives [, a, a_b]
 //   resist   index, weights, derivatives, matrices, nodes              ->  nodes
 //   solve    index, weights, derivatives, matrices, mass, factor, free, weight, active, x, rhs, limits  ->  x, numbers,
 //                                                                         memory to work in (of a batch none)
@@ -108,10 +108,13 @@ struct PullOf {
     task.columns = call.dim(3, 1);
     task.nodes = call.at<T>(3, {task.size, task.columns});
     task.given = call.given<T>(4, valued, task.columns);
-    call.expect(call.buffers.size() == call.operands + 2, "too many or too few results");
+    const bool gathers = call.buffers.size() == call.operands + 4;
+    call.expect(gathers || call.buffers.size() == call.operands + 2, "too many or too few results");
     call.expect(task.size > 0 || call.particles == 0, "no nodes to gather from");
     task.by_weights = call.at<T>(call.operands, {call.d, call.s, call.particles});
     task.by_derivatives = call.at<T>(call.operands + 1, {call.d, call.s, call.particles});
+    if (gathers) task.value = call.at<T>(call.operands + 2, {task.columns, call.particles});
+    if (gathers) task.gradients = call.at<T>(call.operands + 3, {call.d, task.columns, call.particles});
     if (!call.fault.empty()) return true;
     return pull(pool, {int(call.d), int(call.s), false}, call.batch, task);
   }

@@ -93,6 +93,8 @@ struct Pull {
   Given<T> given;
   T* by_weights;      // (d, s, p)
   T* by_derivatives;  // (d, s, p)
+  T* value;           // the gather of the nodes, as in a gather; null where it is not wanted
+  T* gradients;
   int64_t size;
   int64_t columns;
 };

@@ -1,7 +1,8 @@
 // The pull: the derivative of B = Σ_ip f_i · (w_ip a_p + Σ_b g_ip,b a_p,b) by the factors along each axis.
 //
 // By a factor along axis a, B is a product of what the axes before it and the last narrow and what those after it gather;
-// by one along the last axis it is a product of what is given and what all other axes gather.
+// by one along the last axis it is a product of what is given and what all other axes gather. The gather comes out beside
+// it.
 
 #pragma once
 
@@ -89,6 +90,35 @@ MPMJAX_APART void add_lanes(const Vector<T>* from, int count, T* to) {
   write(sums, count, to);
 }
 
+// A block's particles abreast.
+template <class T, int d, int s, int columns>
+MPMJAX_INLINE void pull_fields(const Pull<T>& task, const Block<T, d, s, false>& block, int64_t start) {
+  using Some = Fields<T, d, s, columns>;
+  using V = Abreast<T>;
+  const int64_t particles = task.stencils.particles;
+  for (int q = 0; q < kBlock; q += kAbreast<T>) {
+    const int64_t first = start + q;
+    V given[d + 1][columns] = {};
+    for (int c = 0; c < columns; ++c) {
+      if (task.given.value != nullptr) std::memcpy(&given[0][c], task.given.value + c * particles + first, sizeof(V));
+      for (int b = 0; b < d && c < task.given.graded; ++b) {
+        const int64_t row = b * task.given.graded + c;
+        std::memcpy(&given[b + 1][c], task.given.gradients + row * particles + first, sizeof(V));
+      }
+    }
+    Some some(block, q, task.nodes);
+    const auto found = some.pull(given);
+    for (int a = 0; a < d; ++a) {
+      for (int i = 0; i < s; ++i) {
+        const int64_t at = (a * s + i) * particles + first;
+        Some::put(task.given.value == nullptr && d == 1 ? V{} : some.by_weights[a][i], task.by_weights + at);
+        Some::put(task.given.gradients == nullptr ? V{} : some.by_derivatives[a][i], task.by_derivatives + at);
+      }
+    }
+    if (task.value != nullptr) some.write_sums(found, particles, task.value + first, task.gradients + first);
+  }
+}
+
 template <class T, int d, int s, int columns>
 void pull_columns(const Pull<T>& task, int64_t first, int64_t last) {
   const int64_t particles = task.stencils.particles;
@@ -97,6 +127,13 @@ void pull_columns(const Pull<T>& task, int64_t first, int64_t last) {
     Block<T, d, s, false> block;
     block.find_range(task.stencils, start, count);
     block.read(task.stencils, start, count);
+    if constexpr (columns > 0) {
+      if (has_fields<T, d, s, columns>(block, task.size)) {
+        pull_fields<T, d, s, columns>(task, block, start);
+        continue;
+      }
+    }
+    block.join_last();
     Vector<T> by_weights[d][s][kBlock], by_derivatives[d][s][kBlock];
     for (int64_t c = 0; c < (columns == 0 ? task.columns : columns); c += kLanes) {
       const NodeRows<T, s, columns> rows(task.nodes, task.size, task.columns, c);
@@ -117,6 +154,10 @@ void pull_columns(const Pull<T>& task, int64_t first, int64_t last) {
         } else {
           Puller<T, d, s, false, columns>{block, rows, q}.all(given, add);
         }
+      }
+      if (task.value != nullptr) {
+        const int64_t at = c * particles + start;
+        gather_rows(block, rows, particles, task.columns, count, task.value + at, task.gradients + at);
       }
     }
     // What has no part in B is zero, also where it would be zero times what is not finite.

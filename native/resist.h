@@ -81,6 +81,7 @@ void resist_particles(const Resist<T>& task, int64_t first, int64_t last) {
     Block<T, d, s, false> block;
     block.find_range(task.stencils, start, count);
     block.read(task.stencils, start, count);
+    block.join_last();
     Vector<T> rows[d][kRoom];
     resist_block<T, d, s>(task, block, start, count, rows);
     const int64_t particles = task.stencils.particles;

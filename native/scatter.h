@@ -179,6 +179,7 @@ MPMJAX_INLINE void add_blocks(const Stencils<T>& stencils, const Range* ranges, 
     }
     if (some == 0) continue;
     block.read(stencils, start, count);
+    block.join_last();
     Vector<T> rows[graded ? d + 1 : 1][kRoom];
     give(block, start, count, rows);
     for (int k = 0; k < some; ++k) {

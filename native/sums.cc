@@ -94,6 +94,10 @@ Pull<T> member(Pull<T> all, Form form, int64_t i) {
   all.nodes += i * all.size * all.columns;
   all.by_weights += factors;
   all.by_derivatives += factors;
+  if (all.value != nullptr) {
+    all.value += i * all.columns * all.stencils.particles;
+    all.gradients += i * form.d * all.columns * all.stencils.particles;
+  }
   all.given = member(all.given, form, i, all.columns, all.stencils.particles);
   return all;
 }

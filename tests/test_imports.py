@@ -16,8 +16,8 @@ FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.r
 # Each room may import from those before it.
 ROOMS = (
     "checks",
-    "autodiff",
     "native",
+    "autodiff",
     "linalg",
     "material",
     "discretisation",

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax._types import Array
 from mpmjax.checks import require, require_fields
@@ -46,7 +47,8 @@ class BSpline(eqx.Module):
             case 1:
                 return jnp.stack([1 - f, f], axis=1)
             case 2:
-                return jnp.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2], axis=1)
+                height, slope = (np.array(a, f.dtype)[:, None] for a in ((0, 0.75, 0), (0.5, -1, 0.5)))
+                return self._from_knot(f) ** 2 * slope + height
             case _:
                 t = f - 1
                 near = (3 * t**3 - 6 * t**2 + 4) / 6
@@ -59,9 +61,14 @@ class BSpline(eqx.Module):
             case 1:
                 return jnp.stack([-jnp.ones_like(f), jnp.ones_like(f)], axis=1)
             case 2:
-                return jnp.stack([f - 1.5, -2 * (f - 1), f - 0.5], axis=1)
+                return self._from_knot(f) * np.array((1, -2, 1), f.dtype)[:, None]
             case _:
                 t = f - 1
                 near = (9 * t**2 - 12 * t) / 6
                 far = (-9 * t**2 + 6 * t + 3) / 6
                 return jnp.stack([-((1 - t) ** 2) / 2, near, far, t**2 / 2], axis=1)
+
+    def _from_knot(self, f: Array) -> Array:
+        """The distances in which the quadratic kernel's weights are parabolas, one formula for all three: XLA does not
+        vectorise a stack in what its derivative is fused with."""
+        return f[:, None] - np.array((1.5, 1, 0.5), f.dtype)[:, None]

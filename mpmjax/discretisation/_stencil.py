@@ -13,6 +13,7 @@ from mpmjax._types import Array, Bool, Float, Indices, Int, ParticleVector, comp
 from mpmjax.discretisation._gradient import AbstractGradient
 from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._kernel import BSpline
+from mpmjax.native import written
 
 
 class Stencil(eqx.Module):
@@ -114,7 +115,7 @@ def make_stencil(
     """
     dx = grid.spacing
     xi = components(x) / dx
-    f = xi - jax.lax.stop_gradient(kernel.base(xi))
+    f = written(xi - jax.lax.stop_gradient(kernel.base(xi)))
     weights, spline = kernel.weights(f), kernel.derivatives(f) / dx
     if kernel.order == 1:
         moment = f * (1 - f) * dx**2

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, Matrix, NodeScalar, NodeVector, Scalar
+from mpmjax.autodiff import kept_sums
 from mpmjax.checks import require_between, require_fields
 from mpmjax.discretisation._average import average
 from mpmjax.discretisation._stencil import Stencil
@@ -177,7 +178,8 @@ def p2g(
         used = stencil.least_squares
         gradient_terms.append(mass * C * stencil.moment)
     gradients = jnp.swapaxes(sum(gradient_terms), 0, 1) if gradient_terms else None
-    return average(used, mass, mass * v, gradients, jnp.finfo(mass.dtype).eps * mass.min(), size)
+    given = mass * v, gradients, jnp.finfo(mass.dtype).eps * mass.min()
+    return kept_sums(average(used, mass, *given, size))
 
 
 def g2p(
@@ -210,14 +212,14 @@ def g2p(
             raise ValueError(f"{type(transfer).__name__} needs the change of the nodes' velocity: give before.")
         change = after - before
     fields = [field for field in (after, mean, change) if field is not None]
-    values, gradients = gather(stencil, jnp.concatenate(fields, axis=1))
+    values, gradients = kept_sums(gather(stencil, jnp.concatenate(fields, axis=1)))
     values, gradients = jnp.split(values, len(fields)), _split_gradients(gradients, len(fields))
     affine: list[Matrix | None] = [None] * len(fields)
     if transfer.affine and stencil.mls_weight_derivatives is None:
         affine = [*gradients]
     elif transfer.affine:
         ends = [field for field in (after, change) if field is not None]
-        found = _split_gradients(gather(stencil.least_squares, jnp.concatenate(ends, axis=1))[1], len(ends))
+        found = _split_gradients(kept_sums(gather(stencil.least_squares, jnp.concatenate(ends, axis=1))[1]), len(ends))
         affine[0] = found[0]
         if change is not None:
             affine[-1] = found[-1]

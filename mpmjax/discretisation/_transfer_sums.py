@@ -215,30 +215,86 @@ _scatter_by_factors_p = _sum_primitive(
 )
 
 
-def _tangents(primitive: Primitive, by_factors: Primitive, primals: tuple, tangents: tuple, params: dict) -> list[Any]:
-    """The differentials of a sum's results, by what it is of and by its factors; nothing if both are zero."""
-    factors, rest = primals[:3], primals[3:]
-    parts = []
-    if any(type(t) is not ad.Zero for t in tangents[3:]):
-        parts.append(primitive.bind(*factors, *map(ad.instantiate_zeros, tangents[3:]), **params))
-    if any(type(t) is not ad.Zero for t in tangents[1:3]):
-        parts.append(by_factors.bind(*factors, *map(ad.instantiate_zeros, tangents[1:3]), *rest, **params))
-    return [reduce(ad.add_tangents, part) for part in zip(*parts, strict=True)]
+# Two sums of one scatter, together where both are asked for: reverse mode then passes over the particles once.
+
+
+def _scatter_differential(*args: Array, valued: bool, size: int, batched: int = 0, unroll: bool = False) -> list[Array]:
+    """The differential of a scatter by the factors and by what is given. Arguments: the factors, the differentials of
+    weights and weight derivatives, what is given, its differentials."""
+    del unroll
+    factors, changes, rest = args[:3], args[3:5], args[5:]
+    given, moved = rest[: len(rest) // 2], rest[len(rest) // 2 :]
+    params = {"valued": valued, "size": size, "batched": batched}
+    (by_given,), (by_factors,) = (
+        scatter_p.bind(*factors, *moved, **params),
+        _scatter_by_factors_p.bind(*factors, *changes, *given, **params),
+    )
+    return [by_given + by_factors]
+
+
+def _pull_and_gather(*args: Array, valued: bool, batched: int = 0, unroll: bool = False) -> list[Array]:
+    """Its transpose: the pull, and the gather of its nodes."""
+    del unroll
+    return [*pull_p.bind(*args, valued=valued, batched=batched), *gather_p.bind(*args[:4], batched=batched)]
+
+
+def _pulled_and_gathered(*args: ShapedArray, valued: bool) -> list[tuple]:
+    return _factor_rows(*args, valued=valued) + _particle_rows(*args[:4])
+
+
+_scatter_differential_p = _sum_primitive(
+    "stencil_scatter_differential",
+    _scatter_differential,
+    partial(_node_rows, first=5),
+    fits=lambda avals, batched: False,
+)
+_pull_and_gather_p = _sum_primitive("stencil_pull_and_gather", _pull_and_gather, _pulled_and_gathered)
+
+
+def _instantiated(tangents: Sequence[Any]) -> list[Array]:
+    """The tangents as arrays; none if all are zero."""
+    return [*map(ad.instantiate_zeros, tangents)] if any(type(t) is not ad.Zero for t in tangents) else []
+
+
+def _tangents(
+    primals: tuple,
+    tangents: tuple,
+    params: dict[str, Any],
+    primitive: Primitive,
+    by_factors: Primitive,
+    differential: Primitive | None,
+) -> list[Array]:
+    """The differentials of a sum's results; none if nothing changes."""
+    factors, rest, parts = primals[:3], primals[3:], []
+    changes, moved = map(_instantiated, (tangents[1:3], tangents[3:]))
+    if changes and moved and differential is not None:
+        return differential.bind(*factors, *changes, *rest, *moved, **params)
+    if moved:
+        parts.append(primitive.bind(*factors, *moved, **params))
+    if changes:
+        parts.append(by_factors.bind(*factors, *changes, *rest, **params))
+    return [reduce(jnp.add, part) for part in zip(*parts, strict=True)]
 
 
 def scatter_tangent(primals: tuple, tangents: tuple, **params: Any) -> Array | None:
     """The differential of a scatter's result; None if nothing changes."""
-    found = _tangents(scatter_p, _scatter_by_factors_p, primals, tangents, params)
+    found = _tangents(primals, tangents, params, scatter_p, _scatter_by_factors_p, _scatter_differential_p)
     return found[0] if found else None
 
 
-def _differentiate(primitive: Primitive, by_factors: Primitive, function: Callable[..., list[Array]]) -> None:
+def _differentiate(
+    primitive: Primitive,
+    by_factors: Primitive,
+    function: Callable[..., list[Array]],
+    differential: Primitive | None = None,
+) -> None:
     """Define the forward rules. The differential with respect to the factors is a primitive so that it has a transpose
-    of its own; its own differential, which only second derivatives need, is that of the sum as written."""
+    of its own; its own differential, which only second derivatives need, is that of the sum as written. `differential`
+    is that with respect to all arguments."""
 
     def jvp(primals: tuple, tangents: tuple, **params: Any) -> tuple[list[Array], list[Any]]:
         out = primitive.bind(*primals, **params)
-        changes = _tangents(primitive, by_factors, primals, tangents, params)
+        changes = _tangents(primals, tangents, params, primitive, by_factors, differential)
         return out, changes or [ad.Zero(jax.typeof(o)) for o in out]
 
     def jvp_by_factors(primals: tuple, tangents: tuple, *, batched: int, **params: Any) -> tuple:
@@ -250,6 +306,16 @@ def _differentiate(primitive: Primitive, by_factors: Primitive, function: Callab
     ad.primitive_jvps[by_factors] = jvp_by_factors
 
 
+def _jvp_of(parts: Callable[..., list[Array]]) -> Callable[..., tuple]:
+    """The forward rule of sums that are taken together, by the rules of each."""
+
+    def jvp(primals: tuple, tangents: tuple, **params: Any) -> tuple:
+        rest = tuple(map(ad.instantiate_zeros, tangents[1:]))
+        return jax.jvp(lambda *floats: parts(primals[0], *floats, **params), primals[1:], rest)
+
+    return jvp
+
+
 def _jvp_pull(primals: tuple, tangents: tuple, *, valued: bool, batched: int) -> tuple[list[Array], list[Any]]:
     """The pull is linear in f, and in a: its differential is a pull for each, and that of the sum as written by the
     factors."""
@@ -259,18 +325,19 @@ def _jvp_pull(primals: tuple, tangents: tuple, *, valued: bool, batched: int) ->
     parts = [[ad.Zero(jax.typeof(o)) for o in out]]
     if type(tangents[3]) is not ad.Zero:
         parts.append(pull_p.bind(*factors, tangents[3], *given, **params))
-    if any(type(t) is not ad.Zero for t in tangents[4:]):
-        parts.append(pull_p.bind(*factors, nodes, *map(ad.instantiate_zeros, tangents[4:]), **params))
-    if any(type(t) is not ad.Zero for t in tangents[1:3]):
+    if moved := _instantiated(tangents[4:]):
+        parts.append(pull_p.bind(*factors, nodes, *moved, **params))
+    if along := _instantiated(tangents[1:3]):
         written = members(partial(_pull, valued=valued, unroll=False), batched)
-        along = tuple(map(ad.instantiate_zeros, tangents[1:3]))
-        parts.append(jax.jvp(lambda w, g: written(factors[0], w, g, *primals[3:]), factors[1:], along)[1])
+        parts.append(jax.jvp(lambda w, g: written(factors[0], w, g, *primals[3:]), factors[1:], tuple(along))[1])
     return out, [reduce(ad.add_tangents, part) for part in zip(*parts, strict=True)]
 
 
 _differentiate(gather_p, _gather_by_factors_p, _gather)
-_differentiate(scatter_p, _scatter_by_factors_p, written_scatter)
+_differentiate(scatter_p, _scatter_by_factors_p, written_scatter, _scatter_differential_p)
 ad.primitive_jvps[pull_p] = _jvp_pull
+ad.primitive_jvps[_scatter_differential_p] = _jvp_of(_scatter_differential)
+ad.primitive_jvps[_pull_and_gather_p] = _jvp_of(_pull_and_gather)
 
 
 def _given(cotangents: list) -> tuple[list[Array], bool]:
@@ -316,6 +383,17 @@ def _transpose_scatter_by_factors(cotangents: list, *args: Any, valued: bool, si
     return [None, None, None, *_of_undefined(found, args[3:5]), *(None for _ in args[5:])]
 
 
+def _transpose_scatter_differential(cotangents: list, *args: Any, valued: bool, size: int, batched: int) -> list:
+    del size
+    nodes, rest = ad.instantiate_zeros(cotangents[0]), args[5:]
+    given, moved = rest[: len(rest) // 2], rest[len(rest) // 2 :]
+    by_weights, by_derivatives, *found = _pull_and_gather_p.bind(
+        *args[:3], nodes, *given, valued=valued, batched=batched
+    )
+    by_changes = _of_undefined((by_weights, by_derivatives), args[3:5])
+    return [None, None, None, *by_changes, *(None for _ in given), *_of_given(found, moved, valued)]
+
+
 def _transpose_pull(cotangents: list, *args: Any, valued: bool, batched: int) -> list:
     """Of what is linear in f, the scatter's differential by the factors; of what is linear in a, the gather's."""
     factors, changes = args[:3], map(ad.instantiate_zeros, cotangents)
@@ -337,4 +415,5 @@ ad.primitive_transposes[gather_p] = _transpose_gather
 ad.primitive_transposes[scatter_p] = _transpose_scatter
 ad.primitive_transposes[_gather_by_factors_p] = _transpose_gather_by_factors
 ad.primitive_transposes[_scatter_by_factors_p] = _transpose_scatter_by_factors
+ad.primitive_transposes[_scatter_differential_p] = _transpose_scatter_differential
 ad.primitive_transposes[pull_p] = _transpose_pull

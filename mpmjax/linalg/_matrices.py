@@ -107,8 +107,15 @@ def determinant(A: Matrix) -> Array:
 
 
 def cofactor(A: Matrix) -> Matrix:
-    """The cofactor matrix det(A) A⁻ᵀ = ∂ det A / ∂A. It is a polynomial in A, defined for singular A too."""
-    return assemble(cofactors(entries(A)))
+    """The cofactor matrix det(A) A⁻ᵀ = ∂ det A / ∂A. It is a polynomial in A, defined for singular A too.
+
+    In 2-D it is A turned by half a turn, with two signs: XLA does not vectorise a stack in what its derivative is fused
+    with.
+    """
+    if A.shape[0] != 2:
+        return assemble(cofactors(entries(A)))
+    signs = np.array([[1, -1], [-1, 1]], A.dtype).reshape(2, 2, *[1] * (A.ndim - 2))
+    return jnp.flip(A, axis=(0, 1)) * signs
 
 
 def cofactor_differential(A: Matrix, dA: Matrix) -> Matrix:

@@ -3,5 +3,6 @@
 from mpmjax.native._backend import Backend, backend, is_native
 from mpmjax.native._lowering import sums_fit
 from mpmjax.native._primitive import differentiable, members, native_primitive
+from mpmjax.native._written import written
 
-__all__ = ["Backend", "backend", "differentiable", "is_native", "members", "native_primitive", "sums_fit"]
+__all__ = ["Backend", "backend", "differentiable", "is_native", "members", "native_primitive", "sums_fit", "written"]

@@ -16,6 +16,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Int, Scalar, components, particle_first
 from mpmjax.checks import first_unmet, requirements
 from mpmjax.discretisation import Stencil, in_window
+from mpmjax.native import written
 from mpmjax.simulation._rollout_state import RolloutState
 from mpmjax.simulation._sorting import resorted
 from mpmjax.simulation._statistics import Fault, RunStatistics, no_steps, one_step
@@ -57,10 +58,10 @@ class Problem(eqx.Module):
             y: the state as the loop carries it.
             step: the number of steps since the rollout began.
         """
+        state = jax.tree.map(particle_first, written(y.particles))
         if y.order is None:
-            return self, y
+            return self, replace(y, particles=state)
         t = (self.start + step) * self.dt
-        state = jax.tree.map(particle_first, y.particles)
         state, order = resorted(y.order, self.scene, self.particles, state, t, step, self.save_every)
         scene, particles = order.put_into(self.scene, self.particles)
         return replace(self, scene=scene, particles=particles), replace(y, particles=state, order=order)

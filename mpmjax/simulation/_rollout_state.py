@@ -23,16 +23,14 @@ class RolloutState(eqx.Module):
     """The order of the particles in memory; None if it is that in which they were given."""
 
     def carried(self) -> "RolloutState":
-        """The same state as the loop over steps carries it, if it has an order: component first, as a step has its
-        arrays and rearranges them. XLA would else transpose all of them in each step."""
-        return self if self.order is None else replace(self, particles=jax.tree.map(components, self.particles))
+        """The same state as the loop over steps carries it: component first, as a step has its arrays. XLA would else
+        transpose all of them in each step."""
+        return replace(self, particles=jax.tree.map(components, self.particles))
 
     def as_given(self) -> "RolloutState":
-        """A carried state with the particles in the order in which they were given."""
-        if self.order is None:
-            return self
+        """A carried state, particle first again and in the order in which the particles were given."""
         state = jax.tree.map(particle_first, self.particles)
-        return replace(self, particles=self.order.undone(state), order=None)
+        return replace(self, particles=state if self.order is None else self.order.undone(state), order=None)
 
     def after(self, particles: Particles, info: StepInfo) -> "RolloutState":
         """The state after a step, from the particles after it and what it reports."""

@@ -30,6 +30,7 @@ from mpmjax.simulation._diffrax import Problem, StepSolver, examined, no_vector_
 from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccuracy
 from mpmjax.simulation._rollout_state import RolloutState, initial_state
 from mpmjax.simulation._run import Run
+from mpmjax.simulation._segments import checkpointed
 from mpmjax.simulation._sorting import memory_order
 from mpmjax.simulation._statistics import RunStatistics
 from mpmjax.state import Particles, Scene, prepare, state_of, with_state
@@ -74,8 +75,9 @@ def simulate(
         start: number of the first step, e.g. a former run's `final_step`; time there is start·dt. The impulse on
             colliders and boundaries (`run.collider_impulse`) is summed from here on, also in a run that continues
             another.
-        adjoint: how diffrax differentiates. Default: recursive checkpointing.
-        checkpoint_bytes: memory for the checkpoints of the default adjoint [B]. Fewer of them cost recomputation.
+        adjoint: how diffrax differentiates. Default: reverse mode by segments of steps.
+        checkpoint_bytes: memory for what reverse mode stores by default [B]. With less of it steps are computed again,
+            once if it is enough for the square root of their number.
         progress: show diffrax's progress meter.
         throw: raise on faults. With False the result says them in `statistics`, and a batch member that fails leaves
             the others alone.
@@ -119,7 +121,8 @@ def simulate(
         no_fault, unsolved, zero = jnp.zeros((), jnp.int32), UNSOLVED.format("the adjoint"), jnp.zeros((), dtype)
         (scene, particles, method), slot = guard((scene, particles, method), zero, no_fault, (), unsolved)
     if adjoint is None:
-        adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=max(1, min(count, checkpoint_bytes // state_bytes)))
+        step_bytes = state_bytes + _sum_bytes(scene, particles)
+        adjoint = checkpointed(count, state_bytes, step_bytes, checkpoint_bytes, stops=not traced)
     go = partial(
         integrate,
         scene,
@@ -239,6 +242,14 @@ def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
 def _bytes(state: RolloutState) -> int:
     """Size of a state [B]."""
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
+
+
+def _sum_bytes(scene: Scene, particles: Particles) -> int:
+    """About the size of what is stored of a step besides its state [B]: momentum and mass of the nodes, as much again
+    for solutions, and what the particles gather."""
+    d = particles.dim
+    numbers = 2 * (d + 1) * scene.grid.size + (d + d * d) * particles.count
+    return numbers * particles.x.dtype.itemsize
 
 
 class Saved(NamedTuple):
