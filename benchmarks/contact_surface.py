@@ -134,9 +134,13 @@ def places(wall: str, *some: float) -> list[float]:
 
 
 def rests(quick: bool) -> None:
-    print("Rest: height of the face over the wall [spacings], worst over the wall's places; 16 cells")
-    rows = [(wall, max((rest(16, 1, wall, at=a) for a in places(wall, 0.3, 0.5)), key=abs)) for wall in WALLS]
-    _print(rows, ("wall", "height"))
+    print("Rest: height of the face over the wall [spacings], worst over the wall's places; a bar, a square, a cube")
+    rows = []
+    for cells, d in ((16, 1),) if quick else ((16, 1), (6, 2), (4, 3)):
+        for wall in WALLS:
+            heights = [rest(cells, d, wall, at=a) for a in places(wall, 0.3, 0.5)]
+            rows.append((f"{wall[:18]} {cells}, {d}-D", max(heights, key=abs)))
+    _print(rows, ("wall, cells", "height"))
 
 
 def bars(quick: bool) -> None:
