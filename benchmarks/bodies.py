@@ -168,62 +168,108 @@ def slope(quick: bool) -> None:
         print(f"  {name}, μ = {friction}: {gained[0] / exact - 1:+.2%}")
 
 
-def roll(quick: bool) -> None:
-    """A disk of ten cells' diameter on a slab of 0.1 radians, with friction."""
+ROLLS = {"explicit": (mpm.Explicit(), 900), "semi-implicit": (mpm.SemiImplicit(), 200)}
+
+
+def rolled(name: str, friction: float = 0.5, t1: float = 1.0, cells: int = 10) -> tuple[float, float]:
+    """A disk of so many cells' diameter on a slab of its own softness, 0.1 radians steep: its way over that of a rigid
+    one that rolls, g sin θ t²/3, and what it has turned over its way by its radius."""
     R, angle, law = 0.5, 0.1, mpm.NeoHookean(1e6, 0.3)
-    grid = mpm.Grid((46, 22), 0.1, origin=(-3, -3))
+    grid = mpm.Grid((4 * cells + 6, 8 * cells // 5 + 6), 1 / cells, origin=(-3, -3))
     slab = mpm.fill(mpm.Box((0.0, 0.0), (4.0, 0.4)), grid, density=DENSITY)
     disk = mpm.fill(mpm.Ball((0.9, 0.4 + R), R), grid, density=DENSITY, fitted=True)
     gravity = (G * np.sin(angle), -G * np.cos(angle))
-    scene = mpm.Scene(grid, (law, law), gravity=gravity, boundary=HELD, bodies=mpm.Bodies(0.5))
-    t1 = 0.3 if quick else 1.0
-    for name, method, steps in (("explicit", mpm.Explicit(), 900), ("semi-implicit", mpm.SemiImplicit(), 200)):
-        run = mpm.simulate(scene, mpm.join(slab, disk), t1=t1, dt=t1 / steps, method=method)
-        x, v = (np.asarray(a)[slab.count :] for a in (run.final.x, run.final.v))
-        arm, slip = x - x.mean(axis=0), v - v.mean(axis=0)
-        spin = (arm[:, 0] * slip[:, 1] - arm[:, 1] * slip[:, 0]).sum() / (arm**2).sum()
-        way = x.mean(axis=0)[0] - float(disk.x[:, 0].mean())
+    scene = mpm.Scene(grid, (law, law), gravity=gravity, boundary=HELD, bodies=mpm.Bodies(friction))
+    method, steps = ROLLS[name]
+    steps = steps * cells // 10
+    run = mpm.simulate(scene, mpm.join(slab, disk), t1=t1, dt=t1 / steps, method=method)
+    before, after = np.asarray(disk.x), np.asarray(run.final.x)[slab.count :]
+    way = (after - before).mean(axis=0)[0]
+    turn = (after - after.mean(axis=0)).T @ (before - before.mean(axis=0))
+    turned = np.arctan2(turn[0, 1] - turn[1, 0], turn[0, 0] + turn[1, 1])  # clockwise, the rotation nearest to it
+    return float(way / (G * np.sin(angle) * t1**2 / 3)), float(turned * R / way)
+
+
+def roll(quick: bool) -> None:
+    """A disk that rolls, by integrators."""
+    for cells, name in product((10,) if quick else (10, 20), ROLLS):
+        way, turned = rolled(name, t1=0.3 if quick else 1.0, cells=cells)
         print(
-            f"a disk rolls, {name}: way over g sin θ t²/3 {way / (G * np.sin(angle) * t1**2 / 3):.4f}, "
-            f"−ωR/v {-spin * R / v.mean(axis=0)[0]:.3f}"
+            f"a disk of {cells} cells rolls, {name}: way over g sin θ t²/3 {way:.4f}, R angle/way {turned:.4f}",
+            flush=True,
         )
 
 
-def hertz(quick: bool) -> list[tuple]:
-    """Two equal cylinders that are pressed together: the half-width of contact over Hertz's, a² = 4PR*/(πE*), by the
-    pressure of the springs, and by the forces that they spread on the nodes around."""
-    E, nu, R, rows = 1e5, 0.3, 1.0, []
-    modulus = E / (2 * (1 - nu**2))
-    print("two cylinders: half-width over Hertz's")
-    for cells, press in ((24, 0.05),) if quick else ((32, 0.05), (48, 0.03), (48, 0.05)):
-        dx = R / cells
-        grid = mpm.Grid((int(1.05 * cells) + 6, 2 * cells + 6), dx, origin=(-3, -3))
-        whole = mpm.fill(
-            mpm.Ball((0.0, 0.0), R),
-            mpm.Grid((2 * cells + 8,) * 2, dx, origin=(-cells - 4,) * 2),
-            density=DENSITY,
-            fitted=True,
-        )
-        quarter = np.asarray((whole.x > 0).all(axis=1))
-        low = mpm.Particles(*(getattr(whole, name)[quarter] for name in ("x", "v", "mass", "volume")))
-        high = dataclasses.replace(low, x=jnp.stack([low.x[:, 0], 2 * R - low.x[:, 1]], axis=1))
-        down = mpm.Motion((0.0, 16.0, 20.0), ((0.0, 0.0), (0.0, -press), (0.0, -press)))
-        top = mpm.Grip(mpm.HalfSpace((0.0, 2 * R - 1e-9), (0.0, -1.0)), down, axes=(False, True))
-        walls = mpm.SymmetryPlane(0, 0.0), mpm.SymmetryPlane(1, 0.0), top
-        law = mpm.NeoHookean(E, nu)
-        scene = mpm.Scene(grid, (law, law), boundary=walls, bodies=mpm.Bodies(), boundary_forces=True)
-        run = mpm.simulate(scene, mpm.join(low, high), t1=20.0, dt=2.0, method=mpm.BackwardEuler(), save_every=2)
-        load = 2 * abs(float(run.boundary_forces().force[-1, 1, 1]))
-        contact, x = contact_of(scene, run.final, 20.0)
-        push = np.maximum(-np.where(np.isfinite(contact.gap), contact.gap, 0) * np.asarray(contact.stiffness), 0)
-        spread = np.asarray(contact.patch.spread(jnp.asarray(push)[:, None]))[:, 0]
-        half, wide = (2 * np.sqrt((p * x[:, 0] ** 2).sum() / p.sum()) for p in (push, spread))  # <x²> = a²/4 of Hertz's
-        exact = np.sqrt(4 * load * (R / 2) / (np.pi * modulus))
+def pressed(cells: int, press: float) -> dict:
+    """Two equal cylinders, of so many cells to the radius of 1 m, whose middles are brought nearer to each other by
+    `press` [m]: Hertz's half-width of the contact at the load that the grip feels, a² = 4PR*/(πE*), and the half-width
+    by three measures. By where the faces of the outermost particles part, which asks nothing of the contact; by the
+    pressure of the springs, and by the forces that they spread on the nodes around, whose second moments are a²/4."""
+    E, nu, R = 1e5, 0.3, 1.0
+    dx = R / cells
+    grid = mpm.Grid((int(1.05 * cells) + 6, 2 * cells + 6), dx, origin=(-3, -3))
+    whole = mpm.fill(
+        mpm.Ball((0.0, 0.0), R),
+        mpm.Grid((2 * cells + 8,) * 2, dx, origin=(-cells - 4,) * 2),
+        density=DENSITY,
+        fitted=True,
+    )
+    quarter = np.asarray((whole.x > 0).all(axis=1))
+    low = mpm.Particles(*(getattr(whole, name)[quarter] for name in ("x", "v", "mass", "volume")))
+    high = dataclasses.replace(low, x=jnp.stack([low.x[:, 0], 2 * R - low.x[:, 1]], axis=1))
+    down = mpm.Motion((0.0, 16.0, 20.0), ((0.0, 0.0), (0.0, -press), (0.0, -press)))
+    top = mpm.Grip(mpm.HalfSpace((0.0, 2 * R - 1e-9), (0.0, -1.0)), down, axes=(False, True))
+    walls = mpm.SymmetryPlane(0, 0.0), mpm.SymmetryPlane(1, 0.0), top
+    law = mpm.NeoHookean(E, nu)
+    scene = mpm.Scene(grid, (law, law), boundary=walls, bodies=mpm.Bodies(), boundary_forces=True)
+    run = mpm.simulate(scene, mpm.join(low, high), t1=20.0, dt=2.0, method=mpm.BackwardEuler(), save_every=2)
+    load = 2 * abs(float(run.boundary_forces().force[-1, 1, 1]))
+    contact, x = contact_of(scene, run.final, 20.0)
+    push = np.maximum(-np.where(np.isfinite(contact.gap), contact.gap, 0) * np.asarray(contact.stiffness), 0)
+    spread = np.asarray(contact.patch.spread(jnp.asarray(push)[:, None]))[:, 0]
+    last = np.split(np.asarray(run.final.x), 2)
+    centres = (0.0, 0.0), (0.0, 2 * R)
+    faces = map(faces_of, (low.x, high.x), centres, last, run.final.deformations)
+    return {
+        "hertz": float(np.sqrt(4 * load * (R / 2) / (np.pi * E / (2 * (1 - nu**2))))),
+        "faces": parting(*faces, R / 2),
+        **{name: 2 * np.sqrt((p * x[:, 0] ** 2).sum() / p.sum()) for name, p in (("springs", push), ("nodes", spread))},
+        "at": x[push > 0, 0],
+        "push": push[push > 0],
+        "dx": dx,
+    }
+
+
+def faces_of(X: np.ndarray, centre: tuple[float, float], x: np.ndarray, F: np.ndarray) -> np.ndarray:
+    """The faces of the outermost particles of a cylinder of radius 1 m that were at X and are at x: the points of its
+    surface above them, from left to right."""
+    arm = np.asarray(X) - centre
+    r = np.hypot(*arm.T)
+    outer = r > r.max() - 1e-9
+    depth = arm[outer] / r[outer, None] * (1.0 - r[outer, None])
+    faces = x[outer] + np.einsum("pij,pj->pi", np.asarray(F)[outer], depth)
+    return faces[np.argsort(faces[:, 0])]
+
+
+def parting(low: np.ndarray, high: np.ndarray, within: float) -> float:
+    """Where two surfaces that meet at x = 0 part, by points on them."""
+    low = low[low[:, 0] < within]
+    gap = np.interp(low[:, 0], *high.T) - low[:, 1]
+    k = np.flatnonzero(gap < 0).max()
+    return float(np.interp(0.0, gap[k : k + 2], low[k : k + 2, 0]))
+
+
+def hertz(quick: bool) -> dict:
+    """The half-width of the contact of two cylinders over Hertz's."""
+    print("two cylinders: half-width over Hertz's, by the faces of the particles, the springs, and the nodes' forces")
+    found = {}
+    for cells, press in ((24, 0.05),) if quick else ((32, 0.05), (48, 0.03), (64, 0.03), (48, 0.05)):
+        found = pressed(cells, press)
+        ratios = ", ".join(f"{found[name] / found['hertz']:.3f}" for name in ("faces", "springs", "nodes"))
         print(
-            f"  {cells} cells to the radius, {exact / dx:.1f} to the half-width: {half / exact:.3f}, {wide / exact:.3f}"
+            f"  {cells} cells to the radius, {found['hertz'] / found['dx']:.1f} to the half-width: {ratios}", flush=True
         )
-        rows.append((x[push > 0, 0], push[push > 0], exact, dx))
-    return rows
+    return found
 
 
 def rings(quick: bool) -> None:
@@ -323,9 +369,9 @@ def work(quick: bool) -> None:
         print(f"  {type(method).__name__}, {length}: {most:.3f} {push:+.3f} {lost:.3f}", flush=True)
 
 
-def draw(rows: list[tuple]) -> None:
+def draw(found: dict) -> None:
     """The pressure between the cylinders against Hertz's."""
-    x, push, exact, dx = rows[-1]
+    x, push, exact, dx = (found[name] for name in ("at", "push", "hertz", "dx"))
     columns = np.unique(np.round(x / dx).astype(int))
     force = np.array([push[np.round(x / dx).astype(int) == k].sum() for k in columns])
     share = np.where(columns == 0, 2, 1) * force / force.sum() / 2  # the node on the axis is half a node

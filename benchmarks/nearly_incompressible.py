@@ -231,14 +231,15 @@ def timed(scene: mpm.Scene, particles: mpm.Particles, dt: float, rtol: float, ch
 
 
 def solves(sizes: tuple[int, ...]) -> None:
-    """Print what solves take with each preconditioner: of Cook's membrane to rest, to 1e-9, and in a step of five times
-    dx/c_s, to 1e-8."""
+    """Print what solves take with own volumes, and with averaged ones and each preconditioner: of Cook's membrane to
+    rest, to 1e-9, and in a step of five times dx/c_s, to 1e-8."""
+    ways = {"own volumes": ("own volumes", "diagonal")} | {name: ("averaged", name) for name in PRECONDITIONERS}
     for cells in sizes:
         for nu in (0.3, 0.49, 0.499, 0.4999):
-            scene, particles = cook(cells, nu, VOLUMES["averaged"])
-            wave = 5 * float(scene.grid.spacing) * (2 * (1 + nu)) ** 0.5
+            scenes = {name: cook(cells, nu, volume) for name, volume in VOLUMES.items()}
+            wave = 5 * float(scenes["averaged"][0].grid.spacing) * (2 * (1 + nu)) ** 0.5
             for words, dt, rtol in (("to rest", 1e4, 1e-9), ("a step ", wave, 1e-8)):
-                found = [(name, *timed(scene, particles, dt, rtol, name)) for name in PRECONDITIONERS]
+                found = [(name, *timed(*scenes[volume], dt, rtol, way)) for name, (volume, way) in ways.items()]
                 told = ", ".join(f"{name} {count:5} iterations {1e3 * s:8.1f} ms" for name, count, s in found)
                 print(f"cook {cells:3} cells, nu {nu:6}, {words}: {told}", flush=True)
 

@@ -41,7 +41,7 @@ class VolumePreconditioner(AbstractPreconditioner):
     more than `largest` numbers, on periodic grids and with rigid parts, the diagonal is taken. In float32, C is bounded
     by what the precision can tell, about a thousand times shear. Solvers other than `ConjugateResidual` take the
     diagonal too.
-    *Good values*: for ν above 0.499 (docs/nearly_incompressible.md has iterations and times).
+    *Good values*: for ν from 0.49 on (docs/nearly_incompressible.md has iterations and times).
 
     Args:
         largest: largest number of entries of the factor, 2 K b². Default: 2·10⁷, 160 MB in float64.

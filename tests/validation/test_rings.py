@@ -32,7 +32,7 @@ def scattered_rings():
 def test_the_energy_amid_the_impact_is_the_published_one(bodies):
     """1.539e7 J after 0.2 s, of one velocity field, by APIC and the spline's gradient: a test of Tesserae.jl
     (`docs/literate/tutorials/collision.jl`, May 2026), with other points of the same kind. Those of three seeds give
-    1.535e7 to 1.575e7 J (`benchmarks/bodies.py --only rings`)."""
+    1.535e7 to 1.565e7 J of one field, 1.526e7 to 1.553e7 J of two bodies (`benchmarks/bodies.py --only rings`)."""
     particles, law = mpm.join(*scattered_rings()), mpm.NeoHookean(E, NU)
     grid = mpm.Grid((201, 77), DX, origin=(-100, -38))
     scene = mpm.Scene(grid, (law, law), gradient=mpm.SplineGradient(), bodies=bodies)

@@ -226,7 +226,9 @@ HELD = {
 @pytest.mark.thorough
 def test_flip_at_a_plain_wall_or_grip_keeps_what_is_not_the_walls():
     """Of a bar of 20 cells that vibrates for ten periods, held at one end, a plain wall takes no more than mirrors do:
-    0.2 % of its energy, where the velocity of nodes that it holds, taken from the particles, was 0.9 %."""
+    0.2 % of its energy, where the velocity of nodes that it holds, taken from the particles, was 0.9 %. These are means
+    over a period, within which the energy of explicit steps swings by 1.2 %: the last instant over the first is 2.1 %
+    lower before, 1.4 % now and 0.5 % between mirrors, since plain walls change the period a little."""
     cells, steps, lost = 20, 2600, {}
     dx, k = 1.0 / cells, np.pi / 2
     grid = mpm.Grid((cells + 12,), dx, origin=(-4,))
