@@ -167,7 +167,9 @@ def test_the_program_for_other_platforms_is_the_same_sum(d, monkeypatch):
     loops, kernel = (_transfer_sums._gather(*factors, nodes, unroll=unroll) for unroll in (False, True))
     jax.tree.map(lambda a, b: assert_close(a, b, 1e-15), loops, kernel)
     parts = given[0], given[1:]
-    loops, kernel = (_transfer_sums._scatter(*factors, *parts, valued=True, size=5**d, unroll=u) for u in (False, True))
+    loops, kernel = (
+        _transfer_sums.written_scatter(*factors, *parts, valued=True, size=5**d, unroll=u) for u in (False, True)
+    )
     assert_close(loops[0], kernel[0], 1e-14)
     traced = jax.jit(lambda given, nodes: (scatter(stencil, given[0], given[1:], 5**d), gather(stencil, nodes)))
     programs = {p: traced.trace(given, nodes).lower(lowering_platforms=(p,)).as_text() for p in ("cpu", "cuda")}

@@ -1,10 +1,8 @@
 """The nodes at the start of a step: mass, velocity and force from P2G, boundaries, and the elastic potential."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
 from operator import attrgetter
-from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -28,19 +26,11 @@ from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.state import Particles, Scene, load_force, points_of, supports_of
 from mpmjax.stepping._body_surfaces import contacts_of_bodies
+from mpmjax.stepping._nodal_sums import JoinedSum, SeparateSums, per_mass
 from mpmjax.stepping._particle_faces import faces_of
 from mpmjax.stepping._rigid_layers import RigidLayers, rigid_layers
 
-Fold = Callable[[NodeVector], NodeVector]
-"""A map from a nodal vector to its sum with its images at mirrors."""
-
 _PARALLEL = 1e-2  # a normal whose part in free components is smaller is prescribed by the others
-
-
-def per_mass(impulse: NodeVector, mass: NodeScalar) -> NodeVector:
-    """An impulse or force divided by the nodes' mass; zero on empty nodes."""
-    occupied = (mass > 0)[:, None]
-    return jnp.where(occupied, impulse / jnp.where(occupied, mass[:, None], 1), 0)
 
 
 class FreeNormal(eqx.Module):
@@ -52,99 +42,6 @@ class FreeNormal(eqx.Module):
     """Length of that part [-], shape (n,); 1 where there is none."""
     speed: NodeScalar
     """Velocity along it [m/s], shape (n,), at which the whole normal velocity is that of the collider."""
-
-
-class SeparateSums(eqx.Module):
-    """The result of P2G that sums momentum and force separately."""
-
-    separate: ClassVar[bool] = True
-    velocity: NodeVector
-    """v_i^n [m/s], shape (n, d); zero on empty nodes."""
-    force: NodeVector
-    """Internal force at the start of the step [N], shape (n, d): the elastic one, and for integrators with explicit
-    viscosity the viscous one."""
-    viscous_force: NodeVector | None
-    """The viscous part of `force` [N], shape (n, d); None unless it was asked for."""
-    acceleration: Array
-    """Body acceleration g [m/s²], shape (d,), or (n, d) where it varies."""
-
-    def explicit_velocity(self, nodes: "Nodes") -> NodeVector:
-        """v^n + Δt g + Δt f/m [m/s], shape (n, d)."""
-        return nodes.inertial_velocity() + nodes.dt * nodes.per_mass(self.force)
-
-    def with_force(self, nodes: "Nodes", force: NodeVector) -> "SeparateSums":
-        """The sums with a force on the nodes added [N], shape (n, d)."""
-        del nodes
-        return replace(self, force=self.force + force)
-
-    def moved_by(self, change: NodeVector) -> "SeparateSums":
-        """The sums with a velocity [m/s], shape (n, d), added to that of the nodes."""
-        return replace(self, velocity=self.velocity + change)
-
-    def folded(self, velocity: Fold, force: Fold) -> "SeparateSums":
-        """The same, with velocities, accelerations and forces folded at mirrors."""
-        viscous = None if self.viscous_force is None else force(self.viscous_force)
-        return SeparateSums(velocity(self.velocity), force(self.force), viscous, velocity(self.acceleration))
-
-
-class JoinedSum(eqx.Module):
-    """The result of P2G that adds the impulses of forces to the momentum in one sum, at half the cost."""
-
-    separate: ClassVar[bool] = False
-    viscous_force: ClassVar[None] = None
-    velocity_with_force: NodeVector
-    """v^n + Δt (g + f/m) [m/s], shape (n, d); zero on empty nodes."""
-
-    @property
-    def velocity(self) -> NodeVector:
-        """Not known.
-
-        Raises:
-            ValueError: always.
-        """
-        raise ValueError(_NOT_KNOWN_APART)
-
-    @property
-    def force(self) -> NodeVector:
-        """Not known.
-
-        Raises:
-            ValueError: always.
-        """
-        raise ValueError(_NOT_KNOWN_APART)
-
-    @property
-    def acceleration(self) -> Array:
-        """Not known.
-
-        Raises:
-            ValueError: always.
-        """
-        raise ValueError(_NOT_KNOWN_APART)
-
-    def explicit_velocity(self, nodes: "Nodes") -> NodeVector:
-        """v^n + Δt (g + f/m) [m/s], shape (n, d)."""
-        del nodes
-        return self.velocity_with_force
-
-    def moved_by(self, change: NodeVector) -> "JoinedSum":
-        """The sum with a velocity [m/s], shape (n, d), added to that of the nodes."""
-        return JoinedSum(self.velocity_with_force + change)
-
-    def with_force(self, nodes: "Nodes", force: NodeVector) -> "JoinedSum":
-        """The sums with a force on the nodes added [N], shape (n, d)."""
-        return JoinedSum(self.velocity_with_force + nodes.dt * nodes.per_mass(force))
-
-    def folded(self, velocity: Fold, force: Fold) -> "JoinedSum":
-        """The same, with velocities and forces folded at mirrors."""
-        del force
-        return JoinedSum(velocity(self.velocity_with_force))
-
-
-_NOT_KNOWN_APART = (
-    "P2G summed momentum and forces in one, so v^n, g and the force are not known apart: only "
-    "nodes.explicit_velocity() is. An integrator that uses them must have needs_separate_force = True."
-)
 
 
 class Nodes(AbstractNodes):
@@ -268,11 +165,11 @@ class Nodes(AbstractNodes):
 
     def explicit_velocity(self) -> NodeVector:
         """v* = v^n + Δt f/m + Δt g [m/s], shape (n, d) (derivation, eq. 4)."""
-        return self.sums.explicit_velocity(self)
+        return self.sums.explicit_velocity(self.mass, self.dt)
 
     def inertial_velocity(self) -> NodeVector:
         """v^n + Δt g [m/s], shape (n, d)."""
-        return jnp.where(self.occupied, self.velocity + self.dt * self.acceleration, 0)
+        return self.sums.inertial_velocity(self.mass, self.dt)
 
     def admitted(self, velocity: NodeVector) -> NodeVector:
         """A velocity that is zero on empty nodes, with the prescribed values in held components [m/s], shape (n, d)."""
@@ -325,7 +222,7 @@ class Nodes(AbstractNodes):
         nodes = replace(self.folded(images), conditions=replace(self.conditions, fixed=fixed, holds=True))
         if springs or couplings:
             nodes = eqx.tree_at(lambda n: (n.potential.springs, n.potential.couplings), nodes, (springs, couplings))
-            nodes = replace(nodes, sums=nodes.sums.with_force(nodes, nodes.potential.spring_force(None)))
+            nodes = replace(nodes, sums=nodes.sums.with_force(nodes.potential.spring_force(None), nodes.mass, self.dt))
         if normals is None or colliders is None:
             return nodes
         return eqx.tree_at(lambda n: n.conditions.colliders.held, nodes, colliders.held | normals)
