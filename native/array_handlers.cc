@@ -2,7 +2,7 @@
 //
 //   combine   a, b, c, d, scales, weight, active             ->  y, z, sum
 //   product   force, v, mass, factor, free, weight, active   ->  image, sum
-//   slope     whole, means, by means, by whole               ->  by sums
+//   slope     whole, means, by means [, by whole]            ->  by sums
 //   eigen     S                                              ->  w, V
 //   rotation  F                                              ->  R
 //   order     keys                                           ->  order
@@ -62,13 +62,15 @@ struct ProductOf {
   }
 };
 
+template <bool by_whole>
 struct SlopeOf {
   template <class T>
   void run(const Pool& pool, Call& call) const {
     const int64_t n = call.dim(0, 1), others = call.dim(1, 1);
-    const Slope<T> task = {call.at<T>(0, {n}), call.at<T>(1, {n, others}),     call.at<T>(2, {n, others}),
-                           call.at<T>(3, {n}), call.at<T>(4, {n, others + 1}), n,
-                           others + 1};
+    Slope<T> task = {call.at<T>(0, {n}), call.at<T>(1, {n, others}), call.at<T>(2, {n, others}), nullptr, nullptr, n,
+                     others + 1};
+    if (by_whole) task.by_whole = call.at<T>(3, {n});
+    task.by_sums = call.at<T>(by_whole ? 4 : 3, {n, others + 1});
     if (call.fault.empty()) slope(pool, call.batch, task);
   }
 };
@@ -171,7 +173,10 @@ ffi::Error run_written(ffi::RemainingArgs from, ffi::RemainingRets to) {
 
 constexpr auto run_combine = run<CombineOf, 7, 3, 1>;
 constexpr auto run_product = run<ProductOf, 7, 2, 1>;
-constexpr auto run_slope = run<SlopeOf, 4, 1, 1>;
+ffi::Error run_slope(ffi::ThreadPool threads, ffi::RemainingArgs from, ffi::RemainingRets to) {
+  return from.size() == 3 ? run<SlopeOf<false>, 3, 1, 1>(threads, from, to) : run<SlopeOf<true>, 4, 1, 1>(threads, from, to);
+}
+
 constexpr auto run_eigen = run<EigenOf, 1, 2, 3>;
 constexpr auto run_rotation = run<RotationOf, 1, 1, 3>;
 

@@ -37,7 +37,7 @@ void divide_all(const Average<T>& task, int64_t first, int64_t last) {
 template <class T, int d, int s>
 void average(const Average<T>& task, int64_t first, int64_t last) {
   const int64_t columns = task.columns, others = columns - 1;
-  mark<T, d, s>(task.stencils, task.ranges, task.reached, first, last);
+  if (task.reached != nullptr) mark<T, d, s>(task.stencils, task.ranges, task.reached, first, last);
   over_alike(task.reached, first, last, [&](bool reached, int64_t from, int64_t to) {
     if (reached) {
       clear(task.sums, nullptr, from * columns, to * columns);

@@ -258,6 +258,10 @@ int check_slope(const std::vector<const Pool*>& pools) {
         slope(*pool, batch, Slope<T>{whole.data.get(), means.data.get(), by_means.data.get(), by_whole.data.get(),
                                      found.data.get(), n, c});
         compare("slope", {1, 0, batch, 0, n, c}, found, expected, scale);
+        // The same without slopes by the weights.
+        slope(*pool, batch, Slope<T>{whole.data.get(), means.data.get(), by_means.data.get(), nullptr, found.data.get(), n, c});
+        for (int64_t i = 0; i < whole.size; ++i) found[i * c + others] += whole[i] == 0 ? 0 : by_whole[i];
+        compare("slope by means", {1, 0, batch, 0, n, c}, found, expected, scale);
       }
       ++examples;
     }

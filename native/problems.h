@@ -65,7 +65,7 @@ struct Scatter {
   Given<T> given;
   T* nodes;             // (n, c)
   const Range* ranges;  // of each block, or null
-  bool* reached;        // false, for each of the ⌈n/64⌉ blocks of nodes; or null, where it does not matter
+  bool* reached;        // false, for each of the ⌈n/64⌉ blocks of nodes; or null, where nodes are few
   int64_t size;
   int64_t columns;
   const bool* wanted;  // which of the nodes' ⌈n c/64⌉ blocks are, null for all; others may become anything
@@ -80,8 +80,8 @@ struct Average {
   T* whole;             // the last column, (n)
   T* means;             // the others divided by it, (n, c − 1)
   T* sums;              // memory to work in, (n, c)
-  const Range* ranges;  // of each block
-  bool* reached;        // false, for each of the ⌈n/64⌉ blocks of nodes
+  const Range* ranges;  // as in a scatter, and so the next
+  bool* reached;
   int64_t size;
   int64_t columns;  // c
 };

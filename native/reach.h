@@ -35,9 +35,11 @@ void mark(const Stencils<T>& stencils, const Range* ranges, bool* reached, int64
   }
 }
 
-// Calls run(whether they are reached, first, last) for nodes of a range, as many together as are alike.
+// Calls run(whether they are reached, first, last) for nodes of a range, as many together as are alike; where none is
+// marked as if all were.
 template <class Run>
 void over_alike(const bool* reached, int64_t first, int64_t last, const Run& run) {
+  if (reached == nullptr) return run(true, first, last);
   for (int64_t end, start = first; start < last; start = end) {
     const bool alike = reached[start / kTogether];
     int64_t k = start / kTogether + 1;

@@ -16,7 +16,7 @@ void pull_back(const Slope<T>& task, int64_t first, int64_t last) {
   for (int64_t i = first; i < last; ++i) {
     const T whole = task.whole[i];
     T* to = task.by_sums + i * c;
-    T by_whole = whole == 0 ? T(0) : task.by_whole[i];
+    T by_whole = whole == 0 || task.by_whole == nullptr ? T(0) : task.by_whole[i];
     for (int64_t k = 0; k < others; ++k) {
       to[k] = whole == 0 ? T(0) : task.by_means[i * others + k] / whole;
       by_whole -= to[k] * task.means[i * others + k];
@@ -51,7 +51,7 @@ void slope_all(const Pool& pool, int64_t batch, const Slope<T>& all) {
     const Slope<T> task = {all.whole + nodes,
                            all.means + nodes * others,
                            all.by_means + nodes * others,
-                           all.by_whole + nodes,
+                           all.by_whole == nullptr ? nullptr : all.by_whole + nodes,
                            all.by_sums + nodes * all.columns,
                            all.size,
                            all.columns};

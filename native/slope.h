@@ -15,7 +15,7 @@ struct Slope {
   const T* whole;     // M, (n)
   const T* means;     // a, (n, c − 1)
   const T* by_means;  // g, (n, c − 1)
-  const T* by_whole;  // h, (n)
+  const T* by_whole;  // h, (n), or null for zero
   T* by_sums;         // (n, c)
   int64_t size;
   int64_t columns;  // c

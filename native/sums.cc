@@ -83,7 +83,7 @@ Average<T> member(Average<T> all, Form form, int64_t i) {
   all.whole += i * all.size;
   all.means += i * all.size * (all.columns - 1);
   all.sums += i * all.size * all.columns;
-  all.reached += i * blocks_of(all.size);
+  if (all.reached != nullptr) all.reached += i * blocks_of(all.size);
   return all;
 }
 
@@ -214,15 +214,21 @@ bool pull_all(const Pool& pool, Form form, int64_t batch, const Pull<T>& all) {
   return true;
 }
 
+// Sets all nodes of a scatter or an average. Where they are too many for a cache, those that no particle reaches are told.
+template <class T, class Problem>
+void set_nodes(const Pool& pool, Form form, int64_t batch, Problem all, const Kernels<T>& kernels,
+               void (*run)(const Problem&, int64_t, int64_t)) {
+  const bool large = all.size * all.columns * static_cast<int64_t>(sizeof(T)) > kCached;
+  const Vectors<bool> reached = large ? zeros<bool>(batch * blocks_of(all.size)) : nullptr;
+  all.reached = reached.get();
+  divide(pool, form, batch, all, kernels, large).over_nodes(pool, form, batch, all, run);
+}
+
 template <class T>
 bool scatter_all(const Pool& pool, Form form, int64_t batch, const Scatter<T>& all) {
   const Kernels<T>* found = kernels(T(), form.d, form.s, form.differential);
   if (found == nullptr) return false;
-  const bool large = all.size * all.columns * static_cast<int64_t>(sizeof(T)) > kCached && all.wanted == nullptr;
-  const Vectors<bool> reached = large ? zeros<bool>(batch * blocks_of(all.size)) : nullptr;
-  Scatter<T> task = all;
-  task.reached = reached.get();
-  divide(pool, form, batch, task, *found, large).over_nodes(pool, form, batch, task, found->scatter);
+  set_nodes(pool, form, batch, all, *found, found->scatter);
   return true;
 }
 
@@ -230,10 +236,7 @@ template <class T>
 bool average_all(const Pool& pool, Form form, int64_t batch, const Average<T>& all) {
   const Kernels<T>* found = kernels(T(), form.d, form.s, false);
   if (found == nullptr) return false;
-  const Vectors<bool> reached = zeros<bool>(batch * blocks_of(all.size));
-  Average<T> task = all;
-  task.reached = reached.get();
-  divide(pool, form, batch, task, *found, true).over_nodes(pool, form, batch, task, found->average);
+  set_nodes(pool, form, batch, all, *found, found->average);
   return true;
 }
 

@@ -6,8 +6,6 @@ from typing import Any
 import jax
 from jax.ad_checkpoint import checkpoint_name
 
-from mpmjax.native import written
-
 _KEPT, _SUMS = "mpmjax_kept", "mpmjax_sums"
 
 
@@ -26,7 +24,7 @@ def kept(tree: Any) -> Any:
 
 def kept_sums(tree: Any) -> Any:
     """The tree, its arrays sums over stencils, which may be stored."""
-    return written(_named(tree, _SUMS))
+    return _named(tree, _SUMS)
 
 
 def _named(tree: Any, name: str) -> Any:

@@ -68,19 +68,21 @@ def _divided(change: Array, whole: Array, means: Array, unroll: bool = False) ->
     return [d_whole, jnp.where(some[:, None], d_means, 0)]
 
 
-def _slope(whole: Array, means: Array, by_means: Array, by_whole: Array, unroll: bool = False) -> list[Array]:
-    """The transpose of `_divided`: slopes by the sums, (n, k + 1), from those by averages and whole weights."""
+def _slope(whole: Array, means: Array, by_means: Array, *by_whole: Array, unroll: bool = False) -> list[Array]:
+    """The transpose of `_divided`: slopes by the sums, (n, k + 1), from those by averages, and by whole weights if they
+    are not zero."""
     del unroll  # there is no loop
     some = whole > 0
     by_value = jnp.where(some[:, None], by_means, 0) / jnp.where(some, whole, 1)[:, None]
-    by_weight = jnp.where(some, by_whole, 0) - (by_value * means).sum(axis=1)
+    by_weight = sum((jnp.where(some, by, 0) for by in by_whole), -(by_value * means).sum(axis=1))
     return [jnp.concatenate([by_value, by_weight[:, None]], axis=1)]
 
 
 def _transpose_divided(cotangents: list, change: Any, whole: Array, means: Array, *, batched: int) -> list:
     del change
-    by_whole, by_means = map(ad.instantiate_zeros, cotangents)
-    return [*_slope_p.bind(whole, means, by_means, by_whole, batched=batched), None, None]
+    by_whole = [] if type(cotangents[0]) is ad.Zero else [cotangents[0]]
+    by_means = ad.instantiate_zeros(cotangents[1])
+    return [*_slope_p.bind(whole, means, by_means, *by_whole, batched=batched), None, None]
 
 
 def _shapes(*args: ShapedArray, size: int) -> list[tuple]:
