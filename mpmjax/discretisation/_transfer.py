@@ -220,8 +220,8 @@ def g2p(
         affine = [*gradients]
     elif transfer.affine:
         ends = [field for field in (after, change) if field is not None]
-        _, gradients = written(kept_sums(gather(stencil.least_squares, jnp.concatenate(ends, axis=1))))
-        found = _split_gradients(gradients, len(ends))
+        _, slopes = written(kept_sums(gather(stencil.least_squares, jnp.concatenate(ends, axis=1))))
+        found = _split_gradients(slopes, len(ends))
         affine[0] = found[0]
         if change is not None:
             affine[-1] = found[-1]
