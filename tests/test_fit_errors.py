@@ -159,9 +159,16 @@ def test_bad_questions_get_one_line(fall, call, says):
 
 
 @pytest.mark.thorough
-def test_a_run_that_has_no_forward_derivative_is_told_what_to_do(fall):
+def test_a_prediction_takes_any_run_that_has_a_forward_derivative(fall):
+    """A run as it is has the one of `ForwardMode`. One whose checkpoints move has none, and it is said what to do."""
+
+    def middle(adjoint):
+        return mpm.predict(fall[1], lambda e: e.run(adjoint=adjoint).final.x.mean())
+
+    plain, forward = middle(None), middle(diffrax.ForwardMode())
+    assert np.allclose([plain.value, plain.lower], [forward.value, forward.lower], rtol=1e-12)
     with pytest.raises(ValueError, match="ForwardMode"):
-        mpm.predict(fall[1], lambda e: e.run().final.x)
+        middle(diffrax.RecursiveCheckpointAdjoint(checkpoints=2))
 
 
 class Abrupt(FitProblem):
