@@ -22,12 +22,13 @@ All methods start from the same state, but for the wave: there, those whose velo
 positions (explicit, semi-implicit, backward Euler) start with such, which makes explicit steps second order.
 
 With `--peers`, MLS-MPM in Taichi and in Warp (`peers/`) runs the two problems it can, from the same particles, on the
-same grids, with the same steps. Before that is timed, centre of mass and energy after some steps must agree with this
-package's to what the precision allows.
+same grids, with the same steps. Before that is timed, centre of mass and energy after some steps without a wall must
+agree with this package's to what the precision allows. Walls of the peers hold nodes, those of this package faces.
 """
 
 import argparse
 import csv
+import dataclasses
 import math
 import sys
 import time
@@ -65,12 +66,12 @@ CHOICES = {
     "PIC": {"transfer": mpm.PIC()},
     "linear": {"kernel": mpm.BSpline(1)},
     "cubic": {"kernel": mpm.BSpline(3)},
-    "plain wall": {"wall": "plain"},
+    "mirrored wall": {"wall": "mirrored"},
     "float32": {"dtype": "float32"},
 }
 """Besides quadratic kernel, APIC, the moving-least-squares gradient, float64."""
 COLOURS = dict(zip([*UPDATES, "Taichi", "Warp"], ["C0", "C1", "C3", "C4", "C2", "C9", "C5", "C7"], strict=True))
-MARKERS = {"FLIP": "^", "PIC": "v", "linear": "D", "cubic": "P", "plain wall": "s"}
+MARKERS = {"FLIP": "^", "PIC": "v", "linear": "D", "cubic": "P", "mirrored wall": "s"}
 DASHES = {"total": "-", "updated": "--"}
 EXPLICIT_STEPS = 2.0, 2**0.5, 1.0, 0.5
 """In units of `stable_dt`."""
@@ -209,7 +210,7 @@ def spin(n: int, **choices: Any) -> tuple[mpm.Scene, mpm.Particles]:
     return mpm.Scene(grid, mpm.NeoHookean(1e5, 0.3), gravity=(0.0, -1.5), **choices), block
 
 
-def impact(n: int, wall: str = "mirrored", **choices: Any) -> tuple[mpm.Scene, mpm.Particles]:
+def impact(n: int, wall: str = "plain", **choices: Any) -> tuple[mpm.Scene, mpm.Particles]:
     """A block hits a floor and leaves it."""
     grid = mpm.Grid((20 * n + 1, 16 * n + 1), 1 / (16 * n))
     block = mpm.fill(mpm.Box((0.375, 0.25), (0.875, 0.75)), grid, density=1e3, velocity=(0.0, -2.5))
@@ -312,15 +313,15 @@ PROBLEMS = {
         (
             "explicit, updated",
             "midpoint, updated",
-            "explicit, updated, plain wall",
+            "explicit, updated, mirrored wall",
             "TR-BDF2, updated",
             "semi-implicit β = 1, updated",
-            "explicit, updated, plain wall, float32",
+            "explicit, updated, float32",
             "explicit, updated, FLIP",
         ),
         grids=(1, 2, 4),
         target=5e-2,
-        peers="explicit, updated, plain wall",
+        peers="explicit, updated",
     ),
 }
 
@@ -350,7 +351,7 @@ def reference_of(problem: Problem, limits: Limits) -> Reference:
         print(f"  reference: {name_of(trial.method)} in {trial.steps} steps, spacing / {trial.refinement}", end="")
         print(f", {trial.seconds:.2g} s, known to {trial.error:.1e}", flush=True)
         return Reference(limit, trial.error, lambda n: motion)
-    states, _ = coarse.run(mpm.TRBDF2(), 4 * FRAMES)
+    states = coarse.run(mpm.TRBDF2(), 4 * FRAMES).states
     assert states is not None
     return Reference(coarse.limit(states), 0.0, lambda n: exact_motion(problem, n))
 
@@ -462,12 +463,13 @@ def peer_of(own: Bench, make: Callable[..., Any], dtype: str) -> Any:
 
 
 def require_agreement(problem: Problem, codes: list[tuple[str, Callable[..., Any], str]], dt: float) -> None:
-    """Centre of mass and energy after forty steps."""
-    own = bench_of(problem, problem.peers or "", 1, math.inf)
-    ours = mpm.rollout(own.scene, own.particles, steps=40, dt=dt)
+    """Centre of mass and energy after ten steps, without walls: those of the peers act at nodes."""
+    own = bench_of(problem, problem.peers or "", 1)
+    own = own._replace(scene=dataclasses.replace(own.scene, boundary=()))
+    ours = mpm.rollout(own.scene, own.particles, steps=10, dt=dt)
     centre, energy = balance(own.scene, ours, *(np.asarray(a) for a in (ours.x, ours.v, ours.F)))
     for code, make, dtype in codes:
-        theirs = balance(own.scene, ours, *peer_of(own, make, dtype).run(40, dt))
+        theirs = balance(own.scene, ours, *peer_of(own, make, dtype).run(10, dt))
         if np.abs(theirs[0] - centre).max() > CLOSE[dtype] or abs(theirs[1] / energy - 1) > CLOSE[dtype]:
             raise SystemExit(
                 f"{code}, {dtype} disagrees: centre {theirs[0]} and {centre}, energy {theirs[1]}, {energy}."
