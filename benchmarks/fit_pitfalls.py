@@ -97,7 +97,8 @@ def identifiability(quick: bool) -> plt.Figure:
     cost = jax.jit(lambda rho: jax.lax.map(lambda s: misfit(experiment)(s, rho), jnp.asarray(factors), batch_size=8))
     chi = np.stack([np.asarray(cost(rho)) for rho in factors])
     prior = mpm.Gaussian(1.0, 0.03)
-    weighed = np.asarray(prior.residuals(jnp.asarray(factors)) ** 2)[:, None]
+    densities = jnp.asarray(factors)
+    weighed = np.asarray(prior.residuals(densities, densities) ** 2)[:, None]
     mass = experiment.particles.mass
     heavier = mpm.Positive(update=lambda e, f: eqx.tree_at(lambda e: e.particles.mass, e, f * mass), start=1.1)
     with warnings.catch_warnings(record=True) as said:
