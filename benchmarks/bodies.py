@@ -229,10 +229,10 @@ def pressed(cells: int, press: float) -> dict:
     spread = np.asarray(contact.patch.spread(jnp.asarray(push)[:, None]))[:, 0]
     last = np.split(np.asarray(run.final.x), 2)
     centres = (0.0, 0.0), (0.0, 2 * R)
-    faces = map(faces_of, (low.x, high.x), centres, last, run.final.deformations)
+    faces, others = map(faces_of, (low.x, high.x), centres, last, run.final.deformations)
     return {
         "hertz": float(np.sqrt(4 * load * (R / 2) / (np.pi * E / (2 * (1 - nu**2))))),
-        "faces": parting(*faces, R / 2),
+        "faces": parting(faces, others, R / 2),
         **{name: 2 * np.sqrt((p * x[:, 0] ** 2).sum() / p.sum()) for name, p in (("springs", push), ("nodes", spread))},
         "at": x[push > 0, 0],
         "push": push[push > 0],

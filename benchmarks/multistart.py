@@ -36,7 +36,7 @@ from mpmjax.fitting._starting_points import starting_points, unit_points
 NOISE = 1e-4
 PARAMETERS = {
     "E": mpm.Positive(lambda e: e.scene.material.youngs_modulus, start=1e5),
-    "nu": mpm.Bounded(lambda e: e.scene.material.poisson_ratio, 0.0, 0.49, start=0.2),
+    "nu": mpm.Bounded(lambda e: e.scene.material.poisson_ratio, lower=0.0, upper=0.49, start=0.2),
 }
 OSCILLATIONS = {
     "frequency, 5 periods": ((1.0,), (1.0,), 30.0, 0),

@@ -28,7 +28,7 @@ MEASURED = ("step", "few", "more", "resist", "in parts", "gradient")
 STEPS = 20
 
 
-def tasks(numbers: tuple, dtype: str) -> dict:
+def tasks(numbers: tuple[int, int, int, int], dtype: str) -> dict:
     """What is timed, each with the steps or iterations that its seconds are divided by."""
     import jax
     import jax.numpy as jnp

@@ -96,7 +96,8 @@ def tolerances(n: int, multiple: float, steps: int, rtols: tuple[float, ...]) ->
         slope_error = abs(float(slope / exact_slope) - 1)
         return {"guess": guess, "rtol": rtol, "motion": error, "gradient": slope_error, "seconds": seconds}
 
-    rows = [row("the step", 0.0, *(f(1e-10) for f in functions(GUESSES[0], 4)), float("nan"))]
+    motion, slope = functions(GUESSES[0], 4)
+    rows = [row("the step", 0.0, motion(1e-10), slope(1e-10), float("nan"))]
     for guess in GUESSES:
         motion, slope = functions(guess)
         for rtol in rtols:
