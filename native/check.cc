@@ -358,6 +358,11 @@ int check_all(const std::vector<const Pool*>& pools) {
   for (int oddity = -1; oddity < 3; ++oddity) check_both({2, 3, 1, 20011, 40, 3}, oddity);
   check_both({1, 2, 3, 30011, 999, 1}, 1);
   check_in_order<T>({2, 3, 2, 20011, 40, 2}, random, pools);
+  // More nodes than a cache holds: those that no particle reaches are marked, and set to zero apart.
+  for (int oddity = -1; oddity < 3; ++oddity) {
+    const Example<T> wide({3, 3, 1, 2503, 100, 3}, oddity, random);
+    check(wide, pools), check_average(wide, pools), ++examples;
+  }
   for (int d = 1; d <= 3; ++d) {
     const Example<T> e({d, 3, 3, 53, 6, 1}, 0, random);
     check_solve(e, random, pools), ++examples;

@@ -139,15 +139,30 @@ def test_derivatives_agree(d, graded):
     agree(derivatives(native_), derivatives(written_), "float64", 500)  # slopes along all at once are sums that cancel
 
 
-def averaged(of, index, w, g, given, gradients, k=2):
+def averaged(of, index, w, g, given, gradients, k=2, side=SIDE):
     """Whole weights and averages of k columns, of positive numbers: some nodes are light, and some are empty."""
     positive = index, jnp.abs(w), g, jnp.asarray(0.3, w.dtype), jnp.abs(given[: k + 1])
     parts = positive if gradients is None else (*positive, gradients[:, :k])
-    return of(*parts, size=2 * SIDE ** len(index))
+    return of(*parts, size=2 * side ** len(index))
 
 
 averaged_by_library = partial(averaged, partial(_average._average_p.bind, batched=0))
 averaged_as_written = partial(averaged, partial(_average._average, unroll=False))
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize("p", [45, *thorough(3000)])
+def test_wide_windows_agree(p, choose):
+    """Of more nodes than a cache holds the library looks at those alone that particles reach, other ones in each call."""
+    choose("native")
+    wide = {"k": 2, "side": 70}
+    pairs = [tuple(map(jax.jit, (native, written)))]
+    pairs.append(tuple(jax.jit(partial(of, **wide)) for of in (averaged_by_library, averaged_as_written)))
+    for seed in (0, 1, 0):
+        index, w, g, given, nodes = problem(3, 3, 3, p, "float32", seed, side=70)
+        assert nodes.nbytes > 2**21
+        for (library, plain), args in zip(pairs, ((given, nodes), (given[0], given[1:])), strict=True):
+            agree(library(index, w, g, *args), plain(index, w, g, *args), "float32")
 
 
 @NEEDS_LIBRARY

@@ -38,7 +38,7 @@ def with_native(
 
     def rule(ctx: Any, *args: Any, **params: Any) -> Any:
         avals = ctx.avals_in
-        if not uses_native()[0] or not fits(avals, params["batched"]) or _is_divided(ctx.module_context):
+        if not uses_native()[0] or not fits(avals, params["batched"]) or is_divided(ctx.module_context):
             return written(ctx, *args, **params)
         told = {"valued": np.bool_(params["valued"])} if "valued" in params else {}
         told |= {name: np.bool_(value) for name, value in attributes.items()}
@@ -58,7 +58,7 @@ def sums_fit(avals: Any, batched: int) -> bool:
     return known and same and d in (1, 2, 3) and s in (2, 3, 4)
 
 
-def _is_divided(context: Any) -> bool:
+def is_divided(context: Any) -> bool:
     """Whether XLA divides the program that is being lowered among several devices."""
     axes = context.axis_context
     manual = getattr(axes, "manual_axes", None)

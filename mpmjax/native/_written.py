@@ -8,6 +8,7 @@ from jax.interpreters import ad, batching, mlir
 
 from mpmjax.native._backend import uses_native
 from mpmjax.native._library import target
+from mpmjax.native._lowering import is_divided
 
 
 def written(tree: Any) -> Any:
@@ -43,7 +44,7 @@ def _some(changes: Any) -> list[Any]:
 
 
 def _lowered(ctx: Any, *arrays: Any) -> Any:
-    if not uses_native()[0] or not arrays:
+    if not arrays or not uses_native()[0] or is_divided(ctx.module_context):
         return arrays
     aliases = {i: i for i in range(len(arrays))}
     return jax.ffi.ffi_lowering(target("written"), operand_output_aliases=aliases)(ctx, *arrays)

@@ -73,8 +73,9 @@ def checkpointed(
         stops: whether a fault may stop the run, which ends diffrax's loop alone.
     """
     for loops in () if stops else range(1, _MOST_LOOPS + 1):
-        if _turns(steps, loops) * ((loops - 1) * state_bytes + step_bytes) <= budget:
-            return SegmentAdjoint(_lengths(steps, loops))
+        *outer, inner = _lengths(steps, loops)
+        if sum(outer) * state_bytes + inner * step_bytes <= budget:
+            return SegmentAdjoint((*outer, inner))
     return diffrax.RecursiveCheckpointAdjoint(checkpoints=max(1, min(steps, budget // state_bytes)))
 
 
