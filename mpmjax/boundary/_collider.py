@@ -4,7 +4,8 @@ particles' faces.
 A node lies in a collider up to a thousandth of a spacing off its surface; its normal there is the gradient of the
 shape's distance, and its velocity that of the collider's own point, the chord over the step. Which nodes lie in it has
 no derivative; normals and velocities have, with respect to the motion and the shape. Where two bodies share a node, the
-rules of `combine` apply.
+rules of `combine` apply. All this is of what holds nodes: `SeparatingCollider` pushes faces, and has derivatives by its
+place and size.
 """
 
 from dataclasses import replace

@@ -68,7 +68,7 @@ def fit(
         report: what else to report with its error, by name: functions of an experiment that return one number.
         level: of the intervals [-].
         optimiser: the method of the search. Default: `LevenbergMarquardt` where its Jacobian is cheap, else `LBFGS`.
-        memory: for checkpoints of reverse mode, and for the tangents of forward mode that are made at once [B].
+        memory: for what reverse mode stores, and for the tangents of forward mode that are made at once [B].
         progress: called with a line before the first iteration, which is compiled, and one after each, such as `print`:
             misfit, gradient, parameters, seconds, and about how many are left (see docs/fitting.md).
         log: an HDF5 file that is to hold each iteration (its layout: docs/fitting.md). Whatever ends the fit, the file

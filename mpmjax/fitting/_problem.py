@@ -31,7 +31,7 @@ class FitProblem(eqx.Module):
     starts: tuple[Array, ...]
     """The first guess of each."""
     memory: int = eqx.field(static=True, default=2**28)
-    """Memory for checkpoints of reverse passes, and for tangents [B]."""
+    """Memory for what reverse mode stores, and for tangents [B]."""
 
     def __init__(
         self,
@@ -186,7 +186,7 @@ class FitProblem(eqx.Module):
         Args:
             z: the coordinates.
             sigmas: the noise of each observation.
-            adjoint: how diffrax differentiates; None for reverse mode from checkpoints within the memory.
+            adjoint: how diffrax differentiates; None for reverse mode within the memory.
         """
         parts, reports, noise = [], [], iter(sigmas)
         for experiment in self.at(z):

@@ -1,5 +1,4 @@
-"""The thin adapter by which diffrax drives the step: saving, stopping, progress and the checkpointed adjoint are its
-own."""
+"""The thin adapter by which diffrax drives the step: saving, stopping and progress are its own."""
 
 from collections.abc import Callable
 from dataclasses import replace
