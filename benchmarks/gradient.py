@@ -193,7 +193,8 @@ def show(report: dict) -> None:
     for row in report["costs"]:
         print(
             f"{row['update']:>15}  {row['steps']:5d}  {row['asked_bytes'] / 1e6:11.1f}  "
-            f"{row['forward_seconds']:11.4f}  {row['gradient_seconds']:17.4f}  {row['ratio']:5.1f}  {row['temporary_bytes'] / 1e6:14.2f}"
+            f"{row['forward_seconds']:11.4f}  {row['gradient_seconds']:17.4f}  {row['ratio']:5.1f}  "
+            f"{row['temporary_bytes'] / 1e6:14.2f}"
         )
     for row in report.get("tolerance", ()):
         if row["tolerance_of"] == "both":

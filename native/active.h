@@ -18,8 +18,8 @@ struct Freed {
 template <class T>
 using Vectors = std::unique_ptr<T[], Freed>;
 
-// Zeros. Where they are many, the memory of those that nothing is written to is never touched. In each step anew the
-// touched would be found and cleared by the system, one page after the other: large arrays come from XLA, which keeps them.
+// Zeros. The system gives their memory page by page when it is first written to. For large arrays that are written in
+// each step take memory of XLA, which keeps it from step to step.
 template <class T>
 Vectors<T> zeros(int64_t count) {
   T* memory = static_cast<T*>(std::calloc(static_cast<size_t>(std::max<int64_t>(count, 1)), sizeof(T)));

@@ -114,8 +114,9 @@ struct Resist {
   const bool* wanted;  // as in a scatter
 };
 
-// The sums for one dimension and kernel. Gather and pull take particles from a first to a last. Others take all particles, and set the nodes from a first to a last; they pass over blocks whose range of indices says that they
-// give nothing to these. `resist_particles` stores what the particles from a first to a last give.
+// The sums for one dimension and kernel. Gather and pull take particles from a first to a last. Others take all
+// particles, and set the nodes from a first to a last; they pass over blocks whose range of indices says that they give
+// nothing to these. `resist_particles` stores what the particles from a first to a last give.
 template <class T>
 struct Kernels {
   void (*gather)(const Gather<T>&, int64_t first, int64_t last);

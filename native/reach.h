@@ -35,8 +35,8 @@ void mark(const Stencils<T>& stencils, const Range* ranges, bool* reached, int64
   }
 }
 
-// Calls run(whether they are reached, first, last) for nodes of a range, as many together as are alike; where none is
-// marked as if all were.
+// Calls run(whether they are reached, first, last) for nodes of a range, as many together as are alike. Where there
+// are no marks, all count as reached.
 template <class Run>
 void over_alike(const bool* reached, int64_t first, int64_t last, const Run& run) {
   if (reached == nullptr) return run(true, first, last);

@@ -153,7 +153,7 @@ averaged_as_written = partial(averaged, partial(_average._average, unroll=False)
 @NEEDS_LIBRARY
 @pytest.mark.parametrize("p", [45, *thorough(3000)])
 def test_wide_windows_agree(p, choose):
-    """Of more nodes than a cache holds the library looks at those alone that particles reach, other ones in each call."""
+    """Of more nodes than a cache holds the library looks at those alone that particles reach: other ones each time."""
     choose("native")
     wide = {"k": 2, "side": 70}
     pairs = [tuple(map(jax.jit, (native, written)))]

@@ -47,8 +47,8 @@ class BSpline(eqx.Module):
             case 1:
                 return jnp.stack([1 - f, f], axis=1)
             case 2:
-                height, slope = (np.array(a, f.dtype)[:, None] for a in ((0, 0.75, 0), (0.5, -1, 0.5)))
-                return self._from_knot(f) ** 2 * slope + height
+                height, curvature = (np.array(a, f.dtype)[:, None] for a in ((0, 0.75, 0), (0.5, -1, 0.5)))
+                return self._from_knot(f) ** 2 * curvature + height
             case _:
                 t = f - 1
                 near = (3 * t**3 - 6 * t**2 + 4) / 6

@@ -62,7 +62,7 @@ def predict(
     Args:
         result: the fit.
         of: function of an experiment with the fitted parameters, that returns a number or an array. Give the runs in
-            it `adjoint=diffrax.ForwardMode()`: by default those in little `checkpoint_bytes` have no forward derivative.
+            it `adjoint=diffrax.ForwardMode()`: else those in little `checkpoint_bytes` have no forward derivative.
         experiment: which one: its number among those that were fitted, or another one, into which the parameters are
             put. One that belongs to some experiments only is left out of another.
         sigma: standard deviation of the noise of a new measurement, in the unit of the quantity; a number or an array

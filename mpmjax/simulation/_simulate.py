@@ -59,7 +59,8 @@ def simulate(
 
     The rollout is differentiable with respect to every float of the scene, the particles and the method: in reverse
     mode by default, within `checkpoint_bytes`; in forward mode (`jax.jvp`, `jax.jacfwd`) with
-    `adjoint=diffrax.ForwardMode()`, without which runs in little `checkpoint_bytes` have none. Only the number of steps, `save_every` and choices of code compile anew.
+    `adjoint=diffrax.ForwardMode()`, without which runs in little `checkpoint_bytes` have none. Only the number of
+    steps, `save_every` and choices of code compile anew.
 
     Args:
         scene: the scene.
