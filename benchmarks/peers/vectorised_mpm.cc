@@ -1,78 +1,98 @@
 // MLS-MPM by hand for one processor's vectors: explicit steps, APIC, quadratic kernel, neo-Hookean. What it takes is a
 // limit for other codes. `vectorised_mpm.py` compiles and calls it.
 //
-// Particles are sorted by cell once a call and kept in blocks of 16, component by component: stress and update are
-// loops over the 16. Nodes have four numbers, of which the mass is the last, so that the three nodes of a stencil's row
-// along the last axis are twelve lanes of one vector. Each thread has blocks of its own and adds to a grid of its own,
-// of which it touches the slabs that its particles reach; the update of the nodes adds the grids up.
+// The lanes of a vector are cells (those of particles with the same first node), mostly neighbours along the last axis;
+// a block has one particle of each. What these give to a node relative to their cells is then one vector, neither
+// gathered nor turned, which stays on the stack for all blocks of such a group of cells. It goes to the grid once: cells
+// that are neighbours give to nodes that are neighbours, which is an addition of whole vectors.
+//
+// One pass over the particles takes velocities from the nodes, and gives momenta for the next step to them: x and F are
+// read and written once a step, v and C are in registers only. A particle that has left its cell, a stray, is alone in a
+// vector of one lane, a number. Once strays have cost what sorting costs, all are sorted again. Each thread has groups
+// of its own and adds to a grid of its own, whose rows say what of them was reached.
 
 #include <algorithm>
+#include <array>
 #include <barrier>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
-#include <memory>
 #include <thread>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
 namespace {
 
-constexpr int lanes = 16, columns = 4, mass_column = 3;
+#define INLINE [[gnu::always_inline]] inline
+
+constexpr int power_of_three(int n) { return n == 0 ? 1 : 3 * power_of_three(n - 1); }
 
 template <class T>
-struct Vectors {
-  typedef T Four __attribute__((vector_size(columns * sizeof(T))));
-  typedef T Row __attribute__((vector_size(lanes * sizeof(T))));
+struct Lanes {
+  typedef std::conditional_t<sizeof(T) == 4, int32_t, int64_t> Whole;
+  typedef T Vector __attribute__((vector_size(64)));
+  typedef Whole Mask __attribute__((vector_size(64)));
 };
-template <class T>
-using Four = typename Vectors<T>::Four;
-template <class T>
-using Row = typename Vectors<T>::Row;
 
-template <class V, class T>
-V load(const T* from) {
-  V found;
+template <class N, class T>
+INLINE N load(const T* from) {
+  N found;
   std::memcpy(&found, from, sizeof found);
   return found;
 }
 
-template <class V, class T>
-void store(T* to, V value) {
+template <class N, class T>
+INLINE void store(T* to, N value) {
   std::memcpy(to, &value, sizeof value);
 }
 
-// One number for each of the three nodes of a row, zero beyond them.
-template <class T>
-Row<T> by_node(T a, T b, T c) {
-  return Row<T>{a, a, a, a, b, b, b, b, c, c, c, c, 0, 0, 0, 0};
-}
+// The weights of a stencil along each axis, and where the particle is from the middle node, in spacings. N is a number,
+// or a vector of them.
+template <class N, class T, int d>
+struct Stencil {
+  N place[d], weight[d][3];
 
-// The same columns at each node of a row.
-template <class T>
-Row<T> at_each(const T* four) {
-  auto one = load<Four<T>>(four);
-  return __builtin_shufflevector(one, one, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
-}
+  INLINE void find(int axis, N at) {
+    place[axis] = at;
+    weight[axis][0] = T(0.5) * (T(0.5) - at) * (T(0.5) - at);
+    weight[axis][1] = T(0.75) - at * at;
+    weight[axis][2] = T(0.5) * (at + T(0.5)) * (at + T(0.5));
+  }
 
-template <class T>
-Four<T> sum_of_nodes(Row<T> row) {
-  return __builtin_shufflevector(row, row, 0, 1, 2, 3) + __builtin_shufflevector(row, row, 4, 5, 6, 7) +
-         __builtin_shufflevector(row, row, 8, 9, 10, 11);
-}
+  // The mean along the last n axes of what the nodes have, and its slopes, the last axis first: the sums of weights
+  // times places of nodes from the middle node.
+  template <int n>
+  INLINE std::array<N, n + 1> take(const N* nodes, int step) const {
+    if constexpr (n == 0) {
+      return {*nodes};
+    } else {
+      const N* w = weight[d - n];
+      const int across = power_of_three(n - 1) * step;
+      const auto low = take<n - 1>(nodes, step), middle = take<n - 1>(nodes + across, step),
+                 high = take<n - 1>(nodes + 2 * across, step);
+      std::array<N, n + 1> found;
+      for (int k = 0; k < n; ++k) found[k] = w[0] * low[k] + w[1] * middle[k] + w[2] * high[k];
+      found[n] = w[2] * high[0] - w[0] * low[0];
+      return found;
+    }
+  }
 
-// Sixteen particles; those that fill the last block up have no mass and no volume.
-template <class T, int d>
-struct alignas(64) Block {
-  T x[d][lanes], v[d][lanes], C[d][d][lanes], F[d][d][lanes], mass[lanes], volume[lanes];
-  int64_t from[lanes];  // the user's number of each, -1 of what fills up
-};
-
-// The stencils of a block: the first node, and along each axis the weights and the arms in spacings.
-template <class T, int d>
-struct Stencils {
-  int64_t first[lanes];
-  T weight[d][3][lanes], arm[d][3][lanes];
+  // The transpose: adds to the nodes.
+  template <int n>
+  INLINE void give(N* nodes, int step, const std::array<N, n + 1>& given) const {
+    if constexpr (n == 0) {
+      *nodes += given[0];
+    } else {
+      const N* w = weight[d - n];
+      for (int s = 0; s < 3; ++s) {
+        std::array<N, n> part;
+        for (int k = 0; k < n; ++k) part[k] = w[s] * given[k];
+        if (s != 1) part[0] += T(s - 1) * w[s] * given[n];
+        give<n - 1>(nodes + s * power_of_three(n - 1) * step, step, part);
+      }
+    }
+  }
 };
 
 struct AnyBody {
@@ -82,254 +102,472 @@ struct AnyBody {
 
 template <class T, int d>
 class Body : public AnyBody {
+  static constexpr int lanes = 64 / sizeof(T), columns = d + 1, corners = power_of_three(d);
+  using Whole = typename Lanes<T>::Whole;
+  using Vector = typename Lanes<T>::Vector;
+  using Mask = typename Lanes<T>::Mask;
+  using Name = std::array<int32_t, lanes>;  // the user's number of each particle, -1 of none
+
+  // One particle of each cell of a group; where a cell has no more of them, one without mass and volume.
+  struct Block {
+    Vector x[d], F[d][d], mass, volume;
+  };
+  struct Motion {
+    Vector v[d], C[d][d];
+  };
+  // Lanes whose cells are neighbours: those of a mask, and where in the grid the first node of lane 0 would be.
+  struct Run {
+    int64_t row, node;  // the row, and the node's place along it
+    int begin, end;
+    Mask mask;
+  };
+  struct Group {
+    int64_t begin, end;  // blocks
+    int first_run, last_run;
+    Vector middle[d];  // the middle node of each cell
+  };
+  struct Reach {
+    int64_t low, high;
+  };
+
  public:
   Body(int64_t count, const int64_t* shape, double spacing, double shear_modulus, double lame_lambda,
        const double* gravity, const double* x, const double* v, double mass, double volume, int threads)
       : count_(count), spacing_(spacing), mu_(shear_modulus), lambda_(lame_lambda), threads_(threads),
-        blocks_((count + lanes - 1) / lanes), reach_(threads), sums_(threads) {
-    nodes_ = 1;
-    for (int a = 0; a < d; ++a) shape_[a] = shape[a], gravity_[a] = gravity[a], nodes_ *= shape[a];
-    slab_ = nodes_ / shape_[0] * columns;
-    for (auto& sums : sums_) sums.resize(nodes_ * columns + lanes);
-    velocity_.resize(nodes_ * columns + lanes);
+        blocks_((count + lanes - 1) / lanes), names_(blocks_.size()), shares_(threads + 1), strays_(threads),
+        reached_(threads), reached_of_row_(threads), sums_(threads), rows_(1) {
+    for (int a = 0; a < d; ++a) shape_[a] = shape[a], gravity_[a] = gravity[a];
+    for (int a = 0; a < d - 1; ++a) rows_ *= shape[a];
+    length_ = (shape_[d - 1] + lanes - 1) / lanes * lanes;
+    for (auto& sums : sums_) sums.resize(rows_ * length_ * columns / lanes + 2);
+    for (auto& reached : reached_of_row_) reached.assign(rows_, nothing);
+    velocity_.resize(sums_[0].size());
     for (int64_t p = 0; p < static_cast<int64_t>(blocks_.size()) * lanes; ++p) {
-      Block<T, d>& block = blocks_[p / lanes];
+      Block& block = blocks_[p / lanes];
       const int64_t l = p % lanes, q = std::min(p, count - 1);
-      block.from[l] = p < count ? p : -1;
-      block.mass[l] = p < count ? mass : 0;
-      block.volume[l] = p < count ? volume : 0;
+      names_[p / lanes][l] = p < count ? p : -1;
+      block.mass[l] = mass, block.volume[l] = volume;
       for (int a = 0; a < d; ++a) {
         block.x[a][l] = x[q * d + a];
-        block.v[a][l] = v[q * d + a];
-        for (int b = 0; b < d; ++b) block.C[a][b][l] = 0, block.F[a][b][l] = a == b;
+        for (int b = 0; b < d; ++b) block.F[a][b][l] = a == b;
       }
     }
+    sort();
+    for (int thread = 0; thread < threads; ++thread) rearrange(thread);
+    for (size_t k = 0; k < names_.size(); ++k)
+      for (int l = 0; l < lanes; ++l)
+        for (int a = 0; a < d; ++a) motions_[k].v[a][l] = names_[k][l] < 0 ? 0 : v[names_[k][l] * d + a];
   }
 
   void run(int steps, double dt, double* x, double* v, double* F) override {
-    sort();
-    std::barrier<> together(threads_);
-    std::vector<std::thread> others;
-    auto work = [&](int thread) {
-      find_reach(thread);
-      for (int step = 0; step < steps; ++step) {
-        to_grid(thread, dt);
-        together.arrive_and_wait();
-        update_grid(thread, dt);
-        together.arrive_and_wait();
-        from_grid(thread, dt);
-      }
-    };
-    for (int thread = 1; thread < threads_; ++thread) others.emplace_back(work, thread);
-    work(0);
-    for (auto& other : others) other.join();
-    for (const auto& block : blocks_)
-      for (int l = 0; l < lanes; ++l) {
-        const int64_t p = block.from[l];
-        if (p < 0) continue;
-        for (int a = 0; a < d; ++a) {
-          x[p * d + a] = block.x[a][l];
-          v[p * d + a] = block.v[a][l];
-          for (int b = 0; b < d; ++b) F[(p * d + a) * d + b] = block.F[a][b][l];
+    if (steps > 0) {
+      std::barrier<> together(threads_);
+      std::vector<std::thread> others;
+      auto work = [&](int thread) {
+        for (int step = 0; step < steps; ++step) {
+          if (step == 0)
+            pass<false, true>(thread, dt);
+          else
+            pass<true, true>(thread, dt);
+          together.arrive_and_wait();
+          int64_t strays = 0;
+          for (auto number : strays_) strays += number;
+          update_grid(thread, dt);
+          together.arrive_and_wait();
+          if (strays > count_ / 4) {
+            if (thread == 0) sort();
+            together.arrive_and_wait();
+            rearrange(thread);
+          }
         }
-      }
+        pass<true, false>(thread, dt);
+        write(thread, x, v, F);
+      };
+      for (int thread = 1; thread < threads_; ++thread) others.emplace_back(work, thread);
+      work(0);
+      for (auto& other : others) other.join();
+    }
   }
 
  private:
-  // The blocks of a thread.
-  std::pair<int64_t, int64_t> share(int thread) const {
-    const int64_t n = blocks_.size();
-    return {n * thread / threads_, n * (thread + 1) / threads_};
-  }
+  // ---- sorting ----
 
-  int64_t first_node(const Block<T, d>& block, int l) const {
+  int64_t first_node(const Block& block, int l) const {
     int64_t node = 0;
     for (int a = 0; a < d; ++a) node = node * shape_[a] + static_cast<int64_t>(block.x[a][l] / spacing_ - T(0.5));
     return node;
   }
 
-  // A counting sort by the first node; what fills up stays at the end.
+  // Groups of cells, with the present place of each particle in `order_`, -1 for none.
   void sort() {
-    std::vector<int64_t> begins(nodes_ + 2), keys(blocks_.size() * lanes, nodes_);
-    for (size_t k = 0; k < keys.size(); ++k) {
-      const auto& block = blocks_[k / lanes];
-      if (block.from[k % lanes] >= 0) keys[k] = first_node(block, k % lanes);
-      ++begins[keys[k] + 1];
+    blocks_.swap(old_blocks_);
+    names_.swap(old_names_);
+    const int64_t places = old_blocks_.size() * lanes, nodes = rows_ * shape_[d - 1];
+    std::vector<int32_t> cells(places, -1), begins(nodes + 2), listed(count_);
+    for (int64_t p = 0; p < places; ++p)
+      if (old_names_[p / lanes][p % lanes] >= 0) ++begins[(cells[p] = first_node(old_blocks_[p / lanes], p % lanes)) + 2];
+    for (int64_t cell = 0; cell < nodes; ++cell) begins[cell + 2] += begins[cell + 1];
+    for (int64_t p = 0; p < places; ++p)
+      if (cells[p] >= 0) listed[begins[cells[p] + 1]++] = p;
+
+    // A lane takes so many of a cell's particles at most that all lanes together are shortest. A lane costs as much as
+    // one particle more, and one that splits a cell, for the run that it begins, as much as eight.
+    constexpr int64_t most = 64;
+    std::array<int64_t, most + 1> cells_of{};  // how many cells have so many particles
+    for (int64_t cell = 0; cell < nodes; ++cell) ++cells_of[std::min<int64_t>(begins[cell + 1] - begins[cell], most)];
+    int64_t deepest = 1, least = INT64_MAX;
+    for (int64_t depth = 1; depth <= most; ++depth) {
+      int64_t cost = 0;
+      for (int64_t number = 1; number <= most; ++number)
+        cost += cells_of[number] * ((number + depth - 1) / depth * (depth + 1 + 8) - 8);
+      if (cost < least) least = cost, deepest = depth;
     }
-    for (int64_t node = 0; node <= nodes_; ++node) begins[node + 1] += begins[node];
-    std::vector<Block<T, d>> sorted(blocks_.size());
-    for (size_t k = 0; k < keys.size(); ++k) {
-      const int64_t to = begins[keys[k]]++;
-      const T* one = blocks_[k / lanes].x[0] + k % lanes;
-      T* other = sorted[to / lanes].x[0] + to % lanes;
-      for (int number = 0; number < numbers; ++number) other[number * lanes] = one[number * lanes];
-      sorted[to / lanes].from[to % lanes] = blocks_[k / lanes].from[k % lanes];
-    }
-    blocks_.swap(sorted);
-  }
 
-  // The first and the last slab of nodes, across the first axis, that a thread's particles reach.
-  void find_reach(int thread) {
-    const auto [begin, end] = share(thread);
-    T low = shape_[0] * spacing_, high = 0;
-    for (int64_t k = begin; k < end; ++k)
+    groups_.clear(), runs_.clear(), order_.clear();
+    struct Lane {
+      int64_t cell, begin, end;
+    };
+    std::vector<Lane> gathered;
+    auto close = [&] {
+      if (gathered.empty()) return;
+      const int64_t begin = order_.size() / lanes;
+      int64_t depth = 0;
+      for (const auto& lane : gathered) depth = std::max(depth, lane.end - lane.begin);
+      order_.resize((begin + depth) * lanes, -1);
+      Group group{begin, begin + depth, static_cast<int>(runs_.size()), 0, {}};
       for (int l = 0; l < lanes; ++l) {
-        low = std::min(low, blocks_[k].x[0][l]);
-        high = std::max(high, blocks_[k].x[0][l]);
+        const bool used = l < static_cast<int>(gathered.size());
+        const Lane& lane = gathered[used ? l : 0];
+        int64_t row = lane.cell / shape_[d - 1], node = lane.cell % shape_[d - 1], rest = row;
+        group.middle[d - 1][l] = node + 1;
+        for (int a = d - 2; a >= 0; rest /= shape_[a--]) group.middle[a][l] = rest % shape_[a] + 1;
+        if (!used) continue;
+        if (l == 0 || runs_.back().row != row || runs_.back().node + l != node) runs_.push_back(Run{row, node - l, l, l, Mask{}});
+        runs_.back().end = l + 1;
+        runs_.back().mask[l] = -1;
+        for (int64_t k = 0; k < lane.end - lane.begin; ++k) order_[(begin + k) * lanes + l] = listed[lane.begin + k];
       }
-    const auto first = [&](T x) { return static_cast<int64_t>(x / spacing_ - T(0.5)); };
-    reach_[thread] = {first(low), first(high) + 2};
-  }
-
-  void find_stencils(const Block<T, d>& block, Stencils<T, d>& at) const {
-    const T inverse = 1 / spacing_;
-    for (int l = 0; l < lanes; ++l) at.first[l] = 0;
-    for (int a = 0; a < d; ++a)
-      for (int l = 0; l < lanes; ++l) {
-        const T place = block.x[a][l] * inverse;
-        const auto node = static_cast<int32_t>(place - T(0.5));
-        const T f = place - node;
-        at.first[l] = at.first[l] * shape_[a] + node;
-        at.weight[a][0][l] = T(0.5) * (T(1.5) - f) * (T(1.5) - f);
-        at.weight[a][1][l] = T(0.75) - (f - 1) * (f - 1);
-        at.weight[a][2][l] = T(0.5) * (f - T(0.5)) * (f - T(0.5));
-        for (int s = 0; s < 3; ++s) at.arm[a][s][l] = s - f;
-      }
-  }
-
-  // Calls `visit` with the offset, the weight and the arms of each row of a particle's stencil.
-  template <class Visit>
-  void rows(const Stencils<T, d>& at, int l, Visit visit) const {
-    for (int i = 0; i < 3; ++i) {
-      const T weight = at.weight[0][i][l], arm = at.arm[0][i][l];
-      if constexpr (d == 2) {
-        visit((at.first[l] + i * shape_[1]) * columns, weight, arm, T(0));
-      } else {
-        for (int j = 0; j < 3; ++j)
-          visit((at.first[l] + (i * shape_[1] + j) * shape_[2]) * columns, weight * at.weight[1][j][l], arm,
-                at.arm[1][j][l]);
-      }
-    }
-  }
-
-  static Row<T> last_axis(const T (&values)[d][3][lanes], int l) {
-    return by_node<T>(values[d - 1][0][l], values[d - 1][1][l], values[d - 1][2][l]);
-  }
-
-  // P2G of mass, momentum and the force's impulse at once.
-  void to_grid(int thread, T dt) {
-    const auto [low, high] = reach_[thread];
-    T* sums = sums_[thread].data();
-    std::fill(sums + low * slab_, sums + (high + 1) * slab_, T(0));
-    const auto [begin, end] = share(thread);
-    Stencils<T, d> at;
-    alignas(64) T momentum[lanes][columns] = {}, affine[d][lanes][columns] = {};
-    for (int64_t k = begin; k < end; ++k) {
-      const Block<T, d>& block = blocks_[k];
-      find_stencils(block, at);
-      for (int l = 0; l < lanes; ++l) {
-        const T m = block.mass[l], scale = -4 * dt * block.volume[l] / spacing_;
-        T b[d][d], J;
-        for (int r = 0; r < d; ++r)
-          for (int c = 0; c < d; ++c) {
-            b[r][c] = 0;
-            for (int s = 0; s < d; ++s) b[r][c] += block.F[r][s][l] * block.F[c][s][l];
-          }
-        auto F = [&](int r, int c) { return block.F[r][c][l]; };
-        if constexpr (d == 2)
-          J = F(0, 0) * F(1, 1) - F(0, 1) * F(1, 0);
-        else
-          J = F(0, 0) * (F(1, 1) * F(2, 2) - F(1, 2) * F(2, 1)) - F(0, 1) * (F(1, 0) * F(2, 2) - F(1, 2) * F(2, 0)) +
-              F(0, 2) * (F(1, 0) * F(2, 1) - F(1, 1) * F(2, 0));
-        const T pressure = lambda_ * std::log(J) - mu_;
-        for (int r = 0; r < d; ++r) {
-          momentum[l][r] = m * block.v[r][l];
-          for (int c = 0; c < d; ++c)
-            affine[c][l][r] = m * spacing_ * block.C[r][c][l] + scale * (mu_ * b[r][c] + (r == c ? pressure : T(0)));
+      group.last_run = runs_.size();
+      groups_.push_back(group);
+      gathered.clear();
+    };
+    for (int64_t row = 0; row < nodes; row += shape_[d - 1]) {
+      bool more = begins[row + shape_[d - 1]] > begins[row];
+      for (int64_t part = 0; more; part += deepest) {
+        more = false;
+        for (int64_t cell = row; cell < row + shape_[d - 1]; ++cell) {
+          const int64_t begin = begins[cell] + part, end = begins[cell + 1];
+          if (begin >= end) continue;
+          gathered.push_back({cell, begin, std::min(begin + deepest, end)});
+          more |= begin + deepest < end;
+          if (gathered.size() == lanes) close();
         }
-        momentum[l][mass_column] = m;
       }
-      for (int l = 0; l < lanes; ++l) {
-        const Row<T> weights = last_axis(at.weight, l), arms = last_axis(at.arm, l);
-        const Row<T> even = weights * (at_each(momentum[l]) + arms * at_each(affine[d - 1][l]));
-        const Row<T> by_first = weights * at_each(affine[0][l]);
-        const Row<T> by_second = weights * at_each(affine[d - 2][l]);
-        rows(at, l, [&](int64_t offset, T weight, T first, T second) {
-          Row<T> added = even + first * by_first;
-          if constexpr (d == 3) added += second * by_second;
-          store(sums + offset, load<Row<T>>(sums + offset) + weight * added);
-        });
+    }
+    close();
+    blocks_.resize(order_.size() / lanes), names_.resize(blocks_.size()), motions_.resize(blocks_.size());
+    size_t group = 0;  // the shares of the threads have about as many blocks each
+    for (int thread = 0; thread < threads_; ++thread) {
+      while (group < groups_.size() && groups_[group].begin * threads_ < static_cast<int64_t>(blocks_.size()) * thread)
+        ++group;
+      shares_[thread] = group;
+    }
+    shares_[threads_] = groups_.size();
+  }
+
+  // Brings a thread's particles to where `order_` wants them.
+  void rearrange(int thread) {
+    strays_[thread] = 0;
+    for (size_t g = shares_[thread]; g < shares_[thread + 1]; ++g)
+      for (int64_t k = groups_[g].begin; k < groups_[g].end; ++k)
+        for (int l = 0; l < lanes; ++l) {
+          const int64_t from = order_[k * lanes + l];
+          const Block& old = old_blocks_[std::max<int64_t>(from, 0) / lanes];
+          const int m = from % lanes;
+          Block& block = blocks_[k];
+          names_[k][l] = from < 0 ? -1 : old_names_[from / lanes][m];
+          block.mass[l] = from < 0 ? 0 : old.mass[m];
+          block.volume[l] = from < 0 ? 0 : old.volume[m];
+          for (int a = 0; a < d; ++a) {
+            block.x[a][l] = from < 0 ? groups_[g].middle[a][l] * spacing_ : old.x[a][m];
+            for (int b = 0; b < d; ++b) block.F[a][b][l] = from < 0 ? T(a == b) : old.F[a][b][m];
+          }
+        }
+  }
+
+  // ---- the grid ----
+
+  // Where a number of a node is: each row has its columns one after the other.
+  int64_t place_of(int64_t row, int64_t node, int column) const { return (row * columns + column) * length_ + node; }
+
+  // Calls `visit` with the first corner in a row of a stencil, and the row.
+  template <class Visit>
+  INLINE void corner_rows(int64_t row, Visit visit) const {
+    for (int i = 0; i < 3; ++i)
+      if constexpr (d == 2)
+        visit(3 * i, row + i);
+      else
+        for (int j = 0; j < 3; ++j) visit(3 * (3 * i + j), row + i * shape_[1] + j);
+  }
+
+  // The velocities of a stencil's nodes, from a first node on, of one lane or of all.
+  template <class N, class Choose>
+  INLINE void read(int64_t row, int64_t node, N (&nodes)[corners][d], Choose choose) const {
+    const T* velocity = numbers(velocity_);
+    corner_rows(row, [&](int corner, int64_t at) {
+      for (int c = 0; c < d; ++c)
+        for (int s = 0; s < 3; ++s)
+          nodes[corner + s][c] = choose(load<N>(velocity + place_of(at, node + s, c)), nodes[corner + s][c]);
+    });
+  }
+
+  template <class N, class Choose>
+  INLINE void add(int thread, int64_t row, int64_t node, const N (&nodes)[corners][columns], Choose choose) {
+    T* sums = numbers(sums_[thread]);
+    for (int s = 0; s < 3; ++s)  // outermost: a load of what has just been stored in part would wait
+      corner_rows(row, [&](int corner, int64_t at) {
+        for (int c = 0; c < columns; ++c) {
+          T* to = sums + place_of(at, node + s, c);
+          store(to, load<N>(to) + choose(nodes[corner + s][c]));
+        }
+      });
+  }
+
+  // Notes that nodes from a first one on, of the rows of a stencil, are reached.
+  INLINE void note(int thread, int64_t row, int64_t low, int64_t high) {
+    auto& reached = reached_[thread];
+    corner_rows(row, [&](int, int64_t at) {
+      auto& of_row = reached_of_row_[thread][at];
+      of_row = {std::min(of_row.low, low), std::max(of_row.high, high)};
+      reached = {std::min(reached.low, at), std::max(reached.high, at + 1)};
+    });
+  }
+
+  // The velocities of a share of the rows; sums are cleared.
+  void update_grid(int thread, T dt) {
+    Reach all = nothing;
+    for (const auto& reached : reached_) all = {std::min(all.low, reached.low), std::max(all.high, reached.high)};
+    const int64_t count = all.high - all.low;
+    T* velocity = numbers(velocity_);
+    for (int64_t row = all.low + count * thread / threads_; row < all.low + count * (thread + 1) / threads_; ++row)  {
+      Reach reach = nothing;
+      for (const auto& reached : reached_of_row_)
+        reach = {std::min(reach.low, reached[row].low), std::max(reach.high, reached[row].high)};
+      for (int64_t node = reach.low / lanes * lanes; node < reach.high; node += lanes) {
+        Vector sum[columns] = {};
+        for (int other = 0; other < threads_; ++other) {
+          if (reached_of_row_[other][row].high == 0) continue;
+          T* sums = numbers(sums_[other]);
+          for (int c = 0; c < columns; ++c) {
+            sum[c] += load<Vector>(sums + place_of(row, node, c));
+            store(sums + place_of(row, node, c), Vector{});
+          }
+        }
+        for (int c = 0; c < d; ++c)
+          store(velocity + place_of(row, node, c), sum[d] > 0 ? sum[c] / sum[d] + dt * gravity_[c] : Vector{});
       }
+      for (auto& reached : reached_of_row_) reached[row] = nothing;
     }
   }
 
-  // The velocities of the nodes, of a share of the slabs.
-  void update_grid(int thread, T dt) {
-    int64_t low = shape_[0], high = -1;
-    for (const auto& reach : reach_) low = std::min(low, reach.first), high = std::max(high, reach.second);
-    const int64_t slabs = high + 1 - low;
-    Row<T> gravity{};
-    for (int c = 0; c < lanes; ++c) gravity[c] = c % columns < d ? gravity_[c % columns] : T(0);
-    for (int64_t s = low + slabs * thread / threads_; s < low + slabs * (thread + 1) / threads_; ++s)
-      for (int64_t at = s * slab_; at < (s + 1) * slab_; at += lanes) {
-        Row<T> sum{};
-        for (int other = 0; other < threads_; ++other)
-          if (reach_[other].first <= s && s <= reach_[other].second) sum += load<Row<T>>(sums_[other].data() + at);
-        const Row<T> mass = __builtin_shufflevector(sum, sum, 3, 3, 3, 3, 7, 7, 7, 7, 11, 11, 11, 11, 15, 15, 15, 15);
-        store(velocity_.data() + at, mass > 0 ? sum / mass + dt * gravity : Row<T>{});
+  // ---- the particles ----
+
+  // Stencils of a block, and which of its particles are strays.
+  INLINE Mask stencils(const Block& block, const Group& group, Stencil<Vector, T, d>& at) const {
+    const T inverse = 1 / spacing_;
+    Mask stray{};
+    for (int a = 0; a < d; ++a) {
+      at.find(a, block.x[a] * inverse - group.middle[a]);
+      stray |= (at.place[a] > T(0.5)) | (at.place[a] < T(-0.5));
+    }
+    return stray;
+  }
+
+  static bool any(Mask mask) {
+    Whole found = 0, each[lanes];
+    store(each, mask);
+    for (int l = 0; l < lanes; ++l) found |= each[l];
+    return found;
+  }
+
+  // The stencil of one particle, its first node's row, and the node in it.
+  std::pair<int64_t, int64_t> stencil(const Block& block, int l, Stencil<T, T, d>& at) const {
+    int64_t row = 0, node = 0;
+    for (int a = 0; a < d; ++a) {
+      const T place = block.x[a][l] * (1 / spacing_);
+      node = static_cast<int64_t>(place - T(0.5));
+      at.find(a, place - node - 1);
+      if (a < d - 1) row = row * shape_[a] + node;
+    }
+    return {row, node};
+  }
+
+  template <class N>
+  INLINE static void velocities(const Stencil<N, T, d>& at, const N (&nodes)[corners][d], N (&v)[d], N (&slope)[d][d]) {
+    for (int r = 0; r < d; ++r) {
+      const auto found = at.template take<d>(&nodes[0][r], d);
+      v[r] = found[0];
+      for (int c = 0; c < d; ++c) slope[r][c] = found[d - c] - at.place[c] * found[0];
+    }
+  }
+
+  template <class N>
+  INLINE static void momenta(const Stencil<N, T, d>& at, N mass, const N (&momentum)[d], const N (&affine)[d][d],
+                             N (&nodes)[corners][columns]) {
+    for (int r = 0; r < d; ++r) {
+      std::array<N, d + 1> given{momentum[r]};
+      for (int c = 0; c < d; ++c) given[d - c] = affine[r][c], given[0] -= at.place[c] * affine[r][c];
+      at.template give<d>(&nodes[0][r], columns, given);
+    }
+    at.template give<d>(&nodes[0][d], columns, {mass});
+  }
+
+  // Takes from the nodes and moves the particles, or gives to the nodes, or does both.
+  template <bool takes, bool gives>
+  void pass(int thread, T dt) {
+    reached_[thread] = nothing;
+    for (size_t g = shares_[thread]; g < shares_[thread + 1]; ++g) {
+      const Group& group = groups_[g];
+      Vector nodes[corners][d] = {}, sums[corners][columns] = {};
+      if constexpr (takes)
+        for (int r = group.first_run; r < group.last_run; ++r) {
+          const Run& run = runs_[r];
+          read(run.row, run.node, nodes, [&](Vector here, Vector other) { return run.mask ? here : other; });
+        }
+      for (int64_t k = group.begin; k < group.end; ++k) {
+        Block& block = blocks_[k];
+        Motion motion;
+        if constexpr (takes)
+          move(block, group, nodes, motion, dt);
+        else
+          motion = motions_[k];
+        if constexpr (gives)
+          give(thread, block, group, motion, sums, dt);
+        else
+          motions_[k] = motion;
       }
+      if constexpr (gives)
+        for (int r = group.first_run; r < group.last_run; ++r) {
+          const Run& run = runs_[r];
+          add(thread, run.row, run.node, sums, [&](Vector sum) { return run.mask ? sum : Vector{}; });
+          note(thread, run.row, run.node + run.begin, run.node + run.end + 2);
+        }
+    }
   }
 
   // G2P, and the particles' update.
-  void from_grid(int thread, T dt) {
-    const auto [begin, end] = share(thread);
-    const T* velocity = velocity_.data();
-    Stencils<T, d> at;
-    alignas(64) T mean[lanes][columns], slope[d][lanes][columns];
-    for (int64_t k = begin; k < end; ++k) {
-      Block<T, d>& block = blocks_[k];
-      find_stencils(block, at);
-      for (int l = 0; l < lanes; ++l) {
-        Row<T> even{}, by_first{}, by_second{};
-        rows(at, l, [&](int64_t offset, T weight, T first, T second) {
-          const Row<T> row = weight * load<Row<T>>(velocity + offset);
-          even += row;
-          by_first += first * row;
-          if constexpr (d == 3) by_second += second * row;
-        });
-        const Row<T> weights = last_axis(at.weight, l), arms = last_axis(at.arm, l);
-        store(mean[l], sum_of_nodes<T>(weights * even));
-        store(slope[0][l], sum_of_nodes<T>(weights * by_first));
-        if constexpr (d == 3) store(slope[1][l], sum_of_nodes<T>(weights * by_second));
-        store(slope[d - 1][l], sum_of_nodes<T>(weights * arms * even));
-      }
-      for (int l = 0; l < lanes; ++l) {
-        T C[d][d], F[d][d];
-        for (int r = 0; r < d; ++r) {
-          block.v[r][l] = mean[l][r];
-          block.x[r][l] += dt * mean[l][r];
-          for (int c = 0; c < d; ++c) C[r][c] = 4 / spacing_ * slope[c][l][r], F[r][c] = block.F[r][c][l];
-        }
-        for (int r = 0; r < d; ++r)
-          for (int c = 0; c < d; ++c) {
-            T change = 0;
-            for (int s = 0; s < d; ++s) change += C[r][s] * F[s][c];
-            block.C[r][c][l] = C[r][c];
-            block.F[r][c][l] = F[r][c] + dt * change;
+  INLINE void move(Block& block, const Group& group, const Vector (&nodes)[corners][d], Motion& motion, T dt) const {
+    Stencil<Vector, T, d> at;
+    const Mask stray = stencils(block, group, at) & (block.mass > 0);
+    velocities(at, nodes, motion.v, motion.C);
+    if (any(stray)) [[unlikely]]
+      for (int l = 0; l < lanes; ++l)
+        if (stray[l]) {
+          Stencil<T, T, d> one;
+          const auto [row, node] = stencil(block, l, one);
+          T around[corners][d], v[d], slope[d][d];
+          read(row, node, around, [](T here, T) { return here; });
+          velocities(one, around, v, slope);
+          for (int r = 0; r < d; ++r) {
+            motion.v[r][l] = v[r];
+            for (int c = 0; c < d; ++c) motion.C[r][c][l] = slope[r][c];
           }
-      }
+        }
+    const Vector moving = block.mass > 0 ? Vector{} + dt : Vector{};
+    Vector F[d][d];
+    for (int r = 0; r < d; ++r) {
+      block.x[r] += moving * motion.v[r];
+      for (int c = 0; c < d; ++c) motion.C[r][c] *= 4 / spacing_, F[r][c] = block.F[r][c];
     }
-    find_reach(thread);
+    for (int r = 0; r < d; ++r)
+      for (int c = 0; c < d; ++c) {
+        Vector change{};
+        for (int s = 0; s < d; ++s) change += motion.C[r][s] * F[s][c];
+        block.F[r][c] = F[r][c] + moving * change;
+      }
   }
 
-  static constexpr int numbers = 2 * d + 2 * d * d + 2;  // of a particle: x, v, C, F, mass, volume
-  int64_t count_, nodes_, slab_, shape_[d];
+  // P2G of mass, momentum and the force's impulse at once.
+  INLINE void give(int thread, const Block& block, const Group& group, const Motion& motion,
+                   Vector (&nodes)[corners][columns], T dt) {
+    const auto& F = block.F;
+    const Vector scale = -4 * dt / spacing_ * block.volume;
+    Vector J;
+    if constexpr (d == 2)
+      J = F[0][0] * F[1][1] - F[0][1] * F[1][0];
+    else
+      J = F[0][0] * (F[1][1] * F[2][2] - F[1][2] * F[2][1]) - F[0][1] * (F[1][0] * F[2][2] - F[1][2] * F[2][0]) +
+          F[0][2] * (F[1][0] * F[2][1] - F[1][1] * F[2][0]);
+    T logarithms[lanes];
+    store(logarithms, J);
+    for (auto& number : logarithms) number = std::log(number);
+    const Vector pressure = lambda_ * load<Vector>(logarithms) - mu_;
+    Vector mass = block.mass, momentum[d], affine[d][d];
+    for (int r = 0; r < d; ++r) {
+      momentum[r] = mass * motion.v[r];
+      for (int c = 0; c < d; ++c) {
+        Vector b{};
+        for (int s = 0; s < d; ++s) b += F[r][s] * F[c][s];
+        affine[r][c] = spacing_ * mass * motion.C[r][c] + scale * (mu_ * b + (r == c ? pressure : Vector{}));
+      }
+    }
+    Stencil<Vector, T, d> at;
+    const Mask stray = stencils(block, group, at) & (mass > 0);
+    if (any(stray)) [[unlikely]] {
+      for (int l = 0; l < lanes; ++l)
+        if (stray[l]) {
+          Stencil<T, T, d> one;
+          const auto [row, node] = stencil(block, l, one);
+          T around[corners][columns] = {}, q[d], slope[d][d];
+          for (int r = 0; r < d; ++r) {
+            q[r] = momentum[r][l];
+            for (int c = 0; c < d; ++c) slope[r][c] = affine[r][c][l];
+          }
+          momenta<T>(one, mass[l], q, slope, around);
+          add(thread, row, node, around, [](T sum) { return sum; });
+          note(thread, row, node, node + 3);
+          ++strays_[thread];
+        }
+      for (auto& weight : at.weight[0]) weight = stray ? Vector{} : weight;
+    }
+    momenta<Vector>(at, mass, momentum, affine, nodes);
+  }
+
+  void write(int thread, double* x, double* v, double* F) const {
+    for (size_t g = shares_[thread]; g < shares_[thread + 1]; ++g)
+      for (int64_t k = groups_[g].begin; k < groups_[g].end; ++k)
+        for (int l = 0; l < lanes; ++l) {
+          const int64_t p = names_[k][l];
+          if (p < 0) continue;
+          for (int a = 0; a < d; ++a) {
+            x[p * d + a] = blocks_[k].x[a][l];
+            v[p * d + a] = motions_[k].v[a][l];
+            for (int b = 0; b < d; ++b) F[(p * d + a) * d + b] = blocks_[k].F[a][b][l];
+          }
+        }
+  }
+
+  static constexpr Reach nothing{INT64_MAX / 2, 0};
+  // The numbers of a grid; a vector before them and one after them are never nodes.
+  static T* numbers(std::vector<Vector>& grid) { return reinterpret_cast<T*>(grid.data() + 1); }
+  static const T* numbers(const std::vector<Vector>& grid) { return reinterpret_cast<const T*>(grid.data() + 1); }
+
+  int64_t count_, shape_[d], length_;
   T spacing_, mu_, lambda_, gravity_[d];
   int threads_;
-  std::vector<Block<T, d>> blocks_;
-  std::vector<std::pair<int64_t, int64_t>> reach_;
-  std::vector<std::vector<T>> sums_;
-  std::vector<T> velocity_;
+  std::vector<Block> blocks_, old_blocks_;
+  std::vector<Motion> motions_;
+  std::vector<Name> names_, old_names_;
+  std::vector<Group> groups_;
+  std::vector<Run> runs_;
+  std::vector<int32_t> order_;
+  std::vector<size_t> shares_;  // of groups, where each thread's begin
+  std::vector<int64_t> strays_;
+  std::vector<Reach> reached_;  // rows, for each thread
+  std::vector<std::vector<Reach>> reached_of_row_;
+  std::vector<std::vector<Vector>> sums_;
+  std::vector<Vector> velocity_;
+  int64_t rows_;
 };
 
 }  // namespace
