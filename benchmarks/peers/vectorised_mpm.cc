@@ -1,15 +1,15 @@
 // MLS-MPM by hand for one processor's vectors: explicit steps, APIC, quadratic kernel, neo-Hookean. What it takes is a
 // limit for other codes. `vectorised_mpm.py` compiles and calls it.
 //
-// The lanes of a vector are cells (those of particles with the same first node), mostly neighbours along the last axis;
-// a block has one particle of each. What these give to a node relative to their cells is then one vector, neither
-// gathered nor turned, which stays on the stack for all blocks of such a group of cells. It goes to the grid once: cells
-// that are neighbours give to nodes that are neighbours, which is an addition of whole vectors.
+// The lanes of a vector are cells, those of particles with the same first node, mostly neighbours along the last axis; a
+// block has one particle of each. What these give to a node of their cells is then one vector, neither gathered nor
+// turned, and stays on the stack for all blocks of a group. It goes to the grid once a group: cells that are neighbours
+// give to nodes that are neighbours, so that whole vectors are added.
 //
-// One pass over the particles takes velocities from the nodes, and gives momenta for the next step to them: x and F are
-// read and written once a step, v and C are in registers only. A particle that has left its cell, a stray, is alone in a
-// vector of one lane, a number. Once strays have cost what sorting costs, all are sorted again. Each thread has groups
-// of its own and adds to a grid of its own, whose rows say what of them was reached.
+// One pass over the particles takes velocities from the nodes and gives momenta for the next step to them: x and F are
+// read and written once a step, v and C are in registers only. Particles that have left their cells, strays, are done
+// one by one; once they have cost about what sorting costs, all are sorted again. Each thread has groups of its own and
+// adds to a grid of its own, in which it notes how far each row of nodes is reached.
 
 #include <algorithm>
 #include <array>
@@ -17,6 +17,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <numeric>
 #include <thread>
 #include <type_traits>
 #include <utility>
@@ -97,7 +98,7 @@ struct Stencil {
 
 struct AnyBody {
   virtual ~AnyBody() = default;
-  virtual void run(int steps, double dt, double* x, double* v, double* F) = 0;
+  virtual void run(int steps, double dt, void* x, void* v, void* F) = 0;
 };
 
 template <class T, int d>
@@ -135,12 +136,12 @@ class Body : public AnyBody {
        const double* gravity, const double* x, const double* v, double mass, double volume, int threads)
       : count_(count), spacing_(spacing), mu_(shear_modulus), lambda_(lame_lambda), threads_(threads),
         blocks_((count + lanes - 1) / lanes), names_(blocks_.size()), shares_(threads + 1), strays_(threads),
-        reached_(threads), reached_of_row_(threads), sums_(threads), rows_(1) {
+        first_rows_(threads + 1), reach_(threads), sums_(threads), rows_(1) {
     for (int a = 0; a < d; ++a) shape_[a] = shape[a], gravity_[a] = gravity[a];
     for (int a = 0; a < d - 1; ++a) rows_ *= shape[a];
     length_ = (shape_[d - 1] + lanes - 1) / lanes * lanes;
     for (auto& sums : sums_) sums.resize(rows_ * length_ * columns / lanes + 2);
-    for (auto& reached : reached_of_row_) reached.assign(rows_, nothing);
+    for (auto& reach : reach_) reach.assign(rows_, nothing);
     velocity_.resize(sums_[0].size());
     for (int64_t p = 0; p < static_cast<int64_t>(blocks_.size()) * lanes; ++p) {
       Block& block = blocks_[p / lanes];
@@ -152,6 +153,8 @@ class Body : public AnyBody {
         for (int b = 0; b < d; ++b) block.F[a][b][l] = a == b;
       }
     }
+    cells_.resize(blocks_.size() * lanes);
+    for (int thread = 0; thread < threads; ++thread) find_cells(thread);
     sort();
     for (int thread = 0; thread < threads; ++thread) rearrange(thread);
     for (size_t k = 0; k < names_.size(); ++k)
@@ -159,56 +162,59 @@ class Body : public AnyBody {
         for (int a = 0; a < d; ++a) motions_[k].v[a][l] = names_[k][l] < 0 ? 0 : v[names_[k][l] * d + a];
   }
 
-  void run(int steps, double dt, double* x, double* v, double* F) override {
-    if (steps > 0) {
-      std::barrier<> together(threads_);
-      std::vector<std::thread> others;
-      auto work = [&](int thread) {
-        for (int step = 0; step < steps; ++step) {
-          if (step == 0)
-            pass<false, true>(thread, dt);
-          else
-            pass<true, true>(thread, dt);
-          together.arrive_and_wait();
-          int64_t strays = 0;
-          for (auto number : strays_) strays += number;
-          update_grid(thread, dt);
-          together.arrive_and_wait();
-          if (strays > count_ / 4) {
-            if (thread == 0) sort();
-            together.arrive_and_wait();
-            rearrange(thread);
-          }
-        }
-        pass<true, false>(thread, dt);
-        write(thread, x, v, F);
-      };
-      for (int thread = 1; thread < threads_; ++thread) others.emplace_back(work, thread);
-      work(0);
-      for (auto& other : others) other.join();
-    }
+  void run(int steps, double dt, void* x, void* v, void* F) override {
+    std::barrier<> together(threads_);
+    auto work = [&](int thread) {
+      for (int step = 0; step < steps; ++step) {
+        if (step == 0)
+          pass<false, true>(thread, dt);
+        else
+          pass<true, true>(thread, dt);
+        together.arrive_and_wait();
+        const bool many_strays = std::accumulate(strays_.begin(), strays_.end(), int64_t{0}) > count_ / 4;
+        update_grid(thread, dt);
+        if (many_strays) find_cells(thread);
+        together.arrive_and_wait();
+        if (!many_strays) continue;
+        if (thread == 0) sort();
+        together.arrive_and_wait();
+        rearrange(thread);
+      }
+      if (steps > 0) pass<true, false>(thread, dt);
+      write(thread, static_cast<T*>(x), static_cast<T*>(v), static_cast<T*>(F));
+    };
+    std::vector<std::thread> others;
+    for (int thread = 1; thread < threads_; ++thread) others.emplace_back(work, thread);
+    work(0);
+    for (auto& other : others) other.join();
   }
 
  private:
   // ---- sorting ----
 
-  int64_t first_node(const Block& block, int l) const {
-    int64_t node = 0;
-    for (int a = 0; a < d; ++a) node = node * shape_[a] + static_cast<int64_t>(block.x[a][l] / spacing_ - T(0.5));
-    return node;
+  // The cell of each particle of a thread's, -1 of none.
+  void find_cells(int thread) {
+    const int64_t blocks = blocks_.size();
+    for (int64_t k = blocks * thread / threads_; k < blocks * (thread + 1) / threads_; ++k)
+      for (int l = 0; l < lanes; ++l) {
+        int64_t cell = 0;
+        for (int a = 0; a < d; ++a)
+          cell = cell * shape_[a] + static_cast<int32_t>(blocks_[k].x[a][l] * (1 / spacing_) - T(0.5));
+        cells_[k * lanes + l] = names_[k][l] < 0 ? -1 : cell;
+      }
   }
 
   // Groups of cells, with the present place of each particle in `order_`, -1 for none.
   void sort() {
     blocks_.swap(old_blocks_);
     names_.swap(old_names_);
-    const int64_t places = old_blocks_.size() * lanes, nodes = rows_ * shape_[d - 1];
-    std::vector<int32_t> cells(places, -1), begins(nodes + 2), listed(count_);
-    for (int64_t p = 0; p < places; ++p)
-      if (old_names_[p / lanes][p % lanes] >= 0) ++begins[(cells[p] = first_node(old_blocks_[p / lanes], p % lanes)) + 2];
+    const int64_t nodes = rows_ * shape_[d - 1];
+    std::vector<int32_t> begins(nodes + 2), listed(count_);
+    for (auto cell : cells_)
+      if (cell >= 0) ++begins[cell + 2];
     for (int64_t cell = 0; cell < nodes; ++cell) begins[cell + 2] += begins[cell + 1];
-    for (int64_t p = 0; p < places; ++p)
-      if (cells[p] >= 0) listed[begins[cells[p] + 1]++] = p;
+    for (size_t p = 0; p < cells_.size(); ++p)
+      if (cells_[p] >= 0) listed[begins[cells_[p] + 1]++] = p;
 
     // A lane takes so many of a cell's particles at most that all lanes together are shortest. A lane costs as much as
     // one particle more, and one that splits a cell, for the run that it begins, as much as eight.
@@ -266,13 +272,14 @@ class Body : public AnyBody {
     }
     close();
     blocks_.resize(order_.size() / lanes), names_.resize(blocks_.size()), motions_.resize(blocks_.size());
+    cells_.resize(order_.size());
     size_t group = 0;  // the shares of the threads have about as many blocks each
     for (int thread = 0; thread < threads_; ++thread) {
-      while (group < groups_.size() && groups_[group].begin * threads_ < static_cast<int64_t>(blocks_.size()) * thread)
-        ++group;
+      while (groups_[group].begin * threads_ < static_cast<int64_t>(blocks_.size()) * thread) ++group;
       shares_[thread] = group;
+      first_rows_[thread] = thread == 0 ? 0 : runs_[groups_[group].first_run].row;
     }
-    shares_[threads_] = groups_.size();
+    shares_[threads_] = groups_.size(), first_rows_[threads_] = rows_;
   }
 
   // Brings a thread's particles to where `order_` wants them.
@@ -310,96 +317,109 @@ class Body : public AnyBody {
         for (int j = 0; j < 3; ++j) visit(3 * (3 * i + j), row + i * shape_[1] + j);
   }
 
-  // The velocities of a stencil's nodes, from a first node on, of one lane or of all.
-  template <class N, class Choose>
-  INLINE void read(int64_t row, int64_t node, N (&nodes)[corners][d], Choose choose) const {
+  // The velocities around the cells of a run; in other lanes, unless the run is the first, they stay.
+  template <bool first>
+  INLINE void read(const Run& run, Vector (&nodes)[corners][d]) const {
     const T* velocity = numbers(velocity_);
-    corner_rows(row, [&](int corner, int64_t at) {
+    corner_rows(run.row, [&](int corner, int64_t row) {
       for (int c = 0; c < d; ++c)
-        for (int s = 0; s < 3; ++s)
-          nodes[corner + s][c] = choose(load<N>(velocity + place_of(at, node + s, c)), nodes[corner + s][c]);
+        for (int s = 0; s < 3; ++s) {
+          const auto found = load<Vector>(velocity + place_of(row, run.node + s, c));
+          if constexpr (first)
+            nodes[corner + s][c] = found;
+          else
+            nodes[corner + s][c] = run.mask ? found : nodes[corner + s][c];
+        }
     });
   }
 
-  template <class N, class Choose>
-  INLINE void add(int thread, int64_t row, int64_t node, const N (&nodes)[corners][columns], Choose choose) {
+  // Adds what the cells of a run give. Of three nodes in a row the second is the third of the lane before: the vectors
+  // are moved by a lane each, and added up before they are stored.
+  INLINE void add(int thread, const Run& run, const Vector (&nodes)[corners][columns]) {
     T* sums = numbers(sums_[thread]);
-    for (int s = 0; s < 3; ++s)  // outermost: a load of what has just been stored in part would wait
-      corner_rows(row, [&](int corner, int64_t at) {
-        for (int c = 0; c < columns; ++c) {
-          T* to = sums + place_of(at, node + s, c);
-          store(to, load<N>(to) + choose(nodes[corner + s][c]));
-        }
-      });
+    corner_rows(run.row, [&](int corner, int64_t row) {
+      for (int c = 0; c < columns; ++c) {
+        Vector given[3];
+        for (int s = 0; s < 3; ++s) given[s] = run.mask ? nodes[corner + s][c] : Vector{};
+        T* to = sums + place_of(row, run.node, c);
+        store(to, load<Vector>(to) + given[0] + moved<1>(given[1], every_lane) + moved<2>(given[2], every_lane));
+        to[lanes] += given[1][lanes - 1] + given[2][lanes - 2];
+        to[lanes + 1] += given[2][lanes - 1];
+      }
+    });
+    note(thread, run.row, run.node + run.begin, run.node + run.end + 2);
+  }
+
+  static constexpr std::make_integer_sequence<int, lanes> every_lane{};
+
+  template <int by, int... lane>
+  INLINE static Vector moved(Vector value, std::integer_sequence<int, lane...>) {
+    return __builtin_shufflevector(value, Vector{}, (lane < by ? lanes : lane - by)...);
   }
 
   // Notes that nodes from a first one on, of the rows of a stencil, are reached.
   INLINE void note(int thread, int64_t row, int64_t low, int64_t high) {
-    auto& reached = reached_[thread];
     corner_rows(row, [&](int, int64_t at) {
-      auto& of_row = reached_of_row_[thread][at];
-      of_row = {std::min(of_row.low, low), std::max(of_row.high, high)};
-      reached = {std::min(reached.low, at), std::max(reached.high, at + 1)};
+      Reach& reach = reach_[thread][at];
+      reach = {std::min(reach.low, low), std::max(reach.high, high)};
     });
   }
 
-  // The velocities of a share of the rows; sums are cleared.
+  // The velocities of the rows that begin with a thread's first group; sums are cleared.
   void update_grid(int thread, T dt) {
-    Reach all = nothing;
-    for (const auto& reached : reached_) all = {std::min(all.low, reached.low), std::max(all.high, reached.high)};
-    const int64_t count = all.high - all.low;
     T* velocity = numbers(velocity_);
-    for (int64_t row = all.low + count * thread / threads_; row < all.low + count * (thread + 1) / threads_; ++row)  {
-      Reach reach = nothing;
-      for (const auto& reached : reached_of_row_)
-        reach = {std::min(reach.low, reached[row].low), std::max(reach.high, reached[row].high)};
-      for (int64_t node = reach.low / lanes * lanes; node < reach.high; node += lanes) {
+    for (int64_t row = first_rows_[thread]; row < first_rows_[thread + 1]; ++row) {
+      Reach all = nothing;
+      for (const auto& reach : reach_)
+        all = {std::min(all.low, reach[row].low), std::max(all.high, reach[row].high)};
+      for (int64_t node = all.low / lanes * lanes; node < all.high; node += lanes) {
         Vector sum[columns] = {};
         for (int other = 0; other < threads_; ++other) {
-          if (reached_of_row_[other][row].high == 0) continue;
-          T* sums = numbers(sums_[other]);
+          if (reach_[other][row].high == 0) continue;
           for (int c = 0; c < columns; ++c) {
-            sum[c] += load<Vector>(sums + place_of(row, node, c));
-            store(sums + place_of(row, node, c), Vector{});
+            T* from = numbers(sums_[other]) + place_of(row, node, c);
+            sum[c] += load<Vector>(from);
+            store(from, Vector{});
           }
         }
         for (int c = 0; c < d; ++c)
           store(velocity + place_of(row, node, c), sum[d] > 0 ? sum[c] / sum[d] + dt * gravity_[c] : Vector{});
       }
-      for (auto& reached : reached_of_row_) reached[row] = nothing;
+      for (auto& reach : reach_) reach[row] = nothing;
     }
   }
 
   // ---- the particles ----
 
-  // Stencils of a block, and which of its particles are strays.
-  INLINE Mask stencils(const Block& block, const Group& group, Stencil<Vector, T, d>& at) const {
-    const T inverse = 1 / spacing_;
-    Mask stray{};
+  // Stencils of a block. Returns which of its particles are strays.
+  INLINE Mask find_stencils(const Block& block, const Group& group, Stencil<Vector, T, d>& at) const {
+    Mask outside{};
     for (int a = 0; a < d; ++a) {
-      at.find(a, block.x[a] * inverse - group.middle[a]);
-      stray |= (at.place[a] > T(0.5)) | (at.place[a] < T(-0.5));
+      at.find(a, block.x[a] * (1 / spacing_) - group.middle[a]);
+      outside |= (at.place[a] > T(0.5)) | (at.place[a] < T(-0.5));
     }
-    return stray;
+    return outside & (block.mass > 0);
   }
 
-  static bool any(Mask mask) {
+  // Calls `visit` with the lane of each stray, its stencil, and its first node's row and place in it.
+  template <class Visit>
+  INLINE void visit_strays(const Block& block, Mask stray, Visit visit) const {
     Whole found = 0, each[lanes];
-    store(each, mask);
+    store(each, stray);
     for (int l = 0; l < lanes; ++l) found |= each[l];
-    return found;
-  }
-
-  // The stencil of one particle, its first node's row, and the node in it.
-  std::pair<int64_t, int64_t> stencil(const Block& block, int l, Stencil<T, T, d>& at) const {
-    int64_t row = 0, node = 0;
-    for (int a = 0; a < d; ++a) {
-      const T place = block.x[a][l] * (1 / spacing_);
-      node = static_cast<int64_t>(place - T(0.5));
-      at.find(a, place - node - 1);
-      if (a < d - 1) row = row * shape_[a] + node;
+    if (!found) [[likely]] return;
+    for (int l = 0; l < lanes; ++l) {
+      if (!stray[l]) continue;
+      Stencil<T, T, d> at;
+      int64_t row = 0, node = 0;
+      for (int a = 0; a < d; ++a) {
+        const T place = block.x[a][l] * (1 / spacing_);
+        node = static_cast<int64_t>(place - T(0.5));
+        at.find(a, place - node - 1);
+        if (a < d - 1) row = row * shape_[a] + node;
+      }
+      visit(l, at, row, node);
     }
-    return {row, node};
   }
 
   template <class N>
@@ -425,17 +445,17 @@ class Body : public AnyBody {
   // Takes from the nodes and moves the particles, or gives to the nodes, or does both.
   template <bool takes, bool gives>
   void pass(int thread, T dt) {
-    reached_[thread] = nothing;
     for (size_t g = shares_[thread]; g < shares_[thread + 1]; ++g) {
       const Group& group = groups_[g];
-      Vector nodes[corners][d] = {}, sums[corners][columns] = {};
-      if constexpr (takes)
-        for (int r = group.first_run; r < group.last_run; ++r) {
-          const Run& run = runs_[r];
-          read(run.row, run.node, nodes, [&](Vector here, Vector other) { return run.mask ? here : other; });
-        }
+      Vector nodes[corners][d], sums[corners][columns] = {};
+      if constexpr (takes) {
+        read<true>(runs_[group.first_run], nodes);
+        for (int r = group.first_run + 1; r < group.last_run; ++r) read<false>(runs_[r], nodes);
+      }
       for (int64_t k = group.begin; k < group.end; ++k) {
         Block& block = blocks_[k];
+        for (size_t line = 0; line < sizeof(Block); line += 64)
+          __builtin_prefetch(reinterpret_cast<const char*>(&block + 2) + line, 1);
         Motion motion;
         if constexpr (takes)
           move(block, group, nodes, motion, dt);
@@ -447,32 +467,27 @@ class Body : public AnyBody {
           motions_[k] = motion;
       }
       if constexpr (gives)
-        for (int r = group.first_run; r < group.last_run; ++r) {
-          const Run& run = runs_[r];
-          add(thread, run.row, run.node, sums, [&](Vector sum) { return run.mask ? sum : Vector{}; });
-          note(thread, run.row, run.node + run.begin, run.node + run.end + 2);
-        }
+        for (int r = group.first_run; r < group.last_run; ++r) add(thread, runs_[r], sums);
     }
   }
 
   // G2P, and the particles' update.
   INLINE void move(Block& block, const Group& group, const Vector (&nodes)[corners][d], Motion& motion, T dt) const {
     Stencil<Vector, T, d> at;
-    const Mask stray = stencils(block, group, at) & (block.mass > 0);
+    const Mask stray = find_stencils(block, group, at);
     velocities(at, nodes, motion.v, motion.C);
-    if (any(stray)) [[unlikely]]
-      for (int l = 0; l < lanes; ++l)
-        if (stray[l]) {
-          Stencil<T, T, d> one;
-          const auto [row, node] = stencil(block, l, one);
-          T around[corners][d], v[d], slope[d][d];
-          read(row, node, around, [](T here, T) { return here; });
-          velocities(one, around, v, slope);
-          for (int r = 0; r < d; ++r) {
-            motion.v[r][l] = v[r];
-            for (int c = 0; c < d; ++c) motion.C[r][c][l] = slope[r][c];
-          }
-        }
+    visit_strays(block, stray, [&](int l, const Stencil<T, T, d>& one, int64_t row, int64_t node) {
+      T around[corners][d], v[d], slope[d][d];
+      corner_rows(row, [&](int corner, int64_t at) {
+        for (int s = 0; s < 3; ++s)
+          for (int c = 0; c < d; ++c) around[corner + s][c] = numbers(velocity_)[place_of(at, node + s, c)];
+      });
+      velocities(one, around, v, slope);
+      for (int r = 0; r < d; ++r) {
+        motion.v[r][l] = v[r];
+        for (int c = 0; c < d; ++c) motion.C[r][c][l] = slope[r][c];
+      }
+    });
     const Vector moving = block.mass > 0 ? Vector{} + dt : Vector{};
     Vector F[d][d];
     for (int r = 0; r < d; ++r) {
@@ -502,38 +517,36 @@ class Body : public AnyBody {
     store(logarithms, J);
     for (auto& number : logarithms) number = std::log(number);
     const Vector pressure = lambda_ * load<Vector>(logarithms) - mu_;
-    Vector mass = block.mass, momentum[d], affine[d][d];
+    Vector momentum[d], affine[d][d];
     for (int r = 0; r < d; ++r) {
-      momentum[r] = mass * motion.v[r];
+      momentum[r] = block.mass * motion.v[r];
       for (int c = 0; c < d; ++c) {
         Vector b{};
         for (int s = 0; s < d; ++s) b += F[r][s] * F[c][s];
-        affine[r][c] = spacing_ * mass * motion.C[r][c] + scale * (mu_ * b + (r == c ? pressure : Vector{}));
+        affine[r][c] = spacing_ * block.mass * motion.C[r][c] + scale * (mu_ * b + (r == c ? pressure : Vector{}));
       }
     }
     Stencil<Vector, T, d> at;
-    const Mask stray = stencils(block, group, at) & (mass > 0);
-    if (any(stray)) [[unlikely]] {
-      for (int l = 0; l < lanes; ++l)
-        if (stray[l]) {
-          Stencil<T, T, d> one;
-          const auto [row, node] = stencil(block, l, one);
-          T around[corners][columns] = {}, q[d], slope[d][d];
-          for (int r = 0; r < d; ++r) {
-            q[r] = momentum[r][l];
-            for (int c = 0; c < d; ++c) slope[r][c] = affine[r][c][l];
-          }
-          momenta<T>(one, mass[l], q, slope, around);
-          add(thread, row, node, around, [](T sum) { return sum; });
-          note(thread, row, node, node + 3);
-          ++strays_[thread];
-        }
-      for (auto& weight : at.weight[0]) weight = stray ? Vector{} : weight;
-    }
-    momenta<Vector>(at, mass, momentum, affine, nodes);
+    const Mask stray = find_stencils(block, group, at);
+    visit_strays(block, stray, [&](int l, const Stencil<T, T, d>& one, int64_t row, int64_t node) {
+      T around[corners][columns] = {}, q[d], slope[d][d];
+      for (int r = 0; r < d; ++r) {
+        q[r] = momentum[r][l];
+        for (int c = 0; c < d; ++c) slope[r][c] = affine[r][c][l];
+      }
+      momenta<T>(one, block.mass[l], q, slope, around);
+      corner_rows(row, [&](int corner, int64_t at) {
+        for (int s = 0; s < 3; ++s)
+          for (int c = 0; c < columns; ++c) numbers(sums_[thread])[place_of(at, node + s, c)] += around[corner + s][c];
+      });
+      note(thread, row, node, node + 3);
+      ++strays_[thread];
+    });
+    for (auto& weight : at.weight[0]) weight = stray ? Vector{} : weight;
+    momenta<Vector>(at, block.mass, momentum, affine, nodes);
   }
 
-  void write(int thread, double* x, double* v, double* F) const {
+  void write(int thread, T* x, T* v, T* F) const {
     for (size_t g = shares_[thread]; g < shares_[thread + 1]; ++g)
       for (int64_t k = groups_[g].begin; k < groups_[g].end; ++k)
         for (int l = 0; l < lanes; ++l) {
@@ -560,11 +573,11 @@ class Body : public AnyBody {
   std::vector<Name> names_, old_names_;
   std::vector<Group> groups_;
   std::vector<Run> runs_;
-  std::vector<int32_t> order_;
+  std::vector<int32_t> cells_, order_;  // for each place of a particle
   std::vector<size_t> shares_;  // of groups, where each thread's begin
   std::vector<int64_t> strays_;
-  std::vector<Reach> reached_;  // rows, for each thread
-  std::vector<std::vector<Reach>> reached_of_row_;
+  std::vector<int64_t> first_rows_;          // of nodes, where each thread's begin
+  std::vector<std::vector<Reach>> reach_;    // of each row, for each thread
   std::vector<std::vector<Vector>> sums_;
   std::vector<Vector> velocity_;
   int64_t rows_;
@@ -587,7 +600,7 @@ void* begin(int d, int bytes, int64_t count, const int64_t* shape, double spacin
   return d == 2 ? make(0.0, two) : make(0.0, three);
 }
 
-void run(void* body, int steps, double dt, double* x, double* v, double* F) {
+void run(void* body, int steps, double dt, void* x, void* v, void* F) {
   static_cast<AnyBody*>(body)->run(steps, dt, x, v, F);
 }
 
