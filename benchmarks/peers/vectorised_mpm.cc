@@ -127,21 +127,23 @@ class Body : public AnyBody {
     int first_run, last_run;
     Vector middle[d];  // the middle node of each cell
   };
+  // The nodes of a row that are reached.
   struct Reach {
-    int64_t low, high;
+    int64_t low = INT64_MAX / 2, high = 0;
+    void extend(Reach other) { low = std::min(low, other.low), high = std::max(high, other.high); }
   };
 
  public:
   Body(int64_t count, const int64_t* shape, double spacing, double shear_modulus, double lame_lambda,
        const double* gravity, const double* x, const double* v, double mass, double volume, int threads)
       : count_(count), spacing_(spacing), mu_(shear_modulus), lambda_(lame_lambda), threads_(threads),
-        blocks_((count + lanes - 1) / lanes), names_(blocks_.size()), shares_(threads + 1), strays_(threads),
-        first_rows_(threads + 1), reach_(threads), sums_(threads), rows_(1) {
+        blocks_((count + lanes - 1) / lanes), names_(blocks_.size()), first_groups_(threads + 1), first_rows_(threads + 1),
+        strays_(threads), reach_(threads), sums_(threads), rows_(1) {
     for (int a = 0; a < d; ++a) shape_[a] = shape[a], gravity_[a] = gravity[a];
     for (int a = 0; a < d - 1; ++a) rows_ *= shape[a];
     length_ = (shape_[d - 1] + lanes - 1) / lanes * lanes;
     for (auto& sums : sums_) sums.resize(rows_ * length_ * columns / lanes + 2);
-    for (auto& reach : reach_) reach.assign(rows_, nothing);
+    for (auto& reach : reach_) reach.resize(rows_);
     velocity_.resize(sums_[0].size());
     for (int64_t p = 0; p < static_cast<int64_t>(blocks_.size()) * lanes; ++p) {
       Block& block = blocks_[p / lanes];
@@ -216,90 +218,85 @@ class Body : public AnyBody {
     for (size_t p = 0; p < cells_.size(); ++p)
       if (cells_[p] >= 0) listed[begins[cells_[p] + 1]++] = p;
 
-    // A lane takes so many of a cell's particles at most that all lanes together are shortest. A lane costs as much as
-    // one particle more, and one that splits a cell, for the run that it begins, as much as eight.
-    constexpr int64_t most = 64;
-    std::array<int64_t, most + 1> cells_of{};  // how many cells have so many particles
-    for (int64_t cell = 0; cell < nodes; ++cell) ++cells_of[std::min<int64_t>(begins[cell + 1] - begins[cell], most)];
-    int64_t deepest = 1, least = INT64_MAX;
-    for (int64_t depth = 1; depth <= most; ++depth) {
-      int64_t cost = 0;
-      for (int64_t number = 1; number <= most; ++number)
-        cost += cells_of[number] * ((number + depth - 1) / depth * (depth + 1 + 8) - 8);
-      if (cost < least) least = cost, deepest = depth;
-    }
-
+    const int64_t depth = lane_depth(begins);
     groups_.clear(), runs_.clear(), order_.clear();
-    struct Lane {
-      int64_t cell, begin, end;
-    };
-    std::vector<Lane> gathered;
-    auto close = [&] {
-      if (gathered.empty()) return;
-      const int64_t begin = order_.size() / lanes;
-      int64_t depth = 0;
-      for (const auto& lane : gathered) depth = std::max(depth, lane.end - lane.begin);
-      order_.resize((begin + depth) * lanes, -1);
-      Group group{begin, begin + depth, static_cast<int>(runs_.size()), 0, {}};
-      for (int l = 0; l < lanes; ++l) {
-        const bool used = l < static_cast<int>(gathered.size());
-        const Lane& lane = gathered[used ? l : 0];
-        int64_t row = lane.cell / shape_[d - 1], node = lane.cell % shape_[d - 1], rest = row;
-        group.middle[d - 1][l] = node + 1;
-        for (int a = d - 2; a >= 0; rest /= shape_[a--]) group.middle[a][l] = rest % shape_[a] + 1;
-        if (!used) continue;
-        if (l == 0 || runs_.back().row != row || runs_.back().node + l != node) runs_.push_back(Run{row, node - l, l, l, Mask{}});
-        runs_.back().end = l + 1;
-        runs_.back().mask[l] = -1;
-        for (int64_t k = 0; k < lane.end - lane.begin; ++k) order_[(begin + k) * lanes + l] = listed[lane.begin + k];
+    int lane = lanes;
+    auto add_lane = [&](int64_t row, int64_t node, int64_t begin, int64_t end) {
+      if (lane == lanes) {
+        const int64_t block = order_.size() / lanes;
+        groups_.push_back(Group{block, block, static_cast<int>(runs_.size()), 0, {}});
+        lane = 0;
       }
+      if (lane == 0 || runs_.back().row != row || runs_.back().node + lane != node)
+        runs_.push_back(Run{row, node - lane, lane, lane, Mask{}});
+      runs_.back().mask[lane] = -1;
+      runs_.back().end = lane + 1;
+      Group& group = groups_.back();
       group.last_run = runs_.size();
-      groups_.push_back(group);
-      gathered.clear();
+      group.middle[d - 1][lane] = node + 1;
+      for (int a = d - 2; a >= 0; row /= shape_[a--]) group.middle[a][lane] = row % shape_[a] + 1;
+      group.end = std::max(group.end, group.begin + end - begin);
+      order_.resize(group.end * lanes, -1);
+      for (int64_t k = 0; k < end - begin; ++k) order_[(group.begin + k) * lanes + lane] = listed[begin + k];
+      ++lane;
     };
-    for (int64_t row = 0; row < nodes; row += shape_[d - 1]) {
-      bool more = begins[row + shape_[d - 1]] > begins[row];
-      for (int64_t part = 0; more; part += deepest) {
-        more = false;
-        for (int64_t cell = row; cell < row + shape_[d - 1]; ++cell) {
-          const int64_t begin = begins[cell] + part, end = begins[cell + 1];
-          if (begin >= end) continue;
-          gathered.push_back({cell, begin, std::min(begin + deepest, end)});
-          more |= begin + deepest < end;
-          if (gathered.size() == lanes) close();
-        }
-      }
+    for (int64_t row = 0; row < rows_; ++row) {
+      const int32_t* begin = begins.data() + row * shape_[d - 1];
+      int64_t fullest = 0;
+      for (int64_t node = 0; node < shape_[d - 1]; ++node)
+        fullest = std::max<int64_t>(fullest, begin[node + 1] - begin[node]);
+      for (int64_t part = 0; part < fullest; part += depth)
+        for (int64_t node = 0; node < shape_[d - 1]; ++node)
+          if (const int64_t from = begin[node] + part; from < begin[node + 1])
+            add_lane(row, node, from, std::min<int64_t>(from + depth, begin[node + 1]));
     }
-    close();
-    blocks_.resize(order_.size() / lanes), names_.resize(blocks_.size()), motions_.resize(blocks_.size());
-    cells_.resize(order_.size());
-    size_t group = 0;  // the shares of the threads have about as many blocks each
-    for (int thread = 0; thread < threads_; ++thread) {
-      while (groups_[group].begin * threads_ < static_cast<int64_t>(blocks_.size()) * thread) ++group;
-      shares_[thread] = group;
-      first_rows_[thread] = thread == 0 ? 0 : runs_[groups_[group].first_run].row;
+    names_.resize(order_.size() / lanes), blocks_.resize(names_.size()), motions_.resize(names_.size()), cells_.resize(order_.size());
+    const int64_t blocks = blocks_.size(), groups = groups_.size();
+    for (int64_t thread = 1, group = 0; thread < threads_; ++thread) {  // about as many blocks each
+      while (group < groups && groups_[group].begin * threads_ < blocks * thread) ++group;
+      first_groups_[thread] = group;
+      first_rows_[thread] = group < groups ? runs_[groups_[group].first_run].row : rows_;
     }
-    shares_[threads_] = groups_.size(), first_rows_[threads_] = rows_;
+    first_groups_[threads_] = groups, first_rows_[threads_] = rows_;
+  }
+
+  // How many of a cell's particles a lane takes at most, so that all lanes together are shortest. A lane costs as much
+  // as one particle more, and one that splits a cell, for the run that it begins, as much as eight.
+  static int64_t lane_depth(const std::vector<int32_t>& begins) {
+    constexpr int64_t most = 64;
+    std::array<int64_t, most + 1> cells{}, costs{INT64_MAX};  // how many cells have so many particles
+    for (size_t cell = 0; cell + 1 < begins.size(); ++cell)
+      ++cells[std::min<int64_t>(begins[cell + 1] - begins[cell], most)];
+    for (int64_t depth = 1; depth <= most; ++depth)
+      for (int64_t number = 1; number <= most; ++number)
+        costs[depth] += cells[number] * ((number + depth - 1) / depth * (depth + 1 + 8) - 8);
+    return std::min_element(costs.begin(), costs.end()) - costs.begin();
+  }
+
+  // Calls `visit` with the group, the block and the lane of each of a thread's places.
+  template <class Visit>
+  void each_place(int thread, Visit visit) const {
+    for (int64_t g = first_groups_[thread]; g < first_groups_[thread + 1]; ++g)
+      for (int64_t k = groups_[g].begin; k < groups_[g].end; ++k)
+        for (int l = 0; l < lanes; ++l) visit(groups_[g], k, l);
   }
 
   // Brings a thread's particles to where `order_` wants them.
   void rearrange(int thread) {
     strays_[thread] = 0;
-    for (size_t g = shares_[thread]; g < shares_[thread + 1]; ++g)
-      for (int64_t k = groups_[g].begin; k < groups_[g].end; ++k)
-        for (int l = 0; l < lanes; ++l) {
-          const int64_t from = order_[k * lanes + l];
-          const Block& old = old_blocks_[std::max<int64_t>(from, 0) / lanes];
-          const int m = from % lanes;
-          Block& block = blocks_[k];
-          names_[k][l] = from < 0 ? -1 : old_names_[from / lanes][m];
-          block.mass[l] = from < 0 ? 0 : old.mass[m];
-          block.volume[l] = from < 0 ? 0 : old.volume[m];
-          for (int a = 0; a < d; ++a) {
-            block.x[a][l] = from < 0 ? groups_[g].middle[a][l] * spacing_ : old.x[a][m];
-            for (int b = 0; b < d; ++b) block.F[a][b][l] = from < 0 ? T(a == b) : old.F[a][b][m];
-          }
-        }
+    each_place(thread, [&](const Group& group, int64_t k, int l) {
+      const int64_t from = order_[k * lanes + l], m = from % lanes;
+      const bool none = from < 0;
+      const Block& old = old_blocks_[none ? 0 : from / lanes];
+      Block& block = blocks_[k];
+      names_[k][l] = none ? -1 : old_names_[from / lanes][m];
+      block.mass[l] = none ? 0 : old.mass[m];
+      block.volume[l] = none ? 0 : old.volume[m];
+      for (int a = 0; a < d; ++a) {
+        block.x[a][l] = none ? group.middle[a][l] * spacing_ : old.x[a][m];
+        for (int b = 0; b < d; ++b) block.F[a][b][l] = none ? T(a == b) : old.F[a][b][m];
+      }
+    });
   }
 
   // ---- the grid ----
@@ -325,10 +322,7 @@ class Body : public AnyBody {
       for (int c = 0; c < d; ++c)
         for (int s = 0; s < 3; ++s) {
           const auto found = load<Vector>(velocity + place_of(row, run.node + s, c));
-          if constexpr (first)
-            nodes[corner + s][c] = found;
-          else
-            nodes[corner + s][c] = run.mask ? found : nodes[corner + s][c];
+          nodes[corner + s][c] = first ? found : run.mask ? found : nodes[corner + s][c];
         }
     });
   }
@@ -359,19 +353,15 @@ class Body : public AnyBody {
 
   // Notes that nodes from a first one on, of the rows of a stencil, are reached.
   INLINE void note(int thread, int64_t row, int64_t low, int64_t high) {
-    corner_rows(row, [&](int, int64_t at) {
-      Reach& reach = reach_[thread][at];
-      reach = {std::min(reach.low, low), std::max(reach.high, high)};
-    });
+    corner_rows(row, [&](int, int64_t at) { reach_[thread][at].extend({low, high}); });
   }
 
   // The velocities of the rows that begin with a thread's first group; sums are cleared.
   void update_grid(int thread, T dt) {
     T* velocity = numbers(velocity_);
     for (int64_t row = first_rows_[thread]; row < first_rows_[thread + 1]; ++row) {
-      Reach all = nothing;
-      for (const auto& reach : reach_)
-        all = {std::min(all.low, reach[row].low), std::max(all.high, reach[row].high)};
+      Reach all;
+      for (const auto& reach : reach_) all.extend(reach[row]);
       for (int64_t node = all.low / lanes * lanes; node < all.high; node += lanes) {
         Vector sum[columns] = {};
         for (int other = 0; other < threads_; ++other) {
@@ -385,7 +375,7 @@ class Body : public AnyBody {
         for (int c = 0; c < d; ++c)
           store(velocity + place_of(row, node, c), sum[d] > 0 ? sum[c] / sum[d] + dt * gravity_[c] : Vector{});
       }
-      for (auto& reach : reach_) reach[row] = nothing;
+      for (auto& reach : reach_) reach[row] = {};
     }
   }
 
@@ -445,7 +435,7 @@ class Body : public AnyBody {
   // Takes from the nodes and moves the particles, or gives to the nodes, or does both.
   template <bool takes, bool gives>
   void pass(int thread, T dt) {
-    for (size_t g = shares_[thread]; g < shares_[thread + 1]; ++g) {
+    for (int64_t g = first_groups_[thread]; g < first_groups_[thread + 1]; ++g) {
       const Group& group = groups_[g];
       Vector nodes[corners][d], sums[corners][columns] = {};
       if constexpr (takes) {
@@ -489,17 +479,19 @@ class Body : public AnyBody {
       }
     });
     const Vector moving = block.mass > 0 ? Vector{} + dt : Vector{};
-    Vector F[d][d];
     for (int r = 0; r < d; ++r) {
       block.x[r] += moving * motion.v[r];
-      for (int c = 0; c < d; ++c) motion.C[r][c] *= 4 / spacing_, F[r][c] = block.F[r][c];
+      for (int c = 0; c < d; ++c) motion.C[r][c] *= 4 / spacing_;
     }
-    for (int r = 0; r < d; ++r)
-      for (int c = 0; c < d; ++c) {
+    for (int c = 0; c < d; ++c) {
+      Vector column[d];
+      for (int s = 0; s < d; ++s) column[s] = block.F[s][c];
+      for (int r = 0; r < d; ++r) {
         Vector change{};
-        for (int s = 0; s < d; ++s) change += motion.C[r][s] * F[s][c];
-        block.F[r][c] = F[r][c] + moving * change;
+        for (int s = 0; s < d; ++s) change += motion.C[r][s] * column[s];
+        block.F[r][c] += moving * change;
       }
+    }
   }
 
   // P2G of mass, momentum and the force's impulse at once.
@@ -547,20 +539,17 @@ class Body : public AnyBody {
   }
 
   void write(int thread, T* x, T* v, T* F) const {
-    for (size_t g = shares_[thread]; g < shares_[thread + 1]; ++g)
-      for (int64_t k = groups_[g].begin; k < groups_[g].end; ++k)
-        for (int l = 0; l < lanes; ++l) {
-          const int64_t p = names_[k][l];
-          if (p < 0) continue;
-          for (int a = 0; a < d; ++a) {
-            x[p * d + a] = blocks_[k].x[a][l];
-            v[p * d + a] = motions_[k].v[a][l];
-            for (int b = 0; b < d; ++b) F[(p * d + a) * d + b] = blocks_[k].F[a][b][l];
-          }
-        }
+    each_place(thread, [&](const Group&, int64_t k, int l) {
+      const int64_t p = names_[k][l];
+      if (p < 0) return;
+      for (int a = 0; a < d; ++a) {
+        x[p * d + a] = blocks_[k].x[a][l];
+        v[p * d + a] = motions_[k].v[a][l];
+        for (int b = 0; b < d; ++b) F[(p * d + a) * d + b] = blocks_[k].F[a][b][l];
+      }
+    });
   }
 
-  static constexpr Reach nothing{INT64_MAX / 2, 0};
   // The numbers of a grid; a vector before them and one after them are never nodes.
   static T* numbers(std::vector<Vector>& grid) { return reinterpret_cast<T*>(grid.data() + 1); }
   static const T* numbers(const std::vector<Vector>& grid) { return reinterpret_cast<const T*>(grid.data() + 1); }
@@ -573,11 +562,10 @@ class Body : public AnyBody {
   std::vector<Name> names_, old_names_;
   std::vector<Group> groups_;
   std::vector<Run> runs_;
-  std::vector<int32_t> cells_, order_;  // for each place of a particle
-  std::vector<size_t> shares_;  // of groups, where each thread's begin
+  std::vector<int32_t> cells_, order_;  // of each place of a particle
+  std::vector<int64_t> first_groups_, first_rows_;  // where each thread's groups, and its rows of nodes, begin
   std::vector<int64_t> strays_;
-  std::vector<int64_t> first_rows_;          // of nodes, where each thread's begin
-  std::vector<std::vector<Reach>> reach_;    // of each row, for each thread
+  std::vector<std::vector<Reach>> reach_;  // of each row, for each thread
   std::vector<std::vector<Vector>> sums_;
   std::vector<Vector> velocity_;
   int64_t rows_;
