@@ -1,7 +1,7 @@
 """MLS-MPM by hand in C++, for the processor that it is compiled on: what is to be had. A peer to compare with.
 
-The same scheme, in the same order of operations, as `mpmjax.Explicit` with the default scene; see `taichi_mpm.py`. One
-thread a core; needs GCC 12 or later.
+The same scheme as `mpmjax.Explicit` with the default scene; see `taichi_mpm.py`. One thread a core; needs GCC 12 or
+later.
 """
 
 import ctypes
