@@ -1,335 +1,390 @@
 // MLS-MPM by hand for one processor's vectors: explicit steps, APIC, quadratic kernel, neo-Hookean. What it takes is a
 // limit for other codes. `vectorised_mpm.py` compiles and calls it.
 //
-// Particles are sorted by cell once a call and kept in blocks of 16, component by component: stress and update are
-// loops over the 16. Nodes have four numbers, of which the mass is the last, so that the three nodes of a stencil's row
-// along the last axis are twelve lanes of one vector. Each thread has blocks of its own and adds to a grid of its own,
-// of which it touches the slabs that its particles reach; the update of the nodes adds the grids up.
+// The lanes of a vector are cells, mostly neighbours along the last axis (`sorted_cells.h`). What one particle of each
+// gives to a node of its cell is then one vector, neither gathered nor turned, and such sums stay on the stack for all
+// particles of these cells. They go to the grid once: cells that are neighbours give to nodes that are neighbours, so
+// that whole vectors are added.
+//
+// One pass over the particles takes velocities from the nodes and gives momenta for the next step to them: x and F are
+// read and written once a step, v and C are in registers only. Particles that have left their cells, strays, are done
+// one by one; once they have cost about what sorting costs, all are sorted again. Each thread adds to a grid of its
+// own, in which it notes how far each row of nodes is reached.
 
 #include <algorithm>
+#include <array>
 #include <barrier>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
-#include <memory>
+#include <numeric>
 #include <thread>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
+#include "sorted_cells.h"
+#include "stencil.h"
+
 namespace {
 
-constexpr int lanes = 16, columns = 4, mass_column = 3;
-
-template <class T>
-struct Vectors {
-  typedef T Four __attribute__((vector_size(columns * sizeof(T))));
-  typedef T Row __attribute__((vector_size(lanes * sizeof(T))));
-};
-template <class T>
-using Four = typename Vectors<T>::Four;
-template <class T>
-using Row = typename Vectors<T>::Row;
-
-template <class V, class T>
-V load(const T* from) {
-  V found;
+template <class N, class T>
+INLINE N load(const T* from) {
+  N found;
   std::memcpy(&found, from, sizeof found);
   return found;
 }
 
-template <class V, class T>
-void store(T* to, V value) {
+template <class N, class T>
+INLINE void store(T* to, N value) {
   std::memcpy(to, &value, sizeof value);
 }
 
-// One number for each of the three nodes of a row, zero beyond them.
-template <class T>
-Row<T> by_node(T a, T b, T c) {
-  return Row<T>{a, a, a, a, b, b, b, b, c, c, c, c, 0, 0, 0, 0};
-}
-
-// The same columns at each node of a row.
-template <class T>
-Row<T> at_each(const T* four) {
-  auto one = load<Four<T>>(four);
-  return __builtin_shufflevector(one, one, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
-}
-
-template <class T>
-Four<T> sum_of_nodes(Row<T> row) {
-  return __builtin_shufflevector(row, row, 0, 1, 2, 3) + __builtin_shufflevector(row, row, 4, 5, 6, 7) +
-         __builtin_shufflevector(row, row, 8, 9, 10, 11);
-}
-
-// Sixteen particles; those that fill the last block up have no mass and no volume.
-template <class T, int d>
-struct alignas(64) Block {
-  T x[d][lanes], v[d][lanes], C[d][d][lanes], F[d][d][lanes], mass[lanes], volume[lanes];
-  int64_t from[lanes];  // the user's number of each, -1 of what fills up
-};
-
-// The stencils of a block: the first node, and along each axis the weights and the arms in spacings.
-template <class T, int d>
-struct Stencils {
-  int64_t first[lanes];
-  T weight[d][3][lanes], arm[d][3][lanes];
-};
-
 struct AnyBody {
   virtual ~AnyBody() = default;
-  virtual void run(int steps, double dt, double* x, double* v, double* F) = 0;
+  virtual void run(int steps, double dt, void* x, void* v, void* F) = 0;
 };
 
 template <class T, int d>
 class Body : public AnyBody {
+  static constexpr int lanes = 64 / sizeof(T), columns = d + 1, corners = power_of_three(d);
+  using Whole = typename Lanes<T>::Whole;
+  using Vector = typename Lanes<T>::Vector;
+  using Mask = typename Lanes<T>::Mask;
+  using Block = typename Cells<T, d>::Block;
+  using Group = typename Cells<T, d>::Group;
+  using Run = typename Cells<T, d>::Run;
+
+  struct Motion {
+    Vector v[d], C[d][d];
+  };
+  // The nodes of a row that are reached.
+  struct Reach {
+    int64_t low = INT64_MAX / 2, high = 0;
+    void extend(Reach other) { low = std::min(low, other.low), high = std::max(high, other.high); }
+  };
+
  public:
   Body(int64_t count, const int64_t* shape, double spacing, double shear_modulus, double lame_lambda,
        const double* gravity, const double* x, const double* v, double mass, double volume, int threads)
-      : count_(count), spacing_(spacing), mu_(shear_modulus), lambda_(lame_lambda), threads_(threads),
-        blocks_((count + lanes - 1) / lanes), reach_(threads), sums_(threads) {
-    nodes_ = 1;
-    for (int a = 0; a < d; ++a) shape_[a] = shape[a], gravity_[a] = gravity[a], nodes_ *= shape[a];
-    slab_ = nodes_ / shape_[0] * columns;
-    for (auto& sums : sums_) sums.resize(nodes_ * columns + lanes);
-    velocity_.resize(nodes_ * columns + lanes);
-    for (int64_t p = 0; p < static_cast<int64_t>(blocks_.size()) * lanes; ++p) {
-      Block<T, d>& block = blocks_[p / lanes];
-      const int64_t l = p % lanes, q = std::min(p, count - 1);
-      block.from[l] = p < count ? p : -1;
-      block.mass[l] = p < count ? mass : 0;
-      block.volume[l] = p < count ? volume : 0;
-      for (int a = 0; a < d; ++a) {
-        block.x[a][l] = x[q * d + a];
-        block.v[a][l] = v[q * d + a];
-        for (int b = 0; b < d; ++b) block.C[a][b][l] = 0, block.F[a][b][l] = a == b;
-      }
-    }
+      : cells_(count, shape, spacing, x, mass, volume, threads), count_(count), rows_(1), spacing_(spacing),
+        mu_(shear_modulus), lambda_(lame_lambda), threads_(threads), strays_(threads), reach_(threads), sums_(threads) {
+    for (int a = 0; a < d; ++a) shape_[a] = shape[a], gravity_[a] = gravity[a];
+    for (int a = 0; a < d - 1; ++a) rows_ *= shape[a];
+    length_ = (shape_[d - 1] + lanes - 1) / lanes * lanes;
+    for (auto& sums : sums_) sums.resize(rows_ * length_ * columns / lanes + 2);
+    for (auto& reach : reach_) reach.resize(rows_);
+    velocity_.resize(sums_[0].size());
+    motions_.resize(cells_.blocks.size());
+    for (int thread = 0; thread < threads; ++thread)
+      cells_.each_place(thread, [&](const Group&, int64_t k, int l) {
+        const int64_t p = cells_.names[k][l];
+        for (int a = 0; a < d; ++a) motions_[k].v[a][l] = p < 0 ? 0 : v[p * d + a];
+      });
   }
 
-  void run(int steps, double dt, double* x, double* v, double* F) override {
-    sort();
+  void run(int steps, double dt, void* x, void* v, void* F) override {
     std::barrier<> together(threads_);
-    std::vector<std::thread> others;
     auto work = [&](int thread) {
-      find_reach(thread);
       for (int step = 0; step < steps; ++step) {
-        to_grid(thread, dt);
+        if (step == 0)
+          pass<false, true>(thread, dt);
+        else
+          pass<true, true>(thread, dt);
         together.arrive_and_wait();
+        const bool many_strays = std::accumulate(strays_.begin(), strays_.end(), int64_t{0}) > count_ / 4;
         update_grid(thread, dt);
+        if (many_strays) cells_.find_cells(thread);
         together.arrive_and_wait();
-        from_grid(thread, dt);
+        if (!many_strays) continue;
+        if (thread == 0) {
+          cells_.sort();
+          motions_.resize(cells_.blocks.size());
+        }
+        together.arrive_and_wait();
+        cells_.rearrange(thread);
+        strays_[thread] = 0;
       }
+      if (steps > 0) pass<true, false>(thread, dt);
+      write(thread, static_cast<T*>(x), static_cast<T*>(v), static_cast<T*>(F));
     };
+    std::vector<std::thread> others;
     for (int thread = 1; thread < threads_; ++thread) others.emplace_back(work, thread);
     work(0);
     for (auto& other : others) other.join();
-    for (const auto& block : blocks_)
-      for (int l = 0; l < lanes; ++l) {
-        const int64_t p = block.from[l];
-        if (p < 0) continue;
-        for (int a = 0; a < d; ++a) {
-          x[p * d + a] = block.x[a][l];
-          v[p * d + a] = block.v[a][l];
-          for (int b = 0; b < d; ++b) F[(p * d + a) * d + b] = block.F[a][b][l];
-        }
-      }
   }
 
  private:
-  // The blocks of a thread.
-  std::pair<int64_t, int64_t> share(int thread) const {
-    const int64_t n = blocks_.size();
-    return {n * thread / threads_, n * (thread + 1) / threads_};
-  }
+  // ---- the grid ----
 
-  int64_t first_node(const Block<T, d>& block, int l) const {
-    int64_t node = 0;
-    for (int a = 0; a < d; ++a) node = node * shape_[a] + static_cast<int64_t>(block.x[a][l] / spacing_ - T(0.5));
-    return node;
-  }
+  // Where a number of a node is: each row has its columns one after the other.
+  int64_t place_of(int64_t row, int64_t node, int column) const { return (row * columns + column) * length_ + node; }
 
-  // A counting sort by the first node; what fills up stays at the end.
-  void sort() {
-    std::vector<int64_t> begins(nodes_ + 2), keys(blocks_.size() * lanes, nodes_);
-    for (size_t k = 0; k < keys.size(); ++k) {
-      const auto& block = blocks_[k / lanes];
-      if (block.from[k % lanes] >= 0) keys[k] = first_node(block, k % lanes);
-      ++begins[keys[k] + 1];
-    }
-    for (int64_t node = 0; node <= nodes_; ++node) begins[node + 1] += begins[node];
-    std::vector<Block<T, d>> sorted(blocks_.size());
-    for (size_t k = 0; k < keys.size(); ++k) {
-      const int64_t to = begins[keys[k]]++;
-      const T* one = blocks_[k / lanes].x[0] + k % lanes;
-      T* other = sorted[to / lanes].x[0] + to % lanes;
-      for (int number = 0; number < numbers; ++number) other[number * lanes] = one[number * lanes];
-      sorted[to / lanes].from[to % lanes] = blocks_[k / lanes].from[k % lanes];
-    }
-    blocks_.swap(sorted);
-  }
-
-  // The first and the last slab of nodes, across the first axis, that a thread's particles reach.
-  void find_reach(int thread) {
-    const auto [begin, end] = share(thread);
-    T low = shape_[0] * spacing_, high = 0;
-    for (int64_t k = begin; k < end; ++k)
-      for (int l = 0; l < lanes; ++l) {
-        low = std::min(low, blocks_[k].x[0][l]);
-        high = std::max(high, blocks_[k].x[0][l]);
-      }
-    const auto first = [&](T x) { return static_cast<int64_t>(x / spacing_ - T(0.5)); };
-    reach_[thread] = {first(low), first(high) + 2};
-  }
-
-  void find_stencils(const Block<T, d>& block, Stencils<T, d>& at) const {
-    const T inverse = 1 / spacing_;
-    for (int l = 0; l < lanes; ++l) at.first[l] = 0;
-    for (int a = 0; a < d; ++a)
-      for (int l = 0; l < lanes; ++l) {
-        const T place = block.x[a][l] * inverse;
-        const auto node = static_cast<int32_t>(place - T(0.5));
-        const T f = place - node;
-        at.first[l] = at.first[l] * shape_[a] + node;
-        at.weight[a][0][l] = T(0.5) * (T(1.5) - f) * (T(1.5) - f);
-        at.weight[a][1][l] = T(0.75) - (f - 1) * (f - 1);
-        at.weight[a][2][l] = T(0.5) * (f - T(0.5)) * (f - T(0.5));
-        for (int s = 0; s < 3; ++s) at.arm[a][s][l] = s - f;
-      }
-  }
-
-  // Calls `visit` with the offset, the weight and the arms of each row of a particle's stencil.
+  // Calls `visit` with the first corner in a row of a stencil, and the row.
   template <class Visit>
-  void rows(const Stencils<T, d>& at, int l, Visit visit) const {
-    for (int i = 0; i < 3; ++i) {
-      const T weight = at.weight[0][i][l], arm = at.arm[0][i][l];
-      if constexpr (d == 2) {
-        visit((at.first[l] + i * shape_[1]) * columns, weight, arm, T(0));
-      } else {
-        for (int j = 0; j < 3; ++j)
-          visit((at.first[l] + (i * shape_[1] + j) * shape_[2]) * columns, weight * at.weight[1][j][l], arm,
-                at.arm[1][j][l]);
-      }
-    }
+  INLINE void corner_rows(int64_t row, Visit visit) const {
+    for (int i = 0; i < 3; ++i)
+      if constexpr (d == 2)
+        visit(3 * i, row + i);
+      else
+        for (int j = 0; j < 3; ++j) visit(3 * (3 * i + j), row + i * shape_[1] + j);
   }
 
-  static Row<T> last_axis(const T (&values)[d][3][lanes], int l) {
-    return by_node<T>(values[d - 1][0][l], values[d - 1][1][l], values[d - 1][2][l]);
-  }
-
-  // P2G of mass, momentum and the force's impulse at once.
-  void to_grid(int thread, T dt) {
-    const auto [low, high] = reach_[thread];
-    T* sums = sums_[thread].data();
-    std::fill(sums + low * slab_, sums + (high + 1) * slab_, T(0));
-    const auto [begin, end] = share(thread);
-    Stencils<T, d> at;
-    alignas(64) T momentum[lanes][columns] = {}, affine[d][lanes][columns] = {};
-    for (int64_t k = begin; k < end; ++k) {
-      const Block<T, d>& block = blocks_[k];
-      find_stencils(block, at);
-      for (int l = 0; l < lanes; ++l) {
-        const T m = block.mass[l], scale = -4 * dt * block.volume[l] / spacing_;
-        T b[d][d], J;
-        for (int r = 0; r < d; ++r)
-          for (int c = 0; c < d; ++c) {
-            b[r][c] = 0;
-            for (int s = 0; s < d; ++s) b[r][c] += block.F[r][s][l] * block.F[c][s][l];
-          }
-        auto F = [&](int r, int c) { return block.F[r][c][l]; };
-        if constexpr (d == 2)
-          J = F(0, 0) * F(1, 1) - F(0, 1) * F(1, 0);
-        else
-          J = F(0, 0) * (F(1, 1) * F(2, 2) - F(1, 2) * F(2, 1)) - F(0, 1) * (F(1, 0) * F(2, 2) - F(1, 2) * F(2, 0)) +
-              F(0, 2) * (F(1, 0) * F(2, 1) - F(1, 1) * F(2, 0));
-        const T pressure = lambda_ * std::log(J) - mu_;
-        for (int r = 0; r < d; ++r) {
-          momentum[l][r] = m * block.v[r][l];
-          for (int c = 0; c < d; ++c)
-            affine[c][l][r] = m * spacing_ * block.C[r][c][l] + scale * (mu_ * b[r][c] + (r == c ? pressure : T(0)));
+  // The velocities around the cells of a run; in other lanes, unless the run is the first, they stay.
+  template <bool first>
+  INLINE void read(const Run& run, Vector (&nodes)[corners][d]) const {
+    const T* velocity = numbers(velocity_);
+    corner_rows(run.row, [&](int corner, int64_t row) {
+      for (int c = 0; c < d; ++c)
+        for (int s = 0; s < 3; ++s) {
+          const auto found = load<Vector>(velocity + place_of(row, run.node + s, c));
+          nodes[corner + s][c] = first ? found : run.mask ? found : nodes[corner + s][c];
         }
-        momentum[l][mass_column] = m;
+    });
+  }
+
+  // Adds what the cells of a run give. Of three nodes in a row the second is the third of the lane before: the vectors
+  // are moved by a lane each, and added up before they are stored.
+  INLINE void add(int thread, const Run& run, const Vector (&nodes)[corners][columns]) {
+    T* sums = numbers(sums_[thread]);
+    corner_rows(run.row, [&](int corner, int64_t row) {
+      for (int c = 0; c < columns; ++c) {
+        Vector given[3];
+        for (int s = 0; s < 3; ++s) given[s] = run.mask ? nodes[corner + s][c] : Vector{};
+        T* to = sums + place_of(row, run.node, c);
+        store(to, load<Vector>(to) + given[0] + moved<1>(given[1], every_lane) + moved<2>(given[2], every_lane));
+        to[lanes] += given[1][lanes - 1] + given[2][lanes - 2];
+        to[lanes + 1] += given[2][lanes - 1];
       }
-      for (int l = 0; l < lanes; ++l) {
-        const Row<T> weights = last_axis(at.weight, l), arms = last_axis(at.arm, l);
-        const Row<T> even = weights * (at_each(momentum[l]) + arms * at_each(affine[d - 1][l]));
-        const Row<T> by_first = weights * at_each(affine[0][l]);
-        const Row<T> by_second = weights * at_each(affine[d - 2][l]);
-        rows(at, l, [&](int64_t offset, T weight, T first, T second) {
-          Row<T> added = even + first * by_first;
-          if constexpr (d == 3) added += second * by_second;
-          store(sums + offset, load<Row<T>>(sums + offset) + weight * added);
-        });
+    });
+    note(thread, run.row, run.node + run.begin, run.node + run.end + 2);
+  }
+
+  static constexpr std::make_integer_sequence<int, lanes> every_lane{};
+
+  template <int by, int... lane>
+  INLINE static Vector moved(Vector value, std::integer_sequence<int, lane...>) {
+    return __builtin_shufflevector(value, Vector{}, (lane < by ? lanes : lane - by)...);
+  }
+
+  // Notes that nodes from a first one on, of the rows of a stencil, are reached.
+  INLINE void note(int thread, int64_t row, int64_t low, int64_t high) {
+    corner_rows(row, [&](int, int64_t at) { reach_[thread][at].extend({low, high}); });
+  }
+
+  // The row of a thread's first group; what comes before is the first thread's.
+  int64_t first_row(int thread) const {
+    const size_t group = cells_.first_groups[thread];
+    return thread == 0 ? 0 : group < cells_.groups.size() ? cells_.runs[cells_.groups[group].first_run].row : rows_;
+  }
+
+  // The velocities of a thread's rows; sums are cleared.
+  void update_grid(int thread, T dt) {
+    T* velocity = numbers(velocity_);
+    for (int64_t row = first_row(thread); row < first_row(thread + 1); ++row) {
+      Reach all;
+      for (const auto& reach : reach_) all.extend(reach[row]);
+      for (int64_t node = all.low / lanes * lanes; node < all.high; node += lanes) {
+        Vector sum[columns] = {};
+        for (int other = 0; other < threads_; ++other) {
+          if (reach_[other][row].high == 0) continue;
+          for (int c = 0; c < columns; ++c) {
+            T* from = numbers(sums_[other]) + place_of(row, node, c);
+            sum[c] += load<Vector>(from);
+            store(from, Vector{});
+          }
+        }
+        for (int c = 0; c < d; ++c)
+          store(velocity + place_of(row, node, c), sum[d] > 0 ? sum[c] / sum[d] + dt * gravity_[c] : Vector{});
       }
+      for (auto& reach : reach_) reach[row] = {};
     }
   }
 
-  // The velocities of the nodes, of a share of the slabs.
-  void update_grid(int thread, T dt) {
-    int64_t low = shape_[0], high = -1;
-    for (const auto& reach : reach_) low = std::min(low, reach.first), high = std::max(high, reach.second);
-    const int64_t slabs = high + 1 - low;
-    Row<T> gravity{};
-    for (int c = 0; c < lanes; ++c) gravity[c] = c % columns < d ? gravity_[c % columns] : T(0);
-    for (int64_t s = low + slabs * thread / threads_; s < low + slabs * (thread + 1) / threads_; ++s)
-      for (int64_t at = s * slab_; at < (s + 1) * slab_; at += lanes) {
-        Row<T> sum{};
-        for (int other = 0; other < threads_; ++other)
-          if (reach_[other].first <= s && s <= reach_[other].second) sum += load<Row<T>>(sums_[other].data() + at);
-        const Row<T> mass = __builtin_shufflevector(sum, sum, 3, 3, 3, 3, 7, 7, 7, 7, 11, 11, 11, 11, 15, 15, 15, 15);
-        store(velocity_.data() + at, mass > 0 ? sum / mass + dt * gravity : Row<T>{});
+  // ---- the particles ----
+
+  // Stencils of a block. Returns which of its particles are strays.
+  INLINE Mask find_stencils(const Block& block, const Group& group, Stencil<Vector, T, d>& at) const {
+    Mask outside{};
+    for (int a = 0; a < d; ++a) {
+      at.find(a, block.x[a] * (1 / spacing_) - group.middle[a]);
+      outside |= (at.place[a] > T(0.5)) | (at.place[a] < T(-0.5));
+    }
+    return outside & (block.mass > 0);
+  }
+
+  // Calls `visit` with the lane of each stray, its stencil, and its first node's row and place in it.
+  template <class Visit>
+  INLINE void visit_strays(const Block& block, Mask stray, Visit visit) const {
+    Whole found = 0, each[lanes];
+    store(each, stray);
+    for (int l = 0; l < lanes; ++l) found |= each[l];
+    if (!found) [[likely]] return;
+    for (int l = 0; l < lanes; ++l) {
+      if (!stray[l]) continue;
+      Stencil<T, T, d> at;
+      int64_t row = 0, node = 0;
+      for (int a = 0; a < d; ++a) {
+        const T place = block.x[a][l] * (1 / spacing_);
+        node = static_cast<int64_t>(place - T(0.5));
+        at.find(a, place - node - 1);
+        if (a < d - 1) row = row * shape_[a] + node;
       }
+      visit(l, at, row, node);
+    }
+  }
+
+  template <class N>
+  INLINE static void velocities(const Stencil<N, T, d>& at, const N (&nodes)[corners][d], N (&v)[d], N (&slope)[d][d]) {
+    for (int r = 0; r < d; ++r) {
+      const auto found = at.template take<d>(&nodes[0][r], d);
+      v[r] = found[0];
+      for (int c = 0; c < d; ++c) slope[r][c] = found[d - c] - at.place[c] * found[0];
+    }
+  }
+
+  template <class N>
+  INLINE static void momenta(const Stencil<N, T, d>& at, N mass, const N (&momentum)[d], const N (&affine)[d][d],
+                             N (&nodes)[corners][columns]) {
+    for (int r = 0; r < d; ++r) {
+      std::array<N, d + 1> given{momentum[r]};
+      for (int c = 0; c < d; ++c) given[d - c] = affine[r][c], given[0] -= at.place[c] * affine[r][c];
+      at.template give<d>(&nodes[0][r], columns, given);
+    }
+    at.template give<d>(&nodes[0][d], columns, {mass});
+  }
+
+  // Takes from the nodes and moves the particles, or gives to the nodes, or does both.
+  template <bool takes, bool gives>
+  void pass(int thread, T dt) {
+    for (int64_t g = cells_.first_groups[thread]; g < cells_.first_groups[thread + 1]; ++g) {
+      const Group& group = cells_.groups[g];
+      Vector nodes[corners][d], sums[corners][columns] = {};
+      if constexpr (takes) {
+        read<true>(cells_.runs[group.first_run], nodes);
+        for (int r = group.first_run + 1; r < group.last_run; ++r) read<false>(cells_.runs[r], nodes);
+      }
+      for (int64_t k = group.begin; k < group.end; ++k) {
+        Block& block = cells_.blocks[k];
+        for (size_t line = 0; line < sizeof(Block); line += 64)
+          __builtin_prefetch(reinterpret_cast<const char*>(&block + 2) + line, 1);
+        Motion motion;
+        if constexpr (takes)
+          move(block, group, nodes, motion, dt);
+        else
+          motion = motions_[k];
+        if constexpr (gives)
+          give(thread, block, group, motion, sums, dt);
+        else
+          motions_[k] = motion;
+      }
+      if constexpr (gives)
+        for (int r = group.first_run; r < group.last_run; ++r) add(thread, cells_.runs[r], sums);
+    }
   }
 
   // G2P, and the particles' update.
-  void from_grid(int thread, T dt) {
-    const auto [begin, end] = share(thread);
-    const T* velocity = velocity_.data();
-    Stencils<T, d> at;
-    alignas(64) T mean[lanes][columns], slope[d][lanes][columns];
-    for (int64_t k = begin; k < end; ++k) {
-      Block<T, d>& block = blocks_[k];
-      find_stencils(block, at);
-      for (int l = 0; l < lanes; ++l) {
-        Row<T> even{}, by_first{}, by_second{};
-        rows(at, l, [&](int64_t offset, T weight, T first, T second) {
-          const Row<T> row = weight * load<Row<T>>(velocity + offset);
-          even += row;
-          by_first += first * row;
-          if constexpr (d == 3) by_second += second * row;
-        });
-        const Row<T> weights = last_axis(at.weight, l), arms = last_axis(at.arm, l);
-        store(mean[l], sum_of_nodes<T>(weights * even));
-        store(slope[0][l], sum_of_nodes<T>(weights * by_first));
-        if constexpr (d == 3) store(slope[1][l], sum_of_nodes<T>(weights * by_second));
-        store(slope[d - 1][l], sum_of_nodes<T>(weights * arms * even));
+  INLINE void move(Block& block, const Group& group, const Vector (&nodes)[corners][d], Motion& motion, T dt) const {
+    Stencil<Vector, T, d> at;
+    const Mask stray = find_stencils(block, group, at);
+    velocities(at, nodes, motion.v, motion.C);
+    visit_strays(block, stray, [&](int l, const Stencil<T, T, d>& one, int64_t row, int64_t node) {
+      T around[corners][d], v[d], slope[d][d];
+      corner_rows(row, [&](int corner, int64_t at) {
+        for (int s = 0; s < 3; ++s)
+          for (int c = 0; c < d; ++c) around[corner + s][c] = numbers(velocity_)[place_of(at, node + s, c)];
+      });
+      velocities(one, around, v, slope);
+      for (int r = 0; r < d; ++r) {
+        motion.v[r][l] = v[r];
+        for (int c = 0; c < d; ++c) motion.C[r][c][l] = slope[r][c];
       }
-      for (int l = 0; l < lanes; ++l) {
-        T C[d][d], F[d][d];
-        for (int r = 0; r < d; ++r) {
-          block.v[r][l] = mean[l][r];
-          block.x[r][l] += dt * mean[l][r];
-          for (int c = 0; c < d; ++c) C[r][c] = 4 / spacing_ * slope[c][l][r], F[r][c] = block.F[r][c][l];
-        }
-        for (int r = 0; r < d; ++r)
-          for (int c = 0; c < d; ++c) {
-            T change = 0;
-            for (int s = 0; s < d; ++s) change += C[r][s] * F[s][c];
-            block.C[r][c][l] = C[r][c];
-            block.F[r][c][l] = F[r][c] + dt * change;
-          }
+    });
+    const Vector moving = block.mass > 0 ? Vector{} + dt : Vector{};
+    for (int r = 0; r < d; ++r) {
+      block.x[r] += moving * motion.v[r];
+      for (int c = 0; c < d; ++c) motion.C[r][c] *= 4 / spacing_;
+    }
+    for (int c = 0; c < d; ++c) {
+      Vector column[d];
+      for (int s = 0; s < d; ++s) column[s] = block.F[s][c];
+      for (int r = 0; r < d; ++r) {
+        Vector change{};
+        for (int s = 0; s < d; ++s) change += motion.C[r][s] * column[s];
+        block.F[r][c] += moving * change;
       }
     }
-    find_reach(thread);
   }
 
-  static constexpr int numbers = 2 * d + 2 * d * d + 2;  // of a particle: x, v, C, F, mass, volume
-  int64_t count_, nodes_, slab_, shape_[d];
+  // P2G of mass, momentum and the force's impulse at once.
+  INLINE void give(int thread, const Block& block, const Group& group, const Motion& motion,
+                   Vector (&nodes)[corners][columns], T dt) {
+    const auto& F = block.F;
+    const Vector scale = -4 * dt / spacing_ * block.volume;
+    Vector J;
+    if constexpr (d == 2)
+      J = F[0][0] * F[1][1] - F[0][1] * F[1][0];
+    else
+      J = F[0][0] * (F[1][1] * F[2][2] - F[1][2] * F[2][1]) - F[0][1] * (F[1][0] * F[2][2] - F[1][2] * F[2][0]) +
+          F[0][2] * (F[1][0] * F[2][1] - F[1][1] * F[2][0]);
+    T logarithms[lanes];
+    store(logarithms, J);
+    for (auto& number : logarithms) number = std::log(number);
+    const Vector pressure = lambda_ * load<Vector>(logarithms) - mu_;
+    Vector momentum[d], affine[d][d];
+    for (int r = 0; r < d; ++r) {
+      momentum[r] = block.mass * motion.v[r];
+      for (int c = 0; c < d; ++c) {
+        Vector b{};
+        for (int s = 0; s < d; ++s) b += F[r][s] * F[c][s];
+        affine[r][c] = spacing_ * block.mass * motion.C[r][c] + scale * (mu_ * b + (r == c ? pressure : Vector{}));
+      }
+    }
+    Stencil<Vector, T, d> at;
+    const Mask stray = find_stencils(block, group, at);
+    visit_strays(block, stray, [&](int l, const Stencil<T, T, d>& one, int64_t row, int64_t node) {
+      T around[corners][columns] = {}, q[d], slope[d][d];
+      for (int r = 0; r < d; ++r) {
+        q[r] = momentum[r][l];
+        for (int c = 0; c < d; ++c) slope[r][c] = affine[r][c][l];
+      }
+      momenta<T>(one, block.mass[l], q, slope, around);
+      corner_rows(row, [&](int corner, int64_t at) {
+        for (int s = 0; s < 3; ++s)
+          for (int c = 0; c < columns; ++c) numbers(sums_[thread])[place_of(at, node + s, c)] += around[corner + s][c];
+      });
+      note(thread, row, node, node + 3);
+      ++strays_[thread];
+    });
+    for (auto& weight : at.weight[0]) weight = stray ? Vector{} : weight;
+    momenta<Vector>(at, block.mass, momentum, affine, nodes);
+  }
+
+  void write(int thread, T* x, T* v, T* F) const {
+    cells_.each_place(thread, [&](const Group&, int64_t k, int l) {
+      const int64_t p = cells_.names[k][l];
+      if (p < 0) return;
+      for (int a = 0; a < d; ++a) {
+        x[p * d + a] = cells_.blocks[k].x[a][l];
+        v[p * d + a] = motions_[k].v[a][l];
+        for (int b = 0; b < d; ++b) F[(p * d + a) * d + b] = cells_.blocks[k].F[a][b][l];
+      }
+    });
+  }
+
+  // The numbers of a grid; a vector before them and one after them are never nodes.
+  static T* numbers(std::vector<Vector>& grid) { return reinterpret_cast<T*>(grid.data() + 1); }
+  static const T* numbers(const std::vector<Vector>& grid) { return reinterpret_cast<const T*>(grid.data() + 1); }
+
+  Cells<T, d> cells_;
+  int64_t count_, shape_[d], rows_, length_;
   T spacing_, mu_, lambda_, gravity_[d];
   int threads_;
-  std::vector<Block<T, d>> blocks_;
-  std::vector<std::pair<int64_t, int64_t>> reach_;
-  std::vector<std::vector<T>> sums_;
-  std::vector<T> velocity_;
+  std::vector<Motion> motions_;
+  std::vector<int64_t> strays_;
+  std::vector<std::vector<Reach>> reach_;  // of each row, for each thread
+  std::vector<std::vector<Vector>> sums_;
+  std::vector<Vector> velocity_;
 };
 
 }  // namespace
@@ -349,7 +404,7 @@ void* begin(int d, int bytes, int64_t count, const int64_t* shape, double spacin
   return d == 2 ? make(0.0, two) : make(0.0, three);
 }
 
-void run(void* body, int steps, double dt, double* x, double* v, double* F) {
+void run(void* body, int steps, double dt, void* x, void* v, void* F) {
   static_cast<AnyBody*>(body)->run(steps, dt, x, v, F);
 }
 

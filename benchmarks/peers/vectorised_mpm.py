@@ -1,7 +1,7 @@
 """MLS-MPM by hand in C++, for the processor that it is compiled on: what is to be had. A peer to compare with.
 
-The same scheme, in the same order of operations, as `mpmjax.Explicit` with the default scene; see `taichi_mpm.py`. One
-thread a core; needs GCC 12 or later.
+The same scheme as `mpmjax.Explicit` with the default scene; see `taichi_mpm.py`. One thread a core; needs GCC 12 or
+later.
 """
 
 import ctypes
@@ -34,8 +34,7 @@ def _library() -> ctypes.CDLL:
 
 
 class VectorisedMPM:
-    """A body under gravity in a box whose walls it does not touch; arguments as `TaichiMPM`'s, with nodes in numbers
-    that four divides."""
+    """A body under gravity in a box whose walls it does not touch; arguments as `TaichiMPM`'s."""
 
     def __init__(
         self,
@@ -51,9 +50,8 @@ class VectorisedMPM:
         gravity: tuple[float, ...],
         dtype: str,
     ):
-        if any(n % 4 for n in shape):
-            raise ValueError(f"This peer is written for numbers of nodes that four divides, got {shape}.")
-        self._library, self._shape = _library(), x.shape
+        self._library, (p, d) = _library(), x.shape
+        self._found = np.empty((p, d), dtype), np.empty((p, d), dtype), np.empty((p, d, d), dtype)
         nodes, forces = np.asarray(shape, "int64"), np.asarray(gravity, "float64")
         x, v = (np.ascontiguousarray(a, "float64") for a in (x, v))
         self._body = self._library.begin(
@@ -72,8 +70,6 @@ class VectorisedMPM:
         weakref.finalize(self, self._library.end, self._body)
 
     def run(self, steps: int, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Go on for some steps. Returns x, v and F, in double precision."""
-        p, d = self._shape
-        found = np.empty((p, d)), np.empty((p, d)), np.empty((p, d, d))
-        self._library.run(self._body, steps, dt, *(a.ctypes.data for a in found))
-        return found
+        """Go on for some steps. Returns x, v and F, which the next call overwrites."""
+        self._library.run(self._body, steps, dt, *(a.ctypes.data for a in self._found))
+        return self._found
