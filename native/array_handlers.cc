@@ -7,7 +7,7 @@
 //   rotation  F                                              ->  R
 //   order     keys                                           ->  order
 //   rearrange wanted, order, numbers                         ->  numbers
-//   written   any arrays                                     ->  the same
+//   stored    any arrays                                     ->  the same
 //
 // Vectors are (..., m), scales (..., 2), mass and whole (..., n), means (..., n, c − 1), sums (..., n, c), active
 // (..., ⌈m/64⌉), matrices (..., 3, 3, p), w (..., 3, p), keys
@@ -159,7 +159,7 @@ ffi::Error run_rearrange(ffi::ThreadPool threads, bool inverse, ffi::RemainingAr
 }
 
 // Results lie where the operands do, if XLA has done what it was asked.
-ffi::Error run_written(ffi::RemainingArgs from, ffi::RemainingRets to) {
+ffi::Error run_stored(ffi::RemainingArgs from, ffi::RemainingRets to) {
   Call call = collect(from, to);
   call.expect(call.buffers.size() == 2 * call.operands, "as many arrays as results");
   for (size_t k = 0; call.fault.empty() && k < call.operands; ++k) {
@@ -203,6 +203,6 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_rearrange, mpmjax::run_rearrange,
                                   .Attr<bool>("inverse")
                                   .RemainingArgs()
                                   .RemainingRets());
-XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_written, mpmjax::run_written, ffi::Ffi::Bind().RemainingArgs().RemainingRets());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_stored, mpmjax::run_stored, ffi::Ffi::Bind().RemainingArgs().RemainingRets());
 
 #pragma GCC visibility pop

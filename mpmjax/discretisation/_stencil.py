@@ -13,7 +13,7 @@ from mpmjax._types import Array, Bool, Float, Indices, Int, ParticleVector, comp
 from mpmjax.discretisation._gradient import AbstractGradient
 from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._kernel import BSpline
-from mpmjax.native import written
+from mpmjax.native import stored
 
 
 class Stencil(eqx.Module):
@@ -115,7 +115,7 @@ def make_stencil(
     """
     dx = grid.spacing
     xi = components(x) / dx
-    f = written(xi - jax.lax.stop_gradient(kernel.base(xi)))
+    f = stored(xi - jax.lax.stop_gradient(kernel.base(xi)))
     weights, spline = kernel.weights(f), kernel.derivatives(f) / dx
     if kernel.order == 1:
         moment = f * (1 - f) * dx**2

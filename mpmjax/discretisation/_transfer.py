@@ -12,7 +12,7 @@ from mpmjax.checks import require_between, require_fields
 from mpmjax.discretisation._average import average
 from mpmjax.discretisation._stencil import Stencil
 from mpmjax.discretisation._transfer_sums import gather
-from mpmjax.native import written
+from mpmjax.native import stored
 
 
 class Gathered(eqx.Module):
@@ -213,14 +213,14 @@ def g2p(
             raise ValueError(f"{type(transfer).__name__} needs the change of the nodes' velocity: give before.")
         change = after - before
     fields = [field for field in (after, mean, change) if field is not None]
-    values, gradients = written(kept_sums(gather(stencil, jnp.concatenate(fields, axis=1))))
+    values, gradients = stored(kept_sums(gather(stencil, jnp.concatenate(fields, axis=1))))
     values, gradients = jnp.split(values, len(fields)), _split_gradients(gradients, len(fields))
     affine: list[Matrix | None] = [None] * len(fields)
     if transfer.affine and stencil.mls_weight_derivatives is None:
         affine = [*gradients]
     elif transfer.affine:
         ends = [field for field in (after, change) if field is not None]
-        _, slopes = written(kept_sums(gather(stencil.least_squares, jnp.concatenate(ends, axis=1))))
+        _, slopes = stored(kept_sums(gather(stencil.least_squares, jnp.concatenate(ends, axis=1))))
         found = _split_gradients(slopes, len(ends))
         affine[0] = found[0]
         if change is not None:

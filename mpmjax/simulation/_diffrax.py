@@ -15,7 +15,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Int, Scalar, components, particle_first
 from mpmjax.checks import first_unmet, requirements
 from mpmjax.discretisation import Stencil, in_window
-from mpmjax.native import written
+from mpmjax.native import stored
 from mpmjax.simulation._rollout_state import RolloutState
 from mpmjax.simulation._sorting import resorted
 from mpmjax.simulation._statistics import Fault, RunStatistics, no_steps, one_step
@@ -57,7 +57,7 @@ class Problem(eqx.Module):
             y: the state as the loop carries it.
             step: the number of steps since the rollout began.
         """
-        state = jax.tree.map(particle_first, written(y.particles))
+        state = jax.tree.map(particle_first, stored(y.particles))
         if y.order is None:
             return self, replace(y, particles=state)
         t = (self.start + step) * self.dt

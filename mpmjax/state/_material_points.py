@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix, Scalar, particle_first
 from mpmjax.material import AbstractElastic, AbstractLaw, AbstractTangent, Viscosity
-from mpmjax.native import written
+from mpmjax.native import stored
 from mpmjax.state._averaged_volume import VolumeAverage, averaged_deformation
 from mpmjax.state._particles import Group, Particles
 
@@ -85,7 +85,7 @@ class MaterialPoints(eqx.Module):
     def flux(self, P: Deformation, dim: int) -> Matrix:
         """The flux of a stress P [J], shape (d, d, q), V0 P Fᵀ, of which the force is the sum, f_i = −Σ_p (V0 P Fᵀ)
         g_ip: the transpose of `change`. In the total description V0 P; by P = dΨ/dJ it is V0 P J I."""
-        P = written(self.volume * P)
+        P = stored(self.volume * P)
         return P if self.total else self.law.kinematics.flux(P, self.deformation, dim)
 
     def stiffness(self, tangent: Callable[[Deformation], Deformation], dim: int) -> Float[Array, "t q"]:
