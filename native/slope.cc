@@ -25,15 +25,19 @@ void pull_back(const Slope<T>& task, int64_t first, int64_t last) {
   }
 }
 
-// Nodes from a first to before a last: those of a block of kTogether without mass become zero.
+// Nodes from a first to before a last: those of a block of kTogether without mass become zero. Blocks that follow one
+// another are set at once, for each stretch that is written past the caches waits for its end.
 template <class T>
 void pull_back(const Slope<T>& task, int64_t first, int64_t last) {
+  int64_t empty = first;  // from here to i no node has mass
+  const auto wipe_before = [&](int64_t i) {
+    if (empty < i) wipe(task.by_sums, task.size * task.columns, empty * task.columns, i * task.columns);
+  };
   for (int64_t end, i = first; i < last; i = end) {
     end = std::min(i + kTogether, last);
-    if (std::all_of(task.whole + i, task.whole + end, [](T whole) { return whole == 0; })) {
-      wipe(task.by_sums, task.size * task.columns, i * task.columns, end * task.columns);
-      continue;
-    }
+    if (std::all_of(task.whole + i, task.whole + end, [](T whole) { return whole == 0; })) continue;
+    wipe_before(i);
+    empty = end;
     switch (task.columns) {
       case 2: pull_back<T, 2>(task, i, end); break;
       case 3: pull_back<T, 3>(task, i, end); break;
@@ -41,6 +45,7 @@ void pull_back(const Slope<T>& task, int64_t first, int64_t last) {
       default: pull_back<T, 0>(task, i, end);
     }
   }
+  wipe_before(last);
 }
 
 template <class T>

@@ -17,6 +17,7 @@ from mpmjax.checks._values import canonical
 from mpmjax.implicit._projection import Projection
 from mpmjax.implicit._restarts import _solve
 from mpmjax.simulation._diffrax import Problem
+from mpmjax.simulation._segments import SegmentAdjoint
 from mpmjax.state import state_of
 from mpmjax.stepping._nodes import Nodes
 from mpmjax.stepping._step import step_unchecked
@@ -383,3 +384,17 @@ def test_a_gradient_stores_no_more_than_the_state_before_each_step():
     stored = ahead.outvars[ahead.params["num_carry"] :]
     state = jax.tree.leaves(state_of(particles))
     assert sum(a.aval.size for a in stored) <= 3 * (sum(a.size for a in state) + 1)
+
+
+def test_segments_sum_each_step_twice_and_no_third_time():
+    """Once on the way, and once more for the segment that is differentiated, which stores its sums."""
+    grid = mpm.Grid((12,) * 2, 0.1)
+    block = mpm.fill(mpm.Box((0.3,) * 2, (0.7,) * 2), grid, particles_per_cell=4, density=1e3)
+
+    def moved(stiffness):
+        scene = mpm.Scene(grid, mpm.NeoHookean(stiffness, 0.3), gravity=(0.0, -9.81))
+        adjoint = SegmentAdjoint((2, 3))
+        return (mpm.simulate(scene, block, t1=6e-3, dt=1e-3, adjoint=adjoint, throw=False).final.x ** 2).sum()
+
+    found = operations(jax.make_jaxpr(jax.grad(moved))(jnp.asarray(1e5)).jaxpr)
+    assert (found["stencil_average"], found["stencil_gather"]) == (12, 12)

@@ -290,3 +290,14 @@ def test_the_matrix_of_a_map_applies_it(d):
     S, T = S + la.transpose(S), T + la.transpose(T)
     matrix, image = la.matrix_of(lambda A: la.matmul(la.matmul(S, A), T), A), la.matmul(la.matmul(S, A), T)
     np.testing.assert_allclose(la.matmul(matrix, A.reshape(d * d, 1, 4)).reshape(A.shape), image, atol=1e-13)
+
+
+def test_a_particle_is_finite_if_all_of_its_numbers_are():
+    """Of the largest and the smallest numbers too."""
+    a = np.ones((2, 3, 10), np.float32)
+    for p, (place, number) in enumerate(zip(np.ndindex(2, 3), [np.nan, np.inf, -np.inf] * 2, strict=True)):
+        a[(*place, p)] = number
+    a[:, 0, 6], a[:, 1, 6] = np.finfo(a.dtype).max, np.finfo(a.dtype).min
+    a[:, 0, 7], a[:, 1, 8], a[:, 2, 9] = 1e-45, -0.0, 3e38
+    for ask in (la.finite, jax.jit(la.finite)):
+        np.testing.assert_array_equal(ask(jnp.asarray(a)), [False] * 6 + [True] * 4)

@@ -1,5 +1,6 @@
 """Walls along the axes: boxes that hold, let slide, or let go."""
 
+from functools import reduce
 from typing import ClassVar
 
 import equinox as eqx
@@ -58,10 +59,14 @@ class AbstractBox(AbstractBoundary):
         """Which particles passed a wall: those deeper than `deepest`, among others (`crossed`)."""
         start, end = start - self.displacement(t), end - self.displacement(t + dt)
 
-        corners = jnp.asarray(self.lower, end.dtype), jnp.asarray(self.upper, end.dtype)
-        walls = _on_both_sides(*corners)[:, None]
-        start, end = _on_both_sides(start.T, start.T), _on_both_sides(end.T, end.T)
-        return crossed(start, end, walls, self.deepest(walls, spacing, reach), spacing).any(axis=0)
+        def beyond(inward: int, corner: Corner) -> list[Array]:
+            """Of each axis, along the inward normal of its wall."""
+            walls = inward * jnp.asarray(corner, end.dtype)
+            place = walls, self.deepest(walls, spacing, reach)
+            return [crossed(*along, spacing) for along in zip(inward * start.T, inward * end.T, *place, strict=True)]
+
+        # axis by axis: of a reduction over them XLA would make a loop within its loop over the particles
+        return reduce(jnp.logical_or, beyond(1, self.lower) + beyond(-1, self.upper))
 
     def deepest(self, wall: Array, spacing: Scalar, reach: float) -> Array:
         """How deep a lower wall lets a particle come [m]: to where no node of its stencil is free.
@@ -194,12 +199,6 @@ class SeparatingBox(AbstractBox):
 
     def check(self, grid: Grid, *, total: bool) -> None:
         refuse_contact(total)
-
-
-def _on_both_sides(lower: Array, upper: Array) -> Array:
-    """Coordinates along the inward normals of the lower walls, and then of the upper ones, shape (2d, ...). XLA stores
-    what is concatenated, and only then makes vectors of what follows."""
-    return jnp.concatenate([lower, -upper])
 
 
 def _check_motion(box: AbstractBox, motion: Motion | None) -> None:

@@ -9,6 +9,7 @@ from jax.core import ShapedArray
 from jax.interpreters import ad
 
 from mpmjax._types import Array, Float, Scalar
+from mpmjax.autodiff import kept_sums
 from mpmjax.discretisation._stencil import Stencil
 from mpmjax.discretisation._transfer_sums import scatter_tangent, written_scatter
 from mpmjax.native import differentiable, native_primitive, sums_fit
@@ -50,8 +51,9 @@ def _average(*args: Array, size: int, unroll: bool) -> list[Array]:
 
 
 def _jvp(primals: tuple, tangents: tuple, *, size: int, batched: int) -> tuple[list[Array], list[Any]]:
-    """Of the sums' differentials, what `_divided` makes of them. The least weight has no part in it."""
-    out = _average_p.bind(*primals, size=size, batched=batched)
+    """Of the sums' differentials, what `_divided` makes of them. The least weight has no part in it. The averages are
+    `kept_sums` here, where the rule takes them: named afterwards they would be others, and these computed again."""
+    out = kept_sums(_average_p.bind(*primals, size=size, batched=batched))
     sums, changes = ((*values[:3], *values[4:]) for values in (primals, tangents))
     change = scatter_tangent(sums, changes, valued=True, size=size, batched=batched)
     if change is None:

@@ -180,7 +180,7 @@ def p2g(
         gradient_terms.append(mass * C * stencil.moment)
     gradients = jnp.swapaxes(sum(gradient_terms), 0, 1) if gradient_terms else None
     given = mass * v, gradients, jnp.finfo(mass.dtype).eps * mass.min()
-    return kept_sums(average(used, mass, *given, size))
+    return average(used, mass, *given, size)
 
 
 def g2p(
