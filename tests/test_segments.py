@@ -117,7 +117,7 @@ def test_what_is_stored_is_the_same():
 
 @NEEDS_LIBRARY
 def test_what_is_stored_is_stored_once(choose):
-    """By one call for all arrays of a tree, which XLA cannot merge with what is done with them; by none of XLA's own."""
+    """By one call for all arrays of a tree, beside which XLA computes nothing again; by XLA alone none."""
 
     def program():
         return jax.jit(lambda a: jax.tree.map(jnp.sin, stored((2 * a, 3 * a)))).lower(jnp.ones(64)).compile().as_text()
