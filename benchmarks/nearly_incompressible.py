@@ -4,6 +4,7 @@ python benchmarks/nearly_incompressible.py              # measures, and draws do
 python benchmarks/nearly_incompressible.py --quick      # 8 and 16 cells, no picture
 python benchmarks/nearly_incompressible.py --swing      # a block that swings, over time
 python benchmarks/nearly_incompressible.py --solves     # iterations and seconds of its preconditioners
+python benchmarks/nearly_incompressible.py --solid      # the same of blocks in three dimensions
 python benchmarks/nearly_incompressible.py --reference  # Cook's membrane by Taylor-Hood elements (needs scikit-fem)
 
 Both are plane strain at small strains, in the total description with particles fitted to the body, three along a cell's
@@ -12,6 +13,7 @@ edge. One linear solve with a step so long that inertia does not count gives the
 
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -217,15 +219,18 @@ def swings() -> None:
                 )
 
 
-def timed(scene: mpm.Scene, particles: mpm.Particles, dt: float, rtol: float, choice: str) -> tuple[int, float]:
-    """Iterations of a step's solve and the least processor seconds of three steps, compiled before; −1 if it fails."""
-    solver = mpm.ConjugateResidual(rtol=rtol, max_steps=100_000)
-    method = mpm.SemiImplicit(solver=solver, preconditioner=PRECONDITIONERS[choice])
-    step = jax.jit(lambda p: mpm.step(scene, p, 0.0, dt, method=method))
+def stepping(choice: mpm.AbstractPreconditioner, rtol: float) -> Callable:
+    """A compiled step of scene, particles and Δt."""
+    method = mpm.SemiImplicit(solver=mpm.ConjugateResidual(rtol=rtol, max_steps=100_000), preconditioner=choice)
+    return jax.jit(lambda scene, particles, dt: mpm.step(scene, particles, 0.0, dt, method=method))
+
+
+def timed(step: Callable, scene: mpm.Scene, particles: mpm.Particles, dt: float, count: int = 3) -> tuple[int, float]:
+    """Iterations of a step's solve and the least processor seconds of some steps, compiled before; −1 if it fails."""
     seconds = []
-    for _ in range(4):
+    for _ in range(count + 1):
         start = time.process_time()
-        _, info = jax.block_until_ready(step(particles))
+        _, info = jax.block_until_ready(step(scene, particles, dt))
         seconds.append(time.process_time() - start)
     return int(info.solve.iterations) if bool(info.solve.converged) else -1, min(seconds[1:])
 
@@ -239,9 +244,31 @@ def solves(sizes: tuple[int, ...]) -> None:
             scenes = {name: cook(cells, nu, volume) for name, volume in VOLUMES.items()}
             wave = 5 * float(scenes["averaged"][0].grid.spacing) * (2 * (1 + nu)) ** 0.5
             for words, dt, rtol in (("to rest", 1e4, 1e-9), ("a step ", wave, 1e-8)):
-                found = [(name, *timed(*scenes[volume], dt, rtol, way)) for name, (volume, way) in ways.items()]
+                found = [
+                    (name, *timed(stepping(PRECONDITIONERS[way], rtol), *scenes[volume], dt))
+                    for name, (volume, way) in ways.items()
+                ]
                 told = ", ".join(f"{name} {count:5} iterations {1e3 * s:8.1f} ms" for name, count, s in found)
                 print(f"cook {cells:3} cells, nu {nu:6}, {words}: {told}", flush=True)
+
+
+def solids(sizes: tuple[int, ...]) -> None:
+    """Print what a step of five times dx/c_s takes, to 1e-8, of a free block in three dimensions with so many cells a
+    side and 2 x 2 x 2 particles a cell, in a window of three more nodes around it: it is sheared and turned."""
+    for cells in sizes:
+        grid = mpm.Grid((cells + 6,) * 3, 0.1, origin=(-3,) * 3)
+        particles = mpm.fill(mpm.Box((0.0,) * 3, (0.1 * cells,) * 3), grid, particles_per_cell=8, density=1.0)
+        turned = particles.x[:, ::-1] - particles.x.mean(axis=0)
+        particles = mpm.Particles(particles.x, 1e-3 * turned, particles.mass, particles.volume)
+        boxed = mpm.VolumePreconditioner(largest=100_000_000, extent=(cells + 2,) * 3)
+        ways = {"diagonal": mpm.DiagonalPreconditioner(), "volume, its box": boxed}
+        steps = {name: stepping(way, 1e-8) for name, way in ways.items()}
+        for nu in (0.49, 0.499, 0.4999):
+            scene = mpm.Scene(grid, mpm.NeoHookean(1.0, nu), volume=mpm.AveragedVolume())
+            dt = 5 * 0.1 * (2 * (1 + nu)) ** 0.5
+            found = [(name, *timed(step, scene, particles, dt, count=1)) for name, step in steps.items()]
+            told = ", ".join(f"{name} {count:5} iterations {s:7.2f} s" for name, count, s in found)
+            print(f"block {cells:3} cells, nu {nu:6}: {told}", flush=True)
 
 
 def main(quick: bool) -> None:
@@ -281,6 +308,8 @@ if __name__ == "__main__":
             print(f"nu {nu}: {one:.4f}, {two:.4f}, extrapolated {2 * two - one:.4f}", flush=True)
     elif "--solves" in sys.argv:
         solves((16,) if "--quick" in sys.argv else (32, 16))
+    elif "--solid" in sys.argv:
+        solids((4, 8) if "--quick" in sys.argv else (4, 8, 12, 16, 20))
     elif "--swing" in sys.argv:
         swings()
     else:

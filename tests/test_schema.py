@@ -105,7 +105,7 @@ EXAMPLES = {
     mpm.AveragedVolume: mpm.AveragedVolume((0, 1)),
     mpm.DiagonalPreconditioner: mpm.DiagonalPreconditioner(),
     mpm.MassPreconditioner: mpm.MassPreconditioner(),
-    mpm.VolumePreconditioner: mpm.VolumePreconditioner(1000),
+    mpm.VolumePreconditioner: mpm.VolumePreconditioner(1000, extent=(5, 6)),
 }
 """One of each class that files hold; the next test says so."""
 

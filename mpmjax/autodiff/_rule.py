@@ -129,7 +129,7 @@ def _shapes(*arrays: ShapedArray, call: _Call) -> list[ShapedArray]:
     return [ShapedArray(a.shape, a.dtype) for a in found]
 
 
-def _batch(arrays: Sequence[Array], axes: Sequence[Any], *, call: _Call) -> tuple[list[Array], list[int]]:
+def _batch(arrays: Sequence[Any], axes: Sequence[Any], *, call: _Call) -> tuple[list[Array], list[int]]:
     mapped = tuple(None if axis is batching.not_mapped else axis for axis in axes)
     out = _ruled_p.bind(*arrays, call=call._replace(mapped=(*call.mapped, mapped)))
     return out, [0] * len(out)

@@ -1,22 +1,21 @@
 """The preconditioner of averaged volumes."""
 
-import itertools
 import math
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, NodeVector
 from mpmjax.boundary import Image, Mirror
 from mpmjax.checks import require, require_fields
 from mpmjax.discretisation import Stencil, gather, scatter
-from mpmjax.implicit._band_cholesky import BandCholesky, band_cholesky
+from mpmjax.implicit._dissected_factor import DissectedFactor, dissected_factor
+from mpmjax.implicit._dissection import Dissection
 from mpmjax.implicit._hessian_action import AveragedStiffness, ParticleStiffness
 from mpmjax.implicit._inner_product import AbstractInnerProduct, DiagonalInnerProduct
+from mpmjax.implicit._nodal_coupling import NodeBox, nodal_coupling
 from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._preconditioner import AbstractPreconditioner, DiagonalPreconditioner
 from mpmjax.implicit._projection import Projection
@@ -33,25 +32,36 @@ class VolumePreconditioner(AbstractPreconditioner):
     lumped stiffness χ Σ_p N_i k_p/(Σ_p N_i V0_p)² [kg/m^2d], with N and k as in `AveragedVolume` and its Hessian. The
     eigenvalues of W⁻¹(M + χH) then lie between those of the parts without averages and those of the average's stiffness
     over the lumped one, so that the number of iterations does not grow as ν goes to ½. S, which has one number a node
-    of the window and material, is factored once a solve, as a band matrix. Without averaged volumes it is
+    and material, is factored once a solve, by nested dissection. Without averaged volumes it is
     `DiagonalPreconditioner`.
 
-    *When it breaks*: the factor takes (10/3) K b³ operations, with b the nodes of four of the window's planes across
-    its longest axis and K a fourth of its length: it is for two dimensions and for small windows in three. Where it has
-    more than `largest` numbers, on periodic grids and with rigid parts, the diagonal is taken. In float32, C is bounded
-    by what the precision can tell, about a thousand times shear. Solvers other than `ConjugateResidual` take the
-    diagonal too.
-    *Good values*: for ν from 0.49 on (docs/nearly_incompressible.md has iterations and times).
+    *When it breaks*: the factor is of a box of nodes, empty ones too, and grows fast with it in three dimensions: 8·10⁶
+    numbers with 18 nodes a side, 24·10⁶ with 22, 58·10⁶ with 26, 127·10⁶ with 30. Where it has more than `largest`, on
+    periodic grids and with rigid parts, the diagonal is taken. In float32, C is bounded by what the precision can tell,
+    about a thousand times shear. Solvers other than `ConjugateResidual` take the diagonal too.
+    *Good values*: for ν from 0.49 on; in three dimensions with an `extent` (docs/nearly_incompressible.md has
+    iterations and times).
 
     Args:
-        largest: largest number of entries of the factor, 2 K b². Default: 2·10⁷, 160 MB in float64.
+        largest: largest number of entries of the factor. Default: 6·10⁷, 480 MB in float64; a solve takes about four
+            times that at its peak.
+        extent: how many nodes along each axis the bodies with averaged volumes take: their length in cells plus 2, and
+            more if they grow. A box of so many nodes is laid from the first of their nodes on in each solve, wherever
+            they are. What reaches beyond it is not preconditioned, so that iterations grow. Default: the whole window.
     """
 
-    largest: int = eqx.field(static=True, default=20_000_000)
+    largest: int = eqx.field(static=True, default=60_000_000)
+    extent: tuple[int, ...] | None = eqx.field(
+        static=True, default=None, converter=lambda a: tuple(a) if isinstance(a, list) else a
+    )
 
     def __check_init__(self):
         require_fields(self)
         require(self.largest >= 0, f"VolumePreconditioner's largest must not be negative, got {self.largest}.")
+        require(
+            self.extent is None or all(length >= 1 for length in self.extent),
+            f"VolumePreconditioner's extent must be numbers of nodes from 1, got {self.extent}.",
+        )
 
     def inner_product(self, operator: ImplicitOperator) -> AbstractInnerProduct:
         operator = operator.precomputed()
@@ -59,13 +69,26 @@ class VolumePreconditioner(AbstractPreconditioner):
         assert isinstance(stiffness, ParticleStiffness)
         if not stiffness.averaged or not isinstance(diagonal, DiagonalInnerProduct):
             return diagonal
-        order = _Order.of(stiffness)
-        if order is None or 2 * order.blocks * order.size**2 > self.largest:
+        half = _half(stiffness)
+        if half is None:
+            return diagonal
+        dissection = Dissection(self._shape(stiffness.averaged[0].average.shape), 2 * half, len(stiffness.averaged))
+        if dissection.entries > self.largest:
             return diagonal
         own = eqx.tree_at(lambda h: h.averaged, stiffness, ())
         mass = operator.nodal_mass()
         weight = operator.projection.commuting_weight(mass + operator.factor * own.diagonal(mass))
-        return _inner_product(operator, stiffness, weight, order, diagonal)
+        return _inner_product(operator, stiffness, weight, dissection, diagonal)
+
+    def _shape(self, window: tuple[int, ...]) -> tuple[int, ...]:
+        """Number of the box's nodes along each axis."""
+        if self.extent is None:
+            return window
+        require(
+            len(self.extent) == len(window),
+            f"VolumePreconditioner's extent must have a number for each of {len(window)} axes, got {self.extent}.",
+        )
+        return tuple(min(pair) for pair in zip(self.extent, window, strict=True))
 
 
 class _Divergence(eqx.Module):
@@ -101,10 +124,10 @@ class VolumeInnerProduct(AbstractInnerProduct):
     weight: NodeVector
     """The diagonal of P [kg], shape (n, d)."""
     divergence: _Divergence
-    softness: Float[Array, "a n"]
-    """1/C [m^2d/kg]; infinite where B counts for nothing."""
-    factor: BandCholesky
-    order: "_Order"
+    softness: Float[Array, "a m"]
+    """1/C [m^2d/kg] of the box's nodes; infinite where B counts for nothing."""
+    factor: DissectedFactor
+    box: NodeBox
     diagonal: DiagonalInnerProduct
 
     @property
@@ -116,14 +139,22 @@ class VolumeInnerProduct(AbstractInnerProduct):
         return self.diagonal
 
     def apply(self, v: NodeVector) -> NodeVector:
-        return self.weight * v + self.divergence.transpose(self.divergence(v) / self.softness)
+        return self.weight * v + self._spread(self._change(v) / self.softness)
 
     def solve(self, r: NodeVector) -> NodeVector:
         z = r / self.weight
         known = jnp.isfinite(self.softness)
-        right = self.order.blocked(jnp.where(known, self.divergence(z), 0))
-        q = self.order.unblocked(self.factor.solve(right))
-        return z - self.divergence.transpose(jnp.where(known, q, 0)) / self.weight
+        right = jnp.where(known, self._change(z), 0)
+        q = self.factor.solve(right.T.reshape(-1)).reshape(right.shape[::-1]).T
+        return z - self._spread(jnp.where(known, q, 0)) / self.weight
+
+    def _change(self, v: NodeVector) -> Float[Array, "a m"]:
+        """B v in the box."""
+        return self.box.inside(self.divergence(v))
+
+    def _spread(self, q: Float[Array, "a m"]) -> NodeVector:
+        """Bᵀ q of numbers in the box."""
+        return self.divergence.transpose(self.box.outside(q))
 
     def solve_factor(self, r: Any) -> Any:
         raise NotImplementedError("VolumeInnerProduct has no factor; take that of factored().")
@@ -132,130 +163,31 @@ class VolumeInnerProduct(AbstractInnerProduct):
         return self.solve_factor(v)
 
 
-class _Order(eqx.Module):
-    """The order of the nodes in which S is block tridiagonal: planes across the longest axis, `reach` of them a block,
-    with as many numbers at a node as there are materials with averages."""
-
-    shape: tuple[int, ...] = eqx.field(static=True)
-    axis: int = eqx.field(static=True)
-    reach: int = eqx.field(static=True)
-    """Largest distance of two nodes that S couples, in spacings along an axis."""
-    materials: int = eqx.field(static=True)
-
-    @staticmethod
-    def of(stiffness: ParticleStiffness) -> "_Order | None":
-        """None where S is no band matrix."""
-        average = stiffness.averaged[0].average
-        if any(average.periodic) or any(not isinstance(image, Image) for image in stiffness.mirror.images):
-            return None
-        support = stiffness.stencil.weights.shape[1]
-        reach = 2 * (math.ceil(1 + support / 2) - 1)  # twice that of a hat and a spline of so many cells
-        return _Order(average.shape, int(np.argmax(average.shape)), reach, len(stiffness.averaged))
-
-    @property
-    def planes(self) -> int:
-        """Number of planes."""
-        return self.shape[self.axis]
-
-    @property
-    def plane(self) -> int:
-        """Number of nodes of one plane."""
-        return math.prod(self.shape) // self.planes
-
-    @property
-    def blocks(self) -> int:
-        """K."""
-        return -(-self.planes // self.reach)
-
-    @property
-    def size(self) -> int:
-        """b."""
-        return self.reach * self.materials * self.plane
-
-    def lined(self, field: Array) -> Array:
-        """A field of nodes (..., n) with the planes in a row, shape (..., planes, plane)."""
-        lattice = jnp.moveaxis(
-            field.reshape(*field.shape[:-1], *self.shape), field.ndim - 1 + self.axis, field.ndim - 1
-        )
-        return lattice.reshape(*field.shape[:-1], self.planes, self.plane)
-
-    def blocked(self, field: Float[Array, "a n"]) -> Float[Array, "k b"]:
-        """A field as blocks, zero beyond the last plane."""
-        rows = jnp.moveaxis(self.lined(field), 0, 1)
-        spare = self.blocks * self.reach - self.planes
-        return jnp.pad(rows, ((0, spare), (0, 0), (0, 0))).reshape(self.blocks, self.size)
-
-    def unblocked(self, rows: Float[Array, "k b"]) -> Float[Array, "a n"]:
-        """And back."""
-        planes = rows.reshape(-1, self.materials, self.plane)[: self.planes]
-        others = [length for axis, length in enumerate(self.shape) if axis != self.axis]
-        lattice = jnp.moveaxis(planes, 1, 0).reshape(self.materials, self.planes, *others)
-        return jnp.moveaxis(lattice, 1, 1 + self.axis).reshape(self.materials, -1)
-
-    def colours(self) -> np.ndarray:
-        """A number for each node, shape (n,), that no two nodes within reach of one share."""
-        period = 2 * self.reach + 1
-        each = np.meshgrid(*(np.arange(length) % period for length in self.shape), indexing="ij")
-        return np.sum([colour.reshape(-1) * period**axis for axis, colour in enumerate(each)], axis=0)
-
-    def matrix(self, columns: Float[Array, "c a t n"]) -> tuple[Float[Array, "k b b"], Float[Array, "k b b"]]:
-        """The blocks on the diagonal and those below it, from the products of S with each colour's nodes.
-
-        Args:
-            columns: S e for e of one at one material's nodes of one colour, shape (materials, colours, materials, n).
-        """
-        found, colours = self.lined(columns), jnp.asarray(self.lined(jnp.asarray(self.colours())))
-        places = [np.arange(length) for axis, length in enumerate(self.shape) if axis != self.axis]
-        inside = np.stack([p.reshape(-1) for p in np.meshgrid(*places, indexing="ij")]) if places else np.zeros((1, 1))
-        near = jnp.asarray((np.abs(inside[:, :, None] - inside[:, None]) <= self.reach).all(axis=0))
-        count, along = np.arange(self.materials), jnp.arange(self.reach)
-
-        def block(first: Array, other: Array) -> Array:
-            r, q = (first * self.reach + along, other * self.reach + along)
-            rows = r[:, None, None, None, None, None], count[:, None, None, None, None], np.arange(self.plane)
-            row_plane, row_material, row_node = rows[0], rows[1], rows[2][:, None, None, None]
-            plane, material, node = q[:, None, None], count[:, None], np.arange(self.plane)
-            colour = colours.at[plane, node].get(mode="clip")
-            value = found.at[material, colour, row_material, row_plane, row_node].get(mode="clip")
-            known = (jnp.abs(row_plane - plane) <= self.reach) & near[row_node, node] & (plane >= 0)
-            known &= (row_plane < self.planes) & (plane < self.planes)
-            whole = jnp.where(known, value, 0).reshape(self.size, self.size)
-            beyond = jnp.repeat(r >= self.planes, self.size // self.reach)
-            return whole + jnp.diag(jnp.where(beyond & (first == other), 1.0, 0.0).astype(whole.dtype))
-
-        numbers = jnp.arange(self.blocks)
-        return jax.lax.map(lambda k: (block(k, k), block(k, k - 1)), numbers)
+def _half(stiffness: ParticleStiffness) -> int | None:
+    """How many nodes away B sees along an axis; None where that is no box of nodes."""
+    average = stiffness.averaged[0].average
+    if any(average.periodic) or any(not isinstance(image, Image) for image in stiffness.mirror.images):
+        return None
+    support = stiffness.stencil.weights.shape[1]
+    return math.ceil(1 + support / 2) - 1  # as far as a hat and a spline of so many cells overlap
 
 
 def _inner_product(
     operator: ImplicitOperator,
     stiffness: ParticleStiffness,
     weight: NodeVector,
-    order: _Order,
+    dissection: Dissection,
     diagonal: DiagonalInnerProduct,
 ) -> VolumeInnerProduct:
     divergence = _Divergence(stiffness.stencil, stiffness.mirror, operator.projection, stiffness.averaged)
     bulk = [one.average.inverse**2 * one.average.at_nodes(one.bulk) for one in stiffness.averaged]
     C = operator.factor * jnp.maximum(jnp.stack(bulk), 0)
-    some, colours, materials = C > 0, jnp.asarray(order.colours()), len(stiffness.averaged)
-
-    def column(which: Array) -> Array:
-        material, colour = which
-        q = (colours == colour) & (jnp.arange(materials) == material)[:, None] & some
-        return jnp.where(some, divergence(divergence.transpose(q.astype(C.dtype)) / weight), 0)
-
-    count = (2 * order.reach + 1) ** len(order.shape)
-    pairs = jnp.asarray(list(itertools.product(range(materials), range(count))), dtype=colours.dtype)
-    columns = jax.lax.map(column, pairs).reshape(materials, count, materials, -1)
-    own = jnp.stack([columns[a, colours, a, jnp.arange(colours.size)] for a in range(materials)])
-    least = jnp.sqrt(jnp.finfo(C.dtype).eps) / _STIFFEST * own
+    window = stiffness.averaged[0].average.shape
+    box = NodeBox.around((C > 0).any(axis=0), window, dissection.shape)
+    C = box.inside(C)
+    some = C > 0
+    coupling = nodal_coupling(divergence.transpose, weight, some, box, dissection.reach // 2)
+    least = jnp.sqrt(jnp.finfo(C.dtype).eps) / _STIFFEST * coupling.diagonal
     softness = jnp.where(some, jnp.maximum(1 / jnp.where(some, C, 1), least), jnp.inf)
-    added = jnp.where(some, softness, 1)
-    lattice = colours == jnp.arange(count)[:, None]
-    columns = columns + jnp.stack(
-        [
-            jnp.stack([jnp.where(lattice & (a == b), added[a], 0) for b in range(materials)], axis=1)
-            for a in range(materials)
-        ]
-    )
-    return VolumeInnerProduct(weight, divergence, softness, band_cholesky(*order.matrix(columns)), order, diagonal)
+    factor = dissected_factor(dissection, coupling.plus(jnp.where(some, softness, 1)).entries)
+    return VolumeInnerProduct(weight, divergence, softness, factor, box, diagonal)
