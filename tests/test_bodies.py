@@ -223,10 +223,11 @@ def test_a_block_rests_on_a_rough_slope():
     assert abs(v[-1][0]) < 0.1 * 2.5
 
 
+@pytest.mark.parametrize("d", [2, *thorough(3)])
 @pytest.mark.parametrize("method", **ids({k: METHODS[k] for k in ("explicit", "semi_implicit")}, "explicit"))
-def test_derivatives_of_a_touch_are_those_of_differences(method):
+def test_derivatives_of_a_touch_are_those_of_differences(method, d):
     """By friction, by a law, and by the place and speed of a body."""
-    scene, particles = stacked(gap=-0.05, speed=1.0, shift=0.3)
+    scene, particles = stacked(d, gap=-0.05, speed=1.0, shift=0.3)
     dt, rows = 1e-3 if method.is_explicit else 4e-3, slice(particles.sizes[0], None)
 
     def end(numbers):
@@ -235,7 +236,7 @@ def test_derivatives_of_a_touch_are_those_of_differences(method):
         own = eqx.tree_at(lambda s: s.material[1].youngs_modulus, own, 1e4 * stiffer)
         moved = dataclasses.replace(
             particles,
-            x=particles.x.at[rows, 1].add(0.1 * place),
+            x=particles.x.at[rows, -1].add(0.1 * place),
             v=particles.v.at[rows].multiply(speed),
         )
         new = mpm.rollout(own, moved, steps=3, dt=dt, method=method)

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DESCRIPTIONS, GRADIENTS, TRANSFERS, assert_close, block, explicit_limit, ids
-from test_boundary_forces import METHODS, angular_momentum, shaken
+from helpers import DESCRIPTIONS, GRADIENTS, TRANSFERS, assert_close, block, explicit_limit, ids, thorough
+from test_boundary_forces import METHODS, angular_momentum, axial, shaken
 
 import mpmjax as mpm
 from mpmjax.boundary import constrain
@@ -20,14 +20,29 @@ from mpmjax.io._schema import decode, encode
 from mpmjax.stepping._nodes import particles_to_grid
 
 SIDE = 0.3
-TOP = mpm.Patch(mpm.Box((0.0, 0.0), (SIDE, SIDE)), mpm.Box((-1.0, 0.29), (1.0, 1.0)))
-RIGHT = mpm.Patch(mpm.Box((0.0, 0.0), (SIDE, SIDE)), mpm.Box((0.29, -1.0), (1.0, 1.0)))
-RAMP = mpm.TimeSeries((0.0, 1.0), ((1e3, -2e3), (5e5, -2e3)))
+EACH_DIM = pytest.mark.parametrize("d", [2, *thorough(3)])
 
 
-def loaded(*loads, dim=2, **scene):
+def face(axis, d):
+    """The far side of the block across an axis."""
+    lower = [-1.0] * d
+    lower[axis] = 0.29
+    return mpm.Patch(mpm.Box((0.0,) * d, (SIDE,) * d), mpm.Box(tuple(lower), (1.0,) * d))
+
+
+def ramp(d):
+    """A traction that grows in direction 0."""
+    return mpm.TimeSeries((0.0, 1.0), ((1e3, -2e3, 3e3)[:d], (5e5, -2e3, 3e3)[:d]))
+
+
+TOP, RIGHT, RAMP = face(1, 2), face(0, 2), ramp(2)
+AT = {2: ((0.1, 0.1), (0.2, 0.15)), 3: ((0.1, 0.1, 0.05), (0.2, 0.15, 0.2))}
+"""Two points of the block, on a line."""
+
+
+def loaded(*loads, d=2, **scene):
     """A block with loads on it, at rest."""
-    scene, particles = block(dim, loads=loads, **scene)
+    scene, particles = block(d, loads=loads, **scene)
     return mpm.attach(scene, particles), mpm.prepare(mpm.attach(scene, particles), particles)
 
 
@@ -65,21 +80,26 @@ def test_surfaces_are_closed_and_have_their_area(region, area, volume):
         assert (np.log2(errors[0] / errors[1]) > 1.8).all()
 
 
+@EACH_DIM
 @pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
-def test_loads_have_the_force_and_moment_that_was_asked_for(description):
-    """Of a traction, a pressure, a force at a point beside the particles' lattice: the change of momentum, linear and
-    angular, of a free body, to rounding."""
+def test_loads_have_the_force_and_moment_that_was_asked_for(description, d):
+    """Of a traction, a pressure, a force at a point beside the particles' lattice or along a line: the change of
+    momentum, linear and angular, of a free body, to rounding."""
     gradient = mpm.MLSGradient()  # of which w + g·r has the right moment
-    point = mpm.PointsAt(((0.13, 0.07),))
-    for load, force, moment in (
-        (mpm.Traction(TOP, (3e3, -2e3)), SIDE * np.array([3e3, -2e3]), SIDE * (SIDE / 2 * -2e3 - SIDE * 3e3)),
-        (mpm.Pressure(RIGHT, 4e3), SIDE * np.array([-4e3, 0.0]), SIDE * SIDE / 2 * 4e3),
-        (mpm.PointLoad(point, (50.0, 20.0)), np.array([50.0, 20.0]), 0.13 * 20 - 0.07 * 50),
+    traction, total, point = ((3e3, -2e3, 1e3)[:d], (50.0, 20.0, -30.0)[:d], (0.13, 0.07, 0.19)[:d])
+    middle, area = np.full(d, SIDE / 2), SIDE ** (d - 1)
+    top, right = middle.copy(), middle.copy()
+    top[1] = right[0] = SIDE
+    for load, force, place in (
+        (mpm.Traction(face(1, d), traction), area * np.array(traction), top),
+        (mpm.Pressure(face(0, d), 4e3), area * np.array((-4e3, 0.0, 0.0)[:d]), right),
+        (mpm.PointLoad(mpm.PointsAt((point,)), total), np.array(total), point),
+        (mpm.PointLoad(mpm.PointsAt(AT[d]), total), np.array(total), np.mean(AT[d], axis=0)),
     ):
-        scene, particles = loaded(load, description=description, gradient=gradient)
+        scene, particles = loaded(load, d=d, description=description, gradient=gradient)
         found = gained(scene, particles, mpm.Explicit(), 1e-5)
         assert_close(found[0], force, 1e-9)
-        assert_close(found[1], np.array([moment]), 1e-9)
+        assert_close(found[1], axial(np.outer(force, place)), 1e-9)
 
 
 @pytest.mark.thorough
@@ -106,21 +126,22 @@ def test_loads_in_three_dimensions(description):
             np.testing.assert_allclose(found, force * np.array([0, 1e3, 2e3]), rtol=0, atol=0.03 * 2e3 * force)
 
 
-def test_a_pressure_follows_the_surface_and_a_traction_does_not():
+@EACH_DIM
+def test_a_pressure_follows_the_surface_and_a_traction_does_not(d):
     """On a body that is turned and stretched: −p cof(F) A, and A t."""
-    turn = jnp.asarray([[0.0, -2.0], [1.5, 0.0]])  # by a right angle, and sheared out
+    F = np.diag((0.0, 0.0, 0.8)[:d])  # by a right angle, and sheared out
+    F[0, 1], F[1, 0] = -2.0, 1.5
+    right, area, traction = face(0, d), SIDE ** (d - 1) * np.eye(d)[0], np.array((1e3, 2e3, -3e3)[:d])
+    cofactor = np.linalg.det(F) * np.linalg.inv(F).T
     for load, expected in (
-        (mpm.Pressure(RIGHT, 4e3), SIDE * 1.5 * np.array([0.0, -4e3]) * 2.0 / 2.0),
-        (mpm.Pressure(RIGHT, 4e3, following=False), SIDE * np.array([-4e3, 0.0])),
-        (mpm.Traction(RIGHT, (1e3, 2e3)), SIDE * np.array([1e3, 2e3])),
+        (mpm.Pressure(right, 4e3), -4e3 * cofactor @ area),
+        (mpm.Pressure(right, 4e3, following=False), -4e3 * area),
+        (mpm.Traction(right, tuple(traction)), area[0] * traction),
     ):
-        scene, particles = loaded(load, description=mpm.TotalLagrangian())
-        deformations = (jnp.broadcast_to(turn, particles.F.shape),)
-        particles = dataclasses.replace(particles, x=particles.X @ turn.T, deformations=deformations)
+        scene, particles = loaded(load, d=d, description=mpm.TotalLagrangian())
+        deformations = (jnp.broadcast_to(jnp.asarray(F), particles.F.shape),)
+        particles = dataclasses.replace(particles, x=particles.X @ F.T, deformations=deformations)
         force, _ = gained(scene, particles, mpm.Explicit(), 1e-7)
-        cofactor = np.linalg.det(turn) * np.linalg.inv(turn).T
-        if isinstance(load, mpm.Pressure) and load.following:
-            expected = -4e3 * cofactor @ np.array([SIDE, 0.0])
         np.testing.assert_allclose(force, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
 
 
@@ -134,12 +155,12 @@ def test_loads_change_in_time():
         assert force[0] == pytest.approx(expected, rel=1e-6)
 
 
-def oscillator(method, stiffness=4e3, damping=None, steps=3, dt=0.02, **scene):
+def oscillator(method, stiffness=4e3, damping=None, steps=3, dt=0.02, *, d=2):
     """Velocity and place of a body held by a spring at all of its particles, which moves as one mass: [[x, v], ...]."""
-    _, free = block(2)
+    _, free = block(d)
     everywhere = mpm.PointsAt(np.asarray(free.x), np.asarray(free.mass) / float(free.mass.sum()))
-    scene, particles = loaded(mpm.Spring(everywhere, stiffness, damping), **scene)
-    particles = dataclasses.replace(particles, v=jnp.broadcast_to(jnp.asarray([0.1, 0.0]), particles.x.shape))
+    scene, particles = loaded(mpm.Spring(everywhere, stiffness, damping), d=d)
+    particles = dataclasses.replace(particles, v=particles.v.at[:, 0].set(0.1))
     found = []
     for n in range(steps):
         particles, info = mpm.step(scene, particles, n * dt, dt, method=method)
@@ -149,13 +170,14 @@ def oscillator(method, stiffness=4e3, damping=None, steps=3, dt=0.02, **scene):
     return np.array(found), float(free.mass.sum())
 
 
+@EACH_DIM
 @pytest.mark.parametrize("method", **ids(METHODS, ("explicit", "implicit_midpoint")))
-def test_springs_and_dashpots_are_exact_in_the_solve(method):
+def test_springs_and_dashpots_are_exact_in_the_solve(method, d):
     """A mass on a spring with a dashpot, far beyond the explicit limit for implicit methods, moves as the integrator's
     own formula says."""
     name = next(key for key, value in METHODS.items() if value == method)
     dt, (k, c) = (2e-3, (4e3, 30.0)) if name == "explicit" else (0.5, (4e3, 30.0))
-    found, m = oscillator(method, k, c, dt=dt)
+    found, m = oscillator(method, k, c, dt=dt, d=d)
     expected, (x, v) = [], (0.0, 0.1)
     A = np.array([[0.0, 1.0], [-k / m, -c / m]])
     for _ in found:
@@ -175,11 +197,12 @@ def test_springs_and_dashpots_are_exact_in_the_solve(method):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
 
 
-def test_springs_to_the_ground_and_of_contact_make_one_potential():
+@EACH_DIM
+def test_springs_to_the_ground_and_of_contact_make_one_potential(d):
     """At a symmetry plane, with a floor that pushes: the force is minus the energy's derivative, and the Hessian minus
     the force's, also as matrices; both kinds of springs take part."""
-    floor = mpm.SeparatingBox((-np.inf, 0.02), (np.inf, np.inf))
-    scene, particles = loaded(mpm.Spring(TOP, 5e4), boundary=(mpm.SymmetryPlane(0, 0.0), floor))
+    floor = mpm.SeparatingBox((-np.inf, 0.02, -np.inf)[:d], (np.inf,) * d)
+    scene, particles = loaded(mpm.Spring(face(1, d), 5e4), d=d, boundary=(mpm.SymmetryPlane(0, 0.0), floor))
     nodes = particles_to_grid(scene, particles, 0.0, 1e-3, scene.stencil(particles), force_at=1.0)
     shut = tuple(contact.gap < 0 for contact in nodes.contacts)
     potential = constrain(nodes, shut).nodes.potential
@@ -198,19 +221,20 @@ def test_springs_to_the_ground_and_of_contact_make_one_potential():
         assert np.abs(np.asarray(other.force(u) - potential.force(u))).max() > 1e-3
 
 
-def test_the_stable_step_knows_springs():
+@EACH_DIM
+def test_the_stable_step_knows_springs(d):
     """Springs much stiffer than the body: at the limit that is given nothing grows, at three times of it the velocity
     grows by more than ten a step. A dashpot lowers the limit too."""
-    _, free = block(2)
+    _, free = block(d)
     everywhere = mpm.PointsAt(np.asarray(free.x), np.asarray(free.mass) / float(free.mass.sum()))
     limits = []
     for spring in (None, mpm.Spring(everywhere, 1e8), mpm.Spring(everywhere, 1e8, 1e5)):
-        scene, particles = loaded(*([] if spring is None else [spring]))
+        scene, particles = loaded(*([] if spring is None else [spring]), d=d)
         limits.append(float(mpm.stable_dt(scene, particles, safety=1.0)))
     assert limits[2] < limits[1] < limits[0] / 10
     grown = {}
     for factor, steps in ((1.0, 30), (3.0, 4)):
-        found, _ = oscillator(mpm.Explicit(), 1e8, steps=steps, dt=factor * limits[1])
+        found, _ = oscillator(mpm.Explicit(), 1e8, steps=steps, dt=factor * limits[1], d=d)
         grown[factor] = np.abs(found[-1, 1]) / 0.1
     assert grown[1.0] < 2
     assert grown[3.0] > 1e3
@@ -219,19 +243,25 @@ def test_the_stable_step_knows_springs():
 @pytest.mark.thorough
 @pytest.mark.parametrize("description", DESCRIPTIONS.values(), ids=DESCRIPTIONS)
 @pytest.mark.parametrize(
-    ("gradient", "transfer", "method"),
-    [("mls", "apic", "explicit"), ("spline", "flip", "implicit_midpoint"), ("spline", "pic", "semi_implicit")],
+    ("gradient", "transfer", "method", "d"),
+    [
+        ("mls", "apic", "explicit", 2),
+        ("spline", "flip", "implicit_midpoint", 2),
+        ("spline", "pic", "semi_implicit", 2),
+        ("mls", "apic", "implicit_midpoint", 3),
+    ],
 )
-def test_budgets_close_with_loads(description, gradient, transfer, method):
+def test_budgets_close_with_loads(description, gradient, transfer, method, d):
     """Energy and momentum, with every kind of load."""
     method, choices = METHODS[method], {"gradient": GRADIENTS[gradient], "transfer": TRANSFERS[transfer]}
     loads = (
-        mpm.Traction(TOP, RAMP),
-        mpm.Pressure(RIGHT, 4e3),
-        mpm.Spring(mpm.PointsAt(((0.1, 0.1), (0.2, 0.15))), (1e4, 2e4), 30.0),
+        mpm.Traction(face(1, d), ramp(d)),
+        mpm.Pressure(face(0, d), 4e3),
+        mpm.Spring(mpm.PointsAt(AT[d]), (1e4, 2e4, 3e4)[:d], 30.0),
     )
+    gravity = (1.0, -9.81, 0.5)[:d]
     scene, particles = loaded(
-        *loads, description=description, gravity=(1.0, -9.81), boundary=mpm.SymmetryPlane(1, 0.0), **choices
+        *loads, d=d, description=description, gravity=gravity, boundary=mpm.SymmetryPlane(1, 0.0), **choices
     )
     v = jnp.asarray(np.random.default_rng(3).normal(size=particles.v.shape))
     particles = dataclasses.replace(particles, v=v)
@@ -244,28 +274,31 @@ def test_budgets_close_with_loads(description, gradient, transfer, method):
 
 
 @pytest.mark.thorough
-def test_loads_have_derivatives():
-    """By traction, pressure, the values of a series, stiffness, damping and the ground's motion, through an implicit
-    solve, against central differences."""
+@pytest.mark.parametrize("d", [2, 3])
+def test_loads_have_derivatives(d):
+    """By traction, pressure, the values of a series, stiffness, damping, the ground's motion and a force along a line,
+    through an implicit solve, against central differences."""
+    rest = (0.0,) * d
     loads = (
-        mpm.Traction(TOP, mpm.TimeSeries((0.0, 0.01), ((0.0, 0.0), (1e3, -2e3)))),
-        mpm.Pressure(RIGHT, 4e3),
-        mpm.Spring(mpm.PointsAt(((0.1, 0.1),)), 1e4, 30.0, mpm.Motion((0.0, 0.1), ((0.0, 0.0), (0.01, 0.0)))),
+        mpm.Traction(face(1, d), mpm.TimeSeries((0.0, 0.01), (rest, (1e3, -2e3, 3e3)[:d]))),
+        mpm.Pressure(face(0, d), 4e3),
+        mpm.Spring(mpm.PointsAt(AT[d][:1]), 1e4, 30.0, mpm.Motion((0.0, 0.1), (rest, (0.01, 0.0, 0.0)[:d]))),
+        mpm.PointLoad(mpm.PointsAt(AT[d]), (20.0,) * d),
     )
-    scene, particles = loaded(*loads)
-    numbers = (2e3, 4e3, 1e4, 30.0, 0.01)
+    scene, particles = loaded(*loads, d=d)
+    numbers = (2e3, 4e3, 1e4, 30.0, 0.01, 20.0)
 
     def end(numbers):
-        traction, pressure, stiffness, damping, way = numbers
+        traction, pressure, stiffness, damping, way, force = numbers
         own = eqx.tree_at(
             lambda s: (
                 s.loads[0].traction.values[1][0], s.loads[1].pressure, s.loads[2].stiffness, s.loads[2].damping,
-                s.loads[2].motion.displacement[1][0],
+                s.loads[2].motion.displacement[1][0], s.loads[3].total[0],
             ),
-            scene, (traction, pressure, stiffness, damping, way),
+            scene, (traction, pressure, stiffness, damping, way, force),
         )  # fmt: skip
         run = mpm.simulate(own, particles, t1=0.02, dt=5e-3, method=METHODS["implicit_midpoint"])
-        return (run.final.x * jnp.asarray([1.0, 0.3])).sum()
+        return (run.final.x * jnp.asarray([1.0, 0.3, 0.1])[:d]).sum()
 
     slopes = jax.grad(end)(numbers)
     for i, (number, slope) in enumerate(zip(numbers, slopes, strict=True)):
@@ -287,17 +320,21 @@ def test_loads_forces_and_planes_that_move_in_single_precision():
     assert float(mpm.stable_dt(scene, particles)) > 0
 
 
-@pytest.mark.parametrize("method", **ids(METHODS, "explicit"))
-def test_loads_and_boundaries_sum_to_the_change_of_momentum(method):
+@pytest.mark.parametrize(
+    ("name", "d"),
+    [
+        ("explicit", 2),
+        *thorough(*((name, 2) for name in METHODS if name != "explicit"), ("explicit", 3), ("trbdf2", 3)),
+    ],
+)
+def test_loads_and_boundaries_sum_to_the_change_of_momentum(name, d):
     """What the boundaries receive is what loads and gravity give and the body does not keep."""
-    scene, particles = shaken(
-        boundary=(mpm.SymmetryPlane(0, 0.0), mpm.StickyBox((-np.inf, 0.0), (np.inf, np.inf))),
-        loads=(mpm.Traction(TOP, (3e3, -2e3)),),
-    )
+    wall, traction = mpm.StickyBox((-np.inf, 0.0, -np.inf)[:d], (np.inf,) * d), (3e3, -2e3, 1e3)[:d]
+    scene, particles = shaken(d, boundary=(mpm.SymmetryPlane(0, 0.0), wall), loads=mpm.Traction(face(1, d), traction))
     dt = 0.3 * explicit_limit(scene)
-    after, info = mpm.step(scene, particles, 0.0, dt, method=method)
+    after, info = mpm.step(scene, particles, 0.0, dt, method=METHODS[name])
     mass = np.asarray(particles.mass)
-    given = dt * (mass.sum() * np.asarray(scene.gravity) + SIDE * np.array([3e3, -2e3]))
+    given = dt * (mass.sum() * np.asarray(scene.gravity) + SIDE ** (d - 1) * np.array(traction))
     lost = given - mass @ np.asarray(after.v - particles.v)
     np.testing.assert_allclose(info.boundaries.impulse.sum(axis=0), lost, rtol=0, atol=1e-10 * np.abs(given).max())
 

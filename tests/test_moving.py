@@ -34,32 +34,37 @@ def test_a_grip_that_turns_holds_as_a_sticky_body_does(motion, description):
     assert_close(ends[0][0][deep], motion.place(particles.x, 0.01)[deep], 1e-4 if not scene.total else 1e-6)
 
 
-WAY = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.3, 0.6)))
-PAIRS = {
-    "sticky": (mpm.StickyBox((-np.inf, 0.1), (np.inf, np.inf), WAY), mpm.Grip(mpm.Box((-9.0, -9.0), (9.0, 0.1)), WAY)),
-    "slip": (
-        mpm.SlipBox((-np.inf, 0.1), (np.inf, np.inf), WAY),
-        mpm.SlipCollider(mpm.HalfSpace((0.0, 0.1), (0.0, 1.0)), WAY),
-    ),
-}
+def up(d, way, *, time=1.0, sideways=0.0):
+    """An even motion along the last axis, in a time, and along all others."""
+    return mpm.Motion((0.0, time), ((0.0,) * d, (sideways,) * (d - 1) + (way,)))
+
+
+def wall_and_body(kind, d):
+    """A wall above which a body is, and the grip or collider that it is."""
+    way, low, high = up(d, 0.6, sideways=0.3), (-np.inf,) * (d - 1) + (0.1,), (np.inf,) * d
+    if kind == "sticky":
+        return mpm.StickyBox(low, high, way), mpm.Grip(mpm.Box((-9.0,) * d, (9.0,) * (d - 1) + (0.1,)), way)
+    space = mpm.HalfSpace((0.0,) * (d - 1) + (0.1,), (0.0,) * (d - 1) + (1.0,))
+    return mpm.SlipBox(low, high, way), mpm.SlipCollider(space, way)
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("description", DESCRIPTIONS.values(), ids=DESCRIPTIONS)
-@pytest.mark.parametrize("pair", PAIRS.values(), ids=PAIRS)
-def test_walls_that_move_are_grips_or_colliders_of_a_half_space(pair, description):
+@pytest.mark.parametrize("kind", ["sticky", "slip"])
+def test_walls_that_move_are_grips_or_colliders_of_a_half_space(kind, description, d):
     """In motion and force, over steps in which the wall passes a node."""
     ends = []
-    for wall in pair:
-        scene, particles = block(2, boundary=wall, boundary_forces=True, description=description)
-        particles = dataclasses.replace(particles, v=particles.v + jnp.asarray([0.0, 0.6]))
+    for wall in wall_and_body(kind, d):
+        scene, particles = block(d, boundary=wall, boundary_forces=True, description=description)
+        particles = dataclasses.replace(particles, v=particles.v.at[:, -1].add(0.6))
         run = mpm.simulate(scene, particles, t1=0.2, dt=2e-3, save_every=20)
         ends.append((run.final.x, run.final.v, run.boundary_forces().force))
     for a, b in zip(*ends, strict=True):
         assert_close(a, b, 1e-9)
 
 
-PLANE = mpm.SymmetryPlane(1, 0.0, motion=mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.0, 0.6))))
+PLANES = {d: mpm.SymmetryPlane(d - 1, 0.0, motion=up(d, 0.6)) for d in (2, 3)}
 MOVING = {
     "explicit": (mpm.Explicit(), mpm.APIC()),
     "flip": (mpm.Explicit(), mpm.FLIP(0.95)),
@@ -71,12 +76,15 @@ MOVING = {
 
 
 @pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
-@pytest.mark.parametrize("how", **ids(MOVING, "explicit"))
-def test_a_plane_that_moves_is_one_at_rest_seen_by_somebody_who_moves(how, description):
+@pytest.mark.parametrize(
+    ("name", "d"),
+    [("explicit", 2), *thorough(*((name, 2) for name in MOVING if name != "explicit"), ("flip", 3), ("trbdf2", 3))],
+)
+def test_a_plane_that_moves_is_one_at_rest_seen_by_somebody_who_moves(name, d, description):
     """A shaken block on a plane that moves evenly, against the same at rest: positions, velocities and forces."""
-    (method, transfer), V, found = how, jnp.asarray([0.0, 0.6]), []
-    for plane, drift in ((mpm.SymmetryPlane(1, 0.0), 0 * V), (PLANE, V)):
-        scene, particles = shaken(boundary=plane, transfer=transfer, description=description)
+    (method, transfer), V, found = MOVING[name], jnp.zeros(d).at[-1].set(0.6), []
+    for plane, drift in ((mpm.SymmetryPlane(d - 1, 0.0), 0 * V), (PLANES[d], V)):
+        scene, particles = shaken(d, boundary=plane, transfer=transfer, description=description)
         dt = 0.3 * explicit_limit(scene)
         particles = dataclasses.replace(particles, v=particles.v + drift)
         for n in range(4):
@@ -87,48 +95,53 @@ def test_a_plane_that_moves_is_one_at_rest_seen_by_somebody_who_moves(how, descr
 
 
 @pytest.mark.thorough
-def test_a_block_is_compressed_evenly_between_planes_that_move_apart_from_each_other():
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_block_is_compressed_evenly_between_planes_that_move_apart_from_each_other(d):
     """In the total description; by one long step of a linear solve, to its tolerance; each plane is pressed by the
     stress of that strain times its side."""
-    planes = (
-        mpm.SymmetryPlane(0, 0.0),
-        mpm.SymmetryPlane(0, SIDE, keep="below"),
-        mpm.SymmetryPlane(1, 0.0, motion=mpm.Motion((0.0, 1e3), ((0.0, 0.0), (0.0, 0.001)))),
-        mpm.SymmetryPlane(1, SIDE, keep="below", motion=mpm.Motion((0.0, 1e3), ((0.0, 0.0), (0.0, -0.002)))),
-    )
-    scene, particles = block(2, boundary=planes, boundary_forces=True, description=mpm.TotalLagrangian())
+    planes = [
+        mpm.SymmetryPlane(axis, at, keep, motion=up(d, way, time=1e3) if axis == d - 1 else None)
+        for axis in range(d)
+        for at, keep, way in ((0.0, "above", 0.001), (SIDE, "below", -0.002))
+    ]
+    scene, particles = block(d, boundary=planes, boundary_forces=True, description=mpm.TotalLagrangian())
     after, info = mpm.step(scene, particles, 0.0, 1e3, method=METHODS["backward_euler"])
     stretch = 1 - 0.003 / SIDE
-    assert_close(after.x[:, 1], 0.001 + stretch * particles.x[:, 1], 1e-9)
-    assert_close(after.F[:, 1, 1], jnp.full(particles.count, stretch), 1e-9)
-    P = np.asarray(LAWS["fixed_corotated"].stress(jnp.diag(jnp.asarray([1.0, stretch]))[..., None])[..., 0])
+    assert_close(after.x[:, -1], 0.001 + stretch * particles.x[:, -1], 1e-9)
+    assert_close(after.F[:, -1, -1], jnp.full(particles.count, stretch), 1e-9)
+    P = np.asarray(LAWS["fixed_corotated"].stress(jnp.diag(jnp.ones(d).at[-1].set(stretch))[..., None])[..., 0])
     force = np.asarray(info.boundaries.impulse / 1e3)
-    assert_close(force[:, 0], SIDE * P[0, 0] * np.array([1, -1, 0, 0]), 1e-7)
-    assert_close(force[:, 1], SIDE * P[1, 1] * np.array([0, 0, 1, -1]), 1e-7)
+    for axis in range(d):
+        alone = np.zeros(2 * d)
+        alone[2 * axis : 2 * axis + 2] = 1, -1
+        assert_close(force[:, axis], SIDE ** (d - 1) * P[axis, axis] * alone, 1e-7)
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("transfer", TRANSFERS.values(), ids=TRANSFERS)
-def test_forces_on_planes_that_move_sum_to_the_change_of_momentum(transfer):
+@pytest.mark.parametrize(("transfer", "d"), [*((name, 2) for name in TRANSFERS), ("apic", 3)])
+def test_forces_on_planes_that_move_sum_to_the_change_of_momentum(transfer, d):
     """In a corner of two, with a wall, in both descriptions."""
     boundary = (
-        PLANE,
-        mpm.SymmetryPlane(0, 0.0, motion=mpm.Motion((0.0, 1.0), ((0.0, 0.0), (-0.4, 0.0)))),
-        mpm.StickyBox((-np.inf, -np.inf), (0.3, np.inf)),
+        PLANES[d],
+        mpm.SymmetryPlane(0, 0.0, motion=mpm.Motion((0.0, 1.0), ((0.0,) * d, (-0.4,) + (0.0,) * (d - 1)))),
+        mpm.StickyBox((-np.inf,) * d, (0.3,) + (np.inf,) * (d - 1)),
     )
     for description in DESCRIPTIONS.values():
         for method in (METHODS["explicit"], METHODS["implicit_midpoint"]):
-            assert_sums_to_change(*shaken(boundary=boundary, transfer=transfer, description=description), method)
+            assert_sums_to_change(
+                *shaken(d, boundary=boundary, transfer=TRANSFERS[transfer], description=description), method
+            )
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("description", DESCRIPTIONS.values(), ids=DESCRIPTIONS)
-def test_the_motion_of_a_plane_can_be_differentiated(description):
+def test_the_motion_of_a_plane_can_be_differentiated(description, d):
     """Against central differences, through a rollout; and a run with a plane that moves goes on from its end."""
-    scene, particles = block(2, boundary=PLANE, description=description, gravity=(0.0, -9.81))
+    scene, particles = block(d, boundary=PLANES[d], description=description, gravity=(0.0,) * (d - 1) + (-9.81,))
 
     def end(way):
-        own = eqx.tree_at(lambda s: s.boundary[0].motion.displacement[1][1], scene, way)
+        own = eqx.tree_at(lambda s: s.boundary[0].motion.displacement[1][-1], scene, way)
         return (mpm.simulate(own, particles, t1=0.02, dt=2e-3).final.x ** 2).sum()
 
     slope = jax.grad(end)(0.6)
@@ -142,10 +155,10 @@ def test_planes_that_cannot_move_as_asked_say_so():
     """Two across one axis in the updated description, and a window that follows."""
     still = mpm.SymmetryPlane(1, SIDE, keep="below")
     with pytest.raises(ValueError, match="all of them must move alike"):
-        block(2, boundary=(PLANE, still))
-    block(2, boundary=(PLANE, still), description=mpm.TotalLagrangian())
+        block(2, boundary=(PLANES[2], still))
+    block(2, boundary=(PLANES[2], still), description=mpm.TotalLagrangian())
     with pytest.raises(ValueError, match="cannot follow the particles"):
-        mpm.Scene(mpm.Grid((9, 9), 0.1, follow=True), LAWS["fixed_corotated"], boundary=PLANE)
+        mpm.Scene(mpm.Grid((9, 9), 0.1, follow=True), LAWS["fixed_corotated"], boundary=PLANES[2])
 
 
 def half_bar(e, plane, method, total):
