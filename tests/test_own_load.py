@@ -2,9 +2,12 @@
 
 import dataclasses
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from helpers import assert_files_hold, block
+import pytest
+from helpers import METHODS, assert_files_hold, block
 
 import mpmjax as mpm
 from mpmjax._types import Array, Float, Scalar
@@ -35,3 +38,30 @@ def test_a_load_of_ones_own_acts_and_is_kept_in_files(tmp_path):
     lost = float(particles.mass.sum()) * speed - float(mpm.momentum(run.final)[0])
     np.testing.assert_allclose(lost, dt * 1.2 / 2 * 1.1 * 4 * side * speed**2, rtol=1e-9)
     assert_files_hold(tmp_path / "run.h5", run, Drag)
+
+
+class Fixed(mpm.AbstractLoad):
+    """A force that is not to be differentiated."""
+
+    on: mpm.AbstractPlace
+    total: Scalar
+
+    def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
+        """Along every axis."""
+        del t, dt
+        return jax.lax.stop_gradient(self.total) * points.weight * jnp.ones_like(points.v)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_a_solve_does_not_depend_on_has_a_zero_derivative(method):
+    """In both modes, by the number of a load that stops it."""
+    scene, particles = block(2, loads=Fixed(mpm.PointsAt(((0.1, 0.1),)), jnp.asarray(3.0)))
+    scene = mpm.attach(scene, particles)
+
+    def end(total):
+        loaded = eqx.tree_at(lambda s: s.loads[0].total, scene, total)
+        run = mpm.simulate(loaded, particles, t1=2e-3, dt=1e-3, method=METHODS[method], throw=False)
+        return run.final.x.sum()
+
+    assert jax.grad(end)(3.0) == 0
+    assert jax.jvp(end, (3.0,), (1.0,))[1] == 0

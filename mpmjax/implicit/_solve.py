@@ -68,6 +68,8 @@ def _solve_jvp(primals: Any, tangents: Any) -> Any:
     d_problem, d_slot = tangents[:2]
     v, info = kept(_solve(problem, slot, guess, find, adjoint))
     d_residual = eqx.filter_jvp(lambda q: q.residual(v), (problem,), (d_problem,))[1]
+    if d_residual is None:  # it does not depend on what is differentiated
+        d_residual = jnp.zeros_like(v)
     operator = problem.operator(v)
     known, preconditioner = without_derivative((operator, problem.preconditioner))
     known = known.precomputed()
