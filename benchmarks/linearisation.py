@@ -1,19 +1,23 @@
 """What one linear solve a step leaves undone, beside what it makes wrong.
 
-    python benchmarks/linearisation.py
+    python benchmarks/linearisation.py            # the table, and docs/linearisation.png
+    python benchmarks/linearisation.py --quick    # the longest steps alone, no picture
 
 Each run is compared with Newton's method at the same step. Of a sheet of rubber that is pulled in two directions by 3 %
 the error is that of the nominal stress at the end, of free motions and impacts that of the positions, over how far the
 particles moved.
 """
 
+import sys
 import warnings
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 
 import mpmjax as mpm
 
@@ -46,8 +50,10 @@ def block(motion: str) -> tuple[mpm.Scene, mpm.Particles]:
     return scene, eqx.tree_at(lambda q: q.v, particles, jnp.stack(v, axis=1))
 
 
-def compare(name: str, scene: mpm.Scene, particles: mpm.Particles, t1: float, dt: float, method: Any) -> None:
-    """Print a row: the part left undone, and the error against Newton's method."""
+def compare(
+    name: str, scene: mpm.Scene, particles: mpm.Particles, t1: float, dt: float, method: Any
+) -> tuple[float, float]:
+    """The part left undone, and the error against Newton's method, printed as a row."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         run, exact = (mpm.simulate(scene, particles, t1=t1, dt=dt, method=m) for m in (method, NEWTON[type(method)]))
@@ -58,15 +64,42 @@ def compare(name: str, scene: mpm.Scene, particles: mpm.Particles, t1: float, dt
         apart, moved = run.final.x - exact.final.x, exact.final.x - particles.x
         error = float(jnp.sqrt((apart**2).sum() / (moved**2).sum()))
     undone = float(run.statistics.left_undone.part)
-    print(f"| {name} | `{type(method).__name__}` | {dt:.2g} | {undone:.1e} | {error:.1e} |")
+    print(f"| {name} | `{type(method).__name__}` | {dt:.2g} | {undone:.1e} | {error:.1e} |", flush=True)
+    return undone, error
+
+
+def draw(series: dict[tuple[str, str], list[tuple[float, float]]]) -> None:
+    """The error over what was left undone, a line a motion and method, from long steps to short ones."""
+    figure = Figure(figsize=(7.5, 4.2), layout="constrained")
+    axes = figure.subplots()
+    names = list(dict.fromkeys(name for name, _ in series))
+    for (name, method), points in series.items():
+        style = "o-" if method == "SemiImplicit" else "s--"
+        axes.loglog(*zip(*points, strict=True), style, color=f"C{names.index(name)}", label=f"{name}, {method}")
+    ends = np.array([3e-4, 0.3])
+    axes.loglog(ends, ends, "k:", lw=1, label="error = left undone")
+    axes.axvline(0.05, color="k", lw=1, label="warning beyond")
+    axes.set(xlabel="left undone, largest of any step [-]", ylabel="error against Newton's method [-]")
+    axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
+    figure.savefig(Path(__file__).parents[1] / "docs" / "linearisation.png", dpi=110)
+
+
+def main(quick: bool) -> None:
+    """Print the table, and draw it."""
+    print("| motion | method | Δt [s] | left undone | error |\n|---|---|---|---|---|")
+    series = {}
+    for nu in (0.3, 0.49):
+        name, case = f"sheet, ν = {nu}", sheet(nu)
+        steps = (3,) if quick else (3, 10)
+        series[name, "SemiImplicit"] = [compare(name, *case, 1.0, 1 / n, mpm.SemiImplicit()) for n in steps]
+    for motion in ("stretched", "spinning", "falling"):
+        for method in (mpm.SemiImplicit(), mpm.ImplicitMidpoint()):
+            steps = (0.02,) if quick else (0.02, 0.005)
+            points = [compare(motion, *block(motion), 0.2, dt, method) for dt in steps]
+            series[motion, type(method).__name__] = points
+    if not quick:
+        draw(series)
 
 
 if __name__ == "__main__":
-    print("| motion | method | Δt [s] | left undone | error |\n|---|---|---|---|---|")
-    for nu in (0.3, 0.49):
-        for steps in (3, 10):
-            compare(f"sheet, ν = {nu}", *sheet(nu), 1.0, 1 / steps, mpm.SemiImplicit())
-    for motion in ("stretched", "spinning", "falling"):
-        for method in (mpm.SemiImplicit(), mpm.ImplicitMidpoint()):
-            for dt in (0.02, 0.005):
-                compare(motion, *block(motion), 0.2, dt, method)
+    main("--quick" in sys.argv)
