@@ -59,8 +59,8 @@ class VolumePreconditioner(AbstractPreconditioner):
         require_fields(self)
         require(self.largest >= 0, f"VolumePreconditioner's largest must not be negative, got {self.largest}.")
         require(
-            self.extent is None or all(length >= 1 for length in self.extent),
-            f"VolumePreconditioner's extent must be numbers of nodes from 1, got {self.extent}.",
+            self.extent is None or (len(self.extent) > 0 and all(length >= 1 for length in self.extent)),
+            f"VolumePreconditioner's extent must be a number of nodes from 1 for each axis, got {self.extent}.",
         )
 
     def inner_product(self, operator: ImplicitOperator) -> AbstractInnerProduct:
