@@ -165,6 +165,7 @@ def test_bodies_that_do_not_touch_move_as_each_alone():
         assert_close(both.x[own], new.x)
 
 
+@pytest.mark.thorough
 def test_half_of_two_bodies_is_pushed_as_the_whole():
     """At a symmetry plane through nodes: the push makes the accelerations that it makes without the plane, but for what
     normals know of the side beyond."""
@@ -252,6 +253,7 @@ def test_derivatives_of_a_touch_are_those_of_differences(method, d):
         assert_close(one, other, 1e-5)
 
 
+@pytest.mark.thorough
 def test_three_bodies_touch_each_other(tmp_path):
     """Each two of them; materials may share a body; a run comes back from its file."""
     grid = mpm.Grid((10, 16), 0.1, origin=(-4, -4))

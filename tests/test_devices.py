@@ -62,7 +62,8 @@ def test_a_program_that_xla_divides_gathers_nothing(method):
 
 
 @NEEDS_LIBRARY
-@pytest.mark.parametrize("method", ["explicit", *thorough("semi_implicit")])
+@pytest.mark.thorough
+@pytest.mark.parametrize("method", ["explicit", "semi_implicit"])
 def test_within_shard_map_each_device_calls_the_library(method):
     """With the value and derivative of each member."""
     found = told("shard_map", method)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import METHODS, assert_files_hold, block
+from helpers import METHODS, assert_files_hold, block, ids
 
 import mpmjax as mpm
 from mpmjax._types import Array, Float, Scalar
@@ -52,7 +52,7 @@ class Fixed(mpm.AbstractLoad):
         return jax.lax.stop_gradient(self.total) * jnp.broadcast_to(points.weight, points.v.shape)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", **ids(METHODS, "semi_implicit"))
 def test_what_a_solve_does_not_depend_on_has_a_zero_derivative(method):
     """In both modes, by the number of a load that stops it."""
     scene, particles = block(2, loads=Fixed(mpm.PointsAt(((0.1, 0.1),)), jnp.asarray(3.0)))
@@ -60,7 +60,7 @@ def test_what_a_solve_does_not_depend_on_has_a_zero_derivative(method):
 
     def end(total):
         loaded = eqx.tree_at(lambda s: s.loads[0].total, scene, total)
-        run = mpm.simulate(loaded, particles, t1=2e-3, dt=1e-3, method=METHODS[method])
+        run = mpm.simulate(loaded, particles, t1=1e-3, dt=1e-3, method=method)
         return run.final.x.sum()
 
     assert jax.grad(end)(3.0) == 0

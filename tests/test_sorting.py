@@ -168,6 +168,7 @@ def test_a_run_goes_on_from_a_frame_with_the_same_bits():
 
 
 @NEEDS_LIBRARY
+@pytest.mark.thorough
 def test_a_fault_names_the_particle_as_it_was_given(monkeypatch):
     scene, particles = mixed()
     fast = eqx.tree_at(lambda q: q.v, particles, particles.v.at[11, 0].set(4e4))
