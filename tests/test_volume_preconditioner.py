@@ -107,7 +107,7 @@ def placed(d, corner, nu, preconditioner, window=16, side=3):
     turned = particles.x[:, ::-1] - particles.x.mean(axis=0)
     particles = eqx.tree_at(lambda p: (p.x, p.v), particles, (particles.x + place, 0.1 * turned))
     scene = mpm.Scene(grid, mpm.NeoHookean(1e4, nu), volume=AVERAGED)
-    solver = mpm.ConjugateResidual(rtol=1e-9, max_steps=10_000)
+    solver = mpm.ConjugateResidual(rtol=1e-8, max_steps=10_000)  # with 1e-9 rounding decides the counts
     method = mpm.SemiImplicit(solver=solver, preconditioner=preconditioner)
     speed = (1e4 / (2 * (1 + nu)) / 1e3) ** 0.5
     return particles, lambda own: mpm.step(scene, own, 0.0, 5 * 0.1 / speed, method=method)
@@ -126,7 +126,7 @@ def test_a_box_around_the_bodies_is_as_good_as_the_window_wherever_they_are(d):
     for k, own in enumerate(several):
         expected, one = alone(own)
         assert info.solve.converged[k]
-        assert_close(found.v[k], expected.v, 1e-6)
+        assert_close(found.v[k], expected.v, 1e-5)
         assert abs(int(info.solve.iterations[k]) - int(one.solve.iterations)) < 0.1 * int(one.solve.iterations)
 
 

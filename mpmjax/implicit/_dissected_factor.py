@@ -13,27 +13,30 @@ from mpmjax.implicit._dissection import Dissection, Level
 
 
 class DissectedFactor(eqx.Module):
-    """S = L D Lᵀ by blocks, front by front (I. S. Duff, J. K. Reid, ACM Trans. Math. Softw. 9 (1983) 302, doi
+    """S = L Lᵀ by blocks, front by front (I. S. Duff, J. K. Reid, ACM Trans. Math. Softw. 9 (1983) 302, doi
     10.1145/356044.356047). With o a front's own numbers, b its border, and F what is left of S when it is reached,
 
-        G = F_oo⁻¹,    E = F_bo G,    F_bb ← F_bb − E F_ob.
+        F_oo = L_oo L_ooᵀ,    X = L_oo⁻¹,    Y = F_bo Xᵀ,    F_bb ← F_bb − Y Yᵀ.
+
+    X and not F_oo⁻¹ is kept: the product with the latter loses as many digits again as F_oo has in its condition.
     """
 
     inverse: tuple[Float[Array, "_ _ _"], ...]
-    """G of each level's fronts, shape (f, o, o)."""
+    """X of each level's fronts, shape (f, o, o)."""
     below: tuple[Float[Array, "_ _ _"], ...]
-    """E, shape (f, b, o)."""
+    """Y, shape (f, b, o)."""
     dissection: Dissection
 
     def solve(self, r: Float[Array, "m"]) -> Float[Array, "m"]:
         """S⁻¹ r."""
-        z = jnp.pad(r, (0, 1))
+        z, halves = jnp.pad(r, (0, 1)), []  # L⁻¹ r of each level
         steps = list(zip(self.dissection.levels, self.inverse, self.below, strict=True))
-        for level, _, E in steps:
-            z = z.at[level.border].add(-jnp.einsum("fbo,fo->fb", E, z[level.own]))
-        for level, G, E in reversed(steps):
-            own = jnp.einsum("fpo,fo->fp", G, z[level.own]) - jnp.einsum("fb,fbo->fo", z[level.border], E)
-            z = z.at[level.own].set(own)
+        for level, X, Y in steps:
+            halves.append(jnp.einsum("fpo,fo->fp", X, z[level.own]))
+            z = z.at[level.border].add(-jnp.einsum("fbo,fo->fb", Y, halves[-1]))
+        for (level, X, Y), half in zip(reversed(steps), reversed(halves), strict=True):
+            rest = half - jnp.einsum("fb,fbo->fo", z[level.border], Y)
+            z = z.at[level.own].set(jnp.einsum("fp,fpo->fo", rest, X))
         return z[:-1]
 
 
@@ -51,8 +54,8 @@ def dissected_factor(dissection: Dissection, entries: Callable[[Array, Array], F
         L = jnp.linalg.cholesky(F[:, :own])
         X = solve_triangular(L, jnp.broadcast_to(jnp.eye(own, dtype=F.dtype), L.shape), lower=True)
         Y = jnp.einsum("fbo,fpo->fbp", F[:, own:], X)
-        inverse.append(jnp.einsum("fop,foq->fpq", X, X))
-        below.append(jnp.einsum("fbo,fop->fbp", Y, X))
+        inverse.append(X)
+        below.append(Y)
         left = rest - jnp.einsum("fbo,fco->fbc", Y, Y)
     return DissectedFactor(tuple(inverse), tuple(below), dissection)
 
