@@ -75,7 +75,7 @@ class _Box(NamedTuple):
         return _Box(low, tuple(min(at + reach, n) for at, n in zip(self.high, self.lattice, strict=True)), self.lattice)
 
     def halved(self, axis: int, reach: int) -> "_Box":
-        """The same with a separator."""
+        """The box, cut in the middle of an axis by a separator of `reach` planes."""
         return self._replace(cut=(axis, self.low[axis] + (self.sides[axis] - reach) // 2))
 
     def part(self, axis: int, low: int, high: int) -> "_Box":
