@@ -64,6 +64,12 @@ MPMJAX_INLINE void join(const T (*from)[kBlock], Vector<T>* rows) {
   }
 }
 
+// For each lane the one before it; the first one itself.
+template <int... lane>
+constexpr auto before_of(std::integer_sequence<int, lane...>) {
+  return std::integer_sequence<int, (lane > 0 ? lane - 1 : 0)...>();
+}
+
 // The factors of a block: numbers, or with `differential` numbers with their changes.
 template <class T, int d, int s, bool differential>
 struct Block {
@@ -79,6 +85,8 @@ struct Block {
   Vector<T> last_weight_changes[differential ? kRoom : 1], last_derivative_changes[differential ? kRoom : 1];
   // Whether the nodes along the last axis follow each other.
   int32_t straight[kBlock];
+  // Whether the nodes are those of the particle before in the block.
+  int32_t alike[kBlock];
   // The least and the largest flat index of a particle's nodes, and those from the axes after the first alone.
   int32_t least[kBlock], most[kBlock];
   int32_t least_beyond[kBlock], most_beyond[kBlock];
@@ -131,6 +139,20 @@ struct Block {
     put(low_sum, high_sum, large, least, most);
     const Whole even = bent == 0;
     std::memcpy(straight, &even, sizeof even);
+  }
+
+  // Finds, from the index, which particles have the nodes of the one before.
+  MPMJAX_APART void find_alike() {
+    Whole apart = {};
+    for (int a = 0; a < d; ++a) {
+      for (int i = 0; i < s; ++i) {
+        Whole term;
+        std::memcpy(&term, index[a][i], sizeof term);
+        apart |= term ^ chosen<Whole>(term, before_of(Count<kBlock>()));
+      }
+    }
+    const Whole same = apart == 0;
+    std::memcpy(alike, &same, sizeof same);
   }
 
   static MPMJAX_INLINE void put(Whole low, Whole high, Whole large, int32_t* to_least, int32_t* to_most) {

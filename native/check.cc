@@ -47,7 +47,7 @@ struct Example {
         const bool wild = oddity > 1 && p % 7 == 3;
         int64_t stride = 1;
         for (int a = sh.d - 1; a >= 0; --a, stride *= sh.along) {
-          const int64_t base = oddity < 0 ? 0 : first(random);
+          const int64_t base = oddity == -2 ? in_turn(p, a) : oddity == -1 ? 0 : first(random);
           for (int i = 0; i < sh.s; ++i) {
             const int64_t at = ((m * sh.d + a) * sh.s + i) * sh.particles + p;
             index[at] = wild ? any(random) : int32_t((base + i) * stride);
@@ -55,9 +55,11 @@ struct Example {
         }
       }
     }
+    if (oddity > 1 || oddity == -2) {
+      for (int64_t i = 5; i < nodes.size; i += 89) nodes[i] = std::numeric_limits<T>::infinity();
+    }
     if (oddity > 1) {
       for (int64_t i = 0; i < w.size; i += 97) w[i] = g[i] = dw[i] = dg[i] = std::numeric_limits<T>::quiet_NaN();
-      for (int64_t i = 5; i < nodes.size; i += 89) nodes[i] = std::numeric_limits<T>::infinity();
       for (int64_t i = 7; i < matrices.size; i += 997) matrices[i] = std::numeric_limits<T>::quiet_NaN();
     }
   }
@@ -65,6 +67,13 @@ struct Example {
   Stencils<T> stencils(bool differential) const {
     return {index.data.get(), w.data.get(), g.data.get(), differential ? dw.data.get() : nullptr,
             differential ? dg.data.get() : nullptr, shape.particles};
+  }
+  // Places that particles take in turn, two at each, some of them beside the one before, along the last axis first.
+  int64_t in_turn(int64_t p, int axis) const {
+    const int64_t places = shape.along - shape.s + 1;
+    int64_t place = std::max<int64_t>(p / 2 - (p % 5 == 4), 0);
+    for (int a = shape.d - 1; a > axis; --a) place /= places;
+    return place % places;
   }
   int64_t rows() const { return shape.batch * shape.columns * shape.particles; }
 };
@@ -348,18 +357,23 @@ int check_all(const std::vector<const Pool*>& pools) {
     for (int s = 2; s <= 4; ++s) {
       for (const int64_t particles : {0, 1, 16, 53}) {
         for (const int64_t columns : {1, 2, 3, 4, 6}) {
-          const int oddity = int(random() % 4) - 1;  // all in one cell, inside, at the edge, anywhere
+          const int oddity = int(random() % 5) - 2;  // in turn, all in one cell, inside, at the edge, anywhere
           check_both({d, s, 1 + int64_t(random() % 2), particles, 5, columns}, oddity);
         }
       }
     }
   }
   // Enough for several threads.
-  for (int oddity = -1; oddity < 3; ++oddity) check_both({2, 3, 1, 20011, 40, 3}, oddity);
+  for (int oddity = -2; oddity < 3; ++oddity) check_both({2, 3, 1, 20011, 40, 3}, oddity);
+  for (int d = 1; d <= 3; ++d) {
+    for (int s = 2; s <= 4; ++s) {
+      for (int64_t columns = 1; columns <= 4; ++columns) check_both({d, s, 1, 1003, 20, columns}, -2);
+    }
+  }
   check_both({1, 2, 3, 30011, 999, 1}, 1);
   check_in_order<T>({2, 3, 2, 20011, 40, 2}, random, pools);
   // More nodes than a cache holds: those that no particle reaches are marked, and set to zero apart.
-  for (int oddity = -1; oddity < 3; ++oddity) {
+  for (int oddity = -2; oddity < 3; ++oddity) {
     const Example<T> wide({3, 3, 1, 2503, 100, 3}, oddity, random);
     check(wide, pools), check_average(wide, pools), ++examples;
   }

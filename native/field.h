@@ -1,33 +1,14 @@
 // Fields: what the nodes of some particles' stencils have, with a particle in each lane.
 //
-// Rows of nodes are read as they lie and turned, four numbers of four particles at a time. Sums over the nodes are then
-// sums of vectors, and what particles have is read and written as it lies.
+// Rows of nodes are read by runs where there are few. Else they are read as they lie and turned, four numbers of four
+// particles at a time. Sums over the nodes are then sums of vectors, and what particles have is read and written as it
+// lies.
 
 #pragma once
 
-#include "abreast.h"
-#include "block.h"
+#include "runs.h"
 
 namespace {
-
-constexpr int power(int base, int exponent) { return exponent == 0 ? 1 : base * power(base, exponent - 1); }
-
-// The nodes along the last axis, with all their columns.
-template <class T, int s, int columns>
-struct Field {
-  using V = Abreast<T>;
-  static constexpr int numbers = s * columns;
-  static constexpr int reach = (numbers + kLanes - 1) / kLanes * kLanes;  // how many are read at once
-  V at[numbers];
-
-  template <class F>
-  static MPMJAX_INLINE Field of(const F& number) {
-    Field field;
-#pragma GCC unroll 16
-    for (int k = 0; k < numbers; ++k) field.at[k] = number(k);
-    return field;
-  }
-};
 
 template <class T, int s, int c>
 MPMJAX_INLINE Field<T, s, c> product(Abreast<T> a, const Field<T, s, c>& x) {
@@ -60,6 +41,25 @@ MPMJAX_INLINE bool has_fields(const Block<T, d, s, false>& block, int64_t size) 
   return all;
 }
 
+// The gathered value and gradients of all columns of some particles, one in each lane.
+template <class T, int d, int columns>
+struct Gathered {
+  using V = Abreast<T>;
+  V value[columns] = {}, gradients[d][columns] = {};
+
+  // Adds what one node along axis a has, times its factors: its value, and its gradients along the axes after it.
+  template <int a>
+  MPMJAX_INLINE void add(V w, V g, const Gathered& inner) {
+#pragma GCC unroll 4
+    for (int c = 0; c < columns; ++c) {
+      value[c] += w * inner.value[c];
+      gradients[a][c] += g * inner.value[c];
+#pragma GCC unroll 2
+      for (int b = a + 1; b < d; ++b) gradients[b][c] += w * inner.gradients[b][c];
+    }
+  }
+};
+
 // The fields that some particles of a block read, from the q-th on, and the sums over them.
 template <class T, int d, int s, int columns>
 struct Fields {
@@ -67,16 +67,33 @@ struct Fields {
   using F = Field<T, s, columns>;
   static constexpr int last = d - 1, rows = power(s, last), lanes = kAbreast<T>;
 
+  const Block<T, d, s, false>& block;
+  int q;
+  const T* from;
   V weights[d][s], derivatives[d][s];
-  F nodes[rows];  // in C order of the axes before the last
+  Runs<T, d, s, columns> runs;
+  bool joined = false;  // whether rows are read by runs
+  F nodes[rows];        // in C order of the axes before the last; none before `read_all` if rows are read by runs
 
-  MPMJAX_INLINE Fields(const Block<T, d, s, false>& block, int q, const T* from) {
+  MPMJAX_INLINE Fields(const Block<T, d, s, false>& block, int q, const T* from, int64_t size)
+      : block(block), q(q), from(from) {
     for (int a = 0; a < d; ++a) {
       for (int i = 0; i < s; ++i) {
         std::memcpy(&weights[a][i], block.weights[a][i] + q, sizeof(V));
         std::memcpy(&derivatives[a][i], block.derivatives[a][i] + q, sizeof(V));
       }
     }
+    if constexpr (kPermutes<T>) joined = runs.find(block, q, size);
+    if (!joined) read_each();
+  }
+
+  // Reads all rows, for sums that need them more than once.
+  MPMJAX_INLINE void read_all() {
+    for (int row = 0; row < rows && joined; ++row) nodes[row] = runs.row(block, q, from, row);
+  }
+
+  // The same without runs.
+  MPMJAX_INLINE void read_each() {
     for (int row = 0; row < rows; ++row) {
       T* to = reinterpret_cast<T*>(&nodes[row]);
       for (int p = 0; p < lanes; p += kLanes) {
@@ -107,9 +124,9 @@ struct Fields {
 
   V by_weights[d][s], by_derivatives[d][s];  // of a pull
 
-  // Returns the sums over the axes from a on but the last, from the nodes of a first row on, and with `pulled` adds the
-  // derivatives by these axes' factors.
-  template <int a, bool pulled>
+  // Returns the sums over the axes from a on but the last, from the nodes of a first row on, and adds the derivatives by
+  // these axes' factors.
+  template <int a>
   MPMJAX_INLINE Sums<a> sums(const F* from, const F& value, const F* gradients) {
     Sums<a> total = {};
     if constexpr (a == last) {
@@ -118,17 +135,15 @@ struct Fields {
       for (int i = 0; i < s; ++i) {
         const V w = weights[a][i], g = derivatives[a][i];
         F narrow, inner[d];
-        if constexpr (pulled && a + 1 < last) {
+        if constexpr (a + 1 < last) {
           narrow = product(w, value) + product(g, gradients[0]);
           for (int b = 1; b < last - a; ++b) inner[b - 1] = product(w, gradients[b]);
         }
-        const auto found = sums<a + 1, pulled>(from + i * power(s, last - a - 1), narrow, inner);
-        if constexpr (pulled) {
-          V by_weight = dot(value, found.value);
-          for (int b = 1; b < last - a; ++b) by_weight += dot(gradients[b], found.gradients[b - 1]);
-          by_weights[a][i] += by_weight;
-          by_derivatives[a][i] += dot(gradients[0], found.value);
-        }
+        const auto found = sums<a + 1>(from + i * power(s, last - a - 1), narrow, inner);
+        V by_weight = dot(value, found.value);
+        for (int b = 1; b < last - a; ++b) by_weight += dot(gradients[b], found.gradients[b - 1]);
+        by_weights[a][i] += by_weight;
+        by_derivatives[a][i] += dot(gradients[0], found.value);
         total.value = total.value + product(w, found.value);
         total.gradients[0] = total.gradients[0] + product(g, found.value);
         for (int b = 1; b < last - a; ++b) {
@@ -157,9 +172,30 @@ struct Fields {
     }
   }
 
-  MPMJAX_INLINE Sums<0> gather() {
-    F none;
-    return sums<0, false>(nodes, none, nullptr);
+  // The sums over the axes from a on, of rows from a first one on, each read where it is wanted.
+  template <int a, class Row>
+  MPMJAX_INLINE Gathered<T, d, columns> gathered(int first, const Row& row) const {
+    Gathered<T, d, columns> total;
+    if constexpr (a == last) {
+      const F field = row(first);
+      for (int c = 0; c < columns; ++c) total.value[c] = along(weights[last], field, c);
+      for (int c = 0; c < columns; ++c) total.gradients[last][c] = along(derivatives[last], field, c);
+    } else {
+      each<s, (a + 1 >= last)>([&](int i) MPMJAX_INLINE_LAMBDA {
+        total.template add<a>(weights[a][i], derivatives[a][i], gathered<a + 1>(s * first + i, row));
+      });
+    }
+    return total;
+  }
+
+  // The gather, of which no field but the one at hand is stored.
+  MPMJAX_INLINE Gathered<T, d, columns> gather() const {
+    if constexpr (kPermutes<T>) {
+      if (joined) {
+        return gathered<0>(0, [&](int i) MPMJAX_INLINE_LAMBDA { return runs.row(block, q, from, i); });
+      }
+    }
+    return gathered<0>(0, [&](int i) MPMJAX_INLINE_LAMBDA { return nodes[i]; });
   }
 
   // The same, and the derivatives by all factors, of all columns of the value and the gradients that are given.
@@ -172,7 +208,7 @@ struct Fields {
     for (int b = 0; b < last; ++b) gradients[b] = spread(given[b + 1], w);
     std::memset(by_weights, 0, sizeof by_weights);
     std::memset(by_derivatives, 0, sizeof by_derivatives);
-    const auto found = sums<0, true>(nodes, spread(given[0], w) + spread(given[d], g), gradients);
+    const auto found = sums<0>(nodes, spread(given[0], w) + spread(given[d], g), gradients);
     for (int j = 0; j < s; ++j) {
       for (int c = 0; c < columns; ++c) {
         by_weights[last][j] += given[0][c] * found.value.at[j * columns + c];

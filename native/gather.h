@@ -97,8 +97,13 @@ void gather_columns(const Gather<T>& task, int64_t first, int64_t last) {
     if constexpr (!differential && columns > 0) {
       if (has_fields<T, d, s, columns>(block, task.size)) {
         for (int q = 0; q < kBlock; q += kAbreast<T>) {
-          Fields<T, d, s, columns> some(block, q, task.nodes);
-          some.write_sums(some.gather(), particles, task.value + start + q, task.gradients + start + q);
+          const Fields<T, d, s, columns> some(block, q, task.nodes, task.size);
+          const auto found = some.gather();
+          for (int c = 0; c < columns; ++c) {
+            const int64_t at = c * particles + start + q;
+            some.put(found.value[c], task.value + at);
+            for (int b = 0; b < d; ++b) some.put(found.gradients[b][c], task.gradients + b * columns * particles + at);
+          }
         }
         continue;
       }

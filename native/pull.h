@@ -106,7 +106,8 @@ MPMJAX_INLINE void pull_fields(const Pull<T>& task, const Block<T, d, s, false>&
         std::memcpy(&given[b + 1][c], task.given.gradients + row * particles + first, sizeof(V));
       }
     }
-    Some some(block, q, task.nodes);
+    Some some(block, q, task.nodes, task.size);
+    some.read_all();
     const auto found = some.pull(given);
     for (int a = 0; a < d; ++a) {
       for (int i = 0; i < s; ++i) {

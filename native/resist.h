@@ -43,14 +43,23 @@ MPMJAX_APART void multiply(const T* entries, int64_t stride, const Components<T,
 template <class T, int d, int s>
 MPMJAX_APART void resist_block(const Resist<T>& task, const Block<T, d, s, false>& block, int64_t start, int count,
                                Vector<T> (*rows)[kRoom]) {
-  const NodeRows<T, s, d> nodes(task.moved, task.size, d, 0);
-  gather_block(block, nodes, [&](int q, const auto& found) MPMJAX_INLINE_LAMBDA {
-    for (int b = 0; b < d; ++b) rows[b][q] = found.gradients[b];
-  });
   constexpr int entries = d * d * (d * d + 1) / 2;
   const int64_t particles = task.stencils.particles;
   alignas(64) Components<T, d> slopes, products = {};
-  for (int b = 0; b < d; ++b) split<T>(rows[b], slopes + b * kLanes);
+  if (has_fields<T, d, s, d>(block, task.size)) {
+    for (int q = 0; q < kBlock; q += kAbreast<T>) {
+      const auto found = Fields<T, d, s, d>(block, q, task.moved, task.size).gather();
+      for (int b = 0; b < d; ++b) {
+        for (int c = 0; c < d; ++c) std::memcpy(slopes[b * kLanes + c] + q, &found.gradients[b][c], sizeof(Abreast<T>));
+      }
+    }
+  } else {
+    const NodeRows<T, s, d> nodes(task.moved, task.size, d, 0);
+    gather_block(block, nodes, [&](int q, const auto& found) MPMJAX_INLINE_LAMBDA {
+      for (int b = 0; b < d; ++b) rows[b][q] = found.gradients[b];
+    });
+    for (int b = 0; b < d; ++b) split<T>(rows[b], slopes + b * kLanes);
+  }
   if (count == kBlock) {
     multiply<T, d>(task.matrices + start, particles, slopes, products);
   } else {

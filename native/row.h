@@ -81,6 +81,16 @@ MPMJAX_INLINE V chosen(From from, std::integer_sequence<int, lane...>) {
 #endif
 }
 
+// Lanes chosen from two vectors, those of the second counted on.
+template <class V, class M, int... lane>
+MPMJAX_INLINE V chosen(V a, V b, M, std::integer_sequence<int, lane...>) {
+#if defined(__clang__) || __GNUC__ >= 12
+  return __builtin_shufflevector(a, b, lane...);
+#else
+  return __builtin_shuffle(a, b, M{lane...});
+#endif
+}
+
 template <int count>
 using Count = std::make_integer_sequence<int, count>;
 

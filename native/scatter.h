@@ -1,7 +1,8 @@
 // The scatter: f_i = Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b).
 //
-// It sets the nodes of a range, from all particles in their order. Ranges of different threads share no node, so there
-// is no race and nothing to add up afterwards, and the sums have the same bits however the nodes are divided.
+// It sets the nodes of a range, from all particles in their order; those of a block that follow each other and have the
+// same nodes are added up first. Ranges of different threads share no node, so there is no race and nothing to add up
+// afterwards, and the sums have the same bits however the nodes are divided.
 
 #pragma once
 
@@ -59,7 +60,8 @@ struct NodeSums {
     } else {
       int32_t index[s];
       for (int i = 0; i < s; ++i) index[i] = after(first, block.index[axis][i][q]);
-      add_apart(index, row);
+      const R apart = row;  // so that the row itself needs no place in memory
+      add_apart(index, apart);
     }
   }
 
@@ -80,67 +82,66 @@ struct NodeSums {
   }
 };
 
-// What a particle gives to all rows. Gradients are those of the axes from a on, without the last.
-template <class T, int d, int s, bool differential, bool inside, int columns>
+// What particles with the same nodes give to all rows, in C order of the axes before the last. Gradients are those of the
+// axes from a on, without the last.
+template <class T, int d, int s, bool differential, int columns>
 struct Scatterer {
-  const Block<T, d, s, differential>& block;
-  const NodeSums<T, s, columns>& nodes;
-  int q;
-
-  static constexpr int last = d - 1;
   using R = RowOf<T, s, columns>;
+  static constexpr int last = d - 1, rows = power(s, last);
+
+  const Block<T, d, s, differential>& block;
+  R sums[rows] = {};
 
   // With gradients: the particle's rows of four. The last axis is the first to be multiplied by, within the row.
-  MPMJAX_INLINE void add_graded(const Vector<T> (*rows)[kRoom]) const {
+  MPMJAX_INLINE void add_graded(int q, const Vector<T> (*given)[kRoom]) {
     const auto w = block.template last_weight<R>(q), g = block.template last_derivative<R>(q);
     using X = typename std::conditional<differential, Dual<R>, R>::type;
-    const X value = product(w, at_each<R, T>(rows[0][q])) + product(g, at_each<R, T>(rows[d][q]));
+    const X value = product(w, at_each<R, T>(given[0][q])) + product(g, at_each<R, T>(given[d][q]));
     X gradients[d];
-    for (int b = 0; b < last; ++b) gradients[b] = product(w, at_each<R, T>(rows[b + 1][q]));
-    add<0>(0, value, gradients);
+    for (int b = 0; b < last; ++b) gradients[b] = product(w, at_each<R, T>(given[b + 1][q]));
+    add<0>(q, 0, value, gradients);
   }
 
   // Without.
-  MPMJAX_INLINE void add_value(const Vector<T> (*rows)[kRoom]) const {
-    add<0>(0, product(block.template last_weight<R>(q), at_each<R, T>(rows[0][q])));
+  MPMJAX_INLINE void add_value(int q, const Vector<T> (*given)[kRoom]) {
+    add<0>(q, 0, product(block.template last_weight<R>(q), at_each<R, T>(given[0][q])));
   }
 
   // One step further in: the same times the factors of one node along axis a.
   template <int a, class X>
-  MPMJAX_INLINE void add(int32_t first, X value, const X* gradients) const {
+  MPMJAX_INLINE void add(int q, int row, X value, const X* gradients) {
     if constexpr (a == last) {
-      nodes.template add<inside>(block, q, first, result(value));
+      sums[row] = sums[row] + result(value);
     } else {
-      each<s, inside && !differential>([&](int i) MPMJAX_INLINE_LAMBDA {
-        if (passed_over<a>(i)) return;
+      each<s, !differential>([&](int i) MPMJAX_INLINE_LAMBDA {
         const auto w = block.weight(a, i, q), g = block.derivative(a, i, q);
         X inner[d - a];
         for (int b = 1; b < last - a; ++b) inner[b - 1] = product(w, gradients[b]);
-        add<a + 1>(after(first, block.index[a][i][q]), product(w, value) + product(g, gradients[0]), inner);
+        add<a + 1>(q, s * row + i, product(w, value) + product(g, gradients[0]), inner);
       });
     }
   }
 
   template <int a, class X>
-  MPMJAX_INLINE void add(int32_t first, X value) const {
+  MPMJAX_INLINE void add(int q, int row, X value) {
     if constexpr (a == last) {
-      nodes.template add<inside>(block, q, first, result(value));
+      sums[row] = sums[row] + result(value);
     } else {
-      each<s, false>([&](int i) MPMJAX_INLINE_LAMBDA {
-        if (passed_over<a>(i)) return;
-        add<a + 1>(after(first, block.index[a][i][q]), product(block.weight(a, i, q), value));
+      each<s, !differential>([&](int i) MPMJAX_INLINE_LAMBDA {
+        add<a + 1>(q, s * row + i, product(block.weight(a, i, q), value));
       });
     }
   }
 
-  // Whether the nodes with the i-th index of the first axis are all beyond the range.
-  template <int a>
-  MPMJAX_INLINE bool passed_over(int i) const {
-    if constexpr (inside || a > 0) {
-      return false;
-    } else {
-      const int64_t term = block.index[0][i][q];
-      return !nodes.may_have(term + block.least_beyond[q], term + block.most_beyond[q]);
+  // Adds all rows to the nodes of one of the particles.
+  template <bool inside>
+  MPMJAX_INLINE void put(const NodeSums<T, s, columns>& nodes, int q) const {
+#pragma GCC unroll 16
+    for (int row = 0; row < rows; ++row) {
+      int32_t first = 0;
+      if constexpr (d == 2) first = block.index[0][row][q];
+      if constexpr (d == 3) first = after(block.index[0][row / s][q], block.index[1][row % s][q]);
+      nodes.template add<inside>(block, q, first, sums[row]);
     }
   }
 };
@@ -178,24 +179,22 @@ MPMJAX_INLINE void add_blocks(const Stencils<T>& stencils, const Range* ranges, 
       some += nodes.may_have(block.least[q], block.most[q]) ? 1 : 0;
     }
     if (some == 0) continue;
+    block.find_alike();
     block.read(stencils, start, count);
     block.join_last();
     Vector<T> rows[graded ? d + 1 : 1][kRoom];
     give(block, start, count, rows);
-    for (int k = 0; k < some; ++k) {
+    for (int k = 0; k < some;) {
+      Scatterer<T, d, s, differential, columns> scatterer{block};
       const int q = taken[k];
-      const auto add = [&](const auto& scatterer) MPMJAX_INLINE_LAMBDA {
+      do {
         if constexpr (graded) {
-          scatterer.add_graded(rows);
+          scatterer.add_graded(taken[k], rows);
         } else {
-          scatterer.add_value(rows);
+          scatterer.add_value(taken[k], rows);
         }
-      };
-      if (nodes.holds(block, q)) {
-        add(Scatterer<T, d, s, differential, true, columns>{block, nodes, q});
-      } else {
-        add(Scatterer<T, d, s, differential, false, columns>{block, nodes, q});
-      }
+      } while (++k < some && block.alike[taken[k]]);
+      nodes.holds(block, q) ? scatterer.template put<true>(nodes, q) : scatterer.template put<false>(nodes, q);
     }
   }
 }

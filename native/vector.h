@@ -18,6 +18,8 @@ namespace {
 
 constexpr int kLanes = 4;
 
+constexpr int power(int base, int exponent) { return exponent == 0 ? 1 : base * power(base, exponent - 1); }
+
 #if defined(__AVX512F__)
 constexpr int kWidest = 64;  // bytes of the widest vector
 #elif defined(__AVX__)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Bool, Int, Scalar, components, particle_first
+from mpmjax._types import Array, Bool, Int, Scalar, components
 from mpmjax.checks import first_unmet, requirements
 from mpmjax.discretisation import Stencil, in_window
 from mpmjax.native import stored
@@ -57,11 +57,11 @@ class Problem(eqx.Module):
             y: the state as the loop carries it.
             step: the number of steps since the rollout began.
         """
-        state = jax.tree.map(particle_first, stored(y.particles))
+        y = y.uncarried(stored)
         if y.order is None:
-            return self, replace(y, particles=state)
+            return self, y
         t = (self.start + step) * self.dt
-        state, order = resorted(y.order, self.scene, self.particles, state, t, step, self.save_every)
+        state, order = resorted(y.order, self.scene, self.particles, y.particles, t, step, self.save_every)
         scene, particles = order.put_into(self.scene, self.particles)
         return replace(self, scene=scene, particles=particles), replace(y, particles=state, order=order)
 

@@ -1,9 +1,11 @@
 """The part of a rollout that evolves."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 
 from mpmjax._types import components, particle_first
 from mpmjax.boundary import BoundaryImpulse, ColliderImpulse, no_boundary_impulse, no_impulse
@@ -23,14 +25,24 @@ class RolloutState(eqx.Module):
     """The order of the particles in memory; None if it is that in which they were given."""
 
     def carried(self) -> "RolloutState":
-        """The same state as the loop over steps carries it: component first, as a step has its arrays. XLA would else
-        transpose all of them in each step."""
-        return replace(self, particles=jax.tree.map(components, self.particles))
+        """The same state as the loop over steps carries it: component first, as a step has its arrays, and C with the
+        direction of the derivative before the component, as a gather has it. XLA would else transpose all of them in
+        each step."""
+        return replace(self, particles=_with_transposed_affine(jax.tree.map(components, self.particles)))
+
+    def uncarried(self, hold: Callable[[State], State] = lambda state: state) -> "RolloutState":
+        """The other way round.
+
+        Args:
+            hold: what is done to the arrays as they are carried. Default: nothing.
+        """
+        state = _with_transposed_affine(hold(self.particles))
+        return replace(self, particles=jax.tree.map(particle_first, state))
 
     def as_given(self) -> "RolloutState":
         """A carried state, particle first again and in the order in which the particles were given."""
-        state = jax.tree.map(particle_first, self.particles)
-        return replace(self, particles=state if self.order is None else self.order.undone(state), order=None)
+        given = self.uncarried()
+        return given if self.order is None else replace(given, particles=self.order.undone(given.particles), order=None)
 
     def after(self, particles: Particles, info: StepInfo) -> "RolloutState":
         """The state after a step, from the particles after it and what it reports."""
@@ -48,3 +60,8 @@ def initial_state(scene: Scene, particles: Particles) -> RolloutState:
     colliders = no_impulse(scene.collider_count, *of) if scene.collider_count else None
     boundaries = no_boundary_impulse(len(scene.boundary) + len(scene.guides), *of) if scene.boundary_forces else None
     return RolloutState(state_of(particles), colliders, boundaries)
+
+
+def _with_transposed_affine(state: State) -> State:
+    """A component-first state with C transposed."""
+    return state if state.C is None else replace(state, C=jnp.swapaxes(state.C, 0, 1))

@@ -37,7 +37,8 @@ class Rearrangement(eqx.Module):
         """A state in this order."""
         own = [self.of_material(k, (F, history)) for k, (_, F, history) in enumerate(by_material(state))]
         deformations, histories = zip(*own, strict=True)
-        C = None if state.C is None else self(state.C)
+        # transposed, as a rollout's loop has it in memory
+        C = None if state.C is None else jnp.swapaxes(self(jnp.swapaxes(state.C, 1, 2)), 1, 2)
         return replace(state, x=self(state.x), v=self(state.v), C=C, deformations=deformations, histories=histories)
 
 
