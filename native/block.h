@@ -12,6 +12,7 @@ namespace {
 
 using mpmjax::Given;
 using mpmjax::kBlock;
+using mpmjax::Places;
 using mpmjax::Stencils;
 
 constexpr int kSafeBits = 29;  // three terms of fewer bits add up to fewer than 32
@@ -73,7 +74,7 @@ constexpr auto before_of(std::integer_sequence<int, lane...>) {
 // The factors of a block: numbers, or with `differential` numbers with their changes.
 template <class T, int d, int s, bool differential>
 struct Block {
-  static constexpr int axes = d;
+  static constexpr int axes = d, terms = s + 1;
 
   int32_t index[d][s][kBlock];
   T weights[d][s][kBlock];
@@ -93,6 +94,9 @@ struct Block {
 
   // The numbers; the index is read by `find_range`.
   MPMJAX_APART void read(const Stencils<T>& from, int64_t first, int count) {
+    if constexpr (!differential) {
+      if (from.places.first != nullptr) return evaluate(from.places, from.particles, first, count);
+    }
     for (int a = 0; a < d; ++a) {
       for (int i = 0; i < s; ++i) {
         const int64_t at = (a * s + i) * from.particles + first;
@@ -104,6 +108,56 @@ struct Block {
         }
       }
     }
+  }
+
+  // The numbers of particles whose places are given. Those of no particle are zero.
+  MPMJAX_APART void evaluate(const Places<T>& from, int64_t particles, int64_t first, int count) {
+    typedef T Some __attribute__((vector_size(kBlock * sizeof(T))));
+    for (int a = 0; a < d; ++a) {
+      T offset[kBlock];
+      copy(from.offset + a * particles + first, count, offset);
+      Some t;
+      std::memcpy(&t, offset, sizeof t);
+#pragma GCC unroll 4
+      for (int i = 0; i < s; ++i) {
+        put(value(from.polynomials + i * terms, t), count, weights[a][i]);
+        put(value(from.polynomials + (s + i) * terms, t), count, derivatives[a][i]);
+      }
+    }
+  }
+
+  // Σ_k c_k t^k.
+  template <class V>
+  static MPMJAX_INLINE V value(const T* c, V t) {
+    V sum = V{} + c[terms - 1];
+#pragma GCC unroll 4
+    for (int k = terms - 2; k >= 0; --k) sum = sum * t + c[k];
+    return sum;
+  }
+
+  // Stores numbers of a block, those of no particle as zero.
+  template <class V, class X>
+  static MPMJAX_INLINE void put(V numbers, int count, X* to) {
+    std::memcpy(to, &numbers, sizeof numbers);
+    for (int q = count; q < kBlock; ++q) to[q] = 0;
+  }
+
+  // The index terms of an axis, with zero for no particle.
+  MPMJAX_INLINE void read_index(const Stencils<T>& from, int a, int64_t first, int count) {
+    const Places<T>& places = from.places;
+    if (places.first == nullptr) {
+#pragma GCC unroll 4
+      for (int i = 0; i < s; ++i) copy(from.index + (a * s + i) * from.particles + first, count, index[a][i]);
+      return;
+    }
+    int32_t begin[kBlock];
+    copy(places.first + a * from.particles + first, count, begin);
+    const uint32_t stride = static_cast<uint32_t>(places.strides[a]);
+    Wrapping term;
+    std::memcpy(&term, begin, sizeof term);
+    term *= stride;
+#pragma GCC unroll 4
+    for (int i = 0; i < s; ++i, term += stride) put(term, count, index[a][i]);
   }
 
   // The last axis' rows, once the numbers were read.
@@ -122,8 +176,9 @@ struct Block {
     Whole large = {}, bent = {}, low_sum = {}, high_sum = {};
     for (int a = d - 1; a >= 0; --a) {
       Whole first_term = {}, low = {}, high = {};
+      read_index(from, a, first, count);
+#pragma GCC unroll 4
       for (int i = 0; i < s; ++i) {
-        copy(from.index + (a * s + i) * from.particles + first, count, index[a][i]);
         Whole term;
         std::memcpy(&term, index[a][i], sizeof term);
         if (i == 0) first_term = low = high = term;

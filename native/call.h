@@ -44,6 +44,7 @@ struct Call {
   ffi::DataType type = ffi::DataType::INVALID;
   Shape leading;
   int64_t d = 0, s = 0, particles = 0, batch = 1;
+  bool placed = false;  // whether places are given in place of factors
   std::string fault;
 
   void expect(bool holds, const char* what) {
@@ -85,9 +86,24 @@ struct Call {
     return shape.size() >= from_behind ? shape[shape.size() - from_behind] : 0;
   }
 
+  // How many operands the stencils are.
+  size_t factors(bool differential) const { return placed ? 4 : differential ? 5 : 3; }
+
   template <class T>
   Stencils<T> stencils(bool differential) {
     Stencils<T> found = {};
+    if (placed) {
+      Places<T>& places = found.places;
+      expect(!differential, "a differential by the factors of places");
+      expect(shape_of(buffers[1]).size() == leading.size() + 1 && dim(1, 1) == d, "no stride for each axis");
+      expect(buffers[1].element_type() == ffi::DataType::S32, "strides that are no integers");
+      found.particles = particles;
+      places.first = static_cast<const int32_t*>(buffers[0].untyped_data());
+      places.strides = static_cast<const int32_t*>(buffers[1].untyped_data());
+      places.offset = at<T>(2, {d, particles});
+      places.polynomials = at<T>(3, {2, s, s + 1});
+      return found;
+    }
     found.index = static_cast<const int32_t*>(buffers[0].untyped_data());
     found.particles = particles;
     found.weights = at<T>(1, {d, s, particles});

@@ -9,7 +9,8 @@
 //   solve    index, weights, derivatives, matrices, mass, factor, free, weight, active, x, rhs, limits  ->  x, numbers,
 //                                                                         memory to work in (of a batch none)
 //
-// Factors are (..., d, s, p), values (..., c, p) and gradients (..., d, c, p), nodes (..., n, c), matrices
+// With `placed`, gather, scatter and average are given first nodes, strides, offsets and polynomials in place of the
+// factors: (..., d, p), (..., d), (..., d, p), (..., 2, s, s + 1). Factors are (..., d, s, p), values (..., c, p) and gradients (..., d, c, p), nodes (..., n, c), matrices
 // (..., d² (d² + 1) / 2, p), with the same leading axes everywhere. Given are a value or gradients or both; gradients may
 // have fewer columns than the value. In a solve vectors are (..., n d), mass (..., n), active (..., ⌈n d/64⌉).
 // `valued` says whether there is a value; `differential` whether changes of the factors follow them.
@@ -23,12 +24,24 @@
 namespace mpmjax {
 namespace {
 
-// A sum's call, with the sizes that its index and weights have.
-Call read(const ffi::RemainingArgs& arguments, const ffi::RemainingRets& results) {
+// A sum's call, with the sizes that its index and weights, or its places, have.
+Call read(bool placed, const ffi::RemainingArgs& arguments, const ffi::RemainingRets& results) {
   Call call = collect(arguments, results);
-  call.expect(call.operands >= 4, "an array is missing");
+  call.placed = placed;
+  call.expect(call.operands > call.factors(false), "an array is missing");
   if (!call.fault.empty()) return call;
   const Shape shape = shape_of(call.buffers[0]);
+  if (placed) {
+    call.expect(shape.size() >= 2 && call.buffers[0].element_type() == ffi::DataType::S32, "no first nodes (..., d, p)");
+    if (!call.fault.empty()) return call;
+    call.type = call.buffers[2].element_type();
+    call.lead(shape, 2);
+    call.d = shape[shape.size() - 2];
+    call.s = call.dim(3, 2);
+    call.particles = shape.back();
+    call.expect(call.d >= 1 && call.d <= kMostAxes, "no dimension of one to three");
+    return call;
+  }
   call.expect(shape.size() >= 3 && call.buffers[0].element_type() == ffi::DataType::S32, "no index (..., d, s, p)");
   if (!call.fault.empty()) return call;
   call.type = call.buffers[1].element_type();
@@ -46,7 +59,7 @@ struct GatherOf {
 
   template <class T>
   bool run(const Pool& pool, Call& call) const {
-    const size_t k = differential ? 5 : 3;
+    const size_t k = call.factors(differential);
     Gather<T> task = {};
     task.stencils = call.stencils<T>(differential);
     task.size = call.dim(k, 2);
@@ -66,7 +79,7 @@ struct ScatterOf {
 
   template <class T>
   bool run(const Pool& pool, Call& call) const {
-    const size_t k = differential ? 5 : 3;
+    const size_t k = call.factors(differential);
     Scatter<T> task = {};
     task.stencils = call.stencils<T>(differential);
     task.size = call.dim(call.operands, 2);
@@ -82,12 +95,13 @@ struct ScatterOf {
 struct AverageOf {
   template <class T>
   bool run(const Pool& pool, Call& call) const {
+    const size_t k = call.factors(false);
     Average<T> task = {};
     task.stencils = call.stencils<T>(false);
-    task.least = call.at<T>(3, {});
+    task.least = call.at<T>(k, {});
     task.size = call.dim(call.operands, 1);
-    task.columns = call.dim(4, 2);
-    task.given = call.given<T>(4, true, task.columns);
+    task.columns = call.dim(k + 1, 2);
+    task.given = call.given<T>(k + 1, true, task.columns);
     task.whole = call.at<T>(call.operands, {task.size});
     task.means = call.at<T>(call.operands + 1, {task.size, task.columns - 1});
     task.sums = call.at<T>(call.operands + 2, {task.size, task.columns});
@@ -170,8 +184,8 @@ struct SolveOf {
 
 template <class Problem>
 ffi::Error run(const Problem& problem, ffi::ThreadPool threads, const ffi::RemainingArgs& arguments,
-               const ffi::RemainingRets& results) {
-  Call call = read(arguments, results);
+               const ffi::RemainingRets& results, bool placed = false) {
+  Call call = read(placed, arguments, results);
   if (!call.fault.empty()) return wrong(call.fault);
   const XlaPool pool(threads);
   bool known = false;
@@ -181,18 +195,18 @@ ffi::Error run(const Problem& problem, ffi::ThreadPool threads, const ffi::Remai
   return known ? ffi::Error::Success() : wrong("there is no kernel of this order or type");
 }
 
-ffi::Error run_gather(ffi::ThreadPool threads, bool differential, ffi::RemainingArgs arguments,
+ffi::Error run_gather(ffi::ThreadPool threads, bool placed, bool differential, ffi::RemainingArgs arguments,
                       ffi::RemainingRets results) {
-  return run(GatherOf{differential}, threads, arguments, results);
+  return run(GatherOf{differential}, threads, arguments, results, placed);
 }
 
-ffi::Error run_scatter(ffi::ThreadPool threads, bool differential, bool valued, ffi::RemainingArgs arguments,
-                       ffi::RemainingRets results) {
-  return run(ScatterOf{differential, valued}, threads, arguments, results);
+ffi::Error run_scatter(ffi::ThreadPool threads, bool placed, bool differential, bool valued,
+                       ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  return run(ScatterOf{differential, valued}, threads, arguments, results, placed);
 }
 
-ffi::Error run_average(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
-  return run(AverageOf{}, threads, arguments, results);
+ffi::Error run_average(ffi::ThreadPool threads, bool placed, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  return run(AverageOf{}, threads, arguments, results, placed);
 }
 
 ffi::Error run_pull(ffi::ThreadPool threads, bool valued, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
@@ -220,18 +234,24 @@ ffi::Error run_threads(ffi::ThreadPool threads, ffi::ResultBuffer<ffi::DataType:
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_gather, mpmjax::run_gather,
                               ffi::Ffi::Bind()
                                   .Ctx<ffi::ThreadPool>()
+                                  .Attr<bool>("placed")
                                   .Attr<bool>("differential")
                                   .RemainingArgs()
                                   .RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_scatter, mpmjax::run_scatter,
                               ffi::Ffi::Bind()
                                   .Ctx<ffi::ThreadPool>()
+                                  .Attr<bool>("placed")
                                   .Attr<bool>("differential")
                                   .Attr<bool>("valued")
                                   .RemainingArgs()
                                   .RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_average, mpmjax::run_average,
-                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
+                              ffi::Ffi::Bind()
+                                  .Ctx<ffi::ThreadPool>()
+                                  .Attr<bool>("placed")
+                                  .RemainingArgs()
+                                  .RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_pull, mpmjax::run_pull,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<bool>("valued").RemainingArgs().RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_resist, mpmjax::run_resist,

@@ -10,7 +10,8 @@
 //   resist   the scatter of K_p times the gather's gradients, with a symmetric matrix K_p for each particle
 //
 // Weights are products of one factor along each axis; of a gradient's factors the one along its direction is a
-// derivative. Only the factors are stored, (d, s, p) with s nodes along an axis.
+// derivative. Only the factors are given, (d, s, p) with s nodes along an axis, or the particles' places, of which the
+// factors are polynomials.
 
 #pragma once
 
@@ -23,6 +24,16 @@ constexpr int kBlock = 16;  // particles that are handled together
 constexpr int64_t kTogether = 64;  // numbers of the nodes that are passed over together
 constexpr int64_t kCached = 1 << 21;  // bytes of an array that a cache may hold from one pass to the next
 
+// Where particles are, from which their factors are found: the i-th node along an axis has the index term
+// (first + i) stride, and Σ_k c_k t^k for a weight and for a derivative.
+template <class T>
+struct Places {
+  const int32_t* first;    // (d, p)
+  const int32_t* strides;  // (d)
+  const T* offset;         // t, (d, p)
+  const T* polynomials;    // c, (2, s, s + 1): of the weights, and of the derivatives
+};
+
 template <class T>
 struct Stencils {
   // Terms of the flat node index. They wrap as 32-bit integers do: those of a particle outside of the window have no
@@ -34,6 +45,7 @@ struct Stencils {
   const T* weight_changes;
   const T* derivative_changes;
   int64_t particles;
+  Places<T> places;  // where factors are not given: then those before are null
 };
 
 template <class T>

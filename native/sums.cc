@@ -38,6 +38,12 @@ const bool* member(const bool* wanted, int64_t i, int64_t numbers) {
 
 template <class T>
 Stencils<T> member(Stencils<T> all, Form form, int64_t i) {
+  if (all.places.first != nullptr) {
+    Places<T>& places = all.places;
+    places.first += i * form.d * all.particles, places.offset += i * form.d * all.particles;
+    places.strides += i * form.d, places.polynomials += i * 2 * form.s * (form.s + 1);
+    return all;
+  }
   const int64_t factors = i * form.d * form.s * all.particles;
   all.index += factors;
   all.weights += factors;
@@ -125,6 +131,21 @@ void over_particles(const Pool& pool, Form form, int64_t batch, const Problem& a
   });
 }
 
+// The flat index of a node in the middle of a particle's stencil.
+template <class T>
+int64_t middle_node(const Stencils<T>& stencils, Form form, int64_t particle) {
+  const int middle = form.s / 2;
+  int64_t node = 0;
+  for (int a = 0; a < form.d; ++a) {
+    if (const Places<T>& places = stencils.places; places.first != nullptr) {
+      node += (int64_t(places.first[a * stencils.particles + particle]) + middle) * places.strides[a];
+    } else {
+      node += stencils.index[(a * form.s + middle) * stencils.particles + particle];
+    }
+  }
+  return node;
+}
+
 // Where the nodes are cut into parts with about as many particles each, by a sample: the k-th part goes from the k-th
 // number to the next. None cuts a block of kTogether nodes. How well they are chosen changes seconds, never sums.
 template <class T>
@@ -132,10 +153,7 @@ std::vector<int64_t> cut(const Stencils<T>& stencils, int64_t size, Form form, i
   const int64_t particles = stencils.particles, samples = std::min(kSamples, particles);
   std::vector<int64_t> places;
   for (int64_t k = 0; parts > 1 && k < samples; ++k) {
-    int64_t middle = 0;
-    for (int a = 0; a < form.d; ++a) {
-      middle += stencils.index[(a * form.s + form.s / 2) * particles + k * particles / samples];
-    }
+    const int64_t middle = middle_node(stencils, form, k * particles / samples);
     if (middle >= 0 && middle < size) places.push_back(middle);
   }
   std::sort(places.begin(), places.end());

@@ -10,6 +10,7 @@ from jax.interpreters import ad
 
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.autodiff import kept_sums
+from mpmjax.discretisation._placed import bound, define_placed
 from mpmjax.discretisation._stencil import Stencil
 from mpmjax.discretisation._transfer_sums import scatter_tangent, written_scatter
 from mpmjax.native import differentiable, native_primitive, sums_fit
@@ -37,7 +38,7 @@ def average(
         size: number of nodes n.
     """
     given = [jnp.concatenate([value, weight[None]])] + ([] if gradients is None else [gradients])
-    whole, means = _average_p.bind(*stencil.factors, jnp.asarray(least, weight.dtype), *given, size=size, batched=0)
+    whole, means = bound(_average_p, stencil, jnp.asarray(least, weight.dtype), *given, size=size, batched=0)
     return whole, means
 
 
@@ -111,7 +112,8 @@ def _nodes_fit(avals: Any, batched: int) -> bool:
     return avals[0].dtype in (np.float32, np.float64) and len({aval.dtype for aval in avals}) == 1
 
 
-_average_p = native_primitive("stencil_average", _average, _shapes, sums_fit, workspace=_sums)
+_average_p = native_primitive("stencil_average", _average, _shapes, sums_fit, workspace=_sums, placed=False)
+define_placed(_average_p, _average, _shapes, workspace=_sums)
 ad.primitive_jvps[_average_p] = _jvp
 _divided_p = differentiable(native_primitive("nodes_divided", _divided, _like_averages, lambda *_: False), _divided)
 _slope_p = differentiable(native_primitive("nodes_slope", _slope, _like_sums, _nodes_fit, like=0), _slope)

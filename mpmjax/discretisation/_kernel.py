@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array
+from mpmjax._types import Array, Float
 from mpmjax.checks import require, require_fields
 
 
@@ -67,6 +67,25 @@ class BSpline(eqx.Module):
                 near = (9 * t**2 - 12 * t) / 6
                 far = (-9 * t**2 + 6 * t + 3) / 6
                 return jnp.stack([-((1 - t) ** 2) / 2, near, far, t**2 / 2], axis=1)
+
+    @property
+    def centre(self) -> float:
+        """The middle of the distances f from a first node in which the others follow, in spacings."""
+        return self.order / 2
+
+    @property
+    def pieces(self) -> Float[np.ndarray, "s k"]:
+        """Coefficients c of the weights as polynomials Σ_k c_ik (f − centre)^k, shape (order + 1, order + 1)."""
+        match self.order:
+            case 1:
+                rows = [[1, -2], [1, 2]]
+                return np.array(rows) / 2
+            case 2:
+                return np.array([[1, -4, 4], [6, 0, -8], [1, 4, 4]]) / 8
+            case _:
+                outer, inner = [1, -6, 12, -8], [23, -30, -12, 24]
+                signs = np.array([1, -1, 1, -1])
+                return np.array([outer, inner, inner * signs, outer * signs]) / 48
 
     def _from_knot(self, f: Array) -> Array:
         """The distances in which the quadratic kernel's weights are parabolas, one formula for all three: XLA does not

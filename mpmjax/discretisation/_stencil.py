@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import reduce
 
 import equinox as eqx
@@ -14,6 +15,23 @@ from mpmjax.discretisation._gradient import AbstractGradient
 from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._kernel import BSpline
 from mpmjax.native import stored
+
+
+class Places(eqx.Module):
+    """Where particles are among their nodes. A stencil's factors are functions of it: in 3-D 27 numbers of 6.
+
+    The i-th node along an axis has the index term (first + i) stride, and as weight and as derivative the polynomials
+    Σ_k c_ik t^k in the offset t.
+    """
+
+    first: Int[Array, "d p"]
+    """Number of the first node along each axis in the window, shape (d, p)."""
+    strides: Int[Array, "d"]
+    """Distance in the flat node index of neighbours along each axis, shape (d,)."""
+    offset: Float[Array, "d p"]
+    """t, the distance from the middle of the places that have these nodes, in spacings, shape (d, p)."""
+    polynomials: Float[Array, "2 s k"]
+    """c of the weights [-] and of their derivatives [1/m], shape (2, s, s + 1)."""
 
 
 class Stencil(eqx.Module):
@@ -38,26 +56,24 @@ class Stencil(eqx.Module):
     """Diagonal of D_p [m²], shape (d, p)."""
     inside: Bool[Array, "p"]
     """Whether the whole stencil of the particle lies in the window."""
+    places: Places | None = None
+    """The same in fewer numbers, for sums that are not differentiated; None where factors are no such polynomials."""
 
     @property
     def least_squares(self) -> "Stencil":
         """The stencil with the gradient of moving least squares."""
         if self.mls_weight_derivatives is None:
             return self
-        return eqx.tree_at(
-            lambda s: (s.weight_derivatives, s.mls_weight_derivatives), self, (self.mls_weight_derivatives, None)
-        )
+        return replace(self, weight_derivatives=self.mls_weight_derivatives, mls_weight_derivatives=None, places=None)
 
     @property
     def squared(self) -> "Stencil":
         """The stencil of w_ip² and of the squared components g_ip,a²."""
-        return eqx.tree_at(
-            lambda s: (s.weights, s.weight_derivatives), self, (self.weights**2, self.weight_derivatives**2)
-        )
+        return replace(self, weights=self.weights**2, weight_derivatives=self.weight_derivatives**2, places=None)
 
     def of(self, particles: Int[Array, "s"]) -> "Stencil":
         """The stencil of some of the particles, by their numbers, with the scene's gradient operator alone."""
-        whole = eqx.tree_at(lambda s: s.mls_weight_derivatives, self, None, is_leaf=lambda leaf: leaf is None)
+        whole = replace(self, mls_weight_derivatives=None, places=None)
         return jax.tree.map(lambda factor: factor[..., particles], whole)
 
     @property
@@ -129,6 +145,19 @@ def make_stencil(
     factors = index_factors(kernel, grid, window, xi)
     if layer is not None:
         factors = factors.at[0].add(jnp.asarray(layer * math.prod(grid.shape), jnp.int32))
+    places = None
+    if (derivatives is spline or derivatives is least_squares) and not any(grid.periodic):
+        first = first_nodes(kernel, window, xi)
+        if layer is not None:
+            first = first.at[0].add(jnp.asarray(layer * grid.shape[0], jnp.int32))
+        polynomials = _polynomials(kernel, least_squares=derivatives is not spline)
+        scale = jnp.stack([jnp.ones_like(dx), 1 / dx]).astype(f.dtype)
+        places = Places(
+            first=first,
+            strides=jnp.asarray(_strides(grid)),
+            offset=jax.lax.stop_gradient(f - kernel.centre),
+            polynomials=jax.lax.stop_gradient(scale[:, None, None] * polynomials.astype(f.dtype)),
+        )
     return Stencil(
         index_factors=factors,
         weights=weights,
@@ -136,18 +165,40 @@ def make_stencil(
         mls_weight_derivatives=least_squares if affine and derivatives is not least_squares else None,
         moment=moment,
         inside=in_window(kernel, grid, window, x),
+        places=places,
     )
+
+
+def _polynomials(kernel: BSpline, least_squares: bool) -> Float[np.ndarray, "2 s k"]:
+    """Coefficients of the weights and of their derivatives [1/spacing] or those of moving least squares, shape
+    (2, order + 1, order + 2)."""
+    pieces = kernel.pieces
+    if least_squares and kernel.order > 1:
+        arms = [(node - kernel.centre, -1.0) for node in range(kernel.order + 1)]
+        slopes = [np.polynomial.polynomial.polymul(*both) for both in zip(pieces, arms, strict=True)]
+        slopes = np.array(slopes) / kernel.variance
+    else:
+        slopes = np.pad(np.polynomial.polynomial.polyder(pieces, axis=1), ((0, 0), (0, 2)))
+    return np.stack([np.pad(pieces, ((0, 0), (0, 1))), slopes])
+
+
+def first_nodes(kernel: BSpline, window: Int[Array, "d"], xi: Array) -> Int[Array, "d p"]:
+    """Number of the first stencil node along each axis in the window, shape (d, p), for positions xi in spacings."""
+    return jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window.astype(jnp.int32)[:, None]
+
+
+def _strides(grid: Grid) -> Int[np.ndarray, "d"]:
+    """Distance in the C-order node index of neighbours along each axis, shape (d,)."""
+    return np.array([math.prod(grid.shape[a + 1 :]) for a in range(grid.dim)], np.int32)
 
 
 def index_factors(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Array) -> Int[Array, "d s p"]:
     """Term of the C-order node index from each axis, shape (d, s, p)."""
-    first = jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window.astype(jnp.int32)[:, None]
-    along = first[:, None] + jnp.arange(kernel.order + 1, dtype=jnp.int32)[:, None]
+    along = first_nodes(kernel, window, xi)[:, None] + jnp.arange(kernel.order + 1, dtype=jnp.int32)[:, None]
     if any(grid.periodic):  # by whole numbers in the code: XLA divides by those in an array one by one
         axes = zip(along, grid.shape, grid.periodic, strict=True)
         along = jnp.stack([index % period if wraps else index for index, period, wraps in axes])
-    strides = np.array([math.prod(grid.shape[a + 1 :]) for a in range(grid.dim)], np.int32)
-    return along * strides[:, None, None]
+    return along * _strides(grid)[:, None, None]
 
 
 def _tensor(combine: Callable[[Array, Array], Array], factors: list[Array]) -> Array:

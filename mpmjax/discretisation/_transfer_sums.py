@@ -24,6 +24,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad
 
 from mpmjax._types import Array, Float
+from mpmjax.discretisation._placed import bound, define_placed
 from mpmjax.discretisation._stencil import Stencil
 from mpmjax.native import members, native_primitive, sums_fit
 
@@ -39,7 +40,7 @@ def gather(stencil: Stencil, nodes: Float[Array, "n c"]) -> tuple[Float[Array, "
         stencil: stencil of the particles.
         nodes: f_i, shape (n, c).
     """
-    value, gradients = gather_p.bind(*stencil.factors, nodes, batched=0)
+    value, gradients = bound(gather_p, stencil, nodes, batched=0)
     return value, gradients
 
 
@@ -58,7 +59,7 @@ def scatter(
         size: number of nodes n.
     """
     given = [a for a in (value, gradients) if a is not None]
-    return scatter_p.bind(*stencil.factors, *given, valued=value is not None, size=size, batched=0)[0]
+    return bound(scatter_p, stencil, *given, valued=value is not None, size=size, batched=0)[0]
 
 
 # The sums themselves, of rows (p, c): `_narrow` takes what a particle gives one axis further in, to one node along it;
@@ -204,14 +205,22 @@ def _factor_rows(index_factors: ShapedArray, *others: ShapedArray, valued: bool)
 
 
 _sum_primitive = partial(native_primitive, fits=sums_fit)
-gather_p = _sum_primitive("stencil_gather", _gather, _particle_rows, differential=False)
-scatter_p = _sum_primitive("stencil_scatter", written_scatter, partial(_node_rows, first=3), differential=False)
+gather_p = _sum_primitive("stencil_gather", _gather, _particle_rows, placed=False, differential=False)
+scatter_p = _sum_primitive(
+    "stencil_scatter", written_scatter, partial(_node_rows, first=3), placed=False, differential=False
+)
 pull_p = _sum_primitive("stencil_pull", _pull, _factor_rows)
+define_placed(gather_p, _gather, _particle_rows, differential=False)
+define_placed(scatter_p, written_scatter, partial(_node_rows, first=3), differential=False)
 _gather_by_factors_p = _sum_primitive(
-    "stencil_gather_by_factors", _by_factors(_gather), _particle_rows, differential=True
+    "stencil_gather_by_factors", _by_factors(_gather), _particle_rows, placed=False, differential=True
 )
 _scatter_by_factors_p = _sum_primitive(
-    "stencil_scatter_by_factors", _by_factors(written_scatter), partial(_node_rows, first=5), differential=True
+    "stencil_scatter_by_factors",
+    _by_factors(written_scatter),
+    partial(_node_rows, first=5),
+    placed=False,
+    differential=True,
 )
 
 

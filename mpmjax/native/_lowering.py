@@ -19,6 +19,7 @@ def with_native(
     fits: Callable[..., bool],
     aliases: dict[int, int],
     memory: Callable[..., list[ShapedArray]],
+    unread: tuple[int, ...] = (),
     **attributes: bool,
 ) -> _Rule:
     """The lowering rule for CPUs of a primitive: a call of the native library where it has a kernel, else as written.
@@ -33,6 +34,7 @@ def with_native(
         aliases: arguments whose memory results may take.
         memory: arrays that the kernel works in, as a function of its arguments and parameters. It is given them as
             further results, whose memory XLA then keeps from step to step.
+        unread: numbers of arguments that the kernel is not given.
         attributes: what the library is told besides.
     """
 
@@ -43,7 +45,10 @@ def with_native(
         told = {"valued": np.bool_(params["valued"])} if "valued" in params else {}
         told |= {name: np.bool_(value) for name, value in attributes.items()}
         results = len(ctx.avals_out)
-        ctx = ctx.replace(avals_out=[*ctx.avals_out, *memory(*avals, **params)])
+        read = [k for k in range(len(args)) if k not in unread]
+        args = tuple(args[k] for k in read)
+        out = [*ctx.avals_out, *memory(*avals, **params)]
+        ctx = ctx.replace(avals_in=[avals[k] for k in read], avals_out=out)
         return jax.ffi.ffi_lowering(target(name), operand_output_aliases=aliases)(ctx, *args, **told)[:results]
 
     return rule

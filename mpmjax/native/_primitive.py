@@ -39,6 +39,7 @@ def native_primitive(
     aliases: dict[int, int] | None = None,
     like: int = 1,
     workspace: Callable[..., tuple] | None = None,
+    unread: tuple[int, ...] = (),
     **attributes: bool,
 ) -> Primitive:
     """A primitive that evaluates a function. In a batch all its arguments have as many leading axes as the batch.
@@ -52,6 +53,7 @@ def native_primitive(
         like: the argument whose dtype results have.
         workspace: the shape of memory that the library's kernel works in, as a function of the arguments; None if it
             needs none.
+        unread: numbers of arguments that the library is not given.
         attributes: what the library is told besides the primitive's parameters.
     """
 
@@ -78,7 +80,7 @@ def native_primitive(
     static = ("batched", "unroll", "valued", "size")
     once = jax.jit(run, static_argnames=static)  # traced once for all its uses
     written = mlir.lower_fun(once, multiple_results=True)
-    native = with_native(name.split("_")[1], written, fits, aliases or {}, memory, **attributes)
+    native = with_native(name.split("_")[1], written, fits, aliases or {}, memory, unread, **attributes)
     primitive.def_impl(_compiled(jax.jit(primitive.bind, static_argnames=static)))
     primitive.def_abstract_eval(results)
     batching.primitive_batchers[primitive] = batch

@@ -64,4 +64,4 @@ def initial_state(scene: Scene, particles: Particles) -> RolloutState:
 
 def _with_transposed_affine(state: State) -> State:
     """A component-first state with C transposed."""
-    return state if state.C is None else replace(state, C=jnp.swapaxes(state.C, 0, 1))
+    return state if state.C is None else eqx.tree_at(lambda s: s.C, state, jnp.swapaxes(state.C, 0, 1))

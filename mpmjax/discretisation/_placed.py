@@ -1,0 +1,73 @@
+"""Sums that read the particles' places in place of their stencils' factors."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad
+
+from mpmjax._types import Array
+from mpmjax.discretisation._stencil import Stencil
+from mpmjax.native import native_primitive, sums_fit
+
+_PLACES, _FACTORS = 4, 3
+"""How many arguments places and factors are."""
+_placed: dict[Primitive, Primitive] = {}
+
+
+def bound(primitive: Primitive, stencil: Stencil, *args: Array, **params: Any) -> list[Array]:
+    """A sum over a stencil, from places where it has them. The factors are arguments too. Derivatives are theirs, and
+    so is the sum by XLA; where the native library sums from places, XLA does not compute them."""
+    places = stencil.places
+    if places is None:
+        return primitive.bind(*stencil.factors, *args, **params)
+    given = places.first, places.strides, places.offset, places.polynomials
+    return _placed[primitive].bind(*given, *stencil.factors, *args, **params)
+
+
+def define_placed(
+    primitive: Primitive,
+    function: Callable[..., list[Array]],
+    shapes: Callable[..., list[tuple]],
+    workspace: Callable[..., tuple] | None = None,
+    **attributes: bool,
+) -> None:
+    """Define what `bound` needs of a sum of factors and other arguments.
+
+    Args:
+        primitive: the sum.
+        function: the function of arrays.
+        shapes: the shapes of the results, as a function of the arguments.
+        workspace: as in `native_primitive`.
+        attributes: what the library is told besides.
+    """
+
+    def without_places(of: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda *args, **params: of(*args[_PLACES:], **params)
+
+    def transpose(cotangents: list, *args: Any, **params: Any) -> list:
+        return [None] * _PLACES + ad.primitive_transposes[primitive](cotangents, *args[_PLACES:], **params)
+
+    found = native_primitive(
+        f"placed_{primitive.name.split('_')[1]}",
+        without_places(function),
+        without_places(shapes),
+        _places_fit,
+        like=_PLACES + 1,
+        workspace=None if workspace is None else without_places(workspace),
+        unread=tuple(range(_PLACES, _PLACES + _FACTORS)),
+        placed=True,
+        **attributes,
+    )
+    ad.primitive_jvps[found] = lambda primals, tangents, **params: ad.primitive_jvps[primitive](
+        primals[_PLACES:], tangents[_PLACES:], **params
+    )
+    ad.primitive_transposes[found] = transpose
+    _placed[primitive] = found
+
+
+def _places_fit(avals: Sequence[ShapedArray], batched: int) -> bool:
+    *_, offset, polynomials = avals[:_PLACES]
+    factors = avals[_PLACES:]
+    return offset.dtype == polynomials.dtype == factors[1].dtype and sums_fit(factors, batched)
