@@ -66,7 +66,7 @@ struct Example {
 
   Stencils<T> stencils(bool differential) const {
     return {index.data.get(), w.data.get(), g.data.get(), differential ? dw.data.get() : nullptr,
-            differential ? dg.data.get() : nullptr, shape.particles};
+            differential ? dg.data.get() : nullptr, shape.particles, {}};
   }
   // Places that particles take in turn, two at each, some of them beside the one before, along the last axis first.
   int64_t in_turn(int64_t p, int axis) const {
@@ -182,6 +182,75 @@ void check(const Example<T>& e, const std::vector<const Pool*>& pools) {
     if (!differential && kind != 4) compare("gather beside a pull", sh, e.beside, from, from_scale);
     if (!differential) compare("pull by weights", sh, e.by_w, by_w, by_scale);
     if (!differential) compare("pull by derivatives", sh, e.by_g, by_g, by_g_scale);
+  }
+}
+
+// Sums that are given places, against those of the factors that these places have.
+template <class T>
+void check_places(const Shape& sh, int oddity, std::mt19937& random, const std::vector<const Pool*>& pools) {
+  const Example<T> e(sh, oddity, random);
+  const int64_t rows = e.rows(), n = sh.size(), places = sh.batch * sh.d * sh.particles, terms = sh.s + 1;
+  const Array<int32_t> first(places), strides(sh.batch * sh.d);
+  const Array<T> offset(places), polynomials(sh.batch * 2 * sh.s * terms), least(sh.batch), whole(sh.batch * n);
+  const Array<T> means(sh.batch * n * (sh.columns - 1)), work(e.to_nodes.size);
+  std::normal_distribution<T> normal;
+  for (const Array<T>* array : {&offset, &polynomials}) {
+    for (int64_t i = 0; i < array->size; ++i) (*array)[i] = normal(random);
+  }
+  for (int64_t m = 0; m < sh.batch; ++m) {
+    int32_t stride = 1;
+    for (int a = sh.d - 1; a >= 0; --a, stride *= int32_t(sh.along)) strides[m * sh.d + a] = stride;
+    for (int a = 0; a < sh.d; ++a) {
+      for (int64_t p = 0; p < sh.particles; ++p) {
+        const int64_t axis = m * sh.d + a, at = axis * sh.particles + p;
+        first[at] = e.index[axis * sh.s * sh.particles + p] / strides[axis];
+        for (int i = 0; i < sh.s; ++i) {
+          for (int part = 0; part < 2; ++part) {
+            const T* c = &polynomials[((m * 2 + part) * sh.s + i) * terms];
+            T sum = c[sh.s];
+            for (int k = sh.s - 1; k >= 0; --k) sum = sum * offset[at] + c[k];
+            (part == 0 ? e.w : e.g)[(axis * sh.s + i) * sh.particles + p] = sum;
+          }
+        }
+      }
+    }
+    least[m] = std::numeric_limits<T>::min();
+  }
+  Stencils<T> placed = {};
+  placed.particles = sh.particles;
+  placed.places = {first.data.get(), strides.data.get(), offset.data.get(), polynomials.data.get()};
+  const Form form{sh.d, sh.s, false};
+  const Given<T> given = {e.given.data.get(), e.given.data.get() + rows, sh.columns - 1};
+  const auto sum = [&](const Pool& pool, const Stencils<T>& stencils) {
+    T *value = e.gathered.data.get(), *gradients = value + rows;
+    gather(pool, form, sh.batch, Gather<T>{stencils, e.nodes.data.get(), value, gradients, n, sh.columns});
+    scatter(pool, form, sh.batch, Scatter<T>{stencils, given, e.to_nodes.data.get(), nullptr, nullptr, n, sh.columns, nullptr});
+    average(pool, form, sh.batch, Average<T>{stencils, given, least.data.get(), whole.data.get(), means.data.get(),
+                                             work.data.get(), nullptr, nullptr, n, sh.columns});
+  };
+  const auto as_expected = [](const Array<T>& found) {
+    std::vector<double> numbers(found.size);
+    for (int64_t i = 0; i < found.size; ++i) numbers[i] = found[i];
+    return numbers;
+  };
+  const auto rounding = [](const std::vector<double>& numbers) {
+    double most = 0;
+    for (const double number : numbers) most = std::max(most, std::isfinite(number) ? std::abs(number) : 0);
+    return std::vector<double>(numbers.size(), 100 * most);
+  };
+  sum(*pools[0], e.stencils(false));
+  const auto to = as_expected(e.to_nodes), from = as_expected(e.gathered), weights = as_expected(whole);
+  std::unique_ptr<Array<T>> bits[3];
+  for (const Pool* pool : pools) {
+    sum(*pool, placed);
+    compare("scatter by places", sh, e.to_nodes, to, rounding(to));
+    compare("gather by places", sh, e.gathered, from, rounding(from));
+    compare("whole weights by places", sh, whole, weights, rounding(to));
+    int k = 0;
+    for (const Array<T>* result : {&e.to_nodes, &e.gathered, &means}) {
+      if (bits[k] == nullptr) bits[k] = std::make_unique<Array<T>>(*result);
+      expect_same("sums by places", *bits[k++], *result);
+    }
   }
 }
 
@@ -372,6 +441,13 @@ int check_all(const std::vector<const Pool*>& pools) {
   }
   check_both({1, 2, 3, 30011, 999, 1}, 1);
   check_in_order<T>({2, 3, 2, 20011, 40, 2}, random, pools);
+  for (int d = 1; d <= 3; ++d) {
+    for (int s = 2; s <= 4; ++s) {
+      for (const int64_t particles : {0, 1, 53, 5003}) {
+        check_places<T>({d, s, 1 + d % 2, particles, 20, 2 + s % 3}, int(random() % 4) - 2, random, pools), ++examples;
+      }
+    }
+  }
   // More nodes than a cache holds: those that no particle reaches are marked, and set to zero apart.
   for (int oddity = -2; oddity < 3; ++oddity) {
     const Example<T> wide({3, 3, 1, 2503, 100, 3}, oddity, random);

@@ -235,3 +235,32 @@ def test_other_orders_are_refused(order):
     """Only orders 1, 2 and 3 exist."""
     with pytest.raises(ValueError, match="order must be 1, 2 or 3"):
         mpm.BSpline(order)
+
+
+@pytest.mark.parametrize(("kernel", "gradient", "d"), COMBINATIONS)
+def test_factors_are_polynomials_of_places(kernel, gradient, d):
+    """Terms of the index, weights and derivatives are those that `Places` says, at the edge of a cell too."""
+    stencil, _ = stencil_of(kernel, gradient, d)
+    first, strides, t, c = (np.asarray(a) for a in jax.tree.leaves(stencil.places))
+    along = first[:, None] + np.arange(kernel.order + 1)[:, None]
+    np.testing.assert_array_equal(along * strides[:, None, None], stencil.index_factors)
+    assert (abs(t) <= 0.5).all()
+    weights, derivatives = np.einsum("aik,kdp->adip", c, t ** np.arange(c.shape[-1])[:, None, None])
+    assert_close(weights, stencil.weights, 1e-15)
+    assert_close(derivatives, stencil.weight_derivatives, 1e-14)
+
+
+def test_no_places_where_factors_are_others():
+    """Around a periodic axis, for another gradient operator, and in what is made of a stencil."""
+
+    class Half(mpm.AbstractGradient):
+        def derivatives(self, spline, least_squares):
+            return (spline + least_squares) / 2
+
+    x, kernel = places(2), KERNELS["quadratic"]
+    spline = make(kernel, mpm.SplineGradient(), mpm.Grid((8, 8), DX), x)[0]
+    assert spline.places is not None
+    for other in (spline.least_squares, spline.squared, spline.of(jnp.arange(3))):
+        assert other.places is None
+    assert make(kernel, Half(), mpm.Grid((8, 8), DX), x)[0].places is None
+    assert make(kernel, mpm.MLSGradient(), mpm.Grid((8, 8), DX, periodic=(True, False)), x)[0].places is None

@@ -1,5 +1,6 @@
 """The native sums are those of XLA to rounding, whatever they are given, and one place chooses between them."""
 
+import dataclasses
 import warnings
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,7 @@ from helpers import NEEDS_LIBRARY, assert_close, block, thorough
 
 import mpmjax as mpm
 from mpmjax import linalg as la
-from mpmjax.discretisation import _average, _resistance
+from mpmjax.discretisation import _average, _resistance, make_stencil
 from mpmjax.discretisation import _transfer_sums as sums
 from mpmjax.implicit import _recurrence, _restarts, _vectors
 from mpmjax.native import _library
@@ -137,6 +138,47 @@ def test_derivatives_agree(d, graded):
 
     native_, written_ = (partial(of, graded=graded) for of in (native, written))
     agree(derivatives(native_), derivatives(written_), "float64", 500)  # slopes along all at once are sums that cancel
+
+
+@NEEDS_LIBRARY
+@pytest.mark.parametrize(("d", "order"), [(2, 2), *thorough((1, 1), (3, 2), (2, 3))])
+def test_sums_by_places_agree(d, order):
+    """With those of the factors: values, also in a batch and of no particles, and derivatives to the last bit, also of
+    the linear functions that the sums are."""
+    rng, side, p = np.random.default_rng(3), 8, 45
+    grid = mpm.Grid((side,) * d, 0.1)
+    a, b, nodes = (jnp.asarray(rng.normal(size=shape)) for shape in ((2, p), (d, 2, p), (side**d, 2)))
+    weight = jnp.asarray(rng.uniform(0.5, 1.5, p))
+
+    def stencil(x, placed):
+        made = make_stencil(mpm.BSpline(order), mpm.MLSGradient(), grid, grid.window(x), x, affine=True)
+        return made if placed else dataclasses.replace(made, places=None)
+
+    def all_sums(placed, x, weight, a, b, nodes):
+        of = stencil(x, placed)
+        averages = _average.average(of, weight, a, b, jnp.asarray(1e-9), side**d)
+        return sums.gather(of, nodes), sums.scatter(of, a, b, side**d), averages
+
+    def slopes(placed, *args):
+        return jax.grad(lambda *args: sum((s**2).sum() for s in jax.tree.leaves(all_sums(placed, *args))), range(5))(
+            *args
+        )
+
+    def transposed(placed, x, weight, a, b, nodes):
+        del weight, nodes
+        of = stencil(x, placed)
+        return jax.linear_transpose(lambda a: sums.scatter(of, a, None, side**d), a)(jnp.ones((side**d, 2)))
+
+    x = jnp.asarray(rng.uniform(0.25, 0.45, (p, d)))
+    args = x, weight, a, b, nodes
+    others = jax.tree.map(lambda v: v[..., ::-1], args)
+    batch = jax.tree.map(lambda *v: jnp.stack(v), args, others)
+    nobody = x[:0], weight[:0], a[:, :0], b[..., :0], nodes
+    for through, given in ((jax.jit, args), (lambda of: jax.jit(jax.vmap(of)), batch)):
+        agree(*(through(partial(all_sums, placed))(*given) for placed in (True, False)), "float64")
+    for of, given in ((slopes, args), (transposed, args), (all_sums, nobody)):
+        found, expected = (jax.jit(partial(of, placed))(*given) for placed in (True, False))
+        jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
 def averaged(of, index, w, g, given, gradients, k=2, side=SIDE):
