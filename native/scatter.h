@@ -115,9 +115,13 @@ struct Scatterer {
     } else {
       each<s, !differential>([&](int i) MPMJAX_INLINE_LAMBDA {
         const auto w = block.weight(a, i, q), g = block.derivative(a, i, q);
-        X inner[d - a];
-        for (int b = 1; b < last - a; ++b) inner[b - 1] = product(w, gradients[b]);
-        add<a + 1>(q, s * row + i, product(w, value) + product(g, gradients[0]), inner);
+        if constexpr (a + 1 == last && !differential) {  // so that both products are added as they are formed
+          sums[s * row + i] = sums[s * row + i] + product(w, value) + product(g, gradients[0]);
+        } else {
+          X inner[d - a];
+          for (int b = 1; b < last - a; ++b) inner[b - 1] = product(w, gradients[b]);
+          add<a + 1>(q, s * row + i, product(w, value) + product(g, gradients[0]), inner);
+        }
       });
     }
   }

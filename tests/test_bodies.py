@@ -59,6 +59,17 @@ def contact_of(scene, particles):
     return found, scene.grid.nodes(scene.window(particles))[: len(found.gap)]
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_rounding_does_not_decide_where_bodies_touch(seed):
+    """A node deep in a body that is a lattice has particles around it at a mean distance of zero."""
+    scene, particles = stacked(gap=-0.05, speed=1.0, shift=0.3)
+    noise = np.random.default_rng(seed).normal(size=particles.x.shape)
+    moved = dataclasses.replace(particles, x=particles.x + 1e-15 * noise)
+    one, other = (np.isfinite(touching(scene, p)[0].gap) for p in (particles, moved))
+    assert one.any()
+    np.testing.assert_array_equal(one, other)
+
+
 @pytest.mark.parametrize("d", [2, *thorough(3)])
 @pytest.mark.parametrize("order", [2, *thorough(3)])
 def test_the_gap_is_the_distance_of_the_faces(d, order):

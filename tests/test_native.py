@@ -488,7 +488,11 @@ def test_wrong_arrays_are_refused():
     bad = jax.ffi.ffi_call("mpmjax_gather", [jax.ShapeDtypeStruct((3, 10), "float32")] * 3)
     assert mpm.backend().name == "native"
     with pytest.raises(Exception, match="shapes do not fit"):
-        jax.block_until_ready(jax.jit(lambda *a: bad(*a, differential=np.bool_(False)))(index, w[..., :9], g, nodes))
+        jax.block_until_ready(
+            jax.jit(lambda *a: bad(*a, placed=np.bool_(False), differential=np.bool_(False)))(
+                index, w[..., :9], g, nodes
+            )
+        )
 
 
 @NEEDS_LIBRARY

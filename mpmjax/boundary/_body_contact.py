@@ -21,6 +21,8 @@ STIFFNESS = 2.0
 """α, the stiffness of contact of one body in its wave modulus over a spacing: that of half a spacing of it. A stiffer
 contact makes more of the noise of gaps, some hundredths of a spacing: with 20 the pressure between two cylinders
 differs by a third from node to node."""
+_LEAST_DEPTH = 1e-3
+"""Of the particles around a node from it on, in spacings. Deep in a body it is zero, and of a lattice only rounding."""
 _EMPTY = 1e-9
 """The part of a cell below which a body is not felt at a node."""
 _LEAST_SPREAD = 1e-2
@@ -219,7 +221,7 @@ def body_contact(
     depths = [sign * (normal * body.middle).sum(axis=0) for body, sign in ((a, 1), (b, -1))]
     first, second = (_distance(body, depth, order) for body, depth in zip((a, b), depths, strict=True))
     away = jnp.minimum(jnp.maximum(first, second), 1)
-    felt = both & (depths[0] > 0) & (depths[1] > 0) & (away < 1)
+    felt = both & (depths[0] > _LEAST_DEPTH) & (depths[1] > _LEAST_DEPTH) & (away < 1)
     area = jnp.cos(jnp.pi / 2 * away) ** 2 * (a.part + b.part) * spacing ** (len(normal) - 1)
     approach = jnp.maximum(-(normal * (a.velocity - b.velocity)).sum(axis=0), 0)
     stiff, other = (body.modulus + body.density * approach**2 for body in (a, b))

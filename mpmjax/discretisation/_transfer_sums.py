@@ -205,22 +205,17 @@ def _factor_rows(index_factors: ShapedArray, *others: ShapedArray, valued: bool)
 
 
 _sum_primitive = partial(native_primitive, fits=sums_fit)
-gather_p = _sum_primitive("stencil_gather", _gather, _particle_rows, placed=False, differential=False)
-scatter_p = _sum_primitive(
-    "stencil_scatter", written_scatter, partial(_node_rows, first=3), placed=False, differential=False
-)
+_by_factors_primitive = partial(_sum_primitive, placed=False)
+gather_p = _by_factors_primitive("stencil_gather", _gather, _particle_rows, differential=False)
+scatter_p = _by_factors_primitive("stencil_scatter", written_scatter, partial(_node_rows, first=3), differential=False)
 pull_p = _sum_primitive("stencil_pull", _pull, _factor_rows)
 define_placed(gather_p, _gather, _particle_rows, differential=False)
 define_placed(scatter_p, written_scatter, partial(_node_rows, first=3), differential=False)
-_gather_by_factors_p = _sum_primitive(
-    "stencil_gather_by_factors", _by_factors(_gather), _particle_rows, placed=False, differential=True
+_gather_by_factors_p = _by_factors_primitive(
+    "stencil_gather_by_factors", _by_factors(_gather), _particle_rows, differential=True
 )
-_scatter_by_factors_p = _sum_primitive(
-    "stencil_scatter_by_factors",
-    _by_factors(written_scatter),
-    partial(_node_rows, first=5),
-    placed=False,
-    differential=True,
+_scatter_by_factors_p = _by_factors_primitive(
+    "stencil_scatter_by_factors", _by_factors(written_scatter), partial(_node_rows, first=5), differential=True
 )
 
 
@@ -407,15 +402,9 @@ def _transpose_pull(cotangents: list, *args: Any, valued: bool, batched: int) ->
     """Of what is linear in f, the scatter's differential by the factors; of what is linear in a, the gather's."""
     factors, changes = args[:3], map(ad.instantiate_zeros, cotangents)
     if ad.is_undefined_primal(args[3]):
-        size = args[3].aval.shape[-2]
-        params = {"valued": valued, "size": size, "batched": batched}
-        return [
-            None,
-            None,
-            None,
-            *_scatter_by_factors_p.bind(*factors, *changes, *args[4:], **params),
-            *(None for _ in args[4:]),
-        ]
+        params = {"valued": valued, "size": args[3].aval.shape[-2], "batched": batched}
+        found = _scatter_by_factors_p.bind(*factors, *changes, *args[4:], **params)
+        return [None, None, None, *found, *(None for _ in args[4:])]
     found = _gather_by_factors_p.bind(*factors, *changes, args[3], batched=batched)
     return [None, None, None, None, *_of_given(found, args[4:], valued)]
 
