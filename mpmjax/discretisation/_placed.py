@@ -54,6 +54,7 @@ def define_placed(
         without_places(function),
         without_places(shapes),
         _places_fit,
+        aliases=None,
         like=_PLACES + 1,
         workspace=None if workspace is None else without_places(workspace),
         unread=tuple(range(_PLACES, _PLACES + _FACTORS)),
