@@ -225,6 +225,8 @@ void check_places(const Shape& sh, int oddity, std::mt19937& random, const std::
     T *value = e.gathered.data.get(), *gradients = value + rows;
     gather(pool, form, sh.batch, Gather<T>{stencils, e.nodes.data.get(), value, gradients, n, sh.columns});
     scatter(pool, form, sh.batch, Scatter<T>{stencils, given, e.to_nodes.data.get(), nullptr, nullptr, n, sh.columns, nullptr});
+    resist(pool, form, sh.batch, Resist<T>{stencils, e.matrices.data.get(), e.moved.data.get(), e.resisted.data.get(), {},
+                                           nullptr, n, sh.d, nullptr});
     average(pool, form, sh.batch, Average<T>{stencils, given, least.data.get(), whole.data.get(), means.data.get(),
                                              work.data.get(), nullptr, nullptr, n, sh.columns});
   };
@@ -240,14 +242,16 @@ void check_places(const Shape& sh, int oddity, std::mt19937& random, const std::
   };
   sum(*pools[0], e.stencils(false));
   const auto to = as_expected(e.to_nodes), from = as_expected(e.gathered), weights = as_expected(whole);
-  std::unique_ptr<Array<T>> bits[3];
+  const auto resisted = as_expected(e.resisted);
+  std::unique_ptr<Array<T>> bits[4];
   for (const Pool* pool : pools) {
     sum(*pool, placed);
     compare("scatter by places", sh, e.to_nodes, to, rounding(to));
     compare("gather by places", sh, e.gathered, from, rounding(from));
     compare("whole weights by places", sh, whole, weights, rounding(to));
+    compare("a resistance by places", sh, e.resisted, resisted, rounding(resisted));
     int k = 0;
-    for (const Array<T>* result : {&e.to_nodes, &e.gathered, &means}) {
+    for (const Array<T>* result : {&e.to_nodes, &e.gathered, &means, &e.resisted}) {
       if (bits[k] == nullptr) bits[k] = std::make_unique<Array<T>>(*result);
       expect_same("sums by places", *bits[k++], *result);
     }

@@ -9,8 +9,7 @@
 //   solve    index, weights, derivatives, matrices, mass, factor, free, weight, active, x, rhs, limits  ->  x, numbers,
 //                                                                         memory to work in (of a batch none)
 //
-// With `placed`, gather, scatter and average are given first nodes, strides, offsets and polynomials in place of the
-// factors: (..., d, p), (..., d), (..., d, p), (..., 2, s, s + 1). Factors are (..., d, s, p), values (..., c, p) and gradients (..., d, c, p), nodes (..., n, c), matrices
+// With `placed`, all but a pull are given first nodes, strides, offsets and polynomials in place of the factors: (..., d, p), (..., d), (..., d, p), (..., 2, s, s + 1). Factors are (..., d, s, p), values (..., c, p) and gradients (..., d, c, p), nodes (..., n, c), matrices
 // (..., d² (d² + 1) / 2, p), with the same leading axes everywhere. Given are a value or gradients or both; gradients may
 // have fewer columns than the value. In a solve vectors are (..., n d), mass (..., n), active (..., ⌈n d/64⌉).
 // `valued` says whether there is a value; `differential` whether changes of the factors follow them.
@@ -138,14 +137,15 @@ struct ResistOf {
   template <class T>
   bool run(const Pool& pool, Call& call) const {
     const int64_t m = call.d * call.d;
+    const size_t k = call.factors(false);
     Resist<T> task = {};
     task.stencils = call.stencils<T>(false);
-    task.size = call.dim(4, 2);
+    task.size = call.dim(k + 1, 2);
     task.columns = call.d;
-    task.matrices = call.at<T>(3, {m * (m + 1) / 2, call.particles});
-    task.moved = call.at<T>(4, {task.size, call.d});
-    task.nodes = call.at<T>(5, {task.size, call.d});
-    call.expect(call.operands == 5 && call.buffers.size() == 6, "too many or too few arrays");
+    task.matrices = call.at<T>(k, {m * (m + 1) / 2, call.particles});
+    task.moved = call.at<T>(k + 1, {task.size, call.d});
+    task.nodes = call.at<T>(k + 2, {task.size, call.d});
+    call.expect(call.operands == k + 2 && call.buffers.size() == k + 3, "too many or too few arrays");
     call.expect(task.size > 0 || call.particles == 0, "no nodes to gather from");
     if (!call.fault.empty()) return true;
     return resist(pool, {int(call.d), int(call.s), false}, call.batch, task);
@@ -155,27 +155,28 @@ struct ResistOf {
 struct SolveOf {
   template <class T>
   bool run(const Pool& pool, Call& call) const {
-    const int64_t m = call.d * call.d, nodes = call.dim(4, 1), size = nodes * call.d;
+    const size_t k = call.factors(false);
+    const int64_t m = call.d * call.d, nodes = call.dim(k + 1, 1), size = nodes * call.d;
     Solve<T> task = {};
     Recurrence<T>& of = task.recurrence;
     of.stencils = call.stencils<T>(false);
     of.nodes = nodes;
     of.columns = call.d;
-    of.matrices = call.at<T>(3, {m * (m + 1) / 2, call.particles});
-    of.mass = call.at<T>(4, {nodes});
-    of.factor = call.at<T>(5, {});
-    of.free = call.booleans(6, {size});
-    of.weight = call.at<T>(7, {size});
-    of.active = call.booleans(8, {(size + kTogether - 1) / kTogether});
-    task.start = call.at<T>(9, {size});
-    task.rhs = call.at<T>(10, {size});
-    task.limits = call.at<T>(11, {kTolerances});
-    of.x = call.at<T>(12, {size});
-    task.numbers = call.at<T>(13, {kOutcome});
+    of.matrices = call.at<T>(k, {m * (m + 1) / 2, call.particles});
+    of.mass = call.at<T>(k + 1, {nodes});
+    of.factor = call.at<T>(k + 2, {});
+    of.free = call.booleans(k + 3, {size});
+    of.weight = call.at<T>(k + 4, {size});
+    of.active = call.booleans(k + 5, {(size + kTogether - 1) / kTogether});
+    task.start = call.at<T>(k + 6, {size});
+    task.rhs = call.at<T>(k + 7, {size});
+    task.limits = call.at<T>(k + 8, {kTolerances});
+    of.x = call.at<T>(k + 9, {size});
+    task.numbers = call.at<T>(k + 10, {kOutcome});
     const int64_t memory = call.leading.empty() ? kVectors * size : 0;
-    T* const given = call.at<T>(14, {memory});
+    T* const given = call.at<T>(k + 11, {memory});
     task.memory = memory > 0 ? given : nullptr;
-    call.expect(call.operands == 12 && call.buffers.size() == 15, "too many or too few arrays");
+    call.expect(call.operands == k + 9 && call.buffers.size() == k + 12, "too many or too few arrays");
     call.expect(nodes > 0 || call.particles == 0, "no nodes to gather from");
     if (!call.fault.empty()) return true;
     return solve(pool, {int(call.d), int(call.s), false}, call.batch, task);
@@ -213,12 +214,12 @@ ffi::Error run_pull(ffi::ThreadPool threads, bool valued, ffi::RemainingArgs arg
   return run(PullOf{valued}, threads, arguments, results);
 }
 
-ffi::Error run_resist(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
-  return run(ResistOf{}, threads, arguments, results);
+ffi::Error run_resist(ffi::ThreadPool threads, bool placed, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  return run(ResistOf{}, threads, arguments, results, placed);
 }
 
-ffi::Error run_solve(ffi::ThreadPool threads, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
-  return run(SolveOf{}, threads, arguments, results);
+ffi::Error run_solve(ffi::ThreadPool threads, bool placed, ffi::RemainingArgs arguments, ffi::RemainingRets results) {
+  return run(SolveOf{}, threads, arguments, results, placed);
 }
 
 ffi::Error run_threads(ffi::ThreadPool threads, ffi::ResultBuffer<ffi::DataType::S32> count) {
@@ -255,9 +256,17 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_average, mpmjax::run_average,
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_pull, mpmjax::run_pull,
                               ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Attr<bool>("valued").RemainingArgs().RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_resist, mpmjax::run_resist,
-                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
+                              ffi::Ffi::Bind()
+                                  .Ctx<ffi::ThreadPool>()
+                                  .Attr<bool>("placed")
+                                  .RemainingArgs()
+                                  .RemainingRets());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_solve, mpmjax::run_solve,
-                              ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().RemainingArgs().RemainingRets());
+                              ffi::Ffi::Bind()
+                                  .Ctx<ffi::ThreadPool>()
+                                  .Attr<bool>("placed")
+                                  .RemainingArgs()
+                                  .RemainingRets());
 
 // The threads that sums are shared among.
 XLA_FFI_DEFINE_HANDLER_SYMBOL(mpmjax_threads, mpmjax::run_threads,

@@ -92,11 +92,9 @@ bool run(const Pool& pool, Form form, const Solve<T>& task) {
 template <class T>
 Solve<T> member(Solve<T> all, Form form, int64_t i) {
   Recurrence<T>& of = all.recurrence;
-  const int64_t particles = of.stencils.particles, factors = i * form.d * form.s * particles;
+  const int64_t particles = of.stencils.particles;
   const int64_t size = of.nodes * of.columns, vectors = i * size;
-  of.stencils.index += factors;
-  of.stencils.weights += factors;
-  of.stencils.derivatives += factors;
+  of.stencils = member(of.stencils, form, i);
   of.matrices += i * form.d * form.d * (form.d * form.d + 1) / 2 * particles;
   of.mass += i * of.nodes;
   of.factor += i;

@@ -37,25 +37,6 @@ const bool* member(const bool* wanted, int64_t i, int64_t numbers) {
 }
 
 template <class T>
-Stencils<T> member(Stencils<T> all, Form form, int64_t i) {
-  if (all.places.first != nullptr) {
-    Places<T>& places = all.places;
-    places.first += i * form.d * all.particles, places.offset += i * form.d * all.particles;
-    places.strides += i * form.d, places.polynomials += i * 2 * form.s * (form.s + 1);
-    return all;
-  }
-  const int64_t factors = i * form.d * form.s * all.particles;
-  all.index += factors;
-  all.weights += factors;
-  all.derivatives += factors;
-  if (form.differential) {
-    all.weight_changes += factors;
-    all.derivative_changes += factors;
-  }
-  return all;
-}
-
-template <class T>
 Given<T> member(Given<T> all, Form form, int64_t i, int64_t columns, int64_t particles) {
   if (all.value != nullptr) all.value += i * columns * particles;
   if (all.gradients != nullptr) all.gradients += i * form.d * all.graded * particles;

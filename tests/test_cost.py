@@ -64,8 +64,8 @@ def inner_programs(equation):
     if equation.primitive.name == "ruled":
         yield jax.make_jaxpr(partial(_values, **equation.params))(*(a.aval for a in equation.invars)).jaxpr
         return
-    if equation.primitive.name == "matrices_solve":
-        yield jax.make_jaxpr(_solve)(*(a.aval for a in equation.invars)).jaxpr
+    if equation.primitive.name in ("matrices_solve", "placed_solve"):
+        yield jax.make_jaxpr(_solve)(*(a.aval for a in equation.invars[-12:])).jaxpr
         return
     for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda a: hasattr(a, "eqns")):
         inner = getattr(inner, "jaxpr", inner)

@@ -14,7 +14,7 @@ from helpers import NEEDS_LIBRARY, assert_close, block, thorough
 
 import mpmjax as mpm
 from mpmjax import linalg as la
-from mpmjax.discretisation import _average, _resistance, make_stencil
+from mpmjax.discretisation import _average, _resistance, make_stencil, resist
 from mpmjax.discretisation import _transfer_sums as sums
 from mpmjax.implicit import _recurrence, _restarts, _vectors
 from mpmjax.native import _library
@@ -149,6 +149,7 @@ def test_sums_by_places_agree(d, order):
     grid = mpm.Grid((side,) * d, 0.1)
     a, b, nodes = (jnp.asarray(rng.normal(size=shape)) for shape in ((2, p), (d, 2, p), (side**d, 2)))
     weight = jnp.asarray(rng.uniform(0.5, 1.5, p))
+    upper, u = (jnp.asarray(rng.normal(size=shape)) for shape in ((d * d * (d * d + 1) // 2, p), (side**d, d)))
 
     def stencil(x, placed):
         made = make_stencil(mpm.BSpline(order), mpm.MLSGradient(), grid, grid.window(x), x, affine=True)
@@ -157,7 +158,7 @@ def test_sums_by_places_agree(d, order):
     def all_sums(placed, x, weight, a, b, nodes):
         of = stencil(x, placed)
         averages = _average.average(of, weight, a, b, jnp.asarray(1e-9), side**d)
-        return sums.gather(of, nodes), sums.scatter(of, a, b, side**d), averages
+        return sums.gather(of, nodes), sums.scatter(of, a, b, side**d), averages, resist(of, upper[:, : len(x)], u)
 
     def slopes(placed, *args):
         return jax.grad(lambda *args: sum((s**2).sum() for s in jax.tree.leaves(all_sums(placed, *args))), range(5))(
@@ -382,7 +383,7 @@ def test_solves_agree(choose, d):
     active = _vectors.active_blocks(free)
 
     def run(factor, steps, r, rtol, far):
-        matrices = _recurrence.ParticleMatrices((index, w, g), upper, mass, factor, free)
+        matrices = _recurrence.ParticleMatrices((index, w, g), None, upper, mass, factor, free)
         return _restarts.restarted_by_matrices(matrices, weight, active, _restarts.Ends(rtol, steps), r, far * x)
 
     x = jnp.where(free, jnp.asarray(rng.normal(size=size)), 0)

@@ -4,8 +4,9 @@ from mpmjax.discretisation._cell_order import Order, by_cell, cells_of, rearrang
 from mpmjax.discretisation._gradient import AbstractGradient, MLSGradient, SplineGradient
 from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._kernel import BSpline
-from mpmjax.discretisation._resistance import resist, resist_by
-from mpmjax.discretisation._stencil import Stencil, in_window, make_stencil
+from mpmjax.discretisation._placed import bound, define_placed
+from mpmjax.discretisation._resistance import resist
+from mpmjax.discretisation._stencil import Places, Stencil, in_window, make_stencil
 from mpmjax.discretisation._transfer import APIC, FLIP, PIC, AbstractTransfer, Gathered, g2p, p2g
 from mpmjax.discretisation._transfer_sums import gather, scatter
 
@@ -20,10 +21,13 @@ __all__ = [
     "Grid",
     "MLSGradient",
     "Order",
+    "Places",
     "SplineGradient",
     "Stencil",
+    "bound",
     "by_cell",
     "cells_of",
+    "define_placed",
     "g2p",
     "gather",
     "in_window",
@@ -31,6 +35,5 @@ __all__ = [
     "p2g",
     "rearranged",
     "resist",
-    "resist_by",
     "scatter",
 ]

@@ -1,14 +1,15 @@
 """Sums that read the particles' places in place of their stencils' factors."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import partial
+from typing import Any, Protocol, runtime_checkable
 
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad
 
 from mpmjax._types import Array
-from mpmjax.discretisation._stencil import Stencil
+from mpmjax.discretisation._stencil import Places
 from mpmjax.native import native_primitive, sums_fit
 
 _PLACES, _FACTORS = 4, 3
@@ -16,7 +17,18 @@ _PLACES, _FACTORS = 4, 3
 _placed: dict[Primitive, Primitive] = {}
 
 
-def bound(primitive: Primitive, stencil: Stencil, *args: Array, **params: Any) -> list[Array]:
+@runtime_checkable
+class Factored(Protocol):
+    """What has a stencil's factors, and perhaps places: a stencil."""
+
+    @property
+    def factors(self) -> tuple[Array, Array, Array]: ...
+
+    @property
+    def places(self) -> Places | None: ...
+
+
+def bound(primitive: Primitive, stencil: Factored, *args: Array, **params: Any) -> list[Array]:
     """A sum over a stencil, from places where it has them. The factors are arguments too. Derivatives are theirs, and
     so is the sum by XLA; where the native library sums from places, XLA does not compute them."""
     places = stencil.places
@@ -31,6 +43,8 @@ def define_placed(
     function: Callable[..., list[Array]],
     shapes: Callable[..., list[tuple]],
     workspace: Callable[..., tuple] | None = None,
+    fits: Callable[..., bool] = sums_fit,
+    aliases: dict[int, int] | None = None,
     **attributes: bool,
 ) -> None:
     """Define what `bound` needs of a sum of factors and other arguments.
@@ -39,7 +53,9 @@ def define_placed(
         primitive: the sum.
         function: the function of arrays.
         shapes: the shapes of the results, as a function of the arguments.
-        workspace: as in `native_primitive`.
+        workspace: as in `native_primitive`, and so the next.
+        fits: whether the library has a kernel for arguments.
+        aliases: arguments whose memory results may take, by their numbers among those that the library is given.
         attributes: what the library is told besides.
     """
 
@@ -53,8 +69,8 @@ def define_placed(
         f"placed_{primitive.name.split('_')[1]}",
         without_places(function),
         without_places(shapes),
-        _places_fit,
-        aliases=None,
+        partial(_places_fit, fits),
+        aliases=aliases,
         like=_PLACES + 1,
         workspace=None if workspace is None else without_places(workspace),
         unread=tuple(range(_PLACES, _PLACES + _FACTORS)),
@@ -68,7 +84,7 @@ def define_placed(
     _placed[primitive] = found
 
 
-def _places_fit(avals: Sequence[ShapedArray], batched: int) -> bool:
+def _places_fit(fits: Callable[..., bool], avals: Sequence[ShapedArray], batched: int) -> bool:
     *_, offset, polynomials = avals[:_PLACES]
     factors = avals[_PLACES:]
-    return offset.dtype == polynomials.dtype == factors[1].dtype and sums_fit(factors, batched)
+    return offset.dtype == polynomials.dtype == factors[1].dtype and fits(factors, batched)

@@ -13,12 +13,12 @@ from jax.interpreters import ad
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, NodeVector
-from mpmjax.discretisation._stencil import Stencil
+from mpmjax.discretisation._placed import Factored, bound, define_placed
 from mpmjax.discretisation._transfer_sums import gather_p, scatter_p
 from mpmjax.native import members, native_primitive, sums_fit
 
 
-def resist(stencil: Stencil, upper: Float[Array, "t p"], u: NodeVector) -> NodeVector:
+def resist(stencil: Factored, upper: Float[Array, "t p"], u: NodeVector) -> NodeVector:
     """Σ_p Σ_b g_ip,b r_p,b with r_p = K_p G_p and G_p,b = Σ_j g_jp,b u_j, shape (n, d).
 
     Args:
@@ -27,12 +27,7 @@ def resist(stencil: Stencil, upper: Float[Array, "t p"], u: NodeVector) -> NodeV
             columns are the components of G_p, the direction b first.
         u: what is gathered, shape (n, d).
     """
-    return resist_by(stencil.factors, upper, u)
-
-
-def resist_by(factors: tuple[Array, Array, Array], upper: Float[Array, "t p"], u: NodeVector) -> NodeVector:
-    """The same by the factors of the stencil."""
-    return _resist_p.bind(*factors, upper, u, batched=0)[0]
+    return bound(_resist_p, stencil, upper, u, batched=0)[0]
 
 
 def _resist(*args: Array, unroll: bool = False) -> list[Array]:
@@ -47,7 +42,8 @@ def _like_nodes(*args: ShapedArray) -> list[tuple]:
     return [args[-1].shape[-2:]]
 
 
-_resist_p = native_primitive("stencil_resist", _resist, _like_nodes, sums_fit)
+_resist_p = native_primitive("stencil_resist", _resist, _like_nodes, sums_fit, placed=False)
+define_placed(_resist_p, _resist, _like_nodes)
 
 
 def _jvp(primals: tuple, tangents: tuple, *, batched: int) -> tuple[list[Array], list[Any]]:

@@ -111,7 +111,10 @@ class ImplicitOperator(AbstractSymmetricOperator):
         hessian, free = self.hessian, self.projection.free
         if self.projection.normal is not None or not isinstance(hessian, ParticleStiffness) or not hessian.alone:
             return None
-        return ParticleMatrices(hessian.stencil.factors, hessian.upper, self.mass, self.factor, free.reshape(-1))
+        stencil = hessian.stencil
+        return ParticleMatrices(
+            stencil.factors, stencil.places, hessian.upper, self.mass, self.factor, free.reshape(-1)
+        )
 
     def precomputed(self) -> "ImplicitOperator":
         """The same operator, with H as one matrix for each particle, computed once for many applications."""

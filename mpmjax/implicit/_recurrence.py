@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Int, NodeScalar, Scalar
-from mpmjax.discretisation import resist_by
+from mpmjax.discretisation import Places, resist
 from mpmjax.implicit._vectors import product
 
 
@@ -18,6 +18,8 @@ class ParticleMatrices(eqx.Module):
 
     factors: tuple[Array, Array, Array]
     """Terms of the flat node index, weights and their derivatives of the particles' stencil, each (d, s, p)."""
+    places: Places | None
+    """Those of the stencil."""
     upper: Float[Array, "t p"]
     """See `resist`."""
     mass: NodeScalar
@@ -28,7 +30,7 @@ class ParticleMatrices(eqx.Module):
     def product(self, u: Array, weight: Array, active: Bool[Array, "k"]) -> tuple[Array, Float[Array, ""]]:
         """W⁻¹A u and uᵀA u (see `product` of vectors)."""
         moved = jnp.where(self.free, u, 0).reshape(len(self.mass), -1)
-        force = resist_by(self.factors, self.upper, moved).reshape(-1)
+        force = resist(self, self.upper, moved).reshape(-1)
         return product(force, u, self.mass, self.factor, self.free, weight, active)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from jax.core import ShapedArray
 
 from mpmjax._types import Array, Bool, Float, Int, Scalar
+from mpmjax.discretisation import bound, define_placed
 from mpmjax.implicit._recurrence import Limits, ParticleMatrices, Passes, Recurrence, recur
 from mpmjax.implicit._vectors import combine
 from mpmjax.native import differentiable, native_primitive, sums_fit
@@ -137,8 +138,8 @@ def restarted_by_matrices(
     numbers = jnp.stack([jnp.asarray(number, dtype) for number in (ends.rtol, ends.steps, floor)])
     factor = jnp.asarray(matrices.factor, dtype)
     given = matrices.upper, matrices.mass, factor, matrices.free, weight, active, x, b, numbers
-    x, (rr, k, radius, breakdown, indefinite, correction, stalled, b_norm, x_norm) = _solve_p.bind(
-        *matrices.factors, *given, batched=0
+    x, (rr, k, radius, breakdown, indefinite, correction, stalled, b_norm, x_norm) = bound(
+        _solve_p, matrices, *given, batched=0
     )
     return Found(
         x=x,
@@ -158,7 +159,7 @@ def restarted_by_matrices(
 def _solve(*args: Array, unroll: bool = False) -> list[Array]:
     del unroll  # the sums know
     index, weights, derivatives, upper, mass, factor, free, weight, active, x, b, numbers = args
-    matrices = ParticleMatrices((index, weights, derivatives), upper, mass, factor, free)
+    matrices = ParticleMatrices((index, weights, derivatives), None, upper, mass, factor, free)
     passes = Passes(
         product=lambda u: matrices.product(u, weight, active),
         combined=lambda one, other, onto: combine(one, other, weight, active, onto=onto),
@@ -186,5 +187,7 @@ def _fits(avals: Any, batched: int) -> bool:
 
 # The derivative of what is written in JAX: solves are never differentiated through their iterations.
 _solve_p = differentiable(
-    native_primitive("matrices_solve", _solve, _vector_and_numbers, _fits, {9: 0}, workspace=_vectors), _solve
+    native_primitive("matrices_solve", _solve, _vector_and_numbers, _fits, {9: 0}, workspace=_vectors, placed=False),
+    _solve,
 )
+define_placed(_solve_p, _solve, _vector_and_numbers, workspace=_vectors, fits=_fits, aliases={10: 0})
