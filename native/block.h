@@ -120,18 +120,19 @@ struct Block {
       std::memcpy(&t, offset, sizeof t);
 #pragma GCC unroll 4
       for (int i = 0; i < s; ++i) {
-        put(value(from.polynomials + i * terms, t), count, weights[a][i]);
-        put(value(from.polynomials + (s + i) * terms, t), count, derivatives[a][i]);
+        put(value(from.polynomials + i * (terms + 1), t), count, weights[a][i]);
+        put(value(from.polynomials + (s + i) * (terms + 1), t), count, derivatives[a][i]);
       }
     }
   }
 
-  // Σ_k c_k t^k.
+  // Σ_k c_k (t − τ)^k, of τ and then the c.
   template <class V>
-  static MPMJAX_INLINE V value(const T* c, V t) {
-    V sum = V{} + c[terms - 1];
+  static MPMJAX_INLINE V value(const T* numbers, V t) {
+    const V from = t - numbers[0];
+    V sum = V{} + numbers[terms];
 #pragma GCC unroll 4
-    for (int k = terms - 2; k >= 0; --k) sum = sum * t + c[k];
+    for (int k = terms - 1; k > 0; --k) sum = sum * from + numbers[k];
     return sum;
   }
 

@@ -101,7 +101,7 @@ struct Call {
       places.first = static_cast<const int32_t*>(buffers[0].untyped_data());
       places.strides = static_cast<const int32_t*>(buffers[1].untyped_data());
       places.offset = at<T>(2, {d, particles});
-      places.polynomials = at<T>(3, {2, s, s + 1});
+      places.polynomials = at<T>(3, {2, s, s + 2});
       return found;
     }
     found.index = static_cast<const int32_t*>(buffers[0].untyped_data());

@@ -189,9 +189,9 @@ void check(const Example<T>& e, const std::vector<const Pool*>& pools) {
 template <class T>
 void check_places(const Shape& sh, int oddity, std::mt19937& random, const std::vector<const Pool*>& pools) {
   const Example<T> e(sh, oddity, random);
-  const int64_t rows = e.rows(), n = sh.size(), places = sh.batch * sh.d * sh.particles, terms = sh.s + 1;
+  const int64_t rows = e.rows(), n = sh.size(), places = sh.batch * sh.d * sh.particles, numbers = sh.s + 2;
   const Array<int32_t> first(places), strides(sh.batch * sh.d);
-  const Array<T> offset(places), polynomials(sh.batch * 2 * sh.s * terms), least(sh.batch), whole(sh.batch * n);
+  const Array<T> offset(places), polynomials(sh.batch * 2 * sh.s * numbers), least(sh.batch), whole(sh.batch * n);
   const Array<T> means(sh.batch * n * (sh.columns - 1)), work(e.to_nodes.size);
   std::normal_distribution<T> normal;
   for (const Array<T>* array : {&offset, &polynomials}) {
@@ -206,9 +206,9 @@ void check_places(const Shape& sh, int oddity, std::mt19937& random, const std::
         first[at] = e.index[axis * sh.s * sh.particles + p] / strides[axis];
         for (int i = 0; i < sh.s; ++i) {
           for (int part = 0; part < 2; ++part) {
-            const T* c = &polynomials[((m * 2 + part) * sh.s + i) * terms];
-            T sum = c[sh.s];
-            for (int k = sh.s - 1; k >= 0; --k) sum = sum * offset[at] + c[k];
+            const T* c = &polynomials[((m * 2 + part) * sh.s + i) * numbers];
+            T sum = c[sh.s + 1];
+            for (int k = sh.s; k > 0; --k) sum = sum * (offset[at] - c[0]) + c[k];
             (part == 0 ? e.w : e.g)[(axis * sh.s + i) * sh.particles + p] = sum;
           }
         }

@@ -25,13 +25,13 @@ constexpr int64_t kTogether = 64;  // numbers of the nodes that are passed over 
 constexpr int64_t kCached = 1 << 21;  // bytes of an array that a cache may hold from one pass to the next
 
 // Where particles are, from which their factors are found: the i-th node along an axis has the index term
-// (first + i) stride, and Σ_k c_k t^k for a weight and for a derivative.
+// (first + i) stride, and Σ_k c_k (t − τ)^k for a weight and for a derivative.
 template <class T>
 struct Places {
   const int32_t* first;    // (d, p)
   const int32_t* strides;  // (d)
   const T* offset;         // t, (d, p)
-  const T* polynomials;    // c, (2, s, s + 1): of the weights, and of the derivatives
+  const T* polynomials;    // τ and then the c, (2, s, s + 2): of the weights, and of the derivatives
 };
 
 template <class T>

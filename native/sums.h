@@ -20,7 +20,7 @@ Stencils<T> member(Stencils<T> all, Form form, int64_t i) {
   if (all.places.first != nullptr) {
     Places<T>& places = all.places;
     places.first += i * form.d * all.particles, places.offset += i * form.d * all.particles;
-    places.strides += i * form.d, places.polynomials += i * 2 * form.s * (form.s + 1);
+    places.strides += i * form.d, places.polynomials += i * 2 * form.s * (form.s + 2);
     return all;
   }
   const int64_t factors = i * form.d * form.s * all.particles;

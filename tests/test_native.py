@@ -182,6 +182,27 @@ def test_sums_by_places_agree(d, order):
         jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
+@NEEDS_LIBRARY
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_small_weights_are_right_by_places(order):
+    """Of particles that hardly reach a node, in single precision: each weight, not only their largest."""
+    grid = mpm.Grid((12,), 1.0)
+    edge = 4.0 + (order + 1) % 2 / 2
+    x = jnp.asarray(edge + np.array([-1, 1]) * np.logspace(-6, -2, 20)[:, None], "float32").reshape(-1, 1)
+    stencil = make_stencil(mpm.BSpline(order), mpm.MLSGradient(), grid, grid.window(x), x, affine=True)
+
+    def weights(of):
+        """Of each particle at each node."""
+        one = jnp.eye(len(x), dtype="float32")
+        return sums.scatter(of, one, None, grid.size)
+
+    found, expected = (
+        np.asarray(jax.jit(weights)(dataclasses.replace(stencil, places=p))) for p in (stencil.places, None)
+    )
+    assert (expected[expected > 0] < 1e-2).any()
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
 def averaged(of, index, w, g, given, gradients, k=2, side=SIDE):
     """Whole weights and averages of k columns, of positive numbers: some nodes are light, and some are empty."""
     positive = index, jnp.abs(w), g, jnp.asarray(0.3, w.dtype), jnp.abs(given[: k + 1])

@@ -74,18 +74,20 @@ class BSpline(eqx.Module):
         return self.order / 2
 
     @property
+    def knots(self) -> Float[np.ndarray, "s"]:
+        """τ_i of `pieces`, shape (order + 1,): for the outermost nodes the end at which their weights vanish."""
+        return np.array([0.5, *[0.0] * (self.order - 1), -0.5])
+
+    @property
     def pieces(self) -> Float[np.ndarray, "s k"]:
-        """Coefficients c of the weights as polynomials Σ_k c_ik (f − centre)^k, shape (order + 1, order + 1)."""
+        """Coefficients c of the weights as polynomials Σ_k c_ik (f − centre − τ_i)^k, shape (order + 1, order + 1)."""
         match self.order:
             case 1:
-                rows = [[1, -2], [1, 2]]
-                return np.array(rows) / 2
+                return np.array([[0.0, -1], [0, 1]])
             case 2:
-                return np.array([[1, -4, 4], [6, 0, -8], [1, 4, 4]]) / 8
+                return np.array([[0, 0, 0.5], [0.75, 0, -1], [0, 0, 0.5]])
             case _:
-                outer, inner = [1, -6, 12, -8], [23, -30, -12, 24]
-                signs = np.array([1, -1, 1, -1])
-                return np.array([outer, inner, inner * signs, outer * signs]) / 48
+                return np.array([[0, 0, 0, -8], [23, -30, -12, 24], [23, 30, -12, -24], [0, 0, 0, 8]]) / 48
 
     def _from_knot(self, f: Array) -> Array:
         """The distances in which the quadratic kernel's weights are parabolas, one formula for all three: XLA does not

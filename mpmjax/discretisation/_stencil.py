@@ -21,7 +21,8 @@ class Places(eqx.Module):
     """Where particles are among their nodes. A stencil's factors are functions of it: in 3-D 27 numbers of 6.
 
     The i-th node along an axis has the index term (first + i) stride, and as weight and as derivative the polynomials
-    Σ_k c_ik t^k in the offset t.
+    Σ_k c_ik (t − τ_i)^k in the offset t, around knots τ at which small weights are small by a power and not by a
+    difference.
     """
 
     first: Int[Array, "d p"]
@@ -31,7 +32,7 @@ class Places(eqx.Module):
     offset: Float[Array, "d p"]
     """t, the distance from the middle of the places that have these nodes, in spacings, shape (d, p)."""
     polynomials: Float[Array, "2 s k"]
-    """c of the weights [-] and of their derivatives [1/m], shape (2, s, s + 1)."""
+    """τ, and c of the weights [-] and of their derivatives [1/m], shape (2, s, s + 2)."""
 
 
 class Stencil(eqx.Module):
@@ -150,13 +151,13 @@ def make_stencil(
         first = first_nodes(kernel, window, xi)
         if layer is not None:
             first = first.at[0].add(jnp.asarray(layer * grid.shape[0], jnp.int32))
-        polynomials = _polynomials(kernel, least_squares=derivatives is not spline)
-        scale = jnp.stack([jnp.ones_like(dx), 1 / dx]).astype(f.dtype)
         places = Places(
             first=first,
             strides=jnp.asarray(_strides(grid)),
             offset=jax.lax.stop_gradient(f - kernel.centre),
-            polynomials=jax.lax.stop_gradient(scale[:, None, None] * polynomials.astype(f.dtype)),
+            polynomials=jax.lax.stop_gradient(
+                _polynomials(kernel, jnp.asarray(dx, f.dtype), derivatives is not spline)
+            ),
         )
     return Stencil(
         index_factors=factors,
@@ -169,17 +170,20 @@ def make_stencil(
     )
 
 
-def _polynomials(kernel: BSpline, least_squares: bool) -> Float[np.ndarray, "2 s k"]:
-    """Coefficients of the weights and of their derivatives [1/spacing] or those of moving least squares, shape
-    (2, order + 1, order + 2)."""
-    pieces = kernel.pieces
+def _polynomials(kernel: BSpline, spacing: Array, least_squares: bool) -> Float[Array, "2 s k"]:
+    """Knots and coefficients of the weights and of their derivatives or those of moving least squares, shape
+    (2, order + 1, order + 3)."""
+    pieces, knots = kernel.pieces, kernel.knots
     if least_squares and kernel.order > 1:
-        arms = [(node - kernel.centre, -1.0) for node in range(kernel.order + 1)]
+        arms = [(node - kernel.centre - knot, -1.0) for node, knot in enumerate(knots)]
         slopes = [np.polynomial.polynomial.polymul(*both) for both in zip(pieces, arms, strict=True)]
         slopes = np.array(slopes) / kernel.variance
     else:
         slopes = np.pad(np.polynomial.polynomial.polyder(pieces, axis=1), ((0, 0), (0, 2)))
-    return np.stack([np.pad(pieces, ((0, 0), (0, 1))), slopes])
+    weights = np.pad(pieces, ((0, 0), (0, 1)))
+    coefficients = jnp.stack([jnp.asarray(weights, spacing.dtype), slopes.astype(spacing.dtype) / spacing])
+    both_knots = jnp.broadcast_to(jnp.asarray(knots, spacing.dtype)[:, None], (2, len(knots), 1))
+    return jnp.concatenate([both_knots, coefficients], axis=2)
 
 
 def first_nodes(kernel: BSpline, window: Int[Array, "d"], xi: Array) -> Int[Array, "d p"]:
