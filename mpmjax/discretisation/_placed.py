@@ -22,10 +22,14 @@ class Factored(Protocol):
     """What has a stencil's factors, and perhaps places: a stencil."""
 
     @property
-    def factors(self) -> tuple[Array, Array, Array]: ...
+    def factors(self) -> tuple[Array, Array, Array]:
+        """Terms of the flat node index, weights and their derivatives, each (d, s, p)."""
+        ...
 
     @property
-    def places(self) -> Places | None: ...
+    def places(self) -> Places | None:
+        """The same in fewer numbers, if there are."""
+        ...
 
 
 def bound(primitive: Primitive, stencil: Factored, *args: Array, **params: Any) -> list[Array]:
