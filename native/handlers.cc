@@ -9,7 +9,10 @@
 //   solve    index, weights, derivatives, matrices, mass, factor, free, weight, active, x, rhs, limits  ->  x, numbers,
 //                                                                         memory to work in (of a batch none)
 //
-// With `placed`, all but a pull are given first nodes, strides, offsets and polynomials in place of the factors: (..., d, p), (..., d), (..., d, p), (..., 2, s, s + 2). Factors are (..., d, s, p), values (..., c, p) and gradients (..., d, c, p), nodes (..., n, c), matrices
+// With `placed`, all but a pull are given first nodes (..., d, p), strides (..., d), offsets (..., d, p) and polynomials
+// (..., 2, s, s + 2) in place of the factors.
+//
+// Factors are (..., d, s, p), values (..., c, p) and gradients (..., d, c, p), nodes (..., n, c), matrices
 // (..., d² (d² + 1) / 2, p), with the same leading axes everywhere. Given are a value or gradients or both; gradients may
 // have fewer columns than the value. In a solve vectors are (..., n d), mass (..., n), active (..., ⌈n d/64⌉).
 // `valued` says whether there is a value; `differential` whether changes of the factors follow them.

@@ -18,7 +18,7 @@ from mpmjax.native import stored
 
 
 class Places(eqx.Module):
-    """Where particles are among their nodes. A stencil's factors are functions of it: in 3-D 27 numbers of 6.
+    """Where particles are among their nodes, from which a stencil's factors follow: in 3-D 6 numbers a particle for 27.
 
     The i-th node along an axis has the index term (first + i) stride, and as weight and as derivative the polynomials
     Σ_k c_ik (t − τ_i)^k in the offset t, around knots τ at which small weights are small by a power and not by a

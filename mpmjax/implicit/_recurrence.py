@@ -19,7 +19,7 @@ class ParticleMatrices(eqx.Module):
     factors: tuple[Array, Array, Array]
     """Terms of the flat node index, weights and their derivatives of the particles' stencil, each (d, s, p)."""
     places: Places | None
-    """Those of the stencil."""
+    """`Stencil.places`, from which native sums find the factors; None if it has none."""
     upper: Float[Array, "t p"]
     """See `resist`."""
     mass: NodeScalar
