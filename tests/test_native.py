@@ -143,8 +143,8 @@ def test_derivatives_agree(d, graded):
 @NEEDS_LIBRARY
 @pytest.mark.parametrize(("d", "order"), [(2, 2), *thorough((1, 1), (3, 2), (2, 3))])
 def test_sums_by_places_agree(d, order):
-    """With those of the factors: values, also in a batch and of no particles, and derivatives to the last bit, also of
-    the linear functions that the sums are."""
+    """With those of the factors: values, also in a batch and of no particles, and derivatives, those of the linear
+    functions that the sums are to the last bit. What is differentiated has the values by places too."""
     rng, side, p = np.random.default_rng(3), 8, 45
     grid = mpm.Grid((side,) * d, 0.1)
     a, b, nodes = (jnp.asarray(rng.normal(size=shape)) for shape in ((2, p), (d, 2, p), (side**d, 2)))
@@ -177,7 +177,10 @@ def test_sums_by_places_agree(d, order):
     nobody = x[:0], weight[:0], a[:, :0], b[..., :0], nodes
     for through, given in ((jax.jit, args), (lambda of: jax.jit(jax.vmap(of)), batch)):
         agree(*(through(partial(all_sums, placed))(*given) for placed in (True, False)), "float64")
-    for of, given in ((slopes, args), (transposed, args), (all_sums, nobody)):
+    agree(*(jax.jit(partial(slopes, placed))(*args) for placed in (True, False)), "float64", 10)
+    value = jax.jit(partial(all_sums, True))
+    jax.tree.map(np.testing.assert_array_equal, jax.jit(partial(jax.jvp, value))(args, args)[0], value(*args))
+    for of, given in ((transposed, args), (all_sums, nobody)):
         found, expected = (jax.jit(partial(of, placed))(*given) for placed in (True, False))
         jax.tree.map(np.testing.assert_array_equal, found, expected)
 

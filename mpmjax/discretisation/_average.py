@@ -1,5 +1,6 @@
 """Averages at the nodes: velocity is momentum over mass."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -10,7 +11,7 @@ from jax.interpreters import ad
 
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.autodiff import kept_sums
-from mpmjax.discretisation._placed import bound, define_placed
+from mpmjax.discretisation._placed import bound, define_jvp, define_placed
 from mpmjax.discretisation._stencil import Stencil
 from mpmjax.discretisation._transfer_sums import scatter_tangent, written_scatter
 from mpmjax.native import differentiable, native_primitive, sums_fit
@@ -51,10 +52,12 @@ def _average(*args: Array, size: int, unroll: bool) -> list[Array]:
     return [whole, jnp.where(some[:, None], sums[:, :-1] / jnp.where(some, whole, 1)[:, None], 0)]
 
 
-def _jvp(primals: tuple, tangents: tuple, *, size: int, batched: int) -> tuple[list[Array], list[Any]]:
+def _jvp(
+    take: Callable[[], list[Array]], primals: tuple, tangents: tuple, *, size: int, batched: int
+) -> tuple[list[Array], list[Any]]:
     """Of the sums' differentials, what `_divided` makes of them. The least weight has no part in it. The averages are
     `kept_sums` here, where the rule takes them: named afterwards they would be others, and these computed again."""
-    out = kept_sums(_average_p.bind(*primals, size=size, batched=batched))
+    out = kept_sums(take())
     sums, changes = ((*values[:3], *values[4:]) for values in (primals, tangents))
     change = scatter_tangent(sums, changes, valued=True, size=size, batched=batched)
     if change is None:
@@ -114,7 +117,7 @@ def _nodes_fit(avals: Any, batched: int) -> bool:
 
 _average_p = native_primitive("stencil_average", _average, _shapes, sums_fit, workspace=_sums, placed=False)
 define_placed(_average_p, _average, _shapes, workspace=_sums)
-ad.primitive_jvps[_average_p] = _jvp
+define_jvp(_average_p, _jvp)
 _divided_p = differentiable(native_primitive("nodes_divided", _divided, _like_averages, lambda *_: False), _divided)
 _slope_p = differentiable(native_primitive("nodes_slope", _slope, _like_sums, _nodes_fit, like=0), _slope)
 ad.primitive_transposes[_divided_p] = _transpose_divided

@@ -33,8 +33,9 @@ class Factored(Protocol):
 
 
 def bound(primitive: Primitive, stencil: Factored, *args: Array, **params: Any) -> list[Array]:
-    """A sum over a stencil, from places where it has them. The factors are arguments too. Derivatives are theirs, and
-    so is the sum by XLA; where the native library sums from places, XLA does not compute them."""
+    """A sum over a stencil, from places where it has them. The factors are arguments too. Slopes are theirs, and so is
+    the sum by XLA; where the native library sums from places and nothing is differentiated, XLA does not compute
+    them."""
     places = stencil.places
     if places is None:
         return primitive.bind(*stencil.factors, *args, **params)
@@ -51,7 +52,7 @@ def define_placed(
     aliases: dict[int, int] | None = None,
     **attributes: bool,
 ) -> None:
-    """Define what `bound` needs of a sum of factors and other arguments.
+    """Define what `bound` needs of a sum of factors and other arguments, with the derivatives of that sum.
 
     Args:
         primitive: the sum.
@@ -86,6 +87,26 @@ def define_placed(
     )
     ad.primitive_transposes[found] = transpose
     _placed[primitive] = found
+
+
+def define_jvp(primitive: Primitive, rule: Callable[..., tuple[list[Array], list[Any]]]) -> None:
+    """Define the forward rule of a sum, of factors and of places.
+
+    Args:
+        primitive: the sum of factors.
+        rule: the rule of the sum of factors, as JAX calls it, but with a function that takes the sum as its first
+            argument: from places where these are given.
+    """
+
+    def by_factors(primals: tuple, tangents: tuple, **params: Any) -> tuple[list[Array], list[Any]]:
+        return rule(partial(primitive.bind, *primals, **params), primals, tangents, **params)
+
+    def by_places(primals: tuple, tangents: tuple, **params: Any) -> tuple[list[Array], list[Any]]:
+        take = partial(_placed[primitive].bind, *primals, **params)
+        return rule(take, primals[_PLACES:], tangents[_PLACES:], **params)
+
+    ad.primitive_jvps[primitive] = by_factors
+    ad.primitive_jvps[_placed[primitive]] = by_places
 
 
 def _places_fit(fits: Callable[..., bool], avals: Sequence[ShapedArray], batched: int) -> bool:

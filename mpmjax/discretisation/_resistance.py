@@ -4,6 +4,7 @@ An iteration of an implicit solve is hardly more. On CPUs the native library doe
 particles; written with the sums that they are, they are the reference and what other devices run.
 """
 
+from collections.abc import Callable
 from functools import reduce
 from typing import Any
 
@@ -13,7 +14,7 @@ from jax.interpreters import ad
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, NodeVector
-from mpmjax.discretisation._placed import Factored, bound, define_placed
+from mpmjax.discretisation._placed import Factored, bound, define_jvp, define_placed
 from mpmjax.discretisation._transfer_sums import gather_p, scatter_p
 from mpmjax.native import members, native_primitive, sums_fit
 
@@ -46,11 +47,13 @@ _resist_p = native_primitive("stencil_resist", _resist, _like_nodes, sums_fit, p
 define_placed(_resist_p, _resist, _like_nodes)
 
 
-def _jvp(primals: tuple, tangents: tuple, *, batched: int) -> tuple[list[Array], list[Any]]:
+def _jvp(
+    take: Callable[[], list[Array]], primals: tuple, tangents: tuple, *, batched: int
+) -> tuple[list[Array], list[Any]]:
     """It is linear in u. Differentials by all else, which no iteration needs, are those of the sums it is made of."""
     index, *others, u = primals
     *changes, du = tangents[1:]
-    out = _resist_p.bind(*primals, batched=batched)
+    out = take()
     parts = [[ad.Zero(jax.typeof(out[0]))]]
     if type(du) is not ad.Zero:
         parts.append(_resist_p.bind(index, *others, du, batched=batched))
@@ -67,5 +70,5 @@ def _transpose(cotangents: list, *args: Any, batched: int) -> list:
     return [*(None for _ in args[:-1]), *back]
 
 
-ad.primitive_jvps[_resist_p] = _jvp
+define_jvp(_resist_p, _jvp)
 ad.primitive_transposes[_resist_p] = _transpose

@@ -24,7 +24,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad
 
 from mpmjax._types import Array, Float
-from mpmjax.discretisation._placed import bound, define_placed
+from mpmjax.discretisation._placed import bound, define_jvp, define_placed
 from mpmjax.discretisation._stencil import Stencil
 from mpmjax.native import members, native_primitive, sums_fit
 
@@ -296,8 +296,10 @@ def _differentiate(
     of its own; its own differential, which only second derivatives need, is that of the sum as written. `differential`
     is that with respect to all arguments."""
 
-    def jvp(primals: tuple, tangents: tuple, **params: Any) -> tuple[list[Array], list[Any]]:
-        out = primitive.bind(*primals, **params)
+    def jvp(
+        take: Callable[[], list[Array]], primals: tuple, tangents: tuple, **params: Any
+    ) -> tuple[list[Array], list[Any]]:
+        out = take()
         changes = _tangents(primals, tangents, params, primitive, by_factors, differential)
         return out, changes or [ad.Zero(jax.typeof(o)) for o in out]
 
@@ -306,7 +308,7 @@ def _differentiate(
         rest = tuple(map(ad.instantiate_zeros, tangents[1:]))
         return jax.jvp(lambda *floats: written(primals[0], *floats), primals[1:], rest)
 
-    ad.primitive_jvps[primitive] = jvp
+    define_jvp(primitive, jvp)
     ad.primitive_jvps[by_factors] = jvp_by_factors
 
 
