@@ -27,7 +27,7 @@ import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Matrix
 from mpmjax.autodiff import ruled
-from mpmjax.linalg._matrices import diagonal, matmul, transpose
+from mpmjax.linalg._matrices import matmul, transpose
 from mpmjax.linalg._principal import symmetric_eigen
 
 Frame = tuple[Array, Matrix]
@@ -142,9 +142,10 @@ def _differential(f: AbstractSpectral, S: Matrix, frame: Frame, directions: tupl
     del S
     s, V = frame
     order = len(directions)
-    if order < 2:
-        core = diagonal(f.of(s)) if order == 0 else f.slope(s[:, None], s[None]) * _in_frame(V, directions[0])
-        return _from_frame(V, core)
+    if order == 0:
+        return matmul(V * f.of(s), transpose(V))
+    if order == 1:
+        return _from_frame(V, f.slope(s[:, None], s[None]) * _in_frame(V, directions[0]))
     s, V = _ascending(s, V)
     products = []
     for arranged in itertools.permutations([_in_frame(V, A) for A in directions]):
