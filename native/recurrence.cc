@@ -10,25 +10,17 @@ namespace mpmjax {
 namespace {
 
 template <class T>
-bool run(const Pool& pool, Form form, const Recurrence<T>& task) {
+bool run(const Pool& pool, Form form, const Recurrence<T>& task, const Division& division) {
   const int64_t size = task.nodes * task.columns;
   T *const r = task.r, *const p = task.p, *const q = task.q, *const moved = task.moved, *const image = task.image;
   over_active(task.active, size, [&](int64_t i) { p[i] = q[i] = 0; });
-  Resist<T> resistance = {};
-  resistance.stencils = task.stencils;
-  resistance.matrices = task.matrices;
-  resistance.moved = moved;
-  resistance.nodes = image;
-  resistance.size = task.nodes;
-  resistance.columns = task.columns;
-  resistance.wanted = task.active;
   const T eps = std::numeric_limits<T>::epsilon();
   T rr = task.limits[3], qq = 0, before = std::numeric_limits<T>::infinity(), radius = 0;
   int64_t steps = 0;
   bool vanished = false, negative = false;
   while (std::sqrt(rr) > task.limits[0] && rr > task.limits[1] && T(steps) < task.limits[2] && !vanished) {
     over_active(task.active, size, [&](int64_t i) { moved[i] = task.free[i] ? r[i] : T(0); });
-    if (!resist(pool, form, 1, resistance)) return false;
+    if (!resist(pool, form, 1, resistance(task), division)) return false;
     T gamma, square;
     product(pool, 1, Product<T>{image, r, task.mass, task.factor, task.free, task.weight, task.active, image, &gamma, size,
                                 task.nodes, false});
@@ -50,7 +42,7 @@ bool run(const Pool& pool, Form form, const Recurrence<T>& task) {
 
 }  // namespace
 
-bool recur(const Pool& p, Form f, const Recurrence<float>& r) { return run(p, f, r); }
-bool recur(const Pool& p, Form f, const Recurrence<double>& r) { return run(p, f, r); }
+bool recur(const Pool& p, Form f, const Recurrence<float>& r, const Division& d) { return run(p, f, r, d); }
+bool recur(const Pool& p, Form f, const Recurrence<double>& r, const Division& d) { return run(p, f, r, d); }
 
 }  // namespace mpmjax

@@ -29,8 +29,17 @@ struct Recurrence {
   int64_t nodes, columns;
 };
 
-// Each returns false where there is no kernel of this form.
-bool recur(const Pool& pool, Form form, const Recurrence<float>& task);
-bool recur(const Pool& pool, Form form, const Recurrence<double>& task);
+// H of what is in `moved`, into `image`.
+template <class T>
+Resist<T> resistance(const Recurrence<T>& of) {
+  Resist<T> found = {};
+  found.stencils = of.stencils, found.matrices = of.matrices, found.moved = of.moved, found.nodes = of.image;
+  found.size = of.nodes, found.columns = of.columns, found.wanted = of.active;
+  return found;
+}
+
+// Each returns false where there is no kernel of this form. The division is that of the resistance.
+bool recur(const Pool& pool, Form form, const Recurrence<float>& task, const Division& division);
+bool recur(const Pool& pool, Form form, const Recurrence<double>& task, const Division& division);
 
 }  // namespace mpmjax

@@ -9,6 +9,16 @@
 namespace mpmjax {
 namespace {
 
+// How often a thread looks whether the others are done before it sleeps: for ten microseconds or some more, since to be
+// woken takes longer, and shares are of about the same length.
+constexpr int kLooks = 1000;
+
+void pause() {
+#if defined(__x86_64__)
+  __builtin_ia32_pause();
+#endif
+}
+
 // Outlives the call that made it: helpers that come late find that nothing is left.
 struct Work {
   std::atomic<int64_t> next{0}, done{0};
@@ -41,6 +51,10 @@ void share(const Pool& pool, int64_t count, const std::function<void(int64_t)>& 
   work->run = &run;
   for (int64_t i = 0; i < helpers; ++i) pool.schedule([work] { work->help(); });
   work->help();
+  for (int k = 0; k < kLooks; ++k) {
+    if (work->done.load() == count) return;
+    pause();
+  }
   std::unique_lock<std::mutex> lock(work->mutex);
   work->changed.wait(lock, [&] { return work->done.load() == count; });
 }

@@ -23,15 +23,13 @@ template <class T>
 struct Space {
   const Pool& pool;
   const Recurrence<T>& of;
+  const Division& division;
   int64_t size = of.nodes * of.columns;
 
   // W⁻¹A x into the image; false where there is no kernel of this form.
   bool apply(Form form) const {
     over_active(of.active, size, [&](int64_t i) { of.moved[i] = of.free[i] ? of.x[i] : T(0); });
-    Resist<T> force = {};
-    force.stencils = of.stencils, force.matrices = of.matrices, force.moved = of.moved, force.nodes = of.image;
-    force.size = of.nodes, force.columns = of.columns, force.wanted = of.active;
-    if (!resist(pool, form, 1, force)) return false;
+    if (!resist(pool, form, 1, resistance(of), division)) return false;
     T square;
     product(pool, 1, Product<T>{of.image, of.x, of.mass, of.factor, of.free, of.weight, of.active, of.image, &square, size,
                                 of.nodes, false});
@@ -59,7 +57,8 @@ struct Space {
 template <class T>
 bool run(const Pool& pool, Form form, const Solve<T>& task) {
   Recurrence<T> pass = task.recurrence;
-  const Space<T> space{pool, pass};
+  const Division division = divided(pool, form, 1, resistance(pass));
+  const Space<T> space{pool, pass, division};
   const int64_t size = space.size;
   const std::unique_ptr<T[]> own(task.memory == nullptr ? new T[kVectors * size] : nullptr);
   T* const memory = task.memory == nullptr ? own.get() : task.memory;
@@ -79,7 +78,7 @@ bool run(const Pool& pool, Form form, const Solve<T>& task) {
     if (stalled || vanished || !(std::sqrt(rr) > limits[0]) || !(steps < most)) break;
     limits[1] = task.limits[2] * rr, limits[2] = most - steps, limits[3] = rr;
     over_active(pass.active, size, [&](int64_t i) { last[i] = x[i]; });
-    if (!recur(pool, form, pass)) return false;
+    if (!recur(pool, form, pass, division)) return false;
     change = std::sqrt(space.square([&](int64_t i) { return x[i] - last[i]; }, [](int64_t, T) {}));
     steps += numbers[1], radius = std::max(radius, numbers[2]);
     vanished = numbers[3] != 0, negative = negative || numbers[4] != 0;

@@ -147,37 +147,29 @@ std::vector<int64_t> cut(const Stencils<T>& stencils, int64_t size, Form form, i
   return found;
 }
 
-// The nodes of each member cut into parts, one for each thread, and the ranges of nodes that its blocks of particles
-// reach. Where there is one part there are none, unless they are `wanted`.
-struct Division {
-  int64_t parts, blocks;
-  std::vector<Range> ranges;
-  std::vector<std::vector<int64_t>> cuts;
+// Calls run(problem, first, last) for the nodes of all members.
+template <class Problem, class Run>
+void over_nodes(const Pool& pool, Form form, int64_t batch, const Problem& all, const Division& by, const Run& run) {
+  share(pool, batch * by.parts, [&](int64_t i) {
+    const std::vector<int64_t>& own = by.cuts[i / by.parts];
+    const int64_t first = own[i % by.parts], last = own[i % by.parts + 1];
+    Problem task = member(all, form, i / by.parts);
+    task.ranges = by.ranges.empty() ? nullptr : by.ranges.data() + i / by.parts * by.blocks;
+    if (first < last) run(task, first, last);
+  });
+}
 
-  // Calls run(problem, first, last) for the nodes of all members.
-  template <class Problem, class Run>
-  void over_nodes(const Pool& pool, Form form, int64_t batch, const Problem& all, const Run& run) const {
-    share(pool, batch * parts, [&](int64_t i) {
-      const std::vector<int64_t>& own = cuts[i / parts];
-      const int64_t first = own[i % parts], last = own[i % parts + 1];
-      Problem task = member(all, form, i / parts);
-      task.ranges = ranges.empty() ? nullptr : ranges.data() + i / parts * blocks;
-      if (first < last) run(task, first, last);
-    });
-  }
-
-  // How many times the particles of all members are reached by the parts together.
-  double reached() const {
-    int64_t count = 0;
-    for (size_t m = 0; m < cuts.size() && !ranges.empty(); ++m) {
-      for (int64_t k = 0; k < blocks; ++k) {
-        const Range& range = ranges[m * blocks + k];
-        for (int64_t i = 0; i < parts; ++i) count += range.most >= cuts[m][i] && range.least < cuts[m][i + 1];
-      }
+// How many times the particles of all members are reached by the parts together.
+double reached(const Division& by) {
+  int64_t count = 0;
+  for (size_t m = 0; m < by.cuts.size() && !by.ranges.empty(); ++m) {
+    for (int64_t k = 0; k < by.blocks; ++k) {
+      const Range& range = by.ranges[m * by.blocks + k];
+      for (int64_t i = 0; i < by.parts; ++i) count += range.most >= by.cuts[m][i] && range.least < by.cuts[m][i + 1];
     }
-    return ranges.empty() ? 1 : double(count) / ranges.size();
   }
-};
+  return by.ranges.empty() ? 1 : double(count) / by.ranges.size();
+}
 
 template <class T, class Problem>
 Division divide(const Pool& pool, Form form, int64_t batch, const Problem& all, const Kernels<T>& kernels,
@@ -220,7 +212,7 @@ void set_nodes(const Pool& pool, Form form, int64_t batch, Problem all, const Ke
   const bool large = all.size * all.columns * static_cast<int64_t>(sizeof(T)) > kCached;
   const Vectors<bool> reached = large ? zeros<bool>(batch * blocks_of(all.size)) : nullptr;
   all.reached = reached.get();
-  divide(pool, form, batch, all, kernels, large).over_nodes(pool, form, batch, all, run);
+  over_nodes(pool, form, batch, all, divide(pool, form, batch, all, kernels, large), run);
 }
 
 template <class T>
@@ -240,12 +232,17 @@ bool average_all(const Pool& pool, Form form, int64_t batch, const Average<T>& a
 }
 
 template <class T>
-bool resist_all(const Pool& pool, Form form, int64_t batch, const Resist<T>& all) {
+Division divided_all(const Pool& pool, Form form, int64_t batch, const Resist<T>& all) {
+  const Kernels<T>* found = kernels(T(), form.d, form.s, false);
+  return found == nullptr ? Division{} : divide(pool, form, batch, all, *found);
+}
+
+template <class T>
+bool resist_all(const Pool& pool, Form form, int64_t batch, const Resist<T>& all, const Division& division) {
   const Kernels<T>* found = kernels(T(), form.d, form.s, false);
   if (found == nullptr) return false;
-  const Division division = divide(pool, form, batch, all, *found);
-  if (division.reached() <= kMostReached) {
-    division.over_nodes(pool, form, batch, all, found->resist);
+  if (reached(division) <= kMostReached) {
+    over_nodes(pool, form, batch, all, division, found->resist);
     return true;
   }
   // Each particle once, and then a scatter: the parts would do most particles several times.
@@ -255,7 +252,7 @@ bool resist_all(const Pool& pool, Form form, int64_t batch, const Resist<T>& all
   const Given<T> given = {nullptr, stored.get(), all.columns};
   const Scatter<T> rest = {all.stencils, given, all.nodes, nullptr, nullptr, all.size, all.columns, all.wanted};
   over_particles(pool, form, batch, first, found->resist_particles);
-  division.over_nodes(pool, form, batch, rest, found->scatter);
+  over_nodes(pool, form, batch, rest, division, found->scatter);
   return true;
 }
 
@@ -269,7 +266,11 @@ bool average(const Pool& p, Form f, int64_t b, const Average<float>& a) { return
 bool average(const Pool& p, Form f, int64_t b, const Average<double>& a) { return average_all(p, f, b, a); }
 bool pull(const Pool& p, Form f, int64_t b, const Pull<float>& q) { return pull_all(p, f, b, q); }
 bool pull(const Pool& p, Form f, int64_t b, const Pull<double>& q) { return pull_all(p, f, b, q); }
-bool resist(const Pool& p, Form f, int64_t b, const Resist<float>& r) { return resist_all(p, f, b, r); }
-bool resist(const Pool& p, Form f, int64_t b, const Resist<double>& r) { return resist_all(p, f, b, r); }
+bool resist(const Pool& p, Form f, int64_t b, const Resist<float>& r) { return resist_all(p, f, b, r, divided(p, f, b, r)); }
+bool resist(const Pool& p, Form f, int64_t b, const Resist<double>& r) { return resist_all(p, f, b, r, divided(p, f, b, r)); }
+Division divided(const Pool& p, Form f, int64_t b, const Resist<float>& r) { return divided_all(p, f, b, r); }
+Division divided(const Pool& p, Form f, int64_t b, const Resist<double>& r) { return divided_all(p, f, b, r); }
+bool resist(const Pool& p, Form f, int64_t b, const Resist<float>& r, const Division& d) { return resist_all(p, f, b, r, d); }
+bool resist(const Pool& p, Form f, int64_t b, const Resist<double>& r, const Division& d) { return resist_all(p, f, b, r, d); }
 
 }  // namespace mpmjax

@@ -2,6 +2,8 @@
 
 #pragma once
 
+#include <vector>
+
 #include "problems.h"
 #include "share.h"
 
@@ -34,6 +36,14 @@ Stencils<T> member(Stencils<T> all, Form form, int64_t i) {
   return all;
 }
 
+// The nodes of each member cut into parts, one for each thread, and the ranges of nodes that its blocks of particles
+// reach. Where there is one part there are none, unless they are wanted.
+struct Division {
+  int64_t parts, blocks;
+  std::vector<Range> ranges;
+  std::vector<std::vector<int64_t>> cuts;
+};
+
 // Each returns false where there is no kernel of this form. `batch` problems follow each other in every array.
 bool gather(const Pool& pool, Form form, int64_t batch, const Gather<float>& first);
 bool gather(const Pool& pool, Form form, int64_t batch, const Gather<double>& first);
@@ -45,5 +55,11 @@ bool pull(const Pool& pool, Form form, int64_t batch, const Pull<float>& first);
 bool pull(const Pool& pool, Form form, int64_t batch, const Pull<double>& first);
 bool resist(const Pool& pool, Form form, int64_t batch, const Resist<float>& first);
 bool resist(const Pool& pool, Form form, int64_t batch, const Resist<double>& first);
+
+// The division of a resistance, which its particles' places alone decide, and the resistance with a division found before.
+Division divided(const Pool& pool, Form form, int64_t batch, const Resist<float>& first);
+Division divided(const Pool& pool, Form form, int64_t batch, const Resist<double>& first);
+bool resist(const Pool& pool, Form form, int64_t batch, const Resist<float>& first, const Division& division);
+bool resist(const Pool& pool, Form form, int64_t batch, const Resist<double>& first, const Division& division);
 
 }  // namespace mpmjax

@@ -8,7 +8,7 @@
 namespace mpmjax {
 namespace {
 
-constexpr int64_t kPart = 512;  // times 64 numbers: what a thread takes at a time
+constexpr int64_t kPart = 128;  // times 64 numbers, some microseconds: what a thread takes at a time
 
 // Calls run(m, first, last) for parts of the blocks of each of a batch, and adds up what it returns: the same parts in the
 // same order for any number of threads.
