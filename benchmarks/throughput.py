@@ -272,7 +272,7 @@ def main() -> None:
         if options.scene not in (None, name):
             continue
         for dtype in ("float32",) if name in LARGE else ("float32", "float64"):
-            steps, repeats = (10, 3) if options.quick else (20, 3) if name in LARGE else (20, 7)
+            steps, repeats = 10 if options.quick else 20, 3 if options.quick or name in LARGE else 7
             options_of = {"steps": steps, "repeats": repeats, "peers": options.peers, "solve": name not in LARGE}
             rows.append(compare(name, block(*numbers, dtype), **options_of))
             if not options.json:
