@@ -130,8 +130,7 @@ def _shapes(*arrays: ShapedArray, call: _Call) -> list[ShapedArray]:
 
 
 def _batch(arrays: Sequence[Any], axes: Sequence[Any], *, call: _Call) -> tuple[list[Array], list[int]]:
-    mapped = tuple(None if axis is batching.not_mapped else axis for axis in axes)
-    out = _ruled_p.bind(*arrays, call=call._replace(mapped=(*call.mapped, mapped)))
+    out = _ruled_p.bind(*arrays, call=call._replace(mapped=(*call.mapped, tuple(axes))))
     return out, [0] * len(out)
 
 

@@ -65,7 +65,7 @@ def native_primitive(
         return [ShapedArray((*batch, *shape), args[like].dtype) for shape in shapes(*args, **params)]
 
     def batch(args: tuple, axes: tuple, *, batched: int, **params: Any) -> tuple[list[Array], list[int]]:
-        size = next(a.shape[x] for a, x in zip(args, axes, strict=True) if x is not batching.not_mapped)
+        size = next(a.shape[x] for a, x in zip(args, axes, strict=True) if x is not None)
         args = tuple(batching.bdim_at_front(a, x, size) for a, x in zip(args, axes, strict=True))
         out = primitive.bind(*args, batched=batched + 1, **params)
         return out, [0] * len(out)
