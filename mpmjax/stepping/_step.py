@@ -133,22 +133,23 @@ def step_unchecked(
             reaction,
             new.before,
             new.solved.velocity,
-            new.motion.mean,
+            new.motion.carrier,
+            method.force_at(),
             new.held,
             new.slowed,
         )
     undone = _left_undone(nodes, method, new)
-    return after, StepInfo(new.solve, new.contact, outside, undone, _given_to_colliders(nodes, new), boundaries)
+    colliders = _given_to_colliders(nodes, method, new)
+    return after, StepInfo(new.solve, new.contact, outside, undone, colliders, boundaries)
 
 
-def _given_to_colliders(nodes: Nodes, new: GridUpdate) -> ColliderImpulse | None:
-    """The impulse on the scene's colliders, at their places in the middle of the step if positions move with the mean
-    velocity; None without colliders."""
-    colliders = nodes.conditions.colliders
+def _given_to_colliders(nodes: Nodes, method: AbstractIntegrator, new: GridUpdate) -> ColliderImpulse | None:
+    """The impulse on the scene's colliders, at their places at the time of the forces; None without colliders."""
+    colliders, share = nodes.conditions.colliders, method.force_at()
     if colliders is None:
         return None
-    if new.motion.mean is not None:
-        colliders = colliders.after(nodes.dt / 2, nodes.mirror.unfold(new.motion.mean))
+    if share is not None:
+        colliders = colliders.after(share * nodes.dt, nodes.mirror.unfold(new.motion.carrier))
     holding = new.reaction if new.holding is None else new.holding
     return impulse_on_colliders(colliders, holding, new.normal_impulse, new.pushes)
 
