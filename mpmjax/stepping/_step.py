@@ -40,7 +40,8 @@ class StepInfo(eqx.Module):
     outside: Int[Array, "*f"]
     """Particles whose stencil left the grid's window."""
     left_undone: LeftUndone
-    """What one linear solve leaves undone of the elastic force; nothing of explicit steps and of Newton's method."""
+    """What one linear solve, and in implicit steps the return map after it, leaves undone of the elastic force; nothing
+    of explicit steps, and of Newton's method where nothing yields."""
     colliders: ColliderImpulse | None = None
     """Impulse on the scene's colliders, in the order of its boundaries; None without colliders."""
     boundaries: BoundaryImpulse | None = None
@@ -138,7 +139,7 @@ def step_unchecked(
             new.held,
             new.slowed,
         )
-    undone = _left_undone(nodes, method, new)
+    undone = _left_undone(scene, nodes, method, new, trial, after)
     colliders = _given_to_colliders(nodes, method, new)
     return after, StepInfo(new.solve, new.contact, outside, undone, colliders, boundaries)
 
@@ -154,15 +155,25 @@ def _given_to_colliders(nodes: Nodes, method: AbstractIntegrator, new: GridUpdat
     return impulse_on_colliders(colliders, holding, new.normal_impulse, new.pushes)
 
 
-def _left_undone(nodes: Nodes, method: AbstractIntegrator, new: GridUpdate) -> LeftUndone:
-    """What the linearisation of the step leaves undone. No derivative passes."""
-    nodes, method, new = without_derivative((nodes, method, new))
-    exact = method.exact_impulse(nodes, new.solved)
-    if exact is None or new.internal is None:
+def _left_undone(
+    scene: Scene, nodes: Nodes, method: AbstractIntegrator, new: GridUpdate, trial: Particles, after: Particles
+) -> LeftUndone:
+    """What the step leaves undone by its linearisation, and by the return maps that follow it. No derivative passes."""
+    nodes, method, new, trial, after = without_derivative((nodes, method, new, trial, after))
+    exact, share = method.exact_impulse(nodes, new.solved), method.force_at()
+    yields = share is not None and any(not law.allows_total for law in scene.laws)
+    if new.internal is None or (exact is None and not yields):
         return nothing_left_undone(nodes.mass.dtype)
     elastic = new.internal if new.viscous is None else new.internal - new.viscous
-    momentum = nodes.mass[:, None] * new.solved.velocity
-    scale = reduce(jnp.maximum, (norm(exact), norm(elastic), nodes.dt * norm(nodes.force), norm(momentum)))
+    exact = elastic if exact is None else exact
+    if yields:  # the forces have gone the share θ of the way to the trial stress, the law's would to the returned one
+        tried, returned = (
+            replace(nodes.potential, material_points=scene.material_points(q)).current_flux() for q in (trial, after)
+        )
+        exact = exact + share * nodes.dt * nodes.potential.nodal_sum(tried - returned)
+    # Flow is slowed by a part of the force, however small that is beside the momentum: there only as its rounding
+    inertia = norm(nodes.mass[:, None] * new.solved.velocity) * (jnp.finfo(exact.dtype).eps ** 0.5 if yields else 1)
+    scale = reduce(jnp.maximum, (norm(exact), norm(elastic), nodes.dt * norm(nodes.force), inertia))
     return LeftUndone(norm(exact - elastic) / nodes.dt, scale / nodes.dt)
 
 
