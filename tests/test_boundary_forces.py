@@ -242,7 +242,9 @@ def pressed(method, dt, steps=8):
 @pytest.mark.parametrize(
     ("method", "dt", "rtol"),
     [
-        pytest.param(mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12)), 0.1, 1e-9, id="backward_euler", marks=pytest.mark.thorough),
+        pytest.param(
+            mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12)), 0.1, 1e-9, id="backward_euler", marks=pytest.mark.thorough
+        ),
         pytest.param(mpm.SemiImplicit(), 0.05, 1e-3, id="semi_implicit"),
         pytest.param(mpm.SemiImplicit(0.5), 0.05, 1e-3, id="beta=0.5", marks=pytest.mark.thorough),
         pytest.param(mpm.Explicit(), 1e-3, 1e-9, id="explicit"),
