@@ -215,6 +215,69 @@ def test_torques_in_the_total_description_are_about_the_moved_body():
     assert_close(received.angular.sum(axis=0), gravity - change, 1e-9)
 
 
+PRESSED = mpm.NeoHookean(1e5, 0.3)
+SPEED, EDGE = 0.01, 0.1
+
+
+def pressed(method, dt, steps=8):
+    """A run of a cell pressed at a constant speed between a wall and a plate that starts with it, and the force on the
+    plate as a function of time [N]: all nodes are held, so that it is exact."""
+    grid = mpm.Grid((4, 4), EDGE, origin=(-1, -1))
+    particles = mpm.fill(mpm.Box((0.0, 0.0), (EDGE, EDGE)), grid, particles_per_cell=4, density=1e3)
+    plate = mpm.StickyCollider(
+        mpm.HalfSpace((0.0, EDGE), (0.0, -1.0)), mpm.Motion((0.0, 9.0), ((0.0, 0.0), (0.0, -9 * SPEED)))
+    )
+    walls = mpm.SlipBox((0.0, 0.0), (EDGE, np.inf))
+    options = {"kernel": mpm.BSpline(1), "description": mpm.TotalLagrangian(), "boundary_forces": True}
+    scene = mpm.Scene(grid, PRESSED, boundary=(walls, plate), **options)
+
+    def force(t):
+        stretch = 1 - SPEED * jnp.asarray(t) / EDGE
+        F = jnp.stack([jnp.ones_like(stretch), 0 * stretch, 0 * stretch, stretch]).reshape(2, 2, -1)
+        return -EDGE * PRESSED.stress(F)[1, 1]
+
+    return mpm.simulate(scene, particles, t1=steps * dt, dt=dt, method=method, save_every=1), force
+
+
+@pytest.mark.parametrize(
+    ("method", "dt", "rtol"),
+    [
+        pytest.param(
+            mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12)), 0.1, 1e-9, id="backward_euler", marks=pytest.mark.thorough
+        ),
+        pytest.param(mpm.SemiImplicit(), 0.05, 1e-3, id="semi_implicit"),
+        pytest.param(mpm.SemiImplicit(0.5), 0.05, 1e-3, id="beta=0.5", marks=pytest.mark.thorough),
+        pytest.param(mpm.Explicit(), 1e-3, 1e-9, id="explicit"),
+        pytest.param(mpm.ImplicitMidpoint(), 0.05, 1e-3, id="midpoint", marks=pytest.mark.thorough),
+        pytest.param(mpm.TRBDF2(), 0.05, 1e-3, id="trbdf2", marks=pytest.mark.thorough),
+    ],
+)
+def test_a_force_stands_at_its_own_time(method, dt, rtol):
+    """That of a plate that presses at a constant speed, as a collider's, as a boundary's and as an observation."""
+    run, force = pressed(method, dt)
+    of_plate, of_boundaries = run.forces(), run.boundary_forces()
+    for times, found in ((of_plate.times, of_plate.force[:, 0]), (of_boundaries.times, of_boundaries.force[:, 1])):
+        error = np.abs(found[1:, 1] - force(times[1:])).max()  # the first step sets all in motion
+        assert error < rtol * float(force(times[-1])[0])
+    at = np.array([3.0, 4.25, 7.9]) * dt
+    seen = mpm.Force(at, np.stack([0 * at, force(at)], axis=1), boundary=1)
+    assert_close(seen.predict(None, run), seen.data, 1e-3)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("method", [METHODS["backward_euler"]])
+def test_the_material_has_no_moment_at_the_time_of_its_force(method):
+    """A strained block without inertia, held and turned at once: the torques on what holds it have no sum, wherever
+    the step has moved it."""
+    grips = (mpm.Grip(mpm.Box((-1.0, -1.0), (1.0, 0.1))), mpm.Grip(mpm.Box((-1.0, 0.25), (1.0, 1.0)), MOVED))
+    scene, particles = block(2, boundary=grips, boundary_forces=True)
+    particles = mpm.prepare(scene, dataclasses.replace(particles, mass=1e-9 * particles.mass))
+    _, dt, received = stepped(scene, particles, method, 3.0)
+    np.testing.assert_allclose(received.impulse.sum(axis=0), 0, atol=1e-6 * np.abs(received.impulse).max())
+    moment = torque_about_origin(scene, received, dt)
+    assert np.abs(moment).max() < 1e-6 * np.abs(np.asarray(received.impulse)).max() * 0.3
+
+
 @pytest.mark.thorough
 def test_forces_on_boundaries_against_time(tmp_path):
     """As those on colliders: between frames, in observed runs, in files, resumed, in batches and with derivatives. A

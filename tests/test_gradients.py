@@ -3,6 +3,7 @@
 import itertools
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -285,3 +286,25 @@ def test_an_adjoint_that_does_not_converge_gives_nan():
     gradient = jax.jit(jax.grad(value), static_argnums=1)
     assert np.isfinite(gradient(q, 100)["law"][0]).all()
     assert np.isnan(gradient(q, 1)["law"][0]).all()
+
+
+@pytest.mark.thorough
+def test_a_gradient_in_float32_is_not_limited_by_the_adjoint_solve():
+    """The height of a stiff block that stands between walls, by its modulus, of which a tolerance of 1e-5 left 2e-3."""
+    grid = mpm.Grid((16, 16), 0.05, origin=(-3, -3))
+    walls = mpm.SlipBox((0.0, 0.0), (np.inf, np.inf))
+    block = mpm.fill(mpm.Box((0.0, 0.0), (0.4, 0.4)), grid, particles_per_cell=4, density=1e3)
+    scene = mpm.Scene(grid, mpm.NeoHookean(1e7, 0.45), gravity=(0.0, -9.81), boundary=walls)
+
+    def slope(dtype, method):
+        particles = jax.tree.map(lambda a: jnp.asarray(a, dtype), block)
+
+        def height(E):
+            own = eqx.tree_at(lambda s: s.material.youngs_modulus, scene, E)
+            return mpm.rollout(own, particles, steps=10, dt=2e-2, method=method).x[:, 1].mean()
+
+        return float(jax.grad(height)(jnp.asarray(1e7, dtype)))
+
+    tight = mpm.ConjugateResidual(rtol=1e-12)
+    exact = slope(jnp.float64, mpm.SemiImplicit(solver=tight, adjoint_solver=tight))
+    assert slope(jnp.float32, mpm.SemiImplicit()) == pytest.approx(exact, rel=1e-3)

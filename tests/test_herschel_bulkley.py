@@ -178,3 +178,33 @@ def test_flow_between_plates_has_a_plug():
         errors.append(np.abs(v - (1 - beyond**2)).max())
     assert errors[1] < 0.1
     assert errors[0] / errors[1] > 1.6
+
+
+@pytest.mark.parametrize(
+    ("method", "share"),
+    [
+        (mpm.SemiImplicit(), 1.0),
+        pytest.param(mpm.BackwardEuler(), 1.0, marks=pytest.mark.thorough),
+        pytest.param(mpm.ImplicitMidpoint(), 0.5, marks=pytest.mark.thorough),
+        pytest.param(mpm.Explicit(), 0.0, marks=pytest.mark.thorough),
+    ],
+)
+def test_a_step_that_leaves_the_return_map_behind_says_so(method, share):
+    """Steady shear between plates that hold it: of a solve that resists the flow by the elastic law, θ μ Δt γ̇ of
+    τ + θ μ Δt γ̇ is not Bingham's law. It is reported, and warned of where it is much."""
+    rate, dt, width, E = 1.0, 1e-2, 0.1, 2e4
+    tau, stiffness = 25.0 + 50.0 * rate, E / 2.6
+    grid = mpm.Grid((4, 6), width, origin=(0, -2), periodic=(True, False))
+    motion = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (rate * width, 0.0)))
+    plate = mpm.Grip(mpm.Box((-np.inf, 0.99 * width), (np.inf, np.inf)), motion)
+    floor = mpm.StickyBox((-np.inf, 0.0), (np.inf, np.inf))
+    law = mpm.HerschelBulkley(E, 0.3, yield_stress=25.0, consistency=50.0)
+    scene = mpm.Scene(grid, law, boundary=(floor, plate), kernel=mpm.BSpline(1))
+    layer = mpm.fill(mpm.Box((0.0, 0.0), (4 * width, width)), grid, particles_per_cell=4, density=1.0)
+    if not isinstance(method, mpm.Explicit):
+        with pytest.warns(UserWarning, match=r"returned only at the end of the step.*Explicit\(\)"):
+            run = mpm.simulate(scene, layer, t1=10 * dt, dt=dt, method=method)
+    else:
+        run = mpm.simulate(scene, layer, t1=10 * dt, dt=dt, method=method)
+    left = share * stiffness * dt * rate
+    assert float(run.statistics.left_undone.part) == pytest.approx(left / (tau + left), rel=0.02)

@@ -78,8 +78,8 @@ class WorkPrecision(NamedTuple):
             said += f" None reached {self.target:g}: on the grids tried no step does better."
         if best.left_undone > MOST_LEFT_UNDONE:
             said += (
-                f" Its linear solves left up to {100 * best.left_undone:.2g} % of the elastic force undone: for "
-                "stresses take Newton's method or a shorter step."
+                f" Its steps left up to {100 * best.left_undone:.2g} % of the elastic force undone: for stresses take "
+                "Newton's method, where nothing yields, or a shorter step."
             )
         if self.reference.error > self.target / 2:
             said += f" The reference is known to {self.reference.error:.2g} only, and so are the errors."

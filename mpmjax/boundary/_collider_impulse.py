@@ -23,10 +23,8 @@ class ColliderImpulse(eqx.Module):
     """Impulse [kg m/s], friction included."""
     angular: Float[Array, "*f k r"]
     """Angular impulse [kg m²/s] about the centre of the collider's rotation, or where it has none about its shape's
-    middle, as it moves: of r = 1 component in 2-D, 3 in 3-D, none in 1-D. Nodes and centre are taken where they are as
-    the step begins, with methods of second order half-way through it: about these places the moments of all impulses
-    are the change of angular momentum, Σ x^n × m Δv = Δ Σ x × m v where x moves with v^{n+1}, and
-    Σ ½(x^n + x^{n+1}) × m Δv where it moves with the mean."""
+    middle, as it moves: of r = 1 component in 2-D, 3 in 3-D, none in 1-D. Nodes and centre are taken where they are at
+    the time of the step's forces, t_n + θΔt. About these places the forces of the material have no moment."""
 
     def plus(self, later: "ColliderImpulse") -> "ColliderImpulse":
         """The sum of both."""

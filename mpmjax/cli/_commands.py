@@ -179,7 +179,7 @@ def _summary(simulation: Simulation, run: Run, taken: int, seconds: float) -> st
         )
     if float(run.statistics.undone_force) > 0:
         undone = float(run.statistics.left_undone.part)
-        lines.append(("linearisation", f"at most {undone:.2g} of the elastic force left undone in a step"))
+        lines.append(("left undone", f"at most {undone:.2g} of the elastic force in a step"))
     if int(run.statistics.newton) > 0:
         lines.append(
             ("Newton", f"{int(run.statistics.newton) / steps:.3g} a step, {int(run.statistics.line_search)} halvings")

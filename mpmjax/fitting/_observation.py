@@ -180,18 +180,18 @@ class Series(AbstractObservation):
         return self.of(scene, particles)
 
     def predict(self, seen: Array, run: Run) -> Array:
-        return self._at_times(seen, run, 0.0)
+        return self._at_times(seen, run)
 
-    def _at_times(self, values: Array, run: Run, first: float) -> Array:
+    def _at_times(self, values: Array, run: Run, first: Scalar = 0.0) -> Array:
         """Values at the times; NaN at times that a parameter has moved out of the run.
 
         Args:
-            values: one for each step or state, shape (k, ...), as far before the run's end as after its start.
-            run: the run.
+            values: one for each step or state, shape (k, ...).
+            run: the run, with every step saved.
             first: where the first one stands, in steps from the start.
         """
         step = jnp.asarray(self.times, values.dtype) / run.dt
-        outside = (step < -_BEYOND) | (step > len(values) - 1 + 2 * first + _BEYOND)
+        outside = (step < -_BEYOND) | (step > len(run.steps) - 1 + _BEYOND)
         outside = outside.reshape(-1, *[1] * (values.ndim - 1))
         return jnp.where(outside, jnp.nan, between(values, step - first))
 

@@ -16,7 +16,7 @@ class Force(Series):
     """The force on a collider, or on any boundary, against time, such as that of a plate on which a body falls or of a
     grip that pulls.
 
-    Compared with the mean force over each step, which stands at the step's middle.
+    Compared with the force of each step at its own time (see `Forces`), interpolated linearly.
 
     Args:
         times: when it was measured [s], shape (f,), growing.
@@ -74,7 +74,8 @@ class Force(Series):
 
     def predict(self, seen: Any, run: Run) -> Array:
         del seen
-        return self._at_times(self._simulated(run), run, 0.5)
+        at = run.method.force_at()
+        return self._at_times(self._simulated(run), run, 0.0 if at is None else at)
 
     def explain(self, seen: Any, run: Run) -> None:
         super().explain(self._simulated(run), run)

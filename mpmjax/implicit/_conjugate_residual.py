@@ -44,6 +44,7 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
       its `mv` and sums. Default: these.
     - `matrices`: for a diagonal W, the operator as one matrix for each particle (see `ParticleMatrices`), with which
       the whole iteration is one call of the native library. Default: that it is not of this kind.
+    - `rtol`: the relative tolerance where the solver has none. Default: that of the precision.
 
     Statistics returned:
 
@@ -58,7 +59,7 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
     `RESULTS.breakdown`.
 
     Args:
-        rtol: relative tolerance. Default: 1e-8 in float64, 1e-5 in float32.
+        rtol: relative tolerance. Default: 1e-8 in float64, 1e-5 in float32; 1e-6 there as an adjoint solver.
         increment_rtol: stop also when an increment is small, ‖α_k p_k‖² ≤ increment_rtol² ‖x‖² (the
             alternative named after eq. 20 of the derivation). Default: not used. It says nothing of the residual.
         max_steps: largest number of steps of the recurrence.
@@ -209,7 +210,7 @@ def _system(
     inner: AbstractInnerProduct | None = options.get("inner_product")
     inner = DiagonalInnerProduct(jnp.ones_like(flat)) if inner is None else inner.flattened(unravel)
     b = jnp.stack([inner.solve(flat), flat]) if inner.paired else inner.solve(flat)
-    rtol = default_rtol(flat.dtype) if solver.rtol is None else solver.rtol
+    rtol = options.get("rtol", default_rtol(flat.dtype)) if solver.rtol is None else solver.rtol
     given = operator, inner, unravel, b, Ends(rtol, solver.max_steps, solver.increment_rtol)
     if inner.paired:
         return _PairedSystem(*given)

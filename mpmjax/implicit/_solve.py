@@ -13,7 +13,7 @@ import lineax as lx
 
 from mpmjax._types import Array, NodeVector, Scalar
 from mpmjax.autodiff import kept, ruled, without_derivative
-from mpmjax.implicit._linear_solve import solve_linear
+from mpmjax.implicit._linear_solve import derivative_rtol, solve_linear
 from mpmjax.implicit._problems import AbstractProblem
 from mpmjax.implicit._solution import AbstractSolution
 from mpmjax.implicit._solve_info import SolveInfo
@@ -77,7 +77,7 @@ def _solve_jvp(primals: Any, tangents: Any) -> Any:
 
     def solve_symmetric(matvec: Any, b: tuple[NodeVector, Array]) -> tuple[NodeVector, Array]:
         del matvec  # what JAX passes; `known`, the precomputed operator, is the same map and faster
-        solution = solve_linear(adjoint, known, b[0], inner)
+        solution = solve_linear(adjoint, known, b[0], inner, rtol=derivative_rtol(b[0].dtype))
         solved, finite = solution.converged | solution.nearly_converged, jnp.isfinite(b[0]).all()
         residual = jnp.where(jnp.isfinite(solution.residual), solution.residual, jnp.inf)
         return jnp.where(solved, solution.value, jnp.nan), jnp.where(finite & ~solved, residual, 0)

@@ -18,7 +18,7 @@ from mpmjax.simulation._diffrax import Problem, faulty_particles, passed_particl
 from mpmjax.simulation._rollout_state import RolloutState
 from mpmjax.simulation._run import Run, SimulationError
 from mpmjax.simulation._statistics import Fault, RunStatistics
-from mpmjax.state import Particles, state_of, with_state
+from mpmjax.state import Particles, Scene, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator
 
 
@@ -86,9 +86,9 @@ def unconverged_advice(method: AbstractIntegrator, dtype: Any) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def warn_of_inaccuracy(statistics: RunStatistics) -> None:
+def warn_of_inaccuracy(scene: Scene, statistics: RunStatistics) -> None:
     """A Python warning where solves of an untraced run missed their tolerance by less than ten times, and one where
-    linearised steps left much of the elastic force undone."""
+    implicit steps left much of the elastic force undone."""
     if int(statistics.nearly_converged) > 0:
         warn(
             f"The solve of {int(statistics.nearly_converged)} of {int(statistics.steps)} steps missed its tolerance by "
@@ -97,7 +97,13 @@ def warn_of_inaccuracy(statistics: RunStatistics) -> None:
             "rtol."
         )
     part = float(statistics.left_undone.part) if float(statistics.undone_force) > 0 else 0.0
-    if part > MOST_LEFT_UNDONE:
+    if part > MOST_LEFT_UNDONE and any(not law.allows_total for law in scene.laws):
+        warn(
+            f"Implicit steps left up to {100 * part:.2g} % of the elastic force undone: in the solve, what yields or "
+            "flows resists as if it were elastic, and its flow is returned only at the end of the step. It flows too "
+            f"slowly. Take a shorter step, {part / MOST_LEFT_UNDONE:.1f} times or more, or Explicit()."
+        )
+    elif part > MOST_LEFT_UNDONE:
         warn(
             f"One linear solve a step left up to {100 * part:.2g} % of the elastic force undone, and stresses can be "
             f"wrong by as much. Take a shorter step, {float(np.sqrt(part / MOST_LEFT_UNDONE)):.1f} times or more, or "
@@ -141,7 +147,7 @@ _WORDS: dict[Fault, _Words] = {
     ),
 }
 MOST_LEFT_UNDONE = 0.05
-"""Part of the elastic force up to which what one linear solve leaves undone is not warned of."""
+"""Part of the elastic force up to which what implicit steps leave undone is not warned of."""
 _ADVICE = (
     "Call simulate outside of jax transformations to have step, time and particle named, or with throw=False to "
     "inspect run.statistics."

@@ -22,10 +22,13 @@ class SimulationError(RuntimeError):
 
 
 class Forces(NamedTuple):
-    """Mean forces and torques on k colliders or boundaries between one saved frame and the next, of f frames."""
+    """Mean forces and torques on k colliders or boundaries over the steps between one saved frame and the next, of f
+    frames."""
 
     times: Float[Array, "g"]
-    """Half way between frames [s], shape (f − 1,)."""
+    """The mean of the times of the steps' forces [s], shape (f − 1,): t_n + θΔt, with θ the method's `force_at`. It is
+    half way between frames with θ = ½ (`ImplicitMidpoint`, `TRBDF2`, `SemiImplicit` with β = ½), ½Δt later at the end
+    of steps (`BackwardEuler`, β = 1), and ½Δt earlier at their start (`Explicit`)."""
     force: Float[Array, "g k d"]
     """Friction included [N], shape (f − 1, k, d)."""
     torque: Float[Array, "g k r"]
@@ -61,7 +64,7 @@ class Run(eqx.Module):
     collider_impulse: ColliderImpulse | None = None
     """Linear and angular impulse on the scene's colliders from the run's start to each saved frame, with a leading axis
     f; None without colliders, or where nothing was saved. The difference between two frames, over the time between
-    them, is the mean force and torque (see `forces`)."""
+    them, is the mean force and torque of these steps (see `forces`, which says at what time)."""
     final_collider_impulse: ColliderImpulse | None = None
     """The same to the end; None without colliders."""
     boundary_impulse: BoundaryImpulse | None = None
@@ -90,7 +93,7 @@ class Run(eqx.Module):
         return with_state(self.final, jax.tree.map(lambda a: a[i], self.frames))
 
     def forces(self) -> Forces:
-        """The mean force and torque on each collider between one saved frame and the next.
+        """The mean force and torque on each collider over the steps between one saved frame and the next.
 
         Raises:
             ValueError: nothing was saved on the way, or the scene has no collider.
@@ -103,8 +106,8 @@ class Run(eqx.Module):
 
     def boundary_forces(self) -> Forces:
         """The mean force and torque of the material on each of the scene's boundaries (walls, planes, grips and
-        colliders, in their order) and then on the guides of each `Rigid` body that has some, between one saved frame
-        and the next.
+        colliders, in their order) and then on the guides of each `Rigid` body that has some, over the steps between one
+        saved frame and the next.
 
         Raises:
             ValueError: nothing was saved on the way, or the scene does not have `boundary_forces`.
@@ -117,10 +120,11 @@ class Run(eqx.Module):
         return self._mean_forces(self.boundary_impulse)
 
     def _mean_forces(self, impulses: ColliderImpulse | BoundaryImpulse) -> Forces:
-        times = self.times
+        times, at = self.times, self.method.force_at()
         between = (times[1:] - times[:-1])[:, None, None]
         mean = jax.tree.map(lambda a: (a[1:] - a[:-1]) / between, impulses)
-        return Forces((times[1:] + times[:-1]) / 2, mean.impulse, mean.angular)
+        late = (0.0 if at is None else at) - 0.5
+        return Forces((times[1:] + times[:-1]) / 2 + late * self.dt, mean.impulse, mean.angular)
 
     def __len__(self) -> int:
         return 0 if self.frames is None else int(np.shape(self.steps)[0])

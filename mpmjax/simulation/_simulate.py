@@ -164,7 +164,7 @@ def simulate(
     if traced:
         return guarded(run, end.report)
     raise_faults(run, particles, lambda: before_fault(go, begin, end.statistics), start)
-    warn_of_inaccuracy(run.statistics)
+    warn_of_inaccuracy(run.scene, run.statistics)
     return run
 
 

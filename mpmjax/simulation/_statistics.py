@@ -44,7 +44,7 @@ class RunStatistics(eqx.Module):
     worst_residual: Float[Array, "*f"]
     """Largest relative residual at the end of a solve."""
     undone_force: Float[Array, "*f"]
-    """Largest force that a linearised step left undone [N] (see `left_undone`)."""
+    """Largest force that a step left undone [N] (see `left_undone`)."""
     undone_scale: Float[Array, "*f"]
     """Largest scale of these forces [N]."""
     unconverged: Int[Array, "*f"]
@@ -68,8 +68,8 @@ class RunStatistics(eqx.Module):
 
     @property
     def left_undone(self) -> LeftUndone:
-        """What one linear solve a step left undone of the elastic force: the most of any step, and the largest scale of
-        any, so that quiet steps do not count."""
+        """What implicit steps left undone of the elastic force: the most of any step, and the largest scale of any, so
+        that quiet steps do not count."""
         return LeftUndone(self.undone_force, self.undone_scale)
 
     @property

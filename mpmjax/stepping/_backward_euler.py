@@ -37,8 +37,8 @@ class BackwardEuler(AbstractImplicitIntegrator):
         solution: Newton's method, with its linear solver and tolerances.
         hessian: the Hessian H of the elastic energy. Default: by the analytic stress differential.
         preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH.
-        adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. Its tolerance
-            bounds that of the gradient.
+        adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. The
+            gradient's error is up to some hundred times its tolerance, by default 1e-8 in float64, 1e-6 in float32.
         guess: where Newton's method starts. Default: the velocity of the nodes v^n.
     """
 

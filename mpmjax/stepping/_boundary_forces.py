@@ -34,7 +34,8 @@ def given_to_boundaries(
     reaction: NodeVector,
     before: NodeVector | None,
     solved: NodeVector,
-    mean: NodeVector | None,
+    carrier: NodeVector,
+    force_at: Scalar | None,
     held: ConstrainedNodes,
     slowed: tuple[NodeVector, ...],
 ) -> BoundaryImpulse:
@@ -52,7 +53,8 @@ def given_to_boundaries(
         before: the folded nodes' velocity whose change over the step transfers take [m/s], shape (n, d); None if it is
             not known.
         solved: their velocity v^{n+1} before friction [m/s], shape (n, d).
-        mean: their velocity with which positions move [m/s], shape (n, d); None if it is v^{n+1}.
+        carrier: their velocity with which positions move [m/s], shape (n, d).
+        force_at: the share of the step's displacement at which forces are evaluated; None for forces at its start.
         held: the nodes with what contacts hold.
         slowed: the change of velocity by the friction of each contact [m/s], shape (n, d).
     """
@@ -115,12 +117,12 @@ def given_to_boundaries(
     places, pivots = at, _pivots(scene, t, residual)
     if scene.total:
         places = _moved_places(scene, particles, stencil, unfolded, owners, at, t)
-    if mean is not None:
-        carried = unfold(mean)
+    if force_at is not None:
+        carried = unfold(carrier)
         for image in nodes.mirror.rigid:  # to where its centre goes; its couple is about that
-            carried = image.with_own(carried, jnp.broadcast_to(image.own(mean)[0], image.arms.shape))
-        places = places + dt / 2 * carried
-        pivots = (pivots + _pivots(scene, t + dt, residual)) / 2
+            carried = image.with_own(carried, jnp.broadcast_to(image.own(carrier)[0], image.arms.shape))
+        places = places + force_at * dt * carried
+        pivots = pivots + force_at * (_pivots(scene, t + dt, residual) - pivots)
     return impulse_on_boundaries(given, couples, places, pivots)
 
 

@@ -44,8 +44,8 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
         solution: `Linearised()` for one linear solve, `Newton()`, or one of your own.
         hessian: the Hessian H of the elastic energy. Default: by the analytic stress differential.
         preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH.
-        adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. Its tolerance
-            bounds that of the gradient.
+        adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. The
+            gradient's error is up to some hundred times its tolerance, by default 1e-8 in float64, 1e-6 in float32.
         guess: where the solve starts. Default: the velocity of the nodes v^n.
     """
 

@@ -98,8 +98,9 @@ class AbstractIntegrator(eqx.Module):
         return None
 
     def force_at(self) -> Scalar | None:
-        """The share θ of the step's displacement at which forces are evaluated, on the mean over the step; None for
-        forces at its start. Default: None of an explicit method, 1 of any other."""
+        """The share θ of the step's displacement at which forces are evaluated, on the mean over the step, so that the
+        forces of a step are those at t_n + θΔt; None for forces at its start. Default: None of an explicit method, 1 of
+        any other."""
         return None if self.is_explicit else 1.0
 
     def mean_displacement(self, nodes: Nodes, motion: NodeMotion) -> NodeVector | None:

@@ -40,7 +40,8 @@ class StepInfo(eqx.Module):
     outside: Int[Array, "*f"]
     """Particles whose stencil left the grid's window."""
     left_undone: LeftUndone
-    """What one linear solve leaves undone of the elastic force; nothing of explicit steps and of Newton's method."""
+    """What one linear solve, and in implicit steps the return map after it, leaves undone of the elastic force; nothing
+    of explicit steps, and of Newton's method where nothing yields."""
     colliders: ColliderImpulse | None = None
     """Impulse on the scene's colliders, in the order of its boundaries; None without colliders."""
     boundaries: BoundaryImpulse | None = None
@@ -133,35 +134,46 @@ def step_unchecked(
             reaction,
             new.before,
             new.solved.velocity,
-            new.motion.mean,
+            new.motion.carrier,
+            method.force_at(),
             new.held,
             new.slowed,
         )
-    undone = _left_undone(nodes, method, new)
-    return after, StepInfo(new.solve, new.contact, outside, undone, _given_to_colliders(nodes, new), boundaries)
+    undone = _left_undone(scene, nodes, method, new, trial, after)
+    colliders = _given_to_colliders(nodes, method, new)
+    return after, StepInfo(new.solve, new.contact, outside, undone, colliders, boundaries)
 
 
-def _given_to_colliders(nodes: Nodes, new: GridUpdate) -> ColliderImpulse | None:
-    """The impulse on the scene's colliders, at their places in the middle of the step if positions move with the mean
-    velocity; None without colliders."""
-    colliders = nodes.conditions.colliders
+def _given_to_colliders(nodes: Nodes, method: AbstractIntegrator, new: GridUpdate) -> ColliderImpulse | None:
+    """The impulse on the scene's colliders, at their places at the time of the forces; None without colliders."""
+    colliders, share = nodes.conditions.colliders, method.force_at()
     if colliders is None:
         return None
-    if new.motion.mean is not None:
-        colliders = colliders.after(nodes.dt / 2, nodes.mirror.unfold(new.motion.mean))
+    if share is not None:
+        colliders = colliders.after(share * nodes.dt, nodes.mirror.unfold(new.motion.carrier))
     holding = new.reaction if new.holding is None else new.holding
     return impulse_on_colliders(colliders, holding, new.normal_impulse, new.pushes)
 
 
-def _left_undone(nodes: Nodes, method: AbstractIntegrator, new: GridUpdate) -> LeftUndone:
-    """What the linearisation of the step leaves undone. No derivative passes."""
-    nodes, method, new = without_derivative((nodes, method, new))
-    exact = method.exact_impulse(nodes, new.solved)
-    if exact is None or new.internal is None:
+def _left_undone(
+    scene: Scene, nodes: Nodes, method: AbstractIntegrator, new: GridUpdate, trial: Particles, after: Particles
+) -> LeftUndone:
+    """What the step leaves undone by its linearisation, and by the return maps that follow it. No derivative passes."""
+    nodes, method, new, trial, after = without_derivative((nodes, method, new, trial, after))
+    exact, share = method.exact_impulse(nodes, new.solved), method.force_at()
+    yields = share is not None and any(not law.allows_total for law in scene.laws)
+    if new.internal is None or (exact is None and not yields):
         return nothing_left_undone(nodes.mass.dtype)
     elastic = new.internal if new.viscous is None else new.internal - new.viscous
-    momentum = nodes.mass[:, None] * new.solved.velocity
-    scale = reduce(jnp.maximum, (norm(exact), norm(elastic), nodes.dt * norm(nodes.force), norm(momentum)))
+    exact = elastic if exact is None else exact
+    if yields:  # the forces have gone the share θ of the way to the trial stress, the law's would to the returned one
+        tried, returned = (
+            replace(nodes.potential, material_points=scene.material_points(q)).current_flux() for q in (trial, after)
+        )
+        exact = exact + share * nodes.dt * nodes.potential.nodal_sum(tried - returned)
+    # Flow is slowed by a part of the force, however small that is beside the momentum: there only as its rounding
+    inertia = norm(nodes.mass[:, None] * new.solved.velocity) * (jnp.finfo(exact.dtype).eps ** 0.5 if yields else 1)
+    scale = reduce(jnp.maximum, (norm(exact), norm(elastic), nodes.dt * norm(nodes.force), inertia))
     return LeftUndone(norm(exact - elastic) / nodes.dt, scale / nodes.dt)
 
 
