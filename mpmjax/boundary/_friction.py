@@ -1,4 +1,9 @@
-"""Coulomb friction at nodes: an impulse after the solve, opposed to what slides."""
+"""Coulomb friction at nodes: an impulse after the solve, opposed to what slides.
+
+It takes the share min(1, limit/(m ‖s‖)) of the slip s. Where that is 1 the node sticks, and the derivative is that of
+sticking: d(s after)/ds = 0, at rest too, where s = 0. At the kink, limit = m ‖s‖, it is the one on the side of
+sticking. Where nothing pushes there is no friction and no derivative of it.
+"""
 
 import jax.numpy as jnp
 
@@ -22,11 +27,8 @@ def friction_across(held: ConstrainedNodes, axis: int, limit: NodeScalar, v: Nod
         along = jnp.where(tangent, normal, 0)
         square = (along**2).sum(axis=1, keepdims=True)
         slip = slip - along * (along * slip).sum(axis=1, keepdims=True) / jnp.where(square == 0, 1, square)
-    square = (slip**2).sum(axis=1)
-    speed = jnp.sqrt(jnp.where(square == 0, 1, square))
-    share = jnp.minimum(limit / jnp.where(mass == 0, 1, mass) / speed, 1)
     free = tangent & ~held.unheld.conditions.fixed
-    return -jnp.where(free & (square > 0)[:, None], share[:, None] * slip, 0)
+    return -jnp.where(free, share_taken(slip, mass, limit)[:, None] * slip, 0)
 
 
 def friction_along(
@@ -42,13 +44,24 @@ def friction_along(
         limit: the largest impulse of friction at each node [kg m/s], shape (n,).
         v: velocity of all nodes [m/s], shape (n, d).
     """
-    mass = held.nodes.mass
     square = (normal**2).sum(axis=1)
     unit = normal / jnp.sqrt(jnp.where(square == 0, 1, square))[:, None]
     slip = v - moving
     slip = held.nodes.projection.combine(slip - unit * (unit * slip).sum(axis=1, keepdims=True), 0)
-    speed = (slip**2).sum(axis=1)
-    slides = (square > 0) & (speed > 0) & (mass > 0)
-    stopping = mass * jnp.sqrt(jnp.where(slides, speed, 1))
-    share = jnp.where(slides, jnp.minimum(limit / jnp.where(slides, stopping, 1), 1), 0)
-    return -share[:, None] * slip
+    pushed = jnp.where(square > 0, limit, 0)
+    return -share_taken(slip, held.nodes.mass, pushed)[:, None] * slip
+
+
+def share_taken(slip: NodeVector, mass: NodeScalar, limit: NodeScalar) -> NodeScalar:
+    """The share of the slip that friction takes, min(1, limit/(m ‖s‖)), shape (n,).
+
+    Args:
+        slip: s [m/s], shape (n, d).
+        mass: the mass that slides at each node [kg], shape (n,).
+        limit: the largest impulse of friction at each node [kg m/s], shape (n,).
+    """
+    square = (slip**2).sum(axis=1)
+    moves = (square > 0) & (mass > 0)
+    stopping = mass * jnp.sqrt(jnp.where(moves, square, 1))
+    slides = moves & (stopping > limit)
+    return jnp.where(slides, limit / jnp.where(slides, stopping, 1), jnp.where((limit > 0) & (mass > 0), 1, 0))
