@@ -92,7 +92,7 @@ def _nearest(boundary: AbstractBoundary, grid: Grid, volume: Array) -> Array:
 def _acts(conditions: Conditions) -> Bool[Array, "n"]:
     """The nodes on which a boundary acts, (n,)."""
     acts, colliders = conditions.fixed.any(axis=1), conditions.colliders
-    return acts if colliders is None else acts | (colliders.owner >= 0)
+    return acts if colliders is None else acts | colliders.touched
 
 
 def _beyond(boundary: AbstractBoundary, grid: Grid, particles: Particles) -> int:
