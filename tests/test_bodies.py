@@ -165,13 +165,16 @@ def spin(particles):
 
 
 def test_bodies_that_do_not_touch_move_as_each_alone():
-    """To rounding, though they share cells' nodes."""
-    scene, particles = stacked(gap=0.4, speed=0.3)
+    """To rounding, though they share cells' nodes, a contact plane and a grip."""
+    grip = mpm.Grip(mpm.Box((-0.1, -0.1), (0.05, 0.3)), mpm.Motion((0.0,), ((0.0, 0.0),)))
+    walls = grip, mpm.ContactPlane(1, 0.0, friction=0.3)
+    scene, particles = stacked(gap=0.4, speed=0.3, boundary=walls, gravity=(2.0, -9.81))
     both, _ = mpm.step(scene, particles, 0.0, 1e-3)
     rows = np.split(np.arange(particles.count), [particles.sizes[0]])
+    alone = mpm.Scene(scene.grid, LAW, boundary=walls, gravity=(2.0, -9.81))
     for own in rows:
         parts = {name: getattr(particles, name)[own] for name in ("x", "v", "mass", "volume")}
-        new, _ = mpm.step(mpm.Scene(scene.grid, LAW), mpm.Particles(**parts), 0.0, 1e-3)
+        new, _ = mpm.step(alone, mpm.Particles(**parts), 0.0, 1e-3)
         assert_close(both.v[own], new.v)
         assert_close(both.x[own], new.x)
 

@@ -11,6 +11,7 @@ from numpy_oracle import grid_update
 import mpmjax as mpm
 from mpmjax.boundary._active_set import SWEEPS, find_active_set
 from mpmjax.boundary._contact import ConstrainedNodes, constrain
+from mpmjax.boundary._friction import share_taken
 from mpmjax.boundary._mirror import Mirror
 from mpmjax.checks._values import canonical
 from mpmjax.implicit._solve_info import no_solve
@@ -479,3 +480,56 @@ def test_the_gradient_through_contact_is_that_of_the_active_set(name):
     differences = [float(outcome(at + h * e) - outcome(at - h * e)) / (2 * h) for e in jnp.eye(6)]
     np.testing.assert_allclose(gradient, differences, rtol=1e-6)
     assert np.abs(gradient).min() > 1e-6
+
+
+def test_the_derivative_of_friction_is_that_of_sticking_or_of_sliding():
+    """d(s + Δs)/ds of the slip: 0 where it is stopped, at rest too, and at the kink on the side of sticking; where it
+    is not, I − (limit/m)(I − s sᵀ/s²)/‖s‖ and by the limit −s/(m ‖s‖); I where nothing pushes or has mass."""
+
+    def left(s, limit, mass=2.0):
+        return s - share_taken(s[None], jnp.asarray([mass]), limit[None])[0] * s
+
+    slope = jax.jit(jax.jacfwd(left, argnums=(0, 1)))
+    s, whole = jnp.array([3.0, 4.0]), np.eye(2)
+    for stuck, limit in ((0 * s, 0.1), (s, 11.0), (s, 10.0)):
+        assert not any(np.any(part) for part in (left(stuck, jnp.asarray(limit)), *slope(stuck, jnp.asarray(limit))))
+    for limit in (9.0, 0.0):
+        by_slip, by_limit = slope(s, jnp.asarray(limit))
+        assert_close(by_slip, whole - limit / 2 / 5 * (whole - np.outer(s, s) / 25), 1e-14)
+        assert_close(by_limit, -s / 10, 1e-14)
+    assert_close(slope(0 * s, jnp.asarray(0.0))[0], whole)
+    assert_close(slope(0 * s, jnp.asarray(1.0), 0.0)[0], whole)
+    assert not jax.jit(jax.hessian(left))(0 * s, jnp.asarray(0.1)).any()
+
+
+ROUGH = {
+    "box": lambda d: mpm.SeparatingBox((-np.inf,) * (d - 1) + (3e-4,), (np.inf,) * d, friction=0.3),
+    "plane": lambda d: mpm.ContactPlane(d - 1, 0.0, friction=0.3),
+    "collider": lambda d: mpm.SeparatingCollider(
+        mpm.HalfSpace((0.0,) * (d - 1) + (3e-4,), (0.0,) * (d - 1) + (1.0,)), friction=0.3
+    ),
+}
+STICKING = [
+    ("box", "explicit", LAW, 2),
+    *thorough(("plane", "explicit", LAW, 2), ("collider", "explicit", LAW, 3), ("plane", "semi_implicit", LAW, 3)),
+    *thorough(*(("box", name, mpm.Rigid(1e5), 2) for name in METHODS)),
+    *thorough(*((wall, "implicit_midpoint", mpm.Fluid(1e5), 2) for wall in ("box", "collider"))),
+]
+
+
+@pytest.mark.parametrize(("wall", "name", "law", "d"), STICKING)
+def test_what_friction_holds_at_rest_has_the_derivative_of_sticking(wall, name, law, d):
+    """Of the mean velocity along a rough floor after a step by that before it, which is exactly zero."""
+    grid = mpm.Grid((9,) * d, DX, origin=(-3,) * d)
+    block = mpm.fill(mpm.Box((0.0,) * d, (0.2,) * d), grid, density=1e3)
+    scene = mpm.Scene(grid, law, gravity=(0.0,) * (d - 1) + (-G,), boundary=ROUGH[wall](d))
+    block = mpm.prepare(scene, block)
+
+    def after(v):
+        pushed = eqx.tree_at(lambda b: b.v, block, block.v.at[:, 0].add(v))
+        return mpm.step(scene, pushed, 0.0, 1e-4, method=(METHODS | OTHERS)[name])[0].v[:, 0].mean()
+
+    both, h = jax.jit(lambda v: jax.jvp(after, (v,), (1.0,))), 1e-9
+    slope, difference = float(both(0.0)[1]), float(both(h)[0] - both(-h)[0]) / (2 * h)
+    assert slope < 0.8
+    assert slope == pytest.approx(difference, rel=1e-5)

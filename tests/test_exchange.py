@@ -106,11 +106,7 @@ def test_moments_of_all_boundaries_are_the_change_of_angular_momentum(descriptio
         rub = sum(np.asarray(given) for _, given in new.pushes)  # by springs and friction
         holding = np.asarray(new.reaction if new.holding is None else new.holding)
         friction = 0 if new.friction is None else np.asarray(new.friction)
-        push = (
-            0
-            if new.normal_impulse is None
-            else np.asarray(new.normal_impulse)[:, None] * np.asarray(step.nodes.conditions.colliders.normal)
-        )
+        push = sum(np.asarray(given.impulse) for given in new.along_normals)
         holder = np.asarray(step.nodes.conditions.colliders.holder)
         of_colliders = np.where(holder >= 0, holding, 0) + push + rub
         of_walls = np.where(walled, np.asarray(new.reaction) + friction - of_colliders, 0)

@@ -5,9 +5,7 @@ from mpmjax.boundary._body_contact import STIFFNESS, Body, BodyContact, body_con
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall
 from mpmjax.boundary._boundary_impulse import (
     BoundaryImpulse,
-    Given,
     GivenCouple,
-    Owners,
     impulse_on_boundaries,
     no_boundary_impulse,
     owners_of,
@@ -22,7 +20,7 @@ from mpmjax.boundary._combined import (
     mirror,
     mirror_motion,
 )
-from mpmjax.boundary._conditions import Conditions
+from mpmjax.boundary._conditions import PARALLEL, Conditions, Given
 from mpmjax.boundary._contact import (
     AbstractContact,
     AbstractNodes,
@@ -52,6 +50,7 @@ __all__ = [
     "EXPLICIT_STIFFNESS",
     "IMPLICIT_STIFFNESS",
     "ON_THE_WALL",
+    "PARALLEL",
     "STIFFNESS",
     "AbstractBoundary",
     "AbstractCollider",
@@ -75,7 +74,6 @@ __all__ = [
     "Mirror",
     "MirrorMotion",
     "MirrorPlace",
-    "Owners",
     "Patch",
     "RigidImage",
     "RigidPart",

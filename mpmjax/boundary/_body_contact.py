@@ -11,6 +11,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Mask, Matrix, NodeVector, Scalar
 from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
 from mpmjax.boundary._coupling import Coupling
+from mpmjax.boundary._friction import share_taken
 from mpmjax.boundary._mirror import Mirror
 from mpmjax.boundary._patch import Patch, moment
 from mpmjax.discretisation import Grid
@@ -179,10 +180,7 @@ class BodyContact(AbstractContact):
         slip = slip - self.normal * (self.normal * slip).sum(axis=1, keepdims=True)
         both = mass[a] + mass[b]
         reduced = mass[a] * mass[b] / jnp.where(both == 0, 1, both)
-        square = (slip**2).sum(axis=1)
-        slides = (square > 0) & (reduced > 0)
-        stopping = reduced * jnp.sqrt(jnp.where(slides, square, 1))
-        share = jnp.where(slides, jnp.minimum(limit / jnp.where(slides, stopping, 1), 1), 0)
+        share = share_taken(slip, reduced, limit)
         impulse = (-share * reduced)[:, None] * slip
         change = jnp.zeros((len(mass), *slip.shape), v.dtype)
         for layer, sign in ((a, 1), (b, -1)):

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, Int, NodeVector, Scalar
 from mpmjax.boundary._boundary import AbstractBoundary
-from mpmjax.boundary._conditions import Conditions
+from mpmjax.boundary._conditions import Given
 from mpmjax.boundary._mirror import Image, Mirror, Tie
 from mpmjax.geometry import moment
 from mpmjax.linalg import pairs
@@ -42,48 +42,24 @@ def no_boundary_impulse(boundaries: int, dim: int, dtype: Any) -> BoundaryImpuls
     return BoundaryImpulse(jnp.zeros((boundaries, dim), dtype), jnp.zeros((boundaries, len(pairs(dim))), dtype))
 
 
-class Owners(eqx.Module):
-    """The numbers of the boundaries that hold each component of the nodes' velocity, −1 for none."""
-
-    fixed: Int[Array, "n d"]
-    """Which one prescribes it, shape (n, d)."""
-    collider: Int[Array, "n"]
-    """Whose normal is held, shape (n,)."""
-
-
 def owners_of(
     boundaries: tuple[AbstractBoundary, ...],
-    conditions: Conditions,
     nodes: NodeVector,
     spacing: Scalar,
     t: Scalar,
     dt: Scalar,
     *,
     reference: bool,
-) -> Owners:
-    """The owners by the rules of `combined_conditions`, whose result is `conditions`: the earlier one holds."""
-    nobody = jnp.full(nodes.shape, -1, jnp.int32)
-    fixed, bodies = nobody, []
+) -> Int[Array, "n d"]:
+    """The number of the boundary that prescribes each component of the nodes' velocity, −1 for none, by the rule of
+    `combined_conditions`: the earlier one holds."""
+    fixed = jnp.full(nodes.shape, -1, jnp.int32)
     for number, boundary in enumerate(boundaries):
         own = boundary.conditions(nodes, spacing, t, dt, reference=reference)
         fixed = jnp.where((fixed < 0) & own.fixed, number, fixed)
-        bodies += [number] * (0 if own.colliders is None else len(own.colliders.pivots))
     for boundary in boundaries:
         fixed = boundary.spread(fixed >= 0, fixed, nodes, spacing)[1]
-    collider = nobody[:, 0]
-    if conditions.colliders is not None:
-        owner = conditions.colliders.owner
-        collider = jnp.where(owner < 0, -1, jnp.asarray(bodies, jnp.int32)[owner])
-    return Owners(fixed, collider)
-
-
-class Given(eqx.Module):
-    """Impulses on the nodes, and the boundaries that give them."""
-
-    impulse: NodeVector
-    """[kg m/s], shape (n, d)."""
-    owner: Int[Array, "..."] | int
-    """The number of the boundary, −1 for none: of all nodes, or of shape (n, 1) or (n, d)."""
+    return fixed
 
 
 def taken_by_mirrors(

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
-from mpmjax.boundary._conditions import ColliderConditions, Conditions, no_conditions
+from mpmjax.boundary._conditions import ColliderConditions, Conditions, Slide, no_conditions
 from mpmjax.boundary._surface_contact import Surface, refuse_contact
 from mpmjax.checks import canonical, require, require_between, require_fields
 from mpmjax.discretisation import Grid
@@ -139,7 +139,8 @@ class SlipCollider(AbstractCollider):
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v·n = v_c·n."""
-        touched = _Body(self, nodes, t, dt, reference).conditions(spacing)
+        body = _Body(self, nodes, t, dt, reference)
+        touched = replace(body.nothing_held(), slides=(body.slide(spacing),))
         return replace(no_conditions(nodes), colliders=touched, holds=True, moves=self.motion is not None)
 
 
@@ -225,33 +226,19 @@ class _Body(eqx.Module):
 
     def nothing_held(self) -> ColliderConditions:
         """The conditions of a body that holds no node."""
-        nothing = jnp.zeros_like(self.nodes)
         return ColliderConditions(
-            normal=nothing,
-            velocity=nothing,
-            held=jnp.zeros(len(self.nodes), bool),
-            owner=jnp.full(len(self.nodes), -1, jnp.int32),
+            slides=(),
             holder=jnp.full(self.nodes.shape, -1, jnp.int32),
             position=self.position,
             pivots=self.pivot[None],
             pivot_velocity=self.pivot_velocity[None],
         )
 
-    def conditions(self, spacing: Scalar) -> ColliderConditions:
-        """The conditions of a body that holds the normal velocity of every node in it, but for nodes where the distance
-        has no slope, as a sampled one may have none."""
+    def slide(self, spacing: Scalar) -> Slide:
+        """The normals of a body that holds every node in it along them, but for nodes where the distance has no slope,
+        as a sampled one may have none."""
         slope = jax.grad(lambda x: self.shape.distance(x).sum())(self.place)
         steepness = length(slope)
-        held = self.holds(spacing) & (steepness > 0)
-        normal = self.motion.turned(slope / jnp.where(held, steepness, 1)[:, None], self.t)
-        return ColliderConditions(
-            normal=jnp.where(held[:, None], normal, 0),
-            velocity=jnp.where(held[:, None], self.velocity, 0),
-            held=held,
-            owner=jnp.where(held, 0, -1).astype(jnp.int32),
-            holder=jnp.full(self.nodes.shape, -1, jnp.int32),
-            position=self.position,
-            pivots=self.pivot[None],
-            pivot_velocity=self.pivot_velocity[None],
-            slides=True,
-        )
+        held = (self.holds(spacing) & (steepness > 0))[:, None]
+        normal = self.motion.turned(slope / jnp.where(held, steepness[:, None], 1), self.t)
+        return Slide(jnp.where(held, normal, 0), jnp.where(held, self.velocity, 0))

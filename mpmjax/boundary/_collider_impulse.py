@@ -6,8 +6,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Float, NodeScalar, NodeVector
-from mpmjax.boundary._conditions import ColliderConditions
+from mpmjax._types import Array, Float, NodeVector
+from mpmjax.boundary._conditions import ColliderConditions, Given
 from mpmjax.geometry import moment
 from mpmjax.linalg import pairs
 
@@ -39,7 +39,7 @@ def no_impulse(colliders: int, dim: int, dtype: Any) -> ColliderImpulse:
 def impulse_on_colliders(
     colliders: ColliderConditions,
     reaction: NodeVector,
-    normal_impulse: NodeScalar | None = None,
+    along_normals: tuple[Given, ...] = (),
     pushes: tuple[tuple[int, NodeVector], ...] = (),
 ) -> ColliderImpulse:
     """The impulse on each collider: minus what it gives the nodes by prescribed components, along normals, by springs
@@ -48,14 +48,13 @@ def impulse_on_colliders(
     Args:
         colliders: the conditions of the colliders, with which node and component is whose.
         reaction: the impulse of all that holds nodes, without springs and friction [kg m/s], shape (n, d).
-        normal_impulse: the part of it by colliders, along their normals [kg m/s], shape (n,).
+        along_normals: the parts of it by colliders, along their normals.
         pushes: impulses by springs and friction on the nodes [kg m/s], shape (n, d), each with its collider's number.
     """
-    along = jnp.zeros_like(reaction) if normal_impulse is None else normal_impulse[:, None] * colliders.normal
     impulse, angular = [], []
     for number, pivot in enumerate(colliders.pivots):
-        given = jnp.where((colliders.owner == number)[:, None], along, 0)
-        given = given + jnp.where(colliders.holder == number, reaction, 0)
+        given = jnp.where(colliders.holder == number, reaction, 0)
+        given = sum((jnp.where(part.owner == number, part.impulse, 0) for part in along_normals), start=given)
         given = sum((push for owner, push in pushes if owner == number), start=given)
         impulse.append(-given.sum(axis=0))
         angular.append(-moment(colliders.position - pivot, given).sum(axis=0))

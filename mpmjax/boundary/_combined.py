@@ -27,8 +27,8 @@ def combined_conditions(
     """The conditions of all boundaries of a scene. Where two prescribe the same component, the earlier one holds.
 
     Contact acts on components that nothing prescribes. A node may have components that are prescribed and, besides
-    them, a collider's normal component: both hold (see `Nodes.free_normal`). A normal that lies within a hundredth of
-    the prescribed components asks for nothing more. Of two colliders' normals the earlier one holds.
+    them, normals of several colliders: all hold (see `Nodes.free_normals`). A normal that lies within a hundredth of
+    the prescribed components and of earlier normals asks for nothing more.
     """
     total = no_conditions(nodes)
     for boundary in boundaries:

@@ -1,23 +1,43 @@
 """The conditions of boundaries on the nodes: prescribed velocities, and those of colliders."""
 
+from dataclasses import replace
+from functools import reduce
+
 import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeVector, Scalar
 from mpmjax.geometry import Motion
 
+PARALLEL = 1e-2
+"""Length of a unit normal's part in free directions up to which it is prescribed by the others."""
+
+
+class Given(eqx.Module):
+    """Impulses on the nodes, and the boundaries or colliders that give them."""
+
+    impulse: NodeVector
+    """[kg m/s], shape (n, d)."""
+    owner: Int[Array, "..."] | int
+    """The number of the boundary or collider, −1 for none: of all nodes, or of shape (n, 1) or (n, d)."""
+
+
+class Slide(eqx.Module):
+    """A collider that holds the nodes in it along its normal."""
+
+    normal: NodeVector
+    """Unit normal out of it, shape (n, d); zero at nodes that it does not hold."""
+    velocity: NodeVector
+    """Its velocity there [m/s], shape (n, d)."""
+    number: int = eqx.field(static=True, default=0)
+    """Its number among the colliders."""
+
 
 class ColliderConditions(eqx.Module):
     """The conditions of k colliders on the nodes that lie in them."""
 
-    normal: NodeVector
-    """Unit normal out of the collider that holds the node along it, shape (n, d); zero where none does."""
-    velocity: NodeVector
-    """Velocity of that collider there [m/s], shape (n, d)."""
-    held: Bool[Array, "n"]
-    """Whether the normal component of the node's velocity is held, shape (n,)."""
-    owner: Int[Array, "n"]
-    """Number of that collider, −1 for none, shape (n,)."""
+    slides: tuple[Slide, ...]
+    """Those along which nodes slide."""
     holder: Int[Array, "n d"]
     """Number of the collider that prescribes each component, −1 for none, shape (n, d)."""
     position: NodeVector
@@ -26,28 +46,27 @@ class ColliderConditions(eqx.Module):
     """The points about which the colliders' torques are taken [m], shape (k, d)."""
     pivot_velocity: Float[Array, "k d"]
     """Their velocity [m/s], shape (k, d)."""
-    slides: bool = eqx.field(static=True, default=False)
-    """Whether there is a body along which nodes slide."""
+
+    @property
+    def touched(self) -> Bool[Array, "n"]:
+        """The nodes of which any component is held, shape (n,)."""
+        return reduce(
+            jnp.logical_or, (slide.normal.any(axis=1) for slide in self.slides), (self.holder >= 0).any(axis=1)
+        )
 
     def beside(self, later: "ColliderConditions") -> "ColliderConditions":
-        """Both conditions; where two normals meet at a node, that of the earlier collider."""
+        """Both conditions."""
         number = len(self.pivots)
 
         def numbered(n: Array) -> Array:
             return jnp.where(n < 0, n, n + number)
 
-        mine = self.owner >= 0
-        touched = mine | (self.holder >= 0).any(axis=1)
         return ColliderConditions(
-            normal=jnp.where(mine[:, None], self.normal, later.normal),
-            velocity=jnp.where(mine[:, None], self.velocity, later.velocity),
-            held=jnp.where(mine, self.held, later.held),
-            owner=jnp.where(mine, self.owner, numbered(later.owner)),
+            slides=self.slides + tuple(replace(slide, number=slide.number + number) for slide in later.slides),
             holder=jnp.where(self.holder >= 0, self.holder, numbered(later.holder)),
-            position=jnp.where(touched[:, None], self.position, later.position),
+            position=jnp.where(self.touched[:, None], self.position, later.position),
             pivots=jnp.concatenate([self.pivots, later.pivots]),
             pivot_velocity=jnp.concatenate([self.pivot_velocity, later.pivot_velocity]),
-            slides=self.slides or later.slides,
         )
 
     def after(self, time: Scalar, velocity: NodeVector) -> "ColliderConditions":

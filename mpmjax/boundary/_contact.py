@@ -26,7 +26,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
-from mpmjax.boundary._conditions import Conditions
+from mpmjax.boundary._conditions import Conditions, Given
 from mpmjax.boundary._coupling import Coupling
 from mpmjax.boundary._mirror import Image, Mirror
 from mpmjax.boundary._springs import Springs
@@ -54,8 +54,8 @@ class AbstractNodes(eqx.Module):
 
     @property
     @abc.abstractmethod
-    def free_normal(self) -> Any:
-        """The free part of the colliders' normals; None without colliders."""
+    def free_normals(self) -> tuple[Any, ...]:
+        """The free parts of the colliders' normals."""
 
     @property
     @abc.abstractmethod
@@ -72,7 +72,6 @@ class AbstractNodes(eqx.Module):
         self: "N",
         images: Mirror,
         fixed: Mask,
-        normals: Bool[Array, "n"] | None,
         springs: tuple[Springs, ...],
         couplings: tuple[Coupling, ...],
     ) -> "N":
@@ -81,7 +80,6 @@ class AbstractNodes(eqx.Module):
         Args:
             images: mirrors on which the nodes are folded.
             fixed: components of velocity that are prescribed, shape (n, d).
-            normals: nodes whose component along a collider's normal is held too, shape (n,).
             springs: the springs of what is held by springs.
             couplings: the springs between bodies that are held by such.
         """
@@ -207,11 +205,6 @@ class AbstractContact(eqx.Module):
         """The components of velocity on which the held places act, shape (n, d). Default: those of `fixed`."""
         return self.fixed(active, shape)
 
-    def normals(self, active: Array) -> Bool[Array, "n"] | None:
-        """The nodes whose component along a collider's normal is held, shape (n,); None without any."""
-        del active
-        return None
-
     def representative(self) -> Bool[Array, "n"] | None:
         """One node of each place, shape (n,), by which places are counted; None where each node is a place."""
         return None
@@ -233,42 +226,40 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     as velocities are; None for none, as in an explicit step."""
 
     @property
-    def normal(self) -> NodeVector | None:
-        """The free parts of the normals that colliders hold, of length one, shape (n, d); None without colliders."""
-        return None if self.unheld.conditions.colliders is None else self.nodes.projection.normal
+    def normals(self) -> tuple[NodeVector, ...]:
+        """Unit vectors at right angles along which colliders hold nodes, each (n, d)."""
+        return self.nodes.projection.normals
 
     @property
     def mass(self) -> NodeScalar:
         """The nodes' mass, folded on the mirrors [kg], shape (n,)."""
         return self.images.fold_scalar(self.unheld.mass)
 
-    def beyond_boundaries(self) -> tuple[Mask, NodeVector | None]:
+    def beyond_boundaries(self) -> tuple[Mask, tuple[NodeVector, ...]]:
         """The components of velocity on which no boundary acts, shape (n, d), and the normals that colliders hold."""
-        free, normal = self.unheld.free, self.normal
+        free = self.unheld.free
         for contact, active in zip(self.unheld.contacts, self.active, strict=True):
             free = free & ~contact.reached(active, free.shape)
-        return free, None if normal is None else jnp.where(free, normal, 0)
+        return free, tuple(jnp.where(free, normal, 0) for normal in self.normals)
 
-    def collider_impulse(self, residual: NodeVector) -> NodeScalar | None:
-        """The impulse by which colliders hold each node along their normals [kg m/s], shape (n,), outward positive;
-        None without colliders.
+    def along_normals(self, residual: NodeVector) -> tuple[Given, ...]:
+        """The impulses by which colliders hold nodes along their normals, by the colliders' numbers.
 
         Args:
-            residual: the impulse that is missing at each node [kg m/s], shape (n, d). It is the collider's impulse
-                times n, plus what holds the prescribed components: along the free part of n it is the impulse alone,
-                times the part's length.
+            residual: the impulse that is missing at each node [kg m/s], shape (n, d). It is what holds the prescribed
+                components, plus each collider's impulse times its normal. The direction of the last one is at right
+                angles to all others: along it, it is the last one's impulse alone, times the length of its part.
         """
-        part, normal = self.nodes.free_normal, self.normal
-        if part is None or normal is None:
-            return None
-        return (normal * self.images.fold(residual)).sum(axis=1) / part.length
+        given, left = [], self.images.fold(residual)
+        for part in reversed(self.nodes.free_normals):
+            impulse = ((part.direction * left).sum(axis=1) / part.length)[:, None] * part.normal
+            given.append(Given(impulse, part.owner[:, None]))
+            left = left - impulse
+        return tuple(given)
 
     def beside_colliders(self, residual: NodeVector) -> NodeVector:
         """The residual without what colliders hold along their normals: what walls and planes hold."""
-        impulse, colliders = self.collider_impulse(residual), self.unheld.conditions.colliders
-        if impulse is None or colliders is None:
-            return residual
-        return residual - impulse[:, None] * colliders.normal
+        return residual - sum(part.impulse for part in self.along_normals(residual))
 
     def impulse(self, residual: NodeVector) -> NodeVector:
         """The impulse of walls, planes and contacts, without colliders, on each true node [kg m/s], shape (n, d).
@@ -358,14 +349,12 @@ def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
     """
     pairs = list(zip(nodes.contacts, active, strict=True))
     images = Mirror(tuple(image.within(mask) for contact, mask in pairs if (image := contact.mirror_image) is not None))
-    fixed, normals = nodes.conditions.fixed, None
+    fixed = nodes.conditions.fixed
     for contact, mask in pairs:
         fixed = fixed | contact.fixed(mask, fixed.shape)
-        along = contact.normals(mask)
-        normals = along if normals is None else normals
     springs = tuple(found for contact, mask in pairs if (found := contact.springs(mask)) is not None)
     couplings = tuple(joined for contact, mask in pairs if (joined := contact.coupling(mask)) is not None)
-    return ConstrainedNodes(nodes, active, images, nodes.constrained(images, fixed, normals, springs, couplings))
+    return ConstrainedNodes(nodes, active, images, nodes.constrained(images, fixed, springs, couplings))
 
 
 def count_places(nodes: AbstractNodes, *sets: ActiveSet) -> Int[Array, ""]:

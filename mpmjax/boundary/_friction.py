@@ -1,8 +1,14 @@
-"""Coulomb friction at nodes: an impulse after the solve, opposed to what slides."""
+"""Coulomb friction at nodes: an impulse after the solve, opposed to what slides.
+
+It takes the share min(1, limit/(m ‖s‖)) of the slip s. Where that is 1 the node sticks, and the derivative is that of
+sticking: d(s after)/ds = 0, at rest too, where s = 0. At the kink, limit = m ‖s‖, it is the one on the side of
+sticking. Where nothing pushes there is no friction and no derivative of it.
+"""
 
 import jax.numpy as jnp
 
 from mpmjax._types import NodeScalar, NodeVector
+from mpmjax.boundary._conditions import PARALLEL
 from mpmjax.boundary._contact import ConstrainedNodes
 
 
@@ -15,18 +21,10 @@ def friction_across(held: ConstrainedNodes, axis: int, limit: NodeScalar, v: Nod
         limit: the largest impulse of friction at each node [kg m/s], shape (n,).
         v: velocity of all nodes [m/s], shape (n, d).
     """
-    mass, normal = held.mass, held.normal
     tangent = jnp.arange(v.shape[1]) != axis
-    slip = jnp.where(tangent, v, 0)
-    if normal is not None:  # what a collider holds along it, without the part that is not along the wall
-        along = jnp.where(tangent, normal, 0)
-        square = (along**2).sum(axis=1, keepdims=True)
-        slip = slip - along * (along * slip).sum(axis=1, keepdims=True) / jnp.where(square == 0, 1, square)
-    square = (slip**2).sum(axis=1)
-    speed = jnp.sqrt(jnp.where(square == 0, 1, square))
-    share = jnp.minimum(limit / jnp.where(mass == 0, 1, mass) / speed, 1)
+    slip = _across(jnp.where(tangent, v, 0), [jnp.where(tangent, normal, 0) for normal in held.normals])
     free = tangent & ~held.unheld.conditions.fixed
-    return -jnp.where(free & (square > 0)[:, None], share[:, None] * slip, 0)
+    return -jnp.where(free, share_taken(slip, held.mass, limit)[:, None] * slip, 0)
 
 
 def friction_along(
@@ -42,13 +40,39 @@ def friction_along(
         limit: the largest impulse of friction at each node [kg m/s], shape (n,).
         v: velocity of all nodes [m/s], shape (n, d).
     """
-    mass = held.nodes.mass
     square = (normal**2).sum(axis=1)
     unit = normal / jnp.sqrt(jnp.where(square == 0, 1, square))[:, None]
-    slip = v - moving
-    slip = held.nodes.projection.combine(slip - unit * (unit * slip).sum(axis=1, keepdims=True), 0)
-    speed = (slip**2).sum(axis=1)
-    slides = (square > 0) & (speed > 0) & (mass > 0)
-    stopping = mass * jnp.sqrt(jnp.where(slides, speed, 1))
-    share = jnp.where(slides, jnp.minimum(limit / jnp.where(slides, stopping, 1), 1), 0)
-    return -share[:, None] * slip
+    free = held.nodes.free
+    slip = _across(jnp.where(free, v - moving, 0), [*held.normals, jnp.where(free, unit, 0)])
+    pushed = jnp.where(square > 0, limit, 0)
+    return -share_taken(slip, held.nodes.mass, pushed)[:, None] * slip
+
+
+def _across(v: NodeVector, directions: list[NodeVector]) -> NodeVector:
+    """A velocity without its parts along some directions, each (n, d), of length one or less. One that lies within a
+    hundredth of those before it changes nothing."""
+    earlier = []
+    for along in directions:
+        for unit in earlier:
+            along = along - unit * (unit * along).sum(axis=1, keepdims=True)
+        square = (along**2).sum(axis=1, keepdims=True)
+        some = square > PARALLEL**2
+        unit = jnp.where(some, along / jnp.sqrt(jnp.where(some, square, 1)), 0)
+        v = v - unit * (unit * v).sum(axis=1, keepdims=True)
+        earlier.append(unit)
+    return v
+
+
+def share_taken(slip: NodeVector, mass: NodeScalar, limit: NodeScalar) -> NodeScalar:
+    """The share of the slip that friction takes, min(1, limit/(m ‖s‖)), shape (n,).
+
+    Args:
+        slip: s [m/s], shape (n, d).
+        mass: the mass that slides at each node [kg], shape (n,).
+        limit: the largest impulse of friction at each node [kg m/s], shape (n,).
+    """
+    square = (slip**2).sum(axis=1)
+    moves = (square > 0) & (mass > 0)
+    stopping = mass * jnp.sqrt(jnp.where(moves, square, 1))
+    slides = moves & (stopping > limit)
+    return jnp.where(slides, limit / jnp.where(slides, stopping, 1), jnp.where((limit > 0) & (mass > 0), 1, 0))

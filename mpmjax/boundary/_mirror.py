@@ -6,6 +6,7 @@ implicit one is Bᵀ(M + βΔt²H)B. The transfers know nothing of it. At a `Sym
 a `ContactPlane` only in the *columns* (lines of nodes along the normal) that it holds.
 """
 
+import math
 from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple
 
@@ -68,6 +69,11 @@ class Image(eqx.Module):
     moving: bool = eqx.field(static=True, default=False)
     """Whether the mirror moves along its normal with a velocity V. The normal velocity of a node beyond it is then 2V
     minus that of its image, and V on it. What a node on it or beyond has itself, V or 2V, is the part that is added."""
+
+    @property
+    def size(self) -> int:
+        """n, the number of nodes."""
+        return self.layers * math.prod(self.shape)
 
     def scalar(self, field: NodeScalar) -> NodeScalar:
         """B for an even scalar field."""

@@ -1,6 +1,5 @@
 """Contact with mirrored planes."""
 
-import math
 from dataclasses import replace
 
 import equinox as eqx
@@ -47,7 +46,7 @@ class PlaneContact(AbstractContact):
             stencil: stencil of the particles.
         """
         reached = self.image.column(
-            scatter(stencil, shut.astype(stencil.weights.dtype)[None], None, math.prod(self.image.shape))[:, 0]
+            scatter(stencil, shut.astype(stencil.weights.dtype)[None], None, self.image.size)[:, 0]
         )
         return replace(self, shut=reached > 0)
 

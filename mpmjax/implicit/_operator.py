@@ -96,7 +96,7 @@ class ImplicitOperator(AbstractSymmetricOperator):
     ) -> tuple[NodeVector, Float[Array, ""]]:
         """Without held normals, all but H v in one pass."""
         free = self.projection.free
-        if self.projection.normal is not None:
+        if self.projection.normals:
             return super().product(v, weight, active)
         force = self.hessian(self.projection.combine(v, 0)).reshape(-1)
         image, square = product(
@@ -109,7 +109,7 @@ class ImplicitOperator(AbstractSymmetricOperator):
 
     def matrices(self) -> ParticleMatrices | None:
         hessian, free = self.hessian, self.projection.free
-        if self.projection.normal is not None or not isinstance(hessian, ParticleStiffness) or not hessian.alone:
+        if self.projection.normals or not isinstance(hessian, ParticleStiffness) or not hessian.alone:
             return None
         stencil = hessian.stencil
         return ParticleMatrices(

@@ -84,7 +84,7 @@ def _solve_jvp(primals: Any, tangents: Any) -> Any:
 
     combine = problem.projection.combine
     rhs, lift = combine(-d_residual, 0), None
-    if problem.prescribed is not None or problem.projection.normal is not None:  # else it stays at rest
+    if problem.prescribed is not None or problem.projection.normals:  # else it stays at rest
         lift = combine(0, -d_residual)
         rhs = combine(rhs - operator.unconstrained(lift), 0)
     d_slot = rhs[:0].sum() + (0 if d_slot is None else d_slot)  # a zero that keeps d_slot linear in the tangents

@@ -34,6 +34,7 @@ def warn_of_oversights(grid: Grid, kernel: BSpline, boundary: Boundaries, partic
         particles: the particles, as they start.
         total: whether the description is total Lagrangian: colliders that lie over the body then hold it.
     """
+    grid = grid.with_layers(1)  # the nodes of all bodies are at the same places
     resting = tuple(c.rests(total=total) and not grid.follow for c in boundary)
     probe, given = partial(_probe, resting=resting, total=total), (boundary, grid, particles.x, particles.volume)
     some = jax.tree.leaves(eqx.filter_eval_shape(probe, *given))  # none, and no compiling, of walls
@@ -92,7 +93,7 @@ def _nearest(boundary: AbstractBoundary, grid: Grid, volume: Array) -> Array:
 def _acts(conditions: Conditions) -> Bool[Array, "n"]:
     """The nodes on which a boundary acts, (n,)."""
     acts, colliders = conditions.fixed.any(axis=1), conditions.colliders
-    return acts if colliders is None else acts | (colliders.owner >= 0)
+    return acts if colliders is None else acts | colliders.touched
 
 
 def _beyond(boundary: AbstractBoundary, grid: Grid, particles: Particles) -> int:

@@ -1,6 +1,5 @@
 """What each boundary of a scene receives in a step, from the motion of the nodes and the impulses that made it."""
 
-import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, Int, NodeScalar, NodeVector, Scalar
@@ -10,7 +9,6 @@ from mpmjax.boundary import (
     Given,
     GivenCouple,
     Image,
-    Owners,
     RigidImage,
     brought_images,
     impulse_on_boundaries,
@@ -61,9 +59,9 @@ def given_to_boundaries(
     grid, window, dt = scene.grid, scene.window(particles), nodes.dt
     images = brought_images(scene.boundary, grid, window)
     contacts = list(zip(nodes.brought_by, nodes.contacts, held.active, strict=True))
-    unfold, colliders = nodes.mirror.unfold, nodes.conditions.colliders
+    unfold = nodes.mirror.unfold
     at = scene.nodes(particles, t)
-    owners = owners_of(scene.boundary, nodes.conditions, at, grid.spacing, t, dt, reference=scene.total)
+    owners = owners_of(scene.boundary, at, grid.spacing, t, dt, reference=scene.total)
     planes = [(number, image) for number, image in images if isinstance(image, Image)]
     couples, soft = [], jnp.ones_like(unfolded.mass, dtype=bool)
     for body, image in zip(scene.rigid_bodies, nodes.mirror.rigid, strict=True):
@@ -90,18 +88,18 @@ def given_to_boundaries(
     given += of_planes
 
     # then colliders along their normals, contact planes, and what is prescribed
-    along = held.collider_impulse(residual)
-    if along is not None and colliders is not None:
-        given.append(Given(along[:, None] * colliders.normal, owners.collider[:, None]))
-        residual = residual - given[-1].impulse
+    bodies = jnp.asarray([n for n, boundary in enumerate(scene.boundary) for _ in range(boundary.bodies)], jnp.int32)
+    for part in held.along_normals(residual):
+        given.append(Given(part.impulse, jnp.where(part.owner < 0, -1, bodies[part.owner])))
+        residual = residual - part.impulse
     columns = [
         (number, image.within(active))
         for number, contact, active in contacts
         if number is not None and (image := contact.mirror_image) is not None
     ]
     of_planes, residual = taken_by_mirrors(residual, columns)
-    given += [*of_planes, Given(residual, owners.fixed)]
-    taken = owners.fixed >= 0
+    given += [*of_planes, Given(residual, owners)]
+    taken = owners >= 0
     for number, contact, active in contacts:
         if number is not None:
             mine = contact.fixed(active, residual.shape) & ~taken
@@ -127,13 +125,13 @@ def given_to_boundaries(
 
 
 def _spread(
-    owners: Owners,
+    owners: Int[Array, "n d"],
     image: RigidImage,
     mass: NodeScalar,
     planes: list[tuple[int, Image]],
     freedom: Freedom,
     guide: int | None,
-) -> tuple[Owners, Int[Array, ""]]:
+) -> tuple[Int[Array, "n d"], Int[Array, ""]]:
     """The owners where what holds a node of a rigid body holds all of them in this direction, and who holds its spin.
 
     The body's own guides hold what they forbid, else the first one holds. Directions in which nothing is held add up to
@@ -147,7 +145,7 @@ def _spread(
         freedom: what the body may do.
         guide: the number of its guides; None if it has none.
     """
-    own, full = image.own(owners.fixed), image.own(mass) > 0
+    own, full = image.own(owners), image.own(mass) > 0
     nobody = jnp.iinfo(own.dtype).max
     first = jnp.where((own >= 0) & full[:, None], own, nobody).min(axis=0)
     for number, plane in planes:
@@ -159,8 +157,7 @@ def _spread(
     if guide is not None and freedom.directions is not None:
         first = jnp.where(jnp.asarray(freedom.directions), first, guide)
     first, of_spin = (jnp.where(number == nobody, -1, number) for number in (first, of_spin))
-    spread = image.with_own(owners.fixed, jnp.broadcast_to(first, own.shape))
-    return eqx.tree_at(lambda o: o.fixed, owners, spread), of_spin
+    return image.with_own(owners, jnp.broadcast_to(first, own.shape)), of_spin
 
 
 def _couple(image: RigidImage, unfolded: Nodes, nodes: Nodes, solved: NodeVector) -> Float[Array, "r"]:
@@ -187,7 +184,13 @@ def _share_of_change(transfer: AbstractTransfer, dim: int, dtype: jnp.dtype) -> 
 
 
 def _moved_places(
-    scene: Scene, particles: Particles, stencil: Stencil, nodes: Nodes, owners: Owners, reference: NodeVector, t: Scalar
+    scene: Scene,
+    particles: Particles,
+    stencil: Stencil,
+    nodes: Nodes,
+    owners: Int[Array, "n d"],
+    reference: NodeVector,
+    t: Scalar,
 ) -> NodeVector:
     """Where the body has moved the nodes of the reference configuration at time t [m], shape (n, d)."""
     colliders, places = nodes.conditions.colliders, reference
@@ -195,11 +198,10 @@ def _moved_places(
     for number, boundary in enumerate(scene.boundary):
         carried = boundary.carried(reference, t)
         if carried is not None:
-            places = jnp.where((owners.fixed == number).all(axis=1, keepdims=True), carried, places)
+            places = jnp.where((owners == number).all(axis=1, keepdims=True), carried, places)
     if colliders is None:
         return places
-    touched = (colliders.owner >= 0) | (colliders.holder >= 0).any(axis=1)
-    return jnp.where(touched[:, None], colliders.position, places)
+    return jnp.where(colliders.touched[:, None], colliders.position, places)
 
 
 def _pivots(scene: Scene, t: Scalar, like: NodeVector) -> Array:

@@ -8,8 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
+from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar, components
 from mpmjax.boundary import (
+    PARALLEL,
     AbstractContact,
     AbstractNodes,
     Conditions,
@@ -30,12 +31,14 @@ from mpmjax.stepping._nodal_sums import JoinedSum, SeparateSums, per_mass
 from mpmjax.stepping._particle_faces import faces_of
 from mpmjax.stepping._rigid_layers import RigidLayers, rigid_layers
 
-_PARALLEL = 1e-2  # a normal whose part in free components is smaller is prescribed by the others
-
 
 class FreeNormal(eqx.Module):
-    """The part of the colliders' normals in free components."""
+    """A collider's normal at each node, and its part in free components at right angles to those of earlier ones."""
 
+    normal: NodeVector
+    """The collider's unit normal, shape (n, d)."""
+    owner: Int[Array, "n"]
+    """The collider's number, shape (n,); −1 where there is no such part."""
     direction: NodeVector
     """Unit vector along that part, shape (n, d); zero where there is none."""
     length: NodeScalar
@@ -121,32 +124,43 @@ class Nodes(AbstractNodes):
         return self.potential.mirror
 
     @property
-    def free_normal(self) -> FreeNormal | None:
-        """The part of the colliders' normals in free components, held or not; None without colliders.
+    def free_normals(self) -> tuple[FreeNormal, ...]:
+        """The parts of the colliders' normals in free components, made orthogonal in the colliders' order, as many as a
+        node can have.
 
-        With components a prescribed, n·v = n·v_c becomes Σ_free n v = n·v_c − Σ_a n_a v_a.
+        With components a prescribed, n·v = n·v_c becomes Σ_free n v = n·v_c − Σ_a n_a v_a, and so for earlier parts.
         """
-        colliders = self.conditions.colliders
-        if colliders is None:
-            return None
-        part = jnp.where(self.free, colliders.normal, 0)
-        square = (part**2).sum(axis=1)
-        some = square > _PARALLEL**2
-        length = jnp.sqrt(jnp.where(some, square, 1))
-        missing = colliders.normal * (colliders.velocity - jnp.where(self.free, 0, self.conditions.velocity))
-        return FreeNormal(
-            direction=jnp.where(some[:, None], part / length[:, None], 0),
-            length=length,
-            speed=jnp.where(some, missing.sum(axis=1) / length, 0),
-        )
+        colliders, found = self.conditions.colliders, []
+        for slide in () if colliders is None else colliders.slides:
+            part = jnp.where(self.free, slide.normal, 0)
+            missing = slide.normal * (slide.velocity - jnp.where(self.free, 0, self.conditions.velocity))
+            missing = missing.sum(axis=1)
+            for other in found:
+                share = (part * other.direction).sum(axis=1)
+                part, missing = part - share[:, None] * other.direction, missing - share * other.speed
+            square = (part**2).sum(axis=1)
+            some = square > PARALLEL**2
+            length = jnp.sqrt(jnp.where(some, square, 1))
+            new = FreeNormal(
+                normal=slide.normal,
+                owner=jnp.where(some, jnp.int32(slide.number), -1),
+                direction=jnp.where(some[:, None], part / length[:, None], 0),
+                length=length,
+                speed=jnp.where(some, missing / length, 0),
+            )
+            for place, old in enumerate(found):  # each node's first place that is empty
+                taken = old.owner >= 0
+                found[place] = _where(taken, old, new)
+                new = _where(taken, new, jax.tree.map(jnp.zeros_like, new))
+                new = replace(new, owner=jnp.where(taken, new.owner, -1), length=jnp.where(taken, new.length, 1))
+            if len(found) < self.conditions.fixed.shape[1]:
+                found.append(new)
+        return tuple(found)
 
     @property
     def projection(self) -> Projection:
         """The projection on the components of velocity that nothing holds."""
-        colliders, part = self.conditions.colliders, self.free_normal
-        if colliders is None or part is None:
-            return Projection(self.free)
-        return Projection(self.free, jnp.where(colliders.held[:, None], part.direction, 0))
+        return Projection(self.free, tuple(part.direction for part in self.free_normals))
 
     @property
     def moves_held(self) -> bool:
@@ -156,12 +170,13 @@ class Nodes(AbstractNodes):
     @property
     def prescribed(self) -> NodeVector:
         """The velocity of held components [m/s], shape (n, d)."""
-        part, velocity = self.free_normal, self.conditions.velocity
+        parts, velocity = self.free_normals, self.conditions.velocity
         if self.mirror_motion is not None:
             velocity = jnp.where(self.mirror_motion.beyond, self.mirror_motion.velocity, velocity)
-        if part is None:
+        if not parts:
             return velocity
-        return jnp.where(self.free, part.direction * part.speed[:, None], velocity)
+        along = reduce(jnp.add, (part.direction * part.speed[:, None] for part in parts))
+        return jnp.where(self.free, along, velocity)
 
     def explicit_velocity(self) -> NodeVector:
         """v* = v^n + Δt f/m + Δt g [m/s], shape (n, d) (derivation, eq. 4)."""
@@ -212,20 +227,20 @@ class Nodes(AbstractNodes):
         self,
         images: Mirror,
         fixed: Mask,
-        normals: Bool[Array, "n"] | None,
         springs: tuple[Springs, ...],
         couplings: tuple[Coupling, ...],
     ) -> "Nodes":
-        """The nodes folded at these mirrors, with the components `fixed` and the `normals` held too, and the force of
-        the springs and couplings."""
-        colliders = self.conditions.colliders
+        """The nodes folded at these mirrors, with the components `fixed` held, and the force of the springs and
+        couplings."""
         nodes = replace(self.folded(images), conditions=replace(self.conditions, fixed=fixed, holds=True))
         if springs or couplings:
             nodes = eqx.tree_at(lambda n: (n.potential.springs, n.potential.couplings), nodes, (springs, couplings))
             nodes = replace(nodes, sums=nodes.sums.with_force(nodes.potential.spring_force(None), nodes.mass, self.dt))
-        if normals is None or colliders is None:
-            return nodes
-        return eqx.tree_at(lambda n: n.conditions.colliders.held, nodes, colliders.held | normals)
+        return nodes
+
+
+def _where(mask: Bool[Array, "n"], a: FreeNormal, b: FreeNormal) -> FreeNormal:
+    return jax.tree.map(lambda x, y: jnp.where(mask if x.ndim == 1 else mask[:, None], x, y), a, b)
 
 
 def particles_to_grid(
@@ -301,8 +316,10 @@ def particles_to_grid(
         places = scene.nodes(particles, t)
         conditions = combined_conditions(scene.boundary, places, grid.spacing, t, dt, reference=scene.total)
         if scene.total and conditions.colliders is not None and conditions.colliders.slides:
-            slid = (conditions.colliders.owner >= 0) & (mass > 0)
-            place = jnp.where(slid[:, None], places_of(particles, stencil, grid.size), conditions.colliders.position)
+            slid = reduce(jnp.logical_or, (slide.normal.any(axis=1) for slide in conditions.colliders.slides))
+            place = jnp.where(
+                (slid & (mass > 0))[:, None], places_of(particles, stencil, grid.size), conditions.colliders.position
+            )
             conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
         faces = faces_of(scene, particles, potential.material_points, stencil, dt, force_at)
         acts_at = t if force_at is None else t + jnp.where(jnp.asarray(force_at) > 0, dt, 0)

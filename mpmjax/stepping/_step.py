@@ -8,13 +8,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Int, NodeScalar, NodeVector, Scalar, components, particle_first
+from mpmjax._types import Array, Int, NodeVector, Scalar, components, particle_first
 from mpmjax.autodiff import kept, without_derivative
 from mpmjax.boundary import (
     BoundaryImpulse,
     ColliderImpulse,
     ConstrainedNodes,
     ContactInfo,
+    Given,
     constrain,
     find_active_set,
     impulse_on_colliders,
@@ -74,8 +75,8 @@ class GridUpdate(eqx.Module):
     """`motion` before friction."""
     slowed: tuple[NodeVector, ...] = ()
     """The change of velocity by the friction of each contact [m/s], shape (n, d)."""
-    normal_impulse: NodeScalar | None = None
-    """The impulse of colliders along their normals [kg m/s], shape (n,); None without colliders."""
+    along_normals: tuple[Given, ...] = ()
+    """The impulses of colliders along their normals, by the colliders' numbers."""
     holding: NodeVector | None = None
     """The part of `reaction` that holds components of velocity, without springs [kg m/s], shape (n, d); None if that is
     all."""
@@ -152,7 +153,7 @@ def _given_to_colliders(nodes: Nodes, method: AbstractIntegrator, new: GridUpdat
     if share is not None:
         colliders = colliders.after(share * nodes.dt, nodes.mirror.unfold(new.motion.carrier))
     holding = new.reaction if new.holding is None else new.holding
-    return impulse_on_colliders(colliders, holding, new.normal_impulse, new.pushes)
+    return impulse_on_colliders(colliders, holding, new.along_normals, new.pushes)
 
 
 def _left_undone(
@@ -201,7 +202,7 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
                 contact=no_contact(),
                 held=held,
                 solved=motion,
-                normal_impulse=held.collider_impulse(reaction),
+                along_normals=held.along_normals(reaction),
             )
 
         def moved(
@@ -225,7 +226,6 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
         held, motion, info = moved(constrain(nodes, active), method, guess)
         internal, reaction, viscous = impulses(nodes, method, motion)
         holding = held.beside_springs(reaction)
-        normal = held.collider_impulse(holding)
         final, slowed = held.friction(motion.velocity, holding)
         change = final - motion.velocity
         return GridUpdate(
@@ -241,7 +241,7 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
             held=held,
             solved=motion,
             slowed=slowed,
-            normal_impulse=normal,
+            along_normals=held.along_normals(holding),
             holding=holding,
             pushes=held.pushes(slowed),
         )
