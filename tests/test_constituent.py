@@ -5,7 +5,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import METHODS, QUICK, SECOND_ORDER, assert_close, block, ids, thorough
+from helpers import (
+    ELASTIC,
+    FLUIDS,
+    METHODS,
+    PLASTIC,
+    QUICK,
+    SECOND_ORDER,
+    VISCOUS,
+    assert_close,
+    block,
+    ids,
+    thorough,
+)
 
 import mpmjax as mpm
 
@@ -112,8 +124,13 @@ def test_what_does_not_fit_is_refused():
     two = mpm.Scene(scene.grid, (SOFT, HARD))
     with pytest.raises(ValueError, match=r"The scene has 2 laws, so the particles must be 2 sets .* got 1\."):
         mpm.prepare(two, particles)
-    with pytest.raises(ValueError, match="Join particles before they are prepared"):
+    with pytest.raises(ValueError, match="All joined particles must have deformations or none: prepare each"):
         mpm.join(mpm.prepare(scene, particles), particles)
+    snow = mpm.prepare(mpm.Scene(scene.grid, mpm.Snow()), particles)
+    with pytest.raises(ValueError, match="must have been prepared for one law"):
+        mpm.prepare(scene, mpm.join(mpm.prepare(scene, particles), snow))
+    with pytest.raises(ValueError, match="number of one of the first set's 1 materials"):
+        mpm.join(particles, particles, material=1)
     with pytest.raises(ValueError, match="one dimension and precision"):
         mpm.join(particles, block(1)[1])
     with pytest.raises(ValueError, match=r"The total description keeps .* use the updated one for Snow"):
@@ -127,6 +144,29 @@ def test_one_law_takes_joined_particles_as_one_set():
     both = mpm.prepare(scene, mpm.join(particles, particles))
     assert both.counts is None
     assert both.F.shape == (2 * particles.count, 2, 2)
+
+
+@pytest.mark.parametrize("law", **ids(ELASTIC | PLASTIC | FLUIDS | VISCOUS))
+def test_prepared_particles_are_joined_with_all_that_they_have(law):
+    """In a scene of one law, and as more of one material of several."""
+    scene, particles = block(2, material=law)
+    one = mpm.prepare(scene, particles)
+    one = jax.tree.map(lambda a: a + 0.01 * jnp.linspace(0, 1, a.size).reshape(a.shape), one)  # no two alike
+    two = jax.tree.map(lambda a: 1.1 * a, one)
+    expected = jax.tree.leaves(jax.tree.map(lambda a, b: jnp.concatenate([a, b]), one, two))
+    for both in (mpm.join(one, two, material=0), mpm.join(one, two)):
+        joined = mpm.prepare(scene, both)
+        assert joined.counts is None
+        for a, b in zip(jax.tree.leaves(joined), expected, strict=True):
+            np.testing.assert_array_equal(a, b)
+    more = mpm.join(mpm.join(one, two), one, material=0)
+    assert more.counts == (2 * one.count, two.count)
+    several = mpm.prepare(mpm.Scene(scene.grid, (law, law)), more)
+    of = (q.groups[k][1:] for q, k in ((several, 0), (several, 1), (one, 0), (two, 0)))
+    for a, b, c, d in zip(*map(jax.tree.leaves, of), strict=True):
+        np.testing.assert_array_equal(a, jnp.concatenate([c, c]))
+        np.testing.assert_array_equal(b, d)
+    np.testing.assert_array_equal(several.x, jnp.concatenate([one.x, one.x, two.x]))
 
 
 def test_a_fault_is_named_by_the_particle_of_the_whole_set():

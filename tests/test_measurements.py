@@ -2,6 +2,7 @@
 
 import csv
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import mpmjax as mpm
 from mpmjax.cli._fit_file import read_fit
 from mpmjax.cli._scene_file import read_simulation
+from mpmjax.fitting._problem import FitProblem
 from mpmjax.state import with_state
 
 SCENE = """
@@ -120,6 +122,18 @@ def test_velocity_and_spin_are_those_of_the_body(pushed):
         inertia = (np.asarray(q.mass) * (arms**2).sum(axis=1)).sum()
         assert momentum == pytest.approx(3 * inertia)
         assert np.allclose(q.C - before.C, [[[0, -3], [3, 0]]])
+
+    def spun(e, w):  # velocities alone, of which the fit knows the gradient
+        x = e.particles.x - e.particles.x.mean(axis=0)
+        return eqx.tree_at(lambda e: e.particles.v, e, w * jnp.stack([-x[:, 1], x[:, 0]], axis=1))
+
+    def given(e, w):
+        return eqx.tree_at(lambda e: e.particles.C, spun(e, w), 0.5 * before.C + w)
+
+    for update, C in ((spun, [[0, -3], [3, 0]]), (given, [[3, 3], [3, 3]])):
+        problem = FitProblem((experiment,), {"w": mpm.Unbounded(update=update, start=3.0)})
+        q = problem.put(experiment, jnp.zeros(1), 0).particles
+        np.testing.assert_allclose(q.C, np.broadcast_to(C, q.C.shape), atol=1e-5)
 
 
 def test_a_scene_file_is_refined_with_what_was_measured(pushed):

@@ -360,12 +360,15 @@ def test_single_precision_stays_single(d):
 
 
 def test_its_energy_is_that_of_a_rigid_body():
-    """½ M V² + ½ ω·Iω, with no part of the grid's."""
+    """½ M V² + ½ ω·Iω, with no part of the grid's, also before the first step and of a transfer without C."""
     scene, particles = thrown(3, v=(0.1, 0.2, 0.3))
     body = body_of(particles)
     new, _ = mpm.step(scene, particles, 0.0, 1e-9)
     expected = body.mass * (body.velocity**2).sum() / 2 + body.spin @ body.inertia @ body.spin / 2
     assert float(mpm.energy(scene, new).kinetic) == pytest.approx(float(expected), rel=1e-8)
+    for transfer in (mpm.APIC(), mpm.FLIP()):
+        at_start = mpm.energy(mpm.Scene(scene.grid, RIGID, transfer=transfer), particles)
+        assert float(at_start.kinetic) == pytest.approx(float(expected), rel=1e-12)
 
 
 def test_a_run_comes_back_from_its_file(tmp_path):

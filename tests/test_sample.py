@@ -1,5 +1,7 @@
 """Filling a region: exact totals, counts, places, and what is refused."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -205,6 +207,46 @@ def test_velocity_is_given_to_every_particle():
     np.testing.assert_array_equal(rest.v, 0)
     np.testing.assert_array_equal(moving.v, np.broadcast_to([1.0, -2.0], rest.x.shape))
     assert rest.F is rest.C is rest.X is None
+
+
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
+@pytest.mark.parametrize("kernel", [2, *thorough(1, 3)])
+def test_a_gradient_that_is_not_given_is_that_of_the_velocities(d, kernel):
+    """Of a linear field, at a curved free surface too, with its derivative where the field is zero; exactly zero of
+    bodies that move as a whole."""
+    ball = mpm.fill(mpm.Ball((0.62, 0.6, 0.61)[:d], 0.3), grid_of(d), density=1e3)
+    scene = mpm.Scene(grid_of(d), mpm.NeoHookean(1e4, 0.3), kernel=mpm.BSpline(kernel), gradient=mpm.SplineGradient())
+    A = np.random.default_rng(0).normal(size=(d, d))
+
+    def gradient(s):
+        return mpm.prepare(scene, replace(ball, v=s * (ball.x - 0.5) @ A.T)).C
+
+    found, slope = jax.jvp(gradient, (0.0,), (1.0,))
+    np.testing.assert_array_equal(found, 0)
+    np.testing.assert_allclose(slope, np.broadcast_to(A, slope.shape), atol=2e-6)
+    np.testing.assert_allclose(gradient(2.0), 2 * slope, atol=1e-12)
+    other = mpm.fill(mpm.Ball((1.3,) * d, 0.15), grid_of(d), density=1e3, velocity=(0.3,) * d)
+    np.testing.assert_array_equal(mpm.prepare(scene, mpm.join(ball, other)).C, 0)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_velocity_may_be_a_field_or_a_motion(d):
+    """With its gradient, in any set that it is joined to; of constant fields exactly zero."""
+    spin, axis = 2.0, (0.0, 0.0, 1.0)
+    turns = (0.3, 2.3) if d == 2 else (axis, tuple((1 + spin) * a for a in axis))
+    motion = mpm.RigidMotion((0.0, 1.0), ((0.0,) * d, (0.5,) * d), turns, (0.6,) * d)
+    W = np.zeros((d, d))
+    W[0, 1], W[1, 0] = -spin, spin
+    box = mpm.Box((0.4,) * d, (0.7,) * d)
+    for velocity in (motion, lambda x: jnp.full(d, 0.5) + (x - 0.6) @ W.T):
+        q = mpm.fill(box, grid_of(d), density=1.0, velocity=velocity)
+        np.testing.assert_allclose(q.v, 0.5 + (q.x - 0.6) @ W.T, atol=1e-12)
+        np.testing.assert_allclose(q.C, np.broadcast_to(W, q.C.shape), atol=1e-12)
+        still = mpm.fill(mpm.Box((1.0,) * d, (1.2,) * d), grid_of(d), density=1.0)
+        both = mpm.join(still, q)
+        np.testing.assert_array_equal(both.C, np.concatenate([np.zeros((still.count, d, d)), q.C]))
+    constant = mpm.fill(box, grid_of(d), density=1.0, velocity=lambda x: jnp.full(d, 0.3) + 0 * x)
+    np.testing.assert_array_equal(constant.C, 0)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64, "float32"])

@@ -8,6 +8,7 @@ import scipy.sparse.csgraph
 from mpmjax._types import Array, Float, ParticleScalar, components
 from mpmjax.checks import canonical, checked
 from mpmjax.discretisation import p2g
+from mpmjax.geometry import rigid_body
 from mpmjax.state import Particles, Scene, prepare
 
 
@@ -15,7 +16,7 @@ class Energy(eqx.Module):
     """The energy of a state [J] (per metre of thickness in 2-D, per square metre of section in 1-D)."""
 
     kinetic: Float[Array, "*f"]
-    """½ Σ m (‖v‖² + tr(C D Cᵀ)), with the affine part for APIC; of a rigid body ½ M ‖V‖² + ½ ω·Iω with it."""
+    """½ Σ m (‖v‖² + tr(C D Cᵀ)), with the affine part for APIC; of a rigid body ½ M ‖V‖² + ½ ω·Iω."""
     elastic: Float[Array, "*f"]
     """Σ V0 Ψ(F), with the elastic law for the present history."""
     potential: Float[Array, "*f"]
@@ -43,15 +44,16 @@ def energy_of(scene: Scene, particles: Particles) -> Energy:
     """The energy of prepared particles, without compilation."""
     speed2 = (particles.v**2).sum(axis=1)
     if scene.transfer.affine and particles.C is not None:
-        moment = scene.stencil(particles).moment.T[:, None, :]
-        for body in scene.rigid_bodies:  # whose inertia is that of the particles' cells
-            rows = slice(*particles.groups[body.number].rows)
-            own = particles.volume[rows, None, None] ** (2 / particles.dim) / 12
-            moment = jnp.broadcast_to(moment, (particles.count, 1, particles.dim)).at[rows].set(own)
-        speed2 = speed2 + (particles.C**2 * moment).sum(axis=(1, 2))
+        speed2 = speed2 + (particles.C**2 * scene.stencil(particles).moment.T[:, None, :]).sum(axis=(1, 2))
+    kinetic = particles.mass * speed2 / 2
+    for material in scene.rigid_bodies:
+        rows = slice(*particles.groups[material.number].rows)
+        body = rigid_body(particles.x[rows], particles.v[rows], particles.mass[rows], particles.volume[rows])
+        own = (body.mass * (body.velocity**2).sum() + body.spin @ body.inertia @ body.spin) / 2
+        kinetic = kinetic.at[rows].set(0).at[rows.start].set(own)
     gravity = jnp.asarray(scene.gravity, particles.x.dtype)
     return Energy(
-        kinetic=(particles.mass * speed2).sum() / 2,
+        kinetic=kinetic.sum(),
         elastic=(particles.volume * energy_density(scene, particles)).sum(),
         potential=-(particles.mass[:, None] * particles.x * gravity).sum(),
     )

@@ -1,5 +1,6 @@
 """Grid, B-spline kernels, stencils, and the transfers between particles and grid."""
 
+from mpmjax.discretisation._average import average
 from mpmjax.discretisation._cell_order import Order, by_cell, cells_of, rearranged
 from mpmjax.discretisation._gradient import AbstractGradient, MLSGradient, SplineGradient
 from mpmjax.discretisation._grid import Grid
@@ -24,6 +25,7 @@ __all__ = [
     "Places",
     "SplineGradient",
     "Stencil",
+    "average",
     "bound",
     "by_cell",
     "cells_of",

@@ -10,7 +10,7 @@ from mpmjax._types import Array, Scalar
 from mpmjax.checks import canonical, checked, is_traced, require
 from mpmjax.fitting._observation import AbstractObservation
 from mpmjax.simulation import Run, number_of_steps, simulate
-from mpmjax.state import Particles, Scene, prepare
+from mpmjax.state import Particles, Scene, prepare, velocity_gradient
 from mpmjax.stepping import AbstractIntegrator, Explicit
 
 
@@ -84,6 +84,15 @@ class Experiment(eqx.Module):
             observations=observations,
             name=self.name,
         )
+
+    def with_gradient_since(self, given: Particles) -> "Experiment":
+        """The same experiment with the velocity gradient of what parameters changed of the velocities of the particles
+        given. A gradient that they changed themselves stays."""
+        now = self.particles
+        if now.C is None or now.C is not given.C or now.v is given.v:
+            return self
+        change = velocity_gradient(self.scene, eqx.tree_at(lambda q: q.v, now, now.v - given.v))
+        return eqx.tree_at(lambda e: e.particles.C, self, now.C + change)
 
     def until(self, t1: float) -> "Experiment":
         """The same experiment, ended at the first step from a time [s] on, with what was measured until then; itself

@@ -174,10 +174,11 @@ class FitProblem(eqx.Module):
             z: the coordinates.
             number: the experiment of which it has the parameters; None for those that belong to all experiments.
         """
+        given = experiment.particles
         for parameter, value in zip(self.parameters, self.values(z), strict=True):
             if parameter.only is None or number in parameter.only:
                 experiment = parameter.put(experiment, value)
-        return experiment
+        return experiment.with_gradient_since(given)
 
     def residuals(self, z: Coordinates, sigmas: tuple[Array, ...], adjoint: Any) -> tuple[Array, Array]:
         """The residuals of all observations, then of priors [-], shape (m,), NaN where a simulation met a fault or does

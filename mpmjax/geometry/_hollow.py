@@ -6,7 +6,7 @@ import numpy as np
 from mpmjax._types import Array, Float, Point, Scalar
 from mpmjax.checks import coordinates, require, require_fields, require_finite, require_positive, require_that
 from mpmjax.geometry._cells import Cells, polar_cells, round_cells
-from mpmjax.geometry._region import AbstractRegion, Cylinder, check_segment, common, from_axis
+from mpmjax.geometry._region import AbstractRegion, Cylinder, about_axis, check_segment, common, from_axis
 
 
 def _check_radii(name: str, inner: Scalar, outer: Scalar) -> None:
@@ -42,6 +42,10 @@ class Annulus(AbstractRegion):
         """max(inner − r, r − outer), r = ‖x − centre‖."""
         r = from_axis(x - jnp.asarray(self.centre, x.dtype))
         return jnp.where(r < (self.inner + self.outer) / 2, self.inner - r, r - self.outer)
+
+    def sides(self, x: Float[Array, "m d"]) -> Float[Array, "m k"]:
+        r = from_axis(x - jnp.asarray(self.centre, x.dtype))
+        return jnp.stack([self.inner - r, r - self.outer], axis=-1)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         centre, radius = np.asarray(self.centre, float), float(self.outer)
@@ -83,13 +87,13 @@ class Tube(AbstractRegion):
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         """As for a cylinder, with the distance to the nearer of the two lateral surfaces."""
-        start, end = jnp.asarray(self.start, x.dtype), jnp.asarray(self.end, x.dtype)
-        height = jnp.sqrt(((end - start) ** 2).sum())
-        axis, arm = (end - start) / height, x - (start + end) / 2
-        along = (arm * axis).sum(axis=-1)
-        r = from_axis(arm - along[:, None] * axis)
+        along, half, r = about_axis(x, self.start, self.end)
         beside = jnp.where(r < (self.inner + self.outer) / 2, self.inner - r, r - self.outer)
-        return common(jnp.stack([jnp.where(along < 0, -along, along) - height / 2, beside], axis=-1))
+        return common(jnp.stack([jnp.where(along < 0, -along, along) - half, beside], axis=-1))
+
+    def sides(self, x: Float[Array, "m d"]) -> Float[Array, "m k"]:
+        along, half, r = about_axis(x, self.start, self.end)
+        return jnp.stack([-along - half, along - half, self.inner - r, r - self.outer], axis=-1)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         return Cylinder(self.start, self.end, self.outer).bounds()

@@ -46,6 +46,11 @@ class AbstractRegion(eqx.Module):
         """Whether points x [m], shape (m, d), lie in the region or within `margin` [m] of it, shape (m,)."""
         return self.distance(x) <= margin
 
+    def sides(self, x: Float[Array, "m d"]) -> Float[Array, "m k"]:
+        """Functions of points x [m], shape (m, d), none of which is positive in the region, shape (m, k): the distances
+        from the smooth surfaces that bound it, where these meet in edges. Default: the signed distance alone."""
+        return self.distance(x)[:, None]
+
     def fitted(self, size: np.ndarray) -> Cells | None:
         """Centroids [m], (m, d), and volumes [m^d], (m,), of cells that fill the region to its surface, near `size` in
         their sides [m], (d,). Default: those of its bounding box where that is the region, else None."""
@@ -69,6 +74,18 @@ def common(slabs: Float[Array, "m j"]) -> Float[Array, "m"]:
     """Signed distance from the intersection of sets at right angles to each other, from those of the sets."""
     nearest = slabs.max(axis=-1)
     return jnp.where(nearest > 0, length(jnp.maximum(slabs, 0)), nearest)
+
+
+def about_axis(
+    x: Float[Array, "m d"], start: Point, end: Point
+) -> tuple[Float[Array, "m"], Float[Array, ""], Float[Array, "m"]]:
+    """Places of points along the axis through two points, from their middle [m], shape (m,), half the distance between
+    the two [m], and distances from the axis [m], shape (m,)."""
+    first, last = jnp.asarray(start, x.dtype), jnp.asarray(end, x.dtype)
+    height = length(last - first)
+    axis, arm = (last - first) / height, x - (first + last) / 2
+    along = (arm * axis).sum(axis=-1)
+    return along, height / 2, from_axis(arm - along[:, None] * axis)
 
 
 def check_segment(name: str, start: Point, end: Point) -> None:
@@ -115,6 +132,9 @@ class Box(AbstractRegion):
         """max(q) inside, ‖max(q, 0)‖ outside, q = max(lower − x, x − upper)."""
         below, above = jnp.asarray(self.lower, x.dtype) - x, x - jnp.asarray(self.upper, x.dtype)
         return common(jnp.where(below > above, below, above))
+
+    def sides(self, x: Float[Array, "m d"]) -> Float[Array, "m k"]:
+        return jnp.concatenate([jnp.asarray(self.lower, x.dtype) - x, x - jnp.asarray(self.upper, x.dtype)], axis=1)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         return np.asarray(self.lower, float), np.asarray(self.upper, float)
@@ -269,13 +289,12 @@ class Cylinder(AbstractRegion):
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         """As for a box, from the distances to the ends and to the lateral surface."""
-        start, end = jnp.asarray(self.start, x.dtype), jnp.asarray(self.end, x.dtype)
-        height = length(end - start)
-        axis, arm = (end - start) / height, x - (start + end) / 2
-        along = (arm * axis).sum(axis=-1)
-        beside = from_axis(arm - along[:, None] * axis)
-        beyond = jnp.where(along < 0, -along, along) - height / 2
-        return common(jnp.stack([beyond, beside - self.radius], axis=-1))
+        along, half, r = about_axis(x, self.start, self.end)
+        return common(jnp.stack([jnp.where(along < 0, -along, along) - half, r - self.radius], axis=-1))
+
+    def sides(self, x: Float[Array, "m d"]) -> Float[Array, "m k"]:
+        along, half, r = about_axis(x, self.start, self.end)
+        return jnp.stack([-along - half, along - half, r - self.radius], axis=-1)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         ends = np.stack([np.asarray(self.start, float), np.asarray(self.end, float)])

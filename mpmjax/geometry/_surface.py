@@ -3,37 +3,70 @@
 import itertools
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax.checks import require, require_memory
+from mpmjax._types import Array, Float
+from mpmjax.checks import canonical, require, require_memory
 from mpmjax.geometry._region import AbstractRegion
 
 _ON_IT = 1e-9
-"""Distance within which a lattice point is on the surface, in spacings."""
+"""Distance within which a point is on a surface, in spacings."""
+_ROUNDINGS = 8.0
+"""And in roundings of the greatest coordinate."""
+_BATCH = 4096
+"""Points that are computed together: one compiled program for any number of them."""
 
 
 class Pieces(NamedTuple):
-    """Flat pieces of a surface."""
+    """Flat pieces of a surface: points, segments or triangles."""
 
-    middle: np.ndarray
-    """Their centroids [m], shape (s, d)."""
-    area: np.ndarray
-    """Their outward normals times their areas [m^(d−1)], shape (s, d)."""
+    corners: np.ndarray
+    """Their corners [m], shape (s, d, d)."""
+    normal: np.ndarray
+    """Their outward unit normals, shape (s, d)."""
+    inner: np.ndarray
+    """Whether they do not lie on the boundary of what they were clipped by, shape (s,)."""
+
+    @property
+    def middle(self) -> np.ndarray:
+        """Their centroids [m], shape (s, d)."""
+        return self.corners.mean(axis=1)
+
+    @property
+    def size(self) -> np.ndarray:
+        """Their areas [m^(d−1)], shape (s,)."""
+        return np.sqrt((_area(self.corners) ** 2).sum(axis=1))
+
+    @property
+    def area(self) -> np.ndarray:
+        """Their outward normals times their areas [m^(d−1)], shape (s, d)."""
+        return self.size[:, None] * self.normal
+
+    def of(self, rows: np.ndarray) -> "Pieces":
+        """Some of them."""
+        return Pieces(*(a[rows] for a in self))
 
 
 def surface_pieces(
-    region: AbstractRegion, spacing: float, lower: np.ndarray | None = None, upper: np.ndarray | None = None
+    region: AbstractRegion,
+    spacing: float,
+    lower: np.ndarray | None = None,
+    upper: np.ndarray | None = None,
+    within: AbstractRegion | None = None,
 ) -> Pieces:
     """The surface of a region between two corners, by marching simplices: each cube of a lattice is divided into d!
-    simplices (H. W. Kuhn, IBM J. Res. Dev. 4 (1960) 518, doi 10.1147/rd.45.0518), and the signed distance is taken as
-    linear in each. Second order in the spacing; exact of boxes whose faces lie on the lattice.
+    simplices (H. W. Kuhn, IBM J. Res. Dev. 4 (1960) 518, doi 10.1147/rd.45.0518). Each of the region's `sides` is taken
+    as linear in each simplex and clipped by the others, and by those of `within`. Second order in the spacing; exact of
+    boxes, and of the parts of them in a box.
 
     Args:
         region: whose surface.
         spacing: of the lattice, whose points are the multiples of it [m].
         lower: lower corner [m], shape (d,). Default: the region's.
         upper: upper corner [m], shape (d,).
+        within: the region in which it is wanted. Default: everywhere.
 
     Raises:
         ValueError: a region without end between infinite corners.
@@ -47,59 +80,114 @@ def surface_pieces(
     counts = np.ceil(last / spacing + 0.5).astype(int) - start + 1
     require_memory(
         f"The surface of a region on a lattice of {float(np.prod(counts.astype(float))):.3g} points",
-        float(np.prod(counts.astype(float))) * (d + 1) * 8,
+        float(np.prod(counts.astype(float))) * 3 * d * 8,
         f"take a longer spacing than {spacing:.3g} m.",
     )
     axes = [(low + np.arange(n)) * spacing for low, n in zip(start, counts, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    distance = np.asarray(region.distance(jnp.asarray(points.reshape(-1, d))), float).reshape(counts)
-    distance = np.where(np.abs(distance) <= _ON_IT * spacing, 0, distance)
-    found = [_cut(*corners) for corners in _simplices(points, distance)]
-    middle, area = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    some = (area**2).sum(axis=1) > (_ON_IT * spacing ** (d - 1)) ** 2
-    return Pieces(middle[some], area[some])
+    near = max(_ON_IT * spacing, _ROUNDINGS * float(jnp.finfo(float).eps) * np.abs(points).max())
+    values = _sides(region, points.reshape(-1, d), near)
+    found = []
+    for side in range(values.shape[1]):
+        parts = [_cut(*corners) for corners in _simplices(points, values[:, side].reshape(counts))]
+        corners, outward = (np.concatenate(part) for part in zip(*parts, strict=True))
+        pieces = _clipped(
+            _sized(Pieces(corners, outward, np.ones(len(corners), bool)), spacing), region, near, but=side
+        )
+        found.append(pieces if within is None else _clipped(pieces, within, near))
+    return _sized(Pieces(*(np.concatenate(part) for part in zip(*found, strict=True))), spacing)
 
 
-def _simplices(points: np.ndarray, distance: np.ndarray):
-    """The corners (m, d + 1, d) and their distances (m, d + 1) of the simplices that the surface cuts: one set for each
+def _sized(pieces: Pieces, spacing: float) -> Pieces:
+    """Those of them that are more than rounding, their normals of length one."""
+    pieces = pieces.of(pieces.size > _ON_IT * spacing ** (pieces.normal.shape[1] - 1))
+    return pieces._replace(normal=pieces.normal / np.sqrt((pieces.normal**2).sum(axis=1, keepdims=True)))
+
+
+def _sides(region: AbstractRegion, x: np.ndarray, near: float) -> np.ndarray:
+    """The region's `sides` at points x [m], shape (m, d), shape (m, k); zero where they are not more than `near`."""
+    dtype = jnp.result_type(float)
+    batches = np.zeros((max(1, -(-len(x) // _BATCH)), _BATCH, x.shape[1]), dtype)
+    batches.reshape(-1, x.shape[1])[: len(x)] = x
+    region = canonical(region, dtype)
+    found = np.concatenate([np.asarray(_batch(region, jnp.asarray(batch)), float) for batch in batches])[: len(x)]
+    return np.where(np.abs(found) <= near, 0, found)
+
+
+@eqx.filter_jit
+def _batch(region: AbstractRegion, x: Float[Array, "m d"]) -> Float[Array, "m k"]:
+    return region.sides(x)
+
+
+def _simplices(points: np.ndarray, values: np.ndarray):
+    """The corners (m, d + 1, d) and their values (m, d + 1) of the simplices that the surface cuts: one set for each
     way from a cube's first corner to its last, a step along one axis after another."""
     d = points.shape[-1]
-
-    def corner(a: np.ndarray, offset: np.ndarray) -> np.ndarray:
-        return a[tuple(slice(o, o + n - 1) for o, n in zip(offset, distance.shape, strict=True))]
-
+    inside = values <= 0
+    corners = [
+        inside[tuple(slice(o, o + n - 1) for o, n in zip(offset, inside.shape, strict=True))]
+        for offset in itertools.product((0, 1), repeat=d)
+    ]
+    cubes = np.argwhere(np.any(corners, axis=0) & ~np.all(corners, axis=0))
     for order in itertools.permutations(range(d)):
         offsets = np.concatenate([np.zeros((1, d), int), np.cumsum(np.eye(d, dtype=int)[list(order)], axis=0)])
-        values = np.stack([corner(distance, o).reshape(-1) for o in offsets], axis=1)
-        cut = (values <= 0).any(axis=1) & (values > 0).any(axis=1)
-        yield np.stack([corner(points, o).reshape(-1, d)[cut] for o in offsets], axis=1), values[cut]
+        at = tuple(np.moveaxis(cubes[:, None] + offsets, -1, 0))
+        cut = inside[at].any(axis=1) & ~inside[at].all(axis=1)
+        yield points[at][cut], values[at][cut]
 
 
 def _cut(corners: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centroids and area vectors of the surface in simplices, those inside sorted first."""
+    """The flat pieces of the surface in simplices, by their corners, and directions out of it."""
     d = corners.shape[-1]
-    order = np.argsort(values > 0, axis=1, kind="stable")
-    corners = np.take_along_axis(corners, order[:, :, None], axis=1)
-    values = np.take_along_axis(values, order, axis=1)
-    within = (values <= 0).sum(axis=1)
+    corners, values, within = _sorted(corners, values)
     inside = (np.arange(d + 1) < within[:, None])[:, :, None]
     outward = (corners * np.where(inside, -1 / within[:, None, None], 1 / (d + 1 - within)[:, None, None])).sum(axis=1)
-
-    def crossing(i: int, j: int, rows: np.ndarray) -> np.ndarray:
-        a, b = values[rows, i], values[rows, j]
-        return corners[rows, i] + (a / (a - b))[:, None] * (corners[rows, j] - corners[rows, i])
-
-    middles, areas = [np.zeros((0, d))], [np.zeros((0, d))]
+    found, directions = [np.zeros((0, d, d))], [np.zeros((0, d))]
     for count in range(1, d + 1):
         rows = np.flatnonzero(within == count)
-        inner, outer = range(count), range(count, d + 1)
-        for piece in _pieces(d, inner, outer):
-            vertices = [crossing(i, j, rows) for i, j in piece]
+        for piece in _pieces(d, range(count), range(count, d + 1)):
+            vertices = _crossings(corners[rows], values[rows], piece)
             area = _area(vertices)
-            side = np.sign((area * outward[rows]).sum(axis=1, keepdims=True))
-            middles.append(np.mean(vertices, axis=0))
-            areas.append(side * area)
-    return np.concatenate(middles), np.concatenate(areas)
+            found.append(vertices)
+            directions.append(np.sign((area * outward[rows]).sum(axis=1, keepdims=True)) * area)
+    return np.concatenate(found), np.concatenate(directions)
+
+
+def _clipped(pieces: Pieces, region: AbstractRegion, near: float, but: int | None = None) -> Pieces:
+    """The parts of pieces in a region, one of whose sides may be left out."""
+    d = pieces.normal.shape[1]
+    for side in range(_sides(region, np.zeros((1, d)), near).shape[1]):
+        if side == but:
+            continue
+        values = _sides(region, pieces.corners.reshape(-1, d), near)[:, side].reshape(-1, d)
+        pieces = pieces._replace(inner=pieces.inner & (values != 0).any(axis=1))
+        corners, values, within = _sorted(pieces.corners, values)
+        found = [pieces.of(within == d)]
+        for count in range(1, d):
+            rows = np.flatnonzero(within == count)
+            for last in range(count):  # the corners inside up to it, and the crossings from it on
+                edges = [(i, i) for i in range(last + 1)]
+                edges += [(i, j) for i in range(last, count) for j in range(count, d)]
+                found.append(pieces.of(rows)._replace(corners=_crossings(corners[rows], values[rows], edges)))
+        pieces = Pieces(*(np.concatenate(part) for part in zip(*found, strict=True)))
+    return pieces
+
+
+def _sorted(corners: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners and their values with those inside first, and how many these are."""
+    order = np.argsort(values > 0, axis=1, kind="stable")
+    corners, values = np.take_along_axis(corners, order[:, :, None], axis=1), np.take_along_axis(values, order, axis=1)
+    return corners, values, (values <= 0).sum(axis=1)
+
+
+def _crossings(corners: np.ndarray, values: np.ndarray, edges: list[tuple[int, int]]) -> np.ndarray:
+    """Where edges cross the surface, shape (m, number of edges, d); the corner itself of an edge from it to itself."""
+
+    def crossing(i: int, j: int) -> np.ndarray:
+        a, b = values[:, i, None], values[:, j, None]
+        return corners[:, i] if i == j else corners[:, i] + a / (a - b) * (corners[:, j] - corners[:, i])
+
+    return np.stack([crossing(i, j) for i, j in edges], axis=1)
 
 
 def _pieces(d: int, inner: range, outer: range) -> list[list[tuple[int, int]]]:
@@ -112,12 +200,12 @@ def _pieces(d: int, inner: range, outer: range) -> list[list[tuple[int, int]]]:
     return [[(a, c), (a, e), (b, e)], [(a, c), (b, e), (b, c)]]
 
 
-def _area(vertices: list[np.ndarray]) -> np.ndarray:
-    """The area vectors of points, segments or triangles, of either sign."""
-    d = vertices[0].shape[1]
+def _area(corners: np.ndarray) -> np.ndarray:
+    """The area vectors of points, segments or triangles, of either sign, by their corners, shape (m, d, d)."""
+    d = corners.shape[-1]
     if d == 1:
-        return np.ones_like(vertices[0])
+        return np.ones_like(corners[:, 0])
+    along = corners[:, 1] - corners[:, 0]
     if d == 2:
-        along = vertices[1] - vertices[0]
         return np.stack([along[:, 1], -along[:, 0]], axis=1)
-    return np.cross(vertices[1] - vertices[0], vertices[2] - vertices[0]) / 2
+    return np.cross(along, corners[:, 2] - corners[:, 0]) / 2

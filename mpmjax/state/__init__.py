@@ -23,6 +23,7 @@ from mpmjax.state._particles import Particles, State, by_material, history_array
 from mpmjax.state._preparation import is_prepared, prepare
 from mpmjax.state._scene import RigidMaterial, Scene, attach
 from mpmjax.state._support import Support, SupportStiffness, stiffness_of
+from mpmjax.state._velocity_gradient import velocity_gradient
 
 __all__ = [
     "AbstractBodyForce",
@@ -70,6 +71,7 @@ __all__ = [
     "state_of",
     "stiffness_of",
     "supports_of",
+    "velocity_gradient",
     "whole_numbers",
     "with_state",
 ]

@@ -9,13 +9,15 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.checks import is_traced, require, require_fields, require_positive
-from mpmjax.geometry import AbstractRegion, surface_pieces
+from mpmjax.checks import is_traced, require, require_fields, require_positive, warn
+from mpmjax.geometry import AbstractRegion, Pieces, surface_pieces
 from mpmjax.state._particles import Particles
 
 Rows = Float[Array, "s d"] | Float[np.ndarray, "s d"] | tuple | list
 Numbers = Float[Array, "s"] | Float[np.ndarray, "s"] | tuple[float | int | Array, ...] | list[float | int]
 
+_NARROW = 1.999
+"""A patch narrower than so many particle spacings is not resolved."""
 _FAR = 2.0
 """How many particle spacings a point may lie off the nearest particle."""
 
@@ -77,12 +79,13 @@ class AttachedPoints(AbstractPlace):
 class Patch(AbstractPlace):
     """The surface of a region, or the part of it in another region.
 
-    It is made of flat pieces (see `surface_pieces`), of second order in the spacing. Pieces that are attached to one
-    particle and look along the same axis count as one, at their common centroid.
+    It is made of flat pieces (see `surface_pieces`), of second order in the spacing, and exact of boxes. Pieces that
+    are attached to one particle and look along the same axis count as one, at their common centroid.
 
     Args:
         region: the body, or any region whose surface is that of the body where it counts.
-        within: where the surface belongs to the patch. Default: all of it.
+        within: where the surface belongs to the patch, without what lies on the boundary of this region: around a
+            body's end, a box as wide as the body leaves out its sides. Default: all of it.
         spacing: the size of the pieces [m]. Default: the distance between particles.
     """
 
@@ -108,11 +111,15 @@ class Patch(AbstractPlace):
         x, apart = _known(particles, self)
         spacing = apart if self.spacing is None else float(self.spacing)
         margin = _FAR * apart
-        middle, area = surface_pieces(self.region, spacing, x.min(axis=0) - margin, x.max(axis=0) + margin)
+        found = surface_pieces(self.region, spacing, x.min(axis=0) - margin, x.max(axis=0) + margin, self.within)
+        pieces = found.of(found.inner)
+        require(
+            len(pieces.normal) > 0,
+            f"The {self} has no surface at the particles, or only on the boundary of `within`: move or enlarge it.",
+        )
         if self.within is not None:
-            chosen = np.asarray(self.within.contains(jnp.asarray(middle), 1e-6 * spacing))
-            middle, area = middle[chosen], area[chosen]
-        require(len(middle) > 0, f"The {self} has no surface at the particles: move or enlarge it.")
+            self._warn(pieces, found.size.sum(), apart)
+        middle, area = pieces.middle, pieces.area
         weight = np.sqrt((area**2).sum(axis=1))
         particle = _nearest(x, middle, apart, self)
         axis = np.abs(area).argmax(axis=1)
@@ -129,6 +136,21 @@ class Patch(AbstractPlace):
         first = np.zeros(len(whole), int)
         first[piece.reshape(-1)] = particle
         return _attached(particles, first, middle, whole, summed(area))
+
+    def _warn(self, pieces: Pieces, all_with_edges: float, apart: float) -> None:
+        """Warn of a patch that the grid cannot tell from a wider one, and of one most of which is on its boundary."""
+        kept, wide = pieces.size.sum(), np.ptp(pieces.corners.reshape(-1, self.dim), axis=0)
+        if (wide >= _NARROW * apart).sum() < self.dim - 1:
+            warn(
+                f"The Patch is {' x '.join(f'{a:.3g}' for a in wide)} m wide, less than two particles, {apart:.3g} m "
+                "apart: its force and moment are right, but the grid spreads them further. Refine the grid, or enlarge "
+                "the patch."
+            )
+        if all_with_edges > 2 * kept:
+            warn(
+                f"Of the surface in a Patch's `within`, {all_with_edges - kept:.3g} m^{self.dim - 1} lie on its "
+                f"boundary and do not count, {kept:.3g} lie inside: enlarge `within` beyond what is meant."
+            )
 
 
 class PointsAt(AbstractPlace):

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -12,8 +13,10 @@ import numpy as np
 from mpmjax._types import Array, Float, Point, Scalar
 from mpmjax.checks import checked, coordinates, require, require_memory, require_positive, shortened
 from mpmjax.discretisation import Grid
-from mpmjax.geometry import AbstractRegion, Box, box_cells, inside_parts
+from mpmjax.geometry import AbstractMotion, AbstractRegion, Box, box_cells, inside_parts
 from mpmjax.state._particles import Particles
+
+Velocity = Point | AbstractMotion | Callable[[Float[Array, "d"]], Float[Array, "d"]]
 
 _ALIKE = 1e-6
 """Part of a cell by which a region may reach into the next for rounding's sake."""
@@ -28,7 +31,7 @@ def fill(
     *,
     particles_per_cell: int | tuple[int, ...] | list[int] | None = None,
     density: Scalar,
-    velocity: Point | None = None,
+    velocity: Velocity | None = None,
     dtype: type | str | None = None,
     fitted: bool = False,
 ) -> Particles:
@@ -49,7 +52,8 @@ def fill(
         particles_per_cell: a d-th power (4 in 2-D is 2 x 2), or a count for each direction. Default: two in each, 2^d.
             In fitted cells the directions are: across the rings, around, along the axis.
         density: mass density [kg/m^d].
-        velocity: initial velocity [m/s], (d,). Default: rest.
+        velocity: initial velocity [m/s], (d,), or a motion, whose velocity at t = 0 it is, or a function of one point
+            [m], (d,), written with jax.numpy; these give the gradient C too. Default: rest.
         dtype: float32 or float64. Default: jax's own, float32 unless 64-bit mode is on.
         fitted: whether the cells follow the region's surface.
 
@@ -76,7 +80,7 @@ def fill(
             counts.shape == (d,) and (counts >= 1).all() and counts.dtype.kind == "i",
             f"particles_per_cell must be one or {d} positive whole numbers, got {particles_per_cell}.",
         )
-    velocity = _velocity(velocity, d)
+    field = _velocity(velocity, d)
     lower, upper = region.bounds()
     require(lower.shape == (d,), f"The region is {lower.size}-dimensional, the grid {d}-dimensional.")
     require(
@@ -98,7 +102,7 @@ def fill(
             "fill_mapped."
         )
     require(len(found[0]) > 0, f"{region} holds no particle at this spacing: refine the grid or enlarge the region.")
-    return _particles(*found, density, velocity, precision)
+    return _particles(*found, density, field, precision)
 
 
 @checked
@@ -108,7 +112,7 @@ def fill_mapped(
     counts: tuple[int, ...] | list[int],
     *,
     density: Scalar,
-    velocity: Point | None = None,
+    velocity: Velocity | None = None,
     dtype: type | str | None = None,
 ) -> Particles:
     """Fill the image of a box under a smooth map x(ξ) with the images of equal cells: a lattice fitted to any boundary
@@ -127,7 +131,8 @@ def fill_mapped(
         box: the box of ξ, in the units of ξ.
         counts: number of cells along each axis of the box.
         density: mass density [kg/m^d].
-        velocity: initial velocity [m/s], (d,). Default: rest.
+        velocity: initial velocity [m/s], (d,), or a motion, whose velocity at t = 0 it is, or a function of one point
+            [m], (d,), written with jax.numpy; these give the gradient C too. Default: rest.
         dtype: float32 or float64. Default: jax's own, float32 unless 64-bit mode is on.
 
     Raises:
@@ -141,7 +146,7 @@ def fill_mapped(
         number.shape == (d,) and number.dtype.kind == "i" and (number >= 1).all(),
         f"counts must be {d} positive whole numbers, got {counts}.",
     )
-    velocity = _velocity(velocity, d)
+    field = _velocity(velocity, d)
     lower, upper = box.bounds()
     require(np.isfinite(lower) & np.isfinite(upper), "A box to map must be finite.")
     require_memory(
@@ -163,7 +168,7 @@ def fill_mapped(
     )
     part = np.abs(jacobian).reshape(-1, len(share)) * share
     x = np.einsum("mq,mqd->md", part, np.asarray(mapped, float).reshape(*part.shape, d))
-    return _particles(x / part.sum(axis=1)[:, None], part.sum(axis=1) * volume, density, velocity, precision)
+    return _particles(x / part.sum(axis=1)[:, None], part.sum(axis=1) * volume, density, field, precision)
 
 
 def _precision(dtype: type | str | None) -> Any:
@@ -176,11 +181,22 @@ def _precision(dtype: type | str | None) -> Any:
     return precision
 
 
-def _velocity(velocity: Point | None, d: int) -> Point:
-    """The velocity asked for, zero by default."""
+def _velocity(velocity: Velocity | None, d: int) -> Velocity:
+    """The velocity asked for, as d numbers, zero by default, or as a function of a point."""
     velocity = (0.0,) * d if velocity is None else velocity
-    require(coordinates("velocity", velocity) == d, f"velocity must have {d} components, got {velocity}.")
+    if isinstance(velocity, AbstractMotion):
+        require(velocity.dim == d, f"velocity must be a motion in {d} dimensions, got one in {velocity.dim}.")
+        return partial(_velocity_at_start, velocity)
+    if not callable(velocity):
+        require(coordinates("velocity", velocity) == d, f"velocity must have {d} components, got {velocity}.")
     return velocity
+
+
+def _velocity_at_start(motion: AbstractMotion, x: Float[Array, "d"]) -> Float[Array, "d"]:
+    """The velocity of the point of a moving body that is at x at t = 0 [m/s], shape (d,)."""
+    zero = jnp.zeros((), x.dtype)
+    X = motion.origin(x[None], zero)
+    return jax.jvp(lambda t: motion.place(X, t), (zero,), (jnp.ones_like(zero),))[1][0]
 
 
 def _cut_cells(region: AbstractRegion, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -213,8 +229,13 @@ def _merged(share: np.ndarray, centroid: np.ndarray) -> tuple[np.ndarray, np.nda
     return total, moment / np.where(total > 0, total, 1)[..., None]
 
 
-def _particles(x: np.ndarray, volume: np.ndarray, density: Scalar, velocity: Point, dtype: Any) -> Particles:
-    """Particles at x [m], (p, d), of volumes [m^d], (p,), alike in density and velocity."""
-    places, volumes = jnp.asarray(x, dtype), jnp.asarray(volume, dtype)
-    v = jnp.broadcast_to(jnp.asarray(velocity, dtype), places.shape)
-    return Particles(x=places, v=v, mass=jnp.asarray(density, dtype) * volumes, volume=volumes)
+def _particles(x: np.ndarray, volume: np.ndarray, density: Scalar, velocity: Velocity, dtype: Any) -> Particles:
+    """Particles at x [m], (p, d), of volumes [m^d], (p,), alike in density."""
+    places, volumes, C = jnp.asarray(x, dtype), jnp.asarray(volume, dtype), None
+    if callable(velocity):
+        v, C = eqx.filter_jit(jax.vmap(lambda y: (velocity(y), jax.jacfwd(velocity)(y))))(places)
+        require(v.shape == places.shape, f"velocity must give {places.shape[1]} components, got {v.shape[1:]}.")
+        v, C = v.astype(dtype), C.astype(dtype)
+    else:
+        v = jnp.broadcast_to(jnp.asarray(velocity, dtype), places.shape)
+    return Particles(x=places, v=v, mass=jnp.asarray(density, dtype) * volumes, volume=volumes, C=C)

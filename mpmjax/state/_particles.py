@@ -1,5 +1,6 @@
 """The particles: the state of a simulation."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
@@ -7,11 +8,12 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, ParticleMatrix, ParticleScalar, ParticleVector, components
-from mpmjax.checks import checked, require, require_fields, require_positive
+from mpmjax.checks import checked, is_traced, require, require_fields, require_positive
 
 Deformations = tuple[Float[Array, "..."] | None, ...]
 
@@ -155,28 +157,80 @@ class Group(NamedTuple):
         return found if found.ndim == 1 else la.determinant(found)
 
 
+def moves_as_one(particles: Particles) -> bool:
+    """Whether all velocities are known and alike."""
+    return not is_traced(particles.v) and bool((np.ptp(np.asarray(particles.v), axis=0) == 0).all())
+
+
 @checked
-def join(*sets: Particles) -> Particles:
+def join(*sets: Particles, material: int | None = None) -> Particles:
     """Join several sets of particles. In a scene with as many laws, each set has the law in its place; with one law,
     all sets have that one.
 
+    Prepared particles, such as those of a run's end, are joined with what they have of F, C, X and history, so that
+    material can be added to a run between two calls.
+
     Args:
-        sets: particles of one dimension and precision, as `fill` makes them: deformations, C, X and histories are not
-            joined.
+        sets: particles of one dimension and precision, either none of them prepared, or all for scenes alike: of one
+            description, with the velocity gradient or without. Sets that move as one may lack it: theirs is zero.
+        material: the number of the material of the first set, from 0, that all other sets are more of; particles of
+            later materials then have other numbers. Default: the sets are materials of their own.
 
     Raises:
-        ValueError: sets that differ in dimension or precision, or that are prepared.
+        ValueError: sets that differ in dimension, precision or in what they have, or of other laws than a material's.
     """
     require(len(sets) > 0, "There must be particles to join.")
-    plain = not any(jax.tree.leaves((q.deformations, q.C, q.X, q.histories)) for q in sets)
-    require(plain, "Join particles before they are prepared: F, C, X and history follow from the scene.")
     kinds = {(q.dim, str(q.x.dtype)) for q in sets}
     require(len(kinds) == 1, f"Joined particles must have one dimension and precision, got {sorted(kinds)}.")
+    if any(q.C is not None for q in sets):
+        shape = (sets[0].dim,) * 2
+        sets = tuple(
+            replace(q, C=jnp.zeros((q.count, *shape), q.x.dtype)) if q.C is None and moves_as_one(q) else q
+            for q in sets
+        )
+    for name, known in (
+        ("deformations", [F is not None for q in sets for F in q.deformations]),
+        ("a velocity gradient C", [q.C is not None for q in sets]),
+        ("reference positions X", [q.X is not None for q in sets]),
+    ):
+        require(
+            all(known) or not any(known),
+            f"All joined particles must have {name} or none: prepare each for a scene like that of the others.",
+        )
+    groups = [[(q, group)] for q in sets for group in q.groups]
+    if material is not None:
+        first, more = groups[: len(sets[0].sizes)], groups[len(sets[0].sizes) :]
+        require(
+            0 <= material < len(first) and len(more) == len(sets) - 1,
+            f"join needs the number of one of the first set's {len(first)} materials and others of one material each, "
+            f"got material={material} and {len(more)} materials in {len(sets) - 1} sets.",
+        )
+        added = [member for own in more for member in own]
+        groups = [own + added if number == material else own for number, own in enumerate(first)]
+    members = [member for own in groups for member in own]
     arrays: dict[str, Any] = {
-        name: jnp.concatenate([getattr(q, name) for q in sets]) for name in ("x", "v", "mass", "volume")
+        name: jnp.concatenate([getattr(q, name)[slice(*group.rows)] for q, group in members])
+        for name in ("x", "v", "mass", "volume", "C", "X")
+        if getattr(sets[0], name) is not None
     }
-    counts = tuple(n for q in sets for n in q.sizes)
-    return Particles(**arrays, counts=counts if len(counts) > 1 else None)
+    counts = tuple(sum(group.rows[1] - group.rows[0] for _, group in own) for own in groups)
+    return Particles(
+        **arrays,
+        deformations=tuple(of_one_material([group.stored for _, group in own]) for own in groups),
+        histories=tuple(of_one_material([group.history for _, group in own]) for own in groups),
+        counts=counts if len(counts) > 1 else None,
+    )
+
+
+def of_one_material(parts: Sequence[Any]) -> Any:
+    """The deformations or histories of several sets of particles of one material, as those of one set.
+
+    Raises:
+        ValueError: they are of several laws.
+    """
+    kinds = {(jax.tree.structure(part), tuple(leaf.shape[1:] for leaf in jax.tree.leaves(part))) for part in parts}
+    require(len(kinds) == 1, "Joined particles of one material must have been prepared for one law.")
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
 class State(eqx.Module):

@@ -28,17 +28,21 @@ from mpmjax.state._loaded_points import keeps_deformation
 from mpmjax.state._material_points import MaterialPoints
 from mpmjax.state._order import is_foreign
 from mpmjax.state._oversights import warn_of_oversights
-from mpmjax.state._particles import Group, Particles
+from mpmjax.state._particles import Group, Particles, moves_as_one, of_one_material
 from mpmjax.state._scene import Scene
+from mpmjax.state._velocity_gradient import velocity_gradient
 
 
 @checked
 def prepare(scene: Scene, particles: Particles) -> Particles:
     """Add to the particles what the scene's laws, transfer and description need, where it is missing.
 
-    F = I (J = 1), the history of what never yielded, C = 0 with APIC or viscosity (and none without), and X = x in the
-    total description (and none in the updated one). Of particles that meet a scene for the first time it warns where
-    walls or colliders lie over them, grips or colliders touch nothing, and a body is thinner than two cells.
+    F = I (J = 1), the history of what never yielded, X = x in the total description (and none in the updated one), and
+    with APIC or viscosity (and none without) the C of the velocities: the slope of the linear field that fits those of
+    the neighbours, zero where all are alike. Velocities that are changed afterwards need a C of their own.
+
+    Of particles that meet a scene for the first time it warns where walls or colliders lie over them, grips or
+    colliders touch nothing, and a body is thinner than two cells.
 
     Raises:
         ValueError: a value is not as its module requires (`equinox.tree_at` can make it so), the particles have
@@ -58,7 +62,9 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
     )
     _check_loads(scene, particles)
     first = not jax.tree.leaves(particles.deformations)
-    particles = replace(particles, counts=sizes if len(sizes) > 1 else None)
+    if len(sizes) == 1:
+        own = of_one_material(particles.deformations), of_one_material(particles.histories)
+        particles = replace(particles, counts=None, deformations=own[:1], histories=own[1:])
     require(
         not scene.total or particles.X is not None or first,
         "In the total description particles with an F need the X from which it is measured: give X, or drop F.",
@@ -77,7 +83,9 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
         _check_placement(known, prepared)
         if first:
             warn_of_oversights(known.grid, known.kernel, known.boundary, prepared, total=scene.total)
-    return prepared
+    if not scene.keeps_gradient or particles.C is not None or moves_as_one(particles):
+        return prepared
+    return replace(prepared, C=velocity_gradient(canonical(scene, particles.x.dtype), prepared))
 
 
 def _check_loads(scene: Scene, particles: Particles) -> None:
