@@ -45,7 +45,7 @@ from mpmjax.boundary._springs import (
     spring_force,
     spring_resistance,
 )
-from mpmjax.boundary._surface_contact import Surface, refuse_contact
+from mpmjax.boundary._surface_contact import Surface, SurfaceContact, refuse_contact
 from mpmjax.boundary._walls import SeparatingBox, SlipBox, StickyBox
 
 __all__ = [
@@ -87,6 +87,7 @@ __all__ = [
     "StickyBox",
     "StickyCollider",
     "Surface",
+    "SurfaceContact",
     "SymmetryPlane",
     "Tie",
     "Wall",
