@@ -8,12 +8,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DESCRIPTIONS, ELASTIC, FLUIDS, LAWS, PLASTIC, assert_close, block, explicit_limit, ids
+from helpers import (
+    DESCRIPTIONS,
+    ELASTIC,
+    FLUIDS,
+    LAWS,
+    PLASTIC,
+    RUBBER,
+    VISCOUS,
+    assert_close,
+    block,
+    explicit_limit,
+    ids,
+)
 
 import mpmjax as mpm
 from mpmjax.simulation import _simulate
 from mpmjax.simulation._advice import advise, disallowed
+from mpmjax.simulation._diffrax import Problem, faulty_particles
 from mpmjax.simulation._statistics import Fault
+from mpmjax.state import state_of
 
 DT = 5e-3
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(), "backward_euler": mpm.BackwardEuler()}
@@ -297,6 +311,34 @@ def test_inversion_of_a_law_that_does_not_allow_it_is_named():
     scene = eqx.tree_at(lambda s: s.material, scene, LAWS["neo_hookean"])
     with pytest.raises(mpm.SimulationError, match=r"At step 1 .*det F ≤ 0"):
         mpm.simulate(scene, particles, t1=0.05, dt=0.01)
+
+
+@pytest.mark.parametrize("law", **ids(ELASTIC | RUBBER | PLASTIC | FLUIDS | VISCOUS))
+def test_a_collapsed_particle_is_at_fault_in_every_law(law):
+    """Flat, short in all directions, turned inside out, or as near to nothing as 1e-78: but not at a twentieth."""
+    short = [[1.0, 1.0], [0.05, 2.0], [0.009, 3.0], [0.009, 0.009], [-0.005, 0.5], [1e-39, 1e-39]]
+    F = jax.vmap(jnp.diag)(jnp.asarray(short))
+    J, still = jnp.asarray([1.0, 0.05, 9e-3, 9e-3, -5e-3, 1e-78]), jnp.zeros((6, 2))
+    place = jnp.linspace(2, 4, 6)[:, None]
+    for description, expected in ((mpm.UpdatedLagrangian(), [False] * 2 + [True] * 4), (mpm.TotalLagrangian(), None)):
+        if description == mpm.TotalLagrangian() and not law.allows_total:
+            continue
+        scene = mpm.Scene(mpm.Grid((6, 6), 1.0), law, description=description)
+        particles = mpm.prepare(scene, mpm.Particles(still + place, still, jnp.ones(6), jnp.ones(6)))
+        particles = replace(particles, deformations=(F if law.kinematics.axes else J,))
+        faults = faulty_particles(Problem(scene, particles, None, 1.0, mpm.Explicit()), state_of(particles), 0.0)
+        found = faults.get(Fault.COLLAPSED)
+        assert (None if found is None else found.tolist()) == expected
+
+
+def test_a_body_that_collapses_to_a_point_is_named():
+    """By its own velocities, of a law whose force vanishes with F: not when det F ≤ 0, which it never is."""
+    law = mpm.FixedCorotated(1e4, 0.45)
+    scene, particles = block(1, material=law)
+    particles = replace(particles, v=400 * (0.15 - particles.x))
+    with pytest.raises(mpm.SimulationError, match="has collapsed") as caught:
+        mpm.simulate(scene, particles, t1=0.1, dt=1e-4)
+    assert float(jnp.abs(caught.value.run.final.F).min()) > 0.01
 
 
 def test_an_unconverged_solve_is_raised():

@@ -43,7 +43,7 @@ from mpmjax.boundary._springs import (
     spring_force,
     spring_resistance,
 )
-from mpmjax.boundary._surface_contact import Surface, refuse_contact
+from mpmjax.boundary._surface_contact import Surface, SurfaceContact, refuse_contact
 from mpmjax.boundary._walls import SeparatingBox, SlipBox, StickyBox
 
 __all__ = [
@@ -85,6 +85,7 @@ __all__ = [
     "StickyBox",
     "StickyCollider",
     "Surface",
+    "SurfaceContact",
     "SymmetryPlane",
     "Tie",
     "Wall",

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Deformation, Matrix
+from mpmjax._types import Array, Bool, Deformation, Matrix
 
 
 class AbstractKinematics(eqx.Module):
@@ -55,6 +55,10 @@ class AbstractKinematics(eqx.Module):
     def determinant(self, deformation: Deformation) -> Array:
         """J = det F [-], shape (p,)."""
 
+    @abc.abstractmethod
+    def collapsed(self, deformation: Deformation, least: float) -> Bool[Array, "p"]:
+        """Whether a stretch is below the least one that is allowed, in magnitude, shape (p,)."""
+
 
 class DeformationGradient(AbstractKinematics):
     """The deformation gradient F [-], shape (d, d, p), or its elastic part."""
@@ -83,6 +87,11 @@ class DeformationGradient(AbstractKinematics):
     def determinant(self, deformation: Matrix) -> Array:
         return la.determinant(deformation)
 
+    def collapsed(self, deformation: Matrix, least: float) -> Bool[Array, "p"]:
+        """By 1/‖F⁻¹‖, which is no more than the smallest stretch, and no less than 1/√d of it."""
+        cofactor = la.cofactor(deformation)
+        return la.determinant(deformation) ** 2 <= least**2 * la.double_dot(cofactor, cofactor)
+
 
 class VolumeRatio(AbstractKinematics):
     """J = det F [-] alone, shape (p,)."""
@@ -110,6 +119,10 @@ class VolumeRatio(AbstractKinematics):
 
     def determinant(self, deformation: Array) -> Array:
         return deformation
+
+    def collapsed(self, deformation: Array, least: float) -> Bool[Array, "p"]:
+        """By J, which is what the law knows."""
+        return jnp.abs(deformation) <= least
 
 
 DEFORMATION_GRADIENT, VOLUME_RATIO = DeformationGradient(), VolumeRatio()

@@ -22,6 +22,9 @@ from mpmjax.simulation._statistics import Fault, RunStatistics, no_steps, one_st
 from mpmjax.state import Particles, Scene, State, with_state
 from mpmjax.stepping import AbstractIntegrator, step_compiled
 
+LEAST_STRETCH = 1e-2
+"""A particle that is shorter than this part of its length has collapsed."""
+
 
 class Problem(eqx.Module):
     """The part of a rollout that does not evolve."""
@@ -74,7 +77,11 @@ def faulty_particles(problem: Problem, state: State, t: Scalar) -> dict[Fault, B
     outside = ~in_window(scene.kernel, scene.grid, scene.window(particles), scene.on_grid(particles, t))
     materials = scene.material_points(particles, t)
     admitted = jnp.concatenate([points.is_admissible(points.deformation) for points in materials])
-    return {Fault.NOT_FINITE: ~finite, Fault.OUTSIDE: finite & outside, Fault.INADMISSIBLE: finite & ~admitted}
+    faults = {Fault.NOT_FINITE: ~finite, Fault.OUTSIDE: finite & outside, Fault.INADMISSIBLE: finite & ~admitted}
+    if not scene.total:  # in which the force of what has collapsed is not P Fᵀ, which vanishes with F, but P
+        kept = [points.law.kinematics.collapsed(points.deformation, LEAST_STRETCH) for points in materials]
+        faults[Fault.COLLAPSED] = finite & jnp.concatenate(kept)
+    return faults
 
 
 def _finite(fields: Any) -> Bool[Array, "p"]:
@@ -104,7 +111,7 @@ def gravest(faults: dict[Fault, Bool[Array, "p"]]) -> Int[Array, ""]:
     return found
 
 
-_GRAVEST_FIRST = (Fault.NOT_FINITE, Fault.PASSED, Fault.OUTSIDE, Fault.INADMISSIBLE)
+_GRAVEST_FIRST = (Fault.NOT_FINITE, Fault.PASSED, Fault.OUTSIDE, Fault.INADMISSIBLE, Fault.COLLAPSED)
 """The faults of a state, and of the step that led to it."""
 
 

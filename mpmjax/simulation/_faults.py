@@ -14,7 +14,7 @@ from mpmjax.autodiff import guard
 from mpmjax.checks import requirements, warn
 from mpmjax.material import AbstractLaw
 from mpmjax.simulation._advice import advise, disallowed
-from mpmjax.simulation._diffrax import Problem, faulty_particles, passed_particles
+from mpmjax.simulation._diffrax import LEAST_STRETCH, Problem, faulty_particles, passed_particles
 from mpmjax.simulation._rollout_state import RolloutState
 from mpmjax.simulation._run import Run, SimulationError
 from mpmjax.simulation._statistics import Fault, RunStatistics
@@ -140,6 +140,12 @@ _WORDS: dict[Fault, _Words] = {
         "Enlarge the grid's shape, or use follow=True.",
     ),
     Fault.INADMISSIBLE: _Words("a deformation gradient that its law does not allow"),
+    Fault.COLLAPSED: _Words(
+        "a particle that has collapsed",
+        f"has collapsed: a stretch of it is below {LEAST_STRETCH:g}, where the force of its law may vanish",
+        "Take a law whose energy has no bound there, such as NeoHookean, or in the total description any; or a lower "
+        "velocity.",
+    ),
     Fault.PASSED: _Words(
         "a particle that passed a boundary",
         "passed",

@@ -86,10 +86,11 @@ def simulate(
     Raises:
         ValueError: of `prepare`; a value of the method that it does not allow; a t1 that is not a whole number of steps
             after the start.
-        SimulationError: a state that is not finite, a particle outside the window, an F that the law does not allow
-            or one that passed a boundary (each with step, time and first bad particle; the last good state is in its
-            `run.final`, for which the run is computed once more up to it), a solve that ended beyond ten times its
-            tolerance; one that ended nearer is a Python warning.
+        SimulationError: a state that is not finite, a particle outside the window, an F that the law does not allow,
+            a particle that has collapsed (a stretch below a hundredth, in the updated description) or that passed a
+            boundary (each with step, time and first bad particle; the last good state is in its `run.final`, for which
+            the run is computed once more up to it), a solve that ended beyond ten times its tolerance; one that ended
+            nearer is a Python warning.
         RuntimeError: the same, and values that scene, particles or method do not allow, under an outer transformation
             (`jax.jit`, `jax.grad`, `jax.vmap` and what is made of them, where only the derivative is asked for too);
             and a tangent or adjoint solve that did not converge. In compiled programs it is that of

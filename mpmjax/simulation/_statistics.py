@@ -26,6 +26,8 @@ class Fault(enum.IntEnum):
     """A particle has passed a boundary that keeps it out."""
     BAD_PARAMETERS = 5
     """Scene, particles or method have a value that their module does not allow, which a jax transformation hid."""
+    COLLAPSED = 6
+    """A particle is shorter than any law can answer for."""
 
 
 class RunStatistics(eqx.Module):

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import reduce
 from itertools import combinations
 from typing import Literal
 
@@ -11,14 +12,15 @@ import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.boundary import STIFFNESS, in_a_row
+from mpmjax.boundary import STIFFNESS, BodyContact, Mirror, SurfaceContact, in_a_row
 from mpmjax.checks import canonical, checked, is_traced, require, require_positive
-from mpmjax.discretisation import Stencil
+from mpmjax.discretisation import Stencil, gather
 from mpmjax.geometry import length
 from mpmjax.state import AttachedPoints, MaterialPoints, Particles, Scene, is_prepared, points_of, prepare
 from mpmjax.stepping._explicit import Explicit
 from mpmjax.stepping._integrator import AbstractIntegrator
-from mpmjax.stepping._particle_faces import contact_moduli, faces_of
+from mpmjax.stepping._nodes import Nodes, particles_to_grid
+from mpmjax.stepping._particle_faces import contact_moduli
 
 MOST_STEPS = 2**31 - 1
 """The largest number of steps of a run."""
@@ -66,17 +68,20 @@ def stable_dt(
 
     With averaged volumes Λ is that at F̄, or its average where that is larger: an average has no larger eigenvalue.
 
-    In a scene with surfaces that push (`SeparatingBox`, `SeparatingCollider`) the springs of contact add
-    Δt² k (1 + A ‖B‖²)/m to the left side, whether or not anything touches, with the stiffness k of a particle that
-    comes with all of its speed (see `SurfaceContact`): with two particles along a cell's edge the limit falls by a
-    quarter, at the speed of sound by two fifths. `Bodies` that touch add Δt² 4 k/(ρ dx²), with the stiffness k of
-    `BodyContact`: by bodies of one law the limit falls by three tenths.
+    In the updated description the left side has 2 Δt² α too (derivation, eq. 35), with α the fastest rate at which the
+    present acceleration strains the particle. It is zero in equilibrium; free surfaces of stretched material make it
+    large.
 
-    The default safety of 0.7 covers two effects beyond the linear limit. Vibrations of a few per cent grow where the
+    In a scene with surfaces that push (`SeparatingBox`, `SeparatingCollider`) the springs of contact add
+    n Δt² k (1 + A ‖B‖²)/m to the left side, whether or not anything touches, with the stiffness k of a particle that
+    comes with all of its speed (see `SurfaceContact`), and n = 1, or 2 for a particle between two of them: with two
+    particles along a cell's edge the limit falls by a quarter, at the speed of sound by two fifths. `Bodies` that may
+    touch add Δt² 4 k/(ρ dx²), with the stiffness k of `BodyContact`: by bodies of one law the limit falls by three
+    tenths. Those that do touch add a bound of the springs that there are, if it is more.
+
+    The default safety of 0.7 covers an effect beyond the linear limit. Vibrations of a few per cent grow where the
     third or fourth harmonic of a mode resonates with the step, (ωΔt)² = 3 and 2, which is at 0.87 and 0.71 of the
-    limit: a particle released at a stretch of 1.2 blows up at 0.75 of it, and does not at 0.7. And in the updated
-    description stencils move under stress, which the argument leaves out: among random clouds in which stretches of 0.6
-    and 1.6 are neighbours the linearised step fails down to 0.94 of the bound.
+    limit: a particle released at a stretch of 1.2 blows up at 0.75 of it, and does not at 0.7.
 
     *When it breaks*: Δt is constant in a rollout, so compute it at the state of the largest stretch expected. With the
     linear kernel a = 1/(s(1 − s) dx²), with s the place of the particle in its cell: the bound holds only at the
@@ -162,7 +167,12 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Fl
     elastic_steepness, viscous_steepness = _steepness(scene, particles)
     materials = scene.material_points(particles)
     stiffest = jnp.concatenate([_stiffest(points, particles.dim) for points in materials])
-    z = stiffest * elastic_steepness / density + _contact(scene, particles, materials, elastic_steepness)  # per Δt²
+    z = stiffest * elastic_steepness / density  # per Δt²
+    if not scene.total:  # in which nothing is pushed, and strains do not multiply
+        zero, one = jnp.zeros((), z.dtype), jnp.ones((), z.dtype)
+        nodes = particles_to_grid(scene, particles, zero, one, scene.stencil(particles))
+        z = z + 2 * _straining(scene, particles, nodes) + _contact(particles, nodes, elastic_steepness)
+        z = z + _between_bodies(scene, particles, materials, nodes)
     factor = method.stability_factor()
     if factor is None:
         raise UnknownBoundError(f"{type(method).__name__} gives no bound on its step: give dt.")
@@ -171,13 +181,25 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Fl
     if scene.loads:
         springs, dashpots = _supports(scene, particles, elastic_steepness)
         z, y = z + springs, y + dashpots
-    if scene.bodies is not None:
-        z = z + _between_bodies(scene, particles, materials)
     z, y = jnp.maximum(factor * z, 0), jnp.maximum(factor * y, 0)
     square = y**2 + 16 * z
     none = square == 0  # and not what is NaN, which the least must keep
     steepness = (y + jnp.where(none, 0, jnp.sqrt(jnp.where(none, 1, square)))).max()
     return jnp.where(steepness == 0, jnp.inf, 8 / jnp.where(steepness == 0, 1, steepness))
+
+
+def _straining(scene: Scene, particles: Particles, nodes: Nodes) -> Float[Array, "p"]:
+    """The fastest rate [1/s²] at which the present acceleration a strains each particle, shape (p,): the eigenvalue of
+    the symmetric part of ∇a that is largest in magnitude, or |div a| for a law that knows J alone."""
+    springs = [c.springs(c.gap < 0) for c in nodes.contacts if isinstance(c, SurfaceContact)]
+    couplings = [c.coupling(c.gap < 0) for c in nodes.contacts if isinstance(c, BodyContact)]
+    pushed = nodes.constrained(Mirror(()), nodes.conditions.fixed, None, tuple(springs), tuple(couplings))
+    a = pushed.projection.combine(pushed.per_mass(pushed.force) + pushed.acceleration, 0.0)
+    _, slopes = gather(nodes.potential.stencil, nodes.mirror.unfold(a))
+    rates = la.symmetric_eigen((slopes + la.transpose(slopes)) / 2)[0]
+    each = zip(scene.laws, particles.groups, strict=True)
+    own = [(law.kinematics.axes, rates[:, slice(*group.rows)]) for law, group in each]
+    return jnp.concatenate([jnp.abs(r).max(axis=0) if axes else jnp.abs(r.sum(axis=0)) for axes, r in own])
 
 
 def _supports(scene: Scene, particles: Particles, steepness: Array) -> tuple[Array, Array]:
@@ -201,29 +223,38 @@ def _supports(scene: Scene, particles: Particles, steepness: Array) -> tuple[Arr
     return z, y
 
 
-def _contact(
-    scene: Scene, particles: Particles, materials: tuple[MaterialPoints, ...], steepness: Array
-) -> Float[Array, "p"] | float:
-    """k (1 + A ‖B‖²)/m of each particle [1/s²], by which the spring between its face and a surface adds to Λ A/ρ0; zero
-    in a scene without surfaces. B is that of a face across an axis."""
-    faces = faces_of(scene, particles, materials, scene.stencil(particles), jnp.ones(()))
-    if faces is None or not any(boundary.pushes for boundary in scene.boundary):
+def _contact(particles: Particles, nodes: Nodes, steepness: Array) -> Float[Array, "p"] | float:
+    """n k (1 + A ‖B‖²)/m of each particle [1/s²], by which springs between its face and surfaces add to Λ A/ρ0; zero in
+    a scene without surfaces. n is the largest eigenvalue of the sum of n nᵀ over the surfaces whose springs it may feel
+    now, at least one."""
+    contacts = [c for c in nodes.contacts if isinstance(c, SurfaceContact)]
+    if not contacts:
         return 0.0
-    axes = jnp.eye(particles.dim, dtype=particles.x.dtype)
-    across = [faces.width(jnp.broadcast_to(n[:, None], particles.x.T.shape))[1] for n in axes]
-    square = jnp.stack([(B**2).sum(axis=(0, 1)) for B in across]).max(axis=0)
-    return faces.stiffness_at(length(particles.v)) * (1 + steepness * square) / particles.mass
+    square = jnp.stack([(c.widening**2).sum(axis=(0, 1)) for c in contacts]).max(axis=0)
+    near = reduce(jnp.add, [jnp.where(c.near, c.normal[:, None] * c.normal, 0) for c in contacts])
+    number = jnp.maximum(la.symmetric_eigen(near)[0].max(axis=0), 1)
+    stiffness = contacts[0].faces.stiffness_at(length(particles.v))
+    return number * stiffness * (1 + steepness * square) / particles.mass
 
 
 def _between_bodies(
-    scene: Scene, particles: Particles, materials: tuple[MaterialPoints, ...]
+    scene: Scene, particles: Particles, materials: tuple[MaterialPoints, ...], nodes: Nodes
 ) -> Float[Array, ""] | float:
-    """The most that the springs between two bodies add to Λ A/ρ0 [1/s²]: 4 k/(ρ dx²), with the stiffness k of the two
-    in a row and the density ρ of the lighter. A node at a distance s from the surface has the share cos²(πs/2dx) of a
-    spring, and by its mass, G(s) of the one body and G(−s) of the other, no more than 4 times k/(ρ dx²). At edges of
-    blocks, whose nodes are lighter, the patches that the springs push had 1.01 times that at most."""
+    """The most that the springs between bodies add to Λ A/ρ0 [1/s²].
+
+    Of those that are felt now it is 2 max_j Σ_i k_i q_ij (1/m_j^a + 1/m_j^b), summed over the pairs of bodies: a bound
+    (derivation, section 12). Of bodies that may meet, 4 k/(ρ dx²) with the stiffness k of the two in a row and the
+    density ρ of the lighter, by which a node at a distance s from the surface has the share cos²(πs/2dx) of a spring,
+    and by its mass, G(s) of the one body and G(−s) of the other, no more than 4 times k/(ρ dx²)."""
     if scene.bodies is None:
         return 0.0
+    felt, layers = 0.0, nodes.mass.reshape(scene.grid.layers, -1)
+    for contact in nodes.contacts:
+        if isinstance(contact, BodyContact):
+            first, second = (layers[body] for body in contact.pair)
+            reduced = in_a_row(first, second, first + second > 0)
+            share = contact.patch.spread(contact.stiffness[:, None])[:, 0]
+            felt = felt + 2 * jnp.where(reduced > 0, share / jnp.where(reduced > 0, reduced, 1), 0).max()
     density, speed = particles.mass / particles.volume, length(particles.v)
     modulus = contact_moduli(scene, particles, materials) + density * (speed + speed.max()) ** 2
     of_body = scene.bodies.numbers(len(scene.laws))
@@ -240,7 +271,7 @@ def _between_bodies(
     added = [
         in_a_row(stiff[a], stiff[b]) / jnp.minimum(light[a], light[b]) for a, b in combinations(range(len(stiff)), 2)
     ]
-    return 4 * STIFFNESS * jnp.stack(added).max() / jnp.asarray(scene.grid.spacing) ** 2
+    return jnp.maximum(felt, 4 * STIFFNESS * jnp.stack(added).max() / jnp.asarray(scene.grid.spacing) ** 2)
 
 
 def _stiffest(points: MaterialPoints, dim: int) -> Float[Array, "q"]:
