@@ -176,6 +176,35 @@ def test_an_angle_that_is_none_gets_a_hint(folder, view):
     assert "is not AZIMUTH,ELEVATION" in err
 
 
+BAD_OPTIONS = {
+    "--fps 0": r"fps must be from 1 to 100, got 0",
+    "--fps -1": r"fps must be from 1 to 100, got -1",
+    "--dpi 1e9": r"dpi must be from 1 to \d+, got 1000000000",
+    "--dpi nan": r"dpi must be finite, got nan",
+    "--dpi 0": r"dpi must be from 1 to",
+    "--import os.nope": r"--import os\.nope: ModuleNotFoundError: No module named 'os\.nope'",
+    "--import {}/bad.py": r"--import .*bad\.py: SyntaxError: .*bad\.py, line 1",
+    "--import {}/fails.py": r"--import .*fails\.py: ZeroDivisionError: .*fails\.py, line 2",
+}
+
+
+@pytest.mark.parametrize("options", BAD_OPTIONS)
+def test_a_bad_option_gets_one_line(folder, options):
+    (folder / "bad.py").write_text("def (:\n")
+    (folder / "fails.py").write_text("\n1 / 0\n")
+    line = refused("render", folder / "run.h5", "-o", folder / "a.gif", *options.format(folder).split())
+    assert re.search(BAD_OPTIONS[options], line), line
+
+
+def test_a_fit_on_a_grid_that_cannot_be_does_not_begin(tmp_path):
+    (tmp_path / "front.csv").write_text("t,x\n0.02,0.3\n0.04,0.29\n")
+    observed = '[[fit.observation]]\nkind = "Extent"\ndata = "front.csv"\ntime = "t"\nvalue = "x"\naxis = 1\n'
+    fitted = '[fit]\n[[fit.parameter]]\npath = "scene.material.youngs_modulus"\nstart = 3e4\n'
+    (tmp_path / "scene.toml").write_text(SCENE + fitted + observed)
+    line = refused("fit", tmp_path / "scene.toml", "--refine", "2,1000000")
+    assert re.search(r"A lattice of 9e\+12 particles|fewer than 2\^31 nodes", line), line
+
+
 BAD_SCENES = {
     "wrong key": ("spacing = 0.1", "spacng = 0.1", r"\[grid\].*spacng.*spacing"),
     "wrong kind": ('"SlipBox"', '"SlideBox"', r"\[\[boundary\]\].*SlideBox"),

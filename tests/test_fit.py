@@ -1,6 +1,5 @@
 """Fits: parameters, observations, errors, and what is refused."""
 
-from types import SimpleNamespace
 from unittest.mock import Mock
 
 import equinox as eqx
@@ -163,6 +162,24 @@ def test_a_prior_and_outliers_are_weighed_by_the_estimated_noise(monkeypatch):
     y[::40] += 3.0
     assert fitted_line(monkeypatch, y, robust=1.0)["a"].value == pytest.approx(2, abs=0.01)
     assert abs(fitted_line(monkeypatch, y)["a"].value - 2) > 0.05
+
+
+@pytest.mark.parametrize("steps", [7, 60, 999, 10**6])
+def test_times_of_a_run_in_single_precision_lie_in_it(steps):
+    """Those of its frames as they are, also where they round to times after t1; later ones do not."""
+    scene, particles = bar()
+    for dt in (1e-3, 3e-4, 1 / 7, 0.06 / 60):
+        t1, short = steps * dt, np.float32(dt)
+        times = np.arange(steps - 2, steps + 1, dtype=np.float32) * short
+        seen = mpm.Series(times, np.zeros(3), mpm.Extent(0))
+        seen.check(scene, particles, t1)
+        assert seen.part_until(t1).count == 3
+        with pytest.raises(ValueError, match="must lie in the run"):
+            seen.check(scene, particles, 0.99 * t1)
+        run = Mock(spec=mpm.Run, dt=jnp.asarray(short))
+        predicted = seen.predict(jnp.arange(steps + 1, dtype=jnp.float32), run)
+        assert np.asarray(predicted) == pytest.approx(np.arange(steps - 2, steps + 1), rel=3e-7)
+        assert np.isnan(seen.predict(jnp.zeros(int(0.99 * steps), jnp.float32), run)[-1])
 
 
 @pytest.mark.thorough

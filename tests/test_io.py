@@ -218,7 +218,7 @@ def test_the_file_says_what_it_holds(tmp_path):
     with h5py.File(tmp_path / "run.h5") as file:
         own = file["mpmjax"]
         assert own.attrs["units"].startswith(b"SI")
-        assert (own.attrs["format"], own.attrs["d"], own.attrs["dtype"]) == (7, 2, b"float64")
+        assert (own.attrs["format"], own.attrs["d"], own.attrs["dtype"]) == (8, 2, b"float64")
         scene = json.loads(own["scene"][...].tobytes())
         assert scene["material"] == {"kind": "FixedCorotated", "youngs_modulus": 1 / 3, "poisson_ratio": 0.3}
         assert own["frames"]["step"].tolist() == [0, 5, 7]
@@ -281,7 +281,7 @@ def test_a_signal_is_told_what_the_file_holds(tmp_path, monkeypatch):
 
     def signalled():
         with undisturbed():
-            told.append((writer.standing(), len(load(path))))
+            told.append((writer.standing(""), len(load(path))))
 
     def committed(file):
         commit(file)
@@ -384,7 +384,7 @@ def test_a_full_disk_stops_a_run_at_the_frame_that_does_not_fit(tmp_path):
             record(path, scene, particles, **kwargs)
         assert "\n" not in str(caught.value)
         if not path.exists():
-            assert str(caught.value).endswith("Make room, or name another place.")
+            assert str(caught.value).endswith("It is as it was.")
             continue
         n, last = map(int, re.search(r"holds (\d+) frames?, the last of step (\d+) ", str(caught.value)).groups())
         assert str(caught.value).endswith("Make room, then resume it.")
@@ -412,6 +412,54 @@ def test_a_full_disk_leaves_the_run_that_was_to_be_replaced(tmp_path):
         save(path, run)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk_leaves_the_run_that_was_to_be_recorded_anew(tmp_path):
+    """It goes when the first frame of the new one is on the disk; then the new one is continued like any other."""
+    path, run, (scene, particles) = tmp_path / "run.h5", made_up(2), jelly()
+    kwargs = {"t1": 0.07, "dt": 5e-3, "save_every": 4, "overwrite": True}
+    save(path, run)
+    size = path.stat().st_size
+    for limit in (1000, size // 3):
+        with full_beyond(limit), pytest.raises(OSError, match=rf"^{path} could not be written: .*File too large"):
+            record(path, scene, particles, **kwargs)
+        assert_same(load(path), run)
+        assert list(tmp_path.iterdir()) == [path]
+    record(path, scene, particles, **kwargs)
+    assert load(path).steps.tolist() == [0, 4, 8, 12, 14]
+
+
+GONE = {
+    "removed": lambda path: path.unlink(),
+    "moved": lambda path: path.rename(path.with_name("other.h5")),
+    "replaced": lambda path: shutil.move(shutil.copy(path.parents[1] / "run.h5", path.with_name("new")), path),
+    "folder removed": lambda path: shutil.rmtree(path.parent),
+}
+
+
+@pytest.mark.parametrize("take_away", **ids(GONE))
+def test_a_run_whose_file_is_taken_away_is_not_called_written(take_away, tmp_path, monkeypatch):
+    """At the next frame or, where that was the last, at the end; nor is what stands there now touched."""
+    path, (scene, particles) = tmp_path / "folder" / "run.h5", jelly()
+    append, reached = FrameWriter.append, []
+    save(tmp_path / "run.h5", made_up(2))
+
+    def appended(writer, step, *rest):
+        append(writer, step, *rest)
+        reached.append(step)
+        if reached == until:
+            take_away(path)
+
+    monkeypatch.setattr(FrameWriter, "append", appended)
+    for until in ([0, 4], [0, 4, 8, 12, 14]):
+        path.parent.mkdir(exist_ok=True)
+        reached.clear()
+        says = r"run\.h5 was removed or replaced while it was written: run the simulation again\.$"
+        with pytest.raises(OSError, match=says):
+            record(path, scene, particles, t1=0.07, dt=5e-3, save_every=4, overwrite=True)
+        assert reached == until
+        if path.exists():
+            assert_same(load(path), made_up(2))
 
 
 def test_a_complete_run_can_be_resumed(tmp_path):
@@ -561,9 +609,11 @@ def test_files_of_another_kind_are_named(tmp_path):
     of("other.h5", r"has no group /VTKHDF or /mpmjax: it is not a run that mpmjax wrote\.$")
     save(tmp_path / "later.h5", run)
     with h5py.File(tmp_path / "later.h5", "r+") as file:
-        file["mpmjax"].attrs["format"] = 8
-    of("later.h5", r"has format 8, this mpmjax reads format 7: use mpmjax [\d.]+, which wrote it\.$")
-    FrameWriter.create(tmp_path / "bare.h5", run.scene, run.final, run.method, run.dt).close()
+        file["mpmjax"].attrs["format"] = 7
+    of("later.h5", r"has format 7, this mpmjax reads format 8: use mpmjax [\d.]+, which wrote it\.$")
+    save(tmp_path / "bare.h5", run)
+    with h5py.File(tmp_path / "bare.h5", "r+") as file:
+        file["VTKHDF/Steps"].attrs["NSteps"] = 0
     of("bare.h5", r"holds no frame: run the simulation again\.$")
     save(tmp_path / "lacking.h5", run)
     with h5py.File(tmp_path / "lacking.h5", "r+") as file:
@@ -571,15 +621,20 @@ def test_files_of_another_kind_are_named(tmp_path):
     save(tmp_path / "weightless.h5", run)
     with h5py.File(tmp_path / "weightless.h5", "r+") as file:
         del file["mpmjax/mass"]
-    of("weightless.h5", r"is damaged \(mass or volume is missing\): restore it from a copy, or run")
-    of("lacking.h5", r"is damaged, or just being written \(.*velocity.*\): restore it from a copy, or run")
+    of(
+        "weightless.h5",
+        r"is damaged \(its scene, method or particles are not what was written\): restore it from a copy, or run",
+    )
+    of("lacking.h5", r"is damaged \(frame 0 is not what was written\): restore it")
     with pytest.raises(ValueError, match=r"run\.h5 cannot be written \(no folder .*\): name a place that can be\.$"):
         save(tmp_path / "folder" / "run.h5", run)
 
 
 def replaced(file: h5py.File, name: str, link: object) -> None:
-    del file[name]
-    file[name] = link
+    if name in file:
+        del file[name]
+    if link is not None:
+        file[name] = link
 
 
 def outside(file: h5py.File, **storage: object) -> None:
@@ -621,6 +676,91 @@ def test_a_file_that_leads_elsewhere_is_refused(lead_away, tmp_path):
         with pytest.raises(ValueError, match=r"run\.h5: /.*, which no run of mpmjax has: restore it from a copy"):
             read(path)
     assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+def test_zeros_are_no_data(tmp_path):
+    """Not in any dataset: HDF5's own checksum of zeros is zero."""
+    run, whole, path = made_up(2), tmp_path / "run.h5", tmp_path / "zeros.h5"
+    save(whole, run)
+    chunks = {}
+
+    def add(name, item):
+        if isinstance(item, h5py.Dataset) and item.size:
+            item.id.chunk_iter(lambda chunk: chunks.update({name: chunk}))
+
+    with h5py.File(whole) as file:
+        file.visititems(add)
+    tried = 0
+    for chunk in chunks.values():
+        data, (start, size) = bytearray(whole.read_bytes()), (chunk.byte_offset, chunk.size)
+        if not any(data[start : start + size]):
+            continue
+        tried += 1
+        data[start : start + size] = bytes(size)
+        path.write_bytes(data)
+        for read in (load, lambda path: FrameWriter.resume(path, run.scene, run.final, run.method, run.dt)):
+            with pytest.raises(ValueError, match=r"is damaged \(.* not what was written\): restore it"):
+                read(path)
+    assert tried > 20
+
+
+def spoilt(name: str, value: object) -> Run:
+    """A run with a number that no run has."""
+    run = made_up(2)
+    frames = lambda r: getattr(r.frames, name)  # noqa: E731
+    return eqx.tree_at(frames, run, frames(run).at[1, 3].set(value))
+
+
+NO_RUNS = {
+    "dt": (lambda: eqx.tree_at(lambda r: r.dt, made_up(2), jnp.asarray(jnp.nan)), r"dt \[s\] must be finite"),
+    "negative dt": (lambda: eqx.tree_at(lambda r: r.dt, made_up(2), jnp.asarray(-1.0)), r"dt \[s\] must be greater"),
+    "x": (lambda: spoilt("x", jnp.nan), r"A run's frames must be finite"),
+    "far": (lambda: spoilt("x", 1e30), r"Positions must be below .* m"),
+    "v": (lambda: spoilt("v", jnp.inf), r"A run's frames must be finite"),
+    "steps": (lambda: eqx.tree_at(lambda r: r.steps, made_up(2), jnp.asarray([5.0, 0, 7])), r"A run's steps must grow"),
+}
+
+
+@pytest.mark.parametrize(("bad", "says"), **ids(NO_RUNS))
+def test_what_is_no_run_is_neither_saved_nor_loaded(bad, says, tmp_path, monkeypatch):
+    """Numbers that a run cannot have, also where every checksum is right."""
+    with pytest.raises(ValueError, match=says):
+        save(tmp_path / "run.h5", bad())
+    assert not list(tmp_path.iterdir())
+    with monkeypatch.context() as patched:
+        patched.setattr(mpmjax.io._runs, "_check_numbers", lambda *_: None)
+        save(tmp_path / "run.h5", bad())
+    with pytest.raises(ValueError, match=rf"run\.h5 is damaged \({says}"):
+        load(tmp_path / "run.h5")
+
+
+LARGE = {
+    "mass": lambda file: file["mpmjax/mass"].resize(10**13, axis=0),
+    "x": lambda file: file["VTKHDF/Points"].resize(10**13, axis=0),
+    "frames": lambda file: file["VTKHDF/Steps"].attrs.modify("NSteps", np.int64(10**13)),
+    "no frames": lambda file: file["VTKHDF/Steps"].attrs.modify("NSteps", np.int64(-1)),
+    "no chunks": lambda file: replaced(file, "mpmjax/X", None) or file.create_dataset("mpmjax/X", (10**13, 2), float),
+    "one chunk": lambda file: (
+        replaced(file, "mpmjax/X", None)
+        or file.create_dataset("mpmjax/X", (10**5, 5000), float, chunks=(10**5, 5000), compression="gzip")
+    ),
+    "directions": lambda file: file["mpmjax"].attrs.modify("d", np.int64(10**13)),
+    "materials": lambda file: file["mpmjax"].attrs.create("counts", np.array([10**13, 7 - 10**13])),
+    "precision": lambda file: file["mpmjax"].attrs.create("dtype", np.bytes_("S1000000000")),
+}
+
+
+@pytest.mark.parametrize("enlarge", **ids(LARGE))
+def test_a_file_that_declares_what_it_has_not_is_refused(enlarge, tmp_path):
+    """Before memory is taken for it; or what no frame has is left alone."""
+    save(tmp_path / "run.h5", made_up(2))
+    with h5py.File(tmp_path / "run.h5", "r+", libver=("v110", "v110")) as file:
+        enlarge(file)
+    if enlarge in (LARGE["x"], LARGE["directions"]):
+        assert_same(load(tmp_path / "run.h5"), made_up(2))
+        return
+    with pytest.raises(ValueError, match=r"run\.h5 is damaged|run\.h5 holds no frame"):
+        load(tmp_path / "run.h5")
 
 
 @pytest.mark.thorough
@@ -708,8 +848,7 @@ def test_a_flipped_bit_is_caught_or_harmless(tmp_path):
 def test_no_steps_is_the_row_of_a_start(tmp_path):
     """A recorded run's first frame has the empty statistics."""
     run = made_up(2)
-    with FrameWriter.create(tmp_path / "run.h5", run.scene, run.final, run.method, run.dt) as writer:
-        writer.append(3, initial_state(run.scene, run.final), no_steps(jnp.float64))
+    with FrameWriter.create(tmp_path / "run.h5", run.scene, run.final, run.method, run.dt, start=3) as writer:
         step, state, statistics = writer.last()
     assert step == 3
     assert_same((state, statistics), (initial_state(run.scene, run.final), no_steps(jnp.float64)))

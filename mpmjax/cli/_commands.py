@@ -5,6 +5,7 @@ import importlib.util
 import signal
 import sys
 import time
+import traceback
 import warnings
 from collections.abc import Callable
 from functools import wraps
@@ -78,21 +79,29 @@ def _import(modules: list[str] | None) -> None:
     """Import modules, each by its name or by the path of its .py file: files know what they register from then on.
 
     Raises:
-        ValueError: there is no such module or file.
+        ValueError: there is no such module or file, or its code fails.
     """
     for name in modules or []:
         path = Path(name)
         if path.suffix != ".py":
             known = importlib.util.find_spec(name.partition(".")[0])
             require(known, f"--import: Python finds no module {name!r}; name its .py file instead.")
-            importlib.import_module(name)
-            continue
-        require(path.is_file(), f"--import: there is no file {name}.")
-        spec = importlib.util.spec_from_file_location(path.stem, path)
-        assert spec is not None
-        assert spec.loader is not None
-        sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
+        else:
+            require(path.is_file(), f"--import: there is no file {name}.")
+        try:
+            if path.suffix != ".py":
+                importlib.import_module(name)
+                continue
+            spec = importlib.util.spec_from_file_location(path.stem, path)
+            assert spec is not None
+            assert spec.loader is not None
+            sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
+            spec.loader.exec_module(module)
+        except Exception as error:
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            own = not isinstance(error, (ImportError, SyntaxError))  # which say it themselves
+            where = f" ({place.filename}, line {place.lineno})" if own else ""
+            raise ValueError(f"--import {name}: {type(error).__name__}: {error}{where}") from None
 
 
 Imports = Annotated[
@@ -233,6 +242,8 @@ def fit_command(
     require(log is not None or not resume, "--resume continues the fit of a log: name it by --log.")
     asked = read_fit(scene, lambda file: _chosen(file, most_seconds))
     grids = asked.refine if refine is None else _grids(refine)
+    if grids:
+        asked.refined(grids[-1])  # a grid that cannot be is refused before the first fit
     plot = Path(f"{scene.stem}_fit.png") if plot is None else plot
     require(plot.resolve().parent.is_dir(), f"{plot} cannot be written (no folder {plot.parent}).")
     labels = FitProblem(asked.experiments, asked.parameters).labels

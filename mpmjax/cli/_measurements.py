@@ -26,6 +26,7 @@ from mpmjax.fitting import (
     StressStretch,
     Torque,
     Tracks,
+    after,
     read_arrays,
 )
 from mpmjax.geometry import AbstractRegion
@@ -328,7 +329,7 @@ def _density(
     )
     fine = np.isfinite(t)
     require(fine.all(), f"{path}: {time} must be finite, but picture {np.flatnonzero(~fine)[:1]} has none.")
-    late = np.flatnonzero((t < 0) | (t > source.t1 * (1 + 1e-9)))
+    late = np.flatnonzero((t < 0) | after(t, source.t1))
     require(len(late) == 0, f"{path}: picture {late[:1]} is of a time outside of the run, from 0 to {source.t1:g} s.")
     back = np.flatnonzero(np.diff(t) <= 0) + 1
     require(len(back) == 0, f"{path}: picture {back[:1]} is not later than the one before: sort them by time.")

@@ -3,7 +3,7 @@
 from mpmjax.fitting._adam import Adam
 from mpmjax.fitting._arrays import read_arrays
 from mpmjax.fitting._bootstrap import Bootstrap, bootstrap
-from mpmjax.fitting._columns import Columns, read_columns
+from mpmjax.fitting._columns import Columns, after, read_columns
 from mpmjax.fitting._ensemble import EnsembleFit, fit_ensemble
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._field import Field
@@ -64,6 +64,7 @@ __all__ = [
     "Torque",
     "Tracks",
     "Unbounded",
+    "after",
     "bootstrap",
     "fit",
     "fit_ensemble",

@@ -25,7 +25,7 @@ def read_arrays(path: Path, *names: str) -> list[np.ndarray]:
         else:
             with h5py.File(path, "r", locking=False) as file:
                 found = {name: np.asarray(file[name]) for name in names if name in file}
-    except (OSError, KeyError, EOFError, ValueError, TypeError, zipfile.BadZipFile) as error:
+    except (OSError, KeyError, EOFError, ValueError, TypeError, MemoryError, zipfile.BadZipFile) as error:
         raise ValueError(f"Cannot read the data file {path}: {reason(error).lower()}.") from None
     for name in names:
         require(name in found, f"{path} has no array {name!r}.")

@@ -134,7 +134,7 @@ class Columns:
         read, advice = (f", with time_unit = {unit:g},", "") if unit != 1 else ("", ", or give time_unit")
         self.require(times >= 0, f"{name} {{{name}}} lies before the run, which begins at 0: leave the row out.")
         self.require(
-            times <= t1 * (1 + 1e-9),
+            ~after(times, t1),
             f"{name} {{{name}}}{read} lies after the end of the run, t1 = {t1:g} s: raise [run] t1, leave the row out"
             f"{advice}.",
         )
@@ -142,6 +142,15 @@ class Columns:
             steps = np.diff(times, prepend=-np.inf)
             self.require(steps > 0, f"{name} {{{name}}} must be later than in the row before: sort the rows by time.")
         return times
+
+
+def after(times: np.ndarray, t1: float) -> np.ndarray:
+    """Whether times lie after a run's end t1 [s], by more than single precision has rounded the times of its steps."""
+    return times > t1 * (1 + ROUNDED)
+
+
+ROUNDED = 1e-6
+"""Part of a time by which it may be rounded: its step's number times dt, each in single precision, and more."""
 
 
 def stated_unit(name: str) -> float | None:

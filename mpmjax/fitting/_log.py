@@ -9,11 +9,12 @@
     /resume         what the next iteration needs: what the optimiser remembers, and what it knows of its place
 
 The file is replaced as a whole after each iteration (see `mpmjax.io.ReplacedFile`): it holds whole iterations only,
-however the process ends.
+however the process ends. Its last four bytes are CRC-32 of all others.
 """
 
 import io
 import json
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -34,7 +35,7 @@ from mpmjax.fitting._problem_text import described
 from mpmjax.fitting._search import Iteration, Standing, begin
 from mpmjax.io import ReplacedFile, check_hdf5, reason
 
-_FORMAT = 1
+_FORMAT = 2
 _ROW = [("round", "i8"), ("number", "i8"), ("cost", "f8"), ("gradient", "f8"), ("accepted", "?"), ("seconds", "f8")]
 
 
@@ -101,10 +102,11 @@ class FitLog:
         whole = io.BytesIO()
         with h5py.File(whole, "w", libver=("v110", "v110")) as file:
             self._fill(file)
+        data = whole.getvalue()
         try:
-            self._file.write(whole.getvalue())
+            self._file.write(data + zlib.crc32(data).to_bytes(4))
         except OSError as error:
-            raise OSError(f"{error} The log holds what was there before: make room, then resume the fit.") from None
+            raise OSError(f"{error} If it has no room, make room, then resume the fit.") from None
 
     def standing(self) -> str:
         """What the log holds, as a sentence."""
@@ -182,14 +184,17 @@ def _read(
         ValueError: see `opened_log`.
     """
     try:
-        with h5py.File(path, "r", locking=False) as file:
+        data = path.read_bytes()
+        with h5py.File(io.BytesIO(data), "r") as file:
             known = file.attrs.get("kind") == b"mpmjax fit log"
             found = int(np.asarray(file.attrs["format"])) if known else 0
+            whole = zlib.crc32(data[:-4]) == int.from_bytes(data[-4:])
+            require(whole or found != _FORMAT, "it is not what was written")
             datasets: list[Any] = []
             file.visititems(lambda _, item: datasets.append(item) if isinstance(item, h5py.Dataset) else None)
-            arrays = {item.name.lstrip("/"): np.asarray(item[()]) for item in datasets}
+            arrays = {item.name.lstrip("/"): np.asarray(item[()]) for item in datasets if whole}
         theirs = json.loads(arrays["problem"].tobytes()) if found == _FORMAT else {}
-    except (OSError, KeyError, ValueError, RuntimeError) as error:
+    except (OSError, KeyError, ValueError, RuntimeError, MemoryError) as error:
         raise ValueError(f"{path} is damaged ({reason(error)}): begin the fit anew with another log.") from None
     require(known, f"{path} is not the log of a fit: check its name.")
     require(found == _FORMAT, f"{path} is a log of format {found}, this mpmjax reads {_FORMAT}: begin the fit anew.")

@@ -10,6 +10,7 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import require, require_finite, require_positive
+from mpmjax.fitting._columns import ROUNDED, after
 from mpmjax.fitting._prior import drawn_nearer
 from mpmjax.fitting._quantities import Markers
 from mpmjax.simulation import Run
@@ -191,13 +192,13 @@ class Series(AbstractObservation):
             first: where the first one stands, in steps from the start.
         """
         step = jnp.asarray(self.times, values.dtype) / run.dt
-        outside = (step < -_BEYOND) | (step > len(run.steps) - 1 + _BEYOND)
+        outside = (step < -_BEYOND) | (step > (len(run.steps) - 1) * (1 + ROUNDED) + _BEYOND)
         outside = outside.reshape(-1, *[1] * (values.ndim - 1))
         return jnp.where(outside, jnp.nan, between(values, step - first))
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
         what = f"{type(self).__name__} {self.name!r}"
-        outside = (self.times < 0) | (self.times > t1 * (1 + 1e-9))
+        outside = (self.times < 0) | after(self.times, t1)
         require(
             ~outside,
             f"The times of {what} must lie in the run, from 0 to {t1:g} s, but {int(outside.sum())} do not, the first "
@@ -219,7 +220,7 @@ class Series(AbstractObservation):
         Raises:
             ValueError: there is none.
         """
-        kept = self.times <= t1 * (1 + 1e-9)
+        kept = ~after(self.times, t1)
         require(kept.any(), f"{type(self).__name__} {self.name!r} begins at {self.times[0]:g} s, after t1 = {t1:g} s.")
         sigma = None if self.sigma is None else np.broadcast_to(self.sigma, self.data.shape)[kept]
         return eqx.tree_at(
@@ -230,7 +231,7 @@ class Series(AbstractObservation):
         )
 
     def part_until(self, t1: float) -> "Series | None":
-        seen = np.isfinite(self.data[self.times <= t1 * (1 + 1e-9)]).any()
+        seen = np.isfinite(self.data[~after(self.times, t1)]).any()
         return self.until(t1) if seen else None
 
     def explain(self, seen: Array, run: Run) -> None:

@@ -37,7 +37,7 @@ def replacing(path: Path) -> Iterator[Path]:
             with undisturbed():
                 os.replace(aside, path.resolve())
         except OSError as error:
-            raise OSError(f"{path} could not be written: {reason(error)}.") from None
+            raise OSError(f"{path} could not be written: {reason(error).rstrip('.')}. It is as it was.") from None
         finally:
             aside.unlink(missing_ok=True)
 

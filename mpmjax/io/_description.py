@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mpmjax.checks import canonical
-from mpmjax.io._hdf5 import FORMAT, FileRefusedError, require_of_file
+from mpmjax.io._hdf5 import FORMAT, FileRefusedError, fixed_checksum, require_of_file
 from mpmjax.io._schema import decode, encode
 from mpmjax.io._vtkhdf import File, add_fixed
 from mpmjax.state import Particles, Scene
@@ -49,7 +49,7 @@ def check_readable(path: Path, described: dict[str, Any]) -> None:
 
 
 def write_description(group: File, described: dict[str, Any]) -> None:
-    """Write what `describe` returned into the group of a file that is for it."""
+    """Write what `describe` returned into the group of a file that is for it, the last of what is written once."""
     for name, text in {"version": version("mpmjax"), "units": _UNITS, "dtype": described["dtype"]}.items():
         group.attrs.create(name, np.bytes_(text))  # of fixed length: others lie where HDF5 has no checksum
     group.attrs["format"] = np.int64(FORMAT)
@@ -64,6 +64,7 @@ def write_description(group: File, described: dict[str, Any]) -> None:
             add_fixed(group, name, data)
     for name, data in described["arrays"].items():
         add_fixed(group, f"arrays/{name}", data)
+    group.attrs["checksum"] = np.uint32(fixed_checksum(group.file))
 
 
 def description_in(group: File) -> dict[str, Any]:

@@ -1,19 +1,23 @@
 """Opening a run's HDF5 file, with checks that it is one, holds all of its data itself, and is whole."""
 
+import math
 import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 
 from mpmjax.checks import require
 from mpmjax.io._aside import reason
 from mpmjax.io._staged import StagedFile, require_no_writer
 from mpmjax.io._vtkhdf import File, count_in
 
-FORMAT = 7
+FORMAT = 8
 LIBVER_HEAD = ("v108", "v108")
 _LIBVER = ("v110", "v110")  # what "latest" writes, VTK 9.7 cannot read
 _GROWING = (
@@ -23,8 +27,10 @@ _GROWING = (
     "mpmjax/frames",
     "mpmjax/collider_impulse",
     "mpmjax/boundary_impulse",
+    "mpmjax/checksums",
 )
 _GROUPS = ("VTKHDF", "mpmjax")
+_MOST_SHRUNK = 1032  # by deflate, as h5repack may have written a run anew
 _REMEDY = "restore it from a copy, or run the simulation again"
 _BUSY = "{} is being written by another run: wait until that ends or stop it, or choose another name."
 
@@ -39,11 +45,9 @@ def require_of_file(condition: Any, message: str) -> None:
         raise FileRefusedError(message)
 
 
-def staged_file(path: Path, *, new: bool = False) -> StagedFile:
-    """The file, locked and ready to be changed; with `new` it is made if it is not there."""
+def staged_file(path: Path) -> StagedFile:
+    """The file, locked and ready to be changed."""
     try:
-        if new:
-            path.touch()
         return StagedFile(path)
     except BlockingIOError:
         raise ValueError(_BUSY.format(path)) from None
@@ -109,6 +113,8 @@ def reading(path: Path) -> Iterator[File]:
         with h5py.File(path, "r", locking=False) as file:
             _check_format(path, file)
             _check_written(file)
+            whole = fixed_checksum(file) == file["mpmjax"].attrs["checksum"]
+            require(whole, "its scene, method or particles are not what was written")
             yield file
     except FileRefusedError:
         raise
@@ -167,26 +173,60 @@ def _check_contained(path: Path, file: File) -> None:
 
 
 def _check_written(file: File) -> None:
-    """Check that every counted frame was written: one that was not reads as zeros and has no checksum."""
+    """Check that every counted frame was written: one that was not reads as zeros, has no checksum, and may be declared
+    to be larger than any memory."""
     count = count_in(file)
 
     def check(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset) and item.size:
-            rows, frames = (item.chunks or item.shape)[0], count if name.startswith(_GROWING) else 1
-            chunks = set()
-            item.id.chunk_iter(lambda chunk: chunks.add(chunk.chunk_offset[0]))
-            lost = next((n for n in range(frames) if n * rows not in chunks), None)
+            chunk: tuple[int, ...] = item.chunks or (0,)
+            rows, size = chunk[0], item.dtype.itemsize * math.prod(chunk)
+            require(rows and chunk[1:] == item.shape[1:], f"{name} does not lie in frames")
+            frames = count if name.startswith(_GROWING) else -(-len(item) // rows)
+            least = size // _MOST_SHRUNK if item.compression else size
+            stored: dict[int, int] = {}
+            item.id.chunk_iter(lambda chunk: stored.update({chunk.chunk_offset[0]: chunk.size}))
+            lost = next((n for n in range(frames) if stored.get(n * rows, -1) < least), None)
             require(lost is None, f"frame {lost} of {name} was never written")
 
     file.visititems(check)
 
 
-def check_whole(file: File) -> None:
-    """Read every chunk, so that every checksum is compared."""
+def checksum(rows: dict[str, np.ndarray]) -> int:
+    """CRC-32 of the bytes of some arrays, in the order of their names. Zeros do not have it, as they have HDF5's own:
+    that of zeros is zero."""
+    return reduce(lambda crc, name: zlib.crc32(rows[name].tobytes(), crc), sorted(rows), 0)
 
-    def read(_: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and item.size:
-            for chunk in item.iter_chunks():
-                item[chunk]
+
+def fixed_checksum(file: File) -> int:
+    """The checksum of what is in a file but for its frames."""
+    found: dict[str, np.ndarray] = {}
+
+    def read(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and not name.startswith(_GROWING):
+            found[name] = item[...]
 
     file.visititems(read)
+    return checksum(found)
+
+
+def frame_rows(file: File, start: int, stop: int) -> dict[str, np.ndarray]:
+    """The rows of frames `start` to `stop` in each dataset that grows.
+
+    Raises:
+        ValueError: they are not what was written.
+    """
+    found: dict[str, np.ndarray] = {}
+
+    def read(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and name.startswith(_GROWING):
+            count = (item.chunks or (0,))[0]
+            found[name] = item[start * count : stop * count]
+
+    file.visititems(read)
+    sums = found.pop("mpmjax/checksums")
+    for i in range(stop - start):
+        lengths = {name: len(rows) // (stop - start) for name, rows in found.items()}
+        frame = {name: rows[i * lengths[name] : (i + 1) * lengths[name]] for name, rows in found.items()}
+        require(checksum(frame) == sums[i], f"frame {start + i} is not what was written")
+    return found

@@ -4,8 +4,7 @@ import os
 import sys
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import diffrax
 import jax.numpy as jnp
@@ -14,7 +13,7 @@ from tqdm import tqdm
 
 from mpmjax._types import Scalar
 from mpmjax.checks import canonical, checked, require, require_whole, requirements
-from mpmjax.io._interrupt import reporting, undisturbed
+from mpmjax.io._interrupt import reporting
 from mpmjax.io._runs import FrameWriter
 from mpmjax.simulation import (
     Fault,
@@ -25,7 +24,6 @@ from mpmjax.simulation import (
     before_fault,
     initial_state,
     integrate,
-    no_steps,
     number_of_steps,
     raise_faults,
     warn_of_inaccuracy,
@@ -86,7 +84,7 @@ def record(
     if resume:
         writer = FrameWriter.resume(path, scene, particles, method, dt)
     else:
-        writer = _begun(path, scene, particles, method, dt, start, overwrite)
+        writer = FrameWriter.create(path, scene, particles, method, dt, start=start, overwrite=overwrite)
     scene, dt_, method = canonical((scene, dt, method), dtype)
     with writer:
         step, state, statistics = writer.last()
@@ -99,7 +97,7 @@ def record(
 
         def stopped() -> str:
             bar.close()
-            return f"{writer.standing()} Resume it to continue."
+            return writer.standing("Resume it to continue.")
 
         with bar, reporting(stopped):
             healthy = True
@@ -154,7 +152,7 @@ def record(
                 _append(writer, int(error.run.final_step), last, statistics)
                 again = "Resumed it would end there again: begin anew."
                 then = "It can be resumed as it is." if int(statistics.fault) == Fault.NONE else again
-                said = f"{writer.standing()} {then}"
+                said = writer.standing(then)
             except OSError as refused:
                 said = str(refused)
             raise SimulationError(f"{error} {said}", error.run) from None
@@ -162,32 +160,9 @@ def record(
         return run
 
 
-def _begun(
-    path: str | os.PathLike,
-    scene: Scene,
-    particles: Particles,
-    method: AbstractIntegrator,
-    dt: Any,
-    start: int,
-    overwrite: bool,
-) -> FrameWriter:
-    """A writer of a new file with its first frame. If that fails the file is removed, since it could not be resumed."""
-    with undisturbed():
-        writer = FrameWriter.create(path, scene, particles, method, dt, overwrite=overwrite)
-        try:
-            writer.append(start, initial_state(scene, particles), no_steps(particles.x.dtype))
-        except BaseException as error:
-            writer.close()
-            Path(path).unlink()
-            if isinstance(error, OSError):
-                raise OSError(f"{path} was not begun: {error}. Make room, or name another place.") from None
-            raise
-    return writer
-
-
 def _append(writer: FrameWriter, step: int, state: RolloutState, statistics: RunStatistics) -> None:
     """Write a frame; an error says what the file holds."""
     try:
         writer.append(step, state, statistics)
     except OSError as error:
-        raise OSError(f"{error}. {writer.standing()} Make room, then resume it.") from None
+        raise OSError(f"{error}. {writer.standing('Make room, then resume it.')}") from None

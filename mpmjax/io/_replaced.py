@@ -31,8 +31,10 @@ class ReplacedFile:
         """Replace what the file holds.
 
         Raises:
-            OSError: the disk refused; the file is what it was.
+            OSError: the disk refused, or another file has the name; that is what it was.
         """
+        if self._lock is not None and self._path.exists() and not self._lock.is_at(self._path):
+            raise OSError(f"{self._path} was replaced by another file while it was written: choose another name.")
         with undisturbed():
             with replacing(self._path) as aside:
                 aside.write_bytes(data)

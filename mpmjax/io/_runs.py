@@ -4,17 +4,19 @@
                 J = det F, with APIC affine_velocity, and what laws that yield remember
     /mpmjax     format, version, d, dtype, units, dt, counts, mass, volume, X, the scene and the method as JSON (see
                 `_schema`) with their arrays, and a table with one row a frame: its step and the run's `RunStatistics`
-                up to it; `collider_impulse` and `boundary_impulse`, those on each by then, linear, then angular
+                up to it; `collider_impulse` and `boundary_impulse`, those on each by then, linear, then angular;
+                `checksums`, CRC-32 of all that a frame adds, and the attribute `checksum`, that of all other datasets
 
-Whatever is not in a dataset with checksums lies in headers that HDF5 checks itself, so a flipped bit is found. `NSteps`
-is raised last, and what lies beyond it, the remains of a writer that was killed, is neither read nor kept. A frame that
-the disk does not take leaves the file as it was (see `_staged`).
+Whatever is not in a dataset lies in headers that HDF5 checks itself, so a flipped bit is found. `NSteps` is raised
+last, and what lies beyond it, the remains of a writer that was killed, is neither read nor kept. A frame that the disk
+does not take leaves the file as it was (see `_staged`).
 
 A file is read only if it holds all of its data itself: HDF5 follows links to other files, and would write into them.
 """
 
 import os
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import fields
 from pathlib import Path
 from types import TracebackType
@@ -26,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax.boundary import BoundaryImpulse, ColliderImpulse
-from mpmjax.checks import canonical, checked, is_traced, require
+from mpmjax.checks import canonical, checked, is_traced, require, require_finite, require_memory, require_positive
 from mpmjax.io._aside import reason, replacing
 from mpmjax.io._description import check_readable, check_same, describe, description_in, write_description
 from mpmjax.io._hdf5 import (
@@ -34,7 +36,8 @@ from mpmjax.io._hdf5 import (
     check_hdf5,
     check_no_writer,
     check_place,
-    check_whole,
+    checksum,
+    frame_rows,
     opened,
     reading,
     require_of_file,
@@ -45,7 +48,7 @@ from mpmjax.io._schema import decode
 from mpmjax.io._staged import StagedFile
 from mpmjax.io._vtkhdf import File, add_growing, add_topology, count_in, rows_of, set_count, states_in
 from mpmjax.simulation import RolloutState, Run, RunStatistics, initial_state, no_steps
-from mpmjax.state import Particles, Scene, prepare, state_of, with_state
+from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator
 
 _IMPULSES = {"collider_impulse": ColliderImpulse, "boundary_impulse": BoundaryImpulse}
@@ -71,48 +74,31 @@ class FrameWriter:
         method: AbstractIntegrator,
         dt: Any,
         *,
+        start: int = 0,
         overwrite: bool = False,
     ) -> "FrameWriter":
-        """Begin a file without frames.
+        """Begin a file. It takes its place when its first frame is on the disk.
 
         Args:
             path: the file to be.
             scene: the scene.
-            particles: prepared particles (see `prepare`); their state is not written.
+            particles: prepared particles (see `prepare`), the first frame.
             method: the method.
             dt: step [s].
+            start: step number of the first frame.
             overwrite: replace a run's file that is there.
 
         Raises:
             ValueError: a file that is there, and with `overwrite` one that is no run or is being written; a place that
                 cannot be written; an object that files cannot hold.
-            OSError: the disk has no room for it; no file is left.
+            OSError: the disk has no room for it; what was there is there.
         """
         path = Path(path)
-        described = describe(scene, particles, method, dt)
-        check_readable(path, described)
-        begin = initial_state(scene, particles)
-        rows = _rows(0, 0, described["dt"], begin, no_steps(particles.x.dtype))
         check_place(path, overwrite=overwrite)
-        staged = staged_file(path, new=True)
-        try:
-            staged.clear()
-            h5py.File(staged, "w", libver=LIBVER_HEAD).close()
-            file = opened(staged, path)
-            add_topology(file, particles.count)
-            file.create_group("mpmjax/arrays")
-            for name, data in rows.items():
-                add_growing(file, name, data)
-            write_description(file["mpmjax"], described)
-            file.flush()
-            staged.commit()
-        except BaseException as error:
-            staged.close()
-            path.unlink(missing_ok=True)
-            if isinstance(error, OSError):
-                raise OSError(f"{path} was not begun: {reason(error)}. Make room, or name another place.") from None
-            raise
-        return cls(file, staged, path, begin)
+        with undisturbed():
+            with _new(path, scene, particles, method, dt) as writer:
+                writer.append(start, initial_state(scene, particles), no_steps(particles.x.dtype))
+            return cls.resume(path, scene, particles, method, dt)
 
     @classmethod
     def resume(
@@ -134,7 +120,8 @@ class FrameWriter:
         staged = staged_file(path)
         try:
             with reading(path) as file:
-                check_whole(file)
+                for i in range(count_in(file)):
+                    frame_rows(file, i, i + 1)
                 check_same(path, described, description_in(file["mpmjax"]))
                 require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
             file = opened(staged, path)
@@ -179,6 +166,8 @@ class FrameWriter:
                 self._kept = kept
         except (OSError, RuntimeError) as error:
             raise OSError(f"frame {n} could not be written ({reason(error)})") from None
+        if not self._staged.is_at(self._path):
+            raise OSError(f"frame {n} has no file")
 
     def last(self) -> tuple[int, RolloutState, RunStatistics]:
         """Step number, state and statistics of the last frame."""
@@ -186,12 +175,14 @@ class FrameWriter:
         steps, states, tallies = _frames(self._file, self._like, n - 1, n)
         return int(steps[0]), *jax.tree.map(lambda a: a[0], (states, tallies))
 
-    def standing(self) -> str:
-        """What the file holds, as a sentence. It reads nothing, so that any thread may call it at any time."""
+    def standing(self, then: str) -> str:
+        """What the file holds, as a sentence, and what to do then. It reads nothing, so that any thread may call it at
+        any time."""
+        if not self._staged.is_at(self._path):
+            return f"{self._path} was removed or replaced while it was written: run the simulation again."
         frames, step, time = self._kept
-        if frames == 0:
-            return f"{self._path} holds no frame yet."
-        return f"{self._path} holds {frames} frame{'s' * (frames > 1)}, the last of step {step} (t = {time:.6g} s)."
+        held = f"{frames} frame{'s' * (frames > 1)}, the last of step {step} (t = {time:.6g} s)"
+        return f"{self._path} holds {held}. {then}"
 
     def _standing(self) -> tuple[int, int, float]:
         """The number of frames, and the last one's step and time [s]."""
@@ -218,7 +209,30 @@ class FrameWriter:
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        there = self._staged.is_at(self._path)
         self.close()
+        if kind is None and not there:
+            raise OSError(self.standing(""))
+
+
+@contextmanager
+def _new(path: Path, scene: Scene, particles: Particles, method: AbstractIntegrator, dt: Any) -> Iterator[FrameWriter]:
+    """A writer of a new file, without frames, which is at `path` when the block has ended without an error."""
+    described = describe(scene, particles, method, dt)
+    check_readable(path, described)
+    begin = initial_state(scene, particles)
+    with replacing(path) as aside, staged_file(aside) as staged:
+        h5py.File(staged, "w", libver=LIBVER_HEAD).close()
+        file = opened(staged, aside)
+        add_topology(file, particles.count)
+        file.create_group("mpmjax/arrays")
+        for name, data in _rows(0, 0, described["dt"], begin, no_steps(particles.x.dtype)).items():
+            add_growing(file, name, data)
+        write_description(file["mpmjax"], described)
+        file.flush()
+        staged.commit()
+        with FrameWriter(file, staged, aside, begin) as writer:
+            yield writer
 
 
 @checked
@@ -229,25 +243,24 @@ def save(path: str | os.PathLike, run: Run) -> None:
     Observations are not saved. Of the statistics only the last frame's is known; the others are −1.
 
     Raises:
-        ValueError: a run inside a jax transformation or a batch of them, a scene that files cannot hold, a place that
-            cannot be written, a file there that is no run or is being written.
+        ValueError: a run inside a jax transformation or a batch of them, a scene that files cannot hold, numbers that
+            no run has, a place that cannot be written, a file there that is no run or is being written.
         OSError: the disk refused.
     """
     path = Path(path)
     check_place(path, overwrite=True)
     require(not is_traced(run), "A run inside a jax transformation has no values yet: save it outside.")
     require(run.final.x.ndim == 2, "Save a batch of runs one by one: jax.tree.map(lambda a: a[i], run).")
-    steps, final_step = np.asarray(run.steps), int(run.final_step)
+    final_step = int(run.final_step)
+    count = int((np.asarray(run.steps) < final_step).sum())  # beyond it lie frames of a run that met a fault
+    steps, frames = jax.tree.map(lambda a: a[:count], (np.asarray(run.steps), run.frames))
+    states = (state_of(run.final),) if frames is None else (frames, state_of(run.final))
+    _check_numbers(run.scene, run.dt, np.append(steps, final_step), *states)
     unknown = jax.tree.map(lambda a: np.full_like(a, -1), run.statistics)
-    with (
-        replacing(path) as aside,
-        FrameWriter.create(aside, run.scene, run.final, run.method, run.dt, overwrite=True) as writer,
-    ):
-        for i in range(len(run)):
-            if steps[i] < final_step:  # a run that met a fault has frames beyond its last good state
-                kept = run.frames, run.collider_impulse, run.boundary_impulse
-                frame = jax.tree.map(lambda a, i=i: a[i], kept)
-                writer.append(int(steps[i]), RolloutState(*frame), unknown)
+    with _new(path, run.scene, run.final, run.method, run.dt) as writer:
+        for i in range(count):
+            frame = jax.tree.map(lambda a, i=i: a[i], (frames, run.collider_impulse, run.boundary_impulse))
+            writer.append(int(steps[i]), RolloutState(*frame), unknown)
         received = run.final_collider_impulse, run.final_boundary_impulse
         writer.append(final_step, RolloutState(state_of(run.final), *received), run.statistics)
 
@@ -276,22 +289,23 @@ def load(path: str | os.PathLike) -> Run:
     with reading(path) as file:
         described = description_in(file["mpmjax"])
         dtype, arrays = np.dtype(described["dtype"]), described["arrays"]
+        require(dtype.kind == "f", f"its numbers are of {dtype}")
         require_of_file(
             dtype.itemsize <= jnp.zeros(()).dtype.itemsize,
             f'{path} holds a {dtype} run: call jax.config.update("jax_enable_x64", True) first.',
         )
         require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
+        require_memory(f"The run in {path}", path.stat().st_size, "read a part of it by h5py.")
         scene = decode(described["scene"], Scene, "scene", arrays)
         method = decode(described["method"], AbstractIntegrator, "method", arrays)
         scene, method = canonical((scene, method), dtype)
         parts = {k: a if a is None else jnp.asarray(a) for k, a in described["particles"].items()}
-        require(parts["mass"] is not None and parts["volume"] is not None, "mass or volume is missing")
         known: dict[str, Any] = parts
-        blank = jnp.zeros((len(known["mass"]), described["d"]), dtype)
+        blank = jnp.zeros((len(known["mass"]), scene.grid.dim), dtype)
         particles = Particles(blank, blank, **known, counts=described["counts"])
-        steps, frames, tallies = _frames(
-            file, jax.eval_shape(lambda: initial_state(scene, prepare(scene, particles))), 0, count_in(file)
-        )
+        like = jax.eval_shape(lambda: initial_state(scene, prepare(scene, particles)))
+        steps, frames, tallies = _frames(file, like, 0, count_in(file))
+        _check_numbers(scene, described["dt"], steps, frames.particles)
     last = jax.tree.map(lambda a: a[-1], frames)
     return Run(
         scene=scene,
@@ -318,18 +332,34 @@ def _rows(frame: int, step: int, dt: Any, state: RolloutState, statistics: RunSt
     for name in _IMPULSES:
         if (both := getattr(state, name)) is not None:
             rows[f"mpmjax/{name}"] = np.concatenate([np.asarray(both.impulse), np.asarray(both.angular)], axis=1)[None]
-    return rows
+    return rows | {"mpmjax/checksums": np.array([checksum(rows)], np.uint32)}
 
 
 def _frames(file: File, like: RolloutState, start: int, stop: int) -> tuple[np.ndarray, RolloutState, RunStatistics]:
-    """Step numbers, states and statistics of frames `start` to `stop`, each with a leading axis. See `states_in`."""
-    table = file["mpmjax/frames"][start:stop]
-    require(len(table) == stop - start, "frames are missing")
+    """Step numbers, states and statistics of frames `start` to `stop`, each with a leading axis; of `like` only shapes
+    count."""
+    found = frame_rows(file, start, stop)
+    table = found["mpmjax/frames"]
     tallies = RunStatistics(**{f.name: jnp.asarray(table[f.name]) for f in fields(RunStatistics)})
     received: dict[str, Any] = {}
     for name, kind in _IMPULSES.items():
         if getattr(like, name) is not None:
-            both = jnp.asarray(file[f"mpmjax/{name}"][start:stop])
+            both = jnp.asarray(found[f"mpmjax/{name}"])
             received[name] = kind(*jnp.split(both, [like.particles.x.shape[1]], axis=-1))
     kept = (received.get(name) for name in _IMPULSES)
-    return table["step"], RolloutState(states_in(file, like.particles, start, stop), *kept), tallies
+    return table["step"], RolloutState(states_in(found, like.particles), *kept), tallies
+
+
+def _check_numbers(scene: Scene, dt: Any, steps: np.ndarray, *states: State) -> None:
+    """Check that numbers are such as a run can have.
+
+    Raises:
+        ValueError: they are not.
+    """
+    require_positive("dt [s]", dt)
+    require(steps[0] >= 0 and (np.diff(steps) > 0).all(), f"A run's steps must grow from 0 or later, got {steps}.")
+    most = float(scene.grid.spacing) * 2**31  # as far as nodes are numbered
+    for state in states:
+        for leaf in jax.tree.leaves(state):
+            require_finite("A run's frames", leaf)
+        require(np.abs(state.x).max(initial=0) < most, f"Positions must be below {most:.3g} m.")

@@ -118,11 +118,6 @@ class StagedFile:
 
     # What its owner calls
 
-    def clear(self) -> None:
-        """Empty the file, at once."""
-        self._raw.truncate(0)
-        self._drop()
-
     def commit(self) -> None:
         """Bring the file up to date.
 
@@ -146,6 +141,13 @@ class StagedFile:
                 raise
             finally:
                 self._drop()
+
+    def is_at(self, path: Path) -> bool:
+        """Whether the file has that name: whoever removes or replaces a file does not disturb who has it open."""
+        try:
+            return os.path.samestat(os.fstat(self._raw.fileno()), os.stat(path))
+        except (OSError, ValueError):  # no such name, or closed
+            return False
 
     def sync(self) -> None:
         """Wait until what was committed is on the disk.

@@ -76,29 +76,29 @@ def rows_of(frame: int, time: float, state: State) -> dict[str, np.ndarray]:
     }
 
 
-def states_in(file: File, like: State, start: int, stop: int) -> State:
-    """The states of frames `start` to `stop`, with a leading axis.
+def states_in(rows: dict[str, np.ndarray], like: State) -> State:
+    """The states that some frames' rows describe, with a leading axis.
 
     Args:
-        file: the file.
+        rows: of each dataset, those of all of the frames (see `rows_of`). Those that are used are dropped.
         like: a state of the same run, whose shapes count and whose numbers do not.
-        start: first frame.
-        stop: the one after the last.
     """
-    f, (p, d), data = stop - start, like.x.shape, file["VTKHDF/PointData"]
+    p, d = like.x.shape
 
-    def read(dataset: Any, *shape: int) -> np.ndarray:
-        return dataset[start * p : stop * p].reshape(f, p, *shape)
+    def taken(name: str, *shape: int) -> np.ndarray:
+        return rows.pop(name).reshape(-1, p, *shape)
 
     def tensors(name: str) -> np.ndarray:
-        return read(data[name], 3, 3)[..., :d, :d]
+        return taken(f"VTKHDF/PointData/{name}", 3, 3)[..., :d, :d]
 
-    F, J = tensors("deformation_gradient"), read(data["J"])
-    each = [(J if own.ndim == 1 else F)[:, rows] for rows, own, _ in by_material(like)]
-    history = [jnp.asarray(read(data[name])[:, rows]) for name, rows, _ in history_arrays(like)]
+    F, J = tensors("deformation_gradient"), taken("VTKHDF/PointData/J")
+    each = [(J if own.ndim == 1 else F)[:, of] for of, own, _ in by_material(like)]
+    history = [
+        jnp.asarray(rows[f"VTKHDF/PointData/{name}"].reshape(-1, p)[:, of]) for name, of, _ in history_arrays(like)
+    ]  # kept, since laws may share a name
     return State(
-        x=jnp.asarray(read(file["VTKHDF/Points"], 3)[..., :d]),
-        v=jnp.asarray(read(data["velocity"], 3)[..., :d]),
+        x=jnp.asarray(taken("VTKHDF/Points", 3)[..., :d]),
+        v=jnp.asarray(taken("VTKHDF/PointData/velocity", 3)[..., :d]),
         deformations=tuple(jnp.asarray(own) for own in each),
         C=None if like.C is None else jnp.asarray(tensors("affine_velocity")),
         histories=jax.tree.unflatten(jax.tree.structure(like.histories), history),

@@ -10,7 +10,7 @@ import numpy as np
 
 from mpmjax.analysis import energy_density, volume_ratio
 from mpmjax.boundary import Wall
-from mpmjax.checks import canonical, checked, require, require_between
+from mpmjax.checks import canonical, checked, require, require_between, require_memory
 from mpmjax.io import replacing, save_figure
 from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene, by_material, history_arrays
@@ -56,8 +56,8 @@ def render(
         frame: which frame a still shows; counts from the end if negative. Default: the last.
         view: in three dimensions, azimuth and elevation of the eye [degrees]. At azimuth 0 the first horizontal axis
             points to the right; the elevation is above 0 and at most 90.
-        fps: frames a second of an animation.
-        dpi: resolution.
+        fps: frames a second of an animation, from 1 to 100.
+        dpi: resolution [dots an inch], from 1 to 6000.
 
     Raises:
         ValueError: a run without frames or particles, an unknown suffix or colour, a frame that is not there, an
@@ -77,6 +77,9 @@ def render(
         frame is None or -len(run) <= frame < len(run), f"The run has {len(run)} frames, there is no frame {frame}."
     )
     require(frame is None or path.suffix != ".gif", "frame is for a still; a .gif shows all frames.")
+    require_between("fps", fps, 1, 100)  # a GIF counts hundredths of a second
+    require_between("dpi", dpi, 1, 6000)  # matplotlib draws fewer than 2^16 pixels a side
+    require_memory(f"A picture of {dpi:g} dots an inch", 4 * 8 * 6 * dpi**2, "take a smaller dpi.")
     require_between("view's azimuth [degrees]", view[0], -360, 360)
     require_between("view's elevation [degrees]", view[1], 0.1, 90)
     still = path.suffix != ".gif"
