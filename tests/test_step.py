@@ -220,6 +220,36 @@ def test_a_light_body_flies_as_freely_as_a_heavy_one(dtype, gradient, contrast):
     assert_close(slope, np.eye(2), rounding)
 
 
+@pytest.mark.parametrize(
+    ("d", "description", "dtype"),
+    [
+        (2, "updated", jnp.float64),
+        *thorough((2, "total", jnp.float64), (3, "updated", jnp.float64), (2, "updated", jnp.float32)),
+    ],
+)
+def test_particles_on_nodes_of_the_linear_kernel_read_no_empty_node(d, description, dtype):
+    """An angle of two blocks on the nodes of one direction: that flies as a whole stays undeformed, and strained at
+    random keeps its momentum."""
+    grid, dx = mpm.Grid((9,) * d, 0.25), 0.25
+    places = np.stack(np.meshgrid(*[np.arange(3)] * d, indexing="ij"), axis=-1).reshape(-1, d)
+    places = places[(places[:, 0] < 2) | (places[:, 1] < 1)]
+    x = dx * (places + 3 + np.array([0.0, 0.3, 0.0])[:d])
+    ones = jnp.ones(len(x), dtype)
+    v = jnp.broadcast_to(jnp.array([1.0, -0.5, 0.3][:d], dtype), x.shape)
+    body = mpm.Particles(x=jnp.asarray(x, dtype), v=v, mass=ones, volume=dx**d * ones)
+    scene = mpm.Scene(grid, LAWS["neo_hookean"], kernel=mpm.BSpline(1), description=DESCRIPTIONS[description])
+    body = mpm.prepare(scene, body)
+    flown, _ = mpm.step(scene, body, 0.0, 5e-3)
+    few = 20 * float(jnp.finfo(dtype).eps)
+    assert_close(flown.F, body.F, few)
+    assert_close(flown.v, body.v, few)
+    strain = 0.05 * jax.random.normal(jax.random.key(0), body.F.shape, dtype)
+    strained = eqx.tree_at(lambda q: q.deformations[0], body, body.F + strain)
+    pushed, _ = mpm.step(scene, strained, 0.0, 5e-4)
+    change = pushed.v - body.v
+    assert_close(change.sum(axis=0), jnp.zeros(d), 0, few * float(jnp.abs(change).sum()))
+
+
 @pytest.mark.parametrize("dt", [0.0, -1e-3, np.nan])
 def test_a_step_must_be_positive(dt):
     """dt is refused with its value."""

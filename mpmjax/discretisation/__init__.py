@@ -8,7 +8,7 @@ from mpmjax.discretisation._kernel import BSpline
 from mpmjax.discretisation._placed import bound, define_placed
 from mpmjax.discretisation._resistance import resist
 from mpmjax.discretisation._stencil import Places, Stencil, in_window, make_stencil
-from mpmjax.discretisation._transfer import APIC, FLIP, PIC, AbstractTransfer, Gathered, g2p, p2g
+from mpmjax.discretisation._transfer import APIC, FLIP, PIC, AbstractTransfer, Gathered, g2p, p2g, without_empty
 from mpmjax.discretisation._transfer_sums import gather, scatter
 
 __all__ = [
@@ -38,4 +38,5 @@ __all__ = [
     "rearranged",
     "resist",
     "scatter",
+    "without_empty",
 ]

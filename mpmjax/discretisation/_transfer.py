@@ -1,17 +1,21 @@
 """Transfers between particles and grid: PIC, FLIP and APIC."""
 
 from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import replace
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, Matrix, NodeScalar, NodeVector, Scalar
 from mpmjax.autodiff import kept_sums
 from mpmjax.checks import require_between, require_fields
 from mpmjax.discretisation._average import average
+from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._stencil import Stencil
-from mpmjax.discretisation._transfer_sums import gather
+from mpmjax.discretisation._transfer_sums import gather, scatter
 from mpmjax.native import stored
 
 
@@ -145,6 +149,29 @@ class APIC(AbstractTransfer):
     def steepness(self, inverse_moment: Array, gradient_bound: Array) -> tuple[Array, Array] | None:
         """2Ξ − a and 2a."""
         return 2 * gradient_bound - inverse_moment, 2 * inverse_moment
+
+
+def without_empty(
+    stencil: Stencil, mass: Float[Array, "p"], mirrored: Callable[[NodeScalar], NodeScalar], grid: Grid
+) -> Stencil:
+    """The stencil without a gradient along each axis in which a particle would read the velocity of empty nodes.
+
+    An empty node has no velocity. The linear kernel's slope does not vanish with its weight, so that a particle on a
+    node would read those beside it. The gradients of a particle still sum to zero: motion as a whole deforms nothing,
+    and forces lose no momentum.
+
+    Args:
+        stencil: stencil of the particles.
+        mass: m_p [kg], shape (p,).
+        mirrored: the nodes' masses, shape (n,), to those with their mirror images.
+        grid: the grid.
+    """
+    fixed, mass = jax.lax.stop_gradient((stencil, mass))
+    rounding = jnp.finfo(mass.dtype).eps
+    empty = mirrored(scatter(fixed, mass[None], None, grid.size)[:, 0]) <= rounding * mass.min()
+    _, read = gather(fixed, empty.astype(mass.dtype)[:, None])
+    reads = jnp.abs(read) * grid.spacing > jnp.sqrt(rounding)  # else the nodes are out of reach along another axis
+    return replace(stencil, weight_derivatives=jnp.where(reads, 0, stencil.weight_derivatives), places=None)
 
 
 def p2g(

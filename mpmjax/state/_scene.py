@@ -25,6 +25,7 @@ from mpmjax.discretisation import (
     SplineGradient,
     Stencil,
     make_stencil,
+    without_empty,
 )
 from mpmjax.geometry import Motion
 from mpmjax.material import AbstractLaw, Freedom
@@ -314,15 +315,20 @@ class Scene(eqx.Module):
 
     def stencil(self, particles: Particles, t: Scalar = 0.0) -> Stencil:
         """The particles' stencil at time t, with the moving-least-squares gradient where the transfer needs it."""
-        return make_stencil(
+        window = self.window(particles)
+        stencil = make_stencil(
             self.kernel,
             self.gradient,
             self.grid,
-            self.window(particles),
+            window,
             self.on_grid(particles, t),
             affine=self.transfer.affine,
             layer=self.layer(particles),
         )
+        if self.kernel.order > 1:
+            return stencil
+        images = mirror(self.boundary, self.grid, window).without_ties()
+        return without_empty(stencil, particles.mass, lambda m: images.unfold_scalar(images.fold_scalar(m)), self.grid)
 
     def layer(self, particles: Particles) -> Int[np.ndarray, "p"] | None:
         """The number of each particle's body, shape (p,); None without `bodies`."""
