@@ -193,7 +193,7 @@ def _straining(scene: Scene, particles: Particles, nodes: Nodes) -> Float[Array,
     the symmetric part of ∇a that is largest in magnitude, or |div a| for a law that knows J alone."""
     springs = [c.springs(c.gap < 0) for c in nodes.contacts if isinstance(c, SurfaceContact)]
     couplings = [c.coupling(c.gap < 0) for c in nodes.contacts if isinstance(c, BodyContact)]
-    pushed = nodes.constrained(Mirror(()), nodes.conditions.fixed, None, tuple(springs), tuple(couplings))
+    pushed = nodes.constrained(Mirror(()), nodes.conditions.fixed, tuple(springs), tuple(couplings))
     a = pushed.projection.combine(pushed.per_mass(pushed.force) + pushed.acceleration, 0.0)
     _, slopes = gather(nodes.potential.stencil, nodes.mirror.unfold(a))
     rates = la.symmetric_eigen((slopes + la.transpose(slopes)) / 2)[0]
