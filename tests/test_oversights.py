@@ -97,6 +97,34 @@ def test_a_body_thinner_than_two_cells_is_told_of(d):
         ] * told
 
 
+@pytest.mark.parametrize(
+    ("dtype", "cells", "told"), [("float32", 4096, True), ("float32", 1024, False), ("float64", 4096, False)]
+)
+def test_positions_that_round_to_parts_of_a_spacing_are_told_of(dtype, cells, told):
+    """Far from zero: at 4096 spacings a float32 step loses 5e-4 of one."""
+    grid = mpm.Grid((9, 9), 1 / 32, origin=(cells, -cells))
+    x = jnp.asarray(np.random.default_rng(0).uniform(3, 6, (20, 2)) + np.array([cells, -cells]), dtype) / 32
+    one = jnp.ones(20, dtype)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        mpm.prepare(mpm.Scene(grid, LAWS["neo_hookean"]), mpm.Particles(x, 0 * x, one, one))
+    assert [bool(re.search("float32 rounds positions", str(w.message))) for w in said] == [True] * told
+
+
+@pytest.mark.thorough
+def test_a_run_that_leads_far_from_zero_tells_of_its_rounding():
+    """In float32 and a window that follows; once."""
+    x = jnp.asarray(np.random.default_rng(0).uniform(3, 6, (20, 2)), jnp.float32)
+    one = jnp.ones(20, jnp.float32)
+    scene = mpm.Scene(mpm.Grid((9, 9), 1.0, follow=True), LAWS["neo_hookean"])
+    particles = mpm.Particles(x, 0 * x + 5e6, one, one)
+    with pytest.warns(UserWarning, match="float32 rounds positions .* to 0.0012 spacings"):
+        run = mpm.simulate(scene, particles, t1=2e-3, dt=1e-3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mpm.simulate(scene, run.final, t1=3e-3, dt=1e-3, start=2)
+
+
 def test_a_tolerance_that_anything_meets_is_told_of():
     for make in (mpm.ConjugateResidual, lambda rtol: mpm.Newton(rtol=rtol)):
         with pytest.warns(UserWarning, match=r"rtol is 10\.0: at 1 or more the zero vector already meets it"):

@@ -33,7 +33,7 @@ from mpmjax.simulation._run import Run
 from mpmjax.simulation._segments import checkpointed
 from mpmjax.simulation._sorting import memory_order
 from mpmjax.simulation._statistics import RunStatistics
-from mpmjax.state import Particles, Scene, prepare, state_of, with_state
+from mpmjax.state import Particles, Scene, prepare, state_of, warn_of_rounding, with_state
 from mpmjax.stepping import MOST_STEPS, AbstractIntegrator, Explicit, step_for, step_unchecked
 
 _CHECKPOINT_BYTES = 2**28
@@ -164,6 +164,7 @@ def simulate(
         return run
     if traced:
         return guarded(run, end.report)
+    warn_of_rounding(scene.grid, run.final.x, particles.x)
     raise_faults(run, particles, lambda: before_fault(go, begin, end.statistics), start)
     warn_of_inaccuracy(run.scene, run.statistics)
     return run

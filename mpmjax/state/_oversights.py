@@ -21,6 +21,8 @@ from mpmjax.state._particles import Particles
 
 _THIN = 2.0
 """A body thinner than so many cells is not resolved."""
+_MOST_ROUNDING = 2.0**-12
+"""Rounding of positions, in spacings, up to which it is not warned of: some 2 000 cells from zero in float32."""
 Boundaries = tuple[AbstractBoundary, ...]
 
 
@@ -60,6 +62,27 @@ def warn_of_oversights(grid: Grid, kernel: BSpline, boundary: Boundaries, partic
                 warn(f"The {name} touches nothing, since no node {where}: move it, or enlarge it to a spacing or more.")
     for text in _thin(grid, boundary, particles):
         warn(text)
+    warn_of_rounding(grid, particles.x)
+
+
+def warn_of_rounding(grid: Grid, x: ParticleVector, before: ParticleVector | None = None) -> None:
+    """Warn of positions so far from zero that their rounding is no longer small beside the spacing.
+
+    Args:
+        grid: the grid.
+        x: positions [m].
+        before: positions that were examined before; if they are as far off, nothing is said again.
+    """
+
+    def rounding(x: ParticleVector) -> float:
+        return float(jnp.finfo(x.dtype).eps) * float(np.abs(np.asarray(x)).max()) / float(grid.spacing)
+
+    found = rounding(x)
+    if found > _MOST_ROUNDING and (before is None or rounding(before) <= _MOST_ROUNDING):
+        warn(
+            f"{x.dtype} rounds positions {float(np.abs(np.asarray(x)).max()):.4g} m from zero to {found:.2g} spacings, "
+            "and each step adds as much: move the scene nearer to zero, or take float64 particles."
+        )
 
 
 def _probe(
