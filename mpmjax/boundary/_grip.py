@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Float, NodeVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import Conditions
-from mpmjax.checks import require, require_fields
+from mpmjax.checks import as_plain, require, require_fields
 from mpmjax.geometry import AbstractMotion, AbstractRegion, Motion
 
 
@@ -26,9 +26,7 @@ class Grip(AbstractBoundary):
 
     region: AbstractRegion
     motion: Motion | AbstractMotion  # in files a Motion where no kind is given
-    axes: tuple[bool, ...] | None = eqx.field(
-        static=True, default=None, converter=lambda a: tuple(a) if isinstance(a, list) else a
-    )
+    axes: tuple[bool, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
 
     @property
     def dim(self) -> int:

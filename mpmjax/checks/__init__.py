@@ -3,6 +3,8 @@
 from mpmjax.checks._kinds import alternatives, checked, is_enum, is_module, may_be_infinite, require_fields, shape_of
 from mpmjax.checks._memory import require_memory
 from mpmjax.checks._values import (
+    as_floats,
+    as_plain,
     canonical,
     coordinates,
     first_unmet,
@@ -22,6 +24,8 @@ from mpmjax.checks._values import (
 
 __all__ = [
     "alternatives",
+    "as_floats",
+    "as_plain",
     "canonical",
     "checked",
     "coordinates",

@@ -131,6 +131,13 @@ def _check_size(scene: Scene, particles: Particles) -> None:
 def _prepared(law: AbstractLaw, group: Group, particles: Particles) -> tuple[Array, Any]:
     """Deformation and history of one material's particles."""
     start, stop = group.rows
+    shapes, fitting = {jnp.shape(number) for number in _parameters(law)}, {(), (1,), (stop - start,)}
+    require(
+        shapes <= fitting,
+        f"{law.title()}'s parameters must be one number or one for each of its {stop - start} particles, got shapes "
+        f"{sorted(shapes - fitting)}. What has another shape, as a network's weights, belongs in an equinox.Module "
+        "within the law.",
+    )
     kept = law.kinematics
     undeformed = jnp.asarray(kept.undeformed(particles.dim), particles.x.dtype)
     shape = (stop - start, *undeformed.shape)
@@ -206,15 +213,6 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
             most == particles.dim - 1 and spread[:most] > 1e-6 * float(scene.grid.spacing),
             f"A Rigid body's particles must not lie {'at one point' if particles.dim < 3 else 'on one line'}, by which "
             f"nothing says how it turns: give material {body.number} more of them.",
-        )
-    for law, group in zip(scene.laws, particles.groups, strict=True):
-        rows = group.rows[1] - group.rows[0]
-        sizes = {jnp.size(number) for number in _parameters(law)}
-        require(
-            sizes <= {1, rows},
-            f"{law.title()}'s parameters must be one number or one for each of its {rows} particles, got "
-            f"{sorted(sizes - {1, rows})} of them. What has another shape, as a network's weights, belongs in an "
-            "equinox.Module within the law.",
         )
     for points in scene.material_points(particles):
         kept = points.law.kinematics
