@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax._types import Array, Float, NodeVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
@@ -58,6 +59,9 @@ class Grip(AbstractBoundary):
     def pivot(self, t: Scalar) -> Float[Array, "d"]:
         """The region's middle."""
         return self.motion.pivot(jnp.asarray(self.region.middle()), t)
+
+    def reach(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.motion.swept(*self.region.bounds())
 
     def rests(self, *, total: bool) -> bool:
         return total or self.motion.rests()

@@ -45,7 +45,8 @@ _WORDS: dict[Any, str] = {
 
 
 def checked(function: Function) -> Function:
-    """Decorate a function to check that its arguments are of the kinds that their annotations name.
+    """Decorate a public function to check that its arguments are of the kinds that their annotations name, and to let
+    arrays in it differ in rank, whatever `jax_numpy_rank_promotion` says outside.
 
     Raises:
         ValueError: one is not.
@@ -60,7 +61,8 @@ def checked(function: Function) -> Function:
             several = signature.parameters[name].kind is inspect.Parameter.VAR_POSITIONAL
             for value in given if several else (given,) if name in hints else ():
                 require_kind(f"{owner}'s {name}", value, hints[name])
-        return function(*args, **kwargs)
+        with jax.numpy_rank_promotion("allow"):
+            return function(*args, **kwargs)
 
     return cast(Function, guarded)
 

@@ -131,6 +131,27 @@ def as_plain(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
+def require_placement(tree: Any) -> None:
+    """No array may carry what neither loops nor compiled sums know: manual axes over which it varies, as within a
+    `jax.shard_map` that checks them, or explicit axes over which it is divided.
+
+    Raises:
+        ValueError: one does.
+    """
+    for leaf in jax.tree.leaves(tree):
+        while isinstance(leaf, jax.Array):
+            kind = jax.typeof(leaf)
+            axes = getattr(kind, "manual_axis_type", None)
+            if getattr(axes, "varying", getattr(kind, "vma", None)):  # by its name from jax 0.10 on, and before
+                raise ValueError("A jax.shard_map must not check over which axes arrays vary: give it check_vma=False.")
+            if any(axis is not None for axis in getattr(kind.sharding, "spec", ())):
+                raise ValueError(
+                    "Arrays must not be divided over explicit axes: make the mesh of axes of the kind "
+                    "jax.sharding.AxisType.Auto, or divide them within jax.shard_map(..., check_vma=False)."
+                )
+            leaf = getattr(leaf, "val", getattr(leaf, "primal", None))  # what a batch or tangent is of
+
+
 def require_tolerance(name: str, value: Any) -> None:
     """Check that a relative tolerance is positive; warn of one that any guess meets."""
     require_positive(name, value)

@@ -48,6 +48,13 @@ class AbstractParameter(eqx.Module):
         require(self.update is None or self.start is not None, f"{name} with update needs a start: the first guess.")
         if self.start is not None:
             require_finite(f"{name}'s start", self.start)
+        known = None if self.prior is None else self.prior.distribution()
+        if known is not None:
+            (lower, upper), mean = self.domain, known[0]
+            require(
+                (mean >= lower) & (mean <= upper),
+                f"{name}'s values lie between {lower:g} and {upper:g}, so the mean of its prior must too, got {mean}.",
+            )
 
     @property
     def logarithmic(self) -> bool:

@@ -17,6 +17,7 @@ from mpmjax.checks import (
     require_fields,
     require_finite,
     require_memory,
+    require_placement,
     requirements,
 )
 from mpmjax.discretisation import (
@@ -49,6 +50,7 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
             another dimension than the grid or another number of materials than the scene, a particle lies outside the
             window or beyond a mirrored plane, or a deformation gradient is one the law does not allow.
     """
+    require_placement((scene, particles))
     require_fields(scene)  # what eqx.tree_at may have put past its constructor
     p, d = particles.count, particles.dim
     require(d == scene.grid.dim, f"The particles are {d}-dimensional, the grid {scene.grid.dim}-dimensional.")
@@ -187,15 +189,6 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
     place = scene.anchor(particles)
     require_finite("Particle positions", particles.x)
     require_finite("Particle velocities", particles.v)
-    inside = np.ones(particles.count, bool)
-    if scene.total or not scene.moving_mirrors:  # else the grid is where the time says
-        inside = np.asarray(in_window(scene.kernel, scene.grid, scene.window(particles), place))
-    if not inside.all():
-        first = int(np.argmin(inside))
-        raise ValueError(
-            f"Every particle's stencil must lie in the window; particle {first} at {np.asarray(place[first])} and "
-            f"{int((~inside).sum()) - 1} others do not: enlarge the grid's shape, move its origin, or use follow=True."
-        )
     for boundary in scene.boundary:
         for wall in boundary.walls():
             name, keep = type(boundary).__name__, "above" if wall.inward > 0 else "below"
@@ -205,6 +198,15 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
                 f"Particles must lie {keep} the {name} at {wall.position:g} on axis {wall.axis}, but particle "
                 f"{int(np.argmax(beyond))} does not: move it or change the plane's keep.",
             )
+    inside = np.ones(particles.count, bool)
+    if scene.total or not scene.moving_mirrors:  # else the grid is where the time says
+        inside = np.asarray(in_window(scene.kernel, scene.grid, scene.window(particles), place))
+    if not inside.all():
+        first = int(np.argmin(inside))
+        raise ValueError(
+            f"Every particle's stencil must lie in the window; particle {first} at {np.asarray(place[first])} and "
+            f"{int((~inside).sum()) - 1} others do not: enlarge the grid's shape, move its origin, or use follow=True."
+        )
     for body in scene.rigid_bodies:
         x = np.asarray(particles.x[slice(*particles.groups[body.number].rows)], float)
         spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
