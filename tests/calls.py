@@ -176,6 +176,8 @@ MAY = {
     (mpm.fill, "dtype"),
     (mpm.fill_mapped, "dtype"),
     (mpm.fill_mapped, "mapping"),
+    (mpm.fill, "velocity"),
+    (mpm.fill_mapped, "velocity"),
     (mpm.Experiment, "name"),
     (mpm.Adam, "learning_rate"),
     (mpm.predict, "of"),
