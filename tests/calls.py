@@ -6,7 +6,7 @@ ValueError: nothing, if all is well.
 
 import inspect
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NoReturn
 
 import jax
@@ -33,6 +33,7 @@ def reached(*args: object) -> NoReturn:
 
 SEEN = mpm.Curve([0.05], [0.1], reached, sigma=0.01)
 STIFFNESS = mpm.Positive(lambda e: e.scene.material.youngs_modulus)
+PICTURE = mpm.Density(SCENE.grid)
 RUN = {"scene": SCENE, "particles": PARTICLES, "t1": 0.1, "dt": 0.01}
 
 
@@ -80,8 +81,42 @@ FUNCTIONS = {
     mpm.fit_staged: {"experiments": mpm.Experiment(**RUN, observations=SEEN), "parameters": {"E": STIFFNESS}},
     mpm.fit_ensemble: {"experiments": [mpm.Experiment(**RUN, observations=SEEN)], "parameters": {"E": STIFFNESS}},
     mpm.bootstrap: {"result": None},
+    mpm.join: {"sets": PARTICLES},
+    mpm.Markers.of: {"which": [0]},
+    mpm.Markers.at: {"particles": PARTICLES, "places": [[0.1, 0.1]]},
+    mpm.StressStretch.of: {"region": mpm.Ball((0.1, 0.1), 0.1), "particles": PARTICLES, "axis": 0},
+    mpm.Field.lattice_around: {"particles": PARTICLES, "spacing": 0.1},
+    PICTURE.of_points: {"points": PARTICLES.x, "mass": 1.0},
 }
 """Each public function with arguments; of those the tests replace one at a time."""
+TRUST = {"sigma": 0.1, "weight": 1.0, "robust": None}
+PARAMETER = {
+    "where": reached,
+    "update": None,
+    "start": 1.0,
+    "prior": mpm.Gaussian(1.0, 0.1),
+    "unit": "Pa",
+    "only": (0,),
+}
+FITTING = {
+    mpm.Unbounded: PARAMETER | {"scale": 1.0},
+    mpm.Positive: PARAMETER,
+    mpm.Bounded: PARAMETER | {"lower": 0.0, "upper": 2.0},
+    mpm.Field: {"of": STIFFNESS, "lattice": SCENE.grid, "kernel": mpm.BSpline(1), "start": None},
+    mpm.Gaussian: {"mean": 1.0, "sigma": 0.1},
+    mpm.Smooth: {"sigma": 0.1, "robust": 3.0},
+    mpm.LevenbergMarquardt: {},
+    mpm.LBFGS: {},
+    mpm.Adam: {},
+    mpm.Series: TRUST | {"times": [0.1, 0.2], "values": [1.0, 2.0], "of": reached},
+    mpm.Tracks: TRUST | {"times": [0.1], "positions": [[[0.1, 0.2]]], "which": [0]},
+    mpm.Curve: TRUST | {"x": [0.1, 0.2], "y": [1.0, 2.0], "of": reached},
+    mpm.Force: TRUST | {"times": [0.1], "forces": [[1.0, 2.0]]},
+    mpm.Torque: TRUST | {"times": [0.1], "forces": [[1.0]]},
+    mpm.Extent: {"axis": 0},
+    mpm.Density: {"grid": SCENE.grid},
+}
+"""What fits are made of, which files hold by other means."""
 PARTICLE_FIELDS = {"x": PARTICLES.x, "v": PARTICLES.v, "mass": PARTICLES.mass, "volume": PARTICLES.volume}
 
 
@@ -91,7 +126,8 @@ def arguments_of(value: object) -> dict:
     return {name: getattr(value, name) for name in parameters if name != "self"}
 
 
-CALLS = {type(value): arguments_of(value) for value in EXAMPLES.values()} | {mpm.Particles: PARTICLE_FIELDS} | FUNCTIONS
+MADE = {type(value): arguments_of(value) for value in EXAMPLES.values()}
+CALLS = MADE | {mpm.Particles: PARTICLE_FIELDS} | FITTING | FUNCTIONS
 NO_KIND = {
     "nonsense": "nonsense",
     "class": mpm.Scene,
@@ -102,6 +138,7 @@ NO_KIND = {
     "array of words": np.array(["a", "b"]),
     "empty": (),
     "ragged": ((0.0,), (1.0, 2.0)),
+    "masked": np.ma.masked_array([1.0, 2.0], [True, False]),
 }
 """What few arguments take; those that do may."""
 NUMBERS = {
@@ -113,8 +150,20 @@ NUMBERS = {
     "huge": 10**400,
     "array": np.ones((2, 2, 2, 2)),
     "many": [10**30, 10**30],
+    "list": [0.1, 0.2],
+    "counts": np.array([0, 1]),
+    "count": jnp.asarray(1.0),
 }
 """Numbers that constructors are tried with besides."""
+SENSELESS = {
+    **dict.fromkeys(("t1", "dt", "safety"), (0.0, -1e-3, float("nan"), float("inf"), 1e-46)),
+    "t": (float("nan"), float("inf")),
+    "start": (-1, 0.5, float("nan"), float("inf")),
+    "steps": (-1, 0.5),
+    "save_every": (0, -1),
+}
+"""Numbers that no function takes for what has this name; 1e-46 is zero in single precision."""
+SINGLE = mpm.fill(mpm.Box((0.1, 0.1), (0.2, 0.2)), SCENE.grid, density=1e3, dtype="float32")
 
 
 MAY = {
@@ -127,7 +176,10 @@ MAY = {
     (mpm.fill, "dtype"),
     (mpm.fill_mapped, "dtype"),
     (mpm.fill_mapped, "mapping"),
+    (mpm.fill, "velocity"),
+    (mpm.fill_mapped, "velocity"),
     (mpm.Experiment, "name"),
+    (mpm.Adam, "learning_rate"),
     (mpm.predict, "of"),
     (mpm.fit, "log"),
     (mpm.fit_refined, "log"),
@@ -147,10 +199,16 @@ def offences() -> Iterator[str]:
         for name in inspect.signature(call).parameters:
             if (call, name) in MAY:
                 continue
-            for what, value in wrong.items():
+            senseless = {repr(value): value for value in SENSELESS.get(name, ()) if not isinstance(call, type)}
+            if "particles" not in good:
+                senseless.pop("1e-46", None)
+            for what, value in (wrong | senseless).items():
                 taken = False
+                single = {"particles": SINGLE} if what == "1e-46" else {}
                 try:
-                    call(**good | {name: value})
+                    made = given(call, good | single | {name: value})
+                    if isinstance(call, type):
+                        hash(jax.tree.structure(made))  # as `jax.jit` does
                     taken = True
                 except Reached:
                     taken = True
@@ -159,14 +217,27 @@ def offences() -> Iterator[str]:
                         yield f"{call.__name__}({name}={what}): several lines"
                 except Exception as error:
                     yield f"{call.__name__}({name}={what}): {type(error).__name__}: {error}"
-                if taken and what in NO_KIND and (name, what) not in TAKEN:
+                if taken and (what in NO_KIND or what in senseless) and (name, what) not in TAKEN:
                     yield f"{call.__name__} takes {name}={what}"
 
 
+def given(call: Callable, arguments: dict) -> object:
+    """What a call returns; arguments of which it takes several stand as one."""
+    several = [p.name for p in inspect.signature(call).parameters.values() if p.kind is p.VAR_POSITIONAL]
+    return call(*[arguments[name] for name in several], **{k: v for k, v in arguments.items() if k not in several})
+
+
+NONE = ("boundary", "loads", "also", "deformations", "histories", "methods", "refinements")
+WHERE_USED = ("start", "only", "mean", "sigma")
 TAKEN = {
-    (name, "empty") for name in ("boundary", "loads", "also", "deformations", "histories", "methods", "refinements")
-} | {("fitted", "array of words")}
-"""What may be none of; and what NumPy takes for true."""
+    *((name, "empty") for name in (*NONE, *WHERE_USED)),
+    *((name, "class") for name in ("where", "of")),
+    *((name, "nonsense") for name in ("name", "x_name", "unit")),
+    *((name, "masked") for name in ("values", "y")),
+    ("fitted", "array of words"),
+}
+"""What may be none of, or is refused with the parameter's shape; what can be called; what is a word; what may be
+measured in part; and what NumPy takes for true."""
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)

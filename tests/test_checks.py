@@ -116,3 +116,80 @@ def test_what_tree_at_spoils_is_refused_by_every_entry():
     for run in (mpm.simulate, lambda *inputs, t1, **rest: mpm.rollout(*inputs, steps=1, **rest)):
         with pytest.raises(ValueError, match="beta must be"):
             run(scene, particles, t1=0.1, dt=0.1, method=method)
+
+
+@pytest.mark.parametrize("method", **ids(METHODS, "semi_implicit"))
+def test_ranks_may_differ_inside_whatever_is_set_outside(method):
+    """Where jax's own arrays must not: in a run and its derivative."""
+    scene, particles = block(1)
+
+    def reached(modulus):
+        soft = eqx.tree_at(lambda s: s.material.youngs_modulus, scene, modulus)
+        return (mpm.rollout(soft, particles, steps=1, dt=1e-3, method=method).x ** 2).sum()
+
+    def both():
+        return jax.jit(jax.value_and_grad(reached))(1e4)
+
+    with jax.numpy_rank_promotion("raise"):
+        found = both()
+        with pytest.raises(ValueError, match="rank_promotion"):
+            jnp.ones((2, 3)) + jnp.ones(3)
+    np.testing.assert_allclose(found, both(), rtol=1e-13)
+
+
+SENSELESS = {
+    "shares": (lambda: mpm.PointsAt(((0.1, 0.1),) * 3, (1.0, 1.0, 1.0)), "shares of a whole, which sum to one"),
+    "a prior": (lambda: mpm.Positive(lambda e: e.dt, prior=mpm.Gaussian(-1.0, 2.0)), "mean of its prior must too"),
+    "one of a bounded": (
+        lambda: mpm.Bounded(lambda e: e.dt, 0.0, 0.5, prior=mpm.Gaussian([0.1, 0.6], 1.0)),
+        "between 0 and 0.5, so the mean",
+    ),
+}
+
+
+@pytest.mark.parametrize(("make", "says"), SENSELESS.values(), ids=SENSELESS)
+def test_what_has_no_sense_is_refused(make, says):
+    with pytest.raises(ValueError, match=says):
+        make()
+
+
+def test_a_hidden_measurement_is_none():
+    """A masked array keeps its mask, which NumPy drops where it converts one."""
+    seen = mpm.Series([0.1, 0.2], np.ma.masked_array([1.0, 99.0], [False, True]), lambda scene, particles: particles.x)
+    np.testing.assert_array_equal(seen.data, [1.0, np.nan])
+
+
+def test_loads_are_attached_within_a_transformation():
+    """To particles that are known there; where they are not, the reason is told."""
+    load = mpm.Traction(mpm.Patch(mpm.Box((0.0, 0.0), (0.3, 0.3)), mpm.Box((0.0, 0.29), (0.3, 0.31))), (0.0, 1.0))
+    scene, particles = block(2, loads=load)
+
+    def areas(factor, particles=particles):
+        return factor * mpm.attach(scene, particles).loads[0].on.weight
+
+    np.testing.assert_array_equal(jax.jit(areas)(2.0), areas(2.0))
+    np.testing.assert_array_equal(jax.jit(jax.grad(lambda f: areas(f).sum()))(2.0), areas(1.0).sum())
+    for where in (lambda q: q.x, lambda q: q.volume):
+        with pytest.raises(ValueError, match="call attach outside"):
+            jax.jit(lambda a, where=where: areas(1.0, eqx.tree_at(where, particles, a)))(where(particles))
+
+
+def test_nearly_incompressible_material_is_told_of_averaged_volumes():
+    for volume, told in ((None, True), (mpm.AveragedVolume(), False)):
+        scene, particles = block(1, material=mpm.NeoHookean(1e4, 0.499), volume=volume)
+        fast = eqx.tree_at(lambda q: q.v, particles, -30 * particles.x)
+        with pytest.raises(mpm.SimulationError) as caught:
+            mpm.simulate(scene, fast, t1=0.1, dt=0.1)
+        assert ("give the scene volume=AveragedVolume()" in str(caught.value)) == told
+
+
+def test_what_lies_beyond_a_plane_is_told_of_the_plane():
+    """And not to enlarge the grid, as it starts and on the way."""
+    plane = mpm.SymmetryPlane(0, 0.0)
+    scene, particles = block(1, boundary=plane)
+    moved = eqx.tree_at(lambda q: q.x, particles, particles.x - 0.5)
+    with pytest.raises(ValueError, match="must lie above the SymmetryPlane"):
+        mpm.prepare(scene, moved)
+    thrown = eqx.tree_at(lambda q: q.v, particles, jnp.full(particles.v.shape, -1e3))
+    with pytest.raises(mpm.SimulationError, match=r"passed boundary 0, SymmetryPlane.* [Rr]educe dt"):
+        mpm.simulate(scene, thrown, t1=1e-3, dt=1e-3)

@@ -43,19 +43,19 @@ print(json.dumps({
 """
 
 
-def told(way: str, method: str) -> dict:
-    """What the program prints in a process of its own."""
+def told(way: str, method: str, program: str = PROGRAM) -> str:
+    """What a program prints in a process of its own."""
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
     env = os.environ | {"XLA_FLAGS": flags, "JAX_ENABLE_X64": "1"}
-    done = subprocess.run([sys.executable, "-c", PROGRAM, way, method], env=env, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", program, way, method], env=env, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return done.stdout
 
 
 @pytest.mark.parametrize("method", ["explicit", *thorough("semi_implicit")])
 def test_a_program_that_xla_divides_gathers_nothing(method):
     """It calls no library, which would need whole arrays, and each member has its own value and derivative."""
-    found = told("divided", method)
+    found = json.loads(told("divided", method))
     assert not found["gathers whole arrays"]
     assert not found["native"]
     np.testing.assert_allclose(np.transpose(found["together"]), found["alone"], rtol=1e-9)
@@ -66,7 +66,32 @@ def test_a_program_that_xla_divides_gathers_nothing(method):
 @pytest.mark.parametrize("method", ["explicit", "semi_implicit"])
 def test_within_shard_map_each_device_calls_the_library(method):
     """With the value and derivative of each member."""
-    found = told("shard_map", method)
+    found = json.loads(told("shard_map", method))
     assert not found["gathers whole arrays"]
     assert {"mpmjax_gather", "mpmjax_average"} <= set(found["native"])
     np.testing.assert_allclose(np.transpose(found["together"]), found["alone"], rtol=1e-9)
+
+
+REFUSED = (
+    PROGRAM.split("both, factors =")[0]
+    + """
+both, factors = jax.value_and_grad(size), jnp.asarray([1.0, 2.0])
+explicit = jax.make_mesh((2,), ("i",), axis_types=(AxisType.Explicit,))
+for together, given in (
+    (jax.shard_map(jax.vmap(both), mesh=mesh, in_specs=PartitionSpec("i"), out_specs=PartitionSpec("i")), factors),
+    (jax.vmap(both), jax.device_put(factors, NamedSharding(explicit, PartitionSpec("i")))),
+):
+    try:
+        jax.jit(together)(given)
+    except ValueError as error:
+        print(error)
+"""
+)
+
+
+@pytest.mark.thorough
+def test_what_neither_loops_nor_sums_know_is_refused_in_own_words():
+    """A shard_map that checks what varies, and explicit axes."""
+    checked, explicit = told("refused", "explicit", REFUSED).splitlines()
+    assert "check_vma=False" in checked
+    assert "AxisType.Auto" in explicit

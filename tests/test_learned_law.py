@@ -65,7 +65,7 @@ def test_gradients_by_weights_of_a_network_are_differences(hessian):
 def test_numbers_of_a_law_itself_are_one_a_particle_beside_a_network():
     grid, particles = cloud(2, p=20, cells=3)
     law = eqx.tree_at(lambda law: law.modulus, perceptron(), jnp.full(7, 1e4))
-    with pytest.raises(ValueError, match=r"one for each of its 20 particles, got \[7\] of them\. What has another"):
+    with pytest.raises(ValueError, match=r"one for each of its 20 particles, got shapes \[\(7,\)\]\. What has another"):
         mpm.prepare(mpm.Scene(grid, law), particles)
 
 

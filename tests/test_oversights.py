@@ -40,12 +40,15 @@ DOUBTFUL = {
     ),
     "a moving one in the total description": ({"boundary": mpm.Grip(EDGE, GO)} | TOTAL, "Grip .* touches nothing"),
     "a collider there": ({"boundary": mpm.StickyCollider(FAR, TURN)} | TOTAL, "StickyCollider .* touches nothing"),
+    "a grip that never comes": ({"boundary": mpm.Grip(FAR, GO)}, "Grip .* never comes into the grid's window"),
+    "a plane far away": ({"boundary": mpm.SymmetryPlane(0, -50.0)}, "SymmetryPlane .* never comes"),
+    "walls far away": ({"boundary": mpm.SlipBox((-9.0, -9.0), (9.0, 9.0))}, "SlipBox .* never comes"),
     "a collider between nodes": ({"boundary": mpm.SlipCollider(BETWEEN)}, "no node of the window lies in it"),
 }
 WELL = {
     "walls around": {"boundary": mpm.StickyBox((0.0, 0.0), (1.0, 1.0))},
     "a grip at the end": {"boundary": mpm.Grip(NEAR, GO)},
-    "a grip that comes": {"boundary": mpm.Grip(FAR, GO)},
+    "a grip that comes": {"boundary": mpm.Grip(mpm.Ball((0.9, 0.2), 0.05), GO)},
     "a collider that waits": {"boundary": mpm.StickyCollider(mpm.Box((-1.0, -1.0), (1.0, -0.1)))},
     "one between nodes that comes": {"boundary": mpm.SlipCollider(BETWEEN, GO)},
     "one that turns": {"boundary": mpm.SlipCollider(BETWEEN, TURN)},
@@ -85,7 +88,7 @@ def test_a_body_thinner_than_two_cells_is_told_of(d):
         ({"boundary": walls}, False),
         ({"boundary": mpm.SymmetryPlane(0, 0.0)}, False),
         ({"boundary": mpm.SymmetryPlane(1, 0.0)}, True),
-        ({"boundary": mpm.SlipBox((-np.inf,) * d, (0.9,) * d)}, True),
+        ({"boundary": mpm.SlipBox((-np.inf,) * d, (0.4,) * d)}, True),
     ):
         grid = mpm.Grid((9,) * d, 0.1, origin=(-3,) * d)
         body = mpm.fill(mpm.Box((0.0,) * d, thin), grid, density=1e3)
@@ -125,6 +128,26 @@ def test_a_run_that_leads_far_from_zero_tells_of_its_rounding():
         mpm.simulate(scene, run.final, t1=3e-3, dt=1e-3, start=2)
 
 
+@pytest.mark.parametrize("d", [1, 2, 3])
+def test_two_sets_at_one_place_are_told_of(d):
+    """And none of sets that touch, whatever their lattices: round ones in a box's corner, coarse beside fine."""
+    grid = mpm.Grid((24,) * d, 0.1, origin=(-4,) * d)
+    half, whole, law = (0.52,) + (1.0,) * (d - 1), (1.0,) * d, LAWS["neo_hookean"]
+
+    def filled(lower, upper, each):
+        return mpm.fill(mpm.Box(lower, upper), grid, density=1e3, particles_per_cell=each**d)
+
+    left, right = filled((0.0,) * d, half, 2), filled((0.52,) + (0.0,) * (d - 1), whole, 3)
+    over = filled((0.4,) + (0.0,) * (d - 1), whole, 2)
+    ball = mpm.fill(mpm.Ball((0.33,) * d, 0.31), grid, density=1e3)
+    for sets, told in (((left, right), False), ((left, over), True), ((ball,), False), ((ball, ball), True)):
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            mpm.prepare(mpm.Scene(grid, law), mpm.join(*sets))
+        assert [str(w.message) for w in said if "times the space" not in str(w.message)] == []
+        assert len(said) == told
+
+
 def test_a_tolerance_that_anything_meets_is_told_of():
     for make in (mpm.ConjugateResidual, lambda rtol: mpm.Newton(rtol=rtol)):
         with pytest.warns(UserWarning, match=r"rtol is 10\.0: at 1 or more the zero vector already meets it"):
@@ -150,4 +173,8 @@ def test_the_shell_prints_a_warning_in_a_line(tmp_path):
         read_scene_file(scene)
     assert "no [fit] table" in refused("fit", scene)
     told = [line for line in shell("fit", scene)[2].splitlines() if "warning" in line]
-    assert [line.split(" particles")[0] for line in told] == ["warning: 36", "warning: 36 of 72"]
+    assert [line.split(" particles")[0] for line in told] == [
+        "warning: 36",
+        "warning: 36 of 72",
+        "warning: Near [0.2 0.2] m",
+    ]

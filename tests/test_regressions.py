@@ -1,6 +1,7 @@
 """Faults that reviews found, each seen to fail before it was mended."""
 
-from dataclasses import replace
+import re
+from dataclasses import fields, replace
 
 import equinox as eqx
 import jax
@@ -171,10 +172,15 @@ def test_particles_of_another_law_are_refused():
         mpm.prepare(block(2, material=sand)[0], replace(both, counts=None))
 
 
-def test_a_wrong_number_of_moduli_is_refused():
-    scene, particles = block(2, material=mpm.NeoHookean(jnp.full(3, 1e4), 0.3))
-    with pytest.raises(ValueError, match=r"one for each of its 36 particles, got \[3\]"):
-        mpm.prepare(scene, particles)
+@pytest.mark.parametrize("law", [mpm.NeoHookean(1e4, 0.3), mpm.CamClay(1e4, 0.3, 1.0, 300.0)])
+@pytest.mark.parametrize("shape", [(3,), (36, 1), (1, 1)])
+def test_parameters_of_a_wrong_shape_are_refused(law, shape):
+    """Also where a law's history is made of them."""
+    for name in [f.name for f in fields(law)]:
+        scene, particles = block(2, material=replace(law, **{name: np.full(shape, getattr(law, name))}))
+        got = re.escape(f"one for each of its 36 particles, got shapes [{shape}]")
+        with pytest.raises(ValueError, match=got):
+            mpm.prepare(scene, particles)
 
 
 def test_a_budget_needs_a_step():

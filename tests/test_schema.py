@@ -73,9 +73,9 @@ EXAMPLES = {
     mpm.Rigid: mpm.Rigid(1e6, (True, False), turns=False),
     mpm.Pressure: mpm.Pressure(PATCH, mpm.TimeSeries((0.0, 1.0), (0.0, 2.0)), following=False),
     mpm.PointLoad: mpm.PointLoad(mpm.PointsAt(((0.1, 0.2), (0.3, 0.4))), (1.0, 2.0)),
-    mpm.Spring: mpm.Spring(mpm.PointsAt(((0.1, 0.2),), (2.0,)), (1.0, 2.0), 3.0, GRIP.motion),
+    mpm.Spring: mpm.Spring(mpm.PointsAt(((0.1, 0.2),), (1.0,)), (1.0, 2.0), 3.0, GRIP.motion),
     mpm.Patch: PATCH,
-    mpm.PointsAt: mpm.PointsAt(((0.1, 0.2), (0.3, 0.4)), (0.5, 1.5)),
+    mpm.PointsAt: mpm.PointsAt(((0.1, 0.2), (0.3, 0.4)), (0.25, 0.75)),
     mpm.AttachedPoints: mpm.AttachedPoints(
         np.zeros(1), np.ones((1, 2)), np.ones(1), np.full((1, 2), 0.3), np.array([[0.0, 1.0]])
     ),

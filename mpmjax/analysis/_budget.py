@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, Matrix, NodeVector, Scalar, components
 from mpmjax.analysis._diagnostics import energy_density, energy_of
-from mpmjax.checks import canonical, checked, require, require_positive
+from mpmjax.checks import canonical, checked, require, require_positive, require_whole
 from mpmjax.discretisation import Gathered, Stencil, gather, scatter
 from mpmjax.implicit import ElasticPotential
 from mpmjax.state import Particles, Scene, prepare
@@ -148,7 +148,8 @@ def budget(
     Raises:
         ValueError: from `prepare`, a step that is not positive, a plane of symmetry that moves, or a rigid body.
     """
-    require_positive("dt [s]", dt)
+    require_positive("dt [s]", dt, particles.x.dtype)
+    steps, start = require_whole("steps", steps, 1), require_whole("start", start, 0)
     require(
         not scene.rigid_bodies,
         "A budget does not know how a Rigid body moves: ask for energy and momentum, or give the body a stiff law.",

@@ -23,7 +23,7 @@ for that too:
 """
 
 from collections.abc import Callable, Hashable, Sequence
-from functools import partial
+from functools import partial, wraps
 from typing import Any, NamedTuple
 
 import jax
@@ -37,11 +37,23 @@ from jax.interpreters import ad, batching, mlir
 from mpmjax._types import Array
 
 
+def _promoting(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function in which arrays may differ in rank: rules are called when a derivative is taken, outside of the public
+    functions that allow it."""
+
+    @wraps(function)
+    def allowed(*args: Any, **kwargs: Any) -> Any:
+        with jax.numpy_rank_promotion("allow"):
+            return function(*args, **kwargs)
+
+    return allowed
+
+
 class ruled:  # noqa: N801, a decorator
     """A function with a rule for its derivative."""
 
     def __init__(self, function: Callable[..., Any]):
-        self.function = function
+        self.function = _promoting(function)
         self.jvp: Callable[..., Any] | None = None
         self.transpose: Callable[..., Any] | None = None
         self.__doc__, self.__name__, self.__module__ = function.__doc__, function.__name__, function.__module__
@@ -51,12 +63,12 @@ class ruled:  # noqa: N801, a decorator
 
     def defjvp(self, rule: Callable[..., Any]) -> Callable[..., Any]:
         """The rule of the derivative."""
-        self.jvp = rule
+        self.jvp = _promoting(rule)
         return rule
 
     def deftranspose(self, rule: Callable[..., Any]) -> Callable[..., Any]:
         """The transpose, by arguments in which the function is linear."""
-        self.transpose = rule
+        self.transpose = _promoting(rule)
         return rule
 
     def __call__(self, *args: Any) -> Any:

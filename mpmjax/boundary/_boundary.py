@@ -11,6 +11,7 @@ import abc
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
+import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._conditions import Conditions
@@ -188,6 +189,11 @@ class AbstractBoundary(eqx.Module):
         """The point at time t [m], shape (d,), about which its torque is taken. Default: None, the origin of the
         coordinates."""
         del t
+        return None
+
+    def reach(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """The corners of a box [m], each of shape (d,), that holds the body at all times. Default: None, it is no body.
+        It is asked only while numbers are known."""
         return None
 
     def rests(self, *, total: bool) -> bool:

@@ -14,6 +14,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax._types import Array, Bool, Float, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
@@ -54,6 +55,10 @@ class AbstractCollider(AbstractBoundary):
         """The centre of the rotation or, without one, the shape's middle."""
         middle = jnp.asarray(self.shape.middle())
         return middle if self.motion is None else self.motion.pivot(middle, t)
+
+    def reach(self) -> tuple[np.ndarray, np.ndarray]:
+        bounds = self.shape.bounds()
+        return bounds if self.motion is None else self.motion.swept(*bounds)
 
     def rests(self, *, total: bool) -> bool:
         return total or self.motion is None or self.motion.rests()

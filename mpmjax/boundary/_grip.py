@@ -2,11 +2,12 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax._types import Array, Float, NodeVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import Conditions
-from mpmjax.checks import require, require_fields
+from mpmjax.checks import as_plain, require, require_fields
 from mpmjax.geometry import AbstractMotion, AbstractRegion, Motion
 
 
@@ -26,9 +27,7 @@ class Grip(AbstractBoundary):
 
     region: AbstractRegion
     motion: Motion | AbstractMotion  # in files a Motion where no kind is given
-    axes: tuple[bool, ...] | None = eqx.field(
-        static=True, default=None, converter=lambda a: tuple(a) if isinstance(a, list) else a
-    )
+    axes: tuple[bool, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
 
     @property
     def dim(self) -> int:
@@ -60,6 +59,9 @@ class Grip(AbstractBoundary):
     def pivot(self, t: Scalar) -> Float[Array, "d"]:
         """The region's middle."""
         return self.motion.pivot(jnp.asarray(self.region.middle()), t)
+
+    def reach(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.motion.swept(*self.region.bounds())
 
     def rests(self, *, total: bool) -> bool:
         return total or self.motion.rests()

@@ -7,7 +7,7 @@ from mpmjax._types import Array, Bool, Int, Mask, NodeVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._mirror import Image, Tie
-from mpmjax.checks import require, require_fields
+from mpmjax.checks import as_plain, require, require_fields
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractRegion
 
@@ -33,9 +33,7 @@ class RigidPart(AbstractBoundary):
     """
 
     region: AbstractRegion
-    free: tuple[bool, ...] | None = eqx.field(
-        static=True, default=None, converter=lambda a: tuple(a) if isinstance(a, list) else a
-    )
+    free: tuple[bool, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
 
     def __check_init__(self):
         require_fields(self)

@@ -3,6 +3,8 @@
 from mpmjax.checks._kinds import alternatives, checked, is_enum, is_module, may_be_infinite, require_fields, shape_of
 from mpmjax.checks._memory import require_memory
 from mpmjax.checks._values import (
+    as_floats,
+    as_plain,
     canonical,
     coordinates,
     first_unmet,
@@ -11,6 +13,7 @@ from mpmjax.checks._values import (
     require_between,
     require_finite,
     require_moduli,
+    require_placement,
     require_positive,
     require_that,
     require_tolerance,
@@ -22,6 +25,8 @@ from mpmjax.checks._values import (
 
 __all__ = [
     "alternatives",
+    "as_floats",
+    "as_plain",
     "canonical",
     "checked",
     "coordinates",
@@ -36,6 +41,7 @@ __all__ = [
     "require_finite",
     "require_memory",
     "require_moduli",
+    "require_placement",
     "require_positive",
     "require_that",
     "require_tolerance",

@@ -45,7 +45,8 @@ _WORDS: dict[Any, str] = {
 
 
 def checked(function: Function) -> Function:
-    """Decorate a function to check that its arguments are of the kinds that their annotations name.
+    """Decorate a public function to check that its arguments are of the kinds that their annotations name, and to let
+    arrays in it differ in rank, whatever `jax_numpy_rank_promotion` says outside.
 
     Raises:
         ValueError: one is not.
@@ -60,24 +61,37 @@ def checked(function: Function) -> Function:
             several = signature.parameters[name].kind is inspect.Parameter.VAR_POSITIONAL
             for value in given if several else (given,) if name in hints else ():
                 require_kind(f"{owner}'s {name}", value, hints[name])
-        return function(*args, **kwargs)
+        with jax.numpy_rank_promotion("allow"):
+            return function(*args, **kwargs)
 
     return cast(Function, guarded)
 
 
 def require_fields(module: eqx.Module) -> None:
-    """Check that every field of a module is of the kind that its annotation names.
+    """Check that every field of a module is of the kind that its annotation names, and can fix a program if it is
+    static.
 
     Raises:
         ValueError: one is not.
     """
-    for name, hint in _hints(type(module)):
-        require_kind(f"{type(module).__name__}'s {name}", getattr(module, name), hint)
+    for name, hint, static in _hints(type(module)):
+        value, what = getattr(module, name), f"{type(module).__name__}'s {name}"
+        require_kind(what, value, hint)
+        if static and not _is_hashable(value):
+            raise ValueError(f"{what} fixes a program: give a known number or a tuple, got {shortened(repr(value))}.")
+
+
+def _is_hashable(value: Any) -> bool:
+    try:
+        hash(value)
+    except TypeError:
+        return False
+    return True
 
 
 @cache
-def _hints(module: type) -> tuple[tuple[str, Any], ...]:
-    return tuple((f.name, f.type) for f in fields(module))
+def _hints(module: type) -> tuple[tuple[str, Any, bool], ...]:
+    return tuple((f.name, f.type, f.metadata.get("static", False)) for f in fields(module))
 
 
 def require_kind(name: str, value: Any, hint: Any) -> None:
@@ -120,6 +134,8 @@ def is_enum(hint: Any) -> bool:
 
 def shape_of(value: Any) -> tuple[int, ...] | None:
     """The shape of a number, an array or nested sequences of numbers; None if it is none of these, or ragged."""
+    if isinstance(value, np.ma.MaskedArray):  # NumPy drops the mask wherever it converts one
+        return None
     if isinstance(value, (np.ndarray, np.generic, jax.Array)):
         real = jnp.issubdtype(value.dtype, jnp.integer) or jnp.issubdtype(value.dtype, jnp.floating)
         return np.shape(value) if real else None
@@ -139,7 +155,8 @@ def _takes(hint: Any, value: Any) -> bool:
     if origin in (typing.Union, UnionType):
         return any(_takes(a, value) for a in args)
     if origin in (tuple, list):
-        sequence = isinstance(value, (tuple, list)) or (isinstance(value, np.ndarray) and value.ndim == 1)
+        array = isinstance(value, np.ndarray) and value.ndim == 1 and not isinstance(value, np.ma.MaskedArray)
+        sequence = array or isinstance(value, (tuple, list))
         wanted = args[:1] * len(value) if sequence and (origin is list or Ellipsis in args) else args
         return sequence and len(value) == len(wanted) and all(_takes(a, v) for a, v in zip(wanted, value, strict=True))
     if origin is dict:

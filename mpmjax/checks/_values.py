@@ -114,6 +114,44 @@ def warn(message: str) -> None:
     warnings.warn(message, stacklevel=level)
 
 
+def as_floats(value: Any) -> Any:
+    """An array of floats, NaN where it is masked; what holds no real numbers stays, for `require_fields` to refuse."""
+    try:
+        array = np.ma.asanyarray(value)
+    except (TypeError, ValueError):  # of a tracer; of rows that differ in length
+        return value
+    return np.ma.filled(array.astype(float), np.nan) if array.dtype.kind in "iuf" else value
+
+
+def as_plain(value: Any) -> Any:
+    """A list or array as a tuple of Python's numbers, an array without axes as a number, so that it can fix a program;
+    all else as it is."""
+    if isinstance(value, (np.ndarray, np.generic, jax.Array)) and not is_traced(value):
+        value = value.tolist()
+    return tuple(value) if isinstance(value, list) else value
+
+
+def require_placement(tree: Any) -> None:
+    """No array may carry what neither loops nor compiled sums know: manual axes over which it varies, as within a
+    `jax.shard_map` that checks them, or explicit axes over which it is divided.
+
+    Raises:
+        ValueError: one does.
+    """
+    for leaf in jax.tree.leaves(tree):
+        while isinstance(leaf, jax.Array):
+            kind = jax.typeof(leaf)
+            axes = getattr(kind, "manual_axis_type", None)
+            if getattr(axes, "varying", getattr(kind, "vma", None)):  # by its name from jax 0.10 on, and before
+                raise ValueError("A jax.shard_map must not check over which axes arrays vary: give it check_vma=False.")
+            if any(axis is not None for axis in getattr(kind.sharding, "spec", ())):
+                raise ValueError(
+                    "Arrays must not be divided over explicit axes: make the mesh of axes of the kind "
+                    "jax.sharding.AxisType.Auto, or divide them within jax.shard_map(..., check_vma=False)."
+                )
+            leaf = getattr(leaf, "val", getattr(leaf, "primal", None))  # what a batch or tangent is of
+
+
 def require_tolerance(name: str, value: Any) -> None:
     """Check that a relative tolerance is positive; warn of one that any guess meets."""
     require_positive(name, value)
@@ -133,10 +171,14 @@ def _finite(a: Any) -> Any:
     return abs(a.astype(float)) < np.inf
 
 
-def require_positive(name: str, value: Any) -> None:
-    """Every number of `value` must be finite and above zero."""
+def require_positive(name: str, value: Any, dtype: Any = None) -> None:
+    """Every number of `value` must be finite and above zero; with a dtype, in that precision."""
     require_finite(name, value)
-    require_that(f"{name} must be greater than zero", lambda a: a > 0, value)
+    if dtype is None:
+        require_that(f"{name} must be greater than zero", lambda a: a > 0, value)
+    else:
+        least = float(jnp.finfo(dtype).tiny)
+        require_that(f"{name} must be greater than zero in {jnp.dtype(dtype)}", lambda a: a >= least, value)
 
 
 def require_whole(name: str, value: Any, least: int) -> int:

@@ -28,7 +28,7 @@ from mpmjax.fitting import (
     Positive,
     Unbounded,
 )
-from mpmjax.io import arguments
+from mpmjax.io import arguments, decode
 
 _OPTIMISERS: dict[str, type[AbstractOptimiser]] = {
     "LevenbergMarquardt": LevenbergMarquardt,
@@ -326,7 +326,7 @@ def _turned(experiment: Experiment, spin: Any) -> Experiment:
 
 def _experiments(path: Path, simulation: Simulation, table: dict[str, Any]) -> tuple[Experiment, Experiment]:
     """The experiment that is fitted, which ends at [fit] t1, and the one of all that was measured."""
-    t1 = table.get("t1", simulation.t1)
+    t1 = decode(table.get("t1", simulation.t1), Scalar, "[fit] t1")
     require_positive("[fit] t1", t1)
     require(t1 <= simulation.t1, f"[fit] t1 must not lie after that of [run], got {t1} and {simulation.t1}.")
     tables = _tables(table, "observation")

@@ -6,11 +6,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 
 from mpmjax._types import Array, Float, Int, Scalar
-from mpmjax.checks import require_positive, require_whole
+from mpmjax.checks import as_floats, require_fields, require_positive, require_whole
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation, where
 from mpmjax.fitting._problem import Coordinates, FitProblem
 
@@ -33,14 +32,13 @@ class Adam(AbstractOptimiser):
         patience: iterations in a row without a lower cost, after which steps are halved.
     """
 
-    learning_rate: Scalar | np.ndarray | Callable[[Any], Any] = eqx.field(
-        converter=lambda a: a if callable(a) else np.asarray(a, float), default=0.05
-    )
-    atol: Scalar | np.ndarray = eqx.field(converter=lambda a: np.asarray(a, float), default=1e-4)
+    learning_rate: Scalar | Callable[[Any], Any] = eqx.field(converter=as_floats, default=0.05)
+    atol: Scalar = eqx.field(converter=as_floats, default=1e-4)
     max_steps: int = eqx.field(static=True, default=500)
     patience: int = eqx.field(static=True, default=10)
 
     def __check_init__(self):
+        require_fields(self)
         require_positive("Adam's atol", self.atol)
         for name in ("max_steps", "patience"):
             require_whole(f"Adam's {name}", getattr(self, name), 1)

@@ -12,7 +12,7 @@ from mpmjax._types import Array, ParticleScalar, ParticleVector, Scalar
 from mpmjax.checks import canonical, checked, require, require_finite, require_positive
 from mpmjax.discretisation import BSpline, Grid, SplineGradient, gather, in_window, make_stencil
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._parameter import AbstractParameter
+from mpmjax.fitting._parameter import AbstractParameter, Start
 from mpmjax.fitting._prior import AbstractPrior, Value
 from mpmjax.state import Particles
 
@@ -39,7 +39,7 @@ class Field(AbstractParameter):
     of: AbstractParameter
     lattice: Grid
     kernel: BSpline
-    start: Scalar | Value | np.ndarray | None
+    start: Start | None
 
     @checked
     def __init__(
@@ -48,7 +48,7 @@ class Field(AbstractParameter):
         lattice: Grid,
         *,
         kernel: BSpline = BSpline(1),
-        start: Scalar | Value | np.ndarray | None = None,
+        start: Start | None = None,
     ):
         self.of, self.lattice, self.kernel = of, lattice, kernel
         self.start = of.start if start is None else start
@@ -61,6 +61,7 @@ class Field(AbstractParameter):
         )
 
     @staticmethod
+    @checked
     def lattice_around(particles: Particles, spacing: Scalar, *, kernel: BSpline = BSpline(1)) -> Grid:
         """The smallest lattice of a spacing [m] that holds particles where they are."""
         require_positive("The spacing of a Field's lattice [m]", spacing)

@@ -6,11 +6,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 
 from mpmjax._types import Array, Bool, Float, Int, Scalar
-from mpmjax.checks import require_positive, require_whole
+from mpmjax.checks import as_floats, require_fields, require_positive, require_whole
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation, where
 from mpmjax.fitting._problem import Coordinates, FitProblem
 
@@ -34,12 +33,13 @@ class LBFGS(AbstractOptimiser):
         line_search: most simulations of a line search.
     """
 
-    rtol: Scalar | np.ndarray = eqx.field(converter=lambda a: np.asarray(a, float), default=1e-3)
+    rtol: Scalar = eqx.field(converter=as_floats, default=1e-3)
     max_steps: int = eqx.field(static=True, default=200)
     memory: int = eqx.field(static=True, default=20)
     line_search: int = eqx.field(static=True, default=20)
 
     def __check_init__(self):
+        require_fields(self)
         require_positive("LBFGS's rtol", self.rtol)
         for name in ("max_steps", "memory", "line_search"):
             require_whole(f"LBFGS's {name}", getattr(self, name), 1)

@@ -8,7 +8,7 @@ import numpy as np
 import optimistix
 
 from mpmjax._types import Array, Scalar
-from mpmjax.checks import require, require_tolerance, require_whole
+from mpmjax.checks import require_fields, require_tolerance, require_whole
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._problem import Coordinates, FitProblem
 
@@ -36,12 +36,9 @@ class LevenbergMarquardt(AbstractOptimiser):
     mode: Literal["forward", "reverse"] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
+        require_fields(self)
         require_tolerance("LevenbergMarquardt's rtol", self.rtol)
         require_whole("LevenbergMarquardt's max_steps", self.max_steps, 1)
-        require(
-            self.mode in (None, "forward", "reverse"),
-            f'LevenbergMarquardt\'s mode must be "forward", "reverse" or None, got {self.mode!r}.',
-        )
 
     def begin(self, problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> Any:
         args = problem, sigmas, self.mode

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.checks import require, require_finite, require_positive
+from mpmjax.checks import as_floats, require, require_fields, require_finite, require_positive
 from mpmjax.fitting._columns import ROUNDED, after
 from mpmjax.fitting._prior import drawn_nearer
 from mpmjax.fitting._quantities import Markers
@@ -28,12 +28,12 @@ class AbstractObservation(eqx.Module):
 
     data: eqx.AbstractVar[np.ndarray]
     """What was measured, of any shape; NaN where nothing was."""
-    sigma: eqx.AbstractVar[Scalar | np.ndarray | None]
+    sigma: eqx.AbstractVar[Float[np.ndarray, "..."] | None]
     """Standard deviation of its noise, a number or an array that broadcasts against the data, in the data's unit; None
     to estimate it from the misfit."""
-    weight: eqx.AbstractVar[np.ndarray]
+    weight: eqx.AbstractVar[Scalar]
     """Factor of its squares [-]: 1 believes the noise, less than 1 counts points whose noise is correlated less."""
-    robust: eqx.AbstractVar[np.ndarray | None]
+    robust: eqx.AbstractVar[Scalar | None]
     """The misfit, in standard deviations, beyond which squares grow but linearly (pseudo-Huber), so that outliers count
     little; None for squares throughout."""
     name: eqx.AbstractVar[str]
@@ -70,6 +70,7 @@ class AbstractObservation(eqx.Module):
         """The part that was measured until a time [s]; None where there is none, or it is not known, as of a curve."""
 
     def __check_init__(self):
+        require_fields(self)
         name = f"{type(self).__name__} {self.name!r}"
         measured = np.isfinite(self.data)
         require(not np.isinf(self.data).any(), f"{name} must have finite data, or NaN where nothing was measured.")
@@ -133,7 +134,7 @@ class Series(AbstractObservation):
 
     Args:
         times: when it was measured [s], shape (f,), growing, from 0 to the experiment's t1.
-        values: what was measured, shape (f, ...); NaN where nothing was.
+        values: what was measured, shape (f, ...); NaN or masked where nothing was.
         of: function of (scene, particles) that returns it, shape (...).
         sigma: standard deviation of the noise, in the unit of the values; None to estimate it.
         weight: factor of the squares.
@@ -141,12 +142,12 @@ class Series(AbstractObservation):
         name: what tables and pictures call it.
     """
 
-    times: np.ndarray
-    data: np.ndarray
+    times: Float[np.ndarray, "f"]
+    data: Float[np.ndarray, "f ..."]
     of: Callable[[Scene, Particles], Any]
-    sigma: Scalar | np.ndarray | None
-    weight: np.ndarray
-    robust: np.ndarray | None
+    sigma: Float[np.ndarray, "..."] | None
+    weight: Scalar
+    robust: Scalar | None
     name: str = eqx.field(static=True)
 
     def __init__(
@@ -160,13 +161,14 @@ class Series(AbstractObservation):
         robust: Scalar | None = None,
         name: str = "series",
     ):
-        self.times, self.data = np.asarray(times, float), np.asarray(values, float)
-        self.of, self.name = of, name
-        self.weight, self.robust = np.asarray(weight, float), None if robust is None else np.asarray(robust, float)
-        self.sigma = None if sigma is None else np.asarray(sigma, float)
-        what = f"{type(self).__name__} {name!r}"
+        self.times, self.data, self.of, self.name = as_floats(times), as_floats(values), of, name
+        self.sigma, self.weight, self.robust = as_floats(sigma), as_floats(weight), as_floats(robust)
+
+    def __check_init__(self):
+        require_fields(self)
+        what = f"{type(self).__name__} {self.name!r}"
         require(
-            self.times.ndim == 1 and self.data.shape[:1] == self.times.shape,
+            self.data.shape[:1] == self.times.shape,
             f"{what} needs times of shape (f,) and values of shape (f, ...), got {self.times.shape} and "
             f"{self.data.shape}.",
         )
@@ -286,10 +288,14 @@ class Tracks(Series):
     ):
         markers = which if isinstance(which, Markers) else Markers.of(which)
         super().__init__(times, positions, markers, sigma=sigma, weight=weight, robust=robust, name=name)
+
+    def __check_init__(self):
+        require_fields(self)
+        assert isinstance(self.of, Markers)
         require(
-            self.data.ndim == 3 and markers.count == self.data.shape[1],
-            f"Tracks {name!r} need positions of shape (f, m, d) of the m markers, got {self.data.shape} and "
-            f"{markers.count} markers.",
+            self.data.ndim == 3 and self.of.count == self.data.shape[1],
+            f"Tracks {self.name!r} need positions of shape (f, m, d) of the m markers, got {self.data.shape} and "
+            f"{self.of.count} markers.",
         )
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
@@ -316,13 +322,13 @@ class Curve(AbstractObservation):
         x_name: what pictures call the abscissa.
     """
 
-    x: np.ndarray
+    x: Float[np.ndarray, "m"]
     x_name: str = eqx.field(static=True)
-    data: np.ndarray
+    data: Float[np.ndarray, "m"]
     of: Callable[[Scene, Particles], Any]
-    sigma: Scalar | np.ndarray | None
-    weight: np.ndarray
-    robust: np.ndarray | None
+    sigma: Float[np.ndarray, "..."] | None
+    weight: Scalar
+    robust: Scalar | None
     name: str = eqx.field(static=True)
 
     def __init__(
@@ -338,15 +344,16 @@ class Curve(AbstractObservation):
         x_name: str = "abscissa",
     ):
         self.x_name = x_name
-        self.x, self.data = np.asarray(x, float), np.asarray(y, float)
-        self.of, self.name = of, name
-        self.weight, self.robust = np.asarray(weight, float), None if robust is None else np.asarray(robust, float)
-        self.sigma = None if sigma is None else np.asarray(sigma, float)
+        self.x, self.data, self.of, self.name = as_floats(x), as_floats(y), of, name
+        self.sigma, self.weight, self.robust = as_floats(sigma), as_floats(weight), as_floats(robust)
+
+    def __check_init__(self):
+        require_fields(self)
         require(
-            self.x.ndim == 1 and self.x.shape == self.data.shape,
-            f"Curve {name!r} needs x and y of one shape (m,), got {self.x.shape} and {self.data.shape}.",
+            self.x.shape == self.data.shape,
+            f"Curve {self.name!r} needs x and y of one shape (m,), got {self.x.shape} and {self.data.shape}.",
         )
-        require_finite(f"The abscissae of Curve {name!r}", self.x)
+        require_finite(f"The abscissae of Curve {self.name!r}", self.x)
 
     @property
     def against(self) -> tuple[str, np.ndarray]:

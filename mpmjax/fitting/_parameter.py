@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Scalar
-from mpmjax.checks import require, require_finite, require_positive
+from mpmjax._types import Array, Float, Scalar
+from mpmjax.checks import as_plain, require, require_fields, require_finite, require_positive
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._prior import AbstractPrior, Value
+
+Start = Scalar | Value | Float[np.ndarray, "..."] | tuple | list
 
 
 class AbstractParameter(eqx.Module):
@@ -26,7 +28,7 @@ class AbstractParameter(eqx.Module):
     """The leaf, or a tuple of leaves that share the value, of an experiment, as in `equinox.tree_at`."""
     update: eqx.AbstractVar[Callable[[Experiment, Value], Experiment] | None]
     """In the place of `where`: the experiment with the value put into it, for what is no single leaf."""
-    start: eqx.AbstractVar[Scalar | Value | np.ndarray | None]
+    start: eqx.AbstractVar[Start | None]
     """The first guess. Default: the value of the first experiment."""
     prior: eqx.AbstractVar[AbstractPrior | None]
     """What is known of it beforehand."""
@@ -36,6 +38,7 @@ class AbstractParameter(eqx.Module):
     """The numbers, from 0, of the experiments that it belongs to. Default: all."""
 
     def __check_init__(self):
+        require_fields(self)
         name = type(self).__name__
         require(
             (self.where is None) != (self.update is None),
@@ -45,6 +48,13 @@ class AbstractParameter(eqx.Module):
         require(self.update is None or self.start is not None, f"{name} with update needs a start: the first guess.")
         if self.start is not None:
             require_finite(f"{name}'s start", self.start)
+        known = None if self.prior is None else self.prior.distribution()
+        if known is not None:
+            (lower, upper), mean = self.domain, known[0]
+            require(
+                (mean >= lower) & (mean <= upper),
+                f"{name}'s values lie between {lower:g} and {upper:g}, so the mean of its prior must too, got {mean}.",
+            )
 
     @property
     def logarithmic(self) -> bool:
@@ -128,11 +138,11 @@ class Unbounded(AbstractParameter):
 
     where: Callable[[Experiment], Any] | None = None
     update: Callable[[Experiment, Value], Experiment] | None = None
-    start: Scalar | Value | np.ndarray | None = None
+    start: Start | None = None
     scale: Scalar | None = None
     prior: AbstractPrior | None = None
     unit: str = eqx.field(static=True, default="")
-    only: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    only: tuple[int, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
 
     def value(self, start: Value, z: Value) -> Value:
         """start + scale z."""
@@ -168,10 +178,10 @@ class Positive(AbstractParameter):
 
     where: Callable[[Experiment], Any] | None = None
     update: Callable[[Experiment, Value], Experiment] | None = None
-    start: Scalar | Value | np.ndarray | None = None
+    start: Start | None = None
     prior: AbstractPrior | None = None
     unit: str = eqx.field(static=True, default="")
-    only: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    only: tuple[int, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
 
     @property
     def logarithmic(self) -> bool:
@@ -211,13 +221,13 @@ class Bounded(AbstractParameter):
     """
 
     where: Callable[[Experiment], Any] | None = None
-    lower: float | int = eqx.field(static=True, default=0.0)
-    upper: float | int = eqx.field(static=True, default=1.0)
+    lower: float | int = eqx.field(static=True, default=0.0, converter=as_plain)
+    upper: float | int = eqx.field(static=True, default=1.0, converter=as_plain)
     update: Callable[[Experiment, Value], Experiment] | None = None
-    start: Scalar | Value | np.ndarray | None = None
+    start: Start | None = None
     prior: AbstractPrior | None = None
     unit: str = eqx.field(static=True, default="")
-    only: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    only: tuple[int, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
 
     def value(self, start: Value, z: Value) -> Value:
         """lower + (upper − lower)/(1 + e^{−(z0 + z)})."""

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.checks import require, require_finite, require_positive
+from mpmjax.checks import as_floats, require, require_fields, require_finite, require_positive
 
 Value = Float[Array, "..."]
 
@@ -55,10 +55,11 @@ class Gaussian(AbstractPrior):
         sigma: its standard deviation, likewise.
     """
 
-    mean: Scalar | np.ndarray | Value = eqx.field(converter=lambda a: np.asarray(a, float))
-    sigma: Scalar | np.ndarray | Value = eqx.field(converter=lambda a: np.asarray(a, float))
+    mean: Float[np.ndarray, "..."] = eqx.field(converter=as_floats)
+    sigma: Float[np.ndarray, "..."] = eqx.field(converter=as_floats)
 
     def __check_init__(self):
+        require_fields(self)
         require_finite("Gaussian's mean", self.mean)
         require_positive("Gaussian's sigma", self.sigma)
 
@@ -100,14 +101,12 @@ class Smooth(AbstractPrior):
         robust: the difference, in standard deviations, beyond which squares grow but linearly. Default: none.
     """
 
-    sigma: Scalar | np.ndarray = eqx.field(converter=lambda a: np.asarray(a, float))
-    robust: Scalar | np.ndarray | None = eqx.field(
-        converter=lambda a: None if a is None else np.asarray(a, float), default=None
-    )
+    sigma: Scalar = eqx.field(converter=as_floats)
+    robust: Scalar | None = eqx.field(converter=as_floats, default=None)
 
     def __check_init__(self):
+        require_fields(self)
         require_positive("Smooth's sigma", self.sigma)
-        require(np.ndim(self.sigma) == 0, f"Smooth's sigma must be one number, got shape {np.shape(self.sigma)}.")
         if self.robust is not None:
             require_positive("Smooth's robust limit", self.robust)
 

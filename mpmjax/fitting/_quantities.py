@@ -7,11 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 
-from mpmjax._types import Array, Float, ParticleScalar, ParticleVector
-from mpmjax.checks import canonical, is_traced, require
+from mpmjax._types import Array, Float, ParticleScalar, ParticleVector, Scalar
+from mpmjax.checks import canonical, checked, is_traced, require, require_fields
 from mpmjax.discretisation import BSpline, Grid, SplineGradient, make_stencil, scatter
 from mpmjax.geometry import AbstractRegion
 from mpmjax.state import Particles, Scene
+
+Rows = Float[Array, "m d"] | Float[np.ndarray, "m d"] | tuple | list
 
 _NEIGHBOURS = 3
 """Particles that carry a marker, in each direction."""
@@ -29,6 +31,7 @@ class Markers(eqx.Module):
     """Their shares in its place, shape (m, k); they add up to one."""
 
     @classmethod
+    @checked
     def of(cls, which: Any) -> "Markers":
         """Markers that are particles, by their numbers, shape (m,).
 
@@ -44,7 +47,8 @@ class Markers(eqx.Module):
         return cls(numbers[:, None], np.ones((len(numbers), 1)))
 
     @classmethod
-    def at(cls, particles: Particles, places: ParticleVector | np.ndarray) -> "Markers":
+    @checked
+    def at(cls, particles: Particles, places: Rows) -> "Markers":
         """Markers painted on places of a body as it starts [m], shape (m, d).
 
         A marker moves as the mean of its nearest particles, by shares of least squares that reproduce its place: it
@@ -117,7 +121,7 @@ class Extent(eqx.Module):
     side: Literal["upper", "lower"] = eqx.field(static=True, default="upper")
 
     def __check_init__(self):
-        require(self.side in ("upper", "lower"), f'Extent\'s side must be "upper" or "lower", got {self.side!r}.')
+        require_fields(self)
 
     def __call__(self, scene: Scene, particles: Particles) -> Float[Array, ""]:
         """The coordinate [m]."""
@@ -145,6 +149,7 @@ class StressStretch(eqx.Module):
     """Direction a of the pull."""
 
     @classmethod
+    @checked
     def of(cls, region: AbstractRegion, particles: Particles, axis: int) -> "StressStretch":
         """Over the particles that start in a region, each weighted by its volume.
 
@@ -186,12 +191,16 @@ class Density(eqx.Module):
 
     grid: Grid
 
+    def __check_init__(self):
+        require_fields(self)
+
     def __call__(self, scene: Scene, particles: Particles) -> Array:
         """The density [kg/m^d], of the grid's shape."""
         del scene
         return self._picture(particles.x, particles.mass)
 
-    def of_points(self, points: ParticleVector | np.ndarray, mass: float | Array) -> np.ndarray:
+    @checked
+    def of_points(self, points: Rows, mass: Scalar) -> np.ndarray:
         """The picture of a cloud of points.
 
         Args:

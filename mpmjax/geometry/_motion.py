@@ -27,6 +27,11 @@ class AbstractMotion(eqx.Module):
         """Whether nothing ever moves, as far as is known. Default: False. It is asked only while numbers are known."""
         return False
 
+    def swept(self, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The corners of a box [m], each of shape (d,), that holds another one at all times. Default: of all space. It
+        is asked only while numbers are known."""
+        return np.full(lower.shape, -np.inf), np.full(upper.shape, np.inf)
+
     @property
     @abc.abstractmethod
     def dim(self) -> int:
@@ -71,6 +76,10 @@ class Motion(AbstractMotion):
 
     def rests(self) -> bool:
         return _constant(self.displacement)
+
+    def swept(self, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        moved = np.asarray(self.displacement, float)
+        return lower + moved.min(axis=0), upper + moved.max(axis=0)
 
     @property
     def dim(self) -> int:

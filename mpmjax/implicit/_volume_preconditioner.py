@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, NodeVector
 from mpmjax.boundary import Image, Mirror
-from mpmjax.checks import require, require_fields
+from mpmjax.checks import as_plain, require, require_fields
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.implicit._dissected_factor import DissectedFactor, dissected_factor
 from mpmjax.implicit._dissection import Dissection
@@ -51,9 +51,7 @@ class VolumePreconditioner(AbstractPreconditioner):
     """
 
     largest: int = eqx.field(static=True, default=60_000_000)
-    extent: tuple[int, ...] | None = eqx.field(
-        static=True, default=None, converter=lambda a: tuple(a) if isinstance(a, list) else a
-    )
+    extent: tuple[int, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
 
     def __check_init__(self):
         require_fields(self)

@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax._types import Array, Bool, Deformation, Float, Scalar, components
 from mpmjax.checks import require
@@ -33,6 +34,12 @@ class AbstractLaw(eqx.Module):
     def allows_averaged_volume(self) -> bool:
         """Whether the volumes of its particles may be averaged (see `AveragedVolume`). Default: yes."""
         return True
+
+    def hardly_changes_volume(self) -> bool:
+        """Whether its bulk modulus is ten times its shear modulus or more (ν from 0.45 on), as far as it has both by
+        these names. It is asked only while numbers are known."""
+        bulk, shear = (getattr(self, name, None) for name in ("bulk_modulus", "shear_modulus"))
+        return bulk is not None and shear is not None and bool(np.any(np.asarray(bulk) > 9.6 * np.asarray(shear)))
 
     @abc.abstractmethod
     def initial_history(self, F: Deformation, /) -> Any:

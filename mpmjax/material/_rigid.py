@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix, Scalar
-from mpmjax.checks import require, require_fields, require_positive
+from mpmjax.checks import as_plain, require, require_fields, require_positive
 from mpmjax.material._base import AbstractMaterial
 from mpmjax.material._freedom import Freedom
 from mpmjax.material._tangent import AbstractTangent, MatrixTangent, PrincipalTangent
@@ -35,9 +35,7 @@ class Rigid(AbstractMaterial):
     """
 
     modulus: Scalar
-    free: tuple[bool, ...] | None = eqx.field(
-        static=True, default=None, converter=lambda a: tuple(a) if isinstance(a, list) else a
-    )
+    free: tuple[bool, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
     turns: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self):

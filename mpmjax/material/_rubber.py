@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
-from mpmjax.checks import require, require_fields, require_finite, require_positive, require_that
+from mpmjax.checks import as_plain, require, require_fields, require_finite, require_positive, require_that
 from mpmjax.linalg import PowerLessOne
 from mpmjax.material._base import AbstractMaterial
 from mpmjax.material._isotropic_tangent import IsotropicTangent
@@ -280,8 +280,8 @@ class Ogden(AbstractRubber):
         bulk_modulus: K [Pa].
     """
 
-    moduli: tuple[Scalar, ...]
-    exponents: tuple[Scalar, ...]
+    moduli: tuple[Scalar, ...] = eqx.field(converter=as_plain)
+    exponents: tuple[Scalar, ...] = eqx.field(converter=as_plain)
     bulk_modulus: PerParticle
 
     def __check_init__(self):

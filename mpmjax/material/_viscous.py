@@ -61,6 +61,9 @@ class Viscous(AbstractLaw):
     def allows_averaged_volume(self) -> bool:
         return self.law.allows_averaged_volume
 
+    def hardly_changes_volume(self) -> bool:
+        return self.law.hardly_changes_volume()
+
     def initial_history(self, F: Deformation) -> Any:
         return self.law.initial_history(F)
 

@@ -43,6 +43,17 @@ def advise(scene: Scene, method: AbstractIntegrator, dt: Any, began: Particles, 
     return f"{said}. Take a dt of {shorter}, or an implicit method that has no limit. If the fault stays, {shortly}"
 
 
+def averaging_advice(scene: Scene) -> str:
+    """A sentence on averaged volumes where a law that hardly changes its volume has own ones; else empty."""
+    own = scene.laws if scene.volume is None else ()
+    if not any(law.allows_averaged_volume and law.hardly_changes_volume() for law in own):
+        return ""
+    return (
+        " With own volumes nearly incompressible material locks, and its pressures differ from particle to particle: "
+        "give the scene volume=AveragedVolume()."
+    )
+
+
 def disallowed(law: AbstractLaw, method: AbstractIntegrator) -> tuple[str, str]:
     """What is wrong with a deformation that the law does not allow, and what helps."""
     newton = (

@@ -13,7 +13,7 @@ from mpmjax._types import Array
 from mpmjax.autodiff import guard
 from mpmjax.checks import requirements, warn
 from mpmjax.material import AbstractLaw
-from mpmjax.simulation._advice import advise, disallowed
+from mpmjax.simulation._advice import advise, averaging_advice, disallowed
 from mpmjax.simulation._diffrax import LEAST_STRETCH, Problem, faulty_particles, passed_particles
 from mpmjax.simulation._rollout_state import RolloutState
 from mpmjax.simulation._run import Run, SimulationError
@@ -63,14 +63,16 @@ def raise_faults(run: Run, began: Particles, before: Callable[[], RolloutState],
         )
         raise SimulationError(
             f"At step {step} (t = {step * float(run.dt):.6g} s) particle {first} {what}; the last good position was "
-            f"{np.asarray(previous.particles.x[first])}. {advise(run.scene, run.method, run.dt, began, last, advice)}",
+            f"{np.asarray(previous.particles.x[first])}. {advise(run.scene, run.method, run.dt, began, last, advice)}"
+            + averaging_advice(run.scene),
             good,
         )
     if int(run.statistics.unconverged) > 0:
         raise SimulationError(
             f"The solve of {int(run.statistics.unconverged)} of {int(run.statistics.steps)} steps did not converge "
             f"(worst relative residual {float(run.statistics.worst_residual):.2g}). "
-            + unconverged_advice(run.method, run.final.x.dtype),
+            + unconverged_advice(run.method, run.final.x.dtype)
+            + averaging_advice(run.scene),
             run,
         )
 

@@ -190,7 +190,12 @@ def rollout(
         dt: step [s].
         method: update of the grid velocity.
         start: number of the first step.
+
+    Raises:
+        ValueError: from `prepare`; a step that is not positive, or a number of steps that is negative.
     """
+    require_positive("dt [s]", dt, particles.x.dtype)
+    steps, start = require_whole("steps", steps, 0), require_whole("start", start, 0)
     scene, dt, method = canonical((scene, dt, method), particles.x.dtype)
     requirements(method)
     return _rollout(scene, prepare(scene, particles), dt, method, steps, jnp.asarray(start, particles.x.dtype))
@@ -221,7 +226,7 @@ def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
     """
     if is_traced((t1, dt)):
         raise ValueError("t1 and dt fix the number of steps and must be known numbers, not traced ones.")
-    require_positive("dt [s]", dt)
+    require_positive("dt [s]", dt, dtype)
     require_finite("t1 [s]", t1)
     ratio, exact = float(t1) / float(dt), 2 ** (jnp.finfo(dtype).nmant - 1)
     require(

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.checks import is_traced, require, require_fields, require_positive, warn
+from mpmjax.checks import is_traced, require, require_fields, require_positive, require_that, warn
 from mpmjax.geometry import AbstractRegion, Pieces, surface_pieces
 from mpmjax.state._particles import Particles
 
@@ -20,6 +20,10 @@ _NARROW = 1.999
 """A patch narrower than so many particle spacings is not resolved."""
 _FAR = 2.0
 """How many particle spacings a point may lie off the nearest particle."""
+
+
+_ROUNDED = 1e-4
+"""By how much shares may miss one, as rounding has it."""
 
 
 class AbstractPlace(eqx.Module):
@@ -158,7 +162,7 @@ class PointsAt(AbstractPlace):
 
     Args:
         positions: where they are at the start [m], (s, d).
-        weights: the share of each [-], (s,). Default: equal shares that sum to one.
+        weights: the share of each [-], (s,), in all one. Default: equal shares.
     """
 
     positions: Rows
@@ -172,6 +176,12 @@ class PointsAt(AbstractPlace):
             self.weights is None or jnp.shape(jnp.asarray(self.weights)) == shape[:1],
             f"PointsAt need one weight a position, got {self.weights}.",
         )
+        if self.weights is not None:
+            require_that(
+                "PointsAt's weights must be shares of a whole, which sum to one",
+                lambda w: abs(w.sum() - 1) < _ROUNDED,
+                self.weights,
+            )
 
     @property
     def dim(self) -> int:
@@ -187,8 +197,8 @@ class PointsAt(AbstractPlace):
 def _known(particles: Particles, place: AbstractPlace) -> tuple[np.ndarray, float]:
     """The particles' positions, and the distance between them [m]."""
     require(
-        not is_traced((particles.x, place)),
-        "Loads are attached to particles whose positions are known: call attach outside of the jax transformation.",
+        not is_traced((particles.x, particles.volume, particles.deformations, place)),
+        "Loads are attached to particles that are known: call attach outside of the jax transformation.",
     )
     require(
         place.dim == particles.dim,

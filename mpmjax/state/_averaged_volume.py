@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix
 from mpmjax.boundary import Mirror
-from mpmjax.checks import require, require_fields
+from mpmjax.checks import as_plain, require, require_fields
 from mpmjax.discretisation import BSpline, Grid, SplineGradient, Stencil, gather, make_stencil, scatter
 from mpmjax.material import AbstractElastic
 
@@ -39,9 +39,7 @@ class AveragedVolume(eqx.Module):
             itself. Default: all of them. Laws that yield, and fluids, are refused.
     """
 
-    materials: tuple[int, ...] | None = eqx.field(
-        static=True, default=None, converter=lambda a: tuple(a) if isinstance(a, list) else a
-    )
+    materials: tuple[int, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
 
     def __check_init__(self):
         require_fields(self)

@@ -3,7 +3,7 @@
 import equinox as eqx
 
 from mpmjax._types import Scalar
-from mpmjax.checks import require, require_between, require_fields
+from mpmjax.checks import as_plain, require, require_between, require_fields
 
 
 class Bodies(eqx.Module):
@@ -26,9 +26,7 @@ class Bodies(eqx.Module):
     """
 
     friction: Scalar = 0.0
-    of_materials: tuple[int, ...] | None = eqx.field(
-        static=True, default=None, converter=lambda n: tuple(n) if isinstance(n, list) else n
-    )
+    of_materials: tuple[int, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
 
     def __check_init__(self):
         require_fields(self)

@@ -19,6 +19,10 @@ from mpmjax.checks import warn
 from mpmjax.discretisation import BSpline, Grid
 from mpmjax.state._particles import Particles
 
+_CROWDED = 1.25
+"""How many times the space that there is particles may take."""
+_MOST_CELLS = 10**8
+"""Cells up to which it is looked for."""
 _THIN = 2.0
 """A body thinner than so many cells is not resolved."""
 _MOST_ROUNDING = 2.0**-12
@@ -60,6 +64,10 @@ def warn_of_oversights(grid: Grid, kernel: BSpline, boundary: Boundaries, partic
             if not (mask if may_meet else np.asarray(mask)[_reached(grid, kernel, particles.x)]).any():
                 where = "of the window lies in it" if may_meet else "that a particle reaches lies in it"
                 warn(f"The {name} touches nothing, since no node {where}: move it, or enlarge it to a spacing or more.")
+        elif _stays_outside(condition, grid):
+            warn(f"The {name} touches nothing, since it never comes into the grid's window: move it or the grid.")
+    if (crowded := _crowded(grid, particles)) is not None:
+        warn(crowded)
     for text in _thin(grid, boundary, particles):
         warn(text)
     warn_of_rounding(grid, particles.x)
@@ -126,6 +134,46 @@ def _beyond(boundary: AbstractBoundary, grid: Grid, particles: Particles) -> int
     for wall in boundary.walls():
         outside |= wall.inward * (places[:, wall.axis] - wall.position) < nearest
     return int(outside.sum())
+
+
+def _stays_outside(boundary: AbstractBoundary, grid: Grid) -> bool:
+    """Whether its body, or each of its walls, is outside of a window that rests at all times."""
+    mirrors = (boundary.mirror(),)
+    if grid.follow or any(mirror is not None and mirror.motion is not None for mirror in mirrors):
+        return False
+    dx, free = float(grid.spacing), np.asarray(grid.periodic)
+    first = np.asarray(grid.origin) * dx - dx
+    last = first + (np.asarray(grid.shape) + 1) * dx
+    walls, reach = boundary.walls(), boundary.reach()
+    if reach is not None:
+        return bool((((reach[1] < first) | (reach[0] > last)) & ~free).any())
+    beside = [not free[w.axis] and not first[w.axis] <= w.position <= last[w.axis] for w in walls]
+    return bool(beside) and all(beside)
+
+
+def _crowded(grid: Grid, particles: Particles) -> str | None:
+    """A warning where particles take more space than there is: a quarter more in a lattice of cells two particles wide,
+    by linear weights, which those of one body fill to a tenth."""
+    d, volume, places = grid.dim, np.asarray(particles.volume, float), np.asarray(particles.x, float)
+    cell = 2 * max(float(grid.spacing), float(volume.max()) ** (1 / d))
+    index = np.floor(places / cell).astype(np.int64)
+    index, share = index - index.min(axis=0), places / cell - index
+    shape = index.max(axis=0) + 2
+    if shape.prod() > _MOST_CELLS:
+        return None
+    held = np.zeros(shape.prod())
+    for corner in itertools.product((0, 1), repeat=d):
+        weight = np.where(corner, share, 1 - share).prod(axis=1)
+        held += np.bincount(np.ravel_multi_index(tuple((index + corner).T), shape), weight * volume, held.size)
+    most = int(held.argmax())
+    times = held[most] / cell**d
+    if times < _CROWDED:
+        return None
+    near = (np.asarray(np.unravel_index(most, shape)) + np.floor(places / cell).min(axis=0)) * cell
+    return (
+        f"Near {near} m particles take {times:.2g} times the space that there is: where two sets fill the same place "
+        "there is twice the mass. Leave one of them out there."
+    )
 
 
 def _reached(grid: Grid, kernel: BSpline, x: ParticleVector) -> np.ndarray:

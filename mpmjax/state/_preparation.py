@@ -17,6 +17,7 @@ from mpmjax.checks import (
     require_fields,
     require_finite,
     require_memory,
+    require_placement,
     requirements,
 )
 from mpmjax.discretisation import (
@@ -50,6 +51,7 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
             another dimension than the grid or another number of materials than the scene, a particle lies outside the
             window or beyond a mirrored plane, or a deformation gradient is one the law does not allow.
     """
+    require_placement((scene, particles))
     require_fields(scene)  # what eqx.tree_at may have put past its constructor
     p, d = particles.count, particles.dim
     require(d == scene.grid.dim, f"The particles are {d}-dimensional, the grid {scene.grid.dim}-dimensional.")
@@ -132,6 +134,13 @@ def _check_size(scene: Scene, particles: Particles) -> None:
 def _prepared(law: AbstractLaw, group: Group, particles: Particles) -> tuple[Array, Any]:
     """Deformation and history of one material's particles."""
     start, stop = group.rows
+    shapes, fitting = {jnp.shape(number) for number in _parameters(law)}, {(), (1,), (stop - start,)}
+    require(
+        shapes <= fitting,
+        f"{law.title()}'s parameters must be one number or one for each of its {stop - start} particles, got shapes "
+        f"{sorted(shapes - fitting)}. What has another shape, as a network's weights, belongs in an equinox.Module "
+        "within the law.",
+    )
     kept = law.kinematics
     undeformed = jnp.asarray(kept.undeformed(particles.dim), particles.x.dtype)
     shape = (stop - start, *undeformed.shape)
@@ -181,15 +190,6 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
     place = scene.anchor(particles)
     require_finite("Particle positions", particles.x)
     require_finite("Particle velocities", particles.v)
-    inside = np.ones(particles.count, bool)
-    if scene.total or not scene.moving_mirrors:  # else the grid is where the time says
-        inside = np.asarray(in_window(scene.kernel, scene.grid, scene.window(particles), place))
-    if not inside.all():
-        first = int(np.argmin(inside))
-        raise ValueError(
-            f"Every particle's stencil must lie in the window; particle {first} at {np.asarray(place[first])} and "
-            f"{int((~inside).sum()) - 1} others do not: enlarge the grid's shape, move its origin, or use follow=True."
-        )
     for boundary in scene.boundary:
         for wall in boundary.walls():
             name, keep = type(boundary).__name__, "above" if wall.inward > 0 else "below"
@@ -199,6 +199,15 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
                 f"Particles must lie {keep} the {name} at {wall.position:g} on axis {wall.axis}, but particle "
                 f"{int(np.argmax(beyond))} does not: move it or change the plane's keep.",
             )
+    inside = np.ones(particles.count, bool)
+    if scene.total or not scene.moving_mirrors:  # else the grid is where the time says
+        inside = np.asarray(in_window(scene.kernel, scene.grid, scene.window(particles), place))
+    if not inside.all():
+        first = int(np.argmin(inside))
+        raise ValueError(
+            f"Every particle's stencil must lie in the window; particle {first} at {np.asarray(place[first])} and "
+            f"{int((~inside).sum()) - 1} others do not: enlarge the grid's shape, move its origin, or use follow=True."
+        )
     for body in scene.rigid_bodies:
         x = np.asarray(particles.x[slice(*particles.groups[body.number].rows)], float)
         spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
@@ -207,15 +216,6 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
             most == particles.dim - 1 and spread[:most] > 1e-6 * float(scene.grid.spacing),
             f"A Rigid body's particles must not lie {'at one point' if particles.dim < 3 else 'on one line'}, by which "
             f"nothing says how it turns: give material {body.number} more of them.",
-        )
-    for law, group in zip(scene.laws, particles.groups, strict=True):
-        rows = group.rows[1] - group.rows[0]
-        sizes = {jnp.size(number) for number in _parameters(law)}
-        require(
-            sizes <= {1, rows},
-            f"{law.title()}'s parameters must be one number or one for each of its {rows} particles, got "
-            f"{sorted(sizes - {1, rows})} of them. What has another shape, as a network's weights, belongs in an "
-            "equinox.Module within the law.",
         )
     for points in scene.material_points(particles):
         kept = points.law.kinematics

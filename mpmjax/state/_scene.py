@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -351,5 +352,6 @@ def attach(scene: Scene, particles: Particles) -> Scene:
     """
     if not scene.loads:
         return scene
-    loads = tuple(eqx.tree_at(lambda own: own.on, load, load.on.attached(particles)) for load in scene.loads)
+    with jax.ensure_compile_time_eval():  # what is known stays so within a transformation
+        loads = tuple(eqx.tree_at(lambda own: own.on, load, load.on.attached(particles)) for load in scene.loads)
     return eqx.tree_at(lambda s: s.loads, scene, loads)

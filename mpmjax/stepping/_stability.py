@@ -98,7 +98,7 @@ def stable_dt(
         ValueError: from `prepare`; a safety that is not positive; an integrator, transfer or gradient operator that
             gives no bound; with t1, a bound that is zero or infinite.
     """
-    require_positive("safety", safety)
+    require_positive("safety", safety, particles.x.dtype)
     limit = canonical(safety, particles.x.dtype) * longest_step(scene, particles, method)
     if not is_traced(limit):
         require(
@@ -134,7 +134,7 @@ def _whole(limit: Array, t1: Scalar, method: str) -> Float[Array, ""]:
             "The number of steps must be known, and the limit that fixes it is traced here: ask for "
             "stable_dt(scene, particles, t1=t1) outside of the jax transformation, and pass the number."
         )
-    require_positive("t1 [s]", t1)
+    require_positive("t1 [s]", t1, limit.dtype)
     bound, end = float(limit), float(t1)
     require(
         bound < np.inf,

@@ -21,7 +21,7 @@ from mpmjax.boundary import (
     impulse_on_colliders,
     no_contact,
 )
-from mpmjax.checks import canonical, checked, require_positive
+from mpmjax.checks import canonical, checked, require_finite, require_placement, require_positive
 from mpmjax.discretisation import Stencil, g2p
 from mpmjax.implicit import Projection, SolveInfo, no_solve
 from mpmjax.state import Particles, Scene, is_prepared, prepare
@@ -335,9 +335,11 @@ def step(
         the window; only `simulate` raises for either.
 
     Raises:
-        ValueError: from `prepare`, or a dt that is not positive.
+        ValueError: from `prepare`, a time that is not finite, or a dt that is not positive.
     """
-    require_positive("dt [s]", dt)
+    require_finite("t [s]", t)
+    require_positive("dt [s]", dt, particles.x.dtype)
+    require_placement((scene, particles))
     scene, t, dt, method = canonical((scene, t, dt, method), particles.x.dtype)
     particles = particles if is_prepared(scene, particles) else prepare(scene, particles)
     return step_compiled(scene, particles, t, dt, method)
