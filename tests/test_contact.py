@@ -538,23 +538,22 @@ def test_what_friction_holds_at_rest_has_the_derivative_of_sticking(wall, name, 
     assert slope == pytest.approx(difference, rel=1e-5)
 
 
-def nodes_held(fixed, normal=None, held=None):
+def nodes_held(fixed, normal=None):
     """Nodes of mass 2 kg with an active set held, of which friction is asked alone.
 
     Args:
         fixed: components that a boundary prescribes, shape (n, d).
         normal: normals that colliders hold, shape (n, d).
-        held: components that contacts hold too.
     """
     nodes = object.__new__(ConstrainedNodes)
     fixed, mass = jnp.asarray(fixed), jnp.full(len(fixed), 2.0)
     conditions = SimpleNamespace(fixed=fixed, colliders=None if normal is None else ())
-    free = ~fixed if held is None else ~fixed & ~jnp.asarray(held)
-    normal = None if normal is None else jnp.asarray(normal)
+    free = ~fixed
+    normals = () if normal is None else (jnp.asarray(normal),)
     for name, value in {
         "unheld": SimpleNamespace(mass=mass, conditions=conditions),
         "images": SimpleNamespace(fold_scalar=lambda m: m),
-        "nodes": SimpleNamespace(mass=mass, projection=Projection(free, normal)),
+        "nodes": SimpleNamespace(mass=mass, free=free, projection=Projection(free, normals)),
     }.items():
         object.__setattr__(nodes, name, value)
     return nodes
