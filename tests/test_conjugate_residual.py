@@ -14,11 +14,13 @@ import mpmjax as mpm
 from mpmjax._types import components
 from mpmjax.boundary import mirror
 from mpmjax.discretisation._transfer import p2g
-from mpmjax.implicit._conjugate_residual import NEGLIGIBLE_CHANGE
+from mpmjax.implicit._conjugate_residual import NEGLIGIBLE_CHANGE, _outcome, _System
 from mpmjax.implicit._inner_product import DiagonalInnerProduct
+from mpmjax.implicit._linear_solve import NEARLY_CONVERGED
 from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.implicit._projection import Projection
+from mpmjax.implicit._restarts import Ends, Found
 
 N = 24
 DTYPES = {"float64": jnp.float64, "float32": jnp.float32}
@@ -424,3 +426,43 @@ def test_a_residual_that_cannot_be_corrected_is_no_solution():
         _, result, stats = solve(mpm.ConjugateResidual(), jnp.asarray(A), jnp.asarray(b), None, y0)
         assert result == R.breakdown
         np.testing.assert_allclose(stats["residual"], 0.1 / np.linalg.norm(b))
+
+
+RTOL, MOST = 1e-6, 10
+ENDED = {
+    "at the tolerance": ({}, R.successful, False),
+    "with the last step": ({"k": MOST}, R.successful, False),
+    "above it": ({"residual": 1.01}, R.stagnation, True),
+    "almost too far": ({"residual": NEARLY_CONVERGED}, R.stagnation, True),
+    "too far": ({"residual": 1.01 * NEARLY_CONVERGED}, R.stagnation, False),
+    "exact": ({"residual": 50.0, "stalled": True}, R.successful, False),
+    "exact, at the last step": ({"residual": 50.0, "stalled": True, "k": MOST}, R.max_steps_reached, False),
+    "exact, broken down": ({"residual": 50.0, "stalled": True, "breakdown": True}, R.breakdown, False),
+    "not exact": ({"residual": 50.0, "stalled": True, "correction": 2.1 * NEGLIGIBLE_CHANGE}, R.stagnation, False),
+    "still falling": ({"residual": 50.0}, R.stagnation, False),
+    "by its increment": ({"residual": 50.0, "small_increment": True}, R.successful, False),
+    "not a number": ({"residual": np.nan, "small_increment": True}, R.nonfinite_input, False),
+}
+
+
+@pytest.mark.parametrize("name", ENDED)
+def test_how_a_solve_ended(name):
+    """‖b‖ = 3 and ‖x‖ = 2, the residual in units of the tolerance."""
+    changes, result, nearly = ENDED[name]
+    system = object.__new__(_System)
+    object.__setattr__(system, "ends", Ends(RTOL, MOST))
+    found = {
+        "k": 3,
+        "correction": 1.9 * NEGLIGIBLE_CHANGE,
+        "radius": 1.0,
+        "b_norm": 3.0,
+        "x_norm": 2.0,
+        "residual": 1.0,
+    }
+    found |= dict.fromkeys(("small_increment", "breakdown", "indefinite", "stalled"), False) | changes
+    residual = found.pop("residual") * (1 - 1e-9) * RTOL * 3
+    numbers = {field: jnp.asarray(value) for field, value in found.items()}
+    ended, said = _outcome(system, Found(x=jnp.ones(2), rr=jnp.asarray(residual**2), **numbers))
+    assert ended == result
+    assert bool(said["nearly_converged"]) == nearly
+    np.testing.assert_allclose(said["residual"], residual / 3)

@@ -1,5 +1,7 @@
 """Contact: walls that push but do not pull, and Coulomb friction."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,9 +13,10 @@ from numpy_oracle import grid_update
 import mpmjax as mpm
 from mpmjax.boundary._active_set import SWEEPS, find_active_set
 from mpmjax.boundary._contact import ConstrainedNodes, constrain
-from mpmjax.boundary._friction import share_taken
+from mpmjax.boundary._friction import friction_across, friction_along, share_taken
 from mpmjax.boundary._mirror import Mirror
 from mpmjax.checks._values import canonical
+from mpmjax.implicit._projection import Projection
 from mpmjax.implicit._solve_info import no_solve
 from mpmjax.stepping import NodeMotion
 from mpmjax.stepping._nodes import particles_to_grid
@@ -533,3 +536,59 @@ def test_what_friction_holds_at_rest_has_the_derivative_of_sticking(wall, name, 
     slope, difference = float(both(0.0)[1]), float(both(h)[0] - both(-h)[0]) / (2 * h)
     assert slope < 0.8
     assert slope == pytest.approx(difference, rel=1e-5)
+
+
+def nodes_held(fixed, normal=None):
+    """Nodes of mass 2 kg with an active set held, of which friction is asked alone.
+
+    Args:
+        fixed: components that a boundary prescribes, shape (n, d).
+        normal: normals that colliders hold, shape (n, d).
+    """
+    nodes = object.__new__(ConstrainedNodes)
+    fixed, mass = jnp.asarray(fixed), jnp.full(len(fixed), 2.0)
+    conditions = SimpleNamespace(fixed=fixed, colliders=None if normal is None else ())
+    free = ~fixed
+    normals = () if normal is None else (jnp.asarray(normal),)
+    for name, value in {
+        "unheld": SimpleNamespace(mass=mass, conditions=conditions),
+        "images": SimpleNamespace(fold_scalar=lambda m: m),
+        "nodes": SimpleNamespace(mass=mass, free=free, projection=Projection(free, normals)),
+    }.items():
+        object.__setattr__(nodes, name, value)
+    return nodes
+
+
+V = jnp.asarray([[0.3, 0.4, -1.0]] * 3)
+X_IS_HELD = [[False] * 3, [True, False, False], [False] * 3]
+LIMITS = jnp.asarray([0.05, 0.05, 5.0])
+
+
+def test_friction_on_a_wall_stops_slip_and_nothing_that_is_held():
+    """−min(1, limit/(m ‖s‖)) s at a free node, at one whose x is prescribed, and at one that sticks."""
+    change = friction_across(nodes_held(X_IS_HELD), 2, LIMITS, V)
+    share = 0.05 / 2 / 0.5
+    np.testing.assert_allclose(change, [[-share * 0.3, -share * 0.4, 0], [0, -share * 0.4, 0], [-0.3, -0.4, 0]])
+
+
+def test_friction_on_a_wall_takes_what_a_collider_holds_off_the_slip():
+    """With the collider's normal oblique, along the wall, and along the wall's own."""
+    normal = np.array([[0.48, 0.36, 0.8], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+    change = np.asarray(friction_across(nodes_held([[False] * 3] * 3, normal), 2, LIMITS, V))
+    along = np.array([0.8, 0.6, 0])
+    slip = np.array([0.3, 0.4, 0]) - along * (along @ [0.3, 0.4, 0])
+    wanted = -0.05 / 2 / np.linalg.norm(slip) * slip
+    np.testing.assert_allclose(change, [wanted, wanted, [-0.3, -0.4, 0]], atol=1e-15)
+
+
+def test_friction_on_a_surface_stops_slip_and_nothing_that_is_held():
+    """A surface that pushes along z and moves: the slip is relative to it, and has no part in what is held."""
+    up, moving = jnp.asarray([[0.0, 0.0, 3.0]] * 3), jnp.asarray([[-0.3, 0.0, 7.0]] * 3)
+    change = friction_along(nodes_held(X_IS_HELD), up, moving, LIMITS, V)
+    share = 0.05 / 2 / np.hypot(0.6, 0.4)
+    np.testing.assert_allclose(change, [[-share * 0.6, -share * 0.4, 0], [0, -0.05 / 2, 0], [-0.6, -0.4, 0]])
+    normal = np.array([[0.8, 0.6, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+    change = friction_along(nodes_held([[False] * 3] * 3, normal), up, moving, LIMITS, V)
+    assert np.abs((np.asarray(change) * normal).sum(axis=1)).max() < 1e-15
+    slip = np.array([0.6, 0.4]) - 0.72 * np.array([0.8, 0.6])
+    np.testing.assert_allclose(change[0, :2], -0.05 / 2 * slip / np.linalg.norm(slip))

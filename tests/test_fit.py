@@ -592,6 +592,27 @@ def test_an_order_above_the_one_that_is_asked_for_does_not_narrow_the_interval()
         assert last.interval[0] < 0 < last.interval[1]
 
 
+def test_a_number_near_or_at_its_bound_is_extrapolated_no_farther_than_that():
+    """Poisson's ratio, searched by its logit, in which a step from a bound is as long as one likes: extrapolated along
+    a straight line in the value; and not at all from a grid on which it lies at its bound."""
+    nu = mpm.Bounded(lambda e: e.scene.material.poisson_ratio, 0.0, 0.49)
+
+    def estimate(value, at_bound=False):
+        return Estimate("nu", value, 2e-2, (max(value - 4e-2, 0.0), value + 4e-2), at_bound=at_bound)
+
+    last, left, _ = _extrapolate(nu, (estimate(3e-3), estimate(5e-3)), [1, 2], 1.0, 0.0, 1.96)
+    assert last.value == pytest.approx(7e-3)
+    assert left == pytest.approx(2e-3)
+    assert last.interval == pytest.approx((0, 7e-3 + np.hypot(4e-2, 1.96 * 2e-3)))
+    last, _, _ = _extrapolate(nu, (estimate(5e-3), estimate(2e-3)), [1, 2], 1.0, 0.0, 1.96)
+    assert last.value == 0
+    with pytest.warns(UserWarning, match="nu lies at its bound on a grid"):
+        last, left, _ = _extrapolate(nu, (estimate(1e-9, True), estimate(3e-2)), [1, 2], 1.0, 0.0, 1.96)
+    assert (last.value, last.at_bound) == (3e-2, True)
+    assert left == pytest.approx(3e-2)
+    assert last.interval == pytest.approx((0, 3e-2 + np.hypot(4e-2, 1.96 * 3e-2)))
+
+
 @pytest.mark.thorough
 def test_a_measurements_zero_of_time_is_a_parameter():
     """A front that was read off a clock two steps late; a clock that leaves the run says so."""

@@ -208,3 +208,15 @@ def test_a_step_that_leaves_the_return_map_behind_says_so(method, share):
         run = mpm.simulate(scene, layer, t1=10 * dt, dt=dt, method=method)
     left = share * stiffness * dt * rate
     assert float(run.statistics.left_undone.part) == pytest.approx(left / (tau + left), rel=0.02)
+
+
+def test_the_derivatives_of_the_share_of_flow_are_differences():
+    """By c and by n, at shares from 0.01 to 0.99."""
+    w, n, h = np.array([0.01, 0.3, 0.8, 0.99]), jnp.asarray([0.4, 0.7, 1.0, 1.6]), 1e-6
+    c = jnp.asarray((1 - w) / w**n)
+    _, by_c = jax.jvp(lambda c: _share_of_flow(c, n), (c,), (c,))
+    _, by_n = jax.jvp(lambda n: _share_of_flow(c, n), (n,), (n,))
+    differences = (_share_of_flow(c * (1 + h), n) - _share_of_flow(c * (1 - h), n)) / (2 * h)
+    np.testing.assert_allclose(by_c, differences, rtol=1e-6)
+    differences = (_share_of_flow(c, n * (1 + h)) - _share_of_flow(c, n * (1 - h))) / (2 * h)
+    np.testing.assert_allclose(by_n, differences, rtol=1e-6)

@@ -10,6 +10,7 @@ from numpy_oracle import grid_update, stress
 
 import mpmjax as mpm
 from mpmjax.implicit._hessian import AnalyticHessian
+from mpmjax.implicit._line_search import MOST_HALVINGS, backtrack
 from mpmjax.implicit._problems import LinearProblem
 from mpmjax.implicit._solve_info import SolveInfo
 
@@ -353,3 +354,27 @@ def test_rounding_alone_accepts_no_guess(preconditioner):
         np.testing.assert_allclose(
             fallen.mass @ fallen.v / fallen.mass.sum(), [0, -0.5 * (n + 1) * dt], rtol=0.01, atol=1e-4
         )
+
+
+STEPS_TRIED = {
+    "the whole": ([-1.0], 0.0, 0),
+    "a quarter, by a decrease of 10⁻⁴ of its own length": ([1.0, 1.0, -1.1e-4 / 4], 0.0, 2),
+    "not one below that": ([1.0, -0.9e-4 / 2, 1.0, -1.1e-4 / 8], 0.0, 3),
+    "within the slack": ([0.1, 0.04], 0.05, 1),
+    "not where it is no number": ([np.nan, np.inf, -1.0], 0.0, 2),
+    "none": ([1.0] * MOST_HALVINGS + [2.0], 0.0, MOST_HALVINGS),
+}
+
+
+@pytest.mark.parametrize("name", STEPS_TRIED)
+def test_the_line_search_takes_the_first_sufficient_decrease(name):
+    """E(0) = 3 and E'(0) = −1, E − E(0) at 1, ½, ¼, ... given."""
+    rises, slack, wanted = STEPS_TRIED[name]
+    at = jnp.asarray(rises)
+
+    def merit(size):
+        return 3 + at[jnp.round(-jnp.log2(size)).astype(int)]
+
+    size, halvings = backtrack(merit, jnp.asarray(3.0), jnp.asarray(-1.0), jnp.asarray(slack))
+    assert halvings == wanted
+    assert size == 0.5**wanted

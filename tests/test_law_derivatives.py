@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ELASTIC, rotation_matrix, thorough
+from helpers import ELASTIC, RUBBER, rotation_matrix, thorough
 
 import mpmjax as mpm
 from mpmjax.material import SnowHistory, VonMisesHistory
@@ -214,3 +214,20 @@ def test_every_route_to_a_return_maps_derivative_is_right(name, d):
         if transposed:
             ours, true = (ours * np.asarray(G)).reshape(-1, ours.shape[-1]).sum(axis=0), np.einsum("rp,rp->p", W, true)
         assert np.abs(ours - true).max() < (1e-10, 1e-7)[order - 1] * max(np.abs(true).max(), 1), route
+
+
+@pytest.mark.parametrize("name", ELASTIC | RUBBER)
+def test_principal_tangents_are_of_the_principal_stresses(name):
+    """With P_i = ∂Ψ/∂s_i of F = diag(s): twist (P_i + P_j)/(s_i + s_j), flip (P_i − P_j)/(s_i − s_j), scaling
+    ∂P_i/∂s_j, by central differences. Stretches far apart, so that no index stands for another."""
+    law, s, h = (ELASTIC | RUBBER)[name], np.array([1.35, 0.8, 1.1]), 1e-5
+
+    at = np.concatenate([[s], s + h * np.eye(3), s - h * np.eye(3)])
+    F = jnp.asarray(np.eye(3)[..., None] * at.T)
+    stress, found = jax.jit(lambda F, s: (law.stress(F), law.principal_tangent(s)))(F, jnp.asarray(s)[:, None])
+    P, *beside = np.einsum("iip->pi", stress)
+    for k, (i, j) in enumerate([(0, 1), (0, 2), (1, 2)]):
+        np.testing.assert_allclose(found.twist[k, 0], (P[i] + P[j]) / (s[i] + s[j]), rtol=1e-9, atol=1e-6)
+        np.testing.assert_allclose(found.flip[k, 0], (P[i] - P[j]) / (s[i] - s[j]), rtol=1e-9, atol=1e-6)
+    slopes = np.transpose(np.subtract(beside[:3], beside[3:])) / (2 * h)
+    np.testing.assert_allclose(found.scaling[..., 0], slopes, rtol=1e-7, atol=1e-4)

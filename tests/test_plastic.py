@@ -3,6 +3,7 @@ are right, and single particles follow closed forms."""
 
 import functools
 import itertools
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -624,3 +625,18 @@ def test_bad_parameters_are_refused(name, values, message):
     law = PLASTIC[name]
     with pytest.raises(ValueError, match=message):
         type(law)(**({k: getattr(law, k) for k in law.__dataclass_fields__} | values))
+
+
+@pytest.mark.parametrize("d", [2, *thorough(3)])
+def test_sand_closes_when_the_gap_is_used_up(d):
+    """The mean strain of the return map is m + v_c/3: equal strains of −0.03, and gaps that leave −0.01 and +0.01 of it
+    (in plane strain the third one is the history's)."""
+    law, gap = PLASTIC["drucker_prager"], jnp.asarray([0.06, 0.12])
+    F = jnp.exp(-0.03) * jnp.repeat(jnp.eye(d)[..., None], 2, axis=-1)
+    start = law.initial_history(F)
+    history = replace(start, gap=gap, transverse_strain=None if d == 3 else jnp.full(2, -0.03))
+    returned, after = jax.jit(law.return_map)(F, history, 1.0)
+    np.testing.assert_allclose(after.gap, [0, 0.03], atol=1e-15)
+    np.testing.assert_allclose(returned[0, 0], np.exp([-0.01, 0]), rtol=1e-14)
+    if d == 2:
+        np.testing.assert_allclose(after.transverse_strain, [-0.01, 0], atol=1e-15)

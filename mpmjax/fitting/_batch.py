@@ -218,8 +218,14 @@ class _Lanes:
             self.state = jax.tree.map(lambda a: np.repeat(np.asarray(a)[None], len(self.members), axis=0), arrays)
             self.rest = rest
         self.z[lane] = self.starts[member]
-        jax.tree.map(lambda to, a: to.__setitem__(lane, np.asarray(a)), self.state, arrays)
+        self._keep(lane, arrays)
         self.members[lane], self.history[lane] = member, []
+
+    def _state(self, lane: int) -> Any:
+        return eqx.combine(jax.tree.map(lambda a: a[lane], self.state), self.rest)
+
+    def _keep(self, lane: int, arrays: Any) -> None:
+        jax.tree.map(lambda to, a: to.__setitem__(lane, np.asarray(a)), self.state, arrays)
 
     def advance(self) -> None:
         """An iteration of all; free places repeat one that is busy."""
@@ -240,6 +246,8 @@ class _Lanes:
             slope = float(np.abs(self.seen[lane].gradient).max())
             moved = not history or cost != history[-1].cost
             history.append(Iteration(len(history), cost, slope, moved, self.z[lane].copy()))
+            state = self.optimiser.directed(jnp.asarray(self.z[lane]), self._state(lane), self.seen[lane])
+            self._keep(lane, eqx.filter(state, eqx.is_array_like))
 
     def ended(self, lane: int, settling: float) -> Member | None:
         """What became of a search, once it is done."""
@@ -248,8 +256,7 @@ class _Lanes:
             return Member(None, "the simulation fails where it starts, or does not reach the data")
         if not np.isfinite(last.gradient):
             return Member(None, "there is no derivative")
-        state = eqx.combine(jax.tree.map(lambda a: a[lane], self.state), self.rest)
-        if self._settled(lane, settling) or self.optimiser.has_converged(state, self.seen[lane]):
+        if self._settled(lane, settling) or self.optimiser.has_converged(self._state(lane), self.seen[lane]):
             return self.stopped(lane, converged=True)
         return self.stopped(lane) if len(self.history[lane]) == self.optimiser.max_steps else None
 

@@ -51,11 +51,16 @@ class EnsembleFit(eqx.Module):
     @property
     def alike(self) -> np.ndarray:
         """Of each number, the probability of so large a spread if all data sets had one value and the errors are right:
-        Cochran's Q = Σ (z_k − z̄)²/s_k² of the coordinates, χ² of k − 1 degrees of freedom (W. G. Cochran, Biometrics 10
-        (1954) 101, doi 10.2307/3001666), shape (n,)."""
-        z, s = self._coordinates
+        Cochran's Q = Σ (z_k − z̄)²/s_k² of the values, of logarithms where none is at zero, χ² of k − 1 degrees of
+        freedom (W. G. Cochran, Biometrics 10 (1954) 101, doi 10.2307/3001666), shape (n,)."""
+        found, first = [fit.estimates for fit in self._found], self._found[0].problem
+        z, s, held = (
+            np.array([[getattr(e, name) for e in each] for each in found]) for name in ("value", "error", "at_bound")
+        )
         if len(z) < 2:
             return np.full(z.shape[1], np.nan)
+        ratio = np.array(first.logarithmic) & ~held.any(axis=0)
+        z, s = np.where(ratio, np.log(np.where(ratio, z, 1)), z), s / np.where(ratio, z, 1)
         weight = 1 / s**2
         mean = (weight * z).sum(axis=0) / weight.sum(axis=0)
         return np.asarray(chdtrc(len(z) - 1, (weight * (z - mean) ** 2).sum(axis=0)))
@@ -64,30 +69,19 @@ class EnsembleFit(eqx.Module):
     def _found(self) -> list[FitResult]:
         return [fit for fit in self.fits if fit is not None]
 
-    @property
-    def _coordinates(self) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates with the first fit's zero, and their errors, of what did not fail, shape (k, n)."""
-        first = self._found[0].problem
-        rows = []
-        for fit in self._found:
-            each = zip(first.parameters, first.starts, fit.values.values(), strict=True)
-            parts = [np.ravel(p.coordinate(start, jnp.asarray(v, first.dtype))) for p, start, v in each]
-            rows.append(np.concatenate(parts))
-        return np.array(rows, float), np.array([fit.uncertainty.error for fit in self._found])
-
     def __str__(self) -> str:
         """A table: of each number the mean and spread over the data sets, and what errors the fits have."""
         found = self._found
         lines = [f"{'':<24} {'mean':>12} {'spread':>10} {'error of one':>13}  same value?"]
         values = np.array([[e.value for e in fit.estimates] for fit in found])
         errors = np.array([[e.error for e in fit.estimates] for fit in found])
+        held = np.sum([[e.at_bound for e in fit.estimates] for fit in found], axis=0)
         for k, e in enumerate(found[0].estimates):
             name = f"{e.label} [{e.unit}]" if e.unit else e.label
             spread = values[:, k].std(ddof=1) if len(found) > 1 else np.nan
             error = np.sqrt((errors[:, k] ** 2).mean())
-            lines.append(
-                f"{name:<24} {values[:, k].mean():>12.6g} {spread:>10.2g} {error:>13.2g}  p = {self.alike[k]:.2g}"
-            )
+            alike = f"p = {self.alike[k]:.2g}" + (f", {held[k]} at the bound" if held[k] else "")
+            lines.append(f"{name:<24} {values[:, k].mean():>12.6g} {spread:>10.2g} {error:>13.2g}  {alike}")
         lines.append(f"{len(found)} data sets" + (f", {len(self.failures)} failed" if self.failures else ""))
         return "\n".join(lines)
 

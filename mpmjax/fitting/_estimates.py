@@ -15,12 +15,13 @@ from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
 from mpmjax.fitting._search import Minimum
-from mpmjax.fitting._uncertainty import Uncertainty, noise, quantile, seen_together, uncertainty
+from mpmjax.fitting._uncertainty import Uncertainty, at_bound, noise, quantile, seen_together, uncertainty
 
 
 def noise_factors(problem: FitProblem, found: Minimum) -> tuple[list[float], list[float]]:
     """By what each noise is to be multiplied, and the degrees of freedom of its estimate (zero of what is given)."""
     r, J = np.asarray(found.r), np.asarray(found.J)
+    J = J[:, ~at_bound(r, J, np.asarray(problem.room(found.z)))]  # what a bound holds fits nothing away
     factors, freedoms = [], []
     for observation, rows, given in zip(problem.observations, problem.rows, problem.noise_is_given, strict=True):
         factor, freedom = (1.0, 0.0) if given else noise(r, J, rows, observation.count, *observation.trust)
@@ -78,6 +79,7 @@ def fit_result(
     given = problem.noise_is_given
     estimated = [(rows, f) for rows, f, known in zip(problem.rows, freedoms, given, strict=True) if not known]
     errors = uncertainty(J, eps, estimated)
+    held = at_bound(r, J, np.asarray(problem.room(found.z)))
     priors = len(r) - problem.rows[-1].stop
     counts = [o.count for o in problem.observations]
     noises = tuple(
@@ -97,10 +99,10 @@ def fit_result(
         residuals=r,
         jacobian=J,
         uncertainty=errors,
-        estimates=_estimates(problem, found.z, errors, level),
+        estimates=_estimates(problem, found.z, errors, (J.T @ r) * held, held, level),
         reported=tuple(_reported(problem, found.z, errors, level, name, of) for name, of in report.items()),
         chi_squared=float((r**2).sum()),
-        degrees_of_freedom=sum(counts) + priors - errors.rank,
+        degrees_of_freedom=sum(counts) + priors - errors.rank + int(held.sum()),
         noise=noises,
         experiments=problem.at(found.z),
         level=level,
@@ -118,21 +120,67 @@ def fit_result(
     return result
 
 
-def _estimates(problem: FitProblem, z: Coordinates, errors: Uncertainty, level: float) -> tuple[Estimate, ...]:
-    """The fitted numbers. An interval is symmetric in the coordinate, so it lies within the bounds."""
-    error, freedom = errors.of(np.eye(problem.size))
-    reach = jnp.asarray(quantile(level, freedom) * error, z.dtype)
-    lower, upper = (problem.values(z + side * reach) for side in (-1, 1))
-    at, slope = jax.jvp(problem.values, (z,), (jnp.ones_like(z),))
-    numbers = zip(
-        problem.labels, *(_flat(a) for a in (at, slope, lower, upper, problem.starts)), error.tolist(), strict=True
-    )
-    each = zip(problem.parameters, problem.starts, problem.coordinates(z), strict=True)
-    bound = [(p.unit, bool(at)) for p, start, part in each for at in p.at_bound(start, part).reshape(-1)]
+def _estimates(
+    problem: FitProblem, z: Coordinates, errors: Uncertainty, gradient: np.ndarray, held: np.ndarray, level: float
+) -> tuple[Estimate, ...]:
+    """The fitted numbers.
+
+    Args:
+        problem: what was fitted.
+        z: the coordinates found.
+        errors: their uncertainty.
+        gradient: the derivative of ½ Σ r² by those that a bound holds, zero of the others.
+        held: which these are.
+        level: of the intervals.
+    """
+    error = errors.of(np.eye(problem.size))[0]
+    slope = np.asarray(jax.jvp(problem.numbers, (z,), (jnp.ones_like(z),))[1], float)
+    lower, upper = intervals(problem, z, errors, gradient, level)
+    columns = problem.numbers(z), np.abs(slope) * error, lower, upper, problem.numbers(jnp.zeros_like(z)), held
+    units = [p.unit for p, start in zip(problem.parameters, problem.starts, strict=True) for _ in range(start.size)]
     return tuple(
-        Estimate(label, value, abs(by) * error, (min(a, b), max(a, b)), unit, start, at_bound)
-        for (label, value, by, a, b, start, error), (unit, at_bound) in zip(numbers, bound, strict=True)
+        Estimate(label, value, error, (a, b), unit, start, at_bound)
+        for label, unit, value, error, a, b, start, at_bound in zip(
+            problem.labels, units, *(np.asarray(column).tolist() for column in columns), strict=True
+        )
     )
+
+
+def intervals(
+    problem: FitProblem, z: Coordinates, errors: Uncertainty, gradient: np.ndarray, level: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper ends of the fitted numbers' intervals, each of shape (n,).
+
+    They are where Δχ² = 2 g δ + δ²/s² reaches its threshold q², s being the standard error and g the gradient, zero but
+    of what a bound holds. δ is of the coordinate. Beside a bound, at three times the reach or nearer, data that follow
+    the value would be missed too often: there each end is the farther of two, of the coordinate and of a straight line
+    in the value. Where that line meets the bound, it alone makes the interval, which ends there: the coordinate never
+    comes to a bound, and goes beyond all measure to the other side.
+
+    Args:
+        problem: what was fitted.
+        z: the coordinates found.
+        errors: their uncertainty.
+        gradient: g, shape (n,).
+        level: of the intervals.
+    """
+    error, freedom = errors.of(np.eye(problem.size))
+    q = quantile(level, freedom)
+    pull = np.where(np.isfinite(error), gradient, 0) * np.where(np.isfinite(error), error, 1)
+    root = np.hypot(pull, q)
+    down, up = np.asarray(problem.room(z), float)
+    below, above = error * (root + pull), error * q**2 / (root + pull)
+    at, slope = (np.asarray(a, float) for a in jax.jvp(problem.numbers, (z,), (jnp.ones_like(z),)))
+    straight = at - slope * np.minimum(below, down), at + slope * np.minimum(above, up)
+    curved = (problem.numbers(z + side * jnp.asarray(q * error, z.dtype)) for side in (-1, 1))
+    meets, near = ((times * below >= down) | (times * above >= up) for times in (1, _BESIDE))
+    lower, upper = (
+        np.where(meets, line, np.where(near, farther(line, curve), curve))
+        for line, curve, farther in zip(straight, np.array(list(curved), float), (np.minimum, np.maximum), strict=True)
+    )
+    each = zip(problem.parameters, problem.starts, strict=True)
+    ends = np.array([p.domain for p, start in each for _ in range(start.size)]).T
+    return np.clip(lower, *ends), np.clip(upper, *ends)
 
 
 def _reported(
@@ -148,12 +196,10 @@ def _reported(
     return Estimate(name, number, float(error), (number - reach, number + reach), start=float(value(jnp.zeros_like(z))))
 
 
-def _flat(arrays: tuple[Array, ...]) -> list[float]:
-    return [float(x) for a in arrays for x in np.asarray(a).reshape(-1)]
-
-
 _IMPROBABLE = 1e-3
 """Probability of a χ² from which the model is said not to explain the data."""
+_BESIDE = 3
+"""Reaches of an interval within which it is beside a bound."""
 _NOISE_RTOL = 1e-3
 """The noise of several observations is settled when its estimate changes less, relatively."""
 _LEAST = 1e-12

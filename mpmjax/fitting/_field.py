@@ -102,6 +102,10 @@ class Field(AbstractParameter):
     def logarithmic(self) -> bool:
         return self.of.logarithmic
 
+    @property
+    def domain(self) -> tuple[float, float]:
+        return self.of.domain
+
     def value(self, start: Value, z: Value) -> Value:
         return self.of.value(start, z)
 
@@ -114,8 +118,8 @@ class Field(AbstractParameter):
     def check(self, name: str, start: np.ndarray) -> None:
         self.of.check(name, start)
 
-    def at_bound(self, start: Value, z: Value) -> np.ndarray:
-        return self.of.at_bound(start, z)
+    def room(self, start: Value, z: Value) -> tuple[Value, Value]:
+        return self.of.room(start, z)
 
     def check_experiment(self, name: str, experiment: Experiment) -> None:
         x = experiment.particles.x

@@ -22,6 +22,8 @@ class Evaluation(NamedTuple):
     """r [-], of an optimiser that uses them."""
     jacobian: Float[Array, "m n"] | None = None
     """Their derivative."""
+    room: Float[Array, "2 n"] | None = None
+    """How far values can change until their bounds, see `FitProblem.room`."""
 
 
 class AbstractOptimiser(eqx.Module):
@@ -57,6 +59,11 @@ class AbstractOptimiser(eqx.Module):
             sigmas: the noise of each observation.
             state: what `begin` or the last iteration returned.
         """
+
+    def directed(self, z: Coordinates, state: Any, seen: Evaluation) -> Any:
+        """The state for the next iteration, outside of what is compiled. Default: as it is."""
+        del z, seen
+        return state
 
     @abc.abstractmethod
     def has_converged(self, state: Any, seen: Evaluation) -> bool:

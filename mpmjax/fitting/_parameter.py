@@ -97,10 +97,12 @@ class AbstractParameter(eqx.Module):
             ValueError: it cannot.
         """
 
-    def at_bound(self, start: Value, z: Value) -> np.ndarray:
-        """Whether each number has come so near to a bound that the data want to go beyond it, of the value's shape."""
-        del z
-        return np.zeros(start.shape, bool)
+    def room(self, start: Value, z: Value) -> tuple[Value, Value]:
+        """How far the value can fall and rise until its bounds, each over its derivative by z [-], of the value's
+        shape. A straight line in the value meets the bound after so many units of z."""
+        del start
+        without = jnp.full_like(z, jnp.inf)
+        return without, without
 
     def first_guess(self, experiment: Experiment) -> Array:
         """The value that the search starts from."""
@@ -202,6 +204,11 @@ class Positive(AbstractParameter):
         """ln value."""
         return jnp.log(value)
 
+    def room(self, start: Value, z: Value) -> tuple[Value, Value]:
+        """1 and ∞."""
+        del start
+        return jnp.ones_like(z), jnp.full_like(z, jnp.inf)
+
     def check(self, name: str, start: np.ndarray) -> None:
         require(start > 0, f"The parameter {name!r} must start from positive numbers, got {start}.")
 
@@ -254,15 +261,12 @@ class Bounded(AbstractParameter):
             f"The parameter {name!r} must start between its bounds {self.lower} and {self.upper}, got {start}.",
         )
 
-    def at_bound(self, start: Value, z: Value) -> np.ndarray:
-        now, first = (np.abs(np.asarray(a)) for a in (self._logit(start) + z, self._logit(start)))
-        return np.asarray(now > np.maximum(_AT_BOUND, first + 1))
+    def room(self, start: Value, z: Value) -> tuple[Value, Value]:
+        """1 + e^{z0 + z} and 1 + e^{−(z0 + z)}."""
+        logit = self._logit(start) + z
+        return 1 + jnp.exp(logit), 1 + jnp.exp(-logit)
 
     def _logit(self, value: Value) -> Value:
         """The logit of where the value lies between the bounds."""
         share = (value - self.lower) / (self.upper - self.lower)
         return jnp.log(share) - jnp.log1p(-share)
-
-
-_AT_BOUND = 6.0
-"""The logit at which a value is within a four-hundredth of its bound."""

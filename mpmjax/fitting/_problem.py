@@ -162,6 +162,12 @@ class FitProblem(eqx.Module):
         """The values of all parameters, one after the other."""
         return jnp.concatenate([value.reshape(-1) for value in self.values(z)])
 
+    def room(self, z: Coordinates) -> Float[Array, "2 n"]:
+        """How far each value can fall and rise until its bounds, over its derivative by the coordinate [-]."""
+        each = zip(self.parameters, self.starts, self.coordinates(z), strict=True)
+        down, up = zip(*(parameter.room(start, own) for parameter, start, own in each), strict=True)
+        return jnp.stack([jnp.concatenate([a.reshape(-1) for a in side]) for side in (down, up)])
+
     def at(self, z: Coordinates) -> tuple[Experiment, ...]:
         """The experiments with these values."""
         return tuple(self.put(experiment, z, number) for number, experiment in enumerate(self.experiments))

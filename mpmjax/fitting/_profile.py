@@ -9,6 +9,7 @@ import numpy as np
 
 from mpmjax._types import Array, Scalar
 from mpmjax.checks import checked, require, require_positive, require_whole, warn
+from mpmjax.fitting._estimates import intervals
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._restricted import RestrictedProblem
@@ -36,7 +37,7 @@ class Profile(eqx.Module):
     estimate: float
     """The value of the fit."""
     symmetric: tuple[float, float]
-    """The interval of the standard error, symmetric in the search's coordinate."""
+    """The interval of the standard error."""
     interval: tuple[float, float]
     """Where Δχ² is below the threshold. An end that was not found is the parameter's bound, or infinite."""
     threshold: float
@@ -139,6 +140,7 @@ def profile(
     for text in warnings:
         warn(text)
     estimate = result.estimates[at]
+    symmetric = intervals(problem, jnp.asarray(result.z), result.uncertainty, result.gradient, level)
     return Profile(
         label=label,
         unit=estimate.unit,
@@ -147,7 +149,7 @@ def profile(
         numbers=numbers,
         labels=problem.labels,
         estimate=estimate.value,
-        symmetric=_symmetric(result, at, reach),
+        symmetric=(float(symmetric[0][at]), float(symmetric[1][at])),
         interval=(min(values), max(values)),
         threshold=reach**2,
         degrees_of_freedom=float(freedom),
@@ -199,6 +201,9 @@ class _Walk:
         self.rate = _direction(result, at)
         self.error = float(result.uncertainty.error[at])
         self.pace = self.error if np.isfinite(self.error) else min(float(result.uncertainty.alone[at]), 1.0)
+        if np.isfinite(result.problem.room(jnp.asarray(result.z, result.problem.dtype))[:, at]).any():
+            # Away from a bound, a step of the coordinate that moves the value by its standard error.
+            self.pace = float(np.log1p(self.pace))
 
     def end(self, side: int, reach: float, points: int, rtol: float) -> _End:
         """Walk to one side until √Δχ² is beyond `reach`, and find where it crosses."""
@@ -368,13 +373,6 @@ def _value(problem: FitProblem, z: np.ndarray, at: int, place: float) -> float:
     moved = np.asarray(z, float).copy()
     moved[at] = place
     return float(problem.numbers(jnp.asarray(moved, problem.dtype))[at])
-
-
-def _symmetric(result: FitResult, at: int, reach: float) -> tuple[float, float]:
-    """The interval of so many standard errors to both sides in the coordinate."""
-    half = reach * float(result.uncertainty.error[at])
-    ends = [_value(result.problem, result.z, at, float(result.z[at]) + side * half) for side in (-1, 1)]
-    return min(ends), max(ends)
 
 
 _FARTHEST = 14.0

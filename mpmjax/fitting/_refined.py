@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Scalar
+from mpmjax._types import Scalar
 from mpmjax.checks import checked, require, require_positive, warn
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import fit
@@ -61,7 +59,8 @@ class RefinedFit(eqx.Module):
             rules = "one grid alone" if len(self.fits) == 1 else rules
             interval = f"{e.interval[0]:.5g} to {e.interval[1]:.5g}"
             name = f"{e.label} [{e.unit}]" if e.unit else e.label
-            lines.append(f"{name:<20}{each} {e.value:>13.6g} ± {e.error:<9.2g} {interval:<25} {rules}")
+            bound = "  at its bound" if e.at_bound else ""
+            lines.append(f"{name:<20}{each} {e.value:>13.6g} ± {e.error:<9.2g} {interval:<25} {rules}{bound}")
         for n, found in zip(self.refinements, self.fits, strict=True):
             lines += [f"spacing/{n}: {text}" for text in found.warnings]
             lines += [] if found.converged else [f"spacing/{n}: NOT CONVERGED"]
@@ -91,12 +90,13 @@ def fit_refined(
 
         print(mpm.fit_refined(build, {"E": ...}))
 
-    With estimates a and b on the two finest grids, in the search's coordinate, and their spacings in the ratio r, the
-    extrapolation is b + (b − a)/(r^p − 1), and the standard error that is left of the discretisation is taken as that
-    whole correction. p is `order`; with three grids of equal ratios it is what they show, between half and twice that.
-    A higher order than `order` may be shown by grids that are too coarse to tell, so the error then is the correction
-    by `order`. Where the estimates do not converge, the finest stays, with its last change as the error, and a warning
-    says so.
+    With estimates a and b on the two finest grids, logarithms of `Positive` parameters, and their spacings in the
+    ratio r, the extrapolation is b + (b − a)/(r^p − 1), not beyond a bound, and the standard error that is left of
+    the discretisation is taken as that whole correction. p is `order`; with three grids of equal ratios it is what
+    they show, between half and twice that. A higher order than `order` may be shown by grids that are too coarse to
+    tell, so the error then is the correction by `order`. Where the estimates do not converge, or one lies at its
+    bound, which tells nothing of where it would be without, the finest stays, with its last change as the error, and
+    a warning says so.
 
     Two estimates may agree by chance and both be wrong, as where an error changes its sign between the grids. What the
     finest grid misses of the data then tells more: D, in units of σ. A discretisation that changes predictions by D in
@@ -104,7 +104,7 @@ def fit_refined(
     makes up for it moves by D times its standard error from the noise; half of this is the least error that is taken.
     D² is what the sum of squares loses from the grid before to the finest, over r^2p − 1, and needs no σ.
 
-    Intervals are made of the noise's and the discretisation's part, in the coordinate, so they keep to the bounds.
+    Intervals are made of the noise's and the discretisation's part, and keep to the bounds.
 
     Args:
         build: the experiments on n times as many cells a direction, from n; take the step n times shorter too.
@@ -194,38 +194,43 @@ def _extrapolate(
         normal: the reach of an interval of the normal distribution, in standard errors.
     """
     last = found[-1]
-    at = jnp.asarray(last.value, float)
+    if len(found) == 1:
+        return last, float("nan"), float("nan")
+    held = any(e.at_bound for e in found[-3:])
+    bounds = (-np.inf, np.inf) if kind is None else kind.domain
+    # Of a number that may be zero the logarithm has no end.
+    logarithmic = kind is not None and kind.logarithmic and last.interval[0] > 0 and not held
 
     def coordinate(value: float) -> float:
-        return value - last.value if kind is None else float(kind.coordinate(at, jnp.asarray(value, at.dtype)))
+        return float(np.log(value / last.value)) if logarithmic else value - last.value
 
-    def back(z: Any) -> Array:
-        return at + z if kind is None else kind.value(at, jnp.asarray(z, at.dtype))
+    def back(z: float) -> float:
+        return float(np.clip(last.value * np.exp(z) if logarithmic else last.value + z, *bounds))
 
     values = np.array([coordinate(e.value) for e in found])
-    if len(values) == 1:
-        return last, float("nan"), float("nan")
-    p = _order(values, refinements, order)
+    p = float("nan") if held else _order(values, refinements, order)
     change = values[-1] - values[-2]
     ratio = refinements[-1] / refinements[-2]
     correction = 0.0 if np.isnan(p) else change / (ratio**p - 1)
-    slope = jax.grad(lambda z: back(z))
-    hidden = missed / 2 * last.error / abs(float(slope(jnp.zeros_like(at))))
+    value = back(correction)
+    hidden = missed / 2 * last.error / (last.value if logarithmic else 1)
     remains = max(abs(change) / (1 if np.isnan(p) else ratio ** min(p, order) - 1), hidden)
     if np.isnan(p):
         shown = ", ".join(f"{e.value:.5g}" for e in found)
-        warn(f"{last.label} does not converge with the spacing ({shown}): it is not extrapolated.")
-    lower, upper = (coordinate(end) for end in last.interval)
-    reach = np.hypot([lower, upper], normal * remains)
-    discretisation = float(slope(jnp.asarray(correction, at.dtype))) * remains
-    ends = float(back(correction - reach[0])), float(back(correction + reach[1]))
+        what = "lies at its bound on a grid" if held else "does not converge with the spacing"
+        warn(f"{last.label} {what} ({shown}): it is not extrapolated.")
+    # An interval that ends at a bound holds that bound, and whatever more there is to its reach.
+    reach = [abs(coordinate(end)) if end != bound else np.inf for end, bound in zip(last.interval, bounds, strict=True)]
+    reach = np.hypot(reach, normal * remains)
+    discretisation = remains * (value if logarithmic else 1)
     estimate = last._replace(
-        value=float(back(correction)),
+        value=value,
         error=float(np.hypot(last.error, discretisation)),
-        interval=(min(ends), max(ends)),
+        interval=(back(correction - reach[0]), back(correction + reach[1])),
         start=found[0].start,
+        at_bound=held,
     )
-    return estimate, abs(discretisation), p
+    return estimate, discretisation, p
 
 
 def _order(values: np.ndarray, refinements: list[int], order: float) -> float:

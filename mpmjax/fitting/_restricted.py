@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 
 from mpmjax._types import Array, Float
 from mpmjax.fitting._problem import Coordinates, FitProblem
@@ -35,6 +36,10 @@ class RestrictedProblem(FitProblem):
 
     def coordinates(self, z: Coordinates) -> tuple[Array, ...]:
         return self.whole.coordinates(self.place(z))
+
+    def room(self, z: Coordinates) -> Float[Array, "2 f"]:
+        """On planes of some of the coordinates."""
+        return jnp.where(self.basis.T != 0, self.whole.room(self.place(z))[:, None], jnp.inf).min(axis=2)
 
     def residuals(self, z: Coordinates, sigmas: tuple[Array, ...], adjoint: Any) -> tuple[Array, Array]:
         return self.whole.residuals(self.place(z), sigmas, adjoint)

@@ -102,6 +102,12 @@ class FitResult(eqx.Module):
         return self.uncertainty.covariance
 
     @property
+    def gradient(self) -> np.ndarray:
+        """The derivative of ½ Σ r² by the coordinates that a bound holds, zero of all others, shape (n,)."""
+        held = np.array([e.at_bound for e in self.estimates])
+        return np.asarray(self.jacobian.T @ self.residuals) * held
+
+    @property
     def correlation(self) -> np.ndarray:
         """Of the estimates, shape (n, n)."""
         return self.uncertainty.correlation

@@ -123,6 +123,7 @@ def _next(
     else:
         z, state, _, history = standing
     z, state, seen = iterate(problem, optimiser, z, sigmas, state)
+    state = optimiser.directed(z, state, seen)
     cost, slope = float(seen.cost), float(jnp.abs(seen.gradient).max())
     if np.isfinite(cost) and not np.isfinite(slope):
         raise NoDerivativeError

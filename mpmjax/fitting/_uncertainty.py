@@ -14,6 +14,8 @@ _SHARE = 1e-6
 """Part of a unit vector below which it does not lie in a direction."""
 _LEAST_FREEDOM = 1e-3
 """Degrees of freedom below which there are none, but rounding."""
+_AT_BOUND = 1e-2
+"""Standard errors from a bound at which a number lies at it."""
 _NODES = 100
 """Of Gauss-Hermite quadrature."""
 _MOST_SAID = 8
@@ -149,6 +151,21 @@ def uncertainty(J: np.ndarray, eps: float, estimated: Sequence[tuple[slice, floa
 def _unit(columns: np.ndarray) -> np.ndarray:
     """The columns, each of length one."""
     return columns / np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
+
+
+def at_bound(r: np.ndarray, J: np.ndarray, room: np.ndarray) -> np.ndarray:
+    """Whether each coordinate's value lies at a bound: the data want to go beyond, and it is a hundredth of its
+    standard error away from it, were all others known, shape (n,).
+
+    Args:
+        r: residuals.
+        J: their derivative.
+        room: how far values can fall and rise, over their derivatives by the coordinates, shape (2, n).
+    """
+    length = np.maximum(np.linalg.norm(J, axis=0), np.finfo(float).tiny)
+    error = np.sqrt((r**2).sum() / max(len(r) - len(length), 1))
+    wanted = np.stack([J.T @ r, -J.T @ r]) / length
+    return np.asarray(((wanted > room * length) & (room * length <= _AT_BOUND * error)).any(axis=0))
 
 
 def noise(

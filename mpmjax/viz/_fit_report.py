@@ -134,7 +134,7 @@ def _write_numbers(axis: Any, result: FitResult, profiles: tuple[Profile, ...]) 
     lines = [f"{'':<{wide}}{'value':>12} ± {'error':<9}{100 * result.level:g} % interval"]
     for name, e in zip(names, result.all, strict=True):
         lower, upper = by_profile.get(e.label, e.interval)
-        profiled = " by profile" if e.label in by_profile else ""
+        profiled = (" by profile" if e.label in by_profile else "") + (", at its bound" if e.at_bound else "")
         lines.append(f"{name:<{wide}}{e.value:>12.5g} ± {e.error:<9.2g}{lower:.5g} to {upper:.5g}{profiled}")
     degrees = result.degrees_of_freedom
     lines += ["", f"χ² = {result.chi_squared:.4g}, {degrees} degrees of freedom"]
