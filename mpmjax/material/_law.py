@@ -58,9 +58,9 @@ class AbstractLaw(eqx.Module):
 
     def contact_modulus(self, F: Deformation, history: Any, /) -> Float[Array, "p"]:
         """The modulus [Pa] by which contact takes its stiffness, shape (p,): the wave modulus, now or before anything
-        yielded, whichever is larger. Torn material has lost its stiffness and not its mass, and walls must hold it. By J
-        alone it is that of the present J where that is larger: what stiffens as it is compressed would press its faces
-        far into a spring that does not.
+        yielded, whichever is larger. Torn material has lost its stiffness and not its mass, and walls must hold it. Of J
+        alone its pressure p is added, so that explicit springs of stiffness 2 (M + p) let no pressure press a face by
+        more than half a spacing.
 
         Args:
             F: the deformation [-], component first.
@@ -68,7 +68,7 @@ class AbstractLaw(eqx.Module):
         """
         now, intact = (self.elastic(a).wave_modulus(F) for a in (history, self.initial_history(F)))
         if F.ndim == 1:
-            now = jnp.maximum(now, self.elastic(history).tangent(F)(jnp.ones_like(F)))
+            now = now + jnp.maximum(-self.elastic(history).stress(F), 0)
         return jnp.broadcast_to(jnp.maximum(now, intact), F.shape[self.kinematics.axes :])
 
     def remembers(self, history: Any, stored: Array, /) -> bool:
