@@ -58,9 +58,9 @@ class AbstractLaw(eqx.Module):
 
     def contact_modulus(self, F: Deformation, history: Any, /) -> Float[Array, "p"]:
         """The modulus [Pa] by which contact takes its stiffness, shape (p,): the wave modulus, now or before anything
-        yielded, whichever is larger. Torn material has lost its stiffness and not its mass, and walls must hold it. Of J
-        alone its pressure p is added, so that explicit springs of stiffness 2 (M + p) let no pressure press a face by
-        more than half a spacing.
+        yielded, whichever is larger. Torn material has lost its stiffness and not its mass, and walls must hold it.
+        Of J alone its pressure p is added, so that explicit springs of stiffness 2 (M + p) let no pressure press a face
+        by more than half a spacing.
 
         Args:
             F: the deformation [-], component first.
