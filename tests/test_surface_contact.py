@@ -354,16 +354,16 @@ def test_what_flows_stays_in_its_vessel_when_it_is_let_down(law, kind, d, at, pe
     ("law", "d", "mach"),
     [("fluid", 1, 2.0), *thorough(("viscous_fluid", 1, 2.0), ("fluid_in_tension", 1, 2.0), ("fluid", 2, 1.5))],
 )
-def test_a_fluid_thrown_faster_than_its_sound_stays_above_the_floor(law, d, mach):
-    """Its pressure, of many times its modulus, would press faces by more than a spacing into springs that do not
-    stiffen, and through the floor at any step."""
+def test_a_fluid_thrown_faster_than_its_sound_does_not_pass_the_floor(law, d, mach):
+    """No centre comes half a spacing behind it. Its pressure, of many times its modulus, would press faces by more than
+    a spacing into springs that do not stiffen, and through the floor at any step."""
     grid, body = block(d, cells=12 if d == 1 else 6)
     c = np.sqrt(10.0)
     falling = dataclasses.replace(body, mass=1e3 * body.mass, v=body.v.at[:, -1].set(-mach * c))
     walls = mpm.SeparatingBox((0.0,) * d, (*(0.6,) * (d - 1), INF))
     final = mpm.rollout(mpm.Scene(grid, ALL_LAWS[law], boundary=walls), falling, steps=400, dt=0.01 * 0.1 / c)
     assert bool((final.F > 0).all())
-    assert float(final.x[:, -1].min()) > -0.02
+    assert float(final.x[:, -1].min()) > -0.05
 
 
 @pytest.mark.thorough
