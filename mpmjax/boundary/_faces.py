@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Deformation, Float, Matrix, ParticleVector, Scalar
+from mpmjax._types import Array, Deformation, Float, ParticleVector, Scalar
 from mpmjax.discretisation import Stencil
 
 EXPLICIT_STIFFNESS = 2.0
@@ -18,7 +18,7 @@ class FaceShape(eqx.Module):
     """The shapes of particles of one material: cubes of side l0 = V0^(1/d) that their deformation makes ellipsoids.
 
     Along a unit vector n the half-width of a particle is h = ½ l0 ‖Fᵀn‖, which is the face's distance wherever n is
-    along an edge. Where only the elastic part of the deformation is known or J alone, h = ½ l0 J^(1/d).
+    along an edge. Where only the elastic part of the deformation is known or J alone, h = ½ l0 J^(1/d) after each step.
     """
 
     half: Float[Array, "q"]
@@ -30,17 +30,18 @@ class FaceShape(eqx.Module):
     total: bool = eqx.field(static=True)
     """Whether gradients are with respect to the reference positions."""
 
-    def width(self, n: Float[Array, "d q"]) -> tuple[Float[Array, "q"], Matrix]:
-        """h [m], shape (q,), and B [m], shape (d, d, q), with δh = B : ∇u for a displacement u."""
+    def width(self, n: Float[Array, "d q"]) -> tuple[Float[Array, "q"], Float[Array, "d q"]]:
+        """h [m], shape (q,), and the arm b [m] from the face to the centre, shape (d, q): δh = n · ∇u b for a
+        displacement u. By J alone b = h n, so that pressure acts where the face is whatever the flow (that J^(1/d)
+        changes by another amount is made up for in the next step)."""
         F, d = self.deformation, len(n)
         if F.ndim == 1:
             h = self.half * jnp.where(F > 0, F, 1) ** (1 / d)  # a volume below zero is a fault that is told elsewhere
-            return h, h / d * jnp.broadcast_to(jnp.eye(d, dtype=n.dtype)[..., None], (d, *n.shape))
+            return h, h * n
         m = la.matmul(la.transpose(F), n[:, None])[:, 0]
         square = (m**2).sum(axis=0)
         stretch = jnp.sqrt(jnp.where(square == 0, 1, square))
-        arm = self.half / stretch * (m if self.total else la.matmul(F, m[:, None])[:, 0])
-        return self.half * stretch, n[:, None] * arm[None, :]
+        return self.half * stretch, self.half / stretch * (m if self.total else la.matmul(F, m[:, None])[:, 0])
 
 
 class Faces(eqx.Module):
@@ -81,10 +82,10 @@ class Faces(eqx.Module):
         """k_p = A α (M + ρ0 max(w, 0)²)/dx [N/m], shape (p,), at the velocity of approach w [m/s]."""
         return self.stiffness + self.inertia * jnp.maximum(approach, 0) ** 2
 
-    def width(self, n: Float[Array, "d p"]) -> tuple[Float[Array, "p"], Matrix]:
-        """Half-widths h [m] along unit vectors n, shape (p,), and B [m], shape (d, d, p), with δh = B : ∇u."""
+    def width(self, n: Float[Array, "d p"]) -> tuple[Float[Array, "p"], Float[Array, "d p"]]:
+        """Half-widths h [m] along unit vectors n, shape (p,), and arms b [m], shape (d, p), with δh = n · ∇u b."""
         parts = [shape.width(n[:, slice(*shape.rows)]) for shape in self.shapes]
         if len(parts) == 1:
             return parts[0]
-        widths, growths = zip(*parts, strict=True)
-        return jnp.concatenate(widths), jnp.concatenate(growths, axis=-1)
+        widths, arms = zip(*parts, strict=True)
+        return jnp.concatenate(widths), jnp.concatenate(arms, axis=-1)

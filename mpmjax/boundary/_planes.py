@@ -229,5 +229,5 @@ class ContactPlane(AbstractPlane):
         distance = self.inward * (faces.x[:, self.axis] - self.position)
         landing = surface_contact(Surface(distance, inward, self.friction, axis=self.axis), faces)
         shut = landing.gap <= SHUT * faces.spacing
-        plane = plane.where(shut, faces.stencil)
+        plane = plane.where(shut[0], faces.stencil)
         return (plane,) if faces.explicit else (plane, replace(landing, beside=~shut))

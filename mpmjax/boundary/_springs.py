@@ -2,10 +2,10 @@
 
 The gap is that of a particle's face, linear in the displacement u of the nodes about the start of the step,
 
-    g_p(u) = g_p(0) + n_p · Σ_i w_ip u_i − B_p : Σ_i u_i g_ipᵀ,
+    g_p(u) = g_p(0) + n_p · Σ_i (w_ip − b_p · g_ip) u_i,
 
-where n is the surface's unit normal and B : ∇u the growth of the particle's half-width along it. The force on the
-nodes, −k_p g_p (w_ip n_p − B_p g_ip), acts at the particle's face: its moment is that of −k_p g_p n_p there.
+where n is the surface's unit normal and x_p − b_p the particle's face, which moves by u − ∇u b. The force on the nodes,
+−k_p g_p (w_ip − b_p · g_ip) n_p, acts at the face: its moment is that of −k_p g_p n_p there.
 """
 
 from collections.abc import Sequence
@@ -14,36 +14,47 @@ from functools import reduce
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Float, Matrix, NodeVector
+from mpmjax._types import Array, Float, NodeVector
 from mpmjax.boundary._mirror import Mirror
 from mpmjax.discretisation import Stencil, gather, scatter
 
 
 class Springs(eqx.Module):
-    """The springs between one surface and the particles."""
+    """The springs between one surface, or two that face each other, and the particles: s is 1 or 2."""
 
-    gap: Float[Array, "p"]
-    """g_p at u = 0 [m], shape (p,); zero where nothing is held."""
-    stiffness: Float[Array, "p"]
-    """k_p [N/m], shape (p,); zero where nothing is held."""
+    gap: Float[Array, "s p"]
+    """g_p at u = 0 [m], shape (s, p); zero where nothing is held."""
+    stiffness: Float[Array, "s p"]
+    """k_p [N/m], shape (s, p); zero where nothing is held."""
     normal: Float[Array, "d p"]
-    """n_p [-], out of the surface, shape (d, p)."""
-    widening: Matrix
-    """B_p [m], shape (d, d, p)."""
+    """n_p [-], out of the first surface, shape (d, p); the second one's is the opposite."""
+    arm: Float[Array, "d p"]
+    """b_p [m], from the face at the first surface to the centre, shape (d, p); the second one's is the opposite."""
 
-    def opened(self, moved: tuple[Array, Array] | None) -> Float[Array, "p"]:
-        """The gap [m], shape (p,), at a displacement of the nodes gathered at the particles, with its gradient; None
+    def opened(self, moved: tuple[Array, Array] | None) -> Float[Array, "s p"]:
+        """The gap [m], shape (s, p), at a displacement of the nodes gathered at the particles, with its gradient; None
         for no displacement."""
         return self.gap if moved is None else self.gap + self.opening(moved)
 
-    def opening(self, moved: tuple[Array, Array]) -> Float[Array, "p"]:
-        """n·u − B : ∇u [m], shape (p,)."""
+    def opening(self, moved: tuple[Array, Array]) -> Float[Array, "s p"]:
+        """n · (u − ∇u b) [m], shape (s, p)."""
         value, slopes = moved
-        return (self.normal * value).sum(axis=0) - (self.widening * jnp.swapaxes(slopes, 0, 1)).sum(axis=(0, 1))
+        shift = (self.normal * value).sum(axis=0)
+        growth = (self.normal[None] * self.arm[:, None] * slopes).sum(axis=(0, 1))
+        return jnp.stack([sign * shift - growth for sign in SIGNS[: len(self.gap)]])
 
-    def push(self, amount: Float[Array, "p"]) -> tuple[Array, Array]:
-        """What scattered is the force on the nodes by an amount along the normal at each face [N], shape (p,)."""
-        return amount * self.normal, -amount * jnp.swapaxes(self.widening, 0, 1)
+    def push(self, amount: Float[Array, "s p"]) -> tuple[Array, Array]:
+        """What scattered is the force on the nodes by an amount along the normal at each face [N], shape (s, p)."""
+        return along(amount) * self.normal, -amount.sum(axis=0) * self.arm[:, None] * self.normal[None]
+
+
+SIGNS = (1, -1)
+"""The directions of two surfaces that face each other, along the normal of the first."""
+
+
+def along(amount: Float[Array, "s p"]) -> Float[Array, "p"]:
+    """The sum of amounts along the normal of each surface, along that of the first."""
+    return amount[0] if len(amount) == 1 else amount[0] - amount[1]
 
 
 def spring_energy(springs: Sequence[Springs], moved: tuple[Array, Array]) -> Float[Array, ""]:
@@ -75,7 +86,10 @@ def spring_answer(springs: Sequence[Springs], moved: tuple[Array, Array]) -> tup
 def spring_diagonal(springs: Sequence[Springs], stencil: Stencil, mirror: Mirror, size: int) -> NodeVector:
     """An approximation of the diagonal of their Hessian [N/m], shape (n, d), without the products of weights and their
     derivatives."""
-    parts = [(one.stiffness * one.normal**2, one.stiffness * jnp.swapaxes(one.widening, 0, 1) ** 2) for one in springs]
+    parts = []
+    for one in springs:
+        k = one.stiffness.sum(axis=0)
+        parts.append((k * one.normal**2, k * (one.arm[:, None] * one.normal[None]) ** 2))
     value, slopes = _added(parts)
     nodes = scatter(stencil.squared, value, slopes, size)
     return mirror.fold_scalars(nodes)

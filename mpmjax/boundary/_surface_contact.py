@@ -10,7 +10,7 @@ from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
 from mpmjax.boundary._faces import Faces
 from mpmjax.boundary._friction import friction_across, friction_along
 from mpmjax.boundary._mirror import Mirror
-from mpmjax.boundary._springs import Springs, spring_force
+from mpmjax.boundary._springs import SIGNS, Springs, along, spring_force
 from mpmjax.checks import require
 from mpmjax.discretisation import gather, scatter
 
@@ -28,10 +28,13 @@ class Surface(NamedTuple):
     """Velocity of the surface [m/s], shape (d, p); None at rest."""
     axis: int | None = None
     """The axis of its normal; None if that is along no axis."""
+    opposite: Float[Array, "p"] | None = None
+    """Signed distance of each particle from a second surface that faces this one, as the other wall of a vessel does
+    [m], shape (p,); None without one."""
 
 
 class SurfaceContact(AbstractContact):
-    """A surface that pushes the faces of particles. Each particle is a place.
+    """A surface, or two that face each other, that pushes the faces of particles. Each particle is a place at each.
 
     The gap g_p is the particle's distance from the surface less its half-width along the normal. A particle that is
     held has a spring of stiffness k_p on its gap (see `Springs`), which pushes with −k_p g_p: with the gap at the end
@@ -49,15 +52,15 @@ class SurfaceContact(AbstractContact):
     Friction is at most μ times the push of the particles around each node.
     """
 
-    gap: Float[Array, "p"]
+    gap: Float[Array, "s p"]
     """g_p with the particles at the start of the step, and the surface at its end or, in an explicit step, at its start
-    [m], shape (p,)."""
+    [m], shape (s, p), of s surfaces."""
     normal: Float[Array, "d p"]
-    """n_p [-], shape (d, p)."""
-    widening: Array
-    """B_p [m], shape (d, d, p)."""
-    stiffness: Float[Array, "p"]
-    """k_p at the velocities of the start of the step [N/m], shape (p,) (see `Faces.stiffness_at`)."""
+    """n_p of the first surface [-], shape (d, p)."""
+    arm: Float[Array, "d p"]
+    """b_p at the first surface [m], shape (d, p) (see `Springs`)."""
+    stiffness: Float[Array, "s p"]
+    """k_p at the velocities of the start of the step [N/m], shape (s, p) (see `Faces.stiffness_at`)."""
     velocity: Float[Array, "d p"] | None
     """Velocity of the surface [m/s], shape (d, p); None at rest."""
     faces: Faces
@@ -67,8 +70,8 @@ class SurfaceContact(AbstractContact):
     """The axis of its normal; None if that is along no axis."""
     body: int | None = eqx.field(static=True)
     """The number of the collider that it belongs to; None if it belongs to none."""
-    beside: Bool[Array, "p"] | None = None
-    """The particles that it may push, shape (p,); None for all."""
+    beside: Bool[Array, "s p"] | None = None
+    """The particles that it may push, shape (s, p); None for all."""
 
     @property
     def friction_order(self) -> float:
@@ -89,37 +92,37 @@ class SurfaceContact(AbstractContact):
             gap=share * jnp.where(held, self.gap, 0),
             stiffness=jnp.where(held, self.stiffness / share, 0),
             normal=self.normal,
-            widening=self.widening,
+            arm=self.arm,
         )
 
     @property
-    def near(self) -> Bool[Array, "p"]:
-        """The particles whose face is less than a spacing before or behind the surface, shape (p,): what is further
-        does not come to it in a step, or has passed it."""
+    def near(self) -> Bool[Array, "s p"]:
+        """The particles whose face is less than a spacing before or behind the surface, shape (s, p): what is
+        further does not come to it in a step, or has passed it."""
         near = jnp.abs(self.gap) < self.faces.spacing
         return near if self.beside is None else near & self.beside
 
-    def gap_felt(self, held: ConstrainedNodes) -> Float[Array, "p"]:
-        """The gap that the spring feels [m], shape (p,); infinite for particles that are not near."""
+    def gap_felt(self, held: ConstrainedNodes) -> Float[Array, "s p"]:
+        """The gap that the spring feels [m], shape (s, p); infinite for particles that are not near."""
         every, u = self.springs(jnp.ones(self.gap.shape, bool)), held.displacement
         moved = None if u is None else gather(self.faces.stencil, held.unheld.mirror.unfold(u))
         return jnp.where(self.near, every.opened(moved) / self.faces.share, jnp.inf)
 
-    def push(self, held: ConstrainedNodes, active: Array) -> Float[Array, "p"]:
-        """The normal impulse on each particle in the step [kg m/s], shape (p,)."""
+    def push(self, held: ConstrainedNodes, active: Array) -> Float[Array, "s p"]:
+        """The normal impulse on each particle in the step [kg m/s], shape (s, p)."""
         shut = active & self.near
         return jnp.where(shut, -self.faces.dt * self.stiffness * jnp.where(shut, self.gap_felt(held), 0), 0)
 
-    def likely_held(self, held: ConstrainedNodes, v: NodeVector) -> Bool[Array, "p"]:
+    def likely_held(self, held: ConstrainedNodes, v: NodeVector) -> Bool[Array, "s p"]:
         del v
         return self.gap_felt(held) < 0
 
-    def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> Float[Array, "p"]:
+    def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> Float[Array, "s p"]:
         """The gap over the step [m/s]."""
         del v
         return self.gap_felt(held) / self.faces.dt
 
-    def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> Float[Array, "p"]:
+    def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> Float[Array, "s p"]:
         del residual
         return -self.faces.dt * self.stiffness * self.gap_felt(held)
 
@@ -129,7 +132,7 @@ class SurfaceContact(AbstractContact):
 
     def reached(self, active: Array, shape: tuple[int, ...]) -> Bool[Array, "n d"]:
         """All components of the nodes around the particles held."""
-        shut = (active & self.near).astype(self.gap.dtype)
+        shut = (active & self.near).any(axis=0).astype(self.gap.dtype)
         return jnp.broadcast_to(scatter(self.faces.stencil, shut[None], None, shape[0]) > 0, shape)
 
     def spring_impulse(self, held: ConstrainedNodes, active: Array) -> NodeVector:
@@ -139,11 +142,12 @@ class SurfaceContact(AbstractContact):
 
     def friction(self, held: ConstrainedNodes, active: Array, v: NodeVector, residual: NodeVector) -> NodeVector:
         del residual
-        push, d = jnp.maximum(self.push(held, active), 0), v.shape[1]
+        pushes, d = jnp.maximum(self.push(held, active), 0), v.shape[1]
+        push = pushes.sum(axis=0)
         around, mirror = [(self.coefficient * push)[None]], held.nodes.mirror
         if self.axis is None:
             velocity = jnp.zeros_like(self.normal) if self.velocity is None else self.velocity
-            around += [push[None], push * self.normal, push * velocity]
+            around += [push[None], along(pushes) * self.normal, push * velocity]
         sums = scatter(self.faces.stencil, jnp.concatenate(around), None, len(v))
         limit = mirror.fold_scalar(sums[:, 0])
         if self.axis is not None:
@@ -161,13 +165,15 @@ def surface_contact(surface: Surface, faces: Faces, body: int | None = None) -> 
         faces: the faces.
         body: the number of the collider that it belongs to; None if it belongs to none.
     """
-    width, widening = faces.width(surface.normal)
+    width, arm = faces.width(surface.normal)
     relative = faces.v.T if surface.velocity is None else faces.v.T - surface.velocity
+    leaving = (surface.normal * relative).sum(axis=0)
+    distances = (surface.distance,) if surface.opposite is None else (surface.distance, surface.opposite)
     return SurfaceContact(
-        gap=surface.distance - width,
+        gap=jnp.stack(distances) - width,
         normal=surface.normal,
-        widening=widening,
-        stiffness=faces.stiffness_at(-(surface.normal * relative).sum(axis=0)),
+        arm=arm,
+        stiffness=jnp.stack([faces.stiffness_at(-sign * leaving) for sign in SIGNS[: len(distances)]]),
         velocity=surface.velocity,
         faces=faces,
         coefficient=surface.friction,

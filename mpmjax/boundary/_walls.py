@@ -181,16 +181,15 @@ class SeparatingBox(AbstractBox):
         return no_conditions(nodes)
 
     def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, force_time: Scalar) -> tuple[Surface, ...]:
-        """One an axis: the nearer of its two walls."""
+        """Two an axis, which face each other: what is squeezed is pushed by both."""
         del t, dt, force_time
-        found = []
-        for axis in range(self.dim):
-            above = x[:, axis] - jnp.asarray(self.lower, x.dtype)[axis]
-            below = jnp.asarray(self.upper, x.dtype)[axis] - x[:, axis]
-            lower = above <= below
-            inward = jnp.zeros_like(x.T).at[axis].set(jnp.where(lower, 1, -1).astype(x.dtype))
-            found.append(Surface(jnp.where(lower, above, below), inward, self.friction, axis=axis))
-        return tuple(found)
+        above = (x - jnp.asarray(self.lower, x.dtype)).T
+        below = (jnp.asarray(self.upper, x.dtype) - x).T
+        normals = [jnp.zeros_like(x.T).at[axis].set(1) for axis in range(self.dim)]
+        return tuple(
+            Surface(above[axis], normal, self.friction, axis=axis, opposite=below[axis])
+            for axis, normal in enumerate(normals)
+        )
 
     def deepest(self, wall: Array, spacing: Scalar, reach: float) -> Array:
         """A spacing beyond the wall: what is deeper is not pushed."""

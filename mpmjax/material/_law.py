@@ -66,12 +66,16 @@ class AbstractLaw(eqx.Module):
     def contact_modulus(self, F: Deformation, history: Any, /) -> Float[Array, "p"]:
         """The modulus [Pa] by which contact takes its stiffness, shape (p,): the wave modulus, now or before anything
         yielded, whichever is larger. Torn material has lost its stiffness and not its mass, and walls must hold it.
+        Of J alone its pressure p is added, so that explicit springs of stiffness 2 (M + p) let no pressure press a face
+        by more than half a spacing.
 
         Args:
             F: the deformation [-], component first.
             history: the history.
         """
         now, intact = (self.elastic(a).wave_modulus(F) for a in (history, self.initial_history(F)))
+        if F.ndim == 1:
+            now = now + jnp.maximum(-self.elastic(history).stress(F), 0)
         return jnp.broadcast_to(jnp.maximum(now, intact), F.shape[self.kinematics.axes :])
 
     def remembers(self, history: Any, stored: Array, /) -> bool:

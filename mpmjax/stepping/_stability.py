@@ -73,7 +73,7 @@ def stable_dt(
     large.
 
     In a scene with surfaces that push (`SeparatingBox`, `SeparatingCollider`) the springs of contact add
-    n Δt² k (1 + A ‖B‖²)/m to the left side, whether or not anything touches, with the stiffness k of a particle that
+    n Δt² k (1 + A b²)/m to the left side, whether or not anything touches, with the stiffness k of a particle that
     comes with all of its speed (see `SurfaceContact`), and n = 1, or 2 for a particle between two of them: with two
     particles along a cell's edge the limit falls by a quarter, at the speed of sound by two fifths. `Bodies` that may
     touch add Δt² 4 k/(ρ dx²), with the stiffness k of `BodyContact`: by bodies of one law the limit falls by three
@@ -224,14 +224,14 @@ def _supports(scene: Scene, particles: Particles, steepness: Array) -> tuple[Arr
 
 
 def _contact(particles: Particles, nodes: Nodes, steepness: Array) -> Float[Array, "p"] | float:
-    """n k (1 + A ‖B‖²)/m of each particle [1/s²], by which springs between its face and surfaces add to Λ A/ρ0; zero in
+    """n k (1 + A b²)/m of each particle [1/s²], by which springs between its face and surfaces add to Λ A/ρ0; zero in
     a scene without surfaces. n is the largest eigenvalue of the sum of n nᵀ over the surfaces whose springs it may feel
     now, at least one."""
     contacts = [c for c in nodes.contacts if isinstance(c, SurfaceContact)]
     if not contacts:
         return 0.0
-    square = jnp.stack([(c.widening**2).sum(axis=(0, 1)) for c in contacts]).max(axis=0)
-    near = reduce(jnp.add, [jnp.where(c.near, c.normal[:, None] * c.normal, 0) for c in contacts])
+    square = jnp.stack([(c.arm**2).sum(axis=0) for c in contacts]).max(axis=0)
+    near = reduce(jnp.add, [c.near.sum(axis=0) * c.normal[:, None] * c.normal for c in contacts])
     number = jnp.maximum(la.symmetric_eigen(near)[0].max(axis=0), 1)
     stiffness = contacts[0].faces.stiffness_at(length(particles.v))
     return number * stiffness * (1 + steepness * square) / particles.mass
