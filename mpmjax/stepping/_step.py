@@ -162,8 +162,8 @@ def _left_undone(
     """What the step leaves undone by its linearisation, and by the return maps that follow it. No derivative passes."""
     nodes, method, new, trial, after = without_derivative((nodes, method, new, trial, after))
     exact, share = method.exact_impulse(nodes, new.solved), method.force_at()
-    yields = share is not None and any(not law.allows_total for law in scene.laws)
-    if new.internal is None or (exact is None and not yields):
+    yields = any(not law.allows_total for law in scene.laws)
+    if share is None or new.internal is None or (exact is None and not yields):
         return nothing_left_undone(nodes.mass.dtype)
     elastic = new.internal if new.viscous is None else new.internal - new.viscous
     exact = elastic if exact is None else exact
