@@ -231,7 +231,7 @@ def _contact(particles: Particles, nodes: Nodes, steepness: Array) -> Float[Arra
     if not contacts:
         return 0.0
     square = jnp.stack([(c.arm**2).sum(axis=0) for c in contacts]).max(axis=0)
-    near = reduce(jnp.add, [c.near.sum(axis=0) * c.normal[:, None] * c.normal for c in contacts])
+    near = reduce(jnp.add, [c.near.sum(axis=0, dtype=c.normal.dtype) * c.normal[:, None] * c.normal for c in contacts])
     number = jnp.maximum(la.symmetric_eigen(near)[0].max(axis=0), 1)
     stiffness = contacts[0].faces.stiffness_at(length(particles.v))
     return number * stiffness * (1 + steepness * square) / particles.mass
