@@ -242,7 +242,7 @@ def pushes(contact, step, method):
     gap, nothing_held = judged(contact, step, method)
     push = contact.push(nothing_held, jnp.asarray(gap < 0))
     velocity = jnp.zeros_like(contact.normal) if contact.velocity is None else contact.velocity
-    fields = jnp.concatenate([push[None], push * contact.normal, push * velocity])
+    fields = jnp.concatenate([push, push * contact.normal, push * velocity])
     sums, d = np.asarray(scatter(contact.faces.stencil, fields, None, len(step.velocity))), len(contact.normal)
     total = np.where(sums[:, 0] == 0, 1, sums[:, 0])[:, None]
     normal = sums[:, 1 : d + 1]

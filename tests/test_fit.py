@@ -176,10 +176,11 @@ def test_times_of_a_run_in_single_precision_lie_in_it(steps):
         assert seen.part_until(t1).count == 3
         with pytest.raises(ValueError, match="must lie in the run"):
             seen.check(scene, particles, 0.99 * t1)
-        run = Mock(spec=mpm.Run, dt=jnp.asarray(short))
+        run = Mock(spec=mpm.Run, dt=jnp.asarray(short), steps=range(steps + 1))
         predicted = seen.predict(jnp.arange(steps + 1, dtype=jnp.float32), run)
         assert np.asarray(predicted) == pytest.approx(np.arange(steps - 2, steps + 1), rel=3e-7)
-        assert np.isnan(seen.predict(jnp.zeros(int(0.99 * steps), jnp.float32), run)[-1])
+        run.steps = range(int(0.99 * steps))
+        assert np.isnan(seen.predict(jnp.zeros(len(run.steps), jnp.float32), run)[-1])
 
 
 @pytest.mark.thorough
@@ -216,9 +217,10 @@ def test_what_the_data_do_see_of_a_pair_has_an_error():
 
 
 def test_a_force_is_said_in_the_run_and_nowhere_else():
-    """Means over steps stand at their middles; a time that a parameter moves out of the run is not predicted."""
-    forces = SimpleNamespace(force=jnp.asarray([1.0, 3.0, 7.0])[:, None, None])
-    run = Mock(spec=mpm.Run, dt=0.1, forces=lambda: forces)
+    """Those of the midpoint rule stand at the middles of steps; a time that a parameter moves out of the run is not
+    predicted."""
+    forces = Mock(force=jnp.asarray([1.0, 3.0, 7.0])[:, None, None])
+    run = Mock(spec=mpm.Run, dt=0.1, steps=np.arange(4), method=mpm.ImplicitMidpoint(), forces=lambda: forces)
     seen = mpm.Force([0.0, 0.05, 0.1, 0.3], np.ones((4, 1)))
     assert np.allclose(seen.predict(None, run)[:, 0], [0, 1, 2, 9])
     late = eqx.tree_at(lambda o: o.times, seen, seen.times + 0.2)

@@ -51,7 +51,7 @@ HUGE = {
     "fewer than none": ("density = 1e3", "density = 1e3\nparticles_per_cell = -4", "got -4"),
     "rare frames": ("save_every = 2", f"save_every = {10**30}", "save_every must be a whole number"),
     "a long time": ("t1 = 0.06", "t1 = 1e308", "at most 2147483647 steps"),
-    "a short step": ("dt = 1e-2", "dt = 1e-320", "at most 2147483647 steps"),
+    "a short step": ("dt = 1e-2", "dt = 1e-300", "at most 2147483647 steps"),
     "a far wall": ("upper = [0.6, inf]", f"upper = [0.6, {10**400}]", "upper must be finite"),
     "a number that no text holds": ("spacing = 0.1", f"spacing = 0x1{'0' * 9000}", "spacing must be finite|Exceeds"),
     "nested lists": ("gravity = [0.0, -9.81]", f"gravity = {'[' * 5000}{']' * 5000}", "nested too deeply"),

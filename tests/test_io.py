@@ -35,9 +35,9 @@ STEPPERS = {
 }
 
 
-def made_up(d: int, dtype=jnp.float64, description=DESCRIPTIONS["updated"], transfer=TRANSFERS["apic"]) -> Run:
+def made_up(d: int, dtype=jnp.float64, description=DESCRIPTIONS["updated"], transfer=TRANSFERS["apic"], p=7) -> Run:
     """A run of random numbers: three frames, none of them simulated."""
-    grid, particles = cloud(d, p=7)
+    grid, particles = cloud(d, p=p)
     particles = jax.tree.map(lambda a: a.astype(dtype), particles)
     law = mpm.FixedCorotated(jnp.asarray(1 / 3, dtype), jnp.asarray(0.3, dtype))
     scene = mpm.Scene(grid, law, gravity=(0.1,) * d, description=description, transfer=transfer)
@@ -128,7 +128,7 @@ def test_what_laws_remember_comes_back(laws, tmp_path):
 
 def test_parameters_of_each_particle_come_back(tmp_path):
     """Arrays of the scene that are too long for text lie beside it."""
-    run = made_up(2)
+    run = made_up(2, p=100)
     moduli = jnp.asarray(np.random.default_rng(0).uniform(1, 2, 100))
     run = eqx.tree_at(lambda r: r.scene.material.youngs_modulus, run, moduli)
     save(tmp_path / "run.h5", run)

@@ -25,9 +25,9 @@ EACH_DIM = pytest.mark.parametrize("d", [2, *thorough(3)])
 
 def face(axis, d):
     """The far side of the block across an axis."""
-    lower = [-1.0] * d
-    lower[axis] = 0.29
-    return mpm.Patch(mpm.Box((0.0,) * d, (SIDE,) * d), mpm.Box(tuple(lower), (1.0,) * d))
+    lower, upper = [0.0] * d, [SIDE] * d
+    lower[axis], upper[axis] = 0.29, 1.0
+    return mpm.Patch(mpm.Box((0.0,) * d, (SIDE,) * d), mpm.Box(tuple(lower), tuple(upper)))
 
 
 def ramp(d):
@@ -430,7 +430,7 @@ motion = { times = [0.0], displacement = [[0.0, 0.0]] }
 [[loads]]
 kind = "Traction"
 traction = { kind = "TimeSeries", times = [0.0, 1.0], values = [[0.0, 0.0], [0.0, -2e3]] }
-on = { kind = "Patch", region = { kind = "Box", lower = [0.0, 0.0], upper = [0.3, 0.3] }, within = { kind = "Box", lower = [-1.0, 0.29], upper = [1.0, 1.0] } }
+on = { kind = "Patch", region = { kind = "Box", lower = [0.0, 0.0], upper = [0.3, 0.3] }, within = { kind = "Box", lower = [0.0, 0.29], upper = [0.3, 1.0] } }
 [[loads]]
 kind = "Spring"
 stiffness = 1e4

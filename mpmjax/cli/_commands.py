@@ -83,24 +83,21 @@ def _import(modules: list[str] | None) -> None:
     """
     for name in modules or []:
         path = Path(name)
-        if path.suffix != ".py":
+        if path.suffix == ".py":
+            require(path.is_file(), f"--import: there is no file {name}.")
+        else:
             known = importlib.util.find_spec(name.partition(".")[0])
             require(known, f"--import: Python finds no module {name!r}; name its .py file instead.")
-        else:
-            require(path.is_file(), f"--import: there is no file {name}.")
         try:
             if path.suffix != ".py":
                 importlib.import_module(name)
-                continue
-            spec = importlib.util.spec_from_file_location(path.stem, path)
-            assert spec is not None
-            assert spec.loader is not None
-            sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
-            spec.loader.exec_module(module)
-        except Exception as error:
+            elif (spec := importlib.util.spec_from_file_location(path.stem, path)) and spec.loader:
+                sys.modules[path.stem] = module = importlib.util.module_from_spec(spec)
+                spec.loader.exec_module(module)
+        except Exception as error:  # of the user's own code, which may raise anything
             place = traceback.extract_tb(error.__traceback__)[-1]
-            own = not isinstance(error, (ImportError, SyntaxError))  # which say it themselves
-            where = f" ({place.filename}, line {place.lineno})" if own else ""
+            placed = isinstance(error, (ImportError, SyntaxError))  # which say the place themselves
+            where = "" if placed else f" ({place.filename}, line {place.lineno})"
             raise ValueError(f"--import {name}: {type(error).__name__}: {error}{where}") from None
 
 
