@@ -92,6 +92,20 @@ def test_only_linearised_steps_leave_some(name, dtype):
     assert left(jnp.asarray([3.0, -2.0]) + 0.1 * x[:, ::-1] * jnp.asarray([1.0, -1.0])) < 1e-5
 
 
+def test_a_fluid_is_measured_as_what_is_elastic():
+    """The return map of a fluid takes out expansion, which has no stress: what a linear solve leaves of its force is
+    put beside the momentum too, as for a solid, and Newton's method leaves none."""
+    scene, particles = block(2, side=4, material=mpm.Fluid(1e4))
+    spread = eqx.tree_at(lambda q: q.v, particles, (particles.x - particles.x.mean(axis=0)) * jnp.asarray([2.0, -3.0]))
+
+    def left(method):
+        return mpm.step(scene, spread, 0.0, 2e-2, method=method)[1].left_undone
+
+    momentum = float(jnp.linalg.norm(particles.mass[:, None] * spread.v) / 2e-2)
+    assert float(left(mpm.SemiImplicit()).scale) > momentum / 2
+    assert float(left(mpm.BackwardEuler()).force) == 0
+
+
 @pytest.mark.thorough
 def test_friction_is_not_taken_for_some():
     """A block that slides on a floor: friction slows nodes after the solve, and is no part of what the solve left."""

@@ -35,6 +35,12 @@ class AbstractLaw(eqx.Module):
         """Whether the volumes of its particles may be averaged (see `AveragedVolume`). Default: yes."""
         return True
 
+    @property
+    def relaxes_stress(self) -> bool:
+        """Whether its return map changes the stress, so that implicit solves resist by another one than the law's.
+        Default: no of laws without a history, yes of those with one."""
+        return False
+
     def hardly_changes_volume(self) -> bool:
         """Whether its bulk modulus is ten times its shear modulus or more (ν from 0.45 on), as far as it has both by
         these names. It is asked only while numbers are known."""
@@ -224,6 +230,10 @@ class AbstractInelastic(AbstractLaw):
     def allows_averaged_volume(self) -> bool:
         """No: the return map would act on another volume than the stress."""
         return False
+
+    @property
+    def relaxes_stress(self) -> bool:
+        return True
 
     @abc.abstractmethod
     def initial_history(self, F: Deformation, /) -> Any:

@@ -162,17 +162,17 @@ def _left_undone(
     """What the step leaves undone by its linearisation, and by the return maps that follow it. No derivative passes."""
     nodes, method, new, trial, after = without_derivative((nodes, method, new, trial, after))
     exact, share = method.exact_impulse(nodes, new.solved), method.force_at()
-    yields = any(not law.allows_total for law in scene.laws)
+    yields = any(law.relaxes_stress for law in scene.laws)
     if share is None or new.internal is None or (exact is None and not yields):
         return nothing_left_undone(nodes.mass.dtype)
     elastic = new.internal if new.viscous is None else new.internal - new.viscous
     exact = elastic if exact is None else exact
-    if yields:  # the forces have gone the share θ of the way to the trial stress, the law's would to the returned one
+    if yields:  # the solve's forces went the share θ of the way to the trial stress, the law's go to the returned one
         tried, returned = (
             replace(nodes.potential, material_points=scene.material_points(q)).current_flux() for q in (trial, after)
         )
         exact = exact + share * nodes.dt * nodes.potential.nodal_sum(tried - returned)
-    # Flow is slowed by a part of the force, however small that is beside the momentum: there only as its rounding
+    # Flow is slowed by a part of the force, however small that is beside the momentum, of which only rounding counts
     inertia = norm(nodes.mass[:, None] * new.solved.velocity) * (jnp.finfo(exact.dtype).eps ** 0.5 if yields else 1)
     scale = reduce(jnp.maximum, (norm(exact), norm(elastic), nodes.dt * norm(nodes.force), inertia))
     return LeftUndone(norm(exact - elastic) / nodes.dt, scale / nodes.dt)
