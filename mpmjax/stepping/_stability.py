@@ -168,7 +168,7 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Fl
     materials = scene.material_points(particles)
     stiffest = jnp.concatenate([_stiffest(points, particles.dim) for points in materials])
     z = stiffest * elastic_steepness / density  # per Δt²
-    if not scene.total:  # in which nothing is pushed, and strains do not multiply
+    if not scene.total:  # in the total description there are no such surfaces, and strains add
         zero, one = jnp.zeros((), z.dtype), jnp.ones((), z.dtype)
         nodes = particles_to_grid(scene, particles, zero, one, scene.stencil(particles))
         z = z + 2 * _straining(scene, particles, nodes) + _contact(particles, nodes, elastic_steepness)

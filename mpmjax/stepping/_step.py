@@ -41,8 +41,8 @@ class StepInfo(eqx.Module):
     outside: Int[Array, "*f"]
     """Particles whose stencil left the grid's window."""
     left_undone: LeftUndone
-    """What one linear solve, and in implicit steps the return map after it, leaves undone of the elastic force; nothing
-    of explicit steps, and of Newton's method where nothing yields."""
+    """The elastic force that one linear solve, or the return map after any solve, leaves undone; zero in explicit
+    steps, and with Newton's method where nothing yields."""
     colliders: ColliderImpulse | None = None
     """Impulse on the scene's colliders, in the order of its boundaries; None without colliders."""
     boundaries: BoundaryImpulse | None = None
@@ -159,7 +159,8 @@ def _given_to_colliders(nodes: Nodes, method: AbstractIntegrator, new: GridUpdat
 def _left_undone(
     scene: Scene, nodes: Nodes, method: AbstractIntegrator, new: GridUpdate, trial: Particles, after: Particles
 ) -> LeftUndone:
-    """What the step leaves undone by its linearisation, and by the return maps that follow it. No derivative passes."""
+    """The elastic force that the step leaves undone by its linearisation, and by the return maps that follow its solve.
+    No derivative passes."""
     nodes, method, new, trial, after = without_derivative((nodes, method, new, trial, after))
     exact, share = method.exact_impulse(nodes, new.solved), method.force_at()
     yields = any(law.relaxes_stress for law in scene.laws)
