@@ -42,7 +42,7 @@ class AbstractLaw(eqx.Module):
         return False
 
     def hardly_changes_volume(self) -> bool:
-        """Whether its bulk modulus is more than 9.6 times its shear modulus (ν from 0.45 on). Default: by the attributes
+        """Whether its bulk modulus is over 9.6 times its shear modulus (ν from 0.45 on). Default: by the attributes
         `bulk_modulus` and `shear_modulus`, no without these. It is asked only while numbers are known."""
         bulk, shear = (getattr(self, name, None) for name in ("bulk_modulus", "shear_modulus"))
         return bulk is not None and shear is not None and bool(np.any(np.asarray(bulk) > 9.6 * np.asarray(shear)))

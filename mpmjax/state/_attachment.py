@@ -177,7 +177,7 @@ class PointsAt(AbstractPlace):
         )
         if self.weights is not None:
             require_that(
-                "PointsAt's weights must be shares of a whole, which sum to one",
+                "PointsAt's weights are shares of the load and must sum to one (divide them by their sum)",
                 lambda w: abs(w.sum() - 1) < _ROUNDED,
                 self.weights,
             )
