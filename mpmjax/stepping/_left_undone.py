@@ -16,7 +16,7 @@ class LeftUndone(eqx.Module):
     """The norm of the difference over all nodes, held ones too [N]."""
     scale: Float[Array, "*f"]
     """The largest of four such norms [N]: of the two forces, of the force at the start, and of the nodes' momentum over
-    Δt. Where a law yields the momentum counts only by its rounding, √ε of it."""
+    Δt. The momentum of what yields counts only by its rounding, √ε of it."""
 
     @property
     def part(self) -> Float[Array, "*f"]:

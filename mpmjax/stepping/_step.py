@@ -7,6 +7,7 @@ from functools import reduce
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax._types import Array, Int, NodeVector, Scalar, components, particle_first
 from mpmjax.autodiff import kept, without_derivative
@@ -22,7 +23,7 @@ from mpmjax.boundary import (
     no_contact,
 )
 from mpmjax.checks import canonical, checked, require_finite, require_placement, require_positive
-from mpmjax.discretisation import Stencil, g2p
+from mpmjax.discretisation import Stencil, g2p, scatter
 from mpmjax.implicit import Projection, SolveInfo, no_solve
 from mpmjax.state import Particles, Scene, is_prepared, prepare
 from mpmjax.stepping._boundary_forces import given_to_boundaries
@@ -173,8 +174,15 @@ def _left_undone(
             replace(nodes.potential, material_points=scene.material_points(q)).current_flux() for q in (trial, after)
         )
         exact = exact + share * nodes.dt * nodes.potential.nodal_sum(tried - returned)
-    # Flow is slowed by a part of the force, however small that is beside the momentum, of which only rounding counts
-    inertia = norm(nodes.mass[:, None] * new.solved.velocity) * (jnp.finfo(exact.dtype).eps ** 0.5 if yields else 1)
+    mass = nodes.mass
+    if yields:  # what slows flow counts however small it is beside the momentum of what flows, but for its rounding
+        mass = jnp.finfo(mass.dtype).eps ** 0.5 * mass
+        stays = np.repeat([not law.relaxes_stress for law in scene.laws], trial.sizes)
+        if stays.any():
+            own = jnp.where(stays, trial.mass, 0)[None]
+            sums = scatter(nodes.potential.stencil, own, None, nodes.potential.size)
+            mass = mass + nodes.mirror.fold_scalar(sums[:, 0])
+    inertia = norm(mass[:, None] * new.solved.velocity)
     scale = reduce(jnp.maximum, (norm(exact), norm(elastic), nodes.dt * norm(nodes.force), inertia))
     return LeftUndone(norm(exact - elastic) / nodes.dt, scale / nodes.dt)
 
