@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import block
+from helpers import LAWS, PLASTIC, block
 
 import mpmjax as mpm
 
@@ -90,6 +90,38 @@ def test_only_linearised_steps_leave_some(name, dtype):
 
     assert (left(x * jnp.asarray([10.0, 0.0])) > 1e-4) is linearised
     assert left(jnp.asarray([3.0, -2.0]) + 0.1 * x[:, ::-1] * jnp.asarray([1.0, -1.0])) < 1e-5
+
+
+def test_a_fluid_is_measured_as_what_is_elastic():
+    """The return map of a fluid takes out expansion, which has no stress: what a linear solve leaves of its force is
+    put beside the momentum too, as for a solid, and Newton's method leaves none."""
+    scene, particles = block(2, side=4, material=mpm.Fluid(1e4))
+    spread = eqx.tree_at(lambda q: q.v, particles, (particles.x - particles.x.mean(axis=0)) * jnp.asarray([2.0, -3.0]))
+
+    def left(method):
+        return mpm.step(scene, spread, 0.0, 2e-2, method=method)[1].left_undone
+
+    momentum = float(jnp.linalg.norm(particles.mass[:, None] * spread.v) / 2e-2)
+    assert float(left(mpm.SemiImplicit()).scale) > momentum / 2
+    assert float(left(mpm.BackwardEuler()).force) == 0
+
+
+@pytest.mark.thorough
+def test_what_yields_elsewhere_changes_nothing():
+    """A block that is pulled apart leaves the part that it leaves alone where sand lies beside it at rest."""
+    grid = mpm.Grid((20, 9), 0.1, origin=(-3, -3))
+    block = mpm.fill(
+        mpm.Box((0.0, 0.0), (0.3, 0.3)), grid, density=1e3, velocity=lambda x: jnp.stack([3 * x[0], -3 * x[1]])
+    )
+    sand = mpm.fill(mpm.Box((1.0, 0.0), (1.3, 0.2)), grid, density=1e3, velocity=lambda x: 0 * x)
+    laws = LAWS["neo_hookean"], PLASTIC["drucker_prager"]
+
+    def part(laws, *sets):
+        return float(
+            mpm.step(mpm.Scene(grid, laws), mpm.join(*sets), 0.0, 2e-2, method=mpm.SemiImplicit())[1].left_undone.part
+        )
+
+    assert part(laws, block, sand) == pytest.approx(part(laws[0], block), rel=1e-6)
 
 
 @pytest.mark.thorough

@@ -42,7 +42,7 @@ class Trial(NamedTuple):
     error: float
     """Relative error of the motion; infinite if the run failed, NaN if it was foreseen to take too long."""
     left_undone: float = 0.0
-    """The part of the elastic force that one linear solve a step left undone [-] (`RunStatistics.left_undone`)."""
+    """The part of the elastic force that implicit steps left undone [-] (`RunStatistics.left_undone`)."""
 
     def __str__(self) -> str:
         spacing = f", spacing / {self.refinement}" if self.refinement > 1 else ""

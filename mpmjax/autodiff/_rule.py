@@ -38,8 +38,8 @@ from mpmjax._types import Array
 
 
 def _promoting(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function in which arrays may differ in rank: rules are called when a derivative is taken, outside of the public
-    functions that allow it."""
+    """The function, allowed to broadcast arrays of different ranks. JAX calls rules when a derivative is taken, outside
+    of the public functions that allow this."""
 
     @wraps(function)
     def allowed(*args: Any, **kwargs: Any) -> Any:

@@ -28,16 +28,16 @@ class Slide(eqx.Module):
     normal: NodeVector
     """Unit normal out of it, shape (n, d); zero at nodes that it does not hold."""
     velocity: NodeVector
-    """Its velocity there [m/s], shape (n, d)."""
+    """Velocity of the collider at the nodes [m/s], shape (n, d)."""
     number: int = eqx.field(static=True, default=0)
-    """Its number among the colliders."""
+    """Number of the collider among all colliders."""
 
 
 class ColliderConditions(eqx.Module):
     """The conditions of k colliders on the nodes that lie in them."""
 
     slides: tuple[Slide, ...]
-    """Those along which nodes slide."""
+    """The colliders that hold nodes along their normal alone, in the scene's order."""
     holder: Int[Array, "n d"]
     """Number of the collider that prescribes each component, −1 for none, shape (n, d)."""
     position: NodeVector
@@ -55,7 +55,7 @@ class ColliderConditions(eqx.Module):
         )
 
     def beside(self, later: "ColliderConditions") -> "ColliderConditions":
-        """Both conditions."""
+        """These conditions and those of colliders that stand later in the scene."""
         number = len(self.pivots)
 
         def numbered(n: Array) -> Array:

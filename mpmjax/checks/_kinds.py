@@ -45,8 +45,8 @@ _WORDS: dict[Any, str] = {
 
 
 def checked(function: Function) -> Function:
-    """Decorate a public function to check that its arguments are of the kinds that their annotations name, and to let
-    arrays in it differ in rank, whatever `jax_numpy_rank_promotion` says outside.
+    """Decorate a public function to check that its arguments are of the kinds that their annotations name, and to allow
+    broadcasting of different ranks within it, whatever `jax_numpy_rank_promotion` says outside.
 
     Raises:
         ValueError: one is not.

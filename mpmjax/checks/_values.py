@@ -132,8 +132,8 @@ def as_plain(value: Any) -> Any:
 
 
 def require_placement(tree: Any) -> None:
-    """No array may carry what neither loops nor compiled sums know: manual axes over which it varies, as within a
-    `jax.shard_map` that checks them, or explicit axes over which it is divided.
+    """Refuse arrays that carry placements which neither loops nor compiled sums support: manual axes over which they
+    vary, as within a `jax.shard_map` that checks them, or explicit axes over which they are divided.
 
     Raises:
         ValueError: one does.
@@ -142,14 +142,14 @@ def require_placement(tree: Any) -> None:
         while isinstance(leaf, jax.Array):
             kind = jax.typeof(leaf)
             axes = getattr(kind, "manual_axis_type", None)
-            if getattr(axes, "varying", getattr(kind, "vma", None)):  # by its name from jax 0.10 on, and before
+            if getattr(axes, "varying", getattr(kind, "vma", None)):  # the name from jax 0.10 on, and the older one
                 raise ValueError("A jax.shard_map must not check over which axes arrays vary: give it check_vma=False.")
             if any(axis is not None for axis in getattr(kind.sharding, "spec", ())):
                 raise ValueError(
                     "Arrays must not be divided over explicit axes: make the mesh of axes of the kind "
                     "jax.sharding.AxisType.Auto, or divide them within jax.shard_map(..., check_vma=False)."
                 )
-            leaf = getattr(leaf, "val", getattr(leaf, "primal", None))  # what a batch or tangent is of
+            leaf = getattr(leaf, "val", getattr(leaf, "primal", None))  # the array within a batch or a tangent
 
 
 def require_tolerance(name: str, value: Any) -> None:

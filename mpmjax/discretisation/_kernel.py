@@ -16,7 +16,8 @@ class BSpline(eqx.Module):
 
     *When it breaks*: the gradient of the linear kernel jumps at cell faces. Particles that cross them make the error
     grow under refinement (M. Steffen, R. M. Kirby, M. Berzins, Int. J. Numer. Methods Eng. 76 (2008) 922,
-    doi 10.1002/nme.2360). A particle on a node with empty ones beside it has no gradient towards them, nor stiffness.
+    doi 10.1002/nme.2360). A particle on a node next to empty nodes has no gradient along
+    that axis, and no stiffness.
 
     *Good values*: 2, the default; 3 where smoothness matters.
 

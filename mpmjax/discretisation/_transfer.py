@@ -109,8 +109,9 @@ class FLIP(AbstractTransfer):
 
     v ← α (v + Σ_i w_ip (v_i^{n+1} − v_i^n)) + (1 − α) Σ_i w_ip v_i^{n+1}. Where a wall or grip holds a component of a
     node's velocity, v_i^n has the prescribed value too, so that the particles keep what the boundary has no claim to.
-    With α = 1 it dissipates nothing, not even noise in the null space of the transfer. Without a C the nodes
-    at free surfaces turn more slowly than the particles, at any time: a disk of 12 cells by 4 %, of 24 by 1 %.
+    With α = 1 it dissipates nothing, not even noise in the null space of the transfer. Particles bring no gradient C to
+    the nodes, so that nodes at free surfaces turn more slowly than the body: of a disk 12 cells wide by 4 %, 24 wide by
+    1 %.
 
     Args:
         alpha: share of FLIP, from 0 (PIC) to 1.
@@ -164,14 +165,14 @@ def without_empty(
     Args:
         stencil: stencil of the particles.
         mass: m_p [kg], shape (p,).
-        mirrored: the nodes' masses, shape (n,), to those with their mirror images.
+        mirrored: function of the nodes' masses [kg], shape (n,), that adds those of their mirror images.
         grid: the grid.
     """
     fixed, mass = jax.lax.stop_gradient((stencil, mass))
     rounding = jnp.finfo(mass.dtype).eps
     empty = mirrored(scatter(fixed, mass[None], None, grid.size)[:, 0]) <= rounding * mass.min()
     _, read = gather(fixed, empty.astype(mass.dtype)[:, None])
-    reads = jnp.abs(read) * grid.spacing > jnp.sqrt(rounding)  # else the nodes are out of reach along another axis
+    reads = jnp.abs(read) * grid.spacing > jnp.sqrt(rounding)  # less is read where another axis's weight is rounding
     return replace(stencil, weight_derivatives=jnp.where(reads, 0, stencil.weight_derivatives), places=None)
 
 

@@ -27,10 +27,11 @@ from mpmjax.geometry._region import AbstractRegion, length
 
 _SPLINE = BSpline(2)
 _FIRST = 0.02
-"""The first distance tried, in spacings, by which samples are moved for a region to have its volume."""
+"""The first distance tried by which samples are moved, in spacings, so that the region has the shape's volume."""
 _SECANTS = 4
+"""Steps of the secant method that finds this distance."""
 _ALIKE, _POOR = 1e-4, 5e-3
-"""Errors of a volume that are none, and that are said."""
+"""Relative errors of the volume at which the search ends, and beyond which it is warned of."""
 _PADDING = 3  # samples beyond the bounding box on each side: one and a half are the spline's
 
 
@@ -146,7 +147,7 @@ def sample_mesh(mesh: str | Path | tuple[Any, Any], spacing: float) -> SampledDi
 
 
 def _of_volume(volume: float, values: np.ndarray, points: np.ndarray, spacing: float) -> SampledDistance:
-    """The region of samples at points, all moved by one distance, with which it has a volume [m^d]."""
+    """The region of samples at points, all moved by the one distance with which it has this volume [m^d]."""
     lower = tuple(points[(0,) * values.ndim].tolist())
 
     def moved(by: float) -> tuple[SampledDistance, float]:
@@ -171,7 +172,8 @@ def _of_volume(volume: float, values: np.ndarray, points: np.ndarray, spacing: f
 
 
 def _volume(region: AbstractRegion, values: np.ndarray, points: np.ndarray, spacing: float) -> float:
-    """The volume of a region [m^d] by half the cells of a lattice, of which those away from the surface are whole."""
+    """The volume of a region [m^d]: the sum of the parts inside of cells of half the spacing near the surface, and of
+    whole cells of the lattice elsewhere."""
     d, cells = values.ndim, tuple(slice(0, -1) for _ in range(values.ndim))
     near = np.abs(values[cells]) < (d**0.5 + 0.5) * spacing
     quarters = np.array(list(itertools.product((0.25, 0.75), repeat=d))) * spacing

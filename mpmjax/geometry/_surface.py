@@ -14,9 +14,9 @@ from mpmjax.geometry._region import AbstractRegion
 _ON_IT = 1e-9
 """Distance within which a point is on a surface, in spacings."""
 _ROUNDINGS = 8.0
-"""And in roundings of the greatest coordinate."""
+"""The least such distance, in roundings of the greatest coordinate."""
 _BATCH = 4096
-"""Points that are computed together: one compiled program for any number of them."""
+"""Number of points that are computed together, so that one compiled program serves any number."""
 
 
 class Pieces(NamedTuple):
@@ -27,7 +27,7 @@ class Pieces(NamedTuple):
     normal: np.ndarray
     """Their outward unit normals, shape (s, d)."""
     inner: np.ndarray
-    """Whether they do not lie on the boundary of what they were clipped by, shape (s,)."""
+    """Whether a piece lies off the boundary of the regions that clipped it, shape (s,)."""
 
     @property
     def middle(self) -> np.ndarray:
@@ -45,7 +45,7 @@ class Pieces(NamedTuple):
         return self.size[:, None] * self.normal
 
     def of(self, rows: np.ndarray) -> "Pieces":
-        """Some of them."""
+        """The pieces with these numbers, or where a mask is true."""
         return Pieces(*(a[rows] for a in self))
 
 
@@ -99,7 +99,7 @@ def surface_pieces(
 
 
 def _sized(pieces: Pieces, spacing: float) -> Pieces:
-    """Those of them that are more than rounding, their normals of length one."""
+    """The pieces whose area is more than rounding, with normals of length one."""
     pieces = pieces.of(pieces.size > _ON_IT * spacing ** (pieces.normal.shape[1] - 1))
     return pieces._replace(normal=pieces.normal / np.sqrt((pieces.normal**2).sum(axis=1, keepdims=True)))
 
@@ -181,7 +181,14 @@ def _sorted(corners: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _crossings(corners: np.ndarray, values: np.ndarray, edges: list[tuple[int, int]]) -> np.ndarray:
-    """Where edges cross the surface, shape (m, number of edges, d); the corner itself of an edge from it to itself."""
+    """Points at which edges cross the surface [m], shape (m, number of edges, d). An edge from a corner to itself gives
+    the corner.
+
+    Args:
+        corners: corners of simplices or pieces [m], shape (m, k, d).
+        values: the values at the corners [m], shape (m, k).
+        edges: numbers of the two corners of each edge, one inside and one outside.
+    """
 
     def crossing(i: int, j: int) -> np.ndarray:
         a, b = values[:, i, None], values[:, j, None]

@@ -59,8 +59,9 @@ class AbstractInnerProductSolver(lx.AbstractLinearSolver[_State], Generic[_State
 
 
 def derivative_rtol(dtype: Any) -> float:
-    """That of tangent and adjoint systems: 1e-8 in float64, 1e-6 in float32. In slow pulls of stiff bodies the stiff
-    parts of the right-hand side cancel, and the error of the derivative is some hundred times the tolerance."""
+    """The default relative tolerance of tangent and adjoint solves: 1e-8 in float64, 1e-6 in float32. In float32 it is
+    smaller than that of a step: in slow motion of stiff bodies the stiff parts of the right-hand side cancel, and the
+    derivative's error is some hundred times the tolerance."""
     return min(default_rtol(dtype), 1e-6)
 
 

@@ -30,7 +30,7 @@ _GROWING = (
     "mpmjax/checksums",
 )
 _GROUPS = ("VTKHDF", "mpmjax")
-_MOST_SHRUNK = 1032  # by deflate, as h5repack may have written a run anew
+_MOST_SHRUNK = 1032  # the most that deflate shrinks data by: h5repack may have compressed a run
 _REMEDY = "restore it from a copy, or run the simulation again"
 _BUSY = "{} is being written by another run: wait until that ends or stop it, or choose another name."
 
@@ -193,13 +193,13 @@ def _check_written(file: File) -> None:
 
 
 def checksum(rows: dict[str, np.ndarray]) -> int:
-    """CRC-32 of the bytes of some arrays, in the order of their names. Zeros do not have it, as they have HDF5's own:
-    that of zeros is zero."""
+    """CRC-32 of the bytes of some arrays, in the order of their names. A block of zeros does not pass it, as it passes
+    HDF5's own checksum, which is zero for zeros."""
     return reduce(lambda crc, name: zlib.crc32(rows[name].tobytes(), crc), sorted(rows), 0)
 
 
 def fixed_checksum(file: File) -> int:
-    """The checksum of what is in a file but for its frames."""
+    """The checksum of all datasets that do not grow with the frames."""
     found: dict[str, np.ndarray] = {}
 
     def read(name: str, item: Any) -> None:

@@ -176,7 +176,7 @@ class FrameWriter:
         return int(steps[0]), *jax.tree.map(lambda a: a[0], (states, tallies))
 
     def standing(self, then: str) -> str:
-        """What the file holds, as a sentence, and what to do then. It reads nothing, so that any thread may call it at
+        """A sentence on what the file holds, and then what to do. It reads nothing, so that any thread may call it at
         any time."""
         if not self._staged.is_at(self._path):
             return f"{self._path} was removed or replaced while it was written: run the simulation again."
@@ -351,7 +351,8 @@ def _frames(file: File, like: RolloutState, start: int, stop: int) -> tuple[np.n
 
 
 def _check_numbers(scene: Scene, dt: Any, steps: np.ndarray, *states: State) -> None:
-    """Check that numbers are such as a run can have.
+    """Check that the step is positive, step numbers grow, states are finite, and positions are ones that a grid can
+    number.
 
     Raises:
         ValueError: they are not.

@@ -143,7 +143,8 @@ class StagedFile:
                 self._drop()
 
     def is_at(self, path: Path) -> bool:
-        """Whether the file has that name: whoever removes or replaces a file does not disturb who has it open."""
+        """Whether the open file is the one that has this name. A file that is removed or replaced stays open for its
+        writer, who does not notice otherwise."""
         try:
             return os.path.samestat(os.fstat(self._raw.fileno()), os.stat(path))
         except (OSError, ValueError):  # no such name, or closed

@@ -47,6 +47,11 @@ class Fluid(AbstractInelastic):
     def kinematics(self) -> VolumeRatio:
         return VOLUME_RATIO
 
+    @property
+    def relaxes_stress(self) -> bool:
+        """No: it takes out expansion, which has no stress."""
+        return False
+
     def initial_history(self, J: Array, /) -> None:
         """None."""
         del J

@@ -57,7 +57,7 @@ class AbstractKinematics(eqx.Module):
 
     @abc.abstractmethod
     def collapsed(self, deformation: Deformation, least: float) -> Bool[Array, "p"]:
-        """Whether a stretch is below the least one that is allowed, in magnitude, shape (p,)."""
+        """Whether the smallest principal stretch is below the least one that is allowed [-], shape (p,)."""
 
 
 class DeformationGradient(AbstractKinematics):
@@ -88,7 +88,8 @@ class DeformationGradient(AbstractKinematics):
         return la.determinant(deformation)
 
     def collapsed(self, deformation: Matrix, least: float) -> Bool[Array, "p"]:
-        """By 1/‖F⁻¹‖, which is no more than the smallest stretch, and no less than 1/√d of it."""
+        """Whether 1/‖F⁻¹‖ is below the least stretch, shape (p,). It lies between the smallest stretch and 1/√d of it,
+        and needs no eigenvalues."""
         cofactor = la.cofactor(deformation)
         return la.determinant(deformation) ** 2 <= least**2 * la.double_dot(cofactor, cofactor)
 
@@ -121,7 +122,7 @@ class VolumeRatio(AbstractKinematics):
         return deformation
 
     def collapsed(self, deformation: Array, least: float) -> Bool[Array, "p"]:
-        """By J, which is what the law knows."""
+        """Whether J is below the least stretch, shape (p,): nothing else is stored."""
         return jnp.abs(deformation) <= least
 
 

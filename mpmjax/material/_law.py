@@ -35,9 +35,15 @@ class AbstractLaw(eqx.Module):
         """Whether the volumes of its particles may be averaged (see `AveragedVolume`). Default: yes."""
         return True
 
+    @property
+    def relaxes_stress(self) -> bool:
+        """Whether its return map changes the stress, so that implicit solves resist by another one than the law's.
+        Default: no of laws without a history, yes of those with one."""
+        return False
+
     def hardly_changes_volume(self) -> bool:
-        """Whether its bulk modulus is ten times its shear modulus or more (ν from 0.45 on), as far as it has both by
-        these names. It is asked only while numbers are known."""
+        """Whether its bulk modulus is over 9.6 times its shear modulus (ν from 0.45 on). Default: by the attributes
+        `bulk_modulus` and `shear_modulus`, no without these. It is asked only while numbers are known."""
         bulk, shear = (getattr(self, name, None) for name in ("bulk_modulus", "shear_modulus"))
         return bulk is not None and shear is not None and bool(np.any(np.asarray(bulk) > 9.6 * np.asarray(shear)))
 
@@ -224,6 +230,10 @@ class AbstractInelastic(AbstractLaw):
     def allows_averaged_volume(self) -> bool:
         """No: the return map would act on another volume than the stress."""
         return False
+
+    @property
+    def relaxes_stress(self) -> bool:
+        return True
 
     @abc.abstractmethod
     def initial_history(self, F: Deformation, /) -> Any:

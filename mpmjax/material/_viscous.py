@@ -61,6 +61,10 @@ class Viscous(AbstractLaw):
     def allows_averaged_volume(self) -> bool:
         return self.law.allows_averaged_volume
 
+    @property
+    def relaxes_stress(self) -> bool:
+        return self.law.relaxes_stress
+
     def hardly_changes_volume(self) -> bool:
         return self.law.hardly_changes_volume()
 

@@ -23,7 +23,7 @@ from mpmjax.state import Particles, Scene, State, with_state
 from mpmjax.stepping import AbstractIntegrator, step_compiled
 
 LEAST_STRETCH = 1e-2
-"""A particle that is shorter than this part of its length has collapsed."""
+"""Principal stretch [-] below which a particle has collapsed."""
 
 
 class Problem(eqx.Module):
@@ -78,7 +78,7 @@ def faulty_particles(problem: Problem, state: State, t: Scalar) -> dict[Fault, B
     materials = scene.material_points(particles, t)
     admitted = jnp.concatenate([points.is_admissible(points.deformation) for points in materials])
     faults = {Fault.NOT_FINITE: ~finite, Fault.OUTSIDE: finite & outside, Fault.INADMISSIBLE: finite & ~admitted}
-    if not scene.total:  # in which the force of what has collapsed is not P Fᵀ, which vanishes with F, but P
+    if not scene.total:  # there forces are made of P, here of P Fᵀ, which vanishes with F: nothing opens what collapsed
         kept = [points.law.kinematics.collapsed(points.deformation, LEAST_STRETCH) for points in materials]
         faults[Fault.COLLAPSED] = finite & jnp.concatenate(kept)
     return faults

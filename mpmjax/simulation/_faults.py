@@ -99,11 +99,11 @@ def warn_of_inaccuracy(scene: Scene, statistics: RunStatistics) -> None:
             "rtol."
         )
     part = float(statistics.left_undone.part) if float(statistics.undone_force) > 0 else 0.0
-    if part > MOST_LEFT_UNDONE and any(not law.allows_total for law in scene.laws):
+    if part > MOST_LEFT_UNDONE and any(law.relaxes_stress for law in scene.laws):
         warn(
             f"Implicit steps left up to {100 * part:.2g} % of the elastic force undone: in the solve, what yields or "
-            "flows resists as if it were elastic, and its flow is returned only at the end of the step. It flows too "
-            f"slowly. Take a shorter step, {part / MOST_LEFT_UNDONE:.1f} times or more, or Explicit()."
+            "flows resists as if it were elastic, and its flow is returned only at the end of the step, so that it "
+            f"flows too slowly. Take a step {part / MOST_LEFT_UNDONE:.1f} times shorter or more, or Explicit()."
         )
     elif part > MOST_LEFT_UNDONE:
         warn(

@@ -27,8 +27,8 @@ class Forces(NamedTuple):
 
     times: Float[Array, "g"]
     """The mean of the times of the steps' forces [s], shape (f − 1,): t_n + θΔt, with θ the method's `force_at`. It is
-    half way between frames with θ = ½ (`ImplicitMidpoint`, `TRBDF2`, `SemiImplicit` with β = ½), ½Δt later at the end
-    of steps (`BackwardEuler`, β = 1), and ½Δt earlier at their start (`Explicit`)."""
+    half way between frames with θ = ½ (`ImplicitMidpoint`, `TRBDF2`, `SemiImplicit` with β = ½), ½Δt later with θ = 1
+    (`BackwardEuler`, `SemiImplicit` with β = 1), and ½Δt earlier with θ = 0 (`Explicit`)."""
     force: Float[Array, "g k d"]
     """Friction included [N], shape (f − 1, k, d)."""
     torque: Float[Array, "g k r"]

@@ -27,7 +27,7 @@ class Fault(enum.IntEnum):
     BAD_PARAMETERS = 5
     """Scene, particles or method have a value that their module does not allow, which a jax transformation hid."""
     COLLAPSED = 6
-    """A particle is shorter than any law can answer for."""
+    """A particle has collapsed: a stretch of it is below a hundredth."""
 
 
 class RunStatistics(eqx.Module):
@@ -70,7 +70,7 @@ class RunStatistics(eqx.Module):
 
     @property
     def left_undone(self) -> LeftUndone:
-        """What implicit steps left undone of the elastic force: the most of any step, and the largest scale of any, so
+        """The elastic force that implicit steps left undone: the largest of any step, and the largest scale of any, so
         that quiet steps do not count."""
         return LeftUndone(self.undone_force, self.undone_scale)
 

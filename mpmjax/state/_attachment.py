@@ -20,10 +20,8 @@ _NARROW = 1.999
 """A patch narrower than so many particle spacings is not resolved."""
 _FAR = 2.0
 """How many particle spacings a point may lie off the nearest particle."""
-
-
 _ROUNDED = 1e-4
-"""By how much shares may miss one, as rounding has it."""
+"""How far the sum of shares may be from one, for rounding's sake."""
 
 
 class AbstractPlace(eqx.Module):
@@ -88,8 +86,9 @@ class Patch(AbstractPlace):
 
     Args:
         region: the body, or any region whose surface is that of the body where it counts.
-        within: where the surface belongs to the patch, without what lies on the boundary of this region: around a
-            body's end, a box as wide as the body leaves out its sides. Default: all of it.
+        within: the region in which the surface belongs to the patch. Surface that lies on the boundary of this region
+            does not: a box around a body's end that is as wide as the body leaves out the body's sides. Default:
+            everywhere.
         spacing: the size of the pieces [m]. Default: the distance between particles.
     """
 
@@ -142,7 +141,7 @@ class Patch(AbstractPlace):
         return _attached(particles, first, middle, whole, summed(area))
 
     def _warn(self, pieces: Pieces, all_with_edges: float, apart: float) -> None:
-        """Warn of a patch that the grid cannot tell from a wider one, and of one most of which is on its boundary."""
+        """Warn of a patch narrower than two particles, and of one of which most lies on the boundary of `within`."""
         kept, wide = pieces.size.sum(), np.ptp(pieces.corners.reshape(-1, self.dim), axis=0)
         if (wide >= _NARROW * apart).sum() < self.dim - 1:
             warn(
@@ -162,7 +161,7 @@ class PointsAt(AbstractPlace):
 
     Args:
         positions: where they are at the start [m], (s, d).
-        weights: the share of each [-], (s,), in all one. Default: equal shares.
+        weights: the share of each in the load [-], (s,), which sum to one. Default: equal shares.
     """
 
     positions: Rows
@@ -178,7 +177,7 @@ class PointsAt(AbstractPlace):
         )
         if self.weights is not None:
             require_that(
-                "PointsAt's weights must be shares of a whole, which sum to one",
+                "PointsAt's weights are shares of the load and must sum to one (divide them by their sum)",
                 lambda w: abs(w.sum() - 1) < _ROUNDED,
                 self.weights,
             )

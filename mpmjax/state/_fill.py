@@ -52,8 +52,8 @@ def fill(
         particles_per_cell: a d-th power (4 in 2-D is 2 x 2), or a count for each direction. Default: two in each, 2^d.
             In fitted cells the directions are: across the rings, around, along the axis.
         density: mass density [kg/m^d].
-        velocity: initial velocity [m/s], (d,), or a motion, whose velocity at t = 0 it is, or a function of one point
-            [m], (d,), written with jax.numpy; these give the gradient C too. Default: rest.
+        velocity: initial velocity [m/s], (d,); or a motion, of which the velocity at t = 0 is taken; or a function of
+            one point [m], (d,), written with jax.numpy. The last two give the gradient C too. Default: rest.
         dtype: float32 or float64. Default: jax's own, float32 unless 64-bit mode is on.
         fitted: whether the cells follow the region's surface.
 
@@ -131,8 +131,8 @@ def fill_mapped(
         box: the box of ξ, in the units of ξ.
         counts: number of cells along each axis of the box.
         density: mass density [kg/m^d].
-        velocity: initial velocity [m/s], (d,), or a motion, whose velocity at t = 0 it is, or a function of one point
-            [m], (d,), written with jax.numpy; these give the gradient C too. Default: rest.
+        velocity: initial velocity [m/s], (d,); or a motion, of which the velocity at t = 0 is taken; or a function of
+            one point [m], (d,), written with jax.numpy. The last two give the gradient C too. Default: rest.
         dtype: float32 or float64. Default: jax's own, float32 unless 64-bit mode is on.
 
     Raises:

@@ -66,8 +66,12 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
     _check_loads(scene, particles)
     first = not jax.tree.leaves(particles.deformations)
     if len(sizes) == 1:
-        own = of_one_material(particles.deformations), of_one_material(particles.histories)
-        particles = replace(particles, counts=None, deformations=own[:1], histories=own[1:])
+        particles = replace(
+            particles,
+            counts=None,
+            deformations=(of_one_material(particles.deformations),),
+            histories=(of_one_material(particles.histories),),
+        )
     require(
         not scene.total or particles.X is not None or first,
         "In the total description particles with an F need the X from which it is measured: give X, or drop F.",

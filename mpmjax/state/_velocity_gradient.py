@@ -1,4 +1,4 @@
-"""The velocity gradient of particles of which velocities alone are known."""
+"""The velocity gradient of particles that have velocities and no gradient."""
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ from mpmjax.state._scene import Scene
 _FLAT = 1e-4
 """Spread of the neighbours in a direction, over that of a whole stencil, below which they say nothing of it."""
 _ROUNDING = 1e3
-"""Changes of velocity over a spacing of so many roundings are none."""
+"""Changes of velocity over a spacing below so many roundings are set to zero."""
 
 
 @eqx.filter_jit

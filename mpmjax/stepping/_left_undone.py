@@ -1,4 +1,4 @@
-"""What an implicit step leaves undone."""
+"""The part of the elastic force that an implicit step leaves undone."""
 
 from typing import Any
 
@@ -9,14 +9,14 @@ from mpmjax._types import Array, Float, NodeVector
 
 
 class LeftUndone(eqx.Module):
-    """How far the elastic force that moved the nodes is from that of the law for the same displacement: by the
-    linearisation of one linear solve, and by the return maps of laws that yield, which follow the solve."""
+    """The difference between the elastic force that moved the nodes and the law's force for the same displacement: from
+    the linearisation of one linear solve, and from the return maps of laws that yield, which follow the solve."""
 
     force: Float[Array, "*f"]
     """The norm of the difference over all nodes, held ones too [N]."""
     scale: Float[Array, "*f"]
     """The largest of four such norms [N]: of the two forces, of the force at the start, and of the nodes' momentum over
-    Δt, of which only the rounding counts where a law yields."""
+    Δt. The momentum of what yields counts only by its rounding, √ε of it."""
 
     @property
     def part(self) -> Float[Array, "*f"]:

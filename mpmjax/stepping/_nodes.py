@@ -148,7 +148,7 @@ class Nodes(AbstractNodes):
                 length=length,
                 speed=jnp.where(some, missing / length, 0),
             )
-            for place, old in enumerate(found):  # each node's first place that is empty
+            for place, old in enumerate(found):  # goes into the first place that is empty at each node
                 taken = old.owner >= 0
                 found[place] = _where(taken, old, new)
                 new = _where(taken, new, jax.tree.map(jnp.zeros_like, new))

@@ -69,15 +69,16 @@ def stable_dt(
     With averaged volumes Λ is that at F̄, or its average where that is larger: an average has no larger eigenvalue.
 
     In the updated description the left side has 2 Δt² α too (derivation, eq. 35), with α the fastest rate at which the
-    present acceleration strains the particle. It is zero in equilibrium; free surfaces of stretched material make it
-    large.
+    present acceleration strains the particle. It is zero in equilibrium, and large at free surfaces of stretched
+    material.
 
     In a scene with surfaces that push (`SeparatingBox`, `SeparatingCollider`) the springs of contact add
     n Δt² k (1 + A b²)/m to the left side, whether or not anything touches, with the stiffness k of a particle that
-    comes with all of its speed (see `SurfaceContact`), and n = 1, or 2 for a particle between two of them: with two
-    particles along a cell's edge the limit falls by a quarter, at the speed of sound by two fifths. `Bodies` that may
-    touch add Δt² 4 k/(ρ dx²), with the stiffness k of `BodyContact`: by bodies of one law the limit falls by three
-    tenths. Those that do touch add a bound of the springs that there are, if it is more: of two blocks, by nearly four.
+    comes with all of its speed (see `SurfaceContact`), and n = 1, or 2 for a particle between two that face each other:
+    with two particles along a cell's edge the limit falls by a quarter, at the speed of sound by two fifths. `Bodies`
+    add Δt² 4 k/(ρ dx²), with the stiffness k of `BodyContact`, whether or not they touch: between bodies of one law the
+    limit falls by three tenths. Where they touch, a bound for the present springs takes its place if that is more:
+    between two blocks the limit falls by nearly four tenths.
 
     The default safety of 0.7 covers an effect beyond the linear limit. Vibrations of a few per cent grow where the
     third or fourth harmonic of a mode resonates with the step, (ωΔt)² = 3 and 2, which is at 0.87 and 0.71 of the
@@ -168,7 +169,7 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Fl
     materials = scene.material_points(particles)
     stiffest = jnp.concatenate([_stiffest(points, particles.dim) for points in materials])
     z = stiffest * elastic_steepness / density  # per Δt²
-    if not scene.total:  # in which nothing is pushed, and strains do not multiply
+    if not scene.total:  # in the total description there are no such surfaces, and strains add
         zero, one = jnp.zeros((), z.dtype), jnp.ones((), z.dtype)
         nodes = particles_to_grid(scene, particles, zero, one, scene.stencil(particles))
         z = z + 2 * _straining(scene, particles, nodes) + _contact(particles, nodes, elastic_steepness)
@@ -242,10 +243,10 @@ def _between_bodies(
 ) -> Float[Array, ""] | float:
     """The most that the springs between bodies add to Λ A/ρ0 [1/s²].
 
-    Of those that are felt now it is 2 max_j Σ_i k_i q_ij (1/m_j^a + 1/m_j^b), summed over the pairs of bodies: a bound
-    (derivation, section 12). Of bodies that may meet, 4 k/(ρ dx²) with the stiffness k of the two in a row and the
-    density ρ of the lighter, by which a node at a distance s from the surface has the share cos²(πs/2dx) of a spring,
-    and by its mass, G(s) of the one body and G(−s) of the other, no more than 4 times k/(ρ dx²)."""
+    For the present springs it is 2 max_j Σ_i k_i q_ij (1/m_j^a + 1/m_j^b), summed over the pairs of bodies, which is a
+    bound (derivation, section 12). For bodies that may meet it is 4 k/(ρ dx²), with the stiffness k of the two in a row
+    and the density ρ of the lighter: a node at a distance s from the surface has the share cos²(πs/2dx) of a spring,
+    and with the masses G(s) of the one body and G(−s) of the other that makes at most 4 k/(ρ dx²)."""
     if scene.bodies is None:
         return 0.0
     felt, layers = 0.0, nodes.mass.reshape(scene.grid.layers, -1)

@@ -7,6 +7,7 @@ from functools import reduce
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax._types import Array, Int, NodeVector, Scalar, components, particle_first
 from mpmjax.autodiff import kept, without_derivative
@@ -22,7 +23,7 @@ from mpmjax.boundary import (
     no_contact,
 )
 from mpmjax.checks import canonical, checked, require_finite, require_placement, require_positive
-from mpmjax.discretisation import Stencil, g2p
+from mpmjax.discretisation import Stencil, g2p, scatter
 from mpmjax.implicit import Projection, SolveInfo, no_solve
 from mpmjax.state import Particles, Scene, is_prepared, prepare
 from mpmjax.stepping._boundary_forces import given_to_boundaries
@@ -41,8 +42,8 @@ class StepInfo(eqx.Module):
     outside: Int[Array, "*f"]
     """Particles whose stencil left the grid's window."""
     left_undone: LeftUndone
-    """What one linear solve, and in implicit steps the return map after it, leaves undone of the elastic force; nothing
-    of explicit steps, and of Newton's method where nothing yields."""
+    """The elastic force that one linear solve, or the return map after any solve, leaves undone; zero in explicit
+    steps, and with Newton's method where nothing yields."""
     colliders: ColliderImpulse | None = None
     """Impulse on the scene's colliders, in the order of its boundaries; None without colliders."""
     boundaries: BoundaryImpulse | None = None
@@ -159,21 +160,29 @@ def _given_to_colliders(nodes: Nodes, method: AbstractIntegrator, new: GridUpdat
 def _left_undone(
     scene: Scene, nodes: Nodes, method: AbstractIntegrator, new: GridUpdate, trial: Particles, after: Particles
 ) -> LeftUndone:
-    """What the step leaves undone by its linearisation, and by the return maps that follow it. No derivative passes."""
+    """The elastic force that the step leaves undone by its linearisation, and by the return maps that follow its solve.
+    No derivative passes."""
     nodes, method, new, trial, after = without_derivative((nodes, method, new, trial, after))
     exact, share = method.exact_impulse(nodes, new.solved), method.force_at()
-    yields = any(not law.allows_total for law in scene.laws)
+    yields = any(law.relaxes_stress for law in scene.laws)
     if share is None or new.internal is None or (exact is None and not yields):
         return nothing_left_undone(nodes.mass.dtype)
     elastic = new.internal if new.viscous is None else new.internal - new.viscous
     exact = elastic if exact is None else exact
-    if yields:  # the forces have gone the share θ of the way to the trial stress, the law's would to the returned one
+    if yields:  # the solve's forces went the share θ of the way to the trial stress, the law's go to the returned one
         tried, returned = (
             replace(nodes.potential, material_points=scene.material_points(q)).current_flux() for q in (trial, after)
         )
         exact = exact + share * nodes.dt * nodes.potential.nodal_sum(tried - returned)
-    # Flow is slowed by a part of the force, however small that is beside the momentum: there only as its rounding
-    inertia = norm(nodes.mass[:, None] * new.solved.velocity) * (jnp.finfo(exact.dtype).eps ** 0.5 if yields else 1)
+    mass = nodes.mass
+    if yields:  # what slows flow counts however small it is beside the momentum of what flows, but for its rounding
+        mass = jnp.finfo(mass.dtype).eps ** 0.5 * mass
+        stays = np.repeat([not law.relaxes_stress for law in scene.laws], trial.sizes)
+        if stays.any():
+            own = jnp.where(stays, trial.mass, 0)[None]
+            sums = scatter(nodes.potential.stencil, own, None, nodes.potential.size)
+            mass = mass + nodes.mirror.fold_scalar(sums[:, 0])
+    inertia = norm(mass[:, None] * new.solved.velocity)
     scale = reduce(jnp.maximum, (norm(exact), norm(elastic), nodes.dt * norm(nodes.force), inertia))
     return LeftUndone(norm(exact - elastic) / nodes.dt, scale / nodes.dt)
 
