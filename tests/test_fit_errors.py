@@ -479,7 +479,8 @@ def test_the_mean_square_of_robust_residuals_is_that_of_normal_noise(robust):
 
 def test_the_noise_of_an_observation_is_that_of_its_own_residuals():
     """Two observations of a line: each by its own rows, over the degrees of freedom that the line leaves it; a weight
-    of squares and a robust limit do not change it, numbers that were not measured have no part in it."""
+    of squares and a robust limit do not change it, numbers that were not measured and directions that the data do not
+    see have no part in it."""
     rng, J = np.random.default_rng(3), np.vander(np.linspace(0, 1, 40), 2)
     r = np.linalg.qr(np.column_stack([J, rng.normal(size=40)]))[0][:, 2] * 7
     hat = np.einsum("mi,ij,mj->m", J, np.linalg.inv(J.T @ J), J)
@@ -492,6 +493,7 @@ def test_the_noise_of_an_observation_is_that_of_its_own_residuals():
         assert noise(2 * r, 2 * J, rows, count, 4.0, None) == pytest.approx((plain, freedom))
         robust = plain / np.sqrt(_mean_square(0.5))
         assert noise(r, J, rows, count, 1.0, 0.5) == pytest.approx((robust, freedom))
+        assert noise(r, np.column_stack([J, J[:, 0]]), rows, count, 1.0, None) == pytest.approx((plain, freedom))
         less = np.sqrt((r[rows] ** 2).sum() / (freedom - 3))
         assert noise(r, J, rows, count - 3, 1.0, None) == pytest.approx((less, freedom - 3))
     assert np.isnan(noise(r, J, slice(0, 25), 1, 1.0, None)[0])
