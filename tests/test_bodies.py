@@ -110,11 +110,18 @@ def test_the_force_of_a_coupling_is_that_of_its_energy(shape, periodic):
     parts = rng.normal(size=m), rng.uniform(1, 2, m), rng.normal(size=(m, d))
     own = Coupling(*(jnp.asarray(part) for part in parts), patch, (0, 2))
     u, du = (jnp.asarray(rng.normal(size=(3 * m, d))) for _ in range(2))
-    assert_close(own.force(u, 3 * m), -jax.grad(own.energy)(u))
-    assert_close(own.resistance(du), -jax.jvp(lambda u: own.force(u, 3 * m), (u,), (du,))[1])
-    hessian = jax.hessian(lambda u: own.energy(u.reshape(3 * m, d)))(u.ravel())
-    assert_close(own.diagonal(3 * m).reshape(-1), jnp.diag(hessian))
-    layers = own.force(u, 3 * m).reshape(3, m, d)
+
+    @jax.jit
+    def both(u, du):
+        force, change = jax.jvp(lambda u: own.force(u, 3 * m), (u,), (du,))
+        hessian = jax.hessian(lambda u: own.energy(u.reshape(3 * m, d)))(u.ravel())
+        found = force, own.resistance(du), own.diagonal(3 * m).reshape(-1)
+        return found, (-jax.grad(own.energy)(u), -change, jnp.diag(hessian))
+
+    found, expected = both(u, du)
+    for one, other in zip(found, expected, strict=True):
+        assert_close(one, other)
+    layers = found[0].reshape(3, m, d)
     assert_close(layers[0], -layers[2])
     assert not layers[1].any()
 

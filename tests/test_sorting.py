@@ -129,7 +129,7 @@ def test_particles_are_in_the_order_of_their_cells():
     scene = canonical(scene, particles.x.dtype)
     given = mpm.prepare(scene, particles)
     order, state = _sorting.given_order(scene, given), state_of(given)
-    state, order = _sorting.resorted(order, scene, given, state, 0.0, jnp.asarray(0.0), None)
+    state, order = eqx.filter_jit(_sorting.resorted)(order, scene, given, state, 0.0, jnp.asarray(0.0), None)
     cells = np.asarray(_sorting.cells_of(scene.kernel, scene.grid, scene.window(given), state.x))
     for group in given.groups:
         assert (np.diff(cells[slice(*group.rows)]) >= 0).all()
