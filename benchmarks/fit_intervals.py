@@ -2,12 +2,15 @@
 interval of the standard error holds the truth, and how often that of the profile.
 
 Writes docs/fit_intervals.png and prints the counts. Run: python benchmarks/fit_intervals.py [REPETITIONS]
+
+And beside a bound, by a bar that falls with hardly any gravity: python benchmarks/fit_intervals.py beside [DRAWS]
 """
 
 import sys
 import warnings
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -58,6 +61,31 @@ def main(repetitions=200):
     draw(profiles[:40], np.array(own[:40]))
 
 
+def beside(draws=300):
+    """Gravity, which is positive, and speed from places of a bar: how often intervals hold them, the truth so many
+    standard errors from zero."""
+    jax.config.update("jax_enable_x64", True)
+    grid, dt, steps = mpm.Grid((14,), 0.1, origin=(-6,)), 4e-3, np.arange(1, 16)
+    bar = mpm.fill(mpm.Box((0.0,), (0.3,)), grid, particles_per_cell=2, density=1e3)
+    scene = mpm.Scene(grid, mpm.NeoHookean(7e4, 0.3), gravity=(-5.0,))
+    design = np.stack([-(dt**2) * steps * (steps + 1) / 2, steps * dt], axis=1)
+    error = NOISE * np.sqrt(np.linalg.inv(design.T @ design)[0, 0])
+    parameters = {
+        "g": mpm.Positive(update=lambda e, g: eqx.tree_at(lambda e: e.scene.gravity, e, -g[None]), start=5.0),
+        "v": mpm.Unbounded(update=lambda e, v: eqx.tree_at(lambda e: e.particles.v, e, v + 0 * bar.v), start=1.0),
+    }
+    for sigma in (NOISE, None):
+        seen = mpm.Series(steps * dt, np.zeros((15, 1)), mpm.CentreOfMass(), sigma=sigma)
+        one = mpm.Experiment(scene, bar, t1=15 * dt, dt=dt, observations=seen)
+        for offset in (0.0, 0.5, 1.0, 2.3, 4.2):
+            truth = np.array([offset * error, 0.3])
+            y = 0.15 + design @ truth + NOISE * np.random.default_rng(int(10 * offset) + 1).normal(size=(draws, 15))
+            sets = [eqx.tree_at(lambda e: e.observations[0].data, one, own[:, None]) for own in y]
+            fits = mpm.fit_ensemble(sets, parameters, batch=draws).fits
+            held = [[f[n].interval[0] <= t <= f[n].interval[1] for n, t in zip("gv", truth, strict=True)] for f in fits]
+            print(f"noise {sigma}, {offset} standard errors from zero: g and v held in {np.mean(held, axis=0)}")
+
+
 def draw(profiles, own):
     """One profile, and the intervals of all."""
     from matplotlib import pyplot as plt
@@ -82,4 +110,7 @@ def draw(profiles, own):
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    if sys.argv[1:2] == ["beside"]:
+        beside(*map(int, sys.argv[2:]))
+    else:
+        main(*map(int, sys.argv[1:]))

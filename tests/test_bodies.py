@@ -110,11 +110,18 @@ def test_the_force_of_a_coupling_is_that_of_its_energy(shape, periodic):
     parts = rng.normal(size=m), rng.uniform(1, 2, m), rng.normal(size=(m, d))
     own = Coupling(*(jnp.asarray(part) for part in parts), patch, (0, 2))
     u, du = (jnp.asarray(rng.normal(size=(3 * m, d))) for _ in range(2))
-    assert_close(own.force(u, 3 * m), -jax.grad(own.energy)(u))
-    assert_close(own.resistance(du), -jax.jvp(lambda u: own.force(u, 3 * m), (u,), (du,))[1])
-    hessian = jax.hessian(lambda u: own.energy(u.reshape(3 * m, d)))(u.ravel())
-    assert_close(own.diagonal(3 * m).reshape(-1), jnp.diag(hessian))
-    layers = own.force(u, 3 * m).reshape(3, m, d)
+
+    @jax.jit
+    def both(u, du):
+        force, change = jax.jvp(lambda u: own.force(u, 3 * m), (u,), (du,))
+        hessian = jax.hessian(lambda u: own.energy(u.reshape(3 * m, d)))(u.ravel())
+        found = force, own.resistance(du), own.diagonal(3 * m).reshape(-1)
+        return found, (-jax.grad(own.energy)(u), -change, jnp.diag(hessian))
+
+    found, expected = both(u, du)
+    for one, other in zip(found, expected, strict=True):
+        assert_close(one, other)
+    layers = found[0].reshape(3, m, d)
     assert_close(layers[0], -layers[2])
     assert not layers[1].any()
 
@@ -165,18 +172,20 @@ def spin(particles):
 
 
 def test_bodies_that_do_not_touch_move_as_each_alone():
-    """To rounding, though they share cells' nodes, a contact plane and a grip."""
+    """To rounding, though they share cells' nodes, a contact plane and a grip; of as many particles each, which is one
+    program."""
     grip = mpm.Grip(mpm.Box((-0.1, -0.1), (0.05, 0.3)), mpm.Motion((0.0,), ((0.0, 0.0),)))
     walls = grip, mpm.ContactPlane(1, 0.0, friction=0.3)
     scene, particles = stacked(gap=0.4, speed=0.3, boundary=walls, gravity=(2.0, -9.81))
-    both, _ = mpm.step(scene, particles, 0.0, 1e-3)
-    rows = np.split(np.arange(particles.count), [particles.sizes[0]])
+    both_wide, names = np.asarray(particles.x[:, 0]) < 0.3, ("x", "v", "mass", "volume")
+    rows = [np.arange(*group.rows)[both_wide[slice(*group.rows)]] for group in particles.groups]
+    each = [mpm.Particles(**{name: getattr(particles, name)[own] for name in names}) for own in rows]
+    both, _ = mpm.step(scene, mpm.join(*each), 0.0, 1e-3)
     alone = mpm.Scene(scene.grid, LAW, boundary=walls, gravity=(2.0, -9.81))
-    for own in rows:
-        parts = {name: getattr(particles, name)[own] for name in ("x", "v", "mass", "volume")}
-        new, _ = mpm.step(alone, mpm.Particles(**parts), 0.0, 1e-3)
-        assert_close(both.v[own], new.v)
-        assert_close(both.x[own], new.x)
+    for own, group in zip(each, both.groups, strict=True):
+        new, _ = mpm.step(alone, own, 0.0, 1e-3)
+        assert_close(both.v[slice(*group.rows)], new.v)
+        assert_close(both.x[slice(*group.rows)], new.x)
 
 
 @pytest.mark.thorough
@@ -258,10 +267,9 @@ def test_derivatives_of_a_touch_are_those_of_differences(method, d):
         return (new.x * jnp.sin(jnp.arange(new.x.size)).reshape(new.x.shape)).sum() + (new.v**2).sum()
 
     at = jnp.array([0.1, 1.0, 0.0, 1.0])
-    value = jax.jit(end)
-    found = jax.jit(jax.grad(end))(at)
-    h = 1e-5
-    differences = [(value(at.at[k].add(h)) - value(at.at[k].add(-h))) / (2 * h) for k in range(4)]
+    both, h = jax.jit(jax.value_and_grad(end)), 1e-5
+    found = both(at)[1]
+    differences = [(both(at.at[k].add(h))[0] - both(at.at[k].add(-h))[0]) / (2 * h) for k in range(4)]
     assert np.abs(np.asarray(differences)).min() > 1e-6
     for one, other in zip(found, differences, strict=True):
         assert_close(one, other, 1e-5)

@@ -112,9 +112,9 @@ def test_all_bodies_in_which_a_node_lies_hold_it_whichever_comes_first(d, name):
     angles, rising = np.pi * np.array([0.5, 7 / 6, 11 / 6]), np.array([0.2, -0.1, 0.3])[:d]
     normals = np.stack([np.cos(angles), np.sin(angles), np.array([0.3, -0.2, 0.0])], axis=1)[:, :d]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    motion = mpm.Motion((0.0, 1.0), ((0.0,) * d, tuple(rising)))
     sides = [mpm.HalfSpace(tuple(0.3 - 0.1 * n), tuple(n)) for n in normals]
-    bodies = [mpm.SlipCollider(side, motion if number == 0 else None) for number, side in enumerate(sides)]
+    motions = [mpm.Motion((0.0, 1.0), ((0.0,) * d, tuple(to))) for to in (rising, 0 * rising, 0 * rising)]
+    bodies = [mpm.SlipCollider(side, motion) for side, motion in zip(sides, motions, strict=True)]  # one program
     bodies += [mpm.SlipBox((-np.inf, -np.inf, 0.1), (np.inf,) * 3)] if d == 3 else []
     steps = [grid_update(scene_of(grid, *order), particles, DT, METHODS[name]) for order in (bodies, bodies[::-1])]
     x, mass = np.asarray(steps[0].position), np.asarray(steps[0].nodes.mass) > 0

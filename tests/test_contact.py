@@ -582,13 +582,18 @@ def test_friction_on_a_wall_takes_what_a_collider_holds_off_the_slip():
 
 
 def test_friction_on_a_surface_stops_slip_and_nothing_that_is_held():
-    """A surface that pushes along z and moves: the slip is relative to it, and has no part in what is held."""
-    up, moving = jnp.asarray([[0.0, 0.0, 3.0]] * 3), jnp.asarray([[-0.3, 0.0, 7.0]] * 3)
+    """A surface that pushes along z and moves, oblique where x is held: the slip is relative to it, and has no part in
+    what is held."""
+    up = jnp.asarray([[0.0, 0.0, 3e-3], [3.0, 0.0, 4.0], [0.0, 0.0, 3.0]])
+    moving = jnp.asarray([[-0.3, 0.0, 7.0]] * 3)
     change = friction_along(nodes_held(X_IS_HELD), up, moving, LIMITS, V)
     share = 0.05 / 2 / np.hypot(0.6, 0.4)
     np.testing.assert_allclose(change, [[-share * 0.6, -share * 0.4, 0], [0, -0.05 / 2, 0], [-0.6, -0.4, 0]])
-    normal = np.array([[0.8, 0.6, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
-    change = friction_along(nodes_held([[False] * 3] * 3, normal), up, moving, LIMITS, V)
-    assert np.abs((np.asarray(change) * normal).sum(axis=1)).max() < 1e-15
-    slip = np.array([0.6, 0.4]) - 0.72 * np.array([0.8, 0.6])
-    np.testing.assert_allclose(change[0, :2], -0.05 / 2 * slip / np.linalg.norm(slip))
+    # Beside a collider, whose normal is at right angles to the surface's, or oblique to it; and where it does not push.
+    normal = np.array([[0.8, 0.6, 0.0], [0.48, 0.36, 0.8], [0.8, 0.6, 0.0]])
+    change = friction_along(nodes_held([[False] * 3] * 3, normal), up.at[2].set(0), moving, LIMITS, V)
+    for k in (0, 1):
+        along = np.cross(normal[k], up[k])
+        slip = along * (along @ (V[k] - moving[k])) / np.linalg.norm(along)
+        np.testing.assert_allclose(change[k], -0.05 / 2 * slip / np.linalg.norm(slip), atol=1e-15)
+    assert (np.asarray(change)[2] == 0).all()

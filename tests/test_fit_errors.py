@@ -1,5 +1,6 @@
 """Errors of fits: profiles, bands of predictions, and words for what the data cannot tell."""
 
+import functools
 import json
 
 import diffrax
@@ -243,11 +244,14 @@ BY_A_BOUND = {
 }
 
 
-def beside_a_bound(parameter, bound, side, offset, count):
+@functools.lru_cache(maxsize=3)
+def beside_a_bound(name, offset, count):
     """Fits of a line to many draws of noise, the truth so many standard errors from a bound."""
+    parameter, bound, side = BY_A_BOUND[name]
     truth = np.array([bound + side * offset * ERROR, 0.3])
-    y = LINE @ truth + np.random.default_rng(7).normal(size=(count, STEPS))
-    problems = [Line(parameter, own) for own in y]
+    y = LINE @ truth + np.random.default_rng(7 + int(10 * offset)).normal(size=(count, STEPS))
+    one = Line(parameter, y[0])
+    problems = [eqx.tree_at(lambda line: line.y, one, jnp.asarray(own)) for own in y]
     lm = mpm.LevenbergMarquardt()
     sigmas = Problems.of([(jnp.ones(()),)], shared=True)
     found = search_many(Problems.of(problems, shared=False), lm, np.zeros((count, 2)), sigmas=sigmas, batch=count)
@@ -261,8 +265,8 @@ def beside_a_bound(parameter, bound, side, offset, count):
 @pytest.mark.parametrize("name", BY_A_BOUND)
 def test_a_minimum_beyond_a_bound_is_found_at_it_with_a_one_sided_interval(name):
     """Against the bounded least squares of SciPy, and where Δχ² of the line reaches its threshold."""
-    parameter, bound, side = BY_A_BOUND[name]
-    _, y, results = beside_a_bound(parameter, bound, side, 0.5, 24)
+    _, bound, side = BY_A_BOUND[name]
+    _, y, results = beside_a_bound(name, 0.5, 24)
     q, bounds = (
         norm.ppf(0.975),
         [(bound, np.inf), (-np.inf, np.inf)] if side > 0 else [(-np.inf, bound), (-np.inf, np.inf)],
@@ -286,20 +290,27 @@ def test_a_minimum_beyond_a_bound_is_found_at_it_with_a_one_sided_interval(name)
     assert 0 < beyond < 24
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", BY_A_BOUND)
-def test_intervals_cover_a_truth_beside_its_bound(name):
-    """Of 400 draws of noise, at and beside the bound; and the profiles of some."""
-    for offset in (0.0, 0.3, 0.7, 1.0, 2.0, 3.0):
-        truth, _, results = beside_a_bound(*BY_A_BOUND[name], offset, 400)
-        for k in range(2):
-            held = [r.estimates[k].interval for r in results]
-            assert np.mean([a <= truth[k] <= b for a, b in held]) >= 0.93, (offset, k)
-        assert all(r.converged for r in results)
+@pytest.mark.parametrize("offset", [0.0, 0.5, 1.0, 2.3, 4.2])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("lower", marks=pytest.mark.slow),
+        pytest.param("upper", marks=pytest.mark.slow),
+        pytest.param("zero", marks=pytest.mark.thorough),
+    ],
+)
+def test_intervals_cover_a_truth_beside_its_bound(name, offset):
+    """Of 300 draws of noise, the truth so many standard errors from the bound: 93 in a hundred or more, of the other
+    number too, and all have converged."""
+    truth, _, results = beside_a_bound(name, offset, 300)
+    for k in range(2):
+        held = [r.estimates[k].interval for r in results]
+        assert np.mean([a <= truth[k] <= b for a, b in held]) >= 0.93, k
+    assert all(r.converged for r in results)
 
 
 def test_a_number_at_its_bound_has_a_profile_from_there():
-    result = next(r for r in beside_a_bound(*BY_A_BOUND["lower"], 0.5, 24)[2] if r.estimates[0].at_bound)
+    result = next(r for r in beside_a_bound("lower", 0.5, 24)[2] if r.estimates[0].at_bound)
     with pytest.warns(UserWarning, match="a: the interval is open below"):
         profile = mpm.profile(result, "a")
     assert profile.interval == pytest.approx(result["a"].interval, abs=5e-3 * ERROR)
@@ -479,7 +490,8 @@ def test_the_mean_square_of_robust_residuals_is_that_of_normal_noise(robust):
 
 def test_the_noise_of_an_observation_is_that_of_its_own_residuals():
     """Two observations of a line: each by its own rows, over the degrees of freedom that the line leaves it; a weight
-    of squares and a robust limit do not change it, numbers that were not measured have no part in it."""
+    of squares and a robust limit do not change it, numbers that were not measured and directions that the data do not
+    see have no part in it."""
     rng, J = np.random.default_rng(3), np.vander(np.linspace(0, 1, 40), 2)
     r = np.linalg.qr(np.column_stack([J, rng.normal(size=40)]))[0][:, 2] * 7
     hat = np.einsum("mi,ij,mj->m", J, np.linalg.inv(J.T @ J), J)
@@ -492,6 +504,7 @@ def test_the_noise_of_an_observation_is_that_of_its_own_residuals():
         assert noise(2 * r, 2 * J, rows, count, 4.0, None) == pytest.approx((plain, freedom))
         robust = plain / np.sqrt(_mean_square(0.5))
         assert noise(r, J, rows, count, 1.0, 0.5) == pytest.approx((robust, freedom))
+        assert noise(r, np.column_stack([J, J[:, 0]]), rows, count, 1.0, None) == pytest.approx((plain, freedom))
         less = np.sqrt((r[rows] ** 2).sum() / (freedom - 3))
         assert noise(r, J, rows, count - 3, 1.0, None) == pytest.approx((less, freedom - 3))
     assert np.isnan(noise(r, J, slice(0, 25), 1, 1.0, None)[0])

@@ -247,7 +247,7 @@ def test_a_smooth_prior_is_of_neighbours():
     robust = mpm.Smooth(1.0, robust=1e-3).residuals(value, jnp.asarray([0.0, 10.0]))
     assert float(robust[0] ** 2 / 2) == pytest.approx(1e-3 * 10, rel=1e-3)
     with pytest.raises(ValueError, match="is one number"):
-        FitProblem((experiment(seen()),), {"E": mpm.Positive(STIFFNESS.where, prior=mpm.Smooth(0.1))})
+        FitProblem((in_a_square(),), {"E": mpm.Positive(STIFFNESS.where, prior=mpm.Smooth(0.1))})
     with pytest.raises(ValueError, match="greater than zero"):
         mpm.Smooth(0.0)
 
