@@ -1,5 +1,6 @@
 """Warnings of what is no error and most likely not meant, and none of what is well."""
 
+import dataclasses
 import re
 import warnings
 from pathlib import Path
@@ -9,12 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import LAWS, block
+from helpers import LAWS, PLASTIC, block, thorough
 from shell import refused, shell
 from test_cli import SCENE
 
 import mpmjax as mpm
 from mpmjax.cli._scene_file import read_scene_file
+from mpmjax.state import warn_of_crowding
 
 TOTAL = {"description": mpm.TotalLagrangian()}
 FAR, HALF, NEAR = mpm.Ball((0.9, 0.9), 0.05), mpm.Ball((0.15, 0.3), 0.12), mpm.Box((-1.0, -1.0), (1.0, 0.0))
@@ -146,6 +148,42 @@ def test_two_sets_at_one_place_are_told_of(d):
             mpm.prepare(mpm.Scene(grid, law), mpm.join(*sets))
         assert [str(w.message) for w in said if "times the space" not in str(w.message)] == []
         assert len(said) == told
+
+
+@pytest.mark.parametrize("law", ["fluid", "viscous", "neo_hookean", "snow", "cam_clay"])
+@pytest.mark.parametrize("d", [2, *thorough(1, 3)])
+def test_particles_at_half_the_place_that_their_law_knows_of_are_told_of(law, d):
+    """And not those whose law knows it, by what is elastic or by what has yielded."""
+    law = {"fluid": mpm.Fluid(1e4), "viscous": mpm.Viscous(mpm.Fluid(1e4), 1.0)}.get(law) or (LAWS | PLASTIC)[law]
+    scene, particles = block(d, side=4, material=law)
+    upright = mpm.prepare(scene, particles)
+    (group,) = upright.groups
+    half = eqx.tree_at(lambda p: p.x, upright, upright.x.at[:, -1].mul(0.5))
+    stored, history = group.stored, group.history
+    if isinstance(law, mpm.Snow):
+        history = eqx.tree_at(lambda h: h.plastic_volume, history, history.plastic_volume / 2)
+    elif isinstance(law, mpm.CamClay):
+        history = eqx.tree_at(lambda h: h.volume_strain, history, history.volume_strain - np.log(2))
+    else:
+        stored = stored / 2 if stored.ndim == 1 else stored.at[:, -1, -1].mul(0.5)
+    known = dataclasses.replace(half, deformations=(stored,), histories=(history,))
+    for given, told in ((upright, 0), (known, 0), (half, 1)):
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            warn_of_crowding(scene.grid, scene.laws, given)
+        assert [
+            bool(re.search("At the end particles take up to .* times the space", str(w.message))) for w in said
+        ] == [True] * told
+
+
+def test_a_run_that_ends_with_water_in_its_lowest_layer_tells_of_it():
+    """2.3 times what fits there, at full volume; and nothing of one that ends as it should."""
+    scene, particles = block(2, side=8, material=mpm.Fluid(1e4), boundary=mpm.SlipBox((0.0, 0.0), (0.8, np.inf)))
+    y = particles.x[:, 1]
+    fallen = eqx.tree_at(lambda p: p.x, particles, particles.x.at[:, 1].set(jnp.maximum(y - 0.13, 0.1 * y / 0.23)))
+    mpm.simulate(scene, particles, t1=1e-4, dt=1e-4)
+    with pytest.warns(UserWarning, match="At the end particles take up to 1.* times the space .* ContactPlane"):
+        mpm.simulate(scene, fallen, t1=1e-4, dt=1e-4)
 
 
 def test_a_tolerance_that_anything_meets_is_told_of():

@@ -156,7 +156,7 @@ def record(
             except OSError as refused:
                 said = str(refused)
             raise SimulationError(f"{error} {said}", error.run) from None
-        warn_of_inaccuracy(run.scene, run.statistics)
+        warn_of_inaccuracy(run)
         return run
 
 

@@ -75,9 +75,16 @@ class CamClay(AbstractInelastic):
 
     def initial_history(self, F: Matrix) -> CamClayHistory:
         """α = −arsinh(p₀/K)/ξ, ε_t = 0."""
+        return CamClayHistory(self._first_strain() * jnp.ones(F.shape[2:], F.dtype), no_transverse_strain(F))
+
+    def _first_strain(self) -> Scalar:
+        """α of what never yielded."""
         bulk_modulus = Hencky(self.youngs_modulus, self.poisson_ratio).bulk_modulus
-        alpha = -jnp.arcsinh(self.preconsolidation / bulk_modulus) / self.hardening
-        return CamClayHistory(alpha * jnp.ones(F.shape[2:], F.dtype), no_transverse_strain(F))
+        return -jnp.arcsinh(self.preconsolidation / bulk_modulus) / self.hardening
+
+    def compaction(self, history: CamClayHistory) -> Float[Array, "p"]:
+        """e to the change of α, or 1 of what has loosened."""
+        return jnp.exp(jnp.minimum(history.volume_strain - self._first_strain(), 0))
 
     def elastic(self, history: CamClayHistory) -> Hencky:
         """Hencky's law with the history's ε_t."""

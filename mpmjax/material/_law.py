@@ -84,6 +84,16 @@ class AbstractLaw(eqx.Module):
             now = now + jnp.maximum(-self.elastic(history).stress(F), 0)
         return jnp.broadcast_to(jnp.maximum(now, intact), F.shape[self.kinematics.axes :])
 
+    def compaction(self, history: Any, /) -> Float[Array, "p"] | float:
+        """What yielding has left of its volume [-], at most 1, shape (p,), where the deformation that is stored is the
+        elastic part. Default: 1, of flow that keeps the volume.
+
+        Args:
+            history: the history.
+        """
+        del history
+        return 1.0
+
     def remembers(self, history: Any, stored: Array, /) -> bool:
         """Whether a history is one of the law's: of the structure and shapes of that of particles that store this.
 

@@ -67,6 +67,10 @@ class Snow(AbstractInelastic):
         harder = jnp.exp(jnp.maximum(self.hardening * (1 - history.plastic_volume), _DUST))
         return SnowElasticity(self.youngs_modulus * harder, self.poisson_ratio)
 
+    def compaction(self, history: SnowHistory) -> Float[Array, "p"]:
+        """J_P, or 1 of what is torn."""
+        return jnp.minimum(history.plastic_volume, 1)
+
     def return_map(self, F: Matrix, history: SnowHistory, dt: Scalar) -> tuple[Matrix, SnowHistory]:
         """Clamp the principal stretches of F_E; J_P ← J_P det F_trial / det F_E."""
         del dt

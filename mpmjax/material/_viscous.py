@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from mpmjax._types import Array, Deformation, PerParticle, Scalar
+from mpmjax._types import Array, Deformation, Float, PerParticle, Scalar
 from mpmjax.checks import require, require_between, require_fields
 from mpmjax.material._kinematics import AbstractKinematics
 from mpmjax.material._law import AbstractElastic, AbstractLaw
@@ -70,6 +70,9 @@ class Viscous(AbstractLaw):
 
     def initial_history(self, F: Deformation) -> Any:
         return self.law.initial_history(F)
+
+    def compaction(self, history: Any) -> Float[Array, "p"] | float:
+        return self.law.compaction(history)
 
     def remembers(self, history: Any, stored: Array) -> bool:
         return self.law.remembers(history, stored)

@@ -17,8 +17,8 @@ from mpmjax.simulation._advice import advise, averaging_advice, disallowed
 from mpmjax.simulation._diffrax import LEAST_STRETCH, Problem, faulty_particles, passed_particles
 from mpmjax.simulation._rollout_state import RolloutState
 from mpmjax.simulation._run import Run, SimulationError
-from mpmjax.simulation._statistics import Fault, RunStatistics
-from mpmjax.state import Particles, Scene, state_of, with_state
+from mpmjax.simulation._statistics import Fault
+from mpmjax.state import Particles, state_of, warn_of_crowding, with_state
 from mpmjax.stepping import AbstractIntegrator
 
 
@@ -88,9 +88,12 @@ def unconverged_advice(method: AbstractIntegrator, dtype: Any) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def warn_of_inaccuracy(scene: Scene, statistics: RunStatistics) -> None:
-    """A Python warning where solves of an untraced run missed their tolerance by less than ten times, and one where
-    implicit steps left much of the elastic force undone."""
+def warn_of_inaccuracy(run: Run) -> None:
+    """A Python warning where solves of an untraced run missed their tolerance by less than ten times, one where
+    implicit steps left much of the elastic force undone, and one where particles take more space than there is."""
+    scene, statistics = run.scene, run.statistics
+    if not scene.total:
+        warn_of_crowding(scene.grid, scene.laws, run.final)
     if int(statistics.nearly_converged) > 0:
         warn(
             f"The solve of {int(statistics.nearly_converged)} of {int(statistics.steps)} steps missed its tolerance by "

@@ -166,7 +166,7 @@ def simulate(
         return guarded(run, end.report)
     warn_of_rounding(scene.grid, run.final.x, particles.x)
     raise_faults(run, particles, lambda: before_fault(go, begin, end.statistics), start)
-    warn_of_inaccuracy(run.scene, run.statistics)
+    warn_of_inaccuracy(run)
     return run
 
 

@@ -19,7 +19,7 @@ from mpmjax.state._order import (
     rearrangement,
     whole_numbers,
 )
-from mpmjax.state._oversights import warn_of_rounding
+from mpmjax.state._oversights import warn_of_crowding, warn_of_rounding
 from mpmjax.state._particles import Particles, State, by_material, history_arrays, join, state_of, with_state
 from mpmjax.state._preparation import is_prepared, prepare
 from mpmjax.state._scene import RigidMaterial, Scene, attach
@@ -73,6 +73,7 @@ __all__ = [
     "stiffness_of",
     "supports_of",
     "velocity_gradient",
+    "warn_of_crowding",
     "warn_of_rounding",
     "whole_numbers",
     "with_state",

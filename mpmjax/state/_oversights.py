@@ -1,4 +1,5 @@
-"""Warnings of what is no error but most likely not meant, given when particles are first prepared for a scene.
+"""Warnings of what is no error but most likely not meant, given when particles are first prepared for a scene, and of
+what a run has made of them.
 
 Only what is certain is warned of: a grip or collider that can never touch a node with mass is, one that the body may
 still reach is not.
@@ -17,10 +18,14 @@ from mpmjax._types import Array, Bool, Int, ParticleVector
 from mpmjax.boundary import ON_THE_WALL, AbstractBoundary, Conditions
 from mpmjax.checks import warn
 from mpmjax.discretisation import BSpline, Grid
+from mpmjax.material import AbstractLaw
 from mpmjax.state._particles import Particles
 
 _CROWDED = 1.25
 """How many times the space that there is particles may take."""
+_MOST_BEYOND = 0.05
+"""Part of all volume that may lie beyond that after a run: in a splash of water or a heap of sand it is up to 0.03, in
+a vessel whose lowest layer of cells holds twice what fits 0.05 and more."""
 _MOST_CELLS = 10**8
 """Cells up to which it is looked for."""
 _THIN = 2.0
@@ -93,6 +98,37 @@ def warn_of_rounding(grid: Grid, x: ParticleVector, before: ParticleVector | Non
         )
 
 
+def warn_of_crowding(grid: Grid, laws: tuple[AbstractLaw, ...], particles: Particles) -> None:
+    """Warn of particles that take much more space than there is. A law sees the volume of each particle by itself, and
+    not that they crowd.
+
+    Args:
+        grid: the grid.
+        laws: the laws of the materials.
+        particles: prepared particles after a run in the updated description.
+    """
+    groups = zip(laws, particles.groups, strict=True)
+    ratio = np.concatenate([np.asarray(law.compaction(g.history)) * _volume_ratio(g.stored) for law, g in groups])
+    volume, width = np.asarray(particles.volume, float) * ratio, max(float(grid.spacing), 2 * _largest_side(particles))
+    for offset in (0.0, 0.5):  # a layer between two rows of nodes shows less
+        found = _held(particles.x, volume, width, offset)
+        beyond = 0.0 if found is None else np.maximum(found[0] - _CROWDED, 0).sum() / found[0].sum()
+        if found is not None and beyond > _MOST_BEYOND:
+            warn(
+                f"At the end particles take up to {found[0].max():.2g} times the space that there is, most near "
+                f"{found[1]} m, and {100 * beyond:.2g} % of their volume is too much where it lies: levels and "
+                "pressures are wrong. Take a shorter step, and a ContactPlane or SlipBox in place of a SeparatingBox "
+                "or SeparatingCollider."
+            )
+            return
+
+
+def _volume_ratio(stored: Array | None) -> np.ndarray:
+    """det F or J of prepared particles, which store either, particle first."""
+    known = np.asarray(stored, float)
+    return known if known.ndim == 1 else np.linalg.det(known)
+
+
 def _probe(
     boundary: Boundaries, grid: Grid, x: ParticleVector, volume: Array, *, resting: tuple[bool, ...], total: bool
 ) -> tuple[list[Int[Array, ""] | None], list[Bool[Array, "n"] | None]]:
@@ -152,12 +188,39 @@ def _stays_outside(boundary: AbstractBoundary, grid: Grid) -> bool:
 
 
 def _crowded(grid: Grid, particles: Particles) -> str | None:
-    """A warning where particles take more space than there is: a quarter more in a lattice of cells two particles wide,
-    by linear weights, which those of one body fill to a tenth."""
-    d, volume, places = grid.dim, np.asarray(particles.volume, float), np.asarray(particles.x, float)
-    cell = 2 * max(float(grid.spacing), float(volume.max()) ** (1 / d))
-    index = np.floor(places / cell).astype(np.int64)
-    index, share = index - index.min(axis=0), places / cell - index
+    """A warning where particles take more space than there is, by a quarter of what fits in two particles' width."""
+    width = 2 * max(float(grid.spacing), _largest_side(particles))
+    found = _held(particles.x, np.asarray(particles.volume, float), width)
+    if found is None or found[0].max() < _CROWDED:
+        return None
+    held, near = found
+    return (
+        f"Near {near} m particles take {held.max():.2g} times the space that there is: where two sets fill the same "
+        "place there is twice the mass. Leave one of them out there."
+    )
+
+
+def _largest_side(particles: Particles) -> float:
+    """The side of the largest particle [m]."""
+    return float(np.asarray(particles.volume).max()) ** (1 / particles.dim)
+
+
+def _held(
+    x: ParticleVector, volume: np.ndarray, width: float, offset: float = 0.0
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """How many times its space each node of a lattice holds, by linear weights, which those of one body fill to a
+    tenth, and where the fullest is [m]; None where that is too much to look for.
+
+    Args:
+        x: positions [m], shape (p, d).
+        volume: volumes [m^d], shape (p,).
+        width: the lattice's spacing [m].
+        offset: how far its nodes are before whole numbers of it [-].
+    """
+    places = np.asarray(x, float) / width + offset
+    d, index = places.shape[1], np.floor(places).astype(np.int64)
+    first, share = index.min(axis=0), places - index
+    index = index - first
     shape = index.max(axis=0) + 2
     if shape.prod() > _MOST_CELLS:
         return None
@@ -165,15 +228,7 @@ def _crowded(grid: Grid, particles: Particles) -> str | None:
     for corner in itertools.product((0, 1), repeat=d):
         weight = np.where(corner, share, 1 - share).prod(axis=1)
         held += np.bincount(np.ravel_multi_index(tuple((index + corner).T), shape), weight * volume, held.size)
-    most = int(held.argmax())
-    times = held[most] / cell**d
-    if times < _CROWDED:
-        return None
-    near = (np.asarray(np.unravel_index(most, shape)) + np.floor(places / cell).min(axis=0)) * cell
-    return (
-        f"Near {near} m particles take {times:.2g} times the space that there is: where two sets fill the same place "
-        "there is twice the mass. Leave one of them out there."
-    )
+    return held / width**d, (np.asarray(np.unravel_index(int(held.argmax()), shape)) + first - offset) * width
 
 
 def _reached(grid: Grid, kernel: BSpline, x: ParticleVector) -> np.ndarray:
