@@ -269,7 +269,8 @@ def test_a_force_stands_at_its_own_time(method, dt, rtol):
 def test_the_material_has_no_moment_at_the_time_of_its_force(method):
     """A strained block without inertia, held and turned at once: the torques on what holds it have no sum, wherever
     the step has moved it."""
-    grips = (mpm.Grip(mpm.Box((-1.0, -1.0), (1.0, 0.1))), mpm.Grip(mpm.Box((-1.0, 0.25), (1.0, 1.0)), MOVED))
+    rest = mpm.Motion((0.0, 1.0), ((0.0, 0.0),) * 2)
+    grips = (mpm.Grip(mpm.Box((-1.0, -1.0), (1.0, 0.1)), rest), mpm.Grip(mpm.Box((-1.0, 0.25), (1.0, 1.0)), MOVED))
     scene, particles = block(2, boundary=grips, boundary_forces=True)
     particles = mpm.prepare(scene, dataclasses.replace(particles, mass=1e-9 * particles.mass))
     _, dt, received = stepped(scene, particles, method, 3.0)

