@@ -217,7 +217,6 @@ def test_without_colliders_a_constraint_is_a_mask(method, boundary):
         mock.patch.object(Nodes, "prescribed", property(lambda self: self.conditions.velocity)),
         mock.patch.object(ConstrainedNodes, "along_normals", return_value=()),
         mock.patch.object(ConstrainedNodes, "beside_colliders", lambda self, residual: residual),
-        mock.patch.object(ConstrainedNodes, "normals", ()),
     ):
         step, arrays = program(method, boundary=boundary)
         assert equations(jax.make_jaxpr(step)(arrays).jaxpr) == as_is

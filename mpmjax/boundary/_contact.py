@@ -228,7 +228,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     @property
     def normals(self) -> tuple[NodeVector, ...]:
         """Unit vectors at right angles along which colliders hold nodes, each (n, d)."""
-        return tuple(part.direction for part in self.nodes.free_normals)
+        return self.nodes.projection.normals
 
     @property
     def mass(self) -> NodeScalar:
