@@ -117,8 +117,8 @@ def warn_of_crowding(grid: Grid, laws: tuple[AbstractLaw, ...], particles: Parti
             warn(
                 f"At the end particles take up to {found[0].max():.2g} times the space that there is, most near "
                 f"{found[1]} m, and {100 * beyond:.2g} % of their volume is too much where it lies: levels and "
-                "pressures are wrong. Take a shorter step, and a ContactPlane or SlipBox in place of a SeparatingBox "
-                "or SeparatingCollider."
+                "pressures are wrong. Take a shorter step, and around what flows a ContactPlane, or a SeparatingBox "
+                "half-way between nodes."
             )
             return
 
