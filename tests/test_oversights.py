@@ -49,6 +49,9 @@ DOUBTFUL = {
 }
 WELL = {
     "walls around": {"boundary": mpm.StickyBox((0.0, 0.0), (1.0, 1.0))},
+    "walls that come": {
+        "boundary": mpm.SlipBox((-9.0, -9.0), (9.0, 9.0), mpm.Motion((0.0, 1.0), ((0.0, 0.0), (8.9, 0.0))))
+    },
     "a grip at the end": {"boundary": mpm.Grip(NEAR, GO)},
     "a grip that comes": {"boundary": mpm.Grip(mpm.Ball((0.9, 0.2), 0.05), GO)},
     "a collider that waits": {"boundary": mpm.StickyCollider(mpm.Box((-1.0, -1.0), (1.0, -0.1)))},

@@ -26,7 +26,7 @@ _CROWDED = 1.25
 _MOST_BEYOND = 0.05
 """Part of all volume that may lie beyond that after a run: in a splash of water or a heap of sand it is up to 0.03, in
 a vessel whose lowest layer of cells holds twice what fits 0.05 and more."""
-_MOST_CELLS = 10**8
+_MOST_CELLS = 10**7
 """Cells up to which it is looked for."""
 _THIN = 2.0
 """A body thinner than so many cells is not resolved."""
@@ -173,14 +173,14 @@ def _beyond(boundary: AbstractBoundary, grid: Grid, particles: Particles) -> int
 
 
 def _stays_outside(boundary: AbstractBoundary, grid: Grid) -> bool:
-    """Whether its body, or each of its walls, is outside of a window that rests at all times."""
-    mirrors = (boundary.mirror(),)
-    if grid.follow or any(mirror is not None and mirror.motion is not None for mirror in mirrors):
-        return False
+    """Whether its body, or each of its walls, is outside of a window that rests at all times. Walls that move may come
+    in."""
     dx, free = float(grid.spacing), np.asarray(grid.periodic)
     first = np.asarray(grid.origin) * dx - dx
     last = first + (np.asarray(grid.shape) + 1) * dx
     walls, reach = boundary.walls(), boundary.reach()
+    if grid.follow or (reach is None and getattr(boundary, "motion", None) is not None):
+        return False
     if reach is not None:
         return bool((((reach[1] < first) | (reach[0] > last)) & ~free).any())
     beside = [not free[w.axis] and not first[w.axis] <= w.position <= last[w.axis] for w in walls]
