@@ -125,7 +125,7 @@ def test_a_run_that_leads_far_from_zero_tells_of_its_rounding():
     x = jnp.asarray(np.random.default_rng(0).uniform(3, 6, (20, 2)), jnp.float32)
     one = jnp.ones(20, jnp.float32)
     scene = mpm.Scene(mpm.Grid((9, 9), 1.0, follow=True), LAWS["neo_hookean"])
-    particles = mpm.Particles(x, 0 * x + 5e6, one, one)
+    particles = mpm.Particles(x, 0 * x + 5e6, one, 0.1 * one)
     with pytest.warns(UserWarning, match="float32 rounds positions .* to 0.0012 spacings"):
         run = mpm.simulate(scene, particles, t1=2e-3, dt=1e-3)
     with warnings.catch_warnings():

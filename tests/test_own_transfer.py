@@ -56,13 +56,15 @@ def test_without_a_share_of_flip_it_is_apic(method, gradient):
 
 @pytest.mark.thorough
 def test_it_keeps_more_energy_than_apic():
-    energies = []
+    """Of velocities that differ from particle to particle; APIC loses none of a linear field's."""
+    energies, noise = [], jax.random.normal(jax.random.key(0), (36, 2))
     for transfer in (AFLIP(0.95), mpm.APIC()):
         scene, particles = moving(transfer)
+        particles = eqx.tree_at(lambda q: q.v, particles, particles.v + 0.2 * noise)
         final = mpm.simulate(scene, particles, t1=0.1, dt=1e-3).final
         energy = mpm.energy(scene, final)
         energies.append(float(energy.kinetic + energy.elastic))
-    assert energies[0] > energies[1]
+    assert energies[0] > 1.05 * energies[1]
 
 
 def test_its_parameter_has_a_derivative():

@@ -280,8 +280,11 @@ def test_guides_are_told_what_they_hold(free, turns, held, name):
     weight, before, after = 0.01 * particles.mass.sum() * gravity, body_of(particles), body_of(new)
     assert info.boundaries.impulse.shape == (1 + held, d)
     lost = before.mass * (before.velocity - after.velocity) + weight
-    about = (before.centre + after.centre) / 2 if name == "implicit_midpoint" else before.centre
-    turned = spin_momentum(particles) - spin_momentum(new) + moment(about[None], weight[None])[0]
+    late, moved = METHODS[name].force_at() or 0.0, after.centre - before.centre  # the share of the step of its forces
+    turned = spin_momentum(particles) - spin_momentum(new)
+    turned = turned + moment((before.centre + late * moved)[None], weight[None])[0]
+    carried = before.mass * ((1 - late) * after.velocity + late * before.velocity)  # along `moved` unless θ = 1
+    turned = turned + moment(moved[None], carried[None])[0]
     scale = 0.1 * float(before.mass)
     assert_close(info.boundaries.impulse.sum(axis=0), lost, 0, 1e-9 * scale)
     assert_close(info.boundaries.angular.sum(axis=0), turned, 0, 1e-9 * scale)

@@ -10,8 +10,8 @@ from mpmjax.discretisation import APIC, average, gather
 from mpmjax.state._particles import Particles
 from mpmjax.state._scene import Scene
 
-_FLAT = 1e-4
-"""Spread of the neighbours in a direction, over that of a whole stencil, below which they say nothing of it."""
+_FLAT_POWER = 0.6
+"""Power of the rounding ε: neighbours whose spread in a direction is ε^0.6 of a whole stencil's say nothing of it."""
 _ROUNDING = 1e3
 """Changes of velocity over a spacing below so many roundings are set to zero."""
 
@@ -48,7 +48,7 @@ def velocity_gradient(scene: Scene, particles: Particles) -> ParticleMatrix:
     moments = along + value[2 * d :].reshape(2 * d, d, -1) - mean[:, None] * shift
     Q, M = moments[:d], moments[d:] + la.transpose(along[d:]) + D * axes
     M = M / scene.grid.spacing**2
-    square = la.matmul(M, M) + (_FLAT / 4) ** 2 * axes
+    square = la.matmul(M, M) + (jnp.finfo(v.dtype).eps ** _FLAT_POWER / 4) ** 2 * axes
     inverse = la.matmul(M, la.cofactor(square)) / la.determinant(square)  # M⁻¹, and zero where M is
     C = la.matmul(Q, inverse) / scene.grid.spacing**2
     small = jnp.abs(C) * scene.grid.spacing <= _ROUNDING * jnp.finfo(v.dtype).eps * jnp.abs(v).max()
