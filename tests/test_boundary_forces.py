@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from helpers import DESCRIPTIONS, LAWS, TRANSFERS, assert_close, block, explicit_limit, ids
 from test_body_force import Wind
-from test_budget import BOUNDARIES as OF_BUDGETS
-from test_budget import MOVED
+from test_budget import BOUNDARIES as OF_BUDGETS, MOVED
 
 import mpmjax as mpm
 

@@ -20,7 +20,7 @@ import mpmjax.io._runs
 from mpmjax.io._interrupt import undisturbed
 from mpmjax.io._record import record
 from mpmjax.io._runs import FrameWriter, load, save
-from mpmjax.io._staged import StagedFile
+from mpmjax.io._transactional_file import StagedFile
 from mpmjax.simulation._rollout_state import RolloutState, initial_state
 from mpmjax.simulation._run import Run
 from mpmjax.simulation._simulate import integrate

@@ -14,8 +14,7 @@ from helpers import NEEDS_LIBRARY, assert_close, block, thorough
 
 import mpmjax as mpm
 from mpmjax import linalg as la
-from mpmjax.discretisation import _average, _resistance, make_stencil, resist
-from mpmjax.discretisation import _transfer_sums as sums
+from mpmjax.discretisation import _average, _resistance, _transfer_sums as sums, make_stencil, resist
 from mpmjax.implicit import _recurrence, _restarts, _vectors
 from mpmjax.native import _library
 

@@ -24,8 +24,8 @@ from helpers import (
 
 import mpmjax as mpm
 from mpmjax.simulation import _simulate
-from mpmjax.simulation._advice import advise, disallowed
 from mpmjax.simulation._diffrax import Problem, faulty_particles
+from mpmjax.simulation._faults import advise, disallowed
 from mpmjax.simulation._statistics import Fault
 from mpmjax.state import state_of
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from disk import full_beyond
 
-from mpmjax.io._staged import StagedFile, require_no_writer
+from mpmjax.io._transactional_file import StagedFile, require_no_writer
 
 
 def content(file: StagedFile) -> bytes:
@@ -75,7 +75,7 @@ def test_what_the_disk_refuses_leaves_the_file_as_it_was(tmp_path):
 HOLD = """
 import sys
 from pathlib import Path
-from mpmjax.io._staged import StagedFile
+from mpmjax.io._transactional_file import StagedFile
 file = StagedFile(Path(sys.argv[1]))
 print("held", flush=True)
 sys.stdin.read()

@@ -1,39 +1,25 @@
 """Energy and momentum, their budgets, growth of derivatives, error against seconds."""
 
-from mpmjax.analysis._bench import Build, Trial, name_of
-from mpmjax.analysis._budget import Budget, EnergyBudget, MomentumBudget, budget
-from mpmjax.analysis._diagnostics import (
-    Energy,
-    energy,
-    energy_density,
-    energy_of,
-    grid_mass,
-    momentum,
-    pieces,
-    volume_ratio,
+from mpmjax.analysis._bench import Build as Build, Trial as Trial, name_of as name_of
+from mpmjax.analysis._budget import (
+    Budget as Budget,
+    EnergyBudget as EnergyBudget,
+    MomentumBudget as MomentumBudget,
+    budget as budget,
 )
-from mpmjax.analysis._sensitivity import Sensitivity, sensitivity
-from mpmjax.analysis._work_precision import METHODS, WorkPrecision, work_precision
-
-__all__ = [
-    "METHODS",
-    "Budget",
-    "Build",
-    "Energy",
-    "EnergyBudget",
-    "MomentumBudget",
-    "Sensitivity",
-    "Trial",
-    "WorkPrecision",
-    "budget",
-    "energy",
-    "energy_density",
-    "energy_of",
-    "grid_mass",
-    "momentum",
-    "name_of",
-    "pieces",
-    "sensitivity",
-    "volume_ratio",
-    "work_precision",
-]
+from mpmjax.analysis._diagnostics import (
+    Energy as Energy,
+    energy as energy,
+    energy_density as energy_density,
+    energy_of as energy_of,
+    grid_mass as grid_mass,
+    momentum as momentum,
+    pieces as pieces,
+    volume_ratio as volume_ratio,
+)
+from mpmjax.analysis._sensitivity import Sensitivity as Sensitivity, sensitivity as sensitivity
+from mpmjax.analysis._work_precision import (
+    METHODS as METHODS,
+    WorkPrecision as WorkPrecision,
+    work_precision as work_precision,
+)

@@ -187,40 +187,40 @@ def _axes(hint: type[AbstractArray]) -> tuple[int, bool]:
     return len(named), len(named) < len(hint.dim_str.split())
 
 
-def _known(hint: Any) -> dict[str, Any]:
-    """The classes of objects that an annotation takes, and the members of its enumerations, by their names: of a base
-    class, those below it, in the order of the package's own list."""
+def choices(hint: Any) -> dict[str, Any]:
+    """The public classes of objects that an annotation takes, and the members of its enumerations, by their names: of a
+    base class, those below it in alphabetical order, a user's own among them."""
 
     def below(kind: type) -> dict[str, Any]:
         if inspect.isabstract(kind) or kind.__name__.startswith("Abstract"):
             return {name: c for sub in kind.__subclasses__() for name, c in below(sub).items()}
-        own = kind.__module__.partition(".")[0] == "mpmjax"
-        return {kind.__name__: kind} if not own or hasattr(sys.modules["mpmjax"], kind.__name__) else {}
+        internal = is_own(kind) and not hasattr(sys.modules["mpmjax"], kind.__name__)
+        return {} if internal else {kind.__name__: kind}
 
     names: dict[str, Any] = {}
     for a in alternatives(hint):
         if get_origin(a) in (tuple, list):
-            names |= {name: c for item in get_args(a) for name, c in _known(item).items()}
+            names |= {name: c for item in get_args(a) for name, c in choices(item).items()}
         elif is_enum(a):
             names |= {str(member): member for member in a}
         elif is_module(a):
-            listed = getattr(sys.modules["mpmjax"], "__all__", [])
-            found = below(a)
-            names |= {
-                name: found[name]
-                for name in sorted(found, key=lambda n: listed.index(n) if n in listed else len(listed))
-            }
+            names |= dict(sorted(below(a).items()))
     return names
+
+
+def is_own(kind: type) -> bool:
+    """Whether a class is the package's own."""
+    return kind.__module__.partition(".")[0] == "mpmjax"
 
 
 def _in_words(hint: Any) -> str:
     """The kinds that an annotation takes, in words: classes by their names, then numbers and the rest."""
-    names = list(_known(hint))
+    names = list(choices(hint))
     words = [f"one of {', '.join(names)}" if len(names) > 1 else names[0]] if names else []
     for a in alternatives(hint):
-        if get_origin(a) in (tuple, list) and _known(a):
+        if get_origin(a) in (tuple, list) and choices(a):
             words.append("several of them")
-        elif not _known(a):
+        elif not choices(a):
             words.append(_plain(a))
     *most, last = [w for w in dict.fromkeys(words) if not (w == _WORDS[int] and _WORDS[float] in words)]
     return f"{', '.join(most)} or {last}" if most else last
@@ -247,7 +247,7 @@ def _plain(hint: Any) -> str:
 def _meant(hint: Any, value: Any) -> str:
     """The end of a message that names the object which was probably meant."""
     word = value.__name__ if isinstance(value, type) else value[:60] if isinstance(value, str) else ""
-    known = {name.rsplit(".", 1)[-1].lower(): (name, kind) for name, kind in _known(hint).items()}
+    known = {name.rsplit(".", 1)[-1].lower(): (name, kind) for name, kind in choices(hint).items()}
     key = word.replace(" ", "").replace("_", "").lower()
     inside = [k for k in known if len(key) > 2 and (key in k or k in key)]
     close = inside if len(inside) == 1 else difflib.get_close_matches(key, known, 1)

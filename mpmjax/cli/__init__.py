@@ -1,5 +1,3 @@
 """Scene files and the shell's commands."""
 
-from mpmjax.cli._commands import main
-
-__all__ = ["main"]
+from mpmjax.cli._commands import main as main

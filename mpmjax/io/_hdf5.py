@@ -13,8 +13,8 @@ import h5py
 import numpy as np
 
 from mpmjax.checks import require
-from mpmjax.io._aside import reason
-from mpmjax.io._staged import StagedFile, require_no_writer
+from mpmjax.io._atomic_write import reason
+from mpmjax.io._transactional_file import BUSY, StagedFile, require_no_writer
 from mpmjax.io._vtkhdf import File, count_in
 
 FORMAT = 8
@@ -32,7 +32,6 @@ _GROWING = (
 _GROUPS = ("VTKHDF", "mpmjax")
 _MOST_SHRUNK = 1032  # the most that deflate shrinks data by: h5repack may have compressed a run
 _REMEDY = "restore it from a copy, or run the simulation again"
-_BUSY = "{} is being written by another run: wait until that ends or stop it, or choose another name."
 
 
 class FileRefusedError(ValueError):
@@ -43,16 +42,6 @@ def require_of_file(condition: Any, message: str) -> None:
     """Raise `FileRefusedError(message)` unless the condition holds."""
     if not condition:
         raise FileRefusedError(message)
-
-
-def staged_file(path: Path) -> StagedFile:
-    """The file, locked and ready to be changed."""
-    try:
-        return StagedFile(path)
-    except BlockingIOError:
-        raise ValueError(_BUSY.format(path)) from None
-    except OSError as error:
-        raise ValueError(f"{path} cannot be written ({reason(error)}): name a place that can be.") from None
 
 
 def opened(staged: StagedFile, path: Path) -> File:
@@ -87,7 +76,7 @@ def check_no_writer(path: Path) -> None:
     try:
         require_no_writer(path)
     except BlockingIOError:
-        raise ValueError(_BUSY.format(path)) from None
+        raise ValueError(BUSY.format(path)) from None
     except OSError:
         return  # whoever opens it next says why it cannot
 

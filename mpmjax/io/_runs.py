@@ -29,8 +29,7 @@ import numpy as np
 
 from mpmjax.boundary import BoundaryImpulse, ColliderImpulse
 from mpmjax.checks import canonical, checked, is_traced, require, require_finite, require_memory, require_positive
-from mpmjax.io._aside import reason, replacing
-from mpmjax.io._description import check_readable, check_same, describe, description_in, write_description
+from mpmjax.io._atomic_write import reason, replacing
 from mpmjax.io._hdf5 import (
     LIBVER_HEAD,
     check_hdf5,
@@ -41,11 +40,11 @@ from mpmjax.io._hdf5 import (
     opened,
     reading,
     require_of_file,
-    staged_file,
 )
 from mpmjax.io._interrupt import undisturbed
+from mpmjax.io._run_description import check_readable, check_same, describe, description_in, write_description
 from mpmjax.io._schema import decode
-from mpmjax.io._staged import StagedFile
+from mpmjax.io._transactional_file import StagedFile, staged_file
 from mpmjax.io._vtkhdf import File, add_growing, add_topology, count_in, rows_of, set_count, states_in
 from mpmjax.simulation import RolloutState, Run, RunStatistics, initial_state, no_steps
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state

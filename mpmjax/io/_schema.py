@@ -6,7 +6,7 @@ An object is a table whose `kind` names its class and whose other keys are its c
 
 A key with a default may be left out, and so may `kind` where the package has one class that fits; an object without
 other keys may be written as its kind alone (transfer = "PIC"). What a key takes follows from the constructor's
-annotation, so a new class of the package costs one entry in `CLASSES`, and one of a user's own a call of `register`.
+annotation, so a new public class of the package costs nothing here, and one of a user's own a call of `register`.
 Numbers come back bit for bit. A TOML scene is such data, and so is the JSON in a run's file. Reading it calls
 constructors of known classes and executes nothing else.
 """
@@ -18,14 +18,16 @@ import math
 import typing
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields
+from functools import cache
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import jax
 import numpy as np
 from jaxtyping import AbstractArray
 
-from mpmjax.checks import alternatives, is_enum, is_module, may_be_infinite, require
-from mpmjax.io._classes import CLASSES
+from mpmjax.checks import alternatives, choices, is_enum, is_module, is_own, may_be_infinite, require
+from mpmjax.state import Scene
+from mpmjax.stepping import AbstractIntegrator
 
 _registered: dict[str, type] = {}
 """The registered classes that files can hold, by name."""
@@ -83,8 +85,20 @@ def _place(cls: type) -> tuple[str, str]:
     return cls.__module__, cls.__qualname__
 
 
+@cache
+def saved_classes() -> tuple[type, ...]:
+    """The package's own classes that files can hold: those public ones of which scenes and integrators are made."""
+    reached: dict[type, None] = {}
+    hints: list[Any] = [Scene, AbstractIntegrator]
+    while hints:
+        new = [c for c in choices(hints.pop()).values() if isinstance(c, type) and is_own(c) and c not in reached]
+        reached |= dict.fromkeys(new)
+        hints += [hint for c in new for hint in _field_types(c).values()]
+    return tuple(reached)
+
+
 def _known() -> tuple[type, ...]:
-    return (*CLASSES, *_registered.values())
+    return (*saved_classes(), *_registered.values())
 
 
 def _can_be_held(hint: Any) -> bool:
@@ -158,18 +172,19 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
         ValueError: an unknown, missing or unfit key, an unknown kind, or what the constructor refuses: one line that
             names the place.
     """
-    choices = alternatives(expected)
-    classes = {c.__name__: c for c in _known() if any(is_module(a) and issubclass(c, a) for a in choices)}
-    items = [get_args(a)[0] for a in choices if get_origin(a) in (tuple, list)]
+    options = alternatives(expected)
+    fitting = (c for c in _known() if any(is_module(a) and issubclass(c, a) for a in options))
+    classes = {c.__name__: c for c in sorted(fitting, key=lambda c: c.__name__)}
+    items = [get_args(a)[0] for a in options if get_origin(a) in (tuple, list)]
     if classes and isinstance(data, list) and items:
         return tuple(decode(d, items[0], _nth(where, i), arrays) for i, d in enumerate(data, 1))
     if items and isinstance(data, list) and not _forms(expected):  # of arrays, each of its own shape
         return tuple(decode(d, items[0], _nth(where, i), arrays) for i, d in enumerate(data, 1))
     number = isinstance(data, (int, float)) and not isinstance(data, bool) and (float, 0) in _forms(expected)
-    if any(is_module(a) for a in choices) and not number:
-        plain = [a.__name__ for a in choices if is_module(a) and not inspect.isabstract(a)]
-        return _object(data, classes, any(inspect.isabstract(a) for a in choices), where, arrays, plain)
-    if enums := [a for a in choices if is_enum(a)]:
+    if any(is_module(a) for a in options) and not number:
+        plain = [a.__name__ for a in options if is_module(a) and not inspect.isabstract(a)]
+        return _object(data, classes, any(inspect.isabstract(a) for a in options), where, arrays, plain)
+    if enums := [a for a in options if is_enum(a)]:
         words = [member.value for member in enums[0]]
         _require(isinstance(data, str) and data in words, where, f"must be one of {_quoted(words)}, got {_short(data)}")
         return enums[0](data)
@@ -211,7 +226,7 @@ def _object(
     table = {"kind": data} if isinstance(data, str) else data
     _require(classes or opened, where, "takes an object of Python, which files cannot hold: leave it out")
     choice = f"one of {', '.join(classes)}" if len(classes) > 1 else next(iter(classes), "a class of your own")
-    evident = plain if len(plain) == 1 else [name for name, c in classes.items() if c in CLASSES]
+    evident = plain if len(plain) == 1 else [name for name, c in classes.items() if is_own(c)]
     _require(isinstance(table, dict), where, f"must be a table with a kind, {choice}, got {_short(data)}")
     _require("kind" in table or len(evident) == 1, where, f"needs a kind: {choice}")
     kind = table.get("kind", *evident) if len(evident) == 1 else table["kind"]

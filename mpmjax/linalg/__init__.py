@@ -4,51 +4,36 @@ Products, determinants, decompositions and functions of symmetric matrices. All 
 `principal_frame` can be differentiated to every order, at repeated stretches and eigenvalues too.
 """
 
-from mpmjax.linalg._finite import finite
 from mpmjax.linalg._matrices import (
-    assemble,
-    cofactor,
-    cofactor_differential,
-    determinant,
-    diagonal,
-    double_dot,
-    entries,
-    identity_like,
-    matmul,
-    matrix_of,
-    symmetric,
-    trace,
-    transpose,
-    upper_triangle,
+    assemble as assemble,
+    cofactor as cofactor,
+    cofactor_differential as cofactor_differential,
+    determinant as determinant,
+    diagonal as diagonal,
+    double_dot as double_dot,
+    entries as entries,
+    finite as finite,
+    identity_like as identity_like,
+    matmul as matmul,
+    matrix_of as matrix_of,
+    symmetric as symmetric,
+    trace as trace,
+    transpose as transpose,
+    upper_triangle as upper_triangle,
 )
-from mpmjax.linalg._principal import pairs, principal_frame, principal_modes, symmetric_eigen
-from mpmjax.linalg._rotation import rotation, rotation_differential, spin_compliance
-from mpmjax.linalg._spectral import AbstractSpectral, Logarithm, PowerLessOne
-
-__all__ = [
-    "AbstractSpectral",
-    "Logarithm",
-    "PowerLessOne",
-    "assemble",
-    "cofactor",
-    "cofactor_differential",
-    "determinant",
-    "diagonal",
-    "double_dot",
-    "entries",
-    "finite",
-    "identity_like",
-    "matmul",
-    "matrix_of",
-    "pairs",
-    "principal_frame",
-    "principal_modes",
-    "rotation",
-    "rotation_differential",
-    "spin_compliance",
-    "symmetric",
-    "symmetric_eigen",
-    "trace",
-    "transpose",
-    "upper_triangle",
-]
+from mpmjax.linalg._principal import (
+    pairs as pairs,
+    principal_frame as principal_frame,
+    principal_modes as principal_modes,
+    symmetric_eigen as symmetric_eigen,
+)
+from mpmjax.linalg._rotation import (
+    rotation as rotation,
+    rotation_differential as rotation_differential,
+    spin_compliance as spin_compliance,
+)
+from mpmjax.linalg._spectral import (
+    AbstractSpectral as AbstractSpectral,
+    Logarithm as Logarithm,
+    PowerLessOne as PowerLessOne,
+)

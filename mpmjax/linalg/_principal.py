@@ -9,8 +9,7 @@ from jax.core import ShapedArray
 from mpmjax._types import Array, Float, Matrix
 from mpmjax.autodiff import ruled
 from mpmjax.linalg._matrices import assemble, entries, identity_like, matmul, transpose
-from mpmjax.linalg._native import matrices_fit
-from mpmjax.linalg._rotation import rotation
+from mpmjax.linalg._rotation import matrices_fit, rotation
 from mpmjax.native import native_primitive
 
 _SWEEPS = {1: 0, 2: 1, 3: 4}  # by dimension: in 2-D one rotation is the closed form; 3-D converges quadratically

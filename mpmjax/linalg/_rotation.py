@@ -1,7 +1,10 @@
 """The rotation of the polar decomposition of small matrices, and its differential."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import ShapedArray
 
 from mpmjax._types import Array, Compliance, Matrix
@@ -19,11 +22,16 @@ from mpmjax.linalg._matrices import (
     trace,
     transpose,
 )
-from mpmjax.linalg._native import matrices_fit
 from mpmjax.native import native_primitive
 
 _NEWTON_STEPS = 30  # on the quartic of the 3-D rotation: halves the error at a double root, else squares it
 _POLISH_STEPS = 2  # on the rotation itself
+
+
+def matrices_fit(avals: Any, batched: int) -> bool:
+    """Whether the library has a kernel for these: 3 x 3, of single or double precision."""
+    (aval,) = avals
+    return aval.shape[batched : batched + 2] == (3, 3) and aval.dtype in (np.float32, np.float64)
 
 
 @ruled

@@ -15,8 +15,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 from mpmjax.checks import require_fields, require_moduli
 from mpmjax.material._law import AbstractElastic
-from mpmjax.material._projection import projected_tangent
-from mpmjax.material._tangent import AbstractTangent, MatrixTangent, PrincipalTangent
+from mpmjax.material._tangent import AbstractTangent, MatrixTangent, PrincipalTangent, projected_tangent
 
 _STRETCHES = (1.25, 0.8, 1.0)
 """Where a law is asked whether it is isotropic: they differ and keep the volume, whose energy may hide the rest."""

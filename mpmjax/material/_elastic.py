@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Compliance, Float, Matrix, PerParticle
 from mpmjax.material._base import AbstractIsotropic
-from mpmjax.material._isotropic_tangent import isotropic_matrix
-from mpmjax.material._tangent import AbstractTangent, PrincipalTangent
+from mpmjax.material._tangent import AbstractTangent, PrincipalTangent, isotropic_matrix
 
 
 class FixedCorotated(AbstractIsotropic):

@@ -7,8 +7,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
 from mpmjax.linalg import Logarithm, PowerLessOne
 from mpmjax.material._base import AbstractIsotropic
-from mpmjax.material._isotropic_tangent import IsotropicTangent
-from mpmjax.material._tangent import PrincipalTangent
+from mpmjax.material._tangent import IsotropicTangent, PrincipalTangent
 
 _log = Logarithm()
 

@@ -1,19 +1,52 @@
 """What a step asks of a law, elastic or with a history."""
 
 import abc
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Bool, Deformation, Float, Scalar, components
+from mpmjax import linalg as la
+from mpmjax._types import Array, Bool, Deformation, Float, Matrix, PerParticle, Scalar, components
 from mpmjax.checks import require
-from mpmjax.material._freedom import Freedom
 from mpmjax.material._kinematics import DEFORMATION_GRADIENT, AbstractKinematics
 from mpmjax.material._tangent import AbstractTangent
-from mpmjax.material._viscosity import Viscosity
+
+
+class Freedom(NamedTuple):
+    """What a rigid body may do."""
+
+    directions: tuple[bool, ...] | None
+    """In which directions it may move, one bool each; None for all of them."""
+    turns: bool
+    """Whether it may turn."""
+
+    @property
+    def guided(self) -> bool:
+        """Whether there is anything that it may not do."""
+        return not self.turns or not all(self.directions or ())
+
+
+class Viscosity(eqx.Module):
+    """A Newtonian viscous stress, linear in the velocity gradient L = ∇_x v."""
+
+    shear: PerParticle
+    """η [Pa s]."""
+    bulk: PerParticle
+    """ζ [Pa s]."""
+
+    def stress(self, L: Matrix) -> Matrix:
+        """σ_v = 2η dev D + ζ tr(D) I [Pa], D = ½ (L + Lᵀ), dev D = D − ⅓ tr(D) I in every dimension."""
+        twice = L + la.transpose(L)
+        spherical = (self.bulk - 2 / 3 * self.shear) * la.trace(L)
+        return self.shear * twice + spherical * la.identity_like(L)
+
+    def stiffest(self, dim: int) -> Array:
+        """The largest eigenvalue [Pa s] of L ↦ σ_v: 2η for shear, 2η (1 − d/3) + dζ for even expansion."""
+        even = 2 * (1 - dim / 3) * self.shear + dim * self.bulk
+        return jnp.asarray(even) if dim == 1 else jnp.maximum(2 * self.shear, even)
 
 
 class AbstractLaw(eqx.Module):

@@ -11,9 +11,68 @@ from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
 from mpmjax.checks import as_plain, require, require_fields, require_finite, require_positive, require_that
 from mpmjax.linalg import PowerLessOne
 from mpmjax.material._base import AbstractMaterial
-from mpmjax.material._isotropic_tangent import IsotropicTangent
-from mpmjax.material._power_sum import AbstractPowerSum, FirstInvariant, PowerSum, SecondInvariant
-from mpmjax.material._tangent import PrincipalTangent
+from mpmjax.material._tangent import IsotropicTangent, PrincipalTangent
+
+
+class AbstractPowerSum(eqx.Module):
+    """A power sum T_α of the isochoric stretches.
+
+    Its derivative is ∂T/∂F = α F⁻ᵀ D, with the deviator D = C̄^{α/2} − T/3 I of the isochoric C̄ = J^−2/3 C.
+    """
+
+    exponent: eqx.AbstractVar[PerParticle]
+    """α [-]."""
+
+    @abc.abstractmethod
+    def strain(self, F: Matrix, log_J: Array) -> Matrix:
+        """C̄^{α/2} − I, shape (d, d, *p).
+
+        Args:
+            F: deformation gradient [-], shape (d, d, *p).
+            log_J: ln J [-], shape (*p).
+        """
+
+    def excess(self, trace: Array, log_J: Array, dim: int) -> Array:
+        """T − 3 [-], shape (*p), zero at rest.
+
+        Args:
+            trace: that of `strain` in the d directions of F [-], shape (*p).
+            log_J: ln J [-], shape (*p).
+            dim: d.
+        """
+        return trace + (3 - dim) * jnp.expm1(-self.exponent / 3 * log_J)
+
+
+class FirstInvariant(AbstractPowerSum):
+    """Ī1 = T_2."""
+
+    exponent: PerParticle = eqx.field(static=True, default=2)
+
+    def strain(self, F: Matrix, log_J: Array) -> Matrix:
+        """J^−2/3 C − I."""
+        return jnp.exp(-2 / 3 * log_J) * la.matmul(la.transpose(F), F) - la.identity_like(F)
+
+
+class SecondInvariant(AbstractPowerSum):
+    """Ī2 = T_−2."""
+
+    exponent: PerParticle = eqx.field(static=True, default=-2)
+
+    def strain(self, F: Matrix, log_J: Array) -> Matrix:
+        """J^2/3 C⁻¹ − I, by the cofactor matrix J F⁻ᵀ."""
+        cofactor = la.cofactor(F)
+        return jnp.exp(-4 / 3 * log_J) * la.matmul(la.transpose(cofactor), cofactor) - la.identity_like(F)
+
+
+class PowerSum(AbstractPowerSum):
+    """T_α of any exponent, by the eigenvalues of C. Its derivatives hold at repeated stretches."""
+
+    exponent: PerParticle
+
+    def strain(self, F: Matrix, log_J: Array) -> Matrix:
+        """J^{−α/3} C^{α/2} − I."""
+        exponent = self.exponent * jnp.ones_like(log_J)
+        return PowerLessOne(exponent / 2, -exponent / 3 * log_J)(la.matmul(la.transpose(F), F))
 
 
 class Work(NamedTuple):

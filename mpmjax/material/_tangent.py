@@ -2,12 +2,16 @@
 
 import abc
 from collections.abc import Callable
+from functools import reduce
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, Float, Matrix
+from mpmjax.autodiff import ruled
 
 
 class AbstractTangent(eqx.Module):
@@ -92,3 +96,125 @@ class PrincipalTangent(eqx.Module):
 
         entries = [[scaling(i, j) for j in range(d)] for i in range(d)]
         return cls(over_pairs(twist), over_pairs(flip), la.assemble(entries))
+
+
+class IsotropicTangent(AbstractTangent):
+    """The stress differential as the derivative of an isotropic law's stress."""
+
+    law: Any
+    """A law of F with `stress` and a closed form of `principal_tangent`."""
+    F: Matrix
+
+    def __call__(self, dF: Matrix) -> Matrix:
+        return jax.jvp(self.law.stress, (self.F,), (dF,))[1]
+
+    def pushed_forward(self, A: Matrix, weight: Float[Array, "*p"]) -> Float[Array, "t *p"]:
+        return isotropic_matrix(self.law, self.F, A, weight)
+
+
+def isotropic_matrix(law: Any, F: Matrix, A: Matrix, weight: Float[Array, "*p"]) -> Float[Array, "t *p"]:
+    """`AbstractTangent.pushed_forward` by the law's `principal_tangent`.
+
+    With F = U diag(s) Vᵀ and R = A V, and of the eigenstructure the scaling S_ij and for each pair h and g, half the
+    sum of flip and twist and half their difference, the matrix is
+
+        K_(ba)(dc) = w (Σ_ij S_ij U_ai R_bi U_cj R_dj + Σ_i≠j U_ai R_bj (h_ij U_ci R_dj + g_ij U_cj R_di)).
+
+    Its factors, products of two components, are computed before the sums, so that no component repeats them.
+
+    Args:
+        law: a law of F with `principal_tangent`.
+        F: deformation gradient [-], shape (d, d, *p).
+        A: as there.
+        weight: w, as there.
+    """
+    d, (U, s, V) = len(F), la.principal_frame(F)
+    at = jax.tree.map(lambda part: weight * part, law.principal_tangent(s))
+    U, V, at = jax.lax.optimization_barrier((U, V, at))
+    R, none = la.matmul(A, V), jnp.zeros_like(s[0])
+    mixed = jnp.stack([R[:, None, i] * U[None, :, i] for i in range(d)])  # R_bi U_ai
+    left, right = (jnp.stack([B[:, None, i] * B[None, :, i] for i in range(d)]) for B in (U, R))
+
+    def over_pairs(entry: Array) -> Matrix:
+        """The symmetric matrix of a number for each pair."""
+        place = {pair: entry[k] for k, pair in enumerate(la.pairs(d))}
+        return la.assemble([[place.get((min(i, j), max(i, j)), none) for j in range(d)] for i in range(d)])
+
+    def summed(coefficients: Matrix, terms: Float[Array, "d a b *p"]) -> Float[Array, "d a b *p"]:
+        """Σ_j c_ij M_j."""
+        return (coefficients[:, :, None, None] * terms).sum(axis=1)
+
+    scaled = summed(at.scaling, mixed)
+    straight = summed(over_pairs((at.flip + at.twist) / 2), right)
+    crossed = summed(over_pairs((at.flip - at.twist) / 2), mixed)
+    mixed, left, scaled, straight, crossed = jax.lax.optimization_barrier((mixed, left, scaled, straight, crossed))
+
+    def row(b: int, a: int) -> Array:
+        """The row of G_ab."""
+        terms = [
+            scaled[i, b, a] * mixed[i] + straight[i, b][:, None] * left[i, a] + mixed[i, :, a][:, None] * crossed[i, b]
+            for i in range(d)
+        ]
+        return reduce(jnp.add, terms).reshape(d * d, *s.shape[1:])
+
+    return jnp.concatenate([row(b, a)[b * d + a :] for b in range(d) for a in range(d)])
+
+
+def projected_tangent(law: Any, F: Matrix) -> MatrixTangent:
+    """δP = A⁺ : δF, A⁺ being A = ∂²Ψ/∂F∂F with its negative eigenvalues set to zero (J. Teran, E. Sifakis, G. Irving,
+    R. Fedkiw, SCA 2005, doi 10.1145/1073368.1073394): of the positive semi-definite maps, the nearest to A. In closed
+    form: no eigenvalue problem larger than d x d is solved.
+
+    Its first derivative with respect to F and the law's parameters is exact, at repeated stretches too: with E the
+    eigenvectors of A and λ its eigenvalues, δA⁺ = E (K ∘ Eᵀ δA E) Eᵀ, K_kl = (λ_k⁺ − λ_l⁺)/(λ_k − λ_l) (J. L. Daleckii,
+    S. G. Krein; N. J. Higham, Functions of Matrices, SIAM 2008, theorem 3.11, doi 10.1137/1.9780898717778), the limit
+    of K being 1 where both are positive and 0 where both are negative.
+
+    *When it breaks*: the law must be isotropic. Second derivatives are refused. Where an eigenvalue is zero A⁺ has a
+    kink; the derivative given is the mean of the two sides, which is what a central difference tends to. At F = I that
+    is so: all twists are zero.
+
+    Args:
+        law: a law of F, with `tangent` and `principal_tangent`.
+        F: deformation gradient [-], shape (d, d, p).
+    """
+    return MatrixTangent(_projected_matrix(law, F))
+
+
+@ruled
+def _projected_matrix(law: Any, F: Matrix) -> Float[Array, "m m *p"]:
+    values, modes = _spectrum(law, F)
+    return _in_modes(modes, la.diagonal(jnp.maximum(values, 0)))
+
+
+@_projected_matrix.defjvp
+def _projected_matrix_jvp(primals: tuple[Any, Matrix], tangents: tuple[Any, Matrix | None]) -> tuple[Array, Array]:
+    values, modes = _spectrum(*primals)
+
+    def in_frame(law: Any, F: Matrix) -> Array:
+        """Eᵀ A E, the frame held fixed."""
+        images = jax.vmap(law.tangent(F))(modes.reshape(-1, *F.shape)).reshape(modes.shape)
+        return la.matmul(modes, jnp.swapaxes(images, 0, 1))
+
+    change = eqx.filter_jvp(in_frame, primals, tangents)[1]
+    positive, size = jnp.maximum(values, 0), jnp.abs(values)
+    total = size[:, None] + size
+    # for every pair of signs the quotient of differences is this one of sums, which cancels nowhere
+    K = jnp.where(total == 0, 0.5, (positive[:, None] + positive) / jnp.where(total == 0, 1, total))
+    return _in_modes(modes, la.diagonal(positive)), _in_modes(modes, K * change)
+
+
+def _spectrum(law: Any, F: Matrix) -> tuple[Float[Array, "m *p"], Float[Array, "m m *p"]]:
+    """Eigenvalues λ_k of ∂²Ψ/∂F∂F and its eigenvectors E_ka, a over components in C order."""
+    U, s, V = la.principal_frame(F)
+    tangent = law.principal_tangent(s)
+    scalings, Q = la.symmetric_eigen(tangent.scaling)
+    d, modes = F.shape[0], la.principal_modes(U, V)
+    modes = modes.reshape(d * d, d * d, *F.shape[2:])
+    modes = jnp.concatenate([la.matmul(la.transpose(Q), modes[:d]), modes[d:]])
+    return jnp.concatenate([scalings, tangent.twist, tangent.flip]), modes
+
+
+def _in_modes(modes: Float[Array, "m m *p"], core: Float[Array, "m m *p"]) -> Float[Array, "m m *p"]:
+    """Σ_kl E_ka core_kl E_lb."""
+    return la.matmul(jnp.swapaxes(modes, 0, 1), la.matmul(core, modes))

@@ -5,8 +5,7 @@ from typing import Any
 from mpmjax._types import Array, Deformation, Float, PerParticle, Scalar
 from mpmjax.checks import require, require_between, require_fields
 from mpmjax.material._kinematics import AbstractKinematics
-from mpmjax.material._law import AbstractElastic, AbstractLaw
-from mpmjax.material._viscosity import Viscosity
+from mpmjax.material._law import AbstractElastic, AbstractLaw, Viscosity
 
 
 class Viscous(AbstractLaw):

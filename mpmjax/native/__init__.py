@@ -1,8 +1,10 @@
 """The compiled library of CPUs: whether there is one, and how JAX calls it."""
 
-from mpmjax.native._backend import Backend, backend, is_native
-from mpmjax.native._lowering import sums_fit
-from mpmjax.native._primitive import differentiable, members, native_primitive
-from mpmjax.native._stored import stored
-
-__all__ = ["Backend", "backend", "differentiable", "is_native", "members", "native_primitive", "stored", "sums_fit"]
+from mpmjax.native._library import Backend as Backend, backend as backend, is_native as is_native
+from mpmjax.native._primitive import (
+    differentiable as differentiable,
+    members as members,
+    native_primitive as native_primitive,
+    sums_fit as sums_fit,
+)
+from mpmjax.native._stored import stored as stored

@@ -6,9 +6,8 @@ import jax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from mpmjax.native._backend import uses_native
-from mpmjax.native._library import target
-from mpmjax.native._lowering import is_divided
+from mpmjax.native._library import target, uses_native
+from mpmjax.native._primitive import is_divided
 
 
 def stored(tree: Any) -> Any:

@@ -1,25 +1,17 @@
 """Rollouts: many steps, driven by diffrax, and their faults in words."""
 
-from mpmjax.simulation._faults import MOST_LEFT_UNDONE, raise_faults, warn_of_inaccuracy
-from mpmjax.simulation._rollout_state import RolloutState, initial_state
-from mpmjax.simulation._run import Run, SimulationError
-from mpmjax.simulation._simulate import before_fault, integrate, number_of_steps, rollout, simulate
-from mpmjax.simulation._statistics import Fault, RunStatistics, no_steps
-
-__all__ = [
-    "MOST_LEFT_UNDONE",
-    "Fault",
-    "RolloutState",
-    "Run",
-    "RunStatistics",
-    "SimulationError",
-    "before_fault",
-    "initial_state",
-    "integrate",
-    "no_steps",
-    "number_of_steps",
-    "raise_faults",
-    "rollout",
-    "simulate",
-    "warn_of_inaccuracy",
-]
+from mpmjax.simulation._faults import (
+    MOST_LEFT_UNDONE as MOST_LEFT_UNDONE,
+    raise_faults as raise_faults,
+    warn_of_inaccuracy as warn_of_inaccuracy,
+)
+from mpmjax.simulation._rollout_state import RolloutState as RolloutState, initial_state as initial_state
+from mpmjax.simulation._run import Run as Run, SimulationError as SimulationError
+from mpmjax.simulation._simulate import (
+    before_fault as before_fault,
+    integrate as integrate,
+    number_of_steps as number_of_steps,
+    rollout as rollout,
+    simulate as simulate,
+)
+from mpmjax.simulation._statistics import Fault as Fault, RunStatistics as RunStatistics, no_steps as no_steps

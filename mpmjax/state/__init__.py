@@ -1,80 +1,57 @@
 """Particles, scene and what a step needs of them."""
 
-from mpmjax.state._attachment import AbstractPlace, AttachedPoints, Patch, PointsAt
-from mpmjax.state._averaged_volume import AveragedTangent, AveragedVolume, VolumeAverage
-from mpmjax.state._bodies import Bodies
-from mpmjax.state._body_force import AbstractBodyForce
-from mpmjax.state._couple import Couple
-from mpmjax.state._description import AbstractDescription, TotalLagrangian, UpdatedLagrangian
-from mpmjax.state._fill import fill, fill_mapped
-from mpmjax.state._loaded_points import LoadedPoints
-from mpmjax.state._loads import AbstractLoad, PointLoad, Pressure, Spring, Traction, load_force, points_of, supports_of
-from mpmjax.state._material_points import MaterialPoints
-from mpmjax.state._order import (
-    MemoryOrder,
-    Rearrangement,
-    attached_particles,
-    given_order,
-    places,
-    rearrangement,
-    whole_numbers,
+from mpmjax.state._attachment import (
+    AbstractPlace as AbstractPlace,
+    AttachedPoints as AttachedPoints,
+    Patch as Patch,
+    PointsAt as PointsAt,
 )
-from mpmjax.state._oversights import warn_of_crowding, warn_of_rounding
-from mpmjax.state._particles import Particles, State, by_material, history_arrays, join, state_of, with_state
-from mpmjax.state._preparation import is_prepared, prepare
-from mpmjax.state._scene import RigidMaterial, Scene, attach
-from mpmjax.state._support import Support, SupportStiffness, stiffness_of
-from mpmjax.state._velocity_gradient import velocity_gradient
-
-__all__ = [
-    "AbstractBodyForce",
-    "AbstractDescription",
-    "AbstractLoad",
-    "AbstractPlace",
-    "AttachedPoints",
-    "AveragedTangent",
-    "AveragedVolume",
-    "Bodies",
-    "Couple",
-    "LoadedPoints",
-    "MaterialPoints",
-    "MemoryOrder",
-    "Particles",
-    "Patch",
-    "PointLoad",
-    "PointsAt",
-    "Pressure",
-    "Rearrangement",
-    "RigidMaterial",
-    "Scene",
-    "Spring",
-    "State",
-    "Support",
-    "SupportStiffness",
-    "TotalLagrangian",
-    "Traction",
-    "UpdatedLagrangian",
-    "VolumeAverage",
-    "attach",
-    "attached_particles",
-    "by_material",
-    "fill",
-    "fill_mapped",
-    "given_order",
-    "history_arrays",
-    "is_prepared",
-    "join",
-    "load_force",
-    "places",
-    "points_of",
-    "prepare",
-    "rearrangement",
-    "state_of",
-    "stiffness_of",
-    "supports_of",
-    "velocity_gradient",
-    "warn_of_crowding",
-    "warn_of_rounding",
-    "whole_numbers",
-    "with_state",
-]
+from mpmjax.state._averaged_volume import (
+    AveragedTangent as AveragedTangent,
+    AveragedVolume as AveragedVolume,
+    VolumeAverage as VolumeAverage,
+)
+from mpmjax.state._bodies import Bodies as Bodies
+from mpmjax.state._description import (
+    AbstractDescription as AbstractDescription,
+    TotalLagrangian as TotalLagrangian,
+    UpdatedLagrangian as UpdatedLagrangian,
+)
+from mpmjax.state._fill import fill as fill, fill_mapped as fill_mapped
+from mpmjax.state._loaded_points import LoadedPoints as LoadedPoints
+from mpmjax.state._loads import (
+    AbstractBodyForce as AbstractBodyForce,
+    AbstractLoad as AbstractLoad,
+    Couple as Couple,
+    PointLoad as PointLoad,
+    Pressure as Pressure,
+    Spring as Spring,
+    Traction as Traction,
+    load_force as load_force,
+    points_of as points_of,
+    supports_of as supports_of,
+)
+from mpmjax.state._material_points import MaterialPoints as MaterialPoints
+from mpmjax.state._order import (
+    MemoryOrder as MemoryOrder,
+    Rearrangement as Rearrangement,
+    attached_particles as attached_particles,
+    given_order as given_order,
+    places as places,
+    rearrangement as rearrangement,
+    whole_numbers as whole_numbers,
+)
+from mpmjax.state._oversights import warn_of_crowding as warn_of_crowding, warn_of_rounding as warn_of_rounding
+from mpmjax.state._particles import (
+    Particles as Particles,
+    State as State,
+    by_material as by_material,
+    history_arrays as history_arrays,
+    join as join,
+    state_of as state_of,
+    with_state as with_state,
+)
+from mpmjax.state._preparation import is_prepared as is_prepared, prepare as prepare
+from mpmjax.state._scene import RigidMaterial as RigidMaterial, Scene as Scene, attach as attach
+from mpmjax.state._support import Support as Support, SupportStiffness as SupportStiffness, stiffness_of as stiffness_of
+from mpmjax.state._velocity_gradient import velocity_gradient as velocity_gradient

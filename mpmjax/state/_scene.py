@@ -32,9 +32,8 @@ from mpmjax.geometry import Motion
 from mpmjax.material import AbstractLaw, Freedom
 from mpmjax.state._averaged_volume import AveragedVolume, VolumeAverage, volume_average
 from mpmjax.state._bodies import Bodies
-from mpmjax.state._body_force import AbstractBodyForce
 from mpmjax.state._description import AbstractDescription, UpdatedLagrangian
-from mpmjax.state._loads import AbstractLoad
+from mpmjax.state._loads import AbstractBodyForce, AbstractLoad
 from mpmjax.state._material_points import MaterialPoints, material_points, return_map
 from mpmjax.state._particles import Group, Particles
 

@@ -14,7 +14,7 @@ from mpmjax.material import AbstractMaterial, FixedCorotated, Hencky
 from mpmjax.simulation import simulate
 from mpmjax.state import Particles
 from mpmjax.stepping import AbstractIntegrator, BackwardEuler, SemiImplicit
-from mpmjax.verification._problem import (
+from mpmjax.verification._exact_problem import (
     AbstractProblem,
     discretise,
     displacement_error,

@@ -10,7 +10,7 @@ from mpmjax._types import Array, Float
 from mpmjax.simulation import Run, simulate
 from mpmjax.state import Particles
 from mpmjax.stepping import AbstractIntegrator, Explicit
-from mpmjax.verification._problem import AbstractProblem, discretise, displacement_error
+from mpmjax.verification._exact_problem import AbstractProblem, discretise, displacement_error
 
 _SAMPLES = 10
 Measure = Callable[[AbstractProblem, Particles, Run], Float[Array, "f"]]

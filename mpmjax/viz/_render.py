@@ -86,8 +86,12 @@ def render(
     shown = [len(run) - 1 if frame is None else frame % len(run)] if still else range(len(run))
     label, value = ("", lambda run, q: np.full(q.count, np.nan)) if colour is None else known[colour]
     values = np.stack([np.asarray(value(run, run.frame(i))) for i in shown])
-    from matplotlib import animation, cm, colors  # here, since it takes a second that only pictures should pay
-    from matplotlib import pyplot as plt
+    from matplotlib import (  # here, since it takes a second that only pictures should pay
+        animation,
+        cm,
+        colors,
+        pyplot as plt,
+    )
 
     bar = None
     if colour is not None:

@@ -1,0 +1,341 @@
+"""Problems whose motion is known: of boxes, bars, rings, vortices and waves; and the collision of two disks."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Float, NodeVector, Scalar
+from mpmjax.boundary import AbstractBoundary, Conditions, SlipBox, SymmetryPlane
+from mpmjax.checks import require
+from mpmjax.discretisation import Grid
+from mpmjax.geometry import Annulus, Ball, Box
+from mpmjax.material import AbstractMaterial, FixedCorotated, NeoHookean
+from mpmjax.state import Particles, Scene, fill
+from mpmjax.verification._exact_problem import AbstractProblem, Ends, box_boundary, box_grid
+
+_PHASES = {1: (0.0,), 2: (0.0, 1.0), 3: (0.0, 2 / 3, 4 / 3)}  # of π
+
+
+class AxisAligned(AbstractProblem):
+    """u_i = A sin(πX_i) sin(πct + φ_i) on the unit box, c² = E/ρ0 (M. Steffen, P. C. Wallstedt, J. E. Guilkey,
+    R. M. Kirby, M. Berzins, Comput. Model. Eng. Sci. 31 (2008) 107).
+
+    φ = (0, π) in 2-D, (0, 2π/3, 4π/3) in 3-D. The motion is odd at the faces, so it is periodic over [−1, 1]^d.
+
+    Args:
+        amplitude: A [m], below 1/π. 0.05 deforms by up to 16 per cent.
+        dim: space dimension.
+        ends: boundary at the faces.
+        material: any law; its Young's modulus sets c.
+        density: ρ0 [kg/m^d].
+    """
+
+    amplitude: float = 0.05
+    dim: int = eqx.field(static=True, default=2)
+    ends: Ends = eqx.field(static=True, default=Ends.PERIODIC)
+    material: AbstractMaterial = NeoHookean(1e7, 0.3)
+    density: float = 1e3
+    forced: bool = eqx.field(static=True, default=True)
+
+    @property
+    def duration(self) -> float:
+        """One period, 2/c [s]."""
+        return 2 / float(self._speed)
+
+    def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
+        phase = jnp.pi * jnp.asarray(_PHASES[self.dim], X.dtype)
+        return X + self.amplitude * jnp.sin(jnp.pi * X) * jnp.sin(jnp.pi * self._speed * t + phase)
+
+    def grid(self, cells: int) -> Grid:
+        return box_grid(*self._corners(), cells, self.ends)
+
+    def body(self, cells: int) -> Box:
+        del cells
+        return Box(*self._corners())
+
+    def boundary(self) -> tuple[AbstractBoundary, ...]:
+        return box_boundary(*self._corners(), self.ends)
+
+    @property
+    def _speed(self) -> Any:
+        law: Any = self.material
+        return (law.youngs_modulus / self.density) ** 0.5
+
+    def _corners(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        return ((-1.0 if self.ends is Ends.PERIODIC else 0.0),) * self.dim, (1.0,) * self.dim
+
+
+class VibratingBar(AbstractProblem):
+    """v = v0 cos(ωt) sin(βX), β = (2n − 1)π/2L, ω = β√(E/ρ0), on 0 ≤ X ≤ L.
+
+    Exact at any amplitude in one dimension with ν = 0, where P = E (F − 1) is linear. The free end needs no
+    condition.
+
+    Args:
+        speed: v0 [m/s].
+        mode: n, from 1.
+        length: length L of the bar [m].
+    """
+
+    speed: float = 0.1
+    mode: int = eqx.field(static=True, default=1)
+    length: float = eqx.field(static=True, default=25.0)
+    material: AbstractMaterial = FixedCorotated(100.0, 0.0)
+    density: float = 1.0
+    dim: int = eqx.field(static=True, default=1)
+    forced: bool = eqx.field(static=True, default=False)
+
+    @property
+    def wave_number(self) -> float:
+        """β [1/m]."""
+        return (2 * self.mode - 1) * math.pi / (2 * self.length)
+
+    @property
+    def frequency(self) -> float:
+        """ω [1/s]."""
+        return self.wave_number * self.wave_speed
+
+    @property
+    def duration(self) -> float:
+        """One period [s]."""
+        return 2 * math.pi / self.frequency
+
+    def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
+        omega = self.frequency
+        return X + self.speed / omega * jnp.sin(omega * t) * jnp.sin(self.wave_number * X)
+
+    def grid(self, cells: int) -> Grid:
+        return box_grid((0.0,), (self.length,), cells, Ends.MIRRORED)
+
+    def body(self, cells: int) -> Box:
+        del cells
+        return Box((0.0,), (self.length,))
+
+    def boundary(self) -> tuple[AbstractBoundary, ...]:
+        """Fixed at X = 0."""
+        return (SymmetryPlane(0, 0.0),)
+
+
+class ExpandingRing(AbstractProblem):
+    """x = X (1 + A sin(πct) U(R)/R), c² = E/ρ0, on Ri ≤ R ≤ Ro, with
+    U = (6 Ri Ro R − 3 (Ri + Ro) R² + 2 R³) / (Ri² (3 Ro − Ri)) (radii and conditions of the expanding ring of
+    P. C. Wallstedt, J. E. Guilkey, J. Comput. Phys. 227 (2008) 9628, doi 10.1016/j.jcp.2008.07.019).
+
+    The displacement of the inner edge is A sin(πct). U′ vanishes at both edges, so that with ν = 0 they are free of
+    traction at every amplitude. The grid has no part in the shape.
+
+    Args:
+        amplitude: A [m], below Ri.
+        inner: Ri [m].
+        outer: Ro [m].
+        material: a law with ν = 0, of which the radial stress vanishes at a radial stretch of one.
+        density: ρ0 [kg/m²].
+    """
+
+    amplitude: float = 0.1
+    inner: float = 0.4
+    outer: float = 0.6
+    material: AbstractMaterial = NeoHookean(1e7, 0.0)
+    density: float = 1e3
+    dim: int = eqx.field(static=True, default=2)
+    forced: bool = eqx.field(static=True, default=True)
+
+    @property
+    def duration(self) -> float:
+        """One period, 2/c [s]."""
+        return 2 / float(self._speed)
+
+    def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
+        a, b = self.inner, self.outer
+        R = jnp.sqrt((X**2).sum())
+        over = (6 * a * b - 3 * (a + b) * R + 2 * R**2) / (a**2 * (3 * b - a))
+        return X * (1 + self.amplitude * jnp.sin(jnp.pi * self._speed * t) * over)
+
+    def grid(self, cells: int) -> Grid:
+        return box_grid((-1.0,) * 2, (1.0,) * 2, cells, Ends.PLAIN)
+
+    def body(self, cells: int) -> Annulus:
+        del cells
+        return Annulus((0.0, 0.0), self.inner, self.outer)
+
+    @property
+    def _speed(self) -> Any:
+        law: Any = self.material
+        return (law.youngs_modulus / self.density) ** 0.5
+
+
+_VORTEX_RING = Annulus((0.0, 0.0), 0.75, 1.25)
+
+
+class RestOutside(AbstractBoundary):
+    """A boundary that holds nodes outside of the ring at rest, as the exact motion is at its edges."""
+
+    @property
+    def dim(self) -> int:
+        return 2
+
+    def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
+        del spacing, t, dt, reference
+        outside = _VORTEX_RING.distance(nodes)[:, None] >= 0
+        return Conditions(jnp.broadcast_to(outside, nodes.shape), jnp.zeros_like(nodes))
+
+
+class Vortex(AbstractProblem):
+    """x = Q(g h) X, a rotation by g(t) h(R), g = A sin(πt), h = 1 − 32(R−1)² + 256(R−1)⁴ (K. Kamojjala, R. Brannon,
+    A. Sadeghirad, J. Guilkey, Eng. Comput. 31 (2015) 201, doi 10.1007/s00366-013-0342-x).
+
+    The volume does not change, and the edges of the ring are at rest.
+
+    Args:
+        amplitude: A [rad]. The shear of F reaches 7 A in the ring.
+        material: any law.
+        density: ρ0 [kg/m²].
+    """
+
+    amplitude: float = 0.1
+    material: AbstractMaterial = NeoHookean(1e3, 0.3)
+    density: float = 1e3
+    dim: int = eqx.field(static=True, default=2)
+    forced: bool = eqx.field(static=True, default=True)
+
+    @property
+    def duration(self) -> float:
+        """Duration of the run [s], the time of a turn and its return."""
+        return 1.0
+
+    def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
+        s = (jnp.sqrt((X**2).sum()) - 1) ** 2
+        turn = self.amplitude * jnp.sin(jnp.pi * t) * (1 - 32 * s + 256 * s**2)
+        cos, sin = jnp.cos(turn), jnp.sin(turn)
+        return jnp.stack([cos * X[0] - sin * X[1], sin * X[0] + cos * X[1]])
+
+    def grid(self, cells: int) -> Grid:
+        return box_grid((-1.5,) * 2, (1.5,) * 2, cells, Ends.PLAIN)
+
+    def body(self, cells: int) -> Annulus:
+        del cells
+        return _VORTEX_RING
+
+    def boundary(self) -> tuple[AbstractBoundary, ...]:
+        return (RestOutside(),)
+
+
+_ACROSS = 4  # cells
+
+
+class StandingWave(AbstractProblem):
+    """u₁ = A sin(πX₁) cos(πct) on 0 ≤ X₁ ≤ 1, c² = (λ + 2μ)/ρ0, without any force.
+
+    Exact at every amplitude with F₁₁ > 0: under uniaxial strain fixed corotated elasticity has
+    P₁₁ = (λ + 2μ)(F₁₁ − 1), and no coupling to other directions. In these the body is periodic over four cells.
+
+    Args:
+        amplitude: A [m], below 1/π.
+        dim: space dimension.
+        ends: boundary at X₁ = 0 and 1.
+    """
+
+    amplitude: float = 0.05
+    dim: int = eqx.field(static=True, default=1)
+    ends: Ends = eqx.field(static=True, default=Ends.MIRRORED)
+    material: AbstractMaterial = FixedCorotated(1e4, 0.3)
+    density: float = 1e3
+    forced: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        require(isinstance(self.material, FixedCorotated), "The standing wave is exact for FixedCorotated only.")
+        require(abs(self.amplitude) < 1 / math.pi, f"The amplitude must be below 1/π, got {self.amplitude}.")
+
+    @property
+    def duration(self) -> float:
+        """Half a period [s]."""
+        return 1 / self.wave_speed
+
+    def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
+        law = self.material
+        assert isinstance(law, FixedCorotated)
+        c = jnp.sqrt(jnp.asarray(law.lame_lambda + 2 * law.shear_modulus) / self.density)
+        return X.at[0].add(self.amplitude * jnp.sin(jnp.pi * X[0]) * jnp.cos(jnp.pi * c * t))
+
+    def grid(self, cells: int) -> Grid:
+        along = box_grid(self._ends()[:1], self._ends()[1:], cells, self.ends)
+        across = self.dim - 1
+        return Grid(
+            (*along.shape, *(_ACROSS,) * across),
+            along.spacing,
+            origin=(*along.origin, *(0,) * across),
+            periodic=(*along.periodic, *(True,) * across),
+        )
+
+    def body(self, cells: int) -> Box:
+        (low, high), across = self._ends(), self.dim - 1
+        return Box((low, *(0.0,) * across), (high, *(_ACROSS / cells,) * across))
+
+    def boundary(self) -> tuple[AbstractBoundary, ...]:
+        match self.ends:
+            case Ends.MIRRORED:
+                return (SymmetryPlane(0, 0.0), SymmetryPlane(0, 1.0, keep="below"))
+            case Ends.PLAIN:
+                across = (math.inf,) * (self.dim - 1)
+                return (SlipBox((0.0, *(-a for a in across)), (1.0, *across)),)
+            case Ends.PERIODIC:
+                return ()
+
+    def _ends(self) -> tuple[float, float]:
+        return (-1.0 if self.ends is Ends.PERIODIC else 0.0), 1.0
+
+
+class TwoDisks(eqx.Module):
+    """Two disks that move along a diagonal, collide and part (the scene of D. Sulsky, Z. Chen, H. L. Schreyer, Comput.
+    Methods Appl. Mech. Eng. 118 (1994) 179, doi 10.1016/0045-7825(94)90112-0).
+
+    No exact motion is known. The momentum is zero at all times, the disks touch at t = (‖Δcentre‖ − 2R)/‖Δv‖, and the
+    energy never grows.
+
+    Args:
+        radius: radius R [m].
+        centre: the centres of the disks are ±(centre, centre) [m].
+        speed: their initial velocities are ∓(speed, speed) [m/s].
+        density: ρ0 [kg/m²].
+        material: the law of both.
+    """
+
+    radius: float = 0.2
+    centre: float = 0.3
+    speed: float = 0.1
+    density: float = 1e3
+    material: AbstractMaterial = NeoHookean(1e3, 0.3)
+
+    @property
+    def contact_time(self) -> float:
+        """Time at which the circles touch [s]."""
+        return (2**0.5 * self.centre - self.radius) / (2**0.5 * self.speed)
+
+    def discretise(
+        self, cells: int = 20, *, per_side: int = 2, fitted: bool = False, **choices: Any
+    ) -> tuple[Scene, Particles]:
+        """Scene and particles, with `cells` grid cells to a metre and `per_side` particles to the side of a cell.
+
+        Args:
+            cells: grid cells to a metre.
+            per_side: particles to the side of a cell.
+            fitted: whether they are fitted to the circles (see `fill`).
+            choices: kernel, gradient and transfer of the scene.
+        """
+        half = round(0.75 * cells)
+        grid = Grid((2 * half + 1,) * 2, 1 / cells, origin=(-half,) * 2)
+        disks = [
+            fill(
+                Ball((side * self.centre,) * 2, self.radius),
+                grid,
+                particles_per_cell=per_side**2,
+                density=self.density,
+                velocity=(-side * self.speed,) * 2,
+                fitted=fitted,
+            )
+            for side in (-1, 1)
+        ]
+        return Scene(grid, self.material, **choices), jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *disks)
