@@ -19,7 +19,7 @@ from scipy.stats import qmc
 
 import mpmjax as mpm
 from mpmjax.checks import canonical
-from mpmjax.stepping import particles_to_grid
+from mpmjax.stepping import start_nodes
 
 jax.config.update("jax_enable_x64", True)
 DOCS = Path(__file__).parents[1] / "docs"
@@ -32,7 +32,7 @@ def contact_of(scene: mpm.Scene, particles: mpm.Particles, t: float = 0.0) -> tu
     """The contact of two bodies as it is felt, and the places of its nodes."""
     scene = canonical(scene, particles.x.dtype)
     particles = mpm.prepare(scene, particles)
-    nodes = particles_to_grid(scene, particles, t, jnp.asarray(1e-3), scene.stencil(particles, t))
+    nodes = start_nodes(scene, particles, t, jnp.asarray(1e-3), scene.stencil(particles, t))
     return nodes.contacts[-1], np.asarray(scene.grid.nodes(scene.window(particles)))[: len(nodes.contacts[-1].gap)]
 
 

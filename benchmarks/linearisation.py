@@ -1,4 +1,4 @@
-"""What one linear solve a step leaves undone, beside what it makes wrong.
+"""The linearisation error of one linear solve a step, beside what it makes wrong.
 
     python benchmarks/linearisation.py            # the table, and docs/linearisation.png
     python benchmarks/linearisation.py --quick    # the longest steps alone, no picture
@@ -53,7 +53,7 @@ def block(motion: str) -> tuple[mpm.Scene, mpm.Particles]:
 def compare(
     name: str, scene: mpm.Scene, particles: mpm.Particles, t1: float, dt: float, method: Any
 ) -> tuple[float, float]:
-    """The part left undone, and the error against Newton's method, printed as a row."""
+    """The linearisation error, and the error against Newton's method, printed as a row."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         run, exact = (mpm.simulate(scene, particles, t1=t1, dt=dt, method=m) for m in (method, NEWTON[type(method)]))
@@ -63,13 +63,13 @@ def compare(
     else:
         apart, moved = run.final.x - exact.final.x, exact.final.x - particles.x
         error = float(jnp.sqrt((apart**2).sum() / (moved**2).sum()))
-    undone = float(run.statistics.left_undone.part)
-    print(f"| {name} | `{type(method).__name__}` | {dt:.2g} | {undone:.1e} | {error:.1e} |", flush=True)
-    return undone, error
+    linearisation = float(run.statistics.linearisation_error)
+    print(f"| {name} | `{type(method).__name__}` | {dt:.2g} | {linearisation:.1e} | {error:.1e} |", flush=True)
+    return linearisation, error
 
 
 def draw(series: dict[tuple[str, str], list[tuple[float, float]]]) -> None:
-    """The error over what was left undone, a line a motion and method, from long steps to short ones."""
+    """The error over the linearisation error, a line a motion and method, from long steps to short ones."""
     figure = Figure(figsize=(7.5, 4.2), layout="constrained")
     axes = figure.subplots()
     names = list(dict.fromkeys(name for name, _ in series))
@@ -77,16 +77,16 @@ def draw(series: dict[tuple[str, str], list[tuple[float, float]]]) -> None:
         style = "o-" if method == "SemiImplicit" else "s--"
         axes.loglog(*zip(*points, strict=True), style, color=f"C{names.index(name)}", label=f"{name}, {method}")
     ends = np.array([3e-4, 0.3])
-    axes.loglog(ends, ends, "k:", lw=1, label="error = left undone")
+    axes.loglog(ends, ends, "k:", lw=1, label="error = linearisation error")
     axes.axvline(0.05, color="k", lw=1, label="warning beyond")
-    axes.set(xlabel="left undone, largest of any step [-]", ylabel="error against Newton's method [-]")
+    axes.set(xlabel="linearisation error, largest of any step [-]", ylabel="error against Newton's method [-]")
     axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
     figure.savefig(Path(__file__).parents[1] / "docs" / "linearisation.png", dpi=110)
 
 
 def main(quick: bool) -> None:
     """Print the table, and draw it."""
-    print("| motion | method | Δt [s] | left undone | error |\n|---|---|---|---|---|")
+    print("| motion | method | Δt [s] | linearisation error | error |\n|---|---|---|---|---|")
     series = {}
     for nu in (0.3, 0.49):
         name, case = f"sheet, ν = {nu}", sheet(nu)

@@ -31,7 +31,7 @@ import numpy as np
 
 import mpmjax as mpm
 from mpmjax.implicit._operator import ImplicitOperator
-from mpmjax.stepping._nodes import Nodes, particles_to_grid
+from mpmjax.stepping import Nodes, start_nodes
 
 sys.path.append(str(Path(__file__).parent))
 from gradient import best_of
@@ -117,7 +117,7 @@ class Level(NamedTuple):
 def level(n: int, dt: float, coarser: int, contrast: float) -> tuple[Level, Nodes]:
     """Of one semi-implicit step with β = 1."""
     scene, particles, _ = square(n, coarser=coarser, contrast=contrast)
-    nodes = particles_to_grid(scene, particles, 0.0, jnp.asarray(dt), scene.stencil(particles))
+    nodes = start_nodes(scene, particles, 0.0, jnp.asarray(dt), scene.stencil(particles))
     action = mpm.AnalyticHessian().at_step_start(nodes.potential)
     operator = ImplicitOperator(nodes.mass, jnp.asarray(dt) ** 2, action, nodes.projection)
     weight = mpm.MassPreconditioner().inner_product(operator).weight

@@ -11,10 +11,10 @@ import jax
 import numpy as np
 
 import mpmjax as mpm
+from mpmjax.boundary import ConstrainedNodes
 from mpmjax.checks._values import canonical
-from mpmjax.stepping import _step
-from mpmjax.stepping._nodes import Nodes, particles_to_grid
-from mpmjax.stepping._step import StepInfo, step_unchecked, update
+from mpmjax.stepping import GridUpdate as Update
+from mpmjax.stepping import Nodes, StepInfo, reaction, start_nodes, step_unchecked, update
 
 
 def kernel(order: int, u: float) -> tuple[float, float]:
@@ -156,7 +156,13 @@ class GridUpdate(eqx.Module):
     info: StepInfo
     particles: mpm.Particles
     position: jax.Array
-    update: _step.GridUpdate
+    update: Update
+    held: ConstrainedNodes
+    """The nodes with what contacts hold."""
+    holding: jax.Array
+    """The part of the reaction that holds components of velocity, without springs."""
+    friction: jax.Array
+    """The impulse of friction."""
 
 
 def grid_update(scene: mpm.Scene, particles: mpm.Particles, dt: float, method, t: float = 0.0) -> GridUpdate:
@@ -167,7 +173,7 @@ def grid_update(scene: mpm.Scene, particles: mpm.Particles, dt: float, method, t
 
 @eqx.filter_jit
 def _grid_update(scene, particles, t, dt, method) -> GridUpdate:
-    nodes = particles_to_grid(
+    nodes = start_nodes(
         scene,
         particles,
         t,
@@ -179,4 +185,7 @@ def _grid_update(scene, particles, t, dt, method) -> GridUpdate:
     new, info = step_unchecked(scene, particles, t, dt, method)
     grid = update(nodes, method)
     position = scene.grid.nodes(scene.window(particles))
-    return GridUpdate(nodes, grid.motion.velocity, grid.reaction, info, new, position, grid)
+    held, push = grid.held(nodes), reaction(nodes, grid.solved, grid.elastic)
+    velocity, holding = grid.motion.velocity, held.beside_springs(push)
+    friction = nodes.mass[:, None] * (velocity - grid.solved.velocity)
+    return GridUpdate(nodes, velocity, push, info, new, position, grid, held, holding, friction)

@@ -9,7 +9,7 @@ import pytest
 from helpers import DESCRIPTIONS, block, ids, thorough
 
 import mpmjax as mpm
-from mpmjax.stepping._nodes import particles_to_grid
+from mpmjax.stepping import start_nodes
 
 LAWS = {
     "neo_hookean": mpm.NeoHookean(1e4, 0.49),
@@ -40,7 +40,7 @@ def test_force_and_hessian_are_derivatives_of_the_energy(precomputed, d, law, de
 
     @jax.jit
     def found(u, w):
-        potential = particles_to_grid(scene, particles, 0.0, 1e-3, scene.stencil(particles)).potential
+        potential = start_nodes(scene, particles, 0.0, 1e-3, scene.stencil(particles)).potential
         analytic, jvp = mpm.AnalyticHessian().at(potential, u), mpm.JvpHessian().at(potential, u)
         analytic = analytic.precomputed() if precomputed else analytic
         return potential.force(u), jax.grad(potential.energy)(u), analytic(w), jvp(w)
@@ -58,7 +58,7 @@ def test_a_projected_hessian_is_positive_semidefinite_and_right_without_stress()
 
     @jax.jit
     def matrices(state):
-        potential = particles_to_grid(scene, state, 0.0, 1e-3, scene.stencil(state)).potential
+        potential = start_nodes(scene, state, 0.0, 1e-3, scene.stencil(state)).potential
         hessians = [mpm.AnalyticHessian(projected=projected).at_step_start(potential) for projected in (True, False)]
         return [jax.vmap(hessian.precomputed())(vectors).reshape(vectors.shape[0], -1) for hessian in hessians]
 
@@ -194,7 +194,7 @@ def test_only_the_materials_that_are_named_are_averaged():
     def found():
         (own, other), (single,) = some.material_points(ready), alone.material_points(part)
         assert other.average is None
-        potential = particles_to_grid(some, ready, 0.0, 1e-3, some.stencil(ready)).potential
+        potential = start_nodes(some, ready, 0.0, 1e-3, some.stencil(ready)).potential
         whole, fixed = mpm.JvpHessian().at_step_start(potential), mpm.AnalyticHessian().at_step_start(potential)
         return (own.average(field), single.average(field)), (whole(w), fixed.precomputed()(w))
 

@@ -12,7 +12,7 @@ from helpers import assert_close, assert_files_hold, ids, thorough
 import mpmjax as mpm
 from mpmjax.boundary import Coupling, Patch
 from mpmjax.checks import canonical
-from mpmjax.stepping._nodes import particles_to_grid
+from mpmjax.stepping import start_nodes
 
 LAW = mpm.NeoHookean(1e4, 0.3)
 TIGHT = mpm.ConjugateResidual(rtol=1e-12)
@@ -48,7 +48,7 @@ def touching(scene, particles):
     """The contact of the first two bodies at the start, and the masses of all nodes."""
     scene = canonical(scene, particles.x.dtype)
     particles = mpm.prepare(scene, particles)
-    nodes = particles_to_grid(scene, particles, 0.0, jnp.asarray(1e-3), scene.stencil(particles))
+    nodes = start_nodes(scene, particles, 0.0, jnp.asarray(1e-3), scene.stencil(particles))
     (found,) = nodes.contacts
     return found, nodes.mass
 
@@ -203,7 +203,7 @@ def test_half_of_two_bodies_is_pushed_as_the_whole():
             bodies = [mpm.Particles(*(getattr(b, n)[own] for n in names)) for b, own in zip(bodies, rows, strict=True)]
         scene = mpm.Scene(grid, (LAW, LAW), boundary=plane, bodies=mpm.Bodies())
         scene, particles = canonical(scene, bodies[0].x.dtype), mpm.prepare(scene, mpm.join(*bodies))
-        nodes = particles_to_grid(scene, particles, 0.0, jnp.asarray(1e-3), scene.stencil(particles))
+        nodes = start_nodes(scene, particles, 0.0, jnp.asarray(1e-3), scene.stencil(particles))
         contact = nodes.contacts[0]
         force = nodes.mirror.fold(contact.coupling(contact.gap < 0).force(None, len(nodes.mass)))
         found.append(np.asarray(nodes.per_mass(force)).reshape(2, 20, 16, 2)[:, 10:])

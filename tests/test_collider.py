@@ -79,7 +79,7 @@ def test_what_colliders_hold_moves_with_them(method):
     assert_close(((v - asked) * n).sum(axis=1)[touched], np.zeros(touched.sum()), 0, 1e-13)
     along = v[:, 0] * n[:, 1] - v[:, 1] * n[:, 0]
     assert (np.abs(along[touched & ~floor]) > 1e-3).all()
-    (push,) = step.update.along_normals
+    (push,) = step.held.along_normals(step.holding)
     beside = np.asarray(step.reaction - push.impulse)  # the floor's part, where both hold
     assert_close(beside[touched & floor, 0], np.zeros((touched & floor).sum()), 0, 1e-11 * np.abs(step.reaction).max())
 
@@ -368,7 +368,7 @@ def test_friction_opposes_slip_by_at_most_mu_times_the_push(name, mu):
     particles = eqx.tree_at(lambda q: q.x, particles, particles.x + jnp.asarray([0.0, -1e-3]))
     scene, method = scene_of(grid, *obstacles(mu)), METHODS[name]
     step = grid_update(scene, particles, 0.5 * explicit_limit(scene), method)
-    rub, mass = np.asarray(step.update.friction), np.asarray(step.nodes.mass)
+    rub, mass = np.asarray(step.friction), np.asarray(step.nodes.mass)
     found = [pushes(contact, step, method) for contact in step.nodes.contacts]
     limit = mu * sum(push for push, _, _ in found)
     assert (np.linalg.norm(rub, axis=1) <= limit * (1 + 1e-9)).all()
@@ -409,13 +409,13 @@ def test_friction_of_a_wall_leaves_alone_what_others_hold(floor):
     n = np.array([2.0, 1.0, 0.5]) / np.sqrt(5.25)
     mass &= x[:, 2] > -1e-9  # what lies beyond a plane is its mirror image
     held, gripped = (x - 0.12) @ n < 1e-9, x[:, 1] > 0.32
-    rubbed = np.abs(step.update.friction).max(axis=1) > 1e-9 * np.abs(step.update.friction).max()
+    rubbed = np.abs(step.friction).max(axis=1) > 1e-9 * np.abs(step.friction).max()
     assert (rubbed & held & ~gripped).sum() > 3
     assert (rubbed & gripped & ~held).sum() > 3
     assert (rubbed & ~held & ~gripped).sum() > 3
     assert_close(v[held & mass] @ n, np.full((held & mass).sum(), n @ [0.4, 0.2, 0.1]), 1e-13)
     assert_close(v[gripped & mass, 0], np.full((gripped & mass).sum(), 0.4), 1e-14)
-    friction = np.asarray(step.update.friction)
+    friction = np.asarray(step.friction)
     assert ((friction * v).sum(axis=1)[rubbed & ~held & ~gripped] < 0).all()
     if floor == "box":  # what the body pushes is not the wall's
         push = pushes(step.nodes.contacts[2], step, mpm.Explicit())[0]

@@ -257,7 +257,7 @@ SNOW = mpm.Snow()
 @pytest.mark.parametrize("method", **ids(METHODS | SECOND_ORDER))
 def test_yielding_adds_no_crossing_and_one_number_a_particle(method):
     """To an explicit step; what it computes is its own: an eigenvalue problem and an exponential. An implicit step sums
-    once more what its return map leaves undone."""
+    once more for the linearisation error, which its return map is part of."""
     elastic, yielding = (counted(method, material=law) for law in (mpm.FixedCorotated(1e5, 0.2), SNOW))
     to_nodes, from_nodes = crossings(elastic)
     assert crossings(yielding) == (to_nodes + (not method.is_explicit), from_nodes)
@@ -270,7 +270,7 @@ def test_yielding_adds_no_crossing_and_one_number_a_particle(method):
 @pytest.mark.thorough
 @pytest.mark.parametrize("method", **ids(METHODS))
 def test_a_second_material_adds_no_crossing_and_no_iteration(method):
-    """Both go to the grid and back in one sum. An implicit step sums twice more for what return maps leave undone: the
+    """Both go to the grid and back in one sum. An implicit step sums twice more for its linearisation error: the
     returned stress, and the mass of what does not yield."""
     (to_nodes, from_nodes), two = crossings(counted(method)), counted(method, material=(LAW, SNOW))
     assert crossings(two) == (to_nodes + 2 * (not method.is_explicit), from_nodes)

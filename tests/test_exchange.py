@@ -104,17 +104,18 @@ def test_moments_of_all_boundaries_are_the_change_of_angular_momentum(descriptio
             return cross(place, np.asarray(impulse)).sum(axis=0)
 
         pivots = np.stack([np.asarray(m.centre) + np.asarray(m.at((n + late) * dt)) for m in motions])
-        rub = sum(np.asarray(given) for _, given in new.pushes)  # by springs and friction
-        holding = np.asarray(new.reaction if new.holding is None else new.holding)
-        friction = 0 if new.friction is None else np.asarray(new.friction)
-        push = sum(np.asarray(given.impulse) for given in new.along_normals)
+        rubbed = () if new.contact is None else step.held.pushes(new.contact.friction)
+        rub = sum(np.asarray(given) for _, given in rubbed)  # by springs and friction
+        holding = np.asarray(step.holding)
+        friction = np.asarray(step.friction)
+        push = sum(np.asarray(given.impulse) for given in step.held.along_normals(step.holding))
         holder = np.asarray(step.nodes.conditions.colliders.holder)
         of_colliders = np.where(holder >= 0, holding, 0) + push + rub
-        of_walls = np.where(walled, np.asarray(new.reaction) + friction - of_colliders, 0)
+        of_walls = np.where(walled, np.asarray(step.reaction) + friction - of_colliders, 0)
         received = step.info.colliders
         given = -np.asarray(received.angular) - cross(pivots, np.asarray(received.impulse))
         outer = moment(of_walls) + given.sum(axis=0) + moment(mass * dt * G[:d])
-        change, elastic = moment(mass * (v1 - v0)), moment(new.internal)
+        change, elastic = moment(mass * (v1 - v0)), moment(new.elastic)
         scale = np.abs(given).sum() + np.abs(moment(of_walls)).sum()
         if name != "semi_implicit":  # its linearised force has a moment
             assert np.abs(elastic).max() < 1e-9 * scale

@@ -207,7 +207,7 @@ def test_a_step_that_leaves_the_return_map_behind_says_so(method, share):
     else:
         run = mpm.simulate(scene, layer, t1=10 * dt, dt=dt, method=method)
     left = share * stiffness * dt * rate
-    assert float(run.statistics.left_undone.part) == pytest.approx(left / (tau + left), rel=0.02)
+    assert float(run.statistics.linearisation_error) == pytest.approx(left / (tau + left), rel=0.02)
 
 
 def test_the_derivatives_of_the_share_of_flow_are_differences():

@@ -46,7 +46,7 @@ def made_up(d: int, dtype=jnp.float64, description=DESCRIPTIONS["updated"], tran
     particles = prepare(scene, particles)
     frames = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=(3, *a.shape)), dtype), state_of(particles))
     final = with_state(particles, jax.tree.map(lambda a: a[-1], frames))
-    floats = "worst_residual", "undone_force", "undone_scale"
+    floats = "worst_residual", "force_error", "force_scale"
     counts = {f.name: jnp.asarray(i, jnp.int32) for i, f in enumerate(dataclasses.fields(RunStatistics), 7)}
     return Run(
         scene=scene,
@@ -218,7 +218,7 @@ def test_the_file_says_what_it_holds(tmp_path):
     with h5py.File(tmp_path / "run.h5") as file:
         own = file["mpmjax"]
         assert own.attrs["units"].startswith(b"SI")
-        assert (own.attrs["format"], own.attrs["d"], own.attrs["dtype"]) == (8, 2, b"float64")
+        assert (own.attrs["format"], own.attrs["d"], own.attrs["dtype"]) == (9, 2, b"float64")
         scene = json.loads(own["scene"][...].tobytes())
         assert scene["material"] == {"kind": "FixedCorotated", "youngs_modulus": 1 / 3, "poisson_ratio": 0.3}
         assert own["frames"]["step"].tolist() == [0, 5, 7]
@@ -609,8 +609,8 @@ def test_files_of_another_kind_are_named(tmp_path):
     of("other.h5", r"has no group /VTKHDF or /mpmjax: it is not a run that mpmjax wrote\.$")
     save(tmp_path / "later.h5", run)
     with h5py.File(tmp_path / "later.h5", "r+") as file:
-        file["mpmjax"].attrs["format"] = 7
-    of("later.h5", r"has format 7, this mpmjax reads format 8: use mpmjax [\d.]+, which wrote it\.$")
+        file["mpmjax"].attrs["format"] = 8
+    of("later.h5", r"has format 8, this mpmjax reads format 9: use mpmjax [\d.]+, which wrote it\.$")
     save(tmp_path / "bare.h5", run)
     with h5py.File(tmp_path / "bare.h5", "r+") as file:
         file["VTKHDF/Steps"].attrs["NSteps"] = 0

@@ -17,7 +17,7 @@ from mpmjax.boundary import constrain
 from mpmjax.cli._scene_file import read_scene_file
 from mpmjax.geometry import surface_pieces
 from mpmjax.io._schema import decode, encode
-from mpmjax.stepping._nodes import particles_to_grid
+from mpmjax.stepping import start_nodes
 
 SIDE = 0.3
 EACH_DIM = pytest.mark.parametrize("d", [2, *thorough(3)])
@@ -244,7 +244,7 @@ def test_springs_to_the_ground_and_of_contact_make_one_potential(d):
     the force's, also as matrices; both kinds of springs take part."""
     floor = mpm.SeparatingBox((-np.inf, 0.02, -np.inf)[:d], (np.inf,) * d)
     scene, particles = loaded(mpm.Spring(face(1, d), 5e4), d=d, boundary=(mpm.SymmetryPlane(0, 0.0), floor))
-    nodes = particles_to_grid(scene, particles, 0.0, 1e-3, scene.stencil(particles), force_at=1.0)
+    nodes = start_nodes(scene, particles, 0.0, 1e-3, scene.stencil(particles), force_at=1.0)
     shut = tuple(contact.gap < 0 for contact in nodes.contacts)
     potential = constrain(nodes, shut).nodes.potential
     assert potential.springs

@@ -12,7 +12,7 @@ from helpers import DESCRIPTIONS, GRADIENTS, LAWS, assert_close, block, cloud, e
 import mpmjax as mpm
 from mpmjax import linalg as la
 from mpmjax.implicit._operator import ImplicitOperator
-from mpmjax.stepping._nodes import particles_to_grid
+from mpmjax.stepping import start_nodes
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-11)
 IMPLICIT = {
@@ -31,7 +31,7 @@ def operator_of(scene, particles, hessian, factor=1e-3):
     """M + χH at the particles, with χ such that mass and stiffness are alike."""
     particles = mpm.prepare(scene, particles)
     dt = jnp.asarray(1e-3)
-    nodes = particles_to_grid(scene, particles, 0.0, dt, scene.stencil(particles))
+    nodes = start_nodes(scene, particles, 0.0, dt, scene.stencil(particles))
     action = hessian.at_step_start(nodes.potential)
     return ImplicitOperator(nodes.mass, jnp.asarray(factor), action, nodes.projection)
 

@@ -12,7 +12,7 @@ from helpers import DESCRIPTIONS, assert_close, block, ids, thorough
 
 import mpmjax as mpm
 from mpmjax.implicit import DiagonalInnerProduct, ImplicitOperator
-from mpmjax.stepping._nodes import particles_to_grid
+from mpmjax.stepping import start_nodes
 
 AVERAGED = mpm.AveragedVolume()
 CHOICES = mpm.DiagonalPreconditioner(), mpm.VolumePreconditioner()
@@ -21,7 +21,7 @@ CHOICES = mpm.DiagonalPreconditioner(), mpm.VolumePreconditioner()
 def operator_of(scene, particles, factor=1e-2):
     """M + χH at the particles, with χ such that shear counts a hundred times as much as the mass."""
     particles = mpm.prepare(scene, particles)
-    nodes = particles_to_grid(scene, particles, 0.0, 1e-3, scene.stencil(particles))
+    nodes = start_nodes(scene, particles, 0.0, 1e-3, scene.stencil(particles))
     action = mpm.AnalyticHessian().at_step_start(nodes.potential)
     return ImplicitOperator(nodes.mass, jnp.asarray(factor), action, nodes.projection)
 

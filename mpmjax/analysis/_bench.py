@@ -41,8 +41,8 @@ class Trial(NamedTuple):
     """Wall time without compilation [s]: of one run, the faster of two brief ones, or foreseen from fewer steps."""
     error: float
     """Relative error of the motion; infinite if the run failed, NaN if it was foreseen to take too long."""
-    left_undone: float = 0.0
-    """The part of the elastic force that implicit steps left undone [-] (`RunStatistics.left_undone`)."""
+    linearisation_error: float = 0.0
+    """Linearisation error of the steps [-] (`RunStatistics.linearisation_error`)."""
 
     def __str__(self) -> str:
         spacing = f", spacing / {self.refinement}" if self.refinement > 1 else ""
@@ -81,8 +81,8 @@ class Timed(NamedTuple):
 
     states: list[State] | None
     """The states at the times of comparison, None of a run that failed."""
-    left_undone: float
-    """The part of the elastic force that linearised steps left undone [-]."""
+    linearisation_error: float
+    """Linearisation error of the steps [-]."""
     seconds: float
 
 
@@ -152,8 +152,8 @@ class Bench(NamedTuple):
     def timed(self, method: AbstractIntegrator, steps: int, frames: int, each: int) -> Timed:
         """As `_go`, with the seconds that it took."""
         begun = time.perf_counter()
-        states, left_undone = self._go(method, steps, frames, each)
-        return Timed(states, left_undone, time.perf_counter() - begun)
+        states, linearisation_error = self._go(method, steps, frames, each)
+        return Timed(states, linearisation_error, time.perf_counter() - begun)
 
     def why(self, method: AbstractIntegrator, steps: int) -> str:
         """The error message of a run that fails."""
@@ -166,8 +166,8 @@ class Bench(NamedTuple):
     def _go(
         self, method: AbstractIntegrator, steps: int, frames: int, each: int, *, throw: bool = False
     ) -> tuple[list[State] | None, float]:
-        """The states after each of `frames` times `each` steps of t1 / `steps`, and the part of the elastic force that
-        was left undone. A faulty run has no states, or raises with `throw`."""
+        """The states after each of `frames` times `each` steps of t1 / `steps`, and their linearisation
+        error. A faulty run has no states, or raises with `throw`."""
         dtype = self.particles.x.dtype
         scene, dt, method = canonical((self.scene, self.t1 / steps, method), dtype)
         state, states, statistics = initial_state(scene, self.particles), [], no_steps(dtype)
@@ -201,7 +201,7 @@ class Bench(NamedTuple):
                     raise_faults(run, self.particles, partial(before_fault, go, begin, new), 0)
                 return None, 0.0
             states.append(state.particles)
-        return states, float(statistics.left_undone.part)
+        return states, float(statistics.linearisation_error)
 
 
 def _rms(distance: np.ndarray) -> Any:

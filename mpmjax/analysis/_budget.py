@@ -1,5 +1,7 @@
 """Budgets of energy and momentum for each step, with a term for every transfer, force and approximation."""
 
+from functools import reduce
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,7 @@ from mpmjax._types import Array, Float, Matrix, NodeVector, Scalar, components
 from mpmjax.analysis._diagnostics import energy_density, energy_of
 from mpmjax.checks import canonical, checked, require, require_positive, require_whole
 from mpmjax.discretisation import Gathered, Stencil, gather, scatter
-from mpmjax.implicit import ElasticPotential
+from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.state import Particles, Scene, prepare
 from mpmjax.stepping import (
     AbstractIntegrator,
@@ -16,7 +18,8 @@ from mpmjax.stepping import (
     GridUpdate,
     Nodes,
     grid_to_particles,
-    particles_to_grid,
+    reaction,
+    start_nodes,
     update,
 )
 
@@ -170,7 +173,7 @@ def _budget(
     def body(before: Particles, n: Array) -> tuple[Particles, Budget]:
         t = (start + n) * dt
         stencil = scene.stencil(before, t)
-        nodes = particles_to_grid(
+        nodes = start_nodes(
             scene,
             before,
             t,
@@ -179,53 +182,63 @@ def _budget(
             body_force_at=method.body_force_at,
             force_at=method.force_at(),
             explicit_viscosity=method.explicit_viscosity,
-            viscosity_apart=True,
         )
         new = update(nodes, method)
         trial = grid_to_particles(scene, before, nodes, new)
         after = scene.return_map(trial, dt)
-        return after, _step_budget(scene, before, trial, after, nodes, new)
+        return after, _step_budget(scene, before, trial, after, nodes, new, method)
 
     numbers = jnp.arange(steps, dtype=particles.x.dtype)
     return jax.lax.scan(body, particles, numbers)
 
 
 def _step_budget(
-    scene: Scene, before: Particles, trial: Particles, after: Particles, nodes: Nodes, new: GridUpdate
+    scene: Scene,
+    before: Particles,
+    trial: Particles,
+    after: Particles,
+    nodes: Nodes,
+    new: GridUpdate,
+    method: AbstractIntegrator,
 ) -> Budget:
     potential, dt = nodes.potential, nodes.dt
     stencil, images = potential.stencil, potential.mirror
     v0, v1 = nodes.velocity, new.motion.velocity
     all0, all1 = images.unfold(v0), images.unfold(v1)
     mean = (v0 + v1) / 2
-    friction = jnp.zeros_like(v0) if new.friction is None else new.friction
 
     # impulses at the nodes
-    at_start = nodes.force if nodes.viscous_force is None else nodes.force - nodes.viscous_force
-    elastic_at_start = dt * at_start
+    friction = nodes.mass[:, None] * (v1 - new.solved.velocity)
     raw = scatter(stencil, before.mass[None], None, scene.grid.size)
     weight = dt * images.fold(raw * jnp.asarray(scene.gravity))
     body = jnp.where(nodes.occupied, dt * nodes.mass[:, None] * nodes.acceleration - weight, 0)
-    boundary, missed = new.free.combine(0, new.reaction), new.free.combine(new.reaction, 0)
+    held, free = reaction(nodes, new.solved, new.elastic), nodes.projection
+    if new.contact is not None:
+        free = Projection(*new.contact.held.beyond_boundaries())
+    boundary, missed = free.combine(0, held), free.combine(held, 0)
 
     # viscosity: its impulse, and what it dissipates of the velocity that it resists
-    C, resisted = None if before.C is None else components(before.C), new.motion.resisted
+    assert new.elastic is not None  # P2G was asked for momentum and force apart
+    resisted, elastic, elastic_at_start = new.motion.resisted, new.elastic, dt * nodes.force
     viscous, dissipated = jnp.zeros_like(v0), jnp.zeros((), v0.dtype)
-    if new.viscous is not None:
-        if resisted is not None:
-            power = potential.power(resisted)
-        else:
-            power = sum((support.drag_power() for support in potential.supports), dissipated)
-            if potential.material_viscous and C is not None:
-                power = power + (potential.viscous_flux(C) * C).sum()
-        viscous, dissipated = new.viscous, dt * power
-    assert new.internal is not None and new.before is not None  # P2G was asked for momentum and force apart
-    elastic = new.internal if new.viscous is None else new.internal - new.viscous
+    if resisted is not None:
+        viscous, dissipated = -dt * potential.viscous_resistance(resisted), dt * potential.power(resisted)
+    elif method.explicit_viscosity and potential.viscous:  # part of the force
+        force = potential.support_drag()
+        dissipated = reduce(jnp.add, (support.drag_power() for support in potential.supports), dissipated)
+        if potential.material_viscous and before.C is not None:
+            C = components(before.C)
+            flux = potential.viscous_flux(C)
+            force = -potential.nodal_sum(flux) if force is None else force - potential.nodal_sum(flux)
+            dissipated = dissipated + (flux * C).sum()
+        if force is not None:
+            viscous, dissipated = jnp.where(nodes.occupied, dt * force, 0), dt * dissipated
+            elastic, elastic_at_start = elastic - viscous, elastic_at_start - dt * force
 
     # particle and nodes beside each other
     v_old = components(before.v)
     arrived = _gathered(scene, stencil, all1)
-    change = _gathered(scene, stencil, all1 - images.unfold(new.before)) if scene.transfer.needs_change else None
+    change = _gathered(scene, stencil, all1 - images.unfold(new.before(nodes))) if scene.transfer.needs_change else None
     moved = arrived.value
     C_old, C_new = (components(q.C) if scene.transfer.affine and q.C is not None else None for q in (before, after))
     beside = scene.transfer.velocity(v_old, arrived, change) - moved

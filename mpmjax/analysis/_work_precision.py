@@ -14,7 +14,7 @@ from typing import NamedTuple
 from mpmjax.analysis._bench import FRAMES, Bench, Build, Clock, Trial, name_of
 from mpmjax.analysis._reference_run import HOPELESS, settle
 from mpmjax.checks import checked, require_positive
-from mpmjax.simulation import MOST_LEFT_UNDONE
+from mpmjax.simulation import LARGEST_LINEARISATION_ERROR
 from mpmjax.stepping import TRBDF2, AbstractIntegrator, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
 
 METHODS: tuple[AbstractIntegrator, ...] = (Explicit(), SemiImplicit(), ImplicitMidpoint(), TRBDF2(), BackwardEuler())
@@ -76,10 +76,10 @@ class WorkPrecision(NamedTuple):
         said = f"{best} ({best.steps} steps): {best.seconds:.2g} s, error {best.error:.2g}; {other}."
         if best.error > self.target:
             said += f" None reached {self.target:g}: on the grids tried no step does better."
-        if best.left_undone > MOST_LEFT_UNDONE:
+        if best.linearisation_error > LARGEST_LINEARISATION_ERROR:
             said += (
-                f" Its steps left up to {100 * best.left_undone:.2g} % of the elastic force undone: for stresses take "
-                "Newton's method, where nothing yields, or a shorter step."
+                f" Its linearisation error is up to {100 * best.linearisation_error:.2g} % of the elastic force: for "
+                "stresses take Newton's method, where nothing yields, or a shorter step."
             )
         if self.reference.error > self.target / 2:
             said += f" The reference is known to {self.reference.error:.2g} only, and so are the errors."
@@ -141,16 +141,21 @@ def work_precision(
     skipped: list[str] = []
 
     def note(
-        bench: Bench, method: AbstractIntegrator, steps: int, seconds: float, miss: float, left_undone: float = 0.0
+        bench: Bench,
+        method: AbstractIntegrator,
+        steps: int,
+        seconds: float,
+        miss: float,
+        linearisation_error: float = 0.0,
     ) -> Trial:
-        trials.append(Trial(method, bench.refinement, bench.t1 / steps, steps, seconds, miss, left_undone))
+        trials.append(Trial(method, bench.refinement, bench.t1 / steps, steps, seconds, miss, linearisation_error))
         progress(trials[-1])
         return trials[-1]
 
     def tried(bench: Bench, method: AbstractIntegrator, steps: int) -> Trial:
         run = bench.run(method, steps)
         miss = math.inf if run.states is None else bench.motion(run.states).distance(truth)
-        return note(bench, method, steps, run.seconds, miss, run.left_undone)
+        return note(bench, method, steps, run.seconds, miss, run.linearisation_error)
 
     def rival(method: AbstractIntegrator) -> float:
         """Seconds of the cheapest run so far that reached the target, among explicit or implicit ones as the method."""

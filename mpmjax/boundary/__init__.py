@@ -20,7 +20,7 @@ from mpmjax.boundary._combined import (
     mirror,
     mirror_motion,
 )
-from mpmjax.boundary._conditions import PARALLEL, Conditions, Given
+from mpmjax.boundary._conditions import Conditions, FreeNormal, Given
 from mpmjax.boundary._contact import (
     AbstractContact,
     AbstractNodes,
@@ -50,7 +50,6 @@ __all__ = [
     "EXPLICIT_STIFFNESS",
     "IMPLICIT_STIFFNESS",
     "ON_THE_WALL",
-    "PARALLEL",
     "STIFFNESS",
     "AbstractBoundary",
     "AbstractCollider",
@@ -67,6 +66,7 @@ __all__ = [
     "Coupling",
     "FaceShape",
     "Faces",
+    "FreeNormal",
     "Given",
     "GivenCouple",
     "Grip",

@@ -4,9 +4,10 @@ from dataclasses import replace
 from functools import reduce
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, Int, Mask, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.geometry import Motion
 
 PARALLEL = 1e-2
@@ -76,6 +77,25 @@ class ColliderConditions(eqx.Module):
         return eqx.tree_at(lambda c: (c.position, c.pivots), self, moved)
 
 
+class FreeNormal(eqx.Module):
+    """A collider's normal at each node, and its part in free components at right angles to those of earlier ones."""
+
+    normal: NodeVector
+    """The collider's unit normal, shape (n, d)."""
+    owner: Int[Array, "n"]
+    """The collider's number, shape (n,); −1 where there is no such part."""
+    direction: NodeVector
+    """Unit vector along that part, shape (n, d); zero where there is none."""
+    length: NodeScalar
+    """Length of that part [-], shape (n,); 1 where there is none."""
+    speed: NodeScalar
+    """Velocity along it [m/s], shape (n,), at which the whole normal velocity is that of the collider."""
+
+    def where(self, mask: Bool[Array, "n"], other: "FreeNormal") -> "FreeNormal":
+        """This one at nodes of the mask, the other one elsewhere."""
+        return jax.tree.map(lambda a, b: jnp.where(mask if a.ndim == 1 else mask[:, None], a, b), self, other)
+
+
 class Conditions(eqx.Module):
     """The conditions of boundaries on the window's nodes."""
 
@@ -89,6 +109,41 @@ class Conditions(eqx.Module):
     """Whether any component may be held. What is known here costs a step nothing where the answer is no."""
     moves: bool = eqx.field(static=True, default=True)
     """Whether one may be held at another velocity than zero, by a collider too."""
+
+    def free_normals(self, free: Mask) -> tuple[FreeNormal, ...]:
+        """The parts of the colliders' normals in free components, made orthogonal in the colliders' order, as many as a
+        node can have.
+
+        With components a prescribed, n·v = n·v_c becomes Σ_free n v = n·v_c − Σ_a n_a v_a, and so for earlier parts.
+
+        Args:
+            free: the components that nothing prescribes, shape (n, d).
+        """
+        parts: list[FreeNormal] = []
+        for slide in () if self.colliders is None else self.colliders.slides:
+            part = jnp.where(free, slide.normal, 0)
+            missing = (slide.normal * (slide.velocity - jnp.where(free, 0, self.velocity))).sum(axis=1)
+            for other in parts:
+                share = (part * other.direction).sum(axis=1)
+                part, missing = part - share[:, None] * other.direction, missing - share * other.speed
+            square = (part**2).sum(axis=1)
+            some = square > PARALLEL**2
+            length = jnp.sqrt(jnp.where(some, square, 1))
+            new = FreeNormal(
+                normal=slide.normal,
+                owner=jnp.where(some, jnp.int32(slide.number), -1),
+                direction=jnp.where(some[:, None], part / length[:, None], 0),
+                length=length,
+                speed=jnp.where(some, missing / length, 0),
+            )
+            for place, old in enumerate(parts):  # goes into the first place that is empty at each node
+                taken = old.owner >= 0
+                parts[place] = old.where(taken, new)
+                new = new.where(taken, jax.tree.map(jnp.zeros_like, new))
+                new = replace(new, owner=jnp.where(taken, new.owner, -1), length=jnp.where(taken, new.length, 1))
+            if len(parts) < free.shape[1]:
+                parts.append(new)
+        return tuple(parts)
 
 
 def no_conditions(nodes: NodeVector) -> Conditions:

@@ -214,8 +214,10 @@ class Mirror(eqx.Module):
 
     def fold(self, field: NodeVector) -> NodeVector:
         """Bᵀ f: add to the true nodes what their mirror images received, and leave nothing on the others."""
+        if not self.images:
+            return field
         at_rest = Mirror(tuple(image.at_rest() for image in self.images))
-        return jax.linear_transpose(at_rest.unfold, field)(field)[0] if self.images else field
+        return jax.linear_transpose(at_rest.unfold, field)(field)[0]
 
     def added(self, field: NodeVector) -> NodeVector:
         """The part of a field that mirrors which move add to it (see `Image.moving`), zero elsewhere."""

@@ -183,9 +183,8 @@ def _summary(simulation: Simulation, run: Run, taken: int, seconds: float) -> st
                 f"{float(run.statistics.worst_residual):.2g}",
             )
         )
-    if float(run.statistics.undone_force) > 0:
-        undone = float(run.statistics.left_undone.part)
-        lines.append(("left undone", f"at most {undone:.2g} of the elastic force in a step"))
+    if (error := float(run.statistics.linearisation_error)) > 0:
+        lines.append(("linearisation", f"error of at most {error:.2g} of the elastic force in a step"))
     if int(run.statistics.newton) > 0:
         lines.append(
             ("Newton", f"{int(run.statistics.newton) / steps:.3g} a step, {int(run.statistics.line_search)} halvings")
@@ -345,7 +344,7 @@ def chart_command(
     file = read_scene_file(scene)
     output = Path(f"{scene.stem}_chart.png") if output is None else output
     print(
-        f"{'method':>24} {'spacing':>10} {'dt [s]':>10} {'steps':>9} {'seconds':>9} {'error':>9} {'left undone':>11}",
+        f"{'method':>24} {'spacing':>10} {'dt [s]':>10} {'steps':>9} {'seconds':>9} {'error':>9} {'linearisation':>13}",
         flush=True,
     )
     dt = stable_step(scene, file) if file.run.dt == "stable" else file.run.dt
@@ -365,10 +364,10 @@ def chart_command(
 
 def _line(trial: Trial) -> str:
     said = "failed" if np.isinf(trial.error) else "foreseen" if np.isnan(trial.error) else f"{trial.error:.2e}"
-    undone = f"{trial.left_undone:.1e}" if trial.left_undone > 0 else ""
+    linearisation = f"{trial.linearisation_error:.1e}" if trial.linearisation_error > 0 else ""
     return (
         f"{name_of(trial.method):>24} {f'1 / {trial.refinement}':>10} {trial.dt:10.3g} {trial.steps:9d} "
-        f"{trial.seconds:9.3g} {said:>9} {undone:>11}"
+        f"{trial.seconds:9.3g} {said:>9} {linearisation:>13}"
     )
 
 

@@ -17,7 +17,7 @@ from mpmjax.io._atomic_write import reason
 from mpmjax.io._transactional_file import BUSY, StagedFile, require_no_writer
 from mpmjax.io._vtkhdf import File, count_in
 
-FORMAT = 8
+FORMAT = 9
 LIBVER_HEAD = ("v108", "v108")
 _LIBVER = ("v110", "v110")  # what "latest" writes, VTK 9.7 cannot read
 _GROWING = (

@@ -45,7 +45,7 @@ class HerschelBulkley(AbstractInelastic):
 
     *When it breaks*: it needs J > 0, as Hencky's law does. The stress lags a step behind the law, since the return map
     follows the step, and in an implicit step the elastic law alone resists: its part adds to the flow's stress some
-    μ Δt γ̇, of which `run.statistics.left_undone` tells.
+    μ Δt γ̇, of which `run.statistics.linearisation_error` tells.
     Explicit steps are limited by the speed of sound, not by η. τ_Y is that of shear, a factor √3 below that of
     tension. With n = 1 the derivative jumps where flow begins.
     *Good values*: τ_Y of some tens to some hundreds of Pa, n = 0.3 to 1, and η so that η γ̇ⁿ is of the size of τ_Y. The

@@ -1,7 +1,7 @@
 """Rollouts: many steps, driven by diffrax, and their faults in words."""
 
 from mpmjax.simulation._faults import (
-    MOST_LEFT_UNDONE as MOST_LEFT_UNDONE,
+    LARGEST_LINEARISATION_ERROR as LARGEST_LINEARISATION_ERROR,
     raise_faults as raise_faults,
     warn_of_inaccuracy as warn_of_inaccuracy,
 )

@@ -90,7 +90,7 @@ def unconverged_advice(method: AbstractIntegrator, dtype: Any) -> str:
 
 def warn_of_inaccuracy(run: Run) -> None:
     """A Python warning where solves of an untraced run missed their tolerance by less than ten times, one where
-    implicit steps left much of the elastic force undone, and one where particles take more space than there is."""
+    the linearisation error of implicit steps is large, and one where particles take more space than there is."""
     scene, statistics = run.scene, run.statistics
     if not scene.total:
         warn_of_crowding(scene.grid, scene.laws, run.final)
@@ -101,18 +101,20 @@ def warn_of_inaccuracy(run: Run) -> None:
             "much less accurate than was asked for. Raise the solver's max_steps, or ask for what it can reach by its "
             "rtol."
         )
-    part = float(statistics.left_undone.part) if float(statistics.undone_force) > 0 else 0.0
-    if part > MOST_LEFT_UNDONE and any(law.relaxes_stress for law in scene.laws):
+    error = float(statistics.linearisation_error)
+    if error > LARGEST_LINEARISATION_ERROR and any(law.relaxes_stress for law in scene.laws):
         warn(
-            f"Implicit steps left up to {100 * part:.2g} % of the elastic force undone: in the solve, what yields or "
-            "flows resists as if it were elastic, and its flow is returned only at the end of the step, so that it "
-            f"flows too slowly. Take a step {part / MOST_LEFT_UNDONE:.1f} times shorter or more, or Explicit()."
+            f"Implicit steps have a linearisation error of up to {100 * error:.2g} % of the elastic force: in the "
+            "solve, what yields or flows resists as if it were elastic, and its flow is returned only at the end of "
+            f"the step, so that it flows too slowly. Take a step {error / LARGEST_LINEARISATION_ERROR:.1f} times "
+            "shorter or more, or Explicit()."
         )
-    elif part > MOST_LEFT_UNDONE:
+    elif error > LARGEST_LINEARISATION_ERROR:
         warn(
-            f"One linear solve a step left up to {100 * part:.2g} % of the elastic force undone, and stresses can be "
-            f"wrong by as much. Take a shorter step, {float(np.sqrt(part / MOST_LEFT_UNDONE)):.1f} times or more, or "
-            "Newton's method: BackwardEuler(), or solution=Newton() of ImplicitMidpoint and TRBDF2."
+            f"One linear solve a step has a linearisation error of up to {100 * error:.2g} % of the elastic force, and "
+            "stresses can be wrong by as much. Take a shorter step, "
+            f"{float(np.sqrt(error / LARGEST_LINEARISATION_ERROR)):.1f} times or more, or Newton's method: "
+            "BackwardEuler(), or solution=Newton() of ImplicitMidpoint and TRBDF2."
         )
 
 
@@ -157,8 +159,8 @@ _WORDS: dict[Fault, _Words] = {
         "Reduce dt: a boundary keeps out what comes less than a cell nearer in a step.",
     ),
 }
-MOST_LEFT_UNDONE = 0.05
-"""Part of the elastic force up to which what implicit steps leave undone is not warned of."""
+LARGEST_LINEARISATION_ERROR = 0.05
+"""Linearisation error [-] of a run beyond which it is warned of."""
 _ADVICE = (
     "Call simulate outside of jax transformations to have step, time and particle named, or with throw=False to "
     "inspect run.statistics."

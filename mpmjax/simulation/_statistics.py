@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Int
-from mpmjax.stepping import LeftUndone, StepInfo
+from mpmjax.stepping import StepInfo
 
 
 class Fault(enum.IntEnum):
@@ -45,9 +45,9 @@ class RunStatistics(eqx.Module):
     """Halvings by the line search."""
     worst_residual: Float[Array, "*f"]
     """Largest relative residual at the end of a solve."""
-    undone_force: Float[Array, "*f"]
-    """Largest force that a step left undone [N] (see `left_undone`)."""
-    undone_scale: Float[Array, "*f"]
+    force_error: Float[Array, "*f"]
+    """Largest error of a step's elastic force [N] (see `StepInfo.force_error`)."""
+    force_scale: Float[Array, "*f"]
     """Largest scale of these forces [N]."""
     unconverged: Int[Array, "*f"]
     """Steps whose solve met neither ten times its tolerance nor the precision's limit: the run is not a solution."""
@@ -69,10 +69,10 @@ class RunStatistics(eqx.Module):
     is not met; else zero."""
 
     @property
-    def left_undone(self) -> LeftUndone:
-        """The elastic force that implicit steps left undone: the largest of any step, and the largest scale of any, so
-        that quiet steps do not count."""
-        return LeftUndone(self.undone_force, self.undone_scale)
+    def linearisation_error(self) -> Float[Array, "*f"]:
+        """Error of the elastic force by the linearisation of implicit steps and by the return maps after them [-]: the
+        largest of any step over the largest scale of any, so that quiet steps do not count."""
+        return self.force_error / jnp.where(self.force_scale == 0, 1, self.force_scale)
 
     @property
     def healthy(self) -> Bool[Array, "*f"]:
@@ -89,8 +89,8 @@ class RunStatistics(eqx.Module):
             newton=self.newton + later.newton,
             line_search=self.line_search + later.line_search,
             worst_residual=jnp.maximum(self.worst_residual, later.worst_residual),
-            undone_force=jnp.maximum(self.undone_force, later.undone_force),
-            undone_scale=jnp.maximum(self.undone_scale, later.undone_scale),
+            force_error=jnp.maximum(self.force_error, later.force_error),
+            force_scale=jnp.maximum(self.force_scale, later.force_scale),
             unconverged=self.unconverged + later.unconverged,
             nearly_converged=self.nearly_converged + later.nearly_converged,
             indefinite=self.indefinite + later.indefinite,
@@ -107,7 +107,7 @@ class RunStatistics(eqx.Module):
         new = self.merged(step)
         if solved:
             return new
-        of_solves = ("most_iterations", "worst_residual", "undone_force", "undone_scale")
+        of_solves = ("most_iterations", "worst_residual", "force_error", "force_scale")
         return replace(new, **{name: getattr(self, name) for name in of_solves})
 
 
@@ -115,7 +115,7 @@ def no_steps(dtype: Any) -> RunStatistics:
     """The statistics before the first step."""
     zero = jnp.asarray(0, jnp.int32)
     zeros = {field.name: zero for field in fields(RunStatistics)}
-    nothing = dict.fromkeys(("worst_residual", "undone_force", "undone_scale"), jnp.asarray(0, dtype))
+    nothing = dict.fromkeys(("worst_residual", "force_error", "force_scale"), jnp.asarray(0, dtype))
     return RunStatistics(**zeros | nothing)
 
 
@@ -130,8 +130,8 @@ def one_step(info: StepInfo, fault: Int[Array, ""]) -> RunStatistics:
         newton=solve.newton,
         line_search=solve.line_search,
         worst_residual=jax.lax.stop_gradient(solve.residual),
-        undone_force=info.left_undone.force,
-        undone_scale=info.left_undone.scale,
+        force_error=info.force_error,
+        force_scale=info.force_scale,
         unconverged=(~(solve.converged | solve.nearly_converged)).astype(jnp.int32),
         nearly_converged=solve.nearly_converged.astype(jnp.int32),
         indefinite=solve.indefinite.astype(jnp.int32),

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ from mpmjax._types import Array, Bool, Deformation, Float, Matrix, Scalar, parti
 from mpmjax.material import AbstractElastic, AbstractLaw, AbstractTangent, Viscosity
 from mpmjax.native import stored
 from mpmjax.state._averaged_volume import VolumeAverage, averaged_deformation
-from mpmjax.state._particles import Group, Particles
+from mpmjax.state._particles import Group, Particles, state_of, with_state
 
 
 class MaterialPoints(eqx.Module):
@@ -146,9 +145,8 @@ def material_points(
         total: whether gradients are with respect to the reference positions.
         average: the average of the volumes of a material, by its number and its particles; None without. Default: none.
     """
-
-    def one(number: int, law: AbstractLaw, group: Group) -> MaterialPoints:
-        return MaterialPoints(
+    return tuple(
+        MaterialPoints(
             law=law.elastic(group.history),
             volume=particles.volume[slice(*group.rows)],
             deformation=group.deformation(),
@@ -157,18 +155,15 @@ def material_points(
             viscosity=law.viscous_part(),
             average=average(number, group),
         )
-
-    return tuple(one(n, law, group) for n, (law, group) in enumerate(zip(laws, particles.groups, strict=True)))
+        for number, (law, group) in enumerate(zip(laws, particles.groups, strict=True))
+    )
 
 
 def return_map(laws: tuple[AbstractLaw, ...], particles: Particles, dt: Scalar) -> Particles:
     """The particles after the return maps of laws that yield: from the trial deformation to one that the law
     admits after a step dt [s]."""
-
-    def one(law: AbstractLaw, group: Group) -> tuple[Array, Any]:
-        deformation, history = law.return_map(group.deformation(), group.history, dt)
-        return particle_first(deformation), history
-
-    found = [one(law, group) for law, group in zip(laws, particles.groups, strict=True)]
-    deformations, histories = zip(*found, strict=True)
-    return replace(particles, deformations=deformations, histories=histories)
+    groups = zip(laws, particles.groups, strict=True)
+    mapped = [law.return_map(group.deformation(), group.history, dt) for law, group in groups]
+    deformations = tuple(particle_first(deformation) for deformation, _ in mapped)
+    state = replace(state_of(particles), deformations=deformations, histories=tuple(history for _, history in mapped))
+    return with_state(particles, state)

@@ -1,7 +1,8 @@
 """The particles: the state of a simulation."""
 
+import operator
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
 
@@ -276,7 +277,6 @@ def state_of(particles: Particles) -> State:
 
 
 def with_state(particles: Particles, state: State) -> Particles:
-    """The particles with their evolving part replaced."""
-    return replace(
-        particles, x=state.x, v=state.v, C=state.C, deformations=state.deformations, histories=state.histories
-    )
+    """The particles with their evolving part replaced. It is of their shapes and dtype, so nothing is checked again."""
+    evolving = operator.attrgetter(*(field.name for field in fields(State)))
+    return eqx.tree_at(evolving, particles, evolving(state), is_leaf=lambda a: a is None)

@@ -2,13 +2,13 @@
 
 from mpmjax.stepping._backward_euler import BackwardEuler
 from mpmjax.stepping._explicit import Explicit
+from mpmjax.stepping._grid_update import GridUpdate, reaction, update
 from mpmjax.stepping._implicit_midpoint import ImplicitMidpoint
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
-from mpmjax.stepping._left_undone import LeftUndone
-from mpmjax.stepping._nodes import Nodes, particles_to_grid
+from mpmjax.stepping._nodes import Nodes, start_nodes
 from mpmjax.stepping._semi_implicit import SemiImplicit
 from mpmjax.stepping._stability import MOST_STEPS, SAFETY, UnknownBoundError, longest_step, stable_dt, step_for
-from mpmjax.stepping._step import GridUpdate, StepInfo, grid_to_particles, step, step_compiled, step_unchecked, update
+from mpmjax.stepping._step import StepInfo, grid_to_particles, step, step_compiled, step_unchecked
 from mpmjax.stepping._trbdf2 import TRBDF2
 
 __all__ = [
@@ -20,7 +20,6 @@ __all__ = [
     "Explicit",
     "GridUpdate",
     "ImplicitMidpoint",
-    "LeftUndone",
     "NodeMotion",
     "Nodes",
     "SemiImplicit",
@@ -28,8 +27,9 @@ __all__ = [
     "UnknownBoundError",
     "grid_to_particles",
     "longest_step",
-    "particles_to_grid",
+    "reaction",
     "stable_dt",
+    "start_nodes",
     "step",
     "step_compiled",
     "step_for",

@@ -20,7 +20,6 @@ from mpmjax.implicit import (
 )
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
-from mpmjax.stepping._stage import Stage
 
 
 class BackwardEuler(AbstractImplicitIntegrator):
@@ -53,7 +52,7 @@ class BackwardEuler(AbstractImplicitIntegrator):
         require_fields(self)
 
     def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
-        v, info = Stage(nodes.inertial_velocity(), nodes.dt).solve(nodes, guess, self)
+        v, info = self.solve_stage(nodes, guess, nodes.inertial_velocity(), nodes.dt)
         return NodeMotion(v, resisted=v if nodes.potential.viscous else None), info
 
     def solved_by(self) -> AbstractSolution:

@@ -1,17 +1,19 @@
 """What each boundary of a scene receives in a step, from the motion of the nodes and the impulses that made it."""
 
+import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, Int, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary import (
     BoundaryImpulse,
-    ConstrainedNodes,
+    ColliderImpulse,
     Given,
     GivenCouple,
     Image,
     RigidImage,
     brought_images,
     impulse_on_boundaries,
+    impulse_on_colliders,
     owners_of,
     taken_by_mirrors,
 )
@@ -19,43 +21,56 @@ from mpmjax.discretisation import AbstractTransfer, Gathered, Stencil
 from mpmjax.geometry import moment
 from mpmjax.material import Freedom
 from mpmjax.state import Particles, Scene
+from mpmjax.stepping._grid_update import GridUpdate, elastic_impulse, reaction
+from mpmjax.stepping._integrator import AbstractIntegrator
 from mpmjax.stepping._nodes import Nodes, places_of
 
 
-def given_to_boundaries(
+def impulse_on_colliders_of(nodes: Nodes, method: AbstractIntegrator, new: GridUpdate) -> ColliderImpulse:
+    """The impulse on the scene's colliders, at their places at the time of the forces.
+
+    Args:
+        nodes: the nodes at the start of the step.
+        method: the integrator.
+        new: their update.
+    """
+    colliders, share = nodes.conditions.colliders, method.force_at()
+    assert colliders is not None
+    if share is not None:
+        colliders = colliders.after(share * nodes.dt, nodes.mirror.unfold(new.motion.carrier))
+    held = new.held(nodes)
+    holding = held.beside_springs(reaction(nodes, new.solved, new.elastic))
+    pushes = () if new.contact is None else held.pushes(new.contact.friction)
+    return impulse_on_colliders(colliders, holding, held.along_normals(holding), pushes)
+
+
+def impulse_on_boundaries_of(
     scene: Scene,
     particles: Particles,
-    stencil: Stencil,
     t: Scalar,
     unfolded: Nodes,
     nodes: Nodes,
-    reaction: NodeVector,
-    before: NodeVector | None,
-    solved: NodeVector,
-    carrier: NodeVector,
-    force_at: Scalar | None,
-    held: ConstrainedNodes,
-    slowed: tuple[NodeVector, ...],
+    method: AbstractIntegrator,
+    new: GridUpdate,
 ) -> BoundaryImpulse:
     """The impulse on each boundary of the scene, and on what guides its rigid bodies, in the step from t.
 
     Args:
         scene: the scene.
         particles: the particles at the start of the step.
-        stencil: their stencil.
         t: time at the start of the step [s].
         unfolded: the nodes at the start of the step, not folded at symmetry planes.
         nodes: the same, folded.
-        reaction: the impulse on all nodes besides gravity, body forces and internal ones, without friction [kg m/s],
-            shape (n, d).
-        before: the folded nodes' velocity whose change over the step transfers take [m/s], shape (n, d); None if it is
-            not known.
-        solved: their velocity v^{n+1} before friction [m/s], shape (n, d).
-        carrier: their velocity with which positions move [m/s], shape (n, d).
-        force_at: the share of the step's displacement at which forces are evaluated; None for forces at its start.
-        held: the nodes with what contacts hold.
-        slowed: the change of velocity by the friction of each contact [m/s], shape (n, d).
+        method: the integrator.
+        new: their update.
     """
+    held, force_at, stencil = new.held(nodes), method.force_at(), nodes.potential.stencil
+    solved, carrier = new.solved.velocity, new.motion.carrier
+    whole, elastic = new.solved, new.elastic
+    if nodes.mirror.images:  # of all nodes
+        whole = jax.tree.map(nodes.mirror.unfold, whole)
+        elastic = elastic_impulse(unfolded, method, whole)
+    residual = reaction(unfolded, whole, elastic)
     grid, window, dt = scene.grid, scene.window(particles), nodes.dt
     images = brought_images(scene.boundary, grid, window)
     contacts = list(zip(nodes.brought_by, nodes.contacts, held.active, strict=True))
@@ -71,7 +86,7 @@ def given_to_boundaries(
         soft = image.with_own(soft, jnp.zeros(len(image.arms), dtype=bool))
 
     # springs act on all nodes
-    given, residual = [], reaction
+    given = []
     for number, contact, active in contacts:
         push = contact.spring_impulse(held, active)
         if push is not None:
@@ -80,10 +95,10 @@ def given_to_boundaries(
                 given.append(Given(push, number))
 
     # what symmetry planes take of the impulses on all nodes, and what reaches the folded ones
-    if scene.transfer.needs_change and before is not None:
+    if scene.transfer.needs_change:
         kept = _share_of_change(scene.transfer, scene.grid.dim, residual.dtype)
         mass = jnp.where(soft, unfolded.mass, 0) if couples else unfolded.mass  # a rigid body takes the velocity
-        residual = residual + kept * mass[:, None] * (unfolded.velocity - unfold(before))
+        residual = residual + kept * mass[:, None] * (unfolded.velocity - unfold(new.before(nodes)))
     of_planes, residual = taken_by_mirrors(residual, images)
     given += of_planes
 
@@ -106,7 +121,8 @@ def given_to_boundaries(
             given.append(Given(jnp.where(mine, residual, 0), number))
             taken = taken | mine
 
-    for (number, _, _), change in zip(contacts, slowed, strict=True):
+    friction_of = () if new.contact is None else new.contact.friction
+    for (number, _, _), change in zip(contacts, friction_of, strict=True):
         of_planes, friction = taken_by_mirrors(unfolded.mass[:, None] * unfold(change), images)
         given += of_planes
         if number is not None:

@@ -20,7 +20,6 @@ from mpmjax.implicit import (
 )
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
-from mpmjax.stepping._stage import Stage
 
 
 class ImplicitMidpoint(AbstractImplicitIntegrator):
@@ -61,8 +60,7 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
 
     def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         v0, half = nodes.admitted_velocity(), nodes.dt / 2
-        stage = Stage(v0 + half * nodes.acceleration, half)
-        mean, info = stage.solve(nodes, guess, self)
+        mean, info = self.solve_stage(nodes, guess, v0 + half * nodes.acceleration, half)
         return NodeMotion(2 * mean - v0, mean, resisted=mean if nodes.potential.viscous else None), info
 
     def solved_by(self) -> AbstractSolution:

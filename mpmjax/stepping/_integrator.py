@@ -4,6 +4,7 @@ from abc import abstractmethod
 from typing import ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._types import NodeVector, Scalar
@@ -14,8 +15,10 @@ from mpmjax.implicit import (
     Guess,
     Reporting,
     SolveInfo,
+    StageEquation,
     exact_force,
     require_solver,
+    solve,
 )
 from mpmjax.stepping._nodes import Nodes
 
@@ -156,6 +159,41 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
     def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
         """The stages in which the elastic force acts on displaced nodes: weights q [-] and displacements u [m], shape
         (n, d), of the impulse Δt Σ q f(u)."""
+
+    def solve_stage(
+        self,
+        nodes: Nodes,
+        guess: NodeVector,
+        inertial: NodeVector,
+        stage_dt: Scalar,
+        initial_displacement: NodeVector | None = None,
+    ) -> tuple[NodeVector, SolveInfo]:
+        """The solution v [m/s], shape (n, d), of M (v − a) = Δt_s (f(u + Δt_s v) − D v) (derivation, eq. 22 and section
+        10), and the report of the solve. f(u) is the elastic force at a nodal displacement u and −D v the viscous
+        force. One linear solve takes f(u) = f(0) − H u; Newton's method solves the nonlinear equation.
+
+        Args:
+            nodes: the nodes.
+            guess: where the solve starts [m/s], shape (n, d).
+            inertial: a, the velocity of the stage without the force at its own end [m/s], shape (n, d).
+            stage_dt: Δt_s, the length of the stage [s].
+            initial_displacement: u at the start of the stage [m], shape (n, d); None for zero.
+        """
+        equation = StageEquation(
+            mass=nodes.mass,
+            inertial=inertial,
+            stage_dt=jnp.asarray(stage_dt),
+            initial_displacement=initial_displacement,
+            force=nodes.force,
+            spacing=nodes.spacing,
+            potential=nodes.potential,
+            hessian=self.hessian,
+            projection=nodes.projection,
+            prescribed=nodes.prescribed if nodes.moves_held else None,
+            preconditioner=self.preconditioner,
+        )
+        solution = self.solved_by()
+        return solve(solution.problem(equation), guess, solution, self.adjoint_solver)
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt Σ q f(u) [kg m/s], with the forces that the solution takes."""

@@ -1,20 +1,19 @@
-"""The nodes at the start of a step: mass, velocity and force from P2G, boundaries, and the elastic potential."""
+"""The nodes at the start of a step: P2G, then boundaries and contacts, then the fold at mirror planes."""
 
 from dataclasses import replace
 from functools import reduce
-from operator import attrgetter
+from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, Int, Mask, NodeScalar, NodeVector, Scalar, components
+from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar, components
 from mpmjax.boundary import (
-    PARALLEL,
     AbstractContact,
     AbstractNodes,
     Conditions,
     Coupling,
+    FreeNormal,
     Mirror,
     MirrorMotion,
     Springs,
@@ -26,25 +25,8 @@ from mpmjax.boundary import (
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.state import Particles, Scene, load_force, points_of, supports_of
-from mpmjax.stepping._body_surfaces import contacts_of_bodies
-from mpmjax.stepping._nodal_sums import JoinedSum, SeparateSums, per_mass
-from mpmjax.stepping._particle_faces import faces_of
+from mpmjax.stepping._contact_surfaces import contacts_of_bodies, faces_of
 from mpmjax.stepping._rigid_layers import RigidLayers, rigid_layers
-
-
-class FreeNormal(eqx.Module):
-    """A collider's normal at each node, and its part in free components at right angles to those of earlier ones."""
-
-    normal: NodeVector
-    """The collider's unit normal, shape (n, d)."""
-    owner: Int[Array, "n"]
-    """The collider's number, shape (n,); −1 where there is no such part."""
-    direction: NodeVector
-    """Unit vector along that part, shape (n, d); zero where there is none."""
-    length: NodeScalar
-    """Length of that part [-], shape (n,); 1 where there is none."""
-    speed: NodeScalar
-    """Velocity along it [m/s], shape (n,), at which the whole normal velocity is that of the collider."""
 
 
 class Nodes(AbstractNodes):
@@ -52,8 +34,12 @@ class Nodes(AbstractNodes):
 
     mass: NodeScalar
     """m_i [kg], shape (n,), folded at symmetry planes; zero on empty nodes (see `p2g`)."""
-    sums: SeparateSums | JoinedSum
-    """The sums of P2G besides the mass."""
+    v: NodeVector
+    """v_i^n [m/s], shape (n, d); where P2G has summed momentum and force together, v*."""
+    f: NodeVector | None
+    """`force`; None where P2G has summed momentum and force together, and so the next."""
+    g: Array | None
+    """`acceleration`."""
     dt: Float[Array, ""]
     """Δt [s]."""
     spacing: Float[Array, ""]
@@ -77,22 +63,28 @@ class Nodes(AbstractNodes):
         return (self.mass > 0)[:, None]
 
     @property
+    def separate(self) -> bool:
+        """Whether v^n and the force are known separately."""
+        return self.f is not None
+
+    @property
     def velocity(self) -> NodeVector:
         """v_i^n [m/s], shape (n, d); zero on empty nodes.
 
         Raises:
             ValueError: P2G summed momentum and force together.
         """
-        return self.sums.velocity
+        return self._apart(self.v)
 
     @property
     def force(self) -> NodeVector:
-        """The internal force at the start of the step [N], shape (n, d).
+        """Internal force at the start of the step [N], shape (n, d): the elastic one, and for integrators with explicit
+        viscosity the viscous one.
 
         Raises:
             ValueError: P2G summed momentum and force together.
         """
-        return self.sums.force
+        return self._apart(self.f)
 
     @property
     def acceleration(self) -> Array:
@@ -101,17 +93,15 @@ class Nodes(AbstractNodes):
         Raises:
             ValueError: P2G summed momentum and force together.
         """
-        return self.sums.acceleration
+        return self._apart(self.g)
 
-    @property
-    def viscous_force(self) -> NodeVector | None:
-        """The viscous part of `force` [N], shape (n, d); None unless it was asked for."""
-        return self.sums.viscous_force
-
-    @property
-    def separate(self) -> bool:
-        """Whether v^n and the force are known separately."""
-        return self.sums.separate
+    def _apart(self, field: Any) -> Any:
+        if self.f is None:
+            raise ValueError(
+                "P2G summed momentum and forces in one, so v^n, g and the force are not known apart: only "
+                "nodes.explicit_velocity() is. An integrator that uses them must have needs_separate_force = True."
+            )
+        return field
 
     @property
     def free(self) -> Mask:
@@ -125,37 +115,8 @@ class Nodes(AbstractNodes):
 
     @property
     def free_normals(self) -> tuple[FreeNormal, ...]:
-        """The parts of the colliders' normals in free components, made orthogonal in the colliders' order, as many as a
-        node can have.
-
-        With components a prescribed, n·v = n·v_c becomes Σ_free n v = n·v_c − Σ_a n_a v_a, and so for earlier parts.
-        """
-        colliders, found = self.conditions.colliders, []
-        for slide in () if colliders is None else colliders.slides:
-            part = jnp.where(self.free, slide.normal, 0)
-            missing = slide.normal * (slide.velocity - jnp.where(self.free, 0, self.conditions.velocity))
-            missing = missing.sum(axis=1)
-            for other in found:
-                share = (part * other.direction).sum(axis=1)
-                part, missing = part - share[:, None] * other.direction, missing - share * other.speed
-            square = (part**2).sum(axis=1)
-            some = square > PARALLEL**2
-            length = jnp.sqrt(jnp.where(some, square, 1))
-            new = FreeNormal(
-                normal=slide.normal,
-                owner=jnp.where(some, jnp.int32(slide.number), -1),
-                direction=jnp.where(some[:, None], part / length[:, None], 0),
-                length=length,
-                speed=jnp.where(some, missing / length, 0),
-            )
-            for place, old in enumerate(found):  # goes into the first place that is empty at each node
-                taken = old.owner >= 0
-                found[place] = _where(taken, old, new)
-                new = _where(taken, new, jax.tree.map(jnp.zeros_like, new))
-                new = replace(new, owner=jnp.where(taken, new.owner, -1), length=jnp.where(taken, new.length, 1))
-            if len(found) < self.conditions.fixed.shape[1]:
-                found.append(new)
-        return tuple(found)
+        """The free parts of the colliders' normals (see `Conditions.free_normals`)."""
+        return self.conditions.free_normals(self.free) if self.conditions.colliders is not None else ()
 
     @property
     def projection(self) -> Projection:
@@ -178,13 +139,13 @@ class Nodes(AbstractNodes):
         along = reduce(jnp.add, (part.direction * part.speed[:, None] for part in parts))
         return jnp.where(self.free, along, velocity)
 
-    def explicit_velocity(self) -> NodeVector:
-        """v* = v^n + Δt f/m + Δt g [m/s], shape (n, d) (derivation, eq. 4)."""
-        return self.sums.explicit_velocity(self.mass, self.dt)
-
     def inertial_velocity(self) -> NodeVector:
         """v^n + Δt g [m/s], shape (n, d)."""
-        return self.sums.inertial_velocity(self.mass, self.dt)
+        return jnp.where(self.occupied, self.velocity + self.dt * self.acceleration, 0)
+
+    def explicit_velocity(self) -> NodeVector:
+        """v* = v^n + Δt f/m + Δt g [m/s], shape (n, d) (derivation, eq. 4)."""
+        return self.inertial_velocity() + self.dt * self.per_mass(self.force) if self.separate else self.v
 
     def admitted(self, velocity: NodeVector) -> NodeVector:
         """A velocity that is zero on empty nodes, with the prescribed values in held components [m/s], shape (n, d)."""
@@ -196,7 +157,7 @@ class Nodes(AbstractNodes):
 
     def per_mass(self, impulse: NodeVector) -> NodeVector:
         """An impulse or force divided by the nodes' mass; zero on empty nodes."""
-        return per_mass(impulse, self.mass)
+        return _per_mass(impulse, self.mass)
 
     def folded(self, images: Mirror) -> "Nodes":
         """The nodes with the sums of their images at mirror planes added; the same nodes without a plane.
@@ -205,23 +166,30 @@ class Nodes(AbstractNodes):
         """
         if not images.images:
             return self
-        folded = images.fold_scalar(self.mass), images.then(self.potential.mirror)
-        nodes = eqx.tree_at(lambda n: (n.mass, n.potential.mirror), self, folded)
+        mass = images.fold_scalar(self.mass)
 
-        def fold_per_mass(v: Array) -> NodeVector:
-            return nodes.per_mass(images.fold(self.mass[:, None] * v))
+        def fold(field: Array) -> NodeVector:
+            """Of a field per mass."""
+            return _per_mass(images.fold(self.mass[:, None] * field), mass)
 
-        return replace(nodes, sums=self.sums.folded(fold_per_mass, images.fold))
+        return replace(
+            self,
+            mass=mass,
+            v=fold(self.v),
+            f=None if self.f is None else images.fold(self.f),
+            g=None if self.g is None else fold(self.g),
+            potential=replace(self.potential, mirror=images.then(self.potential.mirror)),
+        )
 
     def tied(self, rigid: RigidLayers) -> "Nodes":
         """The nodes with those of rigid bodies folded to the two that move each of them."""
         nodes = self.folded(Mirror(rigid.images))
-        new = jnp.where(rigid.own, rigid.velocity, nodes.velocity), rigid.conditions, self
-        return eqx.tree_at(attrgetter("sums.velocity", "conditions", "loose"), nodes, new, is_leaf=lambda x: x is None)
+        velocity = jnp.where(rigid.own, rigid.velocity, nodes.velocity)
+        return replace(nodes, v=velocity, conditions=rigid.conditions, loose=self)
 
     def moved_by(self, change: NodeVector) -> "Nodes":
         """The nodes with a velocity [m/s], shape (n, d), added to theirs."""
-        return replace(self, sums=self.sums.moved_by(jnp.where(self.occupied, change, 0)))
+        return replace(self, v=self.v + jnp.where(self.occupied, change, 0))
 
     def constrained(
         self,
@@ -233,14 +201,19 @@ class Nodes(AbstractNodes):
         """The nodes folded at these mirrors, with the components `fixed` held, and the force of the springs and
         couplings."""
         nodes = replace(self.folded(images), conditions=replace(self.conditions, fixed=fixed, holds=True))
-        if springs or couplings:
-            nodes = eqx.tree_at(lambda n: (n.potential.springs, n.potential.couplings), nodes, (springs, couplings))
-            nodes = replace(nodes, sums=nodes.sums.with_force(nodes.potential.spring_force(None), nodes.mass, self.dt))
-        return nodes
+        if not springs and not couplings:
+            return nodes
+        nodes = replace(nodes, potential=replace(nodes.potential, springs=springs, couplings=couplings))
+        force = nodes.potential.spring_force(None)
+        if nodes.f is None:
+            return replace(nodes, v=nodes.v + nodes.dt * nodes.per_mass(force))
+        return replace(nodes, f=nodes.f + force)
 
 
-def _where(mask: Bool[Array, "n"], a: FreeNormal, b: FreeNormal) -> FreeNormal:
-    return jax.tree.map(lambda x, y: jnp.where(mask if x.ndim == 1 else mask[:, None], x, y), a, b)
+def _per_mass(impulse: NodeVector, mass: NodeScalar) -> NodeVector:
+    """An impulse or force divided by the nodes' mass; zero on empty nodes."""
+    occupied = (mass > 0)[:, None]
+    return jnp.where(occupied, impulse / jnp.where(occupied, mass[:, None], 1), 0)
 
 
 def particles_to_grid(
@@ -251,13 +224,10 @@ def particles_to_grid(
     stencil: Stencil,
     *,
     body_force_at: float = 0.0,
-    force_at: Scalar | None = None,
     explicit_viscosity: bool = False,
     joined: bool = False,
-    viscosity_apart: bool = False,
-    folded: bool = True,
 ) -> Nodes:
-    """P2G, folded at symmetry planes, with the elastic potential and the boundaries of the step from t to t + dt.
+    """P2G: mass, velocity and force of the nodes in the step from t to t + dt, and the elastic potential.
 
     Args:
         scene: the scene.
@@ -267,106 +237,130 @@ def particles_to_grid(
         stencil: stencil of the particles.
         body_force_at: the time at which body forces are evaluated, as a fraction of the step. Positions are moved on to
             it with the particles' velocity.
-        force_at: the share of the step's displacement at which forces are evaluated; None if the step is explicit.
         explicit_viscosity: whether the force includes the viscous stress, at the particles' stored velocity gradients.
         joined: whether momentum and force may be summed together. They are if both have the same gradient operator.
-        viscosity_apart: whether to compute the viscous part of the force separately too.
-        folded: whether to fold at symmetry planes.
     """
-    grid, window = scene.grid, scene.window(particles)
-    v = components(particles.v)
+    size, v = scene.grid.size, components(particles.v)
     C = None if particles.C is None else components(particles.C)
+    joined = joined and stencil.mls_weight_derivatives is None and not scene.rigid_bodies
+    potential = ElasticPotential(scene.material_points(particles, t), stencil, Mirror(()), size)
+    flux = potential.current_flux()  # V P Fᵀ, of which the internal force is −Σ_p flux_p g_ip
+    if explicit_viscosity and C is not None and potential.material_viscous:
+        flux = flux + potential.viscous_flux(C)
+    acceleration, pushed = jnp.asarray(scene.gravity), None
+    if scene.body_force is not None:
+        x = particles.x + body_force_at * dt * particles.v if body_force_at else particles.x
+        pushed = components(scene.body_force.acceleration(x, t + body_force_at * dt if body_force_at else t))
+    if joined:
+        g = acceleration[:, None]
+        v = v + dt * (g if pushed is None else g + pushed)
     affine = C if scene.transfer.affine else None
-    with jax.named_scope("p2g"):
+    mass, velocity = p2g(stencil, particles.mass, v, affine, size, -dt * flux if joined else None)
+
+    # forces at points of the body: loads, springs and dashpots to the ground
+    loaded, held = None, None
+    if scene.loads:
         points = points_of(scene.loads, scene.laws, particles, stencil, total=scene.total)
-        supports = supports_of(scene.loads, points, t + body_force_at * dt)
-        potential = ElasticPotential(scene.material_points(particles, t), stencil, Mirror(()), grid.size, supports)
-        joined = joined and stencil.mls_weight_derivatives is None and not scene.rigid_bodies
-        flux, viscous_flux = potential.current_flux(), None
-        if explicit_viscosity and potential.material_viscous and C is not None:
-            viscous_flux = potential.viscous_flux(C)
-            flux = flux + viscous_flux
-        pushed = _body_force(scene, particles, t, dt, body_force_at)
-        if joined:
-            g = jnp.asarray(scene.gravity)[:, None]
-            v = v + dt * (g if pushed is None else g + pushed)
-        mass, velocity = p2g(stencil, particles.mass, v, affine, grid.size, -dt * flux if joined else None)
-        loaded = load_force(scene.loads, points, t, dt, body_force_at, grid.size)
-        held = potential.support_force() if supports else None
-        drag = potential.support_drag() if explicit_viscosity else None
-        if joined:
-            at_nodes = [force for force in (loaded, held, drag) if force is not None]
-            sums = JoinedSum(velocity + dt * per_mass(reduce(jnp.add, at_nodes), mass) if at_nodes else velocity)
-        else:
-            acceleration = jnp.asarray(scene.gravity)
-            if loaded is not None:
-                acceleration = acceleration + per_mass(loaded, mass)
-            if pushed is not None:
-                acceleration = acceleration + per_mass(scatter(stencil, particles.mass * pushed, None, grid.size), mass)
-            force, viscous_force = -potential.nodal_sum(flux), None
-            if viscosity_apart and viscous_flux is not None:
-                viscous_force = -potential.nodal_sum(viscous_flux)
-            if held is not None:
-                force = force + held
-            if drag is not None:
-                force = force + drag
-            if viscosity_apart and drag is not None:
-                viscous_force = drag if viscous_force is None else viscous_force + drag
-            sums = SeparateSums(velocity, force, viscous_force, acceleration)
-        places = scene.nodes(particles, t)
-        conditions = combined_conditions(scene.boundary, places, grid.spacing, t, dt, reference=scene.total)
-        if scene.total and conditions.colliders is not None and conditions.colliders.slides:
-            slid = reduce(jnp.logical_or, (slide.normal.any(axis=1) for slide in conditions.colliders.slides))
-            place = jnp.where(
-                (slid & (mass > 0))[:, None], places_of(particles, stencil, grid.size), conditions.colliders.position
-            )
-            conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
-        faces = faces_of(scene, particles, potential.material_points, stencil, dt, force_at)
-        acts_at = t if force_at is None else t + jnp.where(jnp.asarray(force_at) > 0, dt, 0)
-        brought: list[tuple[int | None, AbstractContact]] = [
-            *brought_contacts(scene.boundary, conditions, grid, window, t, dt, faces, acts_at)
-        ]
+        loaded = load_force(scene.loads, points, t, dt, body_force_at, size)
+        potential = replace(potential, supports=supports_of(scene.loads, points, t + body_force_at * dt))
+        held = potential.support_force() if potential.supports else None
+        if explicit_viscosity and (drag := potential.support_drag()) is not None:
+            held = drag if held is None else held + drag
+
+    if joined:
+        at_points = [force for force in (loaded, held) if force is not None]
+        v = velocity + dt * _per_mass(reduce(jnp.add, at_points), mass) if at_points else velocity
+        force, acceleration = None, None
+    else:
+        v, force = velocity, -potential.nodal_sum(flux)
+        if loaded is not None:
+            acceleration = acceleration + _per_mass(loaded, mass)
+        if pushed is not None:
+            acceleration = acceleration + _per_mass(scatter(stencil, particles.mass * pushed, None, size), mass)
+        if held is not None:
+            force = force + held
+    return Nodes(
+        mass=mass,
+        v=v,
+        f=force,
+        g=acceleration,
+        dt=jnp.asarray(dt),
+        spacing=jnp.asarray(scene.grid.spacing),
+        potential=potential,
+        conditions=Conditions(jnp.zeros(v.shape, bool), jnp.zeros_like(v), holds=False, moves=False),
+    )
+
+
+def with_boundaries(
+    scene: Scene, particles: Particles, nodes: Nodes, t: Scalar, force_at: Scalar | None = None
+) -> Nodes:
+    """The nodes with the conditions and contacts of boundaries and bodies in the step from t.
+
+    Args:
+        scene: the scene.
+        particles: prepared particles.
+        nodes: their nodes, from `particles_to_grid`.
+        t: time at the start of the step [s].
+        force_at: the share of the step's displacement at which forces are evaluated; None if the step is explicit.
+    """
+    grid, window, dt, potential = scene.grid, scene.window(particles), nodes.dt, nodes.potential
+    places = scene.nodes(particles, t)
+    conditions = combined_conditions(scene.boundary, places, grid.spacing, t, dt, reference=scene.total)
+    if scene.total and conditions.colliders is not None and conditions.colliders.slides:
+        slid = reduce(jnp.logical_or, (slide.normal.any(axis=1) for slide in conditions.colliders.slides))
+        moved = places_of(particles, potential.stencil, grid.size)
+        place = jnp.where(slid[:, None] & nodes.occupied, moved, conditions.colliders.position)
+        conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
+    faces = None
+    if any(boundary.pushes or boundary.sees_faces for boundary in scene.boundary):
+        faces = faces_of(scene, particles, potential, dt, force_at)
+    acts_at = t if force_at is None else t + jnp.where(jnp.asarray(force_at) > 0, dt, 0)
+    brought = brought_contacts(scene.boundary, conditions, grid, window, t, dt, faces, acts_at)
+    contacts, brought_by = [contact for _, contact in brought], [number for number, _ in brought]
+    if scene.bodies is not None:
         images = mirror(scene.boundary, grid, window)
-        touching = contacts_of_bodies(scene, particles, potential.material_points, stencil, images, dt, force_at)
-        brought += [(None, contact) for contact in touching]
-        nodes = Nodes(
-            mass=mass,
-            sums=sums,
-            dt=jnp.asarray(dt),
-            spacing=jnp.asarray(grid.spacing),
-            potential=potential,
-            conditions=conditions,
-            contacts=tuple(contact for _, contact in brought),
-            brought_by=tuple(number for number, _ in brought),
-            mirror_motion=mirror_motion(scene.boundary, grid, window, t, dt),
-        )
-        return folded_at_planes(scene, particles, nodes) if folded else nodes
+        contacts += contacts_of_bodies(scene, scene.bodies.friction, particles, potential, images, dt, force_at)
+    return replace(
+        nodes,
+        conditions=conditions,
+        contacts=tuple(contacts),
+        brought_by=(*brought_by, *[None] * (len(contacts) - len(brought_by))),
+        mirror_motion=mirror_motion(scene.boundary, grid, window, t, dt),
+    )
 
 
 def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes) -> Nodes:
     """The nodes, folded at the scene's symmetry planes, and those of rigid bodies to the two that move each."""
     images, moving = mirror(scene.boundary, scene.grid, scene.window(particles)), nodes.mirror_motion
-    with jax.named_scope("p2g"):
-        if scene.rigid_bodies:
-            rigid = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images, nodes.dt)
-            return nodes.folded(images).tied(rigid)
-        if moving is None:
-            return nodes.folded(images)
-        # at rest with the mirrors: the velocity less what they add, which is put back
-        added = jnp.where(nodes.conditions.fixed, nodes.conditions.velocity, 0)
-        added = jnp.where(moving.beyond, moving.velocity, added)
-        added = images.added(added)
-        return nodes.moved_by(-images.unfold(added)).folded(images).moved_by(added)
+    if scene.rigid_bodies:
+        rigid = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images, nodes.dt)
+        return nodes.folded(images).tied(rigid)
+    if moving is None:
+        return nodes.folded(images)
+    # at rest with the mirrors: the velocity less what they add, which is put back
+    added = jnp.where(nodes.conditions.fixed, nodes.conditions.velocity, 0)
+    added = jnp.where(moving.beyond, moving.velocity, added)
+    added = images.added(added)
+    return nodes.moved_by(-images.unfold(added)).folded(images).moved_by(added)
 
 
-def _body_force(scene: Scene, particles: Particles, t: Scalar, dt: Scalar, part: float) -> Float[Array, "d p"] | None:
-    """The scene's body force per unit mass [m/s²], at a part of the step, to which positions are moved on with the
-    particles' velocity; None without one."""
-    if scene.body_force is None:
-        return None
-    if part > 0:
-        return components(scene.body_force.acceleration(particles.x + part * dt * particles.v, t + part * dt))
-    return components(scene.body_force.acceleration(particles.x, t))
+def start_nodes(
+    scene: Scene,
+    particles: Particles,
+    t: Scalar,
+    dt: Scalar,
+    stencil: Stencil,
+    *,
+    body_force_at: float = 0.0,
+    explicit_viscosity: bool = False,
+    force_at: Scalar | None = None,
+) -> Nodes:
+    """The nodes of `particles_to_grid` with boundaries, folded at mirror planes: what an integrator is given."""
+    at, viscosity = body_force_at, explicit_viscosity
+    nodes = particles_to_grid(scene, particles, t, dt, stencil, body_force_at=at, explicit_viscosity=viscosity)
+    if scene.boundary or scene.bodies is not None:
+        nodes = folded_at_planes(scene, particles, with_boundaries(scene, particles, nodes, t, force_at))
+    return nodes
 
 
 def places_of(particles: Particles, stencil: Stencil, size: int) -> NodeVector:

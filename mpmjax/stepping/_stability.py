@@ -17,10 +17,10 @@ from mpmjax.checks import canonical, checked, is_traced, require, require_positi
 from mpmjax.discretisation import Stencil, gather
 from mpmjax.geometry import length
 from mpmjax.state import AttachedPoints, MaterialPoints, Particles, Scene, is_prepared, points_of, prepare
+from mpmjax.stepping._contact_surfaces import contact_moduli
 from mpmjax.stepping._explicit import Explicit
 from mpmjax.stepping._integrator import AbstractIntegrator
-from mpmjax.stepping._nodes import Nodes, particles_to_grid
-from mpmjax.stepping._particle_faces import contact_moduli
+from mpmjax.stepping._nodes import Nodes, start_nodes
 
 MOST_STEPS = 2**31 - 1
 """The largest number of steps of a run."""
@@ -171,7 +171,7 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Fl
     z = stiffest * elastic_steepness / density  # per Δt²
     if not scene.total:  # in the total description there are no such surfaces, and strains add
         zero, one = jnp.zeros((), z.dtype), jnp.ones((), z.dtype)
-        nodes = particles_to_grid(scene, particles, zero, one, scene.stencil(particles))
+        nodes = start_nodes(scene, particles, zero, one, scene.stencil(particles))
         z = z + 2 * _straining(scene, particles, nodes) + _contact(particles, nodes, elastic_steepness)
         z = z + _between_bodies(scene, particles, materials, nodes)
     factor = method.stability_factor()

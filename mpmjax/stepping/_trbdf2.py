@@ -21,7 +21,6 @@ from mpmjax.implicit import (
 )
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
-from mpmjax.stepping._stage import Stage
 
 
 class TRBDF2(AbstractImplicitIntegrator):
@@ -77,11 +76,11 @@ class TRBDF2(AbstractImplicitIntegrator):
         length = q2 * dt  # Δt_s = ½γΔt
         viscous = nodes.potential.viscous
         pull = nodes.per_mass(nodes.force - nodes.potential.viscous_resistance(v0) if viscous else nodes.force)
-        trapezoidal = Stage(v0 + length * (pull + 2 * g), length, length * v0)
-        middle, first = trapezoidal.solve(nodes, guess, self)
-        later_pull = (middle - trapezoidal.inertial) / length  # f_γ/m, viscosity's with it, by the stage's own equation
-        last = Stage(v0 + dt * (q0 * pull + q1 * later_pull + g), length, dt * (q0 * v0 + q1 * middle))
-        v, second = last.solve(nodes, middle, self)
+        inertial = v0 + length * (pull + 2 * g)
+        middle, first = self.solve_stage(nodes, guess, inertial, length, length * v0)
+        later_pull = (middle - inertial) / length  # f_γ/m, viscosity's with it, by the stage's own equation
+        inertial = v0 + dt * (q0 * pull + q1 * later_pull + g)
+        v, second = self.solve_stage(nodes, middle, inertial, length, dt * (q0 * v0 + q1 * middle))
         inner, mean = q2 * (v0 + middle), q0 * v0 + q1 * middle + q2 * v
         return NodeMotion(v, mean, inner, mean if viscous else None), first.together_with(second)
 

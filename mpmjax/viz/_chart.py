@@ -46,6 +46,6 @@ def write_trials(found: WorkPrecision, path: Path) -> Path:
     """The trials as CSV; an error of inf is a run that failed, of nan one that was foreseen to take too long."""
     with replacing(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(["method", "refinement", "dt_s", "steps", "seconds", "error", "left_undone"])
+        rows.writerow(["method", "refinement", "dt_s", "steps", "seconds", "error", "linearisation_error"])
         rows.writerows([name_of(t.method), *t[1:]] for t in found.trials)
     return path

@@ -1,4 +1,4 @@
-"""What one linear solve a step leaves undone is known, reported, and warned of where it is much."""
+"""The linearisation error of one linear solve a step is computed, reported, and warned of where it is large."""
 
 import warnings
 
@@ -44,16 +44,18 @@ def test_it_tells_how_wrong_the_stress_is_and_falls_with_the_square_of_the_step(
     for steps in (3, 10):
         taken, run = pulled(steps, mpm.SemiImplicit())
         exact, newton = pulled(steps, mpm.BackwardEuler())
-        assert float(newton.statistics.undone_force) == 0
-        parts[steps] = float(run.statistics.left_undone.part)
+        assert float(newton.statistics.force_error) == 0
+        parts[steps] = float(run.statistics.linearisation_error)
         assert 0.5 * parts[steps] < 1 - taken / exact < parts[steps]
     assert parts[3] > 0.05
     assert parts[3] / parts[10] == pytest.approx((10 / 3) ** 2, rel=0.1)
 
 
-def test_much_of_it_is_warned_of_and_little_is_not():
+def test_a_large_one_is_warned_of_and_a_small_one_is_not():
     scene, particles = sheet()
-    with pytest.warns(UserWarning, match=r"left up to 11 % of the elastic force undone.*1\.5 times or more.*Newton"):
+    with pytest.warns(
+        UserWarning, match=r"has a linearisation error of up to 11 % of the elastic force.*1\.5 times or more.*Newton"
+    ):
         mpm.simulate(scene, particles, t1=1.0, dt=1 / 3, method=mpm.SemiImplicit())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -77,38 +79,38 @@ METHODS = {
         for name, dtype in [*((name, "float64") for name in METHODS), ("semi-implicit", "float32")]
     ],
 )
-def test_only_linearised_steps_leave_some(name, dtype):
-    """A block that is pulled apart. One that flies and turns slowly leaves none, and rounding is not taken for some."""
+def test_only_linearised_steps_have_one(name, dtype):
+    """A block that is pulled apart. One that flies and turns slowly has none, and rounding is not taken for one."""
     method, linearised = METHODS[name]
     scene, particles = block(2, side=4, gravity=(0.0, -9.81))
     x = particles.x - particles.x.mean(axis=0)
 
-    def left(v):
+    def error(v):
         moving = jax.tree.map(lambda a: a.astype(dtype), eqx.tree_at(lambda q: q.v, particles, v))
         moving = mpm.rollout(scene, moving, steps=3, dt=2e-2, method=method)
-        return float(mpm.step(scene, moving, 6e-2, 2e-2, method=method)[1].left_undone.part)
+        return float(mpm.step(scene, moving, 6e-2, 2e-2, method=method)[1].linearisation_error)
 
-    assert (left(x * jnp.asarray([10.0, 0.0])) > 1e-4) is linearised
-    assert left(jnp.asarray([3.0, -2.0]) + 0.1 * x[:, ::-1] * jnp.asarray([1.0, -1.0])) < 1e-5
+    assert (error(x * jnp.asarray([10.0, 0.0])) > 1e-4) is linearised
+    assert error(jnp.asarray([3.0, -2.0]) + 0.1 * x[:, ::-1] * jnp.asarray([1.0, -1.0])) < 1e-5
 
 
 def test_a_fluid_is_measured_as_what_is_elastic():
-    """The return map of a fluid takes out expansion, which has no stress: what a linear solve leaves of its force is
-    put beside the momentum too, as for a solid, and Newton's method leaves none."""
+    """The return map of a fluid takes out expansion, which has no stress: the error of a linear solve's force is
+    put beside the momentum too, as for a solid, and Newton's method has none."""
     scene, particles = block(2, side=4, material=mpm.Fluid(1e4))
     spread = eqx.tree_at(lambda q: q.v, particles, (particles.x - particles.x.mean(axis=0)) * jnp.asarray([2.0, -3.0]))
 
-    def left(method):
-        return mpm.step(scene, spread, 0.0, 2e-2, method=method)[1].left_undone
+    def error(method):
+        return mpm.step(scene, spread, 0.0, 2e-2, method=method)[1]
 
     momentum = float(jnp.linalg.norm(particles.mass[:, None] * spread.v) / 2e-2)
-    assert float(left(mpm.SemiImplicit()).scale) > momentum / 2
-    assert float(left(mpm.BackwardEuler()).force) == 0
+    assert float(error(mpm.SemiImplicit()).force_scale) > momentum / 2
+    assert float(error(mpm.BackwardEuler()).force_error) == 0
 
 
 @pytest.mark.thorough
 def test_what_yields_elsewhere_changes_nothing():
-    """A block that is pulled apart leaves the part that it leaves alone where sand lies beside it at rest."""
+    """A block that is pulled apart has the error that it has alone where sand lies beside it at rest."""
     grid = mpm.Grid((20, 9), 0.1, origin=(-3, -3))
     block = mpm.fill(
         mpm.Box((0.0, 0.0), (0.3, 0.3)), grid, density=1e3, velocity=lambda x: jnp.stack([3 * x[0], -3 * x[1]])
@@ -116,23 +118,22 @@ def test_what_yields_elsewhere_changes_nothing():
     sand = mpm.fill(mpm.Box((1.0, 0.0), (1.3, 0.2)), grid, density=1e3, velocity=lambda x: 0 * x)
     laws = LAWS["neo_hookean"], PLASTIC["drucker_prager"]
 
-    def part(laws, *sets):
-        return float(
-            mpm.step(mpm.Scene(grid, laws), mpm.join(*sets), 0.0, 2e-2, method=mpm.SemiImplicit())[1].left_undone.part
-        )
+    def error(laws, *sets):
+        info = mpm.step(mpm.Scene(grid, laws), mpm.join(*sets), 0.0, 2e-2, method=mpm.SemiImplicit())[1]
+        return float(info.linearisation_error)
 
-    assert part(laws, block, sand) == pytest.approx(part(laws[0], block), rel=1e-6)
+    assert error(laws, block, sand) == pytest.approx(error(laws[0], block), rel=1e-6)
 
 
 @pytest.mark.thorough
-def test_friction_is_not_taken_for_some():
-    """A block that slides on a floor: friction slows nodes after the solve, and is no part of what the solve left."""
+def test_friction_is_not_taken_for_one():
+    """A block that slides on a floor: friction slows nodes after the solve, and is no part of its error."""
 
-    def left(friction):
+    def error(friction):
         floor = (mpm.ContactPlane(1, 0.0, friction=friction),)
         scene, particles = block(2, side=4, gravity=(0.0, -9.81), boundary=floor)
         sliding = eqx.tree_at(lambda q: q.v, particles, particles.v + jnp.asarray([2.0, -0.2]))
-        return float(mpm.step(scene, sliding, 0.0, 2e-2, method=mpm.SemiImplicit())[1].left_undone.force)
+        return float(mpm.step(scene, sliding, 0.0, 2e-2, method=mpm.SemiImplicit())[1].force_error)
 
-    assert left(0.8) == pytest.approx(left(0.0), rel=1e-6)
-    assert left(0.0) > 0
+    assert error(0.8) == pytest.approx(error(0.0), rel=1e-6)
+    assert error(0.0) > 0

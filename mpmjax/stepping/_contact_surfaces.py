@@ -1,0 +1,123 @@
+"""Surfaces that touch in a step: the faces of particles, before walls and colliders, and those of bodies."""
+
+from itertools import combinations
+
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Float, Scalar, components
+from mpmjax.boundary import (
+    EXPLICIT_STIFFNESS,
+    IMPLICIT_STIFFNESS,
+    Body,
+    BodyContact,
+    Faces,
+    FaceShape,
+    Mirror,
+    body_contact,
+)
+from mpmjax.discretisation import scatter
+from mpmjax.implicit import ElasticPotential
+from mpmjax.state import MaterialPoints, Particles, Scene
+
+
+def faces_of(
+    scene: Scene, particles: Particles, potential: ElasticPotential, dt: Scalar, force_at: Scalar | None
+) -> Faces:
+    """The faces of prepared particles.
+
+    Args:
+        scene: the scene.
+        particles: prepared particles.
+        potential: their elastic potential.
+        dt: step [s].
+        force_at: the share of the step's displacement at which forces are evaluated; None if the step is explicit.
+    """
+    materials, shapes, areas, explicit = potential.material_points, [], [], force_at is None
+    factor = EXPLICIT_STIFFNESS if explicit else IMPLICIT_STIFFNESS
+    for law, points in zip(scene.laws, materials, strict=True):
+        side = points.volume ** (1 / particles.dim)
+        shape = points.deformation if law.allows_total else points.volume_ratio()
+        shapes.append(FaceShape(side / 2, shape, points.rows, points.total))
+        # of a sliver A = V0/l0 is large for its mass, and would shorten explicit steps
+        areas.append(points.volume / (side.max(initial=0) if explicit else side))
+    per_modulus = jnp.concatenate(areas) * (factor / jnp.asarray(scene.grid.spacing))
+    return Faces(
+        x=particles.x,
+        v=particles.v,
+        shapes=tuple(shapes),
+        stiffness=per_modulus * contact_moduli(scene, particles, materials),
+        inertia=per_modulus * particles.mass / particles.volume,
+        stencil=potential.stencil,
+        spacing=jnp.asarray(scene.grid.spacing),
+        dt=jnp.asarray(dt),
+        force_at=0.0 if force_at is None else jnp.asarray(force_at, particles.x.dtype),
+        explicit=explicit,
+    )
+
+
+def contacts_of_bodies(
+    scene: Scene,
+    friction: Scalar,
+    particles: Particles,
+    potential: ElasticPotential,
+    images: Mirror,
+    dt: Scalar,
+    force_at: Scalar | None,
+) -> list[BodyContact]:
+    """The contacts of each two bodies of a scene with `bodies`.
+
+    Args:
+        scene: the scene.
+        friction: the bodies' coefficient of friction [-].
+        particles: prepared particles.
+        potential: their elastic potential.
+        images: the mirrors of symmetry planes, beyond which bodies go on.
+        dt: step [s].
+        force_at: the share of the step's displacement at which forces are evaluated; None if the step is explicit.
+    """
+    bodies = _bodies(scene, particles, potential, images)
+    at = jnp.ones(()) if force_at is None else jnp.asarray(force_at)
+    return [
+        body_contact(
+            bodies[pair[0]],
+            bodies[pair[1]],
+            pair,
+            friction=friction,
+            order=scene.kernel.order,
+            grid=scene.grid,
+            images=images,
+            dt=dt,
+            share=jnp.where(at > 0, at, 1).astype(particles.x.dtype),
+        )
+        for pair in combinations(range(scene.grid.layers), 2)
+    ]
+
+
+def contact_moduli(scene: Scene, particles: Particles, materials: tuple[MaterialPoints, ...]) -> Float[Array, "p"]:
+    """The modulus of contact [Pa] of each prepared particle, shape (p,) (see `AbstractLaw.contact_modulus`)."""
+    each = zip(scene.laws, materials, particles.histories, strict=True)
+    return jnp.concatenate([law.contact_modulus(points.deformation, history) for law, points, history in each])
+
+
+def _bodies(scene: Scene, particles: Particles, potential: ElasticPotential, images: Mirror) -> list[Body]:
+    """The bodies, one for each layer of nodes."""
+    materials, stencil = potential.material_points, potential.stencil
+    d, dx, layers = particles.dim, jnp.asarray(scene.grid.spacing), scene.grid.layers
+    volume = jnp.concatenate([points.volume * jnp.abs(points.volume_ratio()) for points in materials])
+    means = jnp.stack([contact_moduli(scene, particles, materials), particles.mass / volume, volume ** (1 / d) / dx])
+    part = volume / dx**d
+    values = part * jnp.concatenate([jnp.ones_like(part)[None], means, components(particles.v)])
+    sums = scatter(stencil, values, None, scene.grid.size)
+    # w (x_p − x_i)_a = −D_a g_a, with g the moving-least-squares gradient
+    arms = -jnp.eye(d, dtype=part.dtype)[..., None] * (part * stencil.moment / dx)
+    middle = images.fold(scatter(stencil.least_squares, None, arms, scene.grid.size)).T
+    scalars = jnp.stack([images.fold_scalar(own) for own in sums[:, :4].T])
+    velocity = images.fold(sums[:, 4:]).T
+
+    full = jnp.where(scalars[0] > 0, scalars[0], 1)
+    each = jnp.concatenate([scalars[:1], scalars[1:] / full, velocity / full, middle / full])
+    each = each.reshape(len(each), layers, -1).swapaxes(0, 1)
+    return [
+        Body(part=own[0], modulus=own[1], density=own[2], side=own[3], velocity=own[4 : 4 + d], middle=own[4 + d :])
+        for own in each
+    ]

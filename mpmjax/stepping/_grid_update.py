@@ -1,0 +1,129 @@
+"""The grid update: the motion of the nodes by an integrator, free or with contact, and the impulses that made it."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+
+from mpmjax._types import NodeVector
+from mpmjax.autodiff import kept, without_derivative
+from mpmjax.boundary import ConstrainedNodes, ContactInfo, constrain, find_active_set
+from mpmjax.implicit import SolveInfo, no_solve
+from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
+from mpmjax.stepping._nodes import Nodes
+
+
+class ContactUpdate(eqx.Module):
+    """The active set of contact, and friction."""
+
+    held: ConstrainedNodes
+    """The nodes with the active set held."""
+    solved: NodeMotion
+    """The motion of the nodes before friction."""
+    friction: tuple[NodeVector, ...]
+    """The change of velocity by the friction of each contact [m/s], shape (n, d)."""
+    info: ContactInfo
+
+
+class GridUpdate(eqx.Module):
+    """The motion of the nodes over a step, mirrored at active contact planes."""
+
+    motion: NodeMotion
+    elastic: NodeVector | None
+    """The impulse of elastic forces (see `AbstractIntegrator.elastic_impulse`) [kg m/s], shape (n, d); None if P2G
+    summed momentum and force together."""
+    solve: SolveInfo
+    contact: ContactUpdate | None = None
+    """None in a scene without contact."""
+
+    @property
+    def solved(self) -> NodeMotion:
+        """`motion` before friction."""
+        return self.motion if self.contact is None else self.contact.solved
+
+    def held(self, nodes: Nodes) -> ConstrainedNodes:
+        """The nodes with what contacts hold."""
+        return constrain(nodes, ()) if self.contact is None else self.contact.held
+
+    def before(self, nodes: Nodes) -> NodeVector:
+        """v_i^n with the prescribed values where boundaries and contacts hold [m/s], shape (n, d)."""
+        if self.contact is None:
+            return nodes.admitted_velocity()
+        held = self.contact.held
+        return held.images.unfold(held.nodes.admitted_velocity())
+
+
+def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
+    """The grid update by an integrator, with contact and friction where the scene has any."""
+    return constrained_update(nodes, method) if nodes.contacts else free_update(nodes, method)
+
+
+def free_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
+    """The grid update without contact."""
+    motion, info = _advance(nodes, method, method.initial_guess(nodes))
+    return GridUpdate(motion, elastic_impulse(nodes, method, motion), info)
+
+
+def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
+    """The grid update with contact: the active set is searched without derivatives, the last solve with it held is
+    differentiated, and friction acts after that."""
+
+    def solve(
+        held: ConstrainedNodes, method: AbstractIntegrator, guess: NodeVector
+    ) -> tuple[ConstrainedNodes, NodeMotion, SolveInfo]:
+        motion, info = _advance(held.nodes, method, guess)
+        motion = jax.tree.map(held.images.unfold, motion)
+        return replace(held, displacement=method.mean_displacement(held.nodes, motion)), motion, info
+
+    frozen, frozen_method, guess = without_derivative((nodes, method, method.initial_guess(nodes)))
+
+    def attempt(held: ConstrainedNodes, guess: NodeVector) -> tuple:
+        held, motion, info = solve(held, frozen_method, guess)
+        missing = reaction(frozen, motion, elastic_impulse(frozen, frozen_method, motion))
+        return held, motion.velocity, held.beside_springs(missing), motion.carrier, info
+
+    start = frozen_method.mean_displacement(frozen, NodeMotion(guess))
+    active, guess, cost, sweeps = kept(
+        find_active_set(frozen, guess, start, attempt, no_solve(guess.dtype), explicit=method.is_explicit)
+    )
+    held, solved, info = solve(constrain(nodes, active), method, guess)
+    elastic = elastic_impulse(nodes, method, solved)
+    holding = held.beside_springs(reaction(nodes, solved, elastic))
+    velocity, friction = held.friction(solved.velocity, holding)
+    contact = ContactInfo(sweeps, held.count_violations(solved.velocity, holding))
+    return GridUpdate(
+        solved.with_friction(velocity - solved.velocity),
+        elastic,
+        cost.followed_by(info),
+        ContactUpdate(held, solved, friction, contact),
+    )
+
+
+def elastic_impulse(nodes: Nodes, method: AbstractIntegrator, motion: NodeMotion) -> NodeVector | None:
+    """The method's impulse of elastic forces [kg m/s], shape (n, d); None if P2G summed momentum and force together."""
+    return method.elastic_impulse(nodes, motion) if nodes.separate else None
+
+
+def reaction(nodes: Nodes, motion: NodeMotion, elastic: NodeVector | None) -> NodeVector:
+    """The impulse of walls and grips [kg m/s], shape (n, d); in free components the residual of the solve.
+
+    Args:
+        nodes: the nodes.
+        motion: their motion before friction.
+        elastic: `elastic_impulse` of the motion.
+    """
+    if elastic is None:
+        return nodes.mass[:, None] * (motion.velocity - nodes.explicit_velocity())
+    if motion.resisted is not None:
+        elastic = elastic - nodes.dt * nodes.potential.viscous_resistance(motion.resisted)
+    return nodes.mass[:, None] * (motion.velocity - nodes.inertial_velocity()) - elastic
+
+
+def _advance(nodes: Nodes, method: AbstractIntegrator, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+    motion, info = method.advance(nodes, guess)
+    if not method.explicit_viscosity and nodes.potential.viscous and motion.resisted is None:
+        raise ValueError(
+            f"{type(method).__name__} has explicit_viscosity = False, so its advance must return the velocity that "
+            "viscosity resists, NodeMotion.resisted. It returned None."
+        )
+    return motion, info
