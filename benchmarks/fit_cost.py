@@ -67,7 +67,7 @@ def problem(b: Block, method: str, bands: int, numbers: int) -> FitProblem:
     stiffness = mpm.Positive(
         update=lambda e, E: eqx.tree_at(lambda e: e.scene.material.youngs_modulus, e, E[band]),
         start=jnp.full(bands, E_MODULUS),
-        prior=mpm.Gaussian(E_MODULUS, E_MODULUS),
+        prior=mpm.fitting.Gaussian(E_MODULUS, E_MODULUS),
     )
     seen = mpm.Tracks(times, still, which=which, sigma=b.spacing)
     experiment = mpm.Experiment(scene, q, t1=steps * dt, dt=dt, method=integrator, observations=seen)

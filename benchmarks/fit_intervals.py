@@ -45,7 +45,7 @@ def main(repetitions=200):
         seen = mpm.Series(times, data, top, sigma=NOISE)
         result = mpm.fit(mpm.Experiment(*column(0.3), observations=seen, **at), {"nu": parameter})
         off.append(data.mean() - height.mean())
-        profiles.append(mpm.profile(result, "nu"))
+        profiles.append(mpm.fitting.profile(result, "nu"))
         own.append(result["nu"].interval)
     by_profile = np.array([p.interval for p in profiles])
     print(f"{'':<24} {'holds':>6} {'all below':>10} {'all above':>10} {'median width':>13}")
@@ -81,7 +81,7 @@ def beside(draws=300):
             truth = np.array([offset * error, 0.3])
             y = 0.15 + design @ truth + NOISE * np.random.default_rng(int(10 * offset) + 1).normal(size=(draws, 15))
             sets = [eqx.tree_at(lambda e: e.observations[0].data, one, own[:, None]) for own in y]
-            fits = mpm.fit_ensemble(sets, parameters, batch=draws).fits
+            fits = mpm.fitting.fit_ensemble(sets, parameters, batch=draws).fits
             held = [[f[n].interval[0] <= t <= f[n].interval[1] for n, t in zip("gv", truth, strict=True)] for f in fits]
             print(f"noise {sigma}, {offset} standard errors from zero: g and v held in {np.mean(held, axis=0)}")
 

@@ -96,7 +96,7 @@ def identifiability(quick: bool) -> plt.Figure:
     factors = np.linspace(0.7, 1.4, n)
     cost = jax.jit(lambda rho: jax.lax.map(lambda s: misfit(experiment)(s, rho), jnp.asarray(factors), batch_size=8))
     chi = np.stack([np.asarray(cost(rho)) for rho in factors])
-    prior = mpm.Gaussian(1.0, 0.03)
+    prior = mpm.fitting.Gaussian(1.0, 0.03)
     densities = jnp.asarray(factors)
     weighed = np.asarray(prior.residuals(densities, densities) ** 2)[:, None]
     mass = experiment.particles.mass
@@ -236,7 +236,7 @@ def discretisation(quick: bool) -> plt.Figure:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         found = [mpm.fit(vibration(exact, data, n), {"E": STIFFNESS})["E"] for n in cells]
-        refined = mpm.fit_refined(lambda n: vibration(exact, data, 5 * n), {"E": STIFFNESS}, refinements=coarse)
+        refined = mpm.fitting.fit_refined(lambda n: vibration(exact, data, 5 * n), {"E": STIFFNESS}, refinements=coarse)
     for n, e in zip(cells, found, strict=True):
         print(f"{n} cells: E = {e.value / E:.5f} ± {e.error / E:.5f} of the true one")
     print(refined)

@@ -27,11 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpmjax as mpm
-from mpmjax.fitting._batch import Problems, _iterate
-from mpmjax.fitting._linkage import linked
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._search import begin
-from mpmjax.fitting._starting_points import starting_points, unit_points
+from mpmjax.fitting._search import Problems, begin, iterate_together
+from mpmjax.fitting._starting_points import linked, starting_points, unit_points
 
 NOISE = 1e-4
 PARAMETERS = {
@@ -89,13 +87,13 @@ def one_by_one(pull: mpm.Experiment, points: np.ndarray) -> list[float]:
 
 def iteration(pull: mpm.Experiment, points: np.ndarray, batch: int) -> Callable[[], Any]:
     """An iteration of so many searches together."""
-    problem, optimiser = FitProblem((pull,), PARAMETERS), mpm.LevenbergMarquardt()
-    one, sigmas = (Problems.of([a], shared=True) for a in (problem, problem.first_sigmas))
+    problem, optimiser = FitProblem((pull,), PARAMETERS), mpm.fitting.LevenbergMarquardt()
+    one, sigmas = (Problems.of([a]) for a in (problem, problem.first_sigmas))
     states = [begin(problem, optimiser, jnp.asarray(z), problem.first_sigmas) for z in points[:batch]]
     arrays, rest = zip(*(eqx.partition(s, eqx.is_array) for s in states), strict=True)
     state = eqx.combine(jax.tree.map(lambda *a: np.stack(a), *arrays), rest[0])
     return lambda: eqx.filter(
-        _iterate(one.at(0), one.common, optimiser, points[:batch], sigmas.at(0), sigmas.common, state, (None, None)),
+        iterate_together(one.at(0), one.common, optimiser, points[:batch], sigmas.at(0), sigmas.common, state),
         eqx.is_array,
     )
 
@@ -184,13 +182,13 @@ def main() -> None:
                 seconds[batch].append(timed(call)[0] / batch)
         told = ", ".join(f"{batch}: {1e3 * np.median(s[1:]):.1f} ms" for batch, s in seconds.items())
         print(f"{name}: an iteration of a search of so many together, processor: {told}", flush=True)
-        mpm.fit_multistart(pull, PARAMETERS, starts=9)
+        mpm.fitting.fit_multistart(pull, PARAMETERS, starts=9)
         mpm.fit(pull, PARAMETERS)
         for _ in range(given.rounds):
             processor, clock, alone = timed(partial(one_by_one, pull, points))
             print(f"{name}: {given.starts} fits: {processor:.1f} s of the processor, {clock:.1f} s", flush=True)
             for fraction in (1.0, 0.375):
-                call = partial(mpm.fit_multistart, pull, PARAMETERS, starts=given.starts, fraction=fraction)
+                call = partial(mpm.fitting.fit_multistart, pull, PARAMETERS, starts=given.starts, fraction=fraction)
                 own, own_clock, found = timed(call)
                 print(
                     f"{name}: fraction {fraction:g}: {own:.1f} s of the processor, {own_clock:.1f} s; "

@@ -51,7 +51,7 @@ parameters = {
     "friction": mpm.Positive(lambda e: e.scene.boundary[1].friction),
     "release": mpm.Unbounded(update=released, start=0.1, scale=0.1, unit="of T"),
 }
-found = mpm.fit_refined(dam, parameters, optimiser=mpm.LevenbergMarquardt(rtol=1e-4), progress=print)
+found = mpm.fitting.fit_refined(dam, parameters, optimiser=mpm.fitting.LevenbergMarquardt(rtol=1e-4), progress=print)
 print(found)
 finest = found.fits[-1]
 print(f"correlation of friction and release: {finest.correlation[0, 1]:.2f}")

@@ -156,7 +156,7 @@ stiffening = {
 trials = [(kind(2e4, 0.4), stiffness) for kind in (mpm.FixedCorotated, mpm.NeoHookean, mpm.Hencky)]
 closed = {}
 for trial, parameters in (*trials, (mpm.Gent(7e3, 2.0, 3e4), stiffening)):
-    fitted = mpm.fit(with_law(pulled, trial), parameters, optimiser=mpm.LevenbergMarquardt(rtol=1e-3))
+    fitted = mpm.fit(with_law(pulled, trial), parameters, optimiser=mpm.fitting.LevenbergMarquardt(rtol=1e-3))
     name = type(trial).__name__
     closed[name] = fitted.experiments[0].scene.material
     table[name] = errors(closed[name])

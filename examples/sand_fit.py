@@ -62,10 +62,10 @@ angle = {"friction angle": mpm.Bounded(update=rough, lower=5.0, upper=60.0, star
 found = {}
 for grains, rows in runouts.items():
     print(grains)
-    found[grains] = mpm.fit_refined(
+    found[grains] = mpm.fitting.fit_refined(
         lambda n, rows=rows: [column(n, *row) for row in rows],
         angle,
-        optimiser=mpm.LevenbergMarquardt(rtol=1e-3),  # the front is rough: other particles lead
+        optimiser=mpm.fitting.LevenbergMarquardt(rtol=1e-3),  # the front is rough: other particles lead
         progress=print,
     )
     print(found[grains])

@@ -36,7 +36,7 @@ HALF, HEIGHT, WIDTH, TOP = 0.2, 0.4, 1.0, 0.48  # of the body's right half, and 
 FRAMES = np.arange(1, 9) / 20  # s
 NOISE = 2e-3  # m, of a point's coordinate
 POINTS = 4000
-PICTURE = mpm.Density(mpm.Grid((23, 14), 0.05, origin=(-2, -2)))  # as wide as what may be seen, and a margin
+PICTURE = mpm.fitting.Density(mpm.Grid((23, 14), 0.05, origin=(-2, -2)))  # as wide as what may be seen, and a margin
 STEP = 2.5e-3  # s, of the fit on the coarsest grid
 SHARED = 1 / 3.6  # neighbouring pixels share points: so many of them are worth one
 
@@ -171,11 +171,17 @@ def experiment(family: Family, clouds: list[np.ndarray], n: int) -> mpm.Experime
     return mpm.Experiment(scene, particles, t1=float(FRAMES[-1]), dt=STEP / n, observations=seen)
 
 
-def fitted(family: Family, clouds: list[np.ndarray], grids: tuple[int, ...], progress: Any = None) -> mpm.RefinedFit:
+def fitted(
+    family: Family, clouds: list[np.ndarray], grids: tuple[int, ...], progress: Any = None
+) -> mpm.fitting.RefinedFit:
     """The parameters from the clouds, on several grids, extrapolated."""
     build = partial(experiment, family, clouds)
-    return mpm.fit_refined(
-        build, family.parameters, refinements=grids, optimiser=mpm.LevenbergMarquardt(rtol=1e-4), progress=progress
+    return mpm.fitting.fit_refined(
+        build,
+        family.parameters,
+        refinements=grids,
+        optimiser=mpm.fitting.LevenbergMarquardt(rtol=1e-4),
+        progress=progress,
     )
 
 
@@ -184,7 +190,7 @@ TABLE = Path(__file__).parents[1] / "docs" / "video_families.csv"
 HEAD = ["family", "parameter", "unit", "start", "true", "found", "lower", "upper", "noise", "discretisation", "seconds"]
 
 
-def rows_of(name: str, result: mpm.RefinedFit, seconds: float) -> list[list[Any]]:
+def rows_of(name: str, result: mpm.fitting.RefinedFit, seconds: float) -> list[list[Any]]:
     """The rows of a family; seconds are those of its fits, without the film."""
     family = FAMILIES[name]
     parts = zip(family.truth, result.estimates, result.from_noise, result.from_discretisation, strict=True)

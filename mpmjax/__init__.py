@@ -1,6 +1,6 @@
 """A differentiable Material Point Method in JAX, with explicit and implicit grid updates."""
 
-from mpmjax import linalg as linalg
+from mpmjax import fitting as fitting, linalg as linalg
 from mpmjax._types import Corner as Corner
 from mpmjax.analysis import (
     Budget as Budget,
@@ -51,51 +51,20 @@ from mpmjax.discretisation import (
     SplineGradient as SplineGradient,
 )
 from mpmjax.fitting import (
-    LBFGS as LBFGS,
-    AbstractObservation as AbstractObservation,
-    AbstractOptimiser as AbstractOptimiser,
-    AbstractParameter as AbstractParameter,
-    AbstractPrior as AbstractPrior,
-    Adam as Adam,
-    Bootstrap as Bootstrap,
     Bounded as Bounded,
     CentreOfMass as CentreOfMass,
     Curve as Curve,
-    Density as Density,
-    EnsembleFit as EnsembleFit,
-    Estimate as Estimate,
-    Evaluation as Evaluation,
     Experiment as Experiment,
     Extent as Extent,
-    Field as Field,
     FitResult as FitResult,
     Force as Force,
-    Gaussian as Gaussian,
-    LevenbergMarquardt as LevenbergMarquardt,
-    LocalMinimum as LocalMinimum,
     Markers as Markers,
-    MultistartFit as MultistartFit,
     Positive as Positive,
-    Prediction as Prediction,
-    Profile as Profile,
-    RefinedFit as RefinedFit,
     Series as Series,
-    Smooth as Smooth,
-    Stage as Stage,
-    StagedFit as StagedFit,
     StressStretch as StressStretch,
-    Torque as Torque,
     Tracks as Tracks,
     Unbounded as Unbounded,
-    bootstrap as bootstrap,
     fit as fit,
-    fit_ensemble as fit_ensemble,
-    fit_multistart as fit_multistart,
-    fit_refined as fit_refined,
-    fit_staged as fit_staged,
-    predict as predict,
-    predict_observations as predict_observations,
-    profile as profile,
 )
 from mpmjax.geometry import (
     AbstractMotion as AbstractMotion,

@@ -16,8 +16,8 @@ from helpers import block
 from test_schema import EXAMPLES
 
 import mpmjax as mpm
-from mpmjax.fitting._estimates import fit_result
 from mpmjax.fitting._problem import FitProblem
+from mpmjax.fitting._result import SettledNoise, fit_result
 from mpmjax.fitting._search import Minimum
 
 SCENE, PARTICLES = block(2)
@@ -33,7 +33,7 @@ def reached(*args: object) -> NoReturn:
 
 SEEN = mpm.Curve([0.05], [0.1], reached, sigma=0.01)
 STIFFNESS = mpm.Positive(lambda e: e.scene.material.youngs_modulus)
-PICTURE = mpm.Density(SCENE.grid)
+PICTURE = mpm.fitting.Density(SCENE.grid)
 RUN = {"scene": SCENE, "particles": PARTICLES, "t1": 0.1, "dt": 0.01}
 
 
@@ -41,7 +41,8 @@ def found() -> mpm.FitResult:
     """A fit, as if it had been made."""
     problem = FitProblem((mpm.Experiment(**RUN, observations=SEEN),), {"E": STIFFNESS})
     at = Minimum(jnp.zeros(1), jnp.zeros(1), jnp.ones((1, 1)), True, False, ())
-    return fit_result(problem, mpm.LevenbergMarquardt(), at, [1.0], [1.0], (jnp.ones(()),), {}, 0.95)
+    settled = SettledNoise((jnp.ones(()),), [1.0], [1.0], False)
+    return fit_result(problem, mpm.fitting.LevenbergMarquardt(), at, settled, {}, 0.95)
 
 
 FITTED = found()
@@ -73,19 +74,25 @@ FUNCTIONS = {
     mpm.work_precision: {"build": reached, "t1": 0.1},
     mpm.Experiment: RUN | {"observations": SEEN},
     mpm.fit: {"experiments": mpm.Experiment(**RUN, observations=SEEN), "parameters": {"E": STIFFNESS}},
-    mpm.fit_refined: {"build": reached, "parameters": {"E": STIFFNESS}},
-    mpm.profile: {"result": FITTED, "label": "E"},
-    mpm.predict: {"result": FITTED, "of": reached},
-    mpm.predict_observations: {"result": FITTED},
-    mpm.fit_multistart: {"experiments": mpm.Experiment(**RUN, observations=SEEN), "parameters": {"E": STIFFNESS}},
-    mpm.fit_staged: {"experiments": mpm.Experiment(**RUN, observations=SEEN), "parameters": {"E": STIFFNESS}},
-    mpm.fit_ensemble: {"experiments": [mpm.Experiment(**RUN, observations=SEEN)], "parameters": {"E": STIFFNESS}},
-    mpm.bootstrap: {"result": None},
+    mpm.fitting.fit_refined: {"build": reached, "parameters": {"E": STIFFNESS}},
+    mpm.fitting.profile: {"result": FITTED, "label": "E"},
+    mpm.fitting.predict: {"result": FITTED, "of": reached},
+    mpm.fitting.predict_observations: {"result": FITTED},
+    mpm.fitting.fit_multistart: {
+        "experiments": mpm.Experiment(**RUN, observations=SEEN),
+        "parameters": {"E": STIFFNESS},
+    },
+    mpm.fitting.fit_staged: {"experiments": mpm.Experiment(**RUN, observations=SEEN), "parameters": {"E": STIFFNESS}},
+    mpm.fitting.fit_ensemble: {
+        "experiments": [mpm.Experiment(**RUN, observations=SEEN)],
+        "parameters": {"E": STIFFNESS},
+    },
+    mpm.fitting.bootstrap: {"result": None},
     mpm.join: {"sets": PARTICLES},
     mpm.Markers.of: {"which": [0]},
     mpm.Markers.at: {"particles": PARTICLES, "places": [[0.1, 0.1]]},
     mpm.StressStretch.of: {"region": mpm.Ball((0.1, 0.1), 0.1), "particles": PARTICLES, "axis": 0},
-    mpm.Field.lattice_around: {"particles": PARTICLES, "spacing": 0.1},
+    mpm.fitting.Field.lattice_around: {"particles": PARTICLES, "spacing": 0.1},
     PICTURE.of_points: {"points": PARTICLES.x, "mass": 1.0},
 }
 """Each public function with arguments; of those the tests replace one at a time."""
@@ -94,7 +101,7 @@ PARAMETER = {
     "where": reached,
     "update": None,
     "start": 1.0,
-    "prior": mpm.Gaussian(1.0, 0.1),
+    "prior": mpm.fitting.Gaussian(1.0, 0.1),
     "unit": "Pa",
     "only": (0,),
 }
@@ -102,19 +109,19 @@ FITTING = {
     mpm.Unbounded: PARAMETER | {"scale": 1.0},
     mpm.Positive: PARAMETER,
     mpm.Bounded: PARAMETER | {"lower": 0.0, "upper": 2.0},
-    mpm.Field: {"of": STIFFNESS, "lattice": SCENE.grid, "kernel": mpm.BSpline(1), "start": None},
-    mpm.Gaussian: {"mean": 1.0, "sigma": 0.1},
-    mpm.Smooth: {"sigma": 0.1, "robust": 3.0},
-    mpm.LevenbergMarquardt: {},
-    mpm.LBFGS: {},
-    mpm.Adam: {},
+    mpm.fitting.Field: {"of": STIFFNESS, "lattice": SCENE.grid, "kernel": mpm.BSpline(1), "start": None},
+    mpm.fitting.Gaussian: {"mean": 1.0, "sigma": 0.1},
+    mpm.fitting.Smooth: {"sigma": 0.1, "robust": 3.0},
+    mpm.fitting.LevenbergMarquardt: {},
+    mpm.fitting.LBFGS: {},
+    mpm.fitting.Adam: {},
     mpm.Series: TRUST | {"times": [0.1, 0.2], "values": [1.0, 2.0], "of": reached},
     mpm.Tracks: TRUST | {"times": [0.1], "positions": [[[0.1, 0.2]]], "which": [0]},
     mpm.Curve: TRUST | {"x": [0.1, 0.2], "y": [1.0, 2.0], "of": reached},
     mpm.Force: TRUST | {"times": [0.1], "forces": [[1.0, 2.0]]},
-    mpm.Torque: TRUST | {"times": [0.1], "forces": [[1.0]]},
+    mpm.fitting.Torque: TRUST | {"times": [0.1], "forces": [[1.0]]},
     mpm.Extent: {"axis": 0},
-    mpm.Density: {"grid": SCENE.grid},
+    mpm.fitting.Density: {"grid": SCENE.grid},
 }
 """What fits are made of, which files hold by other means."""
 PARTICLE_FIELDS = {"x": PARTICLES.x, "v": PARTICLES.v, "mass": PARTICLES.mass, "volume": PARTICLES.volume}
@@ -179,10 +186,10 @@ MAY = {
     (mpm.fill, "velocity"),
     (mpm.fill_mapped, "velocity"),
     (mpm.Experiment, "name"),
-    (mpm.Adam, "learning_rate"),
-    (mpm.predict, "of"),
+    (mpm.fitting.Adam, "learning_rate"),
+    (mpm.fitting.predict, "of"),
     (mpm.fit, "log"),
-    (mpm.fit_refined, "log"),
+    (mpm.fitting.fit_refined, "log"),
     *(
         (call, name)
         for call in CALLS

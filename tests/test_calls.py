@@ -26,17 +26,27 @@ EnergyBudget EnsembleFit FitResult Gathered MomentumBudget MultistartFit NodeMot
 Run Sensitivity SolveInfo StagedFit StepInfo Markers StressStretch"""
 """Classes of what the package returns, or what a step is made of."""
 WITHOUT_ARGUMENTS = "CentreOfMass backend"
-BY_THEMSELVES = "register no_solve"
+BY_THEMSELVES = "register no_solve read_columns FitProblem"
+
+
+PUBLIC = {name: getattr(mpm.fitting, name) for name in mpm.fitting.__all__} | vars(mpm)
 
 
 def test_nothing_public_is_left_out_of_these_calls():
     """Abstract classes, enumerations, errors and tuples apart."""
     left = set()
-    for name, thing in vars(mpm).items():
+    for name, thing in PUBLIC.items():
         of_a_kind = isinstance(thing, type) and issubclass(thing, (enum.Enum, Exception, tuple))
         if (isinstance(thing, type) or inspect.isfunction(thing)) and not (inspect.isabstract(thing) or of_a_kind):
             left |= set() if thing in CALLS else {name}
     assert left == {*MADE_BY_THE_PACKAGE.split(), *WITHOUT_ARGUMENTS.split(), *BY_THEMSELVES.split()}
+
+
+def test_each_public_name_is_exposed_once():
+    """A first fit's at the top level, all others of fits in `mpmjax.fitting`."""
+    top = {id(thing) for thing in vars(mpm).values()}
+    twice = [name for name in mpm.fitting.__all__ if id(PUBLIC[name]) in top or name in vars(mpm)]
+    assert not twice
 
 
 @pytest.fixture

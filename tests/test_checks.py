@@ -139,9 +139,12 @@ def test_ranks_may_differ_inside_whatever_is_set_outside(method):
 
 SENSELESS = {
     "shares": (lambda: mpm.PointsAt(((0.1, 0.1),) * 3, (1.0, 1.0, 1.0)), "shares of the load and must sum to one"),
-    "a prior": (lambda: mpm.Positive(lambda e: e.dt, prior=mpm.Gaussian(-1.0, 2.0)), "mean of its prior must too"),
+    "a prior": (
+        lambda: mpm.Positive(lambda e: e.dt, prior=mpm.fitting.Gaussian(-1.0, 2.0)),
+        "mean of its prior must too",
+    ),
     "one of a bounded": (
-        lambda: mpm.Bounded(lambda e: e.dt, 0.0, 0.5, prior=mpm.Gaussian([0.1, 0.6], 1.0)),
+        lambda: mpm.Bounded(lambda e: e.dt, 0.0, 0.5, prior=mpm.fitting.Gaussian([0.1, 0.6], 1.0)),
         "between 0 and 0.5, so the mean",
     ),
 }

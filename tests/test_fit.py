@@ -153,7 +153,7 @@ def test_a_prior_and_outliers_are_weighed_by_the_estimated_noise(monkeypatch):
     x = np.linspace(0.02, 1, 400)
     y = 2 * x + 0.01 * rng.normal(size=400)
     exact = (x @ y) / (x @ x)
-    with_prior = fitted_line(monkeypatch, y, prior=mpm.Gaussian(1.0, 0.3))
+    with_prior = fitted_line(monkeypatch, y, prior=mpm.fitting.Gaussian(1.0, 0.3))
     assert with_prior["a"].value == pytest.approx(exact, abs=2e-4)
     assert fitted_line(monkeypatch, y, weight=0.25).noise[0].sigma == pytest.approx(0.01, rel=0.1)
     robust = fitted_line(monkeypatch, y, robust=1.0)
@@ -316,12 +316,12 @@ def test_a_marker_between_particles_follows_any_affine_motion():
 
 def test_a_picture_keeps_the_mass_and_needs_no_correspondence():
     scene, particles = bar(n=2)
-    picture = mpm.Density(mpm.Grid((16, 16), 0.1, origin=(-6, -6)))
+    picture = mpm.fitting.Density(mpm.Grid((16, 16), 0.1, origin=(-6, -6)))
     image = picture(scene, particles)
     assert float(image.sum()) * 0.1**2 == pytest.approx(float(particles.mass.sum()))
     shuffled = np.random.default_rng(0).permutation(np.asarray(particles.x))
     assert np.allclose(picture.of_points(shuffled, float(particles.mass.sum())), image)
-    cut = mpm.Density(mpm.Grid((6, 6), 0.1, origin=(-4, -4)))(scene, particles)
+    cut = mpm.fitting.Density(mpm.Grid((6, 6), 0.1, origin=(-4, -4)))(scene, particles)
     assert float(cut.sum()) * 0.1**2 < 0.5 * float(particles.mass.sum())
 
 
@@ -329,7 +329,7 @@ def test_a_picture_keeps_the_mass_and_needs_no_correspondence():
 def test_a_prior_acts_as_one_more_measurement():
     """E = 5e4 ± 1 Pa rules over noisy tracks."""
     times, x, which = tracks()
-    known = mpm.Positive(STIFFNESS.where, start=1e5, prior=mpm.Gaussian(5e4, 1.0))
+    known = mpm.Positive(STIFFNESS.where, start=1e5, prior=mpm.fitting.Gaussian(5e4, 1.0))
     found = mpm.fit(experiment(mpm.Tracks(times, x, which=which, sigma=10 * NOISE)), {"E": known})
     assert found["E"].value == pytest.approx(5e4, rel=1e-3)
     assert found["E"].error == pytest.approx(1.0, rel=0.05)
@@ -392,7 +392,7 @@ class Failing(FitProblem):
 
 def test_a_step_at_which_the_simulation_fails_is_not_taken():
     """The first Gauss-Newton step goes beyond z = 1."""
-    found = search(Failing(1.0), mpm.LevenbergMarquardt(), jnp.zeros(1), ())
+    found = search(Failing(1.0), mpm.fitting.LevenbergMarquardt(), jnp.zeros(1), ())
     assert found.converged
     assert not all(iteration.accepted for iteration in found.history)
     assert float(found.z[0]) == pytest.approx(0.5 ** (1 / 3) - 0.3, rel=1e-5)
@@ -400,7 +400,7 @@ def test_a_step_at_which_the_simulation_fails_is_not_taken():
 
 def test_a_search_that_ends_where_simulations_begin_to_fail_has_not_converged():
     """The minimum, z = 0.494, lies beyond z = 0.4, where they fail."""
-    found = search(Failing(0.4), mpm.LevenbergMarquardt(max_steps=200), jnp.zeros(1), ())
+    found = search(Failing(0.4), mpm.fitting.LevenbergMarquardt(max_steps=200), jnp.zeros(1), ())
     assert not found.converged
     assert len(found.history) < 200
     assert float(found.z[0]) == pytest.approx(0.4, abs=1e-2)
@@ -422,7 +422,7 @@ class Rounded(Failing):
 def test_a_search_ends_where_no_step_can_lower_the_sum_of_squares_by_more_than_its_rounding():
     """The misfit is large, as that of a law which does not explain the data, and so is its rounding. The standard error
     of z is 8.7."""
-    found = search(Rounded(jnp.inf), mpm.LevenbergMarquardt(), jnp.zeros(1), ())
+    found = search(Rounded(jnp.inf), mpm.fitting.LevenbergMarquardt(), jnp.zeros(1), ())
     z, squares = np.linspace(0.0, 1.0, 100_001), (np.linspace(-1.0, 1.0, 400) ** 2).sum()
     least = z[np.argmin(400 * (100 + z**2 / 1000) ** 2 + squares * (z - 1) ** 2)]
     assert found.converged
@@ -547,13 +547,13 @@ def test_the_discretisation_stands_beside_the_noise_and_rules():
     data = np.asarray(run.observed)[1:13] * (1 + 1e-6 * np.random.default_rng(2).normal(size=12))
     seen = mpm.Series(times, data, spread)
     stiffness = mpm.Positive(lambda e: e.scene.material.youngs_modulus)
-    found = mpm.fit_refined(lambda n: build(n, seen=seen), {"E": stiffness}, order=2)
+    found = mpm.fitting.fit_refined(lambda n: build(n, seen=seen), {"E": stiffness}, order=2)
     coarse, last = found.fits[0]["E"], found["E"]
     assert abs(last.value - 7e4) < 0.5 * abs(coarse.value - 7e4)
     assert last.interval[0] < 7e4 < last.interval[1]
     assert "discretisation" in str(found)
     with pytest.raises(ValueError, match="two or more growing"):
-        mpm.fit_refined(lambda n: build(n, seen=seen), {"E": stiffness}, refinements=(2, 1))
+        mpm.fitting.fit_refined(lambda n: build(n, seen=seen), {"E": stiffness}, refinements=(2, 1))
 
 
 def test_two_grids_that_agree_by_chance_are_not_believed():

@@ -13,12 +13,13 @@ from scipy.optimize import least_squares, lsq_linear
 from scipy.stats import norm, t
 
 import mpmjax as mpm
-from mpmjax.fitting._batch import Problems, search_many
-from mpmjax.fitting._estimates import fit_result
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._search import Minimum, iterate
+from mpmjax.fitting._result import SettledNoise, fit_result
+from mpmjax.fitting._search import Minimum, Problems, iterate, search_many
 from mpmjax.fitting._uncertainty import _mean_square, noise, seen_together, uncertainty
 from mpmjax.viz import draw_fit, write_fit
+
+GIVEN_NOISE = SettledNoise((jnp.ones(()),), [1.0], [0.0], False)
 
 DT, STEPS, NOISE = 4e-3, 15, 2e-3
 G, V = 9.81, 0.3
@@ -78,7 +79,7 @@ def test_profiles_of_a_linear_problem_are_students_intervals_in_any_coordinate(f
     seen, result = fall
     found, covariance, reach, _ = exact(seen)
     for k, label in enumerate(("g", "v")):
-        profile = mpm.profile(result, label)
+        profile = mpm.fitting.profile(result, label)
         half = reach * np.sqrt(covariance[k, k])
         assert np.allclose(profile.interval, [found[k] - half, found[k] + half], rtol=0, atol=2e-3 * half)
         statistic = (profile.values - found[k]) ** 2 / covariance[k, k]
@@ -93,9 +94,9 @@ def test_profiles_of_a_linear_problem_are_students_intervals_in_any_coordinate(f
 
 def test_the_profiles_of_a_fit_are_one_program(fall):
     _, result = fall
-    mpm.profile(result, "g", points=1)
+    mpm.fitting.profile(result, "g", points=1)
     known = iterate._cached._cache_size()
-    mpm.profile(result, "v", points=1, level=0.8)
+    mpm.fitting.profile(result, "v", points=1, level=0.8)
     assert iterate._cached._cache_size() == known
 
 
@@ -105,7 +106,7 @@ def test_the_band_of_a_linear_problem_is_students(fall):
     found, covariance, reach, variance = exact(seen)
     A = design()
     middle, error = 0.15 + A @ found, np.sqrt(np.einsum("mi,ij,mj->m", A, covariance, A))
-    (band,) = mpm.predict_observations(result)
+    (band,) = mpm.fitting.predict_observations(result)
     assert np.allclose(band.value[:, 0], middle, atol=1e-6)
     assert np.allclose(band.error[:, 0], error, rtol=1e-3)
     assert np.allclose(band.upper[:, 0] - middle, reach * error, rtol=2e-2)
@@ -113,7 +114,7 @@ def test_the_band_of_a_linear_problem_is_students(fall):
     assert np.allclose(band.new_lower + band.new_upper, 2 * band.value)
 
     last = design(2 * STEPS)[-1]
-    later = mpm.predict(result, twice_as_long)
+    later = mpm.fitting.predict(result, twice_as_long)
     assert later.value == pytest.approx(0.15 + last @ found, abs=1e-5)
     assert later.error == pytest.approx(np.sqrt(last @ covariance @ last), rel=1e-3)
 
@@ -129,7 +130,7 @@ def test_an_interval_that_the_data_do_not_close_is_open():
     half = reach * np.sqrt(covariance[0, 0])
     assert found[0] - half < 0 < found[0]
     with pytest.warns(UserWarning, match="g: the interval is open below"):
-        profile = mpm.profile(result, "g")
+        profile = mpm.fitting.profile(result, "g")
     assert profile.interval == (0, pytest.approx(found[0] + half, abs=2e-3 * half))
     assert np.isinf(profile.degrees_of_freedom)
     assert profile.threshold == pytest.approx(norm.ppf(0.975) ** 2)
@@ -137,9 +138,9 @@ def test_an_interval_that_the_data_do_not_close_is_open():
 
 def test_the_report_holds_bands_and_profiles(fall, tmp_path):
     _, result = fall
-    profiles = (mpm.profile(result, "g"),)
+    profiles = (mpm.fitting.profile(result, "g"),)
     numbers = json.loads(write_fit(result, tmp_path / "fit.json", profiles=profiles).read_text(encoding="utf-8"))
-    (band,) = mpm.predict_observations(result)
+    (band,) = mpm.fitting.predict_observations(result)
     assert np.allclose(numbers["predictions"][0]["new_upper"], band.new_upper)
     assert numbers["profiles"][0]["interval"] == list(profiles[0].interval)
     assert draw_fit(result, tmp_path / "fit.png", profiles=profiles).stat().st_size > 10_000
@@ -147,11 +148,14 @@ def test_the_report_holds_bands_and_profiles(fall, tmp_path):
 
 
 REFUSED = {
-    "no parameter": (lambda r: mpm.profile(r, "G"), "a fitted number: g, v. Got 'G'"),
-    "level": (lambda r: mpm.profile(r, "g", level=1.5), "between 0 and 1"),
-    "points": (lambda r: mpm.profile(r, "g", points=0), "points"),
-    "experiment": (lambda r: mpm.predict(r, lambda e: e.scene.gravity[0], experiment=3), "experiments 0 to 0, got 3"),
-    "too few": (lambda r: mpm.predict_observations(r, ()), "as many observations"),
+    "no parameter": (lambda r: mpm.fitting.profile(r, "G"), "a fitted number: g, v. Got 'G'"),
+    "level": (lambda r: mpm.fitting.profile(r, "g", level=1.5), "between 0 and 1"),
+    "points": (lambda r: mpm.fitting.profile(r, "g", points=0), "points"),
+    "experiment": (
+        lambda r: mpm.fitting.predict(r, lambda e: e.scene.gravity[0], experiment=3),
+        "experiments 0 to 0, got 3",
+    ),
+    "too few": (lambda r: mpm.fitting.predict_observations(r, ()), "as many observations"),
 }
 
 
@@ -166,7 +170,7 @@ def test_a_prediction_takes_any_run_that_has_a_forward_derivative(fall):
     """A run as it is has the one of `ForwardMode`. One whose checkpoints move has none, and it is said what to do."""
 
     def middle(adjoint):
-        return mpm.predict(fall[1], lambda e: e.run(adjoint=adjoint).final.x.mean())
+        return mpm.fitting.predict(fall[1], lambda e: e.run(adjoint=adjoint).final.x.mean())
 
     plain, forward = middle(None), middle(diffrax.ForwardMode())
     assert np.allclose([plain.value, plain.lower], [forward.value, forward.lower], rtol=1e-12)
@@ -193,7 +197,7 @@ class Abrupt(FitProblem):
         """The fit, at z = 0."""
         column = jnp.full((STEPS, 1), self.slope / np.sqrt(STEPS))
         found = Minimum(jnp.zeros(1), jnp.zeros(STEPS), column, True, False, ())
-        return fit_result(self, mpm.LevenbergMarquardt(), found, [1.0], [0.0], (jnp.ones(()),), {}, 0.95)
+        return fit_result(self, mpm.fitting.LevenbergMarquardt(), found, GIVEN_NOISE, {}, 0.95)
 
 
 @pytest.mark.parametrize(
@@ -208,12 +212,12 @@ class Abrupt(FitProblem):
 def test_an_end_that_is_not_the_datas_is_said(beyond, upper, says):
     """Below, the end is that of z = −1.96·2; the value is 1 + z."""
     with pytest.warns(UserWarning, match=says):
-        profile = mpm.profile(Abrupt(beyond).result(), "v")
+        profile = mpm.fitting.profile(Abrupt(beyond).result(), "v")
     assert profile.interval == pytest.approx((1 + 2 * norm.ppf(0.025), upper), abs=5e-3)
 
 
 def test_a_number_that_is_known_to_its_eighth_digit_has_a_profile():
-    profile = mpm.profile(Abrupt(1.0, slope=1e8).result(), "v")
+    profile = mpm.fitting.profile(Abrupt(1.0, slope=1e8).result(), "v")
     assert np.subtract(profile.interval, 1) * 1e8 == pytest.approx(norm.ppf([0.025, 0.975]), rel=2e-3)
 
 
@@ -252,11 +256,11 @@ def beside_a_bound(name, offset, count):
     y = LINE @ truth + np.random.default_rng(7 + int(10 * offset)).normal(size=(count, STEPS))
     one = Line(parameter, y[0])
     problems = [eqx.tree_at(lambda line: line.y, one, jnp.asarray(own)) for own in y]
-    lm = mpm.LevenbergMarquardt()
-    sigmas = Problems.of([(jnp.ones(()),)], shared=True)
-    found = search_many(Problems.of(problems, shared=False), lm, np.zeros((count, 2)), sigmas=sigmas, batch=count)
+    lm = mpm.fitting.LevenbergMarquardt()
+    sigmas = Problems.of([(jnp.ones(()),)])
+    found = search_many(Problems.of(problems), lm, np.zeros((count, 2)), sigmas=sigmas, batch=count)
     results = [
-        fit_result(problem, lm, member.minimum, [1.0], [0.0], (jnp.ones(()),), {}, 0.95)
+        fit_result(problem, lm, member.minimum, GIVEN_NOISE, {}, 0.95)
         for problem, member in zip(problems, found, strict=True)
     ]
     return truth, y, results
@@ -312,7 +316,7 @@ def test_intervals_cover_a_truth_beside_its_bound(name, offset):
 def test_a_number_at_its_bound_has_a_profile_from_there():
     result = next(r for r in beside_a_bound("lower", 0.5, 24)[2] if r.estimates[0].at_bound)
     with pytest.warns(UserWarning, match="a: the interval is open below"):
-        profile = mpm.profile(result, "a")
+        profile = mpm.fitting.profile(result, "a")
     assert profile.interval == pytest.approx(result["a"].interval, abs=5e-3 * ERROR)
     assert profile.symmetric == result["a"].interval
 
@@ -374,7 +378,7 @@ def test_along_a_profile_the_others_are_at_their_least():
     """Stiffness and the strength of the push from few data: at each point SciPy's least squares over the other
     parameter finds the same misfit. In single precision the interval is the same."""
     result = mpm.fit(followed(5e-3, 5e-3), {"E": STIFFNESS, "push": PUSH})
-    profile = mpm.profile(result, "E", points=2)
+    profile = mpm.fitting.profile(result, "E", points=2)
     problem, residuals = result.problem, eqx.filter_jit(lambda p, z, s: p.residuals(z, s, None)[0])
 
     def misfit(E):
@@ -391,7 +395,7 @@ def test_along_a_profile_the_others_are_at_their_least():
     for end in profile.interval:
         assert misfit(end) - least == pytest.approx(profile.threshold, rel=5e-3)
     single = mpm.fit(followed(5e-3, 5e-3, "float32"), {"E": STIFFNESS, "push": PUSH})
-    assert np.allclose(mpm.profile(single, "E", points=2).interval, profile.interval, rtol=5e-3)
+    assert np.allclose(mpm.fitting.profile(single, "E", points=2).interval, profile.interval, rtol=5e-3)
 
 
 @pytest.mark.thorough
@@ -406,11 +410,11 @@ def test_what_the_data_do_not_see_has_an_infinite_band_and_an_open_profile():
         E = e.scene.material.youngs_modulus
         return jnp.stack([E, E / e.particles.mass[0]])
 
-    assert np.isinf(mpm.predict(result, both).error).tolist() == [True, False]
-    (motion,) = mpm.predict_observations(result)
+    assert np.isinf(mpm.fitting.predict(result, both).error).tolist() == [True, False]
+    (motion,) = mpm.fitting.predict_observations(result)
     assert np.isfinite(motion.upper).all()
     with pytest.warns(UserWarning, match="open"):
-        profile = mpm.profile(result, "density", points=1)
+        profile = mpm.fitting.profile(result, "density", points=1)
     assert profile.interval == (0, np.inf)
     assert np.abs(profile.statistic[1:-1]).max() < 1e-2
 
@@ -419,7 +423,7 @@ def test_what_the_data_do_not_see_has_an_infinite_band_and_an_open_profile():
 def test_noise_that_is_estimated_twice_has_a_threshold_of_its_own():
     """Two observations of unknown noise: between Student's of one and of both."""
     result = mpm.fit(followed([1e-3, 5e-3], seeds=(1, 2)), {"E": STIFFNESS})
-    profile = mpm.profile(result, "E")
+    profile = mpm.fitting.profile(result, "E")
     points = result.noise[0].points
     assert t.ppf(0.975, 2 * points) ** 2 < profile.threshold < t.ppf(0.975, points - 1) ** 2 * 1.001
     half = (profile.interval[1] - profile.interval[0]) / 2
@@ -434,9 +438,9 @@ def test_bands_cover_the_truth_and_new_measurements_as_often_as_they_say():
     held = new = 0
     for seed in range(200):
         result = mpm.fit(thrown(measured(seed=seed)), {"g": GRAVITY, "v": SPEED})
-        later = mpm.predict(result, twice_as_long)
+        later = mpm.fitting.predict(result, twice_as_long)
         held += later.lower < truth < later.upper
-        (band,) = mpm.predict_observations(result)
+        (band,) = mpm.fitting.predict_observations(result)
         again = 0.15 + design()[7] @ [G, V] + NOISE * rng.normal()
         new += band.new_lower[7, 0] < again < band.new_upper[7, 0]
     assert 184 <= held <= 196
@@ -472,7 +476,7 @@ def test_intervals_cover_where_the_data_saturate():
     for seed in range(200):
         data = height + 3e-3 * np.random.default_rng(seed).normal(size=4)
         result = mpm.fit(column(0.3, mpm.Series(times, data, settled, sigma=3e-3)), {"nu": ratio})
-        intervals = mpm.profile(result, "nu", points=1, rtol=1e-2).interval, result["nu"].interval
+        intervals = mpm.fitting.profile(result, "nu", points=1, rtol=1e-2).interval, result["nu"].interval
         held += [lower < 0.4 < upper for lower, upper in intervals]
     assert ((held >= 184) & (held <= 196)).all()
 

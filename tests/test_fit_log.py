@@ -168,7 +168,7 @@ OTHERS = {
     "method": (
         lambda e: e,
         {},
-        {"optimiser": mpm.LevenbergMarquardt(rtol=1e-7)},
+        {"optimiser": mpm.fitting.LevenbergMarquardt(rtol=1e-7)},
         r"optimiser\.rtol is 1e-06 there and 1e-07 here",
     ),
 }
@@ -187,7 +187,7 @@ def test_a_fit_that_was_too_short_goes_on(whole, seen, tmp_path):
     """With more iterations allowed."""
     path = tmp_path / "fit.h5"
     with pytest.warns(UserWarning, match="did not converge"):
-        mpm.fit(seen, PARAMETERS, log=path, optimiser=mpm.LevenbergMarquardt(max_steps=2))
+        mpm.fit(seen, PARAMETERS, log=path, optimiser=mpm.fitting.LevenbergMarquardt(max_steps=2))
     assert_same(mpm.fit(seen, PARAMETERS, log=path, resume=True), whole[0])
 
 

@@ -9,7 +9,7 @@ import pytest
 from test_fit import DT, NOISE, STEPS, STIFFNESS, bar, experiment, tracks
 
 import mpmjax as mpm
-from mpmjax.fitting._choice import MOST_COLUMNS, chosen_optimiser
+from mpmjax.fitting._fit import MOST_COLUMNS, chosen_optimiser
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._search import iterate, search
 
@@ -17,7 +17,7 @@ SIGMAS = (jnp.asarray(NOISE),)
 BANDS = mpm.Positive(
     update=lambda e, E: eqx.tree_at(lambda e: e.scene.material.youngs_modulus, e, jnp.repeat(E, 2)),
     start=jnp.full(4, 1e5),
-    prior=mpm.Smooth(0.5),
+    prior=mpm.fitting.Smooth(0.5),
 )
 
 
@@ -48,7 +48,7 @@ class Valley(FitProblem):
         return jnp.concatenate([10 * (y[1:] - y[:-1] ** 2), 1 - y[:-1]]), jnp.zeros(1)
 
 
-OPTIMISERS = {"LBFGS": (mpm.LBFGS(), 1e-4), "Adam": (mpm.Adam(max_steps=4000), 1e-3)}
+OPTIMISERS = {"LBFGS": (mpm.fitting.LBFGS(), 1e-4), "Adam": (mpm.fitting.Adam(max_steps=4000), 1e-3)}
 
 
 @pytest.mark.parametrize(("optimiser", "near"), OPTIMISERS.values(), ids=OPTIMISERS)
@@ -72,14 +72,16 @@ def test_a_start_that_fails_says_so_and_no_derivative_is_an_error():
     """The cost of the first iteration is then not finite; a derivative that is not raises."""
     from mpmjax.fitting._search import NoDerivativeError
 
-    for optimiser in (mpm.LBFGS(), mpm.Adam()):
+    for optimiser in (mpm.fitting.LBFGS(), mpm.fitting.Adam()):
         with pytest.raises(NoDerivativeError):
             search(Valley(2, broken=True), optimiser, jnp.asarray([2.3, 2.3]), ())
 
 
 @pytest.mark.thorough
 def test_adam_takes_a_schedule():
-    found = search(Valley(2), mpm.Adam(optax.exponential_decay(0.1, 100, 0.9), max_steps=4000), jnp.zeros(2), ())
+    found = search(
+        Valley(2), mpm.fitting.Adam(optax.exponential_decay(0.1, 100, 0.9), max_steps=4000), jnp.zeros(2), ()
+    )
     assert np.abs(np.asarray(found.z) - 2).max() < 1e-2
 
 
@@ -109,11 +111,11 @@ def test_lbfgs_reaches_the_minimum_of_levenberg_marquardt():
     """Four stiffnesses of a bar: the same values and errors, and the table says who found them."""
     of = experiment(seen())
     least = mpm.fit(of, {"E": BANDS})
-    found = mpm.fit(of, {"E": BANDS}, optimiser=mpm.LBFGS())
+    found = mpm.fit(of, {"E": BANDS}, optimiser=mpm.fitting.LBFGS())
     assert found.converged
     assert np.allclose(found.z, least.z, atol=1e-2 * least.uncertainty.error.min())
     assert np.allclose(found.uncertainty.error, least.uncertainty.error, rtol=1e-2)
-    assert isinstance(least.optimiser, mpm.LevenbergMarquardt)
+    assert isinstance(least.optimiser, mpm.fitting.LevenbergMarquardt)
     assert "found by LBFGS" in str(found)
 
 
@@ -121,7 +123,7 @@ def test_lbfgs_reaches_the_minimum_of_levenberg_marquardt():
 def test_adam_reaches_it_too():
     of = experiment(seen())
     least = mpm.fit(of, {"E": STIFFNESS})
-    found = mpm.fit(of, {"E": STIFFNESS}, optimiser=mpm.Adam())
+    found = mpm.fit(of, {"E": STIFFNESS}, optimiser=mpm.fitting.Adam())
     assert found.converged
     assert abs(found.z - least.z) < 0.1 * least.uncertainty.error
 
@@ -132,8 +134,8 @@ def test_fits_by_lbfgs_converge_in_single_precision():
     scene, q = bar()
     single = jax.tree.map(lambda a: a.astype("float32"), q)
     of, exact = (mpm.Experiment(scene, p, t1=STEPS * DT, dt=DT, observations=seen()) for p in (single, q))
-    found = mpm.fit(of, {"E": BANDS}, optimiser=mpm.LBFGS())
-    least = mpm.fit(exact, {"E": BANDS}, optimiser=mpm.LevenbergMarquardt())
+    found = mpm.fit(of, {"E": BANDS}, optimiser=mpm.fitting.LBFGS())
+    least = mpm.fit(exact, {"E": BANDS}, optimiser=mpm.fitting.LevenbergMarquardt())
     assert found.converged
     assert (np.abs(found.z - least.z) < 0.2 * least.uncertainty.error).all()
 
@@ -144,7 +146,7 @@ def test_an_adjoint_solve_that_does_not_converge_is_reported():
     few = mpm.SemiImplicit(adjoint_solver=mpm.ConjugateResidual(rtol=1e-12, max_steps=1))
     scene, q = bar(n=2)
     of = mpm.Experiment(scene, q, t1=STEPS * DT, dt=DT, method=few, observations=seen(n=2))
-    for optimiser in (mpm.LBFGS(), mpm.Adam()):
+    for optimiser in (mpm.fitting.LBFGS(), mpm.fitting.Adam()):
         with pytest.raises(RuntimeError, match="has no derivative"):
             mpm.fit(of, {"E": STIFFNESS}, optimiser=optimiser)
 
@@ -155,19 +157,19 @@ def test_what_has_no_influence_is_refused_without_a_jacobian():
     times, x, which = tracks(sigma=None)
     exact = mpm.Tracks(times, x, which=which, sigma=NOISE)
     true = mpm.Positive(STIFFNESS.where)
-    found = mpm.fit(experiment(exact), {"E": true}, optimiser=mpm.LBFGS())
+    found = mpm.fit(experiment(exact), {"E": true}, optimiser=mpm.fitting.LBFGS())
     assert found["E"].value == pytest.approx(7e4, rel=1e-6)
     unseen = mpm.Series(times, np.zeros(len(times)), lambda s, p: p.mass.sum(), sigma=1.0)
     with pytest.raises(ValueError, match="do not depend on E"):
-        mpm.fit(experiment(unseen), {"E": STIFFNESS}, optimiser=mpm.LBFGS())
+        mpm.fit(experiment(unseen), {"E": STIFFNESS}, optimiser=mpm.fitting.LBFGS())
 
 
 @pytest.mark.thorough
 def test_fits_by_lbfgs_with_new_data_do_not_compile_anew():
     of = seen()
-    mpm.fit(experiment(of), {"E": STIFFNESS}, optimiser=mpm.LBFGS())
+    mpm.fit(experiment(of), {"E": STIFFNESS}, optimiser=mpm.fitting.LBFGS())
     known = iterate._cached._cache_size()
-    again = mpm.LBFGS(rtol=2e-3)
+    again = mpm.fitting.LBFGS(rtol=2e-3)
     mpm.fit(experiment(eqx.tree_at(lambda o: o.data, of, of.data + 1e-5)), {"E": STIFFNESS}, optimiser=again)
     assert iterate._cached._cache_size() == known
 
@@ -185,13 +187,13 @@ def test_the_rule_weighs_parameters_and_numbers():
 
     cases = {(2, 500): "forward", (MOST_COLUMNS, 500): "forward", (1000, 10): "reverse"}
     for case, mode in cases.items():
-        assert isinstance(chosen_optimiser(Counted(*case)), mpm.LevenbergMarquardt)
+        assert isinstance(chosen_optimiser(Counted(*case)), mpm.fitting.LevenbergMarquardt)
         assert Counted(*case).cheaper_mode == mode
-    assert isinstance(chosen_optimiser(Counted(1000, 500)), mpm.LBFGS)
+    assert isinstance(chosen_optimiser(Counted(1000, 500)), mpm.fitting.LBFGS)
 
 
 LATTICE = mpm.Grid((6, 5), 0.1, origin=(-1, 0))
-MODULUS = mpm.Positive(lambda e: e.scene.material.youngs_modulus, prior=mpm.Smooth(0.5), unit="Pa")
+MODULUS = mpm.Positive(lambda e: e.scene.material.youngs_modulus, prior=mpm.fitting.Smooth(0.5), unit="Pa")
 
 
 def in_a_square(**options):
@@ -202,20 +204,20 @@ def in_a_square(**options):
 
 
 def test_a_field_takes_its_nodes_values_and_is_linear_between():
-    of, field = in_a_square(), mpm.Field(MODULUS, LATTICE)
+    of, field = in_a_square(), mpm.fitting.Field(MODULUS, LATTICE)
     place = LATTICE.nodes(LATTICE.window(of.particles.x)).reshape(6, 5, 2)
     put = field.put(of, 1 + 2 * place[..., 0] - 3 * place[..., 1])
     x = of.particles.x
     assert np.allclose(put.scene.material.youngs_modulus, 1 + 2 * x[:, 0] - 3 * x[:, 1])
     assert np.allclose(field.first_guess(of), 7e4)
     assert field.first_guess(of).shape == (6, 5)
-    around = mpm.Field.lattice_around(of.particles, 0.1)
+    around = mpm.fitting.Field.lattice_around(of.particles, 0.1)
     assert around.shape == (5, 5)
-    mpm.Field(MODULUS, around).check_experiment("E", of)
+    mpm.fitting.Field(MODULUS, around).check_experiment("E", of)
     with pytest.raises(ValueError, match="must hold all particles"):
-        mpm.Field(MODULUS, mpm.Grid((4, 4), 0.05)).check_experiment("E", of)
+        mpm.fitting.Field(MODULUS, mpm.Grid((4, 4), 0.05)).check_experiment("E", of)
     with pytest.raises(ValueError, match="stay where it is"):
-        mpm.Field(MODULUS, mpm.Grid((6, 5), 0.1, follow=True))
+        mpm.fitting.Field(MODULUS, mpm.Grid((6, 5), 0.1, follow=True))
 
 
 def test_a_field_of_one_law_among_several_lies_on_its_particles():
@@ -228,11 +230,11 @@ def test_a_field_of_one_law_among_several_lies_on_its_particles():
     values = jnp.broadcast_to(jnp.arange(8.0)[:, None] + 1, (8, 5))
     x = np.asarray(of.particles.x[:, 0])
     for where in (lambda e: e.scene.material[1].youngs_modulus, lambda e: e.scene.laws[1].youngs_modulus):
-        put = mpm.Field(mpm.Positive(where), lattice).put(of, values)
+        put = mpm.fitting.Field(mpm.Positive(where), lattice).put(of, values)
         assert np.allclose(put.scene.laws[1].youngs_modulus, 2 + x[q.count :] / 0.1)
         assert float(put.scene.laws[0].youngs_modulus) == 1e5
     both = mpm.Positive(lambda e: tuple(law.youngs_modulus for law in e.scene.laws), start=1e5)
-    put = mpm.Field(both, lattice).put(of, values)
+    put = mpm.fitting.Field(both, lattice).put(of, values)
     assert np.allclose(np.concatenate([law.youngs_modulus for law in put.scene.laws]), 2 + x / 0.1)
 
 
@@ -242,14 +244,14 @@ def test_a_smooth_prior_is_of_neighbours():
     expected = np.array([0.1, 0.0, 0.3, 0.2, 0.0, 0.1, 0.3]) / 0.5
     assert np.allclose(MODULUS.prior_residuals(value), expected)
     for start in (1.0, 7.0):
-        prior = mpm.Field(MODULUS, LATTICE, start=start).prior_residuals(value)
+        prior = mpm.fitting.Field(MODULUS, LATTICE, start=start).prior_residuals(value)
         assert np.allclose(prior, expected)
-    robust = mpm.Smooth(1.0, robust=1e-3).residuals(value, jnp.asarray([0.0, 10.0]))
+    robust = mpm.fitting.Smooth(1.0, robust=1e-3).residuals(value, jnp.asarray([0.0, 10.0]))
     assert float(robust[0] ** 2 / 2) == pytest.approx(1e-3 * 10, rel=1e-3)
     with pytest.raises(ValueError, match="is one number"):
-        FitProblem((in_a_square(),), {"E": mpm.Positive(STIFFNESS.where, prior=mpm.Smooth(0.1))})
+        FitProblem((in_a_square(),), {"E": mpm.Positive(STIFFNESS.where, prior=mpm.fitting.Smooth(0.1))})
     with pytest.raises(ValueError, match="greater than zero"):
-        mpm.Smooth(0.0)
+        mpm.fitting.Smooth(0.0)
 
 
 METHODS = {"explicit": mpm.Explicit(), "semi-implicit": mpm.SemiImplicit()}
@@ -272,9 +274,9 @@ def test_one_value_a_particle_one_a_material_and_a_field_are_fitted_together(met
             start=jnp.full(parts[0].count, 7e4),
         ),
         "nu": mpm.Bounded(lambda e: e.scene.material[1].poisson_ratio, 0.0, 0.49),
-        "field": mpm.Field(
-            mpm.Positive(lambda e: e.scene.material[1].youngs_modulus, prior=mpm.Smooth(1.0)),
-            mpm.Field.lattice_around(q, 0.2),
+        "field": mpm.fitting.Field(
+            mpm.Positive(lambda e: e.scene.material[1].youngs_modulus, prior=mpm.fitting.Smooth(1.0)),
+            mpm.fitting.Field.lattice_around(q, 0.2),
         ),
     }
     problem = FitProblem((of,), parameters)

@@ -66,7 +66,7 @@ def pushed(tmp_path_factory):
     (folder / "block.toml").write_text(SCENE + observations)
     made = read_simulation(folder / "plain.toml")
     run = mpm.simulate(made.scene, made.particles, t1=0.05, dt=2.5e-3, save_every=1)
-    forces, picture = run.forces(), mpm.Density(mpm.Grid((9, 9), 0.1, origin=(-2, -2)))
+    forces, picture = run.forces(), mpm.fitting.Density(mpm.Grid((9, 9), 0.1, origin=(-2, -2)))
     times, middles, x = (np.asarray(a) for a in (run.times, forces.times, run.frames.x))
     force, torque = (np.asarray(a)[:, 0] for a in (forces.force, forces.torque))
     at = lambda k: with_state(made.particles, jax.tree.map(lambda a: a[k], run.frames))  # noqa: E731

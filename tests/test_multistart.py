@@ -10,13 +10,11 @@ import pytest
 from test_fit import DT, NOISE, STEPS, STIFFNESS, bar, experiment, tracks
 
 import mpmjax as mpm
-from mpmjax.fitting._batch import Problems, costs_at, search_many
-from mpmjax.fitting._linkage import critical_distance, linked
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._search import search
-from mpmjax.fitting._starting_points import starting_points, unit_points
+from mpmjax.fitting._search import Problems, costs_at, search, search_many
+from mpmjax.fitting._starting_points import critical_distance, linked, starting_points, unit_points
 
-LM = mpm.LevenbergMarquardt()
+LM = mpm.fitting.LevenbergMarquardt()
 TIMES = np.linspace(0.001, 0.05, 40)
 
 
@@ -51,7 +49,7 @@ def oscillation(monkeypatch):
     def fitted(gap=np.inf, **options):
         for room in ("_multistart", "_fit"):
             monkeypatch.setattr(f"mpmjax.fitting.{room}.FitProblem", partial(Oscillation, gap=gap))
-        return mpm.fit_multistart([], {"omega": OMEGA}, **options)
+        return mpm.fitting.fit_multistart([], {"omega": OMEGA}, **options)
 
     return fitted
 
@@ -107,9 +105,7 @@ def test_searches_from_few_points_find_what_searches_from_all_find():
     for seed in range(10):
         shares = unit_points(63, 1, seed)
         points = starting_points(problem, shares, {"omega": (100.0, 750.0)})[1:]
-        members = search_many(
-            Problems.of([problem], shared=True), LM, points, sigmas=Problems.of([sigmas], shared=True), batch=63
-        )
+        members = search_many(Problems.of([problem]), LM, points, sigmas=Problems.of([sigmas]), batch=63)
         least = np.array([m.minimum.history[-1].cost for m in members])
         stands = linked(shares, costs_at(problem, points, sigmas, 63), fraction=0.375)
         assert least[np.unique(stands)].min() == pytest.approx(least.min(), rel=1e-3)
@@ -154,9 +150,7 @@ def test_a_search_among_many_goes_where_it_goes_alone():
     problem = Oscillation([], {"omega": OMEGA})
     starts = np.linspace(-1.0, 0.3, 7)[:, None]
     sigmas = problem.first_sigmas
-    members = search_many(
-        Problems.of([problem], shared=True), LM, starts, sigmas=Problems.of([sigmas], shared=True), batch=3
-    )
+    members = search_many(Problems.of([problem]), LM, starts, sigmas=Problems.of([sigmas]), batch=3)
     for start, member in zip(starts, members, strict=True):
         alone = search(problem, LM, jnp.asarray(start), sigmas)
         assert member.minimum.converged == alone.converged
@@ -171,8 +165,8 @@ def test_starting_points_fill_what_is_known_of_each_parameter():
     parameters = {
         "E": STIFFNESS,
         "nu": mpm.Bounded(lambda e: e.scene.material.poisson_ratio, 0.1, 0.4),
-        "v": mpm.Unbounded(lambda e: e.particles.v, prior=mpm.Gaussian(2.0, 0.5)),
-        "m": mpm.Positive(lambda e: e.particles.mass, prior=mpm.Gaussian(0.01, 0.01)),
+        "v": mpm.Unbounded(lambda e: e.particles.v, prior=mpm.fitting.Gaussian(2.0, 0.5)),
+        "m": mpm.Positive(lambda e: e.particles.mass, prior=mpm.fitting.Gaussian(0.01, 0.01)),
     }
     problem = FitProblem((one,), parameters)
     points = starting_points(problem, unit_points(128, problem.size, 0), {"E": (1e3, 1e6)})
@@ -206,7 +200,7 @@ def test_data_sets_of_other_shapes_are_refused():
     times, x, which = tracks()
     sets = [experiment(mpm.Tracks(times[:n], x[:n], which=which, sigma=NOISE)) for n in (5, 6)]
     with pytest.raises(ValueError, match="number 1 has other shapes"):
-        mpm.fit_ensemble(sets, {"E": STIFFNESS})
+        mpm.fitting.fit_ensemble(sets, {"E": STIFFNESS})
 
 
 @pytest.mark.thorough
@@ -220,7 +214,7 @@ def test_an_ensemble_says_what_fits_say_one_by_one():
         sets.append(own)
     sets[1] = eqx.tree_at(lambda e: e.particles.v, sets[1], 1e6 * sets[1].particles.v)
     with pytest.warns(UserWarning, match="1 of 4 data sets could not be fitted: number 1"):
-        found = mpm.fit_ensemble(sets, {"E": STIFFNESS}, batch=2)
+        found = mpm.fitting.fit_ensemble(sets, {"E": STIFFNESS}, batch=2)
     assert list(found.failures) == [1]
     assert np.isnan(found.values["E"][1])
     assert np.isnan(found.errors[1]).all()
@@ -237,7 +231,7 @@ def test_an_ensemble_says_what_fits_say_one_by_one():
 def test_specimens_with_one_value_are_said_to_be_alike():
     """Of twelve draws of noise, the spread of the estimates is their standard error."""
     sets = [experiment(mpm.Tracks(*a[:2], which=a[2], sigma=NOISE)) for a in (tracks(seed=k) for k in range(12))]
-    found = mpm.fit_ensemble(sets, {"E": STIFFNESS})
+    found = mpm.fitting.fit_ensemble(sets, {"E": STIFFNESS})
     assert 0.01 < found.alike[0] < 0.99
     assert found.values["E"].std(ddof=1) == pytest.approx(found.errors[:, 0].mean(), rel=0.6)
 
@@ -247,8 +241,8 @@ def test_the_bootstrap_agrees_with_the_linear_error():
     """Of a problem that is nearly linear."""
     times, x, which = tracks()
     fitted = mpm.fit(experiment(mpm.Tracks(times, x, which=which, sigma=NOISE)), {"E": STIFFNESS})
-    drawn = mpm.bootstrap(fitted, repeats=200)
-    assert drawn.error("E") == pytest.approx(fitted["E"].error, rel=0.15)
-    assert drawn.interval("E") == pytest.approx(fitted["E"].interval, rel=0.3 * fitted["E"].error / 7e4)
+    drawn = mpm.fitting.bootstrap(fitted, repeats=200)
+    assert drawn["E"].error == pytest.approx(fitted["E"].error, rel=0.15)
+    assert drawn["E"].interval == pytest.approx(fitted["E"].interval, rel=0.3 * fitted["E"].error / 7e4)
     with pytest.raises(KeyError, match="no estimate 'G'"):
-        drawn.interval("G")
+        drawn["G"]

@@ -39,7 +39,7 @@ def test_a_vibration_is_found_from_far_off(share):
     with pytest.warns(UserWarning, match="did not converge"):
         alone = mpm.fit(whole, from_part(share))
     assert alone["E"].value < 60
-    found = mpm.fit_staged(whole, from_part(share))
+    found = mpm.fitting.fit_staged(whole, from_part(share))
     assert found["E"].value == pytest.approx(100, rel=2e-3)
     horizons = [stage.horizon for stage in found.stages]
     assert 0.3 * EXACT.duration < horizons[0] < 1.5 * EXACT.duration
@@ -90,7 +90,7 @@ def test_the_first_horizon_is_where_the_data_cease_to_be_linear():
     phase = np.linspace(1e-3, omega * STEPS * DT, 100_000)
     ratio = np.sqrt(np.cumsum((phase * np.cos(phase)) ** 2) / np.cumsum(np.sin(phase) ** 2))
     expected = phase[np.flatnonzero(ratio <= max(1, 1.2 * ratio.min()))[-1]] / omega
-    lm, z = mpm.LevenbergMarquardt(), jnp.zeros(1)
+    lm, z = mpm.fitting.LevenbergMarquardt(), jnp.zeros(1)
     swing = Known(lambda t: (np.sin(omega * t), omega * t * np.cos(omega * t)))
     assert _first_horizon(swing, lm, z) == pytest.approx(expected, abs=2 * DT / 4)
     fall = Known(lambda t: (5 * t**2, 5 * t**2))
@@ -124,4 +124,4 @@ def test_bad_horizons_get_one_line(options, says):
     times, x, which = tracks()
     whole = experiment(mpm.Tracks(times, x, which=which, sigma=NOISE))
     with pytest.raises(ValueError, match=says):
-        mpm.fit_staged(whole, {"E": STIFFNESS}, **options)
+        mpm.fitting.fit_staged(whole, {"E": STIFFNESS}, **options)

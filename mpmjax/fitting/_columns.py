@@ -1,10 +1,12 @@
-"""Columns of measured data, from CSV files."""
+"""Measured data in files: columns of CSV files, arrays of NumPy archives and HDF5 files."""
 
 import csv
 import difflib
 import re
+import zipfile
 from pathlib import Path
 
+import h5py
 import numpy as np
 
 from mpmjax.checks import require, shortened
@@ -87,8 +89,8 @@ class Columns:
         """Check every row.
 
         Args:
-            condition: of each row, whether it is right.
-            message: what is wrong otherwise; {column} stands for the row's number in that column.
+            condition: whether each row is right.
+            message: for a row that is not; {column} stands for the row's number in that column.
 
         Raises:
             ValueError: a row is not right; the first such line is named.
@@ -96,25 +98,25 @@ class Columns:
         wrong = np.flatnonzero(~np.asarray(condition))
         if len(wrong):
             row = {name: f"{column[wrong[0]]:g}" for name, column in self._data.items()}
-            said = re.sub(r"\{(.+?)\}", lambda found: row.get(found[1], found[0]), message)
-            raise ValueError(f"{self.path}, line {self.lines[wrong[0]]}: {said}")
+            text = re.sub(r"\{(.+?)\}", lambda match: row.get(match[1], match[0]), message)
+            raise ValueError(f"{self.path}, line {self.lines[wrong[0]]}: {text}")
 
     def scaled(self, name: str, unit: float, key: str = "unit") -> np.ndarray:
         """The numbers of a column in SI units.
 
         Args:
-            name: the column. A unit with a prefix in its head, "x [mm]" or "stress_MPa", must be that which was given.
+            name: the column. A unit with a prefix in its head, "x [mm]" or "stress_MPa", must be the given one.
             unit: what they are multiplied by.
             key: what the user calls it.
 
         Raises:
             ValueError: the head says another unit.
         """
-        found = stated_unit(name)
+        stated = stated_unit(name)
         require(
-            found is None or np.isclose(unit, found, rtol=1e-9),
+            stated is None or np.isclose(unit, stated, rtol=1e-9),
             f"{self.path}, line {self.header_line}: the column {name!r} states another unit than {key} = {unit:g}: "
-            f"give {key} = {found or 1:g}, or name the column otherwise.",
+            f"give {key} = {stated or 1:g}, or name the column otherwise.",
         )
         return self._data[name] * unit
 
@@ -156,10 +158,10 @@ ROUNDED = 1e-6
 def stated_unit(name: str) -> float | None:
     """The factor to SI units that a column's head states, as "x [mm]", "force (kN)" or "stress_MPa"; None if none."""
     bracketed, underscored = re.search(r"[\[(]\s*(\S+?)\s*[\])]$", name), re.search(r"_([^\W_]+)$", name)
-    found = bracketed or underscored
-    if found is None:
+    match = bracketed or underscored
+    if match is None:
         return None
-    unit = found[1]
+    unit = match[1]
     if bracketed and unit in _UNITS - {"g"}:
         return 1.0
     if unit[1:] in _UNITS and unit[0] in _PREFIXES:
@@ -171,3 +173,27 @@ def read_columns(path: Path | str, *names: str) -> list[np.ndarray]:
     """Columns of a CSV file, see `Columns`."""
     columns = Columns(Path(path), *names)
     return [columns[name] for name in names]
+
+
+def read_arrays(path: Path, *names: str) -> list[np.ndarray]:
+    """Arrays of numbers in a NumPy archive or an HDF5 file.
+
+    Raises:
+        ValueError: no such file or array, or one that is not numbers.
+    """
+    suffixes = (".npz", ".h5", ".hdf5")
+    require(path.suffix in suffixes, f"{path} must be a {', '.join(suffixes)} file with the arrays {', '.join(names)}.")
+    try:
+        if path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in names if name in file}
+        else:
+            with h5py.File(path, "r", locking=False) as file:
+                arrays = {name: np.asarray(file[name]) for name in names if name in file}
+    except (OSError, KeyError, EOFError, ValueError, TypeError, MemoryError, zipfile.BadZipFile) as error:
+        raise ValueError(f"Cannot read the data file {path}: {reason(error).lower()}.") from None
+    for name in names:
+        require(name in arrays, f"{path} has no array {name!r}.")
+        numbers = np.issubdtype(arrays[name].dtype, np.number) and not np.iscomplexobj(arrays[name])
+        require(numbers, f"{path}: the array {name!r} must hold real numbers, got {arrays[name].dtype}.")
+    return [arrays[name].astype(float) for name in names]

@@ -1,7 +1,6 @@
 """Fits of many data sets of one experiment: repeated specimens, and data drawn anew."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -9,18 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import chdtrc
 
-from mpmjax._types import Scalar
-from mpmjax.checks import checked, require, warn
-from mpmjax.fitting._batch import Problems, batch_size, search_many
-from mpmjax.fitting._choice import chosen_optimiser
-from mpmjax.fitting._estimates import fit_result, settle_noise
+from mpmjax._types import Float, Scalar
+from mpmjax.checks import checked, require, require_whole, warn
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._fit import MOST_ROUNDS, explain
+from mpmjax.fitting._fit import MOST_ROUNDS, checked_level, chosen_optimiser
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._result import FitResult
-from mpmjax.fitting._search import Iteration
+from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, fit_result, settle_noise, table
+from mpmjax.fitting._search import Iteration, Problems, batch_size, search_many
 
 
 class EnsembleFit(eqx.Module):
@@ -37,53 +33,57 @@ class EnsembleFit(eqx.Module):
     @property
     def values(self) -> dict[str, np.ndarray]:
         """The estimates of each parameter, NaN where the fit failed, shape (k, ...)."""
-        first = self._found[0]
-        names = {name: np.full(value.shape, np.nan) for name, value in first.values.items()}
-        each = [names if fit is None else fit.values for fit in self.fits]
-        return {name: np.stack([values[name] for values in each]) for name in names}
+        lost = {name: np.full(value.shape, np.nan) for name, value in self._done[0].values.items()}
+        each = [lost if fit is None else fit.values for fit in self.fits]
+        return {name: np.stack([values[name] for values in each]) for name in lost}
 
     @property
     def errors(self) -> np.ndarray:
         """The standard error of each estimate of the n numbers, NaN where the fit failed, shape (k, n)."""
-        lost = [np.nan] * len(self._found[0].estimates)
+        lost = [np.nan] * len(self._done[0].estimates)
         return np.array([lost if fit is None else [e.error for e in fit.estimates] for fit in self.fits])
 
     @property
     def alike(self) -> np.ndarray:
-        """Of each number, the probability of so large a spread if all data sets had one value and the errors are right:
+        """Probability of so large a spread of each number if all data sets had one value and the errors are right:
         Cochran's Q = Σ (z_k − z̄)²/s_k² of the values, of logarithms where none is at zero, χ² of k − 1 degrees of
         freedom (W. G. Cochran, Biometrics 10 (1954) 101, doi 10.2307/3001666), shape (n,)."""
-        found, first = [fit.estimates for fit in self._found], self._found[0].problem
-        z, s, held = (
-            np.array([[getattr(e, name) for e in each] for each in found]) for name in ("value", "error", "at_bound")
-        )
+        z, s, held = self._columns
         if len(z) < 2:
             return np.full(z.shape[1], np.nan)
-        ratio = np.array(first.logarithmic) & ~held.any(axis=0)
+        ratio = np.array(self._done[0].problem.logarithmic) & ~held.any(axis=0)
         z, s = np.where(ratio, np.log(np.where(ratio, z, 1)), z), s / np.where(ratio, z, 1)
         weight = 1 / s**2
         mean = (weight * z).sum(axis=0) / weight.sum(axis=0)
         return np.asarray(chdtrc(len(z) - 1, (weight * (z - mean) ** 2).sum(axis=0)))
 
     @property
-    def _found(self) -> list[FitResult]:
+    def _done(self) -> list[FitResult]:
         return [fit for fit in self.fits if fit is not None]
 
+    @property
+    def _columns(self) -> tuple[np.ndarray, ...]:
+        """Values, errors, and whether they lie at a bound, each of shape (fits that did not fail, n)."""
+        rows = [fit.estimates for fit in self._done]
+        return tuple(np.array([[getattr(e, f) for e in row] for row in rows]) for f in ("value", "error", "at_bound"))
+
     def __str__(self) -> str:
-        """A table: of each number the mean and spread over the data sets, and what errors the fits have."""
-        found = self._found
-        lines = [f"{'':<24} {'mean':>12} {'spread':>10} {'error of one':>13}  same value?"]
-        values = np.array([[e.value for e in fit.estimates] for fit in found])
-        errors = np.array([[e.error for e in fit.estimates] for fit in found])
-        held = np.sum([[e.at_bound for e in fit.estimates] for fit in found], axis=0)
-        for k, e in enumerate(found[0].estimates):
-            name = f"{e.label} [{e.unit}]" if e.unit else e.label
-            spread = values[:, k].std(ddof=1) if len(found) > 1 else np.nan
-            error = np.sqrt((errors[:, k] ** 2).mean())
-            alike = f"p = {self.alike[k]:.2g}" + (f", {held[k]} at the bound" if held[k] else "")
-            lines.append(f"{name:<24} {values[:, k].mean():>12.6g} {spread:>10.2g} {error:>13.2g}  {alike}")
-        lines.append(f"{len(found)} data sets" + (f", {len(self.failures)} failed" if self.failures else ""))
-        return "\n".join(lines)
+        """A table: the mean and spread of each number over the data sets, and the errors of the fits."""
+        (values, errors, held), alike = self._columns, self.alike
+        spread = values.std(axis=0, ddof=1) if len(values) > 1 else np.full(values.shape[1], np.nan)
+        rows = [
+            (
+                e.name,
+                f"{values[:, k].mean():>12.6g}",
+                f"{spread[k]:>10.2g}",
+                f"{np.sqrt((errors[:, k] ** 2).mean()):>13.2g}",
+                f"p = {alike[k]:.2g}" + (f", {held[:, k].sum()} at the bound" if held[:, k].any() else ""),
+            )
+            for k, e in enumerate(self._done[0].estimates)
+        ]
+        head = "", f"{'mean':>12}", f"{'spread':>10}", "error of one", "same value?"
+        last = f"{len(values)} data sets" + (f", {len(self.failures)} failed" if self.failures else "")
+        return "\n".join([*table(head, *rows), last])
 
 
 @checked
@@ -100,9 +100,9 @@ def fit_ensemble(
     """Fit each of many data sets by itself, together in one compiled program: repeated specimens, for instance.
 
         specimens = [mpm.Experiment(scene, particles, ..., observations=tracks) for tracks in measured]
-        found = mpm.fit_ensemble(specimens, {"E": ...})
-        print(found)  # mean and spread of E, and whether the specimens differ by more than their errors
-        found.values["E"]  # shape (number of specimens,)
+        result = mpm.fitting.fit_ensemble(specimens, {"E": ...})
+        print(result)  # mean and spread of E, and whether the specimens differ by more than their errors
+        result.values["E"]  # shape (number of specimens,)
 
     Each gets what `fit` says of it: the same estimates and errors. One that fails ends alone.
 
@@ -121,20 +121,20 @@ def fit_ensemble(
         ValueError: as `fit`; data sets of different shapes; no fit that did not fail.
     """
     require(len(experiments) > 0, "An ensemble needs a data set at least.")
-    require((level > 0) & (level < 1), f"level must lie between 0 and 1, got {level}.")
+    level = checked_level(level)
     sets = [
         (e,) if isinstance(e, Experiment) else tuple(e) if isinstance(e, (tuple, list)) else () for e in experiments
     ]
-    for k, own in enumerate(sets):
-        known = len(own) > 0 and all(isinstance(e, Experiment) for e in own)
-        require(known, f"Data set {k} must be an Experiment, or a tuple of some, got {type(experiments[k]).__name__}.")
-    problems = [FitProblem(own, parameters) for own in sets]
+    for k, each in enumerate(sets):
+        usable = len(each) > 0 and all(isinstance(e, Experiment) for e in each)
+        require(usable, f"Data set {k} must be an Experiment, or a tuple of some, got {type(experiments[k]).__name__}.")
+    problems = [FitProblem(each, parameters) for each in sets]
     optimiser = chosen_optimiser(problems[0]) if optimiser is None else optimiser
-    fits = _fit_each(problems, optimiser, batch, dict(report or {}), float(level), progress)
+    fits = _fit_each(problems, optimiser, batch, dict(report or {}), level, progress)
     failures = {k: fit for k, fit in enumerate(fits) if isinstance(fit, str)}
     if len(failures) == len(fits):
-        explain(problems[0], jnp.zeros(problems[0].size, problems[0].dtype))
-        raise ValueError(f"None of {len(fits)} fits succeeded: {failures[0]}.")
+        z = jnp.zeros(problems[0].size, problems[0].dtype)
+        problems[0].explain(z, failure=f"None of {len(fits)} fits succeeded: {failures[0]}.")
     if failures:
         shown = "; ".join(f"number {k}: {why}" for k, why in list(failures.items())[:3])
         warn(f"{len(failures)} of {len(fits)} data sets could not be fitted: {shown}.")
@@ -153,41 +153,135 @@ def _fit_each(
     progress: Callable[[str], None] | None,
 ) -> list[FitResult | str]:
     """The fit of each, or why it failed; in rounds, as long as the noise of some changes."""
-    stacked, n = Problems.of(problems, shared=False), problems[0].size
-    batch = batch_size(problems[0], batch, len(problems))
-    sigmas = [p.first_sigmas for p in problems]
-    starts = np.zeros((len(problems), n))
-    history: list[tuple[Iteration, ...]] = [()] * len(problems)
-    fits: list[FitResult | str] = [""] * len(problems)
-    left = list(range(len(problems)))
+    stacked, count = Problems.of(problems), len(problems)
+    sigmas, starts = [p.first_sigmas for p in problems], np.zeros((count, problems[0].size))
+    history: list[tuple[Iteration, ...]] = [()] * count
+    fits: list[FitResult | str] = [""] * count
+    left = list(range(count))
     for round_ in range(MOST_ROUNDS):
 
         def say(done: int, count: int, number: int = round_) -> None:
             if progress is not None:
                 progress(f"round {number + 1}: {done} of {count} fits are done")
 
-        members = search_many(
-            stacked.only(left),
-            optimiser,
-            starts[left],
-            sigmas=Problems.of([sigmas[k] for k in left], shared=False),
-            batch=batch,
-            progress=say,
-        )
+        noise = Problems.of([sigmas[k] for k in left])
+        size = batch_size(problems[0], batch, count)
+        members = search_many(stacked.only(left), optimiser, starts[left], sigmas=noise, batch=size, progress=say)
         again = []
         for k, member in zip(left, members, strict=True):
-            found = member.minimum
-            if found is None:
+            if member.minimum is None:
                 fits[k] = member.failure
                 continue
-            starts[k], history[k] = np.asarray(found.z), history[k] + found.history
-            factors, freedom, sigmas[k], changing = settle_noise(problems[k], found, sigmas[k])
-            if changing and found.converged and round_ < MOST_ROUNDS - 1:
+            starts[k], history[k] = np.asarray(member.minimum.z), history[k] + member.minimum.history
+            settled = settle_noise(problems[k], member.minimum, sigmas[k])
+            sigmas[k] = settled.sigmas
+            if settled.changing and member.minimum.converged and round_ < MOST_ROUNDS - 1:
                 again.append(k)
             else:
-                result = fit_result(problems[k], optimiser, found, factors, freedom, sigmas[k], report, level)
-                fits[k] = replace(result, history=history[k])
+                minimum = member.minimum._replace(history=history[k])
+                fits[k] = fit_result(problems[k], optimiser, minimum, settled, report, level)
         left = again
         if not left:
             break
     return fits
+
+
+class Bootstrap(AbstractFit):
+    """The estimates of fits of data drawn anew.
+
+    `print(result)` shows a table; `result["E"].interval` is a percentile interval.
+    """
+
+    estimates: tuple[Estimate, ...]
+    """The fitted numbers: values of the fit of what was measured, errors and percentile intervals of the samples."""
+    samples: Float[np.ndarray, "k n"]
+    """Their values in each fit that did not fail, shape (k, n)."""
+    level: float
+    """The level of the intervals [-]."""
+    failed: int
+    """How many fits failed, or came to no minimum."""
+
+    @property
+    def all(self) -> tuple[Estimate, ...]:
+        return self.estimates
+
+    def __str__(self) -> str:
+        """A table."""
+        head = "", f"{'value':>12} ± {'error':<9}", f"{100 * self.level:g} % interval"
+        last = f"{len(self.samples)} fits of data drawn anew" + (f", {self.failed} failed" if self.failed else "")
+        return "\n".join([*table(head, *((e.name, *e.cells) for e in self.estimates)), last])
+
+
+@checked
+def bootstrap(
+    result: FitResult,
+    *,
+    repeats: int = 200,
+    seed: int = 0,
+    batch: int | None = None,
+    optimiser: AbstractOptimiser | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Bootstrap:
+    """Errors and intervals of a fit without linearisation: the fitted simulation's data with new normal noise of the
+    fit's σ, fitted again, many times (the parametric bootstrap: B. Efron, R. J. Tibshirani, An Introduction to the
+    Bootstrap, Chapman & Hall 1993, chapters 6.5 and 13).
+
+        print(mpm.fitting.bootstrap(mpm.fit(pull, {"E": ...})))
+
+    It takes the model and the independence of the noise for granted, as the errors of `fit` do: what it adds is the
+    curvature of the model and what bounds do. `weight` and `robust` act in each fit; the noise drawn is of σ for each
+    number. A prior's mean is drawn anew too. Two hundred repeats fix a standard error to 5 %, and a 95 % interval
+    less well.
+
+    Args:
+        result: the fit.
+        repeats: how many fits.
+        seed: of the noise.
+        batch: how many fits run together, see `fit_multistart`.
+        optimiser: the method of each. Default: that of the fit.
+        progress: called with a line, such as `print`, as fits end.
+
+    Raises:
+        ValueError: fewer than two repeats; fewer than two fits that succeeded.
+    """
+    require_whole("repeats", repeats, 2)
+    rng = np.random.default_rng(require_whole("seed", seed, 0))
+    problem, z = result.problem, jnp.asarray(result.z, result.problem.dtype)
+    predicted = [np.asarray(y, float) for e in problem.at(z) for y in e.predictions(e.run())]
+    problems = [_drawn(problem, predicted, result.sigmas, rng) for _ in range(repeats)]
+
+    def say(done: int, count: int) -> None:
+        if progress is not None:
+            progress(f"{done} of {count} fits are done")
+
+    members = search_many(
+        Problems.of(problems),
+        result.optimiser if optimiser is None else optimiser,
+        np.repeat(np.asarray(result.z, float)[None], repeats, axis=0),
+        sigmas=Problems.of([result.sigmas]),
+        batch=batch_size(problem, batch, repeats),
+        progress=say,
+    )
+    ends = [m.minimum.z for m in members if m.minimum is not None and m.minimum.converged]
+    require(len(ends) > 1, f"Of {repeats} fits of data drawn anew {len(ends)} came to a minimum: raise max_steps.")
+    if len(ends) < repeats:
+        warn(
+            f"{repeats - len(ends)} of {repeats} fits of data drawn anew came to no minimum: intervals leave them out."
+        )
+    samples = np.array([problem.numbers(end) for end in ends])
+    lower, upper = np.quantile(samples, [(1 - result.level) / 2, (1 + result.level) / 2], axis=0).tolist()
+    errors = samples.std(axis=0, ddof=1).tolist()
+    each = zip(result.estimates, errors, lower, upper, strict=True)
+    estimates = tuple(e._replace(error=error, interval=(a, b)) for e, error, a, b in each)
+    return Bootstrap(estimates, samples, result.level, repeats - len(ends))
+
+
+def _drawn(problem: FitProblem, predicted: list[np.ndarray], sigmas: tuple, rng: np.random.Generator) -> FitProblem:
+    """The problem with data of its simulation and new noise, NaN where nothing was measured."""
+    drawn = []
+    for observation, y, sigma in zip(problem.observations, predicted, sigmas, strict=True):
+        noisy = y + np.asarray(sigma) * rng.normal(size=y.shape)
+        drawn.append(np.where(np.isfinite(observation.data), noisy, np.nan))
+    problem = eqx.tree_at(lambda p: [o.data for o in p.observations], problem, drawn)
+    priors = [p.prior.drawn(rng) for p in problem.parameters if p.prior is not None]
+    return eqx.tree_at(lambda q: [p.prior for p in q.parameters if p.prior is not None], problem, priors)

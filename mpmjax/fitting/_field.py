@@ -21,8 +21,8 @@ class Field(AbstractParameter):
     """A parameter that changes from place to place: its values on the nodes of a lattice, interpolated to the particles
     where they start.
 
-        stiffness = mpm.Positive(lambda e: e.scene.material.youngs_modulus, prior=mpm.Smooth(0.5), unit="Pa")
-        result = mpm.fit(pull, {"E": mpm.Field(stiffness, mpm.Field.lattice_around(particles, 0.1))})
+        stiffness = mpm.Positive(lambda e: e.scene.material.youngs_modulus, prior=mpm.fitting.Smooth(0.5), unit="Pa")
+        result = mpm.fit(pull, {"E": mpm.fitting.Field(stiffness, mpm.fitting.Field.lattice_around(particles, 0.1))})
 
     `result.values["E"]` has the values on the nodes, the fitted scene one for each particle. Nodes that the data do not
     see need a prior: `Smooth`, or `Gaussian`. A parameter of a law among several is a field over the particles of that

@@ -4,26 +4,26 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Scalar
 from mpmjax.checks import checked, require, warn
-from mpmjax.fitting._choice import chosen_optimiser
-from mpmjax.fitting._estimates import fit_result, settle_noise
 from mpmjax.fitting._experiment import Experiment
+from mpmjax.fitting._gradient_methods import LBFGS
+from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._log import FitLog, opened_log
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._problem import ROW_COST, Coordinates, FitProblem
 from mpmjax.fitting._progress import Progress
-from mpmjax.fitting._result import FitResult
-from mpmjax.fitting._search import Iteration, Minimum, NoDerivativeError, Standing, influence, search
+from mpmjax.fitting._result import FitResult, SettledNoise, fit_result, settle_noise
+from mpmjax.fitting._search import Minimum, NoDerivativeError, SearchState, search
 from mpmjax.io import reporting
 
 
@@ -86,65 +86,73 @@ def fit(
         OSError: the disk refused the log, which holds what it held before.
     """
     require(log is not None or not resume, "resume continues the fit of a log: name it by log.")
-    several = (experiments,) if isinstance(experiments, Experiment) else tuple(experiments)
-    problem = FitProblem(several, parameters, memory)
+    problem = FitProblem(experiments, parameters, memory)
     optimiser = chosen_optimiser(problem) if optimiser is None else optimiser
-    require((level > 0) & (level < 1), f"level must lie between 0 and 1, got {level}.")
-    level = float(level)
+    level = checked_level(level)
     report = dict(report or {})
     _check_report(problem, report)
     z = jnp.zeros(problem.size, problem.dtype)
     with ExitStack() as stack:
-        kept = None
+        written = None
         if log is not None:
-            kept = stack.enter_context(opened_log(Path(log), problem, optimiser, z, resume=resume))
-            stack.enter_context(reporting(kept.standing))
-        found, history, sigmas, factors, freedom, unsettled = _rounds(problem, optimiser, z, progress, kept)
-    result = fit_result(problem, optimiser, found, factors, freedom, sigmas, report, level)
-    result = replace(result, history=history, interrupted=found.interrupted)
-    if not found.converged:
-        stopped = "was interrupted" if found.interrupted else "did not converge"
-        advice = "" if found.interrupted else f" {_ADVICE}"
-        warn(f"The fit {stopped} after {len(history)} iterations: its errors hold only at a minimum.{advice}")
-    elif unsettled:
+            written = stack.enter_context(opened_log(Path(log), problem, optimiser, z, resume=resume))
+            stack.enter_context(reporting(written.contents))
+        minimum, settled = _in_rounds(problem, optimiser, z, progress, written)
+    result = fit_result(problem, optimiser, minimum, settled, report, level)
+    if not minimum.converged:
+        stopped = "was interrupted" if minimum.interrupted else "did not converge"
+        advice = "" if minimum.interrupted else f" {_ADVICE}"
+        warn(f"The fit {stopped} after {len(result.history)} iterations: its errors hold only at a minimum.{advice}")
+    elif settled.changing:
         warn(f"The noise of the observations did not settle in {MOST_ROUNDS} rounds: give the sigma of one of them.")
     for text in result.warnings:
         warn(text)
     return result
 
 
-def _rounds(
+def chosen_optimiser(problem: FitProblem) -> AbstractOptimiser:
+    """Levenberg-Marquardt while its Jacobian is cheap: by forward mode it costs as much as a simulation for each few
+    parameters, by reverse mode for each measured number. Else L-BFGS, whose gradient costs the same for any number of
+    parameters, and which takes more iterations (docs/fitting.md has the measurement)."""
+    columns = min(problem.size, ROW_COST * problem.measured)
+    return LevenbergMarquardt() if columns <= MOST_COLUMNS else LBFGS()
+
+
+def checked_level(level: Scalar) -> float:
+    """The level of intervals, which must lie between 0 and 1."""
+    require((level > 0) & (level < 1), f"level must lie between 0 and 1, got {level}.")
+    return float(level)
+
+
+def _in_rounds(
     problem: FitProblem,
     optimiser: AbstractOptimiser,
     z: Coordinates,
     progress: Callable[[str], None] | None,
-    kept: FitLog | None,
-) -> tuple[Minimum, tuple[Iteration, ...], tuple[Array, ...], list[float], list[float], bool]:
-    """The search, again and again until the noise that it leaves is the noise that it was made with.
-
-    Returns:
-        the last minimum; all iterations; the noise; by how much it differs from that of the last search; the degrees of
-        freedom of its estimates; whether it did not settle.
-    """
+    log: FitLog | None,
+) -> tuple[Minimum, SettledNoise]:
+    """The search, again and again until the noise that it leaves is the noise that it was made with: the last minimum,
+    with all iterations, and the noise. A log is continued, and gets each iteration."""
     sigmas = problem.first_sigmas
-    history, rounds, standing, before = (), 0, None, 0.0
-    if kept is not None and kept.last is not None:
-        history, rounds, (sigmas, standing), before = kept.earlier, kept.rounds, kept.last, kept.seconds
-    said, begun = Progress(problem, optimiser, progress), time.perf_counter() - before
-    said.begin(0 if standing is None else len(history) + len(standing.history))
+    history, rounds, state, seconds_before = (), 0, None, 0.0
+    if log is not None and log.last is not None:
+        history, rounds, (sigmas, state), seconds_before = log.earlier, log.rounds, log.last, log.seconds
+    said, begun = Progress(problem, optimiser, progress), time.perf_counter() - seconds_before
+    said.begin(0 if state is None else len(history) + len(state.history))
     while True:
 
-        def report(standing: Standing, sigmas: tuple[Array, ...] = sigmas) -> None:
+        def report(state: SearchState, sigmas: tuple[Array, ...] = sigmas) -> None:
             seconds = time.perf_counter() - begun
-            if kept is not None:
-                kept.append(sigmas, standing, seconds)
-            said(standing, seconds)
+            if log is not None:
+                log.append(sigmas, state, seconds)
+            said(state, seconds)
 
-        found = _search(problem, optimiser, z, sigmas, standing, report)
-        z, history, rounds, standing = found.z, history + found.history, rounds + 1, None
-        factors, freedom, sigmas, changing = settle_noise(problem, found, sigmas)
-        if not changing or not found.converged or rounds == MOST_ROUNDS:
-            return found, history, sigmas, factors, freedom, found.converged and changing
+        minimum = _search(problem, optimiser, z, sigmas, state, report)
+        z, history, rounds, state = minimum.z, history + minimum.history, rounds + 1, None
+        settled = settle_noise(problem, minimum, sigmas)
+        sigmas = settled.sigmas
+        if not settled.changing or not minimum.converged or rounds == MOST_ROUNDS:
+            return minimum._replace(history=history), settled
 
 
 def _check_report(problem: FitProblem, report: Mapping[str, Callable[[Experiment], Any]]) -> None:
@@ -159,8 +167,8 @@ def _search(
     optimiser: AbstractOptimiser,
     z: Coordinates,
     sigmas: tuple[Array, ...],
-    standing: Standing | None,
-    report: Callable[[Standing], None],
+    state: SearchState | None,
+    report: Callable[[SearchState], None],
 ) -> Minimum:
     """The least sum of squares with a noise.
 
@@ -169,29 +177,21 @@ def _search(
         ValueError: a parameter does not influence the data.
         RuntimeError: there is no derivative.
     """
+
+    def begun(seen: Evaluation) -> None:
+        require_influence(problem, sigmas, seen)
+
     try:
-        begun = partial(require_influence, problem, sigmas)
-        found = search(problem, optimiser, z, sigmas, standing=standing, report=report, begun=begun)
+        minimum = search(problem, optimiser, z, sigmas, state=state, report=report, begun=begun)
     except NoDerivativeError:
         raise RuntimeError(
             "The fit has no derivative. Either the tangent or adjoint solve of a step did not converge: raise the "
             "max_steps of the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner(). Or a "
             "law or an observation cannot be differentiated where the run takes it."
         ) from None
-    if not np.isfinite(found.history[0].cost):
-        explain(problem, z)
-        raise ValueError("What is observed of the simulation at the first guess is not finite.")
-    return found
-
-
-def explain(problem: FitProblem, z: Coordinates) -> None:
-    """Say why what is observed is not finite there.
-
-    Raises:
-        SimulationError, ValueError: see `Experiment.explain`.
-    """
-    for experiment in problem.at(z):
-        experiment.explain()
+    if not np.isfinite(minimum.history[0].cost):
+        problem.explain(z)
+    return minimum
 
 
 def require_influence(problem: FitProblem, sigmas: tuple[Array, ...], seen: Evaluation) -> None:
@@ -205,25 +205,30 @@ def require_influence(problem: FitProblem, sigmas: tuple[Array, ...], seen: Eval
         # |Jᵀr| ≤ ‖r‖ times a column's length: where it is not small, the column is not.
         size = np.abs(np.asarray(seen.gradient)) / max(np.sqrt(2 * float(seen.cost)), np.finfo(float).tiny)
         if (size <= rounding).any():
-            size = influence(problem, jnp.zeros(problem.size, problem.dtype), sigmas)
+            size = np.abs(np.asarray(_random_pull(problem, jnp.zeros(problem.size, problem.dtype), sigmas)))
     else:
         size = np.linalg.norm(np.asarray(seen.jacobian), axis=0)
     unseen = [label for label, length in zip(problem.labels, size, strict=True) if length <= rounding]
+    more = f" and {len(unseen) - _MOST_NAMES} more" if len(unseen) > _MOST_NAMES else ""
     require(
         not unseen,
-        f"The data do not depend on {_listed(unseen)}: their derivative by it is zero but for rounding. Leave it "
-        "out, give it a prior, or observe what it changes.",
+        f"The data do not depend on {', '.join(unseen[:_MOST_NAMES])}{more}: their derivative by it is zero but for "
+        "rounding. Leave it out, give it a prior, or observe what it changes.",
     )
 
 
-def _listed(names: list[str]) -> str:
-    """The first names, and how many there are besides."""
-    more = len(names) - _MOST_NAMES
-    return ", ".join(names[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
+@eqx.filter_jit
+def _random_pull(problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> Coordinates:
+    """Jᵀw with random numbers w of variance one, by one pass of reverse mode: the expected square of a component is
+    that of the length of J's column."""
+    r, pull, _ = jax.vjp(lambda z: problem.residuals(z, sigmas, None), z, has_aux=True)
+    return pull(jax.random.normal(jax.random.key(0), r.shape, r.dtype))[0]
 
 
+MOST_COLUMNS = 32
+"""Columns of a Jacobian, or rows at what they cost more, up to which Levenberg-Marquardt is the cheaper."""
 MOST_ROUNDS = 20
-"""Of searches with another noise."""
+"""Most re-estimations of the noise."""
 _MOST_NAMES = 6
 _ROUNDINGS = 10
 """Derivatives by a coordinate below so many roundings of the data are none."""

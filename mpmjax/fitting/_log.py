@@ -6,7 +6,7 @@
     /values         of the parameters, shape (iterations, n); the attribute `labels` names the columns
     /noise/k        the σ of observation k in each round, shape (rounds, ...); the attribute `name` is its name
     /problem        JSON: what is fitted, as names and texts, by which another fit is told from this one
-    /resume         what the next iteration needs: what the optimiser remembers, and what it knows of its place
+    /resume         what the next iteration needs: the optimiser's state, and its evaluation of the place where it is
 
 The file is replaced as a whole after each iteration (see `mpmjax.io.ReplacedFile`): it holds whole iterations only,
 however the process ends. Its last four bytes are CRC-32 of all others.
@@ -32,7 +32,7 @@ from mpmjax.checks import require
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._problem_text import described
-from mpmjax.fitting._search import Iteration, Standing, begin
+from mpmjax.fitting._search import Iteration, SearchState, begin
 from mpmjax.io import ReplacedFile, check_hdf5, reason
 
 _FORMAT = 2
@@ -43,7 +43,7 @@ class _Round(NamedTuple):
     """A search with one noise."""
 
     sigmas: tuple[Array, ...]
-    standing: Standing
+    search: SearchState
     seconds: tuple[float, ...]
     """When each iteration was done, since the fit began [s]."""
 
@@ -53,7 +53,7 @@ class FitLog:
 
     def __init__(self, path: Path, file: ReplacedFile, problem: FitProblem, text: dict[str, str], rounds: list[_Round]):
         self._path, self._file, self._problem, self._text, self._rounds = path, file, problem, text, rounds
-        self._values = [self._numbers(i) for r in rounds for i in r.standing.history]
+        self._values = [self._numbers(i) for r in rounds for i in r.search.history]
 
     @property
     def rounds(self) -> int:
@@ -63,34 +63,29 @@ class FitLog:
     @property
     def earlier(self) -> tuple[Iteration, ...]:
         """The iterations of those rounds."""
-        return tuple(i for r in self._rounds[:-1] for i in r.standing.history)
+        return tuple(i for r in self._rounds[:-1] for i in r.search.history)
 
     @property
-    def last(self) -> tuple[tuple[Array, ...], Standing] | None:
+    def last(self) -> tuple[tuple[Array, ...], SearchState] | None:
         """The noise of the round that the log ends in, and where its search stands; None if it has no iteration."""
-        return (self._rounds[-1].sigmas, self._rounds[-1].standing) if self._rounds else None
+        return (self._rounds[-1].sigmas, self._rounds[-1].search) if self._rounds else None
 
     @property
     def seconds(self) -> float:
         """When the last iteration was done, since the fit began [s]."""
         return self._rounds[-1].seconds[-1] if self._rounds else 0.0
 
-    def append(self, sigmas: tuple[Array, ...], standing: Standing, seconds: float) -> None:
-        """Write an iteration.
-
-        Args:
-            sigmas: the noise of its round.
-            standing: where the search stands.
-            seconds: since the fit began.
+    def append(self, sigmas: tuple[Array, ...], state: SearchState, seconds: float) -> None:
+        """Write an iteration: the noise of its round, the search after it, and the seconds since the fit began.
 
         Raises:
             OSError: the disk refused; the log is what it was.
         """
         past: tuple[float, ...] = ()
-        if len(standing.history) > 1:
+        if len(state.history) > 1:
             past = self._rounds.pop().seconds
-        self._rounds.append(_Round(sigmas, standing, (*past, seconds)))
-        self._values.append(self._numbers(standing.history[len(standing.history) - 1]))
+        self._rounds.append(_Round(sigmas, state, (*past, seconds)))
+        self._values.append(self._numbers(state.history[len(state.history) - 1]))
         self.write()
 
     def write(self) -> None:
@@ -108,8 +103,8 @@ class FitLog:
         except OSError as error:
             raise OSError(f"{error} If it has no room, make room, then resume the fit.") from None
 
-    def standing(self) -> str:
-        """What the log holds, as a sentence."""
+    def contents(self) -> str:
+        """The number of iterations in the log, as a sentence."""
         count = len(self._values)
         return f"{self._path} holds {count} iteration{'s' * (count != 1)}. Resume it to continue."
 
@@ -125,10 +120,10 @@ class FitLog:
         rows = [
             (number, i.number, i.cost, i.gradient, i.accepted, seconds)
             for number, r in enumerate(self._rounds)
-            for i, seconds in zip(r.standing.history, r.seconds, strict=True)
+            for i, seconds in zip(r.search.history, r.seconds, strict=True)
         ]
         _put(file, "iterations", np.array(rows, _ROW))
-        z = [i.z for r in self._rounds for i in r.standing.history]
+        z = [i.z for r in self._rounds for i in r.search.history]
         _put(file, "coordinates", np.array(z).reshape(-1, n))
         _put(file, "values", np.array(self._values).reshape(-1, n))
         file["values"].attrs["labels"] = json.dumps(problem.labels)
@@ -138,8 +133,8 @@ class FitLog:
             _put(file, f"noise/{k}", np.array(sigmas, None if sigmas else float).reshape(-1, *shape))
             file[f"noise/{k}"].attrs["name"] = observation.name
         if self._rounds:
-            _, state, seen, _ = self._rounds[-1].standing
-            for k, leaf in enumerate(jax.tree.leaves(eqx.filter(state, eqx.is_array))):
+            _, inner, seen, _ = self._rounds[-1].search
+            for k, leaf in enumerate(jax.tree.leaves(eqx.filter(inner, eqx.is_array))):
                 _put(file, f"resume/state/{k}", np.asarray(leaf))
             for name, leaf in seen._asdict().items():
                 if leaf is not None:
@@ -186,18 +181,18 @@ def _read(
     try:
         data = path.read_bytes()
         with h5py.File(io.BytesIO(data), "r") as file:
-            known = file.attrs.get("kind") == b"mpmjax fit log"
-            found = int(np.asarray(file.attrs["format"])) if known else 0
+            is_log = file.attrs.get("kind") == b"mpmjax fit log"
+            layout = int(np.asarray(file.attrs["format"])) if is_log else 0
             whole = zlib.crc32(data[:-4]) == int.from_bytes(data[-4:])
-            require(whole or found != _FORMAT, "it is not what was written")
+            require(whole or layout != _FORMAT, "it is not what was written")
             datasets: list[Any] = []
             file.visititems(lambda _, item: datasets.append(item) if isinstance(item, h5py.Dataset) else None)
             arrays = {item.name.lstrip("/"): np.asarray(item[()]) for item in datasets if whole}
-        theirs = json.loads(arrays["problem"].tobytes()) if found == _FORMAT else {}
+        theirs = json.loads(arrays["problem"].tobytes()) if layout == _FORMAT else {}
     except (OSError, KeyError, ValueError, RuntimeError, MemoryError) as error:
         raise ValueError(f"{path} is damaged ({reason(error)}): begin the fit anew with another log.") from None
-    require(known, f"{path} is not the log of a fit: check its name.")
-    require(found == _FORMAT, f"{path} is a log of format {found}, this mpmjax reads {_FORMAT}: begin the fit anew.")
+    require(is_log, f"{path} is not the log of a fit: check its name.")
+    require(layout == _FORMAT, f"{path} is a log of format {layout}, this mpmjax reads {_FORMAT}: begin the fit anew.")
     _require_same(path, text, theirs)
     try:
         return _rounds(arrays, problem, optimiser, z)
@@ -212,35 +207,24 @@ def _rounds(
     places = arrays["coordinates"]
     rounds = []
     for number in range(int(rows["round"][-1]) + 1 if len(rows) else 0):
-        own = np.flatnonzero(rows["round"] == number)
+        at = np.flatnonzero(rows["round"] == number)
         history = tuple(
-            Iteration(
-                int(rows["number"][k]),
-                float(rows["cost"][k]),
-                float(rows["gradient"][k]),
-                bool(rows["accepted"][k]),
-                places[k],
-            )
-            for k in own
+            Iteration(*rows[["number", "cost", "gradient", "accepted"]][k].item(), places[k])  # pyright: ignore[reportCallIssue]
+            for k in at
         )
         sigmas = tuple(jnp.asarray(arrays[f"noise/{k}"][number]) for k in range(len(problem.observations)))
-        seen = Evaluation(
-            **{
-                name: jnp.asarray(a)
-                for name in Evaluation._fields
-                if (a := arrays.get(f"resume/seen/{name}")) is not None
-            }
-        )
-        standing = Standing(jnp.asarray(places[own[-1]]), None, seen, history)
-        rounds.append(_Round(sigmas, standing, tuple(rows["seconds"][own].tolist())))
+        names = [name for name in Evaluation._fields if f"resume/seen/{name}" in arrays]
+        seen = Evaluation(**{name: jnp.asarray(arrays[f"resume/seen/{name}"]) for name in names})
+        state = SearchState(jnp.asarray(places[at[-1]]), None, seen, history)
+        rounds.append(_Round(sigmas, state, tuple(rows["seconds"][at].tolist())))
     if rounds:
         last = rounds[-1]
         like = eqx.filter_eval_shape(begin, problem, optimiser, z.astype(float), last.sigmas)
         numbers, rest = eqx.partition(like, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
         leaves, shape = jax.tree.flatten(numbers)
-        found = [_like(leaf, arrays[f"resume/state/{k}"]) for k, leaf in enumerate(leaves)]
-        state = eqx.combine(jax.tree.unflatten(shape, found), rest)
-        rounds[-1] = last._replace(standing=last.standing._replace(state=state))
+        read = [_like(leaf, arrays[f"resume/state/{k}"]) for k, leaf in enumerate(leaves)]
+        inner = eqx.combine(jax.tree.unflatten(shape, read), rest)
+        rounds[-1] = last._replace(search=last.search._replace(inner=inner))
     return rounds
 
 

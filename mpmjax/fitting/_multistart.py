@@ -1,31 +1,26 @@
-"""Fits from many starting points, and the minima that they find."""
+"""Fits from many starting points, and the minima that they lead to."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Int, Scalar
 from mpmjax.checks import checked, require_between, require_whole, warn
-from mpmjax.fitting._batch import Member, Problems, batch_size, costs_at, search_many
-from mpmjax.fitting._choice import chosen_optimiser
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._fit import explain, fit, require_influence
-from mpmjax.fitting._linkage import linked
+from mpmjax.fitting._fit import chosen_optimiser, fit, require_influence
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._result import Estimate, FitResult
-from mpmjax.fitting._search import Minimum
-from mpmjax.fitting._starting_points import starting_points, unit_points
+from mpmjax.fitting._problem import SHOWN, FitProblem
+from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, restarted, table
+from mpmjax.fitting._search import Member, Minimum, Problems, batch_size, costs_at, search_many
+from mpmjax.fitting._starting_points import linked, starting_points, unit_points
 
 
 class LocalMinimum(NamedTuple):
-    """A minimum that searches found."""
+    """A minimum at which searches ended."""
 
     values: dict[str, np.ndarray]
     """The value of each parameter, in its shape."""
@@ -37,7 +32,7 @@ class LocalMinimum(NamedTuple):
     """The numbers, from 0, of the points that these searches stand for; the first guess is 0."""
 
 
-class MultistartFit(eqx.Module):
+class MultistartFit(AbstractFit):
     """The best of many fits, and the other minima.
 
     `print(result)` shows a table; `result["E"]` is the estimate of a parameter by the best.
@@ -59,35 +54,42 @@ class MultistartFit(eqx.Module):
     """How many iterations all searches took."""
 
     @property
+    def all(self) -> tuple[Estimate, ...]:
+        return self.best.all
+
+    @property
     def count(self) -> int:
         """Number of points."""
         return len(next(iter(self.starts.values())))
 
-    def __getitem__(self, label: str) -> Estimate:
-        """The estimate of a parameter by the best fit.
-
-        Raises:
-            KeyError: there is none of this name.
-        """
-        return self.best[label]
-
     def __str__(self) -> str:
         """The table of the best fit, then one of the minima."""
-        labels = self.best.problem.labels
-        head = f"{'points':>8} {'searches':>8} {'misfit/σ':>10}  " + "".join(f"{label:>14}" for label in labels[:4])
-        told = f"{self.count} points, {len(self.searched)} searches, {self.iterations} iterations"
-        lines = [str(self.best), "", told, head]
-        for found in self.minima[:_SHOWN]:
-            numbers = np.concatenate([value.reshape(-1) for value in found.values.values()])
-            shown = "".join(f"{number:>14.6g}" for number in numbers[:4])
-            lines.append(f"{len(found.members):>8} {found.searches:>8} {found.misfit:>10.4g}  {shown}")
+        rows = [
+            (f"{len(m.members):>24}", f"{m.searches:>8}", f"{m.misfit:>10.4g}", *value_cells(m.values))
+            for m in self.minima[:_SHOWN]
+        ]
+        head = f"{'points':>24}", "searches", f"{'misfit/σ':>10}", *label_cells(self.best.problem)
+        counts = f"{self.count} points, {len(self.searched)} searches, {self.iterations} iterations"
+        lines = [str(self.best), "", counts, *table(head, *rows)]
         if len(self.minima) > _SHOWN:
             lines.append(f"and {len(self.minima) - _SHOWN} minima with a larger misfit.")
         if self.unfinished:
             lines.append(f"{len(self.unfinished)} of {self.count} points led to no minimum.")
         if self.failures:
-            lines.append(f"{len(self.failures)} of {self.count} points failed, number {_listed(self.failures)}.")
+            shown = ", ".join(map(str, list(self.failures)[:_SHOWN])) + (", …" if len(self.failures) > _SHOWN else "")
+            lines.append(f"{len(self.failures)} of {self.count} points failed, number {shown}.")
         return "\n".join(lines)
+
+
+def label_cells(problem: FitProblem) -> list[str]:
+    """The heads of columns of the first fitted numbers."""
+    return [f"{label:>13}" for label in problem.labels[:SHOWN]]
+
+
+def value_cells(values: dict[str, np.ndarray]) -> list[str]:
+    """The first fitted numbers, in columns."""
+    numbers = np.concatenate([value.reshape(-1) for value in values.values()])
+    return [f"{number:>13.6g}" for number in numbers[:SHOWN]]
 
 
 @checked
@@ -107,8 +109,8 @@ def fit_multistart(
 ) -> MultistartFit:
     """Look over many points for where fits start: the best minimum, with its errors, and what other minima there are.
 
-        found = mpm.fit_multistart(pull, {"E": ...}, starts=64, ranges={"E": (1e4, 1e7)})
-        print(found)
+        result = mpm.fitting.fit_multistart(pull, {"E": ...}, starts=64, ranges={"E": (1e4, 1e7)})
+        print(result)
 
     The points are the first guess and scrambled Sobol points over the ranges; of a parameter without one, over its
     prior, between its bounds, from a tenth to ten times the first guess of a `Positive`, and one coordinate to each
@@ -151,20 +153,19 @@ def fit_multistart(
     """
     require_whole("starts", starts, 1)
     require_between("fraction", fraction, 0, 1)
-    problem = FitProblem((experiments,) if isinstance(experiments, Experiment) else tuple(experiments), parameters)
+    problem = FitProblem(experiments, parameters)
     optimiser = chosen_optimiser(problem) if optimiser is None else optimiser
     shares = unit_points(starts - 1, problem.size, require_whole("seed", seed, 0))
     points = starting_points(problem, shares, dict(ranges or {}))
-    sigmas = problem.first_sigmas
-    size = batch_size(problem, batch, starts)
+    sigmas, size = problem.first_sigmas, batch_size(problem, batch, starts)
     look = fraction < 1
     costs = costs_at(problem, points, sigmas, size, _teller(progress, "simulations")) if look else np.zeros(starts)
     failures = {int(k): _FAILS for k in np.flatnonzero(~np.isfinite(costs))}
     together = partial(
         search_many,
-        Problems.of([problem], shared=True),
+        Problems.of([problem]),
         optimiser,
-        sigmas=Problems.of([sigmas], shared=True),
+        sigmas=Problems.of([sigmas]),
         batch=size,
         joining=_JOINED,
     )
@@ -172,23 +173,28 @@ def fit_multistart(
     failures |= {k: m.failure for k, m in members.items() if m.minimum is None}
     groups = _grouped(problem, _ends(members, stands))
     if not groups:
-        explain(problem, jnp.zeros(problem.size, problem.dtype))
-        raise ValueError(f"No search of {len(members)} came to a minimum: {failures.get(0, 'raise max_steps')}.")
+        failure = f"No search of {len(members)} came to a minimum: {failures.get(0, 'raise max_steps')}."
+        problem.explain(jnp.zeros(problem.size, problem.dtype), failure)
     groups, further = _searched_on(problem, groups, together)
-    minima = tuple(_local_minimum(problem, found, numbers, len(members.keys() & numbers)) for found, numbers in groups)
-    restarted = {name: replace(p, start=minima[0].values[name]) for name, p in parameters.items()}
-    best = fit(experiments, restarted, report=report, level=level, optimiser=optimiser, progress=progress)
+    minima = tuple(
+        LocalMinimum(
+            problem.by_name(end.z), problem.misfit(end.cost), len(members.keys() & numbers), tuple(sorted(numbers))
+        )
+        for end, numbers in groups
+    )
+    start = restarted(parameters, minima[0].values)
+    best = fit(experiments, start, report=report, level=level, optimiser=optimiser, progress=progress)
     ended = {k for _, numbers in groups for k in numbers}
     if minima[0].searches == 1 and len(ended & members.keys()) > 1:
         warn(
             f"The best minimum was found by one search of {len(members)}: there may be a better one. Take more starts, "
             "a larger fraction, or narrower ranges."
         )
-    values = [problem.values(jnp.asarray(point, problem.dtype)) for point in points]
+    values = [problem.by_name(jnp.asarray(point, problem.dtype)) for point in points]
     return MultistartFit(
         best=best,
         minima=minima,
-        starts={name: np.stack([v[k] for v in values]) for k, name in enumerate(problem.names)},
+        starts={name: np.stack([v[name] for v in values]) for name in problem.names},
         searched=tuple(sorted(members)),
         failures=dict(sorted(failures.items())),
         unfinished=tuple(k for k in range(starts) if k not in ended and k not in failures),
@@ -209,12 +215,15 @@ def _searched(
     """Searches from the points that stand for the others, until each point is stood for by one that came to a minimum.
 
     Returns:
-        the searches by the numbers of their points, and for each point the number of the one that stands for it.
+        the searches by the numbers of their points, and for each point the number of the one that stands for it; -1
+        where its cost is not finite.
     """
     members: dict[int, Member] = {}
     costs = costs.copy()
     while True:
-        stands = _stands(shares, costs, fraction)
+        # The first guess, which is none of the cube's points, stands for itself.
+        others = linked(shares, costs[1:], fraction)
+        stands = np.concatenate([[0 if np.isfinite(costs[0]) else -1], np.where(others < 0, -1, others + 1)])
         chosen = sorted(set(stands.tolist()) - {-1, *members}, key=lambda k: (k > 0, costs[k]))
         if not chosen:
             return members, stands
@@ -223,10 +232,10 @@ def _searched(
             if chosen[number] == 0:
                 require_influence(problem, sigmas, seen)
 
-        found = together(points[chosen], settling=_SETTLED, progress=_teller(progress, "searches"), begun=begun)
-        joined = [None if m.joined is None else chosen[m.joined] for m in found]
-        members |= {k: m._replace(joined=end) for k, m, end in zip(chosen, found, joined, strict=True)}
-        if any(m.interrupted for m in found):
+        outcomes = together(points[chosen], settling=_SETTLED, progress=_teller(progress, "searches"), begun=begun)
+        joined = [None if m.joined is None else chosen[m.joined] for m in outcomes]
+        members |= {k: m._replace(joined=end) for k, m, end in zip(chosen, outcomes, joined, strict=True)}
+        if any(m.interrupted for m in outcomes):
             return members, stands
         costs[[k for k in chosen if _end(members, k) is None]] = np.nan
 
@@ -235,8 +244,8 @@ def _searched_on(
     problem: FitProblem, groups: list[tuple[Minimum, list[int]]], together: Callable[..., tuple[Member, ...]]
 ) -> tuple[list[tuple[Minimum, list[int]]], tuple[Member, ...]]:
     """The minima after searches from those near to the best one, and these searches."""
-    near = sum(_cost(found) <= _NEAR_BEST * _cost(groups[0][0]) for found, _ in groups[:_SHOWN])
-    further = together(np.array([found.z for found, _ in groups[:near]], float))
+    near = sum(end.cost <= _NEAR_BEST * groups[0][0].cost for end, _ in groups[:_SHOWN])
+    further = together(np.array([end.z for end, _ in groups[:near]], float))
     on = [(groups[k][0] if m.minimum is None else m.minimum, groups[k][1]) for k, m in enumerate(further)]
     return _grouped(problem, [*on, *groups[near:]]), further
 
@@ -254,13 +263,6 @@ def _teller(progress: Callable[[str], None] | None, what: str) -> Callable[[int,
     return say
 
 
-def _stands(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "l"], fraction: Scalar) -> Int[np.ndarray, "l"]:
-    """For each point the number of the one that stands for it, and is searched from; -1 where the cost is not known.
-    The first guess, which is none of the cube's points, stands for itself."""
-    others = linked(shares, costs[1:], fraction)
-    return np.concatenate([[0 if np.isfinite(costs[0]) else -1], np.where(others < 0, -1, others + 1)])
-
-
 def _end(members: dict[int, Member], k: int) -> int | None:
     """The number of the search at whose minimum a search ended; None if it came to none."""
     while (joined := members[k].joined) is not None:
@@ -272,54 +274,34 @@ def _end(members: dict[int, Member], k: int) -> int | None:
 def _ends(members: dict[int, Member], stands: Int[np.ndarray, "k"]) -> list[tuple[Minimum, list[int]]]:
     """Where searches ended, with the numbers of the points that those stand for."""
     numbers: dict[int, list[int]] = {}
-    for k, own in enumerate(stands.tolist()):
-        end = None if own < 0 else _end(members, own)
+    for k, by in enumerate(stands.tolist()):
+        end = None if by < 0 else _end(members, by)
         if end is not None:
             numbers.setdefault(end, []).append(k)
-    found = [(members[end].minimum, own) for end, own in numbers.items()]
-    return [(minimum, own) for minimum, own in found if minimum is not None]
+    ends = [(members[end].minimum, points) for end, points in numbers.items()]
+    return [(minimum, points) for minimum, points in ends if minimum is not None]
 
 
 def _grouped(problem: FitProblem, ends: list[tuple[Minimum, list[int]]]) -> list[tuple[Minimum, list[int]]]:
     """The distinct minima, the lowest first, with the numbers of the points that lead there."""
     groups: list[tuple[Minimum, list[int]]] = []
     least = 1.0 if all(problem.noise_is_given) else 0.0
-    for minimum, own in sorted(ends, key=lambda pair: _cost(pair[0])):
+    for minimum, points in sorted(ends, key=lambda pair: pair[0].cost):
         for there, numbers in groups:
             if _same(np.asarray(minimum.z - there.z, float), there, least):
-                numbers += own
+                numbers += points
                 break
         else:
-            groups.append((minimum, list(own)))
+            groups.append((minimum, list(points)))
     return groups
 
 
 def _same(change: np.ndarray, better: Minimum, least: float) -> bool:
-    """Whether an end of a search, so far from a better one, is the same minimum.
-
-    Args:
-        change: the difference of their coordinates.
-        better: the better one.
-        least: the least mean square of its residuals.
-    """
+    """Whether an end of a search is the same minimum as a better one: `change` is the difference of their coordinates,
+    `least` the least mean square of residuals."""
     r, J = np.asarray(better.r, float), np.asarray(better.J, float)
     variance = max(least, float((r**2).sum()) / max(np.count_nonzero(r) - len(change), 1))
     return bool((np.abs(change) <= _NEAR).all() or ((J @ change) ** 2).sum() <= len(change) * variance)
-
-
-def _cost(minimum: Minimum) -> float:
-    return minimum.history[-1].cost
-
-
-def _local_minimum(problem: FitProblem, found: Minimum, members: list[int], searches: int) -> LocalMinimum:
-    values = {n: np.asarray(v) for n, v in zip(problem.names, problem.values(found.z), strict=True)}
-    numbers = sum(o.count for o in problem.observations)
-    return LocalMinimum(values, float(np.sqrt(2 * _cost(found) / numbers)), searches, tuple(sorted(members)))
-
-
-def _listed(numbers: Any) -> str:
-    shown = [str(number) for number in list(numbers)[:_SHOWN]]
-    return ", ".join(shown) + (", …" if len(numbers) > _SHOWN else "")
 
 
 _FAILS = "the simulation fails there, or does not reach the data"

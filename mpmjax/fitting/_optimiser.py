@@ -1,18 +1,16 @@
-"""What an optimiser of a fit is."""
+"""Optimisers: methods that search the least sum of squares."""
 
 import abc
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float
+from mpmjax._types import Array, Float
 from mpmjax.fitting._problem import Coordinates, FitProblem
 
 
 class Evaluation(NamedTuple):
-    """What an optimiser knows of the place where it is."""
+    """Cost and derivatives at the place where an optimiser is."""
 
     cost: Float[Array, ""]
     """½ Σ r²; NaN where a simulation failed."""
@@ -79,8 +77,3 @@ class AbstractOptimiser(eqx.Module):
         """Whether the search goes no further, and is not known to be at a minimum."""
         del state
         return False
-
-
-def where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
-    """One of two pytrees."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

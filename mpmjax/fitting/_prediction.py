@@ -52,7 +52,7 @@ def predict(
             run = mpm.simulate(heavier(e.scene), e.particles, t1=1.0, dt=e.dt, adjoint=diffrax.ForwardMode())
             return run.final.x[:, 1].max()
 
-        mpm.predict(result, height)
+        mpm.fitting.predict(result, height)
 
     The error is by the delta method: √(g·C g) of each number, g its derivative by the search's coordinates (forward
     mode) and C their covariance. The band reaches as many errors to each side as a normal distribution, or Student's

@@ -1,10 +1,10 @@
 """A fit as a problem of least squares: residuals of all observations as a function of one vector."""
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import diffrax
 import equinox as eqx
@@ -35,11 +35,12 @@ class FitProblem(eqx.Module):
 
     def __init__(
         self,
-        experiments: tuple[Experiment, ...],
+        experiments: Experiment | Sequence[Experiment],
         parameters: Mapping[str, AbstractParameter],
         memory: int = 2**28,
     ):
         self.memory = require_whole("memory [B]", memory, 1)
+        experiments = (experiments,) if isinstance(experiments, Experiment) else tuple(experiments)
         require(len(experiments) > 0, "A fit needs an experiment at least.")
         require(len(parameters) > 0, "A fit needs a parameter at least.")
         dtypes = sorted({str(e.dtype) for e in experiments})
@@ -47,29 +48,26 @@ class FitProblem(eqx.Module):
         self.experiments, self.names, self.parameters = experiments, tuple(parameters), tuple(parameters.values())
         self.starts = tuple(self._start(name, p) for name, p in parameters.items())
         self.parameters = tuple(replace(p, start=start) for p, start in zip(self.parameters, self.starts, strict=True))
-        points = sum(o.count for o in self.observations)
-        each = zip(self.starts, self.parameters, strict=True)
-        known = sum(parameter.prior.fixes(start.shape) for start, parameter in each if parameter.prior is not None)
+        points, freedom = self.points, self.points + self.fixed_by_priors - self.size
         require(
-            points + known >= self.size,
+            freedom >= 0,
             f"{points} measured numbers cannot fix {self.size} parameters: measure more, give priors, or fit fewer.",
         )
-        given = any(o.sigma is not None for o in self.observations)
         require(
-            given or points + known > self.size,
+            any(self.noise_is_given) or freedom > 0,
             f"{points} measured numbers fix {self.size} parameters and leave none to estimate the noise: give sigma.",
         )
 
     def _start(self, name: str, parameter: AbstractParameter) -> Array:
-        own = range(len(self.experiments)) if parameter.only is None else parameter.only
-        unknown = [k for k in own if not 0 <= k < len(self.experiments)]
+        numbers = range(len(self.experiments)) if parameter.only is None else parameter.only
+        unknown = [k for k in numbers if not 0 <= k < len(self.experiments)]
         require(not unknown, f"The parameter {name!r} is only of experiments {unknown}, which there are not.")
-        require(len(own) > 0, f"The parameter {name!r} is of no experiment: only must name one at least.")
-        start = _first_guess(name, parameter, self.experiments[own[0]])
+        require(len(numbers) > 0, f"The parameter {name!r} is of no experiment: only must name one at least.")
+        start = _first_guess(name, parameter, self.experiments[numbers[0]])
         parameter.check(name, np.asarray(start))
         if parameter.prior is not None:
             parameter.prior.check(name, start.shape)
-        for k in own:
+        for k in numbers:
             parameter.check_experiment(name, self.experiments[k])
         return start
 
@@ -85,12 +83,23 @@ class FitProblem(eqx.Module):
 
     @property
     def observations(self) -> tuple[AbstractObservation, ...]:
-        """Those of all experiments, in their order."""
+        """The observations of all experiments, in their order."""
         return tuple(o for e in self.experiments for o in e.observations)
 
     @property
+    def points(self) -> int:
+        """How many numbers were measured."""
+        return sum(o.count for o in self.observations)
+
+    @property
+    def fixed_by_priors(self) -> int:
+        """How many numbers the priors fix by themselves."""
+        each = zip(self.starts, self.parameters, strict=True)
+        return sum(parameter.prior.fixes(start.shape) for start, parameter in each if parameter.prior is not None)
+
+    @property
     def noise_is_given(self) -> tuple[bool, ...]:
-        """Of each observation, whether its noise is given, and not to be estimated."""
+        """Whether the noise of each observation is given, and not to be estimated."""
         return tuple(o.sigma is not None for o in self.observations)
 
     @property
@@ -109,13 +118,13 @@ class FitProblem(eqx.Module):
 
     @property
     def scales_alike(self) -> bool:
-        """Whether another noise would not move the minimum: of one observation, squares alone and no prior."""
+        """Whether another noise would not move the minimum: there is one observation, squares alone and no prior."""
         (first, *others), priors = self.observations, [p for p in self.parameters if p.prior is not None]
         return not others and not priors and first.robust is None
 
     @property
     def logarithmic(self) -> tuple[bool, ...]:
-        """Of each coordinate, whether it is the logarithm of its value."""
+        """Whether each coordinate is the logarithm of its value."""
         each = zip(self.parameters, self.starts, strict=True)
         return tuple(parameter.logarithmic for parameter, start in each for _ in range(start.size))
 
@@ -126,16 +135,18 @@ class FitProblem(eqx.Module):
         return jnp.sqrt(sum((jnp.nansum(ratio**2) for ratio in ratios), jnp.zeros((), self.dtype)))
 
     def rounding(self, cost: Array, sigmas: tuple[Array, ...]) -> Array:
-        """The part of ½ Σ r² that may be rounding: that of the data's size, ε √Σ (data/σ)², in each residual [-]."""
+        """The part of ½ Σ r² that may be rounding: each residual has that of the data's size, ε √Σ (data/σ)² [-]."""
         noise = float(jnp.finfo(self.dtype).eps) * self.size_of_data(sigmas).astype(cost.dtype)
         return jnp.sqrt(2 * cost) * noise + noise**2 + float(jnp.finfo(cost.dtype).eps) * cost
 
     def mean_square(self, cost: Array) -> Array:
         """Σ r²/(m − n) of m numbers, those of priors among them, and n coordinates."""
         points = sum((jnp.isfinite(o.data).sum() for o in self.observations), jnp.zeros((), int))
-        each = zip(self.starts, self.parameters, strict=True)
-        known = sum(parameter.prior.fixes(start.shape) for start, parameter in each if parameter.prior is not None)
-        return 2 * cost / jnp.maximum(points + known - self.size, 1).astype(cost.dtype)
+        return 2 * cost / jnp.maximum(points + self.fixed_by_priors - self.size, 1).astype(cost.dtype)
+
+    def misfit(self, cost: float) -> float:
+        """Root mean square of the residuals of the measured numbers, in units of σ, or of the size of the data."""
+        return float(np.sqrt(2 * cost / self.points))
 
     @property
     def measured(self) -> int:
@@ -156,16 +167,26 @@ class FitProblem(eqx.Module):
     def values(self, z: Coordinates) -> tuple[Array, ...]:
         """The value of each parameter."""
         each = zip(self.parameters, self.starts, self.coordinates(z), strict=True)
-        return tuple(parameter.value(start, own) for parameter, start, own in each)
+        return tuple(parameter.value(start, part) for parameter, start, part in each)
+
+    def by_name(self, z: Coordinates) -> dict[str, np.ndarray]:
+        """The value of each parameter by its name, in its shape."""
+        return {name: np.asarray(value) for name, value in zip(self.names, self.values(z), strict=True)}
 
     def numbers(self, z: Coordinates) -> Float[Array, "n"]:
         """The values of all parameters, one after the other."""
         return jnp.concatenate([value.reshape(-1) for value in self.values(z)])
 
+    def shown(self, z: np.ndarray | Coordinates) -> str:
+        """The first values with their labels, in a line."""
+        numbers = self.numbers(jnp.asarray(z, self.dtype))
+        shown = ", ".join(f"{label} {number:.5g}" for label, number in zip(self.labels[:SHOWN], numbers, strict=False))
+        return shown + (", …" if self.size > SHOWN else "")
+
     def room(self, z: Coordinates) -> Float[Array, "2 n"]:
         """How far each value can fall and rise until its bounds, over its derivative by the coordinate [-]."""
         each = zip(self.parameters, self.starts, self.coordinates(z), strict=True)
-        down, up = zip(*(parameter.room(start, own) for parameter, start, own in each), strict=True)
+        down, up = zip(*(parameter.room(start, part) for parameter, start, part in each), strict=True)
         return jnp.stack([jnp.concatenate([a.reshape(-1) for a in side]) for side in (down, up)])
 
     def at(self, z: Coordinates) -> tuple[Experiment, ...]:
@@ -180,11 +201,11 @@ class FitProblem(eqx.Module):
             z: the coordinates.
             number: the experiment of which it has the parameters; None for those that belong to all experiments.
         """
-        given = experiment.particles
+        before = experiment.particles
         for parameter, value in zip(self.parameters, self.values(z), strict=True):
             if parameter.only is None or number in parameter.only:
                 experiment = parameter.put(experiment, value)
-        return experiment.with_gradient_since(given)
+        return experiment.with_gradient_since(before)
 
     def residuals(self, z: Coordinates, sigmas: tuple[Array, ...], adjoint: Any) -> tuple[Array, Array]:
         """The residuals of all observations, then of priors [-], shape (m,), NaN where a simulation met a fault or does
@@ -222,6 +243,18 @@ class FitProblem(eqx.Module):
         (value, r), slope = jax.value_and_grad(cost, has_aux=True)(z)
         return r, value, slope
 
+    def explain(
+        self, z: Coordinates, failure: str = "What is observed of the simulation at the first guess is not finite."
+    ) -> NoReturn:
+        """Say why a fit fails at z: by the simulation, else by `failure`.
+
+        Raises:
+            SimulationError, ValueError: always, see `Experiment.explain`.
+        """
+        for experiment in self.at(z):
+            experiment.explain()
+        raise ValueError(failure)
+
     def jacobian(
         self, z: Coordinates, sigmas: tuple[Array, ...], mode: Literal["forward", "reverse"] | None = None
     ) -> tuple[Array, Array]:
@@ -247,7 +280,7 @@ class FitProblem(eqx.Module):
         return r, jnp.where((unsolved != 0).any(), jnp.nan, columns.T)
 
     def _jacobian_by_rows(self, z: Coordinates, sigmas: tuple[Array, ...]) -> tuple[Array, Array]:
-        """The same by a pass back for each measured number; priors need no simulation."""
+        """`jacobian` by a pass back for each measured number; priors need no simulation."""
         r, pull, _ = jax.vjp(lambda z: self.residuals(z, sigmas, None), z, has_aux=True)
         _, (rows,) = in_batches(
             lambda unit: ((), pull(unit)), jnp.eye(self.measured, len(r), dtype=r.dtype), self.at_once
@@ -291,16 +324,8 @@ def _first_guess(name: str, parameter: AbstractParameter, experiment: Experiment
 
 
 def in_batches(function: Callable[[Array], tuple[Any, Any]], units: Array, at_once: int) -> tuple[Any, Any]:
-    """What a function returns for each row of `units`, `at_once` of them in one batch, the batches one after the other.
-
-    Args:
-        function: returns a pair of pytrees: what is the same for all rows, and what is the row's own.
-        units: shape (k, ...).
-        at_once: size of a batch.
-
-    Returns:
-        what is the same, and what is each row's own with a leading axis of k.
-    """
+    """A function of each row of `units`, shape (k, ...), by batches of `at_once` rows. It returns two pytrees: one
+    that is the same for all rows, and one of each row, which gets a leading axis k."""
     count = len(units)
     batches = -(-count // at_once)
     size = -(-count // batches)
@@ -308,14 +333,14 @@ def in_batches(function: Callable[[Array], tuple[Any, Any]], units: Array, at_on
     def batch(rows: Array) -> tuple[Any, Any]:
         if size > 1:
             return jax.vmap(function, out_axes=(None, 0))(rows)
-        once, own = function(rows[0])  # a third less to compile than a batch of one
-        return once, jax.tree.map(lambda a: a[None], own)
+        once, each = function(rows[0])  # a third less to compile than a batch of one
+        return once, jax.tree.map(lambda a: a[None], each)
 
     if batches == 1:
         return batch(units)
     padded = jnp.concatenate([units, jnp.zeros((batches * size - count, *units.shape[1:]), units.dtype)])
-    once, own = jax.lax.map(batch, padded.reshape(batches, size, *units.shape[1:]))
-    return jax.tree.map(lambda a: a[0], once), jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:count], own)
+    once, each = jax.lax.map(batch, padded.reshape(batches, size, *units.shape[1:]))
+    return jax.tree.map(lambda a: a[0], once), jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:count], each)
 
 
 def _bytes(tree: Any) -> int:
@@ -324,7 +349,9 @@ def _bytes(tree: Any) -> int:
     return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in leaves)
 
 
+SHOWN = 4
+"""Parameters that a line has room for."""
 ROW_COST = 1.2
-"""What a row of the Jacobian by reverse mode costs over a column by forward mode (benchmarks/fit_cost.py)."""
+"""Cost of a row of the Jacobian by reverse mode, over that of a column by forward mode (benchmarks/fit_cost.py)."""
 _COPIES = 16
 """Memory that a tangent takes, in sizes of the particles' (benchmarks/fit_cost.py)."""

@@ -1,4 +1,4 @@
-"""What is fitted, in words, so that two fits can be told apart."""
+"""Description of a fit in words, by which two fits can be told apart."""
 
 import enum
 import hashlib
@@ -21,22 +21,22 @@ from mpmjax.fitting._problem import FitProblem
 _MOST = 8
 """Numbers of an array that are written out."""
 _FREE = ("optimiser.max_steps",)
-"""What may differ in a fit that is continued: it may go on for longer."""
+"""Choices that may differ in a fit that is continued: it may go on for longer."""
 
 
 def described(problem: FitProblem, optimiser: AbstractOptimiser) -> dict[str, str]:
     """Every number, choice and function of a fit by its dotted path.
 
-    Arrays stand as a digest, functions as their name and a digest of their code, and what a parameter names as the
+    Arrays stand as a digest, functions as their name and a digest of their code, and the `where` of a parameter as the
     numbers that change with it.
     """
-    found = dict(_texts(optimiser, "optimiser"))
+    texts = dict(_texts(optimiser, "optimiser"))
     for k, experiment in enumerate(problem.experiments):
-        found |= dict(_texts(experiment, f"experiments.{k}"))
+        texts |= dict(_texts(experiment, f"experiments.{k}"))
     for name, parameter, start in zip(problem.names, problem.parameters, problem.starts, strict=True):
-        found[f"parameters.{name}"] = _changed(problem, parameter, start)
-        found |= dict(_texts(parameter, f"parameters.{name}"))
-    return {name: text for name, text in found.items() if name not in _FREE}
+        texts[f"parameters.{name}"] = _changed(problem, parameter, start)
+        texts |= dict(_texts(parameter, f"parameters.{name}"))
+    return {name: text for name, text in texts.items() if name not in _FREE}
 
 
 def _changed(problem: FitProblem, parameter: AbstractParameter, start: Any) -> str:
@@ -98,7 +98,7 @@ def _array(data: np.ndarray) -> str:
 
 
 def _code(code: CodeType) -> bytes:
-    """What a function does, without the place where it stands."""
+    """The code of a function, without the place where it stands."""
     constants = [_code(c) if isinstance(c, CodeType) else repr(_ordered(c)).encode() for c in code.co_consts]
     return b"\0".join([code.co_code, repr(code.co_names).encode(), *constants])
 

@@ -1,19 +1,18 @@
 """Profile likelihoods: intervals that need no straight line."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Scalar
+from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import checked, require, require_positive, require_whole, warn
-from mpmjax.fitting._estimates import intervals
+from mpmjax.fitting._fit import checked_level
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._problem import Coordinates, FitProblem
-from mpmjax.fitting._restricted import RestrictedProblem
-from mpmjax.fitting._result import FitResult
+from mpmjax.fitting._result import FitResult, intervals
 from mpmjax.fitting._search import NoDerivativeError, search
 from mpmjax.fitting._uncertainty import quantile
 
@@ -34,6 +33,7 @@ class Profile(eqx.Module):
     numbers: np.ndarray
     """All fitted numbers along it, one a column in the order of `labels`, shape (p, n)."""
     labels: tuple[str, ...]
+    """Names of the fitted numbers."""
     estimate: float
     """The value of the fit."""
     symmetric: tuple[float, float]
@@ -88,7 +88,7 @@ def profile(
 ) -> Profile:
     """The profile likelihood of a fitted number and the interval that follows from it.
 
-        stiffness = mpm.profile(result, "E")
+        stiffness = mpm.fitting.profile(result, "E")
         print(stiffness)
         lower, upper = stiffness.interval
 
@@ -124,8 +124,7 @@ def profile(
         label in problem.labels,
         f"A profile is of a fitted number: {', '.join(problem.labels)}. Got {label!r}.",
     )
-    level = result.level if level is None else float(level)
-    require((level > 0) & (level < 1), f"level must lie between 0 and 1, got {level}.")
+    level = checked_level(result.level if level is None else level)
     require_whole("profile's points", points, 1)
     require_positive("profile's rtol", rtol)
     at = problem.labels.index(label)
@@ -133,9 +132,9 @@ def profile(
     walk = _Walk(result, at, result.optimiser if optimiser is None else optimiser, progress)
     reach = float(quantile(level, freedom))
     ends = [walk.end(side, reach, points, float(rtol)) for side in (-1, 1)]
-    found = sorted(walk.known, key=lambda point: point.z[at])
-    numbers = np.stack([walk.numbers(point.z) for point in found])
-    values = [_value(problem, result.z, at, end.at) for end in ends]
+    path = sorted(walk.visited, key=lambda point: point.z[at])
+    numbers = np.stack([walk.numbers(point.z) for point in path])
+    values = [walk.value(end.at) for end in ends]
     warnings = tuple(walk.warnings(ends, reach))
     for text in warnings:
         warn(text)
@@ -145,7 +144,7 @@ def profile(
         label=label,
         unit=estimate.unit,
         values=numbers[:, at],
-        statistic=np.array([point.growth for point in found]),
+        statistic=np.array([point.growth for point in path]),
         numbers=numbers,
         labels=problem.labels,
         estimate=estimate.value,
@@ -156,6 +155,42 @@ def profile(
         level=level,
         warnings=warnings,
     )
+
+
+class RestrictedProblem(FitProblem):
+    """A problem on a plane of its coordinates, z = origin + basis y, as a function of y. Both are arrays: another plane
+    of as many dimensions does not compile anew."""
+
+    whole: FitProblem = eqx.field(kw_only=True)
+    origin: Coordinates = eqx.field(kw_only=True)
+    basis: Float[Array, "n f"] = eqx.field(kw_only=True)
+
+    def __init__(self, whole: FitProblem, origin: Coordinates, basis: Float[Array, "n f"]):
+        self.experiments, self.names = whole.experiments, whole.names
+        self.parameters, self.starts, self.memory = whole.parameters, whole.starts, whole.memory
+        self.whole, self.origin, self.basis = whole, origin, basis
+
+    @property
+    def size(self) -> int:
+        return self.basis.shape[1]
+
+    @property
+    def dtype(self) -> Any:
+        return self.whole.dtype
+
+    def place(self, y: Float[Array, "f"]) -> Float[Array, "n"]:
+        """The coordinates of the whole problem."""
+        return self.origin + self.basis @ y
+
+    def coordinates(self, z: Coordinates) -> tuple[Array, ...]:
+        return self.whole.coordinates(self.place(z))
+
+    def room(self, z: Coordinates) -> Float[Array, "2 f"]:
+        """On planes of some of the coordinates."""
+        return jnp.where(self.basis.T != 0, self.whole.room(self.place(z))[:, None], jnp.inf).min(axis=2)
+
+    def residuals(self, z: Coordinates, sigmas: tuple[Array, ...], adjoint: Any) -> tuple[Array, Array]:
+        return self.whole.residuals(self.place(z), sigmas, adjoint)
 
 
 class _Point(NamedTuple):
@@ -186,7 +221,7 @@ class _End(NamedTuple):
 
 
 class _Walk:
-    """A walk along a profile, which knows where it has been."""
+    """A walk along a profile, which remembers the points that it visited."""
 
     def __init__(
         self, result: FitResult, at: int, optimiser: AbstractOptimiser, progress: Callable[[str], None] | None
@@ -197,7 +232,7 @@ class _Walk:
         z = np.asarray(result.z, float)
         self.least = self._misfit(z)
         self.start = _Point(z, 0.0)
-        self.known = [self.start]
+        self.visited = [self.start]
         self.rate = _direction(result, at)
         self.error = float(result.uncertainty.error[at])
         self.pace = self.error if np.isfinite(self.error) else min(float(result.uncertainty.alone[at]), 1.0)
@@ -224,31 +259,25 @@ class _Walk:
             grown = point.root - last.root
             longest = _FASTER * (wanted - gone) * points / reach
             pace = min((wanted - gone) / grown, longest) if grown > 0 else longest
-            still = self._moved(point, last) <= _STILL * (wanted - gone) * self._moved(self.start, None)
+            value, before_it, estimate = (self.numbers(p.z)[self.at] for p in (point, last, self.start))
+            still = abs(value - before_it) <= _STILL * (wanted - gone) * abs(estimate)
             before, last = last, point
             if wanted >= farthest or still:
                 break
         fault = self.start.z[self.at] + side * nearest_fault
         return _End(side * np.inf, last, float(fault) if np.isfinite(fault) else None)
 
-    def _moved(self, point: _Point, other: _Point | None) -> float:
-        """How far the number itself is from another one, or from zero."""
-        from_ = 0.0 if other is None else self.numbers(other.z)[self.at]
-        return float(abs(self.numbers(point.z)[self.at] - from_))
-
     def _distance(self, point: _Point) -> float:
-        """Of a point's coordinate from the estimate's."""
+        """Distance of a point's coordinate from the estimate's."""
         return float(abs(point.z[self.at] - self.start.z[self.at]))
 
     def visit(self, place: float, last: _Point, before: _Point) -> _Point | None:
-        """The least misfit with the coordinate held at a place; None where the simulation fails.
-
-        Args:
-            place: the coordinate.
-            last: a point from which the others are foretold,
-            before: and another, for the line through both.
-        """
-        guess = self._foretold(place, last, before)
+        """The least misfit with the coordinate held at a place; None where the simulation fails. The search of the
+        others starts on the line through two points, or along the direction of the covariance from the fit."""
+        covered = last.z[self.at] - before.z[self.at]
+        rate = self.rate if covered == 0 else (last.z - before.z) / covered
+        guess = last.z + rate * (place - last.z[self.at])
+        guess[self.at] = place
         try:
             z, misfit = self._refitted(guess)
         except NoDerivativeError:
@@ -256,23 +285,28 @@ class _Walk:
         if not np.isfinite(misfit):
             return None
         point = _Point(z, misfit - self.least)
-        self.known.append(point)
+        self.visited.append(point)
         if self.progress is not None:
-            shown = ", ".join(f"{n} {v:.5g}" for n, v in zip(self.problem.labels[:4], self.numbers(z), strict=False))
-            self.progress(f"profile of {self.label}: Δχ² {point.growth:8.4g}  {shown}")
+            self.progress(f"profile of {self.label}: Δχ² {point.growth:8.4g}  {self.problem.shown(z)}")
         return point
 
     def numbers(self, z: np.ndarray) -> np.ndarray:
         """All fitted numbers at coordinates."""
         return np.asarray(self.problem.numbers(jnp.asarray(z, self.problem.dtype)), float)
 
+    def value(self, place: float) -> float:
+        """The value of the number where its coordinate is at a place, which may be infinite."""
+        z = self.start.z.copy()
+        z[self.at] = place
+        return float(self.numbers(z)[self.at])
+
     def warnings(self, ends: list[_End], reach: float) -> list[str]:
-        """What is to be said of its ends."""
-        said = []
+        """Ends that are no ends of the interval, in words."""
+        texts = []
         for end, where in zip(ends, ("below", "above"), strict=True):
             value = self.numbers(end.last.z)[self.at]
             if end.jump is not None:
-                said.append(
+                texts.append(
                     f"{self.label}: the interval ends {where} at {value:.5g}, where Δχ² jumps from "
                     f"{max(end.last.growth, 0):.2g} to {end.jump:.2g}: the simulation changes abruptly there, and not "
                     "the data end it. See whether its step is stable."
@@ -281,56 +315,46 @@ class _Walk:
                 continue
             beyond = ""
             if end.fault is not None:
-                held = self.start.z.copy()
-                held[self.at] = end.fault
-                beyond = f" Beyond, at {self.numbers(held)[self.at]:.5g}, the simulation fails."
-            said.append(
+                beyond = f" Beyond, at {self.value(end.fault):.5g}, the simulation fails."
+            texts.append(
                 f"{self.label}: the interval is open {where}. At {value:.5g} Δχ² is {max(end.last.growth, 0):.2g}, "
                 f"less than {reach**2:.3g}: the data do not bound it.{beyond}"
             )
-        best = min(self.known, key=lambda point: point.growth)
+        best = min(self.visited, key=lambda point: point.growth)
         if best.growth < -_BETTER:
-            said.append(
+            texts.append(
                 f"{self.label}: the profile found a misfit smaller by {-best.growth:.2g} at "
                 f"{self.numbers(best.z)[self.at]:.5g}: the fit is not at the least one. Fit again from there."
             )
         if self.unsettled:
-            said.append(f"{self.label}: at {self.unsettled} points of the profile the others did not converge.")
-        return said
+            texts.append(f"{self.label}: at {self.unsettled} points of the profile the others did not converge.")
+        return texts
 
     def _crossing(self, below: _Point, above: _Point, reach: float, rtol: float) -> _End:
         """Where √Δχ² is `reach` between two points, by Brent's method. A value at which the simulation fails counts as
         beyond it."""
         from scipy.optimize import root_scalar  # here, since it takes long to import
 
-        visited: dict[float, _Point | None] = {below.z[self.at]: below, above.z[self.at]: above}
+        tried: dict[float, _Point | None] = {below.z[self.at]: below, above.z[self.at]: above}
 
         def excess(place: float) -> float:
-            if place not in visited:
-                visited[place] = self.visit(place, below, above)
-            point = visited[place]
+            if place not in tried:
+                tried[place] = self.visit(place, below, above)
+            point = tried[place]
             return reach if point is None else point.root - reach
 
         within = rtol / 2 * self._distance(above)
-        found = root_scalar(excess, method="brentq", bracket=(below.z[self.at], above.z[self.at]), xtol=within).root
-        apart = {place: excess(place) for place in visited}
-        inner = min((p for p in apart if apart[p] < 0), key=lambda p: abs(p - found))
-        outer = min((p for p in apart if apart[p] >= 0), key=lambda p: abs(p - found))
-        last, next_ = visited[inner], visited[outer]
+        root = root_scalar(excess, method="brentq", bracket=(below.z[self.at], above.z[self.at]), xtol=within).root
+        apart = {place: excess(place) for place in tried}
+        inner = min((p for p in apart if apart[p] < 0), key=lambda p: abs(p - root))
+        outer = min((p for p in apart if apart[p] >= 0), key=lambda p: abs(p - root))
+        last, next_ = tried[inner], tried[outer]
         assert last is not None
         if apart[outer] - apart[inner] < _JUMP * reach or abs(outer - inner) > 4 * within:
-            return _End(float(found), last)
+            return _End(float(root), last)
         if next_ is None:
             return _End(float(np.copysign(np.inf, outer - inner)), last, float(outer))
-        return _End(float(found), last, jump=next_.growth)
-
-    def _foretold(self, place: float, last: _Point, before: _Point) -> np.ndarray:
-        """The coordinates on the line through two points, or along the direction of the covariance from the fit."""
-        covered = last.z[self.at] - before.z[self.at]
-        rate = self.rate if covered == 0 else (last.z - before.z) / covered
-        guess = last.z + rate * (place - last.z[self.at])
-        guess[self.at] = place
-        return guess
+        return _End(float(root), last, jump=next_.growth)
 
     def _refitted(self, guess: np.ndarray) -> tuple[np.ndarray, float]:
         """All coordinates, the others fitted, and the misfit."""
@@ -339,12 +363,12 @@ class _Walk:
         problem = self.problem
         basis = np.delete(np.eye(len(guess)), self.at, axis=1)
         held = RestrictedProblem(problem, jnp.asarray(guess, problem.dtype), jnp.asarray(basis, problem.dtype))
-        found = search(held, self.optimiser, jnp.zeros(basis.shape[1], problem.dtype), self.sigmas)
-        if found.interrupted:
+        minimum = search(held, self.optimiser, jnp.zeros(basis.shape[1], problem.dtype), self.sigmas)
+        if minimum.interrupted:
             raise KeyboardInterrupt
-        if not found.converged and np.isfinite(found.history[-1].cost):
+        if not minimum.converged and np.isfinite(minimum.cost):
             self.unsettled += 1
-        return guess + basis @ np.asarray(found.z, float), float((np.asarray(found.r, float) ** 2).sum())
+        return guess + basis @ np.asarray(minimum.z, float), float((np.asarray(minimum.r, float) ** 2).sum())
 
     def _misfit(self, z: np.ndarray) -> float:
         """Σ r²."""
@@ -360,19 +384,10 @@ def _residuals(problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -
 
 def _direction(result: FitResult, at: int) -> np.ndarray:
     """How the other coordinates follow one that is moved, by the covariance, shape (n,)."""
-    found, unit = result.uncertainty, np.eye(result.problem.size)[at]
-    if found.unseen.shape[1] and np.isinf(found.error[at]):
-        along = found.unseen @ (found.unseen.T @ unit)
-    else:
-        along = found.inverse @ unit
+    errors, unit = result.uncertainty, np.eye(result.problem.size)[at]
+    blind = errors.unseen.shape[1] and np.isinf(errors.error[at])
+    along = errors.unseen @ (errors.unseen.T @ unit) if blind else errors.inverse @ unit
     return along / along[at]
-
-
-def _value(problem: FitProblem, z: np.ndarray, at: int, place: float) -> float:
-    """The value of a number where its coordinate is at a place, which may be infinite."""
-    moved = np.asarray(z, float).copy()
-    moved[at] = place
-    return float(problem.numbers(jnp.asarray(moved, problem.dtype))[at])
 
 
 _FARTHEST = 14.0

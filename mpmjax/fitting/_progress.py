@@ -1,17 +1,13 @@
-"""What is said of a fit while it runs."""
+"""Progress of a fit, in lines."""
 
 import time
 from collections.abc import Callable
 
-import jax.numpy as jnp
 import numpy as np
 
 from mpmjax.fitting._optimiser import AbstractOptimiser
-from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._search import Standing
-
-_SHOWN = 4
-"""Parameters that a line has room for."""
+from mpmjax.fitting._problem import SHOWN, FitProblem
+from mpmjax.fitting._search import SearchState
 
 
 class Progress:
@@ -37,36 +33,30 @@ class Progress:
         if self._say is None:
             return
         labels, problem = self._problem.labels, self._problem
-        named = ", ".join(labels[:_SHOWN]) + (", …" if len(labels) > _SHOWN else "")
-        points = sum(o.count for o in problem.observations)
+        named = ", ".join(labels[:SHOWN]) + (", …" if len(labels) > SHOWN else "")
         after = f" after {done} iterations of the log" if done else ""
         count = f"{problem.size} number{'s' * (problem.size > 1)}"
-        self._say(f"compiling the fit of {count} ({named}) to {points} that were measured{after}")
+        self._say(f"compiling the fit of {count} ({named}) to {problem.points} that were measured{after}")
 
-    def __call__(self, standing: Standing, seconds: float) -> None:
+    def __call__(self, state: SearchState, seconds: float) -> None:
         """Say where the search stands.
 
         Args:
-            standing: after an iteration.
+            state: after an iteration.
             seconds: since the fit began.
         """
-        iteration = standing.history[-1]
+        iteration = state.history[-1]
         if iteration.number == 0:
             self._distances = []
         now = time.perf_counter()
         self._durations.append(now - self._last)
-        self._distances.append(self._optimiser.distance(standing.state, standing.seen))
+        self._distances.append(self._optimiser.distance(state.inner, state.seen))
         self._last = now
         if self._say is None:
             return
-        values = self._problem.numbers(jnp.asarray(iteration.z, self._problem.dtype))
-        shown = ", ".join(
-            f"{label} {value:.5g}" for label, value in zip(self._problem.labels[:_SHOWN], values, strict=False)
-        )
-        more = ", …" if self._problem.size > _SHOWN else ""
         self._say(
             f"{iteration.number:4d}  misfit {2 * iteration.cost:10.4g}  gradient {iteration.gradient:8.2g}  "
-            f"{shown}{more}  {_clock(seconds)}{self._left(len(standing.history))}"
+            f"{self._problem.shown(iteration.z)}  {_clock(seconds)}{self._left(len(state.history))}"
         )
 
     def _left(self, done: int) -> str:

@@ -180,7 +180,7 @@ class Density(eqx.Module):
     `of_points`, and pictures are compared. The lattice's spacing is the distance over which points are told apart:
     wide enough that shifted clouds still overlap, a tenth of the body or so, and wider than the points' spacing.
 
-        picture = mpm.Density(mpm.Grid((40, 40), 0.05))
+        picture = mpm.fitting.Density(mpm.Grid((40, 40), 0.05))
         seen = mpm.Series(times, [picture.of_points(cloud, mass) for cloud in clouds], picture)
 
     A series of it keeps a picture for each step, and for each parameter a derivative of that.

@@ -6,7 +6,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 
 from mpmjax._types import Scalar
@@ -15,11 +14,11 @@ from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import fit
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._result import Estimate, FitResult, NoiseEstimate
+from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, NoiseEstimate, table
 from mpmjax.fitting._uncertainty import quantile
 
 
-class RefinedFit(eqx.Module):
+class RefinedFit(AbstractFit):
     """Estimates from several grids, extrapolated to a spacing of zero.
 
     `print(result)` shows a table; `result["E"]` is the extrapolated estimate of a parameter.
@@ -37,33 +36,24 @@ class RefinedFit(eqx.Module):
     order: tuple[float, ...]
     """The order in the spacing with which each was extrapolated; NaN of what does not converge."""
 
-    def __getitem__(self, label: str) -> Estimate:
-        """The extrapolated estimate of a parameter.
-
-        Raises:
-            KeyError: there is none of this name.
-        """
-        for estimate in self.estimates:
-            if estimate.label == label:
-                return estimate
-        raise KeyError(f"There is no estimate {label!r}, but {', '.join(e.label for e in self.estimates)}.")
+    @property
+    def all(self) -> tuple[Estimate, ...]:
+        return self.estimates
 
     def __str__(self) -> str:
-        """A table."""
-        level = 100 * self.fits[-1].level
-        on = "".join(f"{f'spacing/{n}':>13}" for n in self.refinements)
-        lines = [f"{'':<20}{on} {'extrapolated':>13} ± {'error':<9} {f'{level:g} % interval':<25} what rules"]
+        """A table: the estimates on each grid and the extrapolated ones."""
+        rows = []
         for k, e in enumerate(self.estimates):
-            each = "".join(f"{found.all[k].value:>13.6g}" for found in self.fits)
             rules = "noise" if self.from_noise[k] > self.from_discretisation[k] else "discretisation"
             rules = "one grid alone" if len(self.fits) == 1 else rules
-            interval = f"{e.interval[0]:.5g} to {e.interval[1]:.5g}"
-            name = f"{e.label} [{e.unit}]" if e.unit else e.label
-            bound = "  at its bound" if e.at_bound else ""
-            lines.append(f"{name:<20}{each} {e.value:>13.6g} ± {e.error:<9.2g} {interval:<25} {rules}{bound}")
-        for n, found in zip(self.refinements, self.fits, strict=True):
-            lines += [f"spacing/{n}: {text}" for text in found.warnings]
-            lines += [] if found.converged else [f"spacing/{n}: NOT CONVERGED"]
+            grids = (f"{result.all[k].value:>13.6g}" for result in self.fits)
+            rows.append((e.name, *grids, *e.cells, rules + ("  at its bound" if e.at_bound else "")))
+        grids = (f"{f'spacing/{n}':>13}" for n in self.refinements)
+        level = f"{100 * self.fits[-1].level:g} % interval"
+        lines = table(("", *grids, f"{'extrapolated':>12} ± {'error':<9}", level, "what rules"), *rows)
+        for n, each in zip(self.refinements, self.fits, strict=True):
+            lines += [f"spacing/{n}: {text}" for text in each.warnings]
+            lines += [] if each.converged else [f"spacing/{n}: NOT CONVERGED"]
         return "\n".join(lines)
 
 
@@ -88,7 +78,7 @@ def fit_refined(
             ...
             return mpm.Experiment(scene, particles, t1=0.1, dt=2e-3 / n, observations=tracks)
 
-        print(mpm.fit_refined(build, {"E": ...}))
+        print(mpm.fitting.fit_refined(build, {"E": ...}))
 
     With estimates a and b on the two finest grids, logarithms of `Positive` parameters, and their spacings in the
     ratio r, the extrapolation is b + (b − a)/(r^p − 1), not beyond a bound, and the standard error that is left of
@@ -130,13 +120,13 @@ def fit_refined(
     )
     require_positive("order", order)
     fits: list[FitResult] = []
-    searched = parameters
+    start = parameters
     for n in numbers:
         path = None if log is None else Path(log).with_stem(f"{Path(log).stem}_{n}")
         again = resume and path is not None and (path.exists() or n == numbers[0])
-        found = fit(
+        result = fit(
             build(n),
-            searched,
+            start,
             report=report,
             level=level,
             optimiser=optimiser,
@@ -144,22 +134,21 @@ def fit_refined(
             log=path,
             resume=again,
         )
-        if found.interrupted and fits:
+        if not result.interrupted or not fits:
+            fits.append(result)
+        if result.interrupted:
             break
-        fits.append(found)
-        if found.interrupted:
-            break
-        searched = found.restarted(parameters)
+        start = result.restarted(parameters)
     numbers = numbers[: len(fits)]
     if len(fits) < len(refinements):
         warn(f"The fit on several grids was interrupted: of {len(refinements)} grids it tells of {len(fits)}.")
     sizes = [(p, fits[-1].values[name].size) for name, p in parameters.items()]
     kinds: list[AbstractParameter | None] = [p for p, size in sizes for _ in range(size)]
     kinds += [None] * len(fits[-1].reported)
-    each = zip(kinds, zip(*(found.all for found in fits), strict=True), strict=True)
+    each = zip(kinds, zip(*(result.all for result in fits), strict=True), strict=True)
     normal = float(quantile(float(level), np.inf))
-    missed = _missed(fits[-2].noise, fits[-1].noise, numbers, float(order))
-    extrapolated = [_extrapolate(kind, found, numbers, float(order), missed, normal) for kind, found in each]
+    missed = _missed(fits[-2].noise, fits[-1].noise, numbers, float(order)) if len(fits) > 1 else 0.0
+    extrapolated = [_extrapolate(kind, of, numbers, float(order), missed, normal) for kind, of in each]
     estimates, left, orders = zip(*extrapolated, strict=True)
     return RefinedFit(tuple(fits), tuple(numbers), estimates, tuple(e.error for e in fits[-1].all), left, orders)
 
@@ -176,7 +165,7 @@ def _missed(
 
 def _extrapolate(
     kind: AbstractParameter | None,
-    found: tuple[Estimate, ...],
+    estimates: tuple[Estimate, ...],
     refinements: list[int],
     order: float,
     missed: float,
@@ -187,18 +176,18 @@ def _extrapolate(
 
     Args:
         kind: its parameter; None for what was reported.
-        found: its estimates, from coarse to fine.
+        estimates: on the grids, from coarse to fine.
         refinements: the grids.
         order: the order in the spacing.
         missed: by how much the finest grid misses the data, in units of σ.
         normal: the reach of an interval of the normal distribution, in standard errors.
     """
-    last = found[-1]
-    if len(found) == 1:
+    last = estimates[-1]
+    if len(estimates) == 1:
         return last, float("nan"), float("nan")
-    held = any(e.at_bound for e in found[-3:])
+    held = any(e.at_bound for e in estimates[-3:])
     bounds = (-np.inf, np.inf) if kind is None else kind.domain
-    # Of a number that may be zero the logarithm has no end.
+    # The logarithm of a number that may be zero has no end.
     logarithmic = kind is not None and kind.logarithmic and last.interval[0] > 0 and not held
 
     def coordinate(value: float) -> float:
@@ -207,7 +196,7 @@ def _extrapolate(
     def back(z: float) -> float:
         return float(np.clip(last.value * np.exp(z) if logarithmic else last.value + z, *bounds))
 
-    values = np.array([coordinate(e.value) for e in found])
+    values = np.array([coordinate(e.value) for e in estimates])
     p = float("nan") if held else _order(values, refinements, order)
     change = values[-1] - values[-2]
     ratio = refinements[-1] / refinements[-2]
@@ -216,7 +205,7 @@ def _extrapolate(
     hidden = missed / 2 * last.error / (last.value if logarithmic else 1)
     remains = max(abs(change) / (1 if np.isnan(p) else ratio ** min(p, order) - 1), hidden)
     if np.isnan(p):
-        shown = ", ".join(f"{e.value:.5g}" for e in found)
+        shown = ", ".join(f"{e.value:.5g}" for e in estimates)
         what = "lies at its bound on a grid" if held else "does not converge with the spacing"
         warn(f"{last.label} {what} ({shown}): it is not extrapolated.")
     # An interval that ends at a bound holds that bound, and whatever more there is to its reach.
@@ -227,7 +216,7 @@ def _extrapolate(
         value=value,
         error=float(np.hypot(last.error, discretisation)),
         interval=(back(correction - reach[0]), back(correction + reach[1])),
-        start=found[0].start,
+        start=estimates[0].start,
         at_bound=held,
     )
     return estimate, discretisation, p

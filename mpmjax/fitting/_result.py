@@ -1,22 +1,25 @@
-"""What a fit found."""
+"""Results of fits: estimates with their errors, and the table that shows them."""
 
+import abc
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.special import chdtrc
 
 from mpmjax._types import Array
+from mpmjax.checks import require
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._search import Iteration
-from mpmjax.fitting._uncertainty import Uncertainty
+from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._search import Iteration, Minimum
+from mpmjax.fitting._uncertainty import Uncertainty, at_bound, noise, quantile, seen_together, uncertainty
 
 
 class Estimate(NamedTuple):
@@ -34,6 +37,16 @@ class Estimate(NamedTuple):
     at_bound: bool = False
     """Whether it came to lie at a bound, where errors mean little."""
 
+    @property
+    def name(self) -> str:
+        """Label and unit."""
+        return f"{self.label} [{self.unit}]" if self.unit else self.label
+
+    @property
+    def cells(self) -> tuple[str, str]:
+        """Value with error, and interval, as a `table` has them."""
+        return f"{self.value:>12.6g} ± {self.error:<9.2g}", f"{self.interval[0]:.5g} to {self.interval[1]:.5g}"
+
 
 class NoiseEstimate(NamedTuple):
     """The noise of an observation."""
@@ -49,16 +62,36 @@ class NoiseEstimate(NamedTuple):
     """How many numbers were measured."""
 
 
-class FitResult(eqx.Module):
+class AbstractFit(eqx.Module):
+    """Estimates by name: `result["E"]` is that of a parameter, and `print(result)` shows a table."""
+
+    @property
+    @abc.abstractmethod
+    def all(self) -> tuple[Estimate, ...]:
+        """The fitted numbers, and the reported ones."""
+
+    def __getitem__(self, label: str) -> Estimate:
+        """The estimate of a parameter, or of a reported number.
+
+        Raises:
+            KeyError: there is none of this name.
+        """
+        for estimate in self.all:
+            if estimate.label == label:
+                return estimate
+        raise KeyError(f"There is no estimate {label!r}, but {', '.join(e.label for e in self.all)}.")
+
+
+class FitResult(AbstractFit):
     """Fitted parameters, their errors, and the fitted scene.
 
     `print(result)` shows a table; `result["E"]` is the estimate of a parameter.
     """
 
     problem: FitProblem
-    """What was fitted."""
+    """The residuals that were made small."""
     z: np.ndarray
-    """The coordinates found [-], shape (n,)."""
+    """The coordinates at the minimum [-], shape (n,)."""
     sigmas: tuple[Array, ...]
     """The noise of each observation, given or estimated, in the data's unit."""
     residuals: np.ndarray
@@ -70,7 +103,7 @@ class FitResult(eqx.Module):
     estimates: tuple[Estimate, ...]
     """The fitted numbers, one for each entry of each parameter."""
     reported: tuple[Estimate, ...]
-    """What else was asked for."""
+    """The estimates that `report` asked for."""
     chi_squared: float
     """Σ r², priors included."""
     degrees_of_freedom: int
@@ -93,12 +126,11 @@ class FitResult(eqx.Module):
     @property
     def values(self) -> dict[str, np.ndarray]:
         """The value of each parameter, in its shape."""
-        values = self.problem.values(jnp.asarray(self.z, self.problem.dtype))
-        return {name: np.asarray(value) for name, value in zip(self.problem.names, values, strict=True)}
+        return self.problem.by_name(jnp.asarray(self.z, self.problem.dtype))
 
     @property
     def covariance(self) -> np.ndarray:
-        """Of the search's coordinates [-], shape (n, n)."""
+        """Covariance of the search's coordinates [-], shape (n, n)."""
         return self.uncertainty.covariance
 
     @property
@@ -109,7 +141,7 @@ class FitResult(eqx.Module):
 
     @property
     def correlation(self) -> np.ndarray:
-        """Of the estimates, shape (n, n)."""
+        """Correlation of the estimates, shape (n, n)."""
         return self.uncertainty.correlation
 
     @property
@@ -125,12 +157,11 @@ class FitResult(eqx.Module):
 
     @property
     def all(self) -> tuple[Estimate, ...]:
-        """The fitted numbers, and what was reported."""
         return (*self.estimates, *self.reported)
 
     def restarted(self, parameters: Mapping[str, AbstractParameter]) -> dict[str, AbstractParameter]:
-        """The parameters, to be searched from the values found."""
-        return {name: replace(p, start=self.values[name]) for name, p in parameters.items()}
+        """The parameters, to be searched from the fitted values."""
+        return restarted(parameters, self.values)
 
     @property
     def scene(self) -> Any:
@@ -146,44 +177,39 @@ class FitResult(eqx.Module):
             return np.nan
         return float(chdtrc(self.degrees_of_freedom, self.chi_squared))
 
-    def __getitem__(self, label: str) -> Estimate:
-        """The estimate of a parameter, or of what was reported.
-
-        Raises:
-            KeyError: there is none of this name.
-        """
-        for estimate in self.all:
-            if estimate.label == label:
-                return estimate
-        raise KeyError(f"There is no estimate {label!r}, but {', '.join(e.label for e in self.estimates)}.")
-
     def __str__(self) -> str:
-        """A table."""
-        lines = [f"{'':<24} {'value':>12} ± {'error':<9} {f'{100 * self.level:g} % interval':<25} {'start':>10}"]
-        left = iter(self.estimates)
-        rows: list[Estimate] = []
+        """A table of the estimates, one of the noise, and what is to be said of them."""
+        left, rows, lines = iter(self.estimates), [], []
         for name, start in zip(self.problem.names, self.problem.starts, strict=True):
-            own = list(itertools.islice(left, start.size))
+            each = list(itertools.islice(left, start.size))
             if start.size > _MOST_ROWS:
-                lines.append(_summary(name, start.shape, own))
+                lines.append(_summary(name, start.shape, each))
             else:
-                rows += own
-        for e in (*rows, *self.reported):
-            name = f"{e.label} [{e.unit}]" if e.unit else e.label
-            interval = f"{e.interval[0]:.5g} to {e.interval[1]:.5g}"
-            start = "" if np.isnan(e.start) else f"{e.start:.4g}"
-            bound = "  at its bound" if e.at_bound else ""
-            lines.append(f"{name:<24} {e.value:>12.6g} ± {e.error:<9.2g} {interval:<25} {start:>10}{bound}")
-        lines += ["", f"{'':<24} {'numbers':>12}   {'noise σ':<22} misfit/σ"]
-        for n in self.noise:
-            sigma = f"{n.sigma:.3g} {'estimated' if n.estimated else 'given'}"
-            lines.append(f"{n.name:<24} {n.points:>12}   {sigma:<22} {n.misfit:.3g}")
-        said = f"χ² = {self.chi_squared:.4g} for {self.degrees_of_freedom} degrees of freedom"
-        lines += ["", said + ("" if np.isnan(self.p_value) else f", probability {self.p_value:.2g}")]
+                rows += each
+        cells = [
+            (e.name, *e.cells, "" if np.isnan(e.start) else f"{e.start:>10.4g}", "at its bound" if e.at_bound else "")
+            for e in (*rows, *self.reported)
+        ]
+        head = "", f"{'value':>12} ± {'error':<9}", f"{100 * self.level:g} % interval", f"{'start':>10}", ""
+        noises = [
+            (n.name, f"{n.points:>12}", f"{n.sigma:.3g} {'estimated' if n.estimated else 'given'}", f"{n.misfit:.3g}")
+            for n in self.noise
+        ]
+        first, *body = table(head, *cells)
+        lines = [first, *lines, *body, "", *table(("", f"{'numbers':>12}", "noise σ", "misfit/σ"), *noises), ""]
+        chi = f"χ² = {self.chi_squared:.4g} for {self.degrees_of_freedom} degrees of freedom"
+        lines.append(chi + ("" if np.isnan(self.p_value) else f", probability {self.p_value:.2g}"))
         lines.append(f"found by {type(self.optimiser).__name__} in {len(self.history)} iterations")
         if not self.converged:
             lines.append("NOT CONVERGED: errors hold only at a minimum.")
         return "\n".join([*lines, *self.warnings])
+
+
+def table(head: Sequence[str], *rows: Sequence[str]) -> list[str]:
+    """The lines of a table, its columns as wide as they need."""
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    widths[0] = max(widths[0], _FIRST_COLUMN)
+    return [" ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in (head, *rows)]
 
 
 def _summary(name: str, shape: tuple[int, ...], each: list[Estimate]) -> str:
@@ -196,5 +222,191 @@ def _summary(name: str, shape: tuple[int, ...], each: list[Estimate]) -> str:
     )
 
 
+def restarted(
+    parameters: Mapping[str, AbstractParameter], values: Mapping[str, np.ndarray]
+) -> dict[str, AbstractParameter]:
+    """Parameters, to be searched from these values."""
+    return {name: replace(p, start=values[name]) for name, p in parameters.items()}
+
+
+class SettledNoise(NamedTuple):
+    """The noise of the observations, by the residuals at a minimum."""
+
+    sigmas: tuple[Array, ...]
+    """The noise of each observation, in its data's unit."""
+    factors: list[float]
+    """By what each is larger than it was in the search."""
+    freedoms: list[float]
+    """Degrees of freedom of each estimate, zero where the noise is given."""
+    changing: bool
+    """Whether the change moves the minimum, which must then be searched again."""
+
+
+def settle_noise(problem: FitProblem, minimum: Minimum, sigmas: tuple[Array, ...]) -> SettledNoise:
+    """The noise by the residuals at a minimum that was searched with `sigmas`.
+
+    Raises:
+        ValueError: an observation has too few numbers to estimate its noise.
+    """
+    r, J = np.asarray(minimum.r), np.asarray(minimum.J)
+    J = J[:, ~at_bound(r, J, np.asarray(problem.room(minimum.z)))]  # what a bound holds fits nothing away
+    factors, freedoms, changing = [], [], False
+    each = zip(problem.observations, problem.rows, problem.noise_is_given, sigmas, strict=True)
+    for observation, rows, is_given, sigma in each:
+        factor, freedom = (1.0, 0.0) if is_given else noise(r, J, rows, observation.count, *observation.trust)
+        require(
+            np.isfinite(factor),
+            f"The noise of {observation.name!r} cannot be estimated from its {observation.count} numbers: the "
+            "parameters use all of them up. Give its sigma.",
+        )
+        floor = _LEAST * observation.scale() / float(np.max(sigma))
+        factors.append(max(factor, floor))
+        freedoms.append(freedom)
+        changing |= abs(factors[-1] - 1) > _NOISE_RTOL and factors[-1] > floor
+    scaled = tuple(sigma * factor for sigma, factor in zip(sigmas, factors, strict=True))
+    return SettledNoise(scaled, factors, freedoms, changing and not problem.scales_alike)
+
+
+def fit_result(
+    problem: FitProblem,
+    optimiser: AbstractOptimiser,
+    minimum: Minimum,
+    settled: SettledNoise,
+    report: Mapping[str, Callable[[Experiment], Any]],
+    level: float,
+) -> FitResult:
+    """The result at a minimum, whose residuals are in units of the noise of its search.
+
+    Args:
+        problem: what was fitted.
+        optimiser: by which method.
+        minimum: where the search ended.
+        settled: the noise by its residuals.
+        report: see `fit`.
+        level: of the intervals.
+    """
+    r, J, z = np.array(minimum.r, float), np.array(minimum.J, float), minimum.z
+    for rows, factor in zip(problem.rows, settled.factors, strict=True):
+        r[rows], J[rows] = r[rows] / factor, J[rows] / factor
+    each = list(zip(problem.observations, problem.rows, problem.noise_is_given, strict=True))
+    estimated = [(rows, f) for (_, rows, is_given), f in zip(each, settled.freedoms, strict=True) if not is_given]
+    errors = uncertainty(J, float(jnp.finfo(problem.dtype).eps), estimated)
+    held = at_bound(r, J, np.asarray(problem.room(z)))
+    priors = len(r) - problem.rows[-1].stop
+    noises = tuple(
+        NoiseEstimate(
+            o.name,
+            float(np.sqrt((np.asarray(sigma) ** 2).mean())),
+            not is_given,
+            float(np.sqrt((r[rows] ** 2).sum() / max(o.count, 1))),
+            o.count,
+        )
+        for (o, rows, is_given), sigma in zip(each, settled.sigmas, strict=True)
+    )
+    result = FitResult(
+        problem=problem,
+        z=np.asarray(z),
+        sigmas=settled.sigmas,
+        residuals=r,
+        jacobian=J,
+        uncertainty=errors,
+        estimates=_estimates(problem, z, errors, (J.T @ r) * held, held, level),
+        reported=tuple(_reported(problem, z, errors, level, name, of) for name, of in report.items()),
+        chi_squared=float((r**2).sum()),
+        degrees_of_freedom=sum(n.points for n in noises) + priors - errors.rank + int(held.sum()),
+        noise=noises,
+        experiments=problem.at(z),
+        level=level,
+        optimiser=optimiser,
+        converged=minimum.converged,
+        history=minimum.history,
+        warnings=tuple(seen_together(problem.labels, errors, problem.logarithmic)),
+        interrupted=minimum.interrupted,
+    )
+    if result.p_value < _IMPROBABLE:
+        text = (
+            f"The misfit is {np.sqrt(result.chi_squared / result.degrees_of_freedom):.2g} times the noise given: the "
+            "model or its discretisation does not explain the data, and the errors are too small by as much or more."
+        )
+        result = replace(result, warnings=(*result.warnings, text))
+    return result
+
+
+def _estimates(
+    problem: FitProblem, z: Coordinates, errors: Uncertainty, gradient: np.ndarray, held: np.ndarray, level: float
+) -> tuple[Estimate, ...]:
+    """The fitted numbers; `gradient` and `held` as of `intervals`, and which coordinates a bound holds."""
+    slope = np.asarray(jax.jvp(problem.numbers, (z,), (jnp.ones_like(z),))[1], float)
+    lower, upper = intervals(problem, z, errors, gradient, level)
+    start = problem.numbers(jnp.zeros_like(z))
+    columns = problem.numbers(z), np.abs(slope) * errors.error, lower, upper, start, held
+    units = [p.unit for p, start in zip(problem.parameters, problem.starts, strict=True) for _ in range(start.size)]
+    return tuple(
+        Estimate(label, value, error, (a, b), unit, start, bound)
+        for label, unit, value, error, a, b, start, bound in zip(
+            problem.labels, units, *(np.asarray(column).tolist() for column in columns), strict=True
+        )
+    )
+
+
+def intervals(
+    problem: FitProblem, z: Coordinates, errors: Uncertainty, gradient: np.ndarray, level: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper ends of the fitted numbers' intervals, each of shape (n,).
+
+    They are where Δχ² = 2 g δ + δ²/s² reaches its threshold q², s being the standard error and g the gradient, zero but
+    of what a bound holds. δ is of the coordinate. Beside a bound, at three times the reach or nearer, data that follow
+    the value would be missed too often: there each end is the farther of two, of the coordinate and of a straight line
+    in the value. Where that line meets the bound, it alone makes the interval, which ends there: the coordinate never
+    comes to a bound, and goes beyond all measure to the other side.
+
+    Args:
+        problem: what was fitted.
+        z: the coordinates at the minimum.
+        errors: their uncertainty.
+        gradient: g, shape (n,).
+        level: of the intervals.
+    """
+    error, freedom = errors.of(np.eye(problem.size))
+    q = quantile(level, freedom)
+    pull = np.where(np.isfinite(error), gradient, 0) * np.where(np.isfinite(error), error, 1)
+    root = np.hypot(pull, q)
+    down, up = np.asarray(problem.room(z), float)
+    below, above = error * (root + pull), error * q**2 / (root + pull)
+    at, slope = (np.asarray(a, float) for a in jax.jvp(problem.numbers, (z,), (jnp.ones_like(z),)))
+    straight = at - slope * np.minimum(below, down), at + slope * np.minimum(above, up)
+    curved = (problem.numbers(z + side * jnp.asarray(q * error, z.dtype)) for side in (-1, 1))
+    meets, near = ((times * below >= down) | (times * above >= up) for times in (1, _BESIDE))
+    lower, upper = (
+        np.where(meets, line, np.where(near, farther(line, curve), curve))
+        for line, curve, farther in zip(straight, np.array(list(curved), float), (np.minimum, np.maximum), strict=True)
+    )
+    each = zip(problem.parameters, problem.starts, strict=True)
+    ends = np.array([p.domain for p, start in each for _ in range(start.size)]).T
+    return np.clip(lower, *ends), np.clip(upper, *ends)
+
+
+def _reported(
+    problem: FitProblem, z: Coordinates, errors: Uncertainty, level: float, name: str, of: Callable[[Experiment], Any]
+) -> Estimate:
+    """A function of the first experiment, its error by its derivative."""
+
+    def value(z: Coordinates) -> Array:
+        return jnp.asarray(of(problem.at(z)[0]))
+
+    error, freedom = errors.of(np.asarray(jax.jacfwd(value)(z), float))
+    number, reach = float(value(z)), float(quantile(level, freedom) * error)
+    return Estimate(name, number, float(error), (number - reach, number + reach), start=float(value(jnp.zeros_like(z))))
+
+
+_FIRST_COLUMN = 24
 _MOST_ROWS = 12
 """Numbers of one parameter up to which each has a row of the table."""
+_IMPROBABLE = 1e-3
+"""Probability of a χ² from which the model is said not to explain the data."""
+_BESIDE = 3
+"""Reaches of an interval within which it is beside a bound."""
+_NOISE_RTOL = 1e-3
+"""The noise of several observations is settled when its estimate changes less, relatively."""
+_LEAST = 1e-12
+"""Smallest noise, in sizes of the data: exact data have none."""

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -13,14 +12,14 @@ import numpy as np
 from mpmjax._types import Scalar
 from mpmjax.analysis import sensitivity
 from mpmjax.checks import checked, require, require_positive, warn
-from mpmjax.fitting._choice import chosen_optimiser
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._fit import explain, fit
+from mpmjax.fitting._fit import chosen_optimiser, fit
+from mpmjax.fitting._multistart import label_cells, value_cells
 from mpmjax.fitting._observation import Series
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
-from mpmjax.fitting._result import Estimate, FitResult
+from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, restarted, table
 from mpmjax.fitting._search import begin, iterate, jacobian, search
 
 
@@ -30,13 +29,13 @@ class Stage(NamedTuple):
     horizon: float
     """The time [s]."""
     values: dict[str, np.ndarray]
-    """The value of each parameter that it found, in its shape."""
+    """The value of each parameter at its minimum, in its shape."""
     misfit: float
     """Root mean square of the residuals, in units of σ, or of the size of the data where σ is not given."""
     iterations: int
 
 
-class StagedFit(eqx.Module):
+class StagedFit(AbstractFit):
     """A fit that came about in stages.
 
     `print(result)` shows a table; `result["E"]` is the estimate of a parameter by the last stage.
@@ -48,25 +47,18 @@ class StagedFit(eqx.Module):
     """The last fit, with its errors."""
     horizons: tuple[float, ...]
     """Until when the data of each experiment were used in the last fit [s]."""
-    said: tuple[str, ...]
+    remarks: tuple[str, ...]
     """How the horizons were chosen, in words."""
 
-    def __getitem__(self, label: str) -> Estimate:
-        """The estimate of a parameter by the last fit.
-
-        Raises:
-            KeyError: there is none of this name.
-        """
-        return self.result[label]
+    @property
+    def all(self) -> tuple[Estimate, ...]:
+        return self.result.all
 
     def __str__(self) -> str:
-        """What was said, a table of the stages, then that of the last fit."""
-        labels = self.result.problem.labels[:4]
-        lines = [*self.said, "", f"{'until [s]':>12} {'misfit/σ':>10}  " + "".join(f"{label:>14}" for label in labels)]
-        for stage in self.stages:
-            numbers = np.concatenate([value.reshape(-1) for value in stage.values.values()])[:4]
-            lines.append(f"{stage.horizon:>12.4g} {stage.misfit:>10.4g}  " + "".join(f"{n:>14.6g}" for n in numbers))
-        return "\n".join([*lines, "", str(self.result)])
+        """The remarks, a table of the stages, then that of the last fit."""
+        head = f"{'until [s]':>24}", f"{'misfit/σ':>10}", *label_cells(self.result.problem)
+        rows = [(f"{s.horizon:>24.4g}", f"{s.misfit:>10.4g}", *value_cells(s.values)) for s in self.stages]
+        return "\n".join([*self.remarks, "", *table(head, *rows), "", str(self.result)])
 
 
 @checked
@@ -85,8 +77,8 @@ def fit_staged(
 
     For motions that repeat or that contacts decide, of which a fit to all data ends in a false minimum.
 
-        found = mpm.fit_staged(swing, {"E": ...})
-        print(found)  # how the horizons were chosen, the stages, the estimate
+        result = mpm.fitting.fit_staged(swing, {"E": ...})
+        print(result)  # how the horizons were chosen, the stages, the estimate
 
     *The first horizon*, where `horizons` does not give it, is the last time until which a change of one in any
     coordinate changes the data by no more than they change themselves, √Σ (∂y/∂z)² ≤ √Σ (y − y(0))², by the derivative
@@ -115,57 +107,52 @@ def fit_staged(
         SimulationError: the simulation at the first guess meets a fault within the first horizon.
     """
     require(float(growth) > 0, f"growth must be positive, or infinite to use all data, got {growth}.")
-    given = None if horizons is None else [float(t) for t in horizons]
-    if given is not None:
-        require(len(given) > 0, "horizons must hold a time at least; leave them out to have them chosen.")
-        require_positive("horizons [s]", np.array(given))
-        require(all(a < b for a, b in pairwise(given)), f"horizons must grow, got {given}.")
-    problem = FitProblem((experiments,) if isinstance(experiments, Experiment) else tuple(experiments), parameters)
+    times = None if horizons is None else [float(t) for t in horizons]
+    if times is not None:
+        require(len(times) > 0, "horizons must hold a time at least; leave them out to have them chosen.")
+        require_positive("horizons [s]", np.array(times))
+        require(all(a < b for a, b in pairwise(times)), f"horizons must grow, got {times}.")
+    problem = FitProblem(experiments, parameters)
     optimiser = chosen_optimiser(problem) if optimiser is None else optimiser
     end = max(e.t1 for e in problem.experiments)
-    said: list[str] = []
+    remarks: list[str] = []
 
     def say(text: str) -> None:
-        said.append(text)
         if progress is not None:
             progress(text)
 
+    def remark(text: str) -> None:
+        remarks.append(text)
+        say(text)
+
     z = jnp.zeros(problem.size, problem.dtype)
     limits = _limits(problem.at(z), float(growth))
-    if given is None:
+    if times is None:
         first = _first_horizon(_cut(problem, limits, end), optimiser, z)
-        given = [first * 2.0**k for k in range(_MOST_STAGES) if first * 2.0**k < _NEARLY_ALL * end]
-        say(_said_first(first, end) if given else _ONE_STAGE)
+        times = [first * 2.0**k for k in range(_MOST_STAGES) if first * 2.0**k < _NEARLY_ALL * end]
+        remark(_FIRST.format(first, end) if times else _ONE_STAGE)
     stages: list[Stage] = []
-    for horizon in given:
+    for horizon in times:
         cut = _cut(problem, limits, horizon)
-        if all(
-            a.steps == b.steps for a, b in zip(cut.experiments, _cut(problem, limits, end).experiments, strict=True)
-        ):
+        if [e.steps for e in cut.experiments] == [e.steps for e in _cut(problem, limits, end).experiments]:
             break
-        sigmas = cut.first_sigmas
-        found = search(cut, optimiser, z, sigmas)
-        if not np.isfinite(found.history[0].cost):
-            explain(cut, z)
-            raise ValueError(f"What is observed of the simulation until {horizon:g} s is not finite.")
-        if found.interrupted:
+        minimum = search(cut, optimiser, z, cut.first_sigmas)
+        if not np.isfinite(minimum.history[0].cost):
+            cut.explain(z, f"What is observed of the simulation until {horizon:g} s is not finite.")
+        if minimum.interrupted:
             raise KeyboardInterrupt
-        z = found.z
-        values = {name: np.asarray(v) for name, v in zip(problem.names, problem.values(z), strict=True)}
-        numbers = sum(o.count for o in cut.observations)
-        stages.append(Stage(horizon, values, float(np.sqrt(2 * found.history[-1].cost / numbers)), len(found.history)))
-        if progress is not None:
-            progress(_said_stage(problem, stages[-1]))
+        z, misfit, count = minimum.z, cut.misfit(minimum.cost), len(minimum.history)
+        stages.append(Stage(horizon, problem.by_name(z), misfit, count))
+        say(f"until {horizon:.4g} s: misfit/σ {misfit:.4g}, {problem.shown(z)}, {count} iterations")
         limits = _limits(problem.at(z), float(growth))
     cut = _cut(problem, limits, end)
     for k, (whole, used, limit) in enumerate(zip(problem.experiments, cut.experiments, limits, strict=True)):
         if used.steps < whole.steps:
-            say(_SHORT.format(f"{whole.name!r} (number {k})", growth, limit, whole.t1))
-            warn(said[-1])
-    values = problem.values(z)
-    restarted = {n: replace(p, start=np.asarray(v)) for (n, p), v in zip(parameters.items(), values, strict=True)}
-    result = fit(cut.experiments, restarted, report=report, level=level, optimiser=optimiser, progress=progress)
-    return StagedFit(tuple(stages), result, tuple(e.t1 for e in cut.experiments), tuple(said))
+            remark(_SHORT.format(f"{whole.name!r} (number {k})", growth, limit, whole.t1))
+            warn(remarks[-1])
+    start = restarted(parameters, problem.by_name(z))
+    result = fit(cut.experiments, start, report=report, level=level, optimiser=optimiser, progress=progress)
+    return StagedFit(tuple(stages), result, tuple(e.t1 for e in cut.experiments), tuple(remarks))
 
 
 def _cut(problem: FitProblem, limits: Sequence[float], horizon: float) -> FitProblem:
@@ -182,9 +169,9 @@ def _limits(experiments: Sequence[Experiment], growth: float) -> list[float]:
     for e in experiments:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            found = sensitivity(e.scene, e.particles, t1=e.t1, dt=e.dt, method=e.method)
-        beyond = np.flatnonzero(~(np.asarray(found.growth) <= growth))
-        times = np.asarray(found.times)
+            grown = sensitivity(e.scene, e.particles, t1=e.t1, dt=e.dt, method=e.method)
+        beyond = np.flatnonzero(~(np.asarray(grown.growth) <= growth))
+        times = np.asarray(grown.times)
         limits.append(e.t1 if len(beyond) == 0 else float(times[max(beyond[0] - 1, 0)]))
     return limits
 
@@ -195,12 +182,10 @@ def _first_horizon(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordin
     Raises:
         SimulationError, ValueError: the simulation fails.
     """
-    sigmas = problem.first_sigmas
-    start = z.astype(float)
+    sigmas, start = problem.first_sigmas, z.astype(float)
     _, _, seen = iterate(problem, optimiser, start, sigmas, begin(problem, optimiser, start, sigmas))
     if not np.isfinite(seen.cost):
-        explain(problem, z)
-        raise ValueError("What is observed of the simulation at the first guess is not finite.")
+        problem.explain(z)
     J = np.asarray(jacobian(problem, z, sigmas)[1] if seen.jacobian is None else seen.jacobian, float)
     times, changes, motions = [], [], []
     for o, rows, sigma in zip(problem.observations, problem.rows, sigmas, strict=True):
@@ -231,19 +216,10 @@ def _motion(data: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     return (np.where(seen, (rows - first) / spread, 0) ** 2).sum(axis=1)
 
 
-def _said_first(first: float, end: float) -> str:
-    return (
-        f"The first horizon is {first:.4g} s of {end:.4g} s: until then a change of one in a coordinate changes the "
-        "data by no more than they change themselves. Horizons double from there."
-    )
-
-
-def _said_stage(problem: FitProblem, stage: Stage) -> str:
-    numbers = np.concatenate([value.reshape(-1) for value in stage.values.values()])
-    shown = ", ".join(f"{label} {n:.5g}" for label, n in zip(problem.labels[:4], numbers, strict=False))
-    return f"until {stage.horizon:.4g} s: misfit/σ {stage.misfit:.4g}, {shown}, {stage.iterations} iterations"
-
-
+_FIRST = (
+    "The first horizon is {0:.4g} s of {1:.4g} s: until then a change of one in a coordinate changes the data by no "
+    "more than they change themselves. Horizons double from there."
+)
 _ONE_STAGE = (
     "One stage suffices: until the end of the data a change of one in a coordinate changes them by no more than they "
     "change themselves, or by as much at all times."

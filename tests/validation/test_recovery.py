@@ -124,7 +124,7 @@ def test_stiffness_and_poissons_ratio_from_exact_motions_of_two_laws():
         return [exact_wave(16 * n), exact(vortex, 16 * n, 0.5, vortex.amplitude, 60)]
 
     near = {"E": mpm.Positive(STIFFNESS.where, start=0.9 * E), "nu": RATIO}
-    found = mpm.fit_refined(build, near, order=2)
+    found = mpm.fitting.fit_refined(build, near, order=2)
     assert is_found(found["E"], E, 0.01)
     assert is_found(found["nu"], NU, 0.01)
     assert found["E"].error < 0.02 * E
@@ -135,7 +135,7 @@ def vibrations():
     """E and ν of the block on 8 and 16 cells from its tracks, by their noise."""
     both = {"E": STIFFNESS, "nu": RATIO}
     return {
-        noise: mpm.fit_refined(lambda n, seen=tracks(noise): experiment(n, seen), both, order=2)
+        noise: mpm.fitting.fit_refined(lambda n, seen=tracks(noise): experiment(n, seen), both, order=2)
         for noise in (0.05, 0.01)
     }
 
@@ -167,10 +167,10 @@ def test_stiffness_from_pictures_without_correspondence():
     3 % and their intervals."""
     times, x = true_motion()
     rng = np.random.default_rng(3)
-    picture = mpm.Density(mpm.Grid((20, 20), 0.05, origin=(-6, -6)))
+    picture = mpm.fitting.Density(mpm.Grid((20, 20), 0.05, origin=(-6, -6)))
     clouds = [rng.permutation(frame)[: len(frame) // 2] for frame in x[1:]]
     seen = mpm.Series(times[1:], [picture.of_points(cloud, DENSITY * SIDE**2) for cloud in clouds], picture)
-    found = mpm.fit_refined(lambda n: experiment(n, lambda q: seen), {"E": STIFFNESS, "nu": RATIO}, order=2)
+    found = mpm.fitting.fit_refined(lambda n: experiment(n, lambda q: seen), {"E": STIFFNESS, "nu": RATIO}, order=2)
     assert all(abs(each["E"].value / E - 1) < 0.03 for each in found.fits)
     assert is_found(found["E"], E, 0.03)
     assert is_found(found["nu"], NU, 0.03)
@@ -184,7 +184,7 @@ def test_velocity_and_spin_are_found_beside_the_stiffness():
         return eqx.tree_at(lambda e: e.particles, e, thrown(e.particles, motion[:2], motion[2]))
 
     free = {"E": STIFFNESS, "motion": mpm.Unbounded(update=put, start=jnp.zeros(3))}
-    found = mpm.fit_refined(lambda n: experiment(n, tracks(0.05)), free, order=2)
+    found = mpm.fitting.fit_refined(lambda n: experiment(n, tracks(0.05)), free, order=2)
     assert is_found(found["E"], E, 0.01)
     for k, true in enumerate((*VELOCITY, SPIN)):
         assert is_found(found[f"motion[{k}]"], true, 0.01)

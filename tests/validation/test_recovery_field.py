@@ -50,8 +50,10 @@ def problem(times, seen, places):
     scene, q = block(1, gradient=mpm.MLSGradient())
     observed = mpm.Tracks(times, seen, which=mpm.Markers.at(q, places), sigma=SIGMA)
     pull = mpm.Experiment(scene, q, t1=STEP * STEPS, dt=STEP, observations=observed)
-    modulus = mpm.Positive(lambda e: e.scene.material.youngs_modulus, prior=mpm.Smooth(0.2, robust=0.3), unit="Pa")
-    return pull, mpm.Field(modulus, mpm.Field.lattice_around(q, 0.1))
+    modulus = mpm.Positive(
+        lambda e: e.scene.material.youngs_modulus, prior=mpm.fitting.Smooth(0.2, robust=0.3), unit="Pa"
+    )
+    return pull, mpm.fitting.Field(modulus, mpm.fitting.Field.lattice_around(q, 0.1))
 
 
 def judged(field, found):
@@ -73,7 +75,7 @@ def test_a_field_of_two_regions_is_found():
     found = mpm.fit(pull, {"E": field})
     border, soft, stiff = judged(field, found)
     assert found.converged
-    assert isinstance(found.optimiser, mpm.LBFGS)
+    assert isinstance(found.optimiser, mpm.fitting.LBFGS)
     assert abs(border - BORDER) < SPACING
     assert soft == pytest.approx(SOFT, rel=0.05)
     assert stiff == pytest.approx(STIFF, rel=0.05)

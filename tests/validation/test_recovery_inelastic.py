@@ -79,8 +79,8 @@ def test_a_parameter_is_found_again(name):
 
     parameter = mpm.Positive(lambda e: case.where(e.scene.material), start=case.start)
     # fronts jump, and a grid smears what jumps over more than a cell: of less than the first order
-    result = mpm.fit_refined(
-        build, {name: parameter}, refinements=(2, 4), order=0.5, optimiser=mpm.LevenbergMarquardt(rtol=1e-4)
+    result = mpm.fitting.fit_refined(
+        build, {name: parameter}, refinements=(2, 4), order=0.5, optimiser=mpm.fitting.LevenbergMarquardt(rtol=1e-4)
     )
     print(result)
     found, truth = result[name], float(case.where(case.law))

@@ -35,7 +35,7 @@ def test_a_family_is_found_from_clouds_without_correspondence(script, name):
     family = script.FAMILIES[name]
     clouds = script.film(family, 4)
     result = mpm.fit(
-        script.experiment(family, clouds, 1), family.parameters, optimiser=mpm.LevenbergMarquardt(rtol=1e-4)
+        script.experiment(family, clouds, 1), family.parameters, optimiser=mpm.fitting.LevenbergMarquardt(rtol=1e-4)
     )
     print(result)
     assert set(script.FAMILIES) == set(FAMILIES)
