@@ -13,8 +13,7 @@ import numpy as np
 import mpmjax as mpm
 from mpmjax.boundary import ConstrainedNodes
 from mpmjax.checks._values import canonical
-from mpmjax.stepping import GridUpdate as Update
-from mpmjax.stepping import Nodes, StepInfo, reaction, start_nodes, step_unchecked, update
+from mpmjax.stepping import GridUpdate as Update, Nodes, StepInfo, reaction, start_nodes, step_unchecked, update
 
 
 def kernel(order: int, u: float) -> tuple[float, float]:

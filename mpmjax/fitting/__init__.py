@@ -4,10 +4,7 @@ A first fit needs the names that `mpmjax` has itself: `fit`, `Experiment`, param
 others: priors and fields, optimisers, strategies for hard fits, and uncertainty beyond standard errors.
 """
 
-from mpmjax.fitting._columns import Columns as Columns
-from mpmjax.fitting._columns import after as after
-from mpmjax.fitting._columns import read_arrays as read_arrays
-from mpmjax.fitting._columns import read_columns
+from mpmjax.fitting._columns import Columns as Columns, after as after, read_arrays as read_arrays, read_columns
 from mpmjax.fitting._ensemble import Bootstrap, EnsembleFit, bootstrap, fit_ensemble
 from mpmjax.fitting._experiment import Experiment as Experiment
 from mpmjax.fitting._field import Field
@@ -15,29 +12,28 @@ from mpmjax.fitting._fit import fit as fit
 from mpmjax.fitting._gradient_methods import LBFGS, Adam
 from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._multistart import LocalMinimum, MultistartFit, fit_multistart
-from mpmjax.fitting._observation import AbstractObservation
-from mpmjax.fitting._observation import Curve as Curve
-from mpmjax.fitting._observation import Series as Series
-from mpmjax.fitting._observation import Tracks as Tracks
+from mpmjax.fitting._observation import AbstractObservation, Curve as Curve, Series as Series, Tracks as Tracks
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
-from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._parameter import Bounded as Bounded
-from mpmjax.fitting._parameter import Positive as Positive
-from mpmjax.fitting._parameter import Unbounded as Unbounded
+from mpmjax.fitting._parameter import (
+    AbstractParameter,
+    Bounded as Bounded,
+    Positive as Positive,
+    Unbounded as Unbounded,
+)
 from mpmjax.fitting._prediction import Prediction, predict, predict_observations
 from mpmjax.fitting._prior import AbstractPrior, Gaussian, Smooth
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._profile import Profile, profile
-from mpmjax.fitting._quantities import CentreOfMass as CentreOfMass
-from mpmjax.fitting._quantities import Density
-from mpmjax.fitting._quantities import Extent as Extent
-from mpmjax.fitting._quantities import Markers as Markers
-from mpmjax.fitting._quantities import StressStretch as StressStretch
-from mpmjax.fitting._reaction import Force as Force
-from mpmjax.fitting._reaction import Torque
+from mpmjax.fitting._quantities import (
+    CentreOfMass as CentreOfMass,
+    Density,
+    Extent as Extent,
+    Markers as Markers,
+    StressStretch as StressStretch,
+)
+from mpmjax.fitting._reaction import Force as Force, Torque
 from mpmjax.fitting._refined import RefinedFit, fit_refined
-from mpmjax.fitting._result import AbstractFit, Estimate, NoiseEstimate
-from mpmjax.fitting._result import FitResult as FitResult
+from mpmjax.fitting._result import AbstractFit, Estimate, FitResult as FitResult, NoiseEstimate
 from mpmjax.fitting._staged import Stage, StagedFit, fit_staged
 
 __all__ = [
