@@ -14,13 +14,12 @@ import mpmjax as mpm
 from mpmjax._types import components
 from mpmjax.boundary import mirror
 from mpmjax.discretisation._transfer import p2g
-from mpmjax.implicit._conjugate_residual import NEGLIGIBLE_CHANGE, _outcome, _System
+from mpmjax.implicit._conjugate_residual import NEGLIGIBLE_CHANGE, SolverResult, StoppingCriteria, _outcome
 from mpmjax.implicit._inner_product import DiagonalInnerProduct
 from mpmjax.implicit._linear_solve import NEARLY_CONVERGED
 from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.implicit._projection import Projection
-from mpmjax.implicit._restarts import Ends, Found
 
 N = 24
 DTYPES = {"float64": jnp.float64, "float32": jnp.float32}
@@ -449,9 +448,7 @@ ENDED = {
 def test_how_a_solve_ended(name):
     """‖b‖ = 3 and ‖x‖ = 2, the residual in units of the tolerance."""
     changes, result, nearly = ENDED[name]
-    system = object.__new__(_System)
-    object.__setattr__(system, "ends", Ends(RTOL, MOST))
-    found = {
+    end = {
         "k": 3,
         "correction": 1.9 * NEGLIGIBLE_CHANGE,
         "radius": 1.0,
@@ -459,10 +456,11 @@ def test_how_a_solve_ended(name):
         "x_norm": 2.0,
         "residual": 1.0,
     }
-    found |= dict.fromkeys(("small_increment", "breakdown", "indefinite", "stalled"), False) | changes
-    residual = found.pop("residual") * (1 - 1e-9) * RTOL * 3
-    numbers = {field: jnp.asarray(value) for field, value in found.items()}
-    ended, said = _outcome(system, Found(x=jnp.ones(2), rr=jnp.asarray(residual**2), **numbers))
-    assert ended == result
-    assert bool(said["nearly_converged"]) == nearly
-    np.testing.assert_allclose(said["residual"], residual / 3)
+    end |= dict.fromkeys(("small_increment", "breakdown", "indefinite", "stalled"), False) | changes
+    residual = end.pop("residual") * (1 - 1e-9) * RTOL * 3
+    numbers = {field: jnp.asarray(value) for field, value in end.items()}
+    end = SolverResult(x=jnp.ones(2), rr=jnp.asarray(residual**2), **numbers)
+    code, statistics = _outcome(StoppingCriteria(RTOL, MOST), end)
+    assert code == result
+    assert bool(statistics["nearly_converged"]) == nearly
+    np.testing.assert_allclose(statistics["residual"], residual / 3)

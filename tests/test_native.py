@@ -15,7 +15,7 @@ from helpers import NEEDS_LIBRARY, assert_close, block, thorough
 import mpmjax as mpm
 from mpmjax import linalg as la
 from mpmjax.discretisation import _average, _resistance, _transfer_sums as sums, make_stencil, resist
-from mpmjax.implicit import _recurrence, _restarts, _vectors
+from mpmjax.implicit import _conjugate_residual, _vectors
 from mpmjax.native import _library
 
 ROOT = Path(__file__).parents[1]
@@ -406,8 +406,9 @@ def test_solves_agree(choose, d):
     active = _vectors.active_blocks(free)
 
     def run(factor, steps, r, rtol, far):
-        matrices = _recurrence.ParticleMatrices((index, w, g), None, upper, mass, factor, free)
-        return _restarts.restarted_by_matrices(matrices, weight, active, _restarts.Ends(rtol, steps), r, far * x)
+        matrices = _vectors.ParticleMatrices((index, w, g), None, upper, mass, factor, free)
+        criteria = _conjugate_residual.StoppingCriteria(rtol, steps)
+        return _conjugate_residual.solve_particle_matrices(matrices, weight, active, r, far * x, criteria)
 
     x = jnp.where(free, jnp.asarray(rng.normal(size=size)), 0)
     given = (

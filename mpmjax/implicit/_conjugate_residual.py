@@ -1,23 +1,29 @@
 """The conjugate residual method."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
+from jax.core import ShapedArray
 from jax.flatten_util import ravel_pytree
 
-from mpmjax._types import Array, Bool, Float, Scalar
+from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.checks import require, require_fields, require_positive, require_tolerance
+from mpmjax.discretisation import bound, define_placed
 from mpmjax.implicit._inner_product import AbstractInnerProduct, DiagonalInnerProduct
 from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, AbstractInnerProductSolver, default_rtol
-from mpmjax.implicit._recurrence import ParticleMatrices, Passes
-from mpmjax.implicit._restarts import Ends, Found, restarted, restarted_by_matrices
-from mpmjax.implicit._vectors import active_blocks, combine
+from mpmjax.implicit._vectors import ParticleMatrices, active_blocks, combine
+from mpmjax.native import differentiable, native_primitive, sums_fit
 
 NEGLIGIBLE_CHANGE = 1e-3
 """Largest relative change of the solution by one more correction, where rounding hides the tolerance."""
+
+_REACH = 64.0  # the recurrence's own residual means nothing below so many units of rounding of the one it started from
+_Combination = tuple[Array, Scalar, Array]
 
 
 class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
@@ -39,7 +45,7 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
     - `inner_product`: the inner product of W, an `AbstractInnerProduct`. Default: W = I.
     - `y0`: the initial guess. Default: zeros.
     - `support`: where A is not the identity, booleans of the vector's structure. What is zero elsewhere stays zero
-      there, and is passed over. Default: everywhere.
+      there, and is skipped. Default: everywhere.
     - `product`: for a diagonal W, the operator's `product` (see `AbstractSymmetricOperator`), which may be faster than
       its `mv` and sums. Default: these.
     - `matrices`: for a diagonal W, the operator as one matrix for each particle (see `ParticleMatrices`), with which
@@ -87,20 +93,43 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
             )
         return operator
 
-    # The recurrence is the derivation's, with the application of E moved to the head of the loop, which saves the last
-    # one. Around it is a loop that this method's textbook form lacks: the recurrence's residual drifts from the true
-    # one (by ε‖E‖‖x‖ a step). So when the recurrence's residual meets the tolerance, or is too small to be trusted, the
-    # true residual is computed, and if that is not small enough the recurrence starts anew from it. Three sums over the
-    # vector are all that an iteration takes: ‖s‖ follows from ‖q‖, the q being orthogonal.
     def compute(
         self, state: lx.AbstractLinearOperator, vector: Any, options: dict[str, Any]
     ) -> tuple[Any, lx.RESULTS, dict[str, Any]]:
-        system = _system(self, state, vector, options)
-        y0 = options.get("y0")
-        x = jnp.zeros_like(system.b) if y0 is None else system.started(ravel_pytree(y0)[0])
-        found = system.solve(x)
-        result, stats = _outcome(system, found)
-        return system.unravel(system.plain(found.x)), result, stats
+        flat, unravel = ravel_pytree(vector)
+        rtol = options.get("rtol", default_rtol(flat.dtype)) if self.rtol is None else self.rtol
+        criteria = StoppingCriteria(rtol, self.max_steps, self.increment_rtol)
+        inner: AbstractInnerProduct | None = options.get("inner_product")
+        y0, fused, matrices = (options.get(name) for name in ("y0", "product", "matrices"))
+        x = jnp.zeros_like(flat) if y0 is None else ravel_pytree(y0)[0]
+
+        def multiply(u: Array) -> Array:
+            return ravel_pytree(state.mv(unravel(u)))[0]
+
+        if inner is not None and not isinstance(inner, DiagonalInnerProduct):
+            space = _PairSpace(multiply, lambda r: ravel_pytree(inner.solve(unravel(r)))[0])
+            pair = jnp.stack([x, ravel_pytree(inner.apply(unravel(x)))[0]])
+            end = conjugate_residual(space, space.pair(flat), pair, criteria)
+            end = end._replace(x=end.x[0])
+        else:
+            weight = jnp.ones_like(flat) if inner is None else ravel_pytree(inner.weight)[0]
+            support = options.get("support")
+            inside = jnp.ones(flat.shape, bool) if support is None else ravel_pytree(support)[0]
+            active = active_blocks(inside, flat != 0, x != 0)
+
+            def product(u: Array) -> tuple[Array, Float[Array, ""]]:
+                if fused is None:
+                    image = multiply(u)
+                    return image / weight, (u * image).sum()
+                image, square = fused(unravel(u), unravel(weight), active)
+                return image.reshape(-1), square
+
+            if matrices is not None and self.increment_rtol is None:
+                end = solve_particle_matrices(matrices, weight, active, flat / weight, x, criteria)
+            else:
+                end = conjugate_residual(_DiagonalSpace(product, weight, active), flat / weight, x, criteria)
+        result, stats = _outcome(criteria, end)
+        return unravel(end.x), result, stats
 
     def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         return state, options
@@ -112,136 +141,252 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
         return True
 
 
-class _System(eqx.Module):
-    """E x = b in the inner product of W, on flat vectors, with its tolerances."""
+class StoppingCriteria(NamedTuple):
+    """Bounds at which the iteration ends."""
 
-    operator: lx.AbstractLinearOperator
-    inner: AbstractInnerProduct
-    unravel: Callable[[Array], Any] = eqx.field(static=True)
-    b: Float[Array, "*pair m"]
-    """W⁻¹ times the right-hand side."""
-    ends: Ends
-
-    def apply(self, u: Array) -> Array:
-        """E u."""
-        return self.inner.solve(ravel_pytree(self.operator.mv(self.unravel(u)))[0])
-
-    def product(self, u: Array) -> tuple[Array, Float[Array, ""]]:
-        """E u, and uᵀA u."""
-        image = self.apply(u)
-        return image, self.dot(u, image)
-
-    def dot(self, a: Array, c: Array) -> Float[Array, ""]:
-        """aᵀ W c."""
-        return (self.inner.apply(a) * c).sum()
-
-    def started(self, x: Array) -> Array:
-        """A plain vector as those of the recurrence."""
-        return x
-
-    def plain(self, x: Array) -> Array:
-        """And back."""
-        return x
-
-    def combined(
-        self, one: tuple[Array, Scalar, Array], other: tuple[Array, Scalar, Array], *, onto: int
-    ) -> tuple[Array, Array, Float[Array, ""]]:
-        """From (a, s, b) and (c, t, d): a + s b, c + t d, and the square of the latter's norm (see `combine`)."""
-        del onto
-        (a, s, b), (c, t, d) = one, other
-        second = c + t * d
-        return a + s * b, second, self.dot(second, second)
-
-    def solve(self, x: Array) -> Found:
-        """The end of the iteration, which starts at x."""
-        return restarted(Passes(self.product, self.combined, self.dot), self.ends, self.b, x)
+    rtol: Scalar
+    """‖r‖/‖W⁻¹b‖."""
+    max_steps: Scalar
+    """Steps of the recurrence."""
+    increment_rtol: Scalar | None = None
+    """‖α p‖/‖x‖."""
 
 
-class _DiagonalSystem(_System):
-    """The same for a diagonal W. Where no vector is different from zero, none becomes so, and all are passed over."""
+class SolverResult(NamedTuple):
+    """The last iterate, and how the iteration ended. Norms are those of W."""
 
+    x: Array
+    rr: Float[Array, ""]
+    """‖r‖², of the true residual."""
+    k: Int[Array, ""]
+    """Steps taken."""
+    radius: Float[Array, ""]
+    """Largest Rayleigh quotient |rᵀA r|/‖r‖²."""
+    breakdown: Bool[Array, ""]
+    """Whether rᵀA r = 0 to rounding was met."""
+    indefinite: Bool[Array, ""]
+    """Whether rᵀA r < 0 beyond rounding was met."""
+    correction: Float[Array, ""]
+    """Change of x since the last restart but one, which estimates its error; infinite if there was none."""
+    stalled: Bool[Array, ""]
+    """Whether the true residual has not halved between the last two restarts."""
+    b_norm: Float[Array, ""]
+    """‖W⁻¹b‖."""
+    x_norm: Float[Array, ""]
+    """‖x‖."""
+    small_increment: Bool[Array, ""] | bool = False
+    """Whether the last increment was within `increment_rtol`."""
+
+
+class _DiagonalSpace(NamedTuple):
+    """Vectors with a diagonal W. They are zero outside of the active blocks, which are skipped."""
+
+    product: Callable[[Array], tuple[Array, Float[Array, ""]]]
+    """E u and uᵀA u of u."""
     weight: Float[Array, "m"]
     """W."""
     active: Bool[Array, "k"]
-    """Where vectors may be different from zero (see `active_blocks`)."""
-    fused: Callable[..., tuple[Array, Float[Array, ""]]] | None
-    """The operator's `product`, if it was given."""
-    matrices: ParticleMatrices | None
-    """The operator's `matrices`, likewise."""
+    """See `active_blocks`."""
 
-    def solve(self, x: Array) -> Found:
-        if self.matrices is None or self.ends.increment_rtol is not None:
-            return super().solve(x)
-        return restarted_by_matrices(self.matrices, self.weight, self.active, self.ends, self.b, x)
+    def dot(self, a: Array, c: Array) -> Float[Array, ""]:
+        """aᵀ W c."""
+        return (self.weight * a * c).sum()
 
-    def product(self, u: Array) -> tuple[Array, Float[Array, ""]]:
-        if self.fused is None:
-            return super().product(u)
-        image, square = self.fused(self.unravel(u), self.unravel(self.weight), self.active)
-        return image.reshape(-1), square
-
-    def combined(
-        self, one: tuple[Array, Scalar, Array], other: tuple[Array, Scalar, Array], *, onto: int
-    ) -> tuple[Array, Array, Float[Array, ""]]:
+    def combine(self, one: _Combination, other: _Combination, *, onto: int) -> tuple[Array, Array, Array]:
+        """From (a, s, b) and (c, t, d): a + s b, c + t d and ‖c + t d‖² (see `combine` of vectors)."""
         return combine(one, other, self.weight, self.active, onto=onto)
 
 
-class _PairedSystem(_System):
-    """The same on pairs (v, W v), shape (2, m), for a W that is dear to apply: a step takes W⁻¹ once, and W never."""
+class _PairSpace(NamedTuple):
+    """Vectors as pairs (v, W v), shape (2, m), with any W: a step then takes W⁻¹ once, and W never."""
 
-    def apply(self, u: Array) -> Array:
-        image = ravel_pytree(self.operator.mv(self.unravel(u[0])))[0]
-        return jnp.stack([self.inner.solve(image), image])
+    multiply: Callable[[Array], Array]
+    """A v of v."""
+    solve: Callable[[Array], Array]
+    """W⁻¹ r of r."""
+
+    def pair(self, r: Array) -> Array:
+        """W⁻¹ r as a pair."""
+        return jnp.stack([self.solve(r), r])
+
+    def product(self, u: Array) -> tuple[Array, Float[Array, ""]]:
+        image = self.pair(self.multiply(u[0]))
+        return image, self.dot(u, image)
 
     def dot(self, a: Array, c: Array) -> Float[Array, ""]:
         return (a[1] * c[0]).sum()
 
-    def started(self, x: Array) -> Array:
-        return jnp.stack([x, self.inner.apply(x)])
-
-    def plain(self, x: Array) -> Array:
-        return x[0]
-
-
-def _system(
-    solver: ConjugateResidual, operator: lx.AbstractLinearOperator, vector: Any, options: dict[str, Any]
-) -> _System:
-    flat, unravel = ravel_pytree(vector)
-    inner: AbstractInnerProduct | None = options.get("inner_product")
-    inner = DiagonalInnerProduct(jnp.ones_like(flat)) if inner is None else inner.flattened(unravel)
-    b = jnp.stack([inner.solve(flat), flat]) if inner.paired else inner.solve(flat)
-    rtol = options.get("rtol", default_rtol(flat.dtype)) if solver.rtol is None else solver.rtol
-    given = operator, inner, unravel, b, Ends(rtol, solver.max_steps, solver.increment_rtol)
-    if inner.paired:
-        return _PairedSystem(*given)
-    if isinstance(inner, DiagonalInnerProduct):
-        found = options.get("product"), options.get("matrices")
-        return _DiagonalSystem(*given, inner.weight, _active(flat, options), *found)
-    return _System(*given)
+    def combine(self, one: _Combination, other: _Combination, *, onto: int) -> tuple[Array, Array, Array]:
+        del onto
+        (a, s, b), (c, t, d) = one, other
+        z = c + t * d
+        return a + s * b, z, self.dot(z, z)
 
 
-def _active(rhs: Array, options: dict[str, Any]) -> Bool[Array, "k"]:
-    """Where a vector of a solve with a diagonal W may be different from zero, as `active_blocks` has it."""
-    support, y0 = options.get("support"), options.get("y0")
-    inside = jnp.ones(rhs.shape, bool) if support is None else ravel_pytree(support)[0]
-    return active_blocks(inside, rhs != 0, *([] if y0 is None else [ravel_pytree(y0)[0] != 0]))
+class _State(NamedTuple):
+    """The letters of the derivation, eq. 19, and what `SolverResult` has of them."""
+
+    x: Array
+    r: Array
+    p: Array
+    q: Array
+    rr: Float[Array, ""]
+    qq: Float[Array, ""]
+    gamma: Float[Array, ""]
+    k: Int[Array, ""]
+    radius: Float[Array, ""]
+    small_increment: Bool[Array, ""]
+    breakdown: Bool[Array, ""]
+    indefinite: Bool[Array, ""]
+    restart_rr: Float[Array, ""]
+    """‖r‖² at the last restart."""
+    correction: Float[Array, ""]
+    stalled: Bool[Array, ""]
+    done: Bool[Array, ""]
 
 
-def _outcome(system: _System, found: Found) -> tuple[lx.RESULTS, dict[str, Any]]:
-    """The result and statistics at the end of the iteration."""
-    residual, rtol, most = jnp.sqrt(found.rr), system.ends.rtol, system.ends.steps
-    negligible = found.correction <= NEGLIGIBLE_CHANGE * found.x_norm
-    exact = found.stalled & ~found.breakdown & (found.k < most) & negligible
-    converged = ((residual <= rtol * found.b_norm) | exact | found.small_increment) & jnp.isfinite(residual)
-    result = lx.RESULTS.where(found.k < most, lx.RESULTS.stagnation, lx.RESULTS.max_steps_reached)
-    result = lx.RESULTS.where(found.breakdown, lx.RESULTS.breakdown, result)
-    result = lx.RESULTS.where(jnp.isfinite(residual), result, lx.RESULTS.nonfinite_input)
+def conjugate_residual(
+    space: _DiagonalSpace | _PairSpace, b: Array, x: Array, criteria: StoppingCriteria
+) -> SolverResult:
+    """The solution of E x = b.
+
+    Args:
+        space: E and the inner product.
+        b: W⁻¹ times the right-hand side.
+        x: the initial guess.
+        criteria: the bounds at which it ends.
+    """
+    # Differences from the derivation:
+    #
+    # 1. E is applied at the head of the loop, which saves the last application.
+    # 2. A step takes three sums over the vectors: ‖s‖² follows from ‖q‖², as the q are orthogonal.
+    # 3. The recurrence's residual drifts from the true one, by ε‖E‖‖x‖ a step. Where it meets the tolerance, or is too
+    #    small to be trusted, the true residual is computed. If that is not small enough, the recurrence restarts from
+    #    it, until a restart no longer halves it.
+    eps = jnp.finfo(b.dtype).eps
+    b_norm = jnp.sqrt(space.dot(b, b))
+    tolerance, max_steps = criteria.rtol * b_norm, jnp.asarray(criteria.max_steps)
+
+    def in_progress(c: _State) -> Bool[Array, ""]:
+        steps_left = c.k.astype(max_steps.dtype) < max_steps
+        return (jnp.sqrt(c.rr) > tolerance) & ~c.small_increment & ~c.breakdown & steps_left
+
+    def cond_fun(c: _State) -> Bool[Array, ""]:
+        return ~c.done & in_progress(c) & (c.rr > (_REACH * eps) ** 2 * c.restart_rr)
+
+    def body_fun(c: _State) -> _State:
+        s, gamma = space.product(c.r)
+        beta = gamma / c.gamma
+        p, q, qq = space.combine((c.r, beta, c.p), (s, beta, c.q), onto=1)
+        rounding = eps * jnp.sqrt(c.rr * (qq + beta**2 * c.qq))  # of γ: ε‖r‖‖s‖
+        breakdown = jnp.abs(gamma) <= rounding
+        alpha = jnp.where(breakdown, 0, gamma / jnp.where(breakdown, 1, qq))
+        x, r, rr = space.combine((c.x, alpha, p), (c.r, -alpha, q), onto=0)
+        small_increment = c.small_increment
+        if criteria.increment_rtol is not None:
+            small = alpha**2 * space.dot(p, p) <= criteria.increment_rtol**2 * space.dot(x, x)
+            small_increment = ~breakdown & small
+        radius, indefinite = jnp.maximum(c.radius, jnp.abs(gamma) / c.rr), c.indefinite | (gamma < -rounding)
+        c = c._replace(x=x, r=r, p=p, q=q, rr=rr, qq=qq, gamma=gamma, k=c.k + 1, radius=radius)
+        return c._replace(small_increment=small_increment, breakdown=breakdown, indefinite=indefinite)
+
+    def restart(c: _State) -> _State:
+        r = b - space.product(c.x)[0]
+        rr = space.dot(r, r)
+        # an infinite γ makes the first β zero, so that p and q begin as r and s
+        start = c._replace(r=r, p=zeros, q=zeros, rr=rr, qq=zero, gamma=infinite, restart_rr=rr)
+        stalled = rr > c.restart_rr / 4
+        start = start._replace(stalled=stalled, done=stalled | ~in_progress(start))
+        end = jax.lax.while_loop(cond_fun, body_fun, start)
+        moved = end.x - c.x
+        return end._replace(correction=jnp.where(end.done, c.correction, jnp.sqrt(space.dot(moved, moved))))
+
+    zeros, zero, no = jnp.zeros_like(b), jnp.zeros_like(b_norm), jnp.zeros(b_norm.shape, bool)
+    infinite, k = jnp.full_like(b_norm, jnp.inf), jnp.zeros(b_norm.shape, jnp.int32)
+    start = _State(x, zeros, zeros, zeros, infinite, zero, infinite, k, zero, no, no, no, infinite, infinite, no, no)
+    c = jax.lax.while_loop(lambda c: ~c.done, restart, start)
+    ended = c.rr, c.k, c.radius, c.breakdown, c.indefinite, c.correction, c.stalled
+    return SolverResult(c.x, *ended, b_norm, jnp.sqrt(space.dot(c.x, c.x)), c.small_increment)
+
+
+def _outcome(criteria: StoppingCriteria, end: SolverResult) -> tuple[lx.RESULTS, dict[str, Any]]:
+    """The result and statistics of `ConjugateResidual.compute`."""
+    residual, tolerance = jnp.sqrt(end.rr), criteria.rtol * end.b_norm
+    ended_early, finite = end.k < criteria.max_steps, jnp.isfinite(residual)
+    negligible = end.correction <= NEGLIGIBLE_CHANGE * end.x_norm
+    exact = end.stalled & ~end.breakdown & ended_early & negligible
+    converged = ((residual <= tolerance) | exact | end.small_increment) & finite
+    result = lx.RESULTS.where(ended_early, lx.RESULTS.stagnation, lx.RESULTS.max_steps_reached)
+    result = lx.RESULTS.where(end.breakdown, lx.RESULTS.breakdown, result)
+    result = lx.RESULTS.where(finite, result, lx.RESULTS.nonfinite_input)
     result = lx.RESULTS.where(converged, lx.RESULTS.successful, result)
     return result, {
-        "num_steps": found.k,
-        "max_steps": most,
-        "residual": residual / jnp.where(found.b_norm == 0, 1, found.b_norm),
-        "spectral_radius": found.radius,
-        "indefinite": found.indefinite,
-        "nearly_converged": ~converged & (residual <= NEARLY_CONVERGED * rtol * found.b_norm),
+        "num_steps": end.k,
+        "max_steps": criteria.max_steps,
+        "residual": residual / jnp.where(end.b_norm == 0, 1, end.b_norm),
+        "spectral_radius": end.radius,
+        "indefinite": end.indefinite,
+        "nearly_converged": ~converged & (residual <= NEARLY_CONVERGED * tolerance),
     }
+
+
+def solve_particle_matrices(
+    matrices: ParticleMatrices,
+    weight: Float[Array, "m"],
+    active: Bool[Array, "k"],
+    b: Array,
+    x: Array,
+    criteria: StoppingCriteria,
+) -> SolverResult:
+    """`conjugate_residual` with one matrix for each particle and a diagonal W, as a primitive.
+
+    On CPUs the native library runs it as a whole, and in a batch each member by itself. A loop of JAX goes on for all
+    members until the last one is done, and selects whole vectors in every step.
+
+    Args:
+        matrices: A.
+        weight: the diagonal of W, shape (m,).
+        active: `active_blocks`. In others x and b are zero.
+        b: W⁻¹ times the right-hand side.
+        x: the initial guess.
+        criteria: the bounds at which it ends, without an `increment_rtol`.
+    """
+    floor = (_REACH * jnp.finfo(b.dtype).eps) ** 2
+    limits = jnp.stack([jnp.asarray(number, b.dtype) for number in (criteria.rtol, criteria.max_steps, floor)])
+    factor = jnp.asarray(matrices.factor, b.dtype)
+    args = matrices.upper, matrices.mass, factor, matrices.free, weight, active, x, b, limits
+    x, (rr, k, radius, breakdown, indefinite, correction, stalled, b_norm, x_norm) = bound(
+        _solve_p, matrices, *args, batched=0
+    )
+    flags = breakdown > 0, indefinite > 0
+    return SolverResult(x, rr, k.astype(jnp.int32), radius, *flags, correction, stalled > 0, b_norm, x_norm)
+
+
+def _solve(*args: Array, unroll: bool = False) -> list[Array]:
+    del unroll  # the sums know
+    index, weights, derivatives, upper, mass, factor, free, weight, active, x, b, limits = args
+    matrices = ParticleMatrices((index, weights, derivatives), None, upper, mass, factor, free)
+    space = _DiagonalSpace(lambda u: matrices.product(u, weight, active), weight, active)
+    x, *numbers, _ = conjugate_residual(space, b, x, StoppingCriteria(limits[0], limits[1]))
+    return [x, jnp.stack([a.astype(b.dtype) for a in numbers])]
+
+
+def _solve_shapes(*args: ShapedArray) -> list[tuple]:
+    return [args[-3].shape[-1:], (9,)]
+
+
+def _workspace(*args: ShapedArray) -> tuple:
+    """Six vectors. Members of a batch, which run one after the other in a thread, take their own."""
+    *batch, size = args[-3].shape
+    return (0 if batch else 6 * size,)
+
+
+def _fits(avals: Any, batched: int) -> bool:
+    return sums_fit([aval for aval in avals if aval.dtype != np.bool_], batched)
+
+
+# The derivative is that of the loop in JAX, and never taken: solves are not differentiated through their iterations.
+_solve_p = differentiable(
+    native_primitive("matrices_solve", _solve, _solve_shapes, _fits, {9: 0}, workspace=_workspace, placed=False), _solve
+)
+define_placed(_solve_p, _solve, _solve_shapes, workspace=_workspace, fits=_fits, aliases={10: 0})

@@ -1,15 +1,11 @@
 """The inner product in which a linear system is solved."""
 
 import abc
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
-
-from mpmjax._types import Array
 
 
 class AbstractInnerProduct(eqx.Module):
@@ -39,18 +35,9 @@ class AbstractInnerProduct(eqx.Module):
         """W⁻¹ r."""
         return self.solve_factor_transpose(self.solve_factor(r))
 
-    @property
-    def paired(self) -> bool:
-        """Whether W v takes much longer than W⁻¹ r, so that `ConjugateResidual` keeps W v beside each vector v."""
-        return False
-
     def factored(self) -> "AbstractInnerProduct":
         """The inner product for solvers that need L: this one, if it has the factor."""
         return self
-
-    def flattened(self, unravel: Callable[[Array], Any]) -> "AbstractInnerProduct":
-        """The same inner product on vectors flattened by `jax.flatten_util.ravel_pytree`."""
-        return _FlatInnerProduct(self, unravel)
 
 
 class DiagonalInnerProduct(AbstractInnerProduct):
@@ -73,27 +60,3 @@ class DiagonalInnerProduct(AbstractInnerProduct):
 
     def solve(self, r: Any) -> Any:
         return jax.tree.map(jnp.divide, r, self.weight)
-
-    def flattened(self, unravel: Callable[[Array], Any]) -> "DiagonalInnerProduct":
-        return DiagonalInnerProduct(ravel_pytree(self.weight)[0])
-
-
-class _FlatInnerProduct(AbstractInnerProduct):
-    inner: AbstractInnerProduct
-    unravel: Callable[[Array], Any] = eqx.field(static=True)
-
-    @property
-    def paired(self) -> bool:
-        return self.inner.paired
-
-    def apply(self, v: Array) -> Array:
-        return ravel_pytree(self.inner.apply(self.unravel(v)))[0]
-
-    def solve(self, r: Array) -> Array:
-        return ravel_pytree(self.inner.solve(self.unravel(r)))[0]
-
-    def solve_factor(self, r: Array) -> Array:
-        return ravel_pytree(self.inner.solve_factor(self.unravel(r)))[0]
-
-    def solve_factor_transpose(self, v: Array) -> Array:
-        return ravel_pytree(self.inner.solve_factor_transpose(self.unravel(v)))[0]

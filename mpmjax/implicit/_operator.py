@@ -11,8 +11,7 @@ import lineax as lx
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.implicit._hessian_action import AbstractHessianAction, ParticleStiffness
 from mpmjax.implicit._projection import Projection
-from mpmjax.implicit._recurrence import ParticleMatrices
-from mpmjax.implicit._vectors import product
+from mpmjax.implicit._vectors import ParticleMatrices, product
 
 
 class AbstractSymmetricOperator(lx.AbstractLinearOperator):

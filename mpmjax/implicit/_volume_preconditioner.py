@@ -128,10 +128,6 @@ class VolumeInnerProduct(AbstractInnerProduct):
     box: NodeBox
     diagonal: DiagonalInnerProduct
 
-    @property
-    def paired(self) -> bool:
-        return True
-
     def factored(self) -> DiagonalInnerProduct:
         """The inner product of the diagonal of M + χH."""
         return self.diagonal
