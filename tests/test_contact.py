@@ -17,7 +17,7 @@ from mpmjax.boundary._friction import friction_across, friction_along, share_tak
 from mpmjax.boundary._mirror import Mirror
 from mpmjax.checks._values import canonical
 from mpmjax.implicit._projection import Projection
-from mpmjax.implicit._solve_info import no_solve
+from mpmjax.implicit._solution import no_solve
 from mpmjax.stepping import NodeMotion, reaction, start_nodes, update
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)

@@ -9,10 +9,9 @@ from helpers import DESCRIPTIONS, ELASTIC, LAWS, assert_close, block, explicit_l
 from numpy_oracle import grid_update, stress
 
 import mpmjax as mpm
-from mpmjax.implicit._hessian import AnalyticHessian
-from mpmjax.implicit._line_search import MOST_HALVINGS, backtrack
-from mpmjax.implicit._problems import LinearProblem
-from mpmjax.implicit._solve_info import SolveInfo
+from mpmjax.implicit._newton import MOST_HALVINGS, backtrack
+from mpmjax.implicit._problem import Problem
+from mpmjax.implicit._solution import SolveInfo
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 NEWTON = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12))
@@ -247,15 +246,19 @@ def test_single_precision_converges_and_says_how_far(times):
     assert grid.info.solve.iterations < 300
     widen = lambda a: a.astype(jnp.float64) if a.dtype == jnp.float32 else a  # noqa: E731
     nodes = jax.tree.map(widen, grid.nodes)
-    predictor = nodes.explicit_velocity()
-    problem = LinearProblem(
+    problem = Problem(
         mass=nodes.mass,
-        factor=nodes.dt**2,
-        hessian=AnalyticHessian().at_step_start(nodes.potential),
-        rhs=nodes.mass[:, None] * predictor,
+        inertial=nodes.inertial_velocity(),
+        stage_dt=nodes.dt,
+        initial_displacement=None,
+        force=nodes.force,
+        spacing=nodes.spacing,
+        potential=nodes.potential,
+        hessian=mpm.AnalyticHessian(),
         projection=nodes.projection,
         prescribed=nodes.prescribed,
-    )
+        preconditioner=mpm.MassPreconditioner(),
+    ).linearised()
 
     def norm(a):
         return float(jnp.sqrt((a**2 / jnp.where(nodes.occupied, nodes.mass[:, None], 1)).sum()))

@@ -1,7 +1,5 @@
 """A way of a user's own to solve the stages of implicit steps, written in one file outside of the package."""
 
-from functools import reduce
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,12 +14,6 @@ class Chord(mpm.AbstractSolution):
     """Newton's method with the Hessian of its start in all steps."""
 
     steps: int = eqx.field(static=True, default=8)
-
-    def problem(self, stage):
-        return stage.nonlinear()
-
-    def stage_force(self, potential, hessian, force, *stages):
-        return reduce(jnp.add, (q * potential.force(u) for q, u in stages))
 
     def __call__(self, problem, guess):
         v = problem.apply_dirichlet(guess)

@@ -1,21 +1,18 @@
 """The elastic potential, its Hessian, and the nodal problems of the implicit updates and their solution."""
 
 from mpmjax.implicit._conjugate_residual import ConjugateResidual
-from mpmjax.implicit._guess import Guess
 from mpmjax.implicit._hessian import AbstractHessian, AnalyticHessian, JvpHessian
 from mpmjax.implicit._hessian_action import AbstractHessianAction, ParticleStiffness, TangentAction, damped
 from mpmjax.implicit._inner_product import AbstractInnerProduct, DiagonalInnerProduct
 from mpmjax.implicit._linear_solve import AbstractInnerProductSolver, require_solver
-from mpmjax.implicit._linearised import Linearised
 from mpmjax.implicit._newton import Newton
 from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.implicit._preconditioner import AbstractPreconditioner, DiagonalPreconditioner, MassPreconditioner
-from mpmjax.implicit._problems import LinearProblem, NewtonProblem
+from mpmjax.implicit._problem import Guess, Problem
 from mpmjax.implicit._projection import Projection
-from mpmjax.implicit._solution import AbstractSolution, StageEquation, exact_force
+from mpmjax.implicit._solution import AbstractSolution, Linearised, SolveInfo, exact_force, no_solve
 from mpmjax.implicit._solve import Reporting, solve
-from mpmjax.implicit._solve_info import SolveInfo, no_solve
 from mpmjax.implicit._volume_preconditioner import VolumePreconditioner
 
 __all__ = [
@@ -33,16 +30,14 @@ __all__ = [
     "Guess",
     "ImplicitOperator",
     "JvpHessian",
-    "LinearProblem",
     "Linearised",
     "MassPreconditioner",
     "Newton",
-    "NewtonProblem",
     "ParticleStiffness",
+    "Problem",
     "Projection",
     "Reporting",
     "SolveInfo",
-    "StageEquation",
     "TangentAction",
     "VolumePreconditioner",
     "damped",

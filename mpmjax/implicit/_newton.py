@@ -1,5 +1,6 @@
 """Newton's method for the nodal problems."""
 
+from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -10,16 +11,14 @@ import lineax as lx
 from mpmjax._types import Array, Bool, Float, Int, NodeVector, Scalar
 from mpmjax.checks import require, require_fields, require_tolerance
 from mpmjax.implicit._conjugate_residual import NEGLIGIBLE_CHANGE, ConjugateResidual
-from mpmjax.implicit._hessian import AbstractHessian
 from mpmjax.implicit._inner_product import AbstractInnerProduct
-from mpmjax.implicit._line_search import MOST_HALVINGS, backtrack
 from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, default_rtol, require_solver, solve_linear
 from mpmjax.implicit._operator import ImplicitOperator
-from mpmjax.implicit._potential import ElasticPotential
-from mpmjax.implicit._problems import NewtonProblem
-from mpmjax.implicit._solution import AbstractSolution, StageEquation, exact_force
-from mpmjax.implicit._solve_info import SolveInfo
+from mpmjax.implicit._problem import Problem
+from mpmjax.implicit._solution import AbstractSolution, SolveInfo
 
+MOST_HALVINGS = 30
+_SUFFICIENT_DECREASE = 1e-4
 _ROUNDING = 4.0  # units of rounding that a sum over the particles and nodes is taken to have
 
 
@@ -68,27 +67,7 @@ class Newton(AbstractSolution):
             require_tolerance("Newton's rtol", self.rtol)
         require(self.max_steps >= 1, f"Newton's max_steps must be at least 1, got {self.max_steps}.")
 
-    def problem(self, stage: StageEquation) -> NewtonProblem:
-        return stage.nonlinear()
-
-    def stage_force(
-        self,
-        potential: ElasticPotential,
-        hessian: AbstractHessian,
-        force: NodeVector,
-        *stages: tuple[Scalar, NodeVector],
-    ) -> NodeVector:
-        """Σ q f(u) [N]."""
-        del hessian, force
-        return exact_force(potential, *stages)
-
-    def __call__(self, problem: NewtonProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
-        """The solution [m/s], shape (n, d), and the report of the solve.
-
-        Args:
-            problem: the problem.
-            guess: where the iteration starts [m/s], shape (n, d).
-        """
+    def __call__(self, problem: Problem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         rtol = default_rtol(guess.dtype) if self.rtol is None else self.rtol
         setting, start = _setting(problem, guess, rtol)
 
@@ -102,7 +81,7 @@ class Newton(AbstractSolution):
 class _Setting(eqx.Module):
     """The constants of an iteration."""
 
-    problem: NewtonProblem
+    problem: Problem
     rtol: Scalar
     mass: NodeVector
     """Nodal masses [kg], 1 in components that are not free: the weight of the norms in the termination rule."""
@@ -152,7 +131,7 @@ class _Direction(eqx.Module):
     indefinite: Bool[Array, ""]
 
 
-def _setting(problem: NewtonProblem, guess: NodeVector, rtol: Scalar) -> tuple[_Setting, _NewtonState]:
+def _setting(problem: Problem, guess: NodeVector, rtol: Scalar) -> tuple[_Setting, _NewtonState]:
     """The constants and the initial state of an iteration."""
     combine, free = problem.projection.combine, problem.projection.free
     rest = problem.apply_dirichlet(jnp.zeros_like(guess))
@@ -244,9 +223,38 @@ def _direction(
     )
 
 
-def _negligible(
-    problem: NewtonProblem, inner: AbstractInnerProduct, v: NodeVector, step: NodeVector
-) -> Bool[Array, ""]:
+def backtrack(
+    merit: Callable[[Float[Array, ""]], Float[Array, ""]],
+    start: Float[Array, ""],
+    slope: Float[Array, ""],
+    slack: Float[Array, ""],
+) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """The first step size a of 1, ½, ¼, ... with sufficient decrease, E(a) ≤ E(0) + 10⁻⁴ a E'(0) + slack (L. Armijo,
+    Pacific J. Math. 16 (1966) 1, doi 10.2140/pjm.1966.16.1).
+
+    The slack is the rounding of E. Near a minimum the expected decrease is smaller than it, and without slack a good
+    step would be refused. NaN is no decrease, so a step that leaves the domain of E is halved.
+
+    Args:
+        merit: the function E of the step size [J].
+        start: E(0).
+        slope: E'(0), negative.
+        slack: by how much E may miss the decrease [J].
+
+    Returns:
+        The step size, and the number of halvings. At `MOST_HALVINGS` the search has failed.
+    """
+
+    def refused(trial: tuple[Array, Array]) -> Bool[Array, ""]:
+        size, halvings = trial
+        decreased = merit(size) <= start + _SUFFICIENT_DECREASE * size * slope + slack
+        return ~decreased & (halvings < MOST_HALVINGS)
+
+    whole, zero_count = jnp.ones((), start.dtype), jnp.asarray(0, dtype=jnp.int32)
+    return jax.lax.while_loop(refused, lambda trial: (trial[0] / 2, trial[1] + 1), (whole, zero_count))
+
+
+def _negligible(problem: Problem, inner: AbstractInnerProduct, v: NodeVector, step: NodeVector) -> Bool[Array, ""]:
     """Whether a step changes the velocity by no more than a thousandth, or strains by no more than √ε."""
     unseen = jnp.sqrt(jnp.finfo(v.dtype).eps) * problem.unit_strain_velocity()
     vectors = step, problem.projection.combine(v + step, 0), jnp.where(problem.projection.free, unseen, 0)

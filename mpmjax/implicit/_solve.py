@@ -14,9 +14,8 @@ import lineax as lx
 from mpmjax._types import Array, NodeVector, Scalar
 from mpmjax.autodiff import kept, ruled, without_derivative
 from mpmjax.implicit._linear_solve import derivative_rtol, solve_linear
-from mpmjax.implicit._problems import AbstractProblem
-from mpmjax.implicit._solution import AbstractSolution
-from mpmjax.implicit._solve_info import SolveInfo
+from mpmjax.implicit._problem import Problem
+from mpmjax.implicit._solution import AbstractSolution, SolveInfo
 
 
 class Reporting(eqx.Module):
@@ -34,7 +33,7 @@ class Reporting(eqx.Module):
 
 
 def solve(
-    problem: AbstractProblem,
+    problem: Problem,
     guess: NodeVector,
     find: AbstractSolution,
     adjoint: lx.AbstractLinearSolver | Reporting,
@@ -56,7 +55,7 @@ def solve(
 
 @ruled
 def _solve(
-    problem: AbstractProblem, slot: Array, guess: NodeVector, find: Any, adjoint: lx.AbstractLinearSolver
+    problem: Problem, slot: Array, guess: NodeVector, find: Any, adjoint: lx.AbstractLinearSolver
 ) -> tuple[NodeVector, SolveInfo]:
     del slot, adjoint
     return find(problem, guess)

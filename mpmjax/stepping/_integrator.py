@@ -13,9 +13,9 @@ from mpmjax.implicit import (
     AbstractPreconditioner,
     AbstractSolution,
     Guess,
+    Problem,
     Reporting,
     SolveInfo,
-    StageEquation,
     exact_force,
     require_solver,
     solve,
@@ -167,10 +167,10 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
         inertial: NodeVector,
         stage_dt: Scalar,
         initial_displacement: NodeVector | None = None,
+        theta: Scalar = 1.0,
     ) -> tuple[NodeVector, SolveInfo]:
-        """The solution v [m/s], shape (n, d), of M (v − a) = Δt_s (f(u + Δt_s v) − D v) (derivation, eq. 22 and section
-        10), and the report of the solve. f(u) is the elastic force at a nodal displacement u and −D v the viscous
-        force. One linear solve takes f(u) = f(0) − H u; Newton's method solves the nonlinear equation.
+        """The solution v [m/s], shape (n, d), of M (v − a) = Δt_s (f(u + θΔt_s v) − θ D v) (see `Problem`), and the
+        report of the solve. One linear solve takes f(u) = f(0) − H u; Newton's method solves the nonlinear equation.
 
         Args:
             nodes: the nodes.
@@ -178,8 +178,9 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
             inertial: a, the velocity of the stage without the force at its own end [m/s], shape (n, d).
             stage_dt: Δt_s, the length of the stage [s].
             initial_displacement: u at the start of the stage [m], shape (n, d); None for zero.
+            theta: θ, the share of the stage's displacement at which its force is evaluated [-].
         """
-        equation = StageEquation(
+        stage = Problem(
             mass=nodes.mass,
             inertial=inertial,
             stage_dt=jnp.asarray(stage_dt),
@@ -191,9 +192,10 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
             projection=nodes.projection,
             prescribed=nodes.prescribed if nodes.moves_held else None,
             preconditioner=self.preconditioner,
+            theta=theta,
         )
         solution = self.solved_by()
-        return solve(solution.problem(equation), guess, solution, self.adjoint_solver)
+        return solve(solution.problem(stage), guess, solution, self.adjoint_solver)
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt Σ q f(u) [kg m/s], with the forces that the solution takes."""

@@ -14,11 +14,8 @@ from mpmjax.implicit import (
     DiagonalPreconditioner,
     Guess,
     Linearised,
-    LinearProblem,
     SolveInfo,
-    damped,
     require_solver,
-    solve,
 )
 from mpmjax.stepping._integrator import AbstractImplicitIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
@@ -64,19 +61,11 @@ class SemiImplicit(AbstractImplicitIntegrator):
         require_between("SemiImplicit's beta", self.beta, 0, 1)
 
     def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
-        predictor, v0, beta = nodes.explicit_velocity(), nodes.admitted_velocity(), self.beta
-        viscous = nodes.potential.viscous
-        impulse = nodes.mass[:, None] * predictor
-        problem = LinearProblem(
-            mass=nodes.mass,
-            factor=beta * nodes.dt**2,
-            hessian=damped(self.hessian.at_step_start(nodes.potential), nodes.potential, 1 / nodes.dt),
-            rhs=impulse - (1 - beta) * nodes.dt * nodes.potential.viscous_resistance(v0) if viscous else impulse,
-            projection=nodes.projection,
-            prescribed=nodes.prescribed if nodes.moves_held else None,
-            preconditioner=self.preconditioner,
-        )
-        v, info = solve(problem, guess, self.solved_by(), self.adjoint_solver)
+        v0, beta = nodes.admitted_velocity(), self.beta
+        inertial, viscous = nodes.inertial_velocity(), nodes.potential.viscous
+        if viscous:
+            inertial = inertial - (1 - beta) * nodes.dt * nodes.per_mass(nodes.potential.viscous_resistance(v0))
+        v, info = self.solve_stage(nodes, guess, inertial, nodes.dt, theta=beta)
         return NodeMotion(v, resisted=(1 - beta) * v0 + beta * v if viscous else None), info
 
     def solved_by(self) -> Linearised:
