@@ -10,8 +10,8 @@ from numpy_oracle import grid_update, stress
 
 import mpmjax as mpm
 from mpmjax.implicit._newton import MOST_HALVINGS, backtrack
-from mpmjax.implicit._problem import Problem
 from mpmjax.implicit._solution import SolveInfo
+from mpmjax.implicit._stage_problem import StageProblem
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 NEWTON = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12))
@@ -246,7 +246,7 @@ def test_single_precision_converges_and_says_how_far(times):
     assert grid.info.solve.iterations < 300
     widen = lambda a: a.astype(jnp.float64) if a.dtype == jnp.float32 else a  # noqa: E731
     nodes = jax.tree.map(widen, grid.nodes)
-    problem = Problem(
+    problem = StageProblem(
         mass=nodes.mass,
         inertial=nodes.inertial_velocity(),
         stage_dt=nodes.dt,

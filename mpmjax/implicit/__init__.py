@@ -9,10 +9,10 @@ from mpmjax.implicit._newton import Newton
 from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.implicit._preconditioner import AbstractPreconditioner, DiagonalPreconditioner, MassPreconditioner
-from mpmjax.implicit._problem import Guess, Problem
 from mpmjax.implicit._projection import Projection
 from mpmjax.implicit._solution import AbstractSolution, Linearised, SolveInfo, exact_force, no_solve
 from mpmjax.implicit._solve import Reporting, solve
+from mpmjax.implicit._stage_problem import Guess, StageProblem
 from mpmjax.implicit._volume_preconditioner import VolumePreconditioner
 
 __all__ = [
@@ -34,10 +34,10 @@ __all__ = [
     "MassPreconditioner",
     "Newton",
     "ParticleStiffness",
-    "Problem",
     "Projection",
     "Reporting",
     "SolveInfo",
+    "StageProblem",
     "TangentAction",
     "VolumePreconditioner",
     "damped",

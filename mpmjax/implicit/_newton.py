@@ -14,8 +14,8 @@ from mpmjax.implicit._conjugate_residual import NEGLIGIBLE_CHANGE, ConjugateResi
 from mpmjax.implicit._inner_product import AbstractInnerProduct
 from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, default_rtol, require_solver, solve_linear
 from mpmjax.implicit._operator import ImplicitOperator
-from mpmjax.implicit._problem import Problem
 from mpmjax.implicit._solution import AbstractSolution, SolveInfo
+from mpmjax.implicit._stage_problem import StageProblem
 
 MOST_HALVINGS = 30
 _SUFFICIENT_DECREASE = 1e-4
@@ -67,7 +67,7 @@ class Newton(AbstractSolution):
             require_tolerance("Newton's rtol", self.rtol)
         require(self.max_steps >= 1, f"Newton's max_steps must be at least 1, got {self.max_steps}.")
 
-    def __call__(self, problem: Problem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
+    def __call__(self, problem: StageProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         rtol = default_rtol(guess.dtype) if self.rtol is None else self.rtol
         setting, start = _setting(problem, guess, rtol)
 
@@ -81,7 +81,7 @@ class Newton(AbstractSolution):
 class _Setting(eqx.Module):
     """The constants of an iteration."""
 
-    problem: Problem
+    problem: StageProblem
     rtol: Scalar
     mass: NodeVector
     """Nodal masses [kg], 1 in components that are not free: the weight of the norms in the termination rule."""
@@ -131,7 +131,7 @@ class _Direction(eqx.Module):
     indefinite: Bool[Array, ""]
 
 
-def _setting(problem: Problem, guess: NodeVector, rtol: Scalar) -> tuple[_Setting, _NewtonState]:
+def _setting(problem: StageProblem, guess: NodeVector, rtol: Scalar) -> tuple[_Setting, _NewtonState]:
     """The constants and the initial state of an iteration."""
     combine, free = problem.projection.combine, problem.projection.free
     rest = problem.apply_dirichlet(jnp.zeros_like(guess))
@@ -254,7 +254,7 @@ def backtrack(
     return jax.lax.while_loop(refused, lambda trial: (trial[0] / 2, trial[1] + 1), (whole, zero_count))
 
 
-def _negligible(problem: Problem, inner: AbstractInnerProduct, v: NodeVector, step: NodeVector) -> Bool[Array, ""]:
+def _negligible(problem: StageProblem, inner: AbstractInnerProduct, v: NodeVector, step: NodeVector) -> Bool[Array, ""]:
     """Whether a step changes the velocity by no more than a thousandth, or strains by no more than √ε."""
     unseen = jnp.sqrt(jnp.finfo(v.dtype).eps) * problem.unit_strain_velocity()
     vectors = step, problem.projection.combine(v + step, 0), jnp.where(problem.projection.free, unseen, 0)

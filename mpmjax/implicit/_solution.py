@@ -16,7 +16,7 @@ from mpmjax.implicit._conjugate_residual import ConjugateResidual
 from mpmjax.implicit._hessian import AbstractHessian
 from mpmjax.implicit._linear_solve import require_solver, solve_linear
 from mpmjax.implicit._potential import ElasticPotential
-from mpmjax.implicit._problem import Problem
+from mpmjax.implicit._stage_problem import StageProblem
 
 
 class SolveInfo(eqx.Module):
@@ -75,7 +75,7 @@ class AbstractSolution(eqx.Module):
     linearises: ClassVar[bool] = False
     """Whether the elastic force is f(0) − H u in place of that of the law."""
 
-    def problem(self, stage: Problem) -> Problem:
+    def problem(self, stage: StageProblem) -> StageProblem:
         """The problem that is solved in the place of a stage's. Derivatives are those of its exact solution. Default:
         the stage's, linearised if the solution `linearises`."""
         return stage.linearised() if self.linearises else stage
@@ -101,7 +101,7 @@ class AbstractSolution(eqx.Module):
         return sum(q for q, _ in stages) * force - hessian.at_step_start(potential)(mean)
 
     @abc.abstractmethod
-    def __call__(self, problem: Problem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
+    def __call__(self, problem: StageProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         """The solution [m/s], shape (n, d), and the report of the solve.
 
         Args:
@@ -134,7 +134,7 @@ class Linearised(AbstractSolution):
         require_fields(self)
         require_solver("Linearised's solver", self.solver)
 
-    def __call__(self, problem: Problem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
+    def __call__(self, problem: StageProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         operator = problem.operator(guess).precomputed()
         combine = problem.projection.combine
         rhs, lift = problem.rhs, None

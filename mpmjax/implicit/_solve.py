@@ -14,8 +14,8 @@ import lineax as lx
 from mpmjax._types import Array, NodeVector, Scalar
 from mpmjax.autodiff import kept, ruled, without_derivative
 from mpmjax.implicit._linear_solve import derivative_rtol, solve_linear
-from mpmjax.implicit._problem import Problem
 from mpmjax.implicit._solution import AbstractSolution, SolveInfo
+from mpmjax.implicit._stage_problem import StageProblem
 
 
 class Reporting(eqx.Module):
@@ -33,7 +33,7 @@ class Reporting(eqx.Module):
 
 
 def solve(
-    problem: Problem,
+    problem: StageProblem,
     guess: NodeVector,
     find: AbstractSolution,
     adjoint: lx.AbstractLinearSolver | Reporting,
@@ -55,7 +55,7 @@ def solve(
 
 @ruled
 def _solve(
-    problem: Problem, slot: Array, guess: NodeVector, find: Any, adjoint: lx.AbstractLinearSolver
+    problem: StageProblem, slot: Array, guess: NodeVector, find: Any, adjoint: lx.AbstractLinearSolver
 ) -> tuple[NodeVector, SolveInfo]:
     del slot, adjoint
     return find(problem, guess)

@@ -13,9 +13,9 @@ from mpmjax.implicit import (
     AbstractPreconditioner,
     AbstractSolution,
     Guess,
-    Problem,
     Reporting,
     SolveInfo,
+    StageProblem,
     exact_force,
     require_solver,
     solve,
@@ -169,7 +169,7 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
         initial_displacement: NodeVector | None = None,
         theta: Scalar = 1.0,
     ) -> tuple[NodeVector, SolveInfo]:
-        """The solution v [m/s], shape (n, d), of M (v − a) = Δt_s (f(u + θΔt_s v) − θ D v) (see `Problem`), and the
+        """The solution v [m/s], shape (n, d), of M (v − a) = Δt_s (f(u + θΔt_s v) − θ D v), a `StageProblem`, and the
         report of the solve. One linear solve takes f(u) = f(0) − H u; Newton's method solves the nonlinear equation.
 
         Args:
@@ -180,7 +180,7 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
             initial_displacement: u at the start of the stage [m], shape (n, d); None for zero.
             theta: θ, the share of the stage's displacement at which its force is evaluated [-].
         """
-        stage = Problem(
+        stage = StageProblem(
             mass=nodes.mass,
             inertial=inertial,
             stage_dt=jnp.asarray(stage_dt),

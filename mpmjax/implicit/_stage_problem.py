@@ -38,7 +38,7 @@ class Guess(enum.Enum):
                 return jnp.zeros_like(before)
 
 
-class Problem(eqx.Module):
+class StageProblem(eqx.Module):
     """M (v − a) = Δt_s (f(u + θΔt_s v) − θ D v), an equation for the velocity v of the nodes [m/s], shape (n, d), in a
     stage of length Δt_s. f(u) is the elastic force at a nodal displacement u and −D v the viscous force.
 
@@ -76,7 +76,7 @@ class Problem(eqx.Module):
     action: AbstractHessianAction | None = None
     """H at the start of the step in a linearised problem; None in others."""
 
-    def linearised(self) -> "Problem":
+    def linearised(self) -> "StageProblem":
         """The problem with f(u) = f(0) − H u."""
         action, u = self.hessian.at_step_start(self.potential), self.initial_displacement
         force = self.force if u is None else self.force - action(u)
