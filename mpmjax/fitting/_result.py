@@ -95,7 +95,7 @@ class FitResult(AbstractFit):
     sigmas: tuple[Array, ...]
     """The noise of each observation, given or estimated, in the data's unit."""
     residuals: np.ndarray
-    """Those of all observations, then of priors, in units of their noise [-], shape (m,)."""
+    """Residuals of all observations, then of priors, in units of their noise [-], shape (m,)."""
     jacobian: np.ndarray
     """Their derivative by the coordinates, shape (m, n)."""
     uncertainty: Uncertainty
@@ -119,7 +119,7 @@ class FitResult(AbstractFit):
     converged: bool
     history: tuple[Iteration, ...]
     warnings: tuple[str, ...]
-    """What the data cannot tell, and what does not fit, in words."""
+    """Directions that the data do not see, and a misfit that the noise does not explain, in words."""
     interrupted: bool = False
     """Whether Ctrl-C ended it."""
 

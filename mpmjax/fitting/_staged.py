@@ -15,12 +15,12 @@ from mpmjax.checks import checked, require, require_positive, warn
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import chosen_optimiser, fit
 from mpmjax.fitting._multistart import label_cells, value_cells
-from mpmjax.fitting._observation import Series
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, restarted, table
 from mpmjax.fitting._search import begin, iterate, jacobian, search
+from mpmjax.fitting._series import Series
 
 
 class Stage(NamedTuple):
