@@ -167,13 +167,8 @@ class _Mark:
 
 
 def _rows(where: Callable[[Experiment], Any], experiment: Experiment, number: int) -> tuple[int, int]:
-    """The particles to which a leaf belongs, the first and the one after the last: those of its law, or all.
-
-    Args:
-        where: the leaf, or a tuple of leaves.
-        experiment: where it is.
-        number: which leaf of the tuple.
-    """
+    """The particles to which leaf `number` of `where` belongs, the first and the one after the last: those of its law,
+    or all."""
 
     def one(experiment: Experiment) -> Any:
         leaves = where(experiment)

@@ -238,11 +238,7 @@ class Progress:
         self._last = time.perf_counter()
 
     def begin(self, done: int) -> None:
-        """Say that the first iteration begins, which is compiled before.
-
-        Args:
-            done: iterations that a log holds already.
-        """
+        """Say that the first iteration begins, which is compiled before; a log may hold iterations that are done."""
         if self._say is None:
             return
         labels, problem = self._problem.labels, self._problem
@@ -252,12 +248,7 @@ class Progress:
         self._say(f"compiling the fit of {count} ({named}) to {problem.points} that were measured{after}")
 
     def __call__(self, state: SearchState, seconds: float) -> None:
-        """Say where the search stands.
-
-        Args:
-            state: after an iteration.
-            seconds: since the fit began.
-        """
+        """Say where the search stands after an iteration, and so many seconds since the fit began."""
         iteration = state.history[-1]
         if iteration.number == 0:
             self._distances = []

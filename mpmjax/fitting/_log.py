@@ -158,13 +158,6 @@ def opened_log(
 ) -> Iterator[FitLog]:
     """A log that is begun or, with `resume`, read and continued.
 
-    Args:
-        path: the file.
-        problem: what is fitted.
-        optimiser: the method.
-        z: where the fit starts.
-        resume: continue what is there.
-
     Raises:
         ValueError: a file that is there or, with `resume`, is not, is damaged, no log, the log of another fit, or being
             written.

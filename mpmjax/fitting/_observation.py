@@ -68,7 +68,7 @@ class AbstractObservation(eqx.Module):
 
     def __check_init__(self):
         require_fields(self)
-        name = f"{type(self).__name__} {self.name!r}"
+        name = self.title
         measured = np.isfinite(self.data)
         require(not np.isinf(self.data).any(), f"{name} must have finite data, or NaN where nothing was measured.")
         require(measured.sum() > 0, f"{name} has no data: it needs a finite number at least.")
@@ -84,6 +84,11 @@ class AbstractObservation(eqx.Module):
         require_positive(f"The weight of {name}", self.weight)
         if self.robust is not None:
             require_positive(f"The robust limit of {name}", self.robust)
+
+    @property
+    def title(self) -> str:
+        """Kind and name, as messages have them."""
+        return f"{type(self).__name__} {self.name!r}"
 
     @property
     def against(self) -> tuple[str, np.ndarray]:
@@ -112,8 +117,7 @@ class AbstractObservation(eqx.Module):
         """
         require(
             predicted.shape == self.data.shape,
-            f"{type(self).__name__} {self.name!r} has data of shape {self.data.shape}, what the simulation says has "
-            f"shape {predicted.shape}.",
+            f"{self.title} has data of shape {self.data.shape}, what the simulation says has shape {predicted.shape}.",
         )
         dtype = predicted.dtype
         data, sigma, weight = (jnp.asarray(a, dtype) for a in (self.data, sigma, self.weight))
@@ -167,9 +171,14 @@ class Curve(AbstractObservation):
         require_fields(self)
         require(
             self.x.shape == self.data.shape,
-            f"Curve {self.name!r} needs x and y of one shape (m,), got {self.x.shape} and {self.data.shape}.",
+            f"{self.title} needs x and y of one shape (m,), got {self.x.shape} and {self.data.shape}.",
         )
-        require_finite(f"The abscissae of Curve {self.name!r}", self.x)
+        require_finite(f"The abscissae of {self.title}", self.x)
+
+    @property
+    def title(self) -> str:
+        """Kind and name, as messages have them."""
+        return f"{type(self).__name__} {self.name!r}"
 
     @property
     def against(self) -> tuple[str, np.ndarray]:
@@ -191,17 +200,17 @@ class Curve(AbstractObservation):
         x, y = (np.asarray(a) for a in seen)
         require(
             np.isfinite(x).all() and (np.diff(x) > 0).all(),
-            f"The simulated abscissa of Curve {self.name!r} must grow with every step of the run: slow the loading "
+            f"The simulated abscissa of {self.title} must grow with every step of the run: slow the loading "
             "down, or reduce dt.",
         )
         slack = _SLACK * (x[-1] - x[0])
         outside = (self.x < x[0] - slack) | (self.x > x[-1] + slack)
         require(
             ~outside,
-            f"The simulation covers {x[0]:.4g} to {x[-1]:.4g}, which leaves out measured points of Curve {self.name!r} "
+            f"The simulation covers {x[0]:.4g} to {x[-1]:.4g}, which leaves out measured points of {self.title} "
             f"({', '.join(f'{w:.4g}' for w in self.x[outside])}): pull further, or narrow the range.",
         )
-        require_finite(f"The simulated ordinate of Curve {self.name!r}", y)
+        require_finite(f"The simulated ordinate of {self.title}", y)
 
 
 def drawn_nearer(r: Array, limit: Scalar | Array) -> Array:

@@ -214,16 +214,8 @@ def _prediction(
     estimated: int | None,
     level: Scalar | None,
 ) -> Prediction:
-    """Values with their bands.
-
-    Args:
-        result: the fit.
-        value: the values.
-        J: their derivative, shape (..., n).
-        sigma: the noise of new measurements, if it is known.
-        estimated: the number of that noise among those that the fit estimated.
-        level: of the bands.
-    """
+    """Values with their bands, by their derivative J, shape (..., n). `sigma` is the noise of new measurements, if that
+    is known, `estimated` its number among those that the fit estimated."""
     level = checked_level(result.level if level is None else level)
     mean, gradient, errors = np.asarray(value, float), np.asarray(J, float), result.uncertainty
     has_derivative = np.asarray(np.isfinite(gradient).all(axis=-1))

@@ -171,16 +171,11 @@ def _extrapolate(
     missed: float,
     normal: float,
 ) -> tuple[Estimate, float, float]:
-    """One number extrapolated; the part of its error that is left of the discretisation; and the order, NaN where the
-    estimates do not converge.
+    """One number extrapolated from its estimates on the grids, from coarse to fine; the part of its error that is left
+    of the discretisation; and the order, NaN where the estimates do not converge.
 
-    Args:
-        kind: its parameter; None for what was reported.
-        estimates: on the grids, from coarse to fine.
-        refinements: the grids.
-        order: the order in the spacing.
-        missed: by how much the finest grid misses the data, in units of σ.
-        normal: the reach of an interval of the normal distribution, in standard errors.
+    `kind` is its parameter, None if it was reported; `missed` as of `_missed`; `normal` the reach of an interval of the
+    normal distribution, in standard errors.
     """
     last = estimates[-1]
     if len(estimates) == 1:

@@ -55,7 +55,7 @@ class Series(AbstractObservation):
 
     def __check_init__(self):
         require_fields(self)
-        what = f"{type(self).__name__} {self.name!r}"
+        what = self.title
         require(
             self.data.shape[:1] == self.times.shape,
             f"{what} needs times of shape (f,) and values of shape (f, ...), got {self.times.shape} and "
@@ -75,20 +75,15 @@ class Series(AbstractObservation):
         return self._at_times(seen, run)
 
     def _at_times(self, values: Array, run: Run, first: Scalar = 0.0) -> Array:
-        """Values at the times; NaN at times that a parameter has moved out of the run.
-
-        Args:
-            values: one for each step or state, shape (k, ...).
-            run: the run, with every step saved.
-            first: where the first one stands, in steps from the start.
-        """
+        """Values at the times, from one for each step or state, shape (k, ...), of which the first stands `first` steps
+        from the start; NaN at times that a parameter has moved out of the run."""
         step = jnp.asarray(self.times, values.dtype) / run.dt
         outside = (step < -_BEYOND) | (step > (len(run.steps) - 1) * (1 + ROUNDED) + _BEYOND)
         outside = outside.reshape(-1, *[1] * (values.ndim - 1))
         return jnp.where(outside, jnp.nan, between(values, step - first))
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
-        what = f"{type(self).__name__} {self.name!r}"
+        what = self.title
         outside = (self.times < 0) | after(self.times, t1)
         require(
             ~outside,
@@ -101,7 +96,7 @@ class Series(AbstractObservation):
         shape = getattr(seen, "shape", None)
         require(
             shape == self.data.shape[1:],
-            f"{type(self).__name__} {self.name!r} has values of shape {self.data.shape[1:]} at each time, but of "
+            f"{self.title} has values of shape {self.data.shape[1:]} at each time, but of "
             f"returns {'no array' if shape is None else f'shape {shape}'}.",
         )
 
@@ -112,7 +107,7 @@ class Series(AbstractObservation):
             ValueError: there is none.
         """
         kept = ~after(self.times, t1)
-        require(kept.any(), f"{type(self).__name__} {self.name!r} begins at {self.times[0]:g} s, after t1 = {t1:g} s.")
+        require(kept.any(), f"{self.title} begins at {self.times[0]:g} s, after t1 = {t1:g} s.")
         sigma = None if self.sigma is None else np.broadcast_to(self.sigma, self.data.shape)[kept]
         return eqx.tree_at(
             lambda o: (o.times, o.data, o.sigma),
@@ -163,14 +158,14 @@ class Tracks(Series):
         assert isinstance(self.of, Markers)
         require(
             self.data.ndim == 3 and self.of.count == self.data.shape[1],
-            f"Tracks {self.name!r} need positions of shape (f, m, d) of the m markers, got {self.data.shape} and "
+            f"{self.title} need positions of shape (f, m, d) of the m markers, got {self.data.shape} and "
             f"{self.of.count} markers.",
         )
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
         require(
             self.data.shape[2] == particles.dim,
-            f"Tracks {self.name!r} are {self.data.shape[2]}-dimensional, the particles {particles.dim}-dimensional.",
+            f"{self.title} are {self.data.shape[2]}-dimensional, the particles {particles.dim}-dimensional.",
         )
         super().check(scene, particles, t1)
         assert isinstance(self.of, Markers)
@@ -219,7 +214,7 @@ class Force(Series):
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
         super().check(scene, particles, t1)
-        what = f"{type(self).__name__} {self.name!r}"
+        what = self.title
         if self.boundary is not None:
             number = len(scene.boundary) + len(scene.guides)
             require(
@@ -270,12 +265,8 @@ def _nothing(scene: Scene, particles: Particles) -> Array:
 
 
 def between(values: Array, place: Array) -> Array:
-    """Values between rows, by linear interpolation; before the first and after the last two, beyond them.
-
-    Args:
-        values: shape (f, ...).
-        place: numbers of rows, shape (m,), not whole.
-    """
+    """Values between rows of `values`, shape (f, ...), at row numbers `place` that are not whole, shape (m,): by linear
+    interpolation, or extrapolation beyond the first and the last two."""
     last = jnp.clip(jnp.floor(place + _ON_A_ROW), 0, len(values) - 2)
     share, at = (place - last).reshape(-1, *[1] * (values.ndim - 1)), last.astype(int)
     return (1 - share) * values[at] + share * values[at + 1]

@@ -117,13 +117,8 @@ def quantile(level: float, degrees_of_freedom: float | np.ndarray) -> np.ndarray
 
 
 def uncertainty(J: np.ndarray, eps: float, estimated: Sequence[tuple[slice, float]]) -> Uncertainty:
-    """The uncertainty of the coordinates.
-
-    Args:
-        J: derivative of the residuals, in units of their noise, shape (m, n).
-        eps: the precision in which it was computed.
-        estimated: rows and degrees of freedom of each observation whose noise was estimated.
-    """
+    """The uncertainty of the coordinates by J, the derivative of residuals in units of their noise, shape (m, n), of
+    precision `eps`; `estimated` are rows and degrees of freedom of each observation whose noise was estimated."""
     n = J.shape[1]
     length = np.linalg.norm(J, axis=0)
     length = np.where(length == 0, 1, length)
@@ -165,17 +160,9 @@ def at_bound(r: np.ndarray, J: np.ndarray, room: np.ndarray) -> np.ndarray:
 def noise(
     r: np.ndarray, J: np.ndarray, rows: slice, count: int, weight: float, robust: float | None
 ) -> tuple[float, float]:
-    """The factor by which an observation's noise is larger than was assumed, and its degrees of freedom: their number
-    less the share of the parameters that it fixes, m − tr(J_k (JᵀJ)⁻¹ J_kᵀ). NaN where that leaves none.
-
-    Args:
-        r: residuals of all observations.
-        J: their derivative.
-        rows: those of the observation.
-        count: how many of them were measured.
-        weight: the factor of its squares.
-        robust: its robust limit.
-    """
+    """The factor by which an observation's noise is larger than was assumed, and its degrees of freedom: the `count`
+    of its measured numbers less the share of the parameters that it fixes, m − tr(J_k (JᵀJ)⁻¹ J_kᵀ). NaN where that
+    leaves none. The observation has some rows of r and J, a weight of its squares, and may have a robust limit."""
     U, singular, _ = np.linalg.svd(J / np.maximum(np.linalg.norm(J, axis=0), np.finfo(float).tiny), full_matrices=False)
     seen = singular > 1e-8 * singular.max(initial=0)
     freedom = count - float((U[rows][:, seen] ** 2).sum())
