@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from mpmjax.fitting._optimiser import LBFGS, AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import ROW_COST, SHOWN, Coordinates, FitProblem
 from mpmjax.fitting._result import FitResult, SettledNoise, fit_result, settle_noise
-from mpmjax.fitting._search import Minimum, NoDerivativeError, SearchState, search
+from mpmjax.fitting._search import Iteration, Minimum, NoDerivativeError, SearchState, search
 from mpmjax.io import reporting
 
 
@@ -95,7 +95,7 @@ def fit(
         if log is not None:
             written = stack.enter_context(opened_log(Path(log), problem, optimiser, z, resume=resume))
             stack.enter_context(reporting(written.contents))
-        minimum, settled = _in_rounds(problem, optimiser, z, progress, written)
+        minimum, settled = _searched(problem, optimiser, progress, written)
     result = fit_result(problem, optimiser, minimum, settled, report, level)
     if not minimum.converged:
         stopped = "was interrupted" if minimum.interrupted else "did not converge"
@@ -122,35 +122,59 @@ def checked_level(level: Scalar) -> float:
     return float(level)
 
 
-def _in_rounds(
-    problem: FitProblem,
-    optimiser: AbstractOptimiser,
-    z: Coordinates,
-    progress: Callable[[str], None] | None,
-    log: FitLog | None,
-) -> tuple[Minimum, SettledNoise]:
-    """The search, again and again until the noise that it leaves is the noise that it was made with: the last minimum,
-    with all iterations, and the noise. A log is continued, and gets each iteration."""
-    sigmas = problem.first_sigmas
-    history, rounds, state, seconds_before = (), 0, None, 0.0
-    if log is not None and log.last is not None:
-        history, rounds, (sigmas, state), seconds_before = log.earlier, log.rounds, log.last, log.seconds
-    lines, begun = Progress(problem, optimiser, progress), time.perf_counter() - seconds_before
-    lines.begin(0 if state is None else len(history) + len(state.history))
-    while True:
+def in_rounds(
+    problems: list[FitProblem],
+    sigmas: list[tuple[Array, ...]],
+    minimise: Callable[[int, list[int], list[Coordinates], list[tuple[Array, ...]]], Sequence[Minimum | str]],
+    rounds: int = 0,
+) -> list[tuple[Minimum, SettledNoise] | str]:
+    """Searches of each problem, again and again until the noise that it leaves is the noise that it was made with: the
+    last minimum, with all iterations, and the noise; or why the search failed.
 
-        def report(state: SearchState, sigmas: tuple[Array, ...] = sigmas) -> None:
+    `minimise` makes searches, given the number of the round, those of the problems, their starts and their noise.
+    """
+    starts = [jnp.zeros(p.size, p.dtype) for p in problems]
+    histories: list[tuple[Iteration, ...]] = [()] * len(problems)
+    outcomes: list[tuple[Minimum, SettledNoise] | str] = [""] * len(problems)
+    left = list(range(len(problems)))
+    while left:
+        ends = minimise(rounds, left, [starts[k] for k in left], [sigmas[k] for k in left])
+        rounds, searched, left = rounds + 1, left, []
+        for k, end in zip(searched, ends, strict=True):
+            if isinstance(end, str):
+                outcomes[k] = end
+                continue
+            settled = settle_noise(problems[k], end, sigmas[k])
+            starts[k], sigmas[k], histories[k] = end.z, settled.sigmas, histories[k] + end.history
+            outcomes[k] = end._replace(history=histories[k]), settled
+            if settled.changing and end.converged and rounds < MOST_ROUNDS:
+                left.append(k)
+    return outcomes
+
+
+def _searched(
+    problem: FitProblem, optimiser: AbstractOptimiser, progress: Callable[[str], None] | None, log: FitLog | None
+) -> tuple[Minimum, SettledNoise]:
+    """The minimum and the noise, in rounds. A log is continued, and gets each iteration."""
+    sigmas, earlier, rounds, state, seconds_before = problem.first_sigmas, (), 0, None, 0.0
+    if log is not None and log.last is not None:
+        earlier, rounds, (sigmas, state), seconds_before = log.earlier, log.rounds, log.last, log.seconds
+    lines, begun = Progress(problem, optimiser, progress), time.perf_counter() - seconds_before
+    lines.begin(0 if state is None else len(earlier) + len(state.history))
+
+    def minimise(number: int, _: Any, starts: list[Coordinates], noise: list[tuple[Array, ...]]) -> list[Minimum]:
+        def report(state: SearchState) -> None:
             seconds = time.perf_counter() - begun
             if log is not None:
-                log.append(sigmas, state, seconds)
+                log.append(noise[0], state, seconds)
             lines(state, seconds)
 
-        minimum = _search(problem, optimiser, z, sigmas, state, report)
-        z, history, rounds, state = minimum.z, history + minimum.history, rounds + 1, None
-        settled = settle_noise(problem, minimum, sigmas)
-        sigmas = settled.sigmas
-        if not settled.changing or not minimum.converged or rounds == MOST_ROUNDS:
-            return minimum._replace(history=history), settled
+        return [_search(problem, optimiser, starts[0], noise[0], state if number == rounds else None, report)]
+
+    (outcome,) = in_rounds([problem], [sigmas], minimise, rounds)
+    assert not isinstance(outcome, str)
+    minimum, settled = outcome
+    return minimum._replace(history=(*earlier, *minimum.history)), settled
 
 
 def _check_report(problem: FitProblem, report: Mapping[str, Callable[[Experiment], Any]]) -> None:
