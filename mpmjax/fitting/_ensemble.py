@@ -112,9 +112,7 @@ def fit_ensemble(
             give a marker that was not seen as NaN.
         parameters: see `fit`.
         batch: how many searches run together, see `fit_multistart`.
-        report: see `fit`.
-        level: see `fit`.
-        optimiser: see `fit`.
+        report, level, optimiser: see `fit`.
         progress: called with a line, such as `print`, as searches end.
 
     Raises:

@@ -137,16 +137,14 @@ def fit_multistart(
     in them, and are only weighed by their noise in the last fit.
 
     Args:
-        experiments: see `fit`.
-        parameters: see `fit`.
+        experiments, parameters: see `fit`.
         starts: how many points, the first guess among them.
         fraction: of the points, the best ones, from which searches start whatever is near. 1 searches from all of them,
             without a look; 0 only from those of single linkage and the first guess.
         ranges: lowest and highest value to start from, by the name of a parameter.
         seed: of the starting points.
         batch: how many points, and searches, run together. Default: eight with explicit steps, one with implicit ones.
-        report: see `fit`.
-        level: see `fit`.
+        report, level: see `fit`.
         optimiser: the method of each search, and of the last fit. Default: as `fit` chooses.
         progress: called with a line, such as `print`, as points are done, as searches end, and by the last fit.
 

@@ -136,9 +136,7 @@ class Curve(AbstractObservation):
         y: measured ordinates, shape (m,).
         of: function of (scene, particles) that returns one point (x, y) of the simulated curve; x must grow in time.
         sigma: standard deviation of the noise of y; None to estimate it.
-        weight: factor of the squares.
-        robust: misfit in standard deviations beyond which squares grow but linearly.
-        name: what tables and pictures call it.
+        weight, robust, name: see `Series`.
         x_name: what pictures call the abscissa.
     """
 

@@ -247,12 +247,8 @@ class Unbounded(AbstractParameter):
 
     Args:
         where: the leaf, `lambda e: e.particles.v`, or a tuple of leaves that share the value.
-        update: in its place, the experiment with the value put in, `lambda e, value: ...`.
-        start: first guess. Default: the value of the first experiment.
         scale: a change that is large but not absurd. Default: the size of the first guess, or one if that is zero.
-        prior: what is known beforehand.
-        unit: the unit that tables show.
-        only: numbers of the experiments that it belongs to. Default: all.
+        update, start, prior, unit, only: see `Positive`.
     """
 
     where: Callable[[Experiment], Any] | None = None
@@ -337,11 +333,7 @@ class Bounded(AbstractParameter):
         where: the leaf, `lambda e: e.scene.material.poisson_ratio`, or a tuple of leaves that share the value.
         lower: lower bound.
         upper: upper bound.
-        update: in the place of `where`, the experiment with the value put in, `lambda e, value: ...`.
-        start: first guess, between the bounds. Default: the value of the first experiment.
-        prior: what is known beforehand.
-        unit: the unit that tables show.
-        only: numbers of the experiments that it belongs to. Default: all.
+        update, start, prior, unit, only: see `Positive`.
     """
 
     where: Callable[[Experiment], Any] | None = None

@@ -101,10 +101,7 @@ def fit_refined(
         parameters: what is fitted, see `fit`. Each fit starts from the one before.
         refinements: the n, growing, two at least.
         order: p, the order in the spacing. One is careful: estimates that converge faster get a wider interval.
-        report: what else to report, see `fit`.
-        level: of the intervals, see `fit`.
-        optimiser: see `fit`.
-        progress: see `fit`.
+        report, level, optimiser, progress: see `fit`.
         log: the name of the logs, one a grid: of "fit.h5" they are "fit_1.h5", "fit_2.h5". See `fit`.
         resume: continue from the logs that are there.
 

@@ -134,9 +134,7 @@ class Tracks(Series):
         positions: where [m], shape (f, m, d); NaN where a marker was not seen.
         which: the markers: numbers of particles, shape (m,), or `Markers.at` for places between particles.
         sigma: standard deviation of the noise of a coordinate [m]; None to estimate it.
-        weight: factor of the squares.
-        robust: misfit in standard deviations beyond which squares grow but linearly.
-        name: what tables and pictures call it.
+        weight, robust, name: see `Series`.
     """
 
     def __init__(
@@ -185,9 +183,7 @@ class Force(Series):
         boundary: number of the boundary, from 0, in the scene's order, in the place of `collider`. The scene must have
             `boundary_forces`.
         sigma: standard deviation of the noise [N]; None to estimate it.
-        weight: factor of the squares.
-        robust: misfit in standard deviations beyond which squares grow but linearly.
-        name: what tables and pictures call it.
+        weight, robust, name: see `Series`.
     """
 
     collider: int = eqx.field(static=True)

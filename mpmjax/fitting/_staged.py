@@ -97,8 +97,7 @@ def fit_staged(
         parameters: see `fit`.
         horizons: growing times [s]; the end of the data is added. Default: by the rule above.
         growth: sensitivity [-] beyond which data are left out; infinite to use all.
-        report: see `fit`.
-        level: see `fit`.
+        report, level: see `fit`.
         optimiser: the method of each search. Default: as `fit` chooses.
         progress: called with a line an iteration, and with what is said, such as `print`.
 
