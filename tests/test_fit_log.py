@@ -18,9 +18,8 @@ import pytest
 
 import mpmjax as mpm
 from mpmjax.fitting import _search
-from mpmjax.fitting._log import _read
-from mpmjax.fitting._problem_text import described
-from mpmjax.fitting._progress import iterations_left
+from mpmjax.fitting._fit import iterations_left
+from mpmjax.fitting._log import _read, described
 
 DT, STEPS = 4e-3, 12
 PARAMETERS = {

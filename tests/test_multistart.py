@@ -10,8 +10,9 @@ import pytest
 from test_fit import DT, NOISE, STEPS, STIFFNESS, bar, experiment, tracks
 
 import mpmjax as mpm
+from mpmjax.fitting._multistart import costs_at
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._search import Problems, costs_at, search, search_many
+from mpmjax.fitting._search import Problems, search, search_many
 from mpmjax.fitting._starting_points import critical_distance, linked, starting_points, unit_points
 
 LM = mpm.fitting.LevenbergMarquardt()

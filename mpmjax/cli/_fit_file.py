@@ -35,11 +35,11 @@ _OPTIMISERS: dict[str, type[AbstractOptimiser]] = {
     "LBFGS": LBFGS,
     "Adam": Adam,
 }
-"""What [fit] optimiser may name."""
+"""Kinds of [fit] optimiser."""
 
 
 class FitFile(NamedTuple):
-    """What a `[fit]` table asks for."""
+    """The content of a `[fit]` table."""
 
     experiments: tuple[Experiment, ...]
     parameters: dict[str, AbstractParameter]
@@ -49,7 +49,7 @@ class FitFile(NamedTuple):
     starts: int
     """Over how many points a first guess is looked for; one for none but the file's own."""
     fraction: float
-    """Of these the fraction, the best ones, from which it is searched whatever is near."""
+    """The fraction of these, the best ones, from which it is searched whatever is near."""
     horizons: tuple[float, ...] | bool
     """Until which times it is fitted first [s]; true to choose them, false for none."""
     refine: tuple[int, ...]
@@ -75,11 +75,13 @@ def read_fit(path: Path, read: Callable[[Path], Simulation] = read_simulation) -
     sources = [(path, simulation, table)] if "observation" in table else []
     try:
         _require_keys(table, "[fit]", _KEYS)
-        for other in _tables(table, "experiment"):
-            _require_keys(other, "[[fit.experiment]]", {"scene"})
-            file = path.parent / _text(other, "scene", "[[fit.experiment]]")
-            own = read(file)
-            sources.append((file, own, _fit_table(file, own)))
+        for named_scene in _tables(table, "experiment"):
+            _require_keys(named_scene, "[[fit.experiment]]", {"scene"})
+            scene = named_scene.get("scene")
+            require(isinstance(scene, str), "[[fit.experiment]] needs the key 'scene', a string.")
+            file = path.parent / str(scene)
+            other = read(file)
+            sources.append((file, other, _fit_table(file, other)))
             _require_keys(sources[-1][2], f"[fit] of {file}", _KEYS)
         require(len(sources) > 0, "[fit] needs an [[fit.observation]], or an [[fit.experiment]] whose scene has one.")
         parts = [_experiments(*source) for source in sources]
@@ -99,13 +101,13 @@ def read_fit(path: Path, read: Callable[[Path], Simulation] = read_simulation) -
         raise ValueError(f"{path}: {error}") from None
 
     def refined(n: int) -> tuple[tuple[Experiment, ...], tuple[Experiment, ...]]:
-        finer = [_experiments(file, _refined(own, n), fit_table) for file, own, fit_table in sources]
+        finer = [_experiments(file, _refined(one, n), fit_table) for file, one, fit_table in sources]
         fitted, whole = zip(*finer, strict=True)
         return fitted, whole
 
-    found = {name: _getter(where) for name, where in report.items()}
+    reported = {name: _getter(where) for name, where in report.items()}
     fitted, whole = zip(*parts, strict=True)
-    return FitFile(fitted, dict(named), found, whole=whole, refined=refined, **settings)
+    return FitFile(fitted, dict(named), reported, whole=whole, refined=refined, **settings)
 
 
 _TABLES = ("parameter", "observation", "experiment", "report")
@@ -140,9 +142,9 @@ def _settings(table: dict[str, Any]) -> dict[str, Any]:
         numbers = {"level": float(level), "starts": starts, "fraction": float(fraction)}
         return numbers | {"horizons": horizons, "refine": finer}
 
-    own = {key: value for key, value in table.items() if key in _SETTINGS}
+    chosen = {key: value for key, value in table.items() if key in _SETTINGS}
     optimiser = _optimiser(table["optimiser"]) if "optimiser" in table else None
-    return settings(**arguments(settings, own, "[fit]")) | {"optimiser": optimiser}
+    return settings(**arguments(settings, chosen, "[fit]")) | {"optimiser": optimiser}
 
 
 def refinements(numbers: tuple[int, ...], where: str) -> tuple[int, ...]:
@@ -160,8 +162,9 @@ def refinements(numbers: tuple[int, ...], where: str) -> tuple[int, ...]:
 def _optimiser(data: Any) -> AbstractOptimiser:
     table = {"kind": data} if isinstance(data, str) else data
     kind = table.get("kind") if isinstance(table, dict) else None
-    known = isinstance(kind, str) and kind in _OPTIMISERS
-    require(known, f"[fit] optimiser must have a kind, one of {', '.join(_OPTIMISERS)}, got {shortened(repr(data))}.")
+    kinds = ", ".join(_OPTIMISERS)
+    there = isinstance(kind, str) and kind in _OPTIMISERS
+    require(there, f"[fit] optimiser must have a kind, one of {kinds}, got {shortened(repr(data))}.")
     cls = _OPTIMISERS[str(kind)]
     where = "[fit.optimiser]"
     try:
@@ -216,16 +219,10 @@ def _fit_table(path: Path, simulation: Simulation) -> dict[str, Any]:
 
 
 def _tables(table: dict[str, Any], name: str) -> list[dict[str, Any]]:
-    found = table.get(name, [])
-    tables = isinstance(found, list) and all(isinstance(t, dict) for t in found)
-    require(tables, f"[[fit.{name}]] must be tables with double brackets.")
-    return found
-
-
-def _text(table: dict[str, Any], key: str, where: str) -> str:
-    text = table.get(key)
-    require(isinstance(text, str), f"{where} needs the key {key!r}, a string.")
-    return text or ""
+    tables = table.get(name, [])
+    several = isinstance(tables, list) and all(isinstance(t, dict) for t in tables)
+    require(several, f"[[fit.{name}]] must be tables with double brackets.")
+    return tables
 
 
 def _parameter(table: dict[str, Any], experiments: list[Experiment]) -> tuple[str, AbstractParameter]:
@@ -247,8 +244,8 @@ def _parameter(table: dict[str, Any], experiments: list[Experiment]) -> tuple[st
             kind in ("Positive", "Bounded", "Unbounded", *_OF_THE_BODY),
             f"{where}: there is no kind of parameter {kind!r}.",
         )
-        own = (0,) if only is None else only
-        there = len(own) > 0 and all(0 <= k < len(experiments) for k in own)
+        numbers = (0,) if only is None else only
+        there = len(numbers) > 0 and all(0 <= k < len(experiments) for k in numbers)
         require(there, f"{where}: only must name experiments from 0 to {len(experiments) - 1}, got {only}.")
         require((mean is None) == (sigma is None), f"{where} takes mean and sigma of a prior together.")
         prior = None if mean is None or sigma is None else Gaussian(mean, sigma)
@@ -258,10 +255,10 @@ def _parameter(table: dict[str, Any], experiments: list[Experiment]) -> tuple[st
         require((kind == "Bounded") == bounds, f'{where}: lower and upper go with kind = "Bounded".')
         if kind in _OF_THE_BODY:
             require(path is None, f"{where}: {kind} is of all particles and takes no path.")
-            return name or kind.lower(), _of_the_body(kind, where, experiments[min(own)], common)
+            return name or kind.lower(), _of_the_body(kind, where, experiments[min(numbers)], common)
         require(path is not None, f'{where} needs a path, such as "scene.material.youngs_modulus".')
         path = str(path)
-        _require_number(path, where, experiments[min(own)])
+        _require_number(path, where, experiments[min(numbers)])
         common |= {"where": _getter(path)}
         last = path.rpartition(".")[2]
         if kind == "Bounded":
@@ -275,10 +272,10 @@ def _parameter(table: dict[str, Any], experiments: list[Experiment]) -> tuple[st
 def _require_number(path: str, where: str, experiment: Experiment) -> None:
     value, (owner, _, last) = leaf_of(_path(path, where), experiment), path.rpartition(".")
     parent = leaf_of(owner, experiment)
-    known = [f.name for f in fields(parent)] if is_dataclass(parent) else []
+    names = [f.name for f in fields(parent)] if is_dataclass(parent) else []
     require(
-        not known or last in known,
-        f"{where} follows from others and cannot be fitted; name one of {', '.join(known)}.",
+        not names or last in names,
+        f"{where} follows from others and cannot be fitted; name one of {', '.join(names)}.",
     )
     number = eqx.is_array_like(value) and np.issubdtype(np.asarray(value).dtype, np.floating)
     require(number, f"{where} must be a number, but is {shortened(repr(value))}.")

@@ -35,7 +35,7 @@ from mpmjax.state import Particles, Scene
 
 
 class Source(NamedTuple):
-    """What an observation is of."""
+    """The run that an observation is of."""
 
     folder: Path
     """Where the scene file lies."""
@@ -46,7 +46,7 @@ class Source(NamedTuple):
 
 
 class Trust(NamedTuple):
-    """What each observation says of its noise."""
+    """Noise, weight and name of an observation."""
 
     sigma: Scalar | None
     weight: Scalar
@@ -69,14 +69,12 @@ def observation(table: dict[str, Any], source: Source, t1: float) -> tuple[Abstr
         ValueError: a table that does not fit, or a data file that does not: one line that names the place.
     """
     kind = table.get("kind")
-    known = isinstance(kind, str) and kind in _kinds
-    require(known, f"{_HEADER} kind must be one of {', '.join(_kinds)}, got {kind!r}.")
+    there = isinstance(kind, str) and kind in _kinds
+    require(there, f"{_HEADER} kind must be one of {', '.join(_kinds)}, got {kind!r}.")
     make = _kinds[str(kind)]
-    found = make(
-        source,
-        **arguments(make, {k: v for k, v in table.items() if k != "kind"}, f"{_HEADER} {kind}", given=["source"]),
-    )
-    return found if isinstance(found, tuple) else (found.until(t1), found)
+    keys = {k: v for k, v in table.items() if k != "kind"}
+    made = make(source, **arguments(make, keys, f"{_HEADER} {kind}", given=["source"]))
+    return made if isinstance(made, tuple) else (made.until(t1), made)
 
 
 def _trust(
@@ -88,20 +86,20 @@ def _trust(
 def _kind(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorate a function (source, trust, keys of its own) to make the observations of a kind."""
 
-    def known(make: Callable[..., Any]) -> Callable[..., Any]:
-        own, common = (inspect.signature(function).parameters for function in (make, _trust))
+    def registered(make: Callable[..., Any]) -> Callable[..., Any]:
+        special, common = (inspect.signature(function).parameters for function in (make, _trust))
 
         @wraps(make)
         def whole(source: Source, **keys: Any) -> Any:
             trust = _trust(**{key: keys.pop(key) for key in list(keys) if key in common})
             return make(source, trust, **keys)
 
-        parameters = [p for key, p in own.items() if key != "trust"]
+        parameters = [p for key, p in special.items() if key != "trust"]
         whole.__signature__ = inspect.Signature([*parameters, *common.values()])  # pyright: ignore[reportAttributeAccessIssue]
         _kinds[name] = whole
         return whole
 
-    return known
+    return registered
 
 
 @_kind("StressStretch")
@@ -123,9 +121,8 @@ def _stress_stretch(
     columns.require(x > 0, f"{stretch} must be positive, got {{{stretch}}}: lengths over first lengths.")
     inside = (x >= range[0]) & (x <= range[1])
     require(inside.sum() > 0, f"{_HEADER} range {range} holds none of the {len(x)} points.")
-    of, said = StressStretch.of(gauge, source.particles, axis), trust("nominal stress [Pa]")
-    said["x_name"] = "stretch"
-    return Curve(x[inside], y[inside], of, **said), Curve(x, y, of, **said)
+    of, names = StressStretch.of(gauge, source.particles, axis), trust("nominal stress [Pa]") | {"x_name": "stretch"}
+    return Curve(x[inside], y[inside], of, **names), Curve(x, y, of, **names)
 
 
 @_kind("Extent")

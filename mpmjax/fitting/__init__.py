@@ -9,19 +9,20 @@ from mpmjax.fitting._ensemble import Bootstrap, EnsembleFit, bootstrap, fit_ense
 from mpmjax.fitting._experiment import Experiment as Experiment
 from mpmjax.fitting._field import Field
 from mpmjax.fitting._fit import fit as fit
-from mpmjax.fitting._gradient_methods import LBFGS, Adam
 from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._multistart import LocalMinimum, MultistartFit, fit_multistart
-from mpmjax.fitting._observation import AbstractObservation, Curve as Curve, Series as Series, Tracks as Tracks
-from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
+from mpmjax.fitting._observation import AbstractObservation, Curve as Curve
+from mpmjax.fitting._optimiser import LBFGS, AbstractOptimiser, Adam, Evaluation
 from mpmjax.fitting._parameter import (
     AbstractParameter,
+    AbstractPrior,
     Bounded as Bounded,
+    Gaussian,
     Positive as Positive,
+    Smooth,
     Unbounded as Unbounded,
 )
 from mpmjax.fitting._prediction import Prediction, predict, predict_observations
-from mpmjax.fitting._prior import AbstractPrior, Gaussian, Smooth
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._profile import Profile, profile
 from mpmjax.fitting._quantities import (
@@ -31,9 +32,9 @@ from mpmjax.fitting._quantities import (
     Markers as Markers,
     StressStretch as StressStretch,
 )
-from mpmjax.fitting._reaction import Force as Force, Torque
 from mpmjax.fitting._refined import RefinedFit, fit_refined
 from mpmjax.fitting._result import AbstractFit, Estimate, FitResult as FitResult, NoiseEstimate
+from mpmjax.fitting._series import Force as Force, Series as Series, Torque, Tracks as Tracks
 from mpmjax.fitting._staged import Stage, StagedFit, fit_staged
 
 __all__ = [

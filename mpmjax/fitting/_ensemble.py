@@ -11,12 +11,12 @@ from scipy.special import chdtrc
 from mpmjax._types import Float, Scalar
 from mpmjax.checks import checked, require, require_whole, warn
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._fit import MOST_ROUNDS, checked_level, chosen_optimiser
+from mpmjax.fitting._fit import checked_level, chosen_optimiser, in_rounds
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, fit_result, settle_noise, table
-from mpmjax.fitting._search import Iteration, Problems, batch_size, search_many
+from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, fit_result, table
+from mpmjax.fitting._search import Minimum, Problems, batch_size, search_many
 
 
 class EnsembleFit(eqx.Module):
@@ -112,9 +112,7 @@ def fit_ensemble(
             give a marker that was not seen as NaN.
         parameters: see `fit`.
         batch: how many searches run together, see `fit_multistart`.
-        report: see `fit`.
-        level: see `fit`.
-        optimiser: see `fit`.
+        report, level, optimiser: see `fit`.
         progress: called with a line, such as `print`, as searches end.
 
     Raises:
@@ -130,7 +128,23 @@ def fit_ensemble(
         require(usable, f"Data set {k} must be an Experiment, or a tuple of some, got {type(experiments[k]).__name__}.")
     problems = [FitProblem(each, parameters) for each in sets]
     optimiser = chosen_optimiser(problems[0]) if optimiser is None else optimiser
-    fits = _fit_each(problems, optimiser, batch, dict(report or {}), level, progress)
+    stacked, size = Problems.of(problems), batch_size(problems[0], batch, len(problems))
+
+    def minimise(round_: int, numbers: list[int], starts: list[Any], sigmas: list[Any]) -> list[Minimum | str]:
+        def say(done: int, count: int) -> None:
+            if progress is not None:
+                progress(f"round {round_ + 1}: {done} of {count} fits are done")
+
+        z, noise = np.array(starts, float), Problems.of(sigmas)
+        members = search_many(stacked.only(numbers), optimiser, z, sigmas=noise, batch=size, progress=say)
+        return [m.failure if m.minimum is None else m.minimum for m in members]
+
+    outcomes = in_rounds(problems, [p.first_sigmas for p in problems], minimise)
+    reported = dict(report or {})
+    fits = [
+        end if isinstance(end, str) else fit_result(problem, optimiser, *end, reported, level)
+        for problem, end in zip(problems, outcomes, strict=True)
+    ]
     failures = {k: fit for k, fit in enumerate(fits) if isinstance(fit, str)}
     if len(failures) == len(fits):
         z = jnp.zeros(problems[0].size, problems[0].dtype)
@@ -142,48 +156,6 @@ def fit_ensemble(
     if lost:
         warn(f"{len(lost)} of {len(fits)} fits did not converge, the first number {lost[0]}: raise max_steps.")
     return EnsembleFit(tuple(fit if isinstance(fit, FitResult) else None for fit in fits), failures)
-
-
-def _fit_each(
-    problems: list[FitProblem],
-    optimiser: AbstractOptimiser,
-    batch: int | None,
-    report: dict[str, Callable[[Experiment], Any]],
-    level: float,
-    progress: Callable[[str], None] | None,
-) -> list[FitResult | str]:
-    """The fit of each, or why it failed; in rounds, as long as the noise of some changes."""
-    stacked, count = Problems.of(problems), len(problems)
-    sigmas, starts = [p.first_sigmas for p in problems], np.zeros((count, problems[0].size))
-    history: list[tuple[Iteration, ...]] = [()] * count
-    fits: list[FitResult | str] = [""] * count
-    left = list(range(count))
-    for round_ in range(MOST_ROUNDS):
-
-        def say(done: int, count: int, number: int = round_) -> None:
-            if progress is not None:
-                progress(f"round {number + 1}: {done} of {count} fits are done")
-
-        noise = Problems.of([sigmas[k] for k in left])
-        size = batch_size(problems[0], batch, count)
-        members = search_many(stacked.only(left), optimiser, starts[left], sigmas=noise, batch=size, progress=say)
-        again = []
-        for k, member in zip(left, members, strict=True):
-            if member.minimum is None:
-                fits[k] = member.failure
-                continue
-            starts[k], history[k] = np.asarray(member.minimum.z), history[k] + member.minimum.history
-            settled = settle_noise(problems[k], member.minimum, sigmas[k])
-            sigmas[k] = settled.sigmas
-            if settled.changing and member.minimum.converged and round_ < MOST_ROUNDS - 1:
-                again.append(k)
-            else:
-                minimum = member.minimum._replace(history=history[k])
-                fits[k] = fit_result(problems[k], optimiser, minimum, settled, report, level)
-        left = again
-        if not left:
-            break
-    return fits
 
 
 class Bootstrap(AbstractFit):

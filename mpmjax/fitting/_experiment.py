@@ -54,11 +54,12 @@ class Experiment(eqx.Module):
         self.particles = prepare(scene, particles)
         self.scene, self.method = canonical((scene, method), particles.x.dtype)
         self.t1, self.dt, self.name = float(t1), float(dt), name
-        given = (observations,) if isinstance(observations, AbstractObservation) else tuple(observations)
-        require(len(given) > 0, f"The experiment {name!r} needs an observation at least: what was measured.")
-        self.observations = given
+        self.observations = (observations,) if isinstance(observations, AbstractObservation) else tuple(observations)
+        require(
+            len(self.observations) > 0, f"The experiment {name!r} needs an observation at least: what was measured."
+        )
         number_of_steps(self.t1, self.dt, 0, particles.x.dtype)
-        for observation in given:
+        for observation in self.observations:
             observation.check(self.scene, self.particles, self.t1)
 
     @property
@@ -74,7 +75,7 @@ class Experiment(eqx.Module):
     def with_observations(
         self, observations: tuple[AbstractObservation, ...], t1: float | int | None = None
     ) -> "Experiment":
-        """The same experiment with other observations, and to another end."""
+        """The experiment with other observations, and to another end."""
         return Experiment(
             self.scene,
             self.particles,
@@ -85,17 +86,17 @@ class Experiment(eqx.Module):
             name=self.name,
         )
 
-    def with_gradient_since(self, given: Particles) -> "Experiment":
-        """The same experiment with the velocity gradient of what parameters changed of the velocities of the particles
-        given. A gradient that they changed themselves stays."""
+    def with_gradient_since(self, before: Particles) -> "Experiment":
+        """The experiment with the velocity gradient of the change of velocities that parameters made since `before`. A
+        gradient that they changed themselves stays."""
         now = self.particles
-        if now.C is None or now.C is not given.C or now.v is given.v:
+        if now.C is None or now.C is not before.C or now.v is before.v:
             return self
-        change = velocity_gradient(self.scene, eqx.tree_at(lambda q: q.v, now, now.v - given.v))
+        change = velocity_gradient(self.scene, eqx.tree_at(lambda q: q.v, now, now.v - before.v))
         return eqx.tree_at(lambda e: e.particles.C, self, now.C + change)
 
     def until(self, t1: float) -> "Experiment":
-        """The same experiment, ended at the first step from a time [s] on, with what was measured until then; itself
+        """The experiment, ended at the first step from a time [s] on, with what was measured until then; itself
         where nothing was, or the time is not before its end. What has no times, such as a `Curve`, is left out."""
         parts = [o.part_until(t1) for o in self.observations]
         kept = tuple(part for part in parts if part is not None)
@@ -124,7 +125,7 @@ class Experiment(eqx.Module):
         )
 
     def predictions(self, run: Run) -> tuple[Array, ...]:
-        """What each observation would have measured in a run of it, in the shape of its data."""
+        """Predictions of a run of it by each observation, in the shape of its data."""
         return tuple(o.predict(seen, run) for o, seen in zip(self.observations, run.observed, strict=True))
 
     def explain(self) -> None:
@@ -141,7 +142,7 @@ class Experiment(eqx.Module):
 
 
 class _Observe(eqx.Module):
-    """What all observations of an experiment need of a state."""
+    """Observes a state for all observations of an experiment."""
 
     observations: tuple[AbstractObservation, ...]
 

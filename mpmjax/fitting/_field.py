@@ -12,8 +12,7 @@ from mpmjax._types import Array, ParticleScalar, ParticleVector, Scalar
 from mpmjax.checks import canonical, checked, require, require_finite, require_positive
 from mpmjax.discretisation import BSpline, Grid, SplineGradient, gather, in_window, make_stencil
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._parameter import AbstractParameter, Start
-from mpmjax.fitting._prior import AbstractPrior, Value
+from mpmjax.fitting._parameter import AbstractParameter, AbstractPrior, Start, Value
 from mpmjax.state import Particles
 
 
@@ -85,7 +84,7 @@ class Field(AbstractParameter):
 
     @property
     def prior(self) -> AbstractPrior | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What is known of the values on nodes."""
+        """Prior knowledge of the values on nodes."""
         return self.of.prior
 
     @property
@@ -164,17 +163,12 @@ class Field(AbstractParameter):
 
 
 class _Mark:
-    """What stands in the place of a leaf to find it again."""
+    """Marks the place of a leaf."""
 
 
 def _rows(where: Callable[[Experiment], Any], experiment: Experiment, number: int) -> tuple[int, int]:
-    """The particles to which a leaf belongs, the first and the one after the last: those of its law, or all.
-
-    Args:
-        where: the leaf, or a tuple of leaves.
-        experiment: where it is.
-        number: which leaf of the tuple.
-    """
+    """The particles to which leaf `number` of `where` belongs, the first and the one after the last: those of its law,
+    or all."""
 
     def one(experiment: Experiment) -> Any:
         leaves = where(experiment)

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,13 @@ import numpy as np
 from mpmjax._types import Array, Scalar
 from mpmjax.checks import checked, require, warn
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._gradient_methods import LBFGS
 from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
 from mpmjax.fitting._log import FitLog, opened_log
-from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
+from mpmjax.fitting._optimiser import LBFGS, AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import ROW_COST, Coordinates, FitProblem
-from mpmjax.fitting._progress import Progress
+from mpmjax.fitting._problem import ROW_COST, SHOWN, Coordinates, FitProblem
 from mpmjax.fitting._result import FitResult, SettledNoise, fit_result, settle_noise
-from mpmjax.fitting._search import Minimum, NoDerivativeError, SearchState, search
+from mpmjax.fitting._search import Iteration, Minimum, NoDerivativeError, SearchState, search
 from mpmjax.io import reporting
 
 
@@ -97,7 +95,7 @@ def fit(
         if log is not None:
             written = stack.enter_context(opened_log(Path(log), problem, optimiser, z, resume=resume))
             stack.enter_context(reporting(written.contents))
-        minimum, settled = _in_rounds(problem, optimiser, z, progress, written)
+        minimum, settled = _searched(problem, optimiser, progress, written)
     result = fit_result(problem, optimiser, minimum, settled, report, level)
     if not minimum.converged:
         stopped = "was interrupted" if minimum.interrupted else "did not converge"
@@ -124,35 +122,59 @@ def checked_level(level: Scalar) -> float:
     return float(level)
 
 
-def _in_rounds(
-    problem: FitProblem,
-    optimiser: AbstractOptimiser,
-    z: Coordinates,
-    progress: Callable[[str], None] | None,
-    log: FitLog | None,
-) -> tuple[Minimum, SettledNoise]:
-    """The search, again and again until the noise that it leaves is the noise that it was made with: the last minimum,
-    with all iterations, and the noise. A log is continued, and gets each iteration."""
-    sigmas = problem.first_sigmas
-    history, rounds, state, seconds_before = (), 0, None, 0.0
-    if log is not None and log.last is not None:
-        history, rounds, (sigmas, state), seconds_before = log.earlier, log.rounds, log.last, log.seconds
-    said, begun = Progress(problem, optimiser, progress), time.perf_counter() - seconds_before
-    said.begin(0 if state is None else len(history) + len(state.history))
-    while True:
+def in_rounds(
+    problems: list[FitProblem],
+    sigmas: list[tuple[Array, ...]],
+    minimise: Callable[[int, list[int], list[Coordinates], list[tuple[Array, ...]]], Sequence[Minimum | str]],
+    rounds: int = 0,
+) -> list[tuple[Minimum, SettledNoise] | str]:
+    """Searches of each problem, again and again until the noise that it leaves is the noise that it was made with: the
+    last minimum, with all iterations, and the noise; or why the search failed.
 
-        def report(state: SearchState, sigmas: tuple[Array, ...] = sigmas) -> None:
+    `minimise` makes searches, given the number of the round, those of the problems, their starts and their noise.
+    """
+    starts = [jnp.zeros(p.size, p.dtype) for p in problems]
+    histories: list[tuple[Iteration, ...]] = [()] * len(problems)
+    outcomes: list[tuple[Minimum, SettledNoise] | str] = [""] * len(problems)
+    left = list(range(len(problems)))
+    while left:
+        ends = minimise(rounds, left, [starts[k] for k in left], [sigmas[k] for k in left])
+        rounds, searched, left = rounds + 1, left, []
+        for k, end in zip(searched, ends, strict=True):
+            if isinstance(end, str):
+                outcomes[k] = end
+                continue
+            settled = settle_noise(problems[k], end, sigmas[k])
+            starts[k], sigmas[k], histories[k] = end.z, settled.sigmas, histories[k] + end.history
+            outcomes[k] = end._replace(history=histories[k]), settled
+            if settled.changing and end.converged and rounds < MOST_ROUNDS:
+                left.append(k)
+    return outcomes
+
+
+def _searched(
+    problem: FitProblem, optimiser: AbstractOptimiser, progress: Callable[[str], None] | None, log: FitLog | None
+) -> tuple[Minimum, SettledNoise]:
+    """The minimum and the noise, in rounds. A log is continued, and gets each iteration."""
+    sigmas, earlier, rounds, state, seconds_before = problem.first_sigmas, (), 0, None, 0.0
+    if log is not None and log.last is not None:
+        earlier, rounds, (sigmas, state), seconds_before = log.earlier, log.rounds, log.last, log.seconds
+    lines, begun = Progress(problem, optimiser, progress), time.perf_counter() - seconds_before
+    lines.begin(0 if state is None else len(earlier) + len(state.history))
+
+    def minimise(number: int, _: Any, starts: list[Coordinates], noise: list[tuple[Array, ...]]) -> list[Minimum]:
+        def report(state: SearchState) -> None:
             seconds = time.perf_counter() - begun
             if log is not None:
-                log.append(sigmas, state, seconds)
-            said(state, seconds)
+                log.append(noise[0], state, seconds)
+            lines(state, seconds)
 
-        minimum = _search(problem, optimiser, z, sigmas, state, report)
-        z, history, rounds, state = minimum.z, history + minimum.history, rounds + 1, None
-        settled = settle_noise(problem, minimum, sigmas)
-        sigmas = settled.sigmas
-        if not settled.changing or not minimum.converged or rounds == MOST_ROUNDS:
-            return minimum._replace(history=history), settled
+        return [_search(problem, optimiser, starts[0], noise[0], state if number == rounds else None, report)]
+
+    (outcome,) = in_rounds([problem], [sigmas], minimise, rounds)
+    assert not isinstance(outcome, str)
+    minimum, settled = outcome
+    return minimum._replace(history=(*earlier, *minimum.history)), settled
 
 
 def _check_report(problem: FitProblem, report: Mapping[str, Callable[[Experiment], Any]]) -> None:
@@ -223,6 +245,73 @@ def _random_pull(problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...])
     that of the length of J's column."""
     r, pull, _ = jax.vjp(lambda z: problem.residuals(z, sigmas, None), z, has_aux=True)
     return pull(jax.random.normal(jax.random.key(0), r.shape, r.dtype))[0]
+
+
+class Progress:
+    """A line an iteration: misfit Σ r², gradient, parameters, seconds, and the time that is left.
+
+    The time left is that of the present search. It is the usual time of an iteration times how many are left: about so
+    many as the optimiser's distance from converged needs to fall to one at the rate of the last three iterations, where
+    it is known and falls; else at most those up to `max_steps`.
+    """
+
+    def __init__(self, problem: FitProblem, optimiser: AbstractOptimiser, say: Callable[[str], None] | None):
+        self._problem, self._optimiser, self._say = problem, optimiser, say
+        self._durations: list[float] = []
+        self._distances: list[float] = []
+        self._last = time.perf_counter()
+
+    def begin(self, done: int) -> None:
+        """Say that the first iteration begins, which is compiled before; a log may hold iterations that are done."""
+        if self._say is None:
+            return
+        labels, problem = self._problem.labels, self._problem
+        named = ", ".join(labels[:SHOWN]) + (", …" if len(labels) > SHOWN else "")
+        after = f" after {done} iterations of the log" if done else ""
+        count = f"{problem.size} number{'s' * (problem.size > 1)}"
+        self._say(f"compiling the fit of {count} ({named}) to {problem.points} that were measured{after}")
+
+    def __call__(self, state: SearchState, seconds: float) -> None:
+        """Say where the search stands after an iteration, and so many seconds since the fit began."""
+        iteration = state.history[-1]
+        if iteration.number == 0:
+            self._distances = []
+        now = time.perf_counter()
+        self._durations.append(now - self._last)
+        self._distances.append(self._optimiser.distance(state.inner, state.seen))
+        self._last = now
+        if self._say is None:
+            return
+        self._say(
+            f"{iteration.number:4d}  misfit {2 * iteration.cost:10.4g}  gradient {iteration.gradient:8.2g}  "
+            f"{self._problem.shown(iteration.z)}  {_clock(seconds)}{self._left(len(state.history))}"
+        )
+
+    def _left(self, done: int) -> str:
+        """The time left, in words; nothing while only the iteration that was compiled is timed, and at the end."""
+        most = self._optimiser.max_steps - done
+        if len(self._durations) < 2 or most == 0 or self._distances[-1] <= 1:
+            return ""
+        pace, steps = float(np.median(self._durations[1:])), iterations_left(self._distances)
+        if steps is None or steps > most:
+            return f", at most {_clock(pace * most)} left"
+        return f", about {_clock(pace * steps)} left"
+
+
+def iterations_left(distances: list[float]) -> int | None:
+    """How many iterations the distance needs to fall to one, at the mean rate of its last three values; None where it
+    does not fall, or is not known."""
+    last = np.asarray(distances[-3:])
+    if len(last) < 3 or not (np.isfinite(last).all() and 0 < last[-1] < last[0]):
+        return None
+    return max(1, int(np.ceil(np.log(last[-1]) / (np.log(last[0] / last[-1]) / 2))))
+
+
+def _clock(seconds: float) -> str:
+    """Seconds as people say them."""
+    if seconds < 100:
+        return f"{seconds:.3g} s" if seconds >= 0.1 else "0.1 s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 MOST_COLUMNS = 32

@@ -55,9 +55,9 @@ class LevenbergMarquardt(AbstractOptimiser):
     ) -> tuple[Coordinates, Any, Evaluation]:
         z, state, _ = self._solver.step(_residuals, z, (problem, sigmas, self.mode), {}, state, frozenset())
         r, J = state.f_info.residual, state.f_info.jac.as_matrix()
-        own = problem.dtype
-        room = problem.room(z.astype(own))
-        return z, state, Evaluation((r**2).sum() / 2, J.T @ r, r.astype(own), J.astype(own), room)
+        dtype = problem.dtype
+        room = problem.room(z.astype(dtype))
+        return z, state, Evaluation((r**2).sum() / 2, J.T @ r, r.astype(dtype), J.astype(dtype), room)
 
     def directed(self, z: Coordinates, state: Any, seen: Evaluation) -> Any:
         r, J, step, _ = _gauss_newton(seen)
@@ -158,7 +158,7 @@ _HIDDEN = 3.0
 _NEGLIGIBLE = 1e-4
 """A step of so many standard errors is none."""
 _ROUNDINGS = 10
-"""Of Σ r²: a smaller change of it cannot be told."""
+"""Rounding of Σ r², in ε: a smaller change of it cannot be told."""
 
 
 def _residuals(z: Coordinates, args: tuple[FitProblem, tuple[Array, ...], Any]) -> tuple[Array, None]:

@@ -12,13 +12,19 @@ The file is replaced as a whole after each iteration (see `mpmjax.io.ReplacedFil
 however the process ends. Its last four bytes are CRC-32 of all others.
 """
 
+import enum
+import hashlib
+import inspect
 import io
 import json
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from types import CodeType
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -30,13 +36,18 @@ import numpy as np
 from mpmjax._types import Array
 from mpmjax.checks import require
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
+from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
-from mpmjax.fitting._problem_text import described
 from mpmjax.fitting._search import Iteration, SearchState, begin
 from mpmjax.io import ReplacedFile, check_hdf5, reason
 
 _FORMAT = 2
 _ROW = [("round", "i8"), ("number", "i8"), ("cost", "f8"), ("gradient", "f8"), ("accepted", "?"), ("seconds", "f8")]
+
+_MOST = 8
+"""Numbers of an array that are written out."""
+_FREE = ("optimiser.max_steps",)
+"""Choices that may differ in a fit that is continued: it may go on for longer."""
 
 
 class _Round(NamedTuple):
@@ -147,13 +158,6 @@ def opened_log(
 ) -> Iterator[FitLog]:
     """A log that is begun or, with `resume`, read and continued.
 
-    Args:
-        path: the file.
-        problem: what is fitted.
-        optimiser: the method.
-        z: where the fit starts.
-        resume: continue what is there.
-
     Raises:
         ValueError: a file that is there or, with `resume`, is not, is damaged, no log, the log of another fit, or being
             written.
@@ -249,3 +253,91 @@ def _require_same(path: Path, ours: dict[str, str], theirs: dict[str, str]) -> N
             f"{path} is the log of another fit: {name} is {there} there and {here} here. Resume the same fit, or name "
             "a new log.",
         )
+
+
+def described(problem: FitProblem, optimiser: AbstractOptimiser) -> dict[str, str]:
+    """Every number, choice and function of a fit by its dotted path.
+
+    Arrays stand as a digest, functions as their name and a digest of their code, and the `where` of a parameter as the
+    numbers that change with it.
+    """
+    texts = dict(_texts(optimiser, "optimiser"))
+    for k, experiment in enumerate(problem.experiments):
+        texts |= dict(_texts(experiment, f"experiments.{k}"))
+    for name, parameter, start in zip(problem.names, problem.parameters, problem.starts, strict=True):
+        texts[f"parameters.{name}"] = _changed(problem, parameter, start)
+        texts |= dict(_texts(parameter, f"parameters.{name}"))
+    return {name: text for name, text in texts.items() if name not in _FREE}
+
+
+def _changed(problem: FitProblem, parameter: AbstractParameter, start: Any) -> str:
+    """The numbers of an experiment that change with a parameter."""
+    experiment = problem.experiments[0 if parameter.only is None else parameter.only[0]]
+    put = parameter.put(experiment, start + 1 + jnp.abs(start))
+    before, after = (jax.tree_util.tree_leaves_with_path(tree) for tree in (experiment, put))
+    names = [
+        jax.tree_util.keystr(path).lstrip(".")
+        for (path, a), (_, b) in zip(before, after, strict=False)
+        if eqx.is_array_like(a) and not np.array_equal(a, b)
+    ]
+    return f"{type(parameter).__name__} of {', '.join(names)}"
+
+
+def _texts(value: Any, path: str) -> Iterator[tuple[str, str]]:
+    """The text of everything within a value."""
+    match value:
+        case AbstractParameter():
+            for f in fields(value):
+                if f.name not in ("where", "update", "unit"):
+                    yield from _texts(getattr(value, f.name), f"{path}.{f.name}")
+        case eqx.Module() if is_dataclass(value):
+            yield path, type(value).__name__
+            for f in fields(value):
+                yield from _texts(getattr(value, f.name, None), f"{path}.{f.name}")
+        case Mapping():
+            for key, part in value.items():
+                yield from _texts(part, f"{path}.{key}")
+        case tuple() | list() if len(value) > 0 and not all(isinstance(part, (bool, int, float)) for part in value):
+            yield path, f"{len(value)} of them"
+            for k, part in enumerate(value):
+                yield from _texts(part, f"{path}.{k}")
+        case None | bool() | str():
+            yield path, repr(value)
+        case partial():
+            yield from _texts((value.func, *value.args, *value.keywords.values()), path)
+        case _ if eqx.is_array_like(value) or isinstance(value, (tuple, list)):
+            yield path, _array(np.asarray(value))
+        case _ if callable(value):
+            code = getattr(value, "__code__", None)
+            digest = f" of code {_digest(_code(code))}" if code is not None else ""
+            name = getattr(value, "__qualname__", type(value).__qualname__)
+            yield path, f"{getattr(value, '__module__', '')}.{name}{digest}"
+            held = inspect.getclosurevars(value).nonlocals if code is not None else {}
+            yield from _texts({key: v for key, v in held.items() if not callable(v)}, path)
+        case enum.Enum():
+            yield path, repr(value.value)
+        case _:
+            yield path, type(value).__qualname__
+
+
+def _array(data: np.ndarray) -> str:
+    if data.size <= _MOST:
+        return repr(data.tolist())
+    return (
+        f"an array of shape {data.shape} ({_digest(repr(data.dtype).encode() + np.ascontiguousarray(data).tobytes())})"
+    )
+
+
+def _code(code: CodeType) -> bytes:
+    """The code of a function, without the place where it stands."""
+    constants = [_code(c) if isinstance(c, CodeType) else repr(_ordered(c)).encode() for c in code.co_consts]
+    return b"\0".join([code.co_code, repr(code.co_names).encode(), *constants])
+
+
+def _ordered(constant: Any) -> Any:
+    """A constant whose text is the same in each process."""
+    return sorted(constant, key=repr) if isinstance(constant, frozenset) else constant
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:12]

@@ -4,6 +4,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+import diffrax
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -13,9 +16,9 @@ from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import chosen_optimiser, fit, require_influence
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import SHOWN, FitProblem
+from mpmjax.fitting._problem import SHOWN, Coordinates, FitProblem
 from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, restarted, table
-from mpmjax.fitting._search import Member, Minimum, Problems, batch_size, costs_at, search_many
+from mpmjax.fitting._search import Member, Minimum, Problems, batch_size, search_many
 from mpmjax.fitting._starting_points import linked, starting_points, unit_points
 
 
@@ -134,16 +137,14 @@ def fit_multistart(
     in them, and are only weighed by their noise in the last fit.
 
     Args:
-        experiments: see `fit`.
-        parameters: see `fit`.
+        experiments, parameters: see `fit`.
         starts: how many points, the first guess among them.
         fraction: of the points, the best ones, from which searches start whatever is near. 1 searches from all of them,
             without a look; 0 only from those of single linkage and the first guess.
         ranges: lowest and highest value to start from, by the name of a parameter.
         seed: of the starting points.
         batch: how many points, and searches, run together. Default: eight with explicit steps, one with implicit ones.
-        report: see `fit`.
-        level: see `fit`.
+        report, level: see `fit`.
         optimiser: the method of each search, and of the last fit. Default: as `fit` chooses.
         progress: called with a line, such as `print`, as points are done, as searches end, and by the last fit.
 
@@ -200,6 +201,37 @@ def fit_multistart(
         unfinished=tuple(k for k in range(starts) if k not in ended and k not in failures),
         iterations=sum(len(m.minimum.history) for m in (*members.values(), *further) if m.minimum is not None),
     )
+
+
+def costs_at(
+    problem: FitProblem,
+    points: Float[np.ndarray, "k n"],
+    sigmas: tuple[Array, ...],
+    batch: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> Float[np.ndarray, "k"]:
+    """½ Σ r² at many points, without derivatives; NaN where a simulation fails. `batch` are computed together, and
+    `progress` is called with how many are done, and of how many."""
+    costs = np.empty(len(points))
+    for first in range(0, len(points), batch):
+        rows = points[np.minimum(np.arange(first, first + batch), len(points) - 1)]
+        costs[first : first + batch] = _costs(problem, rows, sigmas)[: len(points) - first]
+        if progress is not None:
+            progress(min(first + batch, len(points)), len(points))
+    return costs
+
+
+@eqx.filter_jit
+def _costs(
+    problem: FitProblem, points: Float[np.ndarray, "b n"] | Array, sigmas: tuple[Array, ...]
+) -> Float[Array, "b"]:
+    """½ Σ r² at some points together, compiled."""
+
+    def cost(z: Coordinates) -> Array:
+        r, _ = problem.residuals(z, sigmas, diffrax.ForwardMode())
+        return (r**2).sum() / 2
+
+    return jax.vmap(cost)(jnp.asarray(points, problem.dtype))
 
 
 def _searched(

@@ -1,4 +1,4 @@
-"""Parameters that are fitted, and the coordinates in which they are searched."""
+"""Parameters that are fitted, the coordinates in which they are searched, and priors."""
 
 import abc
 from collections.abc import Callable
@@ -10,11 +10,128 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.checks import as_plain, require, require_fields, require_finite, require_positive
+from mpmjax.checks import as_floats, as_plain, require, require_fields, require_finite, require_positive
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._prior import AbstractPrior, Value
+from mpmjax.fitting._observation import drawn_nearer
 
+Value = Float[Array, "..."]
 Start = Scalar | Value | Float[np.ndarray, "..."] | tuple | list
+
+
+class AbstractPrior(eqx.Module):
+    """Prior knowledge of a parameter, as residuals that stand beside those of the data."""
+
+    @abc.abstractmethod
+    def residuals(self, value: Value, free: Value) -> Float[Array, "k"]:
+        """The residuals [-], shape (k,).
+
+        Args:
+            value: the parameter's value, in its unit.
+            free: the same in a measure without bounds (see `AbstractParameter.free`), of the same shape.
+        """
+
+    @abc.abstractmethod
+    def check(self, name: str, shape: tuple[int, ...]) -> None:
+        """Check that it fits a parameter of this shape.
+
+        Raises:
+            ValueError: it does not.
+        """
+
+    @abc.abstractmethod
+    def fixes(self, shape: tuple[int, ...]) -> int:
+        """How many numbers of a parameter of this shape it fixes by itself."""
+
+    def distribution(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Mean and standard deviation of each number by itself, in the parameter's unit; None where it says nothing of
+        single numbers, which is the default."""
+        return None
+
+    def drawn(self, rng: np.random.Generator) -> "AbstractPrior":
+        """The prior as another measurement would have given it. Default: itself."""
+        del rng
+        return self
+
+
+class Gaussian(AbstractPrior):
+    """Prior knowledge of a parameter: a normal distribution. It acts like one more measured point a number.
+
+    Args:
+        mean: expected value, in the parameter's unit, one number or one for each entry.
+        sigma: its standard deviation, likewise.
+    """
+
+    mean: Float[np.ndarray, "..."] = eqx.field(converter=as_floats)
+    sigma: Float[np.ndarray, "..."] = eqx.field(converter=as_floats)
+
+    def __check_init__(self):
+        require_fields(self)
+        require_finite("Gaussian's mean", self.mean)
+        require_positive("Gaussian's sigma", self.sigma)
+
+    def residuals(self, value: Value, free: Value) -> Float[Array, "k"]:
+        """(value − mean)/σ."""
+        del free
+        mean, sigma = (jnp.broadcast_to(jnp.asarray(a, value.dtype), value.shape) for a in (self.mean, self.sigma))
+        return ((value - mean) / sigma).reshape(-1)
+
+    def distribution(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.asarray(self.mean), np.asarray(self.sigma)
+
+    def drawn(self, rng: np.random.Generator) -> "Gaussian":
+        mean, sigma = self.distribution()
+        return Gaussian(mean + sigma * rng.normal(size=np.shape(mean)), sigma)
+
+    def check(self, name: str, shape: tuple[int, ...]) -> None:
+        shapes = {np.shape(self.mean), np.shape(self.sigma)}
+        fits = shapes <= {(), shape}
+        require(fits, f"The prior of {name!r} must have one number or shape {shape}, got {sorted(shapes)}.")
+
+    def fixes(self, shape: tuple[int, ...]) -> int:
+        return int(np.prod(shape))
+
+
+class Smooth(AbstractPrior):
+    """Prior knowledge of a field: neighbours differ little, by a normal distribution of mean zero.
+
+    Neighbours are entries next to each other along an axis of the parameter, which is an array: the nodes of a `Field`,
+    or a history in time. The difference is that of logarithms of a `Positive` parameter (σ = 0.1: about 10 % from one
+    node to the next), of logits of a `Bounded` one, of values of an `Unbounded` one. The mean level is left free.
+
+    Squares draw a jump out over several nodes. With `robust` δ differences beyond δ standard deviations count but
+    linearly (pseudo-Huber, as of observations), and a jump stays one: for bodies made of regions.
+
+    Args:
+        sigma: standard deviation of the difference of two neighbours. On a lattice of half the spacing, the same
+            roughness is about 1/√2 of it.
+        robust: the difference, in standard deviations, beyond which squares grow but linearly. Default: none.
+    """
+
+    sigma: Scalar = eqx.field(converter=as_floats)
+    robust: Scalar | None = eqx.field(converter=as_floats, default=None)
+
+    def __check_init__(self):
+        require_fields(self)
+        require_positive("Smooth's sigma", self.sigma)
+        if self.robust is not None:
+            require_positive("Smooth's robust limit", self.robust)
+
+    def residuals(self, value: Value, free: Value) -> Float[Array, "k"]:
+        """(f_{i+1} − f_i)/σ along each axis."""
+        del value
+        parts = [jnp.diff(free, axis=axis).reshape(-1) for axis in range(free.ndim)]
+        r = jnp.concatenate(parts) / jnp.asarray(self.sigma, free.dtype)
+        return r if self.robust is None else drawn_nearer(r, jnp.asarray(self.robust, free.dtype))
+
+    def check(self, name: str, shape: tuple[int, ...]) -> None:
+        require(
+            int(np.prod(shape)) > 1,
+            f"The prior of {name!r} is Smooth, of neighbours, but {name!r} is one number: make it a Field, or take "
+            "Gaussian.",
+        )
+
+    def fixes(self, shape: tuple[int, ...]) -> int:
+        return int(np.prod(shape)) - 1
 
 
 class AbstractParameter(eqx.Module):
@@ -31,7 +148,7 @@ class AbstractParameter(eqx.Module):
     start: eqx.AbstractVar[Start | None]
     """The first guess. Default: the value of the first experiment."""
     prior: eqx.AbstractVar[AbstractPrior | None]
-    """What is known of it beforehand."""
+    """Prior knowledge of it."""
     unit: eqx.AbstractVar[str]
     """The unit that tables show."""
     only: eqx.AbstractVar[tuple[int, ...] | None]
@@ -48,9 +165,9 @@ class AbstractParameter(eqx.Module):
         require(self.update is None or self.start is not None, f"{name} with update needs a start: the first guess.")
         if self.start is not None:
             require_finite(f"{name}'s start", self.start)
-        known = None if self.prior is None else self.prior.distribution()
-        if known is not None:
-            (lower, upper), mean = self.domain, known[0]
+        distribution = None if self.prior is None else self.prior.distribution()
+        if distribution is not None:
+            (lower, upper), mean = self.domain, distribution[0]
             require(
                 (mean >= lower) & (mean <= upper),
                 f"{name}'s values lie between {lower:g} and {upper:g}, so the mean of its prior must too, got {mean}.",
@@ -109,8 +226,8 @@ class AbstractParameter(eqx.Module):
         if self.start is not None:
             return jnp.asarray(self.start, experiment.dtype)
         assert self.where is not None
-        found = self.where(experiment)
-        return jnp.asarray(found[0] if isinstance(found, tuple) else found, experiment.dtype)
+        leaf = self.where(experiment)
+        return jnp.asarray(leaf[0] if isinstance(leaf, tuple) else leaf, experiment.dtype)
 
     def put(self, experiment: Experiment, value: Value) -> Experiment:
         """The experiment with this value."""
@@ -130,12 +247,8 @@ class Unbounded(AbstractParameter):
 
     Args:
         where: the leaf, `lambda e: e.particles.v`, or a tuple of leaves that share the value.
-        update: in its place, the experiment with the value put in, `lambda e, value: ...`.
-        start: first guess. Default: the value of the first experiment.
         scale: a change that is large but not absurd. Default: the size of the first guess, or one if that is zero.
-        prior: what is known beforehand.
-        unit: the unit that tables show.
-        only: numbers of the experiments that it belongs to. Default: all.
+        update, start, prior, unit, only: see `Positive`.
     """
 
     where: Callable[[Experiment], Any] | None = None
@@ -220,11 +333,7 @@ class Bounded(AbstractParameter):
         where: the leaf, `lambda e: e.scene.material.poisson_ratio`, or a tuple of leaves that share the value.
         lower: lower bound.
         upper: upper bound.
-        update: in the place of `where`, the experiment with the value put in, `lambda e, value: ...`.
-        start: first guess, between the bounds. Default: the value of the first experiment.
-        prior: what is known beforehand.
-        unit: the unit that tables show.
-        only: numbers of the experiments that it belongs to. Default: all.
+        update, start, prior, unit, only: see `Positive`.
     """
 
     where: Callable[[Experiment], Any] | None = None

@@ -13,14 +13,15 @@ import numpy as np
 from mpmjax._types import Array, Scalar
 from mpmjax.checks import checked, require, require_positive, warn
 from mpmjax.fitting._experiment import Experiment
+from mpmjax.fitting._fit import checked_level
 from mpmjax.fitting._observation import AbstractObservation, Numbers
 from mpmjax.fitting._problem import Coordinates, FitProblem, in_batches
 from mpmjax.fitting._result import FitResult
-from mpmjax.fitting._uncertainty import Uncertainty, quantile
+from mpmjax.fitting._uncertainty import quantile
 
 
 class Prediction(eqx.Module):
-    """What a fit says of a quantity, with the error that the parameters' errors make. All arrays have its shape."""
+    """A quantity by a fit, with the error that the parameters' errors make. All arrays have its shape."""
 
     value: np.ndarray
     error: np.ndarray
@@ -46,7 +47,7 @@ def predict(
     sigma: Numbers | None = None,
     level: Scalar | None = None,
 ) -> Prediction:
-    """What a fit says of anything that follows from its parameters, with its band.
+    """Anything that follows from the parameters of a fit, with its band.
 
         def height(e):
             run = mpm.simulate(heavier(e.scene), e.particles, t1=1.0, dt=e.dt, adjoint=diffrax.ForwardMode())
@@ -106,8 +107,8 @@ def predict_observations(
     *,
     level: Scalar | None = None,
 ) -> tuple[Prediction, ...]:
-    """What a fit says of its observations, with bands, in their order. The noise of a new measurement is that which was
-    given or estimated.
+    """The observations of a fit as it predicts them, with bands, in their order. The noise of a new measurement is that
+    which was given or estimated.
 
     Args:
         result: the fit.
@@ -130,18 +131,19 @@ def predict_observations(
         e.t1 == f.t1 and eqx.tree_equal(e.observations, f.observations) for e, f in zip(asked, fitted, strict=True)
     )
     if same and all(o.robust is None and np.isfinite(o.data).all() for o in observations):
-        found = _known(result)
+        linearised = _from_residuals(result)
     else:
         asked = tuple(e.with_observations(a.observations, a.t1) for e, a in zip(fitted, asked, strict=True))
-        found = _linearised(result.problem, _Observed(asked), _coordinates(result))
-    own = _estimated(result.problem)
+        linearised = _linearised(result.problem, _Observed(asked), _coordinates(result))
+    numbers = iter(range(len(observations)))
+    estimated = [None if is_given else next(numbers) for is_given in result.problem.noise_is_given]
     return tuple(
         _prediction(result, value, J, _noise(o, sigma, np.shape(value)), at, level)
-        for value, J, o, sigma, at in zip(*found, observations, result.sigmas, own, strict=True)
+        for value, J, o, sigma, at in zip(*linearised, observations, result.sigmas, estimated, strict=True)
     )
 
 
-def _known(result: FitResult) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+def _from_residuals(result: FitResult) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
     """Predictions of plain observations and their derivatives, as the fit has them in its residuals."""
     values, derivatives = [], []
     for o, sigma, rows in zip(result.problem.observations, result.sigmas, result.problem.rows, strict=True):
@@ -158,25 +160,23 @@ class _Function(eqx.Module):
     experiment: Experiment | int = eqx.field()
 
     def __call__(self, problem: FitProblem, z: Coordinates) -> tuple[Array, ...]:
-        if isinstance(self.experiment, Experiment):
-            found = problem.put(self.experiment, z, None)
-        else:
-            found = problem.at(z)[self.experiment]
-        return (jnp.asarray(self.of(found), problem.dtype),)
+        e = self.experiment
+        fitted = problem.put(e, z, None) if isinstance(e, Experiment) else problem.at(z)[e]
+        return (jnp.asarray(self.of(fitted), problem.dtype),)
 
 
 class _Observed(eqx.Module):
-    """What the observations of some experiments say, NaN where a run fails."""
+    """Predictions of the observations of some experiments, NaN where a run fails."""
 
     experiments: tuple[Experiment, ...]
 
     def __call__(self, problem: FitProblem, z: Coordinates) -> tuple[Array, ...]:
-        said = []
+        predicted = []
         for number, experiment in enumerate(self.experiments):
-            found = problem.put(experiment, z, number)
-            run = found.run(adjoint=diffrax.ForwardMode(), throw=False)
-            said += [jnp.where(run.statistics.healthy, p, jnp.nan) for p in found.predictions(run)]
-        return tuple(said)
+            fitted = problem.put(experiment, z, number)
+            run = fitted.run(adjoint=diffrax.ForwardMode(), throw=False)
+            predicted += [jnp.where(run.statistics.healthy, p, jnp.nan) for p in fitted.predictions(run)]
+        return tuple(predicted)
 
 
 @eqx.filter_jit
@@ -196,16 +196,10 @@ def _coordinates(result: FitResult) -> Coordinates:
     return jnp.asarray(result.z, result.problem.dtype)
 
 
-def _estimated(problem: FitProblem) -> list[int | None]:
-    """Of each observation, its number among those whose noise was estimated."""
-    numbers = iter(range(len(problem.observations)))
-    return [None if given else next(numbers) for given in problem.noise_is_given]
-
-
-def _noise(observation: AbstractObservation, found: Array, shape: tuple[int, ...]) -> np.ndarray | None:
-    """The noise of new measurements: the observation's own, or the one found of the fitted observation, its root mean
-    square where the shapes differ."""
-    sigma = np.asarray(found if observation.sigma is None else observation.sigma, float)
+def _noise(observation: AbstractObservation, fitted: Array, shape: tuple[int, ...]) -> np.ndarray:
+    """The noise of new measurements: the observation's own, or that of the fitted one, its root mean square where the
+    shapes differ."""
+    sigma = np.asarray(fitted if observation.sigma is None else observation.sigma, float)
     try:
         return np.broadcast_to(sigma, shape)
     except ValueError:
@@ -220,43 +214,26 @@ def _prediction(
     estimated: int | None,
     level: Scalar | None,
 ) -> Prediction:
-    """Values with their bands.
-
-    Args:
-        result: the fit.
-        value: the values.
-        J: their derivative, shape (..., n).
-        sigma: the noise of new measurements, if it is known.
-        estimated: the number of that noise among those that the fit estimated.
-        level: of the bands.
-    """
-    level = result.level if level is None else float(level)
-    require((level > 0) & (level < 1), f"level must lie between 0 and 1, got {level}.")
-    mean, gradient = np.asarray(value, float), np.asarray(J, float)
-    known = np.asarray(np.isfinite(gradient).all(axis=-1))
-    seen = np.where(known[..., None], gradient, 0)
-    lost = int((np.isfinite(mean) & ~known).sum())
+    """Values with their bands, by their derivative J, shape (..., n). `sigma` is the noise of new measurements, if that
+    is known, `estimated` its number among those that the fit estimated."""
+    level = checked_level(result.level if level is None else level)
+    mean, gradient, errors = np.asarray(value, float), np.asarray(J, float), result.uncertainty
+    has_derivative = np.asarray(np.isfinite(gradient).all(axis=-1))
+    gradient = np.where(has_derivative[..., None], gradient, 0)
+    lost = int((np.isfinite(mean) & ~has_derivative).sum())
     if lost:
         warn(f"{lost} of {mean.size} predicted numbers have no derivative, and so no band.")
-    error, freedom = result.uncertainty.of(seen)
-    error = np.where(known, error, np.nan)
+    error, freedom = errors.of(gradient)
+    error = np.where(has_derivative, error, np.nan)
     reach = quantile(level, freedom) * error
     new_lower = new_upper = None
     if sigma is not None:
-        wider, freedom = _with_noise(result.uncertainty, seen, sigma, estimated)
-        beyond = quantile(level, freedom) * np.where(np.isfinite(error), wider, error)
+        # One observation: s² + g·C g, Student's as that of a mean. With several the noise adds to its own part alone.
+        total = np.where(np.isfinite(error), error, 0) ** 2 + sigma**2
+        brought = [part + (sigma**2 if k == estimated else 0) for k, part in enumerate(errors.brought(gradient))]
+        wider = np.where(np.isfinite(error), np.sqrt(total), error)
+        beyond = quantile(level, errors.freedom(total, brought)) * wider
         new_lower, new_upper = np.asarray(mean - beyond), np.asarray(mean + beyond)
     return Prediction(
         mean, np.asarray(error), np.asarray(mean - reach), np.asarray(mean + reach), sigma, new_lower, new_upper, level
     )
-
-
-def _with_noise(
-    found: Uncertainty, gradient: np.ndarray, sigma: np.ndarray, estimated: int | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviation of a new measurement about its prediction, and its degrees of freedom (see `Uncertainty.of`):
-    of one observation √(s² + g·C g), Student's as that of a mean."""
-    error, _ = found.of(gradient)
-    total = np.where(np.isfinite(error), error, 0) ** 2 + sigma**2
-    brought = [part + (sigma**2 if k == estimated else 0) for k, part in enumerate(found.brought(gradient))]
-    return np.sqrt(total), found.freedom(total, brought)

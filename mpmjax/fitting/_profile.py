@@ -27,7 +27,7 @@ class Profile(eqx.Module):
     """The parameter."""
     unit: str
     values: np.ndarray
-    """Its values, growing, shape (p,); the fit's is among them."""
+    """Values of the parameter, growing, shape (p,); the fit's is among them."""
     statistic: np.ndarray
     """Δχ² = Σ r² there less that of the fit, in units of the noise, shape (p,)."""
     numbers: np.ndarray
@@ -41,7 +41,7 @@ class Profile(eqx.Module):
     interval: tuple[float, float]
     """Where Δχ² is below the threshold. An end that was not found is the parameter's bound, or infinite."""
     threshold: float
-    """What Δχ² reaches at the interval's ends: the quantile of χ² of one degree of freedom, or of F(1, ν)."""
+    """Δχ² at the interval's ends: the quantile of χ² of one degree of freedom, or of F(1, ν)."""
     degrees_of_freedom: float
     """ν of the noise's estimate; infinite where it was given."""
     level: float
@@ -217,7 +217,7 @@ class _End(NamedTuple):
     fault: float | None = None
     """The nearest coordinate at which the simulation fails."""
     jump: float | None = None
-    """What Δχ² jumps to at the threshold, if it jumps."""
+    """Δχ² beyond a jump at the threshold, if it jumps."""
 
 
 class _Walk:

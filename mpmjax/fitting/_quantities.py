@@ -1,4 +1,4 @@
-"""What is often measured of a body, as functions of (scene, particles)."""
+"""Quantities that are often measured of a body, as functions of (scene, particles)."""
 
 from typing import Any, Literal
 

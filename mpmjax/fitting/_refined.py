@@ -101,10 +101,7 @@ def fit_refined(
         parameters: what is fitted, see `fit`. Each fit starts from the one before.
         refinements: the n, growing, two at least.
         order: p, the order in the spacing. One is careful: estimates that converge faster get a wider interval.
-        report: what else to report, see `fit`.
-        level: of the intervals, see `fit`.
-        optimiser: see `fit`.
-        progress: see `fit`.
+        report, level, optimiser, progress: see `fit`.
         log: the name of the logs, one a grid: of "fit.h5" they are "fit_1.h5", "fit_2.h5". See `fit`.
         resume: continue from the logs that are there.
 
@@ -171,16 +168,11 @@ def _extrapolate(
     missed: float,
     normal: float,
 ) -> tuple[Estimate, float, float]:
-    """One number extrapolated; the part of its error that is left of the discretisation; and the order, NaN where the
-    estimates do not converge.
+    """One number extrapolated from its estimates on the grids, from coarse to fine; the part of its error that is left
+    of the discretisation; and the order, NaN where the estimates do not converge.
 
-    Args:
-        kind: its parameter; None for what was reported.
-        estimates: on the grids, from coarse to fine.
-        refinements: the grids.
-        order: the order in the spacing.
-        missed: by how much the finest grid misses the data, in units of σ.
-        normal: the reach of an interval of the normal distribution, in standard errors.
+    `kind` is its parameter, None if it was reported; `missed` as of `_missed`; `normal` the reach of an interval of the
+    normal distribution, in standard errors.
     """
     last = estimates[-1]
     if len(estimates) == 1:

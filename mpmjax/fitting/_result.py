@@ -95,7 +95,7 @@ class FitResult(AbstractFit):
     sigmas: tuple[Array, ...]
     """The noise of each observation, given or estimated, in the data's unit."""
     residuals: np.ndarray
-    """Those of all observations, then of priors, in units of their noise [-], shape (m,)."""
+    """Residuals of all observations, then of priors, in units of their noise [-], shape (m,)."""
     jacobian: np.ndarray
     """Their derivative by the coordinates, shape (m, n)."""
     uncertainty: Uncertainty
@@ -119,7 +119,7 @@ class FitResult(AbstractFit):
     converged: bool
     history: tuple[Iteration, ...]
     warnings: tuple[str, ...]
-    """What the data cannot tell, and what does not fit, in words."""
+    """Directions that the data do not see, and a misfit that the noise does not explain, in words."""
     interrupted: bool = False
     """Whether Ctrl-C ended it."""
 
@@ -209,7 +209,7 @@ def table(head: Sequence[str], *rows: Sequence[str]) -> list[str]:
     """The lines of a table, its columns as wide as they need."""
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     widths[0] = max(widths[0], _FIRST_COLUMN)
-    return [" ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in (head, *rows)]
+    return ["  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in (head, *rows)]
 
 
 def _summary(name: str, shape: tuple[int, ...], each: list[Estimate]) -> str:
@@ -275,16 +275,8 @@ def fit_result(
     report: Mapping[str, Callable[[Experiment], Any]],
     level: float,
 ) -> FitResult:
-    """The result at a minimum, whose residuals are in units of the noise of its search.
-
-    Args:
-        problem: what was fitted.
-        optimiser: by which method.
-        minimum: where the search ended.
-        settled: the noise by its residuals.
-        report: see `fit`.
-        level: of the intervals.
-    """
+    """The result at a minimum, whose residuals are in units of the noise of its search, with the noise that they
+    settled; `report` and `level` as of `fit`."""
     r, J, z = np.array(minimum.r, float), np.array(minimum.J, float), minimum.z
     for rows, factor in zip(problem.rows, settled.factors, strict=True):
         r[rows], J[rows] = r[rows] / factor, J[rows] / factor
@@ -359,13 +351,6 @@ def intervals(
     the value would be missed too often: there each end is the farther of two, of the coordinate and of a straight line
     in the value. Where that line meets the bound, it alone makes the interval, which ends there: the coordinate never
     comes to a bound, and goes beyond all measure to the other side.
-
-    Args:
-        problem: what was fitted.
-        z: the coordinates at the minimum.
-        errors: their uncertainty.
-        gradient: g, shape (n,).
-        level: of the intervals.
     """
     error, freedom = errors.of(np.eye(problem.size))
     q = quantile(level, freedom)

@@ -4,7 +4,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -252,24 +251,6 @@ def search_many(
     return tuple(done.get(k, Member(None, _NOT_BEGUN)) for k in range(count))
 
 
-def costs_at(
-    problem: FitProblem,
-    points: Float[np.ndarray, "k n"],
-    sigmas: tuple[Array, ...],
-    batch: int,
-    progress: Callable[[int, int], None] | None = None,
-) -> Float[np.ndarray, "k"]:
-    """½ Σ r² at many points, without derivatives; NaN where a simulation fails. `batch` are computed together, and
-    `progress` is called with how many are done, and of how many."""
-    costs = np.empty(len(points))
-    for first in range(0, len(points), batch):
-        rows = points[np.minimum(np.arange(first, first + batch), len(points) - 1)]
-        costs[first : first + batch] = _costs(problem, rows, sigmas)[: len(points) - first]
-        if progress is not None:
-            progress(min(first + batch, len(points)), len(points))
-    return costs
-
-
 def batch_size(problem: FitProblem, batch: int | None, count: int) -> int:
     """How many points or searches of `count` to compute together. Default: eight with explicit steps, where they cost
     less than one by one, and one with implicit ones, where all wait for the slowest solve (`benchmarks/multistart.py`).
@@ -326,8 +307,8 @@ def _step_together(
     z, arrays, seen = (jax.tree.map(np.asarray, a) for a in (z, arrays, seen))
     states = {}
     for lane, (k, history) in enumerate(zip(running, histories, strict=True)):
-        at, own, here = (jax.tree.map(lambda a, i=lane: a[i], tree) for tree in (z, arrays, seen))
-        states[k] = _recorded(optimiser, jnp.asarray(at), eqx.combine(own, rest), here, history)
+        at, part, here = (jax.tree.map(lambda a, i=lane: a[i], tree) for tree in (z, arrays, seen))
+        states[k] = _recorded(optimiser, jnp.asarray(at), eqx.combine(part, rest), here, history)
     return states
 
 
@@ -408,19 +389,6 @@ def iterate_together(
 def jacobian(problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> tuple[Array, Array]:
     """The residuals and their Jacobian, compiled."""
     return problem.jacobian(z, sigmas)
-
-
-@eqx.filter_jit
-def _costs(
-    problem: FitProblem, points: Float[np.ndarray, "b n"] | Array, sigmas: tuple[Array, ...]
-) -> Float[Array, "b"]:
-    """½ Σ r² at some points together, compiled."""
-
-    def cost(z: Coordinates) -> Array:
-        r, _ = problem.residuals(z, sigmas, diffrax.ForwardMode())
-        return (r**2).sum() / 2
-
-    return jax.vmap(cost)(jnp.asarray(points, problem.dtype))
 
 
 _NOT_BEGUN = "was not begun: the search was interrupted"

@@ -15,12 +15,12 @@ from mpmjax.checks import checked, require, require_positive, warn
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import chosen_optimiser, fit
 from mpmjax.fitting._multistart import label_cells, value_cells
-from mpmjax.fitting._observation import Series
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, restarted, table
 from mpmjax.fitting._search import begin, iterate, jacobian, search
+from mpmjax.fitting._series import Series
 
 
 class Stage(NamedTuple):
@@ -97,8 +97,7 @@ def fit_staged(
         parameters: see `fit`.
         horizons: growing times [s]; the end of the data is added. Default: by the rule above.
         growth: sensitivity [-] beyond which data are left out; infinite to use all.
-        report: see `fit`.
-        level: see `fit`.
+        report, level: see `fit`.
         optimiser: the method of each search. Default: as `fit` chooses.
         progress: called with a line an iteration, and with what is said, such as `print`.
 

@@ -17,7 +17,7 @@ _LEAST_FREEDOM = 1e-3
 _AT_BOUND = 1e-2
 """Standard errors from a bound at which a number lies at it."""
 _NODES = 100
-"""Of Gauss-Hermite quadrature."""
+"""Nodes of Gauss-Hermite quadrature."""
 _MOST_SAID = 8
 """Directions that are named."""
 _NEARLY_ONE = 0.99
@@ -72,10 +72,10 @@ class Uncertainty(NamedTuple):
         """Correlations, shape (n, n); NaN beside a coordinate that the data do not see."""
         error = self.error
         with np.errstate(invalid="ignore"):
-            found = self.inverse / np.outer(error, error)
-        found[np.isinf(error)] = np.nan
-        found[:, np.isinf(error)] = np.nan
-        return found
+            correlation = self.inverse / np.outer(error, error)
+        correlation[np.isinf(error)] = np.nan
+        correlation[:, np.isinf(error)] = np.nan
+        return correlation
 
     def of(self, gradient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The standard errors of numbers with these gradients by the coordinates, shape (..., n), and their degrees of
@@ -117,13 +117,8 @@ def quantile(level: float, degrees_of_freedom: float | np.ndarray) -> np.ndarray
 
 
 def uncertainty(J: np.ndarray, eps: float, estimated: Sequence[tuple[slice, float]]) -> Uncertainty:
-    """The uncertainty of the coordinates.
-
-    Args:
-        J: derivative of the residuals, in units of their noise, shape (m, n).
-        eps: the precision in which it was computed.
-        estimated: rows and degrees of freedom of each observation whose noise was estimated.
-    """
+    """The uncertainty of the coordinates by J, the derivative of residuals in units of their noise, shape (m, n), of
+    precision `eps`; `estimated` are rows and degrees of freedom of each observation whose noise was estimated."""
     n = J.shape[1]
     length = np.linalg.norm(J, axis=0)
     length = np.where(length == 0, 1, length)
@@ -155,13 +150,7 @@ def _unit(columns: np.ndarray) -> np.ndarray:
 
 def at_bound(r: np.ndarray, J: np.ndarray, room: np.ndarray) -> np.ndarray:
     """Whether each coordinate's value lies at a bound: the data want to go beyond, and it is a hundredth of its
-    standard error away from it, were all others known, shape (n,).
-
-    Args:
-        r: residuals.
-        J: their derivative.
-        room: how far values can fall and rise, over their derivatives by the coordinates, shape (2, n).
-    """
+    standard error away from it, were all others known, shape (n,). Room is as of `FitProblem.room`."""
     length = np.maximum(np.linalg.norm(J, axis=0), np.finfo(float).tiny)
     error = np.sqrt((r**2).sum() / max(len(r) - len(length), 1))
     wanted = np.stack([J.T @ r, -J.T @ r]) / length
@@ -171,17 +160,9 @@ def at_bound(r: np.ndarray, J: np.ndarray, room: np.ndarray) -> np.ndarray:
 def noise(
     r: np.ndarray, J: np.ndarray, rows: slice, count: int, weight: float, robust: float | None
 ) -> tuple[float, float]:
-    """The factor by which an observation's noise is larger than was assumed, and its degrees of freedom: their number
-    less the share of the parameters that it fixes, m − tr(J_k (JᵀJ)⁻¹ J_kᵀ). NaN where that leaves none.
-
-    Args:
-        r: residuals of all observations.
-        J: their derivative.
-        rows: those of the observation.
-        count: how many of them were measured.
-        weight: the factor of its squares.
-        robust: its robust limit.
-    """
+    """The factor by which an observation's noise is larger than was assumed, and its degrees of freedom: the `count`
+    of its measured numbers less the share of the parameters that it fixes, m − tr(J_k (JᵀJ)⁻¹ J_kᵀ). NaN where that
+    leaves none. The observation has some rows of r and J, a weight of its squares, and may have a robust limit."""
     U, singular, _ = np.linalg.svd(J / np.maximum(np.linalg.norm(J, axis=0), np.finfo(float).tiny), full_matrices=False)
     seen = singular > 1e-8 * singular.max(initial=0)
     freedom = count - float((U[rows][:, seen] ** 2).sum())
@@ -199,34 +180,28 @@ def _mean_square(robust: float | None) -> float:
     return float((weight * 2 * r**2 / (1 + np.sqrt(1 + (r / robust) ** 2))).sum() / np.sqrt(2 * np.pi))
 
 
-def seen_together(labels: tuple[str, ...], found: Uncertainty, logarithmic: tuple[bool, ...]) -> list[str]:
-    """What the data cannot tell, in words: directions in which the coordinates may change and the data do not, or
-    hardly.
-
-    Args:
-        labels: the coordinates' names.
-        found: their uncertainty.
-        logarithmic: whether they are logarithms of their values.
-    """
-    length = np.where(np.isinf(found.alone), 1, 1 / found.alone)
-    said = [_unseen(*_parts(d, length), labels, logarithmic) for d in _simplest(found.unseen * length[:, None]).T]
-    for effect in _simplest(found.weak * length[:, None]).T:
+def seen_together(labels: tuple[str, ...], errors: Uncertainty, logarithmic: tuple[bool, ...]) -> list[str]:
+    """Directions in which the coordinates may change and the data do not, or hardly, in words; `logarithmic` says which
+    coordinates are logarithms of their values."""
+    length = np.where(np.isinf(errors.alone), 1, 1 / errors.alone)
+    texts = [_unseen(*_parts(d, length), labels, logarithmic) for d in _simplest(errors.unseen * length[:, None]).T]
+    for effect in _simplest(errors.weak * length[:, None]).T:
         parts, change = _parts(effect, length)
-        rho = found.correlation[parts[0], parts[-1]]
+        rho = errors.correlation[parts[0], parts[-1]]
         if len(parts) == 2 and np.isfinite(rho):
             together = "together" if rho > 0 else "in opposite directions"
             names = " and ".join(labels[i] for i in parts)
-            said.append(f"{names}: {abs(rho):.5f} correlated, a change of both {together} is hardly seen.")
+            texts.append(f"{names}: {abs(rho):.5f} correlated, a change of both {together} is hardly seen.")
         else:
-            seen = np.sqrt((effect / length @ found.directions) ** 2 @ found.spectrum) / np.linalg.norm(effect)
+            seen = np.sqrt((effect / length @ errors.directions) ** 2 @ errors.spectrum) / np.linalg.norm(effect)
             what = _proportion(parts, change, labels, logarithmic)
-            said.append(f"{what} is hardly seen, {1 / seen:.2g} times less than of one alone.")
-    more = len(said) - _MOST_SAID
-    return said[:_MOST_SAID] + ([f"There are {more} more such directions."] if more > 0 else [])
+            texts.append(f"{what} is hardly seen, {1 / seen:.2g} times less than of one alone.")
+    more = len(texts) - _MOST_SAID
+    return texts[:_MOST_SAID] + ([f"There are {more} more such directions."] if more > 0 else [])
 
 
 def _simplest(columns: np.ndarray) -> np.ndarray:
-    """The same space by columns of which each has a coordinate to itself, so that few coordinates meet in one."""
+    """Columns of one space, each with a coordinate to itself, so that few coordinates meet in one."""
     if columns.shape[1] < 2:
         return columns
     *_, pivots = qr(columns.T, mode="r", pivoting=True)
@@ -235,12 +210,8 @@ def _simplest(columns: np.ndarray) -> np.ndarray:
 
 
 def _parts(effect: np.ndarray, length: np.ndarray) -> tuple[list[int], np.ndarray]:
-    """The coordinates that a direction is of, and their changes, the largest one.
-
-    Args:
-        effect: the change of each coordinate times its effect on the data.
-        length: these effects.
-    """
+    """The coordinates that a direction is of, and their changes, the largest one. `effect` is the change of each
+    coordinate times its effect on the data, `length`."""
     parts = [i for i in range(len(effect)) if abs(effect[i]) > _PART * np.abs(effect).max()]
     change = effect[parts] / length[parts]
     return parts, change / change[np.abs(change).argmax()]

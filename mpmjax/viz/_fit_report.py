@@ -49,9 +49,9 @@ def draw_fit(
     heights = [3.0] * len(observations) + [2.6] * (rows - len(observations))
     figure = plt.figure(figsize=(9.6, sum(heights)), layout="constrained")
     grid = figure.add_gridspec(rows, 6, height_ratios=heights)
-    for row, (observation, predicted, known) in enumerate(zip(observations, predictions, fitted, strict=True)):
+    for row, (observation, predicted, used) in enumerate(zip(observations, predictions, fitted, strict=True)):
         left, right = figure.add_subplot(grid[row, :4]), figure.add_subplot(grid[row, 4:])
-        _draw_observation(left, right, observation, predicted, float(known.against[1].max()))
+        _draw_observation(left, right, observation, predicted, float(used.against[1].max()))
     row = len(observations)
     _draw_history(figure.add_subplot(grid[row, :2]), result)
     _write_numbers(figure.add_subplot(grid[row, 2:]), result, profiles)
@@ -68,15 +68,7 @@ def draw_fit(
 def _draw_observation(
     left: Any, right: Any, observation: AbstractObservation, predicted: Prediction, last: float
 ) -> None:
-    """Data, fit and bands, and beside them the residuals.
-
-    Args:
-        left: the axes of the data.
-        right: those of the residuals.
-        observation: what was measured.
-        predicted: what the fit says.
-        last: where the fitted data end.
-    """
+    """Data, fit and bands on the left axes, residuals on the right ones; the fitted data end at `last`."""
     name, x = observation.against
     order = np.argsort(x)
     x = x[order]
@@ -129,19 +121,18 @@ def _draw_history(axis: Any, result: FitResult) -> None:
 def _write_numbers(axis: Any, result: FitResult, profiles: tuple[Profile, ...]) -> None:
     """The estimates with their intervals, and what is to be said of them."""
     by_profile = {p.label: p.interval for p in profiles}
-    names = [f"{e.label} [{e.unit}]" if e.unit else e.label for e in result.all]
-    wide = max(map(len, names))
+    wide = max(len(e.name) for e in result.all)
     lines = [f"{'':<{wide}}{'value':>12} ± {'error':<9}{100 * result.level:g} % interval"]
-    for name, e in zip(names, result.all, strict=True):
+    for e in result.all:
         lower, upper = by_profile.get(e.label, e.interval)
         profiled = (" by profile" if e.label in by_profile else "") + (", at its bound" if e.at_bound else "")
-        lines.append(f"{name:<{wide}}{e.value:>12.5g} ± {e.error:<9.2g}{lower:.5g} to {upper:.5g}{profiled}")
+        lines.append(f"{e.name:<{wide}}{e.value:>12.5g} ± {e.error:<9.2g}{lower:.5g} to {upper:.5g}{profiled}")
     degrees = result.degrees_of_freedom
     lines += ["", f"χ² = {result.chi_squared:.4g}, {degrees} degrees of freedom"]
     axis.axis("off")
     axis.text(0, 1, "\n".join(lines), va="top", fontsize=7.5, family="monospace", transform=axis.transAxes)
-    said = [*result.warnings, *(text for p in profiles for text in p.warnings)]
-    axis.text(0, 0, "\n".join(said), va="bottom", fontsize=7, wrap=True, color="C3", transform=axis.transAxes)
+    texts = [*result.warnings, *(text for p in profiles for text in p.warnings)]
+    axis.text(0, 0, "\n".join(texts), va="bottom", fontsize=7, wrap=True, color="C3", transform=axis.transAxes)
 
 
 def _draw_profile(axis: Any, profile: Profile) -> None:
@@ -165,7 +156,7 @@ def _draw_profile(axis: Any, profile: Profile) -> None:
 
 
 def write_fit(
-    found: FitResult | RefinedFit,
+    result: FitResult | RefinedFit,
     path: Path,
     measured: tuple[Experiment, ...] = (),
     profiles: tuple[Profile, ...] = (),
@@ -176,24 +167,24 @@ def write_fit(
     each grid. Numbers that are not finite are null.
 
     Args:
-        found: the fit.
+        result: the fit.
         path: the file.
         measured: see `draw_fit`; of the finest grid.
         profiles: of the fit's parameters; of the finest grid.
         predictions: those of `measured`, where they are known already.
     """
-    if isinstance(found, RefinedFit):
-        *coarser, finest = found.fits
+    if isinstance(result, RefinedFit):
+        *coarser, finest = result.fits
         numbers: dict[str, Any] = {
-            "estimates": [e._asdict() for e in found.estimates],
-            "error_from_noise": found.from_noise,
-            "error_from_discretisation": found.from_discretisation,
-            "order": found.order,
-            "refinements": found.refinements,
+            "estimates": [e._asdict() for e in result.estimates],
+            "error_from_noise": result.from_noise,
+            "error_from_discretisation": result.from_discretisation,
+            "order": result.order,
+            "refinements": result.refinements,
             "fits": [*(_numbers(each) for each in coarser), _numbers(finest, measured, profiles, predictions)],
         }
     else:
-        numbers = _numbers(found, measured, profiles, predictions)
+        numbers = _numbers(result, measured, profiles, predictions)
     with replacing(path) as aside:
         aside.write_text(json.dumps(_plain(numbers), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return path
@@ -208,7 +199,7 @@ def _numbers(
     observations = [o for e in measured or result.experiments for o in e.observations]
     predictions = predict_observations(result, measured or None) if predictions is None else predictions
     return {
-        "estimates": [e._asdict() for e in (*result.estimates, *result.reported)],
+        "estimates": [e._asdict() for e in result.all],
         "correlation": result.correlation,
         "fisher_spectrum": result.spectrum,
         "covariance_of_coordinates": result.covariance,
@@ -254,7 +245,7 @@ def _profiled(profile: Profile) -> dict[str, object]:
 
 
 def _plain(value: object) -> object:
-    """As JSON has it: arrays as lists, what is not finite as null."""
+    """A value as JSON has it: arrays as lists, numbers that are not finite as null."""
     match value:
         case dict():
             return {key: _plain(v) for key, v in value.items()}

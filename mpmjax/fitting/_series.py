@@ -1,0 +1,274 @@
+"""Observations against time: of states, of markers, of forces and torques."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Array, Float, Scalar
+from mpmjax.checks import as_floats, require, require_fields, require_finite
+from mpmjax.fitting._columns import ROUNDED, after
+from mpmjax.fitting._observation import AbstractObservation, Numbers
+from mpmjax.fitting._quantities import Markers
+from mpmjax.simulation import Run
+from mpmjax.state import Particles, Scene
+
+
+class Series(AbstractObservation):
+    """A quantity measured against time: a height, a front, an energy, an image, anything that a state says.
+
+    Between steps it is interpolated linearly.
+
+    Args:
+        times: when it was measured [s], shape (f,), growing, from 0 to the experiment's t1.
+        values: what was measured, shape (f, ...); NaN or masked where nothing was.
+        of: function of (scene, particles) that returns it, shape (...).
+        sigma: standard deviation of the noise, in the unit of the values; None to estimate it.
+        weight: factor of the squares.
+        robust: misfit in standard deviations beyond which squares grow but linearly.
+        name: what tables and pictures call it.
+    """
+
+    times: Float[np.ndarray, "f"]
+    data: Float[np.ndarray, "f ..."]
+    of: Callable[[Scene, Particles], Any]
+    sigma: Float[np.ndarray, "..."] | None
+    weight: Scalar
+    robust: Scalar | None
+    name: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        times: Numbers,
+        values: Numbers,
+        of: Callable[[Scene, Particles], Any],
+        *,
+        sigma: Numbers | None = None,
+        weight: Scalar = 1.0,
+        robust: Scalar | None = None,
+        name: str = "series",
+    ):
+        self.times, self.data, self.of, self.name = as_floats(times), as_floats(values), of, name
+        self.sigma, self.weight, self.robust = as_floats(sigma), as_floats(weight), as_floats(robust)
+
+    def __check_init__(self):
+        require_fields(self)
+        what = self.title
+        require(
+            self.data.shape[:1] == self.times.shape,
+            f"{what} needs times of shape (f,) and values of shape (f, ...), got {self.times.shape} and "
+            f"{self.data.shape}.",
+        )
+        require_finite(f"The times of {what} [s]", self.times)
+        require(np.diff(self.times) > 0, f"The times of {what} must grow: sort the measurements by time.")
+
+    @property
+    def against(self) -> tuple[str, np.ndarray]:
+        return "time [s]", self.times
+
+    def observe(self, scene: Scene, particles: Particles) -> Any:
+        return self.of(scene, particles)
+
+    def predict(self, seen: Array, run: Run) -> Array:
+        return self._at_times(seen, run)
+
+    def _at_times(self, values: Array, run: Run, first: Scalar = 0.0) -> Array:
+        """Values at the times, from one for each step or state, shape (k, ...), of which the first stands `first` steps
+        from the start; NaN at times that a parameter has moved out of the run."""
+        step = jnp.asarray(self.times, values.dtype) / run.dt
+        outside = (step < -_BEYOND) | (step > (len(run.steps) - 1) * (1 + ROUNDED) + _BEYOND)
+        outside = outside.reshape(-1, *[1] * (values.ndim - 1))
+        return jnp.where(outside, jnp.nan, between(values, step - first))
+
+    def check(self, scene: Scene, particles: Particles, t1: float) -> None:
+        what = self.title
+        outside = (self.times < 0) | after(self.times, t1)
+        require(
+            ~outside,
+            f"The times of {what} must lie in the run, from 0 to {t1:g} s, but {int(outside.sum())} do not, the first "
+            f"{self.times[outside][:1]}: raise t1, or leave them out.",
+        )
+        self._check_shape(eqx.filter_eval_shape(lambda *state: self.observe(*state), scene, particles))
+
+    def _check_shape(self, seen: Any) -> None:
+        shape = getattr(seen, "shape", None)
+        require(
+            shape == self.data.shape[1:],
+            f"{self.title} has values of shape {self.data.shape[1:]} at each time, but of "
+            f"returns {'no array' if shape is None else f'shape {shape}'}.",
+        )
+
+    def until(self, t1: float) -> "Series":
+        """The part of it that was measured until a time [s].
+
+        Raises:
+            ValueError: there is none.
+        """
+        kept = ~after(self.times, t1)
+        require(kept.any(), f"{self.title} begins at {self.times[0]:g} s, after t1 = {t1:g} s.")
+        sigma = None if self.sigma is None else np.broadcast_to(self.sigma, self.data.shape)[kept]
+        return eqx.tree_at(
+            lambda o: (o.times, o.data, o.sigma),
+            self,
+            (self.times[kept], self.data[kept], sigma),
+            is_leaf=lambda leaf: leaf is None,
+        )
+
+    def part_until(self, t1: float) -> "Series | None":
+        seen = np.isfinite(self.data[~after(self.times, t1)]).any()
+        return self.until(t1) if seen else None
+
+    def explain(self, seen: Array, run: Run) -> None:
+        require_finite(f"What the simulation says of {self.name!r}", seen)
+        reached = np.isfinite(np.asarray(self.predict(seen, run)))
+        require(reached, f"A parameter moves times of {self.name!r} out of the run: raise t1.")
+
+
+class Tracks(Series):
+    """Places of material points that were followed: markers, or features of a video.
+
+    Args:
+        times: when they were seen [s], shape (f,), growing.
+        positions: where [m], shape (f, m, d); NaN where a marker was not seen.
+        which: the markers: numbers of particles, shape (m,), or `Markers.at` for places between particles.
+        sigma: standard deviation of the noise of a coordinate [m]; None to estimate it.
+        weight, robust, name: see `Series`.
+    """
+
+    def __init__(
+        self,
+        times: Numbers,
+        positions: Numbers,
+        *,
+        which: Markers | np.ndarray | Array | list[int] | tuple[int, ...],
+        sigma: Numbers | None = None,
+        weight: Scalar = 1.0,
+        robust: Scalar | None = None,
+        name: str = "tracks",
+    ):
+        markers = which if isinstance(which, Markers) else Markers.of(which)
+        super().__init__(times, positions, markers, sigma=sigma, weight=weight, robust=robust, name=name)
+
+    def __check_init__(self):
+        require_fields(self)
+        assert isinstance(self.of, Markers)
+        require(
+            self.data.ndim == 3 and self.of.count == self.data.shape[1],
+            f"{self.title} need positions of shape (f, m, d) of the m markers, got {self.data.shape} and "
+            f"{self.of.count} markers.",
+        )
+
+    def check(self, scene: Scene, particles: Particles, t1: float) -> None:
+        require(
+            self.data.shape[2] == particles.dim,
+            f"{self.title} are {self.data.shape[2]}-dimensional, the particles {particles.dim}-dimensional.",
+        )
+        super().check(scene, particles, t1)
+        assert isinstance(self.of, Markers)
+        self.of.check(self.name, particles.count)
+
+
+class Force(Series):
+    """The force on a collider, or on any boundary, against time, such as that of a plate on which a body falls or of a
+    grip that pulls.
+
+    Compared with the force of each step at its own time (see `Forces`), interpolated linearly.
+
+    Args:
+        times: when it was measured [s], shape (f,), growing.
+        forces: the force [N], shape (f, d); NaN where a component was not measured.
+        collider: number of the collider, from 0, in the order of the scene's boundaries.
+        boundary: number of the boundary, from 0, in the scene's order, in the place of `collider`. The scene must have
+            `boundary_forces`.
+        sigma: standard deviation of the noise [N]; None to estimate it.
+        weight, robust, name: see `Series`.
+    """
+
+    collider: int = eqx.field(static=True)
+    boundary: int | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        times: Numbers,
+        forces: Numbers,
+        *,
+        collider: int = 0,
+        boundary: int | None = None,
+        sigma: Numbers | None = None,
+        weight: Scalar = 1.0,
+        robust: Scalar | None = None,
+        name: str = "force",
+    ):
+        self.collider, self.boundary = collider, boundary
+        super().__init__(times, forces, _nothing, sigma=sigma, weight=weight, robust=robust, name=name)
+
+    def _check_shape(self, seen: Any) -> None:
+        """The forces' shape is checked when they are predicted."""
+        del seen
+
+    def check(self, scene: Scene, particles: Particles, t1: float) -> None:
+        super().check(scene, particles, t1)
+        what = self.title
+        if self.boundary is not None:
+            number = len(scene.boundary) + len(scene.guides)
+            require(
+                0 <= self.boundary < number,
+                f"{what} is of boundary {self.boundary}, from 0, but the scene has {number}.",
+            )
+            require(
+                scene.boundary_forces,
+                f"{what} is of boundary {self.boundary}, on which the scene computes no force: give it "
+                "boundary_forces=True.",
+            )
+            return
+        count = scene.collider_count
+        require(
+            0 <= self.collider < count, f"{what} is of collider {self.collider}, from 0, but the scene has {count}."
+        )
+
+    def predict(self, seen: Any, run: Run) -> Array:
+        del seen
+        at = run.method.force_at()
+        return self._at_times(self._simulated(run), run, 0.0 if at is None else at)
+
+    def explain(self, seen: Any, run: Run) -> None:
+        super().explain(self._simulated(run), run)
+
+    def _simulated(self, run: Run) -> Array:
+        if self.boundary is None:
+            return self._of(run.forces())[:, self.collider]
+        return self._of(run.boundary_forces())[:, self.boundary]
+
+    def _of(self, forces: Any) -> Array:
+        return forces.force
+
+
+class Torque(Force):
+    """The torque on a collider or boundary against time, as `Force`: [N m], shape (f, 1) in two dimensions and (f, 3)
+    in three, about the centre of the collider's rotation or, where it has none, about its shape's middle; of a grip
+    about its region's middle, of other boundaries about the origin."""
+
+    def _of(self, forces: Any) -> Array:
+        return forces.torque
+
+
+def _nothing(scene: Scene, particles: Particles) -> Array:
+    """A zero: nothing is needed of the states."""
+    del scene
+    return jnp.zeros((), particles.x.dtype)
+
+
+def between(values: Array, place: Array) -> Array:
+    """Values between rows of `values`, shape (f, ...), at row numbers `place` that are not whole, shape (m,): by linear
+    interpolation, or extrapolation beyond the first and the last two."""
+    last = jnp.clip(jnp.floor(place + _ON_A_ROW), 0, len(values) - 2)
+    share, at = (place - last).reshape(-1, *[1] * (values.ndim - 1)), last.astype(int)
+    return (1 - share) * values[at] + share * values[at + 1]
+
+
+_ON_A_ROW = 1e-6
+"""Part of a step by which a time may miss a step and is on it."""
+_BEYOND = 1e-2
+"""Part of a step by which a time may lie beyond the run, as rounding has it."""
