@@ -9,7 +9,7 @@ import mpmjax as mpm
 DT, T1 = 4e-3, 0.06
 
 
-class LargestExtension(mpm.AbstractObservation):
+class LargestExtension(mpm.fitting.AbstractObservation):
     """The largest distance between the outermost particles during the run [m], one number."""
 
     data: np.ndarray
