@@ -86,3 +86,16 @@ def test_the_snippets_of_a_page_run_in_their_order(page, tmp_path):
     code = "\n".join((*(snippets(CONTINUED[page]) if page in CONTINUED else ()), *snippets(page)))
     ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
+
+
+def test_the_page_of_a_step_names_files_and_functions_that_exist():
+    """Each "`file.py`: `function`, ..." of its tables, and each line of its call tree."""
+    text = (ROOT / "docs" / "step.md").read_text(encoding="utf-8")
+    named = re.findall(r"`(\w+/_\w+\.py)`((?:: `\w+`(?:, `\w+`)*)?)", text)
+    tree = [(path, f"`{name}`") for name, path in re.findall(r"(\w+)(?: °)?(?: \(for it\))? +(\w+/_\w+\.py)", text)]
+    assert len(named) > 15
+    assert len(tree) > 15
+    for path, functions in (*named, *tree):
+        source = (ROOT / "mpmjax" / path).read_text(encoding="utf-8")
+        for name in re.findall(r"`(\w+)`", functions):
+            assert re.search(rf"(def|class) {name}\b", source), f"{name} is not in {path}"
