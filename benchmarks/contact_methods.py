@@ -1,4 +1,4 @@
-"""Ways to decide where a body meets a wall, on a bar that bounces: the comparison of docs/contact.md.
+"""Ways to decide where a body meets a wall, on a bar that bounces: the comparison of docs/notes/alternatives.md.
 
     python benchmarks/contact_methods.py                        prints the table (a minute), of 16 cells
     python benchmarks/contact_methods.py --chart docs/contact_bounce.png    draws the bar's velocity against time too

@@ -4,7 +4,7 @@
 
 Prints the relative error of the volume, 2 particles to the side of a cell, for whole cells (those whose centres are
 inside), for `fill`, and for `fill(fitted=True)`: the largest over eight places of the body in a cell, as rows of
-docs/method.md. Writes docs/filling.png.
+docs/accuracy.md. Writes docs/filling.png.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Where walls that move and grips that turn break: the figures of docs/method.md.
+"""Where walls that move and grips that turn break: the figures of docs/boundaries.md.
 
 python benchmarks/moving_boundaries.py             # a few minutes
 python benchmarks/moving_boundaries.py --quick     # one case of each

@@ -1,14 +1,39 @@
-"""The README says what happens."""
+"""The README and the documentation say what happens: links lead somewhere, snippets run, equations exist."""
 
 import dataclasses
 import re
 import subprocess
 import sys
 from pathlib import Path
+from textwrap import dedent
+
+import pytest
 
 from mpmjax.io._schema import saved_classes
 
 ROOT = Path(__file__).parents[1]
+PAGES = {p.relative_to(ROOT).as_posix(): p for p in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"))}
+SNIPPET = re.compile(r"^( *)```python\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
+"""A block that runs. One that cannot run as it stands is opened by ```python no-run: and the reason."""
+CONTINUED = {"docs/features.md": "README.md"}
+"""Pages whose snippets continue those of another page, as they say."""
+
+
+def snippets(page):
+    return [dedent(code) for _, code in SNIPPET.findall(PAGES[page].read_text(encoding="utf-8"))]
+
+
+def anchors(path):
+    """Ids of a page: those written as HTML, and of headings as GitHub makes them."""
+    text = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
+    headings = (re.sub(r"\[(.*?)\]\(.*?\)", r"\1", h).lower() for h in re.findall(r"^#+ (.*)$", text, re.MULTILINE))
+    return {re.sub(r"[^\w\- ]", "", h).replace(" ", "-") for h in headings} | set(re.findall(r'<a id="(.*?)">', text))
+
+
+def equations_cited(text):
+    """Numbers of the derivation's equations that a text cites; "eqs. 7 to 12" cites 7 and 12."""
+    cited = re.findall(r"derivation\b[^.;()]{0,20}?\beqs?\.\s+(\d+)(?:\s+(?:to|and)\s+(\d+))?", text)
+    return {number for pair in cited for number in pair if number}
 
 
 def test_quick_start_runs_as_written_and_ends_in_a_gradient(tmp_path):
@@ -29,3 +54,48 @@ def test_scene_files_documentation_names_every_class_and_key():
     names = {c.__name__ for c in saved_classes()} - by_key
     keys = {f.name for c in saved_classes() for f in dataclasses.fields(c)}
     assert names | keys <= words, (names | keys) - words
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_to_files_and_headings(page):
+    """Every relative link of a page, pictures included, with its anchor."""
+    text = re.sub(r"```.*?```|`[^`\n]*`", "", PAGES[page].read_text(encoding="utf-8"), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if "://" in target:
+            continue
+        name, _, anchor = target.partition("#")
+        path = (PAGES[page].parent / name).resolve() if name else PAGES[page]
+        assert path.exists(), f"{page} links to {target}"
+        assert not anchor or anchor in anchors(path), f"{page} links to {target}"
+
+
+def test_equations_that_are_cited_stand_in_the_derivation():
+    """Those of docstrings and of pages; a number that is gone would send the reader astray."""
+    files = [*ROOT.glob("mpmjax/**/*.py"), *ROOT.glob("native/*.[hc]*"), *ROOT.glob("benchmarks/*.py"), *PAGES.values()]
+    cited = {f"eq-{n}": path.name for path in files for n in equations_cited(path.read_text(encoding="utf-8"))}
+    assert len(cited) > 12
+    there = anchors(PAGES["docs/derivation.md"])
+    assert not {number: name for number, name in cited.items() if number not in there}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("page", [page for page in PAGES if page != "README.md" and snippets(page)])
+def test_the_snippets_of_a_page_run_in_their_order(page, tmp_path):
+    """As one program, in an empty folder beside the examples."""
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    code = "\n".join((*(snippets(CONTINUED[page]) if page in CONTINUED else ()), *snippets(page)))
+    ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+
+
+def test_the_page_of_a_step_names_files_and_functions_that_exist():
+    """Each "`file.py`: `function`, ..." of its tables, and each line of its call tree."""
+    text = (ROOT / "docs" / "step.md").read_text(encoding="utf-8")
+    named = re.findall(r"`(\w+/_\w+\.py)`((?:: `\w+`(?:, `\w+`)*)?)", text)
+    tree = [(path, f"`{name}`") for name, path in re.findall(r"(\w+)(?: °)?(?: \(for it\))? +(\w+/_\w+\.py)", text)]
+    assert len(named) > 15
+    assert len(tree) > 15
+    for path, functions in (*named, *tree):
+        source = (ROOT / "mpmjax" / path).read_text(encoding="utf-8")
+        for name in re.findall(r"`(\w+)`", functions):
+            assert re.search(rf"(def|class) {name}\b", source), f"{name} is not in {path}"
