@@ -121,7 +121,8 @@ def _stress_stretch(
     columns.require(x > 0, f"{stretch} must be positive, got {{{stretch}}}: lengths over first lengths.")
     inside = (x >= range[0]) & (x <= range[1])
     require(inside.sum() > 0, f"{_HEADER} range {range} holds none of the {len(x)} points.")
-    of, names = StressStretch.of(gauge, source.particles, axis), trust("nominal stress [Pa]") | {"x_name": "stretch"}
+    of = StressStretch.of(gauge, source.particles, axis)
+    names: dict[str, Any] = trust("nominal stress [Pa]") | {"x_name": "stretch"}
     return Curve(x[inside], y[inside], of, **names), Curve(x, y, of, **names)
 
 
