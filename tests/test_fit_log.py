@@ -223,7 +223,7 @@ def test_a_damaged_log_is_refused(whole, seen, tmp_path):
     for at, damage in [*zeros, *((at, bytes([data[at] ^ 1 << at % 8])) for at in flipped)]:
         path.write_bytes(data[:at] + damage + data[at + len(damage) :])
         with pytest.raises(ValueError, match=rf"^{path} (is damaged|is not the log)"):
-            _read(path, problem, method, jnp.zeros(2), described(problem, method))
+            _read(path, problem, method, described(problem, method))
     with h5py.File(path, "w") as file:
         file.attrs["kind"], file.attrs["format"] = np.bytes_("mpmjax fit log"), 1
     with pytest.raises(ValueError, match=r"is a log of format 1, this mpmjax reads 2: begin the fit anew"):

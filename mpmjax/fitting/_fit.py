@@ -89,11 +89,10 @@ def fit(
     level = checked_level(level)
     report = dict(report or {})
     _check_report(problem, report)
-    z = jnp.zeros(problem.size, problem.dtype)
     with ExitStack() as stack:
         written = None
         if log is not None:
-            written = stack.enter_context(opened_log(Path(log), problem, optimiser, z, resume=resume))
+            written = stack.enter_context(opened_log(Path(log), problem, optimiser, resume=resume))
             stack.enter_context(reporting(written.contents))
         minimum, settled = _searched(problem, optimiser, progress, written)
     result = fit_result(problem, optimiser, minimum, settled, report, level)
@@ -156,9 +155,8 @@ def _searched(
     problem: FitProblem, optimiser: AbstractOptimiser, progress: Callable[[str], None] | None, log: FitLog | None
 ) -> tuple[Minimum, SettledNoise]:
     """The minimum and the noise, in rounds. A log is continued, and gets each iteration."""
-    sigmas, earlier, rounds, state, seconds_before = problem.first_sigmas, (), 0, None, 0.0
-    if log is not None and log.last is not None:
-        earlier, rounds, (sigmas, state), seconds_before = log.earlier, log.rounds, log.last, log.seconds
+    end = None if log is None else log.end
+    rounds, earlier, sigmas, state, seconds_before = (0, (), problem.first_sigmas, None, 0.0) if end is None else end
     lines, begun = Progress(problem, optimiser, progress), time.perf_counter() - seconds_before
     lines.begin(0 if state is None else len(earlier) + len(state.history))
 

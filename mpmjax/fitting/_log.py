@@ -37,7 +37,7 @@ from mpmjax._types import Array
 from mpmjax.checks import require
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._search import Iteration, SearchState, begin
 from mpmjax.io import ReplacedFile, check_hdf5, reason
 
@@ -67,24 +67,13 @@ class FitLog:
         self._values = [self._numbers(i) for r in rounds for i in r.search.history]
 
     @property
-    def rounds(self) -> int:
-        """How many rounds are done before the one that the log ends in."""
-        return max(len(self._rounds) - 1, 0)
-
-    @property
-    def earlier(self) -> tuple[Iteration, ...]:
-        """The iterations of those rounds."""
-        return tuple(i for r in self._rounds[:-1] for i in r.search.history)
-
-    @property
-    def last(self) -> tuple[tuple[Array, ...], SearchState] | None:
-        """The noise of the round that the log ends in, and where its search stands; None if it has no iteration."""
-        return (self._rounds[-1].sigmas, self._rounds[-1].search) if self._rounds else None
-
-    @property
-    def seconds(self) -> float:
-        """When the last iteration was done, since the fit began [s]."""
-        return self._rounds[-1].seconds[-1] if self._rounds else 0.0
+    def end(self) -> tuple[int, tuple[Iteration, ...], tuple[Array, ...], SearchState, float] | None:
+        """Number of rounds before the last one, and their iterations; noise of the last one, its search, and when its
+        last iteration was done, since the fit began [s]. None if there is no iteration."""
+        if not self._rounds:
+            return None
+        *done, last = self._rounds
+        return len(done), tuple(i for r in done for i in r.search.history), last.sigmas, last.search, last.seconds[-1]
 
     def append(self, sigmas: tuple[Array, ...], state: SearchState, seconds: float) -> None:
         """Write an iteration: the noise of its round, the search after it, and the seconds since the fit began.
@@ -153,9 +142,7 @@ class FitLog:
 
 
 @contextmanager
-def opened_log(
-    path: Path, problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, *, resume: bool
-) -> Iterator[FitLog]:
+def opened_log(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, *, resume: bool) -> Iterator[FitLog]:
     """A log that is begun or, with `resume`, read and continued.
 
     Raises:
@@ -171,12 +158,10 @@ def opened_log(
         return
     check_hdf5(path)
     with ReplacedFile(path, new=False) as file:
-        yield FitLog(path, file, problem, text, _read(path, problem, optimiser, z, text))
+        yield FitLog(path, file, problem, text, _read(path, problem, optimiser, text))
 
 
-def _read(
-    path: Path, problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, text: dict[str, str]
-) -> list[_Round]:
+def _read(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, text: dict[str, str]) -> list[_Round]:
     """The rounds in a log.
 
     Raises:
@@ -199,14 +184,12 @@ def _read(
     require(layout == _FORMAT, f"{path} is a log of format {layout}, this mpmjax reads {_FORMAT}: begin the fit anew.")
     _require_same(path, text, theirs)
     try:
-        return _rounds(arrays, problem, optimiser, z)
+        return _rounds(arrays, problem, optimiser)
     except (KeyError, IndexError, TypeError) as error:
         raise ValueError(f"{path} is damaged ({reason(error)}): begin the fit anew with another log.") from None
 
 
-def _rounds(
-    arrays: dict[str, np.ndarray], problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates
-) -> list[_Round]:
+def _rounds(arrays: dict[str, np.ndarray], problem: FitProblem, optimiser: AbstractOptimiser) -> list[_Round]:
     rows: Any = arrays["iterations"]
     places = arrays["coordinates"]
     rounds = []
@@ -223,7 +206,7 @@ def _rounds(
         rounds.append(_Round(sigmas, state, tuple(rows["seconds"][at].tolist())))
     if rounds:
         last = rounds[-1]
-        like = eqx.filter_eval_shape(begin, problem, optimiser, z.astype(float), last.sigmas)
+        like = eqx.filter_eval_shape(begin, problem, optimiser, jnp.zeros(problem.size), last.sigmas)
         numbers, rest = eqx.partition(like, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
         leaves, shape = jax.tree.flatten(numbers)
         read = [_like(leaf, arrays[f"resume/state/{k}"]) for k, leaf in enumerate(leaves)]
