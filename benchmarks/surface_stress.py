@@ -4,8 +4,8 @@
 
 The displacement U(R) of `verification.ExpandingRing` (ν = 0, free edges) is the exact equilibrium under a body force.
 It is solved for with the weights and gradients of the package's kernels, by sparse factorisation, on 20 and 40 cells a
-metre (and 80 with `--fine`), for three places of the ring in a cell each. Printed, as rows of docs/notes/figures.md: errors
-of the displacement (RMS, over that of the inner edge) and of the strain (mean, over the largest) of all particles, of
+metre (and 80 with `--fine`), for three places of the ring in a cell each. Printed, as rows of docs/notes/figures.md:
+errors of the displacement (RMS, over that of the inner edge) and of the strain (mean, over the largest) of all particles, of
 those within half a cell of the surface, of the others, and the worst; then the least mass of a node over that of a full
 one. All are means over the three places.
 
