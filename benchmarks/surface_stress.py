@@ -4,10 +4,10 @@
 
 The displacement U(R) of `verification.ExpandingRing` (ν = 0, free edges) is the exact equilibrium under a body force.
 It is solved for with the weights and gradients of the package's kernels, by sparse factorisation, on 20 and 40 cells a
-metre (and 80 with `--fine`), for three places of the ring in a cell each. Printed, as rows of docs/accuracy.md: errors
-of the displacement (RMS, over that of the inner edge) and of the strain (mean, over the largest) of all particles, of
-those within half a cell of the surface, of the others, and the worst; then the least mass of a node over that of a full
-one. All are means over the three places.
+metre (and 80 with `--fine`), for three places of the ring in a cell each. Printed, as rows of docs/notes/figures.md:
+errors of the displacement (RMS, over that of the inner edge) and of the strain (mean, over the largest) of all
+particles, of those within half a cell of the surface, of the others, and the worst; then the least mass of a node over
+that of a full one. All are means over the three places.
 
 - whole: a lattice point inside has a whole cell (what `fill` did); parts: the part of its cell inside; filled: parts
   below a fiftieth of a cell given to a neighbour (what `fill` does); beside: filled with a lattice that does not follow

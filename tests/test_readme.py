@@ -69,6 +69,14 @@ def test_links_lead_to_files_and_headings(page):
         assert not anchor or anchor in anchors(path), f"{page} links to {target}"
 
 
+@pytest.mark.parametrize("page", PAGES)
+def test_files_that_a_page_names_exist(page):
+    """Tests, scripts and examples, by their path from the root; NAME stands for any."""
+    text = PAGES[page].read_text(encoding="utf-8")
+    named = set(re.findall(r"\b(?:tests|benchmarks|examples|mpmjax)/[\w/]+\.(?:py|toml|md)\b", text))
+    assert not {name for name in named if "NAME" not in name and not (ROOT / name).exists()}
+
+
 def test_equations_that_are_cited_stand_in_the_derivation():
     """Those of docstrings and of pages; a number that is gone would send the reader astray."""
     files = [*ROOT.glob("mpmjax/**/*.py"), *ROOT.glob("native/*.[hc]*"), *ROOT.glob("benchmarks/*.py"), *PAGES.values()]
