@@ -1,4 +1,4 @@
-"""Pictures: where a ball appears and how large, what hides what, where light and shadow fall, which way is up."""
+"""Pictures: what hides what, which way is up and out, where walls and obstacles are."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,21 +10,17 @@ from helpers import LAWS, thorough
 import mpmjax as mpm
 from mpmjax.simulation._statistics import no_steps
 from mpmjax.state._particles import State
-from mpmjax.viz._ray_casting import SAMPLES, Balls, Camera, look, paint, picture, surroundings
 from mpmjax.viz._render import (
     _bearing,
     _flat_canvas,
-    _measure,
     _obstacles,
+    _outward,
     _remembered,
-    _round_length,
     _tinted,
     _upright,
     _walls,
     skin,
 )
-
-SIZE = (161, 121)
 
 
 def still_run(x, *, volume=1e-3, v=None, **scene) -> mpm.Run:
@@ -41,141 +37,37 @@ def still_run(x, *, volume=1e-3, v=None, **scene) -> mpm.Run:
     )
 
 
-def level(width=SIZE[0], height=SIZE[1], focal=200.0) -> Camera:
-    """A camera in the origin that looks along the second axis, the first to the right, the third up."""
-    axes = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
-    return Camera(np.zeros(3), axes, focal, width, height, np.array([0.0, 1.0, 0.0]))
-
-
-@pytest.mark.parametrize("centre", [(0.0, 3.0, 0.0), (0.7, 3.0, -0.5), (-1.0, 4.0, 0.9)])
-def test_a_balls_silhouette_is_that_of_exact_perspective(centre):
-    """A pixel shows the ball if and only if its ray passes within the angle asin(r / |c|) of its middle."""
-    camera, c, r = level(), np.array(centre), 0.4
-    _, owner = paint(camera, c[None], np.array([r]))
-    column, row = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
-    ray = np.stack([(column - SIZE[0] / 2) / 200, np.ones_like(row), (SIZE[1] / 2 - row) / 200], axis=-1)
-    angle = np.arctan2(np.linalg.norm(np.cross(ray, c), axis=-1), ray @ c)
-    expected = angle < np.arcsin(r / np.linalg.norm(c))
-    assert 500 < expected.sum() < 0.5 * expected.size
-    np.testing.assert_array_equal(owner.reshape(SIZE[::-1]) == 0, expected)
-
-
-def test_a_ball_straight_ahead_has_the_radius_of_the_tangent_cone():
-    """f r / √(Z² − r²) pixels about the middle; its nearest point lies at Z − r."""
-    depth, owner = paint(level(), np.array([[0.0, 3.0, 0.0]]), np.array([0.5]))
-    radius = 200 * 0.5 / np.sqrt(9 - 0.25)
-    assert abs((owner == 0).sum() - np.pi * radius**2) < 2 * radius
-    assert depth.reshape(SIZE[::-1])[60, 80] == pytest.approx(2.5, rel=1e-6)
-
-
-def test_nearer_balls_hide_farther_ones():
-    """Whatever their order; also where two cut each other."""
-    x, r = np.array([[0.0, 4.0, 0.0], [0.1, 3.0, 0.0], [0.0, 3.5, 0.3]]), np.array([0.6, 0.3, 0.4])
-    depth, owner = paint(level(), x, r)
-    alone = np.stack([paint(level(), x[i : i + 1], r[i : i + 1])[0] for i in range(3)])
-    np.testing.assert_array_equal(depth, alone.min(axis=0))
-    np.testing.assert_array_equal(owner, np.where(np.isinf(depth), -1, alone.argmin(axis=0)))
-    assert {0, 1, 2} <= set(owner)
-    order = np.array([2, 0, 1])
-    shuffled = paint(level(), x[order], r[order])[1]
-    np.testing.assert_array_equal(np.where(shuffled < 0, -1, order[shuffled]), owner)
-
-
-def test_painting_many_is_painting_each():
-    """Windows of all sizes, in and across the picture's edge, and balls behind the eye or smaller than a pixel."""
-    rng = np.random.default_rng(0)
-    x = np.concatenate([rng.uniform((-3, -1, -2), (3, 8, 2), (300, 3)), [[0.0, 2.0, 0.0]]])
-    r = np.concatenate([10 ** rng.uniform(-2.5, -0.3, 300), [1e-6]])
-    depth, _ = paint(level(), x, r)
-    each = [paint(level(), x[i : i + 1], r[i : i + 1])[0] for i in range(len(x))]
-    np.testing.assert_array_equal(depth, np.min(each, axis=0))
-    assert np.isfinite(each[-1]).sum() >= 1
-    assert np.isfinite(depth).sum() > 1000
-
-
-def test_no_ball_at_all():
-    depth, owner = paint(level(), np.zeros((0, 3)), np.zeros(0))
-    assert np.isinf(depth).all()
-    assert (owner == -1).all()
-
-
-@pytest.mark.parametrize("view", [(0.0, 10.0), (35.0, 20.0), (-120.0, 75.0)])
-def test_the_camera_holds_all_and_has_it_in_the_middle(view):
-    x = np.random.default_rng(0).uniform((-1, 0, 3), (2, 1, 4), (50, 3))
-    camera = look(x, 0.1, view, SIZE)
-    place, depth = camera.project(x)
-    assert (depth > 0).all()
-    lower, upper = place.min(axis=0) / SIZE, place.max(axis=0) / SIZE
-    assert 0.6 < (upper - lower).max() < 0.8
-    np.testing.assert_allclose((lower + upper) / 2, 0.5, atol=0.02)
-    np.testing.assert_allclose(camera.axes @ camera.axes.T, np.eye(3), atol=1e-12)
-    back = camera.eye - camera.target
-    assert np.degrees(np.arcsin(back[2] / np.linalg.norm(back))) == pytest.approx(view[1])
-    np.testing.assert_allclose(camera.project(camera.eye[None] + camera.rays()[:1])[0], [[0.5, 0.5]], atol=1e-3)
-
-
-def drawn(x, radius, *, ground, reach=4, view=(0.0, 30.0), light=(-60.0, 40.0), size=SIZE):
-    """A picture of white balls, its camera and its light."""
-    x, radius = np.array(x, float), np.full(len(x), radius)
-    camera = look(x, reach * radius[0], view, size)
-    lamp = look(x, 2 * radius[0], light, (512, 512), angle=5.0)
-    about, slope = surroundings(x, 4 / 3 * np.pi * radius**3, ground)
-    balls = Balls(x, radius, np.full((len(x), 3), 0.8), 0 * slope)
-    return picture(camera, lamp, balls, about=about, ground=ground, square=1e-6).mean(axis=-1), camera, lamp
-
-
-def brightness(image, camera, points):
-    """Of the pixels where points appear."""
-    place = camera.project(np.atleast_2d(points))[0].astype(int)
-    return image[place[:, 1], place[:, 0]]
-
-
-def test_what_faces_the_light_is_brighter():
-    """Along the ball's equator of the picture, brightness falls with the angle to the light."""
-    image, camera, lamp = drawn([[0.0, 0.0, 0.0]], 1.0, ground=None)
-    towards = -lamp.axes[2]
-    seen = -camera.axes[2]
-    across = np.cross(np.cross(seen, towards), seen)
-    across /= np.linalg.norm(across)
-    angles = np.radians([-60, -30, 0, 30])
-    values = brightness(image, camera, [np.cos(a) * seen + np.sin(a) * across for a in angles])
-    assert np.all(np.diff(values) > 0.03)
-
-
-def test_the_shadow_falls_away_from_the_light():
-    """On the ground along the light from each ball, and nowhere else; a ball in another's shadow is darker too."""
-    ball, radius, ground = np.array([[0.0, 0.0, 1.5]]), 0.3, 0.0
-    image, camera, lamp = drawn(ball, radius, ground=ground, reach=20, size=(321, 241))
-    ray = ball[0] - lamp.eye
-    spot = ball[0] + ray * (ground - ball[0, 2]) / ray[2]
-    aside = spot + np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0]])
-    inside = brightness(image, camera, spot + 0.6 * radius * np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0]]))
-    outside = brightness(image, camera, aside)
-    assert inside.max() < 0.8 * outside.min()
-    assert np.linalg.norm(spot[:2] - ball[0, :2]) > 4 * radius  # so that this is not the dark below the ball
-    towards = -lamp.axes[2]
-    alone, camera, _ = drawn([[0.0, 0.0, 0.0], [9.0, 9.0, 9.0]], 0.5, ground=None)
-    open_ = brightness(alone, camera, 0.49 * towards)
-    shaded, camera, _ = drawn([[0.0, 0.0, 0.0], 2.5 * towards], 0.5, ground=None)
-    assert brightness(shaded, camera, 0.49 * towards) < 0.85 * open_
-
-
-def test_a_gap_near_a_body_sees_less_sky():
-    """The filled fraction before the ground falls with the distance to a block that stands on it."""
+def test_outward_normals_are_those_of_the_bodys_surface():
+    """On a block's faces along their normals, nowhere in its middle; a particle alone has none."""
     a = (np.arange(16) + 0.5) / 16
     x = np.stack(np.meshgrid(a, a, a), axis=-1).reshape(-1, 3)
-    about, slope = surroundings(x, np.full(len(x), 1 / 16**3), 0.0)
-    points = np.array([[0.5, -s, 0.0] for s in (0.05, 0.2, 1.5)], np.float32)
-    sky = about.sky(points, np.tile(np.float32([0, 0, 1]), (3, 1)))
-    assert np.all(np.diff(sky) > 0.02)
-    assert sky[-1] > 0.95
-    # The slope points outward: on the block's faces along their normals, nowhere in its middle.
+    normal = _outward(x, np.full(len(x), 1 / 16**3))
     top = (x[:, 2] == a[-1]) & (np.abs(x[:, :2] - 0.5) < 0.2).all(axis=1)
     np.testing.assert_allclose(
-        slope[top] / np.linalg.norm(slope[top], axis=1, keepdims=True), np.tile([0, 0, 1], (top.sum(), 1)), atol=0.02
+        normal[top] / np.linalg.norm(normal[top], axis=1, keepdims=True), np.tile([0, 0, 1], (top.sum(), 1)), atol=0.02
     )
-    assert np.linalg.norm(slope[top], axis=1).min() > 0.3
-    assert np.abs(slope[(np.abs(x - 0.5) < 0.2).all(axis=1)]).max() < 0.05
+    assert np.linalg.norm(normal[top], axis=1).min() > 0.3
+    assert np.abs(normal[(np.abs(x - 0.5) < 0.2).all(axis=1)]).max() < 0.05
+    assert np.abs(_outward(np.zeros((1, 3)), np.ones(1))).max() < 0.05
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_nearer_of_two_hides_the_farther(tmp_path, turned):
+    """Seen along the second axis; turned by half a circle, the other one is nearer."""
+    x = np.array([[[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]]])
+    v = jnp.asarray(x)  # the first at rest, dark blue, the second bright yellow
+    path = tmp_path / "two.png"
+    mpm.render(still_run(x, v=v, volume=0.03, gravity=(0.0, 0.0, -9.8)), path, dpi=30.0, view=(180.0 * turned, 1.0))
+    yellow, blue = coloured(path)
+    assert (yellow.sum() > 10 * blue.sum()) == turned
+    assert (blue.sum() > 10 * yellow.sum()) != turned
+
+
+def coloured(path):
+    """Where a picture, without its colour bar, is bright yellow and where dark blue."""
+    image = matplotlib.image.imread(path)[:, :200, :3]
+    yellow = (image[..., 0] > 0.6) & (image[..., 2] < 0.4)
+    return yellow, (image[..., 2] > 1.4 * image[..., 1]) & (image[..., 0] < 0.4)
 
 
 @pytest.mark.parametrize("gravity", [(0.0, 0.0, -9.8), (0.1, -9.8, 0.0), (-9.8, 0.0, 0.0), (0.0, 0.0, 9.8), None])
@@ -201,9 +93,7 @@ def test_the_upper_particle_is_drawn_above(tmp_path, axis):
     gravity[axis] = -9.8
     path = tmp_path / "up.png"
     mpm.render(still_run(x, v=v, volume=0.03, gravity=gravity), path, dpi=30.0)
-    image = matplotlib.image.imread(path)[:, :200, :3]  # without the colour bar
-    yellow = (image[..., 0] > 0.6) & (image[..., 2] < 0.4)
-    blue = (image[..., 2] > 1.6 * image[..., 1]) & (image[..., 0] < 0.4)
+    yellow, blue = coloured(path)
     assert min(yellow.sum(), blue.sum()) > 100
     assert np.nonzero(yellow)[0].max() < np.nonzero(blue)[0].min()
 
@@ -225,17 +115,6 @@ def test_the_ground_is_the_highest_wall_that_bears():
     assert _bearing(scene, np.array([0.0, -1.0, 0.0])) == -1.0
     assert _bearing(scene, np.array([1.0, 0.0, 0.0])) == 0.1
     assert _bearing(scene, np.array([0.0, 0.0, 1.0])) is None
-
-
-def test_the_measure_is_a_side_of_the_grounds_squares():
-    """Its ends, brought back to the ground along their rays, are neighbours on the lattice; both are in the picture."""
-    camera, ground, square = look(np.zeros((1, 3)), 1.0, (30.0, 20.0), SIZE), -0.7, 0.5
-    ends = _measure(camera, ground, square)
-    assert ((ends > 0) & (ends < SIZE)).all()
-    rays = (ends - np.array(SIZE) / 2) / camera.focal @ camera.axes[:2] + camera.axes[2]
-    x = camera.eye + rays * ((ground - camera.eye[2]) / rays[:, 2:])
-    assert np.linalg.norm(x[1] - x[0]) == pytest.approx(square, rel=1e-4)
-    np.testing.assert_allclose(x[:, :2] / square, np.round(x[:, :2] / square), atol=1e-4)
 
 
 def test_the_skin_of_a_shape_lies_on_it():
@@ -310,11 +189,6 @@ def test_disks_are_as_large_as_their_particles():
     assert covered == pytest.approx(12 * 0.3 * scale**2, rel=0.02)
 
 
-@pytest.mark.parametrize(("length", "expected"), [(0.1, 0.1), (0.19, 0.1), (7.3, 5.0), (0.02, 0.02), (499.0, 200.0)])
-def test_scales_are_round(length, expected):
-    assert _round_length(length) == pytest.approx(expected)
-
-
 @pytest.mark.parametrize("d", [1, 2, 3])
 @pytest.mark.parametrize("colour", ["speed", "none"])
 def test_one_particle_is_drawn(tmp_path, d, colour):
@@ -377,9 +251,3 @@ def test_what_cannot_be_drawn_is_refused(tmp_path):
     with pytest.raises(ValueError, match="no frames"):
         mpm.render(eqx.tree_at(lambda r: r.frames, run, None), path)
     assert not path.exists()
-
-
-def test_pictures_have_the_cameras_size():
-    image, camera, _ = drawn([[0.0, 0.0, 0.0]], 1.0, ground=None)
-    assert image.shape == (camera.height, camera.width)
-    assert SAMPLES >= 2

@@ -3,7 +3,8 @@
 Python's own way is an exception in the main thread. It waits until compiled code returns, which can take minutes, and
 then comes anywhere: amid a trace, a callback of the compiler, a call of HDF5. So none is raised here. A thread is told
 of the signal, waits for the write in progress, and ends the process with 128 + the signal's number. Between two writes
-what is in files is whole (see `_staged`). What is better ended in good order, such as a fit, asks for it by `stopping`.
+what is in files is whole (see `_transactional_file`). What is better ended in good order, such as a fit, asks for it by
+`stopping`.
 """
 
 import os

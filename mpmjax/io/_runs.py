@@ -9,7 +9,7 @@
 
 Whatever is not in a dataset lies in headers that HDF5 checks itself, so a flipped bit is found. `NSteps` is raised
 last, and what lies beyond it, the remains of a writer that was killed, is neither read nor kept. A frame that the disk
-does not take leaves the file as it was (see `_staged`).
+does not take leaves the file as it was (see `_transactional_file`).
 
 A file is read only if it holds all of its data itself: HDF5 follows links to other files, and would write into them.
 """

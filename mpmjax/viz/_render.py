@@ -1,4 +1,4 @@
-"""Pictures of runs: matplotlib in one and two dimensions, balls in the light of `_ray_casting` in three."""
+"""Pictures of runs by matplotlib: disks in two dimensions, shaded points sorted by depth in three."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -7,6 +7,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from scipy import ndimage
 
 from mpmjax.analysis import energy_density, volume_ratio
 from mpmjax.boundary import Wall
@@ -14,7 +15,6 @@ from mpmjax.checks import canonical, checked, require, require_between, require_
 from mpmjax.io import replacing, save_figure
 from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene, by_material, history_arrays
-from mpmjax.viz._ray_casting import Balls, Camera, look, picture, surroundings
 
 COLOURS: dict[str, tuple[str, Callable[[Run, Particles], Any]]] = {
     "speed": ("speed [m/s]", lambda run, q: np.linalg.norm(q.v, axis=1)),
@@ -26,6 +26,8 @@ COLOURS: dict[str, tuple[str, Callable[[Run, Particles], Any]]] = {
 SNOW, OCHRE, STEEL, MOSS = (0.91, 0.93, 0.96), (0.82, 0.55, 0.33), (0.36, 0.5, 0.66), (0.45, 0.62, 0.42)
 STONE = (0.55, 0.54, 0.52)
 """The colour of walls and colliders."""
+_MOST_CELLS = 90
+"""Cells in a direction of the lattice by which particles are shaded."""
 
 Draw = Callable[[Particles, np.ndarray, float], None]
 
@@ -43,10 +45,10 @@ def render(
 ) -> None:
     """Draw a run: one frame as a still (.png, .pdf, .svg) or all of them as an animation (.gif).
 
-    In two dimensions particles are disks of their undeformed volume, walls are lines. In three they are balls half as
-    large again, so that they close into a body, lit from the upper left; up is against gravity's largest component (the
-    last axis without gravity), and the ground is the highest wall or plane that bears, else a little below the
-    particles. All frames of a run have the same view and scale.
+    In two dimensions particles are disks of their undeformed volume, walls are lines. In three they are points sorted
+    by depth, half as large again, so that they close into a body, and shaded by its surface in a light from the upper
+    left; up is against gravity's largest component (the last axis without gravity), and the ground is the highest wall
+    or plane that bears, else a little below the particles. All frames of a run have the same view and scale.
 
     Args:
         run: a run with frames.
@@ -96,7 +98,7 @@ def render(
     bar = None
     if colour is not None:
         bar = cm.ScalarMappable(colors.Normalize(np.nanmin(values), np.nanmax(values)), "viridis")
-    figure, draw = _solid_canvas(run, bar, label, view, dpi) if run.final.dim == 3 else _flat_canvas(run, bar, label)
+    figure, draw = _solid_canvas(run, bar, label, view) if run.final.dim == 3 else _flat_canvas(run, bar, label)
 
     def show(k: int) -> None:
         draw(run.frame(shown[k]), values[k], float(run.times[shown[k]]))
@@ -187,89 +189,97 @@ def _bearing(scene: Scene, up: np.ndarray) -> float | None:
     return max(heights, default=None)
 
 
-def _round_length(length: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that does not exceed a length."""
-    power = 10.0 ** np.floor(np.log10(length))
-    return float(power * max(n for n in (1, 2, 5) if n * power <= 1.000001 * length))
-
-
-def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float], dpi: float) -> tuple[Any, Draw]:
-    """A figure of three dimensions, seen from where every frame is held, and what draws one."""
-    from matplotlib import pyplot as plt
+def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> tuple[Any, Draw]:
+    """A figure of three dimensions with axes that hold every frame, and what draws one."""
+    from matplotlib import pyplot as plt, ticker
+    from mpl_toolkits.mplot3d import proj3d
 
     assert run.frames is not None
     turn = _upright(run.scene)
     volume = np.asarray(run.final.volume, float)
     size = float(volume.mean()) ** (1 / 3)
-    radius = 1.15 * (3 * volume / (4 * np.pi)) ** (1 / 3)
-    everything = np.asarray(run.frames.x, float).reshape(-1, 3)
-    lower, upper = everything.min(axis=0) - size, everything.max(axis=0) + size
+    x = np.asarray(run.frames.x, float).reshape(-1, 3)
+    lower, upper = x.min(axis=0) - size, x.max(axis=0) + size
     extent = float((upper - lower).max())
-    square = _round_length(extent / 5)
-    middle = np.round((lower + upper) / 2 / square) * square  # about which single precision does
     room, spacing = (lower - extent / 2, upper + extent / 2), max(size, extent / 50)
-
-    def place(x: Any) -> np.ndarray:
-        return (np.asarray(x, float) - middle) @ turn.T
+    diameter = 2.3 * (3 * volume / (4 * np.pi)) ** (1 / 3)  # so large that they close into a body
 
     def stones(t: float) -> tuple[np.ndarray, np.ndarray]:
-        """The obstacles' skins, below the surface by their balls' radius, and their normals."""
+        """The obstacles' skins, below the surface by the radius of their balls, and their normals."""
         skins = [skin(distance, *room, spacing) for distance in _obstacles(run.scene, t)]
-        found = [(place(x - 1.5 * spacing * n), n @ turn.T) for x, n in skins]
-        x, n = zip((np.zeros((0, 3)), np.zeros((0, 3))), *found, strict=True)
+        turned = [((x - 1.5 * spacing * n) @ turn.T, n @ turn.T) for x, n in skins]
+        x, n = zip((np.zeros((0, 3)), np.zeros((0, 3))), *turned, strict=True)
         return np.concatenate(x), np.concatenate(n)
 
-    # The cells where particles ever are stand for them: what the cameras hold need be known no better.
-    cells = np.unique(np.ravel_multi_index(tuple(((everything - lower) * (64 / extent)).astype(int).T), (65,) * 3))
-    cloud = place(lower + (np.stack(np.unravel_index(cells, (65,) * 3), axis=-1) + 0.5) * (extent / 64))
-    held = np.concatenate([cloud, stones(float(run.times[0]))[0]])
     bearing = _bearing(run.scene, turn[2])
-    ground = float(held[:, 2].min() - 1.5 * spacing if bearing is None else bearing - turn[2] @ middle)
+    everything = np.concatenate([x @ turn.T, stones(float(run.times[0]))[0]])
+    lower, upper = everything.min(axis=0) - size, everything.max(axis=0) + size
+    ground = float(lower[2] if bearing is None else bearing)
+    lower[2] = min(lower[2], ground)
     figure = plt.figure(figsize=(8, 6))
-    pixels = round(8 * dpi), round(6 * dpi)
-    camera = look(held, radius.max() + extent / 64, view, pixels)
-    light = look(held, radius.max() + extent / 32, (view[0] - 50.0, 50.0), (1024, 1024), angle=5.0, filled=0.98)
-    axes: Any = figure.add_axes((0, 0, 1, 1))
-    axes.set_axis_off()
-    image = axes.imshow(np.zeros((2, 2, 3)), extent=(0, pixels[0], pixels[1], 0), aspect="auto")
-    time = figure.text(0.04, 0.93, "", size=15, color="0.2")
+    axes: Any = figure.add_axes((0.02, 0.03, 0.82, 0.9), projection="3d", computed_zorder=False)
+    names = ["−" * bool(row.min() < 0) + "xyz"[int(np.abs(row).argmax())] for row in turn]
+    axes.set(**{f"{a}lim": limits for a, limits in zip("xyz", np.stack([lower, upper], axis=1), strict=True)})
+    axes.set(**{f"{a}label": f"{name} [m]" for a, name in zip("xyz", names, strict=True)})
+    axes.set_box_aspect(upper - lower, zoom=1.15)
+    axes.view_init(view[1], view[0] - 90)
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.pane.set_visible(axis is axes.zaxis)
+        axis.set_major_locator(ticker.MaxNLocator(5))
     if bar is not None:
-        scale = figure.colorbar(bar, cax=figure.add_axes((0.87, 0.28, 0.018, 0.44)))
-        scale.set_label(label, color="0.2")
-        scale.outline.set_visible(False)
-    ends = _measure(camera, ground, square)
-    axes.plot(*ends.T, color="0.2", lw=2.5, solid_capstyle="butt", scalex=False, scaley=False)
-    below = ends.mean(axis=0) + np.array([0, 0.03 * pixels[1]])
-    axes.text(*below, f"{square:g} m", ha="center", va="top", color="0.2")
+        figure.colorbar(bar, cax=figure.add_axes((0.88, 0.28, 0.018, 0.44)), label=label)
+    # points of paper to a metre at the middle, along the picture's horizontal
+    azimuth, elevation = np.radians(view)
+    right = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    ends = np.stack([(lower + upper) / 2 - right * size, (lower + upper) / 2 + right * size])
+    place = np.stack(proj3d.proj_transform(ends[:, 0], ends[:, 1], ends[:, 2], axes.get_proj())[:2], axis=1)
+    figure.canvas.draw()
+    metre = float(np.linalg.norm(np.diff(axes.transData.transform(place), axis=0))) / (2 * size) * 72 / figure.dpi
+    back = np.array([np.sin(azimuth) * np.cos(elevation), -np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
+    light = 0.55 * back - 0.45 * right + np.array([0, 0, 0.7])  # from the upper left
+    light = light / np.linalg.norm(light)
+    shown: list[Any] = []
 
     def draw(particles: Particles, values: np.ndarray, t: float) -> None:
-        x, (rock, normal) = place(particles.x), stones(t)
-        about, slope = surroundings(x, volume, ground)
-        colour = _tinted(particles, bar, values)
-        balls = Balls(
-            np.concatenate([x, rock]),
-            np.concatenate([radius, np.full(len(rock), 1.5 * spacing)]),
-            np.concatenate([colour, np.tile(STONE, (len(rock), 1))]),
-            np.concatenate([slope, 10 * normal]),
-        )
-        image.set_data(picture(camera, light, balls, about=about, ground=ground, square=square))
-        time.set_text(f"t = {t:.4g} s")
+        x, (rock, normal) = np.asarray(particles.x, float) @ turn.T, stones(t)
+        normals = np.concatenate([_outward(x, volume), normal])
+        facing = (normals @ light)[:, None]
+        colour = np.concatenate([_tinted(particles, bar, values), np.tile(STONE, (len(rock), 1))])
+        colour = np.clip(colour * np.where(facing > 0, 0.75 + 0.3 * facing, 0.75 + 0.4 * facing), 0, 1)
+        wide = np.concatenate([diameter, np.full(len(rock), 3 * spacing)])
+        while shown:
+            shown.pop().remove()
+        every = np.concatenate([x, rock])
+        shadow = np.column_stack([every[:, :2], np.full(len(every), ground)])
+        for at, colours, order in ((shadow, "0.8", 1), (every, colour, 2)):
+            points = axes.scatter(
+                *at.T, s=(wide * metre) ** 2, c=colours, depthshade=False, linewidth=0, zorder=order, rasterized=True
+            )
+            shown.append(points)
+        axes.set_title(f"t = {t:.4g} s")
 
     return figure, draw
 
 
-def _measure(camera: Camera, ground: float, square: float) -> np.ndarray:
-    """Where the ends of a side of the ground's squares appear [pixels], (2, 2): the more level of the two, in the lower
-    left of the picture."""
-    size = np.array([camera.width, camera.height])
-    goal = np.array([0.17, 0.89]) * size
-    ray = (goal - size / 2) / camera.focal @ camera.axes[:2] + camera.axes[2]
-    node = camera.eye + ray * (ground - camera.eye[2]) / ray[2]
-    node[:2] = np.round(node[:2] / square) * square
-    side = np.eye(3)[int(np.abs(camera.axes[0, :2]).argmax())] * square
-    near = [node + square * np.array([i, j, 0]) for i in range(-2, 3) for j in range(-2, 3)]
-    ends = [camera.project(np.stack([at, at + side]))[0] for at in near]
-    return min(ends, key=lambda p: float(np.abs((p - goal) / size).sum()))
+def _outward(x: np.ndarray, volume: np.ndarray) -> np.ndarray:
+    """The outward normals of a body at its particles [-], (p, 3): about 1 long at its surface, 0 in its inside. They
+    are the slope of how full the space is, on a lattice of cells as large as the particles.
+
+    Args:
+        x: positions [m], (p, 3).
+        volume: their volumes [m³], (p,).
+    """
+    lower, upper = x.min(axis=0), x.max(axis=0)
+    cell = max(float(volume.mean()) ** (1 / 3), float((upper - lower).max()) / _MOST_CELLS)
+    place = (x - lower) / cell + 3.5
+    shape = tuple(((upper - lower) / cell).astype(int) + 8)
+    index = np.ravel_multi_index(tuple(place.astype(int).T), shape)
+    full = np.bincount(index, volume / cell**3, minlength=int(np.prod(shape))).reshape(shape)
+    full = ndimage.gaussian_filter(full, 1.5)
+    at = partial(ndimage.map_coordinates, coordinates=place.T - 0.5, order=1, mode="nearest")
+    slope = np.stack([at(a) for a in np.gradient(full)], axis=1)
+    normal = -1.5 * slope / np.maximum(at(full), 0.2)[:, None]
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1)
 
 
 def _flat_canvas(run: Run, bar: Any, label: str) -> tuple[Any, Draw]:
