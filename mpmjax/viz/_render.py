@@ -221,7 +221,7 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
     names = ["−" * bool(row.min() < 0) + "xyz"[int(np.abs(row).argmax())] for row in turn]
     axes.set(**{f"{a}lim": limits for a, limits in zip("xyz", np.stack([lower, upper], axis=1), strict=True)})
     axes.set(**{f"{a}label": f"{name} [m]" for a, name in zip("xyz", names, strict=True)})
-    axes.set_box_aspect(upper - lower, zoom=1.15)
+    axes.set_box_aspect(upper - lower, zoom=1.0)
     axes.view_init(view[1], view[0] - 90)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.pane.set_visible(axis is axes.zaxis)
