@@ -48,11 +48,11 @@ Matrix = Float[Array, "d d *p"]
 """A d x d matrix per particle (or a single one), component first."""
 
 Deformation = Float[Array, "..."]
-"""What particles store of their deformation (see `material/_kinematics.py`), component first: F, shape (d, d, *p), or
+"""The deformation that particles store (see `material/_kinematics.py`), component first: F, shape (d, d, *p), or
 J, shape (*p)."""
 
 Compliance = Float[Array, "s s *p"]
-"""What turns the vector of a skew d x d matrix into a spin: s = 3 in 3-D, else 1."""
+"""The map from the vector of a skew d x d matrix to a spin: s = 3 in 3-D, else 1."""
 
 Indices = Int[Array, "k p"]
 

@@ -1,8 +1,11 @@
-"""Every public class, function and method says what it is; an override may leave that to what it overrides."""
+"""Every public name says what it is, in plain words; an override may leave that to what it overrides."""
 
+import ast
 import importlib
 import inspect
 import pkgutil
+import re
+from pathlib import Path
 
 import pytest
 
@@ -30,3 +33,29 @@ def undocumented(module):
 def test_every_public_name_says_what_it_is(name):
     """In its own docstring or, of a method that overrides another, in that of a base class."""
     assert not list(undocumented(importlib.import_module(name)))
+
+
+PACKAGE = Path(mpmjax.__file__).parent
+FILES = {path.relative_to(PACKAGE).as_posix(): ast.parse(path.read_text()) for path in sorted(PACKAGE.rglob("*.py"))}
+NAMELESS = {"found", "own", "known", "given", "said"}
+"""Names that say how a value came about, and not what it is."""
+NOT_YET = ("boundary/", "fitting/", "implicit/", "stepping/", "analysis/_budget.py")
+"""Files that have locals of these names still."""
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_docstrings_start_with_their_subject(name):
+    """And not with a pronoun or a relative clause."""
+    documented = (node for node in ast.walk(FILES[name]) if isinstance(getattr(node, "body", None), list))
+    statements = (statement for node in documented for statement in node.body)  # attributes' docstrings too
+    texts = (s.value.value for s in statements if isinstance(s, ast.Expr) and isinstance(s.value, ast.Constant))
+    openings = re.compile(r"\s*(What|That|Those|Of|Its|The same|And)\b")
+    assert not [text for text in texts if isinstance(text, str) and openings.match(text)]
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if not name.startswith(NOT_YET)])
+def test_variables_are_named_for_what_they_are(name):
+    """No variable, argument or field is called found, own, known, given or said."""
+    nodes = list(ast.walk(FILES[name]))
+    bound = {node.id for node in nodes if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load)}
+    assert not (bound | {node.arg for node in nodes if isinstance(node, ast.arg)}) & NAMELESS

@@ -298,15 +298,15 @@ def test_the_bodies_are_of_every_kind():
 def test_a_function_takes_its_arguments_from_a_table():
     """What `fill` is called with can be read like an object."""
     table = {"region": {"kind": "Ball", "centre": [0, 0], "radius": 1}, "density": 1000, "particles_per_cell": [2, 3]}
-    given = arguments(mpm.fill, table, "[particles]", given=("grid",))
+    given = arguments(mpm.fill, table, "[particles]", without=("grid",))
     assert given["particles_per_cell"] == (2, 3)
     assert isinstance(given["region"], mpm.Ball)
     with pytest.raises(
         ValueError, match=r"^\[particles\]: unknown key 'grid'\. Known here: region, particles_per_cell"
     ):
-        arguments(mpm.fill, {**table, "grid": 1}, "[particles]", given=("grid",))
+        arguments(mpm.fill, {**table, "grid": 1}, "[particles]", without=("grid",))
     with pytest.raises(ValueError, match=r"^\[particles\] needs the key 'density'\.$"):
-        arguments(mpm.fill, {"region": table["region"]}, "[particles]", given=("grid",))
+        arguments(mpm.fill, {"region": table["region"]}, "[particles]", without=("grid",))
 
 
 def test_a_class_of_ones_own_is_refused():

@@ -77,7 +77,7 @@ class Displacements(NamedTuple):
 
 
 class Timed(NamedTuple):
-    """What a run came to."""
+    """The outcome of a run."""
 
     states: list[State] | None
     """The states at the times of comparison, None of a run that failed."""

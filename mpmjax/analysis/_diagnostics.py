@@ -49,8 +49,8 @@ def energy_of(scene: Scene, particles: Particles) -> Energy:
     for material in scene.rigid_bodies:
         rows = slice(*particles.groups[material.number].rows)
         body = rigid_body(particles.x[rows], particles.v[rows], particles.mass[rows], particles.volume[rows])
-        own = (body.mass * (body.velocity**2).sum() + body.spin @ body.inertia @ body.spin) / 2
-        kinetic = kinetic.at[rows].set(0).at[rows.start].set(own)
+        rigid = (body.mass * (body.velocity**2).sum() + body.spin @ body.inertia @ body.spin) / 2
+        kinetic = kinetic.at[rows].set(0).at[rows.start].set(rigid)
     gravity = jnp.asarray(scene.gravity, particles.x.dtype)
     return Energy(
         kinetic=kinetic.sum(),

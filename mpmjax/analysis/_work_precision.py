@@ -54,8 +54,10 @@ class WorkPrecision(NamedTuple):
 
     def _next(self, trial: Trial) -> Trial:
         """The trial with the next smaller step, or the trial itself."""
-        own = [t for t in self.trials if (t.refinement, name_of(t.method)) == (trial.refinement, name_of(trial.method))]
-        finer = [t for t in own if t.dt < trial.dt and not math.isnan(t.error)]
+        tried = [
+            t for t in self.trials if (t.refinement, name_of(t.method)) == (trial.refinement, name_of(trial.method))
+        ]
+        finer = [t for t in tried if t.dt < trial.dt and not math.isnan(t.error)]
         return max(finer, key=lambda t: t.dt, default=trial)
 
     def verdict(self) -> str:
@@ -73,21 +75,21 @@ class WorkPrecision(NamedTuple):
             other = f"{cheap} would need {cheap.seconds:.2g} s"
         else:
             other = f"no {'implicit' if is_explicit else 'explicit'} setting tried is as good"
-        said = f"{best} ({best.steps} steps): {best.seconds:.2g} s, error {best.error:.2g}; {other}."
+        text = f"{best} ({best.steps} steps): {best.seconds:.2g} s, error {best.error:.2g}; {other}."
         if best.error > self.target:
-            said += f" None reached {self.target:g}: on the grids tried no step does better."
+            text += f" None reached {self.target:g}: on the grids tried no step does better."
         if best.linearisation_error > LARGEST_LINEARISATION_ERROR:
-            said += (
+            text += (
                 f" Its linearisation error is up to {100 * best.linearisation_error:.2g} % of the elastic force: for "
                 "stresses take Newton's method, where nothing yields, or a shorter step."
             )
         if self.reference.error > self.target / 2:
-            said += f" The reference is known to {self.reference.error:.2g} only, and so are the errors."
+            text += f" The reference is known to {self.reference.error:.2g} only, and so are the errors."
         if self.reference.refinement == 1:
-            said += " There was no time for a finer grid: the errors are those of the step alone."
+            text += " There was no time for a finer grid: the errors are those of the step alone."
         if self.skipped:
-            said += f" There was no time for {', '.join(self.skipped)}."
-        return said
+            text += f" There was no time for {', '.join(self.skipped)}."
+        return text
 
 
 @checked
@@ -135,8 +137,8 @@ def work_precision(
     require_positive("t1 [s]", t1)
     require_positive("error", error)
     require_positive("most_seconds", most_seconds)
-    clock, own = Clock(most_seconds), Bench.of(build, 1, t1)
-    limit, reference, truth = settle(build, own, error, _REFERENCE_SHARE * most_seconds, say)
+    clock, bench = Clock(most_seconds), Bench.of(build, 1, t1)
+    limit, reference, truth = settle(build, bench, error, _REFERENCE_SHARE * most_seconds, say)
     trials: list[Trial] = []
     skipped: list[str] = []
 
@@ -190,11 +192,11 @@ def work_precision(
     def bettered(method: AbstractIntegrator) -> bool:
         """Whether others reach the errors of this implicit method on the scene's own grid in no more seconds."""
         first = [t for t in trials if t.refinement == 1 and t.method.is_explicit == method.is_explicit]
-        own = [t for t in first if t.method is method and math.isfinite(t.error)]
+        finished = [t for t in first if t.method is method and math.isfinite(t.error)]
         others = [t for t in first if t.method is not method]
-        return all(any(o.error <= _AS_GOOD * t.error and o.seconds <= t.seconds for o in others) for t in own)
+        return all(any(o.error <= _AS_GOOD * t.error and o.seconds <= t.seconds for o in others) for t in finished)
 
-    benches = {1: own}
+    benches = {1: bench}
     plan = [(n, method) for n, method in itertools.product(refinements, methods) if n <= reference.refinement or n == 1]
     for k, (n, method) in enumerate(plan):
         if n > 1 and 1 in refinements and not method.is_explicit and bettered(method):
@@ -205,5 +207,5 @@ def work_precision(
         benches[n] = benches[n] if n in benches else Bench.of(build, n, t1)
         refine(benches[n], method, 1 / (len(plan) - k))
     for method, dt in also:
-        tried(own, method, own.whole(dt))
+        tried(bench, method, bench.whole(dt))
     return WorkPrecision(tuple(trials), reference, float(error), limit, tuple(skipped))

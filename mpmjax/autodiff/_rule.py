@@ -106,16 +106,16 @@ class _Call(NamedTuple):
 
     def args(self, arrays: Sequence[Any]) -> tuple[Any, ...]:
         """The arguments with these arrays in their places."""
-        found = iter(arrays)
-        return jax.tree.unflatten(self.tree, [next(found) if f is _ARRAY else f for f in self.fixed])
+        remaining = iter(arrays)
+        return jax.tree.unflatten(self.tree, [next(remaining) if f is _ARRAY else f for f in self.fixed])
 
     def tangents(self, arrays: Sequence[Any]) -> tuple[Any, ...]:
         """The tangents of the arguments, from those of the arrays."""
-        found = iter(arrays)
-        return jax.tree.unflatten(self.tree, [next(found) if f is _ARRAY else None for f in self.fixed])
+        remaining = iter(arrays)
+        return jax.tree.unflatten(self.tree, [next(remaining) if f is _ARRAY else None for f in self.fixed])
 
     def arrays(self, args: Any) -> list[Any]:
-        """What stands in the places of the arrays."""
+        """The leaves in the places of the arrays."""
         leaves = self.tree.flatten_up_to(args)
         return [leaf for leaf, f in zip(leaves, self.fixed, strict=True) if f is _ARRAY]
 
@@ -137,8 +137,8 @@ def _values(*arrays: Array, call: _Call) -> list[Array]:
 
 
 def _shapes(*arrays: ShapedArray, call: _Call) -> list[ShapedArray]:
-    found = jax.tree.leaves(jax.eval_shape(partial(_evaluated, call), *arrays))
-    return [ShapedArray(a.shape, a.dtype) for a in found]
+    results = jax.tree.leaves(jax.eval_shape(partial(_evaluated, call), *arrays))
+    return [ShapedArray(a.shape, a.dtype) for a in results]
 
 
 def _batch(arrays: Sequence[Any], axes: Sequence[Any], *, call: _Call) -> tuple[list[Array], list[int]]:
@@ -153,8 +153,8 @@ def _jvp(primals: Sequence[Any], tangents: Sequence[Any], *, call: _Call) -> tup
         raise NotImplementedError(f"{call.rule.__name__} has no derivative.")
 
     def changed(primals: Sequence[Any], tangents: Sequence[Any]) -> tuple[list[Any], list[Any]]:
-        found = iter(tangents)
-        out, change = rule(call.args(primals), call.tangents([next(found) if m else None for m in moving]))
+        remaining = iter(tangents)
+        out, change = rule(call.args(primals), call.tangents([next(remaining) if m else None for m in moving]))
         leaves, tree = jax.tree.flatten(out)
         return leaves, tree.flatten_up_to(change)
 
@@ -172,15 +172,15 @@ def _transpose(cotangents: Sequence[Any], *arrays: Any, call: _Call) -> list[Any
         raise NotImplementedError(f"{call.rule.__name__} has no transpose.")
 
     def pulled(cotangent: Array, arrays: Sequence[Any]) -> list[Any]:
-        found = iter(arrays)
-        args = call.args([None if one else next(found) for one in linear])
+        remaining = iter(arrays)
+        args = call.args([None if one else next(remaining) for one in linear])
         pulled = call.arrays(rule(cotangent, args))
         return [a for a, one in zip(pulled, linear, strict=True) if one]
 
     def over_axis(pulled: Callable[..., list[Any]], axes: Sequence[int | None]) -> Callable[..., list[Any]]:
-        known = [axis for axis, one in zip(axes, linear, strict=True) if not one]
+        fixed = [axis for axis, one in zip(axes, linear, strict=True) if not one]
         wanted = [axis for axis, one in zip(axes, linear, strict=True) if one]
-        mapped = jax.vmap(pulled, in_axes=(0, known), out_axes=[axis or 0 for axis in wanted])
+        mapped = jax.vmap(pulled, in_axes=(0, fixed), out_axes=[axis or 0 for axis in wanted])
 
         def summed(cotangent: Array, arrays: Sequence[Any]) -> list[Any]:
             """Sum over the members of the batch that share an array."""
@@ -191,9 +191,9 @@ def _transpose(cotangents: Sequence[Any], *arrays: Any, call: _Call) -> list[Any
 
     for axes in call.mapped:
         pulled = over_axis(pulled, axes)
-    known = [a for a, one in zip(arrays, linear, strict=True) if not one]
-    found = iter(pulled(ad.instantiate_zeros(cotangents[0]), known))
-    return [next(found) if one else None for one in linear]
+    fixed = [a for a, one in zip(arrays, linear, strict=True) if not one]
+    results = iter(pulled(ad.instantiate_zeros(cotangents[0]), fixed))
+    return [next(results) if one else None for one in linear]
 
 
 _ruled_p = Primitive("ruled")

@@ -1,4 +1,4 @@
-"""What a user passes in: its values, its kind, the memory that it asks for."""
+"""Checks of input: its values, its kind, the memory that it asks for."""
 
 from mpmjax.checks._kinds import (
     alternatives as alternatives,

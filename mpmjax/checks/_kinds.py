@@ -57,9 +57,9 @@ def checked(function: Function) -> Function:
 
     @wraps(function)
     def guarded(*args: Any, **kwargs: Any) -> Any:
-        for name, given in signature.bind(*args, **kwargs).arguments.items():
+        for name, argument in signature.bind(*args, **kwargs).arguments.items():
             several = signature.parameters[name].kind is inspect.Parameter.VAR_POSITIONAL
-            for value in given if several else (given,) if name in hints else ():
+            for value in argument if several else (argument,) if name in hints else ():
                 require_kind(f"{owner}'s {name}", value, hints[name])
         with jax.numpy_rank_promotion("allow"):
             return function(*args, **kwargs)
@@ -247,13 +247,13 @@ def _plain(hint: Any) -> str:
 def _meant(hint: Any, value: Any) -> str:
     """The end of a message that names the object which was probably meant."""
     word = value.__name__ if isinstance(value, type) else value[:60] if isinstance(value, str) else ""
-    known = {name.rsplit(".", 1)[-1].lower(): (name, kind) for name, kind in choices(hint).items()}
+    options = {name.rsplit(".", 1)[-1].lower(): (name, kind) for name, kind in choices(hint).items()}
     key = word.replace(" ", "").replace("_", "").lower()
-    inside = [k for k in known if len(key) > 2 and (key in k or k in key)]
-    close = inside if len(inside) == 1 else difflib.get_close_matches(key, known, 1)
+    inside = [k for k in options if len(key) > 2 and (key in k or k in key)]
+    close = inside if len(inside) == 1 else difflib.get_close_matches(key, options, 1)
     if not close:
         return "."
-    name, kind = known[close[0]]
+    name, kind = options[close[0]]
     if not isinstance(kind, type):
         return f", did you mean {name}?"
     parameters = list(inspect.signature(kind.__init__).parameters.values())[1:]

@@ -42,8 +42,8 @@ def available_memory(*, device: bool = False) -> float | int:
 
 def _free() -> int:
     try:
-        known = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-        return 1024 * int(known["MemAvailable"].split()[0])
+        entries = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        return 1024 * int(entries["MemAvailable"].split()[0])
     except (OSError, KeyError, ValueError):
         pass
     try:

@@ -37,7 +37,7 @@ _put_off: ContextVar[list[Requirement] | None] = ContextVar("_put_off", default=
 
 
 def requirements(tree: Any) -> list[Requirement]:
-    """What the modules in a tree require of their traced values, in a fixed order.
+    """The requirements of the modules in a tree on their traced values, in a fixed order.
 
     Raises:
         ValueError: a value that is known is not as its module requires, as `equinox.tree_at` can make it.

@@ -86,8 +86,8 @@ def _import(modules: list[str] | None) -> None:
         if path.suffix == ".py":
             require(path.is_file(), f"--import: there is no file {name}.")
         else:
-            known = importlib.util.find_spec(name.partition(".")[0])
-            require(known, f"--import: Python finds no module {name!r}; name its .py file instead.")
+            spec = importlib.util.find_spec(name.partition(".")[0])
+            require(spec, f"--import: Python finds no module {name!r}; name its .py file instead.")
         try:
             if path.suffix != ".py":
                 importlib.import_module(name)
@@ -257,22 +257,22 @@ def fit_command(
 
         asked = _from_a_better_start(asked, progress)
         if grids:
-            found = fit_refined(
+            outcome = fit_refined(
                 lambda n: asked.refined(n)[0], asked.parameters, refinements=grids, progress=progress, **common
             )
-            fits, whole = found.fits, asked.refined(found.refinements[-1])[1]
+            fits, whole = outcome.fits, asked.refined(outcome.refinements[-1])[1]
         else:
-            found = fit(asked.experiments, asked.parameters, progress=progress, **common)
-            fits, whole = (found,), asked.whole
-        print(found)
+            outcome = fit(asked.experiments, asked.parameters, progress=progress, **common)
+            fits, whole = (outcome,), asked.whole
+        print(outcome)
         result, iterations = fits[-1], sum(len(each.history) for each in fits)
         drawn = _profiles(result, profiles, progress)
     for each in drawn:
         print(each)
     print(f"{iterations} simulations with exact derivatives, {time.perf_counter() - begun:.3g} s in all", flush=True)
-    said = whole, drawn, predict_observations(result, whole)
-    numbers = write_fit(found, plot.with_suffix(".json"), *said)
-    print(f"written {draw_fit(result, plot, *said)} and {numbers}")
+    report = whole, drawn, predict_observations(result, whole)
+    numbers = write_fit(outcome, plot.with_suffix(".json"), *report)
+    print(f"written {draw_fit(result, plot, *report)} and {numbers}")
     if stop.signal or result.interrupted:
         raise typer.Exit(128 + (stop.signal or signal.SIGINT))
 
@@ -280,18 +280,18 @@ def fit_command(
 def _profiles(result: FitResult, names: list[str] | None, progress: Callable[[str], None]) -> tuple[Profile, ...]:
     """The profiles that were asked for; after a signal those that are done."""
     wanted = [] if result.interrupted else names or []
-    found: list[Profile] = []
+    profiles: list[Profile] = []
     try:
         for name in wanted:
-            found.append(profile(result, name, progress=progress))
+            profiles.append(profile(result, name, progress=progress))
     except KeyboardInterrupt:
-        _print_error(f"{len(found)} of {len(wanted)} profiles are done.")
-    return tuple(found)
+        _print_error(f"{len(profiles)} of {len(wanted)} profiles are done.")
+    return tuple(profiles)
 
 
 def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> FitFile:
-    """What is asked, from where many searches or a fit to growing horizons ended, where the file asks for these; to the
-    data that the horizons reach."""
+    """The fit, started where many searches or a fit to growing horizons ended, if the file asks for these, to the data
+    that the horizons reach."""
     common: dict[str, Any] = {"level": asked.level, "progress": progress}
     if asked.optimiser is not None:
         common["optimiser"] = asked.optimiser
@@ -348,26 +348,26 @@ def chart_command(
         flush=True,
     )
     dt = stable_step(scene, file) if file.run.dt == "stable" else file.run.dt
-    own = () if dt is None or file.run.method is None else ((file.run.method, dt),)
-    found = work_precision(
+    extra = () if dt is None or file.run.method is None else ((file.run.method, dt),)
+    comparison = work_precision(
         file.build,
         t1=file.run.t1,
         error=error,
-        also=own,
+        also=extra,
         most_seconds=file.run.most_seconds if most_seconds is None else most_seconds,
         progress=lambda trial: print(_line(trial), flush=True),
         say=_print_error,
     )
-    print(found.verdict())
-    print(f"written {draw_chart(found, output)} and {write_trials(found, output.with_suffix('.csv'))}")
+    print(comparison.verdict())
+    print(f"written {draw_chart(comparison, output)} and {write_trials(comparison, output.with_suffix('.csv'))}")
 
 
 def _line(trial: Trial) -> str:
-    said = "failed" if np.isinf(trial.error) else "foreseen" if np.isnan(trial.error) else f"{trial.error:.2e}"
+    outcome = "failed" if np.isinf(trial.error) else "foreseen" if np.isnan(trial.error) else f"{trial.error:.2e}"
     linearisation = f"{trial.linearisation_error:.1e}" if trial.linearisation_error > 0 else ""
     return (
         f"{name_of(trial.method):>24} {f'1 / {trial.refinement}':>10} {trial.dt:10.3g} {trial.steps:9d} "
-        f"{trial.seconds:9.3g} {said:>9} {linearisation:>13}"
+        f"{trial.seconds:9.3g} {outcome:>9} {linearisation:>13}"
     )
 
 

@@ -73,7 +73,7 @@ def observation(table: dict[str, Any], source: Source, t1: float) -> tuple[Abstr
     require(there, f"{_HEADER} kind must be one of {', '.join(_kinds)}, got {kind!r}.")
     make = _kinds[str(kind)]
     keys = {k: v for k, v in table.items() if k != "kind"}
-    made = make(source, **arguments(make, keys, f"{_HEADER} {kind}", given=["source"]))
+    made = make(source, **arguments(make, keys, f"{_HEADER} {kind}", without=["source"]))
     return made if isinstance(made, tuple) else (made.until(t1), made)
 
 

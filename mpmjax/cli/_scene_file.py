@@ -40,7 +40,7 @@ class RunSettings(NamedTuple):
     error: float
     """Relative error that "auto" aims at."""
     most_seconds: float
-    """What its pilot runs may take [s]."""
+    """Seconds that its pilot runs may take."""
 
 
 class SceneFile(NamedTuple):
@@ -67,7 +67,7 @@ class Simulation(NamedTuple):
     fit: dict[str, Any] | None
     """The `[fit]` table, not read yet; None without one."""
     choice: str | None
-    """What was chosen for "auto" or "stable", and why; None if nothing was."""
+    """The choice for "auto" or "stable", and why; None if there was none."""
     build: Build
     """Makes the scene and its particles on n times as many cells a direction, from n."""
 
@@ -137,7 +137,7 @@ def read_simulation(
         save_every = save_every or max(1, steps // _FRAMES)
     if dt is None or method is None:
         methods = METHODS if method is None else (method,)
-        found = work_precision(
+        comparison = work_precision(
             file.build,
             t1=t1,
             error=error,
@@ -147,7 +147,7 @@ def read_simulation(
             progress=progress,
             say=say,
         )
-        best, choice = found.cheapest(), found.verdict()
+        best, choice = comparison.cheapest(), comparison.verdict()
         if best is None:
             raise ValueError(f"{path}: {choice}")
         dt, method = best.dt, best.method
@@ -200,18 +200,18 @@ def _run_settings(table: Any) -> RunSettings:
         require_positive("[run] most_seconds", most_seconds)
         every = save_every is None or save_every >= 1
         require(every, f"[run] save_every must be at least 1, got {save_every}.")
-        known = precision in ("float32", "float64")
-        require(known, f'[run] precision must be "float32" or "float64", got {precision!r}.')
+        is_dtype = precision in ("float32", "float64")
+        require(is_dtype, f'[run] precision must be "float32" or "float64", got {precision!r}.')
         return RunSettings(float(t1), dt, method, save_every, precision, float(error), float(most_seconds))
 
     require(isinstance(table, dict), f"[run] must be a table, got {shortened(repr(table))}.")
     left = {name for name in ("dt", "method") if table.get(name) == "auto"}
     require("dt" in table, '[run] needs the key \'dt\': a step in seconds, "stable" or "auto".')
     require(left != {"method"}, '[run] method = "auto" goes with dt = "auto": the cheapest of both is chosen together.')
-    given = arguments(run, {key: value for key, value in table.items() if key not in left}, "[run]")
+    settings = arguments(run, {key: value for key, value in table.items() if key not in left}, "[run]")
     if "method" not in left:
-        given.setdefault("method", Explicit())
-    return run(**given)
+        settings.setdefault("method", Explicit())
+    return run(**settings)
 
 
 def _refined(table: dict[str, Any], n: int) -> dict[str, Any]:
@@ -242,17 +242,17 @@ def _filled(scene: Scene, tables: list[Any], dtype: str) -> Particles:
         where = f"[[particles]] {number}"
         require(isinstance(table, dict), f"{where} must be a table, got {shortened(repr(table))}.")
         material, rest = table.get("material", 1), {key: value for key, value in table.items() if key != "material"}
-        known = range(1, len(scene.laws) + 1)
+        numbers = range(1, len(scene.laws) + 1)
         require(
-            type(material) is int and material in known,
+            type(material) is int and material in numbers,
             f"{where} material must be the number of a [[material]], from 1 to {len(scene.laws)}, got "
             f"{shortened(repr(material))}.",
         )
-        given = arguments(fill, rest, where, given=("grid", "dtype"))
+        keys = arguments(fill, rest, where, without=("grid", "dtype"))
         try:
-            _check_place(given["region"], scene.grid)
-            filled[material - 1].append(fill(grid=scene.grid, dtype=dtype, **given))
-            regions, placed = [*regions, given["region"]], [*placed, np.asarray(filled[material - 1][-1].x)]
+            _check_place(keys["region"], scene.grid)
+            filled[material - 1].append(fill(grid=scene.grid, dtype=dtype, **keys))
+            regions, placed = [*regions, keys["region"]], [*placed, np.asarray(filled[material - 1][-1].x)]
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
     _warn_of_overlaps(regions, placed, float(scene.grid.spacing))

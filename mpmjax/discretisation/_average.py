@@ -38,8 +38,8 @@ def average(
         least: the least whole weight, not negative.
         size: number of nodes n.
     """
-    given = [jnp.concatenate([value, weight[None]])] + ([] if gradients is None else [gradients])
-    whole, means = bound(_average_p, stencil, jnp.asarray(least, weight.dtype), *given, size=size, batched=0)
+    columns = [jnp.concatenate([value, weight[None]])] + ([] if gradients is None else [gradients])
+    whole, means = bound(_average_p, stencil, jnp.asarray(least, weight.dtype), *columns, size=size, batched=0)
     return whole, means
 
 
@@ -55,7 +55,7 @@ def _average(*args: Array, size: int, unroll: bool) -> list[Array]:
 def _jvp(
     take: Callable[[], list[Array]], primals: tuple, tangents: tuple, *, size: int, batched: int
 ) -> tuple[list[Array], list[Any]]:
-    """Of the sums' differentials, what `_divided` makes of them. The least weight has no part in it. The averages are
+    """The quotient rule on the differentials of the sums; the threshold is not differentiated. The averages are
     `kept_sums` here, where the rule takes them: named afterwards they would be others, and these computed again."""
     out = kept_sums(take())
     sums, changes = ((*values[:3], *values[4:]) for values in (primals, tangents))

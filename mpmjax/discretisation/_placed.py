@@ -19,7 +19,7 @@ _placed: dict[Primitive, Primitive] = {}
 
 @runtime_checkable
 class Factored(Protocol):
-    """What has a stencil's factors, and perhaps places: a stencil."""
+    """A stencil, as factors and perhaps in compressed form."""
 
     @property
     def factors(self) -> tuple[Array, Array, Array]:
@@ -28,7 +28,7 @@ class Factored(Protocol):
 
     @property
     def places(self) -> Places | None:
-        """The same in fewer numbers, if there are."""
+        """The compressed form, if there is one."""
         ...
 
 
@@ -39,8 +39,8 @@ def bound(primitive: Primitive, stencil: Factored, *args: Array, **params: Any) 
     places = stencil.places
     if places is None:
         return primitive.bind(*stencil.factors, *args, **params)
-    given = places.first, places.strides, places.offset, places.polynomials
-    return _placed[primitive].bind(*given, *stencil.factors, *args, **params)
+    compressed = places.first, places.strides, places.offset, places.polynomials
+    return _placed[primitive].bind(*compressed, *stencil.factors, *args, **params)
 
 
 def define_placed(
@@ -70,7 +70,7 @@ def define_placed(
     def transpose(cotangents: list, *args: Any, **params: Any) -> list:
         return [None] * _PLACES + ad.primitive_transposes[primitive](cotangents, *args[_PLACES:], **params)
 
-    found = native_primitive(
+    primitive_of = native_primitive(
         f"placed_{primitive.name.split('_')[1]}",
         without_places(function),
         without_places(shapes),
@@ -82,11 +82,11 @@ def define_placed(
         placed=True,
         **attributes,
     )
-    ad.primitive_jvps[found] = lambda primals, tangents, **params: ad.primitive_jvps[primitive](
+    ad.primitive_jvps[primitive_of] = lambda primals, tangents, **params: ad.primitive_jvps[primitive](
         primals[_PLACES:], tangents[_PLACES:], **params
     )
-    ad.primitive_transposes[found] = transpose
-    _placed[primitive] = found
+    ad.primitive_transposes[primitive_of] = transpose
+    _placed[primitive] = primitive_of
 
 
 def define_jvp(primitive: Primitive, rule: Callable[..., tuple[list[Array], list[Any]]]) -> None:

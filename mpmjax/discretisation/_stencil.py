@@ -51,14 +51,14 @@ class Stencil(eqx.Module):
     weight_derivatives: Float[Array, "d s p"]
     """Derivatives of the weights along each axis [1/m], by the scene's gradient operator, shape (d, s, p)."""
     mls_weight_derivatives: Float[Array, "d s p"] | None
-    """The same by moving least squares, shape (d, s, p); None if the scene's gradient operator is that, or the transfer
-    keeps no affine velocity."""
+    """Derivatives by moving least squares, shape (d, s, p); None if the scene's gradient operator is that, or if the
+    transfer keeps no affine velocity."""
     moment: Float[Array, "d p"]
     """Diagonal of D_p [m²], shape (d, p)."""
     inside: Bool[Array, "p"]
     """Whether the whole stencil of the particle lies in the window."""
     places: Places | None = None
-    """The same in fewer numbers, for sums that are not differentiated; None where factors are no such polynomials."""
+    """The compressed stencil, for sums that are not differentiated; None where factors are no such polynomials."""
 
     @property
     def least_squares(self) -> "Stencil":
@@ -79,7 +79,7 @@ class Stencil(eqx.Module):
 
     @property
     def factors(self) -> tuple[Array, Array, Array]:
-        """What sums are told of it: terms of the index, weights and their derivatives, each (d, s, p)."""
+        """Terms of the index, weights and their derivatives, each (d, s, p)."""
         return self.index_factors, self.weights, self.weight_derivatives
 
     @property

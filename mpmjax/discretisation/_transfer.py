@@ -31,7 +31,7 @@ class Gathered(eqx.Module):
 
 
 class ParticleMotion(NamedTuple):
-    """What G2P gives the particles."""
+    """The result of G2P at the particles."""
 
     carrier: Float[Array, "d p"]
     """The velocity with which they move, Σ_i w_ip v̄_i [m/s], shape (d, p)."""
@@ -208,8 +208,8 @@ def p2g(
         used = stencil.least_squares
         gradient_terms.append(mass * C * stencil.moment)
     gradients = jnp.swapaxes(sum(gradient_terms), 0, 1) if gradient_terms else None
-    given = mass * v, gradients, jnp.finfo(mass.dtype).eps * mass.min()
-    return average(used, mass, *given, size)
+    rows = mass * v, gradients, jnp.finfo(mass.dtype).eps * mass.min()
+    return average(used, mass, *rows, size)
 
 
 def g2p(
@@ -250,10 +250,10 @@ def g2p(
     elif transfer.affine:
         ends = [field for field in (after, change) if field is not None]
         _, slopes = stored(kept_sums(gather(stencil.least_squares, jnp.concatenate(ends, axis=1))))
-        found = _split_gradients(slopes, len(ends))
-        affine[0] = found[0]
+        split = _split_gradients(slopes, len(ends))
+        affine[0] = split[0]
         if change is not None:
-            affine[-1] = found[-1]
+            affine[-1] = split[-1]
     seen = [Gathered(*parts) for parts in zip(values, gradients, affine, strict=True)]
     new, carrier, changed = seen[0], seen[0 if mean is None else 1], None if change is None else seen[-1]
     C = transfer.affine_velocity(C, new, changed) if transfer.affine else new.gradient if keep_gradient else None

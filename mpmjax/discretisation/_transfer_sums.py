@@ -58,8 +58,8 @@ def scatter(
             value, k < c, it is zero in those that come after.
         size: number of nodes n.
     """
-    given = [a for a in (value, gradients) if a is not None]
-    return bound(scatter_p, stencil, *given, valued=value is not None, size=size, batched=0)[0]
+    rows = [a for a in (value, gradients) if a is not None]
+    return bound(scatter_p, stencil, *rows, valued=value is not None, size=size, batched=0)[0]
 
 
 # The sums themselves, of rows (p, c): `_narrow` takes what a particle gives one axis further in, to one node along it;
@@ -108,8 +108,8 @@ def _gather(*args: Array, unroll: bool) -> list[Array]:
 
 def written_scatter(*args: Array, valued: bool, size: int, unroll: bool) -> list[Array]:
     """∂B/∂f: the nodes' sums, (n, c)."""
-    factors, given = args[:3], args[3:]
-    columns, p = given[0].shape[-2:]
+    factors, rows = args[:3], args[3:]
+    columns, p = rows[0].shape[-2:]
     d = len(factors[0])
 
     def add(axis: int, first: Array, value: Array | None, gradients: list[Array], nodes: Array) -> Array:
@@ -127,26 +127,26 @@ def written_scatter(*args: Array, valued: bool, size: int, unroll: bool) -> list
     for start in range(0, columns, _ROW):
         width = min(columns - start, _ROW)
         padded = 1 << (width - 1).bit_length()
-        value, gradients = _rows(given, valued, start, padded)
-        nodes = jnp.zeros((size, padded), given[0].dtype)
+        value, gradients = _rows(rows, valued, start, padded)
+        nodes = jnp.zeros((size, padded), rows[0].dtype)
         blocks.append(add(0, jnp.zeros((p,), factors[0].dtype), value, gradients, nodes)[:, :width])
     return [jnp.concatenate(blocks, axis=1)]
 
 
-def _rows(given: Sequence[Array], valued: bool, start: int, width: int) -> tuple[Array | None, list[Array]]:
+def _rows(arrays: Sequence[Array], valued: bool, start: int, width: int) -> tuple[Array | None, list[Array]]:
     """So many columns of the value and the gradients, as rows (p, width): zero in columns that they do not have."""
 
     def rows(a: Array) -> Array:
         block = a[start : start + width]
         return jnp.pad(block, ((0, width - len(block)), (0, 0))).T
 
-    return rows(given[0]) if valued else None, [rows(a) for part in given[valued:] for a in part]
+    return rows(arrays[0]) if valued else None, [rows(a) for part in arrays[valued:] for a in part]
 
 
 def _pull(*args: Array, valued: bool, unroll: bool) -> list[Array]:
     """∂B/∂factors at f and a: by the weights and by their derivatives, each (d, s, p)."""
     del unroll  # one kernel would be very long
-    factors, nodes, given = args[:3], args[3], args[4:]
+    factors, nodes, rows = args[:3], args[3], args[4:]
     d, _, p = factors[0].shape
 
     def pulled(axis: int, first: Array, value: Array | None, gradients: list[Array]) -> tuple[list[Array], list]:
@@ -156,18 +156,20 @@ def _pull(*args: Array, valued: bool, unroll: bool) -> list[Array]:
 
         def step(carry: tuple[list[Array], list], factor: tuple[Array, ...]) -> tuple[Any, Any]:
             share, w, g = factor
-            found, inner = pulled(axis + 1, first + share, *_narrow(value, gradients, w, g))
-            by_weight = [a * f for a, f in zip([value, *gradients[1:]], found, strict=False) if a is not None]
-            by_gradient = [a * found[0] for a in gradients[:1]]
-            here = tuple(reduce(jnp.add, by, jnp.zeros_like(found[0])).sum(axis=1) for by in (by_weight, by_gradient))
-            return jax.tree.map(jnp.add, carry, (_widen(found[0], found[1:], w, g), inner)), here
+            weighted, inner = pulled(axis + 1, first + share, *_narrow(value, gradients, w, g))
+            by_weight = [a * f for a, f in zip([value, *gradients[1:]], weighted, strict=False) if a is not None]
+            by_gradient = [a * weighted[0] for a in gradients[:1]]
+            here = tuple(
+                reduce(jnp.add, by, jnp.zeros_like(weighted[0])).sum(axis=1) for by in (by_weight, by_gradient)
+            )
+            return jax.tree.map(jnp.add, carry, (_widen(weighted[0], weighted[1:], w, g), inner)), here
 
         zeros = [jnp.zeros((p, nodes.shape[1]), nodes.dtype)] * (d - axis + 1)
         inner = [(jnp.zeros_like(w), jnp.zeros_like(w)) for w in factors[1][axis + 1 :]]
         (totals, inner), here = _along(axis, factors, step, (zeros, inner), unroll=False)
         return totals, [here, *inner]
 
-    value, gradients = _rows(given, valued, 0, nodes.shape[1])
+    value, gradients = _rows(rows, valued, 0, nodes.shape[1])
     by_axis = pulled(0, jnp.zeros((p,), factors[0].dtype), value, gradients)[1]
     weights, derivatives = zip(*by_axis, strict=True)
     return [jnp.stack(weights), jnp.stack(derivatives)]
@@ -194,7 +196,7 @@ def _particle_rows(index_factors: ShapedArray, *others: ShapedArray) -> list[tup
 
 
 def _node_rows(*args: ShapedArray, valued: bool, size: int, first: int) -> list[tuple]:
-    """Of a sum whose first given argument has this number."""
+    """The result's rows, of a sum whose nodal values begin with the argument of this number."""
     del valued
     return [(size, args[first].shape[-2])]
 
@@ -227,17 +229,17 @@ def _scatter_differential(*args: Array, valued: bool, size: int, batched: int = 
     weights and weight derivatives, what is given, its differentials."""
     del unroll
     factors, changes, rest = args[:3], args[3:5], args[5:]
-    given, moved = rest[: len(rest) // 2], rest[len(rest) // 2 :]
+    values, moved = rest[: len(rest) // 2], rest[len(rest) // 2 :]
     params = {"valued": valued, "size": size, "batched": batched}
     (by_given,), (by_factors,) = (
         scatter_p.bind(*factors, *moved, **params),
-        _scatter_by_factors_p.bind(*factors, *changes, *given, **params),
+        _scatter_by_factors_p.bind(*factors, *changes, *values, **params),
     )
     return [by_given + by_factors]
 
 
 def _pull_and_gather(*args: Array, valued: bool, batched: int = 0, unroll: bool = False) -> list[Array]:
-    """Its transpose: the pull, and the gather of its nodes."""
+    """The transpose of `_scatter_differential`: the pull, and the gather of its nodes."""
     del unroll
     return [*pull_p.bind(*args, valued=valued, batched=batched), *gather_p.bind(*args[:4], batched=batched)]
 
@@ -282,8 +284,8 @@ def _tangents(
 
 def scatter_tangent(primals: tuple, tangents: tuple, **params: Any) -> Array | None:
     """The differential of a scatter's result; None if nothing changes."""
-    found = _tangents(primals, tangents, params, scatter_p, _scatter_by_factors_p, _scatter_differential_p)
-    return found[0] if found else None
+    tangent = _tangents(primals, tangents, params, scatter_p, _scatter_by_factors_p, _scatter_differential_p)
+    return tangent[0] if tangent else None
 
 
 def _differentiate(
@@ -325,12 +327,12 @@ def _jvp_of(parts: Callable[..., list[Array]]) -> Callable[..., tuple]:
 def _jvp_pull(primals: tuple, tangents: tuple, *, valued: bool, batched: int) -> tuple[list[Array], list[Any]]:
     """The pull is linear in f, and in a: its differential is a pull for each, and that of the sum as written by the
     factors."""
-    factors, nodes, given = primals[:3], primals[3], primals[4:]
+    factors, nodes, rows = primals[:3], primals[3], primals[4:]
     params = {"valued": valued, "batched": batched}
     out = pull_p.bind(*primals, **params)
     parts = [[ad.Zero(jax.typeof(o)) for o in out]]
     if type(tangents[3]) is not ad.Zero:
-        parts.append(pull_p.bind(*factors, tangents[3], *given, **params))
+        parts.append(pull_p.bind(*factors, tangents[3], *rows, **params))
     if moved := _instantiated(tangents[4:]):
         parts.append(pull_p.bind(*factors, nodes, *moved, **params))
     if along := _instantiated(tangents[1:3]):
@@ -354,61 +356,61 @@ def _given(cotangents: list) -> tuple[list[Array], bool]:
     return list(map(ad.instantiate_zeros, parts)), valued
 
 
-def _of_undefined(found: Any, args: Any) -> list:
-    return [f if ad.is_undefined_primal(a) else None for f, a in zip(found, args, strict=True)]
+def _of_undefined(results: Any, args: Any) -> list:
+    return [f if ad.is_undefined_primal(a) else None for f, a in zip(results, args, strict=True)]
 
 
-def _of_given(found: list[Array], args: Any, valued: bool) -> list:
+def _of_given(results: list[Array], args: Any, valued: bool) -> list:
     """The gathered value and gradients as cotangents of what is given, in the columns that it has."""
-    parts = zip(found if valued else found[1:], args, strict=False)
+    parts = zip(results if valued else results[1:], args, strict=False)
     return [f[..., : a.aval.shape[-2], :] if ad.is_undefined_primal(a) else None for f, a in parts]
 
 
 def _transpose_gather(cotangents: list, *args: Any, batched: int) -> list:
-    given, valued = _given(cotangents)
+    rows, valued = _given(cotangents)
     size = args[3].aval.shape[-2]
-    return [None, None, None, *scatter_p.bind(*args[:3], *given, valued=valued, size=size, batched=batched)]
+    return [None, None, None, *scatter_p.bind(*args[:3], *rows, valued=valued, size=size, batched=batched)]
 
 
 def _transpose_scatter(cotangents: list, *args: Any, valued: bool, size: int, batched: int) -> list:
     del size
-    found = gather_p.bind(*args[:3], ad.instantiate_zeros(cotangents[0]), batched=batched)
-    return [None, None, None, *_of_given(found, args[3:], valued)]
+    gathered = gather_p.bind(*args[:3], ad.instantiate_zeros(cotangents[0]), batched=batched)
+    return [None, None, None, *_of_given(gathered, args[3:], valued)]
 
 
 def _transpose_gather_by_factors(cotangents: list, *args: Any, batched: int) -> list:
-    given, valued = _given(cotangents)
-    found = pull_p.bind(*args[:3], args[5], *given, valued=valued, batched=batched)
-    return [None, None, None, *_of_undefined(found, args[3:5]), None]
+    rows, valued = _given(cotangents)
+    pulled = pull_p.bind(*args[:3], args[5], *rows, valued=valued, batched=batched)
+    return [None, None, None, *_of_undefined(pulled, args[3:5]), None]
 
 
 def _transpose_scatter_by_factors(cotangents: list, *args: Any, valued: bool, size: int, batched: int) -> list:
     del size
     nodes = ad.instantiate_zeros(cotangents[0])
-    found = pull_p.bind(*args[:3], nodes, *args[5:], valued=valued, batched=batched)
-    return [None, None, None, *_of_undefined(found, args[3:5]), *(None for _ in args[5:])]
+    pulled = pull_p.bind(*args[:3], nodes, *args[5:], valued=valued, batched=batched)
+    return [None, None, None, *_of_undefined(pulled, args[3:5]), *(None for _ in args[5:])]
 
 
 def _transpose_scatter_differential(cotangents: list, *args: Any, valued: bool, size: int, batched: int) -> list:
     del size
     nodes, rest = ad.instantiate_zeros(cotangents[0]), args[5:]
-    given, moved = rest[: len(rest) // 2], rest[len(rest) // 2 :]
-    by_weights, by_derivatives, *found = _pull_and_gather_p.bind(
-        *args[:3], nodes, *given, valued=valued, batched=batched
+    values, moved = rest[: len(rest) // 2], rest[len(rest) // 2 :]
+    by_weights, by_derivatives, *gathered = _pull_and_gather_p.bind(
+        *args[:3], nodes, *values, valued=valued, batched=batched
     )
     by_changes = _of_undefined((by_weights, by_derivatives), args[3:5])
-    return [None, None, None, *by_changes, *(None for _ in given), *_of_given(found, moved, valued)]
+    return [None, None, None, *by_changes, *(None for _ in values), *_of_given(gathered, moved, valued)]
 
 
 def _transpose_pull(cotangents: list, *args: Any, valued: bool, batched: int) -> list:
-    """Of what is linear in f, the scatter's differential by the factors; of what is linear in a, the gather's."""
+    """Transpose with respect to f: the scatter's differential by the factors; with respect to a: the gather's."""
     factors, changes = args[:3], map(ad.instantiate_zeros, cotangents)
     if ad.is_undefined_primal(args[3]):
         params = {"valued": valued, "size": args[3].aval.shape[-2], "batched": batched}
-        found = _scatter_by_factors_p.bind(*factors, *changes, *args[4:], **params)
-        return [None, None, None, *found, *(None for _ in args[4:])]
-    found = _gather_by_factors_p.bind(*factors, *changes, args[3], batched=batched)
-    return [None, None, None, None, *_of_given(found, args[4:], valued)]
+        results = _scatter_by_factors_p.bind(*factors, *changes, *args[4:], **params)
+        return [None, None, None, *results, *(None for _ in args[4:])]
+    results = _gather_by_factors_p.bind(*factors, *changes, args[3], batched=batched)
+    return [None, None, None, None, *_of_given(results, args[4:], valued)]
 
 
 ad.primitive_transposes[gather_p] = _transpose_gather

@@ -38,7 +38,7 @@ def polar_cells(inner: float, outer: float, size: np.ndarray) -> Cells:
 
 
 def round_cells(start: np.ndarray, end: np.ndarray, inner: float, outer: float, size: np.ndarray) -> Cells:
-    """The same about the axis from `start` to `end` [m], shape (3,), in equal slices of a thickness near size[2]."""
+    """`polar_cells` about the axis from `start` to `end` [m], shape (3,), in equal slices of thickness near size[2]."""
     height = np.linalg.norm(end - start)
     axis = (end - start) / height
     first = np.eye(3)[np.abs(axis).argmin()]

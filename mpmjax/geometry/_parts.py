@@ -55,9 +55,9 @@ def _moments(region: AbstractRegion, centres: np.ndarray, size: np.ndarray, halv
         return moments
     offsets = np.array(list(itertools.product((-0.25, 0.25), repeat=d))) * size
     children = (centres[cut, None] + offsets).reshape(-1, d)
-    found = _moments(region, children, size / 2, halvings - 1).reshape(-1, 2**d, 1 + d)
-    found[..., 1:] += found[..., :1] * offsets
-    moments[cut] = found.mean(axis=1)
+    parts = _moments(region, children, size / 2, halvings - 1).reshape(-1, 2**d, 1 + d)
+    parts[..., 1:] += parts[..., :1] * offsets
+    moments[cut] = parts.mean(axis=1)
     return moments
 
 
@@ -66,8 +66,8 @@ def _distances(region: AbstractRegion, x: np.ndarray) -> tuple[np.ndarray, np.nd
     dtype = jnp.result_type(float)
     padded = np.zeros((-(-len(x) // _BATCH) * _BATCH, x.shape[1]), dtype)
     padded[: len(x)] = x
-    found = [_batch(region, jnp.asarray(batch)) for batch in padded.reshape(-1, _BATCH, x.shape[1])]
-    distance, gradient = (np.concatenate(parts).astype(float)[: len(x)] for parts in zip(*found, strict=True))
+    results = [_batch(region, jnp.asarray(batch)) for batch in padded.reshape(-1, _BATCH, x.shape[1])]
+    distance, gradient = (np.concatenate(parts).astype(float)[: len(x)] for parts in zip(*results, strict=True))
     return distance, gradient
 
 
@@ -78,7 +78,7 @@ def _batch(region: AbstractRegion, x: Float[Array, "m d"]) -> tuple[Float[Array,
 
 
 def _by_plane(distance: np.ndarray, normal: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """The same for cells in which the surface is a plane, along lines in the direction nearest to its normal.
+    """`_moments` of cells in which the surface is a plane, along lines in the direction nearest to its normal.
 
     Args:
         distance: φ at the centre [m], shape (m,).
@@ -98,10 +98,10 @@ def _by_plane(distance: np.ndarray, normal: np.ndarray, size: np.ndarray) -> np.
     moment = np.where(up, 1, -1) * (crossing**2 - 0.25) / 2
     flat = (slope == 0)[:, None]  # no direction: inside as its centre is
     length, moment = np.where(flat, distance[:, None] <= 0, length), np.where(flat, 0, moment)
-    found = np.zeros((len(distance), 1 + d))
-    found[:, 0] = length.mean(axis=1)
-    found[rows, 1 + along] = moment.mean(axis=1) * size[along]
+    moments = np.zeros((len(distance), 1 + d))
+    moments[:, 0] = length.mean(axis=1)
+    moments[rows, 1 + along] = moment.mean(axis=1) * size[along]
     for number in range(d - 1):
         axis = beside[:, number]
-        found[rows, 1 + axis] = (length * across[:, number]).mean(axis=1) * size[axis]
-    return found
+        moments[rows, 1 + axis] = (length * across[:, number]).mean(axis=1) * size[axis]
+    return moments

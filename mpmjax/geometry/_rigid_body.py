@@ -130,9 +130,9 @@ def rotation_of_chords(
         mass: weights, shape (m,). Where all are zero nothing turns.
     """
     d, axes = arms.shape[1], jnp.eye(arms.shape[1], dtype=arms.dtype)
-    given = moment(arms, mass[:, None] * chords).sum(axis=0)
+    torque = moment(arms, mass[:, None] * chords).sum(axis=0)
     if d == 1:
-        return given
+        return torque
     second = (mass * arms.T) @ arms  # Σ m r rᵀ
     size = jnp.trace(second)
     per_size = 1 / jnp.where(size > 0, size, 1)
@@ -140,9 +140,9 @@ def rotation_of_chords(
     second = per_size * second + jnp.where(size > 0, least, 1) * axes
 
     def missing(rotation: Array) -> Array:
-        return moment(axes, turn(second, rotation) - second).sum(axis=0) - per_size * given
+        return moment(axes, turn(second, rotation) - second).sum(axis=0) - per_size * torque
 
-    rotation = jnp.zeros_like(given)
+    rotation = jnp.zeros_like(torque)
     for _ in range(_NEWTON):
         rotation = rotation - jnp.linalg.solve(jax.jacfwd(missing)(rotation), missing(rotation))
     return rotation

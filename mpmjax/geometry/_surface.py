@@ -87,15 +87,15 @@ def surface_pieces(
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     near = max(_ON_IT * spacing, _ROUNDINGS * float(jnp.finfo(float).eps) * np.abs(points).max())
     values = _sides(region, points.reshape(-1, d), near)
-    found = []
+    of_sides = []
     for side in range(values.shape[1]):
         parts = [_cut(*corners) for corners in _simplices(points, values[:, side].reshape(counts))]
         corners, outward = (np.concatenate(part) for part in zip(*parts, strict=True))
         pieces = _clipped(
             _sized(Pieces(corners, outward, np.ones(len(corners), bool)), spacing), region, near, but=side
         )
-        found.append(pieces if within is None else _clipped(pieces, within, near))
-    return _sized(Pieces(*(np.concatenate(part) for part in zip(*found, strict=True))), spacing)
+        of_sides.append(pieces if within is None else _clipped(pieces, within, near))
+    return _sized(Pieces(*(np.concatenate(part) for part in zip(*of_sides, strict=True))), spacing)
 
 
 def _sized(pieces: Pieces, spacing: float) -> Pieces:
@@ -110,8 +110,8 @@ def _sides(region: AbstractRegion, x: np.ndarray, near: float) -> np.ndarray:
     batches = np.zeros((max(1, -(-len(x) // _BATCH)), _BATCH, x.shape[1]), dtype)
     batches.reshape(-1, x.shape[1])[: len(x)] = x
     region = canonical(region, dtype)
-    found = np.concatenate([np.asarray(_batch(region, jnp.asarray(batch)), float) for batch in batches])[: len(x)]
-    return np.where(np.abs(found) <= near, 0, found)
+    distance = np.concatenate([np.asarray(_batch(region, jnp.asarray(batch)), float) for batch in batches])[: len(x)]
+    return np.where(np.abs(distance) <= near, 0, distance)
 
 
 @eqx.filter_jit
@@ -142,15 +142,15 @@ def _cut(corners: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarra
     corners, values, within = _sorted(corners, values)
     inside = (np.arange(d + 1) < within[:, None])[:, :, None]
     outward = (corners * np.where(inside, -1 / within[:, None, None], 1 / (d + 1 - within)[:, None, None])).sum(axis=1)
-    found, directions = [np.zeros((0, d, d))], [np.zeros((0, d))]
+    simplices, directions = [np.zeros((0, d, d))], [np.zeros((0, d))]
     for count in range(1, d + 1):
         rows = np.flatnonzero(within == count)
         for piece in _pieces(d, range(count), range(count, d + 1)):
             vertices = _crossings(corners[rows], values[rows], piece)
             area = _area(vertices)
-            found.append(vertices)
+            simplices.append(vertices)
             directions.append(np.sign((area * outward[rows]).sum(axis=1, keepdims=True)) * area)
-    return np.concatenate(found), np.concatenate(directions)
+    return np.concatenate(simplices), np.concatenate(directions)
 
 
 def _clipped(pieces: Pieces, region: AbstractRegion, near: float, but: int | None = None) -> Pieces:
@@ -162,14 +162,14 @@ def _clipped(pieces: Pieces, region: AbstractRegion, near: float, but: int | Non
         values = _sides(region, pieces.corners.reshape(-1, d), near)[:, side].reshape(-1, d)
         pieces = pieces._replace(inner=pieces.inner & (values != 0).any(axis=1))
         corners, values, within = _sorted(pieces.corners, values)
-        found = [pieces.of(within == d)]
+        clipped = [pieces.of(within == d)]
         for count in range(1, d):
             rows = np.flatnonzero(within == count)
             for last in range(count):  # the corners inside up to it, and the crossings from it on
                 edges = [(i, i) for i in range(last + 1)]
                 edges += [(i, j) for i in range(last, count) for j in range(count, d)]
-                found.append(pieces.of(rows)._replace(corners=_crossings(corners[rows], values[rows], edges)))
-        pieces = Pieces(*(np.concatenate(part) for part in zip(*found, strict=True)))
+                clipped.append(pieces.of(rows)._replace(corners=_crossings(corners[rows], values[rows], edges)))
+        pieces = Pieces(*(np.concatenate(part) for part in zip(*clipped, strict=True)))
     return pieces
 
 

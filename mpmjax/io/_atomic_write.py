@@ -60,5 +60,5 @@ def save_figure(figure: Any, path: Path, dpi: float | int) -> None:
 def reason(error: BaseException) -> str:
     """The system's message of an error, or the first line of the library's."""
     text = (isinstance(error, OSError) and error.strerror) or str(error) or type(error).__name__
-    said = re.search(r"error message = '(.*?)'", text)
-    return said[1] if said else text.splitlines()[0].strip("'\"")
+    match = re.search(r"error message = '(.*?)'", text)
+    return match[1] if match else text.splitlines()[0].strip("'\"")

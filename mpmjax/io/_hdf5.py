@@ -126,10 +126,10 @@ def _check_format(path: Path, file: File) -> None:
     missing = [name for name in _GROUPS if file.get(name, getlink=True) is None]
     require_of_file(not missing, f"{path} has no group /{' or /'.join(missing)}: it is not a run that mpmjax wrote.")
     _check_contained(path, file)
-    found = int(file["mpmjax"].attrs["format"])
+    version = int(file["mpmjax"].attrs["format"])
     require_of_file(
-        found == FORMAT,
-        f"{path} has format {found}, this mpmjax reads format {FORMAT}: use mpmjax "
+        version == FORMAT,
+        f"{path} has format {version}, this mpmjax reads format {FORMAT}: use mpmjax "
         f"{file['mpmjax'].attrs['version'].decode()}, which wrote it.",
     )
 
@@ -189,14 +189,14 @@ def checksum(rows: dict[str, np.ndarray]) -> int:
 
 def fixed_checksum(file: File) -> int:
     """The checksum of all datasets that do not grow with the frames."""
-    found: dict[str, np.ndarray] = {}
+    datasets: dict[str, np.ndarray] = {}
 
     def read(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset) and not name.startswith(_GROWING):
-            found[name] = item[...]
+            datasets[name] = item[...]
 
     file.visititems(read)
-    return checksum(found)
+    return checksum(datasets)
 
 
 def frame_rows(file: File, start: int, stop: int) -> dict[str, np.ndarray]:
@@ -205,17 +205,17 @@ def frame_rows(file: File, start: int, stop: int) -> dict[str, np.ndarray]:
     Raises:
         ValueError: they are not what was written.
     """
-    found: dict[str, np.ndarray] = {}
+    datasets: dict[str, np.ndarray] = {}
 
     def read(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset) and name.startswith(_GROWING):
             count = (item.chunks or (0,))[0]
-            found[name] = item[start * count : stop * count]
+            datasets[name] = item[start * count : stop * count]
 
     file.visititems(read)
-    sums = found.pop("mpmjax/checksums")
+    sums = datasets.pop("mpmjax/checksums")
     for i in range(stop - start):
-        lengths = {name: len(rows) // (stop - start) for name, rows in found.items()}
-        frame = {name: rows[i * lengths[name] : (i + 1) * lengths[name]] for name, rows in found.items()}
+        lengths = {name: len(rows) // (stop - start) for name, rows in datasets.items()}
+        frame = {name: rows[i * lengths[name] : (i + 1) * lengths[name]] for name, rows in datasets.items()}
         require(checksum(frame) == sums[i], f"frame {start + i} is not what was written")
-    return found
+    return datasets

@@ -152,10 +152,10 @@ def record(
                 _append(writer, int(error.run.final_step), last, statistics)
                 again = "Resumed it would end there again: begin anew."
                 then = "It can be resumed as it is." if int(statistics.fault) == Fault.NONE else again
-                said = writer.standing(then)
+                text = writer.standing(then)
             except OSError as refused:
-                said = str(refused)
-            raise SimulationError(f"{error} {said}", error.run) from None
+                text = str(refused)
+            raise SimulationError(f"{error} {text}", error.run) from None
         warn_of_inaccuracy(run)
         return run
 

@@ -299,9 +299,9 @@ def load(path: str | os.PathLike) -> Run:
         method = decode(described["method"], AbstractIntegrator, "method", arrays)
         scene, method = canonical((scene, method), dtype)
         parts = {k: a if a is None else jnp.asarray(a) for k, a in described["particles"].items()}
-        known: dict[str, Any] = parts
-        blank = jnp.zeros((len(known["mass"]), scene.grid.dim), dtype)
-        particles = Particles(blank, blank, **known, counts=described["counts"])
+        parts_of_run: dict[str, Any] = parts
+        blank = jnp.zeros((len(parts_of_run["mass"]), scene.grid.dim), dtype)
+        particles = Particles(blank, blank, **parts_of_run, counts=described["counts"])
         like = jax.eval_shape(lambda: initial_state(scene, prepare(scene, particles)))
         steps, frames, tallies = _frames(file, like, 0, count_in(file))
         _check_numbers(scene, described["dt"], steps, frames.particles)
@@ -337,16 +337,16 @@ def _rows(frame: int, step: int, dt: Any, state: RolloutState, statistics: RunSt
 def _frames(file: File, like: RolloutState, start: int, stop: int) -> tuple[np.ndarray, RolloutState, RunStatistics]:
     """Step numbers, states and statistics of frames `start` to `stop`, each with a leading axis; of `like` only shapes
     count."""
-    found = frame_rows(file, start, stop)
-    table = found["mpmjax/frames"]
+    rows = frame_rows(file, start, stop)
+    table = rows["mpmjax/frames"]
     tallies = RunStatistics(**{f.name: jnp.asarray(table[f.name]) for f in fields(RunStatistics)})
     received: dict[str, Any] = {}
     for name, kind in _IMPULSES.items():
         if getattr(like, name) is not None:
-            both = jnp.asarray(found[f"mpmjax/{name}"])
+            both = jnp.asarray(rows[f"mpmjax/{name}"])
             received[name] = kind(*jnp.split(both, [like.particles.x.shape[1]], axis=-1))
     kept = (received.get(name) for name in _IMPULSES)
-    return table["step"], RolloutState(states_in(found, like.particles), *kept), tallies
+    return table["step"], RolloutState(states_in(rows, like.particles), *kept), tallies
 
 
 def _check_numbers(scene: Scene, dt: Any, steps: np.ndarray, *states: State) -> None:

@@ -192,25 +192,25 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
 
 
 def arguments(
-    function: Callable, table: Any, where: str, arrays: dict[str, np.ndarray] | None = None, given: Iterable[str] = ()
+    function: Callable, table: Any, where: str, arrays: dict[str, np.ndarray] | None = None, without: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """The keyword arguments of a function (or class) that a table describes, without those `given` otherwise.
+    """The keyword arguments of a function (or class) that a table describes, `without` those that it has otherwise.
 
     Raises:
         ValueError: see `decode`.
     """
     _require(isinstance(table, dict), where, f"must be a table, got {_short(table)}")
-    known = {name: p for name, p in _parameters(function).items() if name not in given}
+    parameters = {name: p for name, p in _parameters(function).items() if name not in without}
     for key in table:
-        if key not in known:
-            close = difflib.get_close_matches(key[:60], known, 1)
+        if key not in parameters:
+            close = difflib.get_close_matches(key[:60], parameters, 1)
             hint = f", did you mean {close[0]!r}?" if close else "."
             raise ValueError(
-                f"{_named(where, 'unknown key')} {_short(key)}{hint} Known here: {', '.join(known) or 'none'}."
+                f"{_named(where, 'unknown key')} {_short(key)}{hint} Known here: {', '.join(parameters) or 'none'}."
             )
-    for name, (_, default) in known.items():
+    for name, (_, default) in parameters.items():
         _require(name in table or default is not inspect.Parameter.empty, where, f"needs the key {name!r}")
-    return {key: decode(value, known[key][0], _inside(where, key, value), arrays) for key, value in table.items()}
+    return {key: decode(value, parameters[key][0], _inside(where, key, value), arrays) for key, value in table.items()}
 
 
 def _object(
@@ -233,11 +233,13 @@ def _object(
     if not (isinstance(kind, str) and kind in classes):
         close = difflib.get_close_matches(_short(kind), classes, 1)
         hint = f", did you mean {close[0]!r}?" if close else "."
-        own = " A class of your own is known when the module is imported that calls mpm.register." if opened else ""
-        raise ValueError(f"{_named(where, 'unknown kind')} {_short(kind)}{hint} It must be {choice}.{own}")
-    given = arguments(classes[kind], {k: v for k, v in table.items() if k != "kind"}, where, arrays)
+        register = (
+            " A class of your own is known when the module is imported that calls mpm.register." if opened else ""
+        )
+        raise ValueError(f"{_named(where, 'unknown kind')} {_short(kind)}{hint} It must be {choice}.{register}")
+    keywords = arguments(classes[kind], {k: v for k, v in table.items() if k != "kind"}, where, arrays)
     try:
-        return classes[kind](**given)
+        return classes[kind](**keywords)
     except ValueError as error:
         raise ValueError(f"{where}: {error}" if where else str(error)) from None
 
@@ -308,7 +310,7 @@ def _forms(hint: Any, *, within: bool = False) -> set[tuple[type, int]]:
 
 
 def _words(forms: set[tuple[type, int]]) -> str:
-    """What the forms are, in words."""
+    """The forms in words."""
 
     def words(kind: type, depth: int) -> str:
         lists = " ".join(["a list of", *["lists of"] * (depth - 1)])

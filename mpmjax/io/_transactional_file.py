@@ -100,10 +100,10 @@ class StagedFile:
         if end > self._base:
             first, rest = begin + inside - self._base, view[inside:]
             self._tail += bytes(max(0, first - len(self._tail)))
-            known = min(len(self._tail) - first, len(rest))
+            overlap = min(len(self._tail) - first, len(rest))
             with memoryview(self._tail) as tail:
-                tail[first : first + known] = rest[:known]
-            self._tail += rest[known:]
+                tail[first : first + overlap] = rest[:overlap]
+            self._tail += rest[overlap:]
         return len(view)
 
     def truncate(self, size: int) -> int:

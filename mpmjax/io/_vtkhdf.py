@@ -53,11 +53,11 @@ def rows_of(frame: int, time: float, state: State) -> dict[str, np.ndarray]:
     x, v = np.asarray(state.x), np.asarray(state.v)
     p, d = x.shape
     flat = ((0, 0), (0, 3 - d))
-    groups = [np.asarray(own) for _, own, _ in by_material(state)]
+    groups = [np.asarray(stored) for _, stored, _ in by_material(state)]
     data = {
         "velocity": np.pad(v, flat),
-        "J": np.concatenate([_ratio(own) for own in groups]),
-        "deformation_gradient": _padded(np.concatenate([_gradient(own, d) for own in groups]), 1.0),
+        "J": np.concatenate([_ratio(stored) for stored in groups]),
+        "deformation_gradient": _padded(np.concatenate([_gradient(stored, d) for stored in groups]), 1.0),
     }
     if state.C is not None:
         data["affine_velocity"] = _padded(np.asarray(state.C), 0.0)
@@ -92,29 +92,29 @@ def states_in(rows: dict[str, np.ndarray], like: State) -> State:
         return taken(f"VTKHDF/PointData/{name}", 3, 3)[..., :d, :d]
 
     F, J = tensors("deformation_gradient"), taken("VTKHDF/PointData/J")
-    each = [(J if own.ndim == 1 else F)[:, of] for of, own, _ in by_material(like)]
+    each = [(J if stored.ndim == 1 else F)[:, of] for of, stored, _ in by_material(like)]
     history = [
         jnp.asarray(rows[f"VTKHDF/PointData/{name}"].reshape(-1, p)[:, of]) for name, of, _ in history_arrays(like)
     ]  # kept, since laws may share a name
     return State(
         x=jnp.asarray(taken("VTKHDF/Points", 3)[..., :d]),
         v=jnp.asarray(taken("VTKHDF/PointData/velocity", 3)[..., :d]),
-        deformations=tuple(jnp.asarray(own) for own in each),
+        deformations=tuple(jnp.asarray(stored) for stored in each),
         C=None if like.C is None else jnp.asarray(tensors("affine_velocity")),
         histories=jax.tree.unflatten(jax.tree.structure(like.histories), history),
     )
 
 
-def _ratio(own: np.ndarray) -> np.ndarray:
+def _ratio(stored: np.ndarray) -> np.ndarray:
     """J of one material's particles, of F, shape (q, d, d), or J itself, shape (q,)."""
-    if own.ndim == 1:
-        return own
-    return np.linalg.det(own) if own.shape[1] > 1 else own[:, 0, 0]
+    if stored.ndim == 1:
+        return stored
+    return np.linalg.det(stored) if stored.shape[1] > 1 else stored[:, 0, 0]
 
 
-def _gradient(own: np.ndarray, d: int) -> np.ndarray:
+def _gradient(stored: np.ndarray, d: int) -> np.ndarray:
     """F of one material's particles, shape (q, d, d), where J alone is known J^(1/d) I."""
-    return own if own.ndim > 1 else own[:, None, None] ** (1 / d) * np.eye(d, dtype=own.dtype)
+    return stored if stored.ndim > 1 else stored[:, None, None] ** (1 / d) * np.eye(d, dtype=stored.dtype)
 
 
 def _padded(a: np.ndarray, diagonal: float) -> np.ndarray:

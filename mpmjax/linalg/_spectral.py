@@ -191,17 +191,17 @@ def _ascending(s: Array, V: Matrix) -> Frame:
 def _divided_differences(f: AbstractSpectral, s: Array, order: int) -> Array:
     """f[s_i, s_j, ...] for all tuples of n + 1 of the d ascending values s, n = `order`, shape (d, ..., d, *batch)."""
     choices = partial(itertools.combinations_with_replacement, range(len(s)))
-    known: dict[tuple[int, ...], Array] = {(i, j): f.slope(s[i], s[j]) for i, j in choices(2)}
-    values = jnp.stack(list(known.values()))
+    quotients: dict[tuple[int, ...], Array] = {(i, j): f.slope(s[i], s[j]) for i, j in choices(2)}
+    values = jnp.stack(list(quotients.values()))
     for size in range(3, order + 2):
         tuples = list(choices(size))
         x = s[np.array(tuples).T]
         low, high = x[0], x[-1]
         close = f.alike(low, high) & (high - low <= _CLOSE * (jnp.abs(low) + jnp.abs(high)))
-        above, below = (jnp.stack([known[t[part]] for t in tuples]) for part in (slice(1, None), slice(-1)))
+        above, below = (jnp.stack([quotients[t[part]] for t in tuples]) for part in (slice(1, None), slice(-1)))
         values = jnp.where(close, _series(f, x), (above - below) / jnp.where(close, 1, high - low))
-        known = dict(zip(tuples, jnp.unstack(values), strict=True))
-    number = {t: k for k, t in enumerate(known)}
+        quotients = dict(zip(tuples, jnp.unstack(values), strict=True))
+    number = {t: k for k, t in enumerate(quotients)}
     everywhere = itertools.product(range(len(s)), repeat=order + 1)
     return values[np.reshape([number[tuple(sorted(t))] for t in everywhere], [len(s)] * (order + 1))]
 

@@ -160,13 +160,13 @@ class NeoHookeanTangent(AbstractTangent):
 
         def entry(b: int, a: int, e: int, c: int) -> Array:
             """In the row of G_ab and the column of G_ce."""
-            found = bulk[a][b] * first[c][e]
+            value = bulk[a][b] * first[c][e]
             if a == c:
-                return found + square[b][e]
+                return value + square[b][e]
             if b == e:
-                return found
+                return value
             cross = second[3 - b - e][3 - a - c] if d == 3 else second[0][0]
-            return found + cross if (c - a - e + b) % 3 == 0 else found - cross
+            return value + cross if (c - a - e + b) % 3 == 0 else value - cross
 
         places = [(b, a) for b in range(d) for a in range(d)]
         return jnp.stack([entry(*row, *column) for k, row in enumerate(places) for column in places[k:]])

@@ -1,4 +1,4 @@
-"""What particles store of their deformation: the deformation gradient, or its determinant."""
+"""The stored deformation of particles: the deformation gradient, or its determinant."""
 
 import abc
 from typing import ClassVar
@@ -12,7 +12,7 @@ from mpmjax._types import Array, Bool, Deformation, Matrix
 
 
 class AbstractKinematics(eqx.Module):
-    """What a law's particles store of their deformation, and how the motion of the grid changes it.
+    """The measure of deformation that a law's particles store, and how the motion of the grid changes it.
 
     In a step it is component first, a particle's number or matrix in the first axes.
     """
@@ -34,7 +34,7 @@ class AbstractKinematics(eqx.Module):
 
     @abc.abstractmethod
     def of(self, F: Matrix) -> Deformation:
-        """What is stored at deformation gradients [-], shape (d, d, p)."""
+        """The stored deformation at deformation gradients [-], shape (d, d, p)."""
 
     @abc.abstractmethod
     def change(self, gradient: Matrix, deformation: Deformation) -> Deformation:
@@ -42,7 +42,7 @@ class AbstractKinematics(eqx.Module):
 
     @abc.abstractmethod
     def flux(self, stress: Deformation, deformation: Deformation, dim: int) -> Matrix:
-        """What the force is the sum of, f_i = −Σ_p flux_p g_ip, in the unit of the stress, shape (d, d, p): the
+        """The summand of the nodal force f_i = −Σ_p flux_p g_ip, in the unit of the stress, shape (d, d, p): the
         transpose of `change`.
 
         Args:

@@ -1,4 +1,4 @@
-"""What a step asks of a law, elastic or with a history."""
+"""The interface of laws, elastic or with a history."""
 
 import abc
 from typing import Any, NamedTuple
@@ -16,16 +16,16 @@ from mpmjax.material._tangent import AbstractTangent
 
 
 class Freedom(NamedTuple):
-    """What a rigid body may do."""
+    """Degrees of freedom of a rigid body."""
 
     directions: tuple[bool, ...] | None
-    """In which directions it may move, one bool each; None for all of them."""
+    """Whether it may move in each direction; None for all of them."""
     turns: bool
     """Whether it may turn."""
 
     @property
     def guided(self) -> bool:
-        """Whether there is anything that it may not do."""
+        """Whether any degree of freedom is fixed."""
         return not self.turns or not all(self.directions or ())
 
 
@@ -50,12 +50,12 @@ class Viscosity(eqx.Module):
 
 
 class AbstractLaw(eqx.Module):
-    """What a step asks of any law. Laws derive from `AbstractMaterial` (elastic) or `AbstractInelastic` (with a
+    """The interface of any law. Laws derive from `AbstractMaterial` (elastic) or `AbstractInelastic` (with a
     history), which answer most of it."""
 
     @property
     def kinematics(self) -> AbstractKinematics:
-        """What its particles store of their deformation. Default: F."""
+        """The deformation that its particles store. Default: F."""
         return DEFORMATION_GRADIENT
 
     @property
@@ -118,7 +118,7 @@ class AbstractLaw(eqx.Module):
         return jnp.broadcast_to(jnp.maximum(now, intact), F.shape[self.kinematics.axes :])
 
     def compaction(self, history: Any, /) -> Float[Array, "p"] | float:
-        """What yielding has left of its volume [-], at most 1, shape (p,), where the deformation that is stored is the
+        """The volume that yielding has left [-], at most 1, shape (p,), where the deformation that is stored is the
         elastic part. Default: 1, of flow that keeps the volume.
 
         Args:
@@ -134,17 +134,17 @@ class AbstractLaw(eqx.Module):
             history: the history.
             stored: F or J of the particles [-], particle first.
         """
-        own = jax.eval_shape(lambda stored: self.initial_history(components(stored)), stored)
-        if jax.tree.structure(own) != jax.tree.structure(history):
+        initial = jax.eval_shape(lambda stored: self.initial_history(components(stored)), stored)
+        if jax.tree.structure(initial) != jax.tree.structure(history):
             return False
-        return all(a.shape == b.shape for a, b in zip(jax.tree.leaves(own), jax.tree.leaves(history), strict=True))
+        return all(a.shape == b.shape for a, b in zip(jax.tree.leaves(initial), jax.tree.leaves(history), strict=True))
 
     def viscous_part(self) -> Viscosity | None:
         """The viscosity beside the law; None without."""
         return None
 
     def freedom(self) -> Freedom | None:
-        """What a body of it may do, if it is rigid; None of a law of what deforms."""
+        """Degrees of freedom of a rigid body; None for deformable laws."""
         return None
 
     def title(self) -> str:
@@ -152,7 +152,7 @@ class AbstractLaw(eqx.Module):
         return type(self).__name__
 
     def inadmissible(self, or_else: str) -> tuple[str, str]:
-        """What is wrong with a particle whose deformation the law does not allow, and what helps.
+        """Two parts of a message: the deformation that the law does not allow, and the remedy.
 
         Args:
             or_else: what else helps, as the end of a sentence; may be empty.
@@ -220,7 +220,7 @@ class AbstractElastic(AbstractLaw):
 
     @abc.abstractmethod
     def of_gradient(self) -> "AbstractElastic":
-        """The same law as a function of F."""
+        """This law as a function of F."""
 
     def initial_history(self, F: Deformation, /) -> None:
         """None."""

@@ -76,7 +76,7 @@ class PowerSum(AbstractPowerSum):
 
 
 class Work(NamedTuple):
-    """What a power sum T adds to the energy, as a function w of E = T − 3."""
+    """The energy of a power sum T, as a function w of E = T − 3."""
 
     energy: Array
     """w [Pa]."""
@@ -149,11 +149,11 @@ class AbstractRubber(AbstractMaterial):
 
         def growth(i: int, j: int) -> Array:
             """∂τ_i/∂ln s_j."""
-            own = [
+            shares = [
                 a**2 * (w.curvature * e[i] * e[j] + w.slope * ((1 + p[i]) * ((i == j) - 1 / 3) - e[j] / 3))
                 for a, w, _, p, e in terms
             ]
-            return sum(own, self.bulk_modulus * J**2)
+            return sum(shares, self.bulk_modulus * J**2)
 
         def scaling(i: int, j: int) -> Array:
             return (growth(i, j) - (tau[i] if i == j else 0)) / (s[i] * s[j])

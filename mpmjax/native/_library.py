@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 
 INTERFACE = 11
-"""What the library has to answer, as in native/CMakeLists.txt: both change with the handlers' arguments."""
+"""The version of the library's interface, as in native/CMakeLists.txt: both change with the handlers' arguments."""
 PATH = Path(__file__).parent / "lib" / "sums.so"
 """In a folder of its own: Python takes a shared library among modules for a module."""
 HANDLERS = (
@@ -79,9 +79,9 @@ def library() -> Library:
 
 
 def _registered(handle: ctypes.CDLL) -> ctypes.CDLL:
-    found = handle.mpmjax_interface()
-    if found != INTERFACE:
-        raise RuntimeError(f"it has interface {found}, and this version of mpmjax needs {INTERFACE}")
+    interface = handle.mpmjax_interface()
+    if interface != INTERFACE:
+        raise RuntimeError(f"it has interface {interface}, and this version of mpmjax needs {INTERFACE}")
     for name in (*HANDLERS, "threads"):
         capsule = jax.ffi.pycapsule(getattr(handle, target(name)))
         jax.ffi.register_ffi_target(target(name), capsule, platform="cpu")
@@ -120,14 +120,14 @@ def uses_native() -> tuple[bool, str]:
         raise ValueError(f"{VARIABLE} must be native or xla, or not be set, got {asked!r}.")
     if asked == "xla":
         return False, f"{VARIABLE}=xla"
-    found = library()
-    if found.handle is None and asked == "native":
+    native = library()
+    if native.handle is None and asked == "native":
         raise ValueError(
             f"{VARIABLE}=native asks for the native sums, but there is no library of them that can be used: "
-            f"{found.reason}. Install mpmjax again where there is a C++ compiler, or unset {VARIABLE}."
+            f"{native.reason}. Install mpmjax again where there is a C++ compiler, or unset {VARIABLE}."
         )
-    if found.handle is None:
-        return False, f"no native library: {found.reason}"
+    if native.handle is None:
+        return False, f"no native library: {native.reason}"
     return True, f"{VARIABLE}=native" if asked else "the default"
 
 

@@ -96,8 +96,8 @@ def differentiable(primitive: Primitive, function: Callable[..., list[Array]]) -
     def jvp(primals: tuple, tangents: tuple, *, batched: int) -> tuple[list[Array], list[Array]]:
         floats = [k for k, primal in enumerate(primals) if jnp.issubdtype(primal.dtype, jnp.floating)]
 
-        def written(*given: Array) -> list[Array]:
-            at = dict(zip(floats, given, strict=True))
+        def written(*operands: Array) -> list[Array]:
+            at = dict(zip(floats, operands, strict=True))
             return members(function, batched)(*(at.get(k, primal) for k, primal in enumerate(primals)))
 
         along = tuple(ad.instantiate_zeros(tangents[k]) for k in floats)
@@ -155,9 +155,9 @@ def sums_fit(avals: Any, batched: int) -> bool:
     """Whether the library has a kernel for sums of these: index factors, weights, and others of the weights' dtype."""
     index, weights = avals[:2]
     d, s, _ = index.shape[batched:]
-    known = index.dtype == np.int32 and weights.dtype in (np.float32, np.float64)
+    has_kernel = index.dtype == np.int32 and weights.dtype in (np.float32, np.float64)
     same = all(aval.dtype == weights.dtype for aval in avals[1:])
-    return known and same and d in (1, 2, 3) and s in (2, 3, 4)
+    return has_kernel and same and d in (1, 2, 3) and s in (2, 3, 4)
 
 
 def is_divided(context: Any) -> bool:

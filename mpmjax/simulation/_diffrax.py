@@ -95,8 +95,8 @@ def passed_particles(problem: Problem, before: State, after: State, t: Scalar) -
     start = scene.grid.wrapped(before.x, scene.window(problem.at(before)))
     end = start + (after.x - before.x)
     reach = (scene.kernel.order + 1) / 2
-    found = [b.passed(start, end, scene.grid.spacing, t, problem.dt, reach) for b in scene.boundary]
-    return [(number, passed) for number, passed in enumerate(found) if passed is not None]
+    passed_by = [b.passed(start, end, scene.grid.spacing, t, problem.dt, reach) for b in scene.boundary]
+    return [(number, passed) for number, passed in enumerate(passed_by) if passed is not None]
 
 
 def gravest(faults: dict[Fault, Bool[Array, "p"]]) -> Int[Array, ""]:
@@ -105,10 +105,10 @@ def gravest(faults: dict[Fault, Bool[Array, "p"]]) -> Int[Array, ""]:
     of_particle = jnp.zeros_like(next(iter(faults.values())), jnp.int32)
     for fault, particles in reversed(faults.items()):
         of_particle = jnp.where(particles, ranks[fault], of_particle)
-    worst, found = of_particle.max(initial=0), jnp.asarray(Fault.NONE, jnp.int32)
+    worst, fault_found = of_particle.max(initial=0), jnp.asarray(Fault.NONE, jnp.int32)
     for fault, rank in ranks.items():
-        found = jnp.where(worst == rank, fault, found)
-    return found
+        fault_found = jnp.where(worst == rank, fault, fault_found)
+    return fault_found
 
 
 _GRAVEST_FIRST = (Fault.NOT_FINITE, Fault.PASSED, Fault.OUTSIDE, Fault.INADMISSIBLE, Fault.COLLAPSED)
@@ -128,10 +128,12 @@ def examined(problem: Problem, state: RolloutState) -> tuple[Problem, RolloutSta
     """The problem with the fault of its start, found from values that were not known when they were given, and the
     state, made NaN if a parameter is bad, since what follows would look like numbers."""
     arrays, rest = eqx.partition((problem, state), eqx.is_array)
-    known, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
-    unmet = first_unmet(requirements((known.scene, known.particles, known.method)))
+    constant, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
+    unmet = first_unmet(requirements((constant.scene, constant.particles, constant.method)))
     fault = jnp.where(
-        unmet > 0, Fault.BAD_PARAMETERS, gravest(faulty_particles(known, begin.particles, known.start * known.dt))
+        unmet > 0,
+        Fault.BAD_PARAMETERS,
+        gravest(faulty_particles(constant, begin.particles, constant.start * constant.dt)),
     )
     valid = jnp.where(unmet > 0, jnp.nan, 1)
     state = jax.tree.map(lambda a: a * valid.astype(a.dtype), state)

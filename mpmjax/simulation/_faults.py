@@ -125,14 +125,14 @@ def _law(run: Run, particle: int) -> AbstractLaw:
 
 
 class _Words(NamedTuple):
-    """What is said of a fault."""
+    """The parts of a fault's message."""
 
     state: str
-    """Of the state, where no particle can be named."""
+    """Subject, where no particle can be named."""
     particle: str = ""
-    """Of a particle, after its number; empty where it depends on the law (`disallowed`)."""
+    """Predicate of a particle, after its number; empty where it depends on the law (`disallowed`)."""
     advice: str = ""
-    """What helps; empty likewise."""
+    """The remedy; empty likewise."""
 
 
 _WORDS: dict[Fault, _Words] = {
@@ -178,13 +178,13 @@ def guarded(run: Run, report: Array) -> Run:
     jax.eval_shape(lambda a: names.extend(r.message for r in requirements(eqx.combine(a, rest))), inputs)
     statistics = run.statistics
     unsolved = (statistics.fault == Fault.NONE) & (statistics.unconverged > 0)
-    known = [(words.state, statistics.fault == fault) for fault, words in _WORDS.items()]
-    known.append(("a solve that did not converge", unsolved))
-    met = jnp.stack([holds for _, holds in known])
+    states = [(words.state, statistics.fault == fault) for fault, words in _WORDS.items()]
+    states.append(("a solve that did not converge", unsolved))
+    met = jnp.stack([holds for _, holds in states])
     number = jnp.where(met.any(), 1 + jnp.argmax(met).astype(jnp.int32), 0)
-    number = jnp.where(statistics.unmet > 0, len(known) + statistics.unmet, number)
-    said = [*(f"{what}. {_ADVICE}" for what, _ in known), *names]
-    faults = [f"mpmjax: the rollout met a fault: {what}" for what in said]
+    number = jnp.where(statistics.unmet > 0, len(states) + statistics.unmet, number)
+    messages = [*(f"{what}. {_ADVICE}" for what, _ in states), *names]
+    faults = [f"mpmjax: the rollout met a fault: {what}" for what in messages]
     return guard(run, report, number, faults, UNSOLVED.format("the tangent"))[0]
 
 
@@ -209,24 +209,24 @@ def advise(scene: Scene, method: AbstractIntegrator, dt: Any, began: Particles, 
         then = first  # it changes with every move of the particles, and is zero at each cell's face
     if math.isnan(then):
         then = first  # too deformed to tell
-    known = math.isfinite(first) and first > 0 and then > 0
-    if not known or float(dt) <= SAFETY * min(first, then):
+    comparable = math.isfinite(first) and first > 0 and then > 0
+    if not comparable or float(dt) <= SAFETY * min(first, then):
         return otherwise
     times = float(dt) / first
-    said = f"dt = {float(dt):.4g} s is {times:.3g} times the {method.limit_name()} at the start ({first:.4g} s)"
+    text = f"dt = {float(dt):.4g} s is {times:.3g} times the {method.limit_name()} at the start ({first:.4g} s)"
     if not math.isclose(first, then, rel_tol=1e-2):
-        said += f" and {float(dt) / then:.3g} times that of the last good state ({then:.4g} s)"
+        text += f" and {float(dt) / then:.3g} times that of the last good state ({then:.4g} s)"
     if float(dt) <= min(first, then):
-        said += f"; from {SAFETY:g} times on, large vibrations can grow"
+        text += f"; from {SAFETY:g} times on, large vibrations can grow"
     shortly = otherwise[0].lower() + otherwise[1:]
     shorter = f"at most {SAFETY * first:.4g} s (stable_dt, safety {SAFETY:g})" if float(dt) > SAFETY * first else "less"
-    return f"{said}. Take a dt of {shorter}, or an implicit method that has no limit. If the fault stays, {shortly}"
+    return f"{text}. Take a dt of {shorter}, or an implicit method that has no limit. If the fault stays, {shortly}"
 
 
 def averaging_advice(scene: Scene) -> str:
     """A sentence on averaged volumes where a law that hardly changes its volume has own ones; else empty."""
-    own = scene.laws if scene.volume is None else ()
-    if not any(law.allows_averaged_volume and law.hardly_changes_volume() for law in own):
+    laws = scene.laws if scene.volume is None else ()
+    if not any(law.allows_averaged_volume and law.hardly_changes_volume() for law in laws):
         return ""
     return (
         " With own volumes nearly incompressible material locks, and its pressures differ from particle to particle: "
@@ -235,7 +235,7 @@ def averaging_advice(scene: Scene) -> str:
 
 
 def disallowed(law: AbstractLaw, method: AbstractIntegrator) -> tuple[str, str]:
-    """What is wrong with a deformation that the law does not allow, and what helps."""
+    """Two parts of a message: the deformation that the law does not allow, and the remedy."""
     newton = (
         ""
         if method.is_explicit or method.keeps_admissible

@@ -20,18 +20,18 @@ class RolloutState(eqx.Module):
     collider_impulse: ColliderImpulse | None
     """Linear and angular impulse on the scene's colliders since the rollout began; None without colliders."""
     boundary_impulse: BoundaryImpulse | None = None
-    """The same of each of its boundaries; None unless the scene has `boundary_forces`."""
+    """Linear and angular impulse on the scene's boundaries; None unless the scene has `boundary_forces`."""
     order: MemoryOrder | None = None
     """The order of the particles in memory; None if it is that in which they were given."""
 
     def carried(self) -> "RolloutState":
-        """The same state as the loop over steps carries it: component first, as a step has its arrays, and C with the
+        """The state in the layout of the loop over steps: component first, as a step has its arrays, and C with the
         direction of the derivative before the component, as a gather has it. XLA would else transpose all of them in
         each step."""
         return replace(self, particles=_with_transposed_affine(jax.tree.map(components, self.particles)))
 
     def uncarried(self, hold: Callable[[State], State] = lambda state: state) -> "RolloutState":
-        """The other way round.
+        """The state from the layout of the loop over steps.
 
         Args:
             hold: what is done to the arrays as they are carried. Default: nothing.
@@ -41,8 +41,8 @@ class RolloutState(eqx.Module):
 
     def as_given(self) -> "RolloutState":
         """A carried state, particle first again and in the order in which the particles were given."""
-        given = self.uncarried()
-        return given if self.order is None else replace(given, particles=self.order.undone(given.particles), order=None)
+        state = self.uncarried()
+        return state if self.order is None else replace(state, particles=self.order.undone(state.particles), order=None)
 
     def after(self, particles: Particles, info: StepInfo) -> "RolloutState":
         """The state after a step, from the particles after it and what it reports."""

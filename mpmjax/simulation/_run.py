@@ -51,7 +51,7 @@ class Run(eqx.Module):
     frames: State | None
     """The saved states, with a leading axis f; None where nothing or only observations were saved."""
     observed: Any
-    """What `observe` returned for each frame, with a leading axis f."""
+    """The result of `observe` for each frame, with a leading axis f."""
     final: Particles
     """The particles at the end."""
     final_step: Float[Array, ""]
@@ -66,7 +66,7 @@ class Run(eqx.Module):
     f; None without colliders, or where nothing was saved. The difference between two frames, over the time between
     them, is the mean force and torque of these steps (see `forces`, which says at what time)."""
     final_collider_impulse: ColliderImpulse | None = None
-    """The same to the end; None without colliders."""
+    """Linear and angular impulse on the colliders to the end; None without colliders."""
     boundary_impulse: BoundaryImpulse | None = None
     """As `collider_impulse`, on each of the scene's boundaries (see `boundary_forces`); None unless the scene has
     `boundary_forces`, or where nothing was saved."""

@@ -261,7 +261,7 @@ def _sum_bytes(scene: Scene, particles: Particles) -> int:
 
 
 class Saved(NamedTuple):
-    """What was saved on the way, along a first axis; no steps and None if nothing was."""
+    """Saved frames, along a first axis; no steps and None if nothing was saved."""
 
     steps: Float[Array, "f"]
     """Their numbers."""
@@ -281,7 +281,7 @@ class End(NamedTuple):
     """The number of the last step."""
     statistics: RunStatistics
     report: Float[Array, ""]
-    """What tangent solves report."""
+    """Relative residual of the first tangent solve that did not converge; zero if all did."""
 
 
 @eqx.filter_jit

@@ -88,8 +88,8 @@ def resorted(
 
     def found() -> tuple[Order, tuple[Array, ...]]:
         place = places(order.number)
-        given = replace(particles, x=jax.lax.stop_gradient(state.x)[place])
-        cells = cells_of(scene.kernel, scene.grid, scene.window(given), scene.on_grid(given, t))
+        original = replace(particles, x=jax.lax.stop_gradient(state.x)[place])
+        cells = cells_of(scene.kernel, scene.grid, scene.window(original), scene.on_grid(original, t))
         number = jnp.concatenate([_sorted_if_mixed(cells, group.rows) for group in particles.groups])
         new = places(number)
         return place[number], tuple(new[whole_numbers(rows)].astype(rows.dtype) for rows in attached)
@@ -105,8 +105,8 @@ def resorted(
 
 def _sorted_if_mixed(cells: Int[Array, "p"], rows: tuple[int, int]) -> Int[Array, "q"]:
     """The numbers of one material's particles, by cell if they are mixed."""
-    own = cells[slice(*rows)]
-    return rows[0] + jnp.where(is_mixed(own), by_cell(own), jnp.arange(own.size, dtype=own.dtype))
+    among = cells[slice(*rows)]
+    return rows[0] + jnp.where(is_mixed(among), by_cell(among), jnp.arange(among.size, dtype=among.dtype))
 
 
 def is_mixed(cells: Int[Array, "q"]) -> Bool[Array, ""]:

@@ -13,7 +13,7 @@ from mpmjax.stepping import StepInfo
 
 
 class Fault(enum.IntEnum):
-    """What is wrong with a state or a step. A member may be compared with a traced whole number."""
+    """A fault of a state or a step. A member may be compared with a traced whole number."""
 
     NONE = 0
     NOT_FINITE = 1

@@ -114,14 +114,14 @@ class Patch(AbstractPlace):
         x, apart = _known(particles, self)
         spacing = apart if self.spacing is None else float(self.spacing)
         margin = _FAR * apart
-        found = surface_pieces(self.region, spacing, x.min(axis=0) - margin, x.max(axis=0) + margin, self.within)
-        pieces = found.of(found.inner)
+        surface = surface_pieces(self.region, spacing, x.min(axis=0) - margin, x.max(axis=0) + margin, self.within)
+        pieces = surface.of(surface.inner)
         require(
             len(pieces.normal) > 0,
             f"The {self} has no surface at the particles, or only on the boundary of `within`: move or enlarge it.",
         )
         if self.within is not None:
-            self._warn(pieces, found.size.sum(), apart)
+            self._warn(pieces, surface.size.sum(), apart)
         middle, area = pieces.middle, pieces.area
         weight = np.sqrt((area**2).sum(axis=1))
         particle = _nearest(x, middle, apart, self)

@@ -191,8 +191,8 @@ class AveragedTangent(eqx.Module):
     def __call__(self, dF: Matrix) -> Matrix:
         """δP [Pa] of δF [-], both of shape (d, d, q)."""
         average = self.at.average
-        own, mean = self.local(dF, average(la.double_dot(self.cofactor, dF)))
-        return own + average(mean) * self.cofactor
+        stress, mean = self.local(dF, average(la.double_dot(self.cofactor, dF)))
+        return stress + average(mean) * self.cofactor
 
     def local(self, dF: Matrix, d_mean: Array) -> tuple[Matrix, Array]:
         """The derivatives by δF_p and by δJ̄_p of half the second variation of a particle's energy over V0.
@@ -207,6 +207,6 @@ class AveragedTangent(eqx.Module):
         dP = self.tangent(at.scale * dF + dy * at.averaged)
         along = la.double_dot(dP, at.averaged) + at.scale * la.double_dot(self.P, dF) + self.tau * dy
         inward = (self.tau * j / at.ratio - along) / (d * at.ratio)
-        own = at.scale * (dP + dy * self.P) + inward * self.cofactor
-        own = own + self.pull * la.cofactor_differential(at.F, dF)
-        return own, (along - self.tau * d_mean / at.mean) / (d * at.mean)
+        stress = at.scale * (dP + dy * self.P) + inward * self.cofactor
+        stress = stress + self.pull * la.cofactor_differential(at.F, dF)
+        return stress, (along - self.tau * d_mean / at.mean) / (d * at.mean)

@@ -43,15 +43,15 @@ class Bodies(eqx.Module):
         Raises:
             ValueError: not one number a material, a number left out, fewer than two bodies.
         """
-        found = tuple(range(count)) if self.of_materials is None else self.of_materials
+        numbers = tuple(range(count)) if self.of_materials is None else self.of_materials
         require(
-            len(found) == count and set(found) == set(range(max(found) + 1)),
+            len(numbers) == count and set(numbers) == set(range(max(numbers) + 1)),
             f"The of_materials of Bodies must be one number for each of the scene's {count} materials, from 0 and none "
-            f"left out, got {found}.",
+            f"left out, got {numbers}.",
         )
         require(
-            max(found) > 0,
+            max(numbers) > 0,
             f"Bodies must be two or more to touch, got one of {count} material(s): give each body a law of its own in "
             "material, or drop bodies.",
         )
-        return found
+        return numbers

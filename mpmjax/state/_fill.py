@@ -95,14 +95,14 @@ def fill(
         f"take a smaller region (it reaches from {lower} to {upper} m), a larger spacing (it is {grid.spacing} m) or "
         "fewer particles_per_cell.",
     )
-    found = region.fitted(cell) if fitted or region.fills_bounds else _cut_cells(region, cell)
-    if found is None:
+    cells = region.fitted(cell) if fitted or region.fills_bounds else _cut_cells(region, cell)
+    if cells is None:
         raise ValueError(
             f"No cells can be fitted to {region}: leave out fitted, for a lattice cut by the surface, or map one by "
             "fill_mapped."
         )
-    require(len(found[0]) > 0, f"{region} holds no particle at this spacing: refine the grid or enlarge the region.")
-    return _particles(*found, density, field, precision)
+    require(len(cells[0]) > 0, f"{region} holds no particle at this spacing: refine the grid or enlarge the region.")
+    return _particles(*cells, density, field, precision)
 
 
 @checked

@@ -23,7 +23,7 @@ class LoadedPoints(eqx.Module):
     deformation: Matrix | None
     """F of their particles [-], shape (d, d, s); None where a law does not keep it."""
     rate: Matrix | None
-    """Its rate [1/s], shape (d, d, s); None without a velocity gradient."""
+    """Rate of F [1/s], shape (d, d, s); None without a velocity gradient."""
     place: Float[Array, "d s"]
     """Where they were when they were attached [m]."""
     weight: Float[Array, "s"]
@@ -38,7 +38,7 @@ class LoadedPoints(eqx.Module):
     """The mirrors on which the nodes are folded."""
 
     def after(self, time: Scalar) -> "LoadedPoints":
-        """The same points moved on by a time [s] with their velocity, and turned with its gradient."""
+        """The points moved on by a time [s] with their velocity, and turned with its gradient."""
         F = self.deformation
         if F is not None and self.rate is not None:
             F = F + time * self.rate
@@ -112,6 +112,6 @@ def _deformation(laws: tuple[AbstractLaw, ...], particles: Particles) -> Particl
     still = jnp.eye(particles.dim, dtype=particles.x.dtype)
     parts = []
     for law, stored, count in zip(laws, particles.deformations, particles.sizes, strict=True):
-        known = keeps_deformation(law) and stored is not None
-        parts.append(jnp.asarray(stored) if known else jnp.broadcast_to(still, (count, *still.shape)))
+        whole = keeps_deformation(law) and stored is not None
+        parts.append(jnp.asarray(stored) if whole else jnp.broadcast_to(still, (count, *still.shape)))
     return jnp.concatenate(parts)

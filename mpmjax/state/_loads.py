@@ -44,7 +44,7 @@ class AbstractLoad(eqx.Module):
         """The force on each point [N], shape (d, s), at time t, in a step of dt, or None for none; constant over it."""
 
     def support(self, points: LoadedPoints, t: Scalar) -> Support | None:
-        """What it adds to the elastic energy of the grid and to its viscosity, linear in the motion of the points.
+        """The load's part of the grid's elastic energy and viscosity, linear in the motion of the points.
         Default: None, nothing."""
         del points, t
         return None
@@ -204,7 +204,7 @@ class Spring(AbstractLoad):
         )
 
     def support(self, points: LoadedPoints, t: Scalar) -> Support:
-        """Its energy ½ k (x + u − x_0 − d)² and its resistance c."""
+        """The energy ½ k (x + u − x_0 − d)² and the resistance c."""
         ground = points.place if self.motion is None else self.motion.place(points.place.T, t).T
         stiffness = _along(self.stiffness, points)
         damping = None if self.damping is None else _along(self.damping, points)
@@ -232,11 +232,11 @@ def points_of(
     total: bool,
 ) -> tuple[LoadedPoints, ...]:
     """The points of each load at the start of a step."""
-    found = []
+    points = []
     for load in loads:
         assert isinstance(load.on, AttachedPoints)  # `prepare` says so
-        found.append(loaded_points(load.on, laws, particles, stencil, total=total))
-    return tuple(found)
+        points.append(loaded_points(load.on, laws, particles, stencil, total=total))
+    return tuple(points)
 
 
 def load_force(
@@ -258,19 +258,19 @@ def load_force(
         size: number of nodes.
     """
     total = None
-    for load, own in zip(loads, points, strict=True):
-        later = own.after(part * dt) if part > 0 and load.moves_points_on else own
+    for load, at in zip(loads, points, strict=True):
+        later = at.after(part * dt) if part > 0 and load.moves_points_on else at
         force = load.force(later, t + part * dt if part > 0 else t, dt)
         if force is not None:
-            nodal = own.nodal(force, size)
+            nodal = at.nodal(force, size)
             total = nodal if total is None else total + nodal
     return total
 
 
 def supports_of(loads: tuple[AbstractLoad, ...], points: tuple[LoadedPoints, ...], t: Scalar) -> tuple[Support, ...]:
     """The supports of loads, with the ground where it is at time t [s]."""
-    found = (load.support(own, t) for load, own in zip(loads, points, strict=True))
-    return tuple(support for support in found if support is not None)
+    supports = (load.support(at, t) for load, at in zip(loads, points, strict=True))
+    return tuple(support for support in supports if support is not None)
 
 
 class AbstractBodyForce(eqx.Module):

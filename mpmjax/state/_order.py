@@ -20,8 +20,8 @@ class Rearrangement(eqx.Module):
 
     whole: Order
     """The number of the particle that comes first, second, ..., shape (p,)."""
-    own: tuple[Int[Array, "..."], ...]
-    """The same of each material, by numbers among its particles, shape (q,)."""
+    within: tuple[Int[Array, "..."], ...]
+    """The order within each material, by numbers among its particles, shape (q,)."""
     wanted: Bool[Array, ""]
     """If False, everything stays where it is."""
 
@@ -31,12 +31,12 @@ class Rearrangement(eqx.Module):
 
     def of_material(self, number: int, tree: Any) -> Any:
         """Arrays over the particles of one material, shape (q, ...), in this order."""
-        return jax.tree.map(lambda a: rearranged(self.wanted, self.own[number], a), tree)
+        return jax.tree.map(lambda a: rearranged(self.wanted, self.within[number], a), tree)
 
     def of_state(self, state: State) -> State:
         """A state in this order."""
-        own = [self.of_material(k, (F, history)) for k, (_, F, history) in enumerate(by_material(state))]
-        deformations, histories = zip(*own, strict=True)
+        sorted_groups = [self.of_material(k, (F, history)) for k, (_, F, history) in enumerate(by_material(state))]
+        deformations, histories = zip(*sorted_groups, strict=True)
         # transposed, as a rollout's loop has it in memory
         C = None if state.C is None else jnp.swapaxes(self(jnp.swapaxes(state.C, 1, 2)), 1, 2)
         return replace(state, x=self(state.x), v=self(state.v), C=C, deformations=deformations, histories=histories)
@@ -44,11 +44,11 @@ class Rearrangement(eqx.Module):
 
 def rearrangement(whole: Order, sizes: tuple[int, ...], wanted: Bool[Array, ""]) -> Rearrangement:
     """The order of particles, so many of each material."""
-    own, first = [], 0
+    within, first = [], 0
     for size in sizes:
-        own.append(whole[first : first + size] - first)
+        within.append(whole[first : first + size] - first)
         first += size
-    return Rearrangement(whole, tuple(own), wanted)
+    return Rearrangement(whole, tuple(within), wanted)
 
 
 def places(order: Order) -> Order:
@@ -60,12 +60,12 @@ class MemoryOrder(eqx.Module):
     """The order of a rollout's particles in memory, and in that order what does not evolve of them."""
 
     numbers: Float[Array, "3 p"]
-    """Of each particle its number in the order in which they were given, its mass [kg] and its undeformed volume
-    [m^d]. One array, which a loop carries at the cost of one; floats, as all of a rollout's state."""
+    """Rows: original index, mass [kg], undeformed volume [m^d]. One array, which a loop carries at the cost of
+    one; floats, as all of a rollout's state."""
     parameters: tuple[Any, ...]
-    """Of each law the parameters that have one number a particle, in the law's structure, with None for the others."""
+    """The parameters of each law that have one number a particle, in the law's structure, with None for the others."""
     attached: tuple[Float[Array, "..."], ...]
-    """Of each load the places of the particles that its points are attached to."""
+    """The places of the particles that the points of each load are attached to."""
 
     @property
     def number(self) -> Order:
@@ -74,7 +74,7 @@ class MemoryOrder(eqx.Module):
 
     def changed(self, change: Rearrangement, attached: tuple[Float[Array, "..."], ...]) -> "MemoryOrder":
         """Another order, in which loads are attached to the particles at these places."""
-        parameters = (change.of_material(k, own) for k, own in enumerate(self.parameters))
+        parameters = (change.of_material(k, values) for k, values in enumerate(self.parameters))
         return MemoryOrder(change(self.numbers.T).T, tuple(parameters), attached)
 
     def undone(self, state: State) -> State:
@@ -85,7 +85,7 @@ class MemoryOrder(eqx.Module):
     def put_into(self, scene: Scene, particles: Particles) -> tuple[Scene, Particles]:
         """The scene and the particles with what they know of particles one by one in this order."""
         particles = replace(particles, mass=self.numbers[1], volume=self.numbers[2])
-        laws = tuple(eqx.combine(own, law) for own, law in zip(self.parameters, scene.laws, strict=True))
+        laws = tuple(eqx.combine(values, law) for values, law in zip(self.parameters, scene.laws, strict=True))
         scene = eqx.tree_at(lambda s: s.material, scene, laws if isinstance(scene.material, tuple) else laws[0])
         if not self.attached:
             return scene, particles
@@ -95,14 +95,14 @@ class MemoryOrder(eqx.Module):
 def given_order(scene: Scene, particles: Particles) -> MemoryOrder:
     """The order in which prepared particles were given, of a scene whose floats are arrays and whose loads are
     attached."""
-    own = (eqx.filter(law, _one_a_particle(law, n)) for law, n in zip(scene.laws, particles.sizes, strict=True))
+    parameters = (eqx.filter(law, _one_a_particle(law, n)) for law, n in zip(scene.laws, particles.sizes, strict=True))
     number = jnp.arange(particles.count, dtype=particles.x.dtype)
     numbers = jnp.stack([number, particles.mass, particles.volume])
-    return MemoryOrder(numbers, tuple(own), attached_particles(scene))
+    return MemoryOrder(numbers, tuple(parameters), attached_particles(scene))
 
 
 def attached_particles(scene: Scene) -> tuple[Float[Array, "..."], ...]:
-    """Of each load the numbers of the particles that its points are attached to."""
+    """The numbers of the particles that the points of each load are attached to."""
     return tuple(jnp.asarray(load.on.particle) for load in scene.loads if isinstance(load.on, AttachedPoints))
 
 

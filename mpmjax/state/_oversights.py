@@ -47,9 +47,9 @@ def warn_of_oversights(grid: Grid, kernel: BSpline, boundary: Boundaries, partic
     """
     grid = grid.with_layers(1)  # the nodes of all bodies are at the same places
     resting = tuple(c.rests(total=total) and not grid.follow for c in boundary)
-    probe, given = partial(_probe, resting=resting, total=total), (boundary, grid, particles.x, particles.volume)
-    some = jax.tree.leaves(eqx.filter_eval_shape(probe, *given))  # none, and no compiling, of walls
-    within, touched = eqx.filter_jit(probe)(*given) if some else ([None] * len(boundary),) * 2
+    probe, inputs = partial(_probe, resting=resting, total=total), (boundary, grid, particles.x, particles.volume)
+    some = jax.tree.leaves(eqx.filter_eval_shape(probe, *inputs))  # none, and no compiling, of walls
+    within, touched = eqx.filter_jit(probe)(*inputs) if some else ([None] * len(boundary),) * 2
     for number, condition in enumerate(boundary, 1):
         name = f"{type(condition).__name__} (boundary {number})"
         covered = _beyond(condition, grid, particles) if (inside := within[number - 1]) is None else int(inside)
@@ -90,10 +90,10 @@ def warn_of_rounding(grid: Grid, x: ParticleVector, before: ParticleVector | Non
     def rounding(x: ParticleVector) -> float:
         return float(jnp.finfo(x.dtype).eps) * float(np.abs(np.asarray(x)).max()) / float(grid.spacing)
 
-    found = rounding(x)
-    if found > _MOST_ROUNDING and (before is None or rounding(before) <= _MOST_ROUNDING):
+    error = rounding(x)
+    if error > _MOST_ROUNDING and (before is None or rounding(before) <= _MOST_ROUNDING):
         warn(
-            f"{x.dtype} rounds positions {float(np.abs(np.asarray(x)).max()):.4g} m from zero to {found:.2g} spacings, "
+            f"{x.dtype} rounds positions {float(np.abs(np.asarray(x)).max()):.4g} m from zero to {error:.2g} spacings, "
             "and each step adds as much: move the scene nearer to zero, or take float64 particles."
         )
 
@@ -111,12 +111,12 @@ def warn_of_crowding(grid: Grid, laws: tuple[AbstractLaw, ...], particles: Parti
     ratio = np.concatenate([np.asarray(law.compaction(g.history)) * _volume_ratio(g.stored) for law, g in groups])
     volume, width = np.asarray(particles.volume, float) * ratio, max(float(grid.spacing), 2 * _largest_side(particles))
     for offset in (0.0, 0.5):  # a layer between two rows of nodes shows less
-        found = _held(particles.x, volume, width, offset)
-        beyond = 0.0 if found is None else np.maximum(found[0] - _CROWDED, 0).sum() / found[0].sum()
-        if found is not None and beyond > _MOST_BEYOND:
+        volumes = _held(particles.x, volume, width, offset)
+        beyond = 0.0 if volumes is None else np.maximum(volumes[0] - _CROWDED, 0).sum() / volumes[0].sum()
+        if volumes is not None and beyond > _MOST_BEYOND:
             warn(
-                f"At the end particles take up to {found[0].max():.2g} times the space that there is, most near "
-                f"{found[1]} m, and {100 * beyond:.2g} % of their volume is too much where it lies: levels and "
+                f"At the end particles take up to {volumes[0].max():.2g} times the space that there is, most near "
+                f"{volumes[1]} m, and {100 * beyond:.2g} % of their volume is too much where it lies: levels and "
                 "pressures are wrong. Take a shorter step, and around what flows a ContactPlane, or a SeparatingBox "
                 "half-way between nodes."
             )
@@ -125,8 +125,8 @@ def warn_of_crowding(grid: Grid, laws: tuple[AbstractLaw, ...], particles: Parti
 
 def _volume_ratio(stored: Array | None) -> np.ndarray:
     """det F or J of prepared particles, which store either, particle first."""
-    known = np.asarray(stored, float)
-    return known if known.ndim == 1 else np.linalg.det(known)
+    deformation = np.asarray(stored, float)
+    return deformation if deformation.ndim == 1 else np.linalg.det(deformation)
 
 
 def _probe(
@@ -190,10 +190,10 @@ def _stays_outside(boundary: AbstractBoundary, grid: Grid) -> bool:
 def _crowded(grid: Grid, particles: Particles) -> str | None:
     """A warning where particles take more space than there is, by a quarter of what fits in two particles' width."""
     width = 2 * max(float(grid.spacing), _largest_side(particles))
-    found = _held(particles.x, np.asarray(particles.volume, float), width)
-    if found is None or found[0].max() < _CROWDED:
+    volumes = _held(particles.x, np.asarray(particles.volume, float), width)
+    if volumes is None or volumes[0].max() < _CROWDED:
         return None
-    held, near = found
+    held, near = volumes
     return (
         f"Near {near} m particles take {held.max():.2g} times the space that there is: where two sets fill the same "
         "place there is twice the mass. Leave one of them out there."

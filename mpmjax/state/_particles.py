@@ -52,8 +52,8 @@ class Particles(eqx.Module):
     def __post_init__(self):
         materials = len(self.counts) if isinstance(self.counts, tuple) else 1  # what it is is checked below
         for name in ("deformations", "histories"):
-            known = getattr(self, name)
-            if isinstance(known, tuple) and not jax.tree.leaves(known):
+            value = getattr(self, name)
+            if isinstance(value, tuple) and not jax.tree.leaves(value):
                 setattr(self, name, (None,) * materials)
 
     def __check_init__(self):
@@ -74,11 +74,11 @@ class Particles(eqx.Module):
             self.counts is None or (sum(self.counts) == p and min(self.counts) > 0),
             f"The counts of the materials' particles must be positive and add up to {p}, got {self.counts}.",
         )
-        given = len(self.deformations), len(self.histories)
+        lengths = len(self.deformations), len(self.histories)
         require(
-            given == (len(self.sizes),) * 2,
-            f"Particles of {len(self.sizes)} materials need as many deformations and histories, got {given[0]} and "
-            f"{given[1]}: give the counts of all materials, or drop deformations and histories.",
+            lengths == (len(self.sizes),) * 2,
+            f"Particles of {len(self.sizes)} materials need as many deformations and histories, got {lengths[0]} and "
+            f"{lengths[1]}: give the counts of all materials, or drop deformations and histories.",
         )
         require_positive("Particle masses [kg]", self.mass)
         require_positive("Particle volumes [m^d]", self.volume)
@@ -100,7 +100,7 @@ class Particles(eqx.Module):
 
     @property
     def F(self) -> Any:  # noqa: N802
-        """What `deformations` has of the only material: F, shape (p, d, d), or J, shape (p,); None until it is known.
+        """The deformation of the only material: F, shape (p, d, d), or J, shape (p,); None until it is known.
 
         Raises:
             ValueError: the particles are of several materials.
@@ -109,7 +109,7 @@ class Particles(eqx.Module):
 
     @property
     def history(self) -> Any:
-        """What `histories` has of the only material.
+        """The history of the only material.
 
         Raises:
             ValueError: the particles are of several materials.
@@ -154,8 +154,8 @@ class Group(NamedTuple):
 
     def volume_ratio(self) -> Float[Array, "q"]:
         """J = det F [-], shape (q,)."""
-        found = self.deformation()
-        return found if found.ndim == 1 else la.determinant(found)
+        deformation = self.deformation()
+        return deformation if deformation.ndim == 1 else la.determinant(deformation)
 
 
 def moves_as_one(particles: Particles) -> bool:
@@ -189,13 +189,13 @@ def join(*sets: Particles, material: int | None = None) -> Particles:
             replace(q, C=jnp.zeros((q.count, *shape), q.x.dtype)) if q.C is None and moves_as_one(q) else q
             for q in sets
         )
-    for name, known in (
+    for name, values in (
         ("deformations", [F is not None for q in sets for F in q.deformations]),
         ("a velocity gradient C", [q.C is not None for q in sets]),
         ("reference positions X", [q.X is not None for q in sets]),
     ):
         require(
-            all(known) or not any(known),
+            all(values) or not any(values),
             f"All joined particles must have {name} or none: prepare each for a scene like that of the others.",
         )
     groups = [[(q, group)] for q in sets for group in q.groups]
@@ -206,19 +206,28 @@ def join(*sets: Particles, material: int | None = None) -> Particles:
             f"join needs the number of one of the first set's {len(first)} materials and others of one material each, "
             f"got material={material} and {len(more)} materials in {len(sets) - 1} sets.",
         )
-        added = [member for own in more for member in own]
-        groups = [own + added if number == material else own for number, own in enumerate(first)]
-    members = [member for own in groups for member in own]
+        added = [member for members_of_material in more for member in members_of_material]
+        groups = [
+            members_of_material + added if number == material else members_of_material
+            for number, members_of_material in enumerate(first)
+        ]
+    members = [member for members_of_material in groups for member in members_of_material]
     arrays: dict[str, Any] = {
         name: jnp.concatenate([getattr(q, name)[slice(*group.rows)] for q, group in members])
         for name in ("x", "v", "mass", "volume", "C", "X")
         if getattr(sets[0], name) is not None
     }
-    counts = tuple(sum(group.rows[1] - group.rows[0] for _, group in own) for own in groups)
+    counts = tuple(
+        sum(group.rows[1] - group.rows[0] for _, group in members_of_material) for members_of_material in groups
+    )
     return Particles(
         **arrays,
-        deformations=tuple(of_one_material([group.stored for _, group in own]) for own in groups),
-        histories=tuple(of_one_material([group.history for _, group in own]) for own in groups),
+        deformations=tuple(
+            of_one_material([group.stored for _, group in members_of_material]) for members_of_material in groups
+        ),
+        histories=tuple(
+            of_one_material([group.history for _, group in members_of_material]) for members_of_material in groups
+        ),
         counts=counts if len(counts) > 1 else None,
     )
 
@@ -245,12 +254,12 @@ class State(eqx.Module):
 
     @property
     def F(self) -> Any:  # noqa: N802
-        """What `deformations` has of the only material (see `Particles.F`)."""
+        """The deformation of the only material (see `Particles.F`)."""
         return _only(self.deformations, "F", "deformations")
 
     @property
     def history(self) -> Any:
-        """What `histories` has of the only material."""
+        """The history of the only material."""
         return _only(self.histories, "history", "histories")
 
 

@@ -76,20 +76,20 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
         not scene.total or particles.X is not None or first,
         "In the total description particles with an F need the X from which it is measured: give X, or drop F.",
     )
-    own = [_prepared(law, group, particles) for law, group in zip(scene.laws, particles.groups, strict=True)]
+    materials = [_prepared(law, group, particles) for law, group in zip(scene.laws, particles.groups, strict=True)]
     prepared = replace(
         particles,
-        deformations=tuple(deformation for deformation, _ in own),
-        histories=tuple(history for _, history in own),
+        deformations=tuple(deformation for deformation, _ in materials),
+        histories=tuple(history for _, history in materials),
         C=(still if particles.C is None else particles.C) if scene.keeps_gradient else None,
         X=(particles.x if particles.X is None else particles.X) if scene.total else None,
     )
     _check_size(scene, prepared)
     if not is_traced((scene, prepared)):
-        known = canonical(scene, particles.x.dtype)
-        _check_placement(known, prepared)
+        typed = canonical(scene, particles.x.dtype)
+        _check_placement(typed, prepared)
         if first:
-            warn_of_oversights(known.grid, known.kernel, known.boundary, prepared, total=scene.total)
+            warn_of_oversights(typed.grid, typed.kernel, typed.boundary, prepared, total=scene.total)
     if not scene.keeps_gradient or particles.C is not None or moves_as_one(particles):
         return prepared
     return replace(prepared, C=velocity_gradient(canonical(scene, particles.x.dtype), prepared))
@@ -148,16 +148,16 @@ def _prepared(law: AbstractLaw, group: Group, particles: Particles) -> tuple[Arr
     kept = law.kinematics
     undeformed = jnp.asarray(kept.undeformed(particles.dim), particles.x.dtype)
     shape = (stop - start, *undeformed.shape)
-    known = jnp.broadcast_to(undeformed, shape) if group.stored is None else group.stored
-    require(known.shape == shape, f"{law.title()} needs {kept.symbol} of shape {shape}, got {known.shape}.")
-    if group.history is not None and law.remembers(group.history, known):
-        return known, group.history
-    initial = law.initial_history(components(known))
+    stored = jnp.broadcast_to(undeformed, shape) if group.stored is None else group.stored
+    require(stored.shape == shape, f"{law.title()} needs {kept.symbol} of shape {shape}, got {stored.shape}.")
+    if group.history is not None and law.remembers(group.history, stored):
+        return stored, group.history
+    initial = law.initial_history(components(stored))
     require(
         group.history is None or initial is None,
         f"{law.title()} needs a history of its own, got {type(group.history).__name__}: drop it to start anew.",
     )
-    return known, initial
+    return stored, initial
 
 
 def is_prepared(scene: Scene, particles: Particles) -> bool:
@@ -180,8 +180,8 @@ def _fits(law: AbstractLaw, group: Group, dim: int) -> bool:
 def _parameters(law: AbstractLaw) -> list[Any]:
     """The numbers of a law and of the laws that it is made of; those of other modules within it, such as networks, are
     their own."""
-    own = jax.tree.leaves(law, is_leaf=is_foreign)
-    return [leaf for leaf in own if eqx.is_array_like(leaf)]
+    leaves = jax.tree.leaves(law, is_leaf=is_foreign)
+    return [leaf for leaf in leaves if eqx.is_array_like(leaf)]
 
 
 @eqx.filter_jit

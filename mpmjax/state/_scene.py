@@ -43,11 +43,11 @@ class RigidMaterial(NamedTuple):
     """A material that is a rigid body."""
 
     number: int
-    """Its index among the scene's materials."""
+    """Index among the scene's materials."""
     layer: int
     """The layer of nodes that it moves."""
     freedom: Freedom
-    """What it may do."""
+    """Degrees of freedom."""
 
 
 class Scene(eqx.Module):
@@ -145,7 +145,7 @@ class Scene(eqx.Module):
         for load in self.loads:
             load.check(d)
         for axis in range(d if not self.total else 0):
-            motions = [found.motion for found in self.mirrors if found.axis == axis]
+            motions = [mirror.motion for mirror in self.mirrors if mirror.axis == axis]
             require(
                 all(is_traced((m, motions[0])) or bool(eqx.tree_equal(m, motions[0])) for m in motions),
                 f"In the updated description the grid moves with the planes across axis {axis}, so that all of them "
@@ -226,15 +226,14 @@ class Scene(eqx.Module):
     def rigid_bodies(self) -> tuple[RigidMaterial, ...]:
         """The materials that are rigid bodies."""
         layers = (0,) * len(self.laws) if self.bodies is None else self.bodies.numbers(len(self.laws))
-        found = (
+        candidates = (
             (number, layer, law.freedom()) for number, (law, layer) in enumerate(zip(self.laws, layers, strict=True))
         )
-        return tuple(RigidMaterial(n, layer, freedom) for n, layer, freedom in found if freedom is not None)
+        return tuple(RigidMaterial(n, layer, freedom) for n, layer, freedom in candidates if freedom is not None)
 
     @property
     def guides(self) -> dict[int, int]:
-        """The numbers of what guides rigid bodies among the boundaries, after which they are counted, by the number of
-        the body's material."""
+        """Report index of each rigid body's guide, keyed by material; guides follow the boundaries."""
         guided = [body.number for body in self.rigid_bodies if body.freedom.guided]
         return {number: len(self.boundary) + place for place, number in enumerate(guided)}
 
@@ -293,12 +292,12 @@ class Scene(eqx.Module):
     @property
     def moving_mirrors(self) -> dict[int, Motion]:
         """The motions of mirrors that move, by the axis across which they are."""
-        return {found.axis: found.motion for found in self.mirrors if found.motion is not None}
+        return {mirror.axis: mirror.motion for mirror in self.mirrors if mirror.motion is not None}
 
     @property
     def mirrors(self) -> tuple[MirrorPlace, ...]:
         """Where the mirrors of the boundaries are."""
-        return tuple(found for boundary in self.boundary if (found := boundary.mirror()) is not None)
+        return tuple(place for boundary in self.boundary if (place := boundary.mirror()) is not None)
 
     def shift(self, t: Scalar) -> Float[Array, "d"] | None:
         """How far the grid has moved at time t [m], shape (d,), with planes that move, and with the derivative by the
@@ -370,5 +369,5 @@ def attach(scene: Scene, particles: Particles) -> Scene:
     if not scene.loads:
         return scene
     with jax.ensure_compile_time_eval():  # what is known stays so within a transformation
-        loads = tuple(eqx.tree_at(lambda own: own.on, load, load.on.attached(particles)) for load in scene.loads)
+        loads = tuple(eqx.tree_at(lambda load: load.on, load, load.on.attached(particles)) for load in scene.loads)
     return eqx.tree_at(lambda s: s.loads, scene, loads)

@@ -46,7 +46,7 @@ class Support(eqx.Module):
         return 0.0 if self.damping is None else (self.damping * self.points.displacement(v) ** 2).sum()
 
     def mirrored(self, mirror: Mirror) -> "Support":
-        """The same on nodes that are folded at mirrors."""
+        """The support on nodes that are folded at mirrors."""
         return eqx.tree_at(lambda s: s.points.mirror, self, mirror)
 
 
@@ -67,7 +67,7 @@ class SupportStiffness(eqx.Module):
 
 
 def stiffness_of(supports: tuple[Support, ...], rate: Array | float = 0.0) -> tuple[SupportStiffness, ...]:
-    """Of each support, k + r c, with r [1/s] the rate of damping."""
+    """The stiffness k + r c of each support, with r [1/s] the rate of damping."""
     return tuple(
         SupportStiffness(s.points, s.stiffness if s.damping is None else s.stiffness + rate * s.damping)
         for s in supports

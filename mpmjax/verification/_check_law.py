@@ -22,7 +22,7 @@ _CHECKED = (
     "the derivative of tangent by F and the law's parameters",
     "principal_tangent",
 )
-"""What is checked, in this order; the last only for a law that overrides it."""
+"""The checks, in this order; the last only for a law that overrides it."""
 
 
 def check_law(law: AbstractLaw, *, dim: int = 3, F: Any = None, rtol: float = 1e-9) -> None:
@@ -51,14 +51,14 @@ def check_law(law: AbstractLaw, *, dim: int = 3, F: Any = None, rtol: float = 1e
             difference. No deformation that the law admits.
     """
     with jax.enable_x64(True):
-        found = jnp.asarray(_deformations(dim) if F is None else np.asarray(F, float))
+        gradients = jnp.asarray(_deformations(dim) if F is None else np.asarray(F, float))
         require(
-            found.ndim == 3 and found.shape[1:] == (dim, dim),
-            f"check_law's F must have shape (p, {dim}, {dim}), got {found.shape}.",
+            gradients.ndim == 3 and gradients.shape[1:] == (dim, dim),
+            f"check_law's F must have shape (p, {dim}, {dim}), got {gradients.shape}.",
         )
-        place = jnp.moveaxis(found, 0, -1)
-        own: AbstractLaw = canonical(law, place.dtype)
-        elastic = own.elastic(own.initial_history(own.kinematics.of(place)))
+        place = jnp.moveaxis(gradients, 0, -1)
+        typed: AbstractLaw = canonical(law, place.dtype)
+        elastic = typed.elastic(typed.initial_history(typed.kinematics.of(place)))
         of_gradient: Any = elastic.of_gradient()
         faults = eqx.filter_jit(_faults)(of_gradient, place)
     admitted, told = np.asarray(faults[0]), type(elastic).__name__
@@ -66,7 +66,7 @@ def check_law(law: AbstractLaw, *, dim: int = 3, F: Any = None, rtol: float = 1e
     for what, wrong in zip(_CHECKED, faults[1], strict=False):
         wrong = np.where(admitted, np.asarray(wrong), 0)
         worst = int(np.argmax(np.where(np.isnan(wrong), np.inf, wrong)))
-        where = f"at F = {np.array2string(np.asarray(found[worst]), precision=6, separator=', ')}".replace("\n", "")
+        where = f"at F = {np.array2string(np.asarray(gradients[worst]), precision=6, separator=', ')}".replace("\n", "")
         require(not np.isnan(wrong[worst]), f"{told}: {what} is not finite {where}.")
         require(wrong[worst] <= rtol, f"{told}: {what} is off by {wrong[worst]:.2g} of its size {where}.")
 

@@ -70,10 +70,12 @@ def render(
     require(path.suffix in suffixes, f"A picture's name must end in one of {', '.join(suffixes)}, got {path.name!r}.")
     colour = None if colour == "none" else colour
     require(len(run) > 0, "The run has no frames to draw: pass save_every to simulate.")
-    known = COLOURS | {
+    quantities = COLOURS | {
         name: (name.replace("_", " "), partial(_remembered, name)) for name, *_ in history_arrays(run.final)
     }
-    require(colour is None or colour in known, f"colour must be one of {', '.join(known)}, none, got {colour!r}.")
+    require(
+        colour is None or colour in quantities, f"colour must be one of {', '.join(quantities)}, none, got {colour!r}."
+    )
     require(run.final.count > 0, "The run has no particles to draw.")
     require(
         frame is None or -len(run) <= frame < len(run), f"The run has {len(run)} frames, there is no frame {frame}."
@@ -86,7 +88,7 @@ def render(
     require_between("view's elevation [degrees]", view[1], 0.1, 90)
     still = path.suffix != ".gif"
     shown = [len(run) - 1 if frame is None else frame % len(run)] if still else range(len(run))
-    label, value = ("", lambda run, q: np.full(q.count, np.nan)) if colour is None else known[colour]
+    label, value = ("", lambda run, q: np.full(q.count, np.nan)) if colour is None else quantities[colour]
     values = np.stack([np.asarray(value(run, run.frame(i))) for i in shown])
     from matplotlib import (  # here, since it takes a second that only pictures should pay
         animation,
@@ -119,8 +121,8 @@ def _remembered(name: str, run: Any, particles: Particles) -> np.ndarray:
     """The history variable of that name; NaN at particles whose law has none."""
     del run
     values = np.full(particles.count, np.nan)
-    for known, rows, leaf in history_arrays(particles):
-        if known == name:
+    for remembered, rows, leaf in history_arrays(particles):
+        if remembered == name:
             values[rows] = leaf
     return values
 
