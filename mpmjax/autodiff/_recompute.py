@@ -17,15 +17,11 @@ def recomputed(step: Callable[..., Any], *, sums: bool = False) -> Callable[...,
     return jax.checkpoint(step, prevent_cse=False, policy=keep)
 
 
-def kept(tree: Any) -> Any:
+def kept(tree: Any, name: str = _KEPT) -> Any:
     """The tree, its arrays not computed again in the steps of `recomputed`: the results of iterations."""
-    return _named(tree, _KEPT)
+    return jax.tree.map(lambda leaf: checkpoint_name(leaf, name) if isinstance(leaf, jax.Array) else leaf, tree)
 
 
 def kept_sums(tree: Any) -> Any:
     """The tree, its arrays sums over stencils, which may be stored."""
-    return _named(tree, _SUMS)
-
-
-def _named(tree: Any, name: str) -> Any:
-    return jax.tree.map(lambda leaf: checkpoint_name(leaf, name) if isinstance(leaf, jax.Array) else leaf, tree)
+    return kept(tree, _SUMS)

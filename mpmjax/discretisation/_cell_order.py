@@ -13,7 +13,7 @@ from jax.interpreters import ad
 from mpmjax._types import Array, Bool, Float, Int, ParticleVector, components, particle_first
 from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._kernel import BSpline
-from mpmjax.discretisation._stencil import index_factors
+from mpmjax.discretisation._stencil import first_nodes, index_factors
 from mpmjax.native import native_primitive
 
 Order = Int[Array, "p"]
@@ -23,7 +23,8 @@ Order = Int[Array, "p"]
 def cells_of(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleVector) -> Int[Array, "p"]:
     """The C-order index of the first node of each particle's stencil, shape (p,): particles with the same one share all
     nodes. Without meaning outside of the window."""
-    return index_factors(kernel, grid, window, components(x) / grid.spacing)[:, 0].sum(axis=0, dtype=jnp.int32)
+    first = first_nodes(kernel, window, components(x) / grid.spacing)
+    return index_factors(kernel, grid, first)[:, 0].sum(axis=0, dtype=jnp.int32)
 
 
 def by_cell(cells: Int[Array, "p"]) -> Order:

@@ -143,14 +143,13 @@ def make_stencil(
         offset = jnp.arange(kernel.order + 1, dtype=f.dtype)[:, None] - f[:, None]
         least_squares = weights * offset / (variance * dx)
     derivatives = gradient.derivatives(spline, least_squares)
-    factors = index_factors(kernel, grid, window, xi)
+    first = first_nodes(kernel, window, xi)
+    factors = index_factors(kernel, grid, first)
     if layer is not None:
         factors = factors.at[0].add(jnp.asarray(layer * math.prod(grid.shape), jnp.int32))
+        first = first.at[0].add(jnp.asarray(layer * grid.shape[0], jnp.int32))
     places = None
     if (derivatives is spline or derivatives is least_squares) and not any(grid.periodic):
-        first = first_nodes(kernel, window, xi)
-        if layer is not None:
-            first = first.at[0].add(jnp.asarray(layer * grid.shape[0], jnp.int32))
         places = Places(
             first=first,
             strides=jnp.asarray(_strides(grid)),
@@ -196,9 +195,9 @@ def _strides(grid: Grid) -> Int[np.ndarray, "d"]:
     return np.array([math.prod(grid.shape[a + 1 :]) for a in range(grid.dim)], np.int32)
 
 
-def index_factors(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Array) -> Int[Array, "d s p"]:
-    """Term of the C-order node index from each axis, shape (d, s, p)."""
-    along = first_nodes(kernel, window, xi)[:, None] + jnp.arange(kernel.order + 1, dtype=jnp.int32)[:, None]
+def index_factors(kernel: BSpline, grid: Grid, first: Int[Array, "d p"]) -> Int[Array, "d s p"]:
+    """Term of the C-order node index from each axis, shape (d, s, p), from the `first_nodes`."""
+    along = first[:, None] + jnp.arange(kernel.order + 1, dtype=jnp.int32)[:, None]
     if any(grid.periodic):  # by whole numbers in the code: XLA divides by those in an array one by one
         axes = zip(along, grid.shape, grid.periodic, strict=True)
         along = jnp.stack([index % period if wraps else index for index, period, wraps in axes])

@@ -1,12 +1,8 @@
 """Descriptions: stencils at the current or at the reference positions."""
 
-from abc import abstractmethod
 from typing import ClassVar
 
 import equinox as eqx
-
-from mpmjax._types import ParticleVector
-from mpmjax.state._particles import Particles
 
 
 class AbstractDescription(eqx.Module):
@@ -18,18 +14,11 @@ class AbstractDescription(eqx.Module):
     total: ClassVar[bool]
     """Whether gradients are with respect to the reference positions X, and stencils are computed once."""
 
-    @abstractmethod
-    def anchor(self, particles: Particles) -> ParticleVector:
-        """The positions at which stencils stand [m], shape (p, d)."""
-
 
 class UpdatedLagrangian(AbstractDescription):
     """Stencils at the current positions, h_ip = F_pᵀ ∇_x w_ip: for anything that moves, meets or separates."""
 
     total: ClassVar[bool] = False
-
-    def anchor(self, particles: Particles) -> ParticleVector:
-        return particles.x
 
 
 class TotalLagrangian(AbstractDescription):
@@ -40,7 +29,3 @@ class TotalLagrangian(AbstractDescription):
     """
 
     total: ClassVar[bool] = True
-
-    def anchor(self, particles: Particles) -> ParticleVector:
-        """X, or x of particles that are not prepared."""
-        return particles.x if particles.X is None else particles.X

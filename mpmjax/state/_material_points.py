@@ -1,17 +1,15 @@
 """The particles of one material in a step: their law, their deformation, and how the grid's motion changes it."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Bool, Deformation, Float, Matrix, Scalar, particle_first
-from mpmjax.material import AbstractElastic, AbstractLaw, AbstractTangent, Viscosity
+from mpmjax._types import Array, Bool, Deformation, Float, Matrix
+from mpmjax.material import AbstractElastic, AbstractTangent, Viscosity
 from mpmjax.native import stored
 from mpmjax.state._averaged_volume import VolumeAverage, averaged_deformation
-from mpmjax.state._particles import Group, Particles, state_of, with_state
 
 
 class MaterialPoints(eqx.Module):
@@ -128,42 +126,3 @@ class MaterialPoints(eqx.Module):
 def _stress(law: AbstractElastic, F: Deformation) -> Deformation:
     """The stress of a law, compiled as one function so that it is traced once."""
     return law.stress(F)
-
-
-def material_points(
-    laws: tuple[AbstractLaw, ...],
-    particles: Particles,
-    *,
-    total: bool,
-    average: Callable[[int, Group], VolumeAverage | None] = lambda number, group: None,
-) -> tuple[MaterialPoints, ...]:
-    """The materials of prepared particles.
-
-    Args:
-        laws: their laws.
-        particles: the particles.
-        total: whether gradients are with respect to the reference positions.
-        average: the average of the volumes of a material, by its number and its particles; None without. Default: none.
-    """
-    return tuple(
-        MaterialPoints(
-            law=law.elastic(group.history),
-            volume=particles.volume[slice(*group.rows)],
-            deformation=group.deformation(),
-            total=total,
-            rows=group.rows,
-            viscosity=law.viscous_part(),
-            average=average(number, group),
-        )
-        for number, (law, group) in enumerate(zip(laws, particles.groups, strict=True))
-    )
-
-
-def return_map(laws: tuple[AbstractLaw, ...], particles: Particles, dt: Scalar) -> Particles:
-    """The particles after the return maps of laws that yield: from the trial deformation to one that the law
-    admits after a step dt [s]."""
-    groups = zip(laws, particles.groups, strict=True)
-    mapped = [law.return_map(group.deformation(), group.history, dt) for law, group in groups]
-    deformations = tuple(particle_first(deformation) for deformation, _ in mapped)
-    state = replace(state_of(particles), deformations=deformations, histories=tuple(history for _, history in mapped))
-    return with_state(particles, state)

@@ -1,5 +1,6 @@
 """The scene: everything that a step needs and does not change."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -7,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Float, Int, NodeVector, Point, Scalar
+from mpmjax._types import Array, Float, Int, NodeVector, Point, Scalar, particle_first
 from mpmjax.boundary import AbstractBoundary, MirrorPlace, carried_by, mirror, refuse_contact
 from mpmjax.checks import (
     checked,
@@ -30,12 +31,12 @@ from mpmjax.discretisation import (
 )
 from mpmjax.geometry import Motion
 from mpmjax.material import AbstractLaw, Freedom
-from mpmjax.state._averaged_volume import AveragedVolume, VolumeAverage, volume_average
+from mpmjax.state._averaged_volume import AveragedVolume, volume_average
 from mpmjax.state._bodies import Bodies
 from mpmjax.state._description import AbstractDescription, UpdatedLagrangian
 from mpmjax.state._loads import AbstractBodyForce, AbstractLoad
-from mpmjax.state._material_points import MaterialPoints, material_points, return_map
-from mpmjax.state._particles import Group, Particles
+from mpmjax.state._material_points import MaterialPoints
+from mpmjax.state._particles import Particles, State, with_state
 
 
 class RigidMaterial(NamedTuple):
@@ -244,23 +245,40 @@ class Scene(eqx.Module):
 
     def material_points(self, particles: Particles, t: Scalar = 0.0) -> tuple[MaterialPoints, ...]:
         """The materials of prepared particles at time t [s], with the elastic laws in force."""
-        volume = self.volume
-        if volume is None:
-            return material_points(self.laws, particles, total=self.total)
+        materials = tuple(
+            MaterialPoints(
+                law=law.elastic(group.history),
+                volume=particles.volume[slice(*group.rows)],
+                deformation=group.deformation(),
+                total=self.total,
+                rows=group.rows,
+                viscosity=law.viscous_part(),
+            )
+            for law, group in zip(self.laws, particles.groups, strict=True)
+        )
+        return materials if self.volume is None else self._averaged(self.volume, materials, particles, t)
+
+    def _averaged(
+        self, volume: AveragedVolume, materials: tuple[MaterialPoints, ...], particles: Particles, t: Scalar
+    ) -> tuple[MaterialPoints, ...]:
+        """The materials, with the averages of those whose volumes are averaged."""
         grid, window, places = self.grid.with_layers(1), self.window(particles), self.on_grid(particles, t)
         images = mirror(self.boundary, grid, window).without_ties()
 
-        def average(number: int, group: Group) -> VolumeAverage | None:
-            rows = slice(*group.rows)
-            if not volume.covers(number):
-                return None
-            return volume_average(grid, window, places[rows], particles.volume[rows], images)
+        def averaged(points: MaterialPoints) -> MaterialPoints:
+            at = places[slice(*points.rows)]
+            return replace(points, average=volume_average(grid, window, at, points.volume, images))
 
-        return material_points(self.laws, particles, total=self.total, average=average)
+        return tuple(averaged(own) if volume.covers(number) else own for number, own in enumerate(materials))
 
     def return_map(self, particles: Particles, dt: Scalar) -> Particles:
-        """The particles after the return maps of laws that yield, at the end of a step dt [s] (see `return_map`)."""
-        return return_map(self.laws, particles, dt)
+        """The particles after the return maps of laws that yield: from the trial deformation to one that the law
+        admits after a step dt [s]."""
+        groups = zip(self.laws, particles.groups, strict=True)
+        mapped = [law.return_map(group.deformation(), group.history, dt) for law, group in groups]
+        deformations = tuple(particle_first(deformation) for deformation, _ in mapped)
+        histories = tuple(history for _, history in mapped)
+        return with_state(particles, State(particles.x, particles.v, particles.C, deformations, histories))
 
     @property
     def collider_count(self) -> int:
@@ -285,9 +303,12 @@ class Scene(eqx.Module):
     def shift(self, t: Scalar) -> Float[Array, "d"] | None:
         """How far the grid has moved at time t [m], shape (d,), with planes that move, and with the derivative by the
         places of all mirrored ones (see `carried_by`); None where it rests."""
+        mirrors = self.mirrors
+        if not mirrors:
+            return None
         along = {} if self.total else {axis: motion.at(t)[axis] for axis, motion in self.moving_mirrors.items()}
         for axis in range(self.grid.dim):
-            places = [found.position for found in self.mirrors if found.axis == axis]
+            places = [mirror.position for mirror in mirrors if mirror.axis == axis]
             if is_traced(places):
                 along[axis] = along.get(axis, 0) + carried_by(*places)
         if not along:
@@ -305,8 +326,9 @@ class Scene(eqx.Module):
         return self.grid.window(self.anchor(particles))
 
     def anchor(self, particles: Particles) -> Array:
-        """The positions at which stencils stand [m], shape (p, d): x, or X in the total description."""
-        return self.description.anchor(particles)
+        """The positions at which stencils stand [m], shape (p, d): x, or X in the total description (x of particles
+        that are not prepared)."""
+        return particles.X if self.total and particles.X is not None else particles.x
 
     def on_grid(self, particles: Particles, t: Scalar) -> Array:
         """The `anchor` relative to the grid at time t [m], shape (p, d)."""
@@ -315,7 +337,9 @@ class Scene(eqx.Module):
 
     def stencil(self, particles: Particles, t: Scalar = 0.0) -> Stencil:
         """The particles' stencil at time t, with the moving-least-squares gradient where the transfer needs it."""
-        window = self.window(particles)
+        window, layer = self.window(particles), None
+        if self.bodies is not None:  # each body has a layer of nodes of its own
+            layer = np.repeat(self.bodies.numbers(len(self.laws)), particles.sizes).astype(np.int32)
         stencil = make_stencil(
             self.kernel,
             self.gradient,
@@ -323,18 +347,12 @@ class Scene(eqx.Module):
             window,
             self.on_grid(particles, t),
             affine=self.transfer.affine,
-            layer=self.layer(particles),
+            layer=layer,
         )
         if self.kernel.order > 1:
             return stencil
         images = mirror(self.boundary, self.grid, window).without_ties()
         return without_empty(stencil, particles.mass, lambda m: images.unfold_scalar(images.fold_scalar(m)), self.grid)
-
-    def layer(self, particles: Particles) -> Int[np.ndarray, "p"] | None:
-        """The number of each particle's body, shape (p,); None without `bodies`."""
-        if self.bodies is None:
-            return None
-        return np.repeat(self.bodies.numbers(len(self.laws)), particles.sizes).astype(np.int32)
 
 
 @checked

@@ -336,7 +336,7 @@ def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes) -> Nodes:
         rigid = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images, nodes.dt)
         return nodes.folded(images).tied(rigid)
     if moving is None:
-        return nodes.folded(images)
+        return nodes.folded(images) if images.images else nodes
     # at rest with the mirrors: the velocity less what they add, which is put back
     added = jnp.where(nodes.conditions.fixed, nodes.conditions.velocity, 0)
     added = jnp.where(moving.beyond, moving.velocity, added)

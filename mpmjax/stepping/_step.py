@@ -120,8 +120,8 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
     is the trial F_E of `Scene.return_map`."""
     potential, dt, motion = nodes.potential, nodes.dt, new.motion
     before = new.before(nodes) if scene.transfer.needs_change else None
-    if nodes.mirror.images:
-        before, motion = jax.tree.map(nodes.mirror.unfold, (before, motion))
+    if potential.mirror.images:
+        before, motion = jax.tree.map(potential.mirror.unfold, (before, motion))
     gathered = g2p(
         scene.transfer,
         potential.stencil,
