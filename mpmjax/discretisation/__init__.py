@@ -7,13 +7,13 @@ from mpmjax.discretisation._cell_order import (
     cells_of as cells_of,
     rearranged as rearranged,
 )
-from mpmjax.discretisation._gradient import (
+from mpmjax.discretisation._grid import Grid as Grid
+from mpmjax.discretisation._kernel import (
     AbstractGradient as AbstractGradient,
+    BSpline as BSpline,
     MLSGradient as MLSGradient,
     SplineGradient as SplineGradient,
 )
-from mpmjax.discretisation._grid import Grid as Grid
-from mpmjax.discretisation._kernel import BSpline as BSpline
 from mpmjax.discretisation._placed import bound as bound, define_placed as define_placed
 from mpmjax.discretisation._resistance import resist as resist
 from mpmjax.discretisation._stencil import (

@@ -11,9 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Indices, Int, ParticleVector, components
-from mpmjax.discretisation._gradient import AbstractGradient
 from mpmjax.discretisation._grid import Grid
-from mpmjax.discretisation._kernel import BSpline
+from mpmjax.discretisation._kernel import AbstractGradient, BSpline
 from mpmjax.native import stored
 
 

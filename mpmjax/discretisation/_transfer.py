@@ -243,23 +243,19 @@ def g2p(
         change = after - before
     fields = [field for field in (after, mean, change) if field is not None]
     values, gradients = stored(kept_sums(gather(stencil, jnp.concatenate(fields, axis=1))))
-    values, gradients = jnp.split(values, len(fields)), _split_gradients(gradients, len(fields))
+    # one field after the other, each of shape (d, p), and its gradient (d, d, p), the derivative's direction last
+    values, gradients = jnp.split(values, len(fields)), jnp.split(jnp.swapaxes(gradients, 0, 1), len(fields))
     affine: list[Matrix | None] = [None] * len(fields)
     if transfer.affine and stencil.mls_weight_derivatives is None:
         affine = [*gradients]
     elif transfer.affine:
         ends = [field for field in (after, change) if field is not None]
         _, slopes = stored(kept_sums(gather(stencil.least_squares, jnp.concatenate(ends, axis=1))))
-        split = _split_gradients(slopes, len(ends))
-        affine[0] = split[0]
+        slopes = jnp.split(jnp.swapaxes(slopes, 0, 1), len(ends))
+        affine[0] = slopes[0]
         if change is not None:
-            affine[-1] = split[-1]
+            affine[-1] = slopes[-1]
     seen = [Gathered(*parts) for parts in zip(values, gradients, affine, strict=True)]
     new, carrier, changed = seen[0], seen[0 if mean is None else 1], None if change is None else seen[-1]
     C = transfer.affine_velocity(C, new, changed) if transfer.affine else new.gradient if keep_gradient else None
     return ParticleMotion(carrier.value, transfer.velocity(v, new, changed), C, carrier.gradient)
-
-
-def _split_gradients(gradients: Float[Array, "d c p"], fields: int) -> list[Matrix]:
-    """The velocity gradient of each field, shape (d, d, p), from the stacked gradients of all fields."""
-    return [jnp.swapaxes(g, 0, 1) for g in jnp.split(gradients, fields, axis=1)]

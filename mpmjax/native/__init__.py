@@ -5,6 +5,6 @@ from mpmjax.native._primitive import (
     differentiable as differentiable,
     members as members,
     native_primitive as native_primitive,
+    stored as stored,
     sums_fit as sums_fit,
 )
-from mpmjax.native._stored import stored as stored

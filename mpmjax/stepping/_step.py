@@ -132,12 +132,15 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
         C=None if particles.C is None else components(particles.C),
         keep_gradient=scene.keeps_gradient,
     )
-    changes = zip(potential.current_deformation(), potential.change(gathered.gradient), strict=True)
+    grad_v = gathered.gradient
     after = State(
         x=particle_first(components(particles.x) + dt * gathered.carrier),
         v=particle_first(gathered.velocity),
         C=None if gathered.affine is None else particle_first(gathered.affine),
-        deformations=tuple(particle_first(F + dt * rate) for F, rate in changes),
+        deformations=tuple(
+            particle_first(points.deformation + dt * points.change(points.rows_of(grad_v)))
+            for points in potential.material_points
+        ),
         histories=particles.histories,
     )
     moved = with_state(particles, after)
