@@ -165,16 +165,16 @@ def _initialised(solver: lx.AbstractLinearSolver, operator: ScaledOperator, opti
         return solver.init(operator, options)
     except ValueError as error:
         if operator.is_positive_semidefinite():
-            known = "positive definite, without other structure. Take a solver of such matrices, as ConjugateResidual()"
+            kind = "positive definite, without other structure. Take a solver of such matrices, as ConjugateResidual()"
         else:
-            known = (
+            kind = (
                 "may be indefinite. Take a solver of such matrices, as ConjugateResidual(); or make it positive "
                 "definite with AnalyticHessian(projected=True), which for the adjoint_solver of Newton's method is no "
                 "way out, as its derivatives are those of the true Hessian"
             )
         raise ValueError(
             f"{_name(solver)} refuses the matrix M + χH of an implicit step: {str(error).rstrip('.')}. The matrix is "
-            f"symmetric and {known}."
+            f"symmetric and {kind}."
         ) from error
 
 

@@ -19,7 +19,7 @@ class NodeBox(eqx.Module):
     window: tuple[int, ...] = eqx.field(static=True)
     """Number of the window's nodes along each axis."""
     shape: tuple[int, ...] = eqx.field(static=True)
-    """Number of the box's."""
+    """Number of the box's nodes along each axis."""
     corner: Int[Array, "d"]
     """The box's first node along each axis."""
 
@@ -79,13 +79,13 @@ class NodalCoupling(eqx.Module):
         count, span, reach = len(self.by_distance), 4 * self.half + 1, 2 * self.half
         size = math.prod(self.shape) * count
         (i, a), (j, b) = (jnp.divmod(numbers, count) for numbers in (rows, columns))
-        known = (rows < size)[:, None] & (columns < size)
-        distance = jnp.zeros(known.shape, i.dtype)
+        inside = (rows < size)[:, None] & (columns < size)
+        distance = jnp.zeros(inside.shape, i.dtype)
         for one, other in zip(*(jnp.unravel_index(k, self.shape) for k in (i, j)), strict=True):
             apart = other - one[:, None]
-            known &= jnp.abs(apart) <= reach
+            inside &= jnp.abs(apart) <= reach
             distance = span * distance + apart + reach
-        return jnp.where(known, self.by_distance[a[:, None], b, distance, i[:, None]], 0)
+        return jnp.where(inside, self.by_distance[a[:, None], b, distance, i[:, None]], 0)
 
 
 def nodal_coupling(
@@ -130,7 +130,7 @@ def nodal_coupling(
     lattices = entries.reshape(count, period**d, d, *wide)
     scale = box.inside(1 / weight.T, half).reshape(d, *wide)
 
-    def add(found: Array, which: tuple[Array, Array]) -> tuple[Array, None]:
+    def add(total: Array, which: tuple[Array, Array]) -> tuple[Array, None]:
         number, offset = which
         one = jax.lax.dynamic_index_in_dim(lattices, number, 1, keepdims=False) * scale
 
@@ -143,10 +143,10 @@ def nodal_coupling(
         pairs = reduce(jnp.add, (one[:, None, None, k] * other[None, :, :, k] for k in range(d)))
         pairs = pairs.reshape(count, count, *(period,) * d, *box.shape)
         start = (*(jnp.zeros_like(number),) * 2, *(half + offset), *(jnp.zeros_like(number) for _ in range(d)))
-        before = jax.lax.dynamic_slice(found, start, pairs.shape)
-        return jax.lax.dynamic_update_slice(found, before + pairs, start), None
+        before = jax.lax.dynamic_slice(total, start, pairs.shape)
+        return jax.lax.dynamic_update_slice(total, before + pairs, start), None
 
     nothing = jnp.zeros((count, count, *(4 * half + 1,) * d, *box.shape), weight.dtype)
     every = jnp.arange(len(offsets)), jnp.asarray(offsets, dtype=jnp.arange(0).dtype)
-    found = jax.lax.scan(add, nothing, every)[0]
-    return NodalCoupling(found.reshape(count, count, (4 * half + 1) ** d, -1), half, box.shape)
+    total = jax.lax.scan(add, nothing, every)[0]
+    return NodalCoupling(total.reshape(count, count, (4 * half + 1) ** d, -1), half, box.shape)

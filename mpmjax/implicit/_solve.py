@@ -70,13 +70,13 @@ def _solve_jvp(primals: Any, tangents: Any) -> Any:
     if d_residual is None:  # it does not depend on what is differentiated
         d_residual = jnp.zeros_like(v)
     operator = problem.operator(v)
-    known, preconditioner = without_derivative((operator, problem.preconditioner))
-    known = known.precomputed()
-    inner = preconditioner.inner_product(known)
+    matrix, preconditioner = without_derivative((operator, problem.preconditioner))
+    matrix = matrix.precomputed()
+    inner = preconditioner.inner_product(matrix)
 
     def solve_symmetric(matvec: Any, b: tuple[NodeVector, Array]) -> tuple[NodeVector, Array]:
-        del matvec  # what JAX passes; `known`, the precomputed operator, is the same map and faster
-        solution = solve_linear(adjoint, known, b[0], inner, rtol=derivative_rtol(b[0].dtype))
+        del matvec  # the precomputed operator is the same map and faster
+        solution = solve_linear(adjoint, matrix, b[0], inner, rtol=derivative_rtol(b[0].dtype))
         solved, finite = solution.converged | solution.nearly_converged, jnp.isfinite(b[0]).all()
         residual = jnp.where(jnp.isfinite(solution.residual), solution.residual, jnp.inf)
         return jnp.where(solved, solution.value, jnp.nan), jnp.where(finite & ~solved, residual, 0)

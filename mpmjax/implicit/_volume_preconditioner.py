@@ -11,8 +11,7 @@ from mpmjax._types import Array, Float, NodeVector
 from mpmjax.boundary import Image, Mirror
 from mpmjax.checks import as_plain, require, require_fields
 from mpmjax.discretisation import Stencil, gather, scatter
-from mpmjax.implicit._dissected_factor import DissectedFactor, dissected_factor
-from mpmjax.implicit._dissection import Dissection
+from mpmjax.implicit._dissection import DissectedFactor, Dissection, dissected_factor
 from mpmjax.implicit._hessian_action import AveragedStiffness, ParticleStiffness
 from mpmjax.implicit._inner_product import AbstractInnerProduct, DiagonalInnerProduct
 from mpmjax.implicit._nodal_coupling import NodeBox, nodal_coupling
