@@ -115,11 +115,11 @@ _SETTINGS = ("level", "starts", "fraction", "horizons", "refine")
 _KEYS = {*_TABLES, *_SETTINGS, "t1", "optimiser"}
 
 
-def _require_keys(table: dict[str, Any], where: str, known: set[str]) -> None:
+def _require_keys(table: dict[str, Any], where: str, keys: set[str]) -> None:
     for key in table:
-        close = difflib.get_close_matches(key[:60], known, 1)
+        close = difflib.get_close_matches(key[:60], keys, 1)
         hint = f", did you mean {close[0]!r}?" if close else "."
-        require(key in known, f"{where} has the unknown key {key[:60]!r}{hint} Known are {', '.join(sorted(known))}.")
+        require(key in keys, f"{where} has the unknown key {key[:60]!r}{hint} Known are {', '.join(sorted(keys))}.")
 
 
 def _settings(table: dict[str, Any]) -> dict[str, Any]:
