@@ -183,7 +183,7 @@ class SeparatingCollider(AbstractCollider):
         return replace(no_conditions(nodes), colliders=touched, holds=True, moves=self.motion is not None)
 
     def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, force_time: Scalar) -> tuple[Surface, ...]:
-        """That of the body; none where the distance has no slope, as a sampled one may have none."""
+        """Unit normal of the body; zero where the distance gradient vanishes, as a sampled one may."""
         motion = canonical(still(self.dim), x.dtype) if self.motion is None else self.motion
         place = motion.origin(x, force_time)
         distance, slope = jax.vjp(self.shape.distance, place)

@@ -71,7 +71,7 @@ class ColliderConditions(eqx.Module):
         )
 
     def after(self, time: Scalar, velocity: NodeVector) -> "ColliderConditions":
-        """The same conditions with nodes and pivots moved on by a time [s], the nodes at a velocity [m/s], shape (n,
+        """The conditions with nodes and pivots moved on by a time [s], the nodes at a velocity [m/s], shape (n,
         d)."""
         moved = self.position + time * velocity, self.pivots + time * self.pivot_velocity
         return eqx.tree_at(lambda c: (c.position, c.pivots), self, moved)

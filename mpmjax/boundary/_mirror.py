@@ -27,7 +27,7 @@ class MirrorPlace(NamedTuple):
     axis: int
     """The direction of its normal."""
     position: Scalar
-    """Its coordinate on the lattice of nodes [m]."""
+    """Coordinate on the lattice of nodes [m]."""
     motion: Motion | None
     """How it moves; None if it rests."""
 
@@ -88,7 +88,7 @@ class Image(eqx.Module):
         return copied + jnp.where(self.along(self.odd <= 0)[:, None] & normal, field, 0)
 
     def at_rest(self) -> "Image":
-        """The same of a mirror that does not move."""
+        """The image of a mirror that does not move."""
         return replace(self, moving=False)
 
     def within(self, held: Bool[Array, "n"]) -> "Image":
@@ -133,7 +133,7 @@ class Tie(eqx.Module):
         return jnp.where(self.tied[:, None], field[jnp.argmax(self.tied)], field)
 
     def at_rest(self) -> "Tie":
-        """The same map: a tie has no motion of its own."""
+        """The map as it is: a tie has no motion of its own."""
         return self
 
 
@@ -188,12 +188,12 @@ class RigidImage(eqx.Module):
         return there.any() & (jnp.arange(self.arms.shape[1]) == plane.axis)
 
     def at_rest(self) -> "RigidImage":
-        """The same map: it has no motion of its own."""
+        """The map as it is: it has no motion of its own."""
         return self
 
 
 class MirrorMotion(eqx.Module):
-    """What mirrors that move add to the velocity of the nodes beyond them (see `Image.moving`)."""
+    """The velocity that moving mirrors add to the nodes beyond them (see `Image.moving`)."""
 
     beyond: Mask
     """The normal components of the nodes beyond such a mirror, shape (n, d)."""

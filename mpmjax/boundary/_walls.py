@@ -60,7 +60,7 @@ class AbstractBox(AbstractBoundary):
         start, end = start - self.displacement(t), end - self.displacement(t + dt)
 
         def beyond(inward: int, corner: Corner) -> list[Array]:
-            """Of each axis, along the inward normal of its wall."""
+            """Whether particles passed the wall of each axis, along its inward normal."""
             walls = inward * jnp.asarray(corner, end.dtype)
             place = walls, self.deepest(walls, spacing, reach)
             return [crossed(*along, spacing) for along in zip(inward * start.T, inward * end.T, *place, strict=True)]

@@ -24,7 +24,7 @@ class Level(NamedTuple):
     own: np.ndarray
     """The numbers that are eliminated, shape (fronts, s)."""
     border: np.ndarray
-    """Those that are coupled with them and with what was eliminated before, and come after, shape (fronts, b)."""
+    """The unknowns that are coupled with them and with what was eliminated before, and come after, shape (fronts, b)."""
     places: np.ndarray | None
     """Where own and border stand in the borders of fronts 2k and 2k + 1 of the level before, b of that level where they
     are not there, shape (fronts, 2, s + b). None at the first level."""
@@ -113,7 +113,7 @@ def dissected_factor(dissection: Dissection, entries: Callable[[Array, Array], F
 def _assembled(
     size: int, level: Level, entries: Callable[[Array, Array], Array], left: Array | None
 ) -> tuple[Float[Array, "f m o"], Array]:
-    """What is left of S in the columns of each front, whose numbers past the last are those of the identity, and what
+    """The rest of S in the columns of each front, whose numbers past the last are those of the identity, and what
     the fronts before take from the border, shape (f, b, b), or a zero.
 
     Args:

@@ -17,7 +17,7 @@ class AbstractPreconditioner(eqx.Module):
     """
 
     advice: ClassVar[str | None] = None
-    """What to do where solves do not converge, as words that follow "or"; None if nothing better is known."""
+    """The remedy where solves do not converge, as words that follow "or"; None if nothing better is known."""
 
     @abc.abstractmethod
     def inner_product(self, operator: ImplicitOperator) -> AbstractInnerProduct:

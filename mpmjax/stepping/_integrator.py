@@ -128,7 +128,7 @@ class AbstractIntegrator(eqx.Module):
         return self
 
     def unconverged_advice(self) -> tuple[str, ...]:
-        """What to do about a solve that does not converge, besides a smaller step and more iterations: imperative
+        """The remedy for a solve that does not converge, besides a smaller step and more iterations: imperative
         clauses that start in lower case. Default: none."""
         return ()
 

@@ -96,7 +96,7 @@ class TRBDF2(AbstractImplicitIntegrator):
         return None if later is None else nodes.dt * self.weights()[1] * nodes.force + later
 
     def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
-        """Those at γΔt and Δt."""
+        """The stages at γΔt and Δt."""
         _, _, q1, q2 = self.weights()
         inner = motion.carrier if motion.inner is None else motion.inner
         return (q1, nodes.dt * inner), (q2, nodes.dt * motion.carrier)
