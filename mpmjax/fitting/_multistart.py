@@ -283,7 +283,7 @@ def _searched_on(
 
 
 def _teller(progress: Callable[[str], None] | None, what: str) -> Callable[[int, int], None]:
-    """Says how many are done whenever there are more."""
+    """Progress that tells how many are done whenever there are more."""
     told = 0
 
     def say(done: int, count: int) -> None:

@@ -34,7 +34,7 @@ class AbstractObservation(eqx.Module):
     """The misfit, in standard deviations, beyond which squares grow but linearly (pseudo-Huber), so that outliers count
     little; None for squares throughout."""
     name: eqx.AbstractVar[str]
-    """Its name in tables and pictures."""
+    """Name in tables and pictures."""
 
     @abc.abstractmethod
     def observe(self, scene: Scene, particles: Particles) -> Any:
