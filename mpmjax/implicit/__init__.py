@@ -1,8 +1,15 @@
 """The elastic potential, its Hessian, and the nodal problems of the implicit updates and their solution."""
 
 from mpmjax.implicit._conjugate_residual import ConjugateResidual
-from mpmjax.implicit._hessian import AbstractHessian, AnalyticHessian, JvpHessian
-from mpmjax.implicit._hessian_action import AbstractHessianAction, ParticleStiffness, TangentAction, damped
+from mpmjax.implicit._hessian import (
+    AbstractHessian,
+    AbstractHessianAction,
+    AnalyticHessian,
+    JvpHessian,
+    ParticleStiffness,
+    TangentAction,
+    damped,
+)
 from mpmjax.implicit._inner_product import AbstractInnerProduct, DiagonalInnerProduct
 from mpmjax.implicit._linear_solve import AbstractInnerProductSolver, require_solver
 from mpmjax.implicit._newton import Newton

@@ -1,23 +1,25 @@
 """The preconditioner of averaged volumes."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Float, NodeVector
-from mpmjax.boundary import Image, Mirror
+from mpmjax._types import Array, Float, NodeVector, Scalar
 from mpmjax.checks import as_plain, require, require_fields
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.implicit._dissection import DissectedFactor, Dissection, dissected_factor
-from mpmjax.implicit._hessian_action import AveragedStiffness, ParticleStiffness
+from mpmjax.implicit._hessian import ParticleStiffness
 from mpmjax.implicit._inner_product import AbstractInnerProduct, DiagonalInnerProduct
 from mpmjax.implicit._nodal_coupling import NodeBox, nodal_coupling
 from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._preconditioner import AbstractPreconditioner, DiagonalPreconditioner
 from mpmjax.implicit._projection import Projection
+from mpmjax.potential import Image, Mirror
+from mpmjax.state import AveragedStiffness, VolumeAverage
 
 _STIFFEST = 0.3  # of C s, times √ε: where S⁻¹ is known to ε C s, P⁻¹ − P⁻¹Bᵀ S⁻¹ B P⁻¹ keeps 1/(C s) of P⁻¹
 
@@ -64,18 +66,21 @@ class VolumePreconditioner(AbstractPreconditioner):
         operator = operator.precomputed()
         diagonal, stiffness = DiagonalPreconditioner().inner_product(operator), operator.hessian
         assert isinstance(stiffness, ParticleStiffness)
-        if not stiffness.averaged or not isinstance(diagonal, DiagonalInnerProduct):
+        rest = tuple(part for part in stiffness.others if not isinstance(part, AveragedStiffness))
+        averaged = tuple(part for part in stiffness.others if isinstance(part, AveragedStiffness))
+        if not averaged or not isinstance(diagonal, DiagonalInnerProduct):
             return diagonal
-        half = _half(stiffness)
+        half = _half(stiffness, averaged[0].average)
         if half is None:
             return diagonal
-        dissection = Dissection(self._shape(stiffness.averaged[0].average.shape), 2 * half, len(stiffness.averaged))
+        dissection = Dissection(self._shape(averaged[0].average.shape), 2 * half, len(averaged))
         if dissection.entries > self.largest:
             return diagonal
-        own = eqx.tree_at(lambda h: h.averaged, stiffness, ())
+        own = replace(stiffness, others=rest)
         mass = operator.nodal_mass()
         weight = operator.projection.commuting_weight(mass + operator.factor * own.diagonal(mass))
-        return _inner_product(operator, stiffness, weight, dissection, diagonal)
+        divergence = _Divergence(stiffness.stencil, stiffness.mirror, operator.projection, averaged)
+        return _inner_product(operator.factor, divergence, weight, dissection, diagonal)
 
     def _shape(self, window: tuple[int, ...]) -> tuple[int, ...]:
         """Number of the box's nodes along each axis."""
@@ -156,9 +161,8 @@ class VolumeInnerProduct(AbstractInnerProduct):
         return self.solve_factor(v)
 
 
-def _half(stiffness: ParticleStiffness) -> int | None:
+def _half(stiffness: ParticleStiffness, average: VolumeAverage) -> int | None:
     """How many nodes away B sees along an axis; None where that is no box of nodes."""
-    average = stiffness.averaged[0].average
     if any(average.periodic) or any(not isinstance(image, Image) for image in stiffness.mirror.images):
         return None
     support = stiffness.stencil.weights.shape[1]
@@ -166,21 +170,21 @@ def _half(stiffness: ParticleStiffness) -> int | None:
 
 
 def _inner_product(
-    operator: ImplicitOperator,
-    stiffness: ParticleStiffness,
+    factor: Scalar,
+    divergence: _Divergence,
     weight: NodeVector,
     dissection: Dissection,
     diagonal: DiagonalInnerProduct,
 ) -> VolumeInnerProduct:
-    divergence = _Divergence(stiffness.stencil, stiffness.mirror, operator.projection, stiffness.averaged)
-    bulk = [one.average.inverse**2 * one.average.at_nodes(one.bulk) for one in stiffness.averaged]
-    C = operator.factor * jnp.maximum(jnp.stack(bulk), 0)
-    window = stiffness.averaged[0].average.shape
+    averaged = divergence.averaged
+    bulk = [one.average.inverse**2 * one.average.at_nodes(one.bulk) for one in averaged]
+    C = factor * jnp.maximum(jnp.stack(bulk), 0)
+    window = averaged[0].average.shape
     box = NodeBox.around((C > 0).any(axis=0), window, dissection.shape)
     C = box.inside(C)
     some = C > 0
     coupling = nodal_coupling(divergence.transpose, weight, some, box, dissection.reach // 2)
     least = jnp.sqrt(jnp.finfo(C.dtype).eps) / _STIFFEST * coupling.diagonal
     softness = jnp.where(some, jnp.maximum(1 / jnp.where(some, C, 1), least), jnp.inf)
-    factor = dissected_factor(dissection, coupling.plus(jnp.where(some, softness, 1)).entries)
-    return VolumeInnerProduct(weight, divergence, softness, factor, box, diagonal)
+    dissected = dissected_factor(dissection, coupling.plus(jnp.where(some, softness, 1)).entries)
+    return VolumeInnerProduct(weight, divergence, softness, dissected, box, diagonal)
