@@ -10,8 +10,8 @@ import numpy as np
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Mask, Matrix, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
-from mpmjax.boundary._coupling import Coupling, Patch, moment
 from mpmjax.boundary._friction import share_taken
+from mpmjax.boundary._springs import Coupling, Patch, moment
 from mpmjax.discretisation import Grid
 from mpmjax.potential import Mirror
 

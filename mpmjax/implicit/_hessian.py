@@ -11,7 +11,7 @@ import numpy as np
 from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, Float, NodeVector, Scalar
 from mpmjax.checks import require_fields
-from mpmjax.discretisation import Stencil, resist, scatter
+from mpmjax.discretisation import Stencil, resist
 from mpmjax.implicit._potential import ElasticPotential, displacement_gradient, joined
 from mpmjax.material import AbstractElastic, AbstractTangent
 from mpmjax.potential import AbstractStiffness, Displacement, Forces, Mirror, added, scattered
@@ -48,9 +48,11 @@ class ParticleStiffness(AbstractHessianAction):
     stencil: Stencil
     mirror: Mirror
     positive_semidefinite: bool = eqx.field(static=True, default=False)
-    """Whether the K_p are known to be positive semi-definite."""
+    """Whether the K_p with `coupled` are known to be positive semi-definite."""
+    coupled: tuple[AbstractStiffness, ...] = ()
+    """The stiffness of materials that couples their particles."""
     others: tuple[AbstractStiffness, ...] = ()
-    """The stiffness that is not one matrix for each particle."""
+    """The stiffness of terms."""
 
     def is_positive_semidefinite(self) -> bool:
         return self.positive_semidefinite and all(part.is_positive_semidefinite() for part in self.others)
@@ -58,11 +60,11 @@ class ParticleStiffness(AbstractHessianAction):
     @property
     def alone(self) -> bool:
         """Whether H is the resistance of the particles and nothing else."""
-        return not (self.mirror.images or self.others)
+        return not (self.mirror.images or self.coupled or self.others)
 
     def __call__(self, du: NodeVector) -> NodeVector:
         moved = Displacement(self.stencil, len(du), self.mirror.unfold(du))
-        answers = [part(moved) for part in self.others]
+        answers = [part(moved) for part in self.coupled + self.others]
         # what others scatter shares the gather and the scatter of the particles; else `resist` does both in one pass
         if any(answer.value is not None or answer.slopes is not None for answer in answers):
             slopes = moved.at_particles[1]
@@ -79,8 +81,8 @@ class ParticleStiffness(AbstractHessianAction):
         """Σ_p Σ_b g_ip,b² K_p,ba,ba [N/m], shape (n, d), and the same of the others: a non-negative approximation of
         the diagonal of H.
 
-        Negative entries count as zero. It leaves out products of weight derivatives along different axes, which
-        are zero for an isotropic law at F = I, and at mirror planes those of a node with its image.
+        Negative entries of materials count as zero. It leaves out products of weight derivatives along different axes,
+        which are zero for an isotropic law at F = I, and at mirror planes those of a node with its image.
 
         Args:
             like: any node vector.
@@ -88,10 +90,11 @@ class ParticleStiffness(AbstractHessianAction):
         size, d = like.shape
         places = np.cumsum([0, *range(d * d, 1, -1)])  # of the diagonal, row by row
         own = Forces(slopes=jnp.stack([self.upper[m] for m in places]).reshape(d, d, -1))
-        nodes, value, slopes = added([own, *(part.diagonal(self.stencil, size) for part in self.others)])
-        assert slopes is not None
-        total = scatter(self.stencil.squared, value, jnp.maximum(slopes, 0), size)
-        return self.mirror.fold_scalars(total if nodes is None else total + nodes)
+        materials = added([own, *(part.diagonal(self.stencil, size) for part in self.coupled)]).slopes
+        assert materials is not None
+        shares = [part.diagonal(self.stencil, size) for part in self.others]
+        total = scattered([Forces(slopes=jnp.maximum(materials, 0)), *shares], self.stencil.squared, size)
+        return self.mirror.fold_scalars(total)
 
 
 class TangentAction(AbstractHessianAction):
@@ -124,13 +127,14 @@ class TangentAction(AbstractHessianAction):
     def precomputed(self) -> ParticleStiffness:
         potential, d = self.potential, len(self.potential.stencil.weights)
         pairs = zip(potential.material_points, self.tangents, strict=True)
-        upper, others = zip(*(points.stiffness(tangent, d) for points, tangent in pairs), strict=True)
+        upper, coupled = zip(*(points.stiffness(tangent, d) for points, tangent in pairs), strict=True)
         return ParticleStiffness(
             joined(upper),
             potential.stencil,
             potential.mirror,
             self.positive_semidefinite,
-            (*(part for parts in others for part in parts), *self._others()),
+            tuple(part for parts in coupled for part in parts),
+            self._others(),
         )
 
     def _others(self) -> tuple[AbstractStiffness, ...]:

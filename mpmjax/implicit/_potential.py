@@ -66,24 +66,20 @@ class ElasticPotential(eqx.Module):
 
     def energy(self, u: NodeVector) -> Float[Array, ""]:
         """Φ(u) [J]."""
-        moved = self.displaced(u)
-        parts = [
-            (points.volume * points.energy_density(F)).sum()
-            for points, F in zip(self.material_points, self._deformation(moved), strict=True)
-        ]
+        return self._energy(self.displaced(u))
+
+    def _energy(self, moved: Displacement) -> Float[Array, ""]:
+        pairs = zip(self.material_points, self._deformation(moved), strict=True)
+        parts = [(points.volume * points.energy_density(F)).sum() for points, F in pairs]
         return reduce(jnp.add, [*parts, *(term.energy(moved) for term in self.terms)])
 
     def admissible_energy(self, u: NodeVector) -> Float[Array, ""]:
         """Φ(u) [J], NaN if a law or term does not admit the displacement. It must not be differentiated."""
         moved = self.displaced(u)
-        parts = [
-            jnp.where(points.is_admissible(F), points.volume * points.energy_density(F), jnp.nan).sum()
-            for points, F in zip(self.material_points, self._deformation(moved), strict=True)
-        ]
-        for term in self.terms:
-            energy, admissible = term.energy(moved), term.is_admissible(moved)
-            parts.append(energy if admissible is None else jnp.where(admissible, energy, jnp.nan))
-        return reduce(jnp.add, parts)
+        pairs = zip(self.material_points, self._deformation(moved), strict=True)
+        admitted = [points.is_admissible(F).all() for points, F in pairs]
+        admitted += [defined for term in self.terms if (defined := term.is_admissible(moved)) is not None]
+        return jnp.where(reduce(jnp.logical_and, admitted), self._energy(moved), jnp.nan)
 
     def term_energy(self, u: NodeVector | None) -> Float[Array, ""]:
         """The part of Φ(u) by the terms [J]; None for u = 0."""

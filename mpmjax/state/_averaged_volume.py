@@ -254,10 +254,6 @@ class AveragedStiffness(AbstractStiffness):
         back = self.average.spread(la.double_dot(self.coupling, g) + self.bulk * mean)
         return self._of_all(self.coupling * mean + self.volumetric * back, slopes.shape[-1])
 
-    def is_positive_semidefinite(self) -> bool:
-        """Together with the particles' matrices, if the law's stress differential is."""
-        return True
-
     def diagonal(self, stencil: Stencil, size: int) -> Forces:
         """The diagonal of each particle's matrix if volumes were not averaged, without that of K [J]."""
         del size
