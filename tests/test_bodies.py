@@ -10,8 +10,9 @@ import pytest
 from helpers import assert_close, assert_files_hold, ids, thorough
 
 import mpmjax as mpm
-from mpmjax.boundary import Coupling, Patch
+from mpmjax.boundary._springs import Coupling, Patch
 from mpmjax.checks import canonical
+from mpmjax.potential import Displacement
 from mpmjax.stepping import start_nodes
 
 LAW = mpm.NeoHookean(1e4, 0.3)
@@ -94,6 +95,12 @@ def test_shares_of_the_surface_sum_to_it():
     assert 0.49 < total < 0.55  # at an edge the wider body counts too
 
 
+def a_stencil():
+    """That of two blocks."""
+    scene, particles = stacked()
+    return scene.stencil(particles)
+
+
 def a_patch(grid, rng):
     """Nodes of which some have no weight."""
     m = int(np.prod(grid.shape))
@@ -111,12 +118,20 @@ def test_the_force_of_a_coupling_is_that_of_its_energy(shape, periodic):
     own = Coupling(*(jnp.asarray(part) for part in parts), patch, (0, 2))
     u, du = (jnp.asarray(rng.normal(size=(3 * m, d))) for _ in range(2))
 
+    stencil = a_stencil()  # which couplings do not need
+
+    def moved(u):
+        return Displacement(stencil, 3 * m, u.reshape(3 * m, d))
+
+    def energy(u):
+        return own.energy(moved(u))
+
     @jax.jit
     def both(u, du):
-        force, change = jax.jvp(lambda u: own.force(u, 3 * m), (u,), (du,))
-        hessian = jax.hessian(lambda u: own.energy(u.reshape(3 * m, d)))(u.ravel())
-        found = force, own.resistance(du), own.diagonal(3 * m).reshape(-1)
-        return found, (-jax.grad(own.energy)(u), -change, jnp.diag(hessian))
+        force, change = jax.jvp(lambda u: own.force(moved(u)).nodes, (u,), (du,))
+        hessian = jax.hessian(energy)(u.ravel())
+        found = force, own(moved(du)).nodes, own.diagonal(stencil, 3 * m).nodes.reshape(-1)
+        return found, (-jax.grad(energy)(u), -change, jnp.diag(hessian))
 
     found, expected = both(u, du)
     for one, other in zip(found, expected, strict=True):
@@ -205,7 +220,7 @@ def test_half_of_two_bodies_is_pushed_as_the_whole():
         scene, particles = canonical(scene, bodies[0].x.dtype), mpm.prepare(scene, mpm.join(*bodies))
         nodes = start_nodes(scene, particles, 0.0, jnp.asarray(1e-3), scene.stencil(particles))
         contact = nodes.contacts[0]
-        force = nodes.mirror.fold(contact.coupling(contact.gap < 0).force(None, len(nodes.mass)))
+        force = nodes.potential.on_nodes([contact.springs(contact.gap < 0).force(nodes.potential.displaced(None))])
         found.append(np.asarray(nodes.per_mass(force)).reshape(2, 20, 16, 2)[:, 10:])
     assert abs(found[0]).max() > 10
     assert_close(found[1], found[0], 0, 3e-4 * abs(found[0]).max())
@@ -357,13 +372,18 @@ def fastest(coupling, mass):
     """The largest ω² [1/s²] of springs between nodes of these masses."""
     root = jnp.where(mass > 0, 1 / jnp.sqrt(jnp.where(mass > 0, mass, 1)), 0)[:, None]
 
+    stencil = a_stencil()  # which couplings do not need
+
+    def resisted(u):
+        return root * coupling(Displacement(stencil, len(mass), root * u)).nodes
+
     def power(_, u):
-        v = root * coupling.resistance(root * u)
+        v = resisted(u)
         return v / jnp.sqrt((v**2).sum())
 
     start = root * jnp.asarray(np.random.default_rng(0).normal(size=(len(mass), 2)))
     u = jax.lax.fori_loop(0, 60, power, start)
-    return (u * root * coupling.resistance(root * u)).sum()
+    return (u * resisted(u)).sum()
 
 
 def test_springs_between_bodies_are_no_stiffer_than_the_longest_step_knows():
@@ -376,7 +396,7 @@ def test_springs_between_bodies_are_no_stiffer_than_the_longest_step_knows():
         scene, particles = stacked(gap=-0.1 * rng.uniform(), shift=rng.uniform(), cells=4)
         by = jnp.asarray(rng.uniform(-0.05, 0.05, 2))
         contact, mass = touching(scene, dataclasses.replace(particles, x=particles.x + by))
-        most.append(float(fastest(contact.coupling(jnp.ones(contact.gap.shape, bool)), mass)) / bound)
+        most.append(float(fastest(contact.springs(jnp.ones(contact.gap.shape, bool)), mass)) / bound)
     assert 0.5 < max(most) < 1.02
 
 

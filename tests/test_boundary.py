@@ -9,7 +9,8 @@ from helpers import DESCRIPTIONS, KERNELS, LAWS, assert_close, cloud, ids, thoro
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.boundary import Mirror, brought_contacts, combined_conditions, mirror
+from mpmjax.boundary import brought_contacts, combined_conditions, mirror
+from mpmjax.potential import Mirror
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {

@@ -12,10 +12,11 @@ from helpers import LAWS, QUICK, assert_close, cloud, explicit_limit, ids, thoro
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.boundary import ConstrainedNodes, Mirror, combined_conditions
+from mpmjax.boundary import ConstrainedNodes, combined_conditions
 from mpmjax.discretisation import scatter
 from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._projection import Projection
+from mpmjax.potential import Mirror
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 METHODS = {

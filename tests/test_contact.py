@@ -14,10 +14,10 @@ import mpmjax as mpm
 from mpmjax.boundary._active_set import SWEEPS, find_active_set
 from mpmjax.boundary._contact import ConstrainedNodes, constrain
 from mpmjax.boundary._friction import friction_across, friction_along, share_taken
-from mpmjax.boundary._mirror import Mirror
 from mpmjax.checks._values import canonical
 from mpmjax.implicit._projection import Projection
 from mpmjax.implicit._solution import no_solve
+from mpmjax.potential import Mirror
 from mpmjax.stepping import NodeMotion, reaction, start_nodes, update
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)

@@ -22,6 +22,7 @@ ROOMS = (
     "material",
     "discretisation",
     "geometry",
+    "potential",
     "boundary",
     "state",
     "implicit",

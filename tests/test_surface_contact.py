@@ -11,9 +11,9 @@ from derivatives import ALL_LAWS
 from helpers import assert_close, cloud, ids, thorough
 
 import mpmjax as mpm
-from mpmjax.boundary import FaceShape, Springs, spring_energy, spring_force, spring_resistance
-from mpmjax.boundary._mirror import Mirror
-from mpmjax.discretisation import gather
+from mpmjax.boundary import FaceShape
+from mpmjax.boundary._springs import Springs
+from mpmjax.potential import Displacement, scattered
 
 INF = np.inf
 LAW = mpm.FixedCorotated(1.0, 0.3)
@@ -95,22 +95,24 @@ def test_the_force_of_springs_is_that_of_their_energy_and_acts_at_the_face(d):
     F = jnp.moveaxis(particles.F, 0, -1)
     half = particles.volume ** (1 / d) / 2
     width, arm = FaceShape(half, F, (0, 4), total=False).width(n)
-    springs = (Springs(-0.1 * width[None], 3.0 + jnp.arange(4.0)[None], n, arm),)
+    springs = Springs(-0.1 * width[None], 3.0 + jnp.arange(4.0)[None], n, arm)
     u = jnp.asarray(0.01 * rng.normal(size=(grid.size, d)))
-    mirror = Mirror(())
+
+    def moved(u):
+        return Displacement(stencil, grid.size, u)
 
     def energy(u):
-        return spring_energy(springs, gather(stencil, u))
+        return springs.energy(moved(u))
 
     def force(u):
-        return spring_force(springs, stencil, mirror, u, grid.size)
+        return scattered([springs.force(moved(u))], stencil, grid.size)
 
     assert_close(force(u), -jax.grad(energy)(u), 1e-12)
     du = jnp.asarray(rng.normal(size=u.shape))
-    resistance = spring_resistance(springs, stencil, mirror, du)
+    resistance = scattered([springs(moved(du))], stencil, grid.size)
     assert_close(resistance, -jax.jvp(force, (u,), (du,))[1], 1e-12)
-    rest = spring_force(springs, stencil, mirror, None, grid.size)
-    push = -springs[0].stiffness[0] * springs[0].gap[0] * n
+    rest = force(None)
+    push = -springs.stiffness[0] * springs.stretch[0] * n
     assert_close(rest.sum(axis=0), push.sum(axis=1), 1e-12)
     m = jnp.einsum("bap,bp->ap", F, n)
     face = particles.x.T - half * jnp.einsum("abp,bp->ap", F, m) / jnp.linalg.norm(m, axis=0)

@@ -9,7 +9,7 @@ from helpers import DESCRIPTIONS, FLUIDS, LAWS, VISCOUS, assert_close, block, cl
 
 import mpmjax as mpm
 from mpmjax.boundary import mirror
-from mpmjax.implicit._hessian_action import damped
+from mpmjax.implicit import damped
 from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.material import Viscosity
 

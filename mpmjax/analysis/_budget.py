@@ -1,7 +1,5 @@
 """Budgets of energy and momentum for each step, with a term for every transfer, force and approximation."""
 
-from functools import reduce
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,6 +9,7 @@ from mpmjax.analysis._diagnostics import energy_density, energy_of
 from mpmjax.checks import canonical, checked, require, require_positive, require_whole
 from mpmjax.discretisation import Gathered, Stencil, gather, scatter
 from mpmjax.implicit import ElasticPotential, Projection
+from mpmjax.potential import Forces
 from mpmjax.state import Particles, Scene, prepare
 from mpmjax.stepping import (
     AbstractIntegrator,
@@ -37,8 +36,8 @@ class EnergyBudget(eqx.Module):
     kinetic: Float[Array, "*f"]
     """Change of the particles' kinetic energy, with that of their affine motion."""
     elastic: Float[Array, "*f"]
-    """Change of Σ V0 Ψ(F), and of the energy of springs to the ground by what they hold; that by a ground that moves is
-    left out."""
+    """Change of Σ V0 Ψ(F), and of the energy of the loads' terms, such as springs to the ground, by the motion of the
+    body; that by a ground that moves is left out."""
     potential: Float[Array, "*f"]
     """Change of −Σ m g·x, minus the work of gravity."""
     p2g: Float[Array, "*f"]
@@ -105,7 +104,7 @@ class MomentumBudget(eqx.Module):
     friction: Float[Array, "*f d"]
     """Impulse of friction."""
     elastic: Float[Array, "*f d"]
-    """Impulse of the elastic force, and of springs to the ground."""
+    """Impulse of the elastic force, and of the loads' terms."""
     viscous: Float[Array, "*f d"]
     """Impulse of viscosity and dashpots."""
     transfer: Float[Array, "*f d"]
@@ -224,14 +223,15 @@ def _step_budget(
     if resisted is not None:
         viscous, dissipated = -dt * potential.viscous_resistance(resisted), dt * potential.power(resisted)
     elif method.explicit_viscosity and potential.viscous:  # part of the force
-        force = potential.support_drag()
-        dissipated = reduce(jnp.add, (support.drag_power() for support in potential.supports), dissipated)
+        drags = potential.drags()
+        forces, dissipated = [force for force, _ in drags], sum((power for _, power in drags), dissipated)
         if potential.material_viscous and before.C is not None:
             C = components(before.C)
             flux = potential.viscous_flux(C)
-            force = -potential.nodal_sum(flux) if force is None else force - potential.nodal_sum(flux)
+            forces.append(Forces(slopes=-jnp.swapaxes(flux, 0, 1)))
             dissipated = dissipated + (flux * C).sum()
-        if force is not None:
+        if forces:
+            force = potential.on_nodes(forces)
             viscous, dissipated = jnp.where(nodes.occupied, dt * force, 0), dt * dissipated
             elastic, elastic_at_start = elastic - viscous, elastic_at_start - dt * force
 
@@ -254,13 +254,12 @@ def _step_budget(
     old, new_energy = energy_of(scene, before), energy_of(scene, after)
     moved_by = dt * new.motion.carrier
     stored = potential.energy(moved_by)
-    springs = sum(potential.support_energies(moved_by)) - sum(potential.support_energies(jnp.zeros_like(v0)))
     share = jnp.where(nodes.occupied, images.fold(jnp.broadcast_to(raw, v0.shape)), 0)
     share = nodes.per_mass(share)  # of an impulse at a node in the particles' momentum: 1 but at symmetry planes
     return Budget(
         EnergyBudget(
             kinetic=new_energy.kinetic - old.kinetic,
-            elastic=new_energy.elastic - old.elastic + springs,
+            elastic=new_energy.elastic - old.elastic + potential.term_energy(moved_by) - potential.term_energy(None),
             potential=new_energy.potential - old.potential,
             p2g=lost_p2g,
             g2p=lost_g2p - kept,

@@ -28,21 +28,10 @@ from mpmjax.boundary._contact import (
     constrain,
 )
 from mpmjax.boundary._contact_info import ContactInfo, no_contact
-from mpmjax.boundary._coupling import Coupling
 from mpmjax.boundary._faces import EXPLICIT_STIFFNESS, IMPLICIT_STIFFNESS, Faces, FaceShape
 from mpmjax.boundary._grip import Grip
-from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion, MirrorPlace, RigidImage, Tie, carried_by
-from mpmjax.boundary._patch import Patch
 from mpmjax.boundary._planes import ContactPlane, SymmetryPlane
 from mpmjax.boundary._rigid_part import RigidPart
-from mpmjax.boundary._springs import (
-    Springs,
-    spring_answer,
-    spring_diagonal,
-    spring_energy,
-    spring_force,
-    spring_resistance,
-)
 from mpmjax.boundary._surface_contact import Surface, SurfaceContact, refuse_contact
 from mpmjax.boundary._walls import SeparatingBox, SlipBox, StickyBox
 
@@ -63,36 +52,26 @@ __all__ = [
     "ConstrainedNodes",
     "ContactInfo",
     "ContactPlane",
-    "Coupling",
     "FaceShape",
     "Faces",
     "FreeNormal",
     "Given",
     "GivenCouple",
     "Grip",
-    "Image",
-    "Mirror",
-    "MirrorMotion",
-    "MirrorPlace",
-    "Patch",
-    "RigidImage",
     "RigidPart",
     "SeparatingBox",
     "SeparatingCollider",
     "SlipBox",
     "SlipCollider",
-    "Springs",
     "StickyBox",
     "StickyCollider",
     "Surface",
     "SurfaceContact",
     "SymmetryPlane",
-    "Tie",
     "Wall",
     "body_contact",
     "brought_contacts",
     "brought_images",
-    "carried_by",
     "combined_conditions",
     "constrain",
     "find_active_set",
@@ -106,10 +85,5 @@ __all__ = [
     "no_impulse",
     "owners_of",
     "refuse_contact",
-    "spring_answer",
-    "spring_diagonal",
-    "spring_energy",
-    "spring_force",
-    "spring_resistance",
     "taken_by_mirrors",
 ]

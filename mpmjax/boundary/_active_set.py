@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Int, NodeVector
 from mpmjax.boundary._contact import AbstractNodes, ActiveSet, ConstrainedNodes, constrain, count_places
-from mpmjax.boundary._mirror import Mirror
+from mpmjax.potential import Mirror
 
 SWEEPS = 4
 """Most active sets that are tried in a step."""

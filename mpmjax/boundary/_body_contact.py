@@ -1,20 +1,19 @@
 """Contact of two bodies, each of which has a layer of nodes of its own."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Bool, Float, Mask, Matrix, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, Mask, Matrix, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
-from mpmjax.boundary._coupling import Coupling
 from mpmjax.boundary._friction import share_taken
-from mpmjax.boundary._mirror import Mirror
-from mpmjax.boundary._patch import Patch, moment
+from mpmjax.boundary._springs import Coupling, Patch, moment
 from mpmjax.discretisation import Grid
+from mpmjax.potential import Mirror
 
 _SAMPLES = 256
 """Depths at which the distance of a half-space is tabulated."""
@@ -117,10 +116,10 @@ class BodyContact(AbstractContact):
         """The nodes at which both bodies are felt, shape (m,)."""
         return jnp.isfinite(self.gap)
 
-    def coupling(self, active: Array) -> Coupling:
+    def springs(self, active: Array) -> Coupling:
         held = active & self.near
         return Coupling(
-            gap=self.share * jnp.where(held, self.gap, 0),
+            stretch=self.share * jnp.where(held, self.gap, 0),
             stiffness=jnp.where(held, self.stiffness / self.share, 0),
             normal=self.normal,
             patch=self.patch,
@@ -129,9 +128,8 @@ class BodyContact(AbstractContact):
 
     def gap_felt(self, held: ConstrainedNodes) -> Float[Array, "m"]:
         """The gap that the spring feels [m], shape (m,); infinite where a body is not felt."""
-        every, u = self.coupling(jnp.ones(self.gap.shape, bool)), held.displacement
-        u = None if u is None else held.unheld.mirror.unfold(u)
-        return jnp.where(self.near, every.opened(u) / self.share, jnp.inf)
+        every = self.springs(jnp.ones(self.gap.shape, bool))
+        return jnp.where(self.near, every.stretched(held.moved) / self.share, jnp.inf)
 
     def push(self, held: ConstrainedNodes, active: Array) -> Float[Array, "m"]:
         """The normal impulse at each node in the step [kg m/s], shape (m,)."""
@@ -163,9 +161,20 @@ class BodyContact(AbstractContact):
         both = jnp.asarray((layers == self.pair[0]) | (layers == self.pair[1]))
         return jnp.broadcast_to((both[:, None] & shut).reshape(-1)[:, None], shape)
 
-    def spring_impulse(self, held: ConstrainedNodes, active: Array) -> NodeVector:
-        u = None if held.displacement is None else held.unheld.mirror.unfold(held.displacement)
-        return self.dt * self.coupling(active).force(u, len(held.unheld.mass))
+    @staticmethod
+    def stability_rate(
+        contacts: tuple[Any, ...], nodal_mass: NodeScalar, mass: Array, steepness: Array
+    ) -> Array | float:
+        """2 max_j Σ_i k_i q_ij (1/m_j^a + 1/m_j^b) of the present springs, summed over the pairs of bodies, which is a
+        bound (derivation, section 12)."""
+        del mass, steepness
+        rate = 0.0
+        for contact in contacts:
+            first, second = (nodal_mass.reshape(-1, len(contact.gap))[body] for body in contact.pair)
+            reduced = in_a_row(first, second, first + second > 0)
+            share = contact.patch.spread(contact.stiffness[:, None])[:, 0]
+            rate = rate + 2 * jnp.where(reduced > 0, share / jnp.where(reduced > 0, reduced, 1), 0).max()
+        return rate
 
     def friction(self, held: ConstrainedNodes, active: Array, v: NodeVector, residual: NodeVector) -> NodeVector:
         """Opposite impulses on the two bodies, at most as large as what stops their slip."""

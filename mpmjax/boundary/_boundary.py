@@ -17,9 +17,9 @@ from mpmjax._types import Array, Bool, Float, Int, Mask, NodeVector, ParticleVec
 from mpmjax.boundary._conditions import Conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._faces import Faces
-from mpmjax.boundary._mirror import Image, MirrorMotion, MirrorPlace, Tie
 from mpmjax.boundary._surface_contact import Surface
 from mpmjax.discretisation import Grid
+from mpmjax.potential import Image, MirrorMotion, MirrorPlace, Tie
 
 ON_THE_WALL = 1e-3
 """Distance within which a node is on a wall, in spacings."""

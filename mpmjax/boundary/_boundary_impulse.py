@@ -17,9 +17,9 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Float, Int, NodeVector, Scalar
 from mpmjax.boundary._boundary import AbstractBoundary
 from mpmjax.boundary._conditions import Given
-from mpmjax.boundary._mirror import Image, Mirror, Tie
 from mpmjax.geometry import moment
 from mpmjax.linalg import pairs
+from mpmjax.potential import Image, Mirror, Tie
 
 
 class BoundaryImpulse(eqx.Module):

@@ -10,9 +10,9 @@ from mpmjax.boundary._boundary import AbstractBoundary
 from mpmjax.boundary._conditions import Conditions, no_conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._faces import Faces
-from mpmjax.boundary._mirror import Image, Mirror, MirrorMotion, Tie
 from mpmjax.boundary._surface_contact import surface_contact
 from mpmjax.discretisation import Grid
+from mpmjax.potential import Image, Mirror, MirrorMotion, Tie
 
 
 def combined_conditions(

@@ -27,9 +27,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
 from mpmjax.boundary._conditions import Conditions, Given
-from mpmjax.boundary._coupling import Coupling
-from mpmjax.boundary._mirror import Image, Mirror
-from mpmjax.boundary._springs import Springs
+from mpmjax.potential import AbstractTerm, Displacement, Image, Mirror
 
 ActiveSet = tuple[Bool[Array, "..."], ...]
 """The places that are held, one mask for each contact."""
@@ -42,6 +40,10 @@ class AbstractNodes(eqx.Module):
     """m_i [kg], shape (n,)."""
     conditions: eqx.AbstractVar[Conditions]
     """What boundaries prescribe."""
+    dt: eqx.AbstractVar[Array]
+    """Δt [s]."""
+    potential: eqx.AbstractVar[Any]
+    """The potential Φ of the nodes' displacement."""
     contacts: eqx.AbstractVar[tuple["AbstractContact", ...]]
     """The boundaries that may be left."""
     loose: eqx.AbstractVar[Any]
@@ -72,16 +74,14 @@ class AbstractNodes(eqx.Module):
         self: "N",
         images: Mirror,
         fixed: Mask,
-        springs: tuple[Springs, ...],
-        couplings: tuple[Coupling, ...],
+        terms: tuple[AbstractTerm, ...],
     ) -> "N":
         """These nodes with more of them held.
 
         Args:
             images: mirrors on which the nodes are folded.
             fixed: components of velocity that are prescribed, shape (n, d).
-            springs: the springs of what is held by springs.
-            couplings: the springs between bodies that are held by such.
+            terms: the springs of what is held by springs, which are added to the potential.
         """
 
     @abc.abstractmethod
@@ -181,13 +181,8 @@ class AbstractContact(eqx.Module):
         del active
         return jnp.zeros(shape, bool)
 
-    def springs(self, active: Array) -> Springs | None:
-        """The springs of the places held; None without any."""
-        del active
-        return None
-
-    def coupling(self, active: Array) -> Coupling | None:
-        """The springs between two bodies at the places held; None without any."""
+    def springs(self, active: Array) -> AbstractTerm | None:
+        """The springs of the places held; None without any, which is the default."""
         del active
         return None
 
@@ -198,8 +193,24 @@ class AbstractContact(eqx.Module):
             held: the nodes with the active set held, and their displacement.
             active: the places of this contact that are held.
         """
-        del held, active
-        return None
+        springs, nodes = self.springs(active), held.unheld
+        return None if springs is None else nodes.dt * nodes.potential.unfolded([springs.force(held.moved)])
+
+    @staticmethod
+    def stability_rate(
+        contacts: tuple[Any, ...], nodal_mass: NodeScalar, mass: Array, steepness: Array
+    ) -> Array | float:
+        """z [1/s²] of each particle, or a number, that the springs of all contacts of this kind add to the left side
+        of the bound Δt² z ≤ 4 of `stable_dt`, whether they are shut now or may be in a step to come. Default: 0.
+
+        Args:
+            contacts: the contacts of this kind.
+            nodal_mass: masses of the nodes m_i [kg], shape (n,).
+            mass: masses of the particles [kg], shape (p,).
+            steepness: A [1/m²] of each particle (see `stable_dt`).
+        """
+        del contacts, nodal_mass, mass, steepness
+        return 0.0
 
     def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
         """The components of velocity on which the held places act, shape (n, d). Default: those of `fixed`."""
@@ -234,6 +245,11 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     def mass(self) -> NodeScalar:
         """The nodes' mass, folded on the mirrors [kg], shape (n,)."""
         return self.images.fold_scalar(self.unheld.mass)
+
+    @property
+    def moved(self) -> Displacement:
+        """`displacement`, of all nodes."""
+        return self.unheld.potential.displaced(self.displacement)
 
     def beyond_boundaries(self) -> tuple[Mask, tuple[NodeVector, ...]]:
         """The components of velocity on which no boundary acts, shape (n, d), and the normals that colliders hold."""
@@ -352,9 +368,8 @@ def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
     fixed = nodes.conditions.fixed
     for contact, mask in pairs:
         fixed = fixed | contact.fixed(mask, fixed.shape)
-    springs = tuple(found for contact, mask in pairs if (found := contact.springs(mask)) is not None)
-    couplings = tuple(joined for contact, mask in pairs if (joined := contact.coupling(mask)) is not None)
-    return ConstrainedNodes(nodes, active, images, nodes.constrained(images, fixed, springs, couplings))
+    springs = tuple(term for contact, mask in pairs if (term := contact.springs(mask)) is not None)
+    return ConstrainedNodes(nodes, active, images, nodes.constrained(images, fixed, springs))
 
 
 def count_places(nodes: AbstractNodes, *sets: ActiveSet) -> Int[Array, ""]:

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
 from mpmjax.boundary._friction import friction_across
-from mpmjax.boundary._mirror import Image, Mirror
 from mpmjax.discretisation import Stencil, scatter
+from mpmjax.potential import Image, Mirror
 
 SHUT = 1e-2
 """The gap up to which a plane holds what is before it, in spacings."""

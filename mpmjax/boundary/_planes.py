@@ -11,12 +11,12 @@ from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, cross
 from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._faces import Faces
-from mpmjax.boundary._mirror import Image, MirrorMotion, MirrorPlace, mirror_image
 from mpmjax.boundary._plane_contact import SHUT, PlaneContact
 from mpmjax.boundary._surface_contact import Surface, refuse_contact, surface_contact
 from mpmjax.checks import require, require_between, require_fields, require_finite, require_that
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import Motion
+from mpmjax.potential import Image, MirrorMotion, MirrorPlace, mirror_image
 
 
 class AbstractPlane(AbstractBoundary):

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 from mpmjax._types import Array, Bool, Int, Mask, NodeVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.boundary._conditions import Conditions
-from mpmjax.boundary._mirror import Image, Tie
 from mpmjax.checks import as_plain, require, require_fields
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractRegion
+from mpmjax.potential import Image, Tie
 
 
 class RigidPart(AbstractBoundary):

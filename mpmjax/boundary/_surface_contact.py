@@ -1,18 +1,20 @@
 """Contact of particles' faces with rigid surfaces: walls and colliders that push where the material's surface is."""
 
-from typing import NamedTuple
+from functools import reduce
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Float, NodeVector, Scalar
+from mpmjax import linalg as la
+from mpmjax._types import Array, Bool, Float, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
 from mpmjax.boundary._faces import Faces
 from mpmjax.boundary._friction import friction_across, friction_along
-from mpmjax.boundary._mirror import Mirror
-from mpmjax.boundary._springs import SIGNS, Springs, along, spring_force
+from mpmjax.boundary._springs import SIGNS, Springs, along
 from mpmjax.checks import require
-from mpmjax.discretisation import gather, scatter
+from mpmjax.discretisation import scatter
+from mpmjax.geometry import length
 
 
 class Surface(NamedTuple):
@@ -89,7 +91,7 @@ class SurfaceContact(AbstractContact):
     def springs(self, active: Array) -> Springs:
         held, share = active & self.near, self.faces.share
         return Springs(
-            gap=share * jnp.where(held, self.gap, 0),
+            stretch=share * jnp.where(held, self.gap, 0),
             stiffness=jnp.where(held, self.stiffness / share, 0),
             normal=self.normal,
             arm=self.arm,
@@ -104,9 +106,8 @@ class SurfaceContact(AbstractContact):
 
     def gap_felt(self, held: ConstrainedNodes) -> Float[Array, "s p"]:
         """The gap that the spring feels [m], shape (s, p); infinite for particles that are not near."""
-        every, u = self.springs(jnp.ones(self.gap.shape, bool)), held.displacement
-        moved = None if u is None else gather(self.faces.stencil, held.unheld.mirror.unfold(u))
-        return jnp.where(self.near, every.opened(moved) / self.faces.share, jnp.inf)
+        every = self.springs(jnp.ones(self.gap.shape, bool))
+        return jnp.where(self.near, every.stretched(held.moved) / self.faces.share, jnp.inf)
 
     def push(self, held: ConstrainedNodes, active: Array) -> Float[Array, "s p"]:
         """The normal impulse on each particle in the step [kg m/s], shape (s, p)."""
@@ -135,10 +136,16 @@ class SurfaceContact(AbstractContact):
         shut = (active & self.near).any(axis=0).astype(self.gap.dtype)
         return jnp.broadcast_to(scatter(self.faces.stencil, shut[None], None, shape[0]) > 0, shape)
 
-    def spring_impulse(self, held: ConstrainedNodes, active: Array) -> NodeVector:
-        u, size = held.displacement, len(held.unheld.mass)
-        u = None if u is None else held.unheld.mirror.unfold(u)
-        return self.faces.dt * spring_force((self.springs(active),), self.faces.stencil, Mirror(()), u, size)
+    @staticmethod
+    def stability_rate(contacts: tuple[Any, ...], nodal_mass: NodeScalar, mass: Array, steepness: Array) -> Array:
+        """n k (1 + A b²)/m, with n the largest eigenvalue of the sum of n nᵀ over the surfaces whose springs a particle
+        may feel now, at least one, and k that of a face that comes with all of the particle's speed."""
+        del nodal_mass
+        square = jnp.stack([(c.arm**2).sum(axis=0) for c in contacts]).max(axis=0)
+        each = [c.near.sum(axis=0, dtype=c.normal.dtype) * c.normal[:, None] * c.normal for c in contacts]
+        number = jnp.maximum(la.symmetric_eigen(reduce(jnp.add, each))[0].max(axis=0), 1)
+        faces = contacts[0].faces
+        return number * faces.stiffness_at(length(faces.v)) * (1 + steepness * square) / mass
 
     def friction(self, held: ConstrainedNodes, active: Array, v: NodeVector, residual: NodeVector) -> NodeVector:
         del residual

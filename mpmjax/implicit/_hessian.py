@@ -1,20 +1,176 @@
-"""Hessians of the elastic energy."""
+"""Hessians of the potential, and the linear maps of nodal displacements that they are."""
 
 import abc
 from collections.abc import Callable
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 
-from mpmjax._types import Deformation, NodeVector
+from mpmjax import linalg as la
+from mpmjax._types import Array, Deformation, Float, NodeVector, Scalar
 from mpmjax.checks import require_fields
-from mpmjax.implicit._hessian_action import AbstractHessianAction, ParticleStiffness, TangentAction, particle_stiffness
-from mpmjax.implicit._potential import Deformations, ElasticPotential
+from mpmjax.discretisation import Stencil, resist
+from mpmjax.implicit._potential import ElasticPotential, displacement_gradient, joined
 from mpmjax.material import AbstractElastic, AbstractTangent
+from mpmjax.potential import AbstractStiffness, Displacement, Forces, Mirror, added, scattered
+
+Tangents = tuple[Callable[[Deformation], Deformation], ...]
+"""The stress differential δF ↦ δP [Pa] of each material's particles, both of F's shape."""
+
+
+class AbstractHessianAction(eqx.Module):
+    """The symmetric linear map δu ↦ H δu [N], H = ∂²Φ/∂u∂u [N/m], on nodal displacements δu [m], shape (n, d)."""
+
+    @abc.abstractmethod
+    def is_positive_semidefinite(self) -> bool:
+        """Whether H is known to be positive semi-definite."""
+
+    @abc.abstractmethod
+    def __call__(self, du: NodeVector) -> NodeVector:
+        """H δu."""
+
+    @abc.abstractmethod
+    def precomputed(self) -> "ParticleStiffness":
+        """The same map as one matrix for each particle, computed once for many applications."""
+
+
+class ParticleStiffness(AbstractHessianAction):
+    """H as one symmetric matrix for each particle, and what terms add. Applying it evaluates no law.
+
+    Each particle's matrix K_p [J] gives H = Σ_p g_ip K_p g_jpᵀ. Its rows and columns are the components of ∇u, the
+    derivative's direction first.
+    """
+
+    upper: Float[Array, "t p"]
+    """The upper triangle of K_p, row by row, shape (d²(d² + 1)/2, p)."""
+    stencil: Stencil
+    mirror: Mirror
+    positive_semidefinite: bool = eqx.field(static=True, default=False)
+    """Whether the K_p with `coupled` are known to be positive semi-definite."""
+    coupled: tuple[AbstractStiffness, ...] = ()
+    """The stiffness of materials that couples their particles."""
+    others: tuple[AbstractStiffness, ...] = ()
+    """The stiffness of terms."""
+
+    def is_positive_semidefinite(self) -> bool:
+        return self.positive_semidefinite and all(part.is_positive_semidefinite() for part in self.others)
+
+    @property
+    def alone(self) -> bool:
+        """Whether H is the resistance of the particles and nothing else."""
+        return not (self.mirror.images or self.coupled or self.others)
+
+    def __call__(self, du: NodeVector) -> NodeVector:
+        moved = Displacement(self.stencil, len(du), self.mirror.unfold(du))
+        answers = [part(moved) for part in self.coupled + self.others]
+        # what others scatter shares the gather and the scatter of the particles; else `resist` does both in one pass
+        if any(answer.value is not None or answer.slopes is not None for answer in answers):
+            slopes = moved.at_particles[1]
+            flux = la.matmul(la.symmetric(self.upper), slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
+            own = Forces(slopes=flux)
+        else:
+            own = Forces(nodes=resist(self.stencil, self.upper, moved.nodes))
+        return self.mirror.fold(scattered([own, *answers], self.stencil, len(du)))
+
+    def precomputed(self) -> "ParticleStiffness":
+        return self
+
+    def diagonal(self, like: NodeVector) -> NodeVector:
+        """Σ_p Σ_b g_ip,b² K_p,ba,ba [N/m], shape (n, d), and the same of the others: a non-negative approximation of
+        the diagonal of H.
+
+        Negative entries of materials count as zero. It leaves out products of weight derivatives along different axes,
+        which are zero for an isotropic law at F = I, and at mirror planes those of a node with its image.
+
+        Args:
+            like: any node vector.
+        """
+        size, d = like.shape
+        places = np.cumsum([0, *range(d * d, 1, -1)])  # of the diagonal, row by row
+        own = Forces(slopes=jnp.stack([self.upper[m] for m in places]).reshape(d, d, -1))
+        materials = added([own, *(part.diagonal(self.stencil, size) for part in self.coupled)]).slopes
+        assert materials is not None
+        shares = [part.diagonal(self.stencil, size) for part in self.others]
+        total = scattered([Forces(slopes=jnp.maximum(materials, 0)), *shares], self.stencil.squared, size)
+        return self.mirror.fold_scalars(total)
+
+
+class TangentAction(AbstractHessianAction):
+    """H by the stress differentials of the materials.
+
+    Args:
+        potential: the potential.
+        tangents: for each material, the symmetric linear map δF ↦ δP [Pa] of its particles, both of F's shape.
+        positive_semidefinite: whether all of these maps are known to be positive semi-definite.
+        u: the displacement at which terms have their stiffness [m], shape (n, d). Default: none.
+    """
+
+    potential: ElasticPotential
+    tangents: Tangents
+    positive_semidefinite: bool = eqx.field(static=True, default=False)
+    u: NodeVector | None = None
+
+    def is_positive_semidefinite(self) -> bool:
+        return self.positive_semidefinite and all(part.is_positive_semidefinite() for part in self._others())
+
+    @eqx.filter_jit  # a law may hold functions
+    def __call__(self, du: NodeVector) -> NodeVector:
+        """Σ_p V0_p δP_p h_ip, with δP_p = ∂²Ψ/∂F∂F : δF_p (derivation, eqs. 7 and 8), and what terms add."""
+        potential, moved = self.potential, self.potential.displaced(du)
+        changes = potential.change(displacement_gradient(moved))
+        stress = tuple(tangent(dF) for tangent, dF in zip(self.tangents, changes, strict=True))
+        elastic = Forces(slopes=jnp.swapaxes(potential.flux(stress), 0, 1))
+        return potential.on_nodes([elastic, *(part(moved) for part in self._others())])
+
+    def precomputed(self) -> ParticleStiffness:
+        potential, d = self.potential, len(self.potential.stencil.weights)
+        pairs = zip(potential.material_points, self.tangents, strict=True)
+        upper, coupled = zip(*(points.stiffness(tangent, d) for points, tangent in pairs), strict=True)
+        return ParticleStiffness(
+            joined(upper),
+            potential.stencil,
+            potential.mirror,
+            self.positive_semidefinite,
+            tuple(part for parts in coupled for part in parts),
+            self._others(),
+        )
+
+    def _others(self) -> tuple[AbstractStiffness, ...]:
+        moved = self.potential.displaced(self.u)
+        return tuple(term.hessian(moved) for term in self.potential.terms)
+
+
+class _DampedAction(AbstractHessianAction):
+    elastic: AbstractHessianAction
+    potential: ElasticPotential
+    rate: Scalar
+
+    def is_positive_semidefinite(self) -> bool:
+        return self.elastic.is_positive_semidefinite()
+
+    def __call__(self, du: NodeVector) -> NodeVector:
+        """(H + r D) δu."""
+        return self.elastic(du) + self.rate * self.potential.viscous_resistance(du)
+
+    def precomputed(self) -> ParticleStiffness:
+        stiffness, damping = self.elastic.precomputed(), self.potential.damping_matrices()
+        upper = stiffness.upper if damping is None else stiffness.upper + self.rate * damping
+        others = tuple(part.damped(self.rate) for part in stiffness.others)
+        return eqx.tree_at(lambda s: (s.upper, s.others), stiffness, (upper, others))
+
+
+def damped(elastic: AbstractHessianAction, potential: ElasticPotential, rate: Scalar) -> AbstractHessianAction:
+    """H + r D, with D [N s/m] the positive semi-definite matrix of the viscous force; H without viscosity.
+
+    A stage of length Δt_s has r = 1/Δt_s, which gives M + Δt_s D + Δt_s² H.
+    """
+    return _DampedAction(elastic, potential, rate) if potential.viscous else elastic
 
 
 class AbstractHessian(eqx.Module):
-    """The Hessian of the elastic energy in an implicit update.
+    """The Hessian of the potential in an implicit update.
 
     With one linear solve the Hessian is part of the equation. With Newton's method it only sets the steps towards the
     solution of an equation without it. Subclass it for a Hessian of your own: `at` can return a `TangentAction`, which
@@ -27,7 +183,7 @@ class AbstractHessian(eqx.Module):
 
     def at_step_start(self, potential: ElasticPotential) -> AbstractHessianAction:
         """The Hessian where no node has moved, u = 0."""
-        return self.at(potential, potential.no_displacement())
+        return self.at(potential, potential.displaced(None).nodes)
 
     @abc.abstractmethod
     def exact(self) -> "AbstractHessian":
@@ -51,22 +207,17 @@ class AnalyticHessian(AbstractHessian):
     def __check_init__(self):
         require_fields(self)
 
-    def at(self, potential: ElasticPotential, u: NodeVector) -> AbstractHessianAction:
-        return self._action(potential, potential.deformation(u))
-
-    def at_step_start(self, potential: ElasticPotential) -> AbstractHessianAction:
-        return self._action(potential, potential.current_deformation())  # without the gather
-
-    def exact(self) -> "AnalyticHessian":
-        return AnalyticHessian()
-
-    def _action(self, potential: ElasticPotential, F: Deformations) -> TangentAction:
+    def at(self, potential: ElasticPotential, u: NodeVector | None) -> TangentAction:
         def tangent(law: AbstractElastic, F: Deformation) -> AbstractTangent:
             return law.projected_tangent(F) if self.projected else law.tangent(F)
 
-        pairs = zip(potential.material_points, F, strict=True)
-        tangents = tuple(points.tangent(own, tangent, definite=self.projected) for points, own in pairs)
-        return TangentAction(potential, tangents, self.projected)
+        return _tangents_of(potential, u, tangent, definite=self.projected)
+
+    def at_step_start(self, potential: ElasticPotential) -> TangentAction:
+        return self.at(potential, None)  # without the gather
+
+    def exact(self) -> "AnalyticHessian":
+        return AnalyticHessian()
 
 
 class JvpHessian(AbstractHessian):
@@ -87,21 +238,28 @@ class _JvpAction(AbstractHessianAction):
     def is_positive_semidefinite(self) -> bool:
         return False
 
+    @eqx.filter_jit
     def __call__(self, du: NodeVector) -> NodeVector:
         """The derivative of ∂Φ/∂u in the direction δu."""
-        return _jvp_action(self.potential, self.u, du)
+        return jax.jvp(jax.grad(self.potential.energy), (self.u,), (du,))[1]
 
     def precomputed(self) -> ParticleStiffness:
-        pairs = zip(self.potential.material_points, self.potential.deformation(self.u), strict=True)
-        tangents = tuple(points.tangent(own, _jvp_tangent) for points, own in pairs)
-        return particle_stiffness(self.potential, tangents, positive_semidefinite=False)
+        return _tangents_of(self.potential, self.u, _jvp_tangent).precomputed()
+
+
+def _tangents_of(
+    potential: ElasticPotential,
+    u: NodeVector | None,
+    of_law: Callable[[AbstractElastic, Deformation], Callable[[Deformation], Deformation]],
+    *,
+    definite: bool = False,
+) -> TangentAction:
+    """H at a displacement [m], shape (n, d), by the stress differential of each law; None for no displacement."""
+    pairs = zip(potential.material_points, potential.deformation(u), strict=True)
+    tangents = tuple(points.tangent(F, of_law, definite=definite) for points, F in pairs)
+    return TangentAction(potential, tangents, definite, u)
 
 
 def _jvp_tangent(law: AbstractElastic, F: Deformation) -> Callable[[Deformation], Deformation]:
     stress = jax.grad(lambda F: law.energy(F).sum())
     return lambda dF: jax.jvp(stress, (F,), (dF,))[1]
-
-
-@eqx.filter_jit
-def _jvp_action(potential: ElasticPotential, u: NodeVector, du: NodeVector) -> NodeVector:
-    return jax.jvp(jax.grad(potential.energy), (u,), (du,))[1]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
-from mpmjax.implicit._hessian_action import AbstractHessianAction, ParticleStiffness
+from mpmjax.implicit._hessian import AbstractHessianAction, ParticleStiffness
 from mpmjax.implicit._projection import Projection
 from mpmjax.implicit._vectors import ParticleMatrices, product
 

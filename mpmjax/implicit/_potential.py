@@ -1,7 +1,7 @@
 """The elastic potential of the grid: energy, force and deformation as functions of nodal displacement, and the viscous
 force as a function of nodal velocity."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from functools import reduce
 
 import equinox as eqx
@@ -9,9 +9,9 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, Float, Matrix, NodeVector
-from mpmjax.boundary import Coupling, Mirror, Springs, spring_energy, spring_force
-from mpmjax.discretisation import Stencil, gather, scatter
-from mpmjax.state import MaterialPoints, Support
+from mpmjax.discretisation import Stencil
+from mpmjax.potential import AbstractTerm, Displacement, Forces, Mirror, scattered
+from mpmjax.state import MaterialPoints
 
 Deformations = tuple[Deformation, ...]
 """One entry for each material, shape (d, d, q), or (q,) for a law of J alone."""
@@ -22,7 +22,7 @@ class ElasticPotential(eqx.Module):
     in the step.
 
     h_ip is the material gradient: F_pᵀ ∇_x w_ip in the updated description, ∇_X w_ip in the total one. It enters only
-    by `deformation_change` and its transpose, `nodal_sum` of `flux`, so that force and Hessian are derivatives of Φ.
+    by `change` and its transpose, `nodal_sum` of `flux`, so that force and Hessian are derivatives of Φ.
     """
 
     material_points: tuple[MaterialPoints, ...]
@@ -30,90 +30,71 @@ class ElasticPotential(eqx.Module):
     mirror: Mirror
     size: int = eqx.field(static=True)
     """Number of nodes n."""
-    supports: tuple[Support, ...] = ()
-    """Springs and dashpots to the ground, whose energy and resistance are added."""
-    springs: tuple[Springs, ...] = ()
-    """The springs of contact, whose energy is part of Φ."""
-    couplings: tuple[Coupling, ...] = ()
-    """Those between bodies."""
+    terms: tuple[AbstractTerm, ...] = ()
+    """What else has an energy: springs to the ground, contact, terms of a user's own."""
 
-    def deformation_change(self, u: NodeVector) -> Deformations:
-        """δF_p = Σ_i u_i h_ipᵀ, one array for each material."""
-        return self.change(self._gradient(u))
+    def displaced(self, u: NodeVector | None) -> Displacement:
+        """A displacement or velocity of the nodes, shape (n, d), with that of their mirror images; None for zero."""
+        return Displacement(self.stencil, self.size, None if u is None else self.mirror.unfold(u))
+
+    def unfolded(self, forces: Sequence[Forces]) -> NodeVector:
+        """The sum of forces on all nodes [N], shape (n, d), not folded at mirrors."""
+        return scattered(forces, self.stencil, self.size)
+
+    def on_nodes(self, forces: Sequence[Forces]) -> NodeVector:
+        """The sum of forces on the nodes [N], shape (n, d)."""
+        return self.mirror.fold(self.unfolded(forces))
 
     def change(self, gradient: Matrix) -> Deformations:
-        """δF_p from the gradient Σ_i u_i g_ipᵀ of the displacement."""
+        """δF_p from the gradient Σ_i u_i g_ipᵀ of the displacement, one array for each material."""
         return tuple(points.change(points.rows_of(gradient)) for points in self.material_points)
 
     def current_deformation(self) -> Deformations:
         """F_p at u = 0, one array for each material."""
         return tuple(points.deformation for points in self.material_points)
 
-    def deformation(self, u: NodeVector) -> Deformations:
-        """F_p + δF_p at a nodal displacement u [m], shape (n, d), one array for each material."""
-        return tuple(F + dF for F, dF in zip(self.current_deformation(), self.deformation_change(u), strict=True))
+    def deformation(self, u: NodeVector | None) -> Deformations:
+        """F_p + Σ_i u_i h_ipᵀ at a displacement u [m], shape (n, d), one array for each material; None for u = 0."""
+        return self._deformation(self.displaced(u))
 
-    def no_displacement(self) -> NodeVector:
-        """u = 0 [m], shape (n, d)."""
-        return jnp.zeros((self.size, self._dim), self.stencil.weights.dtype)
+    def _deformation(self, moved: Displacement) -> Deformations:
+        if moved.at_rest:
+            return self.current_deformation()
+        return tuple(
+            F + dF for F, dF in zip(self.current_deformation(), self.change(displacement_gradient(moved)), strict=True)
+        )
 
     def energy(self, u: NodeVector) -> Float[Array, ""]:
         """Φ(u) [J]."""
-        parts = [
-            (points.volume * points.energy_density(F)).sum()
-            for points, F in zip(self.material_points, self.deformation(u), strict=True)
-        ]
-        return sum([*parts[1:], *self.spring_energies(u)], parts[0])
+        return self._energy(self.displaced(u))
+
+    def _energy(self, moved: Displacement) -> Float[Array, ""]:
+        pairs = zip(self.material_points, self._deformation(moved), strict=True)
+        parts = [(points.volume * points.energy_density(F)).sum() for points, F in pairs]
+        return reduce(jnp.add, [*parts, *(term.energy(moved) for term in self.terms)])
 
     def admissible_energy(self, u: NodeVector) -> Float[Array, ""]:
-        """Φ(u) [J], NaN if a law does not admit the deformation. It must not be differentiated."""
-        parts = [
-            jnp.where(points.is_admissible(F), points.volume * points.energy_density(F), jnp.nan).sum()
-            for points, F in zip(self.material_points, self.deformation(u), strict=True)
-        ]
-        return sum([*parts[1:], *self.spring_energies(u)], parts[0])
+        """Φ(u) [J], NaN if a law or term does not admit the displacement. It must not be differentiated."""
+        moved = self.displaced(u)
+        pairs = zip(self.material_points, self._deformation(moved), strict=True)
+        admitted = [points.is_admissible(F).all() for points, F in pairs]
+        admitted += [defined for term in self.terms if (defined := term.is_admissible(moved)) is not None]
+        return jnp.where(reduce(jnp.logical_and, admitted), self._energy(moved), jnp.nan)
 
-    def support_energies(self, u: NodeVector) -> list[Float[Array, ""]]:
-        """The energy of each support's springs [J]."""
-        return [support.energy(u) for support in self.held_by()]
+    def term_energy(self, u: NodeVector | None) -> Float[Array, ""]:
+        """The part of Φ(u) by the terms [J]; None for u = 0."""
+        moved = self.displaced(u)
+        return sum((term.energy(moved) for term in self.terms), jnp.zeros((), self.stencil.weights.dtype))
 
-    def spring_energies(self, u: NodeVector) -> list[Float[Array, ""]]:
-        """The energies of the springs of supports and of contact [J]."""
-        contact = [spring_energy(self.springs, gather(self.stencil, self.mirror.unfold(u)))] if self.springs else []
-        coupled = [coupling.energy(self.mirror.unfold(u)) for coupling in self.couplings]
-        return self.support_energies(u) + contact + coupled
-
-    def held_by(self) -> tuple[Support, ...]:
-        """The supports, on the nodes as the mirrors fold them."""
-        return tuple(support.mirrored(self.mirror) for support in self.supports)
-
-    def support_force(self) -> NodeVector:
-        """The force of the supports' springs at u = 0 [N], shape (n, d). There must be one."""
-        first, *others = (support.force(None, self.size) for support in self.held_by())
-        return sum(others, first)
-
-    def support_drag(self) -> NodeVector | None:
-        """The force of their dashpots at the points' velocity at the start of the step [N]; None without any."""
-        found = [drag for support in self.held_by() if (drag := support.drag(self.size)) is not None]
-        return sum(found[1:], found[0]) if found else None
-
-    def force(self, u: NodeVector) -> NodeVector:
-        """f = −∂Φ/∂u [N], shape (n, d). At u = 0, f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
-        force = -self.nodal_sum(self.flux(self._stress(self.deformation(u))))
-        if self.springs or self.couplings:
-            force = force + self.spring_force(u)
-        return force + sum(support.force(u, self.size) for support in self.held_by()) if self.supports else force
-
-    def spring_force(self, u: NodeVector | None) -> NodeVector:
-        """The part of `force` by the springs of contact [N], shape (n, d); None for u = 0."""
-        parts = [spring_force(self.springs, self.stencil, self.mirror, u, self.size)] if self.springs else []
-        moved = None if u is None else self.mirror.unfold(u)
-        parts += [self.mirror.fold(coupling.force(moved, self.size)) for coupling in self.couplings]
-        return reduce(jnp.add, parts)
+    def force(self, u: NodeVector | None) -> NodeVector:
+        """f = −∂Φ/∂u [N], shape (n, d); None for u = 0, where f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
+        moved = self.displaced(u)
+        elastic = Forces(slopes=-jnp.swapaxes(self.flux(self._stress(self._deformation(moved))), 0, 1))
+        return self.on_nodes([elastic, *(term.force(moved) for term in self.terms)])
 
     def flux(self, P: Deformations) -> Matrix:
         """V0_p P_p F_pᵀ [J], shape (d, d, p), from the stress of each material; in the total description V0_p P_p."""
-        return _joined([points.flux(own, self._dim) for points, own in zip(self.material_points, P, strict=True)])
+        return joined([points.flux(own, self._dim) for points, own in zip(self.material_points, P, strict=True)])
 
     def current_flux(self) -> Matrix:
         """V0_p P_p F_pᵀ at u = 0 [J], shape (d, d, p), of which the force is f_i = −Σ_p (V0_p P_p F_pᵀ) g_ip."""
@@ -121,8 +102,8 @@ class ElasticPotential(eqx.Module):
 
     @property
     def viscous(self) -> bool:
-        """Whether any of the materials has viscosity, or a support a dashpot."""
-        return self.material_viscous or any(support.damping is not None for support in self.supports)
+        """Whether any of the materials has viscosity, or any of the terms a resistance."""
+        return self.material_viscous or any(term.viscous for term in self.terms)
 
     @property
     def material_viscous(self) -> bool:
@@ -132,28 +113,34 @@ class ElasticPotential(eqx.Module):
     def viscous_flux(self, gradient: Matrix) -> Matrix:
         """|J| V0 σ_v of each particle [J], whose sum over g_ip is D v, at the particles' velocity gradient [1/s]; both
         of shape (d, d, p)."""
-        return _joined([points.viscous_flux(points.rows_of(gradient)) for points in self.material_points])
+        return joined([points.viscous_flux(points.rows_of(gradient)) for points in self.material_points])
 
     def viscous_resistance(self, v: NodeVector) -> NodeVector:
         """D v [N], the negative of the viscous force at a nodal velocity v [m/s]. D is symmetric and positive
         semi-definite."""
-        parts = [self.nodal_sum(self.viscous_flux(self._gradient(v)))] if self.material_viscous else []
-        parts += [r for support in self.held_by() if (r := support.resistance(v)) is not None]
-        return sum(parts[1:], parts[0]) if parts else jnp.zeros_like(v)
+        moved = self.displaced(v)
+        parts = [r for term in self.terms if (r := term.resistance(moved)) is not None]
+        if self.material_viscous:
+            parts.append(Forces(slopes=jnp.swapaxes(self.viscous_flux(displacement_gradient(moved)), 0, 1)))
+        return self.on_nodes(parts) if parts else jnp.zeros_like(v)
 
     def power(self, v: NodeVector) -> Float[Array, ""]:
         """v·D v [W], the power that viscosity dissipates at a nodal velocity v [m/s]."""
-        power = jnp.zeros((), v.dtype)
-        for support in self.held_by():
-            power = power + support.power(v)
+        moved = self.displaced(v)
+        parts = [r for term in self.terms if (r := term.resistance(moved)) is not None]
+        power = (moved.nodes * self.unfolded(parts)).sum() if parts else jnp.zeros((), v.dtype)
         if not self.material_viscous:
             return power
-        gradient = self._gradient(v)
+        gradient = displacement_gradient(moved)
         return power + (self.viscous_flux(gradient) * gradient).sum()
+
+    def drags(self) -> list[tuple[Forces, Float[Array, ""]]]:
+        """The viscous forces of the terms at the start of the step, and their powers (see `AbstractTerm.drag`)."""
+        return [drag for term in self.terms if (drag := term.drag(self.size)) is not None]
 
     def nodal_sum(self, flux: Matrix) -> NodeVector:
         """Σ_p flux_p g_ip [N], shape (n, d)."""
-        return self.mirror.fold(scatter(self.stencil, None, jnp.swapaxes(flux, 0, 1), self.size))
+        return self.on_nodes([Forces(slopes=jnp.swapaxes(flux, 0, 1))])
 
     def damping_matrices(self) -> Float[Array, "t p"] | None:
         """The matrices of the materials' D [J s], one for each particle, as `stiffness` has those of H; None if no
@@ -168,25 +155,7 @@ class ElasticPotential(eqx.Module):
             like = jnp.zeros((self._dim, self._dim, *points.volume.shape), points.volume.dtype)
             return la.upper_triangle(la.matrix_of(flux_of, like))
 
-        return _joined([matrix(points) for points in self.material_points])
-
-    def stiffness(self, tangents: tuple[Callable[[Deformation], Deformation], ...]) -> Float[Array, "t p"]:
-        """Each particle's symmetric matrix K_p [J], with H = Σ_p g_ip K_p g_jpᵀ, made from its material's stress
-        differential.
-
-        Rows and columns are the components of ∇u, the derivative's direction first. What is returned is the upper
-        triangle, row by row, shape (d²(d² + 1)/2, p).
-
-        Args:
-            tangents: for each material, the stress differential δF ↦ δP of its particles.
-        """
-
-        pairs = zip(self.material_points, tangents, strict=True)
-        return _joined([points.stiffness(tangent, self._dim) for points, tangent in pairs])
-
-    def _gradient(self, field: NodeVector) -> Matrix:
-        _, slopes = gather(self.stencil, self.mirror.unfold(field))
-        return jnp.swapaxes(slopes, 0, 1)
+        return joined([matrix(points) for points in self.material_points])
 
     @property
     def _dim(self) -> int:
@@ -196,5 +165,11 @@ class ElasticPotential(eqx.Module):
         return tuple(points.stress(own) for points, own in zip(self.material_points, F, strict=True))
 
 
-def _joined(parts: list[Array]) -> Array:
+def displacement_gradient(moved: Displacement) -> Matrix:
+    """∇u of each particle."""
+    return jnp.swapaxes(moved.at_particles[1], 0, 1)
+
+
+def joined(parts: Sequence[Array]) -> Array:
+    """Arrays of the materials, as one over all particles."""
     return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=-1)

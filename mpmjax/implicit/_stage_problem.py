@@ -6,8 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, NodeScalar, NodeVector, Scalar
-from mpmjax.implicit._hessian import AbstractHessian
-from mpmjax.implicit._hessian_action import AbstractHessianAction, damped
+from mpmjax.implicit._hessian import AbstractHessian, AbstractHessianAction, damped
 from mpmjax.implicit._operator import ImplicitOperator
 from mpmjax.implicit._potential import ElasticPotential
 from mpmjax.implicit._preconditioner import AbstractPreconditioner

@@ -7,7 +7,7 @@ from mpmjax.state._attachment import (
     PointsAt as PointsAt,
 )
 from mpmjax.state._averaged_volume import (
-    AveragedTangent as AveragedTangent,
+    AveragedStiffness as AveragedStiffness,
     AveragedVolume as AveragedVolume,
     VolumeAverage as VolumeAverage,
 )
@@ -29,7 +29,7 @@ from mpmjax.state._loads import (
     Traction as Traction,
     load_force as load_force,
     points_of as points_of,
-    supports_of as supports_of,
+    terms_of as terms_of,
 )
 from mpmjax.state._material_points import MaterialPoints as MaterialPoints
 from mpmjax.state._order import (
@@ -53,5 +53,4 @@ from mpmjax.state._particles import (
 )
 from mpmjax.state._preparation import is_prepared as is_prepared, prepare as prepare
 from mpmjax.state._scene import RigidMaterial as RigidMaterial, Scene as Scene, attach as attach
-from mpmjax.state._support import Support as Support, SupportStiffness as SupportStiffness, stiffness_of as stiffness_of
 from mpmjax.state._velocity_gradient import velocity_gradient as velocity_gradient

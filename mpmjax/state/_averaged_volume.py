@@ -8,10 +8,10 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix
-from mpmjax.boundary import Mirror
 from mpmjax.checks import as_plain, require, require_fields
 from mpmjax.discretisation import BSpline, Grid, SplineGradient, Stencil, gather, make_stencil, scatter
 from mpmjax.material import AbstractElastic
+from mpmjax.potential import AbstractStiffness, Displacement, Forces, Mirror
 
 
 class AveragedVolume(eqx.Module):
@@ -210,3 +210,58 @@ class AveragedTangent(eqx.Module):
         stress = at.scale * (dP + dy * self.P) + inward * self.cofactor
         stress = stress + self.pull * la.cofactor_differential(at.F, dF)
         return stress, (along - self.tau * d_mean / at.mean) / (d * at.mean)
+
+    def at_fixed_means(self, dF: Matrix) -> Matrix:
+        """δP where no mean changes, δJ̄ = 0."""
+        return self.local(dF, jnp.zeros_like(self.tau))[0]
+
+    def stiffness(self, rows: tuple[int, int], flux: Callable[[Matrix], Matrix]) -> "AveragedStiffness":
+        """The rest of the map, beside `at_fixed_means`, on the nodes.
+
+        Args:
+            rows: first particle of the material and the one after the last.
+            flux: from a stress [Pa] to the flux of its particles [J], the derivative's direction first.
+        """
+        volume = self.at.average.volume
+        own, mean = self.local(jnp.zeros_like(self.cofactor), jnp.ones_like(volume))
+        return AveragedStiffness(rows, self.at.average, flux(self.cofactor), flux(own), volume * mean)
+
+
+class AveragedStiffness(AbstractStiffness):
+    """The part of H by which averaged volumes couple the particles of one material: with the slopes g of the
+    displacement, δJ = c : g, the mean δJ̄ = S V0 δJ, and the matrix K of each particle at fixed means,
+
+        flux = K g + b δJ̄ + V0 c S (b : g + k δJ̄)
+
+    (see `AveragedTangent`)."""
+
+    rows: tuple[int, int] = eqx.field(static=True)
+    """First particle and the one after the last."""
+    average: VolumeAverage
+    """S."""
+    volumetric: Matrix
+    """V0 c [m^d], shape (d, d, q), the derivative's direction first."""
+    coupling: Matrix
+    """b [J], likewise."""
+    bulk: Float[Array, "q"]
+    """k [J], shape (q,)."""
+
+    def __call__(self, moved: Displacement) -> Forces:
+        """b δJ̄ + V0 c S (b : g + k δJ̄)."""
+        slopes = moved.at_particles[1]
+        g = slopes[..., slice(*self.rows)]
+        mean = self.average.spread(la.double_dot(self.volumetric, g))
+        back = self.average.spread(la.double_dot(self.coupling, g) + self.bulk * mean)
+        return self._of_all(self.coupling * mean + self.volumetric * back, slopes.shape[-1])
+
+    def diagonal(self, stencil: Stencil, size: int) -> Forces:
+        """The diagonal of each particle's matrix if volumes were not averaged, without that of K [J]."""
+        del size
+        c = self.volumetric / self.average.volume
+        return self._of_all(2 * self.coupling * c + self.bulk * c**2, len(stencil.inside))
+
+    def _of_all(self, own: Matrix, count: int) -> Forces:
+        """Slopes of this material's particles, zero for those of others."""
+        if self.rows != (0, count):
+            own = jnp.zeros((*own.shape[:-1], count), own.dtype).at[..., slice(*self.rows)].set(own)
+        return Forces(slopes=own)

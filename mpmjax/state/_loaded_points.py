@@ -1,13 +1,15 @@
 """Points that are attached to particles, in a step: how the nodes move them, and how forces on them reach the nodes."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Float, Matrix, NodeVector, ParticleMatrix, Scalar, components
-from mpmjax.boundary import Mirror
+from mpmjax._types import Array, Float, Int, Matrix, NodeVector, ParticleMatrix, Scalar, components
 from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.material import AbstractLaw
+from mpmjax.potential import AbstractSpring, Displacement, Forces
 from mpmjax.state._attachment import AttachedPoints
 from mpmjax.state._particles import Particles
 
@@ -34,8 +36,8 @@ class LoadedPoints(eqx.Module):
     """r_s [m]: F_p R_s, in the total description R_s."""
     stencil: Stencil
     """Nodes, weights and derivatives of the particle that each point is attached to."""
-    mirror: Mirror
-    """The mirrors on which the nodes are folded."""
+    particle: Int[Array, "s"]
+    """The number of that particle, shape (s,)."""
 
     def after(self, time: Scalar) -> "LoadedPoints":
         """The points moved on by a time [s] with their velocity, and turned with its gradient."""
@@ -46,20 +48,74 @@ class LoadedPoints(eqx.Module):
             lambda p: (p.x, p.deformation), self, (self.x + time * self.v, F), is_leaf=lambda leaf: leaf is None
         )
 
-    def displacement(self, u: NodeVector) -> Float[Array, "d s"]:
-        """Σ_i N_is u_i, of a displacement or velocity of the nodes, shape (n, d)."""
-        value, slopes = gather(self.stencil, self.mirror.unfold(u))
+    def displacement(self, moved: Displacement) -> Float[Array, "d s"]:
+        """Σ_i N_is u_i, of a displacement or velocity of the nodes."""
+        if moved.at_rest:
+            return jnp.zeros_like(self.x)
+        value, slopes = gather(self.stencil, moved.nodes)
         return value + sum(r * slope for r, slope in zip(self.arm, slopes, strict=True))
 
     def nodal(self, force: Float[Array, "d s"], size: int) -> NodeVector:
         """Σ_s N_is f_s, the transpose of `displacement`, shape (n, d)."""
-        return self.mirror.fold(scatter(self.stencil, force, self.arm[:, None] * force, size))
+        return scatter(self.stencil, force, self.arm[:, None] * force, size)
 
-    def diagonal(self, coefficient: Float[Array, "d s"], like: NodeVector) -> NodeVector:
+    def diagonal(self, coefficient: Float[Array, "d s"], size: int) -> NodeVector:
         """Σ_s (w_ip² + Σ_b g_ip,b² r_sb²) k_s [N/m], shape (n, d): a non-negative approximation of the diagonal of
         Σ_s N_is k_s N_js, exact where the arms are zero."""
-        squares = scatter(self.stencil.squared, coefficient, self.arm[:, None] ** 2 * coefficient, like.shape[0])
-        return self.mirror.fold_scalars(squares)
+        return scatter(self.stencil.squared, coefficient, self.arm[:, None] ** 2 * coefficient, size)
+
+    def at_particles(
+        self, rates: Float[Array, "s"], mass: Float[Array, "p"], steepness: Float[Array, "p"]
+    ) -> Float[Array, "p"]:
+        """Σ_s k_s (1 + A_p r_s²)/m_p of each particle, shape (p,), from k_s of each point: a bound of Σ_i N_is² k_s/m_i
+        for a particle alone on the grid."""
+        reach = 1 + (self.arm**2).sum(axis=0) * steepness[self.particle]
+        return jnp.zeros_like(mass).at[self.particle].add(rates * reach) / mass
+
+
+class Support(AbstractSpring):
+    """Springs ½ k_s (e_s + N_s u)² between points and the ground, and dashpots of resistance Σ_s N_sᵀ c_s N_s v."""
+
+    points: LoadedPoints
+    stiffness: Float[Array, "d s"]
+    """k_s in each direction [N/m]."""
+    stretch: Float[Array, "d s"]
+    """e_s [m], at the start of the step."""
+    damping: Float[Array, "d s"] | None
+    """c_s [N s/m]; None without dashpots."""
+
+    def elongation(self, moved: Displacement) -> Float[Array, "d s"]:
+        return self.points.displacement(moved)
+
+    def spread(self, amount: Float[Array, "d s"], size: int) -> Forces:
+        return Forces(nodes=self.points.nodal(amount, size))
+
+    def spread_square(self, amount: Float[Array, "d s"], size: int) -> Forces:
+        return Forces(nodes=self.points.diagonal(amount, size))
+
+    @property
+    def viscous(self) -> bool:
+        return self.damping is not None
+
+    def resistance(self, velocity: Displacement) -> Forces | None:
+        return None if self.damping is None else self.spread(self.damping * self.elongation(velocity), velocity.size)
+
+    def drag(self, size: int) -> tuple[Forces, Float[Array, ""]] | None:
+        """At the points' velocity."""
+        if self.damping is None:
+            return None
+        return self.spread(-self.damping * self.points.v, size), (self.damping * self.points.v**2).sum()
+
+    def damped(self, rate: Scalar) -> "Support":
+        """Springs of k + r c."""
+        return self if self.damping is None else replace(self, stiffness=self.stiffness + rate * self.damping)
+
+    def stability_rates(self, mass: Float[Array, "p"], steepness: Array) -> tuple[Array, Array | float]:
+        """Twice what a particle alone feels, which covers transfers that forget the affine velocity."""
+        z = self.points.at_particles(2 * self.stiffness.max(axis=0), mass, steepness)
+        if self.damping is None:
+            return z, 0.0
+        return z, self.points.at_particles(4 * self.damping.max(axis=0), mass, steepness)
 
 
 def loaded_points(
@@ -96,7 +152,7 @@ def loaded_points(
         area=None if on.area is None else jnp.asarray(on.area, dtype).T,
         arm=kept,
         stencil=stencil.of(rows),
-        mirror=Mirror(()),
+        particle=rows,
     )
 
 

@@ -22,16 +22,17 @@ from mpmjax.geometry import (
     vector_size,
 )
 from mpmjax.material import AbstractLaw
+from mpmjax.potential import AbstractTerm
 from mpmjax.state._attachment import AbstractPlace, AttachedPoints
-from mpmjax.state._loaded_points import LoadedPoints, loaded_points
+from mpmjax.state._loaded_points import LoadedPoints, Support, loaded_points
 from mpmjax.state._particles import Particles
-from mpmjax.state._support import Support
 
 
 class AbstractLoad(eqx.Module):
     """A force on points that are attached to a body.
 
-    One of one's own says `on` which points and gives their `force`.
+    One of one's own says `on` which points, and gives their `force`, or a `term` with an energy of their displacement,
+    or both.
     """
 
     on: eqx.AbstractVar[AbstractPlace]
@@ -43,9 +44,9 @@ class AbstractLoad(eqx.Module):
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"] | None:
         """The force on each point [N], shape (d, s), at time t, in a step of dt, or None for none; constant over it."""
 
-    def support(self, points: LoadedPoints, t: Scalar) -> Support | None:
-        """The load's part of the grid's elastic energy and viscosity, linear in the motion of the points.
-        Default: None, nothing."""
+    def term(self, points: LoadedPoints, t: Scalar) -> AbstractTerm | None:
+        """The term of the potential that it adds in a step, with the ground as at time t: part of implicit solves,
+        `stable_dt` and budgets. Default: None."""
         del points, t
         return None
 
@@ -203,12 +204,12 @@ class Spring(AbstractLoad):
             f"A Spring's motion must have {dim} coordinates, got {self.motion and self.motion.dim}.",
         )
 
-    def support(self, points: LoadedPoints, t: Scalar) -> Support:
+    def term(self, points: LoadedPoints, t: Scalar) -> Support:
         """The energy ½ k (x + u − x_0 − d)² and the resistance c."""
         ground = points.place if self.motion is None else self.motion.place(points.place.T, t).T
         stiffness = _along(self.stiffness, points)
         damping = None if self.damping is None else _along(self.damping, points)
-        return Support(points, stiffness, points.x - ground, damping)
+        return Support(points=points, stiffness=stiffness, stretch=points.x - ground, damping=damping)
 
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"] | None:
         """c ḋ, with which a ground that moves drags the points along."""
@@ -247,7 +248,7 @@ def load_force(
     part: float,
     size: int,
 ) -> NodeVector | None:
-    """The forces of loads at the nodes [N], shape (n, d), without their supports; None without any.
+    """The forces of loads at the nodes [N], shape (n, d), without those of their terms; None without any.
 
     Args:
         loads: the loads.
@@ -267,10 +268,10 @@ def load_force(
     return total
 
 
-def supports_of(loads: tuple[AbstractLoad, ...], points: tuple[LoadedPoints, ...], t: Scalar) -> tuple[Support, ...]:
-    """The supports of loads, with the ground where it is at time t [s]."""
-    supports = (load.support(at, t) for load, at in zip(loads, points, strict=True))
-    return tuple(support for support in supports if support is not None)
+def terms_of(loads: tuple[AbstractLoad, ...], points: tuple[LoadedPoints, ...], t: Scalar) -> tuple[AbstractTerm, ...]:
+    """The terms that loads add to the potential, with the ground where it is at time t [s]."""
+    each = zip(loads, points, strict=True)
+    return tuple(term for load, own in each if (term := load.term(own, t)) is not None)
 
 
 class AbstractBodyForce(eqx.Module):

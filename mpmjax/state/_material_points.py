@@ -9,7 +9,8 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix
 from mpmjax.material import AbstractElastic, AbstractTangent, Viscosity
 from mpmjax.native import stored
-from mpmjax.state._averaged_volume import VolumeAverage, averaged_deformation
+from mpmjax.potential import AbstractStiffness
+from mpmjax.state._averaged_volume import AveragedTangent, VolumeAverage, averaged_deformation
 
 
 class MaterialPoints(eqx.Module):
@@ -85,14 +86,23 @@ class MaterialPoints(eqx.Module):
         P = stored(self.volume * P)
         return P if self.total else self.law.kinematics.flux(P, self.deformation, dim)
 
-    def stiffness(self, tangent: Callable[[Deformation], Deformation], dim: int) -> Float[Array, "t q"]:
+    def stiffness(
+        self, tangent: Callable[[Deformation], Deformation], dim: int
+    ) -> tuple[Float[Array, "t q"], tuple[AbstractStiffness, ...]]:
         """The upper triangle of the symmetric matrix of ∇u ↦ `flux` of the stress differential [J], row by row, shape
-        (d²(d² + 1)/2, q). Rows and columns are the components of ∇u, the derivative's direction first.
+        (d²(d² + 1)/2, q), and what couples the particles besides. Rows and columns are the components of ∇u, the
+        derivative's direction first.
 
         Args:
             tangent: the stress differential δF ↦ δP.
             dim: d.
         """
+        if isinstance(tangent, AveragedTangent):
+            part = tangent.stiffness(self.rows, lambda P: la.transpose(self.flux(P, dim)))
+            return self._matrices(tangent.at_fixed_means, dim), (part,)
+        return self._matrices(tangent, dim), ()
+
+    def _matrices(self, tangent: Callable[[Deformation], Deformation], dim: int) -> Float[Array, "t q"]:
         like = jnp.zeros((dim, dim, *self.volume.shape), self.volume.dtype)
         if isinstance(tangent, AbstractTangent) and self.deformation.ndim == like.ndim:
             A = la.identity_like(like) if self.total else self.deformation
@@ -107,6 +117,13 @@ class MaterialPoints(eqx.Module):
     def volume_ratio(self) -> Float[Array, "q"]:
         """J = det F [-], shape (q,)."""
         return self.law.kinematics.determinant(self.deformation)
+
+    def stiffest(self, dim: int) -> Float[Array, "q"]:
+        """Λ of each particle [Pa], shape (q,) (see `stable_dt`). Where volumes are averaged, the larger of Λ and its
+        average: the average A, of weights V0 A symmetric, has Σ V0 Λ (A J)² ≤ Σ V0 (A Λ) J²."""
+        F = self.strained(self.deformation)
+        own = self.law.tangent_eigenvalues(F, dim, total=self.total).max(axis=0)
+        return own if self.average is None else jnp.maximum(own, self.average(own))
 
     def viscous_flux(self, gradient: Matrix) -> Matrix:
         """|J| V0 σ_v [J], whose sum over g_ip is D v (derivation, eq. 28), at a velocity gradient ∇v [1/s], both of

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Int, NodeVector, Point, Scalar, particle_first
-from mpmjax.boundary import AbstractBoundary, MirrorPlace, carried_by, mirror, refuse_contact
+from mpmjax.boundary import AbstractBoundary, mirror, refuse_contact
 from mpmjax.checks import (
     checked,
     coordinates,
@@ -31,6 +31,7 @@ from mpmjax.discretisation import (
 )
 from mpmjax.geometry import Motion
 from mpmjax.material import AbstractLaw, Freedom
+from mpmjax.potential import MirrorPlace, carried_by
 from mpmjax.state._averaged_volume import AveragedVolume, volume_average
 from mpmjax.state._bodies import Bodies
 from mpmjax.state._description import AbstractDescription, UpdatedLagrangian

@@ -9,8 +9,6 @@ from mpmjax.boundary import (
     ColliderImpulse,
     Given,
     GivenCouple,
-    Image,
-    RigidImage,
     brought_images,
     impulse_on_boundaries,
     impulse_on_colliders,
@@ -20,6 +18,7 @@ from mpmjax.boundary import (
 from mpmjax.discretisation import AbstractTransfer, Gathered, Stencil
 from mpmjax.geometry import moment
 from mpmjax.material import Freedom
+from mpmjax.potential import Image, RigidImage
 from mpmjax.state import Particles, Scene
 from mpmjax.stepping._grid_update import GridUpdate, elastic_impulse, reaction
 from mpmjax.stepping._integrator import AbstractIntegrator

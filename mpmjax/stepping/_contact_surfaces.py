@@ -12,11 +12,11 @@ from mpmjax.boundary import (
     BodyContact,
     Faces,
     FaceShape,
-    Mirror,
     body_contact,
 )
 from mpmjax.discretisation import scatter
 from mpmjax.implicit import ElasticPotential
+from mpmjax.potential import Mirror
 from mpmjax.state import MaterialPoints, Particles, Scene
 
 

@@ -12,11 +12,7 @@ from mpmjax.boundary import (
     AbstractContact,
     AbstractNodes,
     Conditions,
-    Coupling,
     FreeNormal,
-    Mirror,
-    MirrorMotion,
-    Springs,
     brought_contacts,
     combined_conditions,
     mirror,
@@ -24,7 +20,8 @@ from mpmjax.boundary import (
 )
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
-from mpmjax.state import Particles, Scene, load_force, points_of, supports_of
+from mpmjax.potential import AbstractTerm, Mirror, MirrorMotion
+from mpmjax.state import Particles, Scene, load_force, points_of, terms_of
 from mpmjax.stepping._contact_surfaces import contacts_of_bodies, faces_of
 from mpmjax.stepping._rigid_layers import RigidLayers, rigid_layers
 
@@ -195,16 +192,15 @@ class Nodes(AbstractNodes):
         self,
         images: Mirror,
         fixed: Mask,
-        springs: tuple[Springs, ...],
-        couplings: tuple[Coupling, ...],
+        terms: tuple[AbstractTerm, ...],
     ) -> "Nodes":
-        """The nodes folded at these mirrors, with the components `fixed` held, and the force of the springs and
-        couplings."""
+        """The nodes folded at these mirrors, with the components `fixed` held, and the force of further terms."""
         nodes = replace(self.folded(images), conditions=replace(self.conditions, fixed=fixed, holds=True))
-        if not springs and not couplings:
+        if not terms:
             return nodes
-        nodes = replace(nodes, potential=replace(nodes.potential, springs=springs, couplings=couplings))
-        force = nodes.potential.spring_force(None)
+        potential = replace(nodes.potential, terms=nodes.potential.terms + terms)
+        force = potential.on_nodes([term.force(potential.displaced(None)) for term in terms])
+        nodes = replace(nodes, potential=potential)
         if nodes.f is None:
             return replace(nodes, v=nodes.v + nodes.dt * nodes.per_mass(force))
         return replace(nodes, f=nodes.f + force)
@@ -262,10 +258,12 @@ def particles_to_grid(
     if scene.loads:
         points = points_of(scene.loads, scene.laws, particles, stencil, total=scene.total)
         loaded = load_force(scene.loads, points, t, dt, body_force_at, size)
-        potential = replace(potential, supports=supports_of(scene.loads, points, t + body_force_at * dt))
-        held = potential.support_force() if potential.supports else None
-        if explicit_viscosity and (drag := potential.support_drag()) is not None:
-            held = drag if held is None else held + drag
+        terms = terms_of(scene.loads, points, t + body_force_at * dt)
+        potential = replace(potential, terms=terms)
+        forces = [term.force(potential.displaced(None)) for term in terms]
+        if explicit_viscosity:
+            forces += [drag for drag, _ in potential.drags()]
+        held = potential.unfolded(forces) if forces else None
 
     if joined:
         at_points = [force for force in (loaded, held) if force is not None]

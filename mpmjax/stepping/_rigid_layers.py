@@ -6,8 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
-from mpmjax.boundary import Conditions, Image, Mirror, RigidImage
+from mpmjax.boundary import Conditions
 from mpmjax.geometry import RigidBody, rigid_body, rotation_of, rotation_of_chords, spinning, turn
+from mpmjax.potential import Image, Mirror, RigidImage
 from mpmjax.state import Particles, RigidMaterial, Scene
 
 

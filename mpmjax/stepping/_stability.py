@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from functools import reduce
 from itertools import combinations
 from typing import Literal
 
@@ -11,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Float, Scalar
-from mpmjax.boundary import STIFFNESS, BodyContact, Mirror, SurfaceContact, in_a_row
+from mpmjax._types import Array, Float, NodeScalar, Scalar
+from mpmjax.boundary import STIFFNESS, AbstractContact, ConstrainedNodes, in_a_row
 from mpmjax.checks import canonical, checked, is_traced, require, require_positive
 from mpmjax.discretisation import Stencil, gather
 from mpmjax.geometry import length
-from mpmjax.state import AttachedPoints, MaterialPoints, Particles, Scene, is_prepared, points_of, prepare
+from mpmjax.potential import Mirror
+from mpmjax.state import MaterialPoints, Particles, Scene, is_prepared, points_of, prepare, terms_of
 from mpmjax.stepping._contact_surfaces import contact_moduli
 from mpmjax.stepping._explicit import Explicit
 from mpmjax.stepping._integrator import AbstractIntegrator
@@ -29,7 +29,7 @@ SAFETY = 0.7
 
 
 class UnknownBoundError(ValueError):
-    """An integrator, transfer or gradient operator gives no bound on the step."""
+    """An integrator, transfer, gradient operator or term gives no bound on the step."""
 
 
 @checked
@@ -40,6 +40,7 @@ def stable_dt(
     method: AbstractIntegrator = Explicit(),
     safety: Scalar = SAFETY,
     t1: Scalar | None = None,
+    t: Scalar = 0.0,
 ) -> Float[Array, ""]:
     """The longest step Δt [s] for which motion about the present state of the particles does not grow.
 
@@ -65,6 +66,9 @@ def stable_dt(
     whose stored gradient is multiplied by 1 − Δt a Λ_v/ρ0 in a step, or 4Ξ for PIC and FLIP, whose stored gradient is
     that of a step ago. Λ_v = |J| max(2η, 2η (1 − d/3) + dζ) is the largest eigenvalue of L ↦ |J| σ_v. The semi-implicit
     step multiplies both terms by 1 − 2β.
+
+    The terms of loads add what each of them states (`AbstractTerm.stability_rates`), springs and dashpots to the ground
+    twice what a particle by itself feels.
 
     With averaged volumes Λ is that at F̄, or its average where that is larger: an average has no larger eigenvalue.
 
@@ -94,13 +98,14 @@ def stable_dt(
         method: the integrator.
         safety: factor of the bound.
         t1: end time [s]. If given, the result is the longest step within the bound of which t1 is a multiple.
+        t: time of the state [s], at which boundaries, loads and body forces act. Default: 0.
 
     Raises:
-        ValueError: from `prepare`; a safety that is not positive; an integrator, transfer or gradient operator that
-            gives no bound; with t1, a bound that is zero or infinite.
+        ValueError: from `prepare`; a safety that is not positive; an integrator, transfer, gradient operator or term
+            that gives no bound; with t1, a bound that is zero or infinite.
     """
     require_positive("safety", safety, particles.x.dtype)
-    limit = canonical(safety, particles.x.dtype) * longest_step(scene, particles, method)
+    limit = canonical(safety, particles.x.dtype) * longest_step(scene, particles, method, t)
     if not is_traced(limit):
         require(
             not np.isnan(limit),
@@ -152,36 +157,44 @@ def _whole(limit: Array, t1: Scalar, method: str) -> Float[Array, ""]:
     return jnp.asarray(end / count, limit.dtype)
 
 
-def longest_step(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Float[Array, ""]:
+def longest_step(scene: Scene, particles: Particles, method: AbstractIntegrator, t: Scalar = 0.0) -> Float[Array, ""]:
     """`stable_dt` with a safety of one [s]; NaN if an F is not finite, or too large.
 
     Raises:
-        UnknownBoundError: an integrator, transfer or gradient operator gives no bound.
+        UnknownBoundError: an integrator, transfer, gradient operator or term gives no bound.
     """
-    scene, method = canonical((scene, method), particles.x.dtype)
-    return _limit(scene, particles if is_prepared(scene, particles) else prepare(scene, particles), method)
+    scene, method, t = canonical((scene, method, t), particles.x.dtype)
+    return _limit(scene, particles if is_prepared(scene, particles) else prepare(scene, particles), method, t)
 
 
 @eqx.filter_jit
-def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Float[Array, ""]:
-    density = particles.mass / particles.volume
-    elastic_steepness, viscous_steepness = _steepness(scene, particles)
-    materials = scene.material_points(particles)
-    stiffest = jnp.concatenate([_stiffest(points, particles.dim) for points in materials])
+def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator, t: Scalar) -> Float[Array, ""]:
+    density, stencil = particles.mass / particles.volume, scene.stencil(particles, t)
+    elastic_steepness, viscous_steepness = _steepness(scene, stencil)
+    materials = scene.material_points(particles, t)
+    stiffest = jnp.concatenate([points.stiffest(particles.dim) for points in materials])
     z = stiffest * elastic_steepness / density  # per Δt²
     if not scene.total:  # in the total description there are no such surfaces, and strains add
-        zero, one = jnp.zeros((), z.dtype), jnp.ones((), z.dtype)
-        nodes = start_nodes(scene, particles, zero, one, scene.stencil(particles))
-        z = z + 2 * _straining(scene, particles, nodes) + _contact(particles, nodes, elastic_steepness)
-        z = z + _between_bodies(scene, particles, materials, nodes)
+        nodes = start_nodes(scene, particles, t, jnp.ones((), z.dtype), stencil)
+        z = z + 2 * _straining(scene, particles, nodes)
+        brought = list(zip(nodes.brought_by, nodes.contacts, strict=True))
+        bounds = nodes.mass, particles.mass, elastic_steepness
+        z = z + _contact_rate([contact for number, contact in brought if number is not None], *bounds)
+        if scene.bodies is not None:
+            felt = _contact_rate([contact for number, contact in brought if number is None], *bounds)
+            z = z + jnp.maximum(felt, _between_bodies(scene, particles, materials))
     factor = method.stability_factor()
     if factor is None:
         raise UnknownBoundError(f"{type(method).__name__} gives no bound on its step: give dt.")
     most = jnp.concatenate([_stiffest_viscosity(points, particles.dim) for points in materials])
     y = most * viscous_steepness / density  # per Δt
     if scene.loads:
-        springs, dashpots = _supports(scene, particles, elastic_steepness)
-        z, y = z + springs, y + dashpots
+        points = points_of(scene.loads, scene.laws, particles, stencil, total=scene.total)
+        for term in terms_of(scene.loads, points, t):
+            rates = term.stability_rates(particles.mass, jnp.broadcast_to(elastic_steepness, z.shape))
+            if rates is None:
+                raise UnknownBoundError(f"{type(term).__name__} gives no bound on the step: give dt.")
+            z, y = z + rates[0], y + rates[1]
     z, y = jnp.maximum(factor * z, 0), jnp.maximum(factor * y, 0)
     square = y**2 + 16 * z
     none = square == 0  # and not what is NaN, which the least must keep
@@ -192,9 +205,10 @@ def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator) -> Fl
 def _straining(scene: Scene, particles: Particles, nodes: Nodes) -> Float[Array, "p"]:
     """The fastest rate [1/s²] at which the present acceleration a strains each particle, shape (p,): the eigenvalue of
     the symmetric part of ∇a that is largest in magnitude, or |div a| for a law that knows J alone."""
-    springs = [c.springs(c.gap < 0) for c in nodes.contacts if isinstance(c, SurfaceContact)]
-    couplings = [c.coupling(c.gap < 0) for c in nodes.contacts if isinstance(c, BodyContact)]
-    pushed = nodes.constrained(Mirror(()), nodes.conditions.fixed, tuple(springs), tuple(couplings))
+    at_rest = ConstrainedNodes(nodes, (), Mirror(()), nodes)
+    contacts = [contact for contact in nodes.contacts if contact.known_at_start]
+    springs = (contact.springs(contact.likely_held(at_rest, nodes.velocity)) for contact in contacts)
+    pushed = nodes.constrained(Mirror(()), nodes.conditions.fixed, tuple(own for own in springs if own is not None))
     a = pushed.projection.combine(pushed.per_mass(pushed.force) + pushed.acceleration, 0.0)
     _, slopes = gather(nodes.potential.stencil, nodes.mirror.unfold(a))
     rates = la.symmetric_eigen((slopes + la.transpose(slopes)) / 2)[0]
@@ -203,59 +217,22 @@ def _straining(scene: Scene, particles: Particles, nodes: Nodes) -> Float[Array,
     return jnp.concatenate([jnp.abs(r).max(axis=0) if axes else jnp.abs(r.sum(axis=0)) for axes, r in own])
 
 
-def _supports(scene: Scene, particles: Particles, steepness: Array) -> tuple[Array, Array]:
-    """What springs [1/s²] and dashpots [1/s] to the ground add to the two terms of the bound at each particle.
-
-    A particle alone with a spring k at an arm r has Σ_i N_i² k/(w_ip m_p) ≤ (1 + r·Ξr) k/m_p, and A is no less
-    than Ξ. Twice that covers transfers that forget the affine velocity.
-    """
-    z, y = jnp.zeros_like(particles.mass), jnp.zeros_like(particles.mass)
-    steepness = jnp.broadcast_to(steepness, z.shape)
-    points = points_of(scene.loads, scene.laws, particles, scene.stencil(particles), total=scene.total)
-    for load, own in zip(scene.loads, points, strict=True):
-        support = load.support(own, jnp.zeros((), z.dtype))
-        if support is None or not isinstance(load.on, AttachedPoints):
-            continue
-        rows = jnp.asarray(load.on.particle).astype(jnp.int32)
-        reach = (1 + (own.arm**2).sum(axis=0) * steepness[rows]) / particles.mass[rows]
-        z = z.at[rows].add(2 * reach * support.stiffness.max(axis=0))
-        if support.damping is not None:
-            y = y.at[rows].add(4 * reach * support.damping.max(axis=0))
-    return z, y
+def _contact_rate(
+    contacts: list[AbstractContact], nodal_mass: NodeScalar, mass: Array, steepness: Array
+) -> Array | float:
+    """What the springs of contacts add to Λ A/ρ0 [1/s²] (see `AbstractContact.stability_rate`)."""
+    kinds: dict[type[AbstractContact], list[AbstractContact]] = {}
+    for contact in contacts:
+        kinds.setdefault(type(contact), []).append(contact)
+    rates = (kind.stability_rate(tuple(own), nodal_mass, mass, steepness) for kind, own in kinds.items())
+    return sum(rates, 0.0)
 
 
-def _contact(particles: Particles, nodes: Nodes, steepness: Array) -> Float[Array, "p"] | float:
-    """n k (1 + A b²)/m of each particle [1/s²], by which springs between its face and surfaces add to Λ A/ρ0; zero in
-    a scene without surfaces. n is the largest eigenvalue of the sum of n nᵀ over the surfaces whose springs it may feel
-    now, at least one."""
-    contacts = [c for c in nodes.contacts if isinstance(c, SurfaceContact)]
-    if not contacts:
-        return 0.0
-    square = jnp.stack([(c.arm**2).sum(axis=0) for c in contacts]).max(axis=0)
-    near = reduce(jnp.add, [c.near.sum(axis=0, dtype=c.normal.dtype) * c.normal[:, None] * c.normal for c in contacts])
-    number = jnp.maximum(la.symmetric_eigen(near)[0].max(axis=0), 1)
-    stiffness = contacts[0].faces.stiffness_at(length(particles.v))
-    return number * stiffness * (1 + steepness * square) / particles.mass
-
-
-def _between_bodies(
-    scene: Scene, particles: Particles, materials: tuple[MaterialPoints, ...], nodes: Nodes
-) -> Float[Array, ""] | float:
-    """The most that the springs between bodies add to Λ A/ρ0 [1/s²].
-
-    For the present springs it is 2 max_j Σ_i k_i q_ij (1/m_j^a + 1/m_j^b), summed over the pairs of bodies, which is a
-    bound (derivation, section 12). For bodies that may meet it is 4 k/(ρ dx²), with the stiffness k of the two in a row
-    and the density ρ of the lighter: a node at a distance s from the surface has the share cos²(πs/2dx) of a spring,
-    and with the masses G(s) of the one body and G(−s) of the other that makes at most 4 k/(ρ dx²)."""
-    if scene.bodies is None:
-        return 0.0
-    felt, layers = 0.0, nodes.mass.reshape(scene.grid.layers, -1)
-    for contact in nodes.contacts:
-        if isinstance(contact, BodyContact):
-            first, second = (layers[body] for body in contact.pair)
-            reduced = in_a_row(first, second, first + second > 0)
-            share = contact.patch.spread(contact.stiffness[:, None])[:, 0]
-            felt = felt + 2 * jnp.where(reduced > 0, share / jnp.where(reduced > 0, reduced, 1), 0).max()
+def _between_bodies(scene: Scene, particles: Particles, materials: tuple[MaterialPoints, ...]) -> Float[Array, ""]:
+    """The most that the springs between bodies that may meet add to Λ A/ρ0 [1/s²]: 4 k/(ρ dx²), with the stiffness k of
+    the two in a row and the density ρ of the lighter. A node at a distance s from the surface has the share
+    cos²(πs/2dx) of a spring, and with the masses G(s) and G(−s) of the two bodies that makes at most that."""
+    assert scene.bodies is not None
     density, speed = particles.mass / particles.volume, length(particles.v)
     modulus = contact_moduli(scene, particles, materials) + density * (speed + speed.max()) ** 2
     of_body = scene.bodies.numbers(len(scene.laws))
@@ -272,15 +249,7 @@ def _between_bodies(
     added = [
         in_a_row(stiff[a], stiff[b]) / jnp.minimum(light[a], light[b]) for a, b in combinations(range(len(stiff)), 2)
     ]
-    return jnp.maximum(felt, 4 * STIFFNESS * jnp.stack(added).max() / jnp.asarray(scene.grid.spacing) ** 2)
-
-
-def _stiffest(points: MaterialPoints, dim: int) -> Float[Array, "q"]:
-    """Λ of each particle [Pa]. Where volumes are averaged, the larger of Λ and its average: the average A, of weights
-    V0 A symmetric, has Σ V0 Λ (A J)² ≤ Σ V0 (A Λ) J²."""
-    F = points.strained(points.deformation)
-    own = points.law.tangent_eigenvalues(F, dim, total=points.total).max(axis=0)
-    return own if points.average is None else jnp.maximum(own, points.average(own))
+    return 4 * STIFFNESS * jnp.stack(added).max() / jnp.asarray(scene.grid.spacing) ** 2
 
 
 def _stiffest_viscosity(points: MaterialPoints, dim: int) -> Float[Array, "q"]:
@@ -292,17 +261,17 @@ def _stiffest_viscosity(points: MaterialPoints, dim: int) -> Float[Array, "q"]:
     return most / (la.principal_frame(points.deformation)[1] ** 2).min(axis=0) if points.total else most
 
 
-def _steepness(scene: Scene, particles: Particles) -> tuple[Array, Array]:
+def _steepness(scene: Scene, stencil: Stencil) -> tuple[Array, Array]:
     """A and B [1/m²] of the bound Δt² Λ A/ρ0 + Δt Λ_v B/ρ0 ≤ 4 (derivation, eq. 34), from the scene's gradient operator
     and transfer."""
     spacing = jnp.asarray(scene.grid.spacing)
     if scene.kernel.order == 1:
-        inverse_moment = 1 / scene.stencil(particles).moment.min(axis=0)
+        inverse_moment = 1 / stencil.moment.min(axis=0)
     else:
         inverse_moment = 1 / scene.kernel.variance / spacing**2
     bound = scene.gradient.steepness(scene.kernel, spacing, inverse_moment)
     if scene.total and (bound is None or scene.kernel.order > 1):
-        bound = _steepness_here(scene.stencil(particles))
+        bound = _steepness_here(stencil)
     bounds = None if bound is None else scene.transfer.steepness(inverse_moment, bound)
     if bound is None or bounds is None:
         culprit = scene.gradient if bound is None else scene.transfer

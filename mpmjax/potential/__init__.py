@@ -1,0 +1,21 @@
+"""The nodes' potential in a step: its terms, and the mirrors on which nodes are folded."""
+
+from mpmjax.potential._mirror import (
+    Image as Image,
+    Mirror as Mirror,
+    MirrorMotion as MirrorMotion,
+    MirrorPlace as MirrorPlace,
+    RigidImage as RigidImage,
+    Tie as Tie,
+    carried_by as carried_by,
+    mirror_image as mirror_image,
+)
+from mpmjax.potential._term import (
+    AbstractSpring as AbstractSpring,
+    AbstractStiffness as AbstractStiffness,
+    AbstractTerm as AbstractTerm,
+    Displacement as Displacement,
+    Forces as Forces,
+    added as added,
+    scattered as scattered,
+)

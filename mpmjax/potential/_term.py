@@ -1,0 +1,222 @@
+"""Terms of the potential: energies of the nodes' displacement in a step, their forces and their stiffness."""
+
+import abc
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property, reduce
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Bool, Float, NodeVector, Scalar
+from mpmjax.discretisation import Stencil, gather, scatter
+
+
+class Displacement:
+    """A displacement [m] or velocity [m/s] of all nodes. Terms that need it at the particles share one gather."""
+
+    def __init__(self, stencil: Stencil, size: int, nodes: NodeVector | None = None):
+        """A field of n = `size` nodes, (n, d); None for zero, which spares the gather."""
+        self.stencil, self.size, self.at_rest = stencil, size, nodes is None
+        self._nodes = nodes
+
+    @cached_property
+    def nodes(self) -> NodeVector:
+        """u_i, shape (n, d)."""
+        weights = self.stencil.weights
+        return jnp.zeros((self.size, len(weights)), weights.dtype) if self._nodes is None else self._nodes
+
+    @cached_property
+    def at_particles(self) -> tuple[Float[Array, "d p"], Float[Array, "d d p"]]:
+        """Σ_i w_ip u_i and Σ_i g_ip u_i, the derivative's direction first."""
+        return gather(self.stencil, self.nodes)
+
+
+class Forces(NamedTuple):
+    """Forces on the nodes, f_i + Σ_p (w_ip a_p + Σ_b g_ip,b a_p,b). Those of several terms share one scatter."""
+
+    nodes: NodeVector | None = None
+    """f_i [N], shape (n, d)."""
+    value: Float[Array, "d p"] | None = None
+    """a_p [N], shape (d, p)."""
+    slopes: Float[Array, "d d p"] | None = None
+    """a_p,b [J], shape (d, d, p), the derivative's direction b first."""
+
+
+def added(forces: Sequence[Forces]) -> Forces:
+    """The sum of forces, one or more, before the scatter."""
+    parts = ([a for a in field if a is not None] for field in zip(*forces, strict=True))
+    return Forces(*(reduce(jnp.add, part) if part else None for part in parts))
+
+
+def scattered(forces: Sequence[Forces], stencil: Stencil, size: int) -> NodeVector:
+    """The sum of forces, one or more, on all nodes [N], shape (n, d)."""
+    nodes, value, slopes = added(forces)
+    if value is None and slopes is None:
+        return jnp.zeros((size, len(stencil.weights)), stencil.weights.dtype) if nodes is None else nodes
+    total = scatter(stencil, value, slopes, size)
+    return total if nodes is None else total + nodes
+
+
+class AbstractStiffness(eqx.Module):
+    """The Hessian H of a term [N/m], a symmetric linear map of displacements."""
+
+    @abc.abstractmethod
+    def __call__(self, moved: Displacement) -> Forces:
+        """H u."""
+
+    def is_positive_semidefinite(self) -> bool:
+        """Whether H is known to be positive semi-definite. Default: False."""
+        return False
+
+    def diagonal(self, stencil: Stencil, size: int) -> Forces:
+        """An approximation of the diagonal of H [N/m], for preconditioners: on nodes, and as factors of w_ip² and
+        g_ip,b². Default: zero.
+
+        Args:
+            stencil: the particles' stencil.
+            size: number of nodes.
+        """
+        del stencil, size
+        return Forces()
+
+    def damped(self, rate: Scalar) -> "AbstractStiffness":
+        """H + r D, with r [1/s] and the D of `AbstractTerm.resistance`. Default: H, for terms without resistance."""
+        del rate
+        return self
+
+
+class AbstractTerm(eqx.Module):
+    """A part of the potential Φ(u) of a step, besides the energy of the materials: an energy of the displacement u of
+    the nodes, and a resistance to their velocity.
+
+    One of your own needs `energy`; an `AbstractLoad` brings it to a scene. Its force and stiffness are derivatives of
+    the energy, unless the term has faster ones. `stable_dt` needs `stability_rates`.
+    """
+
+    @abc.abstractmethod
+    def energy(self, moved: Displacement) -> Float[Array, ""]:
+        """The energy [J] at a displacement of the nodes; any constant may be added."""
+
+    def force(self, moved: Displacement) -> Forces:
+        """Minus the derivative of the energy by the displacement. Default: by `jax.grad`."""
+
+        def energy(u: NodeVector) -> Float[Array, ""]:
+            return self.energy(Displacement(moved.stencil, moved.size, u))
+
+        return Forces(nodes=-jax.grad(energy)(moved.nodes))
+
+    def hessian(self, moved: Displacement) -> AbstractStiffness:
+        """The second derivative of the energy at a displacement. Default: by `jax.jvp` of `force`, without a share in
+        the preconditioner's diagonal."""
+        return _JvpStiffness(self, moved.nodes)
+
+    def is_admissible(self, moved: Displacement) -> Bool[Array, ""] | None:
+        """Whether the energy is defined at a displacement; None if it always is, which is the default. The line search
+        of Newton's method avoids the others."""
+        del moved
+        return None
+
+    @property
+    def viscous(self) -> bool:
+        """Whether it has a `resistance`. Default: False."""
+        return False
+
+    def resistance(self, velocity: Displacement) -> Forces | None:
+        """D v, the force that takes a velocity of the nodes, D symmetric and positive semi-definite. Default: None."""
+        del velocity
+        return None
+
+    def drag(self, size: int) -> tuple[Forces, Float[Array, ""]] | None:
+        """The viscous force at the velocity at the start of the step, for explicit integrators, and the power [W] that
+        it dissipates. Default: None.
+
+        Args:
+            size: number of nodes.
+        """
+        del size
+        return None
+
+    def stability_rates(
+        self, mass: Float[Array, "p"], steepness: Float[Array, "p"]
+    ) -> tuple[Array | float, Array | float] | None:
+        """z [1/s²] and y [1/s] of each particle, or numbers, that energy and resistance add to the left side of the
+        bound Δt² z + Δt y ≤ 4 of `stable_dt`. Default: None, for which `stable_dt` raises.
+
+        A spring k between a particle of mass m, at an arm r from it, and the ground has z = 2 k (1 + A r²)/m, and a
+        dashpot c has y = 4 c (1 + A r²)/m.
+
+        Args:
+            mass: masses of the particles m [kg], shape (p,).
+            steepness: A [1/m²] (see `stable_dt`), shape (p,).
+        """
+        del mass, steepness
+        return None
+
+
+class _JvpStiffness(AbstractStiffness):
+    term: AbstractTerm
+    at: NodeVector
+    rate: Any = None
+    """r [1/s]; None without resistance."""
+
+    def __call__(self, moved: Displacement) -> Forces:
+        def force(u: NodeVector) -> NodeVector:
+            there = Displacement(moved.stencil, moved.size, u)
+            return scattered([self.term.force(there)], moved.stencil, moved.size)
+
+        answer = -jax.jvp(force, (self.at,), (moved.nodes,))[1]
+        if self.rate is not None and (resisted := self.term.resistance(moved)) is not None:
+            answer = answer + self.rate * scattered([resisted], moved.stencil, moved.size)
+        return Forces(nodes=answer)
+
+    def damped(self, rate: Scalar) -> "_JvpStiffness":
+        return replace(self, rate=rate)
+
+
+class AbstractSpring(AbstractTerm, AbstractStiffness):
+    """Springs ½ Σ_s k_s (e_s + N_s u)² whose elongation is linear in the displacement, N a linear map. Their Hessian
+    Nᵀ k N is the same everywhere."""
+
+    stretch: eqx.AbstractVar[Array]
+    """e_s at u = 0 [m]."""
+    stiffness: eqx.AbstractVar[Array]
+    """k_s [N/m], in the same shape."""
+
+    @abc.abstractmethod
+    def elongation(self, moved: Displacement) -> Array:
+        """N u [m]."""
+
+    @abc.abstractmethod
+    def spread(self, amount: Array, size: int) -> Forces:
+        """Nᵀ a."""
+
+    @abc.abstractmethod
+    def spread_square(self, amount: Array, size: int) -> Forces:
+        """Σ_s N_si² a_s, approximately (see `diagonal`)."""
+
+    def stretched(self, moved: Displacement) -> Array:
+        """e + N u [m]."""
+        return self.stretch if moved.at_rest else self.stretch + self.elongation(moved)
+
+    def energy(self, moved: Displacement) -> Float[Array, ""]:
+        return 0.5 * (self.stiffness * self.stretched(moved) ** 2).sum()
+
+    def force(self, moved: Displacement) -> Forces:
+        return self.spread(-self.stiffness * self.stretched(moved), moved.size)
+
+    def hessian(self, moved: Displacement) -> "AbstractSpring":
+        del moved
+        return self
+
+    def __call__(self, moved: Displacement) -> Forces:
+        return self.spread(self.stiffness * self.elongation(moved), moved.size)
+
+    def is_positive_semidefinite(self) -> bool:
+        return True
+
+    def diagonal(self, stencil: Stencil, size: int) -> Forces:
+        del stencil
+        return self.spread_square(self.stiffness, size)
