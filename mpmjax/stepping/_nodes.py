@@ -356,7 +356,7 @@ def start_nodes(
     """The nodes of `particles_to_grid` with boundaries, folded at mirror planes: what an integrator is given."""
     at, viscosity = body_force_at, explicit_viscosity
     nodes = particles_to_grid(scene, particles, t, dt, stencil, body_force_at=at, explicit_viscosity=viscosity)
-    if scene.boundary or scene.bodies is not None:
+    if scene.boundary or scene.bodies is not None or scene.rigid_bodies:
         nodes = folded_at_planes(scene, particles, with_boundaries(scene, particles, nodes, t, force_at))
     return nodes
 

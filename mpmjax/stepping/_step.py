@@ -80,7 +80,7 @@ def step_unchecked(
             explicit_viscosity=method.explicit_viscosity,
             joined=not (method.needs_separate_force or scene.transfer.needs_change),
         )
-    if scene.boundary or scene.bodies is not None:
+    if scene.boundary or scene.bodies is not None or scene.rigid_bodies:
         with jax.named_scope("boundaries"):
             unfolded = with_boundaries(scene, particles, nodes, t, force_at)
             nodes = folded_at_planes(scene, particles, unfolded)
