@@ -28,6 +28,24 @@ def jolted(speed=0.3, side=3, dtype="float64", **scene):
     return scene, mpm.prepare(scene, mpm.Particles(x, v, mass, volume, (F,), X=x))
 
 
+def stage(nodes, theta=1.0, displacement=None):
+    """The equation of a stage of the whole step."""
+    return StageProblem(
+        mass=nodes.mass,
+        inertial=nodes.inertial_velocity(),
+        stage_dt=nodes.dt,
+        initial_displacement=displacement,
+        force=nodes.force,
+        spacing=nodes.spacing,
+        potential=nodes.potential,
+        hessian=mpm.AnalyticHessian(),
+        projection=nodes.projection,
+        prescribed=nodes.prescribed,
+        preconditioner=mpm.MassPreconditioner(),
+        theta=theta,
+    )
+
+
 def squeezed(rate):
     """A neo-Hookean block whose two halves rush at each other, at a rate [1/s] of compression along x."""
     scene, particles = block(2, material=LAWS["neo_hookean"])
@@ -234,11 +252,44 @@ def test_reports_of_two_solves_are_added_up():
     assert not beyond.together_with(one).nearly_converged
 
 
+@pytest.mark.parametrize(("theta", "displacement"), [(1.0, 0.0), (0.6, 1e-3)])
+def test_a_stage_is_the_gradient_of_its_incremental_potential(theta, displacement):
+    """And its operator the gradient's derivative, at any share of the displacement, with viscosity. What is linearised
+    where nothing is displaced has the same residual and operator there."""
+    scene, particles = jolted(material=mpm.Viscous(LAWS["neo_hookean"], 2.0, 1.0))
+    nodes = grid_update(scene, particles, 5e-3, mpm.SemiImplicit()).nodes
+    rng = np.random.default_rng(1)
+    v, along, u = (jnp.where(nodes.free, jnp.asarray(a), 0) for a in rng.normal(size=(3, *nodes.force.shape)))
+
+    @jax.jit
+    def differences(v, along, u):
+        problem = stage(nodes, theta, u)
+        h = 1e-4
+        energies = [problem.incremental_potential(v + k * h * along) for k in (-2, -1, 1, 2)]
+        slope = (energies[0] - 8 * energies[1] + 8 * energies[2] - energies[3]) / (12 * h)
+        change = jax.jvp(problem.residual, (v,), (along,))[1]
+        rest = problem.undisplaced_velocity()
+        linear = problem.linearised()
+        return (
+            (slope, (problem.residual(v) * along).sum()),
+            (change, problem.operator(v).mv(along)),
+            (linear.residual(rest), problem.residual(rest)),
+            (linear.operator(v).mv(along), problem.operator(rest).mv(along)),
+        )
+
+    slopes, *pairs = differences(0.3 * v, along, displacement * u)
+    np.testing.assert_allclose(*slopes, rtol=1e-7)
+    for one, other in pairs:
+        assert_close(one, other, 1e-10)
+
+
 @pytest.mark.parametrize("times", thorough(1, 20, 100))
 def test_single_precision_converges_and_says_how_far(times):
     """The residual it states is the true one, evaluated in double precision; and the iteration does not wander: at 100
-    times the limit it starts from 288 times the right-hand side, of which its own residual keeps a rounding."""
-    scene, particles = jolted(speed=1.0, side=4, dtype="float32")
+    times the limit it starts from 288 times the right-hand side, of which its own residual keeps a rounding. (H is
+    indefinite there: one start in sixty wanders to the last step, before and after any change of roundings, and none
+    with a projected Hessian.)"""
+    scene, particles = jolted(speed=0.9, side=4, dtype="float32")
     method = mpm.SemiImplicit(preconditioner=mpm.MassPreconditioner())  # whose norm is taken below
     grid = grid_update(scene, particles, times * explicit_limit(scene), method)
     assert grid.velocity.dtype == jnp.float32
@@ -246,19 +297,7 @@ def test_single_precision_converges_and_says_how_far(times):
     assert grid.info.solve.iterations < 300
     widen = lambda a: a.astype(jnp.float64) if a.dtype == jnp.float32 else a  # noqa: E731
     nodes = jax.tree.map(widen, grid.nodes)
-    problem = StageProblem(
-        mass=nodes.mass,
-        inertial=nodes.inertial_velocity(),
-        stage_dt=nodes.dt,
-        initial_displacement=None,
-        force=nodes.force,
-        spacing=nodes.spacing,
-        potential=nodes.potential,
-        hessian=mpm.AnalyticHessian(),
-        projection=nodes.projection,
-        prescribed=nodes.prescribed,
-        preconditioner=mpm.MassPreconditioner(),
-    ).linearised()
+    problem = stage(nodes).linearised()
 
     def norm(a):
         return float(jnp.sqrt((a**2 / jnp.where(nodes.occupied, nodes.mass[:, None], 1)).sum()))
