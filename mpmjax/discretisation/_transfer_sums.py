@@ -395,10 +395,8 @@ def _transpose_scatter_differential(cotangents: list, *args: Any, valued: bool, 
     del size
     nodes, rest = ad.instantiate_zeros(cotangents[0]), args[5:]
     values, moved = rest[: len(rest) // 2], rest[len(rest) // 2 :]
-    by_weights, by_derivatives, *gathered = _pull_and_gather_p.bind(
-        *args[:3], nodes, *values, valued=valued, batched=batched
-    )
-    by_changes = _of_undefined((by_weights, by_derivatives), args[3:5])
+    results = _pull_and_gather_p.bind(*args[:3], nodes, *values, valued=valued, batched=batched)
+    by_changes, gathered = _of_undefined(results[:2], args[3:5]), results[2:]
     return [None, None, None, *by_changes, *(None for _ in values), *_of_given(gathered, moved, valued)]
 
 

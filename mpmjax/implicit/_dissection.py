@@ -24,7 +24,7 @@ class Level(NamedTuple):
     own: np.ndarray
     """The numbers that are eliminated, shape (fronts, s)."""
     border: np.ndarray
-    """The unknowns that are coupled with them and with what was eliminated before, and come after, shape (fronts, b)."""
+    """The numbers coupled with them and with what was eliminated before, and that come after, shape (fronts, b)."""
     places: np.ndarray | None
     """Where own and border stand in the borders of fronts 2k and 2k + 1 of the level before, b of that level where they
     are not there, shape (fronts, 2, s + b). None at the first level."""

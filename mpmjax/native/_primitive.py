@@ -195,10 +195,10 @@ def _same(*arrays: Any) -> list[Any]:
 def _some(changes: Any) -> list[Any]:
     """Tangents or cotangents, of which those that are not zero are stored."""
     places = [i for i, change in enumerate(changes) if type(change) is not ad.Zero]
-    found = list(changes)
+    results = list(changes)
     for i, change in zip(places, _stored_p.bind(*(changes[i] for i in places)), strict=True):
-        found[i] = change
-    return found
+        results[i] = change
+    return results
 
 
 def _lowered(ctx: Any, *arrays: Any) -> Any:

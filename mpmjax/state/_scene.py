@@ -269,7 +269,7 @@ class Scene(eqx.Module):
             at = places[slice(*points.rows)]
             return replace(points, average=volume_average(grid, window, at, points.volume, images))
 
-        return tuple(averaged(own) if volume.covers(number) else own for number, own in enumerate(materials))
+        return tuple(averaged(points) if volume.covers(number) else points for number, points in enumerate(materials))
 
     def return_map(self, particles: Particles, dt: Scalar) -> Particles:
         """The particles after the return maps of laws that yield: from the trial deformation to one that the law
