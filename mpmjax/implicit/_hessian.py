@@ -217,7 +217,7 @@ class AnalyticHessian(AbstractHessian):
         return self.at(potential, None)  # without the gather
 
     def exact(self) -> "AnalyticHessian":
-        return AnalyticHessian()
+        return AnalyticHessian() if self.projected else self
 
 
 class JvpHessian(AbstractHessian):

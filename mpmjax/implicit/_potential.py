@@ -89,7 +89,9 @@ class ElasticPotential(eqx.Module):
     def force(self, u: NodeVector | None) -> NodeVector:
         """f = −∂Φ/∂u [N], shape (n, d); None for u = 0, where f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
         moved = self.displaced(u)
-        elastic = Forces(slopes=-jnp.swapaxes(self.flux(self._stress(self._deformation(moved))), 0, 1))
+        pairs = zip(self.material_points, self._deformation(moved), strict=True)
+        stress = tuple(points.stress(F) for points, F in pairs)
+        elastic = Forces(slopes=-jnp.swapaxes(self.flux(stress), 0, 1))
         return self.on_nodes([elastic, *(term.force(moved) for term in self.terms)])
 
     def flux(self, P: Deformations) -> Matrix:
@@ -98,7 +100,7 @@ class ElasticPotential(eqx.Module):
 
     def current_flux(self) -> Matrix:
         """V0_p P_p F_pᵀ at u = 0 [J], shape (d, d, p), of which the force is f_i = −Σ_p (V0_p P_p F_pᵀ) g_ip."""
-        return self.flux(self._stress(self.current_deformation()))
+        return joined([points.flux(points.stress(points.deformation), self._dim) for points in self.material_points])
 
     @property
     def viscous(self) -> bool:
@@ -160,9 +162,6 @@ class ElasticPotential(eqx.Module):
     @property
     def _dim(self) -> int:
         return len(self.stencil.weights)
-
-    def _stress(self, F: Deformations) -> Deformations:
-        return tuple(points.stress(own) for points, own in zip(self.material_points, F, strict=True))
 
 
 def displacement_gradient(moved: Displacement) -> Matrix:
