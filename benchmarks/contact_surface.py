@@ -29,7 +29,7 @@ SPEED = 0.01
 """Of the impact, in wave speeds."""
 
 
-class NodeContact(mpm.AbstractContact):
+class NodeContact(mpm.boundary.AbstractContact):
     """Contact at nodes: each node at or beyond the wall is held where it would enter, and released where it is
     pulled."""
 
@@ -45,7 +45,7 @@ class NodeContact(mpm.AbstractContact):
         return active[:, None] & (jnp.arange(shape[1]) == 0)
 
 
-class NodeWall(mpm.AbstractBoundary):
+class NodeWall(mpm.boundary.AbstractBoundary):
     """The wall of contact at nodes, across the first axis."""
 
     position: float | Array
@@ -55,13 +55,13 @@ class NodeWall(mpm.AbstractBoundary):
         return None
 
     def conditions(self, nodes, spacing, t, dt, *, reference):
-        return mpm.Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes))
+        return mpm.boundary.Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes))
 
     def contacts(self, conditions, grid, window, t, dt):
         return (NodeContact(grid.nodes(window)[:, 0] <= self.position + 1e-3 * grid.spacing),)
 
 
-WALLS: dict[str, Callable[[float, int], mpm.AbstractBoundary]] = {
+WALLS: dict[str, Callable[[float, int], mpm.boundary.AbstractBoundary]] = {
     "at nodes, as it was": lambda at, d: NodeWall(at),
     "SeparatingBox": lambda at, d: mpm.SeparatingBox((at, *(-INF,) * (d - 1)), (INF,) * d),
     "SeparatingCollider": lambda at, d: mpm.SeparatingCollider(

@@ -28,7 +28,7 @@ WALLS = {
 }
 
 
-def energy(wall: mpm.AbstractBoundary, periods: int) -> np.ndarray:
+def energy(wall: mpm.boundary.AbstractBoundary, periods: int) -> np.ndarray:
     """The energy of each step, averaged over the period before it, over that of the first period."""
     dx = 1 / CELLS
     grid = mpm.Grid((CELLS + 12,), dx, origin=(-4,))

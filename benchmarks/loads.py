@@ -20,7 +20,7 @@ E, NU, INNER, OUTER, PRESSURE = 1e5, 0.3, 0.5, 1.0, 10.0
 TIGHT = mpm.ConjugateResidual(rtol=1e-10, max_steps=20_000)
 
 
-class Ring(mpm.AbstractRegion):
+class Ring(mpm.geometry.AbstractRegion):
     """Between two circles about the origin."""
 
     inner: float = INNER

@@ -17,7 +17,7 @@ import numpy as np
 
 import mpmjax as mpm
 
-Wall = Callable[[mpm.Motion], mpm.AbstractBoundary]
+Wall = Callable[[mpm.Motion], mpm.boundary.AbstractBoundary]
 WALLS: dict[str, Wall] = {
     "SymmetryPlane": lambda m: mpm.SymmetryPlane(0, 0.0, motion=m),
     "SlipBox": lambda m: mpm.SlipBox((0.0,), (np.inf,), m),

@@ -164,7 +164,7 @@ def swing(
     cells: int,
     volume: Volume,
     description: mpm.UpdatedLagrangian | mpm.TotalLagrangian,
-    method: mpm.AbstractIntegrator,
+    method: mpm.stepping.AbstractIntegrator,
     dt: float | None = None,
     nu: float = 0.4999,
     periods: float = 4.0,
@@ -219,7 +219,7 @@ def swings() -> None:
                 )
 
 
-def stepping(choice: mpm.AbstractPreconditioner, rtol: float) -> Callable:
+def stepping(choice: mpm.implicit.AbstractPreconditioner, rtol: float) -> Callable:
     """A compiled step of scene, particles and Δt."""
     method = mpm.SemiImplicit(solver=mpm.ConjugateResidual(rtol=rtol, max_steps=100_000), preconditioner=choice)
     return jax.jit(lambda scene, particles, dt: mpm.step(scene, particles, 0.0, dt, method=method))

@@ -37,7 +37,7 @@ def block(d: int, n: int, part: str, contrast: float) -> tuple[mpm.Scene, mpm.Pa
 
 
 def iterations(
-    scene: mpm.Scene, particles: mpm.Particles, dt: float, preconditioner: mpm.AbstractPreconditioner
+    scene: mpm.Scene, particles: mpm.Particles, dt: float, preconditioner: mpm.implicit.AbstractPreconditioner
 ) -> float:
     """Of each of three steps from rest, on average."""
     method = mpm.SemiImplicit(preconditioner=preconditioner, solver=mpm.ConjugateResidual(max_steps=20000))

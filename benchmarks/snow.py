@@ -114,7 +114,7 @@ def account(name: str, n: int) -> dict[str, Any]:
         f"{name}: {particles.count} particles, {steps} steps of {DT / limit:.1f} times the explicit limit at the end, "
         f"{float(statistics.iterations) / steps:.1f} iterations a step, {int(statistics.unconverged)} unconverged, "
         f"fault {int(statistics.fault)}; J_P from {packed.min():.3f} to {packed.max():.3f}, in "
-        f"{mpm.pieces(scene, after)} pieces; kinetic energy at the start {before:.4g} J"
+        f"{mpm.analysis.pieces(scene, after)} pieces; kinetic energy at the start {before:.4g} J"
     )
     print("   " + ", ".join(f"{k} {v:.3g}" for k, v in sums.items()) + " J")
     closing = float(jnp.abs(energy.change - energy.explained).max() / jnp.abs(energy.kinetic).max())

@@ -8,11 +8,11 @@ Prints for each problem what the cheapest run within one per cent is and what th
 or implicit, takes; writes docs/work_precision.csv and docs/work_precision.png. `--only` some problems replaces theirs.
 `--quick` runs a few lines on the coarse grids and writes nothing.
 
-The error is that of `mpmjax.work_precision`: the largest over eight times of the RMS over particles of the distance to
-the reference, over the largest RMS displacement. The reference is the exact motion where there is one, or else a run
-of TR-BDF2 refined in space and time together, whose last change is the estimate of its own error. Seconds are wall time
-without compilation, the least of three rounds in which the settings take turns. Explicit steps are tried at 2, √2, 1
-and ½ times `stable_dt` of the whole motion, implicit ones from eight in all to ever more, until the error falls no
+The error is that of `mpmjax.analysis.work_precision`: the largest over eight times of the RMS over particles of the
+distance to the reference, over the largest RMS displacement. The reference is the exact motion where there is one, or
+else a run of TR-BDF2 refined in space and time together, whose last change is the estimate of its own error. Seconds
+are wall time without compilation, the least of three rounds in which the settings take turns. Explicit steps are tried
+at 2, √2, 1 and ½ times `stable_dt` of the whole motion, implicit ones from eight in all to ever more, until the error falls no
 further. What would take longer than a limit is not run: its time is foreseen from fewer steps.
 
 A small error between two large ones is where the error changes its sign. So a run counts, in the sentences and for the

@@ -49,7 +49,7 @@ class Family(NamedTuple):
     start: dict[str, float]
     parameters: dict[str, Any]
     friction: float = 0.0  # of the floor
-    filmed_by: mpm.AbstractIntegrator = mpm.Explicit()  # implicit steps stiffen what yields
+    filmed_by: mpm.stepping.AbstractIntegrator = mpm.Explicit()  # implicit steps stiffen what yields
     film_steps: int = 25  # a frame, on the coarsest grid
 
 

@@ -3,28 +3,12 @@
 from mpmjax import fitting as fitting, linalg as linalg
 from mpmjax._types import Corner as Corner
 from mpmjax.analysis import (
-    Budget as Budget,
-    Energy as Energy,
-    EnergyBudget as EnergyBudget,
-    MomentumBudget as MomentumBudget,
-    Sensitivity as Sensitivity,
-    Trial as Trial,
-    WorkPrecision as WorkPrecision,
     budget as budget,
     energy as energy,
     momentum as momentum,
-    pieces as pieces,
     sensitivity as sensitivity,
-    work_precision as work_precision,
 )
 from mpmjax.boundary import (
-    AbstractBoundary as AbstractBoundary,
-    AbstractCollider as AbstractCollider,
-    AbstractContact as AbstractContact,
-    BoundaryImpulse as BoundaryImpulse,
-    ColliderImpulse as ColliderImpulse,
-    Conditions as Conditions,
-    ConstrainedNodes as ConstrainedNodes,
     ContactPlane as ContactPlane,
     Grip as Grip,
     RigidPart as RigidPart,
@@ -34,18 +18,13 @@ from mpmjax.boundary import (
     SlipCollider as SlipCollider,
     StickyBox as StickyBox,
     StickyCollider as StickyCollider,
-    Surface as Surface,
     SymmetryPlane as SymmetryPlane,
-    Wall as Wall,
 )
 from mpmjax.discretisation import (
     APIC as APIC,
     FLIP as FLIP,
     PIC as PIC,
-    AbstractGradient as AbstractGradient,
-    AbstractTransfer as AbstractTransfer,
     BSpline as BSpline,
-    Gathered as Gathered,
     Grid as Grid,
     MLSGradient as MLSGradient,
     SplineGradient as SplineGradient,
@@ -67,8 +46,6 @@ from mpmjax.fitting import (
     fit as fit,
 )
 from mpmjax.geometry import (
-    AbstractMotion as AbstractMotion,
-    AbstractRegion as AbstractRegion,
     Annulus as Annulus,
     Ball as Ball,
     Box as Box,
@@ -85,9 +62,6 @@ from mpmjax.geometry import (
     sample_mesh as sample_mesh,
 )
 from mpmjax.implicit import (
-    AbstractHessian as AbstractHessian,
-    AbstractPreconditioner as AbstractPreconditioner,
-    AbstractSolution as AbstractSolution,
     AnalyticHessian as AnalyticHessian,
     ConjugateResidual as ConjugateResidual,
     DiagonalPreconditioner as DiagonalPreconditioner,
@@ -96,15 +70,12 @@ from mpmjax.implicit import (
     Linearised as Linearised,
     MassPreconditioner as MassPreconditioner,
     Newton as Newton,
-    SolveInfo as SolveInfo,
     VolumePreconditioner as VolumePreconditioner,
-    no_solve as no_solve,
 )
 from mpmjax.io import load as load, record as record, register as register, save as save
 from mpmjax.material import (
     AbstractInelastic as AbstractInelastic,
     AbstractMaterial as AbstractMaterial,
-    AbstractTangent as AbstractTangent,
     CamClay as CamClay,
     DruckerPrager as DruckerPrager,
     FixedCorotated as FixedCorotated,
@@ -121,7 +92,7 @@ from mpmjax.material import (
     VonMises as VonMises,
     Yeoh as Yeoh,
 )
-from mpmjax.native import Backend as Backend, backend as backend
+from mpmjax.native import backend as backend
 from mpmjax.simulation import (
     Fault as Fault,
     Run as Run,
@@ -130,9 +101,6 @@ from mpmjax.simulation import (
     simulate as simulate,
 )
 from mpmjax.state import (
-    AbstractBodyForce as AbstractBodyForce,
-    AbstractLoad as AbstractLoad,
-    AbstractPlace as AbstractPlace,
     AttachedPoints as AttachedPoints,
     AveragedVolume as AveragedVolume,
     Bodies as Bodies,
@@ -155,14 +123,10 @@ from mpmjax.state import (
 )
 from mpmjax.stepping import (
     TRBDF2 as TRBDF2,
-    AbstractIntegrator as AbstractIntegrator,
     BackwardEuler as BackwardEuler,
     Explicit as Explicit,
     ImplicitMidpoint as ImplicitMidpoint,
-    NodeMotion as NodeMotion,
-    Nodes as Nodes,
     SemiImplicit as SemiImplicit,
-    StepInfo as StepInfo,
     stable_dt as stable_dt,
     step as step,
 )

@@ -11,7 +11,7 @@ from mpmjax._types import Array, ParticleVector, Scalar
 from mpmjax.stepping._step import step_compiled
 
 
-class Wind(mpm.AbstractBodyForce):
+class Wind(mpm.state.AbstractBodyForce):
     """b = (1 + rate t) strength, plus slope times x."""
 
     strength: Array

@@ -12,7 +12,7 @@ from helpers import ELASTIC, FLUIDS, METHODS, PLASTIC, RUBBER, SECOND_ORDER, VIS
 
 import mpmjax as mpm
 from mpmjax.checks._values import canonical, first_unmet, requirements
-from mpmjax.material import Tait
+from mpmjax.material._fluid import Tait
 
 MOTION = mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.1, 0.1)))
 TURN = mpm.RigidMotion((0.0, 1.0), ((0.0, 0.0), (0.1, 0.1)), (0.0, 1.0), (0.2, 0.2))

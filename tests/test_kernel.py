@@ -255,7 +255,7 @@ def test_factors_are_polynomials_of_places(kernel, gradient, d):
 def test_no_places_where_factors_are_others():
     """Around a periodic axis, for another gradient operator, and in what is made of a stencil."""
 
-    class Half(mpm.AbstractGradient):
+    class Half(mpm.discretisation.AbstractGradient):
         def derivatives(self, spline, least_squares):
             return (spline + least_squares) / 2
 

@@ -14,7 +14,7 @@ from mpmjax.io._schema import decode, encode
 
 
 @mpm.register
-class Whirl(mpm.AbstractBoundary):
+class Whirl(mpm.boundary.AbstractBoundary):
     """Nodes beyond a radius turn about the origin at a given rate [1/s]."""
 
     radius: float | jax.Array
@@ -27,11 +27,11 @@ class Whirl(mpm.AbstractBoundary):
     def conditions(self, nodes, spacing, t, dt, *, reference):
         outside = ((nodes**2).sum(axis=1) >= self.radius**2)[:, None]
         v = self.rate * jnp.stack([-nodes[:, 1], nodes[:, 0]], axis=1)
-        return mpm.Conditions(jnp.broadcast_to(outside, nodes.shape), jnp.where(outside, v, 0))
+        return mpm.boundary.Conditions(jnp.broadcast_to(outside, nodes.shape), jnp.where(outside, v, 0))
 
 
 @mpm.register
-class Gust(mpm.AbstractBodyForce):
+class Gust(mpm.state.AbstractBodyForce):
     """A constant b [m/s²] that begins at a time [s]."""
 
     strength: tuple[float, ...]

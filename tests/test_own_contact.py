@@ -12,7 +12,7 @@ import mpmjax as mpm
 from mpmjax._types import Array
 
 
-class GlueContact(mpm.AbstractContact):
+class GlueContact(mpm.boundary.AbstractContact):
     """Each column of nodes along the axis is a place, held at its nodes on and beyond the wall."""
 
     axis: int = eqx.field(static=True)
@@ -49,7 +49,7 @@ class GlueContact(mpm.AbstractContact):
 
 
 @mpm.register
-class GluedWall(mpm.AbstractBoundary):
+class GluedWall(mpm.boundary.AbstractBoundary):
     """A wall at right angles to an axis along which material slides, and which it leaves where it pulls harder than the
     glue bears [Pa]."""
 
@@ -67,7 +67,7 @@ class GluedWall(mpm.AbstractBoundary):
         return 1 if self.keep == "above" else -1
 
     def conditions(self, nodes, spacing, t, dt, *, reference):
-        return mpm.Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes))
+        return mpm.boundary.Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes))
 
     def contacts(self, conditions, grid, window, t, dt):
         beyond = self.inward * (grid.nodes(window)[:, self.axis] - self.position) <= 1e-3 * grid.spacing
@@ -75,7 +75,7 @@ class GluedWall(mpm.AbstractBoundary):
         return (GlueContact(self.axis, grid.shape, self.inward, beyond, bears),)
 
     def walls(self):
-        return (mpm.Wall(self.axis, float(self.position), self.inward),)
+        return (mpm.boundary.Wall(self.axis, float(self.position), self.inward),)
 
 
 DENSITY, HEIGHT, G = 1e3, 0.4, 10.0

@@ -11,7 +11,7 @@ import mpmjax as mpm
 
 
 @mpm.register
-class BlendedGradient(mpm.AbstractGradient):
+class BlendedGradient(mpm.discretisation.AbstractGradient):
     """The gradient of the spline with a given share, that of moving least squares with the rest."""
 
     share: float | jax.Array = 0.5

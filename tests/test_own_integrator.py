@@ -13,7 +13,7 @@ import mpmjax as mpm
 
 
 @mpm.register
-class DampedEuler(mpm.AbstractIntegrator):
+class DampedEuler(mpm.stepping.AbstractIntegrator):
     """Symplectic Euler with mass-proportional damping: M (v^{n+1} − v^n) = Δt (f + M g) − γ Δt M v^{n+1}."""
 
     damping: float | jax.Array = 0.0
@@ -24,7 +24,7 @@ class DampedEuler(mpm.AbstractIntegrator):
         del guess
         v = nodes.explicit_velocity() / (1 + self.damping * nodes.dt)
         v = nodes.projection.combine(v, nodes.prescribed)
-        return mpm.NodeMotion(v), mpm.no_solve(v.dtype)
+        return mpm.stepping.NodeMotion(v), mpm.implicit.no_solve(v.dtype)
 
     def elastic_impulse(self, nodes, motion):
         drag = self.damping * nodes.mass[:, None] * motion.velocity
@@ -132,7 +132,7 @@ def test_what_is_forgotten_is_said():
         needs_separate_force: ClassVar[bool] = False
 
         def advance(self, nodes, guess):
-            return mpm.NodeMotion(nodes.velocity), mpm.no_solve(guess.dtype)
+            return mpm.stepping.NodeMotion(nodes.velocity), mpm.implicit.no_solve(guess.dtype)
 
     with pytest.raises(ValueError, match="needs_separate_force = True"):
         mpm.step(*falling(), 0.0, 1e-3, method=Hasty())

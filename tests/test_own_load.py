@@ -14,10 +14,10 @@ from mpmjax._types import Array, Float, Scalar
 from mpmjax.state import LoadedPoints
 
 
-class Drag(mpm.AbstractLoad):
+class Drag(mpm.state.AbstractLoad):
     """−½ ρ c ‖v‖ v per area."""
 
-    on: mpm.AbstractPlace
+    on: mpm.state.AbstractPlace
     density: Scalar
     coefficient: Scalar = 1.0
 
@@ -40,10 +40,10 @@ def test_a_load_of_ones_own_acts_and_is_kept_in_files(tmp_path):
     assert_files_hold(tmp_path / "run.h5", run, Drag)
 
 
-class Fixed(mpm.AbstractLoad):
+class Fixed(mpm.state.AbstractLoad):
     """A force that is not to be differentiated."""
 
-    on: mpm.AbstractPlace
+    on: mpm.state.AbstractPlace
     total: Scalar
 
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:

@@ -10,7 +10,7 @@ import mpmjax as mpm
 
 
 @mpm.register
-class Chord(mpm.AbstractSolution):
+class Chord(mpm.implicit.AbstractSolution):
     """Newton's method with the Hessian of its start in all steps."""
 
     steps: int = eqx.field(static=True, default=8)
@@ -22,7 +22,7 @@ class Chord(mpm.AbstractSolution):
         def chord(_, v):
             return v - jax.scipy.sparse.linalg.cg(matrix.mv, problem.residual(v), tol=1e-4)[0]
 
-        return jax.lax.fori_loop(0, self.steps, chord, v), mpm.no_solve(v.dtype)
+        return jax.lax.fori_loop(0, self.steps, chord, v), mpm.implicit.no_solve(v.dtype)
 
 
 def swinging(**scene):

@@ -63,7 +63,7 @@ class MinimalResidual(lx.AbstractLinearSolver):
         return True
 
 
-class BlockJacobi(mpm.AbstractPreconditioner):
+class BlockJacobi(mpm.implicit.AbstractPreconditioner):
     """The d x d blocks of M + χH on the diagonal, by products with vectors of a colouring: a user's own."""
 
     def inner_product(self, operator):
@@ -90,7 +90,7 @@ class Blocks(AbstractInnerProduct):
 
 
 @mpm.register
-class ScaledMass(mpm.AbstractPreconditioner):
+class ScaledMass(mpm.implicit.AbstractPreconditioner):
     """A multiple of M that is a parameter: of no use, but for tests."""
 
     scale: float | jax.Array = 3.0
@@ -100,7 +100,7 @@ class ScaledMass(mpm.AbstractPreconditioner):
 
 
 @mpm.register
-class UndeformedHessian(mpm.AbstractHessian):
+class UndeformedHessian(mpm.implicit.AbstractHessian):
     """That of the undeformed state, whatever the deformation: linear elasticity, with which Newton's method converges
     linearly, and whose matrix is positive definite."""
 

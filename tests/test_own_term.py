@@ -44,10 +44,10 @@ class Quartic(AbstractTerm):
 
 
 @mpm.register
-class HardeningSpring(mpm.AbstractLoad):
+class HardeningSpring(mpm.state.AbstractLoad):
     """A force k |x − X|² (x − X), k [N/m³] for all points together, towards where they were attached."""
 
-    on: mpm.AbstractPlace
+    on: mpm.state.AbstractPlace
     stiffness: float | jax.Array
 
     def force(self, points, t, dt):

@@ -12,7 +12,7 @@ import mpmjax as mpm
 
 
 @mpm.register
-class AFLIP(mpm.AbstractTransfer):
+class AFLIP(mpm.discretisation.AbstractTransfer):
     """Affine FLIP: particles keep a share α of what they had, velocity and affine velocity, and take the change of the
     grid's; the rest is APIC."""
 

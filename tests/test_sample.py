@@ -265,7 +265,7 @@ def test_density_can_be_differentiated():
     np.testing.assert_allclose(total, 0.626 * 0.259, rtol=1e-13)
 
 
-class Nowhere(mpm.AbstractRegion):
+class Nowhere(mpm.geometry.AbstractRegion):
     """A region with bounds but no points."""
 
     dim = 2

@@ -53,7 +53,7 @@ def mixed(d=2):
     return mpm.attach(scene, particles), particles
 
 
-class Still(mpm.AbstractBodyForce):
+class Still(mpm.state.AbstractBodyForce):
     def acceleration(self, x, t):
         return jnp.zeros_like(x)
 

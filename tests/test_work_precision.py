@@ -39,7 +39,7 @@ def waves():
     """Of a quarter of a period."""
     methods = (mpm.Explicit(), mpm.ImplicitMidpoint())
     own = ((mpm.SemiImplicit(), WAVE.duration / 16),)
-    return mpm.work_precision(wave, t1=WAVE.duration / 2, error=1e-2, methods=methods, also=own)
+    return mpm.analysis.work_precision(wave, t1=WAVE.duration / 2, error=1e-2, methods=methods, also=own)
 
 
 def displacements(trial):
@@ -95,7 +95,7 @@ def test_trials_refine_until_they_are_good(waves):
 def test_a_slow_pull_of_a_stiff_bar_is_not_run_explicitly():
     """It is foreseen to take too long, and the verdict says so; an explicit step of an implicit one's length fails."""
     tried = {"methods": (mpm.Explicit(), mpm.SemiImplicit()), "also": ((mpm.Explicit(), 1.25),)}
-    found = mpm.work_precision(pulled, t1=10.0, error=0.1, refinements=(1,), **tried)
+    found = mpm.analysis.work_precision(pulled, t1=10.0, error=0.1, refinements=(1,), **tried)
     explicit, *implicit, wild = found.trials
     assert wild.error == math.inf
     assert math.isnan(explicit.error)
@@ -208,7 +208,7 @@ def test_a_scene_in_which_nothing_moves_is_refused():
         return mpm.Scene(scene.grid, scene.material, gravity=(jnp.zeros(()),)), bar
 
     with pytest.raises(ValueError, match="Nothing moves"):
-        mpm.work_precision(still, t1=1.0)
+        mpm.analysis.work_precision(still, t1=1.0)
 
 
 def test_a_scene_that_fails_at_every_step_is_refused_and_not_tried_for_ever():
@@ -220,4 +220,4 @@ def test_a_scene_that_fails_at_every_step_is_refused_and_not_tried_for_ever():
         return mpm.Scene(scene.grid, mpm.NeoHookean(1e4, 0.3)), bar
 
     with pytest.raises(ValueError, match=r"fails, and half .*At step \d+ .*left the grid's window"):
-        mpm.work_precision(leaving, t1=1.0)
+        mpm.analysis.work_precision(leaving, t1=1.0)

@@ -22,7 +22,8 @@ STIFFNESS = 2.0
 contact makes more of the noise of gaps, some hundredths of a spacing: with 20 the pressure between two cylinders
 differs by a third from node to node."""
 _LEAST_DEPTH = 1e-3
-"""Of the particles around a node from it on, in spacings. Deep in a body it is zero, and of a lattice only rounding."""
+"""Smallest mean depth, in spacings, at which a node counts as near the surface. Deep in a body it is zero, in a
+lattice only rounding."""
 _EMPTY = 1e-9
 """The part of a cell below which a body is not felt at a node."""
 _LEAST_SPREAD = 1e-2

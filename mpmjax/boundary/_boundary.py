@@ -1,4 +1,4 @@
-"""What a boundary is.
+"""The interface of boundaries.
 
 Every boundary acts on the grid alone; the transfers know nothing of it. What holds material acts on the nodes at and
 beyond it; a node within a thousandth of a spacing of a wall counts as on it. Where such walls, planes and grips lie
@@ -31,7 +31,7 @@ class Wall(NamedTuple):
     axis: int
     """The axis."""
     position: float
-    """Its coordinate [m]."""
+    """Coordinate [m]."""
     inward: int
     """The sign of the inward normal's component, +1 or −1."""
     mirrored: bool = False
@@ -104,7 +104,7 @@ class AbstractBoundary(eqx.Module):
         return ()
 
     def facing(self, own: tuple[AbstractContact, ...], faces: Faces) -> tuple[AbstractContact, ...]:
-        """Its contacts with the faces of particles known, if it `sees_faces`. Default: as they are.
+        """The boundary with the faces of particles put into its contacts, if it `sees_faces`. Default: as they are.
 
         Args:
             own: its `contacts`.
@@ -132,7 +132,7 @@ class AbstractBoundary(eqx.Module):
         return ()
 
     def mirror_motion(self, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar) -> MirrorMotion | None:
-        """What its mirrors that move add to the velocity of the nodes beyond them in the step from t to t + dt. None if
+        """The velocity that its moving mirrors add to the nodes beyond them in the step from t to t + dt. None if
         none moves, which is the default."""
         del grid, window, t, dt
         return None
@@ -157,7 +157,7 @@ class AbstractBoundary(eqx.Module):
         del grid, total
 
     def walls(self) -> tuple[Wall, ...]:
-        """Its walls at right angles to an axis, for pictures and for warnings of what lies beyond or beside them.
+        """The walls at right angles to an axis, for pictures and for warnings of what lies beyond or beside them.
         Default: none. It is asked only while numbers are known."""
         return ()
 
@@ -168,7 +168,7 @@ class AbstractBoundary(eqx.Module):
         return None
 
     def spread(self, fixed: Mask, value: Array, nodes: NodeVector, spacing: Scalar) -> tuple[Mask, Array]:
-        """What boundaries prescribe, where one that does so at one of its nodes means all of them. Default: as it is.
+        """The conditions, extended to the whole of a rigid part where one of its nodes has them. Default: as they are.
 
         Args:
             fixed: components of velocity that are prescribed, shape (n, d).

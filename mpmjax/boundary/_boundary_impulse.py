@@ -65,8 +65,8 @@ def owners_of(
 def taken_by_mirrors(
     field: NodeVector, images: list[tuple[int, Image]] | list[tuple[int, Image | Tie]]
 ) -> tuple[list[Given], NodeVector]:
-    """What mirrors take of impulses on all nodes, each by its boundary's number, and the impulses that remain on true
-    nodes.
+    """The part of impulses on all nodes that mirrors take, each by its boundary's number, and the impulses that remain
+    on true nodes.
 
     Where planes meet, each takes its normal component before the others fold it, so that its torque has the places of
     all nodes.

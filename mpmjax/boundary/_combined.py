@@ -1,4 +1,4 @@
-"""What the boundaries of a scene ask of the nodes together: conditions, contacts, mirrors."""
+"""The boundaries of a scene together: conditions, contacts, mirrors."""
 
 from dataclasses import replace
 
@@ -92,7 +92,7 @@ def mirror(boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Arr
 def mirror_motion(
     boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
 ) -> MirrorMotion | None:
-    """What all mirrors that move add to the velocity of the nodes beyond them; None if none moves."""
+    """The velocity that moving mirrors add to the nodes beyond them; None if none moves."""
     total = None
     for boundary in boundaries:
         own = boundary.mirror_motion(grid, window, t, dt)

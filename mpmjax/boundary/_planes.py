@@ -52,7 +52,7 @@ class AbstractPlane(AbstractBoundary):
         return 1 if self.keep == "above" else -1
 
     def check(self, grid: Grid, *, total: bool) -> None:
-        """Its axis is not periodic, and it lies at a multiple of half a spacing."""
+        """Check that the axis is not periodic, and that the plane lies at a multiple of half a spacing."""
         del total
         name = type(self).__name__
         require(self.axis < grid.dim, f"{name}'s axis must be below {grid.dim}, got {self.axis}.")
@@ -90,7 +90,7 @@ class AbstractPlane(AbstractBoundary):
         return (Wall(self.axis, float(self.position), self.inward, mirrored=True),)
 
     def image(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, Array]:
-        """Its mirror in the window, and how many half spacings each node along the axis lies before it."""
+        """The mirror in the window, and how many half spacings each node along the axis lies before it."""
         return mirror_image(self.axis, self.position, self.keep, grid, window)
 
 
@@ -154,7 +154,7 @@ class SymmetryPlane(AbstractPlane):
         )
 
     def mirror_images(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, ...]:
-        """Its own, everywhere."""
+        """The mirror image of this plane, in all columns."""
         return (replace(self.image(grid, window)[0], moving=self.motion is not None),)
 
     def mirror_motion(self, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar) -> MirrorMotion | None:
@@ -215,13 +215,13 @@ class ContactPlane(AbstractPlane):
     def contacts(
         self, conditions: Conditions, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
     ) -> tuple[PlaneContact, ...]:
-        """Its own, with a mirror in the columns that it holds."""
+        """The contact of this plane, with a mirror in the columns that it holds."""
         del conditions, t, dt
         image, before = self.image(grid, window)
         return (PlaneContact(image, self.inward, before, self.friction),)
 
     def facing(self, own: tuple[AbstractContact, ...], faces: Faces) -> tuple[AbstractContact, ...]:
-        """That contact in the columns whose gap is shut. In implicit steps, which may close much of a gap at once, the
+        """The contact in the columns whose gap is shut. In implicit steps, which may close much of a gap at once, the
         faces before the plane are pushed as by a `SeparatingBox` in the step that would bring them behind it."""
         plane = own[0]
         assert isinstance(plane, PlaneContact)

@@ -33,7 +33,7 @@ class AbstractHessianAction(eqx.Module):
 
     @abc.abstractmethod
     def precomputed(self) -> "ParticleStiffness":
-        """The same map as one matrix for each particle, computed once for many applications."""
+        """The map as one matrix for each particle, computed once for many applications."""
 
 
 class ParticleStiffness(AbstractHessianAction):

@@ -116,7 +116,7 @@ class ImplicitOperator(AbstractSymmetricOperator):
         )
 
     def precomputed(self) -> "ImplicitOperator":
-        """The same operator, with H as one matrix for each particle, computed once for many applications."""
+        """The operator, with H as one matrix for each particle, computed once for many applications."""
         return eqx.tree_at(lambda o: o.hessian, self, self.hessian.precomputed())
 
     def nodal_mass(self) -> NodeVector:

@@ -31,7 +31,7 @@ class ElasticPotential(eqx.Module):
     size: int = eqx.field(static=True)
     """Number of nodes n."""
     terms: tuple[AbstractTerm, ...] = ()
-    """What else has an energy: springs to the ground, contact, terms of a user's own."""
+    """Further energies: springs to the ground, contact, terms of a user's own."""
 
     def displaced(self, u: NodeVector | None) -> Displacement:
         """A displacement or velocity of the nodes, shape (n, d), with that of their mirror images; None for zero."""

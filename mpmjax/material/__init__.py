@@ -4,7 +4,7 @@ from mpmjax.material._base import AbstractIsotropic as AbstractIsotropic, Abstra
 from mpmjax.material._cam_clay import CamClay as CamClay, CamClayHistory as CamClayHistory
 from mpmjax.material._drucker_prager import DruckerPrager as DruckerPrager, DruckerPragerHistory as DruckerPragerHistory
 from mpmjax.material._elastic import FixedCorotated as FixedCorotated, NeoHookean as NeoHookean
-from mpmjax.material._fluid import Fluid as Fluid, Tait as Tait
+from mpmjax.material._fluid import Fluid as Fluid
 from mpmjax.material._hencky import Hencky as Hencky
 from mpmjax.material._herschel_bulkley import (
     HerschelBulkley as HerschelBulkley,

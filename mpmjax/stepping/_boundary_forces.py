@@ -1,4 +1,4 @@
-"""What each boundary of a scene receives in a step, from the motion of the nodes and the impulses that made it."""
+"""The impulse that each boundary of a scene receives in a step, from the motion of the nodes and what made it."""
 
 import jax
 import jax.numpy as jnp

@@ -50,9 +50,9 @@ class Nodes(AbstractNodes):
     brought_by: tuple[int | None, ...] = eqx.field(static=True, default=())
     """The number of the boundary that brings each contact; None for that of two bodies."""
     mirror_motion: MirrorMotion | None = None
-    """What mirrors that move add to the velocity of the nodes beyond them; None if none moves."""
+    """The velocity that moving mirrors add to the nodes beyond them; None if none moves."""
     loose: "Nodes | None" = None
-    """The same nodes with those of rigid bodies each by itself; None without rigid bodies."""
+    """The nodes with those of rigid bodies each by itself; None without rigid bodies."""
 
     @property
     def occupied(self) -> Bool[Array, "n 1"]:
@@ -166,7 +166,7 @@ class Nodes(AbstractNodes):
         mass = images.fold_scalar(self.mass)
 
         def fold(field: Array) -> NodeVector:
-            """Of a field per mass."""
+            """Fold a field per mass."""
             return _per_mass(images.fold(self.mass[:, None] * field), mass)
 
         return replace(

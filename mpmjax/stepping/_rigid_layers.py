@@ -13,8 +13,8 @@ from mpmjax.state import Particles, RigidMaterial, Scene
 
 
 class RigidLayers(eqx.Module):
-    """What the nodes of rigid bodies are folded to: two nodes of each layer, of which the first has the velocity V and
-    the second s = Gω (see `RigidImage`)."""
+    """The nodes that those of rigid bodies are folded to: two nodes of each layer, the first with the velocity V and the
+    second s = Gω (see `RigidImage`)."""
 
     images: tuple[RigidImage, ...]
     own: Bool[Array, "n 1"]
@@ -22,7 +22,7 @@ class RigidLayers(eqx.Module):
     velocity: NodeVector
     """Their velocity at the start of the step [m/s], shape (n, d), zero elsewhere."""
     conditions: Conditions
-    """What is prescribed of all nodes: of those of rigid bodies, of these two."""
+    """The conditions on all nodes: for rigid bodies, on these two."""
 
 
 def rigid_layers(

@@ -220,7 +220,7 @@ def _straining(scene: Scene, particles: Particles, nodes: Nodes) -> Float[Array,
 def _contact_rate(
     contacts: list[AbstractContact], nodal_mass: NodeScalar, mass: Array, steepness: Array
 ) -> Array | float:
-    """What the springs of contacts add to Λ A/ρ0 [1/s²] (see `AbstractContact.stability_rate`)."""
+    """The part of the springs of contacts in Λ A/ρ0 [1/s²] (see `AbstractContact.stability_rate`)."""
     kinds: dict[type[AbstractContact], list[AbstractContact]] = {}
     for contact in contacts:
         kinds.setdefault(type(contact), []).append(contact)

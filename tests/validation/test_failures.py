@@ -150,7 +150,7 @@ def pulled(description, per_side):
     stress = LAW.stress(components(after.F))[0, 0, after.count // 2]
     free = (length - 2 * dx) / dx  # cells between the grips
     theory = (LAW.lame_lambda + 2 * LAW.shear_modulus) * (stretch - 1) * cells / free
-    return mpm.pieces(scene, after), float(stress / theory)
+    return mpm.analysis.pieces(scene, after), float(stress / theory)
 
 
 @pytest.mark.slow
@@ -177,9 +177,9 @@ def test_pieces_are_counted_by_shared_nodes():
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *parts)
 
     scene = mpm.Scene(grid, LAW)
-    assert mpm.pieces(scene, blocks(0.0)) == 1
-    assert mpm.pieces(scene, blocks(0.5)) == 2
-    assert mpm.pieces(scene, blocks(1.4)) == 1
+    assert mpm.analysis.pieces(scene, blocks(0.0)) == 1
+    assert mpm.analysis.pieces(scene, blocks(0.5)) == 2
+    assert mpm.analysis.pieces(scene, blocks(1.4)) == 1
 
 
 # Inversion
@@ -360,7 +360,7 @@ def test_angular_momentum_lost_in_a_turn(method, expected):
     np.testing.assert_allclose(lost, expected, rtol=0.03)
 
 
-class Turning(mpm.AbstractBoundary):
+class Turning(mpm.boundary.AbstractBoundary):
     """All nodes turn about the origin at a given rate."""
 
     rate: float
@@ -371,7 +371,7 @@ class Turning(mpm.AbstractBoundary):
 
     def conditions(self, nodes, spacing, t, dt, *, reference):
         v = self.rate * jnp.stack([-nodes[:, 1], nodes[:, 0]], axis=1)
-        return mpm.Conditions(jnp.ones(nodes.shape, bool), v)
+        return mpm.boundary.Conditions(jnp.ones(nodes.shape, bool), v)
 
 
 @pytest.mark.thorough
