@@ -138,7 +138,7 @@ class SurfaceContact(AbstractContact):
     def reached(self, active: Array, shape: tuple[int, ...]) -> Bool[Array, "n d"]:
         """All components of the nodes around the particles held."""
         shut = (active & self.near).any(axis=0).astype(self.gap.dtype)
-        return jnp.broadcast_to(scatter(self.stencil, shut[None], None, shape[0]) > 0, shape)
+        return jnp.broadcast_to(scatter(self.faces.stencil, shut[None], None, shape[0]) > 0, shape)
 
     @staticmethod
     def stability_rate(contacts: tuple[Any, ...], nodal_mass: NodeScalar, mass: Array, steepness: Array) -> Array:
@@ -159,7 +159,7 @@ class SurfaceContact(AbstractContact):
         if self.axis is None:
             velocity = jnp.zeros_like(self.normal) if self.velocity is None else self.velocity
             around += [push[None], along(pushes) * self.normal, push * velocity]
-        sums = scatter(self.stencil, jnp.concatenate(around), None, len(v))
+        sums = scatter(self.faces.stencil, jnp.concatenate(around), None, len(v))
         limit = mirror.fold_scalar(sums[:, 0])
         if self.axis is not None:
             return friction_across(held, self.axis, limit, v)
