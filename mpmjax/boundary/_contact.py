@@ -19,6 +19,7 @@ the elastic response of one step.
 """
 
 import abc
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Generic, TypeVar
 
@@ -106,8 +107,8 @@ class AbstractContact(eqx.Module):
 
     @property
     def friction_order(self) -> float:
-        """Frictions act one after the other, from the lowest number on: that of a wall is its axis, of a contact plane
-        its axis and a half, of colliders 3. Default: 4, after all of these."""
+        """Frictions act one after the other, from the lowest number on, those of one number forth and back: that of a
+        wall is its axis, of a contact plane its axis and a half, of colliders 3. Default: 4, after all of these."""
         return 4.0
 
     @property
@@ -318,20 +319,33 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     def friction(self, v: NodeVector, residual: NodeVector) -> tuple[NodeVector, tuple[NodeVector, ...]]:
         """The velocity after Coulomb friction, one contact after the other, and the change of velocity by each [m/s].
 
+        Contacts of one `friction_order` act in the scene's order and, from the same start, against it; each has the
+        mean of its two changes, so that of two none comes first. The mean is within the limit and takes energy, as both
+        are and do.
+
         Args:
             v: velocity of all nodes after the solve [m/s], shape (n, d).
             residual: the impulse that holds components of velocity [kg m/s], shape (n, d).
         """
-        changes, loosened = [], self._loosened()
-        tied, nodes = Mirror(self.nodes.mirror.rigid), self.nodes
-        for contact, active in zip(self.unheld.contacts, self.active, strict=True):
-            change = contact.friction(loosened, active, tied.unfold(v), residual)
-            if tied.images:  # the impulses on a rigid body's nodes are those on the whole of it
-                mass, impulse = nodes.mass[:, None], tied.fold(loosened.nodes.mass[:, None] * change)
-                change = nodes.projection.combine(jnp.where(mass > 0, impulse / jnp.where(mass > 0, mass, 1), 0), 0)
-            v = v + change
-            changes.append(self.images.unfold(change))
-        return self.images.unfold(v), tuple(changes)
+        loosened, tied, nodes = self._loosened(), Mirror(self.nodes.mirror.rigid), self.nodes
+        contacts = self.unheld.contacts
+
+        def changes(order: Sequence[int]) -> list[NodeVector]:
+            rubbed, by_contact = v, [v] * len(contacts)
+            for k in order:
+                change = contacts[k].friction(loosened, self.active[k], tied.unfold(rubbed), residual)
+                if tied.images:  # the impulses on a rigid body's nodes are those on the whole of it
+                    mass, impulse = nodes.mass[:, None], tied.fold(loosened.nodes.mass[:, None] * change)
+                    change = nodes.projection.combine(jnp.where(mass > 0, impulse / jnp.where(mass > 0, mass, 1), 0), 0)
+                rubbed, by_contact[k] = rubbed + change, change
+            return by_contact
+
+        forth = list(range(len(contacts)))
+        back = sorted(forth, key=lambda k: (contacts[k].friction_order, -k))
+        total = changes(forth)
+        if back != forth:
+            total = [(a + b) / 2 for a, b in zip(total, changes(back), strict=True)]
+        return self.images.unfold(sum(total, v)), tuple(map(self.images.unfold, total))
 
     def pushes(self, slowed: tuple[NodeVector, ...]) -> tuple[tuple[int, NodeVector], ...]:
         """The impulses of colliders on the nodes by springs and friction [kg m/s], each with the collider's number.
