@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Deformation, Float, ParticleVector, Scalar
-from mpmjax.discretisation import AbstractGradient, BSpline, Stencil
+from mpmjax.discretisation import Stencil
 
 EXPLICIT_STIFFNESS = 2.0
 """Stiffness of contact in explicit steps, in the material's wave modulus over a spacing: that of half a spacing of the
@@ -61,8 +61,6 @@ class Faces(eqx.Module):
     """A α ρ0/dx [kg/m²], shape (p,): times the square of the velocity of approach, the stiffness of contact that a
     shock adds."""
     stencil: Stencil
-    kernel: BSpline
-    gradient: AbstractGradient
     spacing: Scalar
     """dx [m]."""
     dt: Scalar

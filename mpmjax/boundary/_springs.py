@@ -5,8 +5,7 @@ The gap of a particle's face is linear in the displacement u of the nodes about 
     g_p(u) = g_p(0) + n_p · Σ_i (w_ip − b_p · g_ip) u_i,
 
 where n is the surface's unit normal and x_p − b_p the particle's face, which moves by u − ∇u b. The force on the nodes,
-−k_p g_p (w_ip − b_p · g_ip) n_p, acts at the face: its moment is that of −k_p g_p n_p there. The weights w_ip are those
-of `balanced`.
+−k_p g_p (w_ip − b_p · g_ip) n_p, acts at the face: its moment is that of −k_p g_p n_p there.
 
 The gap between the surfaces of two bodies, at a node, is so too. Both bodies have a layer of nodes at the same places:
 
@@ -25,7 +24,6 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float
-from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.potential import AbstractSpring, Displacement, Forces
 
 
@@ -40,38 +38,23 @@ class Springs(AbstractSpring):
     """n_p [-], out of the first surface, shape (d, p); the second one's is the opposite."""
     arm: Float[Array, "d p"]
     """b_p [m], from the face at the first surface to the centre, shape (d, p); the second one's is the opposite."""
-    stencil: Stencil
-    """w_ip and g_ip."""
-    axis: int | None = eqx.field(static=True)
-    """The axis of n_p, along which alone nodes are pushed; None if it is along none."""
 
     def elongation(self, moved: Displacement) -> Float[Array, "s p"]:
         """n · (u − ∇u b) [m], shape (s, p)."""
-        value, slopes = gather(self.stencil, moved.nodes[:, self._columns])
-        normal = self.normal[self._columns]
-        shift = (normal * value).sum(axis=0)
-        growth = (normal * self.arm[:, None] * slopes).sum(axis=(0, 1))
+        value, slopes = moved.at_particles
+        shift = (self.normal * value).sum(axis=0)
+        growth = (self.normal[None] * self.arm[:, None] * slopes).sum(axis=(0, 1))
         return jnp.stack([sign * shift - growth for sign in SIGNS[: len(self.stretch)]])
 
     def spread(self, amount: Float[Array, "s p"], size: int) -> Forces:
-        normal = self.normal[self._columns]
-        return self._scattered(
-            self.stencil, along(amount) * normal, -amount.sum(axis=0) * self.arm[:, None] * normal, size
-        )
+        del size
+        return Forces(value=along(amount) * self.normal, slopes=-amount.sum(axis=0) * self.arm[:, None] * self.normal)
 
     def spread_square(self, amount: Float[Array, "s p"], size: int) -> Forces:
         """Without the products of weights and their derivatives."""
-        k, normal = amount.sum(axis=0), self.normal[self._columns]
-        return self._scattered(self.stencil.squared, k * normal**2, k * (self.arm[:, None] * normal) ** 2, size)
-
-    @property
-    def _columns(self) -> slice:
-        """The components of nodal vectors that it knows."""
-        return slice(None) if self.axis is None else slice(self.axis, self.axis + 1)
-
-    def _scattered(self, stencil: Stencil, value: Array, slopes: Array, size: int) -> Forces:
-        nodes = scatter(stencil, value, slopes, size)
-        return Forces(nodes=jnp.zeros((size, len(slopes)), nodes.dtype).at[:, self._columns].set(nodes))
+        del size
+        k = amount.sum(axis=0)
+        return Forces(value=k * self.normal**2, slopes=k * (self.arm[:, None] * self.normal) ** 2)
 
 
 SIGNS = (1, -1)

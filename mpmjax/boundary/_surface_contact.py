@@ -13,7 +13,7 @@ from mpmjax.boundary._faces import Faces
 from mpmjax.boundary._friction import friction_across, friction_along
 from mpmjax.boundary._springs import SIGNS, Springs, along
 from mpmjax.checks import require
-from mpmjax.discretisation import Stencil, balanced, scatter
+from mpmjax.discretisation import scatter
 from mpmjax.geometry import length
 
 
@@ -66,8 +66,6 @@ class SurfaceContact(AbstractContact):
     velocity: Float[Array, "d p"] | None
     """Velocity of the surface [m/s], shape (d, p); None at rest."""
     faces: Faces
-    stencil: Stencil
-    """w_ip and g_ip of `Springs`."""
     coefficient: Scalar
     """Coulomb coefficient [-]."""
     axis: int | None = eqx.field(static=True)
@@ -97,8 +95,6 @@ class SurfaceContact(AbstractContact):
             stiffness=jnp.where(held, self.stiffness / share, 0),
             normal=self.normal,
             arm=self.arm,
-            stencil=self.stencil,
-            axis=self.axis,
         )
 
     @property
@@ -180,16 +176,13 @@ def surface_contact(surface: Surface, faces: Faces, body: int | None = None) -> 
     relative = faces.v.T if surface.velocity is None else faces.v.T - surface.velocity
     leaving = (surface.normal * relative).sum(axis=0)
     distances = (surface.distance,) if surface.opposite is None else (surface.distance, surface.opposite)
-    gap = jnp.stack(distances) - width
-    nearer = surface.normal if len(gap) == 1 else jnp.where(gap[0] < gap[1], surface.normal, -surface.normal)
     return SurfaceContact(
-        gap=gap,
+        gap=jnp.stack(distances) - width,
         normal=surface.normal,
         arm=arm,
         stiffness=jnp.stack([faces.stiffness_at(-sign * leaving) for sign in SIGNS[: len(distances)]]),
         velocity=surface.velocity,
         faces=faces,
-        stencil=balanced(faces.stencil, faces.kernel, faces.gradient, nearer, 2 * width / faces.spacing),
         coefficient=surface.friction,
         axis=surface.axis,
         body=body,

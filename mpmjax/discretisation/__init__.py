@@ -19,7 +19,6 @@ from mpmjax.discretisation._resistance import resist as resist
 from mpmjax.discretisation._stencil import (
     Places as Places,
     Stencil as Stencil,
-    balanced as balanced,
     in_window as in_window,
     make_stencil as make_stencil,
 )

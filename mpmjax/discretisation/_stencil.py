@@ -168,48 +168,6 @@ def make_stencil(
     )
 
 
-def balanced(
-    stencil: Stencil,
-    kernel: BSpline,
-    gradient: AbstractGradient,
-    normal: Float[Array, "d p"],
-    width: Float[Array, "p"],
-) -> Stencil:
-    """The stencil by which pushes p on the faces of a lattice of particles balance the pressure p in them at every
-    node, wherever the lattice is.
-
-    Rows a width l apart push the outermost node by p l Σ_k g(x + k l), and a push on the face of the first row by
-    p (w + ½ l g(x)). Their difference is added to the weight of the outermost node; those of the next two keep sum and
-    mean place. The two weights of the linear kernel follow from these, and stay.
-
-    Args:
-        stencil: stencil of the particles.
-        kernel: its kernel.
-        gradient: its gradient operator.
-        normal: unit normal of the surface that pushes, towards the particles, shape (d, p).
-        width: l in spacings, shape (p,); it counts as at least ¼ and at most 1.
-    """
-    if kernel.order == 1:
-        return stencil
-    width, end = jnp.clip(width, 0.25, 1), (kernel.order + 1) / 2
-
-    def slope(f: Array) -> Array:
-        """dx g of the first node at a distance f from it, shape (d, p)."""
-        least_squares = -f[:, None] * kernel.weights(f) / kernel.variance
-        return jnp.where(f < end, -gradient.derivatives(kernel.derivatives(f), least_squares)[:, 0], 0)
-
-    def missing(f: Array) -> Array:
-        rows = slope(f) / 2 + slope(f + width) + slope(f + 2 * width) + slope(f + 3 * width)
-        return (normal**2 * (width * rows - kernel.weights(f)[:, 0]))[:, None] * np.array((1, -2, 1), f.dtype)[:, None]
-
-    f = (stencil.weights * np.arange(kernel.order + 1, dtype=width.dtype)[:, None]).sum(axis=1)
-    if kernel.order == 2:
-        change = missing(jnp.where(normal > 0, f, 2 - f))
-    else:  # both ends of four nodes can be right
-        change = jnp.pad(missing(f), ((0, 0), (0, 1), (0, 0))) + jnp.pad(missing(3 - f), ((0, 0), (1, 0), (0, 0)))
-    return replace(stencil, weights=stencil.weights + change, mls_weight_derivatives=None, places=None)
-
-
 def _polynomials(kernel: BSpline, spacing: Array, least_squares: bool) -> Float[Array, "2 s k"]:
     """Knots and coefficients of the weights and of their derivatives or those of moving least squares, shape
     (2, order + 1, order + 3)."""

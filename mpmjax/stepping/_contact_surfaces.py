@@ -48,8 +48,6 @@ def faces_of(
         stiffness=per_modulus * contact_moduli(scene, particles, materials),
         inertia=per_modulus * particles.mass / particles.volume,
         stencil=potential.stencil,
-        kernel=scene.kernel,
-        gradient=scene.gradient,
         spacing=jnp.asarray(scene.grid.spacing),
         dt=jnp.asarray(dt),
         force_at=0.0 if force_at is None else jnp.asarray(force_at, particles.x.dtype),
