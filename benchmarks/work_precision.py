@@ -12,8 +12,8 @@ The error is that of `mpmjax.analysis.work_precision`: the largest over eight ti
 distance to the reference, over the largest RMS displacement. The reference is the exact motion where there is one, or
 else a run of TR-BDF2 refined in space and time together, whose last change is the estimate of its own error. Seconds
 are wall time without compilation, the least of three rounds in which the settings take turns. Explicit steps are tried
-at 2, √2, 1 and ½ times `stable_dt` of the whole motion, implicit ones from eight in all to ever more, until the error falls no
-further. What would take longer than a limit is not run: its time is foreseen from fewer steps.
+at 2, √2, 1 and ½ times `stable_dt` of the whole motion, implicit ones from eight in all to ever more, until the error
+falls no further. What would take longer than a limit is not run: its time is foreseen from fewer steps.
 
 A small error between two large ones is where the error changes its sign. So a run counts, in the sentences and for the
 lines of the charts, with the larger of its own error and that of the next smaller step.

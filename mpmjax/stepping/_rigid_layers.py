@@ -13,8 +13,8 @@ from mpmjax.state import Particles, RigidMaterial, Scene
 
 
 class RigidLayers(eqx.Module):
-    """The nodes that those of rigid bodies are folded to: two nodes of each layer, the first with the velocity V and the
-    second s = Gω (see `RigidImage`)."""
+    """The nodes that those of rigid bodies are folded to: two nodes of each layer, the first with the velocity V and
+    the second s = Gω (see `RigidImage`)."""
 
     images: tuple[RigidImage, ...]
     own: Bool[Array, "n 1"]
