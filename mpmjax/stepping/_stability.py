@@ -12,7 +12,7 @@ import numpy as np
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, NodeScalar, Scalar
 from mpmjax.boundary import STIFFNESS, AbstractContact, ConstrainedNodes, in_a_row
-from mpmjax.checks import canonical, checked, is_traced, require, require_positive
+from mpmjax.checks import canonical, checked, is_traced, require, require_finite, require_positive
 from mpmjax.discretisation import Stencil, gather
 from mpmjax.geometry import length
 from mpmjax.potential import Mirror
@@ -105,6 +105,7 @@ def stable_dt(
             that gives no bound; with t1, a bound that is zero or infinite.
     """
     require_positive("safety", safety, particles.x.dtype)
+    require_finite("t [s]", t)
     limit = canonical(safety, particles.x.dtype) * longest_step(scene, particles, method, t)
     if not is_traced(limit):
         require(
