@@ -107,7 +107,7 @@ def test_a_body_stands_where_its_motion_takes_it():
 @pytest.mark.parametrize("name", ["explicit", *thorough("semi_implicit")])
 def test_two_rough_slopes_rub_alike_whichever_comes_first(name):
     """A block that slides into a groove: 20 steps later no particle is elsewhere. One friction after the other, the
-    first had a part of the other's: 1e-4 spacings."""
+    first had a part of the other's: 1e-4 m in 20 steps."""
     dx = 0.1
     grid = mpm.Grid((16, 16), dx, origin=(-8, -4))
     block = mpm.fill(mpm.Box((-0.1, 0.1), (0.1, 0.4)), grid, density=1.0)
