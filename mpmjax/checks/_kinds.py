@@ -210,8 +210,9 @@ def choices(hint: Any) -> dict[str, Any]:
 
 
 def is_own(kind: type) -> bool:
-    """Whether a class is the package's own."""
-    return kind.__module__.partition(".")[0] == "mpmjax"
+    """Whether a class is the package's own. Problems of `mpmjax.verification`, which only a user imports, are not."""
+    package, _, place = kind.__module__.partition(".")
+    return package == "mpmjax" and not place.startswith("verification")
 
 
 def _in_words(hint: Any) -> str:
