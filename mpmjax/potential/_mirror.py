@@ -158,19 +158,19 @@ class RigidImage(eqx.Module):
         """The part of a field of all nodes that is of its layer, shape (m, ...)."""
         return field.reshape(self.layers, len(self.arms), *field.shape[1:])[self.layer]
 
-    def with_own(self, field: Array, own: Array) -> Array:
+    def with_own(self, field: Array, part: Array) -> Array:
         """The field with that part replaced."""
-        return field.reshape(self.layers, *own.shape).at[self.layer].set(own).reshape(field.shape)
+        return field.reshape(self.layers, *part.shape).at[self.layer].set(part).reshape(field.shape)
 
     def scalar(self, field: NodeScalar) -> NodeScalar:
         """A map whose transpose gives both nodes the whole mass."""
-        own = self.own(field)
-        return self.with_own(field, jnp.broadcast_to(own[0] + own[1], own.shape))
+        part = self.own(field)
+        return self.with_own(field, jnp.broadcast_to(part[0] + part[1], part.shape))
 
     def vector(self, field: NodeVector) -> NodeVector:
         """B for a vector field."""
-        own = self.own(field)
-        return self.with_own(field, own[0] + spinning(self.spin(own[1]), self.arms))
+        part = self.own(field)
+        return self.with_own(field, part[0] + spinning(self.spin(part[1]), self.arms))
 
     def angular(self, momentum: Float[Array, "d"]) -> Float[Array, "r"]:
         """Iω = Gᵀ M s [kg m²/s] from M s [kg m/s] of the second node."""
@@ -224,8 +224,8 @@ class Mirror(eqx.Module):
         total = jnp.zeros_like(field)
         for image in self.images:
             if isinstance(image, Image) and image.moving:
-                own = image.along(image.odd <= 0)[:, None] & (jnp.arange(field.shape[1]) == image.axis)
-                total = jnp.where(own, field, total)
+                part = image.along(image.odd <= 0)[:, None] & (jnp.arange(field.shape[1]) == image.axis)
+                total = jnp.where(part, field, total)
         return total
 
     def unfold_scalar(self, field: Float[Array, "n"]) -> Float[Array, "n"]:
@@ -281,7 +281,7 @@ def mirror_image(axis: int, position: Scalar, keep: str, grid: Grid, window: Int
     before = 2 * j - halves if keep == "above" else halves - 2 * j
     ghost = before < 0
     source = jnp.where(ghost, halves - j, j)
-    known = (source >= 0) & (source < length)
-    even = jnp.where(known, 1, 0)
-    odd = jnp.where(known & (before != 0), jnp.where(ghost, -1, 1), 0)
+    inside = (source >= 0) & (source < length)
+    even = jnp.where(inside, 1, 0)
+    odd = jnp.where(inside & (before != 0), jnp.where(ghost, -1, 1), 0)
     return Image(grid.shape, grid.layers, axis, jnp.clip(source, 0, length - 1), even, odd), before

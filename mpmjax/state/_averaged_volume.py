@@ -223,8 +223,8 @@ class AveragedTangent(eqx.Module):
             flux: from a stress [Pa] to the flux of its particles [J], the derivative's direction first.
         """
         volume = self.at.average.volume
-        own, mean = self.local(jnp.zeros_like(self.cofactor), jnp.ones_like(volume))
-        return AveragedStiffness(rows, self.at.average, flux(self.cofactor), flux(own), volume * mean)
+        part, mean = self.local(jnp.zeros_like(self.cofactor), jnp.ones_like(volume))
+        return AveragedStiffness(rows, self.at.average, flux(self.cofactor), flux(part), volume * mean)
 
 
 class AveragedStiffness(AbstractStiffness):
@@ -260,8 +260,8 @@ class AveragedStiffness(AbstractStiffness):
         c = self.volumetric / self.average.volume
         return self._of_all(2 * self.coupling * c + self.bulk * c**2, len(stencil.inside))
 
-    def _of_all(self, own: Matrix, count: int) -> Forces:
+    def _of_all(self, part: Matrix, count: int) -> Forces:
         """Slopes of this material's particles, zero for those of others."""
         if self.rows != (0, count):
-            own = jnp.zeros((*own.shape[:-1], count), own.dtype).at[..., slice(*self.rows)].set(own)
-        return Forces(slopes=own)
+            part = jnp.zeros((*part.shape[:-1], count), part.dtype).at[..., slice(*self.rows)].set(part)
+        return Forces(slopes=part)

@@ -271,7 +271,7 @@ def load_force(
 def terms_of(loads: tuple[AbstractLoad, ...], points: tuple[LoadedPoints, ...], t: Scalar) -> tuple[AbstractTerm, ...]:
     """The terms that loads add to the potential, with the ground where it is at time t [s]."""
     each = zip(loads, points, strict=True)
-    return tuple(term for load, own in each if (term := load.term(own, t)) is not None)
+    return tuple(term for load, at in each if (term := load.term(at, t)) is not None)
 
 
 class AbstractBodyForce(eqx.Module):

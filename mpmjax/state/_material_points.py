@@ -122,8 +122,8 @@ class MaterialPoints(eqx.Module):
         """Λ of each particle [Pa], shape (q,) (see `stable_dt`). Where volumes are averaged, the larger of Λ and its
         average: the average A, of weights V0 A symmetric, has Σ V0 Λ (A J)² ≤ Σ V0 (A Λ) J²."""
         F = self.strained(self.deformation)
-        own = self.law.tangent_eigenvalues(F, dim, total=self.total).max(axis=0)
-        return own if self.average is None else jnp.maximum(own, self.average(own))
+        largest = self.law.tangent_eigenvalues(F, dim, total=self.total).max(axis=0)
+        return largest if self.average is None else jnp.maximum(largest, self.average(largest))
 
     def viscous_flux(self, gradient: Matrix) -> Matrix:
         """|J| V0 σ_v [J], whose sum over g_ip is D v (derivation, eq. 28), at a velocity gradient ∇v [1/s], both of
