@@ -138,6 +138,8 @@ class TangentAction(AbstractHessianAction):
         )
 
     def _others(self) -> tuple[AbstractStiffness, ...]:
+        if not self.potential.terms:
+            return ()
         moved = self.potential.displaced(self.u)
         return tuple(term.hessian(moved) for term in self.potential.terms)
 

@@ -43,7 +43,7 @@ class ElasticPotential(eqx.Module):
 
     def on_nodes(self, forces: Sequence[Forces]) -> NodeVector:
         """The sum of forces on the nodes [N], shape (n, d)."""
-        return self.mirror.fold(self.unfolded(forces))
+        return self.mirror.fold(scattered(forces, self.stencil, self.size))
 
     def change(self, gradient: Matrix) -> Deformations:
         """δF_p from the gradient Σ_i u_i g_ipᵀ of the displacement, one array for each material."""
@@ -55,7 +55,7 @@ class ElasticPotential(eqx.Module):
 
     def deformation(self, u: NodeVector | None) -> Deformations:
         """F_p + Σ_i u_i h_ipᵀ at a displacement u [m], shape (n, d), one array for each material; None for u = 0."""
-        return self._deformation(self.displaced(u))
+        return self.current_deformation() if u is None else self._deformation(self.displaced(u))
 
     def _deformation(self, moved: Displacement) -> Deformations:
         if moved.at_rest:
