@@ -28,7 +28,7 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
 from mpmjax.boundary._conditions import Conditions, Given
-from mpmjax.potential import AbstractTerm, Displacement, Image, Mirror
+from mpmjax.potential import AbstractTerm, Displacement, Image, Mirror, scattered
 
 ActiveSet = tuple[Bool[Array, "..."], ...]
 """The places that are held, one mask for each contact."""
@@ -195,7 +195,11 @@ class AbstractContact(eqx.Module):
             active: the places of this contact that are held.
         """
         springs, nodes = self.springs(active), held.unheld
-        return None if springs is None else nodes.dt * nodes.potential.unfolded([springs.force(held.moved)])
+        return (
+            None
+            if springs is None
+            else nodes.dt * scattered([springs.force(held.moved)], held.moved.stencil, len(nodes.mass))
+        )
 
     @staticmethod
     def stability_rate(

@@ -63,7 +63,10 @@ class ParticleStiffness(AbstractHessianAction):
         return not (self.mirror.images or self.coupled or self.others)
 
     def __call__(self, du: NodeVector) -> NodeVector:
-        moved = Displacement(self.stencil, len(du), self.mirror.unfold(du))
+        u = self.mirror.unfold(du)
+        if not self.coupled + self.others:
+            return self.mirror.fold(resist(self.stencil, self.upper, u))
+        moved = Displacement(self.stencil, len(du), u)
         answers = [part(moved) for part in self.coupled + self.others]
         # what others scatter shares the gather and the scatter of the particles; else `resist` does both in one pass
         if any(answer.value is not None or answer.slopes is not None for answer in answers):
@@ -209,14 +212,14 @@ class AnalyticHessian(AbstractHessian):
     def __check_init__(self):
         require_fields(self)
 
-    def at(self, potential: ElasticPotential, u: NodeVector | None) -> TangentAction:
-        def tangent(law: AbstractElastic, F: Deformation) -> AbstractTangent:
-            return law.projected_tangent(F) if self.projected else law.tangent(F)
-
-        return _tangents_of(potential, u, tangent, definite=self.projected)
+    def at(self, potential: ElasticPotential, u: NodeVector) -> TangentAction:
+        return _tangents_of(potential, u, self._tangent, definite=self.projected)
 
     def at_step_start(self, potential: ElasticPotential) -> TangentAction:
-        return self.at(potential, None)  # without the gather
+        return _tangents_of(potential, None, self._tangent, definite=self.projected)  # without the gather
+
+    def _tangent(self, law: AbstractElastic, F: Deformation) -> AbstractTangent:
+        return law.projected_tangent(F) if self.projected else law.tangent(F)
 
     def exact(self) -> "AnalyticHessian":
         return AnalyticHessian() if self.projected else self

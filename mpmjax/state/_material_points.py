@@ -97,22 +97,20 @@ class MaterialPoints(eqx.Module):
             tangent: the stress differential δF ↦ δP.
             dim: d.
         """
+        coupled: tuple[AbstractStiffness, ...] = ()
         if isinstance(tangent, AveragedTangent):
-            part = tangent.stiffness(self.rows, lambda P: la.transpose(self.flux(P, dim)))
-            return self._matrices(tangent.at_fixed_means, dim), (part,)
-        return self._matrices(tangent, dim), ()
-
-    def _matrices(self, tangent: Callable[[Deformation], Deformation], dim: int) -> Float[Array, "t q"]:
+            coupled = (tangent.stiffness(self.rows, lambda P: la.transpose(self.flux(P, dim))),)
+            tangent = tangent.at_fixed_means
         like = jnp.zeros((dim, dim, *self.volume.shape), self.volume.dtype)
         if isinstance(tangent, AbstractTangent) and self.deformation.ndim == like.ndim:
             A = la.identity_like(like) if self.total else self.deformation
             if (closed := tangent.pushed_forward(A, self.volume)) is not None:
-                return closed
+                return closed, coupled
 
         def flux_of(slopes: Matrix) -> Matrix:
             return la.transpose(self.flux(tangent(self.change(la.transpose(slopes))), dim))
 
-        return la.upper_triangle(la.matrix_of(flux_of, like))
+        return la.upper_triangle(la.matrix_of(flux_of, like)), coupled
 
     def volume_ratio(self) -> Float[Array, "q"]:
         """J = det F [-], shape (q,)."""
