@@ -247,7 +247,7 @@ def test_springs_to_the_ground_and_of_contact_make_one_potential(d):
     nodes = start_nodes(scene, particles, 0.0, 1e-3, scene.stencil(particles), force_at=1.0)
     shut = tuple(contact.gap < 0 for contact in nodes.contacts)
     potential = constrain(nodes, shut).nodes.potential
-    assert [type(term).__name__ for term in potential.terms] == ["Support", "Springs"]
+    assert {type(term).__name__ for term in potential.terms} == {"Support", "Springs"}
     u, du = (
         jnp.where(nodes.occupied, a, 0) for a in 1e-3 * np.random.default_rng(0).normal(size=(2, *nodes.force.shape))
     )
@@ -256,8 +256,9 @@ def test_springs_to_the_ground_and_of_contact_make_one_potential(d):
     resistance = -jax.jvp(potential.force, (jnp.zeros_like(u),), (du,))[1]
     assert_close(action(du), resistance, 1e-10)
     assert_close(action.precomputed()(du), resistance, 1e-10)
-    for term in potential.terms:
-        other = dataclasses.replace(potential, terms=(term,))
+    for without in ("Springs", "Support"):
+        terms = tuple(term for term in potential.terms if type(term).__name__ != without)
+        other = dataclasses.replace(potential, terms=terms)
         assert np.abs(np.asarray(other.force(u) - potential.force(u))).max() > 1e-3
 
 

@@ -69,7 +69,7 @@ def test_its_eigenvalues_are_between_those_of_shear_and_those_of_lumping_whateve
     for volumes that alternate from node to node with two particles along a cell's edge, to 1."""
     operator = operator_of(*bodies(d, 0.49999, 2 if d == 2 else 1))
     A, W, _ = matrices(operator, CHOICES[1])
-    A0, P, _ = matrices(eqx.tree_at(lambda o: o.hessian.averaged, operator.precomputed(), ()), CHOICES[0])
+    A0, P, _ = matrices(eqx.tree_at(lambda o: o.hessian.coupled, operator.precomputed(), ()), CHOICES[0])
     shear, own = (scipy.linalg.eigh(*pair, eigvals_only=True) for pair in ((A0, P), (A, W)))
     assert own[0] > min(shear[0], 4.0**-d) * (1 - 1e-6)
     assert own[-1] < max(shear[-1], 1) * (1 + 1e-6)
