@@ -41,11 +41,9 @@ NAMELESS = {"found", "own", "known", "given", "said"}
 """Names that say how a value came about, and not what it is."""
 NOT_YET = ("boundary/", "implicit/", "stepping/", "analysis/_budget.py")
 """Files in which some are left."""
-ENGINE = ("boundary/_contact.py", "boundary/_springs.py")
-"""Files in which some docstrings still start otherwise."""
 
 
-@pytest.mark.parametrize("name", [name for name in FILES if not name.startswith(ENGINE)])
+@pytest.mark.parametrize("name", FILES)
 def test_docstrings_start_with_their_subject(name):
     """And not with a pronoun or a relative clause."""
     documented = (node for node in ast.walk(FILES[name]) if isinstance(getattr(node, "body", None), list))

@@ -10,7 +10,7 @@ import pytest
 from helpers import assert_close
 
 import mpmjax as mpm
-from mpmjax import Trial, WorkPrecision
+from mpmjax.analysis import Trial, WorkPrecision
 from mpmjax.analysis._bench import FRAMES, Bench, Timed
 from mpmjax.analysis._reference_run import settle
 from mpmjax.verification import StandingWave, discretise

@@ -35,12 +35,12 @@ ActiveSet = tuple[Bool[Array, "..."], ...]
 
 
 class AbstractNodes(eqx.Module):
-    """What contact needs to know of a step's nodes."""
+    """The interface of a step's nodes to contact."""
 
     mass: eqx.AbstractVar[NodeScalar]
     """m_i [kg], shape (n,)."""
     conditions: eqx.AbstractVar[Conditions]
-    """What boundaries prescribe."""
+    """The prescribed motion."""
     dt: eqx.AbstractVar[Array]
     """Δt [s]."""
     potential: eqx.AbstractVar[Any]
@@ -48,7 +48,7 @@ class AbstractNodes(eqx.Module):
     contacts: eqx.AbstractVar[tuple["AbstractContact", ...]]
     """The boundaries that may be left."""
     loose: eqx.AbstractVar[Any]
-    """The same nodes with those of rigid bodies each by itself; None without rigid bodies."""
+    """The nodes with those of rigid bodies each by itself; None without rigid bodies."""
 
     @property
     @abc.abstractmethod
@@ -232,7 +232,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     unheld: N
     """The nodes of which no contact holds anything."""
     active: ActiveSet
-    """What is held."""
+    """The active set."""
     images: Mirror
     """The mirrors in the columns that are held."""
     nodes: N
@@ -365,7 +365,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         return tuple(found)
 
     def _loosened(self) -> "ConstrainedNodes":
-        """The same with the nodes of rigid bodies each by itself, as friction acts on them; gaps are those with the
+        """The nodes with those of rigid bodies each by itself, as friction acts on them; gaps are those with the
         bodies rigid."""
         loose = self.unheld.loose
         if loose is None:

@@ -74,7 +74,7 @@ class Patch(eqx.Module):
     shape: tuple[int, ...] = eqx.field(static=True)
     """The grid's shape."""
     periodic: tuple[bool, ...] = eqx.field(static=True)
-    """Its periodic directions."""
+    """Periodic directions."""
     whole: Float[Array, "m"]
     """Σ_j μ_j over each patch, shape (m,); 1 where it is zero."""
 
@@ -99,7 +99,7 @@ class Patch(eqx.Module):
         return self.weight[:, None] * self.total(amount / self.whole[:, None])
 
     def spread_square(self, amount: Float[Array, "m d"]) -> Float[Array, "m d"]:
-        """The same with the squares of the shares."""
+        """The patch with the squares of the shares."""
         return self.weight[:, None] ** 2 * self.total(amount / self.whole[:, None] ** 2)
 
 

@@ -194,8 +194,8 @@ def choices(hint: Any) -> dict[str, Any]:
     def below(kind: type) -> dict[str, Any]:
         if inspect.isabstract(kind) or kind.__name__.startswith("Abstract"):
             return {name: c for sub in kind.__subclasses__() for name, c in below(sub).items()}
-        room = sys.modules[".".join(kind.__module__.split(".")[:2])]
-        internal = is_own(kind) and not hasattr(room, kind.__name__)
+        room = ".".join(kind.__module__.split(".")[:2])
+        internal = is_own(kind) and not hasattr(sys.modules[room], kind.__name__)
         return {} if internal else {kind.__name__: kind}
 
     names: dict[str, Any] = {}
