@@ -8,7 +8,7 @@ import pytest
 from helpers import FLUIDS, assert_close, block, ids, thorough
 
 import mpmjax as mpm
-from mpmjax.material import Tait
+from mpmjax.material._fluid import Tait
 
 EXPONENTS = (0.5, 1.0, 1.0 + 1e-5, 1.4, 7.0)
 
