@@ -405,3 +405,14 @@ def test_what_passes_a_boundary_is_named(d, name, method):
     for cells in (2.5, 5.0):
         with pytest.raises(mpm.SimulationError, match=rf"At step \d+ .* passed boundary 0, {type(floor).__name__}"):
             thrown(cells)
+
+
+@pytest.mark.parametrize("inward", [1, -1])
+def test_how_deep_a_moving_wall_lets_a_particle_come_is_counted_from_the_nodes(inward):
+    """To where no node of its stencil is free: 1.5 spacings before the first free node, wherever the wall has moved."""
+    wide, corner = (np.inf,) * 2, (0.0, 0.0)
+    lower, upper = (corner, wide) if inward == 1 else (tuple(-a for a in wide), corner)
+    wall = mpm.SlipBox(lower, upper, mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.09 * inward, 0.0))))
+    start = jnp.array([[0.0, 1.0], [0.0, 1.0]]) * inward
+    end = jnp.array([[-0.049, 1.0], [-0.051, 1.0]]) * inward  # the node at 0 is held, that at 0.1 is the first free one
+    np.testing.assert_array_equal(wall.passed(start, end, 0.1, 1.0, 0.0, 1.5), [False, True])

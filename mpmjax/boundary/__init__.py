@@ -27,7 +27,7 @@ from mpmjax.boundary._contact import (
     ConstrainedNodes,
     constrain,
 )
-from mpmjax.boundary._contact_info import ContactInfo, no_contact
+from mpmjax.boundary._contact_info import ContactInfo
 from mpmjax.boundary._faces import EXPLICIT_STIFFNESS, IMPLICIT_STIFFNESS, Faces, FaceShape
 from mpmjax.boundary._grip import Grip
 from mpmjax.boundary._planes import ContactPlane, SymmetryPlane
@@ -81,7 +81,6 @@ __all__ = [
     "mirror",
     "mirror_motion",
     "no_boundary_impulse",
-    "no_contact",
     "no_impulse",
     "owners_of",
     "refuse_contact",

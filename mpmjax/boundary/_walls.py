@@ -56,13 +56,15 @@ class AbstractBox(AbstractBoundary):
     def passed(
         self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
     ) -> Bool[Array, "p"]:
-        """Which particles passed a wall: those deeper than `deepest`, among others (`crossed`)."""
-        start, end = start - self.displacement(t), end - self.displacement(t + dt)
+        """Which particles passed a wall: those that come deeper than `deepest`, among others (`crossed`)."""
+        shift = self.displacement(t + dt)
+        start, end = start - self.displacement(t), end - shift
 
         def beyond(inward: int, corner: Corner) -> list[Array]:
             """Whether particles passed the wall of each axis, along its inward normal."""
             walls = inward * jnp.asarray(corner, end.dtype)
-            place = walls, self.deepest(walls, spacing, reach)
+            moved = inward * jnp.asarray(shift, end.dtype)  # past the nodes, which rest
+            place = walls, self.deepest(walls + moved, spacing, reach) - moved
             return [crossed(*along, spacing) for along in zip(inward * start.T, inward * end.T, *place, strict=True)]
 
         # axis by axis: of a reduction over them XLA would make a loop within its loop over the particles

@@ -140,6 +140,7 @@ class Linearised(AbstractSolution):
         rhs, lift = problem.rhs, None
         if problem.prescribed is not None:
             lift, at_rest = combine(0, problem.prescribed), rhs
+            # walls at rest, the common case, spare one application of H
             rhs = jax.lax.cond((lift != 0).any(), lambda: at_rest - operator.unconstrained(lift), lambda: at_rest)
         rhs = combine(rhs, 0)
         inner = problem.preconditioner.inner_product(operator)

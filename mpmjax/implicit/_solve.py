@@ -86,6 +86,8 @@ def _solve_jvp(primals: Any, tangents: Any) -> Any:
     if problem.prescribed is not None or problem.projection.normals:  # else it stays at rest
         lift = combine(0, -d_residual)
         rhs = combine(rhs - operator.unconstrained(lift), 0)
+    # The second component reports the tangent solve: zero, or the residual of a solve that failed. It goes with the
+    # first through one custom_linear_solve, so that the transposed solve reports likewise.
     d_slot = rhs[:0].sum() + (0 if d_slot is None else d_slot)  # a zero that keeps d_slot linear in the tangents
 
     def matvec(x: tuple[NodeVector, Array]) -> tuple[NodeVector, Array]:
