@@ -82,20 +82,20 @@ def test_iterations_do_not_grow_and_the_motion_is_the_same(d):
         scene, particles = block(d, material=mpm.NeoHookean(1e4, nu), volume=AVERAGED)
         turned = particles.x[:, ::-1] - particles.x.mean(axis=0)
         particles = eqx.tree_at(lambda p: p.v, particles, 0.1 * turned)
-        solver = mpm.ConjugateResidual(rtol=1e-9, max_steps=10_000)
+        solver = mpm.ConjugateResidual(rtol=1e-8, max_steps=10_000)  # with 1e-9 rounding decides the counts
         method = mpm.SemiImplicit(solver=solver, preconditioner=preconditioner)
         after, info = mpm.step(scene, particles, 0.0, 1e-1, method=method)
         return after.v, info.solve
 
     one, other = (jax.jit(lambda nu, choice=choice: stepped(nu, choice)) for choice in CHOICES)
-    (velocity, plain), (found, solve), (_, stiffer) = one(0.4999), other(0.4999), other(0.49999)
-    assert solve.converged
-    assert plain.converged
-    assert_close(found, velocity, 1e-6)
-    assert stiffer.converged
+    (velocity, plain), (preconditioned, solve) = one(0.4999), other(0.4999)
+    plain_stiffer, stiffer = one(0.49999)[1], other(0.49999)[1]
+    for report in (plain, solve, plain_stiffer, stiffer):
+        assert report.converged
+    assert_close(preconditioned, velocity, 1e-6)
     growth = int(stiffer.iterations) / int(solve.iterations)  # by ten times the bulk modulus; the diagonal's is 1.85
     assert growth < (1.2 if d == 2 else 1.7)
-    assert int(solve.iterations) < int(plain.iterations) / 3
+    assert int(stiffer.iterations) < int(plain_stiffer.iterations) / (2.5 if d == 2 else 5)
 
 
 def placed(d, corner, nu, preconditioner, window=16, side=3):
