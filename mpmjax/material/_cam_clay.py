@@ -77,7 +77,7 @@ class CamClay(AbstractInelastic):
         """α = −arsinh(p₀/K)/ξ, ε_t = 0."""
         return CamClayHistory(self._first_strain() * jnp.ones(F.shape[2:], F.dtype), no_transverse_strain(F))
 
-    def _first_strain(self) -> Scalar:
+    def _first_strain(self) -> PerParticle:
         """α of what never yielded."""
         bulk_modulus = Hencky(self.youngs_modulus, self.poisson_ratio).bulk_modulus
         return -jnp.arcsinh(self.preconsolidation / bulk_modulus) / self.hardening
