@@ -81,10 +81,8 @@ def refused(features: dict) -> str | None:
     return None
 
 
-@pytest.mark.parametrize(
-    "first",
-    [pytest.param(name, marks=getattr(pytest.mark, "thorough" if name == "bodies" else "slow")) for name in FEATURES],
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("first", FEATURES)
 def test_two_features_work_together_or_are_refused_in_one_line(first):
     names = list(FEATURES)
     for second in names[names.index(first) + 1 :]:
