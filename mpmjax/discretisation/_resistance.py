@@ -50,7 +50,7 @@ define_placed(_resist_p, _resist, _like_nodes)
 def _jvp(
     take: Callable[[], list[Array]], primals: tuple, tangents: tuple, *, batched: int
 ) -> tuple[list[Array], list[Any]]:
-    """It is linear in u. Differentials by all else, which no iteration needs, are those of the sums it is made of."""
+    """JVP: by u the sum itself, linear in it; by the rest, which no iteration needs, gather's and scatter's."""
     index, *others, u = primals
     *changes, du = tangents[1:]
     out = take()

@@ -17,7 +17,7 @@ from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractRegion
 from mpmjax.material import AbstractMaterial
 from mpmjax.simulation import Run
-from mpmjax.state import AbstractBodyForce, Particles, Scene, UpdatedLagrangian, fill
+from mpmjax.state import AbstractBodyForce, Particles, Scene, State, UpdatedLagrangian, fill
 
 _MARGIN = 4  # nodes beyond the domain, for the widest stencil and some motion
 
@@ -173,6 +173,13 @@ def discretise(
     return scene, Particles(x, v, rest.mass, rest.volume, deformations=(F,), C=C, X=X)
 
 
+def _frames_and_shares(particles: Particles, run: Run) -> tuple[State, Array, Array]:
+    """The frames of a run, X [m] of its particles, and the share of each in the volume, shape (p,)."""
+    if run.frames is None or particles.X is None:
+        raise ValueError("The error needs a run with frames (pass save_every to simulate) and particles with X.")
+    return run.frames, particles.X, particles.volume / particles.volume.sum()
+
+
 def displacement_error(problem: AbstractProblem, particles: Particles, run: Run) -> Float[Array, "f"]:
     """√(Σ V0 ‖x − x(X, t)‖² / Σ V0) [m] at each saved frame, shape (f,).
 
@@ -181,16 +188,14 @@ def displacement_error(problem: AbstractProblem, particles: Particles, run: Run)
         particles: the particles from `discretise`, with X.
         run: the run, with frames.
     """
-    if run.frames is None or particles.X is None:
-        raise ValueError("The error needs a run with frames (pass save_every to simulate) and particles with X.")
-    X, share = particles.X, particles.volume / particles.volume.sum()
+    frames, X, share = _frames_and_shares(particles, run)
 
     def at(frame: tuple[Array, Array]) -> Array:
         x, t = frame
         exact = jax.vmap(lambda Y: problem.position(Y, t))(X)
         return jnp.sqrt((share * ((x - exact) ** 2).sum(axis=1)).sum())
 
-    return jax.lax.map(at, (run.frames.x, run.times))
+    return jax.lax.map(at, (frames.x, run.times))
 
 
 def stress_error(problem: AbstractProblem, particles: Particles, run: Run) -> Float[Array, "f"]:
@@ -202,9 +207,7 @@ def stress_error(problem: AbstractProblem, particles: Particles, run: Run) -> Fl
         particles: the particles from `discretise`, with X.
         run: the run, with frames.
     """
-    if run.frames is None or particles.X is None:
-        raise ValueError("The error needs a run with frames (pass save_every to simulate) and particles with X.")
-    X, share = particles.X, particles.volume / particles.volume.sum()
+    frames, X, share = _frames_and_shares(particles, run)
 
     def at(frame: tuple[Array, Array]) -> Array:
         F, t = frame
@@ -212,4 +215,4 @@ def stress_error(problem: AbstractProblem, particles: Particles, run: Run) -> Fl
         miss = jax.vmap(problem.material.stress)(F) - jax.vmap(problem.material.stress)(exact)
         return (share * jnp.sqrt((miss**2).sum(axis=(1, 2)))).sum()
 
-    return jax.lax.map(at, (run.frames.F, run.times))
+    return jax.lax.map(at, (frames.F, run.times))
