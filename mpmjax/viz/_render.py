@@ -223,11 +223,16 @@ def _solid_canvas(run: Run, bar: Any, label: str, view: tuple[float, float]) -> 
     names = ["−" * bool(row.min() < 0) + "xyz"[int(np.abs(row).argmax())] for row in turn]
     axes.set(**{f"{a}lim": limits for a, limits in zip("xyz", np.stack([lower, upper], axis=1), strict=True)})
     axes.set(**{f"{a}label": f"{name} [m]" for a, name in zip("xyz", names, strict=True)})
-    axes.set_box_aspect(upper - lower, zoom=1.0)
+    sides = upper - lower
+    slender = float(sides.max() / np.linalg.norm(sides))  # matplotlib makes the diagonal of every box as long
+    axes.set_box_aspect(sides, zoom=min(1.0, 0.66 / slender))
     axes.view_init(view[1], view[0] - 90)
-    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+    for axis, side in zip((axes.xaxis, axes.yaxis, axes.zaxis), sides / sides.max(), strict=True):
         axis.pane.set_visible(axis is axes.zaxis)
-        axis.set_major_locator(ticker.MaxNLocator(5))
+        away = float(sides.max() / sides[:2].mean()) if axis is axes.zaxis else 1.0  # pads shrink with the sides
+        axis.set_tick_params(pad=11 * away - 8)
+        axis.labelpad = 25 * away - 21
+        axis.set_major_locator(ticker.MaxNLocator(max(2, round(5 * side))))  # labels of a short side would overlap
     if bar is not None:
         figure.colorbar(bar, cax=figure.add_axes((0.88, 0.28, 0.018, 0.44)), label=label)
     # points of paper to a metre at the middle, along the picture's horizontal
