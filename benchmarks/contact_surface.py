@@ -57,7 +57,7 @@ class NodeWall(mpm.boundary.AbstractBoundary):
     def conditions(self, nodes, spacing, t, dt, *, reference):
         return mpm.boundary.Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes))
 
-    def contacts(self, conditions, grid, window, t, dt):
+    def contacts(self, faces, grid, window, t, dt):
         return (NodeContact(grid.nodes(window)[:, 0] <= self.position + 1e-3 * grid.spacing),)
 
 

@@ -185,6 +185,6 @@ def _grid_update(scene, particles, t, dt, method) -> GridUpdate:
     grid = update(nodes, method)
     position = scene.grid.nodes(scene.window(particles))
     held, push = grid.held(nodes), reaction(nodes, grid.solved, grid.elastic)
-    velocity, holding = grid.motion.velocity, held.beside_springs(push)
+    velocity, holding = grid.motion.velocity, held.without_spring_impulses(push)
     friction = nodes.mass[:, None] * (velocity - grid.solved.velocity)
     return GridUpdate(nodes, velocity, push, info, new, position, grid, held, holding, friction)

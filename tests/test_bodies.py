@@ -10,7 +10,7 @@ import pytest
 from helpers import assert_close, assert_files_hold, ids, thorough
 
 import mpmjax as mpm
-from mpmjax.boundary._springs import Coupling, Patch
+from mpmjax.boundary._body_contact import Coupling, Patch
 from mpmjax.checks import canonical
 from mpmjax.potential import Displacement
 from mpmjax.stepping import start_nodes

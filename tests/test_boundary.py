@@ -222,10 +222,9 @@ def test_fold_is_the_transpose_of_unfold_where_some_columns_are_held():
     """Two planes that meet, with random columns of either: every node is itself or a signed copy; no mass is lost."""
     grid, rng = mpm.Grid((7, 6), DX), np.random.default_rng(0)
     planes = (mpm.ContactPlane(0, 0.2), mpm.ContactPlane(1, 0.35, "below"))
-    nothing_prescribed = mpm.boundary.Conditions(jnp.zeros((42, 2), bool), jnp.zeros((42, 2)))
     columns = [np.broadcast_to(rng.random((1, 6)) < 0.5, (7, 6)), np.broadcast_to(rng.random((7, 1)) < 0.5, (7, 6))]
     window = grid.window(jnp.zeros((1, 2)))
-    found = [c for _, c in brought_contacts(planes, nothing_prescribed, grid, window, 0.0, DT, None, 0.0)]
+    found = [c for _, c in brought_contacts(planes, None, grid, window, 0.0, DT)]
     images = Mirror(tuple(c.image.within(jnp.asarray(h.ravel())) for c, h in zip(found, columns, strict=True)))
     basis = jnp.eye(84).reshape(84, 42, 2)
     B, transpose = (np.asarray(jax.vmap(f)(basis)).reshape(84, 84).T for f in (images.unfold, images.fold))

@@ -253,13 +253,13 @@ def judged(contact, step, method):
     """The gaps that the springs of a contact feel, and nodes of which nothing is held."""
     nodes = step.nodes
     nothing_held = ConstrainedNodes(nodes, (), Mirror(()), nodes, method.mean_displacement(nodes, step.update.solved))
-    return np.asarray(contact.gap_felt(nothing_held)), nothing_held
+    return np.asarray(contact.spring_gap(nothing_held)), nothing_held
 
 
 def pushes(contact, step, method):
     """At the nodes: the sums of the pushes around, and their mean normal and velocity of the surface, of one side."""
     gap, nothing_held = judged(contact, step, method)
-    push = contact.push(nothing_held, jnp.asarray(gap < 0))[:1]
+    push = jnp.where(gap < 0, contact.normal_impulse(nothing_held, None), 0)[:1]
     velocity = jnp.zeros_like(contact.normal) if contact.velocity is None else contact.velocity
     fields = jnp.concatenate([push, push * contact.normal, push * velocity])
     sums, d = np.asarray(scatter(contact.faces.stencil, fields, None, len(step.velocity))), len(contact.normal)

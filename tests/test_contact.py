@@ -1,7 +1,5 @@
 """Contact: walls that push but do not pull, and Coulomb friction."""
 
-from types import SimpleNamespace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,8 +10,8 @@ from numpy_oracle import grid_update
 
 import mpmjax as mpm
 from mpmjax.boundary._active_set import SWEEPS, find_active_set
-from mpmjax.boundary._contact import ConstrainedNodes, constrain
-from mpmjax.boundary._friction import friction_across, friction_along, share_taken
+from mpmjax.boundary._contact import ConstrainedNodes, constrain, count_places
+from mpmjax.boundary._friction import friction_change, friction_share
 from mpmjax.checks._values import canonical
 from mpmjax.implicit._projection import Projection
 from mpmjax.implicit._solution import no_solve
@@ -79,7 +77,7 @@ def judged(step, method):
     felt = method.mean_displacement(nodes, step.update.motion)
     nothing_held = ConstrainedNodes(nodes, (), Mirror(()), nodes, felt)
     for contact in nodes.contacts:
-        gap = contact.gap_felt(nothing_held)
+        gap = contact.spring_gap(nothing_held)
         yield contact, np.asarray(gap), contact.spring_impulse(nothing_held, gap < 0)
 
 
@@ -365,7 +363,8 @@ def test_a_verdict_is_given_beyond_rounding_only():
         active = (jnp.full(len(mass), held),)
         v = fast if held else fast + along * (weight / np.where(met, mass, 1))[:, None]
         momentum_residual = weight[:, None] * along if held else 0 * along
-        return int(constrain(nodes, active).count_violations(jnp.asarray(v), jnp.asarray(momentum_residual)))
+        sets = constrain(nodes, active).violations(jnp.asarray(v), jnp.asarray(momentum_residual))
+        return int(count_places(nodes, *sets))
 
     assert met.sum() > 3
     for held in (True, False):
@@ -489,7 +488,7 @@ def test_the_derivative_of_friction_is_that_of_sticking_or_of_sliding():
     is not, I − (limit/m)(I − s sᵀ/s²)/‖s‖ and by the limit −s/(m ‖s‖); I where nothing pushes or has mass."""
 
     def left(s, limit, mass=2.0):
-        return s - share_taken(s[None], jnp.asarray([mass]), limit[None])[0] * s
+        return s - friction_share(s[None], jnp.asarray([mass]), limit[None])[0] * s
 
     slope = jax.jit(jax.jacfwd(left, argnums=(0, 1)))
     s, whole = jnp.array([3.0, 4.0]), np.eye(2)
@@ -538,34 +537,25 @@ def test_what_friction_holds_at_rest_has_the_derivative_of_sticking(wall, name, 
 
 
 def nodes_held(fixed, normal=None):
-    """Nodes of mass 2 kg with an active set held, of which friction is asked alone.
+    """The projection and mass, 2 kg, of some nodes.
 
     Args:
         fixed: components that a boundary prescribes, shape (n, d).
         normal: normals that colliders hold, shape (n, d).
     """
-    nodes = object.__new__(ConstrainedNodes)
-    fixed, mass = jnp.asarray(fixed), jnp.full(len(fixed), 2.0)
-    conditions = SimpleNamespace(fixed=fixed, colliders=None if normal is None else ())
-    free = ~fixed
-    normals = () if normal is None else (jnp.asarray(normal),)
-    for name, value in {
-        "unheld": SimpleNamespace(mass=mass, conditions=conditions),
-        "images": SimpleNamespace(fold_scalar=lambda m: m),
-        "nodes": SimpleNamespace(mass=mass, free=free, projection=Projection(free, normals)),
-    }.items():
-        object.__setattr__(nodes, name, value)
-    return nodes
+    free, normals = ~jnp.asarray(fixed), () if normal is None else (jnp.asarray(normal),)
+    return Projection(free, normals), jnp.full(len(free), 2.0)
 
 
 V = jnp.asarray([[0.3, 0.4, -1.0]] * 3)
+Z = jnp.asarray([0.0, 0.0, 1.0])
 X_IS_HELD = [[False] * 3, [True, False, False], [False] * 3]
 LIMITS = jnp.asarray([0.05, 0.05, 5.0])
 
 
 def test_friction_on_a_wall_stops_slip_and_nothing_that_is_held():
     """−min(1, limit/(m ‖s‖)) s at a free node, at one whose x is prescribed, and at one that sticks."""
-    change = friction_across(nodes_held(X_IS_HELD), 2, LIMITS, V)
+    change = friction_change(*nodes_held(X_IS_HELD), Z, 0.0, LIMITS, V)
     share = 0.05 / 2 / 0.5
     np.testing.assert_allclose(change, [[-share * 0.3, -share * 0.4, 0], [0, -share * 0.4, 0], [-0.3, -0.4, 0]])
 
@@ -573,7 +563,7 @@ def test_friction_on_a_wall_stops_slip_and_nothing_that_is_held():
 def test_friction_on_a_wall_takes_what_a_collider_holds_off_the_slip():
     """With the collider's normal oblique, along the wall, and along the wall's own."""
     normal = np.array([[0.48, 0.36, 0.8], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
-    change = np.asarray(friction_across(nodes_held([[False] * 3] * 3, normal), 2, LIMITS, V))
+    change = np.asarray(friction_change(*nodes_held([[False] * 3] * 3, normal), Z, 0.0, LIMITS, V))
     along = np.array([0.8, 0.6, 0])
     slip = np.array([0.3, 0.4, 0]) - along * (along @ [0.3, 0.4, 0])
     wanted = -0.05 / 2 / np.linalg.norm(slip) * slip
@@ -585,12 +575,12 @@ def test_friction_on_a_surface_stops_slip_and_nothing_that_is_held():
     what is held."""
     up = jnp.asarray([[0.0, 0.0, 3e-3], [3.0, 0.0, 4.0], [0.0, 0.0, 3.0]])
     moving = jnp.asarray([[-0.3, 0.0, 7.0]] * 3)
-    change = friction_along(nodes_held(X_IS_HELD), up, moving, LIMITS, V)
+    change = friction_change(*nodes_held(X_IS_HELD), up, moving, LIMITS, V)
     share = 0.05 / 2 / np.hypot(0.6, 0.4)
     np.testing.assert_allclose(change, [[-share * 0.6, -share * 0.4, 0], [0, -0.05 / 2, 0], [-0.6, -0.4, 0]])
     # Beside a collider, whose normal is at right angles to the surface's, or oblique to it; and where it does not push.
     normal = np.array([[0.8, 0.6, 0.0], [0.48, 0.36, 0.8], [0.8, 0.6, 0.0]])
-    change = friction_along(nodes_held([[False] * 3] * 3, normal), up.at[2].set(0), moving, LIMITS, V)
+    change = friction_change(*nodes_held([[False] * 3] * 3, normal), up.at[2].set(0), moving, LIMITS, V)
     for k in (0, 1):
         along = np.cross(normal[k], up[k])
         slip = along * (along @ (V[k] - moving[k])) / np.linalg.norm(along)

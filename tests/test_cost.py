@@ -216,7 +216,7 @@ def test_without_colliders_a_constraint_is_a_mask(method, boundary):
         mock.patch.object(Nodes, "projection", property(lambda self: Projection(self.free))),
         mock.patch.object(Nodes, "prescribed", property(lambda self: self.conditions.velocity)),
         mock.patch.object(ConstrainedNodes, "along_normals", return_value=()),
-        mock.patch.object(ConstrainedNodes, "beside_colliders", lambda self, residual: residual),
+        mock.patch.object(ConstrainedNodes, "without_collider_impulses", lambda self, residual: residual),
     ):
         step, arrays = program(method, boundary=boundary)
         assert equations(jax.make_jaxpr(step)(arrays).jaxpr) == as_is

@@ -40,10 +40,8 @@ FILES = {path.relative_to(PACKAGE).as_posix(): ast.parse(path.read_text()) for p
 NAMELESS = {"found", "own", "known", "given", "said"}
 """Names that say how a value came about, and not what it is."""
 NOT_YET = {
-    *(f"boundary/_{n}.py" for n in ("body_contact", "boundary", "boundary_impulse", "collider_impulse", "combined")),
-    *(f"boundary/_{n}.py" for n in ("contact", "planes", "springs")),
     *(f"implicit/_{n}.py" for n in ("dissection", "hessian", "potential", "volume_preconditioner")),
-    *(f"stepping/_{n}.py" for n in ("boundary_forces", "contact_surfaces", "rigid_layers", "stability", "step")),
+    *(f"stepping/_{n}.py" for n in ("rigid_layers", "stability", "step")),
 }
 """Files in which some are left."""
 

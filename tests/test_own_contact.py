@@ -69,7 +69,7 @@ class GluedWall(mpm.boundary.AbstractBoundary):
     def conditions(self, nodes, spacing, t, dt, *, reference):
         return mpm.boundary.Conditions(jnp.zeros(nodes.shape, bool), jnp.zeros_like(nodes))
 
-    def contacts(self, conditions, grid, window, t, dt):
+    def contacts(self, faces, grid, window, t, dt):
         beyond = self.inward * (grid.nodes(window)[:, self.axis] - self.position) <= 1e-3 * grid.spacing
         bears = jnp.asarray(self.glue * grid.spacing ** (grid.dim - 1) * dt)
         return (GlueContact(self.axis, grid.shape, self.inward, beyond, bears),)

@@ -12,7 +12,7 @@ from helpers import assert_close, cloud, ids, thorough
 
 import mpmjax as mpm
 from mpmjax.boundary import FaceShape
-from mpmjax.boundary._springs import Springs
+from mpmjax.boundary._surface_contact import Springs
 from mpmjax.potential import Displacement, scattered
 
 INF = np.inf

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -12,6 +13,15 @@ from mpmjax.potential import Mirror
 
 SWEEPS = 4
 """Most active sets that are tried in a step."""
+
+
+class ContactInfo(eqx.Module):
+    """The report of contact: how the active set was found."""
+
+    sweeps: Int[Array, "*f"]
+    """Solves before the last one."""
+    violations: Int[Array, "*f"]
+    """Places that pull or are entered all the same."""
 
 
 def find_active_set(
@@ -40,14 +50,10 @@ def find_active_set(
 
     def sweep(state: tuple) -> tuple:
         active, guess, cost, _, count = state
-        held = constrain(nodes, active)
-        held, v, residual, guess, info = attempt(held, guess)
+        held, v, residual, guess, info = attempt(constrain(nodes, active), guess)
         pulls, enters = held.violations(v, residual)
         active = jax.tree.map(lambda was, pulled, entered: (was & ~pulled) | entered, active, pulls, enters)
         return active, guess, cost.followed_by(info), count_places(nodes, pulls, enters) > 0, count + 1
-
-    def unsettled(state: tuple) -> Array:
-        return state[3] & (state[4] < SWEEPS)
 
     predictor = nodes.explicit_velocity()
     nothing_held = ConstrainedNodes(nodes, (), Mirror(()), nodes, start)
@@ -56,5 +62,5 @@ def find_active_set(
     if explicit and all(contact.known_at_start for contact in nodes.contacts):
         return active, guess, cost, none
     first = (active, guess, cost, jnp.asarray(True), none)
-    active, guess, cost, _, count = jax.lax.while_loop(unsettled, sweep, first)
+    active, guess, cost, _, count = jax.lax.while_loop(lambda s: s[3] & (s[4] < SWEEPS), sweep, first)
     return active, guess, cost, count

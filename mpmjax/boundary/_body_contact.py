@@ -1,19 +1,31 @@
-"""Contact of two bodies, each of which has a layer of nodes of its own."""
+"""Contact of two bodies, each of which has a layer of nodes of its own at the same places.
+
+The gap between them at a node is linear in the displacement u of the nodes about the start of the step,
+
+    g_i(u) = g_i(0) + n_i · Σ_j q_ij (u_j^a − u_j^b),    Σ_j q_ij = 1,
+
+where n is the unit normal from the body b to the body a and q_ij the mean over the patch of nodes around i. The gap is
+that of the particles around, which do not follow a node that moves by itself: with u_i in place of the mean the forces
+would do work that the gap knows nothing of. The forces on the two nodes of a place are opposite, so that they have
+neither sum nor moment.
+"""
 
 import math
+from collections.abc import Callable
+from functools import reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Mask, Matrix, NodeScalar, NodeVector, Scalar
-from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
-from mpmjax.boundary._friction import share_taken
-from mpmjax.boundary._springs import Coupling, Patch, moment
+from mpmjax.boundary._contact import AbstractSpringContact, ConstrainedNodes
+from mpmjax.boundary._friction import friction_share
 from mpmjax.discretisation import Grid
-from mpmjax.potential import Mirror
+from mpmjax.potential import AbstractSpring, Displacement, Forces, Mirror
 
 _SAMPLES = 256
 """Depths at which the distance of a half-space is tabulated."""
@@ -22,8 +34,8 @@ STIFFNESS = 2.0
 contact makes more of the noise of gaps, some hundredths of a spacing: with 20 the pressure between two cylinders
 differs by a third from node to node."""
 _LEAST_DEPTH = 1e-3
-"""Smallest mean depth, in spacings, at which a node counts as near the surface. Deep in a body it is zero, in a
-lattice only rounding."""
+"""Smallest mean depth of the particles around a node, in spacings, at which it counts as near the surface. Deep in a
+body that is zero, in a lattice only rounding."""
 _EMPTY = 1e-9
 """The part of a cell below which a body is not felt at a node."""
 _LEAST_SPREAD = 1e-2
@@ -69,7 +81,88 @@ class Body(NamedTuple):
     """Their mean density [kg/m^d], shape (m,)."""
 
 
-class BodyContact(AbstractContact):
+class Patch(eqx.Module):
+    """The node itself and its neighbours, 3^d nodes around each node of one layer, with a weight each."""
+
+    weight: Float[Array, "m"]
+    """μ_j ≥ 0, in any unit, shape (m,)."""
+    shape: tuple[int, ...] = eqx.field(static=True)
+    """The grid's shape."""
+    periodic: tuple[bool, ...] = eqx.field(static=True)
+    """Periodic directions."""
+    whole: Float[Array, "m"]
+    """Σ_j μ_j over each patch, shape (m,); 1 where it is zero."""
+
+    def __init__(self, weight: Float[Array, "m"], shape: tuple[int, ...], periodic: tuple[bool, ...]):
+        self.weight, self.shape, self.periodic = weight, shape, periodic
+        whole = self.total(weight)
+        self.whole = jnp.where(whole > 0, whole, 1)
+
+    def total(self, field: Array) -> Array:
+        """Σ_j f_j over the patch around each node, of shape (m,) or (m, d) as the field is."""
+        blocks = field.reshape(*self.shape, -1)
+        for axis, periodic in enumerate(self.periodic):
+            blocks = moment(blocks, axis, 0, reach=1, periodic=periodic)
+        return blocks.reshape(field.shape)
+
+    def mean(self, field: Float[Array, "m d"]) -> Float[Array, "m d"]:
+        """Σ_j μ_j f_j/Σ_j μ_j, shape (m, d); zero where no node of the patch has weight."""
+        return self.total(self.weight[:, None] * field) / self.whole[:, None]
+
+    def spread(self, amount: Float[Array, "m d"]) -> Float[Array, "m d"]:
+        """The transpose of `mean`: what each node has [shape (m, d)], shared among its patch by the weights."""
+        return self.weight[:, None] * self.total(amount / self.whole[:, None])
+
+    def spread_square(self, amount: Float[Array, "m d"]) -> Float[Array, "m d"]:
+        """The patch with the squares of the shares."""
+        return self.weight[:, None] ** 2 * self.total(amount / self.whole[:, None] ** 2)
+
+
+def moment(blocks: Array, axis: int, power: int, *, reach: int, periodic: bool) -> Array:
+    """Σ_k k^power f_{i+k} along an axis of nodes, k from −reach to reach."""
+    around = [(reach, reach) if a == axis else (0, 0) for a in range(blocks.ndim)]
+    wide = jnp.pad(blocks, around, mode="wrap" if periodic else "constant")
+    parts = [
+        k**power * jax.lax.slice_in_dim(wide, k + reach, k + reach + blocks.shape[axis], axis=axis)
+        for k in range(-reach, reach + 1)
+        if k != 0 or power == 0
+    ]
+    return reduce(jnp.add, parts)
+
+
+class Coupling(AbstractSpring):
+    """The springs between two bodies."""
+
+    stretch: Float[Array, "m"]
+    """g_i at u = 0 [m], shape (m,); zero where nothing is held."""
+    stiffness: Float[Array, "m"]
+    """k_i [N/m], shape (m,); zero where nothing is held."""
+    normal: Float[Array, "m d"]
+    """n_i [-], shape (m, d)."""
+    patch: Patch
+    """The nodes over which displacements are averaged, by c_a c_b/(c_a + c_b) of the two bodies."""
+    pair: tuple[int, int] = eqx.field(static=True)
+    """The numbers of the bodies a and b."""
+
+    def elongation(self, moved: Displacement) -> Float[Array, "m"]:
+        """n_i · Σ_j q_ij (u_j^a − u_j^b) [m], shape (m,)."""
+        layers = moved.nodes.reshape(-1, *self.normal.shape)
+        first, second = self.pair
+        return (self.normal * self.patch.mean(layers[first] - layers[second])).sum(axis=1)
+
+    def spread(self, amount: Float[Array, "m"], size: int) -> Forces:
+        return self._on_both(self.patch.spread(amount[:, None] * self.normal), -1, size)
+
+    def spread_square(self, amount: Float[Array, "m"], size: int) -> Forces:
+        return self._on_both(self.patch.spread_square(amount[:, None] * self.normal**2), 1, size)
+
+    def _on_both(self, force: Float[Array, "m d"], sign: int, size: int) -> Forces:
+        first, second = self.pair
+        nodes = jnp.zeros((size // len(force), *force.shape), force.dtype)
+        return Forces(nodes=nodes.at[first].add(force).at[second].add(sign * force).reshape(size, -1))
+
+
+class BodyContact(AbstractSpringContact):
     """Two bodies that push and rub each other, and may part. Each node is a place.
 
     The normal at a node is along C⁻² Δ, with Δ the difference of the bodies' middles around it, and C the covariance of
@@ -80,12 +173,11 @@ class BodyContact(AbstractContact):
     kernel, tells how far its surface is: an edge of the body beside the node does not change that. The gap is the sum
     of both bodies' distances.
 
-    A node at which the gap is below zero at the end of the step, in an explicit step at its start, has a spring
-    between the two bodies (see `Coupling`): those of both in a row, of stiffness α (M + ρ w²)/dx each, α = 2, on the
-    node's share of the surface, with the wave modulus M and the density ρ of the body, and w the velocity with which
-    the two meet. The share is dx^(d−1) cos²(πs/2dx) (c_a + c_b) at a distance s < dx from the surface; over the nodes
-    along the normal it sums to that part of the surface in which there are bodies. The spring feels the mean
-    displacement of the nodes around it, and pushes all of them.
+    The spring between them is those of both in a row, of stiffness α (M + ρ w²)/dx each, α = 2, on the node's share of
+    the surface, with the wave modulus M and the density ρ of the body, and w the velocity with which the two meet. The
+    share is dx^(d−1) cos²(πs/2dx) (c_a + c_b) at a distance s < dx from the surface; over the nodes along the normal it
+    sums to that part of the surface in which there are bodies. The spring feels the mean displacement of the nodes
+    around it, and pushes all of them (see `Coupling`).
 
     Friction is at most μ times the push at each node, against the slip of the two bodies.
     """
@@ -95,65 +187,22 @@ class BodyContact(AbstractContact):
     normal: Float[Array, "m d"]
     """n_i [-], from the second body to the first, shape (m, d)."""
     stiffness: Float[Array, "m"]
-    """k_i [N/m], shape (m,)."""
     coefficient: Scalar
     """Coulomb coefficient [-]."""
     dt: Scalar
-    """Δt [s]."""
     share: Scalar
-    """θ, the share of the step's displacement at which the integrator evaluates forces; 1 in an explicit step."""
     patch: Patch
     """The nodes around each, by c_a c_b/(c_a + c_b) of the two bodies."""
     pair: tuple[int, int] = eqx.field(static=True)
     """The numbers of the bodies."""
 
     @property
-    def known_at_start(self) -> bool:
-        """An explicit step's force is that of the gaps at its start."""
-        return True
-
-    @property
     def near(self) -> Bool[Array, "m"]:
         """The nodes at which both bodies are felt, shape (m,)."""
         return jnp.isfinite(self.gap)
 
-    def springs(self, active: Array) -> Coupling:
-        held = active & self.near
-        return Coupling(
-            stretch=self.share * jnp.where(held, self.gap, 0),
-            stiffness=jnp.where(held, self.stiffness / self.share, 0),
-            normal=self.normal,
-            patch=self.patch,
-            pair=self.pair,
-        )
-
-    def gap_felt(self, held: ConstrainedNodes) -> Float[Array, "m"]:
-        """The gap that the spring feels [m], shape (m,); infinite where a body is not felt."""
-        every = self.springs(jnp.ones(self.gap.shape, bool))
-        return jnp.where(self.near, every.stretched(held.moved) / self.share, jnp.inf)
-
-    def push(self, held: ConstrainedNodes, active: Array) -> Float[Array, "m"]:
-        """The normal impulse at each node in the step [kg m/s], shape (m,)."""
-        shut = active & self.near
-        return jnp.where(shut, -self.dt * self.stiffness * jnp.where(shut, self.gap_felt(held), 0), 0)
-
-    def likely_held(self, held: ConstrainedNodes, v: NodeVector) -> Bool[Array, "m"]:
-        del v
-        return self.gap_felt(held) < 0
-
-    def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> Float[Array, "m"]:
-        """The gap over the step [m/s]."""
-        del v
-        return self.gap_felt(held) / self.dt
-
-    def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> Float[Array, "m"]:
-        del residual
-        felt = self.gap_felt(held)
-        return -self.dt * self.stiffness * jnp.where(self.near, felt, 0)
-
-    def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
-        """The rounding of a velocity [m/s], and what that makes of a push [kg m/s]."""
-        return noise, noise * self.stiffness * self.dt**2
+    def spread(self, stretch: Array, stiffness: Array) -> Coupling:
+        return Coupling(stretch, stiffness, self.normal, self.patch, self.pair)
 
     def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
         """All components of the two bodies' nodes around those that are held."""
@@ -172,31 +221,34 @@ class BodyContact(AbstractContact):
         rate = 0.0
         for contact in contacts:
             first, second = (nodal_mass.reshape(-1, len(contact.gap))[body] for body in contact.pair)
-            reduced = in_a_row(first, second, first + second > 0)
+            reduced = series_stiffness(first, second, first + second > 0)
             share = contact.patch.spread(contact.stiffness[:, None])[:, 0]
             rate = rate + 2 * jnp.where(reduced > 0, share / jnp.where(reduced > 0, reduced, 1), 0).max()
         return rate
 
-    def friction(self, held: ConstrainedNodes, active: Array, v: NodeVector, residual: NodeVector) -> NodeVector:
-        """Opposite impulses on the two bodies, at most as large as what stops their slip."""
-        del residual
-        a, b = self.pair
-        push = jnp.maximum(self.push(held, active), 0)
-        layers = held.nodes.mirror.fold_scalar(jnp.tile(push, len(v) // len(push))).reshape(-1, len(push))
-        limit = self.coefficient * layers[a]
-        mass, free = held.nodes.mass.reshape(-1, len(push)), held.nodes.projection
-        slip = v.reshape(-1, *self.normal.shape)
-        slip = slip[a] - slip[b]
-        slip = slip - self.normal * (self.normal * slip).sum(axis=1, keepdims=True)
-        both = mass[a] + mass[b]
-        reduced = mass[a] * mass[b] / jnp.where(both == 0, 1, both)
-        share = share_taken(slip, reduced, limit)
-        impulse = (-share * reduced)[:, None] * slip
-        change = jnp.zeros((len(mass), *slip.shape), v.dtype)
-        for layer, sign in ((a, 1), (b, -1)):
-            own = mass[layer][:, None]
-            change = change.at[layer].set(sign * jnp.where(own > 0, impulse / jnp.where(own > 0, own, 1), 0))
-        return free.combine(change.reshape(v.shape), 0)
+    def friction(
+        self, held: ConstrainedNodes, active: Array, residual: NodeVector
+    ) -> Callable[[NodeVector], NodeVector]:
+        """Opposite impulses on the two bodies, at most as large as those that stop their slip."""
+        push, count = jnp.where(active, jnp.maximum(self.normal_impulse(held, residual), 0), 0), len(self.gap)
+        layers = held.nodes.mirror.fold_scalar(jnp.tile(push, len(residual) // count)).reshape(-1, count)
+        limit = self.coefficient * layers[self.pair[0]]
+        mass = held.nodes.mass.reshape(-1, count)
+        first, second = (mass[body] for body in self.pair)
+        reduced = series_stiffness(first, second, first + second != 0)
+
+        def change(v: NodeVector) -> NodeVector:
+            bodies = v.reshape(-1, *self.normal.shape)
+            slip = bodies[self.pair[0]] - bodies[self.pair[1]]
+            slip = slip - self.normal * (self.normal * slip).sum(axis=1, keepdims=True)
+            impulse = (-friction_share(slip, reduced, limit) * reduced)[:, None] * slip
+            change = jnp.zeros_like(bodies)
+            for body, sign, weight in zip(self.pair, (1, -1), (first[:, None], second[:, None]), strict=True):
+                dv = jnp.where(weight > 0, impulse / jnp.where(weight > 0, weight, 1), 0)
+                change = change.at[body].set(sign * dv)
+            return held.nodes.projection.combine(change.reshape(v.shape), 0)
+
+        return change
 
 
 def body_contact(
@@ -222,7 +274,7 @@ def body_contact(
         grid: the grid.
         images: the mirrors of symmetry planes.
         dt: Δt [s].
-        share: θ (see `BodyContact`).
+        share: θ (see `AbstractSpringContact`).
     """
     spacing, both = jnp.asarray(grid.spacing), (a.part > _EMPTY) & (b.part > _EMPTY)
     normal = _normal(a, b, both, grid)
@@ -233,7 +285,7 @@ def body_contact(
     area = jnp.cos(jnp.pi / 2 * away) ** 2 * (a.part + b.part) * spacing ** (len(normal) - 1)
     approach = jnp.maximum(-(normal * (a.velocity - b.velocity)).sum(axis=0), 0)
     stiff, other = (body.modulus + body.density * approach**2 for body in (a, b))
-    modulus, weight = in_a_row(stiff, other, felt), in_a_row(a.part, b.part, both)
+    modulus, weight = series_stiffness(stiff, other, felt), series_stiffness(a.part, b.part, both)
     weight = images.continued(jnp.tile(jnp.where(both, weight, 0), grid.layers))[: len(weight)]
     return BodyContact(
         gap=jnp.where(felt, spacing * (first + second), jnp.inf),
@@ -247,8 +299,8 @@ def body_contact(
     )
 
 
-def in_a_row(a: Array, b: Array, felt: Array | bool = True) -> Array:
-    """The stiffness of two springs one behind the other, a b/(a + b)."""
+def series_stiffness(a: Array, b: Array, felt: Array | bool = True) -> Array:
+    """The stiffness of two springs in series, a b/(a + b)."""
     return a * b / jnp.where(felt, a + b, 1)
 
 
@@ -273,14 +325,14 @@ def _spread(field: Float[Array, "m"], grid: Grid) -> Matrix:
     for axis in range(d):
         moments = {
             (*powers[:axis], power, *powers[axis + 1 :]): moment(
-                found, axis, power, reach=_SHEET, periodic=grid.periodic[axis]
+                sums, axis, power, reach=_SHEET, periodic=grid.periodic[axis]
             )
-            for powers, found in moments.items()
+            for powers, sums in moments.items()
             for power in range(3 - sum(powers))
         }
 
     def of(*axes: int) -> Array:
-        return moments[tuple(sum(axis == own for axis in axes) for own in range(d))].reshape(-1)
+        return moments[tuple(axes.count(axis) for axis in range(d))].reshape(-1)
 
     total = of()
     total = jnp.where(total > 0, total, 1)
@@ -296,5 +348,5 @@ def _distance(body: Body, depth: Float[Array, "m"], order: int) -> Float[Array, 
     place = jnp.clip(depth / ((order + 1) / 2), 0, 1) * _SAMPLES
     low = jnp.minimum(place.astype(jnp.int32), _SAMPLES - 1)
     rows = jnp.asarray(np.stack([fine, 4 * (coarse - fine)], axis=1), depth.dtype)
-    found = rows[low] + (place - low.astype(place.dtype))[:, None] * (rows[low + 1] - rows[low])
-    return found[:, 0] + body.side**2 * found[:, 1]
+    row = rows[low] + (place - low.astype(place.dtype))[:, None] * (rows[low + 1] - rows[low])
+    return row[:, 0] + body.side**2 * row[:, 1]

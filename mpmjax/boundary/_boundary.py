@@ -1,4 +1,4 @@
-"""The interface of boundaries.
+"""The interface of boundaries, and the boundaries of a scene together.
 
 Every boundary acts on the grid alone; the transfers know nothing of it. What holds material acts on the nodes at and
 beyond it; a node within a thousandth of a spacing of a wall counts as on it. Where such walls, planes and grips lie
@@ -8,18 +8,19 @@ its surface (`surfaces`), and has derivatives by its place and size.
 """
 
 import abc
+from dataclasses import replace
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Int, Mask, NodeVector, ParticleVector, Scalar
-from mpmjax.boundary._conditions import Conditions
+from mpmjax.boundary._conditions import Conditions, no_conditions
 from mpmjax.boundary._contact import AbstractContact
-from mpmjax.boundary._faces import Faces
-from mpmjax.boundary._surface_contact import Surface
+from mpmjax.boundary._surface_contact import Faces, Surface, surface_contact
 from mpmjax.discretisation import Grid
-from mpmjax.potential import Image, MirrorMotion, MirrorPlace, Tie
+from mpmjax.potential import Image, Mirror, MirrorMotion, MirrorPlace, Tie
 
 ON_THE_WALL = 1e-3
 """Distance within which a node is on a wall, in spacings."""
@@ -45,12 +46,12 @@ class AbstractBoundary(eqx.Module):
     `contacts`. The rest has defaults.
     """
 
-    bodies: ClassVar[int] = 0
-    """Number of bodies in its `Conditions.colliders`; what they receive is recorded."""
+    collider_count: ClassVar[int] = 0
+    """Number of bodies in its `Conditions.colliders`; the impulses on them are recorded."""
     pushes: ClassVar[bool] = False
-    """Whether it has surfaces that push material away (see `surfaces`)."""
+    """Whether it has `surfaces` that push material away."""
     sees_faces: ClassVar[bool] = False
-    """Whether its contacts ask where the faces of particles are (see `facing`)."""
+    """Whether its `contacts` need the faces of particles though it does not push."""
     meets_rigid_bodies: ClassVar[bool] = True
     """Whether it may stand in a scene with rigid bodies. What it prescribes of a node it prescribes of the body."""
 
@@ -87,33 +88,24 @@ class AbstractBoundary(eqx.Module):
         return None
 
     def contacts(
-        self, conditions: Conditions, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
+        self, faces: Faces | None, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
     ) -> tuple[AbstractContact, ...]:
-        """The contacts that it brings in the step from t to t + dt (see `AbstractContact`). Default: none.
-
-        Those of its `surfaces` are made for it.
+        """The contacts that it brings in the step from t to t + dt (see `AbstractContact`). Default: those of its
+        `surfaces`.
 
         Args:
-            conditions: the conditions of all of the scene's boundaries.
+            faces: the faces of the particles; None if no boundary of the scene pushes or sees them.
             grid: the grid; `grid.nodes(window)` are the positions of the nodes [m], shape (n, d).
             window: lattice index of the window's first node, shape (d,).
             t: time [s].
             dt: step [s].
         """
-        del conditions, grid, window, t, dt
-        return ()
+        del grid, window
+        if faces is None or not self.pushes:
+            return ()
+        return tuple(surface_contact(each, faces) for each in self.surfaces(faces.x, t, dt, faces.push_time))
 
-    def facing(self, own: tuple[AbstractContact, ...], faces: Faces) -> tuple[AbstractContact, ...]:
-        """The boundary with the faces of particles put into its contacts, if it `sees_faces`. Default: as they are.
-
-        Args:
-            own: its `contacts`.
-            faces: the faces of the particles at the start of the step.
-        """
-        del faces
-        return own
-
-    def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, force_time: Scalar) -> tuple[Surface, ...]:
+    def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, push_time: Scalar) -> tuple[Surface, ...]:
         """The rigid surfaces that push the faces of particles in the step from t to t + dt, if it `pushes`. Default:
         none.
 
@@ -121,9 +113,9 @@ class AbstractBoundary(eqx.Module):
             x: the particles' positions at t [m], shape (p, d).
             t: time [s].
             dt: step [s].
-            force_time: the time at which they push [s]: t in an explicit step, else t + dt.
+            push_time: the time at which they push [s]: t in an explicit step, else t + dt.
         """
-        del x, t, dt, force_time
+        del x, t, dt, push_time
         return ()
 
     def mirror_images(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image | Tie, ...]:
@@ -167,8 +159,8 @@ class AbstractBoundary(eqx.Module):
         del x, t
         return None
 
-    def spread(self, fixed: Mask, value: Array, nodes: NodeVector, spacing: Scalar) -> tuple[Mask, Array]:
-        """The conditions, extended to the whole of a rigid part where one of its nodes has them. Default: as they are.
+    def extend_to_body(self, fixed: Mask, value: Array, nodes: NodeVector, spacing: Scalar) -> tuple[Mask, Array]:
+        """Conditions on single nodes, extended to the whole of a rigid part. Default: as they are.
 
         Args:
             fixed: components of velocity that are prescribed, shape (n, d).
@@ -214,3 +206,71 @@ def crossed(
     more than a spacing and ended below the wall, or it ended below `deepest`."""
     fast = (start >= wall) & (end < wall) & (start - end > spacing)
     return fast | ((start >= deepest) & (end < deepest))
+
+
+def combined_conditions(
+    boundaries: tuple[AbstractBoundary, ...],
+    nodes: NodeVector,
+    spacing: Scalar,
+    t: Scalar,
+    dt: Scalar,
+    *,
+    reference: bool,
+) -> Conditions:
+    """The conditions of all boundaries of a scene. Where two prescribe the same component, the earlier one holds.
+
+    Contact acts on components that nothing prescribes. A node may have components that are prescribed and, besides
+    them, normals of several colliders: all hold (see `Nodes.free_normals`). A normal that lies within a hundredth of
+    the prescribed components and of earlier normals asks for nothing more.
+    """
+    total = no_conditions(nodes)
+    for boundary in boundaries:
+        new = boundary.conditions(nodes, spacing, t, dt, reference=reference)
+        velocity, colliders = jnp.where(total.fixed, total.velocity, new.velocity), total.colliders
+        if new.colliders is not None:
+            later = replace(new.colliders, holder=jnp.where(total.fixed, -1, new.colliders.holder))
+            colliders = later if colliders is None else colliders.beside(later)
+        either = total.holds or new.holds, total.moves or new.moves
+        total = Conditions(total.fixed | new.fixed, velocity, colliders, *either)
+    for boundary in boundaries:
+        fixed, velocity = boundary.extend_to_body(total.fixed, total.velocity, nodes, spacing)
+        total = replace(total, fixed=fixed, velocity=velocity)
+    return total
+
+
+def brought_contacts(
+    boundaries: tuple[AbstractBoundary, ...],
+    faces: Faces | None,
+    grid: Grid,
+    window: Int[Array, "d"],
+    t: Scalar,
+    dt: Scalar,
+) -> list[tuple[int, AbstractContact]]:
+    """The contacts of a scene, each with the number of its boundary (see `AbstractBoundary.contacts`)."""
+    each = ((n, boundary.contacts(faces, grid, window, t, dt)) for n, boundary in enumerate(boundaries))
+    return [(n, contact) for n, contacts in each for contact in contacts]
+
+
+def mirror(boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"]) -> Mirror:
+    """The mirror images that the boundaries of a scene put in the window."""
+    return Mirror(tuple(image for _, image in brought_images(boundaries, grid, window)))
+
+
+def mirror_motion(
+    boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
+) -> MirrorMotion | None:
+    """The velocity that moving mirrors add to the nodes beyond them; None if none moves."""
+    total = None
+    for boundary in boundaries:
+        new = boundary.mirror_motion(grid, window, t, dt)
+        if new is not None and total is not None:
+            new = MirrorMotion(total.beyond | new.beyond, jnp.where(total.beyond, total.velocity, new.velocity))
+        total = total if new is None else new
+    return total
+
+
+def brought_images(
+    boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"]
+) -> list[tuple[int, Image | Tie]]:
+    """The images of `mirror`, each with the number of its boundary."""
+    return [(n, image) for n, boundary in enumerate(boundaries) for image in boundary.mirror_images(grid, window)]

@@ -34,7 +34,7 @@ class AbstractCollider(AbstractBoundary):
     """The body before its motion."""
     motion: eqx.AbstractVar[AbstractMotion | None]
     """How it moves; None for not at all."""
-    bodies: ClassVar[int] = 1
+    collider_count: ClassVar[int] = 1
 
     def __check_init__(self):
         motion, d = self.motion, self.dim
@@ -182,15 +182,15 @@ class SeparatingCollider(AbstractCollider):
         touched = _Body(self, nodes, t, dt, reference).nothing_held()
         return replace(no_conditions(nodes), colliders=touched, holds=True, moves=self.motion is not None)
 
-    def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, force_time: Scalar) -> tuple[Surface, ...]:
+    def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, push_time: Scalar) -> tuple[Surface, ...]:
         """Unit normal of the body; zero where the distance gradient vanishes, as a sampled one may."""
         motion = canonical(still(self.dim), x.dtype) if self.motion is None else self.motion
-        place = motion.origin(x, force_time)
+        place = motion.origin(x, push_time)
         distance, slope = jax.vjp(self.shape.distance, place)
         (slope,) = slope(jnp.ones_like(distance))
         steepness = length(slope)
         sloping = steepness > 0
-        normal = motion.turned(slope / jnp.where(sloping, steepness, 1)[:, None], force_time)
+        normal = motion.turned(slope / jnp.where(sloping, steepness, 1)[:, None], push_time)
         velocity = motion.velocity_of(motion.origin(x, t), t, dt)
         return (Surface(jnp.where(sloping, distance, jnp.inf), normal.T, self.friction, velocity.T),)
 

@@ -14,7 +14,7 @@ PARALLEL = 1e-2
 """Length of a unit normal's part in free directions up to which it is prescribed by the others."""
 
 
-class Given(eqx.Module):
+class OwnedImpulse(eqx.Module):
     """Impulses on the nodes, and the boundaries or colliders that give them."""
 
     impulse: NodeVector

@@ -1,34 +1,33 @@
 """Contact: boundaries that push but do not pull.
 
-A place of such a boundary is a particle, whose face is before or behind a surface; for a contact plane a column of
-nodes, described at all of its nodes; for a contact of one's own a node. Its gap g and the normal impulse r obey g ≥ 0,
-r ≥ 0, g r = 0; for columns and nodes g is the velocity with which the gap opens. For particles this holds of the gap
-with its spring's length (see `Springs`). The *active set* is the mask of the places that are held shut, one for each
-contact, of shape (p,) or (n,).
+A *place* of contact is a particle, whose face is before or behind a surface, or a node: of two bodies, of a column
+along a contact plane, of a contact of your own. Its gap g and normal impulse r obey g ≥ 0, r ≥ 0, g r = 0; for columns
+g is the velocity with which the gap opens, for faces and bodies the gap with its spring's length. The *active set* is
+the mask of the places that are held shut, one for each contact.
 
-The active set is guessed as the places that the start of the step, or the explicit velocity v*, closes. Then, at most
-`SWEEPS` times: solve with the active set held; release the places that would have to pull, hold those that are entered;
-stop when nothing changes. The conditions that are violated after that are counted in `ContactInfo.violations`. The last
+It is guessed as the places that the start of the step, or the explicit velocity v*, closes. Then, at most `SWEEPS`
+times: solve with the active set held; release the places that would have to pull, hold those that are entered; stop
+when nothing changes. The conditions that are violated after that are counted in `ContactInfo.violations`. The last
 solve, with the set settled and started from the last sweep's result, is the one that is differentiated: its derivative
-is that of the active set found, and does not exist where the set changes. An explicit step's force is known at its
-start, and with it which faces are behind their surface: it needs no sweep.
+is that of the active set, and does not exist where the set changes. An explicit step's force is known at its start, and
+with it which gaps are shut: it needs no sweep.
 
-Friction is an impulse at the places held, applied after the solve against the tangential velocity (at a collider, that
-relative to it) and at most μ times the normal impulse (Coulomb). It is not part of the implicit system, so it lags by
-the elastic response of one step.
+Friction is an impulse at the places held, applied after the solve against the slip and at most μ times the normal
+impulse (Coulomb). It is not part of the implicit system, so it lags by the elastic response of one step.
 """
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Generic, TypeVar
+from itertools import groupby
+from typing import Any, ClassVar, Generic, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector
-from mpmjax.boundary._conditions import Conditions, Given
-from mpmjax.potential import AbstractTerm, Displacement, Image, Mirror, scattered
+from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, Scalar
+from mpmjax.boundary._conditions import Conditions, OwnedImpulse
+from mpmjax.potential import AbstractSpring, AbstractTerm, Displacement, Image, Mirror, scattered
 
 ActiveSet = tuple[Bool[Array, "..."], ...]
 """The places that are held, one mask for each contact."""
@@ -47,6 +46,8 @@ class AbstractNodes(eqx.Module):
     """The potential Φ of the nodes' displacement."""
     contacts: eqx.AbstractVar[tuple["AbstractContact", ...]]
     """The boundaries that may be left."""
+    brought_by: eqx.AbstractVar[tuple[int | None, ...]]
+    """The number of the boundary that brings each contact; None for that of two bodies."""
     loose: eqx.AbstractVar[Any]
     """The nodes with those of rigid bodies each by itself; None without rigid bodies."""
 
@@ -63,7 +64,7 @@ class AbstractNodes(eqx.Module):
     @property
     @abc.abstractmethod
     def projection(self) -> Any:
-        """The projection on what nothing holds."""
+        """The projection on the components that nothing holds."""
 
     @property
     @abc.abstractmethod
@@ -71,19 +72,8 @@ class AbstractNodes(eqx.Module):
         """The mirror images of symmetry planes, and of the columns that are held."""
 
     @abc.abstractmethod
-    def constrained(
-        self: "N",
-        images: Mirror,
-        fixed: Mask,
-        terms: tuple[AbstractTerm, ...],
-    ) -> "N":
-        """These nodes with more of them held.
-
-        Args:
-            images: mirrors on which the nodes are folded.
-            fixed: components of velocity that are prescribed, shape (n, d).
-            terms: the springs of what is held by springs, which are added to the potential.
-        """
+    def constrained(self: "N", images: Mirror, fixed: Mask, terms: tuple[AbstractTerm, ...]) -> "N":
+        """These nodes folded at further mirrors, with the components `fixed` held and further springs."""
 
     @abc.abstractmethod
     def explicit_velocity(self) -> NodeVector:
@@ -96,25 +86,18 @@ N = TypeVar("N", bound=AbstractNodes)
 class AbstractContact(eqx.Module):
     """A boundary that pushes but does not pull.
 
-    One of one's own is brought by `AbstractBoundary.contacts` and needs `gap_velocity`, `normal_impulse` and, to hold
-    components of velocity, `fixed`. The rest has defaults.
+    One of your own is brought by `AbstractBoundary.contacts` and needs `gap_velocity`, `normal_impulse` and, to hold
+    components of velocity, `fixed`. The rest has defaults. Their arguments:
+
+    - `held`: the nodes with an active set held.
+    - `active`: the places of this contact that are held, shape (n,).
+    - `v`: velocity of all nodes [m/s], shape (n, d).
+    - `residual`: the impulse that is missing at each node [kg m/s], shape (n, d).
+    - `shape`: (n, d).
     """
 
-    @property
-    def collider(self) -> int | None:
-        """The number of the collider that receives its impulse by springs and friction; None if none does."""
-        return None
-
-    @property
-    def friction_order(self) -> float:
-        """Frictions act one after the other, from the lowest number on, those of one number forth and back: that of a
-        wall is its axis, of a contact plane its axis and a half, of colliders 3. Default: 4, after all of these."""
-        return 4.0
-
-    @property
-    def known_at_start(self) -> bool:
-        """Whether `likely_held` is the active set of a step whose force is that at its start. Default: False."""
-        return False
+    known_at_start: ClassVar[bool] = False
+    """Whether `likely_held` is the active set of a step whose force is that at its start."""
 
     @property
     def mirror_image(self) -> Image | None:
@@ -124,82 +107,48 @@ class AbstractContact(eqx.Module):
     @abc.abstractmethod
     def gap_velocity(self, held: "ConstrainedNodes", v: NodeVector) -> NodeScalar:
         """The rate at which the gap opens, shape (n,): below zero where it closes, zero where there is no contact. Any
-        positive multiple of a velocity will do, such as the momentum of a column.
-
-        Args:
-            held: the nodes with an active set held.
-            v: velocity of all nodes [m/s], shape (n, d).
-        """
+        positive multiple of a velocity will do, such as the momentum of a column."""
 
     @abc.abstractmethod
     def normal_impulse(self, held: "ConstrainedNodes", residual: NodeVector) -> NodeScalar:
         """The impulse by which the boundary holds each place [kg m/s], shape (n,): below zero where it pulls, and so
-        must let go. A boundary that can pull adds the most that it can pull with.
+        must let go. A boundary that can pull adds the most that it can pull with."""
 
-        Args:
-            held: the nodes with an active set held.
-            residual: the impulse that is missing at each node [kg m/s], shape (n, d).
-        """
-
-    def likely_held(self, held: "ConstrainedNodes", v: NodeVector) -> Bool[Array, "n"]:
-        """The places that are held in the first sweep, shape (n,). Default: those where the gap closes.
-
-        Args:
-            held: the nodes with nothing held.
-            v: the explicit velocity v* of all nodes [m/s], shape (n, d).
-        """
+    def likely_held(self, held: "ConstrainedNodes", v: NodeVector) -> Bool[Array, "..."]:
+        """The places that are held in the first sweep, shape (n,), at the explicit velocity v*, with nothing held yet.
+        Default: those where the gap closes."""
         return self.gap_velocity(held, v) < 0
 
     def rounding(self, held: "ConstrainedNodes", noise: Array) -> tuple[Array, Array]:
-        """How far the gap velocity and the normal impulse may lie below zero by rounding, each (n,) or a number.
-        Default: the rounding of a velocity, and of a node's momentum.
-
-        Args:
-            held: the nodes with an active set held.
-            noise: the rounding of a velocity [m/s].
-        """
+        """How far the gap velocity and the normal impulse may lie below zero by rounding, each (n,) or a number, at the
+        rounding of a velocity `noise` [m/s]. Default: that, and the rounding of a node's momentum."""
         return noise, noise * held.mass
 
-    def friction(self, held: "ConstrainedNodes", active: Array, v: NodeVector, residual: NodeVector) -> NodeVector:
-        """The change of velocity by friction [m/s], shape (n, d), on true nodes. Default: none.
-
-        Args:
-            held: the nodes with the active set held.
-            active: the places of this contact that are held, shape (n,).
-            v: velocity of all nodes [m/s], shape (n, d).
-            residual: the impulse that is missing at each node [kg m/s], shape (n, d).
-        """
+    def friction(
+        self, held: "ConstrainedNodes", active: Array, residual: NodeVector
+    ) -> Callable[[NodeVector], NodeVector] | None:
+        """The change of velocity by friction [m/s], shape (n, d), on true nodes, as a function of the velocity v (see
+        `friction_change`). Default: None, no friction."""
         del held, active, residual
-        return jnp.zeros_like(v)
+        return None
 
     def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
-        """The components of velocity that are zero at the places held, shape (n, d). Default: none.
-
-        Args:
-            active: the places of this contact that are held, shape (n,).
-            shape: (n, d).
-        """
+        """The components of velocity that are zero at the places held, shape (n, d). Default: none."""
         del active
         return jnp.zeros(shape, bool)
 
     def springs(self, active: Array) -> AbstractTerm | None:
-        """The springs of the places held; None without any, which is the default."""
+        """The springs of the places held. Default: None, without any."""
         del active
         return None
 
     def spring_impulse(self, held: "ConstrainedNodes", active: Array) -> NodeVector | None:
         """The impulse of its springs on all nodes [kg m/s], shape (n, d), not folded at mirrors; None without springs.
-
-        Args:
-            held: the nodes with the active set held, and their displacement.
-            active: the places of this contact that are held.
-        """
-        springs, nodes = self.springs(active), held.unheld
-        return (
-            None
-            if springs is None
-            else nodes.dt * scattered([springs.force(held.moved)], held.moved.stencil, len(nodes.mass))
-        )
+        It is that at the displacement of `held`."""
+        springs, nodes = self.springs(active), held.unconstrained
+        if springs is None:
+            return None
+        return nodes.dt * scattered([springs.force(held.moved)], held.moved.stencil, len(nodes.mass))
 
     @staticmethod
     def stability_rate(
@@ -226,10 +175,62 @@ class AbstractContact(eqx.Module):
         return None
 
 
+class AbstractSpringContact(AbstractContact):
+    """Contact by springs on gaps, ½ k min(g, 0)² at each place (see `Springs` and `Coupling`).
+
+    A place is held if its gap at the end of the step, in an explicit step at its start, is below zero, so that the
+    spring pushes and the two conditions exclude each other. The energy is convex in g: a force by the gap at the end
+    takes at least as much energy as the spring keeps, −k g¹ (g¹ − g⁰) ≤ ½ k (min(g⁰, 0)² − min(g¹, 0)²), at any step,
+    as long as k does not grow. An integrator that evaluates forces at θ of the step's displacement gets the force by
+    springs of gap θ g⁰ and stiffness k/θ.
+    """
+
+    gap: eqx.AbstractVar[Array]
+    """g at u = 0 [m]."""
+    stiffness: eqx.AbstractVar[Array]
+    """k [N/m], in the same shape."""
+    dt: eqx.AbstractVar[Scalar]
+    """Δt [s]."""
+    share: eqx.AbstractVar[Scalar]
+    """θ; 1 where forces are those at the start of the step."""
+    known_at_start: ClassVar[bool] = True
+
+    @property
+    @abc.abstractmethod
+    def near(self) -> Bool[Array, "..."]:
+        """The places that may touch in this step, in the shape of the gaps."""
+
+    @abc.abstractmethod
+    def spread(self, stretch: Array, stiffness: Array) -> AbstractSpring:
+        """The springs of this stretch [m] and stiffness [N/m], each in the shape of the gaps, on the nodes."""
+
+    def springs(self, active: Array) -> AbstractSpring:
+        held = active & self.near
+        return self.spread(self.share * jnp.where(held, self.gap, 0), jnp.where(held, self.stiffness / self.share, 0))
+
+    def spring_gap(self, held: "ConstrainedNodes") -> Array:
+        """The gap at the displacement of `held` [m]; infinite for places that are not near."""
+        every = self.springs(jnp.ones(self.gap.shape, bool))
+        return jnp.where(self.near, every.stretched(held.moved) / self.share, jnp.inf)
+
+    def gap_velocity(self, held: "ConstrainedNodes", v: NodeVector) -> Array:
+        """The gap over the step [m/s]."""
+        del v
+        return self.spring_gap(held) / self.dt
+
+    def normal_impulse(self, held: "ConstrainedNodes", residual: NodeVector) -> Array:
+        """The impulse −Δt k g of each spring [kg m/s]; zero at places that are not near."""
+        del residual
+        return -self.dt * self.stiffness * jnp.where(self.near, self.spring_gap(held), 0)
+
+    def rounding(self, held: "ConstrainedNodes", noise: Array) -> tuple[Array, Array]:
+        return noise, noise * self.stiffness * self.dt**2
+
+
 class ConstrainedNodes(eqx.Module, Generic[N]):
     """The nodes while an active set is held; see `constrain`."""
 
-    unheld: N
+    unconstrained: N
     """The nodes of which no contact holds anything."""
     active: ActiveSet
     """The active set."""
@@ -242,53 +243,50 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     as velocities are; None for none, as in an explicit step."""
 
     @property
-    def normals(self) -> tuple[NodeVector, ...]:
-        """Unit vectors at right angles along which colliders hold nodes, each (n, d)."""
-        return self.nodes.projection.normals
-
-    @property
     def mass(self) -> NodeScalar:
         """The nodes' mass, folded on the mirrors [kg], shape (n,)."""
-        return self.images.fold_scalar(self.unheld.mass)
+        return self.nodes.mass
 
     @property
     def moved(self) -> Displacement:
         """`displacement`, of all nodes."""
-        return self.unheld.potential.displaced(self.displacement)
+        return self.unconstrained.potential.displaced(self.displacement)
 
     def beyond_boundaries(self) -> tuple[Mask, tuple[NodeVector, ...]]:
         """The components of velocity on which no boundary acts, shape (n, d), and the normals that colliders hold."""
-        free = self.unheld.free
-        for contact, active in zip(self.unheld.contacts, self.active, strict=True):
+        free = self.unconstrained.free
+        for contact, active in zip(self.unconstrained.contacts, self.active, strict=True):
             free = free & ~contact.reached(active, free.shape)
-        return free, tuple(jnp.where(free, normal, 0) for normal in self.normals)
+        return free, tuple(jnp.where(free, normal, 0) for normal in self.nodes.projection.normals)
 
-    def along_normals(self, residual: NodeVector) -> tuple[Given, ...]:
+    def along_normals(self, residual: NodeVector) -> tuple[OwnedImpulse, ...]:
         """The impulses by which colliders hold nodes along their normals, by the colliders' numbers.
 
-        Args:
-            residual: the impulse that is missing at each node [kg m/s], shape (n, d). It is what holds the prescribed
-                components, plus each collider's impulse times its normal. The direction of the last one is at right
-                angles to all others: along it, it is the last one's impulse alone, times the length of its part.
+        The residual [kg m/s], shape (n, d), is the impulse of the prescribed components, plus each collider's times its
+        normal. The direction of the last one is at right angles to all others: along it, the residual is the last one's
+        impulse alone, times the length of its part.
         """
-        given, left = [], self.images.fold(residual)
+        parts, left = [], self.images.fold(residual)
         for part in reversed(self.nodes.free_normals):
             impulse = ((part.direction * left).sum(axis=1) / part.length)[:, None] * part.normal
-            given.append(Given(impulse, part.owner[:, None]))
+            parts.append(OwnedImpulse(impulse, part.owner[:, None]))
             left = left - impulse
-        return tuple(given)
+        return tuple(parts)
 
-    def beside_colliders(self, residual: NodeVector) -> NodeVector:
-        """The residual without what colliders hold along their normals: what walls and planes hold."""
+    def without_collider_impulses(self, residual: NodeVector) -> NodeVector:
+        """The part of the residual that walls and planes hold, not colliders along their normals."""
         return residual - sum(part.impulse for part in self.along_normals(residual))
 
-    def impulse(self, residual: NodeVector) -> NodeVector:
-        """The impulse of walls, planes and contacts, without colliders, on each true node [kg m/s], shape (n, d).
+    def without_spring_impulses(self, residual: NodeVector) -> NodeVector:
+        """The part of the residual that holds components of velocity."""
+        for contact, active in zip(self.unconstrained.contacts, self.active, strict=True):
+            impulse = contact.spring_impulse(self, active)
+            residual = residual if impulse is None else residual - self.unconstrained.mirror.fold(impulse)
+        return residual
 
-        Args:
-            residual: the impulse that is missing at each node [kg m/s], shape (n, d).
-        """
-        return self.images.fold(self.beside_colliders(residual))
+    def impulse(self, residual: NodeVector) -> NodeVector:
+        """The impulse of walls, planes and contacts, without colliders, on each true node [kg m/s], shape (n, d)."""
+        return self.images.fold(self.without_collider_impulses(residual))
 
     def violations(self, v: NodeVector, residual: NodeVector) -> tuple[ActiveSet, ActiveSet]:
         """The held places that pull, and the others that are entered, beyond rounding.
@@ -299,88 +297,70 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         """
         noise = jnp.sqrt(jnp.finfo(v.dtype).eps) * jnp.abs(v).max()
         pulling, entering = [], []
-        for contact, active in zip(self.unheld.contacts, self.active, strict=True):
+        for contact, active in zip(self.unconstrained.contacts, self.active, strict=True):
             gap, impulse = contact.rounding(self, noise)
             pulling.append(active & (contact.normal_impulse(self, residual) < -impulse))
             entering.append(~active & (contact.gap_velocity(self, v) < -gap))
         return tuple(pulling), tuple(entering)
 
-    def count_violations(self, v: NodeVector, residual: NodeVector) -> Int[Array, ""]:
-        """How many places pull or are entered."""
-        return count_places(self.unheld, *self.violations(v, residual))
-
-    def beside_springs(self, residual: NodeVector) -> NodeVector:
-        """The residual without the impulses of springs: what holds components of velocity.
-
-        Args:
-            residual: the impulse that is missing at each node [kg m/s], shape (n, d).
-        """
-        for contact, active in zip(self.unheld.contacts, self.active, strict=True):
-            impulse = contact.spring_impulse(self, active)
-            residual = residual if impulse is None else residual - self.unheld.mirror.fold(impulse)
-        return residual
-
     def friction(self, v: NodeVector, residual: NodeVector) -> tuple[NodeVector, tuple[NodeVector, ...]]:
-        """The velocity after Coulomb friction, one contact after the other, and the change of velocity by each [m/s].
+        """The velocity after Coulomb friction, and the change of velocity by each contact [m/s].
 
-        Contacts of one `friction_order` act in the scene's order and, from the same start, against it; each has the
-        mean of its two changes, so that of two none comes first. The mean is within the limit and takes energy, as both
-        are and do.
+        Contacts act one after the other: boundary by boundary in the scene's order, then pairs of bodies; and, from the
+        same start, in the reverse order. Each has the mean of its two changes, so that of two boundaries at a node none
+        comes first. The mean is within the limit and takes energy, as both are and do.
 
         Args:
             v: velocity of all nodes after the solve [m/s], shape (n, d).
             residual: the impulse that holds components of velocity [kg m/s], shape (n, d).
         """
-        loosened, tied, nodes = self._loosened(), Mirror(self.nodes.mirror.rigid), self.nodes
-        contacts = self.unheld.contacts
+        tied, nodes, contacts = Mirror(self.nodes.mirror.rigid), self.nodes, self.unconstrained.contacts
+        rubbing = self if nodes.loose is None else replace(self, nodes=nodes.loose)
+        pairs = zip(contacts, self.active, strict=True)
+        frictions = [contact.friction(rubbing, active, residual) for contact, active in pairs]
 
         def changes(order: Sequence[int]) -> list[NodeVector]:
-            rubbed, by_contact = v, [v] * len(contacts)
+            rubbed, by_contact = v, [jnp.zeros_like(v)] * len(contacts)
             for k in order:
-                change = contacts[k].friction(loosened, self.active[k], tied.unfold(rubbed), residual)
+                friction = frictions[k]
+                if friction is None:
+                    continue
+                change = friction(tied.unfold(rubbed))
                 if tied.images:  # the impulses on a rigid body's nodes are those on the whole of it
-                    mass, impulse = nodes.mass[:, None], tied.fold(loosened.nodes.mass[:, None] * change)
+                    mass, impulse = nodes.mass[:, None], tied.fold(rubbing.nodes.mass[:, None] * change)
                     change = nodes.projection.combine(jnp.where(mass > 0, impulse / jnp.where(mass > 0, mass, 1), 0), 0)
                 rubbed, by_contact[k] = rubbed + change, change
             return by_contact
 
-        forth = list(range(len(contacts)))
-        back = sorted(forth, key=lambda k: (contacts[k].friction_order, -k))
+        numbers = [-1 - k if number is None else number for k, number in enumerate(nodes.brought_by)]
+        forth = [k for k in range(len(contacts)) if frictions[k] is not None]
+        groups = [list(group) for _, group in groupby(forth, key=lambda k: numbers[k])]
         total = changes(forth)
-        if back != forth:
-            total = [(a + b) / 2 for a, b in zip(total, changes(back), strict=True)]
+        if len(groups) > 1:
+            back = changes([k for group in reversed(groups) for k in group])
+            total = [(a + b) / 2 for a, b in zip(total, back, strict=True)]
         return self.images.unfold(sum(total, v)), tuple(map(self.images.unfold, total))
 
-    def pushes(self, slowed: tuple[NodeVector, ...]) -> tuple[tuple[int, NodeVector], ...]:
-        """The impulses of colliders on the nodes by springs and friction [kg m/s], each with the collider's number.
+    def pushes(self, friction_dv: tuple[NodeVector, ...]) -> tuple[tuple[int, NodeVector], ...]:
+        """The impulses of boundaries on the nodes by springs and friction [kg m/s], shape (n, d), each with the
+        boundary's number.
 
         Args:
-            slowed: the change of velocity by the friction of each contact [m/s], shape (n, d).
+            friction_dv: the change of velocity by the friction of each contact [m/s], shape (n, d).
         """
-        found, mass, tied = [], self._loosened().unheld.mass, Mirror(self.nodes.mirror.rigid)
-        for contact, active, change in zip(self.unheld.contacts, self.active, slowed, strict=True):
-            if contact.collider is not None:
-                rubbed, impulse = mass[:, None] * tied.unfold(change), contact.spring_impulse(self, active)
-                found.append((contact.collider, rubbed if impulse is None else rubbed + impulse))
-        return tuple(found)
-
-    def _loosened(self) -> "ConstrainedNodes":
-        """The nodes with those of rigid bodies each by itself, as friction acts on them; gaps are those with the
-        bodies rigid."""
-        loose = self.unheld.loose
-        if loose is None:
-            return self
-        unheld = eqx.tree_at(lambda n: (n.mass, n.conditions.fixed), self.unheld, (loose.mass, loose.conditions.fixed))
-        return replace(self, unheld=unheld, nodes=loose)
+        pushes, nodes, tied = [], self.unconstrained, Mirror(self.nodes.mirror.rigid)
+        mass = (nodes if nodes.loose is None else nodes.loose).mass[:, None]
+        for number, contact, active, change in zip(
+            nodes.brought_by, nodes.contacts, self.active, friction_dv, strict=True
+        ):
+            if number is not None:
+                rubbed, impulse = mass * tied.unfold(change), contact.spring_impulse(self, active)
+                pushes.append((number, rubbed if impulse is None else rubbed + impulse))
+        return tuple(pushes)
 
 
 def constrain(nodes: N, active: ActiveSet) -> ConstrainedNodes[N]:
-    """The nodes with an active set held.
-
-    Args:
-        nodes: nodes of which no contact holds anything yet.
-        active: what is held.
-    """
+    """The nodes with an active set held; no contact may hold anything of them yet."""
     pairs = list(zip(nodes.contacts, active, strict=True))
     images = Mirror(tuple(image.within(mask) for contact, mask in pairs if (image := contact.mirror_image) is not None))
     fixed = nodes.conditions.fixed

@@ -1,22 +1,25 @@
-"""Symmetry and contact planes."""
+"""Symmetry and contact planes, beyond which nodes are mirror images."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, Int, NodeVector, ParticleVector, Scalar
+from mpmjax._types import Array, Bool, Int, Mask, NodeScalar, NodeVector, ParticleVector, Scalar
 from mpmjax.boundary._boundary import ON_THE_WALL, AbstractBoundary, Wall, crossed
 from mpmjax.boundary._conditions import Conditions, held_by_wall, no_conditions
-from mpmjax.boundary._contact import AbstractContact
-from mpmjax.boundary._faces import Faces
-from mpmjax.boundary._plane_contact import SHUT, PlaneContact
-from mpmjax.boundary._surface_contact import Surface, refuse_contact, surface_contact
+from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
+from mpmjax.boundary._friction import friction_change
+from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, surface_contact
 from mpmjax.checks import require, require_between, require_fields, require_finite, require_that
-from mpmjax.discretisation import Grid
+from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import Motion
-from mpmjax.potential import Image, MirrorMotion, MirrorPlace, mirror_image
+from mpmjax.potential import Image, Mirror, MirrorMotion, MirrorPlace, mirror_image
+
+SHUT = 1e-2
+"""The gap up to which a plane holds what is before it, in spacings."""
 
 
 class AbstractPlane(AbstractBoundary):
@@ -165,6 +168,92 @@ class SymmetryPlane(AbstractPlane):
         return MirrorMotion(beyond, jnp.where(beyond, 2 * self.motion.velocity(t, dt), 0))
 
 
+class PlaneContact(AbstractContact):
+    """A contact plane in the window. Each column of nodes along its normal is a place, described at all of its nodes.
+
+    Holding a column means that its nodes beyond the plane mirror those before it. The normal impulse r is that of the
+    column's nodes on the plane and twice that of the images (a node and its image share equally). The gap velocity is
+    what r works on: the mean, with weights 2 m m'/(m + m'), of the v + v' of nodes and their images, and of the v of
+    nodes on the plane (where the two are one). So an explicit step that holds the column has
+    r = −Σ 2 m m'/(m + m') (v* + v*'), and the two conditions exclude each other. Columns that no particle reaches whose
+    face is at the plane are not held. Columns that are each other's image in another plane are held together. Friction
+    acts on the column's node on the plane, or half a spacing before it.
+    """
+
+    image: Image
+    """The mirror."""
+    inward: int = eqx.field(static=True)
+    """The inward normal's component: +1 or −1."""
+    before: Int[Array, "m"]
+    """How many half spacings each node along the axis lies before the plane, shape (m,)."""
+    coefficient: Scalar
+    """Coulomb coefficient [-]."""
+    shut: Bool[Array, "n"] | None = None
+    """The columns that may be held, shape (n,); None for all."""
+
+    @property
+    def mirror_image(self) -> Image:
+        return self.image
+
+    def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> NodeScalar:
+        """The momentum with which each column leaves the plane [kg m/s]: its weights times what its velocity lacks of
+        the mirror's."""
+        lacking = (v - self.image.vector(v))[:, self.image.axis]
+        columns = self.inward * self.image.column(self._weight(held.unconstrained.mass) * lacking)
+        return self._tied(held, columns if self.shut is None else jnp.where(self.shut, columns, 0))
+
+    def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> NodeScalar:
+        """The normal impulse of each column [kg m/s]."""
+        return self._tied(held, self._column_impulse(held, residual))
+
+    def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
+        """The rounding of a column's momentum [kg m/s], shape (n,), for both."""
+        least = noise * self._tied(held, self.image.column(self._weight(held.unconstrained.mass)))
+        return least, least
+
+    def friction(
+        self, held: ConstrainedNodes, active: Array, residual: NodeVector
+    ) -> Callable[[NodeVector], NodeVector]:
+        impulse = jnp.where(active & self.representative(), self._column_impulse(held, residual), 0)
+        limit = self.coefficient * jnp.maximum(held.images.fold_scalar(impulse), 0)
+        normal = (jnp.arange(residual.shape[1]) == self.image.axis).astype(limit.dtype)
+        return lambda v: friction_change(held.nodes.projection, held.nodes.mass, normal, 0.0, limit, v)
+
+    def fixed(self, active: Array, shape: tuple[int, ...]) -> Mask:
+        """The normal component of the nodes on the plane."""
+        on_plane = self.image.along(self.before == 0)
+        return (active & on_plane)[:, None] & (jnp.arange(shape[1]) == self.image.axis)
+
+    def reached(self, active: Array, shape: tuple[int, ...]) -> Mask:
+        """All components of the columns held."""
+        return jnp.broadcast_to(active[:, None], shape)
+
+    def representative(self) -> Bool[Array, "n"]:
+        """The node on the plane or, where there is none, half a spacing before it."""
+        return self.image.along((self.before == 0) | (self.before == 1))
+
+    def _weight(self, mass: NodeScalar) -> NodeScalar:
+        """2 m m'/(m + m') [kg] at nodes beyond the plane, m on it, zero before it, shape (n,)."""
+        mirrored = self.image.scalar(mass)
+        both = mass + mirrored
+        harmonic = 2 * mass * mirrored / jnp.where(both == 0, 1, both)
+        return jnp.where(self.image.along(self.before <= 0), harmonic, 0)
+
+    def _column_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> NodeScalar:
+        """The normal impulse that holds each column by itself [kg m/s], shape (n,)."""
+        impulse = held.without_collider_impulses(residual)
+        share = self.image.along(jnp.where(self.before < 0, 2, jnp.where(self.before == 0, 1, 0)))
+        return self.inward * self.image.column(share.astype(impulse.dtype) * impulse[:, self.image.axis])
+
+    def _tied(self, held: ConstrainedNodes, columns: NodeScalar) -> NodeScalar:
+        """A quantity of the columns, summed over columns that are each other's image in other planes, shape (n,)."""
+        contacts = (image for c in held.unconstrained.contacts if (image := c.mirror_image) is not None)
+        for image in (*contacts, *held.unconstrained.mirror.images):
+            if image.axis != self.image.axis:
+                columns = image.scalar(Mirror((image,)).fold_scalar(columns))
+        return columns
+
+
 class ContactPlane(AbstractPlane):
     """A rigid plane that the material may leave, and along which it slides with Coulomb friction.
 
@@ -213,21 +302,20 @@ class ContactPlane(AbstractPlane):
         refuse_contact(total)
 
     def contacts(
-        self, conditions: Conditions, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
-    ) -> tuple[PlaneContact, ...]:
-        """The contact of this plane, with a mirror in the columns that it holds."""
-        del conditions, t, dt
+        self, faces: Faces | None, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
+    ) -> tuple[AbstractContact, ...]:
+        """A mirror in the columns that a particle reaches whose gap is shut. In implicit steps, which may close much of
+        a gap at once, the faces before the plane are pushed as by a `SeparatingBox` in the step that would bring them
+        behind it."""
+        del t, dt
         image, before = self.image(grid, window)
-        return (PlaneContact(image, self.inward, before, self.friction),)
-
-    def facing(self, own: tuple[AbstractContact, ...], faces: Faces) -> tuple[AbstractContact, ...]:
-        """The contact in the columns whose gap is shut. In implicit steps, which may close much of a gap at once, the
-        faces before the plane are pushed as by a `SeparatingBox` in the step that would bring them behind it."""
-        plane = own[0]
-        assert isinstance(plane, PlaneContact)
-        inward = jnp.zeros_like(faces.x.T).at[self.axis].set(self.inward)
+        plane = PlaneContact(image, self.inward, before, self.friction)
+        if faces is None:
+            return (plane,)
+        normal = jnp.zeros_like(faces.x.T).at[self.axis].set(self.inward)
         distance = self.inward * (faces.x[:, self.axis] - self.position)
-        landing = surface_contact(Surface(distance, inward, self.friction, axis=self.axis), faces)
+        landing = surface_contact(Surface(distance, normal, self.friction, axis=self.axis), faces)
         shut = landing.gap <= SHUT * faces.spacing
-        plane = plane.where(shut[0], faces.stencil)
-        return (plane,) if faces.explicit else (plane, replace(landing, beside=~shut))
+        around = scatter(faces.stencil, shut.astype(faces.stencil.weights.dtype), None, grid.size)
+        plane = replace(plane, shut=image.column(around[:, 0]) > 0)
+        return (plane,) if faces.explicit else (replace(landing, beside=~shut), plane)

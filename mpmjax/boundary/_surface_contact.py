@@ -1,5 +1,15 @@
-"""Contact of particles' faces with rigid surfaces: walls and colliders that push where the material's surface is."""
+"""Contact of particles' faces with rigid surfaces: walls and colliders that push where the material's surface is.
 
+A particle is a cube of side l0 = V0^(1/d) that its deformation makes an ellipsoid. Its face is behind its centre x_p by
+the arm b_p, and moves by u − ∇u b under a displacement u. So the gap to a surface of unit normal n,
+
+    g_p(u) = g_p(0) + n_p · Σ_i (w_ip − b_p · g_ip) u_i,
+
+is linear in the displacement of the nodes about the start of the step. The force of a spring on it,
+−k_p g_p (w_ip − b_p · g_ip) n_p on each node, acts at the face: its moment is that of −k_p g_p n_p there.
+"""
+
+from collections.abc import Callable
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -7,14 +17,128 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Bool, Float, NodeScalar, NodeVector, Scalar
-from mpmjax.boundary._contact import AbstractContact, ConstrainedNodes
-from mpmjax.boundary._faces import Faces
-from mpmjax.boundary._friction import friction_across, friction_along
-from mpmjax.boundary._springs import SIGNS, Springs, along
+from mpmjax._types import Array, Bool, Deformation, Float, NodeScalar, NodeVector, ParticleVector, Scalar
+from mpmjax.boundary._contact import AbstractSpringContact, ConstrainedNodes
+from mpmjax.boundary._friction import friction_change
 from mpmjax.checks import require
-from mpmjax.discretisation import scatter
+from mpmjax.discretisation import Stencil, scatter
 from mpmjax.geometry import length
+from mpmjax.potential import AbstractSpring, Displacement, Forces
+
+EXPLICIT_STIFFNESS = 2.0
+"""Stiffness of contact in explicit steps, in the material's wave modulus over a spacing: that of half a spacing of the
+material. More would shorten the longest stable step."""
+IMPLICIT_STIFFNESS = 20.0
+"""Stiffness of contact in implicit steps, in the material's wave modulus over a spacing."""
+SIGNS = (1, -1)
+"""The directions of two surfaces that face each other, along the normal of the first."""
+
+
+class FaceShape(eqx.Module):
+    """The shapes of particles of one material.
+
+    Along a unit vector n the half-width of a particle is h = ½ l0 ‖Fᵀn‖, which is the face's distance wherever n is
+    along an edge. Where only the elastic part of the deformation is known or J alone, h = ½ l0 J^(1/d) after each step.
+    """
+
+    half: Float[Array, "q"]
+    """½ l0 [m], shape (q,)."""
+    deformation: Deformation
+    """F [-], shape (d, d, q), or J, shape (q,)."""
+    rows: tuple[int, int] = eqx.field(static=True)
+    """First particle, and the one after the last."""
+    total: bool = eqx.field(static=True)
+    """Whether gradients are with respect to the reference positions."""
+
+    def width(self, n: Float[Array, "d q"]) -> tuple[Float[Array, "q"], Float[Array, "d q"]]:
+        """h [m], shape (q,), and the arm b [m] from the face to the centre, shape (d, q): δh = n · ∇u b for a
+        displacement u. By J alone b = h n, so that pressure acts where the face is whatever the flow (that J^(1/d)
+        changes by another amount is made up for in the next step)."""
+        F, d = self.deformation, len(n)
+        if F.ndim == 1:
+            h = self.half * jnp.where(F > 0, F, 1) ** (1 / d)  # a volume below zero is a fault that is told elsewhere
+            return h, h * n
+        m = la.matmul(la.transpose(F), n[:, None])[:, 0]
+        square = (m**2).sum(axis=0)
+        stretch = jnp.sqrt(jnp.where(square == 0, 1, square))
+        return self.half * stretch, self.half / stretch * (m if self.total else la.matmul(F, m[:, None])[:, 0])
+
+
+class Faces(eqx.Module):
+    """The particles as contact with surfaces knows them in a step."""
+
+    x: ParticleVector
+    """Positions at the start of the step [m], shape (p, d)."""
+    v: ParticleVector
+    """Velocities at the start of the step [m/s], shape (p, d)."""
+    shapes: tuple[FaceShape, ...]
+    """Their shapes, one for each material."""
+    stiffness: Float[Array, "p"]
+    """Stiffness of contact of a face at rest A α M/dx [N/m], shape (p,), with M the modulus of contact (see
+    `AbstractLaw.contact_modulus`), α the stiffness of explicit or implicit steps, and A the face's area: V0/l0, and in
+    explicit steps V0 over the side of its material's largest particle."""
+    inertia: Float[Array, "p"]
+    """A α ρ0/dx [kg/m²], shape (p,): times the square of the velocity of approach, the stiffness of contact that a
+    shock adds."""
+    stencil: Stencil
+    spacing: Scalar
+    """dx [m]."""
+    dt: Scalar
+    """Δt [s]."""
+    push_time: Scalar
+    """The time at which surfaces push [s]: the start of an explicit step, the end of an implicit one."""
+    share: Scalar = 1.0
+    """θ, the share of the step's displacement at which the integrator evaluates forces; 1 at its start."""
+    explicit: bool = eqx.field(static=True, default=True)
+    """Whether the step is explicit."""
+
+    def stiffness_at(self, approach: Float[Array, "p"]) -> Float[Array, "p"]:
+        """k_p = A α (M + ρ0 max(w, 0)²)/dx [N/m], shape (p,), at the velocity of approach w [m/s]: as in a shock, so
+        that a particle by itself is stopped within half a spacing at any speed."""
+        return self.stiffness + self.inertia * jnp.maximum(approach, 0) ** 2
+
+    def width(self, n: Float[Array, "d p"]) -> tuple[Float[Array, "p"], Float[Array, "d p"]]:
+        """Half-widths h [m] along unit vectors n, shape (p,), and arms b [m], shape (d, p), with δh = n · ∇u b."""
+        parts = [shape.width(n[:, slice(*shape.rows)]) for shape in self.shapes]
+        if len(parts) == 1:
+            return parts[0]
+        widths, arms = zip(*parts, strict=True)
+        return jnp.concatenate(widths), jnp.concatenate(arms, axis=-1)
+
+
+class Springs(AbstractSpring):
+    """The springs between one surface, or two that face each other, and the particles: s is 1 or 2."""
+
+    stretch: Float[Array, "s p"]
+    """g_p at u = 0 [m], shape (s, p); zero where nothing is held."""
+    stiffness: Float[Array, "s p"]
+    """k_p [N/m], shape (s, p); zero where nothing is held."""
+    normal: Float[Array, "d p"]
+    """n_p [-], out of the first surface, shape (d, p); the second one's is the opposite."""
+    arm: Float[Array, "d p"]
+    """b_p [m], from the face at the first surface to the centre, shape (d, p); the second one's is the opposite."""
+
+    def elongation(self, moved: Displacement) -> Float[Array, "s p"]:
+        """n · (u − ∇u b) [m], shape (s, p)."""
+        value, slopes = moved.at_particles
+        shift = (self.normal * value).sum(axis=0)
+        growth = (self.normal[None] * self.arm[:, None] * slopes).sum(axis=(0, 1))
+        return jnp.stack([sign * shift - growth for sign in SIGNS[: len(self.stretch)]])
+
+    def spread(self, amount: Float[Array, "s p"], size: int) -> Forces:
+        del size
+        return Forces(value=along(amount) * self.normal, slopes=-amount.sum(axis=0) * self.arm[:, None] * self.normal)
+
+    def spread_square(self, amount: Float[Array, "s p"], size: int) -> Forces:
+        """Without the products of weights and their derivatives."""
+        del size
+        k = amount.sum(axis=0)
+        return Forces(value=k * self.normal**2, slopes=k * (self.arm[:, None] * self.normal) ** 2)
+
+
+def along(amount: Float[Array, "s p"]) -> Float[Array, "p"]:
+    """The sum of amounts along the normal of each surface, along that of the first."""
+    return amount[0] if len(amount) == 1 else amount[0] - amount[1]
 
 
 class Surface(NamedTuple):
@@ -35,101 +159,41 @@ class Surface(NamedTuple):
     [m], shape (p,); None without one."""
 
 
-class SurfaceContact(AbstractContact):
+class SurfaceContact(AbstractSpringContact):
     """A surface, or two that face each other, that pushes the faces of particles. Each particle is a place at each.
 
-    The gap g_p is the particle's distance from the surface less its half-width along the normal. A particle that is
-    held has a spring of stiffness k_p on its gap (see `Springs`), which pushes with −k_p g_p: with the gap at the end
-    of the step, in an explicit step with that at its start. It is held if that gap is below zero, so that the spring
-    pushes and the two conditions exclude each other.
-
-    The stiffness of a face that comes with the velocity w is that of M + ρ0 w² in the place of the wave modulus M, as
-    in a shock: a particle by itself, of half a spacing, is stopped within half a spacing at any speed.
-
-    The energy ½ k_p min(g_p, 0)² is convex in g_p. So a force by the gap at the end of the step takes at least as much
-    energy as the spring keeps, −k_p g¹ (g¹ − g⁰) ≤ ½ k_p (min(g⁰, 0)² − min(g¹, 0)²), at any step, as long as k_p
-    does not grow. An integrator that evaluates forces at θ of the step's displacement gets the force by springs of gap
-    θ g⁰ and stiffness k_p/θ.
-
-    Friction is at most μ times the push of the particles around each node.
+    The gap g_p is the particle's distance from the surface less its half-width along the normal, at the start of the
+    step; the surface is where it is at `Faces.push_time`. Friction is at most μ times the push of the particles around
+    each node.
     """
 
     gap: Float[Array, "s p"]
-    """g_p with the particles at the start of the step, and the surface at its end or, in an explicit step, at its start
-    [m], shape (s, p), of s surfaces."""
     normal: Float[Array, "d p"]
     """n_p of the first surface [-], shape (d, p)."""
     arm: Float[Array, "d p"]
     """b_p at the first surface [m], shape (d, p) (see `Springs`)."""
     stiffness: Float[Array, "s p"]
-    """k_p at the velocities of the start of the step [N/m], shape (s, p) (see `Faces.stiffness_at`)."""
     velocity: Float[Array, "d p"] | None
     """Velocity of the surface [m/s], shape (d, p); None at rest."""
     faces: Faces
+    dt: Scalar
+    share: Scalar
     coefficient: Scalar
     """Coulomb coefficient [-]."""
     axis: int | None = eqx.field(static=True)
     """The axis of its normal; None if that is along no axis."""
-    body: int | None = eqx.field(static=True)
-    """The number of the collider that it belongs to; None if it belongs to none."""
     beside: Bool[Array, "s p"] | None = None
     """The particles that it may push, shape (s, p); None for all."""
 
     @property
-    def friction_order(self) -> float:
-        return 3.0 if self.axis is None else float(self.axis)
-
-    @property
-    def collider(self) -> int | None:
-        return self.body
-
-    @property
-    def known_at_start(self) -> bool:
-        """An explicit step's force is that of the gaps at its start."""
-        return True
-
-    def springs(self, active: Array) -> Springs:
-        held, share = active & self.near, self.faces.share
-        return Springs(
-            stretch=share * jnp.where(held, self.gap, 0),
-            stiffness=jnp.where(held, self.stiffness / share, 0),
-            normal=self.normal,
-            arm=self.arm,
-        )
-
-    @property
     def near(self) -> Bool[Array, "s p"]:
-        """The particles whose face is less than a spacing before or behind the surface, shape (s, p): what is
-        further does not come to it in a step, or has passed it."""
+        """The particles whose face is less than a spacing before or behind the surface: one that is further does not
+        come to it in a step, or has passed it."""
         near = jnp.abs(self.gap) < self.faces.spacing
         return near if self.beside is None else near & self.beside
 
-    def gap_felt(self, held: ConstrainedNodes) -> Float[Array, "s p"]:
-        """The gap that the spring feels [m], shape (s, p); infinite for particles that are not near."""
-        every = self.springs(jnp.ones(self.gap.shape, bool))
-        return jnp.where(self.near, every.stretched(held.moved) / self.faces.share, jnp.inf)
-
-    def push(self, held: ConstrainedNodes, active: Array) -> Float[Array, "s p"]:
-        """The normal impulse on each particle in the step [kg m/s], shape (s, p)."""
-        shut = active & self.near
-        return jnp.where(shut, -self.faces.dt * self.stiffness * jnp.where(shut, self.gap_felt(held), 0), 0)
-
-    def likely_held(self, held: ConstrainedNodes, v: NodeVector) -> Bool[Array, "s p"]:
-        del v
-        return self.gap_felt(held) < 0
-
-    def gap_velocity(self, held: ConstrainedNodes, v: NodeVector) -> Float[Array, "s p"]:
-        """The gap over the step [m/s]."""
-        del v
-        return self.gap_felt(held) / self.faces.dt
-
-    def normal_impulse(self, held: ConstrainedNodes, residual: NodeVector) -> Float[Array, "s p"]:
-        del residual
-        return -self.faces.dt * self.stiffness * self.gap_felt(held)
-
-    def rounding(self, held: ConstrainedNodes, noise: Array) -> tuple[Array, Array]:
-        """The rounding of a velocity [m/s], and what that makes of a push [kg m/s]."""
-        return noise, noise * self.stiffness * self.faces.dt**2
+    def spread(self, stretch: Array, stiffness: Array) -> Springs:
+        return Springs(stretch, stiffness, self.normal, self.arm)
 
     def reached(self, active: Array, shape: tuple[int, ...]) -> Bool[Array, "n d"]:
         """All components of the nodes around the particles held."""
@@ -147,31 +211,27 @@ class SurfaceContact(AbstractContact):
         faces = contacts[0].faces
         return number * faces.stiffness_at(length(faces.v)) * (1 + steepness * square) / mass
 
-    def friction(self, held: ConstrainedNodes, active: Array, v: NodeVector, residual: NodeVector) -> NodeVector:
-        del residual
-        pushes, d = jnp.maximum(self.push(held, active), 0), v.shape[1]
-        push = pushes.sum(axis=0)
-        around, mirror = [(self.coefficient * push)[None]], held.nodes.mirror
+    def friction(
+        self, held: ConstrainedNodes, active: Array, residual: NodeVector
+    ) -> Callable[[NodeVector], NodeVector]:
+        pushes, (size, d) = jnp.where(active, jnp.maximum(self.normal_impulse(held, residual), 0), 0), residual.shape
+        push, mirror = pushes.sum(axis=0), held.nodes.mirror
+        around = [(self.coefficient * push)[None]]
         if self.axis is None:
             velocity = jnp.zeros_like(self.normal) if self.velocity is None else self.velocity
             around += [push[None], along(pushes) * self.normal, push * velocity]
-        sums = scatter(self.faces.stencil, jnp.concatenate(around), None, len(v))
+        sums = scatter(self.faces.stencil, jnp.concatenate(around), None, size)
         limit = mirror.fold_scalar(sums[:, 0])
         if self.axis is not None:
-            return friction_across(held, self.axis, limit, v)
-        pushed, normal, moving = mirror.fold_scalar(sums[:, 1]), sums[:, 2 : d + 2], sums[:, d + 2 :]
-        moving = mirror.fold(moving) / jnp.where(pushed == 0, 1, pushed)[:, None]
-        return friction_along(held, mirror.fold(normal), moving, limit, v)
+            normal = (jnp.arange(d) == self.axis).astype(limit.dtype)
+            return lambda v: friction_change(held.nodes.projection, held.nodes.mass, normal, 0.0, limit, v)
+        pushed, normal = mirror.fold_scalar(sums[:, 1]), mirror.fold(sums[:, 2 : d + 2])
+        moving = mirror.fold(sums[:, d + 2 :]) / jnp.where(pushed == 0, 1, pushed)[:, None]
+        return lambda v: friction_change(held.nodes.projection, held.nodes.mass, normal, moving, limit, v)
 
 
-def surface_contact(surface: Surface, faces: Faces, body: int | None = None) -> SurfaceContact:
-    """The contact of the particles' faces with a surface.
-
-    Args:
-        surface: the surface.
-        faces: the faces.
-        body: the number of the collider that it belongs to; None if it belongs to none.
-    """
+def surface_contact(surface: Surface, faces: Faces) -> SurfaceContact:
+    """The contact of the particles' faces with a surface."""
     width, arm = faces.width(surface.normal)
     relative = faces.v.T if surface.velocity is None else faces.v.T - surface.velocity
     leaving = (surface.normal * relative).sum(axis=0)
@@ -183,9 +243,10 @@ def surface_contact(surface: Surface, faces: Faces, body: int | None = None) -> 
         stiffness=jnp.stack([faces.stiffness_at(-sign * leaving) for sign in SIGNS[: len(distances)]]),
         velocity=surface.velocity,
         faces=faces,
+        dt=faces.dt,
+        share=faces.share,
         coefficient=surface.friction,
         axis=surface.axis,
-        body=body,
     )
 
 

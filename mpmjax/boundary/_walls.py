@@ -182,9 +182,9 @@ class SeparatingBox(AbstractBox):
         del spacing, t, dt, reference
         return no_conditions(nodes)
 
-    def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, force_time: Scalar) -> tuple[Surface, ...]:
+    def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, push_time: Scalar) -> tuple[Surface, ...]:
         """Two an axis, which face each other: what is squeezed is pushed by both."""
-        del t, dt, force_time
+        del t, dt, push_time
         above = (x - jnp.asarray(self.lower, x.dtype)).T
         below = (jnp.asarray(self.upper, x.dtype) - x).T
         normals = [jnp.zeros_like(x.T).at[axis].set(1) for axis in range(self.dim)]

@@ -248,7 +248,7 @@ def _force_displacement(
     length_unit: Scalar = 1.0,
 ) -> Force:
     d, what, number = source.particles.dim, "collider", collider
-    bodies = [b for b in source.scene.boundary if b.bodies]
+    bodies = [b for b in source.scene.boundary if b.collider_count]
     if boundary is not None:
         what, number, bodies = "boundary", boundary, source.scene.boundary
     require(0 <= axis < d, f"{_HEADER} axis must be below {d}, got {axis}.")

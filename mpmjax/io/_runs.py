@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax.boundary import BoundaryImpulse, ColliderImpulse
+from mpmjax.boundary import Impulses
 from mpmjax.checks import canonical, checked, is_traced, require, require_finite, require_memory, require_positive
 from mpmjax.io._atomic_write import reason, replacing
 from mpmjax.io._hdf5 import (
@@ -50,7 +50,7 @@ from mpmjax.simulation import RolloutState, Run, RunStatistics, initial_state, n
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator
 
-_IMPULSES = {"collider_impulse": ColliderImpulse, "boundary_impulse": BoundaryImpulse}
+_IMPULSES = ("collider_impulse", "boundary_impulse")
 
 
 class FrameWriter:
@@ -341,10 +341,10 @@ def _frames(file: File, like: RolloutState, start: int, stop: int) -> tuple[np.n
     table = rows["mpmjax/frames"]
     tallies = RunStatistics(**{f.name: jnp.asarray(table[f.name]) for f in fields(RunStatistics)})
     received: dict[str, Any] = {}
-    for name, kind in _IMPULSES.items():
+    for name in _IMPULSES:
         if getattr(like, name) is not None:
             both = jnp.asarray(rows[f"mpmjax/{name}"])
-            received[name] = kind(*jnp.split(both, [like.particles.x.shape[1]], axis=-1))
+            received[name] = Impulses(*jnp.split(both, [like.particles.x.shape[1]], axis=-1))
     kept = (received.get(name) for name in _IMPULSES)
     return table["step"], RolloutState(states_in(rows, like.particles), *kept), tallies
 

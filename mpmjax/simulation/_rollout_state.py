@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import components, particle_first
-from mpmjax.boundary import BoundaryImpulse, ColliderImpulse, no_boundary_impulse, no_impulse
+from mpmjax.boundary import Impulses, no_impulses
 from mpmjax.state import MemoryOrder, Particles, Scene, State, state_of
 from mpmjax.stepping import StepInfo
 
@@ -17,9 +17,9 @@ class RolloutState(eqx.Module):
     """The part of a rollout that evolves: the particles' state, and what colliders and boundaries have received."""
 
     particles: State
-    collider_impulse: ColliderImpulse | None
+    collider_impulse: Impulses | None
     """Linear and angular impulse on the scene's colliders since the rollout began; None without colliders."""
-    boundary_impulse: BoundaryImpulse | None = None
+    boundary_impulse: Impulses | None = None
     """Linear and angular impulse on the scene's boundaries; None unless the scene has `boundary_forces`."""
     order: MemoryOrder | None = None
     """The order of the particles in memory; None if it is that in which they were given."""
@@ -57,8 +57,8 @@ class RolloutState(eqx.Module):
 def initial_state(scene: Scene, particles: Particles) -> RolloutState:
     """The state in which a rollout of prepared particles begins."""
     of = particles.dim, particles.x.dtype
-    colliders = no_impulse(scene.collider_count, *of) if scene.collider_count else None
-    boundaries = no_boundary_impulse(len(scene.boundary) + len(scene.guides), *of) if scene.boundary_forces else None
+    colliders = no_impulses(scene.collider_count, *of) if scene.collider_count else None
+    boundaries = no_impulses(len(scene.boundary) + len(scene.guides), *of) if scene.boundary_forces else None
     return RolloutState(state_of(particles), colliders, boundaries)
 
 

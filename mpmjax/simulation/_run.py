@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.boundary import BoundaryImpulse, ColliderImpulse
+from mpmjax.boundary import Impulses
 from mpmjax.simulation._statistics import RunStatistics
 from mpmjax.state import Particles, Scene, State, with_state
 from mpmjax.stepping import AbstractIntegrator
@@ -61,16 +61,16 @@ class Run(eqx.Module):
     report: Float[Array, "..."] | None = None
     """Zero. Its tangent in forward mode is the relative residual of the first tangent solve that did not converge, zero
     if all did. None of a run from a file."""
-    collider_impulse: ColliderImpulse | None = None
+    collider_impulse: Impulses | None = None
     """Linear and angular impulse on the scene's colliders from the run's start to each saved frame, with a leading axis
     f; None without colliders, or where nothing was saved. The difference between two frames, over the time between
     them, is the mean force and torque of these steps (see `forces`, which says at what time)."""
-    final_collider_impulse: ColliderImpulse | None = None
+    final_collider_impulse: Impulses | None = None
     """Linear and angular impulse on the colliders to the end; None without colliders."""
-    boundary_impulse: BoundaryImpulse | None = None
+    boundary_impulse: Impulses | None = None
     """As `collider_impulse`, on each of the scene's boundaries (see `boundary_forces`); None unless the scene has
     `boundary_forces`, or where nothing was saved."""
-    final_boundary_impulse: BoundaryImpulse | None = None
+    final_boundary_impulse: Impulses | None = None
     """Impulse on each of the scene's boundaries from the run's start to its end; None unless the scene has
     `boundary_forces`."""
 
@@ -119,7 +119,7 @@ class Run(eqx.Module):
             )
         return self._mean_forces(self.boundary_impulse)
 
-    def _mean_forces(self, impulses: ColliderImpulse | BoundaryImpulse) -> Forces:
+    def _mean_forces(self, impulses: Impulses) -> Forces:
         times, at = self.times, self.method.force_at()
         between = (times[1:] - times[:-1])[:, None, None]
         mean = jax.tree.map(lambda a: (a[1:] - a[:-1]) / between, impulses)

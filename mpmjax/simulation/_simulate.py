@@ -14,7 +14,7 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.autodiff import guard, recomputed
-from mpmjax.boundary import BoundaryImpulse, ColliderImpulse
+from mpmjax.boundary import Impulses
 from mpmjax.checks import (
     canonical,
     checked,
@@ -266,8 +266,8 @@ class Saved(NamedTuple):
     steps: Float[Array, "f"]
     """Their numbers."""
     values: Any = None
-    collider_impulse: ColliderImpulse | None = None
-    boundary_impulse: BoundaryImpulse | None = None
+    collider_impulse: Impulses | None = None
+    boundary_impulse: Impulses | None = None
 
 
 class End(NamedTuple):

@@ -65,7 +65,7 @@ def warn_of_oversights(grid: Grid, kernel: BSpline, boundary: Boundaries, partic
                 "not move freely. Move one of them; to hold a body on purpose take a Grip."
             )
         if (mask := touched[number - 1]) is not None:
-            may_meet = not total and condition.bodies > 0  # material comes to it: any node will do
+            may_meet = not total and condition.collider_count > 0  # material comes to it: any node will do
             if not (mask if may_meet else np.asarray(mask)[_reached(grid, kernel, particles.x)]).any():
                 where = "of the window lies in it" if may_meet else "that a particle reaches lies in it"
                 warn(f"The {name} touches nothing, since no node {where}: move it, or enlarge it to a spacing or more.")

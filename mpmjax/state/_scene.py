@@ -283,7 +283,7 @@ class Scene(eqx.Module):
     @property
     def collider_count(self) -> int:
         """Number of colliders."""
-        return sum(boundary.bodies for boundary in self.boundary)
+        return sum(boundary.collider_count for boundary in self.boundary)
 
     @property
     def total(self) -> bool:

@@ -5,14 +5,12 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, Int, NodeScalar, NodeVector, Scalar
 from mpmjax.boundary import (
-    BoundaryImpulse,
-    ColliderImpulse,
-    Given,
-    GivenCouple,
+    Impulses,
+    OwnedCouple,
+    OwnedImpulse,
     brought_images,
-    impulse_on_boundaries,
-    impulse_on_colliders,
     owners_of,
+    received_impulses,
     taken_by_mirrors,
 )
 from mpmjax.discretisation import AbstractTransfer, Gathered, Stencil
@@ -25,10 +23,12 @@ from mpmjax.stepping._integrator import AbstractIntegrator
 from mpmjax.stepping._nodes import Nodes, places_of
 
 
-def impulse_on_colliders_of(nodes: Nodes, method: AbstractIntegrator, new: GridUpdate) -> ColliderImpulse:
-    """The impulse on the scene's colliders, at their places at the time of the forces.
+def impulse_on_colliders(scene: Scene, nodes: Nodes, method: AbstractIntegrator, new: GridUpdate) -> Impulses:
+    """The impulse on the scene's colliders, at their places at the time of the forces, by prescribed components, along
+    normals, by springs and friction.
 
     Args:
+        scene: the scene.
         nodes: the nodes at the start of the step.
         method: the integrator.
         new: their update.
@@ -37,13 +37,15 @@ def impulse_on_colliders_of(nodes: Nodes, method: AbstractIntegrator, new: GridU
     assert colliders is not None
     if share is not None:
         colliders = colliders.after(share * nodes.dt, nodes.mirror.unfold(new.motion.carrier))
-    held = new.held(nodes)
-    holding = held.beside_springs(reaction(nodes, new.solved, new.elastic))
+    held, numbers = new.held(nodes), _boundaries_of_colliders(scene)
+    holding = held.without_spring_impulses(reaction(nodes, new.solved, new.elastic))
     pushes = () if new.contact is None else held.pushes(new.contact.friction)
-    return impulse_on_colliders(colliders, holding, held.along_normals(holding), pushes)
+    by_springs = [OwnedImpulse(push, numbers.index(number)) for number, push in pushes if number in numbers]
+    parts = [OwnedImpulse(holding, colliders.holder), *held.along_normals(holding), *by_springs]
+    return received_impulses(parts, colliders.position, colliders.pivots)
 
 
-def impulse_on_boundaries_of(
+def impulse_on_boundaries(
     scene: Scene,
     particles: Particles,
     t: Scalar,
@@ -51,7 +53,7 @@ def impulse_on_boundaries_of(
     nodes: Nodes,
     method: AbstractIntegrator,
     new: GridUpdate,
-) -> BoundaryImpulse:
+) -> Impulses:
     """The impulse on each boundary of the scene, and on what guides its rigid bodies, in the step from t.
 
     Args:
@@ -81,17 +83,17 @@ def impulse_on_boundaries_of(
     for body, image in zip(scene.rigid_bodies, nodes.mirror.rigid, strict=True):
         guide = scene.guides.get(body.number)
         owners, of_spin = _spread(owners, image, unfolded.mass, planes, body.freedom, guide)
-        couples.append(GivenCouple(_couple(image, unfolded, nodes, solved), of_spin))
+        couples.append(OwnedCouple(_couple(image, unfolded, nodes, solved), of_spin))
         soft = image.with_own(soft, jnp.zeros(len(image.arms), dtype=bool))
 
     # springs act on all nodes
-    given = []
+    parts = []
     for number, contact, active in contacts:
         push = contact.spring_impulse(held, active)
         if push is not None:
             residual = residual - push
             if number is not None:  # else two bodies push each other
-                given.append(Given(push, number))
+                parts.append(OwnedImpulse(push, number))
 
     # what symmetry planes take of the impulses on all nodes, and what reaches the folded ones
     if scene.transfer.needs_change:
@@ -99,12 +101,12 @@ def impulse_on_boundaries_of(
         mass = jnp.where(soft, unfolded.mass, 0) if couples else unfolded.mass  # a rigid body takes the velocity
         residual = residual + kept * mass[:, None] * (unfolded.velocity - unfold(new.before(nodes)))
     of_planes, residual = taken_by_mirrors(residual, images)
-    given += of_planes
+    parts += of_planes
 
     # then colliders along their normals, contact planes, and what is prescribed
-    bodies = jnp.asarray([n for n, boundary in enumerate(scene.boundary) for _ in range(boundary.bodies)], jnp.int32)
+    numbers = jnp.asarray(_boundaries_of_colliders(scene), jnp.int32)
     for part in held.along_normals(residual):
-        given.append(Given(part.impulse, jnp.where(part.owner < 0, -1, bodies[part.owner])))
+        parts.append(OwnedImpulse(part.impulse, jnp.where(part.owner < 0, -1, numbers[part.owner])))
         residual = residual - part.impulse
     columns = [
         (number, image.within(active))
@@ -112,20 +114,20 @@ def impulse_on_boundaries_of(
         if number is not None and (image := contact.mirror_image) is not None
     ]
     of_planes, residual = taken_by_mirrors(residual, columns)
-    given += [*of_planes, Given(residual, owners)]
+    parts += [*of_planes, OwnedImpulse(residual, owners)]
     taken = owners >= 0
     for number, contact, active in contacts:
         if number is not None:
             mine = contact.fixed(active, residual.shape) & ~taken
-            given.append(Given(jnp.where(mine, residual, 0), number))
+            parts.append(OwnedImpulse(jnp.where(mine, residual, 0), number))
             taken = taken | mine
 
     friction_of = () if new.contact is None else new.contact.friction
     for (number, _, _), change in zip(contacts, friction_of, strict=True):
         of_planes, friction = taken_by_mirrors(unfolded.mass[:, None] * unfold(change), images)
-        given += of_planes
+        parts += of_planes
         if number is not None:
-            given.append(Given(friction, number))
+            parts.append(OwnedImpulse(friction, number))
 
     places, pivots = at, _pivots(scene, t, residual)
     if scene.total:
@@ -136,7 +138,12 @@ def impulse_on_boundaries_of(
             carried = image.with_own(carried, jnp.broadcast_to(image.own(carrier)[0], image.arms.shape))
         places = places + force_at * dt * carried
         pivots = pivots + force_at * (_pivots(scene, t + dt, residual) - pivots)
-    return impulse_on_boundaries(given, couples, places, pivots)
+    return received_impulses(parts, places, pivots, couples)
+
+
+def _boundaries_of_colliders(scene: Scene) -> list[int]:
+    """The number of the boundary that each collider is."""
+    return [n for n, boundary in enumerate(scene.boundary) for _ in range(boundary.collider_count)]
 
 
 def _spread(
@@ -160,9 +167,9 @@ def _spread(
         freedom: what the body may do.
         guide: the number of its guides; None if it has none.
     """
-    own, full = image.own(owners), image.own(mass) > 0
-    nobody = jnp.iinfo(own.dtype).max
-    first = jnp.where((own >= 0) & full[:, None], own, nobody).min(axis=0)
+    layer, full = image.own(owners), image.own(mass) > 0
+    nobody = jnp.iinfo(layer.dtype).max
+    first = jnp.where((layer >= 0) & full[:, None], layer, nobody).min(axis=0)
     for number, plane in planes:
         first = jnp.where(image.reaches(plane, mass), jnp.minimum(first, number), first)
     of_spin = first.min()
@@ -172,7 +179,7 @@ def _spread(
     if guide is not None and freedom.directions is not None:
         first = jnp.where(jnp.asarray(freedom.directions), first, guide)
     first, of_spin = (jnp.where(number == nobody, -1, number) for number in (first, of_spin))
-    return image.with_own(owners, jnp.broadcast_to(first, own.shape)), of_spin
+    return image.with_own(owners, jnp.broadcast_to(first, layer.shape)), of_spin
 
 
 def _couple(image: RigidImage, unfolded: Nodes, nodes: Nodes, solved: NodeVector) -> Float[Array, "r"]:
@@ -221,6 +228,6 @@ def _moved_places(
 
 def _pivots(scene: Scene, t: Scalar, like: NodeVector) -> Array:
     """The points about which torques are taken at time t [m], shape (b, d)."""
-    found = [boundary.pivot(t) for boundary in scene.boundary] + [None] * len(scene.guides)
+    pivots = [boundary.pivot(t) for boundary in scene.boundary] + [None] * len(scene.guides)
     origin = jnp.zeros(like.shape[1], like.dtype)
-    return jnp.stack([origin if pivot is None else jnp.asarray(pivot, like.dtype) for pivot in found])
+    return jnp.stack([origin if pivot is None else jnp.asarray(pivot, like.dtype) for pivot in pivots])

@@ -21,7 +21,7 @@ from mpmjax.state import MaterialPoints, Particles, Scene
 
 
 def faces_of(
-    scene: Scene, particles: Particles, potential: ElasticPotential, dt: Scalar, force_at: Scalar | None
+    scene: Scene, particles: Particles, potential: ElasticPotential, t: Scalar, dt: Scalar, force_at: Scalar | None
 ) -> Faces:
     """The faces of prepared particles.
 
@@ -29,6 +29,7 @@ def faces_of(
         scene: the scene.
         particles: prepared particles.
         potential: their elastic potential.
+        t: time at the start of the step [s].
         dt: step [s].
         force_at: the share of the step's displacement at which forces are evaluated; None if the step is explicit.
     """
@@ -40,6 +41,7 @@ def faces_of(
         shapes.append(FaceShape(side / 2, shape, points.rows, points.total))
         # of a sliver A = V0/l0 is large for its mass, and would shorten explicit steps
         areas.append(points.volume / (side.max(initial=0) if explicit else side))
+    at = 0.0 if explicit else jnp.asarray(force_at, particles.x.dtype)
     per_modulus = jnp.concatenate(areas) * (factor / jnp.asarray(scene.grid.spacing))
     return Faces(
         x=particles.x,
@@ -50,7 +52,8 @@ def faces_of(
         stencil=potential.stencil,
         spacing=jnp.asarray(scene.grid.spacing),
         dt=jnp.asarray(dt),
-        force_at=0.0 if force_at is None else jnp.asarray(force_at, particles.x.dtype),
+        push_time=t if explicit else t + jnp.where(at > 0, dt, 0),
+        share=1.0 if explicit else jnp.where(at > 0, at, 1),
         explicit=explicit,
     )
 
@@ -111,13 +114,12 @@ def _bodies(scene: Scene, particles: Particles, potential: ElasticPotential, ima
     # w (x_p − x_i)_a = −D_a g_a, with g the moving-least-squares gradient
     arms = -jnp.eye(d, dtype=part.dtype)[..., None] * (part * stencil.moment / dx)
     middle = images.fold(scatter(stencil.least_squares, None, arms, scene.grid.size)).T
-    scalars = jnp.stack([images.fold_scalar(own) for own in sums[:, :4].T])
+    scalars = images.fold_scalars(sums[:, :4]).T
     velocity = images.fold(sums[:, 4:]).T
 
     full = jnp.where(scalars[0] > 0, scalars[0], 1)
     each = jnp.concatenate([scalars[:1], scalars[1:] / full, velocity / full, middle / full])
     each = each.reshape(len(each), layers, -1).swapaxes(0, 1)
     return [
-        Body(part=own[0], modulus=own[1], density=own[2], side=own[3], velocity=own[4 : 4 + d], middle=own[4 + d :])
-        for own in each
+        Body(part=a[0], modulus=a[1], density=a[2], side=a[3], velocity=a[4 : 4 + d], middle=a[4 + d :]) for a in each
     ]

@@ -7,7 +7,7 @@ import jax
 
 from mpmjax._types import NodeVector
 from mpmjax.autodiff import kept, without_derivative
-from mpmjax.boundary import ConstrainedNodes, ContactInfo, constrain, find_active_set
+from mpmjax.boundary import ConstrainedNodes, ContactInfo, constrain, count_places, find_active_set
 from mpmjax.implicit import SolveInfo, no_solve
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
@@ -80,7 +80,7 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     def attempt(held: ConstrainedNodes, guess: NodeVector) -> tuple:
         held, motion, info = solve(held, frozen_method, guess)
         missing = reaction(frozen, motion, elastic_impulse(frozen, frozen_method, motion))
-        return held, motion.velocity, held.beside_springs(missing), motion.carrier, info
+        return held, motion.velocity, held.without_spring_impulses(missing), motion.carrier, info
 
     start = frozen_method.mean_displacement(frozen, NodeMotion(guess))
     active, guess, cost, sweeps = kept(
@@ -88,9 +88,9 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     )
     held, solved, info = solve(constrain(nodes, active), method, guess)
     elastic = elastic_impulse(nodes, method, solved)
-    holding = held.beside_springs(reaction(nodes, solved, elastic))
+    holding = held.without_spring_impulses(reaction(nodes, solved, elastic))
     velocity, friction = held.friction(solved.velocity, holding)
-    contact = ContactInfo(sweeps, held.count_violations(solved.velocity, holding))
+    contact = ContactInfo(sweeps, count_places(nodes, *held.violations(solved.velocity, holding)))
     return GridUpdate(
         solved.with_friction(velocity - solved.velocity),
         elastic,

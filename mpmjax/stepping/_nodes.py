@@ -311,9 +311,8 @@ def with_boundaries(
         conditions = eqx.tree_at(lambda c: c.colliders.position, conditions, place)
     faces = None
     if any(boundary.pushes or boundary.sees_faces for boundary in scene.boundary):
-        faces = faces_of(scene, particles, potential, dt, force_at)
-    acts_at = t if force_at is None else t + jnp.where(jnp.asarray(force_at) > 0, dt, 0)
-    brought = brought_contacts(scene.boundary, conditions, grid, window, t, dt, faces, acts_at)
+        faces = faces_of(scene, particles, potential, t, dt, force_at)
+    brought = brought_contacts(scene.boundary, faces, grid, window, t, dt)
     contacts, brought_by = [contact for _, contact in brought], [number for number, _ in brought]
     if scene.bodies is not None:
         images = mirror(scene.boundary, grid, window)

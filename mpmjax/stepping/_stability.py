@@ -11,7 +11,7 @@ import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Float, NodeScalar, Scalar
-from mpmjax.boundary import STIFFNESS, AbstractContact, ConstrainedNodes, in_a_row
+from mpmjax.boundary import STIFFNESS, AbstractContact, ConstrainedNodes, series_stiffness
 from mpmjax.checks import canonical, checked, is_traced, require, require_finite, require_positive
 from mpmjax.discretisation import Stencil, gather
 from mpmjax.geometry import length
@@ -247,10 +247,9 @@ def _between_bodies(scene: Scene, particles: Particles, materials: tuple[Materia
         return [most(jnp.stack(found)) for found in every]
 
     stiff, light = over(modulus, jnp.max), over(density, jnp.min)
-    added = [
-        in_a_row(stiff[a], stiff[b]) / jnp.minimum(light[a], light[b]) for a, b in combinations(range(len(stiff)), 2)
-    ]
-    return 4 * STIFFNESS * jnp.stack(added).max() / jnp.asarray(scene.grid.spacing) ** 2
+    pairs = combinations(range(len(stiff)), 2)
+    added = jnp.stack([series_stiffness(stiff[a], stiff[b]) / jnp.minimum(light[a], light[b]) for a, b in pairs])
+    return 4 * STIFFNESS * added.max() / jnp.asarray(scene.grid.spacing) ** 2
 
 
 def _stiffest_viscosity(points: MaterialPoints, dim: int) -> Float[Array, "q"]:

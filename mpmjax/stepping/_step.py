@@ -10,12 +10,12 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Int, NodeVector, Scalar, components, particle_first
 from mpmjax.autodiff import without_derivative
-from mpmjax.boundary import BoundaryImpulse, ColliderImpulse, ContactInfo
+from mpmjax.boundary import ContactInfo, Impulses
 from mpmjax.checks import canonical, checked, require_finite, require_placement, require_positive
 from mpmjax.discretisation import Stencil, g2p, scatter
 from mpmjax.implicit import SolveInfo
 from mpmjax.state import Particles, Scene, State, is_prepared, prepare, with_state
-from mpmjax.stepping._boundary_forces import impulse_on_boundaries_of, impulse_on_colliders_of
+from mpmjax.stepping._boundary_forces import impulse_on_boundaries, impulse_on_colliders
 from mpmjax.stepping._explicit import Explicit
 from mpmjax.stepping._grid_update import GridUpdate, constrained_update, free_update
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
@@ -37,9 +37,9 @@ class StepInfo(eqx.Module):
     force_scale: Float[Array, "*f"]
     """The largest of four such norms [N]: of the two forces, of the force at the start, and of the nodes' momentum over
     Δt. The momentum of what yields counts only by its rounding, √ε of it."""
-    colliders: ColliderImpulse | None = None
+    colliders: Impulses | None = None
     """Impulse on the scene's colliders, in the order of its boundaries; None without colliders."""
-    boundaries: BoundaryImpulse | None = None
+    boundaries: Impulses | None = None
     """Impulse on each of the scene's boundaries; None unless the scene has `boundary_forces`."""
 
     @property
@@ -97,9 +97,9 @@ def step_unchecked(
     if force_at is not None and new.elastic is not None:
         error, scale = linearisation_error(scene, nodes, method, force_at, new.solved, new.elastic, trial, after)
     if nodes.conditions.colliders is not None:
-        colliders = impulse_on_colliders_of(nodes, method, new)
+        colliders = impulse_on_colliders(scene, nodes, method, new)
     if scene.boundary_forces:
-        boundaries = impulse_on_boundaries_of(scene, particles, t, unfolded, nodes, method, new)
+        boundaries = impulse_on_boundaries(scene, particles, t, unfolded, nodes, method, new)
     return after, StepInfo(
         solve=new.solve,
         contact=ContactInfo(none, none) if new.contact is None else new.contact.info,

@@ -1,0 +1,137 @@
+"""The impulses that colliders and boundaries receive from the material in a step.
+
+The impulses of all boundaries together are a partition of what the nodes receive besides gravity, body forces and the
+material's own forces, but for the residual of the solve. So their sum is minus the change of the particles' momentum
+that these leave, to rounding.
+
+At a mirror plane the nodes' equations are folded, Bᵀ(...) (see `_mirror`). What the folding takes from the impulses of
+all nodes is the plane's; what remains, on true nodes, belongs to the boundary that prescribes the component there.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mpmjax._types import Array, Float, Int, NodeVector, Scalar
+from mpmjax.boundary._boundary import AbstractBoundary
+from mpmjax.boundary._conditions import OwnedImpulse
+from mpmjax.geometry import moment
+from mpmjax.linalg import pairs
+from mpmjax.potential import Image, Mirror, Tie
+
+
+class Impulses(eqx.Module):
+    """Linear and angular impulse on each of a scene's k colliders, or on each of its k boundaries, in their order, the
+    guides of `Rigid` bodies that have some among them, after all others. Divided by the step they are its mean force
+    and torque.
+
+    Of a collider at a symmetry plane only the true nodes count, not their images; but springs push the faces of
+    particles, and so all nodes.
+    """
+
+    impulse: Float[Array, "*f k d"]
+    """Impulse [kg m/s], friction included."""
+    angular: Float[Array, "*f k r"]
+    """Angular impulse [kg m²/s] about the `pivot` of the boundary as it moves, of a collider the centre of its rotation
+    or, without one, its shape's middle: r = 1 component in 2-D, 3 in 3-D, none in 1-D. Nodes and pivot are taken where
+    they are at the time of the step's forces, t_n + θΔt, and in the total description where the body has moved the
+    nodes. About these places the forces of the material have no moment."""
+
+    def plus(self, later: "Impulses") -> "Impulses":
+        """The sum of both."""
+        return jax.tree.map(jnp.add, self, later)
+
+
+def no_impulses(count: int, dim: int, dtype: Any) -> Impulses:
+    """No impulse yet on a number of colliders or boundaries."""
+    return Impulses(jnp.zeros((count, dim), dtype), jnp.zeros((count, len(pairs(dim))), dtype))
+
+
+class OwnedCouple(eqx.Module):
+    """A couple on a rigid body, and the boundary that gives it."""
+
+    moment: Float[Array, "r"]
+    """[kg m²/s], shape (r,)."""
+    owner: Int[Array, ""]
+    """The number of the boundary, −1 for none."""
+
+
+def received_impulses(
+    parts: Sequence[OwnedImpulse],
+    positions: NodeVector,
+    pivots: Float[Array, "k d"],
+    couples: Sequence[OwnedCouple] = (),
+) -> Impulses:
+    """The impulse on each collider or boundary: minus what it gives the nodes.
+
+    Args:
+        parts: the impulses that they give the nodes.
+        positions: positions of the nodes [m], shape (n, d).
+        pivots: the points for torques [m], shape (k, d).
+        couples: the couples that they give rigid bodies besides.
+    """
+
+    def on(number: int, pivot: Array) -> tuple[Array, Array]:
+        total = jnp.zeros_like(positions)
+        for part in parts:
+            if isinstance(part.owner, int):
+                total = total + part.impulse if part.owner == number else total
+            else:
+                total = total + jnp.where(part.owner == number, part.impulse, 0)
+        angular = moment(positions - pivot, total).sum(axis=0)
+        angular = sum((jnp.where(couple.owner == number, couple.moment, 0) for couple in couples), angular)
+        return -total.sum(axis=0), -angular
+
+    each = [on(number, pivot) for number, pivot in enumerate(pivots)]
+    return Impulses(jnp.stack([linear for linear, _ in each]), jnp.stack([angular for _, angular in each]))
+
+
+def owners_of(
+    boundaries: tuple[AbstractBoundary, ...],
+    nodes: NodeVector,
+    spacing: Scalar,
+    t: Scalar,
+    dt: Scalar,
+    *,
+    reference: bool,
+) -> Int[Array, "n d"]:
+    """The number of the boundary that prescribes each component of the nodes' velocity, −1 for none, by the rule of
+    `combined_conditions`: the earlier one holds."""
+    owners = jnp.full(nodes.shape, -1, jnp.int32)
+    for number, boundary in enumerate(boundaries):
+        fixed = boundary.conditions(nodes, spacing, t, dt, reference=reference).fixed
+        owners = jnp.where((owners < 0) & fixed, number, owners)
+    for boundary in boundaries:
+        owners = boundary.extend_to_body(owners >= 0, owners, nodes, spacing)[1]
+    return owners
+
+
+def taken_by_mirrors(
+    field: NodeVector, images: list[tuple[int, Image]] | list[tuple[int, Image | Tie]]
+) -> tuple[list[OwnedImpulse], NodeVector]:
+    """The part of impulses on all nodes that mirrors take, each by its boundary's number, and the impulses that remain
+    on true nodes.
+
+    Where planes meet, each takes its normal component before the others fold it, so that its torque has the places of
+    all nodes.
+
+    Args:
+        field: impulses on all nodes [kg m/s], shape (n, d).
+        images: the mirrors in the order in which they unfold, with their boundaries' numbers.
+    """
+    taken, remaining = [], jnp.zeros_like(field)
+    planes = all(isinstance(image, Image) for _, image in images)  # they commute
+    for axis in range(field.shape[1]):
+        part = jnp.zeros_like(field).at[:, axis].set(field[:, axis])
+        order = list(reversed(images))
+        if planes:
+            order.sort(key=lambda pair: pair[1].axis != axis)
+        for number, image in order:
+            folded = Mirror((image,)).fold(part)
+            taken.append(OwnedImpulse(part - folded, number))
+            part = folded
+        remaining = remaining + part
+    return taken, remaining
