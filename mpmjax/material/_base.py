@@ -4,8 +4,6 @@ A law is its energy density Ψ(F). Its derivatives default to automatic differen
 them.
 """
 
-import abc
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -26,9 +24,10 @@ _ANISOTROPIC = 1e-4
 class AbstractMaterial(AbstractElastic):
     """A hyperelastic law, given by its energy density Ψ(F).
 
-    A law needs `energy` alone, and then works with every method, Hessian and description, and under every derivative:
-    the stress is the energy's gradient, the stress differential the stress's derivative. A law that has closed forms
-    overrides these methods; `mpmjax.verification.check_law` compares them with the defaults.
+    A law needs `energy(F)` alone [J/m³ of undeformed volume], shape (p,), and then works with every method, Hessian and
+    description, and under every derivative: the stress is the energy's gradient, the stress differential the stress's
+    derivative. A law that has closed forms overrides these methods; `mpmjax.verification.check_law` compares them with
+    the defaults.
 
         class Quadratic(mpm.AbstractMaterial):
             stiffness: float
@@ -50,18 +49,6 @@ class AbstractMaterial(AbstractElastic):
     derivatives. What is written in eigenvalues or singular values has not, where stretches coincide; the functions of
     `mpmjax.linalg` (`rotation`, `Logarithm`) have. Roots such as ‖F − R‖ have a kink at rest.
     """
-
-    @abc.abstractmethod
-    def energy(self, F: Matrix) -> Array:
-        """Ψ(F) [J/m³ of undeformed volume], shape (p,).
-
-        Args:
-            F: deformation gradient [-], shape (d, d, p).
-        """
-
-    def stress(self, F: Matrix) -> Matrix:
-        """The first Piola-Kirchhoff stress P = ∂Ψ/∂F [Pa], shape (d, d, p). Default: the energy's gradient."""
-        return super().stress(F)
 
     def tangent(self, F: Matrix) -> AbstractTangent:
         """The stress differential ∂²Ψ/∂F∂F at F, a symmetric map. Default: its matrix, by the derivative of the stress
@@ -133,10 +120,6 @@ class AbstractMaterial(AbstractElastic):
             centre, radius = (near + far) / 2, jnp.hypot((near - far) / 2, across)
             values += [centre - radius, centre + radius]
         return jnp.stack(values)
-
-    def of_gradient(self) -> "AbstractMaterial":
-        """The law itself."""
-        return self
 
     def inadmissible(self, or_else: str) -> tuple[str, str]:
         what, _ = super().inadmissible(or_else)

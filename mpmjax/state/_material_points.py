@@ -78,13 +78,13 @@ class MaterialPoints(eqx.Module):
     def change(self, gradient: Matrix) -> Deformation:
         """δF [-] by the gradient ∇u of a displacement, shape (d, d, q): ∇u F, in the total description ∇u; δJ is
         tr(∇u) J."""
-        return gradient if self.total else self.law.kinematics.change(gradient, self.deformation)
+        return gradient if self.total else self.law.measure.change(gradient, self.deformation)
 
     def flux(self, P: Deformation, dim: int) -> Matrix:
         """The flux of a stress P [J], shape (d, d, q), V0 P Fᵀ, of which the force is the sum, f_i = −Σ_p (V0 P Fᵀ)
         g_ip: the transpose of `change`. In the total description V0 P; by P = dΨ/dJ it is V0 P J I."""
         P = stored(self.volume * P)
-        return P if self.total else self.law.kinematics.flux(P, self.deformation, dim)
+        return P if self.total else self.law.measure.kirchhoff_stress(P, self.deformation, dim)
 
     def stiffness(
         self, tangent: Callable[[Deformation], Deformation], dim: int
@@ -114,7 +114,7 @@ class MaterialPoints(eqx.Module):
 
     def volume_ratio(self) -> Float[Array, "q"]:
         """J = det F [-], shape (q,)."""
-        return self.law.kinematics.determinant(self.deformation)
+        return self.law.measure.determinant(self.deformation)
 
     def stiffest(self, dim: int) -> Float[Array, "q"]:
         """Λ of each particle [Pa], shape (q,) (see `stable_dt`). Where volumes are averaged, the larger of Λ and its
