@@ -210,8 +210,10 @@ def _check_rows(name: str, times: Times, displacement: Displacements) -> None:
     require_that(f"{name}'s times must increase", lambda t: t[1:] > t[:-1], times)
 
 
-def _interpolated(t: Scalar, times: Float[Array, "j"], values: Float[Array, "j c"]) -> Float[Array, "c"]:
-    """The piecewise linear interpolation of each column of `values` at time t."""
+def _interpolated(t: Scalar, times: Float[Array, "j"], values: Float[Array, "j *c"]) -> Float[Array, "*c"]:
+    """The piecewise linear interpolation of values, or of each column of them, at time t."""
+    if values.ndim == 1:
+        return jnp.interp(t, times, values)
     return jnp.stack([jnp.interp(t, times, values[:, a]) for a in range(values.shape[1])])
 
 
@@ -279,10 +281,7 @@ class TimeSeries(eqx.Module):
 
     def at(self, t: Scalar) -> Float[Array, "..."]:
         """The value at time t, a number or of shape (d,)."""
-        times, values = jnp.asarray(self.times), jnp.asarray(self.values)
-        if values.ndim == 1:
-            return jnp.interp(t, times, values)
-        return jnp.stack([jnp.interp(t, times, values[:, a]) for a in range(values.shape[1])])
+        return _interpolated(t, jnp.asarray(self.times), jnp.asarray(self.values))
 
 
 Changing = Scalar | TimeSeries

@@ -68,6 +68,7 @@ class DruckerPrager(AbstractHenckyPlasticity):
     friction_angle: PerParticle
 
     def __check_init__(self):
+        require_fields(self)
         require_between("DruckerPrager's friction_angle [rad]", self.friction_angle, 0, np.pi / 2, open_ends=True)
 
     def flow(
@@ -142,6 +143,7 @@ class CamClay(AbstractHenckyPlasticity):
     hardening: PerParticle = 1.0
 
     def __check_init__(self):
+        require_fields(self)
         require_positive("CamClay's friction", self.friction)
         require_between("CamClay's preconsolidation [Pa]", self.preconsolidation, 0, np.inf)
         require_between("CamClay's cohesion", self.cohesion, 0, np.inf)

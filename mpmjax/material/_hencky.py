@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
-from mpmjax.checks import require_fields, require_moduli
+from mpmjax.checks import require_moduli
 from mpmjax.linalg import Logarithm, PowerLessOne
 from mpmjax.material._base import AbstractIsotropic
 from mpmjax.material._law import AbstractInelastic
@@ -98,7 +98,6 @@ class AbstractHenckyPlasticity(AbstractInelastic):
     poisson_ratio: eqx.AbstractVar[PerParticle]
 
     def __check_init__(self):
-        require_fields(self)
         require_moduli(type(self).__name__, self.youngs_modulus, self.poisson_ratio)
 
     def initial_variable(self) -> PerParticle:

@@ -8,7 +8,7 @@ import numpy as np
 
 from mpmjax._types import Array, Float, PerParticle, Scalar
 from mpmjax.autodiff import ruled
-from mpmjax.checks import require_between, require_positive
+from mpmjax.checks import require_between, require_fields, require_positive
 from mpmjax.material._hencky import AbstractHenckyPlasticity
 
 
@@ -57,6 +57,7 @@ class VonMises(AbstractHenckyPlasticity):
     hardening_modulus: PerParticle = 0.0
 
     def __check_init__(self):
+        require_fields(self)
         require_positive("VonMises's yield_stress [Pa]", self.yield_stress)
         require_between("VonMises's hardening_modulus [Pa]", self.hardening_modulus, 0, np.inf)
 
@@ -127,6 +128,7 @@ class HerschelBulkley(AbstractHenckyPlasticity):
     exponent: PerParticle = 1.0
 
     def __check_init__(self):
+        require_fields(self)
         require_positive("HerschelBulkley's yield_stress [Pa]", self.yield_stress)
         require_between("HerschelBulkley's consistency [Pa s^n]", self.consistency, 0, np.inf)
         require_positive("HerschelBulkley's exponent", self.exponent)
