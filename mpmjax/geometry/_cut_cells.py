@@ -93,13 +93,8 @@ def _moments(region: AbstractRegion, centres: np.ndarray, size: np.ndarray, halv
 
 
 def _by_plane(distance: np.ndarray, normal: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """`_moments` of cells in which the surface is a plane, along lines in the direction nearest to its normal.
-
-    Args:
-        distance: φ at the centre [m], shape (m,).
-        normal: ∇φ [-] times the sides of the cell [m], shape (m, d).
-        size: the sides [m], shape (d,).
-    """
+    """`_moments` of cells in which the surface is a plane, along lines in the direction nearest to its normal, by φ at
+    the centres [m], shape (m,), and ∇φ [-] times the sides of the cell [m], shape (m, d)."""
     d = len(size)
     rows, along = np.arange(len(distance)), np.abs(normal).argmax(axis=1)
     places = (np.arange(_LINES) + 0.5) / _LINES - 0.5
@@ -275,14 +270,8 @@ def _sorted(corners: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _crossings(corners: np.ndarray, values: np.ndarray, edges: list[tuple[int, int]]) -> np.ndarray:
-    """Points at which edges cross the surface [m], shape (m, number of edges, d). An edge from a corner to itself gives
-    the corner.
-
-    Args:
-        corners: corners of simplices or pieces [m], shape (m, k, d).
-        values: the values at the corners [m], shape (m, k).
-        edges: numbers of the two corners of each edge, one inside and one outside.
-    """
+    """Points at which edges cross the surface [m], shape (m, number of edges, d). An edge has the numbers of a corner
+    inside and one outside; from a corner to itself it gives the corner."""
 
     def crossing(i: int, j: int) -> np.ndarray:
         a, b = values[:, i, None], values[:, j, None]
@@ -297,8 +286,8 @@ def _pieces(d: int, inner: range, outer: range) -> list[list[tuple[int, int]]]:
     edges = list(itertools.product(inner, outer))
     if len(edges) == d:
         return [edges]
-    (a, c), (b, e) = (inner[0], outer[0]), (inner[1], outer[1])  # two corners inside and two outside, in 3-D
-    return [[(a, c), (a, e), (b, e)], [(a, c), (b, e), (b, c)]]
+    first, second, third, fourth = edges  # two corners inside and two outside, in 3-D
+    return [[first, second, fourth], [first, fourth, third]]
 
 
 def _area(corners: np.ndarray) -> np.ndarray:

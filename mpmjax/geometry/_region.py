@@ -105,12 +105,8 @@ class Box(AbstractRegion):
             coordinates("A box's lower corner", self.lower) == coordinates("A box's upper corner", self.upper),
             f"A box needs two corners with as many coordinates, got {self.lower} and {self.upper}.",
         )
-        require_that(
-            "A box's lower corner must lie below its upper one in each direction",
-            lambda a, b: a < b,
-            self.lower,
-            self.upper,
-        )
+        below = "A box's lower corner must lie below its upper one in each direction"
+        require_that(below, lambda a, b: a < b, self.lower, self.upper)
 
     @property
     def dim(self) -> int:
@@ -118,7 +114,7 @@ class Box(AbstractRegion):
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         """max(q) inside, ‖max(q, 0)‖ outside, q = max(lower − x, x − upper)."""
-        below, above = jnp.asarray(self.lower, x.dtype) - x, x - jnp.asarray(self.upper, x.dtype)
+        below, above = jnp.split(self.sides(x), 2, axis=1)
         return common(jnp.where(below > above, below, above))
 
     def sides(self, x: Float[Array, "m d"]) -> Float[Array, "m k"]:

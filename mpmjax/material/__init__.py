@@ -1,7 +1,10 @@
 """Laws: elastic, plastic, fluid, viscous."""
 
-from mpmjax.material._base import AbstractIsotropic as AbstractIsotropic, AbstractMaterial as AbstractMaterial
-from mpmjax.material._elastic import FixedCorotated as FixedCorotated, NeoHookean as NeoHookean
+from mpmjax.material._elastic import (
+    AbstractIsotropic as AbstractIsotropic,
+    FixedCorotated as FixedCorotated,
+    NeoHookean as NeoHookean,
+)
 from mpmjax.material._fluid import AbstractVolumetric as AbstractVolumetric, Fluid as Fluid
 from mpmjax.material._granular import (
     CamClay as CamClay,
@@ -14,14 +17,12 @@ from mpmjax.material._granular import (
 )
 from mpmjax.material._hencky import AbstractHenckyPlasticity as AbstractHenckyPlasticity, Hencky as Hencky
 from mpmjax.material._law import (
-    AbstractDeformationMeasure as AbstractDeformationMeasure,
-    AbstractElastic as AbstractElastic,
     AbstractInelastic as AbstractInelastic,
     AbstractLaw as AbstractLaw,
-    DeformationGradient as DeformationGradient,
+    AbstractMaterial as AbstractMaterial,
+    DeformationMeasure as DeformationMeasure,
     Freedom as Freedom,
     Viscosity as Viscosity,
-    VolumeRatio as VolumeRatio,
 )
 from mpmjax.material._rigid import Rigid as Rigid
 from mpmjax.material._rubber import (
@@ -40,7 +41,6 @@ from mpmjax.material._tangent import (
 from mpmjax.material._viscous import Viscous as Viscous
 from mpmjax.material._von_mises import (
     HerschelBulkley as HerschelBulkley,
-    HerschelBulkleyHistory as HerschelBulkleyHistory,
     VonMises as VonMises,
     VonMisesHistory as VonMisesHistory,
 )

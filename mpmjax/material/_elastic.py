@@ -7,8 +7,37 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Compliance, Float, Matrix, PerParticle
-from mpmjax.material._base import AbstractIsotropic
+from mpmjax.checks import require_fields, require_moduli
+from mpmjax.material._law import AbstractMaterial
 from mpmjax.material._tangent import AbstractTangent, PrincipalTangent, isotropic_matrix
+
+
+class AbstractIsotropic(AbstractMaterial):
+    """A law given by Young's modulus and Poisson's ratio: at small strains δP = 2μ ε + λ tr(ε) I."""
+
+    youngs_modulus: PerParticle
+    """E [Pa]."""
+    poisson_ratio: PerParticle
+    """ν [-]."""
+
+    def __check_init__(self):
+        require_fields(self)
+        require_moduli(type(self).__name__, self.youngs_modulus, self.poisson_ratio)
+
+    @property
+    def shear_modulus(self) -> PerParticle:
+        """μ = E / (2 (1 + ν)) [Pa]."""
+        return self.youngs_modulus / (2 * (1 + self.poisson_ratio))
+
+    @property
+    def lame_lambda(self) -> PerParticle:
+        """λ = E ν / ((1 + ν)(1 − 2ν)) [Pa]."""
+        return self.youngs_modulus * self.poisson_ratio / ((1 + self.poisson_ratio) * (1 - 2 * self.poisson_ratio))
+
+    @property
+    def bulk_modulus(self) -> PerParticle:
+        """K = E / (3 (1 − 2ν)) [Pa], that of three dimensions."""
+        return self.youngs_modulus / (3 * (1 - 2 * self.poisson_ratio))
 
 
 class FixedCorotated(AbstractIsotropic):

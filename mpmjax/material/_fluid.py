@@ -8,11 +8,11 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, PerParticle, Scalar
 from mpmjax.checks import require_fields, require_positive
-from mpmjax.material._law import AbstractDeformationMeasure, AbstractElastic, AbstractInelastic, VolumeRatio
+from mpmjax.material._law import VOLUME_RATIO, AbstractInelastic, AbstractMaterial, DeformationMeasure
 from mpmjax.material._tangent import VolumetricTangent
 
 
-class AbstractVolumetric(AbstractElastic):
+class AbstractVolumetric(AbstractMaterial):
     """An elastic law given by its energy density Ψ(J), J = det F, and nothing else of the deformation.
 
     Its particles store J and no F, so that it works in the updated description alone. Their volumes cannot be averaged:
@@ -20,7 +20,7 @@ class AbstractVolumetric(AbstractElastic):
     J [-] of shape (p,): its derivatives default to automatic differentiation.
     """
 
-    measure: ClassVar[AbstractDeformationMeasure] = VolumeRatio()
+    measure: ClassVar[DeformationMeasure] = VOLUME_RATIO
     allows_total: ClassVar[bool] = False
     allows_averaged_volume: ClassVar[bool] = False
 
@@ -105,7 +105,7 @@ class Fluid(AbstractInelastic):
         tension: whether the pressure may be below zero. Closed vessels and acoustics want it, free surfaces do not.
     """
 
-    measure: ClassVar[AbstractDeformationMeasure] = VolumeRatio()
+    measure: ClassVar[DeformationMeasure] = VOLUME_RATIO
     relaxes_stress: ClassVar[bool] = False  # it takes out expansion, which has no stress
     bulk_modulus: PerParticle
     exponent: PerParticle = 7.0

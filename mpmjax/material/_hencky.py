@@ -10,7 +10,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
 from mpmjax.checks import require_moduli
 from mpmjax.linalg import Logarithm, PowerLessOne
-from mpmjax.material._base import AbstractIsotropic
+from mpmjax.material._elastic import AbstractIsotropic
 from mpmjax.material._law import AbstractInelastic
 from mpmjax.material._tangent import IsotropicTangent, PrincipalTangent
 

@@ -11,111 +11,63 @@ import numpy as np
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix, PerParticle, Scalar, components
 from mpmjax.checks import require
-from mpmjax.material._tangent import AbstractTangent
+from mpmjax.material._tangent import (
+    AbstractTangent,
+    MatrixTangent,
+    PrincipalTangent,
+    is_isotropic,
+    projected_tangent,
+)
 
 
-class AbstractDeformationMeasure(eqx.Module):
-    """The measure of deformation that a law's particles store, component first in a step, and how the grid's motion
-    changes it."""
+class DeformationMeasure(NamedTuple):
+    """The measure of deformation that a law's particles store, and how the motion of the grid changes it: the
+    deformation gradient F or its elastic part [-], shape (d, d, p), or J = det F [-] alone, shape (p,)."""
 
-    axes: ClassVar[int]
-    """How many axes one particle's deformation has."""
-    symbol: ClassVar[str]
+    axes: int
+    """How many axes one particle's deformation has: 2 of F, none of J."""
+    symbol: str
     """In messages, what is stored; `name` says what it is."""
-    name: ClassVar[str]
-    volume: ClassVar[str]
+    name: str
+    volume: str
     """In messages, what most laws need to be positive."""
-    rate: ClassVar[str]
+    rate: str
     """In messages, the rate [1/s] whose product with a step must be below 1."""
 
-    @abc.abstractmethod
     def undeformed(self, dim: int) -> np.ndarray:
         """The deformation of one particle at rest [-], of one particle's shape."""
+        return np.eye(dim) if self.axes else np.ones(())
 
-    @abc.abstractmethod
     def of(self, F: Matrix) -> Deformation:
         """The stored deformation at deformation gradients [-], shape (d, d, p)."""
+        return F if self.axes else la.determinant(F)
 
-    @abc.abstractmethod
     def change(self, gradient: Matrix, deformation: Deformation) -> Deformation:
-        """The change [-] by the gradient ∇u of a displacement, shape (d, d, p), to first order."""
+        """∇u F or tr(∇u) J [-], the change by the gradient ∇u of a displacement, shape (d, d, p), to first order."""
+        return la.matmul(gradient, deformation) if self.axes else la.trace(gradient) * deformation
 
-    @abc.abstractmethod
     def kirchhoff_stress(self, stress: Deformation, deformation: Deformation, dim: int) -> Matrix:
-        """τ = J σ [Pa], shape (d, d, p), by the energy's derivative with respect to the deformation: the transpose of
-        `change`. The nodal force is f_i = −Σ_p V0_p τ_p g_ip."""
+        """τ = P Fᵀ or dΨ/dJ J I [Pa], shape (d, d, p), by the energy's derivative with respect to the deformation: the
+        transpose of `change`. The nodal force is f_i = −Σ_p V0_p τ_p g_ip."""
+        if self.axes:
+            return la.matmul(stress, la.transpose(deformation))
+        return stress * deformation * jnp.eye(dim, dtype=deformation.dtype)[..., None]
 
-    @abc.abstractmethod
     def determinant(self, deformation: Deformation) -> Array:
         """J = det F [-], shape (p,)."""
+        return la.determinant(deformation) if self.axes else deformation
 
-    @abc.abstractmethod
     def collapsed(self, deformation: Deformation, least: float) -> Bool[Array, "p"]:
-        """Whether the smallest principal stretch is below the least one that is allowed [-], shape (p,)."""
-
-
-class DeformationGradient(AbstractDeformationMeasure):
-    """The deformation gradient F [-], shape (d, d, p), or its elastic part."""
-
-    axes: ClassVar[int] = 2
-    symbol: ClassVar[str] = "F"
-    name: ClassVar[str] = "deformation gradient"
-    volume: ClassVar[str] = "det F"
-    rate: ClassVar[str] = "|∇v|"
-
-    def undeformed(self, dim: int) -> np.ndarray:
-        return np.eye(dim)
-
-    def of(self, F: Matrix) -> Matrix:
-        return F
-
-    def change(self, gradient: Matrix, deformation: Matrix) -> Matrix:
-        """∇u F."""
-        return la.matmul(gradient, deformation)
-
-    def kirchhoff_stress(self, stress: Matrix, deformation: Matrix, dim: int) -> Matrix:
-        """P Fᵀ."""
-        del dim
-        return la.matmul(stress, la.transpose(deformation))
-
-    def determinant(self, deformation: Matrix) -> Array:
-        return la.determinant(deformation)
-
-    def collapsed(self, deformation: Matrix, least: float) -> Bool[Array, "p"]:
+        """Whether the smallest principal stretch, or J, is below the least one that is allowed [-], shape (p,)."""
+        if not self.axes:
+            return jnp.abs(deformation) <= least
         # 1/‖F⁻¹‖ lies between the smallest stretch and 1/√d of it, and needs no eigenvalues
         cofactor = la.cofactor(deformation)
         return la.determinant(deformation) ** 2 <= least**2 * la.double_dot(cofactor, cofactor)
 
 
-class VolumeRatio(AbstractDeformationMeasure):
-    """J = det F [-] alone, shape (p,)."""
-
-    axes: ClassVar[int] = 0
-    symbol: ClassVar[str] = "J"
-    name: ClassVar[str] = "volume"
-    volume: ClassVar[str] = "J"
-    rate: ClassVar[str] = "|div v|"
-
-    def undeformed(self, dim: int) -> np.ndarray:
-        del dim
-        return np.ones(())
-
-    def of(self, F: Matrix) -> Array:
-        return la.determinant(F)
-
-    def change(self, gradient: Matrix, deformation: Array) -> Array:
-        """tr(∇u) J."""
-        return la.trace(gradient) * deformation
-
-    def kirchhoff_stress(self, stress: Array, deformation: Array, dim: int) -> Matrix:
-        """dΨ/dJ J I."""
-        return stress * deformation * jnp.eye(dim, dtype=deformation.dtype)[..., None]
-
-    def determinant(self, deformation: Array) -> Array:
-        return deformation
-
-    def collapsed(self, deformation: Array, least: float) -> Bool[Array, "p"]:
-        return jnp.abs(deformation) <= least
+DEFORMATION_GRADIENT = DeformationMeasure(2, "F", "deformation gradient", "det F", "|∇v|")
+VOLUME_RATIO = DeformationMeasure(0, "J", "volume", "J", "|div v|")
 
 
 class Freedom(NamedTuple):
@@ -156,7 +108,7 @@ class AbstractLaw(eqx.Module):
     """The interface of any law. Laws derive from `AbstractMaterial` (elastic) or `AbstractInelastic` (with a
     history), which answer most of it."""
 
-    measure: ClassVar[AbstractDeformationMeasure] = DeformationGradient()
+    measure: ClassVar[DeformationMeasure] = DEFORMATION_GRADIENT
     """The deformation that its particles store."""
     allows_total: ClassVar[bool] = True
     """Whether it may stand in the total description, in which the deformation is that from the start."""
@@ -176,7 +128,7 @@ class AbstractLaw(eqx.Module):
         """The history of particles that have never yielded at a deformation, leaves of shape (p,); None without."""
 
     @abc.abstractmethod
-    def elastic(self, history: Any) -> "AbstractElastic":
+    def elastic(self, history: Any) -> "AbstractMaterial":
         """The elastic law at a history."""
 
     @abc.abstractmethod
@@ -232,10 +184,32 @@ class AbstractLaw(eqx.Module):
         return what, f"Reduce dt: a step must keep Δt {self.measure.rate} below 1{or_else}."
 
 
-class AbstractElastic(AbstractLaw):
-    """A law without a history, given by its energy density: of F in `AbstractMaterial`, of J in `AbstractVolumetric`.
+class AbstractMaterial(AbstractLaw):
+    """A hyperelastic law, given by its energy density Ψ(F).
 
-    Deformations are component first: F [-] of shape (d, d, p), J [-] of shape (p,).
+    A law needs `energy` alone, and then works with every method, Hessian and description, and under every derivative:
+    the stress is the energy's gradient, the stress differential the stress's derivative. A law that has closed forms
+    overrides these methods; `mpmjax.verification.check_law` compares them with the defaults.
+
+        class Quadratic(mpm.AbstractMaterial):
+            stiffness: float
+
+            def energy(self, F):
+                C = mpm.linalg.matmul(mpm.linalg.transpose(F), F)
+                E = (C - mpm.linalg.identity_like(F)) / 2
+                return self.stiffness * mpm.linalg.double_dot(E, E)
+
+    Matrices are component first, (d, d, p), and so an energy is written with the functions of `mpmjax.linalg`
+    (`determinant`, `double_dot`, `matmul`, ...): those of `jax.numpy.linalg` take the last two axes, which are not the
+    matrix. Two dimensions are plane strain, one is uniaxial strain.
+
+    Parameters are fields, each one number or one for each particle, shape (p,), or a tuple of such. Each is a leaf that
+    can be differentiated and batched.
+
+    *When it breaks*: implicit steps take second derivatives of Ψ, and gradients through them third ones, which must be
+    finite wherever the body goes, F = I first of all. Polynomials of F, invariants and functions of them have these
+    derivatives. What is written in eigenvalues or singular values has not, where stretches coincide; the functions of
+    `mpmjax.linalg` (`rotation`, `Logarithm`) have. Roots such as ‖F − R‖ have a kink at rest.
     """
 
     @abc.abstractmethod
@@ -247,18 +221,77 @@ class AbstractElastic(AbstractLaw):
         dΨ/dJ, minus the pressure. Default: the energy's gradient."""
         return jax.grad(lambda F: _density(self, F).sum())(F)
 
-    @abc.abstractmethod
-    def tangent(self, F: Deformation, /) -> AbstractTangent:
-        """The stress differential at a deformation."""
+    def tangent(self, F: Matrix, /) -> AbstractTangent:
+        """The stress differential ∂²Ψ/∂F∂F at F, a symmetric map. Default: its matrix, by the derivative of the stress
+        in each of the d² directions."""
+        return MatrixTangent(la.matrix_of(lambda dF: jax.jvp(self.stress, (F,), (dF,))[1], F))
 
-    @abc.abstractmethod
-    def projected_tangent(self, F: Deformation, /) -> AbstractTangent:
-        """The stress differential with its negative eigenvalues set to zero."""
+    def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
+        """The eigenstructure of the stress differential at signed principal stretches, which `stable_dt` and
+        `AnalyticHessian(projected=True)` need.
 
-    @abc.abstractmethod
-    def tangent_eigenvalues(self, F: Deformation, /, dim: int, *, total: bool) -> Float[Array, "m p"]:
+        Default: of the stress differential A at F = diag(s), twist A_ijij − A_ijji, flip A_ijij + A_ijji, scaling
+        A_iijj. No quotient is formed, so it is as finite as A is, at repeated stretches too.
+
+        *When it breaks*: an anisotropic law has no such eigenstructure. Where a rotation of the material changes the
+        energy, by a ten-thousandth of itself or more at one deformation that keeps the volume, the default is NaN, and
+        `stable_dt` and the projected Hessian refuse the law. Give such a law its step as a number, and
+        `AnalyticHessian()` or `JvpHessian()`.
+
+        Args:
+            s: signed principal stretches [-], shape (d, *p).
+        """
+        F = la.diagonal(s)
+        A, d = la.matrix_of(self.tangent(F), F), len(s)
+        A = jnp.where(is_isotropic(self, F), A, jnp.nan)
+
+        def entry(i: int, j: int, k: int, l: int) -> Array:  # noqa: E741
+            return A[i * d + j, k * d + l]
+
+        return PrincipalTangent.of(
+            s,
+            twist=lambda i, j: (entry(i, j, i, j) + entry(j, i, j, i)) / 2 - entry(i, j, j, i),
+            flip=lambda i, j: (entry(i, j, i, j) + entry(j, i, j, i)) / 2 + entry(i, j, j, i),
+            scaling=lambda i, j: entry(i, i, j, j),
+        )
+
+    def projected_tangent(self, F: Matrix, /) -> AbstractTangent:
+        """The stress differential with its negative eigenvalues set to zero (see `projected_tangent`).
+
+        *When it breaks*: the law must be isotropic; where it has no `principal_tangent` of its own and is not, a
+        `RuntimeError` says so.
+        """
+        if type(self).principal_tangent is AbstractMaterial.principal_tangent:
+            name = type(self).__name__
+            F = eqx.error_if(
+                F,
+                ~is_isotropic(self, F),
+                f"{name} is not isotropic, and the projected Hessian needs a law that is: take AnalyticHessian() "
+                f"without projection or JvpHessian(), or write {name}'s energy in invariants of FᵀF.",
+            )
+        return projected_tangent(self, F)
+
+    def tangent_eigenvalues(self, F: Matrix, /, dim: int, *, total: bool) -> Float[Array, "m p"]:
         """Eigenvalues [Pa] of the tangent L ↦ (∂²Ψ/∂F∂F : (L F)) Fᵀ + τ Lᵀ, L = ∇v, τ = P Fᵀ, made symmetric; in the
         total description of ∂²Ψ/∂F∂F. The largest, which `stable_dt` needs, is among them."""
+        del dim
+        # in the principal frame the map is d x d on the diagonal and 2 x 2 on (L_ij, L_ji) for each pair
+        _, s, _ = la.principal_frame(F)
+        tangent = self.principal_tangent(s)
+        d = s.shape[0]
+        if total:
+            pull, tau = jnp.ones_like(s), jnp.zeros_like(s)
+        else:
+            P = self.stress(la.diagonal(s))
+            pull, tau = s, s * jnp.stack([P[i, i] for i in range(d)])
+        scaling = tangent.scaling * pull[:, None] * pull + la.diagonal(tau)
+        values = [*la.symmetric_eigen(scaling)[0]]
+        for (i, j), twist, flip in zip(la.pairs(d), tangent.twist, tangent.flip, strict=True):
+            near, far = (flip + twist) / 2 * pull[j] ** 2, (flip + twist) / 2 * pull[i] ** 2
+            across = (flip - twist) / 2 * pull[i] * pull[j] + (tau[i] + tau[j]) / 2
+            centre, radius = (near + far) / 2, jnp.hypot((near - far) / 2, across)
+            values += [centre - radius, centre + radius]
+        return jnp.stack(values)
 
     def wave_modulus(self, F: Deformation) -> Float[Array, "*p"]:
         """The modulus M of pressure waves where nothing is deformed [Pa], λ + 2μ of an isotropic solid: the stress
@@ -284,7 +317,7 @@ class AbstractElastic(AbstractLaw):
         del stored
         return history is None
 
-    def elastic(self, history: None) -> "AbstractElastic":
+    def elastic(self, history: None) -> "AbstractMaterial":
         """The law itself."""
         del history
         return self
@@ -294,8 +327,15 @@ class AbstractElastic(AbstractLaw):
         del dt
         return F, history
 
+    def inadmissible(self, or_else: str) -> tuple[str, str]:
+        what, remedy = super().inadmissible(or_else)
+        return (
+            what,
+            f"Reduce dt{or_else}, or use FixedCorotated, which allows inversion." if self.measure.axes else remedy,
+        )
 
-def _density(law: AbstractElastic, F: Deformation) -> Array:
+
+def _density(law: AbstractMaterial, F: Deformation) -> Array:
     """A law's energy, which must have the shape of one number a particle."""
     energy, batch = law.energy(F), F.shape[law.measure.axes :]
     require(

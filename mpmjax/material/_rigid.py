@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix, Scalar
 from mpmjax.checks import as_plain, require, require_fields, require_positive
-from mpmjax.material._base import AbstractMaterial
-from mpmjax.material._law import Freedom
+from mpmjax.material._law import AbstractMaterial, Freedom
 from mpmjax.material._tangent import MatrixTangent, PrincipalTangent
 
 

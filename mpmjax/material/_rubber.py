@@ -10,7 +10,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
 from mpmjax.checks import as_plain, require, require_fields, require_finite, require_positive, require_that
 from mpmjax.linalg import PowerLessOne
-from mpmjax.material._base import AbstractMaterial
+from mpmjax.material._law import AbstractMaterial
 from mpmjax.material._tangent import IsotropicTangent, PrincipalTangent
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 from mpmjax._types import Array, Deformation, Float, PerParticle, Scalar
 from mpmjax.checks import require, require_between, require_fields
-from mpmjax.material._law import AbstractDeformationMeasure, AbstractElastic, AbstractLaw, Viscosity
+from mpmjax.material._law import AbstractLaw, AbstractMaterial, DeformationMeasure, Viscosity
 
 
 class Viscous(AbstractLaw):
@@ -48,7 +48,7 @@ class Viscous(AbstractLaw):
     # all else is the law's
 
     @property
-    def measure(self) -> AbstractDeformationMeasure:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def measure(self) -> DeformationMeasure:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.law.measure
 
     @property
@@ -75,7 +75,7 @@ class Viscous(AbstractLaw):
     def remembers(self, history: Any, stored: Array) -> bool:
         return self.law.remembers(history, stored)
 
-    def elastic(self, history: Any) -> AbstractElastic:
+    def elastic(self, history: Any) -> AbstractMaterial:
         return self.law.elastic(history)
 
     def return_map(self, F: Deformation, history: Any, dt: Scalar) -> tuple[Deformation, Any]:

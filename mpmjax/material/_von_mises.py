@@ -13,10 +13,10 @@ from mpmjax.material._hencky import AbstractHenckyPlasticity
 
 
 class VonMisesHistory(eqx.Module):
-    """The history of a particle of von Mises' law."""
+    """The history of a particle of von Mises' law, and of Herschel and Bulkley's, which does not depend on α."""
 
     plastic_strain: Float[Array, "*p"]
-    """α [-], the accumulated equivalent plastic strain ∫ √(2/3) ‖d_p‖ dt, shape (p,)."""
+    """α [-], the accumulated equivalent plastic strain ∫ √(2/3) ‖d_p‖ dt, shape (p,); of pastes ∫ γ̇/√3 dt."""
     transverse_strain: Float[Array, "*p"] | None
     """ε_t [-] (see `Hencky`), shape (p,); None in 3-D."""
 
@@ -73,16 +73,6 @@ class VonMises(AbstractHenckyPlasticity):
         return ratio, mean, history.plastic_strain + (2 / 3) ** 0.5 * flow
 
 
-class HerschelBulkleyHistory(eqx.Module):
-    """The history of a particle of Herschel and Bulkley's law."""
-
-    plastic_strain: Float[Array, "*p"]
-    """α [-], the accumulated equivalent plastic strain ∫ γ̇/√3 dt, as `VonMises` has it, shape (p,). The law does not
-    depend on it."""
-    transverse_strain: Float[Array, "*p"] | None
-    """ε_t [-] (see `Hencky`), shape (p,); None in 3-D."""
-
-
 class HerschelBulkley(AbstractHenckyPlasticity):
     """An elastic body that flows, beyond a yield stress, at a rate that grows with the stress: paste, mud, foam, dough
     (W. H. Herschel, R. Bulkley, Kolloid-Z. 39 (1926) 291; in the Material Point Method Y. Yue, B. Smith, C. Batty,
@@ -120,7 +110,7 @@ class HerschelBulkley(AbstractHenckyPlasticity):
         exponent: n [-], positive; less than 1 where what flows faster flows more easily.
     """
 
-    History: ClassVar[Any] = HerschelBulkleyHistory
+    History: ClassVar[Any] = VonMisesHistory
     youngs_modulus: PerParticle
     poisson_ratio: PerParticle
     yield_stress: PerParticle
@@ -133,9 +123,7 @@ class HerschelBulkley(AbstractHenckyPlasticity):
         require_between("HerschelBulkley's consistency [Pa s^n]", self.consistency, 0, np.inf)
         require_positive("HerschelBulkley's exponent", self.exponent)
 
-    def flow(
-        self, history: HerschelBulkleyHistory, mean: Array, deviation: Array, dt: Scalar
-    ) -> tuple[Array, Array, Array]:
+    def flow(self, history: VonMisesHistory, mean: Array, deviation: Array, dt: Scalar) -> tuple[Array, Array, Array]:
         """Return of the deviator to the overstress of its flow over the step."""
         stiffness = self.elastic(history).shear_modulus
         trial = 2**0.5 * stiffness * deviation

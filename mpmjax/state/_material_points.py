@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix
-from mpmjax.material import AbstractElastic, AbstractTangent, Viscosity
+from mpmjax.material import AbstractMaterial, AbstractTangent, Viscosity
 from mpmjax.native import stored
 from mpmjax.potential import AbstractStiffness
 from mpmjax.state._averaged_volume import AveragedTangent, VolumeAverage, averaged_deformation
@@ -16,7 +16,7 @@ from mpmjax.state._averaged_volume import AveragedTangent, VolumeAverage, averag
 class MaterialPoints(eqx.Module):
     """The particles of one material, which pay for their own law only."""
 
-    law: AbstractElastic
+    law: AbstractMaterial
     """The elastic law in force, frozen in the step."""
     volume: Float[Array, "q"]
     """V0 [m^d], shape (q,)."""
@@ -49,7 +49,7 @@ class MaterialPoints(eqx.Module):
     def tangent(
         self,
         F: Deformation,
-        of_law: Callable[[AbstractElastic, Deformation], Callable[[Deformation], Deformation]],
+        of_law: Callable[[AbstractMaterial, Deformation], Callable[[Deformation], Deformation]],
         *,
         definite: bool = False,
     ) -> Callable[[Deformation], Deformation]:
@@ -138,6 +138,6 @@ class MaterialPoints(eqx.Module):
 
 
 @eqx.filter_jit  # a law may hold functions
-def _stress(law: AbstractElastic, F: Deformation) -> Deformation:
+def _stress(law: AbstractMaterial, F: Deformation) -> Deformation:
     """The stress of a law, compiled as one function so that it is traced once."""
     return law.stress(F)
