@@ -42,8 +42,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mpmjax as mpm
-from mpmjax.analysis._bench import FRAMES, Bench, Displacements, name_of
-from mpmjax.analysis._reference_run import settle
+from mpmjax.analysis._bench import FRAMES, Bench, Displacements, name_of, settle
 from mpmjax.verification import AbstractProblem, StandingWave, discretise
 
 sys.path.append(str(Path(__file__).parent))

@@ -48,7 +48,7 @@ Matrix = Float[Array, "d d *p"]
 """A d x d matrix per particle (or a single one), component first."""
 
 Deformation = Float[Array, "..."]
-"""The deformation that particles store (see `material/_kinematics.py`), component first: F, shape (d, d, *p), or
+"""The deformation that particles store (see `material/_law.py`), component first: F, shape (d, d, *p), or
 J, shape (*p)."""
 
 Compliance = Float[Array, "s s *p"]

@@ -11,7 +11,7 @@ from helpers import assert_close
 import mpmjax as mpm
 from mpmjax import linalg as la
 from mpmjax.checks._values import canonical
-from mpmjax.material._herschel_bulkley import _share_of_flow
+from mpmjax.material._von_mises import _share_of_flow
 
 E, NU = 1e4, 0.3
 MU = E / (2 * (1 + NU))

@@ -282,7 +282,7 @@ def test_the_shell_imports_what_a_scene_file_names(tmp_path, monkeypatch):
 
 def test_registering_is_refused_where_files_could_not_hold_it():
     """A name that is taken, what is no module, arguments that are no fields or of no kind that files know."""
-    with pytest.raises(ValueError, match=r"the name 'Snow' is taken by mpmjax\.material\._snow\.Snow"):
+    with pytest.raises(ValueError, match=r"the name 'Snow' is taken by mpmjax\.material\._granular\.Snow"):
         mpm.register(type("Snow", (Gel,), {}))
     with pytest.raises(ValueError, match=r"takes a class, an equinox\.Module"):
         mpm.register(dict)

@@ -11,10 +11,9 @@ from helpers import assert_close
 
 import mpmjax as mpm
 from mpmjax.analysis import Trial, WorkPrecision
-from mpmjax.analysis._bench import FRAMES, Bench, Timed
-from mpmjax.analysis._reference_run import settle
+from mpmjax.analysis._bench import FRAMES, Bench, Timed, settle
 from mpmjax.verification import StandingWave, discretise
-from mpmjax.viz._chart import draw_chart, write_trials
+from mpmjax.viz._render import draw_chart, write_trials
 
 WAVE = StandingWave(0.05)
 

@@ -11,8 +11,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from mpmjax.analysis._bench import FRAMES, Bench, Build, Clock, Trial, name_of
-from mpmjax.analysis._reference_run import HOPELESS, settle
+from mpmjax.analysis._bench import FRAMES, HOPELESS, Bench, Build, Clock, Trial, name_of, settle
 from mpmjax.checks import checked, require_positive
 from mpmjax.simulation import LARGEST_LINEARISATION_ERROR
 from mpmjax.stepping import TRBDF2, AbstractIntegrator, BackwardEuler, Explicit, ImplicitMidpoint, SemiImplicit
@@ -54,9 +53,8 @@ class WorkPrecision(NamedTuple):
 
     def _next(self, trial: Trial) -> Trial:
         """The trial with the next smaller step, or the trial itself."""
-        tried = [
-            t for t in self.trials if (t.refinement, name_of(t.method)) == (trial.refinement, name_of(trial.method))
-        ]
+        same = (trial.refinement, name_of(trial.method))
+        tried = [t for t in self.trials if (t.refinement, name_of(t.method)) == same]
         finer = [t for t in tried if t.dt < trial.dt and not math.isnan(t.error)]
         return max(finer, key=lambda t: t.dt, default=trial)
 
@@ -142,15 +140,8 @@ def work_precision(
     trials: list[Trial] = []
     skipped: list[str] = []
 
-    def note(
-        bench: Bench,
-        method: AbstractIntegrator,
-        steps: int,
-        seconds: float,
-        miss: float,
-        linearisation_error: float = 0.0,
-    ) -> Trial:
-        trials.append(Trial(method, bench.refinement, bench.t1 / steps, steps, seconds, miss, linearisation_error))
+    def note(bench: Bench, method: AbstractIntegrator, steps: int, *outcome: float) -> Trial:
+        trials.append(Trial(method, bench.refinement, bench.t1 / steps, steps, *outcome))
         progress(trials[-1])
         return trials[-1]
 

@@ -1,7 +1,6 @@
 """Regions, distances sampled on a lattice, surfaces, prescribed motions and time series."""
 
-from mpmjax.geometry._cells import box_cells as box_cells
-from mpmjax.geometry._hollow import Annulus as Annulus, Tube as Tube
+from mpmjax.geometry._cut_cells import Pieces as Pieces, inside_parts as inside_parts, surface_pieces as surface_pieces
 from mpmjax.geometry._motion import (
     AbstractMotion as AbstractMotion,
     Changing as Changing,
@@ -15,15 +14,12 @@ from mpmjax.geometry._motion import (
     value_at as value_at,
     vector_size as vector_size,
 )
-from mpmjax.geometry._parts import inside_parts as inside_parts
 from mpmjax.geometry._region import (
     AbstractRegion as AbstractRegion,
-    Ball as Ball,
     Box as Box,
-    Capsule as Capsule,
-    Cylinder as Cylinder,
     HalfSpace as HalfSpace,
     Union as Union,
+    box_cells as box_cells,
     length as length,
 )
 from mpmjax.geometry._rigid_body import (
@@ -35,9 +31,15 @@ from mpmjax.geometry._rigid_body import (
     rotation_of_chords as rotation_of_chords,
     spinning as spinning,
 )
+from mpmjax.geometry._round import (
+    Annulus as Annulus,
+    Ball as Ball,
+    Capsule as Capsule,
+    Cylinder as Cylinder,
+    Tube as Tube,
+)
 from mpmjax.geometry._sampled import (
     SampledDistance as SampledDistance,
     sample_distance as sample_distance,
     sample_mesh as sample_mesh,
 )
-from mpmjax.geometry._surface import Pieces as Pieces, surface_pieces as surface_pieces

@@ -18,13 +18,16 @@ Displacements = Float[Array, "j d"] | Float[np.ndarray, "j d"] | tuple | list
 
 
 class AbstractMotion(eqx.Module):
-    """The motion of a rigid body, from positions X before the motion to positions x at time t."""
+    """The motion of a rigid body, from positions X before the motion to positions x at time t: at least a displacement,
+    piecewise linear in time, at rest before its first time and after its last."""
 
     turns: ClassVar[bool] = True
     """Whether it may turn the body."""
+    times: eqx.AbstractVar[Times]
+    displacement: eqx.AbstractVar[Displacements]
 
     def rests(self) -> bool:
-        """Whether nothing ever moves, as far as is known. Default: False. It is asked only while numbers are known."""
+        """Whether nothing ever moves. Default: False. It is asked only while numbers are known."""
         return False
 
     def swept(self, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -33,9 +36,17 @@ class AbstractMotion(eqx.Module):
         return np.full(lower.shape, -np.inf), np.full(upper.shape, np.inf)
 
     @property
-    @abc.abstractmethod
     def dim(self) -> int:
         """Space dimension d."""
+        return jnp.shape(jnp.asarray(self.displacement))[1]
+
+    def at(self, t: Scalar) -> Float[Array, "d"]:
+        """Displacement at time t [m], shape (d,); of a body that turns, that of its centre."""
+        return _interpolated(t, jnp.asarray(self.times), jnp.asarray(self.displacement))
+
+    def shift(self, t: Scalar, dt: Scalar) -> Float[Array, "d"]:
+        """The change of the displacement from t to t + dt [m], shape (d,)."""
+        return _change(t, dt, jnp.asarray(self.times), jnp.asarray(self.displacement))
 
     @abc.abstractmethod
     def origin(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
@@ -81,17 +92,9 @@ class Motion(AbstractMotion):
         moved = np.asarray(self.displacement, float)
         return lower + moved.min(axis=0), upper + moved.max(axis=0)
 
-    @property
-    def dim(self) -> int:
-        return jnp.shape(jnp.asarray(self.displacement))[1]
-
-    def at(self, t: Scalar) -> Float[Array, "d"]:
-        """Displacement at time t [m], shape (d,)."""
-        return _interpolated(t, jnp.asarray(self.times), jnp.asarray(self.displacement))
-
     def velocity(self, t: Scalar, dt: Scalar) -> Float[Array, "d"]:
         """Mean velocity from t to t + dt [m/s], shape (d,). A node with it follows the displacement exactly."""
-        return _change(t, dt, jnp.asarray(self.times), jnp.asarray(self.displacement)) / dt
+        return self.shift(t, dt) / dt
 
     def origin(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m d"]:
         """x − d(t)."""
@@ -148,14 +151,6 @@ class RigidMotion(AbstractMotion):
     def rests(self) -> bool:
         return _constant(self.displacement) and _constant(self.rotation)
 
-    @property
-    def dim(self) -> int:
-        return jnp.shape(jnp.asarray(self.displacement))[1]
-
-    def at(self, t: Scalar) -> Float[Array, "d"]:
-        """Displacement of the centre at time t [m], shape (d,)."""
-        return _interpolated(t, jnp.asarray(self.times), jnp.asarray(self.displacement))
-
     def rotation_at(self, t: Scalar) -> Float[Array, "r"]:
         """Angle or rotation vector at time t [rad], shape (1,) or (3,)."""
         return _interpolated(t, jnp.asarray(self.times), self._rotations())
@@ -180,11 +175,9 @@ class RigidMotion(AbstractMotion):
 
     def velocity_of(self, X: Float[Array, "m d"], t: Scalar, dt: Scalar) -> Float[Array, "m d"]:
         """The mean velocity of the centre plus the change of R over the step times (X − c)/dt."""
-        times, arm = jnp.asarray(self.times), X - jnp.asarray(self.centre, X.dtype)
-        shift = _change(t, dt, times, jnp.asarray(self.displacement))
-        by = _change(t, dt, times, self._rotations())
+        arm, by = X - jnp.asarray(self.centre, X.dtype), _change(t, dt, jnp.asarray(self.times), self._rotations())
         columns = _turn_further(jnp.eye(self.dim, dtype=X.dtype), self.rotation_at(t), by)
-        return (shift + sum(arm[:, a, None] * columns[a] for a in range(self.dim))) / dt
+        return (self.shift(t, dt) + sum(arm[:, a, None] * columns[a] for a in range(self.dim))) / dt
 
     def pivot(self, middle: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
         return jnp.asarray(self.centre, middle.dtype) + self.at(t)
@@ -210,8 +203,10 @@ def _check_rows(name: str, times: Times, displacement: Displacements) -> None:
     require_that(f"{name}'s times must increase", lambda t: t[1:] > t[:-1], times)
 
 
-def _interpolated(t: Scalar, times: Float[Array, "j"], values: Float[Array, "j c"]) -> Float[Array, "c"]:
-    """The piecewise linear interpolation of each column of `values` at time t."""
+def _interpolated(t: Scalar, times: Float[Array, "j"], values: Float[Array, "j *c"]) -> Float[Array, "*c"]:
+    """The piecewise linear interpolation of values, or of each column of them, at time t."""
+    if values.ndim == 1:
+        return jnp.interp(t, times, values)
     return jnp.stack([jnp.interp(t, times, values[:, a]) for a in range(values.shape[1])])
 
 
@@ -279,10 +274,7 @@ class TimeSeries(eqx.Module):
 
     def at(self, t: Scalar) -> Float[Array, "..."]:
         """The value at time t, a number or of shape (d,)."""
-        times, values = jnp.asarray(self.times), jnp.asarray(self.values)
-        if values.ndim == 1:
-            return jnp.interp(t, times, values)
-        return jnp.stack([jnp.interp(t, times, values[:, a]) for a in range(values.shape[1])])
+        return _interpolated(t, jnp.asarray(self.times), jnp.asarray(self.values))
 
 
 Changing = Scalar | TimeSeries

@@ -13,8 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Bool, Corner, Float, Point, Scalar
-from mpmjax.checks import checked, coordinates, require, require_fields, require_finite, require_positive, require_that
-from mpmjax.geometry._cells import Cells, box_cells, polar_cells, round_cells
+from mpmjax.checks import checked, coordinates, require, require_fields, require_finite, require_that
+
+Cells = tuple[np.ndarray, np.ndarray]
+"""Centroids [m], shape (m, d), and volumes [m^d], shape (m,), of cells fitted to a body."""
 
 
 class AbstractRegion(eqx.Module):
@@ -76,27 +78,13 @@ def common(slabs: Float[Array, "m j"]) -> Float[Array, "m"]:
     return jnp.where(nearest > 0, length(jnp.maximum(slabs, 0)), nearest)
 
 
-def about_axis(
-    x: Float[Array, "m d"], start: Point, end: Point
-) -> tuple[Float[Array, "m"], Float[Array, ""], Float[Array, "m"]]:
-    """Places of points along the axis through two points, from their middle [m], shape (m,), half the distance between
-    the two [m], and distances from the axis [m], shape (m,)."""
-    first, last = jnp.asarray(start, x.dtype), jnp.asarray(end, x.dtype)
-    height = length(last - first)
-    axis, arm = (last - first) / height, x - (first + last) / 2
-    along = (arm * axis).sum(axis=-1)
-    return along, height / 2, from_axis(arm - along[:, None] * axis)
-
-
-def check_segment(name: str, start: Point, end: Point) -> None:
-    """Check the two ends of a segment."""
-    require(
-        coordinates(f"{name}'s start", start) == coordinates(f"{name}'s end", end),
-        f"{name} needs two ends with as many coordinates, got {start} and {end}.",
-    )
-    require_finite(f"{name}'s start", start)
-    require_finite(f"{name}'s end", end)
-    require_that(f"{name}'s ends must differ", lambda a, b: (a != b).any(), start, end)
+def box_cells(lower: np.ndarray, upper: np.ndarray, size: np.ndarray) -> Cells:
+    """Equal cells of a box, near `size` [m] in each direction."""
+    number = np.maximum(np.rint((upper - lower) / size), 1).astype(int)
+    cell = (upper - lower) / number
+    axes = [low + (np.arange(n) + 0.5) * c for low, n, c in zip(lower, number, cell, strict=True)]
+    centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(lower))
+    return centres, np.full(len(centres), np.prod(cell))
 
 
 class Box(AbstractRegion):
@@ -117,12 +105,8 @@ class Box(AbstractRegion):
             coordinates("A box's lower corner", self.lower) == coordinates("A box's upper corner", self.upper),
             f"A box needs two corners with as many coordinates, got {self.lower} and {self.upper}.",
         )
-        require_that(
-            "A box's lower corner must lie below its upper one in each direction",
-            lambda a, b: a < b,
-            self.lower,
-            self.upper,
-        )
+        below = "A box's lower corner must lie below its upper one in each direction"
+        require_that(below, lambda a, b: a < b, self.lower, self.upper)
 
     @property
     def dim(self) -> int:
@@ -130,7 +114,7 @@ class Box(AbstractRegion):
 
     def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
         """max(q) inside, ‖max(q, 0)‖ outside, q = max(lower − x, x − upper)."""
-        below, above = jnp.asarray(self.lower, x.dtype) - x, x - jnp.asarray(self.upper, x.dtype)
+        below, above = jnp.split(self.sides(x), 2, axis=1)
         return common(jnp.where(below > above, below, above))
 
     def sides(self, x: Float[Array, "m d"]) -> Float[Array, "m k"]:
@@ -144,49 +128,6 @@ class Box(AbstractRegion):
         corners = jnp.stack([jnp.asarray(self.lower), jnp.asarray(self.upper)])
         finite = jnp.isfinite(corners)
         return jnp.where(finite, corners, 0).sum(axis=0) / jnp.maximum(finite.sum(axis=0), 1).astype(corners.dtype)
-
-
-class Ball(AbstractRegion):
-    """A ball (a disk in 2-D, an interval in 1-D).
-
-    Args:
-        centre: centre [m], (d,).
-        radius: radius [m].
-    """
-
-    centre: Point
-    radius: Scalar
-
-    def __check_init__(self):
-        require_fields(self)
-        coordinates("A ball's centre", self.centre)
-        require_finite("A ball's centre", self.centre)
-        require_positive("A ball's radius", self.radius)
-
-    @property
-    def dim(self) -> int:
-        return len(self.centre)
-
-    def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
-        """‖x − centre‖ − radius."""
-        return from_axis(x - jnp.asarray(self.centre, x.dtype)) - self.radius
-
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centre minus and plus the radius."""
-        centre, radius = np.asarray(self.centre, float), float(self.radius)
-        return centre - radius, centre + radius
-
-    def middle(self) -> Float[Array, "d"]:
-        return jnp.asarray(self.centre)
-
-    def fitted(self, size: np.ndarray) -> Cells | None:
-        """In 2-D sectors of concentric rings; in 3-D none."""
-        if self.dim == 1:
-            return box_cells(*self.bounds(), size)
-        if self.dim == 3:
-            return None
-        centroids, areas = polar_cells(0.0, float(self.radius), size)
-        return np.asarray(self.centre, float) + centroids, areas
 
 
 class HalfSpace(AbstractRegion):
@@ -225,96 +166,6 @@ class HalfSpace(AbstractRegion):
 
     def middle(self) -> Float[Array, "d"]:
         return jnp.asarray(self.point)
-
-
-class Capsule(AbstractRegion):
-    """The points within a radius of a segment.
-
-    Args:
-        start: one end of the segment [m], (d,).
-        end: the other end [m], (d,).
-        radius: radius [m].
-    """
-
-    start: Point
-    end: Point
-    radius: Scalar
-
-    def __check_init__(self):
-        require_fields(self)
-        check_segment("A capsule", self.start, self.end)
-        require_positive("A capsule's radius", self.radius)
-
-    @property
-    def dim(self) -> int:
-        return len(self.start)
-
-    def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
-        """‖x − nearest point of the segment‖ − radius."""
-        start, end = jnp.asarray(self.start, x.dtype), jnp.asarray(self.end, x.dtype)
-        axis, arm = end - start, x - start
-        along = jnp.clip((arm * axis).sum(axis=-1) / (axis**2).sum(), 0, 1)
-        return from_axis(arm - along[:, None] * axis) - self.radius
-
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        ends, radius = np.stack([np.asarray(self.start, float), np.asarray(self.end, float)]), float(self.radius)
-        return ends.min(axis=0) - radius, ends.max(axis=0) + radius
-
-    def middle(self) -> Float[Array, "d"]:
-        return (jnp.asarray(self.start) + jnp.asarray(self.end)) / 2
-
-
-class Cylinder(AbstractRegion):
-    """A round cylinder with flat ends (in 2-D a rectangle, with an axis in any direction).
-
-    Args:
-        start: centre of one end [m], (d,).
-        end: centre of the other end [m], (d,).
-        radius: radius [m].
-    """
-
-    start: Point
-    end: Point
-    radius: Scalar
-
-    def __check_init__(self):
-        require_fields(self)
-        check_segment("A cylinder", self.start, self.end)
-        require(len(self.start) > 1, f"A cylinder has two or three coordinates, got {self.start}: take a Box.")
-        require_positive("A cylinder's radius", self.radius)
-
-    @property
-    def dim(self) -> int:
-        return len(self.start)
-
-    def distance(self, x: Float[Array, "m d"]) -> Float[Array, "m"]:
-        """As for a box, from the distances to the ends and to the lateral surface."""
-        along, half, r = about_axis(x, self.start, self.end)
-        return common(jnp.stack([jnp.where(along < 0, -along, along) - half, r - self.radius], axis=-1))
-
-    def sides(self, x: Float[Array, "m d"]) -> Float[Array, "m k"]:
-        along, half, r = about_axis(x, self.start, self.end)
-        return jnp.stack([-along - half, along - half, r - self.radius], axis=-1)
-
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        ends = np.stack([np.asarray(self.start, float), np.asarray(self.end, float)])
-        axis = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-        reach = float(self.radius) * np.sqrt(np.maximum(1 - axis**2, 0))
-        return ends.min(axis=0) - reach, ends.max(axis=0) + reach
-
-    def middle(self) -> Float[Array, "d"]:
-        return (jnp.asarray(self.start) + jnp.asarray(self.end)) / 2
-
-    def fitted(self, size: np.ndarray) -> Cells:
-        """Sectors of concentric rings, in slices along the axis; in 2-D the cells of the rectangle, along the axis and
-        across."""
-        start, end, radius = np.asarray(self.start, float), np.asarray(self.end, float), float(self.radius)
-        if self.dim == 3:
-            return round_cells(start, end, 0.0, radius, size)
-        height = np.linalg.norm(end - start)
-        along, across = (end - start) / height, np.array([start[1] - end[1], end[0] - start[0]]) / height
-        cells, areas = box_cells(np.array([0.0, -radius]), np.array([height, radius]), size)
-        return start + cells @ np.stack([along, across]), areas
 
 
 class Union(AbstractRegion):

@@ -49,21 +49,17 @@ def rigid_body(x: ParticleVector, v: ParticleVector, mass: Float[Array, "p"], vo
     velocity = (mass[:, None] * v).sum(axis=0) / total
     arms = x - centre
     momentum = moment(arms, mass[:, None] * (v - velocity)).sum(axis=0)
-    of_points = inertia(arms, mass)
+    axes, of_points = jnp.eye(len(momentum), dtype=x.dtype), inertia(arms, mass)
     of_cells = (mass * volume ** (2 / d)).sum() / 6
     spin = momentum if d == 1 else jnp.linalg.solve(of_points, momentum)
-    return RigidBody(total, centre, velocity, spin, of_points + of_cells * jnp.eye(len(momentum), dtype=x.dtype), arms)
+    return RigidBody(total, centre, velocity, spin, of_points + of_cells * axes, arms)
 
 
 def inertia(arms: Float[Array, "m d"], mass: Float[Array, "m"]) -> Float[Array, "r r"]:
     """Σ m (‖r‖² 1 − r rᵀ) [kg m²] of points, (1, 1) in 2-D, where it is Σ m ‖r‖², and (0, 0) in 1-D."""
     d = arms.shape[1]
-    if d == 1:
-        return jnp.zeros((0, 0), arms.dtype)
-    square = (mass * (arms**2).sum(axis=1)).sum()
-    if d == 2:
-        return square[None, None]
-    return square * jnp.eye(3, dtype=arms.dtype) - (mass * arms.T) @ arms
+    of_axes = (mass * (arms**2).sum(axis=1)).sum() * jnp.eye(d * (d - 1) // 2, dtype=arms.dtype)
+    return of_axes if d < 3 else of_axes - (mass * arms.T) @ arms
 
 
 def moment(arm: Float[Array, "m d"], force: Float[Array, "m d"]) -> Float[Array, "m r"]:

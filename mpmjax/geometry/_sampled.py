@@ -22,7 +22,7 @@ from mpmjax.checks import (
     warn,
 )
 from mpmjax.discretisation import BSpline
-from mpmjax.geometry._parts import inside_parts
+from mpmjax.geometry._cut_cells import inside_parts
 from mpmjax.geometry._region import AbstractRegion, length
 
 _SPLINE = BSpline(2)

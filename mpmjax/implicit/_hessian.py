@@ -13,7 +13,7 @@ from mpmjax._types import Array, Deformation, Float, NodeVector, Scalar
 from mpmjax.checks import require_fields
 from mpmjax.discretisation import Stencil, resist
 from mpmjax.implicit._potential import ElasticPotential, displacement_gradient, joined
-from mpmjax.material import AbstractElastic, AbstractTangent
+from mpmjax.material import AbstractMaterial, AbstractTangent
 from mpmjax.potential import AbstractStiffness, Displacement, Forces, Mirror, added, scattered
 
 Tangents = tuple[Callable[[Deformation], Deformation], ...]
@@ -218,7 +218,7 @@ class AnalyticHessian(AbstractHessian):
     def at_step_start(self, potential: ElasticPotential) -> TangentAction:
         return _tangents_of(potential, None, self._tangent, definite=self.projected)  # without the gather
 
-    def _tangent(self, law: AbstractElastic, F: Deformation) -> AbstractTangent:
+    def _tangent(self, law: AbstractMaterial, F: Deformation) -> AbstractTangent:
         return law.projected_tangent(F) if self.projected else law.tangent(F)
 
     def exact(self) -> "AnalyticHessian":
@@ -255,7 +255,7 @@ class _JvpAction(AbstractHessianAction):
 def _tangents_of(
     potential: ElasticPotential,
     u: NodeVector | None,
-    of_law: Callable[[AbstractElastic, Deformation], Callable[[Deformation], Deformation]],
+    of_law: Callable[[AbstractMaterial, Deformation], Callable[[Deformation], Deformation]],
     *,
     definite: bool = False,
 ) -> TangentAction:
@@ -265,6 +265,6 @@ def _tangents_of(
     return TangentAction(potential, tangents, definite, u)
 
 
-def _jvp_tangent(law: AbstractElastic, F: Deformation) -> Callable[[Deformation], Deformation]:
+def _jvp_tangent(law: AbstractMaterial, F: Deformation) -> Callable[[Deformation], Deformation]:
     stress = jax.grad(lambda F: law.energy(F).sum())
     return lambda dF: jax.jvp(stress, (F,), (dF,))[1]

@@ -4,6 +4,15 @@ Products, determinants, decompositions and functions of symmetric matrices. All 
 `principal_frame` can be differentiated to every order, at repeated stretches and eigenvalues too.
 """
 
+from mpmjax.linalg._decompositions import (
+    pairs as pairs,
+    principal_frame as principal_frame,
+    principal_modes as principal_modes,
+    rotation as rotation,
+    rotation_differential as rotation_differential,
+    spin_compliance as spin_compliance,
+    symmetric_eigen as symmetric_eigen,
+)
 from mpmjax.linalg._matrices import (
     assemble as assemble,
     cofactor as cofactor,
@@ -20,17 +29,6 @@ from mpmjax.linalg._matrices import (
     trace as trace,
     transpose as transpose,
     upper_triangle as upper_triangle,
-)
-from mpmjax.linalg._principal import (
-    pairs as pairs,
-    principal_frame as principal_frame,
-    principal_modes as principal_modes,
-    symmetric_eigen as symmetric_eigen,
-)
-from mpmjax.linalg._rotation import (
-    rotation as rotation,
-    rotation_differential as rotation_differential,
-    spin_compliance as spin_compliance,
 )
 from mpmjax.linalg._spectral import (
     AbstractSpectral as AbstractSpectral,

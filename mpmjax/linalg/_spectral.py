@@ -27,8 +27,8 @@ import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Matrix
 from mpmjax.autodiff import ruled
+from mpmjax.linalg._decompositions import symmetric_eigen
 from mpmjax.linalg._matrices import matmul, transpose
-from mpmjax.linalg._principal import symmetric_eigen
 
 Frame = tuple[Array, Matrix]
 """Eigenvalues and eigenvectors, (d, *batch) and (d, d, *batch)."""

@@ -7,8 +7,37 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Compliance, Float, Matrix, PerParticle
-from mpmjax.material._base import AbstractIsotropic
+from mpmjax.checks import require_fields, require_moduli
+from mpmjax.material._law import AbstractMaterial
 from mpmjax.material._tangent import AbstractTangent, PrincipalTangent, isotropic_matrix
+
+
+class AbstractIsotropic(AbstractMaterial):
+    """A law given by Young's modulus and Poisson's ratio: at small strains δP = 2μ ε + λ tr(ε) I."""
+
+    youngs_modulus: PerParticle
+    """E [Pa]."""
+    poisson_ratio: PerParticle
+    """ν [-]."""
+
+    def __check_init__(self):
+        require_fields(self)
+        require_moduli(type(self).__name__, self.youngs_modulus, self.poisson_ratio)
+
+    @property
+    def shear_modulus(self) -> PerParticle:
+        """μ = E / (2 (1 + ν)) [Pa]."""
+        return self.youngs_modulus / (2 * (1 + self.poisson_ratio))
+
+    @property
+    def lame_lambda(self) -> PerParticle:
+        """λ = E ν / ((1 + ν)(1 − 2ν)) [Pa]."""
+        return self.youngs_modulus * self.poisson_ratio / ((1 + self.poisson_ratio) * (1 - 2 * self.poisson_ratio))
+
+    @property
+    def bulk_modulus(self) -> PerParticle:
+        """K = E / (3 (1 − 2ν)) [Pa], that of three dimensions."""
+        return self.youngs_modulus / (3 * (1 - 2 * self.poisson_ratio))
 
 
 class FixedCorotated(AbstractIsotropic):
@@ -29,19 +58,15 @@ class FixedCorotated(AbstractIsotropic):
     """
 
     def energy(self, F: Matrix) -> Array:
-        """Ψ = μ ‖F − R‖² + λ/2 (J − 1)²."""
         stretch = F - la.rotation(F)
-        return (
-            self.shear_modulus * la.double_dot(stretch, stretch) + self.lame_lambda / 2 * (la.determinant(F) - 1) ** 2
-        )
+        volumetric = self.lame_lambda / 2 * (la.determinant(F) - 1) ** 2
+        return self.shear_modulus * la.double_dot(stretch, stretch) + volumetric
 
     def stress(self, F: Matrix) -> Matrix:
-        """P = 2μ (F − R) + λ (J − 1) J F⁻ᵀ."""
         volumetric = self.lame_lambda * (la.determinant(F) - 1)
         return 2 * self.shear_modulus * (F - la.rotation(F)) + volumetric * la.cofactor(F)
 
     def tangent(self, F: Matrix) -> "FixedCorotatedTangent":
-        """Derivation, eq. 11, with R, (tr S I − S)⁻¹ and the cofactor matrix computed once."""
         R, cof = la.rotation(F), la.cofactor(F)
         compliance = la.spin_compliance(la.matmul(la.transpose(R), F))
         volumetric = self.lame_lambda * (la.determinant(F) - 1)
@@ -54,7 +79,6 @@ class FixedCorotated(AbstractIsotropic):
         return _with_volumetric(s, lam * (s.prod(axis=0) - 1), lam, lambda i, j: mu * (1 - 2 / (s[i] + s[j])), mu)
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
-        """Every finite F."""
         return la.finite(F)
 
 
@@ -98,18 +122,15 @@ class NeoHookean(AbstractIsotropic):
     """
 
     def energy(self, F: Matrix) -> Array:
-        """Ψ = μ/2 (F : F − d) − μ ln J + λ/2 (ln J)²."""
         log_J = jnp.log(la.determinant(F))
         mu, lam = self.shear_modulus, self.lame_lambda
         return mu / 2 * (la.double_dot(F, F) - F.shape[0]) - mu * log_J + lam / 2 * log_J**2
 
     def stress(self, F: Matrix) -> Matrix:
-        """P = μ (F − F⁻ᵀ) + λ ln J F⁻ᵀ."""
         pull, _ = self._volumetric(la.determinant(F))
         return self.shear_modulus * F + pull * la.cofactor(F)
 
     def tangent(self, F: Matrix) -> "NeoHookeanTangent":
-        """δP = μ δF + λ (F⁻ᵀ : δF) F⁻ᵀ + (λ ln J − μ) δF⁻ᵀ, in terms of the cofactor matrix."""
         pull, bulk = self._volumetric(la.determinant(F))
         return NeoHookeanTangent(F, la.cofactor(F), pull, bulk, self.shear_modulus)
 
@@ -126,7 +147,6 @@ class NeoHookean(AbstractIsotropic):
         return _with_volumetric(s, pull, bulk, lambda i, j: mu, mu)
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
-        """J > 0."""
         return la.determinant(F) > 0
 
 
@@ -179,13 +199,7 @@ def _with_volumetric(
 
     δ(q J F⁻ᵀ) = b (J F⁻ᵀ : δF) J F⁻ᵀ + q δ(J F⁻ᵀ) has twist q J/(s_i s_j), flip −q J/(s_i s_j) and scaling
     b (J/s_i)(J/s_j) + (1 − δ_ij) q J/(s_i s_j), both quotients being products of the other stretches.
-
-    Args:
-        s: signed principal stretches, shape (d, *p).
-        pull: q, shape (*p).
-        bulk: b, shape (*p).
-        twist: of the deviatoric part, for each pair.
-        stiffness: of the deviatoric part, its flip and the diagonal of its scaling.
+    The deviatoric part has a `twist` for each pair, and `stiffness` as its flip and the diagonal of its scaling.
     """
     d = s.shape[0]
 

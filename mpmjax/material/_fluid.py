@@ -1,70 +1,41 @@
-"""A weakly compressible fluid."""
+"""Laws of the volume alone, and a weakly compressible fluid made of one."""
+
+from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
-from mpmjax._types import Array, Bool, PerParticle, Scalar
+from mpmjax._types import Array, Bool, Float, PerParticle, Scalar
 from mpmjax.checks import require_fields, require_positive
-from mpmjax.material._kinematics import VOLUME_RATIO, VolumeRatio
-from mpmjax.material._law import AbstractInelastic
+from mpmjax.material._law import VOLUME_RATIO, AbstractInelastic, AbstractMaterial, DeformationMeasure
 from mpmjax.material._tangent import VolumetricTangent
-from mpmjax.material._volumetric import AbstractVolumetric
 
 
-class Fluid(AbstractInelastic):
-    """A weakly compressible, inviscid fluid (J. J. Monaghan, J. Comput. Phys. 110 (1994) 399, eq. 2.3,
-    doi 10.1006/jcph.1994.1034; in the Material Point Method by J alone: A. P. Tampubolon et al., ACM Trans. Graph. 36
-    (2017) 105, doi 10.1145/3072959.3073651).
+class AbstractVolumetric(AbstractMaterial):
+    """An elastic law given by its energy density Ψ(J), J = det F, and nothing else of the deformation.
 
-    p = K/γ (J^−γ − 1) with J = ρ0/ρ (see `Tait`), sound at √(K/ρ0) at rest. Particles store J in the place of F.
-    Without `tension` a surface separates freely: beyond J = 1 the pressure is zero, and J returns to 1 at the end of
-    the step, so that the fluid resists as soon as it is compressed again.
-
-    *When it breaks*: J is the product of the steps' changes and not the particles' real spacing, from which it drifts
-    in long mixing flows. With tension, fluid that is torn stays connected until its particles lie further apart than
-    the kernel reaches, and clusters. Without it, sound waves with troughs below zero pressure are cut off; and a single
-    linear solve, whose tangent at J = 1 is that of compression, resists expansion within the step, which Newton's
-    method does not. Explicit steps shrink with 1/√K.
-    *Good values*: water has γ = 7 and K = 2.2e9 Pa, but its speed of sound is rarely of interest: K of 100 to 1000
-    times ρ g H, H the depth, or 100 ρ v², keeps changes of density under 1 %. γ = 1 makes p linear in the density.
-
-    Args:
-        bulk_modulus: K [Pa] at rest, one value or one per particle (p,).
-        exponent: γ [-], positive.
-        tension: whether the pressure may be below zero. Closed vessels and acoustics want it, free surfaces do not.
+    Its particles store J and no F, so that it works in the updated description alone. Their volumes cannot be averaged:
+    nothing would resist what the average does not see. A law needs `energy(J)` alone [J/m³ of undeformed volume], of
+    J [-] of shape (p,): its derivatives default to automatic differentiation.
     """
 
-    bulk_modulus: PerParticle
-    exponent: PerParticle = 7.0
-    tension: bool = eqx.field(static=True, default=False)
+    measure: ClassVar[DeformationMeasure] = VOLUME_RATIO
+    allows_total: ClassVar[bool] = False
+    allows_averaged_volume: ClassVar[bool] = False
 
-    def __check_init__(self):
-        require_fields(self)
-        require_positive("Fluid's bulk_modulus [Pa]", self.bulk_modulus)
-        require_positive("Fluid's exponent", self.exponent)
+    def tangent(self, J: Array, /) -> VolumetricTangent:
+        """d²Ψ/dJ² [Pa]. Default: the derivative of the stress."""
+        return VolumetricTangent(jax.jvp(self.stress, (J,), (jnp.ones_like(J),))[1])
 
-    @property
-    def kinematics(self) -> VolumeRatio:
-        return VOLUME_RATIO
+    def projected_tangent(self, J: Array, /) -> VolumetricTangent:
+        """max(d²Ψ/dJ², 0)."""
+        return VolumetricTangent(jnp.maximum(self.tangent(J).stiffness, 0))
 
-    @property
-    def relaxes_stress(self) -> bool:
-        """No: it takes out expansion, which has no stress."""
-        return False
-
-    def initial_history(self, J: Array, /) -> None:
-        """None."""
-        del J
-
-    def elastic(self, history: None) -> "Tait":
-        """The equation of state."""
-        del history
-        return Tait(self.bulk_modulus, self.exponent, self.tension)
-
-    def return_map(self, J: Array, history: None, dt: Scalar, /) -> tuple[Array, None]:
-        """min(J, 1); with tension J."""
-        del dt
-        return J if self.tension else _pressed(J), history
+    def tangent_eigenvalues(self, J: Array, /, dim: int, *, total: bool) -> Float[Array, "m p"]:
+        """The one of d/dJ(JΨ') J tr(L) I that is not zero, d times the factor."""
+        del total
+        return dim * (self.tangent(J).stiffness * J * J + J * self.stress(J))[None]
 
 
 class Tait(AbstractVolumetric):
@@ -93,12 +64,10 @@ class Tait(AbstractVolumetric):
         require_positive("Tait's exponent", self.exponent)
 
     def energy(self, J: Array, /) -> Array:
-        """Ψ = K/γ (J − 1 + (J^{1−γ} − 1)/(γ − 1))."""
         acting = self._acting(J)
         return self.bulk_modulus / self.exponent * (acting - 1 + _raised(acting, 1 - self.exponent))
 
     def stress(self, J: Array, /) -> Array:
-        """dΨ/dJ = −p."""
         return self.bulk_modulus / self.exponent * (1 - self._acting(J) ** -self.exponent)
 
     def tangent(self, J: Array, /) -> VolumetricTangent:
@@ -107,11 +76,59 @@ class Tait(AbstractVolumetric):
         return VolumetricTangent(stiffness if self.tension else jnp.where(J > 1, 0, stiffness))
 
     def is_admissible(self, J: Array, /) -> Bool[Array, "p"]:
-        """J > 0."""
         return J > 0
 
     def _acting(self, J: Array) -> Array:
         return J if self.tension else _pressed(J)
+
+
+class Fluid(AbstractInelastic):
+    """A weakly compressible, inviscid fluid (J. J. Monaghan, J. Comput. Phys. 110 (1994) 399, eq. 2.3,
+    doi 10.1006/jcph.1994.1034; in the Material Point Method by J alone: A. P. Tampubolon et al., ACM Trans. Graph. 36
+    (2017) 105, doi 10.1145/3072959.3073651).
+
+    p = K/γ (J^−γ − 1) with J = ρ0/ρ (see `Tait`), sound at √(K/ρ0) at rest. Particles store J in the place of F.
+    Without `tension` a surface separates freely: beyond J = 1 the pressure is zero, and J returns to 1 at the end of
+    the step, so that the fluid resists as soon as it is compressed again.
+
+    *When it breaks*: J is the product of the steps' changes and not the particles' real spacing, from which it drifts
+    in long mixing flows. With tension, fluid that is torn stays connected until its particles lie further apart than
+    the kernel reaches, and clusters. Without it, sound waves with troughs below zero pressure are cut off; and a single
+    linear solve, whose tangent at J = 1 is that of compression, resists expansion within the step, which Newton's
+    method does not. Explicit steps shrink with 1/√K.
+    *Good values*: water has γ = 7 and K = 2.2e9 Pa, but its speed of sound is rarely of interest: K of 100 to 1000
+    times ρ g H, H the depth, or 100 ρ v², keeps changes of density under 1 %. γ = 1 makes p linear in the density.
+
+    Args:
+        bulk_modulus: K [Pa] at rest, one value or one per particle (p,).
+        exponent: γ [-], positive.
+        tension: whether the pressure may be below zero. Closed vessels and acoustics want it, free surfaces do not.
+    """
+
+    measure: ClassVar[DeformationMeasure] = VOLUME_RATIO
+    relaxes_stress: ClassVar[bool] = False  # it takes out expansion, which has no stress
+    bulk_modulus: PerParticle
+    exponent: PerParticle = 7.0
+    tension: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        require_fields(self)
+        require_positive("Fluid's bulk_modulus [Pa]", self.bulk_modulus)
+        require_positive("Fluid's exponent", self.exponent)
+
+    def initial_history(self, J: Array, /) -> None:
+        """None."""
+        del J
+
+    def elastic(self, history: None) -> Tait:
+        """The equation of state."""
+        del history
+        return Tait(self.bulk_modulus, self.exponent, self.tension)
+
+    def return_map(self, J: Array, history: None, dt: Scalar, /) -> tuple[Array, None]:
+        """min(J, 1); with tension J."""
+        del dt
+        return J if self.tension else _pressed(J), history
 
 
 def _pressed(J: Array) -> Array:

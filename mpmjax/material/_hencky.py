@@ -1,12 +1,17 @@
-"""Hencky's elasticity, linear in the logarithmic strain, and the strain of the laws that yield on it."""
+"""Hencky's elasticity, linear in the logarithmic strain, and the return map of the laws that yield on it."""
+
+import abc
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Bool, Float, Matrix, PerParticle
+from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
+from mpmjax.checks import require_moduli
 from mpmjax.linalg import Logarithm, PowerLessOne
-from mpmjax.material._base import AbstractIsotropic
+from mpmjax.material._elastic import AbstractIsotropic
+from mpmjax.material._law import AbstractInelastic
 from mpmjax.material._tangent import IsotropicTangent, PrincipalTangent
 
 _log = Logarithm()
@@ -20,9 +25,6 @@ class Hencky(AbstractIsotropic):
 
     In fewer than three dimensions the total strain in the 3 − d directions normal to F is zero. Its elastic part ε_t is
     not zero once a law has yielded: then μ (3 − d) ε_t² is added to the energy, and (3 − d) ε_t to the trace.
-
-    Laws that yield at large strains are built on it: their return maps have the form of small strains, and tr ε = ln J
-    separates changes of volume from changes of shape.
 
     *When it breaks*: it needs J > 0. The force in a stretched fibre falls beyond a stretch of e: not a law for rubber.
     Each particle needs an eigenvalue problem.
@@ -38,7 +40,6 @@ class Hencky(AbstractIsotropic):
     transverse_strain: PerParticle | None = None
 
     def energy(self, F: Matrix) -> Array:
-        """Ψ = μ (ε : ε + (3 − d) ε_t²) + λ/2 (tr ε + (3 − d) ε_t)²."""
         strain = logarithmic_strain(F)
         squares = la.double_dot(strain, strain)
         if self.transverse_strain is not None:
@@ -46,7 +47,6 @@ class Hencky(AbstractIsotropic):
         return self.shear_modulus * squares + self.lame_lambda / 2 * self._dilation(la.trace(strain), F) ** 2
 
     def stress(self, F: Matrix) -> Matrix:
-        """P = F⁻ᵀ (2μ ε + λ (tr ε + (3 − d) ε_t) I)."""
         strain = logarithmic_strain(F)
         dilation = self._dilation(la.trace(strain), F)
         kirchhoff = 2 * self.shear_modulus * strain + self.lame_lambda * dilation * la.identity_like(F)
@@ -74,7 +74,6 @@ class Hencky(AbstractIsotropic):
         return PrincipalTangent.of(s, twist, flip, scaling)
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
-        """J > 0."""
         return la.determinant(F) > 0
 
     def _dilation(self, trace: Array, like: Array) -> Array:
@@ -82,57 +81,65 @@ class Hencky(AbstractIsotropic):
         return trace if self.transverse_strain is None else trace + _missing(like) * self.transverse_strain
 
 
-class ElasticStrain(eqx.Module):
-    """The elastic logarithmic strain in three dimensions, whatever d is, as mean and deviator: ε = m I + e.
+class AbstractHenckyPlasticity(AbstractInelastic):
+    """An isotropic law that yields on Hencky's elasticity: its return map has the form of small strains, and
+    tr ε = ln J separates changes of volume from changes of shape.
 
-    The laws that yield on Hencky's elasticity are isotropic: their return maps turn no principal direction, scale the
-    deviator and set the mean, ε ← k e + m′ I. With F = R exp ε that is F ← F exp((k − 1) ε + c I) = F eᶜ C^((k−1)/2),
-    where C = FᵀF and c = m′ − k m: a function of C, whose derivative needs no eigenvectors.
+    The elastic logarithmic strain in three dimensions, whatever d is, has a mean and a deviator, ε = m I + e. Flow
+    turns no principal direction, scales the deviator and sets the mean, ε ← k e + m′ I. With F = R exp ε that is
+    F ← F exp((k − 1) ε + c I) = F eᶜ C^((k−1)/2), where C = FᵀF and c = m′ − k m: a function of C, whose derivative
+    needs no eigenvectors. Where k = 1 and m′ = m nothing yields, and F is unchanged to the last bit.
     """
 
-    F: Matrix
-    """F_E [-], shape (d, d, p)."""
-    transverse: Array | None
-    """ε_t [-], shape (p,); None in 3-D."""
-    mean: Array
-    """m = (tr ε + (3 − d) ε_t)/3 [-], shape (p,)."""
-    deviation: Array
-    """‖e‖ [-], shape (p,). Where it is zero its derivative is zero."""
+    History: ClassVar[Any]
+    """The class of the history: one variable [-], and `transverse_strain`, ε_t [-] (see `Hencky`), both of shape (p,);
+    no ε_t in 3-D."""
+    youngs_modulus: eqx.AbstractVar[PerParticle]
+    poisson_ratio: eqx.AbstractVar[PerParticle]
 
-    @classmethod
-    def of(cls, F: Matrix, transverse: Array | None) -> "ElasticStrain":
-        """The strain of an elastic deformation.
+    def __check_init__(self):
+        require_moduli(type(self).__name__, self.youngs_modulus, self.poisson_ratio)
+
+    def initial_variable(self) -> PerParticle:
+        """The history's variable where nothing has yielded. Default: zero."""
+        return 0.0
+
+    @abc.abstractmethod
+    def flow(self, history: Any, mean: Array, deviation: Array, dt: Scalar) -> tuple[Array, Array, Array]:
+        """k, m′ and the history's new variable [-], each of shape (p,).
 
         Args:
-            F: F_E [-], shape (d, d, p).
-            transverse: ε_t [-], shape (p,); None in 3-D.
+            history: the history before the step.
+            mean: m [-] of the trial strain, shape (p,).
+            deviation: ‖e‖ [-] of the trial strain, shape (p,).
+            dt: the step [s].
         """
-        strain = logarithmic_strain(F)
+
+    def initial_history(self, F: Matrix) -> Any:
+        """The initial variable, and ε_t = 0."""
+        variable = self.initial_variable() * jnp.ones(F.shape[2:], F.dtype)
+        return self.History(variable, None if len(F) == 3 else jnp.zeros(F.shape[2:], F.dtype))
+
+    def elastic(self, history: Any) -> Hencky:
+        """Hencky's law with the history's ε_t."""
+        return Hencky(self.youngs_modulus, self.poisson_ratio, history.transverse_strain)
+
+    def return_map(self, F: Matrix, history: Any, dt: Scalar) -> tuple[Matrix, Any]:
+        """F and ε_t at the strain k e + m′ I."""
+        strain, transverse = logarithmic_strain(F), history.transverse_strain
         trace = la.trace(strain)
         mean = (trace if transverse is None else trace + _missing(F) * transverse) / 3
         e = strain - mean * la.identity_like(F)
         squares = la.double_dot(e, e)
         if transverse is not None:
             squares = squares + _missing(F) * (transverse - mean) ** 2
-        deviates = squares > 0
-        return cls(F, transverse, mean, jnp.where(deviates, jnp.sqrt(jnp.where(deviates, squares, 1)), 0))
-
-    def returned(self, ratio: Array, mean: Array) -> tuple[Matrix, Array | None]:
-        """F_E and ε_t at the strain k e + m′ I. Where k = 1 and m′ = m they are unchanged to the last bit.
-
-        Args:
-            ratio: k [-], shape (p,).
-            mean: m′ [-], shape (p,).
-        """
-        shift = mean - ratio * self.mean
-        change = PowerLessOne((ratio - 1) / 2, shift)(la.matmul(la.transpose(self.F), self.F))
-        transverse = None if self.transverse is None else ratio * self.transverse + shift
-        return self.F + la.matmul(self.F, change), transverse
-
-
-def no_transverse_strain(F: Matrix) -> Array | None:
-    """ε_t [-] of particles that have never yielded: zero, shape (p,), or None in 3-D."""
-    return None if F.shape[0] == 3 else jnp.zeros(F.shape[2:], F.dtype)
+        deviates = squares > 0  # where not, the derivative of ‖e‖ is zero
+        deviation = jnp.where(deviates, jnp.sqrt(jnp.where(deviates, squares, 1)), 0)
+        ratio, new_mean, variable = self.flow(history, mean, deviation, dt)
+        shift = new_mean - ratio * mean
+        change = PowerLessOne((ratio - 1) / 2, shift)(la.matmul(la.transpose(F), F))
+        transverse = None if transverse is None else ratio * transverse + shift
+        return F + la.matmul(F, change), self.History(variable, transverse)
 
 
 def _missing(like: Array) -> int:

@@ -1,14 +1,15 @@
 """Rigid bodies."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix, Scalar
 from mpmjax.checks import as_plain, require, require_fields, require_positive
-from mpmjax.material._base import AbstractMaterial
-from mpmjax.material._law import Freedom
-from mpmjax.material._tangent import AbstractTangent, MatrixTangent, PrincipalTangent
+from mpmjax.material._law import AbstractMaterial, Freedom
+from mpmjax.material._tangent import MatrixTangent, PrincipalTangent
 
 
 class Rigid(AbstractMaterial):
@@ -34,6 +35,7 @@ class Rigid(AbstractMaterial):
         turns: whether it may turn.
     """
 
+    allows_averaged_volume: ClassVar[bool] = False  # its volume does not change
     modulus: Scalar
     free: tuple[bool, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
     turns: bool = eqx.field(static=True, default=True)
@@ -49,33 +51,22 @@ class Rigid(AbstractMaterial):
     def freedom(self) -> Freedom:
         return Freedom(self.free, self.turns)
 
-    @property
-    def allows_averaged_volume(self) -> bool:
-        """No: its volume does not change."""
-        return False
-
     def energy(self, F: Matrix) -> Array:
-        """None."""
         return jnp.zeros(F.shape[2:], F.dtype)
 
     def stress(self, F: Matrix) -> Matrix:
-        """None: what holds it together does no work."""
         return jnp.zeros_like(F)
 
-    def tangent(self, F: Matrix) -> AbstractTangent:
-        """None."""
+    def tangent(self, F: Matrix) -> MatrixTangent:
         count = F.shape[0] * F.shape[1]
         return MatrixTangent(jnp.zeros((count, count, *F.shape[2:]), F.dtype))
 
     def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
-        """None."""
         none = jnp.zeros_like(s[0])
         return PrincipalTangent.of(s, lambda i, j: none, lambda i, j: none, lambda i, j: none)
 
     def wave_modulus(self, F: Deformation) -> Float[Array, "*p"]:
-        """M, by which contact takes its stiffness."""
         return jnp.broadcast_to(jnp.asarray(self.modulus, F.dtype), (1,))
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
-        """Every finite F."""
         return la.finite(F)

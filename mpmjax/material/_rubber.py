@@ -10,73 +10,12 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
 from mpmjax.checks import as_plain, require, require_fields, require_finite, require_positive, require_that
 from mpmjax.linalg import PowerLessOne
-from mpmjax.material._base import AbstractMaterial
+from mpmjax.material._law import AbstractMaterial
 from mpmjax.material._tangent import IsotropicTangent, PrincipalTangent
 
 
-class AbstractPowerSum(eqx.Module):
-    """A power sum T_α of the isochoric stretches.
-
-    Its derivative is ∂T/∂F = α F⁻ᵀ D, with the deviator D = C̄^{α/2} − T/3 I of the isochoric C̄ = J^−2/3 C.
-    """
-
-    exponent: eqx.AbstractVar[PerParticle]
-    """α [-]."""
-
-    @abc.abstractmethod
-    def strain(self, F: Matrix, log_J: Array) -> Matrix:
-        """C̄^{α/2} − I, shape (d, d, *p).
-
-        Args:
-            F: deformation gradient [-], shape (d, d, *p).
-            log_J: ln J [-], shape (*p).
-        """
-
-    def excess(self, trace: Array, log_J: Array, dim: int) -> Array:
-        """T − 3 [-], shape (*p), zero at rest.
-
-        Args:
-            trace: that of `strain` in the d directions of F [-], shape (*p).
-            log_J: ln J [-], shape (*p).
-            dim: d.
-        """
-        return trace + (3 - dim) * jnp.expm1(-self.exponent / 3 * log_J)
-
-
-class FirstInvariant(AbstractPowerSum):
-    """Ī1 = T_2."""
-
-    exponent: PerParticle = eqx.field(static=True, default=2)
-
-    def strain(self, F: Matrix, log_J: Array) -> Matrix:
-        """J^−2/3 C − I."""
-        return jnp.exp(-2 / 3 * log_J) * la.matmul(la.transpose(F), F) - la.identity_like(F)
-
-
-class SecondInvariant(AbstractPowerSum):
-    """Ī2 = T_−2."""
-
-    exponent: PerParticle = eqx.field(static=True, default=-2)
-
-    def strain(self, F: Matrix, log_J: Array) -> Matrix:
-        """J^2/3 C⁻¹ − I, by the cofactor matrix J F⁻ᵀ."""
-        cofactor = la.cofactor(F)
-        return jnp.exp(-4 / 3 * log_J) * la.matmul(la.transpose(cofactor), cofactor) - la.identity_like(F)
-
-
-class PowerSum(AbstractPowerSum):
-    """T_α of any exponent, by the eigenvalues of C. Its derivatives hold at repeated stretches."""
-
-    exponent: PerParticle
-
-    def strain(self, F: Matrix, log_J: Array) -> Matrix:
-        """J^{−α/3} C^{α/2} − I."""
-        exponent = self.exponent * jnp.ones_like(log_J)
-        return PowerLessOne(exponent / 2, -exponent / 3 * log_J)(la.matmul(la.transpose(F), F))
-
-
 class Work(NamedTuple):
-    """The energy of a power sum T, as a function w of E = T − 3."""
+    """The energy w of a power sum of stretches, as a function of E."""
 
     energy: Array
     """w [Pa]."""
@@ -92,7 +31,7 @@ class AbstractRubber(AbstractMaterial):
     K. S. Pister, Comput. Methods Appl. Mech. Eng. 51 (1985) 177, doi 10.1016/0045-7825(85)90033-7).
 
     Ψ = Σ_k w_k(E_k) + K/4 (J² − 1 − 2 ln J), where E_k = λ̄_1^α + λ̄_2^α + λ̄_3^α − 3 of an exponent α = α_k, with the
-    isochoric stretches λ̄_i = J^−1/3 λ_i. Every law here is of this form, and gives the exponents and functions w_k.
+    isochoric stretches λ̄_i = J^−1/3 λ_i. Laws give the exponents and functions w_k.
 
     P = F⁻ᵀ S with S = Σ_k w_k' α (C̄^{α/2} − (1 + E_k/3) I) + K/2 (J² − 1) I. In two dimensions and in one the stretches
     normal to F are one: plane and uniaxial strain, of the same K. At small strains the law is Hooke's, with K and
@@ -103,31 +42,25 @@ class AbstractRubber(AbstractMaterial):
     """K [Pa]."""
 
     @abc.abstractmethod
-    def sums(self) -> tuple[AbstractPowerSum, ...]:
-        """The power sums that the energy depends on."""
+    def powers(self) -> tuple[PerParticle, ...]:
+        """The exponents α_k [-]. The whole numbers 2 and −2, for Ī1 and Ī2, need no eigenvalues."""
 
     @abc.abstractmethod
     def work(self, excess: tuple[Array, ...]) -> tuple[Work, ...]:
-        """w_k and its derivatives for each of the sums.
-
-        Args:
-            excess: E_k [-], each of shape (*p).
-        """
+        """w_k and its derivatives for each of the sums, at E_k [-], each of shape (*p)."""
 
     def energy(self, F: Matrix) -> Array:
-        """Ψ = Σ_k w_k(E_k) + K/4 (J² − 1 − 2 ln J)."""
         J = la.determinant(F)
         _, excess = self._strains(F, jnp.log(J))
         volumetric = self.bulk_modulus / 4 * (J**2 - 1 - 2 * jnp.log(J))
         return sum((part.energy for part in self.work(excess)), volumetric)
 
     def stress(self, F: Matrix) -> Matrix:
-        """P = F⁻ᵀ S, S = Σ_k w_k' α (C̄^{α/2} − (1 + E_k/3) I) + K/2 (J² − 1) I."""
         J, identity = la.determinant(F), la.identity_like(F)
         strains, excess = self._strains(F, jnp.log(J))
         S = self.bulk_modulus / 2 * (J**2 - 1) * identity
-        for power, strain, E, part in zip(self.sums(), strains, excess, self.work(excess), strict=True):
-            S = S + power.exponent * part.slope * (strain - E / 3 * identity)
+        for exponent, strain, E, part in zip(self.powers(), strains, excess, self.work(excess), strict=True):
+            S = S + exponent * part.slope * (strain - E / 3 * identity)
         return la.matmul(la.cofactor(F), S) / J
 
     def tangent(self, F: Matrix) -> IsotropicTangent:
@@ -139,12 +72,12 @@ class AbstractRubber(AbstractMaterial):
         (∂τ_i/∂ln s_j − δ_ij τ_i)/(s_i s_j), twist (τ_i/s_i + τ_j/s_j)/(s_i + s_j), flip
         (s_j (τ_i − τ_j)/(s_i − s_j) − τ_j)/(s_i s_j)."""
         d, J = len(s), s.prod(axis=0)
-        sums, log_J = self.sums(), jnp.log(J)
-        powers = [PowerLessOne(one.exponent * jnp.ones_like(J), -one.exponent / 3 * log_J) for one in sums]
+        log_J = jnp.log(J)
+        powers = [PowerLessOne(a * jnp.ones_like(J), -a / 3 * log_J) for a in self.powers()]
         p = [power.of(s) for power in powers]
-        excess = tuple(one.excess(part.sum(axis=0), log_J, d) for one, part in zip(sums, p, strict=True))
+        excess = tuple(_excess(a, part.sum(axis=0), log_J, d) for a, part in zip(self.powers(), p, strict=True))
         e = [part - E / 3 for part, E in zip(p, excess, strict=True)]
-        terms = [*zip([one.exponent for one in sums], self.work(excess), powers, p, e, strict=True)]
+        terms = [*zip(self.powers(), self.work(excess), powers, p, e, strict=True)]
         tau = sum((a * w.slope * e for a, w, _, _, e in terms), self.bulk_modulus / 2 * (J**2 - 1))
 
         def growth(i: int, j: int) -> Array:
@@ -168,15 +101,30 @@ class AbstractRubber(AbstractMaterial):
         return PrincipalTangent.of(s, twist, flip, scaling)
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
-        """J > 0."""
         return la.determinant(F) > 0
 
     def _strains(self, F: Matrix, log_J: Array) -> tuple[tuple[Matrix, ...], tuple[Array, ...]]:
-        """C̄^{α/2} − I and E of each power sum."""
-        sums = self.sums()
-        strains = tuple(one.strain(F, log_J) for one in sums)
-        excess = tuple(one.excess(la.trace(A), log_J, len(F)) for one, A in zip(sums, strains, strict=True))
-        return strains, excess
+        """C̄^{α/2} − I and E of each exponent."""
+        strains = tuple(_isochoric_power(a, F, log_J) for a in self.powers())
+        pairs = zip(self.powers(), strains, strict=True)
+        return strains, tuple(_excess(a, la.trace(A), log_J, len(F)) for a, A in pairs)
+
+
+def _isochoric_power(exponent: PerParticle, F: Matrix, log_J: Array) -> Matrix:
+    """C̄^{α/2} − I, C̄ = J^−2/3 C, by products where the law's class fixes α at 2 or −2, else by the eigenvalues of C.
+    Its derivatives hold at repeated stretches."""
+    if isinstance(exponent, int) and exponent == 2:
+        return jnp.exp(-2 / 3 * log_J) * la.matmul(la.transpose(F), F) - la.identity_like(F)
+    if isinstance(exponent, int) and exponent == -2:
+        cofactor = la.cofactor(F)
+        return jnp.exp(-4 / 3 * log_J) * la.matmul(la.transpose(cofactor), cofactor) - la.identity_like(F)
+    exponent = exponent * jnp.ones_like(log_J)
+    return PowerLessOne(exponent / 2, -exponent / 3 * log_J)(la.matmul(la.transpose(F), F))
+
+
+def _excess(exponent: PerParticle, trace: Array, log_J: Array, dim: int) -> Array:
+    """E = λ̄_1^α + λ̄_2^α + λ̄_3^α − 3 [-], zero at rest, by the trace of `_isochoric_power` in the d directions of F."""
+    return trace + (3 - dim) * jnp.expm1(-exponent / 3 * log_J)
 
 
 def _linear(slope: PerParticle, E: Array) -> Work:
@@ -219,12 +167,10 @@ class MooneyRivlin(AbstractRubber):
         """μ = 2 (C1 + C2) [Pa]."""
         return 2 * (self.c1 + self.c2)
 
-    def sums(self) -> tuple[AbstractPowerSum, ...]:
-        """Ī1 and Ī2."""
-        return FirstInvariant(), SecondInvariant()
+    def powers(self) -> tuple[PerParticle, ...]:
+        return (2, -2)
 
     def work(self, excess: tuple[Array, ...]) -> tuple[Work, ...]:
-        """C1 E_1 and C2 E_2."""
         return _linear(self.c1, excess[0]), _linear(self.c2, excess[1])
 
 
@@ -262,12 +208,10 @@ class Yeoh(AbstractRubber):
         """μ = 2 C1 [Pa]."""
         return 2 * self.c1
 
-    def sums(self) -> tuple[AbstractPowerSum, ...]:
-        """Ī1."""
-        return (FirstInvariant(),)
+    def powers(self) -> tuple[PerParticle, ...]:
+        return (2,)
 
     def work(self, excess: tuple[Array, ...]) -> tuple[Work, ...]:
-        """C1 E + C2 E² + C3 E³."""
         (E,) = excess
         c1, c2, c3 = self.c1, self.c2, self.c3
         return (Work(E * (c1 + E * (c2 + E * c3)), c1 + E * (2 * c2 + 3 * E * c3), 2 * c2 + 6 * E * c3),)
@@ -300,18 +244,15 @@ class Gent(AbstractRubber):
         require_positive("Gent's limit", self.limit)
         require_positive("Gent's bulk_modulus [Pa]", self.bulk_modulus)
 
-    def sums(self) -> tuple[AbstractPowerSum, ...]:
-        """Ī1."""
-        return (FirstInvariant(),)
+    def powers(self) -> tuple[PerParticle, ...]:
+        return (2,)
 
     def work(self, excess: tuple[Array, ...]) -> tuple[Work, ...]:
-        """−μ J_m/2 ln(1 − E/J_m)."""
         (E,) = excess
         half, left = self.shear_modulus / 2, 1 - E / self.limit
         return (Work(-half * self.limit * jnp.log1p(-E / self.limit), half / left, half / self.limit / left**2),)
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
-        """J > 0 and Ī1 − 3 < J_m."""
         J = la.determinant(F)
         positive = J > 0
         _, (excess,) = self._strains(F, jnp.log(jnp.where(positive, J, 1)))
@@ -366,11 +307,9 @@ class Ogden(AbstractRubber):
         """μ = ½ Σ_k μ_k α_k [Pa]."""
         return sum(modulus * exponent for modulus, exponent in zip(self.moduli, self.exponents, strict=True)) / 2
 
-    def sums(self) -> tuple[AbstractPowerSum, ...]:
-        """One for each term."""
-        return tuple(PowerSum(exponent) for exponent in self.exponents)
+    def powers(self) -> tuple[Scalar, ...]:
+        return self.exponents
 
     def work(self, excess: tuple[Array, ...]) -> tuple[Work, ...]:
-        """μ_k/α_k E_k."""
         each = zip(self.moduli, self.exponents, excess, strict=True)
         return tuple(_linear(modulus / exponent, E) for modulus, exponent, E in each)

@@ -8,10 +8,16 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Deformation, Float, Matrix
+from mpmjax._types import Array, Bool, Deformation, Float, Matrix
 from mpmjax.autodiff import ruled
+
+_STRETCHES = (1.25, 0.8, 1.0)
+"""Where a law is asked whether it is isotropic: they differ and keep the volume, whose energy may hide the rest."""
+_ANISOTROPIC = 1e-4
+"""Relative change of the energy by a rotation from which a law is anisotropic, well above rounding in float32."""
 
 
 class AbstractTangent(eqx.Module):
@@ -27,12 +33,7 @@ class AbstractTangent(eqx.Module):
     def pushed_forward(self, A: Matrix, weight: Float[Array, "*p"]) -> Float[Array, "t *p"] | None:
         """The upper triangle of the symmetric matrix of G ↦ w (∂²Ψ/∂F∂F : (G A)) Aᵀ, row by row, in closed form, shape
         (d²(d² + 1)/2, *p). Rows and columns are the components G_ab, b before a. Default: None, and the map is applied
-        to the d² unit matrices instead, which takes several times as long. It is never differentiated.
-
-        Args:
-            A: any matrices [-], shape (d, d, *p).
-            weight: w, shape (*p).
-        """
+        to the d² unit matrices instead, which takes several times as long. It is never differentiated."""
         del A, weight
         return None
 
@@ -81,14 +82,8 @@ class PrincipalTangent(eqx.Module):
         flip: Callable[[int, int], Array],
         scaling: Callable[[int, int], Array],
     ) -> "PrincipalTangent":
-        """From functions of the indices i, j: twist and flip of each pair i < j, and each entry of the scaling.
-
-        Args:
-            s: signed principal stretches [-], shape (d, *p).
-            twist: the twist of a pair [Pa], shape (*p).
-            flip: the flip of a pair [Pa], shape (*p).
-            scaling: ∂²Ψ/∂s_i∂s_j [Pa], shape (*p).
-        """
+        """From functions of the indices i, j at signed principal stretches s [-]: twist and flip of each pair i < j,
+        and each entry of the scaling [Pa]."""
         d, none = s.shape[0], jnp.zeros((0, *s.shape[1:]), s.dtype)
 
         def over_pairs(entry: Callable[[int, int], Array]) -> Array:
@@ -119,17 +114,10 @@ def isotropic_matrix(law: Any, F: Matrix, A: Matrix, weight: Float[Array, "*p"])
     sum of flip and twist and half their difference, the matrix is
 
         K_(ba)(dc) = w (Σ_ij S_ij U_ai R_bi U_cj R_dj + Σ_i≠j U_ai R_bj (h_ij U_ci R_dj + g_ij U_cj R_di)).
-
-    Its factors, products of two components, are computed before the sums, so that no component repeats them.
-
-    Args:
-        law: a law of F with `principal_tangent`.
-        F: deformation gradient [-], shape (d, d, *p).
-        A: as there.
-        weight: w, as there.
     """
     d, (U, s, V) = len(F), la.principal_frame(F)
     at = jax.tree.map(lambda part: weight * part, law.principal_tangent(s))
+    # barriers: factors, products of two components, are computed before the sums, and no component repeats them
     U, V, at = jax.lax.optimization_barrier((U, V, at))
     R, none = la.matmul(A, V), jnp.zeros_like(s[0])
     mixed = jnp.stack([R[:, None, i] * U[None, :, i] for i in range(d)])  # R_bi U_ai
@@ -150,14 +138,14 @@ def isotropic_matrix(law: Any, F: Matrix, A: Matrix, weight: Float[Array, "*p"])
     mixed, left, scaled, straight, crossed = jax.lax.optimization_barrier((mixed, left, scaled, straight, crossed))
 
     def row(b: int, a: int) -> Array:
-        """The row of G_ab."""
+        """The row of G_ab, from the diagonal on."""
         terms = [
             scaled[i, b, a] * mixed[i] + straight[i, b][:, None] * left[i, a] + mixed[i, :, a][:, None] * crossed[i, b]
             for i in range(d)
         ]
-        return reduce(jnp.add, terms).reshape(d * d, *s.shape[1:])
+        return reduce(jnp.add, terms).reshape(d * d, *s.shape[1:])[b * d + a :]
 
-    return jnp.concatenate([row(b, a)[b * d + a :] for b in range(d) for a in range(d)])
+    return jnp.concatenate([row(b, a) for b in range(d) for a in range(d)])
 
 
 def projected_tangent(law: Any, F: Matrix) -> MatrixTangent:
@@ -173,10 +161,6 @@ def projected_tangent(law: Any, F: Matrix) -> MatrixTangent:
     *When it breaks*: the law must be isotropic. Second derivatives are refused. Where an eigenvalue is zero A⁺ has a
     kink; the derivative given is the mean of the two sides, which is what a central difference tends to. At F = I that
     is so: all twists are zero.
-
-    Args:
-        law: a law of F, with `tangent` and `principal_tangent`.
-        F: deformation gradient [-], shape (d, d, p).
     """
     return MatrixTangent(_projected_matrix(law, F))
 
@@ -218,3 +202,27 @@ def _spectrum(law: Any, F: Matrix) -> tuple[Float[Array, "m *p"], Float[Array, "
 def _in_modes(modes: Float[Array, "m m *p"], core: Float[Array, "m m *p"]) -> Float[Array, "m m *p"]:
     """Σ_kl E_ka core_kl E_lb."""
     return la.matmul(jnp.swapaxes(modes, 0, 1), la.matmul(core, modes))
+
+
+def is_isotropic(law: Any, like: Matrix) -> Bool[Array, "*p"]:
+    """Whether a law's energy does not change as the material is rotated before a deformation, or space after it: at one
+    deformation, so that the answer is that of the law's parameters. True where the energy is not finite. Of F only the
+    shape counts.
+    """
+    d = len(like)
+    if d == 1:
+        return jnp.ones(like.shape[2:], bool)
+    stretch = np.diag(_STRETCHES[:d])
+
+    def turn(angle: float) -> np.ndarray:
+        """A rotation about no axis of symmetry."""
+        W = np.array([[0, -1, 0.7], [1, 0, -0.4], [-0.7, 0.4, 0]])[:d, :d] * np.tan(angle / 2)
+        return np.linalg.solve(np.eye(d) - W, np.eye(d) + W)
+
+    def energy(F: np.ndarray) -> Array:
+        column = jnp.asarray(F, like.dtype).reshape(d, d, *[1] * (like.ndim - 2))
+        return law.energy(jnp.broadcast_to(column, like.shape))
+
+    one, other = energy(stretch), energy(turn(0.5) @ stretch @ turn(0.8).T)
+    size = jnp.maximum(jnp.abs(one), jnp.abs(other))
+    return ~(jnp.abs(one - other) > _ANISOTROPIC * size)

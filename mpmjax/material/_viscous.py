@@ -4,8 +4,7 @@ from typing import Any
 
 from mpmjax._types import Array, Deformation, Float, PerParticle, Scalar
 from mpmjax.checks import require, require_between, require_fields
-from mpmjax.material._kinematics import AbstractKinematics
-from mpmjax.material._law import AbstractElastic, AbstractLaw, Viscosity
+from mpmjax.material._law import AbstractLaw, AbstractMaterial, DeformationMeasure, Viscosity
 
 
 class Viscous(AbstractLaw):
@@ -43,25 +42,25 @@ class Viscous(AbstractLaw):
         require_between("Viscous's shear_viscosity [Pa s]", self.shear_viscosity, 0, float("inf"))
         require_between("Viscous's bulk_viscosity [Pa s]", self.bulk_viscosity, 0, float("inf"))
 
-    @property
-    def viscosity(self) -> Viscosity:
-        """The viscosity without the law."""
+    def viscous_part(self) -> Viscosity:
         return Viscosity(self.shear_viscosity, self.bulk_viscosity)
 
-    @property
-    def kinematics(self) -> AbstractKinematics:
-        return self.law.kinematics
+    # all else is the law's
 
     @property
-    def allows_total(self) -> bool:
+    def measure(self) -> DeformationMeasure:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.law.measure
+
+    @property
+    def allows_total(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.law.allows_total
 
     @property
-    def allows_averaged_volume(self) -> bool:
+    def allows_averaged_volume(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.law.allows_averaged_volume
 
     @property
-    def relaxes_stress(self) -> bool:
+    def relaxes_stress(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.law.relaxes_stress
 
     def hardly_changes_volume(self) -> bool:
@@ -76,14 +75,11 @@ class Viscous(AbstractLaw):
     def remembers(self, history: Any, stored: Array) -> bool:
         return self.law.remembers(history, stored)
 
-    def elastic(self, history: Any) -> AbstractElastic:
+    def elastic(self, history: Any) -> AbstractMaterial:
         return self.law.elastic(history)
 
     def return_map(self, F: Deformation, history: Any, dt: Scalar) -> tuple[Deformation, Any]:
         return self.law.return_map(F, history, dt)
-
-    def viscous_part(self) -> Viscosity:
-        return self.viscosity
 
     def title(self) -> str:
         return self.law.title()

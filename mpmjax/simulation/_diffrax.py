@@ -79,7 +79,7 @@ def faulty_particles(problem: Problem, state: State, t: Scalar) -> dict[Fault, B
     admitted = jnp.concatenate([points.is_admissible(points.deformation) for points in materials])
     faults = {Fault.NOT_FINITE: ~finite, Fault.OUTSIDE: finite & outside, Fault.INADMISSIBLE: finite & ~admitted}
     if not scene.total:  # there forces are made of P, here of P Fᵀ, which vanishes with F: nothing opens what collapsed
-        kept = [points.law.kinematics.collapsed(points.deformation, LEAST_STRETCH) for points in materials]
+        kept = [points.law.measure.collapsed(points.deformation, LEAST_STRETCH) for points in materials]
         faults[Fault.COLLAPSED] = finite & jnp.concatenate(kept)
     return faults
 

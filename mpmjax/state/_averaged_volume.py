@@ -10,7 +10,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix
 from mpmjax.checks import as_plain, require, require_fields
 from mpmjax.discretisation import BSpline, Grid, SplineGradient, Stencil, gather, make_stencil, scatter
-from mpmjax.material import AbstractElastic
+from mpmjax.material import AbstractMaterial
 from mpmjax.potential import AbstractStiffness, Displacement, Forces, Mirror
 
 
@@ -132,7 +132,7 @@ class AveragedDeformation(eqx.Module):
         """F̄ = s F [-], shape (d, d, q)."""
         return self.scale * self.F
 
-    def admitted(self, law: AbstractElastic) -> Bool[Array, "q"]:
+    def admitted(self, law: AbstractMaterial) -> Bool[Array, "q"]:
         """Whether det F is positive and the law admits F̄."""
         return (self.ratio > 0) & (self.mean > 0) & law.is_admissible(self.averaged)
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix
-from mpmjax.material import AbstractElastic, AbstractTangent, Viscosity
+from mpmjax.material import AbstractMaterial, AbstractTangent, Viscosity
 from mpmjax.native import stored
 from mpmjax.potential import AbstractStiffness
 from mpmjax.state._averaged_volume import AveragedTangent, VolumeAverage, averaged_deformation
@@ -16,7 +16,7 @@ from mpmjax.state._averaged_volume import AveragedTangent, VolumeAverage, averag
 class MaterialPoints(eqx.Module):
     """The particles of one material, which pay for their own law only."""
 
-    law: AbstractElastic
+    law: AbstractMaterial
     """The elastic law in force, frozen in the step."""
     volume: Float[Array, "q"]
     """V0 [m^d], shape (q,)."""
@@ -49,7 +49,7 @@ class MaterialPoints(eqx.Module):
     def tangent(
         self,
         F: Deformation,
-        of_law: Callable[[AbstractElastic, Deformation], Callable[[Deformation], Deformation]],
+        of_law: Callable[[AbstractMaterial, Deformation], Callable[[Deformation], Deformation]],
         *,
         definite: bool = False,
     ) -> Callable[[Deformation], Deformation]:
@@ -78,13 +78,13 @@ class MaterialPoints(eqx.Module):
     def change(self, gradient: Matrix) -> Deformation:
         """δF [-] by the gradient ∇u of a displacement, shape (d, d, q): ∇u F, in the total description ∇u; δJ is
         tr(∇u) J."""
-        return gradient if self.total else self.law.kinematics.change(gradient, self.deformation)
+        return gradient if self.total else self.law.measure.change(gradient, self.deformation)
 
     def flux(self, P: Deformation, dim: int) -> Matrix:
         """The flux of a stress P [J], shape (d, d, q), V0 P Fᵀ, of which the force is the sum, f_i = −Σ_p (V0 P Fᵀ)
         g_ip: the transpose of `change`. In the total description V0 P; by P = dΨ/dJ it is V0 P J I."""
         P = stored(self.volume * P)
-        return P if self.total else self.law.kinematics.flux(P, self.deformation, dim)
+        return P if self.total else self.law.measure.kirchhoff_stress(P, self.deformation, dim)
 
     def stiffness(
         self, tangent: Callable[[Deformation], Deformation], dim: int
@@ -114,7 +114,7 @@ class MaterialPoints(eqx.Module):
 
     def volume_ratio(self) -> Float[Array, "q"]:
         """J = det F [-], shape (q,)."""
-        return self.law.kinematics.determinant(self.deformation)
+        return self.law.measure.determinant(self.deformation)
 
     def stiffest(self, dim: int) -> Float[Array, "q"]:
         """Λ of each particle [Pa], shape (q,) (see `stable_dt`). Where volumes are averaged, the larger of Λ and its
@@ -138,6 +138,6 @@ class MaterialPoints(eqx.Module):
 
 
 @eqx.filter_jit  # a law may hold functions
-def _stress(law: AbstractElastic, F: Deformation) -> Deformation:
+def _stress(law: AbstractMaterial, F: Deformation) -> Deformation:
     """The stress of a law, compiled as one function so that it is traced once."""
     return law.stress(F)

@@ -145,7 +145,7 @@ def _prepared(law: AbstractLaw, group: Group, particles: Particles) -> tuple[Arr
         f"{sorted(shapes - fitting)}. What has another shape, as a network's weights, belongs in an equinox.Module "
         "within the law.",
     )
-    kept = law.kinematics
+    kept = law.measure
     undeformed = jnp.asarray(kept.undeformed(particles.dim), particles.x.dtype)
     shape = (stop - start, *undeformed.shape)
     stored = jnp.broadcast_to(undeformed, shape) if group.stored is None else group.stored
@@ -172,7 +172,7 @@ def is_prepared(scene: Scene, particles: Particles) -> bool:
 
 def _fits(law: AbstractLaw, group: Group, dim: int) -> bool:
     """Whether deformation and history of one material's particles are of the shapes that the law needs."""
-    if group.stored is None or group.stored.shape[1:] != law.kinematics.undeformed(dim).shape:
+    if group.stored is None or group.stored.shape[1:] != law.measure.undeformed(dim).shape:
         return False
     return law.remembers(group.history, group.stored)
 
@@ -222,7 +222,7 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
             f"nothing says how it turns: give material {body.number} more of them.",
         )
     for points in scene.material_points(particles):
-        kept = points.law.kinematics
+        kept = points.law.measure
         allowed = np.asarray(_admissible(points))
         first = int(np.argmin(allowed)) + points.rows[0]
         require(

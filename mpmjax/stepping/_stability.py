@@ -214,7 +214,7 @@ def _straining(scene: Scene, particles: Particles, nodes: Nodes) -> Float[Array,
     _, slopes = gather(nodes.potential.stencil, nodes.mirror.unfold(a))
     rates = la.symmetric_eigen((slopes + la.transpose(slopes)) / 2)[0]
     each = zip(scene.laws, particles.groups, strict=True)
-    own = [(law.kinematics.axes, rates[:, slice(*group.rows)]) for law, group in each]
+    own = [(law.measure.axes, rates[:, slice(*group.rows)]) for law, group in each]
     return jnp.concatenate([jnp.abs(r).max(axis=0) if axes else jnp.abs(r.sum(axis=0)) for axes, r in own])
 
 

@@ -9,6 +9,8 @@ from mpmjax.verification._exact_problem import (
     Manufactured as Manufactured,
     discretise as discretise,
     displacement_error as displacement_error,
+    errors as errors,
+    orders as orders,
     stress_error as stress_error,
 )
 from mpmjax.verification._motions import (
@@ -19,4 +21,3 @@ from mpmjax.verification._motions import (
     VibratingBar as VibratingBar,
     Vortex as Vortex,
 )
-from mpmjax.verification._refinement import errors as errors, orders as orders

@@ -10,7 +10,7 @@ import numpy as np
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix
 from mpmjax.checks import canonical, require, require_positive
-from mpmjax.material import AbstractLaw, AbstractMaterial
+from mpmjax.material import AbstractLaw, AbstractMaterial, MatrixTangent
 
 _CHECKED = (
     "the energy",
@@ -58,9 +58,9 @@ def check_law(law: AbstractLaw, *, dim: int = 3, F: Any = None, rtol: float = 1e
         )
         place = jnp.moveaxis(gradients, 0, -1)
         typed: AbstractLaw = canonical(law, place.dtype)
-        elastic = typed.elastic(typed.initial_history(typed.kinematics.of(place)))
-        of_gradient: Any = elastic.of_gradient()
-        faults = eqx.filter_jit(_faults)(of_gradient, place)
+        elastic = typed.elastic(typed.initial_history(typed.measure.of(place)))
+        by_gradient: Any = elastic if elastic.measure.axes else _OfVolume(elastic)
+        faults = eqx.filter_jit(_faults)(by_gradient, place)
     admitted, told = np.asarray(faults[0]), type(elastic).__name__
     require(admitted.any(), f"{told} admits none of check_law's {len(admitted)} deformations: give some by F.")
     for what, wrong in zip(_CHECKED, faults[1], strict=False):
@@ -69,6 +69,30 @@ def check_law(law: AbstractLaw, *, dim: int = 3, F: Any = None, rtol: float = 1e
         where = f"at F = {np.array2string(np.asarray(gradients[worst]), precision=6, separator=', ')}".replace("\n", "")
         require(not np.isnan(wrong[worst]), f"{told}: {what} is not finite {where}.")
         require(wrong[worst] <= rtol, f"{told}: {what} is off by {wrong[worst]:.2g} of its size {where}.")
+
+
+class _OfVolume(AbstractMaterial):
+    """A law of J alone as a function of F: Ψ(det F), P = Ψ' J F⁻ᵀ."""
+
+    law: Any
+
+    def energy(self, F: Matrix) -> Array:
+        return self.law.energy(la.determinant(F))
+
+    def stress(self, F: Matrix) -> Matrix:
+        return self.law.stress(la.determinant(F)) * la.cofactor(F)
+
+    def tangent(self, F: Matrix) -> MatrixTangent:
+        J, cofactor = la.determinant(F), la.cofactor(F)
+
+        def differential(dF: Matrix) -> Matrix:
+            change = self.law.tangent(J)(la.double_dot(cofactor, dF))
+            return change * cofactor + self.law.stress(J) * la.cofactor_differential(F, dF)
+
+        return MatrixTangent(la.matrix_of(differential, F))
+
+    def is_admissible(self, F: Matrix) -> Array:
+        return self.law.is_admissible(la.determinant(F))
 
 
 def _faults(law: AbstractMaterial, F: Matrix) -> tuple[Bool[Array, "p"], tuple[Float[Array, "p"], ...]]:

@@ -1,14 +1,16 @@
-"""Problems with an exact motion, their discretisation and their errors."""
+"""Problems with an exact motion, their discretisation, their errors, and these under refinement."""
 
 import abc
 import enum
+import itertools
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mpmjax._types import Array, Float, ParticleVector, Scalar
 from mpmjax.boundary import AbstractBoundary, SlipBox, SymmetryPlane
@@ -16,10 +18,12 @@ from mpmjax.checks import require
 from mpmjax.discretisation import Grid
 from mpmjax.geometry import AbstractRegion
 from mpmjax.material import AbstractMaterial
-from mpmjax.simulation import Run
+from mpmjax.simulation import Run, simulate
 from mpmjax.state import AbstractBodyForce, Particles, Scene, State, UpdatedLagrangian, fill
+from mpmjax.stepping import AbstractIntegrator, Explicit
 
 _MARGIN = 4  # nodes beyond the domain, for the widest stencil and some motion
+_SAMPLES = 10
 
 
 class Ends(enum.Enum):
@@ -43,7 +47,7 @@ class AbstractProblem(eqx.Module):
     material: eqx.AbstractVar[AbstractMaterial]
     density: eqx.AbstractVar[float]
     dim: eqx.AbstractVar[int]
-    forced: eqx.AbstractVar[bool]
+    forced: ClassVar[bool] = True
     """Whether the motion needs the body force."""
 
     @abc.abstractmethod
@@ -77,6 +81,12 @@ class AbstractProblem(eqx.Module):
         """Speed of pressure waves at rest, c = √((λ + 2μ) / ρ0) [m/s]."""
         law: Any = self.material
         return math.sqrt(float(law.lame_lambda + 2 * law.shear_modulus) / self.density)
+
+    @property
+    def bar_speed(self) -> Any:
+        """Speed of waves in a thin bar at rest, c = √(E / ρ0) [m/s]."""
+        law: Any = self.material
+        return (law.youngs_modulus / self.density) ** 0.5
 
     def velocity(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
         """∂x/∂t [m/s], shape (d,)."""
@@ -119,10 +129,8 @@ def box_grid(lower: tuple[float, ...], upper: tuple[float, ...], cells: int, end
 def box_boundary(lower: tuple[float, ...], upper: tuple[float, ...], ends: Ends) -> tuple[AbstractBoundary, ...]:
     """The boundaries of a box whose faces do not move along their normals."""
     if ends is Ends.MIRRORED:
-        sides = (
-            (a, place, keep) for a in range(len(lower)) for place, keep in ((lower[a], "above"), (upper[a], "below"))
-        )
-        return tuple(SymmetryPlane(axis, place, keep=keep) for axis, place, keep in sides)
+        sides = itertools.product(range(len(lower)), ((lower, "above"), (upper, "below")))
+        return tuple(SymmetryPlane(axis, corner[axis], keep=keep) for axis, (corner, keep) in sides)
     return (SlipBox(lower, upper),) if ends is Ends.PLAIN else ()
 
 
@@ -181,13 +189,8 @@ def _frames_and_shares(particles: Particles, run: Run) -> tuple[State, Array, Ar
 
 
 def displacement_error(problem: AbstractProblem, particles: Particles, run: Run) -> Float[Array, "f"]:
-    """√(Σ V0 ‖x − x(X, t)‖² / Σ V0) [m] at each saved frame, shape (f,).
-
-    Args:
-        problem: the problem.
-        particles: the particles from `discretise`, with X.
-        run: the run, with frames.
-    """
+    """√(Σ V0 ‖x − x(X, t)‖² / Σ V0) [m] at each saved frame, shape (f,), by the particles from `discretise`, with X,
+    and a run with frames."""
     frames, X, share = _frames_and_shares(particles, run)
 
     def at(frame: tuple[Array, Array]) -> Array:
@@ -199,14 +202,8 @@ def displacement_error(problem: AbstractProblem, particles: Particles, run: Run)
 
 
 def stress_error(problem: AbstractProblem, particles: Particles, run: Run) -> Float[Array, "f"]:
-    """Σ V0 ‖P − P(X, t)‖ / Σ V0 [Pa] at each saved frame, shape (f,), with P the first Piola-Kirchhoff
-    stress.
-
-    Args:
-        problem: the problem.
-        particles: the particles from `discretise`, with X.
-        run: the run, with frames.
-    """
+    """Σ V0 ‖P − P(X, t)‖ / Σ V0 [Pa] at each saved frame, shape (f,), with P the first Piola-Kirchhoff stress,
+    by the particles from `discretise`, with X, and a run with frames."""
     frames, X, share = _frames_and_shares(particles, run)
 
     def at(frame: tuple[Array, Array]) -> Array:
@@ -216,3 +213,52 @@ def stress_error(problem: AbstractProblem, particles: Particles, run: Run) -> Fl
         return (share * jnp.sqrt((miss**2).sum(axis=(1, 2)))).sum()
 
     return jax.lax.map(at, (frames.F, run.times))
+
+
+Measure = Callable[[AbstractProblem, Particles, Run], Float[Array, "f"]]
+"""The error of a run of a problem at each saved frame, shape (f,)."""
+
+
+def errors(
+    problem: AbstractProblem,
+    cells: Sequence[int],
+    *,
+    courant: float | Sequence[float],
+    method: AbstractIntegrator = Explicit(),
+    staggered: bool | None = None,
+    measure: Measure = displacement_error,
+    **discretisation: Any,
+) -> np.ndarray:
+    """The displacement error on each grid [m], or another: the largest at ten times, evenly spaced over the duration.
+
+    The error of a run that fails is infinite.
+
+    Args:
+        problem: the problem.
+        cells: grid cells to a metre, for each grid.
+        courant: Δt c/dx with c the pressure-wave speed at rest, for all grids or for each. It is rounded down so that
+            ten whole numbers of steps fill the duration.
+        method: the integrator.
+        staggered: whether initial velocities are those half a step before the start (see `discretise`). Default: yes,
+            except with methods of second order, whose velocities are at the time of the positions.
+        measure: the error of a run at each saved frame: `displacement_error`, `stress_error`, or one's own.
+        discretisation: further arguments of `discretise`, with `rest` particles of one's own.
+    """
+
+    def error(n: int, number: float) -> float:
+        longest = number / (n * problem.wave_speed)
+        every = max(1, math.ceil(problem.duration / _SAMPLES / longest - 1e-9))
+        dt = problem.duration / (_SAMPLES * every)
+        start = -dt / 2 if staggered or (staggered is None and method.body_force_at == 0) else 0.0
+        scene, particles = discretise(problem, n, velocity_time=start, **discretisation)
+        run = simulate(scene, particles, t1=problem.duration, dt=dt, method=method, save_every=every, throw=False)
+        worst = float(measure(problem, particles, run).max())
+        return worst if bool(run.statistics.healthy) and math.isfinite(worst) else math.inf
+
+    numbers = [courant] * len(cells) if isinstance(courant, (int, float)) else courant
+    return np.array([error(n, number) for n, number in zip(cells, numbers, strict=True)])
+
+
+def orders(errors: np.ndarray, cells: Sequence[int]) -> np.ndarray:
+    """The observed order between successive grids, log(e₁/e₂) / log(n₂/n₁)."""
+    return np.log(errors[:-1] / errors[1:]) / np.log(np.divide(cells[1:], cells[:-1]))

@@ -1,7 +1,7 @@
 """Problems whose motion is known: of boxes, bars, rings, vortices and waves; and the collision of two disks."""
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -38,16 +38,15 @@ class AxisAligned(AbstractProblem):
     ends: Ends = eqx.field(static=True, default=Ends.PERIODIC)
     material: AbstractMaterial = NeoHookean(1e7, 0.3)
     density: float = 1e3
-    forced: bool = eqx.field(static=True, default=True)
 
     @property
     def duration(self) -> float:
         """One period, 2/c [s]."""
-        return 2 / float(self._speed)
+        return 2 / float(self.bar_speed)
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
         phase = jnp.pi * jnp.asarray(_PHASES[self.dim], X.dtype)
-        return X + self.amplitude * jnp.sin(jnp.pi * X) * jnp.sin(jnp.pi * self._speed * t + phase)
+        return X + self.amplitude * jnp.sin(jnp.pi * X) * jnp.sin(jnp.pi * self.bar_speed * t + phase)
 
     def grid(self, cells: int) -> Grid:
         return box_grid(*self._corners(), cells, self.ends)
@@ -58,11 +57,6 @@ class AxisAligned(AbstractProblem):
 
     def boundary(self) -> tuple[AbstractBoundary, ...]:
         return box_boundary(*self._corners(), self.ends)
-
-    @property
-    def _speed(self) -> Any:
-        law: Any = self.material
-        return (law.youngs_modulus / self.density) ** 0.5
 
     def _corners(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         return ((-1.0 if self.ends is Ends.PERIODIC else 0.0),) * self.dim, (1.0,) * self.dim
@@ -80,13 +74,13 @@ class VibratingBar(AbstractProblem):
         length: length L of the bar [m].
     """
 
+    forced: ClassVar[bool] = False
     speed: float = 0.1
     mode: int = eqx.field(static=True, default=1)
     length: float = eqx.field(static=True, default=25.0)
     material: AbstractMaterial = FixedCorotated(100.0, 0.0)
     density: float = 1.0
     dim: int = eqx.field(static=True, default=1)
-    forced: bool = eqx.field(static=True, default=False)
 
     @property
     def wave_number(self) -> float:
@@ -141,18 +135,17 @@ class ExpandingRing(AbstractProblem):
     material: AbstractMaterial = NeoHookean(1e7, 0.0)
     density: float = 1e3
     dim: int = eqx.field(static=True, default=2)
-    forced: bool = eqx.field(static=True, default=True)
 
     @property
     def duration(self) -> float:
         """One period, 2/c [s]."""
-        return 2 / float(self._speed)
+        return 2 / float(self.bar_speed)
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
         a, b = self.inner, self.outer
         R = jnp.sqrt((X**2).sum())
         over = (6 * a * b - 3 * (a + b) * R + 2 * R**2) / (a**2 * (3 * b - a))
-        return X * (1 + self.amplitude * jnp.sin(jnp.pi * self._speed * t) * over)
+        return X * (1 + self.amplitude * jnp.sin(jnp.pi * self.bar_speed * t) * over)
 
     def grid(self, cells: int) -> Grid:
         return box_grid((-1.0,) * 2, (1.0,) * 2, cells, Ends.PLAIN)
@@ -160,11 +153,6 @@ class ExpandingRing(AbstractProblem):
     def body(self, cells: int) -> Annulus:
         del cells
         return Annulus((0.0, 0.0), self.inner, self.outer)
-
-    @property
-    def _speed(self) -> Any:
-        law: Any = self.material
-        return (law.youngs_modulus / self.density) ** 0.5
 
 
 _VORTEX_RING = Annulus((0.0, 0.0), 0.75, 1.25)
@@ -199,7 +187,6 @@ class Vortex(AbstractProblem):
     material: AbstractMaterial = NeoHookean(1e3, 0.3)
     density: float = 1e3
     dim: int = eqx.field(static=True, default=2)
-    forced: bool = eqx.field(static=True, default=True)
 
     @property
     def duration(self) -> float:
@@ -238,12 +225,12 @@ class StandingWave(AbstractProblem):
         ends: boundary at X₁ = 0 and 1.
     """
 
+    forced: ClassVar[bool] = False
     amplitude: float = 0.05
     dim: int = eqx.field(static=True, default=1)
     ends: Ends = eqx.field(static=True, default=Ends.MIRRORED)
     material: AbstractMaterial = FixedCorotated(1e4, 0.3)
     density: float = 1e3
-    forced: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
         require(isinstance(self.material, FixedCorotated), "The standing wave is exact for FixedCorotated only.")
@@ -255,8 +242,7 @@ class StandingWave(AbstractProblem):
         return 1 / self.wave_speed
 
     def position(self, X: Float[Array, "d"], t: Scalar) -> Float[Array, "d"]:
-        law = self.material
-        assert isinstance(law, FixedCorotated)
+        law: Any = self.material
         c = jnp.sqrt(jnp.asarray(law.lame_lambda + 2 * law.shear_modulus) / self.density)
         return X.at[0].add(self.amplitude * jnp.sin(jnp.pi * X[0]) * jnp.cos(jnp.pi * c * t))
 
@@ -275,14 +261,10 @@ class StandingWave(AbstractProblem):
         return Box((low, *(0.0,) * across), (high, *(_ACROSS / cells,) * across))
 
     def boundary(self) -> tuple[AbstractBoundary, ...]:
-        match self.ends:
-            case Ends.MIRRORED:
-                return (SymmetryPlane(0, 0.0), SymmetryPlane(0, 1.0, keep="below"))
-            case Ends.PLAIN:
-                across = (math.inf,) * (self.dim - 1)
-                return (SlipBox((0.0, *(-a for a in across)), (1.0, *across)),)
-            case Ends.PERIODIC:
-                return ()
+        if self.ends is Ends.PLAIN:
+            across = (math.inf,) * (self.dim - 1)
+            return (SlipBox((0.0, *(-a for a in across)), (1.0, *across)),)
+        return box_boundary((0.0,), (1.0,), self.ends)
 
     def _ends(self) -> tuple[float, float]:
         return (-1.0 if self.ends is Ends.PERIODIC else 0.0), 1.0
@@ -317,25 +299,14 @@ class TwoDisks(eqx.Module):
     def discretise(
         self, cells: int = 20, *, per_side: int = 2, fitted: bool = False, **choices: Any
     ) -> tuple[Scene, Particles]:
-        """Scene and particles, with `cells` grid cells to a metre and `per_side` particles to the side of a cell.
-
-        Args:
-            cells: grid cells to a metre.
-            per_side: particles to the side of a cell.
-            fitted: whether they are fitted to the circles (see `fill`).
-            choices: kernel, gradient and transfer of the scene.
-        """
+        """Scene and particles, with `cells` grid cells to a metre and `per_side` particles to the side of a cell,
+        `fitted` to the circles or not (see `fill`), and choices of kernel, gradient and transfer."""
         half = round(0.75 * cells)
         grid = Grid((2 * half + 1,) * 2, 1 / cells, origin=(-half,) * 2)
         disks = [
-            fill(
-                Ball((side * self.centre,) * 2, self.radius),
-                grid,
-                particles_per_cell=per_side**2,
-                density=self.density,
-                velocity=(-side * self.speed,) * 2,
-                fitted=fitted,
+            fill(ball, grid, particles_per_cell=per_side**2, density=self.density, velocity=velocity, fitted=fitted)
+            for ball, velocity in (
+                (Ball((side * self.centre,) * 2, self.radius), (-side * self.speed,) * 2) for side in (-1, 1)
             )
-            for side in (-1, 1)
         ]
         return Scene(grid, self.material, **choices), jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *disks)

@@ -1,9 +1,11 @@
-"""The surface of a region as small flat pieces, for what acts on surfaces."""
+"""Regions on lattices: the parts of cells that lie inside, and the surface as small flat pieces."""
 
 import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -11,12 +13,108 @@ from mpmjax._types import Array, Float
 from mpmjax.checks import canonical, require, require_memory
 from mpmjax.geometry._region import AbstractRegion
 
+_BATCH = 4096
+"""Points that are computed together: one compiled program serves any number of them."""
+_HALVINGS = 2
+"""How often a cell that the surface cuts is halved in each direction, before the surface is taken as a plane."""
+_LINES = 4
+"""Lines across a cell, in each direction, along which the plane is cut."""
 _ON_IT = 1e-9
 """Distance within which a point is on a surface, in spacings."""
 _ROUNDINGS = 8.0
 """The least such distance, in roundings of the greatest coordinate."""
-_BATCH = 4096
-"""Number of points that are computed together, so that one compiled program serves any number."""
+
+
+def _batched(
+    function: Callable[[AbstractRegion, Array], tuple[Array, ...]], region: AbstractRegion, x: np.ndarray
+) -> list[np.ndarray]:
+    """The arrays that a compiled function of a region and of points [m], shape (m, d), gives, a row for each point."""
+    dtype = jnp.result_type(float)
+    batches = np.zeros((max(1, -(-len(x) // _BATCH)), _BATCH, x.shape[1]), dtype)
+    batches.reshape(-1, x.shape[1])[: len(x)] = x
+    region = canonical(region, dtype)
+    results = [function(region, jnp.asarray(batch)) for batch in batches]
+    return [np.concatenate(parts).astype(float)[: len(x)] for parts in zip(*results, strict=True)]
+
+
+@eqx.filter_jit
+def _distance_and_gradient(
+    region: AbstractRegion, x: Float[Array, "m d"]
+) -> tuple[Float[Array, "m"], Float[Array, "m d"]]:
+    distance, pull = jax.vjp(region.distance, x)
+    return distance, pull(jnp.ones_like(distance))[0]
+
+
+@eqx.filter_jit
+def _sides_of(region: AbstractRegion, x: Float[Array, "m d"]) -> tuple[Float[Array, "m k"]]:
+    return (region.sides(x),)
+
+
+def inside_parts(region: AbstractRegion, centres: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The share of each cell that lies inside a region, and the centroid of that part.
+
+    Cells cut by the surface are halved in each direction, again where they are still cut; in the smallest the surface
+    is the tangent plane φ + ∇φ·y = 0. A surface of mean curvature κ is then off by about κ (h/4)²/24 for cells of size
+    h, and an edge by a part of the smallest cells along it: volumes are of second order in h.
+
+    Args:
+        region: the region.
+        centres: the centres of the cells [m], shape (m, d).
+        size: the sides of a cell [m], shape (d,).
+
+    Returns:
+        share of each cell [-], shape (m,), and centroids [m], shape (m, d), of cells without a part their centres.
+    """
+    moments = _moments(region, centres, size, _HALVINGS)
+    share = np.clip(moments[:, 0], 0, 1)
+    return share, centres + moments[:, 1:] / np.where(share > 0, share, 1)[:, None]
+
+
+def _moments(region: AbstractRegion, centres: np.ndarray, size: np.ndarray, halvings: int) -> np.ndarray:
+    """∫ (1, y) dy over the part of each cell that is inside, over the cell's volume, shape (m, 1 + d); y from the
+    centre."""
+    d = len(size)
+    distance, normal = _batched(_distance_and_gradient, region, centres)
+    reach = np.linalg.norm(size) / 2
+    moments = np.zeros((len(centres), 1 + d))
+    moments[distance <= -reach, 0] = 1
+    cut = np.abs(distance) < reach
+    if not cut.any():
+        return moments
+    if halvings == 0:
+        moments[cut] = _by_plane(distance[cut], normal[cut] * size, size)
+        return moments
+    offsets = np.array(list(itertools.product((-0.25, 0.25), repeat=d))) * size
+    children = (centres[cut, None] + offsets).reshape(-1, d)
+    parts = _moments(region, children, size / 2, halvings - 1).reshape(-1, 2**d, 1 + d)
+    parts[..., 1:] += parts[..., :1] * offsets
+    moments[cut] = parts.mean(axis=1)
+    return moments
+
+
+def _by_plane(distance: np.ndarray, normal: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """`_moments` of cells in which the surface is a plane, along lines in the direction nearest to its normal, by φ at
+    the centres [m], shape (m,), and ∇φ [-] times the sides of the cell [m], shape (m, d)."""
+    d = len(size)
+    rows, along = np.arange(len(distance)), np.abs(normal).argmax(axis=1)
+    places = (np.arange(_LINES) + 0.5) / _LINES - 0.5
+    across = np.array(list(itertools.product(places, repeat=d - 1))).reshape(_LINES ** (d - 1), d - 1)  # in sides
+    beside = np.array([[b for b in range(d) if b != a] for a in range(d)], int)[along]
+    slope = normal[rows, along]
+    height = distance[:, None] + np.einsum("mb,lb->ml", np.take_along_axis(normal, beside, axis=1), across)
+    crossing = np.clip(-height / np.where(slope == 0, 1, slope)[:, None], -0.5, 0.5)
+    up = (slope > 0)[:, None]  # inside lies below the crossing
+    length = np.where(up, crossing + 0.5, 0.5 - crossing)
+    moment = np.where(up, 1, -1) * (crossing**2 - 0.25) / 2
+    flat = (slope == 0)[:, None]  # no direction: inside as its centre is
+    length, moment = np.where(flat, distance[:, None] <= 0, length), np.where(flat, 0, moment)
+    moments = np.zeros((len(distance), 1 + d))
+    moments[:, 0] = length.mean(axis=1)
+    moments[rows, 1 + along] = moment.mean(axis=1) * size[along]
+    for number in range(d - 1):
+        axis = beside[:, number]
+        moments[rows, 1 + axis] = (length * across[:, number]).mean(axis=1) * size[axis]
+    return moments
 
 
 class Pieces(NamedTuple):
@@ -106,17 +204,8 @@ def _sized(pieces: Pieces, spacing: float) -> Pieces:
 
 def _sides(region: AbstractRegion, x: np.ndarray, near: float) -> np.ndarray:
     """The region's `sides` at points x [m], shape (m, d), shape (m, k); zero where they are not more than `near`."""
-    dtype = jnp.result_type(float)
-    batches = np.zeros((max(1, -(-len(x) // _BATCH)), _BATCH, x.shape[1]), dtype)
-    batches.reshape(-1, x.shape[1])[: len(x)] = x
-    region = canonical(region, dtype)
-    distance = np.concatenate([np.asarray(_batch(region, jnp.asarray(batch)), float) for batch in batches])[: len(x)]
+    (distance,) = _batched(_sides_of, region, x)
     return np.where(np.abs(distance) <= near, 0, distance)
-
-
-@eqx.filter_jit
-def _batch(region: AbstractRegion, x: Float[Array, "m d"]) -> Float[Array, "m k"]:
-    return region.sides(x)
 
 
 def _simplices(points: np.ndarray, values: np.ndarray):
@@ -181,14 +270,8 @@ def _sorted(corners: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _crossings(corners: np.ndarray, values: np.ndarray, edges: list[tuple[int, int]]) -> np.ndarray:
-    """Points at which edges cross the surface [m], shape (m, number of edges, d). An edge from a corner to itself gives
-    the corner.
-
-    Args:
-        corners: corners of simplices or pieces [m], shape (m, k, d).
-        values: the values at the corners [m], shape (m, k).
-        edges: numbers of the two corners of each edge, one inside and one outside.
-    """
+    """Points at which edges cross the surface [m], shape (m, number of edges, d). An edge has the numbers of a corner
+    inside and one outside; from a corner to itself it gives the corner."""
 
     def crossing(i: int, j: int) -> np.ndarray:
         a, b = values[:, i, None], values[:, j, None]
@@ -203,8 +286,8 @@ def _pieces(d: int, inner: range, outer: range) -> list[list[tuple[int, int]]]:
     edges = list(itertools.product(inner, outer))
     if len(edges) == d:
         return [edges]
-    (a, c), (b, e) = (inner[0], outer[0]), (inner[1], outer[1])  # two corners inside and two outside, in 3-D
-    return [[(a, c), (a, e), (b, e)], [(a, c), (b, e), (b, c)]]
+    first, second, third, fourth = edges  # two corners inside and two outside, in 3-D
+    return [[first, second, fourth], [first, fourth, third]]
 
 
 def _area(corners: np.ndarray) -> np.ndarray:
