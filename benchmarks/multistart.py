@@ -27,9 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import mpmjax as mpm
+from mpmjax.fitting._multistart import linked, starting_points, unit_points
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._search import Problems, begin, iterate_together
-from mpmjax.fitting._starting_points import linked, starting_points, unit_points
 
 NOISE = 1e-4
 PARAMETERS = {

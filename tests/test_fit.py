@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import mpmjax as mpm
+from mpmjax.fitting._observation import between
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._refined import _extrapolate, _missed
 from mpmjax.fitting._result import Estimate, NoiseEstimate
 from mpmjax.fitting._search import iterate, search
-from mpmjax.fitting._series import between
+from mpmjax.fitting._sequence import _extrapolate, _missed
 
 DT, STEPS, NOISE = 4e-3, 15, 1e-4
 

@@ -18,8 +18,7 @@ import pytest
 
 import mpmjax as mpm
 from mpmjax.fitting import _search
-from mpmjax.fitting._fit import iterations_left
-from mpmjax.fitting._log import _read, described
+from mpmjax.fitting._log import _read, described, iterations_left
 
 DT, STEPS = 4e-3, 12
 PARAMETERS = {

@@ -10,10 +10,9 @@ import pytest
 from test_fit import DT, NOISE, STEPS, STIFFNESS, bar, experiment, tracks
 
 import mpmjax as mpm
-from mpmjax.fitting._multistart import costs_at
+from mpmjax.fitting._multistart import costs_at, critical_distance, linked, starting_points, unit_points
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._search import Problems, search, search_many
-from mpmjax.fitting._starting_points import critical_distance, linked, starting_points, unit_points
 
 LM = mpm.fitting.LevenbergMarquardt()
 TIMES = np.linspace(0.001, 0.05, 40)

@@ -8,7 +8,7 @@ from test_fit import DT, NOISE, STEPS, STIFFNESS, bar, experiment, tracks
 
 import mpmjax as mpm
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._staged import _first_horizon, _limits
+from mpmjax.fitting._sequence import _first_horizon, _limits
 from mpmjax.verification import VibratingBar, discretise
 
 EXACT, PERIODS, FRAMES = VibratingBar(), 4, 40

@@ -76,11 +76,7 @@ MostSeconds = Annotated[
 
 
 def _import(modules: list[str] | None) -> None:
-    """Import modules, each by its name or by the path of its .py file: files know what they register from then on.
-
-    Raises:
-        ValueError: there is no such module or file, or its code fails.
-    """
+    """Import modules, each by its name or by the path of its .py file: files know what they register from then on."""
     for name in modules or []:
         path = Path(name)
         if path.suffix == ".py":
@@ -165,50 +161,47 @@ def _print_error(line: str) -> None:
 
 def _summary(simulation: Simulation, run: Run, taken: int, seconds: float) -> str:
     """The cost of a run, with `taken` of its steps done in these seconds, and how well it kept mass and energy."""
-    steps, p = int(run.statistics.steps), run.final.count
+    s, p, steps = run.statistics, run.final.count, max(int(run.statistics.steps), 1)
     before, after = energy(run.scene, simulation.particles), energy(run.scene, run.final)
-    mass = float(run.final.mass.sum())
-    lines = [
-        ("particles", f"{p}"),
-        ("steps", f"{steps} of {float(run.dt):.4g} s with {type(run.method).__name__}"),
-        ("wall time", f"{seconds:.3g} s, {taken * p / seconds:.3g} particle-steps per second, both with compilation"),
-        ("sums", f"{backend()}"),
-    ]
-    if int(run.statistics.iterations) > 0:
-        lines.append(
-            (
-                "solver",
-                f"{int(run.statistics.iterations) / steps:.3g} iterations a step, at most "
-                f"{int(run.statistics.most_iterations)}, worst relative residual "
-                f"{float(run.statistics.worst_residual):.2g}",
-            )
-        )
-    if (error := float(run.statistics.linearisation_error)) > 0:
-        lines.append(("linearisation", f"error of at most {error:.2g} of the elastic force in a step"))
-    if int(run.statistics.newton) > 0:
-        lines.append(
-            ("Newton", f"{int(run.statistics.newton) / steps:.3g} a step, {int(run.statistics.line_search)} halvings")
-        )
-    if int(run.statistics.indefinite) > 0:
-        lines.append(
-            (
-                "indefinite",
-                f"the system of {int(run.statistics.indefinite)} of {steps} steps: compressed material; if the "
-                'motion looks wrong, reduce dt or take hessian = { kind = "AnalyticHessian", projected = true }',
-            )
-        )
-    if int(run.statistics.violations) > 0:
-        lines.append(("contact", f"{int(run.statistics.violations)} conditions left violated"))
     whole, parts = pieces(run.scene, simulation.particles), pieces(run.scene, run.final)
-    if parts > whole:
-        advice = "if nothing was to part, this is numerical fracture: more particles a cell, or TotalLagrangian"
-        lines.append(("pieces", f"{whole} at the start, {parts} at the end; {advice}"))
+    mass, linearisation = float(run.final.mass.sum()), float(s.linearisation_error)
+    lost = (float(grid_mass(run.scene, run.final)) - mass) / mass
+    lines = [
+        (True, "particles", f"{p}"),
+        (True, "steps", f"{int(s.steps)} of {float(run.dt):.4g} s with {type(run.method).__name__}"),
+        (
+            True,
+            "wall time",
+            f"{seconds:.3g} s, {taken * p / seconds:.3g} particle-steps per second, both with compilation",
+        ),
+        (True, "sums", f"{backend()}"),
+        (
+            int(s.iterations) > 0,
+            "solver",
+            f"{int(s.iterations) / steps:.3g} iterations a step, at most {int(s.most_iterations)}, worst relative "
+            f"residual {float(s.worst_residual):.2g}",
+        ),
+        (linearisation > 0, "linearisation", f"error of at most {linearisation:.2g} of the elastic force in a step"),
+        (int(s.newton) > 0, "Newton", f"{int(s.newton) / steps:.3g} a step, {int(s.line_search)} halvings"),
+        (
+            int(s.indefinite) > 0,
+            "indefinite",
+            f"the system of {int(s.indefinite)} of {steps} steps: compressed material; if the motion looks wrong, "
+            'reduce dt or take hessian = { kind = "AnalyticHessian", projected = true }',
+        ),
+        (int(s.violations) > 0, "contact", f"{int(s.violations)} conditions left violated"),
+        (
+            parts > whole,
+            "pieces",
+            f"{whole} at the start, {parts} at the end; if nothing was to part, this is numerical fracture: more "
+            "particles a cell, or TotalLagrangian",
+        ),
+    ]
     for name in ("kinetic", "elastic", "potential", "total"):
         a, b = float(getattr(before, name)), float(getattr(after, name))
-        lines.append((f"{name} energy", f"{a + 0.0:.6g} J to {b + 0.0:.6g} J, change {b - a:+.3g} J"))
-    lost = (float(grid_mass(run.scene, run.final)) - mass) / mass
-    lines.append(("mass", f"{mass:.6g} kg; relative error of the grid's mass {lost:+.1e}"))
-    return "\n".join(f"{name:<18} {text}" for name, text in lines)
+        lines.append((True, f"{name} energy", f"{a + 0.0:.6g} J to {b + 0.0:.6g} J, change {b - a:+.3g} J"))
+    lines.append((True, "mass", f"{mass:.6g} kg; relative error of the grid's mass {lost:+.1e}"))
+    return "\n".join(f"{name:<18} {text}" for shown, name, text in lines if shown)
 
 
 @app.command("fit")
@@ -292,9 +285,7 @@ def _profiles(result: FitResult, names: list[str] | None, progress: Callable[[st
 def _from_a_better_start(asked: FitFile, progress: Callable[[str], None]) -> FitFile:
     """The fit, started where many searches or a fit to growing horizons ended, if the file asks for these, to the data
     that the horizons reach."""
-    common: dict[str, Any] = {"level": asked.level, "progress": progress}
-    if asked.optimiser is not None:
-        common["optimiser"] = asked.optimiser
+    common: dict[str, Any] = {"level": asked.level, "progress": progress, "optimiser": asked.optimiser}
     if asked.starts > 1:
         look = {"starts": asked.starts, "fraction": asked.fraction}
         many = fit_multistart(asked.experiments, asked.parameters, **look, **common)

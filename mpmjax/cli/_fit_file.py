@@ -4,6 +4,7 @@ words."""
 import difflib
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -17,7 +18,6 @@ from mpmjax.cli._measurements import Source, observation
 from mpmjax.cli._scene_file import Simulation, read_simulation
 from mpmjax.fitting import (
     LBFGS,
-    AbstractObservation,
     AbstractOptimiser,
     AbstractParameter,
     Adam,
@@ -30,12 +30,7 @@ from mpmjax.fitting import (
 )
 from mpmjax.io import arguments, decode
 
-_OPTIMISERS: dict[str, type[AbstractOptimiser]] = {
-    "LevenbergMarquardt": LevenbergMarquardt,
-    "LBFGS": LBFGS,
-    "Adam": Adam,
-}
-"""Kinds of [fit] optimiser."""
+_OPTIMISERS: dict[str, type[AbstractOptimiser]] = {cls.__name__: cls for cls in (LevenbergMarquardt, LBFGS, Adam)}
 
 
 class FitFile(NamedTuple):
@@ -46,14 +41,10 @@ class FitFile(NamedTuple):
     report: dict[str, Callable[[Experiment], Any]]
     level: float
     optimiser: AbstractOptimiser | None
-    starts: int
-    """Over how many points a first guess is looked for; one for none but the file's own."""
-    fraction: float
-    """The fraction of these, the best ones, from which it is searched whatever is near."""
-    horizons: tuple[float, ...] | bool
-    """Until which times it is fitted first [s]; true to choose them, false for none."""
-    refine: tuple[int, ...]
-    """On how many times as many cells a direction it is fitted besides; empty for none."""
+    starts: int  # over how many points a first guess is looked for; one for none but the file's own
+    fraction: float  # the fraction of these, the best ones, from which it is searched whatever is near
+    horizons: tuple[float, ...] | bool  # until which times it is fitted first [s]; true to choose them, false for none
+    refine: tuple[int, ...]  # on how many times as many cells a direction it is fitted besides; empty for none
     whole: tuple[Experiment, ...]
     """The experiments over the whole of their runs, with all that was measured: also what is not fitted."""
     refined: Callable[[int], tuple[tuple[Experiment, ...], tuple[Experiment, ...]]]
@@ -105,7 +96,7 @@ def read_fit(path: Path, read: Callable[[Path], Simulation] = read_simulation) -
         fitted, whole = zip(*finer, strict=True)
         return fitted, whole
 
-    reported = {name: _getter(where) for name, where in report.items()}
+    reported = {name: partial(leaf_of, where) for name, where in report.items()}
     fitted, whole = zip(*parts, strict=True)
     return FitFile(fitted, dict(named), reported, whole=whole, refined=refined, **settings)
 
@@ -148,11 +139,7 @@ def _settings(table: dict[str, Any]) -> dict[str, Any]:
 
 
 def refinements(numbers: tuple[int, ...], where: str) -> tuple[int, ...]:
-    """The refinements of a fit on several grids, from one; empty for none.
-
-    Raises:
-        ValueError: they are not growing whole numbers.
-    """
+    """The refinements of a fit on several grids, which must grow, from one; empty for none."""
     finer = tuple(n for n in numbers if n != 1)
     grow = all(a < b for a, b in zip((1, *finer), finer, strict=False))
     require(grow, f"{where} must be growing whole numbers of two at least, such as 2, got {list(numbers)}.")
@@ -160,13 +147,11 @@ def refinements(numbers: tuple[int, ...], where: str) -> tuple[int, ...]:
 
 
 def _optimiser(data: Any) -> AbstractOptimiser:
-    table = {"kind": data} if isinstance(data, str) else data
+    table, where = {"kind": data} if isinstance(data, str) else data, "[fit.optimiser]"
     kind = table.get("kind") if isinstance(table, dict) else None
-    kinds = ", ".join(_OPTIMISERS)
-    there = isinstance(kind, str) and kind in _OPTIMISERS
+    there, kinds = isinstance(kind, str) and kind in _OPTIMISERS, ", ".join(_OPTIMISERS)
     require(there, f"[fit] optimiser must have a kind, one of {kinds}, got {shortened(repr(data))}.")
     cls = _OPTIMISERS[str(kind)]
-    where = "[fit.optimiser]"
     try:
         return cls(**arguments(cls, {key: value for key, value in table.items() if key != "kind"}, where))
     except ValueError as error:
@@ -182,11 +167,7 @@ def _refined(simulation: Simulation, n: int) -> Simulation:
 
 
 def leaf_of(path: str, experiment: Experiment) -> Any:
-    """The value at a dotted path, such as "scene.material.youngs_modulus" or "scene.boundary.0.friction".
-
-    Raises:
-        ValueError: there is none.
-    """
+    """The value at a dotted path, such as "scene.material.youngs_modulus" or "scene.boundary.0.friction"."""
     value: Any = experiment
     for name in path.split("."):
         try:
@@ -194,10 +175,6 @@ def leaf_of(path: str, experiment: Experiment) -> Any:
         except (AttributeError, IndexError, TypeError):
             raise ValueError(f"[fit] names {path!r}, but there is no {name!r} there.") from None
     return value
-
-
-def _getter(path: str) -> Callable[[Experiment], Any]:
-    return lambda experiment: leaf_of(path, experiment)
 
 
 def _path(path: Any, where: str) -> str:
@@ -211,11 +188,9 @@ def _path(path: Any, where: str) -> str:
 
 
 def _fit_table(path: Path, simulation: Simulation) -> dict[str, Any]:
-    require(
-        simulation.fit is not None,
-        f"{path} has no [fit] table, so there is nothing to fit. See docs/scene_files.md.",
-    )
-    return simulation.fit or {}
+    table = simulation.fit
+    require(table is not None, f"{path} has no [fit] table, so there is nothing to fit. See docs/scene_files.md.")
+    return table or {}
 
 
 def _tables(table: dict[str, Any], name: str) -> list[dict[str, Any]]:
@@ -259,7 +234,7 @@ def _parameter(table: dict[str, Any], experiments: list[Experiment]) -> tuple[st
         require(path is not None, f'{where} needs a path, such as "scene.material.youngs_modulus".')
         path = str(path)
         _require_number(path, where, experiments[min(numbers)])
-        common |= {"where": _getter(path)}
+        common |= {"where": partial(leaf_of, path)}
         last = path.rpartition(".")[2]
         if kind == "Bounded":
             require(lower is not None and upper is not None, f"{where} needs lower and upper.")
@@ -281,8 +256,7 @@ def _require_number(path: str, where: str, experiment: Experiment) -> None:
     require(number, f"{where} must be a number, but is {shortened(repr(value))}.")
 
 
-_OF_THE_BODY = ("Velocity", "Spin")
-"""Parameters of the initial motion of all particles."""
+_OF_THE_BODY = ("Velocity", "Spin")  # parameters of the initial motion of all particles
 
 
 def _of_the_body(kind: str, where: str, experiment: Experiment, common: dict[str, Any]) -> Unbounded:
@@ -332,15 +306,7 @@ def _experiments(path: Path, simulation: Simulation, table: dict[str, Any]) -> t
     pairs = [observation(t, source, t1) for t in tables]
     fitted, whole = zip(*pairs, strict=True)
 
-    def experiment(observations: tuple[AbstractObservation, ...], t1: float) -> Experiment:
-        return Experiment(
-            simulation.scene,
-            simulation.particles,
-            t1=t1,
-            dt=simulation.dt,
-            method=simulation.method,
-            observations=observations,
-            name=path.stem,
-        )
-
-    return experiment(fitted, t1), experiment(whole, simulation.t1)
+    experiment = partial(
+        Experiment, simulation.scene, simulation.particles, dt=simulation.dt, method=simulation.method, name=path.stem
+    )
+    return experiment(t1=t1, observations=fitted), experiment(t1=simulation.t1, observations=whole)

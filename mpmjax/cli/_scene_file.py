@@ -21,26 +21,19 @@ from mpmjax.simulation import number_of_steps
 from mpmjax.state import Particles, Scene, attach, fill, join, prepare
 from mpmjax.stepping import AbstractIntegrator, Explicit, stable_dt
 
-_FRAMES = 50
-"""Number of frames that are saved if neither it nor the step is given."""
+_FRAMES = 50  # number of frames that are saved if neither it nor the step is given
 
 
 class RunSettings(NamedTuple):
     """The `[run]` table of a scene file."""
 
-    t1: float
-    """End time [s]."""
-    dt: float | Literal["stable"] | None
-    """Step [s]; None for "auto"."""
-    method: AbstractIntegrator | None
-    """None for "auto"."""
-    save_every: int | None
-    """Steps from frame to frame; None if the file does not say."""
+    t1: float  # end time [s]
+    dt: float | Literal["stable"] | None  # step [s]; None for "auto"
+    method: AbstractIntegrator | None  # none for "auto"
+    save_every: int | None  # steps from frame to frame; None if the file does not say
     dtype: str
-    error: float
-    """Relative error that "auto" aims at."""
-    most_seconds: float
-    """Seconds that its pilot runs may take."""
+    error: float  # relative error that "auto" aims at
+    most_seconds: float  # seconds that its pilot runs may take
 
 
 class SceneFile(NamedTuple):
@@ -49,10 +42,8 @@ class SceneFile(NamedTuple):
     scene: Scene
     particles: Particles
     run: RunSettings
-    fit: dict[str, Any] | None
-    """The `[fit]` table, not read yet; None without one."""
-    build: Build
-    """Makes the scene and its particles on n times as many cells a direction, from n."""
+    fit: dict[str, Any] | None  # the `[fit]` table, not read yet; None without one
+    build: Build  # makes the scene and its particles on n times as many cells a direction, from n
 
 
 class Simulation(NamedTuple):
@@ -64,12 +55,9 @@ class Simulation(NamedTuple):
     dt: float
     method: AbstractIntegrator
     save_every: int
-    fit: dict[str, Any] | None
-    """The `[fit]` table, not read yet; None without one."""
-    choice: str | None
-    """The choice for "auto" or "stable", and why; None if there was none."""
-    build: Build
-    """Makes the scene and its particles on n times as many cells a direction, from n."""
+    fit: dict[str, Any] | None  # the `[fit]` table, not read yet; None without one
+    choice: str | None  # the choice for "auto" or "stable", and why; None if there was none
+    build: Build  # makes the scene and its particles on n times as many cells a direction, from n
 
 
 def read_scene_file(path: Path) -> SceneFile:

@@ -1,76 +1,72 @@
 """Fitting parameters to measured data.
 
-A first fit needs the names that `mpmjax` has itself: `fit`, `Experiment`, parameters and observations. Here are the
-others: priors and fields, optimisers, strategies for hard fits, and uncertainty beyond standard errors.
+A first fit needs the names that `mpmjax` has itself: `fit`, `Experiment`, parameters and observations. The others are
+here: priors and fields, optimisers, strategies for hard fits, and uncertainty beyond standard errors.
 """
 
-from mpmjax.fitting._columns import Columns as Columns, after as after, read_arrays as read_arrays, read_columns
-from mpmjax.fitting._ensemble import Bootstrap, EnsembleFit, bootstrap, fit_ensemble
-from mpmjax.fitting._experiment import Experiment as Experiment
-from mpmjax.fitting._field import Field
-from mpmjax.fitting._fit import fit as fit
-from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
-from mpmjax.fitting._multistart import LocalMinimum, MultistartFit, fit_multistart
-from mpmjax.fitting._observation import AbstractObservation, Curve as Curve
-from mpmjax.fitting._optimiser import LBFGS, AbstractOptimiser, Adam, Evaluation
+from mpmjax.fitting._columns import (
+    Columns as Columns,
+    after as after,
+    read_arrays as read_arrays,
+    read_columns as read_columns,
+)
+from mpmjax.fitting._experiment import AbstractObservation as AbstractObservation, Experiment as Experiment
+from mpmjax.fitting._field import Field as Field
+from mpmjax.fitting._fit import EnsembleFit as EnsembleFit, fit as fit, fit_ensemble as fit_ensemble
+from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt as LevenbergMarquardt
+from mpmjax.fitting._multistart import (
+    LocalMinimum as LocalMinimum,
+    MultistartFit as MultistartFit,
+    fit_multistart as fit_multistart,
+)
+from mpmjax.fitting._observation import (
+    Curve as Curve,
+    Force as Force,
+    Series as Series,
+    Torque as Torque,
+    Tracks as Tracks,
+)
+from mpmjax.fitting._optimiser import (
+    LBFGS as LBFGS,
+    AbstractOptimiser as AbstractOptimiser,
+    Adam as Adam,
+    Evaluation as Evaluation,
+)
 from mpmjax.fitting._parameter import (
-    AbstractParameter,
-    AbstractPrior,
+    AbstractParameter as AbstractParameter,
+    AbstractPrior as AbstractPrior,
     Bounded as Bounded,
-    Gaussian,
+    Gaussian as Gaussian,
     Positive as Positive,
-    Smooth,
+    Smooth as Smooth,
     Unbounded as Unbounded,
 )
-from mpmjax.fitting._prediction import Prediction, predict, predict_observations
-from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._profile import Profile, profile
+from mpmjax.fitting._prediction import (
+    Bootstrap as Bootstrap,
+    Prediction as Prediction,
+    bootstrap as bootstrap,
+    predict as predict,
+    predict_observations as predict_observations,
+)
+from mpmjax.fitting._problem import FitProblem as FitProblem
+from mpmjax.fitting._profile import Profile as Profile, profile as profile
 from mpmjax.fitting._quantities import (
     CentreOfMass as CentreOfMass,
-    Density,
+    Density as Density,
     Extent as Extent,
     Markers as Markers,
     StressStretch as StressStretch,
 )
-from mpmjax.fitting._refined import RefinedFit, fit_refined
-from mpmjax.fitting._result import AbstractFit, Estimate, FitResult as FitResult, NoiseEstimate
-from mpmjax.fitting._series import Force as Force, Series as Series, Torque, Tracks as Tracks
-from mpmjax.fitting._staged import Stage, StagedFit, fit_staged
-
-__all__ = [
-    "LBFGS",
-    "AbstractFit",
-    "AbstractObservation",
-    "AbstractOptimiser",
-    "AbstractParameter",
-    "AbstractPrior",
-    "Adam",
-    "Bootstrap",
-    "Density",
-    "EnsembleFit",
-    "Estimate",
-    "Evaluation",
-    "Field",
-    "FitProblem",
-    "Gaussian",
-    "LevenbergMarquardt",
-    "LocalMinimum",
-    "MultistartFit",
-    "NoiseEstimate",
-    "Prediction",
-    "Profile",
-    "RefinedFit",
-    "Smooth",
-    "Stage",
-    "StagedFit",
-    "Torque",
-    "bootstrap",
-    "fit_ensemble",
-    "fit_multistart",
-    "fit_refined",
-    "fit_staged",
-    "predict",
-    "predict_observations",
-    "profile",
-    "read_columns",
-]
+from mpmjax.fitting._result import (
+    AbstractFit as AbstractFit,
+    Estimate as Estimate,
+    FitResult as FitResult,
+    NoiseEstimate as NoiseEstimate,
+)
+from mpmjax.fitting._sequence import (
+    RefinedFit as RefinedFit,
+    Stage as Stage,
+    StagedFit as StagedFit,
+    fit_refined as fit_refined,
+    fit_staged as fit_staged,
+)

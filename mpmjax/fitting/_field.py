@@ -1,6 +1,7 @@
 """Fields: parameters that change from place to place."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -12,8 +13,22 @@ from mpmjax._types import Array, ParticleScalar, ParticleVector, Scalar
 from mpmjax.checks import canonical, checked, require, require_finite, require_positive
 from mpmjax.discretisation import BSpline, Grid, SplineGradient, gather, in_window, make_stencil
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._parameter import AbstractParameter, AbstractPrior, Start, Value
+from mpmjax.fitting._parameter import AbstractParameter, Start, Value, leaves_of
 from mpmjax.state import Particles
+
+
+class _OfPlain:
+    """An attribute of a field that is one of the parameter that it spreads."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, field: Any, owner: type | None = None) -> Any:
+        return self if field is None else getattr(field.of, self._name)
+
+
+def _of_plain() -> Any:
+    return _OfPlain()
 
 
 class Field(AbstractParameter):
@@ -40,14 +55,13 @@ class Field(AbstractParameter):
     kernel: BSpline
     start: Start | None
 
+    where, update, prior, unit, only = _of_plain(), _of_plain(), _of_plain(), _of_plain(), _of_plain()
+    logarithmic, domain = _of_plain(), _of_plain()  # pyright: ignore[reportIncompatibleMethodOverride]
+    value, coordinate, free, check, room = _of_plain(), _of_plain(), _of_plain(), _of_plain(), _of_plain()
+
     @checked
     def __init__(
-        self,
-        of: AbstractParameter,
-        lattice: Grid,
-        *,
-        kernel: BSpline = BSpline(1),
-        start: Start | None = None,
+        self, of: AbstractParameter, lattice: Grid, *, kernel: BSpline = BSpline(1), start: Start | None = None
     ):
         self.of, self.lattice, self.kernel = of, lattice, kernel
         self.start = of.start if start is None else start
@@ -66,59 +80,11 @@ class Field(AbstractParameter):
         require_positive("The spacing of a Field's lattice [m]", spacing)
         place = np.asarray(particles.x, float) / float(spacing)
         require_finite("The particles' positions [m]", place)
-        first = [
+        first, last = (
             np.floor(np.asarray(kernel.base(jnp.asarray(end)))).astype(int) for end in (place.min(0), place.max(0))
-        ]
-        shape = np.maximum(first[1] - first[0] + kernel.order + 1, 4)
-        return Grid(tuple(map(int, shape)), spacing, origin=tuple(map(int, first[0])))
-
-    @property
-    def where(self) -> Callable[[Experiment], Any] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The leaf, or the tuple of leaves, that takes the values on particles."""
-        return self.of.where
-
-    @property
-    def update(self) -> Callable[[Experiment, Value], Experiment] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """In its place, a function that puts them in."""
-        return self.of.update
-
-    @property
-    def prior(self) -> AbstractPrior | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Prior knowledge of the values on nodes."""
-        return self.of.prior
-
-    @property
-    def unit(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Their unit."""
-        return self.of.unit
-
-    @property
-    def only(self) -> tuple[int, ...] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The experiments that it belongs to."""
-        return self.of.only
-
-    @property
-    def logarithmic(self) -> bool:
-        return self.of.logarithmic
-
-    @property
-    def domain(self) -> tuple[float, float]:
-        return self.of.domain
-
-    def value(self, start: Value, z: Value) -> Value:
-        return self.of.value(start, z)
-
-    def coordinate(self, start: Value, value: Value) -> Value:
-        return self.of.coordinate(start, value)
-
-    def free(self, value: Value) -> Value:
-        return self.of.free(value)
-
-    def check(self, name: str, start: np.ndarray) -> None:
-        self.of.check(name, start)
-
-    def room(self, start: Value, z: Value) -> tuple[Value, Value]:
-        return self.of.room(start, z)
+        )
+        shape = np.maximum(last - first + kernel.order + 1, 4)
+        return Grid(tuple(map(int, shape)), spacing, origin=tuple(map(int, first)))
 
     def check_experiment(self, name: str, experiment: Experiment) -> None:
         x = experiment.particles.x
@@ -137,23 +103,19 @@ class Field(AbstractParameter):
         )
 
     def first_guess(self, experiment: Experiment) -> Array:
-        start = super().first_guess(experiment)
-        shape = self.lattice.shape
-        require(
-            self.start is None or start.shape in ((), shape), f"its start must have shape {shape}, or be one number"
-        )
+        start, shape = super().first_guess(experiment), self.lattice.shape
+        fits = self.start is None or start.shape in ((), shape)
+        require(fits, f"its start must have shape {shape}, or be one number")
         return jnp.broadcast_to(start if start.shape == shape else start.mean(), shape)
 
     def put(self, experiment: Experiment, value: Value) -> Experiment:
         values = self.on_particles(experiment.particles.x, value)
         if self.update is not None:
             return self.update(experiment, values)
-        where = self.where
-        assert where is not None
-        leaves = where(experiment)
-        several = leaves if isinstance(leaves, tuple) else (leaves,)
-        parts = tuple(values[slice(*_rows(where, experiment, number))] for number in range(len(several)))
-        return eqx.tree_at(where, experiment, parts if isinstance(leaves, tuple) else parts[0])
+        where: Any = self.where
+        count = len(leaves_of(where, experiment))
+        parts = tuple(values[slice(*_rows(where, experiment, number))] for number in range(count))
+        return eqx.tree_at(partial(leaves_of, where), experiment, parts)
 
     def on_particles(self, x: ParticleVector, value: Value) -> ParticleScalar:
         """The field at positions x [m], shape (p, d), from its values on the nodes."""
@@ -169,12 +131,7 @@ class _Mark:
 def _rows(where: Callable[[Experiment], Any], experiment: Experiment, number: int) -> tuple[int, int]:
     """The particles to which leaf `number` of `where` belongs, the first and the one after the last: those of its law,
     or all."""
-
-    def one(experiment: Experiment) -> Any:
-        leaves = where(experiment)
-        return leaves[number] if isinstance(leaves, tuple) else leaves
-
-    marked = eqx.tree_at(one, experiment, _Mark())
+    marked = eqx.tree_at(lambda e: leaves_of(where, e)[number], experiment, _Mark())
     for law, group in zip(marked.scene.laws, experiment.particles.groups, strict=True):
         if any(isinstance(leaf, _Mark) for leaf in jax.tree.leaves(law)):
             return group.rows

@@ -1,8 +1,8 @@
-"""Fits of parameters to what was observed."""
+"""Fits of parameters to what was observed: of one data set, or of each of many."""
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -11,17 +11,28 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import chdtrc
 
-from mpmjax._types import Array, Scalar
+from mpmjax._types import Scalar
 from mpmjax.checks import checked, require, warn
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
-from mpmjax.fitting._log import FitLog, opened_log
+from mpmjax.fitting._log import FitLog, Progress, opened_log
 from mpmjax.fitting._optimiser import LBFGS, AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import ROW_COST, SHOWN, Coordinates, FitProblem
-from mpmjax.fitting._result import FitResult, SettledNoise, fit_result, settle_noise
-from mpmjax.fitting._search import Iteration, Minimum, NoDerivativeError, SearchState, search
+from mpmjax.fitting._problem import ROW_COST, Coordinates, FitProblem, Sigmas
+from mpmjax.fitting._result import FitResult, SettledNoise, fit_result, settle_noise, table
+from mpmjax.fitting._search import (
+    Iteration,
+    Minimum,
+    NoDerivativeError,
+    Problems,
+    SearchState,
+    batch_size,
+    counted,
+    search,
+    search_many,
+)
 from mpmjax.io import reporting
 
 
@@ -86,9 +97,11 @@ def fit(
     require(log is not None or not resume, "resume continues the fit of a log: name it by log.")
     problem = FitProblem(experiments, parameters, memory)
     optimiser = chosen_optimiser(problem) if optimiser is None else optimiser
-    level = checked_level(level)
-    report = dict(report or {})
-    _check_report(problem, report)
+    level, report = checked_level(level), dict(report or {})
+    for name, of in report.items():
+        require(name not in problem.labels, f"What is reported must not have a parameter's name, got {name!r}.")
+        shape = jnp.shape(of(problem.experiments[0]))
+        require(shape == (), f"What is reported as {name!r} must be one number, got shape {shape}.")
     with ExitStack() as stack:
         written = None
         if log is not None:
@@ -121,10 +134,10 @@ def checked_level(level: Scalar) -> float:
     return float(level)
 
 
-def in_rounds(
+def _in_rounds(
     problems: list[FitProblem],
-    sigmas: list[tuple[Array, ...]],
-    minimise: Callable[[int, list[int], list[Coordinates], list[tuple[Array, ...]]], Sequence[Minimum | str]],
+    sigmas: list[Sigmas],
+    minimise: Callable[[int, list[int], list[Coordinates], list[Sigmas]], Sequence[Minimum | str]],
     rounds: int = 0,
 ) -> list[tuple[Minimum, SettledNoise] | str]:
     """Searches of each problem, again and again until the noise that it leaves is the noise that it was made with: the
@@ -160,61 +173,38 @@ def _searched(
     lines, begun = Progress(problem, optimiser, progress), time.perf_counter() - seconds_before
     lines.begin(0 if state is None else len(earlier) + len(state.history))
 
-    def minimise(number: int, _: Any, starts: list[Coordinates], noise: list[tuple[Array, ...]]) -> list[Minimum]:
+    def minimise(number: int, _: Any, starts: list[Coordinates], noise: list[Sigmas]) -> list[Minimum]:
+        (z,), (sigmas,) = starts, noise
+
         def report(state: SearchState) -> None:
             seconds = time.perf_counter() - begun
             if log is not None:
-                log.append(noise[0], state, seconds)
+                log.append(sigmas, state, seconds)
             lines(state, seconds)
 
-        return [_search(problem, optimiser, starts[0], noise[0], state if number == rounds else None, report)]
+        try:
+            minimum = search(
+                problem,
+                optimiser,
+                z,
+                sigmas,
+                state=state if number == rounds else None,
+                report=report,
+                begun=lambda seen: require_influence(problem, sigmas, seen),
+            )
+        except NoDerivativeError:
+            raise RuntimeError(_NO_DERIVATIVE) from None
+        if not np.isfinite(minimum.history[0].cost):
+            problem.explain(z)
+        return [minimum]
 
-    (outcome,) = in_rounds([problem], [sigmas], minimise, rounds)
+    (outcome,) = _in_rounds([problem], [sigmas], minimise, rounds)
     assert not isinstance(outcome, str)
     minimum, settled = outcome
     return minimum._replace(history=(*earlier, *minimum.history)), settled
 
 
-def _check_report(problem: FitProblem, report: Mapping[str, Callable[[Experiment], Any]]) -> None:
-    for name, of in report.items():
-        require(name not in problem.labels, f"What is reported must not have a parameter's name, got {name!r}.")
-        shape = jnp.shape(of(problem.experiments[0]))
-        require(shape == (), f"What is reported as {name!r} must be one number, got shape {shape}.")
-
-
-def _search(
-    problem: FitProblem,
-    optimiser: AbstractOptimiser,
-    z: Coordinates,
-    sigmas: tuple[Array, ...],
-    state: SearchState | None,
-    report: Callable[[SearchState], None],
-) -> Minimum:
-    """The least sum of squares with a noise.
-
-    Raises:
-        SimulationError, ValueError: the first simulation is at fault, or does not reach the data.
-        ValueError: a parameter does not influence the data.
-        RuntimeError: there is no derivative.
-    """
-
-    def begun(seen: Evaluation) -> None:
-        require_influence(problem, sigmas, seen)
-
-    try:
-        minimum = search(problem, optimiser, z, sigmas, state=state, report=report, begun=begun)
-    except NoDerivativeError:
-        raise RuntimeError(
-            "The fit has no derivative. Either the tangent or adjoint solve of a step did not converge: raise the "
-            "max_steps of the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner(). Or a "
-            "law or an observation cannot be differentiated where the run takes it."
-        ) from None
-    if not np.isfinite(minimum.history[0].cost):
-        problem.explain(z)
-    return minimum
-
-
-def require_influence(problem: FitProblem, sigmas: tuple[Array, ...], seen: Evaluation) -> None:
+def require_influence(problem: FitProblem, sigmas: Sigmas, seen: Evaluation) -> None:
     """Check that the data depend on every coordinate, at the first guess.
 
     Raises:
@@ -238,88 +228,159 @@ def require_influence(problem: FitProblem, sigmas: tuple[Array, ...], seen: Eval
 
 
 @eqx.filter_jit
-def _random_pull(problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> Coordinates:
+def _random_pull(problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> Coordinates:
     """Jᵀw with random numbers w of variance one, by one pass of reverse mode: the expected square of a component is
     that of the length of J's column."""
     r, pull, _ = jax.vjp(lambda z: problem.residuals(z, sigmas, None), z, has_aux=True)
     return pull(jax.random.normal(jax.random.key(0), r.shape, r.dtype))[0]
 
 
-class Progress:
-    """A line an iteration: misfit Σ r², gradient, parameters, seconds, and the time that is left.
+class EnsembleFit(eqx.Module):
+    """One fit for each data set.
 
-    The time left is that of the present search. It is the usual time of an iteration times how many are left: about so
-    many as the optimiser's distance from converged needs to fall to one at the rate of the last three iterations, where
-    it is known and falls; else at most those up to `max_steps`.
+    `print(result)` shows a table; `result.values["E"]` are the estimates of a parameter; `result.fits[3]` is one fit.
     """
 
-    def __init__(self, problem: FitProblem, optimiser: AbstractOptimiser, say: Callable[[str], None] | None):
-        self._problem, self._optimiser, self._say = problem, optimiser, say
-        self._durations: list[float] = []
-        self._distances: list[float] = []
-        self._last = time.perf_counter()
+    fits: tuple[FitResult | None, ...]
+    """The fit of each data set; None where it failed."""
+    failures: dict[int, str]
+    """Why fits failed, by the number of the data set."""
 
-    def begin(self, done: int) -> None:
-        """Say that the first iteration begins, which is compiled before; a log may hold iterations that are done."""
-        if self._say is None:
-            return
-        labels, problem = self._problem.labels, self._problem
-        named = ", ".join(labels[:SHOWN]) + (", …" if len(labels) > SHOWN else "")
-        after = f" after {done} iterations of the log" if done else ""
-        count = f"{problem.size} number{'s' * (problem.size > 1)}"
-        self._say(f"compiling the fit of {count} ({named}) to {problem.points} that were measured{after}")
+    @property
+    def values(self) -> dict[str, np.ndarray]:
+        """The estimates of each parameter, NaN where the fit failed, shape (k, ...)."""
+        lost = {name: np.full(value.shape, np.nan) for name, value in self._done[0].values.items()}
+        each = [lost if fit is None else fit.values for fit in self.fits]
+        return {name: np.stack([values[name] for values in each]) for name in lost}
 
-    def __call__(self, state: SearchState, seconds: float) -> None:
-        """Say where the search stands after an iteration, and so many seconds since the fit began."""
-        iteration = state.history[-1]
-        if iteration.number == 0:
-            self._distances = []
-        now = time.perf_counter()
-        self._durations.append(now - self._last)
-        self._distances.append(self._optimiser.distance(state.inner, state.seen))
-        self._last = now
-        if self._say is None:
-            return
-        self._say(
-            f"{iteration.number:4d}  misfit {2 * iteration.cost:10.4g}  gradient {iteration.gradient:8.2g}  "
-            f"{self._problem.shown(iteration.z)}  {_clock(seconds)}{self._left(len(state.history))}"
-        )
+    @property
+    def errors(self) -> np.ndarray:
+        """The standard error of each estimate of the n numbers, NaN where the fit failed, shape (k, n)."""
+        lost = [np.nan] * len(self._done[0].estimates)
+        return np.array([lost if fit is None else [e.error for e in fit.estimates] for fit in self.fits])
 
-    def _left(self, done: int) -> str:
-        """The time left, in words; nothing while only the iteration that was compiled is timed, and at the end."""
-        most = self._optimiser.max_steps - done
-        if len(self._durations) < 2 or most == 0 or self._distances[-1] <= 1:
-            return ""
-        pace, steps = float(np.median(self._durations[1:])), iterations_left(self._distances)
-        if steps is None or steps > most:
-            return f", at most {_clock(pace * most)} left"
-        return f", about {_clock(pace * steps)} left"
+    @property
+    def alike(self) -> np.ndarray:
+        """Probability of so large a spread of each number if all data sets had one value and the errors are right:
+        Cochran's Q = Σ (z_k − z̄)²/s_k² of the values, of logarithms where none is at zero, χ² of k − 1 degrees of
+        freedom (W. G. Cochran, Biometrics 10 (1954) 101, doi 10.2307/3001666), shape (n,)."""
+        z, s, held = self._columns
+        if len(z) < 2:
+            return np.full(z.shape[1], np.nan)
+        ratio = np.array(self._done[0].problem.logarithmic) & ~held.any(axis=0)
+        z, s = np.where(ratio, np.log(np.where(ratio, z, 1)), z), s / np.where(ratio, z, 1)
+        weight = 1 / s**2
+        mean = (weight * z).sum(axis=0) / weight.sum(axis=0)
+        return np.asarray(chdtrc(len(z) - 1, (weight * (z - mean) ** 2).sum(axis=0)))
+
+    @property
+    def _done(self) -> list[FitResult]:
+        return [fit for fit in self.fits if fit is not None]
+
+    @property
+    def _columns(self) -> tuple[np.ndarray, ...]:
+        """Values, errors, and whether they lie at a bound, each of shape (fits that did not fail, n)."""
+        rows = [fit.estimates for fit in self._done]
+        return tuple(np.array([[getattr(e, f) for e in row] for row in rows]) for f in ("value", "error", "at_bound"))
+
+    def __str__(self) -> str:
+        """A table: the mean and spread of each number over the data sets, and the errors of the fits."""
+        (values, errors, held), alike = self._columns, self.alike
+        spread = values.std(axis=0, ddof=1) if len(values) > 1 else np.full(values.shape[1], np.nan)
+        rows = [
+            (
+                e.name,
+                f"{values[:, k].mean():>12.6g}",
+                f"{spread[k]:>10.2g}",
+                f"{np.sqrt((errors[:, k] ** 2).mean()):>13.2g}",
+                f"p = {alike[k]:.2g}" + (f", {held[:, k].sum()} at the bound" if held[:, k].any() else ""),
+            )
+            for k, e in enumerate(self._done[0].estimates)
+        ]
+        head = "", f"{'mean':>12}", f"{'spread':>10}", "error of one", "same value?"
+        last = f"{len(values)} data sets" + (f", {len(self.failures)} failed" if self.failures else "")
+        return "\n".join([*table(head, *rows), last])
 
 
-def iterations_left(distances: list[float]) -> int | None:
-    """How many iterations the distance needs to fall to one, at the mean rate of its last three values; None where it
-    does not fall, or is not known."""
-    last = np.asarray(distances[-3:])
-    if len(last) < 3 or not (np.isfinite(last).all() and 0 < last[-1] < last[0]):
-        return None
-    return max(1, int(np.ceil(np.log(last[-1]) / (np.log(last[0] / last[-1]) / 2))))
+@checked
+def fit_ensemble(
+    experiments: tuple[Any, ...] | list[Any],
+    parameters: dict[str, AbstractParameter],
+    *,
+    batch: int | None = None,
+    report: dict[str, Callable[[Experiment], Any]] | None = None,
+    level: Scalar = 0.95,
+    optimiser: AbstractOptimiser | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> EnsembleFit:
+    """Fit each of many data sets by itself, together in one compiled program: repeated specimens, for instance.
 
+        specimens = [mpm.Experiment(scene, particles, ..., observations=tracks) for tracks in measured]
+        result = mpm.fitting.fit_ensemble(specimens, {"E": ...})
+        print(result)  # mean and spread of E, and whether the specimens differ by more than their errors
+        result.values["E"]  # shape (number of specimens,)
 
-def _clock(seconds: float) -> str:
-    """Seconds as people say them."""
-    if seconds < 100:
-        return f"{seconds:.3g} s" if seconds >= 0.1 else "0.1 s"
-    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+    Each gets what `fit` says of it: the same estimates and errors. One that fails ends alone.
+
+    Args:
+        experiments: the data sets: an experiment each, or several experiments each that share the parameters. They may
+            differ in every number (data, noise, places, velocities, materials), and in no shape, choice or function:
+            give a marker that was not seen as NaN.
+        parameters: see `fit`.
+        batch: how many searches run together, see `fit_multistart`.
+        report, level, optimiser: see `fit`.
+        progress: called with a line, such as `print`, as searches end.
+
+    Raises:
+        ValueError: as `fit`; data sets of different shapes; no fit that did not fail.
+    """
+    require(len(experiments) > 0, "An ensemble needs a data set at least.")
+    level = checked_level(level)
+    sets = [
+        (e,) if isinstance(e, Experiment) else tuple(e) if isinstance(e, (tuple, list)) else () for e in experiments
+    ]
+    for k, each in enumerate(sets):
+        usable = len(each) > 0 and all(isinstance(e, Experiment) for e in each)
+        require(usable, f"Data set {k} must be an Experiment, or a tuple of some, got {type(experiments[k]).__name__}.")
+    problems = [FitProblem(each, parameters) for each in sets]
+    optimiser = chosen_optimiser(problems[0]) if optimiser is None else optimiser
+    stacked, size = Problems.of(problems), batch_size(problems[0], batch, len(problems))
+
+    def minimise(round_: int, numbers: list[int], starts: list[Any], sigmas: list[Any]) -> list[Minimum | str]:
+        these, noise = stacked.only(numbers), Problems.of(sigmas)
+        told = counted(progress, f"round {round_ + 1}: {{}} of {{}} fits are done")
+        members = search_many(these, optimiser, np.array(starts, float), sigmas=noise, batch=size, progress=told)
+        return [m.failure if m.minimum is None else m.minimum for m in members]
+
+    outcomes = _in_rounds(problems, [p.first_sigmas for p in problems], minimise)
+    fits = [
+        None if isinstance(end, str) else fit_result(problem, optimiser, *end, dict(report or {}), level)
+        for problem, end in zip(problems, outcomes, strict=True)
+    ]
+    failures = {k: end for k, end in enumerate(outcomes) if isinstance(end, str)}
+    if len(failures) == len(fits):
+        z = jnp.zeros(problems[0].size, problems[0].dtype)
+        problems[0].explain(z, failure=f"None of {len(fits)} fits succeeded: {failures[0]}.")
+    if failures:
+        shown = "; ".join(f"number {k}: {why}" for k, why in list(failures.items())[:3])
+        warn(f"{len(failures)} of {len(fits)} data sets could not be fitted: {shown}.")
+    lost = [k for k, fit in enumerate(fits) if fit is not None and not fit.converged]
+    if lost:
+        warn(f"{len(lost)} of {len(fits)} fits did not converge, the first number {lost[0]}: raise max_steps.")
+    return EnsembleFit(tuple(fits), failures)
 
 
 MOST_COLUMNS = 32
 """Columns of a Jacobian, or rows at what they cost more, up to which Levenberg-Marquardt is the cheaper."""
-MOST_ROUNDS = 20
-"""Most re-estimations of the noise."""
+MOST_ROUNDS = 20  # most re-estimations of the noise
 _MOST_NAMES = 6
-_ROUNDINGS = 10
-"""Derivatives by a coordinate below so many roundings of the data are none."""
+_ROUNDINGS = 10  # derivatives by a coordinate below so many roundings of the data are none
 _ADVICE = (
     "Raise max_steps, start closer, give a rtol that the precision can reach, or see whether simulations fail or the "
     "misfit has a kink where it ended."
+)
+_NO_DERIVATIVE = (
+    "The fit has no derivative. Either the tangent or adjoint solve of a step did not converge: raise the max_steps of "
+    "the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner(). Or a law or an observation "
+    "cannot be differentiated where the run takes it."
 )

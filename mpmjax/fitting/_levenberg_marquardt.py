@@ -10,8 +10,8 @@ import optimistix
 
 from mpmjax._types import Array, Scalar
 from mpmjax.checks import require_fields, require_tolerance, require_whole
-from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
-from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation, evaluated_once
+from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
 
 
 class LevenbergMarquardt(AbstractOptimiser):
@@ -45,13 +45,13 @@ class LevenbergMarquardt(AbstractOptimiser):
         require_tolerance("LevenbergMarquardt's rtol", self.rtol)
         require_whole("LevenbergMarquardt's max_steps", self.max_steps, 1)
 
-    def begin(self, problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> Any:
+    def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> Any:
         args = problem, sigmas, self.mode
         shape, _ = jax.eval_shape(lambda z: _residuals(z, args), z)
         return self._solver.init(_residuals, z, args, {}, shape, None, frozenset())
 
     def iterate(
-        self, problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...], state: Any
+        self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: Any
     ) -> tuple[Coordinates, Any, Evaluation]:
         z, state, _ = self._solver.step(_residuals, z, (problem, sigmas, self.mode), {}, state, frozenset())
         r, J = state.f_info.residual, state.f_info.jac.as_matrix()
@@ -78,8 +78,13 @@ class LevenbergMarquardt(AbstractOptimiser):
         )
 
     def has_converged(self, state: Any, seen: Evaluation) -> bool:
-        ended = bool(state.terminate) and not self._is_held_back(state)
-        return ended or self.distance(state, seen) <= 1 or _is_lost_in_rounding(state, seen)
+        if (bool(state.terminate) and not self._is_held_back(state)) or self.distance(state, seen) <= 1:
+            return True
+        # Refused, and what it could have lowered Σ r² by is lost in the rounding.
+        r, J, step, _ = _gauss_newton(seen)
+        rounding = _ROUNDINGS * float(np.finfo(np.asarray(seen.residuals).dtype).eps) * (r**2).sum()
+        gain = (r**2).sum() - ((r + J @ step) ** 2).sum()
+        return bool(int(state.num_steps_since_acceptance) > 0 and gain <= rounding)
 
     def has_stalled(self, state: Any) -> bool:
         return bool(state.terminate) and self._is_held_back(state)
@@ -115,19 +120,11 @@ class LevenbergMarquardt(AbstractOptimiser):
 
 
 class _TrustRegion(optimistix.ClassicalTrustRegion):
-    """A trust region that never takes a step uphill, though its quadratic foretells one: near a bound that is of
+    """A trust region that takes no step uphill, though its quadratic foretells one: near a bound that is of
     coordinates, and the step of values."""
 
     def predict_reduction(self, y_diff: Any, f_info: Any) -> Any:
         return jnp.minimum(super().predict_reduction(y_diff, f_info), 0)
-
-
-def _is_lost_in_rounding(state: Any, seen: Evaluation) -> bool:
-    """Whether a step was refused which could lower Σ r² by no more than its rounding."""
-    r, J, step, _ = _gauss_newton(seen)
-    gain = (r**2).sum() - ((r + J @ step) ** 2).sum()
-    rounding = _ROUNDINGS * float(np.finfo(np.asarray(seen.residuals).dtype).eps) * (r**2).sum()
-    return bool(int(state.num_steps_since_acceptance) > 0 and gain <= rounding)
 
 
 def _gauss_newton(seen: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -147,35 +144,20 @@ def _gauss_newton(seen: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray,
     return r, J, step / length, (step <= -down) | (step >= up)
 
 
-_FAR = 100.0
-"""A step is short below so many tolerances."""
-_REFUSED = 0.1
-"""Part of the Gauss-Newton step below which a step is held back."""
-_LEAP = 9.0
-"""Longest step to a bound [-]: to a ten-thousandth of the distance from it."""
-_HIDDEN = 3.0
-"""Standard errors from a bound within which a coordinate is near it."""
-_NEGLIGIBLE = 1e-4
-"""A step of so many standard errors is none."""
-_ROUNDINGS = 10
-"""Rounding of Σ r², in ε: a smaller change of it cannot be told."""
-
-
-def _residuals(z: Coordinates, args: tuple[FitProblem, tuple[Array, ...], Any]) -> tuple[Array, None]:
-    """The residuals, evaluated together with their derivative, once."""
+def _residuals(z: Coordinates, args: tuple[FitProblem, Sigmas, Any]) -> tuple[Array, None]:
+    """The residuals, as optimistix asks for them."""
     problem, sigmas, mode = args
 
-    def jacobian(z: Coordinates) -> tuple[Array, Array]:
+    def evaluate(z: Coordinates) -> tuple[Array, Array]:
         r, J = problem.jacobian(z.astype(problem.dtype), sigmas, mode)
         return r.astype(z.dtype), J.astype(z.dtype)
 
-    @jax.custom_jvp
-    def residuals(z: Coordinates) -> Array:
-        return jacobian(z)[0]
+    return evaluated_once(evaluate)(z), None
 
-    @residuals.defjvp
-    def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-        r, J = jacobian(primals[0])
-        return r, J @ tangents[0]
 
-    return residuals(z), None
+_FAR = 100.0  # a step is short below so many tolerances
+_REFUSED = 0.1  # part of the Gauss-Newton step below which a step is held back
+_LEAP = 9.0  # longest step to a bound [-]: to a ten-thousandth of the distance from it
+_HIDDEN = 3.0  # standard errors from a bound within which a coordinate is near it
+_NEGLIGIBLE = 1e-4  # a step of so many standard errors is none
+_ROUNDINGS = 10  # rounding of Σ r², in ε: a smaller change of it cannot be told

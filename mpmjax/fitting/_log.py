@@ -1,4 +1,6 @@
-"""The log of a fit: an HDF5 file that has each iteration, and from which a fit continues bit for bit.
+"""The record of a fit while it runs: lines of progress, and a log from which it continues bit for bit.
+
+The log is an HDF5 file:
 
     /iterations     a table with one row an iteration: round (of the noise's estimates), number (in the round), cost
                     ½ Σ r², gradient (its largest component), accepted, seconds (since the fit began)
@@ -17,8 +19,9 @@ import hashlib
 import inspect
 import io
 import json
+import time
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import partial
@@ -37,26 +40,23 @@ from mpmjax._types import Array
 from mpmjax.checks import require
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import FitProblem
+from mpmjax.fitting._problem import SHOWN, FitProblem, Sigmas
 from mpmjax.fitting._search import Iteration, SearchState, begin
 from mpmjax.io import ReplacedFile, check_hdf5, reason
 
 _FORMAT = 2
 _ROW = [("round", "i8"), ("number", "i8"), ("cost", "f8"), ("gradient", "f8"), ("accepted", "?"), ("seconds", "f8")]
 
-_MOST = 8
-"""Numbers of an array that are written out."""
-_FREE = ("optimiser.max_steps",)
-"""Choices that may differ in a fit that is continued: it may go on for longer."""
+_MOST = 8  # numbers of an array that are written out
+_FREE = ("optimiser.max_steps",)  # choices that may differ in a fit that is continued: it may go on for longer
 
 
 class _Round(NamedTuple):
     """A search with one noise."""
 
-    sigmas: tuple[Array, ...]
+    sigmas: Sigmas
     search: SearchState
-    seconds: tuple[float, ...]
-    """When each iteration was done, since the fit began [s]."""
+    seconds: tuple[float, ...]  # when each iteration was done, since the fit began [s]
 
 
 class FitLog:
@@ -75,7 +75,7 @@ class FitLog:
         *done, last = self._rounds
         return len(done), tuple(i for r in done for i in r.search.history), last.sigmas, last.search, last.seconds[-1]
 
-    def append(self, sigmas: tuple[Array, ...], state: SearchState, seconds: float) -> None:
+    def append(self, sigmas: Sigmas, state: SearchState, seconds: float) -> None:
         """Write an iteration: the noise of its round, the search after it, and the seconds since the fit began.
 
         Raises:
@@ -324,3 +324,70 @@ def _ordered(constant: Any) -> Any:
 
 def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:12]
+
+
+class Progress:
+    """A line an iteration: misfit Σ r², gradient, parameters, seconds, and the time that is left.
+
+    The time left is that of the present search. It is the usual time of an iteration times how many are left: about so
+    many as the optimiser's distance from converged needs to fall to one at the rate of the last three iterations, where
+    it is known and falls; else at most those up to `max_steps`.
+    """
+
+    def __init__(self, problem: FitProblem, optimiser: AbstractOptimiser, say: Callable[[str], None] | None):
+        self._problem, self._optimiser, self._say = problem, optimiser, say
+        self._durations: list[float] = []
+        self._distances: list[float] = []
+        self._last = time.perf_counter()
+
+    def begin(self, done: int) -> None:
+        """Say that the first iteration begins, which is compiled before; a log may hold iterations that are done."""
+        if self._say is None:
+            return
+        labels, problem = self._problem.labels, self._problem
+        named = ", ".join(labels[:SHOWN]) + (", …" if len(labels) > SHOWN else "")
+        after = f" after {done} iterations of the log" if done else ""
+        count = f"{problem.size} number{'s' * (problem.size > 1)}"
+        self._say(f"compiling the fit of {count} ({named}) to {problem.points} that were measured{after}")
+
+    def __call__(self, state: SearchState, seconds: float) -> None:
+        """Say where the search stands after an iteration, and so many seconds since the fit began."""
+        iteration = state.history[-1]
+        if iteration.number == 0:
+            self._distances = []
+        now = time.perf_counter()
+        self._durations.append(now - self._last)
+        self._distances.append(self._optimiser.distance(state.inner, state.seen))
+        self._last = now
+        if self._say is None:
+            return
+        self._say(
+            f"{iteration.number:4d}  misfit {2 * iteration.cost:10.4g}  gradient {iteration.gradient:8.2g}  "
+            f"{self._problem.shown(iteration.z)}  {_clock(seconds)}{self._left(len(state.history))}"
+        )
+
+    def _left(self, done: int) -> str:
+        """The time left, in words; nothing while only the iteration that was compiled is timed, and at the end."""
+        most = self._optimiser.max_steps - done
+        if len(self._durations) < 2 or most == 0 or self._distances[-1] <= 1:
+            return ""
+        pace, steps = float(np.median(self._durations[1:])), iterations_left(self._distances)
+        if steps is None or steps > most:
+            return f", at most {_clock(pace * most)} left"
+        return f", about {_clock(pace * steps)} left"
+
+
+def iterations_left(distances: list[float]) -> int | None:
+    """How many iterations the distance needs to fall to one, at the mean rate of its last three values; None where it
+    does not fall, or is not known."""
+    last = np.asarray(distances[-3:])
+    if len(last) < 3 or not (np.isfinite(last).all() and 0 < last[-1] < last[0]):
+        return None
+    return max(1, int(np.ceil(np.log(last[-1]) / (np.log(last[0] / last[-1]) / 2))))
+
+
+def _clock(seconds: float) -> str:
+    """Seconds as people say them."""
+    if seconds < 100:
+        return f"{seconds:.3g} s" if seconds >= 0.1 else "0.1 s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

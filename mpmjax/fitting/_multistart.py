@@ -1,6 +1,6 @@
 """Fits from many starting points, and the minima that they lead to."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -9,17 +9,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.distance import cdist
+from scipy.special import gammaln, ndtr, ndtri
 
 from mpmjax._types import Array, Float, Int, Scalar
-from mpmjax.checks import checked, require_between, require_whole, warn
+from mpmjax.checks import checked, require, require_between, require_finite, require_whole, warn
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import chosen_optimiser, fit, require_influence
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import SHOWN, Coordinates, FitProblem
-from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, restarted, table
-from mpmjax.fitting._search import Member, Minimum, Problems, batch_size, search_many
-from mpmjax.fitting._starting_points import linked, starting_points, unit_points
+from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
+from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, label_cells, restarted, table, value_cells
+from mpmjax.fitting._search import Member, Minimum, Problems, batch_size, counted, search_many
+
+Ranges = Mapping[str, tuple[float, float]]  # lowest and highest value to start from, by the name of a parameter
+Ends = list[tuple[Minimum, list[int]]]  # minima, with the numbers of the points that led there
 
 
 class LocalMinimum(NamedTuple):
@@ -82,17 +86,6 @@ class MultistartFit(AbstractFit):
             shown = ", ".join(map(str, list(self.failures)[:_SHOWN])) + (", …" if len(self.failures) > _SHOWN else "")
             lines.append(f"{len(self.failures)} of {self.count} points failed, number {shown}.")
         return "\n".join(lines)
-
-
-def label_cells(problem: FitProblem) -> list[str]:
-    """The heads of columns of the first fitted numbers."""
-    return [f"{label:>13}" for label in problem.labels[:SHOWN]]
-
-
-def value_cells(values: dict[str, np.ndarray]) -> list[str]:
-    """The first fitted numbers, in columns."""
-    numbers = np.concatenate([value.reshape(-1) for value in values.values()])
-    return [f"{number:>13.6g}" for number in numbers[:SHOWN]]
 
 
 @checked
@@ -158,25 +151,24 @@ def fit_multistart(
     optimiser = chosen_optimiser(problem) if optimiser is None else optimiser
     shares = unit_points(starts - 1, problem.size, require_whole("seed", seed, 0))
     points = starting_points(problem, shares, dict(ranges or {}))
-    sigmas, size = problem.first_sigmas, batch_size(problem, batch, starts)
-    look = fraction < 1
-    costs = costs_at(problem, points, sigmas, size, _teller(progress, "simulations")) if look else np.zeros(starts)
+    sigmas, size, costs = problem.first_sigmas, batch_size(problem, batch, starts), np.zeros(starts)
+    if fraction < 1:
+        told = counted(progress, "{} of {} simulations are done", again=False)
+        costs = costs_at(problem, points, sigmas, size, told)
     failures = {int(k): _FAILS for k in np.flatnonzero(~np.isfinite(costs))}
-    together = partial(
-        search_many,
-        Problems.of([problem]),
-        optimiser,
-        sigmas=Problems.of([sigmas]),
-        batch=size,
-        joining=_JOINED,
-    )
+    noise = Problems.of([sigmas])
+    together = partial(search_many, Problems.of([problem]), optimiser, sigmas=noise, batch=size, joining=_JOINED)
     members, stands = _searched(problem, sigmas, points, shares, costs, fraction, together, progress)
     failures |= {k: m.failure for k, m in members.items() if m.minimum is None}
     groups = _grouped(problem, _ends(members, stands))
     if not groups:
         failure = f"No search of {len(members)} came to a minimum: {failures.get(0, 'raise max_steps')}."
         problem.explain(jnp.zeros(problem.size, problem.dtype), failure)
-    groups, further = _searched_on(problem, groups, together)
+    # Those near to the best one are searched on, without settling.
+    near = sum(end.cost <= _NEAR_BEST * groups[0][0].cost for end, _ in groups[:_SHOWN])
+    further = together(np.array([end.z for end, _ in groups[:near]], float))
+    on = [(groups[k][0] if m.minimum is None else m.minimum, groups[k][1]) for k, m in enumerate(further)]
+    groups = _grouped(problem, [*on, *groups[near:]])
     minima = tuple(
         LocalMinimum(
             problem.by_name(end.z), problem.misfit(end.cost), len(members.keys() & numbers), tuple(sorted(numbers))
@@ -206,9 +198,9 @@ def fit_multistart(
 def costs_at(
     problem: FitProblem,
     points: Float[np.ndarray, "k n"],
-    sigmas: tuple[Array, ...],
+    sigmas: Sigmas,
     batch: int,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, count: None,
 ) -> Float[np.ndarray, "k"]:
     """½ Σ r² at many points, without derivatives; NaN where a simulation fails. `batch` are computed together, and
     `progress` is called with how many are done, and of how many."""
@@ -216,15 +208,12 @@ def costs_at(
     for first in range(0, len(points), batch):
         rows = points[np.minimum(np.arange(first, first + batch), len(points) - 1)]
         costs[first : first + batch] = _costs(problem, rows, sigmas)[: len(points) - first]
-        if progress is not None:
-            progress(min(first + batch, len(points)), len(points))
+        progress(min(first + batch, len(points)), len(points))
     return costs
 
 
 @eqx.filter_jit
-def _costs(
-    problem: FitProblem, points: Float[np.ndarray, "b n"] | Array, sigmas: tuple[Array, ...]
-) -> Float[Array, "b"]:
+def _costs(problem: FitProblem, points: Float[np.ndarray, "b n"] | Array, sigmas: Sigmas) -> Float[Array, "b"]:
     """½ Σ r² at some points together, compiled."""
 
     def cost(z: Coordinates) -> Array:
@@ -236,7 +225,7 @@ def _costs(
 
 def _searched(
     problem: FitProblem,
-    sigmas: tuple[Array, ...],
+    sigmas: Sigmas,
     points: Float[np.ndarray, "k n"],
     shares: Float[np.ndarray, "l n"],
     costs: Float[np.ndarray, "k"],
@@ -244,12 +233,9 @@ def _searched(
     together: Callable[..., tuple[Member, ...]],
     progress: Callable[[str], None] | None,
 ) -> tuple[dict[int, Member], Int[np.ndarray, "k"]]:
-    """Searches from the points that stand for the others, until each point is stood for by one that came to a minimum.
-
-    Returns:
-        the searches by the numbers of their points, and for each point the number of the one that stands for it; -1
-        where its cost is not finite.
-    """
+    """Searches from the points that stand for the others, until each point is stood for by one that came to a minimum:
+    the searches by the numbers of their points, and for each point the number of the one that stands for it, -1 where
+    its cost is not finite."""
     members: dict[int, Member] = {}
     costs = costs.copy()
     while True:
@@ -264,35 +250,13 @@ def _searched(
             if chosen[number] == 0:
                 require_influence(problem, sigmas, seen)
 
-        outcomes = together(points[chosen], settling=_SETTLED, progress=_teller(progress, "searches"), begun=begun)
+        told = counted(progress, "{} of {} searches are done", again=False)
+        outcomes = together(points[chosen], settling=_SETTLED, progress=told, begun=begun)
         joined = [None if m.joined is None else chosen[m.joined] for m in outcomes]
         members |= {k: m._replace(joined=end) for k, m, end in zip(chosen, outcomes, joined, strict=True)}
         if any(m.interrupted for m in outcomes):
             return members, stands
         costs[[k for k in chosen if _end(members, k) is None]] = np.nan
-
-
-def _searched_on(
-    problem: FitProblem, groups: list[tuple[Minimum, list[int]]], together: Callable[..., tuple[Member, ...]]
-) -> tuple[list[tuple[Minimum, list[int]]], tuple[Member, ...]]:
-    """The minima after searches from those near to the best one, and these searches."""
-    near = sum(end.cost <= _NEAR_BEST * groups[0][0].cost for end, _ in groups[:_SHOWN])
-    further = together(np.array([end.z for end, _ in groups[:near]], float))
-    on = [(groups[k][0] if m.minimum is None else m.minimum, groups[k][1]) for k, m in enumerate(further)]
-    return _grouped(problem, [*on, *groups[near:]]), further
-
-
-def _teller(progress: Callable[[str], None] | None, what: str) -> Callable[[int, int], None]:
-    """Progress that tells how many are done whenever there are more."""
-    told = 0
-
-    def say(done: int, count: int) -> None:
-        nonlocal told
-        if progress is not None and done > told:
-            told = done
-            progress(f"{done} of {count} {what} are done")
-
-    return say
 
 
 def _end(members: dict[int, Member], k: int) -> int | None:
@@ -303,7 +267,7 @@ def _end(members: dict[int, Member], k: int) -> int | None:
     return k if minimum is not None and minimum.converged else None
 
 
-def _ends(members: dict[int, Member], stands: Int[np.ndarray, "k"]) -> list[tuple[Minimum, list[int]]]:
+def _ends(members: dict[int, Member], stands: Int[np.ndarray, "k"]) -> Ends:
     """Where searches ended, with the numbers of the points that those stand for."""
     numbers: dict[int, list[int]] = {}
     for k, by in enumerate(stands.tolist()):
@@ -314,13 +278,13 @@ def _ends(members: dict[int, Member], stands: Int[np.ndarray, "k"]) -> list[tupl
     return [(minimum, points) for minimum, points in ends if minimum is not None]
 
 
-def _grouped(problem: FitProblem, ends: list[tuple[Minimum, list[int]]]) -> list[tuple[Minimum, list[int]]]:
+def _grouped(problem: FitProblem, ends: Ends) -> Ends:
     """The distinct minima, the lowest first, with the numbers of the points that lead there."""
-    groups: list[tuple[Minimum, list[int]]] = []
+    groups: Ends = []
     least = 1.0 if all(problem.noise_is_given) else 0.0
     for minimum, points in sorted(ends, key=lambda pair: pair[0].cost):
-        for there, numbers in groups:
-            if _same(np.asarray(minimum.z - there.z, float), there, least):
+        for better, numbers in groups:
+            if _same(np.asarray(minimum.z - better.z, float), better, least):
                 numbers += points
                 break
         else:
@@ -336,14 +300,119 @@ def _same(change: np.ndarray, better: Minimum, least: float) -> bool:
     return bool((np.abs(change) <= _NEAR).all() or ((J @ change) ** 2).sum() <= len(change) * variance)
 
 
+def unit_points(count: int, size: int, seed: int) -> Float[np.ndarray, "k n"]:
+    """Scrambled Sobol points of the open unit cube of `size` dimensions, which fill it evenly (SciPy's)."""
+    from scipy.stats import qmc  # here, since it takes long to import
+
+    exponent = max(int(np.ceil(np.log2(max(count, 1)))), 0)
+    sobol = qmc.Sobol(size, seed=seed)  # pyright: ignore[reportCallIssue] (rng from SciPy 1.15 on)
+    return np.clip(sobol.random_base2(exponent)[:count], _EDGE, 1 - _EDGE)
+
+
+def starting_points(problem: FitProblem, shares: Float[np.ndarray, "k n"], ranges: Ranges) -> Float[np.ndarray, "l n"]:
+    """Coordinates of the first guess, and of points of the unit cube.
+
+    A parameter's side of the cube is its range, if it has one, else its prior's distribution, else from bound to
+    bound, else from a tenth to ten times the first guess of a positive one, and one coordinate to each side of any
+    other. The range of a positive parameter is one of its logarithm.
+
+    Raises:
+        ValueError: a range of no parameter, or outside of its bounds.
+    """
+    unknown = sorted(set(ranges) - set(problem.names))
+    require(not unknown, f"ranges must be of parameters ({', '.join(problem.names)}), got {', '.join(unknown)}.")
+    parts, column = [], 0
+    for name, parameter, start in zip(problem.names, problem.parameters, problem.starts, strict=True):
+        part = shares[:, column : column + start.size].reshape(-1, *start.shape)
+        parts.append(_spread(name, parameter, start, part, ranges.get(name)).reshape(len(part), -1))
+        column += start.size
+    return np.concatenate([np.zeros((1, problem.size)), np.concatenate(parts, axis=1)])
+
+
+def _spread(
+    name: str, parameter: AbstractParameter, start: Array, shares: np.ndarray, limits: tuple[float, float] | None
+) -> np.ndarray:
+    """Coordinates of a parameter at shares of its distribution between 0 and 1, shape (k, ...)."""
+    first, (lowest, highest) = np.asarray(start, float), parameter.domain
+    prior = None if parameter.prior is None else parameter.prior.distribution()
+    if limits is None and prior is not None:
+        mean, sigma = prior
+        below, above = ndtr((lowest - mean) / sigma), ndtr((highest - mean) / sigma)
+        values = mean + sigma * ndtri(below + shares * (above - below))
+    else:
+        lower, upper = _range(name, parameter, first, limits)
+        if parameter.logarithmic:
+            values = np.exp(np.log(lower) + shares * (np.log(upper) - np.log(lower)))
+        else:
+            values = lower + shares * (upper - lower)
+    return np.asarray(parameter.coordinate(start, jnp.asarray(values, start.dtype)), float)
+
+
+def _range(
+    name: str, parameter: AbstractParameter, first: np.ndarray, limits: tuple[float, float] | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest value to start from."""
+    lowest, highest = parameter.domain
+    if limits is not None:
+        require(len(limits) == 2, f"The range of {name!r} must be two numbers, got {len(limits)}.")
+        require_finite(f"The range of {name!r}", np.asarray(limits, float))
+        inside = lowest <= limits[0] < limits[1] <= highest and (limits[0] > 0 or not parameter.logarithmic)
+        within = "positive numbers" if parameter.logarithmic else f"between {lowest:g} and {highest:g}"
+        require(inside, f"The range of {name!r} must grow and be {within}, got {limits[0]:g} to {limits[1]:g}.")
+        return np.asarray(float(limits[0])), np.asarray(float(limits[1]))
+    if np.isfinite([lowest, highest]).all():
+        return np.asarray(lowest), np.asarray(highest)
+    if parameter.logarithmic:
+        return np.asarray(first / _DECADE), np.asarray(first * _DECADE)
+    ends = [np.asarray(parameter.value(jnp.asarray(first), jnp.full(first.shape, side))) for side in (-1.0, 1.0)]
+    return ends[0], ends[1]
+
+
+def linked(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"], fraction: Scalar) -> Int[np.ndarray, "k"]:
+    """For each point the number of the one that stands for it, from which a search starts; its own where one starts
+    there, and -1 where the cost is not finite.
+
+    Multi-level single linkage (A. H. G. Rinnooy Kan, G. T. Timmer, Mathematical Programming 39 (1987) 57-78): a search
+    starts from each point that has no better one within the critical distance
+
+        r = π^(-1/2) (Γ(1 + n/2) σ ln k / k)^(1/n),  σ = 2,
+
+    of k even points of the unit cube: in a ball of this radius lie σ ln k of them. Any other point is linked to the
+    nearest better one, and so on to one that is searched from. On a rough function that is too few: a fraction of all
+    points, the best ones, is searched from besides, whatever their neighbours.
+
+    Args:
+        shares: the points, evenly spread over the unit cube.
+        costs: the function there; not finite where it fails.
+        fraction: from 0, none besides, to 1, all.
+    """
+    count, size = shares.shape
+    stands = np.full(count, -1)
+    usable = np.isfinite(costs)
+    order = np.argsort(np.where(usable, costs, np.inf), kind="stable")[: usable.sum()]
+    near = critical_distance(count, size)
+    for place, k in enumerate(order):
+        better = order[:place]
+        distances = cdist(shares[k : k + 1], shares[better])[0]
+        alone = place < fraction * count or (distances > near).all()
+        stands[k] = k if alone else stands[better[distances.argmin()]]
+    return stands
+
+
+def critical_distance(count: int, size: int) -> float:
+    """The radius of a ball in which σ ln k of k points of the unit cube of n dimensions lie, but for its boundary."""
+    if count < 2:
+        return 0.0
+    logarithm = gammaln(1 + size / 2) + np.log(_SIGMA * np.log(count) / count)
+    return float(np.exp(logarithm / size) / np.sqrt(np.pi))
+
+
 _FAILS = "the simulation fails there, or does not reach the data"
-_JOINED = 0.01
-"""A search so near to a better one, in each coordinate, would go the same way."""
-_SETTLED = 1e-2
-"""A search that lately lowered its sum of squares by less than this part is at a minimum."""
-_NEAR_BEST = 2.0
-"""Searches that end within this factor of the least sum of squares are searched on."""
-_NEAR = 0.02
-"""Ends of searches so near in each coordinate are one minimum."""
-_SHOWN = 8
-"""How many minima a table shows."""
+_JOINED = 0.01  # a search so near to a better one, in each coordinate, would go the same way
+_SETTLED = 1e-2  # a search that lately lowered its sum of squares by less than this part is at a minimum
+_NEAR_BEST = 2.0  # searches that end within this factor of the least sum of squares are searched on
+_NEAR = 0.02  # ends of searches so near in each coordinate are one minimum
+_SHOWN = 8  # how many minima a table shows
+_EDGE = 1e-3  # shares nearer to 0 and 1 are none: a start at a bound does not move
+_DECADE = 10.0  # how far from the first guess a positive parameter starts, as a factor
+_SIGMA = 2.0  # σ of the critical distance

@@ -12,7 +12,7 @@ import optax
 
 from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.checks import as_floats, require_fields, require_positive, require_whole
-from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
 
 
 class Evaluation(NamedTuple):
@@ -34,35 +34,24 @@ class AbstractOptimiser(eqx.Module):
     """A method that searches the least Σ r², one iteration at a time.
 
     One of your own gives `begin`, `iterate` and `has_converged`. Its state is a pytree of arrays that says all it
-    remembers, so that a search can be written to a file and continued.
+    remembers, so that a search can be written to a file and continued. Its methods are given the problem that is
+    minimised, the coordinates z where the search is, and the noise of each observation.
     """
 
     max_steps: eqx.AbstractVar[int]
     """Most iterations."""
 
     @abc.abstractmethod
-    def begin(self, problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> Any:
-        """The state before the first iteration.
-
-        Args:
-            problem: what is minimised.
-            z: where the search starts.
-            sigmas: the noise of each observation.
-        """
+    def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> Any:
+        """The state before the first iteration, which starts at z."""
 
     @abc.abstractmethod
     def iterate(
-        self, problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...], state: Any
+        self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: Any
     ) -> tuple[Coordinates, Any, Evaluation]:
-        """One iteration: where it is now, the state, and what it knows of that place. The first one evaluates where it
-        starts. A step at which a simulation fails must not be taken.
-
-        Args:
-            problem: what is minimised.
-            z: where it is.
-            sigmas: the noise of each observation.
-            state: what `begin` or the last iteration returned.
-        """
+        """One iteration from the state that `begin` or the last iteration returned: where it is now, the state, and
+        what it knows of that place. The first one evaluates where it starts. A step at which a simulation fails must
+        not be taken."""
 
     def directed(self, z: Coordinates, state: Any, seen: Evaluation) -> Any:
         """The state for the next iteration, outside of what is compiled. Default: as it is."""
@@ -115,22 +104,14 @@ class LBFGS(AbstractOptimiser):
         for name in ("max_steps", "memory", "line_search"):
             require_whole(f"LBFGS's {name}", getattr(self, name), 1)
 
-    def begin(self, problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> "LBFGSState":
+    def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> "LBFGSState":
         del problem, sigmas
         no, zero = jnp.asarray(False), jnp.zeros((), z.dtype)
-        return LBFGSState(
-            begun=no,
-            cost=zero,
-            gradient=jnp.zeros_like(z),
-            past=self._past.init(z),
-            predicted_decrease=zero + jnp.inf,
-            decrease_tolerance=zero,
-            small=jnp.zeros((), jnp.int32),
-            stalled=no,
-        )
+        past, unknown, small = self._past.init(z), zero + jnp.inf, jnp.zeros((), jnp.int32)
+        return LBFGSState(no, zero, jnp.zeros_like(z), past, unknown, zero, small, no)
 
     def iterate(
-        self, problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...], state: "LBFGSState"
+        self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: "LBFGSState"
     ) -> tuple[Coordinates, "LBFGSState", Evaluation]:
         def start(z: Coordinates, state: LBFGSState) -> tuple[Coordinates, LBFGSState]:
             _, cost, gradient = problem.gradient(z, sigmas)
@@ -149,7 +130,7 @@ class LBFGS(AbstractOptimiser):
         return bool(state.stalled)
 
     def _search(
-        self, problem: FitProblem, sigmas: tuple[Array, ...], z: Coordinates, state: "LBFGSState"
+        self, problem: FitProblem, sigmas: Sigmas, z: Coordinates, state: "LBFGSState"
     ) -> tuple[Coordinates, "LBFGSState"]:
         """A line search along the quasi-Newton direction, or where nothing is known yet along the negative gradient."""
         cost, gradient, fresh = state.cost, state.gradient, self._past.init(z)
@@ -158,10 +139,16 @@ class LBFGS(AbstractOptimiser):
         along, past = _where(steep, steepest, newton)
         predicted_decrease = jnp.where(steep, jnp.minimum(state.predicted_decrease, gradient @ along), gradient @ along)
         slack = problem.rounding(cost, sigmas)
+
+        def evaluate(z: Coordinates) -> tuple[Array, Coordinates]:
+            """The cost and its derivative; infinite where either fails."""
+            _, cost, gradient = problem.gradient(z, sigmas)
+            usable = jnp.isfinite(cost) & jnp.isfinite(gradient).all()
+            return jnp.where(usable, cost, jnp.inf), jnp.where(usable, gradient, 0)
+
         line: Any = optax.scale_by_zoom_linesearch(self.line_search, approx_dec_rtol=slack / jnp.maximum(cost, slack))
-        step, at_end = line.update(
-            -along, line.init(z), z, value=cost, grad=gradient, value_fn=partial(_cost, problem, sigmas)
-        )
+        value_fn = evaluated_once(evaluate)
+        step, at_end = line.update(-along, line.init(z), z, value=cost, grad=gradient, value_fn=value_fn)
         moved = (at_end.learning_rate > 0) & (at_end.value <= cost + slack)
         decrease_tolerance = jnp.maximum(jnp.asarray(self.rtol, z.dtype) ** 2 * problem.mean_square(cost), slack)
         small = moved & (predicted_decrease <= decrease_tolerance) & (cost - at_end.value <= decrease_tolerance)
@@ -186,29 +173,19 @@ class LBFGS(AbstractOptimiser):
 class LBFGSState(NamedTuple):
     """State of L-BFGS."""
 
-    begun: Bool[Array, ""]
-    """Whether the cost is known where it is."""
+    begun: Bool[Array, ""]  # whether the cost is known where it is
     cost: Float[Array, ""]
     gradient: Coordinates
-    past: optax.ScaleByLBFGSState
-    """Past steps and the changes of the gradient in them."""
+    past: optax.ScaleByLBFGSState  # past steps and the changes of the gradient in them
     predicted_decrease: Float[Array, ""]
     """Decrease of the cost that the gradient predicted for the last line search that lowered nothing."""
-    decrease_tolerance: Float[Array, ""]
-    """Decrease of the cost below which a line search is negligible."""
-    small: Int[Array, ""]
-    """How many line searches in a row brought next to nothing."""
-    stalled: Bool[Array, ""]
-    """Whether nothing lower was found along the negative gradient."""
+    decrease_tolerance: Float[Array, ""]  # decrease of the cost below which a line search is negligible
+    small: Int[Array, ""]  # how many line searches in a row brought next to nothing
+    stalled: Bool[Array, ""]  # whether nothing lower was found along the negative gradient
 
 
-def _cost(problem: FitProblem, sigmas: tuple[Array, ...], z: Coordinates) -> Array:
-    """½ Σ r² with its derivative by reverse mode, both evaluated once; infinite where it or its derivative fails."""
-
-    def evaluate(z: Coordinates) -> tuple[Array, Coordinates]:
-        _, cost, gradient = problem.gradient(z, sigmas)
-        usable = jnp.isfinite(cost) & jnp.isfinite(gradient).all()
-        return jnp.where(usable, cost, jnp.inf), jnp.where(usable, gradient, 0)
+def evaluated_once(evaluate: Callable[[Coordinates], tuple[Array, Array]]) -> Callable[[Coordinates], Array]:
+    """A function whose value and derivative are evaluated together, once."""
 
     @jax.custom_jvp
     def value(z: Coordinates) -> Array:
@@ -216,10 +193,10 @@ def _cost(problem: FitProblem, sigmas: tuple[Array, ...], z: Coordinates) -> Arr
 
     @value.defjvp
     def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-        cost, gradient = evaluate(primals[0])
-        return cost, gradient @ tangents[0]
+        at, derivative = evaluate(primals[0])
+        return at, derivative @ tangents[0]
 
-    return value(z)
+    return value
 
 
 class Adam(AbstractOptimiser):
@@ -256,14 +233,14 @@ class Adam(AbstractOptimiser):
         """The learning rate of an iteration, before any halving."""
         return self.learning_rate(number) if callable(self.learning_rate) else self.learning_rate
 
-    def begin(self, problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> "AdamState":
+    def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> "AdamState":
         del problem, sigmas
         one, zero = jnp.ones((), z.dtype), jnp.zeros((), jnp.int32)
         none = jnp.zeros_like(z)
         return AdamState(zero, z, _MOMENTS.init(z), one * jnp.inf, none, one, jnp.asarray(self.rate(0), z.dtype), zero)
 
     def iterate(
-        self, problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...], state: "AdamState"
+        self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: "AdamState"
     ) -> tuple[Coordinates, "AdamState", Evaluation]:
         _, cost, gradient = problem.gradient(state.trial, sigmas)
         first = state.number == 0
@@ -299,21 +276,14 @@ class Adam(AbstractOptimiser):
 class AdamState(NamedTuple):
     """State of Adam."""
 
-    number: Int[Array, ""]
-    """How many simulations there were."""
-    trial: Coordinates
-    """Where the next one is."""
-    moments: optax.ScaleByAdamState
-    """Means of gradients and of their squares."""
-    cost: Float[Array, ""]
-    """The lowest cost, that where it is."""
+    number: Int[Array, ""]  # how many simulations there were
+    trial: Coordinates  # where the next one is
+    moments: optax.ScaleByAdamState  # means of gradients and of their squares
+    cost: Float[Array, ""]  # the lowest cost, that where it is
     gradient: Coordinates
-    factor: Float[Array, ""]
-    """By what the learning rate is multiplied."""
-    step: Float[Array, ""]
-    """Length of the next step [-]."""
-    fruitless: Int[Array, ""]
-    """How many simulations in a row found nothing lower."""
+    factor: Float[Array, ""]  # by what the learning rate is multiplied
+    step: Float[Array, ""]  # length of the next step [-]
+    fruitless: Int[Array, ""]  # how many simulations in a row found nothing lower
 
 
 _MOMENTS: Any = optax.scale_by_adam()

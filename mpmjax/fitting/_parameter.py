@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -11,8 +12,7 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import as_floats, as_plain, require, require_fields, require_finite, require_positive
-from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._observation import drawn_nearer
+from mpmjax.fitting._experiment import Experiment, drawn_nearer
 
 Value = Float[Array, "..."]
 Start = Scalar | Value | Float[np.ndarray, "..."] | tuple | list
@@ -137,8 +137,8 @@ class Smooth(AbstractPrior):
 class AbstractParameter(eqx.Module):
     """A number, or an array of them, that is fitted.
 
-    It is searched in a coordinate z of its own, shape as the value's, that takes every real number and is zero at the
-    first guess: so no bound is ever crossed, and a step of one is a large but not an absurd change.
+    It is searched in a coordinate z, shape as the value's, that takes every real number and is zero at the first guess:
+    so no bound is ever crossed, and a step of one is a large but not an absurd change.
     """
 
     where: eqx.AbstractVar[Callable[[Experiment], Any] | None]
@@ -178,6 +178,11 @@ class AbstractParameter(eqx.Module):
         """Whether z is the logarithm of the value but for a constant."""
         return False
 
+    @property
+    def domain(self) -> tuple[float, float]:
+        """The open interval in which values lie."""
+        return -np.inf, np.inf
+
     @abc.abstractmethod
     def value(self, start: Value, z: Value) -> Value:
         """The value at a coordinate z [-]; `start` at zero."""
@@ -186,10 +191,9 @@ class AbstractParameter(eqx.Module):
     def coordinate(self, start: Value, value: Value) -> Value:
         """z [-] at a value, with zero at `start`."""
 
-    @property
-    def domain(self) -> tuple[float, float]:
-        """The open interval in which values lie."""
-        return -np.inf, np.inf
+    @abc.abstractmethod
+    def free(self, value: Value) -> Value:
+        """The value in a measure without bounds, whatever the first guess: z but for a constant and a factor."""
 
     @abc.abstractmethod
     def check(self, name: str, start: np.ndarray) -> None:
@@ -198,14 +202,6 @@ class AbstractParameter(eqx.Module):
         Raises:
             ValueError: it does not.
         """
-
-    @abc.abstractmethod
-    def free(self, value: Value) -> Value:
-        """The value in a measure without bounds, whatever the first guess: z but for a constant and a factor."""
-
-    def prior_residuals(self, value: Value) -> Array:
-        """The residuals of its prior [-], shape (k,); none without."""
-        return jnp.zeros(0, value.dtype) if self.prior is None else self.prior.residuals(value, self.free(value))
 
     def check_experiment(self, name: str, experiment: Experiment) -> None:
         """Check that it can be put into an experiment.
@@ -218,31 +214,48 @@ class AbstractParameter(eqx.Module):
         """How far the value can fall and rise until its bounds, each over its derivative by z [-], of the value's
         shape. A straight line in the value meets the bound after so many units of z."""
         del start
-        without = jnp.full_like(z, jnp.inf)
-        return without, without
+        return jnp.full_like(z, jnp.inf), jnp.full_like(z, jnp.inf)
+
+    def prior_residuals(self, value: Value) -> Array:
+        """The residuals of its prior [-], shape (k,); none without."""
+        return jnp.zeros(0, value.dtype) if self.prior is None else self.prior.residuals(value, self.free(value))
 
     def first_guess(self, experiment: Experiment) -> Array:
         """The value that the search starts from."""
         if self.start is not None:
             return jnp.asarray(self.start, experiment.dtype)
         assert self.where is not None
-        leaf = self.where(experiment)
-        return jnp.asarray(leaf[0] if isinstance(leaf, tuple) else leaf, experiment.dtype)
+        return jnp.asarray(leaves_of(self.where, experiment)[0], experiment.dtype)
 
     def put(self, experiment: Experiment, value: Value) -> Experiment:
         """The experiment with this value."""
         if self.update is not None:
             return self.update(experiment, value)
-        where = self.where
-        assert where is not None
-        leaves = where(experiment)
-        count = len(leaves) if isinstance(leaves, tuple) else None
-        shapes = {jnp.shape(leaf) for leaf in (leaves if isinstance(leaves, tuple) else (leaves,))}
+        assert self.where is not None
+        leaves = leaves_of(self.where, experiment)
+        shapes = {jnp.shape(leaf) for leaf in leaves}
         require(shapes == {value.shape}, f"it has shape {sorted(shapes)}, and its start {value.shape}.")
-        return eqx.tree_at(where, experiment, value if count is None else (value,) * count)
+        return eqx.tree_at(partial(leaves_of, self.where), experiment, (value,) * len(leaves))
 
 
-class Unbounded(AbstractParameter):
+def leaves_of(where: Callable[[Experiment], Any], experiment: Experiment) -> tuple[Any, ...]:
+    """The leaf, or the several leaves, that `where` names."""
+    leaves = where(experiment)
+    return leaves if isinstance(leaves, tuple) else (leaves,)
+
+
+class _PlainParameter(AbstractParameter):
+    """A parameter whose values are those of leaves as they are."""
+
+    where: Callable[[Experiment], Any] | None = None
+    update: Callable[[Experiment, Value], Experiment] | None = eqx.field(default=None, kw_only=True)
+    start: Start | None = eqx.field(default=None, kw_only=True)
+    prior: AbstractPrior | None = eqx.field(default=None, kw_only=True)
+    unit: str = eqx.field(static=True, default="", kw_only=True)
+    only: tuple[int, ...] | None = eqx.field(static=True, default=None, converter=as_plain, kw_only=True)
+
+
+class Unbounded(_PlainParameter):
     """A parameter that may have any value, such as a velocity or an angle.
 
     Args:
@@ -251,13 +264,7 @@ class Unbounded(AbstractParameter):
         update, start, prior, unit, only: see `Positive`.
     """
 
-    where: Callable[[Experiment], Any] | None = None
-    update: Callable[[Experiment, Value], Experiment] | None = None
-    start: Start | None = None
-    scale: Scalar | None = None
-    prior: AbstractPrior | None = None
-    unit: str = eqx.field(static=True, default="")
-    only: tuple[int, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
+    scale: Scalar | None = eqx.field(default=None, kw_only=True)
 
     def value(self, start: Value, z: Value) -> Value:
         """start + scale z."""
@@ -279,7 +286,7 @@ class Unbounded(AbstractParameter):
             require_positive(f"The scale of the parameter {name!r}", self.scale)
 
 
-class Positive(AbstractParameter):
+class Positive(_PlainParameter):
     """A positive parameter, such as a modulus, a viscosity or a density: start·e^z.
 
     Args:
@@ -291,16 +298,13 @@ class Positive(AbstractParameter):
         only: numbers of the experiments that it belongs to. Default: all.
     """
 
-    where: Callable[[Experiment], Any] | None = None
-    update: Callable[[Experiment, Value], Experiment] | None = None
-    start: Start | None = None
-    prior: AbstractPrior | None = None
-    unit: str = eqx.field(static=True, default="")
-    only: tuple[int, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
-
     @property
     def logarithmic(self) -> bool:
         return True
+
+    @property
+    def domain(self) -> tuple[float, float]:
+        return 0.0, np.inf
 
     def value(self, start: Value, z: Value) -> Value:
         """start·e^z."""
@@ -308,10 +312,6 @@ class Positive(AbstractParameter):
 
     def coordinate(self, start: Value, value: Value) -> Value:
         return jnp.log(value / start)
-
-    @property
-    def domain(self) -> tuple[float, float]:
-        return 0.0, np.inf
 
     def free(self, value: Value) -> Value:
         """ln value."""
@@ -326,7 +326,7 @@ class Positive(AbstractParameter):
         require(start > 0, f"The parameter {name!r} must start from positive numbers, got {start}.")
 
 
-class Bounded(AbstractParameter):
+class Bounded(_PlainParameter):
     """A parameter between two bounds, such as Poisson's ratio: lower + (upper − lower)/(1 + e^{−(z0 + z)}).
 
     Args:
@@ -336,29 +336,29 @@ class Bounded(AbstractParameter):
         update, start, prior, unit, only: see `Positive`.
     """
 
-    where: Callable[[Experiment], Any] | None = None
     lower: float | int = eqx.field(static=True, default=0.0, converter=as_plain)
     upper: float | int = eqx.field(static=True, default=1.0, converter=as_plain)
-    update: Callable[[Experiment, Value], Experiment] | None = None
-    start: Start | None = None
-    prior: AbstractPrior | None = None
-    unit: str = eqx.field(static=True, default="")
-    only: tuple[int, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
-
-    def value(self, start: Value, z: Value) -> Value:
-        """lower + (upper − lower)/(1 + e^{−(z0 + z)})."""
-        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(self._logit(start) + z)
-
-    def coordinate(self, start: Value, value: Value) -> Value:
-        return self._logit(value) - self._logit(start)
 
     @property
     def domain(self) -> tuple[float, float]:
         return self.lower, self.upper
 
+    def value(self, start: Value, z: Value) -> Value:
+        """lower + (upper − lower)/(1 + e^{−(z0 + z)})."""
+        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(self.free(start) + z)
+
+    def coordinate(self, start: Value, value: Value) -> Value:
+        return self.free(value) - self.free(start)
+
     def free(self, value: Value) -> Value:
         """The logit of where it lies between the bounds."""
-        return self._logit(value)
+        share = (value - self.lower) / (self.upper - self.lower)
+        return jnp.log(share) - jnp.log1p(-share)
+
+    def room(self, start: Value, z: Value) -> tuple[Value, Value]:
+        """1 + e^{z0 + z} and 1 + e^{−(z0 + z)}."""
+        logit = self.free(start) + z
+        return 1 + jnp.exp(logit), 1 + jnp.exp(-logit)
 
     def check(self, name: str, start: np.ndarray) -> None:
         require(
@@ -369,13 +369,3 @@ class Bounded(AbstractParameter):
             (start > self.lower) & (start < self.upper),
             f"The parameter {name!r} must start between its bounds {self.lower} and {self.upper}, got {start}.",
         )
-
-    def room(self, start: Value, z: Value) -> tuple[Value, Value]:
-        """1 + e^{z0 + z} and 1 + e^{−(z0 + z)}."""
-        logit = self._logit(start) + z
-        return 1 + jnp.exp(logit), 1 + jnp.exp(-logit)
-
-    def _logit(self, value: Value) -> Value:
-        """The logit of where the value lies between the bounds."""
-        share = (value - self.lower) / (self.upper - self.lower)
-        return jnp.log(share) - jnp.log1p(-share)

@@ -1,4 +1,4 @@
-"""Predictions of a fit, with their errors."""
+"""Errors that follow from a fit: of its predictions, and of its parameters by data drawn anew."""
 
 from collections.abc import Callable
 from functools import partial
@@ -10,13 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Scalar
-from mpmjax.checks import checked, require, require_positive, warn
-from mpmjax.fitting._experiment import Experiment
+from mpmjax._types import Array, Float, Scalar
+from mpmjax.checks import checked, require, require_positive, require_whole, warn
+from mpmjax.fitting._experiment import AbstractObservation, Experiment, Numbers
 from mpmjax.fitting._fit import checked_level
-from mpmjax.fitting._observation import AbstractObservation, Numbers
+from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._problem import Coordinates, FitProblem, in_batches
-from mpmjax.fitting._result import FitResult
+from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, table
+from mpmjax.fitting._search import Problems, batch_size, counted, search_many
 from mpmjax.fitting._uncertainty import quantile
 
 
@@ -237,3 +238,100 @@ def _prediction(
     return Prediction(
         mean, np.asarray(error), np.asarray(mean - reach), np.asarray(mean + reach), sigma, new_lower, new_upper, level
     )
+
+
+class Bootstrap(AbstractFit):
+    """The estimates of fits of data drawn anew.
+
+    `print(result)` shows a table; `result["E"].interval` is a percentile interval.
+    """
+
+    estimates: tuple[Estimate, ...]
+    """The fitted numbers: values of the fit of what was measured, errors and percentile intervals of the samples."""
+    samples: Float[np.ndarray, "k n"]
+    """Their values in each fit that did not fail, shape (k, n)."""
+    level: float
+    """The level of the intervals [-]."""
+    failed: int
+    """How many fits failed, or came to no minimum."""
+
+    @property
+    def all(self) -> tuple[Estimate, ...]:
+        return self.estimates
+
+    def __str__(self) -> str:
+        """A table."""
+        head = "", f"{'value':>12} ± {'error':<9}", f"{100 * self.level:g} % interval"
+        last = f"{len(self.samples)} fits of data drawn anew" + (f", {self.failed} failed" if self.failed else "")
+        return "\n".join([*table(head, *((e.name, *e.cells) for e in self.estimates)), last])
+
+
+@checked
+def bootstrap(
+    result: FitResult,
+    *,
+    repeats: int = 200,
+    seed: int = 0,
+    batch: int | None = None,
+    optimiser: AbstractOptimiser | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Bootstrap:
+    """Errors and intervals of a fit without linearisation: the fitted simulation's data with new normal noise of the
+    fit's σ, fitted again, many times (the parametric bootstrap: B. Efron, R. J. Tibshirani, An Introduction to the
+    Bootstrap, Chapman & Hall 1993, chapters 6.5 and 13).
+
+        print(mpm.fitting.bootstrap(mpm.fit(pull, {"E": ...})))
+
+    It takes the model and the independence of the noise for granted, as the errors of `fit` do: what it adds is the
+    curvature of the model and what bounds do. `weight` and `robust` act in each fit; the noise drawn is of σ for each
+    number. A prior's mean is drawn anew too. Two hundred repeats fix a standard error to 5 %, and a 95 % interval
+    less well.
+
+    Args:
+        result: the fit.
+        repeats: how many fits.
+        seed: of the noise.
+        batch: how many fits run together, see `fit_multistart`.
+        optimiser: the method of each. Default: that of the fit.
+        progress: called with a line, such as `print`, as fits end.
+
+    Raises:
+        ValueError: fewer than two repeats; fewer than two fits that succeeded.
+    """
+    require_whole("repeats", repeats, 2)
+    rng = np.random.default_rng(require_whole("seed", seed, 0))
+    problem, z = result.problem, jnp.asarray(result.z, result.problem.dtype)
+    predicted = [np.asarray(y, float) for e in problem.at(z) for y in e.predictions(e.run())]
+    problems = [_drawn(problem, predicted, result.sigmas, rng) for _ in range(repeats)]
+
+    members = search_many(
+        Problems.of(problems),
+        result.optimiser if optimiser is None else optimiser,
+        np.repeat(np.asarray(result.z, float)[None], repeats, axis=0),
+        sigmas=Problems.of([result.sigmas]),
+        batch=batch_size(problem, batch, repeats),
+        progress=counted(progress, "{} of {} fits are done"),
+    )
+    ends = [m.minimum.z for m in members if m.minimum is not None and m.minimum.converged]
+    require(len(ends) > 1, f"Of {repeats} fits of data drawn anew {len(ends)} came to a minimum: raise max_steps.")
+    if len(ends) < repeats:
+        warn(
+            f"{repeats - len(ends)} of {repeats} fits of data drawn anew came to no minimum: intervals leave them out."
+        )
+    samples = np.array([problem.numbers(end) for end in ends])
+    lower, upper = np.quantile(samples, [(1 - result.level) / 2, (1 + result.level) / 2], axis=0).tolist()
+    errors = samples.std(axis=0, ddof=1).tolist()
+    each = zip(result.estimates, errors, lower, upper, strict=True)
+    estimates = tuple(e._replace(error=error, interval=(a, b)) for e, error, a, b in each)
+    return Bootstrap(estimates, samples, result.level, repeats - len(ends))
+
+
+def _drawn(problem: FitProblem, predicted: list[np.ndarray], sigmas: tuple, rng: np.random.Generator) -> FitProblem:
+    """The problem with data of its simulation and new noise, NaN where nothing was measured."""
+    drawn = []
+    for observation, y, sigma in zip(problem.observations, predicted, sigmas, strict=True):
+        noisy = y + np.asarray(sigma) * rng.normal(size=y.shape)
+        drawn.append(np.where(np.isfinite(observation.data), noisy, np.nan))
+    problem = eqx.tree_at(lambda p: [o.data for o in p.observations], problem, drawn)
+    priors = [p.prior.drawn(rng) for p in problem.parameters if p.prior is not None]
+    return eqx.tree_at(lambda q: [p.prior for p in q.parameters if p.prior is not None], problem, priors)

@@ -14,12 +14,11 @@ import numpy as np
 
 from mpmjax._types import Array, Float
 from mpmjax.checks import require, require_whole, shortened
-from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._observation import AbstractObservation
+from mpmjax.fitting._experiment import AbstractObservation, Experiment
 from mpmjax.fitting._parameter import AbstractParameter
 
-Coordinates = Float[Array, "n"]
-"""The coordinates z of all parameters, one after the other [-]."""
+Coordinates = Float[Array, "n"]  # the coordinates z of all parameters, one after the other [-]
+Sigmas = tuple[Array, ...]  # the noise of each observation, in its data's unit
 
 
 class FitProblem(eqx.Module):
@@ -128,13 +127,13 @@ class FitProblem(eqx.Module):
         each = zip(self.parameters, self.starts, strict=True)
         return tuple(parameter.logarithmic for parameter, start in each for _ in range(start.size))
 
-    def size_of_data(self, sigmas: tuple[Array, ...]) -> Array:
+    def size_of_data(self, sigmas: Sigmas) -> Array:
         """√Σ (data/σ)², the size of what the residuals are the difference of [-]."""
         each = zip(self.observations, sigmas, strict=True)
         ratios = (jnp.asarray(o.data, self.dtype) / jnp.asarray(sigma, self.dtype) for o, sigma in each)
         return jnp.sqrt(sum((jnp.nansum(ratio**2) for ratio in ratios), jnp.zeros((), self.dtype)))
 
-    def rounding(self, cost: Array, sigmas: tuple[Array, ...]) -> Array:
+    def rounding(self, cost: Array, sigmas: Sigmas) -> Array:
         """The part of ½ Σ r² that may be rounding: each residual has that of the data's size, ε √Σ (data/σ)² [-]."""
         noise = float(jnp.finfo(self.dtype).eps) * self.size_of_data(sigmas).astype(cost.dtype)
         return jnp.sqrt(2 * cost) * noise + noise**2 + float(jnp.finfo(cost.dtype).eps) * cost
@@ -207,7 +206,7 @@ class FitProblem(eqx.Module):
                 experiment = parameter.put(experiment, value)
         return experiment.with_gradient_since(before)
 
-    def residuals(self, z: Coordinates, sigmas: tuple[Array, ...], adjoint: Any) -> tuple[Array, Array]:
+    def residuals(self, z: Coordinates, sigmas: Sigmas, adjoint: Any) -> tuple[Array, Array]:
         """The residuals of all observations, then of priors [-], shape (m,), NaN where a simulation met a fault or does
         not reach a measurement; and what tangent solves report (see `Run.report`).
 
@@ -231,7 +230,7 @@ class FitProblem(eqx.Module):
         each = zip(self.parameters, self.values(z), strict=True)
         return jnp.concatenate([parameter.prior_residuals(value) for parameter, value in each])
 
-    def gradient(self, z: Coordinates, sigmas: tuple[Array, ...]) -> tuple[Array, Array, Coordinates]:
+    def gradient(self, z: Coordinates, sigmas: Sigmas) -> tuple[Array, Array, Coordinates]:
         """The residuals r, ½ Σ r² and its derivative by the coordinates, by one pass of reverse mode: its cost does not
         grow with their number. NaN where a simulation met a fault, the derivative also where an adjoint solve did not
         converge."""
@@ -256,7 +255,7 @@ class FitProblem(eqx.Module):
         raise ValueError(failure)
 
     def jacobian(
-        self, z: Coordinates, sigmas: tuple[Array, ...], mode: Literal["forward", "reverse"] | None = None
+        self, z: Coordinates, sigmas: Sigmas, mode: Literal["forward", "reverse"] | None = None
     ) -> tuple[Array, Array]:
         """The residuals and their derivative by the coordinates, shape (m, n). NaN where a tangent or adjoint solve did
         not converge.
@@ -279,7 +278,7 @@ class FitProblem(eqx.Module):
         r, (columns, unsolved) = in_batches(push, jnp.eye(self.size, dtype=z.dtype), self.at_once)
         return r, jnp.where((unsolved != 0).any(), jnp.nan, columns.T)
 
-    def _jacobian_by_rows(self, z: Coordinates, sigmas: tuple[Array, ...]) -> tuple[Array, Array]:
+    def _jacobian_by_rows(self, z: Coordinates, sigmas: Sigmas) -> tuple[Array, Array]:
         """`jacobian` by a pass back for each measured number; priors need no simulation."""
         r, pull, _ = jax.vjp(lambda z: self.residuals(z, sigmas, None), z, has_aux=True)
         _, (rows,) = in_batches(
@@ -349,9 +348,7 @@ def _bytes(tree: Any) -> int:
     return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in leaves)
 
 
-SHOWN = 4
-"""Parameters that a line has room for."""
+SHOWN = 4  # parameters that a line has room for
 ROW_COST = 1.2
 """Cost of a row of the Jacobian by reverse mode, over that of a column by forward mode (benchmarks/fit_cost.py)."""
-_COPIES = 16
-"""Memory that a tangent takes, in sizes of the particles' (benchmarks/fit_cost.py)."""
+_COPIES = 16  # memory that a tangent takes, in sizes of the particles' (benchmarks/fit_cost.py)

@@ -11,7 +11,7 @@ from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import checked, require, require_positive, require_whole, warn
 from mpmjax.fitting._fit import checked_level
 from mpmjax.fitting._optimiser import AbstractOptimiser
-from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
 from mpmjax.fitting._result import FitResult, intervals
 from mpmjax.fitting._search import NoDerivativeError, search
 from mpmjax.fitting._uncertainty import quantile
@@ -189,17 +189,15 @@ class RestrictedProblem(FitProblem):
         """On planes of some of the coordinates."""
         return jnp.where(self.basis.T != 0, self.whole.room(self.place(z))[:, None], jnp.inf).min(axis=2)
 
-    def residuals(self, z: Coordinates, sigmas: tuple[Array, ...], adjoint: Any) -> tuple[Array, Array]:
+    def residuals(self, z: Coordinates, sigmas: Sigmas, adjoint: Any) -> tuple[Array, Array]:
         return self.whole.residuals(self.place(z), sigmas, adjoint)
 
 
 class _Point(NamedTuple):
     """The least misfit where the coordinate is held."""
 
-    z: np.ndarray
-    """All coordinates, shape (n,)."""
-    growth: float
-    """Δχ²."""
+    z: np.ndarray  # all coordinates, shape (n,)
+    growth: float  # Δχ²
 
     @property
     def root(self) -> float:
@@ -210,14 +208,10 @@ class _Point(NamedTuple):
 class _End(NamedTuple):
     """Where one side of a profile ends."""
 
-    at: float
-    """The coordinate at the threshold; infinite where that is not reached."""
-    last: _Point
-    """The last point."""
-    fault: float | None = None
-    """The nearest coordinate at which the simulation fails."""
-    jump: float | None = None
-    """Δχ² beyond a jump at the threshold, if it jumps."""
+    at: float  # the coordinate at the threshold; infinite where that is not reached
+    last: _Point  # the last point
+    fault: float | None = None  # the nearest coordinate at which the simulation fails
+    jump: float | None = None  # Δχ² beyond a jump at the threshold, if it jumps
 
 
 class _Walk:
@@ -377,7 +371,7 @@ class _Walk:
 
 
 @eqx.filter_jit
-def _residuals(problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> Array:
+def _residuals(problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> Array:
     """The residuals, compiled."""
     return problem.residuals(z, sigmas, None)[0]
 
@@ -392,18 +386,13 @@ def _direction(result: FitResult, at: int) -> np.ndarray:
 
 _FARTHEST = 14.0
 """How far a profile is followed, in the search's coordinate: to a millionth and a million-fold of a positive one."""
-_MOST_POINTS = 40
-"""On one side."""
+_MOST_POINTS = 40  # on one side
 _BEYOND = 1.02
 """Steps are so much longer than is foretold, so that in a linear problem the last one goes beyond the threshold."""
-_FASTER = 2.0
-"""A step is no longer than so many times the one before."""
+_FASTER = 2.0  # a step is no longer than so many times the one before
 _STILL = 1e-6
 """A walk ends where the number changes, over a unit of the coordinate, by less than so much of its estimate: at a
 bound."""
-_JUMP = 0.2
-"""√Δχ² that grows by more than this part of the threshold's within the tolerance jumps."""
-_NEAR_FAULT = 0.02
-"""A value at which the simulation fails is approached to this part of its distance from the estimate."""
-_BETTER = 1e-2
-"""A Δχ² below zero by more is another minimum."""
+_JUMP = 0.2  # √Δχ² that grows by more than this part of the threshold's within the tolerance jumps
+_NEAR_FAULT = 0.02  # a value at which the simulation fails is approached to this part of its distance from the estimate
+_BETTER = 1e-2  # a Δχ² below zero by more is another minimum

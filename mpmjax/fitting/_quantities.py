@@ -15,8 +15,7 @@ from mpmjax.state import Particles, Scene
 
 Rows = Float[Array, "m d"] | Float[np.ndarray, "m d"] | tuple | list
 
-_NEIGHBOURS = 3
-"""Particles that carry a marker, in each direction."""
+_NEIGHBOURS = 3  # particles that carry a marker, in each direction
 
 
 class Markers(eqx.Module):

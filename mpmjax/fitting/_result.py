@@ -17,7 +17,7 @@ from mpmjax.checks import require
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
-from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._problem import SHOWN, Coordinates, FitProblem, Sigmas
 from mpmjax.fitting._search import Iteration, Minimum
 from mpmjax.fitting._uncertainty import Uncertainty, at_bound, noise, quantile, seen_together, uncertainty
 
@@ -92,7 +92,7 @@ class FitResult(AbstractFit):
     """The residuals that were made small."""
     z: np.ndarray
     """The coordinates at the minimum [-], shape (n,)."""
-    sigmas: tuple[Array, ...]
+    sigmas: Sigmas
     """The noise of each observation, given or estimated, in the data's unit."""
     residuals: np.ndarray
     """Residuals of all observations, then of priors, in units of their noise [-], shape (m,)."""
@@ -212,6 +212,17 @@ def table(head: Sequence[str], *rows: Sequence[str]) -> list[str]:
     return ["  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in (head, *rows)]
 
 
+def label_cells(problem: FitProblem) -> list[str]:
+    """The heads of columns of the first fitted numbers."""
+    return [f"{label:>13}" for label in problem.labels[:SHOWN]]
+
+
+def value_cells(values: Mapping[str, np.ndarray]) -> list[str]:
+    """The first fitted numbers, in columns."""
+    numbers = np.concatenate([value.reshape(-1) for value in values.values()])
+    return [f"{number:>13.6g}" for number in numbers[:SHOWN]]
+
+
 def _summary(name: str, shape: tuple[int, ...], each: list[Estimate]) -> str:
     """Many numbers of one parameter in a line."""
     unit = f" [{each[0].unit}]" if each[0].unit else ""
@@ -232,17 +243,13 @@ def restarted(
 class SettledNoise(NamedTuple):
     """The noise of the observations, by the residuals at a minimum."""
 
-    sigmas: tuple[Array, ...]
-    """The noise of each observation, in its data's unit."""
-    factors: list[float]
-    """By what each is larger than it was in the search."""
-    freedoms: list[float]
-    """Degrees of freedom of each estimate, zero where the noise is given."""
-    changing: bool
-    """Whether the change moves the minimum, which must then be searched again."""
+    sigmas: Sigmas  # the noise of each observation, in its data's unit
+    factors: list[float]  # by what each is larger than it was in the search
+    freedoms: list[float]  # degrees of freedom of each estimate, zero where the noise is given
+    changing: bool  # whether the change moves the minimum, which must then be searched again
 
 
-def settle_noise(problem: FitProblem, minimum: Minimum, sigmas: tuple[Array, ...]) -> SettledNoise:
+def settle_noise(problem: FitProblem, minimum: Minimum, sigmas: Sigmas) -> SettledNoise:
     """The noise by the residuals at a minimum that was searched with `sigmas`.
 
     Raises:
@@ -385,13 +392,8 @@ def _reported(
 
 
 _FIRST_COLUMN = 24
-_MOST_ROWS = 12
-"""Numbers of one parameter up to which each has a row of the table."""
-_IMPROBABLE = 1e-3
-"""Probability of a χ² from which the model is said not to explain the data."""
-_BESIDE = 3
-"""Reaches of an interval within which it is beside a bound."""
-_NOISE_RTOL = 1e-3
-"""The noise of several observations is settled when its estimate changes less, relatively."""
-_LEAST = 1e-12
-"""Smallest noise, in sizes of the data: exact data have none."""
+_MOST_ROWS = 12  # numbers of one parameter up to which each has a row of the table
+_IMPROBABLE = 1e-3  # probability of a χ² from which the model is said not to explain the data
+_BESIDE = 3  # reaches of an interval within which it is beside a bound
+_NOISE_RTOL = 1e-3  # the noise of several observations is settled when its estimate changes less, relatively
+_LEAST = 1e-12  # smallest noise, in sizes of the data: exact data have none

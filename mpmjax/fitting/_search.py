@@ -12,42 +12,34 @@ import numpy as np
 from mpmjax._types import Array, Float
 from mpmjax.checks import require, require_whole
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
-from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
 
 
 class Iteration(NamedTuple):
     """One iteration of a search."""
 
     number: int
-    cost: float
-    """½ Σ r² where it is now."""
-    gradient: float
-    """Largest component of its derivative by the coordinates there."""
-    accepted: bool
-    """Whether it moved."""
-    z: np.ndarray
-    """The coordinates, shape (n,)."""
+    cost: float  # ½ Σ r² where it is now
+    gradient: float  # largest component of its derivative by the coordinates there
+    accepted: bool  # whether it moved
+    z: np.ndarray  # the coordinates, shape (n,)
 
 
 class SearchState(NamedTuple):
     """A search after an iteration: all that the next one needs."""
 
     z: Coordinates
-    inner: Any
-    """State of the optimiser."""
+    inner: Any  # state of the optimiser
     seen: Evaluation
-    history: tuple[Iteration, ...]
-    """The iterations so far, one at least."""
+    history: tuple[Iteration, ...]  # the iterations so far, one at least
 
 
 class Minimum(NamedTuple):
     """The end of a search."""
 
     z: Coordinates
-    r: Float[Array, "m"]
-    """The residuals there [-]."""
-    J: Float[Array, "m n"]
-    """Their derivative."""
+    r: Float[Array, "m"]  # the residuals there [-]
+    J: Float[Array, "m n"]  # their derivative
     converged: bool
     interrupted: bool
     history: tuple[Iteration, ...]
@@ -61,12 +53,9 @@ class Minimum(NamedTuple):
 class Member(NamedTuple):
     """The outcome of one search among many."""
 
-    minimum: Minimum | None
-    """Where it ended; None where it failed, or was not begun."""
-    failure: str = ""
-    """Why it failed, in words."""
-    joined: int | None = None
-    """The number of the search that it came upon, and was ended for."""
+    minimum: Minimum | None  # where it ended; None where it failed, or was not begun
+    failure: str = ""  # why it failed, in words
+    joined: int | None = None  # the number of the search that it came upon, and was ended for
 
     @property
     def interrupted(self) -> bool:
@@ -83,16 +72,11 @@ class Problems(eqx.Module):
 
     varying: Any
     """A problem with the leaves that differ alone, their leading axis the problems; no leaves if one serves all."""
-    common: Any
-    """A problem with the others."""
+    common: Any  # a problem with the others
 
     @staticmethod
     def of(problems: list[Any]) -> "Problems":
-        """Stack a problem for each search, or take one for all of them.
-
-        Raises:
-            ValueError: they differ in more than numbers.
-        """
+        """Stack a problem for each search, or take one for all of them; they must differ in numbers alone."""
         leaves, structures = zip(*(jax.tree.flatten(problem) for problem in problems), strict=True)
         for k, structure in enumerate(structures):
             require(structure == structures[0], _DIFFERENT.format(k))
@@ -130,19 +114,16 @@ def search(
     problem: FitProblem,
     optimiser: AbstractOptimiser,
     z: Coordinates,
-    sigmas: tuple[Array, ...],
+    sigmas: Sigmas,
     *,
     state: SearchState | None = None,
-    report: Callable[[SearchState], None] | None = None,
-    begun: Callable[[Evaluation], None] | None = None,
+    report: Callable[[SearchState], None] = lambda state: None,
+    begun: Callable[[Evaluation], None] = lambda seen: None,
 ) -> Minimum:
     """The least Σ r² near z. An interruption (Ctrl-C) ends the search where it is.
 
     Args:
-        problem: the residuals.
-        optimiser: the method.
-        z: where it starts.
-        sigmas: the noise of each observation.
+        problem, optimiser, z, sigmas: what is minimised, how, from where, and with which noise.
         state: in the place of z, the state of an earlier search of the same kind; it is continued exactly.
         report: called after each iteration.
         begun: called with the evaluation where it starts.
@@ -159,12 +140,12 @@ def search(
             or len(state.history) >= optimiser.max_steps
         ):
             state = _step(problem, optimiser, z, sigmas, state)
-            if np.isfinite(state.history[-1].cost) and not np.isfinite(state.history[-1].gradient):
+            last = state.history[-1]
+            if np.isfinite(last.cost) and not np.isfinite(last.gradient):
                 raise NoDerivativeError
-            if begun is not None and len(state.history) == 1 and np.isfinite(state.history[0].cost):
+            if last.number == 0 and np.isfinite(last.cost):
                 begun(state.seen)
-            if report is not None:
-                report(state)
+            report(state)
     except KeyboardInterrupt:
         if state is None:
             raise
@@ -184,8 +165,8 @@ def search_many(
     batch: int,
     joining: float = 0.0,
     settling: float = 0.0,
-    progress: Callable[[int, int], None] | None = None,
-    begun: Callable[[int, Evaluation], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, count: None,
+    begun: Callable[[int, Evaluation], None] = lambda number, seen: None,
 ) -> tuple[Member, ...]:
     """The minima of many searches, that differ in where they start or in their data.
 
@@ -194,10 +175,8 @@ def search_many(
     fails ends alone. An interruption (Ctrl-C) ends all where they are.
 
     Args:
-        problems: the problems, or one for all.
-        optimiser: the method.
-        starts: where each starts.
-        sigmas: the noise of each observation, of each problem, or one for all.
+        problems, sigmas: a problem and a noise for each search, or one for all.
+        optimiser, starts: how they are minimised, and where each starts.
         batch: how many are computed together.
         joining: a search that comes so near to another one of one problem with a lower cost, in each coordinate, is
             ended: it would go the same way. Zero ends none.
@@ -233,7 +212,7 @@ def search_many(
             states = _step_together(problems, optimiser, starts, sigmas, running, batch)
             running = dict(states)
             for k, state in states.items():
-                if begun is not None and len(state.history) == 1 and np.isfinite(state.history[0].cost):
+                if len(state.history) == 1 and np.isfinite(state.history[0].cost):
                     begun(k, state.seen)
                 member = ended(k, state)
                 if member is not None:
@@ -244,8 +223,7 @@ def search_many(
                 for k, other in _joined(done, left, joining).items():
                     done[k] = stopped(k, left[k])._replace(joined=other)
                     del running[k]
-            if progress is not None:
-                progress(len(done), count)
+            progress(len(done), count)
     except KeyboardInterrupt:
         done |= {k: stopped(k, s, interrupted=True) for k, s in running.items() if s is not None}
     return tuple(done.get(k, Member(None, _NOT_BEGUN)) for k in range(count))
@@ -260,12 +238,21 @@ def batch_size(problem: FitProblem, batch: int | None, count: int) -> int:
     return min(8 if all(e.method.is_explicit for e in problem.experiments) else 1, count)
 
 
+def counted(progress: Callable[[str], None] | None, text: str, *, again: bool = True) -> Callable[[int, int], None]:
+    """Progress of many in lines, of a text such as "{} of {} searches are done": each time, or whenever more are."""
+    told = 0
+
+    def say(done: int, count: int) -> None:
+        nonlocal told
+        if progress is not None and (again or done > told):
+            told = done
+            progress(text.format(done, count))
+
+    return say
+
+
 def _step(
-    problem: FitProblem,
-    optimiser: AbstractOptimiser,
-    z: Coordinates,
-    sigmas: tuple[Any, ...],
-    state: SearchState | None,
+    problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, sigmas: Sigmas, state: SearchState | None
 ) -> SearchState:
     """One iteration, the first one at z where there is no state yet."""
     if state is None:
@@ -291,10 +278,9 @@ def _step_together(
     z, inners, histories = [], [], []
     for k, state in running.items():
         at = jnp.asarray(starts[k], float) if state is None else state.z
-        fresh = state is None
         z.append(np.asarray(at))
-        inners.append(begin(problems.one(k), optimiser, at, sigmas.one(k)) if fresh else state.inner)
-        histories.append(() if fresh else state.history)
+        inners.append(begin(problems.one(k), optimiser, at, sigmas.one(k)) if state is None else state.inner)
+        histories.append(() if state is None else state.history)
     lanes = [*range(len(z)), *[0] * (batch - len(z))]
     members = np.array(list(running))[lanes]
     parts = [eqx.partition(inner, lambda a: isinstance(a, (jax.Array, np.ndarray, np.generic))) for inner in inners]
@@ -322,9 +308,7 @@ def _recorded(
     return SearchState(z, optimiser.directed(z, inner, seen), seen, (*history, iteration))
 
 
-def _minimum(
-    problem: FitProblem, sigmas: tuple[Any, ...], state: SearchState, *, converged: bool, interrupted: bool
-) -> Minimum:
+def _minimum(problem: FitProblem, sigmas: Sigmas, state: SearchState, *, converged: bool, interrupted: bool) -> Minimum:
     """Where a search is, with residuals and Jacobian."""
     z = jnp.asarray(state.z).astype(problem.dtype)
     r, J = state.seen.residuals, state.seen.jacobian
@@ -352,14 +336,14 @@ def _joined(done: dict[int, Member], running: dict[int, SearchState], within: fl
 
 
 @eqx.filter_jit
-def begin(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, sigmas: tuple[Array, ...]) -> Any:
+def begin(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, sigmas: Sigmas) -> Any:
     """An optimiser's `begin`, compiled."""
     return optimiser.begin(problem, z, sigmas)
 
 
 @eqx.filter_jit
 def iterate(
-    problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, sigmas: tuple[Array, ...], inner: Any
+    problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, sigmas: Sigmas, inner: Any
 ) -> tuple[Coordinates, Any, Evaluation]:
     """An optimiser's `iterate`, compiled."""
     return optimiser.iterate(problem, z, sigmas, inner)
@@ -386,7 +370,7 @@ def iterate_together(
 
 
 @eqx.filter_jit
-def jacobian(problem: FitProblem, z: Coordinates, sigmas: tuple[Array, ...]) -> tuple[Array, Array]:
+def jacobian(problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> tuple[Array, Array]:
     """The residuals and their Jacobian, compiled."""
     return problem.jacobian(z, sigmas)
 
@@ -396,7 +380,5 @@ _DIFFERENT = (
     "The data sets of an ensemble must differ in numbers alone, but number {} has other shapes, choices or functions "
     "than the first: give each the same times and markers (NaN where nothing was measured), and the same functions."
 )
-_MOVES = 3
-"""How many moves must have lowered the cost by little."""
-_ITERATIONS = 6
-"""How many iterations must have lowered the cost by little."""
+_MOVES = 3  # how many moves must have lowered the cost by little
+_ITERATIONS = 6  # how many iterations must have lowered the cost by little

@@ -10,20 +10,13 @@ from scipy.special import ndtri, stdtrit
 _ROUNDINGS = 1e3
 """Singular values of J, its columns of length one, below this many roundings of the largest are none: the data do not
 see the direction."""
-_SHARE = 1e-6
-"""Part of a unit vector below which it does not lie in a direction."""
-_LEAST_FREEDOM = 1e-3
-"""Degrees of freedom below which there are none, but rounding."""
-_AT_BOUND = 1e-2
-"""Standard errors from a bound at which a number lies at it."""
-_NODES = 100
-"""Nodes of Gauss-Hermite quadrature."""
-_MOST_SAID = 8
-"""Directions that are named."""
-_NEARLY_ONE = 0.99
-"""Correlation from which two parameters are said to be seen only together."""
-_PART = 0.1
-"""Share of a direction's largest effect on the data from which a coordinate is named with it."""
+_SHARE = 1e-6  # part of a unit vector below which it does not lie in a direction
+_LEAST_FREEDOM = 1e-3  # degrees of freedom below which there are none, but rounding
+_AT_BOUND = 1e-2  # standard errors from a bound at which a number lies at it
+_NODES = 100  # nodes of Gauss-Hermite quadrature
+_MOST_SAID = 8  # directions that are named
+_NEARLY_ONE = 0.99  # correlation from which two parameters are said to be seen only together
+_PART = 0.1  # share of a direction's largest effect on the data from which a coordinate is named with it
 
 
 class Uncertainty(NamedTuple):
@@ -31,18 +24,14 @@ class Uncertainty(NamedTuple):
 
     inverse: np.ndarray
     """The pseudo-inverse of JᵀJ, shape (n, n): the covariance, but in directions that the data do not see."""
-    unseen: np.ndarray
-    """Directions that the data do not see, one a column, shape (n, u)."""
+    unseen: np.ndarray  # directions that the data do not see, one a column, shape (n, u)
     weak: np.ndarray
     """Directions that the data hardly see, a tenth as well as each coordinate alone, one a column, shape (n, w)."""
-    spectrum: np.ndarray
-    """The eigenvalues of the Fisher information JᵀJ, growing, shape (n,)."""
-    directions: np.ndarray
-    """Their eigenvectors, one a column, shape (n, n)."""
+    spectrum: np.ndarray  # the eigenvalues of the Fisher information JᵀJ, growing, shape (n,)
+    directions: np.ndarray  # their eigenvectors, one a column, shape (n, n)
     parts: tuple[np.ndarray, ...]
     """For each observation whose noise was estimated, its part of the covariance, shape (n, n)."""
-    freedoms: tuple[float, ...]
-    """The degrees of freedom of each of these estimates."""
+    freedoms: tuple[float, ...]  # the degrees of freedom of each of these estimates
 
     @property
     def rank(self) -> int:

@@ -17,8 +17,7 @@ from mpmjax.fitting import (
 )
 from mpmjax.io import replacing, save_figure
 
-_MOST_LINES = 6
-"""Components of an observation that are drawn."""
+_MOST_LINES = 6  # components of an observation that are drawn
 _PROFILES_A_ROW = 3
 
 

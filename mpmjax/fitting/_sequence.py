@@ -1,0 +1,437 @@
+"""Fits in a sequence, each from where the last one ended: to growing horizons, or on finer grids."""
+
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from mpmjax._types import Scalar
+from mpmjax.analysis import sensitivity
+from mpmjax.checks import checked, require, require_positive, warn
+from mpmjax.fitting._experiment import Experiment
+from mpmjax.fitting._fit import chosen_optimiser, fit
+from mpmjax.fitting._observation import Series
+from mpmjax.fitting._optimiser import AbstractOptimiser
+from mpmjax.fitting._parameter import AbstractParameter
+from mpmjax.fitting._problem import Coordinates, FitProblem
+from mpmjax.fitting._result import (
+    AbstractFit,
+    Estimate,
+    FitResult,
+    NoiseEstimate,
+    label_cells,
+    restarted,
+    table,
+    value_cells,
+)
+from mpmjax.fitting._search import begin, iterate, jacobian, search
+from mpmjax.fitting._uncertainty import quantile
+
+
+class Stage(NamedTuple):
+    """A search with the data until one time."""
+
+    horizon: float
+    """The time [s]."""
+    values: dict[str, np.ndarray]
+    """The value of each parameter at its minimum, in its shape."""
+    misfit: float
+    """Root mean square of the residuals, in units of σ, or of the size of the data where σ is not given."""
+    iterations: int
+
+
+class StagedFit(AbstractFit):
+    """A fit that came about in stages.
+
+    `print(result)` shows a table; `result["E"]` is the estimate of a parameter by the last stage.
+    """
+
+    stages: tuple[Stage, ...]
+    """The searches before the last, with growing horizons."""
+    result: FitResult
+    """The last fit, with its errors."""
+    horizons: tuple[float, ...]
+    """Until when the data of each experiment were used in the last fit [s]."""
+    remarks: tuple[str, ...]
+    """How the horizons were chosen, in words."""
+
+    @property
+    def all(self) -> tuple[Estimate, ...]:
+        return self.result.all
+
+    def __str__(self) -> str:
+        """The remarks, a table of the stages, then that of the last fit."""
+        head = f"{'until [s]':>24}", f"{'misfit/σ':>10}", *label_cells(self.result.problem)
+        rows = [(f"{s.horizon:>24.4g}", f"{s.misfit:>10.4g}", *value_cells(s.values)) for s in self.stages]
+        return "\n".join([*self.remarks, "", *table(head, *rows), "", str(self.result)])
+
+
+@checked
+def fit_staged(
+    experiments: Experiment | tuple[Experiment, ...] | list[Experiment],
+    parameters: dict[str, AbstractParameter],
+    *,
+    horizons: tuple[float, ...] | list[float] | None = None,
+    growth: Scalar = 1e3,
+    report: dict[str, Callable[[Experiment], Any]] | None = None,
+    level: Scalar = 0.95,
+    optimiser: AbstractOptimiser | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> StagedFit:
+    """Fit to the data until a first time, then until later ones, each from where the last search ended.
+
+    For motions that repeat or that contacts decide, of which a fit to all data ends in a false minimum.
+
+        result = mpm.fitting.fit_staged(swing, {"E": ...})
+        print(result)  # how the horizons were chosen, the stages, the estimate
+
+    *The first horizon*, where `horizons` does not give it, is the last time until which a change of one in any
+    coordinate changes the data by no more than they change themselves, √Σ (∂y/∂z)² ≤ √Σ (y − y(0))², by the derivative
+    at the first guess: of a vibration about half a period. Where that ratio does not grow with time, as of a drop
+    under gravity, there is but one stage. Horizons then double.
+
+    *The last horizon* is the experiment's end, or the time until which `sensitivity` is below `growth`: later data are
+    left out, and a warning says so. It is measured again at each stage's values.
+
+    The last stage is a `fit`. Those before it are searches alone: parameters that the data do not see yet stay where
+    they are. Each stage compiles anew. What has no times, such as a `Curve`, counts in the last stage, or in all if its
+    experiment has nothing else.
+
+    Args:
+        experiments: see `fit`. Horizons are times of each of them.
+        parameters: see `fit`.
+        horizons: growing times [s]; the end of the data is added. Default: by the rule above.
+        growth: sensitivity [-] beyond which data are left out; infinite to use all.
+        report, level: see `fit`.
+        optimiser: the method of each search. Default: as `fit` chooses.
+        progress: called with a line an iteration, and with what is said, such as `print`.
+
+    Raises:
+        ValueError: as `fit`; horizons that do not grow, or none of which has data.
+        SimulationError: the simulation at the first guess meets a fault within the first horizon.
+    """
+    require(float(growth) > 0, f"growth must be positive, or infinite to use all data, got {growth}.")
+    times = None if horizons is None else [float(t) for t in horizons]
+    if times is not None:
+        require(len(times) > 0, "horizons must hold a time at least; leave them out to have them chosen.")
+        require_positive("horizons [s]", np.array(times))
+        require(all(a < b for a, b in pairwise(times)), f"horizons must grow, got {times}.")
+    problem = FitProblem(experiments, parameters)
+    optimiser = chosen_optimiser(problem) if optimiser is None else optimiser
+    end = max(e.t1 for e in problem.experiments)
+    say = progress or (lambda text: None)
+    remarks: list[str] = []
+    z = jnp.zeros(problem.size, problem.dtype)
+    limits = _limits(problem.at(z), float(growth))
+    if times is None:
+        first = _first_horizon(_cut(problem, limits, end), optimiser, z)
+        times = [first * 2.0**k for k in range(_MOST_STAGES) if first * 2.0**k < _NEARLY_ALL * end]
+        remarks.append(_FIRST.format(first, end) if times else _ONE_STAGE)
+        say(remarks[-1])
+    stages: list[Stage] = []
+    for horizon in times:
+        cut = _cut(problem, limits, horizon)
+        if [e.steps for e in cut.experiments] == [e.steps for e in _cut(problem, limits, end).experiments]:
+            break
+        minimum = search(cut, optimiser, z, cut.first_sigmas)
+        if not np.isfinite(minimum.history[0].cost):
+            cut.explain(z, f"What is observed of the simulation until {horizon:g} s is not finite.")
+        if minimum.interrupted:
+            raise KeyboardInterrupt
+        z, misfit, count = minimum.z, cut.misfit(minimum.cost), len(minimum.history)
+        stages.append(Stage(horizon, problem.by_name(z), misfit, count))
+        say(f"until {horizon:.4g} s: misfit/σ {misfit:.4g}, {problem.shown(z)}, {count} iterations")
+        limits = _limits(problem.at(z), float(growth))
+    cut = _cut(problem, limits, end)
+    for k, (whole, used, limit) in enumerate(zip(problem.experiments, cut.experiments, limits, strict=True)):
+        if used.steps < whole.steps:
+            remarks.append(_SHORT.format(f"{whole.name!r} (number {k})", growth, limit, whole.t1))
+            say(remarks[-1])
+            warn(remarks[-1])
+    start = restarted(parameters, problem.by_name(z))
+    result = fit(cut.experiments, start, report=report, level=level, optimiser=optimiser, progress=progress)
+    return StagedFit(tuple(stages), result, tuple(e.t1 for e in cut.experiments), tuple(remarks))
+
+
+def _cut(problem: FitProblem, limits: Sequence[float], horizon: float) -> FitProblem:
+    """The problem of the data until a horizon, and the limit of each experiment."""
+    each = zip(problem.experiments, limits, strict=True)
+    return eqx.tree_at(lambda p: p.experiments, problem, tuple(e.until(min(horizon, limit)) for e, limit in each))
+
+
+def _limits(experiments: Sequence[Experiment], growth: float) -> list[float]:
+    """The time until which each has derivatives that grow no further [s]."""
+    if np.isinf(growth):
+        return [e.t1 for e in experiments]
+    limits = []
+    for e in experiments:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            grown = sensitivity(e.scene, e.particles, t1=e.t1, dt=e.dt, method=e.method)
+        beyond = np.flatnonzero(~(np.asarray(grown.growth) <= growth))
+        times = np.asarray(grown.times)
+        limits.append(e.t1 if len(beyond) == 0 else float(times[max(beyond[0] - 1, 0)]))
+    return limits
+
+
+def _first_horizon(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates) -> float:
+    """The time until which the data are nearly linear in the coordinates [s], see `fit_staged`."""
+    sigmas, start = problem.first_sigmas, z.astype(float)
+    _, _, seen = iterate(problem, optimiser, start, sigmas, begin(problem, optimiser, start, sigmas))
+    if not np.isfinite(seen.cost):
+        problem.explain(z)
+    J = np.asarray(jacobian(problem, z, sigmas)[1] if seen.jacobian is None else seen.jacobian, float)
+    times, changes, motions = [], [], []
+    for o, rows, sigma in zip(problem.observations, problem.rows, sigmas, strict=True):
+        if isinstance(o, Series):
+            times.append(o.times)
+            changes.append((J[rows] ** 2).reshape(len(o.times), -1, problem.size).sum(axis=1))
+            motions.append(np.asarray(o.weight) * _motion(o.data, np.asarray(sigma)))
+    if not times:
+        return max(e.t1 for e in problem.experiments)
+    order = np.argsort(np.concatenate(times), kind="stable")
+    t = np.concatenate(times)[order]
+    change = np.cumsum(np.concatenate(changes)[order], axis=0)
+    motion = np.cumsum(np.concatenate(motions)[order])
+    usable = (motion > 0) & (np.arange(1, len(t) + 1) >= min(_LEAST_TIMES, len(t)))
+    if not usable.any():
+        return float(t[-1])
+    t, ratio = t[usable], np.sqrt(change[usable] / motion[usable, None])
+    bound = np.maximum(1, _GROWN * ratio.min(axis=0))
+    return float(min(t[np.flatnonzero(column <= b)[-1]] for column, b in zip(ratio.T, bound, strict=True)))
+
+
+def _motion(data: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Σ ((y − y(0))/σ)² at each time, y(0) the first that was measured of each number, shape (f,)."""
+    rows = data.reshape(len(data), -1)
+    seen = np.isfinite(rows)
+    first = rows[seen.argmax(axis=0), np.arange(rows.shape[1])]
+    spread = np.broadcast_to(sigma, data.shape).reshape(rows.shape)
+    return (np.where(seen, (rows - first) / spread, 0) ** 2).sum(axis=1)
+
+
+class RefinedFit(AbstractFit):
+    """Estimates from several grids, extrapolated to a spacing of zero.
+
+    `print(result)` shows a table; `result["E"]` is the extrapolated estimate of a parameter.
+    """
+
+    fits: tuple[FitResult, ...]
+    """The fit on each grid, from coarse to fine."""
+    refinements: tuple[int, ...]
+    estimates: tuple[Estimate, ...]
+    """The extrapolated numbers. Error and interval hold the noise's and the discretisation's part."""
+    from_noise: tuple[float, ...]
+    """The part of each error that the data's noise makes."""
+    from_discretisation: tuple[float, ...]
+    """The part that is left of the discretisation."""
+    order: tuple[float, ...]
+    """The order in the spacing with which each was extrapolated; NaN of what does not converge."""
+
+    @property
+    def all(self) -> tuple[Estimate, ...]:
+        return self.estimates
+
+    def __str__(self) -> str:
+        """A table: the estimates on each grid and the extrapolated ones."""
+        rows = []
+        for k, e in enumerate(self.estimates):
+            rules = "noise" if self.from_noise[k] > self.from_discretisation[k] else "discretisation"
+            rules = "one grid alone" if len(self.fits) == 1 else rules
+            grids = (f"{result.all[k].value:>13.6g}" for result in self.fits)
+            rows.append((e.name, *grids, *e.cells, rules + ("  at its bound" if e.at_bound else "")))
+        grids = (f"{f'spacing/{n}':>13}" for n in self.refinements)
+        level = f"{100 * self.fits[-1].level:g} % interval"
+        lines = table(("", *grids, f"{'extrapolated':>12} ± {'error':<9}", level, "what rules"), *rows)
+        for n, each in zip(self.refinements, self.fits, strict=True):
+            lines += [f"spacing/{n}: {text}" for text in each.warnings]
+            lines += [] if each.converged else [f"spacing/{n}: NOT CONVERGED"]
+        return "\n".join(lines)
+
+
+@checked
+def fit_refined(
+    build: Callable[[int], Any],
+    parameters: dict[str, AbstractParameter],
+    *,
+    refinements: tuple[int, ...] | list[int] = (1, 2),
+    order: Scalar = 1,
+    report: dict[str, Callable[[Experiment], Any]] | None = None,
+    level: Scalar = 0.95,
+    optimiser: AbstractOptimiser | None = None,
+    progress: Callable[[str], None] | None = None,
+    log: str | os.PathLike | None = None,
+    resume: bool = False,
+) -> RefinedFit:
+    """Fit on several grids, extrapolate to a spacing of zero, and count what is left as an error.
+
+        def build(n):
+            grid = mpm.Grid((24 * n,), 0.05 / n, origin=(-4 * n,))
+            ...
+            return mpm.Experiment(scene, particles, t1=0.1, dt=2e-3 / n, observations=tracks)
+
+        print(mpm.fitting.fit_refined(build, {"E": ...}))
+
+    With estimates a and b on the two finest grids, logarithms of `Positive` parameters, and their spacings in the
+    ratio r, the extrapolation is b + (b − a)/(r^p − 1), not beyond a bound, and the standard error that is left of
+    the discretisation is taken as that whole correction. p is `order`; with three grids of equal ratios it is what
+    they show, between half and twice that. A higher order than `order` may be shown by grids that are too coarse to
+    tell, so the error then is the correction by `order`. Where the estimates do not converge, or one lies at its
+    bound, which tells nothing of where it would be without, the finest stays, with its last change as the error, and
+    a warning says so.
+
+    Two estimates may agree by chance and both be wrong, as where an error changes its sign between the grids. What the
+    finest grid misses of the data then tells more: D, in units of σ. A discretisation that changes predictions by D in
+    ways that no parameter can follow may change them as much in ways that a parameter does follow. The parameter that
+    makes up for it moves by D times its standard error from the noise; half of this is the least error that is taken.
+    D² is what the sum of squares loses from the grid before to the finest, over r^2p − 1, and needs no σ.
+
+    Intervals are made of the noise's and the discretisation's part, and keep to the bounds.
+
+    Args:
+        build: the experiments on n times as many cells a direction, from n; take the step n times shorter too.
+        parameters: what is fitted, see `fit`. Each fit starts from the one before.
+        refinements: the n, growing, two at least.
+        order: p, the order in the spacing. One is careful: estimates that converge faster get a wider interval.
+        report, level, optimiser, progress: see `fit`.
+        log: the name of the logs, one a grid: of "fit.h5" they are "fit_1.h5", "fit_2.h5". See `fit`.
+        resume: continue from the logs that are there.
+
+    After Ctrl-C it returns what it has, and extrapolates from grids on which the fit was done.
+
+    Raises:
+        ValueError: fewer than two refinements, or not growing ones; see `fit`.
+    """
+    numbers = list(refinements)
+    require(
+        len(numbers) >= 2 and numbers[0] >= 1 and all(a < b for a, b in pairwise(numbers)),
+        f"refinements must be two or more growing whole numbers, got {numbers}.",
+    )
+    require_positive("order", order)
+    fits: list[FitResult] = []
+    start = parameters
+    for n in numbers:
+        path = None if log is None else Path(log).with_stem(f"{Path(log).stem}_{n}")
+        again = resume and path is not None and (path.exists() or n == numbers[0])
+        same: dict[str, Any] = {"report": report, "level": level, "optimiser": optimiser, "progress": progress}
+        result = fit(build(n), start, log=path, resume=again, **same)
+        if not result.interrupted or not fits:
+            fits.append(result)
+        if result.interrupted:
+            break
+        start = result.restarted(parameters)
+    numbers = numbers[: len(fits)]
+    if len(fits) < len(refinements):
+        warn(f"The fit on several grids was interrupted: of {len(refinements)} grids it tells of {len(fits)}.")
+    sizes = [(p, fits[-1].values[name].size) for name, p in parameters.items()]
+    kinds: list[AbstractParameter | None] = [p for p, size in sizes for _ in range(size)]
+    kinds += [None] * len(fits[-1].reported)
+    each = zip(kinds, zip(*(result.all for result in fits), strict=True), strict=True)
+    normal = float(quantile(float(level), np.inf))
+    missed = _missed(fits[-2].noise, fits[-1].noise, numbers, float(order)) if len(fits) > 1 else 0.0
+    extrapolated = [_extrapolate(kind, of, numbers, float(order), missed, normal) for kind, of in each]
+    estimates, left, orders = zip(*extrapolated, strict=True)
+    return RefinedFit(tuple(fits), tuple(numbers), estimates, tuple(e.error for e in fits[-1].all), left, orders)
+
+
+def _missed(
+    coarse: tuple[NoiseEstimate, ...], fine: tuple[NoiseEstimate, ...], refinements: list[int], order: float
+) -> float:
+    """D, by how much the finest grid misses the data beyond their noise, in units of its σ: by what the sum of squares
+    lost since the grid before, as the square of what falls with the spacing to the power of the order."""
+    pairs = zip(coarse, fine, strict=True)
+    lost = sum(b.points * ((a.misfit * a.sigma / b.sigma) ** 2 - b.misfit**2) for a, b in pairs)
+    return float(np.sqrt(max(lost, 0.0) / ((refinements[-1] / refinements[-2]) ** (2 * order) - 1)))
+
+
+def _extrapolate(
+    kind: AbstractParameter | None,
+    estimates: tuple[Estimate, ...],
+    refinements: list[int],
+    order: float,
+    missed: float,
+    normal: float,
+) -> tuple[Estimate, float, float]:
+    """One number extrapolated from its estimates on the grids, from coarse to fine; the part of its error that is left
+    of the discretisation; and the order, NaN where the estimates do not converge.
+
+    `kind` is its parameter, None if it was reported; `missed` as of `_missed`; `normal` the reach of an interval of the
+    normal distribution, in standard errors.
+    """
+    last = estimates[-1]
+    if len(estimates) == 1:
+        return last, float("nan"), float("nan")
+    held = any(e.at_bound for e in estimates[-3:])
+    bounds = (-np.inf, np.inf) if kind is None else kind.domain
+    # The logarithm of a number that may be zero has no end.
+    logarithmic = kind is not None and kind.logarithmic and last.interval[0] > 0 and not held
+
+    def coordinate(value: float) -> float:
+        return float(np.log(value / last.value)) if logarithmic else value - last.value
+
+    def back(z: float) -> float:
+        return float(np.clip(last.value * np.exp(z) if logarithmic else last.value + z, *bounds))
+
+    values = np.array([coordinate(e.value) for e in estimates])
+    p = float("nan") if held else _order(values, refinements, order)
+    change = values[-1] - values[-2]
+    ratio = refinements[-1] / refinements[-2]
+    correction = 0.0 if np.isnan(p) else change / (ratio**p - 1)
+    value = back(correction)
+    hidden = missed / 2 * last.error / (last.value if logarithmic else 1)
+    remains = max(abs(change) / (1 if np.isnan(p) else ratio ** min(p, order) - 1), hidden)
+    if np.isnan(p):
+        shown = ", ".join(f"{e.value:.5g}" for e in estimates)
+        what = "lies at its bound on a grid" if held else "does not converge with the spacing"
+        warn(f"{last.label} {what} ({shown}): it is not extrapolated.")
+    # An interval that ends at a bound holds that bound, and whatever more there is to its reach.
+    reach = [abs(coordinate(end)) if end != bound else np.inf for end, bound in zip(last.interval, bounds, strict=True)]
+    reach = np.hypot(reach, normal * remains)
+    discretisation = remains * (value if logarithmic else 1)
+    estimate = last._replace(
+        value=value,
+        error=float(np.hypot(last.error, discretisation)),
+        interval=(back(correction - reach[0]), back(correction + reach[1])),
+        start=estimates[0].start,
+        at_bound=held,
+    )
+    return estimate, discretisation, p
+
+
+def _order(values: np.ndarray, refinements: list[int], order: float) -> float:
+    """The order that the three finest grids show, if their ratios are one, NaN if they do not converge; with fewer, or
+    other ratios, the one that was given."""
+    if len(values) < 3 or refinements[-1] * refinements[-3] != refinements[-2] ** 2:
+        return order
+    first, second = values[-2] - values[-3], values[-1] - values[-2]
+    if second == 0:
+        return order
+    if first / second <= 1:
+        return float("nan")
+    seen = np.log(first / second) / np.log(refinements[-1] / refinements[-2])
+    return float(np.clip(seen, order / 2, 2 * order))
+
+
+_FIRST = (
+    "The first horizon is {0:.4g} s of {1:.4g} s: until then a change of one in a coordinate changes the data by no "
+    "more than they change themselves. Horizons double from there."
+)
+_ONE_STAGE = (
+    "One stage suffices: until the end of the data a change of one in a coordinate changes them by no more than they "
+    "change themselves, or by as much at all times."
+)
+_SHORT = (
+    "Of the experiment {0} data are used only until {2:.4g} s of {3:.4g} s: beyond, derivatives grow to more than "
+    "{1:.3g} times those of free flight, or the simulation fails, and a fit would follow chance. Give windows of the "
+    "later motion, each from an observed state, as experiments of their own."
+)
+_MOST_STAGES = 20
+_NEARLY_ALL = 0.75  # a horizon beyond this part of the end is the end
+_LEAST_TIMES = 4  # how many measured times the first horizon has, at least
+_GROWN = 1.2  # a ratio that grows by no more than this factor does not grow
