@@ -151,7 +151,7 @@ def assert_same(method, reference, tolerance):
 
 
 OURS = mpm.SemiImplicit(hessian=PROJECTED, solver=TIGHT, adjoint_solver=TIGHT)
-NEWTON = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-11), PROJECTED, adjoint_solver=TIGHT)
+NEWTON = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-11), hessian=PROJECTED, adjoint_solver=TIGHT)
 
 
 @pytest.mark.thorough
@@ -267,6 +267,12 @@ def test_a_hessian_of_ones_own():
 
 def test_a_run_by_a_solver_preconditioner_and_hessian_of_ones_own_is_saved_and_loaded(tmp_path):
     """In one method, each with its parameters."""
-    method = mpm.SemiImplicit(0.9, UndeformedHessian(), MinimalResidual(1e-9), ScaledMass(2.0), MinimalResidual(1e-8))
+    method = mpm.SemiImplicit(
+        0.9,
+        MinimalResidual(1e-9),
+        hessian=UndeformedHessian(),
+        preconditioner=ScaledMass(2.0),
+        adjoint_solver=MinimalResidual(1e-8),
+    )
     run = mpm.simulate(*block(1, gravity=(-9.81,)), t1=DT, dt=DT, method=method)
     assert_files_hold(tmp_path / "run.h5", run, UndeformedHessian, MinimalResidual, ScaledMass)

@@ -211,7 +211,7 @@ def test_backward_euler_finds_the_same_with_projection_and_has_the_same_derivati
     dt = 2 * explicit_limit(scene)
 
     def outcome(hessian):
-        method = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-13), hessian, adjoint_solver=TIGHT)
+        method = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-13), hessian=hessian, adjoint_solver=TIGHT)
 
         def scatter(E):
             moved = eqx.tree_at(lambda s: s.material.youngs_modulus, scene, E)

@@ -1,4 +1,4 @@
-"""The grid update: the motion of the nodes by an integrator, free or with contact, and the impulses that made it."""
+"""The result of a grid update, the update with contact, and the impulses of walls and grips."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from mpmjax._types import NodeVector
 from mpmjax.autodiff import kept, without_derivative
 from mpmjax.boundary import ConstrainedNodes, ContactInfo, constrain, count_places, find_active_set
 from mpmjax.implicit import SolveInfo, no_solve
-from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
+from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion, advance
 from mpmjax.stepping._nodes import Nodes
 
 
@@ -53,17 +53,6 @@ class GridUpdate(eqx.Module):
         return held.images.unfold(held.nodes.admitted_velocity())
 
 
-def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
-    """The grid update by an integrator, with contact and friction where the scene has any."""
-    return constrained_update(nodes, method) if nodes.contacts else free_update(nodes, method)
-
-
-def free_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
-    """The grid update without contact."""
-    motion, info = _advance(nodes, method, method.initial_guess(nodes))
-    return GridUpdate(motion, elastic_impulse(nodes, method, motion), info)
-
-
 def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     """The grid update with contact: the active set is searched without derivatives, the last solve with it held is
     differentiated, and friction acts after that."""
@@ -71,7 +60,7 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     def solve(
         held: ConstrainedNodes, method: AbstractIntegrator, guess: NodeVector
     ) -> tuple[ConstrainedNodes, NodeMotion, SolveInfo]:
-        motion, info = _advance(held.nodes, method, guess)
+        motion, info = advance(held.nodes, method, guess)
         motion = jax.tree.map(held.images.unfold, motion)
         return replace(held, displacement=method.mean_displacement(held.nodes, motion)), motion, info
 
@@ -101,7 +90,7 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
 
 def elastic_impulse(nodes: Nodes, method: AbstractIntegrator, motion: NodeMotion) -> NodeVector | None:
     """The method's impulse of elastic forces [kg m/s], shape (n, d); None if P2G summed momentum and force together."""
-    return method.elastic_impulse(nodes, motion) if nodes.separate else None
+    return None if nodes.f is None else method.elastic_impulse(nodes, motion)
 
 
 def reaction(nodes: Nodes, motion: NodeMotion, elastic: NodeVector | None) -> NodeVector:
@@ -117,13 +106,3 @@ def reaction(nodes: Nodes, motion: NodeMotion, elastic: NodeVector | None) -> No
     if motion.resisted is not None:
         elastic = elastic - nodes.dt * nodes.potential.viscous_resistance(motion.resisted)
     return nodes.mass[:, None] * (motion.velocity - nodes.inertial_velocity()) - elastic
-
-
-def _advance(nodes: Nodes, method: AbstractIntegrator, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
-    motion, info = method.advance(nodes, guess)
-    if not method.explicit_viscosity and nodes.potential.viscous and motion.resisted is None:
-        raise ValueError(
-            f"{type(method).__name__} has explicit_viscosity = False, so its advance must return the velocity that "
-            "viscosity resists, NodeMotion.resisted. It returned None."
-        )
-    return motion, info

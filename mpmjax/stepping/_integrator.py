@@ -1,25 +1,14 @@
-"""The abstract integrator, and the motion of the nodes that it returns."""
+"""The abstract integrator, the motion of the nodes that it returns, and the explicit step."""
 
 from abc import abstractmethod
+from dataclasses import replace
 from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import lineax as lx
 
 from mpmjax._types import NodeVector, Scalar
-from mpmjax.implicit import (
-    AbstractHessian,
-    AbstractPreconditioner,
-    AbstractSolution,
-    Guess,
-    Reporting,
-    SolveInfo,
-    StageProblem,
-    exact_force,
-    require_solver,
-    solve,
-)
+from mpmjax.implicit import SolveInfo, no_solve
 from mpmjax.stepping._nodes import Nodes
 
 
@@ -43,9 +32,8 @@ class NodeMotion(eqx.Module):
     def with_friction(self, change: NodeVector) -> "NodeMotion":
         """The motion with the velocity changed by `change` [m/s], and the mean by half of it, as by an impulse that
         acts evenly over the step."""
-        return NodeMotion(
-            self.velocity + change, None if self.mean is None else self.mean + change / 2, self.inner, self.resisted
-        )
+        mean = None if self.mean is None else self.mean + change / 2
+        return replace(self, velocity=self.velocity + change, mean=mean)
 
 
 class AbstractIntegrator(eqx.Module):
@@ -119,7 +107,7 @@ class AbstractIntegrator(eqx.Module):
 
     def initial_guess(self, nodes: Nodes) -> NodeVector:
         """The initial guess of an implicit solve [m/s], shape (n, d). Default: v^n, or v* if v^n is not known."""
-        return nodes.velocity if nodes.separate else nodes.explicit_velocity()
+        return nodes.v
 
     def reporting(self, slot: Scalar) -> "AbstractIntegrator":
         """This integrator, with tangent and adjoint solves that report through a slot (see `Reporting`). Default: the
@@ -133,86 +121,42 @@ class AbstractIntegrator(eqx.Module):
         return ()
 
 
-class AbstractImplicitIntegrator(AbstractIntegrator):
-    """An integrator that solves with the elastic Hessian, and treats viscosity implicitly. A subclass must have
-    `advance`, `solved_by` and `stages`."""
-
-    explicit_viscosity: ClassVar[bool] = False
-
-    hessian: eqx.AbstractVar[AbstractHessian]
-    """The Hessian H of the elastic energy."""
-    preconditioner: eqx.AbstractVar[AbstractPreconditioner]
-    """Preconditioner of the linear solves."""
-    adjoint_solver: eqx.AbstractVar[lx.AbstractLinearSolver]
-    """Linear solver of the tangent and adjoint systems."""
-    guess: eqx.AbstractVar[Guess]
-    """The initial guess of the solve."""
-
-    def __check_init__(self):
-        require_solver(f"{type(self).__name__}'s adjoint_solver", self.adjoint_solver)
-
-    @abstractmethod
-    def solved_by(self) -> AbstractSolution:
-        """How the equation of a stage is solved."""
-
-    @abstractmethod
-    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
-        """The stages in which the elastic force acts on displaced nodes: weights q [-] and displacements u [m], shape
-        (n, d), of the impulse Δt Σ q f(u)."""
-
-    def solve_stage(
-        self,
-        nodes: Nodes,
-        guess: NodeVector,
-        inertial: NodeVector,
-        stage_dt: Scalar,
-        initial_displacement: NodeVector | None = None,
-        theta: Scalar = 1.0,
-    ) -> tuple[NodeVector, SolveInfo]:
-        """The solution v [m/s], shape (n, d), of M (v − a) = Δt_s (f(u + θΔt_s v) − θ D v), a `StageProblem`, and the
-        report of the solve. One linear solve takes f(u) = f(0) − H u; Newton's method solves the nonlinear equation.
-
-        Args:
-            nodes: the nodes.
-            guess: where the solve starts [m/s], shape (n, d).
-            inertial: a, the velocity of the stage without the force at its own end [m/s], shape (n, d).
-            stage_dt: Δt_s, the length of the stage [s].
-            initial_displacement: u at the start of the stage [m], shape (n, d); None for zero.
-            theta: θ, the share of the stage's displacement at which its force is evaluated [-].
-        """
-        stage = StageProblem(
-            mass=nodes.mass,
-            inertial=inertial,
-            stage_dt=jnp.asarray(stage_dt),
-            initial_displacement=initial_displacement,
-            force=nodes.force,
-            spacing=nodes.spacing,
-            potential=nodes.potential,
-            hessian=self.hessian,
-            projection=nodes.projection,
-            prescribed=nodes.prescribed if nodes.moves_held else None,
-            preconditioner=self.preconditioner,
-            theta=theta,
+def advance(nodes: Nodes, method: AbstractIntegrator, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+    """`AbstractIntegrator.advance`, with a check that an integrator which claims to treat viscosity does so."""
+    motion, info = method.advance(nodes, guess)
+    if not method.explicit_viscosity and motion.resisted is None and nodes.potential.viscous:
+        raise ValueError(
+            f"{type(method).__name__} has explicit_viscosity = False, so its advance must return the velocity that "
+            "viscosity resists, NodeMotion.resisted. It returned None."
         )
-        solution = self.solved_by()
-        return solve(solution.problem(stage), guess, solution, self.adjoint_solver)
+    return motion, info
+
+
+class Explicit(AbstractIntegrator):
+    """Symplectic Euler: v^{n+1} = v* = v^n + Δt (g + f/m) (derivation, eq. 4). Positions move with v^{n+1}.
+
+    First order in time, and second if velocities start half a step before positions; second order in space with APIC
+    and FLIP. It conserves linear momentum, and with APIC angular momentum too.
+
+    *When it breaks*: above a Δt of about 0.4 to 1 times dx/c, depending on dimension, kernel and transfer. c is the
+    pressure-wave speed of the *current* tangent, which stretching and compression raise. `stable_dt` gives the limit.
+    """
+
+    is_explicit: ClassVar[bool] = True
+    needs_separate_force: ClassVar[bool] = False
+
+    def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+        del guess
+        v = nodes.admitted(nodes.explicit_velocity())
+        return NodeMotion(v), no_solve(v.dtype)
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
-        """Δt Σ q f(u) [kg m/s], with the forces that the solution takes."""
-        stages = self.stages(nodes, motion)
-        return nodes.dt * self.solved_by().stage_force(nodes.potential, self.hessian, nodes.force, *stages)
+        """Δt f(0) [kg m/s], on nodes that have mass."""
+        del motion
+        return jnp.where(nodes.occupied, nodes.dt * nodes.force, 0)
 
-    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
-        if not self.solved_by().linearises:
-            return None
-        return nodes.dt * exact_force(nodes.potential, *self.stages(nodes, motion))
+    def stability_factor(self) -> Scalar:
+        return 1.0
 
-    def initial_guess(self, nodes: Nodes) -> NodeVector:
-        return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())
-
-    def reporting(self, slot: Scalar) -> "AbstractImplicitIntegrator":
-        return eqx.tree_at(lambda m: m.adjoint_solver, self, Reporting(self.adjoint_solver, slot))
-
-    def unconverged_advice(self) -> tuple[str, ...]:
-        advice = self.preconditioner.advice
-        return () if advice is None else (advice,)
+    def limit_name(self) -> str:
+        return "explicit limit"

@@ -23,7 +23,7 @@ from mpmjax.implicit import ElasticPotential, Projection
 from mpmjax.potential import AbstractTerm, Mirror, MirrorMotion
 from mpmjax.state import Particles, Scene, load_force, points_of, terms_of
 from mpmjax.stepping._contact_surfaces import contacts_of_bodies, faces_of
-from mpmjax.stepping._rigid_layers import RigidLayers, rigid_layers
+from mpmjax.stepping._rigid_layers import rigid_layers
 
 
 class Nodes(AbstractNodes):
@@ -32,11 +32,11 @@ class Nodes(AbstractNodes):
     mass: NodeScalar
     """m_i [kg], shape (n,), folded at symmetry planes; zero on empty nodes (see `p2g`)."""
     v: NodeVector
-    """v_i^n [m/s], shape (n, d); where P2G has summed momentum and force together, v*."""
+    """`velocity`; where P2G has summed momentum and force together, v*."""
     f: NodeVector | None
-    """`force`; None where P2G has summed momentum and force together, and so the next."""
+    """`force`; None where P2G has summed momentum and force together."""
     g: Array | None
-    """`acceleration`."""
+    """`acceleration`; None likewise."""
     dt: Float[Array, ""]
     """Δt [s]."""
     spacing: Float[Array, ""]
@@ -60,36 +60,23 @@ class Nodes(AbstractNodes):
         return (self.mass > 0)[:, None]
 
     @property
-    def separate(self) -> bool:
-        """Whether v^n and the force are known separately."""
-        return self.f is not None
-
-    @property
     def velocity(self) -> NodeVector:
-        """v_i^n [m/s], shape (n, d); zero on empty nodes.
+        """Velocity at the start of the step v_i^n [m/s], shape (n, d); zero on empty nodes.
 
         Raises:
-            ValueError: P2G summed momentum and force together.
+            ValueError: P2G summed momentum and force together. So for `force` and `acceleration`.
         """
         return self._apart(self.v)
 
     @property
     def force(self) -> NodeVector:
         """Internal force at the start of the step [N], shape (n, d): the elastic one, and for integrators with explicit
-        viscosity the viscous one.
-
-        Raises:
-            ValueError: P2G summed momentum and force together.
-        """
+        viscosity the viscous one."""
         return self._apart(self.f)
 
     @property
     def acceleration(self) -> Array:
-        """Body acceleration g [m/s²], shape (d,), or (n, d) where it varies.
-
-        Raises:
-            ValueError: P2G summed momentum and force together.
-        """
+        """Body acceleration g [m/s²], shape (d,), or (n, d) where it varies."""
         return self._apart(self.g)
 
     def _apart(self, field: Any) -> Any:
@@ -142,7 +129,7 @@ class Nodes(AbstractNodes):
 
     def explicit_velocity(self) -> NodeVector:
         """v* = v^n + Δt f/m + Δt g [m/s], shape (n, d) (derivation, eq. 4)."""
-        return self.inertial_velocity() + self.dt * self.per_mass(self.force) if self.separate else self.v
+        return self.v if self.f is None else self.inertial_velocity() + self.dt * self.per_mass(self.f)
 
     def admitted(self, velocity: NodeVector) -> NodeVector:
         """A velocity that is zero on empty nodes, with the prescribed values in held components [m/s], shape (n, d)."""
@@ -154,7 +141,19 @@ class Nodes(AbstractNodes):
 
     def per_mass(self, impulse: NodeVector) -> NodeVector:
         """An impulse or force divided by the nodes' mass; zero on empty nodes."""
-        return _per_mass(impulse, self.mass)
+        return jnp.where(self.occupied, impulse / jnp.where(self.occupied, self.mass[:, None], 1), 0)
+
+    def pushed(self, force: NodeVector) -> "Nodes":
+        """The nodes with a further internal force [N], shape (n, d)."""
+        if self.f is None:
+            return replace(self, v=self.v + self.dt * self.per_mass(force))
+        return replace(self, f=self.f + force)
+
+    def accelerated(self, force: NodeVector) -> "Nodes":
+        """The nodes with a further outer force [N], shape (n, d)."""
+        if self.g is None:
+            return self.pushed(force)
+        return replace(self, g=self.g + self.per_mass(force))
 
     def folded(self, images: Mirror) -> "Nodes":
         """The nodes with the sums of their images at mirror planes added; the same nodes without a plane.
@@ -163,53 +162,28 @@ class Nodes(AbstractNodes):
         """
         if not images.images:
             return self
-        mass = images.fold_scalar(self.mass)
+        folded = replace(self, mass=images.fold_scalar(self.mass))
 
         def fold(field: Array) -> NodeVector:
             """Fold a field per mass."""
-            return _per_mass(images.fold(self.mass[:, None] * field), mass)
+            return folded.per_mass(images.fold(self.mass[:, None] * field))
 
         return replace(
-            self,
-            mass=mass,
+            folded,
             v=fold(self.v),
             f=None if self.f is None else images.fold(self.f),
             g=None if self.g is None else fold(self.g),
             potential=replace(self.potential, mirror=images.then(self.potential.mirror)),
         )
 
-    def tied(self, rigid: RigidLayers) -> "Nodes":
-        """The nodes with those of rigid bodies folded to the two that move each of them."""
-        nodes = self.folded(Mirror(rigid.images))
-        velocity = jnp.where(rigid.own, rigid.velocity, nodes.velocity)
-        return replace(nodes, v=velocity, conditions=rigid.conditions, loose=self)
-
-    def moved_by(self, change: NodeVector) -> "Nodes":
-        """The nodes with a velocity [m/s], shape (n, d), added to theirs."""
-        return replace(self, v=self.v + jnp.where(self.occupied, change, 0))
-
-    def constrained(
-        self,
-        images: Mirror,
-        fixed: Mask,
-        terms: tuple[AbstractTerm, ...],
-    ) -> "Nodes":
+    def constrained(self, images: Mirror, fixed: Mask, terms: tuple[AbstractTerm, ...]) -> "Nodes":
         """The nodes folded at these mirrors, with the components `fixed` held, and the force of further terms."""
         nodes = replace(self.folded(images), conditions=replace(self.conditions, fixed=fixed, holds=True))
         if not terms:
             return nodes
         potential = replace(nodes.potential, terms=nodes.potential.terms + terms)
         force = potential.on_nodes([term.force(potential.displaced(None)) for term in terms])
-        nodes = replace(nodes, potential=potential)
-        if nodes.f is None:
-            return replace(nodes, v=nodes.v + nodes.dt * nodes.per_mass(force))
-        return replace(nodes, f=nodes.f + force)
-
-
-def _per_mass(impulse: NodeVector, mass: NodeScalar) -> NodeVector:
-    """An impulse or force divided by the nodes' mass; zero on empty nodes."""
-    occupied = (mass > 0)[:, None]
-    return jnp.where(occupied, impulse / jnp.where(occupied, mass[:, None], 1), 0)
+        return replace(nodes, potential=potential).pushed(force)
 
 
 def particles_to_grid(
@@ -243,50 +217,45 @@ def particles_to_grid(
     flux = potential.current_flux()  # V P Fᵀ, of which the internal force is −Σ_p flux_p g_ip
     if explicit_viscosity and C is not None and potential.material_viscous:
         flux = flux + potential.viscous_flux(C)
-    acceleration, pushed = jnp.asarray(scene.gravity), None
+    gravity, body_force = jnp.asarray(scene.gravity), None
     if scene.body_force is not None:
         x = particles.x + body_force_at * dt * particles.v if body_force_at else particles.x
-        pushed = components(scene.body_force.acceleration(x, t + body_force_at * dt if body_force_at else t))
+        body_force = components(scene.body_force.acceleration(x, t + body_force_at * dt if body_force_at else t))
     if joined:
-        g = acceleration[:, None]
-        v = v + dt * (g if pushed is None else g + pushed)
+        v = v + dt * (gravity[:, None] if body_force is None else gravity[:, None] + body_force)
     affine = C if scene.transfer.affine else None
-    mass, velocity = p2g(stencil, particles.mass, v, affine, size, -dt * flux if joined else None)
-
-    # forces at points of the body: loads, springs and dashpots to the ground
-    loaded, held = None, None
-    if scene.loads:
-        points = points_of(scene.loads, scene.laws, particles, stencil, total=scene.total)
-        loaded = load_force(scene.loads, points, t, dt, body_force_at, size)
-        terms = terms_of(scene.loads, points, t + body_force_at * dt)
-        potential = replace(potential, terms=terms)
-        forces = [term.force(potential.displaced(None)) for term in terms]
-        if explicit_viscosity:
-            forces += [drag for drag, _ in potential.drags()]
-        held = potential.unfolded(forces) if forces else None
-
-    if joined:
-        at_points = [force for force in (loaded, held) if force is not None]
-        v = velocity + dt * _per_mass(reduce(jnp.add, at_points), mass) if at_points else velocity
-        force, acceleration = None, None
-    else:
-        v, force = velocity, -potential.nodal_sum(flux)
-        if loaded is not None:
-            acceleration = acceleration + _per_mass(loaded, mass)
-        if pushed is not None:
-            acceleration = acceleration + _per_mass(scatter(stencil, particles.mass * pushed, None, size), mass)
-        if held is not None:
-            force = force + held
-    return Nodes(
+    mass, v = p2g(stencil, particles.mass, v, affine, size, -dt * flux if joined else None)
+    nodes = Nodes(
         mass=mass,
         v=v,
-        f=force,
-        g=acceleration,
+        f=None if joined else -potential.nodal_sum(flux),
+        g=None if joined else gravity,
         dt=jnp.asarray(dt),
         spacing=jnp.asarray(scene.grid.spacing),
         potential=potential,
         conditions=Conditions(jnp.zeros(v.shape, bool), jnp.zeros_like(v), holds=False, moves=False),
     )
+    if scene.loads:
+        nodes = _with_loads(scene, particles, nodes, t, body_force_at, explicit_viscosity=explicit_viscosity)
+    if body_force is not None and not joined:
+        nodes = nodes.accelerated(scatter(stencil, particles.mass * body_force, None, size))
+    return nodes
+
+
+def _with_loads(
+    scene: Scene, particles: Particles, nodes: Nodes, t: Scalar, at: float, *, explicit_viscosity: bool
+) -> Nodes:
+    """The nodes with the forces of loads at points of the body, and the terms of their springs and dashpots."""
+    potential, end = nodes.potential, t + at * nodes.dt
+    points = points_of(scene.loads, scene.laws, particles, potential.stencil, total=scene.total)
+    potential = replace(potential, terms=terms_of(scene.loads, points, end))
+    forces = [term.force(potential.displaced(None)) for term in potential.terms]
+    if explicit_viscosity:
+        forces += [drag for drag, _ in potential.drags()]
+    nodes = replace(nodes, potential=potential)
+    force = load_force(scene.loads, points, t, nodes.dt, at, potential.size)
+    nodes = nodes if force is None else nodes.accelerated(force)
+    return nodes.pushed(potential.unfolded(forces)) if forces else nodes
 
 
 def with_boundaries(
@@ -331,14 +300,17 @@ def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes) -> Nodes:
     images, moving = mirror(scene.boundary, scene.grid, scene.window(particles)), nodes.mirror_motion
     if scene.rigid_bodies:
         rigid = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images, nodes.dt)
-        return nodes.folded(images).tied(rigid)
+        loose = nodes.folded(images)
+        nodes = loose.folded(Mirror(rigid.images))
+        v = jnp.where(rigid.own, rigid.velocity, nodes.velocity)
+        return replace(nodes, v=v, conditions=rigid.conditions, loose=loose)
     if moving is None:
-        return nodes.folded(images) if images.images else nodes
+        return nodes.folded(images)
     # at rest with the mirrors: the velocity less what they add, which is put back
     added = jnp.where(nodes.conditions.fixed, nodes.conditions.velocity, 0)
-    added = jnp.where(moving.beyond, moving.velocity, added)
-    added = images.added(added)
-    return nodes.moved_by(-images.unfold(added)).folded(images).moved_by(added)
+    added = images.added(jnp.where(moving.beyond, moving.velocity, added))
+    nodes = replace(nodes, v=nodes.v - jnp.where(nodes.occupied, images.unfold(added), 0)).folded(images)
+    return replace(nodes, v=nodes.v + jnp.where(nodes.occupied, added, 0))
 
 
 def start_nodes(
@@ -353,8 +325,9 @@ def start_nodes(
     force_at: Scalar | None = None,
 ) -> Nodes:
     """The nodes of `particles_to_grid` with boundaries, folded at mirror planes: what an integrator is given."""
-    at, viscosity = body_force_at, explicit_viscosity
-    nodes = particles_to_grid(scene, particles, t, dt, stencil, body_force_at=at, explicit_viscosity=viscosity)
+    nodes = particles_to_grid(
+        scene, particles, t, dt, stencil, body_force_at=body_force_at, explicit_viscosity=explicit_viscosity
+    )
     if scene.boundary or scene.bodies is not None or scene.rigid_bodies:
         nodes = folded_at_planes(scene, particles, with_boundaries(scene, particles, nodes, t, force_at))
     return nodes

@@ -18,8 +18,7 @@ from mpmjax.geometry import length
 from mpmjax.potential import Mirror
 from mpmjax.state import MaterialPoints, Particles, Scene, is_prepared, points_of, prepare, terms_of
 from mpmjax.stepping._contact_surfaces import contact_moduli
-from mpmjax.stepping._explicit import Explicit
-from mpmjax.stepping._integrator import AbstractIntegrator
+from mpmjax.stepping._integrator import AbstractIntegrator, Explicit
 from mpmjax.stepping._nodes import Nodes, start_nodes
 
 MOST_STEPS = 2**31 - 1

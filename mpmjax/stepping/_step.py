@@ -15,10 +15,9 @@ from mpmjax.checks import canonical, checked, require_finite, require_placement,
 from mpmjax.discretisation import Stencil, g2p, scatter
 from mpmjax.implicit import SolveInfo
 from mpmjax.state import Particles, Scene, State, is_prepared, prepare, with_state
-from mpmjax.stepping._boundary_forces import impulse_on_boundaries, impulse_on_colliders
-from mpmjax.stepping._explicit import Explicit
-from mpmjax.stepping._grid_update import GridUpdate, constrained_update, free_update
-from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
+from mpmjax.stepping._boundary_forces import impulse_on_boundaries_of, impulse_on_colliders_of
+from mpmjax.stepping._grid_update import GridUpdate, constrained_update
+from mpmjax.stepping._integrator import AbstractIntegrator, Explicit, NodeMotion, advance
 from mpmjax.stepping._nodes import Nodes, folded_at_planes, particles_to_grid, with_boundaries
 from mpmjax.stepping._rigid_layers import moved_rigidly
 
@@ -85,7 +84,7 @@ def step_unchecked(
             unfolded = with_boundaries(scene, particles, nodes, t, force_at)
             nodes = folded_at_planes(scene, particles, unfolded)
     with jax.named_scope("grid_update"):
-        new = constrained_update(nodes, method) if nodes.contacts else free_update(nodes, method)
+        new = update(nodes, method)
     with jax.named_scope("g2p"):
         trial = grid_to_particles(scene, particles, nodes, new)
     with jax.named_scope("return_map"):
@@ -113,6 +112,14 @@ def step_unchecked(
 
 step_compiled = eqx.filter_jit(step_unchecked)
 """`step_unchecked`, compiled as one program."""
+
+
+def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
+    """The grid update by an integrator, with contact and friction where the scene has any."""
+    if nodes.contacts:
+        return constrained_update(nodes, method)
+    motion, info = advance(nodes, method, method.initial_guess(nodes))
+    return GridUpdate(motion, None if nodes.f is None else method.elastic_impulse(nodes, motion), info)
 
 
 def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: GridUpdate) -> Particles:
