@@ -1,7 +1,6 @@
 """The longest stable step."""
 
 import math
-from collections.abc import Callable
 from itertools import combinations
 from typing import Literal
 
@@ -50,7 +49,7 @@ def stable_dt(
 
     - Λ is the largest eigenvalue of the symmetric part of the present tangent L ↦ ∂²Ψ/∂F∂F : (L F) Fᵀ + τ Lᵀ with
       L = ∇v and τ = P Fᵀ, by `principal_tangent`; in the total description, that of ∂²Ψ/∂F∂F. Stretching and
-      compression raise it.
+      compression raise it. With averaged volumes it is that at F̄, or its average where that is larger.
     - Ξ bounds Σ_i g_ip g_ipᵀ/w_ip. It is a for the moving-least-squares gradient. For the spline's gradient it is the
       value at the particle in the total description, and in the updated one, where particles move, the largest value
       in a cell: 6/dx² (quadratic) or 3.137/dx² (cubic).
@@ -58,30 +57,24 @@ def stable_dt(
     - κ is 1 for APIC, and 0 for PIC and FLIP, which forget the affine velocity.
 
     At F = I this is √(4ρ0/((2μ + dλ)(2Ξ − κa))). The limit of the semi-implicit step is 1/√(1 − 2β) times that for
-    β < ½. For β ≥ ½, backward Euler and the methods of second order there is no limit: the result is infinite, and says
-    nothing of accuracy.
+    β < ½. For the other implicit methods there is no limit: the result is infinite, and says nothing of accuracy.
 
     With viscosity Δt solves Δt² Λ A/ρ0 + Δt Λ_v B/ρ0 = 4 (derivation, eq. 34) with A = 2Ξ − κa, and B = 2a for APIC,
     whose stored gradient is multiplied by 1 − Δt a Λ_v/ρ0 in a step, or 4Ξ for PIC and FLIP, whose stored gradient is
     that of a step ago. Λ_v = |J| max(2η, 2η (1 − d/3) + dζ) is the largest eigenvalue of L ↦ |J| σ_v. The semi-implicit
-    step multiplies both terms by 1 − 2β.
+    step multiplies both terms by 1 − 2β. The left side has further terms:
 
-    The terms of loads add what each of them states (`AbstractTerm.stability_rates`), springs and dashpots to the ground
-    twice what a particle by itself feels.
-
-    With averaged volumes Λ is that at F̄, or its average where that is larger: an average has no larger eigenvalue.
-
-    In the updated description the left side has 2 Δt² α too (derivation, eq. 35), with α the fastest rate at which the
-    present acceleration strains the particle. It is zero in equilibrium, and large at free surfaces of stretched
-    material.
-
-    In a scene with surfaces that push (`SeparatingBox`, `SeparatingCollider`) the springs of contact add
-    n Δt² k (1 + A b²)/m to the left side, whether or not anything touches, with the stiffness k of a particle that
-    comes with all of its speed (see `SurfaceContact`), and n = 1, or 2 for a particle between two that face each other:
-    with two particles along a cell's edge the limit falls by a quarter, at the speed of sound by two fifths. `Bodies`
-    add Δt² 4 k/(ρ dx²), with the stiffness k of `BodyContact`, whether or not they touch: between bodies of one law the
-    limit falls by three tenths. Where they touch, a bound for the present springs takes its place if that is more:
-    between two blocks the limit falls by nearly four tenths.
+    - of loads what each states (`AbstractTerm.stability_rates`), of springs and dashpots to the ground twice what a
+      particle by itself feels;
+    - in the updated description 2 Δt² α (eq. 35), with α the fastest rate at which the present acceleration strains the
+      particle: zero in equilibrium, and large at free surfaces of stretched material;
+    - of surfaces that push (`SeparatingBox`, `SeparatingCollider`) n Δt² k (1 + A b²)/m, whether or not anything
+      touches, with the stiffness k of a particle that comes with all of its speed (see `SurfaceContact`), and n = 1, or
+      2 for a particle between two that face each other: with two particles along a cell's edge the limit falls by a
+      quarter, at the speed of sound by two fifths;
+    - of `Bodies` Δt² 4 k/(ρ dx²), with the stiffness k of `BodyContact`, whether or not they touch: between bodies of
+      one law the limit falls by three tenths. Where they touch, a bound for the present springs takes its place if that
+      is more: between two blocks the limit falls by nearly four tenths.
 
     The default safety of 0.7 covers an effect beyond the linear limit. Vibrations of a few per cent grow where the
     third or fourth harmonic of a mode resonates with the step, (ωΔt)² = 3 and 2, which is at 0.87 and 0.71 of the
@@ -169,33 +162,38 @@ def longest_step(scene: Scene, particles: Particles, method: AbstractIntegrator,
 
 @eqx.filter_jit
 def _limit(scene: Scene, particles: Particles, method: AbstractIntegrator, t: Scalar) -> Float[Array, ""]:
+    factor = method.stability_factor()
+    if factor is None:
+        raise UnknownBoundError(f"{type(method).__name__} gives no bound on its step: give dt.")
     density, stencil = particles.mass / particles.volume, scene.stencil(particles, t)
     elastic_steepness, viscous_steepness = _steepness(scene, stencil)
     materials = scene.material_points(particles, t)
     stiffest = jnp.concatenate([points.stiffest(particles.dim) for points in materials])
+    most = jnp.concatenate([_stiffest_viscosity(points, particles.dim) for points in materials])
     z = stiffest * elastic_steepness / density  # per Δt²
+    y = most * viscous_steepness / density  # per Δt
     if not scene.total:  # in the total description there are no such surfaces, and strains add
-        nodes = start_nodes(scene, particles, t, jnp.ones((), z.dtype), stencil)
+        dt = _longest(z, y)  # over which walls move
+        nodes = start_nodes(scene, particles, t, jnp.where(jnp.isfinite(dt), dt, 1), stencil)
         z = z + 2 * _straining(scene, particles, nodes)
-        brought = list(zip(nodes.brought_by, nodes.contacts, strict=True))
         bounds = nodes.mass, particles.mass, elastic_steepness
+        brought = list(zip(nodes.brought_by, nodes.contacts, strict=True))
         z = z + _contact_rate([contact for number, contact in brought if number is not None], *bounds)
         if scene.bodies is not None:
             felt = _contact_rate([contact for number, contact in brought if number is None], *bounds)
             z = z + jnp.maximum(felt, _between_bodies(scene, particles, materials))
-    factor = method.stability_factor()
-    if factor is None:
-        raise UnknownBoundError(f"{type(method).__name__} gives no bound on its step: give dt.")
-    most = jnp.concatenate([_stiffest_viscosity(points, particles.dim) for points in materials])
-    y = most * viscous_steepness / density  # per Δt
-    if scene.loads:
-        points = points_of(scene.loads, scene.laws, particles, stencil, total=scene.total)
-        for term in terms_of(scene.loads, points, t):
-            rates = term.stability_rates(particles.mass, jnp.broadcast_to(elastic_steepness, z.shape))
-            if rates is None:
-                raise UnknownBoundError(f"{type(term).__name__} gives no bound on the step: give dt.")
-            z, y = z + rates[0], y + rates[1]
-    z, y = jnp.maximum(factor * z, 0), jnp.maximum(factor * y, 0)
+    points = points_of(scene.loads, scene.laws, particles, stencil, total=scene.total)
+    for term in terms_of(scene.loads, points, t):
+        rates = term.stability_rates(particles.mass, jnp.broadcast_to(elastic_steepness, z.shape))
+        if rates is None:
+            raise UnknownBoundError(f"{type(term).__name__} gives no bound on the step: give dt.")
+        z, y = z + rates[0], y + rates[1]
+    return _longest(factor * z, factor * y)
+
+
+def _longest(z: Array, y: Array) -> Float[Array, ""]:
+    """The longest Δt with Δt² z + Δt y ≤ 4 for all particles [s]; infinite where none limits it."""
+    z, y = jnp.maximum(z, 0), jnp.maximum(y, 0)
     square = y**2 + 16 * z
     none = square == 0  # and not what is NaN, which the least must keep
     steepness = (y + jnp.where(none, 0, jnp.sqrt(jnp.where(none, 1, square)))).max()
@@ -208,13 +206,16 @@ def _straining(scene: Scene, particles: Particles, nodes: Nodes) -> Float[Array,
     at_rest = ConstrainedNodes(nodes, (), Mirror(()), nodes)
     contacts = [contact for contact in nodes.contacts if contact.known_at_start]
     springs = (contact.springs(contact.likely_held(at_rest, nodes.velocity)) for contact in contacts)
-    pushed = nodes.constrained(Mirror(()), nodes.conditions.fixed, tuple(own for own in springs if own is not None))
+    terms = tuple(spring for spring in springs if spring is not None)
+    pushed = nodes.constrained(Mirror(()), nodes.conditions.fixed, terms)
     a = pushed.projection.combine(pushed.per_mass(pushed.force) + pushed.acceleration, 0.0)
     _, slopes = gather(nodes.potential.stencil, nodes.mirror.unfold(a))
     rates = la.symmetric_eigen((slopes + la.transpose(slopes)) / 2)[0]
-    each = zip(scene.laws, particles.groups, strict=True)
-    own = [(law.measure.axes, rates[:, slice(*group.rows)]) for law, group in each]
-    return jnp.concatenate([jnp.abs(r).max(axis=0) if axes else jnp.abs(r.sum(axis=0)) for axes, r in own])
+    fastest = []
+    for law, group in zip(scene.laws, particles.groups, strict=True):
+        r = rates[:, slice(*group.rows)]
+        fastest.append(jnp.abs(r).max(axis=0) if law.kinematics.axes else jnp.abs(r.sum(axis=0)))
+    return jnp.concatenate(fastest)
 
 
 def _contact_rate(
@@ -224,7 +225,7 @@ def _contact_rate(
     kinds: dict[type[AbstractContact], list[AbstractContact]] = {}
     for contact in contacts:
         kinds.setdefault(type(contact), []).append(contact)
-    rates = (kind.stability_rate(tuple(own), nodal_mass, mass, steepness) for kind, own in kinds.items())
+    rates = (kind.stability_rate(tuple(alike), nodal_mass, mass, steepness) for kind, alike in kinds.items())
     return sum(rates, 0.0)
 
 
@@ -235,20 +236,14 @@ def _between_bodies(scene: Scene, particles: Particles, materials: tuple[Materia
     assert scene.bodies is not None
     density, speed = particles.mass / particles.volume, length(particles.v)
     modulus = contact_moduli(scene, particles, materials) + density * (speed + speed.max()) ** 2
-    of_body = scene.bodies.numbers(len(scene.laws))
-    rows = [slice(*points.rows) for points in materials]
-
-    def over(numbers: Array, most: Callable[..., Array]) -> list[Array]:
-        """The largest, or smallest, number of each body."""
-        every = [
-            [most(numbers[own]) for own, body in zip(rows, of_body, strict=True) if body == k] for k in set(of_body)
-        ]
-        return [most(jnp.stack(found)) for found in every]
-
-    stiff, light = over(modulus, jnp.max), over(density, jnp.min)
-    pairs = combinations(range(len(stiff)), 2)
-    added = jnp.stack([series_stiffness(stiff[a], stiff[b]) / jnp.minimum(light[a], light[b]) for a, b in pairs])
-    return 4 * STIFFNESS * added.max() / jnp.asarray(scene.grid.spacing) ** 2
+    stiff: dict[int, Array] = {}
+    light: dict[int, Array] = {}
+    for body, points in zip(scene.bodies.numbers(len(scene.laws)), materials, strict=True):
+        k, rho = modulus[slice(*points.rows)].max(), density[slice(*points.rows)].min()
+        stiff[body], light[body] = jnp.maximum(stiff.get(body, k), k), jnp.minimum(light.get(body, rho), rho)
+    pairs = combinations(stiff, 2)
+    added = [in_a_row(stiff[a], stiff[b]) / jnp.minimum(light[a], light[b]) for a, b in pairs]
+    return 4 * STIFFNESS * jnp.stack(added).max() / jnp.asarray(scene.grid.spacing) ** 2
 
 
 def _stiffest_viscosity(points: MaterialPoints, dim: int) -> Float[Array, "q"]:
@@ -269,17 +264,12 @@ def _steepness(scene: Scene, stencil: Stencil) -> tuple[Array, Array]:
     else:
         inverse_moment = 1 / scene.kernel.variance / spacing**2
     bound = scene.gradient.steepness(scene.kernel, spacing, inverse_moment)
-    if scene.total and (bound is None or scene.kernel.order > 1):
-        bound = _steepness_here(stencil)
+    if scene.total and (bound is None or scene.kernel.order > 1):  # Ξ at each particle; Σ_i g gᵀ/w is diagonal
+        touched = stencil.weights > 0
+        parts = jnp.where(touched, stencil.weight_derivatives**2 / jnp.where(touched, stencil.weights, 1), 0)
+        bound = parts.sum(axis=1).max(axis=0)
     bounds = None if bound is None else scene.transfer.steepness(inverse_moment, bound)
     if bound is None or bounds is None:
         culprit = scene.gradient if bound is None else scene.transfer
         raise UnknownBoundError(f"{type(culprit).__name__} gives no bound on the step: give dt.")
     return bounds
-
-
-def _steepness_here(stencil: Stencil) -> Float[Array, "p"]:
-    """Ξ [1/m²] at the place of each particle, shape (p,). Σ_i g_ip g_ipᵀ/w_ip is diagonal."""
-    touched = stencil.weights > 0
-    parts = jnp.where(touched, stencil.weight_derivatives**2 / jnp.where(touched, stencil.weights, 1), 0)
-    return parts.sum(axis=1).max(axis=0)

@@ -195,8 +195,7 @@ def linearisation_error(
         mass = jnp.finfo(mass.dtype).eps ** 0.5 * mass
         stays = np.repeat([not law.relaxes_stress for law in scene.laws], trial.sizes)
         if stays.any():
-            own = jnp.where(stays, trial.mass, 0)[None]
-            sums = scatter(nodes.potential.stencil, own, None, nodes.potential.size)
+            sums = scatter(nodes.potential.stencil, jnp.where(stays, trial.mass, 0)[None], None, nodes.potential.size)
             mass = mass + nodes.mirror.fold_scalar(sums[:, 0])
     momentum = mass[:, None] * motion.velocity
     norms = [jnp.linalg.norm(a) for a in (exact, elastic, nodes.dt * nodes.force, momentum)]
