@@ -16,8 +16,7 @@ from mpmjax.boundary._contact import ConstrainedNodes
 from mpmjax.checks._values import canonical
 from mpmjax.implicit._conjugate_residual import _solve
 from mpmjax.implicit._projection import Projection
-from mpmjax.simulation._diffrax import Problem
-from mpmjax.simulation._segments import SegmentAdjoint
+from mpmjax.simulation._diffrax import Problem, SegmentAdjoint
 from mpmjax.state import state_of
 from mpmjax.stepping._nodes import Nodes
 from mpmjax.stepping._step import step_unchecked

@@ -9,7 +9,7 @@ import pytest
 from helpers import FORWARD, LAWS, REVERSE, block
 
 import mpmjax as mpm
-from mpmjax.simulation._statistics import Fault
+from mpmjax.simulation._run import Fault
 
 DT = 0.01
 METHOD = mpm.SemiImplicit(

@@ -21,10 +21,9 @@ from mpmjax.io._interrupt import undisturbed
 from mpmjax.io._record import record
 from mpmjax.io._runs import FrameWriter, load, save
 from mpmjax.io._transactional_file import StagedFile
-from mpmjax.simulation._rollout_state import RolloutState, initial_state
-from mpmjax.simulation._run import Run
+from mpmjax.simulation._diffrax import RolloutState, initial_state
+from mpmjax.simulation._run import Run, RunStatistics, no_steps
 from mpmjax.simulation._simulate import integrate
-from mpmjax.simulation._statistics import RunStatistics, no_steps
 from mpmjax.state._particles import Particles, state_of, with_state
 from mpmjax.state._preparation import prepare
 

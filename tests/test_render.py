@@ -8,7 +8,7 @@ import pytest
 from helpers import LAWS, thorough
 
 import mpmjax as mpm
-from mpmjax.simulation._statistics import no_steps
+from mpmjax.simulation._run import no_steps
 from mpmjax.state._particles import State
 from mpmjax.viz._render import (
     _bearing,

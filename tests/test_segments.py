@@ -11,7 +11,7 @@ from helpers import NEEDS_LIBRARY, assert_close, thorough
 
 import mpmjax as mpm
 from mpmjax.native import stored
-from mpmjax.simulation._segments import SegmentAdjoint, checkpointed
+from mpmjax.simulation._diffrax import SegmentAdjoint, checkpointed
 
 STEPS, DT = 12, 2e-3
 GRID = mpm.Grid((16, 16), 1 / 16)

@@ -26,7 +26,7 @@ import mpmjax as mpm
 from mpmjax.simulation import _simulate
 from mpmjax.simulation._diffrax import Problem, faulty_particles
 from mpmjax.simulation._faults import advise, disallowed
-from mpmjax.simulation._statistics import Fault
+from mpmjax.simulation._run import Fault
 from mpmjax.state import state_of
 
 DT = 5e-3

@@ -11,8 +11,8 @@ from helpers import NEEDS_LIBRARY, assert_close, thorough
 
 import mpmjax as mpm
 from mpmjax.checks._values import canonical
-from mpmjax.discretisation import by_cell, rearranged
 from mpmjax.simulation import _sorting
+from mpmjax.simulation._sorting import by_cell, rearranged
 from mpmjax.state import state_of
 
 DT, STEPS = 1e-3, 12
@@ -128,7 +128,7 @@ def test_particles_are_in_the_order_of_their_cells():
     scene, particles = mixed()
     scene = canonical(scene, particles.x.dtype)
     given = mpm.prepare(scene, particles)
-    order, state = _sorting.given_order(scene, given), state_of(given)
+    order, state = _sorting.memory_order(scene, given, STEPS), state_of(given)
     state, order = eqx.filter_jit(_sorting.resorted)(order, scene, given, state, 0.0, jnp.asarray(0.0), None)
     cells = np.asarray(_sorting.cells_of(scene.kernel, scene.grid, scene.window(given), state.x))
     for group in given.groups:

@@ -1,12 +1,6 @@
 """Grid, B-spline kernels, stencils, and the transfers between particles and grid."""
 
 from mpmjax.discretisation._average import average as average
-from mpmjax.discretisation._cell_order import (
-    Order as Order,
-    by_cell as by_cell,
-    cells_of as cells_of,
-    rearranged as rearranged,
-)
 from mpmjax.discretisation._grid import Grid as Grid
 from mpmjax.discretisation._kernel import (
     AbstractGradient as AbstractGradient,
@@ -19,7 +13,9 @@ from mpmjax.discretisation._resistance import resist as resist
 from mpmjax.discretisation._stencil import (
     Places as Places,
     Stencil as Stencil,
+    first_nodes as first_nodes,
     in_window as in_window,
+    index_factors as index_factors,
     make_stencil as make_stencil,
 )
 from mpmjax.discretisation._transfer import (

@@ -1,8 +1,9 @@
-"""The thin adapter by which diffrax drives the step: saving, stopping and progress are its own."""
+"""The thin adapter by which diffrax drives the step, and its adjoint; saving, stopping and progress are diffrax's."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 from typing import Any, ClassVar
 
 import diffrax
@@ -12,18 +13,69 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Bool, Int, Scalar, components
+from mpmjax._types import Array, Bool, Int, Scalar, components, particle_first
+from mpmjax.autodiff import recomputed
+from mpmjax.boundary import BoundaryImpulse, ColliderImpulse, no_boundary_impulse, no_impulse
 from mpmjax.checks import first_unmet, requirements
 from mpmjax.discretisation import Stencil, in_window
 from mpmjax.native import stored
-from mpmjax.simulation._rollout_state import RolloutState
-from mpmjax.simulation._sorting import resorted
-from mpmjax.simulation._statistics import Fault, RunStatistics, no_steps, one_step
-from mpmjax.state import Particles, Scene, State, with_state
-from mpmjax.stepping import AbstractIntegrator, step_compiled
+from mpmjax.simulation._run import Fault, RunStatistics, no_steps, one_step
+from mpmjax.simulation._sorting import MemoryOrder, resorted
+from mpmjax.state import Particles, Scene, State, state_of, with_state
+from mpmjax.stepping import AbstractIntegrator, StepInfo, step_compiled
 
 LEAST_STRETCH = 1e-2
 """Principal stretch [-] below which a particle has collapsed."""
+
+
+class RolloutState(eqx.Module):
+    """The part of a rollout that evolves: the particles' state, and what colliders and boundaries have received."""
+
+    particles: State
+    collider_impulse: ColliderImpulse | None
+    """Linear and angular impulse on the scene's colliders since the rollout began; None without colliders."""
+    boundary_impulse: BoundaryImpulse | None = None
+    """Linear and angular impulse on the scene's boundaries; None unless the scene has `boundary_forces`."""
+    order: MemoryOrder | None = None
+    """The order of the particles in memory; None if it is that in which they were given."""
+
+    def to_loop_layout(self) -> "RolloutState":
+        """The state in the layout of the loop over steps: component first, as a step has its arrays, and C with the
+        direction of the derivative before the component, as a gather has it. XLA would else transpose all of them in
+        each step."""
+        return replace(self, particles=_with_transposed_affine(jax.tree.map(components, self.particles)))
+
+    def from_loop_layout(self, hold: Callable[[State], State] = lambda state: state) -> "RolloutState":
+        """The state from the layout of the loop over steps, with `hold` applied to the arrays as the loop has them."""
+        state = _with_transposed_affine(hold(self.particles))
+        return replace(self, particles=jax.tree.map(particle_first, state))
+
+    def as_given(self) -> "RolloutState":
+        """A state of the loop, particle first again and in the order in which the particles were given."""
+        state = self.from_loop_layout()
+        return state if self.order is None else replace(state, particles=self.order.undone(state.particles), order=None)
+
+    def after(self, particles: Particles, info: StepInfo) -> "RolloutState":
+        """The state after a step, from the particles after it and what it reports."""
+        new = replace(self, particles=state_of(particles))
+        if self.collider_impulse is not None and info.colliders is not None:
+            new = replace(new, collider_impulse=self.collider_impulse.plus(info.colliders))
+        if self.boundary_impulse is not None and info.boundaries is not None:
+            new = replace(new, boundary_impulse=self.boundary_impulse.plus(info.boundaries))
+        return new
+
+
+def initial_state(scene: Scene, particles: Particles) -> RolloutState:
+    """The state in which a rollout of prepared particles begins."""
+    of = particles.dim, particles.x.dtype
+    colliders = no_impulse(scene.collider_count, *of) if scene.collider_count else None
+    boundaries = no_boundary_impulse(len(scene.boundary) + len(scene.guides), *of) if scene.boundary_forces else None
+    return RolloutState(state_of(particles), colliders, boundaries)
+
+
+def _with_transposed_affine(state: State) -> State:
+    """A component-first state with C transposed."""
+    return state if state.C is None else eqx.tree_at(lambda s: s.C, state, jnp.swapaxes(state.C, 0, 1))
 
 
 class Problem(eqx.Module):
@@ -57,10 +109,10 @@ class Problem(eqx.Module):
         time to.
 
         Args:
-            y: the state as the loop carries it.
+            y: the state as the loop has it.
             step: the number of steps since the rollout began.
         """
-        y = y.uncarried(stored)
+        y = y.from_loop_layout(stored)
         if y.order is None:
             return self, y
         t = (self.start + step) * self.dt
@@ -79,8 +131,8 @@ def faulty_particles(problem: Problem, state: State, t: Scalar) -> dict[Fault, B
     admitted = jnp.concatenate([points.is_admissible(points.deformation) for points in materials])
     faults = {Fault.NOT_FINITE: ~finite, Fault.OUTSIDE: finite & outside, Fault.INADMISSIBLE: finite & ~admitted}
     if not scene.total:  # there forces are made of P, here of P Fᵀ, which vanishes with F: nothing opens what collapsed
-        kept = [points.law.measure.collapsed(points.deformation, LEAST_STRETCH) for points in materials]
-        faults[Fault.COLLAPSED] = finite & jnp.concatenate(kept)
+        collapsed = [points.law.kinematics.collapsed(points.deformation, LEAST_STRETCH) for points in materials]
+        faults[Fault.COLLAPSED] = finite & jnp.concatenate(collapsed)
     return faults
 
 
@@ -99,29 +151,28 @@ def passed_particles(problem: Problem, before: State, after: State, t: Scalar) -
     return [(number, passed) for number, passed in enumerate(passed_by) if passed is not None]
 
 
-def gravest(faults: dict[Fault, Bool[Array, "p"]]) -> Int[Array, ""]:
+def _gravest(faults: dict[Fault, Bool[Array, "p"]]) -> Int[Array, ""]:
     """The gravest fault that any particle has, of faults in their order, by one reduction over the particles."""
-    ranks = {fault: len(faults) - i for i, fault in enumerate(faults)}
-    of_particle = jnp.zeros_like(next(iter(faults.values())), jnp.int32)
-    for fault, particles in reversed(faults.items()):
-        of_particle = jnp.where(particles, ranks[fault], of_particle)
-    worst, fault_found = of_particle.max(initial=0), jnp.asarray(Fault.NONE, jnp.int32)
-    for fault, rank in ranks.items():
-        fault_found = jnp.where(worst == rank, fault, fault_found)
-    return fault_found
+    rank, worst = jnp.zeros_like(next(iter(faults.values())), jnp.int32), jnp.asarray(Fault.NONE, jnp.int32)
+    for place, particles in enumerate(reversed(faults.values()), 1):
+        rank = jnp.where(particles, place, rank)
+    most = rank.max(initial=0)
+    for place, fault in enumerate(reversed(faults), 1):
+        worst = jnp.where(most == place, fault, worst)
+    return worst
 
 
 _GRAVEST_FIRST = (Fault.NOT_FINITE, Fault.PASSED, Fault.OUTSIDE, Fault.INADMISSIBLE, Fault.COLLAPSED)
 """The faults of a state, and of the step that led to it."""
 
 
-def fault_of(problem: Problem, before: State, after: State, t: Scalar) -> Int[Array, ""]:
+def _fault_of(problem: Problem, before: State, after: State, t: Scalar) -> Int[Array, ""]:
     """The gravest fault of a state, or of the step from t [s] that led to it."""
     faults = faulty_particles(problem, after, t + problem.dt)
     passed = [particles for _, particles in passed_particles(problem, before, after, t)]
     if passed:
         faults[Fault.PASSED] = reduce(jnp.logical_or, passed)
-    return gravest({fault: faults[fault] for fault in _GRAVEST_FIRST if fault in faults})
+    return _gravest({fault: faults[fault] for fault in _GRAVEST_FIRST if fault in faults})
 
 
 def examined(problem: Problem, state: RolloutState) -> tuple[Problem, RolloutState]:
@@ -130,14 +181,10 @@ def examined(problem: Problem, state: RolloutState) -> tuple[Problem, RolloutSta
     arrays, rest = eqx.partition((problem, state), eqx.is_array)
     constant, begin = eqx.combine(jax.lax.stop_gradient(arrays), rest)
     unmet = first_unmet(requirements((constant.scene, constant.particles, constant.method)))
-    fault = jnp.where(
-        unmet > 0,
-        Fault.BAD_PARAMETERS,
-        gravest(faulty_particles(constant, begin.particles, constant.start * constant.dt)),
-    )
+    fault = _gravest(faulty_particles(constant, begin.particles, constant.start * constant.dt))
     valid = jnp.where(unmet > 0, jnp.nan, 1)
     state = jax.tree.map(lambda a: a * valid.astype(a.dtype), state)
-    return replace(problem, fault=fault, unmet=unmet), state
+    return replace(problem, fault=jnp.where(unmet > 0, Fault.BAD_PARAMETERS, fault), unmet=unmet), state
 
 
 def step_number(t: Array) -> Array:
@@ -181,16 +228,15 @@ class StepSolver(diffrax.AbstractSolver):
         report = report + info.solve.report
         y1 = y.after(particles, info)
         arrays, rest = eqx.partition((args, y.particles, y1.particles, t), eqx.is_array)
-        fault = fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest))
-        statistics = statistics.after_step(one_step(info, fault), solved=not args.method.is_explicit)
-        y1 = y1.carried()
-        dense = {"y0": y0, "y1": y1}
-        if not self.watch:
-            return y1, None, dense, (statistics, report), diffrax.RESULTS.successful
+        fault = _fault_of(*eqx.combine(jax.lax.stop_gradient(arrays), rest))
+        statistics = statistics.merged(one_step(info, fault), solved=not args.method.is_explicit)
+        y1 = y1.to_loop_layout()
         results: Any = diffrax.RESULTS  # whose members the type checker takes for another type
-        goes_on = (statistics.fault == Fault.NONE) & (step_number(t0) + 1 < args.until)
-        result = results.where(goes_on, results.successful, results.nonlinear_divergence)
-        return y1, None, dense, (statistics, report), result
+        result = results.successful
+        if self.watch:
+            goes_on = (statistics.fault == Fault.NONE) & (step_number(t0) + 1 < args.until)
+            result = results.where(goes_on, result, results.nonlinear_divergence)
+        return y1, None, {"y0": y0, "y1": y1}, (statistics, report), result
 
     def func(self, terms: Any, t0: Any, y0: RolloutState, args: Problem) -> RolloutState:
         """Not a vector field; diffrax only asks for its shape."""
@@ -201,3 +247,71 @@ def no_vector_field(t: Any, y: RolloutState, args: Problem) -> RolloutState:
     """A stand-in for the equation that diffrax expects; the solver does not evaluate it."""
     del t, args
     return jax.tree.map(jnp.zeros_like, y)
+
+
+_MOST_LOOPS = 4
+"""Each further loop takes all steps once more."""
+
+
+class SegmentAdjoint(diffrax.AbstractAdjoint):
+    """Reverse mode that stores the state before each segment of steps. From the last segment to the first it computes
+    the steps again, storing what each starts from, its sums and what is `kept` of it, and then differentiates them.
+
+    The loops are scans, so that derivatives of any kind and order exist. All steps are taken: nothing stops a run.
+    """
+
+    lengths: tuple[int, ...] = eqx.field(static=True)
+    """How often each loop turns, the outermost first: the number of segments, then that of their steps; more of them
+    where segments have segments. Steps beyond the last one do nothing."""
+
+    def loop(self, *, throw: Any, passed_solver_state: Any, passed_controller_state: Any, **of_diffrax: Any) -> Any:
+        del throw, passed_solver_state, passed_controller_state
+        return self._loop(inner_while_loop=None, outer_while_loop=self._nested_loops, **of_diffrax)
+
+    def _nested_loops(self, cond_fun: Any, body_fun: Any, state: Any, *, max_steps: int, buffers: Any) -> Any:
+        """The state after all steps, with the arguments of `equinox.internal.while_loop`."""
+        del cond_fun, buffers
+        turns = math.prod(self.lengths)
+
+        def taken(state: Any) -> Any:
+            return jax.tree.map(jnp.asarray, body_fun(state))
+
+        def step(state: Any, number: jax.Array) -> tuple[Any, None]:
+            if turns == max_steps:
+                return taken(state), None
+            return jax.lax.cond(number < max_steps, taken, lambda state: state, state), None
+
+        turn = recomputed(step, sums=True)
+        for _ in self.lengths[1:]:
+            turn = jax.checkpoint(partial(jax.lax.scan, turn), prevent_cse=False)
+        numbers = jnp.arange(turns).reshape(self.lengths)
+        return jax.lax.scan(turn, jax.tree.map(jnp.asarray, state), numbers)[0]
+
+
+def checkpointed(
+    steps: int, state_bytes: int, step_bytes: int, budget: int, *, stops: bool = False
+) -> diffrax.AbstractAdjoint:
+    """The adjoint for reverse mode that computes steps again as seldom as a budget allows: by segments, in up to four
+    loops; with less memory diffrax's, whose checkpoints move.
+
+    Args:
+        steps: number of steps.
+        state_bytes: memory of a state [B].
+        step_bytes: memory of what is stored of a step at once, with the state that it starts from [B].
+        budget: memory for all of them [B].
+        stops: whether a fault may stop the run, which ends diffrax's loop alone.
+    """
+    for loops in () if stops else range(1, _MOST_LOOPS + 1):
+        *outer, inner = _lengths(steps, loops)
+        if sum(outer) * state_bytes + inner * step_bytes <= budget:
+            return SegmentAdjoint((*outer, inner))
+    return diffrax.RecursiveCheckpointAdjoint(checkpoints=max(1, min(steps, budget // state_bytes)))
+
+
+def _lengths(steps: int, loops: int) -> tuple[int, ...]:
+    """The turns of so many loops with as many turns each, if possible none of them for nothing."""
+    if loops == 1:
+        return (steps,)
+    most = math.ceil(round(steps ** (1 / loops), 6))
+    inner = next((n for n in range(most, most // 2, -1) if steps % n == 0), most)
+    return (*_lengths(math.ceil(steps / inner), loops - 1), inner)

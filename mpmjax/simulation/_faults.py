@@ -14,10 +14,8 @@ from mpmjax._types import Array
 from mpmjax.autodiff import guard
 from mpmjax.checks import requirements, warn
 from mpmjax.material import AbstractLaw
-from mpmjax.simulation._diffrax import LEAST_STRETCH, Problem, faulty_particles, passed_particles
-from mpmjax.simulation._rollout_state import RolloutState
-from mpmjax.simulation._run import Run, SimulationError
-from mpmjax.simulation._statistics import Fault
+from mpmjax.simulation._diffrax import LEAST_STRETCH, Problem, RolloutState, faulty_particles, passed_particles
+from mpmjax.simulation._run import Fault, Run, SimulationError
 from mpmjax.state import Particles, Scene, state_of, warn_of_crowding, with_state
 from mpmjax.stepping import SAFETY, AbstractIntegrator, UnknownBoundError, longest_step
 
@@ -47,7 +45,8 @@ def raise_faults(run: Run, began: Particles, before: Callable[[], RolloutState],
                 advice = "In the total description it holds only what touched it from the start: use the updated one."
         first = int(np.argmax(np.asarray(bad[fault])))
         if fault == Fault.INADMISSIBLE:
-            what, advice = disallowed(_law(run, first), run.method)
+            law = run.scene.laws[int(np.searchsorted(np.cumsum(run.final.sizes), first, side="right"))]
+            what, advice = disallowed(law, run.method)
         last = with_state(run.final, previous.particles)
         reached = int((run.steps < step).sum())
         saved = {
@@ -68,24 +67,18 @@ def raise_faults(run: Run, began: Particles, before: Callable[[], RolloutState],
             good,
         )
     if int(run.statistics.unconverged) > 0:
+        advice = [*run.method.unconverged_advice(), "reduce dt", "raise the solver's max_steps or loosen its rtol"]
+        if run.final.x.dtype == jnp.float32:
+            advice.append("take float64 particles, of which rounding leaves more digits")
+        if not run.method.keeps_admissible:
+            advice.append("BackwardEuler holds where one linear solve does not")
+        text = "; ".join(advice)
         raise SimulationError(
             f"The solve of {int(run.statistics.unconverged)} of {int(run.statistics.steps)} steps did not converge "
             f"(worst relative residual {float(run.statistics.worst_residual):.2g}). "
-            + unconverged_advice(run.method, run.final.x.dtype)
-            + averaging_advice(run.scene),
+            f"{text[0].upper()}{text[1:]}." + averaging_advice(run.scene),
             run,
         )
-
-
-def unconverged_advice(method: AbstractIntegrator, dtype: Any) -> str:
-    """Advice on a solve that does not converge."""
-    advice = [*method.unconverged_advice(), "reduce dt", "raise the solver's max_steps or loosen its rtol"]
-    if jnp.dtype(dtype) == jnp.float32:
-        advice.append("take float64 particles, of which rounding leaves more digits")
-    if not method.keeps_admissible:
-        advice.append("BackwardEuler holds where one linear solve does not")
-    text = "; ".join(advice)
-    return f"{text[0].upper()}{text[1:]}."
 
 
 def warn_of_inaccuracy(run: Run) -> None:
@@ -116,12 +109,6 @@ def warn_of_inaccuracy(run: Run) -> None:
             f"{float(np.sqrt(error / LARGEST_LINEARISATION_ERROR)):.1f} times or more, or Newton's method: "
             "BackwardEuler(), or solution=Newton() of ImplicitMidpoint and TRBDF2."
         )
-
-
-def _law(run: Run, particle: int) -> AbstractLaw:
-    """The law of a particle, by its number."""
-    last = np.cumsum(run.final.sizes)
-    return run.scene.laws[int(np.searchsorted(last, particle, side="right"))]
 
 
 class _Words(NamedTuple):
@@ -236,9 +223,5 @@ def averaging_advice(scene: Scene) -> str:
 
 def disallowed(law: AbstractLaw, method: AbstractIntegrator) -> tuple[str, str]:
     """Two parts of a message: the deformation that the law does not allow, and the remedy."""
-    newton = (
-        ""
-        if method.is_explicit or method.keeps_admissible
-        else ", or take BackwardEuler(), whose line search forbids it"
-    )
-    return law.inadmissible(newton)
+    newton = ", or take BackwardEuler(), whose line search forbids it"
+    return law.inadmissible("" if method.is_explicit or method.keeps_admissible else newton)

@@ -1,16 +1,137 @@
-"""The outcome of a simulation."""
+"""The outcome of a simulation, the statistics of its steps, and its faults."""
 
+import enum
+from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Float, Scalar
-from mpmjax.boundary import Impulses
-from mpmjax.simulation._statistics import RunStatistics
+from mpmjax._types import Array, Bool, Float, Int, Scalar
+from mpmjax.boundary import BoundaryImpulse, ColliderImpulse
 from mpmjax.state import Particles, Scene, State, with_state
-from mpmjax.stepping import AbstractIntegrator
+from mpmjax.stepping import AbstractIntegrator, StepInfo
+
+
+class Fault(enum.IntEnum):
+    """A fault of a state or a step. A member may be compared with a traced whole number."""
+
+    NONE = 0
+    NOT_FINITE = 1
+    """A number of a particle is infinite or NaN."""
+    OUTSIDE = 2
+    """A particle's stencil has left the grid's window."""
+    INADMISSIBLE = 3
+    """A law does not allow a particle's deformation gradient."""
+    PASSED = 4
+    """A particle has passed a boundary that keeps it out."""
+    BAD_PARAMETERS = 5
+    """Scene, particles or method have a value that their module does not allow, which a jax transformation hid."""
+    COLLAPSED = 6
+    """A particle has collapsed: a stretch of it is below a hundredth."""
+
+
+class RunStatistics(eqx.Module):
+    """Sums over the steps of a run."""
+
+    steps: Int[Array, "*f"]
+    """Steps taken."""
+    iterations: Int[Array, "*f"]
+    """Iterations of the linear solver."""
+    most_iterations: Int[Array, "*f"]
+    """Largest number of iterations in one step."""
+    newton: Int[Array, "*f"]
+    """Newton steps."""
+    line_search: Int[Array, "*f"]
+    """Halvings by the line search."""
+    worst_residual: Float[Array, "*f"]
+    """Largest relative residual at the end of a solve."""
+    force_error: Float[Array, "*f"]
+    """Largest error of a step's elastic force [N] (see `StepInfo.force_error`)."""
+    force_scale: Float[Array, "*f"]
+    """Largest scale of these forces [N]."""
+    unconverged: Int[Array, "*f"]
+    """Steps whose solve met neither ten times its tolerance nor the precision's limit: the run is not a solution."""
+    nearly_converged: Int[Array, "*f"]
+    """Steps whose solve missed its tolerance, by less than ten times: the run is less accurate than was asked for."""
+    indefinite: Int[Array, "*f"]
+    """Steps whose solve met negative curvature: compression has made M + χH indefinite, and near a singular one the
+    motion is wrong however small the residual. `AnalyticHessian(projected=True)` or a smaller step avoids it."""
+    sweeps: Int[Array, "*f"]
+    """Solves for contact beyond one a step."""
+    violations: Int[Array, "*f"]
+    """Contact conditions left violated, summed over steps."""
+    fault: Int[Array, "*f"]
+    """The first `Fault`."""
+    fault_step: Int[Array, "*f"]
+    """Number of steps that led to it."""
+    unmet: Int[Array, "*f"]
+    """With BAD_PARAMETERS the number, from one, of the first of the `requirements` on scene, particles and method that
+    is not met; else zero."""
+
+    @property
+    def linearisation_error(self) -> Float[Array, "*f"]:
+        """Error of the elastic force by the linearisation of implicit steps and by the return maps after them [-]: the
+        largest of any step over the largest scale of any, so that quiet steps do not count."""
+        return self.force_error / jnp.where(self.force_scale == 0, 1, self.force_scale)
+
+    @property
+    def healthy(self) -> Bool[Array, "*f"]:
+        """Whether no state was at fault and no solve ended far from its tolerance."""
+        return (self.fault == Fault.NONE) & (self.unconverged == 0)
+
+    def merged(self, later: "RunStatistics", *, solved: bool = True) -> "RunStatistics":
+        """These statistics and those of the steps that followed. Of steps that solve nothing the largest numbers of
+        solves stay as they are, which XLA does not see of a maximum with zero."""
+        first, both = self.fault == Fault.NONE, {}
+        for name in (field.name for field in fields(self)):
+            a, b = getattr(self, name), getattr(later, name)
+            both[name] = a + b if name not in _LARGEST else jnp.maximum(a, b) if solved else a
+        return RunStatistics(
+            **both
+            | {
+                "fault": jnp.where(first, later.fault, self.fault),
+                "fault_step": jnp.where(
+                    first & (later.fault != Fault.NONE), self.steps + later.fault_step, self.fault_step
+                ),
+                "unmet": jnp.where(first, later.unmet, self.unmet),
+            }
+        )
+
+
+_LARGEST = ("most_iterations", "worst_residual", "force_error", "force_scale")
+"""Numbers of which a run has the largest; it has the sum of the others."""
+
+
+def no_steps(dtype: Any) -> RunStatistics:
+    """The statistics before the first step."""
+    zero, real = jnp.asarray(0, jnp.int32), ("worst_residual", "force_error", "force_scale")
+    return RunStatistics(**{f.name: jnp.asarray(0, dtype) if f.name in real else zero for f in fields(RunStatistics)})
+
+
+def one_step(info: StepInfo, fault: Int[Array, ""]) -> RunStatistics:
+    """The statistics of one step, from what it reports and the fault of the state after it."""
+    solve, one = info.solve, jnp.asarray(1, jnp.int32)
+    return replace(
+        no_steps(info.force_error.dtype),
+        steps=one,
+        iterations=solve.iterations,
+        most_iterations=solve.iterations,
+        newton=solve.newton,
+        line_search=solve.line_search,
+        worst_residual=jax.lax.stop_gradient(solve.residual),
+        force_error=info.force_error,
+        force_scale=info.force_scale,
+        unconverged=(~(solve.converged | solve.nearly_converged)).astype(jnp.int32),
+        nearly_converged=solve.nearly_converged.astype(jnp.int32),
+        indefinite=solve.indefinite.astype(jnp.int32),
+        sweeps=info.contact.sweeps,
+        violations=info.contact.violations,
+        fault=fault,
+        fault_step=one,
+    )
 
 
 class SimulationError(RuntimeError):

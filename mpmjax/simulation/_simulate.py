@@ -14,7 +14,6 @@ import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.autodiff import guard, recomputed
-from mpmjax.boundary import Impulses
 from mpmjax.checks import (
     canonical,
     checked,
@@ -26,13 +25,19 @@ from mpmjax.checks import (
     require_whole,
     requirements,
 )
-from mpmjax.simulation._diffrax import Problem, StepSolver, examined, no_vector_field, step_number
+from mpmjax.simulation._diffrax import (
+    Problem,
+    RolloutState,
+    StepSolver,
+    checkpointed,
+    examined,
+    initial_state,
+    no_vector_field,
+    step_number,
+)
 from mpmjax.simulation._faults import UNSOLVED, guarded, raise_faults, warn_of_inaccuracy
-from mpmjax.simulation._rollout_state import RolloutState, initial_state
-from mpmjax.simulation._run import Run
-from mpmjax.simulation._segments import checkpointed
+from mpmjax.simulation._run import Run, RunStatistics
 from mpmjax.simulation._sorting import memory_order
-from mpmjax.simulation._statistics import RunStatistics
 from mpmjax.state import Particles, Scene, prepare, state_of, warn_of_rounding, with_state
 from mpmjax.stepping import MOST_STEPS, AbstractIntegrator, Explicit, step_for, step_unchecked
 
@@ -59,8 +64,7 @@ def simulate(
 
     The rollout is differentiable with respect to every float of the scene, the particles and the method: in reverse
     mode by default, within `checkpoint_bytes`; in forward mode (`jax.jvp`, `jax.jacfwd`) with
-    `adjoint=diffrax.ForwardMode()`, without which runs in little `checkpoint_bytes` have none. Only the number of
-    steps, `save_every` and choices of code compile anew.
+    `adjoint=diffrax.ForwardMode()`. Only the number of steps, `save_every` and choices of code compile anew.
 
     Args:
         scene: the scene.
@@ -108,7 +112,7 @@ def simulate(
     if observe is not None and save_every is None:
         save_every = 1
     begin, first, dt_ = initial_state(scene, particles), *canonical((start, dt), dtype)
-    state_bytes = _bytes(begin)
+    state_bytes = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(begin))
     traced = is_traced((scene, particles, dt_, method, observe))  # under jax.jit also if all that was passed is known
     if save_every is not None and observe is None:
         frames = count // save_every + 2
@@ -123,7 +127,10 @@ def simulate(
         no_fault, unsolved, zero = jnp.zeros((), jnp.int32), UNSOLVED.format("the adjoint"), jnp.zeros((), dtype)
         (scene, particles, method), slot = guard((scene, particles, method), zero, no_fault, (), unsolved)
     if adjoint is None:
-        step_bytes = state_bytes + _sum_bytes(scene, particles)
+        # of a step besides its state: momentum and mass of the nodes, as much for solutions, what the particles gather
+        d = particles.dim
+        numbers = 2 * (d + 1) * scene.grid.size + (d + d * d) * particles.count
+        step_bytes = state_bytes + numbers * dtype.itemsize
         adjoint = checkpointed(count, state_bytes, step_bytes, checkpoint_bytes, stops=not traced)
     go = partial(
         integrate,
@@ -144,20 +151,21 @@ def simulate(
         watch=not traced,
     )
     end = go()
+    values, on_colliders, on_boundaries = end.saved
     run = Run(
         scene=scene,
         method=method,
         dt=dt_,
-        steps=end.saved.steps,
-        frames=end.saved.values if observe is None else None,
-        observed=None if observe is None else end.saved.values,
-        final=end.particles,
+        steps=end.steps,
+        frames=values if observe is None else None,
+        observed=None if observe is None else values,
+        final=with_state(particles, end.state.particles),
         final_step=end.step,
         statistics=end.statistics,
         report=end.report if traced else None,
-        collider_impulse=end.saved.collider_impulse,
+        collider_impulse=on_colliders,
         final_collider_impulse=end.state.collider_impulse,
-        boundary_impulse=end.saved.boundary_impulse,
+        boundary_impulse=on_boundaries,
         final_boundary_impulse=end.state.boundary_impulse,
     )
     if not throw:
@@ -211,9 +219,9 @@ def _rollout(
         here, y = problem.resorted(y, n)
         t = (start + n) * dt
         new, _ = step_unchecked(here.scene, here.at(y.particles), t, dt, method, here.stencil)
-        return replace(y, particles=state_of(new)).carried(), None
+        return replace(y, particles=state_of(new)).to_loop_layout(), None
 
-    begin = RolloutState(state_of(particles), None, order=memory_order(scene, particles, steps)).carried()
+    begin = RolloutState(state_of(particles), None, order=memory_order(scene, particles, steps)).to_loop_layout()
     end, _ = jax.lax.scan(recomputed(body), begin, jnp.arange(steps, dtype=particles.x.dtype))
     return with_state(particles, end.as_given().particles)
 
@@ -247,36 +255,15 @@ def number_of_steps(t1: Any, dt: Any, start: int, dtype: Any) -> int:
     return total - int(start)
 
 
-def _bytes(state: RolloutState) -> int:
-    """Size of a state [B]."""
-    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(state))
-
-
-def _sum_bytes(scene: Scene, particles: Particles) -> int:
-    """About the size of what is stored of a step besides its state [B]: momentum and mass of the nodes, as much again
-    for solutions, and what the particles gather."""
-    d = particles.dim
-    numbers = 2 * (d + 1) * scene.grid.size + (d + d * d) * particles.count
-    return numbers * particles.x.dtype.itemsize
-
-
-class Saved(NamedTuple):
-    """Saved frames, along a first axis; no steps and None if nothing was saved."""
-
-    steps: Float[Array, "f"]
-    """Their numbers."""
-    values: Any = None
-    collider_impulse: Impulses | None = None
-    boundary_impulse: Impulses | None = None
-
-
 class End(NamedTuple):
     """The end of an integration."""
 
-    saved: Saved
+    steps: Float[Array, "f"]
+    """Numbers of the saved frames; none if nothing was saved."""
+    saved: Any
+    """The frames, along a first axis: of each its state or what was observed, and the impulses on colliders and on
+    boundaries."""
     state: RolloutState
-    particles: Particles
-    """The particles in this state."""
     step: Float[Array, ""]
     """The number of the last step."""
     statistics: RunStatistics
@@ -317,9 +304,9 @@ def integrate(
     problem = Problem(scene, particles, stencil, dt, method, observe, start, until, slot, save_every=save_every)
     if not watch:
         problem, state = examined(problem, state)
-    state = replace(state, order=memory_order(scene, particles, save_every or max_steps)).carried()
+    state = replace(state, order=memory_order(scene, particles, save_every or max_steps)).to_loop_layout()
 
-    def kept(t: Any, y: RolloutState, args: Problem) -> Any:
+    def frame(t: Any, y: RolloutState, args: Problem) -> Any:
         del t
         y = y.as_given()
         value = y.particles if args.observe is None else args.observe(args.scene, args.at(y.particles))
@@ -327,7 +314,7 @@ def integrate(
 
     subs = {"final": diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: y.as_given())}
     if save_every is not None:
-        subs["frames"] = diffrax.SubSaveAt(t0=True, t1=True, steps=save_every, fn=kept)
+        subs["frames"] = diffrax.SubSaveAt(t0=True, t1=True, steps=save_every, fn=frame)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(no_vector_field),
         StepSolver(watch),
@@ -344,11 +331,10 @@ def integrate(
     )
     times, values, (statistics, report) = cast(Any, (solution.ts, solution.ys, solution.solver_state))
     final = jax.tree.map(lambda a: a[-1], values["final"])
-    saved = Saved(jnp.zeros((0,), start.dtype))
+    steps, saved = jnp.zeros((0,), start.dtype), (None, None, None)
     if save_every is not None:
-        saved = Saved(start + step_number(times["frames"]), *values["frames"])
-    last = start + statistics.steps.astype(start.dtype)
-    return End(saved, final, with_state(particles, final.particles), last, statistics, report)
+        steps, saved = start + step_number(times["frames"]), values["frames"]
+    return End(steps, saved, final, start + statistics.steps.astype(start.dtype), statistics, report)
 
 
 def before_fault(go: Callable[..., Any], begin: RolloutState, statistics: RunStatistics) -> RolloutState:

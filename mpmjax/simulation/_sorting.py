@@ -6,26 +6,25 @@ returned, saved or observed has the order in which the particles were given.
 
 import os
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from equinox.internal import unvmap_any
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad
 
-from mpmjax._types import Array, Bool, Float, Int, Scalar
-from mpmjax.discretisation import Order, by_cell, cells_of
-from mpmjax.native import is_native
-from mpmjax.state import (
-    MemoryOrder,
-    Particles,
-    Scene,
-    State,
-    attached_particles,
-    given_order,
-    places,
-    rearrangement,
-    whole_numbers,
-)
+from mpmjax._types import Array, Bool, Float, Int, ParticleVector, Scalar, components, particle_first
+from mpmjax.discretisation import BSpline, Grid, first_nodes, index_factors
+from mpmjax.native import is_native, native_primitive
+from mpmjax.state import AttachedPoints, Particles, Scene, State, by_material, is_foreign
 
+Order = Int[Array, "p"]
+"""The number of the particle that comes first, second, ..."""
 VARIABLE = "MPMJAX_ORDER"
 LEAST = 16_384
 """Fewer particles stay as they were given: they fit into the cache in any order."""
@@ -37,6 +36,36 @@ MIXED = 0.25
 """Particles are sorted if more than this share of them are in another cell than the one before and the next one."""
 
 
+class MemoryOrder(eqx.Module):
+    """The order of a rollout's particles in memory, and in that order what does not evolve of them."""
+
+    numbers: Float[Array, "3 p"]
+    """Rows: original index, mass [kg], undeformed volume [m^d]. One array, which a loop carries at the cost of
+    one; floats, as all of a rollout's state."""
+    parameters: tuple[Any, ...]
+    """The parameters of each law that have one number a particle, in the law's structure, with None for the others."""
+    attached: tuple[Float[Array, "..."], ...]
+    """The places of the particles that the points of each load are attached to."""
+
+    @property
+    def number(self) -> Order:
+        """The number of each particle in the order in which they were given."""
+        return _whole(self.numbers[0])
+
+    def undone(self, state: State) -> State:
+        """A state in this order, brought into that in which the particles were given."""
+        return _in_order(jnp.asarray(True), _places(self.number), state)
+
+    def put_into(self, scene: Scene, particles: Particles) -> tuple[Scene, Particles]:
+        """The scene and the particles with what they know of particles one by one in this order."""
+        particles = replace(particles, mass=self.numbers[1], volume=self.numbers[2])
+        laws = tuple(eqx.combine(values, law) for values, law in zip(self.parameters, scene.laws, strict=True))
+        scene = eqx.tree_at(lambda s: s.material, scene, laws if isinstance(scene.material, tuple) else laws[0])
+        if self.attached:
+            scene = eqx.tree_at(lambda s: tuple(load.on.particle for load in s.loads), scene, self.attached)
+        return scene, particles
+
+
 def memory_order(scene: Scene, particles: Particles, steps: int) -> MemoryOrder | None:
     """The order in which prepared particles were given, which `resorted` will change; None if they stay in it.
 
@@ -45,7 +74,7 @@ def memory_order(scene: Scene, particles: Particles, steps: int) -> MemoryOrder 
     environment variable MPMJAX_ORDER=given they always do; it is read when a program is compiled.
 
     Args:
-        scene: the scene.
+        scene: the scene, its floats arrays, its loads attached.
         particles: its prepared particles.
         steps: the number of steps of the run, or between two saved frames.
 
@@ -59,7 +88,15 @@ def memory_order(scene: Scene, particles: Particles, steps: int) -> MemoryOrder 
     countable = LEAST <= particles.count <= 2 ** (jnp.finfo(particles.x.dtype).nmant + 1)
     if asked or not mixes or not countable or scene.body_force is not None or steps < FEWEST or not is_native():
         return None
-    return given_order(scene, particles)
+
+    def one_a_particle(size: int, node: Any) -> bool:
+        return eqx.is_array(node) and node.shape == (size,)
+
+    laws = zip(scene.laws, particles.sizes, strict=True)
+    chosen = [(law, jax.tree.map(partial(one_a_particle, n), law, is_leaf=is_foreign)) for law, n in laws]
+    number = jnp.arange(particles.count, dtype=particles.x.dtype)
+    numbers = jnp.stack([number, particles.mass, particles.volume])
+    return MemoryOrder(numbers, tuple(eqx.filter(law, which) for law, which in chosen), _attached(scene))
 
 
 def resorted(
@@ -84,31 +121,138 @@ def resorted(
         save_every: number of steps between frames; None if none is saved.
     """
     due = (step if save_every is None else step % save_every) % STEPS == 0
-    attached = attached_particles(scene)
 
-    def found() -> tuple[Order, tuple[Array, ...]]:
-        place = places(order.number)
+    def by_cells() -> tuple[Order, tuple[Array, ...]]:
+        place = _places(order.number)
         original = replace(particles, x=jax.lax.stop_gradient(state.x)[place])
         cells = cells_of(scene.kernel, scene.grid, scene.window(original), scene.on_grid(original, t))
-        number = jnp.concatenate([_sorted_if_mixed(cells, group.rows) for group in particles.groups])
-        new = places(number)
-        return place[number], tuple(new[whole_numbers(rows)].astype(rows.dtype) for rows in attached)
+        parts = [(group.rows[0], cells[slice(*group.rows)]) for group in particles.groups]
+        number = jnp.concatenate([first + _sorted_if_mixed(part) for first, part in parts])
+        new = _places(number)
+        return place[number], tuple(new[_whole(rows)].astype(rows.dtype) for rows in _attached(scene))
 
     def same() -> tuple[Order, tuple[Array, ...]]:
         return jnp.zeros(particles.count, jnp.int32), order.attached
 
     # of the members of a batch, which may end at different times, all take the branch that any of them needs
-    whole, attached = jax.lax.cond(unvmap_any(due), found, same)
-    change = rearrangement(whole, particles.sizes, due)
-    return change.of_state(state), order.changed(change, attached)
+    whole, attached = jax.lax.cond(unvmap_any(due), by_cells, same)
+    groups = zip(by_material(state), order.parameters, strict=True)
+    parameters = (_moved(due, whole[rows] - rows.start, values) for (rows, *_), values in groups)
+    changed = MemoryOrder(rearranged(due, whole, order.numbers.T).T, tuple(parameters), attached)
+    return _in_order(due, whole, state), changed
 
 
-def _sorted_if_mixed(cells: Int[Array, "p"], rows: tuple[int, int]) -> Int[Array, "q"]:
-    """The numbers of one material's particles, by cell if they are mixed."""
-    among = cells[slice(*rows)]
-    return rows[0] + jnp.where(is_mixed(among), by_cell(among), jnp.arange(among.size, dtype=among.dtype))
+def _in_order(wanted: Bool[Array, ""], order: Order, state: State) -> State:
+    """A state with its particles in another order, in which those of a material stay among themselves, where that is
+    wanted."""
+    groups = [_moved(wanted, order[rows] - rows.start, (F, history)) for rows, F, history in by_material(state)]
+    deformations, histories = zip(*groups, strict=True)
+    x, v, C = _moved(wanted, order, (state.x, state.v, None if state.C is None else jnp.swapaxes(state.C, 1, 2)))
+    C = None if C is None else jnp.swapaxes(C, 1, 2)  # transposed in between, as a rollout's loop has it in memory
+    return State(x, v, C, deformations, histories)
 
 
-def is_mixed(cells: Int[Array, "q"]) -> Bool[Array, ""]:
-    """Whether particles in these cells are far from an order by cell."""
-    return (jnp.abs(cells[1:] - cells[:-1]) > 1).mean() > MIXED
+def _moved(wanted: Bool[Array, ""], order: Order, tree: Any) -> Any:
+    return jax.tree.map(lambda a: rearranged(wanted, order, a), tree)
+
+
+def _attached(scene: Scene) -> tuple[Float[Array, "..."], ...]:
+    """The numbers of the particles that the points of each load are attached to."""
+    return tuple(jnp.asarray(load.on.particle) for load in scene.loads if isinstance(load.on, AttachedPoints))
+
+
+def _whole(numbers: Float[Array, "..."]) -> Array:
+    """Numbers of particles that are stored as floats, as integers. No derivative passes."""
+    return jax.lax.stop_gradient(numbers).astype(jnp.int32)
+
+
+def _places(order: Order) -> Order:
+    """The place of each particle in an order: the inverse permutation."""
+    return jnp.zeros_like(order).at[order].set(jnp.arange(order.size, dtype=order.dtype), unique_indices=True)
+
+
+def _sorted_if_mixed(cells: Int[Array, "q"]) -> Order:
+    """The numbers of one material's particles, by cell if many are far from their neighbours."""
+    mixed = (jnp.abs(cells[1:] - cells[:-1]) > 1).mean() > MIXED
+    return jnp.where(mixed, by_cell(cells), jnp.arange(cells.size, dtype=cells.dtype))
+
+
+def cells_of(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleVector) -> Int[Array, "p"]:
+    """The C-order index of the first node of each particle's stencil, shape (p,): particles with the same one share all
+    nodes. Without meaning outside of the window."""
+    first = first_nodes(kernel, window, components(x) / grid.spacing)
+    return index_factors(kernel, grid, first)[:, 0].sum(axis=0, dtype=jnp.int32)
+
+
+def by_cell(cells: Int[Array, "p"]) -> Order:
+    """The numbers of the particles cell after cell, and in a cell in their order, shape (p,)."""
+    return _order_p.bind(cells, batched=0)[0]
+
+
+def rearranged(wanted: Bool[Array, ""], order: Order, a: Float[Array, "p ..."]) -> Float[Array, "p ..."]:
+    """An array in another order, a[order], where that is wanted, else as it is.
+
+    On CPUs this is done in place, so that in a loop what is not wanted costs nothing; of a `jax.lax.cond` XLA copies
+    what either branch returns. It is done component by component, as a step has its arrays: XLA would transpose them.
+    """
+    rows = components(a).reshape(-1, len(a))
+    moved = _rearrange_p.bind(wanted, order, rows, batched=0)[0]
+    return particle_first(moved.reshape(*a.shape[1:], len(a)))
+
+
+def _sort(cells: Array, *, unroll: bool) -> list[Array]:
+    del unroll  # there is no loop
+    return [jnp.argsort(cells, stable=True).astype(cells.dtype)]
+
+
+def _rearrange(wanted: Array, order: Array, rows: Array, *, inverse: bool, unroll: bool = False) -> list[Array]:
+    del unroll
+    moved = rows.at[:, order].set(rows, mode="drop") if inverse else rows.at[:, order].get(mode="clip")
+    return [jnp.where(wanted, moved, rows)]
+
+
+_order_p = native_primitive(
+    "particle_order",
+    _sort,
+    lambda cells: [cells.shape[-1:]],
+    lambda avals, batched: avals[0].dtype == np.int32,
+    like=0,
+)
+
+
+def _rearrange_primitive(inverse: bool) -> Primitive:
+    def like_rows(wanted: ShapedArray, order: ShapedArray, rows: ShapedArray) -> list[tuple]:
+        return [rows.shape[wanted.ndim :]]
+
+    def fits(avals: Any, batched: int) -> bool:
+        del batched
+        return avals[1].dtype == np.int32 and avals[2].dtype in (np.float32, np.float64)
+
+    rearrange = partial(_rearrange, inverse=inverse)
+    return native_primitive("particle_rearrange", rearrange, like_rows, fits, {2: 0}, like=2, inverse=inverse)
+
+
+_rearrange_p, _restore_p = map(_rearrange_primitive, (False, True))
+
+
+def _differentiate(primitive: Primitive, transpose: Primitive) -> None:
+    """Define the derivative by the rows, in which it is linear, and its transpose, the other order."""
+
+    def jvp(primals: tuple, tangents: tuple, *, batched: int) -> tuple[list[Array], list[Any]]:
+        wanted, order, _ = primals
+        out = primitive.bind(*primals, batched=batched)
+        if type(tangents[2]) is ad.Zero:
+            return out, [ad.Zero(jax.typeof(o)) for o in out]
+        return out, primitive.bind(wanted, order, tangents[2], batched=batched)
+
+    def transposed(cotangents: list, wanted: Any, order: Any, rows: Any, *, batched: int) -> list:
+        del rows
+        back = transpose.bind(wanted, order, ad.instantiate_zeros(cotangents[0]), batched=batched)
+        return [None, None, *back]
+
+    ad.primitive_jvps[primitive] = jvp
+    ad.primitive_transposes[primitive] = transposed
+
+
+_differentiate(_rearrange_p, _restore_p)
+_differentiate(_restore_p, _rearrange_p)

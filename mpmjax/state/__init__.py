@@ -32,15 +32,6 @@ from mpmjax.state._loads import (
     terms_of as terms_of,
 )
 from mpmjax.state._material_points import MaterialPoints as MaterialPoints
-from mpmjax.state._order import (
-    MemoryOrder as MemoryOrder,
-    Rearrangement as Rearrangement,
-    attached_particles as attached_particles,
-    given_order as given_order,
-    places as places,
-    rearrangement as rearrangement,
-    whole_numbers as whole_numbers,
-)
 from mpmjax.state._oversights import warn_of_crowding as warn_of_crowding, warn_of_rounding as warn_of_rounding
 from mpmjax.state._particles import (
     Particles as Particles,
@@ -51,6 +42,6 @@ from mpmjax.state._particles import (
     state_of as state_of,
     with_state as with_state,
 )
-from mpmjax.state._preparation import is_prepared as is_prepared, prepare as prepare
+from mpmjax.state._preparation import is_foreign as is_foreign, is_prepared as is_prepared, prepare as prepare
 from mpmjax.state._scene import RigidMaterial as RigidMaterial, Scene as Scene, attach as attach
 from mpmjax.state._velocity_gradient import velocity_gradient as velocity_gradient

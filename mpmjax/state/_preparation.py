@@ -27,7 +27,6 @@ from mpmjax.material import AbstractLaw
 from mpmjax.state._attachment import AttachedPoints
 from mpmjax.state._loaded_points import keeps_deformation
 from mpmjax.state._material_points import MaterialPoints
-from mpmjax.state._order import is_foreign
 from mpmjax.state._oversights import warn_of_oversights
 from mpmjax.state._particles import Group, Particles, moves_as_one, of_one_material
 from mpmjax.state._scene import Scene
@@ -175,6 +174,11 @@ def _fits(law: AbstractLaw, group: Group, dim: int) -> bool:
     if group.stored is None or group.stored.shape[1:] != law.measure.undeformed(dim).shape:
         return False
     return law.remembers(group.history, group.stored)
+
+
+def is_foreign(node: Any) -> bool:
+    """Whether a part of a law is a module of another kind, such as a network, whose numbers are its own."""
+    return isinstance(node, eqx.Module) and not isinstance(node, AbstractLaw)
 
 
 def _parameters(law: AbstractLaw) -> list[Any]:

@@ -1,0 +1,324 @@
+"""The implicit integrators: the semi-implicit step, backward Euler, the midpoint rule, TR-BDF2."""
+
+from abc import abstractmethod
+from functools import reduce
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import lineax as lx
+
+from mpmjax._types import NodeVector, Scalar
+from mpmjax.checks import require_between, require_fields
+from mpmjax.implicit import (
+    AbstractHessian,
+    AbstractPreconditioner,
+    AbstractSolution,
+    AnalyticHessian,
+    ConjugateResidual,
+    DiagonalPreconditioner,
+    Guess,
+    Linearised,
+    Newton,
+    Reporting,
+    SolveInfo,
+    StageProblem,
+    exact_force,
+    require_solver,
+    solve,
+)
+from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
+from mpmjax.stepping._nodes import Nodes
+
+
+class AbstractImplicitIntegrator(AbstractIntegrator):
+    """An integrator that solves with the elastic Hessian, and treats viscosity implicitly. A subclass must have
+    `advance`, `solution` or `solved_by`, and `stages`. The defaults are those of a method that is stable at every step.
+
+    Args:
+        hessian: the Hessian H of the elastic energy. Default: by the analytic stress differential.
+        preconditioner: preconditioner of the linear solves. Default: the diagonal of M + χH.
+        adjoint_solver: linear solver of the tangent and adjoint systems, any symmetric one of lineax. The
+            gradient's error is up to some hundred times its tolerance, by default 1e-8 in float64, 1e-6 in float32.
+        guess: where the (first) solve starts. Default: the velocity of the nodes v^n.
+    """
+
+    explicit_viscosity: ClassVar[bool] = False
+
+    hessian: AbstractHessian = eqx.field(default=AnalyticHessian(), kw_only=True)
+    preconditioner: AbstractPreconditioner = eqx.field(default=DiagonalPreconditioner(), kw_only=True)
+    adjoint_solver: lx.AbstractLinearSolver = eqx.field(default=ConjugateResidual(), kw_only=True)
+    guess: Guess = eqx.field(static=True, default=Guess.GRID_VELOCITY, kw_only=True)
+
+    def __check_init__(self):
+        require_fields(self)
+        require_solver(f"{type(self).__name__}'s adjoint_solver", self.adjoint_solver)
+
+    def solved_by(self) -> AbstractSolution:
+        """How the equation of a stage is solved. Default: by the field `solution`."""
+        return self.solution  # pyright: ignore[reportAttributeAccessIssue]
+
+    @abstractmethod
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
+        """The stages in which the elastic force acts on displaced nodes: weights q [-] and displacements u [m], shape
+        (n, d), of the impulse Δt Σ q f(u)."""
+
+    def solve_stage(
+        self,
+        nodes: Nodes,
+        guess: NodeVector,
+        inertial: NodeVector,
+        stage_dt: Scalar,
+        initial_displacement: NodeVector | None = None,
+        theta: Scalar = 1.0,
+    ) -> tuple[NodeVector, SolveInfo]:
+        """The solution v [m/s], shape (n, d), of M (v − a) = Δt_s (f(u + θΔt_s v) − θ D v), a `StageProblem`, and the
+        report of the solve. One linear solve takes f(u) = f(0) − H u; Newton's method solves the nonlinear equation.
+
+        Args:
+            nodes: the nodes.
+            guess: where the solve starts [m/s], shape (n, d).
+            inertial: a, the velocity of the stage without the force at its own end [m/s], shape (n, d).
+            stage_dt: Δt_s, the length of the stage [s].
+            initial_displacement: u at the start of the stage [m], shape (n, d); None for zero.
+            theta: θ, the share of the stage's displacement at which its force is evaluated [-].
+        """
+        stage = StageProblem(
+            mass=nodes.mass,
+            inertial=inertial,
+            stage_dt=jnp.asarray(stage_dt),
+            initial_displacement=initial_displacement,
+            force=nodes.force,
+            spacing=nodes.spacing,
+            potential=nodes.potential,
+            hessian=self.hessian,
+            projection=nodes.projection,
+            prescribed=nodes.prescribed if nodes.moves_held else None,
+            preconditioner=self.preconditioner,
+            theta=theta,
+        )
+        solution = self.solved_by()
+        return solve(solution.problem(stage), guess, solution, self.adjoint_solver)
+
+    def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """Δt Σ q f(u) [kg m/s], with the forces that the solution takes."""
+        stages = self.stages(nodes, motion)
+        return nodes.dt * self.solved_by().stage_force(nodes.potential, self.hessian, nodes.force, *stages)
+
+    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
+        if not self.solved_by().linearises:
+            return None
+        return nodes.dt * exact_force(nodes.potential, *self.stages(nodes, motion))
+
+    def mean_displacement(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """Σ q u [m] of the stages."""
+        return reduce(jnp.add, (q * u for q, u in self.stages(nodes, motion)))
+
+    def stability_factor(self) -> Scalar:
+        return 0.0
+
+    def initial_guess(self, nodes: Nodes) -> NodeVector:
+        return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())
+
+    def reporting(self, slot: Scalar) -> "AbstractImplicitIntegrator":
+        return eqx.tree_at(lambda m: m.adjoint_solver, self, Reporting(self.adjoint_solver, slot))
+
+    def unconverged_advice(self) -> tuple[str, ...]:
+        advice = self.preconditioner.advice
+        return () if advice is None else (advice,)
+
+
+class SemiImplicit(AbstractImplicitIntegrator):
+    """The semi-implicit update by one linear solve: (M + βΔt²H) v^{n+1} = M v* (derivation, eq. 17).
+
+    Force and H are those at F^n. With viscosity the system is
+    (M + βΔt D + βΔt²H) v^{n+1} = M v* − (1 − β) Δt D v^n (eq. 29).
+
+    First order in time. A mode of frequency ω is amplified by (1 + βz)^(−½), z = (ωΔt)², as long as z < 4/(1−β)². So
+    the update is stable at every Δt if β ≥ ½, and for z ≤ 4/(1−2β) otherwise. β = 0 is the explicit step, and β = 1 one
+    Newton step of backward Euler. β = ½ is *not* the trapezoidal rule, since positions move with v^{n+1}. Every β > 0
+    damps motion: a standing wave at the explicit limit, by a quarter in one period. The method suits slow, driven and
+    overdamped motion; `ImplicitMidpoint` costs as much and follows motion in time.
+
+    *When it breaks*: at large strains within one step, since the system is linearised once; and where compression makes
+    H indefinite and Δt brings M + βΔt²H near singular. `AnalyticHessian(projected=True)` holds in the latter case.
+
+    *Good values*: for quasi-static pulls, β = 1 with Δt up to some hundred times the explicit limit.
+
+    Args:
+        beta: β, from 0 to 1.
+        solver: linear solver of the update, any symmetric one of lineax.
+        hessian, preconditioner, adjoint_solver, guess: see `AbstractImplicitIntegrator`.
+    """
+
+    beta: Scalar = 1.0
+    solver: lx.AbstractLinearSolver = ConjugateResidual()
+
+    def __check_init__(self):
+        require_fields(self)
+        require_solver("SemiImplicit's solver", self.solver)
+        require_between("SemiImplicit's beta", self.beta, 0, 1)
+
+    def solved_by(self) -> Linearised:
+        return Linearised(self.solver)
+
+    def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+        v0, beta = nodes.admitted_velocity(), self.beta
+        inertial, viscous = nodes.inertial_velocity(), nodes.potential.viscous
+        if viscous:
+            inertial = inertial - (1 - beta) * nodes.dt * nodes.per_mass(nodes.potential.viscous_resistance(v0))
+        v, info = self.solve_stage(nodes, guess, inertial, nodes.dt, theta=beta)
+        return NodeMotion(v, resisted=(1 - beta) * v0 + beta * v if viscous else None), info
+
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
+        """One, at βΔt v^{n+1}."""
+        return ((1, self.beta * nodes.dt * motion.velocity),)
+
+    def force_at(self) -> Scalar:
+        """β."""
+        return self.beta
+
+    def stability_factor(self) -> Scalar:
+        return 1 - 2 * jnp.asarray(self.beta)
+
+    def limit_name(self) -> str:
+        return "limit of SemiImplicit with beta < 1/2"
+
+
+class BackwardEuler(AbstractImplicitIntegrator):
+    """Backward Euler by Newton's method: M (v^{n+1} − v^n) = Δt f(Δt v^{n+1}) + Δt M g (derivation, eq. 2).
+
+    First order in time, and strongly damping. It has no linearisation error, so it holds at large strains in a step,
+    where one linear solve does not.
+
+    *When it breaks*: steps that compress material to a fraction of itself make H indefinite. The incremental potential
+    then has several stationary points, and Newton's method finds one of them, which is not always the one that smaller
+    steps lead to.
+
+    Args:
+        solution: Newton's method, with its linear solver and tolerances.
+        hessian, preconditioner, adjoint_solver, guess: see `AbstractImplicitIntegrator`.
+    """
+
+    solution: Newton = Newton()
+    keeps_admissible: ClassVar[bool] = True
+
+    def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+        v, info = self.solve_stage(nodes, guess, nodes.inertial_velocity(), nodes.dt)
+        return NodeMotion(v, resisted=v if nodes.potential.viscous else None), info
+
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
+        """One, at Δt v^{n+1}."""
+        return ((1, nodes.dt * motion.velocity),)
+
+
+class ImplicitMidpoint(AbstractImplicitIntegrator):
+    """The implicit midpoint rule: M (v^{n+1} − v^n) = Δt f(½Δt v̄) + Δt M g with v̄ = ½(v^n + v^{n+1})
+    (E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration, 2nd ed. 2006, II.1).
+
+    Positions and deformation move with v̄; body forces are taken at the middle of the step. `Linearised()` solves
+    (M + ¼Δt²H) v̄ = M v^n + ½Δt (f + M g), at the cost of `SemiImplicit`; `Newton()` solves the nonlinear equation.
+
+    Second order in time with either, except for one linear solve with a projected Hessian, which solves another
+    equation. Stable at every Δt: a mode of any frequency has |λ| = 1, so that only the transfers dissipate energy. A
+    mode that Δt does not resolve is not damped but slowed down: its period is at least 2Δt.
+
+    *When it breaks*: as `SemiImplicit`. One linear solve fails at large strains in a step, and under compression at
+    twice the Δt at which β = 1 does. The line search of Newton's method keeps the middle of the step admissible, not
+    its end. Unresolved oscillations (from an impact, or a start under load at a large Δt) go on; `TRBDF2` damps them.
+
+    *Good values*: a Δt that resolves the motion of interest, tens of steps a period, whatever the explicit limit.
+
+    Args:
+        solution: `Linearised()` for one linear solve, `Newton()`, or one of your own.
+        hessian, preconditioner, adjoint_solver, guess: see `AbstractImplicitIntegrator`.
+    """
+
+    solution: AbstractSolution = Linearised()
+    body_force_at: ClassVar[float] = 0.5
+
+    def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+        v0, half = nodes.admitted_velocity(), nodes.dt / 2
+        mean, info = self.solve_stage(nodes, guess, v0 + half * nodes.acceleration, half)
+        return NodeMotion(2 * mean - v0, mean, resisted=mean if nodes.potential.viscous else None), info
+
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
+        """One, at ½Δt v̄."""
+        return ((1, nodes.dt / 2 * motion.carrier),)
+
+    def force_at(self) -> Scalar:
+        """½."""
+        return 0.5
+
+
+class TRBDF2(AbstractImplicitIntegrator):
+    """TR-BDF2: a trapezoidal stage from 0 to γΔt, then a stage from 0, γΔt and Δt. For y' = G(y),
+
+        y_γ = y_0 + ½γΔt (G_0 + G_γ),    y_1 = y_0 + Δt (q_0 G_0 + q_1 G_γ + q_2 G_1)
+
+    (derivation, eqs. 25 and 26; R. E. Bank et al., IEEE Trans. CAD 4 (1985) 436, doi 10.1109/TCAD.1985.1270142; with
+    ρ∞: G. Noh, K.-J. Bathe, Comput. Struct. 212 (2019) 299, doi 10.1016/j.compstruc.2018.11.001).
+
+    Second order in time and stable at every Δt. A mode that Δt does not resolve is multiplied by ρ∞ in each step. With
+    ρ∞ = 0, which is TR-BDF2, it vanishes at once (the method is L-stable); with ρ∞ = 1 the method is two trapezoidal
+    steps of Δt/2. The order, ρ∞ and one matrix for both stages, M + (½γΔt)²H, determine γ and q. A step takes two
+    solves, each of them easier than that of `ImplicitMidpoint`: ½γ is 0.29 (ρ∞ = 0) to 0.25.
+
+    It is for motion to be followed in time in which unresolved frequencies would ring, as in contact and stiff starts.
+
+    *When it breaks*: as `ImplicitMidpoint`. Friction acts after both stages, so what it should hold creeps: a block of
+    1e6 Pa, 0.3 m long and pushed by 0.12 g on a floor of μ = 0.15, by 2.4 mm/s in steps of 0.01 s. `SemiImplicit` and
+    `BackwardEuler` hold it.
+
+    Args:
+        rho: ρ∞, from 0 to 1.
+        solution: `Linearised()` for one linear solve a stage, `Newton()`, or one of your own. The second solve starts
+            at the result of the first.
+        hessian, preconditioner, adjoint_solver, guess: see `AbstractImplicitIntegrator`.
+    """
+
+    rho: Scalar = 0.0
+    solution: AbstractSolution = Linearised()
+    body_force_at: ClassVar[float] = 0.5
+
+    def __check_init__(self):
+        require_fields(self)
+        require_between("TRBDF2's rho", self.rho, 0, 1)
+
+    def weights(self) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+        """γ, q_0, q_1, q_2: γ solves (1 − ρ∞)γ² − 4γ + 2 = 0, q_2 = ½γ, q_1 = (½ − q_2)/γ, q_0 = 1 − q_1 − q_2."""
+        gamma = 2 / (2 + jnp.sqrt(2 + 2 * jnp.asarray(self.rho)))
+        q1 = (1 / gamma - 1) / 2
+        return gamma, 1 - q1 - gamma / 2, q1, gamma / 2
+
+    def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
+        _, q0, q1, q2 = self.weights()
+        dt, g, v0 = nodes.dt, nodes.acceleration, nodes.admitted_velocity()
+        length = q2 * dt  # Δt_s = ½γΔt
+        viscous = nodes.potential.viscous
+        pull = nodes.per_mass(nodes.force - nodes.potential.viscous_resistance(v0) if viscous else nodes.force)
+        inertial = v0 + length * (pull + 2 * g)
+        middle, first = self.solve_stage(nodes, guess, inertial, length, length * v0)
+        later_pull = (middle - inertial) / length  # f_γ/m, viscosity's with it, by the stage's own equation
+        inertial = v0 + dt * (q0 * pull + q1 * later_pull + g)
+        v, second = self.solve_stage(nodes, middle, inertial, length, dt * (q0 * v0 + q1 * middle))
+        inner, mean = q2 * (v0 + middle), q0 * v0 + q1 * middle + q2 * v
+        return NodeMotion(v, mean, inner, mean if viscous else None), first.together_with(second)
+
+    def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """Δt (q_0 f_0 + q_1 f_γ + q_2 f_1) [kg m/s]."""
+        return nodes.dt * self.weights()[1] * nodes.force + super().elastic_impulse(nodes, motion)
+
+    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
+        later = super().exact_impulse(nodes, motion)
+        return None if later is None else nodes.dt * self.weights()[1] * nodes.force + later
+
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
+        """The stages at γΔt and Δt."""
+        _, _, q1, q2 = self.weights()
+        inner = motion.carrier if motion.inner is None else motion.inner
+        return (q1, nodes.dt * inner), (q2, nodes.dt * motion.carrier)
+
+    def force_at(self) -> Scalar:
+        """½."""
+        return 0.5
