@@ -173,7 +173,7 @@ def test_particles_at_half_the_place_that_their_law_knows_of_are_told_of(law, d)
     for given, told in ((upright, 0), (known, 0), (half, 1)):
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            warn_of_crowding(scene.grid, scene.laws, given)
+            warn_of_crowding(scene, given)
         assert [
             bool(re.search("At the end particles take up to .* times the space", str(w.message))) for w in said
         ] == [True] * told

@@ -86,7 +86,7 @@ def warn_of_inaccuracy(run: Run) -> None:
     the linearisation error of implicit steps is large, and one where particles take more space than there is."""
     scene, statistics = run.scene, run.statistics
     if not scene.total:
-        warn_of_crowding(scene.grid, scene.laws, run.final)
+        warn_of_crowding(scene, run.final)
     if int(statistics.nearly_converged) > 0:
         warn(
             f"The solve of {int(statistics.nearly_converged)} of {int(statistics.steps)} steps missed its tolerance by "

@@ -3,6 +3,7 @@
 from mpmjax.state._attachment import (
     AbstractPlace as AbstractPlace,
     AttachedPoints as AttachedPoints,
+    LoadedPoints as LoadedPoints,
     Patch as Patch,
     PointsAt as PointsAt,
 )
@@ -11,14 +12,7 @@ from mpmjax.state._averaged_volume import (
     AveragedVolume as AveragedVolume,
     VolumeAverage as VolumeAverage,
 )
-from mpmjax.state._bodies import Bodies as Bodies
-from mpmjax.state._description import (
-    AbstractDescription as AbstractDescription,
-    TotalLagrangian as TotalLagrangian,
-    UpdatedLagrangian as UpdatedLagrangian,
-)
 from mpmjax.state._fill import fill as fill, fill_mapped as fill_mapped
-from mpmjax.state._loaded_points import LoadedPoints as LoadedPoints
 from mpmjax.state._loads import (
     AbstractBodyForce as AbstractBodyForce,
     AbstractLoad as AbstractLoad,
@@ -32,7 +26,6 @@ from mpmjax.state._loads import (
     terms_of as terms_of,
 )
 from mpmjax.state._material_points import MaterialPoints as MaterialPoints
-from mpmjax.state._oversights import warn_of_crowding as warn_of_crowding, warn_of_rounding as warn_of_rounding
 from mpmjax.state._particles import (
     Particles as Particles,
     State as State,
@@ -42,6 +35,19 @@ from mpmjax.state._particles import (
     state_of as state_of,
     with_state as with_state,
 )
-from mpmjax.state._preparation import is_foreign as is_foreign, is_prepared as is_prepared, prepare as prepare
-from mpmjax.state._scene import RigidMaterial as RigidMaterial, Scene as Scene, attach as attach
-from mpmjax.state._velocity_gradient import velocity_gradient as velocity_gradient
+from mpmjax.state._preparation import (
+    attach as attach,
+    is_foreign as is_foreign,
+    is_prepared as is_prepared,
+    prepare as prepare,
+    velocity_gradient as velocity_gradient,
+)
+from mpmjax.state._scene import (
+    AbstractDescription as AbstractDescription,
+    Bodies as Bodies,
+    RigidMaterial as RigidMaterial,
+    Scene as Scene,
+    TotalLagrangian as TotalLagrangian,
+    UpdatedLagrangian as UpdatedLagrangian,
+)
+from mpmjax.state._setup_warnings import warn_of_crowding as warn_of_crowding, warn_of_rounding as warn_of_rounding

@@ -1,16 +1,20 @@
-"""Points of a body's surface or inside of it, attached to its particles, with which they move."""
+"""Points of a body's surface or inside of it, attached to its particles, with which they move; and those points in a
+step: how the nodes move them, and how forces on them reach the nodes."""
 
 import abc
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 
-from mpmjax._types import Array, Float, Scalar
+from mpmjax import linalg as la
+from mpmjax._types import Array, Float, Int, Matrix, NodeVector, ParticleMatrix, Scalar, components
 from mpmjax.checks import is_traced, require, require_fields, require_positive, require_that, warn
+from mpmjax.discretisation import Stencil, gather, scatter
 from mpmjax.geometry import AbstractRegion, Pieces, surface_pieces
+from mpmjax.material import AbstractLaw
+from mpmjax.potential import Displacement
 from mpmjax.state._particles import Particles
 
 Rows = Float[Array, "s d"] | Float[np.ndarray, "s d"] | tuple | list
@@ -73,7 +77,6 @@ class AttachedPoints(AbstractPlace):
         return jnp.shape(jnp.asarray(self.offset))[1]
 
     def attached(self, particles: Particles) -> "AttachedPoints":
-        """The points as they are, attached already."""
         del particles
         return self
 
@@ -81,8 +84,8 @@ class AttachedPoints(AbstractPlace):
 class Patch(AbstractPlace):
     """The surface of a region, or the part of it in another region.
 
-    It is made of flat pieces (see `surface_pieces`), of second order in the spacing, and exact of boxes. Pieces that
-    are attached to one particle and look along the same axis count as one, at their common centroid.
+    It is made of flat pieces (see `surface_pieces`), of second order in the spacing, and exact of boxes. Pieces on one
+    particle that look along the same axis count as one, at their common centroid.
 
     Args:
         region: the body, or any region whose surface is that of the body where it counts.
@@ -111,7 +114,7 @@ class Patch(AbstractPlace):
         return self.region.dim
 
     def attached(self, particles: Particles) -> AttachedPoints:
-        x, apart = _known(particles, self)
+        x, apart = _positions(particles, self)
         spacing = apart if self.spacing is None else float(self.spacing)
         margin = _FAR * apart
         surface = surface_pieces(self.region, spacing, x.min(axis=0) - margin, x.max(axis=0) + margin, self.within)
@@ -187,13 +190,13 @@ class PointsAt(AbstractPlace):
         return jnp.shape(jnp.asarray(self.positions))[1]
 
     def attached(self, particles: Particles) -> AttachedPoints:
-        x, apart = _known(particles, self)
+        x, apart = _positions(particles, self)
         places = np.asarray(self.positions, float)
         weight = np.full(len(places), 1 / len(places)) if self.weights is None else np.asarray(self.weights, float)
         return _attached(particles, _nearest(x, places, apart, self), places, weight, None)
 
 
-def _known(particles: Particles, place: AbstractPlace) -> tuple[np.ndarray, float]:
+def _positions(particles: Particles, place: AbstractPlace) -> tuple[np.ndarray, float]:
     """The particles' positions, and the distance between them [m]."""
     require(
         not is_traced((particles.x, particles.volume, particles.deformations, place)),
@@ -226,25 +229,126 @@ def _attached(
         particles.count < 2 ** (jnp.finfo(dtype).nmant + 1),
         f"{dtype} counts particles exactly only below {2 ** (jnp.finfo(dtype).nmant + 1)}: use float64.",
     )
-    offset, F = places - np.asarray(particles.x, float)[particle], _deformation(particles)
-    if F is not None:
-        F = F[particle]
+    offset = places - np.asarray(particles.x, float)[particle]
+    kept = [np.asarray(F, float) for F in particles.deformations if F is not None and F.ndim == 3]
+    if len(kept) == len(particles.deformations):
+        F = np.concatenate(kept)[particle]
         offset = np.linalg.solve(F, offset[:, :, None])[:, :, 0]
-        turned = None if area is None else (np.swapaxes(F, 1, 2) @ area[:, :, None])[:, :, 0]
-        area = None if turned is None else turned / np.linalg.det(F)[:, None]
-        weight = weight if area is None else np.sqrt((area**2).sum(axis=1))
+        if area is not None:
+            turned: np.ndarray = (np.swapaxes(F, 1, 2) @ area[:, :, None])[:, :, 0] / np.linalg.det(F)[:, None]
+            area, weight = turned, np.sqrt((turned**2).sum(axis=1))
+    of_points = (jnp.asarray(a, dtype) for a in (particle, offset, weight, places))
+    return AttachedPoints(*of_points, area=None if area is None else jnp.asarray(area, dtype))
 
-    def cast(a: np.ndarray) -> Any:
-        return jnp.asarray(a, dtype)
 
-    return AttachedPoints(
-        cast(particle), cast(offset), cast(weight), cast(places), None if area is None else cast(area)
+class LoadedPoints(eqx.Module):
+    """s points that move with particles: u_s = Σ_i N_is u_i with N_is = w_ip + g_ip·r_s, the particle's own motion at
+    the arm r_s. So a force reaches no node that its particle does not reach, its sum is right and so is its moment."""
+
+    x: Float[Array, "d s"]
+    """Where they are [m]."""
+    v: Float[Array, "d s"]
+    """Their velocity, v_p + C_p r_s, without a C v_p [m/s]."""
+    deformation: Matrix | None
+    """F of their particles [-], shape (d, d, s); None where a law does not keep it."""
+    rate: Matrix | None
+    """Rate of F [1/s], shape (d, d, s); None without a velocity gradient."""
+    place: Float[Array, "d s"]
+    """Where they were when they were attached [m]."""
+    weight: Float[Array, "s"]
+    """Their undeformed areas [m^(d−1)], or shares [-]."""
+    area: Float[Array, "d s"] | None
+    """Outward normal times area of the undeformed surface [m^(d−1)]; None of points."""
+    arm: Float[Array, "d s"]
+    """r_s [m]: F_p R_s, in the total description R_s."""
+    stencil: Stencil
+    """Nodes, weights and derivatives of the particle that each point is attached to."""
+    particle: Int[Array, "s"]
+    """The number of that particle, shape (s,)."""
+
+    def after(self, time: Scalar) -> "LoadedPoints":
+        """The points moved on by a time [s] with their velocity, and turned with its gradient."""
+        F = self.deformation
+        if F is not None and self.rate is not None:
+            F = F + time * self.rate
+        return eqx.tree_at(
+            lambda p: (p.x, p.deformation), self, (self.x + time * self.v, F), is_leaf=lambda leaf: leaf is None
+        )
+
+    def displacement(self, moved: Displacement) -> Float[Array, "d s"]:
+        """Σ_i N_is u_i, of a displacement or velocity of the nodes."""
+        if moved.at_rest:
+            return jnp.zeros_like(self.x)
+        value, slopes = gather(self.stencil, moved.nodes)
+        return value + sum(r * slope for r, slope in zip(self.arm, slopes, strict=True))
+
+    def nodal(self, force: Float[Array, "d s"], size: int) -> NodeVector:
+        """Σ_s N_is f_s, the transpose of `displacement`, shape (n, d)."""
+        return scatter(self.stencil, force, self.arm[:, None] * force, size)
+
+    def diagonal(self, coefficient: Float[Array, "d s"], size: int) -> NodeVector:
+        """Σ_s (w_ip² + Σ_b g_ip,b² r_sb²) k_s [N/m], shape (n, d): a non-negative approximation of the diagonal of
+        Σ_s N_is k_s N_js, exact where the arms are zero."""
+        return scatter(self.stencil.squared, coefficient, self.arm[:, None] ** 2 * coefficient, size)
+
+    def at_particles(
+        self, rates: Float[Array, "s"], mass: Float[Array, "p"], steepness: Float[Array, "p"]
+    ) -> Float[Array, "p"]:
+        """Σ_s k_s (1 + A_p r_s²)/m_p of each particle, shape (p,), from k_s of each point: a bound of Σ_i N_is² k_s/m_i
+        for a particle alone on the grid."""
+        reach = 1 + (self.arm**2).sum(axis=0) * steepness[self.particle]
+        return jnp.zeros_like(mass).at[self.particle].add(rates * reach) / mass
+
+
+def loaded_points(
+    on: AttachedPoints, laws: tuple[AbstractLaw, ...], particles: Particles, stencil: Stencil, *, total: bool
+) -> LoadedPoints:
+    """The points of prepared particles at the start of a step.
+
+    Args:
+        on: the points.
+        laws: the laws of the particles' materials.
+        particles: prepared particles.
+        stencil: their stencil.
+        total: whether the description is total Lagrangian.
+    """
+    dtype = particles.x.dtype
+    rows = jnp.asarray(on.particle, dtype).astype(jnp.int32)
+    offset = jnp.asarray(on.offset, dtype).T
+    F = _deformation(laws, particles)
+    F = None if F is None else components(F[rows])
+    arm = offset if F is None else la.matmul(F, offset[:, None])[:, 0]
+    r = offset if total else arm
+    v, rate = components(particles.v[rows]), None
+    if particles.C is not None:
+        C = components(particles.C[rows])
+        v = v + la.matmul(C, r[:, None])[:, 0]
+        rate = None if F is None else C if total else la.matmul(C, F)
+    return LoadedPoints(
+        x=components(particles.x[rows]) + arm,
+        v=v,
+        deformation=F,
+        rate=rate,
+        place=jnp.asarray(on.place, dtype).T,
+        weight=jnp.asarray(on.weight, dtype),
+        area=None if on.area is None else jnp.asarray(on.area, dtype).T,
+        arm=r,
+        stencil=stencil.of(rows),
+        particle=rows,
     )
 
 
-def _deformation(particles: Particles) -> np.ndarray | None:
-    """F of all particles, shape (p, d, d); None of particles that have none, or not all of it."""
-    stored = particles.deformations
-    if any(F is None or F.ndim != 3 for F in stored):
+def keeps_deformation(law: AbstractLaw) -> bool:
+    """Whether particles of a law keep the whole deformation gradient."""
+    return law.allows_total and law.kinematics.undeformed(2).ndim == 2
+
+
+def _deformation(laws: tuple[AbstractLaw, ...], particles: Particles) -> ParticleMatrix | None:
+    """F of all particles, shape (p, d, d), the identity of those whose law does not keep it; None if none does."""
+    if not any(keeps_deformation(law) for law in laws):
         return None
-    return np.concatenate([np.asarray(F, float) for F in stored])
+    still, parts = jnp.eye(particles.dim, dtype=particles.x.dtype), []
+    for law, stored, count in zip(laws, particles.deformations, particles.sizes, strict=True):
+        whole = keeps_deformation(law) and stored is not None
+        parts.append(jnp.asarray(stored) if whole else jnp.broadcast_to(still, (count, *still.shape)))
+    return jnp.concatenate(parts)

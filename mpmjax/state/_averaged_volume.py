@@ -1,6 +1,7 @@
 """Averaged volumes: the volume ratio of a particle is that of its surroundings."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -10,7 +11,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix
 from mpmjax.checks import as_plain, require, require_fields
 from mpmjax.discretisation import BSpline, Grid, SplineGradient, Stencil, gather, make_stencil, scatter
-from mpmjax.material import AbstractMaterial
+from mpmjax.material import AbstractElastic, AbstractLaw
 from mpmjax.potential import AbstractStiffness, Displacement, Forces, Mirror
 
 
@@ -52,6 +53,25 @@ class AveragedVolume(eqx.Module):
         """Whether it averages the material of a number."""
         return self.materials is None or number in self.materials
 
+    def check(self, laws: tuple[AbstractLaw, ...]) -> None:
+        """Check that it can stand in a scene with these laws.
+
+        Raises:
+            ValueError: it cannot.
+        """
+        require(
+            all(number < len(laws) for number in self.materials or ()),
+            f"AveragedVolume's materials must be numbers below {len(laws)}, of the scene's laws, got {self.materials}.",
+        )
+        covered = (law for number, law in enumerate(laws) if self.covers(number))
+        refused = [law.title() for law in covered if not law.allows_averaged_volume]
+        require(
+            not refused,
+            "AveragedVolume is for elastic laws of F: what yields returns to a volume of its own, and a fluid has "
+            "nothing else that resists. Name the other materials, AveragedVolume(materials=(0,)), without "
+            f"{', '.join(refused)}.",
+        )
+
 
 class VolumeAverage(eqx.Module):
     """The average of a field over the particles of one material, J̄ = S V0 J, with the symmetric matrix
@@ -80,15 +100,11 @@ class VolumeAverage(eqx.Module):
 
     def at_nodes(self, amounts: Array) -> Float[Array, "n"]:
         """Σ_p N_i(x_p) a_p, with those of mirror images, shape (n,)."""
-        return _at_nodes(self.hats, self.mirror, amounts, self.inverse.shape[0])
+        return self.mirror.fold_scalar(scatter(self.hats, amounts[None], None, len(self.inverse))[:, 0])
 
     def at_particles(self, nodes: Float[Array, "n"]) -> Array:
         """Σ_i N_i(x_p) θ_i, shape (q,)."""
         return gather(self.hats, self.mirror.unfold_scalar(nodes)[:, None])[0][0]
-
-
-def _at_nodes(hats: Stencil, mirror: Mirror, amounts: Array, size: int) -> Float[Array, "n"]:
-    return mirror.fold_scalar(scatter(hats, amounts[None], None, size)[:, 0])
 
 
 def volume_average(grid: Grid, window: Any, x: Array, volume: Array, mirror: Mirror) -> VolumeAverage:
@@ -102,11 +118,9 @@ def volume_average(grid: Grid, window: Any, x: Array, volume: Array, mirror: Mir
         mirror: the mirror images of symmetry planes.
     """
     hats = make_stencil(BSpline(1), SplineGradient(), grid, window, x, affine=False)
-    total = _at_nodes(hats, mirror, volume, grid.size)
-    some = total > 0
-    return VolumeAverage(
-        hats, volume, jnp.where(some, 1 / jnp.where(some, total, 1), 0), mirror, grid.shape, grid.periodic
-    )
+    average = VolumeAverage(hats, volume, jnp.zeros(grid.size, volume.dtype), mirror, grid.shape, grid.periodic)
+    total = average.at_nodes(volume)
+    return replace(average, inverse=jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0))
 
 
 class AveragedDeformation(eqx.Module):

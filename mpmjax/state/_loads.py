@@ -1,6 +1,7 @@
 """Loads on a body's surface and at points of it, and springs and dashpots to the ground."""
 
 import abc
+from dataclasses import replace
 from typing import ClassVar
 
 import equinox as eqx
@@ -22,9 +23,8 @@ from mpmjax.geometry import (
     vector_size,
 )
 from mpmjax.material import AbstractLaw
-from mpmjax.potential import AbstractTerm
-from mpmjax.state._attachment import AbstractPlace, AttachedPoints
-from mpmjax.state._loaded_points import LoadedPoints, Support, loaded_points
+from mpmjax.potential import AbstractSpring, AbstractTerm, Displacement, Forces
+from mpmjax.state._attachment import AbstractPlace, AttachedPoints, LoadedPoints, loaded_points
 from mpmjax.state._particles import Particles
 
 
@@ -67,15 +67,16 @@ class AbstractLoad(eqx.Module):
         return False
 
 
-def _check_vector(name: str, value: ChangingVector, dim: int) -> None:
+def _check_dead_load(name: str, load: AbstractLoad, value: ChangingVector, dim: int) -> None:
+    """Check a load of `value` a weight, a vector that keeps its direction."""
+    AbstractLoad.check(load, dim)
     size = vector_size(value)
     require(size == dim, f"{name} must have {dim} components, as the grid has directions, got {size or 'a number'}.")
 
 
 class Traction(AbstractLoad):
-    """A dead traction on a surface: a force per undeformed area that keeps its direction.
-
-    Linear, and so exact inside an implicit solve.
+    """A dead traction on a surface: a force per undeformed area that keeps its direction. Linear, and so exact inside
+    an implicit solve.
 
     Args:
         on: the surface, a `Patch`.
@@ -90,20 +91,19 @@ class Traction(AbstractLoad):
         require_some("Traction's traction [N/m²]", self.traction)
 
     def check(self, dim: int) -> None:
-        AbstractLoad.check(self, dim)
-        _check_vector("Traction's traction", self.traction, dim)
+        _check_dead_load("Traction's traction", self, self.traction, dim)
 
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
-        """A t."""
         del dt
         return points.weight * value_at(self.traction, t)[:, None]
 
 
 class PointLoad(AbstractLoad):
-    """A force at a point, or shared by several, as by those of a line. It keeps its direction.
+    """A force at a point, or shared by several, as by those of a line. It keeps its direction. Linear, and so exact
+    inside an implicit solve.
 
-    Linear, and so exact inside an implicit solve. What is stressed by a force at a point has an infinite stress there,
-    so that its displacement grows as the grid is refined.
+    *When it breaks*: the stress at a force on a point is infinite, so that the displacement there grows as the grid is
+    refined.
 
     Args:
         on: the points, `PointsAt`.
@@ -118,11 +118,9 @@ class PointLoad(AbstractLoad):
         require_some("PointLoad's total [N]", self.total)
 
     def check(self, dim: int) -> None:
-        AbstractLoad.check(self, dim)
-        _check_vector("PointLoad's total", self.total, dim)
+        _check_dead_load("PointLoad's total", self, self.total, dim)
 
     def force(self, points: LoadedPoints, t: Scalar, dt: Scalar) -> Float[Array, "d s"]:
-        """The share of each point."""
         del dt
         return points.weight * value_at(self.total, t)[:, None]
 
@@ -165,6 +163,51 @@ class Pressure(AbstractLoad):
         if self.following and F is not None:
             area = la.matmul(la.cofactor(F), area[:, None])[:, 0]
         return -value_at(self.pressure, t) * area
+
+
+class Support(AbstractSpring):
+    """Springs ½ k_s (e_s + N_s u)² between points and the ground, and dashpots of resistance Σ_s N_sᵀ c_s N_s v."""
+
+    points: LoadedPoints
+    stiffness: Float[Array, "d s"]
+    """k_s in each direction [N/m]."""
+    stretch: Float[Array, "d s"]
+    """e_s [m], at the start of the step."""
+    damping: Float[Array, "d s"] | None
+    """c_s [N s/m]; None without dashpots."""
+
+    def elongation(self, moved: Displacement) -> Float[Array, "d s"]:
+        return self.points.displacement(moved)
+
+    def spread(self, amount: Float[Array, "d s"], size: int) -> Forces:
+        return Forces(nodes=self.points.nodal(amount, size))
+
+    def spread_square(self, amount: Float[Array, "d s"], size: int) -> Forces:
+        return Forces(nodes=self.points.diagonal(amount, size))
+
+    @property
+    def viscous(self) -> bool:
+        return self.damping is not None
+
+    def resistance(self, velocity: Displacement) -> Forces | None:
+        return None if self.damping is None else self.spread(self.damping * self.elongation(velocity), velocity.size)
+
+    def drag(self, size: int) -> tuple[Forces, Float[Array, ""]] | None:
+        """At the points' velocity."""
+        if self.damping is None:
+            return None
+        return self.spread(-self.damping * self.points.v, size), (self.damping * self.points.v**2).sum()
+
+    def damped(self, rate: Scalar) -> "Support":
+        """Springs of k + r c."""
+        return self if self.damping is None else replace(self, stiffness=self.stiffness + rate * self.damping)
+
+    def stability_rates(self, mass: Float[Array, "p"], steepness: Array) -> tuple[Array, Array | float]:
+        """Twice what a particle alone feels, which covers transfers that forget the affine velocity."""
+        z = self.points.at_particles(2 * self.stiffness.max(axis=0), mass, steepness)
+        if self.damping is None:
+            return z, 0.0
+        return z, self.points.at_particles(4 * self.damping.max(axis=0), mass, steepness)
 
 
 class Spring(AbstractLoad):
@@ -233,11 +276,8 @@ def points_of(
     total: bool,
 ) -> tuple[LoadedPoints, ...]:
     """The points of each load at the start of a step."""
-    points = []
-    for load in loads:
-        assert isinstance(load.on, AttachedPoints)  # `prepare` says so
-        points.append(loaded_points(load.on, laws, particles, stencil, total=total))
-    return tuple(points)
+    places = [load.on for load in loads if isinstance(load.on, AttachedPoints)]  # `prepare` refuses others
+    return tuple(loaded_points(on, laws, particles, stencil, total=total) for on in places)
 
 
 def load_force(

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpmjax._types import Array, Bool, components
+from mpmjax import linalg as la
+from mpmjax._types import Array, Bool, ParticleMatrix, components, particle_first
 from mpmjax.checks import (
     canonical,
     checked,
@@ -20,17 +21,37 @@ from mpmjax.checks import (
     require_placement,
     requirements,
 )
-from mpmjax.discretisation import (
-    in_window,
-)
+from mpmjax.discretisation import APIC, average, gather, in_window
 from mpmjax.material import AbstractLaw
-from mpmjax.state._attachment import AttachedPoints
-from mpmjax.state._loaded_points import keeps_deformation
+from mpmjax.state._attachment import AttachedPoints, keeps_deformation
 from mpmjax.state._material_points import MaterialPoints
-from mpmjax.state._oversights import warn_of_oversights
 from mpmjax.state._particles import Group, Particles, moves_as_one, of_one_material
 from mpmjax.state._scene import Scene
-from mpmjax.state._velocity_gradient import velocity_gradient
+from mpmjax.state._setup_warnings import warn_of_setup
+
+_FLAT_POWER = 0.6
+"""Power of the rounding ε: neighbours whose spread in a direction is ε^0.6 of a whole stencil's say nothing of it."""
+_ROUNDING = 1e3
+"""Changes of velocity over a spacing below so many roundings are set to zero."""
+
+
+@checked
+def attach(scene: Scene, particles: Particles) -> Scene:
+    """The scene with its loads attached to the particles as they are: each `Patch` of a surface and all `PointsAt`
+    become points that move with the nearest particle.
+
+    Args:
+        scene: the scene.
+        particles: its particles at the start.
+
+    Raises:
+        ValueError: a place with no surface, or with a point off the body; particles inside a jax transformation.
+    """
+    if not scene.loads:
+        return scene
+    with jax.ensure_compile_time_eval():  # what is known stays so within a transformation
+        loads = tuple(eqx.tree_at(lambda load: load.on, load, load.on.attached(particles)) for load in scene.loads)
+    return eqx.tree_at(lambda s: s.loads, scene, loads)
 
 
 @checked
@@ -55,43 +76,47 @@ def prepare(scene: Scene, particles: Particles) -> Particles:
     p, d = particles.count, particles.dim
     require(d == scene.grid.dim, f"The particles are {d}-dimensional, the grid {scene.grid.dim}-dimensional.")
     requirements((scene, particles))
-    still = jnp.zeros((p, d, d), particles.x.dtype)
-    sizes = particles.sizes if len(scene.laws) > 1 else (p,)
+    several = len(scene.laws) > 1
     require(
-        len(sizes) == len(scene.laws),
+        not several or len(particles.sizes) == len(scene.laws),
         f"The scene has {len(scene.laws)} laws, so the particles must be {len(scene.laws)} sets joined by mpmjax.join, "
-        f"in the laws' order, got {len(sizes)}.",
+        f"in the laws' order, got {len(particles.sizes)}.",
     )
     _check_loads(scene, particles)
     first = not jax.tree.leaves(particles.deformations)
-    if len(sizes) == 1:
-        particles = replace(
-            particles,
-            counts=None,
-            deformations=(of_one_material(particles.deformations),),
-            histories=(of_one_material(particles.histories),),
-        )
+    if not several:
+        fields = ("deformations", "histories")
+        particles = replace(particles, counts=None, **{f: (of_one_material(getattr(particles, f)),) for f in fields})
     require(
         not scene.total or particles.X is not None or first,
         "In the total description particles with an F need the X from which it is measured: give X, or drop F.",
     )
     materials = [_prepared(law, group, particles) for law, group in zip(scene.laws, particles.groups, strict=True)]
+    C = jnp.zeros((p, d, d), particles.x.dtype) if particles.C is None else particles.C
     prepared = replace(
         particles,
         deformations=tuple(deformation for deformation, _ in materials),
         histories=tuple(history for _, history in materials),
-        C=(still if particles.C is None else particles.C) if scene.keeps_gradient else None,
+        C=C if scene.keeps_gradient else None,
         X=(particles.x if particles.X is None else particles.X) if scene.total else None,
     )
-    _check_size(scene, prepared)
+    # the arrays of a step: mass, momentum, velocity and force of the nodes; the state before and after it; the stencil
+    n, state = scene.grid.size, sum(leaf.size for leaf in jax.tree.leaves(prepared))
+    numbers = n * (1 + 3 * d) + 2 * state + p * 3 * d * (scene.kernel.order + 1)
+    require_memory(
+        f"A step of {p} particles on a grid of {n} nodes",
+        numbers * particles.x.dtype.itemsize,
+        f"take a smaller shape than {scene.grid.shape}, or fewer particles_per_cell.",
+        device=True,
+    )
+    typed = canonical(scene, particles.x.dtype)
     if not is_traced((scene, prepared)):
-        typed = canonical(scene, particles.x.dtype)
         _check_placement(typed, prepared)
         if first:
-            warn_of_oversights(typed.grid, typed.kernel, typed.boundary, prepared, total=scene.total)
+            warn_of_setup(typed, prepared)
     if not scene.keeps_gradient or particles.C is not None or moves_as_one(particles):
         return prepared
-    return replace(prepared, C=velocity_gradient(canonical(scene, particles.x.dtype), prepared))
+    return replace(prepared, C=velocity_gradient(typed, prepared))
 
 
 def _check_loads(scene: Scene, particles: Particles) -> None:
@@ -120,24 +145,11 @@ def _check_loads(scene: Scene, particles: Particles) -> None:
             )
 
 
-def _check_size(scene: Scene, particles: Particles) -> None:
-    """Check that the arrays of a step fit into memory: mass, momentum, velocity and force of the nodes; the state
-    before and after the step and the stencil of the particles."""
-    n, p, d, bytes_each = scene.grid.size, particles.count, particles.dim, particles.x.dtype.itemsize
-    state = sum(leaf.size for leaf in jax.tree.leaves(particles))
-    stencil = p * 3 * d * (scene.kernel.order + 1)
-    require_memory(
-        f"A step of {p} particles on a grid of {n} nodes",
-        (n * (1 + 3 * d) + 2 * state + stencil) * bytes_each,
-        f"take a smaller shape than {scene.grid.shape}, or fewer particles_per_cell.",
-        device=True,
-    )
-
-
 def _prepared(law: AbstractLaw, group: Group, particles: Particles) -> tuple[Array, Any]:
     """Deformation and history of one material's particles."""
     start, stop = group.rows
-    shapes, fitting = {jnp.shape(number) for number in _parameters(law)}, {(), (1,), (stop - start,)}
+    leaves = jax.tree.leaves(law, is_leaf=is_foreign)  # the numbers of networks and the like are their own
+    shapes, fitting = {jnp.shape(a) for a in leaves if eqx.is_array_like(a)}, {(), (1,), (stop - start,)}
     require(
         shapes <= fitting,
         f"{law.title()}'s parameters must be one number or one for each of its {stop - start} particles, got shapes "
@@ -161,31 +173,23 @@ def _prepared(law: AbstractLaw, group: Group, particles: Particles) -> tuple[Arr
 
 def is_prepared(scene: Scene, particles: Particles) -> bool:
     """Whether the particles have exactly what the scene needs."""
-    has_affine, has_reference = particles.C is not None, particles.X is not None
-    if has_affine != scene.keeps_gradient or has_reference != scene.total:
-        return False
-    if len(scene.laws) != len(particles.sizes):
-        return False
-    return all(_fits(law, group, particles.dim) for law, group in zip(scene.laws, particles.groups, strict=True))
 
+    def fits(law: AbstractLaw, group: Group) -> bool:
+        shape = law.kinematics.undeformed(particles.dim).shape
+        stored = group.stored
+        return stored is not None and stored.shape[1:] == shape and law.remembers(group.history, stored)
 
-def _fits(law: AbstractLaw, group: Group, dim: int) -> bool:
-    """Whether deformation and history of one material's particles are of the shapes that the law needs."""
-    if group.stored is None or group.stored.shape[1:] != law.measure.undeformed(dim).shape:
-        return False
-    return law.remembers(group.history, group.stored)
+    return (
+        (particles.C is not None) == scene.keeps_gradient
+        and (particles.X is not None) == scene.total
+        and len(scene.laws) == len(particles.sizes)
+        and all(fits(law, group) for law, group in zip(scene.laws, particles.groups, strict=True))
+    )
 
 
 def is_foreign(node: Any) -> bool:
     """Whether a part of a law is a module of another kind, such as a network, whose numbers are its own."""
     return isinstance(node, eqx.Module) and not isinstance(node, AbstractLaw)
-
-
-def _parameters(law: AbstractLaw) -> list[Any]:
-    """The numbers of a law and of the laws that it is made of; those of other modules within it, such as networks, are
-    their own."""
-    leaves = jax.tree.leaves(law, is_leaf=is_foreign)
-    return [leaf for leaf in leaves if eqx.is_array_like(leaf)]
 
 
 @eqx.filter_jit
@@ -234,3 +238,42 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
             f"{type(points.law).__name__} does not allow the {kept.symbol} of particle {first} (most laws need "
             f"{kept.volume} > 0): start from an admissible one.",
         )
+
+
+@eqx.filter_jit
+def velocity_gradient(scene: Scene, particles: Particles) -> ParticleMatrix:
+    """The velocity gradient C [1/s] of prepared particles by the velocities of their neighbours, shape (p, d, d).
+
+    It is the slope of the linear field that fits, by least squares, the mean velocities v̄_i that the nodes of a
+    particle's stencil have at the middle x̄_i of their mass,
+
+        C = Q M⁻¹,    Q = Σ_i w_ip v̄_i (x̄_i − ȳ)ᵀ,    M = Σ_i w_ip (x̄_i − ȳ)(x̄_i − ȳ)ᵀ,    ȳ = Σ_i w_ip x̄_i,
+
+    so that it is that of a linear field at free surfaces too, and linear in the velocities. In directions in which the
+    neighbours do not spread, it is zero.
+    """
+    affine = eqx.tree_at(lambda s: s.transfer, scene, APIC())  # for the gradient of moving least squares
+    stencil, size = affine.stencil(particles).least_squares, scene.grid.size
+    v = components(particles.v)
+    d, D, at_rest = len(v), stencil.moment, jnp.zeros_like(v)
+    axes = la.identity_like(jnp.zeros((d, *v.shape), v.dtype))
+
+    # at the nodes v̄_i less the velocity of one particle, and s_i = x̄_i − x_i, where w_ip (x_i − x_p) = D g_ip
+    mass = particles.mass
+    rows, slopes = jnp.concatenate([v - v[:, :1], at_rest]), jnp.concatenate([jnp.zeros_like(axes), -D * axes])
+    least = jnp.finfo(v.dtype).eps * mass.min()
+    _, nodes = average(stencil, mass, mass * rows, jnp.swapaxes(mass * slopes, 0, 1), least, size)
+    products = nodes[:, :, None] * nodes[:, None, d:]
+    value, gradient = gather(stencil, jnp.concatenate([nodes, products.reshape(size, -1)], axis=1))
+
+    # Σ_i w a_i (x̄_i − x_p)ᵀ of a = v̄ and s, where Σ_i w a_i (x_i − x_p)ᵀ = ∇a D
+    mean, shift = value[: 2 * d], value[d : 2 * d]
+    along = jnp.swapaxes(gradient[:, : 2 * d], 0, 1) * D
+    moments = along + value[2 * d :].reshape(2 * d, d, -1) - mean[:, None] * shift
+    Q, M = moments[:d], moments[d:] + la.transpose(along[d:]) + D * axes
+    M = M / scene.grid.spacing**2
+    square = la.matmul(M, M) + (jnp.finfo(v.dtype).eps ** _FLAT_POWER / 4) ** 2 * axes
+    inverse = la.matmul(M, la.cofactor(square)) / la.determinant(square)  # M⁻¹, and zero where M is
+    C = la.matmul(Q, inverse) / scene.grid.spacing**2
+    small = jnp.abs(C) * scene.grid.spacing <= _ROUNDING * jnp.finfo(v.dtype).eps * jnp.abs(v).max()
+    return particle_first(C - jax.lax.stop_gradient(jnp.where(small, C, 0)))

@@ -1,20 +1,22 @@
-"""The scene: everything that a step needs and does not change."""
+"""The scene: everything that a step needs and does not change, with its description and its bodies."""
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Int, NodeVector, Point, Scalar, particle_first
 from mpmjax.boundary import AbstractBoundary, mirror, refuse_contact
 from mpmjax.checks import (
+    as_plain,
     checked,
     coordinates,
     is_traced,
     require,
+    require_between,
+    require_fields,
     require_finite,
 )
 from mpmjax.discretisation import (
@@ -32,12 +34,84 @@ from mpmjax.discretisation import (
 from mpmjax.geometry import Motion
 from mpmjax.material import AbstractLaw, Freedom
 from mpmjax.potential import MirrorPlace, carried_by
-from mpmjax.state._averaged_volume import AveragedVolume, volume_average
-from mpmjax.state._bodies import Bodies
-from mpmjax.state._description import AbstractDescription, UpdatedLagrangian
+from mpmjax.state._averaged_volume import AveragedVolume, VolumeAverage, volume_average
 from mpmjax.state._loads import AbstractBodyForce, AbstractLoad
 from mpmjax.state._material_points import MaterialPoints
 from mpmjax.state._particles import Particles, State, with_state
+
+
+class AbstractDescription(eqx.Module):
+    """Where stencils stand and with respect to what gradients are taken: one of the two below."""
+
+    total: ClassVar[bool]
+    """Whether gradients are with respect to the reference positions X, and stencils are computed once."""
+
+
+class UpdatedLagrangian(AbstractDescription):
+    """Stencils at the current positions, h_ip = F_pᵀ ∇_x w_ip: for anything that moves, meets or separates."""
+
+    total: ClassVar[bool] = False
+
+
+class TotalLagrangian(AbstractDescription):
+    """Stencils at the reference positions, h_ip = ∇_X w_ip, computed once.
+
+    For a body that neither separates nor meets anything but what it was attached to from the start: no cell crossing,
+    no numerical fracture, second order at every amplitude. Boundaries act at reference nodes.
+    """
+
+    total: ClassVar[bool] = True
+
+
+class Bodies(eqx.Module):
+    """Which materials are bodies of their own, that may touch, slide on each other and part.
+
+        particles = mpm.join(block, slab)
+        scene = mpm.Scene(grid, (rubber, steel), bodies=mpm.Bodies(friction=0.3))
+
+    Each body has a layer of nodes of its own, and moves as if it were alone but for push and friction (see
+    `BodyContact`). Without it all materials of a scene share the nodes and stick to each other. Bodies of one law are
+    several materials with this law.
+
+    *When it breaks*: not in the total description, nor with the linear kernel. Bodies that come nearer to each other by
+    more than half a spacing in a step pass through each other.
+
+    Args:
+        friction: Coulomb coefficient between any two bodies [-], at least 0. With a large one, such as 1e3, they stick
+            while they are pressed together.
+        of_materials: the number of each material's body, from 0. Default: each material is a body.
+    """
+
+    friction: Scalar = 0.0
+    of_materials: tuple[int, ...] | None = eqx.field(static=True, default=None, converter=as_plain)
+
+    def __check_init__(self):
+        require_fields(self)
+        require_between("The friction of Bodies", self.friction, 0, 1e6)
+        require(
+            self.of_materials is None or len(self.of_materials) > 0,
+            "The of_materials of Bodies must be one number for each material, got none: leave it out to make each "
+            "material a body.",
+        )
+
+    def numbers(self, count: int) -> tuple[int, ...]:
+        """The number of the body of each of so many materials.
+
+        Raises:
+            ValueError: not one number a material, a number left out, fewer than two bodies.
+        """
+        numbers = tuple(range(count)) if self.of_materials is None else self.of_materials
+        require(
+            len(numbers) == count and set(numbers) == set(range(max(numbers) + 1)),
+            f"The of_materials of Bodies must be one number for each of the scene's {count} materials, from 0 and none "
+            f"left out, got {numbers}.",
+        )
+        require(
+            max(numbers) > 0,
+            f"Bodies must be two or more to touch, got one of {count} material(s): give each body a law of its own in "
+            "material, or drop bodies.",
+        )
+        return numbers
 
 
 class RigidMaterial(NamedTuple):
@@ -168,7 +242,7 @@ class Scene(eqx.Module):
             )
 
         if self.volume is not None:
-            self._check_averaged(self.volume)
+            self.volume.check(self.laws)
         if self.rigid_bodies:
             self._check_rigid()
 
@@ -179,9 +253,8 @@ class Scene(eqx.Module):
             "RigidPart.",
         )
         numbers = (0,) * len(self.laws) if self.bodies is None else self.bodies.numbers(len(self.laws))
-        layers = [body.layer for body in self.rigid_bodies]
         require(
-            all(numbers.count(layer) == 1 for layer in layers),
+            all(numbers.count(body.layer) == 1 for body in self.rigid_bodies),
             "A Rigid body must be of one material alone, and no other material of its body: give the scene bodies, "
             f"Bodies() or with of_materials in which its number appears once, got {numbers}.",
         )
@@ -196,27 +269,11 @@ class Scene(eqx.Module):
             "A SymmetryPlane that moves cannot stand in a scene with a Rigid body: take a SeparatingCollider, or a "
             "plane at rest.",
         )
-        for body in self.rigid_bodies:
-            directions = body.freedom.directions
+        for directions in (body.freedom.directions for body in self.rigid_bodies):
             require(
                 directions is None or len(directions) == self.grid.dim,
                 f"Rigid's free directions must be {self.grid.dim} bools, as the grid has directions, got {directions}.",
             )
-
-    def _check_averaged(self, volume: AveragedVolume) -> None:
-        require(
-            all(number < len(self.laws) for number in volume.materials or ()),
-            f"AveragedVolume's materials must be numbers below {len(self.laws)}, of the scene's laws, got "
-            f"{volume.materials}.",
-        )
-        covered = [law for number, law in enumerate(self.laws) if volume.covers(number)]
-        refused = [law.title() for law in covered if not law.allows_averaged_volume]
-        require(
-            not refused,
-            "AveragedVolume is for elastic laws of F: what yields returns to a volume of its own, and a fluid has "
-            "nothing else that resists. Name the other materials, AveragedVolume(materials=(0,)), without "
-            f"{', '.join(refused)}.",
-        )
 
     @property
     def laws(self) -> tuple[AbstractLaw, ...]:
@@ -265,11 +322,10 @@ class Scene(eqx.Module):
         grid, window, places = self.grid.with_layers(1), self.window(particles), self.on_grid(particles, t)
         images = mirror(self.boundary, grid, window).without_ties()
 
-        def averaged(points: MaterialPoints) -> MaterialPoints:
-            at = places[slice(*points.rows)]
-            return replace(points, average=volume_average(grid, window, at, points.volume, images))
+        def average(points: MaterialPoints) -> VolumeAverage:
+            return volume_average(grid, window, places[slice(*points.rows)], points.volume, images)
 
-        return tuple(averaged(points) if volume.covers(number) else points for number, points in enumerate(materials))
+        return tuple(replace(q, average=average(q)) if volume.covers(i) else q for i, q in enumerate(materials))
 
     def return_map(self, particles: Particles, dt: Scalar) -> Particles:
         """The particles after the return maps of laws that yield: from the trial deformation to one that the law
@@ -303,12 +359,9 @@ class Scene(eqx.Module):
     def shift(self, t: Scalar) -> Float[Array, "d"] | None:
         """How far the grid has moved at time t [m], shape (d,), with planes that move, and with the derivative by the
         places of all mirrored ones (see `carried_by`); None where it rests."""
-        mirrors = self.mirrors
-        if not mirrors:
-            return None
         along = {} if self.total else {axis: motion.at(t)[axis] for axis, motion in self.moving_mirrors.items()}
         for axis in range(self.grid.dim):
-            places = [mirror.position for mirror in mirrors if mirror.axis == axis]
+            places = [mirror.position for mirror in self.mirrors if mirror.axis == axis]
             if is_traced(places):
                 along[axis] = along.get(axis, 0) + carried_by(*places)
         if not along:
@@ -353,22 +406,3 @@ class Scene(eqx.Module):
             return stencil
         images = mirror(self.boundary, self.grid, window).without_ties()
         return without_empty(stencil, particles.mass, lambda m: images.unfold_scalar(images.fold_scalar(m)), self.grid)
-
-
-@checked
-def attach(scene: Scene, particles: Particles) -> Scene:
-    """The scene with its loads attached to the particles as they are: each `Patch` of a surface and all `PointsAt`
-    become points that move with the nearest particle.
-
-    Args:
-        scene: the scene.
-        particles: its particles at the start.
-
-    Raises:
-        ValueError: a place with no surface, or with a point off the body; particles inside a jax transformation.
-    """
-    if not scene.loads:
-        return scene
-    with jax.ensure_compile_time_eval():  # what is known stays so within a transformation
-        loads = tuple(eqx.tree_at(lambda load: load.on, load, load.on.attached(particles)) for load in scene.loads)
-    return eqx.tree_at(lambda s: s.loads, scene, loads)

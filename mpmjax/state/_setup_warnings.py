@@ -1,5 +1,4 @@
-"""Warnings of what is no error but most likely not meant, given when particles are first prepared for a scene, and of
-what a run has made of them.
+"""Warnings of scenes that are valid but probably not meant, when particles are first prepared for one and after a run.
 
 Only what is certain is warned of: a grip or collider that can never touch a node with mass is, one that the body may
 still reach is not.
@@ -15,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Bool, Int, ParticleVector
-from mpmjax.boundary import ON_THE_WALL, AbstractBoundary, Conditions
+from mpmjax.boundary import ON_THE_WALL, AbstractBoundary
 from mpmjax.checks import warn
 from mpmjax.discretisation import BSpline, Grid
-from mpmjax.material import AbstractLaw
 from mpmjax.state._particles import Particles
+from mpmjax.state._scene import Scene
 
 _CROWDED = 1.25
 """How many times the space that there is particles may take."""
@@ -35,24 +34,21 @@ _MOST_ROUNDING = 2.0**-12
 Boundaries = tuple[AbstractBoundary, ...]
 
 
-def warn_of_oversights(grid: Grid, kernel: BSpline, boundary: Boundaries, particles: Particles, *, total: bool) -> None:
+def warn_of_setup(scene: Scene, particles: Particles) -> None:
     """Warn of walls and colliders that lie over the body, of grips and colliders that touch nothing, of thin bodies.
 
     Args:
-        grid: the grid.
-        kernel: the kernel.
-        boundary: the scene's boundary conditions.
+        scene: the scene, its floats arrays.
         particles: the particles, as they start.
-        total: whether the description is total Lagrangian: colliders that lie over the body then hold it.
     """
-    grid = grid.with_layers(1)  # the nodes of all bodies are at the same places
+    grid, boundary, total = scene.grid.with_layers(1), scene.boundary, scene.total  # all bodies' nodes coincide
     resting = tuple(c.rests(total=total) and not grid.follow for c in boundary)
     probe, inputs = partial(_probe, resting=resting, total=total), (boundary, grid, particles.x, particles.volume)
     some = jax.tree.leaves(eqx.filter_eval_shape(probe, *inputs))  # none, and no compiling, of walls
     within, touched = eqx.filter_jit(probe)(*inputs) if some else ([None] * len(boundary),) * 2
-    for number, condition in enumerate(boundary, 1):
+    for number, (condition, inside, mask) in enumerate(zip(boundary, within, touched, strict=True), 1):
         name = f"{type(condition).__name__} (boundary {number})"
-        covered = _beyond(condition, grid, particles) if (inside := within[number - 1]) is None else int(inside)
+        covered = _count_beyond(condition, grid, particles) if inside is None else int(inside)
         if covered and condition.pushes:
             warn(
                 f"{covered} of {particles.count} particles lie in or beyond the {name} at the start, or nearer to it "
@@ -64,15 +60,19 @@ def warn_of_oversights(grid: Grid, kernel: BSpline, boundary: Boundaries, partic
                 f"{covered} of {particles.count} particles lie in or beyond the {name} at the start: nodes there do "
                 "not move freely. Move one of them; to hold a body on purpose take a Grip."
             )
-        if (mask := touched[number - 1]) is not None:
-            may_meet = not total and condition.collider_count > 0  # material comes to it: any node will do
-            if not (mask if may_meet else np.asarray(mask)[_reached(grid, kernel, particles.x)]).any():
+        if mask is not None:
+            may_meet = not total and condition.bodies > 0  # material comes to it: any node will do
+            if not (mask if may_meet else np.asarray(mask)[_reached(grid, scene.kernel, particles.x)]).any():
                 where = "of the window lies in it" if may_meet else "that a particle reaches lies in it"
                 warn(f"The {name} touches nothing, since no node {where}: move it, or enlarge it to a spacing or more.")
         elif _stays_outside(condition, grid):
             warn(f"The {name} touches nothing, since it never comes into the grid's window: move it or the grid.")
-    if (crowded := _crowded(grid, particles)) is not None:
-        warn(crowded)
+    filled = _filled(particles.x, np.asarray(particles.volume, float), 2 * _widest(grid, particles))
+    if filled is not None and filled[0].max() >= _CROWDED:
+        warn(
+            f"Near {filled[1]} m particles take {filled[0].max():.2g} times the space that there is: where two sets "
+            "fill the same place there is twice the mass. Leave one of them out there."
+        )
     for text in _thin(grid, boundary, particles):
         warn(text)
     warn_of_rounding(grid, particles.x)
@@ -98,35 +98,23 @@ def warn_of_rounding(grid: Grid, x: ParticleVector, before: ParticleVector | Non
         )
 
 
-def warn_of_crowding(grid: Grid, laws: tuple[AbstractLaw, ...], particles: Particles) -> None:
-    """Warn of particles that take much more space than there is. A law sees the volume of each particle by itself, and
-    not that they crowd.
-
-    Args:
-        grid: the grid.
-        laws: the laws of the materials.
-        particles: prepared particles after a run in the updated description.
-    """
-    groups = zip(laws, particles.groups, strict=True)
-    ratio = np.concatenate([np.asarray(law.compaction(g.history)) * _volume_ratio(g.stored) for law, g in groups])
-    volume, width = np.asarray(particles.volume, float) * ratio, max(float(grid.spacing), 2 * _largest_side(particles))
+def warn_of_crowding(scene: Scene, particles: Particles) -> None:
+    """Warn of particles that take much more space than there is, after a run in the updated description. A law sees the
+    volume of each particle by itself, and not that they crowd."""
+    groups = zip(scene.laws, particles.groups, strict=True)
+    ratio = np.concatenate([np.asarray(law.compaction(g.history)) * np.asarray(g.volume_ratio()) for law, g in groups])
+    volume, side = np.asarray(particles.volume, float) * ratio, float(particles.volume.max()) ** (1 / particles.dim)
     for offset in (0.0, 0.5):  # a layer between two rows of nodes shows less
-        volumes = _held(particles.x, volume, width, offset)
-        beyond = 0.0 if volumes is None else np.maximum(volumes[0] - _CROWDED, 0).sum() / volumes[0].sum()
-        if volumes is not None and beyond > _MOST_BEYOND:
+        filled = _filled(particles.x, volume, max(float(scene.grid.spacing), 2 * side), offset)
+        beyond = 0.0 if filled is None else np.maximum(filled[0] - _CROWDED, 0).sum() / filled[0].sum()
+        if filled is not None and beyond > _MOST_BEYOND:
             warn(
-                f"At the end particles take up to {volumes[0].max():.2g} times the space that there is, most near "
-                f"{volumes[1]} m, and {100 * beyond:.2g} % of their volume is too much where it lies: levels and "
+                f"At the end particles take up to {filled[0].max():.2g} times the space that there is, most near "
+                f"{filled[1]} m, and {100 * beyond:.2g} % of their volume is too much where it lies: levels and "
                 "pressures are wrong. Take a shorter step, and around what flows a ContactPlane, or a SeparatingBox "
                 "half-way between nodes."
             )
             return
-
-
-def _volume_ratio(stored: Array | None) -> np.ndarray:
-    """det F or J of prepared particles, which store either, particle first."""
-    deformation = np.asarray(stored, float)
-    return deformation if deformation.ndim == 1 else np.linalg.det(deformation)
 
 
 def _probe(
@@ -144,7 +132,9 @@ def _probe(
         distance = body.distance(nodes, t) if body.pushes else None
         if distance is not None:
             return distance <= grid.spacing
-        return _acts(body.conditions(nodes, grid.spacing, t, dt, reference=total))
+        conditions = body.conditions(nodes, grid.spacing, t, dt, reference=total)
+        acts, colliders = conditions.fixed.any(axis=1), conditions.colliders
+        return acts if colliders is None else acts | colliders.touched
 
     return [covered(b) for b in boundary], [touched(b) if r else None for b, r in zip(boundary, resting, strict=True)]
 
@@ -157,13 +147,7 @@ def _nearest(boundary: AbstractBoundary, grid: Grid, volume: Array) -> Array:
     return jnp.full(volume.shape, -ON_THE_WALL * grid.spacing)
 
 
-def _acts(conditions: Conditions) -> Bool[Array, "n"]:
-    """The nodes on which a boundary acts, (n,)."""
-    acts, colliders = conditions.fixed.any(axis=1), conditions.colliders
-    return acts if colliders is None else acts | colliders.touched
-
-
-def _beyond(boundary: AbstractBoundary, grid: Grid, particles: Particles) -> int:
+def _count_beyond(boundary: AbstractBoundary, grid: Grid, particles: Particles) -> int:
     """How many particles lie beyond its walls, or too near to walls that push."""
     nearest, places = np.asarray(_nearest(boundary, grid, particles.volume)), np.asarray(particles.x)
     outside = np.zeros(len(places), bool)
@@ -187,25 +171,12 @@ def _stays_outside(boundary: AbstractBoundary, grid: Grid) -> bool:
     return bool(beside) and all(beside)
 
 
-def _crowded(grid: Grid, particles: Particles) -> str | None:
-    """A warning where particles take more space than there is, by a quarter of what fits in two particles' width."""
-    width = 2 * max(float(grid.spacing), _largest_side(particles))
-    volumes = _held(particles.x, np.asarray(particles.volume, float), width)
-    if volumes is None or volumes[0].max() < _CROWDED:
-        return None
-    held, near = volumes
-    return (
-        f"Near {near} m particles take {held.max():.2g} times the space that there is: where two sets fill the same "
-        "place there is twice the mass. Leave one of them out there."
-    )
+def _widest(grid: Grid, particles: Particles) -> float:
+    """The spacing, or the side of the largest particle if that is more [m]."""
+    return max(float(grid.spacing), float(np.asarray(particles.volume).max()) ** (1 / particles.dim))
 
 
-def _largest_side(particles: Particles) -> float:
-    """The side of the largest particle [m]."""
-    return float(np.asarray(particles.volume).max()) ** (1 / particles.dim)
-
-
-def _held(
+def _filled(
     x: ParticleVector, volume: np.ndarray, width: float, offset: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """How many times its space each node of a lattice holds, by linear weights, which those of one body fill to a
@@ -224,11 +195,13 @@ def _held(
     shape = index.max(axis=0) + 2
     if shape.prod() > _MOST_CELLS:
         return None
-    held = np.zeros(shape.prod())
+    share_filled = np.zeros(shape.prod())
     for corner in itertools.product((0, 1), repeat=d):
         weight = np.where(corner, share, 1 - share).prod(axis=1)
-        held += np.bincount(np.ravel_multi_index(tuple((index + corner).T), shape), weight * volume, held.size)
-    return held / width**d, (np.asarray(np.unravel_index(int(held.argmax()), shape)) + first - offset) * width
+        node = np.ravel_multi_index(tuple((index + corner).T), shape)
+        share_filled += np.bincount(node, weight * volume, share_filled.size)
+    fullest = np.asarray(np.unravel_index(int(share_filled.argmax()), shape))
+    return share_filled / width**d, (fullest + first - offset) * width
 
 
 def _reached(grid: Grid, kernel: BSpline, x: ParticleVector) -> np.ndarray:
