@@ -15,7 +15,7 @@ import numpy as np
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Int, Scalar, components, particle_first
 from mpmjax.autodiff import recomputed
-from mpmjax.boundary import BoundaryImpulse, ColliderImpulse, no_boundary_impulse, no_impulse
+from mpmjax.boundary import Impulses, no_impulses
 from mpmjax.checks import first_unmet, requirements
 from mpmjax.discretisation import Stencil, in_window
 from mpmjax.native import stored
@@ -32,9 +32,9 @@ class RolloutState(eqx.Module):
     """The part of a rollout that evolves: the particles' state, and what colliders and boundaries have received."""
 
     particles: State
-    collider_impulse: ColliderImpulse | None
+    collider_impulse: Impulses | None
     """Linear and angular impulse on the scene's colliders since the rollout began; None without colliders."""
-    boundary_impulse: BoundaryImpulse | None = None
+    boundary_impulse: Impulses | None = None
     """Linear and angular impulse on the scene's boundaries; None unless the scene has `boundary_forces`."""
     order: MemoryOrder | None = None
     """The order of the particles in memory; None if it is that in which they were given."""
@@ -68,8 +68,8 @@ class RolloutState(eqx.Module):
 def initial_state(scene: Scene, particles: Particles) -> RolloutState:
     """The state in which a rollout of prepared particles begins."""
     of = particles.dim, particles.x.dtype
-    colliders = no_impulse(scene.collider_count, *of) if scene.collider_count else None
-    boundaries = no_boundary_impulse(len(scene.boundary) + len(scene.guides), *of) if scene.boundary_forces else None
+    colliders = no_impulses(scene.collider_count, *of) if scene.collider_count else None
+    boundaries = no_impulses(len(scene.boundary) + len(scene.guides), *of) if scene.boundary_forces else None
     return RolloutState(state_of(particles), colliders, boundaries)
 
 
@@ -131,7 +131,7 @@ def faulty_particles(problem: Problem, state: State, t: Scalar) -> dict[Fault, B
     admitted = jnp.concatenate([points.is_admissible(points.deformation) for points in materials])
     faults = {Fault.NOT_FINITE: ~finite, Fault.OUTSIDE: finite & outside, Fault.INADMISSIBLE: finite & ~admitted}
     if not scene.total:  # there forces are made of P, here of P Fᵀ, which vanishes with F: nothing opens what collapsed
-        collapsed = [points.law.kinematics.collapsed(points.deformation, LEAST_STRETCH) for points in materials]
+        collapsed = [points.law.measure.collapsed(points.deformation, LEAST_STRETCH) for points in materials]
         faults[Fault.COLLAPSED] = finite & jnp.concatenate(collapsed)
     return faults
 

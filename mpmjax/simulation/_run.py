@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Int, Scalar
-from mpmjax.boundary import BoundaryImpulse, ColliderImpulse
+from mpmjax.boundary import Impulses
 from mpmjax.state import Particles, Scene, State, with_state
 from mpmjax.stepping import AbstractIntegrator, StepInfo
 

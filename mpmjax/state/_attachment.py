@@ -340,7 +340,7 @@ def loaded_points(
 
 def keeps_deformation(law: AbstractLaw) -> bool:
     """Whether particles of a law keep the whole deformation gradient."""
-    return law.allows_total and law.kinematics.undeformed(2).ndim == 2
+    return law.allows_total and law.measure.undeformed(2).ndim == 2
 
 
 def _deformation(laws: tuple[AbstractLaw, ...], particles: Particles) -> ParticleMatrix | None:

@@ -11,7 +11,7 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix
 from mpmjax.checks import as_plain, require, require_fields
 from mpmjax.discretisation import BSpline, Grid, SplineGradient, Stencil, gather, make_stencil, scatter
-from mpmjax.material import AbstractElastic, AbstractLaw
+from mpmjax.material import AbstractLaw, AbstractMaterial
 from mpmjax.potential import AbstractStiffness, Displacement, Forces, Mirror
 
 

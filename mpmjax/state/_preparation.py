@@ -175,7 +175,7 @@ def is_prepared(scene: Scene, particles: Particles) -> bool:
     """Whether the particles have exactly what the scene needs."""
 
     def fits(law: AbstractLaw, group: Group) -> bool:
-        shape = law.kinematics.undeformed(particles.dim).shape
+        shape = law.measure.undeformed(particles.dim).shape
         stored = group.stored
         return stored is not None and stored.shape[1:] == shape and law.remembers(group.history, stored)
 

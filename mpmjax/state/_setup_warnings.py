@@ -61,7 +61,7 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
                 "not move freely. Move one of them; to hold a body on purpose take a Grip."
             )
         if mask is not None:
-            may_meet = not total and condition.bodies > 0  # material comes to it: any node will do
+            may_meet = not total and condition.collider_count > 0  # material comes to it: any node will do
             if not (mask if may_meet else np.asarray(mask)[_reached(grid, scene.kernel, particles.x)]).any():
                 where = "of the window lies in it" if may_meet else "that a particle reaches lies in it"
                 warn(f"The {name} touches nothing, since no node {where}: move it, or enlarge it to a spacing or more.")

@@ -214,7 +214,7 @@ def _straining(scene: Scene, particles: Particles, nodes: Nodes) -> Float[Array,
     fastest = []
     for law, group in zip(scene.laws, particles.groups, strict=True):
         r = rates[:, slice(*group.rows)]
-        fastest.append(jnp.abs(r).max(axis=0) if law.kinematics.axes else jnp.abs(r.sum(axis=0)))
+        fastest.append(jnp.abs(r).max(axis=0) if law.measure.axes else jnp.abs(r.sum(axis=0)))
     return jnp.concatenate(fastest)
 
 
@@ -242,7 +242,7 @@ def _between_bodies(scene: Scene, particles: Particles, materials: tuple[Materia
         k, rho = modulus[slice(*points.rows)].max(), density[slice(*points.rows)].min()
         stiff[body], light[body] = jnp.maximum(stiff.get(body, k), k), jnp.minimum(light.get(body, rho), rho)
     pairs = combinations(stiff, 2)
-    added = [in_a_row(stiff[a], stiff[b]) / jnp.minimum(light[a], light[b]) for a, b in pairs]
+    added = [series_stiffness(stiff[a], stiff[b]) / jnp.minimum(light[a], light[b]) for a, b in pairs]
     return 4 * STIFFNESS * jnp.stack(added).max() / jnp.asarray(scene.grid.spacing) ** 2
 
 

@@ -15,7 +15,7 @@ from mpmjax.checks import canonical, checked, require_finite, require_placement,
 from mpmjax.discretisation import Stencil, g2p, scatter
 from mpmjax.implicit import SolveInfo
 from mpmjax.state import Particles, Scene, State, is_prepared, prepare, with_state
-from mpmjax.stepping._boundary_forces import impulse_on_boundaries_of, impulse_on_colliders_of
+from mpmjax.stepping._boundary_forces import impulse_on_boundaries, impulse_on_colliders
 from mpmjax.stepping._grid_update import GridUpdate, constrained_update
 from mpmjax.stepping._integrator import AbstractIntegrator, Explicit, NodeMotion, advance
 from mpmjax.stepping._nodes import Nodes, folded_at_planes, particles_to_grid, with_boundaries
