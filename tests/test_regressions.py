@@ -12,7 +12,7 @@ import pytest
 from helpers import block
 
 import mpmjax as mpm
-from mpmjax.analysis._diagnostics import _energy
+from mpmjax.analysis._budget import _energy
 from mpmjax.discretisation._stencil import in_window
 
 

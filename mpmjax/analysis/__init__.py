@@ -3,12 +3,10 @@
 from mpmjax.analysis._bench import Build as Build, Trial as Trial, name_of as name_of
 from mpmjax.analysis._budget import (
     Budget as Budget,
+    Energy as Energy,
     EnergyBudget as EnergyBudget,
     MomentumBudget as MomentumBudget,
     budget as budget,
-)
-from mpmjax.analysis._diagnostics import (
-    Energy as Energy,
     energy as energy,
     energy_density as energy_density,
     energy_of as energy_of,

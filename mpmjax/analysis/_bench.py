@@ -135,6 +135,7 @@ class Bench(NamedTuple):
 
     @classmethod
     def of(cls, build: Build, refinement: int, t1: float) -> "Bench":
+        """The bench of a scene at a refinement, until t1 [s]."""
         scene, particles = build(refinement)
         return cls(refinement, scene, prepare(scene, particles), float(t1))
 

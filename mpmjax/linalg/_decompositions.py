@@ -142,7 +142,9 @@ def rotation_differential(R: Matrix, compliance: Compliance, dF: Matrix) -> Matr
         V, r = entries(matmul(transpose(R), dF)), entries(R)
         omega = compliance[0, 0] * (V[1][0] - V[0][1])
         return omega * assemble([[r[0][1], -r[0][0]], [r[1][1], -r[1][0]]])
-    return matmul(R, _skew(_spin(R, compliance, dF)))
+    x, y, z = _spin(R, compliance, dF)
+    zero = jnp.zeros_like(x)
+    return matmul(R, assemble([[zero, -z, y], [z, zero, -x], [-y, x, zero]]))
 
 
 def _spin(R: Matrix, compliance: Compliance, dF: Matrix) -> tuple[Array, Array, Array]:
@@ -151,12 +153,6 @@ def _spin(R: Matrix, compliance: Compliance, dF: Matrix) -> tuple[Array, Array, 
     v = (V[2][1] - V[1][2], V[0][2] - V[2][0], V[1][0] - V[0][1])
     x, y, z = (dot(row, v) for row in entries(compliance))
     return x, y, z
-
-
-def _skew(w: tuple[Array, Array, Array]) -> Matrix:
-    """[w]ₓ, with [w]ₓ a = w × a."""
-    zero = jnp.zeros_like(w[0])
-    return assemble([[zero, -w[2], w[1]], [w[2], zero, -w[0]], [-w[1], w[0], zero]])
 
 
 def _rotation_2d(F: Matrix) -> Matrix:

@@ -61,8 +61,8 @@ def dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
 
 
 def matrix_of(linear: Callable[[Matrix], Matrix], like: Matrix) -> Float[Array, "m m *p"]:
-    """The matrix of a symmetric linear map between matrices of the shape (d, d, *p) of `like`, on their d² components in
-    C order, shape (d², d², *p). Row m, which equals column m, is the image of the m-th unit matrix."""
+    """The matrix of a symmetric linear map between matrices of the shape (d, d, *p) of `like`, on their d² components
+    in C order, shape (d², d², *p). Row m, which equals column m, is the image of the m-th unit matrix."""
     d, batch = like.shape[0], like.shape[2:]
     units = jnp.eye(d * d, dtype=like.dtype).reshape(d * d, d, d, *[1] * len(batch))
     return jax.vmap(lambda unit: linear(jnp.broadcast_to(unit, like.shape)))(units).reshape(d * d, d * d, *batch)

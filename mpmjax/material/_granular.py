@@ -44,8 +44,7 @@ class DruckerPrager(AbstractHenckyPlasticity):
     105, doi 10.1145/3072959.3073651), and the return map starts from the strain with v_c/3 added to its mean:
     apart while that mean is positive, else closed with v_c = 0. With v_c ≥ 0 no return map adds energy.
 
-    Where sand neither slides nor parts F is unchanged to the last bit. At rest, F = I, it is on the verge of both: the
-    derivative there is the elastic one.
+    At rest, F = I, sand is on the verge of sliding and of parting: the derivative there is the elastic one.
 
     *When it breaks*: it needs J > 0, as Hencky's law does. φ is that of triaxial compression; in extension
     and plane strain the cone is wider than Coulomb's. Where sand flows in plane strain its angle ψ is sin ψ = M/√3,
@@ -115,8 +114,7 @@ class CamClay(AbstractHenckyPlasticity):
     the critical state: q = M (1 + β)/((1 − β) √(1 + 2β)) p, which is M p without cohesion, and is there for β < 1.
     Where α ≥ 0 the material bears no stress: the particles are apart, and α is the gap that must close first. The
     paper's flow is associated (its eqs. 12, 13) and its elasticity neo-Hookean; here it is Hencky's, in whose strains p
-    and q are linear. Where nothing yields F is unchanged to the last bit. No return map adds elastic energy, which does
-    not depend on α.
+    and q are linear. No return map adds elastic energy, which does not depend on α.
 
     *When it breaks*: it needs J > 0, as Hencky's law does. The stress lags behind the ellipse by one step's
     hardening, an error in proportion to the step's strain. Softening localises strain in bands as wide as a cell.

@@ -16,7 +16,7 @@ from mpmjax.material._tangent import (
     MatrixTangent,
     PrincipalTangent,
     is_isotropic,
-    projected_tangent,
+    projected_matrix,
 )
 
 
@@ -256,10 +256,13 @@ class AbstractMaterial(AbstractLaw):
         )
 
     def projected_tangent(self, F: Matrix, /) -> AbstractTangent:
-        """The stress differential with its negative eigenvalues set to zero (see `projected_tangent`).
+        """The stress differential with its negative eigenvalues set to zero (J. Teran, E. Sifakis, G. Irving,
+        R. Fedkiw, SCA 2005, doi 10.1145/1073368.1073394): of the positive semi-definite maps, the nearest to it.
 
         *When it breaks*: the law must be isotropic; where it has no `principal_tangent` of its own and is not, a
-        `RuntimeError` says so.
+        `RuntimeError` says so. Second derivatives are refused. Where an eigenvalue is zero the map has a kink; the
+        derivative given is the mean of the two sides, which is what a central difference tends to. At F = I that is
+        so: all twists are zero.
         """
         if type(self).principal_tangent is AbstractMaterial.principal_tangent:
             name = type(self).__name__
@@ -269,7 +272,7 @@ class AbstractMaterial(AbstractLaw):
                 f"{name} is not isotropic, and the projected Hessian needs a law that is: take AnalyticHessian() "
                 f"without projection or JvpHessian(), or write {name}'s energy in invariants of FᵀF.",
             )
-        return projected_tangent(self, F)
+        return MatrixTangent(projected_matrix(self, F))
 
     def tangent_eigenvalues(self, F: Matrix, /, dim: int, *, total: bool) -> Float[Array, "m p"]:
         """Eigenvalues [Pa] of the tangent L ↦ (∂²Ψ/∂F∂F : (L F)) Fᵀ + τ Lᵀ, L = ∇v, τ = P Fᵀ, made symmetric; in the

@@ -9,7 +9,6 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix, Scalar
 from mpmjax.checks import as_plain, require, require_fields, require_positive
 from mpmjax.material._law import AbstractMaterial, Freedom
-from mpmjax.material._tangent import MatrixTangent, PrincipalTangent
 
 
 class Rigid(AbstractMaterial):
@@ -53,17 +52,6 @@ class Rigid(AbstractMaterial):
 
     def energy(self, F: Matrix) -> Array:
         return jnp.zeros(F.shape[2:], F.dtype)
-
-    def stress(self, F: Matrix) -> Matrix:
-        return jnp.zeros_like(F)
-
-    def tangent(self, F: Matrix) -> MatrixTangent:
-        count = F.shape[0] * F.shape[1]
-        return MatrixTangent(jnp.zeros((count, count, *F.shape[2:]), F.dtype))
-
-    def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
-        none = jnp.zeros_like(s[0])
-        return PrincipalTangent.of(s, lambda i, j: none, lambda i, j: none, lambda i, j: none)
 
     def wave_modulus(self, F: Deformation) -> Float[Array, "*p"]:
         return jnp.broadcast_to(jnp.asarray(self.modulus, F.dtype), (1,))

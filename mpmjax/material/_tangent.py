@@ -148,31 +148,22 @@ def isotropic_matrix(law: Any, F: Matrix, A: Matrix, weight: Float[Array, "*p"])
     return jnp.concatenate([row(b, a) for b in range(d) for a in range(d)])
 
 
-def projected_tangent(law: Any, F: Matrix) -> MatrixTangent:
-    """δP = A⁺ : δF, A⁺ being A = ∂²Ψ/∂F∂F with its negative eigenvalues set to zero (J. Teran, E. Sifakis, G. Irving,
-    R. Fedkiw, SCA 2005, doi 10.1145/1073368.1073394): of the positive semi-definite maps, the nearest to A. In closed
-    form: no eigenvalue problem larger than d x d is solved.
+@ruled
+def projected_matrix(law: Any, F: Matrix) -> Float[Array, "m m *p"]:
+    """A⁺, A being ∂²Ψ/∂F∂F of an isotropic law at F, with its negative eigenvalues set to zero. In closed form: no
+    eigenvalue problem larger than d x d is solved.
 
     Its first derivative with respect to F and the law's parameters is exact, at repeated stretches too: with E the
     eigenvectors of A and λ its eigenvalues, δA⁺ = E (K ∘ Eᵀ δA E) Eᵀ, K_kl = (λ_k⁺ − λ_l⁺)/(λ_k − λ_l) (J. L. Daleckii,
     S. G. Krein; N. J. Higham, Functions of Matrices, SIAM 2008, theorem 3.11, doi 10.1137/1.9780898717778), the limit
     of K being 1 where both are positive and 0 where both are negative.
-
-    *When it breaks*: the law must be isotropic. Second derivatives are refused. Where an eigenvalue is zero A⁺ has a
-    kink; the derivative given is the mean of the two sides, which is what a central difference tends to. At F = I that
-    is so: all twists are zero.
     """
-    return MatrixTangent(_projected_matrix(law, F))
-
-
-@ruled
-def _projected_matrix(law: Any, F: Matrix) -> Float[Array, "m m *p"]:
     values, modes = _spectrum(law, F)
     return _in_modes(modes, la.diagonal(jnp.maximum(values, 0)))
 
 
-@_projected_matrix.defjvp
-def _projected_matrix_jvp(primals: tuple[Any, Matrix], tangents: tuple[Any, Matrix | None]) -> tuple[Array, Array]:
+@projected_matrix.defjvp
+def projected_matrix_jvp(primals: tuple[Any, Matrix], tangents: tuple[Any, Matrix | None]) -> tuple[Array, Array]:
     values, modes = _spectrum(*primals)
 
     def in_frame(law: Any, F: Matrix) -> Array:

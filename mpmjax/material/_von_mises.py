@@ -34,8 +34,7 @@ class VonMises(AbstractHenckyPlasticity):
 
         Δγ = (‖s‖ − √(2/3) (σ_y + H α)) / (2μ + 2H/3),   α ← α + √(2/3) Δγ,
 
-    along e, in closed form. In 1-D and 2-D the deviator is that of three dimensions: plane strain yields out of the
-    plane too. Where nothing yields F is unchanged to the last bit.
+    along e, in closed form. Plane strain yields out of the plane too.
 
     *When it breaks*: it needs J > 0, as Hencky's law does. The stress lags a step behind the yield condition, since the
     return map follows the step. Without hardening, strain localises in bands as wide as a cell. In float32 strains have
@@ -90,8 +89,7 @@ class HerschelBulkley(AbstractHenckyPlasticity):
 
     whose share w = μ Δt γ̇/(τ* − τ_Y) solves w + c wⁿ = 1, c = η ((τ* − τ_Y)/(μ Δt))ⁿ/(τ* − τ_Y): in closed form
     1/(1 + c) for n = 1, else by Newton's method in ln w. In steady shear the stress is that of the law at any step. At
-    rest it relaxes to τ_Y, for n = 1 as e^{−μt/η}. With η = 0 it is `VonMises` with the tensile yield stress √3 τ_Y. In
-    1-D and 2-D the deviator is that of three dimensions. Where nothing yields F is unchanged to the last bit.
+    rest it relaxes to τ_Y, for n = 1 as e^{−μt/η}. With η = 0 it is `VonMises` with the tensile yield stress √3 τ_Y.
 
     *When it breaks*: it needs J > 0, as Hencky's law does. The stress lags a step behind the law, since the return map
     follows the step, and in an implicit step the elastic law alone resists: its part adds to the flow's stress some

@@ -10,7 +10,7 @@ from numpy_oracle import grid_update
 
 import mpmjax as mpm
 from mpmjax._types import components
-from mpmjax.analysis._diagnostics import volume_ratio
+from mpmjax.analysis._budget import volume_ratio
 from mpmjax.simulation._run import Fault
 from mpmjax.verification import AxisAligned, TwoDisks, VibratingBar, Vortex, discretise, errors, orders
 
