@@ -50,8 +50,7 @@ class Columns:
         require(len(rows) > 0, f"{path} has a header and no rows: there is nothing to fit.")
         for line, fields in rows:
             require(
-                len(fields) == len(head),
-                f"{path}, line {line}: {len(fields)} fields, but the header has {len(head)}.",
+                len(fields) == len(head), f"{path}, line {line}: {len(fields)} fields, but the header has {len(head)}."
             )
         self.lines = np.array([line for line, _ in rows])
         """The line of each row, from 1."""

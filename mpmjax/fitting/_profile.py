@@ -120,10 +120,7 @@ def profile(
         ValueError: there is no such fitted number; a level that is none.
     """
     problem = result.problem
-    require(
-        label in problem.labels,
-        f"A profile is of a fitted number: {', '.join(problem.labels)}. Got {label!r}.",
-    )
+    require(label in problem.labels, f"A profile is of a fitted number: {', '.join(problem.labels)}. Got {label!r}.")
     level = checked_level(result.level if level is None else level)
     require_whole("profile's points", points, 1)
     require_positive("profile's rtol", rtol)
