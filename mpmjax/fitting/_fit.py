@@ -206,11 +206,7 @@ def _searched(
 
 
 def require_influence(problem: FitProblem, sigmas: Sigmas, seen: Evaluation) -> None:
-    """Check that the data depend on every coordinate, at the first guess.
-
-    Raises:
-        ValueError: they do not.
-    """
+    """Check that the data depend on every coordinate, at the first guess."""
     rounding = _ROUNDINGS * float(jnp.finfo(problem.dtype).eps) * float(problem.size_of_data(sigmas))
     if seen.jacobian is None:
         # |Jᵀr| ≤ ‖r‖ times a column's length: where it is not small, the column is not.

@@ -84,11 +84,7 @@ class FitLog:
         self.write()
 
     def write(self) -> None:
-        """Write the file.
-
-        Raises:
-            OSError: the disk refused; the log is what it was.
-        """
+        """Write the file; if the disk refuses, the log is what it was."""
         whole = io.BytesIO()
         with h5py.File(whole, "w", libver=("v110", "v110")) as file:
             self._fill(file)
@@ -143,12 +139,7 @@ class FitLog:
 
 @contextmanager
 def opened_log(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, *, resume: bool) -> Iterator[FitLog]:
-    """A log that is begun or, with `resume`, read and continued.
-
-    Raises:
-        ValueError: a file that is there or, with `resume`, is not, is damaged, no log, the log of another fit, or being
-            written.
-    """
+    """A log that is begun or, with `resume`, read and continued."""
     text = described(problem, optimiser)
     if not resume:
         with ReplacedFile(path, new=True) as file:

@@ -313,9 +313,6 @@ def starting_points(problem: FitProblem, shares: Float[np.ndarray, "k n"], range
     A parameter's side of the cube is its range, if it has one, else its prior's distribution, else from bound to
     bound, else from a tenth to ten times the first guess of a positive one, and one coordinate to each side of any
     other. The range of a positive parameter is one of its logarithm.
-
-    Raises:
-        ValueError: a range of no parameter, or outside of its bounds.
     """
     unknown = sorted(set(ranges) - set(problem.names))
     require(not unknown, f"ranges must be of parameters ({', '.join(problem.names)}), got {', '.join(unknown)}.")

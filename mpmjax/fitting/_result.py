@@ -250,11 +250,7 @@ class SettledNoise(NamedTuple):
 
 
 def settle_noise(problem: FitProblem, minimum: Minimum, sigmas: Sigmas) -> SettledNoise:
-    """The noise by the residuals at a minimum that was searched with `sigmas`.
-
-    Raises:
-        ValueError: an observation has too few numbers to estimate its noise.
-    """
+    """The noise by the residuals at a minimum that was searched with `sigmas`."""
     r, J = np.asarray(minimum.r), np.asarray(minimum.J)
     J = J[:, ~at_bound(r, J, np.asarray(problem.room(minimum.z)))]  # what a bound holds fits nothing away
     factors, freedoms, changing = [], [], False
