@@ -214,8 +214,7 @@ def fit_command(
     ] = None,
     resume: Annotated[bool, typer.Option(help="Continue the fit of the log.")] = False,
     refine: Annotated[
-        str | None,
-        typer.Option(metavar="N[,N]", help="Fit on N times as many cells a direction too, and extrapolate."),
+        str | None, typer.Option(metavar="N[,N]", help="Fit on N times as many cells a direction too, and extrapolate.")
     ] = None,
     profiles: Annotated[
         list[str] | None,

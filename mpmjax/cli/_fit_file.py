@@ -249,8 +249,7 @@ def _require_number(path: str, where: str, experiment: Experiment) -> None:
     parent = leaf_of(owner, experiment)
     names = [f.name for f in fields(parent)] if is_dataclass(parent) else []
     require(
-        not names or last in names,
-        f"{where} follows from others and cannot be fitted; name one of {', '.join(names)}.",
+        not names or last in names, f"{where} follows from others and cannot be fitted; name one of {', '.join(names)}."
     )
     number = eqx.is_array_like(value) and np.issubdtype(np.asarray(value).dtype, np.floating)
     require(number, f"{where} must be a number, but is {shortened(repr(value))}.")

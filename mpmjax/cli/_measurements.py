@@ -103,11 +103,7 @@ class Measurement(NamedTuple):
     def check_window(
         self, columns: Columns, x: dict[str, np.ndarray], axes: list[int], grid: Grid | None = None
     ) -> None:
-        """Check that places lie in the window of the scene's grid, if that stays in its place, or on a lattice.
-
-        Raises:
-            ValueError: one does not; its line is named.
-        """
+        """Check that places lie in the window of the scene's grid, if that stays in its place, or on a lattice."""
         window, what = (self.source.scene.grid, "the grid's window") if grid is None else (grid, "the picture's grid")
         if window.follow:
             return
@@ -126,11 +122,7 @@ _HEADER = "[[fit.observation]]"
 
 
 def observation(table: dict[str, Any], source: Source, t1: float) -> tuple[AbstractObservation, AbstractObservation]:
-    """An observation as it is fitted, until t1 [s], and with all that was measured.
-
-    Raises:
-        ValueError: a table that does not fit, or a data file that does not: one line that names the place.
-    """
+    """An observation as it is fitted, until t1 [s], and with all that was measured."""
     kind = table.get("kind")
     there = isinstance(kind, str) and kind in _kinds
     require(there, f"{_HEADER} kind must be one of {', '.join(_kinds)}, got {kind!r}.")

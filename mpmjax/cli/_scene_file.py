@@ -29,7 +29,7 @@ class RunSettings(NamedTuple):
 
     t1: float  # end time [s]
     dt: float | Literal["stable"] | None  # step [s]; None for "auto"
-    method: AbstractIntegrator | None  # none for "auto"
+    method: AbstractIntegrator | None  # None for "auto"
     save_every: int | None  # steps from frame to frame; None if the file does not say
     dtype: str
     error: float  # relative error that "auto" aims at
@@ -144,11 +144,7 @@ def read_simulation(
 
 
 def stable_step(path: Path, file: SceneFile) -> float:
-    """The step of dt = "stable" in a scene file [s].
-
-    Raises:
-        ValueError: as `stable_dt`.
-    """
+    """The step of dt = "stable" in a scene file [s]."""
     assert file.run.method is not None
     try:
         return float(stable_dt(file.scene, file.particles, method=file.run.method, t1=file.run.t1))

@@ -50,8 +50,7 @@ class Columns:
         require(len(rows) > 0, f"{path} has a header and no rows: there is nothing to fit.")
         for line, fields in rows:
             require(
-                len(fields) == len(head),
-                f"{path}, line {line}: {len(fields)} fields, but the header has {len(head)}.",
+                len(fields) == len(head), f"{path}, line {line}: {len(fields)} fields, but the header has {len(head)}."
             )
         self.lines = np.array([line for line, _ in rows])
         """The line of each row, from 1."""
@@ -86,15 +85,7 @@ class Columns:
         return self._data[name]
 
     def require(self, condition: np.ndarray, message: str) -> None:
-        """Check every row.
-
-        Args:
-            condition: whether each row is right.
-            message: for a row that is not; {column} stands for the row's number in that column.
-
-        Raises:
-            ValueError: a row is not right; the first such line is named.
-        """
+        """Check every row; the message names the first line that is not right, {column} its number in that column."""
         wrong = np.flatnonzero(~np.asarray(condition))
         if len(wrong):
             row = {name: f"{column[wrong[0]]:g}" for name, column in self._data.items()}
@@ -102,16 +93,8 @@ class Columns:
             raise ValueError(f"{self.path}, line {self.lines[wrong[0]]}: {text}")
 
     def scaled(self, name: str, unit: float, key: str = "unit") -> np.ndarray:
-        """The numbers of a column in SI units.
-
-        Args:
-            name: the column. A unit with a prefix in its head, "x [mm]" or "stress_MPa", must be the given one.
-            unit: what they are multiplied by.
-            key: what the user calls it.
-
-        Raises:
-            ValueError: the head says another unit.
-        """
+        """The numbers of a column in SI units, multiplied by `unit`, which the user calls `key`. A unit with a prefix
+        in its head, "x [mm]" or "stress_MPa", must be that one."""
         stated = stated_unit(name)
         require(
             stated is None or np.isclose(unit, stated, rtol=1e-9),
@@ -121,17 +104,8 @@ class Columns:
         return self._data[name] * unit
 
     def times(self, name: str, unit: float, t1: float, *, grow: bool = True) -> np.ndarray:
-        """The times [s] of a column, which must lie in a run.
-
-        Args:
-            name: the column.
-            unit: what they are multiplied by.
-            t1: end of the run [s].
-            grow: whether they must grow from row to row.
-
-        Raises:
-            ValueError: they do not.
-        """
+        """The times [s] of a column, multiplied by `unit`, which must lie in a run until t1 [s] and, with `grow`, grow
+        from row to row."""
         times = self.scaled(name, unit, "time_unit")
         read, advice = (f", with time_unit = {unit:g},", "") if unit != 1 else ("", ", or give time_unit")
         self.require(times >= 0, f"{name} {{{name}}} lies before the run, which begins at 0: leave the row out.")
@@ -157,8 +131,8 @@ ROUNDED = 1e-6
 
 def stated_unit(name: str) -> float | None:
     """The factor to SI units that a column's head states, as "x [mm]", "force (kN)" or "stress_MPa"; None if none."""
-    bracketed, underscored = re.search(r"[\[(]\s*(\S+?)\s*[\])]$", name), re.search(r"_([^\W_]+)$", name)
-    match = bracketed or underscored
+    bracketed = re.search(r"[\[(]\s*(\S+?)\s*[\])]$", name)
+    match = bracketed or re.search(r"_([^\W_]+)$", name)
     if match is None:
         return None
     unit = match[1]
@@ -176,11 +150,7 @@ def read_columns(path: Path | str, *names: str) -> list[np.ndarray]:
 
 
 def read_arrays(path: Path, *names: str) -> list[np.ndarray]:
-    """Arrays of numbers in a NumPy archive or an HDF5 file.
-
-    Raises:
-        ValueError: no such file or array, or one that is not numbers.
-    """
+    """Arrays of real numbers in a NumPy archive or an HDF5 file."""
     suffixes = (".npz", ".h5", ".hdf5")
     require(path.suffix in suffixes, f"{path} must be a {', '.join(suffixes)} file with the arrays {', '.join(names)}.")
     try:

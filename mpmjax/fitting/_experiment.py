@@ -58,11 +58,7 @@ class AbstractObservation(eqx.Module):
         """
 
     def explain(self, seen: Any, run: Run) -> None:
-        """Say why a prediction is not finite.
-
-        Raises:
-            ValueError: always, where it is not.
-        """
+        """Raise a `ValueError` that says why a prediction is not finite, where it is not."""
 
     def part_until(self, t1: float) -> "AbstractObservation | None":
         """The part that was measured until a time [s]; None where there is none, or it is not known, as of a curve."""
@@ -75,13 +71,11 @@ class AbstractObservation(eqx.Module):
         require(measured.sum() > 0, f"{name} has no data: it needs a finite number at least.")
         if self.sigma is not None:
             require_positive(f"The sigma of {name}", self.sigma)
+            fault = f"The sigma of {name} must fit its data of shape {self.data.shape}, got {np.shape(self.sigma)}."
             try:
-                fits = np.broadcast_shapes(np.shape(self.sigma), self.data.shape) == self.data.shape
+                np.broadcast_to(self.sigma, self.data.shape)
             except ValueError:
-                fits = False
-            require(
-                fits, f"The sigma of {name} must fit its data of shape {self.data.shape}, got {np.shape(self.sigma)}."
-            )
+                raise ValueError(fault) from None
         require_positive(f"The weight of {name}", self.weight)
         if self.robust is not None:
             require_positive(f"The robust limit of {name}", self.robust)
@@ -197,15 +191,9 @@ class Experiment(eqx.Module):
         self, observations: tuple[AbstractObservation, ...], t1: float | int | None = None
     ) -> "Experiment":
         """The experiment with other observations, and to another end."""
-        return Experiment(
-            self.scene,
-            self.particles,
-            t1=self.t1 if t1 is None else t1,
-            dt=self.dt,
-            method=self.method,
-            observations=observations,
-            name=self.name,
-        )
+        same: dict[str, Any] = {"dt": self.dt, "method": self.method, "name": self.name}
+        t1 = self.t1 if t1 is None else t1
+        return Experiment(self.scene, self.particles, t1=t1, observations=observations, **same)
 
     def with_gradient_since(self, before: Particles) -> "Experiment":
         """The experiment with the velocity gradient of the change of velocities that parameters made since `before`. A
@@ -229,7 +217,7 @@ class Experiment(eqx.Module):
     @property
     def observed_shape(self) -> Any:
         """The shape of what its observations need of one state."""
-        return jax.eval_shape(_Observe(self.observations), self.scene, self.particles)
+        return jax.eval_shape(eqx.Partial(_observe, self.observations), self.scene, self.particles)
 
     def run(self, *, adjoint: Any = None, throw: bool = True, checkpoint_bytes: int = 2**28) -> Run:
         """The simulation of it, with what its observations observe after each step (see `simulate`)."""
@@ -239,7 +227,7 @@ class Experiment(eqx.Module):
             t1=self.t1,
             dt=self.dt,
             method=self.method,
-            observe=_Observe(self.observations),
+            observe=eqx.Partial(_observe, self.observations),
             adjoint=adjoint,
             checkpoint_bytes=checkpoint_bytes,
             throw=throw,
@@ -250,25 +238,17 @@ class Experiment(eqx.Module):
         return tuple(o.predict(seen, run) for o, seen in zip(self.observations, run.observed, strict=True))
 
     def explain(self) -> None:
-        """Say why what is observed is not finite.
-
-        Raises:
-            SimulationError: the simulation met a fault.
-            ValueError: an observation is beyond what the simulation reaches.
-        """
+        """Raise the error that says why what is observed is not finite: of the simulation, or of an observation that it
+        does not reach."""
         assert not is_traced(self)
         run = self.run()
         for observation, seen in zip(self.observations, run.observed, strict=True):
             observation.explain(seen, run)
 
 
-class _Observe(eqx.Module):
-    """Observes a state for all observations of an experiment."""
-
-    observations: tuple[AbstractObservation, ...]
-
-    def __call__(self, scene: Scene, particles: Particles) -> tuple[Any, ...]:
-        return tuple(observation.observe(scene, particles) for observation in self.observations)
+def _observe(observations: tuple[AbstractObservation, ...], scene: Scene, particles: Particles) -> tuple[Any, ...]:
+    """The parts of a state that all observations of an experiment need."""
+    return tuple(observation.observe(scene, particles) for observation in observations)
 
 
 _ON_A_STEP = 1e-6  # part of a step by which a time may lie after it and is on it

@@ -170,8 +170,8 @@ def _searched(
     """The minimum and the noise, in rounds. A log is continued, and gets each iteration."""
     end = None if log is None else log.end
     rounds, earlier, sigmas, state, seconds_before = (0, (), problem.first_sigmas, None, 0.0) if end is None else end
-    lines, begun = Progress(problem, optimiser, progress), time.perf_counter() - seconds_before
-    lines.begin(0 if state is None else len(earlier) + len(state.history))
+    begun, done = time.perf_counter() - seconds_before, 0 if state is None else len(earlier) + len(state.history)
+    lines = None if progress is None else Progress(problem, optimiser, progress, done)
 
     def minimise(number: int, _: Any, starts: list[Coordinates], noise: list[Sigmas]) -> list[Minimum]:
         (z,), (sigmas,) = starts, noise
@@ -180,7 +180,8 @@ def _searched(
             seconds = time.perf_counter() - begun
             if log is not None:
                 log.append(sigmas, state, seconds)
-            lines(state, seconds)
+            if lines is not None:
+                lines(state, seconds)
 
         try:
             minimum = search(
@@ -205,11 +206,7 @@ def _searched(
 
 
 def require_influence(problem: FitProblem, sigmas: Sigmas, seen: Evaluation) -> None:
-    """Check that the data depend on every coordinate, at the first guess.
-
-    Raises:
-        ValueError: they do not.
-    """
+    """Check that the data depend on every coordinate, at the first guess."""
     rounding = _ROUNDINGS * float(jnp.finfo(problem.dtype).eps) * float(problem.size_of_data(sigmas))
     if seen.jacobian is None:
         # |Jᵀr| ≤ ‖r‖ times a column's length: where it is not small, the column is not.

@@ -67,7 +67,7 @@ class FitLog:
         self._values = [self._numbers(i) for r in rounds for i in r.search.history]
 
     @property
-    def end(self) -> tuple[int, tuple[Iteration, ...], tuple[Array, ...], SearchState, float] | None:
+    def end(self) -> tuple[int, tuple[Iteration, ...], Sigmas, SearchState, float] | None:
         """Number of rounds before the last one, and their iterations; noise of the last one, its search, and when its
         last iteration was done, since the fit began [s]. None if there is no iteration."""
         if not self._rounds:
@@ -76,24 +76,15 @@ class FitLog:
         return len(done), tuple(i for r in done for i in r.search.history), last.sigmas, last.search, last.seconds[-1]
 
     def append(self, sigmas: Sigmas, state: SearchState, seconds: float) -> None:
-        """Write an iteration: the noise of its round, the search after it, and the seconds since the fit began.
-
-        Raises:
-            OSError: the disk refused; the log is what it was.
-        """
-        past: tuple[float, ...] = ()
-        if len(state.history) > 1:
-            past = self._rounds.pop().seconds
+        """Write an iteration: the noise of its round, the search after it, and the seconds since the fit began."""
+        *earlier, last = state.history
+        past = self._rounds.pop().seconds if earlier else ()
         self._rounds.append(_Round(sigmas, state, (*past, seconds)))
-        self._values.append(self._numbers(state.history[len(state.history) - 1]))
+        self._values.append(self._numbers(last))
         self.write()
 
     def write(self) -> None:
-        """Write the file.
-
-        Raises:
-            OSError: the disk refused; the log is what it was.
-        """
+        """Write the file; if the disk refuses, the log is what it was."""
         whole = io.BytesIO()
         with h5py.File(whole, "w", libver=("v110", "v110")) as file:
             self._fill(file)
@@ -112,43 +103,43 @@ class FitLog:
         return np.asarray(self._problem.numbers(jnp.asarray(iteration.z, self._problem.dtype)), float)
 
     def _fill(self, file: Any) -> None:
-        problem, n = self._problem, self._problem.size
+        rounds, n = self._rounds, self._problem.size
+
+        def put(name: str, data: np.ndarray) -> None:
+            """A dataset, with checksums where it has data."""
+            checked = {"chunks": data.shape, "fletcher32": True} if data.ndim and data.size else {}
+            file.create_dataset(name, data=data, **checked)
+
         for name, text in {"kind": "mpmjax fit log", "version": version("mpmjax")}.items():
             file.attrs[name] = np.bytes_(text)
         file.attrs["format"] = np.int64(_FORMAT)
-        _put(file, "problem", np.frombuffer(json.dumps(self._text).encode(), np.uint8))
+        put("problem", np.frombuffer(json.dumps(self._text).encode(), np.uint8))
         rows = [
             (number, i.number, i.cost, i.gradient, i.accepted, seconds)
-            for number, r in enumerate(self._rounds)
+            for number, r in enumerate(rounds)
             for i, seconds in zip(r.search.history, r.seconds, strict=True)
         ]
-        _put(file, "iterations", np.array(rows, _ROW))
-        z = [i.z for r in self._rounds for i in r.search.history]
-        _put(file, "coordinates", np.array(z).reshape(-1, n))
-        _put(file, "values", np.array(self._values).reshape(-1, n))
-        file["values"].attrs["labels"] = json.dumps(problem.labels)
-        for k, observation in enumerate(problem.observations):
-            shape = np.shape(self._rounds[0].sigmas[k]) if self._rounds else ()
-            sigmas = [np.asarray(r.sigmas[k]) for r in self._rounds]
-            _put(file, f"noise/{k}", np.array(sigmas, None if sigmas else float).reshape(-1, *shape))
+        put("iterations", np.array(rows, _ROW))
+        put("coordinates", np.array([i.z for r in rounds for i in r.search.history]).reshape(-1, n))
+        put("values", np.array(self._values).reshape(-1, n))
+        file["values"].attrs["labels"] = json.dumps(self._problem.labels)
+        for k, observation in enumerate(self._problem.observations):
+            sigmas = [np.asarray(r.sigmas[k]) for r in rounds]
+            shape = sigmas[0].shape if rounds else ()
+            put(f"noise/{k}", np.array(sigmas, None if rounds else float).reshape(-1, *shape))
             file[f"noise/{k}"].attrs["name"] = observation.name
-        if self._rounds:
-            _, inner, seen, _ = self._rounds[-1].search
+        if rounds:
+            _, inner, seen, _ = rounds[-1].search
             for k, leaf in enumerate(jax.tree.leaves(eqx.filter(inner, eqx.is_array))):
-                _put(file, f"resume/state/{k}", np.asarray(leaf))
+                put(f"resume/state/{k}", np.asarray(leaf))
             for name, leaf in seen._asdict().items():
                 if leaf is not None:
-                    _put(file, f"resume/seen/{name}", np.asarray(leaf))
+                    put(f"resume/seen/{name}", np.asarray(leaf))
 
 
 @contextmanager
 def opened_log(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, *, resume: bool) -> Iterator[FitLog]:
-    """A log that is begun or, with `resume`, read and continued.
-
-    Raises:
-        ValueError: a file that is there or, with `resume`, is not, is damaged, no log, the log of another fit, or being
-            written.
-    """
+    """A log that is begun or, with `resume`, read and continued."""
     text = described(problem, optimiser)
     if not resume:
         with ReplacedFile(path, new=True) as file:
@@ -162,11 +153,8 @@ def opened_log(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, *,
 
 
 def _read(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, text: dict[str, str]) -> list[_Round]:
-    """The rounds in a log.
-
-    Raises:
-        ValueError: see `opened_log`.
-    """
+    """The rounds in a log, which must be whole and of the same fit."""
+    damaged = f"{path} is damaged ({{}}): begin the fit anew with another log."
     try:
         data = path.read_bytes()
         with h5py.File(io.BytesIO(data), "r") as file:
@@ -179,14 +167,20 @@ def _read(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, text: d
             arrays = {item.name.lstrip("/"): np.asarray(item[()]) for item in datasets if whole}
         theirs = json.loads(arrays["problem"].tobytes()) if layout == _FORMAT else {}
     except (OSError, KeyError, ValueError, RuntimeError, MemoryError) as error:
-        raise ValueError(f"{path} is damaged ({reason(error)}): begin the fit anew with another log.") from None
+        raise ValueError(damaged.format(reason(error))) from None
     require(is_log, f"{path} is not the log of a fit: check its name.")
     require(layout == _FORMAT, f"{path} is a log of format {layout}, this mpmjax reads {_FORMAT}: begin the fit anew.")
-    _require_same(path, text, theirs)
+    for name in (*theirs, *text):
+        here, there = text.get(name, "none"), theirs.get(name, "none")
+        require(
+            here == there,
+            f"{path} is the log of another fit: {name} is {there} there and {here} here. Resume the same fit, or name "
+            "a new log.",
+        )
     try:
         return _rounds(arrays, problem, optimiser)
     except (KeyError, IndexError, TypeError) as error:
-        raise ValueError(f"{path} is damaged ({reason(error)}): begin the fit anew with another log.") from None
+        raise ValueError(damaged.format(reason(error))) from None
 
 
 def _rounds(arrays: dict[str, np.ndarray], problem: FitProblem, optimiser: AbstractOptimiser) -> list[_Round]:
@@ -195,10 +189,8 @@ def _rounds(arrays: dict[str, np.ndarray], problem: FitProblem, optimiser: Abstr
     rounds = []
     for number in range(int(rows["round"][-1]) + 1 if len(rows) else 0):
         at = np.flatnonzero(rows["round"] == number)
-        history = tuple(
-            Iteration(*rows[["number", "cost", "gradient", "accepted"]][k].item(), places[k])  # pyright: ignore[reportCallIssue]
-            for k in at
-        )
+        numbers = rows[["number", "cost", "gradient", "accepted"]][at]
+        history = tuple(Iteration(*row.item(), z) for row, z in zip(numbers, places[at], strict=True))  # pyright: ignore[reportCallIssue]
         sigmas = tuple(jnp.asarray(arrays[f"noise/{k}"][number]) for k in range(len(problem.observations)))
         names = [name for name in Evaluation._fields if f"resume/seen/{name}" in arrays]
         seen = Evaluation(**{name: jnp.asarray(arrays[f"resume/seen/{name}"]) for name in names})
@@ -207,10 +199,10 @@ def _rounds(arrays: dict[str, np.ndarray], problem: FitProblem, optimiser: Abstr
     if rounds:
         last = rounds[-1]
         like = eqx.filter_eval_shape(begin, problem, optimiser, jnp.zeros(problem.size), last.sigmas)
-        numbers, rest = eqx.partition(like, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
-        leaves, shape = jax.tree.flatten(numbers)
+        shapes, rest = eqx.partition(like, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
+        leaves, tree = jax.tree.flatten(shapes)
         read = [_like(leaf, arrays[f"resume/state/{k}"]) for k, leaf in enumerate(leaves)]
-        inner = eqx.combine(jax.tree.unflatten(shape, read), rest)
+        inner = eqx.combine(jax.tree.unflatten(tree, read), rest)
         rounds[-1] = last._replace(search=last.search._replace(inner=inner))
     return rounds
 
@@ -220,22 +212,6 @@ def _like(leaf: Any, data: np.ndarray) -> Array:
     if (data.shape, data.dtype) != (leaf.shape, leaf.dtype):
         raise TypeError(f"the optimiser remembers {leaf.shape} of {leaf.dtype}, not {data.shape} of {data.dtype}")
     return jnp.asarray(data.item() if leaf.weak_type and data.ndim == 0 else data)
-
-
-def _put(file: Any, name: str, data: np.ndarray) -> None:
-    """A dataset, with checksums where it has data."""
-    checked = {"chunks": data.shape, "fletcher32": True} if data.ndim and data.size else {}
-    file.create_dataset(name, data=data, **checked)
-
-
-def _require_same(path: Path, ours: dict[str, str], theirs: dict[str, str]) -> None:
-    for name in (*theirs, *ours):
-        here, there = ours.get(name, "none"), theirs.get(name, "none")
-        require(
-            here == there,
-            f"{path} is the log of another fit: {name} is {there} there and {here} here. Resume the same fit, or name "
-            "a new log.",
-        )
 
 
 def described(problem: FitProblem, optimiser: AbstractOptimiser) -> dict[str, str]:
@@ -289,7 +265,10 @@ def _texts(value: Any, path: str) -> Iterator[tuple[str, str]]:
         case partial():
             yield from _texts((value.func, *value.args, *value.keywords.values()), path)
         case _ if eqx.is_array_like(value) or isinstance(value, (tuple, list)):
-            yield path, _array(np.asarray(value))
+            data = np.asarray(value)
+            digest = _digest(repr(data.dtype).encode() + np.ascontiguousarray(data).tobytes())
+            whole = f"an array of shape {data.shape} ({digest})"
+            yield path, repr(data.tolist()) if data.size <= _MOST else whole
         case _ if callable(value):
             code = getattr(value, "__code__", None)
             digest = f" of code {_digest(_code(code))}" if code is not None else ""
@@ -303,23 +282,13 @@ def _texts(value: Any, path: str) -> Iterator[tuple[str, str]]:
             yield path, type(value).__qualname__
 
 
-def _array(data: np.ndarray) -> str:
-    if data.size <= _MOST:
-        return repr(data.tolist())
-    return (
-        f"an array of shape {data.shape} ({_digest(repr(data.dtype).encode() + np.ascontiguousarray(data).tobytes())})"
-    )
-
-
 def _code(code: CodeType) -> bytes:
-    """The code of a function, without the place where it stands."""
-    constants = [_code(c) if isinstance(c, CodeType) else repr(_ordered(c)).encode() for c in code.co_consts]
+    """The code of a function, without the place where it stands; sets in an order that each process has."""
+    constants = [
+        _code(c) if isinstance(c, CodeType) else repr(sorted(c, key=repr) if isinstance(c, frozenset) else c).encode()
+        for c in code.co_consts
+    ]
     return b"\0".join([code.co_code, repr(code.co_names).encode(), *constants])
-
-
-def _ordered(constant: Any) -> Any:
-    """A constant whose text is the same in each process."""
-    return sorted(constant, key=repr) if isinstance(constant, frozenset) else constant
 
 
 def _digest(data: bytes) -> str:
@@ -334,33 +303,25 @@ class Progress:
     it is known and falls; else at most those up to `max_steps`.
     """
 
-    def __init__(self, problem: FitProblem, optimiser: AbstractOptimiser, say: Callable[[str], None] | None):
+    def __init__(self, problem: FitProblem, optimiser: AbstractOptimiser, say: Callable[[str], None], done: int):
+        """Say that the first iteration begins, which is compiled before; a log may hold iterations that are done."""
         self._problem, self._optimiser, self._say = problem, optimiser, say
         self._durations: list[float] = []
         self._distances: list[float] = []
         self._last = time.perf_counter()
-
-    def begin(self, done: int) -> None:
-        """Say that the first iteration begins, which is compiled before; a log may hold iterations that are done."""
-        if self._say is None:
-            return
-        labels, problem = self._problem.labels, self._problem
-        named = ", ".join(labels[:SHOWN]) + (", …" if len(labels) > SHOWN else "")
+        named = ", ".join(problem.labels[:SHOWN]) + (", …" if problem.size > SHOWN else "")
         after = f" after {done} iterations of the log" if done else ""
         count = f"{problem.size} number{'s' * (problem.size > 1)}"
-        self._say(f"compiling the fit of {count} ({named}) to {problem.points} that were measured{after}")
+        say(f"compiling the fit of {count} ({named}) to {problem.points} that were measured{after}")
 
     def __call__(self, state: SearchState, seconds: float) -> None:
         """Say where the search stands after an iteration, and so many seconds since the fit began."""
-        iteration = state.history[-1]
+        iteration, now = state.history[-1], time.perf_counter()
         if iteration.number == 0:
             self._distances = []
-        now = time.perf_counter()
         self._durations.append(now - self._last)
         self._distances.append(self._optimiser.distance(state.inner, state.seen))
         self._last = now
-        if self._say is None:
-            return
         self._say(
             f"{iteration.number:4d}  misfit {2 * iteration.cost:10.4g}  gradient {iteration.gradient:8.2g}  "
             f"{self._problem.shown(iteration.z)}  {_clock(seconds)}{self._left(len(state.history))}"

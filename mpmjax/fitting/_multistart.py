@@ -19,7 +19,7 @@ from mpmjax.fitting._fit import chosen_optimiser, fit, require_influence
 from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
-from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, label_cells, restarted, table, value_cells
+from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, restarted, table_of_minima
 from mpmjax.fitting._search import Member, Minimum, Problems, batch_size, counted, search_many
 
 Ranges = Mapping[str, tuple[float, float]]  # lowest and highest value to start from, by the name of a parameter
@@ -71,13 +71,11 @@ class MultistartFit(AbstractFit):
 
     def __str__(self) -> str:
         """The table of the best fit, then one of the minima."""
-        rows = [
-            (f"{len(m.members):>24}", f"{m.searches:>8}", f"{m.misfit:>10.4g}", *value_cells(m.values))
-            for m in self.minima[:_SHOWN]
-        ]
-        head = f"{'points':>24}", "searches", f"{'misfit/σ':>10}", *label_cells(self.best.problem)
+        minima, labels = self.minima[:_SHOWN], self.best.problem.labels
+        cells = [(f"{len(m.members):>24}", f"{m.searches:>8}") for m in minima]
         counts = f"{self.count} points, {len(self.searched)} searches, {self.iterations} iterations"
-        lines = [str(self.best), "", counts, *table(head, *rows)]
+        rows = table_of_minima((f"{'points':>24}", "searches"), cells, minima, labels)
+        lines = [str(self.best), "", counts, *rows]
         if len(self.minima) > _SHOWN:
             lines.append(f"and {len(self.minima) - _SHOWN} minima with a larger misfit.")
         if self.unfinished:
@@ -315,9 +313,6 @@ def starting_points(problem: FitProblem, shares: Float[np.ndarray, "k n"], range
     A parameter's side of the cube is its range, if it has one, else its prior's distribution, else from bound to
     bound, else from a tenth to ten times the first guess of a positive one, and one coordinate to each side of any
     other. The range of a positive parameter is one of its logarithm.
-
-    Raises:
-        ValueError: a range of no parameter, or outside of its bounds.
     """
     unknown = sorted(set(ranges) - set(problem.names))
     require(not unknown, f"ranges must be of parameters ({', '.join(problem.names)}), got {', '.join(unknown)}.")

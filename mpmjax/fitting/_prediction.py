@@ -82,22 +82,17 @@ def predict(
         require_positive("predict's sigma", sigma)
         require(np.size(sigma) > 0, "predict's sigma must be a number or an array of numbers, got an empty one.")
     try:
-        value, J = _linearised(problem, _Function(of, experiment), _coordinates(result))
+        (value,), (J,) = _linearised(problem, eqx.Partial(_of_one, of, experiment), _coordinates(result))
     except TypeError as error:
         if "custom_vjp" not in str(error):
             raise
         raise ValueError(
             "What is predicted has no derivative by forward mode: give the runs in it adjoint=diffrax.ForwardMode()."
         ) from None
-    (value,), (J,) = value, J
-    noise = None
+    noise = None if sigma is None else _broadcast(sigma, value.shape)
     if sigma is not None:
-        shape = np.shape(sigma)
-        fits = len(shape) <= value.ndim and all(
-            a in (1, b) for a, b in zip(shape[::-1], value.shape[::-1], strict=False)
-        )
-        require(fits, f"predict's sigma must fit what is predicted, of shape {value.shape}, got shape {shape}.")
-        noise = np.broadcast_to(np.asarray(sigma, float), value.shape)
+        fault = f"predict's sigma must fit what is predicted, of shape {value.shape}, got shape {np.shape(sigma)}."
+        require(noise is not None, fault)
     return _prediction(result, value, J, noise, None, level)
 
 
@@ -135,7 +130,7 @@ def predict_observations(
         linearised = _from_residuals(result)
     else:
         asked = tuple(e.with_observations(a.observations, a.t1) for e, a in zip(fitted, asked, strict=True))
-        linearised = _linearised(result.problem, _Observed(asked), _coordinates(result))
+        linearised = _linearised(result.problem, eqx.Partial(_observed, asked), _coordinates(result))
     numbers = iter(range(len(observations)))
     estimated = [None if is_given else next(numbers) for is_given in result.problem.noise_is_given]
     return tuple(
@@ -154,30 +149,22 @@ def _from_residuals(result: FitResult) -> tuple[tuple[np.ndarray, ...], tuple[np
     return tuple(values), tuple(derivatives)
 
 
-class _Function(eqx.Module):
+def _of_one(
+    of: Callable[[Experiment], Any], experiment: Experiment | int, problem: FitProblem, z: Coordinates
+) -> tuple[Array, ...]:
     """A function of one experiment with the parameters put in."""
-
-    of: Callable[[Experiment], Any]
-    experiment: Experiment | int = eqx.field()
-
-    def __call__(self, problem: FitProblem, z: Coordinates) -> tuple[Array, ...]:
-        e = self.experiment
-        fitted = problem.put(e, z, None) if isinstance(e, Experiment) else problem.at(z)[e]
-        return (jnp.asarray(self.of(fitted), problem.dtype),)
+    e = problem.put(experiment, z, None) if isinstance(experiment, Experiment) else problem.at(z)[experiment]
+    return (jnp.asarray(of(e), problem.dtype),)
 
 
-class _Observed(eqx.Module):
+def _observed(experiments: tuple[Experiment, ...], problem: FitProblem, z: Coordinates) -> tuple[Array, ...]:
     """Predictions of the observations of some experiments, NaN where a run fails."""
-
-    experiments: tuple[Experiment, ...]
-
-    def __call__(self, problem: FitProblem, z: Coordinates) -> tuple[Array, ...]:
-        predicted = []
-        for number, experiment in enumerate(self.experiments):
-            fitted = problem.put(experiment, z, number)
-            run = fitted.run(adjoint=diffrax.ForwardMode(), throw=False)
-            predicted += [jnp.where(run.statistics.healthy, p, jnp.nan) for p in fitted.predictions(run)]
-        return tuple(predicted)
+    predicted = []
+    for number, experiment in enumerate(experiments):
+        fitted = problem.put(experiment, z, number)
+        run = fitted.run(adjoint=diffrax.ForwardMode(), throw=False)
+        predicted += [jnp.where(run.statistics.healthy, p, jnp.nan) for p in fitted.predictions(run)]
+    return tuple(predicted)
 
 
 @eqx.filter_jit
@@ -197,14 +184,20 @@ def _coordinates(result: FitResult) -> Coordinates:
     return jnp.asarray(result.z, result.problem.dtype)
 
 
+def _broadcast(sigma: Any, shape: tuple[int, ...]) -> np.ndarray | None:
+    """A noise of this shape; None if it does not fit."""
+    try:
+        return np.broadcast_to(np.asarray(sigma, float), shape)
+    except ValueError:
+        return None
+
+
 def _noise(observation: AbstractObservation, fitted: Array, shape: tuple[int, ...]) -> np.ndarray:
     """The noise of new measurements: the observation's own, or that of the fitted one, its root mean square where the
     shapes differ."""
     sigma = np.asarray(fitted if observation.sigma is None else observation.sigma, float)
-    try:
-        return np.broadcast_to(sigma, shape)
-    except ValueError:
-        return np.full(shape, np.sqrt((sigma**2).mean()))
+    noise = _broadcast(sigma, shape)
+    return np.full(shape, np.sqrt((sigma**2).mean())) if noise is None else noise
 
 
 def _prediction(

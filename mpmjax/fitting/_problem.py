@@ -109,11 +109,11 @@ class FitProblem(eqx.Module):
     @property
     def labels(self) -> tuple[str, ...]:
         """A name for each coordinate: that of its parameter, with an index where that has several."""
-        labels = []
-        for name, start in zip(self.names, self.starts, strict=True):
-            places = np.ndindex(start.shape)
-            labels += [name if start.ndim == 0 else f"{name}[{', '.join(map(str, place))}]" for place in places]
-        return tuple(labels)
+        return tuple(
+            f"{name}[{', '.join(map(str, place))}]" if place else name
+            for name, start in zip(self.names, self.starts, strict=True)
+            for place in np.ndindex(start.shape)
+        )
 
     @property
     def scales_alike(self) -> bool:
@@ -122,10 +122,14 @@ class FitProblem(eqx.Module):
         return not others and not priors and first.robust is None
 
     @property
+    def owners(self) -> tuple[AbstractParameter, ...]:
+        """The parameter of each coordinate."""
+        return tuple(p for p, start in zip(self.parameters, self.starts, strict=True) for _ in range(start.size))
+
+    @property
     def logarithmic(self) -> tuple[bool, ...]:
         """Whether each coordinate is the logarithm of its value."""
-        each = zip(self.parameters, self.starts, strict=True)
-        return tuple(parameter.logarithmic for parameter, start in each for _ in range(start.size))
+        return tuple(parameter.logarithmic for parameter in self.owners)
 
     def size_of_data(self, sigmas: Sigmas) -> Array:
         """√Σ (data/σ)², the size of what the residuals are the difference of [-]."""
@@ -193,13 +197,8 @@ class FitProblem(eqx.Module):
         return tuple(self.put(experiment, z, number) for number, experiment in enumerate(self.experiments))
 
     def put(self, experiment: Experiment, z: Coordinates, number: int | None) -> Experiment:
-        """An experiment with these values.
-
-        Args:
-            experiment: any one.
-            z: the coordinates.
-            number: the experiment of which it has the parameters; None for those that belong to all experiments.
-        """
+        """Any experiment with these values: the parameters of the experiment of a number, or with None those that
+        belong to all experiments."""
         before = experiment.particles
         for parameter, value in zip(self.parameters, self.values(z), strict=True):
             if parameter.only is None or number in parameter.only:
@@ -208,13 +207,8 @@ class FitProblem(eqx.Module):
 
     def residuals(self, z: Coordinates, sigmas: Sigmas, adjoint: Any) -> tuple[Array, Array]:
         """The residuals of all observations, then of priors [-], shape (m,), NaN where a simulation met a fault or does
-        not reach a measurement; and what tangent solves report (see `Run.report`).
-
-        Args:
-            z: the coordinates.
-            sigmas: the noise of each observation.
-            adjoint: how diffrax differentiates; None for reverse mode within the memory.
-        """
+        not reach a measurement; and what tangent solves report (see `Run.report`). `adjoint` is how diffrax
+        differentiates, None reverse mode within the memory."""
         parts, reports, noise = [], [], iter(sigmas)
         for experiment in self.at(z):
             run = experiment.run(adjoint=adjoint, throw=False, checkpoint_bytes=self.memory)
@@ -245,11 +239,8 @@ class FitProblem(eqx.Module):
     def explain(
         self, z: Coordinates, failure: str = "What is observed of the simulation at the first guess is not finite."
     ) -> NoReturn:
-        """Say why a fit fails at z: by the simulation, else by `failure`.
-
-        Raises:
-            SimulationError, ValueError: always, see `Experiment.explain`.
-        """
+        """Raise the error that says why a fit fails at z: of the simulation (see `Experiment.explain`), else with
+        `failure`."""
         for experiment in self.at(z):
             experiment.explain()
         raise ValueError(failure)
@@ -258,17 +249,14 @@ class FitProblem(eqx.Module):
         self, z: Coordinates, sigmas: Sigmas, mode: Literal["forward", "reverse"] | None = None
     ) -> tuple[Array, Array]:
         """The residuals and their derivative by the coordinates, shape (m, n). NaN where a tangent or adjoint solve did
-        not converge.
-
-        Args:
-            z: the coordinates.
-            sigmas: the noise of each observation.
-            mode: "forward": the simulation once, and beside it, in the same pass, the tangents of the coordinates;
-                "reverse": a pass back for each measured number. As many at once as the memory holds. Default: what
-                costs less.
-        """
+        not converge. The mode is "forward", the simulation once and beside it, in the same pass, the tangents of the
+        coordinates, or "reverse", a pass back for each measured number, as many at once as the memory holds; default:
+        what costs less."""
         if (self.cheaper_mode if mode is None else mode) == "reverse":
-            return self._jacobian_by_rows(z, sigmas)
+            r, pull, _ = jax.vjp(lambda z: self.residuals(z, sigmas, None), z, has_aux=True)
+            units = jnp.eye(self.measured, len(r), dtype=r.dtype)  # priors need no simulation
+            _, (rows,) = in_batches(lambda unit: ((), pull(unit)), units, self.at_once)
+            return r, jnp.concatenate([rows, jax.jacfwd(self.prior_residuals)(z)])
 
         def push(tangent: Coordinates) -> tuple[Array, tuple[Array, Array]]:
             evaluate = partial(self.residuals, sigmas=sigmas, adjoint=diffrax.ForwardMode())
@@ -277,14 +265,6 @@ class FitProblem(eqx.Module):
 
         r, (columns, unsolved) = in_batches(push, jnp.eye(self.size, dtype=z.dtype), self.at_once)
         return r, jnp.where((unsolved != 0).any(), jnp.nan, columns.T)
-
-    def _jacobian_by_rows(self, z: Coordinates, sigmas: Sigmas) -> tuple[Array, Array]:
-        """`jacobian` by a pass back for each measured number; priors need no simulation."""
-        r, pull, _ = jax.vjp(lambda z: self.residuals(z, sigmas, None), z, has_aux=True)
-        _, (rows,) = in_batches(
-            lambda unit: ((), pull(unit)), jnp.eye(self.measured, len(r), dtype=r.dtype), self.at_once
-        )
-        return r, jnp.concatenate([rows, jax.jacfwd(self.prior_residuals)(z)])
 
     @property
     def cheaper_mode(self) -> Literal["forward", "reverse"]:
@@ -299,11 +279,7 @@ class FitProblem(eqx.Module):
 
 
 def _first_guess(name: str, parameter: AbstractParameter, experiment: Experiment) -> Array:
-    """The first guess of a parameter, which must be a number or an array of the experiment.
-
-    Raises:
-        ValueError: it is not, or putting another value there changes nothing.
-    """
+    """The first guess of a parameter, which must be a number or an array of the experiment."""
     try:
         start = parameter.first_guess(experiment)
         changed = parameter.put(experiment, start + 1 + jnp.abs(start))

@@ -120,10 +120,7 @@ def profile(
         ValueError: there is no such fitted number; a level that is none.
     """
     problem = result.problem
-    require(
-        label in problem.labels,
-        f"A profile is of a fitted number: {', '.join(problem.labels)}. Got {label!r}.",
-    )
+    require(label in problem.labels, f"A profile is of a fitted number: {', '.join(problem.labels)}. Got {label!r}.")
     level = checked_level(result.level if level is None else level)
     require_whole("profile's points", points, 1)
     require_positive("profile's rtol", rtol)
@@ -157,7 +154,7 @@ def profile(
     )
 
 
-class RestrictedProblem(FitProblem):
+class _RestrictedProblem(FitProblem):
     """A problem on a plane of its coordinates, z = origin + basis y, as a function of y. Both are arrays: another plane
     of as many dimensions does not compile anew."""
 
@@ -227,9 +224,13 @@ class _Walk:
         self.least = self._misfit(z)
         self.start = _Point(z, 0.0)
         self.visited = [self.start]
-        self.rate = _direction(result, at)
-        self.error = float(result.uncertainty.error[at])
-        self.pace = self.error if np.isfinite(self.error) else min(float(result.uncertainty.alone[at]), 1.0)
+        errors, unit = result.uncertainty, np.eye(result.problem.size)[at]
+        self.error = float(errors.error[at])
+        # How the other coordinates follow this one when it is moved, by the covariance.
+        blind = errors.unseen.shape[1] and np.isinf(self.error)
+        along = errors.unseen @ (errors.unseen.T @ unit) if blind else errors.inverse @ unit
+        self.rate = along / along[at]
+        self.pace = self.error if np.isfinite(self.error) else min(float(errors.alone[at]), 1.0)
         if np.isfinite(result.problem.room(jnp.asarray(result.z, result.problem.dtype))[:, at]).any():
             # Away from a bound, a step of the coordinate that moves the value by its standard error.
             self.pace = float(np.log1p(self.pace))
@@ -307,9 +308,8 @@ class _Walk:
                 )
             if np.isfinite(end.at):
                 continue
-            beyond = ""
-            if end.fault is not None:
-                beyond = f" Beyond, at {self.value(end.fault):.5g}, the simulation fails."
+            fault = end.fault
+            beyond = "" if fault is None else f" Beyond, at {self.value(fault):.5g}, the simulation fails."
             texts.append(
                 f"{self.label}: the interval is open {where}. At {value:.5g} Δχ² is {max(end.last.growth, 0):.2g}, "
                 f"less than {reach**2:.3g}: the data do not bound it.{beyond}"
@@ -356,7 +356,7 @@ class _Walk:
             return guess, self._misfit(guess)
         problem = self.problem
         basis = np.delete(np.eye(len(guess)), self.at, axis=1)
-        held = RestrictedProblem(problem, jnp.asarray(guess, problem.dtype), jnp.asarray(basis, problem.dtype))
+        held = _RestrictedProblem(problem, jnp.asarray(guess, problem.dtype), jnp.asarray(basis, problem.dtype))
         minimum = search(held, self.optimiser, jnp.zeros(basis.shape[1], problem.dtype), self.sigmas)
         if minimum.interrupted:
             raise KeyboardInterrupt
@@ -374,14 +374,6 @@ class _Walk:
 def _residuals(problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> Array:
     """The residuals, compiled."""
     return problem.residuals(z, sigmas, None)[0]
-
-
-def _direction(result: FitResult, at: int) -> np.ndarray:
-    """How the other coordinates follow one that is moved, by the covariance, shape (n,)."""
-    errors, unit = result.uncertainty, np.eye(result.problem.size)[at]
-    blind = errors.unseen.shape[1] and np.isinf(errors.error[at])
-    along = errors.unseen @ (errors.unseen.T @ unit) if blind else errors.inverse @ unit
-    return along / along[at]
 
 
 _FARTHEST = 14.0

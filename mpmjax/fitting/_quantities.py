@@ -88,15 +88,9 @@ class Markers(eqx.Module):
         return len(self.which)
 
     def check(self, name: str, particles: int) -> None:
-        """Check that the particles are there.
-
-        Raises:
-            ValueError: they are not.
-        """
-        require(
-            (np.asarray(self.which) >= 0) & (np.asarray(self.which) < particles),
-            f"The markers of {name!r} must be numbers of the {particles} particles, from 0.",
-        )
+        """Check that the particles are there."""
+        which, fault = np.asarray(self.which), f"The markers of {name!r} must be numbers of the {particles} particles, "
+        require((which >= 0) & (which < particles), f"{fault}from 0.")
 
     def __call__(self, scene: Scene, particles: Particles) -> Float[Array, "m d"]:
         """Positions [m], shape (m, d)."""

@@ -212,15 +212,15 @@ def table(head: Sequence[str], *rows: Sequence[str]) -> list[str]:
     return ["  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in (head, *rows)]
 
 
-def label_cells(problem: FitProblem) -> list[str]:
-    """The heads of columns of the first fitted numbers."""
-    return [f"{label:>13}" for label in problem.labels[:SHOWN]]
-
-
-def value_cells(values: Mapping[str, np.ndarray]) -> list[str]:
-    """The first fitted numbers, in columns."""
-    numbers = np.concatenate([value.reshape(-1) for value in values.values()])
-    return [f"{number:>13.6g}" for number in numbers[:SHOWN]]
+def table_of_minima(
+    head: Sequence[str], cells: Sequence[Sequence[str]], minima: Any, labels: Sequence[str]
+) -> list[str]:
+    """The lines of a table of minima: cells of each, its misfit, and the first fitted numbers."""
+    rows = []
+    for these, minimum in zip(cells, minima, strict=True):
+        numbers = np.concatenate([value.reshape(-1) for value in minimum.values.values()])
+        rows.append((*these, f"{minimum.misfit:>10.4g}", *(f"{number:>13.6g}" for number in numbers[:SHOWN])))
+    return table((*head, f"{'misfit/σ':>10}", *(f"{label:>13}" for label in labels[:SHOWN])), *rows)
 
 
 def _summary(name: str, shape: tuple[int, ...], each: list[Estimate]) -> str:
@@ -250,11 +250,7 @@ class SettledNoise(NamedTuple):
 
 
 def settle_noise(problem: FitProblem, minimum: Minimum, sigmas: Sigmas) -> SettledNoise:
-    """The noise by the residuals at a minimum that was searched with `sigmas`.
-
-    Raises:
-        ValueError: an observation has too few numbers to estimate its noise.
-    """
+    """The noise by the residuals at a minimum that was searched with `sigmas`."""
     r, J = np.asarray(minimum.r), np.asarray(minimum.J)
     J = J[:, ~at_bound(r, J, np.asarray(problem.room(minimum.z)))]  # what a bound holds fits nothing away
     factors, freedoms, changing = [], [], False
@@ -339,12 +335,10 @@ def _estimates(
     lower, upper = intervals(problem, z, errors, gradient, level)
     start = problem.numbers(jnp.zeros_like(z))
     columns = problem.numbers(z), np.abs(slope) * errors.error, lower, upper, start, held
-    units = [p.unit for p, start in zip(problem.parameters, problem.starts, strict=True) for _ in range(start.size)]
+    rows = zip(problem.labels, problem.owners, *(np.asarray(column).tolist() for column in columns), strict=True)
     return tuple(
-        Estimate(label, value, error, (a, b), unit, start, bound)
-        for label, unit, value, error, a, b, start, bound in zip(
-            problem.labels, units, *(np.asarray(column).tolist() for column in columns), strict=True
-        )
+        Estimate(label, value, error, (a, b), owner.unit, start, bound)
+        for label, owner, value, error, a, b, start, bound in rows
     )
 
 
@@ -373,8 +367,7 @@ def intervals(
         np.where(meets, line, np.where(near, farther(line, curve), curve))
         for line, curve, farther in zip(straight, np.array(list(curved), float), (np.minimum, np.maximum), strict=True)
     )
-    each = zip(problem.parameters, problem.starts, strict=True)
-    ends = np.array([p.domain for p, start in each for _ in range(start.size)]).T
+    ends = np.array([p.domain for p in problem.owners]).T
     return np.clip(lower, *ends), np.clip(upper, *ends)
 
 

@@ -20,16 +20,7 @@ from mpmjax.fitting._observation import Series
 from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
-from mpmjax.fitting._result import (
-    AbstractFit,
-    Estimate,
-    FitResult,
-    NoiseEstimate,
-    label_cells,
-    restarted,
-    table,
-    value_cells,
-)
+from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, NoiseEstimate, restarted, table, table_of_minima
 from mpmjax.fitting._search import begin, iterate, jacobian, search
 from mpmjax.fitting._uncertainty import quantile
 
@@ -67,9 +58,9 @@ class StagedFit(AbstractFit):
 
     def __str__(self) -> str:
         """The remarks, a table of the stages, then that of the last fit."""
-        head = f"{'until [s]':>24}", f"{'misfit/σ':>10}", *label_cells(self.result.problem)
-        rows = [(f"{s.horizon:>24.4g}", f"{s.misfit:>10.4g}", *value_cells(s.values)) for s in self.stages]
-        return "\n".join([*self.remarks, "", *table(head, *rows), "", str(self.result)])
+        cells = [(f"{s.horizon:>24.4g}",) for s in self.stages]
+        rows = table_of_minima((f"{'until [s]':>24}",), cells, self.stages, self.result.problem.labels)
+        return "\n".join([*self.remarks, "", *rows, "", str(self.result)])
 
 
 @checked
@@ -192,7 +183,11 @@ def _first_horizon(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordin
         if isinstance(o, Series):
             times.append(o.times)
             changes.append((J[rows] ** 2).reshape(len(o.times), -1, problem.size).sum(axis=1))
-            motions.append(np.asarray(o.weight) * _motion(o.data, np.asarray(sigma)))
+            data = o.data.reshape(len(o.times), -1)
+            measured, spread = np.isfinite(data), np.broadcast_to(np.asarray(sigma), o.data.shape).reshape(data.shape)
+            first = data[measured.argmax(axis=0), np.arange(data.shape[1])]
+            # Σ ((y − y(0))/σ)² at each time, y(0) the first that was measured of each number
+            motions.append(np.asarray(o.weight) * (np.where(measured, (data - first) / spread, 0) ** 2).sum(axis=1))
     if not times:
         return max(e.t1 for e in problem.experiments)
     order = np.argsort(np.concatenate(times), kind="stable")
@@ -205,15 +200,6 @@ def _first_horizon(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordin
     t, ratio = t[usable], np.sqrt(change[usable] / motion[usable, None])
     bound = np.maximum(1, _GROWN * ratio.min(axis=0))
     return float(min(t[np.flatnonzero(column <= b)[-1]] for column, b in zip(ratio.T, bound, strict=True)))
-
-
-def _motion(data: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Σ ((y − y(0))/σ)² at each time, y(0) the first that was measured of each number, shape (f,)."""
-    rows = data.reshape(len(data), -1)
-    seen = np.isfinite(rows)
-    first = rows[seen.argmax(axis=0), np.arange(rows.shape[1])]
-    spread = np.broadcast_to(sigma, data.shape).reshape(rows.shape)
-    return (np.where(seen, (rows - first) / spread, 0) ** 2).sum(axis=1)
 
 
 class RefinedFit(AbstractFit):
@@ -329,9 +315,7 @@ def fit_refined(
     numbers = numbers[: len(fits)]
     if len(fits) < len(refinements):
         warn(f"The fit on several grids was interrupted: of {len(refinements)} grids it tells of {len(fits)}.")
-    sizes = [(p, fits[-1].values[name].size) for name, p in parameters.items()]
-    kinds: list[AbstractParameter | None] = [p for p, size in sizes for _ in range(size)]
-    kinds += [None] * len(fits[-1].reported)
+    kinds = [*fits[-1].problem.owners, *[None] * len(fits[-1].reported)]
     each = zip(kinds, zip(*(result.all for result in fits), strict=True), strict=True)
     normal = float(quantile(float(level), np.inf))
     missed = _missed(fits[-2].noise, fits[-1].noise, numbers, float(order)) if len(fits) > 1 else 0.0
@@ -359,11 +343,8 @@ def _extrapolate(
     normal: float,
 ) -> tuple[Estimate, float, float]:
     """One number extrapolated from its estimates on the grids, from coarse to fine; the part of its error that is left
-    of the discretisation; and the order, NaN where the estimates do not converge.
-
-    `kind` is its parameter, None if it was reported; `missed` as of `_missed`; `normal` the reach of an interval of the
-    normal distribution, in standard errors.
-    """
+    of the discretisation; and the order, NaN where the estimates do not converge. `kind` is its parameter, None if it
+    was reported; `missed` as of `_missed`; `normal` the reach of a normal interval, in standard errors."""
     last = estimates[-1]
     if len(estimates) == 1:
         return last, float("nan"), float("nan")
@@ -379,9 +360,12 @@ def _extrapolate(
         return float(np.clip(last.value * np.exp(z) if logarithmic else last.value + z, *bounds))
 
     values = np.array([coordinate(e.value) for e in estimates])
-    p = float("nan") if held else _order(values, refinements, order)
-    change = values[-1] - values[-2]
-    ratio = refinements[-1] / refinements[-2]
+    ratio, steps = refinements[-1] / refinements[-2], np.diff(values)
+    p, change = float("nan") if held else order, steps[-1]
+    if len(steps) > 1 and refinements[-1] * refinements[-3] == refinements[-2] ** 2 and change != 0 and not held:
+        # The order that the three finest grids show; none where steps do not shrink.
+        shrinks = steps[-2] / change
+        p = float(np.clip(np.log(shrinks) / np.log(ratio), order / 2, 2 * order)) if shrinks > 1 else float("nan")
     correction = 0.0 if np.isnan(p) else change / (ratio**p - 1)
     value = back(correction)
     hidden = missed / 2 * last.error / (last.value if logarithmic else 1)
@@ -402,20 +386,6 @@ def _extrapolate(
         at_bound=held,
     )
     return estimate, discretisation, p
-
-
-def _order(values: np.ndarray, refinements: list[int], order: float) -> float:
-    """The order that the three finest grids show, if their ratios are one, NaN if they do not converge; with fewer, or
-    other ratios, the one that was given."""
-    if len(values) < 3 or refinements[-1] * refinements[-3] != refinements[-2] ** 2:
-        return order
-    first, second = values[-2] - values[-3], values[-1] - values[-2]
-    if second == 0:
-        return order
-    if first / second <= 1:
-        return float("nan")
-    seen = np.log(first / second) / np.log(refinements[-1] / refinements[-2])
-    return float(np.clip(seen, order / 2, 2 * order))
 
 
 _FIRST = (

@@ -29,8 +29,7 @@ class Uncertainty(NamedTuple):
     """Directions that the data hardly see, a tenth as well as each coordinate alone, one a column, shape (n, w)."""
     spectrum: np.ndarray  # the eigenvalues of the Fisher information JᵀJ, growing, shape (n,)
     directions: np.ndarray  # their eigenvectors, one a column, shape (n, n)
-    parts: tuple[np.ndarray, ...]
-    """For each observation whose noise was estimated, its part of the covariance, shape (n, n)."""
+    parts: tuple[np.ndarray, ...]  # the part of the covariance of each observation whose noise was estimated, (n, n)
     freedoms: tuple[float, ...]  # the degrees of freedom of each of these estimates
 
     @property
@@ -121,15 +120,8 @@ def uncertainty(J: np.ndarray, eps: float, estimated: Sequence[tuple[slice, floa
     weak = (Vt[seen & (values < np.sqrt(1 - _NEARLY_ONE))] / length).T
     spectrum, directions = np.linalg.eigh(J.T @ J)
     parts = tuple(inverse @ J[rows].T @ J[rows] @ inverse for rows, _ in estimated)
-    return Uncertainty(
-        inverse,
-        _unit(unseen),
-        _unit(weak),
-        np.maximum(spectrum, 0),
-        directions,
-        parts,
-        tuple(freedom for _, freedom in estimated),
-    )
+    freedoms = tuple(freedom for _, freedom in estimated)
+    return Uncertainty(inverse, _unit(unseen), _unit(weak), np.maximum(spectrum, 0), directions, parts, freedoms)
 
 
 def _unit(columns: np.ndarray) -> np.ndarray:
