@@ -13,19 +13,21 @@ import jax
 import pytest
 from jaxtyping import install_import_hook
 
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_numpy_dtype_promotion", "strict")
-
-with install_import_hook("mpmjax", "beartype.beartype"):
-    import mpmjax  # noqa: F401
-
 
 def pytest_configure(config: Any) -> None:
-    """Compile the default tests and the thorough ones quickly: half of their time is XLA's. Level 0 takes three tenths
-    off it, the older emitter of loops half of the rest. A run that may hold slow tests, which compute for longer, is
+    """Import the package as tests see it, in processes that run tests: what only hands them out would wait for it.
+
+    The default tests and the thorough ones compile quickly: half of their time is XLA's. Level 0 takes three tenths off
+    it, the older emitter of loops half of the rest. A run that may hold slow tests, which compute for longer, is
     compiled as users' programs are."""
     if "not slow" in config.option.markexpr:
         os.environ["XLA_FLAGS"] = " ".join((os.environ.get("XLA_FLAGS", ""), *QUICK_TO_COMPILE))
+    if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
+        return
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
+    with install_import_hook("mpmjax", "beartype.beartype"):
+        import mpmjax  # noqa: F401
 
 
 QUICK_TO_COMPILE = [

@@ -60,8 +60,7 @@ def test_what_a_solve_does_not_depend_on_has_a_zero_derivative(method):
 
     def end(total):
         loaded = eqx.tree_at(lambda s: s.loads[0].total, scene, total)
-        run = mpm.simulate(loaded, particles, t1=1e-3, dt=1e-3, method=method)
-        return run.final.x.sum()
+        return mpm.step(loaded, particles, 0.0, 1e-3, method=method)[0].x.sum()
 
-    assert jax.grad(end)(3.0) == 0
-    assert jax.jvp(end, (3.0,), (1.0,))[1] == 0
+    assert jax.jit(jax.grad(end))(3.0) == 0
+    assert jax.jit(lambda total: jax.jvp(end, (total,), (1.0,))[1])(3.0) == 0
