@@ -16,7 +16,6 @@ from mpmjax.boundary._boundary import (
     brought_images as brought_images,
     combined_conditions as combined_conditions,
     mirror as mirror,
-    mirror_motion as mirror_motion,
 )
 from mpmjax.boundary._collider import (
     AbstractCollider as AbstractCollider,

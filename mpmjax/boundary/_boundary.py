@@ -20,7 +20,7 @@ from mpmjax.boundary._conditions import Conditions, no_conditions
 from mpmjax.boundary._contact import AbstractContact
 from mpmjax.boundary._surface_contact import Faces, Surface, surface_contact
 from mpmjax.discretisation import Grid
-from mpmjax.potential import Image, Mirror, MirrorMotion, MirrorPlace, Tie
+from mpmjax.potential import Image, Mirror, MirrorPlace, Tie
 
 ON_THE_WALL = 1e-3
 """Distance within which a node is on a wall, in spacings."""
@@ -118,16 +118,10 @@ class AbstractBoundary(eqx.Module):
         del x, t, dt, push_time
         return ()
 
-    def mirror_images(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image | Tie, ...]:
-        """The mirrors that it puts in the window (see `mirror_image`). Default: none."""
-        del grid, window
-        return ()
-
-    def mirror_motion(self, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar) -> MirrorMotion | None:
-        """The velocity that its moving mirrors add to the nodes beyond them in the step from t to t + dt. None if
-        none moves, which is the default."""
+    def mirror_images(self, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar) -> tuple[Image | Tie, ...]:
+        """The mirrors that it puts in the window in the step from t to t + dt (see `mirror_image`). Default: none."""
         del grid, window, t, dt
-        return None
+        return ()
 
     def mirror(self) -> MirrorPlace | None:
         """Where its mirror is. Default: None, it has none.
@@ -251,26 +245,16 @@ def brought_contacts(
     return [(n, contact) for n, contacts in each for contact in contacts]
 
 
-def mirror(boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"]) -> Mirror:
-    """The mirror images that the boundaries of a scene put in the window."""
-    return Mirror(tuple(image for _, image in brought_images(boundaries, grid, window)))
-
-
-def mirror_motion(
-    boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
-) -> MirrorMotion | None:
-    """The velocity that moving mirrors add to the nodes beyond them; None if none moves."""
-    total = None
-    for boundary in boundaries:
-        new = boundary.mirror_motion(grid, window, t, dt)
-        if new is not None and total is not None:
-            new = MirrorMotion(total.beyond | new.beyond, jnp.where(total.beyond, total.velocity, new.velocity))
-        total = total if new is None else new
-    return total
+def mirror(
+    boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"], t: Scalar = 0.0, dt: Scalar = 1.0
+) -> Mirror:
+    """The mirror images that the boundaries of a scene put in the window; t and dt matter for velocities alone."""
+    return Mirror(tuple(image for _, image in brought_images(boundaries, grid, window, t, dt)))
 
 
 def brought_images(
-    boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"]
+    boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
 ) -> list[tuple[int, Image | Tie]]:
     """The images of `mirror`, each with the number of its boundary."""
-    return [(n, image) for n, boundary in enumerate(boundaries) for image in boundary.mirror_images(grid, window)]
+    each = ((n, boundary.mirror_images(grid, window, t, dt)) for n, boundary in enumerate(boundaries))
+    return [(n, image) for n, images in each for image in images]

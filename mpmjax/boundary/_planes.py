@@ -16,7 +16,7 @@ from mpmjax.boundary._surface_contact import Faces, Surface, refuse_contact, sur
 from mpmjax.checks import require, require_between, require_fields, require_finite, require_that
 from mpmjax.discretisation import Grid, scatter
 from mpmjax.geometry import Motion
-from mpmjax.potential import Image, Mirror, MirrorMotion, MirrorPlace, mirror_image
+from mpmjax.potential import Image, Mirror, MirrorPlace, mirror_image
 
 SHUT = 1e-2
 """The gap up to which a plane holds what is before it, in spacings."""
@@ -156,16 +156,10 @@ class SymmetryPlane(AbstractPlane):
             "The grid moves with a SymmetryPlane that moves, so it cannot follow the particles: drop follow=True.",
         )
 
-    def mirror_images(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, ...]:
+    def mirror_images(self, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar) -> tuple[Image, ...]:
         """The mirror image of this plane, in all columns."""
-        return (replace(self.image(grid, window)[0], moving=self.motion is not None),)
-
-    def mirror_motion(self, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar) -> MirrorMotion | None:
-        if self.motion is None:
-            return None
-        image, before = self.image(grid, window)
-        beyond = image.along(before < 0)[:, None] & (jnp.arange(grid.dim) == self.axis)
-        return MirrorMotion(beyond, jnp.where(beyond, 2 * self.motion.velocity(t, dt), 0))
+        velocity = None if self.motion is None else self.motion.velocity(t, dt)[self.axis]
+        return (replace(self.image(grid, window)[0], velocity=velocity),)
 
 
 class PlaneContact(AbstractContact):

@@ -120,8 +120,9 @@ class RigidPart(AbstractBoundary):
         means = tied & held.any(axis=0)
         return fixed | means, jnp.where(means, first, value)
 
-    def mirror_images(self, grid: Grid, window: Int[Array, "d"]) -> tuple[Image | Tie, ...]:
+    def mirror_images(self, grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar) -> tuple[Image | Tie, ...]:
         """The map that gives all of its nodes the velocity of the first one."""
+        del t, dt
         return (Tie(self.holds(grid.nodes(window), grid.spacing)),)
 
     def check(self, grid: Grid, *, total: bool) -> None:

@@ -3,7 +3,6 @@
 from mpmjax.potential._mirror import (
     Image as Image,
     Mirror as Mirror,
-    MirrorMotion as MirrorMotion,
     MirrorPlace as MirrorPlace,
     RigidImage as RigidImage,
     Tie as Tie,

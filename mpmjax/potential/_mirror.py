@@ -3,7 +3,8 @@
 Nodes beyond such a plane are signed copies of those before it. With B the map from true nodes to all nodes, masses,
 momenta and forces are folded with Bᵀ and velocities unfolded with B, so that every system keeps its symmetry: the
 implicit one is Bᵀ(M + βΔt²H)B. The transfers know nothing of it. At a `SymmetryPlane` B is always that of the plane; at
-a `ContactPlane` only in the *columns* (lines of nodes along the normal) that it holds.
+a `ContactPlane` only in the *columns* (lines of nodes along the normal) that it holds. Rigid parts and bodies are such
+maps too.
 """
 
 import math
@@ -22,7 +23,7 @@ from mpmjax.geometry import Motion, spinning
 
 
 class MirrorPlace(NamedTuple):
-    """Where a boundary's mirror is."""
+    """The place of a boundary's mirror."""
 
     axis: int
     """The direction of its normal."""
@@ -62,13 +63,16 @@ class Image(eqx.Module):
     layers: int = eqx.field(static=True)
     axis: int = eqx.field(static=True)
     source: Int[Array, "m"]
+    """The node of which each node along the axis is a copy, shape (m,)."""
     even: Int[Array, "m"]
+    """The sign of copies of even fields, 0 where the source is outside of the window, shape (m,)."""
     odd: Int[Array, "m"]
+    """The sign of copies of odd fields, 0 on the plane too, shape (m,)."""
     held: Bool[Array, "n"] | None = None
     """The nodes in columns where there is a mirror; None for all of them."""
-    moving: bool = eqx.field(static=True, default=False)
-    """Whether the mirror moves along its normal with a velocity V. The normal velocity of a node beyond it is then 2V
-    minus that of its image, and V on it. What a node on it or beyond has itself, V or 2V, is the part that is added."""
+    velocity: Scalar | None = None
+    """Velocity V of a mirror that moves along its normal [m/s]; None at rest. The normal velocity of a node beyond it
+    is 2V minus that of its image, and V on it."""
 
     @property
     def size(self) -> int:
@@ -80,20 +84,21 @@ class Image(eqx.Module):
         return self._copy(field[:, None], self.even[:, None]).reshape(field.shape)
 
     def vector(self, field: NodeVector) -> NodeVector:
-        """B for a vector field: tangential components even, the normal one odd."""
+        """B for a vector field: tangential components even, the normal one odd. Of a mirror that moves B v + ℓ, where ℓ
+        is the normal component that the field has on the mirror and beyond."""
         normal = jnp.arange(field.shape[1]) == self.axis
         copied = self._copy(field, jnp.where(normal, self.odd[:, None], self.even[:, None]))
-        if not self.moving:
+        if self.velocity is None:
             return copied
-        return copied + jnp.where(self.along(self.odd <= 0)[:, None] & normal, field, 0)
-
-    def at_rest(self) -> "Image":
-        """The image of a mirror that does not move."""
-        return replace(self, moving=False)
+        return copied + jnp.where(self.normal(self.odd <= 0, field.shape[1]), field, 0)
 
     def within(self, held: Bool[Array, "n"]) -> "Image":
         """The mirror in some columns only."""
         return replace(self, held=held)
+
+    def normal(self, along: Bool[Array, "m"], dim: int) -> Mask:
+        """The normal component of some nodes along the axis, as a mask of shape (n, d)."""
+        return self.along(along)[:, None] & (jnp.arange(dim) == self.axis)
 
     def along(self, values: Array) -> Array:
         """Values along the axis, shape (m,), at all nodes, shape (n,)."""
@@ -117,12 +122,11 @@ class Image(eqx.Module):
 
 
 class Tie(eqx.Module):
-    """One velocity for several nodes, that of the first: the map B of a rigid part, used as those of mirrors are."""
+    """One velocity for several nodes, that of the first: the map B of a rigid part."""
 
     tied: Bool[Array, "n"]
     """The nodes tied together."""
     axis: ClassVar[int] = -1
-    moving: ClassVar[bool] = False
 
     def scalar(self, field: NodeScalar) -> NodeScalar:
         """B for a scalar field."""
@@ -131,10 +135,6 @@ class Tie(eqx.Module):
     def vector(self, field: NodeVector) -> NodeVector:
         """B for a vector field."""
         return jnp.where(self.tied[:, None], field[jnp.argmax(self.tied)], field)
-
-    def at_rest(self) -> "Tie":
-        """The map as it is: a tie has no motion of its own."""
-        return self
 
 
 class RigidImage(eqx.Module):
@@ -148,10 +148,9 @@ class RigidImage(eqx.Module):
     per_root: Float[Array, "r r"]
     """G⁻¹ [1/m]."""
     axis: ClassVar[int] = -1
-    moving: ClassVar[bool] = False
 
     def spin(self, s: Float[Array, "d"]) -> Float[Array, "r"]:
-        """ω [rad/s] from what the second node has [m/s]."""
+        """ω [rad/s] from the velocity of the second node [m/s]."""
         return self.per_root @ s[: len(self.per_root)]
 
     def own(self, field: Array) -> Array:
@@ -178,27 +177,9 @@ class RigidImage(eqx.Module):
         return jnp.linalg.solve(self.per_root.T, momentum[:rank]) if rank else momentum[:0]
 
     def reaches(self, plane: Image, mass: NodeScalar) -> Bool[Array, "d"]:
-        """The axis of a plane on or beyond which the body has mass, as a mask of the directions; else nothing.
-
-        Args:
-            plane: the mirror.
-            mass: masses of all nodes [kg], shape (n,).
-        """
+        """The axis of a plane on or beyond which the body has mass [kg], shape (n,), as a mask of the directions."""
         there = self.own(plane.along(plane.odd <= 0)) & (self.own(mass) > 0)
         return there.any() & (jnp.arange(self.arms.shape[1]) == plane.axis)
-
-    def at_rest(self) -> "RigidImage":
-        """The map as it is: it has no motion of its own."""
-        return self
-
-
-class MirrorMotion(eqx.Module):
-    """The velocity that moving mirrors add to the nodes beyond them (see `Image.moving`)."""
-
-    beyond: Mask
-    """The normal components of the nodes beyond such a mirror, shape (n, d)."""
-    velocity: NodeVector
-    """2V there [m/s], shape (n, d); zero elsewhere."""
 
 
 class Mirror(eqx.Module):
@@ -216,17 +197,28 @@ class Mirror(eqx.Module):
         """Bᵀ f: add to the true nodes what their mirror images received, and leave nothing on the others."""
         if not self.images:
             return field
-        at_rest = Mirror(tuple(image.at_rest() for image in self.images))
-        return jax.linear_transpose(at_rest.unfold, field)(field)[0]
+        at_rest = (replace(image, velocity=None) if isinstance(image, Image) else image for image in self.images)
+        return jax.linear_transpose(Mirror(tuple(at_rest)).unfold, field)(field)[0]
+
+    @property
+    def moving(self) -> tuple[tuple[Image, Scalar], ...]:
+        """The mirrors that move, with their velocities [m/s]."""
+        planes = (image for image in self.images if isinstance(image, Image))
+        return tuple((image, image.velocity) for image in planes if image.velocity is not None)
 
     def added(self, field: NodeVector) -> NodeVector:
-        """The part of a field that mirrors which move add to it (see `Image.moving`), zero elsewhere."""
+        """The part of a velocity that mirrors which move add to it, on them and beyond; zero elsewhere."""
         total = jnp.zeros_like(field)
-        for image in self.images:
-            if isinstance(image, Image) and image.moving:
-                beyond = image.along(image.odd <= 0)[:, None] & (jnp.arange(field.shape[1]) == image.axis)
-                total = jnp.where(beyond, field, total)
+        for image, _ in self.moving:
+            total = jnp.where(image.normal(image.odd <= 0, field.shape[1]), field, total)
         return total
+
+    def with_motion(self, velocity: NodeVector) -> NodeVector:
+        """A velocity [m/s], shape (n, d), with 2V in its normal components beyond mirrors that move."""
+        for image, V in reversed(self.moving):  # where several reach, the first one holds
+            beyond = image.normal((image.odd < 0) | (image.even == 0), velocity.shape[1])
+            velocity = jnp.where(beyond, 2 * V, velocity)
+        return velocity
 
     def unfold_scalar(self, field: Float[Array, "n"]) -> Float[Array, "n"]:
         """B for an even scalar, such as mass."""
@@ -258,10 +250,6 @@ class Mirror(eqx.Module):
     def rigid(self) -> tuple[RigidImage, ...]:
         """The maps of rigid bodies."""
         return tuple(image for image in self.images if isinstance(image, RigidImage))
-
-    def then(self, other: "Mirror") -> "Mirror":
-        """The mirror that unfolds by this one first, then by the other."""
-        return Mirror(self.images + other.images)
 
 
 def mirror_image(axis: int, position: Scalar, keep: str, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, Array]:

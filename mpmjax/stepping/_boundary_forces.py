@@ -73,7 +73,7 @@ def impulse_on_boundaries(
         elastic = elastic_impulse(unfolded, method, whole)
     residual = reaction(unfolded, whole, elastic)
     grid, window, dt = scene.grid, scene.window(particles), nodes.dt
-    images = brought_images(scene.boundary, grid, window)
+    images = brought_images(scene.boundary, grid, window, t, dt)
     contacts = list(zip(nodes.brought_by, nodes.contacts, held.active, strict=True))
     unfold = nodes.mirror.unfold
     at = scene.nodes(particles, t)

@@ -16,11 +16,10 @@ from mpmjax.boundary import (
     brought_contacts,
     combined_conditions,
     mirror,
-    mirror_motion,
 )
 from mpmjax.discretisation import Stencil, p2g, scatter
 from mpmjax.implicit import ElasticPotential, Projection
-from mpmjax.potential import AbstractTerm, Mirror, MirrorMotion
+from mpmjax.potential import AbstractTerm, Mirror
 from mpmjax.state import Particles, Scene, load_force, points_of, terms_of
 from mpmjax.stepping._contact_surfaces import contacts_of_bodies, faces_of
 from mpmjax.stepping._rigid_layers import rigid_layers
@@ -49,8 +48,6 @@ class Nodes(AbstractNodes):
     """The contacts of the scene; none of them is active here."""
     brought_by: tuple[int | None, ...] = eqx.field(static=True, default=())
     """The number of the boundary that brings each contact; None for that of two bodies."""
-    mirror_motion: MirrorMotion | None = None
-    """The velocity that moving mirrors add to the nodes beyond them; None if none moves."""
     loose: "Nodes | None" = None
     """The nodes with those of rigid bodies each by itself; None without rigid bodies."""
 
@@ -110,14 +107,12 @@ class Nodes(AbstractNodes):
     @property
     def moves_held(self) -> bool:
         """Whether held components may have another velocity than zero."""
-        return self.conditions.moves or self.mirror_motion is not None
+        return self.conditions.moves or bool(self.mirror.moving)
 
     @property
     def prescribed(self) -> NodeVector:
         """The velocity of held components [m/s], shape (n, d)."""
-        parts, velocity = self.free_normals, self.conditions.velocity
-        if self.mirror_motion is not None:
-            velocity = jnp.where(self.mirror_motion.beyond, self.mirror_motion.velocity, velocity)
+        parts, velocity = self.free_normals, self.mirror.with_motion(self.conditions.velocity)
         if not parts:
             return velocity
         along = reduce(jnp.add, (part.direction * part.speed[:, None] for part in parts))
@@ -173,7 +168,7 @@ class Nodes(AbstractNodes):
             v=fold(self.v),
             f=None if self.f is None else images.fold(self.f),
             g=None if self.g is None else fold(self.g),
-            potential=replace(self.potential, mirror=images.then(self.potential.mirror)),
+            potential=replace(self.potential, mirror=Mirror(images.images + self.potential.mirror.images)),
         )
 
     def constrained(self, images: Mirror, fixed: Mask, terms: tuple[AbstractTerm, ...]) -> "Nodes":
@@ -291,24 +286,22 @@ def with_boundaries(
         conditions=conditions,
         contacts=tuple(contacts),
         brought_by=(*brought_by, *[None] * (len(contacts) - len(brought_by))),
-        mirror_motion=mirror_motion(scene.boundary, grid, window, t, dt),
     )
 
 
-def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes) -> Nodes:
+def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes, t: Scalar) -> Nodes:
     """The nodes, folded at the scene's symmetry planes, and those of rigid bodies to the two that move each."""
-    images, moving = mirror(scene.boundary, scene.grid, scene.window(particles)), nodes.mirror_motion
+    images = mirror(scene.boundary, scene.grid, scene.window(particles), t, nodes.dt)
     if scene.rigid_bodies:
         rigid = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images, nodes.dt)
         loose = nodes.folded(images)
         nodes = loose.folded(Mirror(rigid.images))
         v = jnp.where(rigid.own, rigid.velocity, nodes.velocity)
         return replace(nodes, v=v, conditions=rigid.conditions, loose=loose)
-    if moving is None:
+    if not images.moving:
         return nodes.folded(images)
     # at rest with the mirrors: the velocity less what they add, which is put back
-    added = jnp.where(nodes.conditions.fixed, nodes.conditions.velocity, 0)
-    added = images.added(jnp.where(moving.beyond, moving.velocity, added))
+    added = images.added(images.with_motion(jnp.where(nodes.conditions.fixed, nodes.conditions.velocity, 0)))
     nodes = replace(nodes, v=nodes.v - jnp.where(nodes.occupied, images.unfold(added), 0)).folded(images)
     return replace(nodes, v=nodes.v + jnp.where(nodes.occupied, added, 0))
 
@@ -329,7 +322,7 @@ def start_nodes(
         scene, particles, t, dt, stencil, body_force_at=body_force_at, explicit_viscosity=explicit_viscosity
     )
     if scene.boundary or scene.bodies is not None or scene.rigid_bodies:
-        nodes = folded_at_planes(scene, particles, with_boundaries(scene, particles, nodes, t, force_at))
+        nodes = folded_at_planes(scene, particles, with_boundaries(scene, particles, nodes, t, force_at), t)
     return nodes
 
 

@@ -82,7 +82,7 @@ def step_unchecked(
     if scene.boundary or scene.bodies is not None or scene.rigid_bodies:
         with jax.named_scope("boundaries"):
             unfolded = with_boundaries(scene, particles, nodes, t, force_at)
-            nodes = folded_at_planes(scene, particles, unfolded)
+            nodes = folded_at_planes(scene, particles, unfolded, t)
     with jax.named_scope("grid_update"):
         new = update(nodes, method)
     with jax.named_scope("g2p"):
