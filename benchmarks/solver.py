@@ -30,7 +30,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mpmjax as mpm
-from mpmjax.implicit._operator import ImplicitOperator
+from mpmjax.implicit import ImplicitOperator
 from mpmjax.stepping import Nodes, start_nodes
 
 sys.path.append(str(Path(__file__).parent))
@@ -118,7 +118,7 @@ def level(n: int, dt: float, coarser: int, contrast: float) -> tuple[Level, Node
     """Of one semi-implicit step with β = 1."""
     scene, particles, _ = square(n, coarser=coarser, contrast=contrast)
     nodes = start_nodes(scene, particles, 0.0, jnp.asarray(dt), scene.stencil(particles))
-    action = mpm.AnalyticHessian().at_step_start(nodes.potential)
+    action = mpm.AnalyticHessian().at(nodes.potential, None)
     operator = ImplicitOperator(nodes.mass, jnp.asarray(dt) ** 2, action, nodes.projection)
     weight = mpm.MassPreconditioner().inner_product(operator).weight
 

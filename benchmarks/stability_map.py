@@ -33,7 +33,7 @@ import mpmjax as mpm
 from mpmjax._types import components
 from mpmjax.boundary import mirror
 from mpmjax.discretisation._transfer import p2g
-from mpmjax.implicit._potential import ElasticPotential
+from mpmjax.implicit import ElasticPotential
 
 sys.path += [str(Path(__file__).parents[1] / "tests" / folder) for folder in ("", "validation")]
 jax.config.update("jax_enable_x64", True)

@@ -29,6 +29,7 @@ from mpmjax.discretisation import (
     MLSGradient as MLSGradient,
     SplineGradient as SplineGradient,
 )
+from mpmjax.extensions import VolumePreconditioner as VolumePreconditioner
 from mpmjax.fitting import (
     Bounded as Bounded,
     CentreOfMass as CentreOfMass,
@@ -70,7 +71,6 @@ from mpmjax.implicit import (
     Linearised as Linearised,
     MassPreconditioner as MassPreconditioner,
     Newton as Newton,
-    VolumePreconditioner as VolumePreconditioner,
 )
 from mpmjax.io import load as load, record as record, register as register, save as save
 from mpmjax.material import (

@@ -59,7 +59,7 @@ def test_a_projected_hessian_is_positive_semidefinite_and_right_without_stress()
     @jax.jit
     def matrices(state):
         potential = start_nodes(scene, state, 0.0, 1e-3, scene.stencil(state)).potential
-        hessians = [mpm.AnalyticHessian(projected=projected).at_step_start(potential) for projected in (True, False)]
+        hessians = [mpm.AnalyticHessian(projected=projected).at(potential, None) for projected in (True, False)]
         return [jax.vmap(hessian.precomputed())(vectors).reshape(vectors.shape[0], -1) for hessian in hessians]
 
     values = np.linalg.eigvalsh(np.asarray(matrices(particles)[0]))
@@ -195,7 +195,7 @@ def test_only_the_materials_that_are_named_are_averaged():
         (own, other), (single,) = some.material_points(ready), alone.material_points(part)
         assert other.average is None
         potential = start_nodes(some, ready, 0.0, 1e-3, some.stencil(ready)).potential
-        whole, fixed = mpm.JvpHessian().at_step_start(potential), mpm.AnalyticHessian().at_step_start(potential)
+        whole, fixed = mpm.JvpHessian().at(potential, None), mpm.AnalyticHessian().at(potential, None)
         return (own.average(field), single.average(field)), (whole(w), fixed.precomputed()(w))
 
     (own, single), (whole, precomputed) = found()

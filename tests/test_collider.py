@@ -15,8 +15,7 @@ from numpy_oracle import grid_update
 import mpmjax as mpm
 from mpmjax.boundary import ConstrainedNodes, combined_conditions
 from mpmjax.discretisation import scatter
-from mpmjax.implicit._operator import ImplicitOperator
-from mpmjax.implicit._projection import Projection
+from mpmjax.implicit import ImplicitOperator, Projection
 from mpmjax.potential import Mirror
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
@@ -190,7 +189,7 @@ def test_the_operator_is_symmetric_and_its_inner_product_commutes_with_the_proje
     scene = scene_of(grid, mpm.SlipBox((-np.inf, 0.0), (np.inf, np.inf)), mpm.SlipCollider(ball), slope)
     step = grid_update(scene, particles, DT, METHODS["explicit"])
     nodes = step.nodes
-    action = mpm.AnalyticHessian().at_step_start(nodes.potential)
+    action = mpm.AnalyticHessian().at(nodes.potential, None)
     operator = ImplicitOperator(nodes.mass, jnp.asarray(1e-3), action, nodes.projection)
     A, W = np.asarray(operator.as_matrix()), np.asarray(preconditioner.inner_product(operator).weight).ravel()
     n = A.shape[0]
@@ -218,7 +217,7 @@ def test_a_linear_solve_with_a_collider_is_the_dense_one():
     scene = scene_of(grid, mpm.SlipCollider(mpm.Ball((0.16, 0.12), 0.22), ROLLING))
     step = grid_update(scene, particles, DT, METHODS["semi_implicit"])
     nodes = step.nodes
-    action = mpm.AnalyticHessian().at_step_start(nodes.potential)
+    action = mpm.AnalyticHessian().at(nodes.potential, None)
     whole = ImplicitOperator(nodes.mass, nodes.dt**2, action, Projection(jnp.ones_like(nodes.free)))
     A, n = np.asarray(whole.as_matrix()), nodes.velocity.size
     Q = np.asarray(jax.vmap(lambda e: nodes.projection.combine(e.reshape(-1, 2), 0).ravel())(jnp.eye(n))).T

@@ -14,12 +14,9 @@ import mpmjax as mpm
 from mpmjax._types import components
 from mpmjax.boundary import mirror
 from mpmjax.discretisation._transfer import p2g
-from mpmjax.implicit._conjugate_residual import NEGLIGIBLE_CHANGE, SolverResult, StoppingCriteria, _outcome
-from mpmjax.implicit._inner_product import DiagonalInnerProduct
+from mpmjax.implicit import DiagonalInnerProduct, ElasticPotential, ImplicitOperator, Projection
+from mpmjax.implicit._conjugate_residual import NEGLIGIBLE_CHANGE, Iterate, _outcome
 from mpmjax.implicit._linear_solve import NEARLY_CONVERGED
-from mpmjax.implicit._operator import ImplicitOperator
-from mpmjax.implicit._potential import ElasticPotential
-from mpmjax.implicit._projection import Projection
 
 N = 24
 DTYPES = {"float64": jnp.float64, "float32": jnp.float32}
@@ -370,7 +367,7 @@ def block_and_stray(multiple):
     assert jnp.where(occupied, node_mass, jnp.inf).min() < 1e-10 * mass[0]
     images = mirror((), grid, scene.window(particles))
     potential = ElasticPotential(scene.material_points(particles), stencil, images, grid.size)
-    hessian = mpm.AnalyticHessian().at_step_start(potential)
+    hessian = mpm.AnalyticHessian().at(potential, None)
     free = jnp.broadcast_to(occupied[:, None], velocity.shape)
     factor = jnp.asarray((multiple * explicit_limit(scene)) ** 2)
     return ImplicitOperator(node_mass, factor, hessian, Projection(free)), node_mass[:, None] * velocity
@@ -459,8 +456,8 @@ def test_how_a_solve_ended(name):
     end |= dict.fromkeys(("small_increment", "breakdown", "indefinite", "stalled"), False) | changes
     residual = end.pop("residual") * (1 - 1e-9) * RTOL * 3
     numbers = {field: jnp.asarray(value) for field, value in end.items()}
-    end = SolverResult(x=jnp.ones(2), rr=jnp.asarray(residual**2), **numbers)
-    code, statistics = _outcome(StoppingCriteria(RTOL, MOST), end)
+    end = Iterate(x=jnp.ones(2), rr=jnp.asarray(residual**2), **numbers)
+    code, statistics = _outcome(end, RTOL, MOST)
     assert code == result
     assert bool(statistics["nearly_converged"]) == nearly
     np.testing.assert_allclose(statistics["residual"], residual / 3)

@@ -13,8 +13,7 @@ from mpmjax.boundary._active_set import SWEEPS, find_active_set
 from mpmjax.boundary._contact import ConstrainedNodes, constrain, count_places
 from mpmjax.boundary._friction import friction_change, friction_share
 from mpmjax.checks._values import canonical
-from mpmjax.implicit._projection import Projection
-from mpmjax.implicit._solution import no_solve
+from mpmjax.implicit import Projection, no_solve
 from mpmjax.potential import Mirror
 from mpmjax.stepping import NodeMotion, reaction, start_nodes, update
 

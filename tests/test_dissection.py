@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import assert_close
 
-from mpmjax.implicit._dissection import Dissection, dissected_factor
+from mpmjax.extensions._dissection import Dissection, dissected_factor
 
 BOXES = {
     "line": Dissection((90,), 3),

@@ -15,9 +15,7 @@ from mpmjax._types import components
 from mpmjax.boundary import combined_conditions, mirror
 from mpmjax.discretisation._stencil import make_stencil
 from mpmjax.discretisation._transfer import p2g
-from mpmjax.implicit._operator import ImplicitOperator
-from mpmjax.implicit._potential import ElasticPotential
-from mpmjax.implicit._projection import Projection
+from mpmjax.implicit import ElasticPotential, ImplicitOperator, Projection
 from mpmjax.state._material_points import MaterialPoints
 
 DX = 0.1
@@ -65,7 +63,7 @@ def linearised(potential, du, u, h):
     """About u: −∂Φ/∂u, the force there and at u ∓ h δu, and H δu by both routes, through the operator without mass."""
 
     def action(hessian):
-        H = hessian.at_step_start(potential) if u is None else hessian.at(potential, u)
+        H = hessian.at(potential, u)
         return ImplicitOperator(jnp.zeros(len(du)), jnp.asarray(1.0), H, Projection(jnp.ones(du.shape, bool))).mv(du)
 
     place = jnp.zeros_like(du) if u is None else u
@@ -98,7 +96,7 @@ def relative(a, b):
 def results_of(*case):
     """`linearised` of a case at rest; its steps are small against the smallest stretch. With h."""
     potential, du = scene_of(*case)
-    h = 1e-6 * jnp.abs(jnp.linalg.det(potential.current_deformation()[0].transpose(2, 0, 1))).min() ** (1 / du.shape[1])
+    h = 1e-6 * jnp.abs(jnp.linalg.det(potential.deformation(None)[0].transpose(2, 0, 1))).min() ** (1 / du.shape[1])
     return *jax.tree.map(np.asarray, linearised(potential, du, None, h)), float(h)
 
 
@@ -183,9 +181,7 @@ def constrained(d, description, law="fixed_corotated"):
     }
     # so that mass and stiffness are alike
     factor = jnp.asarray(1e-3)
-    operators = [
-        ImplicitOperator(mass, factor, h.at_step_start(potential), Projection(free)) for h in HESSIANS.values()
-    ]
+    operators = [ImplicitOperator(mass, factor, h.at(potential, None), Projection(free)) for h in HESSIANS.values()]
     return operators, potential, free
 
 

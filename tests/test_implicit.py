@@ -9,9 +9,8 @@ from helpers import DESCRIPTIONS, ELASTIC, LAWS, assert_close, block, explicit_l
 from numpy_oracle import grid_update, stress
 
 import mpmjax as mpm
+from mpmjax.implicit import SolveInfo, StageProblem
 from mpmjax.implicit._newton import MOST_HALVINGS, backtrack
-from mpmjax.implicit._solution import SolveInfo
-from mpmjax.implicit._stage_problem import StageProblem
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 NEWTON = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12))

@@ -27,6 +27,7 @@ ROOMS = (
     "state",
     "implicit",
     "stepping",
+    "extensions",
     "simulation",
     "analysis",
     "io",

@@ -257,7 +257,7 @@ def test_springs_to_the_ground_and_of_contact_make_one_potential(d):
 
     @jax.jit
     def resisted(du):
-        action = mpm.AnalyticHessian().at_step_start(potential)
+        action = mpm.AnalyticHessian().at(potential, None)
         return action(du), action.precomputed()(du)
 
     for found in resisted(du):

@@ -14,9 +14,11 @@ from helpers import NEEDS_LIBRARY, assert_close, block, thorough
 
 import mpmjax as mpm
 from mpmjax import linalg as la
-from mpmjax.discretisation import _average, _resistance, _transfer_sums as sums, make_stencil, resist
-from mpmjax.implicit import _conjugate_residual, _vectors
+from mpmjax.discretisation import Stencil, _average, _resistance, _transfer_sums as sums, make_stencil, resist
+from mpmjax.implicit import ImplicitOperator, ParticleStiffness, Projection, _conjugate_residual as residuals
+from mpmjax.implicit._operator import product_p
 from mpmjax.native import _library
+from mpmjax.potential import Mirror
 
 ROOT = Path(__file__).parents[1]
 SIDE = 6
@@ -341,9 +343,9 @@ def test_combined_vectors_agree(choose):
 
     def combined(onto):
         def of(a, b, c, d, weight, s):
-            active = _vectors.active_blocks(a != 0, b != 0, c != 0, d != 0)
+            active = residuals.active_blocks(a != 0, b != 0, c != 0, d != 0)
             assert active.shape == (16,)
-            return tuple(_vectors.combine((a, s, b), (c, t, d), weight, active, onto=onto))
+            return tuple(residuals.combine_p[onto].bind(a, b, c, d, jnp.stack([s, t]), weight, active, batched=0))
 
         return of
 
@@ -375,7 +377,7 @@ def test_products_of_vectors_agree(choose, each):
     some, free = jnp.asarray(some), jnp.asarray(free)
 
     def agreeing(*args):
-        return tuple(_vectors.product(*args[:4], free, args[4], _vectors.active_blocks(some)))
+        return tuple(product_p.bind(*args[:4], free, args[4], residuals.active_blocks(some), batched=0))
 
     def expected(force, v, mass, factor, weight):
         image = jnp.where(free, jnp.repeat(mass, each) * v + factor * jnp.where(free, force, 0), v)
@@ -403,12 +405,14 @@ def test_solves_agree(choose, d):
     upper = jnp.asarray(np.where((row == column)[:, None], 2.0, 0.1) * np.ones((len(upper), 30)))
     mass, free = jnp.asarray(rng.uniform(1, 2, len(u))), jnp.asarray(rng.uniform(size=size) < 0.7)
     r, weight = jnp.where(free, jnp.asarray(rng.normal(size=size)), 0), jnp.asarray(rng.uniform(1, 2, size))
-    active = _vectors.active_blocks(free)
+    active = residuals.active_blocks(free)
 
     def run(factor, steps, r, rtol, far):
-        matrices = _vectors.ParticleMatrices((index, w, g), None, upper, mass, factor, free)
-        criteria = _conjugate_residual.StoppingCriteria(rtol, steps)
-        return _conjugate_residual.solve_particle_matrices(matrices, weight, active, r, far * x, criteria)
+        stencil = Stencil(index, w, g, None, w[:, 0], index[0, 0] >= 0)
+        stiffness = ParticleStiffness(upper, stencil, Mirror(()))
+        matrices = ImplicitOperator(mass, factor, stiffness, Projection(free.reshape(u.shape)))
+        space = residuals._DiagonalSpace(matrices.product, weight, active)
+        return residuals.solve_particle_matrices(matrices, space, r, far * x, rtol, steps)
 
     x = jnp.where(free, jnp.asarray(rng.normal(size=size)), 0)
     given = (

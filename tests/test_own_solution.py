@@ -10,7 +10,7 @@ import mpmjax as mpm
 
 
 @mpm.register
-class Chord(mpm.implicit.AbstractSolution):
+class Chord(mpm.implicit.AbstractStageSolver):
     """Newton's method with the Hessian of its start in all steps."""
 
     steps: int = eqx.field(static=True, default=8)

@@ -11,7 +11,7 @@ from helpers import DESCRIPTIONS, GRADIENTS, LAWS, assert_close, block, cloud, e
 
 import mpmjax as mpm
 from mpmjax import linalg as la
-from mpmjax.implicit._operator import ImplicitOperator
+from mpmjax.implicit import ImplicitOperator
 from mpmjax.stepping import start_nodes
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-11)
@@ -32,7 +32,7 @@ def operator_of(scene, particles, hessian, factor=1e-3):
     particles = mpm.prepare(scene, particles)
     dt = jnp.asarray(1e-3)
     nodes = start_nodes(scene, particles, 0.0, dt, scene.stencil(particles))
-    action = hessian.at_step_start(nodes.potential)
+    action = hessian.at(nodes.potential, None)
     return ImplicitOperator(nodes.mass, jnp.asarray(factor), action, nodes.projection)
 
 

@@ -10,7 +10,7 @@ from helpers import ELASTIC, LAWS, assert_close, block, explicit_limit, ids, rot
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.implicit._operator import ImplicitOperator
+from mpmjax.implicit import ImplicitOperator
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
 EACH_LAW = pytest.mark.parametrize("law", **ids(ELASTIC))
@@ -153,7 +153,7 @@ def stiffness(scene, particles, hessian):
     """H restricted to the free components, and their masses."""
     nodes = grid_update(scene, particles, 1e-3, mpm.Explicit()).nodes
     free = nodes.free
-    action = hessian.at_step_start(nodes.potential)
+    action = hessian.at(nodes.potential, None)
     operator = ImplicitOperator(jnp.zeros_like(nodes.mass), jnp.asarray(1.0), action, nodes.projection)
     A, keep = np.asarray(eqx.filter_jit(ImplicitOperator.as_matrix)(operator)), np.asarray(free).ravel()
     return A[np.ix_(keep, keep)], np.repeat(np.asarray(nodes.mass), 2)[keep]

@@ -13,7 +13,7 @@ import mpmjax as mpm
 from mpmjax.boundary._collider import AbstractCollider
 from mpmjax.geometry._motion import AbstractMotion
 from mpmjax.geometry._region import AbstractRegion
-from mpmjax.implicit._stage_problem import Guess
+from mpmjax.implicit import Guess
 from mpmjax.io import _schema
 from mpmjax.io._schema import arguments, decode, encode, saved_classes
 from mpmjax.stepping import AbstractIntegrator

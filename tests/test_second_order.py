@@ -9,8 +9,7 @@ from numpy_oracle import grid_update
 from test_implicit import jolted
 
 import mpmjax as mpm
-from mpmjax.implicit._operator import ImplicitOperator
-from mpmjax.implicit._projection import Projection
+from mpmjax.implicit import ImplicitOperator, Projection
 from mpmjax.stepping import NodeMotion, reaction
 
 SOLVER = mpm.ConjugateResidual(rtol=1e-14)
@@ -54,7 +53,7 @@ def test_a_step_is_that_of_the_first_order_system(method, description):
     nodes = grid_update(scene, particles, dt, mpm.Explicit()).nodes
     motion, info = move(method, nodes)
     assert info.converged
-    action = method.hessian.at_step_start(nodes.potential)
+    action = method.hessian.at(nodes.potential, None)
     everything = ImplicitOperator(0 * nodes.mass, jnp.asarray(1.0), action, Projection(jnp.ones_like(nodes.free)))
     H = np.asarray(eqx.filter_jit(ImplicitOperator.as_matrix)(everything))
     free = np.asarray(nodes.free).ravel()
@@ -113,7 +112,7 @@ def test_an_unconverged_first_stage_is_reported():
         _, q0, q1, q2 = method.weights()
         dt, v0, v, g = nodes.dt, nodes.velocity, motion.velocity, nodes.acceleration
         middle, c, pull = motion.inner / q2 - v0, q2 * dt, nodes.per_mass(nodes.force)
-        action = method.hessian.at_step_start(nodes.potential)
+        action = method.hessian.at(nodes.potential, None)
         a = v0 + c * (pull + 2 * g)
         b = v0 + dt * (q0 * pull + q1 * (middle - a) / c + g)
 

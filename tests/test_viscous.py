@@ -9,8 +9,7 @@ from helpers import DESCRIPTIONS, FLUIDS, LAWS, VISCOUS, assert_close, block, cl
 
 import mpmjax as mpm
 from mpmjax.boundary import mirror
-from mpmjax.implicit import damped
-from mpmjax.implicit._potential import ElasticPotential
+from mpmjax.implicit import DampedAction, ElasticPotential
 from mpmjax.material import Viscosity
 
 
@@ -55,8 +54,8 @@ CASES = [("viscous_solid", "updated"), *thorough(("viscous_solid", "total"), ("v
 @eqx.filter_jit
 def applied(potential, u, hessian):
     """D u, both powers, and H + 3D through the law and assembled."""
-    action = damped(hessian.at_step_start(potential), potential, jnp.asarray(3.0))
-    elastic = hessian.at_step_start(potential)(u[0])
+    action = DampedAction(hessian.at(potential, None), potential, jnp.asarray(3.0))
+    elastic = hessian.at(potential, None)(u[0])
     drags, powers = jax.vmap(potential.viscous_resistance)(u), jax.vmap(potential.power)(u)
     return drags, powers, elastic, action(u[0]), action.precomputed()(u[0])
 

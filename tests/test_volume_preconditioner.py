@@ -22,7 +22,7 @@ def operator_of(scene, particles, factor=1e-2):
     """M + χH at the particles, with χ such that shear counts a hundred times as much as the mass."""
     particles = mpm.prepare(scene, particles)
     nodes = start_nodes(scene, particles, 0.0, 1e-3, scene.stencil(particles))
-    action = mpm.AnalyticHessian().at_step_start(nodes.potential)
+    action = mpm.AnalyticHessian().at(nodes.potential, None)
     return ImplicitOperator(nodes.mass, jnp.asarray(factor), action, nodes.projection)
 
 

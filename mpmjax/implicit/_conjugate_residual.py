@@ -1,6 +1,7 @@
 """The conjugate residual method."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,20 +10,23 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 from jax.core import ShapedArray
+from jax.extend.core import Primitive
 from jax.flatten_util import ravel_pytree
 
 from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.checks import require, require_fields, require_positive, require_tolerance
-from mpmjax.discretisation import bound, define_placed
-from mpmjax.implicit._inner_product import AbstractInnerProduct, DiagonalInnerProduct
+from mpmjax.discretisation import bound, define_placed, resist
+from mpmjax.implicit._hessian import ParticleStiffness
 from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, AbstractInnerProductSolver, default_rtol
-from mpmjax.implicit._vectors import ParticleMatrices, active_blocks, combine
+from mpmjax.implicit._operator import ImplicitOperator, product_p, vectors_fit
+from mpmjax.implicit._preconditioner import AbstractInnerProduct, DiagonalInnerProduct
 from mpmjax.native import differentiable, native_primitive, sums_fit
 
 NEGLIGIBLE_CHANGE = 1e-3
 """Largest relative change of the solution by one more correction, where rounding hides the tolerance."""
 
 _REACH = 64.0  # the recurrence's own residual means nothing below so many units of rounding of the one it started from
+_BLOCK_SIZE = 64  # as in native/vectors.h
 _Combination = tuple[Array, Scalar, Array]
 
 
@@ -44,12 +48,6 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
 
     - `inner_product`: the inner product of W, an `AbstractInnerProduct`. Default: W = I.
     - `y0`: the initial guess. Default: zeros.
-    - `support`: where A is not the identity, booleans of the vector's structure. What is zero elsewhere stays zero
-      there, and is skipped. Default: everywhere.
-    - `product`: for a diagonal W, the operator's `product` (see `AbstractSymmetricOperator`), which may be faster than
-      its `mv` and sums. Default: these.
-    - `matrices`: for a diagonal W, the operator as one matrix for each particle (see `ParticleMatrices`), with which
-      the whole iteration is one call of the native library. Default: that it is not of this kind.
     - `rtol`: the relative tolerance where the solver has none. Default: that of the precision.
 
     Statistics returned:
@@ -84,7 +82,7 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
         require(self.max_steps >= 1, f"ConjugateResidual's max_steps must be at least 1, got {self.max_steps}.")
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> lx.AbstractLinearOperator:
-        if not lx.is_symmetric(operator):
+        if not isinstance(operator, ImplicitOperator) and not lx.is_symmetric(operator):
             raise ValueError("ConjugateResidual needs a symmetric operator; tag it lineax.symmetric_tag if it is one.")
         if "preconditioner" in options:
             raise ValueError(
@@ -98,38 +96,34 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
     ) -> tuple[Any, lx.RESULTS, dict[str, Any]]:
         flat, unravel = ravel_pytree(vector)
         rtol = options.get("rtol", default_rtol(flat.dtype)) if self.rtol is None else self.rtol
-        criteria = StoppingCriteria(rtol, self.max_steps, self.increment_rtol)
-        inner: AbstractInnerProduct | None = options.get("inner_product")
-        y0, fused, matrices = (options.get(name) for name in ("y0", "product", "matrices"))
-        x = jnp.zeros_like(flat) if y0 is None else ravel_pytree(y0)[0]
+        x = jnp.zeros_like(flat) if options.get("y0") is None else ravel_pytree(options["y0"])[0]
+        inner = options.get("inner_product")
+        ours = state if isinstance(state, ImplicitOperator) else None
 
         def multiply(u: Array) -> Array:
             return ravel_pytree(state.mv(unravel(u)))[0]
 
-        if inner is not None and not isinstance(inner, DiagonalInnerProduct):
+        if isinstance(inner, AbstractInnerProduct) and not isinstance(inner, DiagonalInnerProduct):
             space = _PairSpace(multiply, lambda r: ravel_pytree(inner.solve(unravel(r)))[0])
-            pair = jnp.stack([x, ravel_pytree(inner.apply(unravel(x)))[0]])
-            end = conjugate_residual(space, space.pair(flat), pair, criteria)
-            end = end._replace(x=end.x[0])
+            b, x = space.pair(flat), jnp.stack([x, ravel_pytree(inner.apply(unravel(x)))[0]])
         else:
             weight = jnp.ones_like(flat) if inner is None else ravel_pytree(inner.weight)[0]
-            support = options.get("support")
-            inside = jnp.ones(flat.shape, bool) if support is None else ravel_pytree(support)[0]
-            active = active_blocks(inside, flat != 0, x != 0)
+            support = jnp.ones(flat.shape, bool) if ours is None else ours.projection.free.reshape(-1)
+            active, b = active_blocks(support, flat != 0, x != 0), flat / weight
 
-            def product(u: Array) -> tuple[Array, Float[Array, ""]]:
-                if fused is None:
-                    image = multiply(u)
-                    return image / weight, (u * image).sum()
-                image, square = fused(unravel(u), unravel(weight), active)
-                return image.reshape(-1), square
+            def product(u: Array) -> Sequence[Array]:
+                if ours is not None:
+                    return ours.product(u, weight, active)
+                image = multiply(u)
+                return image / weight, (u * image).sum()
 
-            if matrices is not None and self.increment_rtol is None:
-                end = solve_particle_matrices(matrices, weight, active, flat / weight, x, criteria)
-            else:
-                end = conjugate_residual(_DiagonalSpace(product, weight, active), flat / weight, x, criteria)
-        result, stats = _outcome(criteria, end)
-        return unravel(end.x), result, stats
+            space = _DiagonalSpace(product, weight, active)
+        if ours and isinstance(space, _DiagonalSpace) and ours.is_particle_matrices and self.increment_rtol is None:
+            end = solve_particle_matrices(ours, space, b, x, rtol, self.max_steps)
+        else:
+            end = conjugate_residual(space, b, x, rtol, self.max_steps, self.increment_rtol)
+        result, stats = _outcome(end, rtol, self.max_steps)
+        return unravel(end.x.reshape(-1, flat.size)[0]), result, stats
 
     def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         return state, options
@@ -141,23 +135,12 @@ class ConjugateResidual(AbstractInnerProductSolver[lx.AbstractLinearOperator]):
         return True
 
 
-class StoppingCriteria(NamedTuple):
-    """Bounds at which the iteration ends."""
-
-    rtol: Scalar
-    """‖r‖/‖W⁻¹b‖."""
-    max_steps: Scalar
-    """Steps of the recurrence."""
-    increment_rtol: Scalar | None = None
-    """‖α p‖/‖x‖."""
-
-
-class SolverResult(NamedTuple):
-    """The last iterate, and how the iteration ended. Norms are those of W."""
+class Iterate(NamedTuple):
+    """An iterate in the letters of the derivation, eq. 19, and the state of its iteration. Norms are those of W."""
 
     x: Array
     rr: Float[Array, ""]
-    """‖r‖², of the true residual."""
+    """‖r‖²; of the true residual at the end."""
     k: Int[Array, ""]
     """Steps taken."""
     radius: Float[Array, ""]
@@ -172,16 +155,25 @@ class SolverResult(NamedTuple):
     """Whether the true residual has not halved between the last two restarts."""
     b_norm: Float[Array, ""]
     """‖W⁻¹b‖."""
-    x_norm: Float[Array, ""]
-    """‖x‖."""
+    x_norm: Any
+    """‖x‖; None before the end."""
     small_increment: Bool[Array, ""] | bool = False
     """Whether the last increment was within `increment_rtol`."""
+    r: Any = None  # None, as the rest, where the library has iterated
+    p: Any = None
+    q: Any = None
+    qq: Any = None
+    """‖q‖²."""
+    gamma: Any = None
+    restart_rr: Any = None
+    """‖r‖² at the last restart."""
+    done: Any = None
 
 
 class _DiagonalSpace(NamedTuple):
     """Vectors with a diagonal W. They are zero outside of the active blocks, which are skipped."""
 
-    product: Callable[[Array], tuple[Array, Float[Array, ""]]]
+    product: Callable[[Array], Sequence[Array]]
     """E u and uᵀA u of u."""
     weight: Float[Array, "m"]
     """W."""
@@ -192,9 +184,16 @@ class _DiagonalSpace(NamedTuple):
         """aᵀ W c."""
         return (self.weight * a * c).sum()
 
-    def combine(self, one: _Combination, other: _Combination, *, onto: int) -> tuple[Array, Array, Array]:
-        """From (a, s, b) and (c, t, d): a + s b, c + t d and ‖c + t d‖² (see `combine` of vectors)."""
-        return combine(one, other, self.weight, self.active, onto=onto)
+    def combine(self, one: _Combination, other: _Combination, *, onto: int) -> list[Array]:
+        """From (a, s, b) and (c, t, d): a + s b, c + t d and ‖c + t d‖².
+
+        Args:
+            one: a, s and b.
+            other: c, t and d.
+            onto: the vectors that are not needed any more, whose memory results may take: 0 for a and c, 1 for b and d.
+        """
+        (a, s, b), (c, t, d) = one, other
+        return combine_p[onto].bind(a, b, c, d, jnp.stack([s, t]), self.weight, self.active, batched=0)
 
 
 class _PairSpace(NamedTuple):
@@ -216,45 +215,30 @@ class _PairSpace(NamedTuple):
     def dot(self, a: Array, c: Array) -> Float[Array, ""]:
         return (a[1] * c[0]).sum()
 
-    def combine(self, one: _Combination, other: _Combination, *, onto: int) -> tuple[Array, Array, Array]:
+    def combine(self, one: _Combination, other: _Combination, *, onto: int) -> list[Array]:
         del onto
         (a, s, b), (c, t, d) = one, other
         z = c + t * d
-        return a + s * b, z, self.dot(z, z)
-
-
-class _State(NamedTuple):
-    """The letters of the derivation, eq. 19, and what `SolverResult` has of them."""
-
-    x: Array
-    r: Array
-    p: Array
-    q: Array
-    rr: Float[Array, ""]
-    qq: Float[Array, ""]
-    gamma: Float[Array, ""]
-    k: Int[Array, ""]
-    radius: Float[Array, ""]
-    small_increment: Bool[Array, ""]
-    breakdown: Bool[Array, ""]
-    indefinite: Bool[Array, ""]
-    restart_rr: Float[Array, ""]
-    """‖r‖² at the last restart."""
-    correction: Float[Array, ""]
-    stalled: Bool[Array, ""]
-    done: Bool[Array, ""]
+        return [a + s * b, z, self.dot(z, z)]
 
 
 def conjugate_residual(
-    space: _DiagonalSpace | _PairSpace, b: Array, x: Array, criteria: StoppingCriteria
-) -> SolverResult:
+    space: _DiagonalSpace | _PairSpace,
+    b: Array,
+    x: Array,
+    rtol: Scalar,
+    max_steps: Scalar,
+    increment_rtol: Scalar | None = None,
+) -> Iterate:
     """The solution of E x = b.
 
     Args:
         space: E and the inner product.
         b: W⁻¹ times the right-hand side.
         x: the initial guess.
-        criteria: the bounds at which it ends.
+        rtol: the bound on ‖r‖/‖b‖.
+        max_steps: the bound on the steps of the recurrence.
+        increment_rtol: the bound on ‖α p‖/‖x‖; None without one.
     """
     # Differences from the derivation:
     #
@@ -263,18 +247,17 @@ def conjugate_residual(
     # 3. The recurrence's residual drifts from the true one, by ε‖E‖‖x‖ a step. Where it meets the tolerance, or is too
     #    small to be trusted, the true residual is computed. If that is not small enough, the recurrence restarts from
     #    it, until a restart no longer halves it.
-    eps = jnp.finfo(b.dtype).eps
+    eps, max_steps = jnp.finfo(b.dtype).eps, jnp.asarray(max_steps)
     b_norm = jnp.sqrt(space.dot(b, b))
-    tolerance, max_steps = criteria.rtol * b_norm, jnp.asarray(criteria.max_steps)
 
-    def in_progress(c: _State) -> Bool[Array, ""]:
+    def in_progress(c: Iterate) -> Bool[Array, ""]:
         steps_left = c.k.astype(max_steps.dtype) < max_steps
-        return (jnp.sqrt(c.rr) > tolerance) & ~c.small_increment & ~c.breakdown & steps_left
+        return (jnp.sqrt(c.rr) > rtol * b_norm) & ~c.small_increment & ~c.breakdown & steps_left
 
-    def cond_fun(c: _State) -> Bool[Array, ""]:
+    def cond_fun(c: Iterate) -> Bool[Array, ""]:
         return ~c.done & in_progress(c) & (c.rr > (_REACH * eps) ** 2 * c.restart_rr)
 
-    def body_fun(c: _State) -> _State:
+    def body_fun(c: Iterate) -> Iterate:
         s, gamma = space.product(c.r)
         beta = gamma / c.gamma
         p, q, qq = space.combine((c.r, beta, c.p), (s, beta, c.q), onto=1)
@@ -283,14 +266,14 @@ def conjugate_residual(
         alpha = jnp.where(breakdown, 0, gamma / jnp.where(breakdown, 1, qq))
         x, r, rr = space.combine((c.x, alpha, p), (c.r, -alpha, q), onto=0)
         small_increment = c.small_increment
-        if criteria.increment_rtol is not None:
-            small = alpha**2 * space.dot(p, p) <= criteria.increment_rtol**2 * space.dot(x, x)
+        if increment_rtol is not None:
+            small = alpha**2 * space.dot(p, p) <= increment_rtol**2 * space.dot(x, x)
             small_increment = ~breakdown & small
         radius, indefinite = jnp.maximum(c.radius, jnp.abs(gamma) / c.rr), c.indefinite | (gamma < -rounding)
         c = c._replace(x=x, r=r, p=p, q=q, rr=rr, qq=qq, gamma=gamma, k=c.k + 1, radius=radius)
         return c._replace(small_increment=small_increment, breakdown=breakdown, indefinite=indefinite)
 
-    def restart(c: _State) -> _State:
+    def restart(c: Iterate) -> Iterate:
         r = b - space.product(c.x)[0]
         rr = space.dot(r, r)
         # an infinite γ makes the first β zero, so that p and q begin as r and s
@@ -303,16 +286,16 @@ def conjugate_residual(
 
     zeros, zero, no = jnp.zeros_like(b), jnp.zeros_like(b_norm), jnp.zeros(b_norm.shape, bool)
     infinite, k = jnp.full_like(b_norm, jnp.inf), jnp.zeros(b_norm.shape, jnp.int32)
-    start = _State(x, zeros, zeros, zeros, infinite, zero, infinite, k, zero, no, no, no, infinite, infinite, no, no)
-    c = jax.lax.while_loop(lambda c: ~c.done, restart, start)
-    ended = c.rr, c.k, c.radius, c.breakdown, c.indefinite, c.correction, c.stalled
-    return SolverResult(c.x, *ended, b_norm, jnp.sqrt(space.dot(c.x, c.x)), c.small_increment)
+    start = Iterate(x, infinite, k, zero, no, no, infinite, no, b_norm, None, no)
+    start = start._replace(r=zeros, p=zeros, q=zeros, qq=zero, gamma=infinite, restart_rr=infinite, done=no)
+    end = jax.lax.while_loop(lambda c: ~c.done, restart, start)
+    return end._replace(x_norm=jnp.sqrt(space.dot(end.x, end.x)))
 
 
-def _outcome(criteria: StoppingCriteria, end: SolverResult) -> tuple[lx.RESULTS, dict[str, Any]]:
+def _outcome(end: Iterate, rtol: Scalar, max_steps: int) -> tuple[lx.RESULTS, dict[str, Any]]:
     """The result and statistics of `ConjugateResidual.compute`."""
-    residual, tolerance = jnp.sqrt(end.rr), criteria.rtol * end.b_norm
-    ended_early, finite = end.k < criteria.max_steps, jnp.isfinite(residual)
+    residual, tolerance = jnp.sqrt(end.rr), rtol * end.b_norm
+    ended_early, finite = end.k < max_steps, jnp.isfinite(residual)
     negligible = end.correction <= NEGLIGIBLE_CHANGE * end.x_norm
     exact = end.stalled & ~end.breakdown & ended_early & negligible
     converged = ((residual <= tolerance) | exact | end.small_increment) & finite
@@ -322,7 +305,7 @@ def _outcome(criteria: StoppingCriteria, end: SolverResult) -> tuple[lx.RESULTS,
     result = lx.RESULTS.where(converged, lx.RESULTS.successful, result)
     return result, {
         "num_steps": end.k,
-        "max_steps": criteria.max_steps,
+        "max_steps": max_steps,
         "residual": residual / jnp.where(end.b_norm == 0, 1, end.b_norm),
         "spectral_radius": end.radius,
         "indefinite": end.indefinite,
@@ -330,45 +313,52 @@ def _outcome(criteria: StoppingCriteria, end: SolverResult) -> tuple[lx.RESULTS,
     }
 
 
+def active_blocks(*may_differ_from_zero: Bool[Array, "m"]) -> Bool[Array, "k"]:
+    """Whether a block of 64 consecutive numbers may differ from zero, shape (⌈m/64⌉,). Others are skipped."""
+    some = reduce(jnp.logical_or, may_differ_from_zero)
+    return jnp.pad(some, (0, -len(some) % _BLOCK_SIZE)).reshape(-1, _BLOCK_SIZE).any(axis=1)
+
+
 def solve_particle_matrices(
-    matrices: ParticleMatrices,
-    weight: Float[Array, "m"],
-    active: Bool[Array, "k"],
-    b: Array,
-    x: Array,
-    criteria: StoppingCriteria,
-) -> SolverResult:
-    """`conjugate_residual` with one matrix for each particle and a diagonal W, as a primitive.
+    operator: ImplicitOperator, space: _DiagonalSpace, b: Array, x: Array, rtol: Scalar, max_steps: Scalar
+) -> Iterate:
+    """`conjugate_residual` with an operator that `is_particle_matrices`, as a primitive.
 
     On CPUs the native library runs it as a whole, and in a batch each member by itself. A loop of JAX goes on for all
     members until the last one is done, and selects whole vectors in every step.
-
-    Args:
-        matrices: A.
-        weight: the diagonal of W, shape (m,).
-        active: `active_blocks`. In others x and b are zero.
-        b: W⁻¹ times the right-hand side.
-        x: the initial guess.
-        criteria: the bounds at which it ends, without an `increment_rtol`.
     """
     floor = (_REACH * jnp.finfo(b.dtype).eps) ** 2
-    limits = jnp.stack([jnp.asarray(number, b.dtype) for number in (criteria.rtol, criteria.max_steps, floor)])
-    factor = jnp.asarray(matrices.factor, b.dtype)
-    args = matrices.upper, matrices.mass, factor, matrices.free, weight, active, x, b, limits
+    limits = jnp.stack([jnp.asarray(number, b.dtype) for number in (rtol, max_steps, floor)])
+    hessian, free = operator.hessian, operator.projection.free.reshape(-1)
+    assert isinstance(hessian, ParticleStiffness)
+    factor = jnp.asarray(operator.factor, b.dtype)
+    args = hessian.upper, operator.mass, factor, free, space.weight, space.active, x, b, limits
     x, (rr, k, radius, breakdown, indefinite, correction, stalled, b_norm, x_norm) = bound(
-        _solve_p, matrices, *args, batched=0
+        _solve_p, hessian.stencil, *args, batched=0
     )
     flags = breakdown > 0, indefinite > 0
-    return SolverResult(x, rr, k.astype(jnp.int32), radius, *flags, correction, stalled > 0, b_norm, x_norm)
+    return Iterate(x, rr, k.astype(jnp.int32), radius, *flags, correction, stalled > 0, b_norm, x_norm)
+
+
+class _Factors(NamedTuple):
+    """A stencil without its compressed form."""
+
+    factors: tuple[Array, Array, Array]
+    places: None = None
 
 
 def _solve(*args: Array, unroll: bool = False) -> list[Array]:
+    """`solve_particle_matrices`, written in JAX."""
     del unroll  # the sums know
     index, weights, derivatives, upper, mass, factor, free, weight, active, x, b, limits = args
-    matrices = ParticleMatrices((index, weights, derivatives), None, upper, mass, factor, free)
-    space = _DiagonalSpace(lambda u: matrices.product(u, weight, active), weight, active)
-    x, *numbers, _ = conjugate_residual(space, b, x, StoppingCriteria(limits[0], limits[1]))
-    return [x, jnp.stack([a.astype(b.dtype) for a in numbers])]
+
+    def product(u: Array) -> list[Array]:
+        moved = jnp.where(free, u, 0).reshape(len(mass), -1)
+        force = resist(_Factors((index, weights, derivatives)), upper, moved).reshape(-1)
+        return product_p.bind(force, u, mass, factor, free, weight, active, batched=0)
+
+    end = conjugate_residual(_DiagonalSpace(product, weight, active), b, x, limits[0], limits[1])
+    return [end.x, jnp.stack([a.astype(b.dtype) for a in end[1:10]])]
 
 
 def _solve_shapes(*args: ShapedArray) -> list[tuple]:
@@ -390,3 +380,21 @@ _solve_p = differentiable(
     native_primitive("matrices_solve", _solve, _solve_shapes, _fits, {9: 0}, workspace=_workspace, placed=False), _solve
 )
 define_placed(_solve_p, _solve, _solve_shapes, workspace=_workspace, fits=_fits, aliases={10: 0})
+
+
+def _combine(*args: Array, unroll: bool = False) -> list[Array]:
+    del unroll  # there is no loop
+    a, b, c, d, scales, weight, _ = args
+    y, z = a + scales[0] * b, c + scales[1] * d
+    return [y, z, (weight * z * z).sum()]
+
+
+def _combine_primitive(onto: int) -> Primitive:
+    aliases = {onto: 0, 2 + onto: 1}
+    shapes = lambda *args: [args[0].shape[-1:], args[0].shape[-1:], ()]  # noqa: E731
+    return differentiable(native_primitive(f"vectors_combine_{onto}", _combine, shapes, vectors_fit, aliases), _combine)
+
+
+combine_p = _combine_primitive(0), _combine_primitive(1)
+"""Two sums of two vectors with a norm. In JAX these are some four passes over the window, of which a body may fill a
+small part; natively it is one, in place, that skips inactive blocks."""

@@ -13,7 +13,7 @@ from mpmjax._types import Array, Deformation, Float, NodeVector, Scalar
 from mpmjax.checks import require_fields
 from mpmjax.discretisation import Stencil, resist
 from mpmjax.implicit._potential import ElasticPotential, displacement_gradient, joined
-from mpmjax.material import AbstractMaterial, AbstractTangent
+from mpmjax.material import AbstractMaterial
 from mpmjax.potential import AbstractStiffness, Displacement, Forces, Mirror, added, scattered
 
 Tangents = tuple[Callable[[Deformation], Deformation], ...]
@@ -57,11 +57,6 @@ class ParticleStiffness(AbstractHessianAction):
     def is_positive_semidefinite(self) -> bool:
         return self.positive_semidefinite and all(part.is_positive_semidefinite() for part in self.others)
 
-    @property
-    def alone(self) -> bool:
-        """Whether H is the resistance of the particles and nothing else."""
-        return not (self.mirror.images or self.coupled or self.others)
-
     def __call__(self, du: NodeVector) -> NodeVector:
         u = self.mirror.unfold(du)
         if not self.coupled + self.others:
@@ -80,7 +75,7 @@ class ParticleStiffness(AbstractHessianAction):
     def precomputed(self) -> "ParticleStiffness":
         return self
 
-    def diagonal(self, like: NodeVector) -> NodeVector:
+    def diagonal(self, size: int) -> NodeVector:
         """Σ_p Σ_b g_ip,b² K_p,ba,ba [N/m], shape (n, d), and the same of the others: a non-negative approximation of
         the diagonal of H.
 
@@ -88,9 +83,9 @@ class ParticleStiffness(AbstractHessianAction):
         which are zero for an isotropic law at F = I, and at mirror planes those of a node with its image.
 
         Args:
-            like: any node vector.
+            size: n.
         """
-        size, d = like.shape
+        d = len(self.stencil.weights)
         places = np.cumsum([0, *range(d * d, 1, -1)])  # of the diagonal, row by row
         own = Forces(slopes=jnp.stack([self.upper[m] for m in places]).reshape(d, d, -1))
         materials = added([own, *(part.diagonal(self.stencil, size) for part in self.coupled)]).slopes
@@ -147,7 +142,12 @@ class TangentAction(AbstractHessianAction):
         return tuple(term.hessian(moved) for term in self.potential.terms)
 
 
-class _DampedAction(AbstractHessianAction):
+class DampedAction(AbstractHessianAction):
+    """H + r D, with D [N s/m] the positive semi-definite matrix of the viscous force.
+
+    A stage of length Δt_s has r = 1/Δt_s, which gives M + Δt_s D + Δt_s² H.
+    """
+
     elastic: AbstractHessianAction
     potential: ElasticPotential
     rate: Scalar
@@ -166,14 +166,6 @@ class _DampedAction(AbstractHessianAction):
         return eqx.tree_at(lambda s: (s.upper, s.others), stiffness, (upper, others))
 
 
-def damped(elastic: AbstractHessianAction, potential: ElasticPotential, rate: Scalar) -> AbstractHessianAction:
-    """H + r D, with D [N s/m] the positive semi-definite matrix of the viscous force; H without viscosity.
-
-    A stage of length Δt_s has r = 1/Δt_s, which gives M + Δt_s D + Δt_s² H.
-    """
-    return _DampedAction(elastic, potential, rate) if potential.viscous else elastic
-
-
 class AbstractHessian(eqx.Module):
     """The Hessian of the potential in an implicit update.
 
@@ -183,12 +175,8 @@ class AbstractHessian(eqx.Module):
     """
 
     @abc.abstractmethod
-    def at(self, potential: ElasticPotential, u: NodeVector) -> AbstractHessianAction:
-        """The Hessian of the potential at a nodal displacement u [m], shape (n, d)."""
-
-    def at_step_start(self, potential: ElasticPotential) -> AbstractHessianAction:
-        """The Hessian where no node has moved, u = 0."""
-        return self.at(potential, potential.displaced(None).nodes)
+    def at(self, potential: ElasticPotential, u: NodeVector | None) -> AbstractHessianAction:
+        """The Hessian of the potential at a nodal displacement u [m], shape (n, d); None for u = 0."""
 
     @abc.abstractmethod
     def exact(self) -> "AbstractHessian":
@@ -212,14 +200,10 @@ class AnalyticHessian(AbstractHessian):
     def __check_init__(self):
         require_fields(self)
 
-    def at(self, potential: ElasticPotential, u: NodeVector) -> TangentAction:
-        return _tangents_of(potential, u, self._tangent, definite=self.projected)
-
-    def at_step_start(self, potential: ElasticPotential) -> TangentAction:
-        return _tangents_of(potential, None, self._tangent, definite=self.projected)  # without the gather
-
-    def _tangent(self, law: AbstractMaterial, F: Deformation) -> AbstractTangent:
-        return law.projected_tangent(F) if self.projected else law.tangent(F)
+    def at(self, potential: ElasticPotential, u: NodeVector | None) -> TangentAction:
+        if self.projected:
+            return _tangents_of(potential, u, lambda law, F: law.projected_tangent(F), definite=True)
+        return _tangents_of(potential, u, lambda law, F: law.tangent(F))
 
     def exact(self) -> "AnalyticHessian":
         return AnalyticHessian() if self.projected else self
@@ -229,8 +213,8 @@ class JvpHessian(AbstractHessian):
     """The Hessian by `jax.jvp` of the energy's gradient. It needs only the energy of a law, and is the reference of
     the tests for `AnalyticHessian`."""
 
-    def at(self, potential: ElasticPotential, u: NodeVector) -> AbstractHessianAction:
-        return _JvpAction(potential, u)
+    def at(self, potential: ElasticPotential, u: NodeVector | None) -> AbstractHessianAction:
+        return _JvpAction(potential, potential.displaced(None).nodes if u is None else u)
 
     def exact(self) -> "JvpHessian":
         return self

@@ -1,18 +1,17 @@
-"""One linear solve by any symmetric solver of lineax, with the quality of its solution."""
+"""One linear solve by any symmetric solver of lineax, and the report of solves."""
 
 import abc
 import math
 from typing import Any, Generic, TypeVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._types import Array, Bool, Float, Int, NodeVector
 from mpmjax.checks import require_that
-from mpmjax.implicit._inner_product import AbstractInnerProduct
-from mpmjax.implicit._operator import AbstractSymmetricOperator
+from mpmjax.implicit._operator import ImplicitOperator
+from mpmjax.implicit._preconditioner import AbstractInnerProduct
 
 _State = TypeVar("_State")
 _DEFAULT_RTOL = {4: 1e-5, 8: 1e-8}  # by bytes a number
@@ -27,30 +26,62 @@ def default_rtol(dtype: Any) -> float:
     return _DEFAULT_RTOL[jnp.dtype(dtype).itemsize]
 
 
-class LinearSolution(eqx.Module):
-    """The solution of a linear system A x = b in an inner product W, with its cost and quality."""
+class SolveInfo(eqx.Module):
+    """Cost and quality of the solution of one step's equations."""
 
-    value: NodeVector
-    iterations: Int[Array, ""]
-    """Iterations of the solver; 0 if it states none."""
-    residual: Float[Array, ""]
-    """True relative residual ‖b − A x‖/‖b‖ in the norm of W⁻¹."""
-    converged: Bool[Array, ""]
+    iterations: Int[Array, "*f"]
+    """Iterations of the linear solver, summed over Newton steps; 0 if the solver states none."""
+    newton: Int[Array, "*f"]
+    """Newton steps."""
+    line_search: Int[Array, "*f"]
+    """Halvings of a Newton step by the line search."""
+    residual: Float[Array, "*f"]
+    """True relative residual at the end. For one linear solve it is in the norm of the inverse preconditioner; for
+    Newton's method in that of the inverse mass, and relative to the momentum of the balanced forces if their sum
+    vanishes."""
+    converged: Bool[Array, "*f"]
     """Whether the residual is within the solver's tolerance, or at the limit of the precision."""
-    nearly_converged: Bool[Array, ""]
+    nearly_converged: Bool[Array, "*f"]
     """Whether it is not, but within ten times the tolerance."""
-    indefinite: Bool[Array, ""]
-    """Whether a direction of negative curvature was met."""
-    spectral_radius: Float[Array, ""]
-    """A lower estimate of ‖W⁻¹A‖; 1 if the solver gives none."""
+    indefinite: Bool[Array, "*f"]
+    """Whether the solver met a direction of negative curvature. M + χH is then indefinite, and may be near singular."""
+    report: Float[Array, "*f"]
+    """Zero. Its tangent is the relative residual of the tangent solves that did not converge (see `Reporting`)."""
+
+    def followed_by(self, later: "SolveInfo") -> "SolveInfo":
+        """The summed cost of two solves of one equation, and the quality of the later one."""
+        return SolveInfo(
+            iterations=self.iterations + later.iterations,
+            newton=self.newton + later.newton,
+            line_search=self.line_search + later.line_search,
+            residual=later.residual,
+            converged=later.converged,
+            nearly_converged=later.nearly_converged,
+            indefinite=self.indefinite | later.indefinite,
+            report=self.report + later.report,
+        )
+
+    def together_with(self, other: "SolveInfo") -> "SolveInfo":
+        """The summed cost of two solves that are both needed, and the quality of the worse one."""
+        both = self.followed_by(other)
+        converged = self.converged & other.converged
+        usable = (self.converged | self.nearly_converged) & (other.converged | other.nearly_converged)
+        worst = jnp.maximum(self.residual, other.residual), converged, usable & ~converged
+        return eqx.tree_at(lambda info: (info.residual, info.converged, info.nearly_converged), both, worst)
+
+
+def no_solve(dtype: Any) -> SolveInfo:
+    """The report of an update without a solve."""
+    count, zero, no = jnp.zeros((), jnp.int32), jnp.zeros((), dtype), jnp.zeros((), bool)
+    return SolveInfo(count, count, count, residual=zero, converged=~no, nearly_converged=no, indefinite=no, report=zero)
 
 
 class AbstractInnerProductSolver(lx.AbstractLinearSolver[_State], Generic[_State]):
     """A symmetric solver that takes an inner product itself.
 
-    `compute` takes the options `inner_product`, an `AbstractInnerProduct`, and `support`, `product` and `matrices`,
-    those of the operator. Its result is successful if it converged. Its statistics have the other fields of
-    `LinearSolution` except `value`, with `num_steps` for `iterations`.
+    `compute` takes the option `inner_product`, an `AbstractInnerProduct`. Its result is successful if it converged. Its
+    statistics are `num_steps`, `residual`, `nearly_converged` and `indefinite` (see `SolveInfo`), and
+    `spectral_radius`, a lower estimate of ‖W⁻¹A‖.
     """
 
     @abc.abstractmethod
@@ -67,14 +98,14 @@ def derivative_rtol(dtype: Any) -> float:
 
 def solve_linear(
     solver: lx.AbstractLinearSolver,
-    operator: AbstractSymmetricOperator,
+    operator: ImplicitOperator,
     rhs: NodeVector,
     inner: AbstractInnerProduct,
     guess: NodeVector | None = None,
     *,
     rtol: float | None = None,
-) -> LinearSolution:
-    """Solve A x = b.
+) -> tuple[NodeVector, SolveInfo, Float[Array, ""]]:
+    """Solve A x = b: x, the report, and a lower estimate of ‖W⁻¹A‖, 1 if the solver gives none.
 
     A solver that does not take an inner product is given the scaled system L⁻¹A L⁻ᵀ y = L⁻¹b/‖b‖ with W = L Lᵀ and
     x = ‖b‖ L⁻ᵀ y. It is symmetric and preconditioned, and its right-hand side has norm one, so that an absolute
@@ -95,87 +126,65 @@ def solve_linear(
     """
     if not isinstance(solver, AbstractInnerProductSolver):
         return _solve_scaled(solver, operator, rhs, inner.factored(), guess)
-    options = {"inner_product": inner, "support": operator.support(), "product": operator.product}
-    options["matrices"] = operator.matrices()
+    options: dict[str, Any] = {"inner_product": inner}
     options |= {} if guess is None else {"y0": guess}
     options |= {} if rtol is None else {"rtol": rtol}
     x, result, stats = solver.compute(solver.init(operator, options), rhs, options)
-    return LinearSolution(
-        value=x,
-        iterations=stats["num_steps"],
-        residual=stats["residual"],
-        converged=result == lx.RESULTS.successful,
-        nearly_converged=stats["nearly_converged"],
-        indefinite=stats["indefinite"],
-        spectral_radius=stats["spectral_radius"],
-    )
+    converged = result == lx.RESULTS.successful
+    info = _info(stats["num_steps"], stats["residual"], converged, stats["nearly_converged"], stats["indefinite"])
+    return x, info, stats["spectral_radius"]
+
+
+def _info(iterations: Array, residual: Array, converged: Array, nearly: Array, indefinite: Array) -> SolveInfo:
+    """The report of one linear solve."""
+    none, zero = jnp.zeros((), jnp.int32), jnp.zeros_like(residual)
+    return SolveInfo(iterations, none, none, residual, converged, nearly, indefinite, zero)
 
 
 def _solve_scaled(
     solver: lx.AbstractLinearSolver,
-    operator: AbstractSymmetricOperator,
+    operator: ImplicitOperator,
     rhs: NodeVector,
     inner: AbstractInnerProduct,
     guess: NodeVector | None,
-) -> LinearSolution:
+) -> tuple[NodeVector, SolveInfo, Float[Array, ""]]:
+    name, definite = type(solver).__name__, lx.is_positive_semidefinite(operator)
     b = inner.solve_factor(rhs)
     size = jnp.sqrt((b**2).sum())
     size = jnp.where(size == 0, 1, size)
     b = b / size
     options = {} if guess is None else {"y0": inner.solve_factor(inner.apply(guess)) / size}
-    scaled = ScaledOperator(operator, inner)
-    y, result, stats = solver.compute(_initialised(solver, scaled, options), b, options)
-    if jnp.shape(y) != b.shape:
-        raise ValueError(
-            f"{_name(solver)}.compute must return a solution of the right-hand side's shape, {b.shape}, got "
-            f"{jnp.shape(y)}."
-        )
-    Ay = scaled.mv(y)
-    residual, tolerance = jnp.sqrt(((b - Ay) ** 2).sum()), _tolerance(solver, b)
-    converged = (result == lx.RESULTS.successful) & (residual <= tolerance)
-    return LinearSolution(
-        value=size * inner.solve_factor_transpose(y),
-        iterations=jnp.asarray(stats.get("num_steps", 0), dtype=jnp.int32),
-        residual=residual,
-        converged=converged,
-        nearly_converged=~converged & (residual <= NEARLY_CONVERGED * tolerance),
-        indefinite=(y * Ay).sum() < 0,
-        spectral_radius=jnp.ones_like(residual),
+    scaled = lx.FunctionLinearOperator(
+        lambda y: inner.solve_factor(operator.mv(inner.solve_factor_transpose(y))),
+        operator.in_structure(),
+        (lx.symmetric_tag, lx.positive_semidefinite_tag) if definite else lx.symmetric_tag,
     )
-
-
-class ScaledOperator(AbstractSymmetricOperator):
-    """L⁻¹A L⁻ᵀ for an operator A and the inner product of W = L Lᵀ."""
-
-    operator: AbstractSymmetricOperator
-    inner: AbstractInnerProduct
-
-    def is_positive_semidefinite(self) -> bool:
-        return self.operator.is_positive_semidefinite()
-
-    def mv(self, vector: Array) -> Array:
-        return self.inner.solve_factor(self.operator.mv(self.inner.solve_factor_transpose(vector)))
-
-    def in_structure(self) -> jax.ShapeDtypeStruct:
-        return self.operator.in_structure()
-
-
-def _initialised(solver: lx.AbstractLinearSolver, operator: ScaledOperator, options: dict[str, Any]) -> Any:
     try:
-        return solver.init(operator, options)
+        state = solver.init(scaled, options)
     except ValueError as error:
-        if operator.is_positive_semidefinite():
-            kind = "positive definite, without other structure. Take a solver of such matrices, as ConjugateResidual()"
-        else:
+        kind = "positive definite, without other structure. Take a solver of such matrices, as ConjugateResidual()"
+        if not definite:
             kind = (
                 "may be indefinite. Take a solver of such matrices, as ConjugateResidual(); or make it positive "
                 "definite with AnalyticHessian(projected=True), which for the adjoint_solver of Newton's method is no "
                 "way out, as its derivatives are those of the true Hessian"
             )
         raise ValueError(
-            f"{_name(solver)} refuses the matrix M + χH of an implicit step: {str(error).rstrip('.')}. The matrix is "
-            f"symmetric and {kind}."
+            f"{name} refuses the matrix M + χH of an implicit step: {str(error).rstrip('.')}. The matrix is symmetric "
+            f"and {kind}."
         ) from error
+    y, result, stats = solver.compute(state, b, options)
+    if jnp.shape(y) != b.shape:
+        raise ValueError(
+            f"{name}.compute must return a solution of the right-hand side's shape, {b.shape}, got {jnp.shape(y)}."
+        )
+    Ay = scaled.mv(y)
+    residual, tolerance = jnp.sqrt(((b - Ay) ** 2).sum()), _tolerance(solver, b)
+    converged = (result == lx.RESULTS.successful) & (residual <= tolerance)
+    nearly = ~converged & (residual <= NEARLY_CONVERGED * tolerance)
+    iterations = jnp.asarray(stats.get("num_steps", 0), dtype=jnp.int32)
+    info = _info(iterations, residual, converged, nearly, (y * Ay).sum() < 0)
+    return size * inner.solve_factor_transpose(y), info, jnp.ones_like(residual)
 
 
 def require_solver(name: str, solver: lx.AbstractLinearSolver) -> None:
@@ -200,7 +209,3 @@ def _tolerance(solver: lx.AbstractLinearSolver, b: Array) -> Any:
     if rtol is None and atol is None:
         return default_rtol(b.dtype)
     return (0 if rtol is None else rtol) + math.sqrt(b.size) * (0 if atol is None else atol)
-
-
-def _name(solver: lx.AbstractLinearSolver) -> str:
-    return type(solver).__name__

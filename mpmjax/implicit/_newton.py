@@ -1,7 +1,7 @@
 """Newton's method for the nodal problems."""
 
 from collections.abc import Callable
-from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,18 +11,15 @@ import lineax as lx
 from mpmjax._types import Array, Bool, Float, Int, NodeVector, Scalar
 from mpmjax.checks import require, require_fields, require_tolerance
 from mpmjax.implicit._conjugate_residual import NEGLIGIBLE_CHANGE, ConjugateResidual
-from mpmjax.implicit._inner_product import AbstractInnerProduct
-from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, default_rtol, require_solver, solve_linear
-from mpmjax.implicit._operator import ImplicitOperator
-from mpmjax.implicit._solution import AbstractSolution, SolveInfo
-from mpmjax.implicit._stage_problem import StageProblem
+from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, SolveInfo, default_rtol, require_solver, solve_linear
+from mpmjax.implicit._stage import AbstractStageSolver, StageProblem
 
 MOST_HALVINGS = 30
 _SUFFICIENT_DECREASE = 1e-4
 _ROUNDING = 4.0  # units of rounding that a sum over the particles and nodes is taken to have
 
 
-class Newton(AbstractSolution):
+class Newton(AbstractStageSolver):
     """Newton's method with a backtracking line search on the incremental potential.
 
     Direction: the Hessian can be indefinite. If the potential does not fall along Newton's direction, the steepest one
@@ -69,41 +66,90 @@ class Newton(AbstractSolution):
 
     def __call__(self, problem: StageProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
         rtol = default_rtol(guess.dtype) if self.rtol is None else self.rtol
-        setting, start = _setting(problem, guess, rtol)
+        combine, free, potential = problem.projection.combine, problem.projection.free, problem.incremental_potential
+        mass = jnp.where(free, problem.mass[:, None], 1)  # the weight of the norms in the termination rule
+        unit, rounding_unit = problem.unit_strain_velocity(), _ROUNDING * jnp.finfo(guess.dtype).eps
 
-        def goes_on(c: _NewtonState) -> Bool[Array, ""]:
-            return ~_converged(setting, c) & (c.newton < self.max_steps) & ~c.stuck
+        def norm(r: NodeVector) -> Float[Array, ""]:
+            """‖r‖ in the norm of the inverse mass."""
+            return jnp.sqrt((r**2 / mass).sum())
 
-        c = jax.lax.while_loop(goes_on, partial(_step, self.solver, setting), start)
-        return _outcome(setting, c)
+        def residual(v: NodeVector) -> NodeVector:
+            return combine(problem.momentum_residual(v), 0)
+
+        rest, start = problem.apply_dirichlet(jnp.zeros_like(guess)), problem.apply_dirichlet(guess)
+        at_start, at_rest = potential(start), potential(rest)
+        start = jnp.where(jnp.isfinite(at_start) & ~(at_rest < at_start), start, rest)
+        startable = jnp.isfinite(at_start) | jnp.isfinite(at_rest)
+        undisplaced = problem.undisplaced_velocity()
+        b = problem.momentum_residual(undisplaced)
+        b = combine(b + problem.operator(undisplaced).unconstrained(rest - undisplaced), 0)
+        scale, inertia = norm(b), norm(combine(problem.mass[:, None] * problem.inertial, 0))
+
+        def converged(c: _Iterate) -> Bool[Array, ""]:
+            left = norm(c.r)
+            speed = jnp.sqrt((mass * combine(c.v, 0) ** 2).sum())
+            bounded = ~c.indefinite & (left <= NEGLIGIBLE_CHANGE * speed)
+            return (left <= rtol * scale) | ((left <= c.rounding) & (c.settled | bounded))
+
+        def cond_fun(c: _Iterate) -> Bool[Array, ""]:
+            return ~converged(c) & (c.newton < self.max_steps) & ~c.stuck
+
+        def body_fun(c: _Iterate) -> _Iterate:
+            at = jnp.where((c.newton == 0) & ~startable, undisplaced, c.v)
+            operator = problem.operator(at, problem.hessian).precomputed()
+            inner = problem.preconditioner.inner_product(operator)
+            # the direction: Newton's, or the steepest one where the potential does not fall along Newton's
+            direction, solve, radius = solve_linear(self.solver, operator, -c.r, inner)
+            slope = (c.r * direction).sum()
+            steepest = inner.solve(-c.r) / jnp.maximum(radius, 1)
+            uphill = ~(slope < 0)
+            direction = jnp.where(uphill, steepest, direction)
+            slope = jnp.where(uphill, (c.r * steepest).sum(), slope)
+            # the line search
+            energy = potential(c.v)
+            energy = jnp.where(jnp.isfinite(energy), energy, jnp.inf)
+            weight = jnp.where(free, operator.diagonal(), 0)
+            slack = rounding_unit * ((weight * unit**2).sum() + jnp.abs(energy))
+            size, halvings = backtrack(lambda size: potential(c.v + size * direction), energy, slope, slack)
+            v = c.v + size * direction
+            # whether the step changes the velocity by no more than a thousandth, or strains by no more than √ε
+            unseen = jnp.where(free, jnp.sqrt(jnp.finfo(v.dtype).eps) * unit, 0)
+            vectors = direction, combine(c.v + direction, 0), unseen
+            moved, speed, least = (jnp.sqrt((inner.apply(a) * a).sum()) for a in vectors)
+            negligible = moved <= jnp.maximum(NEGLIGIBLE_CHANGE * speed, least)
+            return _Iterate(
+                v=v,
+                r=residual(v),
+                rounding=rounding_unit * (norm(weight * (jnp.abs(v) + unit)) + inertia),
+                settled=~uphill & solve.converged & (halvings == 0) & negligible,
+                iterations=c.iterations + solve.iterations,
+                newton=c.newton + 1,
+                halvings=c.halvings + halvings,
+                stuck=halvings >= MOST_HALVINGS,
+                indefinite=c.indefinite | solve.indefinite,
+            )
+
+        none, zero, no = jnp.zeros((), jnp.int32), jnp.zeros((), guess.dtype), jnp.zeros((), bool)
+        first = _Iterate(start, jnp.where(startable, residual(start), b), zero, no, none, none, none, no, no)
+        c = jax.lax.while_loop(cond_fun, body_fun, first)
+        left = norm(c.r)
+        size = jnp.maximum(jnp.maximum(scale, inertia), c.rounding)
+        done = jnp.isfinite(left) & converged(c)
+        info = SolveInfo(
+            iterations=c.iterations,
+            newton=c.newton,
+            line_search=c.halvings,
+            residual=left / jnp.where(size == 0, 1, size),
+            converged=done,
+            nearly_converged=~done & (left <= NEARLY_CONVERGED * rtol * scale),
+            indefinite=c.indefinite,
+            report=jnp.zeros_like(left),
+        )
+        return jnp.where(free & ~jnp.isfinite(left), jnp.nan, c.v), info
 
 
-class _Setting(eqx.Module):
-    """The constants of an iteration."""
-
-    problem: StageProblem
-    rtol: Scalar
-    mass: NodeVector
-    """Nodal masses [kg], 1 in components that are not free: the weight of the norms in the termination rule."""
-    scale: Float[Array, ""]
-    """‖b‖, with b the right-hand side of the system linearised at zero displacement."""
-    inertia: Float[Array, ""]
-    """‖M a‖, with a of the stage."""
-    undisplaced: NodeVector
-    """The velocity at which nothing is displaced [m/s]."""
-    startable: Bool[Array, ""]
-    """Whether the potential is defined at the guess or at rest."""
-
-    def residual(self, v: NodeVector) -> NodeVector:
-        """The momentum residual, zero in components that are held."""
-        return self.problem.projection.combine(self.problem.momentum_residual(v), 0)
-
-    def norm(self, r: NodeVector) -> Float[Array, ""]:
-        """‖r‖ in the norm of the inverse mass."""
-        return _norm(r, self.mass)
-
-
-class _NewtonState(eqx.Module):
+class _Iterate(NamedTuple):
     v: NodeVector
     r: NodeVector
     """The residual at v."""
@@ -117,110 +163,6 @@ class _NewtonState(eqx.Module):
     stuck: Bool[Array, ""]
     """Whether the last line search failed."""
     indefinite: Bool[Array, ""]
-
-
-class _Direction(eqx.Module):
-    """The direction of a Newton step, and the report of its linear solve."""
-
-    value: NodeVector
-    slope: Float[Array, ""]
-    """Derivative of the potential along it."""
-    whole: Bool[Array, ""]
-    """Whether it is Newton's direction, from a solve that converged."""
-    iterations: Int[Array, ""]
-    indefinite: Bool[Array, ""]
-
-
-def _setting(problem: StageProblem, guess: NodeVector, rtol: Scalar) -> tuple[_Setting, _NewtonState]:
-    """The constants and the initial state of an iteration."""
-    combine, free = problem.projection.combine, problem.projection.free
-    rest = problem.apply_dirichlet(jnp.zeros_like(guess))
-    start = problem.apply_dirichlet(guess)
-    energies = problem.incremental_potential(start), problem.incremental_potential(rest)
-    start = jnp.where(jnp.isfinite(energies[0]) & ~(energies[1] < energies[0]), start, rest)
-    undisplaced = problem.undisplaced_velocity()
-    linearised = problem.momentum_residual(undisplaced)
-    linearised = combine(linearised + problem.operator(undisplaced).unconstrained(rest - undisplaced), 0)
-    mass = jnp.where(free, problem.mass[:, None], 1)
-    setting = _Setting(
-        problem=problem,
-        rtol=rtol,
-        mass=mass,
-        scale=_norm(linearised, mass),
-        inertia=_norm(combine(problem.mass[:, None] * problem.inertial, 0), mass),
-        undisplaced=undisplaced,
-        startable=jnp.isfinite(energies[0]) | jnp.isfinite(energies[1]),
-    )
-    first = jnp.where(setting.startable, setting.residual(start), linearised)
-    zero_count, no = jnp.asarray(0, dtype=jnp.int32), jnp.asarray(False)
-    return setting, _NewtonState(
-        v=start,
-        r=first,
-        rounding=jnp.zeros((), guess.dtype),
-        settled=no,
-        iterations=zero_count,
-        newton=zero_count,
-        halvings=zero_count,
-        stuck=no,
-        indefinite=no,
-    )
-
-
-def _norm(r: NodeVector, mass: NodeVector) -> Float[Array, ""]:
-    return jnp.sqrt((r**2 / mass).sum())
-
-
-def _converged(setting: _Setting, c: _NewtonState) -> Bool[Array, ""]:
-    left = setting.norm(c.r)
-    speed = jnp.sqrt((setting.mass * setting.problem.projection.combine(c.v, 0) ** 2).sum())
-    bounded = ~c.indefinite & (left <= NEGLIGIBLE_CHANGE * speed)
-    return (left <= setting.rtol * setting.scale) | ((left <= c.rounding) & (c.settled | bounded))
-
-
-def _step(solver: lx.AbstractLinearSolver, setting: _Setting, c: _NewtonState) -> _NewtonState:
-    """One Newton step: direction, line search, residual."""
-    problem = setting.problem
-    unstarted = (c.newton == 0) & ~setting.startable
-    operator = problem.newton_operator(jnp.where(unstarted, setting.undisplaced, c.v)).precomputed()
-    inner = problem.preconditioner.inner_product(operator)
-    direction = _direction(solver, operator, inner, c.r)
-    energy = problem.incremental_potential(c.v)
-    energy = jnp.where(jnp.isfinite(energy), energy, jnp.inf)
-    weight = jnp.where(problem.projection.free, operator.diagonal(), 0)
-    unit, eps = problem.unit_strain_velocity(), jnp.finfo(c.v.dtype).eps
-    slack = _ROUNDING * eps * ((weight * unit**2).sum() + jnp.abs(energy))
-    size, halvings = backtrack(
-        lambda size: problem.incremental_potential(c.v + size * direction.value), energy, direction.slope, slack
-    )
-    v = c.v + size * direction.value
-    return _NewtonState(
-        v=v,
-        r=setting.residual(v),
-        rounding=_ROUNDING * eps * (setting.norm(weight * (jnp.abs(v) + unit)) + setting.inertia),
-        settled=direction.whole & (halvings == 0) & _negligible(problem, inner, c.v, direction.value),
-        iterations=c.iterations + direction.iterations,
-        newton=c.newton + 1,
-        halvings=c.halvings + halvings,
-        stuck=halvings >= MOST_HALVINGS,
-        indefinite=c.indefinite | direction.indefinite,
-    )
-
-
-def _direction(
-    solver: lx.AbstractLinearSolver, operator: ImplicitOperator, inner: AbstractInnerProduct, r: NodeVector
-) -> _Direction:
-    """Newton's direction, or the steepest one where the potential does not fall along Newton's."""
-    solution = solve_linear(solver, operator, -r, inner)
-    slope = (r * solution.value).sum()
-    steepest = inner.solve(-r) / jnp.maximum(solution.spectral_radius, 1)
-    uphill = ~(slope < 0)
-    return _Direction(
-        value=jnp.where(uphill, steepest, solution.value),
-        slope=jnp.where(uphill, (r * steepest).sum(), slope),
-        whole=~uphill & solution.converged,
-        iterations=solution.iterations,
-        indefinite=solution.indefinite,
-    )
 
 
 def backtrack(
@@ -252,28 +194,3 @@ def backtrack(
 
     whole, zero_count = jnp.ones((), start.dtype), jnp.asarray(0, dtype=jnp.int32)
     return jax.lax.while_loop(refused, lambda trial: (trial[0] / 2, trial[1] + 1), (whole, zero_count))
-
-
-def _negligible(problem: StageProblem, inner: AbstractInnerProduct, v: NodeVector, step: NodeVector) -> Bool[Array, ""]:
-    """Whether a step changes the velocity by no more than a thousandth, or strains by no more than √ε."""
-    unseen = jnp.sqrt(jnp.finfo(v.dtype).eps) * problem.unit_strain_velocity()
-    vectors = step, problem.projection.combine(v + step, 0), jnp.where(problem.projection.free, unseen, 0)
-    moved, speed, least = (jnp.sqrt((inner.apply(a) * a).sum()) for a in vectors)
-    return moved <= jnp.maximum(NEGLIGIBLE_CHANGE * speed, least)
-
-
-def _outcome(setting: _Setting, c: _NewtonState) -> tuple[NodeVector, SolveInfo]:
-    left = setting.norm(c.r)
-    size = jnp.maximum(jnp.maximum(setting.scale, setting.inertia), c.rounding)
-    done = jnp.isfinite(left) & _converged(setting, c)
-    info = SolveInfo(
-        iterations=c.iterations,
-        newton=c.newton,
-        line_search=c.halvings,
-        residual=left / jnp.where(size == 0, 1, size),
-        converged=done,
-        nearly_converged=~done & (left <= NEARLY_CONVERGED * setting.rtol * setting.scale),
-        indefinite=c.indefinite,
-        report=jnp.zeros_like(left),
-    )
-    return jnp.where(setting.problem.projection.free & ~jnp.isfinite(left), jnp.nan, c.v), info

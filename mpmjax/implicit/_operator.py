@@ -1,69 +1,58 @@
 """The matrix of implicit solves, M + χH on free components, as a lineax operator."""
 
-import abc
+from collections.abc import Sequence
+from functools import reduce
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
+from jax.core import ShapedArray
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.implicit._hessian import AbstractHessianAction, ParticleStiffness
-from mpmjax.implicit._projection import Projection
-from mpmjax.implicit._vectors import ParticleMatrices, product
+from mpmjax.native import differentiable, native_primitive
 
 
-class AbstractSymmetricOperator(lx.AbstractLinearOperator):
-    """A symmetric operator on arrays of one shape, given by its products with vectors."""
+class Projection(eqx.Module):
+    """The projection Q of node vectors on the components that nothing holds. At a node with held normals n it also
+    removes the components along them, I − Σ n nᵀ.
 
-    @abc.abstractmethod
-    def is_positive_semidefinite(self) -> bool:
-        """Whether the operator is known to be positive semi-definite, as solvers such as `lineax.CG` require."""
+    Without normals it is a mask.
+    """
 
-    @abc.abstractmethod
-    def mv(self, vector: Array) -> Array:
-        """The product with a vector."""
+    free: Mask
+    """Whether nothing prescribes a component, shape (n, d)."""
+    normals: tuple[NodeVector, ...] = ()
+    """Held unit normals, each (n, d), at right angles where a node has several; zero in components that are not free,
+    and at nodes without one."""
 
-    @abc.abstractmethod
-    def in_structure(self) -> jax.ShapeDtypeStruct:
-        """Shape and dtype of a vector."""
+    def combine(self, a: NodeVector | Scalar, b: NodeVector | Scalar) -> NodeVector:
+        """Q a + (I − Q) b."""
+        if not self.normals:
+            return jnp.where(self.free, a, b)
+        gap = jnp.where(self.free, b - a, 0)
+        held = reduce(jnp.add, (normal * (normal * gap).sum(axis=1, keepdims=True) for normal in self.normals))
+        return jnp.where(self.free, a + held, b)
 
-    def support(self) -> Bool[Array, "..."] | None:
-        """Where the operator is not the identity, in the shape of a vector; None if that is not known."""
-        return None
+    def commuting_weight(self, weight: NodeVector) -> NodeVector:
+        """A positive diagonal weight made to commute with Q: 1 in components that are not free, and the mean over its
+        components at a node with a held normal."""
+        for normal in self.normals:
+            oblique = (normal != 0).any(axis=1, keepdims=True)
+            weight = jnp.where(oblique, weight.mean(axis=1, keepdims=True), weight)
+        return jnp.where(self.free, weight, 1)
 
-    def product(
-        self, v: Array, weight: Float[Array, "..."], active: Bool[Array, "k"]
-    ) -> tuple[Array, Float[Array, ""]]:
-        """W⁻¹A v and vᵀA v for this operator A, as an iteration needs them.
-
-        Args:
-            v: v.
-            weight: the diagonal of W, of the same shape.
-            active: where vectors may differ from zero, and where they are passed over (see `active_blocks`).
-        """
-        del active
-        image = self.mv(v)
-        return image / weight, (v * image).sum()
-
-    def matrices(self) -> ParticleMatrices | None:
-        """The operator as one matrix for each particle; None if it is more than that."""
-        return None
-
-    def out_structure(self) -> jax.ShapeDtypeStruct:
-        return self.in_structure()
-
-    def as_matrix(self) -> Float[Array, "nd nd"]:
-        vector = self.in_structure()
-        columns = jax.vmap(lambda e: self.mv(e.reshape(vector.shape)).reshape(-1))
-        return columns(jnp.eye(vector.size, dtype=vector.dtype)).T
-
-    def transpose(self) -> "AbstractSymmetricOperator":
-        return self
+    def identity_rows(self, vector: NodeVector, mass: NodeScalar) -> Array:
+        """The part of an operator's product outside of the range of Q: the vector itself, and along a held normal the
+        vector times the nodal mass. An inner product of the mass or more then does not enlarge it, at light nodes
+        too."""
+        return jnp.where(self.free, mass[:, None], 1) * vector if self.normals else vector
 
 
-class ImplicitOperator(AbstractSymmetricOperator):
+class ImplicitOperator(lx.AbstractLinearOperator):
     """Q (M + χ H) Q + I − Q [kg] (derivation, eq. 21), with χ = βΔt² for the semi-implicit step and Δt_s² for a stage
     of length Δt_s.
 
@@ -79,9 +68,6 @@ class ImplicitOperator(AbstractSymmetricOperator):
     """H [N/m]."""
     projection: Projection
 
-    def is_positive_semidefinite(self) -> bool:
-        return self.hessian.is_positive_semidefinite()
-
     def unconstrained(self, v: NodeVector) -> NodeVector:
         """(M + χ H) v."""
         return self.mass[:, None] * v + self.factor * self.hessian(v)
@@ -90,34 +76,31 @@ class ImplicitOperator(AbstractSymmetricOperator):
         combine = self.projection.combine
         return combine(self.unconstrained(combine(vector, 0)), self.projection.identity_rows(vector, self.mass))
 
-    def product(
-        self, v: NodeVector, weight: NodeVector, active: Bool[Array, "k"]
-    ) -> tuple[NodeVector, Float[Array, ""]]:
-        """Without held normals, all but H v in one pass."""
-        free = self.projection.free
+    def product(self, u: Float[Array, "m"], weight: Float[Array, "m"], active: Bool[Array, "k"]) -> Sequence[Array]:
+        """W⁻¹A u and uᵀA u of flat vectors, as an iteration needs them.
+
+        Args:
+            u: u, shape (m,).
+            weight: the diagonal of W, shape (m,).
+            active: `active_blocks`. Elsewhere u is zero and nothing is free.
+        """
+        v, free = u.reshape(self.projection.free.shape), self.projection.free.reshape(-1)
         if self.projection.normals:
-            return super().product(v, weight, active)
-        force = self.hessian(self.projection.combine(v, 0)).reshape(-1)
-        image, square = product(
-            force, v.reshape(-1), self.mass, self.factor, free.reshape(-1), weight.reshape(-1), active
-        )
-        return image.reshape(v.shape), square
+            image = self.mv(v).reshape(-1)
+            return image / weight, (u * image).sum()
+        force, factor = self.hessian(self.projection.combine(v, 0)).reshape(-1), jnp.asarray(self.factor, u.dtype)
+        return product_p.bind(force, u, self.mass, factor, free, weight, active, batched=0)
 
-    def support(self) -> Mask:
-        return self.projection.free
-
-    def matrices(self) -> ParticleMatrices | None:
-        hessian, free = self.hessian, self.projection.free
-        if self.projection.normals or not isinstance(hessian, ParticleStiffness) or not hessian.alone:
-            return None
-        stencil = hessian.stencil
-        return ParticleMatrices(
-            stencil.factors, stencil.places, hessian.upper, self.mass, self.factor, free.reshape(-1)
-        )
+    @property
+    def is_particle_matrices(self) -> bool:
+        """Whether A is the mass and one matrix for each particle on a mask, and nothing else."""
+        H = self.hessian
+        plain = isinstance(H, ParticleStiffness) and not (H.mirror.images or H.coupled or H.others)
+        return plain and not self.projection.normals
 
     def precomputed(self) -> "ImplicitOperator":
         """The operator, with H as one matrix for each particle, computed once for many applications."""
-        return eqx.tree_at(lambda o: o.hessian, self, self.hessian.precomputed())
+        return ImplicitOperator(self.mass, self.factor, self.hessian.precomputed(), self.projection)
 
     def nodal_mass(self) -> NodeVector:
         """m_i [kg] in each component, shape (n, d)."""
@@ -125,42 +108,64 @@ class ImplicitOperator(AbstractSymmetricOperator):
 
     def diagonal(self) -> NodeVector:
         """m_i + χ H_ii [kg], shape (n, d), without negative parts of H (see `ParticleStiffness.diagonal`)."""
-        mass = self.nodal_mass()
-        return mass + self.factor * self.hessian.precomputed().diagonal(mass)
+        return self.mass[:, None] + self.factor * self.hessian.precomputed().diagonal(len(self.mass))
 
     def in_structure(self) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct(self.projection.free.shape, self.mass.dtype)
 
+    def out_structure(self) -> jax.ShapeDtypeStruct:
+        return self.in_structure()
 
-@lx.is_symmetric.register(AbstractSymmetricOperator)
-def _(operator: AbstractSymmetricOperator) -> bool:
-    return True
+    def as_matrix(self) -> Float[Array, "nd nd"]:
+        vector = self.in_structure()
+        columns = jax.vmap(lambda e: self.mv(e.reshape(vector.shape)).reshape(-1))
+        return columns(jnp.eye(vector.size, dtype=vector.dtype)).T
 
-
-@lx.is_positive_semidefinite.register(AbstractSymmetricOperator)
-def _(operator: AbstractSymmetricOperator) -> bool:
-    return operator.is_positive_semidefinite()
-
-
-for _property in (
-    lx.is_diagonal,
-    lx.is_tridiagonal,
-    lx.has_unit_diagonal,
-    lx.is_lower_triangular,
-    lx.is_upper_triangular,
-    lx.is_negative_semidefinite,
-):
-
-    @_property.register(AbstractSymmetricOperator)
-    def _(operator: AbstractSymmetricOperator) -> bool:
-        return False
+    def transpose(self) -> "ImplicitOperator":
+        return self
 
 
-del _property
+def _register() -> None:
+    """The operator's properties for lineax: it is symmetric, and otherwise of no structure."""
+    lx.is_symmetric.register(ImplicitOperator, lambda operator: True)
+    lx.is_positive_semidefinite.register(ImplicitOperator, lambda operator: operator.hessian.is_positive_semidefinite())
+    for absent in (
+        lx.is_diagonal,
+        lx.is_tridiagonal,
+        lx.has_unit_diagonal,
+        lx.is_lower_triangular,
+        lx.is_upper_triangular,
+        lx.is_negative_semidefinite,
+    ):
+        absent.register(ImplicitOperator, lambda operator: False)
+    for same in (lx.linearise, lx.materialise, lx.conj):
+        same.register(ImplicitOperator, lambda operator: operator)
 
 
-@lx.linearise.register(AbstractSymmetricOperator)
-@lx.materialise.register(AbstractSymmetricOperator)
-@lx.conj.register(AbstractSymmetricOperator)
-def _(operator: AbstractSymmetricOperator) -> Any:
-    return operator
+_register()
+
+
+def _product(*args: Array, unroll: bool = False) -> list[Array]:
+    """W⁻¹A v and vᵀA v, with (A v)_i = m_i v_i + χ f_i where i is free, f = H v, and v_i elsewhere."""
+    del unroll  # there is no loop
+    force, v, mass, factor, free, weight, _ = args
+    image = jnp.where(free, jnp.repeat(mass, len(v) // max(1, len(mass))) * v + factor * force, v)
+    return [image / weight, (v * image).sum()]
+
+
+def _product_shapes(*args: ShapedArray) -> list[tuple]:
+    return [args[0].shape[-1:], ()]
+
+
+def vectors_fit(avals: Any, batched: int) -> bool:
+    """Whether the native library has a kernel for passes over these vectors: floats of one kind, and masks."""
+    del batched
+    floats = [aval.dtype for aval in avals if aval.dtype != np.bool_]
+    return floats[0] in (np.float32, np.float64) and set(floats) == {floats[0]}
+
+
+product_p = differentiable(
+    native_primitive("vectors_product", _product, _product_shapes, vectors_fit, {0: 0}), _product
+)
+"""The rest of a product with M + χH, once H v is known, with an inner product. In JAX these are some four passes over
+the window, of which a body may fill a small part; natively it is one, in place, that skips inactive blocks."""

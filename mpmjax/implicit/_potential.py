@@ -49,37 +49,28 @@ class ElasticPotential(eqx.Module):
         """δF_p from the gradient Σ_i u_i g_ipᵀ of the displacement, one array for each material."""
         return tuple(points.change(points.rows_of(gradient)) for points in self.material_points)
 
-    def current_deformation(self) -> Deformations:
-        """F_p at u = 0, one array for each material."""
-        return tuple(points.deformation for points in self.material_points)
-
-    def deformation(self, u: NodeVector | None) -> Deformations:
+    def deformation(self, u: NodeVector | Displacement | None) -> Deformations:
         """F_p + Σ_i u_i h_ipᵀ at a displacement u [m], shape (n, d), one array for each material; None for u = 0."""
-        return self.current_deformation() if u is None else self._deformation(self.displaced(u))
-
-    def _deformation(self, moved: Displacement) -> Deformations:
+        current = tuple(points.deformation for points in self.material_points)
+        moved = u if isinstance(u, Displacement) else self.displaced(u)
         if moved.at_rest:
-            return self.current_deformation()
-        return tuple(
-            F + dF for F, dF in zip(self.current_deformation(), self.change(displacement_gradient(moved)), strict=True)
-        )
+            return current
+        return tuple(F + dF for F, dF in zip(current, self.change(displacement_gradient(moved)), strict=True))
 
-    def energy(self, u: NodeVector) -> Float[Array, ""]:
+    def energy(self, u: NodeVector | Displacement) -> Float[Array, ""]:
         """Φ(u) [J]."""
-        return self._energy(self.displaced(u))
-
-    def _energy(self, moved: Displacement) -> Float[Array, ""]:
-        pairs = zip(self.material_points, self._deformation(moved), strict=True)
+        moved = u if isinstance(u, Displacement) else self.displaced(u)
+        pairs = zip(self.material_points, self.deformation(moved), strict=True)
         parts = [(points.volume * points.energy_density(F)).sum() for points, F in pairs]
         return reduce(jnp.add, [*parts, *(term.energy(moved) for term in self.terms)])
 
     def admissible_energy(self, u: NodeVector) -> Float[Array, ""]:
         """Φ(u) [J], NaN if a law or term does not admit the displacement. It must not be differentiated."""
         moved = self.displaced(u)
-        pairs = zip(self.material_points, self._deformation(moved), strict=True)
+        pairs = zip(self.material_points, self.deformation(moved), strict=True)
         admitted = [points.is_admissible(F).all() for points, F in pairs]
         admitted += [defined for term in self.terms if (defined := term.is_admissible(moved)) is not None]
-        return jnp.where(reduce(jnp.logical_and, admitted), self._energy(moved), jnp.nan)
+        return jnp.where(reduce(jnp.logical_and, admitted), self.energy(moved), jnp.nan)
 
     def term_energy(self, u: NodeVector | None) -> Float[Array, ""]:
         """The part of Φ(u) by the terms [J]; None for u = 0."""
@@ -89,23 +80,25 @@ class ElasticPotential(eqx.Module):
     def force(self, u: NodeVector | None) -> NodeVector:
         """f = −∂Φ/∂u [N], shape (n, d); None for u = 0, where f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
         moved = self.displaced(u)
-        pairs = zip(self.material_points, self._deformation(moved), strict=True)
-        stress = tuple(points.stress(F) for points, F in pairs)
-        elastic = Forces(slopes=-jnp.swapaxes(self.flux(stress), 0, 1))
-        return self.on_nodes([elastic, *(term.force(moved) for term in self.terms)])
+        pairs = zip(self.material_points, self.deformation(moved), strict=True)
+        elastic = self.flux([points.stress(F) for points, F in pairs])
+        return self.on_nodes([Forces(slopes=-jnp.swapaxes(elastic, 0, 1)), *(term.force(moved) for term in self.terms)])
 
-    def flux(self, P: Deformations) -> Matrix:
+    def flux(self, P: Sequence[Deformation]) -> Matrix:
         """V0_p P_p F_pᵀ [J], shape (d, d, p), from the stress of each material; in the total description V0_p P_p."""
-        return joined([points.flux(own, self._dim) for points, own in zip(self.material_points, P, strict=True)])
+        d = len(self.stencil.weights)
+        return joined([points.flux(stress, d) for points, stress in zip(self.material_points, P, strict=True)])
 
     def current_flux(self) -> Matrix:
         """V0_p P_p F_pᵀ at u = 0 [J], shape (d, d, p), of which the force is f_i = −Σ_p (V0_p P_p F_pᵀ) g_ip."""
-        return joined([points.flux(points.stress(points.deformation), self._dim) for points in self.material_points])
+        return self.flux([points.stress(points.deformation) for points in self.material_points])
 
     @property
     def viscous(self) -> bool:
         """Whether any of the materials has viscosity, or any of the terms a resistance."""
-        return self.material_viscous or any(term.viscous for term in self.terms)
+        return any(points.viscosity is not None for points in self.material_points) or any(
+            term.viscous for term in self.terms
+        )
 
     @property
     def material_viscous(self) -> bool:
@@ -149,19 +142,16 @@ class ElasticPotential(eqx.Module):
         material has viscosity."""
         if not self.material_viscous:
             return None
+        d = len(self.stencil.weights)
 
         def matrix(points: MaterialPoints) -> Array:
             def flux_of(slopes: Matrix) -> Matrix:
                 return la.transpose(points.viscous_flux(la.transpose(slopes)))
 
-            like = jnp.zeros((self._dim, self._dim, *points.volume.shape), points.volume.dtype)
+            like = jnp.zeros((d, d, *points.volume.shape), points.volume.dtype)
             return la.upper_triangle(la.matrix_of(flux_of, like))
 
         return joined([matrix(points) for points in self.material_points])
-
-    @property
-    def _dim(self) -> int:
-        return len(self.stencil.weights)
 
 
 def displacement_gradient(moved: Displacement) -> Matrix:

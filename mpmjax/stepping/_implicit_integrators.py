@@ -1,6 +1,7 @@
 """The implicit integrators: the semi-implicit step, backward Euler, the midpoint rule, TR-BDF2."""
 
 from abc import abstractmethod
+from collections.abc import Callable
 from functools import reduce
 from typing import ClassVar
 
@@ -13,7 +14,7 @@ from mpmjax.checks import require_between, require_fields
 from mpmjax.implicit import (
     AbstractHessian,
     AbstractPreconditioner,
-    AbstractSolution,
+    AbstractStageSolver,
     AnalyticHessian,
     ConjugateResidual,
     DiagonalPreconditioner,
@@ -23,9 +24,9 @@ from mpmjax.implicit import (
     Reporting,
     SolveInfo,
     StageProblem,
-    exact_force,
     require_solver,
     solve,
+    solve_linearised,
 )
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion
 from mpmjax.stepping._nodes import Nodes
@@ -54,14 +55,19 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
         require_fields(self)
         require_solver(f"{type(self).__name__}'s adjoint_solver", self.adjoint_solver)
 
-    def solved_by(self) -> AbstractSolution:
-        """How the equation of a stage is solved. Default: by the field `solution`."""
+    def solved_by(self) -> Callable[[StageProblem, NodeVector], tuple[NodeVector, SolveInfo]]:
+        """How the equation of a stage is solved, as an `AbstractStageSolver` does. Default: by the field `solution`."""
         return self.solution  # pyright: ignore[reportAttributeAccessIssue]
 
+    @property
+    def linearises(self) -> bool:
+        """Whether stages have the elastic force f(0) − H u in place of that of the law."""
+        return getattr(self.solved_by(), "linearises", False)
+
     @abstractmethod
-    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
-        """The stages in which the elastic force acts on displaced nodes: weights q [-] and displacements u [m], shape
-        (n, d), of the impulse Δt Σ q f(u)."""
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector | None], ...]:
+        """The stages in which the elastic force acts: weights q [-] and displacements u [m], shape (n, d), of the
+        impulse Δt Σ q f(u); None for the start of the step, u = 0."""
 
     def solve_stage(
         self,
@@ -83,7 +89,7 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
             initial_displacement: u at the start of the stage [m], shape (n, d); None for zero.
             theta: θ, the share of the stage's displacement at which its force is evaluated [-].
         """
-        stage = StageProblem(
+        problem = StageProblem(
             mass=nodes.mass,
             inertial=inertial,
             stage_dt=jnp.asarray(stage_dt),
@@ -97,22 +103,28 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
             preconditioner=self.preconditioner,
             theta=theta,
         )
-        solution = self.solved_by()
-        return solve(solution.problem(stage), guess, solution, self.adjoint_solver)
+        problem = problem.linearised() if self.linearises else problem
+        return solve(problem, guess, self.solved_by(), self.adjoint_solver)
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt Σ q f(u) [kg m/s], with the forces that the solution takes."""
         stages = self.stages(nodes, motion)
-        return nodes.dt * self.solved_by().stage_force(nodes.potential, self.hessian, nodes.force, *stages)
+        if not self.linearises:
+            return self._impulse(nodes, stages)
+        stiffness = self.hessian.at(nodes.potential, None)
+        return nodes.dt * (sum(q for q, _ in stages) * nodes.force - stiffness(self.mean_displacement(nodes, motion)))
 
     def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
-        if not self.solved_by().linearises:
-            return None
-        return nodes.dt * exact_force(nodes.potential, *self.stages(nodes, motion))
+        return self._impulse(nodes, self.stages(nodes, motion)) if self.linearises else None
+
+    def _impulse(self, nodes: Nodes, stages: tuple[tuple[Scalar, NodeVector | None], ...]) -> NodeVector:
+        """Δt Σ q f(u) [kg m/s], with the forces of the law."""
+        forces = (q * (nodes.force if u is None else nodes.potential.force(u)) for q, u in stages)
+        return nodes.dt * reduce(jnp.add, forces)
 
     def mean_displacement(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Σ q u [m] of the stages."""
-        return reduce(jnp.add, (q * u for q, u in self.stages(nodes, motion)))
+        return reduce(jnp.add, (q * u for q, u in self.stages(nodes, motion) if u is not None))
 
     def stability_factor(self) -> Scalar:
         return 0.0
@@ -159,8 +171,12 @@ class SemiImplicit(AbstractImplicitIntegrator):
         require_solver("SemiImplicit's solver", self.solver)
         require_between("SemiImplicit's beta", self.beta, 0, 1)
 
-    def solved_by(self) -> Linearised:
-        return Linearised(self.solver)
+    @property
+    def linearises(self) -> bool:
+        return True
+
+    def solved_by(self) -> Callable[[StageProblem, NodeVector], tuple[NodeVector, SolveInfo]]:
+        return eqx.Partial(solve_linearised, self.solver)
 
     def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         v0, beta = nodes.admitted_velocity(), self.beta
@@ -234,7 +250,7 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
         hessian, preconditioner, adjoint_solver, guess: see `AbstractImplicitIntegrator`.
     """
 
-    solution: AbstractSolution = Linearised()
+    solution: AbstractStageSolver = Linearised()
     body_force_at: ClassVar[float] = 0.5
 
     def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
@@ -278,7 +294,7 @@ class TRBDF2(AbstractImplicitIntegrator):
     """
 
     rho: Scalar = 0.0
-    solution: AbstractSolution = Linearised()
+    solution: AbstractStageSolver = Linearised()
     body_force_at: ClassVar[float] = 0.5
 
     def __check_init__(self):
@@ -305,19 +321,11 @@ class TRBDF2(AbstractImplicitIntegrator):
         inner, mean = q2 * (v0 + middle), q0 * v0 + q1 * middle + q2 * v
         return NodeMotion(v, mean, inner, mean if viscous else None), first.together_with(second)
 
-    def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
-        """Δt (q_0 f_0 + q_1 f_γ + q_2 f_1) [kg m/s]."""
-        return nodes.dt * self.weights()[1] * nodes.force + super().elastic_impulse(nodes, motion)
-
-    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
-        later = super().exact_impulse(nodes, motion)
-        return None if later is None else nodes.dt * self.weights()[1] * nodes.force + later
-
-    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector], ...]:
-        """The stages at γΔt and Δt."""
-        _, _, q1, q2 = self.weights()
+    def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector | None], ...]:
+        """Those at 0, γΔt and Δt."""
+        _, q0, q1, q2 = self.weights()
         inner = motion.carrier if motion.inner is None else motion.inner
-        return (q1, nodes.dt * inner), (q2, nodes.dt * motion.carrier)
+        return (q0, None), (q1, nodes.dt * inner), (q2, nodes.dt * motion.carrier)
 
     def force_at(self) -> Scalar:
         """½."""

@@ -94,7 +94,7 @@ def step_unchecked(
     none, zero = jnp.zeros((), jnp.int32), jnp.zeros((), particles.x.dtype)
     error, scale, colliders, boundaries = zero, zero, None, None
     if force_at is not None and new.elastic is not None:
-        error, scale = linearisation_error(scene, nodes, method, force_at, new.solved, new.elastic, trial, after)
+        error, scale = force_error(scene, nodes, method, force_at, new.solved, new.elastic, trial, after)
     if nodes.conditions.colliders is not None:
         colliders = impulse_on_colliders(scene, nodes, method, new)
     if scene.boundary_forces:
@@ -157,7 +157,7 @@ def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: Gri
     return moved_rigidly(scene, particles, moved, nodes.mirror, nodes.conditions.fixed, end, mean, dt)
 
 
-def linearisation_error(
+def force_error(
     scene: Scene,
     nodes: Nodes,
     method: AbstractIntegrator,

@@ -4,7 +4,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 from typing import Any
 
 import equinox as eqx
@@ -13,17 +13,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax import linalg as la
-from mpmjax._types import Array, Bool, Float, Int, NodeVector, Scalar
+from mpmjax._types import Array, Bool, Float, Int, NodeVector
 from mpmjax.checks import as_plain, require, require_fields
 from mpmjax.discretisation import Stencil, gather, scatter
-from mpmjax.implicit._dissection import DissectedFactor, Dissection, dissected_factor
-from mpmjax.implicit._hessian import ParticleStiffness
-from mpmjax.implicit._inner_product import AbstractInnerProduct, DiagonalInnerProduct
-from mpmjax.implicit._operator import ImplicitOperator
-from mpmjax.implicit._preconditioner import AbstractPreconditioner, DiagonalPreconditioner
-from mpmjax.implicit._projection import Projection
+from mpmjax.extensions._dissection import DissectedFactor, Dissection, dissected_factor
+from mpmjax.implicit import (
+    AbstractInnerProduct,
+    AbstractPreconditioner,
+    DiagonalInnerProduct,
+    ImplicitOperator,
+    ParticleStiffness,
+    Projection,
+)
 from mpmjax.potential import Image, Mirror
-from mpmjax.state import AveragedStiffness, VolumeAverage
+from mpmjax.state import AveragedStiffness
 
 _STIFFEST = 0.3  # of C s, times √ε: where S⁻¹ is known to ε C s, P⁻¹ − P⁻¹Bᵀ S⁻¹ B P⁻¹ keeps 1/(C s) of P⁻¹
 
@@ -68,32 +71,40 @@ class VolumePreconditioner(AbstractPreconditioner):
 
     def inner_product(self, operator: ImplicitOperator) -> AbstractInnerProduct:
         operator = operator.precomputed()
-        diagonal, stiffness = DiagonalPreconditioner().inner_product(operator), operator.hessian
+        stiffness, projection, size = operator.hessian, operator.projection, len(operator.mass)
         assert isinstance(stiffness, ParticleStiffness)
+        diagonal = DiagonalInnerProduct(projection.commuting_weight(operator.diagonal()))
         averaged = tuple(part for part in stiffness.coupled if isinstance(part, AveragedStiffness))
-        if not averaged or not isinstance(diagonal, DiagonalInnerProduct):
-            return diagonal
-        half = _half(stiffness, averaged[0].average)
-        if half is None:
-            return diagonal
-        dissection = Dissection(self._shape(averaged[0].average.shape), 2 * half, len(averaged))
+        planar = all(isinstance(image, Image) for image in stiffness.mirror.images)
+        if not averaged or any(averaged[0].average.periodic) or not planar:
+            return diagonal  # B then sees no box of nodes
+        window = shape = averaged[0].average.shape
+        if self.extent is not None:
+            require(
+                len(self.extent) == len(window),
+                f"VolumePreconditioner's extent must have a number for each of {len(window)} axes, got {self.extent}.",
+            )
+            shape = tuple(min(pair) for pair in zip(self.extent, window, strict=True))
+        # how many nodes away B sees along an axis: as far as a hat and a spline of so many cells overlap
+        half = math.ceil(1 + stiffness.stencil.weights.shape[1] / 2) - 1
+        dissection = Dissection(shape, 2 * half, len(averaged))
         if dissection.entries > self.largest:
             return diagonal
-        own = replace(stiffness, coupled=())
-        mass = operator.nodal_mass()
-        weight = operator.projection.commuting_weight(mass + operator.factor * own.diagonal(mass))
-        divergence = _Divergence(stiffness.stencil, stiffness.mirror, operator.projection, averaged)
-        return _inner_product(operator.factor, divergence, weight, dissection, diagonal)
-
-    def _shape(self, window: tuple[int, ...]) -> tuple[int, ...]:
-        """Number of the box's nodes along each axis."""
-        if self.extent is None:
-            return window
-        require(
-            len(self.extent) == len(window),
-            f"VolumePreconditioner's extent must have a number for each of {len(window)} axes, got {self.extent}.",
-        )
-        return tuple(min(pair) for pair in zip(self.extent, window, strict=True))
+        divergence = _Divergence(stiffness.stencil, stiffness.mirror, projection, averaged)
+        weight = operator.mass[:, None] + operator.factor * replace(stiffness, coupled=()).diagonal(size)
+        weight = projection.commuting_weight(weight)
+        bulk = [one.average.inverse**2 * one.average.at_nodes(one.bulk) for one in averaged]
+        C = operator.factor * jnp.maximum(jnp.stack(bulk), 0)
+        box = NodeBox.around((C > 0).any(axis=0), window, shape)
+        C = box.inside(C)
+        some = C > 0
+        S = nodal_coupling(divergence.transpose, weight, some, box, half)
+        numbers, here = np.arange(len(C)), S.shape[2] // 2
+        least = jnp.sqrt(jnp.finfo(C.dtype).eps) / _STIFFEST * S[numbers, numbers, here]
+        softness = jnp.where(some, jnp.maximum(1 / jnp.where(some, C, 1), least), jnp.inf)
+        S = S.at[numbers, numbers, here].add(jnp.where(some, softness, 1))
+        factor = dissected_factor(dissection, partial(_entries, S, half, shape))
+        return VolumeInnerProduct(weight, divergence, softness, factor, box, diagonal)
 
 
 class NodeBox(eqx.Module):
@@ -133,52 +144,14 @@ class NodeBox(eqx.Module):
         return (*(jnp.zeros_like(self.corner[0]) for _ in front), *self.corner)
 
 
-class NodalCoupling(eqx.Module):
-    """S = B P⁻¹ Bᵀ + diagonal, by the distance of the nodes that it couples.
-
-    B takes a vector at the nodes to some numbers at each, and sees what is up to `half` nodes away.
-    """
-
-    by_distance: Float[Array, "a b s m"]
-    """S_ij for each number of node i and of node j = i + δ, by δ from −2 half to 2 half along each axis."""
-    half: int = eqx.field(static=True)
-    shape: tuple[int, ...] = eqx.field(static=True)
-    """Number of the nodes along each axis."""
-
-    @property
-    def diagonal(self) -> Float[Array, "a m"]:
-        """The diagonal of S."""
-        a = np.arange(len(self.by_distance))
-        return self.by_distance[a, a, self.by_distance.shape[2] // 2]
-
-    def plus(self, diagonal: Float[Array, "a m"]) -> "NodalCoupling":
-        """S with this added to its diagonal."""
-        a = np.arange(len(diagonal))
-        added = self.by_distance.at[a, a, self.by_distance.shape[2] // 2].add(diagonal)
-        return NodalCoupling(added, self.half, self.shape)
-
-    def entries(self, rows: Int[Array, "i"], columns: Int[Array, "j"]) -> Float[Array, "i j"]:
-        """The entries in these rows and columns, zero past the last. The numbers of a node stand together."""
-        count, span, reach = len(self.by_distance), 4 * self.half + 1, 2 * self.half
-        size = math.prod(self.shape) * count
-        (i, a), (j, b) = (jnp.divmod(numbers, count) for numbers in (rows, columns))
-        inside = (rows < size)[:, None] & (columns < size)
-        distance = jnp.zeros(inside.shape, i.dtype)
-        for one, other in zip(*(jnp.unravel_index(k, self.shape) for k in (i, j)), strict=True):
-            apart = other - one[:, None]
-            inside &= jnp.abs(apart) <= reach
-            distance = span * distance + apart + reach
-        return jnp.where(inside, self.by_distance[a[:, None], b, distance, i[:, None]], 0)
-
-
 def nodal_coupling(
     transpose: Callable[[Float[Array, "a n"]], NodeVector],
     weight: NodeVector,
     some: Bool[Array, "a m"],
     box: NodeBox,
     half: int,
-) -> NodalCoupling:
-    """B P⁻¹ Bᵀ.
+) -> Float[Array, "a b s m"]:
+    """B P⁻¹ Bᵀ: its entry for each number of node i and of node j = i + δ, by δ from −2 half to 2 half along each axis.
 
     Bᵀ of fields that are one at every (2 half + 1)-th node along each axis has each of its entries by itself. Each node
     of the vectors then couples all pairs of nodes that see it.
@@ -232,7 +205,23 @@ def nodal_coupling(
     nothing = jnp.zeros((count, count, *(4 * half + 1,) * d, *box.shape), weight.dtype)
     every = jnp.arange(len(offsets)), jnp.asarray(offsets, dtype=jnp.arange(0).dtype)
     total = jax.lax.scan(add, nothing, every)[0]
-    return NodalCoupling(total.reshape(count, count, (4 * half + 1) ** d, -1), half, box.shape)
+    return total.reshape(count, count, (4 * half + 1) ** d, -1)
+
+
+def _entries(
+    S: Float[Array, "a b s m"], half: int, shape: tuple[int, ...], rows: Int[Array, "i"], columns: Int[Array, "j"]
+) -> Float[Array, "i j"]:
+    """The entries of `nodal_coupling` in these rows and columns, zero past the last. The numbers of a node stand
+    together."""
+    count, span, reach = len(S), 4 * half + 1, 2 * half
+    (i, a), (j, b) = (jnp.divmod(numbers, count) for numbers in (rows, columns))
+    inside = (rows < math.prod(shape) * count)[:, None] & (columns < math.prod(shape) * count)
+    distance = jnp.zeros(inside.shape, i.dtype)
+    for one, other in zip(*(jnp.unravel_index(k, shape) for k in (i, j)), strict=True):
+        apart = other - one[:, None]
+        inside &= jnp.abs(apart) <= reach
+        distance = span * distance + apart + reach
+    return jnp.where(inside, S[a[:, None], b, distance, i[:, None]], 0)
 
 
 class _Divergence(eqx.Module):
@@ -301,32 +290,3 @@ class VolumeInnerProduct(AbstractInnerProduct):
 
     def solve_factor_transpose(self, v: Any) -> Any:
         return self.solve_factor(v)
-
-
-def _half(stiffness: ParticleStiffness, average: VolumeAverage) -> int | None:
-    """How many nodes away B sees along an axis; None where that is no box of nodes."""
-    if any(average.periodic) or any(not isinstance(image, Image) for image in stiffness.mirror.images):
-        return None
-    support = stiffness.stencil.weights.shape[1]
-    return math.ceil(1 + support / 2) - 1  # as far as a hat and a spline of so many cells overlap
-
-
-def _inner_product(
-    factor: Scalar,
-    divergence: _Divergence,
-    weight: NodeVector,
-    dissection: Dissection,
-    diagonal: DiagonalInnerProduct,
-) -> VolumeInnerProduct:
-    averaged = divergence.averaged
-    bulk = [one.average.inverse**2 * one.average.at_nodes(one.bulk) for one in averaged]
-    C = factor * jnp.maximum(jnp.stack(bulk), 0)
-    window = averaged[0].average.shape
-    box = NodeBox.around((C > 0).any(axis=0), window, dissection.shape)
-    C = box.inside(C)
-    some = C > 0
-    coupling = nodal_coupling(divergence.transpose, weight, some, box, dissection.reach // 2)
-    least = jnp.sqrt(jnp.finfo(C.dtype).eps) / _STIFFEST * coupling.diagonal
-    softness = jnp.where(some, jnp.maximum(1 / jnp.where(some, C, 1), least), jnp.inf)
-    dissected = dissected_factor(dissection, coupling.plus(jnp.where(some, softness, 1)).entries)
-    return VolumeInnerProduct(weight, divergence, softness, dissected, box, diagonal)

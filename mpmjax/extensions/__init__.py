@@ -1,0 +1,3 @@
+"""Parts behind the open doors of the engine, which it does not name."""
+
+from mpmjax.extensions._volume_preconditioner import VolumePreconditioner as VolumePreconditioner

@@ -1,0 +1,294 @@
+"""An implicit stage: its equation, the ways to solve it, and the one rule for the derivative of all of them.
+
+The derivative of the solution v of residual(v) = 0 is that of the implicit function theorem (derivation, eq. 30), and
+in reverse mode its transpose (eq. 31): one more solve with the same operator. Iterations are never differentiated.
+"""
+
+import abc
+import enum
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+
+from mpmjax._types import Array, Float, NodeScalar, NodeVector, Scalar
+from mpmjax.autodiff import kept, ruled, without_derivative
+from mpmjax.checks import require_fields
+from mpmjax.implicit._conjugate_residual import ConjugateResidual
+from mpmjax.implicit._hessian import AbstractHessian, AbstractHessianAction, DampedAction
+from mpmjax.implicit._linear_solve import SolveInfo, default_rtol, require_solver, solve_linear
+from mpmjax.implicit._operator import ImplicitOperator, Projection
+from mpmjax.implicit._potential import ElasticPotential
+from mpmjax.implicit._preconditioner import AbstractPreconditioner
+
+_DERIVATIVE_RTOL = 1e-6
+"""Largest default relative tolerance of tangent and adjoint solves. In float32 it is smaller than that of a step: in
+slow motion of stiff bodies the stiff parts of the right-hand side cancel, and the derivative's error is some hundred
+times the tolerance."""
+
+
+class Guess(enum.Enum):
+    """The initial guess of an implicit solve.
+
+    v*, the result of an explicit step, is far off at a hundred times the explicit limit.
+    """
+
+    GRID_VELOCITY = "grid velocity"
+    """v^n, the velocity of the nodes before the step. The default."""
+    EXPLICIT = "explicit"
+    """v*, the explicitly updated velocity (derivation, eq. 4)."""
+    ZERO = "zero"
+    """Zero velocity."""
+
+    def velocity(self, before: NodeVector, explicit: NodeVector) -> NodeVector:
+        """The guess [m/s], shape (n, d), from v^n and v*."""
+        match self:
+            case Guess.GRID_VELOCITY:
+                return before
+            case Guess.EXPLICIT:
+                return explicit
+            case Guess.ZERO:
+                return jnp.zeros_like(before)
+
+
+class StageProblem(eqx.Module):
+    """M (v − a) = Δt_s (f(u + θΔt_s v) − θ D v), an equation for the velocity v of the nodes [m/s], shape (n, d), in a
+    stage of length Δt_s. f(u) is the elastic force at a nodal displacement u and −D v the viscous force.
+
+    Stages have θ = 1 (derivation, eq. 22 and section 10); backward Euler is one with Δt_s = Δt, u = 0 and
+    a = v^n + Δt g. The semi-implicit step has θ = β (eq. 3). Held components of v have the value of `prescribed`.
+
+    The equation is M (v − a) − Δt_s f(u + θΔt_s v) = 0, the left side being the gradient of the incremental potential
+    𝓔(v) = ½ ‖v − a‖²_M + Φ(u + θΔt_s v)/θ (eq. 23). Viscosity adds θΔt_s D v to it and ½ θΔt_s v·D v to the potential.
+    With `linearised`, f(u) is f(0) − H u and the equation (M + χ H) v = b with χ = θΔt_s² (eq. 17).
+    """
+
+    mass: NodeScalar
+    """Nodal masses m_i [kg], shape (n,)."""
+    inertial: NodeVector
+    """a [m/s], the velocity of the stage without the force at its own end, shape (n, d)."""
+    stage_dt: Float[Array, ""]
+    """Δt_s [s], the length of the stage."""
+    initial_displacement: NodeVector | None
+    """u [m], shape (n, d); None for zero."""
+    force: NodeVector
+    """f(0) [N], shape (n, d); in a linearised problem f(0) − H u."""
+    spacing: Float[Array, ""]
+    """Grid spacing dx [m]."""
+    potential: ElasticPotential
+    """Φ, with f = −∂Φ/∂u."""
+    hessian: AbstractHessian
+    """H = ∂²Φ/∂u∂u [N/m], exactly or approximately."""
+    projection: Projection
+    """The projection on free components."""
+    prescribed: NodeVector | None
+    """The velocity of held components [m/s], shape (n, d); None if they are at rest."""
+    preconditioner: AbstractPreconditioner
+    theta: Scalar = 1.0
+    """θ [-], the share of the stage's displacement at which its force is evaluated."""
+    action: AbstractHessianAction | None = None
+    """H at the start of the step in a linearised problem; None in others."""
+
+    def linearised(self) -> "StageProblem":
+        """The problem with f(u) = f(0) − H u."""
+        action, u = self.hessian.at(self.potential, None), self.initial_displacement
+        return replace(self, force=self.force if u is None else self.force - action(u), action=action)
+
+    @property
+    def rhs(self) -> NodeVector:
+        """b = M a + Δt_s (f(0) − H u) [kg m/s] of a linearised problem, shape (n, d)."""
+        return self.mass[:, None] * self.inertial + self.stage_dt * self.force
+
+    def operator(self, v: NodeVector, hessian: AbstractHessian | None = None) -> ImplicitOperator:
+        """M + θΔt_s D + θΔt_s² H at v, the derivative of `residual`.
+
+        Args:
+            v: v [m/s], shape (n, d).
+            hessian: an approximation of H in a problem that is not linearised. Default: H without approximation.
+        """
+        action = self.action
+        if action is None:
+            action = (hessian or self.hessian.exact()).at(self.potential, self.displacement(v))
+        if self.potential.viscous:
+            action = DampedAction(action, self.potential, 1 / self.stage_dt)
+        return ImplicitOperator(self.mass, self.theta * self.stage_dt**2, action, self.projection)
+
+    def momentum_residual(self, v: NodeVector) -> NodeVector:
+        """The residual of momentum at each node [kg m/s], shape (n, d); in held components, the impulse that holds."""
+        if self.action is not None:
+            return self.operator(v).unconstrained(v) - self.rhs
+        force = self.potential.force(self.displacement(v))
+        if self.potential.viscous:
+            force = force - self.theta * self.potential.viscous_resistance(v)
+        return self.mass[:, None] * (v - self.inertial) - self.stage_dt * force
+
+    def residual(self, v: NodeVector) -> NodeVector:
+        """The momentum residual in free components, and v − prescribed in held ones. Its Jacobian is symmetric."""
+        return self.projection.combine(self.momentum_residual(v), v if self.prescribed is None else v - self.prescribed)
+
+    def apply_dirichlet(self, guess: NodeVector) -> NodeVector:
+        """The guess, with the prescribed values in held components."""
+        return self.projection.combine(guess, 0 if self.prescribed is None else self.prescribed)
+
+    def displacement(self, v: NodeVector) -> NodeVector:
+        """u + θΔt_s v [m]."""
+        moved = self.theta * self.stage_dt * v
+        return moved if self.initial_displacement is None else self.initial_displacement + moved
+
+    def undisplaced_velocity(self) -> NodeVector:
+        """The velocity at which no node is displaced, −u/(θΔt_s) [m/s]."""
+        if self.initial_displacement is None:
+            return jnp.zeros_like(self.inertial)
+        return -self.initial_displacement / (self.theta * self.stage_dt)
+
+    def unit_strain_velocity(self) -> Float[Array, ""]:
+        """The velocity dx/(θΔt_s) [m/s] that strains a cell by one in the stage.
+
+        Deformation gradients are of order one, and rounded to ε, at the smallest strains too. With w this velocity and
+        A the diagonal of the operator, ε A w is the rounding of the momentum residual and ε A w² that of the potential.
+        """
+        return self.spacing / (self.theta * self.stage_dt)
+
+    def incremental_potential(self, v: NodeVector) -> Float[Array, ""]:
+        """𝓔(v) [J] up to a constant, that of held components; NaN if a law does not admit the deformation."""
+        free = self.projection.free
+        inertia = 0.5 * jnp.where(free, self.mass[:, None] * (v - self.inertial) ** 2, 0).sum()
+        if self.potential.viscous:
+            inertia = inertia + self.theta * self.stage_dt / 2 * self.potential.power(v)
+        return inertia + self.potential.admissible_energy(self.displacement(v)) / self.theta
+
+
+class AbstractStageSolver(eqx.Module):
+    """A way to solve the equation of a stage. A subclass must have `__call__`."""
+
+    linearises: ClassVar[bool] = False
+    """Whether it is given the problem with the elastic force f(0) − H u in place of that of the law."""
+
+    @abc.abstractmethod
+    def __call__(self, problem: StageProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
+        """The solution [m/s], shape (n, d), and the report of the solve.
+
+        Args:
+            problem: the problem.
+            guess: where an iteration starts [m/s], shape (n, d).
+        """
+
+
+class Linearised(AbstractStageSolver):
+    """One linear solve with the force f(0) − H u, linear in the displacement u of the step.
+
+    Args:
+        solver: linear solver, any symmetric one of lineax. Default: `ConjugateResidual` with default tolerances.
+    """
+
+    solver: lx.AbstractLinearSolver = ConjugateResidual()
+    linearises: ClassVar[bool] = True
+
+    def __check_init__(self):
+        require_fields(self)
+        require_solver("Linearised's solver", self.solver)
+
+    def __call__(self, problem: StageProblem, guess: NodeVector) -> tuple[NodeVector, SolveInfo]:
+        return solve_linearised(self.solver, problem, guess)
+
+
+def solve_linearised(
+    solver: lx.AbstractLinearSolver, problem: StageProblem, guess: NodeVector
+) -> tuple[NodeVector, SolveInfo]:
+    """The solution of a linearised problem (M + χH) v = b [m/s], shape (n, d), and the report of the solve."""
+    operator = problem.operator(guess).precomputed()
+    combine = problem.projection.combine
+    rhs, lift = problem.rhs, None
+    if problem.prescribed is not None:
+        lift, at_rest = combine(0, problem.prescribed), rhs
+        # walls at rest, the common case, spare one application of H
+        rhs = jax.lax.cond((lift != 0).any(), lambda: at_rest - operator.unconstrained(lift), lambda: at_rest)
+    inner = problem.preconditioner.inner_product(operator)
+    v, info, _ = solve_linear(solver, operator, combine(rhs, 0), inner, combine(guess, 0))
+    return v if lift is None else v + lift, info
+
+
+class Reporting(eqx.Module):
+    """The solver of tangent and adjoint systems, with a report of the solves that did not converge.
+
+    These solves run inside of a derivative, so they can report only by derivatives of zeros: the tangent of `report` in
+    forward mode, and the cotangent of `slot` in reverse mode. Either is the sum of the relative residuals of solves
+    that did not converge, infinite if one is not finite. Such a solve gives NaN, and solves after it are not counted,
+    so the sum is the residual of the first.
+    """
+
+    solver: lx.AbstractLinearSolver
+    slot: Scalar
+    """Zero."""
+
+
+def solve(
+    problem: StageProblem,
+    guess: NodeVector,
+    find: Callable[[StageProblem, NodeVector], tuple[NodeVector, SolveInfo]],
+    adjoint: lx.AbstractLinearSolver | Reporting,
+) -> tuple[NodeVector, SolveInfo]:
+    """The solution of a problem, differentiable with respect to it in forward and reverse mode, to any order.
+
+    Args:
+        problem: the problem.
+        guess: where the search starts [m/s], shape (n, d). Result and derivative depend on it only within the
+            tolerance.
+        find: how the solution is found.
+        adjoint: solver of the tangent and adjoint systems. A solve that ends beyond ten times its tolerance gives NaN,
+            so that a wrong gradient cannot pass for a right one.
+    """
+    if not isinstance(adjoint, Reporting):
+        adjoint = Reporting(adjoint, jnp.zeros((), guess.dtype))
+    return _solve(problem, adjoint.slot, *without_derivative((guess, find, adjoint.solver)))
+
+
+@ruled
+def _solve(
+    problem: StageProblem, slot: Array, guess: NodeVector, find: Any, adjoint: lx.AbstractLinearSolver
+) -> tuple[NodeVector, SolveInfo]:
+    del slot, adjoint
+    return find(problem, guess)
+
+
+@_solve.defjvp
+def _solve_jvp(primals: Any, tangents: Any) -> Any:
+    problem, slot, guess, find, adjoint = primals
+    d_problem, d_slot = tangents[:2]
+    v, info = kept(_solve(problem, slot, guess, find, adjoint))
+    d_residual = eqx.filter_jvp(lambda q: q.residual(v), (problem,), (d_problem,))[1]
+    if d_residual is None:  # it does not depend on what is differentiated
+        d_residual = jnp.zeros_like(v)
+    operator = problem.operator(v)
+    matrix, preconditioner = without_derivative((operator, problem.preconditioner))
+    matrix = matrix.precomputed()
+    inner = preconditioner.inner_product(matrix)
+
+    def solve_symmetric(matvec: Any, b: tuple[NodeVector, Array]) -> tuple[NodeVector, Array]:
+        del matvec  # the precomputed operator is the same map and faster
+        rtol = min(default_rtol(b[0].dtype), _DERIVATIVE_RTOL)
+        x, report, _ = solve_linear(adjoint, matrix, b[0], inner, rtol=rtol)
+        solved, finite = report.converged | report.nearly_converged, jnp.isfinite(b[0]).all()
+        residual = jnp.where(jnp.isfinite(report.residual), report.residual, jnp.inf)
+        return jnp.where(solved, x, jnp.nan), jnp.where(finite & ~solved, residual, 0)
+
+    combine = problem.projection.combine
+    rhs, lift = combine(-d_residual, 0), None
+    if problem.prescribed is not None or problem.projection.normals:  # else it stays at rest
+        lift = combine(0, -d_residual)
+        rhs = combine(rhs - operator.unconstrained(lift), 0)
+    # The second component reports the tangent solve: zero, or the residual of a solve that failed. It goes with the
+    # first through one custom_linear_solve, so that the transposed solve reports likewise.
+    d_slot = rhs[:0].sum() + (0 if d_slot is None else d_slot)  # a zero that keeps d_slot linear in the tangents
+
+    def matvec(x: tuple[NodeVector, Array]) -> tuple[NodeVector, Array]:
+        y = operator.mv(x[0])
+        return y, x[1] + y[:0].sum()  # as above, of the next order's tangents
+
+    dv, d_report = jax.lax.custom_linear_solve(matvec, (rhs, d_slot), solve_symmetric, symmetric=True)
+    d_info = eqx.tree_at(lambda i: i.report, jax.tree.map(lambda _: None, info), d_report, is_leaf=lambda a: a is None)
+    return (v, info), (dv if lift is None else dv + lift, d_info)
