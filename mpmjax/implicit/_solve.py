@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._types import Array, NodeVector, Scalar
-from mpmjax.autodiff import kept, ruled, without_derivative
+from mpmjax.autodiff import ruled, saved_for_backward, without_derivative
 from mpmjax.implicit._linear_solve import derivative_rtol, solve_linear
 from mpmjax.implicit._solution import AbstractSolution, SolveInfo
 from mpmjax.implicit._stage_problem import StageProblem
@@ -65,7 +65,7 @@ def _solve(
 def _solve_jvp(primals: Any, tangents: Any) -> Any:
     problem, slot, guess, find, adjoint = primals
     d_problem, d_slot = tangents[:2]
-    v, info = kept(_solve(problem, slot, guess, find, adjoint))
+    v, info = saved_for_backward(_solve(problem, slot, guess, find, adjoint))
     d_residual = eqx.filter_jvp(lambda q: q.residual(v), (problem,), (d_problem,))[1]
     if d_residual is None:  # it does not depend on what is differentiated
         d_residual = jnp.zeros_like(v)

@@ -13,8 +13,8 @@ from tqdm import tqdm
 
 from mpmjax._types import Scalar
 from mpmjax.checks import canonical, checked, require, require_whole, requirements
-from mpmjax.io._interrupt import reporting
 from mpmjax.io._runs import FrameWriter
+from mpmjax.io._transactional_file import reporting
 from mpmjax.simulation import (
     Fault,
     RolloutState,

@@ -1,7 +1,7 @@
 """Runs in files: HDF5 that ParaView opens as it is, and from which a run continues bit for bit.
 
-    /VTKHDF     the frames in VTK's layout (see `_vtkhdf`): Points, and as PointData velocity, deformation_gradient,
-                J = det F, with APIC affine_velocity, and what laws that yield remember
+    /VTKHDF     the frames (see `_run_contents`): Points, and as PointData velocity, deformation_gradient, J = det F,
+                with APIC affine_velocity, and what laws that yield remember
     /mpmjax     format, version, d, dtype, units, dt, counts, mass, volume, X, the scene and the method as JSON (see
                 `_schema`) with their arrays, and a table with one row a frame: its step and the run's `RunStatistics`
                 up to it; `collider_impulse` and `boundary_impulse`, those on each by then, linear, then angular;
@@ -29,23 +29,33 @@ import numpy as np
 
 from mpmjax.boundary import Impulses
 from mpmjax.checks import canonical, checked, is_traced, require, require_finite, require_memory, require_positive
-from mpmjax.io._atomic_write import reason, replacing
 from mpmjax.io._hdf5 import (
     LIBVER_HEAD,
+    File,
     check_hdf5,
     check_no_writer,
     check_place,
     checksum,
+    count_in,
     frame_rows,
     opened,
     reading,
     require_of_file,
+    set_count,
 )
-from mpmjax.io._interrupt import undisturbed
-from mpmjax.io._run_description import check_readable, check_same, describe, description_in, write_description
+from mpmjax.io._run_contents import (
+    add_growing,
+    add_topology,
+    check_readable,
+    check_same,
+    describe,
+    description_in,
+    rows_of,
+    states_in,
+    write_description,
+)
 from mpmjax.io._schema import decode
-from mpmjax.io._transactional_file import StagedFile, staged_file
-from mpmjax.io._vtkhdf import File, add_growing, add_topology, count_in, rows_of, set_count, states_in
+from mpmjax.io._transactional_file import StagedFile, reason, replacing, staged_file, undisturbed
 from mpmjax.simulation import RolloutState, Run, RunStatistics, initial_state, no_steps
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.autodiff import guard, recomputed
+from mpmjax.autodiff import guard, rematerialised
 from mpmjax.checks import (
     canonical,
     checked,
@@ -222,7 +222,7 @@ def _rollout(
         return replace(y, particles=state_of(new)).to_loop_layout(), None
 
     begin = RolloutState(state_of(particles), None, order=memory_order(scene, particles, steps)).to_loop_layout()
-    end, _ = jax.lax.scan(recomputed(body), begin, jnp.arange(steps, dtype=particles.x.dtype))
+    end, _ = jax.lax.scan(rematerialised(body), begin, jnp.arange(steps, dtype=particles.x.dtype))
     return with_state(particles, end.as_given().particles)
 
 
