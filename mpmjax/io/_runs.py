@@ -64,13 +64,10 @@ _IMPULSES = ("collider_impulse", "boundary_impulse")
 
 
 class FrameWriter:
-    """Writes a run a frame at a time. What is written has left the program when `append` returns.
-
-    A context manager: leaving it closes the file.
-    """
+    """Writes a run a frame at a time. What is written has left the program when `append` returns. A context manager:
+    leaving it closes the file. `create` and `resume` make one."""
 
     def __init__(self, file: File, staged: StagedFile, path: Path, like: RolloutState):
-        """Use `create` or `resume`."""
         self._file, self._staged, self._path, self._like = file, staged, path, like
         self._kept = self._standing()
 
@@ -86,16 +83,8 @@ class FrameWriter:
         start: int = 0,
         overwrite: bool = False,
     ) -> "FrameWriter":
-        """Begin a file. It takes its place when its first frame is on the disk.
-
-        Args:
-            path: the file to be.
-            scene: the scene.
-            particles: prepared particles (see `prepare`), the first frame.
-            method: the method.
-            dt: step [s].
-            start: step number of the first frame.
-            overwrite: replace a run's file that is there.
+        """Begin a file with prepared particles as its first frame, of step `start`. It takes its place when that is on
+        the disk.
 
         Raises:
             ValueError: a file that is there, and with `overwrite` one that is no run or is being written; a place that
@@ -113,9 +102,8 @@ class FrameWriter:
     def resume(
         cls, path: str | os.PathLike, scene: Scene, particles: Particles, method: AbstractIntegrator, dt: Any
     ) -> "FrameWriter":
-        """Open a file to append frames to it, after checking that it is whole and of the same run.
-
-        Frames that a killed writer left incomplete are cut off.
+        """Open a file to append frames to it, after checking that it is whole and of the same run. Frames that a killed
+        writer left incomplete are cut off.
 
         Raises:
             ValueError: see `load`; a file that is being written; a scene, particles, method or dt that differ from the
@@ -148,12 +136,7 @@ class FrameWriter:
         return cls(file, staged, path, begin)
 
     def append(self, step: int, state: RolloutState, statistics: RunStatistics) -> None:
-        """Write a frame; one of the last frame's step replaces it.
-
-        Args:
-            step: its step number.
-            state: its state, with the impulse on the colliders by then.
-            statistics: of the run up to it.
+        """Write the frame of a step, with impulses and statistics by then; one of the last frame's step replaces it.
 
         Raises:
             OSError: the disk refused. The file is what it was before, and this writer can only be closed.
@@ -200,11 +183,7 @@ class FrameWriter:
         return n, step, step * float(self._file["mpmjax"].attrs["dt"])
 
     def close(self) -> None:
-        """Close the file.
-
-        Raises:
-            OSError: what was written cannot be brought to the disk.
-        """
+        """Close the file; an OSError if what was written cannot be brought to the disk."""
         with suppress(OSError, RuntimeError):  # of a writer that failed; what it has not committed is dropped
             self._file.close()
         try:
@@ -275,11 +254,8 @@ def save(path: str | os.PathLike, run: Run) -> None:
 
 
 def steps_in(path: str | os.PathLike) -> int:
-    """How many steps led to the last frame of a file, −1 if that is not known.
-
-    Raises:
-        ValueError: see `load`; a file that is being written.
-    """
+    """How many steps led to the last frame of a file, −1 if that is not known. Raises what `load` does, and for a file
+    that is being written."""
     check_no_writer(Path(path))
     with reading(Path(path)) as file:
         require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
@@ -361,11 +337,7 @@ def _frames(file: File, like: RolloutState, start: int, stop: int) -> tuple[np.n
 
 def _check_numbers(scene: Scene, dt: Any, steps: np.ndarray, *states: State) -> None:
     """Check that the step is positive, step numbers grow, states are finite, and positions are ones that a grid can
-    number.
-
-    Raises:
-        ValueError: they are not.
-    """
+    number."""
     require_positive("dt [s]", dt)
     require(steps[0] >= 0 and (np.diff(steps) > 0).all(), f"A run's steps must grow from 0 or later, got {steps}.")
     most = float(scene.grid.spacing) * 2**31  # as far as nodes are numbered

@@ -338,12 +338,7 @@ def integrate(
 
 
 def before_fault(go: Callable[..., Any], begin: RolloutState, statistics: RunStatistics) -> RolloutState:
-    """The last good state of a run that met a fault, computed once more by the same program: no run carries it.
-
-    Args:
-        go: the run's `integrate`, with all its arguments but `until`.
-        begin: the state in which it began.
-        statistics: its statistics.
-    """
+    """The last good state of a run that met a fault, computed once more by the same program, `integrate` with all its
+    arguments but `until`: no run carries it."""
     good = int(statistics.fault_step) - 1
     return begin if good == 0 else go(until=np.asarray(good, begin.particles.x.dtype)).state

@@ -94,13 +94,8 @@ def elastic_impulse(nodes: Nodes, method: AbstractIntegrator, motion: NodeMotion
 
 
 def reaction(nodes: Nodes, motion: NodeMotion, elastic: NodeVector | None) -> NodeVector:
-    """The impulse of walls and grips [kg m/s], shape (n, d); in free components the residual of the solve.
-
-    Args:
-        nodes: the nodes.
-        motion: their motion before friction.
-        elastic: `elastic_impulse` of the motion.
-    """
+    """The impulse of walls and grips [kg m/s], shape (n, d), by the nodes' motion before friction and its
+    `elastic_impulse`; in free components the residual of the solve."""
     if elastic is None:
         return nodes.mass[:, None] * (motion.velocity - nodes.explicit_velocity())
     if motion.resisted is not None:
