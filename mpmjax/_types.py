@@ -1,10 +1,15 @@
 """Array aliases, and the glossary of axis names that every annotation in the package uses.
 
-    p   particles
-    n   nodes of the grid window, flattened in C order
+    p   particles; q those of one material
+    n   nodes of the grid window, flattened in C order; m some of them, other points, or the d² rows of a matrix
     d   space dimension (1, 2 or 3)
-    k   nodes of one particle's stencil, (order + 1)^d of them
-    f   saved frames
+    k   nodes of one particle's stencil, (order + 1)^d of them; colliders or boundaries
+    f   saved frames; g the spans between them
+    s   attached points of a load, nodes of a stencil along an axis, or components of a skew matrix
+    r   components of a torque or spin (3 in 3-D, 1 in 2-D, 0 in 1-D)
+    t   entries of an upper triangle, row by row
+    c   components of a field that is gathered or scattered
+    j   times of a motion
 
 At the public face a particle array starts with p: positions (p, d), deformation gradients (p, d, d). Inside a step,
 small matrices are *component first*, (d, d, p): `F[0, 1]` is then one contiguous array over the particles, which is

@@ -12,7 +12,7 @@ from shell import refused
 from test_cli import SCENE
 
 import mpmjax as mpm
-from mpmjax.checks import _memory
+from mpmjax.checks import _values
 from mpmjax.cli._scene_file import read_scene_file
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -105,15 +105,15 @@ TOO_MUCH = {
 @pytest.mark.parametrize(("make", "says"), TOO_MUCH.values(), ids=TOO_MUCH)
 def test_what_does_not_fit_into_memory_is_not_begun(make, says, monkeypatch):
     """On a machine with 4 GB to spare."""
-    monkeypatch.setattr(_memory, "available_memory", lambda *, device: 4 * 10**9)
+    monkeypatch.setattr(_values, "available_memory", lambda *, device: 4 * 10**9)
     with pytest.raises(ValueError, match=says):
         make()
 
 
 def test_the_memory_that_there_is_is_known():
     """More than this process has asked for, less than a planet's; not known without /proc, it is a stated number."""
-    assert 2**27 < _memory.available_memory() < 2**50
-    assert _memory.available_memory(device=True) > 2**27
+    assert 2**27 < _values.available_memory() < 2**50
+    assert _values.available_memory(device=True) > 2**27
 
 
 def test_zero_particles_are_refused():

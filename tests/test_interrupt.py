@@ -195,7 +195,7 @@ def test_a_signal_that_is_ignored_stays_ignored(tmp_path):
     """As for a command in the background of a script, or under nohup."""
     program = """
 import os, signal
-from mpmjax.io._interrupt import end_on_signals
+from mpmjax.io._transactional_file import end_on_signals
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 end_on_signals()
 os.kill(os.getpid(), signal.SIGINT)

@@ -17,10 +17,9 @@ from helpers import DESCRIPTIONS, TRANSFERS, block, cloud, ids, thorough
 
 import mpmjax as mpm
 import mpmjax.io._runs
-from mpmjax.io._interrupt import undisturbed
 from mpmjax.io._record import record
 from mpmjax.io._runs import FrameWriter, load, save
-from mpmjax.io._transactional_file import StagedFile
+from mpmjax.io._transactional_file import StagedFile, undisturbed
 from mpmjax.simulation._diffrax import RolloutState, initial_state
 from mpmjax.simulation._run import Run, RunStatistics, no_steps
 from mpmjax.simulation._simulate import integrate

@@ -91,7 +91,9 @@ EXAMPLES = {
     mpm.UpdatedLagrangian: mpm.UpdatedLagrangian(),
     mpm.TotalLagrangian: mpm.TotalLagrangian(),
     mpm.Explicit: mpm.Explicit(),
-    mpm.SemiImplicit: mpm.SemiImplicit(0.5, mpm.JvpHessian(), mpm.ConjugateResidual(1e-7), guess=Guess.EXPLICIT),
+    mpm.SemiImplicit: mpm.SemiImplicit(
+        0.5, mpm.ConjugateResidual(1e-7), hessian=mpm.JvpHessian(), guess=Guess.EXPLICIT
+    ),
     mpm.BackwardEuler: mpm.BackwardEuler(
         mpm.Newton(rtol=1e-6, max_steps=7), preconditioner=mpm.DiagonalPreconditioner()
     ),

@@ -10,7 +10,7 @@ import pytest
 from helpers import NEEDS_LIBRARY, assert_close, thorough
 
 import mpmjax as mpm
-from mpmjax.native import stored
+from mpmjax.native import materialised
 from mpmjax.simulation._diffrax import SegmentAdjoint, checkpointed
 
 STEPS, DT = 12, 2e-3
@@ -102,7 +102,7 @@ def test_what_is_stored_is_the_same():
     tree = {"a": jnp.arange(3.0), "n": jnp.arange(2), "none": None, "text": "as it is"}
 
     def f(a):
-        kept = stored(tree | {"a": a})
+        kept = materialised(tree | {"a": a})
         assert kept["text"] == "as it is"
         return (kept["a"] ** 2).sum() + kept["n"].sum().astype(a.dtype)
 
@@ -120,7 +120,12 @@ def test_what_is_stored_is_stored_once(choose):
     """By one call for all arrays of a tree, beside which XLA computes nothing again; by XLA alone none."""
 
     def program():
-        return jax.jit(lambda a: jax.tree.map(jnp.sin, stored((2 * a, 3 * a)))).lower(jnp.ones(64)).compile().as_text()
+        return (
+            jax.jit(lambda a: jax.tree.map(jnp.sin, materialised((2 * a, 3 * a))))
+            .lower(jnp.ones(64))
+            .compile()
+            .as_text()
+        )
 
     for name, calls in (("native", 1), ("xla", 0)):
         choose(name)

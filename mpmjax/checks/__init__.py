@@ -11,7 +11,6 @@ from mpmjax.checks._kinds import (
     require_fields as require_fields,
     shape_of as shape_of,
 )
-from mpmjax.checks._memory import require_memory as require_memory
 from mpmjax.checks._values import (
     as_floats as as_floats,
     as_plain as as_plain,
@@ -22,6 +21,7 @@ from mpmjax.checks._values import (
     require as require,
     require_between as require_between,
     require_finite as require_finite,
+    require_memory as require_memory,
     require_moduli as require_moduli,
     require_placement as require_placement,
     require_positive as require_positive,

@@ -77,16 +77,11 @@ def require_fields(module: eqx.Module) -> None:
     for name, hint, static in _hints(type(module)):
         value, what = getattr(module, name), f"{type(module).__name__}'s {name}"
         require_kind(what, value, hint)
-        if static and not _is_hashable(value):
-            raise ValueError(f"{what} fixes a program: give a known number or a tuple, got {shortened(repr(value))}.")
-
-
-def _is_hashable(value: Any) -> bool:
-    try:
-        hash(value)
-    except TypeError:
-        return False
-    return True
+        try:
+            hash(value if static else None)
+        except TypeError:
+            shown = shortened(repr(value))
+            raise ValueError(f"{what} fixes a program: give a known number or a tuple, got {shown}.") from None
 
 
 @cache

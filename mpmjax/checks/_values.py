@@ -5,11 +5,14 @@ once, in its `__check_init__`. A constructor checks there what is known; `requir
 and returns those that were put off, for a compiled program to evaluate.
 """
 
+import math
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +20,9 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 from jax.core import Tracer
+
+_UNKNOWN = 2**34
+"""Memory assumed to be available if the system does not say [B]."""
 
 
 def is_traced(tree: Any) -> bool:
@@ -71,17 +77,12 @@ def _modules(tree: Any) -> Iterator[Any]:
         yield tree
 
 
-def _put_off_check(message: str, met: Callable[[], Any]) -> None:
-    gathered = _put_off.get()
-    if gathered is not None:
-        gathered.append(Requirement(message, met))
-
-
 def require(condition: Any, message: str) -> None:
     """Raise `ValueError(message)` unless the condition holds everywhere. Traced conditions are put off
     (`requirements`)."""
     if is_traced(condition):
-        _put_off_check(message, lambda: condition)
+        if (gathered := _put_off.get()) is not None:
+            gathered.append(Requirement(message, lambda: condition))
     elif not np.all(condition):
         raise ValueError(message)
 
@@ -101,7 +102,8 @@ def require_that(what: str, holds: Callable[..., Any], *values: Any) -> None:
         values: its arguments.
     """
     if is_traced(values):
-        _put_off_check(f"{what}.", lambda: holds(*map(jnp.asarray, values)))
+        if (gathered := _put_off.get()) is not None:
+            gathered.append(Requirement(f"{what}.", lambda: holds(*map(jnp.asarray, values))))
     elif not np.all(holds(*map(np.asarray, values))):  # written only here: writing an array takes ms
         raise ValueError(f"{what}, got {' and '.join(shortened(str(value)) for value in values)}.")
 
@@ -164,11 +166,7 @@ def require_tolerance(name: str, value: Any) -> None:
 
 def require_finite(name: str, value: Any) -> None:
     """Every number of `value` must be finite."""
-    require_that(f"{name} must be finite", _finite, value)
-
-
-def _finite(a: Any) -> Any:
-    return abs(a.astype(float)) < np.inf
+    require_that(f"{name} must be finite", lambda a: abs(a.astype(float)) < np.inf, value)
 
 
 def require_positive(name: str, value: Any, dtype: Any = None) -> None:
@@ -238,3 +236,46 @@ def canonical(tree: Any, dtype: Any) -> Any:
         return jnp.asarray(np.asarray(leaf, dtype))  # of a NumPy array: of a Python number XLA compiles a program
 
     return jax.tree.map(convert, tree, is_leaf=lambda node: isinstance(node, lx.AbstractLinearSolver))
+
+
+def require_memory(what: str, needed: float | int, advice: str, *, device: bool = False) -> None:
+    """Check that what will be allocated fits into the available memory.
+
+    Args:
+        what: what it is, as the subject of "takes at least so many GB".
+        needed: how many bytes it takes at least.
+        advice: which number to change.
+        device: whether it lies on jax's device.
+
+    Raises:
+        ValueError: it does not.
+    """
+    if needed < 2**26:  # asking takes longer
+        return
+    there = available_memory(device=device)
+    if not needed <= there:
+        raise ValueError(
+            f"{what} takes at least {needed / 1e9:.3g} GB of memory, and {there / 1e9:.3g} GB are available: {advice}"
+        )
+
+
+def available_memory(*, device: bool = False) -> float | int:
+    """Memory that can be allocated [B]: of the host, within its control group's limit, or with `device` of jax's
+    device."""
+    stats = jax.local_devices()[0].memory_stats() if device else None  # None of a CPU, whose memory is the host's
+    if stats and "bytes_limit" in stats:
+        return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
+    free, limit, group = _UNKNOWN, math.inf, Path("/sys/fs/cgroup")
+    try:
+        free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        entries = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        free = 1024 * int(entries["MemAvailable"].split()[0])  # with caches that can be dropped
+    except (AttributeError, OSError, KeyError, ValueError):
+        pass
+    try:
+        stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        most, used = int((group / "memory.max").read_text()), int((group / "memory.current").read_text())
+        limit = most - used + int(stat.get("file", 0))  # the file cache counts as free
+    except (OSError, ValueError):  # no such group, or no limit: "max"
+        pass
+    return min(free, limit)

@@ -10,7 +10,7 @@ from jax.core import ShapedArray
 from jax.interpreters import ad
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.autodiff import kept_sums
+from mpmjax.autodiff import sums_saved_for_backward
 from mpmjax.discretisation._placed import bound, define_jvp, define_placed
 from mpmjax.discretisation._stencil import Stencil
 from mpmjax.discretisation._transfer_sums import scatter_tangent, written_scatter
@@ -57,7 +57,7 @@ def _jvp(
 ) -> tuple[list[Array], list[Any]]:
     """The quotient rule on the differentials of the sums; the threshold is not differentiated. The averages are
     `kept_sums` here, where the rule takes them: named afterwards they would be others, and these computed again."""
-    out = kept_sums(take())
+    out = sums_saved_for_backward(take())
     sums, changes = ((*values[:3], *values[4:]) for values in (primals, tangents))
     change = scatter_tangent(sums, changes, valued=True, size=size, batched=batched)
     if change is None:

@@ -13,7 +13,7 @@ import numpy as np
 from mpmjax._types import Array, Bool, Float, Indices, Int, ParticleVector, components
 from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._kernel import AbstractGradient, BSpline
-from mpmjax.native import stored
+from mpmjax.native import materialised
 
 
 class Places(eqx.Module):
@@ -131,7 +131,7 @@ def make_stencil(
     """
     dx = grid.spacing
     xi = components(x) / dx
-    f = stored(xi - jax.lax.stop_gradient(kernel.base(xi)))
+    f = materialised(xi - jax.lax.stop_gradient(kernel.base(xi)))
     weights, spline = kernel.weights(f), kernel.derivatives(f) / dx
     if kernel.order == 1:
         moment = f * (1 - f) * dx**2

@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, Matrix, NodeScalar, NodeVector, Scalar
-from mpmjax.autodiff import kept_sums
+from mpmjax.autodiff import sums_saved_for_backward
 from mpmjax.checks import require_between, require_fields
 from mpmjax.discretisation._average import average
 from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._stencil import Stencil
 from mpmjax.discretisation._transfer_sums import gather, scatter
-from mpmjax.native import stored
+from mpmjax.native import materialised
 
 
 class Gathered(eqx.Module):
@@ -242,7 +242,7 @@ def g2p(
             raise ValueError(f"{type(transfer).__name__} needs the change of the nodes' velocity: give before.")
         change = after - before
     fields = [field for field in (after, mean, change) if field is not None]
-    values, gradients = stored(kept_sums(gather(stencil, jnp.concatenate(fields, axis=1))))
+    values, gradients = materialised(sums_saved_for_backward(gather(stencil, jnp.concatenate(fields, axis=1))))
     # one field after the other, each of shape (d, p), and its gradient (d, d, p), the derivative's direction last
     values, gradients = jnp.split(values, len(fields)), jnp.split(jnp.swapaxes(gradients, 0, 1), len(fields))
     affine: list[Matrix | None] = [None] * len(fields)
@@ -250,7 +250,7 @@ def g2p(
         affine = [*gradients]
     elif transfer.affine:
         ends = [field for field in (after, change) if field is not None]
-        _, slopes = stored(kept_sums(gather(stencil.least_squares, jnp.concatenate(ends, axis=1))))
+        _, slopes = materialised(sums_saved_for_backward(gather(stencil.least_squares, jnp.concatenate(ends, axis=1))))
         slopes = jnp.split(jnp.swapaxes(slopes, 0, 1), len(ends))
         affine[0] = slopes[0]
         if change is not None:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import lineax as lx
 
 from mpmjax._types import Array, Float, NodeScalar, NodeVector, Scalar
-from mpmjax.autodiff import kept, ruled, without_derivative
+from mpmjax.autodiff import ruled, saved_for_backward, without_derivative
 from mpmjax.checks import require_fields
 from mpmjax.implicit._conjugate_residual import ConjugateResidual
 from mpmjax.implicit._hessian import AbstractHessian, AbstractHessianAction, DampedAction
@@ -259,7 +259,7 @@ def _solve(
 def _solve_jvp(primals: Any, tangents: Any) -> Any:
     problem, slot, guess, find, adjoint = primals
     d_problem, d_slot = tangents[:2]
-    v, info = kept(_solve(problem, slot, guess, find, adjoint))
+    v, info = saved_for_backward(_solve(problem, slot, guess, find, adjoint))
     d_residual = eqx.filter_jvp(lambda q: q.residual(v), (problem,), (d_problem,))[1]
     if d_residual is None:  # it does not depend on what is differentiated
         d_residual = jnp.zeros_like(v)

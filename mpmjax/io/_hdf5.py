@@ -13,10 +13,10 @@ import h5py
 import numpy as np
 
 from mpmjax.checks import require
-from mpmjax.io._atomic_write import reason
-from mpmjax.io._transactional_file import BUSY, StagedFile, require_no_writer
-from mpmjax.io._vtkhdf import File, count_in
+from mpmjax.io._transactional_file import BUSY, StagedFile, reason, require_no_writer
 
+File = Any
+"""An `h5py.File`, whose own annotations do not say what a name leads to."""
 FORMAT = 9
 LIBVER_HEAD = ("v108", "v108")
 _LIBVER = ("v110", "v110")  # what "latest" writes, VTK 9.7 cannot read
@@ -42,6 +42,16 @@ def require_of_file(condition: Any, message: str) -> None:
     """Raise `FileRefusedError(message)` unless the condition holds."""
     if not condition:
         raise FileRefusedError(message)
+
+
+def count_in(file: File) -> int:
+    """Number of complete frames."""
+    return int(file["VTKHDF/Steps"].attrs["NSteps"])
+
+
+def set_count(file: File, count: int) -> None:
+    """Set the number of complete frames."""
+    file["VTKHDF/Steps"].attrs.modify("NSteps", np.int64(count))
 
 
 def opened(staged: StagedFile, path: Path) -> File:
@@ -110,16 +120,12 @@ def reading(path: Path) -> Iterator[File]:
     except ValueError as error:
         raise ValueError(f"{path} is damaged ({reason(error)}): {_REMEDY}.") from None
     except (OSError, KeyError, RuntimeError, TypeError, AttributeError, IndexError, UnicodeError) as error:
-        what = "is cut short" if _is_cut_short(path) else "is damaged, or just being written"
+        with open(path, "rb") as raw:
+            head = raw.read(36)  # the superblock, which from HDF5 1.8 on says how long the file is
+        stated = struct.unpack_from("<Q", head, 28)[0] if len(head) == 36 and head[8] in (2, 3) else 0
+        short = len(head) < 36 or path.stat().st_size < stated
+        what = "is cut short" if short else "is damaged, or just being written"
         raise ValueError(f"{path} {what} ({reason(error)}): {_REMEDY}.") from None
-
-
-def _is_cut_short(path: Path) -> bool:
-    """Whether a file is shorter than its superblock says, if that is one of HDF5 1.8 or later."""
-    with open(path, "rb") as raw:
-        head = raw.read(36)
-    stated = struct.unpack_from("<Q", head, 28)[0] if len(head) == 36 and head[8] in (2, 3) else 0
-    return len(head) < 36 or path.stat().st_size < stated
 
 
 def _check_format(path: Path, file: File) -> None:
@@ -145,20 +151,21 @@ def _check_contained(path: Path, file: File) -> None:
     while todo:
         group = todo.pop()
         for name in group:
-            where = f"{path}: {group.name.rstrip('/')}/{name}"
-            require_of_file(_is_own(group, name), f"{where} is a link, which no run of mpmjax has: {_REMEDY}.")
-            item = group[name]
-            require_of_file(
-                item not in seen, f"{where} is a second name of an object, which no run of mpmjax has: {_REMEDY}."
+            item = group[name] if _is_own(group, name) else None
+            elsewhere = isinstance(item, h5py.Dataset) and (item.is_virtual or item.external)
+            fault = (
+                "is a link"
+                if item is None
+                else "is a second name of an object"
+                if item in seen
+                else "has its data in other files"
+                if elsewhere
+                else None
             )
+            where = f"{path}: {group.name.rstrip('/')}/{name}"
+            require_of_file(fault is None, f"{where} {fault}, which no run of mpmjax has: {_REMEDY}.")
             seen.add(item)
-            if isinstance(item, h5py.Group):
-                todo.append(item)
-            elif isinstance(item, h5py.Dataset):
-                elsewhere = item.is_virtual or item.external
-                require_of_file(
-                    not elsewhere, f"{where} has its data in other files, which no run of mpmjax has: {_REMEDY}."
-                )
+            todo += [item] if isinstance(item, h5py.Group) else []
 
 
 def _check_written(file: File) -> None:
@@ -187,16 +194,21 @@ def checksum(rows: dict[str, np.ndarray]) -> int:
     return reduce(lambda crc, name: zlib.crc32(rows[name].tobytes(), crc), sorted(rows), 0)
 
 
+def _datasets(file: File, *, growing: bool) -> dict[str, Any]:
+    """The datasets that grow with the frames, or those that do not, by their names."""
+    datasets: dict[str, Any] = {}
+
+    def add(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and name.startswith(_GROWING) == growing:
+            datasets[name] = item
+
+    file.visititems(add)
+    return datasets
+
+
 def fixed_checksum(file: File) -> int:
     """The checksum of all datasets that do not grow with the frames."""
-    datasets: dict[str, np.ndarray] = {}
-
-    def read(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and not name.startswith(_GROWING):
-            datasets[name] = item[...]
-
-    file.visititems(read)
-    return checksum(datasets)
+    return checksum({name: item[...] for name, item in _datasets(file, growing=False).items()})
 
 
 def frame_rows(file: File, start: int, stop: int) -> dict[str, np.ndarray]:
@@ -205,17 +217,13 @@ def frame_rows(file: File, start: int, stop: int) -> dict[str, np.ndarray]:
     Raises:
         ValueError: they are not what was written.
     """
-    datasets: dict[str, np.ndarray] = {}
-
-    def read(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and name.startswith(_GROWING):
-            count = (item.chunks or (0,))[0]
-            datasets[name] = item[start * count : stop * count]
-
-    file.visititems(read)
-    sums = datasets.pop("mpmjax/checksums")
+    rows = {}
+    for name, item in _datasets(file, growing=True).items():
+        count = (item.chunks or (0,))[0]
+        rows[name] = item[start * count : stop * count]
+    sums = rows.pop("mpmjax/checksums")
     for i in range(stop - start):
-        lengths = {name: len(rows) // (stop - start) for name, rows in datasets.items()}
-        frame = {name: rows[i * lengths[name] : (i + 1) * lengths[name]] for name, rows in datasets.items()}
+        lengths = {name: len(a) // (stop - start) for name, a in rows.items()}
+        frame = {name: a[i * lengths[name] : (i + 1) * lengths[name]] for name, a in rows.items()}
         require(checksum(frame) == sums[i], f"frame {start + i} is not what was written")
-    return datasets
+    return rows

@@ -13,8 +13,8 @@ from tqdm import tqdm
 
 from mpmjax._types import Scalar
 from mpmjax.checks import canonical, checked, require, require_whole, requirements
-from mpmjax.io._interrupt import reporting
 from mpmjax.io._runs import FrameWriter
+from mpmjax.io._transactional_file import reporting
 from mpmjax.simulation import (
     Fault,
     RolloutState,
@@ -99,6 +99,12 @@ def record(
             bar.close()
             return writer.standing("Resume it to continue.")
 
+        def append(step: int, state: RolloutState, statistics: RunStatistics) -> None:
+            try:
+                writer.append(step, state, statistics)
+            except OSError as error:
+                raise OSError(f"{error}. {writer.standing('Make room, then resume it.')}") from None
+
         with bar, reporting(stopped):
             healthy = True
             before: Callable[[], RolloutState] = partial(initial_state, scene, particles)
@@ -128,7 +134,7 @@ def record(
                 statistics, step = statistics.merged(new), step + int(new.steps)
                 healthy = int(new.fault) == Fault.NONE and int(new.unconverged) == 0
                 if healthy:
-                    _append(writer, step, state, statistics)
+                    append(step, state, statistics)
                     bar.update(count)
         run = Run(
             scene=scene,
@@ -149,7 +155,7 @@ def record(
             try:
                 received = error.run.final_collider_impulse, error.run.final_boundary_impulse
                 last = RolloutState(state_of(error.run.final), *received)
-                _append(writer, int(error.run.final_step), last, statistics)
+                append(int(error.run.final_step), last, statistics)
                 again = "Resumed it would end there again: begin anew."
                 then = "It can be resumed as it is." if int(statistics.fault) == Fault.NONE else again
                 text = writer.standing(then)
@@ -158,11 +164,3 @@ def record(
             raise SimulationError(f"{error} {text}", error.run) from None
         warn_of_inaccuracy(run)
         return run
-
-
-def _append(writer: FrameWriter, step: int, state: RolloutState, statistics: RunStatistics) -> None:
-    """Write a frame; an error says what the file holds."""
-    try:
-        writer.append(step, state, statistics)
-    except OSError as error:
-        raise OSError(f"{error}. {writer.standing('Make room, then resume it.')}") from None

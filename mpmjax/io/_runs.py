@@ -1,7 +1,7 @@
 """Runs in files: HDF5 that ParaView opens as it is, and from which a run continues bit for bit.
 
-    /VTKHDF     the frames in VTK's layout (see `_vtkhdf`): Points, and as PointData velocity, deformation_gradient,
-                J = det F, with APIC affine_velocity, and what laws that yield remember
+    /VTKHDF     the frames (see `_run_contents`): Points, and as PointData velocity, deformation_gradient, J = det F,
+                with APIC affine_velocity, and what laws that yield remember
     /mpmjax     format, version, d, dtype, units, dt, counts, mass, volume, X, the scene and the method as JSON (see
                 `_schema`) with their arrays, and a table with one row a frame: its step and the run's `RunStatistics`
                 up to it; `collider_impulse` and `boundary_impulse`, those on each by then, linear, then angular;
@@ -29,23 +29,33 @@ import numpy as np
 
 from mpmjax.boundary import Impulses
 from mpmjax.checks import canonical, checked, is_traced, require, require_finite, require_memory, require_positive
-from mpmjax.io._atomic_write import reason, replacing
 from mpmjax.io._hdf5 import (
     LIBVER_HEAD,
+    File,
     check_hdf5,
     check_no_writer,
     check_place,
     checksum,
+    count_in,
     frame_rows,
     opened,
     reading,
     require_of_file,
+    set_count,
 )
-from mpmjax.io._interrupt import undisturbed
-from mpmjax.io._run_description import check_readable, check_same, describe, description_in, write_description
+from mpmjax.io._run_contents import (
+    add_growing,
+    add_topology,
+    check_readable,
+    check_same,
+    describe,
+    description_in,
+    rows_of,
+    states_in,
+    write_description,
+)
 from mpmjax.io._schema import decode
-from mpmjax.io._transactional_file import StagedFile, staged_file
-from mpmjax.io._vtkhdf import File, add_growing, add_topology, count_in, rows_of, set_count, states_in
+from mpmjax.io._transactional_file import StagedFile, reason, replacing, staged_file, undisturbed
 from mpmjax.simulation import RolloutState, Run, RunStatistics, initial_state, no_steps
 from mpmjax.state import Particles, Scene, State, prepare, state_of, with_state
 from mpmjax.stepping import AbstractIntegrator
@@ -54,13 +64,10 @@ _IMPULSES = ("collider_impulse", "boundary_impulse")
 
 
 class FrameWriter:
-    """Writes a run a frame at a time. What is written has left the program when `append` returns.
-
-    A context manager: leaving it closes the file.
-    """
+    """Writes a run a frame at a time. What is written has left the program when `append` returns. A context manager:
+    leaving it closes the file. `create` and `resume` make one."""
 
     def __init__(self, file: File, staged: StagedFile, path: Path, like: RolloutState):
-        """Use `create` or `resume`."""
         self._file, self._staged, self._path, self._like = file, staged, path, like
         self._kept = self._standing()
 
@@ -76,16 +83,8 @@ class FrameWriter:
         start: int = 0,
         overwrite: bool = False,
     ) -> "FrameWriter":
-        """Begin a file. It takes its place when its first frame is on the disk.
-
-        Args:
-            path: the file to be.
-            scene: the scene.
-            particles: prepared particles (see `prepare`), the first frame.
-            method: the method.
-            dt: step [s].
-            start: step number of the first frame.
-            overwrite: replace a run's file that is there.
+        """Begin a file with prepared particles as its first frame, of step `start`. It takes its place when that is on
+        the disk.
 
         Raises:
             ValueError: a file that is there, and with `overwrite` one that is no run or is being written; a place that
@@ -103,9 +102,8 @@ class FrameWriter:
     def resume(
         cls, path: str | os.PathLike, scene: Scene, particles: Particles, method: AbstractIntegrator, dt: Any
     ) -> "FrameWriter":
-        """Open a file to append frames to it, after checking that it is whole and of the same run.
-
-        Frames that a killed writer left incomplete are cut off.
+        """Open a file to append frames to it, after checking that it is whole and of the same run. Frames that a killed
+        writer left incomplete are cut off.
 
         Raises:
             ValueError: see `load`; a file that is being written; a scene, particles, method or dt that differ from the
@@ -138,12 +136,7 @@ class FrameWriter:
         return cls(file, staged, path, begin)
 
     def append(self, step: int, state: RolloutState, statistics: RunStatistics) -> None:
-        """Write a frame; one of the last frame's step replaces it.
-
-        Args:
-            step: its step number.
-            state: its state, with the impulse on the colliders by then.
-            statistics: of the run up to it.
+        """Write the frame of a step, with impulses and statistics by then; one of the last frame's step replaces it.
 
         Raises:
             OSError: the disk refused. The file is what it was before, and this writer can only be closed.
@@ -190,11 +183,7 @@ class FrameWriter:
         return n, step, step * float(self._file["mpmjax"].attrs["dt"])
 
     def close(self) -> None:
-        """Close the file.
-
-        Raises:
-            OSError: what was written cannot be brought to the disk.
-        """
+        """Close the file; an OSError if what was written cannot be brought to the disk."""
         with suppress(OSError, RuntimeError):  # of a writer that failed; what it has not committed is dropped
             self._file.close()
         try:
@@ -265,11 +254,8 @@ def save(path: str | os.PathLike, run: Run) -> None:
 
 
 def steps_in(path: str | os.PathLike) -> int:
-    """How many steps led to the last frame of a file, −1 if that is not known.
-
-    Raises:
-        ValueError: see `load`; a file that is being written.
-    """
+    """How many steps led to the last frame of a file, −1 if that is not known. Raises what `load` does, and for a file
+    that is being written."""
     check_no_writer(Path(path))
     with reading(Path(path)) as file:
         require_of_file(count_in(file) > 0, f"{path} holds no frame: run the simulation again.")
@@ -351,11 +337,7 @@ def _frames(file: File, like: RolloutState, start: int, stop: int) -> tuple[np.n
 
 def _check_numbers(scene: Scene, dt: Any, steps: np.ndarray, *states: State) -> None:
     """Check that the step is positive, step numbers grow, states are finite, and positions are ones that a grid can
-    number.
-
-    Raises:
-        ValueError: they are not.
-    """
+    number."""
     require_positive("dt [s]", dt)
     require(steps[0] >= 0 and (np.diff(steps) > 0).all(), f"A run's steps must grow from 0 or later, got {steps}.")
     most = float(scene.grid.spacing) * 2**31  # as far as nodes are numbered

@@ -16,7 +16,7 @@ import enum
 import inspect
 import math
 import typing
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import fields
 from functools import cache
 from typing import Any, Literal, TypeVar, get_args, get_origin
@@ -68,7 +68,7 @@ def register(cls: Registered) -> Registered:
     name = cls.__name__
     other = next((c for c in _known() if c.__name__ == name), cls)
     require(
-        _place(other) == _place(cls),
+        (other.__module__, other.__qualname__) == (cls.__module__, cls.__qualname__),  # which one defined anew keeps
         f"register: the name {name!r} is taken by {other.__module__}.{other.__qualname__}; choose another.",
     )
     names = {f.name for f in fields(cls)}
@@ -78,11 +78,6 @@ def register(cls: Registered) -> Registered:
         require(_can_be_held(hint), f"{what} is annotated as {hint!r}, which files cannot hold (see its docstring).")
     _registered[name] = cls
     return cls
-
-
-def _place(cls: type) -> tuple[str, str]:
-    """Module and name, which a class defined anew keeps."""
-    return cls.__module__, cls.__qualname__
 
 
 @cache
@@ -176,9 +171,7 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
     fitting = (c for c in _known() if any(is_module(a) and issubclass(c, a) for a in options))
     classes = {c.__name__: c for c in sorted(fitting, key=lambda c: c.__name__)}
     items = [get_args(a)[0] for a in options if get_origin(a) in (tuple, list)]
-    if classes and isinstance(data, list) and items:
-        return tuple(decode(d, items[0], _nth(where, i), arrays) for i, d in enumerate(data, 1))
-    if items and isinstance(data, list) and not _forms(expected):  # of arrays, each of its own shape
+    if items and isinstance(data, list) and (classes or not _forms(expected)):  # of objects, or of arrays
         return tuple(decode(d, items[0], _nth(where, i), arrays) for i, d in enumerate(data, 1))
     number = isinstance(data, (int, float)) and not isinstance(data, bool) and (float, 0) in _forms(expected)
     if any(is_module(a) for a in options) and not number:
@@ -186,7 +179,8 @@ def decode(data: Any, expected: Any, where: str = "", arrays: dict[str, np.ndarr
         return _object(data, classes, any(inspect.isabstract(a) for a in options), where, arrays, plain)
     if enums := [a for a in options if is_enum(a)]:
         words = [member.value for member in enums[0]]
-        _require(isinstance(data, str) and data in words, where, f"must be one of {_quoted(words)}, got {_short(data)}")
+        listed = ", ".join(map(repr, words))
+        _require(isinstance(data, str) and data in words, where, f"must be one of {listed}, got {_short(data)}")
         return enums[0](data)
     return _numbers(data, expected, where, arrays)
 
@@ -233,10 +227,8 @@ def _object(
     if not (isinstance(kind, str) and kind in classes):
         close = difflib.get_close_matches(_short(kind), classes, 1)
         hint = f", did you mean {close[0]!r}?" if close else "."
-        register = (
-            " A class of your own is known when the module is imported that calls mpm.register." if opened else ""
-        )
-        raise ValueError(f"{_named(where, 'unknown kind')} {_short(kind)}{hint} It must be {choice}.{register}")
+        more = " A class of your own is known when the module is imported that calls mpm.register." if opened else ""
+        raise ValueError(f"{_named(where, 'unknown kind')} {_short(kind)}{hint} It must be {choice}.{more}")
     keywords = arguments(classes[kind], {k: v for k, v in table.items() if k != "kind"}, where, arrays)
     try:
         return classes[kind](**keywords)
@@ -253,17 +245,17 @@ def _numbers(data: Any, expected: Any, where: str, arrays: dict[str, np.ndarray]
         _require((float, a.ndim) in forms, where, f"must be {_words(forms)}, got an array of shape {a.shape}")
         leaves, kinds = a.ravel(), {float}
     else:
-        a, leaves, depth = data, list(_leaves(data)), _depth(data)
+        a, leaves, depth = data, _leaves(data), _depth(data)
         kinds = {kind for kind, d in forms if d == depth and all(_fits(leaf, kind) for leaf in leaves)}
         _require(kinds, where, f"must be {_words(forms)}, got {_short(data)}")
     if float in kinds:
         bad = np.isnan if may_be_infinite(expected) else lambda x: ~np.isfinite(x)
         beyond = any(isinstance(x, int) and math.isinf(_float(x)) for x in leaves)
         _require(not (beyond or any(bad(_float(x)) for x in leaves)), where, f"must be finite, got {_short(data)}")
-        data = _floats(data) if a is data else a
+        data = _nested(data, list, float) if a is data else a
     takes_tuples = any(tuple in (a, get_origin(a)) for a in alternatives(expected))
     if not isinstance(data, list) or (takes_tuples and len(leaves) <= _SMALL):
-        return _tuples(data)
+        return _nested(data, tuple, lambda leaf: leaf)
     return np.asarray(data)
 
 
@@ -334,12 +326,8 @@ def _depth(data: Any) -> int:
     return -1 if len(depths) > 1 or len(lengths) > 1 or -1 in depths else 1 + max(depths, default=0)
 
 
-def _leaves(data: Any) -> Iterator[Any]:
-    if isinstance(data, list):
-        for d in data:
-            yield from _leaves(d)
-    else:
-        yield data
+def _leaves(data: Any) -> list[Any]:
+    return [leaf for d in data for leaf in _leaves(d)] if isinstance(data, list) else [data]
 
 
 def _float(x: Any) -> float:
@@ -349,12 +337,9 @@ def _float(x: Any) -> float:
         return math.inf
 
 
-def _floats(data: Any) -> Any:
-    return [_floats(d) for d in data] if isinstance(data, list) else float(data)
-
-
-def _tuples(data: Any) -> Any:
-    return tuple(_tuples(d) for d in data) if isinstance(data, list) else data
+def _nested(data: Any, of_list: type, of_leaf: Callable[[Any], Any]) -> Any:
+    """Nested lists with another type for the lists and a function of the leaves."""
+    return of_list(_nested(d, of_list, of_leaf) for d in data) if isinstance(data, list) else of_leaf(data)
 
 
 def _inside(where: str, key: str, value: Any) -> str:
@@ -375,10 +360,6 @@ def _nth(where: str, i: int) -> str:
 
 def _named(where: str, what: str) -> str:
     return f"{where}: {what}" if where else what.capitalize()
-
-
-def _quoted(words: Iterable[Any]) -> str:
-    return ", ".join(repr(w) for w in words)
 
 
 def _short(data: Any, most: int = 60) -> str:

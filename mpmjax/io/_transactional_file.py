@@ -1,34 +1,182 @@
-"""A file that changes by commits: all of what was written since the last one, or nothing; and one writer at a time.
+"""Files that are whole at every moment, also when the disk is full or a signal ends the process.
 
-HDF5 writes as it sees fit, also while it closes, and what a full disk refuses then is lost in silence. So it writes to
-memory, and a commit puts that on the disk: what lengthens the file first, since this is where room runs out, then what
-lies within it. If the disk refuses, the file is made what it was.
+`replacing` writes a new file aside and puts it in its place. A `StagedFile` changes by commits: all of what was written
+since the last one, or nothing; and one writer at a time. HDF5 writes as it sees fit, also while it closes, and what a
+full disk refuses then is lost in silence. So it writes to memory, and a commit puts that on the disk: what lengthens
+the file first, since this is where room runs out, then what lies within it. If the disk refuses, the file is made what
+it was.
+
+On Ctrl-C and SIGTERM a command of the shell ends at once, between two writes, and says where its files stand. Python's
+own way is an exception in the main thread, which waits until compiled code returns, and then comes anywhere: amid a
+trace, a callback of the compiler, a call of HDF5. So none is raised. A thread is told of the signal, waits for the
+write in progress, and ends the process with 128 + the signal's number. What is better ended in good order, such as a
+fit, asks for it by `stopping`.
 """
 
+import io
 import os
+import re
+import signal
+import socket
 import struct
-from contextlib import suppress
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mpmjax.checks import require
-from mpmjax.io._atomic_write import reason, replacing
-from mpmjax.io._interrupt import undisturbed
 
 try:
     import fcntl
 except ImportError:  # a system without POSIX's locks: two writers are not told from one
     fcntl = None
 
-_PAGE = 4096
+_PAGE = 2**14
 BUSY = "{} is being written by another run: wait until that ends or stop it, or choose another name."
+_NAMES = {"SIGINT": "interrupted", "SIGTERM": "told to end", "SIGHUP": "the terminal was closed"}
+_writing = threading.RLock()
+_reports: list[Callable[[], str]] = []
+_stops: list["Stop"] = []
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """No signal ends the process within this block."""
+    with _writing:
+        yield
+
+
+@contextmanager
+def reporting(report: Callable[[], str]) -> Iterator[None]:
+    """A signal that comes within this block is answered with what `report` returns, which another thread calls."""
+    _reports.append(report)
+    try:
+        yield
+    finally:
+        _reports.remove(report)
+
+
+@dataclass
+class Stop:
+    """A request to stop in good order."""
+
+    what: str
+    """A sentence on what is done about it."""
+    ready: bool = False
+    """Whether there is anything to keep; as long as not, a signal ends the process at once."""
+    signal: int = 0
+    """Number of the signal that came; zero if none did."""
+
+
+@contextmanager
+def stopping(what: str) -> Iterator[Stop]:
+    """The first signal that comes within this block while its `ready` is set does not end the process: the block is to
+    look at `signal` now and then, and to stop. The second one ends the process at once."""
+    stop = Stop(what)
+    _stops.append(stop)
+    try:
+        yield stop
+    finally:
+        _stops.remove(stop)
+
+
+def end_on_signals() -> None:
+    """From now on SIGINT, SIGTERM and SIGHUP end the process as said above, but for those that are ignored already.
+
+    For commands only: it is called once, in the main thread. A program that uses the package keeps its own handlers.
+    """
+    woken, waker = socket.socketpair()
+    waker.setblocking(False)
+    signal.set_wakeup_fd(waker.detach(), warn_on_full_buffer=False)
+    told = {getattr(signal, name): what for name, what in _NAMES.items() if hasattr(signal, name)}
+    for number in told:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, lambda *_: None)  # the other thread does the work
+    threading.Thread(target=_wait, args=(woken, told), daemon=True).start()
+
+
+def _wait(woken: socket.socket, told: dict[int, str]) -> None:
+    number = 0
+    while number not in told or _postponed(number, told[number]):
+        number = woken.recv(1)[0]
+    with undisturbed():
+        printed = threading.Thread(target=sys.stdout.flush, daemon=True)  # it may wait for whoever reads
+        printed.start()
+        printed.join(1.0)
+        where = " ".join(report() for report in _reports) or "No file was being written."
+        os.write(2, f"mpmjax: {told[number]}. {where}\n".encode())
+        os._exit(128 + number)
+
+
+def _postponed(number: int, told: str) -> bool:
+    """Whether the process is left to stop in good order."""
+    for stop in list(_stops):
+        if stop.ready and not stop.signal:
+            stop.signal = number
+            os.write(2, f"mpmjax: {told}. {stop.what}\n".encode())
+            return True
+    return False
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield the name under which to write the file. At every moment `path` is what it was or the whole new file.
+
+    Raises:
+        ValueError: a place that cannot be written.
+        OSError: the disk refused; `path` is what it was.
+    """
+    aside = path.resolve().with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+
+    def dropped() -> str:
+        aside.unlink(missing_ok=True)
+        return f"{path} was not written."
+
+    try:
+        aside.touch()
+    except OSError as error:
+        raise ValueError(f"{path} cannot be written ({reason(error)}): name a place that can be.") from None
+    with reporting(dropped):
+        try:
+            yield aside
+            with open(aside, "rb+") as file:
+                os.fsync(file.fileno())
+            with undisturbed():
+                os.replace(aside, path.resolve())
+        except OSError as error:
+            raise OSError(f"{path} could not be written: {reason(error).rstrip('.')}. It is as it was.") from None
+        finally:
+            aside.unlink(missing_ok=True)
+
+
+def save_figure(figure: Any, path: Path, dpi: float | int) -> None:
+    """Write a figure of matplotlib, of the kind that the suffix says, PNG where there is none.
+
+    It is drawn in memory first: matplotlib's writers do not all report what the disk refuses.
+
+    Raises:
+        ValueError: a kind that matplotlib does not know; see `replacing`.
+        OSError: see `replacing`.
+    """
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format=path.suffix[1:] or "png", dpi=dpi)
+    with replacing(path) as aside:
+        aside.write_bytes(drawn.getbuffer())
+
+
+def reason(error: BaseException) -> str:
+    """The system's message of an error, or the first line of the library's."""
+    text = (isinstance(error, OSError) and error.strerror) or str(error) or type(error).__name__
+    match = re.search(r"error message = '(.*?)'", text)
+    return match[1] if match else text.splitlines()[0].strip("'\"")
 
 
 class StagedFile:
-    """A file object for h5py that stages all changes in memory, on top of an existing file.
-
-    A context manager: leaving it drops what was not committed.
-    """
+    """A file object for h5py that stages all changes in memory, on top of an existing file. A context manager: leaving
+    it drops what was not committed."""
 
     def __init__(self, path: Path):
         """Open a file and lock it for writing. The lock goes with the process, however that ends; readers are free.
@@ -48,17 +196,12 @@ class StagedFile:
 
     def _drop(self) -> None:
         """Forget what is staged."""
-        self._size = os.fstat(self._raw.fileno()).st_size
-        self._base = self._size  # up to here the file holds, but for pages; from here on it is the tail
-        self._pages: dict[int, bytearray] = {}
-        self._tail = bytearray()
-
-    # What h5py calls
+        self._size = self._base = self._length = os.fstat(self._raw.fileno()).st_size
+        self._pages: dict[int, bytearray] = {}  # by their numbers; where there is none, the disk's bytes up to `_base`
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         """Move to a position."""
-        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._base + len(self._tail)}
-        self._at = start[whence] + offset
+        self._at = {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._length}[whence] + offset
         return self._at
 
     def tell(self) -> int:
@@ -75,51 +218,40 @@ class StagedFile:
         """Read into a buffer; bytes beyond the end are zero."""
         view, begin = memoryview(into).cast("B"), self._at
         end = self._at = begin + len(view)
-        inside = max(0, min(end, self._base) - begin)
-        view[:] = self._stored(begin, inside).ljust(len(view), b"\0")
-        for number in self._touched(begin, begin + inside):
+        view[:] = self._stored(begin, min(end, self._base) - begin).ljust(len(view), b"\0")
+        for number in _pages_of(begin, end) if self._pages else ():
             if number in self._pages:
-                low, high = max(begin, number * _PAGE), min(begin + inside, (number + 1) * _PAGE)
-                view[low - begin : high - begin] = self._pages[number][low % _PAGE :][: high - low]
-        if end > self._base:
-            first = begin + inside - self._base
-            part = self._tail[first : first + len(view) - inside]
-            view[inside : inside + len(part)] = part
+                low, high = max(begin, number * _PAGE), min(end, (number + 1) * _PAGE)
+                view[low - begin : high - begin] = self._pages[number][low - number * _PAGE : high - number * _PAGE]
         return len(view)
 
     def write(self, data: Any) -> int:
         """Stage bytes at the position."""
         view, begin = memoryview(data).cast("B"), self._at
         end = self._at = begin + len(view)
-        inside = max(0, min(end, self._base) - begin)
-        for number in self._touched(begin, begin + inside):
-            low, high = max(begin, number * _PAGE), min(begin + inside, (number + 1) * _PAGE)
-            if number not in self._pages:
-                self._pages[number] = bytearray(self._stored(number * _PAGE, _PAGE))
-            self._pages[number][low % _PAGE : low % _PAGE + high - low] = view[low - begin : high - begin]
-        if end > self._base:
-            first, rest = begin + inside - self._base, view[inside:]
-            self._tail += bytes(max(0, first - len(self._tail)))
-            overlap = min(len(self._tail) - first, len(rest))
-            with memoryview(self._tail) as tail:
-                tail[first : first + overlap] = rest[:overlap]
-            self._tail += rest[overlap:]
+        for number in _pages_of(begin, end):
+            low, high = max(begin, number * _PAGE), min(end, (number + 1) * _PAGE)
+            self._page(number)[low - number * _PAGE : high - number * _PAGE] = view[low - begin : high - begin]
+        self._length = max(self._length, end) if len(view) else self._length
         return len(view)
 
     def truncate(self, size: int) -> int:
         """Stage the file's length."""
-        if size < self._base:
-            self._base, self._tail = size, bytearray()
-            self._pages = {number: page for number, page in self._pages.items() if number * _PAGE < size}
-        tail = size - self._base
-        del self._tail[tail:]
-        self._tail += bytes(tail - len(self._tail))
+        self._base, self._length = min(self._base, size), size
+        self._pages = {number: page for number, page in self._pages.items() if number * _PAGE < size}
+        if (last := self._pages.get(size // _PAGE)) is not None:
+            last[size % _PAGE :] = bytes(_PAGE - size % _PAGE)
         return size
 
     def flush(self) -> None:
         """Do nothing: only `commit` writes."""
 
-    # What its owner calls
+    def _page(self, number: int) -> bytearray:
+        """A page to be changed."""
+        if number not in self._pages:
+            stored = self._stored(number * _PAGE, min(_PAGE, self._base - number * _PAGE))
+            self._pages[number] = bytearray(stored.ljust(_PAGE, b"\0"))
+        return self._pages[number]
 
     def commit(self) -> None:
         """Bring the file up to date.
@@ -128,14 +260,15 @@ class StagedFile:
             OSError: the disk refused; the file is what it was, and what was staged is lost.
         """
         with undisturbed():
-            parts: list[tuple[int, bytes | bytearray]] = [(self._base, self._tail)]
-            for number, page in sorted(self._pages.items()):
-                parts.append((number * _PAGE, page[: self._base - number * _PAGE]))
+            for number in _pages_of(self._base, min(self._length, self._size)):
+                self._page(number)  # what was cut off and grew again is zero
+            order = sorted(self._pages, key=lambda number: (number * _PAGE < self._size, number))
+            parts = [(n * _PAGE, self._pages[n][: self._length - n * _PAGE]) for n in order]
             before = [(at, self._stored(at, min(len(data), self._size - at))) for at, data in parts if at < self._size]
             try:
                 for at, data in parts:
                     self._put(at, data)
-                self._raw.truncate(self._base + len(self._tail))
+                self._raw.truncate(self._length)
             except BaseException:
                 with suppress(OSError):
                     self._raw.truncate(self._size)
@@ -186,10 +319,10 @@ class StagedFile:
         while len(view):
             view = view[self._raw.write(view) :]
 
-    @staticmethod
-    def _touched(begin: int, end: int) -> range:
-        """The pages that hold the bytes from `begin` up to `end`."""
-        return range(begin // _PAGE, -(-end // _PAGE) if end > begin else begin // _PAGE)
+
+def _pages_of(begin: int, end: int) -> range:
+    """The pages that hold the bytes from `begin` up to `end`."""
+    return range(begin // _PAGE, -(-end // _PAGE) if end > begin else begin // _PAGE)
 
 
 def require_no_writer(path: Path) -> None:
@@ -224,7 +357,7 @@ def _lock(file: int, *, shared: bool) -> None:
 
 
 def staged_file(path: Path) -> StagedFile:
-    """The file, locked and ready to be changed."""
+    """The file, locked and ready to be changed; `ValueError`s say why not."""
     try:
         return StagedFile(path)
     except BlockingIOError:
@@ -234,10 +367,8 @@ def staged_file(path: Path) -> StagedFile:
 
 
 class ReplacedFile:
-    """A file that holds all of its last `write`, at every moment, however the process ends.
-
-    A context manager: leaving it gives up the lock.
-    """
+    """A file that holds all of its last `write`, at every moment, however the process ends. A context manager: leaving
+    it gives up the lock."""
 
     def __init__(self, path: Path, *, new: bool):
         """Take the lock of a file that is there; with `new`, of one that the first `write` makes.

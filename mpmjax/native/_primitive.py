@@ -169,7 +169,7 @@ def is_divided(context: Any) -> bool:
     return set(manual) != set(axes.mesh.axis_names)
 
 
-def stored(tree: Any) -> Any:
+def materialised(tree: Any) -> Any:
     """The tree as it is, its arrays stored in memory once. XLA would else compute them again, or read them out of what
     a loop has stored, in each number of each operation that takes them, which it then often cannot vectorise.
 

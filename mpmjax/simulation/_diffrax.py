@@ -14,11 +14,11 @@ import numpy as np
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Int, Scalar, components, particle_first
-from mpmjax.autodiff import recomputed
+from mpmjax.autodiff import rematerialised
 from mpmjax.boundary import Impulses, no_impulses
 from mpmjax.checks import first_unmet, requirements
 from mpmjax.discretisation import Stencil, in_window
-from mpmjax.native import stored
+from mpmjax.native import materialised
 from mpmjax.simulation._run import Fault, RunStatistics, no_steps, one_step
 from mpmjax.simulation._sorting import MemoryOrder, resorted
 from mpmjax.state import Particles, Scene, State, state_of, with_state
@@ -112,7 +112,7 @@ class Problem(eqx.Module):
             y: the state as the loop has it.
             step: the number of steps since the rollout began.
         """
-        y = y.from_loop_layout(stored)
+        y = y.from_loop_layout(materialised)
         if y.order is None:
             return self, y
         t = (self.start + step) * self.dt
@@ -255,7 +255,7 @@ _MOST_LOOPS = 4
 
 class SegmentAdjoint(diffrax.AbstractAdjoint):
     """Reverse mode that stores the state before each segment of steps. From the last segment to the first it computes
-    the steps again, storing what each starts from, its sums and what is `kept` of it, and then differentiates them.
+    the steps again, storing what each starts from, its sums and what is `saved_for_backward`, and differentiates them.
 
     The loops are scans, so that derivatives of any kind and order exist. All steps are taken: nothing stops a run.
     """
@@ -281,7 +281,7 @@ class SegmentAdjoint(diffrax.AbstractAdjoint):
                 return taken(state), None
             return jax.lax.cond(number < max_steps, taken, lambda state: state, state), None
 
-        turn = recomputed(step, sums=True)
+        turn = rematerialised(step, sums=True)
         for _ in self.lengths[1:]:
             turn = jax.checkpoint(partial(jax.lax.scan, turn), prevent_cse=False)
         numbers = jnp.arange(turns).reshape(self.lengths)

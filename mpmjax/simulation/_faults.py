@@ -21,14 +21,8 @@ from mpmjax.stepping import SAFETY, AbstractIntegrator, UnknownBoundError, longe
 
 
 def raise_faults(run: Run, began: Particles, before: Callable[[], RolloutState], start: int) -> None:
-    """Raise the faults in the statistics of an untraced run.
-
-    Args:
-        run: the run, its final state possibly bad.
-        began: the particles at the start.
-        before: gives the state before the last step.
-        start: number of the run's first step.
-    """
+    """Raise the faults in the statistics of an untraced run, which began with these particles at step `start`; `before`
+    gives the state before the last step."""
     fault = Fault(int(run.statistics.fault))
     if fault != Fault.NONE:
         previous = before()
@@ -49,9 +43,8 @@ def raise_faults(run: Run, began: Particles, before: Callable[[], RolloutState],
             what, advice = disallowed(law, run.method)
         last = with_state(run.final, previous.particles)
         reached = int((run.steps < step).sum())
-        saved = {
-            name: getattr(run, name) for name in ("steps", "frames", "observed", "collider_impulse", "boundary_impulse")
-        }
+        names = ("steps", "frames", "observed", "collider_impulse", "boundary_impulse")
+        saved = {name: getattr(run, name) for name in names}
         good = replace(
             run,
             **jax.tree.map(lambda a: a[:reached], saved),
@@ -179,14 +172,7 @@ def advise(scene: Scene, method: AbstractIntegrator, dt: Any, began: Particles, 
     """Advice on a fault: to shorten the step if it was too long, else what the fault itself suggests.
 
     A step above the limit explains any fault, but not every run with such a step fails by it. So both are said then.
-
-    Args:
-        scene: the scene.
-        method: update of the grid velocity.
-        dt: Δt [s].
-        began: the particles at the start.
-        last: the last good ones.
-        otherwise: what the fault suggests where the step is within the limit.
+    The particles are those at the start and the last good ones.
     """
     try:
         first, then = (float(longest_step(scene, particles, method)) for particles in (began, last))

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.autodiff import guard, recomputed
+from mpmjax.autodiff import guard, rematerialised
 from mpmjax.checks import (
     canonical,
     checked,
@@ -222,7 +222,7 @@ def _rollout(
         return replace(y, particles=state_of(new)).to_loop_layout(), None
 
     begin = RolloutState(state_of(particles), None, order=memory_order(scene, particles, steps)).to_loop_layout()
-    end, _ = jax.lax.scan(recomputed(body), begin, jnp.arange(steps, dtype=particles.x.dtype))
+    end, _ = jax.lax.scan(rematerialised(body), begin, jnp.arange(steps, dtype=particles.x.dtype))
     return with_state(particles, end.as_given().particles)
 
 
@@ -338,12 +338,7 @@ def integrate(
 
 
 def before_fault(go: Callable[..., Any], begin: RolloutState, statistics: RunStatistics) -> RolloutState:
-    """The last good state of a run that met a fault, computed once more by the same program: no run carries it.
-
-    Args:
-        go: the run's `integrate`, with all its arguments but `until`.
-        begin: the state in which it began.
-        statistics: its statistics.
-    """
+    """The last good state of a run that met a fault, computed once more by the same program, `integrate` with all its
+    arguments but `until`: no run carries it."""
     good = int(statistics.fault_step) - 1
     return begin if good == 0 else go(until=np.asarray(good, begin.particles.x.dtype)).state

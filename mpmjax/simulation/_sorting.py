@@ -71,15 +71,8 @@ def memory_order(scene: Scene, particles: Particles, steps: int) -> MemoryOrder 
 
     Particles are sorted in the updated description, with native sums, if a law yields or flows: bodies that only deform
     keep their order. A body force may know particles by their numbers, so with one they stay as they are. With the
-    environment variable MPMJAX_ORDER=given they always do; it is read when a program is compiled.
-
-    Args:
-        scene: the scene, its floats arrays, its loads attached.
-        particles: its prepared particles.
-        steps: the number of steps of the run, or between two saved frames.
-
-    Raises:
-        ValueError: the variable has another value.
+    environment variable MPMJAX_ORDER=given they always do, and with another value a ValueError is raised; it is read
+    when a program is compiled. `steps` are those of the run, or between two saved frames.
     """
     asked = os.environ.get(VARIABLE, "")
     if asked not in ("", "given"):
@@ -108,18 +101,9 @@ def resorted(
     step: Float[Array, ""],
     save_every: int | None,
 ) -> tuple[State, MemoryOrder]:
-    """The state and its order before a step. They change where a frame was just saved, and every `STEPS` steps from
-    there. So a run that goes on from a frame has the same order, and the same bits, as the one that saved it.
-
-    Args:
-        order: the order of the state.
-        scene: the scene, as given.
-        particles: the particles, as given.
-        state: the state.
-        t: time [s].
-        step: number of steps since the run began.
-        save_every: number of steps between frames; None if none is saved.
-    """
+    """The state and its order before a step, `step` of them since the run began; scene and particles are as given. They
+    change where a frame was just saved, and every `STEPS` steps from there. So a run that goes on from a frame has the
+    same order, and the same bits, as the one that saved it."""
     due = (step if save_every is None else step % save_every) % STEPS == 0
 
     def by_cells() -> tuple[Order, tuple[Array, ...]]:

@@ -303,15 +303,7 @@ class LoadedPoints(eqx.Module):
 def loaded_points(
     on: AttachedPoints, laws: tuple[AbstractLaw, ...], particles: Particles, stencil: Stencil, *, total: bool
 ) -> LoadedPoints:
-    """The points of prepared particles at the start of a step.
-
-    Args:
-        on: the points.
-        laws: the laws of the particles' materials.
-        particles: prepared particles.
-        stencil: their stencil.
-        total: whether the description is total Lagrangian.
-    """
+    """The points of prepared particles at the start of a step."""
     dtype = particles.x.dtype
     rows = jnp.asarray(on.particle, dtype).astype(jnp.int32)
     offset = jnp.asarray(on.offset, dtype).T

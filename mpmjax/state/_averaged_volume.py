@@ -108,15 +108,7 @@ class VolumeAverage(eqx.Module):
 
 
 def volume_average(grid: Grid, window: Any, x: Array, volume: Array, mirror: Mirror) -> VolumeAverage:
-    """The average over particles.
-
-    Args:
-        grid: the grid.
-        window: lattice index of the window's first node.
-        x: where the particles stand on the grid [m], shape (q, d).
-        volume: V0 [m^d], shape (q,).
-        mirror: the mirror images of symmetry planes.
-    """
+    """The average over particles of volumes V0 [m^d], shape (q,), that stand on the grid at x [m], shape (q, d)."""
     hats = make_stencil(BSpline(1), SplineGradient(), grid, window, x, affine=False)
     average = VolumeAverage(hats, volume, jnp.zeros(grid.size, volume.dtype), mirror, grid.shape, grid.periodic)
     total = average.at_nodes(volume)

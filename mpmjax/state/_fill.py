@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -130,10 +129,7 @@ def fill_mapped(
         mapping: x(ξ) [m], shape (d,), of one point ξ of the box, shape (d,), written with jax.numpy.
         box: the box of ξ, in the units of ξ.
         counts: number of cells along each axis of the box.
-        density: mass density [kg/m^d].
-        velocity: initial velocity [m/s], (d,); or a motion, of which the velocity at t = 0 is taken; or a function of
-            one point [m], (d,), written with jax.numpy. The last two give the gradient C too. Default: rest.
-        dtype: float32 or float64. Default: jax's own, float32 unless 64-bit mode is on.
+        density, velocity, dtype: as for `fill`.
 
     Raises:
         ValueError: a map whose Jacobian vanishes or changes its sign in the box, counts that are no whole numbers, or
@@ -172,7 +168,6 @@ def fill_mapped(
 
 
 def _precision(dtype: type | str | None) -> Any:
-    """The precision asked for."""
     try:
         precision = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
     except TypeError:
@@ -182,21 +177,21 @@ def _precision(dtype: type | str | None) -> Any:
 
 
 def _velocity(velocity: Velocity | None, d: int) -> Velocity:
-    """The velocity asked for, as d numbers, zero by default, or as a function of a point."""
+    """The velocity as d numbers, zero by default, or as a function of a point."""
     velocity = (0.0,) * d if velocity is None else velocity
     if isinstance(velocity, AbstractMotion):
         require(velocity.dim == d, f"velocity must be a motion in {d} dimensions, got one in {velocity.dim}.")
-        return partial(_velocity_at_start, velocity)
+
+        def at_start(x: Float[Array, "d"], motion: AbstractMotion = velocity) -> Float[Array, "d"]:
+            """The velocity of the point of the moving body that is at x at t = 0 [m/s], shape (d,)."""
+            zero = jnp.zeros((), x.dtype)
+            X = motion.origin(x[None], zero)
+            return jax.jvp(lambda t: motion.place(X, t), (zero,), (jnp.ones_like(zero),))[1][0]
+
+        return at_start
     if not callable(velocity):
         require(coordinates("velocity", velocity) == d, f"velocity must have {d} components, got {velocity}.")
     return velocity
-
-
-def _velocity_at_start(motion: AbstractMotion, x: Float[Array, "d"]) -> Float[Array, "d"]:
-    """The velocity of the point of a moving body that is at x at t = 0 [m/s], shape (d,)."""
-    zero = jnp.zeros((), x.dtype)
-    X = motion.origin(x[None], zero)
-    return jax.jvp(lambda t: motion.place(X, t), (zero,), (jnp.ones_like(zero),))[1][0]
 
 
 def _cut_cells(region: AbstractRegion, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -213,8 +208,8 @@ def _cut_cells(region: AbstractRegion, size: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _merged(share: np.ndarray, centroid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shares and centroids after parts smaller than `_SMALL` were given to the neighbour, across a face, of the largest
-    part. A part without such a neighbour stays."""
+    """Shares and centroids after parts smaller than `_SMALL` went to the neighbour, across a face, of the largest part.
+    A part without such a neighbour stays."""
     small = (share > 0) & (share < _SMALL)
     padded = np.pad(share, 1)
     middle = (slice(1, -1),) * share.ndim

@@ -288,16 +288,8 @@ def load_force(
     part: float,
     size: int,
 ) -> NodeVector | None:
-    """The forces of loads at the nodes [N], shape (n, d), without those of their terms; None without any.
-
-    Args:
-        loads: the loads.
-        points: the points of each at the start of the step.
-        t: time at the start of the step [s].
-        dt: step [s].
-        part: the time at which forces are taken, as a fraction of the step.
-        size: number of nodes.
-    """
+    """The forces of loads at their points at the fraction `part` of the step from t, on n = `size` nodes [N], shape
+    (n, d), without those of their terms; None without any."""
     total = None
     for load, at in zip(loads, points, strict=True):
         later = at.after(part * dt) if part > 0 and load.moves_points_on else at

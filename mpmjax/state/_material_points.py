@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix
 from mpmjax.material import AbstractMaterial, AbstractTangent, Viscosity
-from mpmjax.native import stored
+from mpmjax.native import materialised
 from mpmjax.potential import AbstractStiffness
 from mpmjax.state._averaged_volume import AveragedTangent, VolumeAverage, averaged_deformation
 
@@ -83,7 +83,7 @@ class MaterialPoints(eqx.Module):
     def flux(self, P: Deformation, dim: int) -> Matrix:
         """The flux of a stress P [J], shape (d, d, q), V0 P Fᵀ, of which the force is the sum, f_i = −Σ_p (V0 P Fᵀ)
         g_ip: the transpose of `change`. In the total description V0 P; by P = dΨ/dJ it is V0 P J I."""
-        P = stored(self.volume * P)
+        P = materialised(self.volume * P)
         return P if self.total else self.law.measure.kirchhoff_stress(P, self.deformation, dim)
 
     def stiffness(

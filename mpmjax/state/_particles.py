@@ -109,11 +109,7 @@ class Particles(eqx.Module):
 
     @property
     def history(self) -> Any:
-        """The history of the only material.
-
-        Raises:
-            ValueError: the particles are of several materials.
-        """
+        """The history of the only material; a ValueError if there are several."""
         return _only(self.histories, "history", "histories")
 
     @property
@@ -124,7 +120,6 @@ class Particles(eqx.Module):
 
 
 def _only(each: tuple, name: str, field: str) -> Any:
-    """The entry of the only material."""
     if len(each) != 1:
         raise ValueError(
             f"The particles are of {len(each)} materials, each with its own {name}: take {field}, one entry a material."
@@ -143,11 +138,7 @@ class Group(NamedTuple):
     """Leaves of shape (q,)."""
 
     def deformation(self) -> Deformation:
-        """F component first, shape (d, d, q), or J, shape (q,).
-
-        Raises:
-            ValueError: the particles are not prepared.
-        """
+        """F component first, shape (d, d, q), or J, shape (q,); a ValueError if the particles are not prepared."""
         if self.stored is None:
             raise ValueError("The particles have no deformation gradient yet: call prepare(scene, particles) first.")
         return components(self.stored)
@@ -198,46 +189,34 @@ def join(*sets: Particles, material: int | None = None) -> Particles:
             all(values) or not any(values),
             f"All joined particles must have {name} or none: prepare each for a scene like that of the others.",
         )
-    groups = [[(q, group)] for q in sets for group in q.groups]
+    materials = [[(q, group)] for q in sets for group in q.groups]  # the members of each
     if material is not None:
-        first, more = groups[: len(sets[0].sizes)], groups[len(sets[0].sizes) :]
+        first, more = materials[: len(sets[0].sizes)], materials[len(sets[0].sizes) :]
         require(
             0 <= material < len(first) and len(more) == len(sets) - 1,
             f"join needs the number of one of the first set's {len(first)} materials and others of one material each, "
             f"got material={material} and {len(more)} materials in {len(sets) - 1} sets.",
         )
-        added = [member for members_of_material in more for member in members_of_material]
-        groups = [
-            members_of_material + added if number == material else members_of_material
-            for number, members_of_material in enumerate(first)
-        ]
-    members = [member for members_of_material in groups for member in members_of_material]
+        first[material] += [member for members in more for member in members]
+        materials = first
+    in_order = [member for members in materials for member in members]
     arrays: dict[str, Any] = {
-        name: jnp.concatenate([getattr(q, name)[slice(*group.rows)] for q, group in members])
+        name: jnp.concatenate([getattr(q, name)[slice(*group.rows)] for q, group in in_order])
         for name in ("x", "v", "mass", "volume", "C", "X")
         if getattr(sets[0], name) is not None
     }
-    counts = tuple(
-        sum(group.rows[1] - group.rows[0] for _, group in members_of_material) for members_of_material in groups
-    )
+    counts = tuple(sum(group.rows[1] - group.rows[0] for _, group in members) for members in materials)
     return Particles(
         **arrays,
-        deformations=tuple(
-            of_one_material([group.stored for _, group in members_of_material]) for members_of_material in groups
-        ),
-        histories=tuple(
-            of_one_material([group.history for _, group in members_of_material]) for members_of_material in groups
-        ),
+        deformations=tuple(of_one_material([group.stored for _, group in members]) for members in materials),
+        histories=tuple(of_one_material([group.history for _, group in members]) for members in materials),
         counts=counts if len(counts) > 1 else None,
     )
 
 
 def of_one_material(parts: Sequence[Any]) -> Any:
-    """The deformations or histories of several sets of particles of one material, as those of one set.
-
-    Raises:
-        ValueError: they are of several laws.
-    """
+    """The deformations or histories of several sets of particles of one material, as those of one set; a ValueError if
+    they are of several laws."""
     kinds = {(jax.tree.structure(part), tuple(leaf.shape[1:] for leaf in jax.tree.leaves(part))) for part in parts}
     require(len(kinds) == 1, "Joined particles of one material must have been prepared for one law.")
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)

@@ -359,6 +359,8 @@ class Scene(eqx.Module):
     def shift(self, t: Scalar) -> Float[Array, "d"] | None:
         """How far the grid has moved at time t [m], shape (d,), with planes that move, and with the derivative by the
         places of all mirrored ones (see `carried_by`); None where it rests."""
+        if not self.mirrors:
+            return None
         along = {} if self.total else {axis: motion.at(t)[axis] for axis, motion in self.moving_mirrors.items()}
         for axis in range(self.grid.dim):
             places = [mirror.position for mirror in self.mirrors if mirror.axis == axis]

@@ -35,12 +35,8 @@ Boundaries = tuple[AbstractBoundary, ...]
 
 
 def warn_of_setup(scene: Scene, particles: Particles) -> None:
-    """Warn of walls and colliders that lie over the body, of grips and colliders that touch nothing, of thin bodies.
-
-    Args:
-        scene: the scene, its floats arrays.
-        particles: the particles, as they start.
-    """
+    """Warn of walls and colliders that lie over the body, of grips and colliders that touch nothing, of thin bodies;
+    the floats of the scene are arrays."""
     grid, boundary, total = scene.grid.with_layers(1), scene.boundary, scene.total  # all bodies' nodes coincide
     resting = tuple(c.rests(total=total) and not grid.follow for c in boundary)
     probe, inputs = partial(_probe, resting=resting, total=total), (boundary, grid, particles.x, particles.volume)
@@ -79,13 +75,8 @@ def warn_of_setup(scene: Scene, particles: Particles) -> None:
 
 
 def warn_of_rounding(grid: Grid, x: ParticleVector, before: ParticleVector | None = None) -> None:
-    """Warn of positions so far from zero that their rounding is no longer small beside the spacing.
-
-    Args:
-        grid: the grid.
-        x: positions [m].
-        before: positions that were examined before; if they are as far off, nothing is said again.
-    """
+    """Warn of positions x [m] so far from zero that their rounding is no longer small beside the spacing, unless those
+    examined `before` were as far off."""
 
     def rounding(x: ParticleVector) -> float:
         return float(jnp.finfo(x.dtype).eps) * float(np.abs(np.asarray(x)).max()) / float(grid.spacing)
@@ -180,14 +171,8 @@ def _filled(
     x: ParticleVector, volume: np.ndarray, width: float, offset: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """How many times its space each node of a lattice holds, by linear weights, which those of one body fill to a
-    tenth, and where the fullest is [m]; None where that is too much to look for.
-
-    Args:
-        x: positions [m], shape (p, d).
-        volume: volumes [m^d], shape (p,).
-        width: the lattice's spacing [m].
-        offset: how far its nodes are before whole numbers of it [-].
-    """
+    tenth, and where the fullest is [m]; None where that is too much to look for. The lattice has a spacing `width` [m],
+    and its nodes are `offset` spacings before whole numbers of it."""
     places = np.asarray(x, float) / width + offset
     d, index = places.shape[1], np.floor(places).astype(np.int64)
     first, share = index.min(axis=0), places - index

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 
 from mpmjax._types import NodeVector
-from mpmjax.autodiff import kept, without_derivative
+from mpmjax.autodiff import saved_for_backward, without_derivative
 from mpmjax.boundary import ConstrainedNodes, ContactInfo, constrain, count_places, find_active_set
 from mpmjax.implicit import SolveInfo, no_solve
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion, advance
@@ -72,7 +72,7 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
         return held, motion.velocity, held.without_spring_impulses(missing), motion.carrier, info
 
     start = frozen_method.mean_displacement(frozen, NodeMotion(guess))
-    active, guess, cost, sweeps = kept(
+    active, guess, cost, sweeps = saved_for_backward(
         find_active_set(frozen, guess, start, attempt, no_solve(guess.dtype), explicit=method.is_explicit)
     )
     held, solved, info = solve(constrain(nodes, active), method, guess)
@@ -94,13 +94,8 @@ def elastic_impulse(nodes: Nodes, method: AbstractIntegrator, motion: NodeMotion
 
 
 def reaction(nodes: Nodes, motion: NodeMotion, elastic: NodeVector | None) -> NodeVector:
-    """The impulse of walls and grips [kg m/s], shape (n, d); in free components the residual of the solve.
-
-    Args:
-        nodes: the nodes.
-        motion: their motion before friction.
-        elastic: `elastic_impulse` of the motion.
-    """
+    """The impulse of walls and grips [kg m/s], shape (n, d), by the nodes' motion before friction and its
+    `elastic_impulse`; in free components the residual of the solve."""
     if elastic is None:
         return nodes.mass[:, None] * (motion.velocity - nodes.explicit_velocity())
     if motion.resisted is not None:

@@ -195,11 +195,8 @@ def particles_to_grid(
     """P2G: mass, velocity and force of the nodes in the step from t to t + dt, and the elastic potential.
 
     Args:
-        scene: the scene.
-        particles: prepared particles.
-        t: time at the start of the step [s].
-        dt: step [s].
-        stencil: stencil of the particles.
+        scene, particles, stencil: the scene, its prepared particles and their stencil.
+        t, dt: time at the start of the step, and its length [s].
         body_force_at: the time at which body forces are evaluated, as a fraction of the step. Positions are moved on to
             it with the particles' velocity.
         explicit_viscosity: whether the force includes the viscous stress, at the particles' stored velocity gradients.
@@ -256,15 +253,8 @@ def _with_loads(
 def with_boundaries(
     scene: Scene, particles: Particles, nodes: Nodes, t: Scalar, force_at: Scalar | None = None
 ) -> Nodes:
-    """The nodes with the conditions and contacts of boundaries and bodies in the step from t.
-
-    Args:
-        scene: the scene.
-        particles: prepared particles.
-        nodes: their nodes, from `particles_to_grid`.
-        t: time at the start of the step [s].
-        force_at: the share of the step's displacement at which forces are evaluated; None if the step is explicit.
-    """
+    """The nodes of `particles_to_grid` with the conditions and contacts of boundaries and bodies in the step from t.
+    Forces are evaluated at the share `force_at` of the step's displacement; None if the step is explicit."""
     grid, window, dt, potential = scene.grid, scene.window(particles), nodes.dt, nodes.potential
     places = scene.nodes(particles, t)
     conditions = combined_conditions(scene.boundary, places, grid.spacing, t, dt, reference=scene.total)

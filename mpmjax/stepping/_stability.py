@@ -115,11 +115,7 @@ def step_for(
     method: AbstractIntegrator,
     start: int,
 ) -> Scalar:
-    """The step of a run [s]: `dt`, or for "stable" the `stable_dt` of the particles at the start.
-
-    Raises:
-        ValueError: from `stable_dt`; "stable" for a run that does not start at step 0.
-    """
+    """The step of a run [s]: `dt`, or for "stable" the `stable_dt` of the particles, at step 0 alone."""
     if not isinstance(dt, str):
         return dt
     require(start == 0, 'A run that goes on has the step that it began with: give dt, which run.dt is, not "stable".')

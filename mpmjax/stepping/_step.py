@@ -55,15 +55,8 @@ def step_unchecked(
     method: AbstractIntegrator,
     stencil: Stencil | None = None,
 ) -> tuple[Particles, StepInfo]:
-    """One step, without checks or compilation: `step` is its public form.
-
-    Args:
-        scene: the scene, its floats arrays of the particles' dtype.
-        particles: prepared particles.
-        t: time at the start of the step [s].
-        dt: step [s].
-        method: the integrator.
-        stencil: stencil of the particles, if it is known already, as in the total description. Default: it is computed.
+    """One step, without checks or compilation: `step` is its public form. The floats of the scene are arrays of the
+    particles' dtype, and the particles are prepared; their stencil may be known already, as in the total description.
     """
     force_at = method.force_at()
     if stencil is None:
@@ -167,18 +160,9 @@ def force_error(
     trial: Particles,
     after: Particles,
 ) -> tuple[Array, Array]:
-    """`StepInfo.force_error` and `force_scale` of an implicit step. No derivative passes.
-
-    Args:
-        scene: the scene.
-        nodes: the nodes at the start of the step.
-        method: the integrator.
-        force_at: θ, the share of the step's displacement at which forces are evaluated.
-        motion: the motion of the nodes before friction.
-        elastic: the impulse of elastic forces that made it [kg m/s], shape (n, d).
-        trial: the particles after G2P.
-        after: those after the return maps.
-    """
+    """`StepInfo.force_error` and `force_scale` of an implicit step, from the motion of the nodes before friction, the
+    impulse of elastic forces that made it [kg m/s], shape (n, d), the particles after G2P, and those after the return
+    maps. No derivative passes."""
     frozen = without_derivative((nodes, method, force_at, motion, elastic, trial, after))
     nodes, method, force_at, motion, elastic, trial, after = frozen
     exact, mass = method.exact_impulse(nodes, motion), nodes.mass
