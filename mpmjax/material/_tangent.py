@@ -163,7 +163,7 @@ def projected_matrix(law: Any, F: Matrix) -> Float[Array, "m m *p"]:
 
 
 @projected_matrix.defjvp
-def projected_matrix_jvp(primals: tuple[Any, Matrix], tangents: tuple[Any, Matrix | None]) -> tuple[Array, Array]:
+def _projected_matrix_jvp(primals: tuple[Any, Matrix], tangents: tuple[Any, Matrix | None]) -> tuple[Array, Array]:
     values, modes = _spectrum(*primals)
 
     def in_frame(law: Any, F: Matrix) -> Array:
