@@ -435,7 +435,7 @@ GONE = {
 }
 
 
-@pytest.mark.parametrize("take_away", **ids(GONE))
+@pytest.mark.parametrize("take_away", **ids(GONE, ("removed", "replaced")))
 def test_a_run_whose_file_is_taken_away_is_not_called_written(take_away, tmp_path, monkeypatch):
     """At the next frame or, where that was the last, at the end; nor is what stands there now touched."""
     path, (scene, particles) = tmp_path / "folder" / "run.h5", jelly()

@@ -29,11 +29,14 @@ def by_the_mass(method):
 
 def operator_of(scene, particles, hessian, factor=1e-3):
     """M + χH at the particles, with χ such that mass and stiffness are alike."""
-    particles = mpm.prepare(scene, particles)
-    dt = jnp.asarray(1e-3)
-    nodes = start_nodes(scene, particles, 0.0, dt, scene.stencil(particles))
+    return prepared_operator(scene, mpm.prepare(scene, particles), hessian, jnp.asarray(factor))
+
+
+@eqx.filter_jit
+def prepared_operator(scene, particles, hessian, factor):
+    nodes = start_nodes(scene, particles, 0.0, jnp.asarray(1e-3), scene.stencil(particles))
     action = hessian.at(nodes.potential, None)
-    return ImplicitOperator(nodes.mass, jnp.asarray(factor), action, nodes.projection)
+    return ImplicitOperator(nodes.mass, factor, action, nodes.projection)
 
 
 @eqx.filter_jit

@@ -20,10 +20,14 @@ CHOICES = mpm.DiagonalPreconditioner(), mpm.VolumePreconditioner()
 
 def operator_of(scene, particles, factor=1e-2):
     """M + χH at the particles, with χ such that shear counts a hundred times as much as the mass."""
-    particles = mpm.prepare(scene, particles)
+    return prepared_operator(scene, mpm.prepare(scene, particles), jnp.asarray(factor))
+
+
+@eqx.filter_jit
+def prepared_operator(scene, particles, factor):
     nodes = start_nodes(scene, particles, 0.0, 1e-3, scene.stencil(particles))
     action = mpm.AnalyticHessian().at(nodes.potential, None)
-    return ImplicitOperator(nodes.mass, jnp.asarray(factor), action, nodes.projection)
+    return ImplicitOperator(nodes.mass, factor, action, nodes.projection)
 
 
 def bodies(d, nu, side=2, description=DESCRIPTIONS["updated"]):

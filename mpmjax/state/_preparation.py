@@ -24,7 +24,6 @@ from mpmjax.checks import (
 from mpmjax.discretisation import APIC, average, gather, in_window
 from mpmjax.material import AbstractLaw
 from mpmjax.state._attachment import AttachedPoints, keeps_deformation
-from mpmjax.state._material_points import MaterialPoints
 from mpmjax.state._particles import Group, Particles, moves_as_one, of_one_material
 from mpmjax.state._scene import Scene
 from mpmjax.state._setup_warnings import warn_of_setup
@@ -193,9 +192,9 @@ def is_foreign(node: Any) -> bool:
 
 
 @eqx.filter_jit
-def _admissible(points: MaterialPoints) -> Bool[Array, "q"]:
-    """Whether the law allows the deformation of each particle, shape (q,)."""
-    return points.is_admissible(points.deformation)
+def _admissible(scene: Scene, particles: Particles) -> list[Bool[Array, "q"]]:
+    """Whether its law allows the deformation of each particle, one array (q,) a material."""
+    return [points.is_admissible(points.deformation) for points in scene.material_points(particles)]
 
 
 def _check_placement(scene: Scene, particles: Particles) -> None:
@@ -229,13 +228,11 @@ def _check_placement(scene: Scene, particles: Particles) -> None:
             f"A Rigid body's particles must not lie {'at one point' if particles.dim < 3 else 'on one line'}, by which "
             f"nothing says how it turns: give material {body.number} more of them.",
         )
-    for points in scene.material_points(particles):
-        kept = points.law.measure
-        allowed = np.asarray(_admissible(points))
-        first = int(np.argmin(allowed)) + points.rows[0]
+    for law, group, allowed in zip(scene.laws, particles.groups, _admissible(scene, particles), strict=True):
+        kept, first = law.measure, int(np.argmin(allowed)) + group.rows[0]
         require(
-            allowed,
-            f"{type(points.law).__name__} does not allow the {kept.symbol} of particle {first} (most laws need "
+            np.asarray(allowed),
+            f"{type(law).__name__} does not allow the {kept.symbol} of particle {first} (most laws need "
             f"{kept.volume} > 0): start from an admissible one.",
         )
 
