@@ -44,11 +44,11 @@ SOLVER = mpm.ConjugateResidual(max_steps=300)
 PLAIN, PROJECTED = mpm.AnalyticHessian(), mpm.AnalyticHessian(projected=True)
 METHODS = {
     "explicit": lambda beta: mpm.Explicit(),
-    "semi-implicit": lambda beta: mpm.SemiImplicit(beta, PLAIN, SOLVER, SOLVER),
-    "projected": lambda beta: mpm.SemiImplicit(beta, PROJECTED, SOLVER, SOLVER),
-    "backward Euler": lambda beta: mpm.BackwardEuler(mpm.Newton(max_steps=15), PROJECTED),
-    "implicit midpoint": lambda beta: mpm.ImplicitMidpoint(mpm.Linearised(SOLVER), PLAIN, SOLVER),
-    "TR-BDF2": lambda beta: mpm.TRBDF2(0.0, mpm.Linearised(SOLVER), PLAIN, SOLVER),
+    "semi-implicit": lambda beta: mpm.SemiImplicit(beta, SOLVER, hessian=PLAIN, adjoint_solver=SOLVER),
+    "projected": lambda beta: mpm.SemiImplicit(beta, SOLVER, hessian=PROJECTED, adjoint_solver=SOLVER),
+    "backward Euler": lambda beta: mpm.BackwardEuler(mpm.Newton(max_steps=15), hessian=PROJECTED),
+    "implicit midpoint": lambda beta: mpm.ImplicitMidpoint(mpm.Linearised(SOLVER), hessian=PLAIN, adjoint_solver=SOLVER),
+    "TR-BDF2": lambda beta: mpm.TRBDF2(0.0, mpm.Linearised(SOLVER), hessian=PLAIN, adjoint_solver=SOLVER),
 }
 IMPLICIT = tuple(METHODS)[1:]
 FIELDS = ("sweep", "method", "beta", "contrast", "compression", "dt_over_bound", "growth")
