@@ -338,7 +338,7 @@ def chart_command(
         flush=True,
     )
     dt = stable_step(scene, file) if file.run.dt == "stable" else file.run.dt
-    extra = () if dt is None or file.run.method is None else ((file.run.method, dt),)
+    extra = () if dt is None or file.run.method is None else ((file.run.method, float(dt)),)
     comparison = work_precision(
         file.build,
         t1=file.run.t1,

@@ -132,49 +132,38 @@ def observation(table: dict[str, Any], source: Source, t1: float) -> tuple[Abstr
     return made if isinstance(made, tuple) else (made.until(t1), made)
 
 
-# The keys that kinds share, with their types: every kind has those of `_any`, and those of one of the others.
-
-
-def _any(
+def _shared(
     *,
     data: str,
     unit: Scalar = 1.0,
+    time: str,
+    time_unit: Scalar = 1.0,
+    length_unit: Scalar = 1.0,
     sigma: Scalar | None = None,
     weight: Scalar = 1.0,
     robust: Scalar | None = None,
     name: str | None = None,
-) -> None: ...
+) -> None:
+    """The keys that kinds share, with their types; each kind says which of them it is without."""
 
 
-def _timed(*, time: str, time_unit: Scalar = 1.0) -> None: ...
-
-
-def _of_arrays(*, time: str = "times", time_unit: Scalar = 1.0) -> None: ...
-
-
-def _of_lengths(*, length_unit: Scalar = 1.0) -> None: ...
-
-
-def _untimed() -> None: ...
-
-
-def _kind(name: str, timed: Callable[..., None] = _timed) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def _kind(name: str, without: tuple[str, ...] = ("length_unit",)) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorate a function (measurement, keys of its own) to make the observations of a kind."""
 
     def registered(make: Callable[..., Any]) -> Callable[..., Any]:
-        special, shared, common = (inspect.signature(function).parameters for function in (make, timed, _any))
-        defaults = {key: p.default for key, p in (shared | common).items()}
+        special, shared = (inspect.signature(function).parameters for function in (make, _shared))
+        common = {key: parameter for key, parameter in shared.items() if key not in without}
 
         @wraps(make)
         def whole(source: Source, **keys: Any) -> Any:
-            values = {key: keys.pop(key, default) for key, default in defaults.items()}
-            trust = {key: values.pop(key) for key in ("sigma", "weight", "robust", "name")}
+            values = {key: keys.pop(key, parameter.default) for key, parameter in common.items()}
+            trust = {key: values[key] for key in ("sigma", "weight", "robust", "name")}
             other = values.get("time_unit", values.get("length_unit", 1.0))
-            file = values["data"], values["unit"], values.get("time", ""), other
-            return make(Measurement(source, *file, trust), **keys)
+            m = Measurement(source, values["data"], values["unit"], values.get("time", ""), other, trust)
+            return make(m, **keys)
 
         parameters = [inspect.Parameter("source", inspect.Parameter.POSITIONAL_ONLY)]
-        parameters += [*(p for key, p in special.items() if key != "m"), *shared.values(), *common.values()]
+        parameters += [*(p for key, p in special.items() if key != "m"), *common.values()]
         whole.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportAttributeAccessIssue]
         _kinds[name] = whole
         return whole
@@ -182,7 +171,7 @@ def _kind(name: str, timed: Callable[..., None] = _timed) -> Callable[[Callable[
     return registered
 
 
-@_kind("StressStretch", _untimed)
+@_kind("StressStretch", without=("time", "time_unit", "length_unit"))
 def _stress_stretch(
     m: Measurement,
     *,
@@ -255,7 +244,7 @@ def _torque(m: Measurement, *, torque: tuple[str, ...], collider: int = 0, bound
     return Torque(t, values, collider=collider, boundary=boundary, **m.named("torque [N m]"))
 
 
-@_kind("ForceDisplacement", _of_lengths)
+@_kind("ForceDisplacement", without=("time", "time_unit"))
 def _force_displacement(
     m: Measurement, *, displacement: str, force: str, axis: int, collider: int = 0, boundary: int | None = None
 ) -> Force:
@@ -304,9 +293,9 @@ class _EnergyPart(eqx.Module):
         return getattr(energy_of(scene, particles), self.part)
 
 
-@_kind("Density", _of_arrays)
-def _density(m: Measurement, *, grid: Grid, value: str = "density") -> Series:
-    path, time = m.source.folder / m.data, m.time
+@_kind("Density", without=("time", "length_unit"))
+def _density(m: Measurement, *, grid: Grid, time: str = "times", value: str = "density") -> Series:
+    path = m.source.folder / m.data
     m.check_units("time_unit")
     t, pictures = read_arrays(path, time, value)
     t, pictures = t * float(m.time_unit), pictures * float(m.unit)

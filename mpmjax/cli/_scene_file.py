@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -24,16 +25,29 @@ from mpmjax.stepping import AbstractIntegrator, Explicit, stable_dt
 _FRAMES = 50  # number of frames that are saved if neither it nor the step is given
 
 
-class RunSettings(NamedTuple):
+class RunSettings(eqx.Module):
     """The `[run]` table of a scene file."""
 
-    t1: float  # end time [s]
-    dt: float | Literal["stable"] | None  # step [s]; None for "auto"
-    method: AbstractIntegrator | None  # None for "auto"
-    save_every: int | None  # steps from frame to frame; None if the file does not say
-    dtype: str
-    error: float  # relative error that "auto" aims at
-    most_seconds: float  # seconds that its pilot runs may take
+    t1: float = eqx.field(converter=float)  # end time [s]
+    dt: Scalar | Literal["stable"] | None = None  # step [s]; None for "auto"
+    method: AbstractIntegrator | None = None  # None for "auto"
+    save_every: int | None = None  # steps from frame to frame; None if the file does not say
+    precision: str = "float64"
+    error: float = eqx.field(converter=float, default=1e-2)  # relative error that "auto" aims at
+    most_seconds: float = eqx.field(converter=float, default=60.0)  # seconds that its pilot runs may take
+
+    def __check_init__(self):
+        require_positive("[run] t1", self.t1)
+        if isinstance(self.dt, str):
+            require(self.dt == "stable", f'[run] dt must be a step in seconds, "stable" or "auto", got {self.dt!r}.')
+        elif self.dt is not None:
+            require_positive("[run] dt", self.dt)
+        require_positive("[run] error", self.error)
+        require_positive("[run] most_seconds", self.most_seconds)
+        every = self.save_every is None or self.save_every >= 1
+        require(every, f"[run] save_every must be at least 1, got {self.save_every}.")
+        is_dtype = self.precision in ("float32", "float64")
+        require(is_dtype, f'[run] precision must be "float32" or "float64", got {self.precision!r}.')
 
 
 class SceneFile(NamedTuple):
@@ -79,13 +93,13 @@ def read_scene_file(path: Path) -> SceneFile:
 
         def build(n: int) -> tuple[Scene, Particles]:
             scene = decode(_refined(table, n), Scene)
-            particles = _filled(scene, groups, run.dtype)
+            particles = _filled(scene, groups, run.precision)
             scene = attach(scene, particles)
             return scene, prepare(scene, particles)
 
         scene, particles = build(1)
-        if isinstance(run.dt, float):
-            number_of_steps(run.t1, run.dt, 0, particles.x.dtype)
+        if run.dt is not None and not isinstance(run.dt, str):
+            number_of_steps(run.t1, float(run.dt), 0, particles.x.dtype)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     except RecursionError:
@@ -112,8 +126,8 @@ def read_simulation(
         ValueError: as `read_scene_file`, and as `stable_dt` and `work_precision`.
     """
     file = read_scene_file(path)
-    t1, dt, method, save_every, _, error, seconds = file.run
-    choice = None
+    run, choice = file.run, None
+    t1, dt, method, save_every = run.t1, run.dt, run.method, run.save_every
     require(
         most_seconds is None or dt is None or method is None,
         "--most-seconds is for pilot runs, and there are none: the file gives dt and method.",
@@ -128,10 +142,10 @@ def read_simulation(
         comparison = work_precision(
             file.build,
             t1=t1,
-            error=error,
+            error=run.error,
             methods=methods,
             refinements=(1,),
-            most_seconds=seconds if most_seconds is None else most_seconds,
+            most_seconds=run.most_seconds if most_seconds is None else most_seconds,
             progress=progress,
             say=say,
         )
@@ -140,7 +154,7 @@ def read_simulation(
             raise ValueError(f"{path}: {choice}")
         dt, method = best.dt, best.method
         save_every = save_every or max(1, best.steps // _FRAMES)
-    return Simulation(file.scene, file.particles, t1, dt, method, save_every or 1, file.fit, choice, file.build)
+    return Simulation(file.scene, file.particles, t1, float(dt), method, save_every or 1, file.fit, choice, file.build)
 
 
 def stable_step(path: Path, file: SceneFile) -> float:
@@ -164,38 +178,14 @@ def _toml(path: Path) -> dict[str, Any]:
 
 
 def _run_settings(table: Any) -> RunSettings:
-    def run(
-        *,
-        t1: Scalar,
-        dt: Scalar | Literal["stable"] | None = None,
-        method: AbstractIntegrator | None = None,
-        save_every: int | None = None,
-        precision: str = "float64",
-        error: Scalar = 1e-2,
-        most_seconds: Scalar = 60.0,
-    ) -> RunSettings:
-        require_positive("[run] t1", t1)
-        if isinstance(dt, str):
-            require(dt == "stable", f'[run] dt must be a step in seconds, "stable" or "auto", got {dt!r}.')
-        elif dt is not None:
-            require_positive("[run] dt", dt)
-            dt = float(dt)
-        require_positive("[run] error", error)
-        require_positive("[run] most_seconds", most_seconds)
-        every = save_every is None or save_every >= 1
-        require(every, f"[run] save_every must be at least 1, got {save_every}.")
-        is_dtype = precision in ("float32", "float64")
-        require(is_dtype, f'[run] precision must be "float32" or "float64", got {precision!r}.')
-        return RunSettings(float(t1), dt, method, save_every, precision, float(error), float(most_seconds))
-
     require(isinstance(table, dict), f"[run] must be a table, got {shortened(repr(table))}.")
     left = {name for name in ("dt", "method") if table.get(name) == "auto"}
     require("dt" in table, '[run] needs the key \'dt\': a step in seconds, "stable" or "auto".')
     require(left != {"method"}, '[run] method = "auto" goes with dt = "auto": the cheapest of both is chosen together.')
-    settings = arguments(run, {key: value for key, value in table.items() if key not in left}, "[run]")
+    settings = arguments(RunSettings, {key: value for key, value in table.items() if key not in left}, "[run]")
     if "method" not in left:
         settings.setdefault("method", Explicit())
-    return run(**settings)
+    return RunSettings(**settings)
 
 
 def _refined(table: dict[str, Any], n: int) -> dict[str, Any]:
