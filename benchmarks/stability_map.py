@@ -47,7 +47,9 @@ METHODS = {
     "semi-implicit": lambda beta: mpm.SemiImplicit(beta, SOLVER, hessian=PLAIN, adjoint_solver=SOLVER),
     "projected": lambda beta: mpm.SemiImplicit(beta, SOLVER, hessian=PROJECTED, adjoint_solver=SOLVER),
     "backward Euler": lambda beta: mpm.BackwardEuler(mpm.Newton(max_steps=15), hessian=PROJECTED),
-    "implicit midpoint": lambda beta: mpm.ImplicitMidpoint(mpm.Linearised(SOLVER), hessian=PLAIN, adjoint_solver=SOLVER),
+    "implicit midpoint": lambda beta: mpm.ImplicitMidpoint(
+        mpm.Linearised(SOLVER), hessian=PLAIN, adjoint_solver=SOLVER
+    ),
     "TR-BDF2": lambda beta: mpm.TRBDF2(0.0, mpm.Linearised(SOLVER), hessian=PLAIN, adjoint_solver=SOLVER),
 }
 IMPLICIT = tuple(METHODS)[1:]
