@@ -70,7 +70,7 @@ def resistances(b: Any) -> tuple[Callable[[], tuple], Callable[[], tuple]]:
 
     p, d = b.x.shape
     grid, window = mpm.Grid((b.nodes,) * d, b.spacing), jnp.zeros(d, "int32")
-    make = jax.jit(lambda x: make_stencil(mpm.BSpline(2), mpm.MLSGradient(), grid, window, x, affine=False))
+    make = jax.jit(lambda x: make_stencil(mpm.BSpline(2), mpm.MLSGradient(), grid, window, x))
     stencil = make(jnp.asarray(b.x, b.dtype))
     random = np.random.default_rng(0)
     upper = jnp.asarray(random.normal(size=(d * d * (d * d + 1) // 2, p)), b.dtype)

@@ -80,7 +80,7 @@ class Discretisation:
         grid = mpm.Grid((n, n), dx, origin=(-(n // 2),) * 2)
         operator = mpm.SplineGradient() if gradient == "spline" else mpm.MLSGradient()
         places = jnp.asarray(x + shift * dx)
-        stencil = make_stencil(mpm.BSpline(order), operator, grid, jnp.asarray(grid.origin), places, affine=False)
+        stencil = make_stencil(mpm.BSpline(order), operator, grid, jnp.asarray(grid.origin), places)
         column, row = np.asarray(stencil.index), np.broadcast_to(np.arange(len(x)), stencil.index.shape)
         slopes = np.asarray(stencil.gradient)
 

@@ -45,11 +45,12 @@ def program(method=mpm.Explicit(), *, d=2, nodes=12, material=LAW, periodic=Fals
 
 
 def operations(jaxpr, times=1):
-    """How often each counted primitive runs: loops of known length all their turns, others one. Sums by places count as
-    those of the factors."""
+    """How often each counted primitive or sum runs: loops of known length all their turns, others one."""
     total = Counter()
     for equation in jaxpr.eqns:
-        name = equation.primitive.name.replace("placed_", "stencil_")
+        name = equation.primitive.name
+        if name == "native":
+            name = f"stencil_{equation.params['function']}"
         if name in COUNTED:
             total[name] += times
         turns = times * equation.params["length"] if equation.primitive.name == "scan" else times
@@ -63,8 +64,9 @@ def inner_programs(equation):
     if equation.primitive.name == "ruled":
         yield jax.make_jaxpr(partial(_values, **equation.params))(*(a.aval for a in equation.invars)).jaxpr
         return
-    if equation.primitive.name in ("matrices_solve", "placed_solve"):
-        yield jax.make_jaxpr(_solve)(*(a.aval for a in equation.invars[-12:])).jaxpr
+    if equation.primitive.name == "native" and str(equation.params["function"]) == "solve":
+        of = partial(_solve, **dict(equation.params["params"]))
+        yield jax.make_jaxpr(of)(*(a.aval for a in equation.invars)).jaxpr
         return
     for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda a: hasattr(a, "eqns")):
         inner = getattr(inner, "jaxpr", inner)

@@ -10,9 +10,8 @@ import pytest
 from helpers import DIMS, GRADIENTS, KERNELS, assert_close, ids, thorough
 
 import mpmjax as mpm
-from mpmjax.discretisation import _transfer_sums as _transfer_sums
-from mpmjax.discretisation._stencil import Stencil, make_stencil
-from mpmjax.discretisation._transfer_sums import gather, scatter
+from mpmjax.discretisation import Stencil, _sums, gather, make_stencil, scatter
+from mpmjax.discretisation._basis import basis_of
 
 P = 17
 EACH_KERNEL = pytest.mark.parametrize("kernel", **ids(KERNELS))
@@ -24,9 +23,7 @@ QUADRATIC, MLS = mpm.BSpline(), mpm.MLSGradient()
 def place(x, kernel=QUADRATIC, gradient=MLS):
     """The stencil at x in a periodic window of 5 nodes, of which the cubic kernel's stencil has 4."""
     d = x.shape[1]
-    return make_stencil(
-        kernel, gradient, mpm.Grid((5,) * d, 1.0, periodic=True), jnp.zeros(d, jnp.int32), x, affine=True
-    )
+    return make_stencil(kernel, gradient, mpm.Grid((5,) * d, 1.0, periodic=True), jnp.zeros(d, jnp.int32), x)
 
 
 @cache
@@ -61,9 +58,9 @@ def test_they_are_the_sums_that_weights_and_gradients_say(c, gradient, d, kernel
 
 def test_what_goes_to_no_node_is_dropped():
     """Beyond either end; the rest arrives. Nothing else is touched."""
-    index_factors = jnp.asarray([-1, 0, 3, 4, 2**30], jnp.int32)[None, None]
-    one = jnp.ones((1, 1, 5))
-    stencil = Stencil(index_factors, one, one, None, one[0], one[0, 0] > 0)
+    first = jnp.asarray([[-1, 0, 3, 4, 2**30]], jnp.int32)
+    basis = basis_of(mpm.BSpline(1), mpm.Grid((4,), 1.0))
+    stencil = Stencil(first, jnp.full((1, 5), -0.5), jnp.asarray(1.0), first[0] > 0, basis)  # each on its first node
     np.testing.assert_array_equal(scatter(stencil, jnp.ones((3, 5)), None, 4), np.tile([[1.0], [0], [0], [1]], 3))
 
 
@@ -84,7 +81,7 @@ def test_each_is_the_others_transpose(d):
     pull = jax.vjp(lambda n: gather(stencil, n), nodes)[1]
     assert_close(pull((given[0], given[1:]))[0], scatter(stencil, given[0], given[1:], 5**d), 1e-15)
     program = str(jax.make_jaxpr(pull)((given[0], given[1:])))
-    assert (program.count("stencil_scatter"), program.count("stencil_gather")) == (1, 0)
+    assert (program.count("function=scatter"), program.count("function=gather")) == (1, 0)
 
 
 @pytest.mark.thorough
@@ -163,13 +160,11 @@ def test_the_program_for_other_platforms_is_the_same_sum(d, monkeypatch):
     """Where it is not for a CPU nothing is left of XLA's loops: the same numbers, in one kernel a sum."""
     monkeypatch.setenv("MPMJAX_BACKEND", "xla")
     _, stencil, given, nodes = example(d)
-    factors = stencil.index_factors, stencil.weights, stencil.weight_derivatives
-    loops, kernel = (_transfer_sums._gather(*factors, nodes, unroll=unroll) for unroll in (False, True))
+    groups, rows = _sums.given_rows(stencil, given[0], given[1:])
+    at, params = (stencil.first, stencil.offset), {"basis": stencil.basis, "groups": groups}
+    loops, kernel = (_sums._gather(*at, nodes, **params, unroll=unroll) for unroll in (False, True))
     jax.tree.map(lambda a, b: assert_close(a, b, 1e-15), loops, kernel)
-    parts = given[0], given[1:]
-    loops, kernel = (
-        _transfer_sums.written_scatter(*factors, *parts, valued=True, size=5**d, unroll=u) for u in (False, True)
-    )
+    loops, kernel = (_sums._scatter(*at, *rows, **params, size=5**d, unroll=u) for u in (False, True))
     assert_close(loops[0], kernel[0], 1e-14)
     traced = jax.jit(lambda given, nodes: (scatter(stencil, given[0], given[1:], 5**d), gather(stencil, nodes)))
     programs = {p: traced.trace(given, nodes).lower(lowering_platforms=(p,)).as_text() for p in ("cpu", "cuda")}

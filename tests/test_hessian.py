@@ -76,7 +76,7 @@ def scene_of(law, d, family, description, gradient):
     """The elastic potential of a random cloud, and a random nodal displacement of about a spacing."""
     grid, particles = cloud(d, dx=DX)
     window = grid.window(particles.x)
-    stencil = make(mpm.BSpline(), GRADIENTS[gradient], grid, window, particles.x, affine=False)
+    stencil = make(mpm.BSpline(), GRADIENTS[gradient], grid, window, particles.x)
     F = jnp.asarray(deformations(family, d, n=particles.count)[0])
     total = description == "total"
     images = mirror((), grid, window)
@@ -165,7 +165,7 @@ def constrained(d, description, law="fixed_corotated"):
     grid, particles = cloud(d, dx=DX)
     walls = (mpm.SymmetryPlane(0, 0.0), mpm.StickyBox((-np.inf,) * d, (5 * DX,) * d))
     window = grid.window(particles.x)
-    stencil = make(mpm.BSpline(), mpm.MLSGradient(), grid, window, particles.x, affine=False)
+    stencil = make(mpm.BSpline(), mpm.MLSGradient(), grid, window, particles.x)
     F, images = components(particles.F), mirror(walls, grid, window)
     points = MaterialPoints(
         jax.tree.map(jnp.asarray, LAWS[law]), particles.volume, F, description == "total", (0, particles.count), None

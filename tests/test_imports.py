@@ -58,17 +58,25 @@ def imported(path: Path) -> set[str]:
 def test_the_rooms_are_the_folders():
     """Every folder is one of `ROOMS`, and every room a folder."""
     assert {name.split("/")[0] for name in INSIDE} == set(ROOMS)
-    assert set(FILES) - set(INSIDE) == {"__init__.py", "_types.py"}
+    assert set(FILES) - set(INSIDE) == {"__init__.py", "_jax.py", "_types.py"}
 
 
 @pytest.mark.parametrize("name", INSIDE)
 def test_imports_run_one_way(name):
     """A file imports from its own room's files, and from the face (`__init__.py`) of the rooms before it."""
     room = name.split("/")[0]
-    known = {"mpmjax._types", *(f"mpmjax.{earlier}" for earlier in ROOMS[: ROOMS.index(room)])}
+    known = {"mpmjax._types", "mpmjax._jax", *(f"mpmjax.{earlier}" for earlier in ROOMS[: ROOMS.index(room)])}
     own = {module for module in imported(FILES[name]) if module.split(".")[0] == "mpmjax"}
     beyond = {module for module in own - known if not module.startswith(f"mpmjax.{room}.")}
     assert not beyond
+
+
+@pytest.mark.parametrize("name", sorted(FILES))
+def test_names_beyond_the_stable_interface_of_jax_stand_in_one_file(name):
+    """Releases of JAX remove and rename them: `_jax.py` lists them with the versions that they were tried on."""
+    beyond = ("jax._src", "jax.core", "jax.experimental", "jax.extend", "jax.interpreters", "jax.lib")
+    touched = {module for module in imported(FILES[name]) if module.startswith(beyond)}
+    assert bool(touched) == (name == "_jax.py")
 
 
 def test_no_file_imports_itself_through_others():

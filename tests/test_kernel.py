@@ -1,5 +1,6 @@
 """B-splines, gradient operators, and the stencil's place in the window."""
 
+import dataclasses
 from functools import cache
 
 import equinox as eqx
@@ -24,7 +25,7 @@ COMBINATIONS = [
 @eqx.filter_jit
 def _make(kernel, gradient, grid, x):
     window = grid.window(x)
-    stencil = make_stencil(kernel, gradient, grid, window, x, affine=True)
+    stencil = make_stencil(kernel, gradient, grid, window, x)
     return stencil, window, grid.nodes(window), in_window(kernel, grid, window, x)
 
 
@@ -92,7 +93,7 @@ def test_spline_gradient_is_the_derivative_of_the_weights(kernel, d):
     @jax.jit
     def weight_and_gradient(x, along):
         def stencil(x):
-            return make_stencil(kernel, mpm.SplineGradient(), grid, grid.window(x), x, affine=False)
+            return make_stencil(kernel, mpm.SplineGradient(), grid, grid.window(x), x)
 
         return jax.jvp(lambda x: stencil(x).weight, (x,), (along,))[1], stencil(x).gradient
 
@@ -208,9 +209,8 @@ def test_indices_have_32_bits_whatever_a_window_has():
             mpm.Grid((8, 8), DX),
             jnp.asarray(window, dtype),
             jnp.asarray(x),
-            affine=False,
         )
-        assert stencil.index_factors.dtype == jnp.int32
+        assert stencil.first.dtype == stencil.index.dtype == jnp.int32
 
 
 @pytest.mark.parametrize("d", [2, *thorough(1, 3)])
@@ -237,32 +237,49 @@ def test_other_orders_are_refused(order):
         mpm.BSpline(order)
 
 
-@pytest.mark.parametrize(("kernel", "gradient", "d"), COMBINATIONS)
-def test_factors_are_polynomials_of_places(kernel, gradient, d):
-    """Terms of the index, weights and derivatives are those that `Places` says, at the edge of a cell too."""
-    stencil, _ = stencil_of(kernel, gradient, d)
-    first, strides, t, c = (np.asarray(a) for a in jax.tree.leaves(stencil.places))
-    along = first[:, None] + np.arange(kernel.order + 1)[:, None]
-    np.testing.assert_array_equal(along * strides[:, None, None], stencil.index_factors)
+@pytest.mark.parametrize("kernel", **ids(KERNELS))
+@pytest.mark.parametrize("gradient", **ids(GRADIENTS))
+def test_polynomials_have_their_derivatives(kernel, gradient):
+    """Of every order, at the edge of a cell too; and offsets lie in the interval of which they hold."""
+    stencil, _ = stencil_of(kernel, gradient, 2)
+    basis, t = stencil.basis, stencil.offset
     assert (abs(t) <= 0.5).all()
-    knots, c = c[0, :, 0], c[..., 1:]
-    powers = (t[:, None] - knots[:, None]) ** np.arange(c.shape[-1])[:, None, None, None]
-    weights, derivatives = np.einsum("aik,kdip->adip", c, powers)
-    np.testing.assert_allclose(weights, stencil.weights, rtol=1e-14)  # of each: those that are small are not lost
-    assert_close(derivatives, stencil.weight_derivatives, 1e-14)
+    for family in (0, 1):
+        for order in range(5):
+            value = lambda t, kind=(family, order): basis.polynomials(kind, t)  # noqa: E731
+            slope = jax.jvp(value, (t,), (jnp.ones_like(t),))[1]
+            np.testing.assert_allclose(basis.polynomials((family, order + 1), t), slope, rtol=1e-13, atol=1e-13)
 
 
-def test_no_places_where_factors_are_others():
-    """Around a periodic axis, for another gradient operator, and in what is made of a stencil."""
+@pytest.mark.parametrize("kernel", **ids(KERNELS))
+def test_small_weights_are_small_by_a_power(kernel):
+    """Near a knot a weight is right to rounding of itself, not of the largest."""
+    edge = 4.0 + (kernel.order + 1) % 2 / 2
+    away = np.logspace(-6, -2, 9)
+    stencil = make(kernel, mpm.MLSGradient(), mpm.Grid((12,), 1.0), (edge + away)[:, None])[0]
+    least = np.asarray(stencil.weight).min(axis=0)
+    expected = {1: away, 2: away**2 / 2, 3: away**3 / 6}[kernel.order]
+    np.testing.assert_allclose(least, expected, rtol=1e-9)
+
+
+def test_what_is_made_of_a_stencil():
+    """Its squares, some of its particles, and moving least squares, also of a gradient operator given by no polynomials
+    and where some particles have no gradient."""
 
     class Half(mpm.discretisation.AbstractGradient):
         def derivatives(self, spline, least_squares):
             return (spline + least_squares) / 2
 
-    x, kernel = places(2), KERNELS["quadratic"]
-    spline = make(kernel, mpm.SplineGradient(), mpm.Grid((8, 8), DX), x)[0]
-    assert spline.places is not None
-    for other in (spline.least_squares, spline.squared, spline.of(jnp.arange(3))):
-        assert other.places is None
-    assert make(kernel, Half(), mpm.Grid((8, 8), DX), x)[0].places is None
-    assert make(kernel, mpm.MLSGradient(), mpm.Grid((8, 8), DX, periodic=(True, False)), x)[0].places is None
+    x, kernel, grid = places(2), KERNELS["quadratic"], mpm.Grid((8, 8), DX)
+    mls, spline = (make(kernel, gradient, grid, x)[0] for gradient in (mpm.MLSGradient(), mpm.SplineGradient()))
+    half = make(kernel, Half(), grid, x)[0]
+    assert_close(half.gradient, (mls.gradient + spline.gradient) / 2, 1e-14)
+    assert mls.is_least_squares
+    assert mls.least_squares is mls
+    flat = dataclasses.replace(spline, flat=jnp.arange(80).reshape(2, 40) % 3 == 0)
+    assert_close(flat.gradient, jnp.where(flat.flat, 0, spline.gradient), 1e-15)
+    for one in (mls, spline, half, flat):
+        assert_close(one.squared.weight, one.weight**2, 1e-14)
+        assert_close(one.squared.gradient, one.gradient**2, 1e-13)
+        assert_close(one.of(jnp.asarray([3, 1])).gradient, one.gradient[..., jnp.asarray([3, 1])], 1e-15)
+        assert_close(one.least_squares.gradient, mls.gradient, 1e-14)

@@ -15,9 +15,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 
+from mpmjax._jax import (
+    Primitive,
+    Zero,
+    instantiate_zeros,
+    lower_fun,
+    primitive_batchers,
+    primitive_jvps,
+    primitive_transposes,
+    register_lowering,
+)
 from mpmjax._types import Array, Float, Int
 
 
@@ -83,7 +91,7 @@ def _unusable(dtype: Any) -> Any:
     return True if jnp.issubdtype(dtype, jnp.bool_) else jnp.iinfo(dtype).max
 
 
-mlir.register_lowering(_guard_p, mlir.lower_fun(_compiled, multiple_results=True))
+register_lowering(_guard_p, lower_fun(_compiled, multiple_results=True))
 
 
 def _differentiated(primals: Any, tangents: Any, *, derivative: bool, **parameters: Any) -> Any:
@@ -96,23 +104,23 @@ def _differentiated(primals: Any, tangents: Any, *, derivative: bool, **paramete
 def _guarded(changes: Any, fault: Any, **parameters: Any) -> list[Any]:
     """Tangents or cotangents of leaves and signal, guarded."""
     *leaves, signal = changes
-    places = [i for i, change in enumerate(leaves) if type(change) is not ad.Zero]
+    places = [i for i, change in enumerate(leaves) if type(change) is not Zero]
     if not places:
         return [*leaves, signal]
-    *some, signal = _guard_p.bind(*(leaves[i] for i in places), ad.instantiate_zeros(signal), fault, **parameters)
+    *some, signal = _guard_p.bind(*(leaves[i] for i in places), instantiate_zeros(signal), fault, **parameters)
     for i, change in zip(places, some, strict=True):
         leaves[i] = change
     return [*leaves, signal]
 
 
-ad.primitive_jvps[_guard_p] = _differentiated
+primitive_jvps[_guard_p] = _differentiated
 
 
 def _transposed(cotangents: Any, *operands: Any, **parameters: Any) -> list[Any]:
     return [*_guarded(cotangents, operands[-1], **parameters), None]
 
 
-ad.primitive_transposes[_guard_p] = _transposed
+primitive_transposes[_guard_p] = _transposed
 
 
 def _batched(operands: Any, axes: Any, **parameters: Any) -> tuple[list[Any], list[Any]]:
@@ -120,4 +128,4 @@ def _batched(operands: Any, axes: Any, **parameters: Any) -> tuple[list[Any], li
     return _guard_p.bind(*operands, **parameters), list(axes[:-1])
 
 
-batching.primitive_batchers[_guard_p] = _batched
+primitive_batchers[_guard_p] = _batched

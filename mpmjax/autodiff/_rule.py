@@ -29,11 +29,20 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import ShapedArray
 from jax.dtypes import float0
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 
+from mpmjax._jax import (
+    Primitive,
+    ShapedArray,
+    Zero,
+    instantiate_zeros,
+    is_undefined_primal,
+    lower_fun,
+    primitive_batchers,
+    primitive_jvps,
+    primitive_transposes,
+    register_lowering,
+)
 from mpmjax._types import Array
 
 
@@ -147,7 +156,7 @@ def _batch(arrays: Sequence[Any], axes: Sequence[Any], *, call: _Call) -> tuple[
 
 
 def _jvp(primals: Sequence[Any], tangents: Sequence[Any], *, call: _Call) -> tuple[list[Any], list[Any]]:
-    moving = [type(t) is not ad.Zero and t.dtype != float0 for t in tangents]
+    moving = [type(t) is not Zero and t.dtype != float0 for t in tangents]
     rule = call.rule.jvp
     if rule is None:
         raise NotImplementedError(f"{call.rule.__name__} has no derivative.")
@@ -161,12 +170,12 @@ def _jvp(primals: Sequence[Any], tangents: Sequence[Any], *, call: _Call) -> tup
     for axes in call.mapped:
         changed = jax.vmap(changed, in_axes=(list(axes), [axis for axis, m in zip(axes, moving, strict=True) if m]))
     out, change = changed(list(primals), [t for t, m in zip(tangents, moving, strict=True) if m])
-    zeros = [ad.Zero(jax.typeof(a).to_tangent_aval()) for a in out]
+    zeros = [Zero(jax.typeof(a).to_tangent_aval()) for a in out]
     return out, [zero if c is None else c for c, zero in zip(change, zeros, strict=True)]
 
 
 def _transpose(cotangents: Sequence[Any], *arrays: Any, call: _Call) -> list[Any]:
-    linear = [ad.is_undefined_primal(a) for a in arrays]
+    linear = [is_undefined_primal(a) for a in arrays]
     rule = call.rule.transpose
     if rule is None:
         raise NotImplementedError(f"{call.rule.__name__} has no transpose.")
@@ -192,7 +201,7 @@ def _transpose(cotangents: Sequence[Any], *arrays: Any, call: _Call) -> list[Any
     for axes in call.mapped:
         pulled = over_axis(pulled, axes)
     fixed = [a for a, one in zip(arrays, linear, strict=True) if not one]
-    results = iter(pulled(ad.instantiate_zeros(cotangents[0]), fixed))
+    results = iter(pulled(instantiate_zeros(cotangents[0]), fixed))
     return [next(results) if one else None for one in linear]
 
 
@@ -200,7 +209,7 @@ _ruled_p = Primitive("ruled")
 _ruled_p.multiple_results = True
 _ruled_p.def_impl(_values)
 _ruled_p.def_abstract_eval(_shapes)
-ad.primitive_jvps[_ruled_p] = _jvp
-ad.primitive_transposes[_ruled_p] = _transpose
-batching.primitive_batchers[_ruled_p] = _batch
-mlir.register_lowering(_ruled_p, mlir.lower_fun(_values, multiple_results=True))
+primitive_jvps[_ruled_p] = _jvp
+primitive_transposes[_ruled_p] = _transpose
+primitive_batchers[_ruled_p] = _batch
+register_lowering(_ruled_p, lower_fun(_values, multiple_results=True))

@@ -310,6 +310,6 @@ class ContactPlane(AbstractPlane):
         distance = self.inward * (faces.x[:, self.axis] - self.position)
         landing = surface_contact(Surface(distance, normal, self.friction, axis=self.axis), faces)
         shut = landing.gap <= SHUT * faces.spacing
-        around = scatter(faces.stencil, shut.astype(faces.stencil.weights.dtype), None, grid.size)
+        around = scatter(faces.stencil, shut.astype(faces.stencil.offset.dtype), None, grid.size)
         plane = replace(plane, shut=image.column(around[:, 0]) > 0)
         return (plane,) if faces.explicit else (replace(landing, beside=~shut), plane)

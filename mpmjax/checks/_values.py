@@ -19,7 +19,8 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
-from jax.core import Tracer
+
+from mpmjax._jax import Tracer
 
 _UNKNOWN = 2**34
 """Memory assumed to be available if the system does not say [B]."""

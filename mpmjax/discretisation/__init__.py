@@ -1,6 +1,12 @@
 """Grid, B-spline kernels, stencils, and the transfers between particles and grid."""
 
-from mpmjax.discretisation._average import average as average
+from mpmjax.discretisation._basis import Basis as Basis, basis_of as basis_of
+from mpmjax.discretisation._fused_sums import (
+    average as average,
+    resist as resist,
+    resist_unscaled as resist_unscaled,
+    without_flat as without_flat,
+)
 from mpmjax.discretisation._grid import Grid as Grid
 from mpmjax.discretisation._kernel import (
     AbstractGradient as AbstractGradient,
@@ -8,16 +14,14 @@ from mpmjax.discretisation._kernel import (
     MLSGradient as MLSGradient,
     SplineGradient as SplineGradient,
 )
-from mpmjax.discretisation._placed import bound as bound, define_placed as define_placed
-from mpmjax.discretisation._resistance import resist as resist
+from mpmjax.discretisation._native_sums import stencil_operands as stencil_operands, sums_fit as sums_fit
 from mpmjax.discretisation._stencil import (
-    Places as Places,
     Stencil as Stencil,
     first_nodes as first_nodes,
     in_window as in_window,
-    index_factors as index_factors,
     make_stencil as make_stencil,
 )
+from mpmjax.discretisation._sums import gather as gather, scatter as scatter
 from mpmjax.discretisation._transfer import (
     APIC as APIC,
     FLIP as FLIP,
@@ -28,4 +32,3 @@ from mpmjax.discretisation._transfer import (
     p2g as p2g,
     without_empty as without_empty,
 )
-from mpmjax.discretisation._transfer_sums import gather as gather, scatter as scatter

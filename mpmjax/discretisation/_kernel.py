@@ -49,30 +49,7 @@ class BSpline(eqx.Module):
     def weights(self, f: Array) -> Array:
         """Weights of the order + 1 nodes along each axis [-], shape (d, order + 1, p), at a distance f from the first
         node in spacings, shape (d, p)."""
-        match self.order:
-            case 1:
-                return jnp.stack([1 - f, f], axis=1)
-            case 2:
-                height, curvature = (np.array(a, f.dtype)[:, None] for a in ((0, 0.75, 0), (0.5, -1, 0.5)))
-                return self._from_knot(f) ** 2 * curvature + height
-            case _:
-                t = f - 1
-                near = (3 * t**3 - 6 * t**2 + 4) / 6
-                far = (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6
-                return jnp.stack([(1 - t) ** 3 / 6, near, far, t**3 / 6], axis=1)
-
-    def derivatives(self, f: Array) -> Array:
-        """Derivatives of the weights with respect to f [1/spacing], shape (d, order + 1, p)."""
-        match self.order:
-            case 1:
-                return jnp.stack([-jnp.ones_like(f), jnp.ones_like(f)], axis=1)
-            case 2:
-                return self._from_knot(f) * np.array((1, -2, 1), f.dtype)[:, None]
-            case _:
-                t = f - 1
-                near = (9 * t**2 - 12 * t) / 6
-                far = (-9 * t**2 + 6 * t + 3) / 6
-                return jnp.stack([-((1 - t) ** 2) / 2, near, far, t**2 / 2], axis=1)
+        return around_knots(self.pieces, self.knots, f - self.centre)
 
     @property
     def centre(self) -> float:
@@ -95,14 +72,42 @@ class BSpline(eqx.Module):
             case _:
                 return np.array([[0, 0, 0, -8], [23, -30, -12, 24], [23, 30, -12, -24], [0, 0, 0, 8]]) / 48
 
-    def _from_knot(self, f: Array) -> Array:
-        """The distances in which the quadratic kernel's weights are parabolas, one formula for all three: XLA does not
-        vectorise a stack in what its derivative is fused with."""
-        return f[:, None] - np.array((1.5, 1, 0.5), f.dtype)[:, None]
+    @property
+    def slopes(self) -> Float[np.ndarray, "s k"]:
+        """Coefficients of the derivatives of the weights, as `pieces` [1/spacing]."""
+        return np.polynomial.polynomial.polyder(self.pieces, axis=1)
+
+    @property
+    def moments(self) -> Float[np.ndarray, "s k"]:
+        """Coefficients of w (i − f)/variance, the derivatives by moving least squares, as `pieces` [1/spacing].
+        The linear kernel, whose variance vanishes at nodes, has the slopes."""
+        if self.order == 1:
+            return self.slopes
+        arms = [(node - self.centre - knot, -1.0) for node, knot in enumerate(self.knots)]
+        pairs = zip(self.pieces, arms, strict=True)
+        return np.array([np.polynomial.polynomial.polymul(*both) for both in pairs]) / self.variance
+
+
+def around_knots(
+    coefficients: Float[np.ndarray, "s k"], knots: Float[np.ndarray, "s"], t: Float[Array, "*b p"]
+) -> Float[Array, "*b s p"]:
+    """The polynomials Σ_k c_ik (t − τ_i)^k. One formula for all of them: XLA does not vectorise a stack in what its
+    derivative is fused with."""
+    c, at = coefficients.astype(t.dtype), t[..., None, :] - knots.astype(t.dtype)[:, None]
+    total = jnp.zeros_like(at) + c[:, -1:]
+    for k in range(c.shape[1] - 2, -1, -1):
+        total = total * at + c[:, k : k + 1]
+    return total
 
 
 class AbstractGradient(eqx.Module):
     """The gradient operator g_ip [1/m] of the internal force and of the deformation gradient's update."""
+
+    def polynomials(self, kernel: BSpline) -> Float[np.ndarray, "s k"] | None:
+        """Coefficients of the factor that `derivatives` gives as polynomials, times the spacing: as `kernel.slopes`,
+        shape (order + 1, k). Default: None, with which sums are those of XLA, by `derivatives`."""
+        del kernel
+        return None
 
     @abstractmethod
     def derivatives(self, spline: Float[Array, "d s p"], least_squares: Float[Array, "d s p"]) -> Float[Array, "d s p"]:
@@ -129,6 +134,9 @@ class AbstractGradient(eqx.Module):
 class SplineGradient(AbstractGradient):
     """The gradient of the kernel, g_ip = ∇w_ip."""
 
+    def polynomials(self, kernel: BSpline) -> Float[np.ndarray, "s k"]:
+        return kernel.slopes
+
     def derivatives(self, spline: Float[Array, "d s p"], least_squares: Float[Array, "d s p"]) -> Float[Array, "d s p"]:
         del least_squares
         return spline
@@ -145,6 +153,9 @@ class MLSGradient(AbstractGradient):
     ACM Trans. Graph. 34 (2015) 51, doi 10.1145/2766996; Y. Hu et al., ACM Trans. Graph. 37 (2018) 150,
     doi 10.1145/3197517.3201293). The velocity gradient is then the affine matrix of APIC.
     """
+
+    def polynomials(self, kernel: BSpline) -> Float[np.ndarray, "s k"]:
+        return kernel.moments
 
     def derivatives(self, spline: Float[Array, "d s p"], least_squares: Float[Array, "d s p"]) -> Float[Array, "d s p"]:
         del spline

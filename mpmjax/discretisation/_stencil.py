@@ -1,6 +1,5 @@
-"""The stencil: the nodes, weights and weight gradients of each particle."""
+"""The stencil: where each particle is among its nodes, from which weights and weight gradients follow."""
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
@@ -11,80 +10,93 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Bool, Float, Indices, Int, ParticleVector, components
+from mpmjax.discretisation._basis import Basis, basis_of
 from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._kernel import AbstractGradient, BSpline
 from mpmjax.native import materialised
 
 
-class Places(eqx.Module):
-    """Where particles are among their nodes, from which a stencil's factors follow: in 3-D 6 numbers a particle for 27.
+class Stencil(eqx.Module):
+    """The nodes of each particle, s = order + 1 along each axis, with their weights and weight gradients.
 
-    The i-th node along an axis has the index term (first + i) stride, and as weight and as derivative the polynomials
-    Σ_k c_ik (t − τ_i)^k in the offset t, around knots τ at which small weights are small by a power and not by a
-    difference.
+    Weights w_ip and gradients g_ip are products of one polynomial along each axis, in the offset t of the particle (see
+    `Basis`): of w_ip the weights along the axes, of g_ip in direction a with the gradient's factor along a. The stencil
+    is made at the positions x (updated Lagrangian), or once at the reference positions X (total Lagrangian), and
+    gradients are with respect to those. Component first: the particle axis is last.
     """
 
     first: Int[Array, "d p"]
-    """Number of the first node along each axis in the window, shape (d, p)."""
-    strides: Int[Array, "d"]
-    """Distance in the flat node index of neighbours along each axis, shape (d,)."""
+    """Number of the first node along each axis in the window, shape (d, p); meaningless for a particle that is not
+    `inside`."""
     offset: Float[Array, "d p"]
     """t, the distance from the middle of the places that have these nodes, in spacings, shape (d, p)."""
-    polynomials: Float[Array, "2 s k"]
-    """τ, and c of the weights [-] and of their derivatives [1/m], shape (2, s, s + 2)."""
-
-
-class Stencil(eqx.Module):
-    """The nodes of each particle, s = order + 1 along each axis, with their weights and weight derivatives.
-
-    Weights and gradients of the s^d stencil nodes are products of one factor for each axis, and only the factors are
-    stored. w_ip is the product of the weights; g_ip in direction a has the weight derivative along a in place of the
-    weight. The stencil is made at the positions x (updated Lagrangian), or once at the reference positions X (total
-    Lagrangian), and gradients are with respect to those. Component first: the particle axis is last.
-    """
-
-    index_factors: Int[Array, "d s p"]
-    """Term of the flat node index from each axis, shape (d, s, p); meaningless for a particle that is not `inside`."""
-    weights: Float[Array, "d s p"]
-    """Weights along each axis [-], shape (d, s, p)."""
-    weight_derivatives: Float[Array, "d s p"]
-    """Derivatives of the weights along each axis [1/m], by the scene's gradient operator, shape (d, s, p)."""
-    mls_weight_derivatives: Float[Array, "d s p"] | None
-    """Derivatives by moving least squares, shape (d, s, p); None if the scene's gradient operator is that, or if the
-    transfer keeps no affine velocity."""
-    moment: Float[Array, "d p"]
-    """Diagonal of D_p [m²], shape (d, p)."""
+    slope: Float[Array, ""]
+    """Factor of the gradient's polynomials, 1/dx [1/m]."""
     inside: Bool[Array, "p"]
     """Whether the whole stencil of the particle lies in the window."""
-    places: Places | None = None
-    """The compressed stencil, for sums that are not differentiated; None where factors are no such polynomials."""
+    basis: Basis = eqx.field(static=True)
+    own_derivatives: Float[Array, "d s p"] | None = None
+    """The gradient's factors along each axis [1/m], shape (d, s, p), of a gradient operator that is not given by
+    polynomials: all sums are then written in JAX. Else None."""
+    flat: Bool[Array, "d p"] | None = None
+    """Along which axes a particle has no gradient, shape (d, p). None: it has one along all."""
+
+    @property
+    def dim(self) -> int:
+        """Space dimension d."""
+        return len(self.basis.shape)
+
+    @property
+    def is_least_squares(self) -> bool:
+        """Whether the gradient is that of moving least squares."""
+        return self.own_derivatives is None and self.basis == self._least_squares_basis
+
+    @property
+    def _least_squares_basis(self) -> Basis:
+        moments = BSpline(len(self.basis.knots) - 1).moments
+        return self.basis._replace(slopes=tuple(tuple(map(float, row)) for row in moments))
 
     @property
     def least_squares(self) -> "Stencil":
         """The stencil with the gradient of moving least squares."""
-        if self.mls_weight_derivatives is None:
+        if self.is_least_squares:
             return self
-        return replace(self, weight_derivatives=self.mls_weight_derivatives, mls_weight_derivatives=None, places=None)
+        return replace(self, basis=self._least_squares_basis, own_derivatives=None, flat=None)
 
     @property
     def squared(self) -> "Stencil":
         """The stencil of w_ip² and of the squared components g_ip,a²."""
-        return replace(self, weights=self.weights**2, weight_derivatives=self.weight_derivatives**2, places=None)
+        custom = None if self.own_derivatives is None else self.own_derivatives**2
+        return replace(self, basis=self.basis.squared, slope=self.slope**2, own_derivatives=custom)
 
     def of(self, particles: Int[Array, "s"]) -> "Stencil":
-        """The stencil of some of the particles, by their numbers, with the scene's gradient operator alone."""
-        whole = replace(self, mls_weight_derivatives=None, places=None)
-        return jax.tree.map(lambda factor: factor[..., particles], whole)
+        """The stencil of some of the particles, by their numbers."""
+        arrays = self.first, self.offset, self.inside, self.own_derivatives, self.flat
+        first, offset, inside, custom, flat = (a if a is None else a[..., particles] for a in arrays)
+        return replace(self, first=first, offset=offset, inside=inside, own_derivatives=custom, flat=flat)
 
     @property
-    def factors(self) -> tuple[Array, Array, Array]:
-        """Terms of the index, weights and their derivatives, each (d, s, p)."""
-        return self.index_factors, self.weights, self.weight_derivatives
+    def moment(self) -> Float[Array, "d p"]:
+        """Diagonal of D_p = Σ_i w_ip (x_i − x_p)(x_i − x_p)ᵀ [m²], shape (d, p)."""
+        kernel, t = BSpline(len(self.basis.knots) - 1), self.offset
+        return ((0.5 - t) * (0.5 + t) if kernel.order == 1 else jnp.full_like(t, kernel.variance)) / self.slope**2
+
+    @property
+    def weights(self) -> Float[Array, "d s p"]:
+        """Weights along each axis [-], shape (d, s, p)."""
+        return self.basis.polynomials((0, 0), self.offset)
+
+    @property
+    def weight_derivatives(self) -> Float[Array, "d s p"]:
+        """The gradient's factors along each axis [1/m], shape (d, s, p)."""
+        custom = self.own_derivatives
+        derivatives = self.basis.polynomials((1, 0), self.offset) * self.slope if custom is None else custom
+        return derivatives if self.flat is None else jnp.where(self.flat[:, None], 0, derivatives)
 
     @property
     def index(self) -> Indices:
         """Flat index of each stencil node, shape (s^d, p)."""
-        return _tensor(jnp.add, list(self.index_factors))
+        return _tensor(jnp.add, list(self.basis.index_terms(self.first)))
 
     @property
     def weight(self) -> Float[Array, "k p"]:
@@ -115,7 +127,6 @@ def make_stencil(
     window: Int[Array, "d"],
     x: ParticleVector,
     *,
-    affine: bool,
     layer: Int[np.ndarray, "p"] | None = None,
 ) -> Stencil:
     """The stencil of particles at x.
@@ -126,81 +137,28 @@ def make_stencil(
         grid: grid.
         window: lattice index of the window's first node.
         x: positions [m], shape (p, d).
-        affine: whether the transfer keeps an affine velocity, which needs the moving-least-squares gradient.
         layer: the number of the nodes' layer of each particle, shape (p,). Default: there is one.
     """
-    dx = grid.spacing
+    dx = jnp.asarray(grid.spacing, x.dtype)
     xi = components(x) / dx
-    f = materialised(xi - jax.lax.stop_gradient(kernel.base(xi)))
-    weights, spline = kernel.weights(f), kernel.derivatives(f) / dx
-    if kernel.order == 1:
-        moment = f * (1 - f) * dx**2
-        least_squares = spline
-    else:
-        variance = kernel.variance
-        moment = jnp.full_like(f, variance) * dx**2
-        offset = jnp.arange(kernel.order + 1, dtype=f.dtype)[:, None] - f[:, None]
-        least_squares = weights * offset / (variance * dx)
-    derivatives = gradient.derivatives(spline, least_squares)
-    first = first_nodes(kernel, window, xi)
-    factors = index_factors(kernel, grid, first)
+    offset = materialised(xi - jax.lax.stop_gradient(kernel.base(xi)) - kernel.centre)
+    first = first_nodes(kernel, grid, window, xi)
     if layer is not None:
-        factors = factors.at[0].add(jnp.asarray(layer * math.prod(grid.shape), jnp.int32))
         first = first.at[0].add(jnp.asarray(layer * grid.shape[0], jnp.int32))
-    places = None
-    if (derivatives is spline or derivatives is least_squares) and not any(grid.periodic):
-        places = Places(
-            first=first,
-            strides=jnp.asarray(_strides(grid)),
-            offset=jax.lax.stop_gradient(f - kernel.centre),
-            polynomials=jax.lax.stop_gradient(
-                _polynomials(kernel, jnp.asarray(dx, f.dtype), derivatives is not spline)
-            ),
-        )
-    return Stencil(
-        index_factors=factors,
-        weights=weights,
-        weight_derivatives=derivatives,
-        mls_weight_derivatives=least_squares if affine and derivatives is not least_squares else None,
-        moment=moment,
-        inside=in_window(kernel, grid, window, x),
-        places=places,
-    )
+    basis, custom = basis_of(kernel, grid, gradient.polynomials(kernel)), None
+    if gradient.polynomials(kernel) is None:
+        families = basis.slopes, basis_of(kernel, grid, kernel.moments).slopes
+        custom = gradient.derivatives(*(basis._replace(slopes=c).polynomials((1, 0), offset) / dx for c in families))
+    return Stencil(first, offset, 1 / dx, in_window(kernel, grid, window, x), basis, custom)
 
 
-def _polynomials(kernel: BSpline, spacing: Array, least_squares: bool) -> Float[Array, "2 s k"]:
-    """Knots and coefficients of the weights and of their derivatives or those of moving least squares, shape
-    (2, order + 1, order + 3)."""
-    pieces, knots = kernel.pieces, kernel.knots
-    if least_squares and kernel.order > 1:
-        arms = [(node - kernel.centre - knot, -1.0) for node, knot in enumerate(knots)]
-        slopes = [np.polynomial.polynomial.polymul(*both) for both in zip(pieces, arms, strict=True)]
-        slopes = np.array(slopes) / kernel.variance
-    else:
-        slopes = np.pad(np.polynomial.polynomial.polyder(pieces, axis=1), ((0, 0), (0, 2)))
-    weights = np.pad(pieces, ((0, 0), (0, 1)))
-    coefficients = jnp.stack([jnp.asarray(weights, spacing.dtype), slopes.astype(spacing.dtype) / spacing])
-    both_knots = jnp.broadcast_to(jnp.asarray(knots, spacing.dtype)[:, None], (2, len(knots), 1))
-    return jnp.concatenate([both_knots, coefficients], axis=2)
-
-
-def first_nodes(kernel: BSpline, window: Int[Array, "d"], xi: Array) -> Int[Array, "d p"]:
+def first_nodes(kernel: BSpline, grid: Grid, window: Int[Array, "d"], xi: Array) -> Int[Array, "d p"]:
     """Number of the first stencil node along each axis in the window, shape (d, p), for positions xi in spacings."""
-    return jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window.astype(jnp.int32)[:, None]
-
-
-def _strides(grid: Grid) -> Int[np.ndarray, "d"]:
-    """Distance in the C-order node index of neighbours along each axis, shape (d,)."""
-    return np.array([math.prod(grid.shape[a + 1 :]) for a in range(grid.dim)], np.int32)
-
-
-def index_factors(kernel: BSpline, grid: Grid, first: Int[Array, "d p"]) -> Int[Array, "d s p"]:
-    """Term of the C-order node index from each axis, shape (d, s, p), from the `first_nodes`."""
-    along = first[:, None] + jnp.arange(kernel.order + 1, dtype=jnp.int32)[:, None]
-    if any(grid.periodic):  # by whole numbers in the code: XLA divides by those in an array one by one
-        axes = zip(along, grid.shape, grid.periodic, strict=True)
-        along = jnp.stack([index % period if wraps else index for index, period, wraps in axes])
-    return along * _strides(grid)[:, None, None]
+    first = jax.lax.stop_gradient(kernel.base(xi)).astype(jnp.int32) - window.astype(jnp.int32)[:, None]
+    if any(grid.periodic):
+        axes = zip(first, grid.shape, grid.periodic, strict=True)
+        first = jnp.stack([index % period if wraps else index for index, period, wraps in axes])
+    return first
 
 
 def _tensor(combine: Callable[[Array, Array], Array], factors: list[Array]) -> Array:

@@ -10,13 +10,11 @@ import jax
 import jax.numpy as jnp
 
 from mpmjax._types import Array, Float, Matrix, NodeScalar, NodeVector, Scalar
-from mpmjax.autodiff import sums_saved_for_backward
 from mpmjax.checks import require_between, require_fields
-from mpmjax.discretisation._average import average
+from mpmjax.discretisation._fused_sums import average
 from mpmjax.discretisation._grid import Grid
 from mpmjax.discretisation._stencil import Stencil
-from mpmjax.discretisation._transfer_sums import gather, scatter
-from mpmjax.native import materialised
+from mpmjax.discretisation._sums import gather, scatter
 
 
 class Gathered(eqx.Module):
@@ -173,7 +171,7 @@ def without_empty(
     empty = mirrored(scatter(fixed, mass[None], None, grid.size)[:, 0]) <= rounding * mass.min()
     _, read = gather(fixed, empty.astype(mass.dtype)[:, None])
     reads = jnp.abs(read) * grid.spacing > jnp.sqrt(rounding)  # less is read where another axis's weight is rounding
-    return replace(stencil, weight_derivatives=jnp.where(reads, 0, stencil.weight_derivatives), places=None)
+    return replace(stencil, flat=reads[:, 0])
 
 
 def p2g(
@@ -242,15 +240,15 @@ def g2p(
             raise ValueError(f"{type(transfer).__name__} needs the change of the nodes' velocity: give before.")
         change = after - before
     fields = [field for field in (after, mean, change) if field is not None]
-    values, gradients = materialised(sums_saved_for_backward(gather(stencil, jnp.concatenate(fields, axis=1))))
+    values, gradients = gather(stencil, jnp.concatenate(fields, axis=1))
     # one field after the other, each of shape (d, p), and its gradient (d, d, p), the derivative's direction last
     values, gradients = jnp.split(values, len(fields)), jnp.split(jnp.swapaxes(gradients, 0, 1), len(fields))
     affine: list[Matrix | None] = [None] * len(fields)
-    if transfer.affine and stencil.mls_weight_derivatives is None:
+    if transfer.affine and stencil.is_least_squares:
         affine = [*gradients]
     elif transfer.affine:
         ends = [field for field in (after, change) if field is not None]
-        _, slopes = materialised(sums_saved_for_backward(gather(stencil.least_squares, jnp.concatenate(ends, axis=1))))
+        _, slopes = gather(stencil.least_squares, jnp.concatenate(ends, axis=1))
         slopes = jnp.split(jnp.swapaxes(slopes, 0, 1), len(ends))
         affine[0] = slopes[0]
         if change is not None:

@@ -86,7 +86,7 @@ class VolumePreconditioner(AbstractPreconditioner):
             )
             shape = tuple(min(pair) for pair in zip(self.extent, window, strict=True))
         # how many nodes away B sees along an axis: as far as a hat and a spline of so many cells overlap
-        half = math.ceil(1 + stiffness.stencil.weights.shape[1] / 2) - 1
+        half = math.ceil(1 + len(stiffness.stencil.basis.knots) / 2) - 1
         dissection = Dissection(shape, 2 * half, len(averaged))
         if dissection.entries > self.largest:
             return diagonal

@@ -120,7 +120,7 @@ class Field(AbstractParameter):
     def on_particles(self, x: ParticleVector, value: Value) -> ParticleScalar:
         """The field at positions x [m], shape (p, d), from its values on the nodes."""
         lattice = canonical(self.lattice, x.dtype)
-        stencil = make_stencil(self.kernel, SplineGradient(), lattice, lattice.window(x), x, affine=False)
+        stencil = make_stencil(self.kernel, SplineGradient(), lattice, lattice.window(x), x)
         return gather(stencil, value.reshape(-1, 1))[0][0]
 
 

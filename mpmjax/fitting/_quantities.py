@@ -209,6 +209,6 @@ class Density(eqx.Module):
 
     def _picture(self, x: ParticleVector, mass: ParticleScalar) -> Array:
         grid = canonical(self.grid, x.dtype)
-        stencil = make_stencil(BSpline(2), SplineGradient(), grid, grid.window(x), x, affine=False)
+        stencil = make_stencil(BSpline(2), SplineGradient(), grid, grid.window(x), x)
         (on_nodes,) = scatter(stencil, jnp.where(stencil.inside, mass, 0)[None], None, grid.size).T
         return (on_nodes / grid.spacing**grid.dim).reshape(grid.shape)

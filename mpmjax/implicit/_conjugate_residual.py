@@ -8,19 +8,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-import numpy as np
-from jax.core import ShapedArray
-from jax.extend.core import Primitive
 from jax.flatten_util import ravel_pytree
 
 from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.checks import require, require_fields, require_positive, require_tolerance
-from mpmjax.discretisation import bound, define_placed, resist
+from mpmjax.discretisation import Basis, resist_unscaled, stencil_operands, sums_fit, without_flat
 from mpmjax.implicit._hessian import ParticleStiffness
 from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, AbstractInnerProductSolver, default_rtol
-from mpmjax.implicit._operator import ImplicitOperator, product_p, vectors_fit
+from mpmjax.implicit._operator import ImplicitOperator, rest_of_product, vectors_fit
 from mpmjax.implicit._preconditioner import AbstractInnerProduct, DiagonalInnerProduct
-from mpmjax.native import differentiable, native_primitive, sums_fit
+from mpmjax.native import NativeFunction, call_library
 
 NEGLIGIBLE_CHANGE = 1e-3
 """Largest relative change of the solution by one more correction, where rounding hides the tolerance."""
@@ -193,7 +190,7 @@ class _DiagonalSpace(NamedTuple):
             onto: the vectors that are not needed any more, whose memory results may take: 0 for a and c, 1 for b and d.
         """
         (a, s, b), (c, t, d) = one, other
-        return combine_p[onto].bind(a, b, c, d, jnp.stack([s, t]), self.weight, self.active, batched=0)
+        return combine_onto[onto](a, b, c, d, jnp.stack([s, t]), self.weight, self.active)
 
 
 class _PairSpace(NamedTuple):
@@ -331,70 +328,67 @@ def solve_particle_matrices(
     limits = jnp.stack([jnp.asarray(number, b.dtype) for number in (rtol, max_steps, floor)])
     hessian, free = operator.hessian, operator.projection.free.reshape(-1)
     assert isinstance(hessian, ParticleStiffness)
-    factor = jnp.asarray(operator.factor, b.dtype)
-    args = hessian.upper, operator.mass, factor, free, space.weight, space.active, x, b, limits
-    x, (rr, k, radius, breakdown, indefinite, correction, stalled, b_norm, x_norm) = bound(
-        _solve_p, hessian.stencil, *args, batched=0
+    stencil = hessian.stencil
+    factor = jnp.asarray(operator.factor * stencil.slope**2, b.dtype)
+    args = without_flat(stencil, hessian.upper), operator.mass, factor, free, space.weight, space.active, x, b, limits
+    x, (rr, k, radius, breakdown, indefinite, correction, stalled, b_norm, x_norm) = _native_solve(
+        stencil.first, stencil.offset, *args, basis=stencil.basis
     )
     flags = breakdown > 0, indefinite > 0
     return Iterate(x, rr, k.astype(jnp.int32), radius, *flags, correction, stalled > 0, b_norm, x_norm)
 
 
-class _Factors(NamedTuple):
-    """A stencil without its compressed form."""
-
-    factors: tuple[Array, Array, Array]
-    places: None = None
-
-
-def _solve(*args: Array, unroll: bool = False) -> list[Array]:
+def _solve(first: Array, t: Array, *args: Array, basis: Basis) -> list[Array]:
     """`solve_particle_matrices`, written in JAX."""
-    del unroll  # the sums know
-    index, weights, derivatives, upper, mass, factor, free, weight, active, x, b, limits = args
+    upper, mass, factor, free, weight, active, x, b, limits = args
 
     def product(u: Array) -> list[Array]:
         moved = jnp.where(free, u, 0).reshape(len(mass), -1)
-        force = resist(_Factors((index, weights, derivatives)), upper, moved).reshape(-1)
-        return product_p.bind(force, u, mass, factor, free, weight, active, batched=0)
+        force = resist_unscaled(basis, first, t, upper, moved).reshape(-1)
+        return rest_of_product(force, u, mass, factor, free, weight, active)
 
     end = conjugate_residual(_DiagonalSpace(product, weight, active), b, x, limits[0], limits[1])
     return [end.x, jnp.stack([a.astype(b.dtype) for a in end[1:10]])]
 
 
-def _solve_shapes(*args: ShapedArray) -> list[tuple]:
-    return [args[-3].shape[-1:], (9,)]
-
-
-def _workspace(*args: ShapedArray) -> tuple:
-    """Six vectors. Members of a batch, which run one after the other in a thread, take their own."""
-    *batch, size = args[-3].shape
-    return (0 if batch else 6 * size,)
-
-
-def _fits(avals: Any, batched: int) -> bool:
-    return sums_fit([aval for aval in avals if aval.dtype != np.bool_], batched)
+def _call_solve(first: Array, t: Array, *args: Array, basis: Basis, batched: int) -> list[Array]:
+    """By the library, with memory for six vectors. Members of a batch, which run one after the other in a thread, take
+    their own."""
+    stencil, told = stencil_operands(basis, first, t)
+    results = _native_solve.results(first, t, *args, basis=basis, batched=batched)
+    memory = (*first.shape[:batched], 0 if batched else 6 * args[-3].shape[-1])
+    aliases = {len(stencil) + len(args) - 3: 0}
+    return call_library("solve", [*stencil, *args], [*results, (memory, t.dtype)], told, aliases)[:2]
 
 
 # The derivative is that of the loop in JAX, and never taken: solves are not differentiated through their iterations.
-_solve_p = differentiable(
-    native_primitive("matrices_solve", _solve, _solve_shapes, _fits, {9: 0}, workspace=_workspace, placed=False), _solve
+_native_solve = NativeFunction(
+    "solve",
+    _solve,
+    lambda *args, basis: [args[-3].shape[-1:], (9,)],
+    sums_fit,
+    like=1,
+    native=_call_solve,
+    differentiable=True,
 )
-define_placed(_solve_p, _solve, _solve_shapes, workspace=_workspace, fits=_fits, aliases={10: 0})
 
 
-def _combine(*args: Array, unroll: bool = False) -> list[Array]:
-    del unroll  # there is no loop
+def _combine(*args: Array) -> list[Array]:
     a, b, c, d, scales, weight, _ = args
     y, z = a + scales[0] * b, c + scales[1] * d
     return [y, z, (weight * z * z).sum()]
 
 
-def _combine_primitive(onto: int) -> Primitive:
-    aliases = {onto: 0, 2 + onto: 1}
-    shapes = lambda *args: [args[0].shape[-1:], args[0].shape[-1:], ()]  # noqa: E731
-    return differentiable(native_primitive(f"vectors_combine_{onto}", _combine, shapes, vectors_fit, aliases), _combine)
-
-
-combine_p = _combine_primitive(0), _combine_primitive(1)
+combine_onto = tuple(
+    NativeFunction(
+        "combine",
+        _combine,
+        lambda *args: [args[0].shape[-1:], args[0].shape[-1:], ()],
+        vectors_fit,
+        aliases={onto: 0, 2 + onto: 1},
+        differentiable=True,
+    )
+    for onto in (0, 1)
+)
 """Two sums of two vectors with a norm. In JAX these are some four passes over the window, of which a body may fill a
 small part; natively it is one, in place, that skips inactive blocks."""

@@ -85,7 +85,7 @@ class ParticleStiffness(AbstractHessianAction):
         Args:
             size: n.
         """
-        d = len(self.stencil.weights)
+        d = self.stencil.dim
         places = np.cumsum([0, *range(d * d, 1, -1)])  # of the diagonal, row by row
         own = Forces(slopes=jnp.stack([self.upper[m] for m in places]).reshape(d, d, -1))
         materials = added([own, *(part.diagonal(self.stencil, size) for part in self.coupled)]).slopes
@@ -123,7 +123,7 @@ class TangentAction(AbstractHessianAction):
         return potential.on_nodes([elastic, *(part(moved) for part in self._others())])
 
     def precomputed(self) -> ParticleStiffness:
-        potential, d = self.potential, len(self.potential.stencil.weights)
+        potential, d = self.potential, self.potential.stencil.dim
         pairs = zip(potential.material_points, self.tangents, strict=True)
         upper, coupled = zip(*(points.stiffness(tangent, d) for points, tangent in pairs), strict=True)
         return ParticleStiffness(

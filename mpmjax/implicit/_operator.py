@@ -9,11 +9,10 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
-from jax.core import ShapedArray
 
 from mpmjax._types import Array, Bool, Float, Mask, NodeScalar, NodeVector, Scalar
 from mpmjax.implicit._hessian import AbstractHessianAction, ParticleStiffness
-from mpmjax.native import differentiable, native_primitive
+from mpmjax.native import NativeFunction
 
 
 class Projection(eqx.Module):
@@ -89,14 +88,14 @@ class ImplicitOperator(lx.AbstractLinearOperator):
             image = self.mv(v).reshape(-1)
             return image / weight, (u * image).sum()
         force, factor = self.hessian(self.projection.combine(v, 0)).reshape(-1), jnp.asarray(self.factor, u.dtype)
-        return product_p.bind(force, u, self.mass, factor, free, weight, active, batched=0)
+        return rest_of_product(force, u, self.mass, factor, free, weight, active)
 
     @property
     def is_particle_matrices(self) -> bool:
         """Whether A is the mass and one matrix for each particle on a mask, and nothing else."""
         H = self.hessian
         plain = isinstance(H, ParticleStiffness) and not (H.mirror.images or H.coupled or H.others)
-        return plain and not self.projection.normals
+        return plain and H.stencil.own_derivatives is None and not self.projection.normals
 
     def precomputed(self) -> "ImplicitOperator":
         """The operator, with H as one matrix for each particle, computed once for many applications."""
@@ -145,27 +144,22 @@ def _register() -> None:
 _register()
 
 
-def _product(*args: Array, unroll: bool = False) -> list[Array]:
+def _product(*args: Array) -> list[Array]:
     """W⁻¹A v and vᵀA v, with (A v)_i = m_i v_i + χ f_i where i is free, f = H v, and v_i elsewhere."""
-    del unroll  # there is no loop
     force, v, mass, factor, free, weight, _ = args
     image = jnp.where(free, jnp.repeat(mass, len(v) // max(1, len(mass))) * v + factor * force, v)
     return [image / weight, (v * image).sum()]
 
 
-def _product_shapes(*args: ShapedArray) -> list[tuple]:
-    return [args[0].shape[-1:], ()]
-
-
-def vectors_fit(avals: Any, batched: int) -> bool:
+def vectors_fit(*avals: Any, batched: int) -> bool:
     """Whether the native library has a kernel for passes over these vectors: floats of one kind, and masks."""
     del batched
     floats = [aval.dtype for aval in avals if aval.dtype != np.bool_]
     return floats[0] in (np.float32, np.float64) and set(floats) == {floats[0]}
 
 
-product_p = differentiable(
-    native_primitive("vectors_product", _product, _product_shapes, vectors_fit, {0: 0}), _product
+rest_of_product = NativeFunction(
+    "product", _product, lambda *args: [args[0].shape[-1:], ()], vectors_fit, aliases={0: 0}, differentiable=True
 )
 """The rest of a product with M + χH, once H v is known, with an inner product. In JAX these are some four passes over
 the window, of which a body may fill a small part; natively it is one, in place, that skips inactive blocks."""

@@ -75,7 +75,7 @@ class ElasticPotential(eqx.Module):
     def term_energy(self, u: NodeVector | None) -> Float[Array, ""]:
         """The part of Φ(u) by the terms [J]; None for u = 0."""
         moved = self.displaced(u)
-        return sum((term.energy(moved) for term in self.terms), jnp.zeros((), self.stencil.weights.dtype))
+        return sum((term.energy(moved) for term in self.terms), jnp.zeros((), self.stencil.offset.dtype))
 
     def force(self, u: NodeVector | None) -> NodeVector:
         """f = −∂Φ/∂u [N], shape (n, d); None for u = 0, where f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
@@ -86,7 +86,7 @@ class ElasticPotential(eqx.Module):
 
     def flux(self, P: Sequence[Deformation]) -> Matrix:
         """V0_p P_p F_pᵀ [J], shape (d, d, p), from the stress of each material; in the total description V0_p P_p."""
-        d = len(self.stencil.weights)
+        d = self.stencil.dim
         return joined([points.flux(stress, d) for points, stress in zip(self.material_points, P, strict=True)])
 
     def current_flux(self) -> Matrix:
@@ -142,7 +142,7 @@ class ElasticPotential(eqx.Module):
         material has viscosity."""
         if not self.material_viscous:
             return None
-        d = len(self.stencil.weights)
+        d = self.stencil.dim
 
         def matrix(points: MaterialPoints) -> Array:
             def flux_of(slopes: Matrix) -> Matrix:

@@ -21,7 +21,7 @@ from mpmjax.linalg._matrices import (
     trace,
     transpose,
 )
-from mpmjax.native import native_primitive
+from mpmjax.native import NativeFunction
 
 _SWEEPS = {1: 0, 2: 1, 3: 4}  # by dimension: in 2-D one rotation is the closed form; 3-D converges quadratically
 _NEWTON_STEPS = 30  # on the quartic of the 3-D rotation: halves the error at a double root, else squares it
@@ -48,12 +48,11 @@ def symmetric_eigen(S: Matrix) -> tuple[Array, Matrix]:
     if len(S) != 3:
         w, V = _jacobi(S)
     else:
-        w, V = _eigen_p.bind(S.reshape(3, 3, -1), batched=0)
+        w, V = _native_eigen(S.reshape(3, 3, -1))
     return w.reshape(S.shape[1:]), V.reshape(S.shape)
 
 
-def _jacobi(S: Matrix, *, unroll: bool = False) -> list[Array]:
-    del unroll  # a sweep is many operations
+def _jacobi(S: Matrix) -> list[Array]:
     d = len(S)
 
     def sweep(_: Array | int, state: tuple[Matrix, Matrix]) -> tuple[Matrix, Matrix]:
@@ -104,7 +103,7 @@ def rotation(F: Matrix) -> Matrix:
         case 2:
             return _rotation_2d(F)
         case _:
-            (R,) = _rotation_p.bind(F.reshape(3, 3, -1), batched=0)
+            (R,) = _native_rotation(F.reshape(3, 3, -1))
             return R.reshape(F.shape)
 
 
@@ -165,8 +164,7 @@ def _rotation_2d(F: Matrix) -> Matrix:
     return assemble([[cos, -sin], [sin, cos]])
 
 
-def _rotation_3d(F: Matrix, *, unroll: bool = False) -> list[Array]:
-    del unroll  # the loop's steps are few operations each
+def _rotation_3d(F: Matrix) -> list[Array]:
     size = jnp.sqrt(double_dot(F, F))
     F = F / jnp.where(size == 0, 1, size)  # ‖F‖ = 1 from here on
     q = _dominant_quaternion(F, _largest_root(F))
@@ -282,11 +280,10 @@ def principal_modes(U: Matrix, V: Matrix) -> Float[Array, "m d d *p"]:
     return jnp.stack([*(outer[i, i] for i in range(d)), *twists, *flips])
 
 
-def _fits(avals: Any, batched: int) -> bool:
+def _fits(aval: Any, *, batched: int) -> bool:
     """Whether the library has a kernel for these: 3 x 3, of single or double precision."""
-    (aval,) = avals
     return aval.shape[batched : batched + 2] == (3, 3) and aval.dtype in (np.float32, np.float64)
 
 
-_eigen_p = native_primitive("matrix_eigen", _jacobi, lambda S: [S.shape[-2:], S.shape[-3:]], _fits, like=0)
-_rotation_p = native_primitive("matrix_rotation", _rotation_3d, lambda F: [F.shape[-3:]], _fits, like=0)
+_native_eigen = NativeFunction("eigen", _jacobi, lambda S: [S.shape[-2:], S.shape[-3:]], _fits)
+_native_rotation = NativeFunction("rotation", _rotation_3d, lambda F: [F.shape[-3:]], _fits)

@@ -25,8 +25,9 @@ class Displacement:
     @cached_property
     def nodes(self) -> NodeVector:
         """u_i, shape (n, d)."""
-        weights = self.stencil.weights
-        return jnp.zeros((self.size, len(weights)), weights.dtype) if self._nodes is None else self._nodes
+        if self._nodes is None:
+            return jnp.zeros((self.size, self.stencil.dim), self.stencil.offset.dtype)
+        return self._nodes
 
     @cached_property
     def at_particles(self) -> tuple[Float[Array, "d p"], Float[Array, "d d p"]]:
@@ -55,7 +56,7 @@ def scattered(forces: Sequence[Forces], stencil: Stencil, size: int) -> NodeVect
     """The sum of forces, one or more, on all nodes [N], shape (n, d)."""
     nodes, value, slopes = added(forces)
     if value is None and slopes is None:
-        return jnp.zeros((size, len(stencil.weights)), stencil.weights.dtype) if nodes is None else nodes
+        return jnp.zeros((size, stencil.dim), stencil.offset.dtype) if nodes is None else nodes
     total = scatter(stencil, value, slopes, size)
     return total if nodes is None else total + nodes
 

@@ -14,13 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from equinox.internal import unvmap_any
-from jax.core import ShapedArray
-from jax.extend.core import Primitive
-from jax.interpreters import ad
 
+from mpmjax._jax import Zero, instantiate_zeros
 from mpmjax._types import Array, Bool, Float, Int, ParticleVector, Scalar, components, particle_first
-from mpmjax.discretisation import BSpline, Grid, first_nodes, index_factors
-from mpmjax.native import is_native, native_primitive
+from mpmjax.discretisation import BSpline, Grid, basis_of, first_nodes
+from mpmjax.native import NativeFunction, is_native
 from mpmjax.state import AttachedPoints, Particles, Scene, State, by_material, is_foreign
 
 Order = Int[Array, "p"]
@@ -164,13 +162,13 @@ def _sorted_if_mixed(cells: Int[Array, "q"]) -> Order:
 def cells_of(kernel: BSpline, grid: Grid, window: Int[Array, "d"], x: ParticleVector) -> Int[Array, "p"]:
     """The C-order index of the first node of each particle's stencil, shape (p,): particles with the same one share all
     nodes. Without meaning outside of the window."""
-    first = first_nodes(kernel, window, components(x) / grid.spacing)
-    return index_factors(kernel, grid, first)[:, 0].sum(axis=0, dtype=jnp.int32)
+    first = first_nodes(kernel, grid, window, components(x) / grid.spacing)
+    return basis_of(kernel, grid).index_terms(first)[:, 0].sum(axis=0, dtype=jnp.int32)
 
 
 def by_cell(cells: Int[Array, "p"]) -> Order:
     """The numbers of the particles cell after cell, and in a cell in their order, shape (p,)."""
-    return _order_p.bind(cells, batched=0)[0]
+    return _native_sort(cells)[0]
 
 
 def rearranged(wanted: Bool[Array, ""], order: Order, a: Float[Array, "p ..."]) -> Float[Array, "p ..."]:
@@ -180,63 +178,44 @@ def rearranged(wanted: Bool[Array, ""], order: Order, a: Float[Array, "p ..."]) 
     what either branch returns. It is done component by component, as a step has its arrays: XLA would transpose them.
     """
     rows = components(a).reshape(-1, len(a))
-    moved = _rearrange_p.bind(wanted, order, rows, batched=0)[0]
+    moved = _native_rearrange(wanted, order, rows, inverse=False)[0]
     return particle_first(moved.reshape(*a.shape[1:], len(a)))
 
 
-def _sort(cells: Array, *, unroll: bool) -> list[Array]:
-    del unroll  # there is no loop
+def _sort(cells: Array) -> list[Array]:
     return [jnp.argsort(cells, stable=True).astype(cells.dtype)]
 
 
-def _rearrange(wanted: Array, order: Array, rows: Array, *, inverse: bool, unroll: bool = False) -> list[Array]:
-    del unroll
+def _rearrange(wanted: Array, order: Array, rows: Array, *, inverse: bool) -> list[Array]:
     moved = rows.at[:, order].set(rows, mode="drop") if inverse else rows.at[:, order].get(mode="clip")
     return [jnp.where(wanted, moved, rows)]
 
 
-_order_p = native_primitive(
-    "particle_order",
-    _sort,
-    lambda cells: [cells.shape[-1:]],
-    lambda avals, batched: avals[0].dtype == np.int32,
-    like=0,
+def _jvp(primals: tuple, tangents: tuple, *, batched: int, inverse: bool) -> tuple[list[Array], list[Any]]:
+    """By the rows, in which it is linear."""
+    wanted, order, _ = primals
+    out = _native_rearrange(*primals, batched=batched, inverse=inverse)
+    if type(tangents[2]) is Zero:
+        return out, [Zero(jax.typeof(o)) for o in out]
+    return out, _native_rearrange(wanted, order, tangents[2], batched=batched, inverse=inverse)
+
+
+def _transpose(cotangents: list, wanted: Any, order: Any, rows: Any, *, batched: int, inverse: bool) -> list:
+    """The other order."""
+    del rows
+    back = _native_rearrange(wanted, order, instantiate_zeros(cotangents[0]), batched=batched, inverse=not inverse)
+    return [None, None, *back]
+
+
+_native_sort = NativeFunction(
+    "order", _sort, lambda cells: [cells.shape[-1:]], lambda cells, batched: cells.dtype == np.int32
 )
-
-
-def _rearrange_primitive(inverse: bool) -> Primitive:
-    def like_rows(wanted: ShapedArray, order: ShapedArray, rows: ShapedArray) -> list[tuple]:
-        return [rows.shape[wanted.ndim :]]
-
-    def fits(avals: Any, batched: int) -> bool:
-        del batched
-        return avals[1].dtype == np.int32 and avals[2].dtype in (np.float32, np.float64)
-
-    rearrange = partial(_rearrange, inverse=inverse)
-    return native_primitive("particle_rearrange", rearrange, like_rows, fits, {2: 0}, like=2, inverse=inverse)
-
-
-_rearrange_p, _restore_p = map(_rearrange_primitive, (False, True))
-
-
-def _differentiate(primitive: Primitive, transpose: Primitive) -> None:
-    """Define the derivative by the rows, in which it is linear, and its transpose, the other order."""
-
-    def jvp(primals: tuple, tangents: tuple, *, batched: int) -> tuple[list[Array], list[Any]]:
-        wanted, order, _ = primals
-        out = primitive.bind(*primals, batched=batched)
-        if type(tangents[2]) is ad.Zero:
-            return out, [ad.Zero(jax.typeof(o)) for o in out]
-        return out, primitive.bind(wanted, order, tangents[2], batched=batched)
-
-    def transposed(cotangents: list, wanted: Any, order: Any, rows: Any, *, batched: int) -> list:
-        del rows
-        back = transpose.bind(wanted, order, ad.instantiate_zeros(cotangents[0]), batched=batched)
-        return [None, None, *back]
-
-    ad.primitive_jvps[primitive] = jvp
-    ad.primitive_transposes[primitive] = transposed
-
-
-_differentiate(_rearrange_p, _restore_p)
-_differentiate(_restore_p, _rearrange_p)
+_native_rearrange = NativeFunction(
+    "rearrange",
+    _rearrange,
+    lambda wanted, order, rows, inverse: [rows.shape[-2:]],
+    lambda wanted, order, rows, **_: order.dtype == np.int32 and rows.dtype in (np.float32, np.float64),
+    like=2,
+    aliases={2: 0},
+)
+_native_rearrange.jvp, _native_rearrange.transpose = _jvp, _transpose

@@ -109,7 +109,7 @@ class VolumeAverage(eqx.Module):
 
 def volume_average(grid: Grid, window: Any, x: Array, volume: Array, mirror: Mirror) -> VolumeAverage:
     """The average over particles of volumes V0 [m^d], shape (q,), that stand on the grid at x [m], shape (q, d)."""
-    hats = make_stencil(BSpline(1), SplineGradient(), grid, window, x, affine=False)
+    hats = make_stencil(BSpline(1), SplineGradient(), grid, window, x)
     average = VolumeAverage(hats, volume, jnp.zeros(grid.size, volume.dtype), mirror, grid.shape, grid.periodic)
     total = average.at_nodes(volume)
     return replace(average, inverse=jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0))

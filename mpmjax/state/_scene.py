@@ -401,7 +401,6 @@ class Scene(eqx.Module):
             self.grid,
             window,
             self.on_grid(particles, t),
-            affine=self.transfer.affine,
             layer=layer,
         )
         if self.kernel.order > 1:

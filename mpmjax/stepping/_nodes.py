@@ -204,7 +204,7 @@ def particles_to_grid(
     """
     size, v = scene.grid.size, components(particles.v)
     C = None if particles.C is None else components(particles.C)
-    joined = joined and stencil.mls_weight_derivatives is None and not scene.rigid_bodies
+    joined = joined and (stencil.is_least_squares or not scene.transfer.affine) and not scene.rigid_bodies
     potential = ElasticPotential(scene.material_points(particles, t), stencil, Mirror(()), size)
     flux = potential.current_flux()  # V P Fᵀ, of which the internal force is −Σ_p flux_p g_ip
     if explicit_viscosity and C is not None and potential.material_viscous:
