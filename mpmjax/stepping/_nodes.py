@@ -206,9 +206,9 @@ def particles_to_grid(
     C = None if particles.C is None else components(particles.C)
     joined = joined and stencil.mls_weight_derivatives is None and not scene.rigid_bodies
     potential = ElasticPotential(scene.material_points(particles, t), stencil, Mirror(()), size)
-    flux = potential.current_flux()  # V P Fᵀ, of which the internal force is −Σ_p flux_p g_ip
+    flux = potential.current_weighted_stress()  # V P Fᵀ, of which the internal force is −Σ_p flux_p g_ip
     if explicit_viscosity and C is not None and potential.material_viscous:
-        flux = flux + potential.viscous_flux(C)
+        flux = flux + potential.weighted_viscous_stress(C)
     gravity, body_force = jnp.asarray(scene.gravity), None
     if scene.body_force is not None:
         x = particles.x + body_force_at * dt * particles.v if body_force_at else particles.x
