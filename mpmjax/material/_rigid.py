@@ -49,6 +49,7 @@ class Rigid(AbstractMaterial):
 
     @property
     def freedom(self) -> Freedom:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Where it may move, and whether it may turn."""
         return Freedom(self.free, self.turns)
 
     def energy(self, F: Matrix) -> Array:

@@ -42,6 +42,7 @@ class Viscous(AbstractLaw):
 
     @property
     def viscosity(self) -> Viscosity:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The viscosity without the law."""
         return Viscosity(self.shear_viscosity, self.bulk_viscosity)
 
     # all else is the law's
