@@ -49,7 +49,7 @@ def test_gradients_by_weights_of_a_network_are_differences(hessian):
     """Through implicit steps."""
     grid, particles = cloud(2, p=20, cells=3)
     scene, solver = mpm.Scene(grid, perceptron()), mpm.ConjugateResidual(rtol=1e-13)
-    method = mpm.SemiImplicit(1.0, hessian, solver, adjoint_solver=solver)
+    method = mpm.SemiImplicit(1.0, solver, hessian=hessian, adjoint_solver=solver)
 
     @jax.jit
     def moment(bias):
