@@ -258,7 +258,7 @@ def judged(contact, step, method):
 def pushes(contact, step, method):
     """At the nodes: the sums of the pushes around, and their mean normal and velocity of the surface, of one side."""
     gap, nothing_held = judged(contact, step, method)
-    push = jnp.where(gap < 0, contact.normal_impulse(nothing_held, None), 0)[:1]
+    push = jnp.where(gap < 0, contact.normal_impulse(nothing_held, step.reaction), 0)[:1]
     velocity = jnp.zeros_like(contact.normal) if contact.velocity is None else contact.velocity
     fields = jnp.concatenate([push, push * contact.normal, push * velocity])
     sums, d = np.asarray(scatter(contact.faces.stencil, fields, None, len(step.velocity))), len(contact.normal)

@@ -41,7 +41,6 @@ NAMELESS = {"found", "own", "known", "given", "said"}
 """Names that say how a value came about, and not what it is."""
 NOT_YET = {
     *(f"implicit/_{n}.py" for n in ("dissection", "hessian", "potential", "volume_preconditioner")),
-    *(f"stepping/_{n}.py" for n in ("rigid_layers",)),
 }
 """Files in which some are left."""
 

@@ -33,7 +33,7 @@ def find_active_set(
     *,
     explicit: bool = False,
 ) -> tuple[ActiveSet, NodeVector, Any, Int[Array, ""]]:
-    """The active set, a velocity to start the last solve from, and what the sweeps cost.
+    """The active set, a velocity to start the last solve from, the sweeps' reports added up, and their number.
 
     Args:
         nodes: nodes of which no contact holds anything yet.
@@ -43,9 +43,6 @@ def find_active_set(
             [kg m/s] of all nodes, guess of the next solve, report). It is not differentiated.
         cost: the report of no solve.
         explicit: whether forces are those at the start of the step.
-
-    Returns:
-        active set, velocity, the sweeps' reports added up, number of sweeps.
     """
 
     def sweep(state: tuple) -> tuple:

@@ -49,10 +49,7 @@ _SHEET = 2
 def half_space(order: int, side: float) -> np.ndarray:
     """How far the surface of a half-space lies from the kernel's middle, in spacings and positive outside, by how deep
     its particles lie on average over the kernel: at equal depths from none to that of a particle at the kernel's end.
-
-    Args:
-        order: that of the B-spline, which is made of its truncated powers.
-        side: that of the particles in spacings; the first of them lie half a side behind the surface.
+    The B-spline is made of its truncated powers; the first particles lie half a side behind the surface, in spacings.
     """
     reach = (order + 1) / 2
     distance = np.linspace(-reach, reach - side / 2, 16 * _SAMPLES, endpoint=False)
@@ -263,19 +260,7 @@ def body_contact(
     dt: Scalar,
     share: Scalar,
 ) -> BodyContact:
-    """The contact of two bodies.
-
-    Args:
-        a: the first body.
-        b: the second one.
-        pair: their numbers.
-        friction: Coulomb coefficient [-].
-        order: that of the kernel.
-        grid: the grid.
-        images: the mirrors of symmetry planes.
-        dt: Δt [s].
-        share: θ (see `AbstractSpringContact`).
-    """
+    """The contact of two bodies with these numbers, for a kernel of some order and the mirrors of symmetry planes."""
     spacing, both = jnp.asarray(grid.spacing), (a.part > _EMPTY) & (b.part > _EMPTY)
     normal = _normal(a, b, both, grid)
     depths = [sign * (normal * body.middle).sum(axis=0) for body, sign in ((a, 1), (b, -1))]

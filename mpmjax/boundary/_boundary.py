@@ -42,7 +42,7 @@ class Wall(NamedTuple):
 class AbstractBoundary(eqx.Module):
     """A boundary condition.
 
-    One of one's own needs `dim` and `conditions`. What holds material only while that pushes, a contact, is brought by
+    One of your own needs `dim` and `conditions`. What holds material only while that pushes, a contact, is brought by
     `contacts`. The rest has defaults.
     """
 
@@ -131,11 +131,7 @@ class AbstractBoundary(eqx.Module):
         return None
 
     def check(self, grid: Grid, *, total: bool) -> None:
-        """Check that it can stand in a scene. Default: it can.
-
-        Args:
-            grid: the scene's grid.
-            total: whether the description is total Lagrangian.
+        """Check that it can stand in a scene with this grid, in the total description or not. Default: it can.
 
         Raises:
             ValueError: it cannot; why, and what to do.
@@ -154,14 +150,8 @@ class AbstractBoundary(eqx.Module):
         return None
 
     def extend_to_body(self, fixed: Mask, value: Array, nodes: NodeVector, spacing: Scalar) -> tuple[Mask, Array]:
-        """Conditions on single nodes, extended to the whole of a rigid part. Default: as they are.
-
-        Args:
-            fixed: components of velocity that are prescribed, shape (n, d).
-            value: what belongs to them, shape (n, d).
-            nodes: positions of the nodes [m], shape (n, d).
-            spacing: dx [m].
-        """
+        """Conditions on single nodes, the components prescribed and a value of each, (n, d), extended to the whole of a
+        rigid part. Default: as they are."""
         del nodes, spacing
         return fixed, value
 
@@ -184,11 +174,7 @@ class AbstractBoundary(eqx.Module):
 
     def rests(self, *, total: bool) -> bool:
         """Whether it acts on the same nodes at all times and is meant to act on some, so that it is an oversight if it
-        touches none. Default: False. It is asked only while numbers are known.
-
-        Args:
-            total: whether the description is total Lagrangian.
-        """
+        touches none. Default: False. It is asked only while numbers are known."""
         del total
         return False
 

@@ -1,15 +1,14 @@
 """Colliders: rigid bodies of any shape that move as prescribed, and hold the nodes that lie in them, or push the
 particles' faces.
 
-A node lies in a collider up to a thousandth of a spacing off its surface; its normal there is the gradient of the
-shape's distance, and its velocity that of the collider's own point, the chord over the step. Which nodes lie in it has
-no derivative; normals and velocities have, with respect to the motion and the shape. Where two bodies share a node, the
-rules of `combine` apply. All this is of what holds nodes: `SeparatingCollider` pushes faces, and has derivatives by its
-place and size.
+Of colliders that hold nodes, a node lies in one up to a thousandth of a spacing off its surface; its normal there is
+the gradient of the shape's distance, and its velocity that of the collider's own point, the chord over the step. Which
+nodes lie in it has no derivative; normals and velocities have, with respect to the motion and the shape. Where two
+bodies share a node, the rules of `combined_conditions` apply.
 """
 
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -47,8 +46,11 @@ class AbstractCollider(AbstractBoundary):
     def dim(self) -> int:
         return self.shape.dim
 
+    def moved_by(self, dtype: Any) -> AbstractMotion:
+        """Its motion, of this dtype; that of a body at rest if it has none."""
+        return canonical(still(self.dim), dtype) if self.motion is None else self.motion
+
     def distance(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m"]:
-        """The signed distance [m] of each of the points x [m], shape (m, d), from the body as it is at time t."""
         return self.shape.distance(x if self.motion is None else self.motion.origin(x, t))
 
     def pivot(self, t: Scalar) -> Float[Array, "d"]:
@@ -85,6 +87,24 @@ class AbstractCollider(AbstractBoundary):
         fast = jnp.any(sum(way[:, a] ** 2 for a in range(self.dim)) > spacing**2)
         return jax.lax.cond(fast, look, lambda: jnp.zeros(len(end), bool))
 
+    def seen_by(
+        self, nodes: NodeVector, t: Scalar, dt: Scalar, reference: bool
+    ) -> tuple[ColliderConditions, NodeVector, NodeVector]:
+        """The conditions of a body that holds no node yet; the nodes in the shape's own frame [m] and the velocity of
+        the body at them [m/s], both of shape (n, d)."""
+        motion = self.moved_by(nodes.dtype)
+        place = nodes if reference else motion.origin(nodes, t)
+        middle = jnp.asarray(self.shape.middle(), nodes.dtype)
+        pivot, later = motion.pivot(middle, t), motion.pivot(middle, t + dt)
+        conditions = ColliderConditions(
+            slides=(),
+            holder=jnp.full(nodes.shape, -1, jnp.int32),
+            position=nodes + motion.place(nodes, t) - motion.place(nodes, 0.0) if reference else nodes,
+            pivots=pivot[None],
+            pivot_velocity=(later - pivot)[None] / dt,
+        )
+        return conditions, place, motion.velocity_of(place, t, dt)
+
 
 class StickyCollider(AbstractCollider):
     """A body to which the material sticks: nodes in it have its velocity, exactly, also after a solve.
@@ -105,13 +125,10 @@ class StickyCollider(AbstractCollider):
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """v = v_c."""
-        body = _Body(self, nodes, t, dt, reference)
-        inside = body.holds(spacing)[:, None]
-        fixed = jnp.broadcast_to(inside, nodes.shape)
-        holder = jnp.where(fixed, 0, -1).astype(jnp.int32)
-        touched = eqx.tree_at(lambda c: c.holder, body.nothing_held(), holder)
-        velocity = jnp.where(fixed, body.velocity, 0)
-        return Conditions(fixed, velocity, touched, moves=self.motion is not None)
+        nothing, place, velocity = self.seen_by(nodes, t, dt, reference)
+        fixed = jnp.broadcast_to(self.shape.contains(place, ON_THE_WALL * spacing)[:, None], nodes.shape)
+        touched = replace(nothing, holder=jnp.where(fixed, 0, -1).astype(jnp.int32))
+        return Conditions(fixed, jnp.where(fixed, velocity, 0), touched, moves=self.motion is not None)
 
 
 class SlipCollider(AbstractCollider):
@@ -143,9 +160,13 @@ class SlipCollider(AbstractCollider):
         )
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        """v·n = v_c·n."""
-        body = _Body(self, nodes, t, dt, reference)
-        touched = replace(body.nothing_held(), slides=(body.slide(spacing),))
+        """v·n = v_c·n, but at nodes where the distance has no slope, as a sampled one may have none."""
+        nothing, place, velocity = self.seen_by(nodes, t, dt, reference)
+        slope = jax.grad(lambda x: self.shape.distance(x).sum())(place)
+        steepness = length(slope)
+        held = (self.shape.contains(place, ON_THE_WALL * spacing) & (steepness > 0))[:, None]
+        normal = self.moved_by(nodes.dtype).turned(slope / jnp.where(held, steepness[:, None], 1), t)
+        touched = replace(nothing, slides=(Slide(jnp.where(held, normal, 0), jnp.where(held, velocity, 0)),))
         return replace(no_conditions(nodes), colliders=touched, holds=True, moves=self.motion is not None)
 
 
@@ -179,12 +200,12 @@ class SeparatingCollider(AbstractCollider):
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
         """None on nodes: it acts on faces. Its pivot, for torques."""
-        touched = _Body(self, nodes, t, dt, reference).nothing_held()
+        touched, _, _ = self.seen_by(nodes, t, dt, reference)
         return replace(no_conditions(nodes), colliders=touched, holds=True, moves=self.motion is not None)
 
     def surfaces(self, x: ParticleVector, t: Scalar, dt: Scalar, push_time: Scalar) -> tuple[Surface, ...]:
         """Unit normal of the body; zero where the distance gradient vanishes, as a sampled one may."""
-        motion = canonical(still(self.dim), x.dtype) if self.motion is None else self.motion
+        motion = self.moved_by(x.dtype)
         place = motion.origin(x, push_time)
         distance, slope = jax.vjp(self.shape.distance, place)
         (slope,) = slope(jnp.ones_like(distance))
@@ -197,53 +218,3 @@ class SeparatingCollider(AbstractCollider):
     def check(self, grid: Grid, *, total: bool) -> None:
         del grid
         refuse_contact(total)
-
-
-class _Body(eqx.Module):
-    """A collider as the nodes see it in one step."""
-
-    shape: AbstractRegion
-    motion: AbstractMotion
-    t: Scalar
-    nodes: NodeVector
-    place: NodeVector
-    """The nodes in the shape's own frame [m], shape (n, d)."""
-    velocity: NodeVector
-    """Velocity of the body at the nodes [m/s], shape (n, d)."""
-    position: NodeVector
-    """Positions of the nodes [m], shape (n, d); in the total description moved with the body."""
-    pivot: Float[Array, "d"]
-    pivot_velocity: Float[Array, "d"]
-
-    def __init__(self, collider: AbstractCollider, nodes: NodeVector, t: Scalar, dt: Scalar, reference: bool):
-        motion = canonical(still(collider.dim), nodes.dtype) if collider.motion is None else collider.motion
-        self.nodes, self.shape, self.motion, self.t = nodes, collider.shape, motion, t
-        self.place = nodes if reference else motion.origin(nodes, t)
-        self.velocity = motion.velocity_of(self.place, t, dt)
-        self.position = nodes + motion.place(nodes, t) - motion.place(nodes, 0.0) if reference else nodes
-        middle = jnp.asarray(collider.shape.middle(), nodes.dtype)
-        self.pivot = motion.pivot(middle, t)
-        self.pivot_velocity = (motion.pivot(middle, t + dt) - self.pivot) / dt
-
-    def holds(self, spacing: Scalar) -> Bool[Array, "n"]:
-        """Which nodes lie in the body, shape (n,)."""
-        return self.shape.contains(self.place, ON_THE_WALL * spacing)
-
-    def nothing_held(self) -> ColliderConditions:
-        """The conditions of a body that holds no node."""
-        return ColliderConditions(
-            slides=(),
-            holder=jnp.full(self.nodes.shape, -1, jnp.int32),
-            position=self.position,
-            pivots=self.pivot[None],
-            pivot_velocity=self.pivot_velocity[None],
-        )
-
-    def slide(self, spacing: Scalar) -> Slide:
-        """The normals of a body that holds every node in it along them, but for nodes where the distance has no slope,
-        as a sampled one may have none."""
-        slope = jax.grad(lambda x: self.shape.distance(x).sum())(self.place)
-        steepness = length(slope)
-        held = (self.holds(spacing) & (steepness > 0))[:, None]
-        normal = self.motion.turned(slope / jnp.where(held, steepness[:, None], 1), self.t)
-        return Slide(jnp.where(held, normal, 0), jnp.where(held, self.velocity, 0))

@@ -70,12 +70,6 @@ class ColliderConditions(eqx.Module):
             pivot_velocity=jnp.concatenate([self.pivot_velocity, later.pivot_velocity]),
         )
 
-    def after(self, time: Scalar, velocity: NodeVector) -> "ColliderConditions":
-        """The conditions with nodes and pivots moved on by a time [s], the nodes at a velocity [m/s], shape (n,
-        d)."""
-        moved = self.position + time * velocity, self.pivots + time * self.pivot_velocity
-        return eqx.tree_at(lambda c: (c.position, c.pivots), self, moved)
-
 
 class FreeNormal(eqx.Module):
     """A collider's normal at each node, and its part in free components at right angles to those of earlier ones."""

@@ -228,7 +228,8 @@ class AbstractSpringContact(AbstractContact):
 
 
 class ConstrainedNodes(eqx.Module, Generic[N]):
-    """The nodes while an active set is held; see `constrain`."""
+    """The nodes while an active set is held; see `constrain`. In its methods `v` is the velocity of all nodes [m/s] and
+    `residual` the impulse that is missing at each [kg m/s], shape (n, d)."""
 
     unconstrained: N
     """The nodes of which no contact holds anything."""
@@ -262,9 +263,9 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
     def along_normals(self, residual: NodeVector) -> tuple[OwnedImpulse, ...]:
         """The impulses by which colliders hold nodes along their normals, by the colliders' numbers.
 
-        The residual [kg m/s], shape (n, d), is the impulse of the prescribed components, plus each collider's times its
-        normal. The direction of the last one is at right angles to all others: along it, the residual is the last one's
-        impulse alone, times the length of its part.
+        The residual is the impulse of the prescribed components, plus each collider's times its normal. The direction
+        of the last one is at right angles to all others: along it, the residual is the last one's impulse alone, times
+        the length of its part.
         """
         parts, left = [], self.images.fold(residual)
         for part in reversed(self.nodes.free_normals):
@@ -289,12 +290,8 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
         return self.images.fold(self.without_collider_impulses(residual))
 
     def violations(self, v: NodeVector, residual: NodeVector) -> tuple[ActiveSet, ActiveSet]:
-        """The held places that pull, and the others that are entered, beyond rounding.
-
-        Args:
-            v: velocity of all nodes after the solve [m/s], shape (n, d).
-            residual: the impulse that is missing at each node [kg m/s], shape (n, d).
-        """
+        """The held places that pull, and the others that are entered, beyond rounding, at the velocity after the
+        solve."""
         noise = jnp.sqrt(jnp.finfo(v.dtype).eps) * jnp.abs(v).max()
         pulling, entering = [], []
         for contact, active in zip(self.unconstrained.contacts, self.active, strict=True):
@@ -308,11 +305,8 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
 
         Contacts act one after the other: boundary by boundary in the scene's order, then pairs of bodies; and, from the
         same start, in the reverse order. Each has the mean of its two changes, so that of two boundaries at a node none
-        comes first. The mean is within the limit and takes energy, as both are and do.
-
-        Args:
-            v: velocity of all nodes after the solve [m/s], shape (n, d).
-            residual: the impulse that holds components of velocity [kg m/s], shape (n, d).
+        comes first. The mean is within the limit and takes energy, as both are and do. The residual is without the
+        impulses of springs.
         """
         tied, nodes, contacts = Mirror(self.nodes.mirror.rigid), self.nodes, self.unconstrained.contacts
         rubbing = self if nodes.loose is None else replace(self, nodes=nodes.loose)
@@ -343,11 +337,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
 
     def pushes(self, friction_dv: tuple[NodeVector, ...]) -> tuple[tuple[int, NodeVector], ...]:
         """The impulses of boundaries on the nodes by springs and friction [kg m/s], shape (n, d), each with the
-        boundary's number.
-
-        Args:
-            friction_dv: the change of velocity by the friction of each contact [m/s], shape (n, d).
-        """
+        boundary's number, from the change of velocity by the friction of each contact [m/s]."""
         pushes, nodes, tied = [], self.unconstrained, Mirror(self.nodes.mirror.rigid)
         mass = (nodes if nodes.loose is None else nodes.loose).mass[:, None]
         for number, contact, active, change in zip(

@@ -47,13 +47,8 @@ def friction_change(
 
 
 def friction_share(slip: NodeVector, mass: NodeScalar, limit: NodeScalar) -> NodeScalar:
-    """The share of the slip that friction takes, min(1, limit/(m ‖s‖)), shape (n,).
-
-    Args:
-        slip: s [m/s], shape (n, d).
-        mass: the mass that slides at each node [kg], shape (n,).
-        limit: the largest impulse of friction at each node [kg m/s], shape (n,).
-    """
+    """The share of the slip s [m/s], shape (n, d), that friction takes, min(1, limit/(m ‖s‖)), shape (n,), of a mass
+    [kg] and a largest impulse [kg m/s], shape (n,)."""
     square = (slip**2).sum(axis=1)
     moves = (square > 0) & (mass > 0)
     stopping = mass * jnp.sqrt(jnp.where(moves, square, 1))

@@ -65,14 +65,8 @@ def received_impulses(
     pivots: Float[Array, "k d"],
     couples: Sequence[OwnedCouple] = (),
 ) -> Impulses:
-    """The impulse on each collider or boundary: minus what it gives the nodes.
-
-    Args:
-        parts: the impulses that they give the nodes.
-        positions: positions of the nodes [m], shape (n, d).
-        pivots: the points for torques [m], shape (k, d).
-        couples: the couples that they give rigid bodies besides.
-    """
+    """The impulse on each collider or boundary, minus the parts that it gives the nodes and the couples that it gives
+    rigid bodies, from the positions of the nodes and the points for torques [m]."""
 
     def on(number: int, pivot: Array) -> tuple[Array, Array]:
         total = jnp.zeros_like(positions)
@@ -112,15 +106,11 @@ def owners_of(
 def taken_by_mirrors(
     field: NodeVector, images: list[tuple[int, Image]] | list[tuple[int, Image | Tie]]
 ) -> tuple[list[OwnedImpulse], NodeVector]:
-    """The part of impulses on all nodes that mirrors take, each by its boundary's number, and the impulses that remain
-    on true nodes.
+    """The part of impulses on all nodes [kg m/s], shape (n, d), that mirrors take, and the impulses that remain on true
+    nodes. The mirrors come in the order in which they unfold, with their boundaries' numbers.
 
     Where planes meet, each takes its normal component before the others fold it, so that its torque has the places of
     all nodes.
-
-    Args:
-        field: impulses on all nodes [kg m/s], shape (n, d).
-        images: the mirrors in the order in which they unfold, with their boundaries' numbers.
     """
     taken, remaining = [], jnp.zeros_like(field)
     planes = all(isinstance(image, Image) for _, image in images)  # they commute

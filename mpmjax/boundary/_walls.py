@@ -56,7 +56,6 @@ class AbstractBox(AbstractBoundary):
     def passed(
         self, start: ParticleVector, end: ParticleVector, spacing: Scalar, t: Scalar, dt: Scalar, reach: float
     ) -> Bool[Array, "p"]:
-        """Which particles passed a wall: those that come deeper than `deepest`, among others (`crossed`)."""
         shift = self.displacement(t + dt)
         start, end = start - self.displacement(t), end - shift
 
@@ -71,13 +70,8 @@ class AbstractBox(AbstractBoundary):
         return reduce(jnp.logical_or, beyond(1, self.lower) + beyond(-1, self.upper))
 
     def deepest(self, wall: Array, spacing: Scalar, reach: float) -> Array:
-        """How deep a lower wall lets a particle come [m]: to where no node of its stencil is free.
-
-        Args:
-            wall: position of the wall [m].
-            spacing: dx [m].
-            reach: half the kernel's width in spacings.
-        """
+        """How deep a lower wall [m] lets a particle come [m]: to where no node of its stencil is free, which reaches so
+        many spacings."""
         first_free = jnp.floor(wall / spacing + ON_THE_WALL) + 1
         return (first_free - reach - ON_THE_WALL) * spacing
 
@@ -178,7 +172,6 @@ class SeparatingBox(AbstractBox):
         require_between("SeparatingBox's friction", self.friction, 0, 1e6)
 
     def conditions(self, nodes: NodeVector, spacing: Scalar, t: Scalar, dt: Scalar, *, reference: bool) -> Conditions:
-        """None: it acts on faces."""
         del spacing, t, dt, reference
         return no_conditions(nodes)
 

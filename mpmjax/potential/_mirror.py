@@ -35,12 +35,9 @@ class MirrorPlace(NamedTuple):
 
 @ruled
 def carried_by(*places: Array) -> Float[Array, ""]:
-    """How far the grid is carried along an axis by the mirrors across it [m]: zero, with the derivative by the place
-    of a mirror. A mirror lies on the lattice of nodes, so where it is elsewhere the lattice is too.
-
-    Args:
-        places: coordinates of the mirrors [m].
-    """
+    """How far the grid is carried along an axis by the mirrors across it, at these coordinates [m]: zero, with the
+    derivative by the place of a mirror. A mirror lies on the lattice of nodes, so where it is elsewhere the lattice is
+    too."""
     return jnp.zeros_like(jnp.asarray(places[0]))
 
 
@@ -254,14 +251,8 @@ class Mirror(eqx.Module):
 
 def mirror_image(axis: int, position: Scalar, keep: str, grid: Grid, window: Int[Array, "d"]) -> tuple[Image, Array]:
     """The map of a mirror from true nodes to all nodes of the window, and how many half spacings each node along the
-    axis lies before it.
-
-    Args:
-        axis: direction of the mirror's normal.
-        position: its coordinate [m], a multiple of half a spacing.
-        keep: the side of the true nodes, "above" or "below".
-        grid: the grid.
-        window: lattice index of the window's first node, shape (d,).
+    axis lies before it. True nodes are "above" or "below" the mirror, whose coordinate [m] is a multiple of half a
+    spacing.
     """
     length = grid.shape[axis]
     j = jnp.arange(length, dtype=jnp.int32)

@@ -35,14 +35,16 @@ def impulse_on_colliders(scene: Scene, nodes: Nodes, method: AbstractIntegrator,
     """
     colliders, share = nodes.conditions.colliders, method.force_at()
     assert colliders is not None
+    position, pivots = colliders.position, colliders.pivots
     if share is not None:
-        colliders = colliders.after(share * nodes.dt, nodes.mirror.unfold(new.motion.carrier))
+        position = position + share * nodes.dt * nodes.mirror.unfold(new.motion.carrier)
+        pivots = pivots + share * nodes.dt * colliders.pivot_velocity
     held, numbers = new.held(nodes), _boundaries_of_colliders(scene)
     holding = held.without_spring_impulses(reaction(nodes, new.solved, new.elastic))
     pushes = () if new.contact is None else held.pushes(new.contact.friction)
     by_springs = [OwnedImpulse(push, numbers.index(number)) for number, push in pushes if number in numbers]
     parts = [OwnedImpulse(holding, colliders.holder), *held.along_normals(holding), *by_springs]
-    return received_impulses(parts, colliders.position, colliders.pivots)
+    return received_impulses(parts, position, pivots)
 
 
 def impulse_on_boundaries(

@@ -286,7 +286,7 @@ def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes, t: Scalar
         rigid = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images, nodes.dt)
         loose = nodes.folded(images)
         nodes = loose.folded(Mirror(rigid.images))
-        v = jnp.where(rigid.own, rigid.velocity, nodes.velocity)
+        v = jnp.where(rigid.of_bodies, rigid.velocity, nodes.velocity)
         return replace(nodes, v=v, conditions=rigid.conditions, loose=loose)
     if not images.moving:
         return nodes.folded(images)

@@ -17,7 +17,7 @@ class RigidLayers(eqx.Module):
     the second s = Gω (see `RigidImage`)."""
 
     images: tuple[RigidImage, ...]
-    own: Bool[Array, "n 1"]
+    of_bodies: Bool[Array, "n 1"]
     """The nodes of rigid bodies, shape (n, 1)."""
     velocity: NodeVector
     """Their velocity at the start of the step [m/s], shape (n, d), zero elsewhere."""
@@ -39,18 +39,18 @@ def rigid_layers(
         dt: step [s].
     """
     places = scene.nodes(particles, 0.0)  # at any time: planes beside rigid bodies rest
-    own, velocity = jnp.zeros((len(mass), 1), bool), jnp.zeros_like(places)
+    of_bodies, velocity = jnp.zeros((len(mass), 1), bool), jnp.zeros_like(places)
     fixed, prescribed, images = conditions.fixed, conditions.velocity, []
     for material in scene.rigid_bodies:
         body = _body(particles, material)
         image = _image(scene, body, places, material.layer)
         held, value = _held(material, body, image, mass, conditions, planes, dt)
         images.append(image)
-        own = image.with_own(own, jnp.ones((len(image.arms), 1), bool))
+        of_bodies = image.with_own(of_bodies, jnp.ones((len(image.arms), 1), bool))
         velocity = image.with_own(velocity, _first_two(image, body.velocity, body.root() @ body.spin))
         fixed = image.with_own(fixed, jnp.zeros(image.arms.shape, bool).at[:2].set(held))
         prescribed = image.with_own(prescribed, jnp.zeros_like(image.arms).at[:2].set(jnp.where(held, value, 0)))
-    return RigidLayers(tuple(images), own, velocity, Conditions(fixed, prescribed, conditions.colliders))
+    return RigidLayers(tuple(images), of_bodies, velocity, Conditions(fixed, prescribed, conditions.colliders))
 
 
 def moved_rigidly(
@@ -141,8 +141,8 @@ def _held(
     What is held of any of its nodes is held of all. The velocity is that of the rigid motion nearest to what is
     prescribed.
     """
-    own, d = image.own(mass), image.arms.shape[1]
-    held = image.own(conditions.fixed) & (own > 0)[:, None]
+    layer_mass, d = image.own(mass), image.arms.shape[1]
+    held = image.own(conditions.fixed) & (layer_mass > 0)[:, None]
     of_planes = [image.reaches(plane, mass) for plane in planes.images if isinstance(plane, Image)]
     guided = jnp.zeros(d, bool) if material.freedom.directions is None else ~jnp.asarray(material.freedom.directions)
     by_nodes = held.any(axis=0)
@@ -150,12 +150,12 @@ def _held(
     spins = material.freedom.turns & ~by_nodes.any() & ~by_planes.any()
 
     # the mean of what is prescribed, and the turning of what is prescribed with all components
-    weight = jnp.where(held, own[:, None], 0)
+    weight = jnp.where(held, layer_mass[:, None], 0)
     total = weight.sum(axis=0)
     per_total = jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0)
     value = image.own(conditions.velocity)
     mean, middle = per_total * (weight * value).sum(axis=0), per_total * (weight * image.arms).sum(axis=0)
-    whole = jnp.where(held.all(axis=1), own, 0)
+    whole = jnp.where(held.all(axis=1), layer_mass, 0)
     arms = jnp.where((whole > 0)[:, None], image.arms - middle, 0)
     angle = jnp.where(material.freedom.turns, rotation_of_chords(arms, dt * (value - mean), whole), 0)
     back = turn(middle[None], angle)[0] - middle if len(angle) else 0.0  # the centre too moves along its chord
