@@ -13,7 +13,6 @@ from mpmjax.boundary import (
     AbstractNodes,
     Conditions,
     FreeNormal,
-    brought_contacts,
     combined_conditions,
     mirror,
 )
@@ -266,7 +265,8 @@ def with_boundaries(
     faces = None
     if any(boundary.pushes or boundary.sees_faces for boundary in scene.boundary):
         faces = faces_of(scene, particles, potential, t, dt, force_at)
-    brought = brought_contacts(scene.boundary, faces, grid, window, t, dt)
+    each = enumerate(scene.boundary)
+    brought = [(n, contact) for n, boundary in each for contact in boundary.contacts(faces, grid, window, t, dt)]
     contacts, brought_by = [contact for _, contact in brought], [number for number, _ in brought]
     if scene.bodies is not None:
         images = mirror(scene.boundary, grid, window)
