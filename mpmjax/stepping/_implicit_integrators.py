@@ -322,7 +322,7 @@ class TRBDF2(AbstractImplicitIntegrator):
         return NodeMotion(v, mean, inner, mean if viscous else None), first.together_with(second)
 
     def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector | None], ...]:
-        """Those at 0, γΔt and Δt."""
+        """The stages at 0, γΔt and Δt."""
         _, q0, q1, q2 = self.weights()
         inner = motion.carrier if motion.inner is None else motion.inner
         return (q0, None), (q1, nodes.dt * inner), (q2, nodes.dt * motion.carrier)
