@@ -36,13 +36,14 @@ def walls_of(kind: str, lower: float, upper: float) -> tuple[mpm.boundary.Abstra
 def rest(cells: int = 8) -> None:
     """Water that starts in its exact state stays in it: the error of the pressure and the centre's height."""
     print("water at rest, K = 40 ρgH, after 2 s: wall, spacings from a node, times the explicit limit;")
-    print("rms error of the pressure over the last half second [% of ρgH], height of the centre over the exact one")
+    print("rms error of the pressure over the last half second [% of ρgH] (in explicit steps")
+    print("mostly sound that still rings), height of the centre over the exact one")
     dx, wide, deep = 1 / 16, cells / 16, cells / 32
     modulus = 40 * WATER * G * deep
 
     for kind, at, times in (
         *(("SeparatingBox", at, times) for at in (0.0, 0.25, 0.5) for times in (0.7, 9.0)),
-        *((kind, at, times) for kind in ("ContactPlane", "SymmetryPlane") for at in (0.0, 0.5) for times in (9.0,)),
+        *((kind, at, times) for kind in ("ContactPlane", "SymmetryPlane") for at in (0.0, 0.5) for times in (0.7, 9.0)),
     ):
         low = at * dx
         grid = mpm.Grid((cells + 10, cells + 12), dx, origin=(-4, -4))
