@@ -9,7 +9,7 @@ from helpers import DESCRIPTIONS, KERNELS, LAWS, assert_close, cloud, ids, thoro
 from numpy_oracle import grid_update
 
 import mpmjax as mpm
-from mpmjax.boundary import brought_contacts, combined_conditions, mirror
+from mpmjax.boundary import combined_conditions, mirror
 from mpmjax.potential import Mirror
 
 TIGHT = mpm.ConjugateResidual(rtol=1e-13)
@@ -224,7 +224,7 @@ def test_fold_is_the_transpose_of_unfold_where_some_columns_are_held():
     planes = (mpm.ContactPlane(0, 0.2), mpm.ContactPlane(1, 0.35, "below"))
     columns = [np.broadcast_to(rng.random((1, 6)) < 0.5, (7, 6)), np.broadcast_to(rng.random((7, 1)) < 0.5, (7, 6))]
     window = grid.window(jnp.zeros((1, 2)))
-    found = [c for _, c in brought_contacts(planes, None, grid, window, 0.0, DT)]
+    found = [contact for plane in planes for contact in plane.contacts(None, grid, window, 0.0, DT)]
     images = Mirror(tuple(c.image.within(jnp.asarray(h.ravel())) for c, h in zip(found, columns, strict=True)))
     basis = jnp.eye(84).reshape(84, 42, 2)
     B, transpose = (np.asarray(jax.vmap(f)(basis)).reshape(84, 84).T for f in (images.unfold, images.fold))

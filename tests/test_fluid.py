@@ -18,7 +18,7 @@ def response(law, J):
     """Energy, stress and tangent of stretches, and the same by differentiation of the energy, the stress once more."""
     gradient = jax.grad(lambda J: law.energy(J).sum())
     curvature = jax.jvp(gradient, (J,), (jnp.ones_like(J),))[1]
-    return law.energy(J), law.stress(J), law.tangent(J)(jnp.ones_like(J)), gradient(J), curvature
+    return law.energy(J), law.stress(J), law.stress_differential(J)(jnp.ones_like(J)), gradient(J), curvature
 
 
 @pytest.mark.parametrize("exponent", EXPONENTS)

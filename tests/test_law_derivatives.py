@@ -67,7 +67,7 @@ def routes(law, G):
     energy = lambda F: law.energy(F).sum()  # noqa: E731
     looped = in_scan(law.energy)
     force = jax.grad(energy)
-    tangent = lambda F: law.tangent(F)(G)  # noqa: E731
+    tangent = lambda F: law.stress_differential(F)(G)  # noqa: E731
     automatic, stress = forward(force, G), law.stress
     transposed = in_scan(reverse(in_scan(stress), G))
     return {
@@ -224,7 +224,7 @@ def test_principal_tangents_are_of_the_principal_stresses(name):
 
     at = np.concatenate([[s], s + h * np.eye(3), s - h * np.eye(3)])
     F = jnp.asarray(np.eye(3)[..., None] * at.T)
-    stress, found = jax.jit(lambda F, s: (law.stress(F), law.principal_tangent(s)))(F, jnp.asarray(s)[:, None])
+    stress, found = jax.jit(lambda F, s: (law.stress(F), law.principal_differential(s)))(F, jnp.asarray(s)[:, None])
     P, *beside = np.einsum("iip->pi", stress)
     for k, (i, j) in enumerate([(0, 1), (0, 2), (1, 2)]):
         np.testing.assert_allclose(found.twist[k, 0], (P[i] + P[j]) / (s[i] + s[j]), rtol=1e-9, atol=1e-6)

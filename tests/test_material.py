@@ -27,7 +27,7 @@ EACH_STATE = pytest.mark.parametrize(
 @eqx.filter_jit
 def response(law, F, dF, dG):
     """Energy, stress, ∂Ψ/∂F, the tangent in two directions, and the jvp of the stress in the first."""
-    tangent = law.tangent(F)
+    tangent = law.stress_differential(F)
     gradient = jax.grad(lambda F: law.energy(F).sum())(F)
     return law.energy(F), law.stress(F), gradient, tangent(dF), tangent(dG), jax.jvp(law.stress, (F,), (dF,))[1]
 
@@ -35,7 +35,7 @@ def response(law, F, dF, dG):
 @eqx.filter_jit
 def forward(law, F, dF):
     """Energy, stress and the tangent in one direction."""
-    return law.energy(F), law.stress(F), law.tangent(F)(dF)
+    return law.energy(F), law.stress(F), law.stress_differential(F)(dF)
 
 
 def evaluate(f, law, *arrays):
@@ -143,9 +143,9 @@ def principal_forms(law, F):
     d = F.shape[0]
     U, s, V = la.principal_frame(F)
     units = jnp.eye(d * d).reshape(d * d, d, d, 1)
-    tangent = law.tangent(F)
+    tangent = law.stress_differential(F)
     dense = jax.vmap(lambda e: tangent(jnp.broadcast_to(e, F.shape)))(units).reshape(d * d, d * d, -1)
-    closed = law.principal_tangent(s)
+    closed = law.principal_differential(s)
     modes = la.principal_modes(U, V)
     inner = jnp.zeros((d * d, d * d, F.shape[-1]))
     inner = inner.at[:d, :d].set(closed.scaling)
@@ -177,7 +177,7 @@ def test_principal_tangent_is_the_tangents_eigenstructure(name, family, d):
 @eqx.filter_jit
 def matrices(law, F, A, weight):
     """The matrix of G ↦ w (∂²Ψ/∂F∂F : (G A)) Aᵀ, the derivative's direction first, in closed form and by the map."""
-    tangent = law.tangent(F)
+    tangent = law.stress_differential(F)
 
     def flux(slopes):
         return la.transpose(weight * la.matmul(tangent(la.matmul(la.transpose(slopes), A)), la.transpose(A)))

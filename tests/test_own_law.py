@@ -51,9 +51,13 @@ RUNS = {
     "trbdf2": (1, mpm.TotalLagrangian(), mpm.TRBDF2(solution=NEWTON)),
     "midpoint": (2, mpm.UpdatedLagrangian(), mpm.ImplicitMidpoint(NEWTON)),
     "backward_euler": (2, mpm.TotalLagrangian(), mpm.BackwardEuler(NEWTON)),
-    "projected": (2, mpm.UpdatedLagrangian(), mpm.SemiImplicit(1.0, mpm.AnalyticHessian(projected=True), TIGHT)),
-    "jvp": (3, mpm.TotalLagrangian(), mpm.SemiImplicit(0.5, mpm.JvpHessian(), TIGHT)),
-    "analytic": (3, mpm.UpdatedLagrangian(), mpm.SemiImplicit(1.0, mpm.AnalyticHessian(), TIGHT)),
+    "projected": (
+        2,
+        mpm.UpdatedLagrangian(),
+        mpm.SemiImplicit(1.0, TIGHT, hessian=mpm.AnalyticHessian(projected=True)),
+    ),
+    "jvp": (3, mpm.TotalLagrangian(), mpm.SemiImplicit(0.5, TIGHT, hessian=mpm.JvpHessian())),
+    "analytic": (3, mpm.UpdatedLagrangian(), mpm.SemiImplicit(1.0, TIGHT, hessian=mpm.AnalyticHessian())),
 }
 
 
@@ -103,7 +107,7 @@ def moment_gradient(law, scene, particles, method):
 @pytest.mark.parametrize("hessian", [mpm.AnalyticHessian(), *thorough(mpm.AnalyticHessian(projected=True))])
 def test_gradients_are_those_of_the_closed_form(hessian):
     """Through implicit steps from rest, where all stretches coincide: third derivatives of the energy."""
-    method = mpm.SemiImplicit(1.0, hessian, TIGHT, adjoint_solver=TIGHT)
+    method = mpm.SemiImplicit(1.0, TIGHT, hessian=hessian, adjoint_solver=TIGHT)
     found = []
     for law in (OWN, CLOSED):
         scene, particles = strained(2, law, mpm.UpdatedLagrangian(), "rest")

@@ -106,7 +106,7 @@ class UndeformedHessian(mpm.implicit.AbstractHessian):
 
     def at(self, potential, u):
         def tangent(law, F):
-            return law.tangent(jnp.broadcast_to(jnp.eye(F.shape[0])[..., None], F.shape))
+            return law.stress_differential(jnp.broadcast_to(jnp.eye(F.shape[0])[..., None], F.shape))
 
         laws = [points.law for points in potential.material_points]
         tangents = tuple(tangent(law, F) for law, F in zip(laws, potential.deformation(u), strict=True))

@@ -27,7 +27,7 @@ def assembled(tangent, F):
 
 @eqx.filter_jit
 def both(law, F):
-    return assembled(law.tangent(F), F), assembled(law.projected_tangent(F), F)
+    return assembled(law.stress_differential(F), F), assembled(law.projected_differential(F), F)
 
 
 @EACH_LAW
@@ -55,7 +55,7 @@ def test_projection_keeps_what_is_positive_and_drops_the_rest(law, family, d):
 
 
 def projected_matrix(law, F):
-    return assembled(law.projected_tangent(F), F)
+    return assembled(law.projected_differential(F), F)
 
 
 @eqx.filter_jit
@@ -125,7 +125,7 @@ def test_second_derivatives_are_refused(inner, outer, looped):
     law, F = LAWS["fixed_corotated"], jnp.eye(2)[..., None] * 0.95
 
     def once(F):
-        return law.projected_tangent(F).matrix[0, 1, 0]
+        return law.projected_differential(F).matrix[0, 1, 0]
 
     def entry(F):
         return jax.lax.scan(lambda _, one: (None, once(one)), None, F[None])[1][0] if looped else once(F)

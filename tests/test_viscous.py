@@ -92,7 +92,7 @@ def test_both_descriptions_resist_the_same_flow_alike(description):
     F, L = np.asarray(points.deformation), rng.normal(size=(3, 3))
     gradient = np.broadcast_to(L[..., None], F.shape)
     gradient = np.einsum("ij,jkp->ikp", L, F) if description == "total" else gradient
-    flux = np.asarray(points.viscous_flux(jnp.asarray(gradient)))
+    flux = np.asarray(points.weighted_viscous_stress(jnp.asarray(gradient)))
     flux = np.einsum("ijp,kjp->ikp", flux, F) if description == "total" else flux
     stress = np.asarray(points.viscosity.stress(jnp.asarray(L)[..., None]))
     assert_close(flux, np.abs(np.linalg.det(F.T)) * np.asarray(points.volume) * stress, 1e-12)

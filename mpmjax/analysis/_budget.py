@@ -321,9 +321,9 @@ def _step_budget(
         forces, dissipated = [force for force, _ in drags], sum((power for _, power in drags), dissipated)
         if potential.material_viscous and before.C is not None:
             C = components(before.C)
-            flux = potential.viscous_flux(C)
-            forces.append(Forces(slopes=-jnp.swapaxes(flux, 0, 1)))
-            dissipated = dissipated + (flux * C).sum()
+            stress = potential.weighted_viscous_stress(C)
+            forces.append(Forces(slopes=-jnp.swapaxes(stress, 0, 1)))
+            dissipated = dissipated + (stress * C).sum()
         if forces:
             force = potential.on_nodes(forces)
             viscous, dissipated = jnp.where(nodes.occupied, dt * force, 0), dt * dissipated

@@ -12,8 +12,6 @@ from mpmjax.boundary._boundary import (
     ON_THE_WALL as ON_THE_WALL,
     AbstractBoundary as AbstractBoundary,
     Wall as Wall,
-    brought_contacts as brought_contacts,
-    brought_images as brought_images,
     combined_conditions as combined_conditions,
     mirror as mirror,
 )

@@ -218,29 +218,8 @@ def combined_conditions(
     return total
 
 
-def brought_contacts(
-    boundaries: tuple[AbstractBoundary, ...],
-    faces: Faces | None,
-    grid: Grid,
-    window: Int[Array, "d"],
-    t: Scalar,
-    dt: Scalar,
-) -> list[tuple[int, AbstractContact]]:
-    """The contacts of a scene, each with the number of its boundary (see `AbstractBoundary.contacts`)."""
-    each = ((n, boundary.contacts(faces, grid, window, t, dt)) for n, boundary in enumerate(boundaries))
-    return [(n, contact) for n, contacts in each for contact in contacts]
-
-
 def mirror(
     boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"], t: Scalar = 0.0, dt: Scalar = 1.0
 ) -> Mirror:
     """The mirror images that the boundaries of a scene put in the window; t and dt matter for velocities alone."""
-    return Mirror(tuple(image for _, image in brought_images(boundaries, grid, window, t, dt)))
-
-
-def brought_images(
-    boundaries: tuple[AbstractBoundary, ...], grid: Grid, window: Int[Array, "d"], t: Scalar, dt: Scalar
-) -> list[tuple[int, Image | Tie]]:
-    """The images of `mirror`, each with the number of its boundary."""
-    each = ((n, boundary.mirror_images(grid, window, t, dt)) for n, boundary in enumerate(boundaries))
-    return [(n, image) for n, images in each for image in images]
+    return Mirror(tuple(image for boundary in boundaries for image in boundary.mirror_images(grid, window, t, dt)))

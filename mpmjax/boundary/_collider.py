@@ -47,7 +47,7 @@ class AbstractCollider(AbstractBoundary):
         return self.shape.dim
 
     def moved_by(self, dtype: Any) -> AbstractMotion:
-        """Its motion, of this dtype; that of a body at rest if it has none."""
+        """The motion, of this dtype; that of a body at rest if it has none."""
         return canonical(still(self.dim), dtype) if self.motion is None else self.motion
 
     def distance(self, x: Float[Array, "m d"], t: Scalar) -> Float[Array, "m"]:

@@ -119,7 +119,7 @@ class TangentAction(AbstractHessianAction):
         potential, moved = self.potential, self.potential.displaced(du)
         changes = potential.change(displacement_gradient(moved))
         stress = tuple(tangent(dF) for tangent, dF in zip(self.tangents, changes, strict=True))
-        elastic = Forces(slopes=jnp.swapaxes(potential.flux(stress), 0, 1))
+        elastic = Forces(slopes=jnp.swapaxes(potential.weighted_stress(stress), 0, 1))
         return potential.on_nodes([elastic, *(part(moved) for part in self._others())])
 
     def precomputed(self) -> ParticleStiffness:
@@ -187,9 +187,10 @@ class AnalyticHessian(AbstractHessian):
     """The Hessian by the stress differential of the law (derivation, eqs. 7 to 12). Faster than `JvpHessian`.
 
     With `projected`, the stress differential of each particle is made positive semi-definite first (see the law's
-    `projected_tangent`). M + χH is then positive definite at every compression and step. Particles whose differential
-    is positive semi-definite already are not changed. One linear solve then solves another equation, with more damping;
-    Newton's method takes other steps to the same solution. First derivatives stay exact; second derivatives raise.
+    `projected_differential`). M + χH is then positive definite at every compression and step. Particles whose
+    differential is positive semi-definite already are not changed. One linear solve then solves another equation, with
+    more damping; Newton's method takes other steps to the same solution. First derivatives stay exact; second
+    derivatives raise.
 
     Args:
         projected: whether the stress differentials are projected.
@@ -202,8 +203,8 @@ class AnalyticHessian(AbstractHessian):
 
     def at(self, potential: ElasticPotential, u: NodeVector | None) -> TangentAction:
         if self.projected:
-            return _tangents_of(potential, u, lambda law, F: law.projected_tangent(F), definite=True)
-        return _tangents_of(potential, u, lambda law, F: law.tangent(F))
+            return _tangents_of(potential, u, lambda law, F: law.projected_differential(F), definite=True)
+        return _tangents_of(potential, u, lambda law, F: law.stress_differential(F))
 
     def exact(self) -> "AnalyticHessian":
         return AnalyticHessian() if self.projected else self
@@ -245,7 +246,7 @@ def _tangents_of(
 ) -> TangentAction:
     """H at a displacement [m], shape (n, d), by the stress differential of each law; None for no displacement."""
     pairs = zip(potential.material_points, potential.deformation(u), strict=True)
-    tangents = tuple(points.tangent(F, of_law, definite=definite) for points, F in pairs)
+    tangents = tuple(points.stress_differential(F, of_law, definite=definite) for points, F in pairs)
     return TangentAction(potential, tangents, definite, u)
 
 

@@ -22,7 +22,7 @@ class ElasticPotential(eqx.Module):
     in the step.
 
     h_ip is the material gradient: F_pᵀ ∇_x w_ip in the updated description, ∇_X w_ip in the total one. It enters only
-    by `change` and its transpose, `nodal_sum` of `flux`, so that force and Hessian are derivatives of Φ.
+    by `change` and its transpose, `nodal_sum` of `weighted_stress`, so that force and Hessian are derivatives of Φ.
     """
 
     material_points: tuple[MaterialPoints, ...]
@@ -81,17 +81,19 @@ class ElasticPotential(eqx.Module):
         """f = −∂Φ/∂u [N], shape (n, d); None for u = 0, where f_i = −Σ_p V0_p P_p F_pᵀ ∇w_ip."""
         moved = self.displaced(u)
         pairs = zip(self.material_points, self.deformation(moved), strict=True)
-        elastic = self.flux([points.stress(F) for points, F in pairs])
+        elastic = self.weighted_stress([points.stress(F) for points, F in pairs])
         return self.on_nodes([Forces(slopes=-jnp.swapaxes(elastic, 0, 1)), *(term.force(moved) for term in self.terms)])
 
-    def flux(self, P: Sequence[Deformation]) -> Matrix:
+    def weighted_stress(self, P: Sequence[Deformation]) -> Matrix:
         """V0_p P_p F_pᵀ [J], shape (d, d, p), from the stress of each material; in the total description V0_p P_p."""
         d = self.stencil.dim
-        return joined([points.flux(stress, d) for points, stress in zip(self.material_points, P, strict=True)])
+        return joined(
+            [points.weighted_stress(stress, d) for points, stress in zip(self.material_points, P, strict=True)]
+        )
 
-    def current_flux(self) -> Matrix:
+    def current_weighted_stress(self) -> Matrix:
         """V0_p P_p F_pᵀ at u = 0 [J], shape (d, d, p), of which the force is f_i = −Σ_p (V0_p P_p F_pᵀ) g_ip."""
-        return self.flux([points.stress(points.deformation) for points in self.material_points])
+        return self.weighted_stress([points.stress(points.deformation) for points in self.material_points])
 
     @property
     def viscous(self) -> bool:
@@ -105,10 +107,10 @@ class ElasticPotential(eqx.Module):
         """Whether any of the materials has viscosity."""
         return any(points.viscosity is not None for points in self.material_points)
 
-    def viscous_flux(self, gradient: Matrix) -> Matrix:
+    def weighted_viscous_stress(self, gradient: Matrix) -> Matrix:
         """|J| V0 σ_v of each particle [J], whose sum over g_ip is D v, at the particles' velocity gradient [1/s]; both
         of shape (d, d, p)."""
-        return joined([points.viscous_flux(points.rows_of(gradient)) for points in self.material_points])
+        return joined([points.weighted_viscous_stress(points.rows_of(gradient)) for points in self.material_points])
 
     def viscous_resistance(self, v: NodeVector) -> NodeVector:
         """D v [N], the negative of the viscous force at a nodal velocity v [m/s]. D is symmetric and positive
@@ -116,7 +118,7 @@ class ElasticPotential(eqx.Module):
         moved = self.displaced(v)
         parts = [r for term in self.terms if (r := term.resistance(moved)) is not None]
         if self.material_viscous:
-            parts.append(Forces(slopes=jnp.swapaxes(self.viscous_flux(displacement_gradient(moved)), 0, 1)))
+            parts.append(Forces(slopes=jnp.swapaxes(self.weighted_viscous_stress(displacement_gradient(moved)), 0, 1)))
         return self.on_nodes(parts) if parts else jnp.zeros_like(v)
 
     def power(self, v: NodeVector) -> Float[Array, ""]:
@@ -127,7 +129,7 @@ class ElasticPotential(eqx.Module):
         if not self.material_viscous:
             return power
         gradient = displacement_gradient(moved)
-        return power + (self.viscous_flux(gradient) * gradient).sum()
+        return power + (self.weighted_viscous_stress(gradient) * gradient).sum()
 
     def drags(self) -> list[tuple[Forces, Float[Array, ""]]]:
         """The viscous forces of the terms at the start of the step, and their powers (see `AbstractTerm.drag`)."""
@@ -146,7 +148,7 @@ class ElasticPotential(eqx.Module):
 
         def matrix(points: MaterialPoints) -> Array:
             def flux_of(slopes: Matrix) -> Matrix:
-                return la.transpose(points.viscous_flux(la.transpose(slopes)))
+                return la.transpose(points.weighted_viscous_stress(la.transpose(slopes)))
 
             like = jnp.zeros((d, d, *points.volume.shape), points.volume.dtype)
             return la.upper_triangle(la.matrix_of(flux_of, like))

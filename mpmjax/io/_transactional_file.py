@@ -306,8 +306,9 @@ class StagedFile:
 
     def _stored(self, at: int, size: int) -> bytes:
         """The bytes of the file on the disk at a position, as far as it has them."""
-        self._raw.seek(at)
-        parts, left = [], size
+        parts, left = [], 0 if self._raw.closed else size  # HDF5 may still write as it is collected, for nothing
+        if left > 0:
+            self._raw.seek(at)
         while left > 0 and (part := self._raw.read(left)):
             parts.append(part)
             left -= len(part)

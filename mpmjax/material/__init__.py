@@ -1,5 +1,11 @@
 """Laws: elastic, plastic, fluid, viscous."""
 
+from mpmjax.material._differential import (
+    AbstractDifferential as AbstractDifferential,
+    MatrixDifferential as MatrixDifferential,
+    PrincipalDifferential as PrincipalDifferential,
+    VolumetricDifferential as VolumetricDifferential,
+)
 from mpmjax.material._elastic import (
     AbstractIsotropic as AbstractIsotropic,
     FixedCorotated as FixedCorotated,
@@ -31,12 +37,6 @@ from mpmjax.material._rubber import (
     MooneyRivlin as MooneyRivlin,
     Ogden as Ogden,
     Yeoh as Yeoh,
-)
-from mpmjax.material._tangent import (
-    AbstractTangent as AbstractTangent,
-    MatrixTangent as MatrixTangent,
-    PrincipalTangent as PrincipalTangent,
-    VolumetricTangent as VolumetricTangent,
 )
 from mpmjax.material._viscous import Viscous as Viscous
 from mpmjax.material._von_mises import (

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Compliance, Float, Matrix, PerParticle
 from mpmjax.checks import require_fields, require_moduli
+from mpmjax.material._differential import AbstractDifferential, PrincipalDifferential, isotropic_matrix
 from mpmjax.material._law import AbstractMaterial
-from mpmjax.material._tangent import AbstractTangent, PrincipalTangent, isotropic_matrix
 
 
 class AbstractIsotropic(AbstractMaterial):
@@ -66,13 +66,13 @@ class FixedCorotated(AbstractIsotropic):
         volumetric = self.lame_lambda * (la.determinant(F) - 1)
         return 2 * self.shear_modulus * (F - la.rotation(F)) + volumetric * la.cofactor(F)
 
-    def tangent(self, F: Matrix) -> "FixedCorotatedTangent":
+    def stress_differential(self, F: Matrix) -> "FixedCorotatedDifferential":
         R, cof = la.rotation(F), la.cofactor(F)
         compliance = la.spin_compliance(la.matmul(la.transpose(R), F))
         volumetric = self.lame_lambda * (la.determinant(F) - 1)
-        return FixedCorotatedTangent(self, F, R, compliance, cof, volumetric)
+        return FixedCorotatedDifferential(self, F, R, compliance, cof, volumetric)
 
-    def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
+    def principal_differential(self, s: Float[Array, "d *p"]) -> PrincipalDifferential:
         """With v = λ (J − 1) J/(s_i s_j): twist 2μ (1 − 2/(s_i + s_j)) + v, flip 2μ − v, scaling
         2μ δ_ij + λ (J/s_i)(J/s_j) + (1 − δ_ij) v."""
         mu, lam = 2 * self.shear_modulus * jnp.ones_like(s[0]), self.lame_lambda * jnp.ones_like(s[0])
@@ -82,7 +82,7 @@ class FixedCorotated(AbstractIsotropic):
         return la.finite(F)
 
 
-class FixedCorotatedTangent(AbstractTangent):
+class FixedCorotatedDifferential(AbstractDifferential):
     """δP = 2μ (δF − δR) + λ (J F⁻ᵀ : δF) J F⁻ᵀ + λ (J − 1) δ(J F⁻ᵀ) (derivation, eq. 11)."""
 
     law: FixedCorotated
@@ -130,16 +130,16 @@ class NeoHookean(AbstractIsotropic):
         pull, _ = self._volumetric(la.determinant(F))
         return self.shear_modulus * F + pull * la.cofactor(F)
 
-    def tangent(self, F: Matrix) -> "NeoHookeanTangent":
+    def stress_differential(self, F: Matrix) -> "NeoHookeanDifferential":
         pull, bulk = self._volumetric(la.determinant(F))
-        return NeoHookeanTangent(F, la.cofactor(F), pull, bulk, self.shear_modulus)
+        return NeoHookeanDifferential(F, la.cofactor(F), pull, bulk, self.shear_modulus)
 
     def _volumetric(self, J: Array) -> tuple[Array, Array]:
         """q = (λ ln J − μ)/J, by which the cofactor matrix enters the stress, and b = dq/dJ."""
         pull = (self.lame_lambda * jnp.log(J) - self.shear_modulus) / J
         return pull, self.lame_lambda / J**2 - pull / J
 
-    def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
+    def principal_differential(self, s: Float[Array, "d *p"]) -> PrincipalDifferential:
         """With v = (μ − λ ln J)/(s_i s_j): twist μ − v, flip μ + v, scaling μ + (μ + λ (1 − ln J))/s_i² on the diagonal
         and λ/(s_i s_j) off it."""
         mu, J = self.shear_modulus * jnp.ones_like(s[0]), s.prod(axis=0)
@@ -150,7 +150,7 @@ class NeoHookean(AbstractIsotropic):
         return la.determinant(F) > 0
 
 
-class NeoHookeanTangent(AbstractTangent):
+class NeoHookeanDifferential(AbstractDifferential):
     """δP = μ δF + q δ(J F⁻ᵀ) + b (J F⁻ᵀ : δF) J F⁻ᵀ, with q = (λ ln J − μ)/J and b = λ/J² − q/J = dq/dJ."""
 
     F: Matrix
@@ -194,7 +194,7 @@ class NeoHookeanTangent(AbstractTangent):
 
 def _with_volumetric(
     s: Array, pull: Array, bulk: Array, twist: Callable[[int, int], Array], stiffness: Array
-) -> PrincipalTangent:
+) -> PrincipalDifferential:
     """The eigenstructure of a law with P = deviatoric part + q J F⁻ᵀ, q = `pull` and b = dq/dJ = `bulk`.
 
     δ(q J F⁻ᵀ) = b (J F⁻ᵀ : δF) J F⁻ᵀ + q δ(J F⁻ᵀ) has twist q J/(s_i s_j), flip −q J/(s_i s_j) and scaling
@@ -210,7 +210,7 @@ def _with_volumetric(
         spherical = bulk * others(i) * others(j)
         return spherical + (stiffness if i == j else pull * others(i, j))
 
-    return PrincipalTangent.of(
+    return PrincipalDifferential.of(
         s,
         twist=lambda i, j: twist(i, j) + pull * others(i, j),
         flip=lambda i, j: stiffness - pull * others(i, j),

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 
 from mpmjax._types import Array, Bool, Float, PerParticle, Scalar
 from mpmjax.checks import require_fields, require_positive
+from mpmjax.material._differential import VolumetricDifferential
 from mpmjax.material._law import VOLUME_RATIO, AbstractInelastic, AbstractMaterial, DeformationMeasure
-from mpmjax.material._tangent import VolumetricTangent
 
 
 class AbstractVolumetric(AbstractMaterial):
@@ -24,18 +24,18 @@ class AbstractVolumetric(AbstractMaterial):
     allows_total: ClassVar[bool] = False
     allows_averaged_volume: ClassVar[bool] = False
 
-    def tangent(self, J: Array, /) -> VolumetricTangent:
+    def stress_differential(self, J: Array, /) -> VolumetricDifferential:
         """d²Ψ/dJ² [Pa]. Default: the derivative of the stress."""
-        return VolumetricTangent(jax.jvp(self.stress, (J,), (jnp.ones_like(J),))[1])
+        return VolumetricDifferential(jax.jvp(self.stress, (J,), (jnp.ones_like(J),))[1])
 
-    def projected_tangent(self, J: Array, /) -> VolumetricTangent:
+    def projected_differential(self, J: Array, /) -> VolumetricDifferential:
         """max(d²Ψ/dJ², 0)."""
-        return VolumetricTangent(jnp.maximum(self.tangent(J).stiffness, 0))
+        return VolumetricDifferential(jnp.maximum(self.stress_differential(J).stiffness, 0))
 
-    def tangent_eigenvalues(self, J: Array, /, dim: int, *, total: bool) -> Float[Array, "m p"]:
+    def stiffness_eigenvalues(self, J: Array, /, dim: int, *, total: bool) -> Float[Array, "m p"]:
         """The one of d/dJ(JΨ') J tr(L) I that is not zero, d times the factor."""
         del total
-        return dim * (self.tangent(J).stiffness * J * J + J * self.stress(J))[None]
+        return dim * (self.stress_differential(J).stiffness * J * J + J * self.stress(J))[None]
 
 
 class Tait(AbstractVolumetric):
@@ -70,10 +70,10 @@ class Tait(AbstractVolumetric):
     def stress(self, J: Array, /) -> Array:
         return self.bulk_modulus / self.exponent * (1 - self._acting(J) ** -self.exponent)
 
-    def tangent(self, J: Array, /) -> VolumetricTangent:
+    def stress_differential(self, J: Array, /) -> VolumetricDifferential:
         """d²Ψ/dJ² = K J^{−1−γ}."""
         stiffness = self.bulk_modulus * self._acting(J) ** (-1 - self.exponent)
-        return VolumetricTangent(stiffness if self.tension else jnp.where(J > 1, 0, stiffness))
+        return VolumetricDifferential(stiffness if self.tension else jnp.where(J > 1, 0, stiffness))
 
     def is_admissible(self, J: Array, /) -> Bool[Array, "p"]:
         return J > 0

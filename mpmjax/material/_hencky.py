@@ -10,9 +10,9 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
 from mpmjax.checks import require_moduli
 from mpmjax.linalg import Logarithm, PowerLessOne
+from mpmjax.material._differential import IsotropicDifferential, PrincipalDifferential
 from mpmjax.material._elastic import AbstractIsotropic
 from mpmjax.material._law import AbstractInelastic
-from mpmjax.material._tangent import IsotropicTangent, PrincipalTangent
 
 _log = Logarithm()
 
@@ -52,10 +52,10 @@ class Hencky(AbstractIsotropic):
         kirchhoff = 2 * self.shear_modulus * strain + self.lame_lambda * dilation * la.identity_like(F)
         return la.matmul(la.cofactor(F), kirchhoff) / la.determinant(F)
 
-    def tangent(self, F: Matrix) -> IsotropicTangent:
-        return IsotropicTangent(self, F)
+    def stress_differential(self, F: Matrix) -> IsotropicDifferential:
+        return IsotropicDifferential(self, F)
 
-    def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
+    def principal_differential(self, s: Float[Array, "d *p"]) -> PrincipalDifferential:
         """With τ_i = 2μ ln s_i + λ (ln J + (3 − d) ε_t): scaling (2μ δ_ij + λ)/(s_i s_j) − δ_ij τ_i/s_i², twist
         (τ_i/s_i + τ_j/s_j)/(s_i + s_j), flip (2μ s_j ln(s_i/s_j)/(s_i − s_j) − τ_j)/(s_i s_j)."""
         mu, lam = self.shear_modulus, self.lame_lambda * jnp.ones_like(s[0])
@@ -71,7 +71,7 @@ class Hencky(AbstractIsotropic):
         def flip(i: int, j: int) -> Array:
             return (2 * mu * s[j] * _log.slope(s[j], s[i]) - tau[j]) / (s[i] * s[j])
 
-        return PrincipalTangent.of(s, twist, flip, scaling)
+        return PrincipalDifferential.of(s, twist, flip, scaling)
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         return la.determinant(F) > 0

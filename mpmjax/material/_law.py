@@ -11,10 +11,10 @@ import numpy as np
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix, PerParticle, Scalar, components
 from mpmjax.checks import require
-from mpmjax.material._tangent import (
-    AbstractTangent,
-    MatrixTangent,
-    PrincipalTangent,
+from mpmjax.material._differential import (
+    AbstractDifferential,
+    MatrixDifferential,
+    PrincipalDifferential,
     is_isotropic,
     projected_matrix,
 )
@@ -116,6 +116,10 @@ class AbstractLaw(eqx.Module):
     """Whether the volumes of its particles may be averaged (see `AveragedVolume`)."""
     relaxes_stress: ClassVar[bool] = False
     """Whether its return map changes the stress, so that implicit solves resist by another one than the law's."""
+    viscosity: ClassVar[Viscosity | None] = None
+    """The viscosity beside the law."""
+    freedom: ClassVar[Freedom | None] = None
+    """Degrees of freedom of a rigid body; None for deformable laws."""
 
     def hardly_changes_volume(self) -> bool:
         """Whether its bulk modulus is over 9.6 times its shear modulus (ν from 0.45 on). Default: by the attributes
@@ -165,14 +169,6 @@ class AbstractLaw(eqx.Module):
             return False
         return all(a.shape == b.shape for a, b in zip(jax.tree.leaves(initial), jax.tree.leaves(history), strict=True))
 
-    def viscous_part(self) -> Viscosity | None:
-        """The viscosity beside the law; None without."""
-        return None
-
-    def freedom(self) -> Freedom | None:
-        """Degrees of freedom of a rigid body; None for deformable laws."""
-        return None
-
     def title(self) -> str:
         """The law's name in messages."""
         return type(self).__name__
@@ -221,12 +217,12 @@ class AbstractMaterial(AbstractLaw):
         dΨ/dJ, minus the pressure. Default: the energy's gradient."""
         return jax.grad(lambda F: _density(self, F).sum())(F)
 
-    def tangent(self, F: Matrix, /) -> AbstractTangent:
+    def stress_differential(self, F: Matrix, /) -> AbstractDifferential:
         """The stress differential ∂²Ψ/∂F∂F at F, a symmetric map. Default: its matrix, by the derivative of the stress
         in each of the d² directions."""
-        return MatrixTangent(la.matrix_of(lambda dF: jax.jvp(self.stress, (F,), (dF,))[1], F))
+        return MatrixDifferential(la.matrix_of(lambda dF: jax.jvp(self.stress, (F,), (dF,))[1], F))
 
-    def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
+    def principal_differential(self, s: Float[Array, "d *p"]) -> PrincipalDifferential:
         """The eigenstructure of the stress differential at signed principal stretches, which `stable_dt` and
         `AnalyticHessian(projected=True)` need.
 
@@ -242,29 +238,29 @@ class AbstractMaterial(AbstractLaw):
             s: signed principal stretches [-], shape (d, *p).
         """
         F = la.diagonal(s)
-        A, d = la.matrix_of(self.tangent(F), F), len(s)
+        A, d = la.matrix_of(self.stress_differential(F), F), len(s)
         A = jnp.where(is_isotropic(self, F), A, jnp.nan)
 
         def entry(i: int, j: int, k: int, l: int) -> Array:  # noqa: E741
             return A[i * d + j, k * d + l]
 
-        return PrincipalTangent.of(
+        return PrincipalDifferential.of(
             s,
             twist=lambda i, j: (entry(i, j, i, j) + entry(j, i, j, i)) / 2 - entry(i, j, j, i),
             flip=lambda i, j: (entry(i, j, i, j) + entry(j, i, j, i)) / 2 + entry(i, j, j, i),
             scaling=lambda i, j: entry(i, i, j, j),
         )
 
-    def projected_tangent(self, F: Matrix, /) -> AbstractTangent:
+    def projected_differential(self, F: Matrix, /) -> AbstractDifferential:
         """The stress differential with its negative eigenvalues set to zero (J. Teran, E. Sifakis, G. Irving,
         R. Fedkiw, SCA 2005, doi 10.1145/1073368.1073394): of the positive semi-definite maps, the nearest to it.
 
-        *When it breaks*: the law must be isotropic; where it has no `principal_tangent` of its own and is not, a
+        *When it breaks*: the law must be isotropic; where it has no `principal_differential` of its own and is not, a
         `RuntimeError` says so. Second derivatives are refused. Where an eigenvalue is zero the map has a kink; the
         derivative given is the mean of the two sides, which is what a central difference tends to. At F = I that is
         so: all twists are zero.
         """
-        if type(self).principal_tangent is AbstractMaterial.principal_tangent:
+        if type(self).principal_differential is AbstractMaterial.principal_differential:
             name = type(self).__name__
             F = eqx.error_if(
                 F,
@@ -272,15 +268,15 @@ class AbstractMaterial(AbstractLaw):
                 f"{name} is not isotropic, and the projected Hessian needs a law that is: take AnalyticHessian() "
                 f"without projection or JvpHessian(), or write {name}'s energy in invariants of FᵀF.",
             )
-        return MatrixTangent(projected_matrix(self, F))
+        return MatrixDifferential(projected_matrix(self, F))
 
-    def tangent_eigenvalues(self, F: Matrix, /, dim: int, *, total: bool) -> Float[Array, "m p"]:
+    def stiffness_eigenvalues(self, F: Matrix, /, dim: int, *, total: bool) -> Float[Array, "m p"]:
         """Eigenvalues [Pa] of the tangent L ↦ (∂²Ψ/∂F∂F : (L F)) Fᵀ + τ Lᵀ, L = ∇v, τ = P Fᵀ, made symmetric; in the
         total description of ∂²Ψ/∂F∂F. The largest, which `stable_dt` needs, is among them."""
         del dim
         # in the principal frame the map is d x d on the diagonal and 2 x 2 on (L_ij, L_ji) for each pair
         _, s, _ = la.principal_frame(F)
-        tangent = self.principal_tangent(s)
+        tangent = self.principal_differential(s)
         d = s.shape[0]
         if total:
             pull, tau = jnp.ones_like(s), jnp.zeros_like(s)
@@ -305,8 +301,8 @@ class AbstractMaterial(AbstractLaw):
         none = jnp.asarray(of_one, F.dtype)[..., None]
         none = jnp.broadcast_to(none, (*of_one.shape, 1 if alike else F.shape[-1]))
         if none.ndim == 1:
-            return self.tangent(none)(jnp.ones_like(none))
-        return self.tangent(none)(jnp.zeros_like(none).at[0, 0].set(1))[0, 0]
+            return self.stress_differential(none)(jnp.ones_like(none))
+        return self.stress_differential(none)(jnp.zeros_like(none).at[0, 0].set(1))[0, 0]
 
     def is_admissible(self, F: Deformation, /) -> Bool[Array, "p"]:
         """Whether the law is defined at a deformation, shape (p,). Default: where its energy is finite."""

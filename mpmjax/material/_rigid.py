@@ -47,7 +47,9 @@ class Rigid(AbstractMaterial):
             f"Rigid's free directions must be one bool for each of the scene's, got {self.free}.",
         )
 
-    def freedom(self) -> Freedom:
+    @property
+    def freedom(self) -> Freedom:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Where it may move, and whether it may turn."""
         return Freedom(self.free, self.turns)
 
     def energy(self, F: Matrix) -> Array:

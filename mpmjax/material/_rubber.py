@@ -10,8 +10,8 @@ from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix, PerParticle, Scalar
 from mpmjax.checks import as_plain, require, require_fields, require_finite, require_positive, require_that
 from mpmjax.linalg import PowerLessOne
+from mpmjax.material._differential import IsotropicDifferential, PrincipalDifferential
 from mpmjax.material._law import AbstractMaterial
-from mpmjax.material._tangent import IsotropicTangent, PrincipalTangent
 
 
 class Work(NamedTuple):
@@ -63,10 +63,10 @@ class AbstractRubber(AbstractMaterial):
             S = S + exponent * part.slope * (strain - E / 3 * identity)
         return la.matmul(la.cofactor(F), S) / J
 
-    def tangent(self, F: Matrix) -> IsotropicTangent:
-        return IsotropicTangent(self, F)
+    def stress_differential(self, F: Matrix) -> IsotropicDifferential:
+        return IsotropicDifferential(self, F)
 
-    def principal_tangent(self, s: Float[Array, "d *p"]) -> PrincipalTangent:
+    def principal_differential(self, s: Float[Array, "d *p"]) -> PrincipalDifferential:
         """With p_i = λ̄_i^α − 1 and e_i = p_i − E/3: τ_i = Σ_k w' α e_i + K/2 (J² − 1),
         ∂τ_i/∂ln s_j = Σ_k α² (w'' e_i e_j + w' ((1 + p_i)(δ_ij − 1/3) − e_j/3)) + K J²; scaling
         (∂τ_i/∂ln s_j − δ_ij τ_i)/(s_i s_j), twist (τ_i/s_i + τ_j/s_j)/(s_i + s_j), flip
@@ -98,7 +98,7 @@ class AbstractRubber(AbstractMaterial):
             slope = sum(a * w.slope * power.slope(s[j], s[i]) for a, w, power, _, _ in terms)
             return (s[j] * slope - tau[j]) / (s[i] * s[j])
 
-        return PrincipalTangent.of(s, twist, flip, scaling)
+        return PrincipalDifferential.of(s, twist, flip, scaling)
 
     def is_admissible(self, F: Matrix) -> Bool[Array, "p"]:
         return la.determinant(F) > 0

@@ -157,7 +157,9 @@ class AveragedDeformation(eqx.Module):
         share = tau / self.dim
         return self.average(share / self.mean) - share / self.ratio
 
-    def tangent(self, P: Matrix, tangent: Callable[[Matrix], Matrix], *, definite: bool) -> "AveragedTangent":
+    def stress_differential(
+        self, P: Matrix, tangent: Callable[[Matrix], Matrix], *, definite: bool
+    ) -> "AveragedDifferential":
         """The derivative of `stress`.
 
         Args:
@@ -168,7 +170,7 @@ class AveragedDeformation(eqx.Module):
         """
         P = jnp.zeros_like(P) if definite else P
         tau = la.double_dot(P, self.averaged)
-        return AveragedTangent(self, P, tau, self.pull(tau), la.cofactor(self.F), tangent)
+        return AveragedDifferential(self, P, tau, self.pull(tau), la.cofactor(self.F), tangent)
 
 
 def averaged_deformation(average: VolumeAverage, F: Matrix) -> AveragedDeformation:
@@ -178,7 +180,7 @@ def averaged_deformation(average: VolumeAverage, F: Matrix) -> AveragedDeformati
     return AveragedDeformation(average, F, ratio, mean, (mean / ratio) ** (1 / F.shape[0]))
 
 
-class AveragedTangent(eqx.Module):
+class AveragedDifferential(eqx.Module):
     """The symmetric map V0 δF ↦ V0 δP of all particles of a material together, by the part of each particle, a
     symmetric map of (δF_p, δJ̄_p), and the average δJ̄ = S V0 (cof F : δF)."""
 
@@ -239,7 +241,7 @@ class AveragedStiffness(AbstractStiffness):
 
         flux = K g + b δJ̄ + V0 c S (b : g + k δJ̄)
 
-    (see `AveragedTangent`)."""
+    (see `AveragedDifferential`)."""
 
     rows: tuple[int, int] = eqx.field(static=True)
     """First particle and the one after the last."""

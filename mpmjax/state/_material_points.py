@@ -7,10 +7,10 @@ import jax.numpy as jnp
 
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Deformation, Float, Matrix
-from mpmjax.material import AbstractMaterial, AbstractTangent, Viscosity
+from mpmjax.material import AbstractDifferential, AbstractMaterial, Viscosity
 from mpmjax.native import materialised
 from mpmjax.potential import AbstractStiffness
-from mpmjax.state._averaged_volume import AveragedTangent, VolumeAverage, averaged_deformation
+from mpmjax.state._averaged_volume import AveragedDifferential, VolumeAverage, averaged_deformation
 
 
 class MaterialPoints(eqx.Module):
@@ -46,7 +46,7 @@ class MaterialPoints(eqx.Module):
         at = averaged_deformation(self.average, F)
         return at.stress(_stress(self.law, at.averaged))
 
-    def tangent(
+    def stress_differential(
         self,
         F: Deformation,
         of_law: Callable[[AbstractMaterial, Deformation], Callable[[Deformation], Deformation]],
@@ -63,7 +63,7 @@ class MaterialPoints(eqx.Module):
         if self.average is None:
             return of_law(self.law, F)
         at = averaged_deformation(self.average, F)
-        return at.tangent(_stress(self.law, at.averaged), of_law(self.law, at.averaged), definite=definite)
+        return at.stress_differential(_stress(self.law, at.averaged), of_law(self.law, at.averaged), definite=definite)
 
     def is_admissible(self, F: Deformation) -> Bool[Array, "q"]:
         """Whether the law is defined at deformations F, shape (q,)."""
@@ -80,35 +80,36 @@ class MaterialPoints(eqx.Module):
         tr(∇u) J."""
         return gradient if self.total else self.law.measure.change(gradient, self.deformation)
 
-    def flux(self, P: Deformation, dim: int) -> Matrix:
-        """The flux of a stress P [J], shape (d, d, q), V0 P Fᵀ, of which the force is the sum, f_i = −Σ_p (V0 P Fᵀ)
-        g_ip: the transpose of `change`. In the total description V0 P; by P = dΨ/dJ it is V0 P J I."""
+    def weighted_stress(self, P: Deformation, dim: int) -> Matrix:
+        """V0 P Fᵀ [J], a stress P weighted with the volume, shape (d, d, q), whose sum is the force,
+        f_i = −Σ_p (V0 P Fᵀ) g_ip: the transpose of `change`. In the total description V0 P; by P = dΨ/dJ it is
+        V0 P J I."""
         P = materialised(self.volume * P)
         return P if self.total else self.law.measure.kirchhoff_stress(P, self.deformation, dim)
 
     def stiffness(
         self, tangent: Callable[[Deformation], Deformation], dim: int
     ) -> tuple[Float[Array, "t q"], tuple[AbstractStiffness, ...]]:
-        """The upper triangle of the symmetric matrix of ∇u ↦ `flux` of the stress differential [J], row by row, shape
-        (d²(d² + 1)/2, q), and what couples the particles besides. Rows and columns are the components of ∇u, the
-        derivative's direction first.
+        """The upper triangle of the symmetric matrix of ∇u ↦ `weighted_stress` of the stress differential [J], row by
+        row, shape (d²(d² + 1)/2, q), and what couples the particles besides. Rows and columns are the components of ∇u,
+        the derivative's direction first.
 
         Args:
             tangent: the stress differential δF ↦ δP.
             dim: d.
         """
         coupled: tuple[AbstractStiffness, ...] = ()
-        if isinstance(tangent, AveragedTangent):
-            coupled = (tangent.stiffness(self.rows, lambda P: la.transpose(self.flux(P, dim))),)
+        if isinstance(tangent, AveragedDifferential):
+            coupled = (tangent.stiffness(self.rows, lambda P: la.transpose(self.weighted_stress(P, dim))),)
             tangent = tangent.at_fixed_means
         like = jnp.zeros((dim, dim, *self.volume.shape), self.volume.dtype)
-        if isinstance(tangent, AbstractTangent) and self.deformation.ndim == like.ndim:
+        if isinstance(tangent, AbstractDifferential) and self.deformation.ndim == like.ndim:
             A = la.identity_like(like) if self.total else self.deformation
             if (closed := tangent.pushed_forward(A, self.volume)) is not None:
                 return closed, coupled
 
         def flux_of(slopes: Matrix) -> Matrix:
-            return la.transpose(self.flux(tangent(self.change(la.transpose(slopes))), dim))
+            return la.transpose(self.weighted_stress(tangent(self.change(la.transpose(slopes))), dim))
 
         return la.upper_triangle(la.matrix_of(flux_of, like)), coupled
 
@@ -120,12 +121,12 @@ class MaterialPoints(eqx.Module):
         """Λ of each particle [Pa], shape (q,) (see `stable_dt`). Where volumes are averaged, the larger of Λ and its
         average: the average A, of weights V0 A symmetric, has Σ V0 Λ (A J)² ≤ Σ V0 (A Λ) J²."""
         F = self.strained(self.deformation)
-        elastic = self.law.tangent_eigenvalues(F, dim, total=self.total).max(axis=0)
+        elastic = self.law.stiffness_eigenvalues(F, dim, total=self.total).max(axis=0)
         return elastic if self.average is None else jnp.maximum(elastic, self.average(elastic))
 
-    def viscous_flux(self, gradient: Matrix) -> Matrix:
+    def weighted_viscous_stress(self, gradient: Matrix) -> Matrix:
         """|J| V0 σ_v [J], whose sum over g_ip is D v (derivation, eq. 28), at a velocity gradient ∇v [1/s], both of
-        shape (d, d, q). In the total description σ_v is of L = ∇v F⁻¹, and the flux |J| V0 σ_v F⁻ᵀ. The map is
+        shape (d, d, q). In the total description σ_v is of L = ∇v F⁻¹, and |J| V0 σ_v F⁻ᵀ is returned. The map is
         symmetric and positive semi-definite."""
         if self.viscosity is None:
             return jnp.zeros_like(gradient)

@@ -285,7 +285,7 @@ class Scene(eqx.Module):
         """The materials that are rigid bodies."""
         layers = (0,) * len(self.laws) if self.bodies is None else self.bodies.numbers(len(self.laws))
         candidates = (
-            (number, layer, law.freedom()) for number, (law, layer) in enumerate(zip(self.laws, layers, strict=True))
+            (number, layer, law.freedom) for number, (law, layer) in enumerate(zip(self.laws, layers, strict=True))
         )
         return tuple(RigidMaterial(n, layer, freedom) for n, layer, freedom in candidates if freedom is not None)
 
@@ -298,7 +298,7 @@ class Scene(eqx.Module):
     @property
     def keeps_gradient(self) -> bool:
         """Whether particles keep the velocity gradient C: for the transfer, or for a viscosity."""
-        return self.transfer.affine or any(law.viscous_part() is not None for law in self.laws)
+        return self.transfer.affine or any(law.viscosity is not None for law in self.laws)
 
     def material_points(self, particles: Particles, t: Scalar = 0.0) -> tuple[MaterialPoints, ...]:
         """The materials of prepared particles at time t [s], with the elastic laws in force."""
@@ -309,7 +309,7 @@ class Scene(eqx.Module):
                 deformation=group.deformation(),
                 total=self.total,
                 rows=group.rows,
-                viscosity=law.viscous_part(),
+                viscosity=law.viscosity,
             )
             for law, group in zip(self.laws, particles.groups, strict=True)
         )

@@ -8,7 +8,6 @@ from mpmjax.boundary import (
     Impulses,
     OwnedCouple,
     OwnedImpulse,
-    brought_images,
     owners_of,
     received_impulses,
     taken_by_mirrors,
@@ -75,7 +74,8 @@ def impulse_on_boundaries(
         elastic = elastic_impulse(unfolded, method, whole)
     residual = reaction(unfolded, whole, elastic)
     grid, window, dt = scene.grid, scene.window(particles), nodes.dt
-    images = brought_images(scene.boundary, grid, window, t, dt)
+    each = enumerate(scene.boundary)
+    images = [(n, image) for n, boundary in each for image in boundary.mirror_images(grid, window, t, dt)]
     contacts = list(zip(nodes.brought_by, nodes.contacts, held.active, strict=True))
     unfold = nodes.mirror.unfold
     at = scene.nodes(particles, t)

@@ -242,6 +242,8 @@ class ImplicitMidpoint(AbstractImplicitIntegrator):
     *When it breaks*: as `SemiImplicit`. One linear solve fails at large strains in a step, and under compression at
     twice the Δt at which β = 1 does. The line search of Newton's method keeps the middle of the step admissible, not
     its end. Unresolved oscillations (from an impact, or a start under load at a large Δt) go on; `TRBDF2` damps them.
+    Where a wall's push oscillates so does what its friction can hold: near the limit a block creeps (pushed by 0.12 g
+    in steps of 7 dx/c, by 4 mm/s at μ = 0.15 and not at all at 0.3).
 
     *Good values*: a Δt that resolves the motion of interest, tens of steps a period, whatever the explicit limit.
 
@@ -282,9 +284,10 @@ class TRBDF2(AbstractImplicitIntegrator):
 
     It is for motion to be followed in time in which unresolved frequencies would ring, as in contact and stiff starts.
 
-    *When it breaks*: as `ImplicitMidpoint`. Friction acts after both stages, so what it should hold creeps: a block of
-    1e6 Pa, 0.3 m long and pushed by 0.12 g on a floor of μ = 0.15, by 2.4 mm/s in steps of 0.01 s. `SemiImplicit` and
-    `BackwardEuler` hold it.
+    *When it breaks*: as `ImplicitMidpoint`. Friction moves nodes after both stages, by a displacement to which the
+    body answers in the next step only. In steps of several dx/c what it should hold creeps, rough floors or not: a
+    block of 1e6 Pa, 0.3 m long and pushed by 0.12 g, in steps of 7 dx/c by 20 mm/s at μ = 0.15 and 62 mm/s at μ = 0.3,
+    in half of them by 2 mm/s (`benchmarks/audit.py`). `SemiImplicit` and `BackwardEuler` hold it.
 
     Args:
         rho: ρ∞, from 0 to 1.
@@ -322,7 +325,7 @@ class TRBDF2(AbstractImplicitIntegrator):
         return NodeMotion(v, mean, inner, mean if viscous else None), first.together_with(second)
 
     def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector | None], ...]:
-        """Those at 0, γΔt and Δt."""
+        """Stages at 0, γΔt and Δt."""
         _, q0, q1, q2 = self.weights()
         inner = motion.carrier if motion.inner is None else motion.inner
         return (q0, None), (q1, nodes.dt * inner), (q2, nodes.dt * motion.carrier)

@@ -13,7 +13,6 @@ from mpmjax.boundary import (
     AbstractNodes,
     Conditions,
     FreeNormal,
-    brought_contacts,
     combined_conditions,
     mirror,
 )
@@ -206,9 +205,9 @@ def particles_to_grid(
     C = None if particles.C is None else components(particles.C)
     joined = joined and (stencil.is_least_squares or not scene.transfer.affine) and not scene.rigid_bodies
     potential = ElasticPotential(scene.material_points(particles, t), stencil, Mirror(()), size)
-    flux = potential.current_flux()  # V P Fᵀ, of which the internal force is −Σ_p flux_p g_ip
+    flux = potential.current_weighted_stress()  # V P Fᵀ, of which the internal force is −Σ_p flux_p g_ip
     if explicit_viscosity and C is not None and potential.material_viscous:
-        flux = flux + potential.viscous_flux(C)
+        flux = flux + potential.weighted_viscous_stress(C)
     gravity, body_force = jnp.asarray(scene.gravity), None
     if scene.body_force is not None:
         x = particles.x + body_force_at * dt * particles.v if body_force_at else particles.x
@@ -266,7 +265,8 @@ def with_boundaries(
     faces = None
     if any(boundary.pushes or boundary.sees_faces for boundary in scene.boundary):
         faces = faces_of(scene, particles, potential, t, dt, force_at)
-    brought = brought_contacts(scene.boundary, faces, grid, window, t, dt)
+    each = enumerate(scene.boundary)
+    brought = [(n, contact) for n, boundary in each for contact in boundary.contacts(faces, grid, window, t, dt)]
     contacts, brought_by = [contact for _, contact in brought], [number for number, _ in brought]
     if scene.bodies is not None:
         images = mirror(scene.boundary, grid, window)

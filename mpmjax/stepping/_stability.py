@@ -48,7 +48,7 @@ def stable_dt(
     section 12). So Δt is the least over particles of Δt² = 4 ρ0 / (Λ (2Ξ − κa)) (eq. 32), where
 
     - Λ is the largest eigenvalue of the symmetric part of the present tangent L ↦ ∂²Ψ/∂F∂F : (L F) Fᵀ + τ Lᵀ with
-      L = ∇v and τ = P Fᵀ, by `principal_tangent`; in the total description, that of ∂²Ψ/∂F∂F. Stretching and
+      L = ∇v and τ = P Fᵀ, by `principal_differential`; in the total description, that of ∂²Ψ/∂F∂F. Stretching and
       compression raise it. With averaged volumes it is that at F̄, or its average where that is larger.
     - Ξ bounds Σ_i g_ip g_ipᵀ/w_ip. It is a for the moving-least-squares gradient. For the spline's gradient it is the
       value at the particle in the total description, and in the updated one, where particles move, the largest value

@@ -172,7 +172,8 @@ def force_error(
     exact = elastic if exact is None else exact
     if yields:  # the solve's forces went the share θ of the way to the trial stress, the law's go to the returned one
         tried, returned = (
-            replace(nodes.potential, material_points=scene.material_points(q)).current_flux() for q in (trial, after)
+            replace(nodes.potential, material_points=scene.material_points(q)).current_weighted_stress()
+            for q in (trial, after)
         )
         exact = exact + force_at * nodes.dt * nodes.potential.nodal_sum(tried - returned)
         # what slows flow counts however small it is beside the momentum of what flows, but for its rounding

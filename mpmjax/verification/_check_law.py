@@ -10,7 +10,7 @@ import numpy as np
 from mpmjax import linalg as la
 from mpmjax._types import Array, Bool, Float, Matrix
 from mpmjax.checks import canonical, require, require_positive
-from mpmjax.material import AbstractLaw, AbstractMaterial, MatrixTangent
+from mpmjax.material import AbstractLaw, AbstractMaterial, MatrixDifferential
 
 _CHECKED = (
     "the energy",
@@ -18,9 +18,9 @@ _CHECKED = (
     "the derivative of the energy's gradient",
     "the energy after a rotation of space",
     "stress",
-    "tangent",
-    "the derivative of tangent by F and the law's parameters",
-    "principal_tangent",
+    "stress_differential",
+    "the derivative of stress_differential by F and the law's parameters",
+    "principal_differential",
 )
 """The checks, in this order; the last only for a law that overrides it."""
 
@@ -31,8 +31,8 @@ def check_law(law: AbstractLaw, *, dim: int = 3, F: Any = None, rtol: float = 1e
     The check is in float64, at each deformation that the law admits:
 
     - The energy is finite, and a rotation of space does not change it.
-    - `stress` is the gradient of the energy, `tangent` the derivative of that, and `principal_tangent` its
-      eigenstructure, as in the defaults of `AbstractMaterial`. Differences are relative to the size of the stress
+    - `stress` is the gradient of the energy, `stress_differential` the derivative of that, and `principal_differential`
+      its eigenstructure, as in the defaults of `AbstractMaterial`. Differences are relative to the size of the stress
       differential.
     - The derivatives of the stress differential by F and by the parameters of the law are finite.
 
@@ -82,14 +82,14 @@ class _OfVolume(AbstractMaterial):
     def stress(self, F: Matrix) -> Matrix:
         return self.law.stress(la.determinant(F)) * la.cofactor(F)
 
-    def tangent(self, F: Matrix) -> MatrixTangent:
+    def stress_differential(self, F: Matrix) -> MatrixDifferential:
         J, cofactor = la.determinant(F), la.cofactor(F)
 
         def differential(dF: Matrix) -> Matrix:
-            change = self.law.tangent(J)(la.double_dot(cofactor, dF))
+            change = self.law.stress_differential(J)(la.double_dot(cofactor, dF))
             return change * cofactor + self.law.stress(J) * la.cofactor_differential(F, dF)
 
-        return MatrixTangent(la.matrix_of(differential, F))
+        return MatrixDifferential(la.matrix_of(differential, F))
 
     def is_admissible(self, F: Matrix) -> Array:
         return self.law.is_admissible(la.determinant(F))
@@ -106,7 +106,7 @@ def _faults(law: AbstractMaterial, F: Matrix) -> tuple[Bool[Array, "p"], tuple[F
     U, s, V = la.principal_frame(F)
 
     def differential(law: AbstractMaterial, F: Matrix) -> Array:
-        return la.matrix_of(law.tangent(F), F)
+        return la.matrix_of(law.stress_differential(F), F)
 
     numbers, rest = eqx.partition(law, eqx.is_inexact_array)
     ones = jax.tree.map(jnp.ones_like, numbers)
@@ -125,14 +125,14 @@ def _faults(law: AbstractMaterial, F: Matrix) -> tuple[Bool[Array, "p"], tuple[F
         compared(differential(law, F), A),
         0 * _size(third),
     )
-    if type(law).principal_tangent is not base.principal_tangent:
+    if type(law).principal_differential is not base.principal_differential:
         faults += (compared(_assembled(law, U, s, V), A),)
     return law.is_admissible(F), faults
 
 
 def _assembled(law: AbstractMaterial, U: Matrix, s: Float[Array, "d p"], V: Matrix) -> Float[Array, "m m p"]:
-    """The stress differential at F = U diag(s) Vᵀ, assembled from `principal_tangent`."""
-    d, tangent = len(s), law.principal_tangent(s)
+    """The stress differential at F = U diag(s) Vᵀ, assembled from `principal_differential`."""
+    d, tangent = len(s), law.principal_differential(s)
     modes = la.principal_modes(U, V).reshape(d * d, d * d, -1)
     core = la.diagonal(jnp.concatenate([jnp.zeros_like(s), tangent.twist, tangent.flip]))
     core = core.at[:d, :d].set(tangent.scaling)

@@ -137,10 +137,10 @@ def tangent_spectra(scene, particles):
     pull = jnp.broadcast_to(jnp.eye(d)[..., None], F.shape) if scene.total else F
     tau = 0 * F if scene.total else jnp.einsum("ijp,kjp->ikp", law.stress(F), F)
     L = jnp.eye(d * d).reshape(-1, d, d)
-    image = jax.vmap(law.tangent(F))(jnp.einsum("mij,jkp->mikp", L, pull))
+    image = jax.vmap(law.stress_differential(F))(jnp.einsum("mij,jkp->mikp", L, pull))
     image = jnp.einsum("mijp,kjp->mikp", image, pull) + jnp.einsum("ijp,mkj->mikp", tau, L)
     (points,) = scene.material_points(particles)
-    found = points.law.tangent_eigenvalues(points.deformation, d, total=scene.total)
+    found = points.law.stiffness_eigenvalues(points.deformation, d, total=scene.total)
     return found, jnp.moveaxis(image.reshape(d * d, d * d, -1), -1, 0)
 
 
@@ -161,7 +161,7 @@ def fluid_spectra(scene, particles):
     d, (points,) = particles.dim, scene.material_points(particles)
     kirchhoff = lambda J: (J * points.law.stress(J)).sum()  # noqa: E731
     eye, J = jnp.eye(d).reshape(-1), points.deformation
-    return points.law.tangent_eigenvalues(J, d, total=False), (jax.grad(kirchhoff)(J) * J)[:, None, None] * jnp.outer(
+    return points.law.stiffness_eigenvalues(J, d, total=False), (jax.grad(kirchhoff)(J) * J)[:, None, None] * jnp.outer(
         eye, eye
     )
 

@@ -20,7 +20,7 @@ _ANISOTROPIC = 1e-4
 """Relative change of the energy by a rotation from which a law is anisotropic, well above rounding in float32."""
 
 
-class AbstractTangent(eqx.Module):
+class AbstractDifferential(eqx.Module):
     """The stress differential at one deformation: the linear map δF ↦ δP = ∂²Ψ/∂F∂F : δF (derivation, eq. 8).
 
     It holds everything that does not depend on δF, so that a solver that applies it many times computes that once.
@@ -38,7 +38,7 @@ class AbstractTangent(eqx.Module):
         return None
 
 
-class MatrixTangent(AbstractTangent):
+class MatrixDifferential(AbstractDifferential):
     """The stress differential as a d² x d² matrix for each particle."""
 
     matrix: Float[Array, "m m *p"]
@@ -48,7 +48,7 @@ class MatrixTangent(AbstractTangent):
         return la.matmul(self.matrix, dF.reshape(-1, 1, *dF.shape[2:])).reshape(dF.shape)
 
 
-class VolumetricTangent(AbstractTangent):
+class VolumetricDifferential(AbstractDifferential):
     """The stress differential of a law of J alone: δJ ↦ d²Ψ/dJ² δJ."""
 
     stiffness: Float[Array, "*p"]
@@ -58,7 +58,7 @@ class VolumetricTangent(AbstractTangent):
         return self.stiffness * dF
 
 
-class PrincipalTangent(eqx.Module):
+class PrincipalDifferential(eqx.Module):
     """The eigenstructure of an isotropic law's ∂²Ψ/∂F∂F at F = U diag(s) Vᵀ (B. Smith, F. de Goes, T. Kim, ACM Trans.
     Graph. 38 (2019) 3, doi 10.1145/3241041).
 
@@ -81,7 +81,7 @@ class PrincipalTangent(eqx.Module):
         twist: Callable[[int, int], Array],
         flip: Callable[[int, int], Array],
         scaling: Callable[[int, int], Array],
-    ) -> "PrincipalTangent":
+    ) -> "PrincipalDifferential":
         """From functions of the indices i, j at signed principal stretches s [-]: twist and flip of each pair i < j,
         and each entry of the scaling [Pa]."""
         d, none = s.shape[0], jnp.zeros((0, *s.shape[1:]), s.dtype)
@@ -93,11 +93,11 @@ class PrincipalTangent(eqx.Module):
         return cls(over_pairs(twist), over_pairs(flip), la.assemble(entries))
 
 
-class IsotropicTangent(AbstractTangent):
+class IsotropicDifferential(AbstractDifferential):
     """The stress differential as the derivative of an isotropic law's stress."""
 
     law: Any
-    """A law of F with `stress` and a closed form of `principal_tangent`."""
+    """A law of F with `stress` and a closed form of `principal_differential`."""
     F: Matrix
 
     def __call__(self, dF: Matrix) -> Matrix:
@@ -108,7 +108,7 @@ class IsotropicTangent(AbstractTangent):
 
 
 def isotropic_matrix(law: Any, F: Matrix, A: Matrix, weight: Float[Array, "*p"]) -> Float[Array, "t *p"]:
-    """`AbstractTangent.pushed_forward` by the law's `principal_tangent`.
+    """`AbstractDifferential.pushed_forward` by the law's `principal_differential`.
 
     With F = U diag(s) Vᵀ and R = A V, and of the eigenstructure the scaling S_ij and for each pair h and g, half the
     sum of flip and twist and half their difference, the matrix is
@@ -116,7 +116,7 @@ def isotropic_matrix(law: Any, F: Matrix, A: Matrix, weight: Float[Array, "*p"])
         K_(ba)(dc) = w (Σ_ij S_ij U_ai R_bi U_cj R_dj + Σ_i≠j U_ai R_bj (h_ij U_ci R_dj + g_ij U_cj R_di)).
     """
     d, (U, s, V) = len(F), la.principal_frame(F)
-    at = jax.tree.map(lambda part: weight * part, law.principal_tangent(s))
+    at = jax.tree.map(lambda part: weight * part, law.principal_differential(s))
     # barriers: factors, products of two components, are computed before the sums, and no component repeats them
     U, V, at = jax.lax.optimization_barrier((U, V, at))
     R, none = la.matmul(A, V), jnp.zeros_like(s[0])
@@ -168,7 +168,7 @@ def _projected_matrix_jvp(primals: tuple[Any, Matrix], tangents: tuple[Any, Matr
 
     def in_frame(law: Any, F: Matrix) -> Array:
         """Eᵀ A E, the frame held fixed."""
-        images = jax.vmap(law.tangent(F))(modes.reshape(-1, *F.shape)).reshape(modes.shape)
+        images = jax.vmap(law.stress_differential(F))(modes.reshape(-1, *F.shape)).reshape(modes.shape)
         return la.matmul(modes, jnp.swapaxes(images, 0, 1))
 
     change = eqx.filter_jvp(in_frame, primals, tangents)[1]
@@ -182,7 +182,7 @@ def _projected_matrix_jvp(primals: tuple[Any, Matrix], tangents: tuple[Any, Matr
 def _spectrum(law: Any, F: Matrix) -> tuple[Float[Array, "m *p"], Float[Array, "m m *p"]]:
     """Eigenvalues λ_k of ∂²Ψ/∂F∂F and its eigenvectors E_ka, a over components in C order."""
     U, s, V = la.principal_frame(F)
-    tangent = law.principal_tangent(s)
+    tangent = law.principal_differential(s)
     scalings, Q = la.symmetric_eigen(tangent.scaling)
     d, modes = F.shape[0], la.principal_modes(U, V)
     modes = modes.reshape(d * d, d * d, *F.shape[2:])

@@ -1,0 +1,233 @@
+"""Scenes with an exact answer in which an earlier version was wrong without a word: water at rest, a fluid that is
+thrown at a wall, what friction holds, a fit of a cylinder, a film of Bingham's fluid, clouds, a spinning disk.
+
+    python benchmarks/audit.py                   prints the tables (ten minutes alone on two cores)
+    python benchmarks/audit.py --only film       one of rest, thrown, friction, cylinder, film, clouds, disk
+"""
+
+import argparse
+import dataclasses
+import sys
+import warnings
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import mpmjax as mpm
+
+jax.config.update("jax_enable_x64", True)
+INF = np.inf
+WATER, G = 1e3, 10.0
+
+
+def walls_of(kind: str, lower: float, upper: float) -> tuple[mpm.boundary.AbstractBoundary, ...]:
+    """A vessel that is open above."""
+    if kind == "SeparatingBox":
+        return (mpm.SeparatingBox((lower, lower), (upper, INF)),)
+    if kind == "SlipBox":
+        return (mpm.SlipBox((lower, lower), (upper, INF)),)
+    plane = {"ContactPlane": mpm.ContactPlane, "SymmetryPlane": mpm.SymmetryPlane}[kind]
+    return plane(0, lower), plane(0, upper, keep="below"), plane(1, lower)
+
+
+def rest(cells: int = 8) -> None:
+    """Water that starts in its exact state stays in it: the error of the pressure and the centre's height."""
+    print("water at rest, K = 40 ρgH, after 2 s: wall, spacings from a node, times the explicit limit;")
+    print("rms error of the pressure over the last half second [% of ρgH] (in explicit steps")
+    print("mostly sound that still rings), height of the centre over the exact one")
+    dx, wide, deep = 1 / 16, cells / 16, cells / 32
+    modulus = 40 * WATER * G * deep
+
+    for kind, at, times in (
+        *(("SeparatingBox", at, times) for at in (0.0, 0.25, 0.5) for times in (0.7, 9.0)),
+        *((kind, at, times) for kind in ("ContactPlane", "SymmetryPlane") for at in (0.0, 0.5) for times in (0.7, 9.0)),
+    ):
+        low = at * dx
+        grid = mpm.Grid((cells + 10, cells + 12), dx, origin=(-4, -4))
+        water = mpm.fill(mpm.Box((low, low), (low + wide, low + deep)), grid, density=WATER)
+        scene = mpm.Scene(grid, mpm.Fluid(modulus), gravity=(0.0, -G), boundary=walls_of(kind, low, low + wide))
+        J = (1 + 7 * WATER * G * (deep + low - water.x[:, 1]) / modulus) ** (-1 / 7)
+        water = dataclasses.replace(water, deformations=(J,), volume=water.volume / J, mass=WATER * water.volume / J)
+
+        def error(scene, now, low=low):
+            pressure = -scene.laws[0].elastic(None).stress(now.F)
+            return jnp.sqrt(((pressure - WATER * G * (deep + low - now.x[:, 1])) ** 2).mean()) / (WATER * G * deep)
+
+        free = mpm.Scene(grid, scene.laws)
+        dt = times * float(mpm.stable_dt(free, water, safety=1.0))
+        method = mpm.Explicit() if times < 1 else mpm.SemiImplicit()
+        steps = round(2 / dt)
+        run = mpm.simulate(scene, water, t1=steps * dt, dt=dt, method=method, observe=error)
+        late = np.asarray(run.observed)[-max(steps // 4, 1) :]
+        rms = 100 * np.sqrt((late**2).mean())
+        level = float((run.final.x[:, 1].mean() - low) / (water.x[:, 1].mean() - low))
+        print(f"{kind:>14} {at:5.2f} {times:4.1f} | {rms:6.2f} {level:6.3f}", flush=True)
+
+
+def thrown() -> None:
+    """A fluid that falls on the floor of a vessel at its own speed of sound, without gravity."""
+    print("\na fluid thrown at 1 c on a SeparatingBox: step over dx/c, deepest centre [spacings behind it], least J")
+    dx = 1 / 32
+    low, high = 3 * dx, 37 * dx
+    grid = mpm.Grid((41, 41), dx)
+    fluid = mpm.fill(mpm.Box((0.4, 0.4), (0.8, 0.8)), grid, density=WATER, velocity=(0.0, -10.0))
+    scene = mpm.Scene(grid, mpm.Fluid(1e5), boundary=mpm.SeparatingBox((low, low), (high, high)))
+    for dt in (5e-4, 1e-4, 5e-5, 5e-6):
+        try:
+            run = mpm.simulate(
+                scene, fluid, t1=0.08, dt=dt, observe=lambda _, now: jnp.stack([now.x[:, 1].min(), now.F.min()])
+            )
+            lowest, least = np.asarray(run.observed).min(axis=0)
+            print(f"{dt * 10 / dx:8.4f} | {(low - lowest) / dx:6.3f} {least:6.3f}", flush=True)
+        except mpm.SimulationError as error:
+            print(f"{dt * 10 / dx:8.4f} | {error}", flush=True)
+
+
+def friction() -> None:
+    """A block that friction holds, pushed along the floor."""
+    print("\na block of 1e6 Pa that friction should hold: method, step [s], μ, push [g], creep [mm/s]")
+    grid = mpm.Grid((24, 12), 0.05, origin=(-4, -4))
+    block = mpm.fill(mpm.Box((0.0, 0.0), (0.3, 0.15)), grid, density=WATER)
+    for method in (mpm.SemiImplicit(), mpm.BackwardEuler(), mpm.ImplicitMidpoint(), mpm.TRBDF2()):
+        for dt, mu, push in ((0.01, 0.15, 0.12), (0.005, 0.15, 0.12), (0.01, 0.3, 0.12), (0.01, 0.15, 0.05)):
+            floor = mpm.SeparatingBox((-INF, 0.0), (INF, INF), friction=mu)
+            scene = mpm.Scene(grid, mpm.NeoHookean(1e6, 0.3), gravity=(push * 9.81, -9.81), boundary=floor)
+            steps = round(0.5 / dt)
+            before = mpm.rollout(scene, mpm.prepare(scene, block), steps=steps, dt=dt, method=method)
+            after = mpm.rollout(scene, before, steps=steps, dt=dt, method=method)
+            creep = float((after.x - before.x)[:, 0].mean()) / 0.5 * 1e3
+            print(f"{type(method).__name__:>16} {dt:6.3f} {mu:5.2f} {push:5.2f} | {creep:8.3f}", flush=True)
+
+
+def pressed(law: mpm.NeoHookean, stretches: np.ndarray, area: float) -> np.ndarray:
+    """The force [N] of a bar of a section that is free at its sides, by its stretch: the closed form."""
+
+    def force(stretch):
+        def side(_, wide):
+            def pull(wide):
+                return law.stress(jnp.diag(jnp.stack([wide, stretch, wide]))[..., None])[0, 0, 0]
+
+            return wide - pull(wide) / jax.grad(pull)(wide)
+
+        wide = jax.lax.fori_loop(0, 20, side, stretch**-0.5)
+        return area * law.stress(jnp.diag(jnp.stack([wide, stretch, wide]))[..., None])[1, 1, 0]
+
+    return np.asarray(jax.vmap(force)(jnp.asarray(stretches)))
+
+
+def cylinder() -> None:
+    """A silicone cylinder between smooth plates, pressed by a fifth of its height, and the fit of its modulus."""
+    print("\na silicone cylinder, 300 kPa in the closed form of its force: method, steps, the fit [kPa]")
+    radius, height, cells = 0.0145, 0.03, 4
+    dx = radius / cells
+    high = round(height / dx)  # whole cells
+    motion = mpm.Motion((0.0, 1.0), ((0.0, 0.0, 0.0), (0.0, -0.2 * high * dx, 0.0)))
+    plates = [mpm.SymmetryPlane(axis, 0.0) for axis in range(3)]
+    plates.append(mpm.SymmetryPlane(1, high * dx, keep="below", motion=motion))
+    grid = mpm.Grid((2 * cells + 6, high + 6, 2 * cells + 6), dx, origin=(-cells - 3, -3, -cells - 3))
+    region = mpm.Cylinder((0.0, 0.0, 0.0), (0.0, high * dx, 0.0), radius)
+    whole = mpm.fill(region, grid, particles_per_cell=8, density=1e3)
+    quarter = np.asarray((whole.x[:, 0] > 0) & (whole.x[:, 2] > 0))
+    silicone = mpm.Particles(whole.x[quarter], whole.v[quarter], whole.mass[quarter], whole.volume[quarter])
+    grid = mpm.Grid((cells + 6, high + 6, cells + 6), dx, origin=(-3, -3, -3))
+    area = float(silicone.volume.sum()) / (high * dx)
+    for method in (mpm.SemiImplicit(), mpm.ImplicitMidpoint()):
+        for steps in (10, 40):
+            times = np.linspace(0.2, 0.95, 16)
+            force = -pressed(mpm.NeoHookean(3e5, 0.45), 1 - 0.2 * times, area)  # up, on the plate
+            seen = mpm.Force(times, np.stack([0 * force, force, 0 * force], axis=1), boundary=3, sigma=0.01)
+            scene = mpm.Scene(
+                grid,
+                mpm.NeoHookean(2e5, 0.45),
+                boundary=tuple(plates),
+                boundary_forces=True,
+                description=mpm.TotalLagrangian(),
+            )
+            experiment = mpm.Experiment(scene, silicone, t1=1.0, dt=1.0 / steps, method=method, observations=seen)
+            result = mpm.fit(experiment, {"E": mpm.Positive(lambda e: e.scene.material.youngs_modulus)})
+            (E,) = result.estimates
+            print(f"{type(method).__name__:>16} {steps:3} | {E.value / 1e3:8.2f} ± {E.error / 1e3:.2f}", flush=True)
+
+
+def film(cells: int = 8) -> None:
+    """A film of Bingham's fluid on a floor that holds it, pulled along it: steady, its upper half is a plug."""
+    print("\na film of Bingham's fluid: steps over the explicit limit, speed of its surface over the exact one")
+    grid = mpm.Grid((4, cells + 8), 1 / cells, origin=(0, -4), periodic=(True, False))
+    law = mpm.HerschelBulkley(2e4, 0.3, yield_stress=50.0, consistency=50.0)  # ρ g h = 100 Pa at the floor
+    floor = mpm.StickyBox((-INF, 0.0), (INF, INF))
+    scene = mpm.Scene(grid, law, gravity=(0.1, 0.0), boundary=floor)
+    rest = mpm.fill(mpm.Box((0.0, 0.0), (4 / cells, 1.0)), grid, particles_per_cell=4, density=1e3)
+    exact = 1e3 * 0.1 * 0.5**2 / (2 * 50)
+    for times, method in ((0.7, mpm.Explicit()), (1.0, mpm.SemiImplicit()), (5.0, mpm.SemiImplicit())):
+        dt = times * float(mpm.stable_dt(scene, rest, safety=1.0))
+        with warnings.catch_warnings(record=True) as heard:
+            warnings.simplefilter("always")
+            run = mpm.simulate(scene, rest, t1=round(20 / dt) * dt, dt=dt, method=method)
+        surface = float(run.final.v[np.asarray(run.final.x[:, 1]) > 0.8, 0].mean()) / exact
+        print(f"{times:4.1f} | {surface:6.3f}", *(f"\n     {w.message}" for w in heard), flush=True)
+
+
+def clouds(count: int = 40) -> None:
+    """Six particles in the square that they fill, stretched: whether the linearised step grows at `stable_dt`."""
+    sys.path[:0] = [str(Path(__file__).parents[1] / path) for path in ("tests", "tests/validation")]
+    from test_stability import eigenvalues
+
+    print("\nclouds of six particles, stretched by 1 to 2.6: ν, least real eigenvalue of a step at 0.999 of stable_dt")
+    rng, dx = np.random.default_rng(1), 1.0
+    for nu in (0.3, 0.45, 0.49, 0.4999):
+        least = []
+        for _ in range(count // 4):
+            stretch = np.exp(rng.uniform(0, np.log(2.6), 2))
+            turn = np.linalg.qr(rng.normal(size=(2, 2)))[0]
+            F = turn @ np.diag(stretch) @ turn.T
+            side = np.sqrt(1.5 * stretch.prod()) * rng.uniform(1.0, 1.3)
+            x, same = jnp.asarray(side * rng.uniform(-0.5, 0.5, (6, 2))), jnp.full(6, 0.25)
+            scene = mpm.Scene(mpm.Grid((9, 9), dx, origin=(-4, -4)), mpm.NeoHookean(1.0, nu))
+            cloud = mpm.Particles(x, 0 * x, same, same, deformations=(jnp.tile(jnp.asarray(F), (6, 1, 1)),))
+            dt = 0.999 * mpm.stable_dt(scene, cloud, safety=1.0)
+            least.append(eigenvalues(scene, cloud, dt).real.min())
+        print(f"{nu:7.4f} | {min(least):8.4f}", flush=True)
+
+
+def disk() -> None:
+    """A stiff disk that is given the velocities of a spin of 2 rad/s, for 0.4 s."""
+    print("\na disk that spins, by velocities alone: transfer, cells across; angle over ωt, kinetic energy left")
+    omega, t1, dx = 2.0, 0.4, 0.1
+    for radius in (0.3, 0.6):
+        n = round(2 * radius / dx) + 10
+        grid, c = mpm.Grid((n + 1, n + 1), dx), n * dx / 2
+        still = mpm.fill(mpm.Ball((c, c), radius), grid, density=1e3)
+        arm = np.asarray(still.x) - c
+        spinning = eqx.tree_at(lambda q: q.v, still, omega * jnp.stack([-arm[:, 1], arm[:, 0]], axis=1))
+        for transfer in (mpm.APIC(), mpm.FLIP(1.0)):
+            scene = mpm.Scene(grid, mpm.NeoHookean(1e6, 0.3), transfer=transfer)
+            start = mpm.prepare(scene, spinning)
+            dt = t1 / np.ceil(t1 / float(mpm.stable_dt(scene, start)))
+            final = mpm.simulate(scene, start, t1=t1, dt=dt).final
+            end = np.asarray(final.x) - c
+            turned = np.arctan2((arm[:, 0] * end[:, 1] - arm[:, 1] * end[:, 0]).sum(), (arm * end).sum())
+            kinetic = float(mpm.energy(scene, final).kinetic / mpm.energy(scene, start).kinetic)
+            name = type(transfer).__name__
+            print(f"{name:>5} {2 * radius / dx:3.0f} | {turned / (omega * t1):6.4f} {kinetic:6.4f}", flush=True)
+
+
+TABLES = {
+    "rest": rest,
+    "thrown": thrown,
+    "friction": friction,
+    "cylinder": cylinder,
+    "film": film,
+    "clouds": clouds,
+    "disk": disk,
+}
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", choices=TABLES, help="one table")
+    options = parser.parse_args()
+    for name, table in TABLES.items():
+        if options.only in (None, name):
+            table()
