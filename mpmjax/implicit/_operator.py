@@ -94,8 +94,9 @@ class ImplicitOperator(lx.AbstractLinearOperator):
     def is_particle_matrices(self) -> bool:
         """Whether A is the mass and one matrix for each particle on a mask, and nothing else."""
         H = self.hessian
-        plain = isinstance(H, ParticleStiffness) and not (H.mirror.images or H.coupled or H.others)
-        return plain and H.stencil.own_derivatives is None and not self.projection.normals
+        if not isinstance(H, ParticleStiffness) or H.stencil.own_derivatives is not None:
+            return False
+        return not (H.mirror.images or H.coupled or H.others or self.projection.normals)
 
     def precomputed(self) -> "ImplicitOperator":
         """The operator, with H as one matrix for each particle, computed once for many applications."""
