@@ -35,6 +35,8 @@ class Basis(NamedTuple):
     """c of the weights [-]."""
     slopes: tuple[tuple[float, ...], ...]
     """c of the gradient's factors [1/spacing]."""
+    moments: tuple[tuple[float, ...], ...]
+    """c of these factors by moving least squares [1/spacing]."""
 
     @property
     def strides(self) -> list[int]:
@@ -51,12 +53,6 @@ class Basis(NamedTuple):
         """The terms of the gradient's components."""
         axes = range(len(self.shape))
         return tuple(tuple((1, 0) if b == a else (0, 0) for b in axes) for a in axes)
-
-    @property
-    def squared(self) -> "Basis":
-        """The basis of the squares of weights and gradients."""
-        square = lambda rows: _frozen([np.polynomial.polynomial.polymul(row, row) for row in rows])  # noqa: E731
-        return self._replace(weights=square(self.weights), slopes=square(self.slopes))
 
     def index_terms(self, first: Int[Array, "*b d p"]) -> Int[Array, "*b d s p"]:
         """The share of each axis in the flat index of a node. Around a periodic axis the nodes after its last are its
@@ -77,19 +73,15 @@ class Basis(NamedTuple):
 
 def basis_of(kernel: BSpline, grid: Grid, slopes: Float[np.ndarray, "s k"] | None = None) -> Basis:
     """The basis of a kernel on a grid, with the gradient's factors as `kernel.slopes`; by default these."""
-    slopes = kernel.slopes if slopes is None else slopes
-    knots = tuple(map(float, kernel.knots))
-    return Basis(grid.shape, grid.periodic, knots, _frozen(kernel.pieces), _frozen(slopes))
+    tables = kernel.pieces, kernel.slopes if slopes is None else slopes, kernel.moments
+    rows = (tuple(map(tuple, np.asarray(table).tolist())) for table in tables)
+    return Basis(grid.shape, grid.periodic, tuple(kernel.knots.tolist()), *rows)
 
 
 def differentiated(terms: tuple[Term, ...]) -> tuple[Term, ...]:
     """The derivatives of terms by t, along the first axis of all, along the second of all, ..."""
     axes = range(len(terms[0]))
     return tuple((*term[:b], (term[b][0], term[b][1] + 1), *term[b + 1 :]) for b in axes for term in terms)
-
-
-def _frozen(rows: object) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(map(float, row)) for row in np.asarray(rows))
 
 
 @cache

@@ -9,6 +9,8 @@ import numpy as np
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import require, require_fields
 
+VARIANCE = {2: 1 / 4, 3: 1 / 3}
+"""`BSpline.variance` of each order."""
 _STEEPEST = {2: 6.0, 3: 3.1368191}
 """The largest value over a cell of dx² Σ_i (∂w_ip)²/w_ip, for the quadratic and the cubic kernel."""
 
@@ -40,7 +42,7 @@ class BSpline(eqx.Module):
     def variance(self) -> float:
         """Σ_i w_ip (x_i − x_p)²/dx² along an axis [-], for the quadratic and the cubic kernel. For the linear one it
         depends on the place."""
-        return {2: 1 / 4, 3: 1 / 3}[self.order]
+        return VARIANCE[self.order]
 
     def base(self, xi: Array) -> Array:
         """Lattice index of the first stencil node along each axis, for positions xi in spacings, both (d, p)."""
@@ -85,7 +87,7 @@ class BSpline(eqx.Module):
             return self.slopes
         arms = [(node - self.centre - knot, -1.0) for node, knot in enumerate(self.knots)]
         pairs = zip(self.pieces, arms, strict=True)
-        return np.array([np.polynomial.polynomial.polymul(*both) for both in pairs]) / self.variance
+        return np.array([np.polynomial.polynomial.polymul(*both) for both in pairs]) / VARIANCE[self.order]
 
 
 def around_knots(

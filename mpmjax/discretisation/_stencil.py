@@ -12,7 +12,7 @@ import numpy as np
 from mpmjax._types import Array, Bool, Float, Indices, Int, ParticleVector, components
 from mpmjax.discretisation._basis import Basis, basis_of
 from mpmjax.discretisation._grid import Grid
-from mpmjax.discretisation._kernel import AbstractGradient, BSpline
+from mpmjax.discretisation._kernel import VARIANCE, AbstractGradient, BSpline
 from mpmjax.native import materialised
 
 
@@ -49,25 +49,24 @@ class Stencil(eqx.Module):
     @property
     def is_least_squares(self) -> bool:
         """Whether the gradient is that of moving least squares."""
-        return self.own_derivatives is None and self.basis == self._least_squares_basis
-
-    @property
-    def _least_squares_basis(self) -> Basis:
-        moments = BSpline(len(self.basis.knots) - 1).moments
-        return self.basis._replace(slopes=tuple(tuple(map(float, row)) for row in moments))
+        return self.own_derivatives is None and self.basis.slopes == self.basis.moments
 
     @property
     def least_squares(self) -> "Stencil":
         """The stencil with the gradient of moving least squares."""
         if self.is_least_squares:
             return self
-        return replace(self, basis=self._least_squares_basis, own_derivatives=None, flat=None)
+        basis = self.basis._replace(slopes=self.basis.moments)
+        return replace(self, basis=basis, own_derivatives=None, flat=None)
 
     @property
     def squared(self) -> "Stencil":
         """The stencil of w_ip² and of the squared components g_ip,a²."""
-        custom = None if self.own_derivatives is None else self.own_derivatives**2
-        return replace(self, basis=self.basis.squared, slope=self.slope**2, own_derivatives=custom)
+        custom, families = self.own_derivatives, (self.basis.weights, self.basis.slopes)
+        squares = [[np.polynomial.polynomial.polymul(row, row).tolist() for row in rows] for rows in families]
+        weights, slopes = (tuple(map(tuple, rows)) for rows in squares)
+        basis = self.basis._replace(weights=weights, slopes=slopes)
+        return replace(self, basis=basis, slope=self.slope**2, own_derivatives=None if custom is None else custom**2)
 
     def of(self, particles: Int[Array, "s"]) -> "Stencil":
         """The stencil of some of the particles, by their numbers."""
@@ -78,8 +77,8 @@ class Stencil(eqx.Module):
     @property
     def moment(self) -> Float[Array, "d p"]:
         """Diagonal of D_p = Σ_i w_ip (x_i − x_p)(x_i − x_p)ᵀ [m²], shape (d, p)."""
-        kernel, t = BSpline(len(self.basis.knots) - 1), self.offset
-        return ((0.5 - t) * (0.5 + t) if kernel.order == 1 else jnp.full_like(t, kernel.variance)) / self.slope**2
+        order, t = len(self.basis.knots) - 1, self.offset
+        return ((0.5 - t) * (0.5 + t) if order == 1 else jnp.full_like(t, VARIANCE[order])) / self.slope**2
 
     @property
     def weights(self) -> Float[Array, "d s p"]:
@@ -147,7 +146,7 @@ def make_stencil(
         first = first.at[0].add(jnp.asarray(layer * grid.shape[0], jnp.int32))
     basis, custom = basis_of(kernel, grid, gradient.polynomials(kernel)), None
     if gradient.polynomials(kernel) is None:
-        families = basis.slopes, basis_of(kernel, grid, kernel.moments).slopes
+        families = basis.slopes, basis.moments
         custom = gradient.derivatives(*(basis._replace(slopes=c).polynomials((1, 0), offset) / dx for c in families))
     return Stencil(first, offset, 1 / dx, in_window(kernel, grid, window, x), basis, custom)
 

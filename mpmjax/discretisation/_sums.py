@@ -49,18 +49,21 @@ class Group(NamedTuple):
 Groups = tuple[Group, ...]
 
 
-def gather(stencil: Stencil, nodes: Float[Array, "n c"]) -> tuple[Float[Array, "c p"], Float[Array, "d c p"]]:
+def gather(
+    stencil: Stencil, nodes: Float[Array, "n c"], *, saved: bool = False
+) -> tuple[Float[Array, "c p"], Float[Array, "d c p"]]:
     """Sums over the nodes of each particle: Σ_i w_ip f_i, and Σ_i g_ip f_i for each direction of the gradient.
 
     Args:
         stencil: stencil of the particles.
         nodes: f_i, shape (n, c).
+        saved: whether they are `sums_saved_for_backward`, from which JAX can transpose nothing.
     """
     basis = stencil.basis
     if stencil.own_derivatives is None:
         groups = Group(basis.value), Group(basis.gradient)
         out = gather_sum(stencil.first, stencil.offset, nodes, basis=basis, groups=groups)
-        (value,), gradients = materialised(sums_saved_for_backward(out))
+        (value,), gradients = materialised(sums_saved_for_backward(out)) if saved else out
         gradients = gradients * stencil.slope
     else:
         of = written_gather(_own_factors(stencil), (*basis.value, *basis.gradient), nodes, unroll=False)
@@ -177,7 +180,8 @@ def _pull(
 
 
 def _node_shape(*args: Any, groups: Groups, size: int, **_: Any) -> list[tuple]:
-    return [(size, max(a.shape[-2] for a in _split(groups, args[2:])[1]))]
+    start = 2 + any(group.moved for group in groups)  # after dt
+    return [(size, max(a.shape[-2] for a in args[start:]))]
 
 
 def _particle_shapes(*args: Any, groups: Groups, **_: Any) -> list[tuple]:

@@ -240,7 +240,7 @@ def g2p(
             raise ValueError(f"{type(transfer).__name__} needs the change of the nodes' velocity: give before.")
         change = after - before
     fields = [field for field in (after, mean, change) if field is not None]
-    values, gradients = gather(stencil, jnp.concatenate(fields, axis=1))
+    values, gradients = gather(stencil, jnp.concatenate(fields, axis=1), saved=True)
     # one field after the other, each of shape (d, p), and its gradient (d, d, p), the derivative's direction last
     values, gradients = jnp.split(values, len(fields)), jnp.split(jnp.swapaxes(gradients, 0, 1), len(fields))
     affine: list[Matrix | None] = [None] * len(fields)
@@ -248,7 +248,7 @@ def g2p(
         affine = [*gradients]
     elif transfer.affine:
         ends = [field for field in (after, change) if field is not None]
-        _, slopes = gather(stencil.least_squares, jnp.concatenate(ends, axis=1))
+        _, slopes = gather(stencil.least_squares, jnp.concatenate(ends, axis=1), saved=True)
         slopes = jnp.split(jnp.swapaxes(slopes, 0, 1), len(ends))
         affine[0] = slopes[0]
         if change is not None:

@@ -67,7 +67,7 @@ class NativeFunction:
     def __repr__(self) -> str:
         return self.name
 
-    def __call__(self, *args: Array, batched: int = 0, **params: Any) -> list[Array]:
+    def __call__(self, *args: Any, batched: int = 0, **params: Any) -> list[Array]:
         return native_p.bind(*args, function=self, params=tuple(sorted(params.items())), batched=batched)
 
     def of_members(self, batched: int, **params: Any) -> Callable[..., list[Array]]:
@@ -113,11 +113,14 @@ def call_library(
 native_p = Primitive("native")
 native_p.multiple_results = True
 _static = ("function", "params", "batched")
+# JAX calls rules outside of the package's public functions, which allow it
+_ranks_may_differ = partial(jax.numpy_rank_promotion, "allow")
 
 
 def _run(*args: Array, function: NativeFunction, params: tuple, batched: int, unroll: bool = False) -> list[Array]:
     told = {"unroll": unroll} if function.unrolls else {}
-    return function.of_members(batched, **dict(params), **told)(*args)
+    with _ranks_may_differ():
+        return function.of_members(batched, **dict(params), **told)(*args)
 
 
 _once = jax.jit(_run, static_argnames=(*_static, "unroll"))  # traced once for all its uses
@@ -146,19 +149,22 @@ def _batch(args: tuple, axes: tuple, *, batched: int, **params: Any) -> tuple[li
 def _jvp(primals: tuple, tangents: tuple, *, function: NativeFunction, params: tuple, batched: int) -> Any:
     if function.jvp is None:
         raise NotImplementedError(f"{function} has no derivative.")
-    return function.jvp(primals, tangents, batched=batched, **dict(params))
+    with _ranks_may_differ():
+        return function.jvp(primals, tangents, batched=batched, **dict(params))
 
 
 def _transpose(cotangents: list, *args: Any, function: NativeFunction, params: tuple, batched: int) -> list:
     if function.transpose is None:
         raise NotImplementedError(f"{function} has no transpose.")
-    return function.transpose(cotangents, *args, batched=batched, **dict(params))
+    with _ranks_may_differ():
+        return function.transpose(cotangents, *args, batched=batched, **dict(params))
 
 
 def _on_cpu(ctx: Any, *args: Any, function: NativeFunction, params: tuple, batched: int) -> Any:
     told = {**dict(params), "batched": batched}
     if uses_native()[0] and not is_divided(ctx.module_context) and function.fits(*ctx.avals_in, **told):
-        return lower_fun(partial(function.native, **told), multiple_results=True)(ctx, *args)
+        with _ranks_may_differ():
+            return lower_fun(partial(function.native, **told), multiple_results=True)(ctx, *args)
     written = partial(_once, function=function, params=params, batched=batched)
     return lower_fun(written, multiple_results=True)(ctx, *args)
 
