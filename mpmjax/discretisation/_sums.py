@@ -213,8 +213,7 @@ def sum_of_changes(out: list[Array], parts: Sequence[Sequence[Array]]) -> list[A
 
 def _jvp_of(function: Callable[..., list[Array]], primals: tuple, tangents: tuple) -> tuple[list[Array], list[Array]]:
     """The forward rule of a sum by that of others."""
-    along = tuple(map(instantiate_zeros, tangents[1:]))
-    return jax.jvp(lambda *floats: function(primals[0], *floats), primals[1:], along)
+    return jax.jvp(function, primals, tuple(map(instantiate_zeros, tangents)))
 
 
 def scatter_change(

@@ -86,15 +86,7 @@ class NativeFunction:
         return call_library(self.name, args, self.results(*args, batched=batched, **params), params, aliases)
 
     def _jvp_as_written(self, primals: tuple, tangents: tuple, *, batched: int, **params: Any) -> Any:
-        floats = [k for k, primal in enumerate(primals) if jnp.issubdtype(primal.dtype, jnp.floating)]
-        written = self.of_members(batched, **params)
-
-        def of_floats(*operands: Array) -> list[Array]:
-            at = dict(zip(floats, operands, strict=True))
-            return written(*(at.get(k, primal) for k, primal in enumerate(primals)))
-
-        along = tuple(instantiate_zeros(tangents[k]) for k in floats)
-        return jax.jvp(of_floats, tuple(primals[k] for k in floats), along)
+        return jax.jvp(self.of_members(batched, **params), primals, tuple(map(instantiate_zeros, tangents)))
 
 
 def call_library(
