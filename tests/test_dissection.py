@@ -29,7 +29,7 @@ def coupled(box):
 @pytest.mark.parametrize("name", BOXES)
 def test_each_number_is_eliminated_once(name):
     box = BOXES[name]
-    own = np.concatenate([level.own.reshape(-1) for level in box.levels])
+    own = np.concatenate([level.eliminated.reshape(-1) for level in box.levels])
     np.testing.assert_array_equal(np.sort(own[own < box.size]), np.arange(box.size))
     assert len(box.levels) > 1 if name in CUT else len(box.levels) == 1
     assert box.levels[-1].border.size == 0
@@ -42,7 +42,7 @@ def test_a_front_is_coupled_with_nothing_later_but_its_border(name):
     for level in box.levels:
         fronts = [
             (own[own < box.size], border[border < box.size])
-            for own, border in zip(level.own, level.border, strict=True)
+            for own, border in zip(level.eliminated, level.border, strict=True)
         ]
         for (one, border), (other, _) in itertools.permutations(fronts, 2):
             assert not near[np.ix_(one, other)].any()

@@ -39,11 +39,6 @@ PACKAGE = Path(mpmjax.__file__).parent
 FILES = {path.relative_to(PACKAGE).as_posix(): ast.parse(path.read_text()) for path in sorted(PACKAGE.rglob("*.py"))}
 NAMELESS = {"found", "own", "known", "given", "said"}
 """Names that say how a value came about, and not what it is."""
-NOT_YET = {
-    *(f"extensions/_{n}.py" for n in ("dissection", "volume_preconditioner")),
-    *(f"implicit/_{n}.py" for n in ("hessian", "potential")),
-}
-"""Files in which some are left."""
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -57,7 +52,7 @@ def test_docstrings_start_with_their_subject(name):
     assert not left
 
 
-@pytest.mark.parametrize("name", [name for name in FILES if name not in NOT_YET])
+@pytest.mark.parametrize("name", FILES)
 def test_variables_are_named_for_what_they_are(name):
     """No variable, argument or field is called found, own, known, given or said."""
     nodes = list(ast.walk(FILES[name]))

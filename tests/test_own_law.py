@@ -120,7 +120,7 @@ def test_gradients_are_those_of_the_closed_form(hessian):
 @pytest.mark.parametrize("d", [1, 2, *thorough(3)])
 def test_the_stable_step_and_the_projection_are_those_of_the_closed_form(d):
     """Where stretches coincide, nearly coincide and do not; of a sheared F too."""
-    projected = eqx.filter_jit(lambda law, F: law.projected_tangent(F).matrix)
+    projected = eqx.filter_jit(lambda law, F: law.projected_differential(F).matrix)
     for family in ("rest", *STRETCHES):
         if family == "inverted":
             continue
@@ -153,14 +153,14 @@ class WrongStress(Gel):
         return self.mu * F
 
 
-class WrongTangent(Gel):
-    def tangent(self, F):
-        return Gel(1.1 * self.mu, self.lam).tangent(F)
+class WrongDifferential(Gel):
+    def stress_differential(self, F):
+        return Gel(1.1 * self.mu, self.lam).stress_differential(F)
 
 
 class WrongFrame(Gel):
-    def principal_tangent(self, s):
-        return Gel(1.1 * self.mu, self.lam).principal_tangent(s)
+    def principal_differential(self, s):
+        return Gel(1.1 * self.mu, self.lam).principal_differential(s)
 
 
 class Kinked(Gel):
@@ -180,8 +180,8 @@ class Turning(Gel):
 
 FAULTS = {
     WrongStress: r"^WrongStress: stress is off by .* of its size at F = \[\[",
-    WrongTangent: r"^WrongTangent: tangent is off by 0.0",
-    WrongFrame: r"^WrongFrame: principal_tangent is off by 0.0",
+    WrongDifferential: r"^WrongDifferential: stress_differential is off by 0.0",
+    WrongFrame: r"^WrongFrame: principal_differential is off by 0.0",
     Kinked: r"^Kinked: the energy's gradient is not finite at F = \[\[1., 0.\], \[0., 1.\]\]",
     Turning: r"^Turning: the energy after a rotation of space is off by",
 }

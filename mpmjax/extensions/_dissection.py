@@ -21,13 +21,13 @@ class Level(NamedTuple):
     """Fronts that are not coupled with each other: numbers that are eliminated together, and those that feel it. Where
     fronts of a level differ in size, they are filled up with the number past the last."""
 
-    own: np.ndarray
+    eliminated: np.ndarray
     """The numbers that are eliminated, shape (fronts, s)."""
     border: np.ndarray
     """The numbers coupled with them and with what was eliminated before, and that come after, shape (fronts, b)."""
     places: np.ndarray | None
-    """Where own and border stand in the borders of fronts 2k and 2k + 1 of the level before, b of that level where they
-    are not there, shape (fronts, 2, s + b). None at the first level."""
+    """Where both stand in the borders of fronts 2k and 2k + 1 of the level before, b of that level where they are not
+    there, shape (fronts, 2, s + b). None at the first level."""
 
 
 class Dissection(eqx.Module):
@@ -64,7 +64,7 @@ class Dissection(eqx.Module):
 
 class DissectedFactor(eqx.Module):
     """S = L Lᵀ by blocks, front by front (I. S. Duff, J. K. Reid, ACM Trans. Math. Softw. 9 (1983) 302, doi
-    10.1145/356044.356047). With o a front's own numbers, b its border, and F what is left of S when it is reached,
+    10.1145/356044.356047). With o what a front eliminates, b its border, and F what is left of S when it is reached,
 
         F_oo = L_oo L_ooᵀ,    X = L_oo⁻¹,    Y = F_bo Xᵀ,    F_bb ← F_bb − Y Yᵀ.
 
@@ -82,11 +82,11 @@ class DissectedFactor(eqx.Module):
         z, halves = jnp.pad(r, (0, 1)), []  # L⁻¹ r of each level
         steps = list(zip(self.dissection.levels, self.inverse, self.below, strict=True))
         for level, X, Y in steps:
-            halves.append(jnp.einsum("fpo,fo->fp", X, z[level.own]))
+            halves.append(jnp.einsum("fpo,fo->fp", X, z[level.eliminated]))
             z = z.at[level.border].add(-jnp.einsum("fbo,fo->fb", Y, halves[-1]))
         for (level, X, Y), half in zip(reversed(steps), reversed(halves), strict=True):
             rest = half - jnp.einsum("fb,fbo->fo", z[level.border], Y)
-            z = z.at[level.own].set(jnp.einsum("fp,fpo->fo", rest, X))
+            z = z.at[level.eliminated].set(jnp.einsum("fp,fpo->fo", rest, X))
         return z[:-1]
 
 
@@ -99,11 +99,11 @@ def dissected_factor(dissection: Dissection, entries: Callable[[Array, Array], F
     """
     inverse, below, left = [], [], None
     for level in dissection.levels:
-        own = level.own.shape[1]
+        eliminated = level.eliminated.shape[1]
         F, rest = _assembled(dissection.size, level, entries, left)
-        L = jnp.linalg.cholesky(F[:, :own])
-        X = solve_triangular(L, jnp.broadcast_to(jnp.eye(own, dtype=F.dtype), L.shape), lower=True)
-        Y = jnp.einsum("fbo,fpo->fbp", F[:, own:], X)
+        L = jnp.linalg.cholesky(F[:, :eliminated])
+        X = solve_triangular(L, jnp.broadcast_to(jnp.eye(eliminated, dtype=F.dtype), L.shape), lower=True)
+        Y = jnp.einsum("fbo,fpo->fbp", F[:, eliminated:], X)
         inverse.append(X)
         below.append(Y)
         left = rest - jnp.einsum("fbo,fco->fbc", Y, Y)
@@ -122,11 +122,11 @@ def _assembled(
         entries: the entries of S.
         left: what those before take, shape (2f, b, b); None at the first level.
     """
-    own = level.own.shape[1]
+    eliminated = level.eliminated.shape[1]
 
     def columns(numbers: Array) -> Array:
-        F = entries(numbers, numbers[:own])
-        return F + jnp.eye(*F.shape, dtype=F.dtype) * (numbers[:own] >= size).astype(F.dtype)
+        F = entries(numbers, numbers[:eliminated])
+        return F + jnp.eye(*F.shape, dtype=F.dtype) * (numbers[:eliminated] >= size).astype(F.dtype)
 
     def front(one: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         numbers, pair, places = one
@@ -134,11 +134,11 @@ def _assembled(
         rest = jnp.zeros((), F.dtype)
         for taken, place in zip(pair, places, strict=True):
             rows = jnp.pad(taken, (0, 1))[place]
-            F = F + rows[:, place[:own]]
-            rest = rest + rows[own:, place[own:]]
+            F = F + rows[:, place[:eliminated]]
+            rest = rest + rows[eliminated:, place[eliminated:]]
         return F, rest
 
-    numbers = jnp.asarray(np.concatenate([level.own, level.border], axis=1))
+    numbers = jnp.asarray(np.concatenate([level.eliminated, level.border], axis=1))
     if left is None or level.places is None:
         F = jax.lax.map(columns, numbers)
         return F, jnp.zeros((), F.dtype)
@@ -172,7 +172,7 @@ class _Box(NamedTuple):
         first, last = ((*end[:axis], at, *end[axis + 1 :]) for end, at in ((self.low, low), (self.high, high)))
         return _Box(first, last, self.lattice)
 
-    def own(self, reach: int) -> "_Box":
+    def eliminated(self, reach: int) -> "_Box":
         """The separator; the whole box if it is not cut."""
         return self if self.cut is None else self.part(self.cut[0], self.cut[1], self.cut[1] + reach)
 
@@ -200,14 +200,14 @@ def _cuts(shape: tuple[int, ...], reach: int) -> list[list[list[_Box]]]:
 
 def _counts(boxes: list[_Box], reach: int) -> tuple[int, int]:
     """The most nodes that a front of a level eliminates, and the most of its border."""
-    own = max(math.prod(box.own(reach).sides) for box in boxes)
-    return own, max(math.prod(box.wide(reach).sides) - math.prod(box.sides) for box in boxes)
+    eliminated = max(math.prod(box.eliminated(reach).sides) for box in boxes)
+    return eliminated, max(math.prod(box.wide(reach).sides) - math.prod(box.sides) for box in boxes)
 
 
 def _entries(cuts: list[list[_Box]], reach: int) -> tuple[int, int]:
     """How many numbers the factor has with one number a node, and the most that are left between two levels."""
     sizes = [(len(boxes), *_counts(boxes, reach)) for boxes in cuts]
-    return sum(f * own * (own + b) for f, own, b in sizes), max(f * b * b for f, _, b in sizes)
+    return sum(f * s * (s + b) for f, s, b in sizes), max(f * b * b for f, _, b in sizes)
 
 
 @functools.lru_cache(maxsize=64)
@@ -221,19 +221,19 @@ def _levels(shape: tuple[int, ...], reach: int, materials: int) -> tuple[Level, 
     levels: list[Level] = []
     for boxes in reversed(_best(shape, reach)):
         most, widest = (materials * count for count in _counts(boxes, reach))
-        own = np.full((len(boxes), most), numbers.size)
+        eliminated = np.full((len(boxes), most), numbers.size)
         border = np.full((len(boxes), widest), numbers.size)
         for k, box in enumerate(boxes):
-            one = box.own(reach).numbers(numbers)
+            one = box.eliminated(reach).numbers(numbers)
             around = np.setdiff1d(box.wide(reach).numbers(numbers), box.numbers(numbers))
-            own[k, : len(one)], border[k, : len(around)] = one, around
+            eliminated[k, : len(one)], border[k, : len(around)] = one, around
         places = None
         if levels:
-            both, before = np.concatenate([own, border], axis=1), levels[-1].border
+            both, before = np.concatenate([eliminated, border], axis=1), levels[-1].border
             places = np.stack(
                 [[_places(row, before[2 * k + part], numbers.size) for part in (0, 1)] for k, row in enumerate(both)]
             )
-        levels.append(Level(own, border, places))
+        levels.append(Level(eliminated, border, places))
     return tuple(levels)
 
 

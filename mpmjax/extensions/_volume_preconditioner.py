@@ -28,7 +28,7 @@ from mpmjax.implicit import (
 from mpmjax.potential import Image, Mirror
 from mpmjax.state import AveragedStiffness
 
-_STIFFEST = 0.3  # of C s, times √ε: where S⁻¹ is known to ε C s, P⁻¹ − P⁻¹Bᵀ S⁻¹ B P⁻¹ keeps 1/(C s) of P⁻¹
+_STIFFEST = 0.3  # of C s, times √ε: where S⁻¹ is bounded to ε C s, P⁻¹ − P⁻¹Bᵀ S⁻¹ B P⁻¹ keeps 1/(C s) of P⁻¹
 
 
 class VolumePreconditioner(AbstractPreconditioner):
@@ -137,8 +137,8 @@ class NodeBox(eqx.Module):
         """A field of the box's nodes (..., m) in the window, zero beyond the box."""
         front = field.shape[:-1]
         lattice = jnp.zeros((*front, *self.window), field.dtype)
-        own = field.reshape(*front, *self.shape)
-        return jax.lax.dynamic_update_slice(lattice, own, self._start(front)).reshape(*front, -1)
+        block = field.reshape(*front, *self.shape)
+        return jax.lax.dynamic_update_slice(lattice, block, self._start(front)).reshape(*front, -1)
 
     def _start(self, front: tuple[int, ...]) -> tuple[Array, ...]:
         return (*(jnp.zeros_like(self.corner[0]) for _ in front), *self.corner)
@@ -171,11 +171,11 @@ def nodal_coupling(
         along = [(np.arange(length) + s) % period * p for length, s, p in zip(shape, shift, places, strict=True)]
         return reduce(np.add, np.ix_(*along)).reshape(-1)
 
-    own = jnp.asarray(colours(box.shape, np.zeros(d, int)))
+    colour_of = jnp.asarray(colours(box.shape, np.zeros(d, int)))
 
     def column(which: tuple[Array, Array]) -> Float[Array, "d k"]:
         material, colour = which
-        q = (own == colour) & (jnp.arange(count) == material)[:, None] & some
+        q = (colour_of == colour) & (jnp.arange(count) == material)[:, None] & some
         return box.inside(transpose(box.outside(q.astype(weight.dtype))).T, half)
 
     materials, numbers = (jnp.asarray(a) for a in np.divmod(np.arange(count * period**d), period**d))
@@ -246,8 +246,8 @@ class _Divergence(eqx.Module):
         """Bᵀ q."""
         d, particles = self.projection.free.shape[1], self.stencil.inside.shape[0]
         flux = jnp.zeros((d, d, particles), q.dtype)
-        for one, own in zip(self.averaged, q, strict=True):
-            flux = flux.at[..., slice(*one.rows)].set(one.volumetric * one.average.at_particles(own))
+        for one, part in zip(self.averaged, q, strict=True):
+            flux = flux.at[..., slice(*one.rows)].set(one.volumetric * one.average.at_particles(part))
         return self.projection.combine(self.mirror.fold(scatter(self.stencil, None, flux, q.shape[1])), 0)
 
 
@@ -272,10 +272,10 @@ class VolumeInnerProduct(AbstractInnerProduct):
 
     def solve(self, r: NodeVector) -> NodeVector:
         z = r / self.weight
-        known = jnp.isfinite(self.softness)
-        right = jnp.where(known, self._change(z), 0)
+        bounded = jnp.isfinite(self.softness)
+        right = jnp.where(bounded, self._change(z), 0)
         q = self.factor.solve(right.T.reshape(-1)).reshape(right.shape[::-1]).T
-        return z - self._spread(jnp.where(known, q, 0)) / self.weight
+        return z - self._spread(jnp.where(bounded, q, 0)) / self.weight
 
     def _change(self, v: NodeVector) -> Float[Array, "a m"]:
         """B v in the box."""

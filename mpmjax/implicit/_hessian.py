@@ -67,10 +67,10 @@ class ParticleStiffness(AbstractHessianAction):
         if any(answer.value is not None or answer.slopes is not None for answer in answers):
             slopes = moved.at_particles[1]
             flux = la.matmul(la.symmetric(self.upper), slopes.reshape(-1, 1, slopes.shape[-1])).reshape(slopes.shape)
-            own = Forces(slopes=flux)
+            elastic = Forces(slopes=flux)
         else:
-            own = Forces(nodes=resist(self.stencil, self.upper, moved.nodes))
-        return self.mirror.fold(scattered([own, *answers], self.stencil, len(du)))
+            elastic = Forces(nodes=resist(self.stencil, self.upper, moved.nodes))
+        return self.mirror.fold(scattered([elastic, *answers], self.stencil, len(du)))
 
     def precomputed(self) -> "ParticleStiffness":
         return self
@@ -87,8 +87,8 @@ class ParticleStiffness(AbstractHessianAction):
         """
         d = self.stencil.dim
         places = np.cumsum([0, *range(d * d, 1, -1)])  # of the diagonal, row by row
-        own = Forces(slopes=jnp.stack([self.upper[m] for m in places]).reshape(d, d, -1))
-        materials = added([own, *(part.diagonal(self.stencil, size) for part in self.coupled)]).slopes
+        elastic = Forces(slopes=jnp.stack([self.upper[m] for m in places]).reshape(d, d, -1))
+        materials = added([elastic, *(part.diagonal(self.stencil, size) for part in self.coupled)]).slopes
         assert materials is not None
         shares = [part.diagonal(self.stencil, size) for part in self.others]
         total = scattered([Forces(slopes=jnp.maximum(materials, 0)), *shares], self.stencil.squared, size)
