@@ -23,7 +23,7 @@ for that too:
 """
 
 from collections.abc import Callable, Hashable, Sequence
-from functools import partial, wraps
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -44,25 +44,14 @@ from mpmjax._jax import (
     register_lowering,
 )
 from mpmjax._types import Array
-
-
-def _promoting(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, allowed to broadcast arrays of different ranks. JAX calls rules when a derivative is taken, outside
-    of the public functions that allow this."""
-
-    @wraps(function)
-    def allowed(*args: Any, **kwargs: Any) -> Any:
-        with jax.numpy_rank_promotion("allow"):
-            return function(*args, **kwargs)
-
-    return allowed
+from mpmjax.native import ranks_may_differ
 
 
 class ruled:  # noqa: N801, a decorator
     """A function with a rule for its derivative."""
 
     def __init__(self, function: Callable[..., Any]):
-        self.function = _promoting(function)
+        self.function = function
         self.jvp: Callable[..., Any] | None = None
         self.transpose: Callable[..., Any] | None = None
         self.__doc__, self.__name__, self.__module__ = function.__doc__, function.__name__, function.__module__
@@ -72,12 +61,12 @@ class ruled:  # noqa: N801, a decorator
 
     def defjvp(self, rule: Callable[..., Any]) -> Callable[..., Any]:
         """The rule of the derivative."""
-        self.jvp = _promoting(rule)
+        self.jvp = rule
         return rule
 
     def deftranspose(self, rule: Callable[..., Any]) -> Callable[..., Any]:
         """The transpose, by arguments in which the function is linear."""
-        self.transpose = _promoting(rule)
+        self.transpose = rule
         return rule
 
     def __call__(self, *args: Any) -> Any:
@@ -131,7 +120,8 @@ class _Call(NamedTuple):
 
 def _evaluate(call: _Call, *arrays: Array) -> Any:
     def value(arrays: tuple[Array, ...]) -> Any:
-        return call.rule.function(*call.args(arrays))
+        with ranks_may_differ():
+            return call.rule.function(*call.args(arrays))
 
     for axes in call.mapped:
         value = jax.vmap(value, in_axes=(axes,))
@@ -163,7 +153,9 @@ def _jvp(primals: Sequence[Any], tangents: Sequence[Any], *, call: _Call) -> tup
 
     def changed(primals: Sequence[Any], tangents: Sequence[Any]) -> tuple[list[Any], list[Any]]:
         remaining = iter(tangents)
-        out, change = rule(call.args(primals), call.tangents([next(remaining) if m else None for m in moving]))
+        along = call.tangents([next(remaining) if m else None for m in moving])
+        with ranks_may_differ():
+            out, change = rule(call.args(primals), along)
         leaves, tree = jax.tree.flatten(out)
         return leaves, tree.flatten_up_to(change)
 
@@ -183,7 +175,8 @@ def _transpose(cotangents: Sequence[Any], *arrays: Any, call: _Call) -> list[Any
     def pulled(cotangent: Array, arrays: Sequence[Any]) -> list[Any]:
         remaining = iter(arrays)
         args = call.args([None if one else next(remaining) for one in linear])
-        pulled = call.arrays(rule(cotangent, args))
+        with ranks_may_differ():
+            pulled = call.arrays(rule(cotangent, args))
         return [a for a, one in zip(pulled, linear, strict=True) if one]
 
     def over_axis(pulled: Callable[..., list[Any]], axes: Sequence[int | None]) -> Callable[..., list[Any]]:

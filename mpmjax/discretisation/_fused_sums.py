@@ -79,8 +79,8 @@ def _average_jvp(primals: tuple, tangents: tuple, *, batched: int, **params: Any
     reverse mode here, where the rule takes them: named afterwards they would be others, and these computed again."""
     first, t, _, *rows = primals
     out = sums_saved_for_backward(_average_sum(*primals, batched=batched, **params))
-    change = scatter_change(first, t, tangents[1], rows, tangents[3:], batched=batched, **params)
-    return out, sum_of_changes(out, [] if change is None else [_quotient(*change, *out, batched=batched)])
+    changes = scatter_change(first, t, tangents[1], rows, tangents[3:], batched=batched, **params)
+    return out, sum_of_changes(out, [_quotient(*change, *out, batched=batched) for change in changes])
 
 
 def _divided(change: Array, whole: Array, means: Array) -> list[Array]:

@@ -218,13 +218,13 @@ def _jvp_of(function: Callable[..., list[Array]], primals: tuple, tangents: tupl
 
 def scatter_change(
     first: Array, t: Array, dt: Any, rows: Sequence[Array], changes: Sequence[Any], groups: Groups, **params: Any
-) -> list[Array] | None:
-    """The differential of a scatter of groups that are not moved, in one sum; None if nothing changes."""
+) -> list[list[Array]]:
+    """The differential of a scatter of groups that are not moved, as its only part; none if nothing changes."""
     some = [(group, da) for group, da in zip(groups, changes, strict=True) if not is_zero(da)]
     every, amounts = tuple(group for group, _ in some), [da for _, da in some]
     if not is_zero(dt):
         every, amounts = (*_moved(groups), *every), [dt, *rows, *amounts]
-    return scatter_sum(first, t, *amounts, groups=every, **params) if every else None
+    return [scatter_sum(first, t, *amounts, groups=every, **params)] if every else []
 
 
 def _scatter_jvp(primals: tuple, tangents: tuple, *, groups: Groups, **params: Any) -> tuple:
@@ -237,8 +237,7 @@ def _scatter_jvp(primals: tuple, tangents: tuple, *, groups: Groups, **params: A
 
         return _jvp_of(plain, primals, tangents)
     out = scatter_sum(*primals, groups=groups, **params)
-    change = scatter_change(first, t, tangents[1], rows, tangents[2:], groups, **params)
-    return out, sum_of_changes(out, [] if change is None else [change])
+    return out, sum_of_changes(out, scatter_change(first, t, tangents[1], rows, tangents[2:], groups, **params))
 
 
 def _gather_jvp(primals: tuple, tangents: tuple, *, groups: Groups, **params: Any) -> tuple:

@@ -105,13 +105,13 @@ def call_library(
 native_p = Primitive("native")
 native_p.multiple_results = True
 _static = ("function", "params", "batched")
-# JAX calls rules outside of the package's public functions, which allow it
-_ranks_may_differ = partial(jax.numpy_rank_promotion, "allow")
+ranks_may_differ = partial(jax.numpy_rank_promotion, "allow")
+"""For rules, which JAX calls outside of the package's public functions, that allow it."""
 
 
 def _run(*args: Array, function: NativeFunction, params: tuple, batched: int, unroll: bool = False) -> list[Array]:
     told = {"unroll": unroll} if function.unrolls else {}
-    with _ranks_may_differ():
+    with ranks_may_differ():
         return function.of_members(batched, **dict(params), **told)(*args)
 
 
@@ -141,21 +141,21 @@ def _batch(args: tuple, axes: tuple, *, batched: int, **params: Any) -> tuple[li
 def _jvp(primals: tuple, tangents: tuple, *, function: NativeFunction, params: tuple, batched: int) -> Any:
     if function.jvp is None:
         raise NotImplementedError(f"{function} has no derivative.")
-    with _ranks_may_differ():
+    with ranks_may_differ():
         return function.jvp(primals, tangents, batched=batched, **dict(params))
 
 
 def _transpose(cotangents: list, *args: Any, function: NativeFunction, params: tuple, batched: int) -> list:
     if function.transpose is None:
         raise NotImplementedError(f"{function} has no transpose.")
-    with _ranks_may_differ():
+    with ranks_may_differ():
         return function.transpose(cotangents, *args, batched=batched, **dict(params))
 
 
 def _on_cpu(ctx: Any, *args: Any, function: NativeFunction, params: tuple, batched: int) -> Any:
     told = {**dict(params), "batched": batched}
     if uses_native()[0] and not is_divided(ctx.module_context) and function.fits(*ctx.avals_in, **told):
-        with _ranks_may_differ():
+        with ranks_may_differ():
             return lower_fun(partial(function.native, **told), multiple_results=True)(ctx, *args)
     written = partial(_once, function=function, params=params, batched=batched)
     return lower_fun(written, multiple_results=True)(ctx, *args)
