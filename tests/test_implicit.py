@@ -214,7 +214,7 @@ def test_the_derivative_of_a_newton_step_with_a_projected_hessian_is_the_equatio
 
     def end(rate, hessian):
         pulled = eqx.tree_at(lambda q: q.v, stretched, rate * stretched.x)
-        return mpm.step(scene, pulled, 0.0, dt, method=mpm.BackwardEuler(NEWTON.solution, hessian))[0].x[-1, 0]
+        return mpm.step(scene, pulled, 0.0, dt, method=mpm.BackwardEuler(NEWTON.solution, hessian=hessian))[0].x[-1, 0]
 
     exact, projected = (
         jax.jvp(lambda rate, h=h: end(rate, h), (jnp.asarray(0.1),), (jnp.asarray(1.0),))
