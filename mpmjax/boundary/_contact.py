@@ -317,8 +317,7 @@ class ConstrainedNodes(eqx.Module, Generic[N]):
             rubbed, by_contact = v, [jnp.zeros_like(v)] * len(contacts)
             for k in order:
                 friction = frictions[k]
-                if friction is None:
-                    continue
+                assert friction is not None  # `forth` has no others
                 change = friction(tied.unfold(rubbed))
                 if tied.images:  # the impulses on a rigid body's nodes are those on the whole of it
                     mass, impulse = nodes.mass[:, None], tied.fold(rubbing.nodes.mass[:, None] * change)

@@ -94,7 +94,7 @@ class Problems(eqx.Module):
 
     def one(self, k: int) -> Any:
         """One of them, whole."""
-        return eqx.combine(self.at(k), self.common)
+        return eqx.combine(jax.tree.map(jnp.asarray, self.at(k)), self.common)
 
 
 def _stacked(column: tuple[Any, ...]) -> np.ndarray | None:

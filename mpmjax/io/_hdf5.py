@@ -71,6 +71,7 @@ def check_place(path: Path, *, overwrite: bool) -> None:
         return
     require(overwrite, f"{path} exists: choose another name, remove it, or ask to overwrite or to resume it.")
     require(path.is_file(), f"{path} is not a file: choose another name.")
+    check_no_writer(path)  # first: what is just being written may not be a whole run to look at
     if path.stat().st_size > 0:
         try:
             with h5py.File(path, "r", locking=False) as file:
@@ -78,7 +79,6 @@ def check_place(path: Path, *, overwrite: bool) -> None:
         except OSError:
             run = False
         require(run, f"{path} is not a run that mpmjax wrote, and is not replaced: choose another name, or remove it.")
-    check_no_writer(path)
 
 
 def check_no_writer(path: Path) -> None:
