@@ -1,6 +1,6 @@
 """Names of JAX beyond its stable interface: all that the package touches, in one place.
 
-Tried with jax 0.10.1 and 0.12.0.1. `tests/test_imports.py` says that no other file imports such names, and that
+Tried with jax 0.10.1, 0.11.2 and 0.12.0.1. `tests/test_imports.py` says that no other file imports such names, and that
 each of these exists.
 """
 
