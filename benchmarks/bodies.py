@@ -300,7 +300,11 @@ def rings(quick: bool) -> None:
     def fitted(seed: int) -> list[mpm.Particles]:
         return [
             mpm.fill(
-                mpm.Annulus((x, 0.0), 3.0, 4.0), grid, density=density, velocity=(-np.sign(x) * speed, 0.0), fitted=True
+                mpm.geometry.Annulus((x, 0.0), 3.0, 4.0),
+                grid,
+                density=density,
+                velocity=(-np.sign(x) * speed, 0.0),
+                fitted=True,
             )
             for x in (-L / 4, L / 4)
         ]

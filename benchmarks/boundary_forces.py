@@ -63,7 +63,7 @@ def twisted(across: int, order: int) -> tuple[np.ndarray, np.ndarray, int]:
     dx = 2 * RADIUS / across
     half = across // 2 + 3
     grid = mpm.Grid((2 * half, 2 * half, round(LENGTH / dx) + 6), dx, origin=(-half, -half, -3))
-    rod = mpm.fill(mpm.Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, LENGTH), RADIUS), grid, density=DENSITY)
+    rod = mpm.fill(mpm.geometry.Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, LENGTH), RADIUS), grid, density=DENSITY)
     still, steps, t1 = ((0.0, 0.0, 0.0),) * 2, 10, 1e3
     turn = mpm.RigidMotion((0.0, t1), still, ((0.0, 0.0, 0.0), (0.0, 0.0, ANGLE)), (0.0, 0.0, LENGTH))
     grips = (

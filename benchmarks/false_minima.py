@@ -69,7 +69,7 @@ def windows() -> None:
         seen = mpm.Tracks(times[own] - times[first], x[own], which=np.arange(len(X)), sigma=NOISE)
         return mpm.Experiment(scene, start, t1=round(times[last] - times[first], 9), dt=0.05, observations=seen)
 
-    def told(name: str, share: float, found: mpm.FitResult) -> None:
+    def told(name: str, share: float, found: mpm.fitting.FitResult) -> None:
         e, rms = found["E"], np.mean([n.misfit for n in found.noise])
         print(f"{name} from {100 * share:.0f} Pa: {e.value:.5g} ± {e.error:.2g} Pa, misfit {rms:.3g} σ", flush=True)
 

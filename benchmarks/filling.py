@@ -39,7 +39,7 @@ def main() -> None:
                 volumes.append(float(mpm.fill(ball, grid, density=1.0, fitted=True).volume.sum()) if d == 2 else np.nan)
                 worst = np.maximum(worst, np.abs(np.array(volumes) / exact - 1))
             print(f"| {d} | {cells} | {' | '.join(f'{e:.1e}' for e in worst)} |", flush=True)
-    grid, ring = mpm.Grid((9, 9), 0.1), mpm.Annulus((0.0, 0.0), 0.4, 0.6)
+    grid, ring = mpm.Grid((9, 9), 0.1), mpm.geometry.Annulus((0.0, 0.0), 0.4, 0.6)
     figure, axes = plt.subplots(1, 2, figsize=(9, 4.6), constrained_layout=True)
     for axis, fitted in zip(axes, (False, True), strict=True):
         q = mpm.fill(ring, grid, density=1.0, fitted=fitted)

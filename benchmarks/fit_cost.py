@@ -37,7 +37,7 @@ from throughput import E_MODULUS, NU, Block, block, medians
 
 DOCS = Path(__file__).parents[1] / "docs"
 TIMES_EXPLICIT, LIMIT = 20, 0.3
-SOLVER = mpm.ConjugateResidual(rtol=1e-5)
+SOLVER = mpm.implicit.ConjugateResidual(rtol=1e-5)
 METHODS = {
     "explicit": (mpm.Explicit(), 40, 1.0),
     "semi-implicit": (mpm.SemiImplicit(solver=SOLVER, adjoint_solver=SOLVER), 10, TIMES_EXPLICIT / LIMIT),

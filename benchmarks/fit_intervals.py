@@ -75,7 +75,7 @@ def beside(draws=300):
         "v": mpm.Unbounded(update=lambda e, v: eqx.tree_at(lambda e: e.particles.v, e, v + 0 * bar.v), start=1.0),
     }
     for sigma in (NOISE, None):
-        seen = mpm.Series(steps * dt, np.zeros((15, 1)), mpm.CentreOfMass(), sigma=sigma)
+        seen = mpm.Series(steps * dt, np.zeros((15, 1)), mpm.fitting.CentreOfMass(), sigma=sigma)
         one = mpm.Experiment(scene, bar, t1=15 * dt, dt=dt, observations=seen)
         for offset in (0.0, 0.5, 1.0, 2.3, 4.2):
             truth = np.array([offset * error, 0.3])

@@ -53,7 +53,7 @@ def seen(exact: VibratingBar, periods: float, sigma: float, markers: int = 8, fr
     x = jax.vmap(lambda t: jax.vmap(lambda Y: exact.position(Y, t))(jnp.asarray(X)))(jnp.asarray(times))
     noise = sigma * np.random.default_rng(0).normal(size=x.shape)
     _, particles = discretise(exact, CELLS)
-    return mpm.Tracks(times, np.asarray(x) + noise, which=mpm.Markers.at(particles, X), sigma=sigma)
+    return mpm.Tracks(times, np.asarray(x) + noise, which=mpm.fitting.Markers.at(particles, X), sigma=sigma)
 
 
 def vibration(exact: VibratingBar, data: mpm.Tracks, cells: int = CELLS, start: float = 1.0) -> mpm.Experiment:
@@ -63,7 +63,7 @@ def vibration(exact: VibratingBar, data: mpm.Tracks, cells: int = CELLS, start: 
     tracks = mpm.Tracks(
         data.times,
         data.data,
-        which=mpm.Markers.at(particles, np.asarray(data.of(scene, coarse))) if cells != CELLS else data.of,
+        which=mpm.fitting.Markers.at(particles, np.asarray(data.of(scene, coarse))) if cells != CELLS else data.of,
         sigma=data.sigma,
     )
     scene = eqx.tree_at(lambda s: s.material.youngs_modulus, scene, jnp.asarray(start * E))
@@ -166,7 +166,7 @@ def chaos(quick: bool) -> plt.Figure:
     dt, early, late = 2e-3, *((0.1, 0.2) if quick else (1.0, 20.0))
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        grown = mpm.sensitivity(scene, particles, t1=late, dt=dt)
+        grown = mpm.analysis.sensitivity(scene, particles, t1=late, dt=dt)
     print(*(str(w.message) for w in said), sep="\n")
     factors = np.linspace(0.98, 1.02, 5 if quick else 41)
 

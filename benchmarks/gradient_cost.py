@@ -93,7 +93,7 @@ def scene_d(b: Block, steps: int, repeats: int, peers: bool) -> dict[str, Any]:
 
 def semi_implicit(b: Block, steps: int, repeats: int) -> dict[str, Any]:
     """At twenty times the explicit limit."""
-    solver = mpm.ConjugateResidual(rtol=1e-5)
+    solver = mpm.implicit.ConjugateResidual(rtol=1e-5)
     size = rollout(b, mpm.SemiImplicit(solver=solver, adjoint_solver=solver), steps, TIMES_EXPLICIT / LIMIT * b.dt)
     programs = {"forward": compiled(size), "with gradient": compiled(with_gradient(size))}
     seconds = medians({name: call for name, (call, _) in programs.items()}, repeats)

@@ -23,7 +23,10 @@ import mpmjax as mpm
 
 jax.config.update("jax_enable_x64", True)
 EDGE, STRETCH = 0.01, 1.03
-NEWTON = {mpm.SemiImplicit: mpm.BackwardEuler(), mpm.ImplicitMidpoint: mpm.ImplicitMidpoint(solution=mpm.Newton())}
+NEWTON = {
+    mpm.SemiImplicit: mpm.BackwardEuler(),
+    mpm.ImplicitMidpoint: mpm.ImplicitMidpoint(solution=mpm.implicit.Newton()),
+}
 
 
 def sheet(nu: float) -> tuple[mpm.Scene, mpm.Particles]:

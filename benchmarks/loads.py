@@ -17,7 +17,7 @@ import mpmjax as mpm
 from mpmjax._types import Array, Float
 
 E, NU, INNER, OUTER, PRESSURE = 1e5, 0.3, 0.5, 1.0, 10.0
-TIGHT = mpm.ConjugateResidual(rtol=1e-10, max_steps=20_000)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-10, max_steps=20_000)
 
 
 class Ring(mpm.geometry.AbstractRegion):

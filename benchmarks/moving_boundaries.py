@@ -98,7 +98,7 @@ def main(quick: bool) -> None:
     presses += [("SeparatingCollider", "updated", 3.0)]
     for wall, description, travel in presses[: 1 if quick else None]:
         print(f"press: {wall}, {description}, by {travel:g} cells: {press(wall, description, travel)}", flush=True)
-    for method in (mpm.SemiImplicit(), mpm.BackwardEuler(), mpm.ImplicitMidpoint(solution=mpm.Newton())):
+    for method in (mpm.SemiImplicit(), mpm.BackwardEuler(), mpm.ImplicitMidpoint(solution=mpm.implicit.Newton())):
         for step in (0.1,) if quick else (0.02, 0.1, 0.3, 0.8):
             print(f"turn: {type(method).__name__}, steps of {step} rad: {turn(method, step)}", flush=True)
 

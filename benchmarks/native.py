@@ -96,7 +96,7 @@ def work(name: str, dtype: str) -> None:
     import mpmjax as mpm
 
     todo = tasks((SCENES | QUICK)[name], dtype)
-    print(mpm.backend(), flush=True)
+    print(mpm.native.backend(), flush=True)
     for go, _ in todo.values():
         last = go()
     state = np.concatenate([np.ravel(a) for a in (*todo["step"][0](), *last)]).astype("float64")

@@ -24,13 +24,13 @@ from scipy.spatial import KDTree
 
 import mpmjax as mpm
 
-TIGHT = mpm.SemiImplicit(solver=mpm.ConjugateResidual(rtol=1e-9, max_steps=100_000))
+TIGHT = mpm.SemiImplicit(solver=mpm.implicit.ConjugateResidual(rtol=1e-9, max_steps=100_000))
 CENTRE = {0.3: 21.9460, 0.49: 18.7378, 0.499: 18.5336, 0.4999: 18.5129}
 """Deflection of the middle of Cook's loaded edge for E = 1 and a total force of 1, by `--reference`: Richardson's
 extrapolation of 32 and 64 elements a side."""
 INNER, OUTER = 0.5, 1.0
 Volume = mpm.AveragedVolume | None
-PRECONDITIONERS = {"diagonal": mpm.DiagonalPreconditioner(), "volume": mpm.VolumePreconditioner()}
+PRECONDITIONERS = {"diagonal": mpm.implicit.DiagonalPreconditioner(), "volume": mpm.extensions.VolumePreconditioner()}
 VOLUMES = {"own volumes": None, "averaged": mpm.AveragedVolume()}
 
 
@@ -66,7 +66,7 @@ def tube(cells: int, nu: float, volume: Volume, load: float = 1e-4) -> tuple[mpm
         (3 * cells // 2, 7 * cells // 2),
         density=1.0,
     )
-    bore = mpm.Patch(mpm.Annulus((0.0, 0.0), INNER, OUTER), mpm.Box((0.0, 0.0), (0.75 * OUTER / 2**0.5,) * 2))
+    bore = mpm.Patch(mpm.geometry.Annulus((0.0, 0.0), INNER, OUTER), mpm.Box((0.0, 0.0), (0.75 * OUTER / 2**0.5,) * 2))
     scene = mpm.Scene(
         grid,
         mpm.NeoHookean(1.0, nu),
@@ -221,7 +221,9 @@ def swings() -> None:
 
 def stepping(choice: mpm.implicit.AbstractPreconditioner, rtol: float) -> Callable:
     """A compiled step of scene, particles and Δt."""
-    method = mpm.SemiImplicit(solver=mpm.ConjugateResidual(rtol=rtol, max_steps=100_000), preconditioner=choice)
+    method = mpm.SemiImplicit(
+        solver=mpm.implicit.ConjugateResidual(rtol=rtol, max_steps=100_000), preconditioner=choice
+    )
     return jax.jit(lambda scene, particles, dt: mpm.step(scene, particles, 0.0, dt, method=method))
 
 
@@ -260,8 +262,8 @@ def solids(sizes: tuple[int, ...]) -> None:
         particles = mpm.fill(mpm.Box((0.0,) * 3, (0.1 * cells,) * 3), grid, particles_per_cell=8, density=1.0)
         turned = particles.x[:, ::-1] - particles.x.mean(axis=0)
         particles = mpm.Particles(particles.x, 1e-3 * turned, particles.mass, particles.volume)
-        boxed = mpm.VolumePreconditioner(largest=100_000_000, extent=(cells + 2,) * 3)
-        ways = {"diagonal": mpm.DiagonalPreconditioner(), "volume, its box": boxed}
+        boxed = mpm.extensions.VolumePreconditioner(largest=100_000_000, extent=(cells + 2,) * 3)
+        ways = {"diagonal": mpm.implicit.DiagonalPreconditioner(), "volume, its box": boxed}
         steps = {name: stepping(way, 1e-8) for name, way in ways.items()}
         for nu in (0.49, 0.499, 0.4999):
             scene = mpm.Scene(grid, mpm.NeoHookean(1.0, nu), volume=mpm.AveragedVolume())

@@ -125,7 +125,7 @@ def main() -> None:
     parser.add_argument("--scene", help="one scene alone")
     parser.add_argument("--rounds", type=int, default=7, help="turns of each order")
     options = parser.parse_args()
-    print(mpm.backend())
+    print(mpm.native.backend())
     scenes = {name: (given, numbers) for name, numbers in (QUICK_BLOCKS if options.quick else BLOCKS).items()}
     scenes |= {name: (mixed, numbers) for name, numbers in (QUICK_DAMS if options.quick else DAMS).items()}
     for name, (make, numbers) in scenes.items():

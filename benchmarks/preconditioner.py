@@ -21,7 +21,7 @@ PARTS = {
     "layers": lambda x: np.floor(8 * x[:, -1]) % 2 == 0,
     "homogeneous": lambda x: np.full(len(x), fill_value=True),
 }
-PRECONDITIONERS = mpm.MassPreconditioner(), mpm.DiagonalPreconditioner()
+PRECONDITIONERS = mpm.implicit.MassPreconditioner(), mpm.implicit.DiagonalPreconditioner()
 
 
 def block(d: int, n: int, part: str, contrast: float) -> tuple[mpm.Scene, mpm.Particles, float]:
@@ -40,7 +40,7 @@ def iterations(
     scene: mpm.Scene, particles: mpm.Particles, dt: float, preconditioner: mpm.implicit.AbstractPreconditioner
 ) -> float:
     """Of each of three steps from rest, on average."""
-    method = mpm.SemiImplicit(preconditioner=preconditioner, solver=mpm.ConjugateResidual(max_steps=20000))
+    method = mpm.SemiImplicit(preconditioner=preconditioner, solver=mpm.implicit.ConjugateResidual(max_steps=20000))
     total = 0
     for _ in range(3):
         particles, info = mpm.step(scene, particles, 0.0, dt, method=method)

@@ -45,7 +45,7 @@ def main() -> None:
             began = time.perf_counter()
             jax.block_until_ready(run())
             taken[k] = time.perf_counter() - began
-    print(f"{mpm.backend()}; {options.steps} steps of {particles.count} particles, {particles.x.dtype}")
+    print(f"{mpm.native.backend()}; {options.steps} steps of {particles.count} particles, {particles.x.dtype}")
     for what, (a, b) in (("median", np.median(seconds, axis=0)), ("fastest", seconds.min(axis=0))):
         print(f"{what:8} rollout {1e3 * a:7.2f} ms, simulate {1e3 * b:7.2f} ms, ratio {b / a:.2f}")
 

@@ -35,7 +35,7 @@ jax.config.update("jax_enable_x64", True)
 DOCS = Path(__file__).parents[1] / "docs"
 DENSITY = 400.0
 RADIUS = 0.15
-SEMI_IMPLICIT = mpm.SemiImplicit(solver=mpm.ConjugateResidual(rtol=1e-3))
+SEMI_IMPLICIT = mpm.SemiImplicit(solver=mpm.implicit.ConjugateResidual(rtol=1e-3))
 DT = 5e-4
 HARDENINGS = (0.0, 5.0, 10.0, 15.0, 20.0, 30.0)
 
@@ -79,7 +79,7 @@ def wedge(n: int, snow: mpm.Snow) -> Case:
     grid = mpm.Grid((n, n), 1 / n)
     block = mpm.fill(mpm.Box((0.3, 0.1), (0.7, 0.4)), grid, particles_per_cell=4, density=DENSITY)
     walls = mpm.SeparatingBox((0.1, 0.1), (0.9, np.inf), friction=0.5)
-    blade = mpm.Capsule((0.5, 0.45 + 0.03), (0.5, 0.75), 0.03)
+    blade = mpm.geometry.Capsule((0.5, 0.45 + 0.03), (0.5, 0.75), 0.03)
     down = mpm.Motion((0.0, 0.15), ((0.0, 0.0), (0.0, -0.3)))
     tool = mpm.SeparatingCollider(blade, down, friction=0.1)
     return mpm.Scene(grid, snow, gravity=(0.0, -9.81), boundary=(walls, tool)), block, 0.15

@@ -42,8 +42,8 @@ DOCS = Path(__file__).parents[1] / "docs"
 E_MODULUS, NU, DENSITY, SIDE = 1e5, 0.3, 1e3, 1.0
 SPEED = float(np.sqrt(E_MODULUS * (1 - NU) / ((1 + NU) * (1 - 2 * NU)) / DENSITY))
 MARGIN = 16  # cells around the square
-PRECONDITIONERS = {"diagonal": mpm.DiagonalPreconditioner(), "mass": mpm.MassPreconditioner()}
-GUESSES = mpm.Guess.GRID_VELOCITY, mpm.Guess.EXPLICIT, mpm.Guess.ZERO
+PRECONDITIONERS = {"diagonal": mpm.implicit.DiagonalPreconditioner(), "mass": mpm.implicit.MassPreconditioner()}
+GUESSES = mpm.implicit.Guess.GRID_VELOCITY, mpm.implicit.Guess.EXPLICIT, mpm.implicit.Guess.ZERO
 Row = dict[str, Any]
 
 
@@ -76,14 +76,14 @@ def tolerances(n: int, multiple: float, steps: int, rtols: tuple[float, ...]) ->
     """Errors and seconds, and in the first row the errors of the step: its difference from a quarter of it."""
     _, particles, limit = square(n)
 
-    def final(factor: Any, rtol: Any, guess: mpm.Guess, refined: int) -> Any:
-        solver = mpm.ConjugateResidual(rtol=rtol, max_steps=5000)
+    def final(factor: Any, rtol: Any, guess: mpm.implicit.Guess, refined: int) -> Any:
+        solver = mpm.implicit.ConjugateResidual(rtol=rtol, max_steps=5000)
         method = mpm.SemiImplicit(solver=solver, adjoint_solver=solver, guess=guess)
         dt = multiple * limit
         scene = square(n, factor=factor).scene
         return mpm.simulate(scene, particles, t1=steps * dt, dt=dt / refined, method=method, throw=False).final.x
 
-    def functions(guess: mpm.Guess, refined: int = 1) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    def functions(guess: mpm.implicit.Guess, refined: int = 1) -> tuple[Callable[..., Any], Callable[..., Any]]:
         motion = partial(final, guess=guess, refined=refined)
         slope = jax.grad(lambda factor, rtol: motion(factor, rtol)[:, 1].mean())
         return jax.jit(partial(motion, 1.0)), jax.jit(partial(slope, 1.0))
@@ -118,9 +118,9 @@ def level(n: int, dt: float, coarser: int, contrast: float) -> tuple[Level, Node
     """Of one semi-implicit step with β = 1."""
     scene, particles, _ = square(n, coarser=coarser, contrast=contrast)
     nodes = start_nodes(scene, particles, 0.0, jnp.asarray(dt), scene.stencil(particles))
-    action = mpm.AnalyticHessian().at(nodes.potential, None)
+    action = mpm.implicit.AnalyticHessian().at(nodes.potential, None)
     operator = ImplicitOperator(nodes.mass, jnp.asarray(dt) ** 2, action, nodes.projection)
-    weight = mpm.MassPreconditioner().inner_product(operator).weight
+    weight = mpm.implicit.MassPreconditioner().inner_product(operator).weight
 
     def power(_: int, v: Any) -> Any:
         v = operator.mv(v) / weight
@@ -210,7 +210,7 @@ def preconditioners(n: int, multiple: float, *, contrast: float = 1.0, rtol: flo
     made = [level(n, dt, m, contrast) for m in range(depth + 1)]
     levels, nodes = [here for here, _ in made], made[0][1]
     fine = levels[0]
-    diagonal = mpm.DiagonalPreconditioner().inner_product(fine.operator).weight
+    diagonal = mpm.implicit.DiagonalPreconditioner().inner_product(fine.operator).weight
     inverse = jnp.linalg.inv(blocks(fine))
     noise = jax.random.normal(jax.random.key(1), fine.weight.shape)
     sides = {
@@ -244,7 +244,7 @@ def break_even(n: int, contrast: float, rtol: float, preconditioner: str, multip
     """The multiple of the limit at which a semi-implicit step costs as many explicit ones, by interpolation."""
     scene, particles, limit = square(n, contrast=contrast)
     method = mpm.SemiImplicit(
-        solver=mpm.ConjugateResidual(rtol=rtol, max_steps=5000), preconditioner=PRECONDITIONERS[preconditioner]
+        solver=mpm.implicit.ConjugateResidual(rtol=rtol, max_steps=5000), preconditioner=PRECONDITIONERS[preconditioner]
     )
     costs = []
     for multiple in multiples:

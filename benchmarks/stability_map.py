@@ -40,17 +40,17 @@ jax.config.update("jax_enable_x64", True)
 
 DX, DENSITY, E, NU, SIDE = 0.1, 1e3, 1e4, 0.3, 3
 DOCS = Path(__file__).parents[1] / "docs"
-SOLVER = mpm.ConjugateResidual(max_steps=300)
-PLAIN, PROJECTED = mpm.AnalyticHessian(), mpm.AnalyticHessian(projected=True)
+SOLVER = mpm.implicit.ConjugateResidual(max_steps=300)
+PLAIN, PROJECTED = mpm.implicit.AnalyticHessian(), mpm.implicit.AnalyticHessian(projected=True)
 METHODS = {
     "explicit": lambda beta: mpm.Explicit(),
     "semi-implicit": lambda beta: mpm.SemiImplicit(beta, SOLVER, hessian=PLAIN, adjoint_solver=SOLVER),
     "projected": lambda beta: mpm.SemiImplicit(beta, SOLVER, hessian=PROJECTED, adjoint_solver=SOLVER),
-    "backward Euler": lambda beta: mpm.BackwardEuler(mpm.Newton(max_steps=15), hessian=PROJECTED),
+    "backward Euler": lambda beta: mpm.BackwardEuler(mpm.implicit.Newton(max_steps=15), hessian=PROJECTED),
     "implicit midpoint": lambda beta: mpm.ImplicitMidpoint(
-        mpm.Linearised(SOLVER), hessian=PLAIN, adjoint_solver=SOLVER
+        mpm.implicit.Linearised(SOLVER), hessian=PLAIN, adjoint_solver=SOLVER
     ),
-    "TR-BDF2": lambda beta: mpm.TRBDF2(0.0, mpm.Linearised(SOLVER), hessian=PLAIN, adjoint_solver=SOLVER),
+    "TR-BDF2": lambda beta: mpm.TRBDF2(0.0, mpm.implicit.Linearised(SOLVER), hessian=PLAIN, adjoint_solver=SOLVER),
 }
 IMPLICIT = tuple(METHODS)[1:]
 FIELDS = ("sweep", "method", "beta", "contrast", "compression", "dt_over_bound", "growth")
@@ -78,7 +78,7 @@ def particle_sweep(count: int) -> list[dict]:
     x = jnp.full((1, 2), 0.2637)
     one = mpm.prepare(scene, mpm.Particles(x, 0 * x, jnp.full(1, DENSITY * 1e-3), jnp.full(1, 1e-3)))
     bound = mpm.stable_dt(scene, one, safety=1.0)
-    tight = mpm.ConjugateResidual(rtol=1e-12)
+    tight = mpm.implicit.ConjugateResidual(rtol=1e-12)
 
     @jax.jit
     @jax.vmap

@@ -55,7 +55,7 @@ def radial(R):
 
 def particles(kind: str, dx: float, per_side: int, shift: float) -> tuple[np.ndarray, np.ndarray]:
     """Positions and volumes of the ring about (shift dx, shift dx)."""
-    ring = mpm.Annulus((shift * dx,) * 2, INNER, OUTER)
+    ring = mpm.geometry.Annulus((shift * dx,) * 2, INNER, OUTER)
     if kind in ("filled", "fitted"):
         grid = mpm.Grid((9, 9), dx)
         q = mpm.fill(ring, grid, particles_per_cell=per_side**2, density=1.0, fitted=kind == "fitted")

@@ -152,7 +152,7 @@ def codes_of(b: Block, steps: int, peers: bool) -> dict[str, Code]:
         "mpmjax": Ours(b, mpm.UpdatedLagrangian(), steps),
         "total": Ours(b, mpm.TotalLagrangian(), steps),
     }
-    if mpm.backend().name == "native":
+    if mpm.native.backend().name == "native":
         found["XLA"] = Ours(b, mpm.UpdatedLagrangian(), steps, backend="xla")
     if peers:
         from peers.taichi_mpm import TaichiMPM
@@ -193,7 +193,7 @@ def iterations(b: Block, backend: str | None = None, wider: tuple[int, ...] = (1
     """Semi-implicit steps of twenty times the block's own, cut off after few and after more iterations."""
 
     def cut(most: int) -> Code:
-        method = mpm.SemiImplicit(solver=mpm.ConjugateResidual(rtol=1e-30, max_steps=most))
+        method = mpm.SemiImplicit(solver=mpm.implicit.ConjugateResidual(rtol=1e-30, max_steps=most))
         return Ours(b._replace(dt=20 * b.dt), mpm.UpdatedLagrangian(), 1, method, backend, wider)
 
     few, more = ITERATIONS

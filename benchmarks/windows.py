@@ -70,7 +70,7 @@ def main() -> None:
     parser.add_argument("--scene", help="one scene alone")
     parser.add_argument("--rounds", type=int, default=7, help="turns of each window")
     options = parser.parse_args()
-    print(mpm.backend())
+    print(mpm.native.backend())
     for name, numbers in (QUICK if options.quick else SCENES).items():
         if options.scene not in (None, name):
             continue

@@ -113,7 +113,7 @@ def experiment(bent, law, cells, steps, positions=None, method=mpm.Explicit(), c
     scene = mpm.Scene(grid, law, boundary=mirrors, description=mpm.TotalLagrangian(), **choices)
     places = np.stack(np.meshgrid(*(np.linspace(0.1 * s, 0.9 * s, 4) for s in size)), axis=-1).reshape(-1, 2)
     positions = np.zeros((21, 16, 2)) if positions is None else positions
-    seen = mpm.Tracks(np.linspace(0, T1, 21), positions, which=mpm.Markers.at(body, places), sigma=1e-4)
+    seen = mpm.Tracks(np.linspace(0, T1, 21), positions, which=mpm.fitting.Markers.at(body, places), sigma=1e-4)
     return mpm.Experiment(scene, body, t1=T1, dt=T1 / steps, method=method, observations=seen)
 
 

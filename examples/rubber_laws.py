@@ -54,7 +54,7 @@ def experiment(law, kind, stretch, stress):
         kernel=mpm.BSpline(1),
         description=mpm.TotalLagrangian(),
     )
-    gauge = mpm.StressStretch.of(mpm.Box((0.0,) * d, (EDGE,) * d), particles, axis=1)
+    gauge = mpm.fitting.StressStretch.of(mpm.Box((0.0,) * d, (EDGE,) * d), particles, axis=1)
     seen = mpm.Curve(stretch, stress, gauge, name=f"{kind}, nominal stress [Pa]", x_name="stretch")
     run = {"t1": float(len(stretch)), "dt": 1.0, "method": mpm.BackwardEuler()}
     return mpm.Experiment(scene, particles, **run, observations=seen, name=kind)

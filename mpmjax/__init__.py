@@ -1,13 +1,26 @@
-"""A differentiable Material Point Method in JAX, with explicit and implicit grid updates."""
+"""A differentiable Material Point Method in JAX, with explicit and implicit grid updates.
 
-from mpmjax import fitting as fitting, linalg as linalg
-from mpmjax._types import Corner as Corner
-from mpmjax.analysis import (
-    budget as budget,
-    energy as energy,
-    momentum as momentum,
-    sensitivity as sensitivity,
+What a first scene and a first fit need is here. Solvers and preconditioners are in `mpm.implicit`, the rarer shapes in
+`mpm.geometry`, quantities, priors and strategies of fits in `mpm.fitting`, small matrices for laws in `mpm.linalg`;
+docs/features.md lists every name.
+"""
+
+from mpmjax import (
+    analysis as analysis,
+    boundary as boundary,
+    discretisation as discretisation,
+    extensions as extensions,
+    fitting as fitting,
+    geometry as geometry,
+    implicit as implicit,
+    linalg as linalg,
+    material as material,
+    native as native,
+    simulation as simulation,
+    state as state,
+    stepping as stepping,
 )
+from mpmjax.analysis import budget as budget, energy as energy, momentum as momentum
 from mpmjax.boundary import (
     ContactPlane as ContactPlane,
     Grip as Grip,
@@ -29,52 +42,26 @@ from mpmjax.discretisation import (
     MLSGradient as MLSGradient,
     SplineGradient as SplineGradient,
 )
-from mpmjax.extensions import VolumePreconditioner as VolumePreconditioner
 from mpmjax.fitting import (
     Bounded as Bounded,
-    CentreOfMass as CentreOfMass,
     Curve as Curve,
     Experiment as Experiment,
-    Extent as Extent,
-    FitResult as FitResult,
-    Force as Force,
-    Markers as Markers,
     Positive as Positive,
     Series as Series,
-    StressStretch as StressStretch,
     Tracks as Tracks,
     Unbounded as Unbounded,
     fit as fit,
 )
 from mpmjax.geometry import (
-    Annulus as Annulus,
     Ball as Ball,
     Box as Box,
-    Capsule as Capsule,
-    Cylinder as Cylinder,
     HalfSpace as HalfSpace,
     Motion as Motion,
     RigidMotion as RigidMotion,
-    SampledDistance as SampledDistance,
     TimeSeries as TimeSeries,
-    Tube as Tube,
-    Union as Union,
-    sample_distance as sample_distance,
-    sample_mesh as sample_mesh,
-)
-from mpmjax.implicit import (
-    AnalyticHessian as AnalyticHessian,
-    ConjugateResidual as ConjugateResidual,
-    DiagonalPreconditioner as DiagonalPreconditioner,
-    Guess as Guess,
-    JvpHessian as JvpHessian,
-    Linearised as Linearised,
-    MassPreconditioner as MassPreconditioner,
-    Newton as Newton,
 )
 from mpmjax.io import load as load, record as record, register as register, save as save
 from mpmjax.material import (
-    AbstractInelastic as AbstractInelastic,
     AbstractMaterial as AbstractMaterial,
     CamClay as CamClay,
     DruckerPrager as DruckerPrager,
@@ -92,16 +79,13 @@ from mpmjax.material import (
     VonMises as VonMises,
     Yeoh as Yeoh,
 )
-from mpmjax.native import backend as backend
 from mpmjax.simulation import (
-    Fault as Fault,
     Run as Run,
     SimulationError as SimulationError,
     rollout as rollout,
     simulate as simulate,
 )
 from mpmjax.state import (
-    AttachedPoints as AttachedPoints,
     AveragedVolume as AveragedVolume,
     Bodies as Bodies,
     Couple as Couple,

@@ -37,7 +37,7 @@ PICTURE = mpm.fitting.Density(SCENE.grid)
 RUN = {"scene": SCENE, "particles": PARTICLES, "t1": 0.1, "dt": 0.01}
 
 
-def found() -> mpm.FitResult:
+def found() -> mpm.fitting.FitResult:
     """A fit, as if it had been made."""
     problem = FitProblem((mpm.Experiment(**RUN, observations=SEEN),), {"E": STIFFNESS})
     at = Minimum(jnp.zeros(1), jnp.zeros(1), jnp.ones((1, 1)), True, False, ())
@@ -58,7 +58,7 @@ FUNCTIONS = {
     mpm.prepare: {"scene": SCENE, "particles": PARTICLES},
     mpm.stable_dt: {"scene": SCENE, "particles": PARTICLES},
     mpm.simulate: RUN,
-    mpm.sensitivity: RUN,
+    mpm.analysis.sensitivity: RUN,
     mpm.record: RUN | {"path": "never.h5", "save_every": 1},
     mpm.rollout: {"scene": SCENE, "particles": PARTICLES, "steps": 1, "dt": 0.01},
     mpm.budget: {"scene": SCENE, "particles": PARTICLES, "steps": 1, "dt": 0.01},
@@ -66,8 +66,8 @@ FUNCTIONS = {
     mpm.energy: {"scene": SCENE, "particles": PARTICLES},
     mpm.momentum: {"particles": PARTICLES},
     mpm.analysis.pieces: {"scene": SCENE, "particles": PARTICLES},
-    mpm.sample_distance: {"region": mpm.Ball((0.1, 0.1), 0.1), "spacing": 0.02},
-    mpm.sample_mesh: {"mesh": "nowhere.stl", "spacing": 0.02},
+    mpm.geometry.sample_distance: {"region": mpm.Ball((0.1, 0.1), 0.1), "spacing": 0.02},
+    mpm.geometry.sample_mesh: {"mesh": "nowhere.stl", "spacing": 0.02},
     mpm.save: {"path": "never.h5", "run": None},
     mpm.load: {"path": "never.h5"},
     mpm.render: {"run": None, "path": "never.png"},
@@ -89,9 +89,9 @@ FUNCTIONS = {
     },
     mpm.fitting.bootstrap: {"result": None},
     mpm.join: {"sets": PARTICLES},
-    mpm.Markers.of: {"which": [0]},
-    mpm.Markers.at: {"particles": PARTICLES, "places": [[0.1, 0.1]]},
-    mpm.StressStretch.of: {"region": mpm.Ball((0.1, 0.1), 0.1), "particles": PARTICLES, "axis": 0},
+    mpm.fitting.Markers.of: {"which": [0]},
+    mpm.fitting.Markers.at: {"particles": PARTICLES, "places": [[0.1, 0.1]]},
+    mpm.fitting.StressStretch.of: {"region": mpm.Ball((0.1, 0.1), 0.1), "particles": PARTICLES, "axis": 0},
     mpm.fitting.Field.lattice_around: {"particles": PARTICLES, "spacing": 0.1},
     PICTURE.of_points: {"points": PARTICLES.x, "mass": 1.0},
 }
@@ -118,9 +118,9 @@ FITTING = {
     mpm.Series: TRUST | {"times": [0.1, 0.2], "values": [1.0, 2.0], "of": reached},
     mpm.Tracks: TRUST | {"times": [0.1], "positions": [[[0.1, 0.2]]], "which": [0]},
     mpm.Curve: TRUST | {"x": [0.1, 0.2], "y": [1.0, 2.0], "of": reached},
-    mpm.Force: TRUST | {"times": [0.1], "forces": [[1.0, 2.0]]},
+    mpm.fitting.Force: TRUST | {"times": [0.1], "forces": [[1.0, 2.0]]},
     mpm.fitting.Torque: TRUST | {"times": [0.1], "forces": [[1.0]]},
-    mpm.Extent: {"axis": 0},
+    mpm.fitting.Extent: {"axis": 0},
     mpm.fitting.Density: {"grid": SCENE.grid},
 }
 """What fits are made of, which files hold by other means."""
@@ -179,7 +179,7 @@ MAY = {
     (mpm.render, "path"),
     (mpm.record, "path"),
     (mpm.render, "colour"),
-    (mpm.sample_mesh, "mesh"),
+    (mpm.geometry.sample_mesh, "mesh"),
     (mpm.fill, "dtype"),
     (mpm.fill_mapped, "dtype"),
     (mpm.fill_mapped, "mapping"),

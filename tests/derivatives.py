@@ -17,14 +17,14 @@ from mpmjax.boundary._contact import ConstrainedNodes
 from mpmjax.simulation import _simulate
 from mpmjax.stepping import _step
 
-TIGHT = mpm.ConjugateResidual(rtol=1e-14)  # that is, down to rounding: central differences see every digit
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-14)  # that is, down to rounding: central differences see every digit
 UPDATES = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(beta=0.8, solver=TIGHT, adjoint_solver=TIGHT),
-    "backward_euler": mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-14), adjoint_solver=TIGHT),
-    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Newton(TIGHT, rtol=1e-14), adjoint_solver=TIGHT),
-    "trbdf2": mpm.TRBDF2(0.2, mpm.Linearised(TIGHT), adjoint_solver=TIGHT),
-    "trbdf2_newton": mpm.TRBDF2(0.2, mpm.Newton(TIGHT, rtol=1e-14), adjoint_solver=TIGHT),
+    "backward_euler": mpm.BackwardEuler(mpm.implicit.Newton(TIGHT, 1e-14), adjoint_solver=TIGHT),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.implicit.Newton(TIGHT, rtol=1e-14), adjoint_solver=TIGHT),
+    "trbdf2": mpm.TRBDF2(0.2, mpm.implicit.Linearised(TIGHT), adjoint_solver=TIGHT),
+    "trbdf2_newton": mpm.TRBDF2(0.2, mpm.implicit.Newton(TIGHT, rtol=1e-14), adjoint_solver=TIGHT),
 }
 DX, DT, STEPS = 0.1, 1e-2, 20
 ALL_LAWS = ELASTIC | RUBBER | PLASTIC | FLUIDS | VISCOUS
@@ -263,11 +263,14 @@ def tolerance_sweep(update: str) -> dict[str, np.ndarray]:
         def value(modulus: Any, v: Any) -> Any:
             softer = eqx.tree_at(lambda s: s.material.youngs_modulus, scene, modulus)
             thrown = eqx.tree_at(lambda p: p.v, particles, v)
-            solver, adjoint_solver = mpm.ConjugateResidual(rtol=forward), mpm.ConjugateResidual(rtol=adjoint)
+            solver, adjoint_solver = (
+                mpm.implicit.ConjugateResidual(rtol=forward),
+                mpm.implicit.ConjugateResidual(rtol=adjoint),
+            )
             if update == "semi_implicit":
                 method = mpm.SemiImplicit(solver=solver, adjoint_solver=adjoint_solver)
             else:
-                method = mpm.BackwardEuler(mpm.Newton(rtol=forward), adjoint_solver=adjoint_solver)
+                method = mpm.BackwardEuler(mpm.implicit.Newton(rtol=forward), adjoint_solver=adjoint_solver)
             return (weights * mpm.rollout(softer, thrown, steps=5, dt=5e-2, method=method).x).sum()
 
         return jax.grad(value, argnums=(0, 1))(modulus, v)

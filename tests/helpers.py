@@ -149,7 +149,7 @@ def explicit_limit(scene: mpm.Scene) -> float:
     """dx / c [s], c the pressure-wave speed at rest."""
     (law,) = scene.laws
     law = law.law if isinstance(law, mpm.Viscous) else law
-    if isinstance(law, mpm.AbstractInelastic) and not isinstance(law, mpm.Fluid):
+    if isinstance(law, mpm.material.AbstractInelastic) and not isinstance(law, mpm.Fluid):
         law = law.elastic(law.initial_history(jnp.ones((1, 1))))
     modulus = law.bulk_modulus if isinstance(law, mpm.Fluid) else law.lame_lambda + 2 * law.shear_modulus
     return float(scene.grid.spacing) / float(np.sqrt(modulus / 1e3))

@@ -41,7 +41,7 @@ def test_force_and_hessian_are_derivatives_of_the_energy(precomputed, d, law, de
     @jax.jit
     def found(u, w):
         potential = start_nodes(scene, particles, 0.0, 1e-3, scene.stencil(particles)).potential
-        analytic, jvp = mpm.AnalyticHessian().at(potential, u), mpm.JvpHessian().at(potential, u)
+        analytic, jvp = mpm.implicit.AnalyticHessian().at(potential, u), mpm.implicit.JvpHessian().at(potential, u)
         analytic = analytic.precomputed() if precomputed else analytic
         return potential.force(u), jax.grad(potential.energy)(u), analytic(w), jvp(w)
 
@@ -59,7 +59,9 @@ def test_a_projected_hessian_is_positive_semidefinite_and_right_without_stress()
     @jax.jit
     def matrices(state):
         potential = start_nodes(scene, state, 0.0, 1e-3, scene.stencil(state)).potential
-        hessians = [mpm.AnalyticHessian(projected=projected).at(potential, None) for projected in (True, False)]
+        hessians = [
+            mpm.implicit.AnalyticHessian(projected=projected).at(potential, None) for projected in (True, False)
+        ]
         return [jax.vmap(hessian.precomputed())(vectors).reshape(vectors.shape[0], -1) for hessian in hessians]
 
     values = np.linalg.eigvalsh(np.asarray(matrices(particles)[0]))
@@ -101,7 +103,7 @@ def test_an_even_stretch_has_the_stress_of_the_law(description):
 
 METHODS = {
     "explicit": (mpm.Explicit(), 2e-4),
-    "implicit_midpoint": (mpm.ImplicitMidpoint(mpm.Newton()), 2e-3),
+    "implicit_midpoint": (mpm.ImplicitMidpoint(mpm.implicit.Newton()), 2e-3),
 }
 
 
@@ -195,7 +197,7 @@ def test_only_the_materials_that_are_named_are_averaged():
         (own, other), (single,) = some.material_points(ready), alone.material_points(part)
         assert other.average is None
         potential = start_nodes(some, ready, 0.0, 1e-3, some.stencil(ready)).potential
-        whole, fixed = mpm.JvpHessian().at(potential, None), mpm.AnalyticHessian().at(potential, None)
+        whole, fixed = mpm.implicit.JvpHessian().at(potential, None), mpm.implicit.AnalyticHessian().at(potential, None)
         return (own.average(field), single.average(field)), (whole(w), fixed.precomputed()(w))
 
     (own, single), (whole, precomputed) = found()

@@ -16,13 +16,13 @@ from mpmjax.potential import Displacement
 from mpmjax.stepping import start_nodes
 
 LAW = mpm.NeoHookean(1e4, 0.3)
-TIGHT = mpm.ConjugateResidual(rtol=1e-12)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-12)
 METHODS = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(solver=TIGHT),
-    "backward_euler": mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12)),
-    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
-    "trbdf2": mpm.TRBDF2(0.0, mpm.Linearised(TIGHT)),
+    "backward_euler": mpm.BackwardEuler(mpm.implicit.Newton(TIGHT, 1e-12)),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.implicit.Linearised(TIGHT)),
+    "trbdf2": mpm.TRBDF2(0.0, mpm.implicit.Linearised(TIGHT)),
 }
 for _name in METHODS.keys() - {"explicit"}:
     METHODS[_name] = eqx.tree_at(lambda m: m.adjoint_solver, METHODS[_name], TIGHT)

@@ -12,13 +12,13 @@ import mpmjax as mpm
 from mpmjax.boundary import combined_conditions, mirror
 from mpmjax.potential import Mirror
 
-TIGHT = mpm.ConjugateResidual(rtol=1e-13)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 METHODS = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(solver=TIGHT),
-    "backward_euler": mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12)),
-    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
-    "trbdf2": mpm.TRBDF2(0.0, mpm.Linearised(TIGHT)),
+    "backward_euler": mpm.BackwardEuler(mpm.implicit.Newton(TIGHT, 1e-12)),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.implicit.Linearised(TIGHT)),
+    "trbdf2": mpm.TRBDF2(0.0, mpm.implicit.Linearised(TIGHT)),
 }
 DX, DT = 0.1, 1e-2
 
@@ -399,7 +399,10 @@ def test_what_passes_a_boundary_is_named(d, name, method):
 
     for cells in (0.4, 0.9):
         run = thrown(cells, throw=False)
-        assert int(run.statistics.fault) in (mpm.Fault.NONE, mpm.Fault.COLLAPSED)  # it is thrown far beyond its sound
+        assert int(run.statistics.fault) in (
+            mpm.simulation.Fault.NONE,
+            mpm.simulation.Fault.COLLAPSED,
+        )  # it is thrown far beyond its sound
         assert float(run.final.x[:, -1].min()) > -1.5 * DX
     for cells in (2.5, 5.0):
         with pytest.raises(mpm.SimulationError, match=rf"At step \d+ .* passed boundary 0, {type(floor).__name__}"):

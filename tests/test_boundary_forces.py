@@ -15,13 +15,13 @@ from test_budget import BOUNDARIES as OF_BUDGETS, MOVED
 
 import mpmjax as mpm
 
-TIGHT = mpm.ConjugateResidual(rtol=1e-13)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 METHODS = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(solver=TIGHT),
-    "backward_euler": mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12)),
-    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
-    "trbdf2": mpm.TRBDF2(0.0, mpm.Newton(TIGHT, 1e-12)),
+    "backward_euler": mpm.BackwardEuler(mpm.implicit.Newton(TIGHT, 1e-12)),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.implicit.Linearised(TIGHT)),
+    "trbdf2": mpm.TRBDF2(0.0, mpm.implicit.Newton(TIGHT, 1e-12)),
 }
 BOUNDARIES = {name: boundary for name, boundary in OF_BUDGETS.items() if boundary} | {
     "walls and planes": (
@@ -33,7 +33,7 @@ BOUNDARIES = {name: boundary for name, boundary in OF_BUDGETS.items() if boundar
         mpm.SymmetryPlane(0, 0.0),
         mpm.ContactPlane(1, 0.0, friction=0.4),
         mpm.SeparatingBox((-1.0, -1.0), (0.2, 1.0), friction=0.2),
-        mpm.StickyCollider(mpm.Capsule((0.0, 0.3), (0.1, 0.3), 0.06), MOVED),
+        mpm.StickyCollider(mpm.geometry.Capsule((0.0, 0.3), (0.1, 0.3), 0.06), MOVED),
     ),
     "between planes": (mpm.SymmetryPlane(0, 0.0), mpm.SymmetryPlane(0, 0.3, keep="below"), mpm.SymmetryPlane(1, 0.0)),
 }
@@ -242,7 +242,11 @@ def pressed(method, dt, steps=8):
     ("method", "dt", "rtol"),
     [
         pytest.param(
-            mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12)), 0.1, 1e-9, id="backward_euler", marks=pytest.mark.thorough
+            mpm.BackwardEuler(mpm.implicit.Newton(TIGHT, 1e-12)),
+            0.1,
+            1e-9,
+            id="backward_euler",
+            marks=pytest.mark.thorough,
         ),
         pytest.param(mpm.SemiImplicit(), 0.05, 1e-3, id="semi_implicit"),
         pytest.param(mpm.SemiImplicit(0.5), 0.05, 1e-3, id="beta=0.5", marks=pytest.mark.thorough),
@@ -259,7 +263,7 @@ def test_a_force_stands_at_its_own_time(method, dt, rtol):
         error = np.abs(found[1:, 1] - force(times[1:])).max()  # the first step sets all in motion
         assert error < rtol * float(force(times[-1])[0])
     at = np.array([3.0, 4.25, 7.9]) * dt
-    seen = mpm.Force(at, np.stack([0 * at, force(at)], axis=1), boundary=1)
+    seen = mpm.fitting.Force(at, np.stack([0 * at, force(at)], axis=1), boundary=1)
     assert_close(seen.predict(None, run), seen.data, 1e-3)
 
 
@@ -309,7 +313,7 @@ def test_forces_on_boundaries_against_time(tmp_path):
         return mpm.simulate(own, particles, t1=1e-2, **settings).boundary_forces().force[0, 1, 1]
 
     fine = mpm.simulate(scene, particles, t1=1e-2, **settings | {"save_every": 1}).boundary_forces()
-    seen = mpm.Force(fine.times, fine.force[:, 1], boundary=1)
+    seen = mpm.fitting.Force(fine.times, fine.force[:, 1], boundary=1)
     experiment = mpm.Experiment(scene, particles, t1=1e-2, dt=2e-3, method=mpm.SemiImplicit(), observations=seen)
     assert_close(experiment.predictions(experiment.run())[0], fine.force[:, 1], 1e-9)
     slope = jax.grad(pull)(-9.81)

@@ -38,7 +38,7 @@ BOUNDARIES = {
         mpm.SeparatingBox((-0.2, 0.0), (0.6, 0.6), friction=0.3),
         mpm.SeparatingCollider(mpm.Ball((0.1, -0.1), 0.24), MOVED, friction=0.3),
         mpm.SlipCollider(mpm.HalfSpace((0.25, 0.2), (-2.0, -1.0))),
-        mpm.StickyCollider(mpm.Capsule((0.0, 0.3), (0.1, 0.3), 0.06), MOVED),
+        mpm.StickyCollider(mpm.geometry.Capsule((0.0, 0.3), (0.1, 0.3), 0.06), MOVED),
     ),
     "collider and contact plane": (
         mpm.ContactPlane(1, 0.0, friction=0.3),
@@ -106,7 +106,7 @@ CASES = {
         "boundary": BOUNDARIES["contact planes"],
     },
     "trbdf2-grip": {"method": SECOND_ORDER["trbdf2"], "boundary": BOUNDARIES["grip"], "transfer": TRANSFERS["flip"]},
-    "trbdf2-contact": {"method": mpm.TRBDF2(0.5, mpm.Newton()), "boundary": BOUNDARIES["contact"]},
+    "trbdf2-contact": {"method": mpm.TRBDF2(0.5, mpm.implicit.Newton()), "boundary": BOUNDARIES["contact"]},
     "body force, half a step on": {
         "body_force": Wind(jnp.asarray([0.5, 2.0]), 0.1, 3.0),
         "method": SECOND_ORDER["implicit_midpoint"],

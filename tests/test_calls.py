@@ -2,6 +2,7 @@
 
 import enum
 import inspect
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -28,8 +29,13 @@ WITHOUT_ARGUMENTS = "CentreOfMass backend"
 BY_THEMSELVES = "register read_columns FitProblem Columns after read_arrays"
 
 
+ROOT = Path(__file__).parents[1]
+TOP = {name: thing for name, thing in vars(mpm).items() if name[0] != "_" and not inspect.ismodule(thing)}
 FITTING = {name: thing for name, thing in vars(mpm.fitting).items() if name[0] != "_" and not inspect.ismodule(thing)}
-PUBLIC = FITTING | vars(mpm)
+LISTED = re.findall(r"`([a-z]+)\.(\w+)", (ROOT / "docs" / "features.md").read_text(encoding="utf-8"))
+"""Names of sub-packages that the features tell users of."""
+IN_ROOMS = {name: getattr(getattr(mpm, room), name) for room, name in LISTED if hasattr(mpm, room)}
+PUBLIC = FITTING | IN_ROOMS | TOP
 
 
 def test_nothing_public_is_left_out_of_these_calls():
@@ -43,10 +49,20 @@ def test_nothing_public_is_left_out_of_these_calls():
 
 
 def test_each_public_name_is_exposed_once():
-    """Under one name, which is the same at the top level and in `mpmjax.fitting`."""
-    assert not [name for name, thing in FITTING.items() if vars(mpm).get(name, thing) is not thing]
-    things = [id(thing) for name, thing in PUBLIC.items() if name[0] != "_"]
-    assert len(things) == len(set(things))
+    """At the top level or in a sub-package, which has no other thing of that name."""
+    assert not [name for name, thing in FITTING.items() if TOP.get(name, thing) is not thing]
+    assert not TOP.keys() & IN_ROOMS.keys()
+    assert len({id(thing) for thing in PUBLIC.values()}) == len(PUBLIC)
+    assert len(TOP) <= 90
+
+
+def test_each_public_name_is_called_in_one_way():
+    """By the tests, examples, benchmarks and documents: what is at the top level is not fetched from below."""
+    below = re.compile(rf"\bmpm(?:jax)?\.[a-z]+\.(?:{'|'.join(TOP)})\b(?!\.py)")
+    folders = ("mpmjax", "tests", "examples", "benchmarks", "docs")
+    paths = [p for kind in ("*.py", "*.md") for folder in folders for p in (ROOT / folder).rglob(kind)]
+    texts = {path: path.read_text(encoding="utf-8") for path in [ROOT / "README.md", *paths]}
+    assert not {path: calls for path, text in texts.items() if (calls := below.findall(text))}
 
 
 @pytest.fixture

@@ -18,14 +18,14 @@ from mpmjax.discretisation import scatter
 from mpmjax.implicit import ImplicitOperator, Projection
 from mpmjax.potential import Mirror
 
-TIGHT = mpm.ConjugateResidual(rtol=1e-13)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 METHODS = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(solver=TIGHT),
-    "mass": mpm.SemiImplicit(solver=TIGHT, preconditioner=mpm.MassPreconditioner()),
-    "backward_euler": mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12)),
-    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
-    "trbdf2": mpm.TRBDF2(0.0, mpm.Linearised(TIGHT)),
+    "mass": mpm.SemiImplicit(solver=TIGHT, preconditioner=mpm.implicit.MassPreconditioner()),
+    "backward_euler": mpm.BackwardEuler(mpm.implicit.Newton(TIGHT, 1e-12)),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.implicit.Linearised(TIGHT)),
+    "trbdf2": mpm.TRBDF2(0.0, mpm.implicit.Linearised(TIGHT)),
 }
 EACH_METHOD = pytest.mark.parametrize("method", **ids(METHODS, "explicit", QUICK))
 DX, DT, G = 0.1, 1e-2, np.array([1.0, -9.81, 2.0])
@@ -180,7 +180,7 @@ def test_what_the_earlier_holds_the_later_does_not_receive():
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("preconditioner", [mpm.DiagonalPreconditioner(), mpm.MassPreconditioner()])
+@pytest.mark.parametrize("preconditioner", [mpm.implicit.DiagonalPreconditioner(), mpm.implicit.MassPreconditioner()])
 def test_the_operator_is_symmetric_and_its_inner_product_commutes_with_the_projection(preconditioner):
     """Q (M + χH) Q and the identity, or the mass, on the rest; beside fixed components too."""
     grid, particles = cloud(2, p=12, cells=3)
@@ -189,7 +189,7 @@ def test_the_operator_is_symmetric_and_its_inner_product_commutes_with_the_proje
     scene = scene_of(grid, mpm.SlipBox((-np.inf, 0.0), (np.inf, np.inf)), mpm.SlipCollider(ball), slope)
     step = grid_update(scene, particles, DT, METHODS["explicit"])
     nodes = step.nodes
-    action = mpm.AnalyticHessian().at(nodes.potential, None)
+    action = mpm.implicit.AnalyticHessian().at(nodes.potential, None)
     operator = ImplicitOperator(nodes.mass, jnp.asarray(1e-3), action, nodes.projection)
     A, W = np.asarray(operator.as_matrix()), np.asarray(preconditioner.inner_product(operator).weight).ravel()
     n = A.shape[0]
@@ -217,7 +217,7 @@ def test_a_linear_solve_with_a_collider_is_the_dense_one():
     scene = scene_of(grid, mpm.SlipCollider(mpm.Ball((0.16, 0.12), 0.22), ROLLING))
     step = grid_update(scene, particles, DT, METHODS["semi_implicit"])
     nodes = step.nodes
-    action = mpm.AnalyticHessian().at(nodes.potential, None)
+    action = mpm.implicit.AnalyticHessian().at(nodes.potential, None)
     whole = ImplicitOperator(nodes.mass, nodes.dt**2, action, Projection(jnp.ones_like(nodes.free)))
     A, n = np.asarray(whole.as_matrix()), nodes.velocity.size
     Q = np.asarray(jax.vmap(lambda e: nodes.projection.combine(e.reshape(-1, 2), 0).ravel())(jnp.eye(n))).T
@@ -297,7 +297,7 @@ def test_what_colliders_receive_is_what_the_material_loses(method, d):
     """Change of momentum + impulse on all colliders = gravity's, with friction, sticking, sliding and separation."""
     grid, particles = landing(d)
     sticky = mpm.StickyCollider(mpm.Ball((0.4,) * d, 0.15), ROLLING if d == 2 else ROLLING_3D)
-    slip = mpm.SlipCollider(mpm.Capsule((0.0,) * d, (0.0, 0.2, 0.1)[:d], 0.11))
+    slip = mpm.SlipCollider(mpm.geometry.Capsule((0.0,) * d, (0.0, 0.2, 0.1)[:d], 0.11))
     scene = scene_of(grid, *obstacles(0.3, d), sticky, slip)
     dt = 0.5 * explicit_limit(scene)
     after, info = mpm.step(scene, particles, 0.0, dt, method=method)
@@ -491,7 +491,7 @@ def test_a_ball_pushed_through_a_block_meets_resistance():
     down = mpm.Motion((0.0, 1.0), ((0.0,) * 3, (0.0, 0.0, -4.0)))
     floor = mpm.SlipBox((-np.inf, -np.inf, 0.0), (np.inf,) * 3)
     impulses = []
-    for shape in (ball, mpm.sample_distance(ball, 0.05)):
+    for shape in (ball, mpm.geometry.sample_distance(ball, 0.05)):
         scene = mpm.Scene(grid, LAW, boundary=(floor, mpm.SeparatingCollider(shape, down, 0.1)))
         dt = 0.3 * explicit_limit(scene)
         step = jax.jit(lambda p, n, scene=scene, dt=dt: mpm.step(scene, p, n * dt, dt))
@@ -565,7 +565,9 @@ def test_single_precision_stays_single():
     """Under strict promotion, in the updates and in what is reported."""
     grid, block = landing()
     block = jax.tree.map(lambda a: a.astype(jnp.float32), block)
-    sticky = mpm.StickyCollider(mpm.Union((mpm.Capsule((0.4, 0.4), (0.4, 0.3), 0.15), mpm.Box((0.0, 0.3), (0.1, 0.4)))))
+    sticky = mpm.StickyCollider(
+        mpm.geometry.Union((mpm.geometry.Capsule((0.4, 0.4), (0.4, 0.3), 0.15), mpm.Box((0.0, 0.3), (0.1, 0.4))))
+    )
     scene = scene_of(grid, *obstacles(0.3), sticky)
     for method in (mpm.Explicit(), mpm.SemiImplicit()):
         after, info = mpm.step(scene, block, 0.0, 1e-3, method=method)
@@ -573,7 +575,7 @@ def test_single_precision_stays_single():
         assert {a.dtype for a in floats} == {jnp.dtype(jnp.float32)}
 
 
-TIGHTEST = mpm.ConjugateResidual(rtol=1e-14)
+TIGHTEST = mpm.implicit.ConjugateResidual(rtol=1e-14)
 UPDATES = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(solver=TIGHTEST, adjoint_solver=TIGHTEST),

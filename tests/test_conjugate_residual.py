@@ -69,7 +69,7 @@ def test_solution_agrees_with_a_dense_solve(spectrum, weighted, guessed):
     A, (b, y0, w) = symmetric(spectrum), vectors()
     A = np.sqrt(w)[:, None] * A * np.sqrt(w) if weighted else A
     arguments = [jnp.asarray(w) if weighted else None, jnp.asarray(y0) if guessed else None]
-    x, result, stats = solve(mpm.ConjugateResidual(rtol=1e-12), jnp.asarray(A), jnp.asarray(b), *arguments)
+    x, result, stats = solve(mpm.implicit.ConjugateResidual(rtol=1e-12), jnp.asarray(A), jnp.asarray(b), *arguments)
     assert result == R.successful
     assert_close(x, jnp.linalg.solve(A, b), 1e-10)
     assert true_residual(A, x, b, w if weighted else 1.0) <= 1.001e-12
@@ -85,7 +85,7 @@ def test_residual_never_grows(spectrum, weighted):
     w = w if weighted else np.ones(10)
     history = []
     for steps in range(1, 8):
-        _, _, stats = solve(mpm.ConjugateResidual(rtol=1e-14, max_steps=steps), *map(jnp.asarray, (A, b, w)))
+        _, _, stats = solve(mpm.implicit.ConjugateResidual(rtol=1e-14, max_steps=steps), *map(jnp.asarray, (A, b, w)))
         history.append(float(stats["residual"]))
     assert (np.diff([1.0, *history]) <= 0).all()
     E, root = A / w[:, None], np.sqrt(w)[:, None]
@@ -102,7 +102,7 @@ def test_it_is_a_lineax_solver():
     """`lineax.linear_solve` takes it, also for pytrees, and differentiates through it in A and b."""
     A, (b, _, w) = symmetric("indefinite"), vectors()
     A, b = jnp.asarray(A), jnp.asarray(b)
-    solver = mpm.ConjugateResidual(rtol=1e-12)
+    solver = mpm.implicit.ConjugateResidual(rtol=1e-12)
 
     @jax.jit
     def solved(A, b):
@@ -128,11 +128,13 @@ def test_an_exact_guess_takes_no_iteration(dtype):
     """y0 = A⁻¹b is seen to be one before any step; so is x = 0 for b = 0."""
     A, (b, _, _) = symmetric("definite"), vectors()
     y0 = np.linalg.solve(A, b)
-    x, result, stats = solve(mpm.ConjugateResidual(), *(jnp.asarray(a, dtype) for a in (A, b)), None, y0.astype(dtype))
+    x, result, stats = solve(
+        mpm.implicit.ConjugateResidual(), *(jnp.asarray(a, dtype) for a in (A, b)), None, y0.astype(dtype)
+    )
     assert result == R.successful
     assert stats["num_steps"] == 0
     np.testing.assert_array_equal(x, y0.astype(dtype))
-    x, result, stats = solve(mpm.ConjugateResidual(), jnp.asarray(A, dtype), jnp.zeros(N, dtype))
+    x, result, stats = solve(mpm.implicit.ConjugateResidual(), jnp.asarray(A, dtype), jnp.zeros(N, dtype))
     assert result == R.successful
     assert (x == 0).all()
     assert stats["num_steps"] == 0
@@ -146,7 +148,7 @@ def test_reported_residual_is_the_true_one(dtype, spectrum, max_steps):
     """`residual` is recomputed from the x returned, converged or not, in both precisions."""
     A, (b, _, w) = symmetric(spectrum).astype(dtype), vectors()
     b = b.astype(dtype)
-    solver = mpm.ConjugateResidual(max_steps=max_steps)
+    solver = mpm.implicit.ConjugateResidual(max_steps=max_steps)
     x, result, stats = solve(solver, jnp.asarray(A), jnp.asarray(b), jnp.asarray(w, dtype))
     eps, weight = float(jnp.finfo(dtype).eps), w.astype(dtype).astype(float)
     # the rounding of a residual's own evaluation
@@ -167,7 +169,7 @@ def test_reported_residual_is_the_true_one_after_a_far_guess(dtype):
     """From y0 a million times too large the recurrence's own residual drifts; what is reported and obeyed does not."""
     b, y0, _ = vectors()
     A, b, y0 = (a.astype(dtype) for a in (symmetric("definite"), b, 1e6 * y0))
-    x, result, stats = solve(mpm.ConjugateResidual(), *map(jnp.asarray, (A, b)), None, jnp.asarray(y0))
+    x, result, stats = solve(mpm.implicit.ConjugateResidual(), *map(jnp.asarray, (A, b)), None, jnp.asarray(y0))
     rtol = {4: 1e-5, 8: 1e-8}[b.itemsize]
     assert result == R.successful
     assert true_residual(A, x, b) <= 1.1 * rtol
@@ -180,7 +182,7 @@ def test_float32_ends_at_its_own_floor_and_says_so():
     Q = np.linalg.qr(rng.normal(size=(N, N)))[0]
     A = (Q @ np.diag(np.logspace(-4, 0, N)) @ Q.T).astype(np.float32)
     A, b = (A + A.T) / 2, rng.normal(size=N).astype(np.float32)
-    x, result, stats = solve(mpm.ConjugateResidual(rtol=1e-12), jnp.asarray(A), jnp.asarray(b))
+    x, result, stats = solve(mpm.implicit.ConjugateResidual(rtol=1e-12), jnp.asarray(A), jnp.asarray(b))
     assert result == R.successful
     floor = float(4 * np.finfo(np.float32).eps * (np.linalg.norm(x) / np.linalg.norm(b) + 1))
     assert 1e-12 < float(stats["residual"]) <= floor
@@ -196,7 +198,7 @@ def test_float32_ends_at_its_own_floor_and_says_so():
 def test_breakdown_is_reported(A):
     """Where rᵀA r = 0 the recurrence cannot go on: `RESULTS.breakdown`, finite numbers, an honest residual."""
     A, b = jnp.asarray(A), jnp.asarray([1.0, 0.0] if A[0][0] == 0 else [1.0, 1.0])
-    x, result, stats = solve(mpm.ConjugateResidual(), A, b)
+    x, result, stats = solve(mpm.implicit.ConjugateResidual(), A, b)
     assert result == R.breakdown
     assert jnp.isfinite(x).all()
     np.testing.assert_allclose(stats["residual"], true_residual(A, x, b))
@@ -206,7 +208,7 @@ def test_breakdown_is_reported(A):
 def test_breakdown_is_known_from_rounding():
     """What of rᵀA r = 0 the rounding of its sum leaves, some tenths of ε‖r‖‖A r‖, is a breakdown and no negative
     curvature; four thousand times that is what it looks like."""
-    solver = mpm.ConjugateResidual(max_steps=5)
+    solver = mpm.implicit.ConjugateResidual(max_steps=5)
 
     @jax.jit
     def report(diagonal, b):
@@ -236,7 +238,7 @@ def test_it_goes_on_while_the_true_residual_halves():
             return u * jnp.where(jnp.linalg.norm(u) < 0.5, 1 / (1 - share), 1.0)
 
         plain = lx.FunctionLinearOperator(off, jax.ShapeDtypeStruct(b.shape, b.dtype), lx.symmetric_tag)
-        x, result, stats = mpm.ConjugateResidual().compute(plain, b, {"y0": 0.6 * b})
+        x, result, stats = mpm.implicit.ConjugateResidual().compute(plain, b, {"y0": 0.6 * b})
         return x, result == R.successful, result == R.stagnation, stats["num_steps"]
 
     x, successful, _, steps = report(0.4)
@@ -253,7 +255,7 @@ def test_a_residual_above_a_twentieth_is_never_accepted():
     """However large the rounding of its own evaluation: 400 times the right-hand side here, in float32."""
     A = jnp.diag(jnp.asarray([1.0, 2.0, 1e-8], jnp.float32))
     b, y0 = (jnp.asarray(a, jnp.float32) for a in ((1.3, 1.3, 10.0), (0.0, 0.0, 1e9)))
-    _, result, stats = solve(mpm.ConjugateResidual(max_steps=1), A, b, None, y0)
+    _, result, stats = solve(mpm.implicit.ConjugateResidual(max_steps=1), A, b, None, y0)
     np.testing.assert_allclose(stats["residual"], 0.0572, atol=1e-4)
     assert result == R.max_steps_reached
 
@@ -261,11 +263,11 @@ def test_a_residual_above_a_twentieth_is_never_accepted():
 def test_running_out_of_steps_is_reported():
     """`max_steps` steps, no more; raised by `lineax.linear_solve`."""
     A, (b, _, _) = symmetric("definite"), vectors()
-    _, result, stats = solve(mpm.ConjugateResidual(max_steps=3), jnp.asarray(A), jnp.asarray(b))
+    _, result, stats = solve(mpm.implicit.ConjugateResidual(max_steps=3), jnp.asarray(A), jnp.asarray(b))
     assert result == R.max_steps_reached
     assert stats["num_steps"] == 3
     with pytest.raises(eqx.EquinoxRuntimeError, match="maximum number of solver steps"):
-        lx.linear_solve(operator(A), jnp.asarray(b), mpm.ConjugateResidual(max_steps=3))
+        lx.linear_solve(operator(A), jnp.asarray(b), mpm.implicit.ConjugateResidual(max_steps=3))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -273,7 +275,7 @@ def test_a_non_finite_right_hand_side_is_reported(bad):
     """Not converged, by its own result code, at once."""
     A, (b, _, _) = symmetric("definite"), vectors()
     b[3] = bad
-    _, result, stats = solve(mpm.ConjugateResidual(), jnp.asarray(A), jnp.asarray(b))
+    _, result, stats = solve(mpm.implicit.ConjugateResidual(), jnp.asarray(A), jnp.asarray(b))
     assert result == R.nonfinite_input
     assert stats["num_steps"] <= 1
 
@@ -282,7 +284,7 @@ def test_a_non_symmetric_operator_is_refused():
     """The tag decides, since a matrix-free operator cannot be looked at."""
     plain = lx.MatrixLinearOperator(jnp.asarray(symmetric("definite")))
     with pytest.raises(ValueError, match="needs a symmetric operator"):
-        lx.linear_solve(plain, jnp.ones(N), mpm.ConjugateResidual())
+        lx.linear_solve(plain, jnp.ones(N), mpm.implicit.ConjugateResidual())
 
 
 @pytest.mark.thorough
@@ -290,14 +292,14 @@ def test_increment_rtol_stops_at_a_small_increment():
     """The reference's test ‖αp‖² ≤ tol²‖x‖²: stops sooner than the residual's would, converged by itself."""
     A, (b, _, _) = symmetric("definite"), vectors()
     A, b = jnp.asarray(A), jnp.asarray(b)
-    x, result, stats = solve(mpm.ConjugateResidual(rtol=1e-12, increment_rtol=1e-3), A, b)
-    _, _, full = solve(mpm.ConjugateResidual(rtol=1e-12), A, b)
+    x, result, stats = solve(mpm.implicit.ConjugateResidual(rtol=1e-12, increment_rtol=1e-3), A, b)
+    _, _, full = solve(mpm.implicit.ConjugateResidual(rtol=1e-12), A, b)
     k = int(stats["num_steps"])
     assert result == R.successful
     assert 1 < k < full["num_steps"]
-    assert k == solve(mpm.ConjugateResidual(rtol=1e-12, increment_rtol=1e-3), A, 2.0**-20 * b)[2]["num_steps"]
+    assert k == solve(mpm.implicit.ConjugateResidual(rtol=1e-12, increment_rtol=1e-3), A, 2.0**-20 * b)[2]["num_steps"]
     np.testing.assert_allclose(stats["residual"], true_residual(A, x, b))
-    iterates = [solve(mpm.ConjugateResidual(rtol=1e-14, max_steps=m), A, b)[0] for m in (k - 2, k - 1, k)]
+    iterates = [solve(mpm.implicit.ConjugateResidual(rtol=1e-14, max_steps=m), A, b)[0] for m in (k - 2, k - 1, k)]
     before, last = (float(jnp.linalg.norm(new - old) / jnp.linalg.norm(new)) for old, new in pairwise(iterates))
     assert last <= 1e-3 < before
 
@@ -307,14 +309,14 @@ def test_tolerance_is_relative_to_the_right_hand_side(dtype):
     """b scaled by a power of two near 1e-12 and the operator by one near 1e3 change neither the path nor the report."""
     A, (b, y0, _) = symmetric("definite"), vectors()
     A, b, y0 = (jnp.asarray(a, dtype) for a in (A, b, y0))
-    x, result, stats = solve(mpm.ConjugateResidual(), A, b, None, y0)
+    x, result, stats = solve(mpm.implicit.ConjugateResidual(), A, b, None, y0)
     small, large = 2.0**-40, 2.0**10
-    y, other, report = solve(mpm.ConjugateResidual(), A, small * b, None, small * y0)
+    y, other, report = solve(mpm.implicit.ConjugateResidual(), A, small * b, None, small * y0)
     assert result == other == R.successful
     np.testing.assert_array_equal(y, small * x)
     assert report["num_steps"] == stats["num_steps"]
     assert report["residual"] == stats["residual"]
-    y, other, report = solve(mpm.ConjugateResidual(), large * A, large * b, None, y0)
+    y, other, report = solve(mpm.implicit.ConjugateResidual(), large * A, large * b, None, y0)
     assert other == R.successful
     np.testing.assert_array_equal(y, x)
     assert report["num_steps"] == stats["num_steps"]
@@ -332,7 +334,7 @@ def test_tolerance_is_relative_to_the_right_hand_side(dtype):
 def test_bad_arguments_are_refused(arguments, message):
     """Tolerances are positive, and there is at least one step."""
     with pytest.raises(ValueError, match=message):
-        mpm.ConjugateResidual(**arguments)
+        mpm.implicit.ConjugateResidual(**arguments)
 
 
 def literal_conjugate_residual(E, b, guess, steps):
@@ -367,7 +369,7 @@ def block_and_stray(multiple):
     assert jnp.where(occupied, node_mass, jnp.inf).min() < 1e-10 * mass[0]
     images = mirror((), grid, scene.window(particles))
     potential = ElasticPotential(scene.material_points(particles), stencil, images, grid.size)
-    hessian = mpm.AnalyticHessian().at(potential, None)
+    hessian = mpm.implicit.AnalyticHessian().at(potential, None)
     free = jnp.broadcast_to(occupied[:, None], velocity.shape)
     factor = jnp.asarray((multiple * explicit_limit(scene)) ** 2)
     return ImplicitOperator(node_mass, factor, hessian, Projection(free)), node_mass[:, None] * velocity
@@ -381,9 +383,9 @@ def test_the_references_plain_inner_product_fails_on_a_nearly_empty_node():
     inner product E is not self-adjoint, does not come near in ten times as many, whichever norm one asks.
     """
     system, momentum = block_and_stray(5)
-    inner = mpm.MassPreconditioner().inner_product(system)
+    inner = mpm.implicit.MassPreconditioner().inner_product(system)
     options = {"inner_product": inner, "y0": momentum / inner.weight}
-    v, result, stats = eqx.filter_jit(mpm.ConjugateResidual(rtol=1e-8).compute)(system, momentum, options)
+    v, result, stats = eqx.filter_jit(mpm.implicit.ConjugateResidual(rtol=1e-8).compute)(system, momentum, options)
     assert result == R.successful
     steps = int(stats["num_steps"])
     assert steps < 60
@@ -408,7 +410,9 @@ def test_converged_below_the_tolerance_of_float32_means_a_small_error(condition)
         A = (A + A.T) / 2
         for b, least in ((A @ rng.normal(size=N), 2e-2), (rng.normal(size=N), NEGLIGIBLE_CHANGE)):
             b = b.astype(np.float32)
-            x, result, _ = solve(mpm.ConjugateResidual(rtol=1e-12, max_steps=4000), jnp.asarray(A), jnp.asarray(b))
+            x, result, _ = solve(
+                mpm.implicit.ConjugateResidual(rtol=1e-12, max_steps=4000), jnp.asarray(A), jnp.asarray(b)
+            )
             exact = np.linalg.solve(A.astype(float), b.astype(float))
             error = np.linalg.norm(np.asarray(x) - exact) / np.linalg.norm(exact)
             assert bool(result == R.successful) == (condition < 1e5)
@@ -419,7 +423,7 @@ def test_a_residual_that_cannot_be_corrected_is_no_solution():
     """The least-squares solution of a singular system: no correction changes it, since there is none."""
     A, b, best = np.diag([1.0, 2.0, 0.0]), np.array([1.0, 1.0, 0.1]), np.array([1.0, 0.5, 0.0])
     for y0 in (None, jnp.asarray(best)):
-        _, result, stats = solve(mpm.ConjugateResidual(), jnp.asarray(A), jnp.asarray(b), None, y0)
+        _, result, stats = solve(mpm.implicit.ConjugateResidual(), jnp.asarray(A), jnp.asarray(b), None, y0)
         assert result == R.breakdown
         np.testing.assert_allclose(stats["residual"], 0.1 / np.linalg.norm(b))
 

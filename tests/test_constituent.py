@@ -54,10 +54,12 @@ def test_two_materials_are_one_with_a_modulus_for_each_particle(method, descript
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("hessian", [mpm.AnalyticHessian(True), mpm.JvpHessian()], ids=["projected", "jvp"])
+@pytest.mark.parametrize(
+    "hessian", [mpm.implicit.AnalyticHessian(True), mpm.implicit.JvpHessian()], ids=["projected", "jvp"]
+)
 @pytest.mark.parametrize(
     "preconditioner",
-    [mpm.DiagonalPreconditioner(), pytest.param(mpm.MassPreconditioner(), marks=pytest.mark.slow)],
+    [mpm.implicit.DiagonalPreconditioner(), pytest.param(mpm.implicit.MassPreconditioner(), marks=pytest.mark.slow)],
 )
 def test_hessians_and_preconditioners_of_two_materials_are_those_of_one(preconditioner, hessian):
     one, two, particles = halves()
@@ -106,8 +108,8 @@ def test_a_bar_of_two_stiffnesses_carries_one_stress(method, contrast):
         dt = 0.5 / round(0.5 / float(mpm.stable_dt(scene, particles, safety=0.5)))
         run = mpm.simulate(scene, particles, t1=4.0, dt=dt)
     else:
-        solver = mpm.ConjugateResidual(1e-10)
-        update = mpm.SemiImplicit(preconditioner=mpm.DiagonalPreconditioner(), solver=solver)
+        solver = mpm.implicit.ConjugateResidual(1e-10)
+        update = mpm.SemiImplicit(preconditioner=mpm.implicit.DiagonalPreconditioner(), solver=solver)
         run = mpm.simulate(scene, particles, t1=40.0, dt=0.5, method=update)
     middle = slice(32, 48)
     soft, hard = (

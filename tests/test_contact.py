@@ -17,13 +17,13 @@ from mpmjax.implicit import Projection, no_solve
 from mpmjax.potential import Mirror
 from mpmjax.stepping import NodeMotion, reaction, start_nodes, update
 
-TIGHT = mpm.ConjugateResidual(rtol=1e-13)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 METHODS = {"explicit": mpm.Explicit(), "semi_implicit": mpm.SemiImplicit(solver=TIGHT)}
-BACKWARD_EULER = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12))
+BACKWARD_EULER = mpm.BackwardEuler(mpm.implicit.Newton(TIGHT, 1e-12))
 OTHERS = {
     "backward_euler": BACKWARD_EULER,
-    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
-    "trbdf2": mpm.TRBDF2(0.0, mpm.Linearised(TIGHT)),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.implicit.Linearised(TIGHT)),
+    "trbdf2": mpm.TRBDF2(0.0, mpm.implicit.Linearised(TIGHT)),
 }
 TIMES = {"explicit": 0.2, "semi_implicit": 2.0}  # of dx / c
 DX, G = 0.1, 9.81

@@ -142,7 +142,7 @@ def test_an_iteration_of_an_implicit_step_crosses_once_each_way():
 
 
 def test_the_diagonal_preconditioner_adds_one_crossing_to_a_solve_and_nothing_to_an_iteration():
-    by_mass, by_diagonal = mpm.SemiImplicit(preconditioner=mpm.MassPreconditioner()), mpm.SemiImplicit()
+    by_mass, by_diagonal = mpm.SemiImplicit(preconditioner=mpm.implicit.MassPreconditioner()), mpm.SemiImplicit()
     (there, back), (more, as_many) = crossings(counted(by_mass)), crossings(counted(by_diagonal))
     assert (more, as_many) == (there + 1, back)
     step, arrays = program(by_diagonal)

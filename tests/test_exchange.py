@@ -10,11 +10,11 @@ from numpy_oracle import grid_update
 import mpmjax as mpm
 
 DX, G = 0.1, np.array([1.0, -9.81, 2.0])
-TIGHT = mpm.ConjugateResidual(rtol=1e-13)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 METHODS = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(solver=TIGHT),
-    "midpoint": mpm.ImplicitMidpoint(mpm.Newton(TIGHT, 1e-13)),
+    "midpoint": mpm.ImplicitMidpoint(mpm.implicit.Newton(TIGHT, 1e-13)),
 }
 TOTAL = {"description": mpm.TotalLagrangian(), "gradient": GRADIENTS["mls"]}
 
@@ -60,7 +60,7 @@ def boundaries(description, d):
     if description == "total":
         return (floor, grip, lid, side), [roller]
     ball = mpm.SeparatingCollider(mpm.Ball((0.3, 0.0, 0.2)[:d], 0.15), rolling(d, slow, -4.0, (0.2, 0.1, 0.0)), 0.3)
-    wedge = mpm.SlipCollider(mpm.Capsule((0.1, 0.0, -1.0)[:d], (0.1, -0.1, 1.0)[:d], 0.1), roller)
+    wedge = mpm.SlipCollider(mpm.geometry.Capsule((0.1, 0.0, -1.0)[:d], (0.1, -0.1, 1.0)[:d], 0.1), roller)
     box = mpm.SeparatingBox((-np.inf,) * d, (0.32, np.inf, np.inf)[:d], 0.2)
     return (ball, wedge, grip, lid, box), [ball.motion, roller]
 
@@ -152,7 +152,7 @@ def test_moments_at_the_two_ends_of_a_column_balance(d):
         mpm.StickyCollider(mpm.Box((-1.0,) * (d - 1) + (0.55,), (*wide, 1.0)), motion),
     )
     scene = mpm.Scene(grid, mpm.NeoHookean(1e5, 0.3), boundary=ends, **TOTAL)
-    method = mpm.SemiImplicit(hessian=mpm.AnalyticHessian(projected=True))
+    method = mpm.SemiImplicit(hessian=mpm.implicit.AnalyticHessian(projected=True))
     run = mpm.simulate(scene, column, t1=3.0, dt=0.05, save_every=10, method=method)
     _, force, torque = (np.asarray(a) for a in run.forces())
     pivots = np.stack([ends[0].shape.middle(), np.asarray(motion.centre) + shift])

@@ -13,7 +13,8 @@ from mpmjax.simulation._run import Fault
 
 DT = 0.01
 METHOD = mpm.SemiImplicit(
-    solver=mpm.ConjugateResidual(rtol=1e-3, max_steps=4), adjoint_solver=mpm.ConjugateResidual(rtol=1e-12, max_steps=4)
+    solver=mpm.implicit.ConjugateResidual(rtol=1e-3, max_steps=4),
+    adjoint_solver=mpm.implicit.ConjugateResidual(rtol=1e-12, max_steps=4),
 )
 """Four iterations solve what is soft, and of what is stiffer the motion but not its derivative."""
 WELL, UNDERIVED = 1.0, 7.0
@@ -132,7 +133,7 @@ def test_a_derivative_that_misses_its_tolerance_by_little_is_taken():
 
     @jax.jit
     def tangent(rtol):
-        adjoint = mpm.ConjugateResidual(rtol, max_steps=2)
+        adjoint = mpm.implicit.ConjugateResidual(rtol, max_steps=2)
 
         def place(stiffness):
             harder = eqx.tree_at(lambda s: s.material.youngs_modulus, scene, stiffness)

@@ -105,7 +105,7 @@ def test_the_jacobian_is_that_of_differences():
     times, x, which = tracks()
     seen = [
         mpm.Tracks(times, x, which=which, sigma=NOISE),
-        mpm.Series(times[::2] - DT / 3, x[::2, -1, 0], mpm.Extent(0), sigma=1e-3),
+        mpm.Series(times[::2] - DT / 3, x[::2, -1, 0], mpm.fitting.Extent(0), sigma=1e-3),
     ]
     speed = mpm.Unbounded(update=lambda e, s: eqx.tree_at(lambda e: e.particles.v, e, s * e.particles.v), start=1.0)
     problem = FitProblem((experiment(seen),), {"E": STIFFNESS, "speed": speed})
@@ -140,7 +140,7 @@ class Line(FitProblem):
 
 def fitted_line(monkeypatch, y, prior=None, **options):
     times = np.linspace(0.001, 0.05, len(y))
-    seen = mpm.Series(times, y, mpm.Extent(0), **options)
+    seen = mpm.Series(times, y, mpm.fitting.Extent(0), **options)
     monkeypatch.setattr("mpmjax.fitting._fit.FitProblem", lambda *_: Line(times * 20, seen, prior))
     return mpm.fit([], {})
 
@@ -171,7 +171,7 @@ def test_times_of_a_run_in_single_precision_lie_in_it(steps):
     for dt in (1e-3, 3e-4, 1 / 7, 0.06 / 60):
         t1, short = steps * dt, np.float32(dt)
         times = np.arange(steps - 2, steps + 1, dtype=np.float32) * short
-        seen = mpm.Series(times, np.zeros(3), mpm.Extent(0))
+        seen = mpm.Series(times, np.zeros(3), mpm.fitting.Extent(0))
         seen.check(scene, particles, t1)
         assert seen.part_until(t1).count == 3
         with pytest.raises(ValueError, match="must lie in the run"):
@@ -221,7 +221,7 @@ def test_a_force_is_said_in_the_run_and_nowhere_else():
     predicted."""
     forces = Mock(force=jnp.asarray([1.0, 3.0, 7.0])[:, None, None])
     run = Mock(spec=mpm.Run, dt=0.1, steps=np.arange(4), method=mpm.ImplicitMidpoint(), forces=lambda: forces)
-    seen = mpm.Force([0.0, 0.05, 0.1, 0.3], np.ones((4, 1)))
+    seen = mpm.fitting.Force([0.0, 0.05, 0.1, 0.3], np.ones((4, 1)))
     assert np.allclose(seen.predict(None, run)[:, 0], [0, 1, 2, 9])
     late = eqx.tree_at(lambda o: o.times, seen, seen.times + 0.2)
     assert np.isfinite(late.predict(None, run)[:, 0]).tolist() == [True, True, True, False]
@@ -243,11 +243,11 @@ def test_the_force_on_a_collider_fixes_the_density_of_what_rests_on_it():
     forces = mpm.simulate(scene, block, save_every=1, **at).forces()
     mass = np.asarray(block.mass)
     scale = mpm.Positive(update=lambda e, f: eqx.tree_at(lambda e: e.particles.mass, e, f * mass), start=0.7)
-    seen = mpm.Force(np.asarray(forces.times)[::2], np.asarray(forces.force)[::2, 0], sigma=0.1)
+    seen = mpm.fitting.Force(np.asarray(forces.times)[::2], np.asarray(forces.force)[::2, 0], sigma=0.1)
     found = mpm.fit(mpm.Experiment(scene, block, observations=seen, **at), {"density": scale})
     assert found["density"].value == pytest.approx(1, rel=1e-4)
     with pytest.raises(ValueError, match="the scene has 1"):
-        mpm.Experiment(scene, block, observations=mpm.Force([0.01], [[0.0, 0.0]], collider=3), **at)
+        mpm.Experiment(scene, block, observations=mpm.fitting.Force([0.01], [[0.0, 0.0]], collider=3), **at)
 
 
 @pytest.mark.parametrize(
@@ -306,12 +306,12 @@ def test_intervals_cover_the_truth_as_often_as_they_say():
 def test_a_marker_between_particles_follows_any_affine_motion():
     scene, particles = bar(n=2)
     places = np.array([[0.13, 0.21], [0.3, 0.05], [0.39, 0.39]])
-    markers = mpm.Markers.at(particles, places)
+    markers = mpm.fitting.Markers.at(particles, places)
     A, b = np.array([[1.2, 0.3], [-0.4, 0.8]]), np.array([0.1, -2.0])
     moved = eqx.tree_at(lambda q: q.x, particles, particles.x @ A.T + b)
     assert np.allclose(markers(scene, moved), places @ A.T + b, atol=1e-12)
     with pytest.raises(ValueError, match="must lie on the body"):
-        mpm.Markers.at(particles, np.array([[2.0, 2.0]]))
+        mpm.fitting.Markers.at(particles, np.array([[2.0, 2.0]]))
 
 
 def test_a_picture_keeps_the_mass_and_needs_no_correspondence():
@@ -462,13 +462,13 @@ def test_bad_parameters_get_one_line(parameters, material, says):
 
 BAD_DATA = {
     "another shape": (lambda: mpm.Series([0.01], ones(1), lambda s, p: p.x[3]), "but of returns shape"),
-    "no axis": (lambda: mpm.Series([0.01], ones(1), mpm.Extent(5)), "axis must be below"),
-    "late": (lambda: mpm.Series([0.01, 9.0], ones(2), mpm.Extent(0)), "must lie in the run"),
-    "unsorted": (lambda: mpm.Series([0.02, 0.01], ones(2), mpm.Extent(0)), "must grow"),
-    "empty": (lambda: mpm.Series([0.02], np.array([np.nan]), mpm.Extent(0)), "has no data"),
-    "infinite": (lambda: mpm.Series([0.02], np.array([np.inf]), mpm.Extent(0)), "finite data"),
-    "no noise": (lambda: mpm.Series([0.02], ones(1), mpm.Extent(0), sigma=0.0), "greater than zero"),
-    "shape": (lambda: mpm.Series([0.01, 0.02], ones(3), mpm.Extent(0)), "values of shape"),
+    "no axis": (lambda: mpm.Series([0.01], ones(1), mpm.fitting.Extent(5)), "axis must be below"),
+    "late": (lambda: mpm.Series([0.01, 9.0], ones(2), mpm.fitting.Extent(0)), "must lie in the run"),
+    "unsorted": (lambda: mpm.Series([0.02, 0.01], ones(2), mpm.fitting.Extent(0)), "must grow"),
+    "empty": (lambda: mpm.Series([0.02], np.array([np.nan]), mpm.fitting.Extent(0)), "has no data"),
+    "infinite": (lambda: mpm.Series([0.02], np.array([np.inf]), mpm.fitting.Extent(0)), "finite data"),
+    "no noise": (lambda: mpm.Series([0.02], ones(1), mpm.fitting.Extent(0), sigma=0.0), "greater than zero"),
+    "shape": (lambda: mpm.Series([0.01, 0.02], ones(3), mpm.fitting.Extent(0)), "values of shape"),
     "markers": (lambda: mpm.Tracks([0.01], ones((1, 2, 1)), which=[0]), "of the m markers"),
     "no particle": (lambda: mpm.Tracks([0.01], ones((1, 1, 1)), which=[99]), "from 0"),
     "dimension": (lambda: mpm.Tracks([0.01], ones((1, 1, 3)), which=[0]), "3-dimensional"),
@@ -495,7 +495,7 @@ def test_a_curve_that_the_run_does_not_reach_is_an_error_and_not_a_flat_line():
 
 @pytest.mark.thorough
 def test_a_simulation_that_fails_at_the_first_guess_says_where():
-    series = mpm.Series([0.01], ones(1), mpm.Extent(0), sigma=1.0)
+    series = mpm.Series([0.01], ones(1), mpm.fitting.Extent(0), sigma=1.0)
     with pytest.raises(mpm.SimulationError, match="step"):
         mpm.fit(experiment(series, E=1e9), {"E": mpm.Positive(STIFFNESS.where)})
 
@@ -619,8 +619,8 @@ def test_a_number_near_or_at_its_bound_is_extrapolated_no_farther_than_that():
 def test_a_measurements_zero_of_time_is_a_parameter():
     """A front that was read off a clock two steps late; a clock that leaves the run says so."""
     scene, particles = bar()
-    run = mpm.simulate(scene, particles, t1=STEPS * DT, dt=DT, save_every=1, observe=mpm.Extent(0))
-    seen = mpm.Series(np.arange(2, 11) * DT, np.asarray(run.observed)[4:13], mpm.Extent(0), sigma=NOISE)
+    run = mpm.simulate(scene, particles, t1=STEPS * DT, dt=DT, save_every=1, observe=mpm.fitting.Extent(0))
+    seen = mpm.Series(np.arange(2, 11) * DT, np.asarray(run.observed)[4:13], mpm.fitting.Extent(0), sigma=NOISE)
 
     def late(e, by):
         return eqx.tree_at(lambda e: e.observations[0].times, e, seen.times + by)

@@ -49,7 +49,7 @@ def measured(noise=NOISE, seed=0, **options):
     """The place of the middle with noise."""
     middle = 0.15 + design() @ [G, V] + noise * np.random.default_rng(seed).normal(size=STEPS)
     times = DT * np.arange(1, STEPS + 1)
-    return mpm.Series(times, middle[:, None], mpm.CentreOfMass(), **options)
+    return mpm.Series(times, middle[:, None], mpm.fitting.CentreOfMass(), **options)
 
 
 def twice_as_long(e):

@@ -343,7 +343,7 @@ def test_doubled_stresses_double_the_modulus():
     particles = mpm.fill(mpm.Box((0.0, 0.0), (0.01, 0.04)), grid, particles_per_cell=4, density=930.0, dtype="float64")
     fine = asked.experiments[0].scene
     scene = mpm.Scene(grid, fine.material, boundary=fine.boundary, description=mpm.TotalLagrangian())
-    of = mpm.StressStretch.of(mpm.Box((0.0, 0.0), (0.01, 0.01)), particles, 1)
+    of = mpm.fitting.StressStretch.of(mpm.Box((0.0, 0.0), (0.01, 0.01)), particles, 1)
     once, twice = (
         mpm.fit(
             mpm.Experiment(
@@ -365,7 +365,7 @@ def test_doubled_stresses_double_the_modulus():
 def test_a_gauge_weighs_by_volume_and_must_hold_particles():
     grid = mpm.Grid((10, 22), 2.5e-3, origin=(-3, -3))
     particles = mpm.fill(mpm.Box((0.0, 0.0), (0.01, 0.04)), grid, particles_per_cell=4, density=930.0)
-    curve = mpm.StressStretch.of(mpm.Box((0.0, 0.0), (0.01, 0.01)), particles, 1)
+    curve = mpm.fitting.StressStretch.of(mpm.Box((0.0, 0.0), (0.01, 0.01)), particles, 1)
     assert float(curve.weight.sum()) == pytest.approx(1)
     law = mpm.NeoHookean(1e6, 0.4)
     F = 2 * np.broadcast_to(np.eye(2), (particles.count, 2, 2))
@@ -375,6 +375,6 @@ def test_a_gauge_weighs_by_volume_and_must_hold_particles():
     assert float(stretch) == pytest.approx(2)
     assert float(stress) == pytest.approx(float(law.stress(2 * jnp.eye(2)[..., None])[1, 1, 0]))
     with pytest.raises(ValueError, match="holds no particle"):
-        mpm.StressStretch.of(mpm.Box((1.0, 1.0), (2.0, 2.0)), particles, 1)
+        mpm.fitting.StressStretch.of(mpm.Box((1.0, 1.0), (2.0, 2.0)), particles, 1)
     with pytest.raises(ValueError, match="axis must be below 2"):
-        mpm.StressStretch.of(mpm.Box((0.0, 0.0), (0.01, 0.01)), particles, 2)
+        mpm.fitting.StressStretch.of(mpm.Box((0.0, 0.0), (0.01, 0.01)), particles, 2)

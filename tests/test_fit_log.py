@@ -44,7 +44,7 @@ def experiment():
     times = np.arange(1, STEPS + 1) * DT
     observed = [
         mpm.Tracks(times, seen, which=np.arange(0, particles.count, 3)),
-        mpm.Series(times, front, mpm.Extent(0), name="front"),
+        mpm.Series(times, front, mpm.fitting.Extent(0), name="front"),
     ]
     return mpm.Experiment(scene, particles, t1=STEPS * DT, dt=DT, observations=observed)
 

@@ -143,7 +143,7 @@ def test_fits_by_lbfgs_converge_in_single_precision():
 @pytest.mark.thorough
 def test_an_adjoint_solve_that_does_not_converge_is_reported():
     """One iteration of the adjoint's solver is too few."""
-    few = mpm.SemiImplicit(adjoint_solver=mpm.ConjugateResidual(rtol=1e-12, max_steps=1))
+    few = mpm.SemiImplicit(adjoint_solver=mpm.implicit.ConjugateResidual(rtol=1e-12, max_steps=1))
     scene, q = bar(n=2)
     of = mpm.Experiment(scene, q, t1=STEPS * DT, dt=DT, method=few, observations=seen(n=2))
     for optimiser in (mpm.fitting.LBFGS(), mpm.fitting.Adam()):
@@ -199,7 +199,7 @@ MODULUS = mpm.Positive(lambda e: e.scene.material.youngs_modulus, prior=mpm.fitt
 def in_a_square(**options):
     """A square, nothing of which was measured but a number."""
     scene, q = bar(n=2)
-    centre = mpm.Series([DT], np.zeros((1, 2)), mpm.CentreOfMass(), sigma=1.0)
+    centre = mpm.Series([DT], np.zeros((1, 2)), mpm.fitting.CentreOfMass(), sigma=1.0)
     return mpm.Experiment(options.get("scene", scene), options.get("q", q), t1=DT, dt=DT, observations=centre)
 
 

@@ -82,9 +82,9 @@ GRID = mpm.Grid((1000, 1000, 100), 0.1)
 LITTLE = mpm.fill(mpm.Ball((5.0, 5.0, 5.0), 0.3), mpm.Grid((9, 9, 9), 0.1), density=1.0)
 SMALL = mpm.Scene(mpm.Grid((100, 100, 100), 0.1), mpm.NeoHookean(1e5, 0.3))
 TOO_MUCH = {
-    "samples of a mesh": (lambda: mpm.sample_mesh(TETRAHEDRON, 1e-5), "A lattice of 1e\\+15 samples"),
+    "samples of a mesh": (lambda: mpm.geometry.sample_mesh(TETRAHEDRON, 1e-5), "A lattice of 1e\\+15 samples"),
     "samples of a region": (
-        lambda: mpm.sample_distance(mpm.Ball((0.0, 0.0), 1.0), 1e-9),
+        lambda: mpm.geometry.sample_distance(mpm.Ball((0.0, 0.0), 1.0), 1e-9),
         "A lattice of 4e\\+18 samples",
     ),
     "a lattice": (

@@ -280,7 +280,7 @@ def test_an_adjoint_that_does_not_converge_gives_nan():
 
     def value(q, steps):
         scene, particles, _ = model(q, case)
-        method = mpm.SemiImplicit(solver=TIGHT, adjoint_solver=mpm.ConjugateResidual(max_steps=steps))
+        method = mpm.SemiImplicit(solver=TIGHT, adjoint_solver=mpm.implicit.ConjugateResidual(max_steps=steps))
         return outcome(mpm.rollout(scene, particles, steps=1, dt=DT, method=method)).sum()
 
     gradient = jax.jit(jax.grad(value), static_argnums=1)
@@ -305,6 +305,6 @@ def test_a_gradient_in_float32_is_not_limited_by_the_adjoint_solve():
 
         return float(jax.grad(height)(jnp.asarray(1e7, dtype)))
 
-    tight = mpm.ConjugateResidual(rtol=1e-12)
+    tight = mpm.implicit.ConjugateResidual(rtol=1e-12)
     exact = slope(jnp.float64, mpm.SemiImplicit(solver=tight, adjoint_solver=tight))
     assert slope(jnp.float32, mpm.SemiImplicit()) == pytest.approx(exact, rel=1e-3)

@@ -29,7 +29,7 @@ CASES = {
     # the others need det F > 0
     if law == "fixed_corotated" or family != "inverted"
 }
-HESSIANS = {"analytic": mpm.AnalyticHessian(), "jvp": mpm.JvpHessian()}
+HESSIANS = {"analytic": mpm.implicit.AnalyticHessian(), "jvp": mpm.implicit.JvpHessian()}
 IN_THREE_DIMENSIONS = [("fixed_corotated", "updated", "spline"), ("neo_hookean", "total", "mls")]
 """Cases of all families of F that are not slow."""
 DEFAULT = [
@@ -227,7 +227,7 @@ def test_rows_of_fixed_components_and_empty_nodes_are_the_identity(d):
     held = ~np.asarray(free)
     np.testing.assert_array_equal(got[held], np.asarray(u)[held])
     np.testing.assert_array_equal(apply(operator, jnp.where(free, 0, u)), jnp.where(free, 0, u))
-    weight = mpm.MassPreconditioner().inner_product(operator).weight
+    weight = mpm.implicit.MassPreconditioner().inner_product(operator).weight
     np.testing.assert_array_equal(weight, jnp.where(free, operator.mass[:, None], 1))
     assert (weight > 0).all()
     without = eqx.tree_at(lambda o: o.factor, operator, jnp.asarray(0.0))

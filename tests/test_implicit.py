@@ -12,8 +12,8 @@ import mpmjax as mpm
 from mpmjax.implicit import SolveInfo, StageProblem
 from mpmjax.implicit._newton import MOST_HALVINGS, backtrack
 
-TIGHT = mpm.ConjugateResidual(rtol=1e-13)
-NEWTON = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12))
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
+NEWTON = mpm.BackwardEuler(mpm.implicit.Newton(TIGHT, 1e-12))
 
 
 def jolted(speed=0.3, side=3, dtype="float64", **scene):
@@ -37,10 +37,10 @@ def stage(nodes, theta=1.0, displacement=None):
         force=nodes.force,
         spacing=nodes.spacing,
         potential=nodes.potential,
-        hessian=mpm.AnalyticHessian(),
+        hessian=mpm.implicit.AnalyticHessian(),
         projection=nodes.projection,
         prescribed=nodes.prescribed,
-        preconditioner=mpm.MassPreconditioner(),
+        preconditioner=mpm.implicit.MassPreconditioner(),
         theta=theta,
     )
 
@@ -58,7 +58,7 @@ def test_beta_zero_from_the_explicit_velocity_is_the_explicit_step(description):
     """To rounding, and without an iteration."""
     scene, particles = jolted(description=description, gravity=(0.0, -9.81), boundary=mpm.SlipBox((0, 0), (1, 1)))
     explicit, _ = mpm.step(scene, particles, 0.0, 5e-3)
-    method = mpm.SemiImplicit(beta=0.0, guess=mpm.Guess.EXPLICIT)
+    method = mpm.SemiImplicit(beta=0.0, guess=mpm.implicit.Guess.EXPLICIT)
     new, info = mpm.step(scene, particles, 0.0, 5e-3, method=method)
     assert info.solve.iterations == 0
     assert info.solve.converged
@@ -70,7 +70,7 @@ def test_beta_zero_from_the_explicit_velocity_is_the_explicit_step(description):
 def test_beta_one_is_one_newton_step_of_backward_euler():
     """Newton from rest linearises where the semi-implicit step does."""
     scene, particles = jolted(gravity=(0.0, -9.81), boundary=mpm.StickyBox((0, 0), (1, 1)))
-    once = mpm.BackwardEuler(mpm.Newton(TIGHT, max_steps=1), guess=mpm.Guess.ZERO)
+    once = mpm.BackwardEuler(mpm.implicit.Newton(TIGHT, max_steps=1), guess=mpm.implicit.Guess.ZERO)
     a, info = mpm.step(scene, particles, 0.0, 2e-2, method=once)
     b, _ = mpm.step(scene, particles, 0.0, 2e-2, method=mpm.SemiImplicit(beta=1.0, solver=TIGHT))
     assert info.solve.newton == 1
@@ -127,19 +127,23 @@ def test_the_two_hessians_give_the_same_step(method):
     """Analytic differential or jvp of the energy's gradient."""
     scene, particles = jolted(material=LAWS["neo_hookean"])
     options = {"solution": NEWTON.solution} if method is mpm.BackwardEuler else {"solver": TIGHT}
-    a, _ = mpm.step(scene, particles, 0.0, 2e-2, method=method(hessian=mpm.AnalyticHessian(), **options))
-    b, _ = mpm.step(scene, particles, 0.0, 2e-2, method=method(hessian=mpm.JvpHessian(), **options))
+    a, _ = mpm.step(scene, particles, 0.0, 2e-2, method=method(hessian=mpm.implicit.AnalyticHessian(), **options))
+    b, _ = mpm.step(scene, particles, 0.0, 2e-2, method=method(hessian=mpm.implicit.JvpHessian(), **options))
     for name in ("x", "v", "F", "C"):
         assert_close(getattr(a, name), getattr(b, name), 1e-11)
 
 
 @pytest.mark.parametrize(
-    "guess", [*thorough(mpm.Guess.GRID_VELOCITY, mpm.Guess.EXPLICIT, mpm.Guess.ZERO)], ids=lambda g: g.name.lower()
+    "guess",
+    [*thorough(mpm.implicit.Guess.GRID_VELOCITY, mpm.implicit.Guess.EXPLICIT, mpm.implicit.Guess.ZERO)],
+    ids=lambda g: g.name.lower(),
 )
 def test_backward_euler_withstands_a_guess_that_inverts_the_material(guess):
     """A compression that would turn cells inside out in the step ends at an admissible state, whatever the guess."""
     scene, particles = squeezed(rate=50.0)
-    new, info = mpm.step(scene, particles, 0.0, 0.05, method=mpm.BackwardEuler(mpm.Newton(max_steps=60), guess=guess))
+    new, info = mpm.step(
+        scene, particles, 0.0, 0.05, method=mpm.BackwardEuler(mpm.implicit.Newton(max_steps=60), guess=guess)
+    )
     assert info.solve.converged
     assert np.isfinite(np.asarray(new.x)).all()
     assert (np.linalg.det(np.asarray(new.F)) > 0).all()
@@ -150,7 +154,7 @@ def test_line_search_backtracks_and_saves_what_one_newton_step_would_invert():
     """In a violent compression the full Newton step overshoots; the semi-implicit one inverts the material."""
     scene, particles = squeezed(rate=150.0)
     linear, _ = mpm.step(scene, particles, 0.0, 0.05, method=mpm.SemiImplicit())
-    method = mpm.BackwardEuler(guess=mpm.Guess.ZERO)
+    method = mpm.BackwardEuler(guess=mpm.implicit.Guess.ZERO)
     new, info = mpm.step(scene, particles, 0.0, 0.05, method=method)
     assert np.linalg.det(np.asarray(linear.F)).min() < 0
     assert info.solve.line_search > 0
@@ -180,7 +184,7 @@ def test_newton_starts_from_the_linearised_system_where_nothing_else_is_admissib
     """A grip that closes more than the gap to its neighbours in a step inverts them by itself, and so does rest."""
     grip = mpm.Grip(mpm.Box((0.25,), (2.0,)), mpm.Motion((0.0, 1.0), ((0.0,), (-0.5,))))
     scene, particles = block(1, material=LAWS["neo_hookean"], boundary=grip)
-    for guess in (mpm.Guess.GRID_VELOCITY, mpm.Guess.ZERO):
+    for guess in (mpm.implicit.Guess.GRID_VELOCITY, mpm.implicit.Guess.ZERO):
         new, info = mpm.step(scene, particles, 0.0, 0.5, method=mpm.BackwardEuler(NEWTON.solution, guess=guess))
         assert info.solve.converged
         assert 0.97 < np.asarray(new.F).min() <= np.asarray(new.F).max() < 1
@@ -218,7 +222,7 @@ def test_the_derivative_of_a_newton_step_with_a_projected_hessian_is_the_equatio
 
     exact, projected = (
         jax.jvp(lambda rate, h=h: end(rate, h), (jnp.asarray(0.1),), (jnp.asarray(1.0),))
-        for h in (mpm.AnalyticHessian(), mpm.AnalyticHessian(projected=True))
+        for h in (mpm.implicit.AnalyticHessian(), mpm.implicit.AnalyticHessian(projected=True))
     )
     assert_close(projected[0], exact[0], 1e-11)
     assert_close(projected[1], exact[1], 1e-7)
@@ -289,7 +293,7 @@ def test_single_precision_converges_and_says_how_far(times):
     indefinite there: one start in sixty wanders to the last step, before and after any change of roundings, and none
     with a projected Hessian.)"""
     scene, particles = jolted(speed=0.9, side=4, dtype="float32")
-    method = mpm.SemiImplicit(preconditioner=mpm.MassPreconditioner())  # whose norm is taken below
+    method = mpm.SemiImplicit(preconditioner=mpm.implicit.MassPreconditioner())  # whose norm is taken below
     grid = grid_update(scene, particles, times * explicit_limit(scene), method)
     assert grid.velocity.dtype == jnp.float32
     assert grid.info.solve.converged
@@ -310,12 +314,12 @@ def test_single_precision_converges_and_says_how_far(times):
 def test_an_unconverged_solve_is_reported():
     """Too few iterations: converged is false and the residual says by how much."""
     scene, particles = jolted()
-    method = mpm.SemiImplicit(solver=mpm.ConjugateResidual(max_steps=3))
+    method = mpm.SemiImplicit(solver=mpm.implicit.ConjugateResidual(max_steps=3))
     _, info = mpm.step(scene, particles, 0.0, 0.1, method=method)
     assert not info.solve.converged
     assert info.solve.iterations == 3
     assert info.solve.residual > 1e-8
-    _, info = mpm.step(scene, particles, 0.0, 0.1, method=mpm.BackwardEuler(mpm.Newton(max_steps=1)))
+    _, info = mpm.step(scene, particles, 0.0, 0.1, method=mpm.BackwardEuler(mpm.implicit.Newton(max_steps=1)))
     assert not info.solve.converged
 
 
@@ -364,7 +368,7 @@ AT_REST = [
 def test_newton_knows_a_body_at_rest(method, d, dtype):
     """A column that has come to rest under its weight, or without any: forces cancel, and what is left is rounding.
     Every step converges, from the third of them to rest in no more than three Newton steps a solve."""
-    newton = {"backward_euler": mpm.BackwardEuler(), "trbdf2": mpm.TRBDF2(solution=mpm.Newton())}[method]
+    newton = {"backward_euler": mpm.BackwardEuler(), "trbdf2": mpm.TRBDF2(solution=mpm.implicit.Newton())}[method]
     most = {"backward_euler": 3, "trbdf2": 6}[method]
     for gravity in (-9.81, 0.0):
         for dt in (1e-2, 1.0, 10.0, 1e4):
@@ -380,7 +384,7 @@ def test_newton_knows_a_body_at_rest(method, d, dtype):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("preconditioner", [mpm.DiagonalPreconditioner(), mpm.MassPreconditioner()])
+@pytest.mark.parametrize("preconditioner", [mpm.implicit.DiagonalPreconditioner(), mpm.implicit.MassPreconditioner()])
 def test_rounding_alone_accepts_no_guess(preconditioner):
     """Free fall in single precision, of a body so stiff that a step's weight is below the rounding of its forces."""
     scene, particles = block(

@@ -29,7 +29,7 @@ from mpmjax.state._preparation import prepare
 DTYPES = {"float32": jnp.float32, "float64": jnp.float64}
 STEPPERS = {
     "explicit": (mpm.Explicit(), 5e-3),
-    "semi_implicit": (mpm.SemiImplicit(solver=mpm.ConjugateResidual(1e-4)), 3e-2),
+    "semi_implicit": (mpm.SemiImplicit(solver=mpm.implicit.ConjugateResidual(1e-4)), 3e-2),
 }
 
 

@@ -44,11 +44,11 @@ def test_a_scene_takes_a_law_that_holds_a_network():
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("hessian", [mpm.AnalyticHessian(), mpm.JvpHessian()])
+@pytest.mark.parametrize("hessian", [mpm.implicit.AnalyticHessian(), mpm.implicit.JvpHessian()])
 def test_gradients_by_weights_of_a_network_are_differences(hessian):
     """Through implicit steps."""
     grid, particles = cloud(2, p=20, cells=3)
-    scene, solver = mpm.Scene(grid, perceptron()), mpm.ConjugateResidual(rtol=1e-13)
+    scene, solver = mpm.Scene(grid, perceptron()), mpm.implicit.ConjugateResidual(rtol=1e-13)
     method = mpm.SemiImplicit(1.0, solver, hessian=hessian, adjoint_solver=solver)
 
     @jax.jit

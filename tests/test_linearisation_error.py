@@ -66,7 +66,7 @@ METHODS = {
     "explicit": (mpm.Explicit(), False),
     "semi-implicit": (mpm.SemiImplicit(), True),
     "midpoint": (mpm.ImplicitMidpoint(), True),
-    "midpoint by Newton": (mpm.ImplicitMidpoint(solution=mpm.Newton()), False),
+    "midpoint by Newton": (mpm.ImplicitMidpoint(solution=mpm.implicit.Newton()), False),
     "TR-BDF2": (mpm.TRBDF2(), True),
     "backward Euler": (mpm.BackwardEuler(), False),
 }

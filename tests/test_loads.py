@@ -65,8 +65,12 @@ def gained(scene, particles, method, dt):
         (mpm.Box((0.013,), (0.871,)), 2.0, 0.858),
         (mpm.Box((0.013, -0.02), (0.871, 0.03)), 1.816, 0.0429),
         (mpm.Box((0.013, 0.1, -0.02), (0.871, 0.4, 0.03)), 0.6306, 0.01287),
-        (mpm.Annulus((0.02, 0.01), 0.8, 1.0), 3.6 * np.pi, 0.36 * np.pi),
-        (mpm.Cylinder((0.02, 0.01, 0.0), (0.72, 0.61, 0.4), 1.0), 2 * np.pi * (1 + 1.01**0.5), np.pi * 1.01**0.5),
+        (mpm.geometry.Annulus((0.02, 0.01), 0.8, 1.0), 3.6 * np.pi, 0.36 * np.pi),
+        (
+            mpm.geometry.Cylinder((0.02, 0.01, 0.0), (0.72, 0.61, 0.4), 1.0),
+            2 * np.pi * (1 + 1.01**0.5),
+            np.pi * 1.01**0.5,
+        ),
     ],
 )
 def test_surfaces_are_closed_and_have_their_area(region, area, volume):
@@ -76,7 +80,7 @@ def test_surfaces_are_closed_and_have_their_area(region, area, volume):
     for spacing in (1 / 4, 1 / 8):
         found = surface_pieces(region, spacing)
         middle, areas = found.middle, found.area
-        assert np.abs(areas.sum(axis=0)).max() < (1e-12 if not isinstance(region, mpm.Cylinder) else 1e-2)
+        assert np.abs(areas.sum(axis=0)).max() < (1e-12 if not isinstance(region, mpm.geometry.Cylinder) else 1e-2)
         found = np.sqrt((areas**2).sum(axis=1)).sum() / area, (middle * areas).sum() / region.dim / volume
         errors.append(np.abs(np.array(found) - 1))
     if isinstance(region, mpm.Box):
@@ -259,7 +263,7 @@ def test_springs_to_the_ground_and_of_contact_make_one_potential(d):
 
     @jax.jit
     def found(u, du):
-        action = mpm.AnalyticHessian().at(potential, None)
+        action = mpm.implicit.AnalyticHessian().at(potential, None)
         resistance = -jax.jvp(potential.force, (jnp.zeros_like(u),), (du,))[1]
         others = []
         for without in ("Springs", "Support"):

@@ -28,7 +28,7 @@ class Oscillation(FitProblem):
         del experiments, memory
         scene, particles = bar()
         rng = np.random.default_rng(0)
-        seen = mpm.Series(TIMES, np.cos(400 * TIMES) + 0.01 * rng.normal(size=40), mpm.Extent(0), sigma=0.01)
+        seen = mpm.Series(TIMES, np.cos(400 * TIMES) + 0.01 * rng.normal(size=40), mpm.fitting.Extent(0), sigma=0.01)
         self.experiments = (mpm.Experiment(scene, particles, t1=STEPS * DT, dt=DT, observations=seen),)
         self.names, self.parameters = ("omega",), tuple(parameters.values())
         self.starts = (jnp.asarray(self.parameters[0].start),)

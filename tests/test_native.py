@@ -465,7 +465,7 @@ def test_wrong_arrays_are_refused():
     nodes = problem(2, 3, 3, 10, "float32")[-1]
     index, w = jnp.zeros((2, 3, 10), "int32"), jnp.zeros((2, 3, 10), "float32")
     bad = jax.ffi.ffi_call("mpmjax_gather", [jax.ShapeDtypeStruct((3, 10), "float32")] * 3)
-    assert mpm.backend().name == "native"
+    assert mpm.native.backend().name == "native"
     with pytest.raises(Exception, match="shapes do not fit"):
         jax.block_until_ready(
             jax.jit(lambda *a: bad(*a, placed=np.bool_(False), differential=np.bool_(False)))(
@@ -497,11 +497,11 @@ def test_runs_agree(choose, method):
 def test_one_variable_chooses(choose):
     """MPMJAX_BACKEND is native, xla or nothing; native where there is no library is an error that says why."""
     choose("xla")
-    assert mpm.backend().name == "xla"
-    assert "MPMJAX_BACKEND=xla" in str(mpm.backend())
+    assert mpm.native.backend().name == "xla"
+    assert "MPMJAX_BACKEND=xla" in str(mpm.native.backend())
     choose("cuda")
     with pytest.raises(ValueError, match="must be native or xla"):
-        mpm.backend()
+        mpm.native.backend()
 
 
 @pytest.fixture
@@ -518,10 +518,10 @@ def test_without_a_library_xla_sums(other_library, choose, tmp_path):
     other_library(tmp_path / "none.so")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert "found no C++ compiler" in str(mpm.backend())
+        assert "found no C++ compiler" in str(mpm.native.backend())
     choose("native")
     with pytest.raises(ValueError, match="no library of them"):
-        mpm.backend()
+        mpm.native.backend()
 
 
 def test_a_library_that_does_not_fit_is_warned_of_once(other_library, tmp_path):
@@ -530,10 +530,10 @@ def test_a_library_that_does_not_fit_is_warned_of_once(other_library, tmp_path):
     broken.write_bytes(b"not a library")
     other_library(broken)
     with pytest.warns(UserWarning, match="are not used"):
-        assert mpm.backend().name == "xla"
+        assert mpm.native.backend().name == "xla"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert mpm.backend().name == "xla"
+        assert mpm.native.backend().name == "xla"
 
 
 @NEEDS_LIBRARY
@@ -542,7 +542,7 @@ def test_a_library_of_another_version_is_not_used(other_library, monkeypatch):
     monkeypatch.setattr(_library, "INTERFACE", -1)
     other_library(_library.PATH)
     with pytest.warns(UserWarning, match="interface"):
-        assert mpm.backend().name == "xla"
+        assert mpm.native.backend().name == "xla"
 
 
 def test_numbers_that_have_to_be_equal_are():

@@ -190,7 +190,7 @@ def test_a_run_that_ends_with_water_in_its_lowest_layer_tells_of_it():
 
 
 def test_a_tolerance_that_anything_meets_is_told_of():
-    for make in (mpm.ConjugateResidual, lambda rtol: mpm.Newton(rtol=rtol)):
+    for make in (mpm.implicit.ConjugateResidual, lambda rtol: mpm.implicit.Newton(rtol=rtol)):
         with pytest.warns(UserWarning, match=r"rtol is 10\.0: at 1 or more the zero vector already meets it"):
             make(10.0)
 

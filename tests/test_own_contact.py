@@ -93,7 +93,7 @@ def hanging(glue, d=1, stiffness=1e7, nu=0.3, **choices):
     return mpm.Scene(grid, law, gravity=down, boundary=GluedWall(d - 1, 0.0, glue), **choices), particles
 
 
-TIGHT = mpm.ConjugateResidual(rtol=1e-12)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-12)
 METHODS = {"semi_implicit": mpm.SemiImplicit(), "backward_euler": mpm.BackwardEuler(), "trbdf2": mpm.TRBDF2()}
 
 

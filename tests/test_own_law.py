@@ -44,8 +44,8 @@ class Fibres(Gel):
 
 CLOSED = mpm.NeoHookean(1e4, 0.3)
 OWN = Gel(CLOSED.shear_modulus, CLOSED.lame_lambda)
-TIGHT = mpm.ConjugateResidual(rtol=1e-13)
-NEWTON = mpm.Newton(TIGHT, 1e-12)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
+NEWTON = mpm.implicit.Newton(TIGHT, 1e-12)
 RUNS = {
     "explicit": (1, mpm.UpdatedLagrangian(), mpm.Explicit()),
     "trbdf2": (1, mpm.TotalLagrangian(), mpm.TRBDF2(solution=NEWTON)),
@@ -54,10 +54,10 @@ RUNS = {
     "projected": (
         2,
         mpm.UpdatedLagrangian(),
-        mpm.SemiImplicit(1.0, TIGHT, hessian=mpm.AnalyticHessian(projected=True)),
+        mpm.SemiImplicit(1.0, TIGHT, hessian=mpm.implicit.AnalyticHessian(projected=True)),
     ),
-    "jvp": (3, mpm.TotalLagrangian(), mpm.SemiImplicit(0.5, TIGHT, hessian=mpm.JvpHessian())),
-    "analytic": (3, mpm.UpdatedLagrangian(), mpm.SemiImplicit(1.0, TIGHT, hessian=mpm.AnalyticHessian())),
+    "jvp": (3, mpm.TotalLagrangian(), mpm.SemiImplicit(0.5, TIGHT, hessian=mpm.implicit.JvpHessian())),
+    "analytic": (3, mpm.UpdatedLagrangian(), mpm.SemiImplicit(1.0, TIGHT, hessian=mpm.implicit.AnalyticHessian())),
 }
 
 
@@ -104,7 +104,9 @@ def moment_gradient(law, scene, particles, method):
     return jax.grad(moment, argnums=(0, 1))(particles.F, jnp.asarray(CLOSED.shear_modulus))
 
 
-@pytest.mark.parametrize("hessian", [mpm.AnalyticHessian(), *thorough(mpm.AnalyticHessian(projected=True))])
+@pytest.mark.parametrize(
+    "hessian", [mpm.implicit.AnalyticHessian(), *thorough(mpm.implicit.AnalyticHessian(projected=True))]
+)
 def test_gradients_are_those_of_the_closed_form(hessian):
     """Through implicit steps from rest, where all stretches coincide: third derivatives of the energy."""
     method = mpm.SemiImplicit(1.0, TIGHT, hessian=hessian, adjoint_solver=TIGHT)
@@ -228,7 +230,13 @@ def test_an_anisotropic_law_moves_and_is_refused_where_its_frame_is_needed():
         mpm.stable_dt(scene, particles)
     with pytest.raises(RuntimeError, match="Fibres is not isotropic, and the projected Hessian needs a law that is"):
         jax.block_until_ready(
-            mpm.step(scene, particles, 0.0, 1e-4, method=mpm.SemiImplicit(hessian=mpm.AnalyticHessian(projected=True)))
+            mpm.step(
+                scene,
+                particles,
+                0.0,
+                1e-4,
+                method=mpm.SemiImplicit(hessian=mpm.implicit.AnalyticHessian(projected=True)),
+            )
         )
 
 

@@ -39,10 +39,10 @@ def test_it_finds_what_newton_finds_with_its_derivative(integrator):
         method = integrator(solution=solution)
         return mpm.simulate(scene, particles, t1=4e-3, dt=2e-3, method=method).final.x
 
-    assert_close(final(Chord(), 1e4), final(mpm.Newton(rtol=1e-11), 1e4), 1e-10)
+    assert_close(final(Chord(), 1e4), final(mpm.implicit.Newton(rtol=1e-11), 1e4), 1e-10)
     own, newton = (
         jax.grad(lambda E, solution=solution: (final(solution, E) ** 2).sum())(1e4)
-        for solution in (Chord(), mpm.Newton(rtol=1e-11))
+        for solution in (Chord(), mpm.implicit.Newton(rtol=1e-11))
     )
     assert float(own) == pytest.approx(float(newton), rel=1e-6)
 

@@ -17,9 +17,9 @@ import mpmjax as mpm
 from mpmjax.implicit import AbstractInnerProduct, DiagonalInnerProduct, TangentAction
 
 DT = 2e-2
-PROJECTED = mpm.AnalyticHessian(projected=True)
+PROJECTED = mpm.implicit.AnalyticHessian(projected=True)
 CG = lx.CG(rtol=1e-11, atol=1e-11)
-TIGHT = mpm.ConjugateResidual(rtol=1e-12)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-12)
 WALL = mpm.SlipBox((0.0, 0.0), (1.0, 1.0))
 
 
@@ -113,7 +113,7 @@ class UndeformedHessian(mpm.implicit.AbstractHessian):
         return TangentAction(potential, tangents, positive_semidefinite=True)
 
     def exact(self):
-        return mpm.AnalyticHessian()
+        return mpm.implicit.AnalyticHessian()
 
 
 def scene_and_particles():
@@ -151,7 +151,7 @@ def assert_same(method, reference, tolerance):
 
 
 OURS = mpm.SemiImplicit(hessian=PROJECTED, solver=TIGHT, adjoint_solver=TIGHT)
-NEWTON = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-11), hessian=PROJECTED, adjoint_solver=TIGHT)
+NEWTON = mpm.BackwardEuler(mpm.implicit.Newton(TIGHT, 1e-11), hessian=PROJECTED, adjoint_solver=TIGHT)
 
 
 @pytest.mark.thorough
@@ -177,7 +177,7 @@ def test_a_semi_implicit_run_and_its_gradient_by_any_symmetric_solver(solver):
 def test_newtons_method_by_conjugate_gradients():
     """In backward Euler, of a projected Hessian; the adjoint is that of the true one, for which it takes a solver of
     matrices that may be indefinite."""
-    method = dataclasses.replace(NEWTON, solution=mpm.Newton(CG, 1e-11), adjoint_solver=MinimalResidual())
+    method = dataclasses.replace(NEWTON, solution=mpm.implicit.Newton(CG, 1e-11), adjoint_solver=MinimalResidual())
     statistics, reference = assert_same(method, NEWTON, 1e-9)
     assert statistics.newton == reference.newton
 
@@ -188,7 +188,7 @@ def test_the_preconditioner_is_that_of_any_solver():
     the better preconditioner, and ends with the residual that it states."""
     scene, particles = scene_and_particles()
     counts = []
-    for preconditioner in (mpm.MassPreconditioner(), mpm.DiagonalPreconditioner(), BlockJacobi()):
+    for preconditioner in (mpm.implicit.MassPreconditioner(), mpm.implicit.DiagonalPreconditioner(), BlockJacobi()):
         method = dataclasses.replace(OURS, preconditioner=preconditioner)
         for solver in (method.solver, MinimalResidual(rtol=1e-12)):
             _, info = mpm.step(scene, particles, 0.0, 5 * DT, method=dataclasses.replace(method, solver=solver))
@@ -209,19 +209,19 @@ def test_what_cannot_solve_is_refused_with_what_can():
     def stepped(method):
         return mpm.step(scene, particles, 0.0, DT, method=method)
 
-    for method in (mpm.SemiImplicit(solver=CG), mpm.BackwardEuler(mpm.Newton(CG))):
+    for method in (mpm.SemiImplicit(solver=CG), mpm.BackwardEuler(mpm.implicit.Newton(CG))):
         with pytest.raises(ValueError, match=r"CG refuses .* may be indefinite\. Take .*AnalyticHessian\(projected"):
             stepped(method)
     with pytest.raises(ValueError, match=r"CG refuses .* adjoint_solver of Newton's method"):
         outcome(dataclasses.replace(NEWTON, adjoint_solver=CG))
     with pytest.raises(ValueError, match=r"Tridiagonal refuses .* without other structure\. Take"):
         stepped(mpm.SemiImplicit(hessian=PROJECTED, solver=lx.Tridiagonal()))
-    for make in (mpm.Linearised, mpm.Newton, lambda solver: mpm.BackwardEuler(adjoint_solver=solver)):
+    for make in (mpm.implicit.Linearised, mpm.implicit.Newton, lambda solver: mpm.BackwardEuler(adjoint_solver=solver)):
         with pytest.raises(ValueError, match=r"must have an atol above zero"):
             make(solver=lx.CG(rtol=1e-8, atol=0.0))
     identity = lx.IdentityLinearOperator(jax.ShapeDtypeStruct((2,), float))
     with pytest.raises(ValueError, match=r"takes no preconditioner"):
-        mpm.ConjugateResidual().init(identity, {"preconditioner": identity})
+        mpm.implicit.ConjugateResidual().init(identity, {"preconditioner": identity})
 
 
 @pytest.mark.thorough

@@ -18,12 +18,12 @@ from mpmjax.state import LoadedPoints
 SPEED, STRETCH, DT = 0.3, 0.05, 0.04
 KAPPA = 4e4
 """Stiffness over mass [1/m²/s²]: at the stretch of 0.05 m that of a spring of period 0.36 s."""
-TIGHT = mpm.ConjugateResidual(rtol=1e-13)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 METHODS = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(solver=TIGHT, adjoint_solver=TIGHT),
-    "backward_euler": mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-12), adjoint_solver=TIGHT),
-    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Newton(TIGHT, 1e-12), adjoint_solver=TIGHT),
+    "backward_euler": mpm.BackwardEuler(mpm.implicit.Newton(TIGHT, 1e-12), adjoint_solver=TIGHT),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.implicit.Newton(TIGHT, 1e-12), adjoint_solver=TIGHT),
 }
 
 

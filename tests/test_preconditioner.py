@@ -14,17 +14,17 @@ from mpmjax import linalg as la
 from mpmjax.implicit import ImplicitOperator
 from mpmjax.stepping import start_nodes
 
-TIGHT = mpm.ConjugateResidual(rtol=1e-11)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-11)
 IMPLICIT = {
     "semi_implicit": mpm.SemiImplicit(solver=TIGHT, adjoint_solver=TIGHT),
-    "backward_euler": mpm.BackwardEuler(mpm.Newton(rtol=1e-11), adjoint_solver=TIGHT),
-    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT), adjoint_solver=TIGHT),
-    "trbdf2": mpm.TRBDF2(solution=mpm.Newton(rtol=1e-11), adjoint_solver=TIGHT),
+    "backward_euler": mpm.BackwardEuler(mpm.implicit.Newton(rtol=1e-11), adjoint_solver=TIGHT),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.implicit.Linearised(TIGHT), adjoint_solver=TIGHT),
+    "trbdf2": mpm.TRBDF2(solution=mpm.implicit.Newton(rtol=1e-11), adjoint_solver=TIGHT),
 }
 
 
 def by_the_mass(method):
-    return dataclasses.replace(method, preconditioner=mpm.MassPreconditioner())
+    return dataclasses.replace(method, preconditioner=mpm.implicit.MassPreconditioner())
 
 
 def operator_of(scene, particles, hessian, factor=1e-3):
@@ -41,7 +41,7 @@ def prepared_operator(scene, particles, hessian, factor):
 
 @eqx.filter_jit
 def weight_and_matrix(operator):
-    return mpm.DiagonalPreconditioner().inner_product(operator).weight, operator.as_matrix()
+    return mpm.implicit.DiagonalPreconditioner().inner_product(operator).weight, operator.as_matrix()
 
 
 @pytest.mark.parametrize("d", [2, *thorough(1, 3)])
@@ -52,7 +52,7 @@ def test_undeformed_it_is_the_operators_diagonal(description, gradient, d):
     grid, particles = cloud(d, p=6, cells=1 if d == 3 else 2)
     still = mpm.Particles(particles.x, particles.v, particles.mass, particles.volume)
     scene = mpm.Scene(grid, LAWS["neo_hookean"], gradient=gradient, description=description)
-    weight, matrix = weight_and_matrix(operator_of(scene, still, mpm.AnalyticHessian()))
+    weight, matrix = weight_and_matrix(operator_of(scene, still, mpm.implicit.AnalyticHessian()))
     assert_close(weight.ravel(), jnp.diag(matrix), 1e-13)
 
 
@@ -65,7 +65,10 @@ def test_deformed_it_scales_the_operator_whatever_the_law_and_the_walls(descript
     grid, particles = cloud(2)
     walls = (mpm.SymmetryPlane(0, 0.0), mpm.StickyBox((-np.inf, 0.05), (5.0, 5.0)))
     scene = mpm.Scene(grid, LAWS[law], boundary=walls, description=description)
-    both = [operator_of(scene, particles, hessian) for hessian in (mpm.AnalyticHessian(), mpm.JvpHessian())]
+    both = [
+        operator_of(scene, particles, hessian)
+        for hessian in (mpm.implicit.AnalyticHessian(), mpm.implicit.JvpHessian())
+    ]
     (weight, matrix), (other, _) = map(weight_and_matrix, both)
     assert_close(weight, other, 1e-12)
     free = np.asarray(both[0].projection.free)
@@ -81,7 +84,7 @@ def test_negative_stiffness_is_left_out():
     scene, particles = block(2)
     F = jnp.broadcast_to(0.3 * jnp.eye(2), (len(particles.x), 2, 2))
     squeezed = mpm.Particles(particles.x, particles.v, particles.mass, particles.volume, (F,))
-    operator = operator_of(scene, squeezed, mpm.AnalyticHessian(), factor=1.0)
+    operator = operator_of(scene, squeezed, mpm.implicit.AnalyticHessian(), factor=1.0)
     weight, matrix = weight_and_matrix(operator)
     assert np.linalg.eigvalsh(matrix).min() < 0
     stiffness, free = operator.hessian.precomputed(), np.asarray(operator.projection.free)
@@ -145,9 +148,9 @@ def test_newton_in_single_precision_knows_its_rounding_in_either():
     """Asked for more than float32 can give, it stops at the same floor, and says that it converged."""
     scene, particles, dt = layered(1e3, 60.0, dtype=jnp.float32)
     ends = {}
-    for preconditioner in (mpm.DiagonalPreconditioner(), mpm.MassPreconditioner()):
-        method = mpm.BackwardEuler(mpm.Newton(rtol=1e-12), preconditioner=preconditioner)
+    for preconditioner in (mpm.implicit.DiagonalPreconditioner(), mpm.implicit.MassPreconditioner()):
+        method = mpm.BackwardEuler(mpm.implicit.Newton(rtol=1e-12), preconditioner=preconditioner)
         ends[preconditioner], info = mpm.step(scene, particles, 0.0, dt, method=method)
         assert info.solve.converged
         assert 1e-12 < info.solve.residual < 1e-3
-    assert_close(ends[mpm.MassPreconditioner()].v, ends[mpm.DiagonalPreconditioner()].v, 1e-3)
+    assert_close(ends[mpm.implicit.MassPreconditioner()].v, ends[mpm.implicit.DiagonalPreconditioner()].v, 1e-3)

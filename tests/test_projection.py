@@ -12,10 +12,10 @@ from numpy_oracle import grid_update
 import mpmjax as mpm
 from mpmjax.implicit import ImplicitOperator
 
-TIGHT = mpm.ConjugateResidual(rtol=1e-13)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 EACH_LAW = pytest.mark.parametrize("law", **ids(ELASTIC))
 EACH_DIM = pytest.mark.parametrize("d", [2, *thorough(1, 3)])
-PROJECTED = mpm.AnalyticHessian(projected=True)
+PROJECTED = mpm.implicit.AnalyticHessian(projected=True)
 
 
 def assembled(tangent, F):
@@ -164,13 +164,13 @@ def test_projected_hessian_is_symmetric_and_positive_semi_definite(law):
     """Of a whole compressed block, whose plain Hessian is not; the two are one where the block is stretched."""
     squeezed = compressed(law=law)
     H, _ = stiffness(*squeezed, PROJECTED)
-    plain, _ = stiffness(*squeezed, mpm.AnalyticHessian())
+    plain, _ = stiffness(*squeezed, mpm.implicit.AnalyticHessian())
     top = np.linalg.eigvalsh(plain)[-1]
     np.testing.assert_allclose(H, H.T, rtol=0, atol=1e-13 * top)
     assert np.linalg.eigvalsh(H)[0] > -1e-12 * top
     assert np.linalg.eigvalsh(plain)[0] < -1e-4 * top
     stretched = compressed((1.1, 1.05), law=law)
-    assert_close(*(stiffness(*stretched, hessian)[0] for hessian in (PROJECTED, mpm.AnalyticHessian())), 1e-12)
+    assert_close(*(stiffness(*stretched, hessian)[0] for hessian in (PROJECTED, mpm.implicit.AnalyticHessian())), 1e-12)
 
 
 @eqx.filter_jit
@@ -211,7 +211,7 @@ def test_backward_euler_finds_the_same_with_projection_and_has_the_same_derivati
     dt = 2 * explicit_limit(scene)
 
     def outcome(hessian):
-        method = mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-13), hessian=hessian, adjoint_solver=TIGHT)
+        method = mpm.BackwardEuler(mpm.implicit.Newton(TIGHT, 1e-13), hessian=hessian, adjoint_solver=TIGHT)
 
         def scatter(E):
             moved = eqx.tree_at(lambda s: s.material.youngs_modulus, scene, E)
@@ -219,10 +219,10 @@ def test_backward_euler_finds_the_same_with_projection_and_has_the_same_derivati
 
         return jax.jvp(scatter, (jnp.asarray(1e4),), (jnp.asarray(1.0),))
 
-    (a, da), (b, db) = outcome(mpm.AnalyticHessian()), outcome(PROJECTED)
+    (a, da), (b, db) = outcome(mpm.implicit.AnalyticHessian()), outcome(PROJECTED)
     assert_close(a, b, 1e-12)
     assert_close(da, db, 1e-9)
-    H, m = stiffness(scene, particles, mpm.AnalyticHessian())
+    H, m = stiffness(scene, particles, mpm.implicit.AnalyticHessian())
     assert np.linalg.eigvalsh(H)[0] < -1e-3 * m.max() / dt**2, "the two operators must differ for this to say anything"
 
 
@@ -240,7 +240,7 @@ def test_projection_holds_where_the_plain_step_is_near_singular(times):
     1/(1 − (Δt/Δ̂t)²), so that it explodes there and turns back beyond; with projection it is kept to 1 %, and in twenty
     steps the block returns to its size."""
     scene, particles = compressed(spin=1e-4, side=3)
-    K, m = stiffness(scene, particles, mpm.AnalyticHessian())
+    K, m = stiffness(scene, particles, mpm.implicit.AnalyticHessian())
     singular = 1 / np.sqrt(-np.linalg.eigvalsh(K / np.sqrt(np.outer(m, m)))[0])
     np.testing.assert_allclose(singular / explicit_limit(scene), 2.621, atol=1e-3)
     dt = times * singular
@@ -269,7 +269,7 @@ def test_negative_curvature_is_counted_by_steps():
         count += int(info.solve.indefinite)
     assert 1 <= int(statistics.indefinite) == count
     assert int(statistics.merged(statistics).indefinite) == 2 * count
-    for hessian in (mpm.AnalyticHessian(), PROJECTED):  # Newton's directions are those of the projected one
+    for hessian in (mpm.implicit.AnalyticHessian(), PROJECTED):  # Newton's directions are those of the projected one
         _, info = mpm.step(scene, particles, 0.0, dt, method=mpm.BackwardEuler(hessian=hessian))
         assert bool(info.solve.indefinite) == (hessian != PROJECTED)
     _, info = mpm.step(scene, compressed((1.1, 1.1))[1], 0.0, dt, method=mpm.SemiImplicit())

@@ -17,17 +17,17 @@ REGIONS = {
     "box-1d": mpm.Box((-0.3,), (0.4,)),
     "box-2d": mpm.Box((-0.3, -0.2), (0.4, 0.3)),
     "box-3d": mpm.Box((-0.3, -0.2, -0.1), (0.4, 0.3, 0.3)),
-    "capsule-2d": mpm.Capsule((-0.3, -0.1), (0.3, 0.2), 0.2),
-    "capsule-3d": mpm.Capsule((-0.3, -0.1, 0.1), (0.3, 0.2, -0.1), 0.2),
-    "cylinder-2d": mpm.Cylinder((-0.3, -0.1), (0.3, 0.2), 0.2),
-    "cylinder-3d": mpm.Cylinder((-0.3, -0.1, 0.1), (0.3, 0.2, -0.1), 0.25),
-    "annulus-2d": mpm.Annulus((0.1, -0.1), 0.3, 0.5),
-    "tube-3d": mpm.Tube((-0.3, -0.1, 0.1), (0.3, 0.2, -0.1), 0.15, 0.35),
+    "capsule-2d": mpm.geometry.Capsule((-0.3, -0.1), (0.3, 0.2), 0.2),
+    "capsule-3d": mpm.geometry.Capsule((-0.3, -0.1, 0.1), (0.3, 0.2, -0.1), 0.2),
+    "cylinder-2d": mpm.geometry.Cylinder((-0.3, -0.1), (0.3, 0.2), 0.2),
+    "cylinder-3d": mpm.geometry.Cylinder((-0.3, -0.1, 0.1), (0.3, 0.2, -0.1), 0.25),
+    "annulus-2d": mpm.geometry.Annulus((0.1, -0.1), 0.3, 0.5),
+    "tube-3d": mpm.geometry.Tube((-0.3, -0.1, 0.1), (0.3, 0.2, -0.1), 0.15, 0.35),
     "half_space-2d": mpm.HalfSpace((0.1, 0.1), (3.0, 4.0)),
     "half_space-3d": mpm.HalfSpace((0.1, 0.1, 0.0), (3.0, 4.0, -1.0)),
-    "union-2d": mpm.Union((mpm.Ball((-0.4, 0.0), 0.2), mpm.Box((0.1, -0.3), (0.5, 0.3)))),
+    "union-2d": mpm.geometry.Union((mpm.Ball((-0.4, 0.0), 0.2), mpm.Box((0.1, -0.3), (0.5, 0.3)))),
 }
-SAMPLED = {f"sampled-{d}d": mpm.sample_distance(mpm.Ball((0.1,) * d, 0.35), 0.05) for d in (1, 2, 3)}
+SAMPLED = {f"sampled-{d}d": mpm.geometry.sample_distance(mpm.Ball((0.1,) * d, 0.35), 0.05) for d in (1, 2, 3)}
 EACH = pytest.mark.parametrize("region", **ids(REGIONS))
 ANY = pytest.mark.parametrize("region", **ids(REGIONS | SAMPLED, ("capsule-2d", "sampled-1d")))
 
@@ -60,11 +60,11 @@ def surface_of(region_name):
     match region:
         case mpm.Ball():
             return np.asarray(region.centre) + region.radius * sphere
-        case mpm.Annulus():
+        case mpm.geometry.Annulus():
             radius = np.where(rng.random((n, 1)) < 0.5, region.inner, region.outer)
             return np.asarray(region.centre) + radius * sphere
-        case mpm.Tube():
-            round_one = [mpm.Cylinder(region.start, region.end, r) for r in (region.inner, region.outer)]
+        case mpm.geometry.Tube():
+            round_one = [mpm.geometry.Cylinder(region.start, region.end, r) for r in (region.inner, region.outer)]
             lateral = np.concatenate([lateral_points(c, sphere, rng) for c in round_one])
             a, b = np.asarray(region.start), np.asarray(region.end)
             radii = np.sqrt(rng.uniform(region.inner**2, region.outer**2, (n, 1)))
@@ -75,11 +75,11 @@ def surface_of(region_name):
             axis = rng.integers(0, d, n)
             x[np.arange(n), axis] = np.where(rng.random(n) < 0.5, lower[axis], upper[axis])
             return x
-        case mpm.Capsule() | mpm.Cylinder():
+        case mpm.geometry.Capsule() | mpm.geometry.Cylinder():
             a, b = np.asarray(region.start), np.asarray(region.end)
             axis, across = (b - a) / np.linalg.norm(b - a), across_of(a, b, sphere)
             side = lateral_points(region, sphere, rng)
-            if isinstance(region, mpm.Cylinder):
+            if isinstance(region, mpm.geometry.Cylinder):
                 cap = np.where(rng.random((n, 1)) < 0.5, a, b) + region.radius * np.sqrt(rng.random((n, 1))) * across
             else:
                 cap = np.where((sphere @ axis < 0)[:, None], a, b) + region.radius * sphere
@@ -112,19 +112,19 @@ def inside(region, x):
             return ((x > np.asarray(region.lower)) & (x < np.asarray(region.upper))).all(axis=1)
         case mpm.HalfSpace():
             return (x - np.asarray(region.point)) @ np.asarray(region.normal) < 0
-        case mpm.Union():
+        case mpm.geometry.Union():
             return np.any([inside(r, x) for r in region.regions], axis=0)
-        case mpm.Annulus():
+        case mpm.geometry.Annulus():
             r = np.linalg.norm(x - np.asarray(region.centre), axis=1)
             return (r > region.inner) & (r < region.outer)
-        case mpm.Tube():
-            inner, outer = (mpm.Cylinder(region.start, region.end, r) for r in (region.inner, region.outer))
+        case mpm.geometry.Tube():
+            inner, outer = (mpm.geometry.Cylinder(region.start, region.end, r) for r in (region.inner, region.outer))
             return inside(outer, x) & ~inside(inner, x)
     a, axis = np.asarray(region.start), np.asarray(region.end) - np.asarray(region.start)
     s = (x - a) @ axis / (axis @ axis)
-    near = s.clip(0, 1) if isinstance(region, mpm.Capsule) else s
+    near = s.clip(0, 1) if isinstance(region, mpm.geometry.Capsule) else s
     beside = np.linalg.norm(x - a - near[:, None] * axis, axis=1) < region.radius
-    return beside & ((s > 0) & (s < 1) if isinstance(region, mpm.Cylinder) else True)
+    return beside & ((s > 0) & (s < 1) if isinstance(region, mpm.geometry.Cylinder) else True)
 
 
 @EACH
@@ -184,11 +184,11 @@ def test_the_middle_has_a_direction_too():
     middles = {
         mpm.Box((0.0, 0.0), (1.0, 2.0)): [[0.5, 1.0], [0.5, 0.7]],
         mpm.Ball((0.2, 0.1)[:2], 0.3): [[0.2, 0.1]],
-        mpm.Capsule((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.2): [[0.5, 0.0, 0.0]],
-        mpm.Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 2.0): [[0.3, 0.0, 0.5], [0.0, 0.0, 0.5]],
-        mpm.Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 4.0), 0.5): [[0.0, 0.0, 2.0]],
-        mpm.Annulus((0.2, 0.1), 0.3, 0.5): [[0.2, 0.1], [0.6, 0.1]],
-        mpm.Tube((0.0, 0.0, 0.0), (0.0, 0.0, 4.0), 0.5, 0.7): [[0.0, 0.0, 2.0], [0.6, 0.0, 2.0]],
+        mpm.geometry.Capsule((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.2): [[0.5, 0.0, 0.0]],
+        mpm.geometry.Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 2.0): [[0.3, 0.0, 0.5], [0.0, 0.0, 0.5]],
+        mpm.geometry.Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 4.0), 0.5): [[0.0, 0.0, 2.0]],
+        mpm.geometry.Annulus((0.2, 0.1), 0.3, 0.5): [[0.2, 0.1], [0.6, 0.1]],
+        mpm.geometry.Tube((0.0, 0.0, 0.0), (0.0, 0.0, 4.0), 0.5, 0.7): [[0.0, 0.0, 2.0], [0.6, 0.0, 2.0]],
     }
     for region, points in middles.items():
         gradient = jax.grad(lambda x, region=region: region.distance(x).sum())(jnp.asarray(points))
@@ -205,7 +205,7 @@ def test_samples_converge_to_the_distance_at_second_order():
     x = jnp.asarray(np.array([0.1, 0.2, 0.0]) + 0.4 * direction)
     errors, slopes = [], []
     for h in (0.1, 0.05, 0.025):
-        sampled = mpm.sample_distance(ball, h)
+        sampled = mpm.geometry.sample_distance(ball, h)
         errors.append(np.abs(sampled.distance(x)).mean())
         normal = jax.grad(lambda x, region=sampled: region.distance(x).sum())(x)
         slopes.append(np.abs(np.asarray(normal) - direction).mean())
@@ -217,7 +217,7 @@ def test_samples_converge_to_the_distance_at_second_order():
 def test_beyond_its_lattice_a_sampled_distance_goes_on():
     """Positive, growing, and never more than the way there."""
     ball = mpm.Ball((0.0, 0.0), 0.3)
-    sampled = mpm.sample_distance(ball, 0.1)
+    sampled = mpm.geometry.sample_distance(ball, 0.1)
     x = jnp.stack([jnp.linspace(0.3, 3.0, 28), jnp.linspace(0.0, 2.0, 28)], axis=1)
     far = np.asarray(sampled.distance(x))
     assert (np.diff(far) > 0).all()
@@ -229,19 +229,19 @@ def test_a_mesh_is_sampled():
     corners = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) * 0.5
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    mesh, box = mpm.sample_mesh((corners, faces), 0.125), mpm.Box((0.0,) * 3, (0.5,) * 3)
-    exact = mpm.sample_distance(box, 0.125)
+    mesh, box = mpm.geometry.sample_mesh((corners, faces), 0.125), mpm.Box((0.0,) * 3, (0.5,) * 3)
+    exact = mpm.geometry.sample_distance(box, 0.125)
     np.testing.assert_allclose(mesh.lower, exact.lower)
     np.testing.assert_allclose(mesh.values, exact.values, atol=1e-12)
     with pytest.raises(ValueError, match="must be a closed surface"):
-        mpm.sample_mesh((corners, faces[:-1]), 0.05)
+        mpm.geometry.sample_mesh((corners, faces[:-1]), 0.05)
 
 
 def test_without_trimesh_it_is_said_how_to_get_it(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "trimesh", None)
     monkeypatch.setitem(__import__("sys").modules, "rtree", None)
     with pytest.raises(ImportError, match=r"mpmjax\[mesh\]"):
-        mpm.sample_mesh("part.stl", 0.1)
+        mpm.geometry.sample_mesh("part.stl", 0.1)
 
 
 @pytest.mark.parametrize("region", [REGIONS["cylinder-3d"], REGIONS["capsule-2d"], REGIONS["union-2d"]])
@@ -249,9 +249,11 @@ def test_any_bounded_region_can_be_filled(region):
     """The particles' volume tends to the region's."""
     grid = mpm.Grid((40,) * region.dim, 0.05, origin=(-20,) * region.dim)
     particles = mpm.fill(region, grid, density=1.0, particles_per_cell=4**region.dim)
-    axis = 0.0 if isinstance(region, mpm.Union) else float(np.linalg.norm(np.subtract(region.end, region.start)))
+    axis = (
+        0.0 if isinstance(region, mpm.geometry.Union) else float(np.linalg.norm(np.subtract(region.end, region.start)))
+    )
     volume = {2: 0.4 * axis + np.pi * 0.2**2, 3: np.pi * 0.25**2 * axis}[region.dim]
-    volume = np.pi * 0.2**2 + 0.24 if isinstance(region, mpm.Union) else volume
+    volume = np.pi * 0.2**2 + 0.24 if isinstance(region, mpm.geometry.Union) else volume
     np.testing.assert_allclose(particles.volume.sum(), volume, rtol=5e-4)
 
 
@@ -260,19 +262,22 @@ def test_any_bounded_region_can_be_filled(region):
     [
         (lambda: mpm.HalfSpace((0.0, 0.0), (0.0, 0.0)), "normal must not be zero"),
         (lambda: mpm.HalfSpace((0.0, 0.0), (0.0, 0.0, 1.0)), "as many coordinates"),
-        (lambda: mpm.Capsule((0.0, 0.0), (0.0, 0.0), 1.0), "ends must differ"),
-        (lambda: mpm.Cylinder((0.0,), (1.0,), 1.0), "take a Box"),
-        (lambda: mpm.Annulus((0.0, 0.0, 0.0), 0.1, 0.2), "take a Tube"),
-        (lambda: mpm.Annulus((0.0, 0.0), 0.2, 0.1), "inner radius must lie below"),
-        (lambda: mpm.Tube((0.0, 0.0), (1.0, 0.0), 0.1, 0.2), "take an Annulus"),
-        (lambda: mpm.Tube((0.0,) * 3, (1.0, 0.0, 0.0), 0.0, 0.2), "inner radius must be greater than zero"),
-        (lambda: mpm.Cylinder((0.0, 0.0), (1.0, 0.0), -1.0), "radius must be greater than zero"),
-        (lambda: mpm.Union(()), "at least one region"),
-        (lambda: mpm.Union((mpm.Ball((0.0,), 1.0), mpm.Ball((0.0, 0.0), 1.0))), "the same dimension"),
-        (lambda: mpm.SampledDistance((0.0,), 0.1, np.ones((5, 5))), "as many coordinates as its values have axes"),
-        (lambda: mpm.SampledDistance((0.0,), 0.1, -np.ones(3)), "at least 4 samples"),
-        (lambda: mpm.SampledDistance((0.0,), 0.1, np.ones(5)), "must be negative somewhere"),
-        (lambda: mpm.sample_distance(REGIONS["half_space-2d"], 0.1), "Only a region with bounds"),
+        (lambda: mpm.geometry.Capsule((0.0, 0.0), (0.0, 0.0), 1.0), "ends must differ"),
+        (lambda: mpm.geometry.Cylinder((0.0,), (1.0,), 1.0), "take a Box"),
+        (lambda: mpm.geometry.Annulus((0.0, 0.0, 0.0), 0.1, 0.2), "take a Tube"),
+        (lambda: mpm.geometry.Annulus((0.0, 0.0), 0.2, 0.1), "inner radius must lie below"),
+        (lambda: mpm.geometry.Tube((0.0, 0.0), (1.0, 0.0), 0.1, 0.2), "take an Annulus"),
+        (lambda: mpm.geometry.Tube((0.0,) * 3, (1.0, 0.0, 0.0), 0.0, 0.2), "inner radius must be greater than zero"),
+        (lambda: mpm.geometry.Cylinder((0.0, 0.0), (1.0, 0.0), -1.0), "radius must be greater than zero"),
+        (lambda: mpm.geometry.Union(()), "at least one region"),
+        (lambda: mpm.geometry.Union((mpm.Ball((0.0,), 1.0), mpm.Ball((0.0, 0.0), 1.0))), "the same dimension"),
+        (
+            lambda: mpm.geometry.SampledDistance((0.0,), 0.1, np.ones((5, 5))),
+            "as many coordinates as its values have axes",
+        ),
+        (lambda: mpm.geometry.SampledDistance((0.0,), 0.1, -np.ones(3)), "at least 4 samples"),
+        (lambda: mpm.geometry.SampledDistance((0.0,), 0.1, np.ones(5)), "must be negative somewhere"),
+        (lambda: mpm.geometry.sample_distance(REGIONS["half_space-2d"], 0.1), "Only a region with bounds"),
     ],
 )
 def test_bad_regions_are_refused(make, message):
@@ -290,5 +295,5 @@ def test_bad_regions_are_refused(make, message):
 )
 def test_samples_keep_the_volume(region, volume):
     """Though they round edges and move curved surfaces inward, by some hundredths here: in what is filled."""
-    filled = mpm.fill(mpm.sample_distance(region, 0.1), mpm.Grid((24,) * region.dim, 0.1), density=1.0)
+    filled = mpm.fill(mpm.geometry.sample_distance(region, 0.1), mpm.Grid((24,) * region.dim, 0.1), density=1.0)
     assert float(filled.mass.sum()) == pytest.approx(volume, rel=1e-3)

@@ -52,9 +52,9 @@ def test_contact_starts_from_the_chosen_guess_and_counts_its_sweeps():
     scene, particles = bar(boundary=wall, gravity=(-50.0,))
     shaken = jnp.asarray(np.random.default_rng(0).normal(size=particles.v.shape))
     particles, iterations = eqx.tree_at(lambda q: q.v, particles, shaken), []
-    for guess in mpm.Guess:
+    for guess in mpm.implicit.Guess:
         method = mpm.SemiImplicit(
-            guess=guess, preconditioner=mpm.MassPreconditioner()
+            guess=guess, preconditioner=mpm.implicit.MassPreconditioner()
         )  # which tells guesses apart in so small a bar
         _, info = mpm.step(scene, particles, 0.0, 0.05, method=method)
         assert int(info.contact.sweeps) >= 1
@@ -66,7 +66,7 @@ def test_contact_starts_from_the_chosen_guess_and_counts_its_sweeps():
 def test_breakdown_is_not_a_small_increment():
     """rᵀAr = 0 at the start, with the increment test on."""
     operator = lx.MatrixLinearOperator(jnp.asarray([[0.0, 1.0], [1.0, 0.0]]), lx.symmetric_tag)
-    solver = mpm.ConjugateResidual(increment_rtol=1e-3)
+    solver = mpm.implicit.ConjugateResidual(increment_rtol=1e-3)
     _, result, _ = solver.compute(solver.init(operator, {}), jnp.asarray([1.0, 0.0]), {})
     assert result == lx.RESULTS.breakdown
 

@@ -153,7 +153,7 @@ def test_obstacles_turn():
     flat = mpm.RigidMotion(times, ((0.0, 0.0), (10.0, 0.0)), (0.0, quarter), (1.0, 2.0))
     x = np.array([[11.0, 3.0], [11.1, 2.5], [11.0, 4.5], [13.0, 2.0]])
     np.testing.assert_allclose(obstacle(bar, flat, 1.0)(x), [-0.1, 0.0, 0.5, 1.9], atol=1e-12)
-    rod = mpm.Cylinder((1.0, 2.0, 3.0), (3.0, 2.0, 3.0), 0.1)
+    rod = mpm.geometry.Cylinder((1.0, 2.0, 3.0), (3.0, 2.0, 3.0), 0.1)
     solid = mpm.RigidMotion(times, ((0.0,) * 3, (10.0, 0.0, 0.0)), ((0.0,) * 3, (0.0, quarter, 0.0)), (1.0, 2.0, 3.0))
     x = np.array([[11.0, 2.0, 2.0], [11.0, 2.1, 2.5], [11.0, 2.0, 0.5], [13.0, 2.0, 3.0]])
     np.testing.assert_allclose(obstacle(rod, solid, 1.0)(x), [-0.1, 0.0, 0.5, 1.9], atol=1e-12)

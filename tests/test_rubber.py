@@ -202,7 +202,7 @@ def pulled(law, d, ends, steps):
         t1=float(steps),
         dt=1.0,
         method=mpm.BackwardEuler(),
-        observe=mpm.StressStretch.of(mpm.Box((0.0,) * d, (dx,) * d), particles, axis=1),
+        observe=mpm.fitting.StressStretch.of(mpm.Box((0.0,) * d, (dx,) * d), particles, axis=1),
     )
     return (np.asarray(a)[1:] for a in run.observed)
 

@@ -94,7 +94,7 @@ def test_a_ball_has_its_volume_to_a_thousandth_at_ten_cells_a_diameter(d):
     "region",
     [
         mpm.Ball((0.013, 0.02), 0.3),
-        *thorough(mpm.Ball((0.013, 0.02, -0.01), 0.3), mpm.Capsule((-0.2, -0.1), (0.2, 0.1), 0.15)),
+        *thorough(mpm.Ball((0.013, 0.02, -0.01), 0.3), mpm.geometry.Capsule((-0.2, -0.1), (0.2, 0.1), 0.15)),
     ],
 )
 def test_volume_and_inertia_of_a_filled_region_are_of_second_order(region):
@@ -123,7 +123,7 @@ def test_the_lattice_of_a_filled_region_is_that_of_the_grid():
 def test_a_filled_region_need_not_be_smooth():
     """A square turned by 30 degrees: corners and edges anywhere in cells."""
     turn = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6)])
-    square = mpm.Cylinder(tuple(-0.3 * turn), tuple(0.3 * turn), 0.3)
+    square = mpm.geometry.Cylinder(tuple(-0.3 * turn), tuple(0.3 * turn), 0.3)
     particles = mpm.fill(square, grid_of(2), density=1.0)
     assert float(particles.volume.sum()) == pytest.approx(0.36, rel=1e-3)
     assert square.contains(particles.x).all()
@@ -131,7 +131,7 @@ def test_a_filled_region_need_not_be_smooth():
 
 def test_a_wall_thinner_than_a_cell_is_filled():
     """With three parts of eight of a cell: no more is lost than a few per cent."""
-    ring = mpm.Annulus((0.0, 0.0), 0.5, 0.52)
+    ring = mpm.geometry.Annulus((0.0, 0.0), 0.5, 0.52)
     particles = mpm.fill(ring, grid_of(2), density=1.0)
     assert float(particles.volume.sum()) == pytest.approx(np.pi * (0.52**2 - 0.25), rel=0.02)
 
@@ -139,10 +139,10 @@ def test_a_wall_thinner_than_a_cell_is_filled():
 FITTED = {
     "disk": (mpm.Ball((0.1, 0.2), 0.3), np.pi * 0.09, 0.09 / 2),
     "interval": (mpm.Ball((0.1,), 0.3), 0.6, 0.03),
-    "annulus": (mpm.Annulus((0.1, 0.2), 0.2, 0.4), np.pi * 0.12, 0.1),
-    "cylinder": (mpm.Cylinder((0.1, 0.2, 0.0), (0.5, 0.4, 0.4), 0.2), np.pi * 0.04 * 0.6, 0.02 + 0.36 / 12),
-    "tube": (mpm.Tube((0.1, 0.2, 0.0), (0.5, 0.4, 0.4), 0.2, 0.4), np.pi * 0.12 * 0.6, 0.1 + 0.36 / 12),
-    "rectangle": (mpm.Cylinder((0.1, 0.2), (0.4, 0.6), 0.2), 0.2, (0.25 + 0.16) / 12),
+    "annulus": (mpm.geometry.Annulus((0.1, 0.2), 0.2, 0.4), np.pi * 0.12, 0.1),
+    "cylinder": (mpm.geometry.Cylinder((0.1, 0.2, 0.0), (0.5, 0.4, 0.4), 0.2), np.pi * 0.04 * 0.6, 0.02 + 0.36 / 12),
+    "tube": (mpm.geometry.Tube((0.1, 0.2, 0.0), (0.5, 0.4, 0.4), 0.2, 0.4), np.pi * 0.12 * 0.6, 0.1 + 0.36 / 12),
+    "rectangle": (mpm.geometry.Cylinder((0.1, 0.2), (0.4, 0.6), 0.2), 0.2, (0.25 + 0.16) / 12),
 }
 
 
@@ -163,7 +163,7 @@ def test_fitted_cells_have_the_regions_volume_and_middle(name):
 
 def test_what_has_no_fitted_cells_is_refused():
     with pytest.raises(ValueError, match="leave out fitted"):
-        mpm.fill(mpm.Capsule((0.0, 0.0), (1.0, 0.0), 0.2), grid_of(2), density=1.0, fitted=True)
+        mpm.fill(mpm.geometry.Capsule((0.0, 0.0), (1.0, 0.0), 0.2), grid_of(2), density=1.0, fitted=True)
 
 
 def bent(xi):

@@ -59,12 +59,12 @@ EXAMPLES = {
     mpm.Box: mpm.Box((0.0, 0.1, 0.2), (1.0, 1.1, 1.2)),
     mpm.Ball: mpm.Ball((0.1, 0.2), 0.3),
     mpm.HalfSpace: mpm.HalfSpace((0.1, 0.2), (3.0, 4.0)),
-    mpm.Capsule: mpm.Capsule((0.1, 0.2), (0.3, 0.4), 0.1),
-    mpm.Cylinder: mpm.Cylinder((0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 0.1),
-    mpm.Annulus: mpm.Annulus((0.1, 0.2), 0.3, 0.4),
-    mpm.Tube: mpm.Tube((0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 0.1, 0.2),
-    mpm.Union: mpm.Union((mpm.Ball((0.1, 0.2), 0.3), mpm.Box((0.0, 0.1), (1.0, 1.1)))),
-    mpm.SampledDistance: mpm.SampledDistance((0.1, 0.2), 0.1, np.linspace(-1, 1, 20).reshape(4, 5)),
+    mpm.geometry.Capsule: mpm.geometry.Capsule((0.1, 0.2), (0.3, 0.4), 0.1),
+    mpm.geometry.Cylinder: mpm.geometry.Cylinder((0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 0.1),
+    mpm.geometry.Annulus: mpm.geometry.Annulus((0.1, 0.2), 0.3, 0.4),
+    mpm.geometry.Tube: mpm.geometry.Tube((0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 0.1, 0.2),
+    mpm.geometry.Union: mpm.geometry.Union((mpm.Ball((0.1, 0.2), 0.3), mpm.Box((0.0, 0.1), (1.0, 1.1)))),
+    mpm.geometry.SampledDistance: mpm.geometry.SampledDistance((0.1, 0.2), 0.1, np.linspace(-1, 1, 20).reshape(4, 5)),
     mpm.StickyCollider: mpm.StickyCollider(mpm.Ball((0.1, 0.2), 0.3), GRIP.motion),
     mpm.SlipCollider: mpm.SlipCollider(mpm.HalfSpace((0.1, 0.2), (0.0, 1.0))),
     mpm.SeparatingCollider: mpm.SeparatingCollider(mpm.Ball((0.1,), 0.3), friction=0.2),
@@ -76,7 +76,7 @@ EXAMPLES = {
     mpm.Spring: mpm.Spring(mpm.PointsAt(((0.1, 0.2),), (1.0,)), (1.0, 2.0), 3.0, GRIP.motion),
     mpm.Patch: PATCH,
     mpm.PointsAt: mpm.PointsAt(((0.1, 0.2), (0.3, 0.4)), (0.25, 0.75)),
-    mpm.AttachedPoints: mpm.AttachedPoints(
+    mpm.state.AttachedPoints: mpm.state.AttachedPoints(
         np.zeros(1), np.ones((1, 2)), np.ones(1), np.full((1, 2), 0.3), np.array([[0.0, 1.0]])
     ),
     mpm.TimeSeries: mpm.TimeSeries((0.0, 1.0), ((0.0, 1.0), (2.0, 3.0))),
@@ -92,22 +92,24 @@ EXAMPLES = {
     mpm.TotalLagrangian: mpm.TotalLagrangian(),
     mpm.Explicit: mpm.Explicit(),
     mpm.SemiImplicit: mpm.SemiImplicit(
-        0.5, mpm.ConjugateResidual(1e-7), hessian=mpm.JvpHessian(), guess=Guess.EXPLICIT
+        0.5, mpm.implicit.ConjugateResidual(1e-7), hessian=mpm.implicit.JvpHessian(), guess=Guess.EXPLICIT
     ),
     mpm.BackwardEuler: mpm.BackwardEuler(
-        mpm.Newton(rtol=1e-6, max_steps=7), preconditioner=mpm.DiagonalPreconditioner()
+        mpm.implicit.Newton(rtol=1e-6, max_steps=7), preconditioner=mpm.implicit.DiagonalPreconditioner()
     ),
-    mpm.ImplicitMidpoint: mpm.ImplicitMidpoint(mpm.Newton(mpm.ConjugateResidual(1e-2), 1e-6, 9), guess=Guess.ZERO),
-    mpm.TRBDF2: mpm.TRBDF2(0.3, mpm.Linearised(mpm.ConjugateResidual(1e-7))),
-    mpm.Linearised: mpm.Linearised(),
-    mpm.Newton: mpm.Newton(),
-    mpm.AnalyticHessian: mpm.AnalyticHessian(),
-    mpm.JvpHessian: mpm.JvpHessian(),
-    mpm.ConjugateResidual: mpm.ConjugateResidual(1e-7, increment_rtol=1e-3, max_steps=17),
+    mpm.ImplicitMidpoint: mpm.ImplicitMidpoint(
+        mpm.implicit.Newton(mpm.implicit.ConjugateResidual(1e-2), 1e-6, 9), guess=Guess.ZERO
+    ),
+    mpm.TRBDF2: mpm.TRBDF2(0.3, mpm.implicit.Linearised(mpm.implicit.ConjugateResidual(1e-7))),
+    mpm.implicit.Linearised: mpm.implicit.Linearised(),
+    mpm.implicit.Newton: mpm.implicit.Newton(),
+    mpm.implicit.AnalyticHessian: mpm.implicit.AnalyticHessian(),
+    mpm.implicit.JvpHessian: mpm.implicit.JvpHessian(),
+    mpm.implicit.ConjugateResidual: mpm.implicit.ConjugateResidual(1e-7, increment_rtol=1e-3, max_steps=17),
     mpm.AveragedVolume: mpm.AveragedVolume((0, 1)),
-    mpm.DiagonalPreconditioner: mpm.DiagonalPreconditioner(),
-    mpm.MassPreconditioner: mpm.MassPreconditioner(),
-    mpm.VolumePreconditioner: mpm.VolumePreconditioner(1000, extent=(5, 6)),
+    mpm.implicit.DiagonalPreconditioner: mpm.implicit.DiagonalPreconditioner(),
+    mpm.implicit.MassPreconditioner: mpm.implicit.MassPreconditioner(),
+    mpm.extensions.VolumePreconditioner: mpm.extensions.VolumePreconditioner(1000, extent=(5, 6)),
 }
 """One of each class that files hold; the next test says so."""
 
@@ -192,7 +194,7 @@ def test_numbers_of_files_are_finite_but_for_corners(monkeypatch):
 
     @mpm.register
     class Slab(mpm.Box):
-        edge: mpm.Corner | None = None
+        edge: mpm.geometry.Corner | None = None
         upwards: tuple[float, ...] = (0.0, 1.0)
 
     data = {"kind": "Slab", "lower": [0, 0], "upper": [1, float("inf")], "edge": [0, float("-inf")]}
@@ -208,7 +210,9 @@ def test_numbers_of_files_are_finite_but_for_corners(monkeypatch):
 
 
 DISK = mpm.Ball((0.3, 0.4), 0.2)
-NESTED = mpm.Union((DISK, mpm.Union((mpm.HalfSpace((0.0, 0.1), (0.0, 1.0)), mpm.Box((0.1, 0.1), (0.2, 0.3))))))
+NESTED = mpm.geometry.Union(
+    (DISK, mpm.geometry.Union((mpm.HalfSpace((0.0, 0.1), (0.0, 1.0)), mpm.Box((0.1, 0.1), (0.2, 0.3)))))
+)
 SLIDE = mpm.Motion((0.0, 0.5), ((0.0, 0.0), (0.1, 0.0)))
 TURN = mpm.RigidMotion((0.0, 0.5), ((0.0, 0.0), (0.1, 0.0)), (0.0, 1.5), (0.3, 0.4))
 SPIN = mpm.RigidMotion((0.0, 0.5), ((0.0,) * 3, (0.1, 0.0, 0.0)), ((0.0,) * 3, (0.0, 1.5, 0.0)), (0.3, 0.4, 0.5))
@@ -244,24 +248,24 @@ BODIES = {
     "union of one": (
         'kind = "SlipCollider"\n[boundary.shape]\nkind = "Union"\n'
         'regions = { kind = "Ball", centre = [0.3, 0.4], radius = 0.2 }',
-        mpm.SlipCollider(mpm.Union(DISK)),
+        mpm.SlipCollider(mpm.geometry.Union(DISK)),
     ),
     "capsule": (
         'kind = "SeparatingCollider"\nshape = { kind = "Capsule", start = [0, 0], end = [0.5, 0.5], radius = 0.1 }',
-        mpm.SeparatingCollider(mpm.Capsule((0.0, 0.0), (0.5, 0.5), 0.1)),
+        mpm.SeparatingCollider(mpm.geometry.Capsule((0.0, 0.0), (0.5, 0.5), 0.1)),
     ),
     "annulus": (
         'kind = "SlipCollider"\nshape = { kind = "Annulus", centre = [0, 0], inner = 0.1, outer = 0.2 }',
-        mpm.SlipCollider(mpm.Annulus((0.0, 0.0), 0.1, 0.2)),
+        mpm.SlipCollider(mpm.geometry.Annulus((0.0, 0.0), 0.1, 0.2)),
     ),
     "tube": (
         'kind = "SlipCollider"\nshape = { kind = "Tube", start = [0, 0, 0], end = [0, 0, 1], inner = 1, outer = 2 }',
-        mpm.SlipCollider(mpm.Tube((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 1.0, 2.0)),
+        mpm.SlipCollider(mpm.geometry.Tube((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 1.0, 2.0)),
     ),
     "samples": (
         'kind = "SlipCollider"\n'
         'shape = { kind = "SampledDistance", lower = [0, 0], spacing = 0.5, values = [' + 4 * "[-1, 0, 1, 2]," + "] }",
-        mpm.SlipCollider(mpm.SampledDistance((0.0, 0.0), 0.5, np.array([[-1.0, 0.0, 1.0, 2.0]] * 4))),
+        mpm.SlipCollider(mpm.geometry.SampledDistance((0.0, 0.0), 0.5, np.array([[-1.0, 0.0, 1.0, 2.0]] * 4))),
     ),
     "cylinder that spins": (
         """kind = "StickyCollider"
@@ -272,7 +276,7 @@ BODIES = {
         displacement = [[0, 0, 0], [0.1, 0, 0]]
         rotation = [[0, 0, 0], [0, 1.5, 0]]
         centre = [0.3, 0.4, 0.5]""",
-        mpm.StickyCollider(mpm.Cylinder((0.0,) * 3, (0.0, 0.0, 1.0), 0.2), SPIN),
+        mpm.StickyCollider(mpm.geometry.Cylinder((0.0,) * 3, (0.0, 0.0, 1.0), 0.2), SPIN),
     ),
 }
 

@@ -12,12 +12,12 @@ import mpmjax as mpm
 from mpmjax.implicit import ImplicitOperator, Projection
 from mpmjax.stepping import NodeMotion, reaction
 
-SOLVER = mpm.ConjugateResidual(rtol=1e-14)
-NEWTON = mpm.Newton(SOLVER, rtol=1e-13)
+SOLVER = mpm.implicit.ConjugateResidual(rtol=1e-14)
+NEWTON = mpm.implicit.Newton(SOLVER, rtol=1e-13)
 METHODS = {
-    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(SOLVER)),
-    "trbdf2": mpm.TRBDF2(0.0, mpm.Linearised(SOLVER)),
-    "trbdf2 with ρ∞ = 0.7": mpm.TRBDF2(0.7, mpm.Linearised(SOLVER)),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.implicit.Linearised(SOLVER)),
+    "trbdf2": mpm.TRBDF2(0.0, mpm.implicit.Linearised(SOLVER)),
+    "trbdf2 with ρ∞ = 0.7": mpm.TRBDF2(0.7, mpm.implicit.Linearised(SOLVER)),
 }
 BY_NEWTON = {"implicit_midpoint": mpm.ImplicitMidpoint(NEWTON), "trbdf2": mpm.TRBDF2(0.0, NEWTON)}
 GRIP = mpm.Grip(mpm.Box((-1.0, -1.0), (1.0, 0.05)), mpm.Motion((0.0, 1.0), ((0.0, 0.0), (0.4, -0.7))))
@@ -90,7 +90,7 @@ def test_newton_solves_the_stages_themselves(method):
     free = np.asarray(nodes.free)
     missed = np.asarray(reaction(nodes, motion, method.elastic_impulse(nodes, motion)))[free]
     assert np.abs(missed).max() < 1e-10 * np.abs(momentum).max()
-    linearised = eqx.tree_at(lambda m: m.solution, method, mpm.Linearised(SOLVER))
+    linearised = eqx.tree_at(lambda m: m.solution, method, mpm.implicit.Linearised(SOLVER))
     once, _ = move(linearised, nodes)
     missed = np.asarray(reaction(nodes, once, method.elastic_impulse(nodes, once)))[free]
     assert np.abs(missed).max() > 1e-3 * np.abs(momentum).max()
@@ -106,8 +106,10 @@ def test_an_unconverged_first_stage_is_reported():
     @eqx.filter_jit
     def stages(rtol):
         """The report, and the relative residual of either stage."""
-        solution = mpm.Linearised(mpm.ConjugateResidual(rtol=rtol, max_steps=25))
-        method = mpm.TRBDF2(0.0, solution, preconditioner=mpm.MassPreconditioner())  # whose norm is taken below
+        solution = mpm.implicit.Linearised(mpm.implicit.ConjugateResidual(rtol=rtol, max_steps=25))
+        method = mpm.TRBDF2(
+            0.0, solution, preconditioner=mpm.implicit.MassPreconditioner()
+        )  # whose norm is taken below
         motion, info = method.advance(nodes, guess)
         _, q0, q1, q2 = method.weights()
         dt, v0, v, g = nodes.dt, nodes.velocity, motion.velocity, nodes.acceleration

@@ -22,7 +22,7 @@ def quiet(scene, particles, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message="The body is .* cells thick")
-        return mpm.sensitivity(scene, particles, **options)
+        return mpm.analysis.sensitivity(scene, particles, **options)
 
 
 @functools.cache
@@ -102,7 +102,7 @@ def test_an_unstable_step_grows_at_the_rate_of_its_jacobian_and_warns():
     scene, particles, radius = bar()
     dt = 1.05 * bar_limit()
     with pytest.warns(UserWarning, match=r"Over 400 steps .* grows to .* passes 1000 by step \d+") as caught:
-        report = mpm.sensitivity(scene, particles, t1=400 * dt, dt=dt)
+        report = mpm.analysis.sensitivity(scene, particles, t1=400 * dt, dt=dt)
     assert len(caught) == 1
     assert float(report.worst) > 1e3
     rate = np.log(radius(dt)) / dt
@@ -118,7 +118,7 @@ def test_a_fault_of_the_run_ends_the_report_and_warns():
     scene, particles, _ = bar()
     particles = eqx.tree_at(lambda p: p.v, particles, jnp.full_like(particles.v, 0.5))
     with pytest.warns(UserWarning, match=r"the run meets a fault at step \d+") as caught:
-        report = mpm.sensitivity(scene, particles, t1=2.0, dt=5e-3, direction=jnp.ones_like(particles.v))
+        report = mpm.analysis.sensitivity(scene, particles, t1=2.0, dt=5e-3, direction=jnp.ones_like(particles.v))
     step = int(str(caught[0].message).split("at step ")[1].split()[0])
     good = np.asarray(report.steps) < step
     assert 0 < good.sum() < 100
@@ -133,9 +133,9 @@ def test_a_run_that_is_not_solved_has_no_growth():
     """One step of conjugate residuals does not do."""
     scene, particles, _ = bar()
     stretched = mpm.Particles(particles.x, 0.1 * particles.x, particles.mass, particles.volume)
-    method = mpm.SemiImplicit(solver=mpm.ConjugateResidual(max_steps=1))
+    method = mpm.SemiImplicit(solver=mpm.implicit.ConjugateResidual(max_steps=1))
     with pytest.warns(UserWarning, match="does not solve its equations"):
-        report = mpm.sensitivity(scene, stretched, t1=0.5, dt=0.1, method=method)
+        report = mpm.analysis.sensitivity(scene, stretched, t1=0.5, dt=0.1, method=method)
     assert np.isnan(report.growth).all()
 
 
@@ -144,9 +144,9 @@ def test_a_tangent_that_is_not_solved_has_no_growth_and_is_named():
     """The run itself is; one iteration does not do for its derivative."""
     scene, particles, _ = bar()
     stretched = mpm.Particles(particles.x, 0.1 * particles.x, particles.mass, particles.volume)
-    method = mpm.SemiImplicit(adjoint_solver=mpm.ConjugateResidual(max_steps=1))
+    method = mpm.SemiImplicit(adjoint_solver=mpm.implicit.ConjugateResidual(max_steps=1))
     with pytest.warns(UserWarning, match=r"tangent solve of a step did not converge \(relative residual"):
-        report = mpm.sensitivity(scene, stretched, t1=0.2, dt=0.1, method=method)
+        report = mpm.analysis.sensitivity(scene, stretched, t1=0.2, dt=0.1, method=method)
     assert np.isnan(report.growth).all()
 
 
@@ -163,7 +163,7 @@ def test_growth_is_that_of_the_reverse_mode_gradient(factor):
 
     @jax.vmap
     def tangent(direction):
-        return mpm.sensitivity(scene, particles, direction=direction, **options).growth
+        return mpm.analysis.sensitivity(scene, particles, direction=direction, **options).growth
 
     def gradients(steps):
         def final(v):
@@ -194,4 +194,4 @@ def test_a_bad_question_is_refused(options, message):
     """With a word."""
     scene, particles = block(1)
     with pytest.raises(ValueError, match=message):
-        mpm.sensitivity(scene, particles, **{"t1": 0.01, "dt": 5e-3} | options)
+        mpm.analysis.sensitivity(scene, particles, **{"t1": 0.01, "dt": 5e-3} | options)

@@ -137,7 +137,7 @@ def test_no_float_compiles_anew():
     scene, particles = pulled()
     wall = mpm.SlipBox((-5.0,), (5.0,))
     scene = eqx.tree_at(lambda s: s.boundary, scene, (*scene.boundary, wall))
-    method = mpm.SemiImplicit(beta=1.0, solver=mpm.ConjugateResidual(rtol=1e-8))
+    method = mpm.SemiImplicit(beta=1.0, solver=mpm.implicit.ConjugateResidual(rtol=1e-8))
     count = []
 
     def run(scene=scene, particles=particles, method=method, steps=3, dt=DT, start=0):
@@ -161,8 +161,8 @@ def test_no_float_compiles_anew():
     }
     for where, value in change.values():
         run(eqx.tree_at(where, scene, value), steps=4)
-    run(method=mpm.SemiImplicit(beta=0.5, solver=mpm.ConjugateResidual(rtol=1e-6)), steps=4)
-    run(method=mpm.SemiImplicit(beta=1, solver=mpm.ConjugateResidual(rtol=1e-6)), steps=4)
+    run(method=mpm.SemiImplicit(beta=0.5, solver=mpm.implicit.ConjugateResidual(rtol=1e-6)), steps=4)
+    run(method=mpm.SemiImplicit(beta=1, solver=mpm.implicit.ConjugateResidual(rtol=1e-6)), steps=4)
     run(dt=2e-3, steps=4)
     run(start=7, steps=4)
     run(particles=eqx.tree_at(lambda p: p.v, particles, 2 * particles.v), steps=4)
@@ -344,7 +344,7 @@ def test_a_body_that_collapses_to_a_point_is_named():
 def test_an_unconverged_solve_is_raised():
     """With the number of steps concerned and the worst residual; throw=False leaves it to the statistics."""
     scene, particles = pulled()
-    method = mpm.SemiImplicit(solver=mpm.ConjugateResidual(max_steps=2))
+    method = mpm.SemiImplicit(solver=mpm.implicit.ConjugateResidual(max_steps=2))
     with pytest.raises(mpm.SimulationError, match="of 4 of 4 steps did not converge"):
         mpm.simulate(scene, particles, t1=4 * 0.1, dt=0.1, method=method)
     run = mpm.simulate(scene, particles, t1=4 * 0.1, dt=0.1, method=method, throw=False)
@@ -354,14 +354,16 @@ def test_an_unconverged_solve_is_raised():
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("preconditioner", [mpm.DiagonalPreconditioner(), mpm.MassPreconditioner()])
+@pytest.mark.parametrize("preconditioner", [mpm.implicit.DiagonalPreconditioner(), mpm.implicit.MassPreconditioner()])
 def test_a_solve_that_misses_its_tolerance_by_little_is_a_warning(preconditioner):
     """Within ten times of it the run goes on, counted and told at its end; beyond, it is a fault. The advice names the
     preconditioner that needs fewer iterations if it is not the one in use."""
     scene, particles = pulled()
 
     def simulated(rtol, **options):
-        method = mpm.SemiImplicit(solver=mpm.ConjugateResidual(rtol, max_steps=3), preconditioner=preconditioner)
+        method = mpm.SemiImplicit(
+            solver=mpm.implicit.ConjugateResidual(rtol, max_steps=3), preconditioner=preconditioner
+        )
         return mpm.simulate(scene, particles, t1=0.1, dt=0.1, method=method, **options)
 
     reached = float(simulated(1e-12, throw=False).statistics.worst_residual)
@@ -372,7 +374,7 @@ def test_a_solve_that_misses_its_tolerance_by_little_is_a_warning(preconditioner
         assert (int(statistics.unconverged), bool(statistics.healthy)) == (0, True)
     with pytest.raises(mpm.SimulationError, match="of 1 of 1 steps did not converge") as caught:
         simulated(reached / 12)
-    assert ("DiagonalPreconditioner()" in str(caught.value)) == (preconditioner == mpm.MassPreconditioner())
+    assert ("DiagonalPreconditioner()" in str(caught.value)) == (preconditioner == mpm.implicit.MassPreconditioner())
     assert int(caught.value.run.statistics.nearly_converged) == 0
 
 

@@ -72,7 +72,7 @@ class Known(FitProblem):
         times = np.linspace(0, STEPS * DT, 61)
         scene, particles = bar()
         y, by = shape(times)
-        seen = mpm.Series(times, y, mpm.Extent(0), sigma=0.1)
+        seen = mpm.Series(times, y, mpm.fitting.Extent(0), sigma=0.1)
         self.experiments = (mpm.Experiment(scene, particles, t1=STEPS * DT, dt=DT, observations=seen),)
         self.names, self.parameters, self.starts = ("a",), (STIFFNESS,), (jnp.asarray(1.0),)
         self.derivative = jnp.asarray(by / 0.1)
@@ -102,7 +102,7 @@ def test_data_beyond_the_growth_of_derivatives_are_left_out():
     """Growth is below the limit until there, and above it after; without a limit all data are used."""
     times, x, which = tracks()
     whole = experiment(mpm.Tracks(times, x, which=which, sigma=NOISE))
-    growth = np.asarray(mpm.sensitivity(whole.scene, whole.particles, t1=whole.t1, dt=DT).growth)
+    growth = np.asarray(mpm.analysis.sensitivity(whole.scene, whole.particles, t1=whole.t1, dt=DT).growth)
     bound = float(np.median(growth))
     (limit,) = _limits([whole], bound)
     last = round(limit / DT)

@@ -22,7 +22,7 @@ from numpy_oracle import numpy_step
 
 import mpmjax as mpm
 
-TIGHT = mpm.ConjugateResidual(rtol=1e-13)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 STICKY = mpm.StickyBox((0.1, -np.inf, 0.05), (np.inf, 0.5, np.inf))
 SLIP = mpm.SlipBox((0.1, -np.inf, 0.05), (0.45, 0.5, np.inf))
 
@@ -106,7 +106,7 @@ def test_semi_implicit_step_agrees_with_numpy_and_with_itself_uncompiled(choices
 METHODS = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(solver=TIGHT),
-    "backward_euler": mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-13)),
+    "backward_euler": mpm.BackwardEuler(mpm.implicit.Newton(TIGHT, 1e-13)),
 }
 
 

@@ -64,9 +64,9 @@ def applied(potential, u, hessian):
 @pytest.mark.parametrize(
     ("hessian", "d"),
     [
-        *thorough((mpm.JvpHessian(), 1), (mpm.JvpHessian(), 2), (mpm.AnalyticHessian(), 1)),
-        (mpm.AnalyticHessian(), 2),
-        *thorough((mpm.AnalyticHessian(), 3)),
+        *thorough((mpm.implicit.JvpHessian(), 1), (mpm.implicit.JvpHessian(), 2), (mpm.implicit.AnalyticHessian(), 1)),
+        (mpm.implicit.AnalyticHessian(), 2),
+        *thorough((mpm.implicit.AnalyticHessian(), 3)),
     ],
     ids=["jvp-1", "jvp-2", "analytic-1", "analytic-2", "analytic-3"],
 )
@@ -110,7 +110,7 @@ def angular_momentum(particles, moment):
         *thorough(
             ("viscous_solid", mpm.Explicit()),
             ("viscous_fluid", mpm.Explicit()),
-            ("viscous_fluid", mpm.SemiImplicit(solver=mpm.ConjugateResidual(rtol=1e-13))),
+            ("viscous_fluid", mpm.SemiImplicit(solver=mpm.implicit.ConjugateResidual(rtol=1e-13))),
         ),
     ],
 )

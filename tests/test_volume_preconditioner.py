@@ -15,7 +15,7 @@ from mpmjax.implicit import DiagonalInnerProduct, ImplicitOperator
 from mpmjax.stepping import start_nodes
 
 AVERAGED = mpm.AveragedVolume()
-CHOICES = mpm.DiagonalPreconditioner(), mpm.VolumePreconditioner()
+CHOICES = mpm.implicit.DiagonalPreconditioner(), mpm.extensions.VolumePreconditioner()
 
 
 def operator_of(scene, particles, factor=1e-2):
@@ -26,7 +26,7 @@ def operator_of(scene, particles, factor=1e-2):
 @eqx.filter_jit
 def prepared_operator(scene, particles, factor):
     nodes = start_nodes(scene, particles, 0.0, 1e-3, scene.stencil(particles))
-    action = mpm.AnalyticHessian().at(nodes.potential, None)
+    action = mpm.implicit.AnalyticHessian().at(nodes.potential, None)
     return ImplicitOperator(nodes.mass, factor, action, nodes.projection)
 
 
@@ -56,7 +56,7 @@ def matrices(operator, preconditioner):
 @pytest.mark.parametrize("extent", [None, *thorough(3)])
 def test_it_is_symmetric_and_definite_and_its_inverse_is_one(extent, description, d):
     """In a box that is too small for the bodies too."""
-    choice = mpm.VolumePreconditioner(extent=None if extent is None else (extent,) * d)
+    choice = mpm.extensions.VolumePreconditioner(extent=None if extent is None else (extent,) * d)
     A, W, inverse = matrices(operator_of(*bodies(d, 0.499, 2 if d == 2 else 1, description)), choice)
     for matrix in (W, inverse):
         assert_close(matrix, matrix.T, 1e-13)
@@ -86,7 +86,7 @@ def test_iterations_do_not_grow_and_the_motion_is_the_same(d):
         scene, particles = block(d, material=mpm.NeoHookean(1e4, nu), volume=AVERAGED)
         turned = particles.x[:, ::-1] - particles.x.mean(axis=0)
         particles = eqx.tree_at(lambda p: p.v, particles, 0.1 * turned)
-        solver = mpm.ConjugateResidual(rtol=1e-8, max_steps=10_000)  # with 1e-9 rounding decides the counts
+        solver = mpm.implicit.ConjugateResidual(rtol=1e-8, max_steps=10_000)  # with 1e-9 rounding decides the counts
         method = mpm.SemiImplicit(solver=solver, preconditioner=preconditioner)
         after, info = mpm.step(scene, particles, 0.0, 1e-1, method=method)
         return after.v, info.solve
@@ -111,7 +111,7 @@ def placed(d, corner, nu, preconditioner, window=16, side=3):
     turned = particles.x[:, ::-1] - particles.x.mean(axis=0)
     particles = eqx.tree_at(lambda p: (p.x, p.v), particles, (particles.x + place, 0.1 * turned))
     scene = mpm.Scene(grid, mpm.NeoHookean(1e4, nu), volume=AVERAGED)
-    solver = mpm.ConjugateResidual(rtol=1e-8, max_steps=10_000)  # with 1e-9 rounding decides the counts
+    solver = mpm.implicit.ConjugateResidual(rtol=1e-8, max_steps=10_000)  # with 1e-9 rounding decides the counts
     method = mpm.SemiImplicit(solver=solver, preconditioner=preconditioner)
     speed = (1e4 / (2 * (1 + nu)) / 1e3) ** 0.5
     return particles, lambda own: mpm.step(scene, own, 0.0, 5 * 0.1 / speed, method=method)
@@ -122,7 +122,7 @@ def placed(d, corner, nu, preconditioner, window=16, side=3):
 def test_a_box_around_the_bodies_is_as_good_as_the_window_wherever_they_are(d):
     """In a batch of bodies at different places."""
     corners = [(3.3,) * d, (9.6, *(4.2,) * (d - 1))]
-    whole, box = mpm.VolumePreconditioner(), mpm.VolumePreconditioner(extent=(5,) * d)
+    whole, box = mpm.extensions.VolumePreconditioner(), mpm.extensions.VolumePreconditioner(extent=(5,) * d)
     several = [placed(d, corner, 0.4999, whole)[0] for corner in corners]
     together = jax.tree.map(lambda *a: jnp.stack(a), *several)
     found, info = jax.jit(jax.vmap(placed(d, corners[0], 0.4999, box)[1]))(together)
@@ -138,7 +138,7 @@ def test_a_box_around_the_bodies_is_as_good_as_the_window_wherever_they_are(d):
 def test_iterations_do_not_grow_in_large_windows_of_three_dimensions(window, side, extent):
     """From ν = 0.49 to 0.4999: a hundred times the bulk modulus. The diagonal's grow 4 times with 4 cells a side, 8
     times with 8."""
-    choice = mpm.VolumePreconditioner(extent=None if extent is None else (extent,) * 3)
+    choice = mpm.extensions.VolumePreconditioner(extent=None if extent is None else (extent,) * 3)
 
     @jax.jit
     def solved(nu):
@@ -163,27 +163,27 @@ def test_it_is_the_diagonal_where_there_is_no_average_or_no_room():
         return found[0]
 
     assert kind(scene) is kind(around) is DiagonalInnerProduct
-    assert kind(averaged, mpm.VolumePreconditioner(largest=10)) is DiagonalInnerProduct
+    assert kind(averaged, mpm.extensions.VolumePreconditioner(largest=10)) is DiagonalInnerProduct
     assert kind(averaged) is not DiagonalInnerProduct
-    assert kind(averaged, mpm.VolumePreconditioner(largest=5_000)) is DiagonalInnerProduct
-    assert kind(averaged, mpm.VolumePreconditioner(largest=5_000, extent=(5, 5))) is not DiagonalInnerProduct
+    assert kind(averaged, mpm.extensions.VolumePreconditioner(largest=5_000)) is DiagonalInnerProduct
+    assert kind(averaged, mpm.extensions.VolumePreconditioner(largest=5_000, extent=(5, 5))) is not DiagonalInnerProduct
 
 
 def test_what_it_is_given_is_checked():
     with pytest.raises(ValueError, match="largest"):
-        mpm.VolumePreconditioner(largest=-1)
+        mpm.extensions.VolumePreconditioner(largest=-1)
     with pytest.raises(ValueError, match="extent"):
-        mpm.VolumePreconditioner(extent=(3, 0))
+        mpm.extensions.VolumePreconditioner(extent=(3, 0))
     operator = operator_of(*block(2, material=mpm.NeoHookean(1e4, 0.49), volume=AVERAGED))
     with pytest.raises(ValueError, match="each of 2 axes"):
-        mpm.VolumePreconditioner(extent=(3, 3, 3)).inner_product(operator)
+        mpm.extensions.VolumePreconditioner(extent=(3, 3, 3)).inner_product(operator)
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("description", **ids(DESCRIPTIONS))
 def test_newtons_method_and_gradients_are_those_of_the_diagonal(description):
-    tight = mpm.ConjugateResidual(rtol=1e-11, max_steps=10_000)
-    method = mpm.ImplicitMidpoint(mpm.Newton(rtol=1e-10, solver=tight), adjoint_solver=tight)
+    tight = mpm.implicit.ConjugateResidual(rtol=1e-11, max_steps=10_000)
+    method = mpm.ImplicitMidpoint(mpm.implicit.Newton(rtol=1e-10, solver=tight), adjoint_solver=tight)
 
     def outcome(scale, preconditioner):
         law = mpm.NeoHookean(1e4 * scale, 0.499)

@@ -1,7 +1,8 @@
 """Fitting parameters to measured data.
 
-A first fit needs the names that `mpmjax` has itself: `fit`, `Experiment`, parameters and observations. The others are
-here: priors and fields, optimisers, strategies for hard fits, and uncertainty beyond standard errors.
+A first fit begins with names of `mpmjax` itself: `fit`, `Experiment`, `Positive`, `Bounded`, `Unbounded`, `Tracks`,
+`Series`, `Curve`. Here are the quantities that a series measures, forces and torques, priors and fields, optimisers,
+strategies for hard fits, and uncertainty beyond standard errors.
 """
 
 from mpmjax.fitting._columns import (

@@ -1,5 +1,6 @@
 """Regions, distances sampled on a lattice, surfaces, prescribed motions and time series."""
 
+from mpmjax._types import Corner as Corner
 from mpmjax.geometry._cut_cells import Pieces as Pieces, inside_parts as inside_parts, surface_pieces as surface_pieces
 from mpmjax.geometry._motion import (
     AbstractMotion as AbstractMotion,

@@ -1,4 +1,8 @@
-"""The elastic potential, its Hessian, and the nodal problems of the implicit updates and their solution."""
+"""The elastic potential, its Hessian, and the nodal problems of the implicit updates and their solution.
+
+Choices of a method: `ConjugateResidual`, `Linearised`, `Newton`; `AnalyticHessian`, `JvpHessian`;
+`DiagonalPreconditioner`, `MassPreconditioner`; `Guess`. The bases to derive from are called `Abstract...`.
+"""
 
 from mpmjax.implicit._conjugate_residual import ConjugateResidual as ConjugateResidual
 from mpmjax.implicit._hessian import (

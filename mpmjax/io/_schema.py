@@ -49,7 +49,7 @@ def register(cls: Registered) -> Registered:
     str, an array, an enumeration, an equinox module whose class is the package's or registered, or tuples of such.
     Those of `equinox.nn` are none of these: write a network as layers of your own, each with its weights as fields
     (`examples/learned_law.py`).
-    Numbers in files are finite; a corner of a box that may have no end is annotated as `mpmjax.Corner`.
+    Numbers in files are finite; a corner of a box that may have no end is annotated as `mpmjax.geometry.Corner`.
 
     A file names classes and never executes code: import the module that registers a class before reading a file with
     one, in the shell by `mpmjax run SCENE.toml --import MODULE`. A class that is defined anew, as in a notebook, takes

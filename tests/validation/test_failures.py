@@ -278,11 +278,13 @@ def test_one_linear_solve_inverts_where_newton_holds():
     faster = [thrown(mpm.BackwardEuler(), speed, 8.0) for speed in (4.0, 8.0, 12.0, 16.0, 24.0)]
     assert not all(bool(statistics.healthy) for statistics in faster)
     assert all(bool(statistics.healthy) or int(statistics.unconverged) for statistics in faster)
-    midpoint = thrown(mpm.ImplicitMidpoint(mpm.Newton()), 2.0, 2.0)  # admissible at the middle of the step only
+    midpoint = thrown(
+        mpm.ImplicitMidpoint(mpm.implicit.Newton()), 2.0, 2.0
+    )  # admissible at the middle of the step only
     assert int(midpoint.fault) in (Fault.INADMISSIBLE, Fault.PASSED)
 
 
-PATIENT = mpm.SemiImplicit(solver=mpm.ConjugateResidual(rtol=1e-6, max_steps=4000))
+PATIENT = mpm.SemiImplicit(solver=mpm.implicit.ConjugateResidual(rtol=1e-6, max_steps=4000))
 
 
 def drawn(method=PATIENT, *, per_cell=4, nu=0.49, **choices):
@@ -346,9 +348,9 @@ SPUN = {  # angular momentum lost in one turn [%], at 0.3, 1 and 3 dx/c
     "semi-implicit": (mpm.SemiImplicit(), (2.3, 8.5, 36)),
     "backward Euler": (mpm.BackwardEuler(), (2.3, 7.1, 17.5)),
     "implicit midpoint": (mpm.ImplicitMidpoint(), (0.096, 0.74, 11.2)),
-    "implicit midpoint, Newton": (mpm.ImplicitMidpoint(mpm.Newton()), (0.083, 0.28, 0.82)),
+    "implicit midpoint, Newton": (mpm.ImplicitMidpoint(mpm.implicit.Newton()), (0.083, 0.28, 0.82)),
     "TR-BDF2": (mpm.TRBDF2(), (0.096, 0.75, 11.9)),
-    "TR-BDF2, Newton": (mpm.TRBDF2(0.0, mpm.Newton()), (0.084, 0.28, 0.76)),
+    "TR-BDF2, Newton": (mpm.TRBDF2(0.0, mpm.implicit.Newton()), (0.084, 0.28, 0.76)),
 }
 
 

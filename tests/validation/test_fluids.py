@@ -104,13 +104,13 @@ def test_sound_has_its_speed(d):
     assert (np.log2(errors[:-1] / errors[1:]) > 1.8).all()
 
 
-TIGHT = mpm.ConjugateResidual(rtol=1e-11)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-11)
 METHODS = {
     "explicit": mpm.Explicit(),
     "semi_implicit": mpm.SemiImplicit(solver=TIGHT),
     "backward_euler": mpm.BackwardEuler(),
-    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.Linearised(TIGHT)),
-    "trbdf2": mpm.TRBDF2(0.0, mpm.Linearised(TIGHT)),
+    "implicit_midpoint": mpm.ImplicitMidpoint(mpm.implicit.Linearised(TIGHT)),
+    "trbdf2": mpm.TRBDF2(0.0, mpm.implicit.Linearised(TIGHT)),
 }
 EACH_METHOD = pytest.mark.parametrize("method", **ids(METHODS, "explicit", ("implicit_midpoint",)))
 

@@ -48,7 +48,7 @@ def test_a_slice_of_the_tube_in_three_dimensions_is_right_to_two_per_cent(nu):
         (12, 28, 2),
         density=1.0,
     )
-    hole = mpm.Tube((0.0, 0.0, -1.0), (0.0, 0.0, 1.0), problems.INNER, problems.OUTER)
+    hole = mpm.geometry.Tube((0.0, 0.0, -1.0), (0.0, 0.0, 1.0), problems.INNER, problems.OUTER)
     bore = mpm.Patch(hole, mpm.Box((0.0, 0.0, 0.0), (0.53, 0.53, dx)))
     planes = [mpm.SymmetryPlane(axis, 0.0) for axis in range(3)]
     scene = mpm.Scene(

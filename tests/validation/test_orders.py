@@ -221,9 +221,9 @@ TIME = {  # the method, whether velocities start half a step before, the grid, n
     "semi-implicit, β = 1": (mpm.SemiImplicit(beta=1.0), False, 16, (80, 160, 320), 1),
     "backward Euler": (mpm.BackwardEuler(), False, 16, (80, 160, 320), 1),
     "implicit midpoint": (mpm.ImplicitMidpoint(), False, 64, (6, 12, 24), 2),
-    "implicit midpoint, Newton": (mpm.ImplicitMidpoint(mpm.Newton()), False, 64, (6, 12, 24), 2),
+    "implicit midpoint, Newton": (mpm.ImplicitMidpoint(mpm.implicit.Newton()), False, 64, (6, 12, 24), 2),
     "TR-BDF2": (mpm.TRBDF2(), False, 64, (6, 12, 24), 2),
-    "TR-BDF2, Newton": (mpm.TRBDF2(0.5, mpm.Newton()), False, 64, (6, 12, 24), 2),
+    "TR-BDF2, Newton": (mpm.TRBDF2(0.5, mpm.implicit.Newton()), False, 64, (6, 12, 24), 2),
 }
 
 

@@ -62,7 +62,9 @@ def tracks(noise, count=150, seed=0):
     away = np.linalg.norm(x - x.mean(axis=1, keepdims=True), axis=2)
     sigma = noise * np.abs(away - away[0]).max()
     seen = x[1:, which] + sigma * np.random.default_rng(seed + 1).normal(size=(FRAMES, count, 2))
-    return lambda particles: mpm.Tracks(times[1:], seen, which=mpm.Markers.at(particles, x[0, which]), sigma=sigma)
+    return lambda particles: mpm.Tracks(
+        times[1:], seen, which=mpm.fitting.Markers.at(particles, x[0, which]), sigma=sigma
+    )
 
 
 def experiment(n, observe, **block_options):

@@ -39,7 +39,7 @@ def tracks():
         dt=STEP / 4,
         method=mpm.ImplicitMidpoint(),
         save_every=8,
-        observe=mpm.Markers.at(q, places),
+        observe=mpm.fitting.Markers.at(q, places),
     )
     noise = SIGMA * np.random.default_rng(0).normal(size=run.observed[1:].shape)
     return np.asarray(run.times)[1:], np.asarray(run.observed)[1:] + noise, places
@@ -48,7 +48,7 @@ def tracks():
 def problem(times, seen, places):
     """The experiment on the coarse grid, and the field to be found on nodes a cell apart."""
     scene, q = block(1, gradient=mpm.MLSGradient())
-    observed = mpm.Tracks(times, seen, which=mpm.Markers.at(q, places), sigma=SIGMA)
+    observed = mpm.Tracks(times, seen, which=mpm.fitting.Markers.at(q, places), sigma=SIGMA)
     pull = mpm.Experiment(scene, q, t1=STEP * STEPS, dt=STEP, observations=observed)
     modulus = mpm.Positive(
         lambda e: e.scene.material.youngs_modulus, prior=mpm.fitting.Smooth(0.2, robust=0.3), unit="Pa"

@@ -50,7 +50,7 @@ def followed(law):
     these are half as long as those of the finest fit."""
     choices = {"kernel": mpm.BSpline(3), "gradient": mpm.SplineGradient(), "transfer": mpm.FLIP(0.99)}
     scene, particles = impact(law, 16, **choices)
-    markers = mpm.Markers.at(particles, PLACES)
+    markers = mpm.fitting.Markers.at(particles, PLACES)
     run = mpm.simulate(
         scene,
         particles,
@@ -74,7 +74,7 @@ def test_a_parameter_is_found_again(name):
 
     def build(n):
         scene, particles = impact(case.law, n)
-        seen = mpm.Tracks(TIMES, positions, which=mpm.Markers.at(particles, PLACES))
+        seen = mpm.Tracks(TIMES, positions, which=mpm.fitting.Markers.at(particles, PLACES))
         return mpm.Experiment(scene, particles, t1=float(TIMES[-1]), dt=5e-4 / n, observations=seen)
 
     parameter = mpm.Positive(lambda e: case.where(e.scene.material), start=case.start)

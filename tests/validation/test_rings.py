@@ -51,7 +51,7 @@ def test_rings_that_touch_part_again():
     grid = mpm.Grid((101, 40), 0.4, origin=(-50, -20))
     rings = []
     for x in (-L / 4, L / 4):
-        ring, v = mpm.Annulus((x, 0.0), 3.0, 4.0), (-np.sign(x) * SPEED, 0.0)
+        ring, v = mpm.geometry.Annulus((x, 0.0), 3.0, 4.0), (-np.sign(x) * SPEED, 0.0)
         rings.append(mpm.fill(ring, grid, density=DENSITY, velocity=v, fitted=True))
     scene = mpm.Scene(grid, (law, law), gradient=mpm.SplineGradient(), bodies=mpm.Bodies())
 

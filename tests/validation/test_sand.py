@@ -30,7 +30,7 @@ def in_plane_strain(phi):
     return np.arcsin(3 * np.sqrt(3) * sine / (6 + np.sqrt(3) * sine))
 
 
-class Forgetful(mpm.AbstractInelastic):
+class Forgetful(mpm.material.AbstractInelastic):
     """Sand that does not remember how far it came apart."""
 
     sand: mpm.DruckerPrager

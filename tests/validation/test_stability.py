@@ -27,7 +27,7 @@ DX, DENSITY = 0.1, 1e3
 LAW = mpm.FixedCorotated(1e4, 0.3)
 LAMBDA, MU = float(LAW.lame_lambda), float(LAW.shear_modulus)
 UNIT = DX / np.sqrt((LAMBDA + 2 * MU) / DENSITY)  # dx/c
-TIGHT = mpm.ConjugateResidual(rtol=1e-13)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 WORST_PLACE = 2.5 + 1e-6  # in spacings: where the spline's gradient is steepest
 
 
@@ -466,7 +466,7 @@ def test_amplification_has_its_known_figures(beta, z, expected, digits):
 def test_amplification_of_the_methods_of_second_order(rho, d):
     """|R(i√z)|, R the rational function of the method for y' = λy, to 1e-6: 1 for the midpoint rule (ρ∞ = None) at
     every z; for TR-BDF2 at most 1, and ρ∞ as z → ∞."""
-    how = mpm.Linearised(TIGHT)
+    how = mpm.implicit.Linearised(TIGHT)
     method = (
         mpm.ImplicitMidpoint(how, adjoint_solver=TIGHT) if rho is None else mpm.TRBDF2(rho, how, adjoint_solver=TIGHT)
     )

@@ -114,7 +114,7 @@ def test_a_contact_plane_that_is_pressed_upon_is_second_order(kernel, offset):
     assert errors[-1] < 3e-3
 
 
-TIGHT = mpm.ConjugateResidual(rtol=1e-13)
+TIGHT = mpm.implicit.ConjugateResidual(rtol=1e-13)
 
 
 @pytest.mark.thorough
@@ -126,7 +126,9 @@ TIGHT = mpm.ConjugateResidual(rtol=1e-13)
         ("quadratic", mpm.Explicit(), mpm.FLIP()),
         pytest.param("cubic", mpm.Explicit(), mpm.APIC(), marks=pytest.mark.slow),
         ("quadratic", mpm.SemiImplicit(solver=TIGHT), mpm.APIC()),
-        pytest.param("quadratic", mpm.BackwardEuler(mpm.Newton(TIGHT, 1e-13)), mpm.APIC(), marks=pytest.mark.slow),
+        pytest.param(
+            "quadratic", mpm.BackwardEuler(mpm.implicit.Newton(TIGHT, 1e-13)), mpm.APIC(), marks=pytest.mark.slow
+        ),
     ],
     ids=lambda a: a if isinstance(a, str) else type(a).__name__,
 )
