@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DESCRIPTIONS, VISCOUS, assert_close, explicit_limit, ids
+from helpers import DESCRIPTIONS, VISCOUS, assert_close, explicit_limit, ids, thorough
 from numpy_oracle import grid_update
 from test_implicit import jolted
 
@@ -198,3 +198,29 @@ def test_a_motion_counts_half_of_what_slows_it():
     assert (NodeMotion(one).with_friction(-one).carrier == 0).all()
     assert (NodeMotion(one, one).with_friction(-one).carrier == 0.5).all()
     assert (NodeMotion(one, one).with_friction(-one).velocity == 0).all()
+
+
+FLOORS = {
+    "wall": mpm.SeparatingBox((-np.inf, 0.0), (np.inf, np.inf), friction=0.15),
+    "plane": mpm.ContactPlane(1, 0.0, friction=0.15),
+    "collider": mpm.SeparatingCollider(mpm.HalfSpace((0.0, 0.0), (0.0, 1.0)), friction=0.15),
+}
+
+
+@pytest.mark.parametrize("floor", thorough(*FLOORS))
+def test_a_block_rests_below_the_limit_of_friction_and_slides_above(floor):
+    """TR-BDF2 in steps of 7 dx/c, pushed by 0.12 and by 0.2 of its weight at μ = 0.15: creep in mm/s, and friction over
+    weight. With friction after the last stage alone the first is 20."""
+    grid = mpm.Grid((24, 12), 0.05, origin=(-4, -4))
+    block = mpm.fill(mpm.Box((0.0, 0.0), (0.3, 0.15)), grid, density=1e3)
+    method, each = mpm.TRBDF2(), {"steps": 30, "dt": 0.01}
+
+    def creep_and_friction(push):
+        scene = mpm.Scene(grid, mpm.NeoHookean(1e6, 0.3), gravity=(push * 9.81, -9.81), boundary=FLOORS[floor])
+        before = mpm.rollout(scene, mpm.prepare(scene, block), method=method, **each)
+        after = mpm.rollout(scene, before, method=method, **each)
+        moved, gained = (float((b - a)[:, 0].mean()) for a, b in ((before.x, after.x), (before.v, after.v)))
+        return moved / 0.3 * 1e3, push - gained / 0.3 / 9.81
+
+    assert abs(creep_and_friction(0.12)[0]) < 0.5
+    assert creep_and_friction(0.2)[1] == pytest.approx(0.15, rel=1e-2)

@@ -13,7 +13,8 @@ is that of the active set, and does not exist where the set changes. An explicit
 with it which gaps are shut: it needs no sweep.
 
 Friction is an impulse at the places held, applied after the solve against the slip and at most μ times the normal
-impulse (Coulomb). It is not part of the implicit system, so it lags by the elastic response of one step.
+impulse (Coulomb). It is not part of the implicit system, so it lags by the elastic response of one step. An integrator
+of several stages may let it act after each (see `TRBDF2`).
 """
 
 import abc

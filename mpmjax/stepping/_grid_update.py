@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 
-from mpmjax._types import NodeVector
+from mpmjax._types import NodeVector, Scalar
 from mpmjax.autodiff import saved_for_backward, without_derivative
 from mpmjax.boundary import ConstrainedNodes, ContactInfo, constrain, count_places, find_active_set
 from mpmjax.implicit import SolveInfo, no_solve
+from mpmjax.stepping._implicit_integrators import AbstractImplicitIntegrator
 from mpmjax.stepping._integrator import AbstractIntegrator, NodeMotion, advance
 from mpmjax.stepping._nodes import Nodes
 
@@ -53,6 +55,35 @@ class GridUpdate(eqx.Module):
         return held.images.unfold(held.nodes.admitted_velocity())
 
 
+class StageFriction(eqx.Module):
+    """Friction at the end of a trapezoidal stage, so that the next stage begins from what sticks."""
+
+    held: ConstrainedNodes
+    """The nodes with the active set held."""
+
+    def __call__(self, method: AbstractImplicitIntegrator, v: NodeVector, u: NodeVector, share: Scalar) -> NodeVector:
+        """The change of velocity [m/s], shape (n, d), in a stage of the length γΔt.
+
+        Args:
+            method: the integrator.
+            v: velocity at the stage's end [m/s], shape (n, d).
+            u: displacement at which its last force is taken [m], shape (n, d).
+            share: γ [-].
+        """
+        nodes, rubbed, unfold = self.held.unconstrained, self.held.nodes, self.held.images.unfold
+        v, u = unfold(v), unfold(u)
+        # what the stage's mean force would do in the whole step gives the limits of the whole step
+        motion = NodeMotion(
+            nodes.velocity + (v - nodes.velocity) / share,
+            resisted=u / (share * nodes.dt) if nodes.potential.viscous else None,
+        )
+        missing = reaction(nodes, motion, method.impulse_of(nodes, ((0.5, None), (0.5, u))))
+        # the share γ of an impulse on a mass is that impulse on 1/γ of the mass
+        rubbed, loose = (each and replace(each, mass=each.mass / share) for each in (rubbed, rubbed.loose))
+        held = replace(self.held, displacement=u / 2, nodes=replace(rubbed, loose=loose))
+        return jnp.where(rubbed.occupied, held.friction(v, held.without_spring_impulses(missing))[0] - v, 0)
+
+
 def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     """The grid update with contact: the active set is searched without derivatives, the last solve with it held is
     differentiated, and friction acts after that."""
@@ -60,7 +91,7 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     def solve(
         held: ConstrainedNodes, method: AbstractIntegrator, guess: NodeVector
     ) -> tuple[ConstrainedNodes, NodeMotion, SolveInfo]:
-        motion, info = advance(held.nodes, method, guess)
+        motion, info = advance(replace(held.nodes, friction=StageFriction(held)), method, guess)
         motion = jax.tree.map(held.images.unfold, motion)
         return replace(held, displacement=method.mean_displacement(held.nodes, motion)), motion, info
 
@@ -68,20 +99,21 @@ def constrained_update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
 
     def attempt(held: ConstrainedNodes, guess: NodeVector) -> tuple:
         held, motion, info = solve(held, frozen_method, guess)
-        missing = reaction(frozen, motion, elastic_impulse(frozen, frozen_method, motion))
+        elastic = elastic_impulse(frozen, frozen_method, motion)
+        missing = reaction(frozen, motion.without_friction(), elastic)
         return held, motion.velocity, held.without_spring_impulses(missing), motion.carrier, info
 
     start = frozen_method.mean_displacement(frozen, NodeMotion(guess))
     active, guess, cost, sweeps = saved_for_backward(
         find_active_set(frozen, guess, start, attempt, no_solve(guess.dtype), explicit=method.is_explicit)
     )
-    held, solved, info = solve(constrain(nodes, active), method, guess)
-    elastic = elastic_impulse(nodes, method, solved)
+    held, motion, info = solve(constrain(nodes, active), method, guess)
+    elastic, solved = elastic_impulse(nodes, method, motion), motion.without_friction()
     holding = held.without_spring_impulses(reaction(nodes, solved, elastic))
     velocity, friction = held.friction(solved.velocity, holding)
     contact = ContactInfo(sweeps, count_places(nodes, *held.violations(solved.velocity, holding)))
     return GridUpdate(
-        solved.with_friction(velocity - solved.velocity),
+        motion.with_friction(velocity - motion.velocity, method.share_in_mean()),
         elastic,
         cost.followed_by(info),
         ContactUpdate(held, solved, friction, contact),

@@ -108,23 +108,24 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Δt Σ q f(u) [kg m/s], with the forces that the solution takes."""
-        stages = self.stages(nodes, motion)
-        if not self.linearises:
-            return self._impulse(nodes, stages)
-        stiffness = self.hessian.at(nodes.potential, None)
-        return nodes.dt * (sum(q for q, _ in stages) * nodes.force - stiffness(self.mean_displacement(nodes, motion)))
+        return self.impulse_of(nodes, self.stages(nodes, motion))
 
-    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
-        return self._impulse(nodes, self.stages(nodes, motion)) if self.linearises else None
-
-    def _impulse(self, nodes: Nodes, stages: tuple[tuple[Scalar, NodeVector | None], ...]) -> NodeVector:
-        """Δt Σ q f(u) [kg m/s], with the forces of the law."""
+    def impulse_of(
+        self, nodes: Nodes, stages: tuple[tuple[Scalar, NodeVector | None], ...], *, exact: bool = False
+    ) -> NodeVector:
+        """Δt Σ q f(u) [kg m/s] of some stages, with the forces that the solution takes, or exactly those of the law."""
+        if self.linearises and not exact:
+            stiffness = self.hessian.at(nodes.potential, None)
+            return nodes.dt * (sum(q for q, _ in stages) * nodes.force - stiffness(_mean(stages)))
         forces = (q * (nodes.force if u is None else nodes.potential.force(u)) for q, u in stages)
         return nodes.dt * reduce(jnp.add, forces)
 
+    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
+        return self.impulse_of(nodes, self.stages(nodes, motion), exact=True) if self.linearises else None
+
     def mean_displacement(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Σ q u [m] of the stages."""
-        return reduce(jnp.add, (q * u for q, u in self.stages(nodes, motion) if u is not None))
+        return _mean(self.stages(nodes, motion))
 
     def stability_factor(self) -> Scalar:
         return 0.0
@@ -284,10 +285,10 @@ class TRBDF2(AbstractImplicitIntegrator):
 
     It is for motion to be followed in time in which unresolved frequencies would ring, as in contact and stiff starts.
 
-    *When it breaks*: as `ImplicitMidpoint`. Friction moves nodes after both stages, by a displacement to which the
-    body answers in the next step only. In steps of several dx/c what it should hold creeps, rough floors or not: a
-    block of 1e6 Pa, 0.3 m long and pushed by 0.12 g, in steps of 7 dx/c by 20 mm/s at μ = 0.15 and 62 mm/s at μ = 0.3,
-    in half of them by 2 mm/s (`benchmarks/audit.py`). `SemiImplicit` and `BackwardEuler` hold it.
+    Contact's friction acts at the end of each stage, that of the first one as a part of G_γ, so that the second begins
+    from what sticks and a body at rest stays there. Over the step it takes at most μ times the push of the step.
+
+    *When it breaks*: as `ImplicitMidpoint`. Near ρ∞ = 1 what a wall's friction can hold oscillates as its push does.
 
     Args:
         rho: ρ∞, from 0 to 1.
@@ -318,11 +319,19 @@ class TRBDF2(AbstractImplicitIntegrator):
         pull = nodes.per_mass(nodes.force - nodes.potential.viscous_resistance(v0) if viscous else nodes.force)
         inertial = v0 + length * (pull + 2 * g)
         middle, first = self.solve_stage(nodes, guess, inertial, length, length * v0)
-        later_pull = (middle - inertial) / length  # f_γ/m, viscosity's with it, by the stage's own equation
+        inner, solved, friction = q2 * (v0 + middle), middle, None
+        if nodes.friction is not None:
+            change = nodes.friction(self, middle, dt * inner, 2 * q2)
+            middle, friction = middle + change, q1 / q2 * change
+        later_pull = (middle - inertial) / length  # f_γ/m, with viscosity and friction, by the stage's own equation
         inertial = v0 + dt * (q0 * pull + q1 * later_pull + g)
         v, second = self.solve_stage(nodes, middle, inertial, length, dt * (q0 * v0 + q1 * middle))
-        inner, mean = q2 * (v0 + middle), q0 * v0 + q1 * middle + q2 * v
-        return NodeMotion(v, mean, inner, mean if viscous else None), first.together_with(second)
+        mean, resisted = (q0 * v0 + q1 * u + q2 * v for u in (middle, solved))
+        return NodeMotion(v, mean, inner, resisted if viscous else None, friction), first.together_with(second)
+
+    def share_in_mean(self) -> Scalar:
+        """q_2."""
+        return self.weights()[3]
 
     def stages(self, nodes: Nodes, motion: NodeMotion) -> tuple[tuple[Scalar, NodeVector | None], ...]:
         """Stages at 0, γΔt and Δt."""
@@ -333,3 +342,8 @@ class TRBDF2(AbstractImplicitIntegrator):
     def force_at(self) -> Scalar:
         """½."""
         return 0.5
+
+
+def _mean(stages: tuple[tuple[Scalar, NodeVector | None], ...]) -> NodeVector:
+    """Σ q u [m] of stages, shape (n, d)."""
+    return reduce(jnp.add, (q * u for q, u in stages if u is not None))

@@ -23,17 +23,22 @@ class NodeMotion(eqx.Module):
     """The displacement at an inner stage over Δt [m/s], shape (n, d); None without one."""
     resisted: NodeVector | None = None
     """The velocity in the viscous force [m/s], shape (n, d); None without viscosity, or with explicit viscosity."""
+    friction: NodeVector | None = None
+    """The part of `velocity` that comes from friction in inner stages [m/s], shape (n, d); None without any."""
 
     @property
     def carrier(self) -> NodeVector:
         """The velocity with which positions and deformation move [m/s], shape (n, d)."""
         return self.velocity if self.mean is None else self.mean
 
-    def with_friction(self, change: NodeVector) -> "NodeMotion":
-        """The motion with the velocity changed by `change` [m/s], and the mean by half of it, as by an impulse that
-        acts evenly over the step."""
-        mean = None if self.mean is None else self.mean + change / 2
+    def with_friction(self, change: NodeVector, share: Scalar = 0.5) -> "NodeMotion":
+        """The motion with the velocity changed by `change` [m/s], and the mean by this share of it."""
+        mean = None if self.mean is None else self.mean + share * change
         return replace(self, velocity=self.velocity + change, mean=mean)
+
+    def without_friction(self) -> "NodeMotion":
+        """The motion whose velocity is without the friction of inner stages."""
+        return self if self.friction is None else replace(self, velocity=self.velocity - self.friction, friction=None)
 
 
 class AbstractIntegrator(eqx.Module):
@@ -100,6 +105,11 @@ class AbstractIntegrator(eqx.Module):
         `force_at` of the step's displacement of any other."""
         share = self.force_at()
         return None if share is None else share * nodes.dt * motion.carrier
+
+    def share_in_mean(self) -> Scalar:
+        """The share of a change of v^{n+1} by friction that the mean velocity takes. Default: ½, as of an impulse that
+        acts evenly over the step."""
+        return 0.5
 
     def limit_name(self) -> str:
         """The name of the bound on the step in messages."""

@@ -1,5 +1,6 @@
 """The nodes at the start of a step: P2G, then boundaries and contacts, then the fold at mirror planes."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
 from typing import Any
@@ -49,6 +50,8 @@ class Nodes(AbstractNodes):
     """The number of the boundary that brings each contact; None for that of two bodies."""
     loose: "Nodes | None" = None
     """The nodes with those of rigid bodies each by itself; None without rigid bodies."""
+    friction: Callable[..., NodeVector] | None = None
+    """The friction of contacts in an inner stage (see `StageFriction`); None without contacts."""
 
     @property
     def occupied(self) -> Bool[Array, "n 1"]:
