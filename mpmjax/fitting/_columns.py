@@ -13,7 +13,9 @@ from mpmjax.checks import require, shortened
 from mpmjax.io import reason
 
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "h": 1e2, "k": 1e3, "M": 1e6, "G": 1e9}
-_UNITS = {"m", "s", "N", "Pa", "J", "g"}
+_UNITS = {prefix + unit: factor for prefix, factor in _PREFIXES.items() for unit in ("m", "s", "N", "Pa", "J")}
+_UNITS |= {prefix + "g": factor * 1e-3 for prefix, factor in _PREFIXES.items()}
+"""Factors to SI units of units with a prefix."""
 
 
 class Columns:
@@ -29,7 +31,7 @@ class Columns:
     """
 
     def __init__(self, path: Path, *names: str):
-        self.path, self._names = path, names
+        self.path = path
         try:
             text = path.read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
@@ -46,38 +48,32 @@ class Columns:
                 raise ValueError(f"{path}, line {line}: not CSV: {error}.") from None
         (self.header_line, head), *rows = rows
         head = [name.strip() for name in head]
-        self._at = {name: self._place(name, head) for name in names}
+        for name in names:
+            close = difflib.get_close_matches(name, head, 1)
+            apart = next((mark for mark in (";", "\t") if len(head) == 1 and mark in head[0]), None)
+            hint = f", did you mean {close[0]!r}?" if close else f" among its {len(head)}."
+            if apart is not None:
+                hint = f": its fields are parted by {apart!r}; part them by commas."
+            # of what else is in the file nothing is said: it may be another file than was meant
+            require(name in head, f"{path} has no column {name!r}{hint}")
+            require(head.count(name) == 1, f"{path}, line {self.header_line}: the column {name!r} is there twice.")
         require(len(rows) > 0, f"{path} has a header and no rows: there is nothing to fit.")
         for line, fields in rows:
             require(
                 len(fields) == len(head), f"{path}, line {line}: {len(fields)} fields, but the header has {len(head)}."
             )
-        self.lines = np.array([line for line, _ in rows])
-        """The line of each row, from 1."""
+        self.lines = np.array([line for line, _ in rows])  # the line of each row, from 1
         self._data = {
-            name: np.array([self._number(n, name, row[k]) for n, row in rows]) for name, k in self._at.items()
+            name: np.array([self._number(n, name, row[head.index(name)]) for n, row in rows]) for name in names
         }
-
-    def _place(self, name: str, head: list[str]) -> int:
-        close = difflib.get_close_matches(name, head, 1)
-        apart = next((mark for mark in (";", "\t") if len(head) == 1 and mark in head[0]), None)
-        hint = f", did you mean {close[0]!r}?" if close else f" among its {len(head)}."
-        if apart is not None:
-            hint = f": its fields are parted by {apart!r}; part them by commas."
-        # of what else is in the file nothing is said: it may be another file than was meant
-        require(name in head, f"{self.path} has no column {name!r}{hint}")
-        require(head.count(name) == 1, f"{self.path}, line {self.header_line}: the column {name!r} is there twice.")
-        return head.index(name)
 
     def _number(self, line: int, name: str, cell: str) -> float:
         try:
             number = float(cell)
         except ValueError:
             number = np.nan
-        require(
-            np.isfinite(number),
-            f"{self.path}, line {line}: {name} must be a finite number, got {shortened(cell, 20)!r}.",
-        )
+        fault = f"{self.path}, line {line}: {name} must be a finite number, got {shortened(cell, 20)!r}."
+        require(np.isfinite(number), fault)
         return number
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -133,14 +129,9 @@ def stated_unit(name: str) -> float | None:
     """The factor to SI units that a column's head states, as "x [mm]", "force (kN)" or "stress_MPa"; None if none."""
     bracketed = re.search(r"[\[(]\s*(\S+?)\s*[\])]$", name)
     match = bracketed or re.search(r"_([^\W_]+)$", name)
-    if match is None:
-        return None
-    unit = match[1]
-    if bracketed and unit in _UNITS - {"g"}:
+    if bracketed and bracketed[1] in ("m", "s", "N", "Pa", "J"):
         return 1.0
-    if unit[1:] in _UNITS and unit[0] in _PREFIXES:
-        return _PREFIXES[unit[0]] * (1e-3 if unit[1:] == "g" else 1.0)
-    return None
+    return None if match is None else _UNITS.get(match[1])
 
 
 def read_columns(path: Path | str, *names: str) -> list[np.ndarray]:

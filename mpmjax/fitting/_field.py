@@ -1,7 +1,7 @@
 """Fields: parameters that change from place to place."""
 
-from collections.abc import Callable
 from functools import partial
+from operator import attrgetter
 from typing import Any
 
 import equinox as eqx
@@ -17,18 +17,9 @@ from mpmjax.fitting._parameter import AbstractParameter, Start, Value, leaves_of
 from mpmjax.state import Particles
 
 
-class _OfPlain:
+def _of_plain(name: str) -> Any:
     """An attribute of a field that is one of the parameter that it spreads."""
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
-
-    def __get__(self, field: Any, owner: type | None = None) -> Any:
-        return self if field is None else getattr(field.of, self._name)
-
-
-def _of_plain() -> Any:
-    return _OfPlain()
+    return property(attrgetter(f"of.{name}"))
 
 
 class Field(AbstractParameter):
@@ -55,9 +46,10 @@ class Field(AbstractParameter):
     kernel: BSpline
     start: Start | None
 
-    where, update, prior, unit, only = _of_plain(), _of_plain(), _of_plain(), _of_plain(), _of_plain()
-    logarithmic, domain = _of_plain(), _of_plain()  # pyright: ignore[reportIncompatibleMethodOverride]
-    value, coordinate, free, check, room = _of_plain(), _of_plain(), _of_plain(), _of_plain(), _of_plain()
+    where, update, prior, unit = map(_of_plain, ("where", "update", "prior", "unit"))
+    only, value, coordinate, free = map(_of_plain, ("only", "value", "coordinate", "free"))
+    check, room, domain = map(_of_plain, ("check", "room", "domain"))  # pyright: ignore[reportIncompatibleMethodOverride]
+    logarithmic = _of_plain("logarithmic")  # pyright: ignore[reportIncompatibleMethodOverride]
 
     @checked
     def __init__(
@@ -112,27 +104,19 @@ class Field(AbstractParameter):
         values = self.on_particles(experiment.particles.x, value)
         if self.update is not None:
             return self.update(experiment, values)
-        where: Any = self.where
-        count = len(leaves_of(where, experiment))
-        parts = tuple(values[slice(*_rows(where, experiment, number))] for number in range(count))
-        return eqx.tree_at(partial(leaves_of, where), experiment, parts)
+        where, parts = partial(leaves_of, self.where), []
+        for number in range(len(where(experiment))):
+            # The particles to which a leaf belongs: those of its law, or all.
+            mark, rows = object(), (0, experiment.particles.count)
+            marked = eqx.tree_at(lambda e, k=number: where(e)[k], experiment, mark)
+            for law, group in zip(marked.scene.laws, experiment.particles.groups, strict=True):
+                if any(leaf is mark for leaf in jax.tree.leaves(law)):
+                    rows = group.rows
+            parts.append(values[slice(*rows)])
+        return eqx.tree_at(where, experiment, tuple(parts))
 
     def on_particles(self, x: ParticleVector, value: Value) -> ParticleScalar:
         """The field at positions x [m], shape (p, d), from its values on the nodes."""
         lattice = canonical(self.lattice, x.dtype)
         stencil = make_stencil(self.kernel, SplineGradient(), lattice, lattice.window(x), x)
         return gather(stencil, value.reshape(-1, 1))[0][0]
-
-
-class _Mark:
-    """Marks the place of a leaf."""
-
-
-def _rows(where: Callable[[Experiment], Any], experiment: Experiment, number: int) -> tuple[int, int]:
-    """The particles to which leaf `number` of `where` belongs, the first and the one after the last: those of its law,
-    or all."""
-    marked = eqx.tree_at(lambda e: leaves_of(where, e)[number], experiment, _Mark())
-    for law, group in zip(marked.scene.laws, experiment.particles.groups, strict=True):
-        if any(isinstance(leaf, _Mark) for leaf in jax.tree.leaves(law)):
-            return group.rows
-    return 0, experiment.particles.count

@@ -24,10 +24,8 @@ class Markers(eqx.Module):
     Make them by `Markers.of` or `Markers.at`.
     """
 
-    which: np.ndarray
-    """Numbers of the particles that carry each marker, shape (m, k)."""
-    share: np.ndarray
-    """Their shares in its place, shape (m, k); they add up to one."""
+    which: np.ndarray  # numbers of the particles that carry each marker, shape (m, k)
+    share: np.ndarray  # their shares in its place, shape (m, k); they add up to one
 
     @classmethod
     @checked
@@ -136,10 +134,8 @@ class CentreOfMass(eqx.Module):
 class StressStretch(eqx.Module):
     """The curve of a tension test: mean stretch F_aa and mean nominal stress P_aa [Pa] of a gauge section."""
 
-    weight: ParticleScalar
-    """Share of each particle in the means, summing to one, shape (p,)."""
-    axis: int = eqx.field(static=True)
-    """Direction a of the pull."""
+    weight: ParticleScalar  # share of each particle in the means, summing to one, shape (p,)
+    axis: int = eqx.field(static=True)  # direction a of the pull
 
     @classmethod
     @checked

@@ -121,12 +121,8 @@ def uncertainty(J: np.ndarray, eps: float, estimated: Sequence[tuple[slice, floa
     spectrum, directions = np.linalg.eigh(J.T @ J)
     parts = tuple(inverse @ J[rows].T @ J[rows] @ inverse for rows, _ in estimated)
     freedoms = tuple(freedom for _, freedom in estimated)
-    return Uncertainty(inverse, _unit(unseen), _unit(weak), np.maximum(spectrum, 0), directions, parts, freedoms)
-
-
-def _unit(columns: np.ndarray) -> np.ndarray:
-    """The columns, each of length one."""
-    return columns / np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
+    unseen, weak = (a / np.maximum(np.linalg.norm(a, axis=0), np.finfo(float).tiny) for a in (unseen, weak))
+    return Uncertainty(inverse, unseen, weak, np.maximum(spectrum, 0), directions, parts, freedoms)
 
 
 def at_bound(r: np.ndarray, J: np.ndarray, room: np.ndarray) -> np.ndarray:
@@ -156,7 +152,6 @@ def _mean_square(robust: float | None) -> float:
     """The mean square of robust residuals of normal noise of variance one: 1 without a limit, less with one."""
     if robust is None:
         return 1.0
-
     r, weight = np.polynomial.hermite_e.hermegauss(_NODES)
     return float((weight * 2 * r**2 / (1 + np.sqrt(1 + (r / robust) ** 2))).sum() / np.sqrt(2 * np.pi))
 
@@ -164,55 +159,38 @@ def _mean_square(robust: float | None) -> float:
 def seen_together(labels: tuple[str, ...], errors: Uncertainty, logarithmic: tuple[bool, ...]) -> list[str]:
     """Directions in which the coordinates may change and the data do not, or hardly, in words; `logarithmic` says which
     coordinates are logarithms of their values."""
-    length = np.where(np.isinf(errors.alone), 1, 1 / errors.alone)
-    texts = [_unseen(*_parts(d, length), labels, logarithmic) for d in _simplest(errors.unseen * length[:, None]).T]
-    for effect in _simplest(errors.weak * length[:, None]).T:
-        parts, change = _parts(effect, length)
-        rho = errors.correlation[parts[0], parts[-1]]
-        if len(parts) == 2 and np.isfinite(rho):
-            together = "together" if rho > 0 else "in opposite directions"
-            names = " and ".join(labels[i] for i in parts)
-            texts.append(f"{names}: {abs(rho):.5f} correlated, a change of both {together} is hardly seen.")
-        else:
-            seen = np.sqrt((effect / length @ errors.directions) ** 2 @ errors.spectrum) / np.linalg.norm(effect)
-            what = _proportion(parts, change, labels, logarithmic)
-            texts.append(f"{what} is hardly seen, {1 / seen:.2g} times less than of one alone.")
+    length, correlation, texts = np.where(np.isinf(errors.alone), 1, 1 / errors.alone), errors.correlation, []
+    for columns, weak in ((errors.unseen, False), (errors.weak, True)):
+        effects = columns * length[:, None]  # on the data
+        if effects.shape[1] > 1:
+            # Combinations, each with a coordinate to itself, so that few coordinates meet in one.
+            *_, pivots = qr(effects.T, mode="r", pivoting=True)
+            effects = effects @ np.linalg.inv(effects[pivots[: effects.shape[1]]])
+        for effect in effects.T:
+            parts = np.flatnonzero(np.abs(effect) > _PART * np.abs(effect).max())
+            change = effect[parts] / length[parts]
+            change, names = change / change[np.abs(change).argmax()], [labels[i] for i in parts]
+            logarithms, rho = all(logarithmic[i] for i in parts), correlation[parts[0], parts[-1]]
+            proportion = (
+                f"{', '.join(names)}: a change in the proportion {' : '.join(f'{c:+.2g}' for c in change)} of their "
+                f"{'logarithms' if logarithms else 'coordinates'}"
+            )
+            if weak and len(parts) == 2 and np.isfinite(rho):
+                together = "together" if rho > 0 else "in opposite directions"
+                correlated = f"{abs(rho):.5f} correlated, a change of both {together} is hardly seen."
+                texts.append(f"{names[0]} and {names[1]}: {correlated}")
+            elif weak:
+                seen = np.sqrt((effect / length @ errors.directions) ** 2 @ errors.spectrum) / np.linalg.norm(effect)
+                texts.append(f"{proportion} is hardly seen, {1 / seen:.2g} times less than of one alone.")
+            elif len(parts) == 1:
+                texts.append(f"{names[0]}: the data do not see it.")
+            elif len(parts) == 2 and logarithms:
+                power = change[0] / change[1]
+                only = f"{names[0]}·{names[1]}^{-power:.3g}"
+                if abs(abs(power) - 1) < 0.01:
+                    only = f"their {'ratio' if power > 0 else 'product'}"
+                texts.append(f"{names[0]} and {names[1]}: only {only} is seen.")
+            else:
+                texts.append(f"{proportion} is not seen by the data.")
     more = len(texts) - _MOST_SAID
     return texts[:_MOST_SAID] + ([f"There are {more} more such directions."] if more > 0 else [])
-
-
-def _simplest(columns: np.ndarray) -> np.ndarray:
-    """Columns of one space, each with a coordinate to itself, so that few coordinates meet in one."""
-    if columns.shape[1] < 2:
-        return columns
-    *_, pivots = qr(columns.T, mode="r", pivoting=True)
-    pivots = pivots[: columns.shape[1]]
-    return columns @ np.linalg.inv(columns[pivots])
-
-
-def _parts(effect: np.ndarray, length: np.ndarray) -> tuple[list[int], np.ndarray]:
-    """The coordinates that a direction is of, and their changes, the largest one. `effect` is the change of each
-    coordinate times its effect on the data, `length`."""
-    parts = [i for i in range(len(effect)) if abs(effect[i]) > _PART * np.abs(effect).max()]
-    change = effect[parts] / length[parts]
-    return parts, change / change[np.abs(change).argmax()]
-
-
-def _unseen(parts: list[int], change: np.ndarray, labels: tuple[str, ...], logarithmic: tuple[bool, ...]) -> str:
-    """A direction that the data do not see, in words."""
-    names = [labels[i] for i in parts]
-    if len(parts) == 1:
-        return f"{names[0]}: the data do not see it."
-    if len(parts) == 2 and all(logarithmic[i] for i in parts):
-        power = change[0] / change[1]
-        if abs(abs(power) - 1) < 0.01:
-            return f"{names[0]} and {names[1]}: only their {'ratio' if power > 0 else 'product'} is seen."
-        return f"{names[0]} and {names[1]}: only {names[0]}·{names[1]}^{-power:.3g} is seen."
-    return f"{_proportion(parts, change, labels, logarithmic)} is not seen by the data."
-
-
-def _proportion(parts: list[int], change: np.ndarray, labels: tuple[str, ...], logarithmic: tuple[bool, ...]) -> str:
-    """A change of several coordinates together, in words."""
-    what = "logarithms" if all(logarithmic[i] for i in parts) else "coordinates"
-    shown = " : ".join(f"{c:+.2g}" for c in change)
-    return f"{', '.join(labels[i] for i in parts)}: a change in the proportion {shown} of their {what}"
