@@ -14,7 +14,7 @@ import numpy as np
 
 from mpmjax._types import Scalar
 from mpmjax.checks import require, require_positive, shortened
-from mpmjax.cli._measurements import Source, observation
+from mpmjax.cli._measurements import observation
 from mpmjax.cli._scene_file import Simulation, read_simulation
 from mpmjax.fitting import (
     LBFGS,
@@ -232,27 +232,20 @@ def _parameter(table: dict[str, Any], experiments: list[Experiment]) -> tuple[st
             require(path is None, f"{where}: {kind} is of all particles and takes no path.")
             return name or kind.lower(), _of_the_body(kind, where, experiments[min(numbers)], common)
         require(path is not None, f'{where} needs a path, such as "scene.material.youngs_modulus".')
-        path = str(path)
-        _require_number(path, where, experiments[min(numbers)])
-        common |= {"where": partial(leaf_of, path)}
-        last = path.rpartition(".")[2]
+        owner, _, last = _path(path, where).rpartition(".")
+        value, parent = (leaf_of(of, experiments[min(numbers)]) for of in (str(path), owner))
+        names = [f.name for f in fields(parent)] if is_dataclass(parent) else [last]
+        fault = f"{where} follows from others and cannot be fitted; name one of {', '.join(names)}."
+        require(last in names, fault)
+        number = eqx.is_array_like(value) and np.issubdtype(np.asarray(value).dtype, np.floating)
+        require(number, f"{where} must be a number, but is {shortened(repr(value))}.")
+        common |= {"where": partial(leaf_of, str(path))}
         if kind == "Bounded":
             require(lower is not None and upper is not None, f"{where} needs lower and upper.")
             return name or last, Bounded(lower=float(lower or 0.0), upper=float(upper or 0.0), **common)
         return name or last, (Positive if kind == "Positive" else Unbounded)(**common)
 
     return parameter(**arguments(parameter, table, "[[fit.parameter]]"))
-
-
-def _require_number(path: str, where: str, experiment: Experiment) -> None:
-    value, (owner, _, last) = leaf_of(_path(path, where), experiment), path.rpartition(".")
-    parent = leaf_of(owner, experiment)
-    names = [f.name for f in fields(parent)] if is_dataclass(parent) else []
-    require(
-        not names or last in names, f"{where} follows from others and cannot be fitted; name one of {', '.join(names)}."
-    )
-    number = eqx.is_array_like(value) and np.issubdtype(np.asarray(value).dtype, np.floating)
-    require(number, f"{where} must be a number, but is {shortened(repr(value))}.")
 
 
 _OF_THE_BODY = ("Velocity", "Spin")  # parameters of the initial motion of all particles
@@ -301,8 +294,7 @@ def _experiments(path: Path, simulation: Simulation, table: dict[str, Any]) -> t
     require(t1 <= simulation.t1, f"[fit] t1 must not lie after that of [run], got {t1} and {simulation.t1}.")
     tables = _tables(table, "observation")
     require(len(tables) > 0, f"{path} needs an [[fit.observation]].")
-    source = Source(path.parent, simulation.scene, simulation.particles, simulation.t1)
-    pairs = [observation(t, source, t1) for t in tables]
+    pairs = [observation(t, path.parent, simulation, t1) for t in tables]
     fitted, whole = zip(*pairs, strict=True)
 
     experiment = partial(

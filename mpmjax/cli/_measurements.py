@@ -2,9 +2,9 @@
 
 import inspect
 from collections.abc import Callable
-from functools import wraps
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import equinox as eqx
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from mpmjax._types import Array, Scalar
 from mpmjax.analysis import energy_of
 from mpmjax.checks import require, require_positive
+from mpmjax.cli._scene_file import Simulation
 from mpmjax.discretisation import Grid
 from mpmjax.fitting import (
     AbstractObservation,
@@ -34,49 +35,47 @@ from mpmjax.io import arguments
 from mpmjax.state import Particles, Scene
 
 
-class Source(NamedTuple):
-    """The run that an observation is of."""
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """The keys of a table that the kinds of observation share; each kind says which of them it is without."""
 
+    simulation: Simulation
     folder: Path  # where the scene file lies
-    scene: Scene
-    particles: Particles
-    t1: float  # end of the run [s]
-
-
-class Measurement(NamedTuple):
-    """The keys of a table that the kinds of observation share, and the run that it is of."""
-
-    source: Source
-    data: str  # the file's name
-    unit: Scalar
-    time: str  # its column or array
-    time_unit: Scalar  # or that of lengths
-    trust: dict[str, Any]  # sigma, weight, robust and name
+    data: str
+    unit: Scalar = 1.0
+    time: str
+    time_unit: Scalar = 1.0
+    length_unit: Scalar = 1.0
+    sigma: Scalar | None = None
+    weight: Scalar = 1.0
+    robust: Scalar | None = None
+    name: str | None = None
 
     @property
     def dim(self) -> int:
         """Number of dimensions of the run."""
-        return self.source.particles.dim
+        return self.simulation.particles.dim
 
     def named(self, name: str) -> dict[str, Any]:
         """Noise, weight and name of the observation, which has this name if the file gives none."""
-        return self.trust | {"name": name if self.trust["name"] is None else self.trust["name"]}
+        name = name if self.name is None else self.name
+        return {"sigma": self.sigma, "weight": self.weight, "robust": self.robust, "name": name}
 
     def columns(self, *names: str, sign: bool = False) -> Columns:
         """Columns of the CSV file, after a look at the units; with `sign` the first may be negative, to turn a
         direction."""
         self.check_units(sign=sign)
         require(len(set(names)) == len(names), f"{_HEADER} names a column twice: {', '.join(names)}.")
-        return Columns(self.source.folder / self.data, *names)
+        return Columns(self.folder / self.data, *names)
 
     def check_units(self, other: str = "time_unit or length_unit", *, sign: bool = False) -> None:
         """Check that the units are positive."""
         require_positive(f"{_HEADER} unit", abs(self.unit) if sign else self.unit)
-        require_positive(f"{_HEADER} {other}", self.time_unit)
+        require_positive(f"{_HEADER} {other}", self.time_unit * self.length_unit)
 
     def times(self, columns: Columns, *, grow: bool = True) -> np.ndarray:
         """The times of the rows [s]."""
-        return columns.times(self.time, float(self.time_unit), self.source.t1, grow=grow)
+        return columns.times(self.time, float(self.time_unit), self.simulation.t1, grow=grow)
 
     def scaled(self, columns: Columns, name: str) -> np.ndarray:
         """A column in SI units."""
@@ -104,7 +103,7 @@ class Measurement(NamedTuple):
         self, columns: Columns, x: dict[str, np.ndarray], axes: list[int], grid: Grid | None = None
     ) -> None:
         """Check that places lie in the window of the scene's grid, if that stays in its place, or on a lattice."""
-        window, what = (self.source.scene.grid, "the grid's window") if grid is None else (grid, "the picture's grid")
+        window, what = grid or self.simulation.scene.grid, "the grid's window" if grid is None else "the picture's grid"
         if window.follow:
             return
         for axis, (name, values) in zip(axes, x.items(), strict=True):
@@ -117,56 +116,41 @@ class Measurement(NamedTuple):
             )
 
 
-_kinds: dict[str, Callable[..., Any]] = {}
+_kinds: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {}
+"""Functions of a measurement and keys of their own that make the observations of a kind, and shared keys not taken."""
 _HEADER = "[[fit.observation]]"
 
 
-def observation(table: dict[str, Any], source: Source, t1: float) -> tuple[AbstractObservation, AbstractObservation]:
-    """An observation as it is fitted, until t1 [s], and with all that was measured."""
+def observation(
+    table: dict[str, Any], folder: Path, simulation: Simulation, t1: float
+) -> tuple[AbstractObservation, AbstractObservation]:
+    """An observation of a simulation as it is fitted, until t1 [s], and with all that was measured in a folder."""
     kind = table.get("kind")
     there = isinstance(kind, str) and kind in _kinds
     require(there, f"{_HEADER} kind must be one of {', '.join(_kinds)}, got {kind!r}.")
-    make = _kinds[str(kind)]
-    keys = {k: v for k, v in table.items() if k != "kind"}
-    made = make(source, **arguments(make, keys, f"{_HEADER} {kind}", without=["source"]))
-    return made if isinstance(made, tuple) else (made.until(t1), made)
+    make, without = _kinds[str(kind)]
+    (_, *special), common = (inspect.signature(of).parameters.values() for of in (make, Measurement))
+    shared = [p for p in common if p.name not in ("simulation", "folder", *without)]
 
+    def keys(**_: Any) -> None: ...
 
-def _shared(
-    *,
-    data: str,
-    unit: Scalar = 1.0,
-    time: str,
-    time_unit: Scalar = 1.0,
-    length_unit: Scalar = 1.0,
-    sigma: Scalar | None = None,
-    weight: Scalar = 1.0,
-    robust: Scalar | None = None,
-    name: str | None = None,
-) -> None:
-    """The keys that kinds share, with their types; each kind says which of them it is without."""
+    keys.__signature__ = inspect.Signature([*special, *shared])  # pyright: ignore[reportFunctionMemberAccess]
+    values = arguments(keys, {k: v for k, v in table.items() if k != "kind"}, f"{_HEADER} {kind}")
+    chosen = {p.name: values.pop(p.name) for p in shared if p.name in values}
+    made = make(Measurement(simulation=simulation, folder=folder, **{"time": ""} | chosen), **values)
+    if isinstance(made, tuple):
+        return made
+    part = made.part_until(t1)
+    require(part is not None, f"{made.title} begins at {made.times[0]:g} s, after t1 = {t1:g} s.")
+    return part, made
 
 
 def _kind(name: str, without: tuple[str, ...] = ("length_unit",)) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorate a function (measurement, keys of its own) to make the observations of a kind."""
 
     def registered(make: Callable[..., Any]) -> Callable[..., Any]:
-        special, shared = (inspect.signature(function).parameters for function in (make, _shared))
-        common = {key: parameter for key, parameter in shared.items() if key not in without}
-
-        @wraps(make)
-        def whole(source: Source, **keys: Any) -> Any:
-            values = {key: keys.pop(key, parameter.default) for key, parameter in common.items()}
-            trust = {key: values[key] for key in ("sigma", "weight", "robust", "name")}
-            other = values.get("time_unit", values.get("length_unit", 1.0))
-            m = Measurement(source, values["data"], values["unit"], values.get("time", ""), other, trust)
-            return make(m, **keys)
-
-        parameters = [inspect.Parameter("source", inspect.Parameter.POSITIONAL_ONLY)]
-        parameters += [*(p for key, p in special.items() if key != "m"), *common.values()]
-        whole.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportAttributeAccessIssue]
-        _kinds[name] = whole
-        return whole
+        _kinds[name] = make, without
+        return make
 
     return registered
 
@@ -187,7 +171,7 @@ def _stress_stretch(
     columns.require(x > 0, f"{stretch} must be positive, got {{{stretch}}}: lengths over first lengths.")
     inside = (x >= range[0]) & (x <= range[1])
     require(inside.sum() > 0, f"{_HEADER} range {range} holds none of the {len(x)} points.")
-    of = StressStretch.of(gauge, m.source.particles, axis)
+    of = StressStretch.of(gauge, m.simulation.particles, axis)
     names: dict[str, Any] = m.named("nominal stress [Pa]") | {"x_name": "stretch"}
     return Curve(x[inside], y[inside], of, **names), Curve(x, y, of, **names)
 
@@ -225,10 +209,10 @@ def _tracks(m: Measurement, *, marker: str, place: tuple[str, ...]) -> Tracks:
     positions[frame, which] = x
     for k in np.flatnonzero(t == 0):  # one by one, so that the line is known
         try:
-            Markers.at(m.source.particles, x[k : k + 1])
+            Markers.at(m.simulation.particles, x[k : k + 1])
         except ValueError as error:
             columns.require(np.arange(len(t)) != k, f"{error} Give unit if {' and '.join(place)} are not in metres.")
-    return Tracks(times[1:], positions[1:], which=Markers.at(m.source.particles, positions[0]), **m.named("tracks"))
+    return Tracks(times[1:], positions[1:], which=Markers.at(m.simulation.particles, positions[0]), **m.named("tracks"))
 
 
 @_kind("Force")
@@ -248,22 +232,22 @@ def _torque(m: Measurement, *, torque: tuple[str, ...], collider: int = 0, bound
 def _force_displacement(
     m: Measurement, *, displacement: str, force: str, axis: int, collider: int = 0, boundary: int | None = None
 ) -> Force:
-    what, number, bodies = "collider", collider, [b for b in m.source.scene.boundary if b.collider_count]
+    what, number, bodies = "collider", collider, [b for b in m.simulation.scene.boundary if b.collider_count]
     if boundary is not None:
-        what, number, bodies = "boundary", boundary, m.source.scene.boundary
+        what, number, bodies = "boundary", boundary, m.simulation.scene.boundary
     require(0 <= axis < m.dim, f"{_HEADER} axis must be below {m.dim}, got {axis}.")
     require(0 <= number < len(bodies), f"{_HEADER} {what} must be from 0 to {len(bodies) - 1}, got {number}.")
     motion: Any = getattr(bodies[number], "motion", None)
     require(motion is not None, f"{_HEADER} ForceDisplacement needs a {what} that moves, but {number} is at rest.")
     columns = m.columns(displacement, force, sign=True)
     times, path = np.asarray(motion.times, float), np.asarray(motion.displacement, float)[:, axis]
-    last, t1 = np.searchsorted(times, m.source.t1), m.source.t1
+    last, t1 = np.searchsorted(times, m.simulation.t1), m.simulation.t1
     times, path = np.append(times[:last], t1), np.append(path[:last], np.interp(t1, times, path))
     way = np.sign(path[-1] - path[0])
     grows = way * np.diff(path)
     moves = np.append(grows > 0, True) | np.append(False, grows > 0)
     require((grows >= 0).all() and way != 0, f"{_HEADER} the {what} must move one way along axis {axis}.")
-    x = columns.scaled(displacement, float(m.time_unit), "length_unit")
+    x = columns.scaled(displacement, float(m.length_unit), "length_unit")
     columns.require(
         (way * x >= way * path[0]) & (way * x <= way * path[-1] * (1 + 1e-9)),
         f"{displacement} {{{displacement}}} is not reached: the {what} moves from {path[0]:g} to {path[-1]:g} m.",
@@ -295,7 +279,7 @@ class _EnergyPart(eqx.Module):
 
 @_kind("Density", without=("time", "length_unit"))
 def _density(m: Measurement, *, grid: Grid, time: str = "times", value: str = "density") -> Series:
-    path = m.source.folder / m.data
+    path = m.folder / m.data
     m.check_units("time_unit")
     t, pictures = read_arrays(path, time, value)
     t, pictures = t * float(m.time_unit), pictures * float(m.unit)
@@ -307,7 +291,7 @@ def _density(m: Measurement, *, grid: Grid, time: str = "times", value: str = "d
     )
     fine = np.isfinite(t)
     require(fine.all(), f"{path}: {time} must be finite, but picture {np.flatnonzero(~fine)[:1]} has none.")
-    t1 = m.source.t1
+    t1 = m.simulation.t1
     late = np.flatnonzero((t < 0) | after(t, t1))
     require(len(late) == 0, f"{path}: picture {late[:1]} is of a time outside of the run, from 0 to {t1:g} s.")
     back = np.flatnonzero(np.diff(t) <= 0) + 1
@@ -324,7 +308,7 @@ def _cloud(m: Measurement, *, place: tuple[str, ...], grid: Grid, mass: Scalar |
     )
     if mass is not None:
         require_positive(f"{_HEADER} mass [kg]", mass)
-    total = float(m.source.particles.mass.sum() if mass is None else mass)
+    total = float(m.simulation.particles.mass.sum() if mass is None else mass)
     picture, times = Density(grid), np.unique(t)
     pictures = np.stack([picture.of_points(x[t == now], total) for now in times])
     return Series(times, pictures, picture, **m.named("cloud"))

@@ -16,33 +16,7 @@ from mpmjax.simulation import Run
 from mpmjax.state import Particles, Scene
 
 
-class _Observed(AbstractObservation):
-    """An observation whose part of a state is a function of (scene, particles)."""
-
-    data: Float[np.ndarray, "f ..."]
-    of: Callable[[Scene, Particles], Any]
-    sigma: Float[np.ndarray, "..."] | None
-    weight: Scalar
-    robust: Scalar | None
-    name: str = eqx.field(static=True)
-
-    def __init__(
-        self,
-        data: Numbers,
-        of: Callable[[Scene, Particles], Any],
-        sigma: Numbers | None,
-        weight: Scalar,
-        robust: Scalar | None,
-        name: str,
-    ):
-        self.data, self.of, self.name = as_floats(data), of, name
-        self.sigma, self.weight, self.robust = as_floats(sigma), as_floats(weight), as_floats(robust)
-
-    def observe(self, scene: Scene, particles: Particles) -> Any:
-        return self.of(scene, particles)
-
-
-class Curve(_Observed):
+class Curve(AbstractObservation):
     """A quantity measured against another one: stress against stretch, a force against a displacement.
 
     Args:
@@ -55,6 +29,12 @@ class Curve(_Observed):
     """
 
     x: Float[np.ndarray, "m"]
+    data: Float[np.ndarray, "m"]
+    of: Callable[[Scene, Particles], Any]
+    sigma: Float[np.ndarray, "..."] | None
+    weight: Scalar
+    robust: Scalar | None
+    name: str = eqx.field(static=True)
     x_name: str = eqx.field(static=True)
 
     def __init__(
@@ -69,8 +49,9 @@ class Curve(_Observed):
         name: str = "curve",
         x_name: str = "abscissa",
     ):
-        self.x, self.x_name = as_floats(x), x_name
-        super().__init__(y, of, sigma, weight, robust, name)
+        self.x, self.data, self.of, self.name = as_floats(x), as_floats(y), of, name
+        self.sigma, self.weight, self.robust = map(as_floats, (sigma, weight, robust))
+        self.x_name = x_name
 
     def __check_init__(self):
         require_fields(self)
@@ -83,6 +64,9 @@ class Curve(_Observed):
     @property
     def against(self) -> tuple[str, np.ndarray]:
         return self.x_name, self.x
+
+    def observe(self, scene: Scene, particles: Particles) -> Any:
+        return self.of(scene, particles)
 
     def predict(self, seen: Any, run: Run) -> Array:
         del run
@@ -112,7 +96,7 @@ class Curve(_Observed):
         return (measured < x[0] - slack) | (measured > x[-1] + slack)
 
 
-class Series(_Observed):
+class Series(AbstractObservation):
     """A quantity measured against time: a height, a front, an energy, an image, anything that a state says.
 
     Between steps it is interpolated linearly.
@@ -128,6 +112,12 @@ class Series(_Observed):
     """
 
     times: Float[np.ndarray, "f"]
+    data: Float[np.ndarray, "f ..."]
+    of: Callable[[Scene, Particles], Any]
+    sigma: Float[np.ndarray, "..."] | None
+    weight: Scalar
+    robust: Scalar | None
+    name: str = eqx.field(static=True)
 
     def __init__(
         self,
@@ -140,8 +130,8 @@ class Series(_Observed):
         robust: Scalar | None = None,
         name: str = "series",
     ):
-        self.times = as_floats(times)
-        super().__init__(values, of, sigma, weight, robust, name)
+        self.times, self.data, self.of, self.name = as_floats(times), as_floats(values), of, name
+        self.sigma, self.weight, self.robust = map(as_floats, (sigma, weight, robust))
 
     def __check_init__(self):
         require_fields(self)
@@ -158,6 +148,9 @@ class Series(_Observed):
     def against(self) -> tuple[str, np.ndarray]:
         return "time [s]", self.times
 
+    def observe(self, scene: Scene, particles: Particles) -> Any:
+        return self.of(scene, particles)
+
     def predict(self, seen: Array, run: Run) -> Array:
         return self._at_times(seen, run)
 
@@ -170,16 +163,8 @@ class Series(_Observed):
         return jnp.where(outside, jnp.nan, between(values, step - first))
 
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
-        what = self.title
-        outside = (self.times < 0) | after(self.times, t1)
-        require(
-            ~outside,
-            f"The times of {what} must lie in the run, from 0 to {t1:g} s, but {int(outside.sum())} do not, the first "
-            f"{self.times[outside][:1]}: raise t1, or leave them out.",
-        )
-        self._check_shape(eqx.filter_eval_shape(lambda *state: self.observe(*state), scene, particles))
-
-    def _check_shape(self, seen: Any) -> None:
+        self._check_times(t1)
+        seen = eqx.filter_eval_shape(lambda *state: self.observe(*state), scene, particles)
         shape = getattr(seen, "shape", None)
         require(
             shape == self.data.shape[1:],
@@ -187,22 +172,22 @@ class Series(_Observed):
             f"returns {'no array' if shape is None else f'shape {shape}'}.",
         )
 
-    def until(self, t1: float) -> "Series":
-        """The part of it that was measured until a time [s].
+    def _check_times(self, t1: float) -> None:
+        outside = (self.times < 0) | after(self.times, t1)
+        require(
+            ~outside,
+            f"The times of {self.title} must lie in the run, from 0 to {t1:g} s, but {int(outside.sum())} do not, the "
+            f"first {self.times[outside][:1]}: raise t1, or leave them out.",
+        )
 
-        Raises:
-            ValueError: there is none.
-        """
+    def part_until(self, t1: float) -> "Series | None":
         kept = ~after(self.times, t1)
-        require(kept.any(), f"{self.title} begins at {self.times[0]:g} s, after t1 = {t1:g} s.")
+        if not np.isfinite(self.data[kept]).any():
+            return None
         part = eqx.tree_at(lambda o: (o.times, o.data), self, (self.times[kept], self.data[kept]))
         if self.sigma is None:
             return part
         return eqx.tree_at(lambda o: o.sigma, part, np.broadcast_to(self.sigma, self.data.shape)[kept])
-
-    def part_until(self, t1: float) -> "Series | None":
-        seen = np.isfinite(self.data[~after(self.times, t1)]).any()
-        return self.until(t1) if seen else None
 
     def explain(self, seen: Array, run: Run) -> None:
         require_finite(f"What the simulation says of {self.name!r}", seen)
@@ -289,12 +274,8 @@ class Force(Series):
         self.collider, self.boundary = collider, boundary
         super().__init__(times, forces, _nothing, sigma=sigma, weight=weight, robust=robust, name=name)
 
-    def _check_shape(self, seen: Any) -> None:
-        """The forces' shape is checked when they are predicted."""
-        del seen
-
     def check(self, scene: Scene, particles: Particles, t1: float) -> None:
-        super().check(scene, particles, t1)
+        self._check_times(t1)  # the forces' shape is checked when they are predicted
         kind, number, count = "collider", self.collider, scene.collider_count
         if self.boundary is not None:
             kind, number, count = "boundary", self.boundary, len(scene.boundary) + len(scene.guides)
