@@ -29,7 +29,7 @@ import numpy as np
 import mpmjax as mpm
 from mpmjax.fitting._multistart import linked, starting_points, unit_points
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._search import Problems, begin, iterate_together
+from mpmjax.fitting._search import begin, iterate_together
 
 NOISE = 1e-4
 PARAMETERS = {
@@ -88,12 +88,13 @@ def one_by_one(pull: mpm.Experiment, points: np.ndarray) -> list[float]:
 def iteration(pull: mpm.Experiment, points: np.ndarray, batch: int) -> Callable[[], Any]:
     """An iteration of so many searches together."""
     problem, optimiser = FitProblem((pull,), PARAMETERS), mpm.fitting.LevenbergMarquardt()
-    one, sigmas = (Problems.of([a]) for a in (problem, problem.first_sigmas))
+    common = problem, problem.first_sigmas
+    none = jax.tree.map(lambda _: None, common)
     states = [begin(problem, optimiser, jnp.asarray(z), problem.first_sigmas) for z in points[:batch]]
     arrays, rest = zip(*(eqx.partition(s, eqx.is_array) for s in states), strict=True)
     state = eqx.combine(jax.tree.map(lambda *a: np.stack(a), *arrays), rest[0])
     return lambda: eqx.filter(
-        iterate_together(one.at(0), one.common, optimiser, points[:batch], sigmas.at(0), sigmas.common, state),
+        iterate_together(none, common, optimiser, points[:batch], state),
         eqx.is_array,
     )
 

@@ -17,8 +17,8 @@ from test_schema import EXAMPLES
 
 import mpmjax as mpm
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._result import SettledNoise, fit_result
-from mpmjax.fitting._search import Minimum
+from mpmjax.fitting._result import fit_result
+from mpmjax.fitting._search import Search
 
 SCENE, PARTICLES = block(2)
 
@@ -40,8 +40,9 @@ RUN = {"scene": SCENE, "particles": PARTICLES, "t1": 0.1, "dt": 0.01}
 def found() -> mpm.fitting.FitResult:
     """A fit, as if it had been made."""
     problem = FitProblem((mpm.Experiment(**RUN, observations=SEEN),), {"E": STIFFNESS})
-    at = Minimum(jnp.zeros(1), jnp.zeros(1), jnp.ones((1, 1)), True, False, ())
-    settled = SettledNoise((jnp.ones(()),), [1.0], [1.0], False)
+    seen = mpm.fitting.Evaluation(jnp.zeros(()), jnp.zeros(1), jnp.zeros(1), jnp.ones((1, 1)))
+    at = Search(jnp.zeros(1), None, seen, (), converged=True)
+    settled = [(jnp.ones(()), 1.0, 1.0)]
     return fit_result(problem, mpm.fitting.LevenbergMarquardt(), at, settled, {}, 0.95)
 
 

@@ -11,7 +11,7 @@ import mpmjax as mpm
 from mpmjax.fitting._observation import between
 from mpmjax.fitting._problem import FitProblem
 from mpmjax.fitting._result import Estimate, NoiseEstimate
-from mpmjax.fitting._search import iterate, search
+from mpmjax.fitting._search import iterate, search, search_many
 from mpmjax.fitting._sequence import _extrapolate, _missed
 
 DT, STEPS, NOISE = 4e-3, 15, 1e-4
@@ -399,11 +399,14 @@ def test_a_step_at_which_the_simulation_fails_is_not_taken():
 
 
 def test_a_search_that_ends_where_simulations_begin_to_fail_has_not_converged():
-    """The minimum, z = 0.494, lies beyond z = 0.4, where they fail."""
-    found = search(Failing(0.4), mpm.fitting.LevenbergMarquardt(max_steps=200), jnp.zeros(1), ())
-    assert not found.converged
-    assert len(found.history) < 200
-    assert float(found.z[0]) == pytest.approx(0.4, abs=1e-2)
+    """The minimum, z = 0.494, lies beyond z = 0.4, where they fail; among others it ends as alone."""
+    lm = mpm.fitting.LevenbergMarquardt(max_steps=200)
+    alone = search(Failing(0.4), lm, jnp.zeros(1), ())
+    assert not alone.converged
+    assert len(alone.history) < 200
+    assert float(alone.z[0]) == pytest.approx(0.4, abs=1e-2)
+    among = search_many([(Failing(0.4), ())], lm, dict.fromkeys(range(2), np.zeros(1)), batch=2)[1]
+    assert (among.converged, len(among.history)) == (False, len(alone.history))
 
 
 class Rounded(Failing):

@@ -14,12 +14,12 @@ from scipy.stats import norm, t
 
 import mpmjax as mpm
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._result import SettledNoise, fit_result
-from mpmjax.fitting._search import Minimum, Problems, iterate, search_many
+from mpmjax.fitting._result import fit_result
+from mpmjax.fitting._search import Search, iterate, search_many
 from mpmjax.fitting._uncertainty import _mean_square, noise, seen_together, uncertainty
 from mpmjax.viz import draw_fit, write_fit
 
-GIVEN_NOISE = SettledNoise((jnp.ones(()),), [1.0], [0.0], False)
+GIVEN_NOISE = [(jnp.ones(()), 1.0, 0.0)]
 
 DT, STEPS, NOISE = 4e-3, 15, 2e-3
 G, V = 9.81, 0.3
@@ -196,7 +196,8 @@ class Abrupt(FitProblem):
     def result(self):
         """The fit, at z = 0."""
         column = jnp.full((STEPS, 1), self.slope / np.sqrt(STEPS))
-        found = Minimum(jnp.zeros(1), jnp.zeros(STEPS), column, True, False, ())
+        seen = mpm.fitting.Evaluation(jnp.zeros(()), jnp.zeros(1), jnp.zeros(STEPS), column)
+        found = Search(jnp.zeros(1), None, seen, (), converged=True)
         return fit_result(self, mpm.fitting.LevenbergMarquardt(), found, GIVEN_NOISE, {}, 0.95)
 
 
@@ -257,12 +258,9 @@ def beside_a_bound(name, offset, count):
     one = Line(parameter, y[0])
     problems = [eqx.tree_at(lambda line: line.y, one, jnp.asarray(own)) for own in y]
     lm = mpm.fitting.LevenbergMarquardt()
-    sigmas = Problems.of([(jnp.ones(()),)])
-    found = search_many(Problems.of(problems), lm, np.zeros((count, 2)), sigmas=sigmas, batch=count)
-    results = [
-        fit_result(problem, lm, member.minimum, GIVEN_NOISE, {}, 0.95)
-        for problem, member in zip(problems, found, strict=True)
-    ]
+    each = [(problem, (jnp.ones(()),)) for problem in problems]
+    ends = search_many(each, lm, dict.fromkeys(range(count), np.zeros(2)), batch=count)
+    results = [fit_result(problem, lm, ends[k], GIVEN_NOISE, {}, 0.95) for k, problem in enumerate(problems)]
     return truth, y, results
 
 

@@ -12,7 +12,7 @@ from test_fit import DT, NOISE, STEPS, STIFFNESS, bar, experiment, tracks
 import mpmjax as mpm
 from mpmjax.fitting._multistart import costs_at, critical_distance, linked, starting_points, unit_points
 from mpmjax.fitting._problem import FitProblem
-from mpmjax.fitting._search import Problems, search, search_many
+from mpmjax.fitting._search import search, search_many
 
 LM = mpm.fitting.LevenbergMarquardt()
 TIMES = np.linspace(0.001, 0.05, 40)
@@ -105,8 +105,8 @@ def test_searches_from_few_points_find_what_searches_from_all_find():
     for seed in range(10):
         shares = unit_points(63, 1, seed)
         points = starting_points(problem, shares, {"omega": (100.0, 750.0)})[1:]
-        members = search_many(Problems.of([problem]), LM, points, sigmas=Problems.of([sigmas]), batch=63)
-        least = np.array([m.minimum.history[-1].cost for m in members])
+        members = search_many([(problem, sigmas)], LM, dict(enumerate(points)), batch=63)
+        least = np.array([m.cost for m in members.values()])
         stands = linked(shares, costs_at(problem, points, sigmas, 63), fraction=0.375)
         assert least[np.unique(stands)].min() == pytest.approx(least.min(), rel=1e-3)
         found.append((len(np.unique(stands)), np.median(least) / least.min()))
@@ -150,12 +150,12 @@ def test_a_search_among_many_goes_where_it_goes_alone():
     problem = Oscillation([], {"omega": OMEGA})
     starts = np.linspace(-1.0, 0.3, 7)[:, None]
     sigmas = problem.first_sigmas
-    members = search_many(Problems.of([problem]), LM, starts, sigmas=Problems.of([sigmas]), batch=3)
-    for start, member in zip(starts, members, strict=True):
+    members = search_many([(problem, sigmas)], LM, dict(enumerate(starts)), batch=3)
+    for start, member in zip(starts, members.values(), strict=True):
         alone = search(problem, LM, jnp.asarray(start), sigmas)
-        assert member.minimum.converged == alone.converged
-        assert [i.cost for i in member.minimum.history] == pytest.approx([i.cost for i in alone.history], rel=1e-6)
-        assert np.allclose(member.minimum.z, alone.z, atol=1e-9)
+        assert member.converged == alone.converged
+        assert [i.cost for i in member.history] == pytest.approx([i.cost for i in alone.history], rel=1e-6)
+        assert np.allclose(member.z, alone.z, atol=1e-9)
 
 
 def test_starting_points_fill_what_is_known_of_each_parameter():

@@ -14,7 +14,6 @@ from mpmjax.fitting._columns import (
 from mpmjax.fitting._experiment import AbstractObservation as AbstractObservation, Experiment as Experiment
 from mpmjax.fitting._field import Field as Field
 from mpmjax.fitting._fit import EnsembleFit as EnsembleFit, fit as fit, fit_ensemble as fit_ensemble
-from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt as LevenbergMarquardt
 from mpmjax.fitting._multistart import (
     LocalMinimum as LocalMinimum,
     MultistartFit as MultistartFit,
@@ -27,12 +26,7 @@ from mpmjax.fitting._observation import (
     Torque as Torque,
     Tracks as Tracks,
 )
-from mpmjax.fitting._optimiser import (
-    LBFGS as LBFGS,
-    AbstractOptimiser as AbstractOptimiser,
-    Adam as Adam,
-    Evaluation as Evaluation,
-)
+from mpmjax.fitting._optimiser import LBFGS as LBFGS, Adam as Adam, LevenbergMarquardt as LevenbergMarquardt
 from mpmjax.fitting._parameter import (
     AbstractParameter as AbstractParameter,
     AbstractPrior as AbstractPrior,
@@ -64,6 +58,7 @@ from mpmjax.fitting._result import (
     FitResult as FitResult,
     NoiseEstimate as NoiseEstimate,
 )
+from mpmjax.fitting._search import AbstractOptimiser as AbstractOptimiser, Evaluation as Evaluation
 from mpmjax.fitting._sequence import (
     RefinedFit as RefinedFit,
     Stage as Stage,

@@ -4,14 +4,13 @@ import abc
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
-from mpmjax.checks import canonical, checked, is_traced, require, require_fields, require_positive
+from mpmjax.checks import canonical, checked, require, require_fields, require_positive
 from mpmjax.simulation import Run, number_of_steps, simulate
-from mpmjax.state import Particles, Scene, prepare, velocity_gradient
+from mpmjax.state import Particles, Scene, prepare
 from mpmjax.stepping import AbstractIntegrator, Explicit
 
 Numbers = Float[np.ndarray, "..."] | Float[Array, "..."] | list | tuple | float | int
@@ -24,8 +23,7 @@ class AbstractObservation(eqx.Module):
     has seen all states (`predict`).
     """
 
-    data: eqx.AbstractVar[np.ndarray]
-    """The measured numbers, of any shape; NaN where nothing was measured."""
+    data: eqx.AbstractVar[np.ndarray]  # the measured numbers, of any shape; NaN where nothing was measured
     sigma: eqx.AbstractVar[Float[np.ndarray, "..."] | None]
     """Standard deviation of its noise, a number or an array that broadcasts against the data, in the data's unit; None
     to estimate it from the misfit."""
@@ -34,8 +32,7 @@ class AbstractObservation(eqx.Module):
     robust: eqx.AbstractVar[Scalar | None]
     """The misfit, in standard deviations, beyond which squares grow but linearly (pseudo-Huber), so that outliers count
     little; None for squares throughout."""
-    name: eqx.AbstractVar[str]
-    """Name in tables and pictures."""
+    name: eqx.AbstractVar[str]  # name in tables and pictures
 
     @abc.abstractmethod
     def observe(self, scene: Scene, particles: Particles) -> Any:
@@ -191,18 +188,8 @@ class Experiment(eqx.Module):
         self, observations: tuple[AbstractObservation, ...], t1: float | int | None = None
     ) -> "Experiment":
         """The experiment with other observations, and to another end."""
-        same: dict[str, Any] = {"dt": self.dt, "method": self.method, "name": self.name}
-        t1 = self.t1 if t1 is None else t1
-        return Experiment(self.scene, self.particles, t1=t1, observations=observations, **same)
-
-    def with_gradient_since(self, before: Particles) -> "Experiment":
-        """The experiment with the velocity gradient of the change of velocities that parameters made since `before`. A
-        gradient that they changed themselves stays."""
-        now = self.particles
-        if now.C is None or now.C is not before.C or now.v is before.v:
-            return self
-        change = velocity_gradient(self.scene, eqx.tree_at(lambda q: q.v, now, now.v - before.v))
-        return eqx.tree_at(lambda e: e.particles.C, self, now.C + change)
+        t1, same = self.t1 if t1 is None else t1, {"method": self.method, "name": self.name}
+        return Experiment(self.scene, self.particles, t1=t1, dt=self.dt, observations=observations, **same)
 
     def until(self, t1: float) -> "Experiment":
         """The experiment, ended at the first step from a time [s] on, with what was measured until then; itself
@@ -214,11 +201,6 @@ class Experiment(eqx.Module):
             return self
         return self.with_observations(kept, steps * self.dt)
 
-    @property
-    def observed_shape(self) -> Any:
-        """The shape of what its observations need of one state."""
-        return jax.eval_shape(eqx.Partial(_observe, self.observations), self.scene, self.particles)
-
     def run(self, *, adjoint: Any = None, throw: bool = True, checkpoint_bytes: int = 2**28) -> Run:
         """The simulation of it, with what its observations observe after each step (see `simulate`)."""
         return simulate(
@@ -227,7 +209,7 @@ class Experiment(eqx.Module):
             t1=self.t1,
             dt=self.dt,
             method=self.method,
-            observe=eqx.Partial(_observe, self.observations),
+            observe=eqx.Partial(observe_all, self.observations),
             adjoint=adjoint,
             checkpoint_bytes=checkpoint_bytes,
             throw=throw,
@@ -237,16 +219,8 @@ class Experiment(eqx.Module):
         """Predictions of a run of it by each observation, in the shape of its data."""
         return tuple(o.predict(seen, run) for o, seen in zip(self.observations, run.observed, strict=True))
 
-    def explain(self) -> None:
-        """Raise the error that says why what is observed is not finite: of the simulation, or of an observation that it
-        does not reach."""
-        assert not is_traced(self)
-        run = self.run()
-        for observation, seen in zip(self.observations, run.observed, strict=True):
-            observation.explain(seen, run)
 
-
-def _observe(observations: tuple[AbstractObservation, ...], scene: Scene, particles: Particles) -> tuple[Any, ...]:
+def observe_all(observations: tuple[AbstractObservation, ...], scene: Scene, particles: Particles) -> tuple[Any, ...]:
     """The parts of a state that all observations of an experiment need."""
     return tuple(observation.observe(scene, particles) for observation in observations)
 

@@ -1,9 +1,8 @@
 """Fits of parameters to what was observed: of one data set, or of each of many."""
 
 import os
-import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,24 +15,21 @@ from scipy.special import chdtrc
 from mpmjax._types import Scalar
 from mpmjax.checks import checked, require, warn
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._levenberg_marquardt import LevenbergMarquardt
-from mpmjax.fitting._log import FitLog, Progress, opened_log
-from mpmjax.fitting._optimiser import LBFGS, AbstractOptimiser, Evaluation
+from mpmjax.fitting._log import recorded
+from mpmjax.fitting._optimiser import LBFGS, LevenbergMarquardt
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import ROW_COST, Coordinates, FitProblem, Sigmas
-from mpmjax.fitting._result import FitResult, SettledNoise, fit_result, settle_noise, table
+from mpmjax.fitting._result import FitResult, Noise, fit_result, settle_noise, table
 from mpmjax.fitting._search import (
+    NO_DERIVATIVE,
+    AbstractOptimiser,
+    Evaluation,
     Iteration,
-    Minimum,
-    NoDerivativeError,
-    Problems,
-    SearchState,
+    Search,
     batch_size,
     counted,
-    search,
     search_many,
 )
-from mpmjax.io import reporting
 
 
 @checked
@@ -61,30 +57,29 @@ def fit(
         })
         print(result)
 
-    The least sum of squares of (simulated − measured)/σ over all observations of all experiments is searched: with few
-    parameters, or few measured numbers, by the Levenberg-Marquardt method (optimistix), with many by L-BFGS (optax),
-    with derivatives through every step and every implicit solve. A step at which a simulation fails is not taken.
-    Where an observation gives no σ, it is estimated: as √(Σ r²/(m − n)) of one observation, and of several so that each
+    The least sum of squares of (simulated − measured)/σ over all observations of all experiments is searched, with
+    derivatives through every step and every implicit solve. A step at which a simulation fails is not taken. Where an
+    observation gives no σ, it is estimated: as √(Σ r²/(m − n)) of one observation, and of several so that each
     explains its own misfit, in rounds.
 
     Errors are those of the Gauss-Newton Hessian (JᵀJ)⁻¹: what the noise of the data, independent and normal, does to
     the parameters. They say nothing of what the law or the discretisation gets wrong, which often is more: fit on two
     spacings and compare.
 
+    Ctrl-C ends a fit after the iteration in progress, and it returns the best that it has, not converged.
+
     Args:
         experiments: one or several, which share the parameters.
         parameters: what is fitted, by name.
         report: what else to report with its error, by name: functions of an experiment that return one number.
         level: of the intervals [-].
-        optimiser: the method of the search. Default: `LevenbergMarquardt` where its Jacobian is cheap, else `LBFGS`.
+        optimiser: the method of the search. Default: `LevenbergMarquardt` where its Jacobian is cheap, with few
+            parameters or few measured numbers, else `LBFGS`.
         memory: for what reverse mode stores, and for the tangents of forward mode that are made at once [B].
-        progress: called with a line before the first iteration, which is compiled, and one after each, such as `print`:
-            misfit, gradient, parameters, seconds, and about how many are left (see docs/fitting.md).
-        log: an HDF5 file that is to hold each iteration (its layout: docs/fitting.md). Whatever ends the fit, the file
-            is whole and lacks at most the iteration in progress.
+        progress: called with a line before the first iteration, which is compiled, and one after each, such as `print`.
+        log: an HDF5 file that is to hold each iteration (docs/fitting.md). Whatever ends the fit, the file is whole and
+            lacks at most the iteration in progress.
         resume: continue the fit of the log, bit for bit. Only the optimiser's `max_steps` may differ.
-
-    Ctrl-C ends a fit after the iteration in progress, and it returns the best that it has, not converged.
 
     Raises:
         ValueError: a parameter that is no number of the experiment, lies outside its bounds or does not influence the
@@ -102,18 +97,32 @@ def fit(
         require(name not in problem.labels, f"What is reported must not have a parameter's name, got {name!r}.")
         shape = jnp.shape(of(problem.experiments[0]))
         require(shape == (), f"What is reported as {name!r} must be one number, got shape {shape}.")
-    with ExitStack() as stack:
-        written = None
-        if log is not None:
-            written = stack.enter_context(opened_log(Path(log), problem, optimiser, resume=resume))
-            stack.enter_context(reporting(written.contents))
-        minimum, settled = _searched(problem, optimiser, progress, written)
-    result = fit_result(problem, optimiser, minimum, settled, report, level)
-    if not minimum.converged:
-        stopped = "was interrupted" if minimum.interrupted else "did not converge"
-        advice = "" if minimum.interrupted else f" {_ADVICE}"
+    with recorded(problem, optimiser, progress, None if log is None else Path(log), resume=resume) as (past, record):
+        first, earlier, sigmas, state = (0, (), problem.first_sigmas, None) if past is None else past
+
+        def minimise(number: int, starts: dict[int, Coordinates], noise: list[Sigmas]) -> dict[int, Search]:
+            return search_many(
+                [(problem, noise[0])],
+                optimiser,
+                starts,
+                state=state if number == first else None,
+                begun=lambda _, seen: require_influence(problem, noise[0], seen),
+                report=partial(record, noise[0]),
+            )
+
+        ((end, settled, changing),) = _in_rounds([problem], [sigmas], minimise, first)
+    if settled is None:
+        if end.interrupted:
+            raise KeyboardInterrupt
+        require_derivative(end)
+        problem.explain(jnp.zeros(problem.size, problem.dtype))
+    end = end._replace(history=(*earlier, *end.history))
+    result = fit_result(problem, optimiser, end, settled, report, level)
+    if not result.converged:
+        stopped = "was interrupted" if result.interrupted else "did not converge"
+        advice = "" if result.interrupted else f" {_ADVICE}"
         warn(f"The fit {stopped} after {len(result.history)} iterations: its errors hold only at a minimum.{advice}")
-    elif settled.changing:
+    elif changing:
         warn(f"The noise of the observations did not settle in {MOST_ROUNDS} rounds: give the sigma of one of them.")
     for text in result.warnings:
         warn(text)
@@ -137,72 +146,37 @@ def checked_level(level: Scalar) -> float:
 def _in_rounds(
     problems: list[FitProblem],
     sigmas: list[Sigmas],
-    minimise: Callable[[int, list[int], list[Coordinates], list[Sigmas]], Sequence[Minimum | str]],
+    minimise: Callable[[int, dict[int, Coordinates], list[Sigmas]], dict[int, Search]],
     rounds: int = 0,
-) -> list[tuple[Minimum, SettledNoise] | str]:
+) -> list[tuple[Search, Noise | None, bool]]:
     """Searches of each problem, again and again until the noise that it leaves is the noise that it was made with: the
-    last minimum, with all iterations, and the noise; or why the search failed.
+    last one, with all iterations; the noise, None where it failed; and whether that still changes the minimum.
 
-    `minimise` makes searches, given the number of the round, those of the problems, their starts and their noise.
+    `minimise` makes searches, given the number of the round, the starts by the numbers of problems, and all noise.
     """
-    starts = [jnp.zeros(p.size, p.dtype) for p in problems]
+    starts = {k: jnp.zeros(p.size, p.dtype) for k, p in enumerate(problems)}
     histories: list[tuple[Iteration, ...]] = [()] * len(problems)
-    outcomes: list[tuple[Minimum, SettledNoise] | str] = [""] * len(problems)
-    left = list(range(len(problems)))
-    while left:
-        ends = minimise(rounds, left, [starts[k] for k in left], [sigmas[k] for k in left])
-        rounds, searched, left = rounds + 1, left, []
-        for k, end in zip(searched, ends, strict=True):
-            if isinstance(end, str):
-                outcomes[k] = end
-                continue
-            settled = settle_noise(problems[k], end, sigmas[k])
-            starts[k], sigmas[k], histories[k] = end.z, settled.sigmas, histories[k] + end.history
-            outcomes[k] = end._replace(history=histories[k]), settled
-            if settled.changing and end.converged and rounds < MOST_ROUNDS:
-                left.append(k)
-    return outcomes
+    outcomes: dict[int, tuple[Search, Noise | None, bool]] = {}
+    while starts:
+        ends = minimise(rounds, starts, list(sigmas))
+        rounds, starts = rounds + 1, {}
+        for k, end in ends.items():
+            histories[k] += end.history
+            settled, changing = (None, False) if end.failure else settle_noise(problems[k], end, sigmas[k])
+            outcomes[k] = end._replace(history=histories[k]), settled, changing
+            if settled is not None and changing and end.converged and rounds < MOST_ROUNDS:
+                starts[k], sigmas[k] = end.z, tuple(sigma for sigma, *_ in settled)
+    return [outcomes[k] for k in range(len(problems))]
 
 
-def _searched(
-    problem: FitProblem, optimiser: AbstractOptimiser, progress: Callable[[str], None] | None, log: FitLog | None
-) -> tuple[Minimum, SettledNoise]:
-    """The minimum and the noise, in rounds. A log is continued, and gets each iteration."""
-    end = None if log is None else log.end
-    rounds, earlier, sigmas, state, seconds_before = (0, (), problem.first_sigmas, None, 0.0) if end is None else end
-    begun, done = time.perf_counter() - seconds_before, 0 if state is None else len(earlier) + len(state.history)
-    lines = None if progress is None else Progress(problem, optimiser, progress, done)
-
-    def minimise(number: int, _: Any, starts: list[Coordinates], noise: list[Sigmas]) -> list[Minimum]:
-        (z,), (sigmas,) = starts, noise
-
-        def report(state: SearchState) -> None:
-            seconds = time.perf_counter() - begun
-            if log is not None:
-                log.append(sigmas, state, seconds)
-            if lines is not None:
-                lines(state, seconds)
-
-        try:
-            minimum = search(
-                problem,
-                optimiser,
-                z,
-                sigmas,
-                state=state if number == rounds else None,
-                report=report,
-                begun=lambda seen: require_influence(problem, sigmas, seen),
-            )
-        except NoDerivativeError:
-            raise RuntimeError(_NO_DERIVATIVE) from None
-        if not np.isfinite(minimum.history[0].cost):
-            problem.explain(z)
-        return [minimum]
-
-    (outcome,) = _in_rounds([problem], [sigmas], minimise, rounds)
-    assert not isinstance(outcome, str)
-    minimum, settled = outcome
-    return minimum._replace(history=(*earlier, *minimum.history)), settled
+def require_derivative(end: Search) -> None:
+    """Raise a `RuntimeError` if a search failed for want of a derivative."""
+    if end.failure == NO_DERIVATIVE:
+        raise RuntimeError(
+            "The fit has no derivative. Either the tangent or adjoint solve of a step did not converge: raise the "
+            "max_steps of the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner(). Or a "
+            "law or an observation cannot be differentiated where the run takes it."
+        )
 
 
 def require_influence(problem: FitProblem, sigmas: Sigmas, seen: Evaluation) -> None:
@@ -238,10 +212,8 @@ class EnsembleFit(eqx.Module):
     `print(result)` shows a table; `result.values["E"]` are the estimates of a parameter; `result.fits[3]` is one fit.
     """
 
-    fits: tuple[FitResult | None, ...]
-    """The fit of each data set; None where it failed."""
-    failures: dict[int, str]
-    """Why fits failed, by the number of the data set."""
+    fits: tuple[FitResult | None, ...]  # the fit of each data set; None where it failed
+    failures: dict[int, str]  # why fits failed, by the number of the data set
 
     @property
     def values(self) -> dict[str, np.ndarray]:
@@ -317,16 +289,15 @@ def fit_ensemble(
         print(result)  # mean and spread of E, and whether the specimens differ by more than their errors
         result.values["E"]  # shape (number of specimens,)
 
-    Each gets what `fit` says of it: the same estimates and errors. One that fails ends alone.
+    Each gets the estimates and errors of `fit`. One that fails ends alone.
 
     Args:
         experiments: the data sets: an experiment each, or several experiments each that share the parameters. They may
             differ in every number (data, noise, places, velocities, materials), and in no shape, choice or function:
             give a marker that was not seen as NaN.
-        parameters: see `fit`.
         batch: how many searches run together, see `fit_multistart`.
-        report, level, optimiser: see `fit`.
         progress: called with a line, such as `print`, as searches end.
+        parameters, report, level, optimiser: see `fit`.
 
     Raises:
         ValueError: as `fit`; data sets of different shapes; no fit that did not fail.
@@ -341,20 +312,18 @@ def fit_ensemble(
         require(usable, f"Data set {k} must be an Experiment, or a tuple of some, got {type(experiments[k]).__name__}.")
     problems = [FitProblem(each, parameters) for each in sets]
     optimiser = chosen_optimiser(problems[0]) if optimiser is None else optimiser
-    stacked, size = Problems.of(problems), batch_size(problems[0], batch, len(problems))
+    size = batch_size(problems[0], batch, len(problems))
 
-    def minimise(round_: int, numbers: list[int], starts: list[Any], sigmas: list[Any]) -> list[Minimum | str]:
-        these, noise = stacked.only(numbers), Problems.of(sigmas)
-        told = counted(progress, f"round {round_ + 1}: {{}} of {{}} fits are done")
-        members = search_many(these, optimiser, np.array(starts, float), sigmas=noise, batch=size, progress=told)
-        return [m.failure if m.minimum is None else m.minimum for m in members]
+    def minimise(number: int, starts: dict[int, Coordinates], sigmas: list[Sigmas]) -> dict[int, Search]:
+        told = counted(progress, f"round {number + 1}: {{}} of {{}} fits are done")
+        return search_many(list(zip(problems, sigmas, strict=True)), optimiser, starts, batch=size, progress=told)
 
     outcomes = _in_rounds(problems, [p.first_sigmas for p in problems], minimise)
     fits = [
-        None if isinstance(end, str) else fit_result(problem, optimiser, *end, dict(report or {}), level)
-        for problem, end in zip(problems, outcomes, strict=True)
+        None if settled is None else fit_result(problem, optimiser, end, settled, dict(report or {}), level)
+        for problem, (end, settled, _) in zip(problems, outcomes, strict=True)
     ]
-    failures = {k: end for k, end in enumerate(outcomes) if isinstance(end, str)}
+    failures = {k: end.failure for k, (end, *_) in enumerate(outcomes) if end.failure}
     if len(failures) == len(fits):
         z = jnp.zeros(problems[0].size, problems[0].dtype)
         problems[0].explain(z, failure=f"None of {len(fits)} fits succeeded: {failures[0]}.")
@@ -375,9 +344,4 @@ _ROUNDINGS = 10  # derivatives by a coordinate below so many roundings of the da
 _ADVICE = (
     "Raise max_steps, start closer, give a rtol that the precision can reach, or see whether simulations fail or the "
     "misfit has a kink where it ended."
-)
-_NO_DERIVATIVE = (
-    "The fit has no derivative. Either the tangent or adjoint solve of a step did not converge: raise the max_steps of "
-    "the method's adjoint_solver, or leave its preconditioner at DiagonalPreconditioner(). Or a law or an observation "
-    "cannot be differentiated where the run takes it."
 )

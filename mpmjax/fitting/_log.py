@@ -1,17 +1,8 @@
 """The record of a fit while it runs: lines of progress, and a log from which it continues bit for bit.
 
-The log is an HDF5 file:
-
-    /iterations     a table with one row an iteration: round (of the noise's estimates), number (in the round), cost
-                    ½ Σ r², gradient (its largest component), accepted, seconds (since the fit began)
-    /coordinates    of the search [-], shape (iterations, n)
-    /values         of the parameters, shape (iterations, n); the attribute `labels` names the columns
-    /noise/k        the σ of observation k in each round, shape (rounds, ...); the attribute `name` is its name
-    /problem        JSON: what is fitted, as names and texts, by which another fit is told from this one
-    /resume         what the next iteration needs: the optimiser's state, and its evaluation of the place where it is
-
-The file is replaced as a whole after each iteration (see `mpmjax.io.ReplacedFile`): it holds whole iterations only,
-however the process ends. Its last four bytes are CRC-32 of all others.
+The log is an HDF5 file, whose layout is in docs/fitting.md. It is replaced as a whole after each iteration (see
+`mpmjax.io.ReplacedFile`): it holds whole iterations only, however the process ends. Its last four bytes are CRC-32 of
+all others.
 """
 
 import enum
@@ -22,13 +13,13 @@ import json
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import fields, is_dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from types import CodeType
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import h5py
@@ -38,11 +29,10 @@ import numpy as np
 
 from mpmjax._types import Array
 from mpmjax.checks import require
-from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import SHOWN, FitProblem, Sigmas
-from mpmjax.fitting._search import Iteration, SearchState, begin
-from mpmjax.io import ReplacedFile, check_hdf5, reason
+from mpmjax.fitting._search import AbstractOptimiser, Evaluation, Iteration, Search, begin
+from mpmjax.io import ReplacedFile, check_hdf5, reason, reporting
 
 _FORMAT = 2
 _ROW = [("round", "i8"), ("number", "i8"), ("cost", "f8"), ("gradient", "f8"), ("accepted", "?"), ("seconds", "f8")]
@@ -51,109 +41,91 @@ _MOST = 8  # numbers of an array that are written out
 _FREE = ("optimiser.max_steps",)  # choices that may differ in a fit that is continued: it may go on for longer
 
 
-class _Round(NamedTuple):
-    """A search with one noise."""
-
-    sigmas: Sigmas
-    search: SearchState
-    seconds: tuple[float, ...]  # when each iteration was done, since the fit began [s]
-
-
-class FitLog:
-    """The iterations of a fit in a file. Make it by `opened_log`."""
-
-    def __init__(self, path: Path, file: ReplacedFile, problem: FitProblem, text: dict[str, str], rounds: list[_Round]):
-        self._path, self._file, self._problem, self._text, self._rounds = path, file, problem, text, rounds
-        self._values = [self._numbers(i) for r in rounds for i in r.search.history]
-
-    @property
-    def end(self) -> tuple[int, tuple[Iteration, ...], Sigmas, SearchState, float] | None:
-        """Number of rounds before the last one, and their iterations; noise of the last one, its search, and when its
-        last iteration was done, since the fit began [s]. None if there is no iteration."""
-        if not self._rounds:
-            return None
-        *done, last = self._rounds
-        return len(done), tuple(i for r in done for i in r.search.history), last.sigmas, last.search, last.seconds[-1]
-
-    def append(self, sigmas: Sigmas, state: SearchState, seconds: float) -> None:
-        """Write an iteration: the noise of its round, the search after it, and the seconds since the fit began."""
-        *earlier, last = state.history
-        past = self._rounds.pop().seconds if earlier else ()
-        self._rounds.append(_Round(sigmas, state, (*past, seconds)))
-        self._values.append(self._numbers(last))
-        self.write()
-
-    def write(self) -> None:
-        """Write the file; if the disk refuses, the log is what it was."""
-        whole = io.BytesIO()
-        with h5py.File(whole, "w", libver=("v110", "v110")) as file:
-            self._fill(file)
-        data = whole.getvalue()
-        try:
-            self._file.write(data + zlib.crc32(data).to_bytes(4))
-        except OSError as error:
-            raise OSError(f"{error} If it has no room, make room, then resume the fit.") from None
-
-    def contents(self) -> str:
-        """The number of iterations in the log, as a sentence."""
-        count = len(self._values)
-        return f"{self._path} holds {count} iteration{'s' * (count != 1)}. Resume it to continue."
-
-    def _numbers(self, iteration: Iteration) -> np.ndarray:
-        return np.asarray(self._problem.numbers(jnp.asarray(iteration.z, self._problem.dtype)), float)
-
-    def _fill(self, file: Any) -> None:
-        rounds, n = self._rounds, self._problem.size
-
-        def put(name: str, data: np.ndarray) -> None:
-            """A dataset, with checksums where it has data."""
-            checked = {"chunks": data.shape, "fletcher32": True} if data.ndim and data.size else {}
-            file.create_dataset(name, data=data, **checked)
-
-        for name, text in {"kind": "mpmjax fit log", "version": version("mpmjax")}.items():
-            file.attrs[name] = np.bytes_(text)
-        file.attrs["format"] = np.int64(_FORMAT)
-        put("problem", np.frombuffer(json.dumps(self._text).encode(), np.uint8))
-        rows = [
-            (number, i.number, i.cost, i.gradient, i.accepted, seconds)
-            for number, r in enumerate(rounds)
-            for i, seconds in zip(r.search.history, r.seconds, strict=True)
-        ]
-        put("iterations", np.array(rows, _ROW))
-        put("coordinates", np.array([i.z for r in rounds for i in r.search.history]).reshape(-1, n))
-        put("values", np.array(self._values).reshape(-1, n))
-        file["values"].attrs["labels"] = json.dumps(self._problem.labels)
-        for k, observation in enumerate(self._problem.observations):
-            sigmas = [np.asarray(r.sigmas[k]) for r in rounds]
-            shape = sigmas[0].shape if rounds else ()
-            put(f"noise/{k}", np.array(sigmas, None if rounds else float).reshape(-1, *shape))
-            file[f"noise/{k}"].attrs["name"] = observation.name
-        if rounds:
-            _, inner, seen, _ = rounds[-1].search
-            for k, leaf in enumerate(jax.tree.leaves(eqx.filter(inner, eqx.is_array))):
-                put(f"resume/state/{k}", np.asarray(leaf))
-            for name, leaf in seen._asdict().items():
-                if leaf is not None:
-                    put(f"resume/seen/{name}", np.asarray(leaf))
+Past = tuple[int, tuple[Iteration, ...], Sigmas, Search]
+"""Number of rounds before the last one, and their iterations; noise of the last one, and its search."""
 
 
 @contextmanager
-def opened_log(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, *, resume: bool) -> Iterator[FitLog]:
-    """A log that is begun or, with `resume`, read and continued."""
-    text = described(problem, optimiser)
-    if not resume:
-        with ReplacedFile(path, new=True) as file:
-            log = FitLog(path, file, problem, text, [])
-            log.write()
-            yield log
-        return
-    check_hdf5(path)
-    with ReplacedFile(path, new=False) as file:
-        yield FitLog(path, file, problem, text, _read(path, problem, optimiser, text))
+def recorded(
+    problem: FitProblem,
+    optimiser: AbstractOptimiser,
+    progress: Callable[[str], None] | None,
+    path: Path | None,
+    *,
+    resume: bool,
+) -> Iterator[tuple[Past | None, Callable[[Sigmas, Search], None]]]:
+    """The past of a fit that a log holds, if it is to `resume`, and a function that records the search after each
+    iteration, with the noise of its round: in the log at this path, by lines of progress, or both."""
+    rows, places, values, noise, past = [], [], [], [], None
+    with ExitStack() as stack:
+        if path is not None:
+            text = described(problem, optimiser)
+            if resume:
+                check_hdf5(path)
+            file = stack.enter_context(ReplacedFile(path, new=not resume))
+            if resume:
+                rows, places, values, noise, past = _read(path, problem, optimiser, text)
+
+            def write(last: Search | None) -> None:
+                """Write the file; if the disk refuses, the log is what it was."""
+                whole = io.BytesIO()
+                with h5py.File(whole, "w", libver=("v110", "v110")) as contents:
+                    attributes = {"kind": np.bytes_("mpmjax fit log"), "version": np.bytes_(version("mpmjax"))}
+                    contents.attrs.update(attributes, format=np.int64(_FORMAT))
+                    arrays = {
+                        "problem": np.frombuffer(json.dumps(text).encode(), np.uint8),
+                        "iterations": np.array(rows, _ROW),
+                        "coordinates": np.array(places).reshape(-1, problem.size),
+                        "values": np.array(values).reshape(-1, problem.size),
+                    }
+                    for k in range(len(problem.observations)):
+                        each = [np.asarray(sigmas[k]) for sigmas in noise]
+                        arrays[f"noise/{k}"] = np.array(each, None if noise else float)
+                    if last is not None:
+                        state = jax.tree.leaves(eqx.filter(last.inner, eqx.is_array))
+                        arrays |= {f"resume/state/{k}": np.asarray(leaf) for k, leaf in enumerate(state)}
+                        seen = {name: a for name, a in last.seen._asdict().items() if a is not None}
+                        arrays |= {f"resume/seen/{name}": np.asarray(a) for name, a in seen.items()}
+                    for name, array in arrays.items():  # with checksums where there are data
+                        checked = {"chunks": array.shape, "fletcher32": True} if array.ndim and array.size else {}
+                        contents.create_dataset(name, data=array, **checked)
+                    contents["values"].attrs["labels"] = json.dumps(problem.labels)
+                    for k, observation in enumerate(problem.observations):
+                        contents[f"noise/{k}"].attrs["name"] = observation.name
+                data = whole.getvalue()
+                try:
+                    file.write(data + zlib.crc32(data).to_bytes(4))
+                except OSError as error:
+                    raise OSError(f"{error} If it has no room, make room, then resume the fit.") from None
+
+            def contents() -> str:
+                count = f"{len(rows)} iteration{'s' * (len(rows) != 1)}"
+                return f"{path} holds {count}. Resume it to continue."
+
+            if not resume:
+                write(None)
+            stack.enter_context(reporting(contents))
+        begun = time.perf_counter() - (rows[-1][-1] if rows else 0.0)
+        say = None if progress is None else _lines(problem, optimiser, progress, len(rows))
+
+        def record(sigmas: Sigmas, search: Search) -> None:
+            iteration, seconds = search.history[-1], time.perf_counter() - begun
+            if path is not None:
+                if iteration.number == 0:
+                    noise.append(sigmas)
+                rows.append((len(noise) - 1, *iteration[:4], seconds))
+                places.append(iteration.z)
+                values.append(np.asarray(problem.numbers(jnp.asarray(iteration.z, problem.dtype)), float))
+                write(search)
+            if say is not None:
+                say(search, seconds)
+
+        yield past, record
 
 
-def _read(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, text: dict[str, str]) -> list[_Round]:
-    """The rounds in a log, which must be whole and of the same fit."""
+def _read(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, text: dict[str, str]) -> tuple[Any, ...]:
+    """The iterations in a log as rows, coordinates and values, the noise of its rounds, and the past of the fit. It
+    must be whole and of the same fit."""
     damaged = f"{path} is damaged ({{}}): begin the fit anew with another log."
     try:
         data = path.read_bytes()
@@ -178,33 +150,24 @@ def _read(path: Path, problem: FitProblem, optimiser: AbstractOptimiser, text: d
             "a new log.",
         )
     try:
-        return _rounds(arrays, problem, optimiser)
+        rows: list[Any] = arrays["iterations"].tolist()
+        places, past = list(arrays["coordinates"]), None
+        rounds, observations = rows[-1][0] + 1 if rows else 0, range(len(problem.observations))
+        noise = [tuple(jnp.asarray(arrays[f"noise/{k}"][n]) for k in observations) for n in range(rounds)]
+        if rows:
+            each: Any = [(n, Iteration(*i, z)) for (n, *i, _), z in zip(rows, places, strict=True)]  # pyright: ignore
+            earlier, history = (tuple(i for n, i in each if (n == rounds - 1) is last) for last in (False, True))
+            names = [name for name in Evaluation._fields if f"resume/seen/{name}" in arrays]
+            seen = Evaluation(**{name: jnp.asarray(arrays[f"resume/seen/{name}"]) for name in names})
+            like = eqx.filter_eval_shape(begin, problem, optimiser, jnp.zeros(problem.size), noise[-1])
+            shapes, rest = eqx.partition(like, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
+            leaves, tree = jax.tree.flatten(shapes)
+            state = [_like(leaf, arrays[f"resume/state/{k}"]) for k, leaf in enumerate(leaves)]
+            inner = eqx.combine(jax.tree.unflatten(tree, state), rest)
+            past = rounds - 1, earlier, noise[-1], Search(jnp.asarray(places[-1]), inner, seen, history)
+        return rows, places, list(arrays["values"]), noise, past
     except (KeyError, IndexError, TypeError) as error:
         raise ValueError(damaged.format(reason(error))) from None
-
-
-def _rounds(arrays: dict[str, np.ndarray], problem: FitProblem, optimiser: AbstractOptimiser) -> list[_Round]:
-    rows: Any = arrays["iterations"]
-    places = arrays["coordinates"]
-    rounds = []
-    for number in range(int(rows["round"][-1]) + 1 if len(rows) else 0):
-        at = np.flatnonzero(rows["round"] == number)
-        numbers = rows[["number", "cost", "gradient", "accepted"]][at]
-        history = tuple(Iteration(*row.item(), z) for row, z in zip(numbers, places[at], strict=True))  # pyright: ignore[reportCallIssue]
-        sigmas = tuple(jnp.asarray(arrays[f"noise/{k}"][number]) for k in range(len(problem.observations)))
-        names = [name for name in Evaluation._fields if f"resume/seen/{name}" in arrays]
-        seen = Evaluation(**{name: jnp.asarray(arrays[f"resume/seen/{name}"]) for name in names})
-        state = SearchState(jnp.asarray(places[at[-1]]), None, seen, history)
-        rounds.append(_Round(sigmas, state, tuple(rows["seconds"][at].tolist())))
-    if rounds:
-        last = rounds[-1]
-        like = eqx.filter_eval_shape(begin, problem, optimiser, jnp.zeros(problem.size), last.sigmas)
-        shapes, rest = eqx.partition(like, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
-        leaves, tree = jax.tree.flatten(shapes)
-        read = [_like(leaf, arrays[f"resume/state/{k}"]) for k, leaf in enumerate(leaves)]
-        inner = eqx.combine(jax.tree.unflatten(tree, read), rest)
-        rounds[-1] = last._replace(search=last.search._replace(inner=inner))
-    return rounds
 
 
 def _like(leaf: Any, data: np.ndarray) -> Array:
@@ -295,47 +258,43 @@ def _digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:12]
 
 
-class Progress:
-    """A line an iteration: misfit Σ r², gradient, parameters, seconds, and the time that is left.
+def _lines(
+    problem: FitProblem, optimiser: AbstractOptimiser, say: Callable[[str], None], done: int
+) -> Callable[[Search, float], None]:
+    """A line an iteration: misfit Σ r², gradient, parameters, seconds, and the time that is left. The first one says
+    that an iteration begins, which is compiled before; a log may hold iterations that are done.
 
     The time left is that of the present search. It is the usual time of an iteration times how many are left: about so
     many as the optimiser's distance from converged needs to fall to one at the rate of the last three iterations, where
-    it is known and falls; else at most those up to `max_steps`.
+    it is known and falls; else at most those up to `max_steps`. While only the iteration that was compiled is timed,
+    and at the end, nothing is said of it.
     """
+    durations: list[float] = []
+    distances: list[float] = []
+    last = time.perf_counter()
+    labels = ", ".join(problem.labels[:SHOWN]) + (", …" if problem.size > SHOWN else "")
+    after = f" after {done} iterations of the log" if done else ""
+    count = f"{problem.size} number{'s' * (problem.size > 1)}"
+    say(f"compiling the fit of {count} ({labels}) to {problem.points} that were measured{after}")
 
-    def __init__(self, problem: FitProblem, optimiser: AbstractOptimiser, say: Callable[[str], None], done: int):
-        """Say that the first iteration begins, which is compiled before; a log may hold iterations that are done."""
-        self._problem, self._optimiser, self._say = problem, optimiser, say
-        self._durations: list[float] = []
-        self._distances: list[float] = []
-        self._last = time.perf_counter()
-        named = ", ".join(problem.labels[:SHOWN]) + (", …" if problem.size > SHOWN else "")
-        after = f" after {done} iterations of the log" if done else ""
-        count = f"{problem.size} number{'s' * (problem.size > 1)}"
-        say(f"compiling the fit of {count} ({named}) to {problem.points} that were measured{after}")
-
-    def __call__(self, state: SearchState, seconds: float) -> None:
-        """Say where the search stands after an iteration, and so many seconds since the fit began."""
-        iteration, now = state.history[-1], time.perf_counter()
+    def line(search: Search, seconds: float) -> None:
+        nonlocal last
+        iteration, now = search.history[-1], time.perf_counter()
         if iteration.number == 0:
-            self._distances = []
-        self._durations.append(now - self._last)
-        self._distances.append(self._optimiser.distance(state.inner, state.seen))
-        self._last = now
-        self._say(
+            distances.clear()
+        durations.append(now - last)
+        distances.append(optimiser.distance(search.inner, search.seen))
+        last, most, left = now, optimiser.max_steps - len(search.history), ""
+        if len(durations) > 1 and most > 0 and not distances[-1] <= 1:
+            pace, steps = float(np.median(durations[1:])), iterations_left(distances)
+            falls = steps is not None and steps <= most
+            left = f", {'about' if falls else 'at most'} {_clock(pace * min(steps or most, most))} left"
+        say(
             f"{iteration.number:4d}  misfit {2 * iteration.cost:10.4g}  gradient {iteration.gradient:8.2g}  "
-            f"{self._problem.shown(iteration.z)}  {_clock(seconds)}{self._left(len(state.history))}"
+            f"{problem.shown(iteration.z)}  {_clock(seconds)}{left}"
         )
 
-    def _left(self, done: int) -> str:
-        """The time left, in words; nothing while only the iteration that was compiled is timed, and at the end."""
-        most = self._optimiser.max_steps - done
-        if len(self._durations) < 2 or most == 0 or self._distances[-1] <= 1:
-            return ""
-        pace, steps = float(np.median(self._durations[1:])), iterations_left(self._distances)
-        if steps is None or steps > most:
-            return f", at most {_clock(pace * most)} left"
-        return f", about {_clock(pace * steps)} left"
+    return line
 
 
 def iterations_left(distances: list[float]) -> int | None:

@@ -16,49 +16,35 @@ from mpmjax._types import Array, Float, Int, Scalar
 from mpmjax.checks import checked, require, require_between, require_finite, require_whole, warn
 from mpmjax.fitting._experiment import Experiment
 from mpmjax.fitting._fit import chosen_optimiser, fit, require_influence
-from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
 from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, restarted, table_of_minima
-from mpmjax.fitting._search import Member, Minimum, Problems, batch_size, counted, search_many
+from mpmjax.fitting._search import AbstractOptimiser, Evaluation, Search, batch_size, counted, search_many
 
 Ranges = Mapping[str, tuple[float, float]]  # lowest and highest value to start from, by the name of a parameter
-Ends = list[tuple[Minimum, list[int]]]  # minima, with the numbers of the points that led there
+Ends = list[tuple[Search, list[int]]]  # minima, with the numbers of the points that led there
 
 
 class LocalMinimum(NamedTuple):
     """A minimum at which searches ended."""
 
-    values: dict[str, np.ndarray]
-    """The value of each parameter, in its shape."""
-    misfit: float
-    """Root mean square of the residuals, in units of σ, or of the size of the data where σ is not given."""
-    searches: int
-    """How many searches ended there."""
-    members: tuple[int, ...]
-    """The numbers, from 0, of the points that these searches stand for; the first guess is 0."""
+    values: dict[str, np.ndarray]  # the value of each parameter, in its shape
+    misfit: float  # root mean square of the residuals, in units of σ, or of the size of the data where σ is not given
+    searches: int  # how many searches ended there
+    members: tuple[int, ...]  # the numbers, from 0, of the points that these searches stand for; the first guess is 0
 
 
 class MultistartFit(AbstractFit):
-    """The best of many fits, and the other minima.
+    """The best of many fits, and the other minima; `result["E"]` is the estimate of a parameter by the best."""
 
-    `print(result)` shows a table; `result["E"]` is the estimate of a parameter by the best.
-    """
-
-    best: FitResult
-    """The fit from the best minimum, with its errors."""
-    minima: tuple[LocalMinimum, ...]
-    """The distinct minima, the best first."""
-    starts: dict[str, np.ndarray]
-    """The points: the values of each parameter, shape (k, ...)."""
-    searched: tuple[int, ...]
-    """The numbers of the points from which searches started."""
-    failures: dict[int, str]
-    """Why the simulation at a point, or the search from it, failed, by the number of the point."""
+    best: FitResult  # the fit from the best minimum, with its errors
+    minima: tuple[LocalMinimum, ...]  # the distinct minima, the best first
+    starts: dict[str, np.ndarray]  # the points: the values of each parameter, shape (k, ...)
+    searched: tuple[int, ...]  # the numbers of the points from which searches started
+    failures: dict[int, str]  # why the simulation at a point, or the search from it, failed, by the number of the point
     unfinished: tuple[int, ...]
     """The numbers of the points from which no search came to a minimum within the optimiser's steps."""
-    iterations: int
-    """How many iterations all searches took."""
+    iterations: int  # how many iterations all searches took
 
     @property
     def all(self) -> tuple[Estimate, ...]:
@@ -106,36 +92,32 @@ def fit_multistart(
         result = mpm.fitting.fit_multistart(pull, {"E": ...}, starts=64, ranges={"E": (1e4, 1e7)})
         print(result)
 
-    The points are the first guess and scrambled Sobol points over the ranges; of a parameter without one, over its
-    prior, between its bounds, from a tenth to ten times the first guess of a `Positive`, and one coordinate to each
-    side of an `Unbounded` one. The simulation runs once at each of them, without derivatives. Searches start from the
-    first guess, from a fraction of the points, the best ones, and from each that has no better one within the critical
-    distance of multi-level single linkage (A. H. G. Rinnooy Kan, G. T. Timmer, Mathematical Programming 39 (1987)
-    57-78). They stand for the others, each of which is linked to the nearest better one. Where a search comes to no
-    minimum, the points that it stood for are linked anew, without it.
+    The points are the first guess and scrambled Sobol points (see `ranges`). The simulation runs once at each of them,
+    without derivatives. Searches start from the first guess, from a fraction of the points, the best ones, and from
+    each that has no better one within the critical distance of multi-level single linkage (A. H. G. Rinnooy Kan, G. T.
+    Timmer, Mathematical Programming 39 (1987) 57-78). They stand for the others, each of which is linked to the nearest
+    better one. Where a search comes to no minimum, the points that it stood for are linked anew, without it.
 
-    Searches run together, `batch` in one compiled program; one that is done leaves its place to the next. Points and
-    searches whose simulation fails hinder no others. A search that comes within a hundredth, in each coordinate, of
-    another with a lower cost is ended, and counted where that one ends; one whose sum of squares three moves, or six
-    iterations, have lowered by less than a hundredth is ended there, as at a minimum. Those that come within twice the
-    least sum of squares are searched on, and the best is then fitted as `fit` does.
+    Searches run together, `batch` in one compiled program. Points and searches whose simulation fails hinder no others.
+    A search that comes within a hundredth, in each coordinate, of another with a lower cost is ended, and counted where
+    that one ends; one whose sum of squares three moves, or six iterations, have lowered by less than a hundredth is
+    ended there, as at a minimum. Those that come within twice the least sum of squares are searched on, and the best is
+    then fitted as `fit` does.
 
     Two searches ended at one minimum where their coordinates differ by less than two hundredths, or where the misfit
     hides the difference: Δᵀ JᵀJ Δ ≤ n s² of n coordinates, J and s² = Σ r²/(m − n), or one if σ is given and that is
-    less, being those of the better one.
-
-    Where σ is not given, searches take the size of the data in its place: several observations without one weigh alike
-    in them, and are only weighed by their noise in the last fit.
+    less, being those of the better one. Where σ is not given, searches take the size of the data in its place: several
+    observations without one weigh alike in them, and are only weighed by their noise in the last fit.
 
     Args:
-        experiments, parameters: see `fit`.
+        experiments, parameters, report, level: see `fit`.
         starts: how many points, the first guess among them.
         fraction: of the points, the best ones, from which searches start whatever is near. 1 searches from all of them,
             without a look; 0 only from those of single linkage and the first guess.
-        ranges: lowest and highest value to start from, by the name of a parameter.
+        ranges: lowest and highest value to start from, by the name of a parameter. Default: its prior, or its bounds,
+            from a tenth to ten times the first guess of a `Positive`, one coordinate each way of an `Unbounded` one.
         seed: of the starting points.
         batch: how many points, and searches, run together. Default: eight with explicit steps, one with implicit ones.
-        report, level: see `fit`.
         optimiser: the method of each search, and of the last fit. Default: as `fit` chooses.
         progress: called with a line, such as `print`, as points are done, as searches end, and by the last fit.
 
@@ -154,18 +136,39 @@ def fit_multistart(
         told = counted(progress, "{} of {} simulations are done", again=False)
         costs = costs_at(problem, points, sigmas, size, told)
     failures = {int(k): _FAILS for k in np.flatnonzero(~np.isfinite(costs))}
-    noise = Problems.of([sigmas])
-    together = partial(search_many, Problems.of([problem]), optimiser, sigmas=noise, batch=size, joining=_JOINED)
-    members, stands = _searched(problem, sigmas, points, shares, costs, fraction, together, progress)
-    failures |= {k: m.failure for k, m in members.items() if m.minimum is None}
-    groups = _grouped(problem, _ends(members, stands))
+    together = partial(search_many, [(problem, sigmas)], optimiser, batch=size, joining=_JOINED)
+
+    def begun(number: int, seen: Evaluation) -> None:
+        if number == 0:
+            require_influence(problem, sigmas, seen)
+
+    # Searches from the points that stand for others, until each point is stood for by one that came to a minimum.
+    members: dict[int, Search] = {}
+    while True:
+        # The first guess, which is none of the cube's points, stands for itself.
+        others = linked(shares, costs[1:], fraction)
+        stands = [0 if np.isfinite(costs[0]) else -1, *np.where(others < 0, -1, others + 1).tolist()]
+        chosen = sorted(set(stands) - {-1, *members}, key=lambda k: (k > 0, costs[k]))
+        if not chosen:
+            break
+        told = counted(progress, "{} of {} searches are done", again=False)
+        members |= together({k: points[k] for k in chosen}, settling=_SETTLED, progress=told, begun=begun)
+        if any(m.interrupted for m in members.values()):
+            break
+        costs[[k for k in chosen if _end(members, k) is None]] = np.nan
+    failures |= {k: m.failure for k, m in members.items() if m.failure}
+    ends: dict[int, list[int]] = {}
+    for k, by in enumerate(stands):
+        if by >= 0 and (end := _end(members, by)) is not None:
+            ends.setdefault(end, []).append(k)
+    groups = _grouped(problem, [(members[end], numbers) for end, numbers in ends.items()])
     if not groups:
         failure = f"No search of {len(members)} came to a minimum: {failures.get(0, 'raise max_steps')}."
         problem.explain(jnp.zeros(problem.size, problem.dtype), failure)
     # Those near to the best one are searched on, without settling.
     near = sum(end.cost <= _NEAR_BEST * groups[0][0].cost for end, _ in groups[:_SHOWN])
-    further = together(np.array([end.z for end, _ in groups[:near]], float))
-    on = [(groups[k][0] if m.minimum is None else m.minimum, groups[k][1]) for k, m in enumerate(further)]
+    further = together({k: groups[k][0].z for k in range(near)})
+    on = [(groups[k][0] if m.failure else m, groups[k][1]) for k, m in further.items()]
     groups = _grouped(problem, [*on, *groups[near:]])
     minima = tuple(
         LocalMinimum(
@@ -189,7 +192,7 @@ def fit_multistart(
         searched=tuple(sorted(members)),
         failures=dict(sorted(failures.items())),
         unfinished=tuple(k for k in range(starts) if k not in ended and k not in failures),
-        iterations=sum(len(m.minimum.history) for m in (*members.values(), *further) if m.minimum is not None),
+        iterations=sum(len(m.history) for m in (*members.values(), *further.values()) if not m.failure),
     )
 
 
@@ -221,81 +224,28 @@ def _costs(problem: FitProblem, points: Float[np.ndarray, "b n"] | Array, sigmas
     return jax.vmap(cost)(jnp.asarray(points, problem.dtype))
 
 
-def _searched(
-    problem: FitProblem,
-    sigmas: Sigmas,
-    points: Float[np.ndarray, "k n"],
-    shares: Float[np.ndarray, "l n"],
-    costs: Float[np.ndarray, "k"],
-    fraction: Scalar,
-    together: Callable[..., tuple[Member, ...]],
-    progress: Callable[[str], None] | None,
-) -> tuple[dict[int, Member], Int[np.ndarray, "k"]]:
-    """Searches from the points that stand for the others, until each point is stood for by one that came to a minimum:
-    the searches by the numbers of their points, and for each point the number of the one that stands for it, -1 where
-    its cost is not finite."""
-    members: dict[int, Member] = {}
-    costs = costs.copy()
-    while True:
-        # The first guess, which is none of the cube's points, stands for itself.
-        others = linked(shares, costs[1:], fraction)
-        stands = np.concatenate([[0 if np.isfinite(costs[0]) else -1], np.where(others < 0, -1, others + 1)])
-        chosen = sorted(set(stands.tolist()) - {-1, *members}, key=lambda k: (k > 0, costs[k]))
-        if not chosen:
-            return members, stands
-
-        def begun(number: int, seen: Evaluation, chosen: list[int] = chosen) -> None:
-            if chosen[number] == 0:
-                require_influence(problem, sigmas, seen)
-
-        told = counted(progress, "{} of {} searches are done", again=False)
-        outcomes = together(points[chosen], settling=_SETTLED, progress=told, begun=begun)
-        joined = [None if m.joined is None else chosen[m.joined] for m in outcomes]
-        members |= {k: m._replace(joined=end) for k, m, end in zip(chosen, outcomes, joined, strict=True)}
-        if any(m.interrupted for m in outcomes):
-            return members, stands
-        costs[[k for k in chosen if _end(members, k) is None]] = np.nan
-
-
-def _end(members: dict[int, Member], k: int) -> int | None:
+def _end(members: dict[int, Search], k: int) -> int | None:
     """The number of the search at whose minimum a search ended; None if it came to none."""
     while (joined := members[k].joined) is not None:
         k = joined
-    minimum = members[k].minimum
-    return k if minimum is not None and minimum.converged else None
-
-
-def _ends(members: dict[int, Member], stands: Int[np.ndarray, "k"]) -> Ends:
-    """Where searches ended, with the numbers of the points that those stand for."""
-    numbers: dict[int, list[int]] = {}
-    for k, by in enumerate(stands.tolist()):
-        end = None if by < 0 else _end(members, by)
-        if end is not None:
-            numbers.setdefault(end, []).append(k)
-    ends = [(members[end].minimum, points) for end, points in numbers.items()]
-    return [(minimum, points) for minimum, points in ends if minimum is not None]
+    return k if members[k].converged else None
 
 
 def _grouped(problem: FitProblem, ends: Ends) -> Ends:
     """The distinct minima, the lowest first, with the numbers of the points that lead there."""
     groups: Ends = []
-    least = 1.0 if all(problem.noise_is_given) else 0.0
     for minimum, points in sorted(ends, key=lambda pair: pair[0].cost):
         for better, numbers in groups:
-            if _same(np.asarray(minimum.z - better.z, float), better, least):
+            change = np.asarray(minimum.z - better.z, float)
+            r, J = np.asarray(better.seen.residuals, float), np.asarray(better.seen.jacobian, float)
+            variance = float((r**2).sum()) / max(np.count_nonzero(r) - len(change), 1)
+            variance = max(variance, 1.0 if all(problem.noise_is_given) else 0.0)
+            if (np.abs(change) <= _NEAR).all() or ((J @ change) ** 2).sum() <= len(change) * variance:
                 numbers += points
                 break
         else:
             groups.append((minimum, list(points)))
     return groups
-
-
-def _same(change: np.ndarray, better: Minimum, least: float) -> bool:
-    """Whether an end of a search is the same minimum as a better one: `change` is the difference of their coordinates,
-    `least` the least mean square of residuals."""
-    r, J = np.asarray(better.r, float), np.asarray(better.J, float)
-    variance = max(least, float((r**2).sum()) / max(np.count_nonzero(r) - len(change), 1))
-    return bool((np.abs(change) <= _NEAR).all() or ((J @ change) ** 2).sum() <= len(change) * variance)
 
 
 def unit_points(count: int, size: int, seed: int) -> Float[np.ndarray, "k n"]:
@@ -308,73 +258,54 @@ def unit_points(count: int, size: int, seed: int) -> Float[np.ndarray, "k n"]:
 
 
 def starting_points(problem: FitProblem, shares: Float[np.ndarray, "k n"], ranges: Ranges) -> Float[np.ndarray, "l n"]:
-    """Coordinates of the first guess, and of points of the unit cube.
-
-    A parameter's side of the cube is its range, if it has one, else its prior's distribution, else from bound to
-    bound, else from a tenth to ten times the first guess of a positive one, and one coordinate to each side of any
-    other. The range of a positive parameter is one of its logarithm.
+    """Coordinates of the first guess, and of points of the unit cube, its sides as `ranges` of `fit_multistart` says.
+    The range of a positive parameter is one of its logarithm.
     """
     unknown = sorted(set(ranges) - set(problem.names))
     require(not unknown, f"ranges must be of parameters ({', '.join(problem.names)}), got {', '.join(unknown)}.")
-    parts, column = [], 0
+    columns, column = [], 0
     for name, parameter, start in zip(problem.names, problem.parameters, problem.starts, strict=True):
-        part = shares[:, column : column + start.size].reshape(-1, *start.shape)
-        parts.append(_spread(name, parameter, start, part, ranges.get(name)).reshape(len(part), -1))
+        share = shares[:, column : column + start.size].reshape(-1, *start.shape)
         column += start.size
-    return np.concatenate([np.zeros((1, problem.size)), np.concatenate(parts, axis=1)])
-
-
-def _spread(
-    name: str, parameter: AbstractParameter, start: Array, shares: np.ndarray, limits: tuple[float, float] | None
-) -> np.ndarray:
-    """Coordinates of a parameter at shares of its distribution between 0 and 1, shape (k, ...)."""
-    first, (lowest, highest) = np.asarray(start, float), parameter.domain
-    prior = None if parameter.prior is None else parameter.prior.distribution()
-    if limits is None and prior is not None:
-        mean, sigma = prior
-        below, above = ndtr((lowest - mean) / sigma), ndtr((highest - mean) / sigma)
-        values = mean + sigma * ndtri(below + shares * (above - below))
-    else:
-        lower, upper = _range(name, parameter, first, limits)
-        if parameter.logarithmic:
-            values = np.exp(np.log(lower) + shares * (np.log(upper) - np.log(lower)))
+        first, (lowest, highest), limits = np.asarray(start, float), parameter.domain, ranges.get(name)
+        prior = None if parameter.prior is None else parameter.prior.distribution()
+        lower, upper = np.asarray(lowest), np.asarray(highest)
+        if limits is not None:
+            require(len(limits) == 2, f"The range of {name!r} must be two numbers, got {len(limits)}.")
+            require_finite(f"The range of {name!r}", np.asarray(limits, float))
+            inside = lowest <= limits[0] < limits[1] <= highest and (limits[0] > 0 or not parameter.logarithmic)
+            within = "positive numbers" if parameter.logarithmic else f"between {lowest:g} and {highest:g}"
+            require(inside, f"The range of {name!r} must grow and be {within}, got {limits[0]:g} to {limits[1]:g}.")
+            lower, upper = (np.asarray(float(limit)) for limit in limits)
+        elif prior is None and parameter.logarithmic:
+            lower, upper = first / _DECADE, first * _DECADE
+        elif prior is None and not np.isfinite([lowest, highest]).all():
+            ends = (parameter.value(jnp.asarray(first), jnp.full(first.shape, side)) for side in (-1.0, 1.0))
+            lower, upper = (np.asarray(end) for end in ends)
+        if limits is None and prior is not None:
+            mean, sigma = prior
+            below, above = ndtr((lowest - mean) / sigma), ndtr((highest - mean) / sigma)
+            values = mean + sigma * ndtri(below + share * (above - below))
+        elif parameter.logarithmic:
+            values = np.exp(np.log(lower) + share * (np.log(upper) - np.log(lower)))
         else:
-            values = lower + shares * (upper - lower)
-    return np.asarray(parameter.coordinate(start, jnp.asarray(values, start.dtype)), float)
-
-
-def _range(
-    name: str, parameter: AbstractParameter, first: np.ndarray, limits: tuple[float, float] | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest value to start from."""
-    lowest, highest = parameter.domain
-    if limits is not None:
-        require(len(limits) == 2, f"The range of {name!r} must be two numbers, got {len(limits)}.")
-        require_finite(f"The range of {name!r}", np.asarray(limits, float))
-        inside = lowest <= limits[0] < limits[1] <= highest and (limits[0] > 0 or not parameter.logarithmic)
-        within = "positive numbers" if parameter.logarithmic else f"between {lowest:g} and {highest:g}"
-        require(inside, f"The range of {name!r} must grow and be {within}, got {limits[0]:g} to {limits[1]:g}.")
-        return np.asarray(float(limits[0])), np.asarray(float(limits[1]))
-    if np.isfinite([lowest, highest]).all():
-        return np.asarray(lowest), np.asarray(highest)
-    if parameter.logarithmic:
-        return np.asarray(first / _DECADE), np.asarray(first * _DECADE)
-    ends = [np.asarray(parameter.value(jnp.asarray(first), jnp.full(first.shape, side))) for side in (-1.0, 1.0)]
-    return ends[0], ends[1]
+            values = lower + share * (upper - lower)
+        z = parameter.coordinate(start, jnp.asarray(values, start.dtype))
+        columns.append(np.asarray(z, float).reshape(len(share), -1))
+    return np.concatenate([np.zeros((1, problem.size)), np.concatenate(columns, axis=1)])
 
 
 def linked(shares: Float[np.ndarray, "k n"], costs: Float[np.ndarray, "k"], fraction: Scalar) -> Int[np.ndarray, "k"]:
     """For each point the number of the one that stands for it, from which a search starts; its own where one starts
     there, and -1 where the cost is not finite.
 
-    Multi-level single linkage (A. H. G. Rinnooy Kan, G. T. Timmer, Mathematical Programming 39 (1987) 57-78): a search
-    starts from each point that has no better one within the critical distance
+    In multi-level single linkage a search starts from each point that has no better one within the critical distance
 
         r = π^(-1/2) (Γ(1 + n/2) σ ln k / k)^(1/n),  σ = 2,
 
     of k even points of the unit cube: in a ball of this radius lie σ ln k of them. Any other point is linked to the
     nearest better one, and so on to one that is searched from. On a rough function that is too few: a fraction of all
-    points, the best ones, is searched from besides, whatever their neighbours.
+    points, the best ones, is searched from besides.
 
     Args:
         shares: the points, evenly spread over the unit cube.

@@ -1,77 +1,162 @@
-"""Optimisers: methods that search the least sum of squares. L-BFGS and Adam of optax search by the gradient alone."""
+"""Methods that search the least sum of squares: Levenberg-Marquardt of optimistix by residuals and their Jacobian,
+L-BFGS and Adam of optax by the gradient alone."""
 
-import abc
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
+import optimistix
 
 from mpmjax._types import Array, Bool, Float, Int, Scalar
-from mpmjax.checks import as_floats, require_fields, require_positive, require_whole
+from mpmjax.checks import as_floats, require_fields, require_positive, require_tolerance, require_whole
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
+from mpmjax.fitting._search import AbstractOptimiser, Evaluation
 
 
-class Evaluation(NamedTuple):
-    """Cost and derivatives at the place where an optimiser is."""
+class LevenbergMarquardt(AbstractOptimiser):
+    """The Levenberg-Marquardt method of optimistix on the residuals and their Jacobian.
 
-    cost: Float[Array, ""]
-    """½ Σ r²; NaN where a simulation failed."""
-    gradient: Coordinates
-    """Derivative of the cost by the coordinates, shape (n,)."""
-    residuals: Float[Array, "m"] | None = None
-    """r [-], of an optimiser that uses them."""
-    jacobian: Float[Array, "m n"] | None = None
-    """Their derivative."""
-    room: Float[Array, "2 n"] | None = None
-    """How far values can change until their bounds, see `FitProblem.room`."""
+    One compiled function makes an iteration: it evaluates residuals and Jacobian together, once. A step at which a
+    simulation fails has residuals of NaN, is not taken, and the next is shorter.
 
+    Near a bound the coordinate hides the value from it: the damping then holds a step that the data ask for. There the
+    next one is the Gauss-Newton step of values that follow their coordinates in straight lines up to their bounds.
 
-class AbstractOptimiser(eqx.Module):
-    """A method that searches the least Σ r², one iteration at a time.
+    It ends by optimistix's criterion, or where the next Gauss-Newton step, no longer than to a bound, would be less
+    than a ten-thousandth of the standard error that the misfit gives, or where a step is refused and could lower the
+    sum of squares by no more than its rounding: in single precision residuals are never still. Where it can only make
+    steps far shorter than the Gauss-Newton step, since the simulation fails beyond or the misfit has a kink, it has not
+    converged.
 
-    One of your own gives `begin`, `iterate` and `has_converged`. Its state is a pytree of arrays that says all it
-    remembers, so that a search can be written to a file and continued. Its methods are given the problem that is
-    minimised, the coordinates z where the search is, and the noise of each observation.
+    Args:
+        rtol: relative and absolute tolerance of coordinates and residuals.
+        max_steps: most iterations.
+        mode: how the Jacobian is made: "forward", by a tangent a coordinate beside the simulation; "reverse", by a pass
+            back a measured number. Default: what costs less.
     """
 
-    max_steps: eqx.AbstractVar[int]
-    """Most iterations."""
+    rtol: Scalar = 1e-6
+    max_steps: int = eqx.field(static=True, default=50)
+    mode: Literal["forward", "reverse"] | None = eqx.field(static=True, default=None)
 
-    @abc.abstractmethod
+    def __check_init__(self):
+        require_fields(self)
+        require_tolerance("LevenbergMarquardt's rtol", self.rtol)
+        require_whole("LevenbergMarquardt's max_steps", self.max_steps, 1)
+
     def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> Any:
-        """The state before the first iteration, which starts at z."""
+        args = problem, sigmas, self.mode
+        shape, _ = jax.eval_shape(lambda z: _residuals(z, args), z)
+        return self._solver.init(_residuals, z, args, {}, shape, None, frozenset())
 
-    @abc.abstractmethod
     def iterate(
         self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: Any
     ) -> tuple[Coordinates, Any, Evaluation]:
-        """One iteration from the state that `begin` or the last iteration returned: where it is now, the state, and
-        what it knows of that place. The first one evaluates where it starts. A step at which a simulation fails must
-        not be taken."""
+        z, state, _ = self._solver.step(_residuals, z, (problem, sigmas, self.mode), {}, state, frozenset())
+        r, J = state.f_info.residual, state.f_info.jac.as_matrix()
+        dtype = problem.dtype
+        room = problem.room(z.astype(dtype))
+        return z, state, Evaluation((r**2).sum() / 2, J.T @ r, r.astype(dtype), J.astype(dtype), room)
 
     def directed(self, z: Coordinates, state: Any, seen: Evaluation) -> Any:
-        """The state for the next iteration, outside of what is compiled. Default: as it is."""
-        del z, seen
-        return state
+        r, J, step, _ = _gauss_newton(seen)
+        if not np.isfinite(step).all() or int(state.num_steps_since_acceptance) > 0:
+            return state
+        (down, up), square = np.asarray(seen.room, float), np.maximum((J**2).sum(axis=0), np.finfo(float).tiny)
+        near = square * np.minimum(down, up) ** 2 <= _HIDDEN**2 * (r**2).sum() / max(len(r) - len(step), 1)
+        side = np.where(down < up, 1, -1)
+        straight = side * np.log1p(np.maximum(side * step, np.exp(-_LEAP) - 1))
+        wanted = np.where(near, straight, step)
+        if not (near & (np.abs(np.asarray(state.y_eval - z, float)) < np.abs(wanted) / 2)).any():
+            return state
+        # The factor is what a refusal takes off the length of steps: damped ones go on as if it had not been tried.
+        return eqx.tree_at(
+            lambda s: (s.y_eval, s.search_state.step_size),
+            state,
+            (z + jnp.asarray(wanted, z.dtype), state.search_state.step_size * 4),
+        )
 
-    @abc.abstractmethod
     def has_converged(self, state: Any, seen: Evaluation) -> bool:
-        """Whether the search is at a minimum."""
-
-    def distance(self, state: Any, seen: Evaluation) -> float:
-        """How far the search is from converged, as a multiple of where it ends; NaN if that is not known, which is the
-        default. The time left is estimated from how fast it falls."""
-        del state, seen
-        return float("nan")
+        if (bool(state.terminate) and not self._is_held_back(state)) or self.distance(state, seen) <= 1:
+            return True
+        # Refused, and what it could have lowered Σ r² by is lost in the rounding.
+        r, J, step, _ = _gauss_newton(seen)
+        rounding = _ROUNDINGS * float(np.finfo(np.asarray(seen.residuals).dtype).eps) * (r**2).sum()
+        gain = (r**2).sum() - ((r + J @ step) ** 2).sum()
+        return bool(int(state.num_steps_since_acceptance) > 0 and gain <= rounding)
 
     def has_stalled(self, state: Any) -> bool:
-        """Whether the search goes no further, and is not known to be at a minimum."""
+        return bool(state.terminate) and self._is_held_back(state)
+
+    def _is_held_back(self, state: Any) -> bool:
+        """Whether the steps are short because longer ones were refused, and not because the minimum is near: the
+        simulation fails beyond, or the misfit has a kink."""
+        r, J = np.asarray(state.f_info.residual, float), np.asarray(state.f_info.jac.as_matrix(), float)
+        if not (np.isfinite(r).all() and np.isfinite(J).all()):
+            return False
+        damping = np.eye(J.shape[1]) / float(state.search_state.step_size)
+        wanted, taken = np.linalg.lstsq(J, -r)[0], np.linalg.solve(J.T @ J + damping, -J.T @ r)
+        far = np.abs(wanted).max() > _FAR * float(self.rtol)
+        return bool(far and np.abs(taken).max() < _REFUSED * np.abs(wanted).max())
+
+    def distance(self, state: Any, seen: Evaluation) -> float:
         del state
-        return False
+        r, J, step, limited = _gauss_newton(seen)
+        rows, columns = J.shape
+        if rows <= columns or not np.isfinite(step).all():
+            return float("nan")
+        error = np.sqrt((r**2).sum() / (rows - columns))
+        # Data without noise leave no error to compare with: towards a bound the tolerance of residuals ends it.
+        least = float(self.rtol) if limited.any() and np.abs(step[~limited]).max(initial=0) <= self.rtol else 0.0
+        length = float(np.linalg.norm(J @ step))
+        return length / max(_NEGLIGIBLE * float(error), least) if length > 0 else 0.0
+
+    @property
+    def _solver(self) -> Any:
+        tolerance: Any = self.rtol
+        solver: Any = optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+        return eqx.tree_at(lambda s: s.search, solver, _TrustRegion())
+
+
+class _TrustRegion(optimistix.ClassicalTrustRegion):
+    """A trust region that takes no step uphill, though its quadratic foretells one: near a bound that is of
+    coordinates, and the step of values."""
+
+    def predict_reduction(self, y_diff: Any, f_info: Any) -> Any:
+        return jnp.minimum(super().predict_reduction(y_diff, f_info), 0)
+
+
+def _gauss_newton(seen: Evaluation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """r, J, the next Gauss-Newton step, were values straight lines in their coordinates up to their bounds, NaN if it
+    is unknown, and which coordinates it brings to a bound."""
+    r, J = np.asarray(seen.residuals, float), np.asarray(seen.jacobian, float)
+    if not (np.isfinite(r).all() and np.isfinite(J).all()):
+        return r, J, np.full(J.shape[1], np.nan), np.zeros(J.shape[1], bool)
+    length = np.linalg.norm(J, axis=0)
+    length = np.where(length > 0, length, 1)
+    down, up = np.asarray(seen.room, float) * length
+    step = np.linalg.lstsq(J / length, -r, rcond=1e-10)[0]
+    if ((step <= -down) | (step >= up)).any():
+        from scipy.optimize import lsq_linear  # here, since it takes long to import
+
+        step = lsq_linear(J / length, -r, (-down, up), method="bvls").x
+    return r, J, step / length, (step <= -down) | (step >= up)
+
+
+def _residuals(z: Coordinates, args: tuple[FitProblem, Sigmas, Any]) -> tuple[Array, None]:
+    """The residuals, as optimistix asks for them."""
+    problem, sigmas, mode = args
+
+    def evaluate(z: Coordinates) -> tuple[Array, Array]:
+        r, J = problem.jacobian(z.astype(problem.dtype), sigmas, mode)
+        return r.astype(z.dtype), J.astype(z.dtype)
+
+    return evaluated_once(evaluate)(z), None
 
 
 class LBFGS(AbstractOptimiser):
@@ -106,9 +191,9 @@ class LBFGS(AbstractOptimiser):
 
     def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> "LBFGSState":
         del problem, sigmas
-        no, zero = jnp.asarray(False), jnp.zeros((), z.dtype)
-        past, unknown, small = self._past.init(z), zero + jnp.inf, jnp.zeros((), jnp.int32)
-        return LBFGSState(no, zero, jnp.zeros_like(z), past, unknown, zero, small, no)
+        no, zero, none = jnp.asarray(False), jnp.zeros((), z.dtype), jnp.zeros((), jnp.int32)
+        past: Any = optax.scale_by_lbfgs(self.memory).init(z)
+        return LBFGSState(no, zero, jnp.zeros_like(z), past, zero + jnp.inf, zero, none, no)
 
     def iterate(
         self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: "LBFGSState"
@@ -117,9 +202,8 @@ class LBFGS(AbstractOptimiser):
             _, cost, gradient = problem.gradient(z, sigmas)
             return z, state._replace(begun=~state.begun, cost=cost, gradient=gradient)
 
-        search = partial(self._search, problem, sigmas)
         with jax.numpy_dtype_promotion("standard"):  # optax mixes integers
-            z, state = jax.lax.cond(state.begun, search, start, z, state)
+            z, state = jax.lax.cond(state.begun, partial(self._search, problem, sigmas), start, z, state)
         return z, state, Evaluation(state.cost, state.gradient)
 
     def has_converged(self, state: "LBFGSState", seen: Evaluation) -> bool:
@@ -133,8 +217,10 @@ class LBFGS(AbstractOptimiser):
         self, problem: FitProblem, sigmas: Sigmas, z: Coordinates, state: "LBFGSState"
     ) -> tuple[Coordinates, "LBFGSState"]:
         """A line search along the quasi-Newton direction, or where nothing is known yet along the negative gradient."""
-        cost, gradient, fresh = state.cost, state.gradient, self._past.init(z)
-        newton, steepest = (self._past.update(gradient, past, z) for past in (state.past, fresh))
+        cost, gradient = state.cost, state.gradient
+        quasi_newton: Any = optax.scale_by_lbfgs(self.memory)
+        fresh = quasi_newton.init(z)
+        newton, steepest = (quasi_newton.update(gradient, past, z) for past in (state.past, fresh))
         steep = (state.past.count == 0) | (gradient @ newton[0] <= 0)
         along, past = _where(steep, steepest, newton)
         predicted_decrease = jnp.where(steep, jnp.minimum(state.predicted_decrease, gradient @ along), gradient @ along)
@@ -164,10 +250,6 @@ class LBFGS(AbstractOptimiser):
         )
         stayed = after._replace(cost=cost, gradient=gradient, past=fresh)
         return _where(moved, (z + step, after), (z, stayed))
-
-    @property
-    def _past(self) -> Any:
-        return optax.scale_by_lbfgs(self.memory)
 
 
 class LBFGSState(NamedTuple):
@@ -235,9 +317,8 @@ class Adam(AbstractOptimiser):
 
     def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> "AdamState":
         del problem, sigmas
-        one, zero = jnp.ones((), z.dtype), jnp.zeros((), jnp.int32)
-        none = jnp.zeros_like(z)
-        return AdamState(zero, z, _MOMENTS.init(z), one * jnp.inf, none, one, jnp.asarray(self.rate(0), z.dtype), zero)
+        one, zero, rate = jnp.ones((), z.dtype), jnp.zeros((), jnp.int32), jnp.asarray(self.rate(0), z.dtype)
+        return AdamState(zero, z, _MOMENTS.init(z), one * jnp.inf, jnp.zeros_like(z), one, rate, zero)
 
     def iterate(
         self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: "AdamState"
@@ -292,3 +373,11 @@ _MOMENTS: Any = optax.scale_by_adam()
 def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
     """One of two pytrees."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+_FAR = 100.0  # a step is short below so many tolerances
+_REFUSED = 0.1  # part of the Gauss-Newton step below which a step is held back
+_LEAP = 9.0  # longest step to a bound [-]: to a ten-thousandth of the distance from it
+_HIDDEN = 3.0  # standard errors from a bound within which a coordinate is near it
+_NEGLIGIBLE = 1e-4  # a step of so many standard errors is none
+_ROUNDINGS = 10  # rounding of Σ r², in ε: a smaller change of it cannot be told

@@ -32,11 +32,7 @@ class AbstractPrior(eqx.Module):
 
     @abc.abstractmethod
     def check(self, name: str, shape: tuple[int, ...]) -> None:
-        """Check that it fits a parameter of this shape.
-
-        Raises:
-            ValueError: it does not.
-        """
+        """Raise a `ValueError` if it does not fit a parameter of this shape."""
 
     @abc.abstractmethod
     def fixes(self, shape: tuple[int, ...]) -> int:
@@ -84,8 +80,9 @@ class Gaussian(AbstractPrior):
 
     def check(self, name: str, shape: tuple[int, ...]) -> None:
         shapes = {np.shape(self.mean), np.shape(self.sigma)}
-        fits = shapes <= {(), shape}
-        require(fits, f"The prior of {name!r} must have one number or shape {shape}, got {sorted(shapes)}.")
+        require(
+            shapes <= {(), shape}, f"The prior of {name!r} must have one number or shape {shape}, got {sorted(shapes)}."
+        )
 
     def fixes(self, shape: tuple[int, ...]) -> int:
         return int(np.prod(shape))
@@ -145,12 +142,9 @@ class AbstractParameter(eqx.Module):
     """The leaf, or a tuple of leaves that share the value, of an experiment, as in `equinox.tree_at`."""
     update: eqx.AbstractVar[Callable[[Experiment, Value], Experiment] | None]
     """In the place of `where`: the experiment with the value put into it, for what is no single leaf."""
-    start: eqx.AbstractVar[Start | None]
-    """The first guess. Default: the value of the first experiment."""
-    prior: eqx.AbstractVar[AbstractPrior | None]
-    """Prior knowledge of it."""
-    unit: eqx.AbstractVar[str]
-    """The unit that tables show."""
+    start: eqx.AbstractVar[Start | None]  # the first guess. Default: the value of the first experiment.
+    prior: eqx.AbstractVar[AbstractPrior | None]  # prior knowledge of it
+    unit: eqx.AbstractVar[str]  # the unit that tables show
     only: eqx.AbstractVar[tuple[int, ...] | None]
     """The numbers, from 0, of the experiments that it belongs to. Default: all."""
 
@@ -165,8 +159,7 @@ class AbstractParameter(eqx.Module):
         require(self.update is None or self.start is not None, f"{name} with update needs a start: the first guess.")
         if self.start is not None:
             require_finite(f"{name}'s start", self.start)
-        distribution = None if self.prior is None else self.prior.distribution()
-        if distribution is not None:
+        if self.prior is not None and (distribution := self.prior.distribution()) is not None:
             (lower, upper), mean = self.domain, distribution[0]
             require(
                 (mean >= lower) & (mean <= upper),
@@ -188,27 +181,19 @@ class AbstractParameter(eqx.Module):
         """The value at a coordinate z [-]; `start` at zero."""
 
     @abc.abstractmethod
-    def coordinate(self, start: Value, value: Value) -> Value:
-        """z [-] at a value, with zero at `start`."""
-
-    @abc.abstractmethod
     def free(self, value: Value) -> Value:
         """The value in a measure without bounds, whatever the first guess: z but for a constant and a factor."""
 
+    def coordinate(self, start: Value, value: Value) -> Value:
+        """z [-] at a value, with zero at `start`. Default: the difference of free values."""
+        return self.free(value) - self.free(start)
+
     @abc.abstractmethod
     def check(self, name: str, start: np.ndarray) -> None:
-        """Check that the first guess lies within the bounds.
-
-        Raises:
-            ValueError: it does not.
-        """
+        """Raise a `ValueError` if the first guess does not lie within the bounds."""
 
     def check_experiment(self, name: str, experiment: Experiment) -> None:
-        """Check that it can be put into an experiment.
-
-        Raises:
-            ValueError: it cannot.
-        """
+        """Raise a `ValueError` if it cannot be put into an experiment."""
 
     def room(self, start: Value, z: Value) -> tuple[Value, Value]:
         """How far the value can fall and rise until its bounds, each over its derivative by z [-], of the value's
@@ -224,22 +209,21 @@ class AbstractParameter(eqx.Module):
         """The value that the search starts from."""
         if self.start is not None:
             return jnp.asarray(self.start, experiment.dtype)
-        assert self.where is not None
         return jnp.asarray(leaves_of(self.where, experiment)[0], experiment.dtype)
 
     def put(self, experiment: Experiment, value: Value) -> Experiment:
         """The experiment with this value."""
         if self.update is not None:
             return self.update(experiment, value)
-        assert self.where is not None
         leaves = leaves_of(self.where, experiment)
         shapes = {jnp.shape(leaf) for leaf in leaves}
         require(shapes == {value.shape}, f"it has shape {sorted(shapes)}, and its start {value.shape}.")
         return eqx.tree_at(partial(leaves_of, self.where), experiment, (value,) * len(leaves))
 
 
-def leaves_of(where: Callable[[Experiment], Any], experiment: Experiment) -> tuple[Any, ...]:
+def leaves_of(where: Callable[[Experiment], Any] | None, experiment: Experiment) -> tuple[Any, ...]:
     """The leaf, or the several leaves, that `where` names."""
+    assert where is not None
     leaves = where(experiment)
     return leaves if isinstance(leaves, tuple) else (leaves,)
 
@@ -267,14 +251,12 @@ class Unbounded(_PlainParameter):
     scale: Scalar | None = eqx.field(default=None, kw_only=True)
 
     def value(self, start: Value, z: Value) -> Value:
-        """start + scale z."""
         return start + self._scale(start) * z
 
     def coordinate(self, start: Value, value: Value) -> Value:
         return (value - start) / self._scale(start)
 
     def free(self, value: Value) -> Value:
-        """The value."""
         return value
 
     def _scale(self, start: Value) -> Value | Scalar:
@@ -307,18 +289,12 @@ class Positive(_PlainParameter):
         return 0.0, np.inf
 
     def value(self, start: Value, z: Value) -> Value:
-        """start·e^z."""
         return start * jnp.exp(z)
 
-    def coordinate(self, start: Value, value: Value) -> Value:
-        return jnp.log(value / start)
-
     def free(self, value: Value) -> Value:
-        """ln value."""
         return jnp.log(value)
 
     def room(self, start: Value, z: Value) -> tuple[Value, Value]:
-        """1 and ∞."""
         del start
         return jnp.ones_like(z), jnp.full_like(z, jnp.inf)
 
@@ -344,11 +320,7 @@ class Bounded(_PlainParameter):
         return self.lower, self.upper
 
     def value(self, start: Value, z: Value) -> Value:
-        """lower + (upper − lower)/(1 + e^{−(z0 + z)})."""
         return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(self.free(start) + z)
-
-    def coordinate(self, start: Value, value: Value) -> Value:
-        return self.free(value) - self.free(start)
 
     def free(self, value: Value) -> Value:
         """The logit of where it lies between the bounds."""

@@ -6,18 +6,16 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import checked, require, require_positive, require_whole, warn
-from mpmjax.fitting._experiment import AbstractObservation, Experiment, Numbers
+from mpmjax.fitting._experiment import Experiment, Numbers
 from mpmjax.fitting._fit import checked_level
-from mpmjax.fitting._optimiser import AbstractOptimiser
-from mpmjax.fitting._problem import Coordinates, FitProblem, in_batches
+from mpmjax.fitting._problem import Coordinates, FitProblem, linearised
 from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, table
-from mpmjax.fitting._search import Problems, batch_size, counted, search_many
+from mpmjax.fitting._search import AbstractOptimiser, batch_size, counted, search_many
 from mpmjax.fitting._uncertainty import quantile
 
 
@@ -25,18 +23,14 @@ class Prediction(eqx.Module):
     """A quantity by a fit, with the error that the parameters' errors make. All arrays have its shape."""
 
     value: np.ndarray
-    error: np.ndarray
-    """Standard error; infinite where the value depends on what the data do not see."""
+    error: np.ndarray  # standard error; infinite where the value depends on what the data do not see
     lower: np.ndarray
     """Where the value lies at the level: the confidence band. It holds at each point, not at all of them together."""
     upper: np.ndarray
-    sigma: np.ndarray | None
-    """Standard deviation of the noise of a measurement of it, where that is known."""
-    new_lower: np.ndarray | None
-    """Where a new measurement lies at the level, its noise included: the prediction band."""
+    sigma: np.ndarray | None  # standard deviation of the noise of a measurement of it, where that is known
+    new_lower: np.ndarray | None  # where a new measurement lies at the level, its noise included: the prediction band
     new_upper: np.ndarray | None
-    level: float
-    """The level of the bands [-], such as 0.95."""
+    level: float  # the level of the bands [-], such as 0.95
 
 
 @checked
@@ -65,8 +59,8 @@ def predict(
         result: the fit.
         of: function of an experiment with the fitted parameters, that returns a number or an array. Give the runs in
             it `adjoint=diffrax.ForwardMode()`: else those in little `checkpoint_bytes` have no forward derivative.
-        experiment: which one: its number among those that were fitted, or another one, into which the parameters are
-            put. One that belongs to some experiments only is left out of another.
+        experiment: the number of one that was fitted, or another one, into which the parameters are put, without those
+            that belong to some experiments only.
         sigma: standard deviation of the noise of a new measurement, in the unit of the quantity; a number or an array
             that broadcasts against it. Default: no prediction band.
         level: of the bands [-]. Default: that of the fit.
@@ -81,18 +75,22 @@ def predict(
     if sigma is not None:
         require_positive("predict's sigma", sigma)
         require(np.size(sigma) > 0, "predict's sigma must be a number or an array of numbers, got an empty one.")
+    z = jnp.asarray(result.z, problem.dtype)
     try:
-        (value,), (J,) = _linearised(problem, eqx.Partial(_of_one, of, experiment), _coordinates(result))
+        (value,), (J,) = _linearised(problem, eqx.Partial(_of_one, of, experiment), z)
     except TypeError as error:
         if "custom_vjp" not in str(error):
             raise
         raise ValueError(
             "What is predicted has no derivative by forward mode: give the runs in it adjoint=diffrax.ForwardMode()."
         ) from None
-    noise = None if sigma is None else _broadcast(sigma, value.shape)
+    noise = None
     if sigma is not None:
         fault = f"predict's sigma must fit what is predicted, of shape {value.shape}, got shape {np.shape(sigma)}."
-        require(noise is not None, fault)
+        try:
+            noise = np.broadcast_to(np.asarray(sigma, float), value.shape)
+        except ValueError:
+            raise ValueError(fault) from None
     return _prediction(result, value, J, noise, None, level)
 
 
@@ -122,31 +120,33 @@ def predict_observations(
         shape == wanted,
         f"predict_observations needs experiments with as many observations as were fitted, {wanted}, got {shape}.",
     )
-    observations = [o for e in asked for o in e.observations]
+    problem, observations = result.problem, [o for e in asked for o in e.observations]
     same = all(
         e.t1 == f.t1 and eqx.tree_equal(e.observations, f.observations) for e, f in zip(asked, fitted, strict=True)
     )
     if same and all(o.robust is None and np.isfinite(o.data).all() for o in observations):
-        linearised = _from_residuals(result)
+        # The fit has them, and their derivatives, in its residuals.
+        values, derivatives = [], []
+        for o, sigma, rows in zip(observations, result.sigmas, problem.rows, strict=True):
+            scale = np.broadcast_to(np.asarray(sigma, float) / np.sqrt(o.trust[0]), o.data.shape)
+            values.append(o.data + scale * result.residuals[rows].reshape(o.data.shape))
+            derivatives.append(scale[..., None] * result.jacobian[rows].reshape(*o.data.shape, -1))
     else:
         asked = tuple(e.with_observations(a.observations, a.t1) for e, a in zip(fitted, asked, strict=True))
-        linearised = _linearised(result.problem, eqx.Partial(_observed, asked), _coordinates(result))
-    numbers = iter(range(len(observations)))
-    estimated = [None if is_given else next(numbers) for is_given in result.problem.noise_is_given]
-    return tuple(
-        _prediction(result, value, J, _noise(o, sigma, np.shape(value)), at, level)
-        for value, J, o, sigma, at in zip(*linearised, observations, result.sigmas, estimated, strict=True)
-    )
-
-
-def _from_residuals(result: FitResult) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-    """Predictions of plain observations and their derivatives, as the fit has them in its residuals."""
-    values, derivatives = [], []
-    for o, sigma, rows in zip(result.problem.observations, result.sigmas, result.problem.rows, strict=True):
-        scale = np.broadcast_to(np.asarray(sigma, float) / np.sqrt(o.trust[0]), o.data.shape)
-        values.append(o.data + scale * result.residuals[rows].reshape(o.data.shape))
-        derivatives.append(scale[..., None] * result.jacobian[rows].reshape(*o.data.shape, -1))
-    return tuple(values), tuple(derivatives)
+        z = jnp.asarray(result.z, problem.dtype)
+        values, derivatives = _linearised(problem, eqx.Partial(_observed, asked), z)
+    predictions, estimated = [], 0
+    each = zip(values, derivatives, observations, result.sigmas, problem.noise_is_given, strict=True)
+    for value, J, o, sigma, is_given in each:
+        # The noise of new measurements is the observation's own, or that of the fitted one.
+        sigma = np.asarray(sigma if o.sigma is None else o.sigma, float)
+        try:
+            noise = np.broadcast_to(sigma, np.shape(value))
+        except ValueError:
+            noise = np.full(np.shape(value), np.sqrt((sigma**2).mean()))
+        predictions.append(_prediction(result, value, J, noise, None if is_given else estimated, level))
+        estimated += not is_given
+    return tuple(predictions)
 
 
 def _of_one(
@@ -172,32 +172,8 @@ def _linearised(
     problem: FitProblem, function: Callable[[FitProblem, Coordinates], tuple[Array, ...]], z: Coordinates
 ) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
     """Values and their derivatives by the coordinates, shape (..., n), compiled."""
-
-    def push(tangent: Coordinates) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-        return jax.jvp(partial(function, problem), (z,), (tangent,))
-
-    values, columns = in_batches(push, jnp.eye(problem.size, dtype=z.dtype), problem.at_once)
+    values, columns = linearised(partial(function, problem), z, problem.at_once)
     return values, tuple(jnp.moveaxis(column, 0, -1) for column in columns)
-
-
-def _coordinates(result: FitResult) -> Coordinates:
-    return jnp.asarray(result.z, result.problem.dtype)
-
-
-def _broadcast(sigma: Any, shape: tuple[int, ...]) -> np.ndarray | None:
-    """A noise of this shape; None if it does not fit."""
-    try:
-        return np.broadcast_to(np.asarray(sigma, float), shape)
-    except ValueError:
-        return None
-
-
-def _noise(observation: AbstractObservation, fitted: Array, shape: tuple[int, ...]) -> np.ndarray:
-    """The noise of new measurements: the observation's own, or that of the fitted one, its root mean square where the
-    shapes differ."""
-    sigma = np.asarray(fitted if observation.sigma is None else observation.sigma, float)
-    noise = _broadcast(sigma, shape)
-    return np.full(shape, np.sqrt((sigma**2).mean())) if noise is None else noise
 
 
 def _prediction(
@@ -234,19 +210,13 @@ def _prediction(
 
 
 class Bootstrap(AbstractFit):
-    """The estimates of fits of data drawn anew.
-
-    `print(result)` shows a table; `result["E"].interval` is a percentile interval.
-    """
+    """The estimates of fits of data drawn anew; `result["E"].interval` is a percentile interval."""
 
     estimates: tuple[Estimate, ...]
     """The fitted numbers: values of the fit of what was measured, errors and percentile intervals of the samples."""
-    samples: Float[np.ndarray, "k n"]
-    """Their values in each fit that did not fail, shape (k, n)."""
-    level: float
-    """The level of the intervals [-]."""
-    failed: int
-    """How many fits failed, or came to no minimum."""
+    samples: Float[np.ndarray, "k n"]  # their values in each fit that did not fail, shape (k, n)
+    level: float  # the level of the intervals [-]
+    failed: int  # how many fits failed, or came to no minimum
 
     @property
     def all(self) -> tuple[Estimate, ...]:
@@ -273,12 +243,9 @@ def bootstrap(
     fit's σ, fitted again, many times (the parametric bootstrap: B. Efron, R. J. Tibshirani, An Introduction to the
     Bootstrap, Chapman & Hall 1993, chapters 6.5 and 13).
 
-        print(mpm.fitting.bootstrap(mpm.fit(pull, {"E": ...})))
-
     It takes the model and the independence of the noise for granted, as the errors of `fit` do: what it adds is the
     curvature of the model and what bounds do. `weight` and `robust` act in each fit; the noise drawn is of σ for each
-    number. A prior's mean is drawn anew too. Two hundred repeats fix a standard error to 5 %, and a 95 % interval
-    less well.
+    number. A prior's mean is drawn anew too. 200 repeats fix a standard error to 5 %, a 95 % interval less well.
 
     Args:
         result: the fit.
@@ -295,17 +262,23 @@ def bootstrap(
     rng = np.random.default_rng(require_whole("seed", seed, 0))
     problem, z = result.problem, jnp.asarray(result.z, result.problem.dtype)
     predicted = [np.asarray(y, float) for e in problem.at(z) for y in e.predictions(e.run())]
-    problems = [_drawn(problem, predicted, result.sigmas, rng) for _ in range(repeats)]
-
+    problems = []
+    for _ in range(repeats):
+        each = zip(problem.observations, predicted, result.sigmas, strict=True)
+        noisy = ((o, y + np.asarray(sigma) * rng.normal(size=y.shape)) for o, y, sigma in each)
+        data = [np.where(np.isfinite(o.data), y, np.nan) for o, y in noisy]
+        priors = [p.prior.drawn(rng) for p in problem.parameters if p.prior is not None]
+        drawn = eqx.tree_at(lambda p: [o.data for o in p.observations], problem, data)
+        drawn = eqx.tree_at(lambda q: [p.prior for p in q.parameters if p.prior is not None], drawn, priors)
+        problems.append((drawn, result.sigmas))
     members = search_many(
-        Problems.of(problems),
+        problems,
         result.optimiser if optimiser is None else optimiser,
-        np.repeat(np.asarray(result.z, float)[None], repeats, axis=0),
-        sigmas=Problems.of([result.sigmas]),
+        dict.fromkeys(range(repeats), result.z),
         batch=batch_size(problem, batch, repeats),
         progress=counted(progress, "{} of {} fits are done"),
     )
-    ends = [m.minimum.z for m in members if m.minimum is not None and m.minimum.converged]
+    ends = [m.z for m in members.values() if m.converged]
     require(len(ends) > 1, f"Of {repeats} fits of data drawn anew {len(ends)} came to a minimum: raise max_steps.")
     if len(ends) < repeats:
         warn(
@@ -317,14 +290,3 @@ def bootstrap(
     each = zip(result.estimates, errors, lower, upper, strict=True)
     estimates = tuple(e._replace(error=error, interval=(a, b)) for e, error, a, b in each)
     return Bootstrap(estimates, samples, result.level, repeats - len(ends))
-
-
-def _drawn(problem: FitProblem, predicted: list[np.ndarray], sigmas: tuple, rng: np.random.Generator) -> FitProblem:
-    """The problem with data of its simulation and new noise, NaN where nothing was measured."""
-    drawn = []
-    for observation, y, sigma in zip(problem.observations, predicted, sigmas, strict=True):
-        noisy = y + np.asarray(sigma) * rng.normal(size=y.shape)
-        drawn.append(np.where(np.isfinite(observation.data), noisy, np.nan))
-    problem = eqx.tree_at(lambda p: [o.data for o in p.observations], problem, drawn)
-    priors = [p.prior.drawn(rng) for p in problem.parameters if p.prior is not None]
-    return eqx.tree_at(lambda q: [p.prior for p in q.parameters if p.prior is not None], problem, priors)

@@ -14,8 +14,9 @@ import numpy as np
 
 from mpmjax._types import Array, Float
 from mpmjax.checks import require, require_whole, shortened
-from mpmjax.fitting._experiment import AbstractObservation, Experiment
+from mpmjax.fitting._experiment import AbstractObservation, Experiment, observe_all
 from mpmjax.fitting._parameter import AbstractParameter
+from mpmjax.state import velocity_gradient
 
 Coordinates = Float[Array, "n"]  # the coordinates z of all parameters, one after the other [-]
 Sigmas = tuple[Array, ...]  # the noise of each observation, in its data's unit
@@ -27,10 +28,8 @@ class FitProblem(eqx.Module):
     experiments: tuple[Experiment, ...]
     names: tuple[str, ...] = eqx.field(static=True)
     parameters: tuple[AbstractParameter, ...]
-    starts: tuple[Array, ...]
-    """The first guess of each."""
-    memory: int = eqx.field(static=True, default=2**28)
-    """Memory for what reverse mode stores, and for tangents [B]."""
+    starts: tuple[Array, ...]  # the first guess of each
+    memory: int = eqx.field(static=True, default=2**28)  # memory for what reverse mode stores, and for tangents [B]
 
     def __init__(
         self,
@@ -58,11 +57,27 @@ class FitProblem(eqx.Module):
         )
 
     def _start(self, name: str, parameter: AbstractParameter) -> Array:
+        """The first guess of a parameter, which must be a number or an array of its experiments."""
         numbers = range(len(self.experiments)) if parameter.only is None else parameter.only
         unknown = [k for k in numbers if not 0 <= k < len(self.experiments)]
         require(not unknown, f"The parameter {name!r} is only of experiments {unknown}, which there are not.")
         require(len(numbers) > 0, f"The parameter {name!r} is of no experiment: only must name one at least.")
-        start = _first_guess(name, parameter, self.experiments[numbers[0]])
+        experiment = self.experiments[numbers[0]]
+        try:
+            start = parameter.first_guess(experiment)
+            changed = parameter.put(experiment, start + 1 + jnp.abs(start))
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"The parameter {name!r} must name a number of the experiment e, such as "
+                f"lambda e: e.scene.material.youngs_modulus: {shortened(str(error), 200)}."
+            ) from None
+        before, after = jax.tree.leaves(experiment), jax.tree.leaves(changed)
+        same = len(before) == len(after) and all(
+            np.shape(a) == np.shape(b) and np.array_equal(a, b)
+            for a, b in zip(before, after, strict=True)
+            if eqx.is_array_like(a)
+        )
+        require(not same, f"The parameter {name!r} changes nothing of the experiment: name a number that it has.")
         parameter.check(name, np.asarray(start))
         if parameter.prior is not None:
             parameter.prior.check(name, start.shape)
@@ -94,7 +109,7 @@ class FitProblem(eqx.Module):
     def fixed_by_priors(self) -> int:
         """How many numbers the priors fix by themselves."""
         each = zip(self.starts, self.parameters, strict=True)
-        return sum(parameter.prior.fixes(start.shape) for start, parameter in each if parameter.prior is not None)
+        return sum(p.prior.fixes(start.shape) for start, p in each if p.prior is not None)
 
     @property
     def noise_is_given(self) -> tuple[bool, ...]:
@@ -114,12 +129,6 @@ class FitProblem(eqx.Module):
             for name, start in zip(self.names, self.starts, strict=True)
             for place in np.ndindex(start.shape)
         )
-
-    @property
-    def scales_alike(self) -> bool:
-        """Whether another noise would not move the minimum: there is one observation, squares alone and no prior."""
-        (first, *others), priors = self.observations, [p for p in self.parameters if p.prior is not None]
-        return not others and not priors and first.robust is None
 
     @property
     def owners(self) -> tuple[AbstractParameter, ...]:
@@ -203,7 +212,12 @@ class FitProblem(eqx.Module):
         for parameter, value in zip(self.parameters, self.values(z), strict=True):
             if parameter.only is None or number in parameter.only:
                 experiment = parameter.put(experiment, value)
-        return experiment.with_gradient_since(before)
+        now = experiment.particles
+        if now.C is None or now.C is not before.C or now.v is before.v:
+            return experiment
+        # The gradient of the change of velocities that parameters made; one that they changed themselves stays.
+        change = velocity_gradient(experiment.scene, eqx.tree_at(lambda q: q.v, now, now.v - before.v))
+        return eqx.tree_at(lambda e: e.particles.C, experiment, now.C + change)
 
     def residuals(self, z: Coordinates, sigmas: Sigmas, adjoint: Any) -> tuple[Array, Array]:
         """The residuals of all observations, then of priors [-], shape (m,), NaN where a simulation met a fault or does
@@ -239,10 +253,12 @@ class FitProblem(eqx.Module):
     def explain(
         self, z: Coordinates, failure: str = "What is observed of the simulation at the first guess is not finite."
     ) -> NoReturn:
-        """Raise the error that says why a fit fails at z: of the simulation (see `Experiment.explain`), else with
-        `failure`."""
+        """Raise the error that says why a fit fails at z: of the simulation, or of an observation that it does not
+        reach; else with `failure`."""
         for experiment in self.at(z):
-            experiment.explain()
+            run = experiment.run()
+            for observation, seen in zip(experiment.observations, run.observed, strict=True):
+                observation.explain(seen, run)
         raise ValueError(failure)
 
     def jacobian(
@@ -255,15 +271,11 @@ class FitProblem(eqx.Module):
         if (self.cheaper_mode if mode is None else mode) == "reverse":
             r, pull, _ = jax.vjp(lambda z: self.residuals(z, sigmas, None), z, has_aux=True)
             units = jnp.eye(self.measured, len(r), dtype=r.dtype)  # priors need no simulation
-            _, (rows,) = in_batches(lambda unit: ((), pull(unit)), units, self.at_once)
+            _, (rows,) = _in_batches(lambda unit: ((), pull(unit)), units, self.at_once)
             return r, jnp.concatenate([rows, jax.jacfwd(self.prior_residuals)(z)])
 
-        def push(tangent: Coordinates) -> tuple[Array, tuple[Array, Array]]:
-            evaluate = partial(self.residuals, sigmas=sigmas, adjoint=diffrax.ForwardMode())
-            (r, _), (column, unsolved) = jax.jvp(evaluate, (z,), (tangent,))
-            return r, (column, unsolved)
-
-        r, (columns, unsolved) = in_batches(push, jnp.eye(self.size, dtype=z.dtype), self.at_once)
+        evaluate = partial(self.residuals, sigmas=sigmas, adjoint=diffrax.ForwardMode())
+        (r, _), (columns, unsolved) = linearised(evaluate, z, self.at_once)
         return r, jnp.where((unsolved != 0).any(), jnp.nan, columns.T)
 
     @property
@@ -274,31 +286,27 @@ class FitProblem(eqx.Module):
     @property
     def at_once(self) -> int:
         """How many tangents, or rows, of all experiments fit into the memory."""
-        each = sum(_COPIES * _bytes(e.particles) + _bytes(e.observed_shape) * (e.steps + 1) for e in self.experiments)
+
+        def size(tree: Any) -> int:
+            """Size of all arrays, or of shapes that stand for them [B]."""
+            leaves = [leaf for leaf in jax.tree.leaves(tree) if hasattr(leaf, "dtype")]
+            return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in leaves)
+
+        each = 0
+        for e in self.experiments:
+            seen = jax.eval_shape(eqx.Partial(observe_all, e.observations), e.scene, e.particles)
+            each += _COPIES * size(e.particles) + size(seen) * (e.steps + 1)
         return max(1, int(self.memory // max(each, 1)))
 
 
-def _first_guess(name: str, parameter: AbstractParameter, experiment: Experiment) -> Array:
-    """The first guess of a parameter, which must be a number or an array of the experiment."""
-    try:
-        start = parameter.first_guess(experiment)
-        changed = parameter.put(experiment, start + 1 + jnp.abs(start))
-    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"The parameter {name!r} must name a number of the experiment e, such as "
-            f"lambda e: e.scene.material.youngs_modulus: {shortened(str(error), 200)}."
-        ) from None
-    before, after = jax.tree.leaves(experiment), jax.tree.leaves(changed)
-    same = len(before) == len(after) and all(
-        np.shape(a) == np.shape(b) and np.array_equal(a, b)
-        for a, b in zip(before, after, strict=True)
-        if eqx.is_array_like(a)
-    )
-    require(not same, f"The parameter {name!r} changes nothing of the experiment: name a number that it has.")
-    return start
+def linearised(function: Callable[[Coordinates], Any], z: Coordinates, at_once: int) -> tuple[Any, Any]:
+    """What a function returns, and its derivative by each coordinate, with a leading axis n: by forward mode, so many
+    tangents at once."""
+    units = jnp.eye(len(z), dtype=z.dtype)
+    return _in_batches(lambda tangent: jax.jvp(function, (z,), (tangent,)), units, at_once)
 
 
-def in_batches(function: Callable[[Array], tuple[Any, Any]], units: Array, at_once: int) -> tuple[Any, Any]:
+def _in_batches(function: Callable[[Array], tuple[Any, Any]], units: Array, at_once: int) -> tuple[Any, Any]:
     """A function of each row of `units`, shape (k, ...), by batches of `at_once` rows. It returns two pytrees: one
     that is the same for all rows, and one of each row, which gets a leading axis k."""
     count = len(units)
@@ -316,12 +324,6 @@ def in_batches(function: Callable[[Array], tuple[Any, Any]], units: Array, at_on
     padded = jnp.concatenate([units, jnp.zeros((batches * size - count, *units.shape[1:]), units.dtype)])
     once, each = jax.lax.map(batch, padded.reshape(batches, size, *units.shape[1:]))
     return jax.tree.map(lambda a: a[0], once), jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:count], each)
-
-
-def _bytes(tree: Any) -> int:
-    """Size of all arrays, or of shapes that stand for them [B]."""
-    leaves = [leaf for leaf in jax.tree.leaves(tree) if hasattr(leaf, "dtype")]
-    return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in leaves)
 
 
 SHOWN = 4  # parameters that a line has room for

@@ -1,7 +1,7 @@
 """Profile likelihoods: intervals that need no straight line."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,10 +10,9 @@ import numpy as np
 from mpmjax._types import Array, Float, Scalar
 from mpmjax.checks import checked, require, require_positive, require_whole, warn
 from mpmjax.fitting._fit import checked_level
-from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
 from mpmjax.fitting._result import FitResult, intervals
-from mpmjax.fitting._search import NoDerivativeError, search
+from mpmjax.fitting._search import AbstractOptimiser, search
 from mpmjax.fitting._uncertainty import quantile
 
 
@@ -23,31 +22,20 @@ class Profile(eqx.Module):
     `print(profile)` says its interval.
     """
 
-    label: str
-    """The parameter."""
+    label: str  # the parameter
     unit: str
-    values: np.ndarray
-    """Values of the parameter, growing, shape (p,); the fit's is among them."""
-    statistic: np.ndarray
-    """Δχ² = Σ r² there less that of the fit, in units of the noise, shape (p,)."""
-    numbers: np.ndarray
-    """All fitted numbers along it, one a column in the order of `labels`, shape (p, n)."""
-    labels: tuple[str, ...]
-    """Names of the fitted numbers."""
-    estimate: float
-    """The value of the fit."""
-    symmetric: tuple[float, float]
-    """The interval of the standard error."""
+    values: np.ndarray  # values of the parameter, growing, shape (p,); the fit's is among them
+    statistic: np.ndarray  # Δχ² = Σ r² there less that of the fit, in units of the noise, shape (p,)
+    numbers: np.ndarray  # all fitted numbers along it, one a column in the order of `labels`, shape (p, n)
+    labels: tuple[str, ...]  # names of the fitted numbers
+    estimate: float  # the value of the fit
+    symmetric: tuple[float, float]  # the interval of the standard error
     interval: tuple[float, float]
     """Where Δχ² is below the threshold. An end that was not found is the parameter's bound, or infinite."""
-    threshold: float
-    """Δχ² at the interval's ends: the quantile of χ² of one degree of freedom, or of F(1, ν)."""
-    degrees_of_freedom: float
-    """ν of the noise's estimate; infinite where it was given."""
-    level: float
-    """The level of the interval [-], such as 0.95."""
-    warnings: tuple[str, ...]
-    """Where it ends without an end of the interval, in words."""
+    threshold: float  # Δχ² at the interval's ends: the quantile of χ² of one degree of freedom, or of F(1, ν)
+    degrees_of_freedom: float  # ν of the noise's estimate; infinite where it was given
+    level: float  # the level of the interval [-], such as 0.95
+    warnings: tuple[str, ...]  # where it ends without an end of the interval, in words
 
     @property
     def signed_root(self) -> np.ndarray:
@@ -101,9 +89,8 @@ def profile(
 
     From the estimate it goes to either side in steps of equal growth of √Δχ², as the last two points foretell it, each
     fit started on the line through them. A value at which the simulation fails is approached by halves. Where the
-    threshold is never reached the interval is open on that side, and a warning says how far Δχ² came; where Δχ² jumps
-    over it, as a simulation does beyond its stable step, a warning says that. One program is compiled for all points,
-    and for all numbers of a fit.
+    threshold is never reached the interval is open, and where Δχ² jumps over it, as a simulation does beyond its stable
+    step, it ends there: a warning says so. One program is compiled for all points, and for all numbers of a fit.
 
     The noise is held at what the fit found. With a robust or weighted observation the threshold is approximate.
 
@@ -119,39 +106,166 @@ def profile(
     Raises:
         ValueError: there is no such fitted number; a level that is none.
     """
-    problem = result.problem
+    problem, sigmas, dtype = result.problem, result.sigmas, result.problem.dtype
     require(label in problem.labels, f"A profile is of a fitted number: {', '.join(problem.labels)}. Got {label!r}.")
     level = checked_level(result.level if level is None else level)
     require_whole("profile's points", points, 1)
     require_positive("profile's rtol", rtol)
-    at = problem.labels.index(label)
-    _, freedom = result.uncertainty.of(np.eye(problem.size)[at])
-    walk = _Walk(result, at, result.optimiser if optimiser is None else optimiser, progress)
+    at, optimiser = problem.labels.index(label), result.optimiser if optimiser is None else optimiser
+    unit, errors = np.eye(problem.size)[at], result.uncertainty
+    freedom, error = float(errors.of(unit)[1]), float(errors.error[at])
     reach = float(quantile(level, freedom))
-    ends = [walk.end(side, reach, points, float(rtol)) for side in (-1, 1)]
-    path = sorted(walk.visited, key=lambda point: point.z[at])
-    numbers = np.stack([walk.numbers(point.z) for point in path])
-    values = [walk.value(end.at) for end in ends]
-    warnings = tuple(walk.warnings(ends, reach))
-    for text in warnings:
+
+    def numbers(z: np.ndarray) -> np.ndarray:
+        """All fitted numbers at coordinates."""
+        return np.asarray(problem.numbers(jnp.asarray(z, dtype)), float)
+
+    def value(place: float) -> float:
+        """The value of the number where its coordinate is at a place, which may be infinite."""
+        return float(numbers(np.where(unit == 1, place, start[0]))[at])
+
+    def misfit(z: np.ndarray) -> float:
+        """Σ r²."""
+        return float((np.asarray(_residuals(problem, jnp.asarray(z, dtype), sigmas), float) ** 2).sum())
+
+    start: _Point = np.asarray(result.z, float), 0.0
+    least, visited, unsettled, texts = misfit(start[0]), [start], 0, list[str]()
+    # How the other coordinates follow this one when it is moved, by the covariance.
+    blind = errors.unseen.shape[1] and np.isinf(error)
+    along = errors.unseen @ (errors.unseen.T @ unit) if blind else errors.inverse @ unit
+    first_pace = error if np.isfinite(error) else min(float(errors.alone[at]), 1.0)
+    if np.isfinite(problem.room(jnp.asarray(result.z, dtype))[:, at]).any():
+        # Away from a bound, a step of the coordinate that moves the value by its standard error.
+        first_pace = float(np.log1p(first_pace))
+
+    def visit(place: float, last: _Point, before: _Point) -> _Point | None:
+        """The least misfit with the coordinate held at a place; None where the simulation fails. The search of the
+        others starts on the line through two points, or along the direction of the covariance from the fit."""
+        nonlocal unsettled
+        covered = last[0][at] - before[0][at]
+        z = last[0] + (along / along[at] if covered == 0 else (last[0] - before[0]) / covered) * (place - last[0][at])
+        z[at] = place
+        if len(z) == 1:
+            square = misfit(z)
+        else:
+            basis = np.delete(np.eye(len(z)), at, axis=1)
+            held = _RestrictedProblem(problem, jnp.asarray(z, dtype), jnp.asarray(basis, dtype))
+            end = search(held, optimiser, jnp.zeros(basis.shape[1], dtype), sigmas)
+            if end.interrupted:
+                raise KeyboardInterrupt
+            if end.failure:
+                return None
+            unsettled += not end.converged
+            z, square = z + basis @ np.asarray(end.z, float), float((np.asarray(end.seen.residuals, float) ** 2).sum())
+        if not np.isfinite(square):
+            return None
+        visited.append((z, square - least))
+        if progress is not None:
+            progress(f"profile of {label}: Δχ² {square - least:8.4g}  {problem.shown(z)}")
+        return visited[-1]
+
+    def crossing(below: _Point, above: _Point) -> tuple[float, _Point, float | None, float | None]:
+        """Where √Δχ² is `reach` between two points, by Brent's method. A value at which the simulation fails counts as
+        beyond it. As of `end`, with Δχ² beyond a jump at the threshold, if it jumps."""
+        from scipy.optimize import root_scalar  # here, since it takes long to import
+
+        tried: dict[float, _Point | None] = {below[0][at]: below, above[0][at]: above}
+
+        def excess(place: float) -> float:
+            if place not in tried:
+                tried[place] = visit(place, below, above)
+            point = tried[place]
+            return reach if point is None else _root(point) - reach
+
+        within = float(rtol) / 2 * abs(above[0][at] - start[0][at])
+        root = root_scalar(excess, method="brentq", bracket=(below[0][at], above[0][at]), xtol=within).root
+        apart = {place: excess(place) for place in tried}
+        inner = min((p for p in apart if apart[p] < 0), key=lambda p: abs(p - root))
+        outer = min((p for p in apart if apart[p] >= 0), key=lambda p: abs(p - root))
+        last, beyond = tried[inner], tried[outer]
+        assert last is not None
+        if apart[outer] - apart[inner] < _JUMP * reach or abs(outer - inner) > 4 * within:
+            return float(root), last, None, None
+        if beyond is None:
+            return float(np.copysign(np.inf, outer - inner)), last, float(outer), None
+        return float(root), last, None, beyond[1]
+
+    def end(side: int) -> tuple[float, _Point, float | None, float | None]:
+        """Walk to one side until √Δχ² is beyond `reach`: the coordinate where it crosses, infinite if it does not; the
+        last point; and the nearest coordinate at which the simulation fails, if it does."""
+        farthest = max(_FARTHEST, 3 * reach * error) if np.isfinite(error) else _FARTHEST
+        before, last, pace, fault = start, start, first_pace, np.inf
+        for _ in range(_MOST_POINTS):
+            gone = float(abs(last[0][at] - start[0][at]))
+            wanted = gone + _BEYOND * reach / points * pace
+            wanted = (gone + fault) / 2 if wanted >= fault else min(wanted, farthest)
+            point = visit(start[0][at] + side * wanted, last, before)
+            if point is None:
+                fault = wanted
+                if fault - gone < _NEAR_FAULT * fault:
+                    break
+                continue
+            if _root(point) >= reach:
+                return crossing(last, point)
+            grown = _root(point) - _root(last)
+            longest = _FASTER * (wanted - gone) * points / reach
+            pace = min((wanted - gone) / grown, longest) if grown > 0 else longest
+            here, there, estimate = (numbers(z)[at] for z, _ in (point, last, start))
+            before, last = last, point
+            if wanted >= farthest or abs(here - there) <= _STILL * (wanted - gone) * abs(estimate):
+                break
+        return side * np.inf, last, float(start[0][at] + side * fault) if np.isfinite(fault) else None, None
+
+    ends = [end(side) for side in (-1, 1)]
+    for (place, (z, growth), fault, jump), where in zip(ends, ("below", "above"), strict=True):
+        if jump is not None:
+            texts.append(
+                f"{label}: the interval ends {where} at {numbers(z)[at]:.5g}, where Δχ² jumps from "
+                f"{max(growth, 0):.2g} to {jump:.2g}: the simulation changes abruptly there, and not the data end it. "
+                "See whether its step is stable."
+            )
+        if np.isinf(place):
+            beyond = "" if fault is None else f" Beyond, at {value(fault):.5g}, the simulation fails."
+            texts.append(
+                f"{label}: the interval is open {where}. At {numbers(z)[at]:.5g} Δχ² is {max(growth, 0):.2g}, less "
+                f"than {reach**2:.3g}: the data do not bound it.{beyond}"
+            )
+    z, growth = min(visited, key=lambda point: point[1])
+    if growth < -_BETTER:
+        texts.append(
+            f"{label}: the profile found a misfit smaller by {-growth:.2g} at {numbers(z)[at]:.5g}: the fit is not at "
+            "the least one. Fit again from there."
+        )
+    if unsettled:
+        texts.append(f"{label}: at {unsettled} points of the profile the others did not converge.")
+    for text in texts:
         warn(text)
-    estimate = result.estimates[at]
-    symmetric = intervals(problem, jnp.asarray(result.z), result.uncertainty, result.gradient, level)
+    path = sorted(visited, key=lambda point: point[0][at])
+    along_path, values = np.stack([numbers(z) for z, _ in path]), [value(place) for place, *_ in ends]
+    symmetric = intervals(problem, jnp.asarray(result.z), errors, result.gradient, level)
     return Profile(
         label=label,
-        unit=estimate.unit,
-        values=numbers[:, at],
-        statistic=np.array([point.growth for point in path]),
-        numbers=numbers,
+        unit=result.estimates[at].unit,
+        values=along_path[:, at],
+        statistic=np.array([growth for _, growth in path]),
+        numbers=along_path,
         labels=problem.labels,
-        estimate=estimate.value,
+        estimate=result.estimates[at].value,
         symmetric=(float(symmetric[0][at]), float(symmetric[1][at])),
         interval=(min(values), max(values)),
         threshold=reach**2,
-        degrees_of_freedom=float(freedom),
+        degrees_of_freedom=freedom,
         level=level,
-        warnings=warnings,
+        warnings=tuple(texts),
     )
+
+
+_Point = tuple[np.ndarray, float]  # all coordinates where one is held, the others fitted, shape (n,), and Δχ² there
+
+
+def _root(point: _Point) -> float:
+    """√Δχ²; negative where the misfit is less than that of the fit."""
+    return float(np.sign(point[1]) * np.sqrt(abs(point[1])))
 
 
 class _RestrictedProblem(FitProblem):
@@ -188,186 +302,6 @@ class _RestrictedProblem(FitProblem):
 
     def residuals(self, z: Coordinates, sigmas: Sigmas, adjoint: Any) -> tuple[Array, Array]:
         return self.whole.residuals(self.place(z), sigmas, adjoint)
-
-
-class _Point(NamedTuple):
-    """The least misfit where the coordinate is held."""
-
-    z: np.ndarray  # all coordinates, shape (n,)
-    growth: float  # Δχ²
-
-    @property
-    def root(self) -> float:
-        """√Δχ²; negative where the misfit is less than that of the fit."""
-        return float(np.sign(self.growth) * np.sqrt(abs(self.growth)))
-
-
-class _End(NamedTuple):
-    """Where one side of a profile ends."""
-
-    at: float  # the coordinate at the threshold; infinite where that is not reached
-    last: _Point  # the last point
-    fault: float | None = None  # the nearest coordinate at which the simulation fails
-    jump: float | None = None  # Δχ² beyond a jump at the threshold, if it jumps
-
-
-class _Walk:
-    """A walk along a profile, which remembers the points that it visited."""
-
-    def __init__(
-        self, result: FitResult, at: int, optimiser: AbstractOptimiser, progress: Callable[[str], None] | None
-    ):
-        self.problem, self.sigmas, self.at = result.problem, result.sigmas, at
-        self.optimiser, self.progress = optimiser, progress
-        self.label, self.unsettled = result.problem.labels[at], 0
-        z = np.asarray(result.z, float)
-        self.least = self._misfit(z)
-        self.start = _Point(z, 0.0)
-        self.visited = [self.start]
-        errors, unit = result.uncertainty, np.eye(result.problem.size)[at]
-        self.error = float(errors.error[at])
-        # How the other coordinates follow this one when it is moved, by the covariance.
-        blind = errors.unseen.shape[1] and np.isinf(self.error)
-        along = errors.unseen @ (errors.unseen.T @ unit) if blind else errors.inverse @ unit
-        self.rate = along / along[at]
-        self.pace = self.error if np.isfinite(self.error) else min(float(errors.alone[at]), 1.0)
-        if np.isfinite(result.problem.room(jnp.asarray(result.z, result.problem.dtype))[:, at]).any():
-            # Away from a bound, a step of the coordinate that moves the value by its standard error.
-            self.pace = float(np.log1p(self.pace))
-
-    def end(self, side: int, reach: float, points: int, rtol: float) -> _End:
-        """Walk to one side until √Δχ² is beyond `reach`, and find where it crosses."""
-        farthest = max(_FARTHEST, 3 * reach * self.error) if np.isfinite(self.error) else _FARTHEST
-        before, last, pace, nearest_fault = self.start, self.start, self.pace, np.inf
-        for _ in range(_MOST_POINTS):
-            gone = self._distance(last)
-            wanted = gone + _BEYOND * reach / points * pace
-            wanted = (gone + nearest_fault) / 2 if wanted >= nearest_fault else min(wanted, farthest)
-            point = self.visit(self.start.z[self.at] + side * wanted, last, before)
-            if point is None:
-                nearest_fault = wanted
-                if nearest_fault - gone < _NEAR_FAULT * nearest_fault:
-                    break
-                continue
-            if point.root >= reach:
-                return self._crossing(last, point, reach, rtol)
-            grown = point.root - last.root
-            longest = _FASTER * (wanted - gone) * points / reach
-            pace = min((wanted - gone) / grown, longest) if grown > 0 else longest
-            value, before_it, estimate = (self.numbers(p.z)[self.at] for p in (point, last, self.start))
-            still = abs(value - before_it) <= _STILL * (wanted - gone) * abs(estimate)
-            before, last = last, point
-            if wanted >= farthest or still:
-                break
-        fault = self.start.z[self.at] + side * nearest_fault
-        return _End(side * np.inf, last, float(fault) if np.isfinite(fault) else None)
-
-    def _distance(self, point: _Point) -> float:
-        """Distance of a point's coordinate from the estimate's."""
-        return float(abs(point.z[self.at] - self.start.z[self.at]))
-
-    def visit(self, place: float, last: _Point, before: _Point) -> _Point | None:
-        """The least misfit with the coordinate held at a place; None where the simulation fails. The search of the
-        others starts on the line through two points, or along the direction of the covariance from the fit."""
-        covered = last.z[self.at] - before.z[self.at]
-        rate = self.rate if covered == 0 else (last.z - before.z) / covered
-        guess = last.z + rate * (place - last.z[self.at])
-        guess[self.at] = place
-        try:
-            z, misfit = self._refitted(guess)
-        except NoDerivativeError:
-            return None
-        if not np.isfinite(misfit):
-            return None
-        point = _Point(z, misfit - self.least)
-        self.visited.append(point)
-        if self.progress is not None:
-            self.progress(f"profile of {self.label}: Δχ² {point.growth:8.4g}  {self.problem.shown(z)}")
-        return point
-
-    def numbers(self, z: np.ndarray) -> np.ndarray:
-        """All fitted numbers at coordinates."""
-        return np.asarray(self.problem.numbers(jnp.asarray(z, self.problem.dtype)), float)
-
-    def value(self, place: float) -> float:
-        """The value of the number where its coordinate is at a place, which may be infinite."""
-        z = self.start.z.copy()
-        z[self.at] = place
-        return float(self.numbers(z)[self.at])
-
-    def warnings(self, ends: list[_End], reach: float) -> list[str]:
-        """Ends that are no ends of the interval, in words."""
-        texts = []
-        for end, where in zip(ends, ("below", "above"), strict=True):
-            value = self.numbers(end.last.z)[self.at]
-            if end.jump is not None:
-                texts.append(
-                    f"{self.label}: the interval ends {where} at {value:.5g}, where Δχ² jumps from "
-                    f"{max(end.last.growth, 0):.2g} to {end.jump:.2g}: the simulation changes abruptly there, and not "
-                    "the data end it. See whether its step is stable."
-                )
-            if np.isfinite(end.at):
-                continue
-            fault = end.fault
-            beyond = "" if fault is None else f" Beyond, at {self.value(fault):.5g}, the simulation fails."
-            texts.append(
-                f"{self.label}: the interval is open {where}. At {value:.5g} Δχ² is {max(end.last.growth, 0):.2g}, "
-                f"less than {reach**2:.3g}: the data do not bound it.{beyond}"
-            )
-        best = min(self.visited, key=lambda point: point.growth)
-        if best.growth < -_BETTER:
-            texts.append(
-                f"{self.label}: the profile found a misfit smaller by {-best.growth:.2g} at "
-                f"{self.numbers(best.z)[self.at]:.5g}: the fit is not at the least one. Fit again from there."
-            )
-        if self.unsettled:
-            texts.append(f"{self.label}: at {self.unsettled} points of the profile the others did not converge.")
-        return texts
-
-    def _crossing(self, below: _Point, above: _Point, reach: float, rtol: float) -> _End:
-        """Where √Δχ² is `reach` between two points, by Brent's method. A value at which the simulation fails counts as
-        beyond it."""
-        from scipy.optimize import root_scalar  # here, since it takes long to import
-
-        tried: dict[float, _Point | None] = {below.z[self.at]: below, above.z[self.at]: above}
-
-        def excess(place: float) -> float:
-            if place not in tried:
-                tried[place] = self.visit(place, below, above)
-            point = tried[place]
-            return reach if point is None else point.root - reach
-
-        within = rtol / 2 * self._distance(above)
-        root = root_scalar(excess, method="brentq", bracket=(below.z[self.at], above.z[self.at]), xtol=within).root
-        apart = {place: excess(place) for place in tried}
-        inner = min((p for p in apart if apart[p] < 0), key=lambda p: abs(p - root))
-        outer = min((p for p in apart if apart[p] >= 0), key=lambda p: abs(p - root))
-        last, next_ = tried[inner], tried[outer]
-        assert last is not None
-        if apart[outer] - apart[inner] < _JUMP * reach or abs(outer - inner) > 4 * within:
-            return _End(float(root), last)
-        if next_ is None:
-            return _End(float(np.copysign(np.inf, outer - inner)), last, float(outer))
-        return _End(float(root), last, jump=next_.growth)
-
-    def _refitted(self, guess: np.ndarray) -> tuple[np.ndarray, float]:
-        """All coordinates, the others fitted, and the misfit."""
-        if len(guess) == 1:
-            return guess, self._misfit(guess)
-        problem = self.problem
-        basis = np.delete(np.eye(len(guess)), self.at, axis=1)
-        held = _RestrictedProblem(problem, jnp.asarray(guess, problem.dtype), jnp.asarray(basis, problem.dtype))
-        minimum = search(held, self.optimiser, jnp.zeros(basis.shape[1], problem.dtype), self.sigmas)
-        if minimum.interrupted:
-            raise KeyboardInterrupt
-        if not minimum.converged and np.isfinite(minimum.cost):
-            self.unsettled += 1
-        return guess + basis @ np.asarray(minimum.z, float), float((np.asarray(minimum.r, float) ** 2).sum())
-
-    def _misfit(self, z: np.ndarray) -> float:
-        """Σ r²."""
-        r = _residuals(self.problem, jnp.asarray(z, self.problem.dtype), self.sigmas)
-        return float((np.asarray(r, float) ** 2).sum())
 
 
 @eqx.filter_jit

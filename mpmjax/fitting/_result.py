@@ -15,10 +15,9 @@ from scipy.special import chdtrc
 from mpmjax._types import Array
 from mpmjax.checks import require
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import SHOWN, Coordinates, FitProblem, Sigmas
-from mpmjax.fitting._search import Iteration, Minimum
+from mpmjax.fitting._search import AbstractOptimiser, Iteration, Search
 from mpmjax.fitting._uncertainty import Uncertainty, at_bound, noise, quantile, seen_together, uncertainty
 
 
@@ -27,15 +26,11 @@ class Estimate(NamedTuple):
 
     label: str
     value: float
-    error: float
-    """Standard error."""
-    interval: tuple[float, float]
-    """Where it lies at the level of the fit."""
+    error: float  # standard error
+    interval: tuple[float, float]  # where it lies at the level of the fit
     unit: str = ""
-    start: float = np.nan
-    """The first guess."""
-    at_bound: bool = False
-    """Whether it came to lie at a bound, where errors mean little."""
+    start: float = np.nan  # the first guess
+    at_bound: bool = False  # whether it came to lie at a bound, where errors mean little
 
     @property
     def name(self) -> str:
@@ -52,14 +47,10 @@ class NoiseEstimate(NamedTuple):
     """The noise of an observation."""
 
     name: str
-    sigma: float
-    """Standard deviation, the root mean square where it varies, in the data's unit."""
-    estimated: bool
-    """Whether the fit estimated it."""
-    misfit: float
-    """Root mean square of the residuals, in units of σ."""
-    points: int
-    """How many numbers were measured."""
+    sigma: float  # standard deviation, the root mean square where it varies, in the data's unit
+    estimated: bool  # whether the fit estimated it
+    misfit: float  # root mean square of the residuals, in units of σ
+    points: int  # how many numbers were measured
 
 
 class AbstractFit(eqx.Module):
@@ -83,45 +74,27 @@ class AbstractFit(eqx.Module):
 
 
 class FitResult(AbstractFit):
-    """Fitted parameters, their errors, and the fitted scene.
+    """Fitted parameters, their errors, and the fitted scene."""
 
-    `print(result)` shows a table; `result["E"]` is the estimate of a parameter.
-    """
-
-    problem: FitProblem
-    """The residuals that were made small."""
-    z: np.ndarray
-    """The coordinates at the minimum [-], shape (n,)."""
-    sigmas: Sigmas
-    """The noise of each observation, given or estimated, in the data's unit."""
-    residuals: np.ndarray
-    """Residuals of all observations, then of priors, in units of their noise [-], shape (m,)."""
-    jacobian: np.ndarray
-    """Their derivative by the coordinates, shape (m, n)."""
-    uncertainty: Uncertainty
-    """Covariance of the coordinates, and the directions that the data do not see."""
-    estimates: tuple[Estimate, ...]
-    """The fitted numbers, one for each entry of each parameter."""
-    reported: tuple[Estimate, ...]
-    """The estimates that `report` asked for."""
-    chi_squared: float
-    """Σ r², priors included."""
-    degrees_of_freedom: int
-    """Measured numbers and priors, less parameters."""
-    noise: tuple[NoiseEstimate, ...]
-    """The noise of each observation."""
-    experiments: tuple[Experiment, ...]
-    """The experiments with the fitted values."""
-    level: float
-    """The level of the intervals [-], such as 0.95."""
-    optimiser: AbstractOptimiser
-    """The method of the search."""
+    problem: FitProblem  # the residuals that were made small
+    z: np.ndarray  # the coordinates at the minimum [-], shape (n,)
+    sigmas: Sigmas  # the noise of each observation, given or estimated, in the data's unit
+    residuals: np.ndarray  # residuals of all observations, then of priors, in units of their noise [-], shape (m,)
+    jacobian: np.ndarray  # their derivative by the coordinates, shape (m, n)
+    uncertainty: Uncertainty  # covariance of the coordinates, and the directions that the data do not see
+    estimates: tuple[Estimate, ...]  # the fitted numbers, one for each entry of each parameter
+    reported: tuple[Estimate, ...]  # the estimates that `report` asked for
+    chi_squared: float  # Σ r², priors included
+    degrees_of_freedom: int  # measured numbers and priors, less parameters
+    noise: tuple[NoiseEstimate, ...]  # the noise of each observation
+    experiments: tuple[Experiment, ...]  # the experiments with the fitted values
+    level: float  # the level of the intervals [-], such as 0.95
+    optimiser: AbstractOptimiser  # the method of the search
     converged: bool
     history: tuple[Iteration, ...]
     warnings: tuple[str, ...]
     """Directions that the data do not see, and a misfit that the noise does not explain, in words."""
-    interrupted: bool = False
-    """Whether Ctrl-C ended it."""
+    interrupted: bool = False  # whether Ctrl-C ended it
 
     @property
     def values(self) -> dict[str, np.ndarray]:
@@ -179,13 +152,19 @@ class FitResult(AbstractFit):
 
     def __str__(self) -> str:
         """A table of the estimates, one of the noise, and what is to be said of them."""
-        left, rows, lines = iter(self.estimates), [], []
+        left, rows, many = iter(self.estimates), [], []
         for name, start in zip(self.problem.names, self.problem.starts, strict=True):
             each = list(itertools.islice(left, start.size))
-            if start.size > _MOST_ROWS:
-                lines.append(_summary(name, start.shape, each))
-            else:
+            if start.size <= _MOST_ROWS:
                 rows += each
+                continue
+            values, errors = (np.array([getattr(e, field) for e in each]) for field in ("value", "error"))
+            unit = f" [{each[0].unit}]" if each[0].unit else ""
+            many.append(
+                f"{name + unit:<24} {' x '.join(map(str, start.shape))} numbers, {values.min():.4g} to "
+                f"{values.max():.4g}, median {np.median(values):.4g}; errors {errors.min():.2g} to "
+                f"{errors.max():.2g}, median {np.median(errors):.2g}"
+            )
         cells = [
             (e.name, *e.cells, "" if np.isnan(e.start) else f"{e.start:>10.4g}", "at its bound" if e.at_bound else "")
             for e in (*rows, *self.reported)
@@ -196,13 +175,12 @@ class FitResult(AbstractFit):
             for n in self.noise
         ]
         first, *body = table(head, *cells)
-        lines = [first, *lines, *body, "", *table(("", f"{'numbers':>12}", "noise σ", "misfit/σ"), *noises), ""]
         chi = f"χ² = {self.chi_squared:.4g} for {self.degrees_of_freedom} degrees of freedom"
-        lines.append(chi + ("" if np.isnan(self.p_value) else f", probability {self.p_value:.2g}"))
-        lines.append(f"found by {type(self.optimiser).__name__} in {len(self.history)} iterations")
-        if not self.converged:
-            lines.append("NOT CONVERGED: errors hold only at a minimum.")
-        return "\n".join([*lines, *self.warnings])
+        chi += "" if np.isnan(self.p_value) else f", probability {self.p_value:.2g}"
+        who = f"found by {type(self.optimiser).__name__} in {len(self.history)} iterations"
+        lost = [] if self.converged else ["NOT CONVERGED: errors hold only at a minimum."]
+        noise = table(("", f"{'numbers':>12}", "noise σ", "misfit/σ"), *noises)
+        return "\n".join([first, *many, *body, "", *noise, "", chi, who, *lost, *self.warnings])
 
 
 def table(head: Sequence[str], *rows: Sequence[str]) -> list[str]:
@@ -223,16 +201,6 @@ def table_of_minima(
     return table((*head, f"{'misfit/σ':>10}", *(f"{label:>13}" for label in labels[:SHOWN])), *rows)
 
 
-def _summary(name: str, shape: tuple[int, ...], each: list[Estimate]) -> str:
-    """Many numbers of one parameter in a line."""
-    unit = f" [{each[0].unit}]" if each[0].unit else ""
-    values, errors = (np.array([getattr(e, field) for e in each]) for field in ("value", "error"))
-    return (
-        f"{name + unit:<24} {' x '.join(map(str, shape))} numbers, {values.min():.4g} to {values.max():.4g}, median "
-        f"{np.median(values):.4g}; errors {errors.min():.2g} to {errors.max():.2g}, median {np.median(errors):.2g}"
-    )
-
-
 def restarted(
     parameters: Mapping[str, AbstractParameter], values: Mapping[str, np.ndarray]
 ) -> dict[str, AbstractParameter]:
@@ -240,20 +208,17 @@ def restarted(
     return {name: replace(p, start=values[name]) for name, p in parameters.items()}
 
 
-class SettledNoise(NamedTuple):
-    """The noise of the observations, by the residuals at a minimum."""
-
-    sigmas: Sigmas  # the noise of each observation, in its data's unit
-    factors: list[float]  # by what each is larger than it was in the search
-    freedoms: list[float]  # degrees of freedom of each estimate, zero where the noise is given
-    changing: bool  # whether the change moves the minimum, which must then be searched again
+Noise = list[tuple[Array, float, float]]
+"""The noise of each observation, in its data's unit, by the residuals at a minimum; the factor by which it is larger
+than it was in the search; and the degrees of freedom of the estimate, zero where the noise is given."""
 
 
-def settle_noise(problem: FitProblem, minimum: Minimum, sigmas: Sigmas) -> SettledNoise:
-    """The noise by the residuals at a minimum that was searched with `sigmas`."""
-    r, J = np.asarray(minimum.r), np.asarray(minimum.J)
+def settle_noise(problem: FitProblem, minimum: Search, sigmas: Sigmas) -> tuple[Noise, bool]:
+    """The noise by the residuals at a minimum that was searched with `sigmas`, and whether the change moves the
+    minimum, which must then be searched again."""
+    r, J = np.asarray(minimum.seen.residuals), np.asarray(minimum.seen.jacobian)
     J = J[:, ~at_bound(r, J, np.asarray(problem.room(minimum.z)))]  # what a bound holds fits nothing away
-    factors, freedoms, changing = [], [], False
+    settled, changing = [], False
     each = zip(problem.observations, problem.rows, problem.noise_is_given, sigmas, strict=True)
     for observation, rows, is_given, sigma in each:
         factor, freedom = (1.0, 0.0) if is_given else noise(r, J, rows, observation.count, *observation.trust)
@@ -263,53 +228,65 @@ def settle_noise(problem: FitProblem, minimum: Minimum, sigmas: Sigmas) -> Settl
             "parameters use all of them up. Give its sigma.",
         )
         floor = _LEAST * observation.scale() / float(np.max(sigma))
-        factors.append(max(factor, floor))
-        freedoms.append(freedom)
-        changing |= abs(factors[-1] - 1) > _NOISE_RTOL and factors[-1] > floor
-    scaled = tuple(sigma * factor for sigma, factor in zip(sigmas, factors, strict=True))
-    return SettledNoise(scaled, factors, freedoms, changing and not problem.scales_alike)
+        factor = max(factor, floor)
+        settled.append((sigma * factor, factor, freedom))
+        changing |= abs(factor - 1) > _NOISE_RTOL and factor > floor
+    # Another noise of one observation, of squares alone and without priors, does not move the minimum.
+    one = len(settled) == 1 and problem.observations[0].robust is None
+    return settled, changing and not (one and all(p.prior is None for p in problem.parameters))
 
 
 def fit_result(
     problem: FitProblem,
     optimiser: AbstractOptimiser,
-    minimum: Minimum,
-    settled: SettledNoise,
+    minimum: Search,
+    settled: Noise,
     report: Mapping[str, Callable[[Experiment], Any]],
     level: float,
 ) -> FitResult:
     """The result at a minimum, whose residuals are in units of the noise of its search, with the noise that they
     settled; `report` and `level` as of `fit`."""
-    r, J, z = np.array(minimum.r, float), np.array(minimum.J, float), minimum.z
-    for rows, factor in zip(problem.rows, settled.factors, strict=True):
+    r, J = np.array(minimum.seen.residuals, float), np.array(minimum.seen.jacobian, float)
+    z, noises, estimated = minimum.z, [], []
+    each = zip(problem.observations, problem.rows, problem.noise_is_given, settled, strict=True)
+    for o, rows, is_given, (sigma, factor, freedom) in each:
         r[rows], J[rows] = r[rows] / factor, J[rows] / factor
-    each = list(zip(problem.observations, problem.rows, problem.noise_is_given, strict=True))
-    estimated = [(rows, f) for (_, rows, is_given), f in zip(each, settled.freedoms, strict=True) if not is_given]
+        sigma, misfit = np.sqrt((np.asarray(sigma) ** 2).mean()), np.sqrt((r[rows] ** 2).sum() / max(o.count, 1))
+        noises.append(NoiseEstimate(o.name, float(sigma), not is_given, float(misfit), o.count))
+        estimated += [] if is_given else [(rows, freedom)]
     errors = uncertainty(J, float(jnp.finfo(problem.dtype).eps), estimated)
     held = at_bound(r, J, np.asarray(problem.room(z)))
-    priors = len(r) - problem.rows[-1].stop
-    noises = tuple(
-        NoiseEstimate(
-            o.name,
-            float(np.sqrt((np.asarray(sigma) ** 2).mean())),
-            not is_given,
-            float(np.sqrt((r[rows] ** 2).sum() / max(o.count, 1))),
-            o.count,
-        )
-        for (o, rows, is_given), sigma in zip(each, settled.sigmas, strict=True)
-    )
+    slope = np.asarray(jax.jvp(problem.numbers, (z,), (jnp.ones_like(z),))[1], float)
+    ends = intervals(problem, z, errors, (J.T @ r) * held, level)
+    columns = problem.numbers(z), np.abs(slope) * errors.error, *ends, problem.numbers(jnp.zeros_like(z)), held
+    numbers = zip(problem.labels, problem.owners, *(np.asarray(column).tolist() for column in columns), strict=True)
+    reported = []
+    for name, of in report.items():
+
+        def value(z: Coordinates, of: Callable[[Experiment], Any] = of) -> Array:
+            """A function of the first experiment."""
+            return jnp.asarray(of(problem.at(z)[0]))
+
+        error, freedom = errors.of(np.asarray(jax.jacfwd(value)(z), float))
+        number, reach = float(value(z)), float(quantile(level, freedom) * error)
+        interval = number - reach, number + reach
+        reported.append(Estimate(name, number, float(error), interval, start=float(value(jnp.zeros_like(z)))))
+    degrees = sum(n.points for n in noises) + len(r) - problem.rows[-1].stop - errors.rank + int(held.sum())
     result = FitResult(
         problem=problem,
         z=np.asarray(z),
-        sigmas=settled.sigmas,
+        sigmas=tuple(sigma for sigma, *_ in settled),
         residuals=r,
         jacobian=J,
         uncertainty=errors,
-        estimates=_estimates(problem, z, errors, (J.T @ r) * held, held, level),
-        reported=tuple(_reported(problem, z, errors, level, name, of) for name, of in report.items()),
+        estimates=tuple(
+            Estimate(label, value, error, (a, b), owner.unit, start, bound)
+            for label, owner, value, error, a, b, start, bound in numbers
+        ),
+        reported=tuple(reported),
         chi_squared=float((r**2).sum()),
-        degrees_of_freedom=sum(n.points for n in noises) + priors - errors.rank + int(held.sum()),
-        noise=noises,
+        degrees_of_freedom=degrees,
+        noise=tuple(noises),
         experiments=problem.at(z),
         level=level,
         optimiser=optimiser,
@@ -325,21 +302,6 @@ def fit_result(
         )
         result = replace(result, warnings=(*result.warnings, text))
     return result
-
-
-def _estimates(
-    problem: FitProblem, z: Coordinates, errors: Uncertainty, gradient: np.ndarray, held: np.ndarray, level: float
-) -> tuple[Estimate, ...]:
-    """The fitted numbers; `gradient` and `held` as of `intervals`, and which coordinates a bound holds."""
-    slope = np.asarray(jax.jvp(problem.numbers, (z,), (jnp.ones_like(z),))[1], float)
-    lower, upper = intervals(problem, z, errors, gradient, level)
-    start = problem.numbers(jnp.zeros_like(z))
-    columns = problem.numbers(z), np.abs(slope) * errors.error, lower, upper, start, held
-    rows = zip(problem.labels, problem.owners, *(np.asarray(column).tolist() for column in columns), strict=True)
-    return tuple(
-        Estimate(label, value, error, (a, b), owner.unit, start, bound)
-        for label, owner, value, error, a, b, start, bound in rows
-    )
 
 
 def intervals(
@@ -369,19 +331,6 @@ def intervals(
     )
     ends = np.array([p.domain for p in problem.owners]).T
     return np.clip(lower, *ends), np.clip(upper, *ends)
-
-
-def _reported(
-    problem: FitProblem, z: Coordinates, errors: Uncertainty, level: float, name: str, of: Callable[[Experiment], Any]
-) -> Estimate:
-    """A function of the first experiment, its error by its derivative."""
-
-    def value(z: Coordinates) -> Array:
-        return jnp.asarray(of(problem.at(z)[0]))
-
-    error, freedom = errors.of(np.asarray(jax.jacfwd(value)(z), float))
-    number, reach = float(value(z)), float(quantile(level, freedom) * error)
-    return Estimate(name, number, float(error), (number - reach, number + reach), start=float(value(jnp.zeros_like(z))))
 
 
 _FIRST_COLUMN = 24

@@ -1,7 +1,8 @@
-"""Searches for the least sum of squares, one or many together, iteration by iteration."""
+"""Searches for the least sum of squares, one or many together, iteration by iteration, by a method's contract."""
 
+import abc
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,8 +12,60 @@ import numpy as np
 
 from mpmjax._types import Array, Float
 from mpmjax.checks import require, require_whole
-from mpmjax.fitting._optimiser import AbstractOptimiser, Evaluation
 from mpmjax.fitting._problem import Coordinates, FitProblem, Sigmas
+
+
+class Evaluation(NamedTuple):
+    """Cost and derivatives at the place where an optimiser is."""
+
+    cost: Float[Array, ""]  # ½ Σ r²; NaN where a simulation failed
+    gradient: Coordinates  # derivative of the cost by the coordinates, shape (n,)
+    residuals: Float[Array, "m"] | None = None  # r [-], of an optimiser that uses them
+    jacobian: Float[Array, "m n"] | None = None  # their derivative
+    room: Float[Array, "2 n"] | None = None  # how far values can change until their bounds, see `FitProblem.room`
+
+
+class AbstractOptimiser(eqx.Module):
+    """A method that searches the least Σ r², one iteration at a time.
+
+    One of your own gives `begin`, `iterate` and `has_converged`. Its state is a pytree of arrays that says all it
+    remembers, so that a search can be written to a file and continued. Its methods are given the problem that is
+    minimised, the coordinates z where the search is, and the noise of each observation.
+    """
+
+    max_steps: eqx.AbstractVar[int]  # most iterations
+
+    @abc.abstractmethod
+    def begin(self, problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> Any:
+        """The state before the first iteration, which starts at z."""
+
+    @abc.abstractmethod
+    def iterate(
+        self, problem: FitProblem, z: Coordinates, sigmas: Sigmas, state: Any
+    ) -> tuple[Coordinates, Any, Evaluation]:
+        """One iteration from the state that `begin` or the last iteration returned: where it is now, the state, and
+        what it knows of that place. The first one evaluates where it starts. A step at which a simulation fails must
+        not be taken."""
+
+    def directed(self, z: Coordinates, state: Any, seen: Evaluation) -> Any:
+        """The state for the next iteration, outside of what is compiled. Default: as it is."""
+        del z, seen
+        return state
+
+    @abc.abstractmethod
+    def has_converged(self, state: Any, seen: Evaluation) -> bool:
+        """Whether the search is at a minimum."""
+
+    def distance(self, state: Any, seen: Evaluation) -> float:
+        """How far the search is from converged, as a multiple of where it ends; NaN if that is not known, which is the
+        default. The time left is estimated from how fast it falls."""
+        del state, seen
+        return float("nan")
+
+    def has_stalled(self, state: Any) -> bool:
+        """Whether the search goes no further, and is not known to be at a minimum."""
+        del state
+        return False
 
 
 class Iteration(NamedTuple):
@@ -25,24 +78,17 @@ class Iteration(NamedTuple):
     z: np.ndarray  # the coordinates, shape (n,)
 
 
-class SearchState(NamedTuple):
-    """A search after an iteration: all that the next one needs."""
+class Search(NamedTuple):
+    """A search after an iteration, all that the next one needs; and how it ended."""
 
     z: Coordinates
     inner: Any  # state of the optimiser
-    seen: Evaluation
-    history: tuple[Iteration, ...]  # the iterations so far, one at least
-
-
-class Minimum(NamedTuple):
-    """The end of a search."""
-
-    z: Coordinates
-    r: Float[Array, "m"]  # the residuals there [-]
-    J: Float[Array, "m n"]  # their derivative
-    converged: bool
-    interrupted: bool
+    seen: Evaluation  # of the place where it is; with residuals and Jacobian once it has ended
     history: tuple[Iteration, ...]
+    converged: bool = False
+    interrupted: bool = False  # whether Ctrl-C ended it, or kept it from beginning
+    failure: str = ""  # why it came to no end that has residuals and Jacobian, in words
+    joined: int | None = None  # the number of the search that it came upon, and was ended for
 
     @property
     def cost(self) -> float:
@@ -50,183 +96,181 @@ class Minimum(NamedTuple):
         return self.history[-1].cost
 
 
-class Member(NamedTuple):
-    """The outcome of one search among many."""
-
-    minimum: Minimum | None  # where it ended; None where it failed, or was not begun
-    failure: str = ""  # why it failed, in words
-    joined: int | None = None  # the number of the search that it came upon, and was ended for
-
-    @property
-    def interrupted(self) -> bool:
-        """Whether it was ended, or not begun, by an interruption."""
-        return self.failure == _NOT_BEGUN or (self.minimum is not None and self.minimum.interrupted)
-
-
-class NoDerivativeError(RuntimeError):
-    """The residuals are finite, their derivative is not."""
-
-
-class Problems(eqx.Module):
-    """Problems, or noises of them, that differ in numbers: leaves that differ are stacked, the others stored once."""
-
-    varying: Any
-    """A problem with the leaves that differ alone, their leading axis the problems; no leaves if one serves all."""
-    common: Any  # a problem with the others
-
-    @staticmethod
-    def of(problems: list[Any]) -> "Problems":
-        """Stack a problem for each search, or take one for all of them; they must differ in numbers alone."""
-        leaves, structures = zip(*(jax.tree.flatten(problem) for problem in problems), strict=True)
-        for k, structure in enumerate(structures):
-            require(structure == structures[0], _DIFFERENT.format(k))
-        varying = [_stacked(column) for column in zip(*leaves, strict=True)]
-        common = [first if stacked is None else None for first, stacked in zip(leaves[0], varying, strict=True)]
-        return Problems(*(jax.tree.unflatten(structures[0], part) for part in (varying, common)))
-
-    def at(self, k: Any) -> Any:
-        """The varying leaves of one of them, or of several."""
-        return jax.tree.map(lambda a: a[k], self.varying)
-
-    def only(self, numbers: list[int]) -> "Problems":
-        """Some of them."""
-        return Problems(self.at(np.array(numbers)), self.common)
-
-    def one(self, k: int) -> Any:
-        """One of them, whole."""
-        return eqx.combine(jax.tree.map(jnp.asarray, self.at(k)), self.common)
-
-
-def _stacked(column: tuple[Any, ...]) -> np.ndarray | None:
-    """A leaf of all problems, shape (k, ...); None if it is the same for all."""
-    first = column[0]
-    if all(leaf is first for leaf in column):
-        return None
-    numbers = all(eqx.is_array_like(leaf) for leaf in column)
-    for k, leaf in enumerate(column):
-        require(bool(np.shape(leaf) == np.shape(first) if numbers else leaf == first), _DIFFERENT.format(k))
-    if not numbers or all(np.array_equal(first, leaf, equal_nan=True) for leaf in column):
-        return None
-    return np.stack([np.asarray(leaf) for leaf in column])
-
-
-def search(
-    problem: FitProblem,
-    optimiser: AbstractOptimiser,
-    z: Coordinates,
-    sigmas: Sigmas,
-    *,
-    state: SearchState | None = None,
-    report: Callable[[SearchState], None] = lambda state: None,
-    begun: Callable[[Evaluation], None] = lambda seen: None,
-) -> Minimum:
-    """The least Σ r² near z. An interruption (Ctrl-C) ends the search where it is.
-
-    Args:
-        problem, optimiser, z, sigmas: what is minimised, how, from where, and with which noise.
-        state: in the place of z, the state of an earlier search of the same kind; it is continued exactly.
-        report: called after each iteration.
-        begun: called with the evaluation where it starts.
-
-    Raises:
-        NoDerivativeError: a derivative is not finite.
-    """
-    converged = interrupted = False
-    try:
-        while state is None or not (
-            (converged := optimiser.has_converged(state.inner, state.seen))
-            or optimiser.has_stalled(state.inner)
-            or not np.isfinite(state.history[-1].cost)
-            or len(state.history) >= optimiser.max_steps
-        ):
-            state = _step(problem, optimiser, z, sigmas, state)
-            last = state.history[-1]
-            if np.isfinite(last.cost) and not np.isfinite(last.gradient):
-                raise NoDerivativeError
-            if last.number == 0 and np.isfinite(last.cost):
-                begun(state.seen)
-            report(state)
-    except KeyboardInterrupt:
-        if state is None:
-            raise
-        interrupted = True
-    minimum = _minimum(problem, sigmas, state, converged=converged, interrupted=interrupted)
-    if state.seen.jacobian is None and not jnp.isfinite(minimum.J).all():
-        raise NoDerivativeError
-    return minimum
+def search(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, sigmas: Sigmas) -> Search:
+    """The least Σ r² near z with this noise; see `search_many`."""
+    return search_many([(problem, sigmas)], optimiser, {0: z})[0]
 
 
 def search_many(
-    problems: Problems,
+    problems: Sequence[tuple[FitProblem, Sigmas]],
     optimiser: AbstractOptimiser,
-    starts: Float[np.ndarray, "k n"],
+    starts: Mapping[int, Any],
     *,
-    sigmas: Problems,
-    batch: int,
+    batch: int = 1,
     joining: float = 0.0,
     settling: float = 0.0,
+    state: Search | None = None,
     progress: Callable[[int, int], None] = lambda done, count: None,
     begun: Callable[[int, Evaluation], None] = lambda number, seen: None,
-) -> tuple[Member, ...]:
-    """The minima of many searches, that differ in where they start or in their data.
+    report: Callable[[Search], None] = lambda state: None,
+) -> dict[int, Search]:
+    """The least Σ r² of searches that differ in where they start or in their data, by their numbers.
 
     One compiled program makes an iteration of `batch` searches together, by `jax.vmap`. A search that is done leaves
-    its place to the next one that waits, so that none is computed in vain until fewer are left than places. One that
-    fails ends alone. An interruption (Ctrl-C) ends all where they are.
+    its place to the next one that waits. One that fails ends alone. An interruption (Ctrl-C) ends all where they are.
 
     Args:
-        problems, sigmas: a problem and a noise for each search, or one for all.
-        optimiser, starts: how they are minimised, and where each starts.
-        batch: how many are computed together.
+        problems: a problem and the noise of its observations for each number, or one for all searches.
+        starts: where each starts, by its number.
         joining: a search that comes so near to another one of one problem with a lower cost, in each coordinate, is
             ended: it would go the same way. Zero ends none.
         settling: a search is at a minimum too where its last three moves, or six iterations, lowered the cost by less
             than this part of it: Gauss-Newton steps are slow where residuals are large, as at false minima. Zero ends
             none.
+        state: in the place of its start, an earlier state of the first search, which is continued exactly.
         progress: called with how many are done, and of how many.
         begun: called with the number of a search and the evaluation where it starts, unless it fails there.
+        report: called after each iteration of each search.
     """
-    count = len(starts)
-    waiting = deque(range(count))
-    running: dict[int, SearchState | None] = {}
-    done: dict[int, Member] = {}
+    stacked = _stacked(problems)
+    waiting, done = deque(starts), dict[int, Search]()
+    running: dict[int, Search | None] = {} if state is None else {waiting.popleft(): state}
 
-    def stopped(k: int, state: SearchState, *, converged: bool = False, interrupted: bool = False) -> Member:
-        one, noise = problems.one(k), sigmas.one(k)
-        return Member(_minimum(one, noise, state, converged=converged, interrupted=interrupted))
-
-    def ended(k: int, state: SearchState) -> Member | None:
-        last = state.history[-1]
-        if not np.isfinite(last.cost):
-            return Member(None, "the simulation fails where it starts, or does not reach the data")
-        if not np.isfinite(last.gradient):
-            return Member(None, "there is no derivative")
-        if _has_settled(state.history, settling) or optimiser.has_converged(state.inner, state.seen):
-            return stopped(k, state, converged=True)
-        return stopped(k, state) if len(state.history) == optimiser.max_steps else None
+    def end(k: int, search: Search, **outcome: Any) -> None:
+        """End a search; where it did not fail, with the residuals and the Jacobian."""
+        if "failure" not in outcome:
+            problem, sigmas = _of(problems, k)
+            z, r, J = jnp.asarray(search.z).astype(problem.dtype), search.seen.residuals, search.seen.jacobian
+            if r is None or J is None:
+                r, J = jacobian(problem, z, sigmas)
+            search = search._replace(z=z, seen=search.seen._replace(residuals=jnp.asarray(r), jacobian=jnp.asarray(J)))
+            if not np.isfinite(J).all():
+                outcome |= {"failure": NO_DERIVATIVE, "converged": False}
+        done[k] = search._replace(**outcome)
+        del running[k]
 
     try:
-        while waiting or running:
-            while waiting and len(running) < batch:
-                running[waiting.popleft()] = None
-            states = _step_together(problems, optimiser, starts, sigmas, running, batch)
-            running = dict(states)
-            for k, state in states.items():
-                if len(state.history) == 1 and np.isfinite(state.history[0].cost):
-                    begun(k, state.seen)
-                member = ended(k, state)
-                if member is not None:
-                    done[k] = member
-                    del running[k]
+        while True:
+            states = {k: search for k, search in running.items() if search is not None}
+            for k, search in states.items():
+                spent = len(search.history) >= optimiser.max_steps
+                if not np.isfinite(search.cost):
+                    end(k, search, failure="the simulation fails where it starts, or does not reach the data")
+                elif not np.isfinite(search.history[-1].gradient):
+                    end(k, search, failure=NO_DERIVATIVE)
+                elif _has_settled(search.history, settling) or optimiser.has_converged(search.inner, search.seen):
+                    end(k, search, converged=True)
+                elif spent or (settling == 0 and optimiser.has_stalled(search.inner)):
+                    end(k, search)  # where searches settle, one that stalls goes on, and soon has settled
             if joining > 0:
                 left = {k: states[k] for k in running}
-                for k, other in _joined(done, left, joining).items():
-                    done[k] = stopped(k, left[k])._replace(joined=other)
-                    del running[k]
-            progress(len(done), count)
+                last = {k: s.history[-1] for k, s in (done | left).items() if not s.failure and s.joined is None}
+                for k, search in left.items():
+                    better = (n for n, i in last.items() if i.cost < last[k].cost)
+                    near = [n for n in better if (np.abs(last[n].z - last[k].z) <= joining).all()]
+                    if near:
+                        end(k, search, joined=near[0])
+            if states:
+                progress(len(done), len(starts))
+            while waiting and len(running) < batch:
+                running[waiting.popleft()] = None
+            if not running:
+                return {k: done[k] for k in starts}
+            states = _iterated(problems, stacked, optimiser, starts, running, batch)
+            running = {**states}
+            for k, search in states.items():
+                if np.isfinite(search.cost) and np.isfinite(search.history[-1].gradient):
+                    if len(search.history) == 1:
+                        begun(k, search.seen)
+                    report(search)
     except KeyboardInterrupt:
-        done |= {k: stopped(k, s, interrupted=True) for k, s in running.items() if s is not None}
-    return tuple(done.get(k, Member(None, _NOT_BEGUN)) for k in range(count))
+        for k, search in list(running.items()):
+            if search is not None:
+                end(k, search, interrupted=True)
+    none = Search(jnp.zeros(0), None, Evaluation(jnp.zeros(()), jnp.zeros(0)), ())
+    return {k: done.get(k, none._replace(interrupted=True, failure=_NOT_BEGUN)) for k in starts}
+
+
+def _of(problems: Sequence[tuple[FitProblem, Sigmas]], k: int) -> tuple[FitProblem, Sigmas]:
+    return problems[0 if len(problems) == 1 else k]
+
+
+def _iterated(
+    problems: Sequence[tuple[FitProblem, Sigmas]],
+    stacked: tuple[Any, Any],
+    optimiser: AbstractOptimiser,
+    starts: Mapping[int, Any],
+    running: Mapping[int, Search | None],
+    batch: int,
+) -> dict[int, Search]:
+    """One iteration of several searches, compiled for `batch` of them: free places repeat the first one."""
+    before: dict[int, tuple[Coordinates, Any, tuple[Iteration, ...]]] = {}
+    for k, search in running.items():
+        if search is None:
+            problem, sigmas = _of(problems, k)
+            z = jnp.asarray(starts[k], float)  # optimistix's own numbers are of JAX's default precision
+            before[k] = z, begin(problem, optimiser, z, sigmas), ()
+        else:
+            before[k] = search.z, search.inner, search.history
+    if batch == 1:  # the program of a single search, which compiles in less time than a batch of one
+        (k,), ((z, inner, _),) = before, before.values()
+        problem, sigmas = _of(problems, k)
+        ends = [iterate(problem, optimiser, z, sigmas, inner)]
+    else:
+        lanes = [*range(len(before)), *[0] * (batch - len(before))]
+        places, inners, _ = zip(*before.values(), strict=True)
+        parts = [eqx.partition(inner, eqx.is_array) for inner in inners]
+        rows = jax.tree.map(lambda *a: np.stack([np.asarray(a[lane]) for lane in lanes]), *(a for a, _ in parts))
+        varying = jax.tree.map(lambda a: a[np.array(list(before))[lanes]], stacked[0])
+        z = np.stack([np.asarray(place) for place in places])[lanes]
+        z, inner, seen = iterate_together(varying, stacked[1], optimiser, z, eqx.combine(rows, parts[0][1]))
+        arrays, rest = eqx.partition(inner, eqx.is_array)
+        whole = jax.tree.map(np.asarray, (z, arrays, seen))
+        each = [jax.tree.map(lambda a, i=lane: a[i], whole) for lane in range(len(before))]
+        ends = [(jnp.asarray(z), eqx.combine(part, rest), seen) for z, part, seen in each]
+    after = {}
+    for (k, (*_, history)), (z, inner, seen) in zip(before.items(), ends, strict=True):
+        cost, slope = float(seen.cost), float(np.abs(seen.gradient).max())
+        moved = not history or cost != history[-1].cost
+        iteration = Iteration(len(history), cost, slope, moved, np.asarray(z))
+        after[k] = Search(z, optimiser.directed(z, inner, seen), seen, (*history, iteration))
+    return after
+
+
+def _stacked(trees: Sequence[Any]) -> tuple[Any, Any]:
+    """Trees that differ in numbers alone: one whose leaves that differ are stacked, shape (k, ...), without the others;
+    and one with the others, which are stored once. A single tree has no leaves that differ."""
+    leaves, structures = zip(*(jax.tree.flatten(tree) for tree in trees), strict=True)
+
+    def check(k: int, same: Any) -> None:
+        require(
+            bool(same),
+            f"The data sets of an ensemble must differ in numbers alone, but number {k} has other shapes, choices or "
+            "functions than the first: give each the same times and markers (NaN where nothing was measured), and the "
+            "same functions.",
+        )
+
+    for k, structure in enumerate(structures):
+        check(k, structure == structures[0])
+    varying, common = [], []
+    for first, *others in zip(*leaves, strict=True):
+        different = False
+        for k, leaf in enumerate(others, 1):
+            if eqx.is_array_like(first) and eqx.is_array_like(leaf):
+                check(k, np.shape(leaf) == np.shape(first))
+                different |= leaf is not first and not np.array_equal(first, leaf, equal_nan=True)
+            else:
+                check(k, leaf is first or leaf == first)
+        varying.append(np.stack([np.asarray(leaf) for leaf in (first, *others)]) if different else None)
+        common.append(None if different else first)
+    return jax.tree.unflatten(structures[0], varying), jax.tree.unflatten(structures[0], common)
+
+
+def _has_settled(history: tuple[Iteration, ...], part: float) -> bool:
+    """Whether the last moves, or the last iterations, lowered the cost by less than this part."""
+    costs, moves = [i.cost for i in history], [i.cost for i in history if i.accepted]
+    slow = len(moves) > 1 and len(costs) > _ITERATIONS and costs[-1] > (1 - part) * costs[-1 - _ITERATIONS]
+    return slow or (len(moves) > _MOVES and moves[-1] > (1 - part) * moves[-1 - _MOVES])
 
 
 def batch_size(problem: FitProblem, batch: int | None, count: int) -> int:
@@ -251,90 +295,6 @@ def counted(progress: Callable[[str], None] | None, text: str, *, again: bool = 
     return say
 
 
-def _step(
-    problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, sigmas: Sigmas, state: SearchState | None
-) -> SearchState:
-    """One iteration, the first one at z where there is no state yet."""
-    if state is None:
-        z = z.astype(float)  # optimistix's own numbers are of JAX's default precision
-        inner, history = begin(problem, optimiser, z, sigmas), ()
-    else:
-        z, inner, _, history = state
-    return _recorded(optimiser, *iterate(problem, optimiser, z, sigmas, inner), history)
-
-
-def _step_together(
-    problems: Problems,
-    optimiser: AbstractOptimiser,
-    starts: Float[np.ndarray, "k n"],
-    sigmas: Problems,
-    running: dict[int, SearchState | None],
-    batch: int,
-) -> dict[int, SearchState]:
-    """One iteration of several searches, compiled for `batch` of them: free places repeat the first one."""
-    if batch == 1:  # the program of a single search, which compiles in less time than a batch of one
-        ((k, state),) = running.items()
-        return {k: _step(problems.one(k), optimiser, jnp.asarray(starts[k], float), sigmas.one(k), state)}
-    z, inners, histories = [], [], []
-    for k, state in running.items():
-        at = jnp.asarray(starts[k], float) if state is None else state.z
-        z.append(np.asarray(at))
-        inners.append(begin(problems.one(k), optimiser, at, sigmas.one(k)) if state is None else state.inner)
-        histories.append(() if state is None else state.history)
-    lanes = [*range(len(z)), *[0] * (batch - len(z))]
-    members = np.array(list(running))[lanes]
-    parts = [eqx.partition(inner, lambda a: isinstance(a, (jax.Array, np.ndarray, np.generic))) for inner in inners]
-    stacked = jax.tree.map(lambda *a: np.stack([np.asarray(a[lane]) for lane in lanes]), *(a for a, _ in parts))
-    inner = eqx.combine(stacked, parts[0][1])
-    z, inner, seen = iterate_together(
-        problems.at(members), problems.common, optimiser, np.stack(z)[lanes], sigmas.at(members), sigmas.common, inner
-    )
-    arrays, rest = eqx.partition(inner, eqx.is_array)
-    z, arrays, seen = (jax.tree.map(np.asarray, a) for a in (z, arrays, seen))
-    states = {}
-    for lane, (k, history) in enumerate(zip(running, histories, strict=True)):
-        at, part, here = (jax.tree.map(lambda a, i=lane: a[i], tree) for tree in (z, arrays, seen))
-        states[k] = _recorded(optimiser, jnp.asarray(at), eqx.combine(part, rest), here, history)
-    return states
-
-
-def _recorded(
-    optimiser: AbstractOptimiser, z: Coordinates, inner: Any, seen: Evaluation, history: tuple[Iteration, ...]
-) -> SearchState:
-    """The state after an iteration, which joins the history."""
-    cost, slope = float(seen.cost), float(np.abs(seen.gradient).max())
-    moved = not history or cost != history[-1].cost
-    iteration = Iteration(len(history), cost, slope, moved, np.asarray(z))
-    return SearchState(z, optimiser.directed(z, inner, seen), seen, (*history, iteration))
-
-
-def _minimum(problem: FitProblem, sigmas: Sigmas, state: SearchState, *, converged: bool, interrupted: bool) -> Minimum:
-    """Where a search is, with residuals and Jacobian."""
-    z = jnp.asarray(state.z).astype(problem.dtype)
-    r, J = state.seen.residuals, state.seen.jacobian
-    if r is None or J is None:
-        r, J = jacobian(problem, z, sigmas)
-    return Minimum(z, jnp.asarray(r), jnp.asarray(J), converged, interrupted, state.history)
-
-
-def _has_settled(history: tuple[Iteration, ...], part: float) -> bool:
-    """Whether the last moves, or the last iterations, lowered the cost by less than this part."""
-    costs, moves = [i.cost for i in history], [i.cost for i in history if i.accepted]
-    slow = len(moves) > 1 and len(costs) > _ITERATIONS and costs[-1] > (1 - part) * costs[-1 - _ITERATIONS]
-    return slow or (len(moves) > _MOVES and moves[-1] > (1 - part) * moves[-1 - _MOVES])
-
-
-def _joined(done: dict[int, Member], running: dict[int, SearchState], within: float) -> dict[int, int]:
-    """The searches that came upon one with a lower cost, which is done or still goes on, and which one."""
-    ends = {k: m.minimum.history for k, m in done.items() if m.minimum is not None and m.joined is None}
-    last = {k: history[-1] for k, history in (ends | {k: s.history for k, s in running.items()}).items()}
-    near = {
-        k: [n for n, i in last.items() if i.cost < last[k].cost and (np.abs(i.z - last[k].z) <= within).all()]
-        for k in running
-    }
-    return {k: others[0] for k, others in near.items() if others}
-
-
 @eqx.filter_jit
 def begin(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordinates, sigmas: Sigmas) -> Any:
     """An optimiser's `begin`, compiled."""
@@ -351,22 +311,16 @@ def iterate(
 
 @eqx.filter_jit
 def iterate_together(
-    varying: Any,
-    common: Any,
-    optimiser: AbstractOptimiser,
-    z: Float[np.ndarray, "b n"] | Array,
-    sigmas: Any,
-    common_sigmas: Any,
-    inner: Any,
+    varying: Any, common: Any, optimiser: AbstractOptimiser, z: np.ndarray | Array, inner: Any
 ) -> tuple[Array, Any, Evaluation]:
     """An optimiser's `iterate` of b searches, compiled: the leaves in which problems and noises differ have a leading
     axis b, like z and the optimiser's state."""
 
-    def one(varying: Any, z: Coordinates, sigmas: Any, inner: Any) -> tuple[Coordinates, Any, Evaluation]:
-        problem: FitProblem = eqx.combine(varying, common)
-        return optimiser.iterate(problem, z, eqx.combine(sigmas, common_sigmas), inner)
+    def one(varying: Any, z: Coordinates, inner: Any) -> tuple[Coordinates, Any, Evaluation]:
+        problem, sigmas = eqx.combine(varying, common)
+        return optimiser.iterate(problem, z, sigmas, inner)
 
-    return eqx.filter_vmap(one, in_axes=(0, 0, 0, eqx.if_array(0)))(varying, z, sigmas, inner)
+    return eqx.filter_vmap(one, in_axes=(0, 0, eqx.if_array(0)))(varying, z, inner)
 
 
 @eqx.filter_jit
@@ -375,10 +329,7 @@ def jacobian(problem: FitProblem, z: Coordinates, sigmas: Sigmas) -> tuple[Array
     return problem.jacobian(z, sigmas)
 
 
+NO_DERIVATIVE = "there is no derivative"
 _NOT_BEGUN = "was not begun: the search was interrupted"
-_DIFFERENT = (
-    "The data sets of an ensemble must differ in numbers alone, but number {} has other shapes, choices or functions "
-    "than the first: give each the same times and markers (NaN where nothing was measured), and the same functions."
-)
 _MOVES = 3  # how many moves must have lowered the cost by little
 _ITERATIONS = 6  # how many iterations must have lowered the cost by little

@@ -15,42 +15,31 @@ from mpmjax._types import Scalar
 from mpmjax.analysis import sensitivity
 from mpmjax.checks import checked, require, require_positive, warn
 from mpmjax.fitting._experiment import Experiment
-from mpmjax.fitting._fit import chosen_optimiser, fit
+from mpmjax.fitting._fit import chosen_optimiser, fit, require_derivative
 from mpmjax.fitting._observation import Series
-from mpmjax.fitting._optimiser import AbstractOptimiser
 from mpmjax.fitting._parameter import AbstractParameter
 from mpmjax.fitting._problem import Coordinates, FitProblem
 from mpmjax.fitting._result import AbstractFit, Estimate, FitResult, NoiseEstimate, restarted, table, table_of_minima
-from mpmjax.fitting._search import begin, iterate, jacobian, search
+from mpmjax.fitting._search import AbstractOptimiser, begin, iterate, jacobian, search
 from mpmjax.fitting._uncertainty import quantile
 
 
 class Stage(NamedTuple):
     """A search with the data until one time."""
 
-    horizon: float
-    """The time [s]."""
-    values: dict[str, np.ndarray]
-    """The value of each parameter at its minimum, in its shape."""
-    misfit: float
-    """Root mean square of the residuals, in units of σ, or of the size of the data where σ is not given."""
+    horizon: float  # the time [s]
+    values: dict[str, np.ndarray]  # the value of each parameter at its minimum, in its shape
+    misfit: float  # root mean square of the residuals, in units of σ, or of the size of the data where σ is not given
     iterations: int
 
 
 class StagedFit(AbstractFit):
-    """A fit that came about in stages.
+    """A fit that came about in stages; `result["E"]` is the estimate of a parameter by the last stage."""
 
-    `print(result)` shows a table; `result["E"]` is the estimate of a parameter by the last stage.
-    """
-
-    stages: tuple[Stage, ...]
-    """The searches before the last, with growing horizons."""
-    result: FitResult
-    """The last fit, with its errors."""
-    horizons: tuple[float, ...]
-    """Until when the data of each experiment were used in the last fit [s]."""
-    remarks: tuple[str, ...]
-    """How the horizons were chosen, in words."""
+    stages: tuple[Stage, ...]  # the searches before the last, with growing horizons
+    result: FitResult  # the last fit, with its errors
+    horizons: tuple[float, ...]  # until when the data of each experiment were used in the last fit [s]
+    remarks: tuple[str, ...]  # how the horizons were chosen, in words
 
     @property
     def all(self) -> tuple[Estimate, ...]:
@@ -95,11 +84,9 @@ def fit_staged(
     experiment has nothing else.
 
     Args:
-        experiments: see `fit`. Horizons are times of each of them.
-        parameters: see `fit`.
+        experiments, parameters, report, level: see `fit`. Horizons are times of each experiment.
         horizons: growing times [s]; the end of the data is added. Default: by the rule above.
         growth: sensitivity [-] beyond which data are left out; infinite to use all.
-        report, level: see `fit`.
         optimiser: the method of each search. Default: as `fit` chooses.
         progress: called with a line an iteration, and with what is said, such as `print`.
 
@@ -116,25 +103,35 @@ def fit_staged(
     problem = FitProblem(experiments, parameters)
     optimiser = chosen_optimiser(problem) if optimiser is None else optimiser
     end = max(e.t1 for e in problem.experiments)
-    say = progress or (lambda text: None)
-    remarks: list[str] = []
+    say, remarks = progress or (lambda text: None), list[str]()
+
+    def tell(text: str) -> None:
+        remarks.append(text)
+        say(text)
+
     z = jnp.zeros(problem.size, problem.dtype)
     limits = _limits(problem.at(z), float(growth))
     if times is None:
         first = _first_horizon(_cut(problem, limits, end), optimiser, z)
         times = [first * 2.0**k for k in range(_MOST_STAGES) if first * 2.0**k < _NEARLY_ALL * end]
-        remarks.append(_FIRST.format(first, end) if times else _ONE_STAGE)
-        say(remarks[-1])
+        tell(
+            f"The first horizon is {first:.4g} s of {end:.4g} s: until then a change of one in a coordinate changes "
+            "the data by no more than they change themselves. Horizons double from there."
+            if times
+            else "One stage suffices: until the end of the data a change of one in a coordinate changes them by no "
+            "more than they change themselves, or by as much at all times."
+        )
     stages: list[Stage] = []
     for horizon in times:
         cut = _cut(problem, limits, horizon)
         if [e.steps for e in cut.experiments] == [e.steps for e in _cut(problem, limits, end).experiments]:
             break
         minimum = search(cut, optimiser, z, cut.first_sigmas)
-        if not np.isfinite(minimum.history[0].cost):
-            cut.explain(z, f"What is observed of the simulation until {horizon:g} s is not finite.")
         if minimum.interrupted:
             raise KeyboardInterrupt
+        require_derivative(minimum)
+        if minimum.failure:
+            cut.explain(z, f"What is observed of the simulation until {horizon:g} s is not finite.")
         z, misfit, count = minimum.z, cut.misfit(minimum.cost), len(minimum.history)
         stages.append(Stage(horizon, problem.by_name(z), misfit, count))
         say(f"until {horizon:.4g} s: misfit/σ {misfit:.4g}, {problem.shown(z)}, {count} iterations")
@@ -142,8 +139,12 @@ def fit_staged(
     cut = _cut(problem, limits, end)
     for k, (whole, used, limit) in enumerate(zip(problem.experiments, cut.experiments, limits, strict=True)):
         if used.steps < whole.steps:
-            remarks.append(_SHORT.format(f"{whole.name!r} (number {k})", growth, limit, whole.t1))
-            say(remarks[-1])
+            tell(
+                f"Of the experiment {whole.name!r} (number {k}) data are used only until {limit:.4g} s of "
+                f"{whole.t1:.4g} s: beyond, derivatives grow to more than {growth:.3g} times those of free flight, or "
+                "the simulation fails, and a fit would follow chance. Give windows of the later motion, each from an "
+                "observed state, as experiments of their own."
+            )
             warn(remarks[-1])
     start = restarted(parameters, problem.by_name(z))
     result = fit(cut.experiments, start, report=report, level=level, optimiser=optimiser, progress=progress)
@@ -203,22 +204,15 @@ def _first_horizon(problem: FitProblem, optimiser: AbstractOptimiser, z: Coordin
 
 
 class RefinedFit(AbstractFit):
-    """Estimates from several grids, extrapolated to a spacing of zero.
+    """Estimates from several grids, extrapolated to a spacing of zero: `result["E"]` is that of a parameter."""
 
-    `print(result)` shows a table; `result["E"]` is the extrapolated estimate of a parameter.
-    """
-
-    fits: tuple[FitResult, ...]
-    """The fit on each grid, from coarse to fine."""
+    fits: tuple[FitResult, ...]  # the fit on each grid, from coarse to fine
     refinements: tuple[int, ...]
     estimates: tuple[Estimate, ...]
     """The extrapolated numbers. Error and interval hold the noise's and the discretisation's part."""
-    from_noise: tuple[float, ...]
-    """The part of each error that the data's noise makes."""
-    from_discretisation: tuple[float, ...]
-    """The part that is left of the discretisation."""
-    order: tuple[float, ...]
-    """The order in the spacing with which each was extrapolated; NaN of what does not converge."""
+    from_noise: tuple[float, ...]  # the part of each error that the data's noise makes
+    from_discretisation: tuple[float, ...]  # the part that is left of the discretisation
+    order: tuple[float, ...]  # the order in the spacing with which each was extrapolated; NaN of what does not converge
 
     @property
     def all(self) -> tuple[Estimate, ...]:
@@ -278,18 +272,15 @@ def fit_refined(
     makes up for it moves by D times its standard error from the noise; half of this is the least error that is taken.
     D² is what the sum of squares loses from the grid before to the finest, over r^2p − 1, and needs no σ.
 
-    Intervals are made of the noise's and the discretisation's part, and keep to the bounds.
+    Intervals are made of the noise's and the discretisation's part, and keep to the bounds. After Ctrl-C it returns
+    what it has, and extrapolates from grids on which the fit was done.
 
     Args:
         build: the experiments on n times as many cells a direction, from n; take the step n times shorter too.
-        parameters: what is fitted, see `fit`. Each fit starts from the one before.
-        refinements: the n, growing, two at least.
+        refinements: the n, growing, two at least. Each fit starts from the one before.
         order: p, the order in the spacing. One is careful: estimates that converge faster get a wider interval.
-        report, level, optimiser, progress: see `fit`.
+        parameters, report, level, optimiser, progress, resume: see `fit`.
         log: the name of the logs, one a grid: of "fit.h5" they are "fit_1.h5", "fit_2.h5". See `fit`.
-        resume: continue from the logs that are there.
-
-    After Ctrl-C it returns what it has, and extrapolates from grids on which the fit was done.
 
     Raises:
         ValueError: fewer than two refinements, or not growing ones; see `fit`.
@@ -304,9 +295,16 @@ def fit_refined(
     start = parameters
     for n in numbers:
         path = None if log is None else Path(log).with_stem(f"{Path(log).stem}_{n}")
-        again = resume and path is not None and (path.exists() or n == numbers[0])
-        same: dict[str, Any] = {"report": report, "level": level, "optimiser": optimiser, "progress": progress}
-        result = fit(build(n), start, log=path, resume=again, **same)
+        result = fit(
+            build(n),
+            start,
+            report=report,
+            level=level,
+            optimiser=optimiser,
+            progress=progress,
+            log=path,
+            resume=resume and path is not None and (path.exists() or n == numbers[0]),
+        )
         if not result.interrupted or not fits:
             fits.append(result)
         if result.interrupted:
@@ -388,19 +386,6 @@ def _extrapolate(
     return estimate, discretisation, p
 
 
-_FIRST = (
-    "The first horizon is {0:.4g} s of {1:.4g} s: until then a change of one in a coordinate changes the data by no "
-    "more than they change themselves. Horizons double from there."
-)
-_ONE_STAGE = (
-    "One stage suffices: until the end of the data a change of one in a coordinate changes them by no more than they "
-    "change themselves, or by as much at all times."
-)
-_SHORT = (
-    "Of the experiment {0} data are used only until {2:.4g} s of {3:.4g} s: beyond, derivatives grow to more than "
-    "{1:.3g} times those of free flight, or the simulation fails, and a fit would follow chance. Give windows of the "
-    "later motion, each from an observed state, as experiments of their own."
-)
 _MOST_STAGES = 20
 _NEARLY_ALL = 0.75  # a horizon beyond this part of the end is the end
 _LEAST_TIMES = 4  # how many measured times the first horizon has, at least
