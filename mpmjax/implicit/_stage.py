@@ -44,16 +44,6 @@ class Guess(enum.Enum):
     ZERO = "zero"
     """Zero velocity."""
 
-    def velocity(self, before: NodeVector, explicit: NodeVector) -> NodeVector:
-        """The guess [m/s], shape (n, d), from v^n and v*."""
-        match self:
-            case Guess.GRID_VELOCITY:
-                return before
-            case Guess.EXPLICIT:
-                return explicit
-            case Guess.ZERO:
-                return jnp.zeros_like(before)
-
 
 class StageProblem(eqx.Module):
     """M (v − a) = Δt_s (f(u + θΔt_s v) − θ D v), an equation for the velocity v of the nodes [m/s], shape (n, d), in a

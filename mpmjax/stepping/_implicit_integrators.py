@@ -99,7 +99,7 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
             potential=nodes.potential,
             hessian=self.hessian,
             projection=nodes.projection,
-            prescribed=nodes.prescribed if nodes.moves_held else None,
+            prescribed=nodes.prescribed if nodes.conditions.moves or nodes.mirror.moving else None,
             preconditioner=self.preconditioner,
             theta=theta,
         )
@@ -131,7 +131,13 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
         return 0.0
 
     def initial_guess(self, nodes: Nodes) -> NodeVector:
-        return self.guess.velocity(nodes.velocity, nodes.explicit_velocity())
+        match self.guess:
+            case Guess.GRID_VELOCITY:
+                return nodes.velocity
+            case Guess.EXPLICIT:
+                return nodes.explicit_velocity()
+            case Guess.ZERO:
+                return jnp.zeros_like(nodes.velocity)
 
     def reporting(self, slot: Scalar) -> "AbstractImplicitIntegrator":
         return eqx.tree_at(lambda m: m.adjoint_solver, self, Reporting(self.adjoint_solver, slot))
@@ -164,6 +170,7 @@ class SemiImplicit(AbstractImplicitIntegrator):
         hessian, preconditioner, adjoint_solver, guess: see `AbstractImplicitIntegrator`.
     """
 
+    linearises: ClassVar[bool] = True  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
     beta: Scalar = 1.0
     solver: lx.AbstractLinearSolver = ConjugateResidual()
 
@@ -171,10 +178,6 @@ class SemiImplicit(AbstractImplicitIntegrator):
         require_fields(self)
         require_solver("SemiImplicit's solver", self.solver)
         require_between("SemiImplicit's beta", self.beta, 0, 1)
-
-    @property
-    def linearises(self) -> bool:
-        return True
 
     def solved_by(self) -> Callable[[StageProblem, NodeVector], tuple[NodeVector, SolveInfo]]:
         return eqx.Partial(solve_linearised, self.solver)

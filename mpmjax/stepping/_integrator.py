@@ -157,7 +157,9 @@ class Explicit(AbstractIntegrator):
 
     def advance(self, nodes: Nodes, guess: NodeVector) -> tuple[NodeMotion, SolveInfo]:
         del guess
-        v = nodes.admitted(nodes.explicit_velocity())
+        v = nodes.explicit_velocity()
+        if nodes.conditions.holds:
+            v = nodes.projection.combine(v, nodes.prescribed)
         return NodeMotion(v), no_solve(v.dtype)
 
     def elastic_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:

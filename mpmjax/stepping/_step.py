@@ -8,12 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mpmjax import linalg as la
 from mpmjax._types import Array, Float, Int, NodeVector, Scalar, components, particle_first
 from mpmjax.autodiff import without_derivative
 from mpmjax.boundary import ContactInfo, Impulses
 from mpmjax.checks import canonical, checked, require_finite, require_placement, require_positive
 from mpmjax.discretisation import Stencil, g2p, scatter
 from mpmjax.implicit import SolveInfo
+from mpmjax.potential import Forces
 from mpmjax.state import Particles, Scene, State, is_prepared, prepare, with_state
 from mpmjax.stepping._boundary_forces import impulse_on_boundaries, impulse_on_colliders
 from mpmjax.stepping._grid_update import GridUpdate, constrained_update
@@ -172,10 +174,10 @@ def force_error(
     exact = elastic if exact is None else exact
     if yields:  # the solve's forces went the share θ of the way to the trial stress, the law's go to the returned one
         tried, returned = (
-            replace(nodes.potential, material_points=scene.material_points(q)).current_weighted_stress()
-            for q in (trial, after)
+            replace(nodes.potential, material_points=scene.material_points(q)).weighted_stress() for q in (trial, after)
         )
-        exact = exact + force_at * nodes.dt * nodes.potential.nodal_sum(tried - returned)
+        relaxed = nodes.potential.on_nodes([Forces(slopes=la.transpose(tried - returned))])
+        exact = exact + force_at * nodes.dt * relaxed
         # what slows flow counts however small it is beside the momentum of what flows, but for its rounding
         mass = jnp.finfo(mass.dtype).eps ** 0.5 * mass
         stays = np.repeat([not law.relaxes_stress for law in scene.laws], trial.sizes)
