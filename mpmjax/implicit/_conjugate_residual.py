@@ -14,9 +14,14 @@ from mpmjax._types import Array, Bool, Float, Int, Scalar
 from mpmjax.checks import require, require_fields, require_positive, require_tolerance
 from mpmjax.discretisation import Basis, resist_unscaled, stencil_operands, sums_fit, without_flat
 from mpmjax.implicit._hessian import ParticleStiffness
-from mpmjax.implicit._linear_solve import NEARLY_CONVERGED, AbstractInnerProductSolver, default_rtol
+from mpmjax.implicit._linear_solve import (
+    NEARLY_CONVERGED,
+    AbstractInnerProduct,
+    AbstractInnerProductSolver,
+    DiagonalInnerProduct,
+    default_rtol,
+)
 from mpmjax.implicit._operator import ImplicitOperator, rest_of_product, vectors_fit
-from mpmjax.implicit._preconditioner import AbstractInnerProduct, DiagonalInnerProduct
 from mpmjax.native import NativeFunction, call_library
 
 NEGLIGIBLE_CHANGE = 1e-3

@@ -20,10 +20,15 @@ from mpmjax.autodiff import ruled, saved_for_backward, without_derivative
 from mpmjax.checks import require_fields
 from mpmjax.implicit._conjugate_residual import ConjugateResidual
 from mpmjax.implicit._hessian import AbstractHessian, AbstractHessianAction, DampedAction
-from mpmjax.implicit._linear_solve import SolveInfo, default_rtol, require_solver, solve_linear
+from mpmjax.implicit._linear_solve import (
+    AbstractPreconditioner,
+    SolveInfo,
+    default_rtol,
+    require_solver,
+    solve_linear,
+)
 from mpmjax.implicit._operator import ImplicitOperator, Projection
 from mpmjax.implicit._potential import ElasticPotential
-from mpmjax.implicit._preconditioner import AbstractPreconditioner
 
 _DERIVATIVE_RTOL = 1e-6
 """Largest default relative tolerance of tangent and adjoint solves. In float32 it is smaller than that of a step: in

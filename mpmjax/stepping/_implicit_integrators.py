@@ -60,7 +60,7 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
         return self.solution  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
-    def linearises(self) -> bool:
+    def linearises(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether stages have the elastic force f(0) − H u in place of that of the law."""
         return getattr(self.solved_by(), "linearises", False)
 
@@ -110,6 +110,10 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
         """Δt Σ q f(u) [kg m/s], with the forces that the solution takes."""
         return self.impulse_of(nodes, self.stages(nodes, motion))
 
+    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
+        """Δt Σ q f(u) [kg m/s], with the forces of the law."""
+        return self.impulse_of(nodes, self.stages(nodes, motion), exact=True)
+
     def impulse_of(
         self, nodes: Nodes, stages: tuple[tuple[Scalar, NodeVector | None], ...], *, exact: bool = False
     ) -> NodeVector:
@@ -119,9 +123,6 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
             return nodes.dt * (sum(q for q, _ in stages) * nodes.force - stiffness(_mean(stages)))
         forces = (q * (nodes.force if u is None else nodes.potential.force(u)) for q, u in stages)
         return nodes.dt * reduce(jnp.add, forces)
-
-    def exact_impulse(self, nodes: Nodes, motion: NodeMotion) -> NodeVector | None:
-        return self.impulse_of(nodes, self.stages(nodes, motion), exact=True) if self.linearises else None
 
     def mean_displacement(self, nodes: Nodes, motion: NodeMotion) -> NodeVector:
         """Σ q u [m] of the stages."""

@@ -189,8 +189,6 @@ def particles_to_grid(
     """P2G: mass, velocity and force of the nodes in the step from t to t + dt, and the elastic potential.
 
     Args:
-        scene, particles, stencil: the scene, its prepared particles and their stencil.
-        t, dt: time at the start of the step, and its length [s].
         body_force_at: the time at which body forces are evaluated, as a fraction of the step. Positions are moved on to
             it with the particles' velocity.
         explicit_viscosity: whether the force includes the viscous stress, at the particles' stored velocity gradients.
@@ -278,11 +276,10 @@ def folded_at_planes(scene: Scene, particles: Particles, nodes: Nodes, t: Scalar
     """The nodes, folded at the scene's symmetry planes, and those of rigid bodies to the two that move each."""
     images = mirror(scene.boundary, scene.grid, scene.window(particles), t, nodes.dt)
     if scene.rigid_bodies:
-        rigid = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images, nodes.dt)
+        rigid, of_bodies, v, conditions = rigid_layers(scene, particles, nodes.mass, nodes.conditions, images, nodes.dt)
         loose = nodes.folded(images)
-        nodes = loose.folded(Mirror(rigid.images))
-        v = jnp.where(rigid.of_bodies, rigid.velocity, nodes.velocity)
-        return replace(nodes, v=v, conditions=rigid.conditions, loose=loose)
+        nodes = loose.folded(rigid)
+        return replace(nodes, v=jnp.where(of_bodies, v, nodes.velocity), conditions=conditions, loose=loose)
     if not images.moving:
         return nodes.folded(images)
     # at rest with the mirrors: the velocity less what they add, which is put back

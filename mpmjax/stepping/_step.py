@@ -96,7 +96,7 @@ def step_unchecked(
         boundaries = impulse_on_boundaries(scene, particles, t, unfolded, nodes, method, new)
     return after, StepInfo(
         solve=new.solve,
-        contact=ContactInfo(none, none) if new.contact is None else new.contact.info,
+        contact=ContactInfo(none, none) if new.contact is None else new.contact,
         outside=(~stencil.inside).sum().astype(jnp.int32),
         force_error=error,
         force_scale=scale,
@@ -114,7 +114,7 @@ def update(nodes: Nodes, method: AbstractIntegrator) -> GridUpdate:
     if nodes.contacts:
         return constrained_update(nodes, method)
     motion, info = advance(nodes, method, method.initial_guess(nodes))
-    return GridUpdate(motion, None if nodes.f is None else method.elastic_impulse(nodes, motion), info)
+    return GridUpdate(motion, motion, None if nodes.f is None else method.elastic_impulse(nodes, motion), info)
 
 
 def grid_to_particles(scene: Scene, particles: Particles, nodes: Nodes, new: GridUpdate) -> Particles:
@@ -167,11 +167,10 @@ def force_error(
     maps. No derivative passes."""
     frozen = without_derivative((nodes, method, force_at, motion, elastic, trial, after))
     nodes, method, force_at, motion, elastic, trial, after = frozen
-    exact, mass = method.exact_impulse(nodes, motion), nodes.mass
-    yields = any(law.relaxes_stress for law in scene.laws)
-    if exact is None and not yields:
+    mass, yields = nodes.mass, any(law.relaxes_stress for law in scene.laws)
+    if not method.linearises and not yields:
         return jnp.zeros((), mass.dtype), jnp.zeros((), mass.dtype)
-    exact = elastic if exact is None else exact
+    exact = method.exact_impulse(nodes, motion) if method.linearises else elastic
     if yields:  # the solve's forces went the share θ of the way to the trial stress, the law's go to the returned one
         tried, returned = (
             replace(nodes.potential, material_points=scene.material_points(q)).weighted_stress() for q in (trial, after)
