@@ -189,9 +189,10 @@ class AbstractHessian(eqx.Module):
     def at(self, potential: ElasticPotential, u: NodeVector | None) -> AbstractHessianAction:
         """The Hessian of the potential at a nodal displacement u [m], shape (n, d); None for u = 0."""
 
-    @abc.abstractmethod
     def exact(self) -> "AbstractHessian":
-        """The Hessian that this one approximates, or this one. Derivatives of a solution by Newton's method use it."""
+        """The Hessian that this one approximates, which derivatives of a solution by Newton's method use. Default: this
+        one."""
+        return self
 
 
 class AnalyticHessian(AbstractHessian):
@@ -230,9 +231,6 @@ class JvpHessian(AbstractHessian):
             return lambda dF: jax.jvp(stress, (F,), (dF,))[1]
 
         return _tangents_of(potential, u, differential)
-
-    def exact(self) -> "JvpHessian":
-        return self
 
 
 def _tangents_of(

@@ -99,7 +99,7 @@ class AbstractImplicitIntegrator(AbstractIntegrator):
             potential=nodes.potential,
             hessian=self.hessian,
             projection=nodes.projection,
-            prescribed=nodes.prescribed if nodes.conditions.moves or nodes.mirror.moving else None,
+            prescribed=nodes.prescribed if nodes.conditions.moves or nodes.potential.mirror.moving else None,
             preconditioner=self.preconditioner,
             theta=theta,
         )

@@ -110,7 +110,7 @@ class Nodes(AbstractNodes):
     @property
     def prescribed(self) -> NodeVector:
         """The velocity of held components [m/s], shape (n, d)."""
-        parts, velocity = self.free_normals, self.mirror.with_motion(self.conditions.velocity)
+        parts, velocity = self.free_normals, self.potential.mirror.with_motion(self.conditions.velocity)
         if not parts:
             return velocity
         along = reduce(jnp.add, (part.direction * part.speed[:, None] for part in parts))
